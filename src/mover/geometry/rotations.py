@@ -1,0 +1,42 @@
+"""Rotations: about the axes of the world, from axis-angle vectors, and between directions."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def rot_x(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
+    """Right-handed rotations about +x; `angle` in [rad]."""
+    c, s, o, i = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    return torch.stack([i, o, o, o, c, -s, o, s, c], -1).reshape(*angle.shape, 3, 3)
+
+
+def rot_y(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
+    """Right-handed rotations about +y; `angle` in [rad]."""
+    c, s, o, i = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    return torch.stack([c, o, s, o, i, o, -s, o, c], -1).reshape(*angle.shape, 3, 3)
+
+
+def rot_z(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
+    """Right-handed rotations about +z; `angle` in [rad]."""
+    c, s, o, i = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    return torch.stack([c, -s, o, s, c, o, o, o, i], -1).reshape(*angle.shape, 3, 3)
+
+
+def axis_angle(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrices of axis-angle vectors [rad] (Rodrigues), smooth at zero."""
+    x, y, z = vector.unbind(-1)
+    o = torch.zeros_like(x)
+    skew = torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(*vector.shape[:-1], 3, 3)
+    squared = vector.square().sum(-1)[..., None, None]
+    small = squared < 1e-8
+    angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
+    first = torch.where(small, 1 - squared / 6, angle.sin() / angle)
+    second = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / angle.square())
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return eye + first * skew + second * (skew @ skew)
+
+
+def wrap(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The same angle in (-pi, pi] [rad]."""
+    return torch.atan2(angle.sin(), angle.cos())

@@ -1,0 +1,145 @@
+"""Records: frozen dataclasses of tensors that are checked, mapped, moved, saved and hashed."""
+
+import dataclasses
+import hashlib
+import json
+import os
+import tempfile
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar, dataclass_transform
+
+import numpy as np
+import torch
+from beartype import BeartypeConf, beartype
+from jaxtyping import jaxtyped
+from torch import Tensor
+
+T = TypeVar("T")
+_check = beartype(conf=BeartypeConf(is_pep484_tower=True))
+
+
+class InputError(Exception):
+    """Bad user data: the message names the file, the field, what was found and what was expected."""
+
+
+@dataclass_transform(frozen_default=True)
+def record(cls: type[T]) -> type[T]:
+    """Make a frozen dataclass whose dtypes and shapes are checked when it is built."""
+    return jaxtyped(typechecker=_check)(dataclasses.dataclass(frozen=True, eq=False)(cls))
+
+
+def map_tensors(fn: Callable[[Tensor], Tensor], value: T) -> T:
+    """Return a copy of `value` with `fn` applied to each tensor inside."""
+    return typing.cast(T, _map(fn, value))
+
+
+def _map(fn: Callable[[Tensor], Tensor], value: Any) -> Any:  # noqa: ANN401
+    match value:
+        case Tensor():
+            return fn(value)
+        case tuple():
+            return tuple(_map(fn, v) for v in value)
+        case Mapping():
+            return {k: _map(fn, v) for k, v in value.items()}
+        case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            names = [f.name for f in dataclasses.fields(value)]
+            return dataclasses.replace(value, **{n: _map(fn, getattr(value, n)) for n in names})
+        case _:
+            return value
+
+
+def to_device(value: T, device: torch.device | str) -> T:
+    """Return a copy of `value` on `device`."""
+    return map_tensors(lambda x: x.to(device), value)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary file beside `path` that takes its place when the block ends well."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    os.close(handle)
+    os.chmod(name, 0o644)
+    try:
+        yield Path(name)
+        os.replace(name, path)
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def save(value: Any, path: Path) -> None:  # noqa: ANN401
+    """Write `value` as `path`.npz for the tensors and then `path`.json for the structure."""
+    tensors: dict[str, Any] = {}
+    tree = _split(value, "", tensors)
+    with replacing(path.with_suffix(".npz")) as part:
+        np.savez(part, **tensors)
+    with replacing(path.with_suffix(".json")) as part:
+        part.write_text(json.dumps(tree))
+
+
+def load(kind: type[T], path: Path) -> T:
+    """Read a record of type `kind` written by `save`."""
+    tree = json.loads(path.with_suffix(".json").read_text())
+    with np.load(path.with_suffix(".npz"), allow_pickle=False) as arrays:
+        return typing.cast(T, _join(kind, tree, dict(arrays)))
+
+
+def fingerprint(*values: Any) -> str:  # noqa: ANN401
+    """Short hash of the content of records: equal content, equal name on disk."""
+    tensors: dict[str, Any] = {}
+    tree = [_split(v, str(i), tensors) for i, v in enumerate(values)]
+    digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode())
+    for name in sorted(tensors):
+        array = np.ascontiguousarray(tensors[name])
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()[:16]
+
+
+def _split(value: Any, key: str, tensors: dict[str, Any]) -> Any:  # noqa: ANN401
+    match value:
+        case Tensor():
+            tensors[key] = value.detach().cpu().numpy()
+            return {"tensor": key}
+        case bytes():
+            return {"bytes": value.decode("latin-1")}
+        case tuple() | list():
+            return [_split(v, f"{key}.{i}", tensors) for i, v in enumerate(value)]
+        case Mapping():
+            return {k: _split(v, f"{key}.{k}", tensors) for k, v in value.items()}
+        case Path():
+            return str(value)
+        case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            names = [f.name for f in dataclasses.fields(value)]
+            return {n: _split(getattr(value, n), f"{key}.{n}", tensors) for n in names}
+        case _:
+            return value
+
+
+def _join(kind: Any, tree: Any, arrays: dict[str, Any]) -> Any:  # noqa: ANN401
+    if tree is None:
+        return None
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):
+        kind = next(k for k in typing.get_args(kind) if k is not types.NoneType)
+    if isinstance(tree, dict) and set(tree) == {"tensor"}:
+        return torch.from_numpy(arrays[tree["tensor"]])
+    if isinstance(tree, dict) and set(tree) == {"bytes"}:
+        return tree["bytes"].encode("latin-1")
+    origin, args = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if dataclasses.is_dataclass(origin):
+        hints = typing.get_type_hints(origin)
+        return kind(**{k: _join(hints[k], v, arrays) for k, v in tree.items()})
+    if isinstance(tree, dict):
+        return {k: _join(args[1], v, arrays) for k, v in tree.items()}
+    if isinstance(tree, list):
+        return tuple(_join(k, v, arrays) for k, v in zip(_kinds(args, len(tree)), tree, strict=True))
+    return tree
+
+
+def _kinds(args: tuple[Any, ...], length: int) -> tuple[Any, ...]:
+    """Types of the items of a tuple: one for all (`tuple[X, ...]`) or one for each."""
+    return args[:1] * length if Ellipsis in args else args

@@ -1,0 +1,50 @@
+r"""Objects fill their detected 2D boxes (supplement, "Loss Terms").
+
+Price:     L_bbox = \sum_i \| Proj_i^a - Det_i^a \|,  a in {x_min, y_min, width}
+Paper:     Proj_i is the projected 3D box (its eight corners); an l1 norm, in pixels of an image
+           that is 640 wide.
+Release:   Proj_i is the extent of the projected mesh; smooth l1 with a knee of one pixel.
+Robust:    extent of the mesh, all four sides that are really seen, each divided by the box's size
+           \sqrt{w h}, so that near and far objects count alike. A side on the image border, or
+           behind another object's mask, says nothing and is left out.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from . import Form
+
+WIDTH = 640.0  # [px], the image width at which the weights of the paper have their meaning
+SOFT = 0.01  # of a box's size: half width of the rounded tip of the robust price
+
+
+def bbox_term(
+    pixels: Float[Tensor, "*starts objects points 2"],
+    detected: Float[Tensor, "objects 4"],
+    sides: Bool[Tensor, "objects 4"],
+    width: float,
+    form: Form,
+) -> Float[Tensor, "*starts objects"]:
+    """Distance between projected and detected boxes.
+
+    Args:
+        pixels: Projected corners (`paper`) or vertices [px].
+        detected: x_min, y_min, x_max, y_max [px].
+        sides: Which sides are known; an object without a box has none and costs nothing.
+        width: Width of the image [px].
+        form: How it is priced; [px at 640] for `paper` and `release`, else box sizes.
+    """
+    drawn = torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
+    if form == "robust":
+        size = (detected[:, 2:] - detected[:, :2]).clamp_min(1).prod(-1, keepdim=True).sqrt()
+        off = ((drawn - detected) / size).square()
+        return (((off + SOFT**2).sqrt() - SOFT) * sides).sum(-1)
+    off = (_corner_and_width(drawn) - _corner_and_width(detected)).abs() * (WIDTH / width)
+    if form == "release":
+        off = torch.where(off < 1, 0.5 * off.square(), off - 0.5)
+    return off.sum(-1) * sides.any(-1)
+
+
+def _corner_and_width(box: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
+    return torch.cat([box[..., :2], box[..., 2:3] - box[..., :1]], -1)

@@ -1,0 +1,62 @@
+r"""Objects cover their masks, wherever nothing may hide them (Sec. 3.1, after PHOSA).
+
+Price:     L_occ-sil = \sum_i \sum_q keep_i(q) (Sil_i(q) - M_i(q))^2
+Evidence:  M_i, the mask in a square window around the object's box; keep_i is 0 where another
+           object, or a person, may hide this one, and beyond the border of the image.
+Paper:     the sum over a window of 256 x 256 pixels.
+Release:   the same, with an edge term of its own weight (`edge_term`) and with everything beyond
+           the border counted as background.
+Robust:    divided by the number of mask pixels, so that resolution and size carry no weight.
+
+The gradient is exact (rendering, docs/method.md), hence 10-14 times smaller than that of the
+neural renderer that the authors used; their weight is kept as printed.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from . import Form
+
+RING = 7  # [px], PHOSA's window for the ring around a silhouette
+
+
+def silhouette_term(
+    drawn: Float[Tensor, "*starts objects h w"],
+    mask: Float[Tensor, "objects h w"],
+    keep: Bool[Tensor, "objects h w"],
+    form: Form,
+) -> Float[Tensor, "*starts objects"]:
+    """Squared difference between drawn and detected masks [px], or per mask pixel (`robust`)."""
+    price = ((drawn - mask).square() * keep).sum((-2, -1))
+    if form == "robust":
+        return price / (mask * keep).sum((-2, -1)).clamp_min(1)
+    return price
+
+
+def edge_term(
+    drawn: Float[Tensor, "*starts objects h w"],
+    mask: Float[Tensor, "objects h w"],
+    keep: Bool[Tensor, "objects h w"],
+) -> Float[Tensor, "*starts objects"]:
+    """One-way distance of the drawn outline from the detected one (PHOSA) [px^1.5].
+
+    Half the sum of the outer ring of the kept silhouette times the root of the distance to the
+    ring of the mask. Only the `release` preset gives it a weight.
+    """
+    distance = _distance_to(_ring((mask > 0.5).to(drawn)))
+    return 0.5 * (_ring(drawn * keep) * distance.sqrt()).sum((-2, -1))
+
+
+def _ring(image: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w"]:
+    flat = image.reshape(-1, 1, *image.shape[-2:])
+    grown = torch.nn.functional.max_pool2d(flat, RING, stride=1, padding=RING // 2)
+    return grown.reshape(image.shape) - image
+
+
+def _distance_to(edges: Float[Tensor, "objects h w"]) -> Float[Tensor, "objects h w"]:
+    """Euclidean distance to the nearest edge pixel [px]."""
+    from scipy.ndimage import distance_transform_edt
+
+    maps = [torch.from_numpy(distance_transform_edt((e == 0).cpu().numpy())) for e in edges]
+    return torch.stack(maps).to(edges)
