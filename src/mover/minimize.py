@@ -97,7 +97,7 @@ def minimize(
 ) -> Minimum[P]:
     """Follow the gradient of `energy` from `start`.
 
-    Every field of `P` is a tensor whose leading axes are those of the energy's items.
+    Every field of `P` is a tensor; with `keep_best` its leading axes are those of the items.
 
     Raises:
         ValueError: If the energy stops being finite.
@@ -106,8 +106,7 @@ def minimize(
     free = {n: getattr(start, n).detach().clone().requires_grad_() for n in names}
     at = dataclasses.replace(start, **free)  # type: ignore[type-var]
     adam = torch.optim.Adam(list(free.values()), lr=method.rate, betas=(0.9, method.beta2))
-    best = map_tensors(lambda x: x.detach().clone(), at)
-    lowest: Tensor | None = None
+    best, lowest = map_tensors(lambda x: x.detach().clone(), at), None
     trace: list[Tensor] = []
     for index in range(method.steps):
         adam.param_groups[0]["lr"] = _rate(method, index)
@@ -115,17 +114,17 @@ def minimize(
         value = energy(at)
         value.total.backward()
         items = value.per_item.detach()
-        lowest, best = _better(items, lowest, at, best)
+        if method.keep_best:
+            lowest, best = _better(items, lowest, at, best)
         trace.append(items.sum())
         adam.step()
         observe(Step(stage, index, method.steps, value))
     with torch.no_grad():
         last = energy(at).per_item
-    if not (torch.stack([*trace, last.sum()]).isfinite()).all():
+    if not torch.stack([*trace, last.sum()]).isfinite().all():
         raise ValueError(f"{stage}: the energy is not finite")
     if method.keep_best:
-        last, best = _better(last, lowest, at, best)
-        return Minimum(best, last, torch.stack(trace) if trace else last.new_zeros(0))
+        last, at = _better(last, lowest, at, best)
     at = map_tensors(lambda x: x.detach(), at)
     return Minimum(at, last, torch.stack(trace) if trace else last.new_zeros(0))
 

@@ -143,3 +143,13 @@ def _join(kind: Any, tree: Any, arrays: dict[str, Any]) -> Any:  # noqa: ANN401
 def _kinds(args: tuple[Any, ...], length: int) -> tuple[Any, ...]:
     """Types of the items of a tuple: one for all (`tuple[X, ...]`) or one for each."""
     return args[:1] * length if Ellipsis in args else args
+
+
+def plain(value: Any) -> Any:  # noqa: ANN401
+    """A record without tensors as plain JSON values; `built` is the way back."""
+    return _split(value, "", {})
+
+
+def built(kind: type[T], tree: Any) -> T:  # noqa: ANN401
+    """A record of type `kind` from plain JSON values."""
+    return typing.cast(T, _join(kind, tree, {}))

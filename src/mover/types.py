@@ -161,6 +161,8 @@ class Objects:
     """Canonical names."""
     verts: Float[Tensor, "objects verts 3"]
     """[m]."""
+    real_verts: Bool[Tensor, "objects verts"]
+    """False where vertices pad."""
     faces: Int[Tensor, "objects faces 3"]
     edges: Int[Tensor, "objects edges 4"]
     """Two vertices and the two faces beside them."""
@@ -174,6 +176,8 @@ class Objects:
     """Points of the region that one leans against [m]."""
     has_top: Bool[Tensor, " objects"]
     has_back: Bool[Tensor, " objects"]
+    is_seat: Bool[Tensor, " objects"]
+    """People can sit or lie on it."""
     supports: Int[Tensor, " objects"]
     """-1: the ground, -2: free, else the index of the carrying object."""
 
@@ -191,10 +195,39 @@ class Layout:
 
 
 @record
+class Evidence:
+    """What held an object in its place."""
+
+    id: str
+    mask_pixels: int
+    """Pixels of its mask in the image."""
+    near_pixels: int
+    """Pixels (of an image 640 wide) where people passed in front of it."""
+    far_pixels: int
+    """Pixels where it hid people."""
+    touching_bodies: int
+    """Bodies that touch it."""
+    energy: float
+    """What is left of Eq. 1 at its place."""
+
+
+@record
 class Room:
     """What `reconstruct` returns."""
 
     scene: Scene
+    """The refined scene: every object of the input."""
+    initial: Scene
+    """The scene as it was given."""
     bodies: Bodies | None
     """All rows of the input, in the world of `scene`."""
+    kept: Bool[Tensor, " bodies"] | None
+    """Rows that served as evidence."""
+    proxies: tuple[Mesh, ...]
+    """The closed meshes that were optimised, in the coordinates of the pieces' own meshes."""
+    evidence: tuple[Evidence, ...]
+    covariance: Float[Tensor, "3 3"] | None
+    """Of pitch [rad], roll [rad] and ground [m] as the feet give them."""
+    traces: dict[str, Tensor]
+    """Total energy before each step, by stage."""
     warnings: tuple[str, ...]

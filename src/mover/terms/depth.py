@@ -51,6 +51,46 @@ class DepthRange:
     """Area of a window pixel in pixels of an image that is 640 wide."""
 
 
+@record
+class Seen:
+    """One person in one frame: what was seen of the body, and what was hidden."""
+
+    front: Float[Tensor, "h w"]
+    """Depth where the ray enters the body [m]; inf where it misses."""
+    exit: Float[Tensor, "h w"]
+    """Depth where it first leaves the body [m]."""
+    visible: Bool[Tensor, "h w"]
+    """The person's visible mask."""
+    others: Bool[Tensor, "h w"]
+    """Masks of the other people of the frame."""
+
+
+def bounds_of(
+    seen: Seen, objects: Bool[Tensor, "objects h w"], erode: int, *, vote: bool
+) -> DepthMaps:
+    """Bounds from one body in one frame.
+
+    Args:
+        seen: The drawn body and the masks.
+        objects: Masks of the objects in the clean image.
+        erode: Pixels by which silhouettes and masks shrink, so that rays that graze the body and
+            borders that leak bound nothing.
+        vote: Of each object, keep only the larger region: it is hidden or hides, not both.
+    """
+    body = _shrink(seen.front.isfinite(), erode)
+    shown = body & _shrink(seen.visible, erode)
+    hidden = body & ~_grow(seen.visible, erode) & ~_grow(seen.others, erode)
+    before, behind = objects & shown, objects & hidden
+    if vote:
+        more = before.sum((-2, -1)) - behind.sum((-2, -1))
+        before = before & (more > 0)[:, None, None]
+        behind = behind & (more < 0)[:, None, None]
+    infinity = torch.full_like(seen.front, float("inf"))
+    near = torch.where(before.any(0), seen.exit, -infinity)
+    free = torch.where(shown, seen.exit, -infinity)
+    return DepthMaps(near, torch.where(behind.any(0), seen.front, infinity), free)
+
+
 def merge(a: DepthMaps, b: DepthMaps) -> DepthMaps:
     """The narrower bounds of two sets of frames."""
     near, far = torch.maximum(a.near, b.near), torch.minimum(a.far, b.far)
@@ -93,7 +133,17 @@ def _short(
 
 
 def _erode(mask: Bool[Tensor, "*batch h w"]) -> Bool[Tensor, "*batch h w"]:
-    """Drop pixels beside an unset one (four neighbours)."""
+    """Drop pixels beside an unset one (four neighbours); the border of the image is no edge."""
     padded = torch.nn.functional.pad(mask, (1, 1, 1, 1), value=True)
     rows = padded[..., :-2, 1:-1] & padded[..., 2:, 1:-1]
     return mask & rows & padded[..., 1:-1, :-2] & padded[..., 1:-1, 2:]
+
+
+def _shrink(mask: Bool[Tensor, "h w"], steps: int) -> Bool[Tensor, "h w"]:
+    for _ in range(steps):
+        mask = _erode(mask)
+    return mask
+
+
+def _grow(mask: Bool[Tensor, "h w"], steps: int) -> Bool[Tensor, "h w"]:
+    return ~_shrink(~mask, steps)

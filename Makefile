@@ -1,0 +1,42 @@
+# make demo | make test | make check: each works on a fresh machine with Python >= 3.11 and make.
+PYTHON ?= python3
+# Where torch comes from. Installed first and pinned, so that nothing else chooses a build.
+# Another build:  make demo TORCH="torch --index-url URL"
+TORCH ?= torch==2.13.0
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
+JOBS ?= 2
+
+.PHONY: demo test check lint slow clean
+
+demo: $(VENV)/.installed
+	$(BIN)/mover demo --out demo
+
+test: $(VENV)/.developed
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) -m "not gpu and not licensed"
+
+check: lint test
+
+lint: $(VENV)/.developed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+$(VENV)/.torch: constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) --upgrade pip
+	$(PIP) $(TORCH)
+	touch $@
+
+$(VENV)/.installed: $(VENV)/.torch pyproject.toml
+	$(PIP) --constraint constraints.txt --editable .
+	touch $@
+
+$(VENV)/.developed: $(VENV)/.installed
+	$(PIP) --constraint constraints.txt --editable ".[dev]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) demo out build dist .pytest_cache .ruff_cache

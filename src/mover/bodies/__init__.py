@@ -1,0 +1,64 @@
+"""People's bodies: models by name, from shape and pose to vertices and joints."""
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..records import InputError
+from ..types import BodyPose
+from .skinning import open_body, zero_pose
+
+__all__ = ["BODY_MODELS", "BodyModel", "load_model", "open_body", "zero_pose"]
+
+
+@runtime_checkable
+class BodyModel(Protocol):
+    """What a body model can do."""
+
+    @property
+    def name(self) -> str:
+        """Its name in `BODY_MODELS`."""
+        ...
+
+    @property
+    def faces(self) -> Int[Tensor, "faces 3"]:
+        """Triangles of its surface, counter-clockwise from outside."""
+        ...
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of its joints, in order."""
+        ...
+
+    def posed(
+        self, pose: BodyPose
+    ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+        """Vertices and joints [m], differentiable in all of `pose`."""
+        ...
+
+
+def _makehuman(gender: str) -> BodyModel:
+    """The open body; its gender is part of its shape, so `gender` changes nothing."""
+    del gender
+    return open_body()
+
+
+BODY_MODELS: dict[str, Callable[[str], BodyModel]] = {"makehuman": _makehuman}
+"""How to get each body model, by name, from a gender."""
+
+
+def load_model(name: str, gender: str = "neutral") -> BodyModel:
+    """The body model with this name.
+
+    Raises:
+        InputError: If there is no such model.
+    """
+    if name not in BODY_MODELS:
+        known = ", ".join(f"'{n}'" for n in sorted(BODY_MODELS))
+        raise InputError(
+            f"bodies.npz: 'model' is '{name}', known are {known}; "
+            "meshes ('vertices' and 'faces') are enough without a model"
+        )
+    return BODY_MODELS[name](gender)

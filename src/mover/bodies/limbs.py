@@ -1,0 +1,122 @@
+"""The limbs of a body as frames: where each starts and how it is turned against the T-pose."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from .intrinsic import TIPS
+from .skeleton import FINGERS, SIDES
+from .skinning import SkinnedBody
+
+Array = np.ndarray
+
+LANDMARKS = (
+    "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle", "neck",
+    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
+"""Joints that are found on any body."""
+
+ABOVE = {
+    "hip": ("pelvis",), "knee": ("hip",), "ankle": ("knee",), "neck": ("spine3",),
+    "shoulder": ("collar",), "elbow": ("shoulder",), "wrist": ("elbow",),
+}  # fmt: skip
+"""The joint whose skin blends with that of each landmark."""
+
+LIMBS = (
+    "trunk", "head",
+    *(f"{s}_{n}" for s in SIDES
+      for n in ("thigh", "shin", "foot", "upper_arm", "forearm", "hand")),
+)  # fmt: skip
+
+CHAIN = {
+    "thigh": ("trunk", "hip", "knee"),
+    "shin": ("thigh", "knee", "ankle"),
+    "foot": ("shin", "ankle", "foot"),
+    "upper_arm": ("trunk", "shoulder", "elbow"),
+    "forearm": ("upper_arm", "elbow", "wrist"),
+    "hand": ("forearm", "wrist", "hand"),
+}
+"""Limb: (the limb it hangs at, where it starts, where it ends)."""
+
+OWNER = {"hip": "thigh", "knee": "shin", "ankle": "foot", "foot": "foot",
+         "shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand",
+         **{f"{f}{k}": "hand" for f in FINGERS for k in (1, 2, 3)}}  # fmt: skip
+
+
+def limb_of(model: SkinnedBody) -> Int[Array, " verts"]:
+    """Index into `LIMBS` for each vertex, by its largest weight."""
+    table: list[int] = []
+    for name in model.joint_names:
+        side, _, joint = name.partition("_")
+        if side in SIDES and joint in OWNER:
+            table.append(LIMBS.index(f"{side}_{OWNER[joint]}"))
+        else:
+            high = name in ("neck", "head", "jaw") or "eye" in name
+            table.append(LIMBS.index("head" if high else "trunk"))
+    return np.array(table)[model.weights.argmax(1).numpy()]
+
+
+def landmark_rings(model: SkinnedBody) -> Float[Array, "verts landmarks"]:
+    """1 where the skin of a landmark blends with the skin above it."""
+    weight = dict(zip(model.joint_names, model.weights.T.numpy(), strict=True))
+    rings: list[Array] = []
+    for name in LANDMARKS:
+        side, _, joint = name.rpartition("_")
+        above = [f"{side}_{n}" if f"{side}_{n}" in weight else n for n in ABOVE[joint]]
+        rings.append(sum(weight[n] for n in above) * weight[name] > 0.12)
+    return np.stack(rings, axis=1).astype(float)
+
+
+def thin(
+    mesh: Float[Array, "verts 3"], rings: Float[Array, "verts landmarks"], members: int = 24
+) -> Int[Array, "landmarks members"]:
+    """So many vertices of each ring, far from each other, so that their mean is its middle."""
+    rows: list[Array] = []
+    for ring in (rings > 0).T:
+        index = np.nonzero(ring)[0] if ring.any() else np.arange(len(mesh))
+        points = mesh[index]
+        far = np.linalg.norm(points - points.mean(0), axis=1)
+        chosen: list[int] = []
+        for _ in range(members):
+            chosen.append(int(far.argmax()))
+            far = np.minimum(far, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        rows.append(index[chosen])
+    return np.stack(rows)
+
+
+def limb_frames(
+    at: dict[str, Float[Array, "3"]], tips: Float[Array, "5 3"]
+) -> dict[str, tuple[Float[Array, "3 3"], Float[Array, "3"]]]:
+    """Rotation (columns left, up, front) and start [m] of each limb.
+
+    A limb is turned from the one it hangs at by the least angle that gives its direction.
+    """
+    hips = (at["left_hip"] + at["right_hip"]) / 2
+    across = at["left_hip"] - at["right_hip"] + at["left_shoulder"] - at["right_shoulder"]
+    up = _unit(at["neck"] - hips)
+    left = _unit(across - up * (up @ across))
+    trunk = np.stack([left, up, np.cross(left, up)], axis=1)
+    frames = {"trunk": (trunk, hips)}
+    ends = {**at, **{str(name): tip for name, tip in zip(TIPS, tips, strict=True)}}
+    head = _unit(ends["head"] - at["neck"])
+    frames["head"] = (_shortest(trunk[:, 1], head) @ trunk, at["neck"])
+    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+        arm, leg = np.array([sign, 0, 0]), np.array([0.0, -1, 0])
+        rest = {"upper_arm": arm, "forearm": arm, "hand": arm, "thigh": leg, "shin": leg}
+        for limb, (parent, start, stop) in CHAIN.items():
+            above = frames[parent if parent == "trunk" else f"{side}_{parent}"][0]
+            first = at[f"{side}_{start}"]
+            last = ends[f"{side}_{stop}"]
+            usual = above @ rest.get(limb, np.array([0.0, -0.35, 0.94]))
+            frames[f"{side}_{limb}"] = (_shortest(usual, _unit(last - first)) @ above, first)
+    return frames
+
+
+def _unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
+
+
+def _shortest(start: Float[Array, "3"], end: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The rotation by the least angle that turns one unit vector into another."""
+    x, y, z = np.cross(start, end)
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + skew + skew @ skew / max(1 + float(start @ end), 1e-6)

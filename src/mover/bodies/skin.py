@@ -1,0 +1,77 @@
+"""Parts of a skinned body, from its weights and from normals and heights in the zero pose."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..geometry.mesh import vertex_normals
+from .part_names import PARTS
+from .skeleton import FINGERS, SIDES
+from .skinning import SkinnedBody, zero_pose
+
+SOLE_HEIGHT = 0.025
+"""A sole is that near the lowest point [statures]: 4 cm of an adult."""
+
+
+def model_parts(model: SkinnedBody) -> Int[Tensor, " verts"]:
+    """Index of each vertex of `model` into `PARTS`, -1 for none."""
+    verts, joints = (x[0] for x in model.posed(zero_pose(1, model)))
+    dominant = tuple(model.joint_names[j] for j in model.weights.argmax(1).tolist())
+    place = dict(zip(model.joint_names, joints, strict=True))
+    return skin_parts(dominant, verts, vertex_normals(verts, model.faces), place)
+
+
+def skin_parts(
+    dominant: tuple[str, ...],
+    verts: Float[Tensor, "verts 3"],
+    normals: Float[Tensor, "verts 3"],
+    place: dict[str, Float[Tensor, "3"]],
+) -> Int[Tensor, " verts"]:
+    """Index of each vertex into `PARTS`, -1 for none.
+
+    Args:
+        dominant: Name of the joint with the largest weight at each vertex.
+        verts: Vertices in the zero pose (T-pose, +y up, +z front) [m].
+        normals: Outward unit normals there.
+        place: Places of the joints by name there [m].
+    """
+    part = torch.full((len(verts),), -1, dtype=torch.long, device=verts.device)
+    for name, inside in _patches(dominant, verts, normals, place).items():
+        part[inside & (part < 0)] = PARTS.index(name)
+    return part
+
+
+def _patches(
+    dominant: tuple[str, ...],
+    verts: Float[Tensor, "verts 3"],
+    normals: Float[Tensor, "verts 3"],
+    place: dict[str, Float[Tensor, "3"]],
+) -> dict[str, Bool[Tensor, " verts"]]:
+    """Where each part is; where two overlap the first counts."""
+
+    def of(*joints: str) -> Bool[Tensor, " verts"]:
+        known = frozenset(joints)
+        return torch.tensor([name in known for name in dominant], device=verts.device)
+
+    height, nx, ny, nz = verts[:, 1], *normals.unbind(-1)
+    del nx
+    low, stature = height.min(), height.max() - height.min()
+    hip = (place["left_hip"][1] + place["right_hip"][1]) / 2
+    thigh = hip - (place["left_knee"][1] + place["right_knee"][1]) / 2
+    patches: dict[str, Bool[Tensor, " verts"]] = {}
+    for side in SIDES:
+        near_floor = height < low + SOLE_HEIGHT * stature
+        patches[f"{side}_sole"] = of(f"{side}_ankle", f"{side}_foot") & (ny < -0.6) & near_floor
+    trunk = of("pelvis", "spine1", "left_hip", "right_hip")
+    level = (height > hip - 0.34 * thigh) & (height < hip + 0.24 * thigh)
+    behind = verts[:, 2] < (place["left_hip"][2] + place["right_hip"][2]) / 2
+    patches["seat"] = trunk & level & behind & (nz < 0.3)
+    for side in SIDES:
+        patches[f"{side}_thigh"] = of(f"{side}_hip") & (nz < -0.2)
+    spine = of("pelvis", "spine1", "spine2", "spine3", "left_collar", "right_collar")
+    patches["back"] = spine & (nz < -0.45) & (height > hip)
+    for side in SIDES:
+        fingers = [f"{side}_{f}{k}" for f in FINGERS for k in (1, 2, 3)]
+        patches[f"{side}_palm"] = of(f"{side}_wrist", *fingers) & (ny < -0.3)
+        patches[f"{side}_forearm"] = of(f"{side}_elbow") & (ny < -0.3)
+    return patches

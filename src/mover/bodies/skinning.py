@@ -1,0 +1,155 @@
+"""Linear blend skinning: from shape and pose to vertices and joints, batched, differentiable."""
+
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..geometry.rotations import axis_angle
+from ..records import InputError, record
+from ..types import BodyPose
+
+ASSETS = Path(__file__).parents[1] / "assets"
+
+
+@record
+class SkinnedBody:
+    """A body whose skin follows its joints; zero pose = T-pose, +y up, +z front."""
+
+    name: str
+    faces: Int[Tensor, "faces 3"]
+    joint_names: tuple[str, ...]
+    parents: tuple[int, ...]
+    """Index of each joint's parent, always an earlier one; -1 for the root."""
+    verts: Float[Tensor, "verts 3"]
+    """The rest shape [m]."""
+    joints: Float[Tensor, "joints 3"]
+    """Places of the joints in the rest shape [m]."""
+    weights: Float[Tensor, "verts joints"]
+    """Share of each joint in the motion of a vertex; rows sum to 1."""
+    shape_dirs: Float[Tensor, "verts 3 shape"]
+    """Displacement of the rest shape for one unit of each shape coefficient [m]."""
+    joint_dirs: Float[Tensor, "joints 3 shape"]
+    """The same for the joints [m]."""
+    tpose: Float[Tensor, "joints 3 3"]
+    """Turns the parts of the rest shape, bone by bone, into the zero pose."""
+
+    def posed(
+        self, pose: BodyPose
+    ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+        """Vertices and joints of people in these poses [m], in the frame of `pose.transl`.
+
+        Raises:
+            InputError: If the numbers of shape coefficients or angles are not this model's.
+        """
+        turns = axis_angle(_angles(self, pose))
+        verts, joints = _shaped(self, pose.betas)
+        world, places = _pose_joints(self, turns, joints)
+        offset = places - torch.einsum("bjik,bjk->bji", world, joints)
+        bodies, count = offset.shape[:2]
+        moves = torch.cat([world, offset[..., None]], -1)
+        flat = moves.transpose(0, 1).reshape(count, bodies * 12)
+        skin = (self.weights.to(flat) @ flat).reshape(-1, bodies, 3, 4)
+        moved = torch.einsum("vbik,bvk->bvi", skin[..., :3], verts) + skin[..., 3].transpose(0, 1)
+        shift = pose.transl[:, None]
+        return moved + shift, places + shift
+
+
+def _angles(model: SkinnedBody, pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
+    """Axis-angle vectors of all joints; parts that are not given stay straight."""
+    bodies = pose.global_orient.shape[0]
+    parts = {
+        "global_orient": (3, pose.global_orient),
+        "body_pose": (63, pose.body_pose),
+        "jaw_pose": (3, pose.extra.get("jaw_pose")),
+        "eyes": (6, None),
+        "left_hand_pose": (45, pose.extra.get("left_hand_pose")),
+        "right_hand_pose": (45, pose.extra.get("right_hand_pose")),
+    }
+    rows: list[Tensor] = []
+    for name, (width, given) in parts.items():
+        value = pose.global_orient.new_zeros(bodies, width) if given is None else given
+        if value.shape[-1] != width:
+            found = f"has {value.shape[-1]} columns, the model '{model.name}' expects {width}"
+            raise InputError(f"bodies.npz: '{name}' {found}")
+        rows.append(value.to(pose.global_orient))
+    return torch.cat(rows, -1).reshape(bodies, -1, 3)
+
+
+def _shaped(
+    model: SkinnedBody, betas: Float[Tensor, "bodies shape"]
+) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+    """Rest shape and joints of each person; the shape coefficients that are not given are 0."""
+    count, most = betas.shape[-1], model.shape_dirs.shape[-1]
+    if count > most:
+        found = f"has {count} columns, the model '{model.name}' knows {most}"
+        raise InputError(f"bodies.npz: 'betas' {found}")
+    dirs, joint_dirs = model.shape_dirs[..., :count], model.joint_dirs[..., :count]
+    verts = torch.einsum("vik,bk->bvi", dirs.to(betas), betas)
+    joints = torch.einsum("jik,bk->bji", joint_dirs.to(betas), betas)
+    return model.verts.to(betas) + verts, model.joints.to(betas) + joints
+
+
+def _pose_joints(
+    model: SkinnedBody,
+    turns: Float[Tensor, "bodies joints 3 3"],
+    joints: Float[Tensor, "bodies joints 3"],
+) -> tuple[Float[Tensor, "bodies joints 3 3"], Float[Tensor, "bodies joints 3"]]:
+    """World rotation (from the rest shape) and place of each joint, down the tree."""
+    tpose = model.tpose.to(turns)
+    world: list[Tensor] = []
+    places: list[Tensor] = []
+    for joint, parent in enumerate(model.parents):
+        if parent < 0:
+            world.append(turns[:, joint])
+            places.append(joints[:, joint])
+            continue
+        bone = (tpose[parent] @ (joints[:, joint] - joints[:, parent])[..., None])[..., 0]
+        world.append(world[parent] @ turns[:, joint])
+        places.append(places[parent] + (world[parent] @ bone[..., None])[..., 0])
+    return torch.stack(world, 1) @ tpose, torch.stack(places, 1)
+
+
+@cache
+def open_body(detail: Literal["small", "full"] = "small") -> SkinnedBody:
+    """The body that ships with the package (MakeHuman's, CC0): SMPL-X's joints, T-pose.
+
+    `small` has 5,002 vertices, `full` 13,380; both are closed. The pelvis joint is at `transl`.
+    All shape coefficients zero give an adult of 1.70 m.
+    """
+    name = {"small": "open_body_small.npz", "full": "open_body.npz"}[detail]
+    with np.load(ASSETS / name, allow_pickle=False) as data:
+        count = len(data["joints"])
+        arrays = {k: torch.from_numpy(data[k].astype(np.float32)) for k in _ARRAYS}
+        index = torch.from_numpy(data["weight_joint"].astype(np.int64))
+        share = torch.from_numpy(data["weight"].astype(np.float32))
+        weights = torch.zeros(len(index), count).scatter_add(1, index, share)
+        return SkinnedBody(
+            name="makehuman",
+            faces=torch.from_numpy(data["faces"].astype(np.int64)),
+            joint_names=tuple(str(n) for n in data["joint_names"]),
+            parents=tuple(int(p) for p in data["parents"]),
+            weights=weights / weights.sum(1, keepdim=True),
+            **arrays,
+        )
+
+
+_ARRAYS = ("verts", "joints", "shape_dirs", "joint_dirs", "tpose")
+
+
+def zero_pose(bodies: int, model: SkinnedBody) -> BodyPose:
+    """So many people of the mean shape in the T-pose, pelvis at the origin."""
+    like = model.verts
+    return BodyPose(
+        model=model.name,
+        gender="neutral",
+        betas=like.new_zeros(bodies, model.shape_dirs.shape[-1]),
+        global_orient=like.new_zeros(bodies, 3),
+        body_pose=like.new_zeros(bodies, 63),
+        transl=like.new_zeros(bodies, 3),
+        extra={},
+    )

@@ -1,0 +1,140 @@
+"""Which vertices touch something, from posture, motion and normals alone: no network.
+
+Sitting, lying, leaning back, hands at rest and still soles (`posture` has the rules of posture). It
+stands in for POSA, whose weights cannot be shipped, and says nothing about what is touched.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..geometry.mesh import vertex_normals
+from ..types import Bodies
+from .part_names import PARTS
+from .parts import Parts, members
+from .posture import Postures, at, elevation, facing, landmarks, postures, speeds
+
+FACING = (0.3, 0.7)  # cosine between normal and the direction of touch: never, surely
+RECLINE = (0.05, 0.2)  # [rad] of the trunk behind upright: not leaning, surely leaning
+STILL = (0.1, 0.3)  # [m/s] of hands and feet: at rest, surely moving
+SURFACE = (0.25, 1.1)  # [m] over the ground: where hands find something to rest on
+LAP = 0.17  # [m] from the middle of the own thigh: a hand there rests on the lap
+LEVEL_ARM = 35.0  # [degrees] from level, at most, of a forearm that rests
+SOLE = (0.03, 0.07)  # [m] over the ground: stands on it, surely not
+UNDERSIDE = 0.1  # [m] over the lowest point: where a body that lies on its front or side touches
+
+
+def touching(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies verts"]:
+    """Chance that each vertex touches something.
+
+    Args:
+        bodies: People in the world (+y up).
+        parts: Parts of their mesh.
+        ground: Height of the floor [m].
+
+    Raises:
+        ValueError: If the bodies are not in the world.
+    """
+    if bodies.space != "world":
+        raise ValueError(f"touching: bodies are in space '{bodies.space}', expected 'world'")
+    pose = postures(bodies, parts, ground)
+    places = landmarks(bodies, parts)
+    normals = vertex_normals(bodies.verts, bodies.faces)
+    down = _ramp(-normals[..., 1], *FACING)
+    chance = _sit(parts, pose, down)
+    chance = torch.maximum(chance, _recline(parts, pose, facing(places), normals))
+    chance = torch.maximum(chance, _lie(bodies, parts, pose, down))
+    chance = torch.maximum(chance, _rest_arms(bodies, parts, places, down, ground))
+    return torch.maximum(chance, _stand(bodies, parts, ground))
+
+
+def _ramp(value: Tensor, zero: float, one: float) -> Tensor:
+    """0 up to `zero`, 1 from `one` on, smooth between; `one` may be the smaller."""
+    share = ((value - zero) / (one - zero)).clamp(0, 1)
+    return torch.nan_to_num(share * share * (3 - 2 * share))
+
+
+def _sit(
+    parts: Parts, pose: Postures, down: Float[Tensor, "bodies verts"]
+) -> Float[Tensor, "bodies verts"]:
+    """Sitting: what faces down of seat and thighs."""
+    part = members(parts, "seat", "left_thigh", "right_thigh")
+    return down * part * pose.sitting[:, None]
+
+
+def _recline(
+    parts: Parts,
+    pose: Postures,
+    front: Float[Tensor, "bodies 3"],
+    normals: Float[Tensor, "bodies verts 3"],
+) -> Float[Tensor, "bodies verts"]:
+    """Leaning back in a seat: what faces backwards of the back."""
+    behind = _ramp(-torch.einsum("bvi,bi->bv", normals, front), *FACING)
+    lean = _ramp(pose.recline, *RECLINE) * pose.sitting
+    return behind * members(parts, "back") * lean[:, None]
+
+
+def _lie(
+    bodies: Bodies, parts: Parts, pose: Postures, down: Float[Tensor, "bodies verts"]
+) -> Float[Tensor, "bodies verts"]:
+    """Lying on the back: back, seat and thighs; else whatever lies lowest and faces down."""
+    rear = members(parts, "back", "seat", "left_thigh", "right_thigh")
+    spine = members(parts, "back")
+    supine = (down * spine).sum(1) > 0.4 * spine.sum()
+    height = bodies.verts[..., 1]
+    lowest = height < height.amin(1, keepdim=True) + UNDERSIDE
+    region = torch.where(supine[:, None], rear, lowest)
+    return down * region * pose.lying[:, None]
+
+
+def _rest_arms(
+    bodies: Bodies,
+    parts: Parts,
+    places: Float[Tensor, "bodies landmarks 3"],
+    down: Float[Tensor, "bodies verts"],
+    ground: float,
+) -> Float[Tensor, "bodies verts"]:
+    """Hands and forearms at rest on a surface, not on the own lap: what faces down of them."""
+    chance = torch.zeros_like(down)
+    for name in ("left_palm", "right_palm", "left_forearm", "right_forearm"):
+        part = members(parts, name)
+        if not part.any():
+            continue
+        side, _, kind = name.partition("_")
+        middle = bodies.verts[:, part].mean(1)
+        rest = _ramp(speeds(middle[:, None], bodies)[:, 0], STILL[1], STILL[0])
+        height = middle[:, 1] - ground
+        free = (_from_lap(middle, places) > LAP) & (height > SURFACE[0]) & (height < SURFACE[1])
+        if kind == "forearm":
+            arm = at(places, f"{side}_wrist") - at(places, f"{side}_elbow")
+            free = free & (elevation(arm).abs() < LEVEL_ARM)
+        mostly = _ramp(down[:, part].mean(1), 0.2, 0.5)
+        chance = torch.maximum(chance, down * part * (rest * free * mostly)[:, None])
+    return chance
+
+
+def _from_lap(
+    point: Float[Tensor, "bodies 3"], places: Float[Tensor, "bodies landmarks 3"]
+) -> Float[Tensor, " bodies"]:
+    """Distance to the nearer of the own thighs' middle lines [m]."""
+    ways: list[Tensor] = []
+    for side in ("left", "right"):
+        hip, knee = at(places, f"{side}_hip"), at(places, f"{side}_knee")
+        thigh = knee - hip
+        along = ((point - hip) * thigh).sum(-1) / thigh.square().sum(-1).clamp_min(1e-9)
+        nearest = hip + along.clamp(0, 1)[:, None] * thigh
+        ways.append((point - nearest).norm(dim=-1))
+    return torch.minimum(*ways)
+
+
+def _stand(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies verts"]:
+    """Soles: still, and on the ground."""
+    near = _ramp(bodies.verts[..., 1] - ground, SOLE[1], SOLE[0])
+    chance = torch.zeros_like(near)
+    for name in PARTS[:2]:
+        part = members(parts, name)
+        if part.any():
+            middle = bodies.verts[:, part].mean(1, keepdim=True)
+            rest = _ramp(speeds(middle, bodies)[:, 0], STILL[1], STILL[0])
+            chance = torch.maximum(chance, near * part * rest[:, None])
+    return chance

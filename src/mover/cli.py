@@ -1,0 +1,37 @@
+"""The command line. This file imports nothing heavy: `mover --help` answers at once."""
+
+import importlib
+import logging
+import sys
+
+COMMANDS = {
+    "demo": "Make a known room, reconstruct it, and open its report: the way to see what mover does.",
+    "check": "Validate a capture, list the evidence of each object, draw the initial overlay.",
+    "run": "Reconstruct a room from a capture folder.",
+    "evaluate": "Compare a result with the truth.",
+}
+USAGE = "usage: mover COMMAND [OPTIONS]; mover COMMAND --help tells more"
+
+
+def main() -> None:
+    """Run the command that is named first."""
+    arguments = sys.argv[1:]
+    if not arguments or arguments[0] in ("-h", "--help"):
+        lines = [f"  {name:<10} {text}" for name, text in COMMANDS.items()]
+        _say("\n".join([USAGE, "", "Rooms from the people who move in them.", "", *lines]))
+        return
+    if arguments[0] == "--version":
+        from . import __version__
+
+        _say(f"mover {__version__}")
+        return
+    if arguments[0] not in COMMANDS:
+        _say(f"mover: no command {arguments[0]!r}; there are {', '.join(COMMANDS)}\n{USAGE}")
+        raise SystemExit(2)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    command = importlib.import_module(".commands", __package__)
+    raise SystemExit(command.run_command(arguments[0], arguments[1:]))
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")

@@ -1,0 +1,192 @@
+"""What each command does."""
+
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import Positional, arg
+
+from . import records
+from .presets import PRESETS, Config
+from .progress import Bar
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RunArgs:
+    """Reconstruct a room from a capture folder."""
+
+    source: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """The capture folder (or whatever --format reads)."""
+    out: Path = Path("out")
+    """Folder for the result; a run that was killed goes on there."""
+    format: str = "folder"
+    """How the capture is written; see docs/data.md."""
+    preset: str = "robust"
+    """paper, release or robust: the settings that the other flags change."""
+    config_from: Annotated[Path | None, arg(name="config")] = None
+    """A run.json whose settings are used instead of a preset's."""
+    config: Annotated[Config, arg(name="")] = field(default_factory=Config)
+
+
+@dataclass(frozen=True)
+class CheckArgs:
+    """Validate a capture, list the evidence of each object, draw the initial overlay."""
+
+    source: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """The capture folder (or whatever --format reads)."""
+    out: Path = Path("check.png")
+    """The picture of the initial scene over the reference image."""
+    format: str = "folder"
+    """How the capture is written."""
+
+
+@dataclass(frozen=True)
+class EvaluateArgs:
+    """Compare a result with the truth; writes OUT/metrics.json."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder of the result."""
+    truth: Path
+    """Folder with the true scene.json, meshes, and bodies.npz if there are any."""
+
+
+@dataclass(frozen=True)
+class DemoArgs:
+    """Make a known room with realistic noise, reconstruct it, and compare with the truth."""
+
+    out: Path = Path("demo")
+    """Folder for the capture and the result."""
+    seed: int = 0
+    """Seed of the noise."""
+    preset: str = "robust"
+    """paper, release or robust."""
+
+
+def run_command(name: str, arguments: Sequence[str]) -> int:
+    """Parse the arguments of a command and run it; the exit code."""
+    try:
+        _COMMANDS[name](arguments)
+    except records.InputError as error:
+        _say(f"mover {name}: {error}", sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        _say(f"\nmover {name}: stopped; the same command goes on from here", sys.stderr)
+        return 130
+    return 0
+
+
+def _parse_run(arguments: Sequence[str]) -> RunArgs:
+    """The preset is read first, so that the other flags may stand before or after it."""
+    import argparse
+
+    from .results import read_config
+
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--preset", default="robust")
+    early.add_argument("--config", type=Path)
+    chosen, _ = early.parse_known_args(list(arguments))
+    config = preset_named(chosen.preset)
+    if chosen.config is not None:
+        config = read_config(chosen.config)
+    return tyro.cli(RunArgs, prog="mover run", args=list(arguments), default=_default(config))
+
+
+def _default(config: Config) -> RunArgs:
+    missing: Any = tyro.MISSING
+    return RunArgs(missing, config=config)
+
+
+def preset_named(name: str) -> Config:
+    """A preset by its name.
+
+    Raises:
+        InputError: If there is none of that name.
+    """
+    if name not in PRESETS:
+        raise records.InputError(f"--preset: {name!r} is none of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def _run(arguments: Sequence[str]) -> None:
+    args = _parse_run(arguments)
+    from .readers import read
+
+    capture = read(args.format, args.source)
+    _reconstruct(capture, args.config, args.out)
+    _say(f"report: {args.out / 'report.html'}")
+
+
+def _reconstruct(capture: Any, config: Config, out: Path) -> Any:  # noqa: ANN401
+    """Run the main job and write its result."""
+    from .pipeline import reconstruct
+    from .results import write_results
+    from .run import Run
+
+    with Bar() as bar:
+        run = Run(out, bar)
+        room = reconstruct(capture, config, run)
+    write_results(capture, room, config, run)
+    for warning in room.warnings:
+        _say(f"warning: {warning}")
+    return room, run
+
+
+def _check(arguments: Sequence[str]) -> None:
+    args = tyro.cli(CheckArgs, prog="mover check", args=list(arguments))
+    from .readers import read
+    from .readers.evidence import evidence_of, table_of
+    from .report import save_overlay
+
+    capture = read(args.format, args.source)
+    _say(table_of(evidence_of(capture)))
+    for warning in capture.warnings:
+        _say(f"warning: {warning}")
+    save_overlay(capture, args.out)
+    _say(f"{args.source} is a valid capture; its initial scene is drawn in {args.out}")
+
+
+def _evaluate(arguments: Sequence[str]) -> None:
+    args = tyro.cli(EvaluateArgs, prog="mover evaluate", args=list(arguments))
+    from .evaluate import evaluate_folder, table
+
+    _say(table(evaluate_folder(args.out, args.truth)))
+
+
+def _demo(arguments: Sequence[str]) -> None:
+    args = tyro.cli(DemoArgs, prog="mover demo", args=list(arguments))
+    config = preset_named(args.preset)
+    from .evaluate import evaluate_folder, table
+    from .readers import read
+    from .readers.folder import write_capture
+    from .readers.scene_file import read_scene
+    from .report import write_report
+    from .results import report_of, write_room
+    from .rooms.demo import demo_room
+    from .rooms.noise import NoiseConfig, add_noise
+
+    folder = args.out / "capture"
+    if not (folder / "truth" / "scene.json").exists():
+        _say("making a known room: furniture, a person, masks ...")
+        room = demo_room()
+        write_capture(add_noise(room, NoiseConfig(), args.seed), folder)
+        write_room(room, folder / "truth")
+    capture = read("folder", folder)
+    found, run = _reconstruct(capture, config, args.out / "room")
+    metrics = evaluate_folder(args.out / "room", folder / "truth")
+    truth = read_scene(folder / "truth" / "scene.json", None)
+    content = report_of(capture, found, config, run, truth=truth, metrics=metrics)
+    report = write_report(args.out / "room", content)
+    _say(f"\n{table(metrics)}\n\nreport: {report}")
+
+
+def _say(text: str, stream: Any = None) -> None:  # noqa: ANN401
+    (stream or sys.stdout).write(text + "\n")
+
+
+_COMMANDS = {"demo": _demo, "check": _check, "run": _run, "evaluate": _evaluate}

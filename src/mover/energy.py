@@ -1,0 +1,193 @@
+"""The equations of the paper, written as they are printed."""
+
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import TypeVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from .geometry.camera import project, to_camera
+from .geometry.placement import place
+from .geometry.raster import Depths, Topology, Views, look
+from .minimize import Energy, weigh
+from .records import record
+from .terms import Form
+from .terms.bbox import bbox_term
+from .terms.collision import BodySpace, collision_term
+from .terms.contact import Touches, contact_term, heading_term
+from .terms.depth import DepthRange, depth_term, free_space_term
+from .terms.offscreen import offscreen_term
+from .terms.scale import scale_term
+from .terms.silhouette import edge_term, silhouette_term
+from .types import Camera, Layout, Objects
+
+E = TypeVar("E")
+CHAIRS = ("chair", "armchair", "office chair", "stool")  # one class in the authors' detector
+
+
+@dataclass(frozen=True)
+class SceneWeights:
+    """Weights of Eq. 1 in its order; zero removes a term and the need for its evidence."""
+
+    bbox: float = 1000.0
+    """lambda 1: objects fill their detected boxes."""
+    silhouette: float = 0.3
+    """lambda 2: objects cover their masks."""
+    scale: float = 1000.0
+    """lambda 3: objects keep their initial size."""
+    depth: float = 8.0
+    """lambda 4: who hides whom bounds the depth."""
+    collision: float = 1000.0
+    """lambda 5: people move through free space."""
+    contact: float = 1e5
+    """lambda 6: touching surfaces share a place."""
+    edge: float = 0.0
+    """Outlines follow the outlines of the masks (release only)."""
+    offscreen: float = 0.0
+    """Objects stay inside the image (release only)."""
+    free_space: float = 0.0
+    """Nothing hides a person that is seen (release only)."""
+    heading: float = 0.0
+    """Seats face where their sitters face (robust only)."""
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """How the room is priced."""
+
+    weights: SceneWeights = field(default_factory=SceneWeights)
+    form: Form = "paper"
+    """As printed, as the authors released it, or normalised and robust."""
+
+
+@record
+class ImageCues:
+    """What the still image says about each object."""
+
+    boxes: Float[Tensor, "objects 4"]
+    """Detected x_min, y_min, x_max, y_max [px]."""
+    sides: Bool[Tensor, "objects 4"]
+    """Sides of the box that are really seen."""
+    views: Views
+    """The window of each object."""
+    masks: Float[Tensor, "objects h w"]
+    """Detected coverage of the window's pixels in [0, 1]."""
+    keep: Bool[Tensor, "objects h w"]
+    """False where it is unknown what would be seen; everywhere without a mask."""
+    trust: Float[Tensor, " objects"]
+    """Weight of the silhouette, below one where the shape is known to be wrong."""
+
+
+@record
+class HumanCues:
+    """What the people of all frames say about the room; None: that evidence is missing."""
+
+    depth: DepthRange | None = None
+    space: BodySpace | None = None
+    touches: Touches | None = None
+
+
+@record
+class Factors:
+    """How much depth order and collision count for each object."""
+
+    depth: Float[Tensor, " objects"]
+    collision: Float[Tensor, " objects"]
+
+
+def scene_energy(
+    layout: Layout,
+    objects: Objects,
+    camera: Camera,
+    image: ImageCues,
+    humans: HumanCues,
+    config: SceneConfig,
+) -> Energy:
+    """Eq. 1: what the image and the people say about where the objects stand."""
+    form, w = config.form, heard(config.weights, humans)
+    verts = to_camera(place(objects.verts, layout), camera.R_cam_world)
+    drawn = cache(lambda: _draw(verts, objects, image.views, w))
+    pixels = cache(lambda: project(verts, camera.K))
+    many = factors(objects, humans if w.contact else HumanCues(), form)
+    return weigh(
+        ("bbox", w.bbox, lambda: bbox_term(
+            project(_corners(objects, layout, camera), camera.K) if form == "paper" else pixels(),
+            image.boxes, image.sides, float(camera.width), form)),
+        ("silhouette", w.silhouette, lambda: image.trust * silhouette_term(
+            drawn()[0], image.masks, image.keep, form)),
+        ("scale", w.scale, lambda: scale_term(layout.log_scale, form)),
+        ("depth", w.depth, lambda: many.depth * depth_term(
+            _known(drawn()[1]), image.masks, _known(humans.depth), form)),
+        ("collision", w.collision, lambda: many.collision * collision_term(
+            _collision_points(layout, objects, form), _known(humans.space), form)),
+        ("contact", w.contact, lambda: contact_term(
+            (place(objects.top, layout), place(objects.back, layout)), _known(humans.touches), form)),
+        ("edge", w.edge, lambda: edge_term(drawn()[0], image.masks, image.keep)),
+        ("offscreen", w.offscreen, lambda: offscreen_term(
+            pixels(), verts, objects.real_verts, camera)),
+        ("free_space", w.free_space, lambda: free_space_term(
+            _known(drawn()[1]), image.masks, _known(humans.depth))),
+        ("heading", w.heading, lambda: heading_term(layout, _known(humans.touches))),
+    )  # fmt: skip
+
+
+def heard(weights: SceneWeights, humans: HumanCues) -> SceneWeights:
+    """The weights without those whose evidence is missing."""
+    missing: dict[str, float] = {}
+    if humans.depth is None:
+        missing |= {"depth": 0.0, "free_space": 0.0}
+    if humans.space is None:
+        missing["collision"] = 0.0
+    if humans.touches is None:
+        missing |= {"contact": 0.0, "heading": 0.0}
+    return replace(weights, **missing)
+
+
+def factors(objects: Objects, humans: HumanCues, form: Form) -> Factors:
+    """Weigh down evidence that pushes used seats away from their sitters.
+
+    A body is soft and a seat's shape is often wrong: the sitter's body then lies inside the mesh
+    and the seat would flee. Release: depth x 0.3 (chair) and x 0.01 (sofa), collision x 0.1
+    (chair). Robust: collision x 0.1 for every seat. Paper: no factor.
+    """
+    depth, collision = objects.verts.new_ones(2, len(objects.ids)).unbind()
+    if humans.touches is None or form == "paper":
+        return Factors(depth, collision)
+    used = torch.zeros_like(depth).index_fill(0, humans.touches.object_of, 1.0)
+
+    def used_as(*names: str) -> Tensor:
+        return used * torch.tensor([c in names for c in objects.categories]).to(used)
+
+    if form == "release":
+        depth = 1 - 0.7 * used_as(*CHAIRS) - 0.99 * used_as("sofa")
+        return Factors(depth, 1 - 0.9 * used_as(*CHAIRS))
+    return Factors(depth, 1 - 0.9 * used * objects.is_seat.to(used))
+
+
+def _draw(verts: Tensor, objects: Objects, views: Views, w: SceneWeights) -> tuple[Tensor, Depths | None]:
+    """Silhouettes and, where a term asks for them, depths."""
+    asked = bool(w.depth or w.free_space)
+    return look(verts, Topology(objects.faces, objects.edges), views, depth=asked)
+
+
+def _corners(objects: Objects, layout: Layout, camera: Camera) -> Float[Tensor, "*starts objects 8 3"]:
+    """The eight corners of each object's box in camera axes [m]."""
+    unit = torch.cartesian_prod(*(torch.tensor(s) for s in ((-0.5, 0.5), (0.0, 1.0), (-0.5, 0.5))))
+    corners = unit.to(objects.size) * objects.size.unsqueeze(-2)
+    return to_camera(place(corners, layout), camera.R_cam_world)
+
+
+def _collision_points(layout: Layout, objects: Objects, form: Form) -> Tensor:
+    """Vertices of the meshes (`paper`; the padding is sent far away) or even surface samples."""
+    if form != "paper":
+        return place(objects.samples, layout)
+    verts = place(objects.verts, layout)
+    return torch.where(objects.real_verts.unsqueeze(-1), verts, torch.full_like(verts, 1e3))
+
+
+def _known(evidence: E | None) -> E:
+    """Evidence whose weight is not zero (see `heard`)."""
+    assert evidence is not None
+    return evidence

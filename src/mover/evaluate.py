@@ -1,0 +1,244 @@
+"""Every metric of the paper, before and after: how far a scene is from the truth.
+
+Definitions, matching rules and sampling densities: docs/metrics.md.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from .metrics_bodies import (
+    GROUND_METRICS,
+    POSE_METRICS,
+    Standing,
+    gather_twins,
+    in_world,
+    soles_of,
+)
+from .metrics_contact import (
+    TOUCH_METRICS,
+    TrueTouch,
+    close_meshes,
+    furniture_of,
+    gather_touch,
+    gather_truth,
+)
+from .metrics_scene import (
+    CAMERA_METRICS,
+    OBJECT_METRICS,
+    Metric,
+    Pair,
+    Sight,
+    match,
+    measure,
+    measure_missing,
+)
+from .readers.bodies_file import read_bodies
+from .readers.camera_file import camera_of
+from .readers.fields import read_json
+from .readers.scene_file import read_scene
+from .records import map_tensors, record, replacing
+from .types import Bodies, Mesh, Piece, Scene
+
+T = TypeVar("T")
+
+METRICS: dict[str, Metric[Any]] = {
+    **OBJECT_METRICS,
+    **TOUCH_METRICS,
+    **CAMERA_METRICS,
+    **GROUND_METRICS,
+    **POSE_METRICS,
+}
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """How densely the metrics are measured."""
+
+    samples: int = 2000
+    """Points on each true surface, spread evenly, for the distance to the estimated one."""
+    bodies: int = 100
+    """At most so many bodies, spread evenly over the rows, for contact and collision."""
+    reach: float = 0.05
+    """A vertex touches furniture that is at most so far away [m]."""
+    ground_tolerance: float = 0.01
+    """How far a sole may be under the floor before it counts as penetration [m]."""
+
+
+@record
+class EvaluatedBodies:
+    """The people of the three scenes, in the camera's or the world's frame; None: not known."""
+
+    initial: Bodies | None
+    result: Bodies | None
+    truth: Bodies | None
+
+
+@record
+class _Populated:
+    """A scene and its people, in one world."""
+
+    scene: Scene
+    bodies: Bodies | None
+    soles: Int[Tensor, " soles"]
+    """The vertices under their feet."""
+    furniture: tuple[Mesh, ...]
+    """The closed objects where they stand; none where there are no people."""
+
+
+def evaluate(
+    initial: Scene,
+    result: Scene,
+    truth: Scene,
+    bodies: EvaluatedBodies | None = None,
+    config: EvaluateConfig | None = None,
+) -> dict[str, Any]:
+    """Measure a scene before and after against the truth.
+
+    Args:
+        initial: The scene that the run was given.
+        result: The scene that it made of it.
+        truth: The true scene.
+        bodies: The people of the three; without them their metrics are absent.
+        config: Densities and thresholds.
+
+    Returns:
+        What metrics.json holds: the means `initial` and `result`, and each of the `objects`.
+    """
+    config = config or EvaluateConfig()
+    before, after, true = _populate(
+        (initial, result, truth), bodies or EvaluatedBodies(None, None, None)
+    )
+    objects = _objects(before.scene, after.scene, true.scene, config.samples)
+    touch = _true_touch(true, after.bodies or before.bodies, config)
+    return {
+        key: _means(objects, key)
+        | measure(CAMERA_METRICS, Sight(judged.scene, true.scene))
+        | _people(judged, true, touch, config)
+        for key, judged in (("initial", before), ("result", after))
+    } | {"objects": objects}
+
+
+def evaluate_folder(out: Path, truth: Path, config: EvaluateConfig | None = None) -> dict[str, Any]:
+    """Measure the result folder `out` against the folder `truth` and write out/metrics.json.
+
+    Raises:
+        InputError: If a scene or a bodies file is missing or wrong.
+    """
+    bodies = EvaluatedBodies(
+        *(
+            read_bodies(path) if path.exists() else None
+            for path in (out / "initial_bodies.npz", out / "bodies.npz", truth / "bodies.npz")
+        )
+    )
+    initial, result = read_scene(out / "initial.json"), read_scene(out / "scene.json")
+    own = truth / "camera.json"
+    true = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
+    metrics = evaluate(initial, result, true, bodies, config)
+    with replacing(out / "metrics.json") as part:
+        part.write_text(json.dumps(metrics, indent=1, allow_nan=False))
+    return metrics
+
+
+def table(metrics: Mapping[str, Any]) -> str:
+    """The metrics before and after as plain text, then the place of each object."""
+    initial, result = metrics["initial"], metrics["result"]
+    lines = [f"{'metric':34}{'before':>10}{'after':>10}{'best':>8}"]
+    for name, metric in METRICS.items():
+        if name in initial or name in result:
+            title = f"{name} [{metric.unit}]" if metric.unit else name
+            values = _cell(initial, name) + _cell(result, name)
+            lines.append(f"{title:34}{values}{metric.best:8.0f}")
+    lines += ["", f"{'object':34}{'iou3d before, after':>20}{'center_error [m]':>20}"]
+    for item in metrics["objects"]:
+        cells = "".join(
+            _cell(item[key], name)
+            for name in ("iou3d", "center_error")
+            for key in ("initial", "result")
+        )
+        lines.append(f"{item['id']:34.34}{cells}")
+    return "\n".join(lines)
+
+
+def _cell(values: Mapping[str, float], name: str) -> str:
+    return f"{values[name]:10.3f}" if name in values else f"{'-':>10}"
+
+
+def _populate(scenes: tuple[Scene, Scene, Scene], people: EvaluatedBodies) -> list[_Populated]:
+    """Scenes and people in double precision and in one world; no rows are no people."""
+    rows = [
+        b if b and len(b.frame) else None for b in (people.initial, people.result, people.truth)
+    ]
+    pairs = list(zip(scenes, rows, strict=True))
+    closed = close_meshes(piece for scene, b in pairs if b is not None for piece in scene.pieces)
+    return [_populated(scene, b, closed) for scene, b in pairs]
+
+
+def _populated(scene: Scene, bodies: Bodies | None, closed: Mapping[str, Mesh]) -> _Populated:
+    if bodies is None:
+        return _Populated(_double(scene), None, torch.zeros(0, dtype=torch.long), ())
+    soles = soles_of(bodies, scene.camera)
+    furniture = _double(tuple(furniture_of(scene.pieces, closed)))
+    scene = _double(scene)
+    return _Populated(scene, in_world(_double(bodies), scene.camera), soles, furniture)
+
+
+def _double(value: T) -> T:
+    return map_tensors(lambda x: x.double() if x.is_floating_point() else x, value)
+
+
+def _objects(initial: Scene, result: Scene, truth: Scene, samples: int) -> list[dict[str, Any]]:
+    """Each true object before and after; who is who is settled on the initial scene."""
+    same = {piece.id: piece.id for piece in truth.pieces}
+    before = match(initial, truth, same)
+    after = match(result, truth, same | {name: piece.id for name, piece in before.items()})
+
+    def of(scene: Scene, piece: Piece | None, true: Piece) -> dict[str, float]:
+        if piece is None:
+            return measure_missing(true, truth.camera)
+        return measure(OBJECT_METRICS, Pair(piece, scene.camera, true, truth.camera, samples))
+
+    return [
+        {
+            "id": true.id,
+            "initial": of(initial, before.get(true.id), true),
+            "result": of(result, after.get(true.id), true),
+        }
+        for true in truth.pieces
+    ]
+
+
+def _means(objects: list[dict[str, Any]], key: str) -> dict[str, float]:
+    """Means over those objects that have the metric."""
+    values = {n: [item[key][n] for item in objects if n in item[key]] for n in OBJECT_METRICS}
+    return {name: sum(found) / len(found) for name, found in values.items() if found}
+
+
+def _true_touch(
+    truth: _Populated, judged: Bodies | None, config: EvaluateConfig
+) -> TrueTouch | None:
+    if truth.bodies is None or judged is None:
+        return None
+    return gather_truth(truth.bodies, truth.furniture, judged, config.bodies, config.reach)
+
+
+def _people(
+    judged: _Populated, truth: _Populated, touch: TrueTouch | None, config: EvaluateConfig
+) -> dict[str, float]:
+    """The metrics of a scene's people; what they or the truth do not tell is left out."""
+    bodies, ground = judged.bodies, judged.scene.ground
+    if bodies is None:
+        return {}
+    near = gather_touch(bodies, judged.furniture, touch, config.bodies, config.reach)
+    values = measure(TOUCH_METRICS, near)
+    if ground is not None and len(judged.soles):
+        heights = bodies.verts[:, judged.soles, 1] - ground
+        values |= measure(GROUND_METRICS, Standing(heights, config.ground_tolerance))
+    twins = None if truth.bodies is None else gather_twins(bodies, truth.bodies)
+    return values | (measure(POSE_METRICS, twins) if twins is not None else {})

@@ -1,0 +1,225 @@
+"""Chairs, armchairs, office chairs, stools and benches."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from .pieces import (
+    Furniture,
+    Part,
+    Seat,
+    block,
+    disc,
+    draw,
+    finish,
+    legs,
+    post,
+    rod,
+    tilted,
+    turned,
+)
+
+
+def chair(rng: np.random.Generator, style: int) -> Furniture:
+    """A chair without arms: 0 panel back, 1 ladder back, 2 side frames, 3 spindles."""
+    w, d = draw(rng, 0.42, 0.48), draw(rng, 0.41, 0.46)
+    h, back = draw(rng, 0.43, 0.46), draw(rng, 0.84, 0.98)
+    x, z = w / 2, d / 2
+    lean, behind = draw(rng, 4, 9), z - 0.045
+    seat = block((-x, x), (h - 0.045, h), (-z, z), 0.008)
+    parts = [seat, *(_CHAIR_LEGS[style](x, z, h))]
+    parts += [tilted(p, lean, h, -behind) for p in _CHAIR_BACKS[style](x, h, back, -behind)]
+    return finish("chair", style, parts, Seat(h, (-x, x), (-behind + 0.01, z), back))
+
+
+def _panel_back(x: float, h: float, back: float, z: float) -> list[Part]:
+    return [block((-x, x), (h - 0.04, back), (z - 0.03, z), 0.008)]
+
+
+def _ladder_back(x: float, h: float, back: float, z: float) -> list[Part]:
+    posts = [
+        rod(
+            (s * (x - 0.02), h - 0.04, z - 0.018), (s * (x - 0.02), back, z - 0.018), (0.018, 0.018)
+        )
+        for s in (-1, 1)
+    ]
+    rungs = np.linspace(h + 0.16, back - 0.04, 3)
+    slats = [
+        block((-x + 0.02, x - 0.02), (y - 0.03, y + 0.03), (z - 0.026, z - 0.004)) for y in rungs
+    ]
+    return posts + slats
+
+
+def _low_back(x: float, h: float, back: float, z: float) -> list[Part]:
+    low = h + 0.12
+    posts = [
+        block((s * x - 0.02, s * x + 0.02), (h - 0.04, back - 0.02), (z - 0.03, z - 0.004))
+        for s in (-0.8, 0.8)
+    ]
+    return [*posts, block((-x, x), (low, back), (z - 0.04, z), 0.012)]
+
+
+def _spindle_back(x: float, h: float, back: float, z: float) -> list[Part]:
+    xs = np.linspace(-x + 0.03, x - 0.03, 6)
+    spindles = [
+        rod((s, h - 0.03, z - 0.018), (s, back - 0.02, z - 0.018), (0.011, 0.009), 8) for s in xs
+    ]
+    return [*spindles, block((-x, x), (back - 0.07, back), (z - 0.034, z - 0.002), 0.008)]
+
+
+def _square_legs(x: float, z: float, h: float) -> list[Part]:
+    return legs(x - 0.03, z - 0.03, h - 0.02, 0.028)
+
+
+def _round_legs(x: float, z: float, h: float) -> list[Part]:
+    rungs = [
+        rod((-x + 0.03, 0.2, s * (z - 0.03)), (x - 0.03, 0.2, s * (z - 0.03)), (0.011, 0.011), 8)
+        for s in (-1, 1)
+    ]
+    return [*legs(x - 0.035, z - 0.035, h - 0.02, 0.02, 0.004), *rungs]
+
+
+def _side_frames(x: float, z: float, h: float) -> list[Part]:
+    parts: list[Part] = []
+    for s in (-1, 1):
+        side = (s * (x - 0.02) - 0.018, s * (x - 0.02) + 0.018)
+        parts.append(block(side, (0, 0.035), (-z + 0.01, z - 0.01)))
+        parts += [
+            block(side, (0.01, h - 0.02), (k - 0.018, k + 0.018)) for k in (-z + 0.03, z - 0.03)
+        ]
+    return parts
+
+
+def _splayed_legs(x: float, z: float, h: float) -> list[Part]:
+    return legs(x - 0.06, z - 0.06, h - 0.02, 0.02, 0.04)
+
+
+_CHAIR_LEGS = (_square_legs, _round_legs, _side_frames, _splayed_legs)
+_CHAIR_BACKS = (_panel_back, _ladder_back, _low_back, _spindle_back)
+
+
+def armchair(rng: np.random.Generator, style: int) -> Furniture:
+    """A wide chair with arms: 0 club, 1 high back on legs, 2 wooden frame with cushions."""
+    inner, d = draw(rng, 0.54, 0.62), draw(rng, 0.48, 0.54)
+    h, x = draw(rng, 0.41, 0.45), inner / 2
+    back, arm = (draw(rng, 0.78, 0.88), draw(rng, 0.12, 0.17))
+    if style == 1:
+        back, arm = back + 0.2, 0.09
+    if style == 2:
+        arm = 0.05
+    foot = 0.05 if style == 0 else 0.16
+    cushion = block((-x - 0.01, x + 0.01), (max(foot, h - 0.2), h), (-0.02, d), 0.03)
+    rest = tilted(block((-x - 0.01, x + 0.01), (h - 0.12, back), (-0.17, 0), 0.03), 9, h, 0)
+    parts = [cushion, rest]
+    for s in (-1, 1):
+        parts += _arm(style, s, x, arm, (h, d, foot))
+    span = (-x - arm + 0.03, x + arm - 0.03)
+    base = block(span, (foot, h - 0.1), (-0.17, d - 0.02), 0.01)
+    thin = 0.03 if style == 0 else 0.022
+    feet = [
+        rod((i, 0, k), (i, foot + 0.03, k), (thin, thin), 8)
+        for i in (span[0] + 0.04, span[1] - 0.04)
+        for k in (-0.12, d - 0.07)
+    ]
+    parts += (
+        [base, *feet]
+        if style < 2
+        else [block((-x - 0.02, x + 0.02), (h - 0.17, h - 0.1), (-0.1, d - 0.02))]
+    )
+    return finish("armchair", style, parts, Seat(h, (-x, x), (0.0, d), back))
+
+
+def _arm(
+    style: int, side: int, x: float, arm: float, rest: tuple[float, float, float]
+) -> list[Part]:
+    h, d, foot = rest
+    inside, outside = side * x, side * (x + arm)
+    span = (min(inside, outside), max(inside, outside))
+    if style < 2:
+        return [block(span, (foot, h + 0.19), (-0.15, d - 0.02), 0.025)]
+    top = block((span[0] - 0.015, span[1] + 0.015), (h + 0.17, h + 0.2), (-0.16, d + 0.03), 0.006)
+    posts = [block(span, (0, h + 0.18), (k - 0.025, k + 0.025)) for k in (-0.12, d - 0.05)]
+    return [top, *posts, block(span, (h - 0.17, h - 0.12), (-0.12, d - 0.05))]
+
+
+def office_chair(rng: np.random.Generator, style: int) -> Furniture:
+    """A chair on a column and a five-armed foot: 0 without arms, 1 with arms and a high back."""
+    w, d, h = draw(rng, 0.46, 0.5), draw(rng, 0.44, 0.48), draw(rng, 0.44, 0.48)
+    back = h + (0.48 if style == 0 else 0.66)
+    x, z = w / 2, d / 2
+    parts = [
+        block((-x, x), (h - 0.07, h), (-z, z), 0.03),
+        disc((0, 0), (0.07, h - 0.03), 0.028, 12),
+    ]
+    parts.append(disc((0, 0), (0.06, 0.14), 0.05, 16))
+    for k in range(5):
+        spoke = block((-0.022, 0.022), (0.06, 0.1), (0, 0.29))
+        caster = rod((-0.025, 0.032, 0.27), (0.025, 0.032, 0.27), (0.032, 0.032), 12)
+        post = block((-0.012, 0.012), (0.03, 0.08), (0.258, 0.282))
+        parts += [turned(p, 72 * k + 36) for p in (spoke, caster, post)]
+    behind = -z + 0.03
+    low = h + (0.14 if style == 0 else 0.02)
+    rest = block((-x + 0.02, x - 0.02), (low, back), (behind - 0.05, behind), 0.02)
+    spine = block((-0.04, 0.04), (h - 0.06, low + 0.1), (behind - 0.075, behind - 0.03))
+    parts += [tilted(p, 7, h, behind) for p in (rest, spine)]
+    if style == 1:
+        for s in (-x - 0.005, x + 0.005):
+            parts.append(block((s - 0.025, s + 0.025), (h + 0.19, h + 0.22), (-0.16, 0.12), 0.008))
+            parts.append(block((s - 0.018, s + 0.018), (h - 0.055, h + 0.2), (-0.05, 0.01)))
+    return finish("office chair", style, parts, Seat(h, (-x, x), (behind + 0.01, z), back))
+
+
+def stool(rng: np.random.Generator, style: int) -> Furniture:
+    """A seat without a back: 0 round on splayed legs, 1 square, 2 a pouf."""
+    r, h = draw(rng, 0.18, 0.22), draw(rng, 0.43, 0.47)
+    if style == 0:
+        parts = [disc((0, 0), (h - 0.04, h), r), *legs(0.1, 0.1, h - 0.02, 0.02, 0.05)]
+    elif style == 1:
+        parts = [
+            block((-r, r), (h - 0.05, h), (-r, r), 0.01),
+            *legs(r - 0.03, r - 0.03, h - 0.02, 0.025),
+        ]
+        parts += [
+            block((-r + 0.02, r - 0.02), (0.13, 0.16), (s - 0.012, s + 0.012))
+            for s in (-r + 0.03, r - 0.03)
+        ]
+    else:
+        r += 0.04
+        rings = [
+            disc((0, 0), (y, y + 0.01), r - cut, 24)
+            for y, cut in ((0, 0.03), (0.03, 0), (h - 0.05, 0), (h - 0.01, 0.03))
+        ]
+        parts = [np.concatenate(rings)]
+    reach = 0.8 * r
+    return finish("stool", style, parts, Seat(h, (-reach, reach), (-r, r)))
+
+
+def bench(rng: np.random.Generator, style: int) -> Furniture:
+    """A long seat without a back: 0 on panels, 1 on legs, slatted, 2 padded."""
+    w, d, h = draw(rng, 1.0, 1.4), draw(rng, 0.36, 0.42), draw(rng, 0.43, 0.47)
+    x, z = w / 2, d / 2
+    if style == 0:
+        parts = [block((-x, x), (h - 0.045, h), (-z, z), 0.006)]
+        parts += [
+            block((s - 0.02, s + 0.02), (0, h - 0.02), (-z + 0.02, z - 0.02))
+            for s in (-x + 0.1, x - 0.1)
+        ]
+        parts.append(block((-x + 0.1, x - 0.1), (h - 0.14, h - 0.03), (-0.012, 0.012)))
+    elif style == 1:
+        edges = np.linspace(-z, z, 6)
+        parts = [block((-x, x), (h - 0.03, h), (a, b - 0.008)) for a, b in pairwise(edges)]
+        parts += [
+            block((s - 0.03, s + 0.03), (h - 0.07, h - 0.02), (-z + 0.01, z - 0.02))
+            for s in (-x + 0.12, x - 0.12)
+        ]
+        parts += [
+            post(i, k, (0, h - 0.03), 0.025)
+            for i in (-x + 0.12, x - 0.12)
+            for k in (-z + 0.05, z - 0.06)
+        ]
+    else:
+        parts = [
+            block((-x, x), (h - 0.12, h), (-z, z), 0.025),
+            *legs(x - 0.08, z - 0.06, h - 0.1, 0.022, 0.03),
+        ]
+    return finish("bench", style, parts, Seat(h, (-x, x), (-z, z)))

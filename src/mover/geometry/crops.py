@@ -1,0 +1,75 @@
+"""Square windows of an image, and exact means of image areas in them."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .raster import Views
+
+
+def crop_views(
+    K: Float[Tensor, "3 3"], boxes: Float[Tensor, "items 4"], margin: float, size: int
+) -> Views:
+    """One square window around each box.
+
+    Args:
+        K: Intrinsics of the image [px].
+        boxes: x_min, y_min, x_max, y_max [px].
+        margin: Share by which a window is larger than the larger side of its box.
+        size: Pixels along a side of the window.
+    """
+    center = (boxes[:, :2] + boxes[:, 2:]) / 2
+    side = (boxes[:, 2:] - boxes[:, :2]).amax(-1).clamp_min(2) * (1 + margin)
+    zoom = size / side
+    crop = K.expand(len(boxes), 3, 3).clone()
+    crop[:, :2, 2] -= center - side.unsqueeze(-1) / 2
+    crop[:, :2] *= zoom[:, None, None]
+    return Views(crop, size, size)
+
+
+def grid_in_image(views: Views, K: Float[Tensor, "3 3"]) -> tuple[Tensor, Tensor]:
+    """Image coordinates [px] of the lines between window pixels: x (items, w+1), y (items, h+1)."""
+    zoom = views.K[:, 0, 0] / K[0, 0]
+    corner = K[:2, 2] - views.K[:, :2, 2] / zoom.unsqueeze(-1)
+    x = corner[:, :1] + torch.arange(views.width + 1) / zoom.unsqueeze(-1)
+    y = corner[:, 1:] + torch.arange(views.height + 1) / zoom.unsqueeze(-1)
+    return x, y
+
+
+def area_mean(
+    images: Float[Tensor, "items h w"], views: Views, K: Float[Tensor, "3 3"]
+) -> Float[Tensor, "items wh ww"]:
+    """Exact mean of each image over each pixel of its window; zero outside the image."""
+    height, width = images.shape[-2:]
+    total = torch.nn.functional.pad(images.double().cumsum(-1).cumsum(-2), (1, 0, 1, 0))
+    x, y = grid_in_image(views, K)
+    rows = _between(total, y.double().clamp(0, height))
+    sums = _between(rows.mT, x.double().clamp(0, width)).mT
+    area = (x[:, 1:] - x[:, :-1]).unsqueeze(-2) * (y[:, 1:] - y[:, :-1]).unsqueeze(-1)
+    return (sums.diff(dim=-1).diff(dim=-2) / area).to(images).clamp(0, 1)
+
+
+def _between(
+    table: Float[Tensor, "items rows columns"], at: Float[Tensor, "items lines"]
+) -> Float[Tensor, "items lines columns"]:
+    """Rows of a table at fractional places, interpolated."""
+    low = at.floor().long().clamp(0, table.shape[-2] - 2)
+    share = (at - low).unsqueeze(-1)
+    index = low.unsqueeze(-1).expand(-1, -1, table.shape[-1])
+    return table.gather(-2, index) * (1 - share) + table.gather(-2, index + 1) * share
+
+
+def sample_nearest(
+    image: Float[Tensor, "h w"], views: Views, K: Float[Tensor, "3 3"], outside: float
+) -> Float[Tensor, "items wh ww"]:
+    """Value of an image with intrinsics `K` at the centre of each window pixel."""
+    x, y = grid_in_image(views, K)
+    columns = ((x[:, 1:] + x[:, :-1]) / 2).floor().long()
+    rows = ((y[:, 1:] + y[:, :-1]) / 2).floor().long()
+    height, width = image.shape
+    inside = ((columns >= 0) & (columns < width)).unsqueeze(-2)
+    inside = inside & ((rows >= 0) & (rows < height)).unsqueeze(-1)
+    picked = image[
+        rows.clamp(0, height - 1).unsqueeze(-1), columns.clamp(0, width - 1).unsqueeze(-2)
+    ]
+    return torch.where(inside, picked, torch.full_like(picked, outside))

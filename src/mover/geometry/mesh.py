@@ -1,0 +1,147 @@
+"""Triangle meshes: boxes, normals, even samples, fewer faces."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..types import Mesh
+from .nearest import as_float64, as_int64
+from .topology import edges_of as edges_of
+from .topology import is_closed as is_closed
+
+OVERSAMPLING = 5  # candidates for each even sample
+GENTLER = 1.5  # a target of faces that opens a mesh is raised by this factor
+
+
+def box(verts: Float[Tensor, "verts 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Lowest and highest coordinates of the vertices [m].
+
+    Raises:
+        ValueError: If there are no vertices.
+    """
+    if len(verts) == 0:
+        raise ValueError("box: 'verts' is empty, expected at least one vertex")
+    return verts.amin(0), verts.amax(0)
+
+
+def used(mesh: Mesh) -> Mesh:
+    """The mesh without the vertices that no face refers to."""
+    keep, faces = torch.unique(mesh.faces, return_inverse=True)
+    return Mesh(mesh.verts[keep], faces.to(mesh.faces))
+
+
+def fit_box(mesh: Mesh, low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> Mesh:
+    """The mesh stretched so that its box runs from `low` to `high` [m].
+
+    Along an axis where either has no extent the mesh is only centred.
+    """
+    start, end = box(mesh.verts)
+    flat = (end <= start) | (high <= low)
+    factor = torch.where(flat, 1.0, (high - low) / torch.where(flat, 1.0, end - start))
+    verts = (mesh.verts - (start + end) / 2) * factor + (low + high) / 2
+    held = torch.minimum(torch.maximum(verts, low), high)  # rounding
+    return Mesh(torch.where(flat, verts, held), mesh.faces)
+
+
+def signed_volume(mesh: Mesh) -> float:
+    """Enclosed volume [m³], positive where faces wind counter-clockwise seen from outside."""
+    verts = mesh.verts.detach().double()
+    a, b, c = (verts - verts.mean(0))[mesh.faces].unbind(-2)
+    return float((torch.linalg.cross(a, b) * c).sum() / 6)
+
+
+def face_normals(
+    verts: Float[Tensor, "*b verts 3"], faces: Int[Tensor, "faces 3"]
+) -> Float[Tensor, "*b faces 3"]:
+    """Unit normals of the faces; zero for a face without area."""
+    return torch.nn.functional.normalize(_area_vectors(verts, faces), dim=-1)
+
+
+def vertex_normals(
+    verts: Float[Tensor, "*b verts 3"], faces: Int[Tensor, "faces 3"]
+) -> Float[Tensor, "*b verts 3"]:
+    """Unit normals at the vertices: of their faces, weighted by area; zero where there are none."""
+    vectors = _area_vectors(verts, faces).repeat_interleave(3, -2)
+    total = torch.zeros_like(verts).index_add(-2, faces.reshape(-1), vectors)
+    return torch.nn.functional.normalize(total, dim=-1)
+
+
+def _area_vectors(
+    verts: Float[Tensor, "*b verts 3"], faces: Int[Tensor, "faces 3"]
+) -> Float[Tensor, "*b faces 3"]:
+    """Normals as long as twice the area [m²]; the size does not matter to their direction."""
+    a, b, c = verts[..., faces, :].unbind(-2)
+    return torch.linalg.cross(b - a, c - a)
+
+
+def sample_surface(
+    mesh: Mesh, count: int, seed: int = 0
+) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"]]:
+    """Points spread evenly over the surface [m], and the normals there.
+
+    Of `OVERSAMPLING` times as many random points, each next one is the farthest from those
+    before; so the first n of the points are even, too.
+
+    Raises:
+        ValueError: If the mesh has no area.
+    """
+    points, face = _scatter(mesh, OVERSAMPLING * count, np.random.default_rng(seed))
+    x, y, z = points.unbind(-1)
+    chosen = torch.zeros(count, dtype=torch.long, device=points.device)
+    nearest = torch.full_like(x, torch.inf)
+    for row in range(count):  # each choice depends on those before it
+        last = chosen[max(row - 1, 0)]
+        apart = (x - x[last]).square() + (y - y[last]).square() + (z - z[last]).square()
+        nearest = torch.minimum(nearest, apart)
+        chosen[row] = 0 if row == 0 else nearest.argmax()
+    return points[chosen], face_normals(mesh.verts.detach(), mesh.faces)[face[chosen]]
+
+
+def _scatter(
+    mesh: Mesh, count: int, rng: np.random.Generator
+) -> tuple[Float[Tensor, "count 3"], Int[Tensor, " count"]]:
+    """Random points, as many on each face as its area asks, and their faces."""
+    verts = mesh.verts.detach()
+    area = _area_vectors(verts, mesh.faces).norm(dim=-1).double().cumsum(0)
+    if len(area) == 0 or not float(area[-1]) > 0:
+        raise ValueError("sample_surface: the mesh has no area")
+    steps = torch.from_numpy((np.arange(count) + rng.random(count)) / count).to(area)
+    face = torch.searchsorted(area, steps * area[-1]).clamp_max(len(area) - 1)
+    u, v = torch.from_numpy(rng.random((2, count))).to(verts)
+    u, v = torch.where(u + v > 1, 1 - u, u)[:, None], torch.where(u + v > 1, 1 - v, v)[:, None]
+    a, b, c = verts[mesh.faces[face]].unbind(-2)
+    return a + u * (b - a) + v * (c - a), face
+
+
+def decimate(mesh: Mesh, faces: int) -> Mesh:
+    """The same shape and box with about `faces` triangles; a closed mesh stays closed.
+
+    Where the target would open the mesh or turn parts of it over, a gentler one is taken, and
+    the mesh itself where none is left.
+    """
+    target, closed = float(faces), is_closed(mesh.faces)
+    while target < len(mesh.faces):
+        small = _simplified(mesh, int(target))
+        if not closed or _still_solid(small, mesh):
+            return fit_box(small, *box(used(mesh).verts))
+        target *= GENTLER
+    return mesh
+
+
+def _simplified(mesh: Mesh, faces: int) -> Mesh:
+    import fast_simplification
+
+    found = fast_simplification.simplify(
+        as_float64(mesh.verts), as_int64(mesh.faces).astype(np.int32), target_count=faces
+    )
+    verts, triangles = (torch.from_numpy(np.ascontiguousarray(part)) for part in found[:2])
+    return used(Mesh(verts.to(mesh.verts), triangles.to(mesh.faces)))
+
+
+def _still_solid(small: Mesh, mesh: Mesh) -> bool:
+    """Whether the simplified mesh is closed and kept at least half of the volume."""
+    if not is_closed(small.faces):
+        return False
+    before, after = signed_volume(mesh), signed_volume(small)
+    return 0.5 * abs(before) <= abs(after) <= 2 * abs(before) and before * after > 0

@@ -1,0 +1,250 @@
+"""The order of the stages, each kept on disk: from a capture to a consistent room."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from .bodies.parts import Parts, parts_of
+from .energy import HumanCues
+from .geometry.camera import to_camera
+from .geometry.floor import recast, slide_to_floor
+from .geometry.placement import GROUND, place, stand
+from .presets import PRESETS as PRESETS
+from .presets import Config as Config
+from .run import Run as Run
+from .stages.align_camera import AlignInputs, Alignment, align_camera
+from .stages.doubt import DoubtInputs, doubts
+from .stages.find_depth import DepthInputs, apply_depth, find_depth
+from .stages.find_image_cues import ImageInputs, find_image_cues, order_of
+from .stages.find_soles import SolesInputs, find_soles
+from .stages.find_touches import FindTouchesInputs, find_touches
+from .stages.gather_cues import Cues, GatherInputs, cues_in_windows, gather_cues
+from .stages.inputs import Seen, ground_without_people, image_evidence, in_world, rows_of
+from .stages.place_objects import Placed, PlaceInputs, place_objects
+from .stages.prepare_objects import Prepared, PrepareInputs, prepare_objects, proxy_meshes, restore
+from .stages.refine_camera import RefineInputs, refine_camera
+from .stages.reinitialize import ReinitInputs, by_release, contact_start
+from .stages.select_frames import SelectInputs, select_frames
+from .terms.feet import Soles
+from .types import Bodies, Camera, Capture, Evidence, Layout, Room, Scene
+
+NOBODY = HumanCues()
+FIT = 0.1  # image energy (robust form) from which on an object's shape is believed less
+
+
+@dataclass(frozen=True)
+class Job:
+    """One capture under one configuration."""
+
+    capture: Capture
+    config: Config
+    run: Run
+    seen: Seen
+    prepared: Prepared
+
+
+@dataclass(frozen=True)
+class Crew:
+    """The people as the stages see them."""
+
+    bodies: Bodies
+    """All rows, in camera axes, at their corrected depth."""
+    kept: Bool[Tensor, " bodies"]
+    parts: Parts
+    soles: Soles
+    alignment: Alignment
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class View:
+    """Camera and ground, and the room as it is placed under them."""
+
+    camera: Camera
+    ground: float
+    image: ImageInputs
+    start: Layout
+    placed: Placed
+    traces: dict[str, Tensor]
+    """Total energy before each step of the descents so far."""
+    cues: Cues | None = None
+
+
+def reconstruct(capture: Capture, config: Config, run: Run) -> Room:
+    """From a capture to a consistent room (Sec. 3)."""
+    seen = image_evidence(capture)
+    prepared = run.stage(prepare_objects, PrepareInputs(capture.scene.pieces), config.prepare)
+    job = Job(capture, config, run, seen, prepared)
+    crew = _people(job)
+    if crew is None:
+        view = _from_image(job, capture.scene.camera, ground_without_people(capture, prepared))
+        return _room(job, view, None)
+    view = _from_image(job, crew.alignment.camera, crew.alignment.ground)
+    for _ in range(config.refine.rounds):
+        view = _refine(job, crew, view)
+    return _room(job, _with_people(job, crew, view), crew)
+
+
+def _people(job: Job) -> Crew | None:
+    """Choose frames, find the people's depth and their feet, and from these camera and ground."""
+    capture, config, run = job.capture, job.config, job.run
+    bodies, scene = capture.bodies, capture.scene
+    if bodies is None:
+        return None
+    parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
+    kept = run.stage(select_frames, SelectInputs(bodies), config.select).keep
+    warnings: tuple[str, ...] = ()
+    if config.depth.use and capture.people is not None:
+        inputs = DepthInputs(rows_of(bodies, kept), capture.people, scene.camera, job.seen.masks.any(0))
+        depth = run.stage(find_depth, inputs, config.depth)
+        bodies, warnings = apply_depth(bodies, depth), depth.warnings
+    soles = run.stage(find_soles, SolesInputs(bodies, parts, kept, scene.camera), config.soles)
+    feet = AlignInputs(soles, scene.camera, scene.ground, capture.camera_height)
+    alignment = run.stage(align_camera, feet, config.align)
+    warnings = (*warnings, *soles.warnings, *alignment.warnings)
+    return Crew(bodies, kept, parts, soles, alignment, warnings)
+
+
+def _from_image(job: Job, camera: Camera, ground: float) -> View:
+    """Carry the initial scene into this world and place the objects by the image alone."""
+    objects, seen = job.prepared.objects, job.seen
+    old = job.capture.scene.camera.R_cam_world
+    start = recast(job.prepared.start, objects.size[:, 1], old, camera.R_cam_world)
+    if job.config.slide:
+        start = slide_to_floor(start, ground, objects.supports == GROUND)
+    start = stand(start, objects.supports, objects.size[:, 1], ground)
+    unordered = torch.zeros(len(objects.ids), len(objects.ids), dtype=torch.bool)
+    image = ImageInputs(camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered)
+    cues = job.run.stage(find_image_cues, image, job.config.image)
+    inputs = PlaceInputs(objects, camera, ground, cues, NOBODY, _alone(start), start.yaw)
+    placed = job.run.stage(place_objects, inputs, job.config.layout)
+    return View(camera, ground, image, start, placed, {"image": placed.trace})
+
+
+def _refine(job: Job, crew: Crew, view: View) -> View:
+    """Camera and ground refined with the objects, and the objects placed anew under them."""
+    cues = job.run.stage(find_image_cues, view.image, job.config.image)
+    inputs = RefineInputs(
+        view.camera, view.ground, _level_soles(crew), job.prepared.objects, cues, view.placed.layout
+    )
+    better = job.run.stage(refine_camera, inputs, job.config.refine)
+    found = _from_image(job, better.camera, better.ground)
+    return replace(found, traces={**view.traces, "camera": better.trace, **found.traces})
+
+
+def _level_soles(crew: Crew) -> Float[Tensor, "soles 3"]:
+    """Soles in camera axes without the height by which each person floats."""
+    up = crew.alignment.camera.R_cam_world[:, 1]
+    offsets = [crew.alignment.offsets.get(str(p), 0.0) for p in crew.soles.person.tolist()]
+    return crew.soles.points_cam - torch.tensor(offsets).to(up).unsqueeze(-1) * up
+
+
+def _with_people(job: Job, crew: Crew, view: View) -> View:
+    """Gather what the people say, and place the objects with it; renew both as often as asked."""
+    bodies = in_world(rows_of(crew.bodies, crew.kept), view.camera)
+    given = None if job.capture.touch is None else job.capture.touch[crew.kept]
+    touching = job.run.stage(
+        find_touches, FindTouchesInputs(bodies, crew.parts, view.ground, given), job.config.touches
+    )
+    fit = view.placed.energy[0]
+    for turn in range(1 + job.config.again):
+        if turn:
+            view = replace(view, image=replace(view.image, behind=_order(job, view)))
+        inputs = GatherInputs(
+            bodies, touching.probability, crew.parts, job.capture.people, job.seen.masks,
+            job.seen.boxes, view.camera, job.prepared.objects, view.placed.layout,
+        )  # fmt: skip
+        cues = job.run.stage(gather_cues, inputs, job.config.gather)
+        view = _place_with(job, view, cues, fit)
+    return view
+
+
+def _place_with(job: Job, view: View, cues: Cues, fit: Float[Tensor, " objects"]) -> View:
+    """One descent of the whole of Eq. 1."""
+    objects, config, run = job.prepared.objects, job.config, job.run
+    image = run.stage(find_image_cues, view.image, config.image)
+    humans = cues_in_windows(cues, image.views, view.camera)
+    if config.trust:
+        image = replace(image, trust=(FIT / fit.clamp_min(1e-6)).clamp(0.1, 1))
+    seats = ReinitInputs(objects, view.camera, humans, image.masks, view.placed.layout)
+    layout = run.stage(by_release, seats, config.reinit)
+    starts = _alone(layout)
+    if config.layout.keep > 1:
+        contact = contact_start(view.placed.layout, objects, cues.touches)
+        starts = _joined(_first(view.placed.candidates, config.layout.keep), _alone(contact))
+    reference = _reference(view.start.yaw, cues)
+    inputs = PlaceInputs(objects, view.camera, view.ground, image, humans, starts, reference)
+    placed = run.stage(place_objects, inputs, config.place)
+    traces = {**view.traces, f"people {len(view.traces)}": placed.trace}
+    return replace(view, placed=placed, cues=cues, traces=traces)
+
+
+def _reference(initial: Float[Tensor, " objects"], cues: Cues) -> Float[Tensor, " objects"]:
+    """Yaw of the sitters of used seats, else the initial one [rad]."""
+    yaw = initial.clone()
+    if cues.touches is not None:
+        x, z = cues.touches.heading.unbind(-1)
+        seated = (x.abs() + z.abs()) > 0
+        yaw[cues.touches.object_of[seated]] = torch.atan2(x, z)[seated]
+    return yaw
+
+
+def _order(job: Job, view: View) -> Bool[Tensor, "objects objects"]:
+    verts = place(job.prepared.objects.verts, view.placed.layout)
+    z = to_camera(verts, view.camera.R_cam_world)[..., 2]
+    return order_of(z.amin(-1), z.amax(-1))
+
+
+def _alone(layout: Layout) -> Layout:
+    """One start."""
+    return Layout(layout.t_world_object[None], layout.yaw[None], layout.log_scale[None])
+
+
+def _first(layout: Layout, count: int) -> Layout:
+    return Layout(layout.t_world_object[:count], layout.yaw[:count], layout.log_scale[:count])
+
+
+def _joined(a: Layout, b: Layout) -> Layout:
+    return Layout(
+        torch.cat([a.t_world_object, b.t_world_object]),
+        torch.cat([a.yaw, b.yaw]),
+        torch.cat([a.log_scale, b.log_scale]),
+    )
+
+
+def _room(job: Job, view: View, crew: Crew | None) -> Room:
+    capture, placed = job.capture, view.placed
+    pieces = restore(capture.scene.pieces, job.prepared, placed.layout)
+    warnings = [*capture.warnings, *job.prepared.warnings]
+    bodies = None
+    if crew is not None:
+        bodies = in_world(crew.bodies, view.camera)
+        warnings += crew.warnings
+    if crew is not None and bodies is not None and view.cues is not None:
+        seated = view.cues.seated_on
+        warnings += doubts(DoubtInputs(
+            rows_of(bodies, crew.kept), crew.parts, capture.people, view.camera,
+            job.prepared.objects, placed.layout, view.cues.touches, seated,
+        ))  # fmt: skip
+    return Room(
+        scene=Scene(view.camera, view.ground, pieces),
+        initial=capture.scene,
+        bodies=bodies,
+        kept=None if crew is None else crew.kept,
+        proxies=proxy_meshes(job.prepared),
+        evidence=_evidence(job, view),
+        covariance=None if crew is None else crew.alignment.covariance,
+        traces=view.traces,
+        warnings=tuple(dict.fromkeys(warnings)),
+    )
+
+
+def _evidence(job: Job, view: View) -> tuple[Evidence, ...]:
+    cues, ids = view.cues, job.prepared.objects.ids
+    zero = (0,) * len(ids)
+    near, far, bodies = (zero, zero, zero) if cues is None else (cues.near_pixels, cues.far_pixels, cues.touched_in)
+    pixels = job.seen.masks.sum((-2, -1)).tolist()
+    lowest = view.placed.energy.amin(0).tolist()
+    return tuple(Evidence(*row) for row in zip(ids, pixels, near, far, bodies, lowest, strict=True))

@@ -1,0 +1,107 @@
+"""The settings of all stages, and the three presets.
+
+`paper`:   each formula and number as printed.
+`release`: what the authors' released code computes, without its bugs.
+`robust`:  ours; docs/method.md gives the reason for each departure.
+"""
+
+from dataclasses import dataclass, field
+
+from .energy import SceneWeights
+from .minimize import Adam
+from .stages.align_camera import AlignConfig
+from .stages.assign_touches import AssignConfig
+from .stages.find_depth import DepthConfig
+from .stages.find_image_cues import ImageConfig
+from .stages.find_soles import SolesConfig
+from .stages.find_touches import TouchConfig
+from .stages.gather_cues import GatherConfig
+from .stages.place_objects import PlaceConfig
+from .stages.prepare_objects import PrepareConfig
+from .stages.refine_camera import RefineConfig
+from .stages.reinitialize import ReinitConfig
+from .stages.select_frames import SelectConfig
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of all stages, in their order."""
+
+    select: SelectConfig = field(default_factory=SelectConfig)
+    """Which frames are believed."""
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    """One depth factor a person."""
+    soles: SolesConfig = field(default_factory=SolesConfig)
+    """Feet at rest."""
+    align: AlignConfig = field(default_factory=AlignConfig)
+    """Camera pitch, roll and ground from the feet."""
+    touches: TouchConfig = field(default_factory=TouchConfig)
+    """Where contacts come from."""
+    prepare: PrepareConfig = field(default_factory=PrepareConfig)
+    """How meshes are made fit."""
+    image: ImageConfig = field(default_factory=ImageConfig)
+    """How the image is sampled."""
+    layout: PlaceConfig = field(default_factory=PlaceConfig)
+    """Stage 1: objects from the image alone."""
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    """Camera and ground refined with the objects."""
+    gather: GatherConfig = field(default_factory=GatherConfig)
+    """Evidence from all people."""
+    reinit: ReinitConfig = field(default_factory=ReinitConfig)
+    """Seats put where their contacts are (release)."""
+    place: PlaceConfig = field(default_factory=PlaceConfig)
+    """Stage 2: objects from the image and the people."""
+    again: int = 0
+    """Further passes of stage 2 with assignment and occlusion order renewed."""
+    slide: bool = False
+    """Start on the floor along the rays with the size in the image kept; else dropped straight."""
+    trust: bool = False
+    """Believe the silhouette of an object less whose shape does not fit."""
+
+
+IMAGE_ONLY = SceneWeights(depth=0.0, collision=0.0, contact=0.0)
+"""L_scene: Eq. 1 without people."""
+
+PAPER = Config(
+    align=AlignConfig(sigmas=(0.1,)),
+    layout=PlaceConfig(weights=IMAGE_ONLY, method=Adam(1000)),
+    place=PlaceConfig(),
+)
+
+_RELEASE_IMAGE = SceneWeights(600.0, 0.5, 1000.0, 0.0, 0.0, 0.0, edge=0.05, offscreen=1.0)
+_RELEASE_FULL = SceneWeights(
+    1000.0, 0.3, 1000.0, 80.0, 1000.0, 1e5, edge=0.03, offscreen=1.0, free_space=80.0
+)
+
+RELEASE = Config(
+    align=AlignConfig(sigmas=(0.1,)),
+    prepare=PrepareConfig(rule="release"),
+    image=ImageConfig(form="release"),
+    layout=PlaceConfig(
+        _RELEASE_IMAGE, "release", Adam(1000), first=Adam(200, 0.01, 0.01), span=0.8, chair_span=0.6
+    ),
+    gather=GatherConfig(erode=2, touches=AssignConfig(by="group", overlap=0.05)),
+    reinit=ReinitConfig(use=True),
+    place=PlaceConfig(_RELEASE_FULL, "release", Adam(2500), span=0.8, chair_span=0.6),
+)
+
+_DESCENT = Adam(200, 0.03, 0.002, beta2=0.98, keep_best=True)
+_ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
+_ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 2.0, 1.0, 2.0, heading=0.1)
+
+ROBUST = Config(
+    depth=DepthConfig(use=True),
+    image=ImageConfig(size=128, form="robust"),
+    layout=PlaceConfig(
+        _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, short=Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True),
+        keep=3, tie=1.0,
+    ),
+    refine=RefineConfig(rounds=1),
+    gather=GatherConfig(erode=1, touches=AssignConfig(by="group", cell=0.02, most=300)),
+    place=PlaceConfig(_ROBUST_FULL, "robust", _DESCENT, tie=1.0),
+    again=1,
+    slide=True,
+    trust=True,
+)  # fmt: skip
+
+PRESETS = {"paper": PAPER, "release": RELEASE, "robust": ROBUST}

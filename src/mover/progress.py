@@ -1,0 +1,47 @@
+"""One progress bar on a terminal, one line a stage elsewhere."""
+
+import sys
+from types import TracebackType
+from typing import Any
+
+from .minimize import Step
+
+
+class Bar:
+    """An observer that draws what the stages tell."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self._stage, self._task = "", None
+        self._console = Console(file=sys.stderr)
+        columns = (TextColumn("{task.description:<28}"), BarColumn(), TextColumn("{task.completed:>5}/{task.total}"))
+        self._progress = Progress(*columns, TimeElapsedColumn(), console=self._console, transient=True)
+
+    def __enter__(self) -> "Bar":
+        if self._console.is_terminal:
+            self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def __call__(self, step: Step) -> None:
+        """Show how far the stage is."""
+        if step.stage != self._stage:
+            self._begin(step)
+        task: Any = self._task
+        if task is not None:
+            self._progress.update(task, completed=step.index + 1, total=step.steps)
+
+    def _begin(self, step: Step) -> None:
+        self._stage = step.stage
+        if not self._console.is_terminal:
+            self._console.print(f"{step.stage} ...", highlight=False)
+            return
+        if self._task is not None:
+            self._progress.remove_task(self._task)
+        self._task = self._progress.add_task(step.stage, total=step.steps)

@@ -1,0 +1,211 @@
+"""A capture from arrays, for notebooks and other readers; the checks are the same."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from ..types import Camera, Capture, Mesh
+from .assemble import Sources, assemble
+from .fields import At, Warn, array, mapping, refuse
+from .masks import encode, tight_box
+from .mesh_file import mesh_of
+from .scene_file import FORMAT, VERSION
+
+FILE = "arrays"
+"""How messages call what has no file."""
+
+
+@dataclass(frozen=True)
+class ObjectArrays:
+    """One object: x_world = R_y(yaw) @ (scale * vertex) + translation."""
+
+    id: str
+    category: str
+    vertices: ArrayLike
+    """(vertices, 3) in its own frame: +y up, +z front [m]."""
+    faces: ArrayLike
+    """(faces, 3)."""
+    translation: Sequence[float]
+    """[m]."""
+    yaw: float
+    """About +y [rad]."""
+    scale: Sequence[float] = (1.0, 1.0, 1.0)
+    support: str = "ground"
+    """`ground`, `free` or the id of the object that carries it."""
+    mask: ArrayLike | None = None
+    """(h, w) of booleans: its pixels in the reference image."""
+    box: Sequence[float] | None = None
+    """x_min, y_min, x_max, y_max [px]; by default that of the mask."""
+    score: float = 1.0
+    mesh_file: str = ""
+    """The file that the mesh is from, where it has one."""
+
+
+@dataclass(frozen=True)
+class PeopleArrays:
+    """Visible masks of people."""
+
+    masks: ArrayLike
+    """(rows, h, w) of booleans."""
+    frame: Sequence[int]
+    person: Sequence[int]
+    heights: Mapping[str, float] | None = None
+    """Known body heights by track [m]."""
+    reference: ArrayLike | None = None
+    """(people, h, w) of booleans: people in the reference image."""
+
+
+def capture_from_arrays(
+    camera: Mapping[str, Any],
+    objects: Sequence[ObjectArrays],
+    *,
+    bodies: Mapping[str, Any] | None = None,
+    people: PeopleArrays | None = None,
+    image: ArrayLike | None = None,
+    name: str = "arrays",
+) -> Capture:
+    """Make a capture in memory.
+
+    Args:
+        camera: The fields of camera.json: w, h, fl_x, fl_y, cx, cy, R_cam_world, height.
+        objects: The initial scene with what the reference image shows of it.
+        bodies: The arrays of bodies.npz, and `probability` of contacts.npz.
+        people: Visible masks in the frames.
+        image: (h, w, 3), the reference image, bytes or from 0 to 1.
+        name: Of the capture.
+
+    Raises:
+        InputError: If anything is wrong.
+    """
+    fields = {k: np.asarray(v).tolist() for k, v in camera.items()}
+    arrays = None if bodies is None else {k: np.asarray(v) for k, v in bodies.items()}
+    touch = None if arrays is None or "probability" not in arrays else At(arrays, FILE, "bodies")
+
+    def load_mesh(at: At) -> tuple[Mesh, str]:
+        found = objects[at.value]
+        verts = array(
+            At(np.asarray(found.vertices), FILE, f"objects[{at.value}].vertices"), ("V", 3)
+        )
+        faces = At(np.asarray(found.faces), FILE, f"objects[{at.value}].faces")
+        return mesh_of(verts, array(faces, ("F", 3), "whole"), faces), found.mesh_file
+
+    def load_image(of: Camera, warn: Warn) -> Float[Tensor, "h w 3"] | None:
+        del warn
+        return None if image is None else _image(image, of)
+
+    return assemble(
+        Sources(
+            name=name,
+            camera=At(fields, FILE, "camera"),
+            scene=At(_scene(objects), FILE),
+            objects=At(_annotations(objects), FILE),
+            people=None if people is None else At(_people(people), FILE, "people"),
+            bodies=None if arrays is None else At(arrays, FILE, "bodies"),
+            contacts=touch,
+            load_mesh=load_mesh,
+            load_image=load_image,
+            n_frames=None,
+        )
+    )
+
+
+def _scene(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
+    """The content of scene.json, where a mesh is named by its index."""
+    rows = [
+        {
+            "id": o.id,
+            "category": o.category,
+            "mesh": i,
+            "annotation": None if o.mask is None and o.box is None else i,
+            "translation": _list(o.translation),
+            "yaw": _list(o.yaw),
+            "scale": _list(o.scale),
+            "support": o.support,
+        }
+        for i, o in enumerate(objects)
+    ]
+    return {"format": FORMAT, "version": VERSION, "objects": rows}
+
+
+def _list(value: ArrayLike) -> Any:  # noqa: ANN401
+    """Numbers of any array library as JSON has them."""
+    return np.asarray(value).tolist()
+
+
+def _annotations(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
+    """The content of objects.json."""
+    names = list(dict.fromkeys(o.category for o in objects))
+    rows: list[dict[str, Any]] = []
+    for i, o in enumerate(objects):
+        if o.mask is None and o.box is None:
+            continue
+        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": names.index(o.category)}
+        box = o.box
+        if o.mask is not None:
+            mask = _mask(At(o.mask, FILE, f"objects[{i}].mask"))
+            box = tight_box(mask).tolist() if box is None else box
+            row["segmentation"] = _code(mask)
+        x, y, right, bottom = array(At(np.asarray(box), FILE, f"objects[{i}].box"), (4,)).tolist()
+        rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": _list(o.score)})
+    categories = [{"id": i, "name": name} for i, name in enumerate(names)]
+    return {"images": [{"id": 0}], "categories": categories, "annotations": rows}
+
+
+def _mask(at: At) -> Tensor:
+    """One mask that is not empty."""
+    value: NDArray[Any] = np.asarray(at.value)
+    if value.dtype != np.bool_ or value.ndim != 2:
+        refuse(At(value, at.file, at.field), "an array of booleans of shape (h, w)")
+    if not value.any():
+        refuse(at, "a mask with pixels", "an empty mask")
+    return torch.from_numpy(value)
+
+
+def _code(mask: Tensor) -> dict[str, Any]:
+    """COCO's run-length code of a mask."""
+    return {"size": list(mask.shape), "counts": encode(mask)}
+
+
+def _people(people: PeopleArrays) -> dict[str, Any]:
+    """The content of people.json."""
+    masks = _stack(people.masks, "people.masks")
+    rows_of = (len(masks),)
+    frames = array(At(np.asarray(people.frame), FILE, "people.frame"), rows_of, "whole").tolist()
+    persons = array(At(np.asarray(people.person), FILE, "people.person"), rows_of, "whole").tolist()
+    rows = [
+        {"image_id": frame, "track_id": person, "segmentation": _code(mask)}
+        for frame, person, mask in zip(frames, persons, masks, strict=True)
+    ]
+    heights = {} if people.heights is None else mapping(At(people.heights, FILE, "people.heights"))
+    hidden = [] if people.reference is None else _stack(people.reference, "people.reference")
+    return {
+        "info": {"heights": heights},
+        "images": [{"id": frame} for frame in dict.fromkeys(frames)],
+        "annotations": rows,
+        "reference_people": [{"segmentation": _code(mask)} for mask in hidden],
+    }
+
+
+def _stack(value: ArrayLike, field: str) -> Tensor:
+    """Several masks, some of which may be empty."""
+    given: NDArray[Any] = np.asarray(value)
+    if given.dtype != np.bool_ or given.ndim != 3:
+        refuse(At(given, FILE, field), "an array of booleans of shape (rows, h, w)")
+    return torch.from_numpy(given)
+
+
+def _image(image: ArrayLike, camera: Camera) -> Float[Tensor, "h w 3"]:
+    """The reference image in [0, 1]."""
+    given: NDArray[Any] = np.asarray(image)
+    value = array(At(given, FILE, "image"), (camera.height, camera.width, 3)).astype(np.float32)
+    if given.dtype == np.uint8:
+        value = value / np.float32(255)
+    if value.min() < 0 or value.max() > 1:
+        refuse(At(given, FILE, "image"), "bytes, or numbers from 0 to 1")
+    return torch.from_numpy(value)

@@ -1,0 +1,169 @@
+"""Mesh files: read any, copy them with what belongs to them, write new ones."""
+
+import json
+import re
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..records import InputError, replacing
+from ..types import Mesh
+from .fields import LARGEST, LARGEST_FILE, At, refuse, text
+
+KINDS = (".glb", ".gltf", ".obj", ".ply", ".off", ".stl")
+THINNEST = 1e-9  # a mesh that is thinner along two axes has no surface
+
+
+def inside(at: At, folder: Path) -> Path:
+    """The file that a relative path names, which may not lie outside of the folder."""
+    name = text(at)
+    path = Path(name)
+    if path.is_absolute() or ".." in path.parts or "\0" in name or "\\" in name:
+        refuse(at, "a relative path with forward slashes inside the capture's folder")
+    full = (folder / path).resolve()
+    if not full.is_relative_to(folder.resolve()):
+        refuse(at, "a file inside the capture's folder", f"{name!r}, a link that leaves it")
+    if not full.is_file():
+        refuse(at, "a file", f"{name!r}, which does not exist")
+    return full
+
+
+def read_mesh(at: At, folder: Path) -> tuple[Mesh, str]:
+    """The mesh that a field names, with the transforms of its nodes applied, and its full path.
+
+    Raises:
+        InputError: If it leaves the folder, cannot be read, is empty or is not finite.
+    """
+    path = inside(at, folder)
+    if path.suffix.lower() not in KINDS:
+        refuse(at, f"a file of kind {', '.join(KINDS)}")
+    if path.stat().st_size > LARGEST_FILE:
+        refuse(at, f"at most {LARGEST_FILE} bytes", f"a file of {path.stat().st_size}")
+    verts, faces = _load(at, path)
+    return mesh_of(verts, faces, at), str(path)
+
+
+def _load(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Vertices and faces of all parts of a file."""
+    import trimesh
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of parsers about things that are checked here
+        try:
+            scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
+            for part in scene.geometry.values():
+                _check_faces(at, np.asarray(part.faces), len(part.vertices))
+            whole = scene.to_mesh()
+            return np.asarray(whole.vertices), np.asarray(whole.faces)
+        except InputError:
+            raise
+        except Exception as error:  # the parsers of six formats raise anything on broken files
+            reason = f"{type(error).__name__}: {error}"[:120]
+            refuse(at, "a readable mesh", f"{str(at.value)!r}, which cannot be read ({reason})")
+
+
+def _check_faces(at: At, faces: NDArray[Any], count: int) -> None:
+    """Refuse faces that name vertices which do not exist."""
+    if faces.size and (faces.min() < 0 or faces.max() >= count):
+        found = f"faces that name vertices {faces.min()} to {faces.max()}"
+        refuse(at, f"vertices 0 to {count - 1}", found)
+
+
+def mesh_of(verts: NDArray[Any], faces: NDArray[Any], at: At) -> Mesh:
+    """A checked mesh without vertices that no face uses and without faces of repeated vertices.
+
+    Raises:
+        InputError: If it is empty, not finite, or its faces name missing vertices.
+    """
+    if verts.ndim != 2 or verts.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
+        found = f"vertices of shape {verts.shape} and faces of shape {faces.shape}"
+        refuse(at, "triangles: (vertices, 3) and (faces, 3)", found)
+    _check_faces(at, faces, len(verts))
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    if not len(faces):
+        refuse(at, "a mesh with faces", "an empty mesh")
+    kept, flat = np.unique(faces, return_inverse=True)
+    verts = verts[kept]
+    if not (np.abs(verts) <= LARGEST).all():
+        refuse(at, "finite vertices", "a mesh with NaN or infinite vertices")
+    if np.sort(np.ptp(verts, axis=0))[1] < THINNEST:
+        refuse(at, "a mesh with a surface", "a mesh that is a line or a point")
+    places = torch.from_numpy(np.ascontiguousarray(verts, dtype=np.float32))
+    return Mesh(places, torch.from_numpy(flat.reshape(-1, 3).astype(np.int64)))
+
+
+def write_mesh(mesh: Mesh, path: Path) -> None:
+    """Write a mesh as binary glTF."""
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+
+    body = trimesh.Trimesh(mesh.verts.cpu().numpy(), mesh.faces.cpu().numpy(), process=False)
+    with replacing(path) as part:
+        part.write_bytes(export_glb(trimesh.Scene({"object": body})))
+
+
+def copy_mesh(source: Path, folder: Path, name: str) -> Path:
+    """Copy a mesh file as it is, into a folder of its own where other files belong to it.
+
+    Args:
+        source: The user's file.
+        folder: Where meshes are kept.
+        name: New name without its ending.
+
+    Returns:
+        The copy.
+    """
+    beside = companions(source)
+    home = folder / name if beside else folder
+    target = home / (name + source.suffix)
+    _copy(source, target)
+    for file in beside:
+        _copy(source.parent / file, home / file)
+    return target
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy the bytes of a file in one step."""
+    if target.exists() and target.samefile(source):
+        return
+    with replacing(target) as part:
+        shutil.copyfile(source, part)
+
+
+def companions(path: Path) -> tuple[Path, ...]:
+    """Files that an .obj or .gltf names (materials, textures, buffers), relative to its folder."""
+    match path.suffix.lower():
+        case ".obj":
+            names = _named_in(path, r"^mtllib\s+(.+?)\s*$")
+            for library in [n for n in names if _is_companion(path, n)]:
+                options = r"^\s*(?:map_\w+|bump|disp|decal|refl|norm)\s+(?:-.*\s)?(.+?)\s*$"
+                home = Path(library).parent
+                names += [str(home / n) for n in _named_in(path.parent / library, options)]
+        case ".gltf":
+            tree = json.loads(path.read_text(encoding="utf-8"))
+            parts = [*tree.get("buffers", []), *tree.get("images", [])]
+            names = [unquote(part["uri"]) for part in parts if "uri" in part]
+        case _:
+            names = []
+    return tuple(Path(n) for n in dict.fromkeys(names) if _is_companion(path, n))
+
+
+def _named_in(path: Path, pattern: str) -> list[str]:
+    """The first group of each match of a pattern in a text file."""
+    found = re.findall(pattern, path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE)
+    return [str(name).replace("\\", "/") for name in found]
+
+
+def _is_companion(path: Path, name: str) -> bool:
+    """Whether a name is that of a file at or below the folder of `path`."""
+    if name.startswith("data:") or "\0" in name:
+        return False
+    full = (path.parent / name).resolve()
+    return full.is_file() and full.is_relative_to(path.parent.resolve())

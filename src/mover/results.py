@@ -1,0 +1,119 @@
+"""Write a room to disk: scene, meshes, proxies, bodies, log and report (FORMAT.md, "Result")."""
+
+import dataclasses
+import json
+import platform
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from . import __version__, records
+from .export import write_glb
+from .geometry.camera import to_world
+from .presets import Config
+from .readers.bodies_file import write_bodies
+from .readers.scene_file import write_scene
+from .report import ReportContent, write_report
+from .run import Run
+from .types import Bodies, Capture, Mesh, Room, Scene
+
+
+def write_results(capture: Capture, room: Room, config: Config, run: Run) -> Path:
+    """Write everything but metrics.json; returns the report's path."""
+    out = run.folder
+    write_scene(room.initial, out / "initial.json")
+    if room.bodies is not None:
+        write_bodies(room.bodies, out / "bodies.npz")
+        write_bodies(initial_bodies(capture), out / "initial_bodies.npz")
+    for piece, proxy in zip(room.scene.pieces, room.proxies, strict=True):
+        _write_mesh(proxy, out / "watertight" / f"{piece.id}.glb")
+    write_glb(room.scene, room.bodies, out / "scene.glb")
+    _write_log(room, config, run)
+    write_scene(room.scene, out / "scene.json")
+    return write_report(out, report_of(capture, room, config, run))
+
+
+def initial_bodies(capture: Capture) -> Bodies:
+    """The bodies in the world of the initial camera."""
+    bodies = capture.bodies
+    assert bodies is not None
+    R = capture.scene.camera.R_cam_world
+    joints = None if bodies.joints is None else to_world(bodies.joints, R)
+    verts = to_world(bodies.verts, R)
+    return dataclasses.replace(bodies, verts=verts, joints=joints, space="world", pose=None)
+
+
+def report_of(
+    capture: Capture,
+    room: Room,
+    config: Config,
+    run: Run,
+    *,
+    truth: Scene | None = None,
+    metrics: dict[str, Any] | None = None,
+) -> ReportContent:
+    """What the report shows."""
+    return ReportContent(
+        title=capture.name,
+        image=capture.reference,
+        initial=room.initial,
+        result=room.scene,
+        truth=truth,
+        initial_bodies=None if room.bodies is None else initial_bodies(capture),
+        bodies=room.bodies,
+        traces={name: trace.tolist() for name, trace in room.traces.items()},
+        metrics=metrics,
+        warnings=room.warnings,
+        stages=[dataclasses.asdict(s) for s in run.stages],
+        config=records.plain(config),
+        objects=[dataclasses.asdict(e) for e in room.evidence],
+    )
+
+
+def _write_mesh(mesh: Mesh, path: Path) -> None:
+    import trimesh
+
+    shape = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)
+    with records.replacing(path) as part:
+        shape.export(part)
+
+
+def _write_log(room: Room, config: Config, run: Run) -> None:
+    log = {
+        "format": "mover-run",
+        "version": __version__,
+        "command": " ".join(["mover", *sys.argv[1:]]),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "device": "cpu",
+        "threads": torch.get_num_threads(),
+        "config": records.plain(config),
+        "stages": [dataclasses.asdict(s) for s in run.stages],
+        "warnings": list(room.warnings),
+        "evidence": [dataclasses.asdict(e) for e in room.evidence],
+        "camera_covariance": _rows(room.covariance),
+        "traces": {name: _thinned(trace) for name, trace in room.traces.items()},
+    }
+    with records.replacing(run.folder / "run.json") as part:
+        part.write_text(json.dumps(log, indent=1))
+
+
+def _rows(matrix: Tensor | None) -> Sequence[Sequence[float]] | None:
+    return None if matrix is None else matrix.tolist()
+
+
+def _thinned(trace: Tensor, most: int = 500) -> list[float]:
+    return trace[:: max(1, len(trace) // most)].tolist()
+
+
+def read_config(path: Path) -> Config:
+    """The configuration of an earlier run, from its run.json."""
+    try:
+        tree: Mapping[str, Any] = json.loads(path.read_text())
+        return records.built(Config, tree["config"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise records.InputError(f"{path}: no configuration of a run in it ({error})") from error

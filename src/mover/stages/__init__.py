@@ -1,0 +1,1 @@
+"""The steps of the method: pure functions `(Inputs, Config, observe) -> Output`."""

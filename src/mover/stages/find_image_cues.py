@@ -1,0 +1,116 @@
+"""What the clean image says about each object: its box, its mask, and what is unknown."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..energy import ImageCues
+from ..geometry.crops import area_mean, crop_views
+from ..minimize import Observer, silent
+from ..records import record
+from ..terms import Form
+from ..types import Camera
+
+BORDER = 1.5  # [px], a side this close to the image's border is cut by it
+STRIP = 0.06  # of the box's size: how far beyond a side one looks for what may hide it
+HIDDEN = 0.5  # share of the strip that makes a side unknown
+MARGIN = 0.3  # of the box's larger side: how much a window is larger than the box (PHOSA)
+
+
+@dataclass(frozen=True)
+class ImageConfig:
+    """How the image is sampled."""
+
+    size: int = 256
+    """Pixels along a side of each object's window."""
+    form: Form = "paper"
+    """`release`: what lies beyond the border is background; `robust`: hidden sides are dropped."""
+
+
+@record
+class ImageInputs:
+    """The detections of the pieces, in their order."""
+
+    camera: Camera
+    boxes: Float[Tensor, "objects 4"]
+    """x_min, y_min, x_max, y_max [px]; the whole image where there is no detection."""
+    seen: Bool[Tensor, " objects"]
+    """False where a piece has no annotation."""
+    masks: Bool[Tensor, "objects h w"]
+    """Empty where only the box is known."""
+    people: Bool[Tensor, "h w"]
+    """People in the reference image."""
+    behind: Bool[Tensor, "objects objects"]
+    """[i, j]: object j is known to stand behind object i, so it cannot hide it."""
+
+
+def find_image_cues(
+    inputs: ImageInputs, config: ImageConfig, observe: Observer = silent
+) -> ImageCues:
+    """Cut a square window around each box; mark what other objects, people or the border hide."""
+    del observe
+    views = crop_views(inputs.camera.K, inputs.boxes, MARGIN, config.size)
+    others = _others(inputs)
+    own = area_mean(inputs.masks.float(), views, inputs.camera.K)
+    hidden = area_mean(others.float(), views, inputs.camera.K)
+    inside = area_mean(torch.ones_like(inputs.masks).float(), views, inputs.camera.K) > 0.999
+    known = inputs.masks.any(-1).any(-1)[:, None, None]
+    if config.form == "release":
+        own, hidden, inside = (own - hidden > 0).float(), (own < hidden).float(), inside | True
+    keep = (hidden < 1e-6) & inside & known
+    sides = inputs.seen.unsqueeze(-1).expand(-1, 4)
+    if config.form == "robust":
+        sides = sides & _seen_sides(inputs, others)
+    trust = torch.ones(len(own))
+    return ImageCues(inputs.boxes, sides, views, own, keep, trust)
+
+
+def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:
+    """Pixels where something else is seen that may hide this object."""
+    rows: list[Tensor] = []
+    for i in range(len(inputs.masks)):  # a loop keeps the memory at one image
+        rivals = ~inputs.behind[i]
+        rivals[i] = False
+        seen = inputs.masks[rivals].any(0) if rivals.any() else torch.zeros_like(inputs.people)
+        rows.append((seen | inputs.people) & ~inputs.masks[i])
+    return torch.stack(rows)
+
+
+def _seen_sides(
+    inputs: ImageInputs, others: Bool[Tensor, "objects h w"]
+) -> Bool[Tensor, "objects 4"]:
+    """Sides of boxes that neither the image's border nor something in front cuts off."""
+    size = inputs.boxes.new_tensor([inputs.camera.width, inputs.camera.height])
+    low, high = inputs.boxes[:, :2] > BORDER, inputs.boxes[:, 2:] < size - BORDER
+    free = torch.cat([low, high], -1)
+    return free & torch.stack([
+        torch.stack([_share(others[i], _strip(box, side)) < HIDDEN for side in range(4)])
+        for i, box in enumerate(inputs.boxes)
+    ])  # fmt: skip
+
+
+def _strip(box: Float[Tensor, "4"], side: int) -> Float[Tensor, "4"]:
+    """The thin box just beyond one side (0 left, 1 top, 2 right, 3 bottom)."""
+    depth = STRIP * (box[2:] - box[:2]).clamp_min(1).prod().sqrt().clamp_min(2)
+    axis, strip = side % 2, box.clone()
+    if side < 2:
+        strip[axis], strip[axis + 2] = box[axis] - depth, box[axis]
+    else:
+        strip[axis], strip[axis + 2] = box[axis + 2], box[axis + 2] + depth
+    return strip
+
+
+def _share(mask: Bool[Tensor, "h w"], box: Float[Tensor, "4"]) -> Float[Tensor, ""]:
+    height, width = mask.shape
+    x0, y0, x1, y1 = (round(v) for v in box.tolist())
+    part = mask[max(0, y0) : min(height, max(y1, y0 + 1)), max(0, x0) : min(width, max(x1, x0 + 1))]
+    return part.float().mean() if part.numel() else torch.tensor(0.0)
+
+
+def order_of(
+    nearest: Float[Tensor, " objects"], farthest: Float[Tensor, " objects"], slack: float = 0.1
+) -> Bool[Tensor, "objects objects"]:
+    """[i, j]: all of object j is farther than all of object i by more than `slack` [m]."""
+    return nearest.unsqueeze(0) > farthest.unsqueeze(1) + slack

@@ -1,0 +1,242 @@
+"""Fit pitch, roll, ground and offsets to sole points: robust Gauss-Newton with its covariance."""
+
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..geometry.camera import tilted
+from ..records import record
+from ..terms.feet import TAIL, Soles, feet_term, heights, tilt_prior, up_cam
+
+STEP_NOISE, PLACE_NOISE = (
+    0.015,
+    0.01,
+)  # [m], of a sole's height: new in every frame; same in a place
+PLACE = 0.15  # [m], soles nearer than this stand in one place
+FIXED = 1e-3  # [m], spread of what is known
+CAUTION = 1.4  # variance of the robust fit over that of least squares, feet with 1-2 cm of noise
+BELIEF = 2.0  # frames, and places, that the noise above is worth when the spread is estimated
+FLAT = math.radians(45)  # [rad], no tilt is less certain than this
+
+
+@record
+class Prior:
+    """What is believed before any foot is seen."""
+
+    first: Float[Tensor, "2"]
+    """Pitch and roll [rad]."""
+    tilt: float
+    """How far off they are [rad]."""
+    offset: float
+    """How far people float [m]."""
+    ground: float | None
+    """Height of the floor, where it is known [m]."""
+
+
+@record
+class Votes:
+    """Sole points with their weight; float64."""
+
+    soles: Soles
+    people: Int[Tensor, " people"]
+    """Tracks, sorted."""
+    person_of: Int[Tensor, " soles"]
+    """Index into `people`."""
+    row_of: Int[Tensor, " soles"]
+    """Points of one foot in one frame share a row."""
+    place_of: Int[Tensor, " soles"]
+    """Rows of one person on one spot share a place."""
+    weight: Float[Tensor, " soles"]
+    """One over the variance of the height [1/m²]."""
+
+
+@record
+class Fit:
+    """A minimum: pitch, roll, ground, then the offset of each person."""
+
+    at: Float[Tensor, " unknowns"]
+    price: float
+    sigma: float
+    """Scale of the robust price at the end [m]."""
+    prior: Prior
+
+
+def vote(soles: Soles, by: Literal["places", "points"]) -> Votes:
+    """Give every sole point its weight: places share theirs among all frames spent there."""
+    points = soles.points_cam.detach().cpu().double()
+    frame, person = soles.frame.cpu(), soles.person.cpu()
+    people, person_of = person.unique(return_inverse=True)
+    _, row_of = torch.stack([frame, person], -1).unique(dim=0, return_inverse=True)
+    place_of = _places(points, person_of, row_of)
+    per_row = row_of.bincount()
+    weight = per_row.double().mean().reciprocal().expand(len(points)) / STEP_NOISE**2
+    if by == "places":
+        place_of_row = torch.zeros_like(per_row).scatter(0, row_of, place_of)
+        stay = place_of_row.bincount()[place_of].double()
+        weight = 1 / (STEP_NOISE**2 + stay * PLACE_NOISE**2) / per_row[row_of]
+    return Votes(
+        Soles(points, person, frame, soles.warnings), people, person_of, row_of, place_of, weight
+    )
+
+
+def _places(
+    points: Float[Tensor, "soles 3"],
+    person_of: Int[Tensor, " soles"],
+    row_of: Int[Tensor, " soles"],
+) -> Int[Tensor, " soles"]:
+    """Number the spots where people stood: a row joins the first spot of its person near it."""
+    rows = int(row_of.max()) + 1
+    ones = torch.ones(len(points), dtype=points.dtype)
+    count = torch.zeros(rows, dtype=points.dtype).index_add(0, row_of, ones)
+    centre = points.new_zeros(rows, 3).index_add(0, row_of, points) / count[:, None]
+    owner = torch.zeros(rows, dtype=torch.long).scatter(0, row_of, person_of)
+    spots, owners, place = centre[:0], owner[:0], torch.zeros(rows, dtype=torch.long)
+    for row in range(rows):  # one after the other: a row may found the spot of later ones
+        near = ((spots - centre[row]).norm(dim=-1) < PLACE) & (owners == owner[row])
+        if bool(near.any()):
+            place[row] = near.long().argmax()
+            continue
+        place[row] = len(spots)
+        spots = torch.cat([spots, centre[row : row + 1]])
+        owners = torch.cat([owners, owner[row : row + 1]])
+    return place[row_of]
+
+
+def price(
+    at: Float[Tensor, " unknowns"], votes: Votes, prior: Prior, sigma: float
+) -> Float[Tensor, ""]:
+    """What the fit minimises: L_feet in units of its noise, plus the priors, in nats."""
+    feet = feet_term(votes.soles, tilted(at[0], at[1]), at[2], at[3:][votes.person_of], sigma)
+    total = 0.5 * sigma**2 * (votes.weight * feet).sum()
+    total = total + tilt_prior(at[0], at[1], prior.first, prior.tilt)
+    total = total + 0.5 * (at[3:] / max(prior.offset, FIXED)).square().sum()
+    if prior.ground is not None:
+        total = total + 0.5 * ((at[2] - prior.ground) / FIXED).square()
+    return total
+
+
+def fit_plane(
+    votes: Votes,
+    prior: Prior,
+    start: Float[Tensor, " unknowns"],
+    sigmas: tuple[float, ...],
+    steps: int,
+) -> Fit:
+    """Descend from `start` with one scale of the robust price after the other."""
+    at = start
+    for sigma in sigmas:
+        at = _descend(votes, prior, at, sigma, steps)
+    return Fit(at, float(price(at, votes, prior, sigmas[-1])), sigmas[-1], prior)
+
+
+def _descend(
+    votes: Votes, prior: Prior, at: Float[Tensor, " unknowns"], sigma: float, steps: int
+) -> Float[Tensor, " unknowns"]:
+    """Levenberg-Marquardt with the weights of Geman-McClure."""
+    damping, value = 1e-3, float(price(at, votes, prior, sigma))
+    for _ in range(steps):
+        residual, slope = _linear(at, votes)
+        pull = votes.weight / (1 + (residual / sigma).square()).square()
+        trust = _prior_weights(at, prior)
+        hessian = slope.mT @ (pull[:, None] * slope) + trust.diag()
+        gradient = slope.mT @ (pull * residual) + trust * (at - _centre(at, prior))
+        while damping < 1e8:
+            change = torch.linalg.solve(hessian + damping * hessian.diag().diag(), gradient)
+            lower = float(price(at - change, votes, prior, sigma))
+            if lower <= value:
+                break
+            damping *= 5
+        else:
+            return at
+        at, damping, gain, value = at - change, damping / 5, value - lower, lower
+        if gain < 1e-12 * (1 + value):
+            return at
+    return at
+
+
+def _linear(
+    at: Float[Tensor, " unknowns"], votes: Votes
+) -> tuple[Float[Tensor, " soles"], Float[Tensor, "soles unknowns"]]:
+    """Heights above the floor [m] and their derivatives."""
+    (pitch, roll), points = at[:2], votes.soles.points_cam
+    offset = at[3:][votes.person_of]
+    residual = heights(points, tilted(pitch, roll), at[2]) - offset
+    up = up_cam(pitch, roll)
+    by_pitch = up_cam(pitch + math.pi / 2, roll)
+    by_roll = torch.stack([up[1], -up[0], torch.zeros_like(pitch)])
+    floats = torch.nn.functional.one_hot(votes.person_of, len(votes.people)).to(points)
+    ground = torch.ones_like(residual)
+    slope = torch.stack([points @ by_pitch, points @ by_roll, -ground], -1)
+    return residual, torch.cat([slope, -floats], -1)
+
+
+def _centre(at: Float[Tensor, " unknowns"], prior: Prior) -> Float[Tensor, " unknowns"]:
+    ground = at[2:3] if prior.ground is None else at.new_tensor([prior.ground])
+    return torch.cat([prior.first, ground, torch.zeros_like(at[3:])])
+
+
+def _prior_weights(at: Float[Tensor, " unknowns"], prior: Prior) -> Float[Tensor, " unknowns"]:
+    """One over the variance that the prior gives each unknown, its long tail included."""
+    tilt = prior.tilt**-2 / (1 + (at[:2] - prior.first).square().sum() / prior.tilt**2 / TAIL)
+    ground = at.new_tensor([0.0 if prior.ground is None else FIXED**-2])
+    floats = torch.full_like(at[3:], max(prior.offset, FIXED) ** -2)
+    return torch.cat([tilt.expand(2), ground, floats])
+
+
+def covariance_of(fit: Fit, votes: Votes) -> Float[Tensor, "3 3"]:
+    """Covariance of pitch [rad], roll [rad] and ground [m] from the spread of the feet themselves.
+
+    A sandwich: the curvature of the price, and the variance of its gradient, in which the frames of
+    one place err together. The mean offset of the people counts as known (see align_camera).
+    """
+    residual, slope = _linear(fit.at, votes)
+    rows = votes.row_of.bincount()
+    per_row = rows.double()[:, None]
+    place = torch.zeros_like(rows).scatter(0, votes.row_of, votes.place_of)
+    height = (
+        residual.new_zeros(len(rows), 1).index_add(0, votes.row_of, residual[:, None]) / per_row
+    )
+    lean = slope.new_zeros(len(rows), slope.shape[1]).index_add(0, votes.row_of, slope) / per_row
+    mass = votes.weight.new_zeros(len(rows)).index_add(0, votes.row_of, votes.weight)
+    height = height[:, 0]
+    inlier = height.abs() < max(2 * fit.sigma, 3 * 1.4826 * float(height.abs().median()))
+    lean, mass, place = lean[inlier], mass[inlier], place[inlier].unique(return_inverse=True)[1]
+    height = height[inlier]
+    squared = (height / fit.sigma).square()
+    bend = ((1 - 3 * squared) / (1 + squared) ** 3).mean().clamp_min(0.2)
+    curvature = bend * lean.mT @ (mass[:, None] * lean)
+    trust = _certain(fit)
+    bread = torch.linalg.inv(curvature + trust)
+    freedom = float((bread @ curvature).trace())
+    step, spot = _noise(height, place, freedom)
+    shared = slope.new_zeros(int(place.max()) + 1, lean.shape[1])
+    shared = shared.index_add(0, place, mass[:, None] * lean)
+    step, spot = CAUTION * step * bend.square(), CAUTION * spot * bend.square()
+    meat = step * lean.mT @ (mass.square()[:, None] * lean) + spot * shared.mT @ shared
+    return (bread @ (meat + trust) @ bread)[:3, :3]
+
+
+def _certain(fit: Fit) -> Float[Tensor, "unknowns unknowns"]:
+    """Prior weights for the covariance: never quite nothing; people float by zero on average."""
+    weights = _prior_weights(fit.at, fit.prior)
+    weights = torch.cat([weights[:2].clamp_min(FLAT**-2), weights[2:].clamp_min(1e-2)])
+    common = torch.cat([torch.zeros_like(weights[:3]), torch.ones_like(weights[3:])])
+    known = 0.0 if fit.prior.ground is not None else FIXED**-2
+    return weights.diag() + known * common[:, None] * common
+
+
+def _noise(
+    height: Float[Tensor, " rows"], place: Int[Tensor, " rows"], freedom: float
+) -> tuple[float, float]:
+    """Variance of the feet's heights, new in each frame and shared by a place [m²]."""
+    stay = place.bincount().double()
+    mean = torch.zeros_like(stay).index_add(0, place, height) / stay
+    within = float((height - mean[place]).square().sum())
+    step = (within + BELIEF * STEP_NOISE**2) / (float(len(height) - len(stay)) + BELIEF)
+    free = max(len(stay) - freedom, 0.0)
+    between = float(mean.square().sum()) - step * float(stay.reciprocal().mean()) * free
+    spot = (max(between, 0.0) + BELIEF * PLACE_NOISE**2) / (free + BELIEF)
+    return step, spot

@@ -1,0 +1,79 @@
+"""Several starts of the descent: spread, thin out, choose."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..geometry.rotations import wrap
+from ..types import Layout
+
+TURNED = math.radians(20)  # candidates nearer than this in yaw,
+MOVED = 0.3  # and than this in place [m], are one
+
+
+def spread(layout: Layout, yaws: int) -> Layout:
+    """Each start turned evenly round, the unturned ones first."""
+    turns = torch.arange(yaws).to(layout.yaw) * (2 * math.pi / yaws)
+    yaw = wrap(layout.yaw + turns[:, None, None]).flatten(0, 1)
+    return Layout(
+        layout.t_world_object.repeat(yaws, 1, 1), yaw, layout.log_scale.repeat(yaws, 1, 1)
+    )
+
+
+def best_few(
+    layout: Layout, energy: Float[Tensor, "starts objects"], keep: int, *, apart: bool = True
+) -> Layout:
+    """For each object its best starts, best first; `apart`: only such as really differ.
+
+    Where fewer than `keep` differ, the best of the rest fill up, so that all objects have as many.
+    """
+    order = energy.argsort(0)
+    if apart:
+        columns = [_differing(layout, order[:, i], i) for i in range(order.shape[1])]
+        order = torch.stack(columns, 1)
+    return pick(layout, order[:keep])
+
+
+def _differing(layout: Layout, order: Tensor, index: int) -> Tensor:
+    """Indices of one object's starts: first those that differ from all better ones, then the rest."""
+    kept: list[int] = []
+    rest: list[int] = []
+    for start in order.tolist():
+        yaw, place = layout.yaw[start, index], layout.t_world_object[start, index]
+        same = any(
+            float(wrap(yaw - layout.yaw[k, index]).abs()) < TURNED
+            and float((place - layout.t_world_object[k, index]).norm()) < MOVED
+            for k in kept
+        )
+        (rest if same else kept).append(start)
+    return torch.tensor(kept + rest)
+
+
+def pick(layout: Layout, index: Tensor) -> Layout:
+    """Starts by index, an own one for each object: `index` is (new starts, objects)."""
+    wide = index.unsqueeze(-1).expand(-1, -1, 3)
+    return Layout(
+        layout.t_world_object.gather(0, wide),
+        layout.yaw.gather(0, index),
+        layout.log_scale.gather(0, wide),
+    )
+
+
+def choose(
+    layout: Layout,
+    energy: Float[Tensor, "starts objects"],
+    reference: Float[Tensor, " objects"],
+    tie: float,
+) -> Layout:
+    """The best start of each object.
+
+    Tables and cabinets look alike when turned, so a turn away from the reference yaw counts:
+    candidates rank by (E + 0.01) (1 + tie (1 - cos d) / 2), relative so that wrong shapes, whose
+    energy is high, are not turned for a small gain.
+    """
+    turned = 1 - (layout.yaw - reference).cos()
+    rank = (energy + 0.01) * (1 + tie * turned / 2)
+    best = pick(layout, rank.argmin(0, keepdim=True))
+    return Layout(best.t_world_object[0], best.yaw[0], best.log_scale[0])

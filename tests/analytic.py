@@ -1,0 +1,111 @@
+"""A noiseless room of boxes whose evidence is known in closed form."""
+
+from dataclasses import replace
+
+import torch
+
+from mover.energy import HumanCues, ImageCues
+from mover.geometry.camera import project, tilted, to_camera
+from mover.geometry.crops import crop_views
+from mover.geometry.mesh import edges_of
+from mover.geometry.placement import place
+from mover.geometry.raster import Topology, look
+from mover.geometry.volume import Volume
+from mover.stages.place_objects import PlaceInputs
+from mover.terms.collision import BodySpace
+from mover.terms.contact import Touches
+from mover.terms.depth import DepthRange
+from mover.types import Camera, Layout, Objects
+
+GROUND = -1.4
+SIZES = ((0.5, 0.45, 0.5), (1.2, 0.7, 0.8), (0.4, 1.8, 0.9))
+PLACES = ((-0.9, GROUND, -2.8), (0.5, GROUND, -3.6), (1.7, GROUND, -4.6))
+YAWS = (0.3, -0.5, 0.8)
+FACES = torch.tensor([
+    [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+    [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+])  # fmt: skip
+
+
+def box_verts(size):
+    """Corners of a box whose bottom is centred at the origin; FACES wind outward."""
+    corners = torch.cartesian_prod(*(torch.tensor(s, dtype=torch.float64) for s in ((-0.5, 0.5), (0.0, 1.0), (-0.5, 0.5))))
+    return corners * torch.tensor(size, dtype=torch.float64)
+
+
+def grid_on_top(size, n=6):
+    u = torch.linspace(-0.45, 0.45, n, dtype=torch.float64)
+    x, z = torch.meshgrid(u, u, indexing="ij")
+    points = torch.stack([x.flatten() * size[0], torch.full((n * n,), size[1], dtype=torch.float64), z.flatten() * size[2]], -1)
+    return points
+
+
+def make_inputs(dtype=torch.float32, size=96):
+    """Everything that `place_objects` needs, at the truth."""
+    camera = Camera(
+        torch.tensor([[500.0, 0, 320], [0, 500.0, 180], [0, 0, 1]], dtype=dtype),
+        tilted(torch.tensor(-0.2, dtype=dtype), torch.tensor(0.03, dtype=dtype)), 640, 360,
+    )  # fmt: skip
+    verts = torch.stack([box_verts(s) for s in SIZES]).to(dtype)
+    n = len(SIZES)
+    top = torch.stack([grid_on_top(s) for s in SIZES]).to(dtype)
+    objects = Objects(
+        ids=("stool", "table", "cabinet"), categories=("stool", "table", "cabinet"), verts=verts,
+        real_verts=torch.ones(n, 8, dtype=torch.bool), faces=FACES.expand(n, -1, -1).clone(),
+        edges=edges_of(FACES).expand(n, -1, -1).clone(), samples=top, size=torch.tensor(SIZES, dtype=dtype),
+        top=top, back=torch.zeros_like(top), has_top=torch.ones(n, dtype=torch.bool),
+        has_back=torch.zeros(n, dtype=torch.bool), is_seat=torch.tensor([True, False, False]),
+        supports=torch.full((n,), -1),
+    )  # fmt: skip
+    truth = Layout(
+        torch.tensor(PLACES, dtype=dtype), torch.tensor(YAWS, dtype=dtype), torch.zeros(n, 3, dtype=dtype)
+    )
+    image = image_at(objects, truth, camera, size)
+    return PlaceInputs(
+        objects, camera, GROUND, image, humans_at(objects, truth, camera, image),
+        Layout(truth.t_world_object[None], truth.yaw[None], truth.log_scale[None]), truth.yaw,
+    )  # fmt: skip
+
+
+def image_at(objects, layout, camera, size):
+    verts = to_camera(place(objects.verts, layout), camera.R_cam_world)
+    pixels = project(verts, camera.K)
+    boxes = torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
+    views = crop_views(camera.K, boxes, 0.3, size)
+    drawn, _ = look(verts, Topology(objects.faces, objects.edges), views, depth=False)
+    n = len(boxes)
+    keep = torch.ones(n, size, size, dtype=torch.bool)
+    return ImageCues(boxes, torch.ones(n, 4, dtype=torch.bool), views, drawn, keep, torch.ones(n).to(boxes))
+
+
+def humans_at(objects, layout, camera, image):
+    """Depth limits a hand's breadth off, bodies that fill the space above the table, touched tops."""
+    verts = to_camera(place(objects.verts, layout), camera.R_cam_world)
+    _, seen = look(verts, Topology(objects.faces, objects.edges), image.views, depth=True)
+    lowest = torch.full_like(seen.nearest, float("-inf"))
+    near = torch.where(seen.covered, seen.nearest - 0.1, lowest)
+    far = torch.where(seen.covered, seen.nearest + 0.1, -lowest)
+    area = (640 / camera.width * camera.K[0, 0] / image.views.K[:, 0, 0]).square()
+    y = GROUND + 0.15 * torch.arange(60) - 0.2
+    values = (GROUND + 2.2 - y).clamp(-0.3, 0.3).to(near).expand(40, 40, 60).transpose(1, 2)
+    volume = Volume(values.contiguous(), torch.tensor([-3.0, GROUND - 0.2, -6.0]).to(near), 0.15)
+    points = place(objects.top, layout)[:2].unsqueeze(1).expand(-1, 4, -1, -1)
+    weight = torch.zeros(points.shape[:-1]).to(near)
+    weight[:, 0] = 1.0
+    heading = torch.stack([layout.yaw[:2].sin(), layout.yaw[:2].cos()], -1)
+    touches = Touches(
+        torch.tensor([0, 1]), points.contiguous(), weight, torch.tensor([6.0, 6.0]).to(near), heading
+    )
+    return HumanCues(DepthRange(near, far, lowest, area), BodySpace(volume), touches)
+
+
+def moved(layout, seed, size):
+    g = torch.Generator().manual_seed(seed)
+
+    def noise(x):
+        return size * (2 * torch.rand(x.shape, generator=g, dtype=torch.float64).to(x) - 1)
+
+    return replace(
+        layout, t_world_object=layout.t_world_object + noise(layout.t_world_object),
+        yaw=layout.yaw + noise(layout.yaw), log_scale=layout.log_scale + noise(layout.log_scale),
+    )  # fmt: skip

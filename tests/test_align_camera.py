@@ -1,0 +1,242 @@
+"""Camera and ground from soles: analytic floors, noise, and what feet cannot tell."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mover.geometry.camera import pitch_roll, tilted
+from mover.stages.align_camera import AlignConfig, AlignInputs, align_camera
+from mover.stages.plane_fit import Prior, covariance_of, fit_plane, price, vote
+from mover.terms.feet import Soles, feet_term, heights, tilt_prior, up_cam
+from mover.types import Camera
+
+PITCH, ROLL, GROUND = math.radians(-11), math.radians(1.5), -1.6
+K = torch.tensor([[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]])
+PAPER = AlignConfig(sigmas=(0.1,), tilt_prior=math.inf, offset_prior=0, votes="points")
+
+
+def rotation(pitch, roll):
+    return tilted(torch.tensor(pitch).double(), torch.tensor(roll).double())
+
+
+def camera_off(degrees=(0.0, 0.0)):
+    pitch, roll = PITCH + math.radians(degrees[0]), ROLL + math.radians(degrees[1])
+    return Camera(K, rotation(pitch, roll).float(), 1280, 720)
+
+
+def soles_at(spots, seed=0, frames=3, noise=0.0, wrong=0.0, person=0, bias=0.0):
+    """Soles on the floor of a known camera: `frames` at every (x, z), four points each."""
+    rng, points = np.random.default_rng(seed), []
+    for x, z in spots:
+        for _ in range(frames):
+            y = GROUND + bias + rng.normal(0, noise)
+            y += rng.uniform(0.1, 0.7) * (rng.random() < wrong)
+            patch = rng.uniform(-0.04, 0.04, (4, 2))
+            points += [(x + a, y, z + b) for a, b in patch]
+    cam = torch.tensor(np.array(points)) @ rotation(PITCH, ROLL).mT
+    frame = torch.arange(len(points)) // 4
+    return Soles(cam.float(), torch.full_like(frame, person), frame, ())
+
+
+def room(n=20, seed=0):
+    rng = np.random.default_rng(seed)
+    return np.stack([rng.uniform(-1.5, 1.5, n), -rng.uniform(2, 5, n)], -1)
+
+
+def line(n=14, angle=0.4, feet=0.2):
+    """A straight walk; the feet are `feet` [m] apart."""
+    along, side = np.linspace(-1, 1, n), feet / 2 * (-1.0) ** np.arange(n)
+    c, s = math.cos(angle), math.sin(angle)
+    return np.stack([along * c - side * s, along * s + side * c - 3.5], -1)
+
+
+def joined(*parts):
+    return Soles(
+        *(torch.cat([getattr(p, n) for p in parts]) for n in ("points_cam", "person", "frame")), ()
+    )
+
+
+def errors(found):
+    """Errors of pitch and roll [degrees] and ground [m]."""
+    pitch, roll = pitch_roll(found.camera.R_cam_world.double())
+    return np.array([math.degrees(pitch - PITCH), math.degrees(roll - ROLL), found.ground - GROUND])
+
+
+def align(soles, camera, ground=None, height=None, config=AlignConfig()):
+    return align_camera(AlignInputs(soles, camera, ground, height), config)
+
+
+@pytest.mark.parametrize("config", [AlignConfig(), PAPER], ids=["robust", "paper"])
+@pytest.mark.parametrize("off", [(3.0, -4.0), (-4.0, 3.0), (20.0, -8.0)])
+def test_a_clean_floor_is_found_from_any_guess(config, off):
+    found = align(soles_at(room()), camera_off(off), config=config)
+    assert np.abs(errors(found)).max() < 0.02
+    assert abs(errors(found)[2]) < 0.001
+
+
+@pytest.mark.parametrize("ground", [None, -1.2, 0.4])
+def test_outliers_and_a_wrong_ground_do_no_harm(ground):
+    walked = soles_at(room(60), frames=2, noise=0.006, wrong=0.25)
+    pitch, roll, floor = np.abs(errors(align(walked, camera_off((3.0, -3.0)), ground)))
+    assert max(pitch, roll) < 0.1
+    assert floor < 0.005
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("spots", [line(feet=0.0), line(), line(angle=1.5)], ids=["0", "1", "2"])
+def test_a_straight_walk_is_never_worse_than_the_guess(spots, seed):
+    sign = (-1.0) ** seed, 1.0
+    off = 3 * sign[0], 3 * sign[1]
+    found = align(soles_at(spots, seed=seed, noise=0.01), camera_off(off))
+    assert np.linalg.norm(errors(found)[:2]) < np.linalg.norm(off)
+    assert np.abs(errors(found)[:2]).max() < 3.6
+    assert len(found.warnings) == 1
+    assert "line" in found.warnings[0]
+
+
+def test_the_tilt_about_an_exact_line_stays_at_the_guess():
+    spots = line(feet=0.0, angle=0.0)
+    still = soles_at(spots, noise=0.0)
+    flat = Soles(
+        still.points_cam.reshape(-1, 4, 3).mean(1), still.person[::4], still.frame[::4], ()
+    )
+    pitch, roll, _ = errors(align(flat, camera_off((3.0, 3.0))))
+    assert abs(pitch - 3) < 0.3  # the ends of the line are seen from different distances
+    assert abs(roll) < 0.1
+
+
+@pytest.mark.parametrize("config", [AlignConfig(), PAPER], ids=["robust", "paper"])
+def test_one_frame_moves_only_the_ground(config):
+    found = align(soles_at([(0.3, -3.0)], frames=1), camera_off((3.0, -2.0)), config=config)
+    if config is not PAPER:  # the paper has no prior: any tilt through four points is as good
+        assert np.abs(errors(found)[:2] - [3, -2]).max() < 0.1
+    world = soles_at([(0.3, -3.0)], frames=1).points_cam @ found.camera.R_cam_world
+    assert abs(float(world[:, 1].mean()) - found.ground) < 2e-3
+    assert "single frame" in found.warnings[0]
+
+
+@pytest.mark.parametrize("bias", [0.03, -0.03])
+@pytest.mark.parametrize("apart", [True, False])
+def test_two_people_with_opposite_depth_bias_are_never_worse_than_the_guess(bias, apart):
+    side = room(15, seed=1) * [0.3, 1] + ([1.0, 0] if apart else [0, 0])
+    other = room(15, seed=2) * [0.3, 1] - ([1.0, 0] if apart else [0, 0])
+    soles = joined(
+        soles_at(side, noise=0.01, person=4, bias=bias),
+        soles_at(other, noise=0.01, person=9, bias=-bias, seed=5),
+    )
+    found = align(soles, camera_off((2.0, -2.0)))
+    assert np.abs(errors(found)[:2]).max() < (1.8 if apart else 0.4)
+    assert abs(errors(found)[2]) < 0.02
+    assert found.offsets.keys() == {"4", "9"}
+    assert abs(found.offsets["4"] + found.offsets["9"]) < 1e-6
+    if not apart:
+        assert abs(found.offsets["4"] - bias) < 0.01
+
+
+def test_offsets_help_where_people_walk_in_the_same_place():
+    biased = [soles_at(room(12, s), person=s, bias=b, seed=s) for s, b in ((0, 0.03), (1, -0.03))]
+    without = AlignConfig(offset_prior=0)
+    free, stiff = (align(joined(*biased), camera_off(), config=c) for c in (AlignConfig(), without))
+    assert np.abs(errors(free)[:2]).max() < np.abs(errors(stiff)[:2]).max() < 2
+
+
+@pytest.mark.parametrize(("frames", "noise"), [(1, 0.015), (6, 0.02)])
+def test_the_covariance_is_calibrated(frames, noise):
+    rng, scores = np.random.default_rng(3), []
+    for seed in range(200):
+        soles = soles_at(room(15, seed), seed=seed + 999, frames=frames, noise=noise)
+        found = align(soles, camera_off(rng.normal(0, 3, 2)))
+        spread = found.covariance.diag().sqrt().numpy() * [180 / math.pi, 180 / math.pi, 1]
+        scores.append(np.abs(errors(found)) < 1.645 * spread)
+    assert (np.mean(scores, 0) >= 0.80).all()
+    assert (np.mean(scores, 0) <= 0.97).all()
+
+
+def test_frames_of_one_pose_are_no_new_evidence():
+    rng = np.random.default_rng(0)
+    spots = room(8)
+    parts = [
+        soles_at([s], frames=40, noise=0.002, bias=rng.normal(0, 0.015), seed=i)
+        for i, s in enumerate(spots)
+    ]
+    stood = joined(*parts)
+    stood = Soles(stood.points_cam, stood.person, torch.arange(len(stood.person)) // 4, ())
+    found = align(stood, camera_off((2.0, 2.0)))
+    spread = found.covariance.diag().sqrt().numpy() * [180 / math.pi, 180 / math.pi, 1]
+    assert (np.abs(errors(found)) < 2.5 * spread).all()
+    assert spread[1] > 0.2
+
+
+def test_a_known_camera_height_is_the_ground_and_people_of_a_wrong_size_are_told():
+    soles = soles_at(room(), noise=0.005, bias=-0.08)
+    found = align(soles, camera_off((2.0, -2.0)), height=-GROUND)
+    assert found.ground == GROUND
+    assert np.abs(errors(found)[:2]).max() < 0.5
+    assert found.offsets["0"] == pytest.approx(-0.08, abs=0.015)
+    assert any("person 0 stands 8 cm below the floor" in w for w in found.warnings)
+
+
+def test_without_feet_everything_stays_and_a_warning_says_so():
+    none = torch.zeros(0, dtype=torch.long)
+    soles = Soles(torch.zeros(0, 3), none, none, ())
+    for ground, height, expected in ((-1.3, None, -1.3), (-1.3, 1.4, -1.4), (None, None, -1.5)):
+        found = align(soles, camera_off((1.0, 2.0)), ground, height)
+        assert np.allclose(errors(found)[:2], [1, 2], atol=1e-4)
+        assert found.ground == expected
+        assert "no feet" in found.warnings[0]
+
+
+def test_the_result_is_a_minimum_of_feet_term_and_prior():
+    votes = vote(soles_at(room(), noise=0.02, wrong=0.2), "places")
+    prior = Prior(torch.tensor([PITCH + 0.05, ROLL - 0.05]).double(), 0.07, 0.03, None)
+    start = torch.tensor([PITCH, ROLL, GROUND, 0.0]).double()
+    fit = fit_plane(votes, prior, start, (0.1, 0.02), 60)
+    at = fit.at.clone().requires_grad_()
+    price(at, votes, prior, 0.02).backward()
+    assert at.grad.abs().max() < 1e-4 * votes.weight.sum() * 0.02
+    around = [
+        float(price(fit.at + d, votes, prior, 0.02))
+        for d in 1e-3 * torch.randn(50, 4, generator=torch.Generator().manual_seed(0)).double()
+    ]
+    assert min(around) >= fit.price
+    assert torch.linalg.eigvalsh(covariance_of(fit, votes).double()).min() > 0
+
+
+def test_places_share_their_votes():
+    once, often = soles_at(room(3), frames=1), soles_at([(0.0, -3.0)], frames=50)
+    votes = vote(joined(once, Soles(often.points_cam, often.person, often.frame + 3, ())), "places")
+    stood, walked = votes.weight[12:].sum(), votes.weight[:4].sum()
+    assert len(votes.place_of.unique()) == 4
+    assert 2 < stood / walked < 6
+    assert vote(once, "points").weight.unique().numel() == 1
+
+
+def test_the_term_is_the_printed_formula_point_by_point():
+    soles, rng = soles_at(room(3)), np.random.default_rng(0)
+    R, ground = rotation(-0.2, 0.1), -1.4
+    offset = torch.from_numpy(rng.normal(0, 0.1, 36)).float()
+    got = feet_term(soles, R[None].float(), torch.tensor([ground]), offset, 0.1)[0]
+    for i, point in enumerate(soles.points_cam.double().numpy()):
+        r = (R.numpy().T @ point)[1] - ground - float(offset[i])
+        assert float(got[i]) == pytest.approx(r**2 / (r**2 + 0.01), abs=1e-5)
+    up = up_cam(torch.tensor([-0.2]).double(), torch.tensor([0.1]).double())
+    assert torch.allclose(up[0], R[:, 1])
+
+
+def test_gradients_of_term_and_prior():
+    soles = soles_at(room(2), frames=1)
+    points = soles.points_cam.double()
+    start = torch.tensor([[-0.2, 0.1], [0.1, 0.0]]).double()[:, :, None].repeat(1, 1, 1)[..., 0]
+
+    def term(x):
+        return heights(points, tilted(x[:, 0], x[:, 1]), x[:, 0]).square() + 0
+
+    assert torch.autograd.gradcheck(term, start.clone().requires_grad_())
+    first = torch.tensor([0.0, 0.05]).double()
+    prior = lambda x: tilt_prior(x[:, 0], x[:, 1], first, 0.07)  # noqa: E731
+    assert torch.autograd.gradcheck(prior, start.clone().requires_grad_())
+    at = first[None] + torch.tensor([[0.0, 0.007]]).double()
+    assert float(prior(first[None])) == 0
+    assert float(prior(at)) == pytest.approx(0.5 * 0.01, rel=0.01)

@@ -1,0 +1,324 @@
+"""Each mistake in a file gives one message that names file, field, found and expected."""
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tiny_capture as tiny
+
+from mover.readers import read_capture
+from mover.records import InputError
+
+NAN = float("nan")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tiny.write_capture(tmp_path / "tiny")
+
+
+def put(tree: Any, path: str, value: Any) -> None:
+    """Set the field `a.0.b` of nested lists and objects; `...` deletes it."""
+    *way, last = [int(key) if key.isdigit() else key for key in path.split(".")]
+    for key in way:
+        tree = tree[key]
+    if value is ...:
+        del tree[last]
+    else:
+        tree[last] = value
+
+
+def refused(folder: Path, file: str, words: str) -> str:
+    with pytest.raises(InputError, match=words) as caught:
+        read_capture(folder)
+    message = str(caught.value)
+    assert message.startswith(file), message
+    assert "expected" in message
+    assert "\n" not in message
+    return message
+
+
+SQUARE = {"size": [10, 10], "counts": [100]}
+JSON = [
+    ("camera.json", "w", 0, "'w' has 0, expected a whole number"),
+    ("camera.json", "w", 64.5, "'w'"),
+    ("camera.json", "w", 30000, "'camera.w'|'w'"),
+    ("camera.json", "h", ..., "'h' has nothing"),
+    ("camera.json", "fl_x", 0.0, "'fl_x' has 0.0, expected a number above 0"),
+    ("camera.json", "fl_x", -3, "'fl_x' has -3"),
+    ("camera.json", "fl_y", NAN, "'fl_y' has nan"),
+    ("camera.json", "cx", "a", "'cx' has \"a\""),
+    ("camera.json", "cy", float("inf"), "'cy' has inf"),
+    ("camera.json", "cy", True, "'cy' has True"),
+    ("camera.json", "k1", 0.1, "'k1'.*undistort"),
+    ("camera.json", "height", -1.4, "'height' has -1.4"),
+    ("camera.json", "R_cam_world", [[1, 0, 0], [0, 1, 0]], "2 items"),
+    ("camera.json", "R_cam_world", [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "rotation matrix"),
+    ("camera.json", "R_cam_world", [[2, 0, 0], [0, 2, 0], [0, 0, 2]], "rotation matrix"),
+    ("camera.json", "R_cam_world", [[1, 0, 0], [0, 1, 0], [0, 0, NAN]], r"R_cam_world\[2\]\[2\]"),
+    ("scene.json", "format", "usd", "'format' has \"usd\", expected one of mover-scene"),
+    ("scene.json", "version", 2, "'version' has 2"),
+    ("scene.json", "ground", {"height": NAN}, "'ground.height' has nan"),
+    ("scene.json", "ground", 3, "'ground' has 3"),
+    ("scene.json", "objects", {}, "'objects' has {}"),
+    ("scene.json", "objects.0.id", "chair 0", r"'objects\[0\].id' has \"chair 0\""),
+    ("scene.json", "objects.0.id", "../chair", "id"),
+    ("scene.json", "objects.0.id", ".hidden", "id"),
+    ("scene.json", "objects.0.id", "ground", "id"),
+    ("scene.json", "objects.0.id", "", "text"),
+    ("scene.json", "objects.1.id", "CHAIR_0", "used twice"),
+    ("scene.json", "objects.0.category", None, "category"),
+    ("scene.json", "objects.0.mesh", "../lamp.glb", "inside the capture"),
+    ("scene.json", "objects.0.mesh", "/etc/passwd", "inside the capture"),
+    ("scene.json", "objects.0.mesh", "meshes/no.glb", "does not exist"),
+    ("scene.json", "objects.0.mesh", "camera.json", "a file of kind"),
+    ("scene.json", "objects.0.annotation", 12, "'objects.0..annotation' has 12"),
+    ("scene.json", "objects.0.annotation", 5, "used twice"),
+    ("scene.json", "objects.0.annotation", "11", "whole number"),
+    ("scene.json", "objects.0.translation", [0, 0], "2 items, expected a list of 3"),
+    ("scene.json", "objects.0.translation", [0, 0, NAN], r"translation\[2\]"),
+    ("scene.json", "objects.0.translation", [0, 0, 1e300], r"translation\[2\]"),
+    ("scene.json", "objects.0.yaw", [0.1], "yaw"),
+    ("scene.json", "objects.0.yaw", 10**400, "yaw"),
+    ("scene.json", "objects.0.scale", 1.0, "scale"),
+    ("scene.json", "objects.0.scale", [1, 0, 1], r"scale\[1\]' has 0, expected a number above 0"),
+    ("scene.json", "objects.0.scale", [1, 1, -1], r"scale\[2\]"),
+    ("scene.json", "objects.0.support", "sofa", "'sofa'"),
+    ("scene.json", "objects.0.support", "chair_0", "circle"),
+    ("scene.json", "objects.0.support", "Lampe_ä.2", "circle"),
+    ("scene.json", "camera", {"w": 64}, "'camera.h' has nothing"),
+    ("objects.json", "images", [], "0 items"),
+    ("objects.json", "images.0.width", 63, "'images.0..width' has 63, expected 64"),
+    ("objects.json", "images.0.file_name", "no.png", "does not exist"),
+    ("objects.json", "images.0.file_name", "../no.png", "inside the capture"),
+    ("objects.json", "images.0.file_name", "camera.json", "cannot be read"),
+    ("objects.json", "categories.0.name", 3, "name"),
+    ("objects.json", "categories.1.id", 62, "used twice"),
+    ("objects.json", "annotations.0.id", ..., "'annotations.0..id' has nothing"),
+    ("objects.json", "annotations.1.id", 11, "used twice"),
+    ("objects.json", "annotations.0.image_id", 0, "expected 4"),
+    ("objects.json", "annotations.0.category_id", 1, "one of the categories"),
+    ("objects.json", "annotations.0.score", 1.5, "score"),
+    ("objects.json", "annotations.0.bbox", [1, 2, 3], "3 items"),
+    ("objects.json", "annotations.0.bbox", [1, 2, 0, 4], "above 0"),
+    ("objects.json", "annotations.0.bbox", [1, 2, NAN, 4], r"bbox\[2\]"),
+    ("objects.json", "annotations.0.bbox", [64, 2, 3, 4], "inside the image of 64 x 48"),
+    ("objects.json", "annotations.0.segmentation", SQUARE, r"size \[10, 10\], expected \[48, 64\]"),
+    ("objects.json", "annotations.0.segmentation.counts", [5], "sum to"),
+    ("objects.json", "annotations.0.segmentation.counts", "0", "sum to"),
+    ("objects.json", "annotations.0.segmentation.counts", [48 * 64], "an empty mask"),
+    ("objects.json", "annotations.1.segmentation.0", [1, 1, 2, 2], "4 items"),
+    ("objects.json", "annotations.1.segmentation.0", [1, 1, 1, 1, 1, 1], "an empty mask"),
+    ("people.json", "info.fps", 0, "'info.fps' has 0"),
+    ("people.json", "info.heights", {"0": 178}, "'info.heights.0' has 178"),
+    ("people.json", "info.heights", {"Anna": 1.7}, "number of a track"),
+    ("people.json", "images.1.id", 0, "not used twice"),
+    ("people.json", "images.0.id", -1, "-1"),
+    ("people.json", "images.0.width", 65, "65"),
+    ("people.json", "annotations.0.image_id", 2, "one of the images"),
+    ("people.json", "annotations.0.track_id", ..., "track_id"),
+    ("people.json", "annotations.1.track_id", 0, "used twice"),
+    ("people.json", "annotations.0.segmentation", SQUARE, r"\[48, 64\]"),
+    ("people.json", "annotations.0.category_id", 9, "one of the categories"),
+    ("people.json", "reference_people.0.segmentation.counts", [1], "sum to 1"),
+]
+
+
+@pytest.mark.parametrize(("file", "path", "value", "words"), JSON)
+def test_a_wrong_field_is_named(
+    folder: Path, file: str, path: str, value: object, words: str
+) -> None:
+    tree = json.loads((folder / file).read_text())
+    put(tree, path, value)
+    (folder / file).write_text(json.dumps(tree))
+    refused(folder, file, words)
+
+
+def with_nan(array: np.ndarray) -> np.ndarray:
+    bad = array.copy()
+    bad[1, 2, 0] = NAN
+    return bad
+
+
+VERTS = tiny.bodies()["vertices"]
+ARRAYS = [
+    ("vertices", with_nan(VERTS), r"nan at \[1, 2, 0\]"),
+    ("vertices", VERTS * np.float32(1e30), "finite"),
+    ("vertices", VERTS[:2], r"shape \(2, 4, 3\) of float32, expected .*\(3, V, 3\)"),
+    ("vertices", VERTS[..., :2], "vertices"),
+    ("vertices", VERTS[:, :0], "at least one point"),
+    ("vertices", VERTS.astype(complex), "complex"),
+    ("vertices", VERTS.astype(str), "vertices"),
+    ("vertices", ..., "'vertices' has nothing"),
+    ("faces", ..., "'faces' has nothing"),
+    ("faces", np.zeros((0, 3), dtype=int), "an empty mesh"),
+    ("faces", tiny.BODY_FACES + 1, "vertices 1 to 4, expected vertices 0 to 3"),
+    ("faces", tiny.BODY_FACES - 1, "vertices -1"),
+    ("faces", tiny.BODY_FACES.astype(float), "whole numbers"),
+    ("frame", np.array([0, 0]), r"'person' has|'vertices' has"),
+    ("frame", np.array([0, 0, -1]), "'frame' has -1"),
+    ("frame", np.array([0, 0, 1 << 40]), "'frame' has 1099511627776"),
+    ("frame", np.array([0.0, 0, 1]), "whole numbers"),
+    ("frame", np.array(0), "shape"),
+    ("frame", ..., "'frame' has nothing"),
+    ("person", np.array([0, 0, 0]), "frame 0 of person 0 twice"),
+    ("space", np.array("room"), "'space' has \"room\", expected one of camera, world"),
+    ("space", ..., "'space' has nothing"),
+    ("fps", np.array(0.0), "'fps' has 0"),
+    ("fps", np.array([5.0]), "'fps' has shape"),
+    ("joint_names", ..., "'joint_names' has nothing"),
+    ("joint_names", np.array(["one"]), "shape"),
+    ("joints", ..., "'joints' has nothing"),
+    ("body_pose", np.zeros((3, 63)), "'model' has nothing"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "words"), ARRAYS)
+def test_a_wrong_array_is_named(folder: Path, name: str, value: Any, words: str) -> None:
+    arrays = tiny.bodies()
+    put(arrays, name, value)
+    np.savez(folder / "bodies.npz", **arrays)
+    refused(folder, "bodies.npz", words)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (tiny.touch()[:2], "shape"),
+        (tiny.touch() + 0.5, "expected probabilities"),
+        (tiny.touch() * NAN, "finite"),
+    ],
+)
+def test_chances_of_contact_are_checked(folder: Path, value: np.ndarray, words: str) -> None:
+    np.savez(folder / "contacts.npz", probability=value)
+    refused(folder, "contacts.npz", words)
+
+
+@pytest.mark.parametrize("name", ["camera.json", "scene.json", "objects.json"])
+def test_a_missing_file_is_named(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    refused(folder, name, "no such file")
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"\xff\xfe\x00", b"[" * 100_000, b"nan"])
+@pytest.mark.parametrize("name", ["camera.json", "scene.json", "objects.json", "people.json"])
+def test_a_file_that_is_not_json_is_named(folder: Path, name: str, text: bytes) -> None:
+    (folder / name).write_bytes(text)
+    refused(folder, name, "is not JSON")
+
+
+@pytest.mark.parametrize("name", ["bodies.npz", "contacts.npz"])
+def test_a_file_that_is_not_npz_is_named(folder: Path, name: str) -> None:
+    for content in (b"", b"PK\x03\x04 not really", (folder / name).read_bytes()[:200]):
+        (folder / name).write_bytes(content)
+        refused(folder, name, "cannot be read")
+
+
+def test_pickled_objects_are_refused_unread(folder: Path) -> None:
+    np.savez(folder / "bodies.npz", frame=np.array([{"a": 1}], dtype=object))
+    refused(folder, "bodies.npz", "field 'frame'.*no pickled objects")
+
+
+def test_an_array_that_unpacks_to_more_than_the_limit_is_refused_by_its_header(
+    folder: Path,
+) -> None:
+    header = {"descr": "<f4", "fortran_order": False, "shape": (100_000, 100_000, 3)}
+    path = folder / "bodies.npz"
+    with zipfile.ZipFile(path, "w") as archive, archive.open("vertices.npy", "w") as stream:
+        np.lib.format.write_array_header_1_0(stream, header)
+    refused(folder, "bodies.npz", "field 'vertices'.*bytes or more, expected at most")
+
+
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "cannot be read|empty mesh"),
+        (OBJ, "cannot be read|empty mesh"),
+        (OBJ + "f 1 1 2\n", "empty mesh"),
+        (OBJ + "f 1 2 7\n", "cannot be read|name vertices"),
+        (OBJ.replace("1 0 0", "nan 0 0") + "f 1 2 3\n", "NaN"),
+        (OBJ.replace("0 1 0", "2 0 0") + "f 1 2 3\n", "a line or a point"),
+    ],
+)
+def test_a_mesh_without_a_surface_is_named(folder: Path, text: str, words: str) -> None:
+    (folder / "meshes" / "step.obj").write_text(text)
+    message = refused(folder, "scene.json", words)
+    assert "objects[0].mesh" in message
+
+
+@pytest.mark.parametrize("kind", ["glb", "gltf", "ply", "off", "stl"])
+@pytest.mark.parametrize("content", [b"", b"solid x\n", bytes(range(256)) * 3])
+def test_a_broken_mesh_file_is_named(folder: Path, kind: str, content: bytes) -> None:
+    (folder / "meshes" / f"broken.{kind}").write_bytes(content)
+    scene = tiny.scene()
+    put(scene, "objects.0.mesh", f"meshes/broken.{kind}")
+    (folder / "scene.json").write_text(json.dumps(scene))
+    refused(folder, "scene.json", "broken|empty mesh")
+
+
+def test_a_link_that_leaves_the_folder_is_refused(folder: Path) -> None:
+    outside = folder.parent / "outside.obj"
+    (folder / "meshes" / "step.obj").rename(outside)
+    (folder / "meshes" / "step.obj").symlink_to(outside)
+    refused(folder, "scene.json", "a link that leaves it")
+
+
+def test_a_picture_of_another_size_is_told_with_both_sizes(folder: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(tiny.picture()[:-1]).save(folder / "room.png")
+    refused(folder, "objects.json", "'room.png' with 64 x 47 pixels, expected 64 x 48")
+
+
+def test_frames_behind_the_end_of_the_video_are_refused(folder: Path) -> None:
+    (folder / "frames").mkdir()
+    for frame in range(3):
+        (folder / "frames" / f"{frame:06d}.jpg").touch()
+    refused(folder, "bodies.npz", "'frame' has 3, expected a frame from 0 to 2")
+
+
+@pytest.mark.parametrize(
+    ("file", "path", "value", "words"),
+    [
+        ("objects.json", "annotations.0.bbox", [30, 2, 20, 5], "a box and a mask in different"),
+        ("objects.json", "annotations.0.bbox", [5, 20, 70, 30], "reaches beyond the image"),
+        ("objects.json", "annotations.1.segmentation.0",
+         [40, 10, 80, 10, 80, 30, 40, 30], "leaves the image and was clipped"),
+        ("people.json", "annotations.1.segmentation", None, "1 of 3 people without mask"),
+        ("people.json", "annotations.1.segmentation.counts", [48 * 64], "1 of 3 people without"),
+        ("people.json", "reference_people.0.segmentation", None, "1 people of the reference"),
+        ("scene.json", "ground.height", 0.4, "the ground is not below the camera"),
+        ("scene.json", "objects", [], "there are no objects"),
+        ("camera.json", "R_cam_world", [[-1, 0, 0], [0, 1, 0], [0, 0, -1]], "on its side or head"),
+        ("camera.json", "R_cam_world", [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "straight up or down"),
+    ],
+)  # fmt: skip
+def test_what_is_odd_but_not_wrong_is_told(
+    folder: Path, file: str, path: str, value: object, words: str
+) -> None:
+    tree = json.loads((folder / file).read_text())
+    put(tree, path, value)
+    (folder / file).write_text(json.dumps(tree))
+    assert words in "\n".join(read_capture(folder).warnings)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: {**a, "vertices": a["vertices"] * 1000}, "are they in metres"),
+        (lambda a: {**a, "vertices": -a["vertices"]}, "behind the camera"),
+        (lambda a: {**a, "person": a["person"] + 1}, "3 of 3 bodies have no mask"),
+    ],
+)
+def test_bodies_that_are_odd_are_told(
+    folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]], words: str
+) -> None:
+    np.savez(folder / "bodies.npz", **change(tiny.bodies()))
+    assert words in "\n".join(read_capture(folder).warnings)

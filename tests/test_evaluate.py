@@ -1,0 +1,220 @@
+"""Whole scenes against the truth: what is best, what is absent, what is written."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+from judged import CAMERA, FAST, GROUND, SELF_CONTAINED, cuboid, moved, pair, people, piece, room
+
+from mover.evaluate import METRICS, EvaluatedBodies, evaluate, evaluate_folder, table
+from mover.geometry.camera import tilted, to_camera
+from mover.metrics_bodies import in_world, soles_of
+from mover.readers.bodies_file import write_bodies
+from mover.readers.scene_file import write_scene
+from mover.records import InputError
+
+
+def test_the_truth_scores_best_in_every_metric() -> None:
+    scene, bodies = room(), people()
+    metrics = evaluate(scene, scene, scene, EvaluatedBodies(bodies, bodies, bodies), FAST)
+    assert list(metrics) == ["initial", "result", "objects"]
+    for key in ("initial", "result"):
+        assert set(metrics[key]) == set(METRICS)
+        for name in set(METRICS) - SELF_CONTAINED:
+            assert metrics[key][name] == pytest.approx(METRICS[name].best, abs=1e-6), name
+    for item in metrics["objects"]:
+        for name, value in item["result"].items():
+            assert value == pytest.approx(METRICS[name].best, abs=1e-6), (item["id"], name)
+    json.dumps(metrics, allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("names", "change"),
+    [
+        (("iou3d", "iou2d", "p2s", "center_error"), lambda p, a: moved(p, 0.1 * a, 0, 0)),
+        (("iou3d", "p2s", "center_error"), lambda p, a: moved(p, 0, 0, -0.1 * a)),
+        (("iou3d", "p2s", "yaw_error"), lambda p, a: replace(p, yaw=p.yaw + 0.15 * a)),
+        (("iou3d", "p2s", "size_error"), lambda p, a: replace(p, scale=p.scale * (1 + 0.2 * a))),
+    ],
+)
+def test_a_larger_fault_never_scores_better(names, change) -> None:
+    truth = piece(cuboid(0.6, 0.9, 0.45), (-0.5, GROUND, -2.8), 0.1)
+    rows = []
+    for amount in range(6):
+        metrics = pair(change(truth, amount), truth, 300)
+        rows.append([METRICS[name].measure(metrics) for name in names])
+    for name, values in zip(names, zip(*rows, strict=True), strict=True):
+        worse = 1 if METRICS[name].best == 0 else -1
+        assert all((b - a) * worse >= -1e-9 for a, b in pairwise(values)), name
+        assert (values[-1] - values[0]) * worse > 0.02, name
+
+
+def test_a_missing_object_scores_zero_in_both_overlaps_and_nothing_else() -> None:
+    truth = room()
+    fewer = replace(truth, pieces=truth.pieces[1:])
+    metrics = evaluate(fewer, truth, truth, config=FAST)
+    assert metrics["objects"][0]["initial"] == {"iou3d": 0.0, "iou2d": 0.0}
+    assert metrics["initial"]["iou3d"] == pytest.approx(2 / 3)
+    assert metrics["initial"]["center_error"] == pytest.approx(0)
+
+
+def test_objects_that_the_truth_does_not_know_cost_nothing() -> None:
+    truth = room()
+    extra = replace(truth, pieces=(*truth.pieces, piece(cuboid(1, 1, 1), (3, GROUND, -3), 0, "x")))
+    assert evaluate(extra, extra, truth, config=FAST) == evaluate(truth, truth, truth, config=FAST)
+
+
+def test_what_lacks_its_truth_is_absent() -> None:
+    scene, bodies = room(), people()
+    blind = replace(scene, ground=None, pieces=())
+    bare = replace(bodies, joints=None, joint_names=())
+    metrics = evaluate(scene, scene, blind, EvaluatedBodies(None, bodies, None), FAST)
+    assert set(metrics["initial"]) == {"pitch_error", "roll_error"}
+    alone = {"non_collision", "contact", "penetration_depth"}
+    floor = {"ground_penetration_frequency", "ground_penetration_distance"}
+    assert set(metrics["result"]) == {"pitch_error", "roll_error"} | alone | floor
+    assert metrics["objects"] == []
+    metrics = evaluate(blind, blind, blind, EvaluatedBodies(bare, bodies, bodies), FAST)
+    assert {"pje", "p_pje"} & set(metrics["initial"]) == set()
+    assert {"v2v", "p_v2v", "contact_f1"} <= set(metrics["initial"])
+    assert floor & set(metrics["initial"]) == set()
+    later = replace(bodies, frame=bodies.frame + 100)
+    metrics = evaluate(scene, scene, scene, EvaluatedBodies(None, bodies, later), FAST)
+    assert {"v2v", "pje", "contact_f1"} & set(metrics["result"]) == set()
+
+
+def test_meshes_of_another_topology_have_no_vertex_metrics() -> None:
+    scene, bodies = room(), people()
+    other = replace(people(detail="full"), joints=bodies.joints)
+    assert other.verts.shape[1] != bodies.verts.shape[1]
+    metrics = evaluate(scene, scene, scene, EvaluatedBodies(None, bodies, other), FAST)["result"]
+    assert metrics["pje"] == pytest.approx(0)
+    assert {"v2v", "p_v2v", "contact_f1"} & set(metrics) == set()
+
+
+def test_people_without_rows_are_no_people() -> None:
+    scene, one = room(), people(1)
+    nobody = replace(
+        one, verts=one.verts[:0], joints=None, joint_names=(), frame=one.frame[:0],
+        person=one.person[:0],
+    )  # fmt: skip
+    without = evaluate(scene, scene, scene, config=FAST)
+    assert evaluate(scene, scene, scene, EvaluatedBodies(nobody, nobody, nobody), FAST) == without
+
+
+def test_bodies_in_the_camera_frame_are_taken_to_the_world_of_their_scene() -> None:
+    bodies = people()
+    assert bodies.joints is not None
+    seen = replace(
+        bodies, space="camera", verts=to_camera(bodies.verts, CAMERA.R_cam_world.float()),
+        joints=to_camera(bodies.joints, CAMERA.R_cam_world.float()),
+    )  # fmt: skip
+    assert torch.allclose(in_world(seen, CAMERA).verts, bodies.verts, atol=1e-5)
+    joints = in_world(seen, CAMERA).joints
+    assert joints is not None
+    assert torch.allclose(joints, bodies.joints, atol=1e-5)
+    assert torch.equal(soles_of(seen, CAMERA), soles_of(bodies, CAMERA))
+
+
+def test_the_folder_gives_the_same_numbers_and_writes_them(tmp_path: Path) -> None:
+    truth, bodies = room(), people()
+    wrong = replace(truth, pieces=tuple(moved(p, 0.2, 0, 0) for p in truth.pieces))
+    out, true = tmp_path / "out", tmp_path / "truth"
+    write_scene(truth, true / "scene.json")
+    write_scene(truth, out / "scene.json")
+    write_scene(wrong, out / "scene.json")
+    (out / "scene.json").rename(out / "initial.json")
+    write_scene(truth, out / "scene.json")
+    write_bodies(bodies, out / "bodies.npz")
+    write_bodies(bodies, true / "bodies.npz")
+    found = evaluate_folder(out, true, FAST)
+    assert json.loads((out / "metrics.json").read_text()) == found
+    assert found["initial"]["center_error"] == pytest.approx(0.2, abs=1e-5)
+    assert found["result"]["center_error"] == pytest.approx(0, abs=1e-5)
+    assert "v2v" in found["result"]
+    assert "v2v" not in found["initial"]
+    expected = evaluate(wrong, truth, truth, EvaluatedBodies(None, bodies, bodies), FAST)
+    for key in ("initial", "result"):
+        assert found[key] == pytest.approx(expected[key], abs=1e-4)
+
+
+def test_a_true_scene_without_a_camera_takes_that_of_camera_json(tmp_path: Path) -> None:
+    scene = room()
+    for name in ("out/scene.json", "out/initial.json", "truth/scene.json"):
+        write_scene(scene, tmp_path / name)
+    path = tmp_path / "truth" / "scene.json"
+    tree = json.loads(path.read_text())
+    camera = tree.pop("camera")
+    path.write_text(json.dumps(tree))
+    with pytest.raises(InputError):
+        evaluate_folder(tmp_path / "out", tmp_path / "truth", FAST)
+    camera["R_cam_world"] = tilted(torch.tensor(-0.3), torch.tensor(0.0)).tolist()
+    (tmp_path / "truth" / "camera.json").write_text(json.dumps(camera))
+    found = evaluate_folder(tmp_path / "out", tmp_path / "truth", FAST)["result"]
+    assert found["pitch_error"] == pytest.approx(0.1, abs=1e-6)
+
+
+def test_a_folder_without_truth_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError):
+        evaluate_folder(tmp_path, tmp_path / "truth")
+
+
+def test_the_table_tells_every_metric_before_and_after() -> None:
+    scene, bodies = room(), people()
+    metrics = evaluate(scene, scene, scene, EvaluatedBodies(None, bodies, bodies), FAST)
+    lines = table(metrics).splitlines()
+    for name in METRICS:
+        row = next(line for line in lines if line.split()[0] == name)
+        before, after, best = row.split()[-3:]
+        assert float(best) == METRICS[name].best
+        assert float(after) == pytest.approx(metrics["result"][name], abs=1e-3)
+        assert (before == "-") == (name not in metrics["initial"])
+    for item in metrics["objects"]:
+        assert any(line.startswith(item["id"]) for line in lines)
+
+
+def test_the_result_keeps_the_partners_of_the_initial_scene() -> None:
+    scene = room()
+    left, right = (
+        piece(cuboid(0.5, 0.9, 0.5), (x, GROUND, -3), 0, n) for x, n in ((-1, "l"), (1, "r"))
+    )
+    truth = replace(scene, pieces=(left, right))
+    initial = replace(scene, pieces=(replace(left, id="p"), replace(right, id="q")))
+    crossed = replace(scene, pieces=(replace(right, id="p"), replace(left, id="q")))
+    metrics = evaluate(initial, crossed, truth, config=FAST)
+    assert metrics["initial"]["iou3d"] == pytest.approx(1)
+    assert metrics["result"]["center_error"] == pytest.approx(2)
+
+
+def test_a_seat_in_the_way_of_a_standing_person_costs_non_collision() -> None:
+    scene, bodies = room(), people(1)
+    feet = bodies.verts[0].mean(0).double()
+    block = piece(cuboid(0.6, 0.5, 0.6), (float(feet[0]), GROUND, float(feet[2])), 0, "block")
+    hit = replace(scene, pieces=(block,))
+    free = replace(scene, pieces=(moved(block, 3, 0, 0),))
+    everyone = EvaluatedBodies(bodies, bodies, bodies)
+    metrics = evaluate(hit, free, free, everyone, FAST)
+    height = bodies.verts[0, :, 1] - GROUND
+    inside = ((height < 0.5) & (height > 0)).double().mean()
+    assert metrics["initial"]["non_collision"] == pytest.approx(1 - float(inside), abs=0.01)
+    assert metrics["initial"]["contact"] == 1
+    assert metrics["initial"]["contact_f1"] == 0
+    assert metrics["result"]["non_collision"] == 1
+    assert metrics["result"]["contact"] == 0
+    assert metrics["result"]["contact_f1"] == 1
+
+
+def test_a_floor_that_rises_over_standing_feet_is_penetrated_by_its_rise() -> None:
+    scene, bodies = room(), people(2)
+    soles = bodies.verts[:, soles_of(bodies, CAMERA), 1] - GROUND
+    assert 0 <= float(soles.min()) < 0.01
+    high = replace(scene, ground=GROUND + 0.3)
+    metrics = evaluate(high, scene, scene, EvaluatedBodies(bodies, bodies, None), FAST)
+    assert metrics["initial"]["ground_penetration_frequency"] == 1
+    expected = 0.3 - float(soles.mean())
+    assert metrics["initial"]["ground_penetration_distance"] == pytest.approx(expected, abs=1e-5)
+    assert metrics["initial"]["ground_error"] == pytest.approx(0.3)
+    assert metrics["result"]["ground_penetration_frequency"] == 0

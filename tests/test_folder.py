@@ -1,0 +1,220 @@
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_capture as tiny
+import torch
+
+from mover.geometry.camera import pitch_roll
+from mover.readers import READERS, read, read_capture, write_capture
+from mover.readers.masks import decode
+from mover.records import map_tensors
+from mover.types import Capture
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tiny.write_capture(tmp_path / "tiny")
+
+
+def edit(path: Path, **changes: object) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def close(a: object, b: object) -> None:
+    """Equal records: numbers to 1e-6, all else exactly; where meshes lie does not count."""
+    if isinstance(a, torch.Tensor):
+        assert isinstance(b, torch.Tensor)
+        assert a.shape == b.shape
+        assert a.dtype == b.dtype
+        assert torch.allclose(a.double(), b.double(), atol=1e-6, rtol=1e-6)
+    elif isinstance(a, tuple):
+        assert isinstance(b, tuple)
+        for x, y in zip(a, b, strict=True):
+            close(x, y)
+    elif dataclasses.is_dataclass(a):
+        for field in dataclasses.fields(a):
+            if field.name not in ("mesh_file", "name", "warnings"):
+                close(getattr(a, field.name), getattr(b, field.name))
+    else:
+        assert a == b
+
+
+def test_every_field_of_a_capture_arrives(folder: Path) -> None:
+    found = read("folder", folder)
+    assert found.name == "tiny"
+    assert found.camera_height == 1.45
+    camera = found.scene.camera
+    assert (camera.width, camera.height) == (tiny.WIDTH, tiny.HEIGHT)
+    assert camera.K.tolist() == [[60.0, 0.0, 30.5], [0.0, 58.5, 25.25], [0.0, 0.0, 1.0]]
+    assert [float(v) for v in pitch_roll(camera.R_cam_world)] == pytest.approx(
+        [tiny.PITCH, tiny.ROLL], abs=1e-6
+    )
+    chair, lamp = found.scene.pieces
+    assert (chair.id, chair.category, chair.annotation, chair.support) == (
+        "chair_0", "chair", 11, "ground",
+    )  # fmt: skip
+    assert (lamp.id, lamp.category, lamp.annotation, lamp.support) == (
+        "Lampe_ä.2", "Stehlampe", 5, "chair_0",
+    )  # fmt: skip
+    assert torch.allclose(lamp.t_world_object, torch.tensor([0.8, -0.5, -3.2]))
+    assert float(lamp.yaw) == pytest.approx(-2.9)
+    assert torch.allclose(chair.scale, torch.tensor([0.5, 0.9, 0.6]))
+    assert found.scene.ground == -1.4
+    assert found.warnings == ()
+
+
+def test_meshes_come_with_the_transforms_of_their_nodes(folder: Path) -> None:
+    chair, lamp = read_capture(folder).scene.pieces
+    step = torch.from_numpy(tiny.STEP).float()
+    assert torch.allclose(chair.mesh.verts, step)
+    assert chair.mesh.faces.tolist() == tiny.STEP_FACES.tolist()
+    assert torch.allclose(lamp.mesh.verts, step / 2 + torch.tensor([0.1, 0.2, 0.3]), atol=1e-6)
+    assert Path(lamp.mesh_file).read_bytes() == (folder / "meshes" / "lamp.glb").read_bytes()
+
+
+def test_evidence_arrives_as_it_was_drawn(folder: Path) -> None:
+    found = read_capture(folder)
+    for detection, index in zip(found.detections, (0, 1), strict=True):
+        assert detection.mask is not None
+        assert (decode(detection.mask, 0).numpy() == tiny.object_mask(index)).all()
+    assert found.detections[0].score == 0.75
+    assert found.detections[1].box.tolist() == [40.5, 10, 59.75, 30]
+    assert found.people is not None
+    assert found.reference_people is not None
+    for row in range(3):
+        assert (decode(found.people.masks, row).numpy() == tiny.person_mask(row)).all()
+    assert (decode(found.reference_people, 0).numpy() == tiny.person_mask(2)).all()
+    assert found.people.frame.tolist() == [0, 0, 3]
+    assert found.people.person.tolist() == [0, 7, 0]
+    assert found.people.heights == {"0": 1.78}
+    assert found.reference is not None
+    assert ((found.reference * 255).round().numpy() == tiny.picture()).all()
+    assert found.touch is not None
+    assert (found.touch.numpy() == tiny.touch()).all()
+
+
+def test_bodies_take_the_frame_rate_of_people_json(folder: Path) -> None:
+    found = read_capture(folder).bodies
+    assert found is not None
+    assert found.fps == 5.0
+    assert (found.verts.numpy() == tiny.bodies()["vertices"]).all()
+    assert found.joint_names == ("head", "foot")
+    np.savez(folder / "bodies.npz", **tiny.bodies(), fps=30.0)
+    found = read_capture(folder).bodies
+    assert found is not None
+    assert found.fps == 30
+
+
+def test_writing_and_reading_gives_the_same_capture(folder: Path, tmp_path: Path) -> None:
+    first = read_capture(folder)
+    write_capture(first, tmp_path / "copy")
+    second = read_capture(tmp_path / "copy")
+    close(first, second)
+    assert first.detections[0].mask.counts == second.detections[0].mask.counts
+    write_capture(second, tmp_path / "again")
+    for path in sorted(p for p in (tmp_path / "copy").rglob("*") if p.is_file()):
+        same = tmp_path / "again" / path.relative_to(tmp_path / "copy")
+        assert path.read_bytes() == same.read_bytes(), path.name
+
+
+def test_a_capture_without_anything_optional_is_read_with_a_word_about_each(folder: Path) -> None:
+    for name in ("bodies.npz", "people.json", "contacts.npz"):
+        (folder / name).unlink()
+    (folder / "camera.json").write_text(
+        json.dumps({k: v for k, v in tiny.camera().items() if k != "R_cam_world"})
+    )
+    objects = tiny.objects()
+    del objects["images"][0]["file_name"]
+    objects["annotations"][1].pop("segmentation")
+    objects["annotations"].append({**objects["annotations"][0], "id": 99})
+    (folder / "objects.json").write_text(json.dumps(objects))
+    scene = tiny.scene()
+    scene["objects"][1].pop("annotation")
+    (folder / "scene.json").write_text(json.dumps(scene))
+    found = read_capture(folder)
+    assert (found.bodies, found.people, found.touch, found.reference) == (None, None, None, None)
+    assert found.scene.camera.R_cam_world.tolist() == np.diag([1.0, -1, -1]).tolist()
+    told = "\n".join(found.warnings)
+    for word in ("bodies.npz", "people.json", "reference.jpg", "annotation 5 without segm",
+                 "(5 Stehlampe, 99 chair) without object", "'Lampe"):  # fmt: skip
+        assert word.strip("'") in told, (word, told)
+
+
+def test_what_scene_json_says_about_the_camera_wins(folder: Path) -> None:
+    other = tiny.camera(fl_x=70.0)
+    del other["R_cam_world"]
+    edit(folder / "scene.json", camera=other)
+    camera = read_capture(folder).scene.camera
+    assert float(camera.K[0, 0]) == 70
+    assert float(pitch_roll(camera.R_cam_world)[0]) == pytest.approx(tiny.PITCH, abs=1e-6)
+
+
+def test_a_heading_turns_the_world_and_leaves_the_view(folder: Path) -> None:
+    straight = read_capture(folder)
+    # The same room in a world that is turned by -heading: same camera picture.
+    heading, scene = 0.7, tiny.scene()
+    c, s = np.cos(heading), np.sin(heading)
+    ry = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    for item in scene["objects"]:
+        item["translation"] = (ry.T @ np.array(item["translation"])).tolist()
+        item["yaw"] -= heading
+    turned = tiny.rotation(tiny.PITCH, tiny.ROLL, heading)
+    scene["camera"] = tiny.camera(R_cam_world=turned.tolist())
+    (folder / "scene.json").write_text(json.dumps(scene))
+    bodies = tiny.bodies()
+    for key in ("vertices", "joints"):
+        bodies[key] = bodies[key] @ turned  # from camera axes to that world
+    np.savez(folder / "bodies.npz", **{**bodies, "space": np.array("world")})
+    found = read_capture(folder)
+    assert float(found.scene.camera.R_cam_world[2, 0]) == pytest.approx(0, abs=1e-6)
+    assert found.bodies.space == "camera"
+    wrapped = dataclasses.replace(
+        straight,
+        scene=dataclasses.replace(
+            straight.scene,
+            pieces=tuple(
+                dataclasses.replace(p, yaw=torch.atan2(p.yaw.sin(), p.yaw.cos()))
+                for p in straight.scene.pieces
+            ),
+        ),
+    )
+    close(wrapped, found)
+
+
+def test_truth_is_not_looked_at(folder: Path) -> None:
+    (folder / "truth").mkdir()
+    (folder / "truth" / "scene.json").write_text("broken")
+    assert read_capture(folder).warnings == ()
+
+
+def test_an_unknown_format_names_the_choices() -> None:
+    with pytest.raises(ValueError, match=", ".join(sorted(READERS))):
+        read("prose", Path())
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
+def test_a_real_photograph_is_read_without_a_word() -> None:
+    found = read_capture(DATA / "photo_bench")
+    assert found.warnings == ()
+    assert found.bodies is not None
+    assert tuple(found.bodies.verts.shape) == (1, 18439, 3)
+    assert found.people is not None
+    assert found.reference is not None
+    assert tuple(found.reference.shape) == (898, 1600, 3)
+    mask = found.detections[0].mask
+    assert mask is not None
+    assert int(decode(mask, 0).sum()) == 41688  # COCO's own "area" in the file
+
+
+def test_a_capture_in_double_precision_is_written_too(folder: Path, tmp_path: Path) -> None:
+    double = map_tensors(lambda x: x.double() if x.is_floating_point() else x, read_capture(folder))
+    write_capture(double, tmp_path / "double")
+    found = read_capture(tmp_path / "double")
+    assert isinstance(found, Capture)
+    assert found.bodies is not None
+    assert found.bodies.verts.dtype == torch.float32

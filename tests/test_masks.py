@@ -1,0 +1,128 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from pycocotools import mask as coco
+from tiny_capture import compressed, runs
+
+from mover.readers.masks import area, decode, encode, from_coco, run_lengths, tight_box
+from mover.records import InputError
+from mover.types import Masks
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+WHERE = "objects.json: field 'segmentation'"
+MASKS = arrays(np.bool_, st.tuples(st.integers(1, 9), st.integers(1, 13)))
+SPARSE = st.integers(0, 255)
+
+
+def corners(box: np.ndarray) -> list[float]:
+    return [box[0], box[1], box[0] + box[2], box[1] + box[3]]
+
+
+def image_of(code: bytes, shape: tuple[int, int]) -> np.ndarray:
+    return decode(Masks(*shape, (code,)), 0).numpy()
+
+
+@given(MASKS)
+def test_both_codes_and_the_encoder_give_the_mask_back(mask: np.ndarray) -> None:
+    counts = runs(mask)
+    size = list(mask.shape)
+    for written in (counts, compressed(counts), compressed(counts).encode()):
+        code = from_coco({"size": size, "counts": written}, *mask.shape, WHERE)
+        assert (image_of(code, mask.shape) == mask).all()
+    assert (image_of(encode(torch.from_numpy(mask)), mask.shape) == mask).all()
+    assert area(Masks(*mask.shape, (encode(torch.from_numpy(mask)),)), 0) == mask.sum()
+
+
+@given(st.lists(st.integers(0, 10**7), min_size=1, max_size=40))
+def test_a_compressed_code_holds_its_runs(counts: list[int]) -> None:
+    assert run_lengths(compressed(counts).encode()).tolist() == counts
+
+
+@given(st.binary(max_size=12) | st.text(max_size=12))
+def test_a_code_of_noise_is_refused_or_fits_the_image(code: bytes | str) -> None:
+    try:
+        found = from_coco({"size": [3, 5], "counts": code}, 3, 5, WHERE)
+    except InputError as error:
+        assert str(error).startswith(WHERE)  # noqa: PT017
+    else:
+        assert image_of(found, (3, 5)).shape == (3, 5)
+
+
+def test_a_polygon_covers_the_pixels_whose_centres_it_holds() -> None:
+    box = [[2, 1, 7, 1, 7, 4, 2, 4]]
+    found = image_of(from_coco(box, 6, 9, WHERE), (6, 9))
+    expected = np.zeros((6, 9), dtype=bool)
+    expected[1:4, 2:7] = True
+    assert (found == expected).all()
+    assert tight_box(torch.from_numpy(found)).tolist() == [2, 1, 7, 4]
+
+
+def test_polygons_are_joined_and_clipped() -> None:
+    outlines = [[-3, -2, 2, -2, 2, 3, -3, 3], [5, 0, 8, 0, 8, 6, 5, 6]]
+    found = image_of(from_coco(outlines, 6, 7, WHERE), (6, 7))
+    expected = np.zeros((6, 7), dtype=bool)
+    expected[:3, :2] = expected[:, 5:] = True
+    assert (found == expected).all()
+
+
+@pytest.mark.parametrize(
+    ("segmentation", "words"),
+    [
+        ([], "no polygon"),
+        ([[0, 0, 1, 1]], "4 items"),
+        ([[0, 0, 1, 1, 2, 2, 3]], "7 items"),
+        ([[0, 0, 1, float("nan"), 2, 2]], "far outside"),
+        ([[0, 0, 1, 1e300, 2, 2]], "far outside"),
+        ([[0, 0, 1, "a", 2, 2]], "6 items"),
+        ([3], "3"),
+        ("abc", "str"),
+        (7, "int"),
+        ({"counts": [15]}, "has size None"),
+        ({"size": [5, 3], "counts": [15]}, r"has size \[5, 3\], expected \[3, 5\]"),
+        ({"size": [3, 5]}, "NoneType"),
+        ({"size": [3, 5], "counts": [14]}, "sum to 14"),
+        ({"size": [3, 5], "counts": [20, -5]}, "a negative run"),
+        ({"size": [3, 5], "counts": [15.0]}, "whole numbers"),
+        ({"size": [3, 5], "counts": [True] * 15}, "whole numbers"),
+        ({"size": [3, 5], "counts": [10**30]}, "whole numbers"),
+        ({"size": [3, 5], "counts": ""}, "cut off"),
+        ({"size": [3, 5], "counts": "o"}, "cut off"),
+        ({"size": [3, 5], "counts": "oooooooo0"}, "35 bits"),
+        ({"size": [3, 5], "counts": "ä"}, "compressed code"),
+        ({"size": [3, 5], "counts": " "}, "characters"),
+        ({"size": [3, 5], "counts": "40"}, "sum to"),
+    ],
+)
+def test_a_malformed_mask_is_told_with_its_place(segmentation: object, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        from_coco(segmentation, 3, 5, WHERE)
+    assert str(caught.value).startswith(WHERE)
+    assert "expected" in str(caught.value)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
+class TestRealFiles:
+    def test_results_of_cocos_own_tools_decode_as_pycocotools_does(self) -> None:
+        file = DATA / "formats" / "coco_instances_val2014_fakesegm100_results.json"
+        rows = json.loads(file.read_text())
+        for row in rows[::40]:
+            code = row["segmentation"]
+            found = image_of(from_coco(code, *code["size"], WHERE), tuple(code["size"]))
+            assert found.sum() == coco.area(code)
+            assert tight_box(torch.from_numpy(found)).tolist() == corners(coco.toBbox(code))
+            assert run_lengths(code["counts"].encode()).tolist() == runs(found)
+
+    def test_a_masklet_of_sa_v_decodes_to_masks_of_the_right_area(self) -> None:
+        tree = json.loads((DATA / "formats/sav_000001_manual.json").read_text())
+        codes = [code for frame in tree["masklet"][:3] for code in frame]
+        assert codes
+        for code in codes:
+            encoded = from_coco(code, *code["size"], WHERE)
+            found = image_of(encoded, tuple(code["size"]))
+            assert found.sum() == coco.area(code)

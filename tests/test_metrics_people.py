@@ -1,0 +1,178 @@
+"""Metrics of contact, floor and pose: analytic bodies, another library."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from judged import F64, cuboid, grid_body, mesh_of, people, some_people
+from scipy.spatial.transform import Rotation
+
+from mover.metrics_bodies import (
+    Standing,
+    Twins,
+    gather_twins,
+    ground_penetration_distance,
+    ground_penetration_frequency,
+    p_pje,
+    p_v2v,
+    pje,
+    procrustes,
+    v2v,
+)
+from mover.metrics_contact import (
+    Nearness,
+    Touch,
+    contact,
+    contact_f1,
+    evenly,
+    gather_touch,
+    gather_truth,
+    nearness,
+    non_collision,
+    penetration_depth,
+)
+
+
+def test_a_body_that_sinks_into_a_box_collides_by_its_share_and_depth() -> None:
+    box = [cuboid(1, 1, 1)]  # its top is at 1
+    touch = gather_touch(some_people(grid_body(0.92, 1.32)), box, None, 10, 0.05)
+    assert non_collision(touch) == pytest.approx(4 / 5)  # rows at .92, 1.02, 1.12, 1.22, 1.32
+    assert contact(touch) == 1
+    assert penetration_depth(touch) == pytest.approx(0.08)
+    assert contact_f1(touch) is None
+
+
+def test_a_body_just_above_a_box_touches_it_without_colliding() -> None:
+    box = [cuboid(1, 1, 1)]
+    above = some_people(grid_body(1.04, 1.44))
+    touch = gather_touch(above, box, None, 10, 0.05)
+    assert (non_collision(touch), contact(touch), penetration_depth(touch)) == (1, 0, 0)
+    assert int((touch.near.surface <= 0.05).sum()) == 5
+
+
+def test_contact_scores_are_means_over_bodies() -> None:
+    box = [cuboid(1, 1, 1)]
+    both = some_people(torch.cat([grid_body(0.92, 1.32), grid_body(1.04, 1.44)]))
+    touch = gather_touch(both, box, None, 10, 0.05)
+    assert non_collision(touch) == pytest.approx(0.9)
+    assert contact(touch) == pytest.approx(0.5)
+    assert penetration_depth(touch) == pytest.approx(0.04)
+
+
+def test_contact_f1_compares_the_touching_vertices_with_the_true_ones() -> None:
+    box = [cuboid(1, 1, 1)]
+    true = some_people(grid_body(1.0, 1.4, 9))  # heights 1, 1.05, 1.1, ...: two rows touch
+    high = some_people(grid_body(1.04, 1.44, 9))  # one row touches
+    for judged, expected in ((true, 1.0), (high, 2 * 9 / (9 + 18))):
+        truth = gather_truth(true, box, judged, 10, 0.0501)
+        assert contact_f1(gather_touch(judged, box, truth, 10, 0.0501)) == pytest.approx(expected)
+    nobody = Nearness(torch.full((1, 3), torch.inf), torch.full((1, 3), torch.inf))
+    assert contact_f1(Touch(nobody, nobody, nobody, 0.05)) == 1
+
+
+def test_contact_f1_is_paired_by_frame_and_person_not_by_row() -> None:
+    box = [cuboid(1, 1, 1)]
+    bodies = some_people(torch.cat([grid_body(1.0, 1.4), grid_body(1.04, 1.44), grid_body(2, 3)]))
+    order = torch.tensor([2, 0, 1])
+    shuffled = replace(bodies, verts=bodies.verts[order], frame=bodies.frame[order])
+    truth = gather_truth(shuffled, box, bodies, 10, 0.05)
+    assert contact_f1(gather_touch(bodies, box, truth, 10, 0.05)) == 1
+    later = replace(bodies, frame=bodies.frame + 1)  # frames 1, 2, 3: of the true 0, 1, 2
+    touch = gather_touch(later, box, truth, 10, 0.05)
+    assert touch.shared is not None
+    assert touch.shared.signed.shape[0] == 2
+    assert touch.near.signed.shape[0] == 3
+
+
+def test_distances_within_reach_are_those_to_all_objects_without_culling() -> None:
+    rng = torch.Generator().manual_seed(0)
+    verts = torch.rand(3, 400, 3, generator=rng, dtype=F64) * 3 - 1.5
+    sphere = mesh_of(trimesh.creation.icosphere(3, 0.8))
+    found = nearness(verts, [sphere, cuboid(1, 1, 1)], 0.05)
+    whole = nearness(verts, [sphere, cuboid(1, 1, 1)], 10.0)
+    near = whole.surface <= 0.05
+    assert near.sum() > 50
+    assert torch.equal(near, found.surface <= 0.05)
+    assert torch.equal(whole.signed < 0, found.signed < 0)
+    assert torch.allclose(found.signed[whole.signed < 0], whole.signed[whole.signed < 0])
+    in_box = ((verts - torch.tensor([0, 0.5, 0])).abs() < 0.5).all(-1)
+    in_ball = verts.norm(dim=-1) < 0.8
+    assert ((whole.signed < 0) != (in_box | in_ball)).sum() <= 8  # the ball has flat triangles
+
+
+@given(st.integers(1, 500), st.integers(2, 100))
+def test_rows_are_thinned_evenly_and_each_at_most_once(rows: int, count: int) -> None:
+    picked = evenly(rows, count).tolist()
+    assert len(set(picked)) == len(picked) == min(rows, count)
+    assert picked[0] == 0
+    assert picked[-1] == rows - 1
+    steps = np.diff(picked)
+    assert len(steps) == 0 or steps.max() - steps.min() <= 1
+
+
+def test_soles_under_the_floor_are_counted_and_measured() -> None:
+    standing = Standing(torch.tensor([[0.1, 0.0, -0.005, -0.02], [0.3, -0.04, 0, 0]]), 0.01)
+    assert ground_penetration_frequency(standing) == pytest.approx(2 / 8)
+    assert ground_penetration_distance(standing) == pytest.approx(0.03)
+    above = Standing(torch.ones(2, 3), 0.01)
+    assert ground_penetration_frequency(above) == 0
+    assert ground_penetration_distance(above) == 0
+
+
+def test_procrustes_undoes_every_similarity_but_no_mirror() -> None:
+    rng = np.random.default_rng(1)
+    points = torch.tensor(rng.normal(size=(5, 30, 3)))
+    turns = torch.tensor(Rotation.random(5, rng).as_matrix())
+    scale = torch.tensor(rng.uniform(0.3, 3, (5, 1, 1)))
+    target = scale * points @ turns.mT + torch.tensor(rng.normal(size=(5, 1, 3)))
+    assert torch.allclose(procrustes(points, target), target, atol=1e-12)
+    mirrored = target * torch.tensor([-1.0, 1, 1])
+    assert (procrustes(points, mirrored) - mirrored).norm(dim=-1).mean() > 0.1
+
+
+def test_procrustes_finds_the_rotation_of_another_library_and_the_best_scale() -> None:
+    rng = np.random.default_rng(2)
+    points, target = rng.normal(size=(2, 12, 3))
+    a, b = points - points.mean(0), target - target.mean(0)
+    turn = Rotation.align_vectors(b, a)[0].as_matrix()
+    scale = (b * (a @ turn.T)).sum() / (a**2).sum()
+    found = procrustes(torch.tensor(points), torch.tensor(target))
+    assert np.allclose(found.numpy(), scale * a @ turn.T + target.mean(0))
+
+
+def test_pose_errors_are_in_the_world_and_aligned_ones_are_not() -> None:
+    bodies = people(3)
+    assert bodies.joints is not None
+    shift = torch.tensor([0.03, 0.0, 0.04])
+    wrong = replace(bodies, verts=bodies.verts + shift, joints=bodies.joints + shift)
+    found = gather_twins(wrong, bodies)
+    assert found is not None
+    assert pje(found) == pytest.approx(0.05, rel=1e-4)
+    assert v2v(found) == pytest.approx(0.05, rel=1e-4)
+    assert p_pje(found) == pytest.approx(0, abs=1e-5)
+    assert p_v2v(found) == pytest.approx(0, abs=1e-5)
+    assert found.joints is not None
+    assert found.joints.shape == (3, 22, 3)
+
+
+def test_joints_are_paired_by_name() -> None:
+    bodies = people(2)
+    assert bodies.joints is not None
+    order = torch.randperm(55, generator=torch.Generator().manual_seed(0))
+    names = tuple(bodies.joint_names[i] for i in order)
+    found = gather_twins(replace(bodies, joints=bodies.joints[:, order], joint_names=names), bodies)
+    assert found is not None
+    assert pje(found) == 0
+
+
+def test_points_that_coincide_have_an_aligned_error_and_no_nan() -> None:
+    same, spread = torch.zeros(1, 4, 3), torch.eye(4)[None, :, :3]
+    value = p_v2v(Twins(same, spread, None, None))
+    assert value is not None
+    assert math.isfinite(value)
+    assert value == pytest.approx(float((spread - spread.mean(-2)).norm(dim=-1).mean()))

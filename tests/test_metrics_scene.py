@@ -1,0 +1,196 @@
+"""Metrics of objects and camera: analytic cases, another library, matching."""
+
+import math
+from dataclasses import replace
+
+import manifold3d
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from judged import CAMERA, F64, GROUND, K, cuboid, mesh_of, moved, pair, piece, random_piece, room
+
+from mover.geometry.camera import project, tilted, to_camera
+from mover.geometry.placement import place_piece
+from mover.geometry.rotations import rot_y
+from mover.metrics_scene import (
+    Sight,
+    center_error,
+    image_box,
+    iou2d,
+    iou3d,
+    match,
+    p2s,
+    pitch_error,
+    roll_error,
+    size_error,
+    yaw_error,
+)
+from mover.types import Camera, Mesh
+
+
+def test_two_cubes_that_share_a_half_overlap_by_a_third() -> None:
+    cube = piece(cuboid(1, 1, 1), (0, GROUND, -3))
+    for shift in ((0.5, 0, 0), (0, 0.5, 0), (0, 0, -0.5)):
+        assert iou3d(pair(moved(cube, *shift), cube)) == pytest.approx(1 / 3)
+    assert iou3d(pair(moved(cube, 1.5, 0, 0), cube)) == 0
+    turned = replace(cube, yaw=torch.tensor(math.pi / 4, dtype=F64))
+    octagon = 2 * (math.sqrt(2) - 1)
+    assert iou3d(pair(turned, cube)) == pytest.approx(octagon / (2 - octagon))
+
+
+NUMBERS = st.lists(st.floats(-1, 1), min_size=10, max_size=10)
+
+
+@given(NUMBERS, NUMBERS)
+@settings(max_examples=60, deadline=None)
+def test_overlap_of_turned_boxes_is_that_of_a_solid_modeller(
+    a: list[float], b: list[float]
+) -> None:
+    solids = []
+    for item in (random_piece(a), random_piece(b)):
+        mesh = place_piece(item)
+        verts = mesh.verts.numpy()
+        solids.append(
+            manifold3d.Manifold(manifold3d.Mesh64(verts, mesh.faces.numpy().astype(np.uint64)))
+        )
+    shared, joint = (solids[0] ^ solids[1]).volume(), (solids[0] + solids[1]).volume()
+    assert iou3d(pair(random_piece(a), random_piece(b))) == pytest.approx(shared / joint, abs=1e-6)
+
+
+@given(NUMBERS, NUMBERS)
+@settings(max_examples=25, deadline=None)
+def test_swapping_estimate_and_truth_changes_no_symmetric_metric(
+    a: list[float], b: list[float]
+) -> None:
+    first, second = random_piece(a), random_piece(b)
+    for metric in (iou3d, iou2d, center_error, size_error, yaw_error):
+        there, back = metric(pair(first, second)), metric(pair(second, first))
+        assert there == pytest.approx(back, abs=1e-9), metric.__name__
+        assert there is not None
+        assert math.isfinite(there)
+
+
+def test_a_flat_object_at_its_place_overlaps_itself() -> None:
+    rug = room().pieces[2]
+    assert iou3d(pair(rug, rug)) == pytest.approx(1)
+    assert iou3d(pair(moved(rug, 0.5, 0, 0), rug)) < 0.6
+
+
+def test_surface_distance_of_a_shifted_sphere_is_the_integral() -> None:
+    sphere = piece(mesh_of(trimesh.creation.icosphere(4, 1.0)), (0, 0, -4))
+    cosine = np.linspace(-1, 1, 20001)
+    for shift in (0.1, 0.3, 0.8):
+        exact = np.abs(np.sqrt(1 + shift**2 - 2 * shift * cosine) - 1).mean()
+        found = p2s(pair(moved(sphere, shift, 0, 0), sphere))
+        assert found == pytest.approx(exact, rel=0.02)
+
+
+def test_surface_distance_is_measured_to_triangles_and_in_one_direction() -> None:
+    plate, cube = piece(cuboid(2, 0.0001, 2), (0, 0, -3)), piece(cuboid(2, 2, 2), (0, 0, -3))
+    assert p2s(pair(cube, plate)) < 1e-3
+    sides, top = 4 * 1.0, 2.0  # mean height of a side wall is 1, the lid is 2 above the plate
+    assert p2s(pair(plate, cube)) == pytest.approx((sides + top) / 6, rel=0.02)
+
+
+def test_yaw_error_takes_the_short_way_around() -> None:
+    ahead = piece(cuboid(1, 1, 1), (0, 0, -3), 3.1)
+    assert yaw_error(pair(replace(ahead, yaw=-ahead.yaw), ahead)) == pytest.approx(
+        2 * (math.pi - 3.1)
+    )
+
+
+def test_center_and_size_do_not_depend_on_the_origin_of_the_mesh() -> None:
+    truth = piece(cuboid(0.5, 0.9, 0.6), (0.3, GROUND, -2), 0.7)
+    offset = torch.tensor([0.4, -0.2, 1.0], dtype=F64)
+    other = replace(
+        truth, mesh=Mesh(truth.mesh.verts + offset, truth.mesh.faces),
+        t_world_object=truth.t_world_object - rot_y(truth.yaw) @ offset,
+    )  # fmt: skip
+    assert center_error(pair(other, truth)) == pytest.approx(0, abs=1e-12)
+    assert iou3d(pair(other, truth)) == pytest.approx(1)
+    larger = replace(truth, scale=torch.tensor([2.0, 1, 1], dtype=F64))
+    assert size_error(pair(larger, truth)) == pytest.approx(0.5 / 3)
+
+
+def test_camera_errors_are_differences_of_pitch_and_roll() -> None:
+    turned = tilted(torch.tensor(-0.25, dtype=F64), torch.tensor(-0.07, dtype=F64))
+    scene = room()
+    sight = Sight(replace(scene, camera=replace(CAMERA, R_cam_world=turned)), scene)
+    assert pitch_error(sight) == pytest.approx(0.05)
+    assert roll_error(sight) == pytest.approx(0.09)
+
+
+def test_the_image_box_holds_the_drawn_mesh_and_is_cut_at_the_border() -> None:
+    item = piece(cuboid(0.5, 0.9, 0.5), (-0.6, GROUND, -2.5), 0.4)
+    pixels = project(to_camera(place_piece(item).verts, CAMERA.R_cam_world), K)
+    expected = torch.cat([pixels.amin(0), pixels.amax(0)]) / torch.tensor([640, 480, 640, 480])
+    found = image_box(item, CAMERA)
+    assert found is not None
+    assert torch.allclose(found, expected)
+    found = image_box(moved(item, -1, 0, 0), CAMERA)
+    assert found is not None
+    assert found[0] == 0
+    assert image_box(moved(item, -9, 0, 0), CAMERA) is None
+    assert image_box(moved(item, 0, 0, 9), CAMERA) is None
+
+
+def test_a_mesh_that_passes_the_camera_is_cut_before_it() -> None:
+    level = Camera(K, tilted(torch.zeros((), dtype=F64), torch.zeros((), dtype=F64)), 640, 480)
+    beam = piece(cuboid(0.02, 0.02, 4), (0.05, 0.0, 0.0))
+    along = torch.linspace(-2, 2, 40001, dtype=F64)
+    verts = torch.cat([
+        torch.stack([torch.full_like(along, x), torch.full_like(along, y), along], -1)
+        for x in (0.04, 0.06) for y in (0, 0.02)
+    ])  # fmt: skip
+    in_cam = to_camera(verts, level.R_cam_world)
+    pixels = project(in_cam[in_cam[:, 2] >= 0.05], K) / torch.tensor([640, 480])
+    expected = torch.cat([pixels.amin(0), pixels.amax(0)]).clamp(0, 1)
+    found = image_box(beam, level)
+    assert found is not None
+    assert torch.allclose(found, expected, atol=2e-3)
+
+
+def test_an_object_off_the_image_scores_zero_and_a_true_one_cannot_be_scored() -> None:
+    here = piece(cuboid(0.5, 0.9, 0.5), (0, GROUND, -2.5))
+    gone = moved(here, -9, 0, 0)
+    assert iou2d(pair(gone, here)) == 0
+    assert iou2d(pair(here, gone)) is None
+
+
+def test_names_decide_before_places() -> None:
+    scene = room()
+    swapped = tuple(
+        replace(p, id=name) for p, name in zip(scene.pieces, ("table", "chair", "rug"), strict=True)
+    )
+    names = {p.id: p.id for p in scene.pieces}
+    found = match(replace(scene, pieces=swapped), scene, names)
+    assert {k: p.id for k, p in found.items()} == names
+
+
+def test_without_names_the_best_overlaps_within_a_class_decide() -> None:
+    truth = room()
+    row = [piece(cuboid(0.5, 0.9, 0.5), (x, GROUND, -3), 0, f"c{x}") for x in (-0.6, 0.0, 0.6)]
+    shifted = [replace(moved(p, 0.2, 0, 0), id=f"z{i}") for i, p in enumerate(row)]
+    sofa = replace(moved(row[1], 0, 0, 0), id="couch", category="Couch")
+    true_sofa = replace(moved(row[1], 5, 0, 0), id="s", category="sofa")
+    found = match(
+        replace(truth, pieces=(*shifted[::-1], sofa)),
+        replace(truth, pieces=(*row, true_sofa)),
+        {"c0.6": "nobody"},
+    )
+    assert {k: p.id for k, p in found.items()} == {
+        "c-0.6": "z0",
+        "c0.0": "z1",
+        "c0.6": "z2",
+        "s": "couch",
+    }
+
+
+def test_of_two_that_stand_for_one_the_nearer_is_taken() -> None:
+    truth = replace(room(), pieces=room().pieces[:1])
+    far, near = (replace(moved(truth.pieces[0], x, 0, 0), id=f"at{x}") for x in (-30, 20))
+    found = match(replace(truth, pieces=(far, near)), truth, {})
+    assert found["chair"].id == "at20"
