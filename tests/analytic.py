@@ -29,15 +29,23 @@ FACES = torch.tensor([
 
 def box_verts(size):
     """Corners of a box whose bottom is centred at the origin; FACES wind outward."""
-    corners = torch.cartesian_prod(*(torch.tensor(s, dtype=torch.float64) for s in ((-0.5, 0.5), (0.0, 1.0), (-0.5, 0.5))))
+    corners = torch.cartesian_prod(
+        *(torch.tensor(s, dtype=torch.float64) for s in ((-0.5, 0.5), (0.0, 1.0), (-0.5, 0.5)))
+    )
     return corners * torch.tensor(size, dtype=torch.float64)
 
 
 def grid_on_top(size, n=6):
     u = torch.linspace(-0.45, 0.45, n, dtype=torch.float64)
     x, z = torch.meshgrid(u, u, indexing="ij")
-    points = torch.stack([x.flatten() * size[0], torch.full((n * n,), size[1], dtype=torch.float64), z.flatten() * size[2]], -1)
-    return points
+    return torch.stack(
+        [
+            x.flatten() * size[0],
+            torch.full((n * n,), size[1], dtype=torch.float64),
+            z.flatten() * size[2],
+        ],
+        -1,
+    )
 
 
 def make_inputs(dtype=torch.float32, size=96):
@@ -52,13 +60,16 @@ def make_inputs(dtype=torch.float32, size=96):
     objects = Objects(
         ids=("stool", "table", "cabinet"), categories=("stool", "table", "cabinet"), verts=verts,
         real_verts=torch.ones(n, 8, dtype=torch.bool), faces=FACES.expand(n, -1, -1).clone(),
-        edges=edges_of(FACES).expand(n, -1, -1).clone(), samples=top, size=torch.tensor(SIZES, dtype=dtype),
+        edges=edges_of(FACES).expand(n, -1, -1).clone(), samples=top,
+        size=torch.tensor(SIZES, dtype=dtype),
         top=top, back=torch.zeros_like(top), has_top=torch.ones(n, dtype=torch.bool),
         has_back=torch.zeros(n, dtype=torch.bool), is_seat=torch.tensor([True, False, False]),
         supports=torch.full((n,), -1),
     )  # fmt: skip
     truth = Layout(
-        torch.tensor(PLACES, dtype=dtype), torch.tensor(YAWS, dtype=dtype), torch.zeros(n, 3, dtype=dtype)
+        torch.tensor(PLACES, dtype=dtype),
+        torch.tensor(YAWS, dtype=dtype),
+        torch.zeros(n, 3, dtype=dtype),
     )
     image = image_at(objects, truth, camera, size)
     return PlaceInputs(
@@ -75,11 +86,13 @@ def image_at(objects, layout, camera, size):
     drawn, _ = look(verts, Topology(objects.faces, objects.edges), views, depth=False)
     n = len(boxes)
     keep = torch.ones(n, size, size, dtype=torch.bool)
-    return ImageCues(boxes, torch.ones(n, 4, dtype=torch.bool), views, drawn, keep, torch.ones(n).to(boxes))
+    return ImageCues(
+        boxes, torch.ones(n, 4, dtype=torch.bool), views, drawn, keep, torch.ones(n).to(boxes)
+    )
 
 
 def humans_at(objects, layout, camera, image):
-    """Depth limits a hand's breadth off, bodies that fill the space above the table, touched tops."""
+    """Depth limits a hand's breadth off, bodies above the table, touched tops."""
     verts = to_camera(place(objects.verts, layout), camera.R_cam_world)
     _, seen = look(verts, Topology(objects.faces, objects.edges), image.views, depth=True)
     lowest = torch.full_like(seen.nearest, float("-inf"))
@@ -94,7 +107,11 @@ def humans_at(objects, layout, camera, image):
     weight[:, 0] = 1.0
     heading = torch.stack([layout.yaw[:2].sin(), layout.yaw[:2].cos()], -1)
     touches = Touches(
-        torch.tensor([0, 1]), points.contiguous(), weight, torch.tensor([6.0, 6.0]).to(near), heading
+        torch.tensor([0, 1]),
+        points.contiguous(),
+        weight,
+        torch.tensor([6.0, 6.0]).to(near),
+        heading,
     )
     return HumanCues(DepthRange(near, far, lowest, area), BodySpace(volume), touches)
 

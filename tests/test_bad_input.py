@@ -46,7 +46,7 @@ SQUARE = {"size": [10, 10], "counts": [100]}
 JSON = [
     ("camera.json", "w", 0, "'w' has 0, expected a whole number"),
     ("camera.json", "w", 64.5, "'w'"),
-    ("camera.json", "w", 30000, "'camera.w'|'w'"),
+    ("camera.json", "w", 1 << 20, "'w' has 1048576"),
     ("camera.json", "h", ..., "'h' has nothing"),
     ("camera.json", "fl_x", 0.0, "'fl_x' has 0.0, expected a number above 0"),
     ("camera.json", "fl_x", -3, "'fl_x' has -3"),

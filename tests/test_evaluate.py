@@ -1,6 +1,7 @@
 """Whole scenes against the truth: what is best, what is absent, what is written."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +16,7 @@ from mover.metrics_bodies import in_world, soles_of
 from mover.readers.bodies_file import write_bodies
 from mover.readers.scene_file import write_scene
 from mover.records import InputError
+from mover.types import Piece
 
 
 def test_the_truth_scores_best_in_every_metric() -> None:
@@ -40,7 +42,9 @@ def test_the_truth_scores_best_in_every_metric() -> None:
         (("iou3d", "p2s", "size_error"), lambda p, a: replace(p, scale=p.scale * (1 + 0.2 * a))),
     ],
 )
-def test_a_larger_fault_never_scores_better(names, change) -> None:
+def test_a_larger_fault_never_scores_better(
+    names: tuple[str, ...], change: Callable[[Piece, int], Piece]
+) -> None:
     truth = piece(cuboid(0.6, 0.9, 0.45), (-0.5, GROUND, -2.8), 0.1)
     rows = []
     for amount in range(6):

@@ -40,10 +40,14 @@ JUNK = st.recursive(
     max_leaves=5,
 )  # fmt: skip
 BAD_ARRAYS = st.sampled_from(
-    [np.zeros(()), np.zeros(3), np.zeros((3, 4, 3)), np.zeros((0, 3)), np.array("x"),
-     np.ones((3, 4)),      np.full((3, 4, 3), np.inf), np.array([1 << 62] * 3), np.zeros(3, dtype=bool), np.array(NAN),
-     np.array([["a", "b"]]), np.zeros((3, 63)), np.array("world"), np.zeros((5, 3), dtype=np.uint64),
-     np.array([-(1 << 63)] * 3), np.array("makehuman"), np.zeros((3, 10)), np.zeros((3, 3)) ]
+    [
+        *(np.zeros(shape) for shape in ((), 3, (3, 4, 3), (0, 3), (3, 63), (3, 10), (3, 3))),
+        *(np.full(shape, NAN) for shape in ((), 3, (3, 4, 3))),
+        *(np.array([value] * 3) for value in (1 << 62, -(1 << 63), (1 << 64) - 1, 1e300, "a")),
+        *(np.array(word) for word in ("x", "world", "makehuman", "smplx", "")),
+        np.ones((3, 4), dtype=bool), np.zeros((5, 3), dtype=np.uint64), np.array([["a", "b"]]),
+        np.zeros((3, 4, 3), dtype=np.float16), np.zeros((2, 3), dtype="M8[s]"),
+    ]
 )  # fmt: skip
 NAMES = (
     "frame", "person", "space", "vertices", "faces", "joints", "joint_names", "fps", "model",

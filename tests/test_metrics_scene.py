@@ -13,10 +13,12 @@ from hypothesis import strategies as st
 from judged import CAMERA, F64, GROUND, K, cuboid, mesh_of, moved, pair, piece, random_piece, room
 
 from mover.geometry.camera import project, tilted, to_camera
+from mover.geometry.nearest import to_surface
 from mover.geometry.placement import place_piece
 from mover.geometry.rotations import rot_y
 from mover.metrics_scene import (
     Sight,
+    area_samples,
     center_error,
     image_box,
     iou2d,
@@ -93,6 +95,21 @@ def test_surface_distance_is_measured_to_triangles_and_in_one_direction() -> Non
     assert p2s(pair(cube, plate)) < 1e-3
     sides, top = 4 * 1.0, 2.0  # mean height of a side wall is 1, the lid is 2 above the plate
     assert p2s(pair(plate, cube)) == pytest.approx((sides + top) / 6, rel=0.02)
+
+
+def test_samples_of_a_surface_weigh_it_by_its_area() -> None:
+    shape = trimesh.creation.box((1.0, 0.02, 0.6)) + trimesh.creation.icosphere(2, 0.3)
+    shape.apply_translation([0.2, 0.1, -0.4])
+    points = area_samples(mesh_of(shape), 10_000).numpy()
+    assert np.allclose(points.mean(0), shape.centroid, atol=2e-3)
+    many = trimesh.sample.sample_surface(shape, 400_000, seed=0)[0]
+    assert np.allclose(np.cov(points.T), np.cov(many.T), atol=2e-3)
+    mesh = mesh_of(shape)
+    assert to_surface(torch.tensor(points[::50]), mesh.verts, mesh.faces).max() < 1e-9
+    upper = (points[:, 1] > 0.1099) & (points[:, 1] < 0.1101)
+    lower = (points[:, 1] > 0.0899) & (points[:, 1] < 0.0901)
+    assert upper.mean() == pytest.approx(0.6 / shape.area, abs=5e-3)
+    assert lower.mean() == pytest.approx(0.6 / shape.area, abs=5e-3)
 
 
 def test_yaw_error_takes_the_short_way_around() -> None:

@@ -5,7 +5,7 @@ import logging
 import sys
 
 COMMANDS = {
-    "demo": "Make a known room, reconstruct it, and open its report: the way to see what mover does.",
+    "demo": "Make a known room, reconstruct it, compare it with the truth.",
     "check": "Validate a capture, list the evidence of each object, draw the initial overlay.",
     "run": "Reconstruct a room from a capture folder.",
     "evaluate": "Compare a result with the truth.",

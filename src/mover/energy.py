@@ -123,7 +123,8 @@ def scene_energy(
         ("collision", w.collision, lambda: many.collision * collision_term(
             _collision_points(layout, objects, form), _known(humans.space), form)),
         ("contact", w.contact, lambda: contact_term(
-            (place(objects.top, layout), place(objects.back, layout)), _known(humans.touches), form)),
+            (place(objects.top, layout), place(objects.back, layout)),
+            _known(humans.touches), form)),
         ("edge", w.edge, lambda: edge_term(drawn()[0], image.masks, image.keep)),
         ("offscreen", w.offscreen, lambda: offscreen_term(
             pixels(), verts, objects.real_verts, camera)),
@@ -166,13 +167,17 @@ def factors(objects: Objects, humans: HumanCues, form: Form) -> Factors:
     return Factors(depth, 1 - 0.9 * used * objects.is_seat.to(used))
 
 
-def _draw(verts: Tensor, objects: Objects, views: Views, w: SceneWeights) -> tuple[Tensor, Depths | None]:
+def _draw(
+    verts: Tensor, objects: Objects, views: Views, w: SceneWeights
+) -> tuple[Tensor, Depths | None]:
     """Silhouettes and, where a term asks for them, depths."""
     asked = bool(w.depth or w.free_space)
     return look(verts, Topology(objects.faces, objects.edges), views, depth=asked)
 
 
-def _corners(objects: Objects, layout: Layout, camera: Camera) -> Float[Tensor, "*starts objects 8 3"]:
+def _corners(
+    objects: Objects, layout: Layout, camera: Camera
+) -> Float[Tensor, "*starts objects 8 3"]:
     """The eight corners of each object's box in camera axes [m]."""
     unit = torch.cartesian_prod(*(torch.tensor(s) for s in ((-0.5, 0.5), (0.0, 1.0), (-0.5, 0.5))))
     corners = unit.to(objects.size) * objects.size.unsqueeze(-2)

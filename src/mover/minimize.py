@@ -93,7 +93,11 @@ class Minimum(Generic[P]):
 
 
 def minimize(
-    energy: Callable[[P], Energy], start: P, method: Adam, observe: Observer = silent, stage: str = ""
+    energy: Callable[[P], Energy],
+    start: P,
+    method: Adam,
+    observe: Observer = silent,
+    stage: str = "",
 ) -> Minimum[P]:
     """Follow the gradient of `energy` from `start`.
 

@@ -97,7 +97,9 @@ def _people(job: Job) -> Crew | None:
     kept = run.stage(select_frames, SelectInputs(bodies), config.select).keep
     warnings: tuple[str, ...] = ()
     if config.depth.use and capture.people is not None:
-        inputs = DepthInputs(rows_of(bodies, kept), capture.people, scene.camera, job.seen.masks.any(0))
+        inputs = DepthInputs(
+            rows_of(bodies, kept), capture.people, scene.camera, job.seen.masks.any(0)
+        )
         depth = run.stage(find_depth, inputs, config.depth)
         bodies, warnings = apply_depth(bodies, depth), depth.warnings
     soles = run.stage(find_soles, SolesInputs(bodies, parts, kept, scene.camera), config.soles)
@@ -244,7 +246,9 @@ def _room(job: Job, view: View, crew: Crew | None) -> Room:
 def _evidence(job: Job, view: View) -> tuple[Evidence, ...]:
     cues, ids = view.cues, job.prepared.objects.ids
     zero = (0,) * len(ids)
-    near, far, bodies = (zero, zero, zero) if cues is None else (cues.near_pixels, cues.far_pixels, cues.touched_in)
+    near, far, bodies = (
+        (zero, zero, zero) if cues is None else (cues.near_pixels, cues.far_pixels, cues.touched_in)
+    )
     pixels = job.seen.masks.sum((-2, -1)).tolist()
     lowest = view.placed.energy.amin(0).tolist()
     return tuple(Evidence(*row) for row in zip(ids, pixels, near, far, bodies, lowest, strict=True))

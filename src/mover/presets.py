@@ -86,6 +86,7 @@ RELEASE = Config(
 )
 
 _DESCENT = Adam(200, 0.03, 0.002, beta2=0.98, keep_best=True)
+_SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
 _ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
 _ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 2.0, 1.0, 2.0, heading=0.1)
 
@@ -93,8 +94,7 @@ ROBUST = Config(
     depth=DepthConfig(use=True),
     image=ImageConfig(size=128, form="robust"),
     layout=PlaceConfig(
-        _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, short=Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True),
-        keep=3, tie=1.0,
+        _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, short=_SHORT, keep=3, tie=1.0
     ),
     refine=RefineConfig(rounds=1),
     gather=GatherConfig(erode=1, touches=AssignConfig(by="group", cell=0.02, most=300)),

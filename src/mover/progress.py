@@ -16,8 +16,14 @@ class Bar:
 
         self._stage, self._task = "", None
         self._console = Console(file=sys.stderr)
-        columns = (TextColumn("{task.description:<28}"), BarColumn(), TextColumn("{task.completed:>5}/{task.total}"))
-        self._progress = Progress(*columns, TimeElapsedColumn(), console=self._console, transient=True)
+        columns = (
+            TextColumn("{task.description:<28}"),
+            BarColumn(),
+            TextColumn("{task.completed:>5}/{task.total}"),
+        )
+        self._progress = Progress(
+            *columns, TimeElapsedColumn(), console=self._console, transient=True
+        )
 
     def __enter__(self) -> "Bar":
         if self._console.is_terminal:
@@ -25,7 +31,10 @@ class Bar:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._progress.stop()
 

@@ -7,7 +7,7 @@ import os
 import tempfile
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, dataclass_transform
@@ -23,7 +23,7 @@ _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
 class InputError(Exception):
-    """Bad user data: the message names the file, the field, what was found and what was expected."""
+    """Bad user data: the message names the file, the field, what was found, what was expected."""
 
 
 @dataclass_transform(frozen_default=True)
@@ -58,7 +58,7 @@ def to_device(value: T, device: torch.device | str) -> T:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path) -> Generator[Path, None, None]:
     """Give a temporary file beside `path` that takes its place when the block ends well."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
@@ -136,7 +136,9 @@ def _join(kind: Any, tree: Any, arrays: dict[str, Any]) -> Any:  # noqa: ANN401
     if isinstance(tree, dict):
         return {k: _join(args[1], v, arrays) for k, v in tree.items()}
     if isinstance(tree, list):
-        return tuple(_join(k, v, arrays) for k, v in zip(_kinds(args, len(tree)), tree, strict=True))
+        return tuple(
+            _join(k, v, arrays) for k, v in zip(_kinds(args, len(tree)), tree, strict=True)
+        )
     return tree
 
 

@@ -13,7 +13,8 @@ DECADES = 2.2  # below this many decades, 2 and 5 are ticks too
 def draw_curves(traces: Mapping[str, Sequence[float]]) -> str:
     """Plot the total energy of each stage over its iterations on a logarithmic scale."""
     plots = [
-        f"<figure>{draw_curve(trace)}<figcaption>{escape(name)} {_fall(trace)}</figcaption></figure>"
+        f"<figure>{draw_curve(trace)}"
+        f"<figcaption>{escape(name)} {_fall(trace)}</figcaption></figure>"
         for name, trace in traces.items()
         if _finite(trace)
     ]

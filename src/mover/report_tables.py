@@ -13,44 +13,18 @@ from .geometry.camera import to_camera
 from .geometry.placement import place_piece
 from .geometry.rotations import wrap
 from .report_colours import colour, css
+from .report_numbers import (
+    NOTHING,
+    QUANTITIES,
+    Quantity,
+    is_number,
+    signed,
+    write_quantity,
+    write_value,
+)
 from .types import Piece, Scene
 
-NOTHING = "–"
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """How a number of metrics.json is written."""
-
-    label: str
-    unit: str = ""
-    factor: float = 1.0
-    digits: int = 3
-    more_is_better: bool = False
-
-
-_CM, _DEG, _PERCENT = ("cm", 100.0, 1), ("°", 180 / math.pi, 2), ("%", 100.0, 1)
-QUANTITIES = {
-    "iou3d": Quantity("3D overlap with the truth (IoU)", more_is_better=True),
-    "iou2d": Quantity("Overlap of the image boxes (IoU)", more_is_better=True),
-    "p2s": Quantity("True surface to estimated surface", *_CM),
-    "center_error": Quantity("Error of the centre", *_CM),
-    "yaw_error": Quantity("Error of the orientation", *_DEG),
-    "size_error": Quantity("Error of the size", *_CM),
-    "contact": Quantity("Contacts that touch furniture", *_PERCENT, True),
-    "contact_f1": Quantity("Contact F1", more_is_better=True),
-    "non_collision": Quantity("Body outside furniture", *_PERCENT, True),
-    "penetration_depth": Quantity("Depth of bodies in furniture", *_CM),
-    "pitch_error": Quantity("Error of the camera's pitch", *_DEG),
-    "roll_error": Quantity("Error of the camera's roll", *_DEG),
-    "ground_error": Quantity("Error of the floor's height", *_CM),
-    "ground_penetration_frequency": Quantity("Frames with soles under the floor", *_PERCENT),
-    "ground_penetration_distance": Quantity("Depth of soles under the floor", *_CM),
-    "pje": Quantity("Error of the joints", *_CM),
-    "v2v": Quantity("Error of the body's surface", *_CM),
-    "p_pje": Quantity("Error of the joints, aligned", *_CM),
-    "p_v2v": Quantity("Error of the body's surface, aligned", *_CM),
-}
+JUDGED = ("iou3d", "center_error")  # metrics that stand beside each object
 
 
 @dataclass(frozen=True)
@@ -84,17 +58,6 @@ def _centre(piece: Piece, scene: Scene) -> torch.Tensor:
     return to_camera((verts.amin(0) + verts.amax(0)) / 2, scene.camera.R_cam_world)
 
 
-def write_quantity(key: str, value: float | None, unit: bool = True) -> str:
-    """A number of metrics.json with its unit."""
-    quantity = QUANTITIES.get(key, Quantity(key))
-    if value is None or not math.isfinite(value):
-        return NOTHING
-    text = f"{quantity.factor * value:.{quantity.digits}f}"
-    if not unit or not quantity.unit:
-        return text
-    return text + ("" if quantity.unit == "°" else "\N{NO-BREAK SPACE}") + quantity.unit
-
-
 def metrics_table(metrics: Mapping[str, Any]) -> str:
     """Each metric before and after, coloured by whether it became better."""
     before, after = metrics.get("initial") or {}, metrics.get("result") or {}
@@ -102,7 +65,7 @@ def metrics_table(metrics: Mapping[str, Any]) -> str:
     keys += [
         k
         for k in (*before, *after)
-        if k not in QUANTITIES and _is_number(before.get(k, after.get(k)))
+        if k not in QUANTITIES and is_number(before.get(k, after.get(k)))
     ]
     rows = [_metric_row(k, before.get(k), after.get(k)) for k in dict.fromkeys(keys)]
     head = '<tr><th class="text">Metric</th><th>Before</th><th>After</th><th>Change</th></tr>'
@@ -114,7 +77,7 @@ def _metric_row(key: str, before: float | None, after: float | None) -> str:
     change, mood = NOTHING, ""
     if before is not None and after is not None and math.isfinite(before) and math.isfinite(after):
         grown = quantity.factor * (after - before)
-        change = f"{grown:+.{quantity.digits}f}".replace("-", "−")
+        change = signed(grown, quantity.digits)
         if key in QUANTITIES and float(f"{grown:.{quantity.digits}f}"):
             mood = "better" if (grown > 0) == quantity.more_is_better else "worse"
     return (
@@ -134,39 +97,33 @@ def objects_table(
     extra = {str(row.get("id")): row for row in rows}
     fields = list(dict.fromkeys(k for row in rows for k in row if k not in ("id", "category")))
     scores = {str(o.get("id")): o for o in (metrics or {}).get("objects") or ()}
-    judged = [
-        k
-        for k in ("iou3d", "center_error")
-        if any(k in (o.get("result") or {}) for o in scores.values())
-    ]
-    titles = [
-        "Moved",
-        "Turned",
-        "Size",
-        *(QUANTITIES[k].label for k in judged),
-        *(f.replace("_", " ") for f in fields),
-    ]
-    head = f'<tr><th>Object</th><th class="text">Category</th>{"".join(f"<th>{escape(t)}</th>" for t in titles)}</tr>'
+    judged = [k for k in JUDGED if any(k in (o.get("result") or {}) for o in scores.values())]
+    titles = ["Moved", "Turned", "Size", *(QUANTITIES[k].short for k in judged)]
+    titles += [f.replace("_", " ") for f in fields]
+    cells = "".join(f"<th>{escape(t)}</th>" for t in titles)
+    head = f'<tr><th>Object</th><th class="text">Category</th>{cells}</tr>'
     lines: list[str] = []
     for index, piece in enumerate(result.pieces):
-        cells = [
-            *_change_cells(changes.get(piece.id)),
-            *(_score_cell(scores.get(piece.id), k) for k in judged),
-        ]
-        cells += [write_value(extra.get(piece.id, {}).get(f)) for f in fields]
-        lines.append(
-            f'<tr><th><span class="dot" style="--tint:{css(colour(index))}"></span>{escape(piece.id)}</th>'
-            f'<td class="text">{escape(piece.category)}</td>{"".join(f"<td>{c}</td>" for c in cells)}</tr>'
-        )
+        values = [*_change_cells(changes.get(piece.id))]
+        values += [_score_cell(scores.get(piece.id), k) for k in judged]
+        values += [write_value(extra.get(piece.id, {}).get(f)) for f in fields]
+        lines.append(_object_row(piece, css(colour(index)), values))
     return _table(head, lines) if lines else ""
+
+
+def _object_row(piece: Piece, tint: str, values: Sequence[str]) -> str:
+    dot = f'<span class="dot" style="--tint:{tint}"></span>'
+    cells = "".join(f"<td>{v}</td>" for v in values)
+    category = f'<td class="text">{escape(piece.category)}</td>'
+    return f"<tr><th>{dot}{escape(piece.id)}</th>{category}{cells}</tr>"
 
 
 def _change_cells(change: Change | None) -> tuple[str, str, str]:
     if change is None:
         return ("new", NOTHING, NOTHING)
-    grown = [f"{100 * (g - 1):+.0f}".replace("-", "−") for g in change.grown]
+    grown = [signed(100 * (g - 1), 0) for g in change.grown]
     size = f"{grown[0]} %" if len(set(grown)) == 1 else f"{' / '.join(grown)} %"
-    turned = f"{math.degrees(change.turned):+.1f}°".replace("-", "−")
+    turned = f"{signed(math.degrees(change.turned), 1)}°"
     return (f"{100 * change.moved:.0f} cm", turned, size)
 
 
@@ -175,29 +132,9 @@ def _score_cell(score: Mapping[str, Any] | None, key: str) -> str:
     return f"{write_quantity(key, before.get(key), False)} → {write_quantity(key, after.get(key))}"
 
 
-def write_value(value: Any) -> str:  # noqa: ANN401
-    """Any plain value as HTML text."""
-    match value:
-        case None:
-            return NOTHING
-        case bool():
-            return "yes" if value else "no"
-        case int():
-            return f"{value:,}"
-        case float():
-            return f"{value:.3g}" if math.isfinite(value) else NOTHING
-        case list() | tuple():
-            return ", ".join(write_value(v) for v in value) or NOTHING
-        case _:
-            return escape(str(value))
-
-
-def _is_number(value: Any) -> bool:  # noqa: ANN401
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _table(head: str, rows: Sequence[str]) -> str:
-    return f'<div class="wide"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div>'
+    body = f"<thead>{head}</thead><tbody>{''.join(rows)}</tbody>"
+    return f'<div class="wide"><table>{body}</table></div>'
 
 
 def stage_bars(stages: Sequence[Mapping[str, Any]]) -> str:
@@ -205,9 +142,10 @@ def stage_bars(stages: Sequence[Mapping[str, Any]]) -> str:
     longest = max([float(s.get("seconds") or 0) for s in stages], default=0.0) or 1.0
     parts: list[str] = []
     for stage in stages:
-        seconds, memory = float(stage.get("seconds") or 0), stage.get("memory")
+        seconds = float(stage.get("seconds") or 0)
+        memory = float(stage.get("memory") or 0)
         kept = ' <span class="quiet">(from disk)</span>' if stage.get("kept") else ""
-        size = f"{float(memory):,.0f} MB" if _is_number(memory) else ""
+        size = f"{memory:,.0f} MB" if memory else ""
         parts.append(
             f"<span>{escape(str(stage.get('name', '')))}{kept}</span>"
             f'<span class="bar" style="--share:{100 * seconds / longest:.1f}%"><i></i></span>'

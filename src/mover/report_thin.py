@@ -29,7 +29,7 @@ def thin(mesh: Mesh, count: int) -> Mesh:
 
     verts, faces = _welded(mesh)
     if len(faces) > count:
-        verts, faces = simplify(verts, faces.astype(np.int32), target_count=count)
+        verts, faces, *_ = simplify(verts, faces.astype(np.int32), target_count=count)
     if not len(faces):
         return mesh
     return Mesh(torch.from_numpy(verts).float(), torch.from_numpy(faces.astype(np.int64)))

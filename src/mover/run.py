@@ -57,7 +57,13 @@ class Run:
             output = fn(inputs, config, self.observe)
             records.save(output, path)
         self.stages.append(StageLog(name, time.perf_counter() - begin, _peak_memory(), kept))
-        log.info("%s: %s %s in %.1f s", name, "kept" if kept else "made", path.name, self.stages[-1].seconds)
+        log.info(
+            "%s: %s %s in %.1f s",
+            name,
+            "kept" if kept else "made",
+            path.name,
+            self.stages[-1].seconds,
+        )
         return output
 
 

@@ -24,6 +24,8 @@ Array = np.ndarray
 
 NEAR = 40
 """Candidates looked at for each vertex."""
+WORST_MATCH = 0.13
+"""Mismatch of the distances between head, hands and feet; real people give .01 to .08."""
 SPREAD = (0.06, 0.05, 0.5)
 """Typical mismatch of walking distances [m], of places along a limb [m], and of normals."""
 
@@ -48,8 +50,6 @@ class Matched:
 
     part: Int[Array, " verts"]
     rings: Int[Array, "landmarks members"]
-    mismatch: float
-    """Of the distances between the ends of the body, relative."""
 
 
 @cache
@@ -76,15 +76,17 @@ def atlas() -> Atlas:
     )
 
 
-def match(meshes: Float[Array, "meshes verts 3"], faces: Int[Array, "faces 3"]) -> Matched:
+def match(meshes: Float[Array, "meshes verts 3"], faces: Int[Array, "faces 3"]) -> Matched | None:
     """Match a human mesh, seen in one or more poses, to the open body.
 
-    Vertices that hang together with nothing (eyes, teeth) get no part.
+    Vertices that hang together with nothing (eyes, teeth) get no part. None: no whole human body.
     """
     known = atlas()
     model = known.walks.far[known.walks.tips]
     tries = [match_ends(mesh, faces, model) for mesh in meshes]
     found, size, mismatch = min(tries, key=lambda item: item[2])
+    if not mismatch < WORST_MATCH:
+        return None
     rough = _nearest(found.far / size, known.walks.far, 1)[:, 0]
     rings = known.rings[rough]
     if _frontness(meshes, rings, found.tips) < 0:
@@ -95,7 +97,7 @@ def match(meshes: Float[Array, "meshes verts 3"], faces: Int[Array, "faces 3"]) 
     counts = np.stack([(part == p).sum(0) for p in range(-1, int(known.part.max()) + 1)])
     best = counts.argmax(0) - 1
     best[~np.isfinite(found.far[:, 0])] = -1
-    return Matched(best, thin(meshes[0], rings), mismatch)
+    return Matched(best, thin(meshes[0], rings))
 
 
 def _nearest(

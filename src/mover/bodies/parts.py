@@ -23,8 +23,6 @@ log = logging.getLogger(__name__)
 
 __all__ = ["LANDMARKS", "PARTS", "Parts", "members", "parts_of"]
 
-WORST_MATCH = 0.13
-"""Mismatch of the distances between head, hands and feet; real people give .01 to .08."""
 POSES = 4
 """Poses that vote on the parts of an unknown mesh."""
 
@@ -55,6 +53,12 @@ def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> Parts:
             given. Asked only of a mesh that cannot be matched to a human body: its soles are what
             lies lowest.
     """
+    found = _find(bodies, up_cam)
+    device = bodies.verts.device
+    return Parts(found.part_of.to(device), found.rings.to(device))
+
+
+def _find(bodies: Bodies, up_cam: Float[Tensor, "3"] | None) -> Parts:
     model = known_model(bodies.faces, bodies.verts.shape[1])
     if model is not None:
         return _of_model(model)
@@ -64,7 +68,7 @@ def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> Parts:
     meshes = bodies.verts[rows].detach().cpu().double()
     faces = bodies.faces.detach().cpu()
     found = match(meshes.numpy(), faces.numpy())
-    if found.mismatch < WORST_MATCH:
+    if found is not None:
         return Parts(torch.from_numpy(found.part), torch.from_numpy(found.rings))
     log.warning("the bodies' mesh does not look like a whole person: only its soles are looked for")
     default = (0.0, -1.0, 0.0) if bodies.space == "camera" else (0.0, 1.0, 0.0)

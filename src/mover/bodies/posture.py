@@ -4,7 +4,7 @@ World frame, +y up. People are told apart by track; speeds are taken within a tr
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..records import record
@@ -17,6 +17,7 @@ LYING = 24.0  # [degrees] from level, at most, of a trunk that lies
 LOW_PELVIS = 0.78  # of its height when standing, at most, of a sitter's pelvis
 STILL_PELVIS = 0.3  # [m/s] at most, of a sitter's pelvis
 ANKLE = 0.085  # height of the ankle joints over the floor when standing [legs, hip to ankle]
+WINDOW = 0.1  # [s] before and after: long enough that trembling meshes are still
 LONGEST_GAP = 1.0  # [s] between rows of a track that still give a speed
 
 
@@ -55,7 +56,7 @@ def at(places: Float[Tensor, "bodies landmarks 3"], name: str) -> Float[Tensor, 
 def speeds(
     points: Float[Tensor, "bodies points 3"], bodies: Bodies
 ) -> Float[Tensor, "bodies points"]:
-    """Speed of points on each body [m/s], between the neighbours of its frame in its track.
+    """Speed of points on each body [m/s], over the frames about it in its track.
 
     0 where nothing is known: unordered images, or no other frame of the track within a second.
     """
@@ -65,16 +66,23 @@ def speeds(
     for person in bodies.person.unique().tolist():
         row = torch.nonzero(bodies.person == person)[:, 0]
         row = row[torch.argsort(bodies.frame[row])]
-        time = bodies.frame[row].to(points) / bodies.fps
-        gap = time.diff()
-        near = (gap <= LONGEST_GAP) & (gap > 0)
-        way = torch.where(near[:, None, None], points[row].diff(dim=0), 0.0)
-        spent = torch.where(near, gap, 0.0)
-        zero = way.new_zeros(1, *way.shape[1:]), spent.new_zeros(1)
-        both = torch.cat([way, zero[0]]) + torch.cat([zero[0], way])
-        seconds = torch.cat([spent, zero[1]]) + torch.cat([zero[1], spent])
-        result[row] = both.norm(dim=-1) / seconds.clamp_min(1e-6)[:, None]
+        time = bodies.frame[row].double() / bodies.fps
+        first, last = _window(time)
+        way = (points[row[last]] - points[row[first]]).norm(dim=-1)
+        seconds = (time[last] - time[first]).clamp_min(1e-6)
+        result[row] = way / seconds[:, None].to(way)
     return result
+
+
+def _window(time: Float[Tensor, " rows"]) -> tuple[Int[Tensor, " rows"], Int[Tensor, " rows"]]:
+    """First and last row near each moment: within `WINDOW`, else the neighbours if near enough."""
+    index, step = torch.arange(len(time), device=time.device), time.diff()
+    joined = torch.cat([step.new_full((1,), torch.inf), step, step.new_full((1,), torch.inf)])
+    before = index - (joined[:-1] <= LONGEST_GAP).long()
+    after = index + (joined[1:] <= LONGEST_GAP).long()
+    early = torch.searchsorted(time, time - WINDOW - 1e-6)
+    late = torch.searchsorted(time, time + WINDOW + 1e-6, right=True) - 1
+    return torch.minimum(early, before), torch.maximum(late, after)
 
 
 def elevation(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -82,20 +90,24 @@ def elevation(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     return torch.rad2deg(torch.atan2(vector[..., 1], vector[..., [0, 2]].norm(dim=-1)))
 
 
-def postures(bodies: Bodies, parts: Parts, ground: float) -> Postures:
-    """Posture of each body in the world; `ground` is the height of the floor [m]."""
+def postures(bodies: Bodies, parts: Parts, ground: float | None = None) -> Postures:
+    """Posture of each body in the world.
+
+    `ground` is the height of the floor [m]; where it is not known, each body's lowest point counts.
+    """
     places = landmarks(bodies, parts)
+    floor = bodies.verts[..., 1].amin(1) if ground is None else ground
     hips, trunk = at(places, "hips"), at(places, "neck") - at(places, "hips")
     thighs = torch.stack(
         [at(places, f"{s}_knee") - at(places, f"{s}_hip") for s in ("left", "right")], 1
     )
     level = elevation(thighs).abs().amax(1) < LEVEL_THIGH
     rise = elevation(trunk)
-    low = (hips[:, 1] - ground) < LOW_PELVIS * _standing_hips(places, bodies)
+    low = (hips[:, 1] - floor) < LOW_PELVIS * _standing_hips(places, bodies)
     still = speeds(hips[:, None], bodies)[:, 0] < STILL_PELVIS
-    lying = (rise.abs() < LYING) & still & low
     sitting = level & low & still & (rise > UPRIGHT)
     steep = elevation(-thighs).amin(1) > LEVEL_THIGH
+    lying = (rise.abs() < LYING) & still & ~steep
     standing = steep & ~low & (rise > UPRIGHT)
     front = facing(places)
     back = torch.atan2(-(trunk * front).sum(-1), trunk[:, 1])
@@ -132,7 +144,9 @@ def _level(vector: Float[Tensor, "bodies 3"]) -> Float[Tensor, "bodies 3"]:
     return flat / flat.norm(dim=-1, keepdim=True).clamp_min(1e-9)
 
 
-def headings(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies 3"]:
+def headings(
+    bodies: Bodies, parts: Parts, ground: float | None = None
+) -> Float[Tensor, "bodies 3"]:
     """Level unit vector to where each sitter faces: the pelvis' front and the thighs' way.
 
     Zero for people who do not sit.

@@ -12,7 +12,18 @@ from ..geometry.mesh import vertex_normals
 from ..types import Bodies
 from .part_names import PARTS
 from .parts import Parts, members
-from .posture import Postures, at, elevation, facing, landmarks, postures, speeds
+from .posture import (
+    Postures,
+    at,
+    elevation,
+    facing,
+    headings,
+    landmarks,
+    postures,
+    speeds,
+)
+
+__all__ = ["Postures", "headings", "postures", "touching"]
 
 FACING = (0.3, 0.7)  # cosine between normal and the direction of touch: never, surely
 RECLINE = (0.05, 0.2)  # [rad] of the trunk behind upright: not leaning, surely leaning

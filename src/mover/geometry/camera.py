@@ -11,7 +11,9 @@ from .rotations import rot_x, rot_y, rot_z
 NEAR = 0.05  # [m], nothing nearer than this is drawn
 
 
-def project(points_cam: Float[Tensor, "*batch 3"], K: Float[Tensor, "3 3"]) -> Float[Tensor, "*batch 2"]:
+def project(
+    points_cam: Float[Tensor, "*batch 3"], K: Float[Tensor, "3 3"]
+) -> Float[Tensor, "*batch 2"]:
     """Pixels of points in camera axes [m]; points behind the camera are held at `NEAR`."""
     uvw = torch.cat([points_cam[..., :2], points_cam[..., 2:].clamp_min(NEAR)], -1) @ K.mT
     return uvw[..., :2] / uvw[..., 2:]
@@ -31,7 +33,9 @@ def to_world(
     return points_cam @ R_cam_world
 
 
-def tilted(pitch: Float[Tensor, "*batch"], roll: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
+def tilted(
+    pitch: Float[Tensor, "*batch"], roll: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 3 3"]:
     """R_cam_world of a camera with this pitch and roll [rad] and no heading (FORMAT.md)."""
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0])).to(pitch)
     return flip @ rot_z(roll) @ rot_x(-pitch)
@@ -53,5 +57,5 @@ def heading(R_cam_world: Float[Tensor, "3 3"]) -> float:
 
 def without_heading(R_cam_world: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     """R_cam_new of the world turned by `heading`."""
-    turn = rot_y(torch.tensor(heading(R_cam_world)).to(R_cam_world))
+    turn = rot_y(R_cam_world.new_tensor(heading(R_cam_world)))
     return R_cam_world @ turn.mT

@@ -11,7 +11,9 @@ LOWEST = 0.02  # how much a ray of unit depth must go down at least to meet the 
 
 
 def hit_floor(
-    rays_cam: Float[Tensor, "*batch 3"], R_cam_world: Float[Tensor, "3 3"], ground: Float[Tensor, ""]
+    rays_cam: Float[Tensor, "*batch 3"],
+    R_cam_world: Float[Tensor, "3 3"],
+    ground: Float[Tensor, ""],
 ) -> Float[Tensor, "*batch 3"]:
     """Where rays from the camera meet the floor, in the world [m].
 

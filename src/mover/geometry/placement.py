@@ -10,14 +10,19 @@ from .rotations import rot_y
 GROUND, FREE = -1, -2
 
 
-def place(points: Float[Tensor, "objects points 3"], layout: Layout) -> Float[Tensor, "*starts objects points 3"]:
+def place(
+    points: Float[Tensor, "objects points 3"], layout: Layout
+) -> Float[Tensor, "*starts objects points 3"]:
     """Move points from object frames to the world [m]."""
     scaled = points * layout.log_scale.exp().unsqueeze(-2)
     return scaled @ rot_y(layout.yaw).mT + layout.t_world_object.unsqueeze(-2)
 
 
 def stand(
-    layout: Layout, supports: Int[Tensor, " objects"], heights: Float[Tensor, " objects"], ground: float
+    layout: Layout,
+    supports: Int[Tensor, " objects"],
+    heights: Float[Tensor, " objects"],
+    ground: float,
 ) -> Layout:
     """Eliminate the height of objects that stand on the ground or on another object.
 

@@ -166,10 +166,12 @@ def manifold(verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
         faces = fan.reshape(-1, 3)
         tails, heads = half_edges(faces)
         _, first = np.unique(tails * len(verts) + heads, return_index=True)
-        twice = np.setdiff1d(half, np.union1d(first, mates[first]))
+        again = tails < heads
+        again[first] = False
+        twice = np.flatnonzero(again)
         if len(twice) == 0:
             return verts, faces
-        verts, faces = _with_middle(verts, faces, twice[0], mates[twice[0]])
+        verts, faces = _with_middle(verts, faces, int(twice[0]), int(mates[twice[0]]))
 
 
 def _with_middle(

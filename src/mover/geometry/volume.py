@@ -137,8 +137,8 @@ def add_body(
     is_in = np.asarray(inside.ravel()[near])
     keep = ((at >= 0) & (at < values.shape)).all(-1)
     at, is_in = at[keep], is_in[keep]
-    flat = np.ravel_multi_index(tuple(at.T), values.shape)
-    field = values.reshape(-1)
+    flat = np.asarray(np.ravel_multi_index(tuple(at.T), values.shape))
+    field: np.ndarray = values.reshape(-1)
     open_ = is_in | (field[flat] > 0)  # a positive distance cannot lower what is not positive
     at, is_in, flat = at[open_], is_in[open_], flat[open_]
     if len(at) == 0:

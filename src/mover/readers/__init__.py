@@ -4,11 +4,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..types import Capture
-from .arrays import capture_from_arrays as capture_from_arrays
+from .arrays import ObjectArrays, PeopleArrays, capture_from_arrays
 from .folder import read_capture, write_capture
 from .total3d import read_total3d
 
-__all__ = ["READERS", "capture_from_arrays", "read", "read_capture", "write_capture"]
+__all__ = [
+    "READERS", "ObjectArrays", "PeopleArrays", "capture_from_arrays", "read", "read_capture",
+    "write_capture",
+]  # fmt: skip
 
 READERS: dict[str, Callable[[Path], Capture]] = {"folder": read_capture, "total3d": read_total3d}
 """How to read each format, by name."""

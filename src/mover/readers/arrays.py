@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..types import Camera, Capture, Mesh
@@ -17,6 +17,8 @@ from .masks import encode, tight_box
 from .mesh_file import mesh_of
 from .scene_file import FORMAT, VERSION
 
+Numbers = Tensor | NDArray[Any] | np.generic | Sequence[Any] | float
+"""One number or many, of any library."""
 FILE = "arrays"
 """How messages call what has no file."""
 
@@ -27,20 +29,20 @@ class ObjectArrays:
 
     id: str
     category: str
-    vertices: ArrayLike
+    vertices: Numbers
     """(vertices, 3) in its own frame: +y up, +z front [m]."""
-    faces: ArrayLike
+    faces: Numbers
     """(faces, 3)."""
-    translation: Sequence[float]
+    translation: Numbers
     """[m]."""
-    yaw: float
+    yaw: Numbers
     """About +y [rad]."""
-    scale: Sequence[float] = (1.0, 1.0, 1.0)
+    scale: Numbers = (1.0, 1.0, 1.0)
     support: str = "ground"
     """`ground`, `free` or the id of the object that carries it."""
-    mask: ArrayLike | None = None
+    mask: Numbers | None = None
     """(h, w) of booleans: its pixels in the reference image."""
-    box: Sequence[float] | None = None
+    box: Numbers | None = None
     """x_min, y_min, x_max, y_max [px]; by default that of the mask."""
     score: float = 1.0
     mesh_file: str = ""
@@ -51,13 +53,13 @@ class ObjectArrays:
 class PeopleArrays:
     """Visible masks of people."""
 
-    masks: ArrayLike
+    masks: Numbers
     """(rows, h, w) of booleans."""
-    frame: Sequence[int]
-    person: Sequence[int]
+    frame: Numbers
+    person: Numbers
     heights: Mapping[str, float] | None = None
     """Known body heights by track [m]."""
-    reference: ArrayLike | None = None
+    reference: Numbers | None = None
     """(people, h, w) of booleans: people in the reference image."""
 
 
@@ -67,7 +69,7 @@ def capture_from_arrays(
     *,
     bodies: Mapping[str, Any] | None = None,
     people: PeopleArrays | None = None,
-    image: ArrayLike | None = None,
+    image: Numbers | None = None,
     name: str = "arrays",
 ) -> Capture:
     """Make a capture in memory.
@@ -133,7 +135,7 @@ def _scene(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
     return {"format": FORMAT, "version": VERSION, "objects": rows}
 
 
-def _list(value: ArrayLike) -> Any:  # noqa: ANN401
+def _list(value: Numbers) -> Any:  # noqa: ANN401
     """Numbers of any array library as JSON has them."""
     return np.asarray(value).tolist()
 
@@ -192,7 +194,7 @@ def _people(people: PeopleArrays) -> dict[str, Any]:
     }
 
 
-def _stack(value: ArrayLike, field: str) -> Tensor:
+def _stack(value: Numbers, field: str) -> Tensor:
     """Several masks, some of which may be empty."""
     given: NDArray[Any] = np.asarray(value)
     if given.dtype != np.bool_ or given.ndim != 3:
@@ -200,7 +202,7 @@ def _stack(value: ArrayLike, field: str) -> Tensor:
     return torch.from_numpy(given)
 
 
-def _image(image: ArrayLike, camera: Camera) -> Float[Tensor, "h w 3"]:
+def _image(image: Numbers, camera: Camera) -> Float[Tensor, "h w 3"]:
     """The reference image in [0, 1]."""
     given: NDArray[Any] = np.asarray(image)
     value = array(At(given, FILE, "image"), (camera.height, camera.width, 3)).astype(np.float32)

@@ -31,6 +31,15 @@ def decode(masks: Masks, index: int) -> Bool[Tensor, "h w"]:
     return torch.from_numpy(np.ascontiguousarray(image))
 
 
+def thinned(masks: Masks, index: int, step: int) -> NDArray[np.bool_]:
+    """Every `step`-th pixel of one of the masks, without unpacking the rest."""
+    rows = np.arange(step // 2, masks.height, step)
+    columns = np.arange(step // 2, masks.width, step)
+    ends = np.cumsum(run_lengths(masks.counts[index]))
+    places = columns[None, :] * masks.height + rows[:, None]
+    return np.searchsorted(ends, places, side="right") % 2 == 1
+
+
 def area(masks: Masks, index: int) -> int:
     """How many pixels of one of the masks are set."""
     return int(run_lengths(masks.counts[index])[1::2].sum())

@@ -34,6 +34,8 @@ class Spot:
     """[m]"""
     depth: float
     """From the edge to the backrest, or to the far edge [m]."""
+    lip: float
+    """How far the base stands out under the edge [m]."""
     has_back: bool
     piece: int
     """Index of the piece."""

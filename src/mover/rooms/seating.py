@@ -22,7 +22,7 @@ def seat_spot(pieces: tuple[Placed, ...], index: int, along: float = 0.0) -> Spo
     middle = (seat.seat_left + seat.seat_right) / 2
     edge = on_floor(piece, middle + along, seat.seat_front)
     back = seat.back_height > 0
-    return Spot(edge, piece.heading, seat.seat_height, seat.seat_depth, back, index)
+    return Spot(edge, piece.heading, seat.seat_height, seat.seat_depth, 0.0, back, index)
 
 
 def bed_spot(pieces: tuple[Placed, ...], index: int, side: int, along: float) -> Spot:
@@ -31,7 +31,9 @@ def bed_spot(pieces: tuple[Placed, ...], index: int, side: int, along: float) ->
     bed = piece.furniture
     edge = on_floor(piece, bed.seat_right if side > 0 else bed.seat_left, along)
     width = bed.seat_right - bed.seat_left
-    return Spot(edge, piece.heading + side * np.pi / 2, bed.seat_height, width, False, index)
+    lip = bed.size[0] / 2 - bed.seat_right
+    heading = piece.heading + side * np.pi / 2
+    return Spot(edge, heading, bed.seat_height, width, lip, False, index)
 
 
 def before(person: Person, spot: Spot) -> np.ndarray:
@@ -44,8 +46,9 @@ def _depths(person: Person, spot: Spot) -> tuple[float, float]:
     hip, knee = person.joints[LEG[0][0]], person.joints[LEG[0][1]]
     thigh = float(np.linalg.norm(knee - hip))
     rear = -float(person.skin[np.abs(person.skin[:, 1]) < 0.15, 2].min())
-    behind = min(thigh - 0.12, spot.depth - rear - 0.015)
-    return behind, max(CALF, thigh - behind - 0.02)
+    high = max(0.0, spot.height - 0.42)  # high seats: nearer to the edge, knees lower than hips
+    behind = min(thigh - 0.12 - high - spot.lip, spot.depth - rear - 0.015)
+    return behind, max(CALF + spot.lip, thigh - behind - 0.02)
 
 
 def standing(person: Person, place: np.ndarray, heading: float) -> Posture:
@@ -90,8 +93,8 @@ def sit_down(person: Person, end: Posture, heading: float, share: np.ndarray) ->
     feet = end.ankles.mean(1)[0, [0, 2]]
     start = standing(person, feet, heading)
     down = blend(start, end, smooth(share))
-    back = smooth(np.clip(share * 1.25, 0, 1))[:, None]
-    fall = smooth(np.clip((share - 0.12) / 0.88, 0, 1))[:, None]
+    back = smooth(np.clip((share - 0.08) / 0.92, 0, 1))[:, None]
+    fall = smooth(np.clip(share / 0.95, 0, 1))[:, None]
     flat = (1 - back) * start.pelvis + back * end.pelvis
     high = (1 - fall) * start.pelvis + fall * end.pelvis
     bow = BOW * np.sin(np.pi * np.clip(share, 0, 1)) ** 2
@@ -114,8 +117,15 @@ def leaning(person: Person, sitting: Posture, piece: Placed) -> Posture:
             head=sitting.head + np.array([[0.5 * angle, 0]]),
         )
 
-    angle = approach(lambda a: gap(person, at(a), piece, "trunk"), 0.0, 0.62, np.radians(50))
-    drop = approach(lambda d: gap(person, at(angle, d), piece, "core"), -0.04, 1.0, 0.08)
+    angle, drop = 0.0, 0.0
+    for _ in range(2):  # the pelvis tips when one leans, so the seat is met again
+        angle = approach(
+            lambda a, d=drop: gap(person, at(a, d), piece, "trunk"),
+            0.8 * angle,
+            0.62,
+            np.radians(50),
+        )
+        drop = approach(lambda d, a=angle: gap(person, at(a, d), piece, "core"), -0.04, 1.0, 0.08)
     return hands_on_thighs(person, at(angle, drop))
 
 

@@ -1,4 +1,4 @@
-"""Which object does each touching body part touch? (Sec. 3.1, "Contact constraint".)
+"""Find the object that each touching body part touches (Sec. 3.1, "Contact constraint").
 
 By the overlap of its projection with the objects' masks and by the distance in 3D. `vertex` (paper)
 decides for every vertex; `group` decides once for each body and group of parts (seat with thighs,
@@ -154,7 +154,9 @@ def _filled(masks: Bool[Tensor, "objects h w"], boxes: Float[Tensor, "objects 4"
     return torch.where(known, masks, inside)
 
 
-def _distances(points: Float[Tensor, "verts 3"], region: Float[Tensor, "objects region 3"]) -> Tensor:
+def _distances(
+    points: Float[Tensor, "verts 3"], region: Float[Tensor, "objects region 3"]
+) -> Tensor:
     """Distance of each vertex from each object's part, through at most 40 of the vertices [m]."""
     some = points[:: max(1, len(points) // 40)]
     away = torch.cdist(some, region).amin(-1)  # objects some

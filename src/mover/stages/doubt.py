@@ -102,13 +102,15 @@ def _wrong_seats(inputs: DoubtInputs) -> Iterator[str]:
         if abs(gap) > HEIGHT:
             side = "above" if gap > 0 else "below"
             yield (
-                f"{inputs.objects.ids[i]}: its sitters touch {100 * abs(gap):.0f} cm {side} its seat:"
-                " the mesh may have the wrong shape"
+                f"{inputs.objects.ids[i]}: its sitters touch {100 * abs(gap):.0f} cm {side} its"
+                " seat: the mesh may have the wrong shape"
             )
 
 
 def _gap(
-    points: Float[Tensor, "points 3"], weight: Float[Tensor, " points"], seat: Float[Tensor, "region 3"]
+    points: Float[Tensor, "points 3"],
+    weight: Float[Tensor, " points"],
+    seat: Float[Tensor, "region 3"],
 ) -> float:
     """Median height of contact points over the seat below them [m]."""
     real = points[weight > 0]

@@ -114,7 +114,7 @@ def _best_evidence(
 def _lower_feet(inputs: SolesInputs, config: SolesConfig) -> _Feet:
     """Points, posture and motion of the lower foot of each body."""
     bodies, up = inputs.bodies, inputs.camera.R_cam_world[:, 1].to(inputs.bodies.verts)
-    straight = _straight(inputs, config, up)
+    straight = straight_legs(bodies, inputs.parts, up, config)
     points, still, height = [], [], []
     for side in SIDES:
         sole = members(inputs.parts, f"{side}_sole")
@@ -131,12 +131,14 @@ def _lower_feet(inputs: SolesInputs, config: SolesConfig) -> _Feet:
     )
 
 
-def _straight(
-    inputs: SolesInputs, config: SolesConfig, up: Float[Tensor, "3"]
+def straight_legs(
+    bodies: Bodies, parts: Parts, up: Float[Tensor, "3"], config: SolesConfig
 ) -> Bool[Tensor, "bodies sides"]:
-    """Whether each leg stands straight; of a mesh without landmarks whether the body is tall."""
-    bodies = inputs.bodies
-    places = landmarks(bodies, inputs.parts)
+    """Whether each leg, left and right, stands straight; `up` may be off by several degrees.
+
+    Of a mesh without landmarks: whether the body reaches about as high as its person usually does.
+    """
+    places = landmarks(bodies, parts)
     if bool(places.isnan().any()):
         return _tall(bodies, up)[:, None].expand(-1, 2)
     legs: list[Tensor] = []

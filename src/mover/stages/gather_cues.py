@@ -1,5 +1,7 @@
-"""Gather what the people say, once, over all frames (Sec. 3.1): the cost of placing the objects
-does not grow with the video."""
+"""Gather what the people say, once, over all frames (Sec. 3.1).
+
+The cost of placing the objects then does not grow with the video.
+"""
 
 from dataclasses import dataclass, field, replace
 
@@ -81,7 +83,7 @@ def gather_cues(inputs: GatherInputs, config: GatherConfig, observe: Observer = 
     """Two depth maps, one distance volume and one set of contact points from all frames."""
     views = _small_views(inputs.camera)
     masks = _small(inputs.masks, views)
-    maps = None if inputs.people is None else _depth_maps(inputs, config, observe)
+    maps = _depth_maps(inputs, config, observe)
     space = _space(inputs, config, observe)
     touches, seated = assign_touches(
         TouchInputs(
@@ -142,7 +144,9 @@ def _small_boxes(inputs: GatherInputs, views: Views) -> Float[Tensor, "objects 4
     return inputs.boxes * inputs.boxes.new_tensor(zoom * 2)
 
 
-def _depth_maps(inputs: GatherInputs, config: GatherConfig, observe: Observer) -> DepthMaps:
+def _depth_maps(inputs: GatherInputs, config: GatherConfig, observe: Observer) -> DepthMaps | None:
+    if inputs.people is None:
+        return None
     views, bodies = _small_views(inputs.camera), inputs.bodies
     masks = _small(inputs.masks, views)
     table: MaskTable = mask_table(inputs.people, bodies)

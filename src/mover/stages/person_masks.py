@@ -31,7 +31,10 @@ class MaskTable:
 
 def mask_table(people: People, bodies: Bodies) -> MaskTable:
     """Match masks with bodies by frame and track."""
-    row_of = {key: row for row, key in enumerate(zip(people.frame.tolist(), people.person.tolist(), strict=True))}
+    row_of = {
+        key: row
+        for row, key in enumerate(zip(people.frame.tolist(), people.person.tolist(), strict=True))
+    }
     in_frame: dict[int, list[int]] = {}
     for row, frame in enumerate(people.frame.tolist()):
         in_frame.setdefault(frame, []).append(row)

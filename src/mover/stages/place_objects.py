@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..energy import CHAIRS, HumanCues, ImageCues, SceneConfig, SceneWeights, scene_energy
+from ..energy import HumanCues, ImageCues, SceneConfig, SceneWeights, scene_energy
 from ..geometry.placement import stand
 from ..minimize import Adam, Energy, Minimum, Observer, minimize, silent
 from ..records import record
@@ -128,14 +128,12 @@ def _by_boxes(
     def at(free: Layout) -> Layout:
         return replace(starts, t_world_object=free.t_world_object)
 
-    found = minimize(
-        lambda free: energy(at(free)), starts, config.first, observe, "place_objects"
-    )
+    found = minimize(lambda free: energy(at(free)), starts, config.first, observe, "place_objects")
     return at(found.at)
 
 
 def _only(**weights: float) -> SceneWeights:
-    zeros = {name: 0.0 for name in SceneWeights.__dataclass_fields__}
+    zeros = dict.fromkeys(SceneWeights.__dataclass_fields__, 0.0)
     return SceneWeights(**(zeros | weights))
 
 

@@ -19,6 +19,7 @@ PLACE = 0.15  # [m], soles nearer than this stand in one place
 FIXED = 1e-3  # [m], spread of what is known
 CAUTION = 1.4  # variance of the robust fit over that of least squares, feet with 1-2 cm of noise
 BELIEF = 2.0  # frames, and places, that the noise above is worth when the spread is estimated
+ROUGH = 8  # steps are enough before the last scale
 FLAT = math.radians(45)  # [rad], no tilt is less certain than this
 
 
@@ -128,7 +129,7 @@ def fit_plane(
     """Descend from `start` with one scale of the robust price after the other."""
     at = start
     for sigma in sigmas:
-        at = _descend(votes, prior, at, sigma, steps)
+        at = _descend(votes, prior, at, sigma, steps if sigma == sigmas[-1] else min(steps, ROUGH))
     return Fit(at, float(price(at, votes, prior, sigmas[-1])), sigmas[-1], prior)
 
 
@@ -152,7 +153,7 @@ def _descend(
         else:
             return at
         at, damping, gain, value = at - change, damping / 5, value - lower, lower
-        if gain < 1e-12 * (1 + value):
+        if gain < 1e-9 * (1 + value):
             return at
     return at
 
@@ -194,14 +195,11 @@ def covariance_of(fit: Fit, votes: Votes) -> Float[Tensor, "3 3"]:
     """
     residual, slope = _linear(fit.at, votes)
     rows = votes.row_of.bincount()
-    per_row = rows.double()[:, None]
     place = torch.zeros_like(rows).scatter(0, votes.row_of, votes.place_of)
-    height = (
-        residual.new_zeros(len(rows), 1).index_add(0, votes.row_of, residual[:, None]) / per_row
-    )
-    lean = slope.new_zeros(len(rows), slope.shape[1]).index_add(0, votes.row_of, slope) / per_row
-    mass = votes.weight.new_zeros(len(rows)).index_add(0, votes.row_of, votes.weight)
-    height = height[:, 0]
+    height = residual.new_zeros(len(rows)).index_add(0, votes.row_of, residual) / rows
+    lean = slope.new_zeros(len(rows), slope.shape[1]).index_add(0, votes.row_of, slope)
+    lean = lean / rows[:, None]
+    mass = residual.new_zeros(len(rows)).index_add(0, votes.row_of, votes.weight)
     inlier = height.abs() < max(2 * fit.sigma, 3 * 1.4826 * float(height.abs().median()))
     lean, mass, place = lean[inlier], mass[inlier], place[inlier].unique(return_inverse=True)[1]
     height = height[inlier]

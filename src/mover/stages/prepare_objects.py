@@ -67,7 +67,7 @@ class _Proxy:
 def prepare_objects(
     inputs: PrepareInputs, config: PrepareConfig, observe: Observer = silent
 ) -> Prepared:
-    """Close, decimate, sample and pack the furniture; read the initial layout off its placements."""
+    """Close, decimate, sample and pack the furniture; read off where it starts."""
     proxies: list[_Proxy] = []
     for index, piece in enumerate(inputs.pieces):
         proxies.append(_proxy(piece, config))

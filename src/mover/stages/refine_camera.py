@@ -29,7 +29,14 @@ from ..types import Camera, Layout, Objects
 IMAGE_ONLY = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
 SOFT = 0.02  # [1], added to an object's own residual
 RHO = 0.02  # [m], robust width of the soles' heights
-UNITS = (0.01, 0.01, 0.02, 0.01, 0.05, 0.03)  # pitch, roll [rad], ground [m], rays, yaw [rad], log scale
+UNITS = (
+    0.01,
+    0.01,
+    0.02,
+    0.01,
+    0.05,
+    0.03,
+)  # pitch, roll [rad], ground [m], rays, yaw [rad], log scale
 
 
 @dataclass(frozen=True)
@@ -73,12 +80,16 @@ class _Joint:
     log_scale: Float[Tensor, "objects 3"]
 
 
-def refine_camera(inputs: RefineInputs, config: RefineConfig, observe: Observer = silent) -> Refined:
+def refine_camera(
+    inputs: RefineInputs, config: RefineConfig, observe: Observer = silent
+) -> Refined:
     """Minimise over the camera, the ground and all standing objects at once."""
     image = SceneConfig(IMAGE_ONLY, "robust")
     fixed = _start(inputs)
     usable = _usable(inputs)
-    zero = _Joint(*(torch.zeros_like(x) for x in (fixed.tilt, fixed.rays, fixed.yaw, fixed.log_scale)))
+    zero = _Joint(
+        *(torch.zeros_like(x) for x in (fixed.tilt, fixed.rays, fixed.yaw, fixed.log_scale))
+    )
 
     def objects_energy(joint: _Joint) -> Float[Tensor, " objects"]:
         camera, layout = _unpack(joint, inputs)

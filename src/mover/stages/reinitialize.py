@@ -1,10 +1,10 @@
 """Put seats where their contacts are, before people have their say in the descent.
 
-`by_release` is the authors' re-initialisation: chairs and sofas that people touch are turned so that
-their back faces the backs that lean against it, moved to the mean of their contact points, and
-resized with their distance; untouched chairs with more than 500 pixels that are bounded from both
-sides move to the middle. (The release inverts its sigmoid wrongly, which shrinks every such piece by
-10-13 %; not here.) `contact_start` gives the robust preset one more candidate for used seats.
+`by_release` is the authors' re-initialisation. Chairs and sofas that people touch are turned so
+that they face as their sitters do, moved to the mean of their contact points, and resized with
+their distance; untouched chairs with more than 500 pixels that are bounded from both sides move to
+the middle. (The release inverts its sigmoid wrongly, which shrinks every such piece by 10-13 %; not
+here.) `contact_start` gives the robust preset one more candidate for used seats.
 """
 
 from dataclasses import dataclass
@@ -75,9 +75,13 @@ def by_release(inputs: ReinitInputs, config: ReinitConfig, observe: Observer = s
 def _at_contacts(touches: Touches, k: int, layout: Layout, i: int) -> tuple[Tensor, Tensor]:
     """Mean of the contact points, and the turn towards the sitters' heading."""
     weight = touches.weight[k].flatten()
-    mean = (touches.points[k].flatten(0, 1) * weight.unsqueeze(-1)).sum(0) / weight.sum().clamp_min(1e-9)
+    mean = (touches.points[k].flatten(0, 1) * weight.unsqueeze(-1)).sum(0) / weight.sum().clamp_min(
+        1e-9
+    )
     x, z = touches.heading[k].unbind()
-    turn = torch.where(x.abs() + z.abs() > 0, torch.atan2(x, z) - layout.yaw[i], torch.zeros_like(x))
+    turn = torch.where(
+        x.abs() + z.abs() > 0, torch.atan2(x, z) - layout.yaw[i], torch.zeros_like(x)
+    )
     return mean, turn
 
 
@@ -103,7 +107,11 @@ def contact_start(layout: Layout, objects: Objects, touches: Touches | None) -> 
     for k, i in enumerate(touches.object_of.tolist()):
         x, z = touches.heading[k].unbind()
         weight = touches.weight[k, 0]
-        if not bool(objects.is_seat[i]) or float(weight.sum()) == 0 or float(x.abs() + z.abs()) == 0:
+        if (
+            not bool(objects.is_seat[i])
+            or float(weight.sum()) == 0
+            or float(x.abs() + z.abs()) == 0
+        ):
             continue
         yaw[i] = torch.atan2(x, z)
         contact = (touches.points[k, 0] * weight.unsqueeze(-1)).sum(0) / weight.sum()

@@ -37,7 +37,7 @@ def best_few(
 
 
 def _differing(layout: Layout, order: Tensor, index: int) -> Tensor:
-    """Indices of one object's starts: first those that differ from all better ones, then the rest."""
+    """Indices of one object's starts: those that differ from all better ones, then the rest."""
     kept: list[int] = []
     rest: list[int] = []
     for start in order.tolist():

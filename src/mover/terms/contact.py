@@ -3,7 +3,8 @@ r"""Touching surfaces share a place (Sec. 3.1, "Contact constraint").
 Evidence:  body points that touch, from all frames, each assigned to one object and to its part: to
            the seat or top (C(O)^y) if its normal lies within 45 degrees of the vertical, else to
            the back (C(O)^{\perp y}); thinned to small cells whose weight counts the points inside.
-Price:     L_contact = \sum_i \sum_v I(v, O_i) [CD(v^y, C(O_i)^y) + CD(v^{\perp y}, C(O_i)^{\perp y})]
+Price:     L_contact = \sum_i \sum_v I(v, O_i)
+           [CD(v^y, C(O_i)^y) + CD(v^{\perp y}, C(O_i)^{\perp y})]
 Paper:     CD is the distance from a body point to the nearest point of the object's part.
 Release:   from each point of the object's part to the nearest body point, its mean; body and hands
            apart.
@@ -44,7 +45,9 @@ class Touches:
 
 
 def contact_term(
-    regions: tuple[Float[Tensor, "*starts objects region 3"], Float[Tensor, "*starts objects region 3"]],
+    regions: tuple[
+        Float[Tensor, "*starts objects region 3"], Float[Tensor, "*starts objects region 3"]
+    ],
     touches: Touches,
     form: Form,
 ) -> Float[Tensor, "*starts objects"]:

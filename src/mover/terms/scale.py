@@ -23,7 +23,9 @@ from . import Form
 LOWEST, HIGHEST = math.log(0.6), math.log(1.6)
 
 
-def scale_term(log_scale: Float[Tensor, "*starts objects 3"], form: Form) -> Float[Tensor, "*starts objects"]:
+def scale_term(
+    log_scale: Float[Tensor, "*starts objects 3"], form: Form
+) -> Float[Tensor, "*starts objects"]:
     """Distance of the size from the initial one [1]."""
     if form == "paper":
         return safe_norm(log_scale.exp() - 1)

@@ -1,0 +1,152 @@
+"""What a capture knows about each object before anything is computed: for `mover check`."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..geometry.camera import NEAR, project
+from ..types import Bodies, Capture, Masks
+from .masks import area, thinned
+
+CELLS = 320  # columns of the grid on which overlaps are counted
+ENOUGH = 6000  # bodies with fewer vertices are filled with points between them
+FEW = 50  # [px], less than that is no evidence to speak of
+
+
+@dataclass(frozen=True)
+class ObjectEvidence:
+    """What the image and the people say about one object."""
+
+    id: str
+    category: str
+    mask_pixels: int
+    """Size of its mask; 0: it has only a box, or nothing."""
+    near_pixels: int
+    """Pixels of the mask in which a person stands before it at some time (it is farther)."""
+    far_pixels: int
+    """Pixels of the mask in which a body is hidden at some time (it is nearer)."""
+    frames: int
+    """Frames in which a person's visible mask overlaps it."""
+    missing: tuple[str, ...]
+    """What would help and is not there."""
+
+
+def gather_evidence(capture: Capture) -> tuple[ObjectEvidence, ...]:
+    """The evidence of each object, counted on a coarse grid from projected body vertices."""
+    known = {d.id: d for d in capture.detections}
+    found = [None if p.annotation is None else known[p.annotation] for p in capture.scene.pieces]
+    masks = [None if d is None else d.mask for d in found]
+    step = max(1, capture.scene.camera.width // CELLS)
+    grids = _stack(masks, capture, step)
+    near, far = np.zeros_like(grids), np.zeros_like(grids)
+    frames = [set[int]() for _ in masks]
+    for frame, visible, body in _rows(capture, step):
+        over = grids & visible
+        for i in np.flatnonzero(over.any((1, 2))):
+            frames[i].add(frame)
+        if body is not None:
+            near |= over & body
+            far |= grids & body & ~_visible_in(capture, frame, step)
+    counts = near.sum((1, 2)) * step**2, far.sum((1, 2)) * step**2
+    return tuple(
+        _object(capture, i, masks[i], (int(counts[0][i]), int(counts[1][i]), len(frames[i])))
+        for i in range(len(masks))
+    )
+
+
+def _object(
+    capture: Capture, index: int, mask: Masks | None, counts: tuple[int, int, int]
+) -> ObjectEvidence:
+    """The evidence of one object, with what is missing."""
+    piece, (near, far, frames) = capture.scene.pieces[index], counts
+    missing: list[str] = []
+    if piece.annotation is None:
+        missing.append("no annotation")
+    elif mask is None:
+        missing.append("no mask, only a box")
+    elif capture.people is not None and not frames:
+        missing.append("nobody passes it")
+    if frames and capture.bodies is not None:
+        missing += ["no near bound"] if near < FEW else []
+        missing += ["no far bound"] if far < FEW else []
+    size = 0 if mask is None else area(mask, 0)
+    return ObjectEvidence(piece.id, piece.category, size, near, far, frames, tuple(missing))
+
+
+def _stack(masks: Sequence[Masks | None], capture: Capture, step: int) -> NDArray[np.bool_]:
+    """The objects' masks on the grid, empty where there is none."""
+    camera = capture.scene.camera
+    shape = len(range(step // 2, camera.height, step)), len(range(step // 2, camera.width, step))
+    grids = np.zeros((len(masks), *shape), dtype=np.bool_)
+    for grid, mask in zip(grids, masks, strict=True):
+        if mask is not None:
+            grid[:] = thinned(mask, 0, step)
+    return grids
+
+
+def _rows(
+    capture: Capture, step: int
+) -> Iterator[tuple[int, NDArray[np.bool_], NDArray[np.bool_] | None]]:
+    """Frame, visible mask and body silhouette of each mask of a person; on the grid."""
+    people, bodies = capture.people, capture.bodies
+    if people is None:
+        return
+    places: dict[tuple[int, int], int] = {}
+    if bodies is not None:
+        pairs = zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True)
+        places = {pair: row for row, pair in enumerate(pairs)}
+    rows = zip(people.frame.tolist(), people.person.tolist(), strict=True)
+    for i, (frame, person) in enumerate(rows):
+        row = places.get((frame, person))
+        body = None if row is None or bodies is None else _silhouette(capture, bodies, row, step)
+        yield frame, thinned(people.masks, i, step), body
+
+
+def _visible_in(capture: Capture, frame: int, step: int) -> NDArray[np.bool_]:
+    """Where anyone is visible in a frame; on the grid."""
+    assert capture.people is not None
+    rows = (capture.people.frame == frame).nonzero()[:, 0].tolist()
+    return np.any([thinned(capture.people.masks, i, step) for i in rows], axis=0)
+
+
+def _silhouette(capture: Capture, bodies: Bodies, row: int, step: int) -> NDArray[np.bool_]:
+    """Where a body projects to, from its vertices, without gaps of a cell; on the grid."""
+    from scipy.ndimage import binary_closing
+
+    camera, verts = capture.scene.camera, bodies.verts[row]
+    if len(verts) < ENOUGH:
+        corners = verts[bodies.faces]
+        between = [corners.mean(1), *((corners + corners.roll(1, 1)) / 2).unbind(1)]
+        verts = torch.cat([verts, *between])
+    verts = verts[verts[:, 2] > NEAR]
+    cells = (project(verts, camera.K) / step).floor().long()
+    rows, columns = (len(range(step // 2, n, step)) for n in (camera.height, camera.width))
+    inside = ((cells >= 0) & (cells < torch.tensor([columns, rows]))).all(1)
+    x, y = cells[inside].numpy().T
+    grid = np.zeros((rows + 2, columns + 2), dtype=np.bool_)
+    grid[y + 1, x + 1] = True
+    closed = np.asarray(binary_closing(grid, np.ones((3, 3))), dtype=np.bool_)
+    return closed[1:-1, 1:-1]
+
+
+def evidence_table(capture: Capture, evidence: Sequence[ObjectEvidence]) -> str:
+    """The evidence as a table in plain text, and the capture's warnings."""
+    head = ("object", "category", "mask px", "near px", "far px", "frames", "missing")
+    rows = [head] + [
+        (
+            e.id,
+            e.category,
+            str(e.mask_pixels),
+            str(e.near_pixels),
+            str(e.far_pixels),
+            str(e.frames),
+            ", ".join(e.missing) or "-",
+        )
+        for e in evidence
+    ]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
+    lines = ["  ".join(c.ljust(w) for c, w in zip(r, widths, strict=True)).rstrip() for r in rows]
+    return "\n".join([*lines, *(f"warning: {text}" for text in capture.warnings)])

@@ -1,0 +1,156 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tiny_capture as tiny
+import torch
+
+from mover.bodies import load_model
+from mover.bodies.skinning import open_body, zero_pose
+from mover.readers import read_capture
+from mover.readers.bodies_file import read_bodies, write_bodies
+from mover.readers.pose_file import into_camera
+from mover.records import InputError
+from mover.types import BodyPose
+
+ROWS = 3
+
+
+def parameters() -> dict[str, np.ndarray]:
+    generator = np.random.default_rng(3)
+    return {
+        "model": np.array("makehuman"), "gender": np.array("neutral"),
+        "betas": np.zeros(zero_pose(1, open_body()).betas.shape[1]),
+        "global_orient": generator.normal(size=(ROWS, 3)),
+        "body_pose": generator.normal(size=(ROWS, 63)) * 0.2,
+        "transl": generator.normal(size=(ROWS, 3)) * 0.3 + [0, 0, 4],
+        "left_hand_pose": generator.normal(size=(ROWS, 45)) * 0.1,
+    }  # fmt: skip
+
+
+def rows() -> dict[str, np.ndarray]:
+    return {k: v for k, v in tiny.bodies().items() if k in ("frame", "person", "space")}
+
+
+def pose() -> BodyPose:
+    data = {k: torch.from_numpy(v).float() for k, v in parameters().items() if v.dtype.kind == "f"}
+    hand = {"left_hand_pose": data.pop("left_hand_pose")}
+    data["betas"] = data["betas"].expand(ROWS, -1)
+    return BodyPose("makehuman", "neutral", **data, extra=hand)
+
+
+def save(path: Path, **arrays: Any) -> Path:
+    np.savez(path / "bodies.npz", **arrays)
+    return path / "bodies.npz"
+
+
+def told(path: Path) -> tuple[Any, str]:
+    warnings: list[str] = []
+    return read_bodies(path, warnings.append), "\n".join(warnings)
+
+
+def test_parameters_alone_are_posed(tmp_path: Path) -> None:
+    found, words = told(save(tmp_path, **rows(), **parameters()))
+    verts, joints = load_model("makehuman").posed(pose())
+    assert torch.allclose(found.verts, verts, atol=1e-6)
+    assert found.joints is not None
+    assert torch.allclose(found.joints, joints, atol=1e-6)
+    assert found.joint_names == load_model("makehuman").joint_names
+    assert found.pose is not None
+    assert not words
+
+
+def test_meshes_count_and_parameters_stay_when_they_agree(tmp_path: Path) -> None:
+    verts = load_model("makehuman").posed(pose())[0].numpy() + np.float32(0.004)
+    faces = load_model("makehuman").faces.numpy()
+    path = save(tmp_path, **rows(), **parameters(), vertices=verts, faces=faces)
+    found, words = told(path)
+    assert (found.verts.numpy() == verts).all()
+    assert found.pose is not None
+    assert not words
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"transl": np.zeros((ROWS, 3))}, "miss the meshes by up to"),
+        ({"model": np.array("smplx")}, "cannot be used"),
+        ({"body_pose": np.zeros((ROWS, 69))}, "cannot be used"),
+    ],
+)
+def test_parameters_that_do_not_give_the_meshes_are_left_out_with_a_word(
+    tmp_path: Path, change: dict[str, np.ndarray], words: str
+) -> None:
+    meshes = {"vertices": load_model("makehuman").posed(pose())[0].numpy()}
+    meshes["faces"] = load_model("makehuman").faces.numpy()
+    found, told_words = told(save(tmp_path, **rows(), **{**parameters(), **change}, **meshes))
+    assert found.pose is None
+    assert words in told_words
+    assert "rigidly" in told_words
+
+
+def test_meshes_of_another_topology_with_parameters_are_refined_rigidly(tmp_path: Path) -> None:
+    found, words = told(save(tmp_path, **tiny.bodies(), **parameters()))
+    assert found.pose is None
+    assert "4" in words
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"model": np.array("smplx")}, "'model' has 'smplx'"),
+        ({"model": np.array("star")}, "'model' has \"star\", expected one of"),
+        ({"gender": np.array("x")}, "'gender' has \"x\""),
+        ({"body_pose": np.zeros((ROWS, 64))}, "'body_pose' has 64, expected 63 or 69"),
+        ({"body_pose": np.zeros((ROWS, 69))}, "'model' has 'makehuman'.*69"),
+        ({"betas": np.zeros((2, 10))}, "'betas' has shape"),
+        ({"transl": np.full((ROWS, 3), np.nan)}, "'transl' has nan at"),
+        ({"global_orient": np.zeros((ROWS, 4))}, "'global_orient' has shape"),
+        ({"left_hand_pose": np.zeros(45)}, "'left_hand_pose' has shape"),
+    ],
+)
+def test_wrong_parameters_are_named(
+    tmp_path: Path, change: dict[str, np.ndarray], words: str
+) -> None:
+    path = save(tmp_path, **rows(), **{**parameters(), **change})
+    with pytest.raises(InputError, match=words) as caught:
+        read_bodies(path)
+    assert str(caught.value).startswith("bodies.npz: field")
+
+
+def test_bodies_survive_writing(tmp_path: Path) -> None:
+    first, _ = told(save(tmp_path, **rows(), **parameters(), fps=np.array(12.5)))
+    write_bodies(first, tmp_path / "copy.npz")
+    second, words = told(tmp_path / "copy.npz")
+    assert not words
+    assert torch.equal(first.verts, second.verts)
+    assert second.pose is not None
+    assert first.pose is not None
+    for name in ("betas", "global_orient", "body_pose", "transl"):
+        assert torch.equal(getattr(first.pose, name), getattr(second.pose, name))
+    assert torch.equal(first.pose.extra["left_hand_pose"], second.pose.extra["left_hand_pose"])
+    assert (second.fps, second.space) == (12.5, "camera")
+    write_bodies(second, tmp_path / "again.npz")
+    assert (tmp_path / "copy.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
+
+
+def test_parameters_of_world_bodies_turn_with_their_meshes(tmp_path: Path) -> None:
+    world, _ = told(save(tmp_path, **{**rows(), "space": np.array("world")}, **parameters()))
+    R = torch.from_numpy(tiny.rotation(-0.3, 0.1, 0.8)).float()
+    found = into_camera(world, R)
+    assert found.space == "camera"
+    assert torch.allclose(found.verts, world.verts @ R.mT, atol=1e-6)
+    assert found.pose is not None
+    again, _ = load_model("makehuman").posed(found.pose)
+    assert torch.allclose(again, found.verts, atol=2e-5)
+
+
+def test_a_capture_with_parameters_only_is_read(tmp_path: Path) -> None:
+    folder = tiny.write_capture(tmp_path / "tiny")
+    (folder / "contacts.npz").unlink()
+    save(folder, **rows(), **parameters())
+    found = read_capture(folder)
+    assert found.warnings == ()
+    assert found.bodies is not None
+    assert found.bodies.pose is not None

@@ -1,0 +1,40 @@
+import torch
+
+from mover.geometry.crops import area_mean, crop_views, grid_in_image, sample_nearest
+
+K = torch.tensor([[300.0, 0, 32], [0, 310.0, 24], [0, 0, 1]])
+
+
+def test_the_mean_over_a_window_pixel_equals_that_of_a_fine_naive_sampling():
+    g = torch.Generator().manual_seed(0)
+    image = (torch.rand(1, 48, 64, generator=g) > 0.5).float()
+    views = crop_views(K, torch.tensor([[10.3, 5.7, 40.1, 30.9]]), 0.3, 8)
+    x, y = grid_in_image(views, K)
+    found = area_mean(image, views, K)[0]
+    n = 400
+    for row, column in ((0, 0), (3, 5), (7, 7), (2, 6)):
+        xs = torch.linspace(0, 1, n + 1)[:-1] + 0.5 / n
+        u = (x[0, column] + xs * (x[0, column + 1] - x[0, column])).floor().long()
+        v = (y[0, row] + xs * (y[0, row + 1] - y[0, row])).floor().long()
+        inside = ((v >= 0) & (v < 48)).unsqueeze(1) & ((u >= 0) & (u < 64))
+        values = image[0][v.clamp(0, 47)][:, u.clamp(0, 63)] * inside
+        assert abs(float(found[row, column]) - float(values.mean())) < 0.01
+
+
+def test_a_window_sees_a_point_where_its_intrinsics_say():
+    views = crop_views(K, torch.tensor([[10.0, 5.0, 40.0, 30.0]]), 0.3, 32)
+    x, y = grid_in_image(views, K)
+    point = torch.tensor([-0.02, 0.01, 1.0])
+    u, v, _ = (K @ point).tolist()
+    wu, wv, _ = (views.K[0] @ point).tolist()
+    step = float(x[0, 1] - x[0, 0])
+    assert abs(float(x[0, 0]) + wu * step - u) < 1e-3
+    assert abs(float(y[0, 0]) + wv * step - v) < 1e-3
+
+
+def test_beyond_the_image_the_mean_is_zero_and_the_sample_is_the_given_value():
+    views = crop_views(K, torch.tensor([[50.0, 30.0, 90.0, 60.0]]), 0.3, 16)
+    assert float(area_mean(torch.ones(1, 48, 64), views, K)[0, -1, -1]) == 0
+    found = sample_nearest(torch.ones(48, 64), views, K, float("-inf"))
+    assert found[0, -1, -1] == float("-inf")
+    assert found[0, 2, 2] == 1

@@ -1,0 +1,69 @@
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mover.geometry.camera import pitch_roll, tilted, to_camera, without_heading
+from mover.geometry.floor import hit_floor, recast, slide_to_floor
+from mover.geometry.rotations import rot_y
+from mover.types import Layout
+
+ANGLE = st.floats(-0.5, 0.5)
+
+
+@given(ANGLE, ANGLE)
+@settings(max_examples=30, deadline=None)
+def test_pitch_and_roll_come_back_and_the_world_has_no_heading(pitch, roll):
+    R = tilted(torch.tensor(pitch, dtype=torch.float64), torch.tensor(roll, dtype=torch.float64))
+    found = pitch_roll(R)
+    assert abs(float(found[0]) - pitch) < 1e-9
+    assert abs(float(found[1]) - roll) < 1e-9
+    assert abs(float(R[2, 0])) < 1e-12
+    assert float(R[2, 2]) < 0
+    assert abs(float(torch.linalg.det(R)) - 1) < 1e-12
+
+
+@given(ANGLE, ANGLE, st.floats(-3, 3))
+@settings(max_examples=30, deadline=None)
+def test_a_heading_is_removed_whatever_it_is(pitch, roll, turn):
+    R = tilted(torch.tensor(pitch, dtype=torch.float64), torch.tensor(roll, dtype=torch.float64))
+    turned = R @ rot_y(torch.tensor(turn, dtype=torch.float64))
+    torch.testing.assert_close(without_heading(turned), R)
+
+
+def test_rays_meet_the_floor_where_they_point():
+    R = tilted(torch.tensor(-0.3), torch.tensor(0.1))
+    place = torch.tensor([[0.5, -1.5, -3.0], [-1.0, -1.5, -2.0]])
+    cam = to_camera(place, R)
+    torch.testing.assert_close(hit_floor(cam / cam[:, 2:], R, torch.tensor(-1.5)), place)
+
+
+def test_rays_above_the_horizon_stay_finite():
+    R = tilted(torch.tensor(0.0), torch.tensor(0.0))
+    found = hit_floor(torch.tensor([[0.1, -0.5, 1.0]]), R, torch.tensor(-1.5))
+    assert found.isfinite().all()
+    assert float(found[0, 1]) == -1.5
+
+
+def test_a_new_camera_keeps_box_centres_in_the_camera_frame():
+    old, new = (
+        tilted(torch.tensor(-0.1), torch.tensor(0.0)),
+        tilted(torch.tensor(-0.3), torch.tensor(0.1)),
+    )
+    layout = Layout(torch.tensor([[0.5, -1.2, -3.0]]), torch.tensor([0.7]), torch.zeros(1, 3))
+    heights = torch.tensor([0.8])
+    found = recast(layout, heights, old, new)
+    half = torch.tensor([0.0, 0.4, 0.0])
+    torch.testing.assert_close(
+        to_camera(found.t_world_object + half, new), to_camera(layout.t_world_object + half, old)
+    )
+    torch.testing.assert_close(recast(found, heights, new, new).yaw, found.yaw)
+
+
+def test_sliding_to_the_floor_keeps_the_picture():
+    R = tilted(torch.tensor(-0.2), torch.tensor(0.0))
+    layout = Layout(torch.tensor([[0.5, -1.2, -3.0]]), torch.tensor([0.7]), torch.zeros(1, 3))
+    found = slide_to_floor(layout, -1.5, torch.tensor([True]))
+    a, b = to_camera(layout.t_world_object, R), to_camera(found.t_world_object, R)
+    torch.testing.assert_close(a / a[:, 2:], b / b[:, 2:])
+    assert abs(float(found.t_world_object[0, 1]) + 1.5) < 1e-6
+    torch.testing.assert_close(found.log_scale.exp(), torch.full((1, 3), 1.25))

@@ -1,0 +1,170 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from figures import ARMS_DOWN, ARMS_UP, SEATED, STRIDE, people, pose, turned
+
+from mover.bodies import open_body, zero_pose
+from mover.bodies.parts import LANDMARKS, PARTS, members, parts_of
+from mover.bodies.posture import landmarks
+from mover.geometry.mesh import vertex_normals
+from mover.types import Bodies
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+ASSETS = Path(__file__).parents[1] / "src" / "mover" / "assets"
+POSTURES = {"tpose": {}, "stand": ARMS_DOWN, "seated": SEATED, "walk": STRIDE, "up": ARMS_UP}
+
+
+def unknown(base, seed=0):
+    """The same people with shuffled vertices: no model has this topology."""
+    bodies = people(base)
+    order = torch.randperm(bodies.verts.shape[1], generator=torch.Generator().manual_seed(seed))
+    hidden = replace(
+        bodies, verts=bodies.verts[:, order], faces=torch.argsort(order)[bodies.faces], pose=None
+    )
+    true = parts_of(bodies)
+    return hidden, replace(true, part_of=true.part_of[order])
+
+
+def overlap(a, b) -> float:
+    return float((a & b).sum() / (a | b).sum())
+
+
+def centres(bodies, parts):
+    return {p: bodies.verts[0, members(parts, p)].mean(0) for p in PARTS}
+
+
+@pytest.mark.parametrize("detail", ["small", "full"])
+def test_every_part_is_there_and_left_mirrors_right(detail):
+    model = open_body(detail)
+    verts = model.posed(zero_pose(1, model))[0]
+    bodies = replace(people(zero_pose(1, model)), verts=verts, faces=model.faces)
+    parts = parts_of(bodies)
+    middle = centres(bodies, parts)
+    for name in PARTS:
+        assert members(parts, name).sum() > 20
+        if name.startswith("left"):
+            mirror = middle[name.replace("left", "right")] * torch.tensor([-1.0, 1, 1])
+            torch.testing.assert_close(middle[name], mirror, atol=0.02, rtol=0)
+            assert middle[name][0] > 0.05
+
+
+def test_parts_face_where_they_should():
+    model = open_body()
+    verts, _ = model.posed(zero_pose(1, model))
+    bodies = people(zero_pose(1, model))
+    parts, normals = parts_of(bodies), vertex_normals(verts, model.faces)[0]
+    facing = {p: normals[members(parts, p)].mean(0) for p in PARTS}
+    for name in ("left_sole", "right_palm", "left_forearm"):
+        assert facing[name][1] < -0.6
+    for name in ("seat", "back", "right_thigh"):
+        assert facing[name][2] < -0.5
+    height = {p: c[1] for p, c in centres(bodies, parts).items()}
+    assert height["left_sole"] < 0.02
+    assert height["left_thigh"] < height["seat"] < height["back"] < height["left_palm"]
+
+
+@pytest.mark.parametrize("name", ["open_body.npz", "open_body_small.npz"])
+def test_seat_from_skinning_weights_is_where_the_artists_put_the_buttocks(name):
+    with np.load(ASSETS / name) as data:
+        true = torch.from_numpy(data["buttocks"])
+    model = open_body("small" if "small" in name else "full")
+    verts = model.posed(zero_pose(1, model))[0]
+    parts = parts_of(replace(people(zero_pose(1, model)), verts=verts, faces=model.faces))
+    seat = members(parts, "seat")
+    assert (seat & true).sum() / seat.sum() > 0.8
+    assert overlap(seat, true) > 0.55
+
+
+def test_seat_is_what_a_sitter_sits_on():
+    bodies = people(pose(SEATED))
+    model = open_body()
+    upper = [model.joint_names.index(n) for n in ("pelvis", "left_hip", "right_hip")]
+    trunk = torch.isin(model.weights.argmax(1), torch.tensor(upper))
+    height = torch.where(trunk, bodies.verts[0, :, 1], torch.inf)
+    lowest = height.topk(40, largest=False).indices
+    assert (
+        members(parts_of(bodies), "seat", "left_thigh", "right_thigh")[lowest].float().mean() > 0.9
+    )
+
+
+@pytest.mark.parametrize("name", POSTURES)
+def test_parts_of_an_unknown_mesh_are_those_of_the_body_it_is(name):
+    base = turned(pose(POSTURES[name]), 0.4, -2.0, 0.3)
+    base = replace(base, betas=torch.tensor([[0.8, -0.5, 1.0, 0.3]]))
+    bodies, true = unknown(base)
+    found = parts_of(bodies)
+    least = {"sole": 0.7, "seat": 0.6, "back": 0.7, "thigh": 0.5, "palm": 0.6, "forearm": 0.5}
+    for part in PARTS:
+        score = overlap(members(found, part), members(true, part))
+        assert score > least[part.split("_")[-1]], (part, score)
+
+
+def test_landmarks_of_an_unknown_mesh_are_near_the_joints():
+    base = pose(STRIDE)
+    bodies, _ = unknown(base)
+    joints = open_body().posed(base)[1]
+    joints = joints + (people(base).verts - open_body().posed(base)[0]).mean(1, keepdim=True)
+    true = joints[:, [open_body().joint_names.index(n) for n in LANDMARKS]]
+    error = (landmarks(bodies, parts_of(bodies)) - true).norm(dim=-1)
+    assert error.max() < 0.08
+
+
+def test_an_unknown_mesh_and_its_mirror_image_exchange_left_and_right():
+    bodies, _ = unknown(pose(STRIDE))
+    mirror = replace(
+        bodies, verts=bodies.verts * torch.tensor([-1.0, 1, 1]), faces=bodies.faces.flip(1)
+    )
+    found, swapped = parts_of(bodies), parts_of(mirror)
+    for side, other in (("left", "right"), ("right", "left")):
+        for part in ("sole", "thigh", "palm"):
+            same = overlap(members(found, f"{side}_{part}"), members(swapped, f"{other}_{part}"))
+            assert same > 0.8
+
+
+def test_eyes_that_hang_loose_have_no_part():
+    bodies, _ = unknown(pose(ARMS_DOWN))
+    count = bodies.verts.shape[1]
+    ball = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * 0.02
+    loose = replace(
+        bodies,
+        verts=torch.cat([bodies.verts, bodies.verts[:, :1] + 0.01 + ball], 1),
+        faces=torch.cat(
+            [bodies.faces, torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]) + count]
+        ),
+    )
+    found = parts_of(loose)
+    assert (found.part_of[count:] == -1).all()
+    assert torch.equal(found.part_of[:count], parts_of(bodies).part_of)
+
+
+def test_of_a_statue_on_a_block_only_the_lowest_faces_are_soles(caplog):
+    corners = torch.tensor([[x, y, z] for x in (0, 1.0) for y in (0, 1.0) for z in (0, 1.0)])
+    faces = torch.tensor([
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ])  # fmt: skip
+    stretched = corners * torch.tensor([1.0, 0.1, 1.0])
+    block = replace(people(pose({})), verts=stretched[None], faces=faces, pose=None)
+    found = parts_of(block)
+    assert "whole person" in caplog.text
+    assert found.rings.numel() == 0
+    assert (found.part_of[stretched[:, 1] > 0] == -1).all()
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the shared data are not here")
+def test_dancer_in_a_photograph_stands_on_the_soles_that_are_found():
+    with np.load(SHARED / "photo_bench" / "bodies.npz") as data:
+        verts, faces = torch.from_numpy(data["vertices"]), torch.from_numpy(data["faces"]).long()
+    zero = torch.zeros(1, dtype=torch.long)
+    bodies = Bodies(verts, faces, None, (), zero, zero, None, "camera", None)
+    parts = parts_of(bodies, torch.tensor([0.0, -1.0, 0.0]))
+    height = -verts[0, :, 1]
+    for side in ("left", "right"):
+        sole = members(parts, f"{side}_sole")
+        assert 250 < sole.sum() < 600
+        ground = height[sole].min() - height.min()
+        assert ground < 0.15  # one foot is off the ground, heel first
+    assert height[members(parts, "seat")].mean() < height[members(parts, "back")].mean()

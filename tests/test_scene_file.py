@@ -1,0 +1,117 @@
+import json
+from pathlib import Path
+
+import pytest
+import tiny_capture as tiny
+import torch
+
+from mover.geometry.placement import place_piece
+from mover.readers.scene_file import read_scene, write_scene
+from mover.records import InputError
+from mover.types import Camera, Mesh, Piece, Scene
+
+CAMERA = Camera(torch.eye(3) * 50, torch.diag(torch.tensor([1.0, -1, -1])), 20, 10)
+
+
+def step() -> Mesh:
+    return Mesh(torch.from_numpy(tiny.STEP).float(), torch.from_numpy(tiny.STEP_FACES))
+
+
+def piece(name: str = "a", file: str = "") -> Piece:
+    place, scale = torch.tensor([0.1, -1.0, -2.0]), torch.tensor([1.0, 2.0, 3.0])
+    return Piece(name, "chair", step(), file, None, "free", place, torch.tensor(0.3), scale)
+
+
+def test_a_mesh_without_a_file_becomes_glb_with_the_same_triangles(tmp_path: Path) -> None:
+    write_scene(Scene(CAMERA, None, (piece(),)), tmp_path / "scene.json")
+    assert [p.name for p in (tmp_path / "meshes").iterdir()] == ["a.glb"]
+    found = read_scene(tmp_path / "scene.json")
+    assert found.ground is None
+    assert found.pieces[0].support == "free"
+    assert found.pieces[0].annotation is None
+    assert torch.allclose(place_piece(found.pieces[0]).verts, place_piece(piece()).verts)
+    assert found.pieces[0].mesh.faces.tolist() == tiny.STEP_FACES.tolist()
+
+
+def test_a_users_mesh_is_copied_byte_by_byte(tmp_path: Path) -> None:
+    source = tmp_path / "user" / "thing.obj"
+    source.parent.mkdir()
+    tiny.write_obj(source, tiny.STEP, tiny.STEP_FACES)
+    out = tmp_path / "out" / "scene.json"
+    write_scene(Scene(CAMERA, -1.0, (piece("a", str(source)), piece("b", str(source)))), out)
+    for name in ("a", "b"):
+        assert (out.parent / "meshes" / f"{name}.obj").read_bytes() == source.read_bytes()
+
+
+def test_materials_and_textures_go_with_an_obj_and_two_do_not_mix(tmp_path: Path) -> None:
+    pieces = []
+    for colour in ("red", "blue"):
+        home = tmp_path / colour
+        (home / "maps").mkdir(parents=True)
+        tiny.write_obj(home / "thing.obj", tiny.STEP, tiny.STEP_FACES)
+        (home / "thing.obj").write_text(
+            "mtllib my stuff.mtl\nmtllib ../secret.mtl\n" + (home / "thing.obj").read_text()
+        )
+        (home / "my stuff.mtl").write_text(f"newmtl {colour}\nmap_Kd -s 1 1 1 maps/wood.png\n")
+        (home / "maps" / "wood.png").write_text(colour)
+        pieces.append(piece(colour, str(home / "thing.obj")))
+    (tmp_path / "secret.mtl").write_text("not beside the mesh")
+    write_scene(Scene(CAMERA, None, tuple(pieces)), tmp_path / "out" / "scene.json")
+    files = [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
+    assert not [p for p in files if "secret" in p.name]
+    for colour in ("red", "blue"):
+        home = tmp_path / "out" / "meshes" / colour
+        assert (home / f"{colour}.obj").read_bytes() == (
+            tmp_path / colour / "thing.obj"
+        ).read_bytes()
+        assert colour in (home / "my stuff.mtl").read_text()
+        assert (home / "maps" / "wood.png").read_text() == colour
+    assert len(read_scene(tmp_path / "out" / "scene.json").pieces) == 2
+
+
+def test_the_buffer_of_a_gltf_goes_with_it(tmp_path: Path) -> None:
+    import trimesh
+
+    body = trimesh.Trimesh(tiny.STEP, tiny.STEP_FACES, process=False)
+    for name, content in trimesh.Scene(body).export(file_type="gltf").items():
+        (tmp_path / name).write_bytes(content)
+    write_scene(
+        Scene(CAMERA, None, (piece("a", str(tmp_path / "model.gltf")),)), tmp_path / "o" / "s.json"
+    )
+    found = read_scene(tmp_path / "o" / "s.json").pieces[0]
+    assert torch.equal(found.mesh.verts, step().verts)
+
+
+def test_writing_over_the_scene_that_was_read_changes_no_byte(tmp_path: Path) -> None:
+    folder = tiny.write_capture(tmp_path / "tiny")
+    scene = read_scene(folder / "scene.json", CAMERA)
+    write_scene(scene, folder / "scene.json")
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    write_scene(read_scene(folder / "scene.json"), folder / "scene.json")
+    assert before == {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_vertices_that_no_face_uses_and_faces_without_area_do_not_count(tmp_path: Path) -> None:
+    verts = [[9.0, 9, 9], *tiny.STEP.tolist(), [-9.0, 0, 0]]
+    lines = ["v " + " ".join(map(str, v)) for v in verts]
+    lines += ["f " + " ".join(str(i + 2) for i in f) for f in tiny.STEP_FACES.tolist()]
+    folder = tiny.write_capture(tmp_path / "tiny")
+    (folder / "meshes" / "step.obj").write_text("\n".join([*lines, "f 1 1 1", ""]))
+    mesh = read_scene(folder / "scene.json", CAMERA).pieces[0].mesh
+    assert torch.equal(mesh.verts, step().verts)
+    assert torch.equal(mesh.faces, step().faces)
+
+
+def test_a_scene_without_any_camera_is_refused(tmp_path: Path) -> None:
+    folder = tiny.write_capture(tmp_path / "tiny")
+    with pytest.raises(
+        InputError, match=r"scene.json: field 'camera' has nothing, expected a camera"
+    ):
+        read_scene(folder / "scene.json")
+
+
+def test_numbers_are_written_as_short_decimals_that_read_back_the_same(tmp_path: Path) -> None:
+    write_scene(Scene(CAMERA, None, (piece(),)), tmp_path / "scene.json")
+    tree = json.loads((tmp_path / "scene.json").read_text())
+    assert tree["objects"][0]["translation"] == [0.1, -1.0, -2.0]
+    assert tree["objects"][0]["yaw"] == 0.3
