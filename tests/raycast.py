@@ -67,8 +67,8 @@ def _cast(verts, faces, K, height, width):
     step = max(1, CHUNK // max(len(faces), 1))
     parts = [_hits(flat[i : i + step], verts[faces]) for i in range(0, len(flat), step)]
     if parts:
-        for image, values in zip((front, back, face_index, count), zip(*parts)):
-            image[rows, columns] = np.concatenate(values).reshape(grid.shape[:2])
+        for k, image in enumerate((front, back, face_index, count)):
+            image[rows, columns] = np.concatenate([p[k] for p in parts]).reshape(grid.shape[:2])
     return front, back, face_index, count
 
 

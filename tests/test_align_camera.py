@@ -145,6 +145,7 @@ def test_offsets_help_where_people_walk_in_the_same_place():
     assert np.abs(errors(free)[:2]).max() < np.abs(errors(stiff)[:2]).max() < 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("frames", "noise"), [(1, 0.015), (6, 0.02)])
 def test_the_covariance_is_calibrated(frames, noise):
     rng, scores = np.random.default_rng(3), []

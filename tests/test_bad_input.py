@@ -76,6 +76,9 @@ JSON = [
     ("scene.json", "objects.0.mesh", "/etc/passwd", "inside the capture"),
     ("scene.json", "objects.0.mesh", "meshes/no.glb", "does not exist"),
     ("scene.json", "objects.0.mesh", "camera.json", "a file of kind"),
+    ("scene.json", "objects.0.mesh", "a" * 5000, "cannot be found"),
+    ("scene.json", "objects.0.mesh", "a\0b", "printable"),
+    ("scene.json", "objects.0.category", "\ud800", "printable"),
     ("scene.json", "objects.0.annotation", 12, "'objects.0..annotation' has 12"),
     ("scene.json", "objects.0.annotation", 5, "used twice"),
     ("scene.json", "objects.0.annotation", "11", "whole number"),
@@ -261,6 +264,25 @@ def test_a_broken_mesh_file_is_named(folder: Path, kind: str, content: bytes) ->
     put(scene, "objects.0.mesh", f"meshes/broken.{kind}")
     (folder / "scene.json").write_text(json.dumps(scene))
     refused(folder, "scene.json", "broken|empty mesh")
+
+
+@pytest.mark.parametrize(
+    ("tree", "words"),
+    [
+        ({"buffers": [{"uri": "../../secret.bin", "byteLength": 4}]}, "buffers beside it"),
+        ({"accessors": [{"count": 1 << 40}]}, "1099511627776"),
+        ({"buffers": [3]}, "cannot be read"),
+    ],
+)
+def test_a_gltf_that_reaches_out_of_its_folder_or_of_memory_is_refused(
+    folder: Path, tree: dict[str, Any], words: str
+) -> None:
+    (folder.parent.parent / "secret.bin").write_bytes(b"1234")
+    (folder / "meshes" / "a.gltf").write_text(json.dumps(tree))
+    scene = tiny.scene()
+    put(scene, "objects.0.mesh", "meshes/a.gltf")
+    (folder / "scene.json").write_text(json.dumps(scene))
+    refused(folder, "scene.json", words)
 
 
 def test_a_link_that_leaves_the_folder_is_refused(folder: Path) -> None:

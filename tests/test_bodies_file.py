@@ -1,3 +1,4 @@
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import torch
 
 from mover.bodies import load_model
 from mover.bodies.skinning import open_body, zero_pose
+from mover.geometry.rotations import axis_angle
 from mover.readers import read_capture
 from mover.readers.bodies_file import read_bodies, write_bodies
 from mover.readers.pose_file import into_camera
@@ -17,7 +19,7 @@ from mover.types import BodyPose
 ROWS = 3
 
 
-def parameters() -> dict[str, np.ndarray]:
+def parameters() -> dict[str, Any]:
     generator = np.random.default_rng(3)
     return {
         "model": np.array("makehuman"), "gender": np.array("neutral"),
@@ -29,7 +31,7 @@ def parameters() -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
-def rows() -> dict[str, np.ndarray]:
+def rows() -> dict[str, Any]:
     return {k: v for k, v in tiny.bodies().items() if k in ("frame", "person", "space")}
 
 
@@ -80,7 +82,7 @@ def test_meshes_count_and_parameters_stay_when_they_agree(tmp_path: Path) -> Non
     ],
 )
 def test_parameters_that_do_not_give_the_meshes_are_left_out_with_a_word(
-    tmp_path: Path, change: dict[str, np.ndarray], words: str
+    tmp_path: Path, change: dict[str, Any], words: str
 ) -> None:
     meshes = {"vertices": load_model("makehuman").posed(pose())[0].numpy()}
     meshes["faces"] = load_model("makehuman").faces.numpy()
@@ -111,7 +113,7 @@ def test_meshes_of_another_topology_with_parameters_are_refined_rigidly(tmp_path
     ],
 )
 def test_wrong_parameters_are_named(
-    tmp_path: Path, change: dict[str, np.ndarray], words: str
+    tmp_path: Path, change: dict[str, Any], words: str
 ) -> None:
     path = save(tmp_path, **rows(), **{**parameters(), **change})
     with pytest.raises(InputError, match=words) as caught:
@@ -154,3 +156,29 @@ def test_a_capture_with_parameters_only_is_read(tmp_path: Path) -> None:
     assert found.warnings == ()
     assert found.bodies is not None
     assert found.bodies.pose is not None
+
+
+@dataclass(frozen=True)
+class Puppet:
+    """A stiff body whose pelvis is not at its origin, as SMPL's is not."""
+
+    name: str = "smplx"
+    joint_names: tuple[str, ...] = ("pelvis",)
+
+    @property
+    def faces(self) -> torch.Tensor:
+        return torch.from_numpy(tiny.BODY_FACES)
+
+    def posed(self, pose: BodyPose) -> tuple[torch.Tensor, torch.Tensor]:
+        pelvis = torch.tensor([0.1, -0.35, 0.02])
+        turned = (torch.from_numpy(tiny.BODY).float() - pelvis) @ axis_angle(pose.global_orient).mT
+        return (turned + pelvis + pose.transl[:, None]), (pelvis + pose.transl)[:, None]
+
+
+def test_the_root_turns_about_the_pelvis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mover.readers.pose_file.load_model", lambda *_: Puppet())
+    given = {**parameters(), "model": np.array("smplx")}
+    world, _ = told(save(tmp_path, **{**rows(), "space": np.array("world")}, **given))
+    found = into_camera(world, torch.from_numpy(tiny.rotation(-0.3, 0.1, 0.8)).float())
+    assert found.pose is not None
+    assert torch.allclose(Puppet().posed(found.pose)[0], found.verts, atol=1e-5)

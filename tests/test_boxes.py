@@ -4,6 +4,7 @@ import manifold3d
 import numpy as np
 import pytest
 import torch
+
 from mover.geometry.boxes import Box, box_of, corners, iou2d, iou3d
 from mover.geometry.placement import place_piece
 from mover.geometry.rotations import rot_y
@@ -26,7 +27,7 @@ def by_manifold(a: Box, b: Box, index: int) -> float:
 def random_boxes(count: int, seed: int) -> Box:
     generator = torch.Generator().manual_seed(seed)
     rows = torch.rand(count, 7, generator=generator, dtype=torch.float64)
-    return Box(2 * rows[:, :3], 0.05 + 2 * rows[:, 3:6], 14 * (rows[:, 6] - 0.5))
+    return Box(1.5 * rows[:, :3], 0.05 + 2 * rows[:, 3:6], 14 * (rows[:, 6] - 0.5))
 
 
 def test_iou_is_that_of_exact_solids_on_a_thousand_pairs():
@@ -78,7 +79,8 @@ def test_iou_of_empty_boxes_is_zero():
 def test_iou_keeps_leading_axes_and_precision():
     rows = random_boxes(6, 2)
     folded = Box(
-        rows.center.reshape(2, 3, 3).float(), rows.size.reshape(2, 3, 3).float(),
+        rows.center.reshape(2, 3, 3).float(),
+        rows.size.reshape(2, 3, 3).float(),
         rows.yaw.reshape(2, 3).float(),
     )
     found = iou3d(folded, folded)
@@ -89,9 +91,7 @@ def test_iou_keeps_leading_axes_and_precision():
 
 def test_corners_are_in_their_documented_order():
     box = boxes_at([1, 2, 3], [2, 4, 6], 0)
-    expected = [
-        [x, y, z] for x in (0.0, 2.0) for y in (0.0, 4.0) for z in (0.0, 6.0)
-    ]
+    expected = [[x, y, z] for x in (0.0, 2.0) for y in (0.0, 4.0) for z in (0.0, 6.0)]
     torch.testing.assert_close(corners(box)[0], torch.tensor(expected, dtype=torch.float64))
     turned = boxes_at([0, 0, 0], [2, 4, 6], np.pi / 2)  # +z of the box is +x of the world
     torch.testing.assert_close(
@@ -104,9 +104,14 @@ def test_the_box_of_a_piece_has_the_corners_of_its_placed_box_mesh():
     faces = torch.tensor([[0, 1, 2], [3, 4, 5], [5, 6, 7]])
     unused = torch.full((1, 3), 50.0)
     piece = Piece(
-        id="shelf_0", category="shelf", mesh=Mesh(torch.cat([verts, unused]), faces),
-        mesh_file="meshes/shelf_0.glb", annotation=None, support="ground",
-        t_world_object=torch.tensor([0.3, -1.0, -2.0]), yaw=torch.tensor(0.8),
+        id="shelf_0",
+        category="shelf",
+        mesh=Mesh(torch.cat([verts, unused]), faces),
+        mesh_file="meshes/shelf_0.glb",
+        annotation=None,
+        support="ground",
+        t_world_object=torch.tensor([0.3, -1.0, -2.0]),
+        yaw=torch.tensor(0.8),
         scale=torch.tensor([1.5, 0.5, 2.0]),
     )
     box = box_of(piece)

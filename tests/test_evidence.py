@@ -30,8 +30,8 @@ def room(hide: bool) -> Capture:
     """A cupboard fills the right half; a ball passes before it, or is hidden by it."""
     left = np.zeros((HEIGHT, WIDTH), dtype=bool)
     left[:, 80:] = True
-    verts = [sphere(x)[0] for x in (-1.0, 0.0)]
-    masks = np.stack([disc(-1.0), disc(0.0) & (~left if hide else True)])
+    verts = [sphere(x)[0] for x in (-1.5, 0.0)]
+    masks = np.stack([disc(-1.5), disc(0.0) & (~left if hide else True)])
     other = np.zeros_like(left)
     other[:5, :5] = True
     step = {"vertices": tiny.STEP, "faces": tiny.STEP_FACES, "translation": (0, 0, -3), "yaw": 0}

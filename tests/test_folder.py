@@ -186,6 +186,12 @@ def test_a_heading_turns_the_world_and_leaves_the_view(folder: Path) -> None:
     close(wrapped, found)
 
 
+def test_a_capture_is_not_mixed_with_what_lies_in_its_folder(folder: Path) -> None:
+    capture = dataclasses.replace(read_capture(folder), people=None, reference_people=None)
+    with pytest.raises(ValueError, match=r"has people.json, which the capture lacks"):
+        write_capture(capture, folder)
+
+
 def test_truth_is_not_looked_at(folder: Path) -> None:
     (folder / "truth").mkdir()
     (folder / "truth" / "scene.json").write_text("broken")

@@ -6,12 +6,13 @@ import torch
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
+
 from mover.geometry import mesh as m
 from mover.geometry.nearest import nearest_points, to_surface
 from mover.geometry.rotations import axis_angle
 from mover.geometry.topology import manifold
 from mover.types import Mesh
-from torch import Tensor
 
 
 def as_mesh(shape: trimesh.Trimesh) -> Mesh:
@@ -143,16 +144,17 @@ def test_solids_that_touch_in_an_edge_come_apart():
     assert trimesh.Trimesh(verts, faces, process=False).body_count == 2
 
 
-def test_a_ring_that_meets_itself_in_an_edge_becomes_manifold():
-    cells = [(0, 0), (1, 1), (0, 2), (-1, 1), (0, 3), (1, 3), (2, 3), (2, 2), (2, 1)]
-    solid = voxels({(x, y, 0) for x, y in cells})
+def test_a_solid_whose_walls_meet_in_an_inner_edge_becomes_manifold():
+    cells = {(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1, 2)}
+    cells -= {(1, 0, 1), (0, 1, 1)}
+    solid = voxels(cells)
     assert not m.is_closed(solid.faces)
     found = manifold(solid.verts.numpy(), solid.faces.numpy())
     assert found is not None
-    assert m.is_closed(torch.from_numpy(found[1]))
-    assert m.signed_volume(
-        Mesh(torch.from_numpy(found[0]), torch.from_numpy(found[1]))
-    ) == pytest.approx(len(cells))
+    mesh = Mesh(torch.from_numpy(found[0]), torch.from_numpy(found[1]))
+    assert m.is_closed(mesh.faces)
+    assert m.signed_volume(mesh) == pytest.approx(len(cells))
+    assert trimesh.Trimesh(*found, process=False).body_count == 1
 
 
 def voxels(cells: set[tuple[int, int, int]]) -> Mesh:

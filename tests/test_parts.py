@@ -168,3 +168,14 @@ def test_dancer_in_a_photograph_stands_on_the_soles_that_are_found():
         ground = height[sole].min() - height.min()
         assert ground < 0.15  # one foot is off the ground, heel first
     assert height[members(parts, "seat")].mean() < height[members(parts, "back")].mean()
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the shared data are not here")
+@pytest.mark.parametrize("row", range(8))
+def test_left_and_right_of_real_poses_are_not_confused(row):
+    angles = torch.from_numpy(np.load(SHARED / "sam3d_body" / "example_smplx_poses.npy")[row])
+    base = replace(pose({}), body_pose=angles[None, 3:66], global_orient=angles[None, :3])
+    bodies, true = unknown(base)
+    found = parts_of(bodies)
+    for part in ("left_sole", "right_sole", "seat", "back"):
+        assert overlap(members(found, part), members(true, part)) > 0.45, part

@@ -3,6 +3,7 @@
 import json
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -67,12 +68,12 @@ def compressed(counts: list[int]) -> str:
     return code
 
 
-def camera(**changes: object) -> dict[str, object]:
+def camera(**changes: object) -> dict[str, Any]:
     tree = {"w": WIDTH, "h": HEIGHT, "fl_x": 60.0, "fl_y": 58.5, "cx": 30.5, "cy": 25.25}
     return {**tree, "R_cam_world": rotation(PITCH, ROLL).tolist(), **changes}
 
 
-def scene() -> dict[str, object]:
+def scene() -> dict[str, Any]:
     return {
         "format": "mover-scene",
         "version": 1,
@@ -91,7 +92,7 @@ def scene() -> dict[str, object]:
     }  # fmt: skip
 
 
-def objects() -> dict[str, object]:
+def objects() -> dict[str, Any]:
     code = {"size": [HEIGHT, WIDTH], "counts": compressed(runs(object_mask(0)))}
     corners = [[40.0, 10.0, 60.0, 10.0, 60.0, 30.0, 40.0, 30.0]]
     first = {"id": 11, "image_id": 4, "category_id": 62, "bbox": [5, 20, 20, 20], "score": 0.75}
@@ -103,7 +104,7 @@ def objects() -> dict[str, object]:
     }
 
 
-def people() -> dict[str, object]:
+def people() -> dict[str, Any]:
     annotations = []
     for i, (frame, person, _) in enumerate(ROWS):
         counts = runs(person_mask(i))
@@ -120,7 +121,7 @@ def people() -> dict[str, object]:
     }
 
 
-def bodies() -> dict[str, np.ndarray]:
+def bodies() -> dict[str, Any]:
     verts = np.stack([BODY + np.array(place) for _, _, place in ROWS])
     return {
         "frame": np.array([frame for frame, _, _ in ROWS]),
@@ -159,7 +160,8 @@ def write_glb(path: Path) -> None:
     body = trimesh.Trimesh(STEP, STEP_FACES, process=False)
     whole = trimesh.Scene()
     whole.add_geometry(body, transform=transform)
-    path.write_bytes(whole.export(file_type="glb"))
+    content: Any = whole.export(file_type="glb")
+    path.write_bytes(content)
 
 
 def write_capture(folder: Path) -> Path:

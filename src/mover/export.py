@@ -34,6 +34,7 @@ def write_glb(scene: Scene, bodies: Bodies | None, path: Path) -> Path:
         path: The file to write.
     """
     import trimesh
+    from trimesh.exchange.gltf import export_glb
 
     out = trimesh.Scene()
     for index, piece in enumerate(scene.pieces):
@@ -42,10 +43,11 @@ def write_glb(scene: Scene, bodies: Bodies | None, path: Path) -> Path:
         floor = _solid(_floor(scene, scene.ground), (*FLOOR_COLOUR, 1.0), "ground")
         name = _free(out, "ground")
         out.add_geometry(floor, node_name=name, geom_name=name)
-    for row in _chosen(bodies) if bodies is not None else []:
-        _add_body(out, bodies, row)
+    if bodies is not None:
+        for row in _chosen(bodies):
+            _add_body(out, bodies, row)
     _add_camera(out, scene.camera)
-    raw = out.export(file_type="glb", tree_postprocessor=lambda tree: _set_lens(tree, scene.camera))
+    raw = export_glb(out, tree_postprocessor=lambda tree: _set_lens(tree, scene.camera))
     with replacing(path) as part:
         part.write_bytes(raw)
     return path

@@ -21,7 +21,14 @@ from .stages.find_image_cues import ImageInputs, find_image_cues, order_of
 from .stages.find_soles import SolesInputs, find_soles
 from .stages.find_touches import FindTouchesInputs, find_touches
 from .stages.gather_cues import Cues, GatherInputs, cues_in_windows, gather_cues
-from .stages.inputs import Seen, ground_without_people, image_evidence, in_world, rows_of
+from .stages.inputs import (
+    Seen,
+    detected_masks,
+    ground_without_people,
+    image_evidence,
+    in_world,
+    rows_of,
+)
 from .stages.place_objects import Placed, PlaceInputs, place_objects
 from .stages.prepare_objects import Prepared, PrepareInputs, prepare_objects, proxy_meshes, restore
 from .stages.refine_camera import RefineInputs, refine_camera
@@ -96,9 +103,9 @@ def _people(job: Job) -> Crew | None:
     parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
     kept = run.stage(select_frames, SelectInputs(bodies), config.select).keep
     warnings: tuple[str, ...] = ()
-    if config.depth.use and capture.people is not None:
+    if config.correct_depth and capture.people is not None:
         inputs = DepthInputs(
-            rows_of(bodies, kept), capture.people, scene.camera, job.seen.masks.any(0)
+            bodies, parts, kept, capture.people, detected_masks(capture), scene.camera
         )
         depth = run.stage(find_depth, inputs, config.depth)
         bodies, warnings = apply_depth(bodies, depth), depth.warnings

@@ -31,6 +31,8 @@ class Config:
     """Which frames are believed."""
     depth: DepthConfig = field(default_factory=DepthConfig)
     """One depth factor a person."""
+    correct_depth: bool = False
+    """Whether it is looked for and applied."""
     soles: SolesConfig = field(default_factory=SolesConfig)
     """Feet at rest."""
     align: AlignConfig = field(default_factory=AlignConfig)
@@ -63,7 +65,8 @@ IMAGE_ONLY = SceneWeights(depth=0.0, collision=0.0, contact=0.0)
 """L_scene: Eq. 1 without people."""
 
 PAPER = Config(
-    align=AlignConfig(sigmas=(0.1,)),
+    select=SelectConfig("each"),
+    align=AlignConfig(sigmas=(0.1,), votes="points"),
     layout=PlaceConfig(weights=IMAGE_ONLY, method=Adam(1000)),
     place=PlaceConfig(),
 )
@@ -74,7 +77,8 @@ _RELEASE_FULL = SceneWeights(
 )
 
 RELEASE = Config(
-    align=AlignConfig(sigmas=(0.1,)),
+    select=SelectConfig("each", 0.0, 0.18, 0.0, 0.09, "vector", 1, 0.2),
+    align=AlignConfig(sigmas=(0.1,), votes="points"),
     prepare=PrepareConfig(rule="release"),
     image=ImageConfig(form="release"),
     layout=PlaceConfig(
@@ -91,7 +95,7 @@ _ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
 _ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 2.0, 1.0, 2.0, heading=0.1)
 
 ROBUST = Config(
-    depth=DepthConfig(use=True),
+    correct_depth=True,
     image=ImageConfig(size=128, form="robust"),
     layout=PlaceConfig(
         _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, short=_SHORT, keep=3, tie=1.0

@@ -11,10 +11,12 @@ from torch import Tensor
 from .records import map_tensors, replacing
 from .report_content import ReportContent
 from .report_overlay import draw_overlay
+from .report_pictures import bitmap, canvas
 from .report_plan import draw_top
-from .report_sections import all_sections, asset, data, fill, lead, tiles
+from .report_sections import WIDEST, all_sections, asset, data, fill, lead, tiles
+from .types import Capture
 
-__all__ = ["ReportContent", "draw_overlay", "draw_top", "write_report"]
+__all__ = ["ReportContent", "draw_overlay", "draw_top", "save_overlay", "write_report"]
 
 
 def write_report(out: Path, content: ReportContent) -> Path:
@@ -40,6 +42,15 @@ def write_report(out: Path, content: ReportContent) -> Path:
     )
     with replacing(path) as part:
         part.write_text(page, encoding="utf-8")
+    return path
+
+
+def save_overlay(capture: Capture, path: Path) -> Path:
+    """Draw the initial scene over the reference image into the file `path` (.png, .jpg, ...)."""
+    scene, image = map_tensors(_plain, (capture.scene, capture.reference))
+    picture = bitmap(draw_overlay(canvas(image, scene, WIDEST), scene))
+    with replacing(path) as part:
+        picture.save(part)
     return path
 
 

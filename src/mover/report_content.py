@@ -31,7 +31,7 @@ class ReportContent:
     """What metrics.json holds."""
     warnings: tuple[str, ...] = ()
     stages: Sequence[Mapping[str, Any]] = ()
-    """`name`, `seconds`, `memory` [MB] and `kept` of each stage."""
+    """`name`, `seconds`, `memory` or `peak_memory` [MB] and `kept` of each stage."""
     config: Mapping[str, Any] = field(default_factory=lambda: {})
     objects: Sequence[Mapping[str, Any]] = ()
     """Rows of the table of objects, found by `id`; other keys become columns."""

@@ -7,6 +7,7 @@ from html import escape
 WIDTH, HEIGHT = 420.0, 200.0  # [px] of a plot
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 12.0, 12.0, 28.0  # [px] around its frame
 POINTS = 320  # at most so many points are drawn
+DEEPEST = 1e-12  # a curve is drawn down to this share of its highest value
 DECADES = 2.2  # below this many decades, 2 and 5 are ticks too
 
 
@@ -71,7 +72,8 @@ def _thinned(trace: Sequence[float]) -> list[tuple[int, float]]:
 
 def _range(values: Sequence[float]) -> tuple[float, float]:
     positive = [v for v in values if v > 0] or [1.0]
-    low, high = min(positive), max(positive)
+    high = max(positive)
+    low = max(min(positive), high * DEEPEST)
     pad = max(1.05, (high / low) ** 0.06)
     return low / pad, high * pad
 

@@ -24,11 +24,9 @@ def draw_comparison(
         image: The picture behind both; None: a neutral backdrop.
         initial: Left of the bar.
         result: Right of it.
-        widest: Width of the backdrop at most [px].
+        widest: Width of the pictures at most [px].
     """
-    before, after = (
-        data_url(draw_overlay(_canvas(image, s, widest), s)) for s in (initial, result)
-    )
+    before, after = (data_url(draw_overlay(canvas(image, s, widest), s)) for s in (initial, result))
     return (
         '<figure class="compare">'
         f'<img src="{after}" alt="The furniture after the run, over the image">'
@@ -39,9 +37,12 @@ def draw_comparison(
     )
 
 
-def _canvas(image: Tensor | None, scene: Scene, widest: int) -> Float[Tensor, "h w 3"]:
+def canvas(
+    image: Float[Tensor, "h w 3"] | None, scene: Scene, widest: int
+) -> Float[Tensor, "height width 3"]:
+    """What the furniture is drawn on, at most `widest` pixels wide: the image or a backdrop."""
     if image is not None:
-        return image
+        return shrink(image, widest)
     width = min(widest, scene.camera.width)
     return backdrop(max(1, round(width * scene.camera.height / scene.camera.width)), width)
 
@@ -51,16 +52,17 @@ def shrink(image: Float[Tensor, "h w 3"], widest: int) -> Float[Tensor, "height 
     if image.shape[1] <= widest:
         return image.detach().cpu().float()
     size = (widest, max(1, round(widest * image.shape[0] / image.shape[1])))
-    small = _bitmap(image).resize(size, Image.Resampling.LANCZOS)
+    small = bitmap(image).resize(size, Image.Resampling.LANCZOS)
     return torch.from_numpy(np.asarray(small).copy()).float() / 255
 
 
 def data_url(image: Float[Tensor, "h w 3"]) -> str:
     """The image as a JPEG that stands in the page itself."""
     file = io.BytesIO()
-    _bitmap(image).save(file, "JPEG", quality=QUALITY, subsampling=0)
+    bitmap(image).save(file, "JPEG", quality=QUALITY, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
 
 
-def _bitmap(image: Float[Tensor, "h w 3"]) -> Image.Image:
+def bitmap(image: Float[Tensor, "h w 3"]) -> Image.Image:
+    """The image with 8 bits a channel."""
     return Image.fromarray((image.detach().cpu().clamp(0, 1) * 255).round().byte().numpy())

@@ -15,6 +15,7 @@ from .types import Bodies, Camera, Piece, Scene
 
 MARGIN = 0.5  # [m] around everything that is drawn
 RANGE = 2.0  # how far beyond the furthest object the camera's cone is drawn
+FEW = 8  # bodies whose dots are drawn larger
 DOTS = 400  # at most so many bodies are dotted for each person
 
 
@@ -28,13 +29,16 @@ class Extent:
     near: float
 
 
-def extent_of(*scenes: Scene | None) -> Extent:
-    """Smallest part of the floor that holds the furniture and the cameras of all `scenes`."""
+def extent_of(*things: Scene | Bodies | None) -> Extent:
+    """Smallest part of the floor that holds all furniture, people and cameras."""
     points = [torch.zeros(1, 2)]
-    for scene in scenes:
-        pieces = scene.pieces if scene is not None else ()
-        points += [place_piece(p).verts[:, [0, 2]].detach().cpu().float() for p in pieces]
-    stands = torch.cat(points)
+    for thing in things:
+        if isinstance(thing, Bodies):
+            rows = torch.arange(len(thing.verts))
+            points += [_hips(thing, rows), _soles(thing, rows)]
+        elif thing is not None:
+            points += [place_piece(p).verts[:, [0, 2]] for p in thing.pieces]
+    stands = torch.cat([p.detach().cpu().float() for p in points])
     (left, far), (right, near) = stands.amin(0).tolist(), stands.amax(0).tolist()
     grow = max(0.0, 2.0 - (right - left)) / 2
     return Extent(left - MARGIN - grow, right + MARGIN + grow, far - MARGIN, near + MARGIN)
@@ -55,7 +59,7 @@ def draw_top(
         bodies: People in the world of `scene`; their pelvises and soles are dotted.
         extent: Part of the floor to show; None: everything.
     """
-    extent = extent or extent_of(scene, truth)
+    extent = extent or extent_of(scene, truth, bodies)
     parts = [_grid(extent), _cone(scene.camera, extent)]
     parts += [_footprint(piece, css(colour(i))) for i, piece in enumerate(scene.pieces)]
     parts += [_dashed(piece) for piece in (truth.pieces if truth is not None else ())]
@@ -150,10 +154,11 @@ def _paths(bodies: Bodies) -> str:
         rows = rows[bodies.frame[rows].argsort()]
         rows = rows[:: max(1, math.ceil(len(rows) / DOTS))]
         tint = css(person_colour(person))
+        few = " few" if len(rows) < FEW else ""
         hips, feet = _hips(bodies, rows), _soles(bodies, rows)
         line = "" if bodies.fps is None else f'<path class="walk" d="{_line(hips)}"/>'
         parts.append(
-            f'<g class="person" style="--tint:{tint}"><path class="soles" d="{_dots(feet)}"/>'
+            f'<g class="person{few}" style="--tint:{tint}"><path class="soles" d="{_dots(feet)}"/>'
             f'{line}<path class="hips" d="{_dots(hips)}"/></g>'
         )
     return "".join(parts)

@@ -8,7 +8,7 @@ from importlib.resources import files
 from .geometry.camera import pitch_roll
 from .report_content import ReportContent
 from .report_curves import draw_curves
-from .report_numbers import QUANTITIES, signed, write_quantity
+from .report_numbers import QUANTITIES, write_quantity
 from .report_pictures import data_url, draw_comparison, shrink
 from .report_plan import draw_top, extent_of
 from .report_tables import (
@@ -64,22 +64,26 @@ def lead(content: ReportContent) -> str:
         parts.append(_count(len(content.bodies.frame.unique()), "frame"))
     changes = sorted(c.moved for c in find_changes(content.initial, content.result).values())
     moves = f"furniture moved {100 * changes[len(changes) // 2]:.0f} cm (median)" if changes else ""
-    tilts = [_tilt(scene) for scene in (content.initial, content.result)]
-    seen = f"camera pitch {tilts[0]} → {tilts[1]}"
-    heights = [scene.ground for scene in (content.initial, content.result)]
-    above = "" if heights[1] is None else f", {-heights[1]:.2f} m above the floor"
-    if None not in heights:
-        above = f", its height {-(heights[0] or 0):.2f} → {-(heights[1] or 0):.2f} m"
+    scenes = (content.initial, content.result)
+    seen = f"camera pitch {_from_to([_tilt(s) for s in scenes], '°')}"
+    heights = [-s.ground for s in scenes if s.ground is not None]
+    above = f", height {_from_to([f'{h:.2f}' for h in heights], ' m')}" if heights else ""
     did = "; ".join(part for part in (moves, seen + above) if part)
     return f"{', '.join(parts)}. {did[0].upper()}{did[1:]}."
 
 
-def _count(number: int, one: str, many: str = "") -> str:
-    return f"{number:,} {one if number == 1 else many or one + 's'}"
+def _from_to(values: list[str], unit: str) -> str:
+    """The first and the last value; one alone where they are the same."""
+    return " → ".join(dict.fromkeys((values[0], values[-1]))) + unit
 
 
 def _tilt(scene: Scene) -> str:
-    return f"{signed(math.degrees(float(pitch_roll(scene.camera.R_cam_world)[0])), 1)}°"
+    degrees = math.degrees(float(pitch_roll(scene.camera.R_cam_world)[0]))
+    return f"{round(degrees, 1) + 0.0:.1f}".replace("-", "\N{MINUS SIGN}")
+
+
+def _count(number: int, one: str, many: str = "") -> str:
+    return f"{number:,} {one if number == 1 else many or one + 's'}"
 
 
 def tiles(content: ReportContent) -> str:
@@ -96,8 +100,8 @@ def tiles(content: ReportContent) -> str:
 
 
 def _overlays(content: ReportContent) -> str:
-    image = None if content.image is None else shrink(content.image, WIDEST)
-    return _section("On the image", draw_comparison(image, content.initial, content.result, WIDEST))
+    pictures = draw_comparison(content.image, content.initial, content.result, WIDEST)
+    return _section("On the image", pictures)
 
 
 def _stage(content: ReportContent) -> str:
@@ -140,7 +144,8 @@ def data(content: ReportContent) -> str:
 
 
 def _plans(content: ReportContent) -> str:
-    extent = extent_of(content.initial, content.result, content.truth)
+    scenes = [content.initial, content.result, content.truth]
+    extent = extent_of(*scenes, content.initial_bodies, content.bodies)
     sides = (
         ("Before", content.initial, content.initial_bodies),
         ("After", content.result, content.bodies),

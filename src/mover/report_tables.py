@@ -143,7 +143,7 @@ def stage_bars(stages: Sequence[Mapping[str, Any]]) -> str:
     parts: list[str] = []
     for stage in stages:
         seconds = float(stage.get("seconds") or 0)
-        memory = float(stage.get("memory") or 0)
+        memory = float(stage.get("memory") or stage.get("peak_memory") or 0)
         kept = ' <span class="quiet">(from disk)</span>' if stage.get("kept") else ""
         size = f"{memory:,.0f} MB" if memory else ""
         parts.append(

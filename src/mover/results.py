@@ -71,7 +71,13 @@ def report_of(
         stages=[dataclasses.asdict(s) for s in run.stages],
         config=records.plain(config),
         objects=[dataclasses.asdict(e) for e in room.evidence],
+        command=command_line(),
     )
+
+
+def command_line() -> str:
+    """What was typed."""
+    return " ".join(["mover", *sys.argv[1:]])
 
 
 def _write_mesh(mesh: Mesh, path: Path) -> None:
@@ -86,7 +92,7 @@ def _write_log(room: Room, config: Config, run: Run) -> None:
     log = {
         "format": "mover-run",
         "version": __version__,
-        "command": " ".join(["mover", *sys.argv[1:]]),
+        "command": command_line(),
         "python": platform.python_version(),
         "torch": torch.__version__,
         "device": "cpu",

@@ -196,9 +196,19 @@
     if (weight === 0) return;
     const { middle, step, verts } = people.worlds[world];
     const whole = new Int16Array(block, verts + row * people.n_verts * 6, people.n_verts * 3);
-    const floor = data.scenes[world] ? data.scenes[world].floor : first.floor;
+    const { floor } = data.scenes[world];
     const shift = [middle[0], middle[1] - floor, middle[2]];
     for (let i = 0; i < out.length; i++) out[i] += weight * (shift[i % 3] + step * whole[i]);
+  }
+
+  // Some vertices of every body, to see how far people go.
+  function* strides() {
+    const world = people.worlds.result ? "result" : Object.keys(people.worlds)[0];
+    const { middle, step, verts } = people.worlds[world], floor = data.scenes[world].floor;
+    const whole = new Int16Array(block, verts, people.rows.length * people.n_verts * 3);
+    for (let i = 0; i < whole.length; i += 3 * 17) {
+      yield [middle[0] + step * whole[i], middle[1] - floor + step * whole[i + 1], middle[2] + step * whole[i + 2]];
+    }
   }
 
   // Fill the buffer with the body of one person; false where nobody is seen at this moment.
@@ -276,6 +286,9 @@
         const at = [c * x + s * z + p.t[0], y + p.t[1] - first.floor, c * z - s * x + p.t[2]];
         for (let k = 0; k < 3; k++) { low[k] = Math.min(low[k], at[k]); high[k] = Math.max(high[k], at[k]); }
       }
+    }
+    for (const [x, y, z] of people ? strides() : []) {
+      [x, y, z].forEach((v, k) => { low[k] = Math.min(low[k], v); high[k] = Math.max(high[k], v); });
     }
     if (!Number.isFinite(low[0])) return;
     room.middle = [0, 1, 2].map((k) => (low[k] + high[k]) / 2);
@@ -470,27 +483,34 @@
   // ---------------------------------------------------------------- names over the objects
   const names = new Map();
   function nameThings(pieces) {
-    const alive = new Set();
-    for (const p of show.labels ? pieces : []) {
-      const m = meshes[p.mesh], c = Math.cos(p.yaw), s = Math.sin(p.yaw);
-      const x = ((m.low[0] + m.high[0]) / 2) * p.scale[0], z = ((m.low[2] + m.high[2]) / 2) * p.scale[2];
-      const at = [c * x + s * z + p.t[0], m.high[1] * p.scale[1] + p.t[1] + 0.08, c * z - s * x + p.t[2], 1];
-      const [u, v, , w] = [0, 1, 2, 3].map((r) => at.reduce((sum, a, k) => sum + a * view[4 * k + r], 0));
-      if (w < 0.1) continue;
-      let tag = names.get(p.id);
-      if (!tag) {
-        tag = document.createElement("span");
-        tag.textContent = p.id;
-        tag.style.setProperty("--tint", p.colour);
-        stage.querySelector(".names").append(tag);
-        names.set(p.id, tag);
-      }
-      alive.add(p.id);
-      tag.hidden = Math.abs(u / w) > 1 || Math.abs(v / w) > 1;
-      tag.style.zIndex = Math.round(1e4 / w); // nearer names lie above
-      tag.style.transform = `translate(${((u / w + 1) * canvas.clientWidth) / 2}px, ${((1 - v / w) * canvas.clientHeight) / 2}px) translate(-50%, -100%)`;
+    const tags = show.labels ? pieces.map(tagOf).filter((t) => t.w > 0.1).sort((a, b) => a.w - b.w) : [];
+    for (const { tag } of names.values()) tag.hidden = true;
+    const taken = [];
+    for (const { tag, x, y, wide } of tags) { // nearest first; a name that would cover a nearer one is left out
+      const box = [x - wide / 2, y - 20, x + wide / 2, y];
+      const covered = taken.some((t) => Math.min(box[2], t[2]) - Math.max(box[0], t[0]) > 6 && Math.min(box[3], t[3]) - Math.max(box[1], t[1]) > 4);
+      if (covered || x < 0 || y < 0 || x > canvas.clientWidth || y > canvas.clientHeight) continue;
+      taken.push(box);
+      tag.hidden = false;
+      tag.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -100%)`;
     }
-    for (const [id, tag] of names) if (!alive.has(id)) tag.hidden = true;
+  }
+
+  // The name of an object and where the middle of its top is seen [px].
+  function tagOf(p) {
+    const m = meshes[p.mesh], c = Math.cos(p.yaw), s = Math.sin(p.yaw);
+    const x = ((m.low[0] + m.high[0]) / 2) * p.scale[0], z = ((m.low[2] + m.high[2]) / 2) * p.scale[2];
+    const at = [c * x + s * z + p.t[0], m.high[1] * p.scale[1] + p.t[1] + 0.08, c * z - s * x + p.t[2], 1];
+    const [u, v, w] = [0, 1, 3].map((r) => at.reduce((sum, a, k) => sum + a * view[4 * k + r], 0));
+    if (!names.has(p.id)) {
+      const made = document.createElement("span");
+      made.textContent = p.id;
+      made.style.setProperty("--tint", p.colour);
+      stage.querySelector(".names").append(made);
+      names.set(p.id, { tag: made, wide: made.offsetWidth });
+    }
+    const { tag, wide } = names.get(p.id);
+    return { tag, wide, w, x: ((u / w + 1) * canvas.clientWidth) / 2, y: ((1 - v / w) * canvas.clientHeight) / 2 };
   }
 
   // ---------------------------------------------------------------- time
@@ -618,6 +638,7 @@
     stage.querySelector("[name=time]").addEventListener("input", (e) => { play(false); state.slot = Number(e.target.value); timeline(); redraw(); });
     stage.querySelector("[name=time]").max = people.frames.length - 1;
     state.slot = people.opening;
+    stage.querySelector(".time").hidden = people.frames.length < 2;
   }
 
   canvas.addEventListener("webglcontextlost", (e) => e.preventDefault());

@@ -1,10 +1,9 @@
 """Parts of a human mesh of unknown topology: matched to the open body, vertex by vertex.
 
 1. Walking distances to head, hands and feet say roughly where a vertex lies (`intrinsic`).
-2. From that come places of the joints; toes, knees and elbows tell front from back, and so left
-   from right.
-3. Each limb of the open body is laid over the mesh's; the nearest vertex of like direction gives
-   its part.
+2. From that come places of the joints, and the limbs of the open body are laid over the mesh's.
+3. Distances cannot tell left from right. The way in which the limbs fit best can.
+4. The vertex of the open body that is nearest and of like direction gives a vertex its part.
 """
 
 from dataclasses import dataclass
@@ -15,8 +14,8 @@ import torch
 from jaxtyping import Float, Int
 
 from ..geometry.mesh import vertex_normals
-from .intrinsic import TIPS, Walks, ends, match_ends, mirrored
-from .limbs import LANDMARKS, LIMBS, landmark_rings, limb_frames, limb_of, thin
+from .intrinsic import SIDED, Walks, ends, match_ends
+from .limbs import LANDMARKS, LIMBS, landmark_rings, limb_frames, limb_of, naturalness, thin
 from .skin import model_parts
 from .skinning import open_body, zero_pose
 
@@ -26,6 +25,15 @@ NEAR = 40
 """Candidates looked at for each vertex."""
 WORST_MATCH = 0.13
 """Mismatch of the distances between head, hands and feet; real people give .01 to .08."""
+WORST_FIT = 60.0
+"""A vertex that fits worse belongs to no part."""
+ROUNDS = 3
+FEWEST = 20
+"""Vertices of a limb that are enough to lay it again."""
+REACH = 0.05
+"""A normal counts as much as a place that far from the middle [m]."""
+SAMPLED = 1500
+"""Vertices that tell left from right."""
 SPREAD = (0.06, 0.05, 0.5)
 """Typical mismatch of walking distances [m], of places along a limb [m], and of normals."""
 
@@ -50,6 +58,34 @@ class Matched:
 
     part: Int[Array, " verts"]
     rings: Int[Array, "landmarks members"]
+
+
+@dataclass(frozen=True)
+class Near:
+    """Candidates for some vertices of an unknown mesh."""
+
+    rows: Int[Array, " rows"]
+    index: Int[Array, "rows candidates"]
+    """Vertices of the open body."""
+    price: Float[Array, "rows candidates"]
+    """Mismatch of the walking distances."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """How each of `LIMBS` lies: x_zero = back @ (x - start) / size + origin."""
+
+    back: Float[Array, "limbs 3 3"]
+    start: Float[Array, "limbs 3"]
+    origin: Float[Array, "limbs 3"]
+
+
+@dataclass(frozen=True)
+class Posed:
+    """An unknown mesh in one pose."""
+
+    verts: Float[Array, "verts 3"]
+    normals: Float[Array, "verts 3"]
 
 
 @cache
@@ -87,17 +123,22 @@ def match(meshes: Float[Array, "meshes verts 3"], faces: Int[Array, "faces 3"]) 
     found, size, mismatch = min(tries, key=lambda item: item[2])
     if not mismatch < WORST_MATCH:
         return None
-    rough = _nearest(found.far / size, known.walks.far, 1)[:, 0]
-    rings = known.rings[rough]
-    if _frontness(meshes, rings, found.tips) < 0:
-        found = mirrored(found)
-        rough = _nearest(found.far / size, known.walks.far, 1)[:, 0]
-        rings = known.rings[rough]
-    part = np.stack([_assign(mesh, faces, found, rings, size) for mesh in meshes])
+    normals = vertex_normals(torch.from_numpy(meshes), torch.from_numpy(faces)).numpy()
+    linked = np.nonzero(np.isfinite(found.far[:, 0]))[0]
+    posed = [Posed(v[linked], n[linked]) for v, n in zip(meshes, normals, strict=True)]
+    tips, far = np.searchsorted(linked, found.tips), found.far[linked] / size
+    some = np.arange(0, len(linked), max(1, len(linked) // SAMPLED))
+    guesses = [Walks(tips[order], far[:, order]) for order in SIDED]
+    walks = min(guesses, key=lambda walks: _misfit(posed, walks, size, some))
+    rings = known.rings[_nearest(walks.far, known.walks.far, 1)[:, 0]]
+    near = _near(walks, np.arange(len(linked)))
+    laid = [_fit(mesh, walks, near, rings, size) for mesh in posed]
+    rings = np.mean([known.rings[chosen] for chosen, _ in laid], axis=0)
+    part = np.stack([np.where(price < WORST_FIT, known.part[chosen], -1) for chosen, price in laid])
     counts = np.stack([(part == p).sum(0) for p in range(-1, int(known.part.max()) + 1)])
-    best = counts.argmax(0) - 1
-    best[~np.isfinite(found.far[:, 0])] = -1
-    return Matched(best, thin(meshes[0], rings))
+    best = np.full(meshes.shape[1], -1)
+    best[linked] = counts.argmax(0) - 1
+    return Matched(best, linked[thin(posed[0].verts, rings)])
 
 
 def _nearest(
@@ -105,8 +146,7 @@ def _nearest(
 ) -> Int[Array, "queries count"]:
     from scipy.spatial import KDTree
 
-    finite = np.where(np.isfinite(query), query, 1e3)
-    return np.asarray(KDTree(points).query(finite, k=count)[1]).reshape(len(query), count)
+    return np.asarray(KDTree(points).query(query, k=count)[1]).reshape(len(query), count)
 
 
 def _landmarks(
@@ -117,56 +157,86 @@ def _landmarks(
     return dict(zip(LANDMARKS, share.T @ mesh, strict=True))
 
 
-def _frontness(
-    meshes: Float[Array, "meshes verts 3"],
-    rings: Float[Array, "verts landmarks"],
-    tips: Int[Array, "5"],
-) -> float:
-    """How far toes and knees point forward and elbows backward [m], if left is left."""
-    total = 0.0
-    for mesh in meshes:
-        at = _landmarks(mesh, rings)
-        across = at["left_hip"] - at["right_hip"] + at["left_shoulder"] - at["right_shoulder"]
-        hips = (at["left_hip"] + at["right_hip"]) / 2
-        front = np.cross(across, at["neck"] - hips)
-        front = front / np.linalg.norm(front)
-        for side in ("left", "right"):
-            toe = mesh[tips[TIPS.index(f"{side}_foot")]]
-            hip, knee, ankle = (at[f"{side}_{n}"] for n in ("hip", "knee", "ankle"))
-            shoulder, elbow, wrist = (at[f"{side}_{n}"] for n in ("shoulder", "elbow", "wrist"))
-            total += front @ (toe - ankle) + front @ (knee - (hip + ankle) / 2)
-            total -= front @ (elbow - (shoulder + wrist) / 2)
-    return float(total)
+def _fit(
+    mesh: Posed, walks: Walks, near: Near, rings: Float[Array, "verts landmarks"], size: float
+) -> tuple[Int[Array, " verts"], Float[Array, " verts"]]:
+    """Lay the limbs over the mesh by landmarks, then again by what fits."""
+    frames = _frames(mesh, walks, rings)
+    laid = _lay(mesh, near, frames, size)
+    for _ in range(ROUNDS):
+        frames = _refitted(mesh, laid[0], frames, size)
+        laid = _lay(mesh, near, frames, size)
+    return laid
 
 
-def _assign(
-    mesh: Float[Array, "verts 3"],
-    faces: Int[Array, "faces 3"],
-    found: Walks,
-    rings: Float[Array, "verts landmarks"],
-    size: float,
-) -> Int[Array, " verts"]:
-    """Part of each vertex: that of the vertex of the open body that fits it best, if one does."""
+def _misfit(posed: list[Posed], walks: Walks, size: float, rows: Int[Array, " rows"]) -> float:
+    """How badly the limbs of the open body fit, and bend, if left and right are as in `walks`."""
     known = atlas()
-    tensor = torch.from_numpy(mesh)
-    normals = vertex_normals(tensor, torch.from_numpy(faces)).numpy()
-    here = limb_frames(_landmarks(mesh, rings), mesh[found.tips])
+    rings = known.rings[_nearest(walks.far, known.walks.far, 1)[:, 0]]
+    near = _near(walks, rows)
+    prices = [_lay(m, near, _frames(m, walks, rings), size)[1] for m in posed]
+    bent = [naturalness(_landmarks(m.verts, rings), m.verts[walks.tips]) for m in posed]
+    return float(np.minimum(prices, WORST_FIT).mean() - np.mean(bent))
+
+
+def _frames(mesh: Posed, walks: Walks, rings: Float[Array, "verts landmarks"]) -> Frames:
+    """The limbs' turn back into the zero pose and their starts, from landmarks."""
+    known = atlas()
+    here = limb_frames(_landmarks(mesh.verts, rings), mesh.verts[walks.tips])
     there = limb_frames(_landmarks(known.verts, known.rings), known.verts[known.walks.tips])
-    candidates = _nearest(found.far / size, known.walks.far, NEAR)
-    limb = known.limb[candidates]
-    turn = np.stack([here[n][0] @ there[n][0].T for n in LIMBS])
-    start_here = np.stack([here[n][1] for n in LIMBS])
-    start_there = np.stack([there[n][1] for n in LIMBS])
-    back = turn[limb].swapaxes(-1, -2)
-    place = (back @ (mesh[:, None] - start_here[limb])[..., None])[..., 0] / size
-    facing = (back @ normals[:, None, :, None])[..., 0]
-    walked = np.where(np.isfinite(found.far), found.far, 0)[:, None] / size
-    price = (
-        np.square(walked - known.walks.far[candidates]).sum(-1) / SPREAD[0] ** 2
-        + np.square(place + start_there[limb] - known.verts[candidates]).sum(-1) / SPREAD[1] ** 2
-        + np.square(facing - known.normals[candidates]).sum(-1) / SPREAD[2] ** 2
+    return Frames(
+        back=np.stack([there[n][0] @ here[n][0].T for n in LIMBS]),
+        start=np.stack([here[n][1] for n in LIMBS]),
+        origin=np.stack([there[n][1] for n in LIMBS]),
     )
-    row, best = np.arange(len(mesh)), price.argmin(1)
-    chosen = candidates[row, best]
+
+
+def _refitted(mesh: Posed, chosen: Int[Array, " verts"], frames: Frames, size: float) -> Frames:
+    """The limbs' frames that bring matched vertices and normals together best (Kabsch)."""
+    known = atlas()
+    back, start, origin = frames.back.copy(), frames.start.copy(), frames.origin.copy()
+    for limb in range(len(LIMBS)):
+        mine = known.limb[chosen] == limb
+        if mine.sum() < FEWEST:
+            continue
+        here, there = mesh.verts[mine], known.verts[chosen[mine]]
+        start[limb], origin[limb] = here.mean(0), there.mean(0)
+        spread = (here - start[limb]).T / size @ (there - origin[limb])
+        spread = spread + REACH**2 * mesh.normals[mine].T @ known.normals[chosen[mine]]
+        u, _, vt = np.linalg.svd(spread)
+        flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+        back[limb] = vt.T @ flip @ u.T
+    return Frames(back, start, origin)
+
+
+def _near(walks: Walks, rows: Int[Array, " rows"]) -> Near:
+    """The vertices of the open body that lie about as far from its ends as `rows` do."""
+    known = atlas().walks.far
+    far = walks.far[rows]
+    index = _nearest(far, known, NEAR)
+    return Near(rows, index, np.square(far[:, None] - known[index]).sum(-1) / SPREAD[0] ** 2)
+
+
+def _lay(
+    mesh: Posed, near: Near, frames: Frames, size: float
+) -> tuple[Int[Array, " rows"], Float[Array, " rows"]]:
+    """The vertex of the open body that fits each row of `near` best, and how badly it does.
+
+    The limbs of the open body are laid over those of the mesh; a vertex fits by its place along the
+    limb, its normal and its walking distances.
+    """
+    known = atlas()
+    row = np.arange(len(near.rows))
+    limb = known.limb[near.index]
+    from_start = (mesh.verts[near.rows, None] - frames.start) / size
+    place = np.einsum("lij,vlj->vli", frames.back, from_start) + frames.origin
+    facing = np.einsum("lij,vj->vli", frames.back, mesh.normals[near.rows])[row[:, None], limb]
+    price = (
+        near.price
+        + np.square(place[row[:, None], limb] - known.verts[near.index]).sum(-1) / SPREAD[1] ** 2
+        + np.square(facing - known.normals[near.index]).sum(-1) / SPREAD[2] ** 2
+    )
+    best = price.argmin(1)
+    chosen = near.index[row, best]
     agree = np.einsum("vi,vi->v", facing[row, best], known.normals[chosen]) > 0
-    return np.where(agree, known.part[chosen], -1)
+    return chosen, np.where(agree, price[row, best], np.inf)

@@ -17,8 +17,8 @@ TIPS = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
 """The five ends of a body."""
 CANDIDATES = 8
 """Ends to choose the five from."""
-MIRRORED = [0, 2, 1, 4, 3]
-"""Order of `TIPS` when left and right change places."""
+SIDED = ([0, 1, 2, 3, 4], [0, 2, 1, 4, 3], [0, 2, 1, 3, 4], [0, 1, 2, 4, 3])
+"""Orders of `TIPS` when left and right of nothing, all, hands or feet change places."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def match_ends(
 ) -> tuple[Walks, float, float]:
     """Find head, hands and feet by the distances between them in a known body.
 
-    Left and right of the whole body may be exchanged: distances cannot tell.
+    Left and right may be exchanged: distances cannot tell.
 
     Returns:
         The walks, the size relative to the known body, and the root mean square of the mismatch of
@@ -67,11 +67,6 @@ def match_ends(
     best = int(np.argmin(wrong))
     order = orders[best]
     return Walks(tips[order], far[:, order]), float(size[best]), float(wrong[best])
-
-
-def mirrored(found: Walks) -> Walks:
-    """The same with left and right exchanged."""
-    return Walks(found.tips[MIRRORED], found.far[:, MIRRORED])
 
 
 def _graph(verts: Float[Array, "verts 3"], faces: Int[Array, "faces 3"]) -> Any:  # noqa: ANN401

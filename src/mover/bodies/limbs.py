@@ -37,6 +37,14 @@ CHAIN = {
 }
 """Limb: (the limb it hangs at, where it starts, where it ends)."""
 
+BENDS = (
+    ("shin", "foot", 1.0),
+    ("thigh", "shin", -1.0),
+    ("upper_arm", "forearm", 0.5),
+    ("trunk", "thigh", 0.3),
+)
+"""A limb, the one that hangs at it, and how surely the second points to the front of the first."""
+
 OWNER = {"hip": "thigh", "knee": "shin", "ankle": "foot", "foot": "foot",
          "shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand",
          **{f"{f}{k}": "hand" for f in FINGERS for k in (1, 2, 3)}}  # fmt: skip
@@ -109,6 +117,23 @@ def limb_frames(
             usual = above @ rest.get(limb, np.array([0.0, -0.35, 0.94]))
             frames[f"{side}_{limb}"] = (_shortest(usual, _unit(last - first)) @ above, first)
     return frames
+
+
+def naturalness(at: dict[str, Float[Array, "3"]], tips: Float[Array, "5 3"]) -> float:
+    """How far limbs bend the way they can: toes, knees, elbows, hips; and no twist of the trunk.
+
+    About 4 for a person whose left is left, about -4 if left and right are exchanged.
+    """
+    frames = limb_frames(at, tips)
+    ends = {**at, **{str(name): tip for name, tip in zip(TIPS, tips, strict=True)}}
+    hips = _unit(at["left_hip"] - at["right_hip"])
+    total = float(hips @ _unit(at["left_shoulder"] - at["right_shoulder"]))
+    for side in SIDES:
+        for above, limb, gain in BENDS:
+            first, last = (ends[f"{side}_{n}"] for n in CHAIN[limb][1:])
+            front = frames["trunk" if above == "trunk" else f"{side}_{above}"][0][:, 2]
+            total += gain * float(front @ _unit(last - first))
+    return total
 
 
 def _unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ..records import record
 from ..types import Mesh
 
-Part = Float[np.ndarray, "points 3"]
+Part = Float[np.ndarray, "_ 3"]
 Span = tuple[float, float]
 
 

@@ -6,12 +6,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..types import Mesh
-from .nearest import as_float64, as_int64
+from .nearest import as_float64, as_int64, closest
+from .solids import THIN, volumes
 from .topology import edges_of as edges_of
 from .topology import is_closed as is_closed
+from .topology import manifold
 
 OVERSAMPLING = 5  # candidates for each even sample
-GENTLER = 1.5  # a target of faces that opens a mesh is raised by this factor
+STRAY = 0.03  # of the longest side; no vertex may be further from the decimated surface
+GENTLER = 1.5  # a target of faces that spoils a mesh is raised by this factor
 
 
 def box(verts: Float[Tensor, "verts 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
@@ -117,16 +120,24 @@ def _scatter(
 def decimate(mesh: Mesh, faces: int) -> Mesh:
     """The same shape and box with about `faces` triangles; a closed mesh stays closed.
 
-    Where the target would open the mesh or turn parts of it over, a gentler one is taken, and
-    the mesh itself where none is left.
+    Where the target would open the mesh or lose a part of it, a gentler one is taken, and the mesh
+    itself where none is left.
     """
     target, closed = float(faces), is_closed(mesh.faces)
     while target < len(mesh.faces):
         small = _simplified(mesh, int(target))
-        if not closed or _still_solid(small, mesh):
+        small = _resolidified(small, mesh) if closed else small
+        if small is not None and _strays(used(mesh), small) <= STRAY:
             return fit_box(small, *box(used(mesh).verts))
         target *= GENTLER
     return mesh
+
+
+def _strays(mesh: Mesh, small: Mesh) -> float:
+    """Farthest vertex of a mesh from its simplification, over the longest side of its box."""
+    squared, _, _ = closest(as_float64(mesh.verts), as_float64(small.verts), as_int64(small.faces))
+    low, high = box(mesh.verts)
+    return float(squared.max() ** 0.5 / (high - low).max())
 
 
 def _simplified(mesh: Mesh, faces: int) -> Mesh:
@@ -139,9 +150,18 @@ def _simplified(mesh: Mesh, faces: int) -> Mesh:
     return used(Mesh(verts.to(mesh.verts), triangles.to(mesh.faces)))
 
 
-def _still_solid(small: Mesh, mesh: Mesh) -> bool:
-    """Whether the simplified mesh is closed and kept at least half of the volume."""
-    if not is_closed(small.faces):
-        return False
-    before, after = signed_volume(mesh), signed_volume(small)
-    return 0.5 * abs(before) <= abs(after) <= 2 * abs(before) and before * after > 0
+def _resolidified(small: Mesh, mesh: Mesh) -> Mesh | None:
+    """A simplified solid without the pinches and folds that its collapsed edges left.
+
+    None if it is open, or its volume is not within a factor of two of the one before.
+    """
+    found = manifold(as_float64(small.verts), as_int64(small.faces))
+    if found is None:
+        return None
+    part_of, parts = volumes(*found)
+    before = signed_volume(mesh)
+    keep = np.sign(before) * parts > THIN * np.ptp(found[0], axis=0).max() ** 3
+    if not 0.5 <= parts[keep].sum() / before <= 2:
+        return None
+    verts, faces = (torch.from_numpy(part) for part in (found[0], found[1][keep[part_of]]))
+    return used(Mesh(verts.to(mesh.verts), faces.to(mesh.faces)))

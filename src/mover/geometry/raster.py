@@ -10,7 +10,17 @@ from torch import Tensor
 from . import raster_torch
 from .raster_records import Depths, Layers, Topology, Views
 
-__all__ = ["Depths", "Layers", "Topology", "Views", "depths", "first_hit", "layers", "look", "silhouettes"]
+__all__ = [
+    "Depths",
+    "Layers",
+    "Topology",
+    "Views",
+    "depths",
+    "first_hit",
+    "layers",
+    "look",
+    "silhouettes",
+]
 
 
 def silhouettes(
@@ -26,7 +36,9 @@ def silhouettes(
     return look(verts_cam, shape, views, depth=False)[0]
 
 
-def depths(verts_cam: Float[Tensor, "*starts items verts 3"], shape: Topology, views: Views) -> Depths:
+def depths(
+    verts_cam: Float[Tensor, "*starts items verts 3"], shape: Topology, views: Views
+) -> Depths:
     """First and last surface [m], differentiable in the vertices of the triangle that is seen.
 
     The outline's motion has no share in the gradient (`silhouettes` has it). A triangle seen at
@@ -36,7 +48,10 @@ def depths(verts_cam: Float[Tensor, "*starts items verts 3"], shape: Topology, v
 
 
 def look(
-    verts_cam: Float[Tensor, "*starts items verts 3"], shape: Topology, views: Views, depth: bool = True
+    verts_cam: Float[Tensor, "*starts items verts 3"],
+    shape: Topology,
+    views: Views,
+    depth: bool = True,
 ) -> tuple[Float[Tensor, "*starts items h w"], Depths | None]:
     """`silhouettes` and, where asked for, `depths`: both from one pass over the triangles."""
     return raster_torch.look(verts_cam, shape, views, depth)

@@ -79,19 +79,19 @@ def outline(screen: Screen, faces: Tensor, edges: Tensor, front: Tensor) -> Outl
 def cuts(screen: Screen, line: Outline, covered: Tensor) -> Cuts:
     """The cuts of the outline that count, given which centres are covered (flat)."""
     items, height, width = screen.size
-    found, place = _candidates(screen, line)
+    found, at = _candidates(screen, line)
     size = torch.where(found.steep, width, height)
     last = items * height * width - 1
-    within = (place >= 0) & (place < size) & (found.place >= 0) & (found.place < size)
+    within = (found.place >= 0) & (found.place < size)
     within &= (found.place + found.outward >= 0) & (found.place + found.outward < size)
     hit = covered[found.inner.clamp(0, last)] & ~covered[found.outer.clamp(0, last)]
     few = torch.nonzero(within & hit & (found.outward != 0))[:, 0]
     found = Cuts(**{name: value.index_select(-1, few) for name, value in vars(found).items()})
-    distance = (place.index_select(0, few) - found.place).abs()
+    distance = (at.index_select(0, few) - found.place).abs()
     pair = torch.minimum(found.inner, found.outer) + torch.where(found.steep, 0, last + 1)
     keys = (distance.view(torch.int32).long() << 32) | torch.arange(len(few), device=few.device)
     best = torch.zeros(2 * (last + 1), dtype=torch.int64, device=few.device)
-    best.scatter_reduce_(0, pair, keys, "amax", include_self=False)
+    best.scatter_reduce_(0, pair, keys, "amax")
     outermost = torch.nonzero(best[pair] == keys)[:, 0]
     return Cuts(**{name: value.index_select(-1, outermost) for name, value in vars(found).items()})
 

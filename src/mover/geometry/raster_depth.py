@@ -30,9 +30,9 @@ def planes(verts_cam: Tensor, K: Tensor, faces: Tensor) -> Tensor:
     keep = (toward.square() > limit) & torch.isfinite(toward)
     normal = normal * (keep / torch.where(keep, toward, 1))[:, None]
     u, v, one = normal.view(len(verts_cam), -1, 3).unbind(-1)
-    K = K[:, :, :, None]
-    x, y = u / K[:, 0, 0], v / K[:, 1, 1]
-    return torch.stack([x, y, one - x * K[:, 0, 2] - y * K[:, 1, 2]]).view(3, -1)
+    k = K[:, :, :, None]
+    x, y = u / k[:, 0, 0], v / k[:, 1, 1]
+    return torch.stack([x, y, one - x * k[:, 0, 2] - y * k[:, 1, 2]]).view(3, -1)
 
 
 def surface(plane: Tensor, screen: Screen, runs: Spans, keys: Tensor, pixel: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from torch import Tensor
 from .camera import NEAR
 
 TINY = 1e-12  # [px], keeps the slope of level edges finite; their rows use its sign only
+AWAY = 1e9  # [px], vertices further off would overflow; their triangles are left out
 LOW = 0xFFFFFFFF  # low half of a packed key
 
 
@@ -27,7 +28,7 @@ class Screen:
     q: Tensor
     """Inverse depth [1/m]."""
     drawn: Tensor
-    """Whether the vertex is in front of the near plane."""
+    """Whether the vertex is in front of the near plane, and finite."""
     size: tuple[int, int, int]
     """Items, rows and columns of the grids."""
 
@@ -54,7 +55,7 @@ class Spans:
 
 def ragged(count: Tensor) -> tuple[Tensor, Tensor]:
     """Owner and place within the owner for `count` copies of each index."""
-    ends = count.cumsum(0)
+    ends = count.cumsum(0)  # the size of what follows depends on data: this waits for the device
     total = int(ends[-1]) if len(ends) else 0
     starts = torch.zeros(total + 1, dtype=torch.int64, device=count.device)
     starts.scatter_add_(0, ends[:-1], torch.ones_like(ends[:-1]))
@@ -66,16 +67,17 @@ def ragged(count: Tensor) -> tuple[Tensor, Tensor]:
 def on_screen(verts_cam: Tensor, K: Tensor, size: tuple[int, int]) -> Screen:
     """Project the vertices of each item on its grid of `size` rows and columns."""
     points = verts_cam.detach().float()
-    K = K.detach().float()[:, :, :, None]
+    k = K.detach().float()[:, :, :, None]
     q = 1 / points[..., 2].clamp_min(NEAR)
-    x = points[..., 0] * q * K[:, 0, 0] + K[:, 0, 2]
-    y = points[..., 1] * q * K[:, 1, 1] + K[:, 1, 2]
-    drawn = (points[..., 2] >= NEAR) & torch.isfinite(x + y)
-    return Screen(x.reshape(-1), y.reshape(-1), q.reshape(-1), drawn.reshape(-1), (len(points), *size))
+    x = points[..., 0] * q * k[:, 0, 0] + k[:, 0, 2]
+    y = points[..., 1] * q * k[:, 1, 1] + k[:, 1, 2]
+    drawn = (points[..., 2] >= NEAR) & (x.abs() < AWAY) & (y.abs() < AWAY)
+    x, y, q, drawn = (v.reshape(-1) for v in (x, y, q, drawn))
+    return Screen(x, y, q, drawn, (len(points), *size))
 
 
 def signed_areas(screen: Screen, faces: Tensor) -> Tensor:
-    """Twice the signed area of each triangle [px²]: negative fronts, positive backs, 0 not drawn."""
+    """Twice each triangle's area [px²]: negative for fronts, positive for backs, 0 if not drawn."""
     x, y = (s.index_select(0, faces.reshape(-1)).reshape(3, -1) for s in (screen.x, screen.y))
     area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     drawn = screen.drawn.index_select(0, faces.reshape(-1)).reshape(3, -1)
@@ -102,8 +104,8 @@ def _edges(order: Tensor, screen: Screen) -> Tensor:
     y, x, q = (s.index_select(0, order.reshape(-1)).reshape(3, -1) for s in channels)
     upper, lower = [0, 0, 1], [2, 1, 2]
     drop = (y[lower] - y[upper]).clamp_min_(TINY)
-    lines = [y[upper], x[upper], (x[lower] - x[upper]) / drop, q[upper], (q[lower] - q[upper]) / drop]
-    return torch.stack(lines).reshape(5, -1)
+    x_step, q_step = (x[lower] - x[upper]) / drop, (q[lower] - q[upper]) / drop
+    return torch.stack([y[upper], x[upper], x_step, q[upper], q_step]).reshape(5, -1)
 
 
 def _cut(edges: Tensor, index: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -133,10 +135,11 @@ def spans(screen: Screen, faces: Tensor, drawn: Tensor, nearest: bool = True) ->
     last = (torch.maximum(x, x2) - 0.5).floor_().clamp_(-1, width - 1)
     across = x2 - x
     step = (q2 - q) * across / across.square().clamp_min_(TINY)
-    line = (torch.div(chosen, max(per_item, 1), rounding_mode="floor") * height).index_select(0, owner)
+    item = torch.div(chosen, max(per_item, 1), rounding_mode="floor")
+    line = (item * height).index_select(0, owner) + row.long()
     count = (last - first + 1).clamp_min_(0).long()
-    q_first = q + (first + 0.5 - x) * step
-    return Spans(chosen.index_select(0, owner), line + row.long(), first.long(), count, q_first, step, nearest)
+    q = q + (first + 0.5 - x) * step
+    return Spans(chosen.index_select(0, owner), line, first.long(), count, q, step, nearest)
 
 
 def coverage(screen: Screen, runs: Spans) -> Tensor:

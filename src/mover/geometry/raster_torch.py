@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import prod
+from math import ceil, prod
 
 import torch
 from jaxtyping import Float, Int
@@ -34,7 +34,10 @@ class Chunk:
 
 
 def look(
-    verts_cam: Float[Tensor, "*starts items verts 3"], shape: Topology, views: Views, depth: bool = True
+    verts_cam: Float[Tensor, "*starts items verts 3"],
+    shape: Topology,
+    views: Views,
+    depth: bool = True,
 ) -> tuple[Float[Tensor, "*starts items h w"], Depths | None]:
     """See `raster.look`."""
     size = (*verts_cam.shape[:-2], views.height, views.width)
@@ -45,7 +48,9 @@ def look(
     return image.view(size), _depths(maps, size, verts_cam) if depth else None
 
 
-def depths(verts_cam: Float[Tensor, "*starts items verts 3"], shape: Topology, views: Views) -> Depths:
+def depths(
+    verts_cam: Float[Tensor, "*starts items verts 3"], shape: Topology, views: Views
+) -> Depths:
     """See `raster.depths`."""
     size = (*verts_cam.shape[:-2], views.height, views.width)
     maps = [_seen(chunk, False, True)[1] for chunk in _chunks(verts_cam, shape, views)]
@@ -59,9 +64,10 @@ def _chunks(verts_cam: Tensor, shape: Topology, views: Views) -> Iterator[Chunk]
     size = (views.height + 2 * BORDER, views.width + 2 * BORDER)
     border = verts_cam.new_tensor([[0.0, 0, BORDER], [0, 0, BORDER], [0, 0, 0]])
     step = max(1, min(PIXELS // prod(size), TRIANGLES // max(n_faces, 1)))
-    first = 0
-    if verts_cam.numel() == 0:
+    total = prod(verts_cam.shape[:-2])
+    if total * n_verts == 0:
         return
+    step, first = ceil(total / ceil(total / step)), 0
     for verts in verts_cam.reshape(-1, n_verts, 3).split(step):
         place = torch.arange(len(verts), device=verts.device)
         item = (place + first) % items

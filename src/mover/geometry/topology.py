@@ -53,8 +53,8 @@ def mates_of(faces: np.ndarray, verts: np.ndarray | None = None) -> np.ndarray |
 
     Args:
         faces: Triangles, none of them degenerate.
-        verts: If given, faces around a shared edge are paired as walls of one solid; otherwise
-            they are paired within their component.
+        verts: If given, those of one component around a shared edge are paired as the walls of a
+            wedge of matter; otherwise in the order of the faces.
     """
     tails, heads = half_edges(faces)
     low, high = np.minimum(tails, heads), np.maximum(tails, heads)
@@ -93,50 +93,40 @@ def _pair_shared(
     tails, heads = half_edges(faces)
     order = np.nonzero(busy)[0]
     order = order[np.argsort(edge[order], kind="stable")]
-    for group in np.split(order, np.nonzero(np.diff(edge[order]))[0] + 1):
+    for group in np.split(order, np.flatnonzero(np.diff(edge[order])) + 1):
         ahead = tails[group] < heads[group]
         out, back = group[ahead], group[~ahead]
-        if verts is None:
-            back = _same_component(out, back, component)
-        else:
-            back = _same_solid(out, back, faces, verts)
+        cost = (component[out // 3][:, None] != component[back // 3]) * 2 * np.pi
+        if verts is not None:
+            cost = cost + _wedges(out, back, faces, verts)
+        back = back[_matched(cost)]
         mates[out], mates[back] = back, out
 
 
-def _same_component(out: np.ndarray, back: np.ndarray, component: np.ndarray) -> np.ndarray:
-    """`back` in an order that puts faces of the same component side by side where possible."""
-    left, chosen = list(back), dict[int, int]()
-    for half in out:
-        same = [other for other in left if component[other // 3] == component[half // 3]]
-        if same:
-            chosen[half] = same[0]
-            left.remove(same[0])
-    rest = iter(left)
-    return np.array([chosen[half] if half in chosen else next(rest) for half in out])
-
-
-def _same_solid(
-    out: np.ndarray, back: np.ndarray, faces: np.ndarray, verts: np.ndarray
-) -> np.ndarray:
-    """`back` in an order that makes each pair the two walls of one wedge of matter.
+def _wedges(out: np.ndarray, back: np.ndarray, faces: np.ndarray, verts: np.ndarray) -> np.ndarray:
+    """Angle of the matter between each two faces around an edge [rad], in [0, 2 pi).
 
     Around an edge that points at the viewer, the normal of a face that runs along it points
     counter-clockwise: matter begins there, clockwise, and ends at the next face.
     """
-    tip = faces[out[0] // 3, (out[0] + 1) % 3]
-    root = faces[out[0] // 3, out[0] % 3]
+    root, tip = faces[out[0] // 3, out[0] % 3], faces[out[0] // 3, (out[0] + 1) % 3]
     along = verts[tip] - verts[root]
     halves = np.concatenate([out, back])
     apexes = verts[faces[halves // 3, (halves + 2) % 3]] - verts[root]
     apexes = apexes - np.outer(apexes @ along, along) / max(float(along @ along), 1e-300)
     side = np.cross(along, apexes[0])
     angle = np.arctan2(apexes @ side, apexes @ apexes[0] * np.linalg.norm(along))
-    turn = (angle[: len(out), None] - angle[None, len(out) :]) % (2 * np.pi)
-    chosen = np.full(len(out), -1)
-    for row in np.argsort(turn.min(1)):
-        chosen[row] = int(np.argmin(turn[row]))
-        turn[:, chosen[row]] = np.inf
-    return back[chosen]
+    return (angle[: len(out), None] - angle[len(out) :]) % (2 * np.pi)
+
+
+def _matched(cost: np.ndarray) -> np.ndarray:
+    """A column of its own for each row, the cheapest first."""
+    cost, chosen = cost.astype(np.float64), np.zeros(len(cost), dtype=np.int64)
+    for _ in range(len(cost)):
+        row, column = np.unravel_index(cost.argmin(), cost.shape)
+        chosen[row] = column
+        cost[row], cost[:, column] = np.inf, np.inf
+    return chosen
 
 
 def labels(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 The sign is the winding number of the cell centres, found from signed crossings of vertical lines
 with the triangles, so that a hand inside a thigh is inside. The distance is exact, and computed
-only where the collision term looks: inside, and in a shell of two cells around.
+only where the collision term looks: inside, and up to two cells from the surface.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,11 @@ from torch import Tensor
 from ..records import record
 from .nearest import as_float64, as_int64, closest
 
-SHELL = 2  # [cells], the depth of the exact layer outside of the bodies
-BAND = 4.0  # [cells], more than the diagonal of the shell: 2 * sqrt(3)
+SHELL = 2.0  # [cells], the distance up to which it is exact; more than a cell's diagonal
+BAND = 4.0  # [cells], what stands for any larger distance
+SPACING = 0.8  # [cells] between marks on the surface; no point is further than 0.47 from one
+REACH = 2  # [cells] from a mark's cell along each axis: all that is nearer than SHELL is less
+# than 2 + 0.47 and 0.5 for rounding away, and whole cells below 3 are 2
 SNAP = 1 << 16  # vertices snap to this part of a cell, so that crossings are exact
 
 
@@ -90,9 +93,8 @@ def union_bodies(
 ) -> Volume:
     """V = min over the bodies, and what `grid` holds, of the signed distance to each [m].
 
-    Exact inside the bodies and up to two cells outside; further away positive, and as in `grid`
-    beyond the exact layer. The result does not depend on the number of workers, and memory not on
-    that of bodies.
+    Exact inside the bodies and up to two cells outside; further away as in `grid`. The result
+    does not depend on the number of workers, and memory not on that of bodies.
 
     Args:
         verts: Closed bodies in the world [m].
@@ -126,16 +128,16 @@ def add_body(
     verts: np.ndarray, faces: np.ndarray, values: np.ndarray, cell: float, lock: Lock
 ) -> None:
     """Lower `values` [m] to the signed distance of one body whose vertices are in cells."""
-    margin = SHELL + 1
-    low = np.maximum(np.floor(verts.min(0)).astype(np.int64) - margin, -margin)
-    high = np.minimum(np.ceil(verts.max(0)).astype(np.int64) + margin, values.shape + np.array(2))
-    if (high < 0).any() or (low >= values.shape).any():
+    size = np.array(values.shape)
+    low = np.maximum(np.floor(verts.min(0)).astype(np.int64), 0) - REACH
+    high = np.minimum(np.ceil(verts.max(0)).astype(np.int64), size - 1) + REACH
+    if (high < 0).any() or (low >= size).any():
         return
     inside = winding(verts - low, faces, high - low + 1) > 0
-    near = np.flatnonzero(_grown(inside, SHELL))
+    near = np.flatnonzero(inside | _grown(_marks(verts - low, faces, high - low + 1), REACH))
     at = np.stack(np.unravel_index(near, inside.shape), -1) + low
     is_in = np.asarray(inside.ravel()[near])
-    keep = ((at >= 0) & (at < values.shape)).all(-1)
+    keep = ((at >= 0) & (at < size)).all(-1)
     at, is_in = at[keep], is_in[keep]
     flat = np.asarray(np.ravel_multi_index(tuple(at.T), values.shape))
     field: np.ndarray = values.reshape(-1)
@@ -143,10 +145,10 @@ def add_body(
     at, is_in, flat = at[open_], is_in[open_], flat[open_]
     if len(at) == 0:
         return
-    distance = np.sqrt(closest(at.astype(np.float64), verts, faces)[0]) * cell
-    signed = np.where(is_in, -distance, distance).astype(values.dtype)
+    distance = np.sqrt(closest(at.astype(np.float64), verts, faces)[0])
+    signed = np.where(is_in, -distance, np.where(distance <= SHELL, distance, BAND)) * cell
     with lock:
-        field[flat] = np.minimum(field[flat], signed)
+        field[flat] = np.minimum(field[flat], signed.astype(values.dtype))
 
 
 def outward(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -209,6 +211,21 @@ def _crossings(
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _marks(verts: np.ndarray, faces: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Cells of points on the surface, no further apart than SPACING."""
+    corners = verts[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(-1)
+    parts = np.maximum(np.ceil(longest / SPACING), 1).astype(np.int64)
+    marks = np.zeros(shape, dtype=bool)
+    for count in np.unique(parts):
+        i, j = np.nonzero(np.tri(count + 1, dtype=bool)[::-1])
+        share = np.stack([i, j, count - i - j], -1) / count
+        points = np.rint(share @ corners[parts == count]).astype(np.int64).reshape(-1, 3)
+        points = points[((points >= 0) & (points < shape)).all(-1)]
+        marks[tuple(points.T)] = True
+    return marks
 
 
 def _grown(mask: np.ndarray, cells: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -89,18 +90,6 @@ def capture_from_arrays(
     arrays = None if bodies is None else {k: np.asarray(v) for k, v in bodies.items()}
     touch = None if arrays is None or "probability" not in arrays else At(arrays, FILE, "bodies")
 
-    def load_mesh(at: At) -> tuple[Mesh, str]:
-        found = objects[at.value]
-        verts = array(
-            At(np.asarray(found.vertices), FILE, f"objects[{at.value}].vertices"), ("V", 3)
-        )
-        faces = At(np.asarray(found.faces), FILE, f"objects[{at.value}].faces")
-        return mesh_of(verts, array(faces, ("F", 3), "whole"), faces), found.mesh_file
-
-    def load_image(of: Camera, warn: Warn) -> Float[Tensor, "h w 3"] | None:
-        del warn
-        return None if image is None else _image(image, of)
-
     return assemble(
         Sources(
             name=name,
@@ -110,11 +99,19 @@ def capture_from_arrays(
             people=None if people is None else At(_people(people), FILE, "people"),
             bodies=None if arrays is None else At(arrays, FILE, "bodies"),
             contacts=touch,
-            load_mesh=load_mesh,
-            load_image=load_image,
+            load_mesh=partial(_load_mesh, objects),
+            load_image=partial(_load_image, image),
             n_frames=None,
         )
     )
+
+
+def _load_mesh(objects: Sequence[ObjectArrays], at: At) -> tuple[Mesh, str]:
+    """The mesh of an object that is named by its index."""
+    given, field = objects[at.value], f"objects[{at.value}]"
+    verts = array(At(np.asarray(given.vertices), FILE, f"{field}.vertices"), ("V", 3))
+    faces = At(np.asarray(given.faces), FILE, f"{field}.faces")
+    return mesh_of(verts, array(faces, ("F", 3), "whole"), faces), given.mesh_file
 
 
 def _scene(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
@@ -202,12 +199,15 @@ def _stack(value: Numbers, field: str) -> Tensor:
     return torch.from_numpy(given)
 
 
-def _image(image: Numbers, camera: Camera) -> Float[Tensor, "h w 3"]:
+def _load_image(image: Numbers | None, camera: Camera, warn: Warn) -> Float[Tensor, "h w 3"] | None:
     """The reference image in [0, 1]."""
-    given: NDArray[Any] = np.asarray(image)
-    value = array(At(given, FILE, "image"), (camera.height, camera.width, 3)).astype(np.float32)
-    if given.dtype == np.uint8:
+    if image is None:
+        warn(f"{FILE}: there is no picture to draw on")
+        return None
+    at = At(np.asarray(image), FILE, "image")
+    value = array(at, (camera.height, camera.width, 3)).astype(np.float32)
+    if at.value.dtype == np.uint8:
         value = value / np.float32(255)
     if value.min() < 0 or value.max() > 1:
-        refuse(At(given, FILE, "image"), "bytes, or numbers from 0 to 1")
+        refuse(at, "bytes, or numbers from 0 to 1")
     return torch.from_numpy(value)

@@ -37,7 +37,7 @@ class ObjectEvidence:
 def gather_evidence(capture: Capture) -> tuple[ObjectEvidence, ...]:
     """The evidence of each object, counted on a coarse grid from projected body vertices."""
     known = {d.id: d for d in capture.detections}
-    found = [None if p.annotation is None else known[p.annotation] for p in capture.scene.pieces]
+    found = [known.get(-1 if p.annotation is None else p.annotation) for p in capture.scene.pieces]
     masks = [None if d is None else d.mask for d in found]
     step = max(1, capture.scene.camera.width // CELLS)
     grids = _stack(masks, capture, step)

@@ -61,6 +61,11 @@ def shown(value: Any) -> str:  # noqa: ANN401
     return text if len(text) <= 60 else f"{text[:56]} ..."
 
 
+def reason(error: Exception) -> str:
+    """What another library says, on one short line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:160]
+
+
 def listed(what: str, names: Sequence[object]) -> str:
     """`3 chairs (1, 2, 3)` for a warning about many."""
     some = ", ".join(map(str, names[:6])) + (", ..." if len(names) > 6 else "")
@@ -97,9 +102,9 @@ def items(at: At, count: int | None = None) -> list[At]:
 
 
 def text(at: At) -> str:
-    """Text that is not blank."""
-    if not isinstance(at.value, str) or not at.value.strip():
-        refuse(at, "text")
+    """Printable text that is not blank."""
+    if not isinstance(at.value, str) or not at.value.strip() or not at.value.isprintable():
+        refuse(at, "printable text")
     return at.value
 
 
@@ -200,7 +205,7 @@ def read_json(path: Path) -> At:
     try:
         return At(json.loads(path.read_text(encoding="utf-8-sig")), name)
     except (ValueError, RecursionError, OSError) as error:
-        raise InputError(f"{name}: is not JSON ({error}), expected a JSON file") from error
+        raise InputError(f"{name}: is not JSON ({reason(error)}), expected a JSON file") from error
 
 
 def write_json(value: object, path: Path) -> None:

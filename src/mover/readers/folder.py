@@ -78,7 +78,11 @@ def write_capture(capture: Capture, folder: Path) -> None:
     """Write a capture folder, without frames; reading it gives the same capture.
 
     The picture is kept with 8 bits a channel.
+
+    Raises:
+        ValueError: If the folder has a file that this capture lacks: the two would mix.
     """
+    _check_room_for(capture, folder)
     camera = camera_to_json(capture.scene.camera)
     if capture.camera_height is not None:
         camera["height"] = capture.camera_height
@@ -101,3 +105,15 @@ def write_capture(capture: Capture, folder: Path) -> None:
     write_json(objects, folder / "objects.json")
     write_json(camera, folder / "camera.json")
     write_scene(capture.scene, folder / "scene.json")
+
+
+def _check_room_for(capture: Capture, folder: Path) -> None:
+    """Refuse a folder whose optional files would join a capture that has none."""
+    wanted = {
+        "bodies.npz": capture.bodies is not None,
+        "people.json": capture.people is not None or capture.reference_people is not None,
+        "contacts.npz": capture.touch is not None,
+    }
+    for name, is_written in wanted.items():
+        if not is_written and (folder / name).exists():
+            raise ValueError(f"{folder} has {name}, which the capture lacks; choose a new folder")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..records import InputError, replacing
 from ..types import Camera
-from .fields import At, refuse
+from .fields import At, reason, refuse
 from .mesh_file import inside
 
 
@@ -35,7 +35,7 @@ def read_image(at: At, folder: Path, camera: Camera) -> Float[Tensor, "h w 3"]:
                 if size == (camera.width, camera.height):
                     pixels = np.asarray(picture, dtype=np.float32)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        refuse(at, "a picture", f"{str(at.value)!r}, which cannot be read ({error})")
+        refuse(at, "a picture", f"{str(at.value)!r}, which cannot be read ({reason(error)})")
     if pixels is None:
         expected = f"{camera.width} x {camera.height} pixels, as the camera has"
         refuse(at, expected, f"{str(at.value)!r} with {size[0]} x {size[1]} pixels")
@@ -56,7 +56,9 @@ def image_size(path: Path) -> tuple[int, int]:
             with Image.open(path) as picture:
                 return picture.size
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path.name}: cannot be read ({error}), expected a picture") from error
+        raise InputError(
+            f"{path.name}: cannot be read ({reason(error)}), expected a picture"
+        ) from error
 
 
 def write_image(image: Float[Tensor, "h w 3"], path: Path) -> None:

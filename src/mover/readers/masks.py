@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..geometry.runs import decode as decode
+from ..geometry.runs import run_lengths as run_lengths
 from ..records import InputError
 from ..types import Masks
 
@@ -21,14 +23,6 @@ def encode(mask: Bool[Tensor, "h w"]) -> bytes:
 
     code: Any = coco.encode(np.asfortranarray(mask.cpu().numpy(), dtype=np.uint8))
     return code["counts"]
-
-
-def decode(masks: Masks, index: int) -> Bool[Tensor, "h w"]:
-    """One of the masks as an image."""
-    runs = run_lengths(masks.counts[index])
-    flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
-    image = flat.reshape(masks.width, masks.height).T
-    return torch.from_numpy(np.ascontiguousarray(image))
 
 
 def thinned(masks: Masks, index: int, step: int) -> NDArray[np.bool_]:
@@ -103,32 +97,6 @@ def _runs(counts: Any, where: str) -> NDArray[np.int64]:  # noqa: ANN401
         raise InputError(
             f"{where} has counts with {error}, expected COCO's compressed code"
         ) from error
-
-
-def run_lengths(counts: bytes) -> NDArray[np.int64]:
-    """The runs (background first, down the columns) of a compressed code.
-
-    Each run is written in groups of five bits, least first, as the difference from the run two
-    before; the sixth bit of a character says that another follows.
-
-    Raises:
-        ValueError: If the code is malformed.
-    """
-    codes = np.frombuffer(counts, np.uint8).astype(np.int64) - 48
-    if ((codes < 0) | (codes > 63)).any():
-        raise ValueError("characters outside of '0' to 'o'")
-    ends = np.flatnonzero(codes < 32)
-    if not len(ends) or ends[-1] != len(codes) - 1:
-        raise ValueError("a code that is cut off")
-    starts = np.concatenate([[0], ends[:-1] + 1])
-    lengths = ends - starts + 1
-    if lengths.max() > 7:
-        raise ValueError("a run of more than 35 bits")
-    shift = 5 * (np.arange(len(codes)) - np.repeat(starts, lengths))
-    values = np.add.reduceat((codes & 31) << shift, starts)
-    values -= np.where(codes[ends] & 16, np.int64(1) << (5 * lengths), 0)
-    values[1::2], values[2::2] = np.cumsum(values[1::2]), np.cumsum(values[2::2])
-    return values
 
 
 def _compressed(runs: NDArray[np.int64], height: int, width: int) -> bytes:

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from ..records import InputError, replacing
 from ..types import Mesh
-from .fields import LARGEST, LARGEST_FILE, At, refuse, text
+from .fields import LARGEST, LARGEST_FILE, At, reason, refuse, shown, text
 
 KINDS = (".glb", ".gltf", ".obj", ".ply", ".off", ".stl")
+MOST_NUMBERS = 1 << 27  # in one array of a glTF file
 THINNEST = 1e-9  # a mesh that is thinner along two axes has no surface
 
 
@@ -26,11 +27,14 @@ def inside(at: At, folder: Path) -> Path:
     path = Path(name)
     if path.is_absolute() or ".." in path.parts or "\0" in name or "\\" in name:
         refuse(at, "a relative path with forward slashes inside the capture's folder")
-    full = (folder / path).resolve()
-    if not full.is_relative_to(folder.resolve()):
-        refuse(at, "a file inside the capture's folder", f"{name!r}, a link that leaves it")
-    if not full.is_file():
-        refuse(at, "a file", f"{name!r}, which does not exist")
+    try:
+        full = (folder / path).resolve()
+        if not full.is_relative_to(folder.resolve()):
+            refuse(at, "a file inside the capture's folder", f"{name!r}, a link that leaves it")
+        if not full.is_file():
+            refuse(at, "a file", f"{shown(name)}, which does not exist")
+    except (OSError, RuntimeError) as error:  # names that are too long, links in a circle
+        refuse(at, "a file", f"{shown(name)}, which cannot be found ({reason(error)})")
     return full
 
 
@@ -56,6 +60,7 @@ def _load(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of parsers about things that are checked here
         try:
+            _check_gltf(at, path)
             scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
             for part in scene.geometry.values():
                 _check_faces(at, np.asarray(part.faces), len(part.vertices))
@@ -64,8 +69,26 @@ def _load(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
         except InputError:
             raise
         except Exception as error:  # the parsers of six formats raise anything on broken files
-            reason = f"{type(error).__name__}: {error}"[:120]
-            refuse(at, "a readable mesh", f"{str(at.value)!r}, which cannot be read ({reason})")
+            found = f"{at.value!r}, which cannot be read ({reason(error)})"
+            refuse(at, "a readable mesh", found)
+
+
+def _check_gltf(at: At, path: Path) -> None:
+    """Refuse buffers outside of the file's folder, and more numbers than a file can hold."""
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        return
+    content = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        start, size = 20, int.from_bytes(content[12:16], "little")
+        content = content[start : start + size]
+    tree = json.loads(content)
+    for part in tree.get("buffers", []):
+        uri = part.get("uri", "data:")
+        if not uri.startswith("data:") and not _is_companion(path, unquote(uri)):
+            refuse(at, "buffers beside it", f"{at.value!r} with the buffer {shown(uri)}")
+    for part in tree.get("accessors", []):
+        if part["count"] > MOST_NUMBERS:
+            refuse(at, f"at most {MOST_NUMBERS} items", f"{at.value!r} with {part['count']}")
 
 
 def _check_faces(at: At, faces: NDArray[Any], count: int) -> None:

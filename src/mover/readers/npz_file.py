@@ -11,7 +11,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from ..records import InputError, replacing
-from .fields import LARGEST_FILE, At
+from .fields import LARGEST_FILE, At, reason
 
 BROKEN = (ValueError, OSError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
@@ -30,7 +30,9 @@ def read_npz(path: Path) -> At:
         with np.load(path, allow_pickle=False) as arrays:
             return At({key: arrays[key] for key in arrays.files}, name)
     except (*BROKEN, MemoryError, SyntaxError) as error:
-        raise InputError(f"{name}: cannot be read ({error}), expected an .npz file") from error
+        raise InputError(
+            f"{name}: cannot be read ({reason(error)}), expected an .npz file"
+        ) from error
 
 
 def _check_headers(path: Path) -> None:

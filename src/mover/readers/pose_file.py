@@ -13,7 +13,7 @@ from ..bodies import BodyModel, load_model
 from ..geometry.rotations import axis_angle
 from ..records import InputError
 from ..types import Bodies, BodyPose
-from .fields import At, array, choice, get, maybe, refuse
+from .fields import At, array, choice, get, maybe, reason, refuse
 
 NEEDED = ("betas", "global_orient", "body_pose", "transl")
 EXTRA = ("left_hand_pose", "right_hand_pose", "jaw_pose", "expression")
@@ -107,7 +107,7 @@ def posed(
         model = load_model(pose.model, pose.gender)
         verts, joints = _run(model, pose)
     except (InputError, ValueError, RuntimeError, KeyError, OSError) as error:
-        message = f"{str(pose.model)!r}, which gives no meshes ({error})"
+        message = f"{str(pose.model)!r}, which gives no meshes ({reason(error)})"
         refuse(
             get(at, "model"), "a body model that can be posed, or 'vertices' and 'faces'", message
         )
@@ -122,7 +122,7 @@ def reproduces(pose: BodyPose, verts: Float[Tensor, "bodies verts 3"], at: At) -
         index = torch.linspace(0, len(verts) - 1, count).round().long()
         found, _ = _run(model, _rows_of(pose, index))
     except (InputError, ValueError, RuntimeError, KeyError, OSError) as error:
-        return f"the parameters of '{pose.model}' cannot be used ({error})"
+        return f"the parameters of '{pose.model}' cannot be used ({reason(error)})"
     if found.shape[1] != verts.shape[1]:
         return f"{pose.model} has {found.shape[1]} vertices, {at.file} has {verts.shape[1]}"
     worst = float((found - verts[index]).norm(dim=-1).max())

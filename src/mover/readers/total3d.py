@@ -7,8 +7,9 @@ is taken as the image's: no half pixel is added.
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,27 +21,12 @@ from torch import Tensor
 from ..records import InputError
 from ..types import Camera, Capture, Mesh
 from .assemble import Sources, assemble
-from .fields import At, Warn, array, choice, get, items, read_json, refuse, vector
+from .fields import At, Warn, array, choice, get, items, read_json, reason, refuse, vector
 from .image_file import image_size, read_image
 from .mesh_file import mesh_of
+from .nyu40 import CLASSES, FURNITURE, LIFTED
 from .scene_file import FORMAT, VERSION
 
-CLASSES = (
-    "void", "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window",
-    "bookshelf", "picture", "counter", "blinds", "desk", "shelves", "curtain", "dresser",
-    "pillow", "mirror", "floor_mat", "clothes", "ceiling", "books", "refridgerator",
-    "television", "paper", "towel", "shower_curtain", "box", "whiteboard", "person",
-    "night_stand", "toilet", "sink", "lamp", "bathtub", "bag", "otherstructure",
-    "otherfurniture", "otherprop",
-)  # fmt: skip
-"""NYU40's names, by class id."""
-FURNITURE = (
-    "cabinet", "bed", "chair", "sofa", "table", "bookshelf", "counter", "desk", "shelves",
-    "dresser", "refridgerator", "television", "box", "night_stand", "toilet", "sink", "lamp",
-    "bathtub", "otherfurniture",
-)  # fmt: skip
-LIFTED = ("television", "box", "sink", "lamp")
-"""What may stand on something else or hang on a wall."""
 ON_FLOOR = 0.3  # [m], such a thing stands on the floor if its box ends so close above it
 TO_OURS = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 """x forward, y up, z right -> x right, y up, z backward."""
@@ -58,6 +44,9 @@ class _Box:
     name: str
 
 
+_Shape = tuple[NDArray[np.float64], NDArray[np.int64]]
+
+
 def read_total3d(folder: Path) -> Capture:
     """Read the input and the output of Total3D for one picture.
 
@@ -73,19 +62,8 @@ def read_total3d(folder: Path) -> Capture:
         expected = "the classes of detections.json, in order"
         raise InputError(f"bdb_3d.mat: field 'class_id' has {found}, expected {expected}")
     kept = [i for i, box in enumerate(boxes) if box.name in FURNITURE]
-    shapes = {i: _read_obj(result / f"{i}_{CLASSES.index(boxes[i].name)}.obj") for i in kept}
-    pieces = [_piece(i, boxes[i], shapes[i][0], floor) for i in kept]
-
-    def load_mesh(at: At) -> tuple[Mesh, str]:
-        path = result / at.value
-        return mesh_of(*shapes[int(path.stem.split("_")[0])], At(None, path.name)), str(
-            path.resolve()
-        )
-
-    def load_image(camera: Camera, warn: Warn) -> Float[Tensor, "h w 3"] | None:
-        del warn
-        return read_image(At("img.jpg", "input"), source, camera)
-
+    shapes = {_obj_name(i, boxes[i]): _read_obj(result / _obj_name(i, boxes[i])) for i in kept}
+    pieces = [_piece(i, boxes[i], shapes[_obj_name(i, boxes[i])][0], floor) for i in kept]
     scene = {"format": FORMAT, "version": VERSION, "ground": {"height": floor}, "objects": pieces}
     return assemble(
         Sources(
@@ -96,11 +74,27 @@ def read_total3d(folder: Path) -> Capture:
             people=None,
             bodies=None,
             contacts=None,
-            load_mesh=load_mesh,
-            load_image=load_image,
+            load_mesh=partial(_load_mesh, result, shapes),
+            load_image=partial(_load_image, source),
             n_frames=None,
         )
     )
+
+
+def _obj_name(index: int, box: _Box) -> str:
+    """The file of a mesh."""
+    return f"{index}_{CLASSES.index(box.name)}.obj"
+
+
+def _load_mesh(result: Path, shapes: Mapping[str, _Shape], at: At) -> tuple[Mesh, str]:
+    """The mesh of an object, as it is in the file."""
+    return mesh_of(*shapes[at.value], At(None, at.value)), str((result / at.value).resolve())
+
+
+def _load_image(source: Path, camera: Camera, warn: Warn) -> Float[Tensor, "h w 3"]:
+    """The picture."""
+    del warn
+    return read_image(At("img.jpg", "input"), source, camera)
 
 
 def _camera(source: Path, attitude: Path) -> At:
@@ -109,7 +103,9 @@ def _camera(source: Path, attitude: Path) -> At:
     try:
         K = np.atleast_2d(np.loadtxt(path))
     except (OSError, ValueError) as error:
-        raise InputError(f"cam_K.txt: cannot be read ({error}), expected 3 x 3 numbers") from error
+        raise InputError(
+            f"cam_K.txt: cannot be read ({reason(error)}), expected 3 x 3 numbers"
+        ) from error
     array(At(K, path.name), (3, 3))
     bottom_and_skew = [K[0, 1], K[1, 0], *K[2]]
     if bottom_and_skew != [0, 0, 0, 0, 1]:
@@ -156,7 +152,9 @@ def _load_mat(path: Path) -> At:
             warnings.simplefilter("ignore")
             return At(loadmat(str(path)), path.name)
     except Exception as error:  # the parser raises anything on broken files
-        raise InputError(f"{path.name}: cannot be read ({error}), expected a .mat file") from error
+        raise InputError(
+            f"{path.name}: cannot be read ({reason(error)}), expected a .mat file"
+        ) from error
 
 
 def _matrix(path: Path, key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -207,7 +205,7 @@ def _piece(index: int, box: _Box, verts: NDArray[np.float64], floor: float) -> d
     """
     low, high = verts.min(0), verts.max(0)
     if (high <= low).any():
-        refuse(At(None, f"{index}_{CLASSES.index(box.name)}.obj"), "a solid mesh", "a flat mesh")
+        refuse(At(None, _obj_name(index, box)), "a solid mesh", "a flat mesh")
     scale = 2 * box.half / (high - low)
     yaw = box.yaw + math.pi / 2  # TO_OURS is R_y of a quarter turn
     c, s = math.cos(yaw), math.sin(yaw)
@@ -217,7 +215,7 @@ def _piece(index: int, box: _Box, verts: NDArray[np.float64], floor: float) -> d
     return {
         "id": f"{box.name}_{index}",
         "category": box.name,
-        "mesh": f"{index}_{CLASSES.index(box.name)}.obj",
+        "mesh": _obj_name(index, box),
         "annotation": index,
         "translation": place.tolist(),
         "yaw": math.atan2(math.sin(yaw), math.cos(yaw)),
@@ -226,7 +224,7 @@ def _piece(index: int, box: _Box, verts: NDArray[np.float64], floor: float) -> d
     }
 
 
-def _read_obj(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _read_obj(path: Path) -> _Shape:
     """All vertices and triangles of an .obj, used or not."""
     if not path.is_file():
         raise InputError(f"{path.name}: there is no such file in {path.parent}, expected a mesh")

@@ -5,128 +5,17 @@ the body moves on. The pelvis runs through the middle between the feet.
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from ..records import record
-from .poses import LEG, STANCE, Person, Posture
-from .turns import X, Y, about, apply, smooth
+from .person import LEG, Person
+from .poses import Posture
+from .steps import STEP, STEP_TIME, Stations, Steps, steps_of
+from .turns import X, Y, about, apply, facing, left_of, smooth
 
-STEP = 0.5  # [m], length of an indoor step
-STEP_TIME = 0.5  # [s]
-TURN = np.radians(40)  # [rad], of one step on the spot
 LIFT = 0.07  # [m], of the ankle in mid-swing
 SWING = (0.12, 0.94)  # share of the step's time during which the foot is in the air
 REACH = 0.985  # share of the leg's length that a planted leg may span
 ARM_SWING = np.radians(20)
-
-Floor = Float[np.ndarray, "points 2"]
-
-
-@record
-class Steps:
-    """Where the feet land; the first two rows are where they stood, left then right."""
-
-    side: Int[np.ndarray, " steps"]
-    place: Float[np.ndarray, "steps 2"]
-    """x and z of the ankle [m]."""
-    heading: Float[np.ndarray, " steps"]
-    """Of the foot [rad]."""
-
-
-@record
-class Stations:
-    """Where the body stands when each step lands."""
-
-    place: Float[np.ndarray, "steps 2"]
-    heading: Float[np.ndarray, " steps"]
-
-
-def heading_of(direction: Float[np.ndarray, "*any 2"]) -> Float[np.ndarray, "*any"]:
-    """Angle about +y that turns +z into a direction on the floor (x, z) [rad]."""
-    return np.arctan2(direction[..., 0], direction[..., 1])
-
-
-def facing(heading: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any 2"]:
-    """Direction on the floor (x, z) of a heading."""
-    return np.stack([np.sin(heading), np.cos(heading)], -1)
-
-
-def left_of(heading: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any 2"]:
-    """Direction on the floor (x, z) to the left of a heading."""
-    return np.stack([np.cos(heading), -np.sin(heading)], -1)
-
-
-def stations(path: Floor, start: float, end: float) -> Stations:
-    """Turn on the spot, walk along the path, turn on the spot [rad, m]."""
-    route = _rounded(path)
-    lengths = np.linalg.norm(np.diff(route, axis=0), axis=1)
-    total = float(lengths.sum())
-    places: list[np.ndarray] = [path[0]]
-    headings: list[float] = [start]
-    if total > 0.05:
-        count = max(1, int(np.ceil(total / STEP)))
-        at = np.concatenate([[0.0], np.cumsum(lengths)])
-        goals = np.linspace(0, total, count + 1)
-        walk = np.stack([np.interp(goals, at, route[:, k]) for k in (0, 1)], -1)
-        ahead = np.interp(np.minimum(goals + 0.1, total), at, np.arange(len(at)))
-        segment = np.minimum(ahead.astype(int), len(lengths) - 1)
-        along = np.unwrap(heading_of(np.diff(route, axis=0)[segment]))
-        _turn_to(places, headings, float(along[0]), settle=False)
-        along = along + _lap(headings[-1] - along[0])
-        places += list(walk[1:])
-        headings += list(along[1:])
-    _turn_to(places, headings, end, settle=True)
-    return Stations(np.array(places), np.array(headings))
-
-
-def _turn_to(places: list[np.ndarray], headings: list[float], goal: float, settle: bool) -> None:
-    """Append stations on the spot until the heading is (almost) `goal`."""
-    turn = float((goal - headings[-1] + np.pi) % (2 * np.pi) - np.pi)
-    slack = 0.0 if settle else TURN
-    count = int(np.ceil(max(0.0, abs(turn) - slack) / TURN - 1e-9))
-    first = headings[-1]
-    share = 1.0 if settle else max(0.0, abs(turn) - slack / 2) / max(abs(turn), 1e-9)
-    for k in range(count):
-        places.append(places[-1])
-        headings.append(first + turn * share * (k + 1) / count)
-
-
-def _lap(difference: float) -> float:
-    return float(2 * np.pi * np.round(difference / (2 * np.pi)))
-
-
-def _rounded(path: Floor) -> Floor:
-    """The path with its corners cut to arcs, sampled every 4 cm."""
-    from scipy.ndimage import gaussian_filter1d
-
-    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    at = np.concatenate([[0.0], np.cumsum(lengths)])
-    count = max(2, int(at[-1] / 0.04) + 1)
-    dense = np.stack([np.interp(np.linspace(0, at[-1], count), at, path[:, k]) for k in (0, 1)], -1)
-    odd = 2 * np.array([dense[0], dense[-1]])
-    pad = min(20, count - 1)
-    long = np.concatenate([odd[0] - dense[pad:0:-1], dense, odd[1] - dense[-2 : -pad - 2 : -1]])
-    return gaussian_filter1d(long, 4.0, axis=0)[pad : pad + count]
-
-
-def steps_of(way: Stations) -> Steps:
-    """Alternate feet on the stations, then bring the other foot beside the last."""
-    places, headings = way.place, way.heading
-    first = 0 if headings[-1] >= headings[0] else 1
-    if len(places) > 1:
-        first = 0 if headings[1] >= headings[0] else 1
-    order = [(first + k) % 2 for k in range(len(places))]
-    last = len(places) - 1
-    rows = [(0, 0), (1, 0), *((order[k], k + 1) for k in range(last)), (order[last], last)]
-    side = np.array([s for s, _ in rows])
-    station = np.array([k for _, k in rows])
-    out = (STANCE * (1 - 2 * side))[:, None] * left_of(headings[station])
-    return Steps(side, places[station] + out, headings[station])
-
-
-def duration(way: Stations) -> float:
-    """Time of all steps [s]."""
-    return STEP_TIME * len(way.place)
 
 
 def walk(person: Person, way: Stations, times: Float[np.ndarray, " frames"]) -> Posture:

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from ..furniture import Furniture
 from ..records import record
-from .gait import facing, left_of
+from .turns import facing, left_of
 
 FAR = 0.03  # [m], signed distances beyond this are not told apart
 

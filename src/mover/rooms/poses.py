@@ -12,70 +12,13 @@ import torch
 from jaxtyping import Bool, Float
 
 from ..bodies import open_body
-from ..bodies.skeleton import JOINTS, PARENTS
+from ..bodies.skeleton import PARENTS
 from ..records import record
 from ..types import BodyPose
+from .person import ARM, AT, LEG, SIDES, SPINE, Person
 from .turns import X, Y, Z, about, apply, between, frame, to_vector, unit
 
-AT = {name: k for k, name in enumerate(JOINTS)}
-SIDES = ("left", "right")
-LEG = tuple(tuple(AT[f"{s}_{j}"] for j in ("hip", "knee", "ankle", "foot")) for s in SIDES)
-ARM = tuple(tuple(AT[f"{s}_{j}"] for j in ("shoulder", "elbow", "wrist")) for s in SIDES)
-SPINE = tuple(AT[f"spine{k}"] for k in (1, 2, 3))
 REACH = 0.995  # a limb is never quite straight
-
-
-@record
-class Person:
-    """One body shape: its skeleton and skin in the T-pose."""
-
-    betas: Float[np.ndarray, " shape"]
-    joints: Float[np.ndarray, "55 3"]
-    """[m], relative to the pelvis."""
-    skin: Float[np.ndarray, "verts 3"]
-    """[m], relative to the pelvis."""
-    origin: Float[np.ndarray, "3"]
-    """The pelvis of the rest shape: what `transl` leaves out [m]."""
-
-    @property
-    def leg(self) -> float:
-        """From hip to ankle along the straight leg [m]."""
-        return _length(self.joints, LEG[0][:3])
-
-    @property
-    def arm(self) -> float:
-        """From shoulder to wrist along the straight arm [m]."""
-        return _length(self.joints, ARM[0])
-
-    @property
-    def ankle(self) -> float:
-        """Height of the ankle above the sole [m]."""
-        return float(self.joints[LEG[0][2], 1] - self.skin[:, 1].min())
-
-    @property
-    def standing(self) -> float:
-        """Height of the pelvis of a person who stands with almost straight legs [m]."""
-        hip = self.joints[LEG[0][0]]
-        spread = hip[0] - STANCE
-        return self.ankle - float(hip[1]) + float(np.sqrt((0.988 * self.leg) ** 2 - spread**2))
-
-
-STANCE = 0.085  # [m], half the distance between the ankles of a standing person
-
-
-def _length(joints: np.ndarray, chain: Sequence[int]) -> float:
-    return float(np.linalg.norm(np.diff(joints[list(chain)], axis=0), axis=1).sum())
-
-
-def make_person(betas: Sequence[float]) -> Person:
-    """A person with these shape coefficients of the open body."""
-    shape = torch.tensor(betas, dtype=torch.float64)
-    zero = torch.zeros(1, 3, dtype=torch.float64)
-    flat = torch.zeros(1, 63, dtype=torch.float64)
-    pose = BodyPose("makehuman", "neutral", shape[None], zero, flat, zero, {})
-    verts, joints = open_body().posed(pose)
-    origin = joints[0, 0].numpy()
-    return Person(shape.numpy(), joints[0].numpy() - origin, verts[0].numpy() - origin, origin)
 
 
 @record
@@ -228,7 +171,7 @@ def _arm_turns(
     hinge = -Y if side == 0 else Y
     pole = apply(chest, posture.elbows[:, side])
     upper, lower = _two_bones(person, ARM[side], (shoulder, goal, pole), hinge)
-    front = apply(posture.turn, Z) * np.array([1.0, 0, 1.0])
+    front = apply(posture.turn, Z) * np.array([1.0, 0, 1.0]) + 1e-6 * Z
     inward = 1.0 if side == 0 else -1.0
     flat = frame(inward * unit(front), np.broadcast_to(Y, front.shape))
     hand = between(lower, flat, posture.resting[:, side])

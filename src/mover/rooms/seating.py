@@ -4,11 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from .gait import Stations, facing, walk
+from .gait import walk
+from .person import LEG, SIDES, Person
 from .placed import Placed, Spot, on_floor
-from .poses import LEG, SIDES, Person, Posture, blend, chest_of, rows
+from .poses import Posture, blend, chest_of, rows
 from .settle import approach, gap
-from .turns import X, about, apply, smooth
+from .steps import Stations
+from .turns import X, about, apply, facing, smooth
 
 SIT_TIME = 1.8  # [s]
 BOW = np.radians(32)  # how far one bends forward on the way down
@@ -47,7 +49,7 @@ def _depths(person: Person, spot: Spot) -> tuple[float, float]:
     thigh = float(np.linalg.norm(knee - hip))
     rear = -float(person.skin[np.abs(person.skin[:, 1]) < 0.15, 2].min())
     high = max(0.0, spot.height - 0.42)  # high seats: nearer to the edge, knees lower than hips
-    behind = min(thigh - 0.12 - high - spot.lip, spot.depth - rear - 0.015)
+    behind = min(thigh - 0.1 - high - spot.lip, spot.depth - rear - 0.015)
     return behind, max(CALF + spot.lip, thigh - behind - 0.02)
 
 

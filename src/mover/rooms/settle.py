@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..bodies import open_body
+from .person import AT, Person
 from .placed import Placed, distances
-from .poses import AT, Person, Posture, moved, skinned
+from .poses import Posture, moved, skinned
 
 PRESS = 0.006  # [m], how deep skin gives way
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -20,7 +21,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "core": ("pelvis", "left_hip", "right_hip", "spine1", "spine2", "spine3"),
     "torso": (
         "pelvis", "left_hip", "right_hip", "spine1", "spine2", "spine3", "left_collar",
-        "right_collar", "left_shoulder", "right_shoulder",
+        "right_collar",
     ),
     "feet": ("left_ankle", "right_ankle", "left_foot", "right_foot"),
 }  # fmt: skip
@@ -29,9 +30,11 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 @cache
 def part(name: str) -> Bool[np.ndarray, " verts"]:
-    """The vertices of one of `GROUPS`."""
+    """The vertices of one of `GROUPS`, or of all of them."""
     model = open_body()
     joint = model.weights.argmax(1).numpy()
+    if name == "all":
+        return np.ones(len(joint), dtype=bool)
     wanted = [AT[j] for j in GROUPS[name]]
     if name.endswith("_hand"):
         side = name.removesuffix("_hand")

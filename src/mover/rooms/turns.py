@@ -60,3 +60,18 @@ def smooth(share: Angles) -> Angles:
     """Ease in and out: 0 to 1 with no speed and no acceleration at both ends."""
     s = np.clip(share, 0, 1)
     return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+def heading_of(direction: Float[np.ndarray, "*any 2"]) -> Float[np.ndarray, "*any"]:
+    """Angle about +y that turns +z into a direction on the floor (x, z) [rad]."""
+    return np.arctan2(direction[..., 0], direction[..., 1])
+
+
+def facing(heading: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any 2"]:
+    """Direction on the floor (x, z) of a heading."""
+    return np.stack([np.sin(heading), np.cos(heading)], -1)
+
+
+def left_of(heading: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any 2"]:
+    """Direction on the floor (x, z) to the left of a heading."""
+    return np.stack([np.cos(heading), -np.sin(heading)], -1)

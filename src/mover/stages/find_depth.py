@@ -1,11 +1,12 @@
 r"""Correct the depth of people whose size is right: too near is too large for their mask.
 
-Not in the paper. Bodies estimated frame by frame keep their size while one person is 2 % too near or
-too far throughout; the floor under the feet, and the whole room with it, is then wrong by 1-2 cm.
-One factor a person moves the body along its pelvis' ray so that it fills its visible masks best.
+Not in the paper. Bodies estimated frame by frame keep their size while one person is 2 % too near
+or too far throughout; the floor under the feet, and the whole room with it, is then wrong by
+1-2 cm. One factor a person moves the body along its pelvis' ray so that it fills its visible masks
+best; the width of the mask's border is found with it, in every frame.
 
-What masks cannot tell is a wrong size at a wrong depth. Only a known height does: then the person is
-first scaled about the camera, which no picture sees.
+What masks cannot tell is a wrong size at a wrong depth. Only a known height does: then the person
+is first scaled about the camera, which no picture sees.
 """
 
 import dataclasses
@@ -18,13 +19,15 @@ from torch import Tensor
 from ..bodies.parts import Parts
 from ..geometry.camera import project
 from ..geometry.raster import Views, layers
+from ..geometry.runs import decode
 from ..minimize import Observer, Step, silent
 from ..records import record
 from ..types import Bodies, Camera, Masks, People
 from .find_soles import SolesConfig, straight_legs
-from .person_masks import MaskTable, decode_mask, mask_table
+from .mask_overlap import overlaps, small
+from .person_masks import MaskTable, mask_table
 
-SYSTEMATIC = 0.004  # spread of the factor when all masks are a pixel too wide
+SYSTEMATIC = 0.003  # error of the factor that more frames do not make smaller
 LIKELY_SIZE = (0.8, 1.25)  # a body whose size is off by more is a mistake in the height
 
 
@@ -48,7 +51,7 @@ class DepthConfig:
 
     span: float = 0.09
     """Factors from 1 - span to 1 + span are tried."""
-    factors: int = 19
+    factors: int = 13
     """How many."""
     every: int = 3
     """Use every so many of a person's frames ..."""
@@ -56,7 +59,7 @@ class DepthConfig:
     """... and at most so many, spread over the video."""
     least: int = 5
     """Fewer frames than that tell nothing."""
-    width: int = 320
+    width: int = 240
     """Width of the pictures that are compared [px]."""
     seen: float = 0.7
     """Share of a body's picture that its mask has to fill, and that no object may cover."""
@@ -95,12 +98,13 @@ def find_depth(
         size, note = _size(inputs, rows, str(person))
         rows = rows[torch.tensor([table.own[r] is not None for r in rows.tolist()]).bool()]
         curves = _curves(inputs, config, rows, table, free)
-        factor, spread, weak = _peak(curves, config)
-        found[:, index] = torch.tensor([factor, spread, size])
+        *peak, weak = _peak(curves, config)
+        found[:, index] = torch.tensor([*peak, size])
         warnings += note + [f"depth of person {person}: {w}" for w in weak]
         observe(Step("find_depth", index, len(tracks)))
-    found = found.to(bodies.verts)
-    return DepthFactors(torch.tensor(tracks).long(), *found.unbind(0), tuple(warnings))
+    factor, spread, size = found.to(bodies.verts)
+    person = torch.tensor(tracks, dtype=torch.long)
+    return DepthFactors(person, factor, spread, size, tuple(warnings))
 
 
 def apply_depth(bodies: Bodies, factors: DepthFactors) -> Bodies:
@@ -108,8 +112,10 @@ def apply_depth(bodies: Bodies, factors: DepthFactors) -> Bodies:
 
     A changed size is beyond the pose's parameters, so they are dropped: the bodies stay meshes.
     """
-    index = (bodies.person[:, None] == factors.person.to(bodies.person)).long().argmax(1)
-    factor, size = (x.to(bodies.verts)[index] for x in (factors.factor, factors.size))
+    same = (bodies.person[:, None] == factors.person.to(bodies.person)).to(bodies.verts)
+    factor, size = (
+        1 + same @ (x.to(bodies.verts) - 1) for x in (factors.factor, factors.size)
+    )  # people without a factor keep their place
     shift = (factor - 1)[:, None] * pelvis(bodies) * size[:, None]
     verts = bodies.verts * size[:, None, None] + shift[:, None]
     joints, pose = bodies.joints, bodies.pose
@@ -154,15 +160,8 @@ def _free_of_objects(inputs: DepthInputs, config: DepthConfig) -> Bool[Tensor, "
     """Pixels of the small picture that no object covers."""
     covered = torch.zeros(inputs.people.masks.height, inputs.people.masks.width, dtype=torch.bool)
     for row in range(len(inputs.objects.counts)):
-        covered = covered | decode_mask(inputs.objects, row)
-    return _small(covered, config) < 0.05
-
-
-def _small(mask: Bool[Tensor, "h w"], config: DepthConfig) -> Float[Tensor, "small_h small_w"]:
-    """Share of each pixel of the small picture that is set."""
-    height = max(1, round(mask.shape[0] * config.width / mask.shape[1]))
-    big = mask[None, None].float()
-    return torch.nn.functional.interpolate(big, (height, config.width), mode="area")[0, 0]
+        covered = covered | decode(inputs.objects, row)
+    return small(covered, config.width) < 0.05
 
 
 def _curves(
@@ -176,15 +175,14 @@ def _curves(
     curves: list[Tensor] = []
     for row in _spread_out(rows[:: config.every], inputs, config):  # masks are decoded one by one
         own, others = table.decode(row)
-        known = free & (_small(others, config) < 0.05)
-        mask, drawn = _small(own, config) > 0.5, _drawn(inputs, config, row, free)
+        known = free & (small(others, config.width) < 0.05)
+        mask, drawn = small(own, config.width), _drawn(inputs, config, row, free)
         middle = drawn[config.factors // 2]
-        seen = (middle & known & mask).sum() / (middle & known).sum().clamp_min(1)
+        seen = mask[middle & known].sum() / (middle & known).sum().clamp_min(1)
         open_share = (middle & known).sum() / middle.sum().clamp_min(1)
         if min(float(seen), float(open_share)) < config.seen:
             continue
-        both, either = (drawn & mask & known).sum((1, 2)), ((drawn | mask) & known).sum((1, 2))
-        curves.append(both / either.clamp_min(1))
+        curves.append(overlaps(drawn, mask, known))
     return torch.stack(curves) if curves else torch.zeros(0, config.factors)
 
 

@@ -7,9 +7,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..geometry.camera import to_world
+from ..geometry.runs import decode
 from ..records import map_tensors, record
-from ..types import Bodies, BodyPose, Camera, Capture
-from .person_masks import decode_mask
+from ..types import Bodies, BodyPose, Camera, Capture, Masks
 from .prepare_objects import Prepared
 
 
@@ -33,17 +33,24 @@ def image_evidence(capture: Capture) -> Seen:
     found = [by_id.get(-1 if p.annotation is None else p.annotation) for p in pieces]
     whole = torch.tensor([0.0, 0.0, camera.width, camera.height])
     blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    masks = [blank if d is None or d.mask is None else decode_mask(d.mask, 0) for d in found]
+    masks = [blank if d is None or d.mask is None else decode(d.mask, 0) for d in found]
     people = blank
     if capture.reference_people is not None:
         for row in range(len(capture.reference_people.counts)):
-            people = people | decode_mask(capture.reference_people, row)
+            people = people | decode(capture.reference_people, row)
     return Seen(
         torch.stack([whole if d is None else d.box for d in found]) if found else torch.zeros(0, 4),
         torch.tensor([d is not None for d in found], dtype=torch.bool),
         torch.stack(masks) if masks else blank.expand(0, -1, -1),
         people,
     )
+
+
+def detected_masks(capture: Capture) -> Masks:
+    """All masks of the reference image."""
+    camera = capture.scene.camera
+    found = [d.mask.counts[0] for d in capture.detections if d.mask is not None]
+    return Masks(camera.height, camera.width, tuple(found))
 
 
 def rows_of(bodies: Bodies, keep: Bool[Tensor, " bodies"]) -> Bodies:

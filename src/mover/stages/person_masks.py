@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from ..geometry.runs import decode
 from ..types import Bodies, Masks, People
 
 
@@ -25,8 +25,8 @@ class MaskTable:
         blank = torch.zeros(self.masks.height, self.masks.width, dtype=torch.bool)
         rest = blank
         for row in self.others[body]:
-            rest = rest | decode_mask(self.masks, row)
-        return (blank if own is None else decode_mask(self.masks, own)), rest
+            rest = rest | decode(self.masks, row)
+        return (blank if own is None else decode(self.masks, own)), rest
 
 
 def mask_table(people: People, bodies: Bodies) -> MaskTable:
@@ -45,11 +45,3 @@ def mask_table(people: People, bodies: Bodies) -> MaskTable:
         for (frame, _), mine in zip(keys, own, strict=True)
     )
     return MaskTable(people.masks, own, others)
-
-
-def decode_mask(masks: Masks, row: int) -> Bool[Tensor, "h w"]:
-    """One mask of a set."""
-    from pycocotools import mask as coco
-
-    image = coco.decode({"size": [masks.height, masks.width], "counts": masks.counts[row]})
-    return torch.from_numpy(np.ascontiguousarray(image).astype(bool))

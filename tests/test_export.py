@@ -1,0 +1,168 @@
+"""scene.glb: read back by another reader, everything stands where it stood."""
+
+import dataclasses
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from little_room import box, camera, piece, room, walkers
+from PIL import Image
+
+from mover.export import write_glb
+from mover.geometry.placement import place_piece
+from mover.types import Piece, Scene
+
+
+def placed(path: Path, name: str) -> trimesh.Trimesh:
+    """The mesh below a node, in the world."""
+    scene = trimesh.load_scene(path)
+    below = [
+        n for n in scene.graph.nodes_geometry if name in (n, scene.graph.transforms.parents[n])
+    ]
+    parts = []
+    for node in below:
+        transform, geometry = scene.graph[node]
+        parts.append(scene.geometry[geometry].copy().apply_transform(transform))
+    return trimesh.util.concatenate(parts)
+
+
+def tree_of(path: Path) -> dict[str, Any]:
+    raw = path.read_bytes()
+    return json.loads(raw[20 : 20 + struct.unpack("<I", raw[12:16])[0]])
+
+
+def with_file(file: Path) -> Piece:
+    given = piece("chair_0", box(0.5, 0.9, 0.5), (0.4, -3.0), 0.7, -1.5)
+    return dataclasses.replace(given, mesh_file=str(file), scale=torch.tensor([1.2, 0.8, 1.0]))
+
+
+def textured() -> trimesh.Trimesh:
+    shape = trimesh.creation.box(extents=(0.5, 0.9, 0.5))
+    picture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+    uv = np.random.default_rng(0).random((len(shape.vertices), 2))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+    shape.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return shape
+
+
+def test_objects_are_nodes_of_their_ids_where_they_stand(tmp_path: Path):
+    scene = room()
+    path = write_glb(scene, None, tmp_path / "scene.glb")
+    for given in scene.pieces:
+        truth = place_piece(given).verts.numpy()
+        assert placed(path, given.id).bounds == pytest.approx(
+            np.stack([truth.min(0), truth.max(0)]), abs=1e-5
+        )
+
+
+def test_a_node_holds_the_placement_and_its_mesh_keeps_its_own_frame(tmp_path: Path):
+    turned = dataclasses.replace(room().pieces[0], scale=torch.tensor([1.2, 0.8, 1.0]))
+    path = write_glb(Scene(camera(), None, (turned,)), None, tmp_path / "scene.glb")
+    node = next(n for n in tree_of(path)["nodes"] if n.get("name") == "chair_0")
+    matrix = np.array(node["matrix"]).reshape(4, 4).T
+    corner = np.array([0.25, 0.9, 0.25])
+    c, s = math.cos(float(turned.yaw)), math.sin(float(turned.yaw))
+    x, y, z = corner * [1.2, 0.8, 1.0]
+    by_hand = np.array([c * x + s * z, y, c * z - s * x]) + turned.t_world_object.numpy()
+    assert matrix[:3, :3] @ corner + matrix[:3, 3] == pytest.approx(by_hand, abs=1e-6)
+
+
+def test_textures_of_the_users_file_survive(tmp_path: Path):
+    file = tmp_path / "chair.glb"
+    textured().export(file)
+    scene = Scene(camera(), None, (with_file(file),))
+    path = write_glb(scene, None, tmp_path / "scene.glb")
+    image = placed(path, "chair_0").visual.material.baseColorTexture
+    assert np.array_equal(np.asarray(image.convert("RGB")).ravel(), np.arange(48))
+
+
+def test_transforms_inside_the_users_file_apply(tmp_path: Path):
+    inside = trimesh.Scene()
+    lift = trimesh.transformations.translation_matrix([0.0, 0.45, 0.0])
+    inside.add_geometry(trimesh.creation.box(extents=(0.5, 0.9, 0.5)), transform=lift)
+    seat = trimesh.transformations.translation_matrix([0.0, 1.0, 0.0])
+    inside.add_geometry(trimesh.creation.box(extents=(0.1, 0.2, 0.1)), transform=seat)
+    file = tmp_path / "chair.glb"
+    inside.export(file)
+    given = with_file(file)
+    path = write_glb(Scene(camera(), None, (given,)), None, tmp_path / "scene.glb")
+    found = placed(path, "chair_0")
+    assert found.bounds[:, 1] == pytest.approx([-1.5, -1.5 + 0.8 * 1.1], abs=1e-5)
+    assert found.volume == pytest.approx(1.2 * 0.8 * (0.5 * 0.9 * 0.5 + 0.1 * 0.2 * 0.1), rel=1e-4)
+
+
+def test_at_most_twelve_bodies_are_named_after_person_and_frame(tmp_path: Path):
+    bodies = walkers(40, people=2)
+    path = write_glb(room(), bodies, tmp_path / "scene.glb")
+    names = [n["name"] for n in tree_of(path)["nodes"] if n.get("name", "").startswith("body_")]
+    assert len(names) == 12
+    for name in names:
+        _, person, frame = name.split("_")
+        row = int(((bodies.person == int(person)) & (bodies.frame == int(frame))).nonzero())
+        truth = bodies.verts[row].numpy()
+        assert placed(path, name).bounds == pytest.approx(
+            np.stack([truth.min(0), truth.max(0)]), abs=1e-5
+        )
+
+
+def test_the_floor_is_level_under_everything_and_faces_up(tmp_path: Path):
+    scene = room()
+    floor = placed(write_glb(scene, None, tmp_path / "scene.glb"), "ground")
+    assert floor.bounds[:, 1] == pytest.approx([scene.ground, scene.ground])
+    assert np.allclose(floor.face_normals, [0, 1, 0])
+    stands = torch.cat([place_piece(p).verts for p in scene.pieces]).numpy()
+    assert (floor.bounds[0, [0, 2]] < stands.min(0)[[0, 2]]).all()
+    assert (floor.bounds[1, [0, 2]] > stands.max(0)[[0, 2]]).all()
+
+
+def test_the_camera_sees_the_same_pixels(tmp_path: Path):
+    scene = dataclasses.replace(room(), camera=camera(-0.3, 0.1))
+    tree = tree_of(write_glb(scene, None, tmp_path / "scene.glb"))
+    lens = tree["cameras"][0]["perspective"]
+    node = next(n for n in tree["nodes"] if "camera" in n)
+    to_world = np.array(node["matrix"]).reshape(4, 4).T
+    point = np.array([0.4, -0.8, -3.5])
+    x, y, z = to_world[:3, :3].T @ (point - to_world[:3, 3])  # glTF: looks along -z, +y up
+    focal = 1 / math.tan(lens["yfov"] / 2)
+    u = 320 * (1 + focal / lens["aspectRatio"] * x / -z)
+    v = 180 * (1 - focal * y / -z)
+    seen = (scene.camera.K @ scene.camera.R_cam_world @ torch.tensor(point).float()).numpy()
+    assert [u, v] == pytest.approx(seen[:2] / seen[2], abs=0.01)
+
+
+def test_names_that_clash_stay_apart(tmp_path: Path):
+    names = ("ground", "camera", "world", "body_0_0", "ground_mesh")
+    pieces = [piece(n, box(1, 1, 1), (i * 2.0, -3.0), 0.0, -1.5) for i, n in enumerate(names)]
+    path = write_glb(Scene(camera(), -1.5, tuple(pieces)), walkers(1), tmp_path / "scene.glb")
+    tree = tree_of(path)
+    assert len(tree["meshes"]) == len(names) + 2
+    assert len({n["name"] for n in tree["nodes"]}) == len(tree["nodes"])
+
+
+def test_normals_of_flattened_triangles_are_valid(tmp_path: Path):
+    shape = trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0.0]],
+        [[0, 1, 2], [3, 4, 5]],
+        process=False,
+    )
+    file = tmp_path / "flat.glb"
+    file.write_bytes(trimesh.exchange.gltf.export_glb(trimesh.Scene(shape), include_normals=True))
+    scene = Scene(camera(), None, (with_file(file),))
+    path = write_glb(scene, None, tmp_path / "scene.glb")
+    tree = tree_of(path)
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["NORMAL"]]
+    view = tree["bufferViews"][accessor["bufferView"]]
+    start = len(path.read_bytes()) - tree["buffers"][0]["byteLength"] + view.get("byteOffset", 0)
+    normals = np.frombuffer(path.read_bytes(), np.float32, 18, start).reshape(6, 3)
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(np.ones(6), abs=1e-3)
+
+
+def test_the_file_appears_all_at_once(tmp_path: Path):
+    write_glb(Scene(camera(), None, ()), None, tmp_path / "out" / "scene.glb")
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["scene.glb"]

@@ -1,0 +1,172 @@
+"""Depth of people from their masks: known bodies, drawn, moved away, and brought back."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from figures import ARMS_DOWN, AT_TABLE, SEATED, STRIDE, people, pose
+
+from mover.bodies import open_body
+from mover.bodies.parts import parts_of
+from mover.geometry.camera import tilted
+from mover.geometry.raster import Views, layers
+from mover.readers.masks import encode
+from mover.stages.find_depth import (
+    DepthConfig,
+    DepthFactors,
+    DepthInputs,
+    apply_depth,
+    find_depth,
+    pelvis,
+)
+from mover.types import Bodies, Camera, Masks, People
+
+SIZE = (360, 640)
+K = torch.tensor([[520.0, 0, 320], [0, 520, 180], [0, 0, 1]])
+CAMERA = Camera(K, tilted(torch.tensor(math.radians(-8)), torch.tensor(0.0)), SIZE[1], SIZE[0])
+QUICK = DepthConfig(every=1, factors=13, width=160)
+
+
+def film(spots, person=0, scale=1.0):
+    """Bodies in several poses at several places, in camera axes."""
+    turns = (ARMS_DOWN, SEATED, STRIDE, AT_TABLE)
+    verts = torch.cat([people(pose(turns[i % 4]), floor=-1.3).verts for i in range(len(spots))])
+    verts = verts + torch.tensor([[x, 0.0, z] for x, z in spots])[:, None]
+    rows = torch.arange(len(spots))
+    return Bodies(
+        verts=verts @ CAMERA.R_cam_world.mT * scale,
+        faces=open_body().faces,
+        joints=None,
+        joint_names=(),
+        frame=rows,
+        person=torch.full_like(rows, person),
+        fps=5.0,
+        space="camera",
+        pose=None,
+    )
+
+
+def spots(n=8, seed=0):
+    free = torch.rand(n, 2, generator=torch.Generator().manual_seed(seed))
+    return [(float(a) * 1.6 - 0.8, -3.2 - 1.5 * float(b)) for a, b in free]
+
+
+def masks_of(bodies, hidden=None, grow=0):
+    views = Views(K.expand(len(bodies.verts), 3, 3), *SIZE)
+    drawn = layers(bodies.verts, bodies.faces, views).front.isfinite()
+    if grow:
+        grown = torch.nn.functional.max_pool2d(grow * drawn.float(), 3, 1, 1)
+        drawn = grown > 0 if grow > 0 else grown < 0
+    if hidden is not None:
+        drawn = drawn & ~hidden
+    masks = Masks(*SIZE, tuple(encode(m) for m in drawn))
+    return People(masks, bodies.frame, bodies.person, {})
+
+
+def moved(bodies, factor):
+    return dataclasses.replace(bodies, verts=bodies.verts + (factor - 1) * pelvis(bodies)[:, None])
+
+
+def inputs_of(bodies, seen, objects=()):
+    keep = torch.ones(len(bodies.frame), dtype=torch.bool)
+    objects = Masks(*SIZE, tuple(encode(m) for m in objects))
+    return DepthInputs(bodies, parts_of(bodies), keep, seen, objects, CAMERA)
+
+
+def table():
+    """An object that hides the legs of most people."""
+    mask = torch.zeros(SIZE, dtype=torch.bool)
+    mask[250:, 200:380] = True
+    return mask
+
+
+@pytest.mark.parametrize("bias", [1.03, 0.975])
+def test_a_wrong_depth_is_found_though_objects_hide_legs(bias):
+    true = film(spots())
+    seen = masks_of(true, hidden=table())
+    found = find_depth(inputs_of(moved(true, bias), seen, [table()]), QUICK)
+    assert found.warnings == ()
+    assert float(found.factor[0]) == pytest.approx(1 / bias, abs=0.004)
+    back = apply_depth(moved(true, bias), found)
+    assert (pelvis(back) - pelvis(true)).norm(dim=-1).max() < 0.02
+
+
+def test_each_person_has_a_factor_of_its_own_and_true_bodies_stay():
+    one, two = film(spots(seed=1), 3), film(spots(seed=2), 5)
+    both = dataclasses.replace(
+        one,
+        verts=torch.cat([moved(one, 1.04).verts, two.verts]),
+        frame=torch.cat([one.frame, two.frame + 100]),
+        person=torch.cat([one.person, two.person]),
+    )
+    true = dataclasses.replace(both, verts=torch.cat([one.verts, two.verts]))
+    found = find_depth(inputs_of(both, masks_of(true)), QUICK)
+    assert found.person.tolist() == [3, 5]
+    assert torch.allclose(found.factor, torch.tensor([1 / 1.04, 1.0]), atol=0.004)
+    assert (found.spread < 0.01).all()
+
+
+@pytest.mark.parametrize("grow", [-1, 0, 1])
+def test_masks_that_are_too_wide_or_too_narrow_do_not_move_people(grow):
+    true = film(spots())
+    found = find_depth(inputs_of(moved(true, 1.02), masks_of(true, grow=grow)), QUICK)
+    assert float(found.factor[0]) == pytest.approx(1 / 1.02, abs=0.005)
+
+
+def test_few_or_cut_off_or_hidden_people_stay_where_they_are():
+    true = film(spots(3))
+    few = find_depth(inputs_of(moved(true, 1.03), masks_of(true)), QUICK)
+    near = film([(0.0, -1.0)] * 6)
+    cut = find_depth(inputs_of(near, masks_of(near)), QUICK)
+    wall = torch.ones(SIZE, dtype=torch.bool)
+    wall[:170] = False
+    many = film(spots())
+    hidden = find_depth(inputs_of(many, masks_of(many, hidden=wall), [wall]), QUICK)
+    for found in (few, cut, hidden):
+        assert found.factor.tolist() == [1.0]
+        assert found.spread.isinf().all()
+        assert "are seen well enough" in found.warnings[0]
+
+
+def test_a_track_without_masks_is_told():
+    true = film(spots())
+    seen = masks_of(true)
+    other = dataclasses.replace(seen, person=seen.person + 1)
+    found = find_depth(inputs_of(true, other), QUICK)
+    assert found.factor.tolist() == [1.0]
+    assert "only 0 bodies" in found.warnings[0]
+
+
+def test_a_known_height_scales_the_person_about_the_camera():
+    true = film(spots())
+    standing = true.verts[0] @ CAMERA.R_cam_world
+    height = float(standing[:, 1].max() - standing[:, 1].min())
+    seen = dataclasses.replace(masks_of(true), heights={"0": height})
+    small = dataclasses.replace(true, verts=true.verts * 0.94)
+    back = apply_depth(small, find_depth(inputs_of(small, seen), QUICK))
+    assert (back.verts - true.verts).norm(dim=-1).max() < 0.04
+    wrong = dataclasses.replace(seen, heights={"0": 0.6})
+    found = find_depth(inputs_of(small, wrong), QUICK)
+    assert found.size.tolist() == [1.0]
+    assert "height not used" in found.warnings[0]
+
+
+def test_pose_and_mesh_move_together():
+    model, base = open_body(), pose(STRIDE, 4)
+    base = dataclasses.replace(base, transl=torch.tensor([[0.1, 0.2, 3.0]]).repeat(4, 1))
+    verts, joints = model.posed(base)
+    bodies = dataclasses.replace(
+        film(spots(4)), verts=verts, joints=joints, joint_names=model.joint_names, pose=base,
+        person=torch.tensor([2, 2, 7, 8]),
+    )  # fmt: skip
+    one = torch.ones(2)
+    person, factor = torch.tensor([2, 7]), torch.tensor([1.05, 0.97])
+    result = apply_depth(bodies, DepthFactors(person, factor, 0.01 * one, one, ()))
+    assert result.pose is not None
+    assert result.joints is not None
+    again = model.posed(result.pose)
+    assert torch.allclose(again[0], result.verts, atol=1e-5)
+    assert torch.allclose(again[1], result.joints, atol=1e-5)
+    expected = joints[:, 0] * torch.tensor([1.05, 1.05, 0.97, 1.0])[:, None]
+    assert torch.allclose(result.joints[:, 0], expected, atol=1e-5)

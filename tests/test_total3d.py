@@ -1,0 +1,160 @@
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tiny_capture as tiny
+import torch
+from PIL import Image
+from scipy.io import savemat
+
+from mover.geometry.camera import pitch_roll, project, to_camera
+from mover.geometry.placement import place_piece
+from mover.readers import read, read_capture, write_capture
+from mover.records import InputError
+
+DATA = Path(__file__).parents[2] / "shared" / "data" / "total3d_1"
+PITCH, ROLL = -0.25, 0.06
+K = np.array([[50.0, 0, 31], [0, 50, 22], [0, 0, 1]])
+# Class, angle of the front about +y, centre and half sizes in Total3D's world (forward, up, right).
+BOXES: list[tuple[Any, ...]] = [
+    (5, 0.4, [3.0, -0.9, 0.5], [0.3, 0.5, 0.2]),
+    (1, 0.0, [6.0, 0.0, 0.0], [3.0, 2.0, 0.1]),
+    (25, 2.0, [4.0, -0.1, -1.0], [0.4, 0.3, 0.1]),
+]
+
+
+def attitude() -> np.ndarray:
+    """cam_R = R_y(0) R_z(pitch) R_x(roll)."""
+    c, s = math.cos(PITCH), math.sin(PITCH)
+    rz = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    c, s = math.cos(ROLL), math.sin(ROLL)
+    return rz @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def cell(angle: float, centre: list[float], half: list[float]) -> dict[str, Any]:
+    c, s = math.cos(angle), math.sin(angle)
+    basis = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]], dtype=np.float32)
+    return {"basis": basis, "coeffs": np.array([half], "f4"), "centroid": np.array([centre], "f4")}
+
+
+def write(folder: Path) -> Path:
+    source, result = folder / "input", folder / "output"
+    source.mkdir(parents=True)
+    result.mkdir()
+    Image.fromarray(tiny.picture()).save(source / "img.jpg")
+    np.savetxt(source / "cam_K.txt", K)
+    names = {1: "wall", 5: "chair", 25: "television"}
+    rows = [{"bbox": [5, 6, 20 + i, 30], "class": names[box[0]]} for i, box in enumerate(BOXES)]
+    (source / "detections.json").write_text(json.dumps(rows))
+    cells = np.empty((1, len(BOXES)), dtype=object)
+    for i, (_, *box) in enumerate(BOXES):
+        cells[0, i] = cell(*box)
+    savemat(result / "bdb_3d.mat", {"bdb": cells, "class_id": np.array([[b[0] for b in BOXES]])})
+    savemat(result / "r_ex.mat", {"cam_R": attitude()})
+    savemat(result / "layout.mat", {"layout": np.array([[0.0, 2.5, 0]] * 4 + [[0, -1.45, 0]] * 4)})
+    for i, box in enumerate(BOXES):
+        # One vertex that no face uses counts in the bounds that are stretched to the box.
+        lines = ["v " + " ".join(map(str, v)) for v in [*tiny.STEP.tolist(), [0.0, -0.5, 0.0]]]
+        lines += ["f " + " ".join(str(j + 1) for j in f) for f in tiny.STEP_FACES.tolist()]
+        (result / f"{i}_{box[0]}.obj").write_text("\n".join([*lines, "f 2 2 2", ""]))
+    return folder
+
+
+def test_a_vertex_lands_on_the_pixel_that_total3d_says(tmp_path: Path) -> None:
+    found = read("total3d", write(tmp_path / "room"))
+    assert [p.id for p in found.scene.pieces] == ["chair_0", "television_2"]
+    assert [p.support for p in found.scene.pieces] == ["ground", "free"]
+    assert found.scene.ground == pytest.approx(-1.45)
+    bounds = np.concatenate([tiny.STEP, [[0, -0.5, 0]]])
+    low, high = bounds.min(0), bounds.max(0)
+    for piece, box in zip(found.scene.pieces, (BOXES[0], BOXES[2]), strict=True):
+        parts = cell(*box[1:])
+        local = (tiny.STEP - (low + high) / 2) / ((high - low) / 2) * parts["coeffs"]
+        points = local @ parts["basis"] + parts["centroid"]  # rows, in Total3D's world
+        image = points @ attitude() @ np.array([[0, 0, 1], [0, -1, 0], [1, 0, 0]]).T @ K.T
+        camera = found.scene.camera
+        seen = project(to_camera(place_piece(piece).verts, camera.R_cam_world), camera.K)
+        assert np.allclose(seen.numpy(), image[:, :2] / image[:, 2:], atol=1e-3)
+        assert place_piece(piece).faces.tolist() == tiny.STEP_FACES.tolist()
+
+
+def test_the_camera_keeps_its_pitch_and_roll(tmp_path: Path) -> None:
+    camera = read("total3d", write(tmp_path / "room")).scene.camera
+    pitch, roll = pitch_roll(camera.R_cam_world)
+    assert (float(pitch), float(roll)) == pytest.approx((PITCH, ROLL), abs=1e-6)
+    assert float(camera.R_cam_world[2, 0]) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words"),
+    [
+        ("input/cam_K.txt", b"a b", "cam_K.txt"),
+        ("input/cam_K.txt", b"1 2 3\n4 5 6\n7 8 9", "intrinsics"),
+        ("input/detections.json", b"[]", "bdb_3d.mat: field 'class_id' has 3 boxes"),
+        ("input/detections.json", b'[{"class": "robot"}]', 'class\' has "robot"'),
+        ("input/img.jpg", b"", "img.jpg"),
+        ("output/bdb_3d.mat", b"junk", "bdb_3d.mat"),
+        ("output/r_ex.mat", b"", "r_ex.mat"),
+        ("output/0_5.obj", b"v 0 0 0\n", "0_5.obj"),
+        ("output/0_5.obj", b"v 0 a 0\nf 1 2 3\n", "0_5.obj"),
+        ("output/0_5.obj", b"v 0 0 0\nv 1 1 0\nv 1 0 0\nf 1 2 3\n", "a flat mesh"),
+        ("output/0_5.obj", b"v 0 0 0\nv 1 1 0\nv 1 0 1\nf 1 2 9\n", "vertices 0 to 8"),
+    ],
+)
+def test_a_broken_file_is_named(tmp_path: Path, file: str, content: bytes, words: str) -> None:
+    folder = write(tmp_path / "room")
+    (folder / file).write_bytes(content)
+    with pytest.raises(InputError, match=words) as caught:
+        read("total3d", folder)
+    assert "expected" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["input/cam_K.txt", "input/img.jpg", "output/layout.mat", "output/2_25.obj"]
+)
+def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
+    folder = write(tmp_path / "room")
+    (folder / name).unlink()
+    with pytest.raises(InputError, match=Path(name).name):
+        read("total3d", folder)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
+class TestRealOutput:
+    def test_its_meshes_lie_on_their_detections_as_loosely_as_known(self) -> None:
+        found = read("total3d", DATA)
+        camera, ious = found.scene.camera, []
+        assert [p.annotation for p in found.scene.pieces] == list(range(18))
+        for piece, detection in zip(found.scene.pieces, found.detections, strict=True):
+            verts = to_camera(place_piece(piece).verts, camera.R_cam_world)
+            seen = project(verts, camera.K)
+            low = torch.maximum(seen.amin(0), torch.zeros(2))
+            high = torch.minimum(seen.amax(0), torch.tensor([camera.width, camera.height]))
+            box = detection.box
+            common = torch.minimum(high, box[2:]) - torch.maximum(low, box[:2])
+            inner = common.clamp_min(0).prod()
+            union = (high - low).prod() + (box[2:] - box[:2]).prod() - inner
+            ious.append(float(inner / union))
+        assert min(ious[:8]) == pytest.approx(0.30, abs=0.01)
+        assert max(ious[:8]) == pytest.approx(0.90, abs=0.01)
+        assert sum(ious) / len(ious) > 0.6
+
+    def test_its_camera_looks_down_by_what_is_known(self) -> None:
+        pitch, roll = pitch_roll(read("total3d", DATA).scene.camera.R_cam_world)
+        assert math.degrees(pitch) == pytest.approx(-16.75, abs=0.01)
+        assert math.degrees(roll) == pytest.approx(2.76, abs=0.01)
+
+    def test_it_survives_as_a_capture_folder_with_its_meshes_untouched(
+        self, tmp_path: Path
+    ) -> None:
+        first = read("total3d", DATA)
+        write_capture(first, tmp_path)
+        second = read_capture(tmp_path)
+        copy = tmp_path / "meshes" / "chair_10.obj"
+        assert copy.read_bytes() == (DATA / "output" / "10_5.obj").read_bytes()
+        for a, b in zip(first.scene.pieces, second.scene.pieces, strict=True):
+            assert torch.allclose(place_piece(a).verts, place_piece(b).verts, atol=1e-5)
+            assert torch.equal(a.mesh.faces, b.mesh.faces)

@@ -1,0 +1,293 @@
+"""The volume of all bodies: signs, distances, and lookups."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from mover.geometry.mesh import is_closed
+from mover.geometry.nearest import nearest_points, to_surface
+from mover.geometry.rotations import axis_angle
+from mover.geometry.volume import (
+    Volume,
+    grid_around,
+    sample,
+    signed_distance,
+    union_bodies,
+    winding,
+)
+
+BODY = Path(__file__).parents[2] / "shared" / "prototypes" / "body" / "body_10kf.npz"
+
+
+def sphere(center: list[float], radius: float, level: int = 4) -> tuple[Tensor, Tensor]:
+    shape = trimesh.creation.icosphere(level)
+    verts = torch.from_numpy(shape.vertices.copy()).float() * radius + torch.tensor(center)
+    return verts, torch.from_numpy(shape.faces.copy())
+
+
+def naive_winding(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Solid angles of all triangles over 4 pi (Van Oosterom and Strackee)."""
+    total = np.zeros(len(points))
+    for row in range(0, len(points), 200):
+        corners = verts[faces][None] - points[row : row + 200, None, None]
+        length = np.linalg.norm(corners, axis=-1)
+        a, b, c = np.moveaxis(corners, 2, 0)
+        triple = (np.cross(a, b) * c).sum(-1)
+        below = length.prod(-1) + (a * b).sum(-1) * length[..., 2]
+        below += (b * c).sum(-1) * length[..., 0] + (c * a).sum(-1) * length[..., 1]
+        total[row : row + 200] = np.arctan2(triple, below).sum(-1) / (2 * np.pi)
+    return total
+
+
+def centers(grid: Volume) -> Tensor:
+    at = torch.cartesian_prod(*[torch.arange(n) for n in grid.values.shape])
+    return at * grid.cell + grid.origin
+
+
+def test_a_sphere_has_its_analytic_distance_inside_and_near():
+    verts, faces = sphere([0.3, -0.2, 1.0], 0.4, level=5)
+    grid = grid_around(verts.amin(0), verts.amax(0), cells=60)
+    found = union_bodies(verts[None], faces, grid).values.flatten()
+    expected = (centers(grid) - torch.tensor([0.3, -0.2, 1.0])).norm(dim=-1) - 0.4
+    exact = expected < 1.99 * grid.cell
+    torch.testing.assert_close(found[exact], expected[exact], rtol=0, atol=4e-4)
+    assert ((found < 0) == (expected < 0)).float().mean() > 0.999
+    assert (found[~exact] > 1.9 * grid.cell).all()
+
+
+def test_two_spheres_that_overlap_in_one_mesh_are_inside_everywhere():
+    one, faces = sphere([0.0, 0, 0], 0.5)
+    two, _ = sphere([0.4, 0.1, 0], 0.4)
+    verts, both = torch.cat([one, two]), torch.cat([faces, faces + len(one)])
+    grid = grid_around(verts.amin(0), verts.amax(0), cells=48)
+    values = union_bodies(verts[None], both, grid).values.flatten()
+    place = centers(grid)
+    deep = torch.minimum(
+        place.norm(dim=-1) - 0.5, (place - torch.tensor([0.4, 0.1, 0])).norm(dim=-1) - 0.4
+    )
+    assert (values[deep < -0.005] < 0).all()
+    assert (values[deep > 0.005] > 0).all()
+
+
+def test_columns_through_edges_and_vertices_count_once():
+    shape = trimesh.creation.box((4, 4, 4)).subdivide()  # every edge lies on integer columns
+    verts = shape.vertices + 4.0
+    found = winding(verts, shape.faces, np.array([9, 9, 9]))
+    inside = np.zeros((9, 9, 9), dtype=int)
+    assert set(np.unique(found)) == {0, 1}
+    inside[3:6, 3:6, 3:6] = 1  # strictly inside; on the walls either answer is right
+    assert (found[3:6, 3:6, 3:6] == 1).all()
+    strictly_out = np.ones((9, 9, 9), dtype=bool)
+    strictly_out[2:7, 2:7, 2:7] = False
+    assert (found[strictly_out] == 0).all()
+    assert found.sum() == 64  # the rule gives each column and each layer to one side
+
+
+def test_winding_counts_layers_and_holes():
+    outer = trimesh.creation.icosphere(3, radius=7.3)
+    inner = trimesh.creation.icosphere(3, radius=4.1)
+    for turn, value in ((inner.faces, 2), (inner.faces[:, ::-1], 0)):
+        verts = np.vstack([outer.vertices, inner.vertices]) + np.array([10.1, 9.9, 10.3])
+        faces = np.vstack([outer.faces, turn + len(outer.vertices)])
+        found = winding(verts, faces, np.array([20, 20, 20]))
+        assert found[10, 10, 10] == value
+        assert found[10, 4, 10] == 1
+        assert found[10, 1, 10] == 0
+
+
+def posed_bodies(count: int) -> tuple[Tensor, Tensor]:
+    """The prototype's body with bent and twisted limbs (skinned by its weights), or capsules."""
+    generator = torch.Generator().manual_seed(0)
+    if not BODY.exists():
+        shape = trimesh.creation.capsule(1.0, 0.25, count=[24, 24])
+        arm = trimesh.creation.capsule(0.8, 0.12, count=[24, 24])
+        both = np.vstack([shape.vertices, arm.vertices + np.array([0.1, 0, 0.3])])
+        faces = np.vstack([shape.faces, arm.faces + len(shape.vertices)])
+        turns = axis_angle(torch.randn(count, 3, generator=generator))
+        return torch.from_numpy(both).float() @ turns.mT, torch.from_numpy(faces)
+    with np.load(BODY) as data:
+        rest = torch.from_numpy(data["v_template"])
+        joints, parents = torch.from_numpy(data["joints"]), data["parents"]
+        weights = torch.zeros(len(rest), 55)
+        index = torch.from_numpy(data["weight_idx"].astype(np.int64))
+        weights.scatter_add_(1, index, torch.from_numpy(data["weights"].astype(np.float32)))
+        faces = torch.from_numpy(data["faces"].astype(np.int64))
+    angles = torch.zeros(count, 55, 3)
+    angles[:, :22] = 0.3 * torch.randn(count, 22, 3, generator=generator)
+    turns, world, place = axis_angle(angles), [], []
+    for joint, parent in enumerate(parents.tolist()):
+        if parent < 0:
+            world.append(turns[:, joint])
+            place.append(joints[joint].expand(count, 3))
+        else:
+            world.append(world[parent] @ turns[:, joint])
+            bone = joints[joint] - joints[parent]
+            place.append(place[parent] + (world[parent] @ bone))
+    moved = [
+        r @ (rest - joints[j]).T + p[..., None]
+        for j, (r, p) in enumerate(zip(world, place, strict=True))
+    ]
+    return torch.einsum("vj,jbiv->bvi", weights, torch.stack(moved)), faces
+
+
+def test_ten_posed_bodies_agree_with_exact_distances_and_signs():
+    verts, faces = posed_bodies(10)
+    assert is_closed(faces)
+    apart = verts - verts.mean(1, keepdim=True)
+    cell, wrong, total = 0.0, 0, 0
+    for body in apart:
+        grid = grid_around(body.amin(0), body.amax(0), cells=96, padding=0.1)
+        values, place = union_bodies(body[None], faces, grid).values.flatten(), centers(grid)
+        near = values < 3.9 * grid.cell
+        exact = signed_distance(place[near], body, faces)
+        inside = exact < 0
+        wrong += int(((values[near] < 0) != inside).sum())
+        total += len(exact)
+        cell = max(cell, grid.cell)
+        close = exact.abs() < 0.03
+        assert (values[near][close].abs() - exact[close].abs()).abs().max() < 1e-5
+        rest = place[~near]
+        assert to_surface(rest, body, faces).min() > 1.9 * grid.cell
+    assert cell < 0.03
+    assert wrong <= 1e-3 * total
+
+
+def test_signs_are_those_of_naive_solid_angles():
+    verts, faces = posed_bodies(1)
+    grid = grid_around(verts[0].amin(0), verts[0].amax(0), cells=40, padding=0.1)
+    values, place = union_bodies(verts, faces, grid).values.flatten(), centers(grid)
+    near = torch.nonzero(values < 3.9 * grid.cell)[::9, 0]
+    naive = naive_winding(place[near].double().numpy(), verts[0].double().numpy(), faces.numpy())
+    assert ((naive > 0.5) == (values[near] < 0).numpy()).mean() >= 0.999
+    oracle = signed_distance(place[near], verts[0], faces)
+    assert ((naive > 0.5) == (oracle < 0).numpy()).mean() >= 0.999
+
+
+def moving_spheres(count: int) -> tuple[Tensor, Tensor]:
+    verts, faces = sphere([0, 0, 0], 0.3, level=2)
+    steps = torch.linspace(0, 1, count)[:, None, None] * torch.tensor([1.0, 0.2, 0.5])
+    return verts + steps, faces
+
+
+def test_the_union_does_not_depend_on_workers_order_or_batches():
+    verts, faces = moving_spheres(12)
+    grid = grid_around(verts.amin((0, 1)), verts.amax((0, 1)), cells=50)
+    first = union_bodies(verts, faces, grid, workers=1).values
+    assert torch.equal(first, union_bodies(verts, faces, grid, workers=4).values)
+    assert torch.equal(first, union_bodies(verts.flip(0), faces, grid).values)
+    half = union_bodies(verts[:5], faces, grid)
+    assert torch.equal(first, union_bodies(verts[5:], faces, half).values)
+    assert grid.values.min() > 0  # the input is untouched
+    alone = [union_bodies(one[None], faces, grid).values for one in verts]
+    assert torch.equal(first, torch.stack(alone).amin(0))
+
+
+def test_progress_is_told_for_each_body():
+    verts, faces = moving_spheres(5)
+    seen = []
+    grid = grid_around(verts.amin((0, 1)), verts.amax((0, 1)), cells=20)
+    union_bodies(verts, faces, grid, observe=lambda done, of: seen.append((done, of)))
+    assert seen == [(k, 5) for k in range(1, 6)]
+
+
+def test_inside_out_bodies_are_bodies():
+    verts, faces = moving_spheres(3)
+    grid = grid_around(verts.amin((0, 1)), verts.amax((0, 1)), cells=40)
+    mirrored = union_bodies(verts, faces.flip(-1), grid)
+    assert torch.equal(mirrored.values, union_bodies(verts, faces, grid).values)
+    assert signed_distance(verts[0, :1] * 0, verts[0], faces.flip(-1)) < 0
+
+
+def test_bodies_that_leave_the_grid_are_cut_off():
+    verts, faces = sphere([0, 0, 0], 0.5)
+    whole = grid_around(verts.amin(0), verts.amax(0), cells=40, padding=0.2)
+    part = Volume(
+        whole.values[10:25, 18:39, :13],
+        whole.origin + whole.cell * torch.tensor([10.0, 18, 0]),
+        whole.cell,
+    )
+    cut = union_bodies(verts[None], faces, part).values
+    torch.testing.assert_close(
+        cut, union_bodies(verts[None], faces, whole).values[10:25, 18:39, :13], rtol=0, atol=1e-6
+    )
+    away = union_bodies(verts[None] + 9, faces, part)
+    assert torch.equal(away.values, part.values)
+
+
+def test_vertices_that_are_not_finite_are_refused():
+    verts, faces = moving_spheres(2)
+    grid = grid_around(verts.amin((0, 1)), verts.amax((0, 1)), cells=20)
+    verts[1, 3] = torch.nan
+    with pytest.raises(ValueError, match="body 1"):
+        union_bodies(verts, faces, grid)
+
+
+def test_a_grid_holds_its_box_with_cubic_cells():
+    low, high = torch.tensor([0.0, -1.0, 2.0]), torch.tensor([3.0, 1.0, 2.5])
+    grid = grid_around(low, high, cells=64, padding=0.2)
+    assert grid.cell == pytest.approx(3.4 / 64)
+    assert grid.values.shape[0] == 64
+    ends = grid.origin + grid.cell * (torch.tensor(grid.values.shape) - 1)
+    assert (grid.origin - grid.cell / 2 <= low - 0.2 + 1e-5).all()
+    assert (ends + grid.cell / 2 >= high + 0.2 - 1e-5).all()
+    assert grid.values.min() > 0
+    with pytest.raises(ValueError, match="cells"):
+        grid_around(high, low)
+
+
+def linear_field() -> Volume:
+    slope = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    at = torch.cartesian_prod(*[torch.arange(n) for n in (5, 6, 7)]).double()
+    values = ((at * 0.1 + 1) * slope).sum(-1).reshape(5, 6, 7)
+    return Volume(values, torch.ones(3, dtype=torch.float64), 0.1)
+
+
+def test_a_linear_field_is_reproduced_between_cell_centres():
+    volume = linear_field()
+    size = torch.tensor([0.4, 0.5, 0.6], dtype=torch.float64)
+    points = 1 + size * torch.rand(
+        4, 9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    expected = points @ torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    torch.testing.assert_close(sample(volume, points), expected)
+    corner = sample(volume, volume.origin + 0.1 * torch.tensor([[2.0, 3, 4]]).double())
+    torch.testing.assert_close(corner, volume.values[2, 3, 4][None])
+
+
+def test_lookup_has_the_gradient_of_finite_differences():
+    generator = torch.Generator().manual_seed(1)
+    field = Volume(torch.randn(5, 6, 7, generator=generator).double(), torch.zeros(3), 0.1)
+    points = 0.1 + 0.2 * torch.rand(8, 3, generator=generator, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda x: sample(field, x), points.requires_grad_())
+
+
+def test_outside_of_the_grid_nothing_is_inside_and_nothing_pulls():
+    field = Volume(torch.full((4, 4, 4), -1.0), torch.zeros(3), 0.1)
+    points = torch.tensor(
+        [[0.15, 0.15, 0.15], [0.15, 0.15, 0.31], [-5.0, 0.1, 9.0]], requires_grad=True
+    )
+    values = sample(field, points)
+    values.sum().backward()
+    assert values.tolist() == [-1.0, 0.0, 0.0]
+    assert torch.equal(points.grad, torch.zeros(3, 3))
+
+
+def test_nearest_points_and_distances_are_those_of_naive_loops():
+    generator = torch.Generator().manual_seed(2)
+    query, points = torch.rand(40, 3, generator=generator), torch.rand(60, 3, generator=generator)
+    distance, index = nearest_points(query, points)
+    naive = torch.cdist(query, points)
+    assert torch.equal(index, naive.argmin(1))
+    torch.testing.assert_close(distance, naive.amin(1), rtol=0, atol=1e-4)
+    verts, faces = sphere([0.0, 0.0, 0.0], 1.0, level=5)
+    found = to_surface(query * 3, verts, faces)
+    torch.testing.assert_close(found, (query.norm(dim=-1) * 3 - 1).abs(), rtol=0, atol=2e-3)
+    assert to_surface(query[:0], verts, faces).shape == (0,)
+    with pytest.raises(ValueError, match="empty"):
+        nearest_points(query, points[:0])
+    with pytest.raises(ValueError, match="empty"):
+        to_surface(query, verts, faces[:0])
