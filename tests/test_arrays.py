@@ -1,3 +1,7 @@
+import json
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import tiny_capture as tiny
@@ -13,22 +17,31 @@ STEP = {"vertices": tiny.STEP, "faces": tiny.STEP_FACES}
 
 def chair(**changes: object) -> ObjectArrays:
     place = {"translation": (-0.9, -1.4, -3.0), "yaw": 0.4, "scale": (0.5, 0.9, 0.6)}
-    given = {**STEP, **place, "mask": tiny.object_mask(0), "score": 0.75, **changes}
+    given: dict[str, Any] = {**STEP, **place, "mask": tiny.object_mask(0), "score": 0.75, **changes}
     return ObjectArrays("chair_0", "chair", **given)
 
 
 def lamp(**changes: object) -> ObjectArrays:
-    mesh = {"vertices": tiny.STEP / 2 + [0.1, 0.2, 0.3], "faces": torch.from_numpy(tiny.STEP_FACES)}
-    place = {"translation": np.array([0.8, -0.5, -3.2]), "yaw": np.float32(-2.9)}
+    mesh: dict[str, Any] = {
+        "vertices": tiny.STEP / 2 + [0.1, 0.2, 0.3],
+        "faces": torch.from_numpy(tiny.STEP_FACES),
+    }
+    place: dict[str, Any] = {"translation": np.array([0.8, -0.5, -3.2]), "yaw": np.float32(-2.9)}
     box, mask = (40.5, 10, 59.75, 30), tiny.object_mask(1)
-    given = {"scale": [1.0, 1.1, 1.2], "support": "chair_0", "mask": mask, "box": box, **changes}
+    given: dict[str, Any] = {
+        "scale": [1.0, 1.1, 1.2],
+        "support": "chair_0",
+        "mask": mask,
+        "box": box,
+        **changes,
+    }
     return ObjectArrays("Lampe_ä.2", "Stehlampe", **mesh, **place, **given)
 
 
 def make(**changes: object) -> Capture:
     masks = np.stack([tiny.person_mask(i) for i in range(3)])
     people = PeopleArrays(masks, [0, 0, 3], [0, 7, 0], {"0": 1.78}, tiny.person_mask(2)[None])
-    given = {
+    given: dict[str, Any] = {
         "camera": tiny.camera(height=1.45), "objects": [chair(), lamp()], "people": people,
         "bodies": {**tiny.bodies(), "fps": 5.0, "probability": tiny.touch()},
         "image": tiny.picture(), **changes,
@@ -36,15 +49,13 @@ def make(**changes: object) -> Capture:
     return capture_from_arrays(given.pop("camera"), given.pop("objects"), **given)
 
 
-def test_arrays_give_the_same_capture_as_the_folder(tmp_path) -> None:
+def test_arrays_give_the_same_capture_as_the_folder(tmp_path: Path) -> None:
     folder = tiny.write_capture(tmp_path / "tiny")
     # What arrays cannot say the same way: where the ground is, and numbers of annotations.
     scene, objects = tiny.scene(), tiny.objects()
     del scene["ground"]
     for i in range(2):
         scene["objects"][i]["annotation"] = objects["annotations"][i]["id"] = i
-    import json
-
     (folder / "scene.json").write_text(json.dumps(scene))
     (folder / "objects.json").write_text(json.dumps(objects))
     close(read_capture(folder), make())
@@ -72,7 +83,7 @@ def test_arrays_give_the_same_capture_as_the_folder(tmp_path) -> None:
         ({"bodies": {**tiny.bodies(), "faces": tiny.BODY_FACES + 9}}, "bodies.faces"),
     ],
 )
-def test_the_checks_are_those_of_the_folder(change: dict, words: str) -> None:
+def test_the_checks_are_those_of_the_folder(change: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words) as caught:
         make(**change)
     assert str(caught.value).startswith("arrays: field")

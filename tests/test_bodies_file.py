@@ -112,9 +112,7 @@ def test_meshes_of_another_topology_with_parameters_are_refined_rigidly(tmp_path
         ({"left_hand_pose": np.zeros(45)}, "'left_hand_pose' has shape"),
     ],
 )
-def test_wrong_parameters_are_named(
-    tmp_path: Path, change: dict[str, Any], words: str
-) -> None:
+def test_wrong_parameters_are_named(tmp_path: Path, change: dict[str, Any], words: str) -> None:
     path = save(tmp_path, **rows(), **{**parameters(), **change})
     with pytest.raises(InputError, match=words) as caught:
         read_bodies(path)

@@ -15,7 +15,7 @@ def as_solid(box: Box, index: int) -> manifold3d.Manifold:
     turn = np.zeros((3, 4))
     turn[:, :3] = rot_y(box.yaw[index]).numpy()
     turn[:, 3] = box.center[index].numpy()
-    return manifold3d.Manifold.cube(box.size[index].tolist(), True).transform(turn)
+    return manifold3d.Manifold.cube(box.size[index].tolist(), True).transform(turn)  # pyright: ignore[reportArgumentType]
 
 
 def by_manifold(a: Box, b: Box, index: int) -> float:
@@ -63,7 +63,9 @@ def boxes_at(center: list[float], size: list[float], yaw: float) -> Box:
         pytest.param([0, 0, 0], [1, 1, 1], np.pi / 4, 2**0.5 / 2, id="octagon"),
     ],
 )
-def test_iou_of_special_pairs_is_exact(yaw, center, size, other, expected):
+def test_iou_of_special_pairs_is_exact(
+    yaw: float, center: list[float], size: list[float], other: float, expected: float
+):
     a = boxes_at([1.0, 2.0, -3.0], [1, 1, 1], yaw)
     moved = rot_y(a.yaw)[0] @ torch.tensor(center, dtype=torch.float64) + a.center[0]
     b = boxes_at(moved.tolist(), size, yaw + other)

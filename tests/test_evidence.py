@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,12 @@ def room(hide: bool) -> Capture:
     masks = np.stack([disc(-1.5), disc(0.0) & (~left if hide else True)])
     other = np.zeros_like(left)
     other[:5, :5] = True
-    step = {"vertices": tiny.STEP, "faces": tiny.STEP_FACES, "translation": (0, 0, -3), "yaw": 0}
+    step: dict[str, Any] = {
+        "vertices": tiny.STEP,
+        "faces": tiny.STEP_FACES,
+        "translation": (0, 0, -3),
+        "yaw": 0,
+    }
     return capture_from_arrays(
         CAMERA,
         [

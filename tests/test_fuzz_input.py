@@ -54,7 +54,8 @@ NAMES = (
     "gender", "betas", "body_pose", "global_orient", "transl", "left_hand_pose", "expression",
 )  # fmt: skip
 FILES = ("bodies.npz", "contacts.npz", "meshes/lamp.glb", "meshes/step.obj", "room.png")
-FUZZ = settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+SLOW = (HealthCheck.too_slow, HealthCheck.function_scoped_fixture)
+FUZZ = settings(max_examples=300, deadline=None, suppress_health_check=SLOW)
 
 
 @pytest.fixture(scope="module")

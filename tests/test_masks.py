@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,19 +25,20 @@ def corners(box: np.ndarray) -> list[float]:
     return [box[0], box[1], box[0] + box[2], box[1] + box[3]]
 
 
-def image_of(code: bytes, shape: tuple[int, int]) -> np.ndarray:
-    return decode(Masks(*shape, (code,)), 0).numpy()
+def image_of(code: bytes, shape: Any) -> np.ndarray:
+    return decode(Masks(shape[0], shape[1], (code,)), 0).numpy()
 
 
 @given(MASKS)
 def test_both_codes_and_the_encoder_give_the_mask_back(mask: np.ndarray) -> None:
     counts = runs(mask)
-    size = list(mask.shape)
+    height, width = mask.shape
+    size = [height, width]
     for written in (counts, compressed(counts), compressed(counts).encode()):
-        code = from_coco({"size": size, "counts": written}, *mask.shape, WHERE)
+        code = from_coco({"size": size, "counts": written}, height, width, WHERE)
         assert (image_of(code, mask.shape) == mask).all()
     assert (image_of(encode(torch.from_numpy(mask)), mask.shape) == mask).all()
-    assert area(Masks(*mask.shape, (encode(torch.from_numpy(mask)),)), 0) == mask.sum()
+    assert area(Masks(height, width, (encode(torch.from_numpy(mask)),)), 0) == mask.sum()
 
 
 @given(st.lists(st.integers(0, 10**7), min_size=1, max_size=40))
@@ -113,7 +115,9 @@ class TestRealFiles:
         rows = json.loads(file.read_text())
         for row in rows[::40]:
             code = row["segmentation"]
-            found = image_of(from_coco(code, *code["size"], WHERE), tuple(code["size"]))
+            found = image_of(
+                from_coco(code, code["size"][0], code["size"][1], WHERE), tuple(code["size"])
+            )
             assert found.sum() == coco.area(code)
             assert tight_box(torch.from_numpy(found)).tolist() == corners(coco.toBbox(code))
             assert run_lengths(code["counts"].encode()).tolist() == runs(found)
@@ -123,6 +127,6 @@ class TestRealFiles:
         codes = [code for frame in tree["masklet"][:3] for code in frame]
         assert codes
         for code in codes:
-            encoded = from_coco(code, *code["size"], WHERE)
+            encoded = from_coco(code, code["size"][0], code["size"][1], WHERE)
             found = image_of(encoded, tuple(code["size"]))
             assert found.sum() == coco.area(code)

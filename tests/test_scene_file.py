@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tiny_capture as tiny
@@ -73,7 +74,8 @@ def test_the_buffer_of_a_gltf_goes_with_it(tmp_path: Path) -> None:
     import trimesh
 
     body = trimesh.Trimesh(tiny.STEP, tiny.STEP_FACES, process=False)
-    for name, content in trimesh.Scene(body).export(file_type="gltf").items():
+    files: Any = trimesh.Scene(body).export(file_type="gltf")
+    for name, content in files.items():
         (tmp_path / name).write_bytes(content)
     write_scene(
         Scene(CAMERA, None, (piece("a", str(tmp_path / "model.gltf")),)), tmp_path / "o" / "s.json"

@@ -17,8 +17,8 @@ from mover.geometry.volume import (
     sample,
     signed_distance,
     union_bodies,
-    winding,
 )
+from mover.geometry.voxels import winding
 
 BODY = Path(__file__).parents[2] / "shared" / "prototypes" / "body" / "body_10kf.npz"
 
@@ -53,7 +53,7 @@ def test_a_sphere_has_its_analytic_distance_inside_and_near():
     grid = grid_around(verts.amin(0), verts.amax(0), cells=60)
     found = union_bodies(verts[None], faces, grid).values.flatten()
     expected = (centers(grid) - torch.tensor([0.3, -0.2, 1.0])).norm(dim=-1) - 0.4
-    exact = expected < 1.99 * grid.cell
+    exact = expected < 1.97 * grid.cell
     torch.testing.assert_close(found[exact], expected[exact], rtol=0, atol=4e-4)
     assert ((found < 0) == (expected < 0)).float().mean() > 0.999
     assert (found[~exact] > 1.9 * grid.cell).all()
@@ -137,22 +137,20 @@ def posed_bodies(count: int) -> tuple[Tensor, Tensor]:
 def test_ten_posed_bodies_agree_with_exact_distances_and_signs():
     verts, faces = posed_bodies(10)
     assert is_closed(faces)
-    apart = verts - verts.mean(1, keepdim=True)
-    cell, wrong, total = 0.0, 0, 0
-    for body in apart:
-        grid = grid_around(body.amin(0), body.amax(0), cells=96, padding=0.1)
+    wrong, total = 0, 0
+    for body in verts:
+        grid = grid_around(body.amin(0), body.amax(0), cells=64, padding=0.1)
+        assert 0.015 < grid.cell < 0.04
         values, place = union_bodies(body[None], faces, grid).values.flatten(), centers(grid)
-        near = values < 3.9 * grid.cell
-        exact = signed_distance(place[near], body, faces)
-        inside = exact < 0
-        wrong += int(((values[near] < 0) != inside).sum())
+        near = values <= 2 * grid.cell
+        exact = signed_distance(place[near][::2], body, faces)
+        found = values[near][::2]
+        assert (found.abs() - exact.abs()).abs().max() < 1e-5
+        wrong += int(((found < 0) != (exact < 0)).sum())
         total += len(exact)
-        cell = max(cell, grid.cell)
-        close = exact.abs() < 0.03
-        assert (values[near][close].abs() - exact[close].abs()).abs().max() < 1e-5
-        rest = place[~near]
-        assert to_surface(rest, body, faces).min() > 1.9 * grid.cell
-    assert cell < 0.03
+        assert to_surface(place[~near][::13], body, faces).min() > 1.999 * grid.cell
+        assert torch.equal(values[~near].unique(), grid.values.unique())
+    assert total > 50_000
     assert wrong <= 1e-3 * total
 
 
@@ -160,7 +158,7 @@ def test_signs_are_those_of_naive_solid_angles():
     verts, faces = posed_bodies(1)
     grid = grid_around(verts[0].amin(0), verts[0].amax(0), cells=40, padding=0.1)
     values, place = union_bodies(verts, faces, grid).values.flatten(), centers(grid)
-    near = torch.nonzero(values < 3.9 * grid.cell)[::9, 0]
+    near = torch.nonzero(values <= 2 * grid.cell)[::23, 0]
     naive = naive_winding(place[near].double().numpy(), verts[0].double().numpy(), faces.numpy())
     assert ((naive > 0.5) == (values[near] < 0).numpy()).mean() >= 0.999
     oracle = signed_distance(place[near], verts[0], faces)
@@ -273,6 +271,7 @@ def test_outside_of_the_grid_nothing_is_inside_and_nothing_pulls():
     values = sample(field, points)
     values.sum().backward()
     assert values.tolist() == [-1.0, 0.0, 0.0]
+    assert points.grad is not None
     assert torch.equal(points.grad, torch.zeros(3, 3))
 
 

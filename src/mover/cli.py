@@ -9,6 +9,7 @@ COMMANDS = {
     "check": "Validate a capture, list the evidence of each object, draw the initial overlay.",
     "run": "Reconstruct a room from a capture folder.",
     "evaluate": "Compare a result with the truth.",
+    "experiment": "Rebuild known rooms with each preset and compare them with the truth.",
 }
 USAGE = "usage: mover COMMAND [OPTIONS]; mover COMMAND --help tells more"
 

@@ -185,8 +185,23 @@ def _demo(arguments: Sequence[str]) -> None:
     _say(f"\n{table(metrics)}\n\nreport: {report}")
 
 
+def _experiment(arguments: Sequence[str]) -> None:
+    from .experiments import ExperimentArgs, run_experiment
+
+    args = tyro.cli(ExperimentArgs, prog="mover experiment", args=list(arguments))
+    with Bar() as bar:
+        summary = run_experiment(args, bar)
+    _say(f"{summary.read_text()}\nsummary: {summary}")
+
+
 def _say(text: str, stream: Any = None) -> None:  # noqa: ANN401
     (stream or sys.stdout).write(text + "\n")
 
 
-_COMMANDS = {"demo": _demo, "check": _check, "run": _run, "evaluate": _evaluate}
+_COMMANDS = {
+    "demo": _demo,
+    "check": _check,
+    "run": _run,
+    "evaluate": _evaluate,
+    "experiment": _experiment,
+}

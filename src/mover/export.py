@@ -40,7 +40,7 @@ def write_glb(scene: Scene, bodies: Bodies | None, path: Path) -> Path:
     for index, piece in enumerate(scene.pieces):
         _add_piece(out, piece, colour(index))
     if scene.ground is not None:
-        floor = _solid(_floor(scene, scene.ground), (*FLOOR_COLOUR, 1.0), "ground")
+        floor = _solid(floor_of(scene, scene.ground), (*FLOOR_COLOUR, 1.0), "ground")
         name = _free(out, "ground")
         out.add_geometry(floor, node_name=name, geom_name=name)
     if bodies is not None:
@@ -63,15 +63,15 @@ def _free(out: Any, name: str) -> str:  # noqa: ANN401
 def _add_piece(out: Any, piece: Piece, tint: Colour) -> None:  # noqa: ANN401
     """A node with the piece's id, and the meshes of its file below it."""
     above = _free(out, piece.id)
-    out.graph.update(frame_to=above, frame_from=out.graph.base_frame, matrix=_placement(piece))
-    for part, transform in _parts(piece, tint):
+    out.graph.update(frame_to=above, frame_from=out.graph.base_frame, matrix=placement_of(piece))
+    for part, transform in parts_of(piece, tint):
         name = _free(out, f"{above}_mesh")
         out.add_geometry(
             part, node_name=name, geom_name=name, parent_node_name=above, transform=transform
         )
 
 
-def _placement(piece: Piece) -> np.ndarray:
+def placement_of(piece: Piece) -> np.ndarray:
     """Matrix of scale, then rotation about +y, then translation: glTF's order."""
     matrix = np.eye(4)
     turn = rot_y(piece.yaw.detach().cpu().double()).numpy()
@@ -80,7 +80,7 @@ def _placement(piece: Piece) -> np.ndarray:
     return matrix
 
 
-def _parts(piece: Piece, tint: Colour) -> list[tuple[Any, np.ndarray]]:
+def parts_of(piece: Piece, tint: Colour) -> list[tuple[Any, np.ndarray]]:
     """Meshes of the user's file with their places in it; without a file, the mesh that is known."""
     import trimesh
 
@@ -108,25 +108,30 @@ def _finished(part: Any, tint: Colour, name: str) -> Any:  # noqa: ANN401
     if isinstance(part.visual, ColorVisuals) and not part.visual.defined:
         part.visual = TextureVisuals(material=_material((*tint, 1.0), name))
     if "vertex_normals" in part._cache.cache:  # asked in public, trimesh would make some up
-        part.vertex_normals = _unit(part.vertex_normals)
+        part.vertex_normals = unit_normals(part.vertex_normals)
     return part
 
 
-def _unit(normals: Float[np.ndarray, "verts 3"]) -> Float[np.ndarray, "verts 3"]:
+def unit_normals(normals: Float[np.ndarray, "verts 3"]) -> Float[np.ndarray, "verts 3"]:
     """Directions of length one; where triangles without area leave none, up."""
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     up = np.array([0.0, 1.0, 0.0])
     return np.where(length > 1e-6, normals / np.maximum(length, 1e-6), up)
 
 
+def linear(rgb: Colour) -> Colour:
+    """Amounts of light of a colour on the screen."""
+    red, green, blue = (((c + 0.055) / 1.055) ** 2.4 if c > 0.04045 else c / 12.92 for c in rgb)
+    return red, green, blue
+
+
 def _material(rgba: tuple[float, float, float, float], name: str) -> Any:  # noqa: ANN401
     """A rough material; glTF counts light, so the colour leaves its sRGB curve here."""
     from trimesh.visual.material import PBRMaterial
 
-    linear = [((c + 0.055) / 1.055) ** 2.4 if c > 0.04045 else c / 12.92 for c in rgba[:3]]
     return PBRMaterial(
         name=name,
-        baseColorFactor=[*(round(255 * c) for c in linear), round(255 * rgba[3])],
+        baseColorFactor=[*(round(255 * c) for c in linear(rgba[:3])), round(255 * rgba[3])],
         metallicFactor=0.0,
         roughnessFactor=0.9,
         alphaMode="BLEND" if rgba[3] < 1 else "OPAQUE",
@@ -146,7 +151,7 @@ def _solid(mesh: Mesh, rgba: tuple[float, float, float, float], name: str) -> An
     )
 
 
-def _floor(scene: Scene, height: float) -> Mesh:
+def floor_of(scene: Scene, height: float) -> Mesh:
     """A rectangle under everything, front side up."""
     stands = [place_piece(p).verts.detach().cpu()[:, [0, 2]].float() for p in scene.pieces]
     flat = torch.cat([torch.zeros(1, 2), *stands])
@@ -169,7 +174,7 @@ def _add_body(out: Any, bodies: Bodies, row: int) -> None:  # noqa: ANN401
     person, frame = int(bodies.person[row]), int(bodies.frame[row])
     name = _free(out, f"body_{person}_{frame}")
     body = _solid(Mesh(bodies.verts[row], bodies.faces), (*person_colour(person), BODY_ALPHA), name)
-    body.vertex_normals = _unit(body.vertex_normals)  # skin is smooth
+    body.vertex_normals = unit_normals(body.vertex_normals)  # skin is smooth
     out.add_geometry(body, node_name=name, geom_name=name)
 
 

@@ -76,6 +76,8 @@ class View:
     placed: Placed
     traces: dict[str, Tensor]
     """Total energy before each step of the descents so far."""
+    alone: Layout
+    """Where the image alone places the objects."""
     cues: Cues | None = None
 
 
@@ -129,25 +131,17 @@ def _from_image(job: Job, camera: Camera, ground: float) -> View:
     cues = job.run.stage(find_image_cues, image, job.config.image)
     inputs = PlaceInputs(objects, camera, ground, cues, NOBODY, _alone(start), start.yaw)
     placed = job.run.stage(place_objects, inputs, job.config.layout)
-    return View(camera, ground, image, start, placed, {"image": placed.trace})
+    return View(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
 
 
 def _refine(job: Job, crew: Crew, view: View) -> View:
     """Camera and ground refined with the objects, and the objects placed anew under them."""
     cues = job.run.stage(find_image_cues, view.image, job.config.image)
-    inputs = RefineInputs(
-        view.camera, view.ground, _level_soles(crew), job.prepared.objects, cues, view.placed.layout
-    )
+    spread, objects = crew.alignment.covariance, job.prepared.objects
+    inputs = RefineInputs(view.camera, view.ground, spread, objects, cues, view.placed.layout)
     better = job.run.stage(refine_camera, inputs, job.config.refine)
     found = _from_image(job, better.camera, better.ground)
     return replace(found, traces={**view.traces, "camera": better.trace, **found.traces})
-
-
-def _level_soles(crew: Crew) -> Float[Tensor, "soles 3"]:
-    """Soles in camera axes without the height by which each person floats."""
-    up = crew.alignment.camera.R_cam_world[:, 1]
-    offsets = [crew.alignment.offsets.get(str(p), 0.0) for p in crew.soles.person.tolist()]
-    return crew.soles.points_cam - torch.tensor(offsets).to(up).unsqueeze(-1) * up
 
 
 def _with_people(job: Job, crew: Crew, view: View) -> View:
@@ -226,6 +220,7 @@ def _joined(a: Layout, b: Layout) -> Layout:
 def _room(job: Job, view: View, crew: Crew | None) -> Room:
     capture, placed = job.capture, view.placed
     pieces = restore(capture.scene.pieces, job.prepared, placed.layout)
+    alone = restore(capture.scene.pieces, job.prepared, view.alone)
     warnings = [*capture.warnings, *job.prepared.warnings]
     bodies = None
     if crew is not None:
@@ -240,6 +235,7 @@ def _room(job: Job, view: View, crew: Crew | None) -> Room:
     return Room(
         scene=Scene(view.camera, view.ground, pieces),
         initial=capture.scene,
+        image_only=Scene(view.camera, view.ground, alone),
         bodies=bodies,
         kept=None if crew is None else crew.kept,
         proxies=proxy_meshes(job.prepared),

@@ -90,6 +90,7 @@ RELEASE = Config(
 )
 
 _DESCENT = Adam(200, 0.03, 0.002, beta2=0.98, keep_best=True)
+_GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300)
 _SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
 _ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
 _ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 2.0, 1.0, 2.0, heading=0.1)
@@ -101,7 +102,7 @@ ROBUST = Config(
         _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, short=_SHORT, keep=3, tie=1.0
     ),
     refine=RefineConfig(rounds=1),
-    gather=GatherConfig(erode=1, touches=AssignConfig(by="group", cell=0.02, most=300)),
+    gather=GatherConfig(erode=1, touches=_GROUPS),
     place=PlaceConfig(_ROBUST_FULL, "robust", _DESCENT, tie=1.0),
     again=1,
     slide=True,

@@ -219,6 +219,8 @@ class Room:
     """The refined scene: every object of the input."""
     initial: Scene
     """The scene as it was given."""
+    image_only: Scene
+    """The same objects under the refined camera as the image alone places them (stage 1)."""
     bodies: Bodies | None
     """All rows of the input, in the world of `scene`."""
     kept: Bool[Tensor, " bodies"] | None

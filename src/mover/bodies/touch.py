@@ -26,7 +26,12 @@ from .posture import (
 __all__ = ["Postures", "headings", "postures", "touching"]
 
 FACING = (0.3, 0.7)  # cosine between normal and the direction of touch: never, surely
-RECLINE = (0.05, 0.2)  # [rad] of the trunk behind upright: not leaning, surely leaning
+RECLINE = (0.12, 0.3)  # [rad] of the trunk behind upright: not leaning, surely leaning
+LAYER = (
+    0.07,
+    0.03,
+)  # [m] from what reaches farthest: a flat surface is not touched, surely touched
+PALM = (0.04, 0.015)  # the same for a hand
 STILL = (0.1, 0.3)  # [m/s] of hands and feet: at rest, surely moving
 SURFACE = (0.25, 1.1)  # [m] over the ground: where hands find something to rest on
 LAP = 0.17  # [m] from the middle of the own thigh: a hand there rests on the lap
@@ -52,8 +57,9 @@ def touching(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodi
     places = landmarks(bodies, parts)
     normals = vertex_normals(bodies.verts, bodies.faces)
     down = _ramp(-normals[..., 1], *FACING)
-    chance = _sit(parts, pose, down)
-    chance = torch.maximum(chance, _recline(parts, pose, facing(places), normals))
+    chance = _sit(bodies, parts, pose, down)
+    trunk = at(places, "neck") - at(places, "hips")
+    chance = torch.maximum(chance, _recline(bodies, parts, pose, facing(places), trunk, normals))
     chance = torch.maximum(chance, _lie(bodies, parts, pose, down))
     chance = torch.maximum(chance, _rest_arms(bodies, parts, places, down, ground))
     return torch.maximum(chance, _stand(bodies, parts, ground))
@@ -65,24 +71,47 @@ def _ramp(value: Tensor, zero: float, one: float) -> Tensor:
     return torch.nan_to_num(share * share * (3 - 2 * share))
 
 
-def _sit(
-    parts: Parts, pose: Postures, down: Float[Tensor, "bodies verts"]
+def _flat(
+    reach: Float[Tensor, "bodies verts"],
+    chance: Float[Tensor, "bodies verts"],
+    layer: tuple[float, float],
 ) -> Float[Tensor, "bodies verts"]:
-    """Sitting: what faces down of seat and thighs."""
+    """Leave only what lies in the layer that reaches farthest: furniture is flatter than bodies.
+
+    Args:
+        reach: How far each vertex reaches towards the surface [m].
+        chance: Which vertices could touch.
+        layer: Distances from the farthest at which they do not, and surely do [m].
+    """
+    could = torch.where(chance > 0.5, reach, torch.full_like(reach, -torch.inf))
+    farthest = could.topk(min(5, could.shape[1]), dim=1).values[:, -1:]
+    return chance * _ramp(farthest - reach, *layer)
+
+
+def _sit(
+    bodies: Bodies, parts: Parts, pose: Postures, down: Float[Tensor, "bodies verts"]
+) -> Float[Tensor, "bodies verts"]:
+    """Sitting: what faces down of seat and thighs, as far as it is low enough."""
     part = members(parts, "seat", "left_thigh", "right_thigh")
-    return down * part * pose.sitting[:, None]
+    return _flat(-bodies.verts[..., 1], down * part * pose.sitting[:, None], LAYER)
 
 
 def _recline(
+    bodies: Bodies,
     parts: Parts,
     pose: Postures,
     front: Float[Tensor, "bodies 3"],
+    trunk: Float[Tensor, "bodies 3"],
     normals: Float[Tensor, "bodies verts 3"],
 ) -> Float[Tensor, "bodies verts"]:
-    """Leaning back in a seat: what faces backwards of the back."""
+    """Leaning back in a seat: what faces backwards of the back and reaches far enough."""
     behind = _ramp(-torch.einsum("bvi,bi->bv", normals, front), *FACING)
     lean = _ramp(pose.recline, *RECLINE) * pose.sitting
-    return behind * members(parts, "back") * lean[:, None]
+    axis = trunk / trunk.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    backward = torch.linalg.cross(axis, torch.linalg.cross(axis, front))
+    backward = torch.nan_to_num(backward / backward.norm(dim=-1, keepdim=True).clamp_min(1e-9))
+    reach = torch.einsum("bvi,bi->bv", bodies.verts, backward)
+    return _flat(reach, behind * members(parts, "back") * lean[:, None], LAYER)
 
 
 def _lie(
@@ -95,7 +124,7 @@ def _lie(
     height = bodies.verts[..., 1]
     lowest = height < height.amin(1, keepdim=True) + UNDERSIDE
     region = torch.where(supine[:, None], rear, lowest)
-    return down * region * pose.lying[:, None]
+    return _flat(-height, down * region * pose.lying[:, None], (2 * LAYER[0], 2 * LAYER[1]))
 
 
 def _rest_arms(
@@ -120,7 +149,8 @@ def _rest_arms(
             arm = at(places, f"{side}_wrist") - at(places, f"{side}_elbow")
             free = free & (elevation(arm).abs() < LEVEL_ARM)
         mostly = _ramp(down[:, part].mean(1), 0.2, 0.5)
-        chance = torch.maximum(chance, down * part * (rest * free * mostly)[:, None])
+        hand = down * part * (rest * free * mostly)[:, None]
+        chance = torch.maximum(chance, _flat(-bodies.verts[..., 1], hand, PALM))
     return chance
 
 

@@ -100,7 +100,7 @@ _CHAIR_BACKS = (_panel_back, _ladder_back, _low_back, _spindle_back)
 
 def armchair(rng: np.random.Generator, style: int) -> Furniture:
     """A wide chair with arms: 0 club, 1 high back on legs, 2 wooden frame with cushions."""
-    inner, d = draw(rng, 0.54, 0.62), draw(rng, 0.48, 0.54)
+    inner, d = draw(rng, 0.54, 0.62), draw(rng, 0.46, 0.51)
     h, x = draw(rng, 0.41, 0.45), inner / 2
     back, arm = (draw(rng, 0.78, 0.88), draw(rng, 0.12, 0.17))
     if style == 1:

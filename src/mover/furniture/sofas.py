@@ -10,7 +10,7 @@ def sofa(rng: np.random.Generator, style: int) -> Furniture:
     low, high = {0: (2, 5), 1: (1, 4), 2: (2, 5), 3: (3, 4)}[style]
     seats = int(rng.integers(low, high))
     each = draw(rng, 0.6, 0.72) if seats > 1 else draw(rng, 0.7, 0.8)
-    d, h, back = draw(rng, 0.48, 0.54), draw(rng, 0.4, 0.44), draw(rng, 0.76, 0.86)
+    d, h, back = draw(rng, 0.47, 0.52), draw(rng, 0.4, 0.44), draw(rng, 0.76, 0.86)
     arm = (draw(rng, 0.15, 0.22), 0.0, draw(rng, 0.08, 0.1), draw(rng, 0.14, 0.18))[style]
     x, foot = seats * each / 2, 0.14 if style == 2 else 0.05
     sides = {0: (-1, 1), 1: (), 2: (-1, 1), 3: (-1,)}[style]

@@ -7,13 +7,15 @@ from torch import Tensor
 
 from ..types import Mesh
 from .nearest import as_float64, as_int64, closest
-from .solids import THIN, volumes
+from .solids import volumes
 from .topology import edges_of as edges_of
 from .topology import is_closed as is_closed
 from .topology import manifold
 
 OVERSAMPLING = 5  # candidates for each even sample
 STRAY = 0.03  # of the longest side; no vertex may be further from the decimated surface
+FOLD = 1e-9  # of the cube of the longest side; closed pieces of less volume are folded faces
+CAUTION = 5  # of fast_simplification: 7 is its default, less is slower and better
 GENTLER = 1.5  # a target of faces that spoils a mesh is raised by this factor
 
 
@@ -143,9 +145,8 @@ def _strays(mesh: Mesh, small: Mesh) -> float:
 def _simplified(mesh: Mesh, faces: int) -> Mesh:
     import fast_simplification
 
-    found = fast_simplification.simplify(
-        as_float64(mesh.verts), as_int64(mesh.faces).astype(np.int32), target_count=faces
-    )
+    corners, rows = as_float64(mesh.verts), as_int64(mesh.faces).astype(np.int32)
+    found = fast_simplification.simplify(corners, rows, target_count=faces, agg=CAUTION)
     verts, triangles = (torch.from_numpy(np.ascontiguousarray(part)) for part in found[:2])
     return used(Mesh(verts.to(mesh.verts), triangles.to(mesh.faces)))
 
@@ -160,7 +161,7 @@ def _resolidified(small: Mesh, mesh: Mesh) -> Mesh | None:
         return None
     part_of, parts = volumes(*found)
     before = signed_volume(mesh)
-    keep = np.sign(before) * parts > THIN * np.ptp(found[0], axis=0).max() ** 3
+    keep = np.sign(before) * parts > FOLD * np.ptp(found[0], axis=0).max() ** 3
     if not 0.5 <= parts[keep].sum() / before <= 2:
         return None
     verts, faces = (torch.from_numpy(part) for part in (found[0], found[1][keep[part_of]]))

@@ -14,7 +14,7 @@ from .solids import Triangles, volumes
 from .topology import labels, manifold
 
 WALL = 0.75  # [cells], more than the half diagonal of a step, or the flood would leak through
-REST = 0.1  # of the wall's thickness that stays
+REST = 0.3  # of the thickness of the wall that stays: sheets need two sides that are apart
 REACH = 3.0  # [walls], vertices further from the triangles stay where they are: lids over holes
 INSIDE = 0.85  # winding number from which a place that the flood reached still counts as matter
 LID = 4.0  # [cells] over which a winding number that is larger by 1 would lower the field

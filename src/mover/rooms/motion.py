@@ -96,16 +96,9 @@ def perform(
         phase = float(rng.uniform(0, 2 * np.pi))
         try:
             stop = _stop(stage, task, here)
-            new = [_walk(stage, here, stop), *_ACTS[task.kind](stage, task, stop, phase)]
-            wrong = [
-                f
-                for take in new
-                for f in faults(stage.person, take.posture, take.label, stage.pieces, take.piece)
-            ]
-        except (NoWayError, ValueError) as error:
-            wrong = [str(error)]
-        if wrong:
-            refused.append(f"{task.kind} {_name(stage, task)}: {wrong[0]}")
+            new = _played(stage, task, (here, stop), phase)
+        except (NoWayError, RefusedTaskError, ValueError) as error:
+            refused.append(f"{task.kind} {_name(stage, task)}: {error}")
         else:
             takes, here = takes + new, stop
     if not takes:
@@ -114,6 +107,26 @@ def perform(
     labels = tuple(t.label for t, n in zip(takes, count, strict=True) for _ in range(n))
     touched = tuple(t.piece for t, n in zip(takes, count, strict=True) for _ in range(n))
     return Performance(chain([t.posture for t in takes]), labels, touched, tuple(refused))
+
+
+class RefusedTaskError(Exception):
+    """Bodies would sink into furniture, or hang in the air."""
+
+
+def _played(stage: Stage, task: Task, way: tuple[Stop, Stop], phase: float) -> list[Take]:
+    """Walk there and do it, checked against the furniture."""
+    takes = [_walk(stage, *way)]
+    _check(stage, takes)
+    acts = _ACTS[task.kind](stage, task, way[1], phase)
+    _check(stage, acts)
+    return takes + acts
+
+
+def _check(stage: Stage, takes: list[Take]) -> None:
+    for take in takes:
+        wrong = faults(stage.person, take.posture, take.label, stage.pieces, take.piece)
+        if wrong:
+            raise RefusedTaskError(wrong[0])
 
 
 def _name(stage: Stage, task: Task) -> str:

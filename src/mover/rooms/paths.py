@@ -7,7 +7,7 @@ from .placed import Placed, free_of
 from .steps import Floor
 
 CELL = 0.06  # [m]
-BODY = 0.2  # [m], nearer than this to furniture nobody walks
+BODY = 0.28  # [m], nearer than this to furniture nobody walks
 ROOMY = 0.42  # [m], nearer than this one walks only where one must
 DEAR = 6.0  # cost of a metre in between
 

@@ -16,10 +16,15 @@ class Placed:
 
     id: str
     furniture: Furniture
-    place: Float[np.ndarray, "2"]
+    at: tuple[float, float]
     """x and z of the centre of the base [m]."""
     heading: float
     """Rotation about +y; 0 faces +z, towards the camera [rad]."""
+
+    @property
+    def place(self) -> Float[np.ndarray, "2"]:
+        """X and z of the centre of the base [m]."""
+        return np.array(self.at)
 
 
 @record

@@ -83,7 +83,7 @@ def reach_out(end: Posture, stand: Posture, share: np.ndarray) -> Posture:
     hand = int(end.resting[0].argmax())
     half = blend(stand, end, np.array([0.5]))
     wrists = half.wrists.copy()
-    wrists[0, hand] = np.array([0.04 if hand == 0 else -0.04, -0.22, 0.3])
+    wrists[0, hand] = np.array([0.05 if hand == 0 else -0.05, -0.2, 0.13])
     palms = np.where(end.resting[..., None] > 0, end.palms, half.palms)
     raised = dataclasses.replace(half, wrists=wrists, palms=palms, resting=np.zeros((1, 2)))
     start = dataclasses.replace(stand, palms=palms)

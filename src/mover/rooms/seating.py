@@ -49,7 +49,7 @@ def _depths(person: Person, spot: Spot) -> tuple[float, float]:
     thigh = float(np.linalg.norm(knee - hip))
     rear = -float(person.skin[np.abs(person.skin[:, 1]) < 0.15, 2].min())
     high = max(0.0, spot.height - 0.42)  # high seats: nearer to the edge, knees lower than hips
-    behind = min(thigh - 0.1 - high - spot.lip, spot.depth - rear - 0.015)
+    behind = min(thigh - 0.1 - high - spot.lip, spot.depth - rear - 0.045)
     return behind, max(CALF + spot.lip, thigh - behind - 0.02)
 
 
@@ -68,8 +68,8 @@ def seated(person: Person, spot: Spot, piece: Placed) -> Posture:
         pelvis = np.array([[behind[0], height, behind[1]]])
         return dataclasses.replace(stand, pelvis=pelvis, spine=np.array([[0.06, 0, 0]]))
 
-    top = spot.height + 0.25
-    height = approach(lambda y: gap(person, at(y), piece, "lower"), top, -1.0, 0.3)
+    top = spot.height + 0.16
+    height = approach(lambda y: gap(person, at(y), piece, "core"), top, -1.0, 0.2)
     return hands_on_thighs(person, at(height))
 
 

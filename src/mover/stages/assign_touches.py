@@ -40,6 +40,8 @@ class AssignConfig:
 
     by: Literal["vertex", "group"] = "vertex"
     """What is assigned as one."""
+    split: Literal["normals", "parts"] = "normals"
+    """Seat or back: by the normal of the vertex, or backs alone touch backs (unless they lie)."""
     chance: float = 0.5
     """A vertex touches from here on."""
     overlap: float = 0.5
@@ -168,6 +170,8 @@ def _pack(rows: _Contacts, inputs: TouchInputs, config: AssignConfig) -> Touches
     normals = vertex_normals(inputs.bodies.verts, inputs.bodies.faces)[rows.body, rows.vert]
     points = inputs.bodies.verts[rows.body, rows.vert]
     level = normals[:, 1].abs() >= LEVEL
+    if config.split == "parts":
+        level = level | (inputs.parts.part_of[rows.vert] != PARTS.index("back"))
     touched = rows.object_of.unique()
     packed, weight = thin(
         points,

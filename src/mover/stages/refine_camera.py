@@ -5,9 +5,11 @@ ground is 5-15 cm of depth at 5 m, because an object stands where the ray to its
 floor. Objects whose shape fits tell the camera more exactly than noisy feet do.
 
     min over pitch, roll, ground and all objects on the floor:
-        mean_i E_i / (E_i(start) + 0.02)  +  n/100 mean_j rho(height of sole j; 2 cm)
+        mean_i E_i / (E_i(start) + 0.02)  +  1/2 d^T C^-1 d
 
-Each object's energy is divided by its own residual: exact shapes pull hard, wrong shapes softly.
+Each object's energy is divided by its own residual: exact shapes pull hard, wrong shapes softly. d
+is the change of pitch, roll and ground, C their covariance from the feet: a floor that was walked
+all around outweighs the objects, and what no foot told is left to them.
 An object is carried by the ray to the centre of its base, so a change of the camera leaves it where
 it is in the image.
 """
@@ -22,13 +24,12 @@ from ..energy import HumanCues, ImageCues, SceneConfig, SceneWeights, scene_ener
 from ..geometry.camera import pitch_roll, tilted, to_camera
 from ..geometry.floor import LOWEST, hit_floor
 from ..geometry.placement import GROUND
-from ..minimize import Adam, Energy, Observer, geman_mcclure, minimize, silent
+from ..minimize import Adam, Energy, Observer, minimize, silent
 from ..records import record
 from ..types import Camera, Layout, Objects
 
 IMAGE_ONLY = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
 SOFT = 0.02  # [1], added to an object's own residual
-RHO = 0.02  # [m], robust width of the soles' heights
 UNITS = (
     0.01,
     0.01,
@@ -46,7 +47,7 @@ class RefineConfig:
     rounds: int = 0
     """How often; 0: never (the paper)."""
     feet: float = 1.0
-    """Weight of a hundred soles against all objects."""
+    """Weight of what the feet say against all objects."""
     method: Adam = field(default_factory=lambda: Adam(150, rate=0.3, last_rate=0.02, beta2=0.98))
 
 
@@ -56,8 +57,8 @@ class RefineInputs:
 
     camera: Camera
     ground: float
-    soles: Float[Tensor, "soles 3"]
-    """In camera axes, already moved by the offset of their person [m]."""
+    covariance: Float[Tensor, "3 3"]
+    """Of pitch [rad], roll [rad] and ground [m], from the feet."""
     objects: Objects
     image: ImageCues
     layout: Layout
@@ -85,7 +86,7 @@ def refine_camera(
 ) -> Refined:
     """Minimise over the camera, the ground and all standing objects at once."""
     image = SceneConfig(IMAGE_ONLY, "robust")
-    fixed = _start(inputs)
+    fixed, certainty = _start(inputs), torch.linalg.inv(inputs.covariance)
     usable = _usable(inputs)
     zero = _Joint(
         *(torch.zeros_like(x) for x in (fixed.tilt, fixed.rays, fixed.yaw, fixed.log_scale))
@@ -102,7 +103,8 @@ def refine_camera(
     def energy(free: _Joint) -> Energy:
         joint = _shift(fixed, free)
         terms = objects_energy(joint) / own
-        feet = _feet(joint, inputs) * (config.feet * len(inputs.soles) / 100)
+        off = joint.tilt - fixed.tilt
+        feet = 0.5 * config.feet * (off @ certainty @ off)
         return Energy({"objects": (terms * usable).sum() / usable.sum().clamp_min(1), "feet": feet})
 
     if not bool(usable.any()):
@@ -146,10 +148,3 @@ def _unpack(joint: _Joint, inputs: RefineInputs) -> tuple[Camera, Layout]:
     rays = torch.nn.functional.pad(joint.rays, (0, 1), value=1.0)
     t = hit_floor(rays, R, joint.tilt[2])
     return Camera(old.K, R, old.width, old.height), Layout(t, joint.yaw, joint.log_scale)
-
-
-def _feet(joint: _Joint, inputs: RefineInputs) -> Float[Tensor, ""]:
-    if len(inputs.soles) == 0:
-        return joint.tilt.new_zeros(())
-    up = tilted(joint.tilt[0], joint.tilt[1])[:, 1]
-    return geman_mcclure(inputs.soles @ up - joint.tilt[2], RHO).mean()

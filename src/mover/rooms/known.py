@@ -1,0 +1,212 @@
+"""What is known of a room: the capture that a perfect upstream would give, and the truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..bodies import open_body
+from ..furniture import Furniture
+from ..records import map_tensors, record
+from ..types import Bodies, BodyPose, Capture, Detection, People, Piece, Scene
+from .compose import Plan
+from .motion import Performance, Stage
+from .noise_masks import box_of_mask
+from .poses import angles, skinned
+from .render import Sight, encode, see, see_body
+from .truth import GAPE, NONE, nearness
+from .turns import from_vector, to_vector
+
+
+@dataclass(frozen=True)
+class RoomConfig:
+    """How a known room is made."""
+
+    width: int = 960
+    """Of the image [px]."""
+    height: int = 540
+    """Of the image [px]."""
+    fps: float = 5.0
+    """Frames a second."""
+    people: int = 1
+    """How many people use the room, 1 or 2."""
+    pieces: int = 9
+    """Most pieces of furniture."""
+    least_pieces: int = 6
+    """Fewest pieces of furniture that the camera sees."""
+    least_frames: int = 200
+    """Fewest frames."""
+    least_touches: int = 3
+    """Fewest tasks that touch furniture, over all people."""
+    least_pixels: int = 500
+    """A piece with fewer visible pixels is not annotated well enough: the room is refused."""
+    stay: float = 1.0
+    """Factor on how long people sit, lie and stand."""
+
+
+@record
+class KnownRoom:
+    """A capture without noise, and the truth behind it."""
+
+    capture: Capture
+    """What a perfect upstream would give: true scene, camera, bodies and masks."""
+    truth: Scene
+    bodies: Bodies
+    """In the camera frame, with pose parameters of the open body."""
+    touching: Bool[Tensor, "bodies verts"]
+    """Skin within 1 cm of a piece or of the floor."""
+    touched: Int[Tensor, "bodies verts"]
+    """What it touches: index of the piece, -1 the floor, -2 nothing."""
+    actions: tuple[str, ...]
+    """What each body does."""
+    furniture: tuple[Furniture, ...]
+    """The pieces in the order of `truth.pieces`."""
+    plan: Plan
+    refused: tuple[str, ...]
+    """Rooms and tasks that were not true enough, with the reasons."""
+
+
+class RefusedError(Exception):
+    """A draft of a room is not true enough or not rich enough."""
+
+
+@record
+class Actor:
+    """One person and what they do."""
+
+    stage: Stage
+    performance: Performance
+
+
+def build(
+    plan: Plan, actors: tuple[Actor, ...], config: RoomConfig, name: str, refused: tuple[str, ...]
+) -> KnownRoom:
+    """Put people and furniture before the camera.
+
+    Raises:
+        RefusedError: If too little is seen or happens.
+    """
+    frames = max(len(a.performance.labels) for a in actors)
+    used = {(k, i) for k, a in enumerate(actors) for i in a.performance.touched if i >= 0}
+    if frames < config.least_frames or len(used) < config.least_touches:
+        raise RefusedError(f"{frames} frames, {len(used)} pieces used")
+    sight = see(plan)
+    detections = _detections(plan, sight, config)
+    crowd = _crowd(plan, actors, config.fps)
+    scene = _scene(plan)
+    capture = Capture(
+        name=name,
+        scene=scene,
+        camera_height=None,
+        detections=detections,
+        reference=sight.picture,
+        reference_people=None,
+        bodies=crowd.bodies,
+        people=_people(plan, sight, crowd.bodies),
+        touch=None,
+        warnings=(),
+    )
+    touching = crowd.distance < GAPE
+    touched = torch.where(touching, crowd.nearest, torch.full_like(crowd.nearest, NONE))
+    furniture = tuple(p.furniture for p in plan.pieces)
+    return KnownRoom(
+        capture, scene, crowd.bodies, touching, touched, crowd.actions, furniture, plan, refused
+    )
+
+
+def _scene(plan: Plan) -> Scene:
+    pieces = []
+    for index, piece in enumerate(plan.pieces):
+        x, z = piece.place.tolist()
+        place = torch.tensor([x, -plan.view.height, z])
+        pieces.append(
+            Piece(piece.id, piece.furniture.category, piece.furniture.mesh, "", index + 1, "ground",
+                  place, torch.tensor(float(piece.heading)), torch.ones(3))
+        )  # fmt: skip
+    return Scene(plan.view.camera, -plan.view.height, tuple(pieces))
+
+
+def _detections(plan: Plan, sight: Sight, config: RoomConfig) -> tuple[Detection, ...]:
+    found = []
+    for index, piece in enumerate(plan.pieces):
+        mask = (sight.piece == index).numpy()
+        if mask.sum() < config.least_pixels:
+            raise RefusedError(f"{piece.id} is hidden: {int(mask.sum())} pixels")
+        box = box_of_mask(mask)
+        found.append(Detection(index + 1, piece.furniture.category, box, encode([mask]), 1.0))
+    return tuple(found)
+
+
+@record
+class _Crowd:
+    """Everybody, row by row."""
+
+    bodies: Bodies
+    distance: Float[Tensor, "bodies verts"]
+    nearest: Int[Tensor, "bodies verts"]
+    actions: tuple[str, ...]
+
+
+def _crowd(plan: Plan, actors: tuple[Actor, ...], fps: float) -> _Crowd:
+    """Everybody in camera axes, how near they are to what, and what they do."""
+    rows = [(f, k) for k, a in enumerate(actors) for f in range(len(a.performance.labels))]
+    order = sorted(range(len(rows)), key=lambda k: rows[k])
+    index = torch.tensor(order)
+    nears = [nearness(skinned(a.stage.person, a.performance.posture), plan.pieces) for a in actors]
+    distance = torch.cat([torch.from_numpy(n.distance).float() for n in nears])[index]
+    nearest = torch.cat([torch.from_numpy(n.nearest) for n in nears])[index]
+    labels = [name for a in actors for name in a.performance.labels]
+    pose = _in_camera(plan, actors, index)
+    model = open_body()
+    verts, joints = model.posed(pose)
+    bodies = Bodies(
+        verts=rounded(verts),
+        faces=model.faces,
+        joints=rounded(joints),
+        joint_names=model.joint_names,
+        frame=torch.tensor([rows[k][0] for k in order]),
+        person=torch.tensor([rows[k][1] for k in order]),
+        fps=fps,
+        space="camera",
+        pose=map_tensors(rounded, pose),
+    )
+    return _Crowd(bodies, distance, nearest, tuple(labels[k] for k in order))
+
+
+def rounded(value: Tensor) -> Tensor:
+    """To 10 micrometres, so that the last bits of other machines do not show."""
+    return value.mul(1e5).round().div(1e5).float()
+
+
+def _in_camera(plan: Plan, actors: tuple[Actor, ...], index: Tensor) -> BodyPose:
+    """Pose parameters in camera axes, float64; the root turns about the pelvis."""
+    R = plan.view.camera.R_cam_world.double().numpy()
+    eye = np.array([0.0, plan.view.height, 0.0])
+    fields: dict[str, list[Tensor]] = {
+        n: [] for n in ("betas", "global_orient", "body_pose", "transl")
+    }
+    for actor in actors:
+        pose = angles(actor.stage.person, actor.performance.posture)
+        turn = R @ from_vector(pose.global_orient.numpy())
+        pelvis = (actor.performance.posture.pelvis - eye) @ R.T
+        fields["betas"].append(pose.betas)
+        fields["body_pose"].append(pose.body_pose)
+        fields["global_orient"].append(torch.from_numpy(to_vector(turn)))
+        fields["transl"].append(torch.from_numpy(pelvis - actor.stage.person.origin))
+    rows = {n: torch.cat(parts)[index] for n, parts in fields.items()}
+    return BodyPose(model="makehuman", gender="neutral", extra={}, **rows)
+
+
+def _people(plan: Plan, sight: Sight, bodies: Bodies) -> People:
+    """Visible masks: what furniture or a nearer person hides is left out."""
+    depths = [see_body(plan, v, bodies.faces)[0] for v in bodies.verts]
+    nearest: dict[int, Tensor] = {}
+    for frame, depth in zip(bodies.frame.tolist(), depths, strict=True):
+        nearest[frame] = torch.minimum(nearest.get(frame, sight.depth), depth)
+    masks = [
+        (depth.isfinite() & (depth <= nearest[frame])).numpy()
+        for frame, depth in zip(bodies.frame.tolist(), depths, strict=True)
+    ]
+    return People(encode(masks), bodies.frame, bodies.person, {})

@@ -1,0 +1,45 @@
+"""How wrong the input of a known room is, with a source for each number."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """How wrong the input is. Zero everywhere gives the truth back."""
+
+    along_ray: float = 0.3
+    """Objects: largest shift along the viewing ray, drawn evenly [m]; the size follows."""
+    sideways: float = 0.1
+    """Objects: largest shift along each world axis, drawn evenly [m]."""
+    yaw: float = 30.0
+    """Objects: largest turn, drawn evenly [degrees]."""
+    flips: float = 0.1
+    """Objects: share that is turned by a further 90, 180 or 270 degrees."""
+    scale: float = 0.15
+    """Objects: largest error of the size along each axis, drawn evenly [share]."""
+    other_shapes: float = 0.0
+    """Objects: share whose mesh is another piece of the same class, stretched to the same box."""
+    camera: float = 3.0
+    """Mean size of the error of pitch and of roll; between 2/3 and 4/3 of it [degrees]."""
+    focal: float = 0.0
+    """Largest error of the focal length, drawn evenly [share]."""
+    depth_bias: float = 0.03
+    """Bodies: largest error of a person's depth; the body keeps its size [share]."""
+    depth_drift: float = 0.01
+    """Bodies: standard deviation of a depth error that changes within a second [share]."""
+    pose: float = 4.0
+    """Bodies: standard deviation of each joint's rotation error [degrees]."""
+    pose_seconds: float = 0.6
+    """Bodies: how long a pose error lasts [s]."""
+    pose_hidden: float = 1.5
+    """Bodies: factor on the pose error where more than half of the body is hidden."""
+    jitter: float = 0.015
+    """Bodies: standard deviation of the place, independent in each frame and axis [m]."""
+    dropped: float = 0.02
+    """Bodies: share of rows that are missing."""
+    person_masks: int = 3
+    """People's masks: most pixels by which they grow or shrink (at least 1 unless 0) [px]."""
+    missed_masks: float = 0.03
+    """People's masks: share that is missing."""
+    object_masks: int = 1
+    """Objects' masks: most pixels by which they grow or shrink [px]."""

@@ -1,0 +1,101 @@
+"""Known rooms: drawn from a seed, or composed by hand for the demo."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..furniture import make_piece
+from ..types import Mesh
+from .compose import Plan, draw_plan, make_view
+from .known import Actor, KnownRoom, RefusedError, RoomConfig, build
+from .motion import Stage, Stop, Task, perform
+from .person import make_person
+from .placed import Placed
+from .render import draw_bodies, see
+from .scripts import draw_person, draw_start, draw_tasks
+
+
+def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
+    """A room in which everything is known; the same for the same seed and configuration.
+
+    Raises:
+        ValueError: If 60 drafts in a row had to be refused.
+    """
+    config = config or RoomConfig()
+    refused: list[str] = []
+    for draft in range(60):
+        rng = np.random.default_rng([seed, draft])
+        try:
+            plan = draw_plan(rng, (config.width, config.height), config.pieces)
+            room = build(
+                plan, _cast(plan, config, rng, refused), config, f"room_{seed}", tuple(refused)
+            )
+        except RefusedError as error:
+            refused.append(f"draft {draft}: {error}")
+        else:
+            return room
+    raise ValueError(f"seed {seed}: 60 drafts were refused: {refused[-3:]}")
+
+
+def _cast(
+    plan: Plan, config: RoomConfig, rng: np.random.Generator, refused: list[str]
+) -> tuple[Actor, ...]:
+    """Everybody's performance."""
+    if len(plan.pieces) < config.least_pieces:
+        raise RefusedError(f"only {len(plan.pieces)} pieces fit")
+    actors: list[Actor] = []
+    bounds = np.stack([plan.walls[0] + 0.25, plan.walls[1] - 0.25])
+    for _ in range(config.people):
+        stage = Stage(make_person(draw_person(rng)), plan.pieces, bounds, config.fps)
+        try:
+            tasks, start = draw_tasks(plan, rng, config.stay), draw_start(plan, rng)
+        except ValueError as error:
+            raise RefusedError(str(error)) from error
+        performance = perform(stage, tasks, start, rng)
+        refused += performance.refused
+        actors.append(Actor(stage, performance))
+    return tuple(actors)
+
+
+_DEMO: tuple[tuple[str, str, int, int, tuple[float, float, float]], ...] = (
+    ("bed_0", "single bed", 0, 3, (-1.75, -5.08, 0.0)),
+    ("nightstand_0", "nightstand", 0, 3, (-0.9, -5.92, 0.0)),
+    ("shelf_0", "shelf", 2, 3, (-0.05, -5.98, 0.0)),
+    ("cabinet_0", "cabinet", 1, 3, (0.95, -5.9, 0.0)),
+    ("sofa_0", "sofa", 0, 6, (2.1, -4.72, -1.5708)),
+    ("floor_lamp_0", "floor lamp", 0, 3, (1.72, -6.02, 0.0)),
+    ("table_0", "table", 0, 3, (-0.98, -3.2, 0.05)),
+    ("chair_0", "chair", 1, 3, (0.45, -3.9, 0.35)),
+)
+"""Id, piece, style, seed of the sizes, and (x, z, heading) of the demo's furniture."""
+
+
+def demo_room() -> KnownRoom:
+    """A bed-sitting room whose tenant walks, sits, leans back, lies and stands at a table."""
+    pieces = tuple(
+        Placed(name, make_piece(kind, np.random.default_rng(sizes), style), spot[:2], spot[2])
+        for name, kind, style, sizes, spot in _DEMO
+    )
+    view = make_view((960, 540), (1.62, float(np.radians(-12.5)), float(np.radians(1.1)), 1.15))
+    plan = Plan(pieces, view, (-2.75, -6.25), (2.75, -1.9))
+    tasks = (
+        Task("walk", goal=(1.1, -4.9)),
+        Task("sit", 7, seconds=5.0),
+        Task("lean", 4, seconds=5.0, along=0.3),
+        Task("table", 6, seconds=4.0, side=2),
+        Task("lie", 0, seconds=6.0, side=1, roll=True),
+        Task("walk", goal=(0.9, -3.0)),
+    )
+    stage = Stage(make_person([0.0] * 10), pieces, np.array([[-2.5, -6.0], [2.5, -2.1]]), 5.0)
+    start = Stop(np.array([0.9, -2.95]), 3.0, np.array([0.9, -2.95]))
+    performance = perform(stage, tasks, start, np.random.default_rng(5))
+    actors = (Actor(stage, performance),)
+    return build(plan, actors, RoomConfig(), "demo", performance.refused)
+
+
+def draw_frame(room: KnownRoom, frame: int) -> Float[Tensor, "h w 3"]:
+    """A picture of the room with everybody in it, in [0, 1]."""
+    rows = torch.nonzero(room.bodies.frame == frame)[:, 0].tolist()
+    meshes = [Mesh(room.bodies.verts[k], room.bodies.faces) for k in rows]
+    return draw_bodies(room.plan, see(room.plan), meshes)
