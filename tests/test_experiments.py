@@ -32,7 +32,7 @@ from mover.geometry.raster import first_hit
 from mover.minimize import Adam, Step
 from mover.presets import PRESETS, Config
 from mover.readers.masks import encode, tight_box
-from mover.types import Capture, Detection, Masks, Scene
+from mover.types import Camera, Capture, Detection, Masks, Scene
 
 FEW = EvaluateConfig(samples=200, bodies=2)
 
@@ -41,6 +41,12 @@ def true_scene() -> Scene:
     scene = little_room.room()
     pieces = [replace(p, annotation=i) for i, p in enumerate(scene.pieces[:2])]
     return replace(scene, pieces=tuple(pieces))
+
+
+def small(camera: Camera) -> Camera:
+    """The same view in a picture of a quarter of the size."""
+    zoom = torch.tensor([0.25, 0.25, 1.0])
+    return replace(camera, K=camera.K * zoom[:, None], width=160, height=90)
 
 
 def detections(scene: Scene) -> tuple[Detection, ...]:
@@ -58,11 +64,12 @@ def detections(scene: Scene) -> tuple[Detection, ...]:
 def trial(shift: float = 0.2) -> Trial:
     """Two boxes whose guess is off, and a person who stands in front of a wrong camera."""
     truth = true_scene()
+    truth = replace(truth, camera=small(truth.camera))
     guess = tuple(
         replace(p, t_world_object=p.t_world_object + torch.tensor([shift, 0.0, -shift]))
         for p in truth.pieces
     )
-    initial = Scene(little_room.camera(-0.25, 0.02), None, guess)
+    initial = Scene(small(little_room.camera(-0.25, 0.02)), None, guess)
     people = records.map_tensors(
         lambda x: x.float() if x.is_floating_point() else x, judged.people(2)
     )

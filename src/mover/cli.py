@@ -10,6 +10,9 @@ COMMANDS = {
     "run": "Reconstruct a room from a capture folder.",
     "evaluate": "Compare a result with the truth.",
     "experiment": "Rebuild known rooms with each preset and compare them with the truth.",
+    "export": "Write a result for other programs: GLB, USD, MJCF, URDF, PLY, bodies.",
+    "settle": "Let gravity act on a result: how far does each piece move?",
+    "batch": "Run thousands of captures; what is finished is not run again.",
 }
 USAGE = "usage: mover COMMAND [OPTIONS]; mover COMMAND --help tells more"
 

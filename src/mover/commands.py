@@ -1,8 +1,9 @@
 """What each command does."""
 
+import importlib
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +16,7 @@ from .presets import PRESETS, Config
 from .progress import Bar
 
 log = logging.getLogger(__name__)
+THREADS = 1  # of torch: its operations here are small, and threads that wait for others cost more
 
 
 @dataclass(frozen=True)
@@ -124,10 +126,13 @@ def _run(arguments: Sequence[str]) -> None:
 
 def _reconstruct(capture: Any, config: Config, out: Path) -> Any:  # noqa: ANN401
     """Run the main job and write its result."""
+    import torch
+
     from .pipeline import reconstruct
     from .results import write_results
     from .run import Run
 
+    torch.set_num_threads(THREADS)
     with Bar() as bar:
         run = Run(out, bar)
         room = reconstruct(capture, config, run)
@@ -140,11 +145,11 @@ def _reconstruct(capture: Any, config: Config, out: Path) -> Any:  # noqa: ANN40
 def _check(arguments: Sequence[str]) -> None:
     args = tyro.cli(CheckArgs, prog="mover check", args=list(arguments))
     from .readers import read
-    from .readers.evidence import evidence_of, table_of
+    from .readers.evidence import evidence_table, gather_evidence
     from .report import save_overlay
 
     capture = read(args.format, args.source)
-    _say(table_of(evidence_of(capture)))
+    _say(evidence_table(capture, gather_evidence(capture)))
     for warning in capture.warnings:
         _say(f"warning: {warning}")
     save_overlay(capture, args.out)
@@ -166,16 +171,16 @@ def _demo(arguments: Sequence[str]) -> None:
     from .readers.folder import write_capture
     from .readers.scene_file import read_scene
     from .report import write_report
-    from .results import report_of, write_room
-    from .rooms.demo import demo_room
+    from .results import report_of, write_truth
     from .rooms.noise import NoiseConfig, add_noise
+    from .rooms.room import demo_room
 
     folder = args.out / "capture"
     if not (folder / "truth" / "scene.json").exists():
         _say("making a known room: furniture, a person, masks ...")
         room = demo_room()
         write_capture(add_noise(room, NoiseConfig(), args.seed), folder)
-        write_room(room, folder / "truth")
+        write_truth(room.truth, room.bodies, folder / "truth")
     capture = read("folder", folder)
     found, run = _reconstruct(capture, config, args.out / "room")
     metrics = evaluate_folder(args.out / "room", folder / "truth")
@@ -194,6 +199,15 @@ def _experiment(arguments: Sequence[str]) -> None:
     _say(f"{summary.read_text()}\nsummary: {summary}")
 
 
+def _lazily(module: str, name: str) -> Callable[[Sequence[str]], None]:
+    """A command of another module, which is imported when the command runs."""
+
+    def run(arguments: Sequence[str]) -> None:
+        importlib.import_module(f".{module}", __package__).COMMANDS[name](arguments)
+
+    return run
+
+
 def _say(text: str, stream: Any = None) -> None:  # noqa: ANN401
     (stream or sys.stdout).write(text + "\n")
 
@@ -204,4 +218,5 @@ _COMMANDS = {
     "run": _run,
     "evaluate": _evaluate,
     "experiment": _experiment,
+    **{name: _lazily("commands_share", name) for name in ("export", "settle", "batch")},
 }

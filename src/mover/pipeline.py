@@ -15,6 +15,7 @@ from .presets import PRESETS as PRESETS
 from .presets import Config as Config
 from .run import Run as Run
 from .stages.align_camera import AlignInputs, Alignment, align_camera
+from .stages.assign_touches import Contacts, TouchInputs, assign_touches
 from .stages.doubt import DoubtInputs, doubts
 from .stages.find_depth import DepthInputs, apply_depth, find_depth
 from .stages.find_image_cues import ImageInputs, find_image_cues, order_of
@@ -34,6 +35,7 @@ from .stages.prepare_objects import Prepared, PrepareInputs, prepare_objects, pr
 from .stages.refine_camera import RefineInputs, refine_camera
 from .stages.reinitialize import ReinitInputs, by_release, contact_start
 from .stages.select_frames import SelectInputs, select_frames
+from .stages.starts import alone, first, joined, reference_yaw
 from .terms.feet import Soles
 from .types import Bodies, Camera, Capture, Evidence, Layout, Room, Scene
 
@@ -79,6 +81,7 @@ class View:
     alone: Layout
     """Where the image alone places the objects."""
     cues: Cues | None = None
+    contacts: Contacts | None = None
 
 
 def reconstruct(capture: Capture, config: Config, run: Run) -> Room:
@@ -129,7 +132,7 @@ def _from_image(job: Job, camera: Camera, ground: float) -> View:
     unordered = torch.zeros(len(objects.ids), len(objects.ids), dtype=torch.bool)
     image = ImageInputs(camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered)
     cues = job.run.stage(find_image_cues, image, job.config.image)
-    inputs = PlaceInputs(objects, camera, ground, cues, NOBODY, _alone(start), start.yaw)
+    inputs = PlaceInputs(objects, camera, ground, cues, NOBODY, alone(start), start.yaw)
     placed = job.run.stage(place_objects, inputs, job.config.layout)
     return View(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
 
@@ -151,70 +154,50 @@ def _with_people(job: Job, crew: Crew, view: View) -> View:
     touching = job.run.stage(
         find_touches, FindTouchesInputs(bodies, crew.parts, view.ground, given), job.config.touches
     )
+    cues = job.run.stage(
+        gather_cues,
+        GatherInputs(bodies, job.capture.people, job.seen.masks, view.camera),
+        job.config.gather,
+    )
     fit = view.placed.energy[0]
     for turn in range(1 + job.config.again):
         if turn:
             view = replace(view, image=replace(view.image, behind=_order(job, view)))
-        inputs = GatherInputs(
-            bodies, touching.probability, crew.parts, job.capture.people, job.seen.masks,
-            job.seen.boxes, view.camera, job.prepared.objects, view.placed.layout,
+        inputs = TouchInputs(
+            bodies, touching.probability, crew.parts, job.seen.masks, job.seen.boxes, view.camera,
+            job.prepared.objects, view.placed.layout,
         )  # fmt: skip
-        cues = job.run.stage(gather_cues, inputs, job.config.gather)
-        view = _place_with(job, view, cues, fit)
+        contacts = job.run.stage(assign_touches, inputs, job.config.assign)
+        view = _place_with(job, replace(view, cues=cues, contacts=contacts), fit)
     return view
 
 
-def _place_with(job: Job, view: View, cues: Cues, fit: Float[Tensor, " objects"]) -> View:
+def _place_with(job: Job, view: View, fit: Float[Tensor, " objects"]) -> View:
     """One descent of the whole of Eq. 1."""
     objects, config, run = job.prepared.objects, job.config, job.run
+    assert view.cues is not None
+    assert view.contacts is not None
+    touches = view.contacts.touches
     image = run.stage(find_image_cues, view.image, config.image)
-    humans = cues_in_windows(cues, image.views, view.camera)
+    humans = cues_in_windows(view.cues, touches, image.views, view.camera)
     if config.trust:
         image = replace(image, trust=(FIT / fit.clamp_min(1e-6)).clamp(0.1, 1))
     seats = ReinitInputs(objects, view.camera, humans, image.masks, view.placed.layout)
-    layout = run.stage(by_release, seats, config.reinit)
-    starts = _alone(layout)
+    starts = alone(run.stage(by_release, seats, config.reinit))
     if config.layout.keep > 1:
-        contact = contact_start(view.placed.layout, objects, cues.touches)
-        starts = _joined(_first(view.placed.candidates, config.layout.keep), _alone(contact))
-    reference = _reference(view.start.yaw, cues)
+        contact = contact_start(view.placed.layout, objects, touches)
+        starts = joined(first(view.placed.candidates, config.layout.keep), alone(contact))
+    reference = reference_yaw(view.start.yaw, touches)
     inputs = PlaceInputs(objects, view.camera, view.ground, image, humans, starts, reference)
     placed = run.stage(place_objects, inputs, config.place)
     traces = {**view.traces, f"people {len(view.traces)}": placed.trace}
-    return replace(view, placed=placed, cues=cues, traces=traces)
-
-
-def _reference(initial: Float[Tensor, " objects"], cues: Cues) -> Float[Tensor, " objects"]:
-    """Yaw of the sitters of used seats, else the initial one [rad]."""
-    yaw = initial.clone()
-    if cues.touches is not None:
-        x, z = cues.touches.heading.unbind(-1)
-        seated = (x.abs() + z.abs()) > 0
-        yaw[cues.touches.object_of[seated]] = torch.atan2(x, z)[seated]
-    return yaw
+    return replace(view, placed=placed, traces=traces)
 
 
 def _order(job: Job, view: View) -> Bool[Tensor, "objects objects"]:
     verts = place(job.prepared.objects.verts, view.placed.layout)
     z = to_camera(verts, view.camera.R_cam_world)[..., 2]
     return order_of(z.amin(-1), z.amax(-1))
-
-
-def _alone(layout: Layout) -> Layout:
-    """One start."""
-    return Layout(layout.t_world_object[None], layout.yaw[None], layout.log_scale[None])
-
-
-def _first(layout: Layout, count: int) -> Layout:
-    return Layout(layout.t_world_object[:count], layout.yaw[:count], layout.log_scale[:count])
-
-
-def _joined(a: Layout, b: Layout) -> Layout:
-    return Layout(
-        torch.cat([a.t_world_object, b.t_world_object]),
-        torch.cat([a.yaw, b.yaw]),
-        torch.cat([a.log_scale, b.log_scale]),
-    )
 
 
 def _room(job: Job, view: View, crew: Crew | None) -> Room:
@@ -226,11 +209,10 @@ def _room(job: Job, view: View, crew: Crew | None) -> Room:
     if crew is not None:
         bodies = in_world(crew.bodies, view.camera)
         warnings += crew.warnings
-    if crew is not None and bodies is not None and view.cues is not None:
-        seated = view.cues.seated_on
+    if crew is not None and bodies is not None and view.contacts is not None:
         warnings += doubts(DoubtInputs(
             rows_of(bodies, crew.kept), crew.parts, capture.people, view.camera,
-            job.prepared.objects, placed.layout, view.cues.touches, seated,
+            job.prepared.objects, placed.layout, view.contacts.touches, view.contacts.seated_on,
         ))  # fmt: skip
     return Room(
         scene=Scene(view.camera, view.ground, pieces),
@@ -247,11 +229,10 @@ def _room(job: Job, view: View, crew: Crew | None) -> Room:
 
 
 def _evidence(job: Job, view: View) -> tuple[Evidence, ...]:
-    cues, ids = view.cues, job.prepared.objects.ids
-    zero = (0,) * len(ids)
-    near, far, bodies = (
-        (zero, zero, zero) if cues is None else (cues.near_pixels, cues.far_pixels, cues.touched_in)
-    )
+    ids = job.prepared.objects.ids
+    near = far = bodies = (0,) * len(ids)
+    if view.cues is not None and view.contacts is not None:
+        near, far, bodies = view.cues.near_pixels, view.cues.far_pixels, view.contacts.touched_in
     pixels = job.seen.masks.sum((-2, -1)).tolist()
     lowest = view.placed.energy.amin(0).tolist()
     return tuple(Evidence(*row) for row in zip(ids, pixels, near, far, bodies, lowest, strict=True))

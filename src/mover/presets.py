@@ -49,6 +49,8 @@ class Config:
     """Camera and ground refined with the objects."""
     gather: GatherConfig = field(default_factory=GatherConfig)
     """Evidence from all people."""
+    assign: AssignConfig = field(default_factory=AssignConfig)
+    """Which object each touching body part touches."""
     reinit: ReinitConfig = field(default_factory=ReinitConfig)
     """Seats put where their contacts are (release)."""
     place: PlaceConfig = field(default_factory=PlaceConfig)
@@ -84,7 +86,8 @@ RELEASE = Config(
     layout=PlaceConfig(
         _RELEASE_IMAGE, "release", Adam(1000), first=Adam(200, 0.01, 0.01), span=0.8, chair_span=0.6
     ),
-    gather=GatherConfig(erode=2, touches=AssignConfig(by="group", overlap=0.05)),
+    gather=GatherConfig(erode=2),
+    assign=AssignConfig(by="group", overlap=0.05),
     reinit=ReinitConfig(use=True),
     place=PlaceConfig(_RELEASE_FULL, "release", Adam(2500), span=0.8, chair_span=0.6),
 )
@@ -102,7 +105,8 @@ ROBUST = Config(
         _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, short=_SHORT, keep=3, tie=1.0
     ),
     refine=RefineConfig(rounds=1),
-    gather=GatherConfig(erode=1, touches=_GROUPS),
+    gather=GatherConfig(erode=1),
+    assign=_GROUPS,
     place=PlaceConfig(_ROBUST_FULL, "robust", _DESCENT, tie=1.0),
     again=1,
     slide=True,

@@ -37,6 +37,12 @@ def write_results(capture: Capture, room: Room, config: Config, run: Run) -> Pat
     return write_report(out, report_of(capture, room, config, run))
 
 
+def write_truth(scene: Scene, bodies: Bodies, folder: Path) -> None:
+    """The truth of a known room, for `mover evaluate`."""
+    write_bodies(bodies, folder / "bodies.npz")
+    write_scene(scene, folder / "scene.json")
+
+
 def initial_bodies(capture: Capture) -> Bodies:
     """The bodies in the world of the initial camera."""
     bodies = capture.bodies

@@ -2,7 +2,6 @@
 
 import heapq
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -45,11 +44,3 @@ def _worst(
     miss = (line - verts[inner]).norm(dim=-1).amax(-1)
     worst = int(miss.argmax())
     return -float(miss[worst]), first + 1 + worst, first, last
-
-
-def runs_of(frames: Tensor, gap: int) -> list[tuple[int, int]]:
-    """First and last index of each run of ascending frames without a gap wider than `gap`."""
-    breaks = (frames.diff() > gap).nonzero()[:, 0].tolist()
-    starts = [0, *(b + 1 for b in breaks)]
-    ends = [*breaks, len(frames) - 1]
-    return list(zip(starts, ends, strict=True))

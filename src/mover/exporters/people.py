@@ -21,24 +21,22 @@ class Track:
     frame: Int[Tensor, " rows"]
     time: Float[Tensor, " rows"]
     """Since the first frame of the file [s]."""
+    last: float
+    """Time of the last frame of the file [s]."""
 
 
 def tracks_of(bodies: Bodies) -> list[Track]:
     """Everybody, by the number of their track."""
     fps = bodies.fps or FPS
     begin = int(bodies.frame.min())
+    last = (int(bodies.frame.max()) - begin) / fps
     found: list[Track] = []
     for person in bodies.person.unique().tolist():
         rows = (bodies.person == person).nonzero()[:, 0]
         rows = rows[torch.argsort(bodies.frame[rows])]
         frame = bodies.frame[rows]
-        found.append(Track(person, rows, frame, (frame - begin).double() / fps))
+        found.append(Track(person, rows, frame, (frame - begin).double() / fps, last))
     return found
-
-
-def last_time(bodies: Bodies) -> float:
-    """Time of the last frame since the first [s]."""
-    return float(bodies.frame.max() - bodies.frame.min()) / (bodies.fps or FPS)
 
 
 def seen_from_to(track: Track) -> list[tuple[float, float]]:

@@ -52,7 +52,7 @@ def _carried(given: Bodies, pose: BodyPose, bodies: Bodies) -> Motion | str:
     size, turn, shift, error = similarity(given.verts.double(), bodies.verts.double())
     if float(error.max()) > SAME:
         return f"the result's bodies are not those of the capture, by {float(error.max()):.3f} m"
-    offset = _pelvis(pose)
+    offset = pelvis_of(pose)
     pelvis = (pose.transl + offset).double()
     there = size[:, None] * (turn @ pelvis[..., None])[..., 0] + shift
     root = vectors_of(turn @ axis_angle(pose.global_orient.double()))
@@ -62,7 +62,7 @@ def _carried(given: Bodies, pose: BodyPose, bodies: Bodies) -> Motion | str:
     return Motion(moved, size.to(pose.transl))
 
 
-def _pelvis(pose: BodyPose) -> Float[Tensor, "bodies 3"]:
+def pelvis_of(pose: BodyPose) -> Float[Tensor, "bodies 3"]:
     """From `transl` to the pelvis, about which the root turns [m]."""
     straight = {name: torch.zeros_like(getattr(pose, name)) for name in ("transl", "global_orient")}
     _, joints = load_model(pose.model, pose.gender).posed(dataclasses.replace(pose, **straight))
@@ -72,7 +72,10 @@ def _pelvis(pose: BodyPose) -> Float[Tensor, "bodies 3"]:
 def similarity(
     start: Float[Tensor, "rows points 3"], end: Float[Tensor, "rows points 3"]
 ) -> tuple[
-    Float[Tensor, " rows"], Float[Tensor, "rows 3 3"], Float[Tensor, "rows 3"], Float[Tensor, " rows"]
+    Float[Tensor, " rows"],
+    Float[Tensor, "rows 3 3"],
+    Float[Tensor, "rows 3"],
+    Float[Tensor, " rows"],
 ]:
     """Size, rotation and shift that best take `start` to `end`, and the largest miss [m]."""
     a, b = start.mean(1, keepdim=True), end.mean(1, keepdim=True)
@@ -115,23 +118,26 @@ def _or_zeros(given: Tensor | None, rows: int, width: int) -> Tensor:
     return given if given is not None and fits else torch.zeros(rows, width)
 
 
-def skin_of(motion: Motion, bodies: Bodies) -> tuple[SkinnedBody, float] | None:
-    """The skinned model of the bodies, and how far it misses their meshes at most [m].
+def skin_of(pose: BodyPose, bodies: Bodies) -> SkinnedBody | None:
+    """The skinned model of the bodies.
 
     None if the model is not skinned, has other vertices, or other joints than SMPL-X.
     """
-    model = load_model(motion.pose.model, motion.pose.gender)
+    model = load_model(pose.model, pose.gender)
     if not isinstance(model, SkinnedBody) or len(model.parents) != 55:
         return None
-    if len(model.verts) != bodies.verts.shape[1]:
-        return None
+    return model if len(model.verts) == bodies.verts.shape[1] else None
+
+
+def misses(motion: Motion, model: SkinnedBody, bodies: Bodies) -> float:
+    """How far a skinned model in this motion is off the meshes at most [m]."""
     worst = 0.0
     for rows in torch.arange(len(bodies.verts)).split(128):
         verts, joints = model.posed(rows_of(motion.pose, rows))
         root = joints[:, :1]
         sized = root + motion.size[rows, None, None] * (verts - root)
         worst = max(worst, float((sized - bodies.verts[rows]).norm(dim=-1).max()))
-    return model, worst
+    return worst
 
 
 def rows_of(pose: BodyPose, rows: Tensor) -> BodyPose:

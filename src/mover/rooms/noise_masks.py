@@ -16,10 +16,18 @@ def grown(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]
 
     if pixels == 0 or not mask.any() or mask.all():
         return mask
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    pad = abs(pixels) + 1
+    window = np.s_[
+        max(0, rows[0] - pad) : rows[-1] + pad + 1, max(0, cols[0] - pad) : cols[-1] + pad + 1
+    ]
+    part = mask[window]
+    out = np.zeros_like(mask)
     if pixels > 0:
-        return np.asarray(distance_transform_edt(~mask)) <= pixels
-    shrunk = np.asarray(distance_transform_edt(mask)) > -pixels
-    return shrunk if shrunk.any() else mask
+        out[window] = np.asarray(distance_transform_edt(~part)) <= pixels
+    else:
+        out[window] = np.asarray(distance_transform_edt(part)) > -pixels
+    return out if out.any() else mask
 
 
 def noisy_people(

@@ -121,6 +121,15 @@ def skinned(
     return model.posed(angles(person, posture))[0].numpy()
 
 
+def jointed(person: Person, posture: Posture) -> Float[np.ndarray, "frames 22 3"]:
+    """The joints of the body in the frame of the floor [m]."""
+    model = open_body()
+    few = dataclasses.replace(
+        model, verts=model.verts[:1], weights=model.weights[:1], shape_dirs=model.shape_dirs[:1]
+    )
+    return few.posed(angles(person, posture))[1][:, :22].numpy()
+
+
 def chest_of(person: Person, posture: Posture) -> tuple[np.ndarray, np.ndarray]:
     """Rotation of the chest, and the places of both shoulders [m]."""
     turns, place = _trunk(person, posture)

@@ -1,5 +1,7 @@
 """Known rooms: drawn from a seed, or composed by hand for the demo."""
 
+import dataclasses
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -9,11 +11,15 @@ from ..furniture import make_piece
 from ..types import Mesh
 from .compose import Plan, draw_plan, make_view
 from .known import Actor, KnownRoom, RefusedError, RoomConfig, build
-from .motion import Stage, Stop, Task, perform
+from .motion import Performance, Stage, Stop, Task, perform
 from .person import make_person
 from .placed import Placed
+from .poses import jointed, rows
 from .render import draw_bodies, see
 from .scripts import draw_person, draw_start, draw_tasks
+
+CLEAR = 0.25  # [m], between the joints of two people
+MOST_WAIT = 24.0  # [s], before somebody begins
 
 
 def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
@@ -45,17 +51,60 @@ def _cast(
     if len(plan.pieces) < config.least_pieces:
         raise RefusedError(f"only {len(plan.pieces)} pieces fit")
     actors: list[Actor] = []
-    bounds = np.stack([plan.walls[0] + 0.25, plan.walls[1] - 0.25])
-    for _ in range(config.people):
-        stage = Stage(make_person(draw_person(rng)), plan.pieces, bounds, config.fps)
-        try:
-            tasks, start = draw_tasks(plan, rng, config.stay), draw_start(plan, rng)
-        except ValueError as error:
-            raise RefusedError(str(error)) from error
-        performance = perform(stage, tasks, start, rng)
-        refused += performance.refused
-        actors.append(Actor(stage, performance))
+    for _ in range(6 * config.people):
+        if len(actors) == config.people:
+            break
+        actor = _actor(plan, config, rng)
+        wait = patience(actor, actors)
+        if wait is not None:
+            refused += actor.performance.refused
+            actors.append(dataclasses.replace(actor, performance=late(actor.performance, wait)))
+    if len(actors) < config.people:
+        raise RefusedError("people run into each other")
     return tuple(actors)
+
+
+def _actor(plan: Plan, config: RoomConfig, rng: np.random.Generator) -> Actor:
+    """Somebody of a random shape who does random things."""
+    bounds = np.stack([plan.walls[0] + 0.25, plan.walls[1] - 0.25])
+    stage = Stage(make_person(draw_person(rng)), plan.pieces, bounds, config.fps)
+    try:
+        tasks, start = draw_tasks(plan, rng, config.stay), draw_start(plan, rng)
+    except ValueError as error:
+        raise RefusedError(str(error)) from error
+    return Actor(stage, perform(stage, tasks, start, rng))
+
+
+def patience(newcomer: Actor, others: list[Actor]) -> int | None:
+    """Fewest frames to stand still first so that joints of two people keep `CLEAR`; None: never."""
+    if not others:
+        return 0
+    own = jointed(newcomer.stage.person, newcomer.performance.posture)
+    theirs = [jointed(o.stage.person, o.performance.posture) for o in others]
+    for wait in range(0, int(MOST_WAIT * newcomer.stage.fps) + 1, 2):
+        mine = np.concatenate([np.repeat(own[:1], wait, axis=0), own])
+        if all(_clear(mine, joints) for joints in theirs):
+            return wait
+    return None
+
+
+def _clear(a: np.ndarray, b: np.ndarray) -> bool:
+    frames = min(len(a), len(b))
+    middle = np.linalg.norm(a[:frames, 0] - b[:frames, 0], axis=-1)
+    near = np.flatnonzero(middle < 2.0)
+    gap = np.linalg.norm(a[near, :, None] - b[near, None], axis=-1)
+    return bool(gap.size == 0 or gap.min() > CLEAR)
+
+
+def late(performance: Performance, wait: int) -> Performance:
+    """The same, after standing still for so many frames."""
+    order = np.maximum(np.arange(-wait, len(performance.labels)), 0)
+    return Performance(
+        rows(performance.posture, order),
+        ("stand",) * wait + performance.labels,
+        (-1,) * wait + performance.touched,
+        performance.refused,
+    )
 
 
 _DEMO: tuple[tuple[str, str, int, int, tuple[float, float, float]], ...] = (

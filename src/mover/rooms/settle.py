@@ -42,6 +42,12 @@ def part(name: str) -> Bool[np.ndarray, " verts"]:
     return np.isin(joint, wanted)
 
 
+def part_of(vertex: int) -> str:
+    """Name of the joint that moves a vertex most."""
+    model = open_body()
+    return model.joint_names[int(model.weights[vertex].argmax())]
+
+
 def gap(person: Person, posture: Posture, piece: Placed, group: str) -> float:
     """Distance from a part of the body (one frame) to a piece; negative: inside [m]."""
     return float(distances(piece, skinned(person, posture, part(group))[0], 0.6).min())

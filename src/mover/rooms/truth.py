@@ -7,7 +7,7 @@ from ..records import record
 from .person import Person
 from .placed import Placed, distances
 from .poses import Posture, skinned
-from .settle import part
+from .settle import part, part_of
 
 SINK = 0.02  # [m], deeper no body may be inside a piece
 GAPE = 0.01  # [m], farther no touch may be off
@@ -56,9 +56,11 @@ def faults(
     flat = skin.reshape(-1, 3)
     found: list[str] = []
     for piece in pieces:
-        deep = -float(distances(piece, flat).min())
+        near = distances(piece, flat)
+        deep = -float(near.min())
         if deep > SINK:
-            found.append(f"{label}: {100 * deep:.1f} cm inside {piece.id}")
+            where = part_of(int(near.argmin()) % skin.shape[1])
+            found.append(f"{label}: {where} {100 * deep:.1f} cm inside {piece.id}")
     for name in RESTS.get(label, ()):
         mask = part(name)
         near = distances(pieces[index], skin[:, mask].reshape(-1, 3)).reshape(len(skin), -1).min(1)

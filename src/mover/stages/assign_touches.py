@@ -19,9 +19,11 @@ from ..bodies.touch import headings, postures
 from ..geometry.camera import project, to_camera
 from ..geometry.mesh import vertex_normals
 from ..geometry.placement import place
+from ..minimize import Observer, silent
 from ..records import record
 from ..terms.contact import Touches
 from ..types import Bodies, Camera, Layout, Objects
+from .small import small_boxes, small_camera, small_masks
 from .thin_points import thin
 
 GROUPS = (
@@ -56,7 +58,7 @@ class AssignConfig:
 
 @record
 class TouchInputs:
-    """Bodies in the world and the objects in a small image."""
+    """Bodies in the world and the objects in the image."""
 
     bodies: Bodies
     probability: Float[Tensor, "bodies verts"]
@@ -79,27 +81,46 @@ class _Contacts:
     hand: Bool[Tensor, " rows"]
 
 
+@record
+class Contacts:
+    """Who touches what."""
+
+    touches: Touches | None
+    """Contact points of each object; None: nothing is touched."""
+    seated_on: Bool[Tensor, " bodies"]
+    """Bodies whose seat or back touches an object."""
+    touched_in: tuple[int, ...]
+    """Number of bodies that touch each object."""
+
+
 def assign_touches(
-    inputs: TouchInputs, config: AssignConfig
-) -> tuple[Touches | None, Bool[Tensor, " bodies"]]:
-    """Contact points of each object (None: nothing is touched); and who sits or leans on one."""
+    inputs: TouchInputs, config: AssignConfig, observe: Observer = silent
+) -> Contacts:
+    """Give each touching part of each body to the object that it touches."""
+    del observe
     found = [c for c in _contacts(inputs, config) if len(c.body)]
     seated = torch.zeros(len(inputs.bodies.frame), dtype=torch.bool)
+    counts = [0] * len(inputs.objects.ids)
     if not found:
-        return None, seated
+        return Contacts(None, seated, tuple(counts))
     names = ("body", "vert", "object_of", "hand")
     rows = _Contacts(*(torch.cat([getattr(c, n) for c in found]) for n in names))
     seated[rows.body[~rows.hand]] = True
-    return _pack(rows, inputs, config), seated
+    touches = _pack(rows, inputs, config)
+    for i, bodies in zip(touches.object_of.tolist(), touches.bodies.tolist(), strict=True):
+        counts[i] = int(bodies)
+    return Contacts(touches, seated, tuple(counts))
 
 
 def _contacts(inputs: TouchInputs, config: AssignConfig) -> Iterator[_Contacts]:
-    masks = _filled(inputs.masks, inputs.boxes)
+    camera = small_camera(inputs.camera)
+    boxes = small_boxes(inputs.boxes, inputs.camera)
+    masks = _filled(small_masks(inputs.masks, inputs.camera), boxes)
     grown = torch.nn.functional.max_pool2d(masks.float().unsqueeze(1), 7, 1, 3).squeeze(1) > 0
     regions = place(inputs.objects.top, inputs.layout), place(inputs.objects.back, inputs.layout)
     for body in range(len(inputs.bodies.frame)):  # one body at a time: memory stays that of one
         points = inputs.bodies.verts[body]
-        pixels = project(to_camera(points, inputs.camera.R_cam_world), inputs.camera.K).long()
+        pixels = project(to_camera(points, camera.R_cam_world), camera.K).long()
         for group, names in enumerate(GROUPS):
             mine = torch.isin(inputs.parts.part_of, torch.tensor([PARTS.index(n) for n in names]))
             verts = (mine & (inputs.probability[body] > config.chance)).nonzero()[:, 0]

@@ -3,13 +3,12 @@
 The cost of placing the objects then does not grow with the video.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
-from ..bodies.parts import Parts
 from ..energy import HumanCues
 from ..geometry.camera import to_camera
 from ..geometry.crops import sample_nearest
@@ -21,9 +20,9 @@ from ..terms.bbox import WIDTH
 from ..terms.collision import BodySpace
 from ..terms.contact import Touches
 from ..terms.depth import DepthMaps, DepthRange, Seen, bounds_of, merge
-from ..types import Bodies, Camera, Layout, Objects, People
-from .assign_touches import AssignConfig, TouchInputs, assign_touches
+from ..types import Bodies, Camera, People
 from .person_masks import MaskTable, mask_table
+from .small import small_camera, small_masks, small_views
 
 BLOCK = 8  # bodies that are drawn at once
 
@@ -42,25 +41,18 @@ class GatherConfig:
     """Space around the bodies in the volume [m]."""
     workers: int = 2
     """Threads that measure distances; the result does not depend on it."""
-    touches: AssignConfig = field(default_factory=AssignConfig)
 
 
 @record
 class GatherInputs:
-    """People, masks and the room as it stands."""
+    """People and masks."""
 
     bodies: Bodies
     """The selected bodies, in the world."""
-    probability: Float[Tensor, "bodies verts"]
-    """Chance that a vertex touches."""
-    parts: Parts
     people: People | None
     masks: Bool[Tensor, "objects h w"]
     """Of the objects in the clean image; empty where only the box is known."""
-    boxes: Float[Tensor, "objects 4"]
     camera: Camera
-    objects: Objects
-    layout: Layout
 
 
 @record
@@ -69,45 +61,28 @@ class Cues:
 
     maps: DepthMaps | None
     space: BodySpace
-    touches: Touches | None
-    seated_on: Bool[Tensor, " bodies"]
-    """Bodies whose seat or back touches an object."""
-    touched_in: tuple[int, ...]
-    """Number of bodies that touch each object."""
     near_pixels: tuple[int, ...]
     far_pixels: tuple[int, ...]
     """Bounded pixels (of an image 640 wide) inside each object's mask."""
 
 
 def gather_cues(inputs: GatherInputs, config: GatherConfig, observe: Observer = silent) -> Cues:
-    """Two depth maps, one distance volume and one set of contact points from all frames."""
-    views = _small_views(inputs.camera)
-    masks = _small(inputs.masks, views)
+    """Two depth maps and one distance volume from all frames."""
+    masks = small_masks(inputs.masks, inputs.camera)
     maps = _depth_maps(inputs, config, observe)
-    space = _space(inputs, config, observe)
-    touches, seated = assign_touches(
-        TouchInputs(
-            inputs.bodies, inputs.probability, inputs.parts, masks, _small_boxes(inputs, views),
-            to_small(inputs.camera, views), inputs.objects, inputs.layout,
-        ),
-        config.touches,
-    )  # fmt: skip
-    counts = torch.zeros(len(masks))
-    if touches is not None:
-        counts[touches.object_of] = touches.bodies
     near = far = torch.zeros(len(masks))
     if maps is not None:
         near = (masks & maps.near.isfinite()).sum((-2, -1))
         far = (masks & maps.far.isfinite()).sum((-2, -1))
-    whole = [tuple(int(v) for v in row.tolist()) for row in (counts, near, far)]
-    return Cues(maps, space, touches, seated, whole[0], whole[1], whole[2])
+    whole = [tuple(int(v) for v in row.tolist()) for row in (near, far)]
+    return Cues(maps, _space(inputs, config, observe), whole[0], whole[1])
 
 
-def cues_in_windows(cues: Cues, views: Views, camera: Camera) -> HumanCues:
+def cues_in_windows(cues: Cues, touches: Touches | None, views: Views, camera: Camera) -> HumanCues:
     """The evidence as the terms want it: depth bounds sampled in the objects' windows."""
     depth = None
     if cues.maps is not None:
-        K = to_small(camera, _small_views(camera)).K
+        K = small_camera(camera).K
         lowest = float("-inf")
         scale = WIDTH / camera.width * camera.K[0, 0] / views.K[:, 0, 0]
         depth = DepthRange(
@@ -116,39 +91,14 @@ def cues_in_windows(cues: Cues, views: Views, camera: Camera) -> HumanCues:
             sample_nearest(cues.maps.free, views, K, lowest),
             scale.square(),
         )
-    return HumanCues(depth, cues.space, cues.touches)
-
-
-def to_small(camera: Camera, views: Views) -> Camera:
-    """The camera of an image of the views' size."""
-    return replace(camera, K=views.K[0], width=views.width, height=views.height)
-
-
-def _small_views(camera: Camera) -> Views:
-    zoom = min(1.0, WIDTH / camera.width)
-    width, height = max(1, round(camera.width * zoom)), max(1, round(camera.height * zoom))
-    zooms = torch.tensor([width / camera.width, height / camera.height, 1.0]).to(camera.K)
-    return Views((camera.K * zooms.unsqueeze(-1)).unsqueeze(0), height, width)
-
-
-def _small(masks: Bool[Tensor, "rows h w"], views: Views) -> Bool[Tensor, "rows sh sw"]:
-    """Masks at the views' size, by their nearest pixel."""
-    height, width = masks.shape[-2:]
-    rows = ((torch.arange(views.height) + 0.5) * height / views.height).long()
-    columns = ((torch.arange(views.width) + 0.5) * width / views.width).long()
-    return masks[:, rows][:, :, columns]
-
-
-def _small_boxes(inputs: GatherInputs, views: Views) -> Float[Tensor, "objects 4"]:
-    zoom = [views.width / inputs.camera.width, views.height / inputs.camera.height]
-    return inputs.boxes * inputs.boxes.new_tensor(zoom * 2)
+    return HumanCues(depth, cues.space, touches)
 
 
 def _depth_maps(inputs: GatherInputs, config: GatherConfig, observe: Observer) -> DepthMaps | None:
     if inputs.people is None:
         return None
-    views, bodies = _small_views(inputs.camera), inputs.bodies
-    masks = _small(inputs.masks, views)
+    views, bodies = small_views(inputs.camera), inputs.bodies
+    masks = small_masks(inputs.masks, inputs.camera)
     table: MaskTable = mask_table(inputs.people, bodies)
     blank = torch.full((views.height, views.width), float("inf"))
     maps = DepthMaps(-blank, blank, -blank)
@@ -160,7 +110,7 @@ def _depth_maps(inputs: GatherInputs, config: GatherConfig, observe: Observer) -
         drawn = layers(verts, bodies.faces, many)
         for k, row in enumerate(block.tolist()):  # frames are streamed: memory stays that of one
             visible, others = table.decode(row)
-            small = _small(torch.stack([visible, others]), views)
+            small = small_masks(torch.stack([visible, others]), inputs.camera)
             seen = Seen(drawn.front[k], drawn.exit[k], small[0], small[1])
             maps = merge(maps, bounds_of(seen, masks, config.erode, vote=config.vote))
         observe(Step("gather_cues: depth", begin, len(rows)))

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..geometry.rotations import wrap
+from ..terms.contact import Touches
 from ..types import Layout
 
 TURNED = math.radians(20)  # candidates nearer than this in yaw,
@@ -77,3 +78,34 @@ def choose(
     rank = (energy + 0.01) * (1 + tie * turned / 2)
     best = pick(layout, rank.argmin(0, keepdim=True))
     return Layout(best.t_world_object[0], best.yaw[0], best.log_scale[0])
+
+
+def alone(layout: Layout) -> Layout:
+    """One layout as the only start."""
+    return Layout(layout.t_world_object[None], layout.yaw[None], layout.log_scale[None])
+
+
+def first(layout: Layout, count: int) -> Layout:
+    """The first of the starts."""
+    return Layout(layout.t_world_object[:count], layout.yaw[:count], layout.log_scale[:count])
+
+
+def joined(a: Layout, b: Layout) -> Layout:
+    """All starts of both."""
+    return Layout(
+        torch.cat([a.t_world_object, b.t_world_object]),
+        torch.cat([a.yaw, b.yaw]),
+        torch.cat([a.log_scale, b.log_scale]),
+    )
+
+
+def reference_yaw(
+    initial: Float[Tensor, " objects"], touches: Touches | None
+) -> Float[Tensor, " objects"]:
+    """Yaw of the sitters of used seats, else the initial one [rad]."""
+    yaw = initial.clone()
+    if touches is not None:
+        x, z = touches.heading.unbind(-1)
+        seated = (x.abs() + z.abs()) > 0
+        yaw[touches.object_of[seated]] = torch.atan2(x, z)[seated]
+    return yaw
