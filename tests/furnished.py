@@ -39,11 +39,11 @@ def furnished(
     return Scene(camera(), ground, tuple(pieces))
 
 
-def moving_pose(frames: int, person: int = 0) -> BodyPose:
+def moving_pose(frames: int, person: int = 0, pace: float = 1.0) -> BodyPose:
     """Angles that swing, of another rhythm in each joint, on a curved way."""
     model = open_body()
     pose = zero_pose(frames, model)
-    time = torch.arange(frames) / FPS
+    time = pace * torch.arange(frames) / FPS
     rhythm = 1 + torch.arange(63) % 5
     body = 0.25 * torch.sin(rhythm * time[:, None] + torch.arange(63))
     hand = 0.1 * torch.sin(2 * time[:, None] + torch.arange(45))

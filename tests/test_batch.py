@@ -243,6 +243,12 @@ def test_a_list_without_captures_or_with_one_twice_is_refused(tmp_path: Path, te
         captures_in(listing)
 
 
+def test_a_capture_in_place_of_a_list_is_told_apart(tmp_path: Path):
+    write_capture(tmp_path / "room")
+    with pytest.raises(InputError, match="is a capture"):
+        captures_in(tmp_path / "room")
+
+
 def test_captures_of_one_name_get_different_folders():
     names = names_of([Path("/a/room"), Path("/b/room"), Path("/b/hall"), Path("/b/failures")])
     assert names[2] == "hall"
@@ -268,7 +274,8 @@ def test_other_engines_give_what_the_local_one_gives(tmp_path: Path, engine: str
     package = {"ray": "ray", "slurm": "submitit"}[engine]
     if importlib.util.find_spec(package) is None:
         pytest.skip(f"needs the extra {engine}")
-    captures = fakes(tmp_path, 6, {1: "refuse", 2: "crash", 3: "slow"})
+    count = {"ray": 40, "slurm": 6}[engine]
+    captures = fakes(tmp_path, count, {1: "refuse", 2: "crash", 3: "slow"})
     here = plan_of(tmp_path, captures, 3.0)
     there = BatchPlan(captures, tmp_path / "there", here.command, "settings", 3.0)
     local = run_here(here)

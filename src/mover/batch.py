@@ -51,6 +51,8 @@ def captures_in(listing: Path, out: Path | None = None) -> tuple[Path, ...]:
         InputError: If there are none, or one is listed twice.
     """
     if listing.is_dir():
+        if (listing / "camera.json").is_file():
+            raise InputError(f"{listing}: is a capture, expected a folder or list of captures")
         found = [p for p in sorted(listing.iterdir()) if p.is_dir() and p.name[0] not in "._"]
         found = [p.resolve() for p in found if out is None or p.resolve() != out.resolve()]
     elif listing.is_file():

@@ -30,6 +30,7 @@ class Tally:
         self._before = self._done = len(before)
         self._begin = self._said = time.monotonic()
         self._console = Console(file=sys.stderr)
+        self._live = self._console.is_terminal and not quiet
         self._progress = Progress(
             TextColumn("captures"), BarColumn(), MofNCompleteColumn(),
             TextColumn("{task.fields[failed]} failed"), TimeElapsedColumn(),
@@ -39,7 +40,7 @@ class Tally:
         self._task = self._progress.add_task("", total=total, failed=self._failed)
 
     def __enter__(self) -> "Tally":
-        if self._console.is_terminal and not self._quiet:
+        if self._live:
             self._progress.update(self._task, completed=self._done)
             self._progress.start()
         elif not self._quiet and self._before:
@@ -52,7 +53,8 @@ class Tally:
         value: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._progress.stop()
+        if self._live:
+            self._progress.stop()
 
     def add(self, outcome: Outcome) -> None:
         """Count one more."""

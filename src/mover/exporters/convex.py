@@ -140,7 +140,7 @@ def _hull(points: NDArray[np.float64]) -> Any:  # noqa: ANN401
             found = ConvexHull(cloud)
         except QhullError:
             continue
-        if found.volume > 1e-9 or grow:
+        if grow or 2 * found.volume > THINNEST * found.area / 2:
             break
     else:
         raise AssertionError("a thickened cloud has a hull")

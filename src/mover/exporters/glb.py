@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..export import write_glb
+from ..records import InputError
 from ..report_colours import person_colour
 from ..types import Bodies
 from .finished import Exported, Finished
@@ -28,6 +29,9 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
         body: How people move: on the bones of their model (skin: small, a copy within 2 cm), by
             shapes of chosen frames (morph: those are exact), or not at all (none); auto: on bones
             where the parameters are known.
+
+    Raises:
+        InputError: If bones are asked for and there are none.
     """
     path = write_glb(finished.scene, None, folder / "scene.glb")
     bodies = finished.bodies
@@ -35,7 +39,10 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
         return Exported((path,), ("no people",))
     skin = _fit(finished) if body in ("auto", "skin") else "morph was asked for"
     document = Document(path.read_bytes())
-    notes = [f"frame k of the video is at {1 / (bodies.fps or FPS):g} k seconds"]
+    first, step = int(bodies.frame.min()), 1 / (bodies.fps or FPS)
+    notes = [f"frame {first} of the video is at 0 s, each next one {step:g} s later"]
+    if isinstance(skin, str) and body == "skin":
+        raise InputError(f"--body skin: {skin}")
     if isinstance(skin, str):
         notes += [] if body == "morph" else [f"people move by shapes, not on bones: {skin}"]
     else:

@@ -56,7 +56,9 @@ def mjcf_of(
     SubElement(option, "flag", multiccd="enable")
     _add_defaults(root)
     asset, world = SubElement(root, "asset"), SubElement(root, "worldbody")
-    SubElement(world, "light", pos="0 0 4", dir="0 0 -1", diffuse="0.8 0.8 0.8")
+    lamp = {"ambient": "0.4 0.4 0.4", "diffuse": "0.5 0.5 0.5"}
+    SubElement(SubElement(root, "visual"), "headlight", lamp)
+    SubElement(world, "light", pos="0 0 4", dir="0 0 -1", diffuse="0.5 0.5 0.5")
     _add_camera(world, scene.camera, floor_height(scene))
     size = _reach(solids)
     ground = {"name": "ground", "type": "plane", "size": f"{size:g} {size:g} 0.1"}

@@ -95,7 +95,7 @@ def _stretched(person: Person, pelvis: np.ndarray, turn: np.ndarray, place: Bert
         toes=np.zeros((1, 2)),
         knees=knees,
         wrists=zero + np.array([0.0, -0.4, 0.1]),
-        elbows=np.array([[[0.7, -0.3, 0.1], [-0.7, -0.3, 0.1]]]),
+        elbows=np.array([[[0.3, 0.0, 1.0], [-0.3, 0.0, 1.0]]]),
         palms=zero,
         resting=np.zeros((1, 2)),
     )
@@ -153,24 +153,26 @@ def on_side(person: Person, back: Posture, place: Berth, piece: Placed) -> Postu
         knees=np.repeat((towards + 0.15 * UP)[None, None], 2, axis=1),
     )  # fmt: skip
     side = laid(person, side, piece, "torso")
-    high = (
-        np.array([[[0, 0.12, 0], [0, 0, 0]]]) if sign < 0 else np.array([[[0, 0, 0], [0, 0.12, 0]]])
-    )
+    lower = 0 if sign > 0 else 1
+    high = np.zeros((1, 2, 3))
+    high[0, 1 - lower, 1] = 0.12
     side = _heels_down(person, side, place)
     side = dataclasses.replace(side, ankles=side.ankles + high)
-    return _head_down(person, _hands_before(person, side, place, towards), piece)
+    return _head_down(person, _hands_before(person, side, place, lower), piece)
 
 
-def _hands_before(person: Person, lying: Posture, place: Berth, towards: np.ndarray) -> Posture:
-    """Both hands on the surface before the chest."""
-    along = facing(np.array(place.head))
-    reach = min(0.32, place.behind - 0.02)
+def _hands_before(person: Person, lying: Posture, place: Berth, lower: int) -> Posture:
+    """Both hands on the surface before the chest, the `lower` arm stretched, elbows off it."""
+    head, edge = facing(np.array(place.head)), facing(np.array(place.spot.heading))
     palms = np.zeros((1, 2, 3))
     for k in range(2):
-        far = (0.3 + 0.12 * k) * np.array([along[0], 0, along[1]])
-        palms[:, k] = lying.pelvis + reach * towards + far
+        ahead, along = (0.4, 0.5) if k == lower else (0.28, 0.24)
+        flat = min(ahead, place.behind - 0.02) * edge + along * head
+        palms[:, k] = lying.pelvis + np.array([flat[0], 0, flat[1]])
         palms[:, k, 1] = place.spot.height + palm_height(person)
-    elbows = np.array([[[0.0, -1.0, 0.5], [0.0, -1.0, 0.5]]])
+    chest, _ = chest_of(person, lying)
+    up = apply(np.swapaxes(chest, 1, 2), UP[None])
+    elbows = np.stack([up, up], 1)
     return dataclasses.replace(lying, palms=palms, resting=np.ones((1, 2)), elbows=elbows)
 
 
@@ -195,7 +197,10 @@ def roll_over(
     """From one way of lying to another, always resting on the piece."""
     hands = end.resting[..., None] > 0
     start = dataclasses.replace(start, palms=np.where(hands, end.palms, start.palms))
-    return laid(person, blend(start, end, smooth(share)), piece, "torso")
+    posture = blend(start, end, smooth(share))
+    rise = 0.06 * np.sin(np.pi * np.clip(share, 0, 1))[:, None, None] * UP
+    posture = dataclasses.replace(posture, palms=posture.palms + rise)
+    return laid(person, posture, piece, "torso")
 
 
 def _lifted(person: Person, posture: Posture, piece: Placed) -> Posture:

@@ -6,8 +6,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
+from ..geometry.runs import decode
 from ..types import Detection, Masks, People
-from .render import decode, encode
+from .render import encode
 
 
 def grown(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
@@ -39,7 +40,7 @@ def noisy_people(
     count = len(people.frame)
     off = rng.integers(1, max(1, most) + 1, count) * rng.choice([-1, 1], count) * (most > 0)
     keep = np.flatnonzero(rng.uniform(size=count) >= missed)
-    masks = [grown(decode(people.masks, int(k)), int(off[k])) for k in keep]
+    masks = [grown(decode(people.masks, int(k)).numpy(), int(off[k])) for k in keep]
     rows = torch.from_numpy(keep)
     size = (people.masks.height, people.masks.width)
     coded = encode(masks) if masks else Masks(*size, ())
@@ -56,7 +57,7 @@ def noisy_detections(
         if one.mask is None or off == 0:
             out.append(one)
             continue
-        mask = grown(decode(one.mask, 0), off)
+        mask = grown(decode(one.mask, 0).numpy(), off)
         out.append(dataclasses.replace(one, mask=encode([mask]), box=box_of_mask(mask)))
     return tuple(out)
 

@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 
 from ..bodies import open_body
+from ..geometry.runs import decode
 from ..records import map_tensors
 from ..types import Bodies, BodyPose
 from .known import KnownRoom, rounded
 from .noise_config import NoiseConfig
-from .render import decode, see_body
+from .render import see_body
 from .turns import from_vector, to_vector
 
 
@@ -69,7 +70,7 @@ def hidden_rows(room: KnownRoom) -> Bool[np.ndarray, " bodies"]:
     out = np.zeros(len(room.bodies.frame), dtype=bool)
     for row, verts in enumerate(room.bodies.verts):
         whole = int(see_body(room.plan, verts, room.bodies.faces)[0].isfinite().sum())
-        out[row] = decode(people.masks, row).sum() < 0.5 * max(whole, 1)
+        out[row] = int(decode(people.masks, row).sum()) < 0.5 * max(whole, 1)
     return out
 
 

@@ -94,7 +94,7 @@ def distances(
 
 
 def free_of(
-    point: Float[np.ndarray, "*any 2"], pieces: tuple[Placed, ...], margin: float
+    point: Float[np.ndarray, "... 2"], pieces: tuple[Placed, ...], margin: float
 ) -> np.ndarray:
     """Whether points of the floor keep `margin` from every footprint [m]."""
     free = np.ones(point.shape[:-1], dtype=bool)

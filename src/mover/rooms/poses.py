@@ -111,7 +111,7 @@ def angles(person: Person, posture: Posture) -> BodyPose:
 
 def skinned(
     person: Person, posture: Posture, part: Bool[np.ndarray, " verts"] | None = None
-) -> Float[np.ndarray, "frames verts 3"]:
+) -> Float[np.ndarray, "frames kept 3"]:
     """The skin, or a part of it, in the frame of the floor [m]."""
     model = open_body()
     if part is not None:

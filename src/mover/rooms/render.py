@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..geometry.camera import to_camera
@@ -44,14 +44,6 @@ def encode(masks: list[np.ndarray]) -> Masks:
     height, width = masks[0].shape
     rows: list[Any] = [coco.encode(np.asfortranarray(m.astype(np.uint8))) for m in masks]
     return Masks(height, width, tuple(bytes(r["counts"]) for r in rows))
-
-
-def decode(masks: Masks, index: int) -> Bool[np.ndarray, "h w"]:
-    """One of the binary images."""
-    from pycocotools import mask as coco
-
-    row: Any = {"size": [masks.height, masks.width], "counts": masks.counts[index]}
-    return np.asarray(coco.decode(row)).astype(bool)
 
 
 def see(plan: Plan) -> Sight:
@@ -170,7 +162,8 @@ def _shadow(plan: Plan, point: np.ndarray) -> np.ndarray:
     for piece in plan.pieces:
         box = corners(piece)
         edges = np.roll(box, -1, axis=0) - box
-        side = np.cross(edges[:, None, None], grid[None] - box[:, None, None])
+        off = grid[None] - box[:, None, None]
+        side = edges[:, None, None, 0] * off[..., 1] - edges[:, None, None, 1] * off[..., 0]
         dark = np.maximum(dark, ((side >= 0).all(0) | (side <= 0).all(0)).astype(float))
     blurred = 0.55 * gaussian_filter(dark, 2.0) + 0.45 * gaussian_filter(dark, 7.0)
     at = np.moveaxis((point[..., [0, 2]] - low) / cell, -1, 0)

@@ -11,7 +11,7 @@ STEP = 0.5  # [m], length of an indoor step
 STEP_TIME = 0.5  # [s]
 TURN = np.radians(40)  # [rad], of one step on the spot
 
-Floor = Float[np.ndarray, "points 2"]
+Floor = Float[np.ndarray, "_ 2"]
 
 
 @record

@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Float
 
-Turns = Float[np.ndarray, "*frames 3 3"]
-Vectors = Float[np.ndarray, "*frames 3"]
-Angles = Float[np.ndarray, "*frames"]
+Turns = Float[np.ndarray, "... 3 3"]
+Vectors = Float[np.ndarray, "... 3"]
+Angles = Float[np.ndarray, "..."]
 
 X, Y, Z = np.eye(3)
 
@@ -62,16 +62,16 @@ def smooth(share: Angles) -> Angles:
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 
-def heading_of(direction: Float[np.ndarray, "*any 2"]) -> Float[np.ndarray, "*any"]:
+def heading_of(direction: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
     """Angle about +y that turns +z into a direction on the floor (x, z) [rad]."""
-    return np.arctan2(direction[..., 0], direction[..., 1])
+    return np.asarray(np.arctan2(direction[..., 0], direction[..., 1]))
 
 
-def facing(heading: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any 2"]:
+def facing(heading: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 2"]:
     """Direction on the floor (x, z) of a heading."""
     return np.stack([np.sin(heading), np.cos(heading)], -1)
 
 
-def left_of(heading: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any 2"]:
+def left_of(heading: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 2"]:
     """Direction on the floor (x, z) to the left of a heading."""
     return np.stack([np.cos(heading), -np.sin(heading)], -1)

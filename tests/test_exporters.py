@@ -1,0 +1,442 @@
+"""Exports, read back by other programs or by a few naive lines: everything is where it was."""
+
+import dataclasses
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from furnished import (
+    bodies_of,
+    furnished,
+    moving_pose,
+    similar,
+    two_people,
+    write_out,
+)
+from little_room import walkers
+
+import mover.exporters.pxr_modules
+from mover.bodies import open_body
+from mover.commands import run_command
+from mover.exporters import (
+    EXPORTERS,
+    Finished,
+    export_bodies,
+    export_glb,
+    export_objects,
+    export_usd,
+    read_finished,
+)
+from mover.exporters.keyframes import keyframes
+from mover.geometry.placement import place_piece
+from mover.records import InputError
+from mover.types import Bodies, BodyPose, Piece, Scene
+
+TYPES = {5126: np.float32, 5125: np.uint32, 5123: np.uint16, 5121: np.uint8}
+WIDTH = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
+
+def scaled(scene: Scene) -> Scene:
+    pieces = [
+        dataclasses.replace(p, scale=torch.tensor([1.2, 0.9, 1.1]) + 0.05 * k)
+        for k, p in enumerate(scene.pieces)
+    ]
+    return dataclasses.replace(scene, pieces=tuple(pieces))
+
+
+def finished(tmp_path: Path, bodies: Bodies | None = None) -> Finished:
+    return read_finished(write_out(tmp_path / "out", scaled(furnished()), bodies))
+
+
+def world(piece: Piece) -> np.ndarray:
+    verts = place_piece(piece).verts.numpy()
+    return np.stack([verts.min(0), verts.max(0)])
+
+
+class Glb:
+    """A naive reader of animated glTF: the formulas of its specification, one node at a time."""
+
+    def __init__(self, path: Path) -> None:
+        raw = path.read_bytes()
+        size = struct.unpack("<I", raw[12:16])[0]
+        self.tree = json.loads(raw[20 : 20 + size])
+        self.block = raw[28 + size :]
+        self.parent = {
+            c: k for k, node in enumerate(self.tree["nodes"]) for c in node.get("children", [])
+        }
+
+    def array(self, index: int) -> np.ndarray:
+        accessor = self.tree["accessors"][index]
+        view = self.tree["bufferViews"][accessor["bufferView"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        kind, width = TYPES[accessor["componentType"]], WIDTH[accessor["type"]]
+        flat = np.frombuffer(self.block, kind, accessor["count"] * width, start)
+        return flat if width == 1 else flat.reshape(-1, width)
+
+    def named(self, name: str) -> int:
+        return next(k for k, n in enumerate(self.tree["nodes"]) if n.get("name") == name)
+
+    def value(self, node: int, path: str, time: float, rest: Any) -> np.ndarray:
+        """What a channel says at a time, or the node itself."""
+        for animation in self.tree.get("animations", []):
+            for channel in animation["channels"]:
+                if channel["target"] == {"node": node, "path": path}:
+                    found = self.sampled(animation["samplers"][channel["sampler"]], time)
+                    return found / np.linalg.norm(found) if path == "rotation" else found
+        return np.array(self.tree["nodes"][node].get(path, rest), float)
+
+    def sampled(self, sampler: dict[str, Any], time: float) -> np.ndarray:
+        times, values = self.array(sampler["input"]), self.array(sampler["output"])
+        values = values.reshape(len(times), -1).astype(float)
+        after = int(np.searchsorted(times, time + 1e-6))
+        if after == 0 or after == len(times):
+            return values[min(after, len(times) - 1)]
+        if sampler["interpolation"] == "STEP":
+            return values[after - 1]
+        share = (time - times[after - 1]) / (times[after] - times[after - 1])
+        return (1 - share) * values[after - 1] + share * values[after]
+
+    def matrix(self, node: int | None, time: float) -> np.ndarray:
+        if node is None:
+            return np.eye(4)
+        tree = self.tree["nodes"][node]
+        if "matrix" in tree:
+            local = np.array(tree["matrix"]).reshape(4, 4).T
+        else:
+            x, y, z, w = self.value(node, "rotation", time, [0, 0, 0, 1])
+            turn = trimesh.transformations.quaternion_matrix([w, x, y, z])[:3, :3]
+            local = np.eye(4)
+            local[:3, :3] = turn * self.value(node, "scale", time, [1, 1, 1])
+            local[:3, 3] = self.value(node, "translation", time, [0, 0, 0])
+        return self.matrix(self.parent.get(node), time) @ local
+
+    def skinned(self, name: str, time: float) -> np.ndarray:
+        node = self.tree["nodes"][self.named(name)]
+        part = self.tree["meshes"][node["mesh"]]["primitives"][0]["attributes"]
+        verts, joints, weights = (
+            self.array(part[key]) for key in ("POSITION", "JOINTS_0", "WEIGHTS_0")
+        )
+        skin = self.tree["skins"][node["skin"]]
+        inverse = self.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+        moves = np.stack([self.matrix(j, time) for j in skin["joints"]]) @ inverse
+        flat = np.concatenate([verts, np.ones((len(verts), 1))], 1)
+        blend = (weights[..., None, None] * moves[joints]).sum(1)
+        return (blend @ flat[..., None])[:, :3, 0]
+
+    def morphed(self, name: str, time: float) -> np.ndarray:
+        node = self.named(name)
+        part = self.tree["meshes"][self.tree["nodes"][node]["mesh"]]["primitives"][0]
+        verts = self.array(part["attributes"]["POSITION"]).astype(float)
+        weights = self.value(node, "weights", time, [])
+        for weight, target in zip(weights, part.get("targets", []), strict=True):
+            verts = verts + weight * self.array(target["POSITION"])
+        flat = np.concatenate([verts, np.ones((len(verts), 1))], 1)
+        return (flat @ self.matrix(node, time).T)[:, :3]
+
+
+def rows(bodies: Bodies, person: int) -> list[tuple[int, float]]:
+    first = int(bodies.frame.min())
+    return [
+        (k, (int(bodies.frame[k]) - first) / (bodies.fps or 5.0))
+        for k in range(len(bodies.frame))
+        if int(bodies.person[k]) == person
+    ]
+
+
+@pytest.mark.parametrize("person", [0, 1])
+def test_bones_carry_the_skin_to_the_result_in_every_frame(tmp_path: Path, person: int):
+    bodies = two_people()
+    found = export_glb(finished(tmp_path, bodies), tmp_path)
+    glb = Glb(found.files[0])
+    worst = max(
+        np.linalg.norm(
+            glb.skinned(f"person_{person}_body", t) - bodies.verts[k].numpy(), axis=1
+        ).max()
+        for k, t in rows(bodies, person)
+    )
+    assert worst < 0.006  # four weights a vertex, where the model has six
+    assert f"{1e3 * worst:.0f} mm" in " ".join(found.notes) or person == 1
+
+
+def test_a_person_is_hidden_while_nobody_sees_them(tmp_path: Path):
+    bodies = two_people()
+    glb = Glb(export_glb(finished(tmp_path, bodies), tmp_path).files[0])
+    seen = [t for _, t in rows(bodies, 1)]
+    gap = int(np.argmax(np.diff(seen)))
+    for time, size in ((0.0, 0.0), (seen[0], 1.0), (seen[gap], 1.0), (seen[gap] + 1.5, 0.0)):
+        assert np.ptp(glb.skinned("person_1_body", time), axis=0).max() > 0.5 or size == 0.0
+        assert glb.matrix(glb.named("person_1"), time)[0, 0] == size
+    assert glb.matrix(glb.named("person_0"), 0.0)[0, 0] == 1.0
+
+
+def test_shapes_are_the_result_at_the_keys_and_near_it_between(tmp_path: Path):
+    bodies = bodies_of(moving_pose(30, pace=0.1))
+    glb = Glb(export_glb(finished(tmp_path, bodies), tmp_path, "morph").files[0])
+    miss = np.array([
+        np.linalg.norm(glb.morphed("person_0_body", t) - bodies.verts[k].numpy(), axis=1).max()
+        for k, t in rows(bodies, 0)
+    ])  # fmt: skip
+    keys = len(glb.tree["meshes"][-1]["primitives"][0]["targets"]) + 1
+    assert (miss < 1e-5).sum() >= keys
+    assert miss.max() < 0.0055
+    assert keys < 30
+
+
+def test_bodies_without_parameters_still_move(tmp_path: Path):
+    bodies = walkers(20, people=2)
+    found = export_glb(finished(tmp_path, bodies), tmp_path)
+    glb = Glb(found.files[0])
+    k, t = rows(bodies, 1)[-1]
+    assert glb.morphed("person_1_body", t) == pytest.approx(bodies.verts[k].numpy(), abs=1e-5)
+    assert "--capture" in " ".join(found.notes)
+
+
+def test_bones_that_are_asked_for_and_not_there_are_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="--body skin"):
+        export_glb(finished(tmp_path, walkers(2)), tmp_path, "skin")
+
+
+def test_parameters_of_the_capture_move_bodies_that_were_turned_and_sized(tmp_path: Path):
+    truth = two_people()
+    scene = scaled(furnished())
+    grown, turn = similar(truth, 1.03)
+    given = dataclasses.replace(truth, space="camera")
+    result = dataclasses.replace(grown, space="world")
+    home = Finished(write_out(tmp_path / "out", scene), scene, result, given)
+    glb = Glb(export_glb(home, tmp_path).files[0])
+    k, t = rows(result, 1)[3]
+    miss = np.linalg.norm(glb.skinned("person_1_body", t) - result.verts[k].numpy(), axis=1)
+    assert miss.max() < 0.006
+    arrays = np.load(export_bodies(home, tmp_path).files[1])
+    assert arrays["size"] == pytest.approx(1.03, abs=1e-4)
+    assert turn.shape == (3, 3)
+
+
+def test_the_validator_of_gltf_finds_nothing(tmp_path: Path):
+    import os
+    import shutil
+    import subprocess
+
+    node = shutil.which("node")
+    script = (
+        "const v=require('gltf-validator'),fs=require('fs');v.validateBytes(new Uint8Array("
+        "fs.readFileSync(process.argv[1]))).then(r=>console.log(JSON.stringify(r.issues)))"
+    )
+    if (
+        node is None
+        or subprocess.run(
+            [node, "-e", "require('gltf-validator')"],
+            capture_output=True,
+            env=os.environ,
+            check=False,
+        ).returncode
+    ):
+        pytest.skip("needs node with the package gltf-validator on NODE_PATH")
+    home = finished(tmp_path, two_people())
+    for form in ("skin", "morph", "none"):
+        path = export_glb(home, tmp_path / form, form).files[0]
+        said = subprocess.run([node, "-e", script, str(path)], capture_output=True, check=True)
+        issues = json.loads(said.stdout)
+        assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"][:3]
+
+
+def test_trimesh_opens_the_file_with_the_objects_in_place(tmp_path: Path):
+    home = finished(tmp_path, two_people(4))
+    scene = trimesh.load_scene(export_glb(home, tmp_path).files[0])
+    for piece in home.scene.pieces:
+        node = next(n for n in scene.graph.nodes_geometry if n.startswith(f"{piece.id}_mesh"))
+        transform, name = scene.graph[node]
+        part = scene.geometry[name].copy().apply_transform(transform)
+        assert part.bounds == pytest.approx(world(piece), abs=1e-5)
+
+
+def test_no_frame_between_keys_is_farther_off_than_is_said():
+    verts = bodies_of(moving_pose(60)).verts
+    time = torch.linspace(0, 4, 60).double().square()  # uneven
+    keys, miss = keyframes(verts, time, 0.004, 1000)
+    seen = verts[:, :: max(1, verts.shape[1] // 300)].numpy()
+    worst = 0.0
+    for k in range(60):
+        b = next(i for i in keys if i >= k)
+        a = max(i for i in keys if i <= k)
+        share = 0.0 if a == b else float((time[k] - time[a]) / (time[b] - time[a]))
+        line = seen[a] + share * (seen[b] - seen[a])
+        worst = max(worst, float(np.linalg.norm(line - seen[k], axis=1).max()))
+    assert worst == pytest.approx(miss, abs=1e-6)
+    assert miss <= 0.004
+    assert keys[0] == 0
+    assert keys[-1] == 59
+
+
+def test_keys_stop_where_there_are_enough():
+    verts = bodies_of(moving_pose(30)).verts
+    keys, miss = keyframes(verts, torch.arange(30).double(), 0.0, 7)
+    assert len(keys) == 7
+    assert miss > 0
+
+
+class TestUsd:
+    @pytest.fixture
+    def stage(self, tmp_path: Path):
+        Usd = pytest.importorskip("pxr.Usd", reason="needs usd-core")
+        self.home = finished(tmp_path, two_people())
+        return Usd.Stage.Open(str(export_usd(self.home, tmp_path).files[0]))
+
+    def test_objects_stand_where_they_stood_to_a_hundredth_of_a_millimetre(self, stage):
+        from pxr import UsdGeom
+
+        assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+        assert UsdGeom.GetStageUpAxis(stage) == "Y"
+        for piece in self.home.scene.pieces:
+            mesh = stage.GetPrimAtPath(f"/room/{piece.id}/mesh")
+            points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get(), float)
+            matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh))
+            found = np.concatenate([points, np.ones((len(points), 1))], 1) @ matrix
+            assert np.stack([found.min(0), found.max(0)])[:, :3] == pytest.approx(
+                world(piece), abs=1e-5
+            )
+            node = stage.GetPrimAtPath(f"/room/{piece.id}")
+            assert node.GetCustomDataByKey("mover:category") == piece.category
+
+    def test_people_are_where_they_were_in_every_frame(self, stage):
+        from pxr import UsdGeom
+
+        bodies = self.home.bodies
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/room/person_1"))
+        for k, _ in rows(bodies, 1):
+            frame = float(bodies.frame[k])
+            points = np.array(mesh.GetPointsAttr().Get(frame))
+            assert np.linalg.norm(points - bodies.verts[k].numpy(), axis=1).max() < 0.0025
+            assert mesh.ComputeVisibility(frame) == "inherited"
+        assert mesh.ComputeVisibility(float(bodies.frame.min())) == "invisible"
+        assert stage.GetTimeCodesPerSecond() == bodies.fps
+        assert stage.GetEndTimeCode() == float(bodies.frame.max())
+
+    def test_the_camera_sees_the_same_pixels(self, stage):
+        from pxr import UsdGeom
+
+        camera = self.home.scene.camera
+        frustum = UsdGeom.Camera(stage.GetPrimAtPath("/room/camera")).GetCamera(0).frustum
+        point = np.array([0.4, -0.8, -3.5])
+        matrix = np.array(frustum.ComputeViewMatrix()) @ np.array(frustum.ComputeProjectionMatrix())
+        x, y, _, w = np.append(point, 1.0) @ matrix
+        seen = (camera.K @ camera.R_cam_world @ torch.tensor(point).float()).numpy()
+        u, v = camera.width * (1 + x / w) / 2, camera.height * (1 - y / w) / 2
+        assert [u, v] == pytest.approx(seen[:2] / seen[2], abs=0.01)
+
+
+def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path: Path):
+    Usd = pytest.importorskip("pxr.Usd", reason="needs usd-core")
+    from PIL import Image
+
+    box = trimesh.creation.box(extents=(0.5, 0.9, 0.5))
+    picture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+    uv = np.random.default_rng(0).random((len(box.vertices), 2))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+    box.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    box.export(tmp_path / "box.glb")
+    scene = furnished(("chair",))
+    pieces = [
+        dataclasses.replace(scene.pieces[0], id=name, mesh_file=str(tmp_path / "box.glb"))
+        for name in ("0-chair.a", "0-chair_a")
+    ]
+    home = Finished(tmp_path, dataclasses.replace(scene, pieces=tuple(pieces)), None, None)
+    stage = Usd.Stage.Open(str(export_usd(home, tmp_path / "usd").files[0]))
+    ids = {p.GetCustomDataByKey("mover:id") for p in stage.Traverse()} - {None}
+    assert ids == {"0-chair.a", "0-chair_a"}
+    files = [
+        p.GetAttribute("inputs:file").Get() for p in stage.Traverse() if p.GetName() == "picture"
+    ]
+    assert len(files) == 2
+    found = Image.open(tmp_path / "usd" / files[0].path)
+    assert np.array_equal(np.asarray(found).ravel(), np.arange(48))
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_the_parameters_give_the_bodies_back(tmp_path: Path, up: str):
+    bodies = two_people()
+    found = export_bodies(finished(tmp_path, bodies), tmp_path, up)
+    for person, file in enumerate(found.files):
+        arrays = np.load(file)
+        angles = torch.from_numpy(arrays["poses"])
+        count = len(angles)
+        assert angles.shape == (count, 165)
+        assert np.array_equal(arrays["root_orient"], arrays["poses"][:, :3])
+        assert np.array_equal(arrays["pose_hand"], arrays["poses"][:, 75:])
+        pose = BodyPose(
+            "makehuman", "neutral", torch.from_numpy(arrays["betas"]).float().expand(count, -1),
+            angles[:, :3], angles[:, 3:66], torch.from_numpy(arrays["trans"]),
+            {"left_hand_pose": angles[:, 75:120], "right_hand_pose": angles[:, 120:]},
+        )  # fmt: skip
+        truth = bodies.verts[bodies.person == person]
+        if up == "z":
+            x, y, z = truth.unbind(-1)
+            truth = torch.stack([x, -z, y], -1)
+        assert float((open_body().posed(pose)[0] - truth).norm(dim=-1).max()) < 1e-4
+        assert arrays["mocap_framerate"] == 5.0  # every second frame of 10 a second
+
+
+def test_bodies_without_parameters_are_refused_with_the_way_out(tmp_path: Path):
+    home = finished(tmp_path, walkers(3))
+    with pytest.raises(InputError, match="--capture"):
+        export_bodies(home, tmp_path)
+
+
+def test_single_objects_stand_in_the_world_in_both_formats(tmp_path: Path):
+    home = finished(tmp_path)
+    files = export_objects(home, tmp_path).files
+    assert len(files) == 2 * len(home.scene.pieces)
+    for k, piece in enumerate(home.scene.pieces):
+        for file in files[2 * k : 2 * k + 2]:
+            found = trimesh.load_mesh(file)
+            assert found.bounds == pytest.approx(world(piece), abs=1e-5), file
+            assert found.area == pytest.approx(
+                trimesh.Trimesh(*(x.numpy() for x in dataclasses.astuple(place_piece(piece)))).area,
+                rel=1e-4,
+            )
+
+
+def test_the_command_writes_what_is_asked_for(tmp_path: Path, capsys):
+    out = write_out(tmp_path / "out", furnished(("chair",)), bodies_of(moving_pose(3)))
+    assert run_command("export", [str(out), "--to", "glb", "ply", "bodies"]) == 0
+    names = {p.name for p in (out / "export").rglob("*") if p.is_file()}
+    assert {"scene.glb", "chair_0.ply", "chair_0.obj", "bodies_0.npz"} <= names
+    assert "on bones" in capsys.readouterr().out
+
+
+def test_a_folder_without_a_result_is_refused(tmp_path: Path, capsys):
+    assert run_command("export", [str(tmp_path)]) == 2
+    assert "scene.json" in capsys.readouterr().err
+
+
+def test_without_usd_core_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(mover.exporters.pxr_modules, "find_spec", lambda _: None)
+    with pytest.raises(InputError, match=r"mover\[usd\]"):
+        export_usd(finished(tmp_path), tmp_path)
+
+
+def test_a_second_export_gives_the_same_bytes(tmp_path: Path):
+    home = finished(tmp_path, two_people(5))
+    for name in ("glb", "ply", "bodies"):
+        one = EXPORTERS[name](home, tmp_path / "a").files
+        two = EXPORTERS[name](home, tmp_path / "b").files
+        assert [f.read_bytes() for f in one] == [f.read_bytes() for f in two]
+
+
+def test_angles_turn_back(tmp_path: Path):
+    """Quaternions of neighbouring frames are on one side, so that viewers turn the short way."""
+    pose = moving_pose(40)
+    spin = torch.linspace(0, 4 * math.pi, 40)
+    pose = dataclasses.replace(pose, global_orient=torch.stack([0 * spin, spin, 0 * spin], -1))
+    glb = Glb(export_glb(finished(tmp_path, bodies_of(pose)), tmp_path).files[0])
+    animation = glb.tree["animations"][0]
+    for channel in animation["channels"]:
+        if channel["target"]["path"] == "rotation":
+            values = glb.array(animation["samplers"][channel["sampler"]]["output"])
+            assert ((values[1:] * values[:-1]).sum(1) > 0).all()

@@ -1,0 +1,136 @@
+"""Pieces of furniture: closed, outward, in their canonical frame, of believable size."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mover.furniture import PIECES, SEATS, Furniture, canonical, make_piece
+from mover.furniture.library import BACKS, BEDS, SIZES, STYLES, TOPS, another
+
+ALL = [(name, style) for name in PIECES for style in range(STYLES[name])]
+
+
+def solid(name: str, style: int, seed: int = 0) -> tuple[trimesh.Trimesh, Furniture]:
+    piece = make_piece(name, np.random.default_rng(seed), style)
+    mesh = trimesh.Trimesh(piece.mesh.verts.numpy(), piece.mesh.faces.numpy(), process=False)
+    return mesh, piece
+
+
+@pytest.mark.parametrize(("name", "style"), ALL)
+class TestPiece:
+    def test_is_one_closed_outward_body(self, name: str, style: int) -> None:
+        mesh, _ = solid(name, style)
+        assert mesh.is_watertight
+        assert mesh.is_winding_consistent
+        assert mesh.volume > 0
+        assert len(mesh.split(only_watertight=False)) == 1
+
+    def test_stands_at_the_centre_of_its_base(self, name: str, style: int) -> None:
+        mesh, _ = solid(name, style)
+        low, high = mesh.bounds
+        assert abs(low[1]) < 1e-6
+        assert np.abs((low + high)[[0, 2]]).max() < 1e-6
+
+    def test_has_a_believable_size_for_every_seed(self, name: str, style: int) -> None:
+        ranges = np.array(SIZES[canonical(name)])
+        for seed in range(5):
+            mesh, piece = solid(name, style, seed)
+            size = mesh.extents
+            assert (size >= ranges[:, 0]).all(), (size, ranges)
+            assert (size <= ranges[:, 1]).all(), (size, ranges)
+            assert np.allclose(piece.size, size)
+
+    def test_is_drawn_from_its_seed_alone(self, name: str, style: int) -> None:
+        a, b, c = (solid(name, style, seed)[1] for seed in (4, 4, 5))
+        assert torch.equal(a.mesh.verts, b.mesh.verts)
+        assert torch.equal(a.mesh.faces, b.mesh.faces)
+        assert a.size != c.size
+
+
+def depth_from(mesh: trimesh.Trimesh, origins: np.ndarray, direction: list[float]) -> np.ndarray:
+    """Distance to the first surface along one direction: every ray against every triangle."""
+    a, b, c = np.moveaxis(np.asarray(mesh.triangles), 1, 0)
+    way = np.array(direction, dtype=float)
+    across = np.cross(way, c - a)
+    det = (across * (b - a)).sum(-1)
+    det = np.where(np.abs(det) < 1e-12, np.nan, det)
+    off = origins[:, None] - a
+    u = (off * across).sum(-1) / det
+    turned = np.cross(off, b - a)
+    v = (turned @ way) / det
+    far = (turned * (c - a)).sum(-1) / det
+    hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (far > 0)
+    return np.where(hit, far, np.inf).min(1)
+
+
+@pytest.mark.parametrize(("name", "style"), [a for a in ALL if canonical(a[0]) in SEATS])
+def test_the_seat_is_where_it_says_and_open_to_the_front(name: str, style: int) -> None:
+    mesh, piece = solid(name, style)
+    inner = np.linspace(0.2, 0.8, 5)
+    xs = piece.seat_left + inner * (piece.seat_right - piece.seat_left)
+    zs = piece.seat_back + 0.06 + inner * (piece.seat_depth - 0.08)
+    if canonical(name) == "bed":
+        zs = zs[1:]
+    spots = np.array([[x, piece.seat_height + 0.1, z] for x in xs for z in zs])
+    down = depth_from(mesh, spots, [0, -1, 0])
+    level = np.abs(down - 0.1) < 0.002  # the rest are seams of cushions and slits of slats
+    assert level.mean() > 0.75
+    assert down.min() > 0.098
+    ahead = depth_from(mesh, spots, [0, 0, 1])
+    if canonical(name) != "bed":
+        assert np.isinf(ahead).all()
+
+
+@pytest.mark.parametrize(("name", "style"), [a for a in ALL if canonical(a[0]) in BACKS])
+def test_the_backrest_is_behind_the_sitter(name: str, style: int) -> None:
+    mesh, piece = solid(name, style)
+    middle = (piece.seat_left + piece.seat_right) / 2
+    heights = np.linspace(piece.seat_height + 0.05, piece.back_height - 0.02, 15)
+    across = middle + np.linspace(-0.15, 0.15, 7)
+    spots = np.array([[x, y, piece.seat_front] for x in across for y in heights])
+    behind = depth_from(mesh, spots, [0, 0, -1])
+    assert np.isfinite(behind).mean() > 0.15
+    assert behind[np.isfinite(behind)].min() > piece.seat_depth - 0.03
+
+
+@pytest.mark.parametrize(("name", "style"), [a for a in ALL if canonical(a[0]) in TOPS])
+def test_the_top_is_the_highest_flat_surface(name: str, style: int) -> None:
+    mesh, piece = solid(name, style)
+    up = mesh.face_normals[:, 1] > 0.99
+    level = np.abs(mesh.triangles_center[:, 1] - piece.top_height) < 1e-4
+    area = mesh.area_faces[up & level].sum()
+    assert area > 0.3 * piece.size[0] * piece.size[2]
+
+
+@given(st.sampled_from(sorted(PIECES)), st.integers(0, 10_000))
+@settings(max_examples=25, deadline=None)
+def test_another_piece_of_the_class_is_another_shape(name: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    piece = make_piece(name, rng)
+    other = another(piece, rng)
+    assert other.category == piece.category
+    assert other.style != piece.style
+    assert len(other.mesh.verts) != len(piece.mesh.verts) or other.size != piece.size
+
+
+def test_names_are_matched_without_case_through_synonyms() -> None:
+    pairs = {
+        "Couch": "sofa", "dining table": "table", "night_stand": "nightstand", "BOOKSHELF": "shelf",
+        "bookcase": "shelf", "dining-table": "table", "Grand Piano": "grand piano", "bed": "bed",
+    }  # fmt: skip
+    assert {k: canonical(k) for k in pairs} == pairs
+    assert all(canonical(canonical(k)) == canonical(k) for k in [*pairs, *PIECES])
+
+
+def test_tables_of_classes_name_known_classes() -> None:
+    known = {canonical(name) for name in PIECES}
+    assert known >= SEATS | BACKS | TOPS | BEDS
+    assert set(SIZES) == known
+    assert set(STYLES) == set(PIECES)
+    with pytest.raises(ValueError, match="no piece 'throne', expected one of"):
+        make_piece("throne", np.random.default_rng(0))
+    with pytest.raises(ValueError, match="chair has no style 9, expected 0 to 3"):
+        make_piece("chair", np.random.default_rng(0), 9)

@@ -1,0 +1,258 @@
+"""The noise model: its statistics are those that its configuration names, and the truth stays."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from test_rooms import tiny_room
+
+from mover.bodies import open_body
+from mover.geometry.camera import pitch_roll
+from mover.geometry.rotations import axis_angle, rot_y
+from mover.geometry.runs import decode
+from mover.records import fingerprint
+from mover.rooms import KnownRoom, NoiseConfig, add_noise
+from mover.rooms.noise_masks import grown
+from mover.rooms.noise_people import slow
+from mover.types import Piece
+
+SILENT = NoiseConfig(
+    along_ray=0, sideways=0, yaw=0, flips=0, scale=0, camera=0, depth_bias=0, depth_drift=0, pose=0,
+    jitter=0, dropped=0, person_masks=0, missed_masks=0, object_masks=0, pose_hidden=1,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def room() -> KnownRoom:
+    return tiny_room()
+
+
+def centre(piece: Piece) -> torch.Tensor:
+    low, high = piece.mesh.verts.amin(0), piece.mesh.verts.amax(0)
+    return rot_y(piece.yaw) @ ((low + high) / 2 * piece.scale) + piece.t_world_object
+
+
+def size(piece: Piece) -> torch.Tensor:
+    return (piece.mesh.verts.amax(0) - piece.mesh.verts.amin(0)) * piece.scale
+
+
+def test_no_noise_gives_the_truth_back(room: KnownRoom) -> None:
+    capture = add_noise(room, SILENT, 3)
+    for given, true in zip(capture.scene.pieces, room.truth.pieces, strict=True):
+        assert torch.allclose(given.t_world_object, true.t_world_object, atol=1e-6)
+        assert torch.allclose(given.yaw, true.yaw, atol=1e-6)
+        assert torch.allclose(given.scale, true.scale, atol=1e-6)
+    assert capture.bodies is not None
+    assert torch.allclose(capture.bodies.verts, room.bodies.verts, atol=5e-5)
+    assert capture.people is not None
+    assert room.capture.people is not None
+    assert capture.people.masks.counts == room.capture.people.masks.counts
+    assert capture.scene.ground is None
+
+
+def test_noise_is_repeatable_differs_by_seed_and_leaves_the_truth(room: KnownRoom) -> None:
+    before = fingerprint(room)
+    first, again, other = (fingerprint(add_noise(room, NoiseConfig(), s)) for s in (1, 1, 2))
+    assert first == again
+    assert first != other
+    assert fingerprint(room) == before
+
+
+def test_a_wrong_camera_keeps_centres_in_the_camera_frame_and_projects_fronts(
+    room: KnownRoom,
+) -> None:
+    capture = add_noise(room, dataclasses.replace(SILENT, camera=5.0), 0)
+    true, wrong = room.truth.camera.R_cam_world, capture.scene.camera.R_cam_world
+    for given, piece in zip(capture.scene.pieces, room.truth.pieces, strict=True):
+        assert torch.allclose(wrong @ centre(given), true @ centre(piece), atol=1e-5)
+        front = true @ torch.stack([piece.yaw.sin(), torch.tensor(0.0), piece.yaw.cos()])
+        projected = wrong.mT @ front
+        assert math.isclose(
+            float(torch.atan2(projected[0], projected[2])), float(given.yaw), abs_tol=1e-5
+        )
+        assert torch.allclose(given.scale, piece.scale, atol=1e-6)
+
+
+def test_camera_errors_have_the_stated_size(room: KnownRoom) -> None:
+    true = torch.stack(pitch_roll(room.truth.camera.R_cam_world))
+    config = dataclasses.replace(SILENT, camera=3.0, focal=0.05)
+    errors, zooms = [], []
+    for seed in range(60):
+        camera = add_noise(_light(room), config, seed).scene.camera
+        errors.append(torch.stack(pitch_roll(camera.R_cam_world)) - true)
+        zooms.append(float(camera.K[0, 0] / room.truth.camera.K[0, 0]) - 1)
+        assert abs(float(camera.R_cam_world[2, 0])) < 1e-6, "a guess has no heading"
+    degrees = torch.stack(errors).rad2deg()
+    assert float(degrees.abs().min()) > 1.99
+    assert float(degrees.abs().max()) < 4.01
+    assert abs(float(degrees.abs().mean()) - 3) < 0.2
+    assert abs(float(degrees.mean())) < 0.9
+    assert 0.02 < np.abs(zooms).mean() < 0.03
+
+
+def _light(room: KnownRoom) -> KnownRoom:
+    """The room with three bodies only, for statistics over many seeds."""
+    few = torch.arange(3)
+    pose, joints = room.bodies.pose, room.bodies.joints
+    assert pose is not None
+    assert joints is not None
+    assert room.capture.people is not None
+    masks = dataclasses.replace(
+        room.capture.people.masks, counts=room.capture.people.masks.counts[:3]
+    )
+    people = dataclasses.replace(
+        room.capture.people,
+        masks=masks,
+        frame=room.bodies.frame[few],
+        person=room.bodies.person[few],
+    )
+    thin = {
+        f.name: getattr(pose, f.name)[few]
+        for f in dataclasses.fields(pose)
+        if isinstance(getattr(pose, f.name), torch.Tensor)
+    }
+    bodies = dataclasses.replace(
+        room.bodies, verts=room.bodies.verts[few], joints=joints[few],
+        frame=room.bodies.frame[few], person=room.bodies.person[few],
+        pose=dataclasses.replace(pose, **thin),
+    )  # fmt: skip
+    capture = dataclasses.replace(room.capture, bodies=bodies, people=people)
+    return dataclasses.replace(room, bodies=bodies, capture=capture)
+
+
+def test_object_errors_have_the_stated_ranges_and_lie_along_the_ray(room: KnownRoom) -> None:
+    light = _light(room)
+    ray_only = dataclasses.replace(SILENT, along_ray=0.3, yaw=30.0, scale=0.0)
+    along, turn = [], []
+    for seed in range(60):
+        for given, true in zip(
+            add_noise(light, ray_only, seed).scene.pieces, room.truth.pieces, strict=True
+        ):
+            c = centre(true)
+            off = centre(given) - c
+            ray = c / c.norm()
+            assert float((off - (off @ ray) * ray).norm()) < 1e-5
+            along.append(float(off @ ray))
+            factor = size(given) / size(true)
+            assert torch.allclose(factor, (centre(given).norm() / c.norm()).expand(3), atol=1e-5)
+            turn.append(math.degrees(float(given.yaw - true.yaw)))
+    assert 0.28 < max(along) <= 0.3001
+    assert abs(np.std(along) - 0.3 / math.sqrt(3)) < 0.02
+    turn = (np.array(turn) + 180) % 360 - 180
+    assert 28 < np.abs(turn).max() <= 30.001
+    assert abs(turn.std() - 30 / math.sqrt(3)) < 2
+
+
+def test_sizes_and_flips_follow_their_configuration(room: KnownRoom) -> None:
+    light = _light(room)
+    config = dataclasses.replace(SILENT, scale=0.15, flips=0.3)
+    factors, quarters = [], []
+    for seed in range(60):
+        for given, true in zip(
+            add_noise(light, config, seed).scene.pieces, room.truth.pieces, strict=True
+        ):
+            factors.append(size(given) / size(true))
+            turned = float(torch.remainder((given.yaw - true.yaw) / (math.pi / 2) + 0.5, 4) - 0.5)
+            assert abs(turned - round(turned)) < 1e-4
+            quarters.append(round(turned))
+    factor = torch.stack(factors)
+    assert 0.849 < float(factor.min()) < 0.86
+    assert 1.14 < float(factor.max()) < 1.151
+    assert abs(float(torch.corrcoef(factor.T)[0, 1])) < 0.15, "axes are independent"
+    assert abs(np.mean(np.array(quarters) != 0) - 0.3) < 0.08
+    assert set(quarters) == {0, 1, 2, 3}
+
+
+def test_other_shapes_fill_the_same_box(room: KnownRoom) -> None:
+    capture = add_noise(room, dataclasses.replace(SILENT, other_shapes=1.0), 0)
+    for given, true in zip(capture.scene.pieces, room.truth.pieces, strict=True):
+        assert given.mesh.verts.shape != true.mesh.verts.shape
+        assert torch.allclose(size(given), size(true), atol=1e-5)
+        assert torch.allclose(centre(given), centre(true), atol=1e-5)
+
+
+def test_depth_bias_moves_a_body_along_its_ray_and_keeps_its_size(room: KnownRoom) -> None:
+    bodies = add_noise(room, dataclasses.replace(SILENT, depth_bias=0.03), 4).bodies
+    assert bodies is not None
+    assert bodies.joints is not None
+    assert room.bodies.joints is not None
+    pelvis, given = room.bodies.joints[:, 0], bodies.joints[:, 0]
+    factor = (given / pelvis)[:, 2]
+    assert torch.allclose(given, pelvis * factor[:, None], atol=1e-4)
+    assert float(factor.std()) < 1e-4
+    assert 0 < abs(float(factor.mean()) - 1) <= 0.0301
+    moved = bodies.verts - given[:, None]
+    assert torch.allclose(moved, room.bodies.verts - pelvis[:, None], atol=1e-4)
+
+
+def test_pose_errors_turn_every_joint_by_the_stated_angle(room: KnownRoom) -> None:
+    bodies = add_noise(room, dataclasses.replace(SILENT, pose=4.0), 0).bodies
+    assert bodies is not None
+    pose, true = bodies.pose, room.bodies.pose
+    assert pose is not None
+    assert true is not None
+    wrong, right = (axis_angle(p.body_pose.double().reshape(-1, 21, 3)) for p in (pose, true))
+    step = right.mT @ wrong
+    cosine = ((step.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)
+    rms = float(cosine.acos().square().mean().sqrt().rad2deg())
+    assert abs(rms - 4 * math.sqrt(3)) < 0.6, "4 degrees about each of three axes"
+    assert torch.allclose(open_body().posed(pose)[0], bodies.verts, atol=1e-4)
+
+
+def test_slow_noise_has_variance_one_and_forgets_in_time(room: KnownRoom) -> None:
+    frames = torch.arange(4000)
+    bodies = dataclasses.replace(
+        room.bodies,
+        verts=torch.zeros(4000, 1, 3), faces=torch.zeros(0, 3, dtype=torch.long), joints=None,
+        frame=frames, person=torch.zeros(4000, dtype=torch.long), pose=None,
+    )  # fmt: skip
+    noise = slow(np.random.default_rng(0), bodies, (8,), 1.0)
+    assert abs(noise.var() - 1) < 0.06
+    for lag in (1, 5, 10):
+        assert abs((noise[lag:] * noise[:-lag]).mean() - math.exp(-lag / 5)) < 0.06
+
+
+def test_jitter_and_dropped_rows_follow_their_configuration(room: KnownRoom) -> None:
+    bodies = add_noise(room, dataclasses.replace(SILENT, jitter=0.015, dropped=0.2), 1).bodies
+    assert bodies is not None
+    kept = torch.isin(room.bodies.frame, bodies.frame)
+    assert 0.05 < 1 - float(kept.float().mean()) < 0.35
+    shift = (bodies.verts - room.bodies.verts[kept])[:, 0]
+    assert abs(float(shift.std()) - 0.015) < 0.002
+    assert bodies.pose is not None
+    assert len(bodies.pose.transl) == len(bodies.frame)
+
+
+def test_masks_grow_and_shrink_by_whole_pixels() -> None:
+    mask = np.zeros((40, 60), dtype=bool)
+    mask[10:20, 15:40] = True
+    for pixels in (1, 2, 3):
+        big, small = grown(mask, pixels), grown(mask, -pixels)
+        assert big[10 - pixels, 20]
+        assert not big[10 - pixels - 1, 20]
+        assert small.sum() == (10 - 2 * pixels) * (25 - 2 * pixels)
+        assert (grown(mask, 0) == mask).all()
+
+
+def test_people_masks_are_off_by_at_most_the_stated_pixels_and_some_are_missed(
+    room: KnownRoom,
+) -> None:
+    from scipy.ndimage import distance_transform_edt
+
+    people = add_noise(
+        room, dataclasses.replace(SILENT, person_masks=3, missed_masks=0.25), 0
+    ).people
+    true = room.capture.people
+    assert people is not None
+    assert true is not None
+    assert 0.1 < 1 - len(people.frame) / len(true.frame) < 0.4
+    rows = {int(f): k for k, f in enumerate(true.frame.tolist())}
+    for k, frame in enumerate(people.frame.tolist()):
+        a, b = decode(people.masks, k).numpy(), decode(true.masks, rows[frame]).numpy()
+        extra, lost = a & ~b, b & ~a
+        if extra.any():
+            assert np.asarray(distance_transform_edt(~b))[extra].max() <= 3
+        if lost.any():
+            assert np.asarray(distance_transform_edt(b))[lost].max() <= 3

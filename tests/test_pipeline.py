@@ -1,0 +1,183 @@
+"""The main job as a whole, on small captures: resume, determinism, and no look at the truth."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import raycast
+import torch
+
+from mover.geometry.runs import decode
+from mover.minimize import Adam, Step
+from mover.pipeline import PRESETS, Run, reconstruct
+from mover.readers import read
+from mover.readers.scene_file import read_scene
+from mover.results import read_config, write_results
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+PHOTO, TOTAL3D = SHARED / "photo_bench", SHARED / "total3d_1"
+
+
+def light(name, steps=15):
+    """A preset with few steps and coarse volumes."""
+    config = PRESETS[name]
+    return replace(
+        config,
+        prepare=replace(config.prepare, cells=32, faces=300, samples=200, region=60),
+        image=replace(config.image, size=48),
+        layout=replace(
+            config.layout, method=replace(config.layout.method, steps=steps), first=Adam(3),
+            short=replace(config.layout.short, steps=min(5, config.layout.short.steps)),
+        ),
+        refine=replace(config.refine, method=replace(config.refine.method, steps=5)),
+        gather=replace(config.gather, cells=48),
+        place=replace(config.place, method=replace(config.place.method, steps=steps)),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def capture_folder(tmp_path_factory, small_room):
+    from mover.readers.folder import write_capture
+    from mover.results import write_truth
+    from mover.rooms.noise import NoiseConfig, add_noise
+
+    folder = tmp_path_factory.mktemp("capture")
+    write_capture(add_noise(small_room, NoiseConfig(), 1), folder)
+    write_truth(small_room.truth, small_room.bodies, folder / "truth")
+    return folder
+
+
+def run_in(folder, capture, config, observe=lambda step: None):
+    run = Run(folder, observe)
+    room = reconstruct(capture, config, run)
+    write_results(capture, room, config, run)
+    return room
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.mark.slow
+class TestRun:
+    def test_a_run_that_was_killed_goes_on_and_gives_the_same_result(self, capture_folder, tmp_path):
+        capture, config = read("folder", capture_folder), light("robust")
+        run_in(tmp_path / "whole", capture, config)
+        seen = []
+
+        def die(step: Step):
+            seen.append(step.stage)
+            if step.stage == "gather_cues: free space":
+                raise Killed
+
+        with pytest.raises(Killed):
+            run_in(tmp_path / "cut", capture, config, die)
+        finished = {p.parent.name for p in (tmp_path / "cut" / "stages").rglob("*.json")}
+        assert "align_camera" in finished
+        second = []
+        run_in(tmp_path / "cut", capture, config, lambda step: second.append(step.stage))
+        assert "prepare_objects" not in second
+        for name in ("scene.json", "bodies.npz"):
+            a, b = (tmp_path / f / name for f in ("whole", "cut"))
+            assert a.read_bytes() == b.read_bytes()
+
+    def test_the_result_is_the_same_without_the_truth(self, capture_folder, tmp_path):
+        blind = tmp_path / "capture"
+        shutil.copytree(capture_folder, blind)
+        shutil.rmtree(blind / "truth")
+        config = light("paper")
+        run_in(tmp_path / "a", read("folder", capture_folder), config)
+        run_in(tmp_path / "b", read("folder", blind), config)
+        assert (tmp_path / "a/scene.json").read_bytes() == (tmp_path / "b/scene.json").read_bytes()
+
+    @pytest.mark.parametrize("name", sorted(PRESETS))
+    def test_every_preset_writes_a_whole_result(self, capture_folder, tmp_path, name):
+        capture, config = read("folder", capture_folder), light(name)
+        room = run_in(tmp_path, capture, config)
+        for file in ("scene.json", "scene.glb", "bodies.npz", "run.json", "report.html", "initial.json"):
+            assert (tmp_path / file).stat().st_size > 100, file
+        scene = read_scene(tmp_path / "scene.json")
+        assert [p.id for p in scene.pieces] == [p.id for p in capture.scene.pieces]
+        assert len(list((tmp_path / "watertight").iterdir())) == len(scene.pieces)
+        assert len(room.bodies.frame) == len(capture.bodies.frame)
+        log = json.loads((tmp_path / "run.json").read_text())
+        assert {"place_objects", "align_camera"} <= {s["name"] for s in log["stages"]}
+        assert read_config(tmp_path / "run.json") == config
+
+    def test_objects_of_the_result_stand_on_the_ground(self, capture_folder, tmp_path):
+        from mover.geometry.placement import place_piece
+
+        room = run_in(tmp_path, read("folder", capture_folder), light("robust"))
+        for piece in room.scene.pieces:
+            lowest = float(place_piece(piece).verts[:, 1].min())
+            assert abs(lowest - room.scene.ground) < 1e-4, piece.id
+
+    def test_without_people_only_the_image_speaks_and_the_run_says_so(self, capture_folder, tmp_path):
+        alone = tmp_path / "capture"
+        shutil.copytree(capture_folder, alone)
+        (alone / "bodies.npz").unlink()
+        (alone / "people.json").unlink()
+        room = run_in(tmp_path / "out", read("folder", alone), light("robust"))
+        assert room.bodies is None
+        assert any("bodies" in w for w in room.warnings)
+
+    def test_two_people_are_two_tracks(self, capture_folder, tmp_path):
+        capture = read("folder", capture_folder)
+        bodies, people = capture.bodies, capture.people
+        half = bodies.frame > int(bodies.frame.median())
+        both = replace(
+            capture,
+            bodies=replace(bodies, person=half.long(), pose=None),
+            people=replace(people, person=(people.frame > int(bodies.frame.median())).long()),
+        )
+        room = run_in(tmp_path, both, light("robust"))
+        assert set(room.bodies.person.tolist()) == {0, 1}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PHOTO.exists(), reason="the photograph is not here")
+def test_the_bench_of_a_real_photograph_stands_where_the_soles_stand(tmp_path):
+    from mover.geometry.camera import pitch_roll, to_camera
+    from mover.geometry.placement import place_piece
+
+    capture = read("folder", PHOTO)
+    room = run_in(tmp_path, capture, PRESETS["robust"])
+    ground, camera = room.scene.ground, room.scene.camera
+    assert abs(float(room.bodies.verts[..., 1].min()) - ground) < 0.02
+    bench = place_piece(room.scene.pieces[0])
+    assert abs(float(bench.verts[:, 1].min()) - ground) < 1e-3
+    assert abs(float(pitch_roll(camera.R_cam_world)[0])) < np.radians(5)
+    front = raycast.cast(
+        to_camera(bench.verts, camera.R_cam_world).numpy(), bench.faces.numpy(),
+        camera.K.numpy(), camera.height, camera.width,
+    )[0]  # fmt: skip
+    drawn = np.isfinite(front)
+    mask = decode(capture.detections[0].mask, 0).numpy()
+    assert (drawn & mask).sum() / (drawn | mask).sum() >= 0.55
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not TOTAL3D.exists(), reason="Total3D's outputs are not here")
+def test_the_outputs_of_a_network_run_through_the_image_only_stage(tmp_path):
+    from mover.geometry.boxes import iou2d
+    from mover.geometry.camera import project, to_camera
+    from mover.geometry.placement import place_piece
+
+    capture = read("total3d", TOTAL3D)
+    config = replace(PRESETS["robust"], layout=replace(PRESETS["robust"].layout, yaws=1, keep=1))
+    room = run_in(tmp_path, capture, config)
+
+    def fit(scene):
+        boxes = {d.id: d.box for d in capture.detections}
+        values = []
+        for piece in scene.pieces:
+            verts = to_camera(place_piece(piece).verts, scene.camera.R_cam_world)
+            pixels = project(verts, scene.camera.K)
+            drawn = torch.cat([pixels.amin(0), pixels.amax(0)])
+            values.append(float(iou2d(drawn, boxes[piece.annotation])))
+        return sum(values) / len(values)
+
+    assert fit(room.scene) > max(0.85, fit(room.initial))

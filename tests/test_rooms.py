@@ -1,0 +1,315 @@
+"""Known rooms: people walk on planted feet, sit on seats, and masks tell what the camera sees."""
+
+import dataclasses
+import itertools
+
+import igl
+import numpy as np
+import pytest
+import torch
+from raycast import draw
+
+from mover.bodies import open_body
+from mover.furniture import make_piece
+from mover.geometry.camera import to_world
+from mover.geometry.placement import place_piece
+from mover.geometry.runs import decode
+from mover.records import fingerprint
+from mover.rooms import KnownRoom, RoomConfig, demo_room, make_room
+from mover.rooms.compose import Plan, make_view, overlap
+from mover.rooms.gait import walk
+from mover.rooms.known import Actor, build
+from mover.rooms.lying import berth, on_side, supine
+from mover.rooms.motion import Stage, Stop, Task, perform
+from mover.rooms.paths import NoWayError, way
+from mover.rooms.person import Person, make_person
+from mover.rooms.placed import Placed, free_of
+from mover.rooms.poses import Posture, skinned
+from mover.rooms.reaching import hand_on, table_stand
+from mover.rooms.seating import leaning, seat_spot, seated
+from mover.rooms.settle import part
+from mover.rooms.steps import duration, stations
+
+SHAPES = ([0.0] * 10, [1.3, -1.0, 0.5] + [0.0] * 7)
+
+
+@pytest.fixture(scope="module", params=SHAPES, ids=("mean", "tall"))
+def person(request: pytest.FixtureRequest) -> Person:
+    return make_person(request.param)
+
+
+def stands(name: str, style: int, seed: int = 1) -> Placed:
+    return Placed(
+        f"{name}_0", make_piece(name, np.random.default_rng(seed), style), (0.3, -0.2), 0.7
+    )
+
+
+def signed(person: Person, posture: Posture, piece: Placed, group: str) -> np.ndarray:
+    """Signed distances of part of the skin to a piece, by another package's winding numbers."""
+    c, s = np.cos(piece.heading), np.sin(piece.heading)
+    verts = piece.furniture.mesh.verts.double().numpy()
+    turned = verts @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T
+    turned = turned + np.array([piece.at[0], 0, piece.at[1]])
+    points = skinned(person, posture, part(group)).reshape(-1, 3)
+    return exact(points, turned, piece.furniture.mesh.faces.numpy())
+
+
+def exact(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Signed distances by generalised winding numbers."""
+    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
+    return np.asarray(igl.signed_distance(points, verts, faces, sign_type=kind)[0])
+
+
+def near_box(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Signed distances within 5 cm of a mesh's box, 5 cm elsewhere [m]."""
+    out = np.full(len(points), 0.05)
+    near = ((points > verts.min(0) - 0.05) & (points < verts.max(0) + 0.05)).all(1)
+    out[near] = exact(points[near], verts, faces)
+    return out
+
+
+def test_a_planted_foot_does_not_slide_and_stands_on_the_floor(person: Person) -> None:
+    path = np.array([[0, 0], [1.2, 0.8], [1.2, 2.5]], dtype=float)
+    route = stations(path, -1.0, 2.5)
+    times = np.arange(0, duration(route), 0.05)
+    skin = skinned(person, walk(person, route, times), part("feet"))
+    low = skin[..., 1].min(1)
+    assert np.abs(low).max() < 0.01
+    down = skin[..., 1] < 0.003
+    both = down[1:] & down[:-1]
+    slide = np.linalg.norm(np.diff(skin, axis=0)[..., [0, 2]], axis=-1)
+    assert both.any(1).mean() > 0.95
+    start: dict[int, np.ndarray] = {}
+    for frame in range(len(both)):
+        for vertex in np.flatnonzero(down[frame]):
+            start.setdefault(int(vertex), skin[frame, vertex])
+            drift = np.linalg.norm((skin[frame, vertex] - start[int(vertex)])[[0, 2]])
+            assert drift < 0.01, "a sole slides within one step"
+        for vertex in [v for v in start if not down[frame, v]]:
+            del start[vertex]
+    assert slide[both].max() < 0.004
+
+
+def test_a_walk_ends_where_and_how_it_should(person: Person) -> None:
+    path = np.array([[0.5, 0.5], [-1.0, 2.0]])
+    route = stations(path, 0.3, -2.0)
+    end = walk(person, route, np.array([0.0, duration(route)]))
+    assert np.allclose(end.pelvis[:, [0, 2]], path, atol=1e-6)
+    front = end.turn[:, :, 2]
+    assert np.allclose(front[:, 0], np.sin([0.3, -2.0]), atol=1e-6)
+    assert np.allclose(front[:, 2], np.cos([0.3, -2.0]), atol=1e-6)
+
+
+def test_knees_and_elbows_bend_the_human_way(person: Person) -> None:
+    route = stations(np.array([[0.0, 0.0], [0.0, 2.0]]), 0.0, 0.0)
+    posture = walk(person, route, np.arange(0, duration(route), 0.1))
+    from mover.rooms.poses import angles
+
+    pose = angles(person, posture)
+    names = open_body().joint_names[1:22]
+    local = pose.body_pose.reshape(-1, 21, 3)
+    for side in ("left", "right"):
+        knee = local[:, names.index(f"{side}_knee")]
+        assert float(knee[:, 0].min()) > -0.15
+        assert float(knee[:, 0].max()) < 1.6
+        assert float(local[:, names.index(f"{side}_hip")].norm(dim=-1).max()) < 1.2
+
+
+@pytest.mark.parametrize(
+    ("name", "style"),
+    [("chair", 0), ("chair", 2), ("armchair", 1), ("office chair", 0), ("stool", 2), ("sofa", 0)],
+)
+def test_a_sitter_presses_on_the_seat_and_keeps_the_feet_on_the_floor(
+    person: Person, name: str, style: int
+) -> None:
+    piece = stands(name, style)
+    posture = seated(person, seat_spot((piece,), 0), piece)
+    assert -0.02 < signed(person, posture, piece, "lower").min() < 0.0
+    assert signed(person, posture, piece, "all").min() > -0.02
+    assert abs(skinned(person, posture)[..., 1].min()) < 0.01
+    front = posture.turn[0, :, 2]
+    assert np.allclose(front[[0, 2]], [np.sin(0.7), np.cos(0.7)], atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "style"), [("chair", 1), ("armchair", 0), ("sofa", 2)])
+def test_a_leaning_back_touches_the_backrest(person: Person, name: str, style: int) -> None:
+    piece = stands(name, style)
+    posture = leaning(person, seated(person, seat_spot((piece,), 0), piece), piece)
+    for group in ("trunk", "lower"):
+        assert -0.02 < signed(person, posture, piece, group).min() < 0.01
+
+
+@pytest.mark.parametrize(("name", "style"), [("single bed", 0), ("double bed", 2)])
+def test_a_lying_body_rests_on_the_mattress(person: Person, name: str, style: int) -> None:
+    piece = stands(name, style)
+    place = berth(person, (piece,), 0, 1)
+    back = supine(person, place, piece)
+    for posture in (back, on_side(person, back, place, piece)):
+        assert -0.02 < signed(person, posture, piece, "torso").min() < 0.01
+        assert signed(person, posture, piece, "all").min() > -0.02
+        trunk = posture.turn[0, :, 1]
+        assert abs(trunk[1]) < 1e-6, "the spine is level"
+
+
+def test_a_hand_rests_on_a_table(person: Person) -> None:
+    piece = stands("table", 0)
+    place, heading = table_stand((piece,), 0, 1, 0.05)
+    for hand, group in enumerate(("left_hand", "right_hand")):
+        posture = hand_on(person, place, heading, piece, hand)
+        assert -0.02 < signed(person, posture, piece, group).min() < 0.01
+        assert abs(skinned(person, posture)[..., 1].min()) < 0.01
+
+
+def test_a_way_goes_around_furniture_or_there_is_none() -> None:
+    wall = make_piece("wardrobe", np.random.default_rng(0), 1)
+    bounds = np.array([[-2.0, -2.0], [2.0, 2.0]])
+    start, goal = np.array([0.0, -1.5]), np.array([0.0, 1.5])
+    block = (Placed("a", wall, (0.0, 0.0), 0.0),)
+    path = way(start, goal, block, bounds)
+    assert np.allclose(path[[0, -1]], [start, goal])
+    share = np.linspace(0, 1, 50)[:, None]
+    dense = np.concatenate([a + share * (b - a) for a, b in itertools.pairwise(path)])
+    assert free_of(dense, block, 0.24).all()
+    row = tuple(Placed(str(k), wall, (x, 0.0), 0.0) for k, x in enumerate((-1.5, 0.0, 1.5)))
+    with pytest.raises(NoWayError):
+        way(start, goal, row, bounds)
+
+
+def tiny_room() -> KnownRoom:
+    """A chair, a table and a shelf; somebody sits down and puts a hand on the table."""
+    spots = (
+        ("chair", 0, (0.7, -3.4), 0.2),
+        ("table", 0, (-0.8, -3.9), 0.0),
+        ("shelf", 2, (0.4, -5.0), 0.0),
+    )
+    pieces = tuple(
+        Placed(f"{n}_0", make_piece(n, np.random.default_rng(2), s), at, heading)
+        for n, s, at, heading in spots
+    )
+    view = make_view((320, 180), (1.6, -0.22, 0.02, 1.15))
+    plan = Plan(pieces, view, (-2.6, -5.4), (2.6, -1.6))
+    stage = Stage(
+        make_person([0.4] + [0.0] * 9), pieces, np.array([[-2.4, -5.2], [2.4, -1.8]]), 5.0
+    )
+    start = Stop(np.array([0.2, -2.6]), 0.0, np.array([0.2, -2.6]))
+    tasks = (Task("sit", 0, seconds=2.0), Task("table", 1, seconds=1.0))
+    acts = perform(stage, tasks, start, np.random.default_rng(0))
+    config = RoomConfig(320, 180, least_frames=20, least_touches=2, least_pixels=50)
+    return build(plan, (Actor(stage, acts),), config, "tiny", acts.refused)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> KnownRoom:
+    return tiny_room()
+
+
+def test_masks_are_what_an_independent_ray_caster_sees(tiny: KnownRoom) -> None:
+    meshes = [place_piece(p) for p in tiny.truth.pieces]
+    seen = draw([(m.verts.numpy(), m.faces.numpy()) for m in meshes], tiny.truth.camera)
+    counts = np.zeros(seen.shape, dtype=int)
+    for index, detection in enumerate(tiny.capture.detections):
+        assert detection.mask is not None
+        mask = decode(detection.mask, 0).numpy()
+        counts += mask
+        true = seen == index
+        assert (mask & true).sum() / (mask | true).sum() > 0.98
+        rows, cols = np.nonzero(mask)
+        box = [cols.min(), rows.min(), cols.max() + 1, rows.max() + 1]
+        assert detection.box.tolist() == box
+        assert detection.category == tiny.truth.pieces[index].category
+    assert counts.max() == 1, "no pixel belongs to two objects"
+
+
+def test_visible_people_and_furniture_share_the_image(tiny: KnownRoom) -> None:
+    people, bodies = tiny.capture.people, tiny.bodies
+    assert people is not None
+    for row in (20,):
+        body = (
+            to_world(bodies.verts[row], tiny.truth.camera.R_cam_world).numpy(),
+            bodies.faces.numpy(),
+        )
+        rest = [place_piece(p) for p in tiny.truth.pieces]
+        seen = draw([body, *((m.verts.numpy(), m.faces.numpy()) for m in rest)], tiny.truth.camera)
+        mask = decode(people.masks, row).numpy()
+        assert (mask & (seen == 0)).sum() / (mask | (seen == 0)).sum() > 0.97
+
+
+def test_pose_parameters_give_the_bodies(tiny: KnownRoom) -> None:
+    assert tiny.bodies.pose is not None
+    verts, joints = open_body().posed(tiny.bodies.pose)
+    assert float((verts - tiny.bodies.verts).abs().max()) < 1e-4
+    assert tiny.bodies.joints is not None
+    assert float((joints - tiny.bodies.joints).abs().max()) < 1e-4
+
+
+def test_truth_neither_sinks_nor_gapes(tiny: KnownRoom) -> None:
+    world = to_world(tiny.bodies.verts, tiny.truth.camera.R_cam_world).double().numpy()
+    assert tiny.refused == ()
+    assert tiny.truth.ground is not None
+    low = world[..., 1].min(1) - tiny.truth.ground
+    assert np.abs(low).max() < 0.01
+    count = len(world)
+    nearest = np.full(world.shape[:2], np.inf)
+    for index, piece in enumerate(tiny.truth.pieces):
+        mesh = place_piece(piece)
+        verts, faces = mesh.verts.double().numpy(), mesh.faces.numpy()
+        far = near_box(world.reshape(-1, 3), verts, faces).reshape(count, -1)
+        assert far.min() > -0.02
+        sitting = [k for k, a in enumerate(tiny.actions) if a == "sit"]
+        hands = [k for k, a in enumerate(tiny.actions) if a.endswith("hand")]
+        if index == 0:
+            assert far[sitting].min(1).max() < 0.01
+        if index == 1:
+            assert far[hands].min(1).max() < 0.01
+        nearest = np.minimum(nearest, far)
+    floor = world[..., 1] - tiny.truth.ground
+    touching = np.minimum(nearest, floor) < 0.01
+    assert (touching != tiny.touching.numpy()).mean() < 1e-4
+    assert set(tiny.touched[tiny.touching].unique().tolist()) <= {-1, 0, 1, 2}
+    assert bool((tiny.touched[~tiny.touching] == -2).all())
+
+
+def test_a_room_is_the_same_every_time(tiny: KnownRoom) -> None:
+    assert fingerprint(tiny) == fingerprint(tiny_room())
+
+
+def test_tasks_that_the_furniture_does_not_allow_are_refused_with_a_reason() -> None:
+    chair = make_piece("chair", np.random.default_rng(0), 0)
+    wall = make_piece("wardrobe", np.random.default_rng(0), 1)
+    pieces = (
+        Placed("chair_0", chair, (0.0, -4.0), 0.0),
+        Placed("wardrobe_0", wall, (0.0, -3.4), 0.0),
+    )
+    stage = Stage(make_person(SHAPES[0]), pieces, np.array([[-2.0, -6.0], [2.0, -2.0]]), 5.0)
+    start = Stop(np.array([0.0, -2.5]), 0.0, np.array([0.0, -2.5]))
+    result = perform(stage, (Task("sit", 0),), start, np.random.default_rng(0))
+    assert len(result.refused) == 1
+    assert "sit chair_0" in result.refused[0]
+    assert set(result.labels) == {"walk"}
+
+
+@pytest.mark.slow
+class TestWholeRooms:
+    def test_the_demo_shows_every_motion_and_hides_nothing(self) -> None:
+        room = demo_room()
+        assert room.refused == ()
+        assert len(room.actions) >= 200
+        assert {"walk", "sit", "lean", "lie", "left hand"} <= set(room.actions)
+        assert len(room.truth.pieces) >= 6
+
+    @pytest.mark.parametrize(("seed", "people"), [(0, 1), (1, 1), (2, 1), (21, 2)])
+    def test_a_drawn_room_is_rich_free_of_overlap_and_repeatable(
+        self, seed: int, people: int
+    ) -> None:
+        config = RoomConfig(people=people)
+        room = make_room(seed, config)
+        assert 6 <= len(room.truth.pieces) <= 9
+        assert int(room.bodies.frame.max()) + 1 >= 200
+        assert len(set(room.bodies.person.tolist())) == people
+        placed, ground = room.plan.pieces, room.truth.ground
+        assert ground is not None
+        assert not any(overlap(a, b, 0.0) for k, a in enumerate(placed) for b in placed[k + 1 :])
+        assert all(abs(float(p.t_world_object[1]) - ground) < 1e-6 for p in room.truth.pieces)
+        assert fingerprint(room) == fingerprint(make_room(seed, config))
+        other = make_room(seed + 100, dataclasses.replace(config, people=1))
+        assert not torch.equal(room.bodies.verts[0], other.bodies.verts[0])

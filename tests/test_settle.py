@@ -1,0 +1,279 @@
+"""Physics: convex pieces fill the furniture, simulators read it, gravity tells what is wrong."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from furnished import furnished, write_out
+from little_room import GROUND, box, camera, mesh_of, piece
+
+import mover.settle
+from mover.commands import run_command
+from mover.exporters import export_mjcf, export_urdf, read_finished
+from mover.exporters.convex import ConvexConfig, ConvexInputs, cut_into_convex
+from mover.exporters.solids import DENSITY, solids_of
+from mover.furniture import make_piece
+from mover.furniture.library import PIECES, canonical
+from mover.geometry.mesh import is_closed
+from mover.geometry.placement import place_piece
+from mover.geometry.watertight import close_mesh
+from mover.readers.mesh_file import write_mesh
+from mover.readers.scene_file import write_scene
+from mover.records import InputError
+from mover.run import Run
+from mover.settle import SettleConfig, Settled, settle
+from mover.types import Mesh, Scene
+
+BOXES = ("chair", "table")
+needs_mujoco = pytest.mark.skipif(
+    not mover.settle.find_spec("mujoco"), reason="needs the extra physics"
+)
+
+
+def manifold(mesh: Mesh) -> Any:
+    import manifold3d
+
+    faces = mesh.faces.numpy().astype(np.uint64)
+    return manifold3d.Manifold(manifold3d.Mesh64(mesh.verts.double().numpy(), faces))
+
+
+def alone(mesh: Mesh, lift: float = 0.0, **changes: Any) -> Scene:
+    given = piece("thing_0", mesh, (0.3, -3.0), 0.4, GROUND + lift)
+    return Scene(camera(), GROUND, (dataclasses.replace(given, **changes),))
+
+
+def settled(scene: Scene, tmp_path: Path) -> Settled:
+    return settle(scene, Run(tmp_path))[0]
+
+
+@pytest.mark.parametrize("method", ["coacd", "slices"])
+@pytest.mark.parametrize("name", ["chair", "sofa", "table"])
+def test_convex_pieces_fill_the_furniture_and_little_more(name: str, method: str):
+    if method == "coacd":
+        pytest.importorskip("coacd", reason="needs the extra physics")
+    mesh = close_mesh(make_piece(name, np.random.default_rng(0), 0).mesh)
+    found = cut_into_convex(ConvexInputs(mesh), ConvexConfig(method))
+    union = manifold(found.hulls[0])
+    for hull in found.hulls:
+        assert is_closed(hull.faces)
+        assert trimesh.Trimesh(hull.verts, hull.faces, process=False).is_convex
+        union = union + manifold(hull)
+    solid = manifold(mesh)
+    missing, extra = (solid - union).volume(), (union - solid).volume()
+    assert missing < 0.01 * solid.volume()
+    assert extra < 0.08 * solid.volume()
+    legs = min(float(hull.verts[:, 1].min()) for hull in found.hulls)
+    assert legs == pytest.approx(float(mesh.verts[:, 1].min()), abs=0.001)
+
+
+def test_a_convex_piece_stays_whole_and_a_sheet_gets_some_thickness():
+    whole = cut_into_convex(ConvexInputs(box(1, 2, 3)), ConvexConfig("slices"))
+    assert len(whole.hulls) == 1
+    assert whole.volume == pytest.approx(6)
+    thin = cut_into_convex(ConvexInputs(box(1, 1e-7, 1)), ConvexConfig("slices"))
+    assert float(np.ptp(thin.hulls[0].verts[:, 1].numpy())) > 5e-4
+
+
+def test_convex_pieces_are_kept_with_the_result(tmp_path: Path):
+    scene = furnished(BOXES)
+    first = solids_of(scene, Run(tmp_path))
+    again = Run(tmp_path)
+    second = solids_of(scene, again)
+    assert [log.kept for log in again.stages] == [True, True]
+    for a, b in zip(first, second, strict=True):
+        assert torch.equal(
+            torch.cat([h.verts for h in a.hulls]), torch.cat([h.verts for h in b.hulls])
+        )
+
+
+def test_the_closed_proxies_of_the_run_are_what_collides(tmp_path: Path):
+    scene = furnished(("chair",))
+    write_mesh(box(0.3, 0.4, 0.5), tmp_path / "watertight" / "chair_0.glb")
+    solid = solids_of(scene, Run(tmp_path))[0]
+    assert len(solid.hulls) == 1
+    assert solid.mass == pytest.approx(0.3 * 0.4 * 0.5 * DENSITY["chair"], rel=1e-5)
+
+
+def test_mass_and_inertia_are_those_of_the_stretched_solid(tmp_path: Path):
+    """Against trimesh, on the mesh in the simulator's axes."""
+    given = furnished(("chair",)).pieces[0]
+    given = dataclasses.replace(given, scale=torch.tensor([1.3, 0.8, 1.1]))
+    solid = solids_of(Scene(camera(), GROUND, (given,)), Run(tmp_path))[0]
+    x, y, z = (close_mesh(given.mesh).verts * given.scale).double().numpy().T
+    truth = trimesh.Trimesh(
+        np.stack([x, -z, y], -1), close_mesh(given.mesh).faces.numpy(), process=False
+    )
+    truth.density = DENSITY["chair"]
+    assert solid.mass == pytest.approx(truth.mass, rel=1e-4)
+    assert solid.centre.numpy() == pytest.approx(truth.center_mass, abs=1e-5)
+    assert solid.inertia.numpy() == pytest.approx(truth.moment_inertia, rel=1e-3, abs=1e-4)
+
+
+def test_every_class_of_the_library_has_a_density():
+    assert {canonical(name) for name in PIECES} <= set(DENSITY)
+
+
+@needs_mujoco
+def test_mujoco_reads_the_model_with_everything_in_place(tmp_path: Path):
+    import mujoco
+
+    scene = furnished((*BOXES, "shelf"))
+    pieces = [
+        dataclasses.replace(p, scale=torch.tensor([1.1, 0.9, 1.2]), support=s)
+        for p, s in zip(scene.pieces, ("ground", "free", "ground"), strict=True)
+    ]
+    scene = dataclasses.replace(scene, pieces=tuple(pieces))
+    home = read_finished(write_out(tmp_path / "out", scene))
+    path = export_mjcf(home, tmp_path).files[0]
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert model.njnt == 2  # the table hangs
+    for given in pieces:
+        body = model.body(given.id)
+        points = [
+            corners(model, data, geom)
+            for geom in range(body.geomadr[0], body.geomadr[0] + body.geomnum[0])
+        ]
+        collide = np.concatenate([p for p, group in points if group == 3])
+        look = np.concatenate([p for p, group in points if group == 2])
+        x, y, z = place_piece(given).verts.double().numpy().T
+        truth = np.stack([x, -z, y - GROUND], -1)
+        bounds = np.stack([truth.min(0), truth.max(0)])
+        assert np.stack([look.min(0), look.max(0)]) == pytest.approx(bounds, abs=1e-4)
+        assert np.stack([collide.min(0), collide.max(0)]) == pytest.approx(bounds, abs=2e-3)
+    assert data.geom("ground").xpos == pytest.approx([0, 0, 0])
+    assert data.cam("camera").xpos == pytest.approx([0, 0, -GROUND])
+    view = np.array(data.cam("camera").xmat).reshape(3, 3)
+    point = np.array([0.4, -0.8, -3.5])
+    there = view.T @ (np.array([point[0], -point[2], point[1]]))
+    focal = 180 / math.tan(math.radians(model.cam("camera").fovy[0]) / 2)
+    seen = (scene.camera.K @ scene.camera.R_cam_world @ torch.tensor(point).float()).numpy()
+    u, v = 320 - focal * there[0] / there[2], 180 + focal * there[1] / there[2]
+    assert [u, v] == pytest.approx(seen[:2] / seen[2], abs=0.05)
+
+
+def corners(model: Any, data: Any, geom: int) -> tuple[np.ndarray, int]:
+    """Vertices of a mesh in the world, and its group."""
+    mesh = model.geom_dataid[geom]
+    start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    turn = np.array(data.geom_xmat[geom]).reshape(3, 3)
+    verts = np.array(model.mesh_vert[start : start + count]) @ turn.T + data.geom_xpos[geom]
+    return verts, int(model.geom_group[geom])
+
+
+@needs_mujoco
+def test_mujoco_reads_the_urdf_with_everything_in_place(tmp_path: Path):
+    import mujoco
+
+    home = read_finished(write_out(tmp_path / "out", furnished(BOXES)))
+    files = export_urdf(home, tmp_path).files
+    assert [f.name for f in files] == ["room.urdf", "chair_0.urdf", "table_0.urdf"]
+    model = mujoco.MjModel.from_xml_path(str(files[0]))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    every = [corners(model, data, g)[0] for g in range(model.ngeom) if model.geom_dataid[g] >= 0]
+    flat = np.concatenate(every)
+    x, y, z = np.concatenate([place_piece(p).verts.numpy() for p in home.scene.pieces]).T
+    truth = np.stack([x, -z, y - GROUND], -1)
+    assert flat.min(0) == pytest.approx(truth.min(0), abs=2e-3)
+    assert flat.max(0) == pytest.approx(truth.max(0), abs=2e-3)
+    single = mujoco.MjModel.from_xml_path(str(files[1]))
+    tree = ElementTree.parse(files[1]).getroot()
+    assert tree.tag == "robot"
+    assert single.ngeom == len(tree.findall("link/visual")) + len(tree.findall("link/collision"))
+    mass = tree.find("link/inertial/mass")
+    assert mass is not None
+    assert 2 < float(mass.attrib["value"]) < 20
+
+
+@needs_mujoco
+def test_what_stands_on_the_floor_stays(tmp_path: Path):
+    for found in settle(furnished(), Run(tmp_path)):
+        assert found.moved < 0.001, found
+        assert found.turned < math.radians(0.2), found
+        assert found.stuck < 0.001
+
+
+@needs_mujoco
+def test_what_floats_falls_as_far_as_it_floats(tmp_path: Path):
+    found = settled(alone(box(0.6, 0.5, 0.6), lift=0.15), tmp_path)
+    assert found.fell == pytest.approx(0.15, abs=0.003)
+    assert found.moved == pytest.approx(0.15, abs=0.01)
+
+
+@needs_mujoco
+def test_what_is_sunk_is_reported_and_comes_up(tmp_path: Path):
+    found = settled(alone(box(0.6, 0.5, 0.6), lift=-0.05), tmp_path)
+    assert found.stuck == pytest.approx(0.05, abs=0.001)
+    assert found.fell < -0.04
+
+
+@needs_mujoco
+def test_what_leans_over_its_foot_falls_over(tmp_path: Path):
+    foot = trimesh.creation.box(extents=(0.2, 0.4, 0.2))
+    foot.apply_translation([0, 0.2, 0])
+    arm = trimesh.creation.box(extents=(1.2, 0.2, 0.2))
+    arm.apply_translation([0.5, 0.5, 0])
+    found = settled(alone(mesh_of(trimesh.util.concatenate([foot, arm]))), tmp_path)
+    assert found.moved > 0.1
+    assert found.turned > math.radians(15)
+
+
+@needs_mujoco
+def test_what_hangs_is_held(tmp_path: Path):
+    found = settled(alone(box(0.6, 0.5, 0.1), lift=1.0, support="free"), tmp_path)
+    assert found.fixed
+    assert found.moved == 0
+
+
+@needs_mujoco
+def test_what_stands_on_a_table_stays_on_it(tmp_path: Path):
+    table = piece("table_0", box(1.2, 0.7, 0.8), (0, -3), 0.2, GROUND)
+    lamp = piece("lamp_0", box(0.2, 0.4, 0.2), (0.1, -3.1), 0.0, GROUND + 0.7)
+    lamp = dataclasses.replace(lamp, support="table_0")
+    for found in settle(Scene(camera(), GROUND, (table, lamp)), Run(tmp_path)):
+        assert found.moved < 0.002
+
+
+@needs_mujoco
+def test_a_scene_whose_floor_nobody_knows_stands_on_its_lowest_point(tmp_path: Path):
+    scene = dataclasses.replace(furnished(BOXES), ground=None)
+    assert max(found.moved for found in settle(scene, Run(tmp_path))) < 0.001
+
+
+@needs_mujoco
+def test_the_command_compares_initial_and_result(tmp_path: Path, capsys):
+    out = write_out(tmp_path / "out", alone(box(0.6, 0.5, 0.6)))
+    write_scene(alone(box(0.6, 0.5, 0.6), lift=0.1), out / "initial.json")
+    assert run_command("settle", [str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "initial: median 100 mm" in text
+    assert "result: median 0 mm" in text
+    tree = json.loads((out / "settle.json").read_text())
+    assert tree["scenes"]["initial"][0]["fell"] == pytest.approx(0.1, abs=0.002)
+    assert tree["scenes"]["result"][0]["toppled"] is False
+
+
+def test_without_mujoco_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(mover.settle, "find_spec", lambda _: None)
+    with pytest.raises(InputError, match=r"mover\[physics\]"):
+        settle(furnished(BOXES), Run(tmp_path))
+
+
+@pytest.mark.slow
+@needs_mujoco
+@pytest.mark.parametrize("seed", range(10))
+def test_the_truth_of_known_rooms_stands_still(seed: int, tmp_path: Path):
+    from mover.rooms import make_room
+
+    truth = make_room(seed).truth
+    for found in settle(truth, Run(tmp_path), SettleConfig(3.0)):
+        assert found.moved < 0.01, found
