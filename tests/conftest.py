@@ -1,10 +1,7 @@
 import pytest
 import torch
 
-
-def pytest_configure(config):
-    """Threads that wait for one another are slower than one, and results do not depend on them."""
-    torch.set_num_threads(1)
+torch.set_num_threads(1)  # threads that wait for one another are slower than one
 
 
 @pytest.fixture(scope="session")
@@ -13,3 +10,11 @@ def small_room():
     from mover.rooms.room import RoomConfig, make_room
 
     return make_room(3, RoomConfig(width=480, height=270, stay=0.3, least_frames=60))
+
+
+@pytest.fixture(scope="session")
+def demo_room():
+    """The room of `mover demo`."""
+    from mover.rooms import room
+
+    return room.demo_room()

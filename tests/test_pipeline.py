@@ -11,7 +11,7 @@ import raycast
 import torch
 
 from mover.geometry.runs import decode
-from mover.minimize import Adam, Step
+from mover.minimize import Adam, Step, silent
 from mover.pipeline import PRESETS, Run, reconstruct
 from mover.readers import read
 from mover.readers.scene_file import read_scene
@@ -50,7 +50,7 @@ def capture_folder(tmp_path_factory, small_room):
     return folder
 
 
-def run_in(folder, capture, config, observe=lambda step: None):
+def run_in(folder, capture, config, observe=silent):
     run = Run(folder, observe)
     room = reconstruct(capture, config, run)
     write_results(capture, room, config, run)
@@ -63,7 +63,9 @@ class Killed(Exception):
 
 @pytest.mark.slow
 class TestRun:
-    def test_a_run_that_was_killed_goes_on_and_gives_the_same_result(self, capture_folder, tmp_path):
+    def test_a_run_that_was_killed_goes_on_and_gives_the_same_result(
+        self, capture_folder, tmp_path
+    ):
         capture, config = read("folder", capture_folder), light("robust")
         run_in(tmp_path / "whole", capture, config)
         seen = []
@@ -97,7 +99,14 @@ class TestRun:
     def test_every_preset_writes_a_whole_result(self, capture_folder, tmp_path, name):
         capture, config = read("folder", capture_folder), light(name)
         room = run_in(tmp_path, capture, config)
-        for file in ("scene.json", "scene.glb", "bodies.npz", "run.json", "report.html", "initial.json"):
+        for file in (
+            "scene.json",
+            "scene.glb",
+            "bodies.npz",
+            "run.json",
+            "report.html",
+            "initial.json",
+        ):
             assert (tmp_path / file).stat().st_size > 100, file
         scene = read_scene(tmp_path / "scene.json")
         assert [p.id for p in scene.pieces] == [p.id for p in capture.scene.pieces]
@@ -115,7 +124,9 @@ class TestRun:
             lowest = float(place_piece(piece).verts[:, 1].min())
             assert abs(lowest - room.scene.ground) < 1e-4, piece.id
 
-    def test_without_people_only_the_image_speaks_and_the_run_says_so(self, capture_folder, tmp_path):
+    def test_without_people_only_the_image_speaks_and_the_run_says_so(
+        self, capture_folder, tmp_path
+    ):
         alone = tmp_path / "capture"
         shutil.copytree(capture_folder, alone)
         (alone / "bodies.npz").unlink()

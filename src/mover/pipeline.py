@@ -89,7 +89,7 @@ def reconstruct(capture: Capture, config: Config, run: Run) -> Room:
     seen = image_evidence(capture)
     prepared = run.stage(prepare_objects, PrepareInputs(capture.scene.pieces), config.prepare)
     job = Job(capture, config, run, seen, prepared)
-    crew = _people(job)
+    crew = people_of(job)
     if crew is None:
         view = _from_image(job, capture.scene.camera, ground_without_people(capture, prepared))
         return _room(job, view, None)
@@ -99,7 +99,7 @@ def reconstruct(capture: Capture, config: Config, run: Run) -> Room:
     return _room(job, _with_people(job, crew, view), crew)
 
 
-def _people(job: Job) -> Crew | None:
+def people_of(job: Job) -> Crew | None:
     """Choose frames, find the people's depth and their feet, and from these camera and ground."""
     capture, config, run = job.capture, job.config, job.run
     bodies, scene = capture.bodies, capture.scene
@@ -149,27 +149,33 @@ def _refine(job: Job, crew: Crew, view: View) -> View:
 
 def _with_people(job: Job, crew: Crew, view: View) -> View:
     """Gather what the people say, and place the objects with it; renew both as often as asked."""
-    bodies = in_world(rows_of(crew.bodies, crew.kept), view.camera)
-    given = None if job.capture.touch is None else job.capture.touch[crew.kept]
-    touching = job.run.stage(
-        find_touches, FindTouchesInputs(bodies, crew.parts, view.ground, given), job.config.touches
-    )
-    cues = job.run.stage(
-        gather_cues,
-        GatherInputs(bodies, job.capture.people, job.seen.masks, view.camera),
-        job.config.gather,
-    )
+    view = gathered(job, crew, view)
     fit = view.placed.energy[0]
     for turn in range(1 + job.config.again):
         if turn:
             view = replace(view, image=replace(view.image, behind=_order(job, view)))
-        inputs = TouchInputs(
-            bodies, touching.probability, crew.parts, job.seen.masks, job.seen.boxes, view.camera,
-            job.prepared.objects, view.placed.layout,
-        )  # fmt: skip
-        contacts = job.run.stage(assign_touches, inputs, job.config.assign)
-        view = _place_with(job, replace(view, cues=cues, contacts=contacts), fit)
+        view = _place_with(job, assigned(job, crew, view), fit)
     return view
+
+
+def gathered(job: Job, crew: Crew, view: View) -> View:
+    """The view with depth maps and free space from all frames."""
+    bodies = in_world(rows_of(crew.bodies, crew.kept), view.camera)
+    inputs = GatherInputs(bodies, job.capture.people, job.seen.masks, view.camera)
+    return replace(view, cues=job.run.stage(gather_cues, inputs, job.config.gather))
+
+
+def assigned(job: Job, crew: Crew, view: View) -> View:
+    """The view with contact points, each given to an object where it stands now."""
+    bodies = in_world(rows_of(crew.bodies, crew.kept), view.camera)
+    given = None if job.capture.touch is None else job.capture.touch[crew.kept]
+    inputs = FindTouchesInputs(bodies, crew.parts, view.ground, given)
+    touching = job.run.stage(find_touches, inputs, job.config.touches)
+    touches = TouchInputs(
+        bodies, touching.probability, crew.parts, job.seen.masks, job.seen.boxes, view.camera,
+        job.prepared.objects, view.placed.layout,
+    )  # fmt: skip
+    return replace(view, contacts=job.run.stage(assign_touches, touches, job.config.assign))
 
 
 def _place_with(job: Job, view: View, fit: Float[Tensor, " objects"]) -> View:

@@ -20,8 +20,10 @@ from .known import KnownRoom
 from .noise_config import NoiseConfig
 from .noise_masks import noisy_detections, noisy_people
 from .noise_people import noisy_bodies
+from .threads import one_thread
 
 
+@one_thread()
 def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     """What upstream tools would say about a room; the same for the same seed on every machine.
 

@@ -17,11 +17,13 @@ from .placed import Placed
 from .poses import jointed, rows
 from .render import draw_bodies, see
 from .scripts import draw_person, draw_start, draw_tasks
+from .threads import one_thread
 
 CLEAR = 0.25  # [m], between the joints of two people
 MOST_WAIT = 24.0  # [s], before somebody begins
 
 
+@one_thread()
 def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
     """A room in which everything is known; the same for the same seed and configuration.
 
@@ -120,6 +122,7 @@ _DEMO: tuple[tuple[str, str, int, int, tuple[float, float, float]], ...] = (
 """Id, piece, style, seed of the sizes, and (x, z, heading) of the demo's furniture."""
 
 
+@one_thread()
 def demo_room() -> KnownRoom:
     """A bed-sitting room whose tenant walks, sits, leans back, lies and stands at a table."""
     pieces = tuple(
@@ -143,6 +146,7 @@ def demo_room() -> KnownRoom:
     return build(plan, actors, RoomConfig(), "demo", performance.refused)
 
 
+@one_thread()
 def draw_frame(room: KnownRoom, frame: int) -> Float[Tensor, "h w 3"]:
     """A picture of the room with everybody in it, in [0, 1]."""
     rows = torch.nonzero(room.bodies.frame == frame)[:, 0].tolist()

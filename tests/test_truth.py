@@ -1,0 +1,131 @@
+"""On known rooms the truth is a minimum of the full energy, and files say what masks show."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import raycast
+import torch
+import trimesh
+
+from mover.geometry.runs import decode
+from mover.pipeline import PRESETS, Run
+from mover.readers.scene_file import write_scene
+from mover.stages.place_objects import PlaceInputs, energy_of
+from mover.types import Layout
+
+COUNT = 200  # perturbations of each object
+FLIP_X, FLIP_Y = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0])
+
+
+def at_truth(room, preset, folder):
+    """The evidence of a noiseless room, gathered at the truth, and the true layout."""
+    from mover import pipeline
+
+    config = PRESETS[preset]
+    config = replace(config, correct_depth=False, refine=replace(config.refine, rounds=0), again=0)
+    config = replace(config, gather=replace(config.gather, cells=192))
+    capture = room.capture
+    seen = pipeline.image_evidence(capture)
+    run = Run(folder)
+    prepared = run.stage(
+        pipeline.prepare_objects, pipeline.PrepareInputs(room.truth.pieces), config.prepare
+    )
+    job = pipeline.Job(capture, config, run, seen, prepared)
+    crew = pipeline.people_of(job)
+    unordered = torch.zeros(len(seen.boxes), len(seen.boxes), dtype=torch.bool)
+    camera, ground = room.truth.camera, room.truth.ground
+    image = pipeline.ImageInputs(
+        camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered
+    )
+    placed = pipeline.Placed(
+        prepared.start,
+        pipeline.alone(prepared.start),
+        torch.zeros(1, len(seen.boxes)),
+        torch.zeros(0),
+    )
+    view = pipeline.View(camera, ground, image, prepared.start, placed, {}, prepared.start)
+    view = pipeline.assigned(job, crew, pipeline.gathered(job, crew, view))
+    cues = run.stage(pipeline.find_image_cues, image, config.image)
+    humans = pipeline.cues_in_windows(view.cues, view.contacts.touches, cues.views, camera)
+    starts = pipeline.alone(prepared.start)
+    inputs = PlaceInputs(prepared.objects, camera, ground, cues, humans, starts, prepared.start.yaw)
+    return inputs, config
+
+
+def perturbed(truth, count, seed):
+    """2-30 cm, 2-30 degrees and 3-20 % away, in directions drawn evenly."""
+    g = torch.Generator().manual_seed(seed)
+
+    def draw(shape, low, high):
+        size = low + (high - low) * torch.rand(shape, generator=g)
+        return size * torch.sign(torch.rand(shape, generator=g) - 0.5)
+
+    n = truth.yaw.shape[-1]
+    angle = 2 * torch.pi * torch.rand(count, n, generator=g)
+    reach = draw((count, n), 0.02, 0.30)
+    step = torch.stack([reach * angle.cos(), torch.zeros_like(reach), reach * angle.sin()], -1)
+    turn = draw((count, n), np.radians(2), np.radians(30))
+    size = (1 + draw((count, n, 3), 0.03, 0.20)).log()
+    return Layout(truth.t_world_object + step, truth.yaw + turn, truth.log_scale + size)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["small", "demo"])
+def test_the_truth_is_a_minimum_of_the_full_energy(which, request, tmp_path):
+    """Of `robust`; the printed formulas are not least at the truth (docs/method.md)."""
+    room = request.getfixturevalue(f"{which}_room")
+    inputs, config = at_truth(room, "robust", tmp_path)
+    energy = energy_of(inputs, config.place)
+    with torch.no_grad():
+        true = energy(inputs.starts).per_item[0]
+        lower = torch.zeros_like(true)
+        for seed in range(COUNT // 20):
+            lower += (energy(perturbed(inputs.starts, 20, seed)).per_item < true).sum(0)
+    share = dict(zip(inputs.objects.ids, (lower / COUNT).tolist(), strict=True))
+    assert max(share.values()) <= 0.02, share
+
+
+def redraw(folder, turn=None):
+    """Ids of the objects in each pixel, from the files alone and by an independent ray caster."""
+    scene = json.loads((folder / "scene.json").read_text())
+    camera = scene["camera"]
+    K = np.array([[camera["fl_x"], 0, camera["cx"]], [0, camera["fl_y"], camera["cy"]], [0, 0, 1]])
+    R = np.array(camera["R_cam_world"])
+    meshes = []
+    for item in scene["objects"]:
+        mesh = trimesh.load(folder / item["mesh"], force="mesh")
+        c, s = np.cos(item["yaw"]), np.sin(item["yaw"])
+        rotation = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        verts = (mesh.vertices * item["scale"]) @ rotation.T + item["translation"]
+        verts = verts if turn is None else verts @ turn.T
+        meshes.append((verts @ R.T, mesh.faces))
+    depth = np.full((len(meshes), camera["h"], camera["w"]), np.inf)
+    for k, (verts, faces) in enumerate(meshes):
+        depth[k] = raycast.cast(verts, np.asarray(faces), K, camera["h"], camera["w"])[0]
+    ids = depth.argmin(0)
+    ids[~np.isfinite(depth.min(0))] = -1
+    return [item["annotation"] for item in scene["objects"]], ids
+
+
+def overlaps(folder, room, turn=None):
+    masks = {d.id: decode(d.mask, 0).numpy() for d in room.capture.detections}
+    annotations, ids = redraw(folder, turn)
+    values = []
+    for k, annotation in enumerate(annotations):
+        mask = masks[annotation]
+        values.append(((ids == k) & mask).sum() / max(1, ((ids == k) | mask).sum()))
+    return np.array(values)
+
+
+@pytest.mark.slow
+def test_a_room_redrawn_from_its_files_matches_its_masks_and_mirrored_worlds_do_not(
+    small_room, tmp_path
+):
+    write_scene(small_room.truth, tmp_path / "scene.json")
+    true = overlaps(tmp_path, small_room)
+    assert true.min() >= 0.98, true
+    for turn in (FLIP_X, FLIP_Y):
+        assert overlaps(tmp_path, small_room, turn).max() < 0.98
+        assert overlaps(tmp_path, small_room, turn).mean() < 0.5
