@@ -4,7 +4,7 @@ import importlib
 import logging
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,7 +33,6 @@ class RunArgs:
     """paper, release or robust: the settings that the other flags change."""
     config_from: Annotated[Path | None, arg(name="config")] = None
     """A run.json whose settings are used instead of a preset's."""
-    config: Annotated[Config, arg(name="")] = field(default_factory=Config)
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     return 0
 
 
-def _parse_run(arguments: Sequence[str]) -> RunArgs:
+def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
     """The preset is read first, so that the other flags may stand before or after it."""
     import argparse
 
@@ -96,12 +95,14 @@ def _parse_run(arguments: Sequence[str]) -> RunArgs:
     config = preset_named(chosen.preset)
     if chosen.config is not None:
         config = read_config(chosen.config)
-    return tyro.cli(RunArgs, prog="mover run", args=list(arguments), default=_default(config))
 
+    def both(
+        args: Annotated[RunArgs, arg(name="")], config: Annotated[Config, arg(name="")] = config
+    ) -> tuple[RunArgs, Config]:
+        """Reconstruct a room from a capture folder."""
+        return args, config
 
-def _default(config: Config) -> RunArgs:
-    missing: Any = tyro.MISSING
-    return RunArgs(missing, config=config)
+    return tyro.cli(both, prog="mover run", args=list(arguments))
 
 
 def preset_named(name: str) -> Config:
@@ -116,11 +117,11 @@ def preset_named(name: str) -> Config:
 
 
 def _run(arguments: Sequence[str]) -> None:
-    args = _parse_run(arguments)
+    args, config = parse_run(arguments)
     from .readers import read
 
     capture = read(args.format, args.source)
-    _reconstruct(capture, args.config, args.out)
+    _reconstruct(capture, config, args.out)
     _say(f"report: {args.out / 'report.html'}")
 
 
@@ -150,8 +151,6 @@ def _check(arguments: Sequence[str]) -> None:
 
     capture = read(args.format, args.source)
     _say(evidence_table(capture, gather_evidence(capture)))
-    for warning in capture.warnings:
-        _say(f"warning: {warning}")
     save_overlay(capture, args.out)
     _say(f"{args.source} is a valid capture; its initial scene is drawn in {args.out}")
 

@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import NEAR, project
 from ..types import Bodies, Capture, Masks
+from .evidence_contacts import contact_frames
 from .masks import area, thinned
 
 CELLS = 320  # columns of the grid on which overlaps are counted
 ENOUGH = 6000  # bodies with fewer vertices are filled with points between them
+BORDER = 2  # cells of the grid beside an outline that tell nothing
 FEW = 50  # [px], less than that is no evidence to speak of
 
 
@@ -30,6 +32,8 @@ class ObjectEvidence:
     """Pixels of the mask in which a body is hidden at some time (it is nearer)."""
     frames: int
     """Frames in which a person's visible mask overlaps it."""
+    contacts: int
+    """Frames in which somebody seems to touch it."""
     missing: tuple[str, ...]
     """What would help and is not there."""
 
@@ -48,20 +52,31 @@ def gather_evidence(capture: Capture) -> tuple[ObjectEvidence, ...]:
         for i in np.flatnonzero(over.any((1, 2))):
             frames[i].add(frame)
         if body is not None:
-            near |= over & body
-            far |= grids & body & ~_visible_in(capture, frame, step)
+            before = over & body
+            behind = grids & _shrunk(body) & _shrunk(~_visible_in(capture, frame, step))
+            more = before.sum((1, 2)) - behind.sum((1, 2))  # it hides or is hidden, not both
+            near |= before & (more > 0)[:, None, None]
+            far |= behind & (more < 0)[:, None, None]
     counts = near.sum((1, 2)) * step**2, far.sum((1, 2)) * step**2
+    contacts = contact_frames(capture)
     return tuple(
-        _object(capture, i, masks[i], (int(counts[0][i]), int(counts[1][i]), len(frames[i])))
-        for i in range(len(masks))
+        _object(capture, i, masks[i], (int(counts[0][i]), int(counts[1][i]), len(frames[i]), n))
+        for i, n in enumerate(contacts)
     )
 
 
+def _shrunk(grid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Without its border: masks and bodies are rarely right to the pixel."""
+    from scipy.ndimage import binary_erosion
+
+    return np.asarray(binary_erosion(grid, iterations=BORDER, border_value=1), dtype=np.bool_)
+
+
 def _object(
-    capture: Capture, index: int, mask: Masks | None, counts: tuple[int, int, int]
+    capture: Capture, index: int, mask: Masks | None, counts: tuple[int, int, int, int]
 ) -> ObjectEvidence:
     """The evidence of one object, with what is missing."""
-    piece, (near, far, frames) = capture.scene.pieces[index], counts
+    piece, (near, far, frames, contacts) = capture.scene.pieces[index], counts
     missing: list[str] = []
     if piece.annotation is None:
         missing.append("no annotation")
@@ -73,7 +88,9 @@ def _object(
         missing += ["no near bound"] if near < FEW else []
         missing += ["no far bound"] if far < FEW else []
     size = 0 if mask is None else area(mask, 0)
-    return ObjectEvidence(piece.id, piece.category, size, near, far, frames, tuple(missing))
+    return ObjectEvidence(
+        piece.id, piece.category, size, near, far, frames, contacts, tuple(missing)
+    )
 
 
 def _stack(masks: Sequence[Masks | None], capture: Capture, step: int) -> NDArray[np.bool_]:
@@ -134,7 +151,9 @@ def _silhouette(capture: Capture, bodies: Bodies, row: int, step: int) -> NDArra
 
 def evidence_table(capture: Capture, evidence: Sequence[ObjectEvidence]) -> str:
     """The evidence as a table in plain text, and the capture's warnings."""
-    head = ("object", "category", "mask px", "near px", "far px", "frames", "missing")
+    head = (
+        "object", "category", "mask px", "near px", "far px", "frames", "contacts", "missing",
+    )  # fmt: skip
     rows = [head] + [
         (
             e.id,
@@ -143,6 +162,7 @@ def evidence_table(capture: Capture, evidence: Sequence[ObjectEvidence]) -> str:
             str(e.near_pixels),
             str(e.far_pixels),
             str(e.frames),
+            str(e.contacts),
             ", ".join(e.missing) or "-",
         )
         for e in evidence

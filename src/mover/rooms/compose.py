@@ -1,21 +1,20 @@
 """Furnish a room: what stands where, and from where the camera sees it."""
 
-from collections.abc import Callable
-from typing import Literal
+import dataclasses
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from ..furniture import make_piece
 from ..geometry.camera import project, tilted, to_camera
 from ..records import record
 from ..types import Camera
+from .crowding import depth_of, worth
 from .placed import Placed, corners, verts_on_floor
-from .turns import facing, heading_of, left_of
-
-Rule = Literal["wall", "corner", "middle", "facing", "before", "around", "beside"]
-Pose = tuple[float, float, float]
+from .spots import RULES, Rule
+from .turns import facing, left_of
 
 
 @record
@@ -67,6 +66,7 @@ KINDS: dict[str, tuple[tuple[str, Rule], ...]] = {
 """What stands in each kind of room, the most important first."""
 
 TRIES = 40
+CHOICES = 5  # places to choose from, the one that hides the most pieces
 LEAST_VISIBLE = 0.85  # share of the corners of a piece's box inside the image
 MARGIN: dict[Rule, float] = {
     "wall": 0.06, "corner": 0.05, "middle": 0.5, "facing": 0.45, "before": 0.1, "around": 0.04,
@@ -86,9 +86,9 @@ def make_view(size: tuple[int, int], numbers: tuple[float, float, float, float])
 
 
 def draw_view(rng: np.random.Generator, size: tuple[int, int]) -> View:
-    """A camera as somebody would put it up: 1.3-1.9 m high, looking 8-16 degrees down."""
-    height = float(rng.uniform(1.35, 1.9))
-    pitch = -np.radians(rng.uniform(8, 14) + 4 * (height - 1.35))
+    """A camera as somebody would put it up: 1.2-1.7 m high, looking 8-16 degrees down."""
+    height = float(rng.uniform(1.2, 1.7))
+    pitch = -np.radians(rng.uniform(8, 14) + 4 * (height - 1.2))
     roll = np.radians(rng.uniform(-2, 2))
     return make_view(
         size, (height, float(pitch), float(roll), float(np.radians(rng.uniform(61, 69))))
@@ -96,26 +96,41 @@ def draw_view(rng: np.random.Generator, size: tuple[int, int]) -> View:
 
 
 def draw_plan(rng: np.random.Generator, size: tuple[int, int], most: int) -> Plan:
-    """A room of a random kind with at most so many pieces."""
+    """A room of a random kind with at most so many pieces, many of them partly hidden."""
     view = draw_view(rng, size)
     wide, deep = float(rng.uniform(4.6, 5.4)), float(rng.uniform(5.6, 6.4))
     low, high = (-wide / 2, -deep), (wide / 2, -1.9)
-    walls = np.array([low, high])
     kind = sorted(KINDS)[int(rng.integers(len(KINDS)))]
-    pieces: list[Placed] = []
+    plan = Plan((), view, low, high)
+    drawn: list[Float[Tensor, "h w"]] = []
     for name, rule in KINDS[kind][:most]:
-        furniture = make_piece(name, rng)
-        count = sum(p.furniture.category == furniture.category for p in pieces)
-        label = f"{furniture.category.replace(' ', '_')}_{count}"
-        for _ in range(TRIES):
-            spot = _RULES[rule](rng, furniture.size, walls, pieces)
-            if spot is None:
-                break
-            piece = Placed(label, furniture, (spot[0], spot[1]), spot[2])
-            if _fits(piece, pieces, MARGIN[rule], walls) and in_view(piece, view) >= LEAST_VISIBLE:
-                pieces.append(piece)
-                break
-    return Plan(tuple(pieces), view, low, high)
+        spots = _spots(plan, (name, rule), rng)
+        looks = [depth_of(spot, view.camera, view.height) for spot in spots]
+        values = [worth([*drawn, look]) for look in looks]
+        best = int(np.argmax(values)) if values else -1
+        if best >= 0 and values[best] >= 0:
+            drawn.append(looks[best])
+            plan = dataclasses.replace(plan, pieces=(*plan.pieces, spots[best]))
+    return plan
+
+
+def _spots(plan: Plan, what: tuple[str, Rule], rng: np.random.Generator) -> list[Placed]:
+    """Up to `CHOICES` places where a new piece stands free and in view."""
+    name, rule = what
+    furniture = make_piece(name, rng)
+    others = list(plan.pieces)
+    count = sum(p.furniture.category == furniture.category for p in others)
+    label = f"{furniture.category.replace(' ', '_')}_{count}"
+    found: list[Placed] = []
+    for _ in range(TRIES):
+        spot = RULES[rule](rng, furniture.size, plan.walls, others)
+        if spot is None or len(found) == CHOICES:
+            break
+        piece = Placed(label, furniture, (spot[0], spot[1]), spot[2])
+        free = _fits(piece, others, MARGIN[rule], plan.walls)
+        if free and in_view(piece, plan.view) >= LEAST_VISIBLE:
+            found.append(piece)
+    return found
 
 
 def in_view(piece: Placed, view: View) -> float:
@@ -144,80 +159,3 @@ def overlap(a: Placed, b: Placed, margin: float) -> bool:
             if p.max() < q.min() or q.max() < p.min():
                 return False
     return True
-
-
-Size = tuple[float, float, float]
-Others = list[Placed]
-
-
-def _wall(rng: np.random.Generator, size: Size, walls: np.ndarray, _: Others) -> Pose:
-    side = int(rng.integers(3))
-    off = size[2] / 2 + float(rng.uniform(0.02, 0.06))
-    half = size[0] / 2 + 0.02
-    if side == 0:
-        return float(rng.uniform(walls[0, 0] + half, walls[1, 0] - half)), walls[0, 1] + off, 0.0
-    z = float(rng.uniform(walls[0, 1] + half, max(walls[0, 1] + half + 0.1, -2.6 - half)))
-    turn = np.pi / 2 if side == 1 else -np.pi / 2
-    return (walls[0, 0] + off if side == 1 else walls[1, 0] - off), z, turn
-
-
-def _corner(rng: np.random.Generator, size: Size, walls: np.ndarray, _: Others) -> Pose:
-    off = max(size[0], size[2]) / 2 + float(rng.uniform(0.03, 0.5))
-    x = walls[0, 0] + off if rng.integers(2) else walls[1, 0] - off
-    return float(x), float(walls[0, 1] + off), float(rng.uniform(-np.pi, np.pi))
-
-
-def _middle(rng: np.random.Generator, _: Size, walls: np.ndarray, __: Others) -> Pose:
-    x = float(rng.uniform(-1.4, 1.4))
-    z = float(rng.uniform(walls[0, 1] + 1.6, -3.1))
-    return x, z, float(rng.choice([0.0, np.pi / 2]) + np.radians(rng.uniform(-8, 8)))
-
-
-def _facing(rng: np.random.Generator, _: Size, walls: np.ndarray, __: Others) -> Pose:
-    x = float(rng.uniform(walls[0, 0] + 0.6, walls[1, 0] - 0.6))
-    z = float(rng.uniform(walls[0, 1] + 0.6, -3.0))
-    centre = np.array([0.0, (walls[0, 1] - 2.8) / 2])
-    heading = float(heading_of(centre - np.array([x, z])) + np.radians(rng.uniform(-50, 50)))
-    return x, z, heading
-
-
-def _before(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
-    sofas = [p for p in others if p.furniture.category == "sofa"]
-    if not sofas:
-        return None
-    front = sofas[0].furniture.size[2] / 2 + size[2] / 2 + float(rng.uniform(0.8, 1.0))
-    place = sofas[0].place + front * facing(np.array(sofas[0].heading))
-    return float(place[0]), float(place[1]), sofas[0].heading
-
-
-def _around(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
-    tables = [p for p in others if p.furniture.category == "table"]
-    if not tables:
-        return None
-    side = int(rng.integers(4))
-    w, d = tables[0].furniture.size[0], tables[0].furniture.size[2]
-    away = (d if side % 2 == 0 else w) / 2 + size[2] / 2 + float(rng.uniform(0.06, 0.45))
-    out = tables[0].heading + side * np.pi / 2
-    place = tables[0].place + away * facing(np.array(out))
-    turn = float(rng.choice([np.pi, np.pi / 2, -np.pi / 2, 0.0])) + np.radians(rng.uniform(-20, 20))
-    return float(place[0]), float(place[1]), float(out + turn)
-
-
-def _beside(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
-    beds = [p for p in others if p.furniture.category == "bed"]
-    if not beds:
-        return None
-    bed = beds[0]
-    side = 1 if rng.integers(2) else -1
-    across = side * (bed.furniture.size[0] / 2 + size[0] / 2 + float(rng.uniform(0.06, 0.12)))
-    along = -bed.furniture.size[2] / 2 + size[2] / 2
-    place = (
-        bed.place + across * left_of(np.array(bed.heading)) + along * facing(np.array(bed.heading))
-    )
-    return float(place[0]), float(place[1]), bed.heading
-
-
-_RULES: dict[Rule, Callable[[np.random.Generator, Size, np.ndarray, Others], Pose | None]] = {
-    "wall": _wall, "corner": _corner, "middle": _middle, "facing": _facing, "before": _before,
-    "around": _around, "beside": _beside,
-}  # fmt: skip

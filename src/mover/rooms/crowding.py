@@ -1,0 +1,39 @@
+"""How much of each piece of furniture other pieces hide, in a small picture without people."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..geometry.camera import to_camera
+from ..geometry.raster import first_hit
+from ..types import Camera
+from .placed import Placed, verts_on_floor
+
+WIDTH = 240  # [px] of the small picture
+HIDDEN = 0.3  # a piece of which more is hidden counts as hidden
+TOO_MUCH = 0.75  # no piece may be hidden more than this
+
+
+def depth_of(piece: Placed, camera: Camera, height: float) -> Float[Tensor, "h w"]:
+    """Depth of a piece drawn alone by a camera above the floor [m], infinite where it is not."""
+    zoom = WIDTH / camera.width
+    size = (max(1, round(camera.height * zoom)), WIDTH)
+    K = camera.K * torch.tensor([[zoom], [size[0] / camera.height], [1.0]])
+    verts = torch.from_numpy(verts_on_floor(piece)).float() - torch.tensor([0, height, 0])
+    cam = to_camera(verts, camera.R_cam_world)
+    return first_hit(cam, piece.furniture.mesh.faces, K, size)[0]
+
+
+def hidden_of(depths: list[Float[Tensor, "h w"]]) -> Float[np.ndarray, " pieces"]:
+    """Share of the image of each piece that others hide."""
+    alone = torch.stack(depths)
+    covered = alone.isfinite()
+    left = (covered & (alone <= alone.amin(0))).sum((1, 2))
+    return (1 - left / covered.sum((1, 2)).clamp_min(1)).numpy()
+
+
+def worth(depths: list[Float[Tensor, "h w"]]) -> float:
+    """How many pieces are well hidden; -1 where one can hardly be seen."""
+    hidden = hidden_of(depths)
+    return -1.0 if (hidden > TOO_MUCH).any() else float((hidden >= HIDDEN).sum())
