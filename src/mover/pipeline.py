@@ -13,6 +13,7 @@ from .geometry.floor import recast, slide_to_floor
 from .geometry.placement import GROUND, place, stand
 from .presets import PRESETS as PRESETS
 from .presets import Config as Config
+from .readers.pose_file import into_camera
 from .run import Run as Run
 from .stages.align_camera import AlignInputs, Alignment, align_camera
 from .stages.assign_touches import Contacts, TouchInputs, assign_touches
@@ -213,7 +214,8 @@ def _room(job: Job, view: View, crew: Crew | None) -> Room:
     warnings = [*capture.warnings, *job.prepared.warnings]
     bodies = None
     if crew is not None:
-        bodies = in_world(crew.bodies, view.camera)
+        turned = into_camera(replace(crew.bodies, space="world"), view.camera.R_cam_world.mT)
+        bodies = replace(turned, space="world")
         warnings += crew.warnings
     if crew is not None and bodies is not None and view.contacts is not None:
         warnings += doubts(DoubtInputs(

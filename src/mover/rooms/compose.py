@@ -65,8 +65,9 @@ KINDS: dict[str, tuple[tuple[str, Rule], ...]] = {
 }  # fmt: skip
 """What stands in each kind of room, the most important first."""
 
+ROUNDS = 5  # rooms to choose from
 TRIES = 40
-CHOICES = 5  # places to choose from, the one that hides the most pieces
+CHOICES = 8  # places to choose from, the one that hides the most pieces
 LEAST_VISIBLE = 0.85  # share of the corners of a piece's box inside the image
 MARGIN: dict[Rule, float] = {
     "wall": 0.06, "corner": 0.05, "middle": 0.5, "facing": 0.45, "before": 0.1, "around": 0.04,
@@ -96,12 +97,25 @@ def draw_view(rng: np.random.Generator, size: tuple[int, int]) -> View:
 
 
 def draw_plan(rng: np.random.Generator, size: tuple[int, int], most: int) -> Plan:
-    """A room of a random kind with at most so many pieces, many of them partly hidden."""
+    """A room of a random kind with at most so many pieces, a third of them partly hidden."""
+    best, most_hidden = None, -1.0
+    for _ in range(ROUNDS):
+        plan, value = _furnished(rng, size, most)
+        if best is None or value > most_hidden:
+            best, most_hidden = plan, value
+        if most_hidden >= len(best.pieces) / 3:
+            break
+    assert best is not None, "there is at least one round"
+    return best
+
+
+def _furnished(rng: np.random.Generator, size: tuple[int, int], most: int) -> tuple[Plan, float]:
+    """One room, and how many of its pieces are well hidden."""
     view = draw_view(rng, size)
     wide, deep = float(rng.uniform(4.6, 5.4)), float(rng.uniform(5.6, 6.4))
     low, high = (-wide / 2, -deep), (wide / 2, -1.9)
     kind = sorted(KINDS)[int(rng.integers(len(KINDS)))]
-    plan = Plan((), view, low, high)
+    plan, value = Plan((), view, low, high), 0.0
     drawn: list[Float[Tensor, "h w"]] = []
     for name, rule in KINDS[kind][:most]:
         spots = _spots(plan, (name, rule), rng)
@@ -109,9 +123,9 @@ def draw_plan(rng: np.random.Generator, size: tuple[int, int], most: int) -> Pla
         values = [worth([*drawn, look]) for look in looks]
         best = int(np.argmax(values)) if values else -1
         if best >= 0 and values[best] >= 0:
-            drawn.append(looks[best])
+            drawn, value = [*drawn, looks[best]], values[best]
             plan = dataclasses.replace(plan, pieces=(*plan.pieces, spots[best]))
-    return plan
+    return plan, value
 
 
 def _spots(plan: Plan, what: tuple[str, Rule], rng: np.random.Generator) -> list[Placed]:

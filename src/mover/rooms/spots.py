@@ -39,7 +39,7 @@ def _middle(rng: np.random.Generator, _: Size, walls: np.ndarray, __: Others) ->
 
 def _facing(rng: np.random.Generator, _: Size, walls: np.ndarray, __: Others) -> Pose:
     x = float(rng.uniform(walls[0, 0] + 0.6, walls[1, 0] - 0.6))
-    z = float(rng.uniform(walls[0, 1] + 0.6, -3.0))
+    z = float(rng.uniform(walls[0, 1] + 0.6, -2.7))
     centre = np.array([0.0, (walls[0, 1] - 2.8) / 2])
     heading = float(heading_of(centre - np.array([x, z])) + np.radians(rng.uniform(-50, 50)))
     return x, z, heading
