@@ -5,7 +5,7 @@ ground is 5-15 cm of depth at 5 m, because an object stands where the ray to its
 floor. Objects whose shape fits tell the camera more exactly than noisy feet do.
 
     min over pitch, roll, ground and all objects on the floor:
-        mean_i E_i / (E_i(start) + 0.02)  +  1/2 d^T C^-1 d
+        sum_i E_i / (E_i(start) + 0.02)  +  w/2 d^T C^-1 d
 
 Each object's energy is divided by its own residual: exact shapes pull hard, wrong shapes softly. d
 is the change of pitch, roll and ground, C their covariance from the feet: a floor that was walked
@@ -46,9 +46,9 @@ class RefineConfig:
 
     rounds: int = 0
     """How often; 0: never (the paper)."""
-    feet: float = 1.0
-    """Weight of what the feet say against all objects."""
-    method: Adam = field(default_factory=lambda: Adam(150, rate=0.3, last_rate=0.02, beta2=0.98))
+    feet: float = 0.25
+    """Weight w of what the feet say; each object counts about one."""
+    method: Adam = field(default_factory=lambda: Adam(400, rate=0.3, last_rate=0.02, beta2=0.98))
 
 
 @record
@@ -105,7 +105,7 @@ def refine_camera(
         terms = objects_energy(joint) / own
         off = joint.tilt - fixed.tilt
         feet = 0.5 * config.feet * (off @ certainty @ off)
-        return Energy({"objects": (terms * usable).sum() / usable.sum().clamp_min(1), "feet": feet})
+        return Energy({"objects": (terms * usable).sum(), "feet": feet})
 
     if not bool(usable.any()):
         return Refined(inputs.camera, inputs.ground, torch.zeros(0))
