@@ -10,14 +10,17 @@ from test_rooms import tiny_room
 
 from mover.bodies import open_body
 from mover.geometry.camera import pitch_roll
+from mover.geometry.mesh import signed_volume
 from mover.geometry.rotations import axis_angle, rot_y
 from mover.geometry.runs import decode
+from mover.geometry.topology import is_closed
 from mover.records import fingerprint
 from mover.rooms import KnownRoom, NoiseConfig, add_noise
-from mover.rooms.noise_masks import grown
+from mover.rooms.noise_masks import grown, leaked
 from mover.rooms.noise_people import slow
 from mover.types import Piece
 
+SIDES = ("left", "right")
 SILENT = NoiseConfig(
     along_ray=0, sideways=0, yaw=0, flips=0, scale=0, camera=0, depth_bias=0, depth_drift=0, pose=0,
     jitter=0, dropped=0, person_masks=0, missed_masks=0, object_masks=0, pose_hidden=1,
@@ -256,3 +259,96 @@ def test_people_masks_are_off_by_at_most_the_stated_pixels_and_some_are_missed(
             assert np.asarray(distance_transform_edt(~b))[extra].max() <= 3
         if lost.any():
             assert np.asarray(distance_transform_edt(b))[lost].max() <= 3
+
+
+def test_lost_feet_turn_only_what_is_below_the_knee_in_the_stated_share(room: KnownRoom) -> None:
+    config = dataclasses.replace(SILENT, lost_feet=0.25)
+    bodies = add_noise(room, config, 0).bodies
+    assert bodies is not None
+    assert bodies.joints is not None
+    assert room.bodies.joints is not None
+    off = (bodies.joints - room.bodies.joints).norm(dim=-1)
+    names = open_body().joint_names
+    lower = [names.index(f"{side}_{part}") for side in SIDES for part in ("ankle", "foot")]
+    rest = [k for k in range(len(names)) if k not in lower]
+    lost = off[:, lower].amax(1) > 0.01
+    assert abs(float(lost.float().mean()) - 0.25) < 0.03
+    assert float(off[:, rest].max()) < 1e-4, "knees and all above stay"
+    assert float(off[lost][:, lower].amax(1).mean()) > 0.1
+    changes = int((lost[1:] != lost[:-1]).sum())
+    assert changes < 0.7 * int(lost.sum()), "1.5 if each frame were drawn alone"
+
+
+def test_a_leak_adds_one_disc_at_the_border(room: KnownRoom) -> None:
+    mask = np.zeros((60, 90), dtype=bool)
+    mask[20:40, 30:60] = True
+    for where in (0.0, 0.4, 0.99):
+        extra = leaked(mask, where) & ~mask
+        assert (leaked(mask, where) | ~mask).all(), "nothing is lost"
+        rows, cols = np.nonzero(extra)
+        reach = 0.2 * math.sqrt(mask.sum())
+        assert 0.3 * math.pi * reach**2 < extra.sum() < math.pi * reach**2
+        assert max(np.ptp(rows), np.ptp(cols)) <= 2 * reach + 1
+    capture = add_noise(room, dataclasses.replace(SILENT, leaks=1.0), 0)
+    for given, true in zip(capture.detections, room.capture.detections, strict=True):
+        assert given.mask is not None
+        assert true.mask is not None
+        assert decode(given.mask, 0).sum() > decode(true.mask, 0).sum()
+
+
+def test_detections_and_pieces_are_missed_and_invented_together(room: KnownRoom) -> None:
+    light = _light(room)
+    missed = invented = 0
+    for seed in range(40):
+        capture = add_noise(light, dataclasses.replace(SILENT, missed=0.3, false=0.2), seed)
+        found = {d.id: d for d in capture.detections}
+        assert len(found) == len(capture.detections)
+        assert sorted(found) == sorted(p.annotation or 0 for p in capture.scene.pieces)
+        for piece in capture.scene.pieces:
+            one = found[piece.annotation or 0]
+            assert one.category == piece.category
+            assert float((one.box[2:] - one.box[:2]).min()) >= 1
+        real = {p.id for p in capture.scene.pieces} & {p.id for p in room.truth.pieces}
+        missed += 3 - len(real)
+        invented += len(capture.scene.pieces) - len(real)
+        assert all(p.id in real or p.id.startswith("false_") for p in capture.scene.pieces)
+    assert abs(missed / 120 - 0.3) < 0.12
+    assert abs(invented / (120 - missed) - 0.2) < 0.12
+
+
+def test_merged_masks_are_the_union_of_two_and_one_object_is_missing(room: KnownRoom) -> None:
+    capture = add_noise(room, dataclasses.replace(SILENT, merged=1.0), 0)
+    true = {d.id: decode(d.mask, 0) for d in room.capture.detections if d.mask is not None}
+    assert len(capture.detections) < len(true)
+    assert {p.annotation for p in capture.scene.pieces} == {d.id for d in capture.detections}
+    left = {d.id: d for d in capture.detections}
+    gone = [true[k] for k in true if k not in left]
+    unions = torch.stack([decode(d.mask, 0) for d in left.values() if d.mask is not None])
+    assert torch.equal(unions.any(0), torch.stack(list(true.values())).any(0)), "no pixel is lost"
+    for mask in gone:
+        assert any(bool((union & mask).sum() == mask.sum()) for union in unions)
+
+
+def test_a_wrong_class_has_another_mesh_in_the_same_box(room: KnownRoom) -> None:
+    capture = add_noise(room, dataclasses.replace(SILENT, wrong_class=1.0), 0)
+    for given, true, found in zip(
+        capture.scene.pieces, room.truth.pieces, capture.detections, strict=True
+    ):
+        assert given.id == true.id
+        assert given.category != true.category
+        assert found.category == given.category
+        assert torch.allclose(size(given), size(true), atol=1e-5)
+        assert torch.allclose(centre(given), centre(true), atol=1e-5)
+
+
+def test_holes_open_meshes_and_inverted_meshes_have_negative_volume(room: KnownRoom) -> None:
+    holed = add_noise(room, dataclasses.replace(SILENT, holes=1.0), 0).scene.pieces
+    turned = add_noise(room, dataclasses.replace(SILENT, inverted=1.0), 0).scene.pieces
+    for hole, inside_out, true in zip(holed, turned, room.truth.pieces, strict=True):
+        assert is_closed(true.mesh.faces)
+        assert not is_closed(hole.mesh.faces)
+        lost = len(true.mesh.faces) - len(hole.mesh.faces)
+        assert 0 < lost < 0.6 * len(true.mesh.faces)
+        assert torch.equal(hole.mesh.verts, true.mesh.verts)
+        assert is_closed(inside_out.mesh.faces)
+        assert math.isclose(signed_volume(inside_out.mesh), -signed_volume(true.mesh), rel_tol=1e-5)

@@ -16,7 +16,7 @@ from mover.geometry.placement import place_piece
 from mover.geometry.runs import decode
 from mover.records import fingerprint
 from mover.rooms import KnownRoom, RoomConfig, demo_room, make_room
-from mover.rooms.compose import Plan, make_view, overlap
+from mover.rooms.compose import Plan, draw_plan, make_view, overlap
 from mover.rooms.gait import walk
 from mover.rooms.known import Actor, build
 from mover.rooms.lying import berth, on_side, supine
@@ -26,6 +26,7 @@ from mover.rooms.person import Person, make_person
 from mover.rooms.placed import Placed, free_of
 from mover.rooms.poses import Posture, skinned
 from mover.rooms.reaching import hand_on, table_stand
+from mover.rooms.render import see
 from mover.rooms.seating import leaning, seat_spot, seated
 from mover.rooms.settle import part
 from mover.rooms.steps import duration, stations
@@ -290,6 +291,20 @@ def test_tasks_that_the_furniture_does_not_allow_are_refused_with_a_reason() -> 
 
 @pytest.mark.slow
 class TestWholeRooms:
+    def test_a_third_of_the_pieces_of_drawn_rooms_is_partly_hidden_and_all_are_seen(self) -> None:
+        hidden, pixels = [], []
+        for seed in range(6):
+            plan = draw_plan(np.random.default_rng(seed), (480, 270), 9, 200)
+            sight = see(plan)
+            for k, piece in enumerate(plan.pieces):
+                alone = see(dataclasses.replace(plan, pieces=(piece,)))
+                seen = int((sight.piece == k).sum())
+                hidden.append(1 - seen / int((alone.piece == 0).sum()))
+                pixels.append(seen)
+        assert np.mean(np.array(hidden) >= 0.3) >= 0.3
+        assert max(hidden) < 0.8
+        assert min(pixels) >= 200
+
     def test_the_demo_shows_every_motion_and_hides_nothing(self) -> None:
         room = demo_room()
         assert room.refused == ()

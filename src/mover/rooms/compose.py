@@ -11,7 +11,7 @@ from ..furniture import make_piece
 from ..geometry.camera import project, tilted, to_camera
 from ..records import record
 from ..types import Camera
-from .crowding import depth_of, worth
+from .crowding import WIDTH, depth_of, worth
 from .placed import Placed, corners, verts_on_floor
 from .spots import RULES, Rule
 from .turns import facing, left_of
@@ -68,6 +68,7 @@ KINDS: dict[str, tuple[tuple[str, Rule], ...]] = {
 ROUNDS = 5  # rooms to choose from
 TRIES = 40
 CHOICES = 8  # places to choose from, the one that hides the most pieces
+SPARE = 1.15  # on the fewest pixels of a piece, which are counted in a small picture
 LEAST_VISIBLE = 0.85  # share of the corners of a piece's box inside the image
 MARGIN: dict[Rule, float] = {
     "wall": 0.06, "corner": 0.05, "middle": 0.5, "facing": 0.45, "before": 0.1, "around": 0.04,
@@ -96,11 +97,19 @@ def draw_view(rng: np.random.Generator, size: tuple[int, int]) -> View:
     )
 
 
-def draw_plan(rng: np.random.Generator, size: tuple[int, int], most: int) -> Plan:
-    """A room of a random kind with at most so many pieces, a third of them partly hidden."""
+def draw_plan(rng: np.random.Generator, size: tuple[int, int], most: int, least: int) -> Plan:
+    """A room of a random kind, a third of whose pieces are partly hidden.
+
+    Args:
+        rng: Source of randomness.
+        size: Width and height of the image [px].
+        most: Most pieces.
+        least: Fewest pixels that each piece shows.
+    """
+    kind = sorted(KINDS)[int(rng.integers(len(KINDS)))]
     best, most_hidden = None, -1.0
     for _ in range(ROUNDS):
-        plan, value = _furnished(rng, size, most)
+        plan, value = _furnished(rng, size, KINDS[kind][:most], least)
         if best is None or value > most_hidden:
             best, most_hidden = plan, value
         if most_hidden >= len(best.pieces) / 3:
@@ -109,18 +118,23 @@ def draw_plan(rng: np.random.Generator, size: tuple[int, int], most: int) -> Pla
     return best
 
 
-def _furnished(rng: np.random.Generator, size: tuple[int, int], most: int) -> tuple[Plan, float]:
+def _furnished(
+    rng: np.random.Generator,
+    size: tuple[int, int],
+    wanted: tuple[tuple[str, Rule], ...],
+    least: int,
+) -> tuple[Plan, float]:
     """One room, and how many of its pieces are well hidden."""
     view = draw_view(rng, size)
     wide, deep = float(rng.uniform(4.6, 5.4)), float(rng.uniform(5.6, 6.4))
     low, high = (-wide / 2, -deep), (wide / 2, -1.9)
-    kind = sorted(KINDS)[int(rng.integers(len(KINDS)))]
     plan, value = Plan((), view, low, high), 0.0
+    few = SPARE * least * (WIDTH / size[0]) ** 2
     drawn: list[Float[Tensor, "h w"]] = []
-    for name, rule in KINDS[kind][:most]:
-        spots = _spots(plan, (name, rule), rng)
+    for what in wanted:
+        spots = _spots(plan, what, rng)
         looks = [depth_of(spot, view.camera, view.height) for spot in spots]
-        values = [worth([*drawn, look]) for look in looks]
+        values = [worth([*drawn, look], few) for look in looks]
         best = int(np.argmax(values)) if values else -1
         if best >= 0 and values[best] >= 0:
             drawn, value = [*drawn, looks[best]], values[best]

@@ -1,6 +1,5 @@
 """How much of each piece of furniture other pieces hide, in a small picture without people."""
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,17 +24,17 @@ def depth_of(piece: Placed, camera: Camera, height: float) -> Float[Tensor, "h w
     return first_hit(cam, piece.furniture.mesh.faces, K, size)[0]
 
 
-def hidden_of(depths: list[Float[Tensor, "h w"]]) -> Float[np.ndarray, " pieces"]:
-    """Share of the image of each piece that others hide."""
+def worth(depths: list[Float[Tensor, "h w"]], least: float) -> float:
+    """How many pieces others hide well, plus a little; -1 where one can hardly be seen.
+
+    Args:
+        depths: Of each piece drawn alone [m].
+        least: Fewest pixels of the small picture that a piece must show.
+    """
     alone = torch.stack(depths)
     covered = alone.isfinite()
-    left = (covered & (alone <= alone.amin(0))).sum((1, 2))
-    return (1 - left / covered.sum((1, 2)).clamp_min(1)).numpy()
-
-
-def worth(depths: list[Float[Tensor, "h w"]]) -> float:
-    """How many pieces are well hidden, plus a little; -1 where one can hardly be seen."""
-    hidden = hidden_of(depths)
-    if (hidden > TOO_MUCH).any():
+    seen = (covered & (alone <= alone.amin(0))).sum((1, 2)).numpy()
+    hidden = 1 - seen / covered.sum((1, 2)).clamp_min(1).numpy()
+    if (hidden > TOO_MUCH).any() or (seen < least).any():
         return -1.0
     return float((hidden >= HIDDEN).sum() + 0.1 * hidden.mean())

@@ -2,7 +2,8 @@
 
 Sources: the paper's sensitivity table (uniform noise on the translation, orientation and scale of
 Total3D's objects: 0.3 m, 30 degrees, 15 %), and published errors of monocular body regression
-(a few degrees a joint and 2-3 % in depth, both slow in time). Every part has its own stream of
+(a few degrees a joint and 2-3 % in depth, both slow in time); the other rows name their own
+sources in `NoiseConfig`. Every part has its own stream of
 random numbers, so that changing one leaves the others as they were.
 """
 
@@ -12,14 +13,15 @@ import numpy as np
 import torch
 
 from ..furniture import Furniture
-from ..furniture.library import another
 from ..geometry.camera import pitch_roll, tilted
 from ..geometry.rotations import rot_y
-from ..types import Camera, Capture, Mesh, Piece, Scene
+from ..types import Camera, Capture, Piece, Scene
 from .known import KnownRoom
 from .noise_config import NoiseConfig
-from .noise_masks import noisy_detections, noisy_people
-from .noise_people import noisy_bodies
+from .noise_finds import noisy_finds
+from .noise_masks import leaking, noisy_detections, noisy_people
+from .noise_meshes import broken, other_shapes
+from .noise_people import lose_feet, noisy_bodies
 from .threads import one_thread
 
 
@@ -30,21 +32,25 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     The guess of the camera is wrong, so the objects are given in a wrong world: they keep their
     box centres in the camera frame, and their fronts are projected onto its horizontal plane.
     """
-    streams = [np.random.default_rng([seed, k]) for k in range(6)]
+    streams = [np.random.default_rng([seed, k]) for k in range(9)]
     camera = _noisy_camera(room.truth.camera, noise, streams[0])
     pieces = tuple(
         _noisy_piece((piece, furniture), (room.truth.camera, camera), noise, streams[1])
         for piece, furniture in zip(room.truth.pieces, room.furniture, strict=True)
     )
-    return dataclasses.replace(
+    pieces = broken(other_shapes(pieces, room.furniture, noise, streams[2]), noise, streams[6])
+    detections = noisy_detections(room.capture.detections, noise.object_masks, streams[3])
+    capture = dataclasses.replace(
         room.capture,
-        scene=Scene(camera, None, _other_shapes(pieces, room.furniture, noise, streams[2])),
-        detections=noisy_detections(room.capture.detections, noise.object_masks, streams[3]),
-        bodies=noisy_bodies(room, noise, streams[4]),
+        scene=Scene(camera, None, pieces),
+        detections=leaking(detections, noise.leaks, streams[7]),
+        bodies=lose_feet(noisy_bodies(room, noise, streams[4]), noise, streams[8]),
         people=noisy_people(
             room.capture.people, noise.person_masks, noise.missed_masks, streams[5]
         ),
     )
+    assert room.truth.ground is not None, "a known room has a floor"
+    return noisy_finds(capture, room.truth.ground, noise, [seed, 9])
 
 
 def _noisy_camera(camera: Camera, noise: NoiseConfig, rng: np.random.Generator) -> Camera:
@@ -81,22 +87,3 @@ def _noisy_piece(
     return dataclasses.replace(
         piece, t_world_object=place.float(), yaw=angle.float(), scale=size.float()
     )
-
-
-def _other_shapes(
-    pieces: tuple[Piece, ...],
-    furniture: tuple[Furniture, ...],
-    noise: NoiseConfig,
-    rng: np.random.Generator,
-) -> tuple[Piece, ...]:
-    """Some meshes replaced by other designs that fill the same box."""
-    out: list[Piece] = []
-    for piece, known in zip(pieces, furniture, strict=True):
-        swap = float(rng.uniform()) < noise.other_shapes
-        new = another(known, rng)
-        if not swap:
-            out.append(piece)
-            continue
-        ratio = torch.tensor(known.size) / torch.tensor(new.size)
-        out.append(dataclasses.replace(piece, mesh=Mesh(new.mesh.verts * ratio, new.mesh.faces)))
-    return tuple(out)

@@ -43,3 +43,37 @@ class NoiseConfig:
     """People's masks: share that is missing."""
     object_masks: int = 1
     """Objects' masks: most pixels by which they grow or shrink [px]."""
+    lost_feet: float = 0.0
+    """Bodies: share of rows whose lower legs and feet are lost, in runs of about a second.
+
+    Source: regressors guess the legs that furniture or the border of the image hides (PARE).
+    """
+    lost_angle: float = 35.0
+    """Bodies: standard deviation of the error of lost knees, ankles and toes [degrees]."""
+    leaks: float = 0.0
+    """Objects' masks: share that leaks over its border by a fifth of its own extent.
+
+    Source: instance masks of cluttered rooms run over into the floor and into neighbours of the
+    same colour, which finer outlines (PointRend) do not cure.
+    """
+    missed: float = 0.0
+    """Detections: share that is missing, and with it the object of the initial scene.
+
+    Source of this and of the next three: the paper's rows with PointRend in place of annotated
+    boxes. A score threshold of 0.55 misses hidden objects, and COCO has one class of tables, no
+    shelves and no cabinets.
+    """
+    false: float = 0.0
+    """Detections: objects that are not there, as a share of those that are found."""
+    merged: float = 0.0
+    """Detections: share that swallows a neighbour in the image, which is then missing."""
+    wrong_class: float = 0.0
+    """Detections: share with another class; the mesh is of that class and fills the same box."""
+    holes: float = 0.0
+    """Meshes: share with a hole of up to a tenth of the surface.
+
+    Source of this and of the next: meshes of Total3D are cut out of a deformed sphere, which
+    leaves open borders, and the paper makes them watertight; files of other origin are no better.
+    """
+    inverted: float = 0.0
+    """Meshes: share whose faces all wind the wrong way."""

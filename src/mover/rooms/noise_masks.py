@@ -10,6 +10,8 @@ from ..geometry.runs import decode
 from ..types import Detection, Masks, People
 from .render import encode
 
+LEAK = 0.2  # radius of a leak as a share of the root of the mask's area
+
 
 def grown(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
     """The mask with its outline moved out by so many pixels, in where negative."""
@@ -60,6 +62,37 @@ def noisy_detections(
         mask = grown(decode(one.mask, 0).numpy(), off)
         out.append(dataclasses.replace(one, mask=encode([mask]), box=box_of_mask(mask)))
     return tuple(out)
+
+
+def leaking(
+    detections: tuple[Detection, ...], share: float, rng: np.random.Generator
+) -> tuple[Detection, ...]:
+    """Some masks of objects run over at one place of their border; the boxes follow."""
+    out: list[Detection] = []
+    for one in detections:
+        leaks, where = rng.uniform(size=2)
+        if one.mask is None or leaks >= share:
+            out.append(one)
+            continue
+        mask = leaked(decode(one.mask, 0).numpy(), float(where))
+        out.append(dataclasses.replace(one, mask=encode([mask]), box=box_of_mask(mask)))
+    return tuple(out)
+
+
+def leaked(mask: Bool[np.ndarray, "h w"], where: float) -> Bool[np.ndarray, "h w"]:
+    """The mask and a disc around a point of its border.
+
+    Args:
+        mask: Not empty.
+        where: In [0, 1), which point of the border.
+    """
+    rows, cols = np.nonzero(mask & ~grown(mask, -1))
+    if not len(rows):
+        return mask
+    centre = int(where * len(rows))
+    radius = LEAK * np.sqrt(mask.sum())
+    v, u = np.mgrid[: mask.shape[0], : mask.shape[1]]
+    return mask | ((v - rows[centre]) ** 2 + (u - cols[centre]) ** 2 <= radius**2)
 
 
 def box_of_mask(mask: Bool[np.ndarray, "h w"]) -> torch.Tensor:

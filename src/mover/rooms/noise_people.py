@@ -12,8 +12,11 @@ from ..records import map_tensors
 from ..types import Bodies, BodyPose
 from .known import KnownRoom, rounded
 from .noise_config import NoiseConfig
+from .person import LEG
 from .render import see_body
 from .turns import from_vector, to_vector
+
+LOST_SECONDS = 2.0  # memory of what loses them; a stretch lasts about a second
 
 
 def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) -> Bodies:
@@ -42,6 +45,23 @@ def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) 
         frame=bodies.frame[keep],
         person=bodies.person[keep],
         pose=map_tensors(lambda x: rounded(x[keep]), pose),
+    )
+
+
+def lose_feet(bodies: Bodies, noise: NoiseConfig, rng: np.random.Generator) -> Bodies:
+    """Legs below the knees guessed wrongly in some stretches of time."""
+    if noise.lost_feet == 0:
+        return bodies
+    assert bodies.pose is not None, "bodies of known rooms have parameters"
+    mood = slow(rng, bodies, (1,), LOST_SECONDS)[:, 0]
+    lost = mood <= np.quantile(mood, noise.lost_feet)
+    wrong = slow(rng, bodies, (22, 3), noise.pose_seconds) * np.radians(noise.lost_angle)
+    below = np.isin(np.arange(22), [joint for leg in LEG for joint in leg[1:]])
+    pose = map_tensors(lambda x: x.double(), bodies.pose)
+    pose = _turned(pose, wrong * lost[:, None, None] * below[:, None])
+    verts, joints = open_body().posed(pose)
+    return dataclasses.replace(
+        bodies, verts=rounded(verts), joints=rounded(joints), pose=map_tensors(rounded, pose)
     )
 
 

@@ -35,7 +35,8 @@ def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
     for draft in range(60):
         rng = np.random.default_rng([seed, draft])
         try:
-            plan = draw_plan(rng, (config.width, config.height), config.pieces)
+            size = (config.width, config.height)
+            plan = draw_plan(rng, size, config.pieces, config.least_pixels)
             room = build(
                 plan, _cast(plan, config, rng, refused), config, f"room_{seed}", tuple(refused)
             )
