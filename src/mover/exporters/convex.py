@@ -111,7 +111,7 @@ def _by_coacd(
     verts: NDArray[np.float64], faces: NDArray[np.int64], config: ConvexConfig
 ) -> list[NDArray[np.float64]]:
     """Approximate convex decomposition (Wei et al. 2022)."""
-    import coacd
+    import coacd  # pyright: ignore[reportMissingImports]
 
     coacd.set_log_level("error")
     parts = coacd.run_coacd(
