@@ -135,6 +135,14 @@ class TestRun:
         assert room.bodies is None
         assert any("bodies" in w for w in room.warnings)
 
+    def test_a_room_without_objects_still_has_a_floor_and_people(self, capture_folder, tmp_path):
+        capture = read("folder", capture_folder)
+        empty = replace(capture, scene=replace(capture.scene, pieces=()))
+        room = run_in(tmp_path, empty, light("robust"))
+        assert room.scene.pieces == ()
+        assert room.scene.ground < -1
+        assert (tmp_path / "report.html").stat().st_size > 100
+
     def test_two_people_are_two_tracks(self, capture_folder, tmp_path):
         capture = read("folder", capture_folder)
         bodies, people = capture.bodies, capture.people

@@ -12,7 +12,7 @@ import trimesh
 from mover.geometry.runs import decode
 from mover.pipeline import PRESETS, Run
 from mover.readers.scene_file import write_scene
-from mover.stages.place_objects import PlaceInputs, energy_of
+from mover.stages.place_objects import Placed, PlaceInputs, energy_of
 from mover.types import Layout
 
 COUNT = 200  # perturbations of each object
@@ -33,13 +33,13 @@ def at_truth(room, preset, folder):
         pipeline.prepare_objects, pipeline.PrepareInputs(room.truth.pieces), config.prepare
     )
     job = pipeline.Job(capture, config, run, seen, prepared)
-    crew = pipeline.people_of(job)
+    crew = pipeline.people_of(capture, config, run)
     unordered = torch.zeros(len(seen.boxes), len(seen.boxes), dtype=torch.bool)
     camera, ground = room.truth.camera, room.truth.ground
     image = pipeline.ImageInputs(
         camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered
     )
-    placed = pipeline.Placed(
+    placed = Placed(
         prepared.start,
         pipeline.alone(prepared.start),
         torch.zeros(1, len(seen.boxes)),

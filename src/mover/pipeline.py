@@ -1,108 +1,65 @@
 """The order of the stages, each kept on disk: from a capture to a consistent room."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .bodies.parts import Parts, parts_of
+from .bodies.parts import parts_of
 from .energy import HumanCues
 from .geometry.camera import to_camera
 from .geometry.floor import recast, slide_to_floor
 from .geometry.placement import GROUND, place, stand
+from .outcome import Crew, Job, View, room_of, unfurnished
 from .presets import PRESETS as PRESETS
 from .presets import Config as Config
-from .readers.pose_file import into_camera
 from .run import Run as Run
-from .stages.align_camera import AlignInputs, Alignment, align_camera
-from .stages.assign_touches import Contacts, TouchInputs, assign_touches
-from .stages.doubt import DoubtInputs, doubts
+from .stages.align_camera import AlignInputs, align_camera
+from .stages.assign_touches import TouchInputs, assign_touches
 from .stages.find_depth import DepthInputs, apply_depth, find_depth
 from .stages.find_image_cues import ImageInputs, find_image_cues, order_of
 from .stages.find_soles import SolesInputs, find_soles
 from .stages.find_touches import FindTouchesInputs, find_touches
-from .stages.gather_cues import Cues, GatherInputs, cues_in_windows, gather_cues
+from .stages.gather_cues import GatherInputs, cues_in_windows, gather_cues
 from .stages.inputs import (
-    Seen,
     detected_masks,
     ground_without_people,
     image_evidence,
     in_world,
     rows_of,
 )
-from .stages.place_objects import Placed, PlaceInputs, place_objects
-from .stages.prepare_objects import Prepared, PrepareInputs, prepare_objects, proxy_meshes, restore
+from .stages.place_objects import PlaceInputs, place_objects
+from .stages.prepare_objects import PrepareInputs, prepare_objects
 from .stages.refine_camera import RefineInputs, refine_camera
 from .stages.reinitialize import ReinitInputs, by_release, contact_start
 from .stages.select_frames import SelectInputs, select_frames
 from .stages.starts import alone, first, joined, reference_yaw
-from .terms.feet import Soles
-from .types import Bodies, Camera, Capture, Evidence, Layout, Room, Scene
+from .types import Camera, Capture, Room
 
 NOBODY = HumanCues()
 FIT = 0.1  # image energy (robust form) from which on an object's shape is believed less
 
 
-@dataclass(frozen=True)
-class Job:
-    """One capture under one configuration."""
-
-    capture: Capture
-    config: Config
-    run: Run
-    seen: Seen
-    prepared: Prepared
-
-
-@dataclass(frozen=True)
-class Crew:
-    """The people as the stages see them."""
-
-    bodies: Bodies
-    """All rows, in camera axes, at their corrected depth."""
-    kept: Bool[Tensor, " bodies"]
-    parts: Parts
-    soles: Soles
-    alignment: Alignment
-    warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class View:
-    """Camera and ground, and the room as it is placed under them."""
-
-    camera: Camera
-    ground: float
-    image: ImageInputs
-    start: Layout
-    placed: Placed
-    traces: dict[str, Tensor]
-    """Total energy before each step of the descents so far."""
-    alone: Layout
-    """Where the image alone places the objects."""
-    cues: Cues | None = None
-    contacts: Contacts | None = None
-
-
 def reconstruct(capture: Capture, config: Config, run: Run) -> Room:
     """From a capture to a consistent room (Sec. 3)."""
+    crew = people_of(capture, config, run)
+    if not capture.scene.pieces:
+        return unfurnished(capture, crew)
     seen = image_evidence(capture)
     prepared = run.stage(prepare_objects, PrepareInputs(capture.scene.pieces), config.prepare)
     job = Job(capture, config, run, seen, prepared)
-    crew = people_of(job)
     if crew is None:
         view = _from_image(job, capture.scene.camera, ground_without_people(capture, prepared))
-        return _room(job, view, None)
+        return room_of(job, view, None)
     view = _from_image(job, crew.alignment.camera, crew.alignment.ground)
     for _ in range(config.refine.rounds):
         view = _refine(job, crew, view)
-    return _room(job, _with_people(job, crew, view), crew)
+    return room_of(job, _with_people(job, crew, view), crew)
 
 
-def people_of(job: Job) -> Crew | None:
+def people_of(capture: Capture, config: Config, run: Run) -> Crew | None:
     """Choose frames, find the people's depth and their feet, and from these camera and ground."""
-    capture, config, run = job.capture, job.config, job.run
     bodies, scene = capture.bodies, capture.scene
     if bodies is None:
         return None
@@ -205,42 +162,3 @@ def _order(job: Job, view: View) -> Bool[Tensor, "objects objects"]:
     verts = place(job.prepared.objects.verts, view.placed.layout)
     z = to_camera(verts, view.camera.R_cam_world)[..., 2]
     return order_of(z.amin(-1), z.amax(-1))
-
-
-def _room(job: Job, view: View, crew: Crew | None) -> Room:
-    capture, placed = job.capture, view.placed
-    pieces = restore(capture.scene.pieces, job.prepared, placed.layout)
-    alone = restore(capture.scene.pieces, job.prepared, view.alone)
-    warnings = [*capture.warnings, *job.prepared.warnings]
-    bodies = None
-    if crew is not None:
-        turned = into_camera(replace(crew.bodies, space="world"), view.camera.R_cam_world.mT)
-        bodies = replace(turned, space="world")
-        warnings += crew.warnings
-    if crew is not None and bodies is not None and view.contacts is not None:
-        warnings += doubts(DoubtInputs(
-            rows_of(bodies, crew.kept), crew.parts, capture.people, view.camera,
-            job.prepared.objects, placed.layout, view.contacts.touches, view.contacts.seated_on,
-        ))  # fmt: skip
-    return Room(
-        scene=Scene(view.camera, view.ground, pieces),
-        initial=capture.scene,
-        image_only=Scene(view.camera, view.ground, alone),
-        bodies=bodies,
-        kept=None if crew is None else crew.kept,
-        proxies=proxy_meshes(job.prepared),
-        evidence=_evidence(job, view),
-        covariance=None if crew is None else crew.alignment.covariance,
-        traces=view.traces,
-        warnings=tuple(dict.fromkeys(warnings)),
-    )
-
-
-def _evidence(job: Job, view: View) -> tuple[Evidence, ...]:
-    ids = job.prepared.objects.ids
-    near = far = bodies = (0,) * len(ids)
-    if view.cues is not None and view.contacts is not None:
-        near, far, bodies = view.cues.near_pixels, view.cues.far_pixels, view.contacts.touched_in
-    pixels = job.seen.masks.sum((-2, -1)).tolist()
-    lowest = view.placed.energy.amin(0).tolist()
-    return tuple(Evidence(*row) for row in zip(ids, pixels, near, far, bodies, lowest, strict=True))
