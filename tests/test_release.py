@@ -25,7 +25,7 @@ def test_used_chairs_and_sofas_are_spared_by_depth_and_collision():
     inputs = make_inputs(size=16)
     found = factors(renamed(inputs, "chair", "sofa", "table"), inputs.humans, "release")
     assert found.depth.tolist() == pytest.approx([0.3, 0.01, 1.0])
-    assert found.collision.tolist() == pytest.approx([0.1, 1.0, 1.0])
+    assert found.collision.tolist() == pytest.approx([0.1, 2.0, 1.0])
 
 
 def test_paper_spares_nobody():

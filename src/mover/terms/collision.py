@@ -3,7 +3,7 @@ r"""People move through free space (Sec. 3.1, "Collision constraint").
 Evidence:  V = min(V_1, ..., V_T), the signed distance to all bodies on one grid [m]
 Price:     L_collision = \sum_i \sum_u \| V(u_i) \|_2^2   where V(u_i) < 0
 Paper:     u runs over the vertices of the mesh.
-Release:   u runs over even surface samples (sofas count twice), and the price is |V|.
+Release:   u runs over even surface samples, and the price is |V| (energy.py doubles sofas).
 Robust:    1000 times the mean of V^2 over even surface samples: neither the resolution of the mesh
            nor the number of samples has a weight.
 """
