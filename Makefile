@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 JOBS ?= 2
 
-.PHONY: demo test check lint slow clean
+.PHONY: demo test check lint docs slow clean
 
 demo: $(VENV)/.installed
 	$(BIN)/mover demo --out demo
@@ -24,6 +24,10 @@ lint: $(VENV)/.developed
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
+docs: $(VENV)/.documented
+	$(BIN)/python -m sphinx -W --keep-going -E -q -b html docs docs/_build/html
+	@echo docs/_build/html/index.html
+
 $(VENV)/.torch: constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) --upgrade pip
@@ -38,5 +42,9 @@ $(VENV)/.developed: $(VENV)/.installed
 	$(PIP) --constraint constraints.txt --editable ".[dev]"
 	touch $@
 
+$(VENV)/.documented: $(VENV)/.installed
+	$(PIP) --constraint constraints.txt --editable ".[docs]"
+	touch $@
+
 clean:
-	rm -rf $(VENV) demo out build dist .pytest_cache .ruff_cache
+	rm -rf $(VENV) demo out build dist docs/_build .pytest_cache .ruff_cache

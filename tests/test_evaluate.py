@@ -10,9 +10,10 @@ import pytest
 import torch
 from judged import CAMERA, FAST, GROUND, SELF_CONTAINED, cuboid, moved, pair, people, piece, room
 
+from mover.bodies.world import in_world
 from mover.evaluate import METRICS, EvaluatedBodies, evaluate, evaluate_folder, table
 from mover.geometry.camera import tilted, to_camera
-from mover.metrics_bodies import in_world, soles_of
+from mover.metrics_bodies import soles_of
 from mover.readers.bodies_file import write_bodies
 from mover.readers.scene_file import write_scene
 from mover.records import InputError

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -85,3 +87,13 @@ def test_thinning_keeps_every_weight_and_does_not_grow_with_the_video():
     assert float(few[1].sum()) == pytest.approx(200)
     middle = (once[0][0] * once[1][0][:, None]).sum(0) / 200
     torch.testing.assert_close(middle, cloud.mean(0), atol=1e-5, rtol=0)
+
+
+def test_what_a_wrong_outline_explains_is_not_hidden():
+    nothing = torch.zeros(H, W, dtype=torch.bool)
+    thin_strip = columns(4, 14)  # two of the twelve columns of the body are not seen
+    found = bounds_of(replace(seen(thin_strip), reach=2.0), columns(0, 20)[None], 0, vote=False)
+    assert not found.far.isfinite().any()
+    found = bounds_of(replace(seen(nothing), reach=2.0), columns(0, 20)[None], 0, vote=False)
+    assert (found.far[:, 6:14] == 2.0).all()
+    assert not found.far[:, [4, 15]].isfinite().any()

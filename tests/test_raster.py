@@ -12,10 +12,18 @@ from raycast import cast, cast_backs, draw
 from mover.geometry import raster_torch
 from mover.geometry.camera import NEAR, tilted
 from mover.geometry.raster import Topology, Views, depths, first_hit, layers, look, silhouettes
+from mover.geometry.raster_engine import use_engine
 from mover.geometry.raster_spans import coverage, on_screen, signed_areas, spans
 from mover.geometry.rotations import rot_y
 
 FOCAL = 500.0
+
+
+@pytest.fixture(autouse=True, params=["torch", "warp"])
+def engine(request):
+    """Every test holds for both engines (double precision is drawn by torch)."""
+    with use_engine(request.param):
+        yield request.param
 
 
 def boxes(*parts):

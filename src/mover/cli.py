@@ -6,11 +6,16 @@ import sys
 
 COMMANDS = {
     "demo": "Make a known room, reconstruct it, compare it with the truth.",
+    "import": "Turn what other tools wrote into a capture folder.",
+    "bodies": "Turn what another tool found of people into bodies.npz or keypoints.npz.",
     "check": "Validate a capture, list the evidence of each object, draw the initial overlay.",
     "run": "Reconstruct a room from a capture folder.",
     "evaluate": "Compare a result with the truth.",
+    "paper-table": "Print the paper's table for your copy of PROX or PiGraphs.",
     "experiment": "Rebuild known rooms with each preset and compare them with the truth.",
     "export": "Write a result for other programs: GLB, USD, MJCF, URDF, PLY, bodies.",
+    "render": "Draw a result without a screen: a picture or a film.",
+    "view": "Look at a result in the browser, correct it, solve it again.",
     "settle": "Let gravity act on a result: how far does each piece move?",
     "batch": "Run thousands of captures; what is finished is not run again.",
 }
@@ -21,7 +26,7 @@ def main() -> None:
     """Run the command that is named first."""
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help"):
-        lines = [f"  {name:<10} {text}" for name, text in COMMANDS.items()]
+        lines = [f"  {name:<12} {text}" for name, text in COMMANDS.items()]
         _say("\n".join([USAGE, "", "Rooms from the people who move in them.", "", *lines]))
         return
     if arguments[0] == "--version":

@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 
 from . import records
 from .presets import PRESETS, Config
-from .progress import Bar
+from .progress import Bar, both
 
 log = logging.getLogger(__name__)
 THREADS = 1  # of torch: its operations here are small, and threads that wait for others cost more
@@ -33,6 +33,10 @@ class RunArgs:
     """paper, release or robust: the settings that the other flags change."""
     config_from: Annotated[Path | None, arg(name="config")] = None
     """A run.json whose settings are used instead of a preset's."""
+    edits: Path | None = None
+    """A list of edits (edits.json of `mover view`) that is applied first."""
+    view: bool = False
+    """Watch the furniture move in the browser (extra `viewer`)."""
 
 
 @dataclass(frozen=True)
@@ -119,25 +123,41 @@ def preset_named(name: str) -> Config:
 def _run(arguments: Sequence[str]) -> None:
     args, config = parse_run(arguments)
     from .readers import read
+    from .readers.edits_file import read_edits
+    from .results import Origin
 
     capture = read(args.format, args.source)
-    _reconstruct(capture, config, args.out)
+    edits = () if args.edits is None else read_edits(args.edits)
+    origin = Origin(str(args.source.resolve()), args.format, edits)
+    if args.view:
+        view = importlib.import_module(".commands_view", __package__)
+        view.run_in_view(capture, config, args.out, origin)
+        return
+    reconstruct_into(args.out, capture, config, origin)
     _say(f"report: {args.out / 'report.html'}")
 
 
-def _reconstruct(capture: Any, config: Config, out: Path) -> Any:  # noqa: ANN401
-    """Run the main job and write its result."""
+def reconstruct_into(
+    out: Path,
+    capture: Any,  # noqa: ANN401
+    config: Config,
+    origin: Any,  # noqa: ANN401
+    watch: Any = None,  # noqa: ANN401
+) -> Any:  # noqa: ANN401
+    """Run the main job on the edited capture and write its result; `watch` sees every step."""
     import torch
 
+    from .edits import apply_edits
     from .pipeline import reconstruct
     from .results import write_results
     from .run import Run
 
     torch.set_num_threads(THREADS)
+    capture, pinned = apply_edits(capture, origin.edits)
     with Bar() as bar:
-        run = Run(out, bar)
-        room = reconstruct(capture, config, run)
-    write_results(capture, room, config, run)
+        run = Run(out, bar if watch is None else both(bar, watch))
+        room = reconstruct(capture, config, run, pinned)
+    write_results(capture, room, config, run, origin)
     for warning in room.warnings:
         _say(f"warning: {warning}")
     return room, run
@@ -170,7 +190,7 @@ def _demo(arguments: Sequence[str]) -> None:
     from .readers.folder import write_capture
     from .readers.scene_file import read_scene
     from .report import write_report
-    from .results import report_of, write_truth
+    from .results import Origin, report_of, write_truth
     from .rooms.noise import NoiseConfig, add_noise
     from .rooms.room import demo_room
 
@@ -181,7 +201,8 @@ def _demo(arguments: Sequence[str]) -> None:
         write_capture(add_noise(room, NoiseConfig(), args.seed), folder)
         write_truth(room.truth, room.bodies, folder / "truth")
     capture = read("folder", folder)
-    found, run = _reconstruct(capture, config, args.out / "room")
+    origin = Origin(str(folder.resolve()))
+    found, run = reconstruct_into(args.out / "room", capture, config, origin)
     metrics = evaluate_folder(args.out / "room", folder / "truth")
     truth = read_scene(folder / "truth" / "scene.json", None)
     content = report_of(capture, found, config, run, truth=truth, metrics=metrics)
@@ -217,5 +238,10 @@ _COMMANDS = {
     "run": _run,
     "evaluate": _evaluate,
     "experiment": _experiment,
+    "import": _lazily("commands_import", "import"),
+    "paper-table": _lazily("commands_table", "paper-table"),
+    "bodies": _lazily("commands_people", "bodies"),
     **{name: _lazily("commands_share", name) for name in ("export", "settle", "batch")},
+    "render": _lazily("commands_render", "render"),
+    "view": _lazily("commands_view", "view"),
 }

@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from .bodies.world import in_world
 from .metrics_bodies import (
     GROUND_METRICS,
     POSE_METRICS,
     Standing,
     gather_twins,
-    in_world,
     soles_of,
 )
 from .metrics_contact import (

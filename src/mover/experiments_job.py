@@ -4,8 +4,6 @@ Each job is a process of its own (`python -m mover.experiments_job SET SEED NAME
 thread, so that its numbers depend on nothing but its inputs.
 """
 
-import functools
-import hashlib
 import json
 import shutil
 import sys
@@ -22,7 +20,7 @@ from .experiments_traits import Traits, hidden_shares
 from .pipeline import reconstruct
 from .presets import PRESETS, Config
 from .rooms import KnownRoom, NoiseConfig, add_noise, make_room
-from .run import Run
+from .run import Run, sources
 from .types import Bodies, Capture, Room, Scene
 
 ROOM = "room"  # the job that makes the room; all others have the name of their preset
@@ -99,15 +97,6 @@ def key_of(job: Job) -> str:
     return records.fingerprint(SETS[job.rooms], job.seed, job.name, settings, sources())
 
 
-@functools.cache
-def sources() -> str:
-    """Digest of the package's version and sources."""
-    digest = hashlib.sha256(__version__.encode())
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
 def do_job(job: Job) -> None:
     """Do one job, from what is left of it on disk, and write its results."""
     if job.name == ROOM:
@@ -172,7 +161,7 @@ def _finish(job: Job, results: dict[str, Any]) -> None:
         "name": job.name,
         "key": key_of(job),
         "version": __version__,
-        "sources": sources(),
+        "sources": sources()[:16],
     }
     with records.replacing(job.folder / DONE) as part:
         part.write_text(json.dumps(about | results, indent=1, allow_nan=False))

@@ -13,10 +13,11 @@ from typing import Any
 import torch
 
 from . import __version__
-from .experiments_job import SETS, STAGES, sources
+from .experiments_job import SETS, STAGES
 from .experiments_page import Line, fill_page
 from .metrics_scene import OBJECT_METRICS
 from .records import plain, replacing
+from .run import sources
 
 HIDDEN = 0.3  # share of an object that others hide, from which on it counts as hidden
 TURNED = math.radians(45)  # an object with a larger yaw error is turned
@@ -169,7 +170,7 @@ def _cell(value: object) -> object:
 def _made_by(experiment: Experiment) -> str:
     """Version and machine; a mixture of versions is told."""
     versions = sorted({outcome.version for outcome in experiment.outcomes})
-    version = " and ".join(versions) or f"{__version__} ({sources()})"
+    version = " and ".join(versions) or f"{__version__} ({sources()[:16]})"
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
     parts = f"Python {platform.python_version()}, torch {torch.__version__}, {machine}"
     mixed = " **Jobs of different versions are mixed.**" if len(versions) > 1 else ""

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from .bodies.parts import members, parts_of
 from .bodies.skeleton import BODY
-from .geometry.camera import to_world
 from .metrics_scene import Metric
 from .records import record
 from .types import Bodies, Camera
@@ -115,18 +114,6 @@ def procrustes(
     spread = source.square().sum((-2, -1)).clamp_min(torch.finfo(points.dtype).tiny)
     scale = (s * signs).sum(-1) / spread
     return scale[..., None, None] * (source @ ((u * signs.unsqueeze(-2)) @ vt)) + goal
-
-
-def in_world(bodies: Bodies, camera: Camera) -> Bodies:
-    """The same people, without their parameters, in the world of `camera`."""
-    verts, joints = bodies.verts, bodies.joints
-    if bodies.space == "camera":
-        verts = to_world(verts, camera.R_cam_world.to(verts))
-        joints = None if joints is None else to_world(joints, camera.R_cam_world.to(joints))
-    return Bodies(
-        verts=verts, faces=bodies.faces, joints=joints, joint_names=bodies.joint_names,
-        frame=bodies.frame, person=bodies.person, fps=bodies.fps, space="world", pose=None,
-    )  # fmt: skip
 
 
 def shared_rows(bodies: Bodies, truth: Bodies) -> tuple[Int[Tensor, " rows"], Int[Tensor, " rows"]]:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -72,6 +72,8 @@ class Step:
     index: int
     steps: int
     energy: Energy | None = None
+    at: Callable[[], Any] | None = None
+    """Gives the state after the step; not called unless somebody draws it."""
 
 
 Observer = Callable[[Step], None]
@@ -122,7 +124,7 @@ def minimize(
             lowest, best = _better(items, lowest, at, best)
         trace.append(items.sum())
         adam.step()
-        observe(Step(stage, index, method.steps, value))
+        observe(Step(stage, index, method.steps, value, lambda: at))
     with torch.no_grad():
         last = energy(at).per_item
     if not torch.stack([*trace, last.sum()]).isfinite().all():

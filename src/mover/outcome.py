@@ -30,6 +30,8 @@ class Job:
     run: Run
     seen: Seen
     prepared: Prepared
+    pinned: tuple[str, ...] = ()
+    """Ids of the objects that stay where the capture has them."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .bodies.parts import parts_of
+from .bodies.world import in_world
 from .energy import HumanCues
 from .geometry.camera import to_camera
 from .geometry.floor import recast, slide_to_floor
@@ -26,29 +27,29 @@ from .stages.inputs import (
     detected_masks,
     ground_without_people,
     image_evidence,
-    in_world,
     rows_of,
 )
+from .stages.pinned import Pinned
 from .stages.place_objects import PlaceInputs, place_objects
 from .stages.prepare_objects import PrepareInputs, prepare_objects
 from .stages.refine_camera import RefineInputs, refine_camera
 from .stages.reinitialize import ReinitInputs, by_release, contact_start
 from .stages.select_frames import SelectInputs, select_frames
 from .stages.starts import alone, first, joined, reference_yaw
-from .types import Camera, Capture, Room
+from .types import Camera, Capture, Layout, Room
 
 NOBODY = HumanCues()
 FIT = 0.1  # image energy (robust form) from which on an object's shape is believed less
 
 
-def reconstruct(capture: Capture, config: Config, run: Run) -> Room:
-    """From a capture to a consistent room (Sec. 3)."""
+def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...] = ()) -> Room:
+    """From a capture to a consistent room (Sec. 3); `pinned` objects stay where they start."""
     crew = people_of(capture, config, run)
     if not capture.scene.pieces:
         return unfurnished(capture, crew)
     seen = image_evidence(capture)
     prepared = run.stage(prepare_objects, PrepareInputs(capture.scene.pieces), config.prepare)
-    job = Job(capture, config, run, seen, prepared)
+    job = Job(capture, config, run, seen, prepared, pinned)
     if crew is None:
         view = _from_image(job, capture.scene.camera, ground_without_people(capture, prepared))
         return room_of(job, view, None)
@@ -85,12 +86,14 @@ def _from_image(job: Job, camera: Camera, ground: float) -> View:
     old = job.capture.scene.camera.R_cam_world
     start = recast(job.prepared.start, objects.size[:, 1], old, camera.R_cam_world)
     if job.config.slide:
-        start = slide_to_floor(start, ground, objects.supports == GROUND)
+        start = slide_to_floor(start, ground, (objects.supports == GROUND) & ~_is_pinned(job))
     start = stand(start, objects.supports, objects.size[:, 1], ground)
     unordered = torch.zeros(len(objects.ids), len(objects.ids), dtype=torch.bool)
     image = ImageInputs(camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered)
     cues = job.run.stage(find_image_cues, image, job.config.image)
-    inputs = PlaceInputs(objects, camera, ground, cues, NOBODY, alone(start), start.yaw)
+    inputs = PlaceInputs(
+        objects, camera, ground, cues, NOBODY, alone(start), start.yaw, _pinned(job, start)
+    )
     placed = job.run.stage(place_objects, inputs, job.config.layout)
     return View(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
 
@@ -131,7 +134,7 @@ def assigned(job: Job, crew: Crew, view: View) -> View:
     touching = job.run.stage(find_touches, inputs, job.config.touches)
     touches = TouchInputs(
         bodies, touching.probability, crew.parts, job.seen.masks, job.seen.boxes, view.camera,
-        job.prepared.objects, view.placed.layout,
+        job.prepared.objects, view.placed.layout, job.capture.people,
     )  # fmt: skip
     return replace(view, contacts=job.run.stage(assign_touches, touches, job.config.assign))
 
@@ -152,10 +155,21 @@ def _place_with(job: Job, view: View, fit: Float[Tensor, " objects"]) -> View:
         contact = contact_start(view.placed.layout, objects, touches)
         starts = joined(first(view.placed.candidates, config.layout.keep), alone(contact))
     reference = reference_yaw(view.start.yaw, touches)
-    inputs = PlaceInputs(objects, view.camera, view.ground, image, humans, starts, reference)
+    inputs = PlaceInputs(
+        objects, view.camera, view.ground, image, humans, starts, reference,
+        _pinned(job, view.start),
+    )  # fmt: skip
     placed = run.stage(place_objects, inputs, config.place)
     traces = {**view.traces, f"people {len(view.traces)}": placed.trace}
     return replace(view, placed=placed, traces=traces)
+
+
+def _is_pinned(job: Job) -> Bool[Tensor, " objects"]:
+    return torch.tensor([name in job.pinned for name in job.prepared.objects.ids], dtype=torch.bool)
+
+
+def _pinned(job: Job, start: Layout) -> Pinned | None:
+    return Pinned(_is_pinned(job), start) if job.pinned else None
 
 
 def _order(job: Job, view: View) -> Bool[Tensor, "objects objects"]:

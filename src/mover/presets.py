@@ -87,16 +87,16 @@ RELEASE = Config(
         _RELEASE_IMAGE, "release", Adam(1000), first=Adam(200, 0.01, 0.01), span=0.8, chair_span=0.6
     ),
     gather=GatherConfig(erode=2),
-    assign=AssignConfig(by="group", overlap=0.05),
+    assign=AssignConfig(by="release"),
     reinit=ReinitConfig(use=True),
     place=PlaceConfig(_RELEASE_FULL, "release", Adam(2500), span=0.8, chair_span=0.6),
 )
 
 _DESCENT = Adam(200, 0.03, 0.002, beta2=0.98, keep_best=True)
-_GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300)
+_GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300, hand_reach=0.25)
 _SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
 _ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
-_ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 2.0, 1.0, 2.0, heading=0.1)
+_ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, heading=0.1)
 
 ROBUST = Config(
     correct_depth=True,
@@ -105,7 +105,7 @@ ROBUST = Config(
         _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, short=_SHORT, keep=3, tie=1.0
     ),
     refine=RefineConfig(rounds=1),
-    gather=GatherConfig(erode=1),
+    gather=GatherConfig(erode=1, reach=0.1),
     assign=_GROUPS,
     place=PlaceConfig(_ROBUST_FULL, "robust", _DESCENT, tie=1.0),
     again=1,

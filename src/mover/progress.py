@@ -4,7 +4,7 @@ import sys
 from types import TracebackType
 from typing import Any
 
-from .minimize import Step
+from .minimize import Observer, Step
 
 
 class Bar:
@@ -54,3 +54,13 @@ class Bar:
         if self._task is not None:
             self._progress.remove_task(self._task)
         self._task = self._progress.add_task(step.stage, total=step.steps)
+
+
+def both(first: Observer, second: Observer) -> Observer:
+    """An observer that passes each step on to two."""
+
+    def observe(step: Step) -> None:
+        first(step)
+        second(step)
+
+    return observe

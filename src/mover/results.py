@@ -12,18 +12,34 @@ import torch
 from torch import Tensor
 
 from . import __version__, records
+from .bodies.world import in_world
+from .edits import Edit
 from .export import write_glb
-from .geometry.camera import to_world
 from .presets import Config
 from .readers.bodies_file import write_bodies
+from .readers.edits_file import write_edits
 from .readers.scene_file import write_scene
 from .report import ReportContent, write_report
 from .run import Run
 from .types import Bodies, Capture, Mesh, Room, Scene
 
 
-def write_results(capture: Capture, room: Room, config: Config, run: Run) -> Path:
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Where a result comes from, so that it can be computed again."""
+
+    source: str = ""
+    """Full path of the capture."""
+    format: str = "folder"
+    edits: tuple[Edit, ...] = ()
+    """What the user changed in it before."""
+
+
+def write_results(
+    capture: Capture, room: Room, config: Config, run: Run, origin: Origin | None = None
+) -> Path:
     """Write everything but metrics.json; returns the report's path."""
+    origin = origin or Origin()
     out = run.folder
     write_scene(room.initial, out / "initial.json")
     if room.bodies is not None:
@@ -32,7 +48,9 @@ def write_results(capture: Capture, room: Room, config: Config, run: Run) -> Pat
     for piece, proxy in zip(room.scene.pieces, room.proxies, strict=True):
         _write_mesh(proxy, out / "watertight" / f"{piece.id}.glb")
     write_glb(room.scene, room.bodies, out / "scene.glb")
-    _write_log(room, config, run)
+    if origin.edits:
+        write_edits(origin.edits, out / "edits.json")
+    _write_log(room, config, run, origin)
     write_scene(room.scene, out / "scene.json")
     return write_report(out, report_of(capture, room, config, run))
 
@@ -45,12 +63,8 @@ def write_truth(scene: Scene, bodies: Bodies, folder: Path) -> None:
 
 def initial_bodies(capture: Capture) -> Bodies:
     """The bodies in the world of the initial camera."""
-    bodies = capture.bodies
-    assert bodies is not None
-    R = capture.scene.camera.R_cam_world
-    joints = None if bodies.joints is None else to_world(bodies.joints, R)
-    verts = to_world(bodies.verts, R)
-    return dataclasses.replace(bodies, verts=verts, joints=joints, space="world", pose=None)
+    assert capture.bodies is not None
+    return in_world(capture.bodies, capture.scene.camera)
 
 
 def report_of(
@@ -94,11 +108,14 @@ def _write_mesh(mesh: Mesh, path: Path) -> None:
         shape.export(part)
 
 
-def _write_log(room: Room, config: Config, run: Run) -> None:
+def _write_log(room: Room, config: Config, run: Run, origin: Origin) -> None:
     log = {
         "format": "mover-run",
         "version": __version__,
         "command": command_line(),
+        "source": origin.source,
+        "source_format": origin.format,
+        "edits": len(origin.edits),
         "python": platform.python_version(),
         "torch": torch.__version__,
         "device": "cpu",

@@ -31,6 +31,8 @@ class StageLog:
     """Peak resident memory of the process until then [MB]."""
     kept: bool
     """True: read from disk, not computed."""
+    fingerprint: str = ""
+    """Name of its files in stages/<name>."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Run:
         and its sources: a stale result cannot be read, and a killed run goes on where it stopped.
         """
         name = getattr(fn, "__name__", "stage")
-        path = self.folder / "stages" / name / records.fingerprint(inputs, config, _sources())
+        path = self.folder / "stages" / name / records.fingerprint(inputs, config, sources())
         begin = time.perf_counter()
         kept = path.with_suffix(".json").exists()
         if kept:
@@ -56,7 +58,8 @@ class Run:
         else:
             output = fn(inputs, config, self.observe)
             records.save(output, path)
-        self.stages.append(StageLog(name, time.perf_counter() - begin, _peak_memory(), kept))
+        seconds = time.perf_counter() - begin
+        self.stages.append(StageLog(name, seconds, _peak_memory(), kept, path.name))
         log.info(
             "%s: %s %s in %.1f s",
             name,
@@ -73,7 +76,7 @@ def _peak_memory() -> float:
 
 
 @functools.cache
-def _sources() -> str:
+def sources() -> str:
     """Digest of the package's version and sources."""
     digest = hashlib.sha256(__version__.encode())
     for path in sorted(Path(__file__).parent.rglob("*.py")):

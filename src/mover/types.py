@@ -105,7 +105,8 @@ class BodyPose:
     body_pose: Float[Tensor, "bodies angles"]
     transl: Float[Tensor, "bodies 3"]
     extra: dict[str, Tensor]
-    """left_hand_pose, right_hand_pose, jaw_pose, expression where given; one row a body."""
+    """left_hand_pose, right_hand_pose, jaw_pose, leye_pose, reye_pose, expression where given; one
+    row a body. `flat_hand_mean` (bodies, 1): not 0 where hands turn from flat, not mean, hands."""
 
 
 @record
@@ -125,6 +126,20 @@ class Bodies:
     space: Literal["camera", "world"]
     """Frame of vertices and joints."""
     pose: BodyPose | None
+
+
+@record
+class Keypoints:
+    """Joints that a detector saw in the images [px]: one row for each (frame, person)."""
+
+    points: Float[Tensor, "rows joints 2"]
+    confidence: Float[Tensor, "rows joints"]
+    """From 0 to 1; 0: the joint is missing."""
+    layout: str
+    """Which joints: a name in `bodies.keypoints.LAYOUTS`."""
+    frame: Int[Tensor, " rows"]
+    person: Int[Tensor, " rows"]
+    fps: float | None
 
 
 @record

@@ -1,6 +1,7 @@
 """People's bodies: models by name, from shape and pose to vertices and joints."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float, Int
@@ -9,8 +10,18 @@ from torch import Tensor
 from ..records import InputError
 from ..types import BodyPose
 from .skinning import open_body, zero_pose
+from .smpl_files import load_smpl
+from .smpl_model import rest_pose
 
-__all__ = ["BODY_MODELS", "BodyModel", "load_model", "open_body", "zero_pose"]
+__all__ = [
+    "BODY_MODELS",
+    "BodyModel",
+    "load_model",
+    "load_smpl",
+    "open_body",
+    "rest_pose",
+    "zero_pose",
+]
 
 
 @runtime_checkable
@@ -45,15 +56,20 @@ def _makehuman(gender: str) -> BodyModel:
     return open_body()
 
 
-BODY_MODELS: dict[str, Callable[[str], BodyModel]] = {"makehuman": _makehuman}
-"""How to get each body model, by name, from a gender."""
+BODY_MODELS: dict[str, Callable[[str], BodyModel]] = {
+    "makehuman": _makehuman,
+    "smpl": partial(load_smpl, "smpl"),
+    "smplh": partial(load_smpl, "smplh"),
+    "smplx": partial(load_smpl, "smplx"),
+}
+"""How to get each body model, by name, from a gender; all but the first need the user's files."""
 
 
 def load_model(name: str, gender: str = "neutral") -> BodyModel:
     """The body model with this name.
 
     Raises:
-        InputError: If there is no such model.
+        InputError: If there is no such model, or its licensed files are not there.
     """
     if name not in BODY_MODELS:
         known = ", ".join(f"'{n}'" for n in sorted(BODY_MODELS))

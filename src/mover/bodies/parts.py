@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..records import record
+from ..records import InputError, record
 from ..types import Bodies
 from .bare import match
 from .limbs import LANDMARKS, landmark_rings, thin
@@ -18,6 +18,9 @@ from .lowest import lowest_soles
 from .part_names import PARTS
 from .skin import model_parts
 from .skinning import SkinnedBody, open_body
+from .smpl_arrays import KINDS
+from .smpl_files import load_smpl
+from .smpl_model import skin_of_model
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +62,7 @@ def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> Parts:
 
 
 def _find(bodies: Bodies, up_cam: Float[Tensor, "3"] | None) -> Parts:
-    model = known_model(bodies.faces, bodies.verts.shape[1])
+    model = known_model(bodies.faces, bodies.verts.shape[1]) or _users_model(bodies)
     if model is not None:
         return _of_model(model)
     if bodies.verts.shape[0] == 0:
@@ -81,6 +84,20 @@ def known_model(faces: Int[Tensor, "faces 3"], verts: int) -> SkinnedBody | None
     for model in (open_body("small"), open_body("full")):
         if model.verts.shape[0] == verts and torch.equal(model.faces, faces.cpu()):
             return model
+    return None
+
+
+def _users_model(bodies: Bodies) -> SkinnedBody | None:
+    """The skin of the user's licensed model, where its files are there and fit these bodies."""
+    named = [] if bodies.pose is None else [(bodies.pose.model, bodies.pose.gender)]
+    count = bodies.verts.shape[1]
+    for name, gender in [*named, *((n, "neutral") for n, k in KINDS.items() if k.verts == count)]:
+        try:
+            skin = skin_of_model(load_smpl(name, gender)) if name in KINDS else None
+        except InputError:
+            continue
+        if skin is not None and torch.equal(skin.faces, bodies.faces.cpu()):
+            return skin
     return None
 
 

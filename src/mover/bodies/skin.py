@@ -72,6 +72,6 @@ def _patches(
     patches["back"] = spine & (nz < -0.45) & (height > hip)
     for side in SIDES:
         fingers = [f"{side}_{f}{k}" for f in FINGERS for k in (1, 2, 3)]
-        patches[f"{side}_palm"] = of(f"{side}_wrist", *fingers) & (ny < -0.3)
+        patches[f"{side}_palm"] = of(f"{side}_wrist", f"{side}_hand", *fingers) & (ny < -0.3)
         patches[f"{side}_forearm"] = of(f"{side}_elbow") & (ny < -0.3)
     return patches

@@ -46,33 +46,59 @@ class SkinnedBody:
         Raises:
             InputError: If the numbers of shape coefficients or angles are not this model's.
         """
-        turns = axis_angle(_angles(self, pose))
-        verts, joints = _shaped(self, pose.betas)
-        world, places = _pose_joints(self, turns, joints)
-        offset = places - torch.einsum("bjik,bjk->bji", world, joints)
-        bodies, count = offset.shape[:2]
-        moves = torch.cat([world, offset[..., None]], -1)
-        flat = moves.transpose(0, 1).reshape(count, bodies * 12)
-        skin = (self.weights.to(flat) @ flat).reshape(-1, bodies, 3, 4)
-        moved = torch.einsum("vbik,bvk->bvi", skin[..., :3], verts) + skin[..., 3].transpose(0, 1)
-        shift = pose.transl[:, None]
-        return moved + shift, places + shift
+        turns = axis_angle(angles_of(self, pose))
+        verts, joints = shaped(self, pose.betas)
+        return skinned(self, turns, verts, joints, pose.transl)
 
 
-def _angles(model: SkinnedBody, pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
-    """Axis-angle vectors of all joints; parts that are not given stay straight."""
+def skinned(
+    model: SkinnedBody,
+    turns: Float[Tensor, "bodies joints 3 3"],
+    verts: Float[Tensor, "bodies verts 3"],
+    joints: Float[Tensor, "bodies joints 3"],
+    transl: Float[Tensor, "bodies 3"],
+) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+    """Vertices and joints in a pose, from rest shapes and the rotation of each joint [m]."""
+    world, places = _pose_joints(model, turns, joints)
+    offset = places - torch.einsum("bjik,bjk->bji", world, joints)
+    bodies, count = offset.shape[:2]
+    moves = torch.cat([world, offset[..., None]], -1)
+    flat = moves.transpose(0, 1).reshape(count, bodies * 12)
+    skin = (model.weights.to(flat) @ flat).reshape(-1, bodies, 3, 4)
+    moved = torch.einsum("vbik,bvk->bvi", skin[..., :3], verts) + skin[..., 3].transpose(0, 1)
+    shift = transl[:, None]
+    return moved + shift, places + shift
+
+
+ANGLES = {
+    55: ("global_orient", "body_pose", "jaw_pose", "leye_pose", "reye_pose",
+         "left_hand_pose", "right_hand_pose"),
+    52: ("global_orient", "body_pose", "left_hand_pose", "right_hand_pose"),
+    24: ("global_orient", "body_pose"),
+}  # fmt: skip
+"""Names of the angles by the number of joints (SMPL-X, SMPL-H, SMPL), in order."""
+
+
+def widths_of(model: SkinnedBody) -> dict[str, int]:
+    """Number of angles of each part of the pose, in order."""
+    count = len(model.parents)
+    own = {"body_pose": 69 if count == 24 else 63, "left_hand_pose": 45, "right_hand_pose": 45}
+    return {name: own.get(name, 3) for name in ANGLES[count]}
+
+
+def angles_of(model: SkinnedBody, pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
+    """Axis-angle vectors of all joints; parts that are not given stay straight.
+
+    Raises:
+        InputError: If a part has another number of angles.
+    """
     bodies = pose.global_orient.shape[0]
-    parts = {
-        "global_orient": (3, pose.global_orient),
-        "body_pose": (63, pose.body_pose),
-        "jaw_pose": (3, pose.extra.get("jaw_pose")),
-        "eyes": (6, None),
-        "left_hand_pose": (45, pose.extra.get("left_hand_pose")),
-        "right_hand_pose": (45, pose.extra.get("right_hand_pose")),
-    }
+    given = {**pose.extra, "global_orient": pose.global_orient, "body_pose": pose.body_pose}
     rows: list[Tensor] = []
-    for name, (width, given) in parts.items():
-        value = pose.global_orient.new_zeros(bodies, width) if given is None else given
+    for name, width in widths_of(model).items():
+        value = given.get(name)
+        if value is None:
+            value = pose.global_orient.new_zeros(bodies, width)
         if value.shape[-1] != width:
             found = f"has {value.shape[-1]} columns, the model '{model.name}' expects {width}"
             raise InputError(f"bodies.npz: '{name}' {found}")
@@ -80,10 +106,14 @@ def _angles(model: SkinnedBody, pose: BodyPose) -> Float[Tensor, "bodies joints 
     return torch.cat(rows, -1).reshape(bodies, -1, 3)
 
 
-def _shaped(
+def shaped(
     model: SkinnedBody, betas: Float[Tensor, "bodies shape"]
 ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
-    """Rest shape and joints of each person; the shape coefficients that are not given are 0."""
+    """Rest shape and joints of each person [m]; shape coefficients that are not given are 0.
+
+    Raises:
+        InputError: If there are more than the model knows.
+    """
     count, most = betas.shape[-1], model.shape_dirs.shape[-1]
     if count > most:
         found = f"has {count} columns, the model '{model.name}' knows {most}"
@@ -103,14 +133,17 @@ def _pose_joints(
     tpose = model.tpose.to(turns)
     world: list[Tensor] = []
     places: list[Tensor] = []
-    for joint, parent in enumerate(model.parents):
+    above = torch.tensor([max(p, 0) for p in model.parents], device=joints.device)
+    bones = (tpose[above] @ (joints - joints[:, above])[..., None]).unbind(1)
+    for parent, turn, bone, start in zip(
+        model.parents, turns.unbind(1), bones, joints.unbind(1), strict=True
+    ):
         if parent < 0:
-            world.append(turns[:, joint])
-            places.append(joints[:, joint])
+            world.append(turn)
+            places.append(start)
             continue
-        bone = (tpose[parent] @ (joints[:, joint] - joints[:, parent])[..., None])[..., 0]
-        world.append(world[parent] @ turns[:, joint])
-        places.append(places[parent] + (world[parent] @ bone[..., None])[..., 0])
+        world.append(world[parent] @ turn)
+        places.append(places[parent] + (world[parent] @ bone)[..., 0])
     return torch.stack(world, 1) @ tpose, torch.stack(places, 1)
 
 
@@ -149,7 +182,7 @@ def zero_pose(bodies: int, model: SkinnedBody) -> BodyPose:
         gender="neutral",
         betas=like.new_zeros(bodies, model.shape_dirs.shape[-1]),
         global_orient=like.new_zeros(bodies, 3),
-        body_pose=like.new_zeros(bodies, 63),
+        body_pose=like.new_zeros(bodies, widths_of(model)["body_pose"]),
         transl=like.new_zeros(bodies, 3),
         extra={},
     )

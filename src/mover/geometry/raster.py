@@ -1,13 +1,17 @@
 """Exact-contour silhouettes and depth of many objects at once: the interface of the rasterisers.
 
 The grid of a window has its first pixel centre at (0.5, 0.5). Triangles with a vertex nearer than
-`camera.NEAR` are not drawn. `raster_torch` does the work on any device.
+`camera.NEAR` are not drawn. The work is done by `raster_warp` (compiled kernels) or by
+`raster_torch` (any device, any precision): see `raster_engine`.
 """
+
+from types import ModuleType
 
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from . import raster_torch
+from . import layers_warp, raster_torch, raster_warp
+from .raster_engine import engine
 from .raster_records import Depths, Layers, Topology, Views
 
 __all__ = [
@@ -44,7 +48,7 @@ def depths(
     The outline's motion has no share in the gradient (`silhouettes` has it). A triangle seen at
     less than half a degree gives a depth but no gradient, which would be without bound.
     """
-    return raster_torch.depths(verts_cam, shape, views)
+    return _drawer(verts_cam, views.K).depths(verts_cam, shape, views)
 
 
 def look(
@@ -54,7 +58,7 @@ def look(
     depth: bool = True,
 ) -> tuple[Float[Tensor, "*starts items h w"], Depths | None]:
     """`silhouettes` and, where asked for, `depths`: both from one pass over the triangles."""
-    return raster_torch.look(verts_cam, shape, views, depth)
+    return _drawer(verts_cam, views.K).look(verts_cam, shape, views, depth)
 
 
 def layers(
@@ -66,7 +70,8 @@ def layers(
     ray may still be inside another part there: the bound is conservative, never too deep.
     Items are streamed, so memory does not grow with their number but for the result.
     """
-    return raster_torch.layers(verts_cam, faces, views)
+    draw = layers_warp.layers if engine() == "warp" else raster_torch.layers
+    return draw(verts_cam, faces, views)
 
 
 def first_hit(
@@ -83,4 +88,10 @@ def first_hit(
         K: Intrinsics [px].
         size: Height and width [px].
     """
-    return raster_torch.first_hit(verts_cam, faces, K, size)
+    return _drawer(verts_cam, K).first_hit(verts_cam, faces, K, size)
+
+
+def _drawer(verts_cam: Tensor, K: Tensor) -> ModuleType:
+    """Who draws: Warp if it is the engine and can (float32, CPU or CUDA), else torch."""
+    warp = engine() == "warp" and raster_warp.draws(verts_cam, K)
+    return raster_warp if warp else raster_torch

@@ -6,34 +6,28 @@ only where the collision term looks: inside, and up to two cells from the surfac
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import replace
-from threading import Lock
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..records import record
+from . import sample_warp, volume_igl, volume_warp
 from .nearest import as_float64, as_int64, closest
-from .voxels import REACH, near_surface, outward, winding
+from .raster_engine import engine
+from .volume_record import BAND, SHELL, Volume
+from .voxels import outward
 
-SHELL = 2.0  # [cells], up to where it is exact outside: what `near_surface` finds, more than a
-# cell's diagonal
-BAND = 4.0  # [cells], what stands for any larger distance
-
-
-@record
-class Volume:
-    """A scalar field sampled at the centres of cubic cells."""
-
-    values: Float[Tensor, "x y z"]
-    """Signed distance [m], negative inside; a positive constant away from the bodies."""
-    origin: Float[Tensor, "3"]
-    """Centre of cell (0, 0, 0) in the world [m]."""
-    cell: float
-    """Edge of a cell [m]."""
+__all__ = [
+    "BAND",
+    "SHELL",
+    "Volume",
+    "grid_around",
+    "sample",
+    "sample_torch",
+    "signed_distance",
+    "union_bodies",
+]
 
 
 def sample(volume: Volume, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -42,6 +36,14 @@ def sample(volume: Volume, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "
     A point outside of the outermost cell centres gets the border's value, or zero where that is
     negative, and no gradient.
     """
+    plain = {volume.values.dtype, points.dtype} == {torch.float32}
+    if engine() == "warp" and plain and points.device == volume.values.device:
+        return sample_warp.sample(volume, points)
+    return sample_torch(volume, points)
+
+
+def sample_torch(volume: Volume, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    """See `sample`; for any precision, and the oracle of the kernel."""
     values = volume.values
     half = (torch.tensor(values.shape, dtype=points.dtype, device=points.device) - 1) / 2
     place = (points - volume.origin.to(points)) / volume.cell / half - 1
@@ -104,50 +106,9 @@ def union_bodies(
     Raises:
         ValueError: If a vertex is not finite.
     """
-    values = grid.values.detach().cpu().numpy().copy()
-    triangles, origin, lock = as_int64(faces), as_float64(grid.origin), Lock()
-
-    def add(body: int) -> None:
-        points = (as_float64(verts[body]) - origin) / grid.cell
-        if not np.isfinite(points).all():
-            raise ValueError(f"union_bodies: body {body} has vertices that are not finite")
-        add_body(points, outward(points, triangles), values, grid.cell, lock)
-
-    with ThreadPoolExecutor(workers) as pool:
-        jobs = [pool.submit(add, body) for body in range(len(verts))]
-        for done, job in enumerate(as_completed(jobs), 1):
-            job.result()
-            if observe is not None:
-                observe(done, len(jobs))
-    return replace(grid, values=torch.from_numpy(values).to(grid.values))
-
-
-def add_body(
-    verts: np.ndarray, faces: np.ndarray, values: np.ndarray, cell: float, lock: Lock
-) -> None:
-    """Lower `values` [m] to the signed distance of one body whose vertices are in cells."""
-    size = np.array(values.shape)
-    low = np.maximum(np.floor(verts.min(0)).astype(np.int64), 0) - REACH
-    high = np.minimum(np.ceil(verts.max(0)).astype(np.int64), size - 1) + REACH
-    if (high < 0).any() or (low >= size).any():
-        return
-    shape = high - low + 1
-    inside = winding(verts - low, faces, shape) > 0
-    near = np.flatnonzero(inside | near_surface(verts - low, faces, shape))
-    at = np.stack(np.unravel_index(near, inside.shape), -1) + low
-    is_in = np.asarray(inside.ravel()[near])
-    keep = ((at >= 0) & (at < size)).all(-1)
-    at, is_in = at[keep], is_in[keep]
-    flat = np.asarray(np.ravel_multi_index(tuple(at.T), values.shape))
-    field: np.ndarray = values.reshape(-1)
-    open_ = is_in | (field[flat] > 0)  # a positive distance cannot lower what is not positive
-    at, is_in, flat = at[open_], is_in[open_], flat[open_]
-    if len(at) == 0:
-        return
-    distance = np.sqrt(closest(at.astype(np.float64), verts, faces)[0])
-    signed = np.where(is_in, -distance, np.where(distance <= SHELL, distance, BAND)) * cell
-    with lock:
-        field[flat] = np.minimum(field[flat], signed.astype(values.dtype))
+    warped = grid.values.dtype == torch.float32 and engine() == "warp"
+    measure = volume_warp.union_bodies if warped else volume_igl.union_bodies
+    return measure(verts, faces, grid, workers, observe)
 
 
 def signed_distance(

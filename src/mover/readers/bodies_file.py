@@ -30,6 +30,16 @@ def read_bodies(path: Path, warn: Warn = log.warning) -> Bodies:
     return bodies_of(read_npz(path), warn)
 
 
+def read_body_arrays(path: Path, fps: float | None = None) -> At:
+    """The arrays of bodies.npz as they are, with a frame rate where one is given.
+
+    Raises:
+        InputError: If the file cannot be read.
+    """
+    at = read_npz(path)
+    return at if fps is None else At({**at.value, "fps": np.array(fps)}, at.file)
+
+
 def bodies_of(at: At, warn: Warn) -> Bodies:
     """The bodies of named arrays: meshes where they are given, else the posed model."""
     frame = _indices(get(at, "frame"), "B")
@@ -133,6 +143,11 @@ def _space(at: At) -> Any:  # noqa: ANN401
 
 def write_bodies(bodies: Bodies, path: Path) -> None:
     """Write bodies as they are, parameters included."""
+    write_npz(bodies_to_arrays(bodies), path)
+
+
+def bodies_to_arrays(bodies: Bodies) -> dict[str, NDArray[Any]]:
+    """The arrays of bodies.npz."""
     arrays: dict[str, NDArray[Any]] = {
         "frame": bodies.frame.cpu().numpy(),
         "person": bodies.person.cpu().numpy(),
@@ -147,7 +162,7 @@ def write_bodies(bodies: Bodies, path: Path) -> None:
         arrays["joint_names"] = np.array(bodies.joint_names, dtype=np.str_)
     if bodies.pose is not None:
         arrays |= pose_to_arrays(bodies.pose)
-    write_npz(arrays, path)
+    return arrays
 
 
 def read_touch(at: At, bodies: Bodies) -> Float[Tensor, "bodies verts"]:

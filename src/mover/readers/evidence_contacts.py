@@ -1,14 +1,13 @@
 """In how many frames somebody seems to touch each object: for `mover check`."""
 
-import dataclasses
-
 from jaxtyping import Bool
 from torch import Tensor
 
 from ..bodies.parts import members, parts_of
 from ..bodies.touch import touching
-from ..geometry.camera import project, to_world
-from ..types import Bodies, Capture
+from ..bodies.world import in_world
+from ..geometry.camera import project
+from ..types import Capture
 from .masks import decode
 
 FEWEST = 5  # touching vertices inside a mask that make a frame with contact
@@ -28,7 +27,7 @@ def contact_frames(capture: Capture) -> tuple[int, ...]:
     if capture.touch is not None:
         chance = capture.touch
     else:
-        world = _in_world(bodies, R)
+        world = in_world(bodies, capture.scene.camera)
         floor = float(world.verts[..., 1].amin(1).quantile(0.05))
         chance = touching(world, parts, floor)
     chance = chance * ~members(parts, "left_sole", "right_sole")
@@ -45,12 +44,6 @@ def contact_frames(capture: Capture) -> tuple[int, ...]:
             if mask is not None and _inside(mask, pixels) >= FEWEST:
                 frames[i].add(int(bodies.frame[row]))
     return tuple(len(f) for f in frames)
-
-
-def _in_world(bodies: Bodies, R_cam_world: Tensor) -> Bodies:
-    joints = None if bodies.joints is None else to_world(bodies.joints, R_cam_world)
-    verts = to_world(bodies.verts, R_cam_world)
-    return dataclasses.replace(bodies, verts=verts, joints=joints, space="world", pose=None)
 
 
 def _inside(mask: Bool[Tensor, "h w"], pixels: Tensor) -> int:

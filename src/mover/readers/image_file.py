@@ -20,9 +20,22 @@ def read_image(at: At, folder: Path, camera: Camera) -> Float[Tensor, "h w 3"]:
     Raises:
         InputError: If it is missing, cannot be read or has another size.
     """
+    return read_image_file(at, inside(at, folder), camera)
+
+
+def read_image_file(at: At, path: Path, camera: Camera) -> Float[Tensor, "h w 3"]:
+    """A picture wherever it lies, upright, in [0, 1]; its size must be the camera's.
+
+    Args:
+        at: How messages call it.
+        path: Its file.
+        camera: Of the size that it must have.
+
+    Raises:
+        InputError: If it cannot be read or has another size.
+    """
     from PIL import Image, ImageOps
 
-    path = inside(at, folder)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -68,3 +81,22 @@ def write_image(image: Float[Tensor, "h w 3"], path: Path) -> None:
     pixels = (image.detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8).numpy()
     with replacing(path) as part:
         Image.fromarray(pixels).save(part, format="PNG")
+
+
+def mirrored_copy(path: Path, work: Path) -> Path:
+    """A picture flipped left to right, as a new file in `work`.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    from PIL import Image, ImageOps
+
+    target = work / f"mirrored_{path.stem}.jpg"
+    try:
+        with Image.open(path) as picture:
+            ImageOps.mirror(picture.convert("RGB")).save(target, quality=95)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(
+            f"{path.name}: cannot be read ({reason(error)}), expected a picture"
+        ) from error
+    return target

@@ -60,7 +60,7 @@ def _load(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of parsers about things that are checked here
         try:
-            _check_gltf(at, path)
+            check_gltf(at, path)
             scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
             for part in scene.geometry.values():
                 _check_faces(at, np.asarray(part.faces), len(part.vertices))
@@ -73,22 +73,37 @@ def _load(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
             refuse(at, "a readable mesh", found)
 
 
-def _check_gltf(at: At, path: Path) -> None:
-    """Refuse buffers outside of the file's folder, and more numbers than a file can hold."""
+def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
+    """Refuse buffers outside of the file's folder, and more numbers than a file can hold.
+
+    Args:
+        at: How messages call the file.
+        path: Of a mesh; other kinds than glTF pass.
+        pictures: Refuse pictures outside of the folder as well.
+
+    Raises:
+        InputError: If it does so.
+    """
     if path.suffix.lower() not in (".glb", ".gltf"):
         return
+    tree = gltf_tree(path)
+    for kind in ("buffers", "images") if pictures else ("buffers",):
+        for part in tree.get(kind, []):
+            uri = part.get("uri", "data:")
+            if not uri.startswith("data:") and not _is_companion(path, unquote(uri)):
+                refuse(at, f"{kind} beside it", f"{at.value!r} with the file {shown(uri)}")
+    for part in tree.get("accessors", []):
+        if part["count"] > MOST_NUMBERS:
+            refuse(at, f"at most {MOST_NUMBERS} items", f"{at.value!r} with {part['count']}")
+
+
+def gltf_tree(path: Path) -> Any:  # noqa: ANN401
+    """The JSON of a .gltf or .glb; what it holds is not checked."""
     content = path.read_bytes()
     if path.suffix.lower() == ".glb":
         start, size = 20, int.from_bytes(content[12:16], "little")
         content = content[start : start + size]
-    tree = json.loads(content)
-    for part in tree.get("buffers", []):
-        uri = part.get("uri", "data:")
-        if not uri.startswith("data:") and not _is_companion(path, unquote(uri)):
-            refuse(at, "buffers beside it", f"{at.value!r} with the buffer {shown(uri)}")
-    for part in tree.get("accessors", []):
-        if part["count"] > MOST_NUMBERS:
-            refuse(at, f"at most {MOST_NUMBERS} items", f"{at.value!r} with {part['count']}")
+    return json.loads(content)
 
 
 def _check_faces(at: At, faces: NDArray[Any], count: int) -> None:

@@ -69,6 +69,20 @@ def _header(stream: Any) -> tuple[np.dtype[Any], int]:  # noqa: ANN401
     return dtype, size
 
 
+def check_array_header(path: Path) -> None:
+    """Refuse an .npy file that holds objects or promises more than it has.
+
+    Raises:
+        InputError: If it does.
+    """
+    with path.open("rb") as stream:
+        dtype, size = _header(stream)
+    if dtype.hasobject or dtype.fields:
+        raise InputError(f"{path.name}: has {dtype}, expected plain numbers (no pickled objects)")
+    if size > min(LARGEST_FILE, path.stat().st_size):
+        raise InputError(f"{path.name}: promises {size} bytes, expected no more than it has")
+
+
 def write_npz(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
     """Write arrays in one step, always the same bytes for the same arrays."""
     with replacing(path) as part:

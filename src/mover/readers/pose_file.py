@@ -16,7 +16,8 @@ from ..types import Bodies, BodyPose
 from .fields import At, array, choice, get, maybe, reason, refuse
 
 NEEDED = ("betas", "global_orient", "body_pose", "transl")
-EXTRA = ("left_hand_pose", "right_hand_pose", "jaw_pose", "expression")
+HANDS = ("left_hand_pose", "right_hand_pose", "flat_hand_mean")
+EXTRA = (*HANDS, "jaw_pose", "leye_pose", "reye_pose", "expression")
 MODELS = ("smplx", "smplh", "smpl", "makehuman")
 GENDERS = ("neutral", "female", "male")
 ANGLES = (63, 69)  # of SMPL-X and SMPL-H, of SMPL

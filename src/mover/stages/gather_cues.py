@@ -3,28 +3,26 @@
 The cost of placing the objects then does not grow with the video.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
 from ..energy import HumanCues
-from ..geometry.camera import to_camera
 from ..geometry.crops import sample_nearest
-from ..geometry.raster import Views, layers
+from ..geometry.raster import Views
 from ..geometry.volume import grid_around, union_bodies
 from ..minimize import Observer, Step, silent
 from ..records import record
 from ..terms.bbox import WIDTH
 from ..terms.collision import BodySpace
 from ..terms.contact import Touches
-from ..terms.depth import DepthMaps, DepthRange, Seen, bounds_of, merge
+from ..terms.depth import DepthMaps, DepthRange
 from ..types import Bodies, Camera, People
-from .person_masks import MaskTable, mask_table
-from .small import small_camera, small_masks, small_views
-
-BLOCK = 8  # bodies that are drawn at once
+from .gather_depth import Sight, gather_depth
+from .person_masks import mask_table
+from .small import small_camera, small_masks
 
 
 @dataclass(frozen=True)
@@ -33,6 +31,8 @@ class GatherConfig:
 
     erode: int = 1
     """Pixels (of an image 640 wide) by which masks and silhouettes shrink."""
+    reach: float = 0.0
+    """How far the outlines of bodies may be wrong: what is thinner is not hidden (robust) [m]."""
     vote: bool = True
     """Per body and object, keep only the larger of the hidden and the hiding region."""
     cells: int = 256
@@ -40,7 +40,7 @@ class GatherConfig:
     padding: float = 0.2
     """Space around the bodies in the volume [m]."""
     workers: int = 2
-    """Threads that measure distances; the result does not depend on it."""
+    """Threads that draw and measure; the result does not depend on it."""
 
 
 @record
@@ -97,24 +97,13 @@ def cues_in_windows(cues: Cues, touches: Touches | None, views: Views, camera: C
 def _depth_maps(inputs: GatherInputs, config: GatherConfig, observe: Observer) -> DepthMaps | None:
     if inputs.people is None:
         return None
-    views, bodies = small_views(inputs.camera), inputs.bodies
     masks = small_masks(inputs.masks, inputs.camera)
-    table: MaskTable = mask_table(inputs.people, bodies)
-    blank = torch.full((views.height, views.width), float("inf"))
-    maps = DepthMaps(-blank, blank, -blank)
-    rows = [row for row in range(len(bodies.frame)) if table.own[row] is not None]
-    for begin in range(0, len(rows), BLOCK):
-        block = torch.tensor(rows[begin : begin + BLOCK])
-        verts = to_camera(bodies.verts[block], inputs.camera.R_cam_world)
-        many = replace(views, K=views.K.expand(len(block), 3, 3))
-        drawn = layers(verts, bodies.faces, many)
-        for k, row in enumerate(block.tolist()):  # frames are streamed: memory stays that of one
-            visible, others = table.decode(row)
-            small = small_masks(torch.stack([visible, others]), inputs.camera)
-            seen = Seen(drawn.front[k], drawn.exit[k], small[0], small[1])
-            maps = merge(maps, bounds_of(seen, masks, config.erode, vote=config.vote))
-        observe(Step("gather_cues: depth", begin, len(rows)))
-    return maps
+    table = mask_table(inputs.people, inputs.bodies)
+    return gather_depth(
+        Sight(inputs.bodies, table, masks, inputs.camera, config.erode, config.vote, config.reach),
+        config.workers,
+        lambda done, of: observe(Step("gather_cues: depth", done, of)),
+    )
 
 
 def _space(inputs: GatherInputs, config: GatherConfig, observe: Observer) -> BodySpace:

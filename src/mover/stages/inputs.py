@@ -6,10 +6,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..geometry.camera import to_world
 from ..geometry.runs import decode
 from ..records import map_tensors, record
-from ..types import Bodies, BodyPose, Camera, Capture, Masks
+from ..types import Bodies, BodyPose, Capture, Masks
 from .prepare_objects import Prepared
 
 
@@ -65,15 +64,6 @@ def rows_of(bodies: Bodies, keep: Bool[Tensor, " bodies"]) -> Bodies:
         bodies, verts=bodies.verts[keep], joints=joints, frame=bodies.frame[keep],
         person=bodies.person[keep], pose=pose,
     )  # fmt: skip
-
-
-def in_world(bodies: Bodies, camera: Camera) -> Bodies:
-    """Bodies from camera axes into the world (vertices and joints; parameters stay behind)."""
-    R = camera.R_cam_world
-    joints = None if bodies.joints is None else to_world(bodies.joints, R)
-    return dataclasses.replace(
-        bodies, verts=to_world(bodies.verts, R), joints=joints, space="world", pose=None
-    )
 
 
 def ground_without_people(capture: Capture, prepared: Prepared) -> float:

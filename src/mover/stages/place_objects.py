@@ -9,10 +9,11 @@ from torch import Tensor
 
 from ..energy import HumanCues, ImageCues, SceneConfig, SceneWeights, scene_energy
 from ..geometry.placement import stand
-from ..minimize import Adam, Energy, Minimum, Observer, minimize, silent
+from ..minimize import Adam, Energy, Minimum, Observer, Step, minimize, silent
 from ..records import record
 from ..terms import Form
 from ..types import Camera, Layout, Objects
+from .pinned import Pinned, hold
 from .starts import best_few, choose, spread
 
 
@@ -54,6 +55,18 @@ class PlaceInputs:
     """Candidates on a leading axis."""
     reference: Float[Tensor, " objects"]
     """Yaw that breaks ties: of the sitters where there are any, else the initial one [rad]."""
+    pinned: Pinned | None = None
+    """Objects that stay where they are; None: all may move."""
+
+
+@record
+class Moment:
+    """The room in the middle of a descent, for those who watch."""
+
+    layout: Layout
+    """All starts."""
+    camera: Camera
+    ground: float
 
 
 @record
@@ -94,7 +107,8 @@ def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], En
     heights = objects.size[:, 1]
 
     def energy(layout: Layout) -> Energy:
-        standing = stand(layout, objects.supports, heights, inputs.ground)
+        held = hold(layout, inputs.pinned)
+        standing = stand(held, objects.supports, heights, inputs.ground)
         return scene_energy(standing, objects, inputs.camera, inputs.image, inputs.humans, scene)
 
     return energy
@@ -108,15 +122,24 @@ def descend(
     span = torch.tensor(
         [config.chair_span if c == "chair" else config.span for c in objects.categories]
     )
+
+    def at(free: Layout) -> Layout:
+        held = hold(_bounded(free, span), inputs.pinned)
+        return stand(held, objects.supports, objects.size[:, 1], inputs.ground)
+
+    def watched(step: Step) -> None:
+        free = step.at
+        assert free is not None
+        observe(replace(step, at=lambda: Moment(at(free()), inputs.camera, inputs.ground)))
+
     found = minimize(
         lambda free: energy(_bounded(free, span)),
         _unbounded(starts, span),
         method,
-        observe,
+        watched,
         "place_objects",
     )
-    at = stand(_bounded(found.at, span), objects.supports, objects.size[:, 1], inputs.ground)
-    return Minimum(at, found.value, found.trace)
+    return Minimum(at(found.at), found.value, found.trace)
 
 
 def _by_boxes(

@@ -9,7 +9,8 @@ Paper:     both bounds act on D_i, the front surface; pixels of an image that is
 Release:   the far bound acts on the back surface, both are clamped at 2 m, the region is eroded
            by a pixel, and a third map keeps objects behind people outside their masks (`free`).
 Robust:    mean over the constrained pixels (at least 100), 2 cm margin, clamped at 2 m; pixels
-           whose bounds contradict each other are dropped.
+           whose bounds contradict each other are dropped. What is missing from a person's mask
+           counts as hidden only where it is thicker than the error of an outline (`Seen.reach`).
 Departure: the near bound is the first exit of the ray from the visible body, not the farthest
            layer of the body, which would forbid true places (an arm in front of a chair).
 """
@@ -63,6 +64,8 @@ class Seen:
     """The person's visible mask."""
     others: Bool[Tensor, "h w"]
     """Masks of the other people of the frame."""
+    reach: float = 0.0
+    """How far the drawn outline may be wrong [px]."""
 
 
 def bounds_of(
@@ -80,6 +83,8 @@ def bounds_of(
     body = _shrink(seen.front.isfinite(), erode)
     shown = body & _shrink(seen.visible, erode)
     hidden = body & ~_grow(seen.visible, erode) & ~_grow(seen.others, erode)
+    if seen.reach > 0:
+        hidden = _thick(hidden, seen.reach)
     before, behind = objects & shown, objects & hidden
     if vote:
         more = before.sum((-2, -1)) - behind.sum((-2, -1))
@@ -137,6 +142,19 @@ def _erode(mask: Bool[Tensor, "*batch h w"]) -> Bool[Tensor, "*batch h w"]:
     padded = torch.nn.functional.pad(mask, (1, 1, 1, 1), value=True)
     rows = padded[..., :-2, 1:-1] & padded[..., 2:, 1:-1]
     return mask & rows & padded[..., 1:-1, :-2] & padded[..., 1:-1, 2:]
+
+
+def _thick(hidden: Bool[Tensor, "h w"], reach: float) -> Bool[Tensor, "h w"]:
+    """What a wrong outline does not explain: discs of the radius `reach` that are wholly hidden.
+
+    An arm that the body has in a wrong place is not hidden by what stands behind it.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    inner = torch.from_numpy(distance_transform_edt(hidden.numpy())) > reach
+    if not bool(inner.any()):
+        return inner
+    return hidden & (torch.from_numpy(distance_transform_edt(~inner.numpy())) < reach / 2)
 
 
 def _shrink(mask: Bool[Tensor, "h w"], steps: int) -> Bool[Tensor, "h w"]:

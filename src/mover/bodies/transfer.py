@@ -1,0 +1,206 @@
+r"""From one body model to another: the pose is copied, shape and place are solved.
+
+    E = \sum_b mean_k ||x_bk - y_bk||^2 / σ_x^2 + ||θ_b - θ_b^copied||^2 / σ_θ^2 + ||β||^2 / σ_β^2
+
+y are points of the source: vertices where both meshes correspond (SMPL and SMPL-H have one mesh;
+the user's official matrix gives SMPL-X's from SMPL's), else joints and the points that keypoint
+detectors know, at the places that both models have. x are the same points of the target.
+Departure from the SMPL-X authors' tool: rows that share a shape before share one after it, and the
+pose starts from the copy instead of from edges of the mesh.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..records import record
+from ..types import BodyPose
+from .correspondence import Pairs, pairs_of, thinned
+from .skinning import SkinnedBody, widths_of
+from .smpl_model import FLAT, HANDS, SmplBody, skin_of_model, with_full_hands
+from .transfer_matrix import TransferMatrix
+
+Model = SkinnedBody | SmplBody
+SHAPES = 10
+"""Numbers of shape that are solved."""
+
+
+@dataclass(frozen=True)
+class TransferConfig:
+    """How a body is laid into another model."""
+
+    steps: int = 60
+    """Most iterations of L-BFGS, first of shape and place, then of everything."""
+    sigma_vertex: float = 0.001
+    """Expected distance of corresponding vertices [m]."""
+    sigma_joint: float = 0.01
+    """Expected distance of joints and keypoints of the same name, which models place apart [m]."""
+    sigma_pose: float = 0.15
+    """Expected difference of an angle between the models [rad]."""
+    sigma_shape: float = 3.0
+    """Expected size of a number of the shape."""
+    free_pose: bool = True
+    """Turn the joints after the copy; else only shape and place are solved."""
+
+
+@record
+class Transferred:
+    """A body in another model."""
+
+    pose: BodyPose
+    miss: Float[Tensor, " bodies"]
+    """Root mean square distance of corresponding points [m]."""
+
+
+@record
+class Unknowns:
+    """What is solved."""
+
+    betas: Float[Tensor, "people shape"]
+    transl: Float[Tensor, "bodies 3"]
+    turn: Float[Tensor, "bodies angles"]
+    """Added to the copied angles of the root and the body [rad]."""
+
+
+def transfer(
+    pose: BodyPose,
+    source: Model,
+    target: Model,
+    config: TransferConfig | None = None,
+    matrix: TransferMatrix | None = None,
+) -> Transferred:
+    """The same people in the model `target`.
+
+    Args:
+        pose: Parameters of `source`; rows with equal shape are one person and stay so.
+        source: The model of the pose.
+        target: The model to change to.
+        config: Weights and steps.
+        matrix: The user's matrix that gives the vertices of `target` from those of `source`.
+    """
+    config = config or TransferConfig()
+    pairs = pairs_of(source, target, matrix)
+    goal = _goal(pose, source, pairs)
+    person = torch.unique(pose.betas, dim=0, return_inverse=True)[1]
+    copied = copy_pose(pose, source, target)
+    small = thinned(target, pairs.target)
+    sigma = config.sigma_joint if len(pairs.source_joints) else config.sigma_vertex
+
+    def points(at: Unknowns) -> Float[Tensor, "bodies points 3"]:
+        verts, joints = small.posed(_laid(at, copied, person))
+        return torch.cat([joints[:, pairs.target_joints], verts], 1)
+
+    def energy(at: Unknowns) -> Float[Tensor, ""]:
+        return _misfit(points(at), goal, sigma) + _doubt(at, config)
+
+    at = _start(copied, target, person, goal, points)
+    at = _solve(at, ("betas", "transl"), energy, config.steps)
+    if config.free_pose:
+        at = _solve(at, ("betas", "transl", "turn"), energy, config.steps)
+    with torch.no_grad():
+        miss = (points(at) - goal).square().sum(-1).mean(1).sqrt()
+    return Transferred(_laid(at, copied, person), miss)
+
+
+def _laid(at: Unknowns, copied: BodyPose, person: Int[Tensor, " bodies"]) -> BodyPose:
+    """The copied pose with what is solved."""
+    angles = torch.cat([copied.global_orient, copied.body_pose], -1) + at.turn
+    return dataclasses.replace(
+        copied, betas=at.betas[person], global_orient=angles[:, :3],
+        body_pose=angles[:, 3:], transl=at.transl,
+    )  # fmt: skip
+
+
+def copy_pose(pose: BodyPose, source: Model, target: Model) -> BodyPose:
+    """The angles of all joints that both models have; shape zero, place as it was.
+
+    Hands become 45 angles from flat hands; where the source has none, the target's are at rest.
+    """
+    full = with_full_hands(source, pose) if isinstance(source, SmplBody) else pose
+    widths = widths_of(_skin(target))
+    body = full.body_pose[:, :63]
+    body = torch.cat([body, body.new_zeros(len(body), widths["body_pose"] - 63)], -1)
+    wanted = {*widths} | ({"expression"} if source.name == target.name else set())
+    extra = {name: value for name, value in full.extra.items() if name in wanted}
+    if any(name in extra for name in HANDS):
+        extra[FLAT] = body.new_ones(len(body), 1)
+    shapes = min(SHAPES, _skin(target).shape_dirs.shape[-1])
+    gender = target.gender if isinstance(target, SmplBody) else "neutral"
+    return BodyPose(
+        model=target.name, gender=gender, betas=body.new_zeros(len(body), shapes),
+        global_orient=full.global_orient, body_pose=body, transl=full.transl, extra=extra,
+    )  # fmt: skip
+
+
+def _skin(model: Model) -> SkinnedBody:
+    skin = skin_of_model(model)
+    assert skin is not None
+    return skin
+
+
+def _goal(pose: BodyPose, source: Model, pairs: Pairs) -> Float[Tensor, "bodies points 3"]:
+    """Where the points of the source are [m]."""
+    with torch.no_grad():
+        verts, joints = thinned(source, pairs.source).posed(pose)
+    if pairs.mix is not None:
+        verts = torch.einsum("kv,bvi->bki", pairs.mix.to(verts), verts)
+    return torch.cat([joints[:, pairs.source_joints], verts], 1)
+
+
+def _start(
+    copied: BodyPose,
+    target: Model,
+    person: Int[Tensor, " bodies"],
+    goal: Float[Tensor, "bodies points 3"],
+    points: Callable[[Unknowns], Float[Tensor, "bodies points 3"]],
+) -> Unknowns:
+    """The mean shape in the copied pose, with its points about those of the source."""
+    people, shapes = int(person.max()) + 1, copied.betas.shape[-1]
+    angles = 3 + widths_of(_skin(target))["body_pose"]
+    at = Unknowns(
+        betas=goal.new_zeros(people, shapes),
+        transl=goal.new_zeros(len(goal), 3),
+        turn=goal.new_zeros(len(goal), angles),
+    )
+    with torch.no_grad():
+        return dataclasses.replace(at, transl=(goal - points(at)).mean(1))
+
+
+def _misfit(
+    points: Float[Tensor, "bodies points 3"], goal: Float[Tensor, "bodies points 3"], sigma: float
+) -> Float[Tensor, ""]:
+    """Squared distances of corresponding points over what is expected of them."""
+    return (points - goal).square().sum(-1).mean(1).sum() / sigma**2
+
+
+def _doubt(at: Unknowns, config: TransferConfig) -> Float[Tensor, ""]:
+    """Squared turns from the copied pose and sizes of the shape, over what is expected."""
+    turn = at.turn.square().mean(-1).sum() / config.sigma_pose**2
+    return turn + at.betas.square().sum() / config.sigma_shape**2
+
+
+def _solve(
+    start: Unknowns,
+    free: tuple[str, ...],
+    energy: Callable[[Unknowns], Float[Tensor, ""]],
+    steps: int,
+) -> Unknowns:
+    """Lower the energy in the fields `free` by L-BFGS with a strong Wolfe line search."""
+    values = {name: getattr(start, name).detach().clone().requires_grad_() for name in free}
+    solver = torch.optim.LBFGS(
+        list(values.values()), max_iter=steps, history_size=20,
+        line_search_fn="strong_wolfe",
+    )  # fmt: skip
+
+    def closure() -> Tensor:
+        solver.zero_grad()
+        value = energy(dataclasses.replace(start, **values))
+        value.backward()
+        return value
+
+    solver.step(closure)
+    return dataclasses.replace(start, **{name: value.detach() for name, value in values.items()})

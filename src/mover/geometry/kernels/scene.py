@@ -1,0 +1,113 @@
+# pyright: basic, reportInvalidTypeForm=false
+"""What the kernels read, their working memory and what they write."""
+
+from typing import no_type_check
+
+import warp as wp
+
+BORDER = 1  # [px], so that an outline just outside the window still moves the window's pixels
+
+
+@wp.struct
+@no_type_check
+class Scene:
+    """Items with their topologies and windows; item i has topology and window i % views."""
+
+    verts: wp.array(dtype=wp.vec3)
+    """Vertices of all items in camera axes [m]."""
+    window: wp.array(dtype=wp.vec4)
+    """Focal lengths and principal point of each window, with the border [px]."""
+    faces: wp.array(dtype=wp.vec3l)
+    """Triangles of each topology."""
+    edges: wp.array(dtype=wp.vec4l)
+    """Edges of each topology: two vertices, two faces."""
+    views: int
+    """Number of windows."""
+    shapes: int
+    """Number of topologies."""
+    n_verts: int
+    """Vertices of an item."""
+    n_faces: int
+    """Faces of a topology, with padding."""
+    n_edges: int
+    """Edges of a topology, with padding."""
+    height: int
+    """Rows of a grid, with the border [px]."""
+    width: int
+    """Columns of a grid, with the border [px]."""
+    border: int
+    """Rows and columns around the window [px]."""
+
+
+@wp.struct
+@no_type_check
+class Scratch:
+    """Working memory; `near`, `far` and `pairs` are zero before and after."""
+
+    screen: wp.array(dtype=wp.vec3)
+    """Column, row [px] and inverse depth [1/m] of each vertex; zeros where it is not drawn."""
+    front: wp.array(dtype=wp.int8)
+    """Whether each face is drawn and faces the camera."""
+    near: wp.array(dtype=wp.uint64)
+    """Winner of each pixel among the fronts: bits of 1/z (high half), face + 1 (low half)."""
+    far: wp.array(dtype=wp.uint64)
+    """Winner of each pixel among the backs."""
+    pairs: wp.array(dtype=wp.uint64)
+    """Outermost cut of each pair of neighbours in a row, then in a column: its place, its edge."""
+    queue: wp.array(dtype=wp.int32)
+    """Edges of the outline, or triangles that many threads share."""
+    cuts: wp.array(dtype=wp.vec4i)
+    """Cuts that count: two vertices (over all items), line x 4 + flags, covered place."""
+    targets: wp.array(dtype=wp.int32)
+    """Pixel of the window that each cut moves, over all items; -1 - pixel where it overshoots."""
+    count: wp.array(dtype=wp.int32)
+    """Number of entries of `queue`, of `cuts`."""
+
+
+@wp.struct
+@no_type_check
+class Maps:
+    """What is drawn, without the border; a pixel that nothing covers is left as it is."""
+
+    image: wp.array(dtype=wp.float32)
+    """Covered share of each pixel."""
+    nearest: wp.array(dtype=wp.float32)
+    """Depth of the surface in `near` [m]."""
+    farthest: wp.array(dtype=wp.float32)
+    """Depth of the surface in `far` [m]."""
+    covered: wp.array(dtype=wp.bool)
+    """Whether both were seen."""
+    near_face: wp.array(dtype=wp.int32)
+    """Face that won the pixel in `near`."""
+    far_face: wp.array(dtype=wp.int32)
+    """Face that won the pixel in `far`."""
+    box: wp.array(dtype=wp.vec4i)
+    """Where each item may be: first row, row after the last, the same of columns, in the grid."""
+    silhouette: bool
+    """Whether `image` is wanted."""
+    depth: bool
+    """Whether the other maps are wanted."""
+
+
+@wp.struct
+@no_type_check
+class Pull:
+    """Gradients of the maps, on their way to the vertices."""
+
+    cuts: wp.array(dtype=wp.vec4i)
+    """As in `Scratch`."""
+    targets: wp.array(dtype=wp.int32)
+    """As in `Scratch`."""
+    starts: wp.array(dtype=wp.int32)
+    """First cut of each item, and the number of all."""
+    image: wp.array(dtype=wp.float32)
+    """Gradient of the covered share."""
+    nearest: wp.array(dtype=wp.float32)
+    """Gradient of the first depth."""
+    farthest: wp.array(dtype=wp.float32)
+    """Gradient of the last depth."""
+    has_image: bool
+    has_nearest: bool
+    has_farthest: bool
+    verts: wp.array(dtype=wp.vec3)
+    """Gradient of the vertices, which is added to."""

@@ -1,0 +1,199 @@
+# pyright: basic, reportInvalidTypeForm=false, reportGeneralTypeIssues=false
+"""A triangle's runs of pixel centres, row by row, as `raster_spans` makes them.
+
+The order of the operations is that of the torch version, and products are not fused with sums, so
+that both decide alike for centres on an edge.
+"""
+
+from typing import no_type_check
+
+import warp as wp
+
+from ..camera import NEAR
+from ..raster_spans import AWAY, TINY
+from .scene import Scene, Scratch
+
+SLACK = 0.01  # [px], far more than the rounding of a cut near the window
+FULL = wp.constant(wp.uint32(0x7FFFFFFF))
+HALF = wp.constant(wp.uint64(32))
+
+
+@wp.struct
+@no_type_check
+class Side:
+    """An edge of a triangle from its upper to its lower vertex."""
+
+    y: float
+    x: float
+    x_step: float
+    q: float
+    q_step: float
+
+
+@wp.struct
+@no_type_check
+class Triangle:
+    """A triangle cut by rows of pixel centres."""
+
+    across: Side
+    """From the top to the bottom."""
+    upper: Side
+    """From the top to the middle."""
+    lower: Side
+    """From the middle to the bottom."""
+    kink: float
+    """Row of the middle vertex [px]."""
+    first: int
+    """First row."""
+    last: int
+    """Last row; before the first where no row cuts the triangle."""
+
+
+@wp.func
+@no_type_check
+def on_screen(p: wp.vec3, k: wp.vec4) -> wp.vec3:
+    """Column, row [px] and inverse depth [1/m] of a point; zeros where it is not drawn."""
+    q = 1.0 / wp.max(p[2], NEAR)
+    x = p[0] * q * k[0] + k[2]
+    y = p[1] * q * k[1] + k[3]
+    if p[2] >= NEAR and wp.abs(x) < AWAY and wp.abs(y) < AWAY:
+        return wp.vec3(x, y, q)
+    return wp.vec3(0.0, 0.0, 0.0)
+
+
+@wp.func
+@no_type_check
+def signed_area(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
+    """Twice the area [px²]: negative for fronts, positive for backs, 0 if not drawn."""
+    if wp.min(a[2], wp.min(b[2], c[2])) == 0.0:
+        return 0.0
+    return (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+
+
+@wp.func
+@no_type_check
+def side(a: wp.vec3, b: wp.vec3) -> Side:
+    """The edge from `a` down to `b`."""
+    drop = wp.max(b[1] - a[1], TINY)
+    s = Side()
+    s.y = a[1]
+    s.x = a[0]
+    s.x_step = (b[0] - a[0]) / drop
+    s.q = a[2]
+    s.q_step = (b[2] - a[2]) / drop
+    return s
+
+
+@wp.func
+@no_type_check
+def is_above(a: wp.vec3, b: wp.vec3, i: wp.int64, j: wp.int64) -> bool:
+    """Whether vertex i at `a` comes before vertex j at `b` from the top; ties by index."""
+    return a[1] < b[1] or (a[1] == b[1] and i < j)
+
+
+@wp.func
+@no_type_check
+def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, face: wp.vec3l, height: int) -> Triangle:
+    """Sort the vertices from the top and find the rows."""
+    t = Triangle()
+    t.first = int(wp.max(wp.ceil(wp.min(a[1], wp.min(b[1], c[1])) - 0.5), 0.0))
+    t.last = int(wp.min(wp.floor(wp.max(a[1], wp.max(b[1], c[1])) - 0.5), float(height - 1)))
+    left = wp.min(a[0], wp.min(b[0], c[0])) - SLACK
+    right = wp.max(a[0], wp.max(b[0], c[0])) + SLACK
+    if t.first > t.last or wp.ceil(left - 0.5) > wp.floor(right - 0.5):
+        t.last = t.first - 1
+        return t
+    ab = is_above(a, b, face[0], face[1])
+    bc = is_above(b, c, face[1], face[2])
+    ca = is_above(c, a, face[2], face[0])
+    top = wp.where(ab, wp.where(ca, c, a), wp.where(bc, b, c))
+    low = wp.where(ab, wp.where(bc, c, b), wp.where(ca, a, c))
+    mid = wp.where(ab == bc, b, wp.where(ab == ca, a, c))
+    t.across = side(top, low)
+    t.upper = side(top, mid)
+    t.lower = side(mid, low)
+    t.kink = mid[1]
+    return t
+
+
+@wp.func
+@no_type_check
+def fill(
+    keys: wp.array(dtype=wp.uint64), first: int, count: int, q: float, step: float, tag: int
+) -> None:
+    """Raise the keys of a run of pixels; `tag` as for `draw_row`.
+
+    Args:
+        keys: Winner of each pixel.
+        first: First pixel.
+        count: Number of pixels.
+        q: Inverse depth at the first pixel [1/m].
+        step: Its change from one pixel to the next [1/m].
+        tag: Face and order.
+    """
+    flip = wp.where(tag > 0, wp.uint32(0), FULL)
+    face = wp.uint64(wp.abs(tag))
+    i = int(0)
+    while i < count:
+        at = q + float(i) * step
+        bits = wp.cast(wp.where(at > TINY, at, TINY), wp.uint32) ^ flip
+        wp.atomic_max(keys, first + i, (wp.uint64(bits) << HALF) | face)
+        i += 1
+
+
+@wp.func
+@no_type_check
+def draw_row(
+    t: Triangle, row: int, start: int, width: int, keys: wp.array(dtype=wp.uint64), tag: int
+) -> None:
+    """Write the run of one row: where its key is greater than the pixel's it wins.
+
+    Args:
+        t: A triangle that the row cuts.
+        row: Row of the grid.
+        start: First pixel of the row in `keys`.
+        width: Columns of the grid.
+        keys: Winner of each pixel.
+        tag: Face + 1 where the nearest run wins, or less than zero where the farthest does.
+    """
+    y = float(row) + 0.5
+    down = y - t.across.y
+    other = y - t.upper.y
+    x = t.across.x + down * t.across.x_step
+    x2 = t.upper.x + other * t.upper.x_step
+    if y >= t.kink:
+        other = y - t.lower.y
+        x2 = t.lower.x + other * t.lower.x_step
+    low = wp.where(x < x2, x, x2) - 0.5
+    high = wp.where(x < x2, x2, x) - 0.5
+    wide = float(width)
+    first = int(wp.ceil(wp.where(low > 0.0, wp.where(low < wide, low, wide), 0.0)))
+    last = int(wp.floor(wp.where(high > -1.0, wp.where(high < wide, high, wide - 1.0), -1.0)))
+    if first <= last:
+        q = t.across.q + down * t.across.q_step
+        q2 = t.upper.q + other * t.upper.q_step
+        if y >= t.kink:
+            q2 = t.lower.q + other * t.lower.q_step
+        span = x2 - x
+        step = (q2 - q) * span / wp.max(span * span, TINY)
+        q = q + (float(first) + 0.5 - x) * step
+        fill(keys, start + first, last - first + 1, q, step, tag)
+
+
+@wp.func
+@no_type_check
+def paint(scene: Scene, scratch: Scratch, t: Triangle, place: wp.vec3i, near: bool) -> None:
+    """Draw one row of a triangle.
+
+    Args:
+        scene: Items.
+        scratch: Working memory.
+        t: The triangle.
+        place: Item within `scratch`, row and face.
+        near: Draw to `near`, where the nearest wins, else to `far`, where the farthest does.
+    """
+    start = (place[0] * scene.height + place[1]) * scene.width
+    if near:
+        draw_row(t, place[1], start, scene.width, scratch.near, place[2] + 1)
+    else:
+        draw_row(t, place[1], start, scene.width, scratch.far, -place[2] - 1)

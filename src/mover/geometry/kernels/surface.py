@@ -1,0 +1,132 @@
+# pyright: basic, reportInvalidTypeForm=false
+"""Depth of the surface that a pixel sees, and its gradient, as in `raster_depth`.
+
+The depth itself is that of the run of pixels: in single precision it is nearer to the exact value
+than the plane through the vertices, from which the gradient comes.
+"""
+
+from typing import no_type_check
+
+import warp as wp
+
+from ..raster_depth import AGREE, GRAZING
+from .scene import Maps, Pull, Scene
+
+FULL = wp.constant(wp.uint32(0x7FFFFFFF))
+LOW = wp.constant(wp.uint64(0xFFFFFFFF))
+HALF = wp.constant(wp.uint64(32))
+
+
+@wp.func
+@no_type_check
+def face_of(key: wp.uint64) -> int:
+    """Face that won a pixel."""
+    return int(key & LOW) - 1
+
+
+@wp.func
+@no_type_check
+def inverse_depth(key: wp.uint64, farthest: bool) -> float:
+    """Inverse depth [1/m] of the run that won a pixel."""
+    flip = wp.where(farthest, FULL, wp.uint32(0))
+    return wp.cast(wp.uint32(key >> HALF) ^ flip, wp.float32)
+
+
+@wp.func
+@no_type_check
+def pixel_of(scene: Scene, item: int, row: int, column: int) -> int:
+    """Pixel of the windows, over all items, for a place of the grid."""
+    high = scene.height - 2 * scene.border
+    return (item * high + row - scene.border) * (scene.width - 2 * scene.border) + (
+        column - scene.border
+    )
+
+
+@wp.func
+@no_type_check
+def item_of(scene: Scene, pixel: int) -> int:
+    """Item that a pixel of the windows belongs to."""
+    border = 2 * scene.border
+    return pixel / ((scene.width - border) * (scene.height - border))
+
+
+@wp.func
+@no_type_check
+def ray_of(scene: Scene, pixel: int) -> wp.vec3:
+    """Ray through the centre of a pixel of the windows, with a depth of 1."""
+    wide = scene.width - 2 * scene.border
+    high = scene.height - 2 * scene.border
+    k = scene.window[item_of(scene, pixel) % scene.views]
+    column = float(pixel % wide + scene.border) + 0.5
+    row = float(pixel / wide % high + scene.border) + 0.5
+    return wp.vec3((column - k[2]) / k[0], (row - k[3]) / k[1], 1.0)
+
+
+@wp.func
+@no_type_check
+def show_pixel(maps: Maps, pixel: int, near: wp.uint64, far: wp.uint64) -> None:
+    """Write the maps of one pixel from its winners."""
+    if near != wp.uint64(0):
+        if maps.silhouette:
+            maps.image[pixel] = 1.0
+        if maps.depth and far != wp.uint64(0):
+            maps.covered[pixel] = True
+            maps.nearest[pixel] = 1.0 / inverse_depth(near, False)
+            maps.farthest[pixel] = 1.0 / inverse_depth(far, True)
+            maps.near_face[pixel] = face_of(near)
+            maps.far_face[pixel] = face_of(far)
+
+
+@wp.func
+@no_type_check
+def pull_pixel(scene: Scene, maps: Maps, pull: Pull, pixel: int) -> None:
+    """Add the gradients of both depths of a pixel to the vertices."""
+    if pull.has_nearest:
+        g = pull.nearest[pixel]
+        if g != 0.0 and maps.covered[pixel]:
+            pull_depth(scene, pixel, maps.near_face[pixel], maps.nearest[pixel], g, pull.verts)
+    if pull.has_farthest:
+        g = pull.farthest[pixel]
+        if g != 0.0 and maps.covered[pixel]:
+            pull_depth(scene, pixel, maps.far_face[pixel], maps.farthest[pixel], g, pull.verts)
+
+
+@wp.func
+@no_type_check
+def pull_depth(
+    scene: Scene, pixel: int, face: int, z: float, gradient: float, grads: wp.array(dtype=wp.vec3)
+) -> None:
+    """Add the gradient of a pixel's depth to the vertices of the face that it sees.
+
+    The depth z = (n . a) / (n . ray) moves by n / (n . ray) times the motion of the point that is
+    hit, which is the mean of the motions of the vertices with its barycentric weights. Faces that
+    are seen edge-on, and slivers whose plane is noise, have no gradient.
+
+    Args:
+        scene: Items.
+        pixel: Pixel of the windows, over all items.
+        face: Face that won the pixel.
+        z: Its depth there [m].
+        gradient: Of that depth.
+        grads: Gradients of the vertices of all items.
+    """
+    item = item_of(scene, pixel)
+    ray = ray_of(scene, pixel)
+    corner = scene.faces[item % scene.shapes * scene.n_faces + face]
+    base = item * scene.n_verts
+    a = scene.verts[base + int(corner[0])]
+    e = scene.verts[base + int(corner[1])] - a
+    f = scene.verts[base + int(corner[2])] - a
+    normal = wp.cross(e, f)
+    size = wp.dot(normal, normal)
+    toward = wp.dot(normal, a)
+    slant = wp.dot(normal, ray)
+    steep = toward * toward > GRAZING * GRAZING * size * wp.dot(a, a)
+    if steep and wp.isfinite(toward) and wp.abs(slant * z - toward) < AGREE * wp.abs(toward):
+        p = ray * (toward / slant) - a
+        second = wp.dot(wp.cross(p, f), normal) / size
+        third = wp.dot(wp.cross(e, p), normal) / size
+        pull = normal * (gradient / slant)
+        wp.atomic_add(grads, base + int(corner[0]), (1.0 - second - third) * pull)
+        wp.atomic_add(grads, base + int(corner[1]), second * pull)
+        wp.atomic_add(grads, base + int(corner[2]), third * pull)

@@ -1,0 +1,42 @@
+"""First entry and first exit of rays as Warp kernels: same result as `raster_torch.layers`."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from .kernels.start import kernels, started
+from .raster_records import Layers, Views
+
+
+def layers(
+    verts_cam: Float[Tensor, "items verts 3"], faces: Int[Tensor, "faces 3"], views: Views
+) -> Layers:
+    """See `raster.layers`. A call works in one thread and leaves Python's lock to others."""
+    wp = started()
+    items, n_verts, _ = verts_cam.shape
+    points = verts_cam.detach().float().contiguous()
+    front = points.new_zeros(items, views.height, views.width)
+    leave = torch.zeros_like(front)
+    if front.numel() * n_verts * len(faces) > 0:
+        K = views.K.to(points)
+        window = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]], -1).contiguous()
+        screen = wp.from_torch(torch.empty_like(points), dtype=wp.vec3)
+        table = wp.from_torch(faces.to(points.device).long().contiguous(), dtype=wp.vec3l)
+        maps = [wp.from_torch(front), wp.from_torch(leave)]
+        device = str(wp.device_from_torch(points.device))
+        exits = kernels("exits", device)
+
+        def launch(kernel: Any, dim: tuple[int, int], *inputs: Any) -> None:  # noqa: ANN401
+            wp.launch(kernel, dim, inputs, device=device)
+
+        verts = wp.from_torch(points, dtype=wp.vec3)
+        windows = wp.from_torch(window, dtype=wp.vec4)
+        launch(exits.project, (items, n_verts), verts, windows, screen)
+        launch(exits.draw, (items, len(faces)), screen, table, *maps)
+        for values, nothing in zip(maps, (torch.inf, -torch.inf), strict=True):
+            launch(exits.depth, (items, views.height), values, nothing)
+    else:
+        front, leave = front + torch.inf, leave - torch.inf
+    return Layers(front.to(verts_cam), leave.to(verts_cam))

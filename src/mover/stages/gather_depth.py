@@ -1,0 +1,109 @@
+"""Depth bounds of all frames: bodies are drawn in threads, and one set of maps is kept."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextvars import copy_context
+from dataclasses import dataclass, replace
+from threading import Lock
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from ..geometry.camera import to_camera
+from ..geometry.raster import layers
+from ..terms.depth import DepthMaps, Seen, bounds_of, merge
+from ..types import Bodies, Camera
+from .person_masks import MaskTable
+from .small import small_masks, small_views
+
+NEAREST = 0.3  # [m], bodies are taken to be at least that far when pixels become metres
+BLOCK = 4  # bodies that a thread draws at once
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The people, the objects and where they are seen from."""
+
+    bodies: Bodies
+    table: MaskTable
+    masks: Bool[Tensor, "objects h w"]
+    """Of the objects, in the image 640 wide."""
+    camera: Camera
+    erode: int
+    """Pixels by which masks and silhouettes shrink."""
+    vote: bool
+    """See `terms.depth.bounds_of`."""
+    reach: float = 0.0
+    """How far the outline of a body may be wrong [m]."""
+
+
+def gather_depth(
+    sight: Sight, workers: int, observe: Callable[[int, int], None] | None = None
+) -> DepthMaps:
+    """The narrowest bounds of all frames; they do not depend on the number of workers.
+
+    Memory is that of a few frames for each worker, however many frames there are. Bodies whose
+    track has no mask say nothing.
+
+    Args:
+        sight: What is seen.
+        workers: Threads that draw.
+        observe: Called with (bodies done, bodies) after each block.
+    """
+    views = small_views(sight.camera)
+    blank, lock = torch.full((views.height, views.width), float("inf")), Lock()
+    maps = DepthMaps(-blank, blank, -blank)
+    rows = [row for row in range(len(sight.bodies.frame)) if sight.table.own[row] is not None]
+
+    def add(block: list[int]) -> int:
+        for window, found in _bounds(sight, block):
+            with lock:  # the least and the greatest do not depend on the order
+                kept = merge(_cut(maps, window), found)
+                maps.near[window], maps.far[window], maps.free[window] = (
+                    kept.near, kept.far, kept.free,
+                )  # fmt: skip
+        return len(block)
+
+    done = 0
+    with ThreadPoolExecutor(max(workers, 1)) as pool:
+        blocks = [rows[first : first + BLOCK] for first in range(0, len(rows), BLOCK)]
+        for job in as_completed([pool.submit(copy_context().run, add, block) for block in blocks]):
+            done += job.result()
+            if observe is not None:
+                observe(done, len(rows))
+    return maps
+
+
+Window = tuple[slice, slice]
+
+
+def _cut(maps: DepthMaps, window: Window) -> DepthMaps:
+    return DepthMaps(maps.near[window], maps.far[window], maps.free[window])
+
+
+def _bounds(sight: Sight, block: list[int]) -> Iterator[tuple[Window, DepthMaps]]:
+    """Where each of some bodies is seen, and its bounds there."""
+    views = small_views(sight.camera)
+    verts = to_camera(sight.bodies.verts[torch.tensor(block)], sight.camera.R_cam_world)
+    many = replace(views, K=views.K.expand(len(block), 3, 3))
+    drawn = layers(verts, sight.bodies.faces, many)
+    for k, row in enumerate(block):
+        window = _window(drawn.front[k].isfinite(), sight.erode)
+        visible, others = (
+            small_masks(mask[None], sight.camera)[0][window] for mask in sight.table.decode(row)
+        )
+        reach = sight.reach * float(views.K[0, 0, 0] / verts[k, :, 2].median().clamp_min(NEAREST))
+        seen = Seen(drawn.front[k][window], drawn.exit[k][window], visible, others, reach)
+        objects = sight.masks[:, *window]
+        yield window, bounds_of(seen, objects, sight.erode, vote=sight.vote)
+
+
+def _window(body: Bool[Tensor, "h w"], border: int) -> Window:
+    """Rows and columns of a silhouette and a border, so that its masks shrink as in the image."""
+    sides: list[slice] = []
+    for axis, size in zip((1, 0), body.shape, strict=True):
+        index = torch.nonzero(body.any(axis))[:, 0]
+        first, last = (int(index[0]), int(index[-1])) if len(index) else (0, -1)
+        sides.append(slice(max(first - border, 0), min(last + border + 1, size)))
+    return sides[0], sides[1]

@@ -1,0 +1,103 @@
+"""Start a viewer on this machine's own address."""
+
+import contextlib
+import io
+import math
+from dataclasses import dataclass
+
+import torch
+
+from ..geometry.boxes import box_of
+from ..records import InputError
+from ..types import Scene
+from .drawing import Drawing
+from .grips import Grips
+from .panel_object import add_object_panel
+from .panel_room import add_room_panel
+from .panel_solve import Gauges, SolveJob, add_solve_panel
+from .people import People
+from .session import Session
+from .window import Window, redraw, redraw_result
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the viewer listens."""
+
+    host: str = "127.0.0.1"
+    """This machine only; 0.0.0.0 lets the whole network in."""
+    port: int = 8080
+    """The next free one is taken where it is in use."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A running viewer."""
+
+    window: Window
+    gauges: Gauges
+    url: str
+
+    def close(self) -> None:
+        """Stop the run, if there is one, and the server."""
+        if self.window.watch is not None:
+            self.window.watch.stop = True
+        self.window.server.stop()
+
+
+def open_viewer(
+    session: Session, address: Address, job: SolveJob | None = None, why_not: str = ""
+) -> Opened:
+    """Start the server and draw the room.
+
+    Raises:
+        InputError: If viser is not installed.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError("mover view needs viser: pip install 'mover[viewer]'") from error
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(
+            host=address.host, port=address.port, label=session.shown.title, verbose=False
+        )
+    server.gui.configure_theme(
+        show_logo=False, show_share_button=False, control_width="large", control_layout="fixed"
+    )
+    server.scene.set_up_direction("+y")
+    window = _window_of(server, session)
+    _aim(window, session.shown.result)
+    redraw(window)
+    redraw_result(window)
+    tabs = server.gui.add_tab_group()
+    with tabs.add_tab("Room"):
+        add_room_panel(window)
+    with tabs.add_tab("Object"):
+        add_object_panel(window)
+    with tabs.add_tab("Solve"):
+        gauges = add_solve_panel(window, job, why_not)
+    return Opened(window, gauges, f"http://{server.get_host()}:{server.get_port()}")
+
+
+def _window_of(server: object, session: Session) -> Window:
+    drawing = Drawing(server)
+    window = Window(server, session, drawing, People(server), Grips(session, drawing))
+
+    def changed() -> None:
+        if not window.watching:
+            redraw(window)
+
+    session.on_room.append(changed)
+    session.on_select.append(changed)
+    return window
+
+
+def _aim(window: Window, scene: Scene) -> None:
+    """Begin behind and above the video's camera, looking at the furniture."""
+    centers = [box_of(piece).center for piece in scene.pieces] or [torch.tensor([0.0, -1.0, -3.0])]
+    middle = torch.stack(centers).mean(0).tolist()
+    start = window.server.initial_camera
+    start.up = (0.0, 1.0, 0.0)
+    start.position = (middle[0] + 1.0, 2.2, 1.8)
+    start.look_at = (middle[0], middle[1], middle[2])
+    start.fov = math.radians(55)

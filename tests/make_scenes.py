@@ -1,0 +1,536 @@
+"""Writes rooms in the layouts of other tools, from their pages alone: nothing of mover is used.
+
+A room is plain: `Room(K, R, size, ground, things)`, the world has +y up and the camera at the
+origin, x_cam = R @ x_world (x right, y down, z forward).
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+from scipy.io import savemat
+from scipy.spatial.transform import Rotation
+
+NYU40 = {
+    "bed": 4, "chair": 5, "sofa": 6, "table": 7, "desk": 14, "shelves": 15, "cabinet": 3,
+    "night_stand": 32, "lamp": 35, "bookshelf": 10, "otherfurniture": 39,
+}  # fmt: skip
+FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass
+class Thing:
+    """x_world = R_y(yaw) @ (scale * verts) + t."""
+
+    name: str
+    category: str
+    verts: np.ndarray
+    faces: np.ndarray
+    t: np.ndarray
+    yaw: float
+    scale: np.ndarray
+
+    @property
+    def world(self) -> np.ndarray:
+        return (self.verts * self.scale) @ about_y(self.yaw).T + self.t
+
+
+@dataclass
+class Room:
+    K: np.ndarray
+    R: np.ndarray
+    size: tuple[int, int]
+    ground: float
+    things: list[Thing]
+
+    def box2d(self, thing: Thing) -> list[float]:
+        seen = thing.world @ self.R.T @ self.K.T
+        pixels = seen[:, :2] / seen[:, 2:]
+        low, high = pixels.min(0), pixels.max(0)
+        return [*np.clip(low, 0, self.size).tolist(), *np.clip(high, 0, self.size).tolist()]
+
+
+def about_y(a: float) -> np.ndarray:
+    return np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+
+
+def picture(size: tuple[int, int]) -> Image.Image:
+    """A picture whose left half is darker."""
+    pixels = np.zeros((size[1], size[0], 3), dtype=np.uint8)
+    pixels[:, size[0] // 2 :, 0] = 200
+    pixels[: size[1] // 2, :, 1] = 90
+    return Image.fromarray(pixels)
+
+
+def write_obj(path: Path, verts: np.ndarray, faces: np.ndarray) -> None:
+    lines = ["v " + " ".join(repr(float(x)) for x in v) for v in verts]
+    lines += ["f " + " ".join(str(int(i) + 1) for i in f) for f in faces]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n")
+
+
+def mesh(verts: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(verts, faces, process=False)
+
+
+# --- Total3D: world x forward, y up, z right; boxes with half sizes; camera to world in cam_R ---
+OURS_TO_T3D = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
+T = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])  # its camera axes -> right, down, forward
+
+
+def write_total3d(folder: Path, room: Room, *, flat: bool = False, kind: str = "obj") -> Path:
+    """Everything in one folder if `flat`, as in MOVER's Total3D_input."""
+    source = folder if flat else folder / "input"
+    result = folder if flat else folder / "output"
+    source.mkdir(parents=True, exist_ok=True)
+    result.mkdir(parents=True, exist_ok=True)
+    picture(room.size).save(source / "img.jpg")
+    np.savetxt(source / "cam_K.txt", room.K)
+    rows = [{"bbox": room.box2d(t), "class": t.category} for t in room.things]
+    (source / "detections.json").write_text(json.dumps(rows))
+    # p_world = cam_R @ p_cam (forward, up, right); p_image = T p_cam; p_image = R p_ours.
+    savemat(result / "r_ex.mat", {"cam_R": OURS_TO_T3D @ room.R.T @ T})
+    y = room.ground
+    signs = [[-1, 1, -1], [-1, 1, 1], [1, 1, 1], [1, 1, -1]]
+    corners = [[3 * a, 2.5, 3 * c] for a, _, c in signs] + [[3 * a, y, 3 * c] for a, _, c in signs]
+    savemat(result / "layout.mat", {"layout": np.array(corners, dtype="f4")})
+    cells = np.empty((1, len(room.things)), dtype=object)
+    for i, t in enumerate(room.things):
+        low, high = t.verts.min(0), t.verts.max(0)
+        centre = about_y(t.yaw) @ (t.scale * (low + high) / 2) + t.t
+        # Rows of basis: the box's own x, y, z (front) in Total3D's world.
+        basis = (OURS_TO_T3D @ about_y(t.yaw)).T
+        cells[0, i] = {
+            "basis": basis.astype("f4"),
+            "coeffs": (t.scale * (high - low) / 2)[None].astype("f4"),
+            "centroid": (OURS_TO_T3D @ centre)[None].astype("f4"),
+            "classid": np.array([[NYU40[t.category]]]),
+        }
+        unit = (t.verts - (low + high) / 2) / ((high - low) / 2)
+        path = result / f"{i}_{NYU40[t.category]}.{kind}"
+        if kind == "obj":
+            write_obj(path, unit, t.faces)
+        else:
+            mesh(unit, t.faces).export(path)
+    ids = np.array([[NYU40[t.category] for t in room.things]])
+    savemat(result / "bdb_3d.mat", {"bdb": cells, "class_id": ids})
+    return folder
+
+
+# --- SAM 3D Objects: z-up local frame stored y-up; rows times R(q); PyTorch3D camera ---
+def write_sam3d(folder: Path, room: Room, *, kind: str = "npz", placed: bool = False) -> Path:
+    """A mesh and a pose for each thing; the tool's scale is the same along all axes."""
+    folder.mkdir(parents=True)
+    to_p3d = np.diag([-1.0, -1.0, 1.0])
+    for i, t in enumerate(room.things):
+        verts = t.verts * t.scale
+        if placed:
+            camera = t.world @ room.R.T
+            mesh(camera @ FLIP, t.faces).export(folder / f"{i}.glb")
+            continue
+        size = float(np.ptp(verts, axis=0).max())
+        stored = verts / size
+        mesh(stored, t.faces).export(folder / f"{i}.glb")
+        # local = (x, -z, y) of the stored ones; p3d = (local * s) @ M + t
+        A = to_p3d @ room.R @ about_y(t.yaw)  # p3d from y-up
+        local_to_yup = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+        M = (A @ local_to_yup).T
+        x, y, z, w = Rotation.from_matrix(M).as_quat()
+        pose: dict[str, Any] = {
+            "rotation": np.array([[w, x, y, z]]),
+            "translation": (to_p3d @ room.R @ t.t)[None],
+            "scale": np.full((1, 3), size),
+        }
+        if kind == "npz":
+            np.savez(folder / f"{i}.npz", **pose, category=np.array(t.category))
+        else:
+            row = {k: v.tolist() for k, v in pose.items()} | {"category": t.category}
+            (folder / f"{i}.json").write_text(json.dumps(row))
+    return folder
+
+
+# --- Gen3DSR: vertices in a world of c2w; its camera is x right, y down, z forward ---
+def write_gen3dsr(folder: Path, room: Room, c2w: np.ndarray | None = None) -> Path:
+    home = folder / "reconstruction"
+    home.mkdir(parents=True)
+    c2w = np.eye(4) if c2w is None else c2w
+    for i, t in enumerate(room.things):
+        points = t.world @ room.R.T @ c2w[:3, :3].T + c2w[:3, 3]
+        mesh(points, t.faces).export(home / f"{i}_{t.category.replace(' ', '_')}.glb")
+    mesh(np.eye(3), np.array([[0, 1, 2]])).export(home / "background.ply")
+    mesh(np.eye(3), np.array([[0, 1, 2]])).export(home / "full_scene.glb")
+    K = room.K.copy()
+    K[:2, 2] -= 0.5  # pixels counted from the centre of the first
+    tree = {"K": K.tolist(), "c2w": c2w.tolist(), "W": room.size[0], "H": room.size[1]}
+    (folder / "cam_params.json").write_text(json.dumps(tree))
+    picture(room.size).save(folder / "input.png")
+    return folder
+
+
+# --- glTF: nodes with translation, rotation, scale; a camera node that looks along -z ---
+def write_glb(path: Path, room: Room, world: np.ndarray | None = None, camera: bool = True) -> Path:
+    """`world` is a transform of everything (4, 4), camera included."""
+    world = np.eye(4) if world is None else world
+    scene = trimesh.Scene()
+    for t in room.things:
+        matrix = np.eye(4)
+        matrix[:3, :3] = about_y(t.yaw) @ np.diag(t.scale)
+        matrix[:3, 3] = t.t
+        scene.add_geometry(mesh(t.verts, t.faces), node_name=t.name, transform=world @ matrix)
+    content = scene.export(file_type="glb")
+    if camera:
+        pose = np.eye(4)
+        pose[:3, :3] = room.R.T @ FLIP
+        content = with_camera(content, world @ pose, room)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    return path
+
+
+def with_camera(content: bytes, pose: np.ndarray, room: Room) -> bytes:
+    """A camera node in the JSON chunk of a .glb."""
+    size = int.from_bytes(content[12:16], "little")
+    tree = json.loads(content[20 : 20 + size])
+    fy, fx, (w, h) = room.K[1, 1], room.K[0, 0], room.size
+    lens = {"yfov": 2 * np.arctan(h / 2 / fy), "aspectRatio": (w / fx) / (h / fy), "znear": 0.1}
+    tree["cameras"] = [{"type": "perspective", "perspective": lens}]
+    tree["nodes"].append({"name": "camera", "camera": 0, "matrix": pose.T.ravel().tolist()})
+    tree["scenes"][tree.get("scene", 0)]["nodes"].append(len(tree["nodes"]) - 1)
+    chunk = json.dumps(tree).encode()
+    chunk += b" " * (-len(chunk) % 4)
+    body = content[20 + size :]
+    head = len(chunk).to_bytes(4, "little") + b"JSON"
+    total = (12 + 8 + len(chunk) + len(body)).to_bytes(4, "little")
+    return content[:8] + total + head + chunk + body
+
+
+# --- boxes ---
+def write_boxes(path: Path, room: Room, *, frame: str = "y") -> Path:
+    """Boxes in a world with y up, -y up or z up, or in the camera's axes."""
+    worlds = {
+        "y": np.eye(3), "-y": FLIP, "z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+        "camera": room.R,
+    }  # fmt: skip
+    turn = worlds[frame]
+    rows = []
+    for t in room.things:
+        low, high = t.verts.min(0), t.verts.max(0)
+        centre = about_y(t.yaw) @ (t.scale * (low + high) / 2) + t.t
+        rows.append({
+            "id": t.name, "category": t.category, "center": (turn @ centre).tolist(),
+            "size": (t.scale * (high - low)).tolist(), "box2d": room.box2d(t), "score": 0.9,
+            "rotation": (turn @ about_y(t.yaw)).tolist(),
+        })  # fmt: skip
+    w, h = room.size
+    camera = {"w": w, "h": h, "fl_x": room.K[0, 0], "fl_y": room.K[1, 1], "cx": room.K[0, 2],
+              "cy": room.K[1, 2], "R_cam_world": room.R.tolist()}  # fmt: skip
+    tree = {"camera": camera, "ground": room.ground, "objects": rows}
+    tree |= {"frame": "camera"} if frame == "camera" else {"frame": "world", "up": frame}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(tree))
+    return path
+
+
+# --- the authors' release ---
+def write_release(folder: Path, room: Room, bodies: np.ndarray, faces: np.ndarray) -> Path:
+    """Bodies (frames, verts, 3) are in the camera's frame."""
+    write_total3d(folder / "Total3D_label_occNet_results" / "Total3D_input", room, flat=True)
+    st2 = folder / "smplifyx_results_st2_newCamera_gpConstraints_posaVersion"
+    R_down = room.R @ FLIP  # from their world, y down
+    for i, verts in enumerate(bodies):
+        write_obj(st2 / "meshes" / f"{i + 1:06d}.obj", verts @ R_down, faces)
+    write_xml(st2 / "smplifyx_cam" / "001.xml", room.K - HALF, R_down)
+    posa = folder / "smplifyx_results_st0" / "results" / "posa_contact_npy_newBottom"
+    posa.mkdir(parents=True)
+    for i in range(len(bodies)):
+        np.save(
+            posa / f"{i:06d}_sample_00.npy", np.full((bodies.shape[1], 1), 0.25 * (i % 4), "f4")
+        )
+    frames = folder / "Color_flip_rename"
+    frames.mkdir()
+    w, h = room.size
+    for i in range(len(bodies)):
+        picture(room.size).save(frames / f"{i + 1:06d}.jpg")
+        home = folder / "Color_flip_rename_pointrend_X_101_det_all" / f"{i + 1:06d}"
+        home.mkdir(parents=True)
+        mask = np.zeros((h, w), dtype=bool)
+        mask[5:20, 10 + i : 20 + i] = True
+        row = {"class": "person", "bbox": [10 + i, 5, 20 + i, 20, 0.9], "mask": mask.tolist()}
+        (home / "detections.json").write_text(json.dumps([row]))
+    out = folder / "refine_results" / "scene_reconstruction_s3kind1" / "obj_-1" / "model_end"
+    for i, t in enumerate(room.things):
+        write_obj(out / f"f{i:03d}_world.obj", t.world @ FLIP, t.faces)
+    write_truth(folder / "prox_scans_pre", room)
+    return folder
+
+
+HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+
+
+def write_xml(path: Path, K: np.ndarray, R: np.ndarray) -> None:
+    def node(name: str, value: np.ndarray) -> str:
+        body = " ".join(repr(float(v)) for v in value.ravel())
+        rows, cols = value.shape
+        return (f'<{name} type_id="opencv-matrix"><rows>{rows}</rows><cols>{cols}</cols>'
+                f"<dt>d</dt><data>{body}</data></{name}>")  # fmt: skip
+
+    path.parent.mkdir(parents=True)
+    parts = [node("CameraMatrix", np.concatenate([R, np.zeros((3, 1))], 1)),
+             node("Intrinsics", K), node("Distortion", np.zeros((8, 1)))]  # fmt: skip
+    path.write_text('<?xml version="1.0"?><opencv_storage>' + "".join(parts) + "</opencv_storage>")
+
+
+def write_truth(folder: Path, room: Room, *, columns: bool = False) -> None:
+    """bbox3d.json and the scan, both in the camera's axes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tree = {}
+    for t in room.things:
+        low, high = t.verts.min(0), t.verts.max(0)
+        centre = about_y(t.yaw) @ (t.scale * (low + high) / 2) + t.t
+        axes = (room.R @ about_y(t.yaw)).T  # rows
+        tree[t.name] = {
+            "centroid": (room.R @ centre).tolist(),
+            "coeffs": (t.scale * (high - low) / 2).tolist(),
+            "basis": (axes.T if columns else axes).tolist(),
+        }
+    (folder / "bbox3d.json").write_text(json.dumps(tree))
+    scan(room).apply_transform(_four(room.R)).export(folder / "scan_cam_cooridnates.ply")
+
+
+def scan(room: Room) -> trimesh.Trimesh:
+    """Everything and a floor, in our world."""
+    grid = np.stack(np.meshgrid(np.arange(-4, 4, 0.2), np.arange(-8, 0, 0.2)), -1).reshape(-1, 2)
+    n = 40
+    cells = [
+        (i * n + j, i * n + j + 1, (i + 1) * n + j) for i in range(n - 1) for j in range(n - 1)
+    ]
+    floor = np.stack([grid[:, 0], np.full(len(grid), room.ground), grid[:, 1]], 1)
+    parts = [mesh(t.world, t.faces) for t in room.things] + [mesh(floor, np.array(cells))]
+    return trimesh.util.concatenate(parts)
+
+
+def _four(R: np.ndarray) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3] = R
+    return out
+
+
+# --- PROX ---
+Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # our world -> the scan's, z up
+
+
+def write_prox(root: Path, room: Room, recording: str, frames: int, shift: np.ndarray) -> Path:
+    """The camera stands at `shift` in the scan's frame; pictures are stored mirrored."""
+    place = recording.split("_")[0]
+    for name in ("calibration", "cam2world", "scenes", "sdf"):
+        (root / name).mkdir(parents=True, exist_ok=True)
+    lens = {"camera_mtx": (room.K - HALF).tolist(), "k": [0.1, 0.0, 0.0, 0.0, 0.0]}
+    (root / "calibration" / "Color.json").write_text(json.dumps(lens))
+    cam2world = _four(Z_UP @ room.R.T)
+    cam2world[:3, 3] = shift
+    (root / "cam2world" / f"{place}.json").write_text(json.dumps(cam2world.tolist()))
+    matrix = _four(Z_UP)
+    matrix[:3, 3] = shift
+    scan(room).apply_transform(matrix).export(root / "scenes" / f"{place}.ply")
+    color = root / "recordings" / recording / "Color"
+    keypoints = root / "keypoints" / recording
+    color.mkdir(parents=True)
+    keypoints.mkdir(parents=True)
+    for i in range(frames):
+        stem = f"s001_frame_{i + 1:05d}__00.00.{i // 30:02d}.{i % 30:03d}"
+        picture(room.size).transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(color / f"{stem}.jpg")
+        joints = np.zeros((25, 3))
+        joints[4] = [100 + i, 200, 0.9]  # right wrist of the mirrored picture
+        row = {"person_id": [-1], "pose_keypoints_2d": joints.ravel().tolist(),
+               "face_keypoints_2d": [0.0] * 210, "hand_left_keypoints_2d": [1.0] * 63,
+               "hand_right_keypoints_2d": [0.0] * 63}  # fmt: skip
+        tree = {"version": 1.2, "people": [row]}
+        (keypoints / f"{stem}_keypoints.json").write_text(json.dumps(tree))
+    write_truth(root / "boxes", room)
+    return root
+
+
+def write_sdf(root: Path, place: str, dim: int = 16) -> None:
+    """A ball of 0.5 m about (1, 2, 3), in a cube of 4 m."""
+    low = np.array([-1.0, 0.0, 1.0])
+    cell = 4.0 / dim
+    axes = [low[i] + (np.arange(dim) + 0.5) * cell for i in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    values = np.linalg.norm(points - [1, 2, 3], axis=-1) - 0.5
+    (root / "sdf").mkdir(parents=True, exist_ok=True)
+    np.save(root / "sdf" / f"{place}_sdf.npy", values.ravel())
+    tree = {"min": low.tolist(), "max": (low + 4).tolist(), "dim": dim}
+    (root / "sdf" / f"{place}.json").write_text(json.dumps(tree))
+
+
+# --- PiGraphs ---
+def write_pigraphs(root: Path, room: Room, name: str, joints: np.ndarray, *, mirror: bool) -> Path:
+    """Joints (frames, 25, 3) in the camera's axes; Kinect's x is left, or right if `mirror`."""
+    root.mkdir(parents=True, exist_ok=True)
+    place = name.split("_")[0]
+    kinect = np.diag([1.0, -1, 1]) if mirror else np.diag([-1.0, -1, 1])  # from x right, y down
+    scan_cam = _four(Z_UP @ room.R.T @ kinect)
+    scan_cam[:3, 3] = [1.0, 2.0, 1.5]
+    rows = [
+        {"trackingId": 72057594037928000 + 1, "timestamp": 1000 + 200 * i,
+         "jointPositions": (pose @ kinect).tolist()}
+        for i, pose in enumerate(joints)
+    ]  # fmt: skip
+    times = [1000 + 200 * i for i in range(len(joints))]
+    tree = {"id": name, "camera": scan_cam.ravel().tolist(), "depthTimestamps": times,
+            "skeletons": rows}  # fmt: skip
+    (root / f"{name}.json").write_text(json.dumps(tree))
+    groups = []
+    for i, t in enumerate(room.things):
+        low, high = t.verts.min(0), t.verts.max(0)
+        centre = about_y(t.yaw) @ (t.scale * (low + high) / 2) + t.t
+        size = t.scale * (high - low)
+        axes = (Z_UP @ about_y(t.yaw)).T
+        # Two parts: the lower and the upper half.
+        for part, sign in (("base", -1), ("top", 1)):
+            middle = centre + np.array([0, sign * size[1] / 4, 0])
+            lengths = size * [1, 0.5, 1]
+            groups.append({
+                "id": len(groups), "label": f"{t.category}:{part}", "objectId": i,
+                "dominantNormal": [0, 0, 1], "segments": [],
+                "obb": {"centroid": (Z_UP @ middle + [1.0, 2.0, 1.5]).tolist(),
+                        "axesLengths": lengths.tolist(),
+                        "normalizedAxes": axes.ravel().tolist()},
+            })  # fmt: skip
+    wall = {"centroid": [0, 0, 0], "axesLengths": [1, 1, 1], "normalizedAxes": [1, 0, 0, 0, 1, 0,
+            0, 0, 1]}  # fmt: skip
+    groups.append({"id": 999, "label": "wall", "objectId": 999, "obb": wall, "segments": []})
+    (root / f"{place}d.segs.json").write_text(json.dumps({"segGroups": groups}))
+    matrix = _four(Z_UP)
+    matrix[:3, 3] = [1.0, 2.0, 1.5]
+    scan(room).apply_transform(matrix).export(root / f"{place}.ply")
+    return root
+
+
+# --- masks ---
+def runs_of(mask: np.ndarray) -> list[int]:
+    """Run lengths down the columns, background first."""
+    flat = np.concatenate([[0], mask.T.ravel().astype(int), [0]])
+    edges = np.flatnonzero(np.diff(flat))
+    ends = np.concatenate([[0], edges, [mask.size]]) if len(edges) else np.array([0, mask.size])
+    counts = np.diff(ends).tolist()
+    return counts[:-1] if counts and counts[-1] == 0 and len(counts) > 1 else counts
+
+
+def compressed(counts: list[int]) -> str:
+    """COCO's code of run lengths: five bits a character, differences to the run two before."""
+    code = ""
+    for i, count in enumerate(counts):
+        x = count - (counts[i - 2] if i > 2 else 0)
+        more = True
+        while more:
+            bits = x & 31
+            x >>= 5
+            more = x != (-1 if bits & 16 else 0)
+            code += chr(bits + (32 if more else 0) + 48)
+    return code
+
+
+def write_masks(folder: Path, masks: np.ndarray, names: list[str]) -> dict[str, Path]:
+    """The same masks (n, h, w), which do not overlap, in every layout."""
+    folder.mkdir(parents=True)
+    n, h, w = masks.shape
+    out: dict[str, Path] = {}
+    ids = {name: i + 1 for i, name in enumerate(dict.fromkeys(names))}
+    boxes = [[int(v) for v in (*np.argwhere(m).min(0)[::-1], *(np.argwhere(m).max(0)[::-1] + 1))]
+             for m in masks]  # fmt: skip
+    base: dict[str, Any] = {
+        "images": [{"id": 7, "width": w, "height": h, "file_name": "a.jpg"}],
+        "categories": [{"id": i, "name": name} for name, i in ids.items()],
+    }
+
+    def save(key: str, name: str, tree: Any) -> None:
+        out[key] = folder / name
+        out[key].write_text(json.dumps(tree))
+
+    codes = {
+        "coco_list": lambda m: {"size": [h, w], "counts": runs_of(m)},
+        "coco_text": lambda m: {"size": [h, w], "counts": compressed(runs_of(m))},
+    }
+    for key, code in codes.items():
+        rows = [
+            {"id": i, "image_id": 7, "category_id": ids[names[i]], "segmentation": code(m),
+             "bbox": [b[0], b[1], b[2] - b[0], b[3] - b[1]]}
+            for i, (m, b) in enumerate(zip(masks, boxes, strict=True))
+        ]  # fmt: skip
+        save(key, f"{key}.json", {**base, "annotations": rows})
+    coco = {"chair": 62, "couch": 63, "bed": 65, "dining table": 67, "person": 1}
+    order = {"chair": 56, "couch": 57, "bed": 59, "dining table": 60, "person": 0}
+    for key, table in (("results", coco), ("detectron2", order)):
+        save(key, f"{key}.json", [
+            {"image_id": 3, "category_id": table[names[i]], "score": 0.5, "bbox": [0, 0, 1, 1],
+             "segmentation": {"size": [h, w], "counts": compressed(runs_of(m))}}
+            for i, m in enumerate(masks)
+        ])  # fmt: skip
+    save("mover", "mover.json", [
+        {"class": names[i], "bbox": [*b, 0.9], "mask": m.tolist()}
+        for i, (m, b) in enumerate(zip(masks, boxes, strict=True))
+    ])  # fmt: skip
+    save("sam3", "sam3.json", {
+        "orig_img_h": h, "orig_img_w": w, "pred_scores": [0.5] * n,
+        "pred_boxes": [[0, 0, 1, 1]] * n,
+        "pred_masks": [compressed(runs_of(m)) for m in masks],
+    })  # fmt: skip
+    save("sav", "sav.json", {
+        "video_width": float(w), "video_height": float(h), "masklet_id": list(range(n)),
+        "masklet": [[{"size": [h, w], "counts": compressed(runs_of(m))} for m in masks]],
+    })  # fmt: skip
+    out["npz"] = folder / "masks.npz"
+    np.savez(out["npz"], masks=masks, scores=np.full(n, 0.5), labels=np.array(names))
+    out["npz_logits"] = folder / "logits.npz"
+    np.savez(out["npz_logits"], masks=np.where(masks, 3.0, -3.0)[:, None].astype("f4"))
+    out["labels"] = folder / "labels"
+    out["labels"].mkdir()
+    numbers = (masks * np.arange(1, n + 1)[:, None, None]).sum(0).astype(np.uint8)
+    Image.fromarray(numbers).save(out["labels"] / "map.png")
+    (out["labels"] / "labels.json").write_text(
+        json.dumps({str(i + 1): name for i, name in enumerate(names)})
+    )
+    out["files"] = folder / "files"
+    out["files"].mkdir()
+    out["alpha"] = folder / "alpha"
+    out["alpha"].mkdir()
+    for i, m in enumerate(masks):
+        Image.fromarray((m * 255).astype(np.uint8)).save(out["files"] / f"{names[i]}_{i}.png")
+        rgba = np.zeros((h, w, 4), dtype=np.uint8)
+        rgba[..., :3], rgba[..., 3] = 77, m * 255
+        Image.fromarray(rgba).save(out["alpha"] / f"{i}.png")
+    picture((w, h)).save(out["alpha"] / "image.png")
+    return out
+
+
+class Bomb:
+    """A pickle of this writes a file when it is loaded."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return exec, (f"open({str(self.path)!r}, 'w').write('run')",)
+
+
+def write_bomb(path: Path, mark: Path) -> Path:
+    """An .npz with a pickled object that would write `mark`."""
+    np.savez(path, masks=np.array([Bomb(mark)], dtype=object))
+    return path
+
+
+def write_zip_bomb(path: Path) -> Path:
+    """An .npz whose header promises 10^12 numbers."""
+    import zipfile
+
+    head = str({"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)}).encode()
+    head += b" " * (-(len(head) + 11) % 64) + b"\n"
+    body = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("masks.npy", body + b"\0" * 10**6)
+    return path

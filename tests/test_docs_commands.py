@@ -1,0 +1,137 @@
+"""Every `mover` command in the README and the docs is one that the program understands."""
+
+import contextlib
+import io
+import json
+import re
+import shlex
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+
+from mover import commands, results
+from mover.cli import COMMANDS
+from mover.presets import PRESETS
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.S | re.M)
+INLINE = re.compile(r"`(mover [^`\n]*(?:\n[^`\n]+)?)`")
+
+
+class ParsedError(Exception):
+    """The arguments were understood."""
+
+
+def blocks(page: Path) -> list[str]:
+    """Lines of code that call the program, without remarks."""
+    found = []
+    for language, code in FENCE.findall(page.read_text()):
+        if language in ("", "bash", "sh", "console"):
+            whole = code.replace("\\\n", " ")
+            lines = [line.strip().removeprefix("$ ") for line in whole.splitlines()]
+            found += [line for line in lines if line.startswith("mover ")]
+    return found
+
+
+def words_of(line: str) -> list[str]:
+    """The words after `mover`, up to a remark."""
+    return shlex.split(line, comments=True)[1:]
+
+
+LINES = [
+    pytest.param(line, id=f"{page.stem}: {line.split('  ')[0]}")
+    for page in PAGES
+    for line in dict.fromkeys(blocks(page))
+]
+MENTIONS = [
+    pytest.param(text, id=f"{page.stem}: {text}")
+    for page in PAGES
+    for text in dict.fromkeys(
+        " ".join(found.split()) for found in INLINE.findall(FENCE.sub("", page.read_text()))
+    )
+]
+
+
+@pytest.fixture
+def _only_parse(monkeypatch: pytest.MonkeyPatch):
+    """Commands stop as soon as their arguments are read; run.json need not exist."""
+    real = tyro.cli
+
+    def parse(*args: Any, **options: Any) -> Any:
+        real(*args, **options)
+        raise ParsedError
+
+    monkeypatch.setattr(tyro, "cli", parse)
+    monkeypatch.setattr(results, "read_config", lambda _path: PRESETS["robust"])
+
+
+def parse(name: str, words: list[str]) -> None:
+    with pytest.raises(ParsedError):
+        commands._COMMANDS[name](words)
+
+
+@pytest.mark.usefixtures("_only_parse")
+@pytest.mark.parametrize("line", [p for p in LINES if words_of(p.values[0])[0] != "batch"])
+def test_a_command_in_a_block_is_understood(line: str):
+    name, *words = words_of(line)
+    assert name in COMMANDS
+    parse(name, words)
+
+
+ELSEWHERE = """
+import json, sys, tyro
+from mover import commands_share, results
+from mover.presets import PRESETS
+results.read_config = lambda path: PRESETS["robust"]
+for words in json.loads(sys.argv[1]):
+    commands_share._parse_batch(words)
+"""
+
+
+def test_batches_in_blocks_are_understood():
+    """In a process of its own: tyro marks what is missing by a value that no type check lets by."""
+    wanted = [words_of(p.values[0])[1:] for p in LINES if words_of(p.values[0])[0] == "batch"]
+    assert wanted
+    run = [sys.executable, "-c", ELSEWHERE, json.dumps(wanted)]
+    done = subprocess.run(run, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+@cache
+def help_of(name: str) -> str:
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), pytest.raises(SystemExit):
+        commands._COMMANDS[name](["--help"])
+    return text.getvalue()
+
+
+@pytest.mark.parametrize("text", MENTIONS)
+def test_a_command_in_a_sentence_has_these_options(text: str):
+    name, *words = text.split()[1:]
+    if name.startswith("-"):
+        assert name in ("--help", "--version")
+        return
+    assert name.rstrip(",.") in COMMANDS
+    options = [word.split("=")[0] for word in words if word.startswith("--")]
+    for option in options:
+        assert option in help_of(name).replace("_", "-").split() or option == "--help", option
+
+
+def test_there_are_commands_to_check():
+    assert {words_of(line.values[0])[0] for line in LINES} >= {"check", "run", "export", "render"}
+
+
+@pytest.mark.usefixtures("_only_parse")
+@pytest.mark.parametrize(
+    "line", ["mover render OUT --too x.png", "mover run --out OUT", "mover export OUT --to fbx"]
+)
+def test_a_wrong_command_would_be_found(line: str):
+    name, *words = words_of(line)
+    with pytest.raises(SystemExit), contextlib.redirect_stderr(io.StringIO()):
+        commands._COMMANDS[name](words)

@@ -1,0 +1,241 @@
+"""Gathering with Warp kernels: the same as without them, whoever does what."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from test_volume import moving_spheres, posed_bodies, sphere
+from torch import Tensor
+
+from mover.geometry import layers_warp, raster_torch, sample_warp, volume_igl, volume_warp
+from mover.geometry.face_tree import face_tree
+from mover.geometry.raster import Views
+from mover.geometry.volume import Volume, grid_around, sample_torch
+from mover.rooms.render import encode
+from mover.stages.gather_depth import Sight, gather_depth
+from mover.stages.person_masks import mask_table
+from mover.terms.depth import DepthMaps, Seen, bounds_of, merge
+from mover.types import Bodies, Camera, People
+
+pytest.importorskip("warp")
+
+
+def around(verts: Tensor, cells: int) -> Volume:
+    return grid_around(verts.amin((0, 1)), verts.amax((0, 1)), cells, padding=0.1)
+
+
+def assert_same(verts: Tensor, faces: Tensor, grid: Volume) -> Tensor:
+    """Signs and, where they are promised, distances are those of libigl."""
+    found = volume_warp.union_bodies(verts, faces, grid, 2).values
+    exact = volume_igl.union_bodies(verts, faces, grid, 1).values
+    assert ((found < 0) == (exact < 0)).float().mean() > 0.9999
+    known = (exact.abs() < 1.999 * grid.cell) | (exact < 0)
+    same = (found < 0) == (exact < 0)
+    torch.testing.assert_close(found[known & same], exact[known & same], rtol=0, atol=2e-6)
+    assert (found[~known] >= 1.998 * grid.cell).all()
+    return found
+
+
+def test_posed_bodies_have_the_distances_of_libigl() -> None:
+    verts, faces = posed_bodies(3)
+    assert (assert_same(verts, faces, around(verts, 96)) < 0).any()
+
+
+def test_a_body_that_cuts_into_itself_is_inside_where_its_parts_overlap() -> None:
+    one, faces = sphere([0.0, 0, 0], 0.5, level=3)
+    two, _ = sphere([0.4, 0.1, 0], 0.4, level=3)
+    verts, both = torch.cat([one, two])[None], torch.cat([faces, faces + len(one)])
+    found = assert_same(verts, both, around(verts, 60))
+    place = torch.cartesian_prod(*[torch.arange(n) for n in found.shape])
+    grid = around(verts, 60)
+    at = place * grid.cell + grid.origin
+    within = (at.norm(dim=-1) < 0.49) & ((at - torch.tensor([0.4, 0.1, 0])).norm(dim=-1) < 0.39)
+    assert (found.flatten()[within] < 0).all()
+
+
+def test_a_box_of_twelve_triangles_has_the_distances_of_libigl() -> None:
+    shape = trimesh.creation.box((0.41, 0.73, 0.59))
+    verts = torch.from_numpy(shape.vertices.copy()).float()[None]
+    assert_same(verts, torch.from_numpy(shape.faces.copy()), around(verts, 40))
+
+
+def test_a_body_that_leaves_the_grid_is_cut_off() -> None:
+    verts, faces = sphere([0.0, 0, 0], 0.5)
+    whole = grid_around(verts.amin(0), verts.amax(0), cells=40, padding=0.2)
+    corner = torch.tensor([10.0, 18, 0])
+    part = Volume(whole.values[10:25, 18:39, :13], whole.origin + whole.cell * corner, whole.cell)
+    assert (assert_same(verts[None], faces, part) < 0).any()
+    away = volume_warp.union_bodies(verts[None] + 9, faces, part, 2).values
+    assert torch.equal(away, part.values)
+
+
+def test_any_number_of_workers_gives_the_same_bits() -> None:
+    verts, faces = posed_bodies(7)
+    verts = verts + torch.linspace(0, 0.5, 7)[:, None, None]
+    grid = around(verts, 80)
+    one, two, three = (volume_warp.union_bodies(verts, faces, grid, n).values for n in (1, 2, 3))
+    assert torch.equal(one, two)
+    assert torch.equal(one, three)
+    assert torch.equal(one, volume_warp.union_bodies(verts.flip(0), faces, grid, 2).values)
+    alone = [volume_warp.union_bodies(body[None], faces, grid, 1).values for body in verts]
+    assert torch.equal(one, torch.stack(alone).amin(0))
+
+
+def test_the_order_of_the_triangles_does_not_change_a_bit() -> None:
+    verts, faces = posed_bodies(2)
+    grid = around(verts, 64)
+    mixed = faces[torch.randperm(len(faces), generator=torch.Generator().manual_seed(0))]
+    one = volume_warp.union_bodies(verts, faces, grid, 1).values
+    assert torch.equal(one, volume_warp.union_bodies(verts, mixed, grid, 1).values)
+    assert torch.equal(one, volume_warp.union_bodies(verts, faces.flip(-1), grid, 1).values)
+
+
+def test_no_frames_leave_the_grid_as_it_was() -> None:
+    verts, faces = moving_spheres(2)
+    grid = around(verts, 20)
+    assert torch.equal(volume_warp.union_bodies(verts[:0], faces, grid, 2).values, grid.values)
+
+
+def test_a_failure_in_a_worker_is_told() -> None:
+    verts, faces = moving_spheres(9)
+    grid = around(verts, 20)
+    verts[7, 3] = torch.inf
+    with pytest.raises(ValueError, match="body 7"):
+        volume_warp.union_bodies(verts, faces, grid, 3)
+
+
+@pytest.mark.parametrize("count", [1, 8, 9, 100, 3000])
+def test_each_triangle_is_in_one_leaf(count: int) -> None:
+    verts = torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
+    faces = torch.randint(0, 50, (count, 3), generator=torch.Generator().manual_seed(2))
+    tree = face_tree(verts, faces)
+    assert len(tree.first) == tree.branches**4 + 1
+    assert (tree.first[0], tree.first[-1]) == (0, count)
+    assert (tree.first[1:] >= tree.first[:-1]).all()
+    assert sorted(map(tuple, tree.faces.tolist())) == sorted(map(tuple, faces.tolist()))
+
+
+def cameras(items: int, size: tuple[int, int], focal: float) -> Views:
+    height, width = size
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return Views(K.expand(items, 3, 3), height, width)
+
+
+def assert_same_layers(verts: Tensor, faces: Tensor, views: Views) -> None:
+    found, exact = (m.layers(verts, faces, views) for m in (layers_warp, raster_torch))
+    for mine, other in ((found.front, exact.front), (found.exit, exact.exit)):
+        assert mine.dtype == other.dtype
+        assert torch.equal(mine.isfinite(), other.isfinite())
+        torch.testing.assert_close(mine, other, rtol=0, atol=1e-5)
+
+
+def test_rays_enter_and_leave_bodies_where_the_torch_version_says() -> None:
+    verts, faces = posed_bodies(3)
+    turned = verts * torch.tensor([1.0, -1.0, -1.0]) + torch.tensor([0.1, 0.2, 3.0])
+    views = cameras(3, (120, 160), 150.0)
+    assert layers_warp.layers(turned, faces, views).front.isfinite().any((-2, -1)).all()
+    assert_same_layers(turned, faces, views)
+    assert_same_layers(turned, faces.int(), views)
+
+
+def test_what_is_behind_the_camera_or_beside_the_image_is_not_drawn() -> None:
+    verts, faces = posed_bodies(4)
+    shift = torch.tensor([[0.0, 0.2, 0.1], [0.0, 0, -4.0], [9.0, 0, 3.0], [0.5, 0.8, 2.0]])
+    turned = verts * torch.tensor([1.0, -1.0, -1.0]) + shift[:, None]
+    views = cameras(4, (90, 120), 110.0)
+    assert_same_layers(turned, faces, views)
+    found = layers_warp.layers(turned, faces, views)
+    assert not found.front[1:3].isfinite().any()
+    assert found.front[0].isfinite().any()
+    assert found.front[3].isfinite().any()
+
+
+def test_nothing_to_draw_is_nothing_seen() -> None:
+    verts, faces = sphere([0.0, 0, 2.0], 0.5, level=1)
+    assert_same_layers(verts[None][:0], faces, cameras(0, (8, 9), 9.0))
+    assert_same_layers(verts[None], faces[:0], cameras(1, (8, 9), 9.0))
+    assert_same_layers(verts[None].double(), faces, cameras(1, (8, 9), 9.0))
+
+
+def passing(count: int) -> Sight:
+    """A ball that crosses the image (in part outside), its masks too small or shifted."""
+    verts, faces = sphere([0.0, 0, 0], 0.4, level=2)
+    way = torch.linspace(-1.6, 1.3, count)[:, None] * torch.tensor([1.0, 0.3, 0.2])
+    K = torch.tensor([[80.0, 0, 40], [0, 80, 30], [0, 0, 1]])
+    camera = Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0])), 80, 60)
+    frame, person = torch.arange(count), torch.zeros(count, dtype=torch.long)
+    place = way[:, None] + torch.tensor([0.0, 0.0, -2.0])
+    bodies = Bodies(verts + place, faces, None, (), frame, person, None, "world", None)
+    masks = np.zeros((count, 60, 80), dtype=bool)
+    for k in range(count):
+        column = int(40 + 40 * float(way[k, 0]))
+        masks[k, 18 + k % 5 : 40, max(column - 12, 0) : max(column + 3 * (k % 4), 0)] = True
+    people = People(encode(list(masks)), frame, person, {})
+    objects = torch.zeros(3, 60, 80, dtype=torch.bool)
+    for k in range(3):
+        objects[k, 10 + 5 * k : 45, 25 * k : 25 * k + 30] = True
+    return Sight(bodies, mask_table(people, bodies), objects, camera, erode=2, vote=True)
+
+
+def test_bounds_are_those_of_whole_images_one_after_another() -> None:
+    sight = passing(13)
+    blank = torch.full((60, 80), torch.inf)
+    expected = DepthMaps(-blank, blank, -blank)
+    views = Views(sight.camera.K[None], 60, 80)
+    for row, verts in enumerate(sight.bodies.verts):
+        cam = verts @ sight.camera.R_cam_world.mT
+        drawn = raster_torch.layers(cam[None], sight.bodies.faces, views)
+        seen = Seen(drawn.front[0], drawn.exit[0], *sight.table.decode(row))
+        expected = merge(expected, bounds_of(seen, sight.masks, 2, vote=True))
+    for workers in (1, 2, 3):
+        found = gather_depth(sight, workers)
+        for name in ("near", "far", "free"):
+            assert getattr(expected, name).isfinite().any()
+            assert torch.equal(getattr(found, name), getattr(expected, name))
+
+
+def test_progress_of_the_bounds_ends_with_all_bodies() -> None:
+    seen: list[tuple[int, int]] = []
+    sight = passing(9)
+    gather_depth(sight, 2, lambda done, of: seen.append((done, of)))
+    assert seen[-1] == (9, 9)
+    nobody = dataclasses.replace(sight, table=dataclasses.replace(sight.table, own=(None,) * 9))
+    assert gather_depth(nobody, 2).near.max() == -torch.inf
+
+
+def some_field(size: tuple[int, int, int]) -> Volume:
+    """Random values in one corner, constant elsewhere."""
+    values = torch.full(size, 0.5)
+    corner = tuple(slice(n // 2) for n in size)
+    values[corner] = torch.randn(values[corner].shape, generator=torch.Generator().manual_seed(3))
+    return Volume(values, torch.tensor([0.3, -0.2, 1.0]), 0.05)
+
+
+@pytest.mark.parametrize("size", [(20, 33, 26), (2, 2, 2), (9, 17, 10), (8, 16, 7)])
+def test_lookups_and_their_gradients_are_those_of_torch(size: tuple[int, int, int]) -> None:
+    field = some_field(size)
+    span = field.cell * (torch.tensor(size) - 1)
+    share = torch.rand(3, 400, 3, generator=torch.Generator().manual_seed(4)) * 1.4 - 0.2
+    points = (field.origin + share * span).requires_grad_()
+    weights = torch.randn(3, 400, generator=torch.Generator().manual_seed(5))
+    found, exact = sample_warp.sample(field, points), sample_torch(field, points)
+    torch.testing.assert_close(found, exact, rtol=0, atol=1e-5)
+    slopes = [torch.autograd.grad((v * weights).sum(), points)[0] for v in (found, exact)]
+    torch.testing.assert_close(slopes[0], slopes[1], rtol=1e-3, atol=1e-3)
+    assert slopes[1].abs().max() > 1
+
+
+def test_lookups_of_no_points_and_of_points_that_are_no_numbers() -> None:
+    field = some_field((9, 9, 9))
+    assert sample_warp.sample(field, torch.zeros(2, 0, 3)).shape == (2, 0)
+    assert sample_warp.sample(field, torch.full((1, 3), torch.nan)).shape == (1,)
+
+
+def test_bricks_are_busy_where_the_field_changes() -> None:
+    field = some_field((20, 33, 26))
+    assert field.busy.shape == (3, 4, 4)
+    for brick in torch.cartesian_prod(*[torch.arange(n) for n in field.busy.shape]).tolist():
+        cut = tuple(slice(8 * k, 8 * k + 9) for k in brick)
+        assert bool(field.busy[tuple(brick)]) == (field.values[cut].unique().numel() > 1)

@@ -1,0 +1,201 @@
+"""PROX and PiGraphs from files in their exact layout."""
+
+import json
+from pathlib import Path
+
+import make_scenes as layouts
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from test_import_scenes import check_truth, imported
+from test_import_scenes import plain as plain  # the fixture
+
+from mover.geometry.placement import place_piece
+from mover.geometry.volume import sample
+from mover.readers import read_capture
+from mover.readers.evidence import gather_evidence
+from mover.readers.kinect import NAMES, capsule_people
+from mover.readers.pigraphs import read_segments
+from mover.readers.prox_files import read_sdf, recordings_of
+from mover.readers.scene_file import read_scene
+from mover.records import InputError
+
+RECORDING = "MPH8_00034_01"
+
+
+def prox_room(plain: layouts.Room) -> layouts.Room:
+    """The room under PROX's picture size."""
+    factor = 1920 / plain.size[0]
+    K = plain.K * factor
+    K[2, 2] = 1
+    return layouts.Room(K, plain.R, (1920, 1080), plain.ground, plain.things)
+
+
+@pytest.fixture(scope="module")
+def prox(plain: layouts.Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("prox")
+    room = prox_room(plain)
+    layouts.write_prox(root, room, RECORDING, 3, np.array([1.0, 2.0, 1.5]))
+    (root / "recordings" / "N0SittingBooth_00162_01" / "Color").mkdir(parents=True)
+    return root
+
+
+def test_the_booths_are_left_out(prox: Path) -> None:
+    assert recordings_of(prox) == [RECORDING]
+
+
+def test_prox_gives_flipped_frames_its_lens_and_the_truth(
+    prox: Path, plain: layouts.Room, tmp_path: Path
+) -> None:
+    out, room = tmp_path / "out", prox_room(plain)
+    boxes = prox / "boxes" / "bbox3d.json"
+    imported("prox", prox, out, tmp_path, recording=RECORDING, boxes=boxes)
+    lens = json.loads((out / "camera.json").read_text())
+    assert lens["cx"] == pytest.approx(room.K[0, 2], abs=1e-6)
+    assert "R_cam_world" not in lens  # the truth stays in truth/
+    names = sorted(p.name for p in (out / "frames").iterdir())
+    assert names == ["000000.jpg", "000001.jpg", "000002.jpg"]
+    with Image.open(out / "frames" / "000000.jpg") as picture:
+        flipped = np.asarray(picture).astype(int)
+    assert np.abs(flipped - np.asarray(layouts.picture(room.size)).astype(int)).mean() < 3
+    check_truth(out / "truth", room)
+    check_scan(out / "truth_scan", room)
+
+
+def check_scan(folder: Path, room: layouts.Room) -> None:
+    """What the scan has in the boxes are the objects themselves, with some floor at most."""
+    truth = read_scene(folder / "scene.json")
+    known = {t.name: t for t in room.things}
+    assert len(truth.pieces) == len(known)
+    for piece, thing in zip(truth.pieces, room.things, strict=True):
+        verts = place_piece(piece).verts.numpy()
+        gap = np.linalg.norm(thing.world[:, None] - verts[None], axis=-1).min(1)
+        assert gap.max() < 1e-3, thing.name
+
+
+def test_keypoints_of_mirrored_pictures_change_sides(
+    prox: Path, plain: layouts.Room, tmp_path: Path
+) -> None:
+    del plain
+    imported("prox", prox, tmp_path / "out", tmp_path, recording=RECORDING)
+    tree = json.loads((tmp_path / "out" / "keypoints" / "000001_keypoints.json").read_text())
+    joints = np.array(tree["people"][0]["pose_keypoints_2d"]).reshape(-1, 3)
+    assert joints[7].tolist() == [1920 - 101, 200, 0.9]  # the left wrist
+    assert not joints[4].any()
+    hands = [np.array(tree["people"][0][f"hand_{s}_keypoints_2d"]) for s in ("right", "left")]
+    assert hands[0].any()
+    assert not hands[1].any()
+
+
+def test_axes_by_columns_are_understood(plain: layouts.Room, tmp_path: Path) -> None:
+    layouts.write_prox(tmp_path / "p", prox_room(plain), RECORDING, 1, np.array([0.0, 1, 2]))
+    layouts.write_truth(tmp_path / "p" / "boxes", prox_room(plain), columns=True)
+    imported(
+        "prox", tmp_path / "p", tmp_path / "out", tmp_path, recording=RECORDING,
+        boxes=tmp_path / "p" / "boxes" / "bbox3d.json",
+    )  # fmt: skip
+    check_truth(tmp_path / "out" / "truth", prox_room(plain))
+
+
+def test_an_sdf_is_read_where_it_is(tmp_path: Path) -> None:
+    layouts.write_sdf(tmp_path, "MPH8", 64)
+    volume = read_sdf(tmp_path, "MPH8")
+    points = torch.tensor([[1.5, 2.0, 3.0], [1.0, 2.9, 3.0], [0.2, 1.4, 3.7]])
+    truth = (points - torch.tensor([1.0, 2, 3])).norm(dim=-1) - 0.5
+    assert torch.allclose(sample(volume, points), truth, atol=5e-3)  # half a cell is 0.03
+
+
+def test_an_unknown_recording_is_named_with_those_there_are(prox: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=RECORDING):
+        imported("prox", prox, tmp_path / "out", tmp_path, recording="MPH11_1_1")
+
+
+def walking(frames: int) -> np.ndarray:
+    """Skeletons of Kinect in the camera's axes: they walk to the right of the picture."""
+    joints = np.zeros((frames, 25, 3))
+    heights = {0: 0.9, 1: 1.2, 2: 1.5, 3: 1.65, 20: 1.4, 12: 0.9, 16: 0.9, 13: 0.5, 17: 0.5,
+               14: 0.1, 18: 0.1, 15: 0.03, 19: 0.03}  # fmt: skip
+    for j in range(25):
+        joints[:, j, 1] = 1.4 - heights.get(j, 1.1)
+        side = 1 if j in (4, 5, 6, 7, 12, 13, 14, 15, 21, 22) else -1
+        joints[:, j, 0] = 0.15 * side if j not in (0, 1, 2, 3, 20) else 0
+    joints[..., 2] = 3.0
+    joints[..., 0] += 0.1 * np.arange(frames)[:, None]
+    return joints
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_pigraphs_gives_skeletons_with_skin_and_the_truth(
+    plain: layouts.Room, tmp_path: Path, mirror: bool
+) -> None:
+    joints = walking(4)
+    name = "3bHallway_mati2_2014-04-30-22-46-22"
+    things = [t for t in plain.things if t.category in ("chair", "bed", "desk", "cabinet", "sofa")]
+    room = layouts.Room(plain.K, plain.R, plain.size, plain.ground, things)
+    layouts.write_pigraphs(tmp_path / "in", room, name, joints, mirror=mirror)
+    source = layouts.write_glb(tmp_path / "in.glb", plain)
+    imported("glb", source, tmp_path / "out", tmp_path)
+    found = imported("pigraphs", tmp_path / "in", tmp_path / "out", tmp_path, recording=name)
+    assert any("mirrored" in note for note in found.notes) != mirror
+    capture = read_capture(tmp_path / "out")
+    assert capture.bodies is not None
+    assert capture.bodies.joints is not None
+    assert np.allclose(capture.bodies.joints.numpy(), joints, atol=1e-5)
+    assert capture.bodies.frame.tolist() == [0, 1, 2, 3]
+    gap = torch.cdist(capture.bodies.verts[2], capture.bodies.joints[2]).amin(0)
+    assert float(gap[[0, 3, 13, 17]].max()) < 0.15
+    check_truth(tmp_path / "out" / "truth", room)
+    gather_evidence(capture)
+
+
+def test_capsules_are_closed_and_outward() -> None:
+    from mover.geometry.mesh import box
+
+    arrays = capsule_people([(0, 0, walking(1)[0])], np.eye(3), 5.0)
+    verts, faces = arrays["vertices"][0].astype(float), arrays["faces"]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    assert {tuple(e) for e in edges.tolist()} == {tuple(e[::-1]) for e in edges.tolist()}
+    volume = np.einsum("ij,ij->i", verts[faces[:, 0]],
+                       np.cross(verts[faces[:, 1]], verts[faces[:, 2]])).sum() / 6  # fmt: skip
+    assert 0.03 < volume < 0.2
+    assert len(NAMES) == 25
+    del box
+
+
+def test_parts_of_an_object_become_one_box(plain: layouts.Room, tmp_path: Path) -> None:
+    layouts.write_pigraphs(tmp_path, plain, "room_a_b", walking(1), mirror=False)
+    boxes = read_segments(tmp_path / "roomd.segs.json")
+    known = [t for t in plain.things if t.category not in ("shelves", "lamp", "night_stand")]
+    assert len(boxes) == len(known)
+    for box, thing in zip(boxes, known, strict=True):
+        size = thing.scale * np.ptp(thing.verts, axis=0)
+        assert np.allclose(sorted(2 * box.half), sorted(size), atol=1e-6)
+
+
+def test_the_papers_table_of_a_perfect_copy_has_perfect_rows(
+    plain: layouts.Room, prox: Path, tmp_path: Path
+) -> None:
+    """A result that is the truth scores 1 in both overlaps; the published rows stand below."""
+    import shutil
+
+    from mover.paper_table import paper_table
+
+    room = prox_room(plain)
+    out = tmp_path / "captures" / RECORDING
+    boxes = prox / "boxes" / "bbox3d.json"
+    imported("prox", prox, out, tmp_path, recording=RECORDING, boxes=boxes)
+    results = tmp_path / "results" / RECORDING
+    shutil.copytree(out / "truth", results)
+    shutil.copy(results / "scene.json", results / "initial.json")
+    told = paper_table("prox", tmp_path / "captures", tmp_path / "results")
+    assert "here 1 of 51" in told
+    rows = {line[:20].strip(): line[20:].split() for line in told.splitlines()[2:6]}
+    ours = rows["your copy, mover"]
+    assert (ours[0], ours[2]) == ("1.000", "1.000")
+    assert float(ours[1]) < 0.2  # boxes are not the shapes in the scan
+    assert ours[5:8] == ["0.000", "0.000", "0.000"]
+    assert rows["Total3D"][0] == "0.196"
+    with pytest.raises(InputError, match="no capture"):
+        paper_table("pigraphs", tmp_path / "results", tmp_path / "captures")
+    assert len(room.things) > 2

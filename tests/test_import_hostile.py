@@ -1,0 +1,264 @@
+"""Whatever a source holds: it is imported or refused with a message; nothing in it runs."""
+
+import dataclasses
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import make_scenes as layouts
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mover.readers.fields import At
+from mover.readers.importers import IMPORTERS
+from mover.readers.instance_files import read_instances
+from mover.readers.merge import import_into
+from mover.readers.parts import Hints
+from mover.records import InputError
+
+SLOW = (HealthCheck.too_slow, HealthCheck.function_scoped_fixture)
+FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=SLOW)
+STEP = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0.5]], dtype=float)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3], [1, 4, 2]])
+AHEAD = np.array([0, 0, 3.0])
+JOINTS = np.tile(np.linspace(0, 1, 25)[:, None], (2, 1, 3)) + AHEAD
+
+
+def little() -> layouts.Room:
+    things = [
+        layouts.Thing(f"{c}_{i}", c, STEP * 0.5, FACES, np.array([0.4 * i - 0.4, -1.4, -3.0]),
+                      0.3 * i, np.ones(3))
+        for i, c in enumerate(("chair", "table"))
+    ]  # fmt: skip
+    K = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]])
+    return layouts.Room(K, np.diag([1.0, -1, -1]), (64, 48), -1.4, things)
+
+
+def camera() -> At:
+    fields = {"w": 64, "h": 48, "fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0,
+              "R_cam_world": np.diag([1.0, -1, -1]).tolist()}  # fmt: skip
+    return At(fields, "camera.json")
+
+
+@pytest.fixture(scope="module")
+def sources() -> Iterator[dict[str, Path]]:
+    room = little()
+    with tempfile.TemporaryDirectory() as place:
+        home = Path(place)
+        masks = np.zeros((2, 48, 64), dtype=bool)
+        masks[0, 5:20, 3:20], masks[1, 22:40, 30:50] = True, True
+        kinds = layouts.write_masks(home / "masks", masks, ["chair", "couch"])
+        found = {
+            "total3d": layouts.write_total3d(home / "t3d", room),
+            "sam3d": layouts.write_sam3d(home / "sam3d", room),
+            "gen3dsr": layouts.write_gen3dsr(home / "gen", room),
+            "glb": layouts.write_glb(home / "glb" / "a.glb", room),
+            "boxes": layouts.write_boxes(home / "boxes" / "a.json", room),
+            "release": layouts.write_release(
+                home / "rel", room, np.stack([STEP + AHEAD] * 2), FACES
+            ),
+            "pigraphs": layouts.write_pigraphs(home / "pig", room, "a_b_c", JOINTS, mirror=False),
+            **{f"masks:{k}": v for k, v in kinds.items()},
+        }
+        yield found
+
+
+def import_or_refuse(format: str, source: Path, home: Path) -> bool:
+    """Whether it was taken; nothing may be written outside of `home`/out and its work folder."""
+    out, work = home / "out", home / "work"
+    for folder in (out, work):
+        shutil.rmtree(folder, ignore_errors=True)
+    work.mkdir(parents=True)
+    before = sorted(p for p in home.rglob("*") if not p.is_relative_to(work))
+    try:
+        hints = Hints(work=work, camera=None if format == "total3d" else camera())
+        import_into(out, IMPORTERS[format.split(":")[0]].read(source, hints))
+    except InputError as error:
+        assert str(error)  # noqa: PT017
+        assert sorted(p for p in home.rglob("*") if not p.is_relative_to(work)) == before
+        return False
+    outside = (p for p in home.rglob("*") if not p.is_relative_to(work))
+    assert sorted(p for p in outside if not p.is_relative_to(out)) == before
+    return True
+
+
+def copied(source: Path, home: Path) -> Path:
+    """The source's folder in a new place; the same path in it."""
+    shutil.rmtree(home, ignore_errors=True)
+    if source.is_dir():
+        shutil.copytree(source, home / "in")
+        return home / "in"
+    shutil.copytree(source.parent, home / "in")
+    return home / "in" / source.name
+
+
+FORMATS = ("total3d", "sam3d", "gen3dsr", "glb", "boxes", "release", "pigraphs", "masks:coco_text",
+           "masks:mover", "masks:sam3", "masks:sav", "masks:npz", "masks:labels")  # fmt: skip
+
+
+def files_of(source: Path) -> list[Path]:
+    return sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_little_room_itself_is_taken(
+    sources: dict[str, Path], format: str, tmp_path: Path
+) -> None:
+    assert import_or_refuse(format, copied(sources[format], tmp_path), tmp_path)
+
+
+@pytest.mark.slow
+@FUZZ
+@given(
+    format=st.sampled_from(FORMATS), which=st.integers(0, 100), where=st.floats(0, 1),
+    junk=st.binary(min_size=1, max_size=8), cut=st.booleans(),
+)  # fmt: skip
+def test_no_flipped_or_missing_bytes_raise_anything_else(
+    sources: dict[str, Path], format: str, which: int, where: float, junk: bytes, cut: bool
+) -> None:
+    with tempfile.TemporaryDirectory() as place:
+        home = Path(place) / "home"
+        source = copied(sources[format], home)
+        paths = files_of(source)
+        path = paths[which % len(paths)]
+        content = path.read_bytes()
+        start = int(where * len(content))
+        tail = b"" if cut else content[start + len(junk) :]
+        path.write_bytes(content[:start] + junk + tail)
+        import_or_refuse(format, source, home)
+
+
+JUNK = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
+    | st.sampled_from([..., 0, -1, 1 << 70, 1e308, "ground", "..", "../../x", 64, 48, [], {}]),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=5,
+)  # fmt: skip
+
+
+def ways_of(tree: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """The place of every value in nested lists and objects; long lists at their ends only."""
+    found = [way] if way else []
+    keys: Any = ()
+    if isinstance(tree, dict):
+        keys = tree
+    elif isinstance(tree, list):
+        keys = range(len(tree)) if len(tree) < 30 else (0, len(tree) - 1)
+    for key in keys:
+        found += ways_of(tree[key], (*way, key))
+    return found
+
+
+@pytest.mark.slow
+@FUZZ
+@given(
+    format=st.sampled_from([f for f in FORMATS if f not in ("glb", "masks:npz")]),
+    which=st.integers(0, 10**6), value=JUNK,
+)  # fmt: skip
+def test_no_junk_in_any_json_field_raises_anything_else(
+    sources: dict[str, Path], format: str, which: int, value: Any
+) -> None:
+    with tempfile.TemporaryDirectory() as place:
+        home = Path(place) / "home"
+        source = copied(sources[format], home)
+        paths = [p for p in files_of(source) if p.suffix == ".json"]
+        if not paths:
+            return
+        path = paths[which % len(paths)]
+        tree = json.loads(path.read_text())
+        ways = ways_of(tree)
+        *way, last = ways[which % len(ways)]
+        inner = tree
+        for key in way:
+            inner = inner[key]
+        if value is ...:
+            del inner[last]
+        else:
+            inner[last] = value
+        path.write_text(json.dumps(tree, default=str))
+        import_or_refuse(format, source, home)
+
+
+def test_pickles_in_arrays_do_not_run(tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+    bomb = layouts.write_bomb(tmp_path / "a.npz", mark)
+    with pytest.raises(InputError, match="pickled"):
+        read_instances(bomb, {}, None)
+    folder = layouts.write_sam3d(tmp_path / "sam", little())
+    shutil.copy(bomb, folder / "0.npz")
+    assert not import_or_refuse("sam3d", folder, tmp_path)
+    assert not mark.exists()
+
+
+def test_zip_bombs_are_not_unpacked(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="bytes"):
+        read_instances(layouts.write_zip_bomb(tmp_path / "a.npz"), {}, None)
+    head = str({"descr": "<f8", "fortran_order": False, "shape": (10**9, 3)}).encode()
+    head += b" " * (-(len(head) + 11) % 64) + b"\n"
+    body = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head
+    (tmp_path / "b.npy").write_bytes(body + b"\0" * 100)
+    with pytest.raises(InputError, match=r"b\.npy"):
+        read_instances(tmp_path / "b.npy", {}, None)
+
+
+@pytest.mark.parametrize("kind", ["ply", "off", "obj"])
+def test_headers_of_a_thousand_million_vertices_are_refused(tmp_path: Path, kind: str) -> None:
+    source = layouts.write_total3d(tmp_path / "in", little())
+    for path in (source / "output").glob("*.obj"):
+        path.unlink()
+    header = {
+        "ply": "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000\nproperty float x\n"
+        "property float y\nproperty float z\nelement face 1000000000\n"
+        "property list uchar int vertex_indices\nend_header\n",
+        "off": "OFF\n1000000000 1000000000 0\n0 0 0\n",
+        "obj": "v 0 0 0\nv 1 0 0\nv 0 1 1\nf 1 2 1000000000\n",
+    }[kind]
+    for i, c in ((0, 5), (1, 7)):
+        (source / "output" / f"{i}_{c}.{kind}").write_text(header)
+    assert not import_or_refuse("total3d", source, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["../../escaped", "/tmp/escaped", "..", "a/b", "CON:", "\0", ""])
+def test_names_cannot_leave_the_folder(tmp_path: Path, name: str) -> None:
+    room = little()
+    things = [dataclasses.replace(t, name=name or "x") for t in room.things[:1]]
+    source = layouts.write_boxes(
+        tmp_path / "in" / "a.json", dataclasses.replace(room, things=things)
+    )
+    assert import_or_refuse("boxes", source, tmp_path) or "\0" in name
+    tree = json.loads(source.read_text())
+    tree["objects"][0]["category"] = name
+    source.write_text(json.dumps(tree))
+    import_or_refuse("boxes", source, tmp_path)
+
+
+def test_a_gltf_cannot_bring_other_files_along(tmp_path: Path) -> None:
+    secret = tmp_path / "secret.png"
+    layouts.picture((8, 8)).save(secret)
+    path = layouts.write_glb(tmp_path / "in" / "a.glb", little())
+    content = path.read_bytes()
+    size = int.from_bytes(content[12:16], "little")
+    tree = json.loads(content[20 : 20 + size])
+    tree["images"] = [{"uri": "../secret.png"}]
+    chunk = json.dumps(tree).encode()
+    chunk += b" " * (-len(chunk) % 4)
+    body = content[20 + size :]
+    total = (20 + len(chunk) + len(body)).to_bytes(4, "little")
+    head = content[:8] + total + len(chunk).to_bytes(4, "little") + b"JSON"
+    path.write_bytes(head + chunk + body)
+    with pytest.raises(InputError, match="images beside it"):
+        IMPORTERS["glb"].read(path, Hints(work=tmp_path))
+
+
+def test_xml_bombs_are_refused(tmp_path: Path) -> None:
+    from mover.readers.any_camera import read_camera_file
+
+    path = tmp_path / "a.xml"
+    path.write_text('<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><x>&b;</x>')
+    with pytest.raises(InputError, match="entities"):
+        read_camera_file(path, (64, 48))

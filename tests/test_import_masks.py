@@ -1,0 +1,262 @@
+"""The same masks in every layout, and parts of captures that come one after the other."""
+
+import json
+from pathlib import Path
+
+import make_scenes as layouts
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from test_import_scenes import camera_at, capture_of, imported
+from test_import_scenes import plain as plain  # the fixture
+
+from mover.commands_import import ImportArgs, run_import
+from mover.readers import read_capture
+from mover.readers.instance_files import read_instances
+from mover.readers.instances import fitted
+from mover.readers.masks import decode
+from mover.readers.merge import import_into
+from mover.readers.parts import Parts
+from mover.records import InputError
+from mover.types import Masks
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+WORDS = ["chair", "couch", "chair", "person"]
+KINDS = (
+    "coco_list", "coco_text", "results", "detectron2", "mover", "sam3", "sav", "npz",
+    "npz_logits", "labels", "files", "alpha",
+)  # fmt: skip
+NAMELESS = {"sam3", "sav", "npz_logits", "alpha"}
+
+
+def drawn() -> np.ndarray:
+    """Masks with a hole, two parts, and a border pixel."""
+    masks = np.zeros((4, 48, 64), dtype=bool)
+    masks[0, 5:20, 3:20] = True
+    masks[0, 8:12, 6:9] = False
+    masks[1, 22:40, 0:10] = True
+    masks[1, 44:48, 0:3] = True
+    masks[2, 10:30, 40:64] = True
+    masks[3, 0:9, 30:36] = True
+    return masks
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_layout_gives_the_same_masks(tmp_path: Path, kind: str) -> None:
+    masks = drawn()
+    files = layouts.write_masks(tmp_path / "in", masks, WORDS)
+    found = read_instances(files[kind], {}, None)
+    assert found.size == (64, 48)
+    got = {}
+    for item in found.items:
+        assert item.mask is not None
+        got[decode(Masks(48, 64, (item.mask,)), 0).numpy().tobytes()] = item.category
+    assert set(got) == {m.tobytes() for m in masks}
+    words = [got[m.tobytes()] for m in masks]
+    assert words == (["object"] * 4 if kind in NAMELESS else WORDS)
+
+
+def test_polygons_fill_what_they_surround(tmp_path: Path) -> None:
+    tree = {
+        "images": [{"id": 1, "width": 64, "height": 48}],
+        "categories": [{"id": 1, "name": "bed"}],
+        "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "bbox": [10, 10, 20, 15],
+                         "segmentation": [[10, 10, 30, 10, 30, 25, 10, 25]]}],
+    }  # fmt: skip
+    (tmp_path / "a.json").write_text(json.dumps(tree))
+    found = read_instances(tmp_path / "a.json", {}, None).items[0]
+    assert found.mask is not None
+    mask = decode(Masks(48, 64, (found.mask,)), 0).numpy()
+    assert mask[10:25, 10:30].all()
+    assert mask.sum() == 300
+
+
+def test_names_of_the_user_win(tmp_path: Path) -> None:
+    files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
+    names = {"0": "table", "1": "bed"}
+    for kind in ("sam3", "sav", "npz_logits", "alpha"):
+        found = read_instances(files[kind], names, None)
+        assert [i.category for i in found.items][:2] == ["table", "bed"], kind
+
+
+def test_masks_of_another_size_are_stretched_and_of_another_shape_refused(tmp_path: Path) -> None:
+    files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
+    found = fitted(read_instances(files["npz"], {}, None), (128, 96))
+    assert found.items[0].mask is not None
+    mask = decode(Masks(96, 128, (found.items[0].mask,)), 0).numpy()
+    assert (mask == np.kron(drawn()[0], np.ones((2, 2), dtype=bool))).all()
+    with pytest.raises(InputError, match="64 x 48"):
+        fitted(read_instances(files["npz"], {}, None), (128, 128))
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")
+class TestRealFiles:
+    def test_real_results_of_coco_have_their_runs(self) -> None:
+        path = DATA / "formats" / "coco_instances_val2014_fakesegm100_results.json"
+        rows = [row for row in json.loads(path.read_text()) if row["image_id"] == 42]
+        found = read_list(rows, path.name)
+        assert len(found) == len(rows)
+        for item, row in zip(found, rows, strict=True):
+            height, width = row["segmentation"]["size"]
+            assert item.mask is not None
+            mask = decode(Masks(height, width, (item.mask,)), 0).numpy()
+            assert layouts.compressed(layouts.runs_of(mask)) == row["segmentation"]["counts"]
+        assert found[0].category == "dog"
+
+    def test_a_real_masklet_has_its_tracks_through_all_frames(self) -> None:
+        found = read_instances(DATA / "formats" / "sav_000001_manual.json", {}, None)
+        assert found.size == (480, 848)
+        assert {i.track for i in found.items} == {0, 1, 2, 3, 4}
+        assert max(i.frame for i in found.items) == 120
+
+    def test_real_total3d_and_masks_of_its_boxes_become_one_capture(self, tmp_path: Path) -> None:
+        rows = json.loads((DATA / "total3d_1" / "input" / "detections.json").read_text())
+        masks = np.zeros((len(rows), 530, 730), dtype=bool)
+        for mask, row in zip(masks, rows, strict=True):
+            x0, y0, x1, y1 = (round(v) for v in row["bbox"])
+            mask[max(y0, 0) + 2 : y1 - 2, max(x0, 0) + 2 : x1 - 2] = True
+        np.savez(tmp_path / "masks.npz", masks=masks[::-1])
+        args = ImportArgs(
+            "total3d", DATA / "total3d_1", tmp_path / "out", objects_masks=tmp_path / "masks.npz"
+        )
+        run_import(args, tmp_path)
+        found = read_capture(tmp_path / "out")
+        known = {d.id: d for d in found.detections}
+        assert [p.annotation for p in found.scene.pieces] == list(range(18))
+        for i, mask in enumerate(masks):
+            code = known[i].mask
+            assert code is not None
+            assert (decode(code, 0).numpy() == mask).all()
+
+
+def read_list(rows: list[dict[str, object]], name: str) -> list[layouts.Any]:
+    from mover.readers.fields import At
+    from mover.readers.instances_lists import list_instances
+
+    return list(list_instances(At(rows, name), {}, None).items)
+
+
+def test_parts_come_in_any_order_and_stay(plain: layouts.Room, tmp_path: Path) -> None:
+    """Masks first and the scene later is the same capture as the other way round."""
+    w, h = plain.size
+    masks = np.zeros((len(plain.things), h, w), dtype=bool)
+    for mask, thing in zip(masks, plain.things, strict=True):
+        x0, y0, x1, y1 = (round(v) for v in plain.box2d(thing))
+        mask[y0:y1, x0:x1] = True
+    np.savez(
+        tmp_path / "masks.npz", masks=masks, labels=np.array([t.category for t in plain.things])
+    )
+    t3d = layouts.write_total3d(tmp_path / "in", plain)
+    layouts.picture(plain.size).save(tmp_path / "photo.png")
+    steps = {
+        "scene": ImportArgs("total3d", t3d, tmp_path / "a"),
+        "masks": ImportArgs("masks", tmp_path / "masks.npz", tmp_path / "a"),
+    }
+    found = []
+    for name, order in (("a", ("scene", "masks")), ("b", ("masks", "scene"))):
+        for step in order:
+            args = steps[step]
+            run_import(ImportArgs(args.format, args.source, tmp_path / name), tmp_path)
+        found.append(read_capture(tmp_path / name))
+    for capture in found:
+        assert all(d.mask is not None for d in capture.detections)
+        assert len(capture.detections) == len(plain.things)
+        used = {p.annotation: p.category for p in capture.scene.pieces}
+        assert {d.id: d.category for d in capture.detections} == used
+    for piece, other in zip(found[0].scene.pieces, found[1].scene.pieces, strict=True):
+        a = next(d for d in found[0].detections if d.id == piece.annotation)
+        b = next(d for d in found[1].detections if d.id == other.annotation)
+        assert torch.allclose(a.box, b.box)
+
+
+def test_a_scene_without_annotations_finds_its_masks(plain: layouts.Room, tmp_path: Path) -> None:
+    w, h = plain.size
+    masks = np.zeros((len(plain.things), h, w), dtype=bool)
+    for mask, thing in zip(masks, plain.things[::-1], strict=True):
+        x0, y0, x1, y1 = (round(v) for v in plain.box2d(thing))
+        mask[y0:y1, x0:x1] = True
+    np.savez(tmp_path / "masks.npz", masks=masks)
+    source = layouts.write_glb(tmp_path / "in.glb", plain)
+    layouts.picture(plain.size).save(tmp_path / "photo.png")
+    args = ImportArgs(
+        "glb", source, tmp_path / "out", image=tmp_path / "photo.png",
+        objects_masks=tmp_path / "masks.npz",
+    )  # fmt: skip
+    run_import(args, tmp_path)
+    found = read_capture(tmp_path / "out")
+    order = [t.name for t in plain.things[::-1]]
+    assert {p.id: p.annotation for p in found.scene.pieces} == {n: i for i, n in enumerate(order)}
+
+
+def test_a_new_tilt_keeps_box_centres_in_the_camera(plain: layouts.Room, tmp_path: Path) -> None:
+    source = layouts.write_total3d(tmp_path / "in", plain)
+    first = capture_of("total3d", source, tmp_path)
+    camera = {**camera_at(plain).value}
+    del camera["R_cam_world"]
+    tilted = {**camera, "R_cam_world": np.diag([1.0, -1, -1]).tolist()}
+    (tmp_path / "level.json").write_text(json.dumps(tilted))
+    args = ImportArgs("folder", tmp_path / "out", tmp_path / "out", camera=tmp_path / "level.json")
+    run_import(args, tmp_path)
+    second = read_capture(tmp_path / "out")
+    from mover.geometry.boxes import box_of
+    from mover.geometry.camera import to_camera
+
+    for a, b in zip(first.scene.pieces, second.scene.pieces, strict=True):
+        before = to_camera(box_of(a).center, first.scene.camera.R_cam_world)
+        after = to_camera(box_of(b).center, second.scene.camera.R_cam_world)
+        assert torch.allclose(before, after, atol=1e-4)
+    assert second.scene.camera.R_cam_world.tolist() == np.diag([1.0, -1, -1]).tolist()
+
+
+def test_people_keep_their_tracks_and_frames(plain: layouts.Room, tmp_path: Path) -> None:
+    w, h = plain.size
+    stack = np.zeros((3, 2, h, w), dtype=bool)
+    for frame in range(3):
+        stack[frame, 0, 10:50, 10 + frame : 30 + frame] = True
+        stack[frame, 1, 60:90, 40:60] = frame != 1
+    np.savez(tmp_path / "people.npz", masks=stack, object_ids=np.array([4, 9]))
+    source = layouts.write_total3d(tmp_path / "in", plain)
+    args = ImportArgs(
+        "total3d", source, tmp_path / "out", people_masks=tmp_path / "people.npz", fps=5.0
+    )
+    run_import(args, tmp_path)
+    people = read_capture(tmp_path / "out").people
+    assert people is not None
+    rows = list(zip(people.frame.tolist(), people.person.tolist(), strict=True))
+    assert rows == [(0, 4), (0, 9), (1, 4), (2, 4), (2, 9)]
+    for row, (frame, person) in enumerate(rows):
+        truth = stack[frame, [4, 9].index(person)]
+        assert (decode(people.masks, row).numpy() == truth).all()
+
+
+def test_masks_alone_make_a_part_and_what_is_missing_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
+    run_import(ImportArgs("masks", files["coco_text"], tmp_path / "out"), tmp_path)
+    told = capsys.readouterr().out
+    assert "wrote objects.json" in told
+    for word in ("camera.json", "scene.json", "bodies.npz", "people.json", "reference.jpg"):
+        assert f"still missing: {word}" in told
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["objects.json"]
+
+
+def test_nothing_is_written_when_a_part_does_not_fit(plain: layouts.Room, tmp_path: Path) -> None:
+    capture_of("total3d", layouts.write_total3d(tmp_path / "in", plain), tmp_path)
+    before = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()}
+    Image.new("RGB", (10, 10)).save(tmp_path / "small.png")
+    with pytest.raises(InputError, match="10 x 10"):
+        run_import(
+            ImportArgs("folder", tmp_path / "out", tmp_path / "out", image=tmp_path / "small.png"),
+            tmp_path,
+        )
+    after = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()}
+    assert before == after
+
+
+def test_an_empty_import_changes_nothing(plain: layouts.Room, tmp_path: Path) -> None:
+    imported("total3d", layouts.write_total3d(tmp_path / "in", plain), tmp_path / "out", tmp_path)
+    before = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*.json")}
+    import_into(tmp_path / "out", Parts(name="nothing"))
+    assert before == {p: p.read_bytes() for p in (tmp_path / "out").rglob("*.json")}

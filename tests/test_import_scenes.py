@@ -1,0 +1,311 @@
+"""A known room in the layout of every tool comes back as the same room."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import make_scenes as layouts
+import numpy as np
+import pytest
+import torch
+
+from mover.geometry.boxes import box_of, iou3d
+from mover.geometry.camera import pitch_roll
+from mover.geometry.placement import place_piece
+from mover.readers import read_capture
+from mover.readers.fields import At
+from mover.readers.importers import IMPORTERS
+from mover.readers.merge import Imported, import_into
+from mover.readers.odd_world import odd_world, overlap
+from mover.readers.parts import Hints
+from mover.records import InputError
+from mover.rooms.known import KnownRoom
+from mover.types import Capture
+
+NAMES = {
+    "floor lamp": "lamp", "coffee table": "table", "shelf": "shelves", "wardrobe": "cabinet",
+    "nightstand": "night_stand", "armchair": "sofa", "office chair": "chair", "stool": "chair",
+    "bench": "sofa",
+}  # fmt: skip
+FINE, COARSE = 1e-4, 1e-2
+
+
+@pytest.fixture(scope="module")
+def plain(small_room: KnownRoom) -> layouts.Room:
+    """The room as numbers, with sizes that are not those of the meshes."""
+    camera = small_room.truth.camera
+    things = []
+    for i, piece in enumerate(small_room.truth.pieces):
+        stretch = np.array([1.1, 0.9, 1.2]) if i % 2 else np.ones(3)
+        things.append(
+            layouts.Thing(
+                f"{piece.id}", NAMES.get(piece.category, piece.category),
+                piece.mesh.verts.double().numpy(), piece.mesh.faces.numpy(),
+                piece.t_world_object.double().numpy(), float(piece.yaw), stretch,
+            )
+        )  # fmt: skip
+    assert small_room.truth.ground is not None
+    return layouts.Room(
+        camera.K.double().numpy(), camera.R_cam_world.double().numpy(),
+        (camera.width, camera.height), small_room.truth.ground, things,
+    )  # fmt: skip
+
+
+def imported(format: str, source: Path, out: Path, work: Path, **hints: object) -> Imported:
+    parts = IMPORTERS[format].read(source, Hints(work=work, **hints))  # pyright: ignore
+    return import_into(out, parts)
+
+
+def capture_of(format: str, source: Path, tmp: Path, **hints: object) -> Capture:
+    """Imported, written, and read again."""
+    found = imported(format, source, tmp / "out", tmp / "work", **hints)
+    assert found.capture is not None
+    return read_capture(tmp / "out")
+
+
+def worst(found: Capture, room: layouts.Room) -> float:
+    """Largest distance between the vertices of an object and the true ones [m]."""
+    assert len(found.scene.pieces) == len(room.things)
+    gaps = []
+    for piece, thing in zip(found.scene.pieces, room.things, strict=True):
+        verts = place_piece(piece).verts.double().numpy()
+        assert verts.shape == thing.verts.shape
+        gaps.append(np.abs(verts - thing.world).max())
+    return float(max(gaps))
+
+
+def tilt_error(found: Capture, room: layouts.Room) -> float:
+    mine = pitch_roll(found.scene.camera.R_cam_world)
+    true = pitch_roll(torch.from_numpy(room.R))
+    return max(abs(float(a) - float(b)) for a, b in zip(mine, true, strict=True))
+
+
+def camera_at(room: layouts.Room) -> At:
+    fields = {"w": room.size[0], "h": room.size[1], "fl_x": room.K[0, 0], "fl_y": room.K[1, 1],
+              "cx": room.K[0, 2], "cy": room.K[1, 2], "R_cam_world": room.R.tolist()}  # fmt: skip
+    return At(fields, "camera")
+
+
+@pytest.mark.parametrize(("flat", "kind"), [(False, "obj"), (True, "obj"), (False, "ply")])
+def test_total3d_gives_the_room_back(
+    plain: layouts.Room, tmp_path: Path, flat: bool, kind: str
+) -> None:
+    source = layouts.write_total3d(tmp_path / "in", plain, flat=flat, kind=kind)
+    found = capture_of("total3d", source, tmp_path)
+    assert worst(found, plain) < FINE
+    assert tilt_error(found, plain) < FINE
+    assert found.scene.ground == pytest.approx(plain.ground, abs=1e-5)
+    assert overlap(found.scene, found.detections) == pytest.approx(1, abs=1e-3)
+
+
+def test_total3d_numbers_are_numbers_not_words(plain: layouts.Room, tmp_path: Path) -> None:
+    many = dataclasses.replace(plain, things=[plain.things[i % 4] for i in range(12)])
+    moved = [
+        dataclasses.replace(t, t=t.t + np.array([0.01 * i, 0, 0]))
+        for i, t in enumerate(many.things)
+    ]
+    many = dataclasses.replace(many, things=moved)
+    source = layouts.write_total3d(tmp_path / "in", many)
+    assert worst(capture_of("total3d", source, tmp_path), many) < FINE
+
+
+@pytest.mark.parametrize("kind", ["npz", "json"])
+def test_sam_3d_objects_gives_the_room_back_with_the_tilt_of_its_objects(
+    plain: layouts.Room, tmp_path: Path, kind: str
+) -> None:
+    source = layouts.write_sam3d(tmp_path / "in", plain, kind=kind)
+    level = At({k: v for k, v in camera_at(plain).value.items() if k != "R_cam_world"}, "lens")
+    found = capture_of("sam3d", source, tmp_path, camera=level)
+    assert tilt_error(found, plain) < FINE
+    assert worst(found, plain) < FINE
+    assert [p.category for p in found.scene.pieces] == [t.category for t in plain.things]
+
+
+def test_meshes_that_sam_3d_has_placed_lie_where_they_are(
+    plain: layouts.Room, tmp_path: Path
+) -> None:
+    source = layouts.write_sam3d(tmp_path / "in", plain, placed=True)
+    found = capture_of("sam3d", source, tmp_path, camera=camera_at(plain))
+    assert worst(found, plain) < FINE
+
+
+def test_gen3dsr_gives_the_room_back_under_any_pose(plain: layouts.Room, tmp_path: Path) -> None:
+    c2w = np.eye(4)
+    c2w[:3, :3] = layouts.Rotation.from_euler("xyz", [0.3, -0.5, 0.2]).as_matrix()
+    c2w[:3, 3] = [1, 2, 3]
+    for name, pose in (("still", None), ("moved", c2w)):
+        tmp = tmp_path / name
+        source = layouts.write_gen3dsr(tmp / "in", plain, pose)
+        found = capture_of("gen3dsr", source, tmp, camera=camera_at(plain))
+        order = [f"{i}_{t.category}" for i, t in enumerate(plain.things)]
+        assert [p.id for p in found.scene.pieces] == order
+        assert worst(found, plain) < FINE
+        assert float(found.scene.camera.K[0, 2]) == pytest.approx(plain.K[0, 2], abs=1e-4)
+
+
+def test_gen3dsr_boxes_are_as_tight_as_the_true_ones_and_seats_face_forward(
+    plain: layouts.Room, tmp_path: Path
+) -> None:
+    source = layouts.write_gen3dsr(tmp_path / "in", plain)
+    found = capture_of("gen3dsr", source, tmp_path, camera=camera_at(plain))
+    for piece, thing in zip(found.scene.pieces, plain.things, strict=True):
+        low, high = thing.verts.min(0), thing.verts.max(0)
+        true = float(np.prod(thing.scale * (high - low)))
+        assert float(box_of(piece).size.prod()) <= 1.02 * true
+        if thing.name.startswith(("chair", "sofa")):
+            turn = float(piece.yaw) - thing.yaw
+            assert abs(math.atan2(math.sin(turn), math.cos(turn))) < 0.05, thing.name
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "z"])
+@pytest.mark.parametrize("camera", [True, False])
+def test_a_gltf_scene_gives_the_room_back_whichever_way_is_up(
+    plain: layouts.Room, tmp_path: Path, up: str, camera: bool
+) -> None:
+    turns = {"y": np.eye(3), "-y": layouts.FLIP, "z": layouts.Z_UP}
+    world = np.eye(4)
+    world[:3, :3] = turns[up]
+    if camera:
+        world[:3, 3] = [0.5, -2, 3]
+    source = layouts.write_glb(tmp_path / "in.glb", plain, world, camera)
+    given = {} if camera else {"camera": camera_at(plain)}
+    found = capture_of("glb", source, tmp_path, up=up, **given)
+    order = {p.id: p for p in found.scene.pieces}
+    pieces = tuple(order[t.name] for t in plain.things)
+    found = dataclasses.replace(found, scene=dataclasses.replace(found.scene, pieces=pieces))
+    assert worst(found, plain) < FINE
+    assert tilt_error(found, plain) < FINE
+    assert all(
+        float(p.scale[0]) == pytest.approx(t.scale[0], abs=1e-5)
+        for p, t in zip(pieces, plain.things, strict=True)
+    )
+
+
+@pytest.mark.parametrize("frame", ["y", "-y", "z", "camera"])
+def test_boxes_come_back_with_furniture_of_their_class(
+    plain: layouts.Room, tmp_path: Path, frame: str
+) -> None:
+    source = layouts.write_boxes(tmp_path / "in.json", plain, frame=frame)
+    found = capture_of("boxes", source, tmp_path)
+    assert tilt_error(found, plain) < FINE
+    for piece, thing in zip(found.scene.pieces, plain.things, strict=True):
+        mine = box_of(piece)
+        low, high = thing.verts.min(0), thing.verts.max(0)
+        centre = layouts.about_y(thing.yaw) @ (thing.scale * (low + high) / 2) + thing.t
+        assert np.allclose(mine.center.numpy(), centre, atol=FINE)
+        assert np.allclose(mine.size.numpy(), thing.scale * (high - low), atol=FINE)
+        assert math.cos(float(piece.yaw) - thing.yaw) == pytest.approx(1, abs=1e-6)
+        assert len(piece.mesh.faces) > 12
+    assert all(p.annotation is not None for p in found.scene.pieces)
+
+
+@pytest.mark.parametrize(
+    ("turn", "word"),
+    [
+        (np.diag([-1.0, 1, 1]), "mirrored"),
+        (np.diag([1.0, -1, -1]), "upside down"),
+        (layouts.Z_UP, "its side"),
+    ],
+)
+def test_a_scene_in_another_world_is_told_by_name(
+    plain: layouts.Room, tmp_path: Path, turn: np.ndarray, word: str
+) -> None:
+    world = np.eye(4)
+    world[:3, :3] = turn
+    right = layouts.write_total3d(tmp_path / "t3d", plain)
+    detections = capture_of("total3d", right, tmp_path / "a").detections
+    boxes = {t.name: d.box for t, d in zip(plain.things, detections, strict=True)}
+    source = layouts.write_glb(tmp_path / "in.glb", plain, world, camera=False)
+    found = capture_of("glb", source, tmp_path / "b", camera=camera_at(plain))
+    pieces = tuple(dataclasses.replace(p, annotation=i) for i, p in enumerate(found.scene.pieces))
+    seen = tuple(
+        dataclasses.replace(detections[0], id=i, box=boxes[p.id]) for i, p in enumerate(pieces)
+    )
+    told = odd_world(dataclasses.replace(found.scene, pieces=pieces), seen)
+    assert told is not None
+    assert word in told
+
+
+def test_a_right_scene_is_not_called_odd(plain: layouts.Room, tmp_path: Path) -> None:
+    found = capture_of("total3d", layouts.write_total3d(tmp_path / "in", plain), tmp_path)
+    assert odd_world(found.scene, found.detections) is None
+
+
+def test_a_tilted_object_stands_upright_about_its_centre(
+    plain: layouts.Room, tmp_path: Path
+) -> None:
+    world = np.eye(4)
+    world[:3, :3] = layouts.Rotation.from_euler("x", 8, degrees=True).as_matrix()
+    source = layouts.write_glb(tmp_path / "in.glb", plain, world, camera=False)
+    result = imported("glb", source, tmp_path / "out", tmp_path, camera=camera_at(plain))
+    assert result.capture is not None
+    assert sum("a tilt of" in note for note in result.notes) == len(plain.things)
+    for piece in result.capture.scene.pieces:
+        thing = next(t for t in plain.things if t.name == piece.id)
+        low, high = thing.verts.min(0), thing.verts.max(0)
+        centre = layouts.about_y(thing.yaw) @ (thing.scale * (low + high) / 2) + thing.t
+        assert np.allclose(box_of(piece).center.numpy(), world[:3, :3] @ centre, atol=FINE)
+
+
+def test_the_release_of_the_authors_comes_back_with_their_result_and_the_truth(
+    plain: layouts.Room, tmp_path: Path
+) -> None:
+    tetra = np.array([[0, 0, 3.0], [0.3, 0, 3], [0, 0.9, 3], [0, 0, 3.3]])
+    bodies = np.stack([tetra + np.array([0.1 * i, 0, 0]) for i in range(4)])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    source = layouts.write_release(tmp_path / "in", plain, bodies, faces)
+    found = capture_of("release", source, tmp_path)
+    assert worst(found, plain) < FINE
+    assert found.bodies is not None
+    assert np.allclose(found.bodies.verts.numpy(), bodies, atol=FINE)
+    assert found.bodies.frame.tolist() == [0, 1, 2, 3]
+    assert found.people is not None
+    assert found.people.frame.tolist() == [0, 1, 2, 3]
+    assert found.touch is not None
+    assert found.touch[:, 0].tolist() == [0, 0.25, 0.5, 0.75]
+    assert sorted(p.name for p in (tmp_path / "out" / "frames").iterdir())[0] == "000000.jpg"
+    check_truth(tmp_path / "out" / "truth", plain)
+    from mover.readers.scene_file import read_scene
+
+    authors = read_scene(tmp_path / "out" / "authors" / "scene.json")
+    for piece, thing in zip(authors.pieces, plain.things, strict=True):
+        assert np.abs(place_piece(piece).verts.numpy() - thing.world).max() < FINE
+
+
+def check_truth(folder: Path, plain: layouts.Room) -> None:
+    """True boxes are those of the room, and so is its floor."""
+    from mover.readers.scene_file import read_scene
+
+    truth = read_scene(folder / "scene.json")
+    assert truth.ground == pytest.approx(plain.ground, abs=0.02)
+    assert tilt_error_of(truth.camera.R_cam_world, plain) < FINE
+    known = {t.name: t for t in plain.things}
+    assert len(truth.pieces) == len(known)
+    for piece, thing in zip(truth.pieces, plain.things, strict=True):
+        low, high = thing.verts.min(0), thing.verts.max(0)
+        size = torch.from_numpy(thing.scale * (high - low)).float()
+        centre = layouts.about_y(thing.yaw) @ (thing.scale * (low + high) / 2) + thing.t
+        mine = box_of(piece)
+        true = type(mine)(torch.from_numpy(centre).float(), size, torch.tensor(thing.yaw).float())
+        assert float(iou3d(mine, true)) > 1 - COARSE
+
+
+def tilt_error_of(R: torch.Tensor, room: layouts.Room) -> float:
+    pairs = zip(pitch_roll(R), pitch_roll(torch.from_numpy(room.R)), strict=True)
+    return max(abs(float(a) - float(b)) for a, b in pairs)
+
+
+def test_a_scene_needs_a_camera(plain: layouts.Room, tmp_path: Path) -> None:
+    source = layouts.write_glb(tmp_path / "in.glb", plain, camera=False)
+    with pytest.raises(InputError, match="--camera"):
+        imported("glb", source, tmp_path / "out", tmp_path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_mesh_without_pose_in_its_own_frame_is_refused(
+    plain: layouts.Room, tmp_path: Path
+) -> None:
+    source = layouts.write_sam3d(tmp_path / "in", plain)
+    (source / "1.npz").unlink()
+    with pytest.raises(InputError, match=r"1\.npz or 1\.json"):
+        imported("sam3d", source, tmp_path / "out", tmp_path, camera=camera_at(plain))

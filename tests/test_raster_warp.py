@@ -1,0 +1,283 @@
+"""The Warp rasteriser against the torch rasteriser, itself, and input that must not hurt."""
+
+import gc
+import os
+import subprocess
+import sys
+import weakref
+
+import pytest
+import torch
+import trimesh
+from test_raster import PINHOLE, edges_of, packed, posed, poses, slab, window
+
+from mover.geometry import (
+    raster,
+    raster_engine,
+    raster_torch,
+    raster_warp,
+    raster_warp_cpu,
+    raster_warp_cuda,
+)
+from mover.geometry.raster import Topology, Views
+from mover.geometry.raster_engine import engine, threads, use_engine, use_threads
+
+wp = pytest.importorskip("warp")
+NAMES = ["sphere", "torus", "chair", "table", "sofa"]
+
+
+@pytest.fixture(params=["a thread an item", "a thread an element"])
+def driver(request, monkeypatch):
+    """Both ways to launch the kernels; the second is that of a GPU, on the CPU."""
+    if request.param == "a thread an element":
+        monkeypatch.setattr(raster_warp, "_driver", lambda _: raster_warp_cuda)
+    return request.param
+
+
+def scene(names=NAMES, size=96, seed=0, starts=1):
+    """Vertices in camera axes, topology and windows of some shapes."""
+    verts, shape = packed(names, extra=5)
+    verts_cam = posed(verts, poses(starts, len(names), seed))
+    return verts_cam if starts > 1 else verts_cam[0], shape, window(verts_cam, size)
+
+
+def pulled(drawer, verts_cam, shape, views, seed=0):
+    """Silhouette, depths and the gradient of a random mean of all of them."""
+    free = verts_cam.clone().requires_grad_()
+    image, seen = drawer.look(free, shape, views)
+    r = torch.Generator().manual_seed(seed)
+    maps = (image, seen.nearest, seen.farthest)
+    weights = [torch.randn(image.shape, generator=r).to(image) for _ in maps]
+    sum((m * w).sum() for m, w in zip(maps, weights, strict=True)).backward()
+    return image.detach(), seen.nearest.detach(), seen.farthest.detach(), seen.covered, free.grad
+
+
+class TestAgreement:
+    @pytest.mark.usefixtures("driver")
+    @pytest.mark.parametrize("seed", [0, 1, 2])
+    @pytest.mark.parametrize("size", [33, 128])
+    def test_depths_and_gradients_are_those_of_torch_in_double_precision(self, size, seed):
+        verts_cam, shape, views = scene(size=size, seed=seed)
+        found = pulled(raster_warp, verts_cam, shape, views)
+        exact = pulled(raster_torch, verts_cam.double(), shape, views)
+        assert torch.equal(found[3], exact[3])
+        for values, truth in zip(found[1:3], exact[1:3], strict=True):
+            torch.testing.assert_close(values.double(), truth, atol=1e-5, rtol=0)
+        for mine, truth in zip(found[4], exact[4], strict=True):
+            assert (mine - truth).norm() <= 1e-3 * truth.norm()
+
+    @pytest.mark.usefixtures("driver")
+    def test_silhouettes_have_the_bits_of_torch(self):
+        verts_cam, shape, views = scene(size=150, starts=3)
+        image = raster_warp.look(verts_cam, shape, views, depth=False)[0]
+        assert torch.equal(image, raster_torch.look(verts_cam, shape, views, depth=False)[0])
+
+    @pytest.mark.usefixtures("driver")
+    @pytest.mark.parametrize("shift", [0.0, 0.5, 1e-6])
+    def test_edges_through_pixel_centres_are_decided_as_by_torch(self, shift):
+        """Both test centres with the same operations, so not even a tie may differ."""
+        verts, shape = slab((9.5 + shift, 5.5), (21.5, 20.5 + shift), 2.0, 2.5, PINHOLE)
+        views = Views(PINHOLE[None], 32, 32)
+        verts = verts[None].float()
+        found, truth = (pulled(r, verts, shape, views) for r in (raster_warp, raster_torch))
+        assert torch.equal(found[0], truth[0])
+        assert torch.equal(found[3], truth[3])
+        torch.testing.assert_close(found[4], truth[4], atol=1e-3, rtol=1e-3)
+
+    @pytest.mark.usefixtures("driver")
+    def test_first_hits_have_the_bits_of_torch(self):
+        verts_cam, shape, views = scene(["chair"], 70)
+        inputs = verts_cam[0], shape.faces[0], views.K[0], (60, 70)
+        for values, truth in zip(
+            raster_warp.first_hit(*inputs), raster_torch.first_hit(*inputs), strict=True
+        ):
+            assert torch.equal(values, truth)
+
+    @pytest.mark.usefixtures("driver")
+    def test_a_triangle_across_the_window_is_shared_by_rows(self):
+        verts = torch.tensor([[-9.0, 1, 9], [9, 1, 9], [0, 1, 0.5], [0, 2, 5]])
+        faces = torch.tensor([[0, 1, 2], [0, 2, 3], [2, 1, 3], [1, 0, 3]])
+        inputs = verts[None], Topology(faces[None], edges_of(faces)[None])
+        views = Views(PINHOLE[None] * torch.tensor([[4.0], [4], [1]]), 200, 130)
+        found, truth = (pulled(r, *inputs, views) for r in (raster_warp, raster_torch))
+        assert found[3].float().mean() > 0.2
+        for values, expected in zip(found[:4], truth[:4], strict=True):
+            torch.testing.assert_close(values, expected, atol=1e-5, rtol=0)
+        torch.testing.assert_close(found[4], truth[4], rtol=1e-3, atol=1e-3)
+
+    def test_parts_too_long_to_count_are_drawn_one_after_the_other(self, monkeypatch):
+        verts_cam, shape, views = scene(["chair", "sphere"], 40, starts=3)
+        whole = pulled(raster_warp, verts_cam, shape, views)
+        monkeypatch.setattr(raster_warp, "MOST", 1)
+        for part, expected in zip(pulled(raster_warp, verts_cam, shape, views), whole, strict=True):
+            assert torch.equal(part, expected)
+
+    def test_numbers_of_vertices_may_be_short(self):
+        verts_cam, shape, views = scene(["table"], 50)
+        short = Topology(shape.faces.int(), shape.edges.int())
+        assert torch.equal(
+            raster_warp.look(verts_cam, short, views)[0],
+            raster_warp.look(verts_cam, shape, views)[0],
+        )
+
+
+class TestRepetition:
+    def test_any_number_of_threads_gives_the_same_bits(self):
+        verts_cam, shape, views = scene(size=128, starts=2)
+        runs = []
+        for count in (1, 2, 3, 2):
+            with use_threads(count):
+                runs.append(pulled(raster_warp, verts_cam, shape, views))
+        for run in runs[1:]:
+            for values, expected in zip(run, runs[0], strict=True):
+                assert torch.equal(values, expected)
+
+    def test_working_memory_is_left_clean_for_smaller_and_larger_windows(self):
+        inputs = [scene(NAMES[i:], size) for i, size in enumerate((64, 128, 31))]
+        alone = []
+        for args in inputs:
+            vars(raster_warp_cpu._own).clear()
+            alone.append(pulled(raster_warp, *args))
+        for args, expected in zip(inputs, alone, strict=True):
+            for values, truth in zip(pulled(raster_warp, *args), expected, strict=True):
+                assert torch.equal(values, truth)
+
+    def test_images_are_freed_without_the_garbage_collector(self):
+        verts_cam, shape, views = scene(["chair"], 32)
+        gc.disable()
+        try:
+            image, seen = raster_warp.look(verts_cam.requires_grad_(), shape, views)
+            ghosts = [weakref.ref(image), weakref.ref(seen.nearest)]
+            del image, seen
+            assert all(ghost() is None for ghost in ghosts)
+        finally:
+            gc.enable()
+
+
+class TestBadInput:
+    """What `test_raster` asks of every engine is not repeated here."""
+
+    @pytest.mark.usefixtures("driver")
+    @pytest.mark.parametrize(
+        ("factor", "shift"),
+        [(1, (0, 0, -3)), (1, (80, 0, 0)), (1e4, (0, 0, 0)), (1e12, (0, 0, 0)), (1e-9, (0, 0, 0))],
+    )
+    def test_objects_out_of_sight_draw_nothing_that_is_not_finite(self, factor, shift):
+        verts, shape = packed(["chair"])
+        verts = verts * factor + torch.tensor([0, 0, 3.0]) + torch.tensor(shape and shift)
+        views = Views(PINHOLE[None], 32, 32)
+        found, truth = (pulled(r, verts, shape, views) for r in (raster_warp, raster_torch))
+        for values, expected in zip(found[:4], truth[:4], strict=True):
+            torch.testing.assert_close(values, expected, atol=1e-5, rtol=1e-5)
+        assert torch.isfinite(found[4]).all()
+        verts[0, 0] = torch.nan
+        for values in pulled(raster_warp, verts, shape, views)[:3]:
+            assert torch.isfinite(values).all()
+
+    @pytest.mark.usefixtures("driver")
+    def test_one_triangle_is_drawn(self):
+        verts = torch.tensor([[[-0.3, -0.2, 2.0], [0.04, 0.33, 1.9], [0.31, -0.14, 2.1]]])
+        shape = Topology(torch.tensor([[[0, 1, 2]]]), torch.zeros(1, 0, 4, dtype=torch.int64))
+        K = PINHOLE * torch.tensor([[4.0], [4.0], [1.0]])
+        image = raster_warp.look(verts, shape, Views(K[None], 128, 128), depth=False)[0]
+        uv = (verts[0] @ K.T)[:, :2] / verts[0, :, 2:]
+        area = torch.linalg.det(uv[1:] - uv[0]).abs().item() / 2
+        assert image.sum().item() == pytest.approx(area, rel=0.01)
+        assert ((image == 0) | (image == 1)).all()  # no edge, no antialiasing
+
+    @pytest.mark.usefixtures("driver")
+    def test_no_objects_give_empty_images(self):
+        verts_cam, shape, views = scene(["chair"], 16)
+        none = Topology(shape.faces[:0], shape.edges[:0])
+        image, seen = raster_warp.look(verts_cam[:0], none, Views(views.K[:0], 8, 9))
+        assert image.shape == seen.covered.shape == (0, 8, 9)
+
+    def test_a_window_of_4k_is_drawn(self):
+        verts_cam, shape, views = scene(["chair"], 2160)
+        K = views.K + torch.tensor([[0, 0, 840.0], [0, 0, 0], [0, 0, 0]])
+        image, seen = raster_warp.look(verts_cam, shape, Views(K, 2160, 3840))
+        small = raster_warp.look(verts_cam, shape, scene(["chair"], 216)[2])[0]
+        assert image.sum().item() == pytest.approx(100 * small.sum().item(), rel=0.01)
+        assert torch.isfinite(seen.nearest).all()
+
+    @pytest.mark.slow
+    def test_half_a_million_faces_are_drawn(self):
+        mesh = trimesh.creation.icosphere(8, 0.6)
+        while len(mesh.faces) < 500_000:
+            mesh = mesh.subdivide()
+        faces = torch.tensor(mesh.faces)[None]
+        verts = torch.tensor(mesh.vertices, dtype=torch.float32)[None] + torch.tensor([0, 0, 3.0])
+        shape = Topology(faces, torch.zeros(1, 0, 4, dtype=torch.int64))
+        free = verts.requires_grad_()
+        image, seen = raster_warp.look(free, shape, window(verts, 256))
+        (image.sum() + seen.nearest.sum()).backward()
+        assert torch.isfinite(free.grad).all()
+        assert seen.nearest.max() < 3.01
+
+
+class TestEngine:
+    def test_the_block_wins_over_the_environment_and_that_over_auto(self, monkeypatch):
+        monkeypatch.delenv("MOVER_ENGINE", raising=False)
+        assert engine() == "warp"
+        monkeypatch.setenv("MOVER_ENGINE", "torch")
+        assert engine() == "torch"
+        with use_engine("warp"):
+            assert engine() == "warp"
+        with use_engine("auto"):
+            assert engine() == "warp"
+        assert engine() == "torch"
+
+    def test_an_unknown_engine_is_refused_with_the_choices(self, monkeypatch):
+        monkeypatch.setenv("MOVER_ENGINE", "cuda")
+        with pytest.raises(ValueError, match="'cuda', expected one of auto, torch, warp"):
+            engine()
+
+    def test_without_warp_auto_is_torch(self, monkeypatch):
+        monkeypatch.delenv("MOVER_ENGINE", raising=False)
+        monkeypatch.setattr(raster_engine, "_has_warp", lambda: False)
+        assert engine() == "torch"
+
+    @pytest.mark.parametrize(("asked", "count"), [("3", 3), ("0", None), ("many", None)])
+    def test_threads_are_those_of_openmp_else_one_a_core(self, asked, count, monkeypatch):
+        monkeypatch.setenv("OMP_NUM_THREADS", asked)
+        assert threads() == (count or raster_engine._cores())
+        with use_threads(5):
+            assert threads() == 5
+
+    def test_what_warp_cannot_draw_goes_to_torch(self):
+        verts_cam, shape, views = scene(["sphere"], 24)
+        K = views.K.clone().requires_grad_()
+        with use_engine("warp"):
+            image = raster.look(verts_cam, shape, Views(K, 24, 24))[0]
+            image.square().sum().backward()
+            assert K.grad.abs().sum() > 0
+            assert raster.look(verts_cam.double(), shape, views)[0].dtype == torch.float64
+
+    @pytest.mark.slow
+    def test_drawing_says_nothing(self):
+        code = (
+            "import torch; from mover.geometry.raster import *;"
+            "e = torch.zeros(1, 0, 4).long(); f = torch.tensor([[[0, 1, 2]]]);"
+            "v = torch.tensor([[[0., 0, 2], [0, 1, 2], [1, 0, 2]]]);"
+            "K = torch.tensor([[[9., 0, 8], [0, 9, 8], [0, 0, 1]]]);"
+            "assert look(v, Topology(f, e), Views(K, 16, 16))[0].sum() > 5"
+        )
+        env = {**os.environ, "MOVER_ENGINE": "warp"}
+        done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+    @pytest.mark.slow
+    def test_kernels_compile_for_an_h100_without_a_driver(self, tmp_path):
+        code = (
+            "import sys, warp as wp; from mover.geometry.kernels import grid;"
+            "90 in wp.get_cuda_supported_archs() or sys.exit(77);"
+            "wp.compile_aot_module(grid, arch=90, module_dir=sys.argv[1], use_ptx=True)"
+        )
+        done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True)
+        if done.returncode == 77:
+            pytest.skip("this build of Warp has no CUDA compiler")
+        assert done.returncode == 0, done.stderr.decode()
+        text = "".join(p.read_text() for p in tmp_path.glob("*.ptx"))
+        assert ".target sm_90" in text
+        for name in ("draw_tall", "enter_cuts", "keep_cuts", "show", "pull_cuts", "pull_pixels"):
+            assert f".entry {name}_" in text

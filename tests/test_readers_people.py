@@ -1,0 +1,556 @@
+"""People from today's tools: joints fall on their pixels, up stays up, left stays left."""
+
+import json
+import os
+import pickle
+import types
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import make_people as made
+import make_smpl
+import numpy as np
+import pytest
+import torch
+
+from mover import commands
+from mover.bodies import BODY_MODELS, load_model
+from mover.bodies.skeleton import JOINTS
+from mover.geometry.camera import project
+from mover.readers.bodies_file import read_bodies, write_bodies
+from mover.readers.camera_file import camera_of
+from mover.readers.fields import At
+from mover.readers.people import (
+    BODIES_FROM,
+    KEYPOINTS_FROM,
+    Known,
+    as_openpose,
+    attitude,
+    bodies_from,
+    camera_from,
+    in_world,
+    keypoints_from,
+    read_keypoints,
+    write_keypoints,
+)
+from mover.records import InputError
+from mover.types import BodyPose, Keypoints
+
+pytest.importorskip("joblib", reason="the fixtures are written by joblib, as the tools do")
+
+CAMERA = camera_of(At(made.camera_json(), "camera.json"))
+KNOWN = Known(camera=CAMERA)
+GRAVITY = ("gem", "gvhmr", "prompthmr", "slahmr", "tram", "wham", "wham:python")
+GAPLESS = ("gvhmr", "gem", "mover")  # files whose rows are all frames of a video
+MODELS = {"sam3dbody": "smplx", "slahmr": "smplh"} | dict.fromkeys(
+    ("gem", "gvhmr", "mover", "multihmr", "prompthmr", "prox", "smplifyx"), "smplx"
+)
+
+
+@dataclass(frozen=True)
+class Toy:
+    """The fixtures' body as a model of the package."""
+
+    name: str
+
+    @property
+    def faces(self) -> torch.Tensor:
+        return torch.from_numpy(made.flesh(self.name)[2])
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(JOINTS[k] if k < 22 else f"part{k}" for k in range(self.count))
+
+    @property
+    def count(self) -> int:
+        return made.COUNTS[self.name][0]
+
+    def posed(self, pose: BodyPose) -> tuple[torch.Tensor, torch.Tensor]:
+        angles = np.zeros((len(pose.transl), self.count, 3))
+        body = pose.body_pose.shape[1] // 3
+        angles[:, 0] = pose.global_orient
+        angles[:, 1 : 1 + body] = pose.body_pose.reshape(-1, body, 3)
+        flat = "flat_hand_mean" in pose.extra
+        if self.name == "smplx":
+            for start, name in ((25, "left_hand_pose"), (40, "right_hand_pose")):
+                if name in pose.extra:
+                    angles[:, start : start + 15] = pose.extra[name].reshape(-1, 15, 3)
+        given = pose.transl.numpy(), pose.betas.numpy()
+        verts, joints = made.posed(self.name, angles, *given, flat_hands=flat)
+        return torch.from_numpy(verts).float(), torch.from_numpy(joints).float()
+
+
+@pytest.fixture(autouse=True)
+def models(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in made.COUNTS:
+        monkeypatch.setitem(BODY_MODELS, name, lambda _, name=name: Toy(name))
+
+
+@pytest.fixture
+def faces(tmp_path: Path) -> Path:
+    """A mesh file with the triangles of the SMPL-X toy."""
+    path = tmp_path / "faces.ply"
+    import trimesh
+
+    verts = made.person("smplx")["verts"][0]
+    trimesh.Trimesh(verts, made.flesh("smplx")[2], process=False).export(path)
+    return path
+
+
+def imported(tool: str, folder: Path, faces: Path, **known: Any):
+    source = folder / "source"
+    source.mkdir()
+    path = made.BODIES[tool](source)
+    more = {"faces": faces} if tool == "sam3dbody" else {}
+    return bodies_from(tool.split(":")[0], path, replace(KNOWN, **more, **known))
+
+
+def seen(points: torch.Tensor) -> np.ndarray:
+    return project(points, CAMERA.K).numpy()
+
+
+@pytest.mark.parametrize("tool", made.BODIES)
+def test_bodies_fall_on_their_pixels_upright_and_not_mirrored(tool, tmp_path, faces):
+    found = imported(tool, tmp_path, faces)
+    model = MODELS.get(tool, "smpl")
+    true, bodies = made.person(model), found.bodies
+    assert found.warnings == () or tool == "slahmr"  # whose fixture has NaN
+    near = bodies.verts[..., 2].mean(1).argmin()  # SAM 3D Body's fixture has another behind
+    rows = bodies.person == bodies.person[near]
+    assert bodies.space == "camera"
+    expected = range(5) if tool in GAPLESS else made.FRAMES.tolist()
+    assert bodies.frame[rows].tolist() == list(expected)
+    _, owner, _ = made.flesh(model)
+    body = owner < 22  # GVHMR knows no hands
+    verts = bodies.verts[rows]
+    off = seen(verts)[:, body] - made.pixels(true["verts"])[:, body]
+    assert np.linalg.norm(off, axis=-1).max() < 1
+    assert np.abs(verts.numpy()[:, body] - true["verts"][:, body]).max() < 2e-3
+    up = torch.from_numpy(made.camera_matrix()[:, 1]).float()
+    part = [verts[:, owner == joint].mean(1) for joint in (15, 7, 20, 21)]
+    head, foot, left, right = (p @ up for p in part)
+    assert (head - foot > 1.2).all()
+    assert (left - head > 0.2).all()  # the left arm is raised, the right one hangs
+    assert (head - right > 0.2).all()
+    assert (seen(part[2])[:, 0] > seen(part[3])[:, 0]).all()  # and they face the camera
+
+
+@pytest.mark.parametrize("tool", [t for t in made.BODIES if t != "sam3dbody"])
+def test_parameters_are_kept_and_give_the_same_meshes(tool, tmp_path, faces):
+    bodies = imported(tool, tmp_path, faces).bodies
+    model = MODELS.get(tool, "smpl")
+    assert bodies.pose is not None
+    assert bodies.pose.model == model
+    verts, joints = Toy(model).posed(bodies.pose)
+    assert torch.allclose(verts, bodies.verts, atol=2e-3)
+    off = seen(joints[:, :22]) - made.person(model)["pixels"][:, :22]
+    assert np.linalg.norm(off, axis=-1).max() < 1
+    assert bodies.joints is not None
+    assert torch.allclose(joints, bodies.joints, atol=2e-3)
+
+
+@pytest.mark.parametrize("tool", GRAVITY)
+def test_gravity_of_the_tool_is_the_cameras_pitch_and_roll(tool, tmp_path, faces):
+    found = imported(tool, tmp_path, faces)
+    assert found.up is not None
+    assert attitude(found.up) == pytest.approx((made.PITCH, made.ROLL), abs=1e-3)
+    world = in_world(found, "file")
+    expected = made.person(MODELS.get(tool, "smpl"))["verts"] @ made.camera_matrix()
+    _, owner, _ = made.flesh(MODELS.get(tool, "smpl"))
+    error = np.abs(world.verts.numpy() - expected)[:, owner < 22]
+    assert world.space == "world"
+    assert error.max() < 0.01
+    assert np.allclose(camera_from(found, KNOWN).R_cam_world, made.camera_matrix(), atol=1e-3)
+
+
+@pytest.mark.parametrize("tool", [t for t in made.BODIES if ":" not in t])
+def test_what_is_written_is_read_again(tool, tmp_path, faces):
+    bodies = imported(tool, tmp_path, faces, fps=30.0).bodies
+    write_bodies(bodies, tmp_path / "bodies.npz")
+    warnings: list[str] = []
+    again = read_bodies(tmp_path / "bodies.npz", warnings.append)
+    assert torch.equal(again.verts, bodies.verts)
+    assert again.frame.tolist() == bodies.frame.tolist()
+    assert again.fps == 30.0
+
+
+def test_every_tool_has_a_fixture():
+    assert {name.split(":")[0] for name in made.BODIES} == set(BODIES_FROM)
+    assert {name.split(":")[0] for name in made.KEYPOINTS} == set(KEYPOINTS_FROM)
+
+
+@pytest.mark.parametrize("tool", ["phalp", "slahmr", "wham", "gvhmr", "tram", "smplifyx"])
+def test_without_the_true_lens_bodies_stay_where_the_tool_put_them(tool, tmp_path, faces):
+    bodies = imported(tool, tmp_path, faces, camera=None).bodies
+    used = {
+        "phalp": made.lens(25000), "wham": made.lens(1468.605), "gvhmr": made.lens(1468.605),
+        "tram": made.lens(900), "slahmr": made.K, "smplifyx": made.lens(5000),
+    }[tool]  # fmt: skip
+    true = made.person(MODELS.get(tool, "smpl"))
+    shift = made.under(used, true)
+    _, owner, _ = made.flesh(MODELS.get(tool, "smpl"))
+    off = bodies.verts.numpy() - true["verts"] - shift[:, None]
+    assert np.abs(off[:, owner < 22]).max() < 0.02
+
+
+def test_tracks_of_slahmr_are_those_that_its_side_file_names(tmp_path):
+    folder = made.write_slahmr(tmp_path)
+    mask = [frame in made.FRAMES for frame in range(7)]
+    tracks = {"12": {"index": 0, "vis_mask": mask}}
+    (tmp_path / "track_info.json").write_text(json.dumps({"tracks": tracks, "meta": {}}))
+    found = bodies_from("slahmr", folder, KNOWN)
+    assert found.warnings == ()
+    assert found.bodies.person.tolist() == [12] * 5
+
+
+def test_meshes_about_the_pelvis_give_transl_its_shift(tmp_path):
+    data = made.wham_person()
+    data["trans"] = data["trans"] + [0.0, 0.3, 0.0]  # parameters count from another origin
+    bodies = bodies_from("wham", made.dump({1: data}, tmp_path / "w.pkl"), KNOWN).bodies
+    assert bodies.pose is not None
+    verts, _ = Toy("smpl").posed(bodies.pose)
+    assert torch.allclose(verts, bodies.verts, atol=2e-3)
+
+
+def test_parameters_that_are_not_of_the_meshes_are_left_out(tmp_path):
+    data = made.wham_person()
+    data["pose"][:, 48] += 0.5
+    found = bodies_from("wham", made.dump({1: data}, tmp_path / "w.pkl"), KNOWN)
+    assert found.bodies.pose is None
+    assert any("miss the vertices" in warning for warning in found.warnings)
+
+
+def test_meshes_of_another_topology_are_refused(tmp_path):
+    data = made.wham_person()
+    data["verts"] = data["verts"][:, :-10]
+    with pytest.raises(InputError, match=r"verts.*20670"):
+        bodies_from("wham", made.dump({1: data}, tmp_path / "w.pkl"), KNOWN)
+
+
+def test_two_people_keep_their_tracks_though_each_image_lists_them_in_another_order(
+    tmp_path, faces
+):
+    bodies = imported("sam3dbody", tmp_path, faces).bodies
+    assert len(bodies.frame) == 10
+    depth = bodies.verts[..., 2].mean(1)
+    for person in (0, 1):
+        assert float(np.ptp(depth[bodies.person == person].numpy())) < 0.5
+    assert (depth[0] - depth[1]).abs() > 1
+
+
+def test_the_lens_follows_from_joints_where_the_focal_length_is_missing(tmp_path, faces):
+    source = tmp_path / "source"
+    source.mkdir()
+    made.write_sam3dbody(source, focal=False)
+    found = bodies_from("sam3dbody", source, Known(faces=faces))
+    assert found.K is not None
+    assert np.allclose(found.K, made.lens(1400), atol=0.5)
+
+
+def test_a_moving_camera_is_told(tmp_path):
+    folder = made.write_tram(tmp_path)
+    camera = np.load(folder / "camera.npy", allow_pickle=True).item()
+    camera["world_cam_T"] = camera["world_cam_T"] + np.linspace(0, 1, 7)[:, None]
+    np.save(folder / "camera.npy", camera, allow_pickle=True)
+    found = bodies_from("tram", folder, KNOWN)
+    assert any("travels 1.73 m" in warning for warning in found.warnings)
+
+
+def test_a_model_file_in_the_true_format_gives_meshes_and_keeps_flat_hands(tmp_path, monkeypatch):
+    monkeypatch.undo()
+    (tmp_path / "smplx").mkdir()
+    make_smpl.write_npz(make_smpl.make_model("smplx"), tmp_path / "smplx" / "SMPLX_NEUTRAL.npz")
+    monkeypatch.setenv("MOVER_BODY_MODELS", str(tmp_path))
+    true = made.person("smplx")
+    angles = torch.from_numpy(true["angles"]).float()
+    pose = BodyPose(
+        model="smplx", gender="neutral", betas=torch.zeros(5, 10),
+        global_orient=angles[:, 0], body_pose=angles[:, 1:22].flatten(1),
+        transl=torch.from_numpy(true["transl"]).float(),
+        extra={"left_hand_pose": angles[:, 25:40].flatten(1), "flat_hand_mean": torch.ones(5, 1),
+               "right_hand_pose": angles[:, 40:].flatten(1)},
+    )  # fmt: skip
+    verts, joints = load_model("smplx").posed(pose)
+    human = {
+        "shape": np.zeros(10), "expression": np.zeros(10), "v3d": verts[0].numpy(),
+        "rotvec": true["angles"][0, [0, *range(1, 22), *range(25, 55), 22]],
+        "transl_pelvis": joints[0, :1].numpy(),
+    }  # fmt: skip
+    found = bodies_from("multihmr", made.store([human], tmp_path / "000000.pkl"))
+    assert found.warnings == ()
+    assert found.bodies.joint_names[20] == "left_wrist"
+    write_bodies(found.bodies, tmp_path / "bodies.npz")
+    warnings: list[str] = []
+    again = read_bodies(tmp_path / "bodies.npz", warnings.append)
+    assert warnings == []  # the parameters in the file give the meshes in the file
+    assert again.pose is not None
+    assert torch.allclose(again.pose.transl, pose.transl[:1], atol=1e-4)
+
+
+# What is wrong is told with its file, its key and the keys that are there.
+
+
+def smplify_file(folder: Path, change: Any = None) -> Path:
+    data = {**made.smplx_parts(0), "camera_translation": np.array([[0, 0, 3.0]])}
+    return made.store(change(data) if change else data, folder / "000.pkl")
+
+
+def without(*names: str):
+    return lambda data: {k: v for k, v in data.items() if k not in names}
+
+
+def test_one_frame_is_enough(tmp_path):
+    bodies = bodies_from("smplifyx", smplify_file(tmp_path)).bodies
+    assert bodies.frame.tolist() == [0]
+
+
+def test_a_missing_key_is_told_with_the_keys_that_are_there(tmp_path):
+    path = smplify_file(tmp_path, without("body_pose"))
+    with pytest.raises(InputError, match=r"000\.pkl.*'body_pose'.*found 'betas', 'global_orient'"):
+        bodies_from("smplifyx", path)
+
+
+@pytest.mark.parametrize("tool", ["gvhmr", "slahmr", "wham", "phalp", "prompthmr", "multihmr"])
+def test_a_file_of_another_tool_is_told_with_its_keys(tool, tmp_path):
+    path = tmp_path / "some.pkl"
+    made.store({"one": {"strange": np.zeros(3)}}, path)
+    with pytest.raises(InputError, match=r"some\.pkl.*no key.*found '(one|strange)'"):
+        bodies_from(tool, path, KNOWN)
+
+
+def test_codes_of_vposer_are_refused_with_the_way_out(tmp_path):
+    path = smplify_file(tmp_path, lambda d: {**d, "body_pose": np.zeros((1, 32))})
+    with pytest.raises(InputError, match=r"32 numbers, expected 63 angles: .*VPoser"):
+        bodies_from("smplifyx", path)
+
+
+def test_frames_with_nan_are_left_out_and_told(tmp_path):
+    data = made.wham_person()
+    data["pose"][1, 5] = np.nan
+    data["verts"][1] = np.nan
+    path = made.dump({"7": data}, tmp_path / "wham_output.pkl")
+    found = bodies_from("wham", path, KNOWN)
+    assert found.bodies.frame.tolist() == [0, 2, 5, 6]
+    assert found.bodies.person.tolist() == [7] * 4
+    assert any("NaN in frame 1" in warning for warning in found.warnings)
+
+
+def test_only_nan_is_refused(tmp_path):
+    path = smplify_file(tmp_path, lambda d: {**d, "global_orient": np.full((1, 3), np.nan)})
+    with pytest.raises(InputError, match="only rows with NaN"):
+        bodies_from("smplifyx", path)
+
+
+def test_a_person_who_is_twice_in_a_frame_is_refused(tmp_path):
+    data = made.wham_person()
+    data["frame_ids"] = np.array([0, 1, 1, 2, 3])
+    with pytest.raises(InputError, match="person 3 twice in frame 1"):
+        bodies_from("wham", made.dump({3: data}, tmp_path / "w.pkl"), KNOWN)
+
+
+def test_matrices_that_are_no_rotations_are_refused(tmp_path):
+    folder = made.write_tram(tmp_path)
+    track = folder / "hps" / "hps_track_0.npy"
+    data = np.load(track, allow_pickle=True).item()
+    data["pred_rotmat"] = data["pred_rotmat"] * 1.2
+    np.save(track, data, allow_pickle=True)
+    with pytest.raises(InputError, match="expected rotation matrices"):
+        bodies_from("tram", folder, KNOWN)
+
+
+class Hostile:
+    def __reduce__(self):
+        return (os.system, ("touch owned",))
+
+
+@pytest.mark.parametrize("tool", ["smplifyx", "wham", "tram", "gvhmr", "multihmr", "phalp"])
+def test_hostile_pickles_are_refused_and_not_run(tool, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {"tram": "hps/hps_track_0.npy", "gvhmr": "hmr4d_results.pt"}
+    path = tmp_path / names.get(tool, "wham_output.pkl")
+    path.parent.mkdir(exist_ok=True)
+    if tool == "tram":
+        np.save(path, {"pred_rotmat": Hostile()}, allow_pickle=True)
+    elif tool == "gvhmr":
+        torch.save({"smpl_params_incam": Hostile()}, path)
+    else:
+        path.write_bytes(pickle.dumps({"betas": Hostile()}))
+    with pytest.raises(InputError, match=path.name):
+        bodies_from(tool, path, KNOWN)
+    assert not (tmp_path / "owned").exists()
+
+
+def test_an_npz_with_pickled_objects_is_refused(tmp_path):
+    path = tmp_path / "a_world_results.npz"
+    np.savez(path, trans=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(InputError, match=r"'trans' .*no pickled objects"):
+        bodies_from("slahmr", path)
+
+
+def test_a_missing_model_is_told_with_the_place_of_its_file(tmp_path, monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.delenv("MOVER_BODY_MODELS", raising=False)
+    with pytest.raises(InputError, match=r"'smplx'.*MOVER_BODY_MODELS.*SMPLX_NEUTRAL\.npz"):
+        bodies_from("smplifyx", smplify_file(tmp_path))
+
+
+def test_meshes_of_mhr_without_triangles_ask_for_them(tmp_path):
+    with pytest.raises(InputError, match="--faces"):
+        bodies_from("sam3dbody", made.write_sam3dbody(tmp_path), KNOWN)
+
+
+def test_pare_without_a_lens_asks_for_it(tmp_path):
+    with pytest.raises(InputError, match="--camera"):
+        bodies_from("pare", made.write_pare(tmp_path), Known())
+
+
+def test_an_unknown_tool_is_answered_with_the_known_ones(tmp_path):
+    with pytest.raises(ValueError, match="gvhmr"):
+        bodies_from("hmr", tmp_path)
+
+
+# Keypoints.
+
+
+@pytest.mark.parametrize("tool", made.KEYPOINTS)
+def test_keypoints_fall_on_the_joints_they_name(tool, tmp_path):
+    found = keypoints_from(tool.split(":")[0], made.KEYPOINTS[tool](tmp_path), Known(fps=30.0))
+    assert found.frame.tolist() == made.FRAMES.tolist()
+    assert len(found.person.unique()) == 1
+    whole = as_openpose(found)
+    assert whole.points.shape == (5, 137, 2)
+    true = made.person("smplx")["pixels"]
+    told = 0
+    for k, name in enumerate(made.OPENPOSE):
+        sure = whole.confidence[:, k] > 0
+        if name in made.SHOWN and sure.all():
+            expected = true[:, made.SHOWN[name]]
+            if name in ("neck", "mid_hip") and tool not in ("openpose", "halpe26"):
+                pair = ("shoulder",) if name == "neck" else ("hip",)
+                sides = [made.SHOWN[f"{side}_{p}"] for side in ("left", "right") for p in pair]
+                expected = true[:, sides].mean(1)
+            assert np.linalg.norm(whole.points[:, k].numpy() - expected, axis=-1).max() < 0.01, name
+            told += 1
+    assert told == (15 if tool == "coco17" else 17)
+    left, right = (whole.points[:, k, 1] for k in (7, 4))
+    assert (left < whole.points[:, 0, 1]).all()  # the left hand is above the nose
+    assert (right > whole.points[:, 0, 1]).all()
+    if tool in ("openpose", "wholebody"):
+        assert torch.allclose(whole.points[:, 25], whole.points[:, 7])  # the left hand's wrist
+        assert torch.allclose(whole.points[:, 46], whole.points[:, 4])
+    assert (whole.confidence[:, 67:] == 0).all()
+
+
+def test_keypoints_that_are_written_are_read_again(tmp_path):
+    found = keypoints_from("openpose", made.write_openpose(tmp_path), Known(fps=5.0))
+    write_keypoints(found, tmp_path / "keypoints.npz")
+    again = read_keypoints(tmp_path / "keypoints.npz")
+    assert torch.equal(again.points, found.points)
+    assert torch.equal(again.confidence, found.confidence)
+    assert (again.layout, again.fps) == ("openpose137", 5.0)
+
+
+def openpose(folder: Path, frame: int, *people: np.ndarray) -> None:
+    rows = [{"person_id": [-1], "pose_keypoints_2d": p.ravel().tolist()} for p in people]
+    text = json.dumps({"people": rows})
+    (folder / f"v_{frame:012d}_keypoints.json").write_text(text)
+
+
+def test_people_who_are_not_named_are_followed_over_a_gap(tmp_path):
+    one = made.seen(made.OPENPOSE)[0]
+    other = one + [400, 0, 0] * (one[:, 2:] > 0)
+    for frame, people in enumerate([(one, other), (other, one), (other,), (one, other)]):
+        openpose(tmp_path, frame, *people)
+    found = keypoints_from("openpose", tmp_path)
+    assert found.layout == "openpose25"
+    nose = found.points[:, 0, 0]
+    for person in (0, 1):
+        assert len(nose[found.person == person].unique()) == 1
+    assert found.person.tolist() == [0, 1, 0, 1, 1, 0, 1]
+
+
+def test_people_without_joints_are_left_out_and_nobody_is_refused(tmp_path):
+    openpose(tmp_path, 0, np.zeros((25, 3)), made.seen(made.OPENPOSE)[0])
+    assert len(keypoints_from("openpose", tmp_path).frame) == 1
+    openpose(tmp_path, 0, np.zeros((25, 3)))
+    with pytest.raises(InputError, match="no joints of anyone"):
+        keypoints_from("openpose", tmp_path)
+
+
+def test_joints_with_nan_are_missing(tmp_path):
+    rows = made.seen(made.COCO)
+    rows[0, 5] = np.nan
+    np.savez(tmp_path / "k.npz", keypoints=rows[..., :2], scores=rows[..., 2], frame=made.FRAMES)
+    found = keypoints_from("coco17", tmp_path / "k.npz")
+    assert found.confidence[0, 5] == 0
+    assert found.points.isfinite().all()
+
+
+def test_another_number_of_joints_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"keypoints.*expected 26 joints"):
+        keypoints_from("halpe26", made.write_coco17(tmp_path))
+    openpose(tmp_path, 0, np.ones((18, 3)))
+    with pytest.raises(InputError, match="expected 25 triples"):
+        keypoints_from("openpose", tmp_path / "v_000000000000_keypoints.json")
+
+
+def test_wrong_shapes_of_keypoints_are_refused():
+    with pytest.raises(Exception, match=r"shape|type"):
+        Keypoints(torch.zeros(2, 25, 2), torch.zeros(2, 24), "x", *torch.zeros(2, 2).long(), None)
+
+
+# The command.
+
+
+def test_the_command_writes_bodies_and_a_camera(tmp_path, capsys):
+    path = made.write_gvhmr(tmp_path)
+    (tmp_path / "camera.json").write_text(json.dumps(made.camera_json()))
+    out, camera = tmp_path / "bodies.npz", tmp_path / "found.json"
+    line = ["gvhmr", path, "--out", out, "--camera", tmp_path / "camera.json"]
+    line += ["--write-camera", camera, "--fps", "30", "--space", "world"]
+    assert commands.run_command("bodies", [str(word) for word in line]) == 0
+    text = capsys.readouterr().out
+    assert "5 rows, 1 people in 5 frames" in text
+    assert f"pitch {made.PITCH:.3f} rad" in text
+    bodies = read_bodies(out)
+    assert (bodies.space, bodies.fps) == ("world", 30.0)
+    written = json.loads(camera.read_text())
+    assert np.allclose(written["R_cam_world"], made.camera_matrix(), atol=1e-3)
+    assert (written["w"], written["fl_x"]) == (1280, 1100)
+
+
+def test_the_command_writes_keypoints_and_names_the_tools(tmp_path, capsys):
+    path, out = made.write_coco17(tmp_path), tmp_path / "k.npz"
+    assert commands.run_command("bodies", ["coco17", str(path), "--out", str(out)]) == 0
+    assert read_keypoints(out).layout == "coco17"
+    assert commands.run_command("bodies", ["smpl", str(path)]) == 2
+    assert "sam3dbody" in capsys.readouterr().err
+
+
+# Real files.
+
+SHARED = Path(__file__).parents[2] / "shared" / "data" / "sam3d_body"
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the real SAM 3D Body files are not here")
+def test_real_people_of_sam_3d_body_fall_on_their_own_keypoints_and_stand_up(tmp_path):
+    for file in SHARED.glob("img_*.npz"):
+        (tmp_path / file.name).symlink_to(file)
+    found = bodies_from("sam3dbody", tmp_path, Known(faces=SHARED / "mhr_lod1_topology.ply"))
+    bodies = found.bodies
+    assert bodies.verts.shape == (4, 18439, 3)
+    assert sorted(bodies.person.tolist()) == [0, 1, 2, 3]
+    assert found.K is not None
+    for file in sorted(SHARED.glob("img_*.npz")):
+        given = types.SimpleNamespace(**np.load(file))
+        seen_at = project(torch.from_numpy(given.pred_keypoints_3d + given.pred_cam_t), found.K)
+        off = np.linalg.norm(seen_at.numpy() - given.pred_keypoints_2d, axis=1)
+        assert off.max() < 1
+        middle = torch.from_numpy(given.pred_vertices + given.pred_cam_t)
+        row = int((bodies.verts.mean(1) - middle.mean(0)).norm(dim=1).argmin())
+        assert torch.allclose(bodies.verts[row], middle, atol=1e-5)
+        low, high = project(middle, found.K).aminmax(dim=0)
+        box = torch.from_numpy(given.bbox)
+        assert ((low + high) / 2 - (box[:2] + box[2:]) / 2).norm() < 0.15 * (box[3] - box[1])
+        assert high[1] - low[1] > 0.7 * (box[3] - box[1])

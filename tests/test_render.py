@@ -1,0 +1,234 @@
+"""Pictures without a screen: the right pixels, the right size, the right number of them."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from little_room import GROUND, room, walkers
+from PIL import Image
+
+from mover.geometry.camera import project, to_camera
+from mover.readers.masks import thinned
+from mover.records import InputError
+from mover.render import Moment, RenderConfig, render_result, render_worlds, world_of
+from mover.render_board import set_up, show
+from mover.render_eye import above_eye, floor_seen, orbit_eye, seen_from, spinning_eyes, video_eye
+from mover.render_film import save_film, video_pictures
+from mover.render_floor import ground_under, shadows
+from mover.render_paint import NOBODY, PERSON, draw, furniture, joined, people
+from mover.rooms.render import see
+
+
+def pixels_of(points_world, eye):
+    return project(seen_from(eye, points_world), eye.K)
+
+
+def test_an_object_is_drawn_on_the_pixels_of_its_mask(small_room):
+    camera = small_room.truth.camera
+    owner = draw(furniture(small_room.truth), video_eye(camera, camera.width)).owner
+    masks = see(small_room.plan).piece
+    assert owner.shape == masks.shape
+    for index in range(len(small_room.truth.pieces)):
+        mine, mask = owner == index, masks == index
+        assert (mine & mask).sum() >= 0.98 * (mine | mask).sum()
+
+
+def test_a_person_is_drawn_on_the_pixels_of_the_visible_mask(small_room):
+    camera, given = small_room.truth.camera, small_room.bodies
+    world = given.verts @ camera.R_cam_world
+    bodies = dataclasses.replace(given, verts=world, joints=None, joint_names=(), space="world")
+    masks = small_room.capture.people.masks
+    for row in (0, len(world) // 2, len(world) - 1):
+        surfaces = joined([furniture(small_room.truth), people(bodies, [row])])
+        mine = draw(surfaces, video_eye(camera, camera.width)).owner >= PERSON
+        mask = torch.from_numpy(thinned(masks, row, 1))
+        assert (mine & mask).sum() >= 0.98 * (mine | mask).sum()
+
+
+def test_the_eye_of_the_video_sees_the_same_points_at_any_size():
+    scene = room()
+    points = torch.tensor([[0.4, -0.8, -3.5], [-1.0, -1.5, -4.0]])
+    truth = project(to_camera(points, scene.camera.R_cam_world), scene.camera.K)
+    for width in (640, 320, 1280):
+        eye = video_eye(scene.camera, width)
+        assert torch.allclose(pixels_of(points, eye), truth * width / 640, atol=1e-3)
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 0.7, 2.0, -2.5])
+@pytest.mark.parametrize("elevation", [0.0, 0.4, 1.2, -0.3])
+def test_an_eye_around_the_room_sees_everything_upright(azimuth: float, elevation: float):
+    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().pieces])
+    eye = orbit_eye(points, (400, 300), azimuth, elevation)
+    assert torch.allclose(eye.R_eye_world @ eye.R_eye_world.mT, torch.eye(3), atol=1e-6)
+    assert torch.linalg.det(eye.R_eye_world) == pytest.approx(1, abs=1e-5)
+    pixel = pixels_of(points, eye)
+    assert (pixel > 0).all()
+    assert (pixel < torch.tensor([400.0, 300.0])).all()
+    middle = (points.amin(0) + points.amax(0)) / 2
+    higher = pixels_of(torch.stack([middle, middle + torch.tensor([0, 0.1, 0])]), eye)
+    assert higher[1, 1] < higher[0, 1]
+
+
+def test_from_the_right_the_right_of_the_image_is_near():
+    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().pieces])
+    right = torch.tensor([1.0, -1.0, -3.5])
+    front, side = (orbit_eye(points, (400, 300), a, 0.3) for a in (0.0, math.pi / 2))
+    centre = points.mean(0)
+    assert pixels_of(right, front)[0] > pixels_of(centre, front)[0]
+    assert seen_from(side, right)[2] < seen_from(side, centre)[2]
+
+
+def test_from_above_the_plan_lies_as_in_the_report():
+    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().pieces])
+    eye = above_eye(points, (400, 300))
+    near_left, near_right, far_left = (
+        pixels_of(torch.tensor([x, -1.0, z]), eye) for x, z in ((-1, -3), (1, -3), (-1, -4))
+    )
+    assert near_right[0] > near_left[0]
+    assert far_left[1] < near_left[1]
+
+
+def test_eyes_that_go_around_keep_their_distance():
+    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().pieces])
+    eyes = spinning_eyes(points, (400, 300), [0.0, 1.0, 2.0, 4.0], 0.4)
+    middle = (points.amin(0) + points.amax(0)) / 2
+    far = torch.stack([(e.t_world_eye - middle).norm() for e in eyes])
+    assert torch.allclose(far, far[0])
+    for eye in eyes:
+        assert (pixels_of(points, eye) > 0).all()
+
+
+def test_rays_to_the_floor_project_back_to_their_pixels():
+    eye = video_eye(room().camera, 64)
+    floor = floor_seen(eye, GROUND)
+    seen = floor.isfinite().all(-1)
+    rows, columns = torch.nonzero(seen, as_tuple=True)
+    centre = torch.stack([columns, rows], -1) + 0.5
+    assert torch.allclose(pixels_of(floor[seen], eye), centre.float(), atol=1e-2)
+    assert torch.allclose(floor[seen][:, 1], torch.tensor(GROUND), atol=1e-5)
+
+
+def test_people_drawn_in_their_window_are_people_drawn_whole():
+    scene, bodies = room(), walkers(3, people=2)
+    still, moving = furniture(scene), people(bodies, [1, 4])
+    eye = video_eye(scene.camera, 320)
+    points = torch.cat([still.verts, moving.verts])
+    ground = ground_under(points, GROUND)
+    base = torch.full((eye.height, eye.width, 3), 0.4)
+    whole = set_up(eye, ground, joined([still, moving]), base)
+    part = show(set_up(eye, ground, still, base), moving)
+    assert (part - show(whole)).abs().max() < 1e-5
+
+
+def test_a_shadow_is_darkest_where_something_stands():
+    scene = room()
+    still = furniture(scene)
+    ground = ground_under(still.verts, GROUND)
+    eye = above_eye(still.verts, (320, 240))
+    dark = shadows(eye, ground, still)[..., 3]
+    owner = draw(still, eye).owner
+    assert dark[owner == 2].mean() > 3 * dark[owner == NOBODY].mean()
+    assert dark[0, 0] == 0
+
+
+def unannotated(scene):
+    pieces = tuple(dataclasses.replace(p, annotation=None) for p in scene.pieces)
+    return dataclasses.replace(scene, pieces=pieces)
+
+
+def folder(tmp_path: Path) -> Path:
+    from mover.readers.bodies_file import write_bodies
+    from mover.readers.scene_file import write_scene
+
+    for name, shift in (("scene", 0.0), ("initial", 0.3)):
+        write_scene(unannotated(room(shift)), tmp_path / f"{name}.json")
+    for name in ("bodies", "initial_bodies"):
+        write_bodies(walkers(6), tmp_path / f"{name}.npz")
+    return tmp_path
+
+
+def test_a_film_has_a_picture_for_each_frame_at_the_size_asked_for(tmp_path: Path):
+    av = pytest.importorskip("av")
+    out, film = folder(tmp_path), tmp_path / "room.mp4"
+    count = render_result(out, film, RenderConfig(scene="both", width=161))
+    with av.open(str(film)) as video:
+        pictures = list(video.decode(video=0))
+        rate = float(video.streams.video[0].average_rate)
+    assert len(pictures) == count == 6
+    assert {(p.width, p.height) for p in pictures} == {(320, 90)}
+    assert rate == pytest.approx(15.0 / 3)
+    moved = [np.asarray(p.to_image()).astype(float) for p in (pictures[0], pictures[-1])]
+    assert np.abs(moved[0] - moved[1]).max() > 50
+
+
+def test_a_still_shows_the_frame_that_is_asked_for(tmp_path: Path):
+    out = folder(tmp_path)
+    found = []
+    for frame in (0, 15):
+        path = tmp_path / f"{frame}.png"
+        assert render_result(out, path, RenderConfig(width=160, frame=frame)) == 1
+        with Image.open(path) as picture:
+            found.append(np.asarray(picture).astype(float))
+    assert found[0].shape == (90, 160, 3)
+    assert np.abs(found[0] - found[1]).max() > 50
+
+
+def test_the_video_is_behind_the_furniture(tmp_path: Path):
+    from tiny_capture import HEIGHT, WIDTH, write_capture
+
+    capture = write_capture(tmp_path / "capture")
+    (capture / "frames").mkdir()
+    colours = {0: (250, 0, 0), 3: (0, 250, 0)}
+    for frame, colour in colours.items():
+        Image.new("RGB", (WIDTH, HEIGHT), colour).save(capture / "frames" / f"{frame:06d}.png")
+    scene = room()
+    world = world_of("after", scene, walkers(2))
+    moments = [Moment(0, 0.0), Moment(3, 0.5), Moment(9, 0.7)]
+    pictures = list(render_worlds([world], moments, RenderConfig(width=64), capture))
+    for picture, channel in zip(pictures[:2], (0, 1), strict=True):
+        assert picture[0, 0].argmax() == channel
+        assert picture[0, 0, channel] > 0.95
+    assert picture.shape == (36, 64, 3)
+    assert (pictures[2][0, 0] - pictures[0][0, 0]).abs().max() > 0.2
+
+
+def test_frames_of_a_film_are_found_by_their_number(tmp_path: Path):
+    pytest.importorskip("av")
+    shades = [torch.full((32, 48, 3), k / 10) for k in range(10)]
+    assert save_film(iter(shades), 10.0, tmp_path / "video.mp4") == 10
+    found = list(video_pictures(tmp_path, [2, 7, 12], (24, 16)))
+    assert [None if p is None else tuple(p.shape) for p in found] == [(16, 24, 3)] * 2 + [None]
+    for picture, frame in zip(found[:2], (2, 7), strict=True):
+        assert float(picture.mean()) == pytest.approx(frame / 10, abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["room.gif", "room", "room.mp4"])
+def test_what_cannot_be_drawn_is_said(tmp_path: Path, name: str):
+    from mover.readers.scene_file import write_scene
+
+    pytest.importorskip("av")
+    write_scene(unannotated(room()), tmp_path / "scene.json")
+    with pytest.raises(InputError, match="--to: "):
+        render_result(tmp_path, tmp_path / name, RenderConfig(width=64))
+
+
+def test_a_room_without_people_turns():
+    world = world_of("after", room(), None)
+    config = RenderConfig(view="orbit", turns=1, width=64)
+    a, b = render_worlds([world], [Moment(0, 0.0), Moment(0, 0.5)], config, None)
+    assert a.shape == b.shape == (36, 64, 3)
+    assert (a - b).abs().max() > 0.2
+
+
+def test_the_command_says_what_it_drew(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    from mover.commands import run_command
+
+    out, path = folder(tmp_path), tmp_path / "room.jpg"
+    assert run_command("render", [str(out), "--to", str(path), "--width", "64"]) == 0
+    assert "one picture" in capsys.readouterr().out
+    with Image.open(path) as picture:
+        assert picture.size == (64, 36)
+    assert run_command("render", [str(out), "--to", str(path), "--width", "1"]) == 2

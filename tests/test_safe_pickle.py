@@ -1,0 +1,391 @@
+import builtins
+import bz2
+import collections
+import contextlib
+import gzip
+import io
+import lzma
+import os
+import pickle
+import pickletools
+import posix
+import struct
+import subprocess
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import sparse
+
+from mover.pickles import arrays, load
+from mover.readers.safe_pickle import load_pickle
+from mover.records import InputError
+
+PLAIN = {
+    "row": np.arange(6.0).reshape(2, 3),
+    "columns": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+    "big end": np.arange(3, dtype=">i4"),
+    "none": np.zeros((0, 3), np.float32),
+    "point": np.array(2.5),
+    "words": np.array(["aé", "b"]),
+    "bits": np.array([True, False]),
+}
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(data: bytes) -> Path:
+        path = tmp_path / "x.pkl"
+        path.write_bytes(data)
+        return path
+
+    return write
+
+
+class Calls:
+    """Reduces to any call."""
+
+    def __init__(self, what, *args):
+        self.what, self.args = what, args
+
+    def __reduce__(self):
+        return self.what, self.args
+
+
+class Sneaky(dict):
+    def __reduce__(self):
+        return getattr, (os, "system")
+
+
+def marker(path):
+    return f"touch {path}"
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_hostile_pickles_are_refused_by_name_and_run_nothing(file, tmp_path, protocol):
+    done = tmp_path / "done"
+    text = f"open({str(done)!r}, 'w')"
+    attacks = [
+        (Calls(os.system, marker(done)), "system"),
+        (Calls(posix.system, marker(done)), "system"),
+        (Calls(eval, text), "eval"),
+        (Calls(exec, text), "exec"),
+        (Calls(getattr, os, "system"), "getattr"),
+        (Calls(Calls(getattr, os, "system"), marker(done)), "getattr"),
+        (Calls(subprocess.Popen, ["touch", str(done)]), "Popen"),
+        (Calls(builtins.__import__, "os"), "__import__"),
+        (Calls(open, str(done), "w"), "open"),
+        (Calls(np.load, "x.npy", None, True), "load"),
+        (Calls(torch.load, "x"), "load"),
+        (Calls(pickle.loads, b"x"), "loads"),
+        (Sneaky(), "getattr"),
+    ]
+    for attack, name in attacks:
+        try:
+            data = pickle.dumps({"a": [attack]}, protocol=protocol)
+        except (pickle.PicklingError, TypeError):
+            continue  # a module as an argument cannot be written
+        with pytest.raises(InputError, match=rf"^x\.pkl: the pickle holds .*{name}"):
+            load_pickle(file(data))
+    assert not done.exists()
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        b"cos\nsystem\n(S'true'\ntR.",
+        b"cposix\nsystem\n(S'true'\ntR.",
+        b"(S'true'\nios\nsystem\n.",
+        b"\x80\x02(cos\nsystem\nX\x04\x00\x00\x00trueo.",
+        b"\x80\x02\x82\x01.",
+        b"c__builtin__\ngetattr\n(cos\nsystem\nS'x'\ntR.",
+        b"\x80\x04\x8c\x08builtins\x8c\x04eval\x93\x8c\x011\x85R.",
+        b"\x80\x04\x8c\x05numpy\x8c\x0ecore.os.system\x93\x8c\x011\x85R.",
+        b"cnumpy.core.multiarray\n_reconstruct\n(cos\nsystem\nK\x00\x85U\x01btR.",
+        b"ccopy_reg\n_reconstructor\n(cos\nsystem\nc__builtin__\nobject\nNtR.",
+        b"\x80\x02c__builtin__\nset\n}U\x08__call__cos\nsystem\nsb.",
+        b"\x80\x02cchumpy.ch\n__class__.__mro__\n)R.",
+        b"\x80\x02Ptrue\n.",
+        b"\x80\x02K\x01Q.",
+        b"\x80\x02cnumpy\nndarray\n(J\xff\xff\xff\x7ftR.",
+        b"\x80\x02c__builtin__\nbytearray\n(J\xff\xff\xff\x7ftR.",
+        b"\x80\x02c__builtin__\nlist\n(X\x01\x00\x00\x00atR.",
+        b"\x80\x05\x96\xff\xff\xff\xff\xff\xff\x00\x00.",
+        b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\x00\x00.",
+        b"\x80\x02K\x01r\xff\xff\xff\x7f",
+        b"\x80\x02]q\x00h\x00b.",
+        b"\x80\x02h\x05.",
+        b"\x80\x02a.",
+        b"\x80\x02(t",
+        b"(" * 50 + b"t" * 51 + b".",
+        b"",
+        b"no pickle",
+        b"PK\x03\x04 no zip",
+        b"\x93NUMPY no header",
+        b"\x1f\x8b no gzip",
+        b"\x78\x9c no zlib",
+    ],
+)
+def test_code_written_by_hand_ends_in_an_input_error(file, code):
+    with pytest.raises(InputError, match=r"^x\.pkl: "):
+        load_pickle(file(code))
+
+
+def test_no_opcode_can_call_import_or_set_an_attribute_of_a_thing():
+    """Every class and function is a word; the table of makers holds functions of the package."""
+    from mover.pickles import machine, parts
+
+    for maker in parts.CONTAINERS.values():
+        assert maker.__module__ == "mover.pickles.parts"
+    assert {"INST", "OBJ", "EXT1", "EXT2", "EXT4", "PERSID", "NEXT_BUFFER", "NEWOBJ_EX"}.isdisjoint(
+        machine.ACTS
+    )
+    known = {op.name for op in pickletools.opcodes}
+    assert set(machine.ACTS) <= known
+
+
+@pytest.mark.parametrize("protocol", range(1, 6))
+def test_arrays_come_back_as_numpy_would_read_them(file, protocol):
+    found = load_pickle(file(pickle.dumps(PLAIN, protocol=protocol)))
+    for key, array in PLAIN.items():
+        assert found[key].dtype == array.dtype
+        assert found[key].shape == array.shape
+        np.testing.assert_array_equal(found[key], array)
+        assert found[key].flags.writeable
+
+
+plain = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False)
+    | st.text()
+    | st.binary(),
+    lambda inner: (
+        st.lists(inner)
+        | st.dictionaries(st.text() | st.integers(), inner)
+        | st.tuples(inner, inner)
+        | st.frozensets(st.integers())
+    ),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(plain, st.integers(2, 5))
+def test_plain_values_come_back_equal(tmp_path_factory, value, protocol):
+    path = tmp_path_factory.mktemp("p") / "x.pkl"
+    path.write_bytes(pickle.dumps(value, protocol=protocol))
+    assert load_pickle(path) == value
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(0, 10_000), st.integers(0, 255))
+def test_a_broken_byte_gives_a_value_or_an_input_error(tmp_path_factory, at, byte):
+    data = bytearray(pickle.dumps({**PLAIN, "s": sparse.csc_matrix(np.eye(2))}, protocol=2))
+    data[at % len(data)] = byte
+    path = tmp_path_factory.mktemp("p") / "x.pkl"
+    path.write_bytes(bytes(data))
+    with contextlib.suppress(InputError):  # and nothing else
+        load_pickle(path)
+
+
+def test_containers_paths_and_numbers_of_other_classes_become_plain(file):
+    value = {
+        "o": collections.OrderedDict(a=1), "d": collections.defaultdict(list, {"q": [1]}),
+        "p": Path("/a/b"), "c": 1 + 2j, "f": np.float32(3), "i": np.int64(4), "s": {1, 2},
+        "x": np.array([1, "x", None, [2], np.ones(2)], dtype=object), "t": np.float32,
+    }  # fmt: skip
+    found = load_pickle(file(pickle.dumps(value, protocol=4)))
+    assert found["o"] == {"a": 1}
+    assert found["d"] == {"q": [1]}
+    assert found["p"] == "/a/b"
+    assert (found["c"], found["f"], found["i"], found["s"]) == (1 + 2j, 3, 4, {1, 2})
+    assert found["x"][:4].tolist() == [1, "x", None, [2]]
+    assert found["t"] == "numpy.float32"
+
+
+def test_what_is_shared_stays_shared_and_a_list_may_hold_itself(file):
+    inner = [np.ones(2)]
+    loop = [1]
+    loop.append(loop)
+    found = load_pickle(file(pickle.dumps({"a": inner, "b": inner, "loop": loop})))
+    assert found["a"] is found["b"]
+    assert found["loop"][1] is found["loop"]
+
+
+def test_a_pickle_whose_parts_double_each_time_is_read_in_no_time(file):
+    nested: tuple = (np.ones(1),)
+    for _ in range(60):
+        nested = (nested, nested)
+    found = load_pickle(file(pickle.dumps(nested)))
+    assert found[0] is found[1]
+
+
+@pytest.mark.parametrize("form", ["csc", "csr", "coo"])
+def test_sparse_matrices_come_back_and_odd_indices_are_refused(file, form):
+    dense = np.array([[0, 1.5, 0], [2, 0, 0]])
+    found = load_pickle(file(pickle.dumps(getattr(sparse, f"{form}_matrix")(dense), protocol=2)))
+    np.testing.assert_array_equal(found.toarray(), dense)
+    bad = getattr(sparse, f"{form}_matrix")(dense)
+    for name in ("indices", "row"):
+        if hasattr(bad, name):
+            getattr(bad, name)[0] = 10**6
+    with pytest.raises(InputError, match="cannot be read"):
+        load_pickle(file(pickle.dumps(bad, protocol=2)))
+
+
+def old_pickle_of_python_2(arrays: dict[str, np.ndarray]) -> bytes:
+    """The bytes that Python 2 and chumpy 0.70 wrote: text for bytes, old module names."""
+    out = io.BytesIO()
+    w = out.write
+
+    def text(value: bytes) -> bytes:
+        return b"T" + struct.pack("<i", len(value)) + value
+
+    w(b"\x80\x02}(")
+    for key, array in arrays.items():
+        w(text(key.encode()))
+        w(b"ccopy_reg\n_reconstructor\n(cchumpy.ch\nCh\nc__builtin__\nobject\nNtR}(")
+        w(text(b"_dirty_vars") + b"c__builtin__\nset\n(](" + text(b"x") + b"etR" + text(b"x"))
+        w(b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\nK\x00\x85U\x01btR(K\x01(")
+        for n in array.shape:
+            w(b"J" + struct.pack("<i", n))
+        w(
+            b"tcnumpy\ndtype\n(U\x02f8K\x00K\x01tR(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
+        )
+        w(b"\x89" + text(array.astype("<f8").tobytes()) + b"tbub")
+    w(b"u.")
+    return out.getvalue()
+
+
+def test_chumpy_arrays_of_python_2_are_read_without_chumpy(file):
+    rng = np.random.default_rng(0)
+    arrays = {"v_template": rng.normal(size=(5, 3)), "weights": rng.normal(size=(5, 2))}
+    found = load_pickle(file(old_pickle_of_python_2(arrays)))
+    for key, array in arrays.items():
+        assert type(found[key]) is np.ndarray
+        np.testing.assert_array_equal(found[key], array)
+
+
+def test_a_selection_of_a_chumpy_array_is_its_values_and_a_sum_is_refused(file):
+    base = np.arange(12.0).reshape(3, 4)
+    start = (
+        b"\x80\x02ccopy_reg\n_reconstructor\n(cchumpy.reordering\nSelect\nc__builtin__\nobject\nNtR"
+    )
+    state = {"a": base, "idxs": np.array([0, 5, 11, 2]), "preferred_shape": (2, 2)}
+    inner = pickle.dumps(state, protocol=2)[2:-1]
+    found = load_pickle(file(start + inner + b"b."))
+    np.testing.assert_array_equal(found, [[0, 5], [11, 2]])
+    inner = pickle.dumps({"b": base}, protocol=2)[2:-1]
+    with pytest.raises(InputError, match=r"chumpy\.reordering\.Select without an array"):
+        load_pickle(file(start + inner + b"b."))
+
+
+TENSORS = {
+    "part": torch.arange(12.0).reshape(3, 4)[:, 1:].T,
+    "whole": torch.arange(5),
+    "bits": torch.tensor([True, False]),
+    "brain": torch.tensor([1.5, -2.0], dtype=torch.bfloat16),
+    "same": torch.ones(2).expand(3, 2),
+    "learned": torch.nn.Parameter(torch.full((2,), 0.5)),
+    "empty": torch.zeros(0, 3),
+}
+
+
+def check_tensors(found):
+    for key, tensor in TENSORS.items():
+        expected = tensor.detach()
+        expected = expected.float() if expected.dtype == torch.bfloat16 else expected
+        np.testing.assert_array_equal(found[key], expected.numpy())
+
+
+def test_torch_tensors_become_arrays_from_pickles_and_both_forms_of_torch_files(file, tmp_path):
+    check_tensors(load_pickle(file(pickle.dumps(TENSORS))))
+    for new in (True, False):
+        torch.save(TENSORS, tmp_path / "x.pt", _use_new_zipfile_serialization=new)
+        check_tensors(load_pickle(tmp_path / "x.pt"))
+
+
+def test_a_tensor_that_reaches_beyond_its_storage_is_refused(file):
+    data = pickle.dumps(torch.arange(4.0), protocol=2)
+    huge = data.replace(b"K\x04\x85", b"J\xff\xff\xff\x7f\x85")
+    assert huge != data
+    with pytest.raises(InputError, match="larger than what it holds"):
+        load_pickle(file(huge))
+
+
+def test_an_array_that_claims_more_than_its_bytes_is_refused(file):
+    data = pickle.dumps(np.zeros((2, 3), np.float32), protocol=2)
+    huge = data.replace(b"K\x02K\x03\x86", b"J\xff\xff\xff\x7fK\x03\x86")
+    assert huge != data
+    with pytest.raises(InputError, match="do not fit its shape"):
+        load_pickle(file(huge))
+
+
+def test_objects_inside_an_npy_file_are_read_and_plain_ones_are_no_pickle(tmp_path):
+    np.save(tmp_path / "x.npy", np.array({"pred_cam_R": np.eye(3)}, dtype=object))
+    found = load_pickle(tmp_path / "x.npy")
+    assert found.shape == ()
+    np.testing.assert_array_equal(found.item()["pred_cam_R"], np.eye(3))
+    np.save(tmp_path / "x.npy", np.eye(3))
+    with pytest.raises(InputError, match="which is no pickle"):
+        load_pickle(tmp_path / "x.npy")
+
+
+@pytest.mark.parametrize("pack", [zlib.compress, gzip.compress, bz2.compress, lzma.compress])
+def test_packed_pickles_are_unpacked_but_bombs_are_not(file, pack, monkeypatch):
+    data = pack(pickle.dumps(PLAIN["row"]))
+    np.testing.assert_array_equal(load_pickle(file(data)), PLAIN["row"])
+    with pytest.raises(InputError, match="ends too early"):
+        load_pickle(file(data[:-3]))
+    monkeypatch.setattr(load, "LARGEST", 100_000)
+    bomb = pack(bytes(10_000_000))
+    with pytest.raises(InputError, match="unpacks to more than 100000 bytes"):
+        load_pickle(file(bomb))
+
+
+def test_a_file_that_is_too_large_or_missing_is_refused(file, tmp_path, monkeypatch):
+    monkeypatch.setattr(load, "LARGEST", 100)
+    with pytest.raises(InputError, match="expected at most 100"):
+        load_pickle(file(pickle.dumps(np.zeros(100))))
+    with pytest.raises(InputError, match="no such file"):
+        load_pickle(tmp_path / "none.pkl")
+    assert arrays.LARGEST > 1 << 30
+
+
+def joblibs_bytes(array: np.ndarray) -> bytes:
+    """What joblib writes: a description, padding, the array's own bytes, the rest of the pickle."""
+    start = pickle.dumps({}, protocol=2)[:2] + b"}X\x05\x00\x00\x00verts"
+    start += b"cjoblib.numpy_pickle\nNumpyArrayWrapper\n)\x81}("
+    for key, value in (
+        ("subclass", np.ndarray), ("shape", array.shape), ("order", "C"),
+        ("dtype", array.dtype), ("allow_mmap", True), ("numpy_array_alignment_bytes", 16),
+    ):  # fmt: skip
+        start += pickle.dumps(key, protocol=2)[2:-1] + pickle.dumps(value, protocol=2)[2:-1]
+    start += b"ub"
+    padding = 16 - (len(start) + 1) % 16
+    return start + bytes([padding]) + b"\xff" * padding + array.tobytes() + b"s."
+
+
+def test_arrays_that_joblib_wrote_beside_the_pickle_are_found(file):
+    array = np.arange(12.0).reshape(4, 3)
+    found = load_pickle(file(joblibs_bytes(array)))
+    np.testing.assert_array_equal(found["verts"], array)
+    with pytest.raises(InputError, match="do not fit"):
+        load_pickle(file(joblibs_bytes(array)[:-40]))
+
+
+@pytest.mark.parametrize("compress", [0, 3, ("lzma", 3)])
+def test_files_of_joblib_itself_are_read(tmp_path, compress):
+    joblib = pytest.importorskip("joblib")
+    value = {0: {**PLAIN, "list": [np.ones(3), "x"], "object": np.array([1, None], dtype=object)}}
+    joblib.dump(value, tmp_path / "x.pkl", compress=compress)
+    found = load_pickle(tmp_path / "x.pkl")[0]
+    for key, array in PLAIN.items():
+        np.testing.assert_array_equal(found[key], array)
+    assert found["object"].tolist() == [1, None]
+    np.testing.assert_array_equal(found["list"][0], np.ones(3))
