@@ -77,7 +77,7 @@ class Viewer:
         self.page.on("pageerror", lambda e: self.troubles.append(str(e)))
         self.page.on("request", lambda r: self.requests.append(r.url))
         self.page.on("websocket", lambda w: self.requests.append(w.url))
-        self.page.goto(self.url)
+        self.page.goto(f"{self.url}?fixedDpr=1")  # else it follows the speed of the machine
         self.page.get_by_role("tab", name="Room").wait_for(timeout=60_000)
         self.page.wait_for_timeout(3000)
         with contextlib.suppress(Exception):  # a note that there is no GPU
