@@ -1,6 +1,9 @@
 """Gathering with Warp kernels: the same as without them, whoever does what."""
 
 import dataclasses
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -239,3 +242,50 @@ def test_bricks_are_busy_where_the_field_changes() -> None:
     for brick in torch.cartesian_prod(*[torch.arange(n) for n in field.busy.shape]).tolist():
         cut = tuple(slice(8 * k, 8 * k + 9) for k in brick)
         assert bool(field.busy[tuple(brick)]) == (field.values[cut].unique().numel() > 1)
+
+
+def test_a_mesh_in_great_pieces_has_the_distances_of_libigl() -> None:
+    """Lists of leaves that are too long, and places inside that begin at the grid's border."""
+    verts, faces = sphere([0.0, 0, 0], 0.5, level=4)
+    whole = grid_around(verts.amin(0), verts.amax(0), cells=120, padding=0.1)
+    part = Volume(whole.values[40:80, 40:80, 40:80], whole.origin + 40 * whole.cell, whole.cell)
+    assert (assert_same(verts[None], faces, part) < 0).all()
+
+
+def test_long_lists_of_leaves_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    verts, faces = posed_bodies(2)
+    grid = around(verts, 48)
+    long = volume_warp.union_bodies(verts, faces, grid, 1).values
+    monkeypatch.setattr(volume_warp, "LIST", 1)
+    assert torch.equal(volume_warp.union_bodies(verts, faces, grid, 1).values, long)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "entries"),
+    [
+        ("bodies", ["place", "leaves", "inner"]),
+        ("crossings", ["cross"]),
+        ("lower", ["blocks"]),
+        ("exits", []),
+        ("lookup", []),
+        ("nearest", []),
+    ],
+)
+def test_kernels_compile_for_an_h100_without_a_driver(
+    name: str, entries: list[str], tmp_path: Path
+) -> None:
+    code = (
+        f"import sys, warp as wp; from mover.geometry.kernels import {name} as module;"
+        "90 in wp.get_cuda_supported_archs() or sys.exit(77);"
+        "wp.compile_aot_module(module, arch=90, module_dir=sys.argv[1], use_ptx=True)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True)
+    if done.returncode == 77:
+        pytest.skip("this build of Warp has no CUDA compiler")
+    assert done.returncode == 0, done.stderr.decode()
+    text = "".join(p.read_text() for p in tmp_path.glob("*.ptx"))
+    assert ".target sm_90" in text
+    assert ".entry" in text
+    for entry in entries:
+        assert f".entry {entry}_" in text

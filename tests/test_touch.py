@@ -184,3 +184,12 @@ def test_people_must_be_in_the_world():
     bodies = replace(people(pose(SEATED)), space="camera")
     with pytest.raises(ValueError, match="'camera', expected 'world'"):
         touching(bodies, parts_of(bodies), 0.0)
+
+
+def test_who_sits_high_up_with_hanging_feet_sits():
+    high = replace(people(pose(SEATED)), joints=None)
+    up = torch.tensor([0.0, 1.0, 0.0])
+    for lift, sits in ((0.0, True), (0.4, False), (1.0, True)):
+        bodies = replace(high, verts=high.verts + lift * up)
+        assert posture(bodies) == (["sitting"] if sits else [""])
+    assert chance(replace(high, verts=high.verts + up), "seat") > 0.2

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import AvoidSubcommands, Positional, arg
 
 from . import records
-from .presets import PRESETS, Config
+from .presets import PRESETS, Config, with_methods
 from .progress import Bar, both
 
 log = logging.getLogger(__name__)
@@ -96,9 +96,8 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
     early.add_argument("--preset", default="robust")
     early.add_argument("--config", type=Path)
     chosen, _ = early.parse_known_args(list(arguments))
-    config = preset_named(chosen.preset)
-    if chosen.config is not None:
-        config = read_config(chosen.config)
+    config = preset_named(chosen.preset) if chosen.config is None else read_config(chosen.config)
+    config, rest = with_methods(config, arguments)
 
     def both(
         args: Annotated[RunArgs, arg(name="")], config: Annotated[Config, arg(name="")] = config
@@ -106,7 +105,7 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
         """Reconstruct a room from a capture folder."""
         return args, config
 
-    return tyro.cli(both, prog="mover run", args=list(arguments))
+    return tyro.cli(both, prog="mover run", args=rest, config=(AvoidSubcommands,))
 
 
 def preset_named(name: str) -> Config:
@@ -240,7 +239,10 @@ _COMMANDS = {
     "experiment": _experiment,
     "import": _lazily("commands_import", "import"),
     "paper-table": _lazily("commands_table", "paper-table"),
+    **{name: _lazily("commands_perceive", name) for name in ("perceive", "layout")},
     "bodies": _lazily("commands_people", "bodies"),
+    "fit": _lazily("commands_fit", "fit"),
+    **{name: _lazily("commands_refine", name) for name in ("refine", "contacts")},
     **{name: _lazily("commands_share", name) for name in ("export", "settle", "batch")},
     "render": _lazily("commands_render", "render"),
     "view": _lazily("commands_view", "view"),

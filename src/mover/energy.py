@@ -8,16 +8,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .geometry.camera import project, to_camera
-from .geometry.placement import place
+from .geometry.camera import outermost, project, to_camera
+from .geometry.placement import place, place_in
 from .geometry.raster import Depths, Topology, Views, look
 from .minimize import Energy, weigh
 from .records import record
 from .terms import Form
 from .terms.bbox import bbox_term
 from .terms.collision import BodySpace, collision_term
-from .terms.contact import Touches, contact_term, heading_term
+from .terms.contact import Touches, contact_term, gap_term, heading_term
+from .terms.contact_trees import Trees, gaps
 from .terms.depth import DepthRange, depth_term, free_space_term
+from .terms.distance import distance_term
 from .terms.offscreen import offscreen_term
 from .terms.scale import scale_term
 from .terms.silhouette import edge_term, silhouette_term
@@ -49,6 +51,8 @@ class SceneWeights:
     """Objects stay inside the image (release only)."""
     free_space: float = 0.0
     """Nothing hides a person that is seen (release only)."""
+    distance: float = 0.0
+    """Objects stay at the distance they were given, where nothing else tells it (robust only)."""
     heading: float = 0.0
     """Seats face where their sitters face (robust only)."""
 
@@ -78,6 +82,8 @@ class ImageCues:
     """False where it is unknown what would be seen; everywhere without a mask."""
     trust: Float[Tensor, " objects"]
     """Weight of the silhouette, below one where the shape is known to be wrong."""
+    distance: Float[Tensor, " objects"] | None = None
+    """From the camera to the middle of the base in the initial scene [m]; None: not known."""
 
 
 @record
@@ -87,6 +93,8 @@ class HumanCues:
     depth: DepthRange | None = None
     space: BodySpace | None = None
     touches: Touches | None = None
+    trees: Trees | None = None
+    """Finds what is touched faster; None: all points are compared."""
 
 
 @record
@@ -107,13 +115,16 @@ def scene_energy(
 ) -> Energy:
     """Eq. 1: what the image and the people say about where the objects stand."""
     form, w = config.form, heard(config.weights, humans)
-    verts = to_camera(place(objects.verts, layout), camera.R_cam_world)
+    if image.distance is None:
+        w = replace(w, distance=0.0)
+    verts = place_in(objects.verts, layout, camera.R_cam_world)
     drawn = cache(lambda: _draw(verts, objects, image.views, w))
     pixels = cache(lambda: project(verts, camera.K))
     many = factors(objects, humans if w.contact else HumanCues(), form)
     return weigh(
         ("bbox", w.bbox, lambda: bbox_term(
-            project(_corners(objects, layout, camera), camera.K) if form == "paper" else pixels(),
+            project(_corners(objects, layout, camera) if form == "paper"
+                    else outermost(verts, camera.K), camera.K),
             image.boxes, image.sides, float(camera.width), form)),
         ("silhouette", w.silhouette, lambda: image.trust * silhouette_term(
             drawn()[0], image.masks, image.keep, form)),
@@ -122,14 +133,13 @@ def scene_energy(
             _known(drawn()[1]), image.masks, _known(humans.depth), form)),
         ("collision", w.collision, lambda: many.collision * collision_term(
             _collision_points(layout, objects, form), _known(humans.space), form)),
-        ("contact", w.contact, lambda: contact_term(
-            (place(objects.top, layout), place(objects.back, layout)),
-            _known(humans.touches), form)),
+        ("contact", w.contact, lambda: _contact(layout, objects, humans, form)),
         ("edge", w.edge, lambda: edge_term(drawn()[0], image.masks, image.keep)),
         ("offscreen", w.offscreen, lambda: offscreen_term(
             pixels(), verts, objects.real_verts, camera)),
         ("free_space", w.free_space, lambda: free_space_term(
             _known(drawn()[1]), image.masks, _known(humans.depth))),
+        ("distance", w.distance, lambda: distance_term(layout, _known(image.distance))),
         ("heading", w.heading, lambda: heading_term(layout, _known(humans.touches))),
     )  # fmt: skip
 
@@ -177,6 +187,16 @@ def _draw(
     """Silhouettes and, where a term asks for them, depths."""
     asked = bool(w.depth or w.free_space)
     return look(verts, Topology(objects.faces, objects.edges), views, depth=asked)
+
+
+def _contact(layout: Layout, objects: Objects, humans: HumanCues, form: Form) -> Tensor:
+    """By search trees where there are any: the release asks the other way round."""
+    touches = _known(humans.touches)
+    if humans.trees is None or form == "release":
+        regions = place(objects.top, layout), place(objects.back, layout)
+        return contact_term(regions, touches, form)
+    found = gaps(layout, objects, touches, humans.trees)
+    return gap_term(found, touches, len(objects.ids), form)
 
 
 def _corners(

@@ -29,6 +29,7 @@ from .metrics_contact import (
     gather_touch,
     gather_truth,
 )
+from .metrics_motion import MOTION_METRICS, gather_gait
 from .metrics_scene import (
     CAMERA_METRICS,
     OBJECT_METRICS,
@@ -54,6 +55,7 @@ METRICS: dict[str, Metric[Any]] = {
     **CAMERA_METRICS,
     **GROUND_METRICS,
     **POSE_METRICS,
+    **MOTION_METRICS,
 }
 
 
@@ -240,5 +242,6 @@ def _people(
     if ground is not None and len(judged.soles):
         heights = bodies.verts[:, judged.soles, 1] - ground
         values |= measure(GROUND_METRICS, Standing(heights, config.ground_tolerance))
+    values |= measure(MOTION_METRICS, gather_gait(bodies, truth.bodies, ground))
     twins = None if truth.bodies is None else gather_twins(bodies, truth.bodies)
     return values | (measure(POSE_METRICS, twins) if twins is not None else {})

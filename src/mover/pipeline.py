@@ -89,7 +89,10 @@ def _from_image(job: Job, camera: Camera, ground: float) -> View:
         start = slide_to_floor(start, ground, (objects.supports == GROUND) & ~_is_pinned(job))
     start = stand(start, objects.supports, objects.size[:, 1], ground)
     unordered = torch.zeros(len(objects.ids), len(objects.ids), dtype=torch.bool)
-    image = ImageInputs(camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered)
+    given = job.prepared.start.t_world_object.norm(dim=-1)
+    image = ImageInputs(
+        camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered, given
+    )
     cues = job.run.stage(find_image_cues, image, job.config.image)
     inputs = PlaceInputs(
         objects, camera, ground, cues, NOBODY, alone(start), start.yaw, _pinned(job, start)

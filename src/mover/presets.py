@@ -5,10 +5,13 @@
 `robust`:  ours; docs/method.md gives the reason for each departure.
 """
 
-from dataclasses import dataclass, field
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 from .energy import SceneWeights
 from .minimize import Adam
+from .minimize_newton import Quasi
 from .stages.align_camera import AlignConfig
 from .stages.assign_touches import AssignConfig
 from .stages.find_depth import DepthConfig
@@ -95,8 +98,8 @@ RELEASE = Config(
 _DESCENT = Adam(200, 0.03, 0.002, beta2=0.98, keep_best=True)
 _GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300, hand_reach=0.25)
 _SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
-_ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
-_ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, heading=0.1)
+_ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0, distance=0.02)
+_ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1)
 
 ROBUST = Config(
     correct_depth=True,
@@ -112,5 +115,25 @@ ROBUST = Config(
     slide=True,
     trust=True,
 )  # fmt: skip
+
+METHODS = {"adam": Adam, "newton": Quasi}
+"""How a descent goes down: `--place.method newton` chooses one, with its own settings."""
+
+
+def with_methods(config: Config, arguments: Sequence[str]) -> tuple[Config, list[str]]:
+    """Replace the methods of descents that are named, and return the other arguments."""
+    parser = argparse.ArgumentParser(prog="mover run", add_help=False, allow_abbrev=False)
+    names = [f"{stage}.{use}" for stage in ("layout", "place") for use in ("short", "method")]
+    for name in names:
+        parser.add_argument(f"--{name}", dest=name, choices=tuple(METHODS))
+    chosen, rest = parser.parse_known_args(list(arguments))
+    for name in names:
+        stage, use = name.split(".")
+        method = getattr(chosen, name)
+        if method is not None:
+            changed = replace(getattr(config, stage), **{use: METHODS[method]()})
+            config = replace(config, **{stage: changed})
+    return config, rest
+
 
 PRESETS = {"paper": PAPER, "release": RELEASE, "robust": ROBUST}

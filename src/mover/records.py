@@ -124,7 +124,7 @@ def _join(kind: Any, tree: Any, arrays: dict[str, Any]) -> Any:  # noqa: ANN401
     if tree is None:
         return None
     if typing.get_origin(kind) in (typing.Union, types.UnionType):
-        kind = next(k for k in typing.get_args(kind) if k is not types.NoneType)
+        kind = _chosen([k for k in typing.get_args(kind) if k is not types.NoneType], tree)
     if isinstance(tree, dict) and set(tree) == {"tensor"}:
         return torch.from_numpy(arrays[tree["tensor"]])
     if isinstance(tree, dict) and set(tree) == {"bytes"}:
@@ -140,6 +140,15 @@ def _join(kind: Any, tree: Any, arrays: dict[str, Any]) -> Any:  # noqa: ANN401
             _join(k, v, arrays) for k, v in zip(_kinds(args, len(tree)), tree, strict=True)
         )
     return tree
+
+
+def _chosen(kinds: list[Any], tree: Any) -> Any:  # noqa: ANN401
+    """Of several kinds the one whose fields the tree has, else the first."""
+    names = set(tree) if isinstance(tree, dict) else set[str]()
+    for kind in kinds:
+        if dataclasses.is_dataclass(kind) and {f.name for f in dataclasses.fields(kind)} == names:
+            return kind
+    return kinds[0]
 
 
 def _kinds(args: tuple[Any, ...], length: int) -> tuple[Any, ...]:

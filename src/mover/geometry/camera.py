@@ -19,6 +19,16 @@ def project(
     return uvw[..., :2] / uvw[..., 2:]
 
 
+def outermost(
+    points_cam: Float[Tensor, "*batch points 3"], K: Float[Tensor, "3 3"]
+) -> Float[Tensor, "*batch 4 3"]:
+    """The points whose pixels lie leftmost, topmost, rightmost and lowest; the first of equals."""
+    with torch.no_grad():
+        pixels = project(points_cam, K)
+        index = torch.cat([pixels.argmin(-2), pixels.argmax(-2)], -1)
+    return points_cam.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3))
+
+
 def to_camera(
     points_world: Float[Tensor, "*batch 3"], R_cam_world: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "*batch 3"]:

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from ..records import record
 from .kernels.start import kernels, started
+from .raster_engine import threads
+from .raster_warp_cpu import share
 
 FAN = 8  # points of a leaf, leaves of a group
 
@@ -92,8 +94,17 @@ def nearest(
                 array = wp.from_torch(boxes[:, side].float().contiguous(), dtype=wp.vec3)
                 setattr(cloud, f"{name}_{corner}", array)
         arrays = [wp.from_torch(rows, dtype=wp.vec3), wp.from_torch(sizes, dtype=wp.vec3)]
+        arrays.append(wp.from_torch(found))
         device = str(wp.device_from_torch(rows.device))
-        wp.launch(nearest, found.shape, [cloud, *arrays, wp.from_torch(found)], device=device)
+        parts = min(threads(), len(rows)) if device == "cpu" else 1
+        cuts = [len(rows) * k // parts for k in range(parts + 1)]
+
+        def find(part: int) -> None:
+            first, stop = cuts[part], cuts[part + 1]
+            size = (stop - first, found.shape[1])
+            wp.launch(nearest, size, [cloud, *arrays, first], device=device)
+
+        share(find, parts)
     return found.reshape(query.shape[:-1])
 
 

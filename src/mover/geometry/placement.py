@@ -18,6 +18,15 @@ def place(
     return scaled @ rot_y(layout.yaw).mT + layout.t_world_object.unsqueeze(-2)
 
 
+def place_in(
+    points: Float[Tensor, "objects points 3"], layout: Layout, R_cam_world: Float[Tensor, "3 3"]
+) -> Float[Tensor, "*starts objects points 3"]:
+    """Move points from object frames into camera axes, by one matrix an object [m]."""
+    turn = R_cam_world @ rot_y(layout.yaw) * layout.log_scale.exp().unsqueeze(-2)
+    origin = layout.t_world_object @ R_cam_world.mT
+    return points @ turn.mT + origin.unsqueeze(-2)
+
+
 def stand(
     layout: Layout,
     supports: Int[Tensor, " objects"],

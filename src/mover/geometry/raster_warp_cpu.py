@@ -55,7 +55,7 @@ def pull(items: Items, maps: Maps, trace: Trace, grads: Gradients) -> Tensor:
     inputs = [pack_scene(items), pack_maps(maps, trace.near_face, trace.far_face, trace.box)]
     inputs.append(pack_pull(trace, grads, verts))
     launch = started().launch
-    _share(lambda item: launch(kernel, 1, [*inputs, item], device="cpu"), len(verts))
+    share(lambda item: launch(kernel, 1, [*inputs, item], device="cpu"), len(verts))
     return verts
 
 
@@ -84,7 +84,7 @@ def _draw(
         launch(kernel, 1, [scene, desk.scratch, maps, item], device="cpu")
         keep(item, desk)
 
-    _share(one, len(items.verts))
+    share(one, len(items.verts))
 
 
 def _desk(room: tuple[int, int, int, int]) -> Desk:
@@ -96,7 +96,7 @@ def _desk(room: tuple[int, int, int, int]) -> Desk:
     return desk
 
 
-def _share(work: Callable[[int], object], n: int) -> None:
+def share(work: Callable[[int], object], n: int) -> None:
     """Do the work for 0 ... n - 1 on as many threads as are wanted, this one among them."""
     todo = iter(range(n))
 

@@ -21,6 +21,7 @@ from .kernels.start import kernels, started
 from .volume_record import Volume
 
 BLOCK = 4  # [cells], side of the blocks that are marked as near the surface
+LIST = 256  # leaves that are searched for a block of places, at most
 REACH = 2  # [cells], that the shell reaches out of the body
 
 
@@ -45,6 +46,7 @@ class Scratch:
     """The volume of the bodies that this worker measured."""
     places: int = 0
     blocks: int = 0
+    lists: int = 0
 
 
 def union_bodies(
@@ -65,7 +67,8 @@ def union_bodies(
     count = max(1, min(workers, len(verts))) if tools.device == "cpu" else 1
     idle: SimpleQueue[Scratch] = SimpleQueue()
     every = [_scratch(tools) for _ in range(count)]
-    for scratch in every:
+    for scratch, other in zip(every, every[1:] + every[:1], strict=True):
+        scratch.work.other = other.work.field
         idle.put(scratch)
 
     def add(body: int) -> None:
@@ -106,7 +109,7 @@ def _borrowed(idle: SimpleQueue[Scratch]) -> Generator[Scratch]:
 
 def _tools(verts: Tensor, faces: Tensor, grid: Volume) -> Tools:
     device = str(started().device_from_torch(verts.device))
-    for name in ("bodies", "distance"):
+    for name in ("bodies", "crossings", "lower"):
         kernels(name, device)  # before there are threads
     return Tools(face_tree(verts[0], faces), verts, grid, device)
 
@@ -127,6 +130,8 @@ def _scratch(tools: Tools) -> Scratch:
     work.turn = _blank(1, wp.float64, tools.device)
     work.beside = int(tools.device == "cpu")  # where columns are measured one after another
     work.field = wp.from_torch(field)
+    work.other = work.field  # until there is another
+    work.eight = 8  # places of a block; a number here keeps the loops over them short
     return Scratch(work, field)
 
 
@@ -141,6 +146,10 @@ def _tree(shape: FaceTree, device: str) -> Any:  # noqa: ANN401
     tree.corners = _blank(3 * len(shape.faces), wp.vec3, device)
     boxes = starts[-1] + len(shape.faces)
     tree.below, tree.above = _blank(boxes, wp.vec3, device), _blank(boxes, wp.vec3, device)
+    tree.plane = _blank(len(shape.faces), wp.vec4, device)
+    leaves = len(shape.first) - 1
+    tree.slab, tree.thick = _blank(leaves, wp.vec4, device), _blank(leaves, wp.float32, device)
+    tree.longest = max(LIST, shape.branches**2)  # a node of the second level must fit
     return tree
 
 
@@ -152,7 +161,7 @@ def add_body(tools: Tools, scratch: Scratch, body: int) -> None:
     """
     import warp as wp
 
-    from .kernels import bodies, distance
+    from .kernels import bodies, crossings, lower
 
     verts = tools.verts[body]
     box = torch.stack([verts.amin(0), verts.amax(0)]).double().cpu()
@@ -176,8 +185,13 @@ def add_body(tools: Tools, scratch: Scratch, body: int) -> None:
     launch(bodies.leaves, tools.tree.branches**LEVELS)
     for level in reversed(range(LEVELS - 1)):
         launch(bodies.inner, tools.tree.branches ** (level + 1), level)
-    launch(bodies.cross, work.faces.shape[0])
-    launch(distance.columns, int(shape[0] * shape[2]))
+    launch(crossings.cross, work.faces.shape[0])
+    launch(lower.blocks, _columns(shape))
+
+
+def _columns(shape: np.ndarray) -> int:
+    """Columns of blocks of two by two places in a box."""
+    return int((shape[0] + 1) // 2 * ((shape[2] + 1) // 2))
 
 
 def _resized(tools: Tools, scratch: Scratch, shape: np.ndarray) -> Any:  # noqa: ANN401
@@ -191,10 +205,13 @@ def _resized(tools: Tools, scratch: Scratch, shape: np.ndarray) -> Any:  # noqa:
         scratch.places = places * 5 // 4
         work.steps = _blank(scratch.places, wp.int32, tools.device)
         work.owner = wp.full(scratch.places, -1, dtype=wp.int32, device=tools.device)
-        work.least = _blank(scratch.places, wp.float32, tools.device)
     if blocks > scratch.blocks:
         scratch.blocks = blocks * 5 // 4
         work.near = _blank(scratch.blocks, wp.uint8, tools.device)
+    lists = 1 if work.beside else _columns(shape)
+    if lists > scratch.lists:
+        scratch.lists = lists
+        work.tree.leaves = _blank(lists * work.tree.longest, wp.int32, tools.device)
     work.turn.zero_()
     work.steps[:places].zero_()
     work.near[:blocks].zero_()

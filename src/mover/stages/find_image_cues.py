@@ -44,6 +44,8 @@ class ImageInputs:
     """People in the reference image."""
     behind: Bool[Tensor, "objects objects"]
     """[i, j]: object j is known to stand behind object i, so it cannot hide it."""
+    distance: Float[Tensor, " objects"] | None = None
+    """From the camera to the middle of each base in the initial scene [m]."""
 
 
 def find_image_cues(
@@ -64,7 +66,7 @@ def find_image_cues(
     if config.form == "robust":
         sides = sides & _seen_sides(inputs, others)
     trust = torch.ones(len(own))
-    return ImageCues(inputs.boxes, sides, views, own, keep, trust)
+    return ImageCues(inputs.boxes, sides, views, own, keep, trust, inputs.distance)
 
 
 def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:

@@ -10,11 +10,15 @@ from torch import Tensor
 from ..energy import HumanCues, ImageCues, SceneConfig, SceneWeights, scene_energy
 from ..geometry.placement import stand
 from ..minimize import Adam, Energy, Minimum, Observer, Step, minimize, silent
+from ..minimize_newton import Problems, Quasi, settle
 from ..records import record
 from ..terms import Form
+from ..terms.contact_trees import trees_of
 from ..types import Camera, Layout, Objects
+from .coarser import coarser_humans, coarser_image
 from .pinned import Pinned, hold
-from .starts import best_few, choose, spread
+from .some_objects import some_humans, some_image, some_objects, some_pinned
+from .starts import best_few, choose, joined, shaken, spread
 
 
 @dataclass(frozen=True)
@@ -24,16 +28,20 @@ class PlaceConfig:
     weights: SceneWeights = field(default_factory=SceneWeights)
     form: Form = "paper"
     """How the terms are priced."""
-    method: Adam = field(default_factory=Adam)
+    method: Adam | Quasi = field(default_factory=Adam)
     """The descent from each start that is left."""
     first: Adam = field(default_factory=lambda: Adam(steps=0))
     """A descent of the box term over the places alone, before all others (release)."""
     yaws: int = 1
     """Starts that are turned evenly round each object."""
-    short: Adam = field(default_factory=lambda: Adam(steps=0))
+    short: Adam | Quasi = field(default_factory=lambda: Adam(steps=0))
     """A short descent from each of them."""
     keep: int = 1
     """Starts of each object that are left after the short descents."""
+    coarse: int = 1
+    """Pixels of a window that are one, along each side, in the short descents."""
+    shaken: int = 0
+    """Further descents from places around the best one of each object."""
     tie: float = 0.0
     """How much a turn away from the reference yaw worsens a candidate: 1 doubles half a turn."""
     span: float = 0.0
@@ -85,15 +93,28 @@ class Placed:
 
 def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = silent) -> Placed:
     """Minimise Eq. 1 over the layout, from one start or from many."""
-    starts = inputs.starts
+    starts, inputs = inputs.starts, with_trees(inputs)
     if config.first.steps:
         starts = _by_boxes(inputs, config, starts, observe)
     if config.yaws > 1:
         starts = spread(starts, config.yaws)
     if config.short.steps:
-        found = descend(inputs, config, starts, config.short, observe)
+        blurred = replace(
+            inputs,
+            image=coarser_image(inputs.image, config.coarse),
+            humans=coarser_humans(inputs.humans, config.coarse),
+        )
+        found = descend(blurred, config, starts, config.short, observe)
         starts = best_few(found.at, found.value, config.keep)
     found = descend(inputs, config, starts, config.method, observe)
+    if config.shaken:
+        around = shaken(best_few(found.at, found.value, 1), config.shaken)
+        more = descend(inputs, config, around, config.method, observe)
+        found = Minimum(
+            joined(found.at, more.at),
+            torch.cat([found.value, more.value]),
+            torch.cat([found.trace, more.trace]),
+        )
     candidates = best_few(found.at, found.value, len(found.value), apart=False)
     energy = found.value.sort(0).values
     at = choose(candidates, energy, inputs.reference, config.tie)
@@ -115,13 +136,14 @@ def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], En
 
 
 def descend(
-    inputs: PlaceInputs, config: PlaceConfig, starts: Layout, method: Adam, observe: Observer
+    inputs: PlaceInputs,
+    config: PlaceConfig,
+    starts: Layout,
+    method: Adam | Quasi,
+    observe: Observer,
 ) -> Minimum[Layout]:
     """Follow the energy from each start; the result stands on its supports."""
-    energy, objects = energy_of(inputs, config), inputs.objects
-    span = torch.tensor(
-        [config.chair_span if c == "chair" else config.span for c in objects.categories]
-    )
+    objects, span = inputs.objects, _spans(inputs.objects, config)
 
     def at(free: Layout) -> Layout:
         held = hold(_bounded(free, span), inputs.pinned)
@@ -132,14 +154,61 @@ def descend(
         assert free is not None
         observe(replace(step, at=lambda: Moment(at(free()), inputs.camera, inputs.ground)))
 
-    found = minimize(
-        lambda free: energy(_bounded(free, span)),
-        _unbounded(starts, span),
-        method,
-        watched,
-        "place_objects",
-    )
+    begin = _unbounded(starts, span)
+    if isinstance(method, Quasi):
+        found = settle(_problems(inputs, config, begin), method, watched, "place_objects")
+    else:
+        energy = _free_energy(inputs, config)
+        found = minimize(energy, begin, method, watched, "place_objects")
     return Minimum(at(found.at), found.value, found.trace)
+
+
+def with_trees(inputs: PlaceInputs) -> PlaceInputs:
+    """The inputs with search trees of what is touched, where these help."""
+    humans = inputs.humans
+    if humans.touches is None:
+        return inputs
+    trees = trees_of(inputs.objects, humans.touches)
+    return replace(inputs, humans=replace(humans, trees=trees))
+
+
+def _free_energy(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
+    """The energy as a function of the unknowns of a descent."""
+    energy, span = energy_of(inputs, config), _spans(inputs.objects, config)
+    return lambda free: energy(_bounded(free, span))
+
+
+def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Problems[Layout]:
+    """Each start of each object as a problem of its own; loads belong to their carriers."""
+    starts, n = begin.yaw.shape
+
+    def of(rows: Tensor) -> Callable[[Layout], Energy]:
+        index = rows % n
+        few = replace(
+            inputs,
+            objects=some_objects(inputs.objects, rows),
+            image=some_image(inputs.image, index),
+            humans=some_humans(inputs.humans, index, n),
+            reference=inputs.reference[index],
+            pinned=some_pinned(inputs.pinned, index),
+        )
+        return _free_energy(few, config)
+
+    carrier = inputs.objects.supports
+    if not bool((carrier >= 0).any()):
+        return Problems(of, begin, (starts, n))
+    root = torch.where(carrier >= 0, carrier, torch.arange(n).to(carrier))
+    for _ in range(n):
+        root = root[root]
+    group = root + n * torch.arange(starts).to(root)[:, None]
+    return Problems(of, begin, (starts, n), group.flatten())
+
+
+def _spans(objects: Objects, config: PlaceConfig) -> Float[Tensor, " objects"]:
+    """Range of the scale of each object, 0 where it is free."""
+    return torch.tensor(
+        [config.chair_span if c == "chair" else config.span for c in objects.categories]
+    )
 
 
 def _by_boxes(

@@ -12,6 +12,7 @@ from ..types import Layout
 
 TURNED = math.radians(20)  # candidates nearer than this in yaw,
 MOVED = 0.3  # and than this in place [m], are one
+SHAKE = (0.05, 0.05, 0.03)  # by which places [m], yaws [rad] and log scales are shaken
 
 
 def spread(layout: Layout, yaws: int) -> Layout:
@@ -20,6 +21,22 @@ def spread(layout: Layout, yaws: int) -> Layout:
     yaw = wrap(layout.yaw + turns[:, None, None]).flatten(0, 1)
     return Layout(
         layout.t_world_object.repeat(yaws, 1, 1), yaw, layout.log_scale.repeat(yaws, 1, 1)
+    )
+
+
+def shaken(layout: Layout, times: int) -> Layout:
+    """Places around each start, the same in every run and for every object.
+
+    Minima of Eq. 1 are rugged within a pixel or two; from around one the next, deeper one is found.
+    """
+    generator = torch.Generator().manual_seed(0)
+    draw = torch.randn(times, 7, generator=generator).to(layout.yaw)
+    place, turn, size = draw[:, None, :3], draw[:, None, 3], draw[:, None, 4:]
+    t, yaw, log_scale = layout.t_world_object, layout.yaw, layout.log_scale
+    return Layout(
+        (t + SHAKE[0] * place[:, None]).flatten(0, 1),
+        wrap(yaw + SHAKE[1] * turn[:, None]).flatten(0, 1),
+        (log_scale + SHAKE[2] * size[:, None]).flatten(0, 1),
     )
 
 

@@ -60,13 +60,25 @@ def contact_term(
     """
     top, back = (r[..., touches.object_of, :, :].unsqueeze(-3) for r in regions)
     parts = torch.cat([top, back, top, back], -3)  # *starts touched 4 region 3
-    price = _to_bodies(parts, touches) if form == "release" else _to_object(parts, touches, form)
+    if form == "release":
+        price = _to_bodies(parts, touches)
+    else:
+        near = _nearest(touches.points.expand(*parts.shape[:-2], -1, 3), parts)
+        price = _price(near, touches, form)
     total = torch.zeros_like(regions[0][..., 0, 0])
     return total.index_add(-1, touches.object_of, price)
 
 
-def _to_object(parts: Tensor, touches: Touches, form: Form) -> Float[Tensor, "*starts touched"]:
-    near = _nearest(touches.points.expand(*parts.shape[:-2], -1, 3), parts)
+def gap_term(
+    gaps: Float[Tensor, "*starts touched 4 points"], touches: Touches, objects: int, form: Form
+) -> Float[Tensor, "*starts objects"]:
+    """`contact_term` of `paper` and `robust`, from distances that are known [m]."""
+    price = _price(gaps, touches, form)
+    total = price.new_zeros(*price.shape[:-1], objects)
+    return total.index_add(-1, touches.object_of, price)
+
+
+def _price(near: Tensor, touches: Touches, form: Form) -> Float[Tensor, "*starts touched"]:
     if form == "paper":
         return (near * touches.weight).sum((-2, -1))
     share = torch.tensor(SHARE).to(near)

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..geometry.price_warp import bounds_depths, outside
 from ..geometry.raster import Depths
 from ..records import record
 from . import Form
@@ -106,6 +107,10 @@ def depth_term(
     seen: Depths, mask: Float[Tensor, "objects h w"], allowed: DepthRange, form: Form
 ) -> Float[Tensor, "*starts objects"]:
     """Distance out of the allowed range [m px at 640], or its mean [m] (`robust`)."""
+    if form == "robust" and bounds_depths(seen.nearest, mask, allowed.near, allowed.far):
+        maps, bounds = (seen.nearest, seen.covered), (allowed.near, allowed.far)
+        out, count = outside(maps, mask, bounds, (MARGIN, CLAMP))
+        return out / count.clamp_min(FEWEST)
     inside = seen.covered & (mask > 0.5)
     if form == "release":
         inside = _erode(inside)

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..geometry.price_warp import squares
 from . import Form
 
 RING = 7  # [px], PHOSA's window for the ring around a silhouette
@@ -28,7 +29,7 @@ def silhouette_term(
     form: Form,
 ) -> Float[Tensor, "*starts objects"]:
     """Squared difference between drawn and detected masks [px], or per mask pixel (`robust`)."""
-    price = ((drawn - mask).square() * keep).sum((-2, -1))
+    price = squares(drawn, mask, keep)
     if form == "robust":
         return price / (mask * keep).sum((-2, -1)).clamp_min(1)
     return price

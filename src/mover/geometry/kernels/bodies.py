@@ -3,10 +3,6 @@
 
 Positions are in cells: the centres of the grid's cells have integer coordinates. Scratch arrays
 are laid out by column, (x, z, y), with one place more than the body's box has along y.
-
-A box of triangles is skipped only if it is clearly further away than the best triangle so far
-(`SLACK`). So the least distance is the same bits whatever the tree, the order of the search or
-what was known before it.
 """
 
 from typing import no_type_check
@@ -15,12 +11,11 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-SNAP = wp.constant(wp.float64(65536.0))  # vertices snap to this part of a cell, as in `voxels`
-BITS = wp.constant(wp.int64(16))
 SHELL = wp.constant(2.0)  # [cells], see `volume.SHELL`
 BLOCK = wp.constant(2)  # bits: blocks of 4 cells are marked as near the surface
-SLACK = wp.constant(1.0001)  # of squared distances; rounding is a thousand times smaller
+SLACK = wp.constant(1.0001)  # of squared limits; rounding is a thousand times smaller
 FAR = wp.constant(1.0e30)
+MARGIN = wp.constant(0.002)  # [cells], of distances to planes; rounding is a hundred times smaller
 
 
 @wp.struct
@@ -28,7 +23,8 @@ FAR = wp.constant(1.0e30)
 class Tree:
     """The triangles of a body and the boxes around them, level by level, then of each triangle.
 
-    Functions get a copy of their arguments, so what is searched often is kept small.
+    `plane` holds each triangle, `slab` and `thick` each leaf (its middle plane and half its
+    thickness). `leaves` is scratch for lists that have room for `longest`.
     """
 
     branches: int
@@ -37,12 +33,21 @@ class Tree:
     corners: wp.array(dtype=wp.vec3)
     below: wp.array(dtype=wp.vec3)
     above: wp.array(dtype=wp.vec3)
+    plane: wp.array(dtype=wp.vec4)
+    slab: wp.array(dtype=wp.vec4)
+    thick: wp.array(dtype=wp.float32)
+    leaves: wp.array(dtype=wp.int32)
+    longest: int
 
 
 @wp.struct
 @no_type_check
 class Work:
-    """One body on its way into a volume; one of these for each worker."""
+    """One body on its way into a volume; one of these for each worker.
+
+    `other` is the volume of another worker: what is no lower than there need not be measured.
+    It is read while it is written; any value that it has held is right, since it only falls.
+    """
 
     origin: wp.vec3d
     cell: wp.float64
@@ -55,10 +60,11 @@ class Work:
     turn: wp.array(dtype=wp.float64)
     steps: wp.array(dtype=wp.int32)
     owner: wp.array(dtype=wp.int32)
-    least: wp.array(dtype=wp.float32)
     beside: int
+    eight: int
     near: wp.array(dtype=wp.uint8)
     field: wp.array3d(dtype=wp.float32)
+    other: wp.array3d(dtype=wp.float32)
 
 
 @wp.kernel
@@ -102,6 +108,55 @@ def mark(w: Work, low: wp.vec3, high: wp.vec3) -> None:
                 w.near[block_of(w, i << BLOCK, j << BLOCK, k << BLOCK)] = wp.uint8(1)
 
 
+@wp.func
+@no_type_check
+def direction(n: wp.vec3) -> wp.vec3:
+    """Unit vector along another; zero where there is none."""
+    size = wp.length(n)
+    if size < 1.0e-12:
+        return wp.vec3(0.0, 0.0, 0.0)
+    return n / size
+
+
+@wp.func
+@no_type_check
+def flatten(t: Tree, leaf: int, normal: wp.vec3) -> None:
+    """The slab around the triangles of a leaf."""
+    n = direction(normal)
+    low = float(FAR)
+    high = float(-FAR)
+    for k in range(3 * t.first[leaf], 3 * t.first[leaf + 1]):
+        h = wp.dot(n, t.corners[k])
+        low = wp.min(low, h)
+        high = wp.max(high, h)
+    t.slab[leaf] = wp.vec4(n[0], n[1], n[2], 0.5 * (low + high))
+    t.thick[leaf] = 0.5 * (high - low) + MARGIN
+
+
+@wp.func
+@no_type_check
+def enter(w: Work, f: int, t: wp.vec3i) -> wp.vec3:
+    """Corners, box and plane of a triangle; gives its normal, as long as twice its area.
+
+    The corners are in the order of their indices: a mirrored body gives the same bits.
+    """
+    i = wp.min(t)
+    k = wp.max(t)
+    a = single(w.place[i])
+    b = single(w.place[t[0] + t[1] + t[2] - i - k])
+    c = single(w.place[k])
+    w.tree.corners[3 * f] = a
+    w.tree.corners[3 * f + 1] = b
+    w.tree.corners[3 * f + 2] = c
+    w.tree.below[w.tree.start[4] + f] = wp.min(a, wp.min(b, c))
+    w.tree.above[w.tree.start[4] + f] = wp.max(a, wp.max(b, c))
+    across = wp.cross(b - a, c - a)
+    n = direction(across)
+    w.tree.plane[f] = wp.vec4(n[0], n[1], n[2], wp.dot(n, a))
+    even = (i == t[0] and k == t[2]) or (i == t[1] and k == t[0]) or (i == t[2] and k == t[1])
+    return wp.where(even, across, -across)
+
+
 @wp.kernel
 @no_type_check
 def leaves(w: Work) -> None:
@@ -110,25 +165,16 @@ def leaves(w: Work) -> None:
     base = w.place[w.faces[0][0]]
     low = wp.vec3(FAR, FAR, FAR)
     high = -low
+    normal = wp.vec3(0.0, 0.0, 0.0)
     total = wp.float64(0.0)
     for f in range(w.tree.first[leaf], w.tree.first[leaf + 1]):
         t = w.faces[f]
         total += wp.dot(wp.cross(w.place[t[0]] - base, w.place[t[1]] - base), w.place[t[2]] - base)
-        i = wp.min(t)  # in the order of their indices, so that a mirrored body gives the same bits
-        k = wp.max(t)
-        a = single(w.place[i])
-        b = single(w.place[t[0] + t[1] + t[2] - i - k])
-        c = single(w.place[k])
-        w.tree.corners[3 * f] = a
-        w.tree.corners[3 * f + 1] = b
-        w.tree.corners[3 * f + 2] = c
-        least = wp.min(a, wp.min(b, c))
-        most = wp.max(a, wp.max(b, c))
-        w.tree.below[w.tree.start[4] + f] = least
-        w.tree.above[w.tree.start[4] + f] = most
-        low = wp.min(low, least)
-        high = wp.max(high, most)
+        normal += enter(w, f, t)
+        low = wp.min(low, w.tree.below[w.tree.start[4] + f])
+        high = wp.max(high, w.tree.above[w.tree.start[4] + f])
     mark(w, low, high)
+    flatten(w.tree, leaf, normal)
     w.tree.below[w.tree.start[3] + leaf] = low
     w.tree.above[w.tree.start[3] + leaf] = high
     wp.atomic_add(w.turn, 0, total)
@@ -147,84 +193,3 @@ def inner(w: Work, level: int) -> None:
         high = wp.max(high, w.tree.above[k])
     w.tree.below[w.tree.start[level] + node] = low
     w.tree.above[w.tree.start[level] + node] = high
-
-
-@wp.struct
-@no_type_check
-class Flat:
-    """A triangle seen along y, in fixed point, counter-clockwise."""
-
-    x: wp.types.vector(length=3, dtype=wp.int64)
-    z: wp.types.vector(length=3, dtype=wp.int64)
-    y: wp.vec3d
-    sign: int
-
-
-@wp.func
-@no_type_check
-def flat(w: Work, t: wp.vec3i) -> Flat:
-    """See `Flat`; the sign is 0 where the triangle is seen edge-on."""
-    r = Flat()
-    for k in range(3):
-        v = w.place[t[k]]
-        r.x[k] = wp.int64(wp.rint(v[0] * SNAP)) - (wp.int64(w.low[0]) << BITS)
-        r.z[k] = wp.int64(wp.rint(v[2] * SNAP)) - (wp.int64(w.low[2]) << BITS)
-        r.y[k] = v[1]
-    area = (r.x[1] - r.x[0]) * (r.z[2] - r.z[0]) - (r.z[1] - r.z[0]) * (r.x[2] - r.x[0])
-    r.sign = 1
-    if area == wp.int64(0):
-        r.sign = 0
-    if area < wp.int64(0):
-        r.sign = -1
-        x = r.x[1]
-        z = r.z[1]
-        y = r.y[1]
-        r.x[1] = r.x[2]
-        r.z[1] = r.z[2]
-        r.y[1] = r.y[2]
-        r.x[2] = x
-        r.z[2] = z
-        r.y[2] = y
-    return r
-
-
-@wp.func
-@no_type_check
-def weight(r: Flat, k: int, px: wp.int64, pz: wp.int64) -> wp.int64:
-    """Twice the area of a column and the edge opposite of a corner; -1 if it is outside."""
-    i = (k + 1) % 3
-    j = (k + 2) % 3
-    ex = r.x[j] - r.x[i]
-    ez = r.z[j] - r.z[i]
-    area = ex * (pz - r.z[i]) - ez * (px - r.x[i])
-    owns = ez < wp.int64(0) or (ez == wp.int64(0) and ex > wp.int64(0))
-    if area == wp.int64(0) and not owns:
-        area = wp.int64(-1)
-    return area
-
-
-@wp.kernel
-@no_type_check
-def cross(w: Work) -> None:
-    """Signed crossings of the columns with each triangle, one step where they pass it."""
-    r = flat(w, w.faces[wp.tid()])
-    if r.sign == 0:
-        return
-    one = wp.int64(65535)
-    xl = wp.max(int((wp.min(r.x) + one) >> BITS), 0)
-    xh = wp.min(int(wp.max(r.x) >> BITS), w.size[0] - 1)
-    zl = wp.max(int((wp.min(r.z) + one) >> BITS), 0)
-    zh = wp.min(int(wp.max(r.z) >> BITS), w.size[2] - 1)
-    for x in range(xl, xh + 1):
-        for z in range(zl, zh + 1):
-            px = wp.int64(x) << BITS
-            pz = wp.int64(z) << BITS
-            a = weight(r, 0, px, pz)
-            b = weight(r, 1, px, pz)
-            c = weight(r, 2, px, pz)
-            if wp.min(a, wp.min(b, c)) >= wp.int64(0):
-                share = wp.vec3d(wp.float64(a), wp.float64(b), wp.float64(c))
-                height = wp.dot(share, r.y) / wp.float64(a + b + c)
-                y = int(wp.ceil(wp.clamp(height, wp.float64(-1.0e6), wp.float64(1.0e6))))
-                y = wp.clamp(y - w.low[1], 0, w.size[1])
-                wp.atomic_add(w.steps, (x * w.size[2] + z) * (w.size[1] + 1) + y, r.sign)

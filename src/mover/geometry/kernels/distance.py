@@ -1,17 +1,20 @@
 # pyright: basic, reportInvalidTypeForm=false
-"""Warp kernels of the distance from cells to triangles; see `bodies`."""
+"""Warp functions of the distance from places to triangles, and of the tree over these.
+
+A triangle counts as no nearer than the box around it. No rounding then makes a triangle nearer
+than a box that holds it, and the least distance is the same bits whatever the tree, the order of
+the search or what was known before it.
+"""
 
 from typing import no_type_check
 
 import warp as wp
 
-from .bodies import FAR, SHELL, SLACK, Tree, Work, block_of
+from .bodies import FAR, MARGIN, Tree
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 TINY = wp.constant(1.0e-30)
-STEP = wp.constant(1.0001)  # [cells], to the next place, and rounding
-AHEAD = wp.constant(1.2)  # [cells], to search further than needed: the next places gain from it
 
 
 @wp.func
@@ -48,9 +51,45 @@ def to_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
         return along(ap, ac, d2, d2 - d6)
     if d3 * d6 <= d5 * d4 and d4 >= d3 and d5 >= d6:
         return along(bp, c - b, d4 - d3, d4 - d3 + d5 - d6)
-    n = wp.cross(ab, ac)
-    d = wp.dot(ap, n)
-    return d * d / wp.max(wp.length_sq(n), TINY)
+    vb = d5 * d2 - d1 * d6
+    vc = d1 * d4 - d3 * d2
+    whole = wp.max(d3 * d6 - d5 * d4 + vb + vc, TINY)
+    return wp.length_sq(ap - ab * (vb / whole) - ac * (vc / whole))
+
+
+@wp.func
+@no_type_check
+def gap(a: float, b: float) -> float:
+    """Of two numbers, of which not both are above zero, the one that is; else zero.
+
+    Exact, and without a comparison: `wp.max` takes care of NaN, which is many times slower.
+    """
+    return 0.5 * ((a + wp.abs(a)) + (b + wp.abs(b)))
+
+
+@wp.func
+@no_type_check
+def between(low: wp.vec3, high: wp.vec3, below: wp.vec3, above: wp.vec3) -> float:
+    """Squared distance between two boxes."""
+    x = gap(below[0] - high[0], low[0] - above[0])
+    y = gap(below[1] - high[1], low[1] - above[1])
+    z = gap(below[2] - high[2], low[2] - above[2])
+    return x * x + y * y + z * z
+
+
+@wp.func
+@no_type_check
+def to_box(p: wp.vec3, low: wp.vec3, high: wp.vec3) -> float:
+    """Squared distance to a box."""
+    return between(p, p, low, high)
+
+
+@wp.func
+@no_type_check
+def to_corners(t: Tree, p: wp.vec3, face: int) -> float:
+    """Squared distance to the triangle of a face."""
+    k = 3 * face
+    return to_triangle(p, t.corners[k], t.corners[k + 1], t.corners[k + 2])
 
 
 @wp.func
@@ -59,142 +98,99 @@ def to_face(t: Tree, p: wp.vec3, face: int) -> float:
     """Squared distance to one face; far away for none."""
     if face < 0:
         return FAR
-    return to_triangle(p, t.corners[3 * face], t.corners[3 * face + 1], t.corners[3 * face + 2])
+    box = t.start[4] + face
+    least = to_box(p, t.below[box], t.above[box])
+    d = to_corners(t, p, face)
+    return wp.where(d > least, d, least)
 
 
 @wp.func
 @no_type_check
-def to_box(p: wp.vec3, low: wp.vec3, high: wp.vec3) -> float:
-    """Squared distance to a box."""
-    out = wp.max(wp.max(low - p, p - high), wp.vec3(0.0, 0.0, 0.0))
-    return wp.length_sq(out)
+def off(p: wp.vec3, plane: wp.vec4) -> float:
+    """Distance to a plane."""
+    return wp.abs(plane[0] * p[0] + plane[1] * p[1] + plane[2] * p[2] - plane[3])
 
 
 @wp.func
 @no_type_check
-def look_in(t: Tree, p: wp.vec3, node: int, best: float, face: int) -> tuple[float, int]:
-    """Look for a nearer face in one node above the leaves: squared distance and face."""
-    start = t.branches * node
-    for k in range(start, start + t.branches):
-        leaf = t.start[3] + k
-        if to_box(p, t.below[leaf], t.above[leaf]) <= best * SLACK:
-            for f in range(t.first[k], t.first[k + 1]):
-                box = t.start[4] + f
-                if to_box(p, t.below[box], t.above[box]) <= best * SLACK:
-                    a = t.corners[3 * f]
-                    d = to_triangle(p, a, t.corners[3 * f + 1], t.corners[3 * f + 2])
-                    if d < best:
-                        best = d
+def in_leaves(t: Tree, p: wp.vec3, first: int, end: int, best: float) -> tuple[float, int]:
+    """Nearest face of listed leaves, if it is nearer than what is known: squared distance, face."""
+    least = float(best)
+    reach = wp.sqrt(least)
+    face = int(-1)
+    for k in range(first, end):
+        leaf = t.leaves[k]
+        at = t.start[3] + leaf
+        box = to_box(p, t.below[at], t.above[at])
+        if box < least and off(p, t.slab[leaf]) - t.thick[leaf] < reach:
+            for f in range(t.first[leaf], t.first[leaf + 1]):
+                at = t.start[4] + f
+                box = to_box(p, t.below[at], t.above[at])
+                if box < least and off(p, t.plane[f]) - MARGIN < reach:
+                    d = to_corners(t, p, f)
+                    d = wp.where(d > box, d, box)
+                    if d < least:
+                        least = d
+                        reach = wp.sqrt(d)
                         face = f
-    return best, face
+    return least, face
 
 
 @wp.func
 @no_type_check
-def search(t: Tree, p: wp.vec3, known: float, owner: int, enough: float) -> tuple[float, int]:
-    """Least squared distance and its face, if less than what is known; ends where it is enough."""
-    best = float(known)
-    face = int(owner)
+def under(t: Tree, low: wp.vec3, high: wp.vec3, reach: float, node: int, first: int) -> int:
+    """Add the leaves under a node of the second level to a list, see `gather`."""
+    end = int(first)
+    n = t.branches
+    wide = high - low
+    middle = low + 0.5 * wide
+    far = wp.sqrt(reach)
+    for k in range(n * node, n * node + n):
+        box = t.start[2] + k
+        if between(low, high, t.below[box], t.above[box]) < reach:
+            for leaf in range(n * k, n * k + n):
+                s = t.slab[leaf]
+                spread = wp.abs(s[0]) * wide[0] + wp.abs(s[1]) * wide[1] + wp.abs(s[2]) * wide[2]
+                if off(middle, s) - t.thick[leaf] - 0.5 * spread < far:
+                    box = t.start[3] + leaf
+                    if between(low, high, t.below[box], t.above[box]) < reach:
+                        t.leaves[end] = leaf
+                        end += 1
+    return end
+
+
+@wp.func
+@no_type_check
+def gather(t: Tree, low: wp.vec3, high: wp.vec3, reach: float, first: int) -> int:
+    """List the leaves nearer to a box than a squared distance; the list's end, -1 if too long."""
+    end = int(first)
     n = t.branches
     for i in range(n):
-        if to_box(p, t.below[i], t.above[i]) <= best * SLACK:
+        if between(low, high, t.below[i], t.above[i]) < reach:
             for j in range(n * i, n * i + n):
                 box = t.start[1] + j
-                if to_box(p, t.below[box], t.above[box]) <= best * SLACK:
-                    for k in range(n * j, n * j + n):
-                        box = t.start[2] + k
-                        if to_box(p, t.below[box], t.above[box]) <= best * SLACK:
-                            best, face = look_in(t, p, k, best, face)
-                            if best * SLACK <= enough:
-                                return best, face
-    return best, face
+                if between(low, high, t.below[box], t.above[box]) < reach:
+                    if end - first + n * n > t.longest:
+                        return -1
+                    end = under(t, low, high, reach, j, end)
+    return end
 
 
 @wp.func
 @no_type_check
-def nearer_of(t: Tree, p: wp.vec3, one: int, other: int) -> tuple[float, int]:
-    """The nearer of two faces: its squared distance and itself."""
-    best = to_face(t, p, one)
-    face = int(one)
-    d = to_face(t, p, other)
-    if d < best:
-        best = d
-        face = other
-    return best, face
-
-
-@wp.func
-@no_type_check
-def beside(w: Work, v: int) -> int:
-    """A face that is near the place beside; -1 where none is known."""
-    if v <= w.size[1]:
-        return -1
-    return w.owner[v - w.size[1] - 1]
-
-
-@wp.func
-@no_type_check
-def deeper(w: Work, at: wp.vec3i, v: int, guess: int) -> int:
-    """Lower the field at one place inside; gives a face that is near."""
-    cell = wp.float32(w.cell)
-    p = wp.vec3(float(at[0]), float(at[1]), float(at[2]))
-    held = w.field[at[0], at[1], at[2]] / cell
-    enough = wp.where(held < 0.0, held * held, -1.0)
-    known, face = nearer_of(w.tree, p, guess, beside(w, v))
-    if known * SLACK > enough:  # else the place is not as deep in this body as in another
-        known, face = search(w.tree, p, known, face, enough)
-        depth = -wp.sqrt(known) * cell
-        w.field[at[0], at[1], at[2]] = wp.min(w.field[at[0], at[1], at[2]], depth)
-    return face
-
-
-@wp.func
-@no_type_check
-def nearer(w: Work, at: wp.vec3i, v: int, guess: int, least: float) -> tuple[int, float]:
-    """Lower the field at one place outside; gives a face that is near and the least distance."""
-    cell = wp.float32(w.cell)
-    p = wp.vec3(float(at[0]), float(at[1]), float(at[2]))
-    held = w.field[at[0], at[1], at[2]] / cell
-    limit = wp.min(SHELL, held) * SLACK
-    if least >= limit:
-        return guess, least
-    reach = (limit + AHEAD) * (limit + AHEAD)
-    known, face = nearer_of(w.tree, p, guess, beside(w, v))
-    if known >= reach:
-        known = reach
-    known, face = search(w.tree, p, known, face, -1.0)
-    distance = wp.sqrt(known)
-    if known < reach and distance <= SHELL:
-        w.field[at[0], at[1], at[2]] = wp.min(w.field[at[0], at[1], at[2]], distance * cell)
-    return face, distance
-
-
-@wp.kernel
-@no_type_check
-def columns(w: Work) -> None:
-    """Lower the field along one column of the body's box."""
-    column = wp.tid()
-    x = column / w.size[2]
-    z = column - x * w.size[2]
-    side = wp.where(w.turn[0] < wp.float64(0.0), -1, 1)
-    winding = wp.int32(0)
-    guess = wp.int32(-1)
-    least = wp.float32(0.0)
-    for y in range(w.size[1]):
-        v = column * (w.size[1] + 1) + y
-        winding += w.steps[v] * side
-        if w.beside > 0 and z > 0:
-            least = wp.max(least, w.least[v - w.size[1] - 1])
-        if w.beside > 0 and x > 0:
-            least = wp.max(least, w.least[v - w.size[2] * (w.size[1] + 1)])
-        least = wp.max(least - STEP, 0.0)
-        at = w.low + wp.vec3i(x, y, z)
-        if winding > 0:
-            guess = deeper(w, at, v, guess)
-            least = 0.0
-        elif w.near[block_of(w, x, y, z)] == wp.uint8(0):
-            least = wp.max(least, SHELL)
-        elif w.field[at[0], at[1], at[2]] > 0.0:
-            guess, least = nearer(w, at, v, guess, least)
-        w.owner[v] = guess
-        w.least[v] = least
+def in_tree(t: Tree, p: wp.vec3, first: int, best: float) -> tuple[float, int]:
+    """Nearest face of all, if it is nearer than what is known: squared distance, face."""
+    least = float(best)
+    face = int(-1)
+    n = t.branches
+    for i in range(n):
+        if to_box(p, t.below[i], t.above[i]) < least:
+            for j in range(n * i, n * i + n):
+                box = t.start[1] + j
+                if to_box(p, t.below[box], t.above[box]) < least:
+                    end = under(t, p, p, least, j, first)
+                    d, one = in_leaves(t, p, first, end, least)
+                    if one >= 0:
+                        least = d
+                        face = one
+    return least, face

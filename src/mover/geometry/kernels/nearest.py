@@ -74,9 +74,11 @@ def nearest(
     query: wp.array2d(dtype=wp.vec3),
     scale: wp.array(dtype=wp.vec3),
     found: wp.array2d(dtype=wp.int64),
+    first_row: int,
 ) -> None:
     """Index of the nearest scaled point of each query; the first of those equally near."""
-    row, column = wp.tid()
+    tid, column = wp.tid()
+    row = first_row + tid
     q = Query()
     q.item = row % c.points.shape[0]
     q.place = query[row, column]

@@ -1,0 +1,105 @@
+"""The paper's table of human poses on known rooms: what the room gives back to the bodies.
+
+    PYTHONPATH=src python benchmarks/bodies.py --seeds 200 202 203
+
+The bodies have the errors of `NoiseConfig`: pose and depth errors that last. Every row is refined
+by the same terms of smoothness and of staying near; only what it knows of the room differs.
+"""
+
+import argparse
+import dataclasses
+import sys
+import time
+from collections.abc import Sequence
+
+import torch
+
+from mover.geometry.watertight import close_mesh
+from mover.metrics_bodies import gather_twins, p_pje, p_v2v, pje, v2v
+from mover.outcome import carried
+from mover.rooms.noise import add_noise
+from mover.rooms.noise_config import NoiseConfig
+from mover.rooms.room import make_room
+from mover.stages.refine_bodies import ABLATION, RefineBodiesConfig, refine_bodies
+from mover.types import Bodies, Capture, Room, Scene
+
+METRICS = (pje, v2v, p_pje, p_v2v)
+GIVEN = "as given"
+
+
+def rooms_of(seed: int, place: float) -> tuple[Capture, Bodies, Room, Room]:
+    """A noisy capture, the true bodies, the room under the guessed and under the true camera.
+
+    Args:
+        seed: Of the room; its noise is drawn from another one.
+        place: Error of the furniture's place along x and z, drawn evenly [m].
+    """
+    known = make_room(seed)
+    capture = add_noise(known, NoiseConfig(), seed + 1000)
+    draw = torch.Generator().manual_seed(seed)
+    pieces = tuple(
+        dataclasses.replace(p, t_world_object=p.t_world_object + place * _flat(draw))
+        for p in known.truth.pieces
+    )
+    proxies = tuple(close_mesh(p.mesh) for p in pieces)
+    assert capture.bodies is not None
+    found: list[Room] = []
+    for camera in (capture.scene.camera, known.truth.camera):
+        scene = Scene(camera, known.truth.ground, pieces)
+        found.append(
+            Room(scene, capture.scene, scene, carried(capture.bodies, camera), None, proxies, (),
+                 None, {}, ())
+        )  # fmt: skip
+    return capture, carried(known.bodies, known.truth.camera), found[0], found[1]
+
+
+def _flat(draw: torch.Generator) -> torch.Tensor:
+    both = 2 * torch.rand(3, generator=draw) - 1
+    return both * torch.tensor([1.0, 0.0, 1.0])
+
+
+def scores(bodies: Bodies, truth: Bodies) -> list[float]:
+    """PJE, V2V and both after Procrustes [mm]."""
+    twins = gather_twins(bodies, truth)
+    assert twins is not None
+    return [1000 * float(metric(twins) or 0) for metric in METRICS]
+
+
+def main() -> None:
+    """Refine each room with each row of the table, and print the means."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[200, 202, 203])
+    parser.add_argument("--rows", nargs="+", default=list(ABLATION))
+    parser.add_argument("--place", type=float, default=0.0)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    table: dict[str, list[list[float]]] = {}
+    for seed in args.seeds:
+        capture, truth, guessed, known = rooms_of(seed, args.place)
+        assert guessed.bodies is not None
+        table.setdefault(GIVEN, []).append(scores(guessed.bodies, truth))
+        for name in args.rows:
+            room, begin = guessed if name == "baseline" else known, time.perf_counter()
+            config = RefineBodiesConfig(weights=ABLATION[name])
+            found = refine_bodies(room, capture, config)
+            table.setdefault(name, []).append(scores(found.bodies, truth))
+            _say(f"{seed} {_line(name, table[name][-1:])} {time.perf_counter() - begin:6.0f} s")
+    _say(
+        f"\n{'row':24}{'PJE':>8}{'V2V':>8}{'p.PJE':>8}{'p.V2V':>8}   [mm], {len(args.seeds)} rooms"
+    )
+    for name, rows in table.items():
+        _say(_line(name, rows))
+
+
+def _line(name: str, rows: Sequence[Sequence[float]]) -> str:
+    means = [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+    return f"{name:24}" + "".join(f"{value:8.1f}" for value in means)
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

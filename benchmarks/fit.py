@@ -1,0 +1,137 @@
+"""Bodies fitted to 2D joints alone: PYTHONPATH=src python benchmarks/fit.py --rooms 0 1 2.
+
+Known rooms give the joints that OpenPose would see (BODY_25): noise of 3 px in an image 960 wide,
+a tenth of the joints missing, none outside the image, and no legs while people sit. They are
+written as OpenPose's JSON, read as a user's would be, and fitted. PJE is the mean distance of the
+22 joints of the body from the truth: absolute, and with both pelvises laid on each other.
+"""
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mover.bodies import open_body
+from mover.bodies.keypoints import LAYOUTS, keypoints_of
+from mover.fitting import FitInputs, Fitted, fit_bodies
+from mover.geometry.camera import project
+from mover.geometry.runs import decode
+from mover.readers.people import Known, keypoints_from
+from mover.rooms.known import KnownRoom, RoomConfig
+from mover.rooms.render import see, see_body
+from mover.rooms.room import make_room
+
+LEGS = ("knee", "ankle", "toe", "heel")
+SEATED = ("sit", "lean")
+NOISE, MISSING = 3.0, 0.1
+
+
+def joints_seen(room: KnownRoom, rng: np.random.Generator) -> np.ndarray:
+    """Triples x, y, confidence of each body; zeros for what is not seen."""
+    camera, names = room.truth.camera, LAYOUTS["openpose25"]
+    points = keypoints_of(open_body(), room.bodies.verts, room.bodies.joints, "openpose25")
+    pixels = project(points, camera.K).double().numpy()
+    seen = rng.uniform(size=pixels.shape[:2]) >= MISSING
+    pixels = pixels + NOISE * rng.normal(size=pixels.shape)
+    seen &= ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(-1)
+    legs = np.array([any(part in name for part in LEGS) for name in names])
+    seated = np.array([action in SEATED for action in room.actions])
+    seen &= ~(legs & seated[:, None])
+    sure = np.where(seen, rng.uniform(0.5, 1.0, seen.shape), 0.0)
+    return np.concatenate([pixels * seen[..., None], sure[..., None]], -1)
+
+
+def write_openpose(room: KnownRoom, triples: np.ndarray, folder: Path) -> None:
+    """A JSON file for each frame."""
+    for frame in range(int(room.bodies.frame.max()) + 1):
+        rows = torch.nonzero(room.bodies.frame == frame)[:, 0].tolist()
+        people = [{"pose_keypoints_2d": triples[k].reshape(-1).tolist()} for k in rows]
+        (folder / f"{frame:06d}_keypoints.json").write_text(json.dumps({"people": people}))
+
+
+def errors(found: Fitted, room: KnownRoom) -> tuple[Tensor, Tensor, list[str]]:
+    """Absolute and pelvis-aligned PJE of each body [m], and what it does."""
+    where = {int(f): k for k, f in enumerate(room.bodies.frame.tolist())}
+    rows = [where[f] for f in found.bodies.frame.tolist()]
+    joints, truth = found.bodies.joints[:, :22], room.bodies.joints[rows][:, :22]
+    off = joints - truth
+    return (
+        off.norm(dim=-1).mean(1),
+        (off - off[:, :1]).norm(dim=-1).mean(1),
+        [room.actions[k] for k in rows],
+    )
+
+
+def draw(room: KnownRoom, found: Fitted, path: Path) -> None:
+    """Fitted bodies (red) over the true visible masks (green)."""
+    from PIL import Image
+
+    background, tiles = see(room.plan).picture * 0.6 + 0.3, []
+    faces = found.bodies.faces
+    for k in np.linspace(0, len(found.rows) - 1, 12).astype(int):
+        picture, verts = background.clone(), found.bodies.verts[k]
+        mask = decode(room.capture.people.masks, int(room.bodies.frame.tolist().index(
+            int(found.bodies.frame[k]))))  # fmt: skip
+        picture[mask] = 0.3 * picture[mask] + 0.7 * torch.tensor([0.1, 0.75, 0.2])
+        _, face = see_body(room.plan, verts, faces)
+        a, b, c = (verts[faces[:, i]] for i in range(3))
+        normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+        shade = 0.35 + 0.65 * (-normal[:, 2]).clamp_min(0)
+        red = shade[face.clamp_min(0)][..., None] * torch.tensor([0.95, 0.35, 0.25])
+        picture[face >= 0] = (0.3 * picture + 0.7 * red)[face >= 0]
+        tiles.append(picture[::2, ::2])
+    rows = [torch.cat(tiles[i : i + 3], 1) for i in range(0, 12, 3)]
+    Image.fromarray((torch.cat(rows).clamp(0, 1) * 255).byte().numpy()).save(path)
+
+
+def measure(seed: int, fps: float, ground: bool, picture: Path | None) -> str:
+    """One row of the table."""
+    room = make_room(seed, RoomConfig(fps=fps))
+    with tempfile.TemporaryDirectory() as folder:
+        write_openpose(room, joints_seen(room, np.random.default_rng(seed)), Path(folder))
+        keypoints = keypoints_from("openpose", Path(folder), Known(fps=fps))
+    floor = room.truth.ground if ground else None
+    inputs = FitInputs(keypoints, room.truth.camera, open_body(), ground=floor)
+    wall, processor = time.perf_counter(), time.process_time()
+    found = fit_bodies(inputs)
+    wall, processor = time.perf_counter() - wall, time.process_time() - processor
+    absolute, aligned, actions = errors(found, room)
+    if picture is not None:
+        draw(room, found, picture / f"fit_{seed}.png")
+    groups = []
+    for name, some in (("seated", SEATED), ("lying", ("lie", "lie down", "get up"))):
+        mine = torch.tensor([a in some for a in actions])
+        if mine.any():
+            groups.append(
+                f"{name} {1e3 * aligned[mine].mean():.0f}/{1e3 * absolute[mine].mean():.0f}"
+            )
+    n = len(absolute)
+    return (
+        f"room {seed}, {fps:g} fps{', floor known' if ground else ''}: {n} bodies, "
+        f"PJE {1e3 * aligned.mean():.0f} mm aligned (median {1e3 * aligned.median():.0f}), "
+        f"{1e3 * absolute.mean():.0f} mm absolute (median {1e3 * absolute.median():.0f}); "
+        f"{'; '.join(groups)}; {n / wall:.0f} frames/s by the clock, {n / processor:.0f} by the "
+        f"processor, load {os.getloadavg()[0]:.1f}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rooms", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--fps", type=float, default=5.0)
+    parser.add_argument("--ground", action="store_true", help="tell the fit the true floor")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of the fits")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    for seed in args.rooms:
+        print(measure(seed, args.fps, args.ground, args.pictures), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""First scenes without a 3D detector on known rooms, against noisy true ones.
+
+    python benchmarks/layout.py --seeds 100 101 102 --out layout.json
+
+For each known room the program gets what a detector gives (noisy masks, boxes and classes, and a
+camera whose tilt is some degrees wrong) and finds a first scene from the furniture library, whose
+shapes are not the room's. Reported is the mean IoU of the upright boxes with the true ones: of the
+noise model's first scene (the truth, moved, turned and stretched), of ours, and of both after the
+main job with the `robust` preset.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+
+from mover.furniture.choose import catalogue
+from mover.geometry.boxes import box_of, iou3d
+from mover.geometry.runs import decode
+from mover.perceive.layout import FirstScene, LayoutConfig, Picture, first_scene
+from mover.pipeline import PRESETS, reconstruct
+from mover.readers.mesh_file import write_mesh
+from mover.rooms import KnownRoom, NoiseConfig, add_noise, make_room
+from mover.run import Run
+from mover.types import Capture, Scene
+
+
+def picture_of(capture: Capture) -> Picture:
+    """What the first scene is found from."""
+    camera = capture.scene.camera
+    blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    masks = [blank if d.mask is None else decode(d.mask, 0) for d in capture.detections]
+    return Picture(camera, capture.detections, torch.stack(masks), blank, None, None)
+
+
+def iou(scene: Scene, truth: Scene) -> float:
+    """Mean IoU3D; objects are matched by their annotation, a missing one scores 0."""
+    by_note = {p.annotation: p for p in scene.pieces}
+    values = [
+        float(iou3d(box_of(by_note[p.annotation]), box_of(p))) if p.annotation in by_note else 0.0
+        for p in truth.pieces
+    ]
+    return sum(values) / len(values)
+
+
+def other_designs(room: KnownRoom, folder: Path) -> Path:
+    """Shapes of all classes of a room, without any design that stands in it."""
+    used = {(f.category, f.style) for f in room.furniture}
+    for category in sorted({f.category for f in room.furniture}):
+        shapes = [f for f in catalogue(category) if (category, f.style) not in used]
+        for index, shape in enumerate(shapes):
+            name = f"{category.replace(' ', '_')}_{index}.glb"
+            write_mesh(shape.mesh, folder / name)
+    return folder
+
+
+def trial(seed: int, args: argparse.Namespace) -> dict[str, float]:
+    """One known room."""
+    room = make_room(seed)
+    capture = add_noise(room, NoiseConfig(), seed)
+    begin = time.perf_counter()
+    with TemporaryDirectory() as folder:
+        meshes = other_designs(room, Path(folder) / "meshes") if args.other_designs else None
+        first = first_scene(picture_of(capture), LayoutConfig(), Run(Path(folder)), meshes)
+        row = {
+            "seed": seed,
+            "objects": len(room.truth.pieces),
+            "seconds": time.perf_counter() - begin,
+            "noise": iou(capture.scene, room.truth),
+            "layout": iou(first.scene, room.truth),
+            "best hypothesis": best_hypothesis(first, room.truth),
+            "height error": abs((first.scene.ground or 0) - (room.truth.ground or 0)),
+        }
+        given = {"noise": capture.scene, "layout": replace(first.scene, ground=None)}
+        for name in args.job:
+            run = Run(Path(folder) / name)
+            found = reconstruct(replace(capture, scene=given[name]), PRESETS["robust"], run)
+            row[f"{name} after the job"] = iou(found.scene, room.truth)
+    return row
+
+
+def best_hypothesis(first: FirstScene, truth: Scene) -> float:
+    """Mean IoU3D if an oracle chose among the hypotheses that are kept."""
+    best = {
+        group[0].piece.annotation: max(
+            float(iou3d(box_of(h.piece), box_of(true)))
+            for h in group
+            for true in truth.pieces
+            if true.annotation == h.piece.annotation
+        )
+        for group in first.others
+    }
+    return sum(best.get(p.annotation, 0.0) for p in truth.pieces) / len(truth.pieces)
+
+
+def main() -> None:
+    """Measure and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(100, 110)))
+    parser.add_argument("--job", nargs="*", choices=("noise", "layout"), default=["layout"],
+                        help="scenes from which the main job starts")  # fmt: skip
+    parser.add_argument("--other-designs", action="store_true",
+                        help="no shape of a design that stands in the room")  # fmt: skip
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = []
+    for seed in args.seeds:
+        rows.append(trial(seed, args))
+        print({k: round(v, 3) for k, v in rows[-1].items()}, flush=True)
+        if args.out:
+            args.out.write_text(json.dumps(rows, indent=1))
+    print("mean", {k: round(sum(r[k] for r in rows) / len(rows), 3) for k in rows[0]})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""Bodies that are moved a little: as a whole about the pelvis, and by a model joint by joint."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..geometry.mesh import vertex_normals
+from ..geometry.rotations import axis_angle
+from ..records import map_tensors, record
+from ..types import Bodies, BodyPose
+from . import BodyModel, load_model
+from .skeleton import BODY
+from .thinned import pose_rows, spread, thinned
+
+LOOSE_POINTS = 16  # vertices that stand for the joints of a body without any
+CHUNK = 64  # bodies posed at once
+
+
+@record
+class Correction:
+    """How bodies are moved; zero leaves them where they are."""
+
+    shift: Float[Tensor, "bodies 3"]
+    """Of the pelvis [m]."""
+    turn: Float[Tensor, "bodies 3"]
+    """Of the whole body about its pelvis, an axis-angle vector in the world [rad]."""
+    angles: Float[Tensor, "bodies angles"]
+    """Added to `body_pose` [rad]; no columns where bodies move rigidly."""
+
+
+@dataclass(frozen=True)
+class Puppet:
+    """Some rows of the bodies, ready to be moved."""
+
+    model: BodyModel | None
+    """Of the picked vertices only; None: rigid."""
+    pose: BodyPose | None
+    skin: Float[Tensor, "bodies picked 3"]
+    """Picked vertices as they were given [m]."""
+    normals: Float[Tensor, "bodies picked 3"]
+    points: Float[Tensor, "bodies points 3"]
+    """Joints as they were given, or vertices that stand for them [m]; the first is the pivot."""
+    joints: Int[Tensor, " known"]
+    """Which joints of the model they are; none of a bare mesh."""
+
+
+@record
+class Moved:
+    """Where picked vertices and joints have gone."""
+
+    skin: Float[Tensor, "bodies picked 3"]
+    points: Float[Tensor, "bodies points 3"]
+
+
+def puppet_of(bodies: Bodies, picked: Int[Tensor, " picked"]) -> Puppet:
+    """The bodies, in the world, seen through a few of their vertices."""
+    normals = vertex_normals(bodies.verts, bodies.faces)[:, picked]
+    skin, pose = bodies.verts[:, picked], bodies.pose
+    joints = torch.zeros(0, dtype=torch.long)
+    if pose is None:
+        return Puppet(None, None, skin, normals, _loose_points(bodies), joints)
+    full = load_model(pose.model, pose.gender)
+    joints = torch.tensor([full.joint_names.index(n) for n in BODY if n in full.joint_names])
+    model = thinned(full, picked)
+    with torch.no_grad():
+        skin, places = model.posed(pose)
+    return Puppet(model, pose, skin, normals, places[:, joints], joints)
+
+
+def _loose_points(bodies: Bodies) -> Float[Tensor, "bodies points 3"]:
+    """Joints of a body without a model, or vertices; the pivot first."""
+    names = bodies.joint_names
+    if bodies.joints is not None and "pelvis" in names:
+        kept = ["pelvis", *(n for n in names if n in BODY and n != "pelvis")]
+        return bodies.joints[:, [names.index(n) for n in kept]]
+    some = spread(bodies.verts[0], LOOSE_POINTS)
+    return torch.cat([bodies.verts.mean(1, keepdim=True), bodies.verts[:, some]], 1)
+
+
+def no_correction(puppet: Puppet) -> Correction:
+    """Leave everybody where they are."""
+    zero = torch.zeros_like(puppet.points[:, 0])
+    width = 0 if puppet.pose is None else puppet.pose.body_pose.shape[-1]
+    return Correction(zero, zero, zero.new_zeros(len(zero), width))
+
+
+def moved(puppet: Puppet, by: Correction) -> Moved:
+    """The picked vertices and the joints after a correction, differentiable in it."""
+    skin, points = puppet.skin, puppet.points
+    if puppet.model is not None and puppet.pose is not None:
+        bent = dataclasses.replace(puppet.pose, body_pose=puppet.pose.body_pose + by.angles)
+        skin, joints = puppet.model.posed(bent)
+        points = joints[:, puppet.joints]
+    pivot = puppet.points[:, :1]
+    turn = axis_angle(by.turn).mT
+    goal = pivot + by.shift[:, None]
+    return Moved((skin - pivot) @ turn + goal, (points - pivot) @ turn + goal)
+
+
+def normals_after(puppet: Puppet, by: Correction) -> Float[Tensor, "bodies picked 3"]:
+    """Normals of the picked vertices; they follow the whole body, not its joints."""
+    return puppet.normals @ axis_angle(by.turn).mT
+
+
+def corrected(bodies: Bodies, by: Correction) -> Bodies:
+    """All vertices, joints and parameters of the bodies after a correction.
+
+    Args:
+        bodies: In the world; those with parameters are posed anew.
+        by: One row for each body.
+    """
+    if bodies.pose is None:
+        return _moved_rigidly(bodies, by)
+    pose = _new_pose(bodies.pose, by)
+    model = load_model(pose.model, pose.gender)
+    with torch.no_grad():
+        parts = [model.posed(pose_rows(pose, r)) for r in torch.arange(len(by.shift)).split(CHUNK)]
+    verts, joints = (torch.cat([part[k] for part in parts]) for k in (0, 1))
+    return dataclasses.replace(
+        bodies, verts=verts.to(bodies.verts), joints=joints.to(bodies.verts),
+        joint_names=model.joint_names, pose=pose,
+    )  # fmt: skip
+
+
+def _moved_rigidly(bodies: Bodies, by: Correction) -> Bodies:
+    pivot = _loose_points(bodies)[:, :1]
+    turn, goal = axis_angle(by.turn).mT, pivot + by.shift[:, None]
+
+    def along(places: Tensor) -> Tensor:
+        return (places - pivot) @ turn + goal
+
+    joints = None if bodies.joints is None else along(bodies.joints)
+    return dataclasses.replace(bodies, verts=along(bodies.verts), joints=joints)
+
+
+def _new_pose(pose: BodyPose, by: Correction) -> BodyPose:
+    """The parameters of the moved bodies: the root turns about the pelvis."""
+    from scipy.spatial.transform import Rotation
+
+    turned = axis_angle(by.turn.double()) @ axis_angle(pose.global_orient.double())
+    orient = torch.from_numpy(Rotation.from_matrix(turned.cpu().numpy()).as_rotvec())
+    found = dataclasses.replace(
+        pose, global_orient=orient.to(pose.global_orient), transl=pose.transl + by.shift,
+        body_pose=pose.body_pose + by.angles,
+    )  # fmt: skip
+    return map_tensors(lambda x: x.detach(), found)

@@ -1,0 +1,173 @@
+"""Contacts of SMPL-X bodies from an official POSA checkpoint that the user has downloaded.
+
+POSA (Hassan et al. 2021) guesses from the pose alone which vertices touch something. The network
+is written from a description of its layers; neither weights nor meshes come with this package.
+
+Departure: z = 0, the mean of the latent code, gives one answer; upstream draws z at random. The
+bodies are turned by the true direction of gravity; upstream trusts the camera to be level.
+"""
+
+import hashlib
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..geometry.rotations import axis_angle, rot_x
+from ..records import InputError
+from ..types import Bodies
+from .half_edges import spirals
+from .posa_mesh import Pyramid, read_pyramid
+
+log = logging.getLogger(__name__)
+
+LENGTH = 9  # vertices of a spiral
+CODE = 256  # numbers of the latent code
+GROUPS = 8  # of the normalisation
+COUNTS = {1: (1_875_009, 153_665), 43: (1_923_435, 177_899)}
+"""Numbers in the network and in its decoder, by the channels of the output."""
+OFFICIAL = "b61f137d02a33c49f9d83ee651f0d60b1ddb80fc0c1e5b6aa85469f707238fb4"
+"""Digest of the spirals of the official mesh_2."""
+DECODER = "decoder.de_spiral"
+CHUNK = 32  # bodies decoded at once
+
+
+@dataclass(frozen=True)
+class Posa:
+    """A decoder and the meshes that it works on."""
+
+    weights: dict[str, Tensor]
+    """Of the decoder."""
+    spirals: Int[Tensor, "coarse 9"]
+    pyramid: Pyramid
+    channels: int
+    """1: contact; 43: contact and the kind of object."""
+
+
+def load_posa(weights: Path, meshes: Path) -> Posa:
+    """Read a checkpoint (contact.pt, contact_semantics.pt) and the folder mesh_ds.
+
+    Raises:
+        InputError: If a file is missing, or is not what the published network needs.
+    """
+    state = _state(weights)
+    last = state.get(f"{DECODER}.5.layer.weight")
+    channels = 0 if last is None else len(last)
+    if channels not in COUNTS:
+        raise InputError(f"{weights.name}: no POSA network in it, expected '{DECODER}.5.layer'")
+    decoder = {k: v.float() for k, v in state.items() if k.startswith("decoder.")}
+    found = sum(v.numel() for v in state.values()), sum(v.numel() for v in decoder.values())
+    if found != COUNTS[channels]:
+        raise InputError(
+            f"{weights.name}: has {found[0]} numbers, {found[1]} of them in the decoder, "
+            f"expected {COUNTS[channels][0]} and {COUNTS[channels][1]}"
+        )
+    pyramid = read_pyramid(meshes)
+    index = spirals(pyramid.verts, pyramid.faces, LENGTH)
+    if spiral_digest(index) != OFFICIAL:
+        log.warning("%s: mesh_2.obj is not the official one: are the contacts right?", meshes)
+    return Posa(decoder, torch.from_numpy(index), pyramid, channels)
+
+
+def spiral_digest(index: Int[np.ndarray, "verts 9"]) -> str:
+    """Digest of spirals as little-endian 64-bit numbers, row by row."""
+    return hashlib.sha256(np.ascontiguousarray(index, dtype="<i8").tobytes()).hexdigest()
+
+
+def _state(path: Path) -> dict[str, Tensor]:
+    try:
+        loaded: Any = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a broken file may raise anything
+        raise InputError(f"{path.name}: no checkpoint can be read from it ({error})") from error
+    state = loaded.get("model_state_dict", loaded) if isinstance(loaded, dict) else {}
+    return {k: v for k, v in state.items() if isinstance(v, Tensor)}
+
+
+def posa_contacts(
+    posa: Posa, bodies: Bodies, samples: int = 0, seed: int = 0
+) -> Float[Tensor, "bodies verts"]:
+    """Chance that each vertex touches something, in [0, 1].
+
+    Args:
+        posa: The network.
+        bodies: SMPL-X bodies with their pose, in the world (+y up).
+        samples: Mean over so many random latent codes; 0: the mean code alone.
+        seed: Of the random codes.
+
+    Raises:
+        InputError: If these are no SMPL-X bodies with a pose.
+        ValueError: If they are not in the world.
+    """
+    if bodies.space != "world":
+        raise ValueError(f"posa_contacts: bodies are in space '{bodies.space}', expected 'world'")
+    full = posa.pyramid.down[0].shape[1]
+    if bodies.verts.shape[1] != full:
+        raise InputError(f"bodies: {bodies.verts.shape[1]} vertices, POSA expects {full} (SMPL-X)")
+    if bodies.pose is None or bodies.joints is None:
+        raise InputError("bodies: POSA needs SMPL-X parameters and joints, found meshes only")
+    noise = np.random.default_rng(seed).standard_normal((max(samples, 1), CODE))
+    codes = torch.from_numpy(noise).float() * float(samples > 0)
+    still = canonical(bodies.verts, bodies.joints[:, 0], axis_angle(bodies.pose.global_orient))
+    found: list[Tensor] = []
+    for part in still.float().split(CHUNK):
+        coarse = _through(posa.pyramid.down, part)
+        with torch.no_grad():
+            chance = torch.stack([decode(posa, coarse, z)[..., :1] for z in codes]).mean(0)
+        found.append(_through(posa.pyramid.up, chance)[..., 0].clamp(0, 1))
+    return torch.cat(found)
+
+
+def canonical(
+    verts: Float[Tensor, "bodies verts 3"],
+    pelvis: Float[Tensor, "bodies 3"],
+    turn: Float[Tensor, "bodies 3 3"],
+) -> Float[Tensor, "bodies verts 3"]:
+    """Vertices about the pelvis without heading and roll: x to the person's left, y down, z back.
+
+    Args:
+        verts: In the world (+y up) [m].
+        pelvis: Places of the pelvis [m].
+        turn: Rotation of the body's root in the world.
+    """
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0])).to(verts)
+    root = flip @ turn.to(verts)
+    tilt = rot_x(torch.atan2(-root[:, 1, 2], root[:, 1, 1]))
+    return (verts - pelvis[:, None]) @ flip.mT @ (tilt @ root.mT).mT
+
+
+def decode(
+    posa: Posa, coarse: Float[Tensor, "bodies coarse 3"], code: Float[Tensor, " code"]
+) -> Float[Tensor, "bodies coarse channels"]:
+    """Contact (a chance) and, if the network has them, scores of the kinds of objects."""
+    x = torch.cat([coarse, code.expand(*coarse.shape[:2], -1)], -1)
+    for layer in range(5):
+        name = f"{DECODER}.{layer}"
+        x = _gathered(posa, x) if layer > 1 else x
+        x = _linear(posa, f"{name}.conv.layer", x)
+        scale, shift = (posa.weights[f"{name}.norm.{k}"] for k in ("weight", "bias"))
+        x = torch.nn.functional.group_norm(x.mT, GROUPS, scale, shift).mT.relu()
+    x = _linear(posa, f"{DECODER}.5.layer", _gathered(posa, x))
+    return torch.cat([x[..., :1].sigmoid(), x[..., 1:]], -1)
+
+
+def _gathered(posa: Posa, x: Float[Tensor, "bodies coarse c"]) -> Float[Tensor, "bodies coarse m"]:
+    return x[:, posa.spirals].flatten(2)
+
+
+def _linear(posa: Posa, name: str, x: Float[Tensor, "b v c"]) -> Float[Tensor, "b v d"]:
+    return torch.nn.functional.linear(
+        x, posa.weights[f"{name}.weight"], posa.weights[f"{name}.bias"]
+    )
+
+
+def _through(maps: tuple[Tensor, ...], x: Float[Tensor, "b v c"]) -> Float[Tensor, "b w c"]:
+    """Apply sparse matrices to the vertices, one after another."""
+    for matrix in maps:
+        flat = x.transpose(0, 1).reshape(x.shape[1], -1)
+        x = torch.sparse.mm(matrix, flat).reshape(-1, x.shape[0], x.shape[2]).transpose(0, 1)
+    return x

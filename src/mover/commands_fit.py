@@ -1,0 +1,109 @@
+"""What `fit` does."""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from . import records
+
+
+@dataclass(frozen=True)
+class FitArgs:
+    """Fit bodies to the 2D joints of a video: keypoints.npz, or what a detector wrote."""
+
+    source: Annotated[Positional[Path], arg(metavar="KEYPOINTS")]
+    """keypoints.npz, or a file or folder of a detector."""
+    camera: Path
+    """The true lens (camera.json or a calibration); its pitch and roll are a first guess."""
+    out: Path = Path("bodies.npz")
+    """The file to write."""
+    tool: Literal["openpose", "coco17", "halpe26", "wholebody"] = "openpose"
+    """The detector, where the source is not keypoints.npz."""
+    model: Literal["makehuman", "smpl", "smplh", "smplx"] = "makehuman"
+    """The body model; all but the open body need the user's files."""
+    gender: Literal["neutral", "female", "male"] = "neutral"
+    """Of the body model."""
+    model_folder: Path | None = None
+    """Folder of the licensed body models; by default what MOVER_BODY_MODELS names."""
+    start: Path | None = None
+    """bodies.npz to start from: parameters of any model, or joints, in the camera frame."""
+    vposer: Path | None = None
+    """VPoser's weights (a checkpoint, its folder, or .npz) instead of the ranges of motion."""
+    ground: float | None = None
+    """Height of the floor in the camera's world, where it is known: nobody sinks into it [m]."""
+    fps: float | None = None
+    """Frames a second, where the keypoints do not tell."""
+    first: int = 0
+    """The number in the name of the first frame's file, 1 where they count from 1."""
+    one_euro: bool = False
+    """Filter the keypoints over time before the fit (One-Euro)."""
+    drop: bool = False
+    """Leave out bodies that no person can have been (the filter of `mover run`)."""
+
+
+def fit(arguments: Sequence[str]) -> None:
+    """`mover fit`."""
+    args = tyro.cli(FitArgs, prog="mover fit", args=list(arguments))
+    from .bodies import load_model
+    from .fitting import FitInputs, fit_bodies, load_vposer, smooth_keypoints, vposer_prior
+    from .fitting.prior import ANGLES
+    from .progress import Bar
+    from .readers.any_camera import read_camera_file
+    from .readers.bodies_file import read_bodies, write_bodies
+    from .readers.camera_file import camera_of
+
+    if args.fps is not None and not args.fps > 0:
+        raise records.InputError(f"--fps: {args.fps:g}, expected more than 0")
+    if args.model_folder is not None:
+        os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
+    keypoints = _keypoints(args)
+    inputs = FitInputs(
+        keypoints=smooth_keypoints(keypoints) if args.one_euro else keypoints,
+        camera=camera_of(read_camera_file(args.camera, None)),
+        model=load_model(args.model, args.gender),  # pyright: ignore[reportArgumentType]
+        start=None if args.start is None else read_bodies(args.start),
+        prior=ANGLES if args.vposer is None else vposer_prior(load_vposer(args.vposer)),
+        ground=args.ground,
+    )
+    with Bar() as bar:
+        found = fit_bodies(inputs, observe=bar)
+    for warning in found.warnings:
+        _say(f"warning: {warning}")
+    bodies = _without_outliers(found.bodies) if args.drop else found.bodies
+    write_bodies(bodies, args.out)
+    people, frames = len(bodies.person.unique()), len(bodies.frame.unique())
+    miss = float(found.miss.mean())
+    _say(f"{people} people in {frames} frames, keypoints missed by {miss:.1f} px: {args.out}")
+
+
+def _keypoints(args: FitArgs) -> Any:  # noqa: ANN401
+    """The 2D joints."""
+    from .readers.people import Known, keypoints_from, read_keypoints
+
+    if args.source.suffix != ".npz":
+        return keypoints_from(args.tool, args.source, Known(fps=args.fps, first=args.first))
+    found = read_keypoints(args.source)
+    return found if args.fps is None else replace(found, fps=args.fps)
+
+
+def _without_outliers(bodies: Any) -> Any:  # noqa: ANN401
+    """The rows that the frame filter keeps."""
+    from .fitting.finish import rows_of_bodies
+    from .stages.select_frames import SelectInputs, select_frames
+
+    keep = select_frames(SelectInputs(bodies)).keep
+    _say(f"{int((~keep).sum())} of {len(keep)} bodies are left out by the frame filter")
+    return rows_of_bodies(bodies, keep)
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+
+
+COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {"fit": fit}

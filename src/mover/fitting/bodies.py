@@ -1,0 +1,169 @@
+"""From keypoints to bodies: the batch fit of a whole video."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..bodies.correspondence import Model
+from ..bodies.keypoints import LAYOUTS
+from ..minimize import Energy, Observer, Step, silent
+from ..records import record
+from ..types import Bodies, Camera, Keypoints
+from .config import FitConfig
+from .energy import Seen, Weighed, body_energy
+from .finish import bodies_of, miss_of, pose_of
+from .gather import at_stage, rows_of, seen_at_all, seen_of, usable_rows
+from .given import begin_from
+from .prior import ANGLES, PosePrior, encoded
+from .rig import Rig, rig_of
+from .solve import EVERYTHING, solve
+from .start import Begun, begin
+from .unknowns import HAND, Frame, Unknowns
+from .windows import Window, rows_at, windows_of
+
+SHAPES = 10
+EXPRESSION = 10
+
+
+@dataclass(frozen=True)
+class FitInputs:
+    """What bodies are fitted to, and with what."""
+
+    keypoints: Keypoints
+    camera: Camera
+    """The true lens; its rotation is the first guess of upright."""
+    model: Model
+    start: Bodies | None = None
+    """Bodies of another tool in the camera frame: with parameters, or with joints."""
+    prior: PosePrior = ANGLES
+    ground: float | None = None
+    """Height of the floor in the camera's world [m], where it is known: nobody goes below it."""
+
+
+@record
+class Fitted:
+    """Bodies in the camera frame, and how well they explain the keypoints."""
+
+    bodies: Bodies
+    rows: Int[Tensor, " bodies"]
+    """The row of the keypoints of each body."""
+    miss: Float[Tensor, " bodies"]
+    """Root mean square distance of the keypoints that are seen [px]."""
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A fit under way."""
+
+    inputs: FitInputs
+    config: FitConfig
+    rig: Rig
+    names: list[str]
+    seen: Seen
+    observe: Observer
+
+
+def fit_bodies(
+    inputs: FitInputs, config: FitConfig | None = None, observe: Observer = silent
+) -> Fitted:
+    """Fit a body model to the keypoints of a video: E_Body of the paper.
+
+    Raises:
+        InputError: If no row has enough keypoints.
+    """
+    config = config or FitConfig()
+    rows, warnings = usable_rows(inputs.keypoints, config)
+    some = rows_of(inputs.keypoints, rows)
+    inputs = dataclasses.replace(inputs, keypoints=some)
+    rig = rig_of(inputs.model, some.layout, seen_at_all(some, config))
+    names = [LAYOUTS[some.layout][k] for k in rig.keypoints.tolist()]
+    seen = seen_of(some, rig, inputs.camera, config)
+    seen = dataclasses.replace(seen, floor=inputs.ground)
+    job = _Job(inputs, config, rig, names, seen, observe)
+    at, frame, seen = _solved(_begun(job), job)
+    pose = pose_of(at, frame, inputs.model, inputs.prior)
+    miss = miss_of(at, frame, seen, inputs.prior)
+    return Fitted(bodies_of(pose, inputs.model, some), rows, miss, warnings)
+
+
+def _begun(job: _Job) -> Begun:
+    """From given bodies, or from keypoints alone; the code is that of the prior."""
+    inputs = job.inputs
+    if inputs.start is None:
+        begun = begin(inputs.keypoints, job.seen, job.rig, inputs.camera, job.config)
+    else:
+        begun = begin_from(inputs.start, inputs.keypoints, job.seen, job.rig, job.config)
+    code = encoded(inputs.prior, begun.at.code)
+    return dataclasses.replace(begun, at=dataclasses.replace(begun.at, code=code))
+
+
+def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
+    """All rows; the shapes first from some of them where there are too many at once."""
+    seen = dataclasses.replace(job.seen, centre=begun.centre, spread=begun.spread)
+    people, person = job.inputs.keypoints.person.unique(return_inverse=True)
+    at = dataclasses.replace(begun.at, **_widened(begun.at, len(people), job))
+    frame = Frame(job.rig, begun.root, person)
+    windows = windows_of(job.inputs.keypoints, job.config)
+    free = EVERYTHING
+    if len(windows) > 1:
+        some = windows[0]
+        at = dataclasses.replace(at, betas=_stages(at, frame, seen, some, (job, free)).betas)
+        free, windows = tuple(n for n in EVERYTHING if n != "betas"), windows[1:]
+    parts = [_stages(at, frame, seen, window, (job, free)) for window in windows]
+    betas = parts[0].betas
+    fields = {
+        name: torch.cat([getattr(p, name)[w.keep] for p, w in zip(parts, windows, strict=True)])
+        for name in ("turn", "code", "place", "hands", "face")
+    }
+    back = torch.argsort(torch.cat([w.rows[w.keep] for w in windows]))
+    fields = {name: value[back] for name, value in fields.items()}
+    return Unknowns(betas=betas, **fields), frame, seen
+
+
+def _widened(at: Unknowns, people: int, job: _Job) -> dict[str, Tensor]:
+    """Shapes of all people, and hands and faces where they are seen and the model has them."""
+    rows, model = len(at.turn), job.inputs.model
+    skin = job.rig.skin
+    shapes = min(SHAPES, skin.shape_dirs.shape[-1])
+    hands, face = 0, 0
+    full = len(skin.parents) > 24
+    if full and any("index" in name for name in job.names):
+        space = getattr(model, "hands", None)
+        hands = HAND if space is None else min(job.config.hands, space.components.shape[1])
+    if len(skin.parents) == 55 and any(n.startswith("face_") for n in job.names):
+        face = 3 + min(EXPRESSION, getattr(model, "expression_dirs").shape[-1])  # noqa: B009
+    return {
+        "betas": at.place.new_zeros(people, shapes),
+        "hands": at.place.new_zeros(rows, 2 * hands),
+        "face": at.place.new_zeros(rows, face),
+    }
+
+
+def _stages(
+    at: Unknowns, frame: Frame, seen: Seen, window: Window, what: tuple[_Job, tuple[str, ...]]
+) -> Unknowns:
+    """All stages over some of the rows."""
+    job, free = what
+    at, frame, seen = rows_at(at, frame, seen, window, job.config)
+    stages = job.config.stages
+    for index, stage in enumerate(stages):
+        here = at_stage(seen, job.names, stage)
+        by = Weighed(stage, job.config, job.inputs.prior.decode, job.inputs.prior.width > 0)
+
+        def energy(u: Unknowns, here: Seen = here, by: Weighed = by) -> Energy:
+            return body_energy(u, frame, here, by)
+
+        if len(stages) > 1 and index == len(stages) - 1 and not _extremities(job):
+            continue
+        at = solve(energy, at, stage.steps, free)
+        job.observe(Step("fit_bodies", index, len(stages)))
+    return at
+
+
+def _extremities(job: _Job) -> bool:
+    """Whether hands or faces are seen."""
+    return any("index" in name or name.startswith("face_") for name in job.names)

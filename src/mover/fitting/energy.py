@@ -1,0 +1,194 @@
+r"""E_Body: what keypoints say of bodies, and what is known of bodies and of motion (Sec. 3.2).
+
+    E_Body = Σ_t E_SMPLify-X(t) + λ_smooth L_smooth,
+    E_SMPLify-X = (1000 / H)² Σ_j (w_j c_j)² ρ(π(J_j) - x_j) + E_pose + E_shape + E_hands + E_face
+                  + E_bend,
+    L_smooth = Σ_t ρ(|J_{t-1} + J_{t+1} - 2 J_t|; σ2) + ρ(|π(J_{t-1}) + π(J_{t+1}) - 2 π(J_t)|; σ3)
+
+after Pavlakos et al. 2019 (SMPLify-X, Sec. 3.2 and its published configuration) and the paper;
+ρ(r; σ) = σ² r² / (r² + σ²), for keypoints on each coordinate.
+Departure: Second differences are taken over real time, so that gaps and frame rates make no
+acceleration, and are divided by what people do in that time. σ2 and σ3 stay the lengths beyond
+which a jump is believed. Self-collision is left out, as in the authors' video configuration.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..geometry.camera import project
+from ..minimize import Energy, weigh
+from ..records import record
+from .config import FitConfig, Stage
+from .limits import limit_price
+from .rig import Points
+from .unknowns import Decode, Frame, Unknowns, points_of
+
+LIFTED = 10.0  # weight of joints that are known in 3D
+HEIGHT = 1000.0  # [px], the image height at which the published weights were chosen
+BENT = ((17, 1, 1.0), (18, 1, -1.0), (3, 0, -1.0), (4, 0, -1.0))
+"""Elbows and knees: joint of the body, axis, and the sign that is the wrong way."""
+
+
+@record
+class Triples:
+    """Rows of one track at three moments."""
+
+    rows: Int[Tensor, "triples 3"]
+    share: Float[Tensor, " triples"]
+    """Weight of the first in the straight line through first and last."""
+    expected: Float[Tensor, " triples"]
+    """Second difference that people make in that time [m]."""
+
+
+@record
+class Seen:
+    """What is seen of the bodies."""
+
+    pixels: Float[Tensor, "bodies keypoints 2"]
+    weight: Float[Tensor, "bodies keypoints"]
+    """Confidence times the weight of the keypoint; 0: missing."""
+    K: Float[Tensor, "3 3"]
+    height: int
+    """Of the image [px]."""
+    up: Float[Tensor, "3"]
+    """Away from the floor, in camera axes."""
+    floor: float | None
+    """Height of the floor along `up` from the camera [m]."""
+    triples: Triples
+    centre: Float[Tensor, "bodies 63"]
+    """The pose that the prior expects: of the row's posture, or of the body to start from [rad]."""
+    spread: Float[Tensor, "63"]
+    """How far from it each angle may be [rad]."""
+    joints: Float[Tensor, "bodies joints 3"] | None
+    """Joints of the body that are known in 3D [m]; NaN: not known."""
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """Weights of a stage with the settings that all stages share."""
+
+    stage: Stage
+    config: FitConfig
+    decode: Decode
+    learned: bool
+    """The code is that of a learned prior, normally distributed."""
+
+
+def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
+    """E_Body, row by row."""
+    points = points_of(at, frame, by.decode)
+    pixels = project(points.keypoints, seen.K)
+    image, rho = (HEIGHT / seen.height) ** 2, by.config.rho
+    floor = by.stage.pose / by.config.support if seen.floor is not None else 0.0
+    lifted = LIFTED if seen.joints is not None else 0.0
+    smooth = by.stage.smooth if len(seen.triples.rows) else 0.0
+    solid, flat = by.config.smooth_joints, by.config.smooth_pixels
+    space = weigh(
+        ("keypoints", image, lambda: keypoint_price(pixels, seen, rho)),
+        ("support", floor**2, lambda: support_price(points, seen)),
+        ("joints", lifted**2, lambda: joint_price(points, seen)),
+        ("smooth_joints", smooth * solid, lambda: smooth_joint_price(points.joints, seen, by)),
+        ("smooth_pixels", smooth * flat, lambda: smooth_pixel_price(pixels, seen, by)),
+    )
+    return Energy({**space.parts, **_prior_energy(at, frame, seen, by).parts})
+
+
+def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
+    """What is known of poses and shapes, whatever is seen."""
+    stage, config = by.stage, by.config
+    angles = by.decode(at.code)
+    count = torch.bincount(frame.person, minlength=len(at.betas)).to(at.betas)[frame.person]
+    hands, face = min(1, at.hands.shape[1]), min(1, at.face.shape[1])
+    expression = at.face[:, 3:]
+
+    def pose() -> Tensor:
+        return at.code.square().sum(-1) if by.learned else pose_price(angles, seen)
+
+    return weigh(
+        ("pose", stage.pose**2, pose),
+        ("limits", config.limits**2, lambda: limit_price(angles)),
+        ("bending", config.bending * stage.pose, lambda: bending_price(angles)),
+        ("shape", stage.shape**2, lambda: at.betas.square().sum(-1)[frame.person] / count),
+        ("hands", stage.hands**2 * hands, lambda: at.hands.square().sum(-1)),
+        ("jaw", stage.jaw**2 * face, lambda: jaw_price(at.face)),
+        ("expression", stage.shape**2 * face, lambda: expression.square().sum(-1)),
+    )
+
+
+def geman_mcclure(squared: Float[Tensor, "*any"], rho: float) -> Float[Tensor, "*any"]:
+    """ρ² r² / (r² + ρ²): r² near zero, ρ² far away."""
+    return rho**2 * squared / (squared + rho**2)
+
+
+def keypoint_price(
+    pixels: Float[Tensor, "bodies keypoints 2"], seen: Seen, rho: float
+) -> Float[Tensor, " bodies"]:
+    """Robust squared distances of projected keypoints from detected ones [px²]."""
+    scaled = rho * seen.height / 1080
+    price = geman_mcclure((pixels - seen.pixels).square(), scaled).sum(-1)
+    return (price * seen.weight.square()).sum(-1)
+
+
+def bending_price(angles: Float[Tensor, "bodies angles"]) -> Float[Tensor, " bodies"]:
+    """Elbows and knees that bend the wrong way: exp(±θ)²; 1 for a straight one."""
+    bent = [(sign * angles[:, 3 * joint + axis]).exp().square() for joint, axis, sign in BENT]
+    return torch.stack(bent, -1).sum(-1)
+
+
+def pose_price(angles: Float[Tensor, "bodies angles"], seen: Seen) -> Float[Tensor, " bodies"]:
+    """Squared distance from the pose that is expected, in spreads."""
+    return ((angles[:, :63] - seen.centre) / seen.spread).square().sum(-1)
+
+
+def jaw_price(face: Float[Tensor, "bodies face"]) -> Float[Tensor, " bodies"]:
+    """Squared turns of the jaw; about y and z a hundred times as much as opening."""
+    return face[:, 0].square() + 100 * face[:, 1:3].square().sum(-1)
+
+
+def support_price(points: Points, seen: Seen) -> Float[Tensor, " bodies"]:
+    """Squared depth of joints and keypoints under the floor [m²]."""
+    assert seen.floor is not None
+    every = torch.cat([points.joints, points.keypoints], 1)
+    return (seen.floor - every @ seen.up).clamp_min(0).square().sum(-1)
+
+
+def joint_price(points: Points, seen: Seen) -> Float[Tensor, " bodies"]:
+    """Squared distances from joints that are known in 3D [m²]."""
+    assert seen.joints is not None
+    known = seen.joints.isfinite().all(-1)
+    count = seen.joints.shape[1]
+    goal = torch.where(known[..., None], seen.joints, torch.zeros_like(seen.joints))
+    price = (points.joints[:, :count] - goal).square().sum(-1)
+    return torch.where(known, price, torch.zeros_like(price)).sum(-1)
+
+
+def second_difference(
+    values: Float[Tensor, "bodies points axes"], triples: Triples
+) -> Float[Tensor, "triples points axes"]:
+    """Twice the distance from the straight line through the neighbours, at their real times."""
+    before, now, after = (values[triples.rows[:, k]] for k in range(3))
+    share = triples.share[:, None, None]
+    return 2 * (share * before + (1 - share) * after - now)
+
+
+def smooth_joint_price(
+    joints: Float[Tensor, "bodies joints 3"], seen: Seen, by: Weighed
+) -> Float[Tensor, " bodies"]:
+    """Robust squared second differences of the joints of the body, over what people do."""
+    triples = seen.triples
+    second = second_difference(joints[:, :22], triples).square().sum(-1)
+    price = geman_mcclure(second, by.config.sigma_joints).sum(-1) / triples.expected.square()
+    return joints.new_zeros(len(joints)).index_add(0, triples.rows[:, 1], price)
+
+
+def smooth_pixel_price(
+    pixels: Float[Tensor, "bodies keypoints 2"], seen: Seen, by: Weighed
+) -> Float[Tensor, " bodies"]:
+    """Robust squared second differences of projections where the middle one is seen [px²]."""
+    middle = seen.triples.rows[:, 1]
+    second = second_difference(pixels, seen.triples).square().sum(-1)
+    price = geman_mcclure(second, by.config.sigma_pixels) * seen.weight[middle].square()
+    return pixels.new_zeros(len(pixels)).index_add(0, middle, price.sum(-1))

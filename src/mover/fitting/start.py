@@ -1,0 +1,241 @@
+"""Where a fit begins: orientation, posture and place of each body from its keypoints alone.
+
+Each row is tried upright and facing the camera, turned left, right and away, standing and sitting;
+the picture of the trunk tells how far the body is tilted in the image. The place follows from the
+torso by linear least squares under the true camera. All are fitted without shape for a few steps,
+and along a track the cheapest sequence is kept whose bodies move as bodies can.
+"""
+
+import dataclasses
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..bodies.keypoints import LAYOUTS
+from ..bodies.skeleton import BODY
+from ..geometry.rotations import rot_x, rot_y, rot_z
+from ..records import record
+from ..types import Camera, Keypoints
+from .config import FitConfig, Stage
+from .energy import Seen, Weighed, body_energy
+from .limits import resting
+from .rig import Rig
+from .solve import solve
+from .tracks import best_path, every_so_often, tracks_of
+from .unknowns import Frame, Unknowns, place_of, points_of
+
+YAWS = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)
+ROLLS = (0.0,)
+SEATED = {"hip": -80.0, "knee": 85.0}  # [degrees] about x
+TORSO = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
+START = Stage(pose=12.0, shape=5.0, smooth=0.0)
+BEFORE = 3.5  # [m], where a body is put whose keypoints do not tell
+NEAREST, FARTHEST = 0.4, 40.0  # [m]
+START_FPS = 6.0  # hypotheses are tried so many times a second
+STRAIN = 4.0  # most that a jump costs, so that a track may begin anew
+
+
+@record
+class Begun:
+    """Where all rows begin."""
+
+    at: Unknowns
+    root: Float[Tensor, "bodies 3 3"]
+    centre: Float[Tensor, "bodies 63"]
+    """The pose that is expected [rad]."""
+    spread: Float[Tensor, "63"]
+    """How far from it each angle may be [rad]."""
+
+
+@record
+class Guess:
+    """A hypothesis that is tried for every row."""
+
+    pose: Float[Tensor, "63"]
+    """Angles of the body [rad]."""
+    root: Float[Tensor, "3 3"]
+    """The root's rotation in the world."""
+    upright: bool
+    """Tilted in the image as the trunk is seen there."""
+
+
+def guesses(like: Tensor) -> list[Guess]:
+    """Standing and sitting people who face four ways, and people who lie with the head in four."""
+    stand = resting(1, like)[0]
+    sit = stand.clone()
+    for name, angle in SEATED.items():
+        for side in ("left", "right"):
+            sit[3 * (BODY.index(f"{side}_{name}") - 1)] = math.radians(angle)
+    turns = rot_y(torch.tensor(YAWS).to(like)).unbind(0)
+    back = rot_x(torch.tensor(-0.5 * math.pi).to(like))
+    upright = [Guess(pose, turn, True) for pose in (stand, sit) for turn in turns]
+    sides = [rot_z(torch.tensor(angle).to(like)) @ back for angle in ROLLS]
+    return upright + [Guess(stand, turn @ side, False) for side in sides for turn in turns]
+
+
+def unknowns_at(
+    pose: Float[Tensor, "bodies code"], pelvis: Float[Tensor, "bodies 3"], shapes: tuple[int, int]
+) -> Unknowns:
+    """Bodies at rest but for this pose and place; `shapes` is people, numbers of shape."""
+    none = pose.new_zeros(len(pose), 0)
+    return Unknowns(
+        torch.zeros_like(pelvis), pose, place_of(pelvis), pose.new_zeros(shapes), none, none
+    )
+
+
+def placed(
+    points: Float[Tensor, "bodies keypoints 3"],
+    pixels: Float[Tensor, "bodies keypoints 2"],
+    weight: Float[Tensor, "bodies keypoints"],
+    K: Float[Tensor, "3 3"],
+) -> Float[Tensor, "bodies 3"]:
+    """Where the origin of points must be for them to be seen at these pixels [m].
+
+    Linear least squares under the true camera: what turns weak perspective into perspective.
+    """
+    rays = (pixels - K[:2, 2]) / torch.stack([K[0, 0], K[1, 1]])
+    one, none = torch.ones_like(rays[..., 0]), torch.zeros_like(rays[..., 0])
+    left = torch.stack(
+        [torch.stack([one, none, -rays[..., 0]], -1), torch.stack([none, one, -rays[..., 1]], -1)],
+        -2,
+    )
+    right = rays * points[..., 2:] - points[..., :2]
+    left, right = left * weight[..., None, None], right * weight[..., None]
+    left, right = left.flatten(1, 2).double(), right.flatten(1).double()
+    faint = 1e-6 * torch.eye(3).to(left)
+    goal = (left.mT @ right[..., None])[..., 0] + 1e-6 * BEFORE * faint.new_tensor([0, 0, 1.0])
+    place = torch.linalg.solve(left.mT @ left + faint, goal).to(points)
+    depth = place[:, 2]
+    good = (depth > NEAREST) & (depth < FARTHEST) & place.isfinite().all(-1)
+    seen = (rays * weight[..., None]).sum(1) / weight.sum(1).clamp_min(1e-9)[:, None]
+    ahead = torch.cat([seen, torch.ones_like(seen[:, :1])], -1) * BEFORE
+    return torch.where(good[:, None], place, ahead)
+
+
+def torso_first(
+    weight: Float[Tensor, "bodies keypoints"], names: list[str]
+) -> Float[Tensor, "bodies keypoints"]:
+    """Weights by which a body is placed: mostly its torso, where two of its joints are seen."""
+    torso = torch.tensor([name in TORSO for name in names], device=weight.device)
+    enough = ((weight > 0) & torso).sum(1, keepdim=True) >= 3
+    return torch.where(enough & ~torso, 0.2 * weight, weight)
+
+
+def tilt_of(
+    points: Float[Tensor, "bodies keypoints 3"], seen: Seen, names: list[str]
+) -> Float[Tensor, " bodies"]:
+    """Angle in the image from the trunk of a hypothesis to the one that is seen [rad]."""
+    weight = (seen.weight > 0).to(points)
+    angles: list[Tensor] = []
+    there = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    for place in (points[..., :2], seen.pixels):
+        ends: list[Tensor] = []
+        for part in ("shoulder", "hip"):
+            index = [k for k, name in enumerate(names) if name.endswith(part)]
+            share = weight[:, index]
+            there = there & (share.sum(1) > 0)
+            total = (place[:, index] * share[..., None]).sum(1)
+            ends.append(total / share.sum(1, keepdim=True).clamp_min(1e-9))
+        trunk = ends[0] - ends[1]
+        angles.append(torch.atan2(trunk[:, 1], trunk[:, 0]))
+    return torch.where(there, angles[1] - angles[0], torch.zeros_like(angles[0]))
+
+
+def begin(keypoints: Keypoints, seen: Seen, rig: Rig, camera: Camera, config: FitConfig) -> Begun:
+    """Start from keypoints alone: the best of all hypotheses, row by row and along each track."""
+    fps = keypoints.fps
+    step = 1 if fps is None else max(1, round(fps / START_FPS))
+    rows, nearest = every_so_often(keypoints.frame, keypoints.person, step)
+    names = [LAYOUTS[keypoints.layout][k] for k in rig.keypoints.tolist()]
+    R = camera.R_cam_world.to(seen.pixels)
+    every = guesses(seen.pixels)
+    tries = [
+        _tried(guess, R @ guess.root, chosen(seen, rows), (rig, names, config)) for guess in every
+    ]
+    cost = torch.stack([cost for _, _, cost, _ in tries], 1)
+    joints = torch.stack([joints for _, _, _, joints in tries], 1)
+    best = torch.zeros(len(rows), dtype=torch.long)
+    for track in tracks_of(keypoints.frame[rows], keypoints.person[rows]):
+        time = None if fps is None else keypoints.frame[rows][track] / fps
+        best[track] = _followed(cost[track], joints[track], time, config)
+    at = _picked([at for at, _, _, _ in tries], best[nearest], nearest)
+    root = torch.stack([root for _, root, _, _ in tries])[best[nearest], nearest]
+    centre = torch.stack([guess.pose for guess in every])[best[nearest]]
+    return Begun(at, root, centre, seen.spread)
+
+
+def chosen(seen: Seen, rows: Int[Tensor, " rows"]) -> Seen:
+    """Some rows, without neighbours."""
+    triples = dataclasses.replace(
+        seen.triples, rows=seen.triples.rows[:0], share=seen.triples.share[:0],
+        expected=seen.triples.expected[:0],
+    )  # fmt: skip
+    joints = None if seen.joints is None else seen.joints[rows]
+    return dataclasses.replace(
+        seen, pixels=seen.pixels[rows], weight=seen.weight[rows], triples=triples,
+        centre=seen.centre[rows], joints=joints,
+    )  # fmt: skip
+
+
+def _tried(
+    guess: Guess,
+    root: Float[Tensor, "3 3"],
+    seen: Seen,
+    what: tuple[Rig, list[str], FitConfig],
+) -> tuple[Unknowns, Tensor, Tensor, Tensor]:
+    """Unknowns, root rotations, cost and joints of one hypothesis for all rows."""
+    rig, names, config = what
+    rows = len(seen.pixels)
+    body = guess.pose.expand(rows, -1)
+    person = torch.zeros(rows, dtype=torch.long)
+    at = unknowns_at(body, body.new_tensor([[0, 0, BEFORE]]).expand(rows, -1), (1, 1))
+    seen = dataclasses.replace(seen, centre=guess.pose.expand(rows, -1))
+    frame = Frame(rig, root.expand(rows, -1, -1), person)
+    if guess.upright:
+        flat = points_of(at, frame, _same).keypoints
+        frame = Frame(rig, rot_z(tilt_of(flat, seen, names)) @ frame.root, person)
+    found = points_of(at, frame, _same).keypoints
+    origin = found - found.new_tensor([0, 0, BEFORE])
+    pelvis = placed(origin, seen.pixels, torso_first(seen.weight, names), seen.K)
+    at = dataclasses.replace(at, place=place_of(pelvis))
+    by = Weighed(START, config, _same, learned=False)
+    at = solve(
+        lambda u: body_energy(u, frame, seen, by), at, config.start_steps, ("turn", "code", "place")
+    )
+    with torch.no_grad():
+        cost = body_energy(at, frame, seen, by).per_item / START.pose**2
+        joints = points_of(at, frame, _same).joints[:, :22]
+    return at, frame.root, cost, joints
+
+
+def _same(code: Tensor) -> Tensor:
+    return code
+
+
+def _followed(
+    cost: Float[Tensor, "rows tries"],
+    joints: Float[Tensor, "rows tries joints 3"],
+    time: Float[Tensor, " rows"] | None,
+    config: FitConfig,
+) -> Int[Tensor, " rows"]:
+    """The hypotheses of a track: cheap ones whose joints stay near from frame to frame."""
+    if time is None or len(cost) < 2:
+        return cost.argmin(1)
+    gone = joints[:-1, :, None] - joints[1:, None]
+    about = (gone - gone[..., :1, :]).norm(dim=-1).mean(-1)
+    reach = config.reach + config.speed * time.diff()[:, None, None]
+    strain = (about / config.jump).square() + (gone[..., 0, :].norm(dim=-1) / reach).square()
+    return best_path(cost, config.switch * strain.clamp_max(STRAIN))
+
+
+def _picked(
+    tries: list[Unknowns], best: Int[Tensor, " rows"], nearest: Int[Tensor, " rows"]
+) -> Unknowns:
+    """For each row, the unknowns of its hypothesis."""
+    fields = {
+        name: torch.stack([getattr(at, name) for at in tries])[best, nearest]
+        for name in ("turn", "code", "place", "hands", "face")
+    }
+    return dataclasses.replace(tries[0], **fields)

@@ -1,0 +1,173 @@
+"""The Occupancy Network for point clouds (Mescheder et al., CVPR 2019): shapes as a classifier.
+
+The paper closes the meshes of its detector with it. The parameters have the names and shapes of
+the authors' checkpoints (`onet_pcl2mesh`), so that a published file loads by its keys; widths are
+read off the file. Encoder: a ResNet-PointNet. Decoder: five residual blocks whose batch norms take
+scale and shift from the shape's code (conditional batch normalisation).
+"""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..records import InputError
+
+BLOCKS = 5
+
+
+class ResidualLayer(nn.Module):
+    """Two linear layers beside a shortcut."""
+
+    def __init__(self, size_in: int, size_out: int) -> None:
+        super().__init__()
+        inner = min(size_in, size_out)
+        self.fc_0 = nn.Linear(size_in, inner)
+        self.fc_1 = nn.Linear(inner, size_out)
+        self.shortcut = nn.Linear(size_in, size_out, bias=False)
+
+    def forward(self, x: Float[Tensor, "*b n"]) -> Float[Tensor, "*b m"]:
+        """The sum of both ways."""
+        return self.shortcut(x) + self.fc_1(self.fc_0(x.relu()).relu())
+
+
+class PointEncoder(nn.Module):
+    """Code of a point cloud; each block sees its own point and the largest value of all."""
+
+    def __init__(self, hidden: int, code: int) -> None:
+        super().__init__()
+        self.fc_pos = nn.Linear(3, 2 * hidden)
+        for k in range(BLOCKS):
+            self.add_module(f"block_{k}", ResidualLayer(2 * hidden, hidden))
+        self.fc_c = nn.Linear(hidden, code)
+
+    def forward(self, points: Float[Tensor, "shapes points 3"]) -> Float[Tensor, "shapes code"]:
+        """The code of each shape."""
+        x = self.get_submodule("block_0")(self.fc_pos(points))
+        for k in range(1, BLOCKS):
+            pooled = x.amax(1, keepdim=True).expand_as(x)
+            x = self.get_submodule(f"block_{k}")(torch.cat([x, pooled], -1))
+        return self.fc_c(x.amax(1).relu())
+
+
+class ConditionalNorm(nn.Module):
+    """Batch norm whose scale and shift are linear in the code."""
+
+    def __init__(self, code: int, size: int) -> None:
+        super().__init__()
+        self.conv_gamma = nn.Conv1d(code, size, 1)
+        self.conv_beta = nn.Conv1d(code, size, 1)
+        self.bn = nn.BatchNorm1d(size, affine=False)
+
+    def forward(
+        self, x: Float[Tensor, "shapes size points"], code: Float[Tensor, "shapes code 1"]
+    ) -> Float[Tensor, "shapes size points"]:
+        """Normalised features."""
+        return self.conv_gamma(code) * self.bn(x) + self.conv_beta(code)
+
+
+class ConditionalBlock(nn.Module):
+    """Two layers, each after a conditional norm, added to what came in."""
+
+    def __init__(self, code: int, size: int) -> None:
+        super().__init__()
+        self.bn_0, self.bn_1 = ConditionalNorm(code, size), ConditionalNorm(code, size)
+        self.fc_0, self.fc_1 = nn.Conv1d(size, size, 1), nn.Conv1d(size, size, 1)
+
+    def forward(
+        self, x: Float[Tensor, "shapes size points"], code: Float[Tensor, "shapes code 1"]
+    ) -> Float[Tensor, "shapes size points"]:
+        """The sum of both ways."""
+        inner = self.fc_0(self.bn_0(x, code).relu())
+        return x + self.fc_1(self.bn_1(inner, code).relu())
+
+
+class OccupancyDecoder(nn.Module):
+    """Is a point inside the shape of a code?"""
+
+    def __init__(self, code: int, hidden: int, latent: int) -> None:
+        super().__init__()
+        if latent:
+            self.fc_z = nn.Linear(latent, hidden)
+        self.latent = latent
+        self.fc_p = nn.Conv1d(3, hidden, 1)
+        for k in range(BLOCKS):
+            self.add_module(f"block{k}", ConditionalBlock(code, hidden))
+        self.bn = ConditionalNorm(code, hidden)
+        self.fc_out = nn.Conv1d(hidden, 1, 1)
+
+    def forward(
+        self, points: Float[Tensor, "shapes points 3"], code: Float[Tensor, "shapes code"]
+    ) -> Float[Tensor, "shapes points"]:
+        """Logits; a latent code, where the network has one, is at its mean (zero)."""
+        x, column = self.fc_p(points.mT), code[..., None]
+        if self.latent:
+            x = x + self.fc_z(x.new_zeros(len(x), self.latent))[..., None]
+        for k in range(BLOCKS):
+            x = self.get_submodule(f"block{k}")(x, column)
+        return self.fc_out(self.bn(x, column).relu())[:, 0]
+
+
+class OccupancyNetwork(nn.Module):
+    """Encoder and decoder."""
+
+    def __init__(self, code: int, encoder: int, decoder: int, latent: int = 0) -> None:
+        super().__init__()
+        self.encoder = PointEncoder(encoder, code)
+        self.decoder = OccupancyDecoder(code, decoder, latent)
+
+    def forward(
+        self, cloud: Float[Tensor, "shapes cloud 3"], points: Float[Tensor, "shapes points 3"]
+    ) -> Float[Tensor, "shapes points"]:
+        """Logits of points being inside the shape of a point cloud."""
+        return self.decoder(points, self.encoder(cloud))
+
+
+def load_occupancy(path: Path) -> OccupancyNetwork:
+    """The network of a checkpoint (`model.pt`, `onet_pcl2mesh-*.pt`), ready for use.
+
+    No code in the file is executed.
+
+    Raises:
+        InputError: If the file is missing or is no checkpoint of a point-cloud network.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file, expected an Occupancy Network")
+    try:
+        tree: Any = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises what the damage happens to cause
+        text = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise InputError(f"{path.name}: cannot be read ({text}), expected a checkpoint") from error
+    return network_of(tree, path.name)
+
+
+def network_of(tree: Any, name: str) -> OccupancyNetwork:  # noqa: ANN401
+    """The network of a state dictionary, which may lie under `model`.
+
+    Raises:
+        InputError: If keys are missing, unknown, or of another shape.
+    """
+    state: Any = tree.get("model", tree) if isinstance(tree, dict) else None
+    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise InputError(f"{name}: holds no parameters, expected the field 'model' of a checkpoint")
+    state = {key.removeprefix("module."): value for key, value in state.items()}
+    try:
+        code, encoder = state["encoder.fc_c.weight"].shape
+        decoder = state["decoder.fc_p.weight"].shape[0]
+        latent = state["decoder.fc_z.weight"].shape[1] if "decoder.fc_z.weight" in state else 0
+        network = OccupancyNetwork(code, encoder, decoder, latent)
+        own = network.state_dict()
+        kept = {k: v for k, v in state.items() if not k.startswith("encoder_latent.")}
+        for key in own:  # checkpoints of old torch do not count batches
+            if key.endswith("num_batches_tracked"):
+                kept.setdefault(key, own[key])
+        network.load_state_dict(kept)
+    except (KeyError, ValueError, RuntimeError, IndexError) as error:
+        text = str(error).splitlines()[0][:120]
+        raise InputError(
+            f"{name}: is not an Occupancy Network for point clouds ({text}), expected "
+            "pointnet_resnet and cbatchnorm, as in onet_pcl2mesh"
+        ) from error
+    return network.eval()

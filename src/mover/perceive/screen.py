@@ -1,0 +1,238 @@
+r"""How high is the camera, and which shapes can fill the boxes: a quick look by boxes alone.
+
+    E(h, tilt) = \sum_i min_{shape, yaw}  L_bbox + \lambda L_scale   on the floor y = -h
+
+One picture has no scale. Furniture has: beds are two metres long, seats are knee-high. Each shape
+of the library is put on floors of several heights and turned, and descends until its projected
+extent fills the detected box at the least change of its usual size. The height (and a small change
+of the tilt) at which all objects together are most usual is the camera's; outliers are capped.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..geometry.camera import pitch_roll, project, tilted, to_world
+from ..geometry.placement import place
+from ..minimize import Adam, Energy, Observer, minimize, silent
+from ..records import record
+from ..terms.bbox import bbox_term
+from ..terms.scale import scale_term
+from ..types import Camera, Layout
+
+DIRECTIONS = 60  # in which the outermost point of a shape is kept
+LITTLE = 0.01  # share of items that are not the best
+NEAREST = 0.6  # [m], where a start is put at least
+FARTHEST = 15.0  # [m], and at most
+
+
+@dataclass(frozen=True)
+class ScreenConfig:
+    """How the quick look is done."""
+
+    heights: tuple[float, ...] = (0.8, 0.95, 1.1, 1.25, 1.4, 1.6, 1.8, 2.05, 2.35)
+    """Heights of the camera that are tried [m]."""
+    usual: float = 1.5
+    """The usual one [m],"""
+    spread: float = 0.4
+    """and how much it varies (of its logarithm)."""
+    yaws: int = 8
+    """Turns that are tried."""
+    scale: float = 0.3
+    """Weight of usual sizes against boxes."""
+    depth: float = 0.5
+    """Weight of measured depth, where there is any."""
+    tilt: float = math.radians(3)
+    """How wrong pitch and roll may be [rad]; 0: not at all."""
+    prior: float = 0.03
+    """Weight of usual heights and tilts."""
+    cap: float = 0.3
+    """Most that one object may say about the height."""
+    soft: float = 0.05
+    """Shapes that fit worse than the best by so much hardly count."""
+    method: Adam = field(default_factory=lambda: Adam(100, 0.05, 0.005, beta2=0.98))
+    """The descent."""
+
+
+@record
+class ScreenInputs:
+    """Shapes for the detected things: `items` are (thing, shape) pairs."""
+
+    camera: Camera
+    boxes: Float[Tensor, "things 4"]
+    sides: Bool[Tensor, "things 4"]
+    """Sides of the box that are really seen."""
+    depth: Float[Tensor, " things"]
+    """Measured distance along the view of the visible surface [m]; NaN: unknown."""
+    thing: Int[Tensor, " items"]
+    """Whose shape an item is."""
+    points: Float[Tensor, "items points 3"]
+    """Outermost points of each shape, from the centre of its bottom [m]."""
+    height: float | None
+    """The camera's, where it is known [m]."""
+
+
+@record
+class Guess:
+    """What descends, from each height."""
+
+    t_world_object: Float[Tensor, "heights yaws items 3"]
+    """Its y does not count: everything stands on the floor."""
+    yaw: Float[Tensor, "heights yaws items"]
+    log_scale: Float[Tensor, "heights yaws items 3"]
+    log_height: Float[Tensor, " heights"]
+    """Of the camera above the floor [m]."""
+    tilt: Float[Tensor, "heights 2"]
+    """What pitch and roll differ from the first guess [rad]."""
+
+
+@record
+class Screened:
+    """What the quick look found."""
+
+    height: float
+    """Of the camera above the floor [m]."""
+    R_cam_world: Float[Tensor, "3 3"]
+    """Of the camera with its tilt corrected."""
+    curve: Float[Tensor, " heights"]
+    """What the things cost together, from each height at which the descent began."""
+    heights: Float[Tensor, " heights"]
+    """Where it ended from there [m]."""
+    layout: Layout
+    """Each item in each turn on the floor of that height."""
+    energy: Float[Tensor, "yaws items"]
+
+
+def outermost(verts: Float[Tensor, "verts 3"]) -> Float[Tensor, "points 3"]:
+    """The outermost vertices in evenly spread directions."""
+    k = torch.arange(DIRECTIONS) + 0.5
+    y = 1 - 2 * k / DIRECTIONS
+    angle = k * math.pi * (3 - math.sqrt(5))
+    ring = (1 - y * y).sqrt()
+    out = torch.stack([ring * angle.cos(), y, ring * angle.sin()], -1).to(verts)
+    return verts[(verts @ out.mT).argmax(0)]
+
+
+def screen(inputs: ScreenInputs, config: ScreenConfig, observe: Observer = silent) -> Screened:
+    """Begin at all heights, descend, choose the best."""
+    heights = torch.tensor(config.heights if inputs.height is None else (inputs.height,))
+    start = _starts(inputs, config, heights)
+
+    def energy(guess: Guess) -> Energy:
+        each = _each(guess, inputs, config)
+        share = _share(each, inputs, config)
+        world = _world(guess, inputs, config)
+        return Energy({"items": (each * share).sum((1, 2)), "world": world})
+
+    found = minimize(energy, start, config.method, observe, "screen").at
+    with torch.no_grad():
+        each = _each(found, inputs, config)
+        things = _best_of_things(inputs, each.amin(1)).clamp_max(config.cap)
+        curve = things.sum(-1) + _world(found, inputs, config)
+        best = int(curve.argmin())
+        layout = _standing(found)
+        pitch, roll = pitch_roll(inputs.camera.R_cam_world)
+        turn = found.tilt[best]
+        R = tilted(pitch + turn[0], roll + turn[1])
+    return Screened(
+        height=float(found.log_height[best].exp()),
+        R_cam_world=R if config.tilt else inputs.camera.R_cam_world,
+        curve=curve,
+        heights=found.log_height.exp(),
+        layout=Layout(layout.t_world_object[best], layout.yaw[best], layout.log_scale[best]),
+        energy=each[best],
+    )
+
+
+def _best_of_things(
+    inputs: ScreenInputs, energy: Float[Tensor, "heights items"]
+) -> Float[Tensor, "heights things"]:
+    """The best shape of each thing."""
+    best = energy.new_full((len(energy), len(inputs.boxes)), math.inf)
+    return best.scatter_reduce(1, inputs.thing.expand(len(energy), -1), energy, "amin")
+
+
+def _share(
+    each: Float[Tensor, "heights yaws items"], inputs: ScreenInputs, config: ScreenConfig
+) -> Float[Tensor, "heights yaws items"]:
+    """How much an item in a turn moves camera and floor: the best of its thing, if it fits at all.
+
+    The others keep a little, so that they go on (Adam's steps do not shrink with it).
+    """
+    with torch.no_grad():
+        best = _best_of_things(inputs, each.amin(1))[:, None, inputs.thing]
+        share = ((best - each) / config.soft).exp() * (1 + best / config.cap) ** -2
+        return share.clamp_min(LITTLE)
+
+
+def _world(guess: Guess, inputs: ScreenInputs, config: ScreenConfig) -> Float[Tensor, " heights"]:
+    """How unusual height and tilt are."""
+    prior = ((guess.log_height - math.log(config.usual)) / config.spread).square()
+    if inputs.height is not None:
+        prior = torch.zeros_like(prior)
+    tilt = (guess.tilt / max(config.tilt, 1e-3)).square().sum(-1)
+    return config.prior * (prior + tilt)
+
+
+def _standing(guess: Guess) -> Layout:
+    x, _, z = guess.t_world_object.unbind(-1)
+    y = -guess.log_height.exp()[:, None, None].expand_as(x)
+    return Layout(torch.stack([x, y, z], -1), guess.yaw, guess.log_scale)
+
+
+def _each(
+    guess: Guess, inputs: ScreenInputs, config: ScreenConfig
+) -> Float[Tensor, "heights yaws items"]:
+    """Price of each item in each turn on the floor of each height."""
+    camera, thing = inputs.camera, inputs.thing
+    pitch, roll = pitch_roll(camera.R_cam_world)
+    turn = guess.tilt if config.tilt else torch.zeros_like(guess.tilt)
+    R = tilted(pitch + turn[:, 0], roll + turn[:, 1])[:, None, None]
+    verts = place(inputs.points, _standing(guess)) @ R.mT
+    boxes, sides = inputs.boxes[thing], inputs.sides[thing]
+    box = bbox_term(project(verts, camera.K), boxes, sides, float(camera.width), "robust")
+    size = config.scale * scale_term(guess.log_scale, "robust")
+    return box + size + config.depth * _off_depth(verts, inputs.depth[thing])
+
+
+def _off_depth(
+    verts: Float[Tensor, "*starts items points 3"], depth: Float[Tensor, " items"]
+) -> Float[Tensor, "*starts items"]:
+    """How far a measured depth is out of the object's own range (of its logarithm)."""
+    z = verts[..., 2].clamp_min(0.05).log()
+    near, far = z.amin(-1), z.mean(-1)
+    known = depth.nan_to_num(1.0).clamp_min(0.05).log()
+    off = (near - known).relu() + (known - far).relu()
+    return torch.where(depth.isnan(), torch.zeros_like(off), off)
+
+
+def _starts(inputs: ScreenInputs, config: ScreenConfig, heights: Tensor) -> Guess:
+    """On the floor below the box where its lower edge is seen, else as far as its usual size says.
+
+    An item whose floor point is not plausible (above the horizon) starts by its size, too.
+    """
+    R, K, boxes = inputs.camera.R_cam_world, inputs.camera.K, inputs.boxes[inputs.thing]
+    extent = inputs.points.amax(1) - inputs.points.amin(1)
+    ones = torch.ones(len(boxes))
+    foot = torch.stack([(boxes[:, 0] + boxes[:, 2]) / 2, boxes[:, 3], ones], -1)
+    middle = torch.stack([foot[:, 0], (boxes[:, 1] + boxes[:, 3]) / 2, ones], -1)
+    rays = [to_world(pixel @ torch.linalg.inv(K).mT, R) for pixel in (foot, middle)]
+    by_size = (extent[:, 1] * K[1, 1] / (boxes[:, 3] - boxes[:, 1]).clamp_min(1)).clamp(
+        NEAREST, FARTHEST
+    )
+    far = -heights[:, None] / rays[0][:, 1].clamp_max(-1e-3) + extent[:, 2] / 2
+    usable = (rays[0][:, 1] < -0.02) & inputs.sides[inputs.thing][:, 3] & (far < FARTHEST)
+    distance = torch.where(usable, far, by_size.expand_as(far)).clamp(NEAREST, FARTHEST)
+    t = distance[..., None] * torch.where(usable[..., None], rays[0], rays[1])
+    yaw = torch.arange(config.yaws) * (2 * math.pi / config.yaws)
+    shape = (len(heights), config.yaws, len(boxes))
+    return Guess(
+        t_world_object=t[:, None].expand(*shape, 3).clone(),
+        yaw=yaw[None, :, None].expand(shape).clone(),
+        log_scale=torch.zeros(*shape, 3),
+        log_height=heights.log(),
+        tilt=torch.zeros(len(heights), 2),
+    )

@@ -1,0 +1,216 @@
+"""People through the video: SAM 2 carries masks on, detections bring new people in.
+
+The video is cut into segments. At the first frame of each, people are detected; who overlaps
+somebody that is already followed stays the same person, all others are new. SAM 2 then carries all
+masks through the segment. Each segment is kept on disk, so a killed run goes on with the next.
+Without a tracker detections in all frames are linked by their overlap.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..geometry.runs import decode
+from ..minimize import Observer, Step, silent
+from ..readers.masks import encode
+from ..records import record
+from ..types import Masks
+from .detect import Finds, overlap
+from .models import ModelsConfig, Network, network
+from .video import Clip, load_frame
+
+MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as SAM 2 was trained
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """How people are followed."""
+
+    models: ModelsConfig = field(default_factory=ModelsConfig)
+    """Which network."""
+    segment: int = 50
+    """Frames between two detections."""
+    same: float = 0.3
+    """Overlap from which on a detection is somebody who is already followed."""
+    present: float = 0.0
+    """Least score (logit) of SAM 2 that a person is in the picture."""
+    least: float = 0.0004
+    """Smallest mask, as a share of the picture."""
+    patience: int = 10
+    """Frames for which somebody who is not detected is remembered (without a tracker)."""
+
+
+@record
+class Tracks:
+    """People's masks, one row for each (frame, person)."""
+
+    masks: Masks
+    frame: Int[Tensor, " rows"]
+    person: Int[Tensor, " rows"]
+    people: int
+    """Numbers that are used up."""
+
+
+@record
+class SegmentInputs:
+    """A segment of the video."""
+
+    clip: Clip
+    first: int
+    """Its first frame,"""
+    last: int
+    """and its last."""
+    found: Finds
+    """People detected in the first frame."""
+    carried: Tracks
+    """People who were followed into the first frame."""
+
+
+def nobody(clip: Clip, used: int = 0) -> Tracks:
+    """Nobody is followed; so many numbers are used up."""
+    none = torch.zeros(0, dtype=torch.long)
+    return Tracks(Masks(clip.height, clip.width, ()), none, none, used)
+
+
+def stack_of(masks: Masks) -> Bool[Tensor, "rows h w"]:
+    """Masks as pixels."""
+    if not masks.counts:
+        return torch.zeros(0, masks.height, masks.width, dtype=torch.bool)
+    return torch.stack([decode(masks, k) for k in range(len(masks.counts))])
+
+
+def track_people(inputs: SegmentInputs, config: TrackConfig, observe: Observer = silent) -> Tracks:
+    """Follow everybody through a segment.
+
+    Raises:
+        InputError: If the network is not there.
+    """
+    seeds, names, used = seeded(inputs, config.same)
+    if not names:
+        return nobody(inputs.clip, used)
+    net = network("tracker", config.models.tracker, config.models)
+    codes: list[bytes] = []
+    rows: list[tuple[int, int]] = []
+    size = inputs.clip.height, inputs.clip.width
+    frames = range(inputs.first, inputs.last + 1)
+    session = opened(net, [inputs.clip.path(k) for k in frames], size)
+    add_masks(session, net, seeds, names)
+    with torch.inference_mode():
+        for output in net.model.propagate_in_video_iterator(session, start_frame_idx=0):
+            masks = full_masks(output.pred_masks, size)
+            scores = output.object_score_logits.flatten().tolist()
+            for name, mask, score in zip(output.object_ids, masks, scores, strict=True):
+                if score >= config.present and int(mask.sum()) >= config.least * mask.numel():
+                    codes.append(encode(mask))
+                    rows.append((inputs.first + int(output.frame_idx), int(name)))
+            observe(Step("track_people", int(output.frame_idx) + 1, len(frames)))
+    return _tracks(codes, rows, size, used)
+
+
+def seeded(inputs: SegmentInputs, same: float) -> tuple[Bool[Tensor, "people h w"], list[int], int]:
+    """Masks at the first frame, who they are, and how many numbers are used up.
+
+    Somebody who is followed and detected takes the detection's mask; followed but not detected
+    (hidden for a moment) goes on; detected but not followed is new.
+    """
+    old, new = stack_of(inputs.carried.masks), stack_of(inputs.found.masks)
+    names = inputs.carried.person.tolist()
+    masks, used = list(old), inputs.carried.people
+    pairs = matched(overlap(old, new), same)
+    for index, mask in enumerate(new):
+        if index in pairs:
+            masks[pairs[index]] = mask
+        else:
+            masks.append(mask)
+            names.append(used)
+            used += 1
+    return (torch.stack(masks) if masks else old), names, used
+
+
+def matched(overlaps: Float[Tensor, "old new"], least: float) -> dict[int, int]:
+    """Old row of each new one: the pairing with the largest sum of overlaps above `least`."""
+    from scipy.optimize import linear_sum_assignment
+
+    if 0 in overlaps.shape:
+        return {}
+    values = np.where(overlaps.numpy() >= least, overlaps.numpy(), 0)
+    rows, columns = linear_sum_assignment(-values)
+    return {int(c): int(r) for r, c in zip(rows, columns, strict=True) if values[r, c] > 0}
+
+
+def link_people(found: Finds, config: TrackConfig) -> Tracks:
+    """Detections of all frames linked by the overlap with where each person was last seen."""
+    last: dict[int, tuple[int, Tensor]] = {}
+    persons, used = [0] * len(found.category), 0
+    for frame in sorted(set(found.frame.tolist())):
+        rows = (found.frame == frame).nonzero()[:, 0].tolist()
+        masks = torch.stack([decode(found.masks, k) for k in rows])
+        names = [n for n, (when, _) in last.items() if frame - when <= config.patience]
+        old = torch.stack([last[n][1] for n in names]) if names else masks[:0]
+        pairs = matched(overlap(old, masks), config.same)
+        for index, row in enumerate(rows):
+            name = names[pairs[index]] if index in pairs else used
+            used += index not in pairs
+            persons[row], last[name] = name, (frame, masks[index])
+    return Tracks(found.masks, found.frame, torch.tensor(persons, dtype=torch.long), used)
+
+
+def opened(net: Network, paths: Sequence[Any], size: tuple[int, int]) -> Any:  # noqa: ANN401
+    """A session of SAM 2 with these frames.
+
+    Its own processor needs torchvision; resizing and normalising is all that it does.
+    """
+    from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
+
+    side = net.model.config.image_size
+    frames = torch.stack([prepared(load_frame(path), side) for path in paths])
+    return Sam2VideoInferenceSession(
+        video=frames, video_height=size[0], video_width=size[1], inference_device=net.device,
+        inference_state_device=net.device, video_storage_device="cpu", dtype=net.model.dtype,
+    )  # fmt: skip
+
+
+def prepared(picture: Float[Tensor, "h w 3"], side: int) -> Float[Tensor, "3 side side"]:
+    """A picture as SAM 2 wants it: a square, normalised."""
+    square = torch.nn.functional.interpolate(
+        picture.permute(2, 0, 1)[None], (side, side), mode="bilinear", antialias=True
+    )[0]
+    mean, spread = (torch.tensor(v)[:, None, None] for v in (MEAN, SPREAD))
+    return (square - mean) / spread
+
+
+def add_masks(
+    session: Any,  # noqa: ANN401
+    net: Network,
+    masks: Bool[Tensor, "people h w"],
+    names: Sequence[int],
+) -> None:
+    """Tell SAM 2 who is where in the first frame."""
+    side = net.model.config.image_size
+    square = torch.nn.functional.interpolate(
+        masks[:, None].float(), (side, side), mode="bilinear", antialias=True
+    )
+    for mask, name in zip((square >= 0.5).float(), names, strict=True):
+        index = session.obj_id_to_idx(name)
+        session.add_mask_inputs(index, 0, mask[None].to(net.device))
+    session.obj_with_new_inputs = list(names)
+
+
+def full_masks(logits: Tensor, size: tuple[int, int]) -> Bool[Tensor, "people h w"]:
+    """Masks in the pixels of the video from SAM 2's own resolution."""
+    wide = torch.nn.functional.interpolate(
+        logits.reshape(-1, 1, *logits.shape[-2:]).float(), size, mode="bilinear"
+    )
+    return (wide[:, 0] > 0).cpu()
+
+
+def _tracks(
+    codes: list[bytes], rows: list[tuple[int, int]], size: tuple[int, int], used: int
+) -> Tracks:
+    frame, person = (torch.tensor([r[k] for r in rows], dtype=torch.long) for k in (0, 1))
+    return Tracks(Masks(*size, tuple(codes)), frame, person, used)

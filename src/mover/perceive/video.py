@@ -1,0 +1,235 @@
+"""Frames of a video or of a folder of pictures, at an even rate, as files."""
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from ..minimize import Observer, Step, silent
+from ..readers.fields import reason
+from ..readers.people.files import natural
+from ..records import InputError, fingerprint, record, replacing
+
+PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+LARGEST_AREA = 1 << 26  # [px²], of a frame
+QUALITY = 95  # of JPEG
+EARLY = 0.05  # of the time between two frames: how early one may be taken
+
+Picture = UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class FramesConfig:
+    """Which frames are taken."""
+
+    fps: float = 5.0
+    """Frames a second; 0: all."""
+    start: float = 0.0
+    """Where to begin [s]."""
+    end: float = 0.0
+    """Where to stop [s]; 0: at the end."""
+    folder_fps: float = 0.0
+    """Frames a second of a folder of pictures; 0: unknown, all are taken."""
+
+
+@record
+class Clip:
+    """Frames on disk, in order: 000000.jpg ..."""
+
+    folder: str
+    width: int
+    height: int
+    time: Float[Tensor, " frames"]
+    """When each was taken, from the start of the source [s]."""
+    fps: float | None
+    """Frames a second; None: unordered pictures."""
+    origin: str = ""
+    """What the pictures were made from: another source is another clip."""
+
+    def path(self, frame: int) -> Path:
+        """The file of a frame."""
+        return Path(self.folder) / f"{frame:06d}.jpg"
+
+
+@dataclass(frozen=True)
+class TakeInputs:
+    """Where frames come from and go to."""
+
+    source: Path
+    """A video, or a folder of pictures."""
+    stamp: tuple[int, int]
+    """Its size and when it was changed, so that another file is not taken for it."""
+    folder: Path
+
+
+def stamp_of(source: Path) -> tuple[int, int]:
+    """Size [bytes] and time of change of a file; number of pictures and latest change of a folder.
+
+    Raises:
+        InputError: If there is nothing.
+    """
+    if source.is_dir():
+        times = [p.stat().st_mtime_ns for p in pictures_of(source)]
+        return len(times), max(times)
+    if not source.is_file():
+        raise InputError(f"{source}: there is no such file, expected a video or a folder")
+    stat = source.stat()
+    return stat.st_size, stat.st_mtime_ns
+
+
+def take_frames(inputs: TakeInputs, config: FramesConfig, observe: Observer = silent) -> Clip:
+    """Write the chosen frames of a source as JPEG.
+
+    Raises:
+        InputError: If the source cannot be read, or its pictures differ in size.
+    """
+    inputs.folder.mkdir(parents=True, exist_ok=True)
+    times: list[float] = []
+    size: tuple[int, int] | None = None
+    fps = _rate(inputs.source, config)
+    for time, picture in chosen(read_frames(inputs.source, config), config, fps):
+        found = picture.shape[1], picture.shape[0]
+        if size is not None and found != size:
+            raise InputError(
+                f"{inputs.source.name}: frame {len(times)} has {found[0]} x {found[1]} pixels, "
+                f"expected {size[0]} x {size[1]} as the first"
+            )
+        size = found
+        write_jpeg(picture, inputs.folder / f"{len(times):06d}.jpg")
+        observe(Step("take_frames", len(times), len(times) + 1))
+        times.append(time)
+    if size is None:
+        raise InputError(f"{inputs.source.name}: has no frames, expected some in the chosen time")
+    origin = fingerprint(inputs.stamp, str(inputs.source.resolve()), config)
+    return Clip(str(inputs.folder), *size, torch.tensor(times), fps, origin)
+
+
+def read_frames(source: Path, config: FramesConfig) -> Iterator[tuple[float, Picture]]:
+    """Time [s] and pixels of each frame, upright.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    if source.is_dir():
+        rate = config.folder_fps or 1.0
+        for index, path in enumerate(pictures_of(source)):
+            yield index / rate, read_picture(path)
+        return
+    try:
+        yield from _decoded(source, config.start)
+    except (OSError, ValueError) as error:  # av's errors are of both kinds
+        raise InputError(
+            f"{source.name}: cannot be read ({reason(error)}), expected a video"
+        ) from error
+
+
+def chosen(
+    frames: Iterator[tuple[float, Picture]], config: FramesConfig, fps: float | None
+) -> Iterator[tuple[float, Picture]]:
+    """The first frame of each interval of 1/fps between start and end.
+
+    Times of phones' videos are uneven, so the clock decides and not the count.
+    """
+    step = 0.0 if fps is None or not config.fps else 1 / fps
+    due = config.start
+    for time, picture in frames:
+        if config.end and time > config.end:
+            return
+        if time < due - EARLY * step:
+            continue
+        yield time, picture
+        due = max(due + step, time + step / 2)
+
+
+def pictures_of(folder: Path) -> list[Path]:
+    """The pictures of a folder, `2.jpg` before `10.jpg`.
+
+    Raises:
+        InputError: If there are none.
+    """
+    found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURES and p.is_file()]
+    if not found:
+        raise InputError(f"{folder}: has no pictures, expected {', '.join(PICTURES[:3])} ...")
+    return sorted(found, key=natural)
+
+
+def read_picture(path: Path) -> Picture:
+    """A picture, upright.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    from PIL import Image, ImageOps
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(path) as picture:
+                return np.array(ImageOps.exif_transpose(picture).convert("RGB"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Warning) as error:
+        raise InputError(
+            f"{path.name}: cannot be read ({reason(error)}), expected a picture"
+        ) from error
+
+
+def write_jpeg(picture: Picture, path: Path) -> None:
+    """Write a picture."""
+    from PIL import Image
+
+    with replacing(path) as part:
+        Image.fromarray(picture).save(part, format="JPEG", quality=QUALITY)
+
+
+def load_frame(path: Path) -> Float[Tensor, "h w 3"]:
+    """A frame in [0, 1]."""
+    return torch.from_numpy(read_picture(path)).float() / 255
+
+
+def _rate(source: Path, config: FramesConfig) -> float | None:
+    """Frames a second of what is taken."""
+    known = (config.folder_fps or None) if source.is_dir() else _video_rate(source)
+    return known if known is None or not config.fps else min(known, config.fps)
+
+
+def _video_rate(source: Path) -> float:
+    with _opened(source) as container:
+        rate = container.streams.video[0].average_rate
+    return float(rate) if rate else 30.0
+
+
+def _opened(source: Path) -> Any:  # noqa: ANN401
+    """An open container with a video stream."""
+    try:
+        import av
+    except ImportError as error:
+        raise InputError("reading video needs PyAV: pip install mover[perceive]") from error
+    try:
+        container = av.open(str(source))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{source.name}: cannot be read ({reason(error)}), expected a video"
+        ) from error
+    if not container.streams.video:
+        raise InputError(f"{source.name}: has no pictures, only sound, expected a video")
+    return container
+
+
+def _decoded(source: Path, start: float) -> Iterator[tuple[float, Picture]]:
+    with _opened(source) as container:
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        if context.width * context.height > LARGEST_AREA:
+            raise ValueError(f"{context.width} x {context.height} pixels are too many")
+        first = float((stream.start_time or 0) * stream.time_base)
+        if start > 0:
+            container.seek(int((start + first) / stream.time_base), stream=stream)
+        for frame in container.decode(stream):
+            time = float((frame.pts or 0) * frame.time_base) - first
+            turns = round(frame.rotation / 90) % 4
+            yield time, np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), turns))

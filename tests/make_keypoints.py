@@ -1,0 +1,77 @@
+"""2D joints of people whose truth is known."""
+
+import numpy as np
+import torch
+
+from mover.bodies import open_body, zero_pose
+from mover.bodies.keypoints import LAYOUTS, has_keypoints, keypoints_of
+from mover.bodies.skeleton import BODY
+from mover.geometry.camera import project, tilted
+from mover.geometry.rotations import rot_y
+from mover.types import Bodies, BodyPose, Camera, Keypoints
+
+WIDTH, HEIGHT = 960, 540
+CAMERA = Camera(
+    torch.tensor([[760.0, 0, 470], [0, 770, 280], [0, 0, 1]]),
+    tilted(torch.tensor(-0.15), torch.tensor(0.03)),
+    WIDTH,
+    HEIGHT,
+)
+
+
+def walker(frames=12, fps=5.0, yaw=0.6, model=None, tall=0.8) -> tuple[BodyPose, torch.Tensor]:
+    """Somebody who walks across the room with swinging limbs: pose in camera axes, and frames."""
+    from scipy.spatial.transform import Rotation
+
+    t = torch.arange(frames) / fps
+    rest = zero_pose(frames, model or open_body())
+    angles = torch.zeros(frames, 21, 3)
+    swing = 0.45 * torch.sin(5.5 * t)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        at = {n: BODY.index(f"{side}_{n}") - 1 for n in ("hip", "knee", "shoulder", "elbow")}
+        angles[:, at["hip"], 0] = -0.15 - sign * swing
+        angles[:, at["knee"], 0] = 0.5 + 0.3 * sign * swing
+        angles[:, at["shoulder"], 2] = -sign * 1.15
+        angles[:, at["shoulder"], 1] = sign * 0.5 * swing
+        angles[:, at["elbow"], 1] = -sign * 0.5
+    way = rot_y(torch.tensor(yaw))
+    root = (CAMERA.R_cam_world @ way).expand(frames, 3, 3)
+    vector = torch.from_numpy(Rotation.from_matrix(root.numpy()).as_rotvec()).float()
+    start = torch.tensor([-0.3, -0.55, -4.0])
+    path = start + 0.9 * (t - t.mean())[:, None] * (way @ torch.tensor([0, 0, 1.0]))
+    betas = rest.betas.clone()
+    betas[:, 0] = tall
+    pose = BodyPose(
+        rest.model, "neutral", betas, vector, angles.reshape(frames, 63),
+        path @ CAMERA.R_cam_world.mT, {},
+    )  # fmt: skip
+    return pose, torch.arange(frames)
+
+
+def as_bodies(pose: BodyPose, frame: torch.Tensor, fps: float | None = 5.0, person=0) -> Bodies:
+    model = open_body()
+    verts, joints = model.posed(pose)
+    who = torch.full_like(frame, person)
+    return Bodies(
+        verts, model.faces, joints, model.joint_names, frame, who, fps, "camera", pose
+    )  # fmt: skip
+
+
+def seen(bodies: Bodies, layout="openpose25", noise=0.0, missing=0.0, seed=0) -> Keypoints:
+    """What a detector would say."""
+    rng = np.random.default_rng(seed)
+    points = keypoints_of(open_body(), bodies.verts, bodies.joints, layout)
+    pixels = project(points, CAMERA.K)
+    pixels = pixels + torch.from_numpy(noise * rng.normal(size=pixels.shape)).float()
+    there = torch.from_numpy(rng.uniform(size=pixels.shape[:2]) >= missing)
+    there = there & has_keypoints(open_body(), layout)
+    sure = there.float()
+    return Keypoints(
+        torch.where(there[..., None], pixels, torch.zeros_like(pixels)),
+        sure, layout, bodies.frame, bodies.person, bodies.fps,
+    )  # fmt: skip
+
+
+def leg_columns(layout="openpose25") -> list[int]:
+    legs = ("knee", "ankle", "toe", "heel")
+    return [k for k, n in enumerate(LAYOUTS[layout]) if any(part in n for part in legs)]

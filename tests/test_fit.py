@@ -1,0 +1,380 @@
+"""The fit of bodies to keypoints."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from make_keypoints import CAMERA, as_bodies, leg_columns, seen, walker
+from make_smpl import make_model, write_npz
+
+from mover.bodies import load_smpl, open_body, zero_pose
+from mover.bodies.keypoints import keypoints_of
+from mover.fitting import FitConfig, FitInputs, fit_bodies
+from mover.fitting.config import PUBLISHED, STAGES, Stage
+from mover.fitting.energy import Weighed, bending_price, body_energy, geman_mcclure
+from mover.fitting.gather import seen_of
+from mover.fitting.limits import limit_price, limit_table, resting
+from mover.fitting.prior import ANGLES, same
+from mover.fitting.rig import move, rig_of
+from mover.fitting.start import placed
+from mover.fitting.tracks import best_path, triples_of
+from mover.fitting.unknowns import Frame, Unknowns, points_of
+from mover.geometry.camera import project
+from mover.geometry.rotations import axis_angle
+from mover.records import InputError
+
+QUICK = FitConfig(
+    start_steps=20,
+    stages=(dataclasses.replace(STAGES[0], steps=25), dataclasses.replace(STAGES[1], steps=50)),
+)
+
+FEW = FitConfig(start_steps=2, stages=(dataclasses.replace(STAGES[1], steps=5),))
+"""Enough to see that it runs, not to be right."""
+
+
+def off(found, truth):
+    """Mean distance of the joints about the pelvis, and with nothing aligned [m]."""
+    miss = found.bodies.joints[:, :22] - truth.joints[found.rows][:, :22]
+    return float((miss - miss[:, :1]).norm(dim=-1).mean()), float(miss.norm(dim=-1).mean())
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return as_bodies(*walker())
+
+
+@pytest.fixture(scope="module")
+def found(walk):
+    return fit_bodies(FitInputs(seen(walk, noise=3.0, missing=0.1), CAMERA, open_body()))
+
+
+def random_pose(rows=3, seed=0):
+    rng = torch.Generator().manual_seed(seed)
+    base = zero_pose(rows, open_body())
+    return dataclasses.replace(
+        base,
+        betas=torch.randn(rows, 10, generator=rng),
+        global_orient=torch.randn(rows, 3, generator=rng),
+        body_pose=0.5 * torch.randn(rows, 63, generator=rng),
+        transl=torch.randn(rows, 3, generator=rng),
+    )
+
+
+def test_the_rig_puts_keypoints_and_joints_where_the_whole_body_has_them():
+    pose = random_pose()
+    verts, joints = open_body().posed(pose)
+    wanted = keypoints_of(open_body(), verts, joints, "openpose25")
+    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
+    root = axis_angle(pose.global_orient)[:, None]
+    turns = torch.cat([root, axis_angle(pose.body_pose.reshape(-1, 21, 3))], 1)
+    points = move(rig, turns, pose.betas, joints[:, 0])
+    torch.testing.assert_close(points.keypoints, wanted, atol=2e-5, rtol=0)
+    torch.testing.assert_close(points.joints, joints[:, :22], atol=2e-5, rtol=0)
+
+
+@pytest.mark.slow
+def test_the_rig_of_smplx_has_its_hands_face_correctives_and_expression(tmp_path):
+    file = write_npz(make_model("smplx"), tmp_path / "smplx" / "SMPLX_NEUTRAL.npz")
+    model = load_smpl("smplx", place=file)
+    rng = torch.Generator().manual_seed(1)
+    expression = torch.randn(2, 10, generator=rng)
+    base = random_pose(2)
+    pose = dataclasses.replace(base, model="smplx", extra={"expression": expression})
+    verts, joints = model.posed(pose)
+    wanted = keypoints_of(model, verts, joints, "smplifyx118")
+    rig = rig_of(model, "smplifyx118", torch.ones(118, dtype=torch.bool))
+    none = torch.zeros(2, 0)
+    at = Unknowns(
+        torch.zeros(2, 3), pose.body_pose, torch.zeros(2, 3), pose.betas, none,
+        torch.cat([torch.zeros(2, 3), expression], -1),
+    )  # fmt: skip
+    frame = Frame(rig, axis_angle(pose.global_orient), torch.arange(2))
+    points = points_of(at, frame, same)
+    about = points.keypoints - points.joints[:, :1]
+    torch.testing.assert_close(about, wanted - joints[:, :1], atol=1e-5, rtol=0)
+
+
+@pytest.mark.slow
+def test_bodies_are_found_from_keypoints_alone(found, walk):
+    aligned, absolute = off(found, walk)
+    assert aligned < 0.06
+    assert absolute < 0.25  # size and distance cannot be told apart: 5 % of 4 m
+    assert found.miss.mean() < 5
+    assert found.bodies.pose.betas.unique(dim=0).shape[0] == 1
+
+
+@pytest.mark.slow
+def test_a_fitted_body_is_what_its_parameters_say_and_looks_where_it_should(found, walk):
+    verts, joints = open_body().posed(found.bodies.pose)
+    torch.testing.assert_close(verts, found.bodies.verts, atol=1e-5, rtol=0)
+    front = axis_angle(found.bodies.pose.global_orient)[..., 2]
+    true = axis_angle(walk.pose.global_orient)[..., 2]
+    assert ((front * true).sum(-1) > 0.9).all()
+    up = joints @ CAMERA.R_cam_world[:, 1]
+    assert (up[:, 15] > up[:, 10] + 1.2).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("yaw", [0.0, 1.6, 3.1])
+def test_people_are_not_turned_about(yaw):
+    truth = as_bodies(*walker(4, yaw=yaw))
+    out = fit_bodies(FitInputs(seen(truth, noise=2.0), CAMERA, open_body()), QUICK)
+    front = axis_angle(out.bodies.pose.global_orient)[..., 2]
+    assert ((front * axis_angle(truth.pose.global_orient)[..., 2]).sum(-1) > 0.85).all()
+
+
+@pytest.mark.slow
+def test_bodies_of_another_tool_are_put_under_the_true_camera(walk):
+    rng = torch.Generator().manual_seed(3)
+    wrong = dataclasses.replace(
+        walk.pose,
+        body_pose=walk.pose.body_pose + 0.12 * torch.randn(12, 63, generator=rng),
+        transl=walk.pose.transl * 3.0,  # a weak-perspective tool's long lens
+        betas=torch.zeros_like(walk.pose.betas),
+    )
+    start = as_bodies(wrong, walk.frame)
+    before = (start.joints - start.joints[:, :1] - walk.joints + walk.joints[:, :1])[:, :22]
+    out = fit_bodies(FitInputs(seen(walk, noise=2.0), CAMERA, open_body(), start))
+    aligned, absolute = off(out, walk)
+    assert aligned < 0.6 * float(before.norm(dim=-1).mean())
+    assert absolute < 0.25
+
+
+@pytest.mark.slow
+def test_joints_in_3d_are_enough_to_start_from(walk):
+    start = dataclasses.replace(walk, pose=None, joints=walk.joints + torch.tensor([0.2, 0, 2.0]))
+    out = fit_bodies(FitInputs(seen(walk, noise=2.0), CAMERA, open_body(), start), QUICK)
+    assert off(out, walk)[0] < 0.05
+
+
+@pytest.mark.slow
+def test_legs_of_a_sitter_that_nobody_sees_stay_as_they_were_before_and_after():
+    pose, frame = walker(9)
+    angles = pose.body_pose.reshape(9, 21, 3).clone()
+    angles[:, :2, 0], angles[:, 3:5, 0] = -1.4, 1.4
+    still = dataclasses.replace(
+        pose, body_pose=angles.reshape(9, 63), transl=pose.transl[4:5].expand(9, 3).clone()
+    )
+    truth = as_bodies(still, frame)
+    keypoints = seen(truth, noise=1.0)
+    sure = keypoints.confidence.clone()
+    sure[3:6, leg_columns()] = 0
+    hidden = dataclasses.replace(keypoints, confidence=sure)
+    out = fit_bodies(FitInputs(hidden, CAMERA, open_body()), QUICK)
+    miss = out.bodies.joints - truth.joints
+    about = (miss - miss[:, :1])[:, [4, 5, 7, 8]].norm(dim=-1).mean(1)
+    assert about[3:6].mean() < about[:3].mean() + 0.05
+
+
+@pytest.mark.slow
+def test_two_people_keep_their_own_shapes_and_places():
+    one, two = as_bodies(*walker(5, tall=2.0)), as_bodies(*walker(5, yaw=2.5, tall=-2.0), person=4)
+    a, b = seen(one), seen(two)
+    both = dataclasses.replace(
+        a,
+        points=torch.cat([a.points, b.points]),
+        confidence=torch.cat([a.confidence, b.confidence]),
+        frame=torch.cat([a.frame, b.frame]),
+        person=torch.cat([a.person, b.person]),
+    )
+    out = fit_bodies(FitInputs(both, CAMERA, open_body()), QUICK).bodies
+    assert out.person.tolist() == [0] * 5 + [4] * 5
+    assert out.pose.betas.unique(dim=0).shape[0] == 2
+    assert (out.joints[:5, 0] - one.joints[:, 0]).norm(dim=-1).mean() < 0.4
+    assert (out.joints[5:, 0] - two.joints[:, 0]).norm(dim=-1).mean() < 0.4
+
+
+def test_rows_without_joints_are_left_out_and_nan_is_missing(walk):
+    keypoints = seen(walk)
+    points, sure = keypoints.points.clone(), keypoints.confidence.clone()
+    points[2] = torch.nan
+    points[5, 3] = torch.nan
+    sure[7] = 0
+    sure[8, 4] = torch.nan
+    bad = dataclasses.replace(keypoints, points=points, confidence=sure)
+    out = fit_bodies(FitInputs(bad, CAMERA, open_body()), FEW)
+    assert out.rows.tolist() == [0, 1, 3, 4, 5, 6, 8, 9, 10, 11]
+    assert out.bodies.frame.tolist() == out.rows.tolist()
+    assert out.bodies.verts.isfinite().all()
+    assert out.warnings == ("2 of 12 rows have fewer than 4 joints: left out",)
+
+
+def test_keypoints_that_are_all_missing_are_refused(walk):
+    nothing = dataclasses.replace(seen(walk), confidence=torch.zeros(12, 25))
+    with pytest.raises(InputError, match=r"12 rows with at most 0 joints.*expected a row with 4"):
+        fit_bodies(FitInputs(nothing, CAMERA, open_body()), QUICK)
+
+
+@pytest.mark.slow
+def test_a_person_in_one_frame_and_an_unordered_image_are_fitted(walk):
+    for fps in (5.0, None):
+        one = dataclasses.replace(
+            seen(walk), points=seen(walk).points[3:4], confidence=torch.ones(1, 25),
+            frame=torch.tensor([40]), person=torch.tensor([2]), fps=fps,
+        )  # fmt: skip
+        out = fit_bodies(FitInputs(one, CAMERA, open_body()), QUICK)
+        assert out.bodies.frame.tolist() == [40]
+        miss = out.bodies.joints[0, :22] - walk.joints[3, :22]
+        assert (miss - miss[0]).norm(dim=-1).mean() < 0.08
+
+
+@pytest.mark.slow
+def test_a_known_floor_carries_people(walk):
+    keypoints = seen(walk, noise=3.0)
+    floor = float((walk.verts @ CAMERA.R_cam_world[:, 1]).min()) + 0.2
+    plain = fit_bodies(FitInputs(keypoints, CAMERA, open_body()), QUICK).bodies
+    carried = fit_bodies(FitInputs(keypoints, CAMERA, open_body(), ground=floor), QUICK).bodies
+    depth = [
+        (floor - b.joints @ CAMERA.R_cam_world[:, 1]).clamp_min(0).amax(1).mean()
+        for b in (plain, carried)
+    ]
+    assert depth[1] < 0.5 * depth[0]
+
+
+@pytest.mark.slow
+def test_a_long_video_in_stretches_is_the_video_at_once(walk):
+    keypoints = seen(walk, noise=1.0)
+    whole = fit_bodies(FitInputs(keypoints, CAMERA, open_body()), QUICK)
+    parts = fit_bodies(
+        FitInputs(keypoints, CAMERA, open_body()), dataclasses.replace(QUICK, chunk=10)
+    )
+    assert parts.bodies.frame.tolist() == whole.bodies.frame.tolist()
+    assert abs(off(parts, walk)[0] - off(whole, walk)[0]) < 0.02
+
+
+def test_place_from_pixels_is_exact_under_the_true_camera():
+    points = torch.randn(6, 9, 3, generator=torch.Generator().manual_seed(0))
+    place = torch.tensor([0.4, -0.2, 5.0]).expand(6, 3)
+    pixels = project(points + place[:, None], CAMERA.K)
+    found = placed(points, pixels, torch.ones(6, 9), CAMERA.K)
+    torch.testing.assert_close(found, place, atol=1e-3, rtol=0)
+    blind = placed(points, pixels, torch.zeros(6, 9), CAMERA.K)
+    assert (blind[:, 2] > 1).all()
+    assert blind.isfinite().all()
+
+
+def test_the_best_path_is_that_of_all_paths():
+    rng = torch.Generator().manual_seed(0)
+    cost, step = torch.rand(5, 3, generator=rng), torch.rand(4, 3, 3, generator=rng)
+    paths = torch.cartesian_prod(*[torch.arange(3)] * 5)
+    total = cost[torch.arange(5), paths].sum(1)
+    total = total + torch.stack([step[k, paths[:, k], paths[:, k + 1]] for k in range(4)]).sum(0)
+    assert best_path(cost, step).tolist() == paths[total.argmin()].tolist()
+
+
+def test_constant_velocity_costs_nothing_over_gaps_and_long_gaps_join_nothing():
+    frame, person = torch.tensor([0, 1, 3, 4, 40, 41, 42]), torch.zeros(7, dtype=torch.long)
+    triples = triples_of(frame, person, 10.0, FitConfig())
+    assert triples.rows.tolist() == [[0, 1, 2], [1, 2, 3], [4, 5, 6]]
+    from mover.fitting.energy import second_difference
+
+    line = (0.3 * frame.float())[:, None, None].expand(-1, 2, 3)
+    assert second_difference(line, triples).abs().max() < 1e-5
+    assert len(triples_of(frame, person, None, FitConfig()).rows) == 0
+
+
+def test_prices_are_those_of_the_publication():
+    r = torch.tensor([0.0, 3.0, 100.0, 1e6])
+    wanted = [0.0, 9e4 / 10009, 5000.0, 1e4]
+    torch.testing.assert_close(geman_mcclure(r**2, 100.0), torch.tensor(wanted), rtol=1e-4, atol=0)
+    assert float(bending_price(torch.zeros(1, 63))) == 4.0
+    elbow = torch.zeros(1, 63)
+    elbow[0, 52] = 0.7  # the left elbow, backwards: index 55 of the full pose less the root's three
+    assert float(bending_price(elbow)) == pytest.approx(3 + np.exp(1.4), rel=1e-5)
+    assert PUBLISHED[2].pose == 57.4
+
+
+def test_limits_mirror_left_and_right_and_hold_the_resting_pose():
+    low, high, rest, _ = (row.reshape(21, 3) for row in limit_table())
+    for left, right in ((0, 1), (3, 4), (15, 16), (17, 18), (19, 20)):
+        assert torch.equal(low[left, 0], low[right, 0])
+        torch.testing.assert_close(low[left, 1:], -high[right, 1:])
+    assert ((low < rest) & (rest < high)).all()
+    pose = resting(1, torch.zeros(1))
+    assert float(limit_price(pose)) == 0
+    pose[0, 9] = np.radians(-9)  # the left knee forwards: 4 degrees beyond its limit
+    assert float(limit_price(pose)) == pytest.approx(1, rel=1e-4)
+
+
+def test_the_energy_has_the_gradient_of_finite_differences(walk):
+    keypoints = dataclasses.replace(
+        seen(walk), points=seen(walk).points[:3].double(), frame=torch.arange(3),
+        confidence=torch.ones(3, 25).double(), person=torch.zeros(3, dtype=torch.long),
+    )  # fmt: skip
+    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
+    looked = seen_of(keypoints, rig, CAMERA, FitConfig())
+    looked = dataclasses.replace(looked, K=looked.K.double(), floor=-0.5)
+    frame = Frame(rig, axis_angle(walk.pose.global_orient[:3]).double(), keypoints.person)
+    by = Weighed(Stage(), FitConfig(), ANGLES.decode, learned=False)
+    none = torch.zeros(3, 0).double()
+    base = (
+        0.1 * torch.ones(3, 3).double(),
+        walk.pose.body_pose[:3].double() + 0.1,
+        torch.tensor([[0.0, 0.02, 1.3]]).double().expand(3, 3).clone(),
+        0.2 * torch.ones(1, 10).double(),
+    )
+
+    def total(turn, code, place, betas):
+        return body_energy(Unknowns(turn, code, place, betas, none, none), frame, looked, by).total
+
+    leaves = [v.clone().requires_grad_() for v in base]
+    assert torch.autograd.gradcheck(total, leaves, eps=1e-6, rtol=1e-4, atol=1e-2, fast_mode=True)
+
+
+def test_a_weight_of_zero_needs_no_evidence(walk):
+    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
+    looked = seen_of(seen(walk), rig, CAMERA, FitConfig())
+    none = torch.zeros(12, 0)
+    at = Unknowns(torch.zeros(12, 3), walk.pose.body_pose, torch.ones(12, 3),
+                  torch.zeros(1, 10), none, none)  # fmt: skip
+    frame = Frame(rig, axis_angle(walk.pose.global_orient), walk.person)
+    by = Weighed(Stage(smooth=0.0), FitConfig(), ANGLES.decode, learned=False)
+    parts = body_energy(at, frame, looked, by).parts
+    assert set(parts) == {"keypoints", "pose", "limits", "bending", "shape"}
+    assert all((value >= 0).all() for value in parts.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["smpl", "smplh", "smplx"])
+def test_models_of_the_users_files_are_fitted_with_hands_and_face(name, tmp_path, monkeypatch):
+    file = tmp_path / name / f"{name.upper()}_NEUTRAL.npz"
+    model = load_smpl(name, place=write_npz(make_model(name), file))
+    monkeypatch.setenv("MOVER_BODY_MODELS", str(tmp_path))
+    walk = as_bodies(*walker(4))
+    keypoints = seen(walk, layout="openpose137", noise=1.0)
+    config = dataclasses.replace(QUICK, stages=(*QUICK.stages, Stage(4.78, 5, 4.78, 47.8, 1, 1)))
+    out = fit_bodies(FitInputs(keypoints, CAMERA, model), config)
+    assert out.bodies.verts.shape[1] == len(model.posed(out.bodies.pose)[0][0])
+    miss = out.bodies.joints[:, :22] - walk.joints[:, :22]
+    assert (miss - miss[:, :1]).norm(dim=-1).mean() < 0.08
+    if name != "smpl":
+        assert out.bodies.pose.extra["left_hand_pose"].shape == (4, 45)
+    again = fit_bodies(FitInputs(keypoints, CAMERA, model, start=out.bodies), config)
+    assert again.miss.mean() < 6
+
+
+@pytest.mark.slow
+def test_the_command_reads_openpose_and_writes_bodies(tmp_path, walk, capsys):
+    from mover.commands_fit import fit
+    from mover.readers.bodies_file import read_bodies
+    from mover.readers.camera_file import camera_to_json
+
+    keypoints = seen(walk, noise=1.0)
+    folder = tmp_path / "keypoints"
+    folder.mkdir()
+    for k in range(12):
+        triple = torch.cat([keypoints.points[k], keypoints.confidence[k, :, None]], -1)
+        person = {"pose_keypoints_2d": triple.reshape(-1).tolist()}
+        (folder / f"{k:06d}_keypoints.json").write_text(json.dumps({"people": [person]}))
+    (tmp_path / "camera.json").write_text(json.dumps(camera_to_json(CAMERA)))
+    out = tmp_path / "bodies.npz"
+    fit([str(folder), "--camera", str(tmp_path / "camera.json"), "--out", str(out), "--fps", "5",
+         "--one-euro", "--drop"])  # fmt: skip
+    bodies = read_bodies(out)
+    assert bodies.pose is not None
+    assert bodies.fps == 5
+    assert "keypoints missed by" in capsys.readouterr().out
+    rows = bodies.frame
+    assert (bodies.joints[:, 0] - walk.joints[rows, 0]).norm(dim=-1).median() < 0.3

@@ -1,0 +1,262 @@
+"""Frames, the steady camera, the clean picture and the lens."""
+
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from mover.perceive.clean import CleanConfig, clean_picture, spread_frames
+from mover.perceive.homography import align, centres, moved, warp
+from mover.perceive.lens import exif_focal, lens_of
+from mover.perceive.steady import (
+    SteadyConfig,
+    SteadyInputs,
+    find_drift,
+    seen_share,
+    steady_frames,
+    warning_of,
+)
+from mover.perceive.video import (
+    Clip,
+    FramesConfig,
+    TakeInputs,
+    load_frame,
+    stamp_of,
+    take_frames,
+    write_jpeg,
+)
+from mover.records import InputError
+
+BEDROOM = Path(__file__).parents[2] / "shared" / "data" / "sam2_bedroom" / "bedroom.mp4"
+W, H = 320, 180
+
+
+def texture(seed: int = 0, size: tuple[int, int] = (260, 420)) -> torch.Tensor:
+    """Smooth random patches of colour."""
+    generator = torch.Generator().manual_seed(seed)
+    parts = [
+        torch.nn.functional.interpolate(
+            torch.rand(1, 3, size[0] // n, size[1] // n, generator=generator), size, mode="bicubic"
+        )
+        for n in (8, 20, 50)
+    ]
+    picture = torch.stack(parts).mean(0)[0].permute(1, 2, 0)
+    return ((picture - 0.5) * 2 + 0.5).clamp(0, 1)
+
+
+def turn(pan: float, tilt: float, roll: float, zoom: float, f: float) -> torch.Tensor:
+    """The homography of a camera that turns about its centre, written out."""
+    K = np.array([[f, 0, W / 2], [0, f, H / 2], [0, 0, 1]])
+    cy, sy, cx, sx, cz, sz = (g(a) for a in (pan, tilt, roll) for g in (math.cos, math.sin))
+    R = (
+        np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+        @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+        @ np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    )
+    M = K @ np.diag([zoom, zoom, 1]) @ R @ np.linalg.inv(K)
+    return torch.from_numpy(M / M[2, 2]).float()
+
+
+def view(world: torch.Tensor, M: torch.Tensor) -> torch.Tensor:
+    """What a turned camera sees of a picture that is larger than its own."""
+    shift = torch.tensor([[1.0, 0, 50], [0, 1, 40], [0, 0, 1]])
+    return warp(world, shift @ torch.linalg.inv(M), (H, W))[0]
+
+
+def worst(found: torch.Tensor, true: torch.Tensor) -> float:
+    corners = torch.tensor([[0.0, 0], [W, 0], [0, H], [W, H]])
+    return float((moved(found, corners) - moved(true, corners)).norm(dim=-1).max())
+
+
+@pytest.mark.parametrize(("focal", "error"), [(250.0, 0.2), (None, 2.0)])
+def test_a_turned_camera_is_found(focal: float | None, error: float):
+    """To a fifth of a pixel with its lens; to a tenth of its motion with a lens 15 % off."""
+    world = texture()
+    M = turn(0.05, -0.03, 0.02, 1.01, 250.0)
+    fit = align(view(world, torch.eye(3)).mean(-1), view(world, M).mean(-1), torch.eye(3), focal)
+    assert worst(fit.H, M) < error
+    assert worst(torch.eye(3), M) > 20
+    assert fit.agree > 0.85
+
+
+def test_people_and_light_do_not_pull_the_camera():
+    world = texture(1)
+    M = turn(-0.03, 0.02, 0.0, 1.0, 288.0)
+    a, b = view(world, torch.eye(3)).mean(-1), view(world, M).mean(-1) * 0.8 + 0.1
+    other = texture(2).mean(-1)
+    a[40:150, 60:120], b[30:140, 150:210] = other[40:150, 60:120], other[40:150, 60:120]
+    assert worst(align(a, b, torch.eye(3)).H, M) < 0.5
+
+
+def write_clip(folder: Path, turns: list[torch.Tensor], walkers: bool = False) -> Clip:
+    folder.mkdir()
+    world, other = texture(3), texture(4)
+    for k, M in enumerate(turns):
+        picture = view(world, M)
+        if walkers:
+            picture[40:160, 20 + 20 * k : 70 + 20 * k] = other[:120, :50]
+        pixels = (picture * 255).round().to(torch.uint8).numpy()
+        write_jpeg(np.ascontiguousarray(pixels), folder / f"{k:06d}.jpg")
+    return Clip(str(folder), W, H, torch.arange(len(turns)) / 5, 5.0)
+
+
+def test_a_still_camera_is_left_alone(tmp_path: Path):
+    clip = write_clip(tmp_path / "raw", [torch.eye(3)] * 4, walkers=True)
+    drift = find_drift(SteadyInputs(clip), SteadyConfig())
+    assert drift.verdict == "still"
+    assert warning_of(drift) is None
+    steady = steady_frames(clip, drift, tmp_path / "steady")
+    assert steady.path(2).read_bytes() == clip.path(2).read_bytes()
+    assert seen_share(drift, 2, (H, W)).all()
+
+
+def test_a_swaying_camera_is_turned_back(tmp_path: Path):
+    turns = [turn(0.012 * k, 0.006 * k, -0.004 * k, 1.0, 288.0) for k in range(6)]
+    clip = write_clip(tmp_path / "raw", turns, walkers=True)
+    drift = find_drift(SteadyInputs(clip), SteadyConfig())
+    assert drift.verdict == "sways"
+    assert "sways" in (warning_of(drift) or "")
+    assert drift.reference in (2, 3)
+    centre = torch.tensor([[W / 2, H / 2]])
+    far = float((moved(turns[5], centre) - centre).norm())
+    found = drift.H[5] @ torch.linalg.inv(drift.H[0])
+    assert float((moved(found, centre) - centre).norm()) == pytest.approx(far, abs=0.5)
+    steady = steady_frames(clip, drift, tmp_path / "steady")
+    inner = (slice(20, 160), slice(190, 300))  # nobody walks here in the first two frames
+    a, b = (load_frame(steady.path(k))[inner] for k in (0, 1))
+    raw = (load_frame(clip.path(0)) - load_frame(clip.path(1)))[inner].abs().mean()
+    assert (a - b).abs().mean() < 0.2 * raw
+
+
+def test_a_walking_camera_is_told(tmp_path: Path):
+    world = [texture(seed) for seed in range(5, 9)]
+    (tmp_path / "raw").mkdir()
+    for k, one in enumerate(world):  # each frame shows something else
+        pixels = (view(one, torch.eye(3)) * 255).round().to(torch.uint8).numpy()
+        write_jpeg(np.ascontiguousarray(pixels), tmp_path / "raw" / f"{k:06d}.jpg")
+    clip = Clip(str(tmp_path / "raw"), W, H, torch.arange(4) / 5, 5.0)
+    drift = find_drift(SteadyInputs(clip), SteadyConfig())
+    assert drift.verdict == "moves"
+    assert "stands still" in (warning_of(drift) or "")
+
+
+def write_video(path: Path, colours: list[int], times: list[int], rate: int = 30) -> None:
+    """A video of grey frames with given time stamps in 1/rate seconds."""
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=rate)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, rate)
+        for colour, time in zip(colours, times, strict=True):
+            pixels = np.full((48, 64, 3), colour, dtype=np.uint8)
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            frame.pts, frame.time_base = time, Fraction(1, rate)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def take(source: Path, out: Path, config: FramesConfig | None = None) -> Clip:
+    return take_frames(TakeInputs(source, stamp_of(source), out), config or FramesConfig())
+
+
+def test_frames_are_chosen_by_the_clock_not_by_counting(tmp_path: Path):
+    colours = [10 * k for k in range(20)]
+    times = [*range(10), *range(20, 30)]  # a third of a second is missing
+    write_video(tmp_path / "v.mp4", colours, times)
+    clip = take(tmp_path / "v.mp4", tmp_path / "f", FramesConfig(fps=10))
+    assert clip.time.mul(30).round().tolist() == [0, 3, 6, 9, 20, 22, 25, 28]
+    greys = [float(load_frame(clip.path(k)).mean()) * 255 for k in range(len(clip.time))]
+    expected = [colours[times.index(round(30 * t))] for t in clip.time.tolist()]
+    assert greys == pytest.approx(expected, abs=4)
+    part = take(tmp_path / "v.mp4", tmp_path / "g", FramesConfig(fps=10, start=0.2, end=0.31))
+    assert part.time.mul(30).round().tolist() == [6, 9]
+
+
+def test_a_folder_of_pictures_keeps_the_order_of_numbers(tmp_path: Path):
+    (tmp_path / "in").mkdir()
+    for k in (10, 2, 1):
+        Image.new("L", (8, 6), 20 * k).save(tmp_path / "in" / f"im{k}.png")
+    clip = take(tmp_path / "in", tmp_path / "out")
+    assert clip.fps is None
+    greys = [round(float(load_frame(clip.path(k)).mean()) * 255 / 20) for k in range(3)]
+    assert greys == [1, 2, 10]
+    Image.new("L", (9, 6)).save(tmp_path / "in" / "im11.png")
+    with pytest.raises(InputError, match="9 x 6 pixels, expected 8 x 6"):
+        take(tmp_path / "in", tmp_path / "out2")
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense" * 100])
+def test_a_file_that_is_no_video_gives_one_clear_error(tmp_path: Path, content: bytes):
+    pytest.importorskip("av")
+    (tmp_path / "v.mp4").write_bytes(content)
+    with pytest.raises(InputError, match=r"v\.mp4: cannot be read"):
+        take(tmp_path / "v.mp4", tmp_path / "f")
+    with pytest.raises(InputError, match="no such file"):
+        stamp_of(tmp_path / "other.mp4")
+
+
+def test_the_clean_picture_is_the_room_that_people_never_hide_for_long():
+    room = texture(6, (60, 80))
+    room = (room * 255).round() / 255
+    masks = []
+    for k in range(6):
+        mask = torch.zeros(60, 80, dtype=torch.bool)
+        mask[10:50, 10 * k : 10 * k + 20] = True
+        mask[:5, :5] = True  # always hidden
+        masks.append(mask)
+
+    def load(frame: int):
+        picture = room.clone()
+        picture[masks[frame]] = 0.1 * frame
+        return picture, ~masks[frame]
+
+    found = clean_picture(range(6), load, CleanConfig())
+    assert found.frame == -1
+    assert torch.equal(found.hidden.nonzero().amax(0), torch.tensor([4, 4]))
+    assert torch.equal(found.picture[~found.hidden], room[~found.hidden])
+    masks[3][:] = False
+    assert clean_picture(range(6), load, CleanConfig()).frame == 3
+    assert spread_frames(100, 3) == [0, 50, 99]
+    assert len(centres(2, 3)) == 6
+
+
+def test_the_lens_comes_from_the_file_the_angle_or_the_photo(tmp_path: Path):
+    (tmp_path / "geo.json").write_text('{"f": 700, "pitch": -0.2, "roll": 0.05}')
+    at, text = lens_of((640, 480), file=tmp_path / "geo.json", fov=None, photo=None)
+    assert (at.value["fl_x"], text) == (700, None)
+    up = np.array(at.value["R_cam_world"])[:, 1]
+    assert math.asin(up[2]) == pytest.approx(-0.2)
+    at, _ = lens_of((640, 480), file=None, fov=90.0, photo=None)
+    assert at.value["fl_x"] == pytest.approx(320)
+    picture = Image.new("RGB", (36, 24))
+    exif = picture.getexif()
+    exif.get_ifd(0x8769)[0xA405] = 28
+    picture.save(tmp_path / "p.jpg", exif=exif)
+    assert exif_focal(tmp_path / "p.jpg", (3600, 2400)) == pytest.approx(2800)
+    at, text = lens_of((3600, 2400), file=None, fov=None, photo=tmp_path / "p.jpg")
+    assert text is None
+    _, text = lens_of((3600, 2400), file=None, fov=None, photo=None)
+    assert "--fov" in (text or "")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not BEDROOM.exists(), reason="shared/data is not there")
+def test_the_swaying_bedroom_is_steadied(tmp_path: Path):
+    pytest.importorskip("av")
+    raw = take(BEDROOM, tmp_path / "raw", FramesConfig(fps=5))
+    assert (raw.width, raw.height, raw.fps, len(raw.time)) == (960, 540, 5.0, 34)
+    drift = find_drift(SteadyInputs(raw), SteadyConfig())
+    assert drift.verdict == "sways"
+    centre = torch.tensor([[480.0, 270.0]])
+    last = drift.H[-1] @ torch.linalg.inv(drift.H[0])
+    assert float((moved(last, centre) - centre).norm()) == pytest.approx(56, abs=3)
+    steady = steady_frames(raw, drift, tmp_path / "steady")
+    wall = (slice(60, 300), slice(620, 720))  # stripes, shelf and candle, where no child jumps
+    for a, b in ((0, 33), (10, 25)):
+        before = (load_frame(raw.path(a)) - load_frame(raw.path(b)))[wall].abs().mean()
+        after = (load_frame(steady.path(a)) - load_frame(steady.path(b)))[wall].abs().mean()
+        assert after < 0.5 * before

@@ -1,0 +1,273 @@
+"""The first scene: heights, shapes, depth maps, files, and the whole way from a video."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mover.commands import run_command
+from mover.furniture import make_piece
+from mover.geometry.boxes import box_of, iou3d
+from mover.geometry.camera import pitch_roll, tilted, to_camera, to_world
+from mover.geometry.mesh import edges_of
+from mover.geometry.placement import place_piece
+from mover.geometry.raster import Topology, Views, look
+from mover.perceive.candidates import is_placed, shapes_of
+from mover.perceive.depth_map import floor_height, median_depths, read_depth
+from mover.perceive.layout import LayoutConfig, Picture, first_scene
+from mover.perceive.screen import ScreenConfig, ScreenInputs, outermost, screen
+from mover.readers import read
+from mover.readers.masks import encode, tight_box
+from mover.readers.mesh_file import write_mesh
+from mover.records import InputError
+from mover.run import Run
+from mover.types import Camera, Detection, Masks, Piece
+
+W, H, FOCAL = 480, 320, 420.0
+HEIGHT = 1.35
+
+
+def camera(pitch: float = -0.25, roll: float = 0.03) -> Camera:
+    K = torch.tensor([[FOCAL, 0, W / 2], [0, FOCAL, H / 2], [0, 0, 1]])
+    return Camera(K, tilted(torch.tensor(pitch), torch.tensor(roll)), W, H)
+
+
+def furniture(names: dict[str, tuple[float, float, float]], seed: int = 50) -> list[Piece]:
+    rng = np.random.default_rng(seed)
+    pieces = []
+    for k, (name, (x, z, yaw)) in enumerate(names.items()):
+        mesh = make_piece(name, rng).mesh
+        t = torch.tensor([x, -HEIGHT, z])
+        pieces.append(
+            Piece(f"p{k}", name, mesh, "", k, "ground", t, torch.tensor(yaw), torch.ones(3))
+        )
+    return pieces
+
+
+def drawn(piece: Piece, view: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mask and depth of one piece."""
+    mesh = place_piece(piece)
+    verts = to_camera(mesh.verts, view.R_cam_world)[None]
+    faces = mesh.faces[None]
+    views = Views(view.K[None], H, W)
+    cover, depths = look(verts, Topology(faces, edges_of(mesh.faces)[None]), views, depth=True)
+    assert depths is not None
+    depth = torch.where(depths.covered[0], depths.nearest[0], torch.inf)
+    return cover[0] > 0.5, depth
+
+
+def picture(pieces: list[Piece], view: Camera, depth: bool = False) -> Picture:
+    """What a perfect detector gives; the floor fills the rest of the depth map."""
+    seen = [drawn(piece, view) for piece in pieces]
+    nearest = torch.stack([d for _, d in seen]).amin(0)
+    masks = torch.stack([m & (d <= nearest) for m, d in seen])
+    found = tuple(
+        Detection(k, p.category, tight_box(m), Masks(H, W, (encode(m),)), 1.0)
+        for k, (p, m) in enumerate(zip(pieces, masks, strict=True))
+    )
+    return Picture(
+        view, found, masks, torch.zeros(H, W, dtype=torch.bool), None,
+        torch.minimum(nearest, floor_depth(view)) if depth else None,
+    )  # fmt: skip
+
+
+def floor_depth(view: Camera) -> torch.Tensor:
+    """Depth of the floor, written out; NaN above the horizon."""
+    y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
+    rays = torch.stack([(x - W / 2) / FOCAL, (y - H / 2) / FOCAL, torch.ones(H, W)], -1)
+    down = to_world(rays, view.R_cam_world)[..., 1]
+    return torch.where(down < -0.05, -HEIGHT / down, torch.nan)
+
+
+ROOM = {"sofa": (-1.2, -4.2, 0.5), "chair": (0.7, -3.0, -0.6), "table": (0.2, -4.6, 0.1),
+        "cabinet": (1.9, -4.9, -0.4)}  # fmt: skip
+QUICK = LayoutConfig(shapes=4, keep=2, turns=4)
+
+
+@pytest.fixture(scope="module")
+def pieces() -> list[Piece]:
+    return furniture(ROOM)
+
+
+def test_outermost_points_have_the_box_of_the_shape(pieces: list[Piece]):
+    verts = pieces[0].mesh.verts
+    points = outermost(verts)
+    size = verts.amax(0) - verts.amin(0)
+    assert ((points.amax(0) - points.amin(0)) > 0.97 * size).all()
+
+
+@pytest.mark.slow
+def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[Piece]):
+    seen = picture(pieces, camera())
+    shapes = [shape for p in pieces for shape in shapes_of(p.category, 1)]
+    low = [(s.mesh.verts - torch.tensor([0, float(s.mesh.verts[:, 1].min()), 0])) for s in shapes]
+    inputs = ScreenInputs(
+        camera(), torch.stack([d.box for d in seen.detections]),
+        torch.ones(4, 4, dtype=torch.bool), torch.full((4,), torch.nan), torch.arange(4),
+        torch.stack([outermost(v) for v in low]), None,
+    )  # fmt: skip
+    found = screen(inputs, ScreenConfig(heights=(0.9, 1.2, 1.5, 1.9)))
+    assert found.height == pytest.approx(HEIGHT, rel=0.15)
+    # a picture cannot tell a doll's house: doubled shapes double the height
+    twice = screen(
+        replace(inputs, points=2 * inputs.points),
+        ScreenConfig(heights=(1.8, 2.4, 3.0, 3.8), usual=3.0),
+    )
+    assert twice.height / found.height == pytest.approx(2, rel=0.05)
+    known = screen(replace(inputs, height=1.2), ScreenConfig(tilt=0.0))
+    assert torch.equal(known.R_cam_world, camera().R_cam_world)
+
+
+@pytest.mark.slow
+def test_a_perfect_picture_gives_furniture_near_the_true_one(pieces: list[Piece], tmp_path: Path):
+    run = Run(tmp_path)
+    first = first_scene(picture(pieces, camera()), QUICK, run)
+    assert [p.category for p in first.scene.pieces] == list(ROOM)
+    assert [p.annotation for p in first.scene.pieces] == [0, 1, 2, 3]
+    overlaps = [
+        float(iou3d(box_of(a), box_of(b))) for a, b in zip(first.scene.pieces, pieces, strict=True)
+    ]
+    assert sum(overlaps) / 4 > 0.3
+    for group in first.others:
+        assert 1 < len(group) <= QUICK.keep
+        assert [h.energy for h in group] == sorted(h.energy for h in group)
+    first_scene(picture(pieces, camera()), QUICK, run)
+    assert all(stage.kept for stage in run.stages[len(run.stages) // 2 :])
+
+
+@pytest.mark.slow
+def test_measured_depth_makes_it_better(pieces: list[Piece], tmp_path: Path):
+    view = camera()
+    seen = picture(pieces, view, depth=True)
+    assert seen.depth is not None
+    things = seen.masks.any(0)
+    assert floor_height(seen.depth, view, things) == pytest.approx(HEIGHT, abs=0.03)
+    assert floor_height(torch.full((H, W), torch.nan), view, things) is None
+    medians = median_depths(seen.depth, seen.masks)
+    for k, piece in enumerate(pieces):
+        assert float(medians[k]) == pytest.approx(float(box_of(piece).center.norm()), rel=0.15)
+    config = replace(QUICK, screen=ScreenConfig(tilt=0.0))
+    plain = first_scene(replace(seen, depth=None), config, Run(tmp_path))
+    deep = first_scene(seen, config, Run(tmp_path))
+
+    def score(first) -> float:
+        pairs = zip(first.scene.pieces, pieces, strict=True)
+        return sum(float((box_of(a).center - box_of(b).center).norm()) for a, b in pairs) / 4
+
+    assert score(deep) < min(0.3, score(plain))
+
+
+@pytest.mark.slow
+def test_a_wrong_tilt_is_partly_corrected(tmp_path: Path):
+    pieces = furniture(
+        ROOM | {"office chair": (-0.3, -2.4, 2.0), "double bed": (-2.4, -6.4, 0.0)}, seed=51
+    )
+    true = camera(-0.25, 0.0)
+    seen = picture(pieces, true)
+    tilt = torch.tensor(-0.25 + math.radians(3))
+    wrong = replace(seen, camera=replace(true, R_cam_world=tilted(tilt, torch.tensor(0.0))))
+    config = replace(QUICK, screen=ScreenConfig(prior=0.003))
+    first = first_scene(wrong, config, Run(tmp_path))
+    pitch, _ = pitch_roll(first.scene.camera.R_cam_world)
+    assert abs(float(pitch) + 0.25) < math.radians(3)
+
+
+def test_shapes_are_those_of_the_class_and_differ():
+    found = shapes_of("couch", 5)
+    assert len({tuple(s.mesh.verts.shape) for s in found}) > 1
+    widths = [s.size[0] for s in found]
+    assert max(widths) > 1.5 * min(widths)
+    assert len(shapes_of("dining table", 20)) == 20
+    (fridge,) = shapes_of("refrigerator", 5)
+    assert fridge.size[1] > 1.5
+    assert not is_placed("TV")
+    assert is_placed("dining table")
+
+
+def test_the_users_own_shapes_come_first(tmp_path: Path, pieces: list[Piece]):
+    write_mesh(pieces[1].mesh, tmp_path / "chair_0.glb")
+    write_mesh(pieces[0].mesh, tmp_path / "sofa-1.glb")
+    (own,) = shapes_of("chair", 5, tmp_path)
+    assert own.file.endswith("chair_0.glb")
+    assert own.size == pytest.approx(tuple(box_of(pieces[1]).size.tolist()), rel=1e-4)
+    assert len(shapes_of("bed", 5, tmp_path)) == 5
+    with pytest.raises(InputError, match="no such folder"):
+        shapes_of("chair", 5, tmp_path / "none")
+
+
+@pytest.mark.parametrize("kind", ["npz", "moge", "npy", "png", "half"])
+def test_depth_maps_of_all_kinds_say_the_same(kind: str, tmp_path: Path):
+    from PIL import Image
+
+    depth = floor_depth(camera()).numpy()
+    match kind:
+        case "npz":
+            np.savez(tmp_path / "d.npz", depth=depth[None])
+        case "moge":
+            np.savez(tmp_path / "d.npz", points=np.repeat(depth[..., None], 3, -1), mask=depth > 0)
+        case "npy":
+            np.save(tmp_path / "d.npy", depth.astype(np.float16))
+        case "png":
+            values = (np.nan_to_num(depth).clip(0, 65) * 1000).round().astype(np.uint16)
+            Image.fromarray(values).save(tmp_path / "d.png")
+        case _:
+            np.savez(tmp_path / "d.npz", depth=depth[::2, ::2])
+    found = read_depth(next(tmp_path.iterdir()), camera())
+    known = ~np.isnan(depth) & (depth < 40)
+    rows = slice(H // 2 + 40, H)
+    near = 0.03 if kind == "half" else 0.002
+    assert np.allclose(found.numpy()[rows][known[rows]], depth[rows][known[rows]], rtol=near)
+    assert torch.equal(found.isnan(), torch.from_numpy(np.isnan(depth))) or kind == "half"
+
+
+def test_depth_maps_without_a_unit_or_of_another_shape_are_refused(tmp_path: Path):
+    from PIL import Image
+
+    Image.new("L", (W, H), 80).save(tmp_path / "d.png")
+    with pytest.raises(InputError, match="16 bits of millimetres"):
+        read_depth(tmp_path / "d.png", camera())
+    np.savez(tmp_path / "d.npz", depth=np.ones((H, H)))
+    with pytest.raises(InputError, match="expected the shape of 480 x 320"):
+        read_depth(tmp_path / "d.npz", camera())
+    np.savez(tmp_path / "e.npz", other=np.ones((H, W)))
+    with pytest.raises(InputError, match="one of the arrays depth"):
+        read_depth(tmp_path / "e.npz", camera())
+    with pytest.raises(InputError, match=r"expected \.npz"):
+        read_depth(tmp_path / "d.exr", camera())
+
+
+def write_capture_without_scene(folder: Path, seen: Picture) -> None:
+    from mover.readers.camera_file import camera_to_json
+    from mover.readers.fields import write_json
+    from mover.readers.objects_file import detections_to_json
+
+    folder.mkdir()
+    write_json(camera_to_json(seen.camera), folder / "camera.json")
+    write_json(detections_to_json(seen.detections, seen.camera, None), folder / "objects.json")
+
+
+@pytest.mark.slow
+def test_the_command_turns_masks_into_a_capture(
+    pieces: list[Piece], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder = tmp_path / "c"
+    write_capture_without_scene(folder, picture(pieces[:2], camera()))
+    quick = ["--shapes", "2", "--keep", "2", "--turns", "2"]
+    assert run_command("layout", [str(folder), *quick, "--screen.method.steps", "20"]) == 0
+    assert "first scene of 2 objects" in capsys.readouterr().out
+    capture = read("folder", folder)
+    assert [p.id for p in capture.scene.pieces] == ["sofa_0", "chair_0"]
+    others = json.loads((folder / "hypotheses.json").read_text())["objects"]
+    for name, rows in others.items():
+        assert len(rows) == 2
+        assert all((folder / row["mesh"]).is_file() for row in rows)
+        piece = next(p for p in capture.scene.pieces if p.id == name)
+        assert rows[0]["yaw"] == pytest.approx(float(piece.yaw), abs=1e-5)
+    assert run_command("layout", [str(tmp_path / "none")]) == 2
+    (folder / "objects.json").unlink()
+    assert run_command("layout", [str(folder)]) == 2
+    assert "needs camera.json and objects.json" in capsys.readouterr().err

@@ -1,0 +1,280 @@
+"""Refinement of the bodies with the room: terms, and what happens to bodies in simple rooms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from analytic import FACES, box_verts
+from figures import ARMS_DOWN, SEATED, STRIDE, people, pose
+
+from mover.bodies.corrected import Correction, corrected, moved, no_correction, puppet_of
+from mover.bodies.parts import members, parts_of
+from mover.geometry.mesh import vertex_normals
+from mover.geometry.volume import Volume
+from mover.minimize import Adam
+from mover.records import InputError
+from mover.stages.body_evidence import surroundings_of
+from mover.stages.refine_bodies import ABLATION, SMOOTHED, RefineBodiesConfig, refine_bodies
+from mover.terms.body_contact import MatchConfig, Matches, Skin, Surface, gather_matches, touch_term
+from mover.terms.body_order import Bounds, Sighting, bounds_of_skin, order_term
+from mover.terms.body_room import sink_term, stand_term, under_term
+from mover.terms.body_start import angle_term, depth_share, image_term, range_term
+from mover.terms.body_time import gather_neighbours, lock_term, smooth_term, steady_term
+from mover.types import Camera, Mesh, Piece, Room, Scene
+
+K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+CAMERA = Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0])), 640, 480)
+GROUND = -1.4
+LINE = gather_neighbours(torch.arange(4), torch.zeros(4, dtype=torch.long), 5.0)
+WALL = Surface(torch.zeros(1, 3), torch.tensor([[0.0, 1.0, 0.0]]))
+
+
+def still_people(turns, count=1, at=(0.0, -3.0), lift=0.0, fps=5.0):
+    """People in one posture, with joints, their feet on the floor but for `lift`."""
+    bodies = people(pose(turns, count), fps, GROUND + lift)
+    shift = torch.tensor([at[0], 0.0, at[1]]) + (bodies.verts[:, :1] * 0)[0, 0]
+    move = bodies.verts[0, 0] - puppet_verts(bodies)[0, 0] + shift
+    placed = replace(bodies.pose, transl=bodies.pose.transl + move)
+    return corrected(replace(bodies, pose=placed), nothing(count))
+
+
+def puppet_verts(bodies):
+    return puppet_of(bodies, torch.arange(bodies.verts.shape[1])).skin
+
+
+def nothing(count):
+    return Correction(torch.zeros(count, 3), torch.zeros(count, 3), torch.zeros(count, 63))
+
+
+def room_with(bodies, *boxes):
+    """A room with boxes: size and place of the bottom's centre."""
+    pieces, proxies = [], []
+    for k, (size, place) in enumerate(boxes):
+        mesh = Mesh(box_verts(size).float(), FACES)
+        proxies.append(mesh)
+        pieces.append(
+            Piece(f"box_{k}", "stool", mesh, "", None, "ground", torch.tensor(place),
+                  torch.tensor(0.0), torch.ones(3))
+        )  # fmt: skip
+    scene = Scene(CAMERA, GROUND, tuple(pieces))
+    return Room(scene, scene, scene, bodies, None, tuple(proxies), (), None, {}, ())
+
+
+def lowest(bodies):
+    return bodies.verts[..., 1].amin(1) - GROUND
+
+
+def seat_gap(bodies, height):
+    """How far the lowest skin of seat and thighs is above a level [m]."""
+    part = members(parts_of(bodies), "seat", "left_thigh", "right_thigh")
+    return bodies.verts[:, part, 1].amin(1) - GROUND - height
+
+
+def analytic_volume():
+    """Half space y < 0 filled."""
+    y = (torch.arange(20, dtype=torch.float64) - 9.5) * 0.05
+    values = y[None, :, None].expand(20, 20, 20).clone()
+    return Volume(values, torch.full((3,), -9.5 * 0.05, dtype=torch.float64), 0.05)
+
+
+def random_points(seed, *shape):
+    return torch.from_numpy(np.random.default_rng(seed).uniform(-0.3, 0.3, shape))
+
+
+MATCHES = Matches(
+    torch.tensor([0, 2]), torch.tensor([1, 0]), torch.zeros(2, 3, dtype=torch.float64),
+    torch.tensor([[0.0, 1, 0], [1, 0, 0]], dtype=torch.float64),
+    torch.ones(2, dtype=torch.float64),
+)  # fmt: skip
+AWAY = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+TERMS = {
+    "angles": lambda x: angle_term(x.flatten(1)),
+    "range": lambda x: range_term(x[:, 0, 0], LINE.track),
+    "image": lambda x: image_term(x + AWAY, 0 * x.detach() + AWAY),
+    "smooth": lambda x: smooth_term(x, LINE),
+    "steady": lambda x: steady_term(x.flatten(1), x[:, 0, 0], LINE),
+    "lock": lambda x: lock_term(x[:, :2], torch.ones(4, 2, dtype=x.dtype), LINE),
+    "sink": lambda x: sink_term(x, analytic_volume()),
+    "under": lambda x: under_term(x, 0.0),
+    "stand": lambda x: stand_term(x[:, :2], torch.ones(4, 2, dtype=x.dtype), 0.0),
+    "touch": lambda x: touch_term(x, MATCHES, 0.1),
+    "order": lambda x: order_term(x[..., 2], Bounds(0 * x[..., 0].detach() + 0.05,
+                                                    0 * x[..., 0].detach() + torch.inf)),
+}  # fmt: skip
+AT_REST = {"order": 0.2}
+
+
+@pytest.mark.parametrize("name", TERMS)
+class TestEveryTerm:
+    def test_is_never_negative(self, name):
+        for seed in range(5):
+            assert (TERMS[name](random_points(seed, 4, 3, 3)) >= 0).all()
+
+    def test_is_zero_where_nothing_is_wrong(self, name):
+        still = torch.full((4, 3, 3), AT_REST.get(name, 0.0), dtype=torch.float64)
+        if name in ("sink", "under"):
+            still[..., 1] = 0.01
+        torch.testing.assert_close(TERMS[name](still), torch.zeros(4, dtype=torch.float64))
+
+    def test_gradient_equals_finite_differences(self, name):
+        x = random_points(7, 4, 3, 3).requires_grad_()
+        assert torch.autograd.gradcheck(TERMS[name], (x,), eps=1e-6, atol=1e-5)
+
+
+def test_constant_motion_is_smooth_at_any_times():
+    frame = torch.tensor([0, 1, 4, 5])
+    near = gather_neighbours(frame, torch.zeros(4, dtype=torch.long), 10.0)
+    points = frame[:, None, None] * torch.tensor([0.1, 0.0, 0.05]).double()
+    assert float(smooth_term(points, near).sum()) < 1e-12
+    bent = points + torch.tensor([0.0, 0.1, 0.0, 0.0]).double()[:, None, None]
+    assert float(smooth_term(bent, near)[1]) > 0.5
+
+
+def test_tracks_gaps_and_unordered_images_have_no_neighbours():
+    frame, person = torch.tensor([0, 0, 1, 1, 20]), torch.tensor([0, 1, 0, 1, 0])
+    near = gather_neighbours(frame, person, 5.0)
+    assert {tuple(p) for p in near.pairs.tolist()} == {(0, 2), (1, 3)}
+    assert len(gather_neighbours(frame, person, None).pairs) == 0
+
+
+def test_one_lasting_depth_error_of_a_person_costs_once():
+    many = torch.full((50,), 0.03, dtype=torch.float64)
+    assert float(range_term(many, torch.zeros(50, dtype=torch.long)).sum()) == pytest.approx(0.5)
+    assert float(range_term(many, torch.arange(50)).sum()) == pytest.approx(25)
+
+
+def test_points_behind_the_camera_have_finite_prices():
+    behind = torch.tensor([[[0.1, 0.2, -1.0]]], requires_grad=True)
+    start = torch.tensor([[[0.1, 0.2, 3.0]]])
+    (image_term(behind, start).sum() + depth_share(behind[:, 0], start[:, 0]).sum()).backward()
+    assert behind.grad.isfinite().all()
+
+
+def test_only_surfaces_that_face_the_skin_are_touched():
+    points = torch.tensor([[[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]])
+    skin = Skin(
+        points, torch.tensor([[[0.0, -1, 0], [0.0, 1, 0]]]), torch.ones(1, 2), torch.zeros(2).long()
+    )
+    found = gather_matches(skin, WALL, MatchConfig())
+    assert found.point.tolist() == [0]
+    sunk = replace(skin, points=-points)
+    assert gather_matches(sunk, WALL, MatchConfig()).point.tolist() == [0]
+    unsure = replace(skin, chance=torch.full((1, 2), 0.5))
+    assert len(gather_matches(unsure, WALL, MatchConfig()).body) == 0
+
+
+def test_visible_skin_is_before_and_hidden_skin_behind_the_furniture():
+    front = torch.full((2, 30), 3.0)
+    yes, no = torch.ones(2, 30, dtype=torch.bool), torch.zeros(2, 30, dtype=torch.bool)
+    shown = bounds_of_skin(Sighting(front, yes, no, yes))
+    hidden = bounds_of_skin(Sighting(front, no, yes, yes))
+    near, far = torch.full((2, 30), 2.5), torch.full((2, 30), 3.5)
+    assert (order_term(near, shown) == 0).all()
+    assert (order_term(far, shown) > 1).all()
+    assert (order_term(far, hidden) == 0).all()
+    assert (order_term(near, hidden) > 1).all()
+    assert (order_term(far, bounds_of_skin(Sighting(front, yes, yes, no))) == 0).all()
+
+
+def test_a_corrected_body_is_its_puppet_moved():
+    bodies = still_people(STRIDE, 2)
+    draw = np.random.default_rng(3)
+    by = Correction(*(torch.from_numpy(draw.normal(0, 0.1, (2, n))).float() for n in (3, 3, 63)))
+    puppet = puppet_of(bodies, torch.arange(0, 5002, 10))
+    found, now = corrected(bodies, by), moved(puppet, by)
+    torch.testing.assert_close(found.verts[:, ::10], now.skin, atol=2e-5, rtol=0)
+    torch.testing.assert_close(found.joints[:, :22], now.points, atol=2e-5, rtol=0)
+    assert (found.verts - bodies.verts).norm(dim=-1).mean() > 0.05
+    same = corrected(bodies, no_correction(puppet))
+    torch.testing.assert_close(same.verts, bodies.verts, atol=2e-5, rtol=0)
+
+
+QUICK = RefineBodiesConfig(method=Adam(25, 0.01, 0.003, beta2=0.98), rounds=4)
+
+
+@pytest.mark.slow
+def test_a_body_sunk_in_the_floor_comes_out():
+    bodies = still_people(ARMS_DOWN, 3, lift=-0.05)
+    found = refine_bodies(room_with(bodies), None, QUICK).bodies
+    assert lowest(bodies).max() < -0.045
+    assert lowest(found).abs().max() < 0.015
+
+
+@pytest.mark.slow
+def test_a_floating_sitter_sits():
+    sitter = still_people(SEATED, 3)
+    height = float(seat_gap(sitter, 0.0)[0]) - 0.06
+    room = room_with(sitter, ((0.6, height, 0.6), (0.0, GROUND, -3.1)))
+    found = refine_bodies(room, None, QUICK).bodies
+    assert seat_gap(sitter, height).min() > 0.055
+    assert seat_gap(found, height).abs().max() < 0.02
+    off = replace(QUICK, weights=replace(QUICK.weights, touch=0.0))
+    assert seat_gap(refine_bodies(room, None, off).bodies, height).min() > 0.04
+
+
+@pytest.mark.slow
+def test_a_sitter_sunk_in_the_seat_comes_out_of_it():
+    sitter = still_people(SEATED, 3)
+    height = float(seat_gap(sitter, 0.0)[0]) + 0.05
+    room = room_with(sitter, ((0.6, height, 0.6), (0.0, GROUND, -3.1)))
+    only = replace(QUICK, weights=ABLATION["+CamGP+SDF"])
+    assert seat_gap(refine_bodies(room, None, only).bodies, height).min() > -0.035
+    assert seat_gap(refine_bodies(room, None, QUICK).bodies, height).abs().max() < 0.02
+
+
+def test_bare_meshes_move_rigidly():
+    bodies = replace(still_people(ARMS_DOWN, 2, lift=-0.05), pose=None)
+    found = refine_bodies(room_with(bodies), None, replace(QUICK, rounds=2)).bodies
+    some = torch.arange(0, 5002, 250)
+    before, after = (torch.cdist(b.verts[:, some], b.verts[:, some]) for b in (bodies, found))
+    torch.testing.assert_close(after, before, atol=1e-5, rtol=0)
+    assert (found.verts - bodies.verts)[..., 1].mean() > 0.02
+    assert lowest(found).min() > lowest(bodies).max() + 0.02
+
+
+def test_who_touches_nothing_stays_where_they_are():
+    bodies = still_people(ARMS_DOWN, 3, lift=0.4, at=(1.0, -4.0))
+    room = room_with(bodies, ((0.5, 0.5, 0.5), (-1.0, GROUND, -3.0)))
+    config = replace(QUICK, rounds=1, weights=replace(QUICK.weights, stand=0.0))
+    found = refine_bodies(room, None, config).bodies
+    torch.testing.assert_close(found.verts, bodies.verts, atol=1e-3, rtol=0)
+
+
+def test_chunks_do_not_show():
+    bodies = still_people(ARMS_DOWN, 12, lift=-0.03)
+    config = replace(QUICK, rounds=1, method=Adam(10))
+    whole = refine_bodies(room_with(bodies), None, config)
+    parts = refine_bodies(room_with(bodies), None, replace(config, rows=4, overlap=3))
+    torch.testing.assert_close(parts.bodies.verts, whole.bodies.verts, atol=2e-3, rtol=0)
+    again = refine_bodies(room_with(bodies), None, config)
+    assert torch.equal(again.bodies.verts, whole.bodies.verts)
+
+
+def test_rows_keep_their_order():
+    bodies = still_people(ARMS_DOWN, 4)
+    mixed = replace(bodies, frame=torch.tensor([3, 0, 2, 1]), person=torch.tensor([0, 1, 0, 1]))
+    room = room_with(mixed)
+    found = refine_bodies(room, None, replace(QUICK, rounds=1, weights=SMOOTHED)).bodies
+    torch.testing.assert_close(found.verts, bodies.verts, atol=1e-3, rtol=0)
+    assert torch.equal(found.frame, mixed.frame)
+
+
+def test_a_room_without_people_or_floor_is_refused():
+    with pytest.raises(InputError, match="no bodies"):
+        refine_bodies(room_with(None), None, QUICK)
+    room = room_with(still_people(ARMS_DOWN))
+    floorless = replace(room, scene=replace(room.scene, ground=None))
+    with pytest.raises(InputError, match="no floor"):
+        refine_bodies(floorless, None, QUICK)
+
+
+def test_furniture_is_drawn_where_it_stands():
+    room = room_with(None, ((0.5, 1.0, 0.5), (0.0, GROUND, -3.0)))
+    around = surroundings_of(room, None)
+    seen = around.front.isfinite()
+    assert float(around.front[seen].min()) == pytest.approx(2.75, abs=0.02)
+    columns = seen.any(0).nonzero()[:, 0].float()
+    assert float(columns.mean()) == pytest.approx(320, abs=2)
+    mesh = room.proxies[0]
+    assert (vertex_normals(mesh.verts, mesh.faces)[:, 1].abs() > 0).all()

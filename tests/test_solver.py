@@ -1,0 +1,337 @@
+"""Second-order descents: known minima, independent problems, honest ends; Eq. 1 through them."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from analytic import make_inputs, moved
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mover.commands import parse_run
+from mover.energy import SceneWeights
+from mover.geometry.camera import outermost, project, to_camera
+from mover.geometry.placement import place, place_in
+from mover.geometry.price_warp import squares
+from mover.geometry.raster import Depths
+from mover.geometry.raster_engine import use_engine
+from mover.minimize import Adam, Energy, silent
+from mover.minimize_newton import Problems, Quasi, settle
+from mover.presets import Config
+from mover.records import built, plain, record
+from mover.stages.coarser import coarser_image
+from mover.stages.pinned import Pinned
+from mover.stages.place_objects import PlaceConfig, descend, energy_of, place_objects, with_trees
+from mover.stages.starts import alone
+from mover.terms.depth import DepthRange, depth_term
+from mover.types import Layout
+
+EXACT = Quasi(steps=400, gain=1e-12, least=1e-9, patience=10)
+
+
+@record
+class Point:
+    """Unknowns in two fields, as a layout has them."""
+
+    x: torch.Tensor
+    y: torch.Tensor
+
+
+def bowls(n, seed=0):
+    """Curved bowls with known bottoms; condition up to 10^4."""
+    r = torch.Generator().manual_seed(seed)
+    axes, _ = torch.linalg.qr(torch.randn(n, 3, 3, generator=r).double())
+    curve = 10 ** (4 * torch.rand(n, 3, generator=r).double())
+    bottom = torch.randn(n, 3, generator=r).double()
+
+    def of(rows):
+        def energy(p):
+            at = torch.cat([p.x[:, None], p.y], -1) - bottom[rows]
+            along = (axes[rows] * at[:, :, None]).sum(1)
+            return Energy({"bowl": 0.5 * (curve[rows] * along.square()).sum(-1)})
+
+        return energy
+
+    start = Point(torch.zeros(n).double(), torch.zeros(n, 2).double())
+    return Problems(of, start, (n,)), bottom
+
+
+def valleys(n, seed=0):
+    """Rosenbrock's function, a = 1, with valleys of different steepness."""
+    steep = 10 ** torch.linspace(0.5, 2, n).double()
+    r = torch.Generator().manual_seed(seed)
+    start = Point(torch.randn(n, generator=r).double(), torch.randn(n, 1, generator=r).double())
+
+    def of(rows):
+        return lambda p: Energy({
+            "far": (1 - p.x).square(),
+            "off": steep[rows] * (p.y[:, 0] - p.x.square()).square(),
+        })  # fmt: skip
+
+    return Problems(of, start, (n,))
+
+
+def only(problems, k):
+    """One of the problems, alone."""
+    start = Point(problems.start.x[k : k + 1], problems.start.y[k : k + 1])
+    return Problems(lambda rows: problems.of(rows + k), start, (1,))
+
+
+def test_bottoms_of_bowls_are_found():
+    problems, bottom = bowls(20)
+    found = settle(problems, EXACT)
+    at = torch.cat([found.at.x[:, None], found.at.y], -1)
+    torch.testing.assert_close(at, bottom, rtol=0, atol=1e-4)
+
+
+def test_the_end_of_each_of_rosenbrocks_valleys_is_found():
+    found = settle(valleys(12), EXACT)
+    assert float(found.value.max()) < 1e-8
+    torch.testing.assert_close(found.at.x, torch.ones(12).double(), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("k", [0, 3, 11])
+def test_a_problem_goes_its_way_whatever_else_is_in_the_batch(k):
+    together, one = settle(valleys(12), Quasi()), settle(only(valleys(12), k), Quasi())
+    torch.testing.assert_close(one.at.x[0], together.at.x[k], rtol=0, atol=1e-6)
+    torch.testing.assert_close(one.value[0], together.value[k], rtol=1e-6, atol=1e-9)
+
+
+def test_two_runs_give_the_same_bits():
+    a, b = settle(valleys(9), Quasi()), settle(valleys(9), Quasi())
+    assert torch.equal(a.at.x, b.at.x)
+    assert torch.equal(a.value, b.value)
+
+
+def test_what_has_converged_leaves_the_batch_and_the_rest_goes_on():
+    problems = valleys(12)
+    sizes = []
+
+    def of(rows):
+        energy = problems.of(rows)
+
+        def counted(p):
+            sizes.append(len(p.x))
+            return energy(p)
+
+        return counted
+
+    steps = []
+    found = settle(replace(problems, of=of), Quasi(steps=500), steps.append)
+    assert sizes[0] == 12
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] < 12
+    assert len(sizes) < 300
+    assert len(found.trace) == len(sizes)
+    assert steps[-1].index + 1 == steps[-1].steps
+
+
+@given(seed=st.integers(0, 2**20), steps=st.integers(0, 12))
+@settings(max_examples=25, deadline=None)
+def test_no_problem_ends_higher_than_it_starts_and_the_trace_falls(seed, steps):
+    """Also where the surface is torn into terraces with slopes that mislead."""
+    r = torch.Generator().manual_seed(seed)
+    wild = torch.randn(6, 3, generator=r).double() * 20
+
+    def of(rows):
+        def energy(p):
+            at = torch.cat([p.x[:, None], p.y], -1)
+            terrace = (at * 9).floor().detach().sum(-1).abs() / 9
+            return Energy({"rough": (at * wild[rows]).sin().sum(-1) + at.abs().sum(-1) + terrace})
+
+        return energy
+
+    start = Point(torch.randn(6, generator=r).double(), torch.randn(6, 2, generator=r).double())
+    problems = Problems(of, start, (6,))
+    found = settle(problems, Quasi(steps=steps))
+    before = of(torch.arange(6))(start).per_item
+    assert (found.value <= before).all()
+    assert (found.trace.diff() <= 0).all()
+    there = of(torch.arange(6))(found.at).per_item
+    torch.testing.assert_close(there, found.value, rtol=0, atol=0)
+
+
+def test_an_energy_that_is_not_finite_at_the_start_is_an_error():
+    problems, _ = bowls(3)
+    start = Point(problems.start.x * torch.nan, problems.start.y)
+    with pytest.raises(ValueError, match="somewhere: the energy is not finite"):
+        settle(replace(problems, start=start), Quasi(), silent, "somewhere")
+
+
+def test_a_cliff_of_nan_is_not_stepped_over():
+    def of(_rows):
+        return lambda p: Energy({"cliff": torch.where(p.x < 0.3, -p.x, torch.nan) + 0 * p.y[:, 0]})
+
+    start = Point(torch.zeros(1).double(), torch.zeros(1, 1).double())
+    found = settle(Problems(of, start, (1,)), Quasi())
+    assert 0.2 < float(found.at.x) < 0.3
+
+
+def test_grouped_problems_decide_together():
+    """The first one's unknown rules the second one's energy: alone it would raise the sum."""
+
+    def of(_rows):
+        def energy(p):
+            first = torch.stack([-p.x[0], 3 * p.x[0] + p.x[1].square()])
+            return Energy({"pair": first + p.x.square() + 0 * p.y[:, 0]})
+
+        return energy
+
+    start = Point(torch.zeros(2).double(), torch.zeros(2, 1).double())
+    found = settle(Problems(of, start, (2,), torch.zeros(2).long()), EXACT)
+    torch.testing.assert_close(found.at.x, torch.tensor([-1.0, 0.0]).double(), rtol=0, atol=1e-4)
+
+
+WEIGHTS = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, heading=0.1)
+ROBUST = PlaceConfig(WEIGHTS, "robust", Quasi())
+
+
+class TestPlacing:
+    def test_it_ends_no_higher_than_adam_from_the_same_start(self):
+        inputs = make_inputs(size=32)
+        starts = moved(inputs.starts, 3, 0.1)
+        adam = descend(
+            inputs, ROBUST, starts, Adam(60, 0.02, 0.002, beta2=0.98, keep_best=True), silent
+        )
+        fast = descend(inputs, ROBUST, starts, Quasi(), silent)
+        assert (fast.value <= adam.value * 1.05 + 1e-3).all()
+
+    def test_each_start_of_each_object_ends_where_it_ends_alone(self):
+        inputs = make_inputs(size=32)
+        many = [moved(inputs.starts, s, 0.1) for s in range(3)]
+        batch = Layout(*(torch.cat([getattr(m, f.name) for m in many]) for f in fields(Layout)))
+        together = descend(inputs, ROBUST, batch, Quasi(steps=5), silent)
+        one = descend(inputs, ROBUST, many[1], Quasi(steps=5), silent)
+        torch.testing.assert_close(together.value[1:2], one.value, rtol=1e-3, atol=1e-5)
+
+    def test_its_energies_are_those_of_the_layout_it_returns(self):
+        inputs = make_inputs(size=32)
+        found = descend(inputs, ROBUST, moved(inputs.starts, 1, 0.1), Quasi(steps=8), silent)
+        there = energy_of(inputs, ROBUST)(found.at).per_item
+        torch.testing.assert_close(found.value, there, rtol=1e-4, atol=1e-6)
+
+    def test_pinned_objects_stay(self):
+        inputs = make_inputs(size=32)
+        off = moved(inputs.starts, 5, 0.2)
+        n = off.yaw.shape[-1]
+        held = Layout(off.t_world_object[0] + 0.05, off.yaw[0] + 0.1, off.log_scale[0])
+        fixed = torch.arange(n) == 0
+        inputs = replace(inputs, starts=off, pinned=Pinned(fixed, held))
+        placed = place_objects(inputs, replace(ROBUST, shaken=1)).layout
+        assert torch.equal(placed.yaw[0], held.yaw[0])
+        assert torch.equal(placed.t_world_object[0, [0, 2]], held.t_world_object[0, [0, 2]])
+        assert not torch.equal(placed.yaw[1:], off.yaw[0, 1:])
+
+    def test_a_load_moves_with_what_carries_it(self):
+        inputs = make_inputs(size=32)
+        supports = inputs.objects.supports.clone()
+        supports[1] = 0
+        inputs = replace(inputs, objects=replace(inputs.objects, supports=supports))
+        starts = moved(inputs.starts, 2, 0.1)
+        found = descend(inputs, ROBUST, starts, Quasi(steps=6), silent)
+        before = energy_of(inputs, ROBUST)(starts).per_item
+        assert (found.value[:, :2].sum(1) <= before[:, :2].sum(1)).all()
+        there = energy_of(inputs, ROBUST)(found.at).per_item
+        torch.testing.assert_close(found.value, there, rtol=1e-4, atol=1e-6)
+
+    def test_coarse_short_descents_and_shaken_ends_never_worsen_the_result(self):
+        inputs = make_inputs(size=32)
+        inputs = replace(inputs, starts=alone(_first(moved(inputs.starts, 4, 0.1))))
+        plain_ = place_objects(inputs, ROBUST)
+        more = place_objects(inputs, replace(ROBUST, shaken=2))
+        assert (more.energy[0] <= plain_.energy[0]).all()
+        quick = replace(ROBUST, yaws=4, short=Quasi(steps=6), keep=2, coarse=2)
+        assert place_objects(inputs, quick).layout.yaw.isfinite().all()
+
+
+def _first(layout):
+    return Layout(layout.t_world_object[0], layout.yaw[0], layout.log_scale[0])
+
+
+class TestCommandLine:
+    def test_a_method_is_chosen_by_name_and_set_by_its_own_flags(self):
+        args = ["room", "--place.method", "newton", "--place.method.gain", "0.5"]
+        run, config = parse_run([*args, "--layout.method.steps", "3"])
+        assert run.source.name == "room"
+        assert config.place.method == Quasi(gain=0.5)
+        assert isinstance(config.layout.method, Adam)
+        assert config.layout.method.steps == 3
+
+    def test_settings_come_back_from_a_file_with_the_right_method(self):
+        _, config = parse_run(["room", "--place.method", "newton", "--preset", "paper"])
+        again = built(Config, plain(config))
+        assert again.place.method == Quasi()
+        assert again.layout.method == config.layout.method
+
+
+def random_maps(seed, n=3, starts=2, size=24):
+    """Depths, where they are known, masks and bounds of every kind."""
+    r = torch.Generator().manual_seed(seed)
+    depth = 1 + torch.rand(starts, n, size, size, generator=r)
+    covered = torch.rand(starts, n, size, size, generator=r) < 0.7
+    mask = torch.rand(n, size, size, generator=r)
+    near, far = 1 + torch.rand(2, n, size, size, generator=r)
+    near = torch.where(torch.rand(near.shape, generator=r) < 0.4, -torch.inf, near)
+    far = torch.where(torch.rand(far.shape, generator=r) < 0.4, torch.inf, far)
+    return depth, covered, mask, near, far
+
+
+class TestFasterTerms:
+    """What was made faster against the plain way to compute it."""
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_depths_out_of_bounds_and_their_gradient_are_those_of_torch(self, seed):
+        depth, covered, mask, near, far = random_maps(seed)
+        allowed = DepthRange(near, far, near, torch.ones(len(mask)))
+        found = []
+        for name in ("torch", "warp"):
+            free = depth.clone().requires_grad_()
+            with use_engine(name):
+                term = depth_term(Depths(free, free.detach(), covered), mask, allowed, "robust")
+            found.append((term.detach(), *torch.autograd.grad(term.sum(), free)))
+        torch.testing.assert_close(found[0], found[1], rtol=1e-5, atol=1e-6)
+
+    def test_squares_and_their_gradient_are_those_of_autograd(self):
+        drawn, keep, mask, _, _ = random_maps(7)
+        free = drawn.double().requires_grad_()
+        plain_ = ((free - mask.double()).square() * keep[0]).sum((-2, -1))
+        fast = squares(free, mask.double(), keep[0])
+        torch.testing.assert_close(fast, plain_)
+        one, two = (torch.autograd.grad(p.square().sum(), free)[0] for p in (plain_, fast))
+        torch.testing.assert_close(one, two)
+
+    @pytest.mark.parametrize("form", ["paper", "robust"])
+    def test_contact_by_trees_is_that_by_all_distances(self, form):
+        inputs = make_inputs(size=32)
+        config = PlaceConfig(SceneWeights(*([0.0] * 5), contact=1.0), form)
+        start = moved(inputs.starts, 3, 0.2)
+        found = []
+        for given_ in (inputs, with_trees(inputs)):
+            free = Layout(*(getattr(start, f.name).requires_grad_() for f in fields(Layout)))
+            value = energy_of(given_, config)(free).per_item
+            slopes = torch.autograd.grad(value.sum(), [free.t_world_object, free.log_scale])
+            found.append((value.detach(), *slopes))
+        assert float(found[0][0].sum()) > 0
+        torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-5)
+
+    def test_points_are_placed_in_camera_axes_by_one_matrix(self):
+        inputs = make_inputs(torch.float64, size=16)
+        layout, R = moved(inputs.starts, 1, 0.4), inputs.camera.R_cam_world
+        one = place_in(inputs.objects.verts, layout, R)
+        two = to_camera(place(inputs.objects.verts, layout), R)
+        torch.testing.assert_close(one, two)
+
+    def test_the_outermost_points_have_the_extent_of_all(self):
+        points = torch.randn(2, 3, 50, 3, generator=torch.Generator().manual_seed(0))
+        points = points + torch.tensor([0.0, 0.0, 4.0])
+        K = torch.tensor([[300.0, 0, 100], [0, 300, 80], [0, 0, 1]])
+        few, every = project(outermost(points, K), K), project(points, K)
+        torch.testing.assert_close(few.amin(-2), every.amin(-2), rtol=0, atol=0)
+        torch.testing.assert_close(few.amax(-2), every.amax(-2), rtol=0, atol=0)
+
+    def test_coarser_masks_keep_their_area(self):
+        image = make_inputs(size=32).image
+        small = coarser_image(image, 4)
+        torch.testing.assert_close(small.masks.sum((-2, -1)) * 16, image.masks.sum((-2, -1)))
+        with pytest.raises(ValueError, match="which 5 does not divide"):
+            coarser_image(image, 5)
