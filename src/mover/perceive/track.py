@@ -8,6 +8,7 @@ Without a tracker detections in all frames are linked by their overlap.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -165,11 +166,10 @@ def opened(net: Network, paths: Sequence[Any], size: tuple[int, int]) -> Any:  #
 
     Its own processor needs torchvision; resizing and normalising is all that it does.
     """
-    from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
-
+    sam2: Any = import_module("transformers.models.sam2_video.modeling_sam2_video")
     side = net.model.config.image_size
     frames = torch.stack([prepared(load_frame(path), side) for path in paths])
-    return Sam2VideoInferenceSession(
+    return sam2.Sam2VideoInferenceSession(
         video=frames, video_height=size[0], video_width=size[1], inference_device=net.device,
         inference_state_device=net.device, video_storage_device="cpu", dtype=net.model.dtype,
     )  # fmt: skip

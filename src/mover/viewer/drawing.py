@@ -103,7 +103,7 @@ def _frustum(server: Any, camera: Camera, image: torch.Tensor | None) -> Any:  #
 
 def camera_wxyz(camera: Camera) -> Float[np.ndarray, "4"]:
     """The quaternion of the camera's axes in the world."""
-    from viser.transforms import SO3
+    from viser.transforms import SO3  # pyright: ignore[reportMissingImports]
 
     matrix = camera.R_cam_world.detach().double().numpy().T
     return SO3.from_matrix(matrix).wxyz

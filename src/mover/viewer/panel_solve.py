@@ -73,7 +73,7 @@ def add_solve_panel(window: Window, job: SolveJob | None, why_not: str) -> Gauge
 
 def add_gauges(window: Window, text: str) -> Gauges:
     """A line of text, a bar, and the curve of the energy."""
-    import viser.uplot as uplot
+    import viser.uplot as uplot  # pyright: ignore[reportMissingImports]
 
     gui = window.server.gui
     status = gui.add_markdown(text)

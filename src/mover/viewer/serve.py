@@ -54,7 +54,7 @@ def open_viewer(
         InputError: If viser is not installed.
     """
     try:
-        import viser
+        import viser  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise InputError("mover view needs viser: pip install 'mover[viewer]'") from error
     with contextlib.redirect_stdout(io.StringIO()):
