@@ -87,8 +87,9 @@ def image_at(objects, layout, camera, size):
     n = len(boxes)
     keep = torch.ones(n, size, size, dtype=torch.bool)
     return ImageCues(
-        boxes, torch.ones(n, 4, dtype=torch.bool), views, drawn, keep, torch.ones(n).to(boxes)
-    )
+        boxes, torch.ones(n, 4, dtype=torch.bool), views, drawn, keep, torch.ones(n).to(boxes),
+        layout.t_world_object.norm(dim=-1),
+    )  # fmt: skip
 
 
 def humans_at(objects, layout, camera, image):

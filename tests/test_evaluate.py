@@ -79,8 +79,8 @@ def test_what_lacks_its_truth_is_absent() -> None:
     metrics = evaluate(scene, scene, blind, EvaluatedBodies(None, bodies, None), FAST)
     assert set(metrics["initial"]) == {"pitch_error", "roll_error"}
     alone = {"non_collision", "contact", "penetration_depth"}
-    floor = {"ground_penetration_frequency", "ground_penetration_distance"}
-    assert set(metrics["result"]) == {"pitch_error", "roll_error"} | alone | floor
+    floor = {"ground_penetration_frequency", "ground_penetration_distance", "float_height"}
+    assert set(metrics["result"]) == {"pitch_error", "roll_error", "foot_skate"} | alone | floor
     assert metrics["objects"] == []
     metrics = evaluate(blind, blind, blind, EvaluatedBodies(bare, bodies, bodies), FAST)
     assert {"pje", "p_pje"} & set(metrics["initial"]) == set()

@@ -12,7 +12,8 @@ import tyro
 from tyro.conf import AvoidSubcommands, Positional, arg
 
 from . import records
-from .presets import PRESETS, Config, with_methods
+from .commands_config import chosen_config, preset_named
+from .presets import Config
 from .progress import Bar, both
 
 log = logging.getLogger(__name__)
@@ -87,17 +88,8 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
 
 
 def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
-    """The preset is read first, so that the other flags may stand before or after it."""
-    import argparse
-
-    from .results import read_config
-
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--preset", default="robust")
-    early.add_argument("--config", type=Path)
-    chosen, _ = early.parse_known_args(list(arguments))
-    config = preset_named(chosen.preset) if chosen.config is None else read_config(chosen.config)
-    config, rest = with_methods(config, arguments)
+    """What `mover run` is asked for, and the settings."""
+    config, rest = chosen_config(arguments)
 
     def both(
         args: Annotated[RunArgs, arg(name="")], config: Annotated[Config, arg(name="")] = config
@@ -106,17 +98,6 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
         return args, config
 
     return tyro.cli(both, prog="mover run", args=rest, config=(AvoidSubcommands,))
-
-
-def preset_named(name: str) -> Config:
-    """A preset by its name.
-
-    Raises:
-        InputError: If there is none of that name.
-    """
-    if name not in PRESETS:
-        raise records.InputError(f"--preset: {name!r} is none of {', '.join(PRESETS)}")
-    return PRESETS[name]
 
 
 def _run(arguments: Sequence[str]) -> None:

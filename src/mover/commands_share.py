@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import AvoidSubcommands, Positional, arg
 
 from . import records
 from .batch import CAPTURE, OUT, BatchPlan, captures_in, cores, counted, run_batch
 from .batch_engines import EngineOptions, RayOptions, SlurmOptions
-from .commands import preset_named
+from .commands_config import chosen_config
 from .presets import Config
 
 Target = Literal["glb", "usd", "mjcf", "urdf", "ply", "bodies"]
@@ -131,21 +131,12 @@ def batch(arguments: Sequence[str]) -> None:
 
 
 def _parse_batch(arguments: Sequence[str]) -> BatchArgs:
-    """The preset is read first, so that the other flags may stand before or after it."""
-    import argparse
-
-    from .results import read_config
-
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--preset", default="robust")
-    early.add_argument("--config", type=Path)
-    chosen, _ = early.parse_known_args(list(arguments))
-    config = preset_named(chosen.preset)
-    if chosen.config is not None:
-        config = read_config(chosen.config)
+    config, rest = chosen_config(arguments)
     missing: Any = tyro.MISSING
     default = BatchArgs(missing, config=config)
-    args = tyro.cli(BatchArgs, prog="mover batch", args=list(arguments), default=default)
+    args = tyro.cli(
+        BatchArgs, prog="mover batch", args=rest, default=default, config=(AvoidSubcommands,)
+    )
     if args.workers < 0 or args.limit < 0 or args.threads < 1:
         raise records.InputError("--workers, --limit and --threads: expected 0, 0 and 1 or more")
     return args
