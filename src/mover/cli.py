@@ -4,6 +4,8 @@ import importlib
 import logging
 import sys
 
+from .console import say
+
 COMMANDS = {
     "demo": "Make a known room, reconstruct it, compare it with the truth.",
     "import": "Turn what other tools wrote into a capture folder.",
@@ -32,20 +34,16 @@ def main() -> None:
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help"):
         lines = [f"  {name:<12} {text}" for name, text in COMMANDS.items()]
-        _say("\n".join([USAGE, "", "Rooms from the people who move in them.", "", *lines]))
+        say("\n".join([USAGE, "", "Rooms from the people who move in them.", "", *lines]))
         return
     if arguments[0] == "--version":
         from . import __version__
 
-        _say(f"mover {__version__}")
+        say(f"mover {__version__}")
         return
     if arguments[0] not in COMMANDS:
-        _say(f"mover: no command {arguments[0]!r}; there are {', '.join(COMMANDS)}\n{USAGE}")
+        say(f"mover: no command {arguments[0]!r}; there are {', '.join(COMMANDS)}\n{USAGE}")
         raise SystemExit(2)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     command = importlib.import_module(".commands", __package__)
     raise SystemExit(command.run_command(arguments[0], arguments[1:]))
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")

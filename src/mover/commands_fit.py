@@ -1,7 +1,6 @@
 """What `fit` does."""
 
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from . import records
+from .console import say
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,12 @@ def fit(arguments: Sequence[str]) -> None:
     with Bar() as bar:
         found = fit_bodies(inputs, observe=bar)
     for warning in found.warnings:
-        _say(f"warning: {warning}")
+        say(f"warning: {warning}")
     bodies = _without_outliers(found.bodies) if args.drop else found.bodies
     write_bodies(bodies, args.out)
     people, frames = len(bodies.person.unique()), len(bodies.frame.unique())
     miss = float(found.miss.mean())
-    _say(f"{people} people in {frames} frames, keypoints missed by {miss:.1f} px: {args.out}")
+    say(f"{people} people in {frames} frames, keypoints missed by {miss:.1f} px: {args.out}")
 
 
 def _keypoints(args: FitArgs) -> Any:  # noqa: ANN401
@@ -98,12 +98,8 @@ def _without_outliers(bodies: Any) -> Any:  # noqa: ANN401
     from .stages.select_frames import SelectInputs, select_frames
 
     keep = select_frames(SelectInputs(bodies)).keep
-    _say(f"{int((~keep).sum())} of {len(keep)} bodies are left out by the frame filter")
+    say(f"{int((~keep).sum())} of {len(keep)} bodies are left out by the frame filter")
     return rows_of_bodies(bodies, keep)
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
 
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {"fit": fit}

@@ -1,7 +1,6 @@
 """What `import` does."""
 
 import dataclasses
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from . import records
+from .console import say
 from .readers.fields import At
 from .readers.importers import IMPORTERS
 from .readers.instances import Instances
@@ -156,7 +156,7 @@ def _bodies_of_tool(args: ImportArgs, parts: Sequence[Parts], hints: Hints) -> A
     )
     found = bodies_from(args.bodies_from, args.bodies, known)
     for text in found.warnings:
-        _say(f"note: {text}")
+        say(f"note: {text}")
     return At(bodies_to_arrays(found.bodies), args.bodies.name)
 
 
@@ -205,23 +205,19 @@ def tell(imported: Imported, folder: Path) -> None:
     from .readers.evidence import evidence_table, gather_evidence
     from .readers.odd_world import odd_world
 
-    _say(f"{folder}: wrote {', '.join(imported.written) or 'nothing'}")
+    say(f"{folder}: wrote {', '.join(imported.written) or 'nothing'}")
     for note in imported.notes:
-        _say(f"note: {note}")
+        say(f"note: {note}")
     capture = imported.capture
     if capture is not None:
-        _say(evidence_table(capture, gather_evidence(capture)))
+        say(evidence_table(capture, gather_evidence(capture)))
         odd = odd_world(capture.scene, capture.detections)
         if odd is not None:
-            _say(f"warning: {odd}")
+            say(f"warning: {odd}")
     for text in imported.missing:
-        _say(f"still missing: {text}")
+        say(f"still missing: {text}")
     if capture is not None:
-        _say(f"next: mover check {folder}; mover run {folder} --out OUT")
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
+        say(f"next: mover check {folder}; mover run {folder} --out OUT")
 
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {"import": import_}

@@ -1,7 +1,6 @@
 """What `bodies` does."""
 
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from . import records
+from .console import say
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def _keypoints(args: BodiesArgs) -> None:
     found = keypoints_from(args.tool, args.source, _known(args))
     out = args.out or Path("keypoints.npz")
     write_keypoints(found, out)
-    _say(f"{_counted(found)}, joints: {found.layout}: {out}")
+    say(f"{_counted(found)}, joints: {found.layout}: {out}")
 
 
 def _bodies(args: BodiesArgs) -> None:
@@ -82,9 +82,9 @@ def _bodies(args: BodiesArgs) -> None:
     people = found.bodies if args.space == "camera" else in_world(found, args.source.name)
     write_bodies(people, out)
     for warning in found.warnings:
-        _say(f"warning: {warning}")
+        say(f"warning: {warning}")
     model = "meshes only" if people.pose is None else f"parameters of {people.pose.model}"
-    _say(f"{_counted(people)}, {people.verts.shape[1]} vertices, {model}: {out}")
+    say(f"{_counted(people)}, {people.verts.shape[1]} vertices, {model}: {out}")
     _tell_gravity(found)
     if args.write_camera is not None:
         _write_camera(found, known, args.write_camera)
@@ -95,7 +95,7 @@ def _tell_gravity(found: Any) -> None:  # noqa: ANN401
 
     if found.up is not None:
         pitch, roll = attitude(found.up)
-        _say(f"its gravity: pitch {pitch:.3f} rad, roll {roll:.3f} rad")
+        say(f"its gravity: pitch {pitch:.3f} rad, roll {roll:.3f} rad")
 
 
 def _write_camera(found: Any, known: Any, path: Path) -> None:  # noqa: ANN401
@@ -105,7 +105,7 @@ def _write_camera(found: Any, known: Any, path: Path) -> None:  # noqa: ANN401
     from .readers.people import camera_from
 
     write_json(camera_to_json(camera_from(found, known)), path)
-    _say(f"camera: {path}")
+    say(f"camera: {path}")
 
 
 def _known(args: BodiesArgs) -> Any:  # noqa: ANN401
@@ -122,10 +122,6 @@ def _counted(found: Any) -> str:  # noqa: ANN401
     """`12 rows, 2 people in 6 frames`."""
     people, frames = len(found.person.unique()), len(found.frame.unique())
     return f"{len(found.frame)} rows, {people} people in {frames} frames"
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
 
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {"bodies": bodies}

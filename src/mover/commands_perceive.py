@@ -1,6 +1,5 @@
 """What `perceive` and `layout` do."""
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from .console import say
 from .perceive.capture import PerceiveConfig
 from .perceive.layout import LayoutConfig
 from .progress import Bar
@@ -72,11 +72,11 @@ def perceive(arguments: Sequence[str]) -> None:
     lens = Lens(args.camera, args.fov, args.photo)
     with Bar() as bar:
         run = Run(args.out / "perceived", bar)
-        fill(args.source, args.out, lens, args.config, run, _say)
-    _say(f"{args.out}: wrote frames/, reference.png, objects.json, people.json, camera.json")
+        fill(args.source, args.out, lens, args.config, run, say)
+    say(f"{args.out}: wrote frames/, reference.png, objects.json, people.json, camera.json")
     if args.layout:
         _layout(LayoutArgs(args.out, args.depth, args.meshes))
-    _say("still missing: bodies.npz (mover bodies TOOL PATH --out CAPTURE/bodies.npz)")
+    say("still missing: bodies.npz (mover bodies TOOL PATH --out CAPTURE/bodies.npz)")
 
 
 def layout(arguments: Sequence[str]) -> None:
@@ -99,14 +99,10 @@ def _layout(args: LayoutArgs) -> None:
     write_first_scene(first, args.capture)
     ground = first.scene.ground
     height = "" if ground is None else f", camera {-ground:.2f} m above the floor"
-    _say(f"{args.capture}: first scene of {len(first.scene.pieces)} objects{height}")
+    say(f"{args.capture}: first scene of {len(first.scene.pieces)} objects{height}")
     if first.skipped:
-        _say(f"note: not on the floor, left out: {', '.join(sorted(set(first.skipped)))}")
-    _say(f"next: mover check {args.capture}; mover run {args.capture} --out OUT")
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
+        say(f"note: not on the floor, left out: {', '.join(sorted(set(first.skipped)))}")
+    say(f"next: mover check {args.capture}; mover run {args.capture} --out OUT")
 
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {"perceive": perceive, "layout": layout}

@@ -1,7 +1,6 @@
 """What `refine` and `contacts` do."""
 
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from . import records
+from .console import say
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,12 @@ def refine(arguments: Sequence[str]) -> None:
         found = refine_result(args.out, config, args.capture, bar)
     way = found.shift.norm(dim=-1).median()
     how = "rigidly" if found.bodies.pose is None else "with their pose"
-    _say(f"{len(found.shift)} bodies refined {how}, moved by {1000 * float(way):.0f} mm (median): "
+    say(f"{len(found.shift)} bodies refined {how}, moved by {1000 * float(way):.0f} mm (median): "
          f"{args.out / 'refined' / 'bodies.npz'}")  # fmt: skip
     if args.truth is not None:
         values = measure_people(args.out, args.truth)
         for name in values["result"]:
-            _say(f"{name:20}{values['result'][name]:10.4f}{values['refined'].get(name, 0):10.4f}")
+            say(f"{name:20}{values['result'][name]:10.4f}{values['refined'].get(name, 0):10.4f}")
 
 
 def contacts(arguments: Sequence[str]) -> None:
@@ -105,17 +105,13 @@ def contacts(arguments: Sequence[str]) -> None:
         chance = find_posa(people, weights, meshes, args.samples, args.camera)
     write_contacts(chance, args.out)
     touching = int((chance > 0.5).any(1).sum())
-    _say(f"{touching} of {len(chance)} bodies touch something: {args.out}")
+    say(f"{touching} of {len(chance)} bodies touch something: {args.out}")
 
 
 def _needed(path: Path | None, name: str) -> Path:
     if path is None:
         raise records.InputError(f"{name}: is missing, expected a path")
     return path
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
 
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {"refine": refine, "contacts": contacts}

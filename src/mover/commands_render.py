@@ -1,6 +1,5 @@
 """What `render` does."""
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from .console import say
 from .records import InputError
 from .render import RenderConfig, render_result
 
@@ -41,7 +41,7 @@ def render(arguments: Sequence[str]) -> None:
     torch.set_num_threads(1)
     count = render_result(args.out, args.to, args.config, args.capture)
     what = "one picture" if count == 1 else f"{count} pictures"
-    sys.stdout.write(f"{args.to}: {what}\n")
+    say(f"{args.to}: {what}")
 
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {"render": render}

@@ -13,6 +13,7 @@ from . import records
 from .batch import CAPTURE, OUT, BatchPlan, captures_in, cores, counted, run_batch
 from .batch_engines import EngineOptions, RayOptions, SlurmOptions
 from .commands_config import chosen_config
+from .console import say
 from .presets import Config
 
 Target = Literal["glb", "usd", "mjcf", "urdf", "ply", "bodies"]
@@ -91,9 +92,9 @@ def export(arguments: Sequence[str]) -> None:
             found = EXPORTERS[target](finished, folder)
         shown = found.files if len(found.files) <= 3 else found.files[:1]
         more = f" and {len(found.files) - 1} more" if len(found.files) > 3 else ""
-        _say(f"{target}: {', '.join(str(file) for file in shown)}{more}")
+        say(f"{target}: {', '.join(str(file) for file in shown)}{more}")
         for note in found.notes:
-            _say(f"  {note}")
+            say(f"  {note}")
 
 
 def settle(arguments: Sequence[str]) -> None:
@@ -104,7 +105,7 @@ def settle(arguments: Sequence[str]) -> None:
 
     if not 0 < args.seconds <= 60:
         raise records.InputError(f"--seconds: {args.seconds:g}, expected more than 0, at most 60")
-    _say(settle_table(settle_folder(args.out, args.truth, SettleConfig(args.seconds))))
+    say(settle_table(settle_folder(args.out, args.truth, SettleConfig(args.seconds))))
 
 
 def batch(arguments: Sequence[str]) -> None:
@@ -121,12 +122,12 @@ def batch(arguments: Sequence[str]) -> None:
     )
     options = EngineOptions(args.engine, args.workers or cores(), args.ray, args.slurm)
     outcomes = run_batch(plan, options, retry=args.retry)
-    _say(f"{counted(outcomes)}: {args.out / 'summary.csv'}")
+    say(f"{counted(outcomes)}: {args.out / 'summary.csv'}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     for outcome in failed[:20]:
-        _say(f"  {outcome.name}: {outcome.reason}")
+        say(f"  {outcome.name}: {outcome.reason}")
     if failed:
-        _say(f"records of what failed: {args.out / 'failures'}; --retry runs them again")
+        say(f"records of what failed: {args.out / 'failures'}; --retry runs them again")
         raise SystemExit(1)
 
 
@@ -157,10 +158,6 @@ def _version() -> str:
     from . import __version__
 
     return __version__
-
-
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
 
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {

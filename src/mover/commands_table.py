@@ -1,6 +1,5 @@
 """What `paper-table` does."""
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, arg
+
+from .console import say
 
 Table = Literal["prox", "prox-quantitative", "pigraphs"]
 
@@ -29,7 +30,7 @@ def show_paper_table(arguments: Sequence[str]) -> None:
     args = tyro.cli(PaperTableArgs, prog="mover paper-table", args=list(arguments))
     from .paper_table import paper_table
 
-    sys.stdout.write(paper_table(args.table, args.captures, args.results) + "\n")
+    say(paper_table(args.table, args.captures, args.results))
 
 
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {"paper-table": show_paper_table}

@@ -114,9 +114,7 @@ def scene_energy(
     config: SceneConfig,
 ) -> Energy:
     """Eq. 1: what the image and the people say about where the objects stand."""
-    form, w = config.form, heard(config.weights, humans)
-    if image.distance is None:
-        w = replace(w, distance=0.0)
+    form, w = config.form, heard(config.weights, image, humans)
     verts = place_in(objects.verts, layout, camera.R_cam_world)
     drawn = cache(lambda: _draw(verts, objects, image.views, w))
     pixels = cache(lambda: project(verts, camera.K))
@@ -144,9 +142,9 @@ def scene_energy(
     )  # fmt: skip
 
 
-def heard(weights: SceneWeights, humans: HumanCues) -> SceneWeights:
+def heard(weights: SceneWeights, image: ImageCues, humans: HumanCues) -> SceneWeights:
     """The weights without those whose evidence is missing."""
-    missing: dict[str, float] = {}
+    missing: dict[str, float] = {} if image.distance is not None else {"distance": 0.0}
     if humans.depth is None:
         missing |= {"depth": 0.0, "free_space": 0.0}
     if humans.space is None:

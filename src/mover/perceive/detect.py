@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -150,8 +149,3 @@ def overlap(a: Bool[Tensor, "n h w"], b: Bool[Tensor, "m h w"]) -> Float[Tensor,
     flat = [x.flatten(1).float() for x in (a, b)]
     shared = flat[0] @ flat[1].mT
     return shared / (flat[0].sum(1)[:, None] + flat[1].sum(1)[None] - shared).clamp_min(1)
-
-
-def as_array(picture: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """A picture as bytes."""
-    return (picture * 255).round().clamp(0, 255).to(torch.uint8).numpy()

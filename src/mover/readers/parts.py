@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
-import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
@@ -85,12 +84,6 @@ class Hints:
     """bbox3d.json: the true boxes of MOVER's authors."""
     work: Path = Path()
     """A folder for meshes that a reader makes; it goes away after the import."""
-
-
-def none_of(parts: Parts) -> bool:
-    """Whether the source gave nothing."""
-    known = (parts.camera, parts.scene, parts.objects, parts.people, parts.bodies, parts.contacts)
-    return all(part is None for part in known) and parts.load_image is None and not parts.copies
 
 
 def image_parts(path: Path, *, mirrored: bool = False) -> tuple[LoadImage, tuple[int, int]]:
@@ -187,8 +180,3 @@ def parts_of(sources: Sources) -> Parts:
     """A whole capture as parts."""
     known: dict[str, Any] = {f.name: getattr(sources, f.name) for f in dataclasses.fields(Sources)}
     return Parts(**known)
-
-
-def plain_numbers(value: Any) -> Any:  # noqa: ANN401
-    """Numbers of any array library as JSON has them."""
-    return np.asarray(value).tolist()
