@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from mover import records
-from mover.experiments_job import Rebuilt, Trial
+from mover.experiments.job import Rebuilt, Trial
 from mover.run import Run
 from mover.settle import Settled, settle
 from mover.types import Scene

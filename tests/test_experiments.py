@@ -16,16 +16,16 @@ from PIL import Image
 from mover import records
 from mover.commands import run_command
 from mover.evaluate import EvaluateConfig
-from mover.experiments import (
+from mover.experiments.job import DONE, ROOM, Job, Trial, rebuild, store_room
+from mover.experiments.page import Line, fill_page
+from mover.experiments.run import (
     ExperimentArgs,
     parse_seeds,
     run_experiment,
     start,
 )
-from mover.experiments_job import DONE, ROOM, Job, Trial, rebuild, store_room
-from mover.experiments_page import Line, fill_page
-from mover.experiments_tables import mean_of
-from mover.experiments_traits import Traits, hidden_shares
+from mover.experiments.tables import mean_of
+from mover.experiments.traits import Traits, hidden_shares
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import place_piece
 from mover.geometry.raster import first_hit

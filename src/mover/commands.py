@@ -191,7 +191,7 @@ def _demo(arguments: Sequence[str]) -> None:
 
 
 def _experiment(arguments: Sequence[str]) -> None:
-    from .experiments import ExperimentArgs, run_experiment
+    from .experiments.run import ExperimentArgs, run_experiment
 
     args = tyro.cli(ExperimentArgs, prog="mover experiment", args=list(arguments))
     with Bar() as bar:

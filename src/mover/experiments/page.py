@@ -4,8 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from .evaluate import METRICS
-from .experiments_job import STAGES
+from ..evaluate import METRICS
+from .job import STAGES
 
 UNITS = {"m": ("cm", 100.0, 1), "rad": ("°", math.degrees(1.0), 1), "": ("", 1.0, 3)}
 """How a unit is shown: its name, the factor, digits after the point."""

@@ -4,11 +4,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .geometry.camera import to_camera
-from .geometry.placement import place_piece
-from .geometry.raster import first_hit
-from .records import record
-from .types import Scene
+from ..geometry.camera import to_camera
+from ..geometry.placement import place_piece
+from ..geometry.raster import first_hit
+from ..records import record
+from ..types import Scene
 
 WIDTH = 480  # [px] of the picture in which hidden shares are counted
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import torch
 
-from . import __version__
-from .experiments_job import SETS, STAGES
-from .experiments_page import Line, fill_page
-from .metrics_scene import OBJECT_METRICS
-from .records import plain, replacing
-from .run import sources
+from .. import __version__
+from ..metrics_scene import OBJECT_METRICS
+from ..records import plain, replacing
+from ..run import sources
+from .job import SETS, STAGES
+from .page import Line, fill_page
 
 HIDDEN = 0.3  # share of an object that others hide, from which on it counts as hidden
 TURNED = math.radians(45)  # an object with a larger yaw error is turned

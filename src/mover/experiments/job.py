@@ -1,6 +1,6 @@
 """One job of an experiment: make a known room with noise, or rebuild it with a preset and measure.
 
-Each job is a process of its own (`python -m mover.experiments_job SET SEED NAME FOLDER`) with one
+Each job is a process of its own (`python -m mover.experiments.job SET SEED NAME FOLDER`) with one
 thread, so that its numbers depend on nothing but its inputs.
 """
 
@@ -14,14 +14,14 @@ from typing import Any
 
 import torch
 
-from . import __version__, records
-from .evaluate import EvaluateConfig, EvaluatedBodies, evaluate
-from .experiments_traits import Traits, hidden_shares
-from .pipeline import reconstruct
-from .presets import PRESETS, Config
-from .rooms import KnownRoom, NoiseConfig, add_noise, make_room
-from .run import Run, sources
-from .types import Bodies, Capture, Room, Scene
+from .. import __version__, records
+from ..evaluate import EvaluateConfig, EvaluatedBodies, evaluate
+from ..pipeline import reconstruct
+from ..presets import PRESETS, Config
+from ..rooms import KnownRoom, NoiseConfig, add_noise, make_room
+from ..run import Run, sources
+from ..types import Bodies, Capture, Room, Scene
+from .traits import Traits, hidden_shares
 
 ROOM = "room"  # the job that makes the room; all others have the name of their preset
 DONE = "metrics.json"  # a job that has it is finished

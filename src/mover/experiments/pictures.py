@@ -10,15 +10,15 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from .experiments_job import Job, Rebuilt, Trial
-from .experiments_page import shown
-from .experiments_tables import Experiment
-from .geometry.boxes import box_of, corners
-from .metrics_scene import image_box
-from .records import load, map_tensors, replacing
-from .report_overlay import draw_overlay
-from .report_pictures import bitmap, canvas
-from .types import Piece, Scene
+from ..geometry.boxes import box_of, corners
+from ..metrics_scene import image_box
+from ..records import load, map_tensors, replacing
+from ..report_overlay import draw_overlay
+from ..report_pictures import bitmap, canvas
+from ..types import Piece, Scene
+from .job import Job, Rebuilt, Trial
+from .page import shown
+from .tables import Experiment
 
 WORST = 3  # so many pictures
 SIDE, HEAD, GAP = 420, 30, 6  # [px] of a panel, of its title, between panels

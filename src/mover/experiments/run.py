@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from .experiments_job import DONE, ROOM, SETS, Job, key_of
-from .experiments_pictures import draw_worst
-from .experiments_tables import Experiment, Failure, read_outcome, write_tables
-from .minimize import Observer, Step, silent
-from .presets import PRESETS
-from .records import InputError, replacing
+from ..minimize import Observer, Step, silent
+from ..presets import PRESETS
+from ..records import InputError, replacing
+from .job import DONE, ROOM, SETS, Job, key_of
+from .pictures import draw_worst
+from .tables import Experiment, Failure, read_outcome, write_tables
 
 log = logging.getLogger(__name__)
 WAIT = 0.2  # [s] between two looks at the running jobs
@@ -125,7 +125,7 @@ def start(job: Job) -> Running:
     """Start a job as a process with one thread; what it says goes to its log."""
     job.folder.mkdir(parents=True, exist_ok=True)
     words = (job.rooms, str(job.seed), job.name, str(job.out))
-    command = [sys.executable, "-m", "mover.experiments_job", *words]
+    command = [sys.executable, "-m", "mover.experiments.job", *words]
     single = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     with (job.folder / LOG).open("w") as file:
         return subprocess.Popen(

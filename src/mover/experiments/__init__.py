@@ -1,0 +1,1 @@
+"""Known rooms rebuilt and measured: sets, jobs, tables and pictures."""
