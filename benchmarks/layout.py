@@ -75,10 +75,12 @@ def trial(seed: int, args: argparse.Namespace) -> dict[str, float]:
             "best hypothesis": best_hypothesis(first, room.truth),
             "height error": abs((first.scene.ground or 0) - (room.truth.ground or 0)),
         }
-        given = {"noise": capture.scene, "layout": replace(first.scene, ground=None)}
+        ours = replace(capture, scene=replace(first.scene, ground=None))
+        others = tuple(h.piece for group in first.others for h in group[1:])
+        given = {"noise": capture, "alone": ours, "layout": replace(ours, hypotheses=others)}
         for name in args.job:
             run = Run(Path(folder) / name)
-            found = reconstruct(replace(capture, scene=given[name]), PRESETS["robust"], run)
+            found = reconstruct(given[name], PRESETS["robust"], run)
             row[f"{name} after the job"] = iou(found.scene, room.truth)
     return row
 
@@ -101,8 +103,10 @@ def main() -> None:
     """Measure and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(100, 110)))
-    parser.add_argument("--job", nargs="*", choices=("noise", "layout"), default=["layout"],
-                        help="scenes from which the main job starts")  # fmt: skip
+    parser.add_argument("--job", nargs="*", choices=("noise", "alone", "layout"),
+                        default=["layout"],
+                        help="from what the main job starts; alone: ours without the other "
+                        "hypotheses")  # fmt: skip
     parser.add_argument("--other-designs", action="store_true",
                         help="no shape of a design that stands in the room")  # fmt: skip
     parser.add_argument("--out", type=Path)

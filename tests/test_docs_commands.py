@@ -28,14 +28,20 @@ class ParsedError(Exception):
     """The arguments were understood."""
 
 
+def indented(text: str) -> list[str]:
+    """Blocks of code that are set in by four spaces."""
+    return re.findall(r"(?:^    \S.*\n(?:^     .*\n)*)+", FENCE.sub("", text), re.M)
+
+
 def blocks(page: Path) -> list[str]:
     """Lines of code that call the program, without remarks."""
+    text, shells = page.read_text(), ("", "bash", "sh", "console")
+    codes = [code for language, code in FENCE.findall(text) if language in shells]
     found = []
-    for language, code in FENCE.findall(page.read_text()):
-        if language in ("", "bash", "sh", "console"):
-            whole = code.replace("\\\n", " ")
-            lines = [line.strip().removeprefix("$ ") for line in whole.splitlines()]
-            found += [line for line in lines if line.startswith("mover ")]
+    for code in [*codes, *indented(text)]:
+        whole = code.replace("\\\n", " ")
+        lines = [line.strip().removeprefix("$ ") for line in whole.splitlines()]
+        found += [line for line in lines if line.startswith("mover ")]
     return found
 
 

@@ -14,6 +14,7 @@ from mover.bodies.world import in_world
 from mover.evaluate import METRICS, EvaluatedBodies, evaluate, evaluate_folder, table
 from mover.geometry.camera import tilted, to_camera
 from mover.metrics_bodies import soles_of
+from mover.metrics_pairs import unmatched
 from mover.readers.bodies_file import write_bodies
 from mover.readers.scene_file import write_scene
 from mover.records import InputError
@@ -70,6 +71,22 @@ def test_objects_that_the_truth_does_not_know_cost_nothing() -> None:
     truth = room()
     extra = replace(truth, pieces=(*truth.pieces, piece(cuboid(1, 1, 1), (3, GROUND, -3), 0, "x")))
     assert evaluate(extra, extra, truth, config=FAST) == evaluate(truth, truth, truth, config=FAST)
+
+
+def test_missed_and_false_objects_are_named_and_a_missed_one_counts_as_nothing_found() -> None:
+    truth = room()
+    ghost = replace(moved(truth.pieces[0], 0.1, 0, 0), id="ghost")
+    given = replace(truth, pieces=(*truth.pieces[1:], ghost))
+    names = [p.id for p in truth.pieces]
+    assert unmatched(given, given, truth) == {"missed": [], "false": []}
+    known = unmatched(given, given, truth, by_place=False)
+    assert known == {"missed": names[:1], "false": ["ghost"]}
+    config = replace(FAST, by_place=False)
+    metrics = evaluate(given, given, truth, config=config)
+    assert metrics["objects"][0]["result"] == {"iou3d": 0.0, "iou2d": 0.0}
+    assert metrics["result"]["iou3d"] == pytest.approx((len(names) - 1) / len(names))
+    text = table({**metrics, "unmatched": known})
+    assert f"missed: {names[0]}\nfalse: ghost" in text
 
 
 def test_what_lacks_its_truth_is_absent() -> None:

@@ -18,14 +18,15 @@ from mover.commands import run_command
 from mover.evaluate import EvaluateConfig
 from mover.experiments.job import DONE, ROOM, Job, Trial, rebuild, store_room
 from mover.experiments.page import Line, fill_page
+from mover.experiments.queue import start
 from mover.experiments.run import (
     ExperimentArgs,
     parse_seeds,
     run_experiment,
-    start,
 )
 from mover.experiments.tables import mean_of
 from mover.experiments.traits import Traits, hidden_shares
+from mover.experiments.variants import Variant
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import place_piece
 from mover.geometry.raster import first_hit
@@ -129,13 +130,13 @@ class Bench:
             (job.folder / "log.txt").write_text("Traceback\n  ...\nValueError: not finite\n")
             return Ended(1)
         if job.name == ROOM:
-            store_room(job, trial(0.1 * (job.seed + 1)))
+            store_room(job, trial(0.1 * (job.seed + 1)), FEW)
         else:
             self.measured(job)
         return Ended(0)
 
     def measured(self, job: Job) -> None:
-        rebuild(job, quick(PRESETS[job.name]), FEW)
+        rebuild(job, Variant(quick(PRESETS[job.name])), FEW)
 
 
 @pytest.fixture(scope="module")
@@ -277,10 +278,10 @@ def test_a_finished_job_of_other_sources_is_done_again_unless_kept(
 
 def test_nothing_is_left_of_a_room_that_could_not_be_made(tmp_path: Path) -> None:
     job = Job("rooms", 0, ROOM, tmp_path)
-    store_room(job, trial())
+    store_room(job, trial(), FEW)
     (job.folder / DONE).unlink()
     with pytest.raises(FileNotFoundError, match="seed 0"):
-        rebuild(Job("rooms", 0, "paper", tmp_path), quick(PRESETS["paper"]), FEW)
+        rebuild(Job("rooms", 0, "paper", tmp_path), Variant(quick(PRESETS["paper"])), FEW)
 
 
 def test_no_more_jobs_run_at_once_than_there_are_workers(tmp_path: Path) -> None:
@@ -334,7 +335,7 @@ def test_a_job_is_a_process_whose_last_words_are_kept(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--set", "flats"], "--set: 'flats' is none of rooms"),
+        (["--set", "flats"], "--set: 'flats' is none of mini, rooms"),
         (["--presets", "best"], "--presets: 'best' is none of paper, release, robust"),
         (["--seeds", "x"], "--seeds: 'x'"),
         (["--workers", "-1"], "--workers: -1"),

@@ -31,6 +31,7 @@ def paths_of(tree: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 TREES = {
     "camera.json": tiny.camera(height=1.4), "scene.json": {**tiny.scene(), "camera": tiny.camera()},
     "objects.json": tiny.objects(), "people.json": tiny.people(),
+    "hypotheses.json": tiny.hypotheses(),
 }  # fmt: skip
 PLACES = [(file, way) for file, tree in TREES.items() for way in paths_of(tree)]
 JUNK = st.recursive(
@@ -61,7 +62,9 @@ FUZZ = settings(max_examples=300, deadline=None, suppress_health_check=SLOW)
 @pytest.fixture(scope="module")
 def whole() -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as place:
-        yield tiny.write_capture(Path(place) / "tiny")
+        folder = tiny.write_capture(Path(place) / "tiny")
+        (folder / "hypotheses.json").write_text(json.dumps(tiny.hypotheses()))
+        yield folder
 
 
 def read_or_refuse(folder: Path) -> None:

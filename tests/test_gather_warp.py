@@ -109,15 +109,29 @@ def test_a_failure_in_a_worker_is_told() -> None:
         volume_warp.union_bodies(verts, faces, grid, 3)
 
 
-@pytest.mark.parametrize("count", [1, 8, 9, 100, 3000])
-def test_each_triangle_is_in_one_leaf(count: int) -> None:
+@pytest.mark.parametrize("count", [1, 2, 8, 9, 17, 33, 65, 100, 600, 3000])
+def test_each_triangle_is_in_one_leaf_and_each_leaf_under_the_first_pack(count: int) -> None:
     verts = torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
-    faces = torch.randint(0, 50, (count, 3), generator=torch.Generator().manual_seed(2))
+    order = torch.rand(count, 50, generator=torch.Generator().manual_seed(2)).argsort(1)
+    faces = order[:, :3]
     tree = face_tree(verts, faces)
-    assert len(tree.first) == tree.branches**4 + 1
-    assert (tree.first[0], tree.first[-1]) == (0, count)
-    assert (tree.first[1:] >= tree.first[:-1]).all()
-    assert sorted(map(tuple, tree.faces.tolist())) == sorted(map(tuple, faces.tolist()))
+    corners, side = tree.corners[:, :3].swapaxes(1, 2).reshape(-1, 3), tree.corners[:, 3].ravel()
+    assert (np.diff(corners, axis=1) > 0).all()
+    once = corners[side != 0]
+    once[side[side != 0] < 0] = once[side[side != 0] < 0][:, [0, 2, 1]]
+    start = faces.argmin(1, keepdim=True)
+    turned = faces.gather(1, (start + torch.arange(3)) % 3)
+    assert sorted(map(tuple, once.tolist())) == sorted(map(tuple, turned.tolist()))
+    leaves, slots = len(tree.corners), [s for s in range(8) if s + tree.shift > 0 or s >= tree.base]
+    found = []
+    while slots:
+        slot = slots.pop()
+        if slot >= tree.base:
+            found.append(slot - tree.base)
+        else:
+            slots += range(8 * (slot + tree.shift), 8 * (slot + tree.shift) + 8)
+    assert sorted(found) == list(range(leaves))
+    assert 8 * tree.levels[-1] == tree.base + leaves
 
 
 def cameras(items: int, size: tuple[int, int], focal: float) -> Views:
@@ -252,12 +266,24 @@ def test_a_mesh_in_great_pieces_has_the_distances_of_libigl() -> None:
     assert (assert_same(verts[None], faces, part) < 0).all()
 
 
-def test_long_lists_of_leaves_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    verts, faces = posed_bodies(2)
-    grid = around(verts, 48)
-    long = volume_warp.union_bodies(verts, faces, grid, 1).values
-    monkeypatch.setattr(volume_warp, "LIST", 1)
-    assert torch.equal(volume_warp.union_bodies(verts, faces, grid, 1).values, long)
+def test_triangles_without_an_area_are_edges_and_points() -> None:
+    one, faces = sphere([0.0, 0, 0], 0.5, level=2)
+    a, b = one[faces[0, 0]], one[faces[0, 1]]
+    tip = one[0] * 1.6  # sharp: an edge that stands out of the surface, and a point at its end
+    more = torch.stack([a, (a + b) / 2, b, a, one[0], tip, tip, tip])
+    extra = torch.tensor([[0, 1, 2], [0, 3, 2], [4, 5, 6], [6, 4, 5], [5, 6, 7], [7, 4, 4]])
+    verts, both = torch.cat([one, more])[None], torch.cat([faces, extra + len(one)])
+    grid = around(verts, 50)
+    found = assert_same(verts, both, grid)
+    place = ((tip - grid.origin) / grid.cell).round().long()
+    assert 0 < found[tuple(place.tolist())] < grid.cell
+
+
+@pytest.mark.parametrize("level", [0, 1, 2, 4, 5])
+def test_trees_of_any_depth_have_the_distances_of_libigl(level: int) -> None:
+    verts, faces = sphere([0.1, -0.2, 0.3], 0.5, level)
+    verts = torch.stack([verts, verts * torch.tensor([1.1, 0.8, 1.0])])
+    assert_same(verts, faces, around(verts, 36))
 
 
 @pytest.mark.slow

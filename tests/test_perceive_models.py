@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny_models import tiny_mask2former, tiny_sam2, tiny_vitpose
+from tiny_models import tiny_mask2former, tiny_oneformer, tiny_sam2, tiny_vitpose
 
 from mover.geometry.runs import decode
 from mover.perceive.detect import (
@@ -101,6 +101,51 @@ def test_crafted_logits_become_known_masks_and_classes(folders: ModelsConfig):
     for index, one in enumerate(truth.values()):
         assert overlap(decode(found.masks, index)[None], one[None]) > 0.95
     assert people_in(found).category == ("person",)
+
+
+@pytest.fixture(scope="module")
+def oneformer(tmp_path_factory: pytest.TempPathFactory) -> ModelsConfig:
+    folder = tiny_oneformer(tmp_path_factory.mktemp("models") / "oneformer")
+    return ModelsConfig(masks=str(folder), device="cpu")
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_crafted_logits_of_oneformer_become_the_same_masks(oneformer: ModelsConfig, count: int):
+    """One instance alone does not get the rest of the picture, and overlaps stay."""
+    net = network("masks", oneformer.masks, oneformer)
+    shapes = [(1, mask(slice(20, 70), slice(10, 60))), (0, mask(slice(40, 90), slice(50, 120)))]
+    classes = torch.full((1, 6, 5), -10.0)
+    classes[..., 4] = 10.0  # nothing
+    pixels = torch.full((1, 6, H, W), -10.0)
+    for query, (label, one) in enumerate(shapes[:count]):
+        classes[0, query, label], classes[0, query, 4] = 10.0, -10.0
+        pixels[0, query][one] = 10.0
+    output = SimpleNamespace(class_queries_logits=classes, masks_queries_logits=pixels)
+    said = Network(Says(output, net.model.config), net.processor, "cpu")
+    found = instances(said, [np.zeros((H, W, 3), dtype=np.uint8)], [7], DetectConfig())
+    assert found.category == ("chair", "person")[:count]
+    assert bool((found.score > 0.9).all())
+    for index, (_, one) in enumerate(shapes[:count]):
+        assert overlap(decode(found.masks, index)[None], one[None]) > 0.95
+
+
+def test_oneformer_is_asked_for_instances_and_runs_in_batches(
+    oneformer: ModelsConfig, tmp_path: Path
+):
+    clip = clip_of(tmp_path, 3)
+    config = DetectConfig(oneformer, score=0.0, batch=2, least=0.0)
+    found = find_instances(DetectInputs(clip, (0, 1, 2)), config)
+    assert set(found.frame.tolist()) == {0, 1, 2}
+    assert set(found.category) <= {"person", "chair", "couch", "wall-other-merged"}
+    net = network("masks", oneformer.masks, oneformer)
+    words = net.processor(
+        images=[np.zeros((H, W, 3), np.uint8)], task_inputs=["instance"], return_tensors="pt"
+    )["task_inputs"]
+    other = net.processor(
+        images=[np.zeros((H, W, 3), np.uint8)], task_inputs=["semantic"], return_tensors="pt"
+    )["task_inputs"]
+    assert words.shape == (1, 77)
+    assert not torch.equal(words, other)
 
 
 def test_crafted_heat_becomes_known_joints(folders: ModelsConfig):

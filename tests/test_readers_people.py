@@ -520,6 +520,23 @@ def test_the_command_writes_bodies_and_a_camera(tmp_path, capsys):
     assert (written["w"], written["fl_x"]) == (1280, 1100)
 
 
+def test_an_import_takes_the_bodies_of_a_tool_by_their_path(tmp_path):
+    """`--bodies PATH --bodies-from TOOL`: the same bodies as `mover bodies`, in the capture."""
+    path = made.write_gvhmr(tmp_path)
+    box = {"id": "t", "category": "table", "center": [0, -1, -3], "size": [1.2, 0.8, 0.6]}
+    room = {"camera": made.camera_json(), "ground": -1.4, "objects": [{**box, "yaw": 0.3}]}
+    (tmp_path / "boxes.json").write_text(json.dumps(room))
+    line = ["boxes", tmp_path / "boxes.json", "--out", tmp_path / "room", "--bodies", path]
+    assert commands.run_command("import", [*map(str, line), "--bodies-from", "gvhmr"]) == 0
+    found = read_bodies(tmp_path / "room" / "bodies.npz")
+    direct = bodies_from("gvhmr", path, KNOWN).bodies
+    assert found.frame.tolist() == direct.frame.tolist()
+    assert (found.verts - direct.verts).abs().max() < 1e-4
+    assert found.pose is not None
+    bad = [*map(str, line), "--bodies-from", "nobody"]
+    assert commands.run_command("import", bad) == 2
+
+
 def test_the_command_writes_keypoints_and_names_the_tools(tmp_path, capsys):
     path, out = made.write_coco17(tmp_path), tmp_path / "k.npz"
     assert commands.run_command("bodies", ["coco17", str(path), "--out", str(out)]) == 0

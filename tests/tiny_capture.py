@@ -92,6 +92,15 @@ def scene() -> dict[str, Any]:
     }  # fmt: skip
 
 
+def hypotheses() -> dict[str, Any]:
+    """The chair in its place, and in another one in the shape of the lamp."""
+    keys = ("mesh", "translation", "yaw", "scale")
+    first = {key: scene()["objects"][0][key] for key in keys}
+    other = {**first, "mesh": "meshes/lamp.glb", "translation": [-0.2, -1.4, -3.5], "energy": 0.25}
+    objects = {"chair_0": [first, other]}
+    return {"format": "mover-hypotheses", "version": 1, "objects": objects}
+
+
 def objects() -> dict[str, Any]:
     code = {"size": [HEIGHT, WIDTH], "counts": compressed(runs(object_mask(0)))}
     corners = [[40.0, 10.0, 60.0, 10.0, 60.0, 30.0, 40.0, 30.0]]

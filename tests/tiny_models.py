@@ -1,5 +1,6 @@
 """Networks of transformers with a few random weights, saved as users' folders are."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,36 @@ def tiny_mask2former(folder: Path) -> Path:
     tf.Mask2FormerImageProcessor(
         size={"shortest_edge": 64, "longest_edge": 128}, num_labels=4, ignore_index=255
     ).save_pretrained(folder)
+    return folder
+
+
+def tiny_oneformer(folder: Path) -> Path:
+    """With the files of the published ones: the classes lie in the folder itself."""
+    tf = pytest.importorskip("transformers")
+    torch.manual_seed(0)
+    backbone = tf.SwinConfig(
+        image_size=64, embed_dim=12, depths=[1, 1, 1, 1], num_heads=[1, 1, 2, 2], window_size=4,
+        out_features=["stage1", "stage2", "stage3", "stage4"],
+    )  # fmt: skip
+    names = {0: "person", 1: "chair", 2: "couch", 3: "wall-other-merged"}
+    config = tf.OneFormerConfig(
+        backbone_config=backbone, num_queries=6, conv_dim=32, mask_dim=32, hidden_dim=32,
+        encoder_feedforward_dim=16, encoder_layers=1, decoder_layers=3, num_attention_heads=2,
+        dim_feedforward=32, text_encoder_width=32, text_encoder_num_layers=1,
+        text_encoder_vocab_size=600, text_encoder_n_ctx=4, id2label=names,
+    )  # fmt: skip
+    tf.OneFormerForUniversalSegmentation(config).save_pretrained(folder)
+    classes = {str(k): {"name": n, "isthing": int(k < 3)} for k, n in names.items()}
+    (folder / "classes.json").write_text(json.dumps(classes))
+    letters = [c + end for end in ("", "</w>") for c in "abcdefghijklmnopqrstuvwxyz"]
+    ends = ["<|startoftext|>", "<|endoftext|>"]
+    vocab = {word: i for i, word in enumerate([*letters, *ends])}
+    tokenizer = tf.CLIPTokenizer(vocab=vocab, merges=[])
+    images = tf.OneFormerImageProcessorPil(
+        size={"shortest_edge": 64, "longest_edge": 128}, num_labels=4, ignore_index=255,
+        repo_path=str(folder), class_info_file="classes.json", num_text=2,
+    )  # fmt: skip
+    tf.OneFormerProcessor(images, tokenizer).save_pretrained(folder)
     return folder
 
 

@@ -203,7 +203,8 @@ def _result(job: Job, handle: Any) -> Outcome:  # noqa: ANN401
 def _need(package: str, extra: str) -> None:
     if find_spec(package) is None:
         raise InputError(
-            f"--engine {extra}: {package} is not installed; pip install 'mover[{extra}]'"
+            f"--engine {extra}: {package} is not installed; "
+            f"pip install '.[{extra}]' in mover's folder"
         )
 
 

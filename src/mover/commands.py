@@ -38,6 +38,8 @@ class RunArgs:
     """A list of edits (edits.json of `mover view`) that is applied first."""
     view: bool = False
     """Watch the furniture move in the browser (extra `viewer`)."""
+    refine: bool = False
+    """At the end, refine the people with the room they helped to find: bodies.npz holds them."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def _run(arguments: Sequence[str]) -> None:
         view = importlib.import_module(".commands_view", __package__)
         view.run_in_view(capture, config, args.out, origin)
         return
-    reconstruct_into(args.out, capture, config, origin)
+    reconstruct_into(args.out, capture, config, origin, refine=args.refine)
     _say(f"report: {args.out / 'report.html'}")
 
 
@@ -123,6 +125,7 @@ def reconstruct_into(
     config: Config,
     origin: Any,  # noqa: ANN401
     watch: Any = None,  # noqa: ANN401
+    refine: bool = False,
 ) -> Any:  # noqa: ANN401
     """Run the main job on the edited capture and write its result; `watch` sees every step."""
     import torch
@@ -137,6 +140,10 @@ def reconstruct_into(
     with Bar() as bar:
         run = Run(out, bar if watch is None else both(bar, watch))
         room = reconstruct(capture, config, run, pinned)
+        if refine:
+            from .refinement import refined_room
+
+            room = refined_room(room, capture, bar)
     write_results(capture, room, config, run, origin)
     for warning in room.warnings:
         _say(f"warning: {warning}")
@@ -190,15 +197,6 @@ def _demo(arguments: Sequence[str]) -> None:
     _say(f"\n{table(metrics)}\n\nreport: {report}")
 
 
-def _experiment(arguments: Sequence[str]) -> None:
-    from .experiments.run import ExperimentArgs, run_experiment
-
-    args = tyro.cli(ExperimentArgs, prog="mover experiment", args=list(arguments))
-    with Bar() as bar:
-        summary = run_experiment(args, bar)
-    _say(f"{summary.read_text()}\nsummary: {summary}")
-
-
 def _lazily(module: str, name: str) -> Callable[[Sequence[str]], None]:
     """A command of another module, which is imported when the command runs."""
 
@@ -217,7 +215,7 @@ _COMMANDS = {
     "check": _check,
     "run": _run,
     "evaluate": _evaluate,
-    "experiment": _experiment,
+    "experiment": _lazily("commands_experiment", "experiment"),
     "import": _lazily("commands_import", "import"),
     "paper-table": _lazily("commands_table", "paper-table"),
     **{name: _lazily("commands_perceive", name) for name in ("perceive", "layout")},

@@ -31,8 +31,10 @@ class RefineArgs:
     """Use contacts: seats, backs and hands at rest lie on furniture."""
     order: bool = True
     """Use who hides whom."""
-    rounds: int = 5
-    """How often contacts are looked for anew."""
+    masks: bool = True
+    """Use the outlines of people's masks."""
+    rounds: int = 3
+    """How often contacts and outlines are looked for anew while poses change."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def refine(arguments: Sequence[str]) -> None:
     torch.set_num_threads(1)
     off = {
         "camgp": not args.camgp, "sdf": not args.sdf, "contact": not args.contact,
-        "order": not args.order,
+        "order": not args.order, "masks": not args.masks,
     }  # fmt: skip
     config = switched(RefineBodiesConfig(rounds=args.rounds), off)
     with Bar() as bar:

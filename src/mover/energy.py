@@ -15,8 +15,10 @@ from .minimize import Energy, weigh
 from .records import record
 from .terms import Form
 from .terms.bbox import bbox_term
+from .terms.border import Borders, Fitted, fit_borders
 from .terms.collision import BodySpace, collision_term
 from .terms.contact import Touches, contact_term, gap_term, heading_term
+from .terms.contact_reach import reach_term
 from .terms.contact_trees import Trees, gaps
 from .terms.depth import DepthRange, depth_term, free_space_term
 from .terms.distance import distance_term
@@ -84,6 +86,10 @@ class ImageCues:
     """Weight of the silhouette, below one where the shape is known to be wrong."""
     distance: Float[Tensor, " objects"] | None = None
     """From the camera to the middle of the base in the initial scene [m]; None: not known."""
+    outline: Float[Tensor, "objects h w"] | None = None
+    """Root of the distance to the mask's outline [px^0.5]; None: the edge term finds it anew."""
+    borders: Borders | None = None
+    """What the masks may be if their outlines are too wide or too narrow; None: they are not."""
 
 
 @record
@@ -119,20 +125,23 @@ def scene_energy(
     drawn = cache(lambda: _draw(verts, objects, image.views, w))
     pixels = cache(lambda: project(verts, camera.K))
     many = factors(objects, humans if w.contact else HumanCues(), form)
+    fitted = cache(lambda: _fit(drawn()[0], outermost(verts, camera.K), camera, image, w))
+    loose = image.borders is not None and w.silhouette
     return weigh(
-        ("bbox", w.bbox, lambda: bbox_term(
+        ("bbox", w.bbox, lambda: fitted().bbox if loose else bbox_term(
             project(_corners(objects, layout, camera) if form == "paper"
                     else outermost(verts, camera.K), camera.K),
             image.boxes, image.sides, float(camera.width), form)),
-        ("silhouette", w.silhouette, lambda: image.trust * silhouette_term(
-            drawn()[0], image.masks, image.keep, form)),
+        ("silhouette", w.silhouette, lambda: fitted().silhouette if loose
+            else image.trust * silhouette_term(drawn()[0], image.masks, image.keep, form)),
         ("scale", w.scale, lambda: scale_term(layout.log_scale, form)),
         ("depth", w.depth, lambda: many.depth * depth_term(
             _known(drawn()[1]), image.masks, _known(humans.depth), form)),
         ("collision", w.collision, lambda: many.collision * collision_term(
             _collision_points(layout, objects, form), _known(humans.space), form)),
         ("contact", w.contact, lambda: _contact(layout, objects, humans, form)),
-        ("edge", w.edge, lambda: edge_term(drawn()[0], image.masks, image.keep)),
+        ("edge", w.edge, lambda: edge_term(
+            drawn()[0], image.masks, image.keep, image.outline)),
         ("offscreen", w.offscreen, lambda: offscreen_term(
             pixels(), verts, objects.real_verts, camera)),
         ("free_space", w.free_space, lambda: free_space_term(
@@ -140,6 +149,15 @@ def scene_energy(
         ("distance", w.distance, lambda: distance_term(layout, _known(image.distance))),
         ("heading", w.heading, lambda: heading_term(layout, _known(humans.touches))),
     )  # fmt: skip
+
+
+def _fit(
+    drawn: Tensor, extent: Tensor, camera: Camera, image: ImageCues, w: SceneWeights
+) -> Fitted:
+    """Box and silhouette under the border of each mask that suits them best."""
+    seen = image.boxes, image.sides, image.keep
+    here = drawn, project(extent, camera.K)
+    return fit_borders(here, seen, image.trust, _known(image.borders), (w.bbox, w.silhouette))
 
 
 def heard(weights: SceneWeights, image: ImageCues, humans: HumanCues) -> SceneWeights:
@@ -188,11 +206,13 @@ def _draw(
 
 
 def _contact(layout: Layout, objects: Objects, humans: HumanCues, form: Form) -> Tensor:
-    """By search trees where there are any: the release asks the other way round."""
+    """By search trees where there are any."""
     touches = _known(humans.touches)
-    if humans.trees is None or form == "release":
+    if humans.trees is None or (form == "release" and humans.trees.skin is None):
         regions = place(objects.top, layout), place(objects.back, layout)
         return contact_term(regions, touches, form)
+    if form != "robust":
+        return reach_term(layout, touches, humans.trees, form)
     found = gaps(layout, objects, touches, humans.trees)
     return gap_term(found, touches, len(objects.ids), form)
 

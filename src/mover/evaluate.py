@@ -4,7 +4,7 @@ Definitions, matching rules and sampling densities: docs/metrics.md.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,13 +30,13 @@ from .metrics_contact import (
     gather_truth,
 )
 from .metrics_motion import MOTION_METRICS, gather_gait
+from .metrics_pairs import pairs, unmatched
 from .metrics_scene import (
     CAMERA_METRICS,
     OBJECT_METRICS,
     Metric,
     Pair,
     Sight,
-    match,
     measure,
     measure_missing,
 )
@@ -71,6 +71,8 @@ class EvaluateConfig:
     """A vertex touches furniture that is at most so far away [m]."""
     ground_tolerance: float = 0.01
     """How far a sole may be under the floor before it counts as penetration [m]."""
+    by_place: bool = True
+    """Objects that bear no true name are paired by place; False: they are false."""
 
 
 @record
@@ -117,7 +119,7 @@ def evaluate(
     before, after, true = _populate(
         (initial, result, truth), bodies or EvaluatedBodies(None, None, None)
     )
-    objects = _objects(before.scene, after.scene, true.scene, config.samples)
+    objects = _objects((before.scene, after.scene, true.scene), config)
     touch = _true_touch(true, after.bodies or before.bodies, config)
     return {
         key: _means(objects, key)
@@ -143,6 +145,7 @@ def evaluate_folder(out: Path, truth: Path, config: EvaluateConfig | None = None
     own = truth / "camera.json"
     true = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
     metrics = evaluate(initial, result, true, bodies, config)
+    metrics["unmatched"] = unmatched(initial, result, true)
     with replacing(out / "metrics.json") as part:
         part.write_text(json.dumps(metrics, indent=1, allow_nan=False))
     return metrics
@@ -165,6 +168,8 @@ def table(metrics: Mapping[str, Any]) -> str:
             for key in ("initial", "result")
         )
         lines.append(f"{item['id']:34.34}{cells}")
+    for name, ids in metrics.get("unmatched", {}).items():
+        lines += [f"{name}: {', '.join(ids)}"] if ids else []
     return "\n".join(lines)
 
 
@@ -195,24 +200,21 @@ def _double(value: T) -> T:
     return map_tensors(lambda x: x.double() if x.is_floating_point() else x, value)
 
 
-def _objects(initial: Scene, result: Scene, truth: Scene, samples: int) -> list[dict[str, Any]]:
-    """Each true object before and after; who is who is settled on the initial scene."""
-    same = {piece.id: piece.id for piece in truth.pieces}
-    before = match(initial, truth, same)
-    after = match(result, truth, same | {name: piece.id for name, piece in before.items()})
+def _objects(scenes: Sequence[Scene], config: EvaluateConfig) -> list[dict[str, Any]]:
+    """Each true object before and after."""
+    initial, result, truth = scenes
+    before, after = pairs(initial, result, truth, config.by_place)
 
     def of(scene: Scene, piece: Piece | None, true: Piece) -> dict[str, float]:
         if piece is None:
             return measure_missing(true, truth.camera)
-        return measure(OBJECT_METRICS, Pair(piece, scene.camera, true, truth.camera, samples))
+        pair = Pair(piece, scene.camera, true, truth.camera, config.samples)
+        return measure(OBJECT_METRICS, pair)
 
+    rows = [(p, before.get(p.id), after.get(p.id)) for p in truth.pieces]
     return [
-        {
-            "id": true.id,
-            "initial": of(initial, before.get(true.id), true),
-            "result": of(result, after.get(true.id), true),
-        }
-        for true in truth.pieces
+        {"id": true.id, "initial": of(initial, one, true), "result": of(result, other, true)}
+        for true, one, other in rows
     ]
 
 

@@ -156,7 +156,9 @@ def area_samples(mesh: Mesh, count: int) -> Float[Tensor, "count 3"]:
     return a[face] + u * (b - a)[face] + v * (c - a)[face]
 
 
-def match(estimate: Scene, truth: Scene, known: Mapping[str, str]) -> dict[str, Piece]:
+def match(
+    estimate: Scene, truth: Scene, known: Mapping[str, str], by_place: bool = True
+) -> dict[str, Piece]:
     """Say which estimated object stands for which true one.
 
     Names decide first. What they leave over is paired one to one within its class so that the
@@ -166,12 +168,15 @@ def match(estimate: Scene, truth: Scene, known: Mapping[str, str]) -> dict[str, 
         estimate: The scene that is judged.
         truth: The true scene.
         known: Id of the estimated object by id of the true one; unknown names are skipped.
+        by_place: Pair what names leave over; else it is missing, or stands for nothing.
 
     Returns:
         The estimated object by id of the true one; a true object that is missing is not in it.
     """
     by_id = {piece.id: piece for piece in estimate.pieces}
     found = {p.id: by_id[known[p.id]] for p in truth.pieces if known.get(p.id) in by_id}
+    if not by_place:
+        return found
     taken = {piece.id for piece in found.values()}
     rest = [p for p in truth.pieces if p.id not in found]
     free = [p for p in estimate.pieces if p.id not in taken]

@@ -31,10 +31,14 @@ class Energy:
     """Weighted terms of an objective, before any sum over the items (objects or frames)."""
 
     parts: Mapping[str, PerItem]
+    whole: PerItem | None = None
+    """Their sum, where it is known."""
 
     @property
     def per_item(self) -> PerItem:
         """Sum of the terms for each item."""
+        if self.whole is not None:
+            return self.whole
         return torch.stack(list(self.parts.values())).sum(0)
 
     @property
@@ -108,46 +112,75 @@ def minimize(
     Raises:
         ValueError: If the energy stops being finite.
     """
-    names = [f.name for f in dataclasses.fields(start)]  # type: ignore[arg-type]
-    free = {n: getattr(start, n).detach().clone().requires_grad_() for n in names}
-    at = dataclasses.replace(start, **free)  # type: ignore[type-var]
-    adam = torch.optim.Adam(list(free.values()), lr=method.rate, betas=(0.9, method.beta2))
-    best, lowest = map_tensors(lambda x: x.detach().clone(), at), None
+    free = _Unknowns(start)
+    best, lowest = free.at.clone(), None
     trace: list[Tensor] = []
     for index in range(method.steps):
-        adam.param_groups[0]["lr"] = _rate(method, index)
-        adam.zero_grad()
-        value = energy(at)
+        free.slope.zero_()
+        value = energy(free.record)
         value.total.backward()
         items = value.per_item.detach()
         if method.keep_best:
-            lowest, best = _better(items, lowest, at, best)
+            best, lowest = free.better(items, lowest, best)
         trace.append(items.sum())
-        adam.step()
-        observe(Step(stage, index, method.steps, value, lambda: at))
+        free.step(method, index)
+        observe(Step(stage, index, method.steps, value, lambda: free.record))
     with torch.no_grad():
-        last = energy(at).per_item
+        last = energy(free.record).per_item
     if not torch.stack([*trace, last.sum()]).isfinite().all():
         raise ValueError(f"{stage}: the energy is not finite")
     if method.keep_best:
-        last, at = _better(last, lowest, at, best)
-    at = map_tensors(lambda x: x.detach(), at)
+        best, last = free.better(last, lowest, best)
+        free.at.copy_(best)
+    at = map_tensors(lambda x: x.detach().clone(), free.record)
     return Minimum(at, last, torch.stack(trace) if trace else last.new_zeros(0))
+
+
+class _Unknowns(Generic[P]):
+    """All fields of a record in one piece of memory, so that a step takes few operations."""
+
+    def __init__(self, start: P) -> None:
+        names = [f.name for f in dataclasses.fields(start)]  # type: ignore[arg-type]
+        fields = [getattr(start, n).detach() for n in names]
+        self.at = torch.cat([x.flatten() for x in fields])
+        self.slope, self.mean, self.square = (torch.zeros_like(self.at) for _ in range(3))
+        sizes = [x.numel() for x in fields]
+        leaves: dict[str, Tensor] = {}
+        for name, x, part, grad in zip(
+            names, fields, self.at.split(sizes), self.slope.split(sizes), strict=True
+        ):
+            leaves[name] = part.view(x.shape).detach().requires_grad_()
+            leaves[name].grad = grad.view(x.shape)
+        self.record: P = dataclasses.replace(start, **leaves)  # type: ignore[type-var]
+        self.shapes = [x.shape for x in fields]
+        self.owner: Tensor | None = None
+
+    def step(self, method: Adam, index: int) -> None:
+        """Adam's step, in the operations of `torch.optim.Adam`."""
+        beta1, beta2, grad = 0.9, method.beta2, self.slope
+        self.mean.lerp_(grad, 1 - beta1)
+        self.square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+        spread = (1 - beta2 ** (index + 1)) ** 0.5
+        rate = _rate(method, index) / (1 - beta1 ** (index + 1))
+        length = (self.square.sqrt() / spread).add_(1e-8)
+        self.at.addcdiv_(self.mean, length, value=-rate)
+
+    def better(self, items: Tensor, lowest: Tensor | None, best: Tensor) -> tuple[Tensor, Tensor]:
+        """Keep, item by item, the state with the lowest energy so far, and that energy."""
+        if lowest is None:
+            return self.at.clone(), items.clone()
+        if self.owner is None:
+            number = torch.arange(items.numel(), device=items.device).view(items.shape)
+            parts = [
+                number.reshape(items.shape + (1,) * (len(shape) - items.ndim)).expand(shape)
+                for shape in self.shapes
+            ]
+            self.owner = torch.cat([x.flatten() for x in parts])
+        wins = items < lowest
+        best = torch.where(wins.flatten()[self.owner], self.at, best)
+        return best, torch.where(wins, items, lowest)
 
 
 def _rate(method: Adam, index: int) -> float:
     share = index / max(1, method.steps - 1)
     return method.rate * (method.last_rate / method.rate) ** share
-
-
-def _better(items: Tensor, lowest: Tensor | None, at: P, best: P) -> tuple[Tensor, P]:
-    """Keep, item by item, the state with the lowest energy so far."""
-    if lowest is None:
-        return items.clone(), map_tensors(lambda x: x.detach().clone(), at)
-    wins = items < lowest
-    kept = {}
-    for field in dataclasses.fields(at):  # type: ignore[arg-type]
-        new, old = getattr(at, field.name).detach(), getattr(best, field.name)
-        mask = wins.reshape(wins.shape + (1,) * (new.ndim - wins.ndim))
-        kept[field.name] = torch.where(mask, new, old)
-    return torch.where(wins, items, lowest), dataclasses.replace(best, **kept)  # type: ignore[type-var]

@@ -6,16 +6,21 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from .bodies.parts import Parts
+from .bodies.world import in_world
+from .calibration import calibration_of
+from .explanation import explain
+from .explanation_records import Explanation
 from .presets import Config
 from .readers.pose_file import into_camera
 from .run import Run
 from .stages.align_camera import Alignment
 from .stages.assign_touches import Contacts
 from .stages.doubt import DoubtInputs, doubts
+from .stages.explain_placements import ExplainInputs, explain_placements
 from .stages.find_image_cues import ImageInputs
 from .stages.gather_cues import Cues
 from .stages.inputs import Seen, rows_of
-from .stages.place_objects import Placed
+from .stages.place_objects import PlaceConfig, Placed, PlaceInputs
 from .stages.prepare_objects import Prepared, proxy_meshes, restore
 from .terms.feet import Soles
 from .types import Bodies, Camera, Capture, Evidence, Layout, Room, Scene
@@ -62,6 +67,8 @@ class View:
     """Where the image alone places the objects."""
     cues: Cues | None = None
     contacts: Contacts | None = None
+    priced: tuple[PlaceInputs, PlaceConfig] | None = None
+    """What the last descent minimised; None: nothing is explained."""
 
 
 def carried(bodies: Bodies, camera: Camera) -> Bodies:
@@ -110,7 +117,21 @@ def room_of(job: Job, view: View, crew: Crew | None) -> Room:
         covariance=None if crew is None else crew.alignment.covariance,
         traces=view.traces,
         warnings=tuple(dict.fromkeys(warnings)),
+        explanations=explanations_of(job, view, crew),
     )
+
+
+def explanations_of(job: Job, view: View, crew: Crew | None) -> tuple[Explanation, ...]:
+    """What holds each object, and how well its place is known."""
+    if view.priced is None:
+        return ()
+    inputs, config = view.priced
+    bodies = None if crew is None else in_world(rows_of(crew.bodies, crew.kept), view.camera)
+    pairs = None if view.contacts is None else view.contacts.pairs
+    tilt = None if crew is None else crew.alignment.covariance
+    asked = ExplainInputs(inputs, config, view.placed, bodies, pairs, tilt)
+    found = job.run.stage(explain_placements, asked, job.config.explain)
+    return explain(found.facts, calibration_of(config.form))
 
 
 def _evidence(job: Job, view: View) -> tuple[Evidence, ...]:

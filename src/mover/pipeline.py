@@ -29,6 +29,7 @@ from .stages.inputs import (
     image_evidence,
     rows_of,
 )
+from .stages.other_starts import other_starts
 from .stages.pinned import Pinned
 from .stages.place_objects import PlaceInputs, place_objects
 from .stages.prepare_objects import PrepareInputs, prepare_objects
@@ -84,10 +85,18 @@ def _from_image(job: Job, camera: Camera, ground: float) -> View:
     """Carry the initial scene into this world and place the objects by the image alone."""
     objects, seen = job.prepared.objects, job.seen
     old = job.capture.scene.camera.R_cam_world
-    start = recast(job.prepared.start, objects.size[:, 1], old, camera.R_cam_world)
-    if job.config.slide:
-        start = slide_to_floor(start, ground, (objects.supports == GROUND) & ~_is_pinned(job))
-    start = stand(start, objects.supports, objects.size[:, 1], ground)
+
+    def carried(layout: Layout) -> Layout:
+        there = recast(layout, objects.size[:, 1], old, camera.R_cam_world)
+        if job.config.slide:
+            there = slide_to_floor(there, ground, (objects.supports == GROUND) & ~_is_pinned(job))
+        return stand(there, objects.supports, objects.size[:, 1], ground)
+
+    start = carried(job.prepared.start)
+    starts = alone(start)
+    if job.config.layout.keep > 1 and job.capture.hypotheses:
+        others = other_starts(job.capture.hypotheses, objects, job.prepared.start)
+        starts = joined(starts, carried(others))
     unordered = torch.zeros(len(objects.ids), len(objects.ids), dtype=torch.bool)
     given = job.prepared.start.t_world_object.norm(dim=-1)
     image = ImageInputs(
@@ -95,10 +104,11 @@ def _from_image(job: Job, camera: Camera, ground: float) -> View:
     )
     cues = job.run.stage(find_image_cues, image, job.config.image)
     inputs = PlaceInputs(
-        objects, camera, ground, cues, NOBODY, alone(start), start.yaw, _pinned(job, start)
+        objects, camera, ground, cues, NOBODY, starts, start.yaw, _pinned(job, start)
     )
     placed = job.run.stage(place_objects, inputs, job.config.layout)
-    return View(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
+    found = View(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
+    return replace(found, priced=(inputs, job.config.layout))
 
 
 def _refine(job: Job, crew: Crew, view: View) -> View:
@@ -164,7 +174,7 @@ def _place_with(job: Job, view: View, fit: Float[Tensor, " objects"]) -> View:
     )  # fmt: skip
     placed = run.stage(place_objects, inputs, config.place)
     traces = {**view.traces, f"people {len(view.traces)}": placed.trace}
-    return replace(view, placed=placed, traces=traces)
+    return replace(view, placed=placed, traces=traces, priced=(inputs, config.place))
 
 
 def _is_pinned(job: Job) -> Bool[Tensor, " objects"]:

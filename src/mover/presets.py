@@ -14,6 +14,7 @@ from .minimize import Adam
 from .minimize_newton import Quasi
 from .stages.align_camera import AlignConfig
 from .stages.assign_touches import AssignConfig
+from .stages.explain_placements import ExplainConfig
 from .stages.find_depth import DepthConfig
 from .stages.find_image_cues import ImageConfig
 from .stages.find_soles import SolesConfig
@@ -58,6 +59,8 @@ class Config:
     """Seats put where their contacts are (release)."""
     place: PlaceConfig = field(default_factory=PlaceConfig)
     """Stage 2: objects from the image and the people."""
+    explain: ExplainConfig = field(default_factory=ExplainConfig)
+    """What holds each object, and how well its place is known."""
     again: int = 0
     """Further passes of stage 2 with assignment and occlusion order renewed."""
     slide: bool = False

@@ -81,6 +81,14 @@ def refine_result(
     return found
 
 
+def refined_room(room: Room, capture: Capture, observe: Observer = silent) -> Room:
+    """The room with its people refined, where there are people and a floor."""
+    if room.bodies is None or not len(room.bodies.frame) or room.scene.ground is None:
+        return room
+    found = refine_bodies(room, capture, RefineBodiesConfig(), observe)
+    return replace(room, bodies=found.bodies)
+
+
 def measure_people(out: Path, truth: Path) -> dict[str, dict[str, float]]:
     """The people of a result before and after their refinement against the true ones.
 
@@ -136,10 +144,10 @@ def contacts_from(source: Path, bodies: Bodies, first: int) -> Float[Tensor, "bo
 
 
 def switched(config: RefineBodiesConfig, off: Mapping[str, bool]) -> RefineBodiesConfig:
-    """The settings without some of the evidence: camgp, sdf, contact, order."""
+    """The settings without some of the evidence: camgp, sdf, contact, order, masks."""
     terms = {
         "camgp": ("under", "stand", "lock"), "sdf": ("sink",), "contact": ("touch",),
-        "order": ("order",),
+        "order": ("order",), "masks": ("outline",),
     }  # fmt: skip
     zero: dict[str, Any] = {t: 0.0 for name, is_off in off.items() if is_off for t in terms[name]}
     return replace(config, weights=replace(config.weights, **zero))

@@ -58,7 +58,7 @@ def video_library(why: str) -> Any:  # noqa: ANN401
         InputError: If it is not installed; `why` says what needs it.
     """
     if find_spec("av") is None:
-        raise InputError(f"{why}: PyAV is not installed; pip install 'mover[render]'")
+        raise InputError(f"{why}: PyAV is not installed; pip install '.[render]' in mover's folder")
     import av
 
     return av

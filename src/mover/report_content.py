@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from . import __version__
+from .explanation_records import Explanation
 from .types import Bodies, Scene
 
 
@@ -35,6 +36,8 @@ class ReportContent:
     config: Mapping[str, Any] = field(default_factory=lambda: {})
     objects: Sequence[Mapping[str, Any]] = ()
     """Rows of the table of objects, found by `id`; other keys become columns."""
+    explanations: Sequence[Explanation] = ()
+    """Why each object of `result` stands where it stands, in their order."""
     command: str = ""
     """What the user typed."""
     version: str = __version__

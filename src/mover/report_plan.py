@@ -50,6 +50,7 @@ def draw_top(
     bodies: Bodies | None = None,
     *,
     extent: Extent | None = None,
+    over: str = "",
 ) -> str:
     """Plan of `scene` as inline SVG: x to the right, away from the camera upwards.
 
@@ -58,12 +59,14 @@ def draw_top(
         truth: Dashed footprints, in the truth's own world.
         bodies: People in the world of `scene`; their pelvises and soles are dotted.
         extent: Part of the floor to show; None: everything.
+        over: More SVG, in metres, drawn over the furniture.
     """
     extent = extent or extent_of(scene, truth, bodies)
     parts = [_grid(extent), _cone(scene.camera, extent)]
     parts += [_footprint(piece, css(colour(i))) for i, piece in enumerate(scene.pieces)]
     parts += [_dashed(piece) for piece in (truth.pieces if truth is not None else ())]
     parts += [_paths(bodies)] if bodies is not None else []
+    parts.append(over)
     parts += [_label(piece) for piece in scene.pieces]
     parts += [_bar(extent)]
     width, height = extent.right - extent.left, extent.near - extent.far

@@ -8,6 +8,7 @@ from importlib.resources import files
 from .geometry.camera import pitch_roll
 from .report_content import ReportContent
 from .report_curves import draw_curves
+from .report_doubts import doubts_list, draw_doubts
 from .report_numbers import QUANTITIES, write_quantity
 from .report_pictures import data_url, draw_comparison, shrink
 from .report_plan import draw_top, extent_of
@@ -48,6 +49,7 @@ def all_sections(content: ReportContent) -> list[str]:
             "Objects",
             objects_table(content.initial, content.result, content.objects, content.metrics),
         ),
+        _section("What holds them", doubts_list(content.explanations)),
         _running(content),
     ]
 
@@ -147,13 +149,13 @@ def _plans(content: ReportContent) -> str:
     scenes = [content.initial, content.result, content.truth]
     extent = extent_of(*scenes, content.initial_bodies, content.bodies)
     sides = (
-        ("Before", content.initial, content.initial_bodies),
-        ("After", content.result, content.bodies),
+        ("Before", content.initial, content.initial_bodies, ""),
+        ("After", content.result, content.bodies, draw_doubts(content.explanations)),
     )
     figures = "".join(
         f"<figure><figcaption>{name}</figcaption>"
-        f"{draw_top(scene, content.truth, bodies, extent=extent)}</figure>"
-        for name, scene, bodies in sides
+        f"{draw_top(scene, content.truth, bodies, extent=extent, over=over)}</figure>"
+        for name, scene, bodies, over in sides
     )
     return _section("From above", f'<div class="plans">{figures}</div>{_key(content)}')
 
@@ -164,6 +166,9 @@ def _key(content: ReportContent) -> str:
     signs = [('<path d="M8 9L13 4L18 9"/>', "front of an object")]
     if content.truth is not None:
         signs.append(('<path stroke-dasharray="4 4" d="M0 6H26"/>', "truth"))
+    if content.explanations:
+        ring = '<ellipse cx="13" cy="6" rx="12" ry="5" stroke-width="1"/>'
+        signs.append((ring, "90 % of where its middle is"))
     if content.peopled:
         signs += [(dots.format(5), "hips of people"), (dots.format(3), "their feet")]
     form = '<svg viewBox="0 0 26 12" class="sign" aria-hidden="true">'

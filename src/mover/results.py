@@ -14,6 +14,7 @@ from torch import Tensor
 from . import __version__, records
 from .bodies.world import in_world
 from .edits import Edit
+from .explanation_file import log_rows, scene_fields
 from .export import write_glb
 from .presets import Config
 from .readers.bodies_file import write_bodies
@@ -51,7 +52,7 @@ def write_results(
     if origin.edits:
         write_edits(origin.edits, out / "edits.json")
     _write_log(room, config, run, origin)
-    write_scene(room.scene, out / "scene.json")
+    write_scene(room.scene, out / "scene.json", scene_fields(room.explanations))
     return write_report(out, report_of(capture, room, config, run))
 
 
@@ -91,6 +92,7 @@ def report_of(
         stages=[dataclasses.asdict(s) for s in run.stages],
         config=records.plain(config),
         objects=[dataclasses.asdict(e) for e in room.evidence],
+        explanations=room.explanations,
         command=command_line(),
     )
 
@@ -124,6 +126,7 @@ def _write_log(room: Room, config: Config, run: Run, origin: Origin) -> None:
         "stages": [dataclasses.asdict(s) for s in run.stages],
         "warnings": list(room.warnings),
         "evidence": [dataclasses.asdict(e) for e in room.evidence],
+        "explanations": log_rows(room.explanations),
         "camera_covariance": _rows(room.covariance),
         "traces": {name: _thinned(trace) for name, trace in room.traces.items()},
     }

@@ -69,7 +69,9 @@ def settle(scene: Scene, run: Run, config: SettleConfig | None = None) -> tuple[
         InputError: If mujoco is not installed.
     """
     if find_spec("mujoco") is None:
-        raise InputError("mover settle: mujoco is not installed; pip install 'mover[physics]'")
+        raise InputError(
+            "mover settle: mujoco is not installed; pip install '.[physics]' in mover's folder"
+        )
     mujoco: Any = import_module("mujoco")
     config = config or SettleConfig()
     solids = solids_of(scene, run)

@@ -5,21 +5,20 @@ from typing import Literal
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from .explanation_records import Explanation
 from .records import record
 
 
 @record
 class Camera:
-    """A pinhole camera that stands still at the world origin (x right, y down, z forward)."""
+    """A pinhole camera, still at the world origin (x right, y down, z forward); picture in [px]."""
 
     K: Float[Tensor, "3 3"]
     """Intrinsics [px]; the centre of the top-left pixel is (0.5, 0.5)."""
     R_cam_world: Float[Tensor, "3 3"]
     """Maps world (+y up, viewing direction without x) to camera axes."""
     width: int
-    """Image width [px]."""
     height: int
-    """Image height [px]."""
 
 
 @record
@@ -111,13 +110,11 @@ class BodyPose:
 
 @record
 class Bodies:
-    """People in all frames: one row for each (frame, person), one topology."""
+    """People in all frames: one row for each (frame, person), one topology; places in [m]."""
 
     verts: Float[Tensor, "bodies verts 3"]
-    """Vertices [m]."""
     faces: Int[Tensor, "faces 3"]
     joints: Float[Tensor, "bodies joints 3"] | None
-    """Joint places [m]."""
     joint_names: tuple[str, ...]
     frame: Int[Tensor, " bodies"]
     person: Int[Tensor, " bodies"]
@@ -161,11 +158,13 @@ class Capture:
     touch: Float[Tensor, "bodies verts"] | None
     """Chance that a body's vertex touches something, where the user has it (POSA, DECO)."""
     warnings: tuple[str, ...]
+    hypotheses: tuple[Piece, ...] = ()
+    """Other places and shapes of the scene's objects, under their ids: further starts."""
 
 
 @record
 class Objects:
-    """The furniture, packed: closed proxies at their initial size, each in its own frame.
+    """The furniture, packed: closed proxies at their initial size [m], each in its own frame.
 
     The origin of a frame is the centre of the box's bottom, +y is up, +z the front. Arrays are
     padded: vertices and points by repetition, faces and edges by zeros (degenerate).
@@ -175,7 +174,6 @@ class Objects:
     categories: tuple[str, ...]
     """Canonical names."""
     verts: Float[Tensor, "objects verts 3"]
-    """[m]."""
     real_verts: Bool[Tensor, "objects verts"]
     """False where vertices pad."""
     faces: Int[Tensor, "objects faces 3"]
@@ -248,3 +246,5 @@ class Room:
     traces: dict[str, Tensor]
     """Total energy before each step, by stage."""
     warnings: tuple[str, ...]
+    explanations: tuple[Explanation, ...] = ()
+    """Why each object stands where it stands; empty: nobody asked."""

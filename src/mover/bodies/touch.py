@@ -32,11 +32,13 @@ LAYER = (
     0.03,
 )  # [m] from what reaches farthest: a flat surface is not touched, surely touched
 PALM = (0.04, 0.015)  # the same for a hand
-STILL = (0.1, 0.3)  # [m/s] of hands and feet: at rest, surely moving
+STILL = (0.1, 0.3)  # [m/s] of hands: at rest, surely moving
+STANCE = (0.3, 0.8)  # [m/s] of soles, which tremble more and swing faster
 SURFACE = (0.25, 1.1)  # [m] over the ground: where hands find something to rest on
 LAP = 0.17  # [m] from the middle of the own thigh: a hand there rests on the lap
 LEVEL_ARM = 35.0  # [degrees] from level, at most, of a forearm that rests
-SOLE = (0.03, 0.07)  # [m] over the ground: stands on it, surely not
+SOLE = (0.03, 0.07)  # [m] over the lowest point of the body: stands on it, surely not
+FLOATS = (0.08, 0.16)  # [m] of that point from the ground: on the floor, surely not
 UNDERSIDE = 0.1  # [m] over the lowest point: where a body that lies on its front or side touches
 
 
@@ -169,13 +171,20 @@ def _from_lap(
 
 
 def _stand(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies verts"]:
-    """Soles: still, and on the ground."""
-    near = _ramp(bodies.verts[..., 1] - ground, SOLE[1], SOLE[0])
+    """Soles: hardly moving, and as low as the body reaches, which is about the ground.
+
+    A body whose depth is wrong floats or sinks by some centimetres: its own lowest point tells
+    which foot carries it, the ground only whether it stands on the floor at all.
+    """
+    height = bodies.verts[..., 1]
+    lowest = height.amin(1, keepdim=True)
+    floor = _ramp((lowest - ground).abs(), FLOATS[1], FLOATS[0])
+    near = _ramp(height - lowest, SOLE[1], SOLE[0]) * floor
     chance = torch.zeros_like(near)
     for name in PARTS[:2]:
         part = members(parts, name)
         if part.any():
             middle = bodies.verts[:, part].mean(1, keepdim=True)
-            rest = _ramp(speeds(middle, bodies)[:, 0], STILL[1], STILL[0])
+            rest = _ramp(speeds(middle, bodies)[:, 0], STANCE[1], STANCE[0])
             chance = torch.maximum(chance, near * part * rest[:, None])
     return chance

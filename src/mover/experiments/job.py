@@ -1,4 +1,4 @@
-"""One job of an experiment: make a known room with noise, or rebuild it with a preset and measure.
+"""One job of an experiment: make a known room with noise, or rebuild it and measure.
 
 Each job is a process of its own (`python -m mover.experiments.job SET SEED NAME FOLDER`) with one
 thread, so that its numbers depend on nothing but its inputs.
@@ -7,6 +7,7 @@ thread, so that its numbers depend on nothing but its inputs.
 import json
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,20 +16,26 @@ from typing import Any
 import torch
 
 from .. import __version__, records
-from ..evaluate import EvaluateConfig, EvaluatedBodies, evaluate
+from ..evaluate import EvaluateConfig
+from ..minimize import Observer, silent
 from ..pipeline import reconstruct
-from ..presets import PRESETS, Config
-from ..rooms import KnownRoom, NoiseConfig, add_noise, make_room
+from ..rooms import KnownRoom, RoomConfig, add_noise, make_room
 from ..run import Run, sources
-from ..types import Bodies, Capture, Room, Scene
-from .traits import Traits, hidden_shares
+from ..types import Scene
+from .changes import set_named
+from .measures import Trial, carry_all, measure, measure_people, measure_truth, timing
+from .sets import RoomSet
+from .traits import traits_of
+from .variants import VARIANTS, Variant
+from .withheld import frames_of, withheld
 
-ROOM = "room"  # the job that makes the room; all others have the name of their preset
+ROOM = "room"  # the job that makes the room; all others have the name of their variant
 DONE = "metrics.json"  # a job that has it is finished
-SETS = {"rooms": NoiseConfig()}
-"""Generated rooms with their noise; the standard noise is the default one."""
+TRUTHS = "truths"  # folder of rooms without noise, which sets share
 STAGES = {"initial": "Initial", "image": "Stage 1", "full": "Full"}
 """Scenes that are measured, by their name in the files."""
+USES = {"sit": "sit", "lean": "sit", "lie": "lie", "left hand": "hand", "right hand": "hand"}
+"""Interactions that are told apart, by the action of a known room."""
 
 
 @dataclass(frozen=True)
@@ -36,35 +43,32 @@ class Job:
     """One process of an experiment."""
 
     rooms: str
-    """Name of a set in `SETS`."""
+    """Name of a set, see `changes.set_named`."""
     seed: int
     name: str
-    """A preset, or `ROOM`."""
+    """A variant, or `ROOM`."""
     out: Path
     """Folder of the experiment."""
 
     @property
+    def home(self) -> Path:
+        """Where the jobs of its room are, and the stages that they share."""
+        return self.out / self.rooms / str(self.seed)
+
+    @property
     def folder(self) -> Path:
         """Where its files are."""
-        return self.out / self.rooms / str(self.seed) / self.name
+        return self.home / self.name
 
     @property
     def room(self) -> Path:
         """What the room of its seed is stored as."""
-        return self.out / self.rooms / str(self.seed) / ROOM / ROOM
+        return self.home / ROOM / ROOM
 
-
-@records.record
-class Trial:
-    """A known room as the method gets it, and the truth."""
-
-    capture: Capture
-    """With noise."""
-    truth: Scene
-    bodies: Bodies | None
-    """The true people."""
-    traits: tuple[Traits, ...]
-    """Of the true objects, in their order."""
+    @property
+    def truths(self) -> Path:
+        """Where rooms of its seed without noise are kept, for all sets."""
+        return self.out / TRUTHS / str(self.seed)
 
 
 @records.record
@@ -75,83 +79,100 @@ class Rebuilt:
     full: Scene
 
 
-def noisy_room(seed: int, noise: NoiseConfig) -> Trial:
-    """A generated room with noise."""
-    room = make_room(seed)
-    return Trial(add_noise(room, noise, seed), room.truth, room.bodies, traits_of(room))
+@dataclass(frozen=True)
+class Seed:
+    """What a room is drawn from."""
+
+    seed: int
 
 
-def traits_of(room: KnownRoom) -> tuple[Traits, ...]:
-    """What each object of a generated room is, who uses it and how well it is seen."""
-    used = set(room.touched.unique().tolist())
-    rows = zip(room.truth.pieces, hidden_shares(room.truth), strict=True)
-    return tuple(
-        Traits(piece.id, piece.category, index in used, hidden)
-        for index, (piece, hidden) in enumerate(rows)
+def make_truth(inputs: Seed, config: RoomConfig, observe: Observer = silent) -> KnownRoom:
+    """A room without noise, as a stage: sets with the same rooms make it once."""
+    del observe
+    return make_room(inputs.seed, config)
+
+
+def noisy_room(seed: int, rooms: RoomSet, run: Run | None = None) -> Trial:
+    """A generated room of a set, with the noise of the set; `run` keeps the one without noise."""
+    recipe = Seed(seed)
+    room = (
+        make_truth(recipe, rooms.room) if run is None else run.stage(make_truth, recipe, rooms.room)
     )
+    return spoilt(room, seed, rooms)
+
+
+def spoilt(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
+    """A known room with the noise of a set."""
+    capture = add_noise(room, rooms.noise, seed)
+    traits = traits_of(room, capture.scene)
+    return Trial(capture, room.truth, room.bodies, traits, doing_of(room))
+
+
+def doing_of(room: KnownRoom) -> tuple[str, ...]:
+    """For each body how it uses which piece, such as `sit chair_0`; empty: it uses none."""
+    names: list[str] = []
+    for action, touched in zip(room.actions, room.touched, strict=True):
+        pieces = Counter(touched[touched >= 0].tolist())
+        known = USES.get(action) if pieces else None
+        most = max(pieces, key=lambda k: (pieces[k], -k)) if pieces else -1
+        names.append(f"{known} {room.truth.pieces[most].id}" if known else "")
+    return tuple(names)
 
 
 def key_of(job: Job) -> str:
     """Digest of everything that a job's numbers depend on."""
-    settings = None if job.name == ROOM else PRESETS[job.name]
-    return records.fingerprint(SETS[job.rooms], job.seed, job.name, settings, sources())
+    settings = None if job.name == ROOM else VARIANTS[job.name]
+    rooms = set_named(job.rooms)
+    return records.fingerprint(
+        rooms.room, rooms.noise, rooms.version, job.seed, job.name, settings, sources()
+    )
 
 
 def do_job(job: Job) -> None:
     """Do one job, from what is left of it on disk, and write its results."""
     if job.name == ROOM:
-        store_room(job, noisy_room(job.seed, SETS[job.rooms]))
+        store_room(job, noisy_room(job.seed, set_named(job.rooms), Run(job.truths)))
     else:
-        rebuild(job, PRESETS[job.name])
+        rebuild(job, VARIANTS[job.name])
 
 
-def store_room(job: Job, trial: Trial) -> None:
-    """Keep a room for the jobs that rebuild it."""
+def store_room(job: Job, trial: Trial, densities: EvaluateConfig | None = None) -> None:
+    """Keep a room for the jobs that rebuild it, and measure the truth itself."""
     records.save(trial, job.room)
-    _finish(job, {"objects": len(trial.truth.pieces)})
+    truth = measure_truth(trial, densities)
+    _finish(job, {"truth": truth})
 
 
-def rebuild(job: Job, config: Config, densities: EvaluateConfig | None = None) -> None:
-    """Rebuild a stored room with one configuration and measure it."""
+def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None) -> None:
+    """Rebuild a stored room as a variant does and measure it."""
     if not job.room.with_name(DONE).exists():
         raise FileNotFoundError(f"the room of seed {job.seed} could not be made")
     trial = records.load(Trial, job.room)
-    room = reconstruct(trial.capture, config, Run(job.folder))
-    records.save(Rebuilt(room.image_only, room.scene), job.folder / "scenes")
-    _finish(job, measure(trial, room, densities))
-    shutil.rmtree(job.folder / "stages")
+    capture = withheld(trial.capture, variant.hears, variant.cut)
+    run = Run(job.folder if variant.fresh else job.home)
+    room = reconstruct(capture, variant.config, run)
+    if room.bodies is None or variant.cut is not None:
+        room = carry_all(room, trial.capture)
+    stages = timing(run.stages)
+    if variant.bodies:
+        found = measure_people(trial, room, variant.bodies)
+    else:
+        records.save(Rebuilt(room.image_only, room.scene), job.folder / "scenes")
+        found = measure(trial, room, run, densities)
+    _finish(job, found | {"stages": stages, **_length(trial, variant)})
+    shutil.rmtree(job.folder / "stages", ignore_errors=True)
 
 
-def measure(trial: Trial, room: Room, densities: EvaluateConfig | None = None) -> dict[str, Any]:
-    """All metrics of the initial scene, of Stage 1 and of the full method, object by object.
-
-    Stage 1 has camera, ground and people of the full method: only the furniture differs.
-    """
-    bodies = EvaluatedBodies(trial.capture.bodies, room.bodies, trial.bodies)
-    image, full = (
-        evaluate(trial.capture.scene, scene, trial.truth, bodies, densities)
-        for scene in (room.image_only, room.scene)
-    )
-    rows = zip(trial.traits, image["objects"], full["objects"], strict=True)
-    objects = [
-        {
-            "id": traits.id,
-            "category": traits.category,
-            "touched": traits.touched,
-            "hidden": traits.hidden,
-            "initial": one["initial"],
-            "image": one["result"],
-            "full": other["result"],
-        }
-        for traits, one, other in rows
-    ]
-    return {
-        "initial": full["initial"],
-        "image": image["result"],
-        "full": full["result"],
-        "objects": objects,
-        "warnings": list(room.warnings),
-    }
+def _length(trial: Trial, variant: Variant) -> dict[str, float]:
+    """How many frames and seconds were given, and how many different interactions are in them."""
+    given, truth = trial.capture.bodies, trial.bodies
+    if given is None or truth is None or variant.hears == "nobody":
+        return {"frames": 0, "seconds": 0.0, "interactions": 0}
+    frames = given.frame.unique() if variant.cut is None else frames_of(given, variant.cut)
+    seen = torch.isin(truth.frame, frames).tolist()
+    uses = {name for name, there in zip(trial.doing, seen, strict=False) if there and name}
+    seconds = len(frames) / given.fps if given.fps else 0.0
+    return {"frames": len(frames), "seconds": seconds, "interactions": len(uses)}
 
 
 def _finish(job: Job, results: dict[str, Any]) -> None:

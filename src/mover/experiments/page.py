@@ -35,7 +35,8 @@ class Line:
 
 def fill_page(command: str, made_by: str, lines: Sequence[Line], notes: Sequence[str]) -> str:
     """The whole page but for the pictures."""
-    objects = ("objects", "touched objects", "untouched objects", "hidden objects")
+    kinds = ("touched", "untouched", "hidden", "truncated", "flipped")
+    objects = ("objects", *(f"{kind} objects" for kind in kinds))
     few = ("iou3d", "p2s", "iou2d", "yaw_error", "center_error", "size_error")
     parts = [
         "# Known rooms",

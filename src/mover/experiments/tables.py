@@ -16,13 +16,16 @@ from .. import __version__
 from ..metrics_scene import OBJECT_METRICS
 from ..records import plain, replacing
 from ..run import sources
-from .job import SETS, STAGES
+from .changes import set_named
+from .job import STAGES
 from .page import Line, fill_page
 
 HIDDEN = 0.3  # share of an object that others hide, from which on it counts as hidden
+CUT = 0.1  # share of an object that the border of the image cuts off, likewise
 TURNED = math.radians(45)  # an object with a larger yaw error is turned
 BAD = 0.25  # IoU3D below which an object is lost
-ABOUT = ("seed", "preset", "stage", "object", "category", "touched", "hidden")
+TRAITS = ("category", "touched", "hidden", "truncated", "flipped", "stays")
+ABOUT = ("seed", "preset", "stage", "object", *TRAITS)
 SHOWN = (
     "iou3d", "p2s", "iou2d", "yaw_error", "center_error", "size_error", "contact_f1",
     "non_collision", "contact", "penetration_depth", "pitch_error", "roll_error", "ground_error",
@@ -52,6 +55,8 @@ class Outcome:
     scenes: Mapping[str, Mapping[str, float]]
     """Metrics of each stage of `STAGES`."""
     objects: tuple[Row, ...]
+    false: int = 0
+    """Objects of the result that the truth does not have."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,8 @@ def read_outcome(path: Path) -> Outcome:
     tree = json.loads(path.read_text())
     version = f"{tree['version']} ({tree['sources']})"
     scenes = {stage: tree[stage] for stage in STAGES}
-    return Outcome(tree["seed"], tree["name"], version, scenes, tuple(tree["objects"]))
+    false = len(tree.get("unmatched", {}).get("false", ()))
+    return Outcome(tree["seed"], tree["name"], version, scenes, tuple(tree["objects"]), false)
 
 
 def write_tables(experiment: Experiment, pictures: Sequence[str], folder: Path) -> Path:
@@ -88,7 +94,12 @@ def write_tables(experiment: Experiment, pictures: Sequence[str], folder: Path) 
         for x in lines
     ]
     _write_csv(folder / "summary.csv", (*about, *SHOWN), flat)
-    page = fill_page(experiment.command, _made_by(experiment), lines, _notes(experiment, objects))
+    page = fill_page(
+        experiment.command,
+        made_by(x.version for x in experiment.outcomes),
+        lines,
+        _notes(experiment, objects),
+    )
     with replacing(folder / "summary.md") as part:
         part.write_text(page + "".join(f"\n![{name}]({name})\n" for name in pictures))
     return folder / "summary.md"
@@ -100,7 +111,7 @@ def object_rows(experiment: Experiment) -> list[Row]:
     for outcome, stage, preset in _scenes(experiment):
         for item in outcome.objects:
             about = {"seed": outcome.seed, "preset": preset, "stage": stage, "object": item["id"]}
-            traits = {name: item[name] for name in ("category", "touched", "hidden")}
+            traits = {name: item[name] for name in TRAITS}
             rows.append({**about, **traits, **item[stage]})
     return rows
 
@@ -130,6 +141,8 @@ def summarise(objects: Sequence[Row], rooms: Sequence[Row]) -> list[Line]:
         ("touched objects", lambda row: row["touched"]),
         ("untouched objects", lambda row: not row["touched"]),
         ("hidden objects", lambda row: row["hidden"] >= HIDDEN),
+        ("truncated objects", lambda row: row["truncated"] >= CUT),
+        ("flipped objects", lambda row: row["flipped"]),
     )
     lines = _means("rooms", rooms)
     for over, belongs in kinds:
@@ -167,9 +180,9 @@ def _cell(value: object) -> object:
     return f"{value:.6g}" if isinstance(value, float) else value
 
 
-def _made_by(experiment: Experiment) -> str:
-    """Version and machine; a mixture of versions is told."""
-    versions = sorted({outcome.version for outcome in experiment.outcomes})
+def made_by(found: Iterable[str]) -> str:
+    """Versions of the program that did the jobs, and this machine; a mixture is told."""
+    versions = sorted(set(found))
     version = " and ".join(versions) or f"{__version__} ({sources()[:16]})"
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
     parts = f"Python {platform.python_version()}, torch {torch.__version__}, {machine}"
@@ -183,12 +196,21 @@ def _notes(experiment: Experiment, objects: Sequence[Row]) -> list[str]:
     used = sum(row["touched"] for row in first)
     hidden = sum(row["hidden"] >= HIDDEN for row in first)
     found = len({row["seed"] for row in first})
-    noise = ", ".join(f"{n} {v:g}" for n, v in plain(SETS[experiment.rooms]).items() if v)
+    noise = ", ".join(
+        f"{n} {v:g}" for n, v in plain(set_named(experiment.rooms).noise).items() if v
+    )
     notes = [
         f"{found} of {len(experiment.seeds)} rooms, {len(first)} objects: {used} touched by people,"
         f" {len(first) - used} not, {hidden} hidden by other furniture by {HIDDEN:.0%} or more.",
         f"Noise: {noise}.",
     ]
+    missed = sum("center_error" not in row for row in first)
+    false = sum({outcome.seed: outcome.false for outcome in experiment.outcomes}.values())
+    if missed or false:
+        notes.append(
+            f"**{missed} objects were not given: they count with IoU 0** and have no other metric."
+            f" {false} were given that are not there: they are in no mean of objects."
+        )
     for failure in experiment.failures:
         notes.append(f"**Failed**: seed {failure.seed}, {failure.name}: {failure.reason}")
     expected = len(experiment.seeds) * len(experiment.presets)

@@ -14,5 +14,7 @@ def pxr(name: str) -> Any:  # noqa: ANN401
         InputError: If usd-core is not installed.
     """
     if find_spec("pxr") is None:
-        raise InputError("--to usd: usd-core is not installed; pip install 'mover[usd]'")
+        raise InputError(
+            "--to usd: usd-core is not installed; pip install '.[usd]' in mover's folder"
+        )
     return import_module(f"pxr.{name}")

@@ -1,7 +1,8 @@
-"""A balanced tree over the triangles of a mesh, four levels deep.
+"""A balanced tree over the triangles of a mesh: nodes with eight children, leaves of eight faces.
 
 Its shape depends on the number of triangles only, so that it is laid out once and only its boxes
-follow the poses.
+follow the poses. The eight children of a node lie together in a pack, so that one instruction
+serves all of them.
 """
 
 from dataclasses import dataclass
@@ -12,37 +13,56 @@ from torch import Tensor
 
 from .nearest import as_float64, as_int64
 
-LEVELS = 4
-LEAF = 8  # triangles of a leaf, at most, but for huge meshes
-MOST = 5  # halvings from one level to the next, at most
+EIGHT = 8
 
 
 @dataclass(frozen=True)
 class FaceTree:
-    """The triangles in the order of the leaves; node k of a level has children k * branches, ..."""
+    """Slot s is lane s % 8 of pack s // 8; the children of slot s are the pack s + `shift`.
 
-    faces: np.ndarray
-    first: np.ndarray
-    """First triangle of each leaf, and an end."""
-    branches: int
-    """Children of a node, and nodes of the first level."""
+    The first pack holds the nodes of the first level in its last lanes.
+    """
 
-    def starts(self) -> list[int]:
-        """Number of the first node of each level, and the number of nodes."""
-        sizes = [self.branches ** (level + 1) for level in range(LEVELS)]
-        return [0, *np.cumsum(sizes).tolist()]
+    corners: np.ndarray
+    """Of each leaf (leaves 4 8): lowest, second and highest vertex of its eight faces, and 1, or -1
+    where that order turns a face over, or 0 where a face stands there a second time."""
+    shift: int
+    base: int
+    """Slot of the first leaf."""
+    levels: tuple[int, ...]
+    """First pack of each level, and the number of packs."""
+
+    def inner(self) -> list[tuple[int, int, int]]:
+        """Levels above the leaves, from below: first pack of the children, first slot, nodes."""
+        pairs = list(zip(self.levels[1:-1], self.levels[2:], strict=True))
+        return [(first, first - self.shift, end - first) for first, end in reversed(pairs)]
 
 
 def face_tree(verts: Tensor, faces: Int[Tensor, "faces 3"]) -> FaceTree:
     """Halve the triangles again and again across their longest side."""
     triangles = as_int64(faces)
-    count, halvings = len(triangles), 0
-    while count > LEAF << (LEVELS * halvings) and halvings < MOST:
-        halvings += 1
-    order = _order(as_float64(verts)[triangles].mean(1), LEVELS * halvings)
-    leaves = 1 << (LEVELS * halvings)
-    first = np.arange(leaves + 1) * count // leaves
-    return FaceTree(triangles[order].astype(np.int32), first.astype(np.int32), 1 << halvings)
+    halvings = max(0, int(np.ceil(np.log2(len(triangles) / EIGHT))))
+    top = 1 << ((halvings - 1) % 3 + 1) if halvings else 1
+    order = _order(as_float64(verts)[triangles].mean(1), halvings)
+    packs, nodes = [0, 1], top
+    while nodes < 1 << halvings:
+        packs.append(packs[-1] + nodes)
+        nodes *= EIGHT
+    base = EIGHT * packs[-2] if len(packs) > 2 else EIGHT - top
+    return FaceTree(_corners(triangles[order], halvings), top - EIGHT + 1, base, tuple(packs))
+
+
+def _corners(triangles: np.ndarray, halvings: int) -> np.ndarray:
+    """See `FaceTree.corners`."""
+    first = np.arange((1 << halvings) + 1) * len(triangles) // (1 << halvings)
+    lane = np.arange(EIGHT)
+    count = np.diff(first)[:, None]
+    picked = triangles[first[:-1, None] + np.minimum(lane, count - 1)]
+    rank = picked.argsort(-1, kind="stable")
+    turned = (rank[..., 1] - rank[..., 0]) % 3 == 1
+    side = np.where(turned, 1, -1) * (lane < count)
+    ordered = np.take_along_axis(picked, rank, -1)
+    return np.concatenate([ordered, side[..., None]], -1).swapaxes(1, 2).astype(np.int32)
 
 
 def _order(center: np.ndarray, halvings: int) -> np.ndarray:

@@ -18,7 +18,7 @@ def layers(
     items, n_verts, _ = verts_cam.shape
     points = verts_cam.detach().float().contiguous()
     front = points.new_zeros(items, views.height, views.width)
-    leave = torch.zeros_like(front)
+    leave = torch.full_like(front, -0.0)  # whose inverse is what stands for no exit
     if front.numel() * n_verts * len(faces) > 0:
         K = views.K.to(points)
         window = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]], -1).contiguous()
@@ -35,8 +35,4 @@ def layers(
         windows = wp.from_torch(window, dtype=wp.vec4)
         launch(exits.project, (items, n_verts), verts, windows, screen)
         launch(exits.draw, (items, len(faces)), screen, table, *maps)
-        for values, nothing in zip(maps, (torch.inf, -torch.inf), strict=True):
-            launch(exits.depth, (items, views.height), values, nothing)
-    else:
-        front, leave = front + torch.inf, leave - torch.inf
-    return Layers(front.to(verts_cam), leave.to(verts_cam))
+    return Layers(front.reciprocal_().to(verts_cam), leave.reciprocal_().to(verts_cam))

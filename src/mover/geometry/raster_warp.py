@@ -57,7 +57,7 @@ def first_hit(
     face = torch.full(size, -1, dtype=torch.int32, device=verts_cam.device)
     if len(verts_cam):
         shape = Topology(faces[None], faces.new_zeros(1, 0, 4))
-        items = _items(verts_cam[None], shape, Views(K[None], *size), border=0)
+        items = items_of(verts_cam[None], shape, Views(K[None], *size), border=0)
         _driver(items).first_hit(items, depth, face)
     return depth, face.long()
 
@@ -73,7 +73,7 @@ def _maps(verts_cam: Tensor, shape: Topology, views: Views, asked: Asked) -> Map
     one = len(views.K)
     most = MOST // max(views.height * views.width, n_verts)
     parts = flat.split(max(one, most // one * one))
-    drawn = [_Look.apply(v, _items(v, shape, views, BORDER), asked) for v in parts]
+    drawn = [_Look.apply(v, items_of(v, shape, views, BORDER), asked) for v in parts]
     image, nearest, farthest, covered = (
         (m[0] if len(m) == 1 else torch.cat(m)) for m in zip(*drawn, strict=True)
     )
@@ -84,8 +84,8 @@ def _maps(verts_cam: Tensor, shape: Topology, views: Views, asked: Asked) -> Map
     return Maps(shaped(image), shaped(nearest), shaped(farthest), shaped(covered))
 
 
-def _items(verts: Tensor, shape: Topology, views: Views, border: int) -> Items:
-    """Lay out the inputs as the kernels read them."""
+def items_of(verts: Tensor, shape: Topology, views: Views, border: int) -> Items:
+    """The inputs as the kernels read them; `border` [px] lies around the windows."""
     K = views.K.to(verts)
     window = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2] + border, K[:, 1, 2] + border], -1)
     edges = shape.edges[:, : None if shape.faces.shape[1] else 0]

@@ -16,12 +16,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .face_tree import LEVELS, FaceTree, face_tree
+from .face_tree import EIGHT, FaceTree, face_tree
 from .kernels.start import kernels, started
+from .nearest import as_int64
 from .volume_record import Volume
 
-BLOCK = 4  # [cells], side of the blocks that are marked as near the surface
-LIST = 256  # leaves that are searched for a block of places, at most
 REACH = 2  # [cells], that the shell reaches out of the body
 
 
@@ -30,6 +29,8 @@ class Tools:
     """What the bodies of one union share."""
 
     tree: FaceTree
+    faces: np.ndarray
+    """Triangles, as they were given."""
     verts: Tensor
     """Bodies in the world [m], float32."""
     grid: Volume
@@ -46,7 +47,7 @@ class Scratch:
     """The volume of the bodies that this worker measured."""
     places: int = 0
     blocks: int = 0
-    lists: int = 0
+    stacks: int = 0
 
 
 def union_bodies(
@@ -111,13 +112,13 @@ def _tools(verts: Tensor, faces: Tensor, grid: Volume) -> Tools:
     device = str(started().device_from_torch(verts.device))
     for name in ("bodies", "crossings", "lower"):
         kernels(name, device)  # before there are threads
-    return Tools(face_tree(verts[0], faces), verts, grid, device)
+    return Tools(face_tree(verts[0], faces), as_int64(faces).astype(np.int32), verts, grid, device)
 
 
 def _scratch(tools: Tools) -> Scratch:
     import warp as wp
 
-    from .kernels.bodies import Work
+    from .kernels.bodies import Pair, Work
 
     field, tree = tools.grid.values.detach().clone().contiguous(), tools.tree
 
@@ -125,7 +126,9 @@ def _scratch(tools: Tools) -> Scratch:
     work.origin = wp.vec3d(*tools.grid.origin.double().tolist())
     work.cell = tools.grid.cell
     work.tree = _tree(tree, tools.device)
-    work.faces = wp.array(tree.faces, dtype=wp.vec3i, device=tools.device)
+    work.faces = wp.array(tools.faces, dtype=wp.vec3i, device=tools.device)
+    work.lines = _blank(tools.verts.shape[1], Pair, tools.device)
+    work.at = _blank(tools.verts.shape[1], wp.vec3, tools.device)
     work.place = _blank(tools.verts.shape[1], wp.vec3d, tools.device)
     work.turn = _blank(1, wp.float64, tools.device)
     work.beside = int(tools.device == "cpu")  # where columns are measured one after another
@@ -140,16 +143,13 @@ def _tree(shape: FaceTree, device: str) -> Any:  # noqa: ANN401
 
     from .kernels.bodies import Tree
 
-    tree, starts = Tree(), shape.starts()
-    tree.branches, tree.start = shape.branches, type(tree.start)(*starts)
-    tree.first = wp.array(shape.first, dtype=wp.int32, device=device)
-    tree.corners = _blank(3 * len(shape.faces), wp.vec3, device)
-    boxes = starts[-1] + len(shape.faces)
-    tree.below, tree.above = _blank(boxes, wp.vec3, device), _blank(boxes, wp.vec3, device)
-    tree.plane = _blank(len(shape.faces), wp.vec4, device)
-    leaves = len(shape.first) - 1
-    tree.slab, tree.thick = _blank(leaves, wp.vec4, device), _blank(leaves, wp.float32, device)
-    tree.longest = max(LIST, shape.branches**2)  # a node of the second level must fit
+    tree, packs = Tree(), shape.levels[-1]
+    tree.shift, tree.base, tree.longest = shape.shift, shape.base, EIGHT * (len(shape.levels) + 1)
+    tree.corners = wp.array(shape.corners.ravel(), dtype=wp.int32, device=device)
+    empty = np.repeat(np.array([1e30, -1e30], np.float32), 3 * EIGHT)
+    tree.boxes = wp.array(np.tile(empty, packs), dtype=wp.float32, device=device)
+    tree.shapes = _blank(17 * EIGHT * len(shape.corners), wp.float32, device)
+    tree.slabs = _blank(EIGHT * len(shape.corners), wp.float32, device)
     return tree
 
 
@@ -164,7 +164,7 @@ def add_body(tools: Tools, scratch: Scratch, body: int) -> None:
     from .kernels import bodies, crossings, lower
 
     verts = tools.verts[body]
-    box = torch.stack([verts.amin(0), verts.amax(0)]).double().cpu()
+    box = torch.stack([torch.stack(verts[:, k].aminmax()) for k in range(3)], 1).double().cpu()
     if not bool(box.isfinite().all()):
         raise ValueError(f"union_bodies: body {body} has vertices that are not finite")
     ends = ((box - tools.grid.origin.double().cpu()) / tools.grid.cell).numpy()
@@ -182,9 +182,9 @@ def add_body(tools: Tools, scratch: Scratch, body: int) -> None:
         wp.launch(kernel, dim, [work, *rest], device=tools.device)
 
     launch(bodies.place, len(verts))
-    launch(bodies.leaves, tools.tree.branches**LEVELS)
-    for level in reversed(range(LEVELS - 1)):
-        launch(bodies.inner, tools.tree.branches ** (level + 1), level)
+    launch(bodies.leaves, len(tools.tree.corners))
+    for pack, first, count in tools.tree.inner():
+        launch(bodies.inner, count, pack, first)
     launch(crossings.cross, work.faces.shape[0])
     launch(lower.blocks, _columns(shape))
 
@@ -200,21 +200,23 @@ def _resized(tools: Tools, scratch: Scratch, shape: np.ndarray) -> Any:  # noqa:
 
     work = scratch.work
     places = int(shape[0] * shape[2] * (shape[1] + 1))
-    blocks = int((shape // BLOCK + 1).prod())
+    blocks = int(((shape + 1) // 2).prod())
     if places > scratch.places:
         scratch.places = places * 5 // 4
         work.steps = _blank(scratch.places, wp.int32, tools.device)
-        work.owner = wp.full(scratch.places, -1, dtype=wp.int32, device=tools.device)
     if blocks > scratch.blocks:
         scratch.blocks = blocks * 5 // 4
         work.near = _blank(scratch.blocks, wp.uint8, tools.device)
-    lists = 1 if work.beside else _columns(shape)
-    if lists > scratch.lists:
-        scratch.lists = lists
-        work.tree.leaves = _blank(lists * work.tree.longest, wp.int32, tools.device)
+        work.owner = _blank(scratch.blocks, wp.int32, tools.device)
+        work.crossed = _blank(scratch.blocks, wp.uint8, tools.device)
+    stacks = 1 if work.beside else _columns(shape)
+    if stacks > scratch.stacks:
+        scratch.stacks = stacks
+        work.tree.stack = _blank(stacks * work.tree.longest, wp.int32, tools.device)
     work.turn.zero_()
     work.steps[:places].zero_()
     work.near[:blocks].zero_()
+    work.crossed[: _columns(shape)].zero_()
     return work
 
 

@@ -12,10 +12,11 @@ from ..minimize import Observer, Step, silent
 from ..readers.masks import encode
 from ..records import record
 from ..types import Masks
-from .models import ModelsConfig, Network, network
+from .models import ModelsConfig, Network, instance_reader, network
 from .video import Clip, read_picture
 
 PERSON = "person"
+TASK = "instance"  # what OneFormer is asked for
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,13 @@ def instances(
     net: Network, pictures: Sequence[Any], frames: Sequence[int], config: DetectConfig
 ) -> Finds:
     """What the network sees in a batch of pictures."""
-    inputs = net.processor(images=list(pictures), return_tensors="pt").to(net.device)
+    words = net.model.config.model_type == "oneformer"
+    told: dict[str, Any] = {"task_inputs": [TASK] * len(pictures)} if words else {}
+    inputs = net.processor(images=list(pictures), return_tensors="pt", **told).to(net.device)
     with torch.inference_mode():
         outputs = net.model(**inputs)
     sizes = [picture.shape[:2] for picture in pictures]
-    found = net.processor.post_process_instance_segmentation(
+    found = instance_reader(net).post_process_instance_segmentation(
         outputs, threshold=config.score, target_sizes=sizes, return_binary_maps=True
     )
     return finds_of(found, frames, sizes[0], net.model.config.id2label, config.least)

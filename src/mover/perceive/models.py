@@ -17,6 +17,10 @@ KINDS = {
     "keypoints": ("VitPoseForPoseEstimation", "AutoImageProcessor"),
 }
 """Classes of transformers for each task: of the network, and of what prepares its input."""
+OWN_PROCESSOR = {"oneformer": "OneFormerProcessor"}
+"""Networks that are told their task in words, too."""
+CLASSES = "shi-labs/oneformer_demo"
+"""Where OneFormer's processor looks for the names of its classes, if they are not in its folder."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +28,7 @@ class ModelsConfig:
     """Which networks do what: names on Hugging Face, or folders."""
 
     masks: str = "facebook/mask2former-swin-large-coco-instance"
-    """Furniture and people in one picture (Mask2Former or MaskFormer on COCO's instances)."""
+    """Furniture and people in one picture (Mask2Former, MaskFormer or OneFormer on COCO)."""
     tracker: str = "facebook/sam2.1-hiera-large"
     """People through the video (SAM 2); empty: detections are linked frame by frame."""
     keypoints: str = "usyd-community/vitpose-base-simple"
@@ -53,6 +57,21 @@ def network(kind: str, name: str, config: ModelsConfig) -> Network:
     return _loaded(kind, name, device_of(config.device), config.download)
 
 
+def instance_reader(net: Network) -> Any:  # noqa: ANN401
+    """What turns the queries' logits of a network for masks into instances.
+
+    OneFormer reads instances off as Mask2Former does. Its own processor in transformers (up to 5.x)
+    forgets the sigmoid of the masks, so that the best mask of all also gets every pixel where
+    nothing is, and needs torchvision; Mask2Former's is used for both.
+    """
+    if net.model.config.model_type not in OWN_PROCESSOR:
+        return net.processor
+    library: Any = importlib.import_module("transformers")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return library.Mask2FormerImageProcessor()
+
+
 def device_of(name: str) -> str:
     """The device that a name stands for.
 
@@ -75,7 +94,9 @@ def _loaded(kind: str, name: str, device: str, download: bool) -> Network:
     try:
         library: Any = importlib.import_module("transformers")
     except ImportError as error:
-        raise InputError("perceive needs transformers: pip install mover[perceive]") from error
+        raise InputError(
+            "perceive needs transformers: pip install '.[perceive]' in mover's folder"
+        ) from error
     model_class, processor_class = KINDS[kind]
     own: dict[str, Any] = {"local_files_only": not download}
     try:
@@ -83,6 +104,7 @@ def _loaded(kind: str, name: str, device: str, download: bool) -> Network:
             warnings.simplefilter("ignore")
             model = getattr(library, model_class).from_pretrained(name, **own)
             processor = None
+            processor_class = OWN_PROCESSOR.get(model.config.model_type, processor_class)
             if processor_class:
                 processor = getattr(library, processor_class).from_pretrained(name, **own)
     except (OSError, ValueError, KeyError, ImportError) as error:
@@ -98,7 +120,9 @@ def missing_text(kind: str, name: str) -> str:
             f"--models.{kind}: the folder {name} holds no network for this task, expected "
             "config.json and model.safetensors as transformers save them"
         )
+    more = f" and `hf download {CLASSES}`" if "oneformer" in name.lower() else ""
     return (
         f"--models.{kind}: {name!r} is not on this machine; where there is a network, run "
-        f"`hf download {name}` once (or add --models.download), or name a folder that holds it"
+        f"`hf download {name}`{more} once (or add --models.download), or name a folder that holds "
+        "it"
     )

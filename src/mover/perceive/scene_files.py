@@ -1,6 +1,5 @@
 """What the first scene is found from in a capture folder, and how it is written there."""
 
-import dataclasses
 import logging
 from pathlib import Path
 
@@ -8,19 +7,17 @@ import torch
 
 from ..geometry.runs import decode
 from ..readers.camera_file import camera_of, camera_to_json
-from ..readers.fields import maybe, number, plain, write_json
-from ..readers.mesh_file import write_mesh
+from ..readers.fields import maybe, number, write_json
+from ..readers.hypotheses_file import write_hypotheses
 from ..readers.objects_file import detections_of
 from ..readers.parts import folder_parts
 from ..readers.people_file import people_of
 from ..readers.scene_file import write_scene
 from ..records import InputError
-from ..types import Piece
 from .depth_map import read_depth
 from .layout import FirstScene, Picture
 
 log = logging.getLogger(__name__)
-OTHERS = "hypotheses.json"
 
 
 def read_picture_of(folder: Path, depth: Path | None = None) -> Picture:
@@ -62,25 +59,6 @@ def write_first_scene(first: FirstScene, folder: Path) -> None:
     assert parts.camera is not None
     given = {k: v for k, v in parts.camera.value.items() if k == "height"}
     write_json({**camera_to_json(first.scene.camera), **given}, folder / "camera.json")
-    rows: dict[str, list[dict[str, object]]] = {}
-    for group in first.others:
-        rows[group[0].piece.id] = [
-            {"energy": h.energy, **_row(h.piece, folder, rank)} for rank, h in enumerate(group)
-        ]
-    write_json({"format": "mover-hypotheses", "version": 1, "objects": rows}, folder / OTHERS)
-
-
-def _row(piece: Piece, folder: Path, rank: int) -> dict[str, object]:
-    """Place and shape of a hypothesis; the shape of the first is that of the scene."""
-    own = dataclasses.replace(piece, id=f"{piece.id}_{rank}")
-    name = f"meshes/other/{own.id}.glb" if rank else f"meshes/{piece.id}.glb"
-    if piece.mesh_file:
-        name = piece.mesh_file
-    elif rank:
-        write_mesh(piece.mesh, folder / name)
-    return {
-        "mesh": name,
-        "translation": plain(piece.t_world_object),
-        "yaw": plain(piece.yaw),
-        "scale": plain(piece.scale),
-    }
+    groups = {group[0].piece.id: [h.piece for h in group] for group in first.others}
+    energies = {group[0].piece.id: [h.energy for h in group] for group in first.others}
+    write_hypotheses(folder, groups, energies)

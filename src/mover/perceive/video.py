@@ -208,7 +208,9 @@ def _opened(source: Path) -> Any:  # noqa: ANN401
     try:
         import av
     except ImportError as error:
-        raise InputError("reading video needs PyAV: pip install mover[perceive]") from error
+        raise InputError(
+            "reading video needs PyAV: pip install '.[perceive]' in mover's folder"
+        ) from error
     try:
         container = av.open(str(source))
     except (OSError, ValueError) as error:

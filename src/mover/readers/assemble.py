@@ -9,10 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..geometry.rotations import rot_y
-from ..types import Bodies, Camera, Capture, Detection, Scene
+from ..types import Bodies, Camera, Capture, Detection, Piece, Scene
 from .bodies_file import bodies_of, read_touch
 from .camera_file import camera_of
 from .fields import At, Warn, get, items, listed, maybe, number, refuse
+from .hypotheses_file import hypotheses_of
 from .objects_file import detections_of
 from .people_file import PeopleFile, people_of
 from .pose_file import into_camera
@@ -37,6 +38,7 @@ class Sources:
     load_image: Callable[[Camera, Warn], Tensor | None]
     n_frames: int | None
     """How many frames the video has, where that is known."""
+    hypotheses: At | None = None
 
 
 def assemble(sources: Sources) -> Capture:
@@ -57,6 +59,9 @@ def assemble(sources: Sources) -> Capture:
     bodies = _bodies_of(sources, scene.camera, turn, found.fps, warn)
     touch = _touch_of(sources, bodies, warn)
     _check_people(sources, found, bodies, warn)
+    others: tuple[Piece, ...] = ()
+    if sources.hypotheses is not None:
+        others = hypotheses_of(sources.hypotheses, sources.load_mesh, scene, warn)
     return Capture(
         name=sources.name,
         scene=scene,
@@ -68,6 +73,7 @@ def assemble(sources: Sources) -> Capture:
         people=found.people,
         touch=touch,
         warnings=tuple(warnings),
+        hypotheses=others,
     )
 
 

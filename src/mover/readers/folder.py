@@ -13,6 +13,8 @@ from .assemble import Sources, assemble
 from .bodies_file import write_bodies
 from .camera_file import camera_to_json
 from .fields import At, Warn, read_json, write_json
+from .hypotheses_file import FILE as HYPOTHESES
+from .hypotheses_file import write_hypotheses
 from .image_file import read_image, write_image
 from .mesh_file import read_mesh
 from .npz_file import read_npz, write_npz
@@ -56,6 +58,7 @@ def read_capture(folder: Path) -> Capture:
             load_mesh=load_mesh,
             load_image=load_image,
             n_frames=_count_frames(folder / "frames"),
+            hypotheses=_if_there(folder / HYPOTHESES, read_json),
         )
     )
 
@@ -105,6 +108,11 @@ def write_capture(capture: Capture, folder: Path) -> None:
     write_json(objects, folder / "objects.json")
     write_json(camera, folder / "camera.json")
     write_scene(capture.scene, folder / "scene.json")
+    if capture.hypotheses:
+        own = {piece.id: [piece] for piece in capture.scene.pieces}
+        for piece in capture.hypotheses:
+            own[piece.id].append(piece)
+        write_hypotheses(folder, {k: v for k, v in own.items() if len(v) > 1}, {})
 
 
 def _check_room_for(capture: Capture, folder: Path) -> None:

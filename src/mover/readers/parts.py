@@ -54,6 +54,8 @@ class Parts:
     image_size: tuple[int, int] | None = None
     """Width and height of the image, where it is known [px]."""
     n_frames: int | None = None
+    hypotheses: At | None = None
+    """The fields of hypotheses.json."""
     copies: Mapping[str, Path] = field(default_factory=dict[str, Path])
     """Files that are taken as they are, by their place in the capture."""
     trees: Mapping[str, Any] = field(default_factory=dict[str, Any])
@@ -168,6 +170,7 @@ def sources_of(parts: Parts) -> Sources:
         load_mesh=parts.load_mesh,
         load_image=parts.load_image or _no_image,
         n_frames=parts.n_frames,
+        hypotheses=parts.hypotheses,
     )
 
 

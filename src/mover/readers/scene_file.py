@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -147,8 +147,16 @@ def _turn(piece: Piece, angle: float) -> Piece:
     )
 
 
-def write_scene(scene: Scene, path: Path) -> None:
-    """Write a scene: the user's meshes are copied as they are, new ones become meshes/<id>.glb."""
+def write_scene(
+    scene: Scene, path: Path, more: Mapping[str, Mapping[str, Any]] | None = None
+) -> None:
+    """Write a scene: the user's meshes are copied as they are, new ones become meshes/<id>.glb.
+
+    Args:
+        scene: What is written.
+        path: The file; `meshes/` goes beside it.
+        more: Further fields of the objects, by their ids; `read_scene` does not look at them.
+    """
     meshes = path.parent / "meshes"
     objects: list[dict[str, Any]] = []
     for piece in scene.pieces:
@@ -158,7 +166,8 @@ def write_scene(scene: Scene, path: Path) -> None:
         else:
             target = meshes / f"{piece.id}.glb"
             write_mesh(piece.mesh, target)
-        objects.append(_piece_to_json(piece, target.relative_to(path.parent).as_posix()))
+        fields = _piece_to_json(piece, target.relative_to(path.parent).as_posix())
+        objects.append(fields | dict((more or {}).get(piece.id, {})))
     tree: dict[str, Any] = {"format": FORMAT, "version": VERSION}
     tree["camera"] = camera_to_json(scene.camera)
     if scene.ground is not None:

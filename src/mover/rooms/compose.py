@@ -13,6 +13,7 @@ from ..records import record
 from ..types import Camera
 from .crowding import WIDTH, depth_of, worth
 from .placed import Placed, corners, verts_on_floor
+from .room_config import PlanConfig
 from .spots import RULES, Rule
 from .turns import facing, left_of
 
@@ -69,7 +70,6 @@ ROUNDS = 5  # rooms to choose from
 TRIES = 40
 CHOICES = 8  # places to choose from, the one that hides the most pieces
 SPARE = 1.15  # on the fewest pixels of a piece, which are counted in a small picture
-LEAST_VISIBLE = 0.85  # share of the corners of a piece's box inside the image
 MARGIN: dict[Rule, float] = {
     "wall": 0.06, "corner": 0.05, "middle": 0.5, "facing": 0.45, "before": 0.1, "around": 0.04,
     "beside": 0.04,
@@ -87,32 +87,40 @@ def make_view(size: tuple[int, int], numbers: tuple[float, float, float, float])
     return View(Camera(K.float(), turn.float(), width, height), above)
 
 
-def draw_view(rng: np.random.Generator, size: tuple[int, int]) -> View:
-    """A camera as somebody would put it up: 1.2-1.7 m high, looking 8-16 degrees down."""
-    height = float(rng.uniform(1.2, 1.7))
-    pitch = -np.radians(rng.uniform(8, 14) + 4 * (height - 1.2))
+def draw_view(rng: np.random.Generator, size: tuple[int, int], config: PlanConfig) -> View:
+    """A camera as somebody would put it up: the higher, the more it looks down."""
+    height = float(rng.uniform(*config.camera_height))
+    pitch = -np.radians(rng.uniform(*config.look_down) + 4 * (height - 1.2))
     roll = np.radians(rng.uniform(-2, 2))
-    return make_view(
-        size, (height, float(pitch), float(roll), float(np.radians(rng.uniform(61, 69))))
-    )
+    fov = np.radians(rng.uniform(*config.field_of_view))
+    return make_view(size, (height, float(pitch), float(roll), float(fov)))
 
 
-def draw_plan(rng: np.random.Generator, size: tuple[int, int], most: int, least: int) -> Plan:
-    """A room of a random kind, a third of whose pieces are partly hidden.
+def draw_plan(
+    rng: np.random.Generator,
+    size: tuple[int, int],
+    most: int,
+    least: int,
+    config: PlanConfig | None = None,
+) -> Plan:
+    """A room of a random kind, many of whose pieces are partly hidden.
 
     Args:
         rng: Source of randomness.
         size: Width and height of the image [px].
         most: Most pieces.
         least: Fewest pixels that each piece shows.
+        config: How it is furnished and seen.
     """
+    config = config or PlanConfig()
     kind = sorted(KINDS)[int(rng.integers(len(KINDS)))]
     best, most_hidden = None, -1.0
     for _ in range(ROUNDS):
-        plan, value = _furnished(rng, size, KINDS[kind][:most], least)
+        wanted = (*KINDS[kind], *config.more)[:most]
+        plan, value = _furnished(rng, size, wanted, least, config)
         if best is None or value > most_hidden:
             best, most_hidden = plan, value
-        if most_hidden >= len(best.pieces) / 3:
+        if most_hidden >= config.crowded * len(best.pieces):
             break
     assert best is not None, "there is at least one round"
     return best
@@ -123,18 +131,19 @@ def _furnished(
     size: tuple[int, int],
     wanted: tuple[tuple[str, Rule], ...],
     least: int,
+    config: PlanConfig,
 ) -> tuple[Plan, float]:
     """One room, and how many of its pieces are well hidden."""
-    view = draw_view(rng, size)
-    wide, deep = float(rng.uniform(4.6, 5.4)), float(rng.uniform(5.6, 6.4))
+    view = draw_view(rng, size, config)
+    wide, deep = float(rng.uniform(*config.wide)), float(rng.uniform(*config.far))
     low, high = (-wide / 2, -deep), (wide / 2, -1.9)
     plan, value = Plan((), view, low, high), 0.0
     few = SPARE * least * (WIDTH / size[0]) ** 2
     drawn: list[Float[Tensor, "h w"]] = []
     for what in wanted:
-        spots = _spots(plan, what, rng)
+        spots = _spots(plan, what, rng, config)
         looks = [depth_of(spot, view.camera, view.height) for spot in spots]
-        values = [worth([*drawn, look], few) for look in looks]
+        values = [worth([*drawn, look], few, config.hidden) for look in looks]
         best = int(np.argmax(values)) if values else -1
         if best >= 0 and values[best] >= 0:
             drawn, value = [*drawn, looks[best]], values[best]
@@ -142,7 +151,9 @@ def _furnished(
     return plan, value
 
 
-def _spots(plan: Plan, what: tuple[str, Rule], rng: np.random.Generator) -> list[Placed]:
+def _spots(
+    plan: Plan, what: tuple[str, Rule], rng: np.random.Generator, config: PlanConfig
+) -> list[Placed]:
     """Up to `CHOICES` places where a new piece stands free and in view."""
     name, rule = what
     furniture = make_piece(name, rng)
@@ -155,8 +166,8 @@ def _spots(plan: Plan, what: tuple[str, Rule], rng: np.random.Generator) -> list
         if spot is None or len(found) == CHOICES:
             break
         piece = Placed(label, furniture, (spot[0], spot[1]), spot[2])
-        free = _fits(piece, others, MARGIN[rule], plan.walls)
-        if free and in_view(piece, plan.view) >= LEAST_VISIBLE:
+        free = _fits(piece, others, config.spacing * MARGIN[rule], plan.walls)
+        if free and in_view(piece, plan.view) >= config.visible:
             found.append(piece)
     return found
 
@@ -180,6 +191,12 @@ def _fits(piece: Placed, others: list[Placed], margin: float, walls: np.ndarray)
 
 def overlap(a: Placed, b: Placed, margin: float) -> bool:
     """Whether footprints come nearer than `margin` (along some edge's normal) [m]."""
+    reach = (
+        np.hypot(a.furniture.size[0], a.furniture.size[2])
+        + np.hypot(b.furniture.size[0], b.furniture.size[2])
+    ) / 2 + 2 * margin
+    if np.hypot(*(a.place - b.place)) > reach:
+        return False
     first, second = corners(a, margin / 2), corners(b, margin / 2)
     for heading in (a.heading, b.heading):
         for axis in (facing(np.array(heading)), left_of(np.array(heading))):

@@ -11,7 +11,6 @@ from .placed import Placed, verts_on_floor
 
 WIDTH = 240  # [px] of the small picture
 HIDDEN = 0.3  # a piece of which more is hidden counts as hidden
-TOO_MUCH = 0.75  # no piece may be hidden more than this
 
 
 def depth_of(piece: Placed, camera: Camera, height: float) -> Float[Tensor, "h w"]:
@@ -24,17 +23,18 @@ def depth_of(piece: Placed, camera: Camera, height: float) -> Float[Tensor, "h w
     return first_hit(cam, piece.furniture.mesh.faces, K, size)[0]
 
 
-def worth(depths: list[Float[Tensor, "h w"]], least: float) -> float:
+def worth(depths: list[Float[Tensor, "h w"]], least: float, most: float) -> float:
     """How many pieces others hide well, plus a little; -1 where one can hardly be seen.
 
     Args:
         depths: Of each piece drawn alone [m].
         least: Fewest pixels of the small picture that a piece must show.
+        most: No piece may be hidden more than this share.
     """
     alone = torch.stack(depths)
     covered = alone.isfinite()
     seen = (covered & (alone <= alone.amin(0))).sum((1, 2)).numpy()
     hidden = 1 - seen / covered.sum((1, 2)).clamp_min(1).numpy()
-    if (hidden > TOO_MUCH).any() or (seen < least).any():
+    if (hidden > most).any() or (seen < least).any():
         return -1.0
     return float((hidden >= HIDDEN).sum() + 0.1 * hidden.mean())

@@ -1,7 +1,5 @@
 """What is known of a room: the capture that a perfect upstream would give, and the truth."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,40 +8,17 @@ from torch import Tensor
 from ..bodies import open_body
 from ..furniture import Furniture
 from ..records import map_tensors, record
-from ..types import Bodies, BodyPose, Capture, Detection, People, Piece, Scene
+from ..types import Bodies, BodyPose, Capture, Detection, Masks, People, Piece, Scene
 from .compose import Plan
 from .motion import Performance, Stage
 from .noise_masks import box_of_mask
 from .poses import angles, skinned
-from .render import Sight, encode, see, see_body
+from .render import Sight, encode, look_at, see
+from .room_config import RoomConfig
 from .truth import GAPE, NONE, nearness
 from .turns import from_vector, to_vector
 
-
-@dataclass(frozen=True)
-class RoomConfig:
-    """How a known room is made."""
-
-    width: int = 960
-    """Of the image [px]."""
-    height: int = 540
-    """Of the image [px]."""
-    fps: float = 5.0
-    """Frames a second."""
-    people: int = 1
-    """How many people use the room, 1 or 2."""
-    pieces: int = 9
-    """Most pieces of furniture."""
-    least_pieces: int = 6
-    """Fewest pieces of furniture that the camera sees."""
-    least_frames: int = 200
-    """Fewest frames."""
-    least_touches: int = 3
-    """Fewest tasks that touch furniture, over all people."""
-    least_pixels: int = 500
-    """A piece with fewer visible pixels is not annotated well enough: the room is refused."""
-    stay: float = 1.0
-    """Factor on how long people sit, lie and stand."""
+PASSING = 0.1  # a body of which furniture hides more passes behind it
 
 
 @record
@@ -66,6 +41,10 @@ class KnownRoom:
     plan: Plan
     refused: tuple[str, ...]
     """Rooms and tasks that were not true enough, with the reasons."""
+    whole: Int[Tensor, " bodies"]
+    """Pixels that each body would fill if nothing hid it."""
+    passing: Bool[Tensor, " bodies"]
+    """Furniture hides more than `PASSING` of what the image would show of the body."""
 
 
 class RefusedError(Exception):
@@ -96,6 +75,11 @@ def build(
     detections = _detections(plan, sight, config)
     crowd = _crowd(plan, actors, config.fps)
     scene = _scene(plan)
+    shown = _people(plan, sight, crowd.bodies)
+    passing = shown.free < (1 - PASSING) * shown.whole
+    share = float(passing.double().mean())
+    if share < config.least_passing:
+        raise RefusedError(f"furniture hides a part of only {share:.0%} of the bodies")
     capture = Capture(
         name=name,
         scene=scene,
@@ -104,7 +88,7 @@ def build(
         reference=sight.picture,
         reference_people=None,
         bodies=crowd.bodies,
-        people=_people(plan, sight, crowd.bodies),
+        people=shown.people,
         touch=None,
         warnings=(),
     )
@@ -112,7 +96,17 @@ def build(
     touched = torch.where(touching, crowd.nearest, torch.full_like(crowd.nearest, NONE))
     furniture = tuple(p.furniture for p in plan.pieces)
     return KnownRoom(
-        capture, scene, crowd.bodies, touching, touched, crowd.actions, furniture, plan, refused
+        capture=capture,
+        truth=scene,
+        bodies=crowd.bodies,
+        touching=touching,
+        touched=touched,
+        actions=crowd.actions,
+        furniture=furniture,
+        plan=plan,
+        refused=refused,
+        whole=shown.whole,
+        passing=passing,
     )
 
 
@@ -199,14 +193,38 @@ def _in_camera(plan: Plan, actors: tuple[Actor, ...], index: Tensor) -> BodyPose
     return BodyPose(model="makehuman", gender="neutral", extra={}, **rows)
 
 
-def _people(plan: Plan, sight: Sight, bodies: Bodies) -> People:
+@record
+class _Shown:
+    """What is seen of everybody, row by row."""
+
+    people: People
+    whole: Int[Tensor, " bodies"]
+    """Pixels of the body alone."""
+    free: Int[Tensor, " bodies"]
+    """Pixels of it that no furniture hides."""
+
+
+def _people(plan: Plan, sight: Sight, bodies: Bodies) -> _Shown:
     """Visible masks: what furniture or a nearer person hides is left out."""
-    depths = [see_body(plan, v, bodies.faces)[0] for v in bodies.verts]
-    nearest: dict[int, Tensor] = {}
-    for frame, depth in zip(bodies.frame.tolist(), depths, strict=True):
-        nearest[frame] = torch.minimum(nearest.get(frame, sight.depth), depth)
-    masks = [
-        (depth.isfinite() & (depth <= nearest[frame])).numpy()
-        for frame, depth in zip(bodies.frame.tolist(), depths, strict=True)
-    ]
-    return People(encode(masks), bodies.frame, bodies.person, {})
+    masks, wholes, frees = list[bytes](), list[int](), list[int]()
+    rows: dict[int, list[Tensor]] = {}
+    for frame, verts in zip(bodies.frame.tolist(), bodies.verts, strict=True):
+        rows.setdefault(frame, []).append(verts)
+    for group in rows.values():  # rows are in the order of their frames
+        looks = [look_at(plan, verts, bodies.faces) for verts in group]
+        nearest = sight.depth
+        if len(looks) > 1:
+            nearest = nearest.clone()
+            for look in looks:
+                nearest[look.window] = torch.minimum(nearest[look.window], look.depth)
+        for look in looks:
+            whole = look.depth.isfinite()
+            wholes.append(int(whole.sum()))
+            frees.append(int((whole & (look.depth <= sight.depth[look.window])).sum()))
+            mask = torch.zeros_like(sight.piece, dtype=torch.bool)
+            mask[look.window] = whole & (look.depth <= nearest[look.window])
+            masks += encode([mask.numpy()]).counts
+    camera = plan.view.camera
+    coded = Masks(camera.height, camera.width, tuple(masks))
+    people = People(coded, bodies.frame, bodies.person, {})
+    return _Shown(people, torch.tensor(wholes), torch.tensor(frees))

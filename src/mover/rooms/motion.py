@@ -22,6 +22,7 @@ from .steps import Stations, duration, stations
 from .truth import faults
 from .turns import facing, smooth
 
+ARM = 0.06  # [m], how far arms that swing reach out over the width of a way
 DOOR = 0.3  # [m], from a seat or table to where one turns round
 
 
@@ -72,6 +73,8 @@ class Stage:
     bounds: Float[np.ndarray, "2 2"]
     """Smallest and largest x and z that one may walk [m]."""
     fps: float
+    apart: float = 0.0
+    """More than 0: how far from all furniture the skin must stay [m]."""
 
 
 @record
@@ -86,14 +89,19 @@ class Performance:
 
 
 def perform(
-    stage: Stage, tasks: tuple[Task, ...], start: Stop, rng: np.random.Generator
+    stage: Stage, tasks: tuple[Task, ...], start: Stop, rng: np.random.Generator, enough: int = 0
 ) -> Performance:
-    """Do the tasks one after the other; refuse those that the furniture does not allow."""
+    """Do the tasks one after the other; refuse those that the furniture does not allow.
+
+    After `enough` frames no further task is begun, unless that is 0.
+    """
     takes: list[Take] = []
     refused: list[str] = []
     here = start
     for task in tasks:
         phase = float(rng.uniform(0, 2 * np.pi))
+        if enough and sum(len(take.posture.pelvis) for take in takes) >= enough:
+            break
         try:
             stop = _stop(stage, task, here)
             new = _played(stage, task, (here, stop), phase)
@@ -124,7 +132,9 @@ def _played(stage: Stage, task: Task, way: tuple[Stop, Stop], phase: float) -> l
 
 def _check(stage: Stage, takes: list[Take]) -> None:
     for take in takes:
-        wrong = faults(stage.person, take.posture, take.label, stage.pieces, take.piece)
+        wrong = faults(
+            stage.person, take.posture, take.label, stage.pieces, take.piece, stage.apart
+        )
         if wrong:
             raise RefusedTaskError(wrong[0])
 
@@ -149,7 +159,8 @@ def _stop(stage: Stage, task: Task, here: Stop) -> Stop:
 
 
 def _walk(stage: Stage, here: Stop, stop: Stop) -> Take:
-    path = way(here.door, stop.door, stage.pieces, stage.bounds)
+    more = stage.apart + ARM if stage.apart > 0 else 0.0
+    path = way(here.door, stop.door, stage.pieces, stage.bounds, more)
     outer = np.stack([here.place, stop.place])
     route: Stations = stations(path, here.heading, stop.heading, outer)
     return Take(walk(stage.person, route, _times(stage, duration(route))), "walk", -1)

@@ -13,7 +13,6 @@ from ..types import Bodies, BodyPose
 from .known import KnownRoom, rounded
 from .noise_config import NoiseConfig
 from .person import LEG
-from .render import see_body
 from .turns import from_vector, to_vector
 
 LOST_SECONDS = 2.0  # memory of what loses them; a stretch lasts about a second
@@ -87,11 +86,8 @@ def hidden_rows(room: KnownRoom) -> Bool[np.ndarray, " bodies"]:
     """Bodies of which less than half is seen, behind furniture or outside the image."""
     people = room.capture.people
     assert people is not None, "a known room has masks"
-    out = np.zeros(len(room.bodies.frame), dtype=bool)
-    for row, verts in enumerate(room.bodies.verts):
-        whole = int(see_body(room.plan, verts, room.bodies.faces)[0].isfinite().sum())
-        out[row] = int(decode(people.masks, row).sum()) < 0.5 * max(whole, 1)
-    return out
+    seen = [int(decode(people.masks, row).sum()) for row in range(len(people.frame))]
+    return np.array(seen) < 0.5 * room.whole.clamp_min(1).numpy()
 
 
 def _turned(pose: BodyPose, error: Float[np.ndarray, "bodies 22 3"]) -> BodyPose:

@@ -21,6 +21,7 @@ def way(
     goal: Float[np.ndarray, "2"],
     pieces: tuple[Placed, ...],
     bounds: Float[np.ndarray, "2 2"],
+    apart: float = 0.0,
 ) -> Floor:
     """Points (x, z) from start to goal, both included [m].
 
@@ -29,6 +30,7 @@ def way(
         goal: Where it ends.
         pieces: Furniture to walk around.
         bounds: Smallest and largest x and z that one may walk.
+        apart: How much farther from furniture than usual [m].
 
     Raises:
         NoWayError: If furniture closes the way.
@@ -38,8 +40,8 @@ def way(
     shape = np.ceil((bounds[1] - bounds[0]) / CELL).astype(int) + 1
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1)
     points = bounds[0] + CELL * grid
-    cost = np.where(free_of(points, pieces, ROOMY), 1.0, DEAR)
-    open_ = free_of(points, pieces, BODY)
+    cost = np.where(free_of(points, pieces, ROOMY + apart), 1.0, DEAR)
+    open_ = free_of(points, pieces, BODY + apart)
     index = [_nearest(points, open_, end) for end in (start, goal)]
     _, before = dijkstra(_graph(open_, cost), indices=index[0], return_predecessors=True)
     cells = [index[1]]
@@ -48,7 +50,7 @@ def way(
         if cells[-1] < 0:
             raise NoWayError(f"no way from {start.round(2).tolist()} to {goal.round(2).tolist()}")
     middle = points.reshape(-1, 2)[cells[::-1]]
-    return _straightened(np.concatenate([start[None], middle, goal[None]]), pieces)
+    return _straightened(np.concatenate([start[None], middle, goal[None]]), pieces, apart)
 
 
 def _nearest(points: np.ndarray, open_: Bool[np.ndarray, "x z"], end: np.ndarray) -> int:
@@ -76,26 +78,29 @@ def _graph(open_: Bool[np.ndarray, "x z"], cost: Float[np.ndarray, "x z"]) -> ob
     return (one_way + one_way.T).tocsr()
 
 
-def _straightened(path: Floor, pieces: tuple[Placed, ...]) -> Floor:
+def _straightened(path: Floor, pieces: tuple[Placed, ...], apart: float) -> Floor:
     """Leave out corners where the straight line is not dearer than the way around."""
-    cumulative = np.concatenate([[0.0], np.cumsum(_prices(path[:-1], path[1:], pieces))])
+    ends = np.cumsum(_prices(path[:-1], path[1:], pieces, apart))
+    cumulative = np.concatenate([[0.0], ends])
     kept, at = [0], 0
     while at < len(path) - 1:
         later = np.arange(len(path) - 1, at, -1)
-        price = _prices(np.repeat(path[at][None], len(later), 0), path[later], pieces)
+        price = _prices(np.repeat(path[at][None], len(later), 0), path[later], pieces, apart)
         cheap = price <= 1.01 * (cumulative[later] - cumulative[at]) + 1e-9
         at = int(later[np.flatnonzero(cheap)[0]]) if cheap.any() else at + 1
         kept.append(at)
     return path[kept]
 
 
-def _prices(start: Floor, end: Floor, pieces: tuple[Placed, ...]) -> Float[np.ndarray, " lines"]:
+def _prices(
+    start: Floor, end: Floor, pieces: tuple[Placed, ...], apart: float
+) -> Float[np.ndarray, " lines"]:
     """Cost of straight lines; infinite where a line is blocked in its middle."""
     share = np.linspace(0, 1, 24)[:, None, None]
     points = start + share * (end - start)
     length = np.linalg.norm(end - start, axis=-1)
-    near = np.where(free_of(points, pieces, ROOMY), 1.0, DEAR)
+    near = np.where(free_of(points, pieces, ROOMY + apart), 1.0, DEAR)
     inner = np.linalg.norm(points - start, axis=-1) > 0.3
     inner &= np.linalg.norm(points - end, axis=-1) > 0.3
-    blocked = (~free_of(points, pieces, BODY) & inner).any(0)
+    blocked = (~free_of(points, pieces, BODY + apart) & inner).any(0)
     return np.where(blocked, np.inf, length * near.mean(0))

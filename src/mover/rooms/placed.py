@@ -7,6 +7,7 @@ from ..furniture import Furniture
 from ..records import record
 from .turns import facing, left_of
 
+SIGNS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # of the corners of a footprint
 FAR = 0.03  # [m], signed distances beyond this are not told apart
 
 
@@ -55,9 +56,8 @@ def corners(piece: Placed, margin: float = 0.0) -> Float[np.ndarray, "4 2"]:
     """Corners of the footprint of a piece, grown by `margin` [m]."""
     w, _, d = piece.furniture.size
     x, z = w / 2 + margin, d / 2 + margin
-    return np.stack(
-        [on_floor(piece, i * x, k * z) for i, k in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    )
+    heading = np.array(piece.heading)
+    return piece.place + SIGNS[:, :1] * x * left_of(heading) + SIGNS[:, 1:] * z * facing(heading)
 
 
 def verts_on_floor(piece: Placed) -> Float[np.ndarray, "verts 3"]:

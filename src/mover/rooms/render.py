@@ -37,6 +37,18 @@ class Sight:
     """A shaded picture with floor and walls, in [0, 1]."""
 
 
+@record
+class Look:
+    """One body alone, in a window of the image."""
+
+    window: tuple[slice, slice]
+    """Rows and columns."""
+    depth: Float[Tensor, "h w"]
+    """[m], infinite where there is none."""
+    face: Int[Tensor, "h w"]
+    """-1: none."""
+
+
 def encode(masks: list[np.ndarray]) -> Masks:
     """Binary images (h, w), run-length encoded."""
     from pycocotools import mask as coco
@@ -66,24 +78,32 @@ def see(plan: Plan) -> Sight:
 def see_body(
     plan: Plan, verts_cam: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]
 ) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Depth [m] and face of a body alone, drawn in the window that it fills."""
+    """Depth [m] and face of a body alone."""
     camera = plan.view.camera
     depth = torch.full((camera.height, camera.width), torch.inf)
     face = torch.full((camera.height, camera.width), -1)
+    look = look_at(plan, verts_cam, faces)
+    depth[look.window], face[look.window] = look.depth, look.face
+    return depth, face
+
+
+def look_at(plan: Plan, verts_cam: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]) -> Look:
+    """A body alone, in the window that it fills."""
+    camera = plan.view.camera
+    nothing = Look((slice(0, 0), slice(0, 0)), torch.zeros(0, 0), torch.zeros(0, 0).long())
     if float(verts_cam[:, 2].max()) < 0.1:
-        return depth, face
+        return nothing
     flat = verts_cam @ camera.K.mT
     pixel = flat[:, :2] / flat[:, 2:].clamp_min(0.05)
     size = torch.tensor([camera.width, camera.height])
     low = torch.minimum(pixel.amin(0).floor().long().clamp_min(0), size)
     high = torch.minimum(pixel.amax(0).ceil().long().clamp_min(0), size)
     if bool((high <= low).any()):
-        return depth, face
+        return nothing
     (left, top), (right, bottom) = low.tolist(), high.tolist()
     K = camera.K - torch.tensor([[0, 0, left], [0, 0, top], [0, 0, 0]])
     part = first_hit(verts_cam, faces, K, (bottom - top, right - left))
-    depth[top:bottom, left:right], face[top:bottom, left:right] = part
-    return depth, face
+    return Look((slice(top, bottom), slice(left, right)), *part)
 
 
 def draw_bodies(plan: Plan, sight: Sight, bodies: list[Mesh]) -> Float[Tensor, "h w 3"]:

@@ -10,14 +10,16 @@ from torch import Tensor
 from ..furniture import make_piece
 from ..types import Mesh
 from .compose import Plan, draw_plan, make_view
-from .known import Actor, KnownRoom, RefusedError, RoomConfig, build
+from .known import Actor, KnownRoom, RefusedError, build
 from .motion import Performance, Stage, Stop, Task, perform
 from .person import make_person
 from .placed import Placed
 from .poses import jointed, rows
 from .render import draw_bodies, see
+from .room_config import RoomConfig
 from .scripts import draw_person, draw_start, draw_tasks
 from .threads import one_thread
+from .truth import faults
 
 CLEAR = 0.25  # [m], between the joints of two people
 MOST_WAIT = 24.0  # [s], before somebody begins
@@ -36,7 +38,7 @@ def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
         rng = np.random.default_rng([seed, draft])
         try:
             size = (config.width, config.height)
-            plan = draw_plan(rng, size, config.pieces, config.least_pixels)
+            plan = draw_plan(rng, size, config.pieces, config.least_pixels, config.plan)
             room = build(
                 plan, _cast(plan, config, rng, refused), config, f"room_{seed}", tuple(refused)
             )
@@ -61,7 +63,9 @@ def _cast(
         wait = patience(actor, actors)
         if wait is not None:
             refused += actor.performance.refused
-            actors.append(dataclasses.replace(actor, performance=late(actor.performance, wait)))
+            whole = late(actor.performance, wait)
+            acted = cut(whole, config.most_frames) if config.most_frames else whole
+            actors.append(dataclasses.replace(actor, performance=acted))
     if len(actors) < config.people:
         raise RefusedError("people run into each other")
     return tuple(actors)
@@ -70,12 +74,18 @@ def _cast(
 def _actor(plan: Plan, config: RoomConfig, rng: np.random.Generator) -> Actor:
     """Somebody of a random shape who does random things."""
     bounds = np.stack([plan.walls[0] + 0.25, plan.walls[1] - 0.25])
-    stage = Stage(make_person(draw_person(rng)), plan.pieces, bounds, config.fps)
+    person, apart = make_person(draw_person(rng)), config.acts.apart
+    stage = Stage(person, plan.pieces, bounds, config.fps, apart)
     try:
-        tasks, start = draw_tasks(plan, rng, config.stay), draw_start(plan, rng)
+        tasks, start = draw_tasks(plan, rng, config.stay, config.acts), draw_start(plan, rng)
     except ValueError as error:
         raise RefusedError(str(error)) from error
-    return Actor(stage, perform(stage, tasks, start, rng))
+    actor = Actor(stage, perform(stage, tasks, start, rng, config.most_frames))
+    if apart > 0:  # also between the tasks
+        near = faults(person, actor.performance.posture, "walk", plan.pieces, -1, apart)
+        if near:
+            raise RefusedError(near[0])
+    return actor
 
 
 def patience(newcomer: Actor, others: list[Actor]) -> int | None:
@@ -97,6 +107,17 @@ def _clear(a: np.ndarray, b: np.ndarray) -> bool:
     near = np.flatnonzero(middle < 2.0)
     gap = np.linalg.norm(a[near, :, None] - b[near, None], axis=-1)
     return bool(gap.size == 0 or gap.min() > CLEAR)
+
+
+def cut(performance: Performance, frames: int) -> Performance:
+    """The first frames of it."""
+    first = slice(0, frames)
+    return Performance(
+        rows(performance.posture, first),
+        performance.labels[first],
+        performance.touched[first],
+        performance.refused,
+    )
 
 
 def late(performance: Performance, wait: int) -> Performance:

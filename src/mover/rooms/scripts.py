@@ -8,10 +8,13 @@ from .motion import DOOR, Stop, Task
 from .paths import ROOMY
 from .placed import Placed, free_of
 from .reaching import table_stand
+from .room_config import ActConfig
 from .turns import facing
 
 SITS = frozenset({"chair", "armchair", "office chair", "sofa", "stool", "bench"})
 STANDS = frozenset({"table", "desk", "cabinet"})
+PLACES = 60  # to choose walks from
+GONE = 4  # so many last goals the next one keeps away from
 
 
 def draw_person(rng: np.random.Generator) -> list[float]:
@@ -39,14 +42,53 @@ def draw_start(plan: Plan, rng: np.random.Generator) -> Stop:
     return Stop(place, float(rng.uniform(-np.pi, np.pi)), place)
 
 
-def draw_tasks(plan: Plan, rng: np.random.Generator, length: float) -> tuple[Task, ...]:
-    """Sit, lean, lie and stand at tables, in random order, with walks in between.
+def draw_tasks(
+    plan: Plan, rng: np.random.Generator, length: float, acts: ActConfig
+) -> tuple[Task, ...]:
+    """Sit, lean, lie and stand at tables in random order; walk before and after.
 
     Args:
         plan: The room.
         rng: Source of randomness.
         length: Factor on all times to stay.
+        acts: How much.
     """
+    if acts.apart > 0:
+        return draw_walks(plan, rng, acts.walks)
+    tasks: list[Task] = []
+    for _ in range(acts.rounds):
+        uses = _uses(plan, rng, length)
+        tasks += [uses[k] for k in rng.permutation(len(uses))]
+    walks = [Task("walk", goal=_pair(free_place(plan, rng))) for _ in range(acts.walks)]
+    return (*walks[:1], *tasks[: acts.tasks], *walks[1:])
+
+
+def draw_walks(plan: Plan, rng: np.random.Generator, count: int) -> tuple[Task, ...]:
+    """Walks to free places far from one another, every other one behind furniture if there is one.
+
+    Args:
+        plan: The room.
+        rng: Source of randomness.
+        count: How many.
+    """
+    places = np.array([free_place(plan, rng) for _ in range(PLACES)])
+    behind = places[[_is_behind(place, plan) for place in places]]
+    goals = places[:1]
+    for k in range(count):
+        pool = places if k % 2 or not len(behind) else behind
+        apart = np.linalg.norm(pool[:, None] - goals[-GONE:], axis=-1).min(1)
+        goals = np.concatenate([goals, pool[[int(apart.argmax())]]])
+    return tuple(Task("walk", goal=_pair(goal)) for goal in goals[1:])
+
+
+def _is_behind(place: np.ndarray, plan: Plan) -> bool:
+    """Whether furniture stands between the camera and a place."""
+    line = np.linspace(0, 1, 60)[:, None] * place
+    return not bool(free_of(line, plan.pieces, 0.0).all())
+
+
+def _uses(plan: Plan, rng: np.random.Generator, length: float) -> list[Task]:
+    """What can be done with each piece, once."""
     tasks: list[Task] = []
     for index, piece in enumerate(plan.pieces):
         name = canonical(piece.furniture.category)
@@ -65,9 +107,7 @@ def draw_tasks(plan: Plan, rng: np.random.Generator, length: float) -> tuple[Tas
         if name in STANDS and 0.65 < piece.furniture.top_height < 1.0:
             side = _open_side(plan, index, rng)
             tasks.append(Task("table", index, seconds=0.7 * stay, side=side))
-    order = rng.permutation(len(tasks))
-    walks = [Task("walk", goal=_pair(free_place(plan, rng))) for _ in range(2)]
-    return (walks[0], *(tasks[k] for k in order[:5]), walks[1])
+    return tasks
 
 
 def _pair(place: np.ndarray) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 
 from ..records import record
 from .person import Person
-from .placed import Placed, distances
+from .placed import FAR, Placed, distances
 from .poses import Posture, skinned
 from .settle import part, part_of
 
@@ -49,14 +49,30 @@ def nearness(skin: Float[np.ndarray, "frames verts 3"], pieces: tuple[Placed, ..
 
 
 def faults(
-    person: Person, posture: Posture, label: str, pieces: tuple[Placed, ...], index: int
+    person: Person,
+    posture: Posture,
+    label: str,
+    pieces: tuple[Placed, ...],
+    index: int,
+    apart: float = 0.0,
 ) -> list[str]:
-    """Why these frames are not true: what sinks in, what hangs in the air."""
+    """Why these frames are not true: what sinks in, what hangs in the air, what comes too near.
+
+    Args:
+        person: Whose skin.
+        posture: The frames.
+        label: What is done in them.
+        pieces: All furniture.
+        index: The piece that is used.
+        apart: More than 0: how far the skin must stay from furniture [m].
+    """
     skin = skinned(person, posture)
     flat = skin.reshape(-1, 3)
     found: list[str] = []
     for piece in pieces:
-        near = distances(piece, flat)
+        near = distances(piece, flat, max(FAR, apart))
+        if apart > 0 and near.min() < apart:
+            found.append(f"{label}: {100 * near.min():.1f} cm from {piece.id}")
         deep = -float(near.min())
         if deep > SINK:
             where = part_of(int(near.argmin()) % skin.shape[1])

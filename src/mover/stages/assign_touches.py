@@ -30,6 +30,8 @@ class Contacts:
     """Bodies whose seat or back touches an object."""
     touched_in: tuple[int, ...]
     """Number of bodies that touch each object."""
+    pairs: Int[Tensor, "pairs 3"]
+    """Who touches what: body, object, and part as in `Touches.points`."""
 
 
 def assign_touches(
@@ -41,26 +43,35 @@ def assign_touches(
     seated = torch.zeros(len(inputs.bodies.frame), dtype=torch.bool)
     counts = [0] * len(inputs.objects.ids)
     if not found:
-        return Contacts(None, seated, tuple(counts))
+        return Contacts(None, seated, tuple(counts), torch.zeros(0, 3, dtype=torch.long))
     names = ("body", "vert", "object_of", "hand")
     rows = ContactRows(*(torch.cat([getattr(c, n) for c in found]) for n in names))
     seated[rows.body[~rows.hand]] = True
-    touches = _pack(rows, inputs, config)
+    part = _parts(rows, inputs, config)
+    touches = _pack(rows, part, inputs, config)
     for i, bodies in zip(touches.object_of.tolist(), touches.bodies.tolist(), strict=True):
         counts[i] = int(bodies)
-    return Contacts(touches, seated, tuple(counts))
+    pairs = torch.stack([rows.body, rows.object_of, part], -1).unique(dim=0)
+    return Contacts(touches, seated, tuple(counts), pairs)
 
 
-def _pack(rows: ContactRows, inputs: TouchInputs, config: AssignConfig) -> Touches:
+def _parts(rows: ContactRows, inputs: TouchInputs, config: AssignConfig) -> Int[Tensor, " rows"]:
+    """The part that each row touches: top, back, and the same for hands."""
     normals = vertex_normals(inputs.bodies.verts, inputs.bodies.faces)[rows.body, rows.vert]
-    points = inputs.bodies.verts[rows.body, rows.vert]
     level = normals[:, 1].abs() >= LEVEL
     if config.split == "parts":
         level = level | (inputs.parts.part_of[rows.vert] != PARTS.index("back"))
+    return (~level).long() + 2 * rows.hand.long()
+
+
+def _pack(
+    rows: ContactRows, part: Int[Tensor, " rows"], inputs: TouchInputs, config: AssignConfig
+) -> Touches:
+    points = inputs.bodies.verts[rows.body, rows.vert]
     touched = rows.object_of.unique()
     packed, weight = thin(
         points,
-        torch.searchsorted(touched, rows.object_of) * 4 + (~level).long() + 2 * rows.hand.long(),
+        torch.searchsorted(touched, rows.object_of) * 4 + part,
         4 * len(touched),
         (config.cell, config.most),
     )

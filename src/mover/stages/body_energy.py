@@ -13,6 +13,7 @@ from ..geometry.volume import Volume
 from ..minimize import Energy, weigh
 from ..terms.body_contact import Matches, touch_term
 from ..terms.body_order import Bounds, order_term
+from ..terms.body_outline import Outline, outline_term
 from ..terms.body_room import sink_term, stand_term, under_term
 from ..terms.body_start import angle_term, depth_share, image_term, range_term
 from ..terms.body_time import Neighbours, lock_term, smooth_term, steady_term
@@ -47,6 +48,8 @@ class BodyWeights:
     """Contact: skin that touches, off the furniture."""
     order: float = 0.3
     """Depth order: skin before what hides it, or behind what it hides."""
+    outline: float = 1.0
+    """Masks: the outline of the body on the outline of its mask."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ class Evidence:
     """Of the contact [m]."""
     even: Bool[Tensor, " picked"]
     """Points of the skin that lie evenly over the body."""
+    outline: Outline | None = None
 
 
 def body_energy(by: Correction, puppet: Puppet, known: Evidence, weights: BodyWeights) -> Energy:
@@ -96,6 +100,8 @@ def body_energy(by: Correction, puppet: Puppet, known: Evidence, weights: BodyWe
         ("touch", w.touch, lambda: touch_term(now.skin, _known(known.matches), known.rho)),
         ("order", w.order, lambda: order_term(
             to_camera(even, R)[..., 2], _known(known.bounds))),
+        ("outline", w.outline, lambda: outline_term(
+            to_camera(now.skin, R), _known(known.outline), known.camera.K, known.camera.width)),
     )  # fmt: skip
 
 
@@ -108,6 +114,8 @@ def _heard(weights: BodyWeights, known: Evidence) -> BodyWeights:
         missing["touch"] = 0.0
     if known.bounds is None:
         missing["order"] = 0.0
+    if known.outline is None or not len(known.outline.body):
+        missing["outline"] = 0.0
     if not known.feet.members.any():
         missing |= {"stand": 0.0, "lock": 0.0}
     return replace(weights, **missing)

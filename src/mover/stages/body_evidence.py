@@ -59,7 +59,7 @@ class Picked:
     part: Int[Tensor, " picked"]
     """Index into `PARTS`; -1: none."""
     group: Int[Tensor, " picked"]
-    """0: trunk and legs, then the arms."""
+    """0: no part that is known, then each of `PARTS`."""
 
 
 def surroundings_of(room: Room, capture: Capture | None) -> Surroundings:
@@ -130,11 +130,7 @@ def pick(bodies: Bodies, parts: Parts) -> Picked:
             chosen.append(own[spread(verts[own], PART_POINTS)])
     index = torch.cat(chosen).unique()
     part = parts.part_of[index]
-    group = torch.zeros_like(part)
-    for k, side in enumerate(("left", "right"), 1):
-        arm = torch.tensor([PARTS.index(f"{side}_palm"), PARTS.index(f"{side}_forearm")])
-        group = torch.where(torch.isin(part, arm.to(part)), k, group)
-    return Picked(index, torch.isin(index, even), part, group)
+    return Picked(index, torch.isin(index, even), part, part + 1)
 
 
 def resting_soles(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies feet"]:

@@ -6,7 +6,9 @@ from torch import Tensor
 
 from ..energy import HumanCues, ImageCues
 from ..geometry.raster import Views
+from ..terms.border import Borders
 from ..terms.depth import DepthRange
+from ..terms.silhouette import outline_root
 
 
 def coarser_image(image: ImageCues, factor: int) -> ImageCues:
@@ -27,7 +29,13 @@ def coarser_image(image: ImageCues, factor: int) -> ImageCues:
     small = Views(views.K * zoom, views.height // factor, views.width // factor)
     masks = _tiles(image.masks, factor).mean((-3, -1))
     keep = _tiles(image.keep, factor).all(-1).all(-2)
-    return replace(image, views=small, masks=masks, keep=keep)
+    outline = None if image.outline is None else outline_root(masks)
+    borders = image.borders
+    if borders is not None:
+        borders = Borders(borders.shifts, _tiles(borders.masks, factor).mean((-3, -1)))
+    return replace(
+        image, views=small, masks=masks, keep=keep, outline=outline, borders=borders
+    )
 
 
 def coarser_humans(humans: HumanCues, factor: int) -> HumanCues:

@@ -11,6 +11,8 @@ from ..geometry.crops import area_mean, crop_views
 from ..minimize import Observer, silent
 from ..records import record
 from ..terms import Form
+from ..terms.border import borders_of
+from ..terms.silhouette import outline_root
 from ..types import Camera
 
 BORDER = 1.5  # [px], a side this close to the image's border is cut by it
@@ -27,6 +29,8 @@ class ImageConfig:
     """Pixels along a side of each object's window."""
     form: Form = "paper"
     """`release`: what lies beyond the border is background; `robust`: hidden sides are dropped."""
+    borders: tuple[float, ...] = ()
+    """By how much outlines of masks may be off, with 0 among them [px of the image] (`robust`)."""
 
 
 @record
@@ -66,7 +70,14 @@ def find_image_cues(
     if config.form == "robust":
         sides = sides & _seen_sides(inputs, others)
     trust = torch.ones(len(own))
-    return ImageCues(inputs.boxes, sides, views, own, keep, trust, inputs.distance)
+    outline = outline_root(own) if config.form == "release" else None
+    borders = None
+    if config.borders:
+        zoom = views.K[:, 0, 0] / inputs.camera.K[0, 0]
+        borders = borders_of(own, zoom, config.borders)
+    return ImageCues(
+        inputs.boxes, sides, views, own, keep, trust, inputs.distance, outline, borders
+    )
 
 
 def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:

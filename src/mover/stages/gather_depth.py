@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextvars import copy_context
 from dataclasses import dataclass, replace
+from functools import cached_property
 from threading import Lock
 
 import torch
@@ -19,6 +20,8 @@ from .small import small_masks, small_views
 
 NEAREST = 0.3  # [m], bodies are taken to be at least that far when pixels become metres
 BLOCK = 4  # bodies that a thread draws at once
+
+Window = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,21 @@ class Sight:
     """See `terms.depth.bounds_of`."""
     reach: float = 0.0
     """How far the outline of a body may be wrong [m]."""
+
+    @cached_property
+    def spans(self) -> tuple[tuple[int, int, int, int], ...]:
+        """First row and the one after the last of each object, and the same of its columns."""
+        return tuple((*_ends(mask.any(1)), *_ends(mask.any(0))) for mask in self.masks)
+
+    def meeting(self, window: Window) -> list[int]:
+        """The objects that may have a pixel in a window."""
+        rows, columns = window
+        return [
+            k
+            for k, (top, end, left, right) in enumerate(self.spans)
+            if top < rows.stop and rows.start < end
+            if left < columns.stop and columns.start < right
+        ]
 
 
 def gather_depth(
@@ -75,9 +93,6 @@ def gather_depth(
     return maps
 
 
-Window = tuple[slice, slice]
-
-
 def _cut(maps: DepthMaps, window: Window) -> DepthMaps:
     return DepthMaps(maps.near[window], maps.far[window], maps.free[window])
 
@@ -89,21 +104,27 @@ def _bounds(sight: Sight, block: list[int]) -> Iterator[tuple[Window, DepthMaps]
     many = replace(views, K=views.K.expand(len(block), 3, 3))
     drawn = layers(verts, sight.bodies.faces, many)
     for k, row in enumerate(block):
-        window = _window(drawn.front[k].isfinite(), sight.erode)
+        window = _window(drawn.front[k] < float("inf"), sight.erode)
         visible, others = (
             small_masks(mask[None], sight.camera)[0][window] for mask in sight.table.decode(row)
         )
-        reach = sight.reach * float(views.K[0, 0, 0] / verts[k, :, 2].median().clamp_min(NEAREST))
+        reach = sight.reach
+        if reach > 0:
+            reach *= float(views.K[0, 0, 0] / verts[k, :, 2].median().clamp_min(NEAREST))
         seen = Seen(drawn.front[k][window], drawn.exit[k][window], visible, others, reach)
-        objects = sight.masks[:, *window]
+        objects = sight.masks[sight.meeting(window)][:, *window]
         yield window, bounds_of(seen, objects, sight.erode, vote=sight.vote)
 
 
 def _window(body: Bool[Tensor, "h w"], border: int) -> Window:
     """Rows and columns of a silhouette and a border, so that its masks shrink as in the image."""
-    sides: list[slice] = []
-    for axis, size in zip((1, 0), body.shape, strict=True):
-        index = torch.nonzero(body.any(axis))[:, 0]
-        first, last = (int(index[0]), int(index[-1])) if len(index) else (0, -1)
-        sides.append(slice(max(first - border, 0), min(last + border + 1, size)))
-    return sides[0], sides[1]
+    first, last = _ends(body.any(1))
+    left, right = _ends(body[first:last].any(0))
+    rows = slice(max(first - border, 0), min(last + border, body.shape[0]))
+    return rows, slice(max(left - border, 0), min(right + border, body.shape[1]))
+
+
+def _ends(line: Bool[Tensor, " n"]) -> tuple[int, int]:
+    """First place that is set, and the one after the last; zeros where none is."""
+    index = torch.nonzero(line)[:, 0]
+    return (int(index[0]), int(index[-1]) + 1) if len(index) else (0, 0)

@@ -7,12 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..energy import HumanCues, ImageCues, SceneConfig, SceneWeights, scene_energy
+from ..energy import HumanCues, ImageCues, SceneConfig, SceneWeights
+from ..energy_warp import pricing
 from ..geometry.placement import stand
 from ..minimize import Adam, Energy, Minimum, Observer, Step, minimize, silent
 from ..minimize_newton import Problems, Quasi, settle
 from ..records import record
 from ..terms import Form
+from ..terms.contact_reach import together
 from ..terms.contact_trees import trees_of
 from ..types import Camera, Layout, Objects
 from .coarser import coarser_humans, coarser_image
@@ -93,7 +95,7 @@ class Placed:
 
 def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = silent) -> Placed:
     """Minimise Eq. 1 over the layout, from one start or from many."""
-    starts, inputs = inputs.starts, with_trees(inputs)
+    starts, inputs = inputs.starts, with_trees(inputs, config.form)
     if config.first.steps:
         starts = _by_boxes(inputs, config, starts, observe)
     if config.yaws > 1:
@@ -126,11 +128,12 @@ def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], En
     scene = SceneConfig(config.weights, config.form)
     objects = inputs.objects
     heights = objects.size[:, 1]
+    price = pricing(objects, inputs.camera, inputs.image, inputs.humans, scene)
 
     def energy(layout: Layout) -> Energy:
         held = hold(layout, inputs.pinned)
         standing = stand(held, objects.supports, heights, inputs.ground)
-        return scene_energy(standing, objects, inputs.camera, inputs.image, inputs.humans, scene)
+        return price(standing)
 
     return energy
 
@@ -163,19 +166,20 @@ def descend(
     return Minimum(at(found.at), found.value, found.trace)
 
 
-def with_trees(inputs: PlaceInputs) -> PlaceInputs:
+def with_trees(inputs: PlaceInputs, form: Form = "robust") -> PlaceInputs:
     """The inputs with search trees of what is touched, where these help."""
     humans = inputs.humans
     if humans.touches is None:
         return inputs
-    trees = trees_of(inputs.objects, humans.touches)
-    return replace(inputs, humans=replace(humans, trees=trees))
+    touches = together(humans.touches) if form != "robust" else humans.touches
+    trees = trees_of(inputs.objects, touches, form)
+    return replace(inputs, humans=replace(humans, touches=touches, trees=trees))
 
 
 def _free_energy(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
     """The energy as a function of the unknowns of a descent."""
     energy, span = energy_of(inputs, config), _spans(inputs.objects, config)
-    return lambda free: energy(_bounded(free, span))
+    return (lambda free: energy(_bounded(free, span))) if bool(span.any()) else energy
 
 
 def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Problems[Layout]:

@@ -26,8 +26,10 @@ def small_camera(camera: Camera) -> Camera:
 
 
 def small_masks(masks: Bool[Tensor, "rows h w"], camera: Camera) -> Bool[Tensor, "rows sh sw"]:
-    """Masks of that image, by their nearest pixel."""
+    """Masks of that image, by their nearest pixel; those given, where they have its size."""
     views, (height, width) = small_views(camera), masks.shape[-2:]
+    if (views.height, views.width) == (height, width):
+        return masks
     rows = ((torch.arange(views.height) + 0.5) * height / views.height).long()
     columns = ((torch.arange(views.width) + 0.5) * width / views.width).long()
     return masks[:, rows][:, :, columns]

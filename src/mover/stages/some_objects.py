@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..energy import HumanCues, ImageCues
 from ..geometry.raster import Views
+from ..terms.border import Borders
 from ..terms.contact import Touches
 from ..terms.contact_trees import some_trees
 from ..types import Objects
@@ -48,8 +49,11 @@ def some_image(image: ImageCues, index: Rows) -> ImageCues:
     """What the image says about the objects of this index."""
     views = Views(image.views.K[index], image.views.height, image.views.width)
     rest = {k: getattr(image, k)[index] for k in ("boxes", "sides", "masks", "keep", "trust")}
-    distance = None if image.distance is None else image.distance[index]
-    return ImageCues(views=views, distance=distance, **rest)
+    distance, outline = (x if x is None else x[index] for x in (image.distance, image.outline))
+    borders = image.borders
+    if borders is not None:
+        borders = Borders(borders.shifts, borders.masks[:, index])
+    return ImageCues(views=views, distance=distance, outline=outline, borders=borders, **rest)
 
 
 def some_humans(humans: HumanCues, index: Rows, n: int) -> HumanCues:

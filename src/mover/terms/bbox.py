@@ -25,6 +25,7 @@ def bbox_term(
     sides: Bool[Tensor, "objects 4"],
     width: float,
     form: Form,
+    wider: float = 0.0,
 ) -> Float[Tensor, "*starts objects"]:
     """Distance between projected and detected boxes.
 
@@ -34,11 +35,13 @@ def bbox_term(
         sides: Which sides are known; an object without a box has none and costs nothing.
         width: Width of the image [px].
         form: How it is priced; [px at 640] for `paper` and `release`, else box sizes.
+        wider: How far the true sides lie outside the detected ones [px] (`robust` only).
     """
     drawn = torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
     if form == "robust":
         size = (detected[:, 2:] - detected[:, :2]).clamp_min(1).prod(-1, keepdim=True).sqrt()
-        off = ((drawn - detected) / size).square()
+        out = detected.new_tensor([-wider, -wider, wider, wider])
+        off = ((drawn - (detected + out)) / size).square()
         return (((off + SOFT**2).sqrt() - SOFT) * sides).sum(-1)
     off = (_corner_and_width(drawn) - _corner_and_width(detected)).abs() * (WIDTH / width)
     if form == "release":

@@ -1,7 +1,8 @@
 r"""Skin that touches lies on a surface that faces it (after PROX, contact term).
 
 Evidence:  for each skin point that touches, the nearest surface point whose normal is opposed to
-           the skin's within 45 degrees, and the plane there; found anew as the body moves.
+           the skin's within 45 degrees, and the plane there; found anew as the body moves. Where
+           the distance to the furniture contradicts the plane, the surface ends before it.
 Price:     Geman-McClure of the distance from the plane; the points of one group share one weight.
 Paper:     distance to the nearest vertex of the scene, normals up to their sign: a thigh inside a
            seat may be drawn through it. Here the surface must face the skin, and one may slide.
@@ -11,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..geometry.nearest import as_float64
+from ..geometry.volume import Volume, sample
 from ..minimize import geman_mcclure
 from ..records import record
 
@@ -22,7 +24,8 @@ FACING = -0.7071  # cosine of 135 degrees, PROX's 45 degrees with the sign
 BEND = 0.15  # [m], how much a normal counts beside a place
 USUAL = 0.02  # [m], usual distance of skin that touches
 LAYER = 0.015  # [m], skin of a group that is no farther than this from its foremost point touches
-POINTS = 6.0  # independent places of a group that touches
+POINTS = 3.0  # independent places of a group that touches
+EDGE = 0.03  # [m], by which a plane and the furniture's own distance may differ
 
 
 @record
@@ -45,8 +48,8 @@ class Skin:
     """Outward unit normals."""
     chance: Float[Tensor, "bodies points"]
     group: Int[Tensor, " points"]
-    """From 0: trunk and thighs, each arm; points of a group on level, or on steep, surfaces share
-    a weight."""
+    """From 0: parts of the body; points of one part on level, or on steep, surfaces share a weight
+    and have one foremost point, so that a thigh that hangs does not speak for the seat."""
 
 
 @record
@@ -73,7 +76,9 @@ class MatchConfig:
     """Farther no surface is touched [m]."""
 
 
-def gather_matches(skin: Skin, surface: Surface, config: MatchConfig) -> Matches:
+def gather_matches(
+    skin: Skin, surface: Surface, config: MatchConfig, furniture: Volume | None = None
+) -> Matches:
     """The nearest surface that faces each skin point that touches."""
     from scipy.spatial import KDTree
 
@@ -87,6 +92,8 @@ def gather_matches(skin: Skin, surface: Surface, config: MatchConfig) -> Matches
     place, normal = surface.points[index], surface.normals[index]
     opposed = (facing * normal).sum(-1) < FACING
     keep = opposed & ((places - place).norm(dim=-1) < config.reach)
+    if furniture is not None:
+        keep = keep & _on_surface(sample(furniture, places), ((places - place) * normal).sum(-1))
     body, point, place, normal = body[keep], point[keep], place[keep], normal[keep]
     off = ((skin.points[body, point].detach() - place) * normal).sum(-1)
     level = (normal[:, 1].abs() > -FACING).long()
@@ -95,6 +102,18 @@ def gather_matches(skin: Skin, surface: Surface, config: MatchConfig) -> Matches
     total = weight.new_zeros(int(group.max()) + 1 if len(group) else 1)
     total = total.index_add(0, group, weight)[group]
     return Matches(body, point, place, normal, POINTS * weight / total.clamp_min(POINTS))
+
+
+def _on_surface(
+    distance: Float[Tensor, " matches"], off: Float[Tensor, " matches"]
+) -> Bool[Tensor, " matches"]:
+    """Whether a plane still is the surface of the furniture where the skin is.
+
+    Args:
+        distance: Of the skin from the furniture, negative inside [m].
+        off: Of the skin from the plane [m].
+    """
+    return ((distance - off).abs() < EDGE) | ((distance < 0) & (off < 0))
 
 
 def _foremost(off: Float[Tensor, " matches"], group: Int[Tensor, " matches"]) -> Tensor:

@@ -19,7 +19,7 @@ BIAS = 0.03  # usual error of a person's depth in all frames, as a share
 DRIFT = 0.012  # usual error that changes, as a share
 PLACE = 0.03  # [m], usual error of a joint across the ray
 LOST = 0.15  # [m], an error across the ray that is no longer believed
-POINTS = 8.0  # joints whose places are independent, of all of them
+POINTS = 3.0  # joints whose places are independent: a body that is off is off as a whole
 NEAR = 0.1  # [m], nearer no depth is taken to be
 
 

@@ -10,7 +10,10 @@ from ..geometry.rotations import rot_y
 from ..minimize import safe_norm
 from ..records import map_tensors, record
 from ..types import Layout, Objects
-from .contact import Touches
+from . import Form
+from .contact import PARTS, Touches
+
+FAR_AWAY = 1e3  # [m], where points without weight are put
 
 
 @record
@@ -21,16 +24,38 @@ class Trees:
     back: Clouds
     asking: Bool[Tensor, "objects 2 points"]
     """By top and back: whether points of the body, then of the hands, have a weight."""
+    skin: tuple[Clouds, ...] | None = None
+    """The points of the evidence, by part (`release` only); meaningless where none has a weight."""
 
 
-def trees_of(objects: Objects, touches: Touches) -> Trees | None:
+def trees_of(objects: Objects, touches: Touches, form: Form = "robust") -> Trees | None:
     """Search trees of all objects; None where Warp is not the engine or cannot help."""
     if engine() != "warp" or objects.top.dtype != torch.float32 or not objects.top.numel():
         return None
     weighty = _by_region(touches.weight > 0)
     asking = weighty.new_zeros(len(objects.ids), *weighty.shape[1:])
     asking[touches.object_of] = weighty
-    return Trees(clouds(objects.top), clouds(objects.back), asking)
+    skin = _skin(touches, len(objects.ids)) if form == "release" else None
+    return Trees(clouds(objects.top), clouds(objects.back), asking, skin)
+
+
+def _skin(touches: Touches, objects: int) -> tuple[Clouds, ...] | None:
+    """Search trees of the points of each part; None where nothing is touched."""
+    known, index = touches.weight > 0, touches.object_of
+    if not bool(known.any()):
+        return None
+    points = torch.where(known.unsqueeze(-1), touches.points.detach(), FAR_AWAY)
+    found: list[Clouds] = []
+    for part in range(PARTS):
+        order = known[:, part].byte().argsort(dim=-1, descending=True, stable=True)
+        order = order[:, : max(1, int(known[:, part].sum(-1).max()))]
+        some = clouds(points[:, part].gather(-2, order.unsqueeze(-1).expand(-1, -1, 3)))
+        found.append(map_tensors(lambda x: _spread(x, index, objects), some))
+    return tuple(found)
+
+
+def _spread(rows: Tensor, index: Tensor, objects: int) -> Tensor:
+    return rows.new_zeros(objects, *rows.shape[1:]).index_copy(0, index, rows)
 
 
 def some_trees(trees: Trees | None, index: Tensor) -> Trees | None:

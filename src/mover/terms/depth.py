@@ -81,8 +81,8 @@ def bounds_of(
             borders that leak bound nothing.
         vote: Of each object, keep only the larger region: it is hidden or hides, not both.
     """
-    body = _shrink(seen.front.isfinite(), erode)
-    shown = body & _shrink(seen.visible, erode)
+    body = eroded(seen.front.isfinite(), erode)
+    shown = body & eroded(seen.visible, erode)
     hidden = body & ~_grow(seen.visible, erode) & ~_grow(seen.others, erode)
     if seen.reach > 0:
         hidden = _thick(hidden, seen.reach)
@@ -162,11 +162,12 @@ def _thick(hidden: Bool[Tensor, "h w"], reach: float) -> Bool[Tensor, "h w"]:
     return hidden & (torch.from_numpy(distance_transform_edt(~inner.numpy())) < reach / 2)
 
 
-def _shrink(mask: Bool[Tensor, "h w"], steps: int) -> Bool[Tensor, "h w"]:
+def eroded(mask: Bool[Tensor, "*batch h w"], steps: int) -> Bool[Tensor, "*batch h w"]:
+    """The mask without what lies so many steps from an unset pixel; the image's border is none."""
     for _ in range(steps):
         mask = _erode(mask)
     return mask
 
 
 def _grow(mask: Bool[Tensor, "h w"], steps: int) -> Bool[Tensor, "h w"]:
-    return ~_shrink(~mask, steps)
+    return ~eroded(~mask, steps)

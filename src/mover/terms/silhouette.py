@@ -39,19 +39,33 @@ def edge_term(
     drawn: Float[Tensor, "*starts objects h w"],
     mask: Float[Tensor, "objects h w"],
     keep: Bool[Tensor, "objects h w"],
+    outline: Float[Tensor, "objects h w"] | None = None,
 ) -> Float[Tensor, "*starts objects"]:
     """One-way distance of the drawn outline from the detected one (PHOSA) [px^1.5].
 
     Half the sum of the outer ring of the kept silhouette times the root of the distance to the
     ring of the mask. Only the `release` preset gives it a weight.
+
+    Args:
+        drawn: Silhouettes.
+        mask: Detected coverage.
+        keep: What is outside counts as empty.
+        outline: `outline_root` of the mask; None: it is found anew.
     """
-    distance = _distance_to(_ring((mask > 0.5).to(drawn)))
-    return 0.5 * (_ring(drawn * keep) * distance.sqrt()).sum((-2, -1))
+    root = outline_root(mask).to(drawn) if outline is None else outline
+    return 0.5 * (_ring(drawn * keep) * root).sum((-2, -1))
+
+
+def outline_root(mask: Float[Tensor, "objects h w"]) -> Float[Tensor, "objects h w"]:
+    """Root of the distance to the ring of the mask [px^0.5]."""
+    return _distance_to(_ring((mask > 0.5).to(mask))).sqrt()
 
 
 def _ring(image: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w"]:
-    flat = image.reshape(-1, 1, *image.shape[-2:])
-    grown = torch.nn.functional.max_pool2d(flat, RING, stride=1, padding=RING // 2)
+    """What the highest pixel around exceeds each by; rows first, which finds the same pixel."""
+    flat, reach = image.reshape(-1, 1, *image.shape[-2:]), RING // 2
+    grown = torch.nn.functional.max_pool2d(flat, (1, RING), stride=1, padding=(0, reach))
+    grown = torch.nn.functional.max_pool2d(grown, (RING, 1), stride=1, padding=(reach, 0))
     return grown.reshape(image.shape) - image
 
 

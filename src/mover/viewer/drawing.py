@@ -38,7 +38,7 @@ class Drawing:
     colours: dict[str, Colour] = field(default_factory=lambda: {})
 
 
-LAYERS = ("near", "far", "free space", "contacts", "doubt")
+LAYERS = ("near", "far", "free space", "contacts", "doubt", "place")
 
 
 def draw_room(drawing: Drawing, scene: Scene, kind: str) -> None:
@@ -135,13 +135,19 @@ def draw_layers(drawing: Drawing, layers: Layers) -> None:
     for name, points in layers.contacts.items():
         drawn = _points(scene, f"/evidence/contacts/{name}", points, _tint(drawing, name), 0.025)
         drawing.layers["contacts"].append(drawn)
-    for name, outline in layers.ellipses.items():
+    _draw_rings(drawing, "doubt", layers.ellipses)
+    _draw_rings(drawing, "place", layers.places)
+
+
+def _draw_rings(drawing: Drawing, layer: str, rings: dict[str, torch.Tensor]) -> None:
+    """Outlines on the floor, in the colours of their objects."""
+    scene = drawing.server.scene
+    for name, outline in rings.items():
         ring = torch.stack([outline, outline.roll(-1, 0)], 1).numpy()
         raised = ring + np.array([0.0, 0.01, 0.0], dtype=np.float32)
-        drawn = scene.add_line_segments(
-            f"/evidence/doubt/{name}", raised, _tint(drawing, name), thickness=0.02, visible=False
-        )
-        drawing.layers["doubt"].append(drawn)
+        path, tint = f"/evidence/{layer}/{name}", _tint(drawing, name)
+        drawn = scene.add_line_segments(path, raised, tint, thickness=0.02, visible=False)
+        drawing.layers[layer].append(drawn)
 
 
 def _tint(drawing: Drawing, name: str) -> tuple[int, int, int]:

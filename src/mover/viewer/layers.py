@@ -1,7 +1,9 @@
 """The evidence as things that can be drawn: points, surfaces and outlines in the world."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +23,7 @@ from ..types import Camera, Mesh, Scene
 MOST_POINTS = 30_000  # of each depth map
 MOST_CELLS = 96  # along the longest side of the free space, when its surface is drawn
 LIKELY = math.sqrt(5.991)  # the ellipse that holds 95 % of a normal distribution in the plane
+USUAL = math.sqrt(4.605)  # the same for 90 %
 CORNERS = 48  # of an ellipse
 
 
@@ -38,6 +41,8 @@ class Layers:
     """Points of bodies that touch an object [m], by its id."""
     ellipses: dict[str, Float[Tensor, "corners 3"]]
     """95 % of where the floor and camera let an object stand [m], by its id."""
+    places: dict[str, Float[Tensor, "corners 3"]] = field(default_factory=lambda: {})
+    """90 % of where all evidence together lets the middle of an object stand [m], by its id."""
 
 
 def no_layers() -> Layers:
@@ -131,11 +136,22 @@ def floor_ellipses(
     return found
 
 
+def place_ellipses(rows: Sequence[Mapping[str, Any]]) -> dict[str, Float[Tensor, "corners 3"]]:
+    """How well each object's place is known, from the explanations of run.json."""
+    found: dict[str, Tensor] = {}
+    for row in rows:
+        doubt = row["uncertainty"]
+        base = torch.tensor(doubt["base"], dtype=torch.float64)
+        spread = torch.tensor(doubt["covariance"], dtype=torch.float64)[[0, 2]][:, [0, 2]]
+        found[str(row["id"])] = _ellipse(base, spread, float(base[1]), USUAL)
+    return found
+
+
 def _ellipse(
-    base: Float[Tensor, "3"], spread: Float[Tensor, "2 2"], ground: float
+    base: Float[Tensor, "3"], spread: Float[Tensor, "2 2"], ground: float, likely: float = LIKELY
 ) -> Float[Tensor, "corners 3"]:
     values, axes = torch.linalg.eigh(spread)
     angle = torch.arange(CORNERS, dtype=torch.float64) * (2 * math.pi / CORNERS)
     circle = torch.stack([angle.cos(), angle.sin()], -1)
-    flat = base[[0, 2]] + LIKELY * (circle * values.clamp_min(0).sqrt()) @ axes.mT
+    flat = base[[0, 2]] + likely * (circle * values.clamp_min(0).sqrt()) @ axes.mT
     return torch.stack([flat[:, 0], torch.full_like(angle, ground), flat[:, 1]], -1).float()

@@ -20,6 +20,7 @@ TITLES = {
     "free space": "People's space",
     "contacts": "Contact points",
     "doubt": "Camera doubt (95 %)",
+    "place": "Where it may stand (90 %)",
 }
 
 

@@ -16,6 +16,7 @@ from .panel_object import add_object_panel
 from .panel_room import add_room_panel
 from .panel_solve import Gauges, SolveJob, add_solve_panel
 from .people import People
+from .quiet import quiet_presses
 from .session import Session
 from .window import Window, redraw, redraw_result
 
@@ -56,7 +57,9 @@ def open_viewer(
     try:
         import viser  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise InputError("mover view needs viser: pip install 'mover[viewer]'") from error
+        raise InputError(
+            "mover view needs viser: pip install '.[viewer]' in mover's folder"
+        ) from error
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(
             host=address.host, port=address.port, label=session.shown.title, verbose=False
@@ -65,6 +68,7 @@ def open_viewer(
         show_logo=False, show_share_button=False, control_width="large", control_layout="fixed"
     )
     server.scene.set_up_direction("+y")
+    quiet_presses(server)
     window = _window_of(server, session)
     _aim(window, session.shown.result)
     redraw(window)

@@ -11,7 +11,14 @@ from .. import records
 from ..stages.assign_touches import Contacts
 from ..stages.gather_cues import Cues
 from ..types import Scene
-from .layers import Layers, contact_points, depth_points, floor_ellipses, space_surface
+from .layers import (
+    Layers,
+    contact_points,
+    depth_points,
+    floor_ellipses,
+    place_ellipses,
+    space_surface,
+)
 
 log = logging.getLogger(__name__)
 Out = TypeVar("Out")
@@ -39,6 +46,7 @@ def read_layers(out: Path, run: Mapping[str, Any], scene: Scene) -> Layers:
             None if contacts is None else contacts.touches, tuple(p.id for p in scene.pieces)
         ),
         ellipses={} if spread is None else floor_ellipses(scene, torch.tensor(spread)),
+        places=place_ellipses(run.get("explanations", ())),
     )
 
 

@@ -5,12 +5,9 @@ from typing import no_type_check
 
 import warp as wp
 
-from .bodies import Work
+from .bodies import BITS, Work
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-SNAP = wp.constant(wp.float64(65536.0))  # vertices snap to this part of a cell, as in `voxels`
-BITS = wp.constant(wp.int64(16))
 
 
 @wp.struct
@@ -30,10 +27,10 @@ def flat(w: Work, t: wp.vec3i) -> Flat:
     """See `Flat`; the sign is 0 where the triangle is seen edge-on."""
     r = Flat()
     for k in range(3):
-        v = w.place[t[k]]
-        r.x[k] = wp.int64(wp.rint(v[0] * SNAP)) - (wp.int64(w.low[0]) << BITS)
-        r.z[k] = wp.int64(wp.rint(v[2] * SNAP)) - (wp.int64(w.low[2]) << BITS)
-        r.y[k] = v[1]
+        v = w.lines[t[k]]
+        r.x[k] = v[0]
+        r.z[k] = v[1]
+        r.y[k] = w.place[t[k]][1]
     area = (r.x[1] - r.x[0]) * (r.z[2] - r.z[0]) - (r.z[1] - r.z[0]) * (r.x[2] - r.x[0])
     r.sign = 1
     if area == wp.int64(0):
@@ -71,14 +68,20 @@ def weight(r: Flat, k: int, px: wp.int64, pz: wp.int64) -> wp.int64:
 @no_type_check
 def cross(w: Work) -> None:
     """Signed crossings of the columns with each triangle, one step where they pass it."""
-    r = flat(w, w.faces[wp.tid()])
+    t = w.faces[wp.tid()]
+    u = w.lines[t[0]]
+    v = w.lines[t[1]]
+    p = w.lines[t[2]]
+    one = wp.int64(65535)
+    xl = wp.max(int((wp.min(u[0], wp.min(v[0], p[0])) + one) >> BITS), 0)
+    xh = wp.min(int(wp.max(u[0], wp.max(v[0], p[0])) >> BITS), w.size[0] - 1)
+    zl = wp.max(int((wp.min(u[1], wp.min(v[1], p[1])) + one) >> BITS), 0)
+    zh = wp.min(int(wp.max(u[1], wp.max(v[1], p[1])) >> BITS), w.size[2] - 1)
+    if xl > xh or zl > zh:
+        return
+    r = flat(w, t)
     if r.sign == 0:
         return
-    one = wp.int64(65535)
-    xl = wp.max(int((wp.min(r.x) + one) >> BITS), 0)
-    xh = wp.min(int(wp.max(r.x) >> BITS), w.size[0] - 1)
-    zl = wp.max(int((wp.min(r.z) + one) >> BITS), 0)
-    zh = wp.min(int(wp.max(r.z) >> BITS), w.size[2] - 1)
     for x in range(xl, xh + 1):
         for z in range(zl, zh + 1):
             px = wp.int64(x) << BITS
@@ -91,4 +94,5 @@ def cross(w: Work) -> None:
                 height = wp.dot(share, r.y) / wp.float64(a + b + c)
                 y = int(wp.ceil(wp.clamp(height, wp.float64(-1.0e6), wp.float64(1.0e6))))
                 y = wp.clamp(y - w.low[1], 0, w.size[1])
+                w.crossed[(x >> 1) * ((w.size[2] + 1) >> 1) + (z >> 1)] = wp.uint8(1)
                 wp.atomic_add(w.steps, (x * w.size[2] + z) * (w.size[1] + 1) + y, r.sign)

@@ -2,20 +2,23 @@
 """Warp kernels that lower a volume where a body is deeper or nearer; see `bodies`.
 
 Places are measured in blocks of two along each axis. Which of a block's places can gain is known
-from a face that is near (that of a block beside); for these the leaves of the tree that can hold
-the nearest face are listed once, and only those are searched.
+from a leaf that is near (that of a block beside); for these the tree is searched once, with what
+the eight places know together. Nothing is left out that the rounding of distances might hide: the
+least distance is the same bits whatever the tree, the order of the search or what was known.
 """
 
 from typing import no_type_check
 
 import warp as wp
 
-from .bodies import SHELL, SLACK, Work, block_of
-from .distance import gather, in_leaves, in_tree, to_face
+from .bodies import BESIDE, SHELL, SLACK, WITHIN, Work
+from .packs import Eight, expand, look, reached, to_leaf
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-Eight = wp.types.vector(length=8, dtype=wp.float32)
+FAR = wp.constant(1.0e30)
+LOOSE = wp.constant(1.002)  # times a squared distance, and MORES: no less than the square of
+MORES = wp.constant(Eight(*[0.0021] * 8))  # 0.002 cells more; rounding is ten times smaller
 
 
 @wp.func
@@ -34,49 +37,48 @@ def place_of(w: Work, at: wp.vec3i) -> int:
 
 @wp.func
 @no_type_check
-def inside_of(w: Work, at: wp.vec3i) -> bool:
-    """Whether a place is in the box and in the body; to be called after `add_up`."""
-    if at[0] >= w.size[0] or at[1] >= w.size[1] or at[2] >= w.size[2]:
-        return False
-    return w.steps[place_of(w, at)] > 0
-
-
-@wp.func
-@no_type_check
-def add_up(w: Work, x: int, z: int) -> None:
-    """Turn the steps along a column into winding numbers, positive inside."""
+def add_up(w: Work, x: int, z: int, block: int) -> None:
+    """Turn the steps along a column into winding numbers, positive inside, and mark its blocks."""
     if x >= w.size[0] or z >= w.size[2]:
         return
     side = wp.where(w.turn[0] < wp.float64(0.0), -1, 1)
     winding = wp.int32(0)
     first = place_of(w, wp.vec3i(x, 0, z))
-    for v in range(first, first + w.size[1]):
-        winding += w.steps[v] * side
-        w.steps[v] = winding
+    for y in range(w.size[1]):
+        winding += w.steps[first + y] * side
+        w.steps[first + y] = winding
+        if winding > 0:
+            w.near[block + (y >> 1)] = w.near[block + (y >> 1)] | WITHIN
 
 
 @wp.func
 @no_type_check
-def open_to(w: Work, at: wp.vec3i, near: bool, known: float) -> float:
+def open_to(w: Work, at: wp.vec3i, near: bool, guess: int) -> float:
     """Squared distance below which a face lowers the field at a place; negative for none.
 
     Args:
         w: The body and the volume.
         at: The place in the body's box.
         near: Whether the surface may be within the shell.
-        known: Squared distance to a face that is near [cells²].
+        guess: A leaf that is near; negative for none.
     """
     if at[0] >= w.size[0] or at[1] >= w.size[1] or at[2] >= w.size[2]:
         return -1.0
     g = w.low + at
-    cell = wp.float32(w.cell)
-    held = wp.min(w.field[g[0], g[1], g[2]], w.other[g[0], g[1], g[2]])
-    if w.steps[place_of(w, at)] > 0:
-        return wp.where(-wp.sqrt(known) * cell >= held, -1.0, known)
-    if held <= 0.0 or not near:
+    held = w.field[g[0], g[1], g[2]]
+    than = w.other[g[0], g[1], g[2]]
+    held = wp.where(than < held, than, held) / wp.float32(w.cell)
+    square = held * held
+    inside = w.steps[place_of(w, at)] > 0
+    if not inside and (held <= 0.0 or not near):
         return -1.0
-    limit = wp.min(SHELL, held / cell)
-    return wp.min(known, limit * limit * SLACK)
+    known = float(FAR)
+    if guess >= 0:
+        known = to_leaf(w.tree.shapes, guess, center(g))
+    if inside:
+        return wp.where(held < 0.0 and known * SLACK < square, -1.0, known)
+    limit = wp.where(held < SHELL, square, SHELL * SHELL) * SLACK
+    return wp.where(known < limit, known, limit)
 
 
 @wp.func
@@ -102,53 +104,86 @@ def center(at: wp.vec3i) -> wp.vec3:
 @wp.func
 @no_type_check
 def nearest_of(w: Work, p: wp.vec3, guess: int, block: int) -> int:
-    """Of the faces near the block before and those beside, the one that is nearest to a point."""
+    """Of the leaves near the block before and those beside, the one that is nearest to a point."""
     if w.beside == 0:
         return guess
-    face = int(guess)
-    best = to_face(w.tree, p, guess)
+    leaf = int(guess)
+    best = float(FAR)
+    if guess >= 0:
+        best = to_leaf(w.tree.shapes, guess, p)
     rows = (w.size[1] + 1) >> 1
     for k in range(2):
         back = wp.where(k == 0, rows, rows * ((w.size[2] + 1) >> 1))
         if block >= back:
             one = w.owner[block - back]
-            if one != face:
-                d = to_face(w.tree, p, one)
+            if one != leaf and one >= 0:
+                d = to_leaf(w.tree.shapes, one, p)
                 if d < best:
                     best = d
-                    face = one
-    return face
+                    leaf = one
+    return leaf
+
+
+@wp.func
+@no_type_check
+def farthest(known: Eight) -> float:
+    """The largest of eight numbers."""
+    most = known[0]
+    for k in range(1, 8):
+        most = wp.where(known[k] > most, known[k], most)
+    return most
+
+
+@wp.func
+@no_type_check
+def search(w: Work, low: wp.vec3, best: Eight, guess: int, first: int) -> tuple[Eight, int]:
+    """Least squared distances at the places of a block, and a leaf that is near its last place.
+
+    Args:
+        w: The body.
+        low: First place of the block.
+        best: What is known of the squared distances; negative where nothing is searched.
+        guess: A leaf that has been looked at.
+        first: Where the stack begins.
+    """
+    high = low + wp.vec3(1.0, 1.0, 1.0)
+    known = best
+    loose = known * LOOSE + MORES
+    leaf = int(guess)
+    most = farthest(loose)
+    end = expand(w.tree.boxes, 0, low, high, most, w.tree.stack, first)
+    while end > first:
+        end -= 1
+        slot = w.tree.stack[end]
+        at = slot - w.tree.base
+        if at < 0:
+            pack = slot + w.tree.shift
+            end = expand(w.tree.boxes, pack, low, high, most, w.tree.stack, end)
+        elif at != guess:
+            hit = reached(w.tree.boxes, w.tree.slabs, slot, at, low, loose)
+            if hit != 0:
+                last = known[7]
+                known = look(w.tree.shapes, at, low, hit, known)
+                loose = known * LOOSE + MORES
+                most = farthest(loose)
+                leaf = wp.where(known[7] < last, at, leaf)
+    return known, leaf
 
 
 @wp.func
 @no_type_check
 def measure(w: Work, at: wp.vec3i, near: bool, guess: int, first: int) -> int:
-    """Lower the field in one block; gives a face that is near."""
-    low = center(w.low + at)
+    """Lower the field in one block; gives a leaf that is near."""
     known = Eight()
-    reach = float(-1.0)
     for k in range(w.eight):
-        here = at + corner(k)
-        known[k] = open_to(w, here, near, to_face(w.tree, center(w.low + here), guess))
-        reach = wp.max(reach, known[k])
-    if reach < 0.0:
+        known[k] = open_to(w, at + corner(k), near, guess)
+    if farthest(known) < 0.0:
         return guess
-    face = int(guess)
-    end = gather(w.tree, low, low + wp.vec3(1.0, 1.0, 1.0), reach, first)
+    known, leaf = search(w, center(w.low + at), known, guess, first)
     for k in range(w.eight):
         if known[k] >= 0.0:
-            here = at + corner(k)
-            p = center(w.low + here)
-            best = wp.min(known[k], to_face(w.tree, p, face))
-            found = int(-1)
-            if end < 0:
-                best, found = in_tree(w.tree, p, first, best)
-            else:
-                best, found = in_leaves(w.tree, p, first, end, best)
-            put(w, here, best)
-            if found >= 0:
-                face = found
-    return face
+            put(w, at + corner(k), known[k])
+    return leaf
 
 
 @wp.kernel
@@ -159,19 +194,18 @@ def blocks(w: Work) -> None:
     wide = (w.size[2] + 1) >> 1
     x = 2 * (column / wide)
     z = 2 * (column - (column / wide) * wide)
-    for k in range(4):
-        add_up(w, x + (k >> 1), z + (k & 1))
     rows = (w.size[1] + 1) >> 1
+    if w.crossed[column] != wp.uint8(0):
+        for k in range(4):
+            add_up(w, x + (k >> 1), z + (k & 1), column * rows)
     first = wp.where(w.beside > 0, 0, column * w.tree.longest)
     guess = int(-1)
     for row in range(rows):
         at = wp.vec3i(x, 2 * row, z)
-        near = w.near[block_of(w, x, 2 * row, z)] != wp.uint8(0)
-        some = bool(near)
-        for k in range(w.eight):
-            some = some or inside_of(w, at + corner(k))
         block = column * rows + row
-        if some:
+        marked = w.near[block]
+        if marked != wp.uint8(0):
+            near = (marked & BESIDE) != wp.uint8(0)
             guess = nearest_of(w, center(w.low + at) + wp.vec3(0.5, 0.5, 0.5), guess, block)
             guess = measure(w, at, near, guess, first)
         w.owner[block] = guess

@@ -1,0 +1,75 @@
+"""What stated doubts are multiplied by, so that 90 % of them hold: learnt on known rooms.
+
+`assets/calibration.json` is made by `benchmarks/calibrate.py`; its rooms are never those that
+results are reported on.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+
+from .terms import Form
+
+KIND_OF = ("distance", "height", "sideways", "yaw", "size", "size", "size")
+"""What is calibrated together, by direction (`explanation.ways_of`); the factor of the height
+holds for all that the camera's and the floor's doubt does."""
+KINDS = tuple(dict.fromkeys(KIND_OF))
+FILE = "calibration.json"
+SHARES = tuple(0.01 * 1.2**k for k in range(30))  # weights that are tried
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Factors on the spreads that the energy gives, by kind of unknown."""
+
+    factors: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(KINDS, 1.0))
+    share: float = 1.0
+    """Weight of an alternative whose energy is as low as that of the result, which has 1."""
+    learnt: bool = False
+    """False: nothing was learnt for these settings."""
+
+
+def calibration_of(form: Form) -> Calibration:
+    """What is known for a form of the prices; factors of one where nothing is."""
+    found = json.loads(files("mover").joinpath("assets", FILE).read_text(encoding="utf-8"))
+    learnt = found["forms"].get(form)
+    if learnt is None:
+        return Calibration()
+    return Calibration(learnt["factors"], learnt["share"], True)
+
+
+def learn_factor(needed: Sequence[float], level: float) -> float:
+    """The factor with which intervals hold a share `level` of errors (split conformal prediction).
+
+    Args:
+        needed: For each error the least factor with which its interval holds it.
+        level: The probability that an interval holds.
+
+    Raises:
+        ValueError: If there are too few errors for that probability.
+    """
+    rank = math.ceil(level * (len(needed) + 1) - 1e-9)
+    if rank > len(needed):
+        raise ValueError(f"learn_factor: {len(needed)} errors are too few for {level:.0%}")
+    return sorted(needed)[rank - 1]
+
+
+def learn_share(cases: Sequence[tuple[Sequence[float], int]]) -> float:
+    """The weight of alternatives under which it was likeliest that the true ones were true.
+
+    Args:
+        cases: For each object the rises of its alternatives, and which one is nearest to the
+            truth, counted from 1; 0: the result itself. Objects without alternatives say nothing.
+    """
+    told = [(rises, true) for rises, true in cases if rises]
+
+    def surprise(share: float) -> float:
+        total = 0.0
+        for rises, true in told:
+            weights = [1.0, *(share * math.exp(-max(r, 0.0)) for r in rises)]
+            total -= math.log(weights[true] / sum(weights))
+        return total
+
+    return min(SHARES, key=surprise) if told else 1.0

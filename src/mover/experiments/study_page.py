@@ -1,0 +1,133 @@
+"""Tables of a study as Markdown and as CSV."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ..records import replacing
+from .columns import COLUMNS, head_of, markdown, shown
+from .compare import Cell, Filled, Row
+from .finished import Source
+from .job import ROOM
+from .statistics import FEWEST, RESAMPLES, Interval
+
+MARKS = {"better": " ▲", "worse": " ▼", "": ""}
+LEGEND = (
+    f"▲ significantly better, ▼ worse than {{against}}: paired bootstrap over rooms ({RESAMPLES:,}"
+    " resamples), 5 % over all comparisons of this page by Holm's correction, from"
+    f" {FEWEST} rooms on."
+)
+FIELDS: tuple[str, ...] = (
+    "table", "row", "quoted", "metric", "unit", "rooms", "mean", "low", "high",
+    "difference", "difference_low", "difference_high", "p", "p_holm", "mark", "command",
+)  # fmt: skip
+
+
+def table_of(filled: Filled) -> str:
+    """A table with its marks, and the differences below it."""
+    table = filled.table
+    parts = [f"## {table.title}"] + ([table.note] if table.note else [])
+    head = ["", *table.parts, *(head_of(name) for name in table.columns), "rooms"]
+    parts.append(markdown(head, [_row(filled, k) for k in range(len(table.rows))]))
+    against = _against(filled)
+    if against:
+        parts += [
+            LEGEND.format(against=f"*{against}*"),
+            f"Difference from *{against}* with its 95 % interval:",
+            _differences(filled),
+        ]
+    return "\n\n".join(parts)
+
+
+def _row(filled: Filled, index: int) -> list[str]:
+    row, cells = filled.table.rows[index], filled.cells[index]
+    ticks = ["✓" if on else "" for on in row.ticks] or [""] * len(filled.table.parts)
+    label = f"*{row.label}* (paper)" if row.source is None else row.label
+    return [label, *ticks, *(_shown(cell) for cell in cells), _rooms(cells)]
+
+
+def _shown(cell: Cell) -> str:
+    if cell.value is None:
+        return shown(cell.metric, cell.quoted)
+    return shown(cell.metric, cell.value.mean) + MARKS[cell.mark]
+
+
+def _rooms(cells: Sequence[Cell]) -> str:
+    counts = sorted({cell.value.rooms for cell in cells if cell.value is not None})
+    return "-".join(str(n) for n in dict.fromkeys((*counts[:1], *counts[-1:])))
+
+
+def _against(filled: Filled) -> str:
+    """Label of the row that the others are compared with."""
+    source = filled.table.against
+    labels = [row.label for row in filled.table.rows if row.source == source]
+    return labels[0] if source is not None and labels else ""
+
+
+def _differences(filled: Filled) -> str:
+    rows = [
+        [row.label, *(_interval(cell) for cell in cells)]
+        for row, cells in zip(filled.table.rows, filled.cells, strict=True)
+        if any(cell.difference is not None for cell in cells)
+    ]
+    return markdown(["", *(head_of(name) for name in filled.table.columns)], rows)
+
+
+def _interval(cell: Cell) -> str:
+    return "-" if cell.difference is None else difference_text(cell.metric, cell.difference)
+
+
+def difference_text(metric: str, found: Interval) -> str:
+    """A difference and its interval in the unit of the column."""
+    mean, low, high = (shown(metric, v, sign=True) for v in (found.mean, found.low, found.high))
+    return f"{mean} [{low}, {high}]"
+
+
+def command_of(source: Source, seeds: str) -> str:
+    """The command that does the jobs of a row."""
+    names = " ".join("robust" if name == ROOM else name for name in source.names)
+    return f"mover experiment --set {source.rooms} --seeds {seeds} --presets {names}"
+
+
+def commands_of(tables: Sequence[Filled], seeds: Mapping[str, str]) -> list[str]:
+    """The commands of all rows, each once."""
+    sources = [row.source for filled in tables for row in filled.table.rows if row.source]
+    return list(dict.fromkeys(command_of(s, seeds[s.rooms]) for s in sources))
+
+
+def write_csv(tables: Sequence[Filled], seeds: Mapping[str, str], path: Path) -> None:
+    """A line for each number [m], [rad]: mean, interval, difference, p, and its command."""
+    with replacing(path) as part, part.open("w", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
+        writer.writeheader()
+        for filled in tables:
+            for row, cells in zip(filled.table.rows, filled.cells, strict=True):
+                writer.writerows(_line(filled.table.title, row, cell, seeds) for cell in cells)
+
+
+def _line(title: str, row: Row, cell: Cell, seeds: Mapping[str, str]) -> dict[str, str]:
+    value, difference = cell.value, cell.difference
+    line = dict.fromkeys(FIELDS, "") | {
+        "table": title,
+        "row": row.label,
+        "quoted": "yes" if row.source is None else "",
+        "metric": cell.metric,
+        "unit": "m" if COLUMNS[cell.metric].factor in (100, 1000) else "",
+        "mark": cell.mark,
+        "command": "" if row.source is None else command_of(row.source, seeds[row.source.rooms]),
+    }
+    if COLUMNS[cell.metric].unit == "°":
+        line["unit"] = "rad"
+    if cell.quoted is not None:
+        line["mean"] = f"{cell.quoted:.6g}"
+    if value is not None:
+        line |= {"rooms": str(value.rooms), **_three("mean", "low", "high", value)}
+    if difference is not None:
+        names = ("difference", "difference_low", "difference_high")
+        line |= _three(*names, difference)
+        line |= {"p": f"{difference.p:.4g}", "p_holm": f"{cell.adjusted:.4g}"}
+    return line
+
+
+def _three(mean: str, low: str, high: str, found: Interval) -> dict[str, str]:
+    return {mean: f"{found.mean:.6g}", low: f"{found.low:.6g}", high: f"{found.high:.6g}"}

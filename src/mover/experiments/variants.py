@@ -1,0 +1,135 @@
+"""What a room is rebuilt with: a preset, a preset without one of its parts, or less evidence.
+
+A job has the name of a variant. Variants of one room share its finished stages, so that only what
+differs is computed anew.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from ..presets import PRESETS, Config
+from ..stages.align_camera import AlignConfig
+from ..stages.assign_touches import AssignConfig
+
+Hears = Literal["all", "no contact", "nobody"]
+SEGMENTS = 10  # of each length, as in the paper
+LENGTHS = (10, 20, 30)  # [s]
+FRAMES = 5  # single frames whose results are averaged
+SHARES = (0.125, 0.25, 0.5, 1.0)  # of the video, for the time
+HIDDEN = ("frame-", "s-", "time-", "people-")  # names of variants that tables put together
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Which part of a video is given."""
+
+    seconds: float = 0.0
+    """Length of a segment [s]; 0: see `share`."""
+    share: float = 0.0
+    """Part of the frames, from the first one; 0: a single frame."""
+    place: float = 0.0
+    """Where it begins: 0 as early, 1 as late as possible."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Settings, and what is withheld."""
+
+    config: Config
+    hears: Hears = "all"
+    """What of the people is told: `no contact`: nobody touches anything; `nobody`: an image."""
+    cut: Cut | None = None
+    """Part of the video; None: all of it."""
+    bodies: str = ""
+    """People refined afterwards: a row of the paper's table of bodies; empty: they are not."""
+    fresh: bool = False
+    """Nothing is taken from stages that other variants have finished: it is timed."""
+
+
+ROBUST = PRESETS["robust"]
+
+
+def weighed(config: Config, **weights: float) -> Config:
+    """Other weights of the people's evidence in stage 2."""
+    return replace(
+        config, place=replace(config.place, weights=replace(config.place.weights, **weights))
+    )
+
+
+def relaxed(config: Config, factor: float = 0.1) -> Config:
+    """A weaker prior on the sizes of objects, in both stages."""
+
+    def of(stage: Any) -> Any:  # noqa: ANN401
+        weights = replace(stage.weights, scale=factor * stage.weights.scale)
+        return replace(stage, weights=weights)
+
+    return replace(config, layout=of(config.layout), place=of(config.place))
+
+
+def _far(config: Config) -> Config:
+    """Without the prior on distances."""
+    layout = replace(config.layout, weights=replace(config.layout.weights, distance=0.0))
+    return weighed(replace(config, layout=layout), distance=0.0)
+
+
+_SILENT = {"contact": 0.0, "heading": 0.0}
+TERMS: dict[str, Variant] = {
+    "again-alone": Variant(weighed(ROBUST, depth=0.0, collision=0.0, **_SILENT), "no contact"),
+    "contact": Variant(weighed(ROBUST, depth=0.0, collision=0.0)),
+    "depth": Variant(weighed(ROBUST, collision=0.0, **_SILENT), "no contact"),
+    "collision": Variant(weighed(ROBUST, depth=0.0, **_SILENT), "no contact"),
+    "contact-depth": Variant(weighed(ROBUST, collision=0.0)),
+    "contact-collision": Variant(weighed(ROBUST, depth=0.0)),
+    "depth-collision": Variant(weighed(ROBUST, **_SILENT), "no contact"),
+}
+"""The paper's ablation: which terms of the people are on, under the same camera."""
+
+PARTS: dict[str, Variant] = {
+    "no-refined-camera": Variant(replace(ROBUST, refine=replace(ROBUST.refine, rounds=0))),
+    "paper-camera": Variant(replace(ROBUST, align=AlignConfig(sigmas=(0.1,), votes="points"))),
+    "no-yaw-starts": Variant(replace(ROBUST, layout=replace(ROBUST.layout, yaws=1))),
+    "no-second-pass": Variant(replace(ROBUST, again=0)),
+    "no-depth-factor": Variant(replace(ROBUST, correct_depth=False)),
+    "no-distance": Variant(_far(ROBUST)),
+    "no-heading": Variant(weighed(ROBUST, heading=0.0)),
+    "no-trust": Variant(replace(ROBUST, trust=False)),
+    "no-slide": Variant(replace(ROBUST, slide=False)),
+    "no-groups": Variant(replace(ROBUST, assign=AssignConfig())),
+}
+"""`robust` without one of the parts that it adds to the paper."""
+
+NOBODY: dict[str, Variant] = {"nobody": Variant(ROBUST, "nobody")}
+SINGLE: dict[str, Variant] = {
+    f"frame-{k}": Variant(ROBUST, cut=Cut(place=(k + 0.5) / FRAMES)) for k in range(FRAMES)
+}
+"""One frame with its people, as methods do that do not accumulate."""
+SEGMENT: dict[str, Variant] = {
+    f"{s}s-{k}": Variant(ROBUST, cut=Cut(s, place=(k + 0.5) / SEGMENTS))
+    for s in LENGTHS
+    for k in range(SEGMENTS)
+}
+"""Segments of a video, evenly spread over it."""
+TIMED: dict[str, Variant] = {
+    f"time-{share:g}": Variant(ROBUST, cut=Cut(share=share), fresh=True) for share in SHARES
+}
+RELAXED: dict[str, Variant] = {"relaxed-scale": Variant(relaxed(ROBUST))}
+PEOPLE: dict[str, Variant] = {
+    f"people-{name}": Variant(ROBUST, bodies=row)
+    for name, row in {
+        "given": "given", "baseline": "baseline", "camgp": "+CamGP", "sdf": "+CamGP+SDF",
+        "contact": "+CamGP+SDF+Contact", "order": "all", "true-given": "true given",
+        "true-room": "true room",
+    }.items()
+}  # fmt: skip
+"""The people after the room is known; the last two in the true room."""
+
+VARIANTS: dict[str, Variant] = {
+    **{name: Variant(config) for name, config in PRESETS.items()},
+    **TERMS, **PARTS, **NOBODY, **RELAXED, **SINGLE, **SEGMENT, **TIMED, **PEOPLE,
+}  # fmt: skip
+"""By the name of the job."""
+
+
+def choices() -> str:
+    """The names that one would type."""
+    return ", ".join(name for name in VARIANTS if not any(part in name for part in HIDDEN))

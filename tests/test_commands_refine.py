@@ -1,0 +1,123 @@
+"""`mover refine` and `mover contacts` from the command line; a licensed model's bodies refined."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from analytic import FACES, box_verts
+from figures import ARMS_DOWN, people, pose
+from little_room import camera
+from make_smpl import make_model, write_npz
+
+from mover import commands
+from mover.bodies import open_body, zero_pose
+from mover.bodies.smpl_files import load_smpl
+from mover.readers.bodies_file import read_bodies, write_bodies
+from mover.readers.mesh_file import write_mesh
+from mover.readers.scene_file import write_scene
+from mover.types import Bodies, Mesh, Piece, Scene
+
+GROUND = -1.4
+SUNK = 0.05  # [m]
+
+
+def standing(depth: float, frames: int = 3, name: str = "makehuman") -> Bodies:
+    """Somebody who stands still three metres away, sunk so deep into the floor [m]."""
+    if name == "makehuman":
+        model, base = open_body(), pose(ARMS_DOWN, frames)
+    else:
+        model = load_smpl(name)
+        base = zero_pose(frames, model)
+    verts, _ = model.posed(base)
+    low = float(verts[0, :, 1].min())
+    middle = verts[0].mean(0)
+    shift = torch.stack([-middle[0], torch.tensor(GROUND - depth - low), -3.0 - middle[2]])
+    base = replace(base, transl=base.transl + shift)
+    verts, joints = model.posed(base)
+    bodies = people(pose(ARMS_DOWN, frames), 5.0)
+    return replace(
+        bodies, verts=verts, faces=model.faces, joints=joints, joint_names=model.joint_names,
+        pose=base,
+    )  # fmt: skip
+
+
+def finished(out: Path, bodies: Bodies | None) -> Path:
+    """A result: a box on a floor, and people."""
+    mesh = Mesh(box_verts((0.5, 0.5, 0.5)).float(), FACES)
+    box = Piece(
+        "box_0", "stool", mesh, "", None, "ground", torch.tensor([1.0, GROUND, -3.0]),
+        torch.tensor(0.0), torch.ones(3),
+    )  # fmt: skip
+    write_scene(Scene(camera(pitch=0.0), GROUND, (box,)), out / "scene.json")
+    (out / "watertight").mkdir(exist_ok=True)
+    write_mesh(mesh, out / "watertight" / "box_0.glb")
+    if bodies is not None:
+        write_bodies(bodies, out / "bodies.npz")
+    return out
+
+
+def lowest(bodies: Bodies) -> torch.Tensor:
+    return bodies.verts[..., 1].amin(1) - GROUND
+
+
+def test_refine_lifts_people_out_of_the_floor_and_says_how_wrong_they_were(tmp_path, capsys):
+    out = finished(tmp_path / "out", standing(SUNK))
+    truth = finished(tmp_path / "truth", standing(0.0))
+    before = (out / "bodies.npz").read_bytes()
+    answer = commands.run_command("refine", [str(out), "--truth", str(truth), "--rounds", "2"])
+    assert answer == 0
+    assert (out / "bodies.npz").read_bytes() == before
+    assert lowest(read_bodies(out / "refined" / "bodies.npz")).abs().max() < 0.02
+    values = json.loads((out / "refined" / "metrics.json").read_text())
+    assert values["result"]["pje"] == pytest.approx(SUNK, abs=2e-3)
+    assert values["refined"]["pje"] < 0.5 * SUNK
+    assert "3 bodies refined with their pose" in capsys.readouterr().out
+
+
+def test_without_the_floor_nobody_is_lifted(tmp_path):
+    out = finished(tmp_path / "out", standing(SUNK))
+    assert commands.run_command("refine", [str(out), "--no-camgp", "--rounds", "1"]) == 0
+    assert lowest(read_bodies(out / "refined" / "bodies.npz")).max() < -0.9 * SUNK
+
+
+def test_a_result_without_people_is_refused_and_nothing_is_written(tmp_path, capsys):
+    out = finished(tmp_path / "out", None)
+    assert commands.run_command("refine", [str(out)]) != 0
+    assert "nobody to refine" in capsys.readouterr().err
+    assert not (out / "refined").exists()
+
+
+def test_bodies_of_a_licensed_model_are_refined_with_their_parameters(tmp_path, monkeypatch):
+    write_npz(make_model("smplx"), tmp_path / "models" / "smplx" / "SMPLX_NEUTRAL.npz")
+    monkeypatch.setenv("MOVER_BODY_MODELS", str(tmp_path / "models"))
+    out = finished(tmp_path / "out", standing(SUNK, 2, "smplx"))
+    assert commands.run_command("refine", [str(out), "--rounds", "1"]) == 0
+    found = read_bodies(out / "refined" / "bodies.npz")
+    assert found.pose is not None
+    assert found.pose.model == "smplx"
+    assert lowest(found).abs().max() < 0.025
+    again, _ = load_smpl("smplx").posed(found.pose)
+    torch.testing.assert_close(again, found.verts, atol=1e-4, rtol=0)
+
+
+def test_contacts_of_another_tool_become_contacts_npz(tmp_path, capsys):
+    bodies = standing(0.0)
+    write_bodies(bodies, tmp_path / "bodies.npz")
+    chance = np.zeros(bodies.verts.shape[:2], np.float32)
+    chance[1, :40] = 0.9
+    np.save(tmp_path / "deco.npy", chance)
+    out = tmp_path / "contacts.npz"
+    flags = ["--source", str(tmp_path / "deco.npy"), "--out", str(out)]
+    answer = commands.run_command("contacts", ["files", str(tmp_path / "bodies.npz"), *flags])
+    assert answer == 0
+    np.testing.assert_array_equal(np.load(out)["probability"], chance)
+    assert "1 of 3 bodies touch something" in capsys.readouterr().out
+
+
+def test_contacts_without_their_source_name_the_missing_flag(tmp_path, capsys):
+    write_bodies(standing(0.0), tmp_path / "bodies.npz")
+    assert commands.run_command("contacts", ["files", str(tmp_path / "bodies.npz")]) != 0
+    assert "--source" in capsys.readouterr().err
