@@ -56,12 +56,8 @@ def test_a_mask_too_wide_all_around_says_nothing():
     own = drawn(seen_box(0.0))
     wide = torch.nn.functional.max_pool2d(own.float()[None, None], 7, 1, 3)[0, 0] > 0.5
     outline = wish(seen_box(0.0), wide)
-    assert float(outline.gap.median()) == pytest.approx(-3, abs=0.7)
+    assert outline.gap.abs().median() < 1
     assert step(outline)[:2].abs().max() < 0.4
-    skin = seen_box(0.0).skin
-    alone = replace(outline, body=torch.arange(len(outline.body)))
-    each = outline_term(skin.expand(len(alone.body), -1, -1), alone, K, 640)
-    assert float(outline_term(skin, outline, K, 640)) < 0.2 * float(each.sum())
 
 
 def test_where_furniture_may_hide_the_body_the_mask_is_not_asked():
@@ -70,7 +66,7 @@ def test_where_furniture_may_hide_the_body_the_mask_is_not_asked():
     cut = drawn(seen_box(0.0)) & torch.arange(480)[:, None].lt(260)
     outline = wish(seen_box(0.0, front), cut)
     assert len(outline.body)
-    assert outline.pixel[:, 1].max() < 300
+    assert outline.normal[:, 1].max() < 0.5  # nothing of its bottom, where the mask ends
     assert step(outline)[0].abs() < 0.3
 
 
@@ -81,7 +77,7 @@ def test_bodies_without_a_mask_or_without_overlap_have_no_outline():
 
 def test_the_price_is_zero_where_outlines_meet_and_is_shared_by_the_points():
     outline = wish(seen_box(0.0), drawn(seen_box(0.04)))
-    assert 0.8 * POINTS < float(outline.weight.sum()) <= POINTS + 1e-4
+    assert float(outline.weight.sum()) == pytest.approx(POINTS)
     skin = seen_box(0.0).skin.double()
     at = replace(outline, gap=torch.zeros_like(outline.gap), pixel=project(skin, K.double())[0][
         outline.skin].float())  # fmt: skip

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from analytic import FACES, box_verts
 from figures import ARMS_DOWN, people, pose
@@ -13,7 +12,7 @@ from little_room import camera
 from make_smpl import make_model, write_npz
 
 from mover import commands
-from mover.bodies import open_body, zero_pose
+from mover.bodies import open_body, rest_pose
 from mover.bodies.smpl_files import load_smpl
 from mover.readers.bodies_file import read_bodies, write_bodies
 from mover.readers.mesh_file import write_mesh
@@ -21,21 +20,22 @@ from mover.readers.scene_file import write_scene
 from mover.types import Bodies, Mesh, Piece, Scene
 
 GROUND = -1.4
-SUNK = 0.05  # [m]
+FAR = 0.06  # share by which somebody seems too far away: they then sink into the floor
 
 
-def standing(depth: float, frames: int = 3, name: str = "makehuman") -> Bodies:
-    """Somebody who stands still three metres away, sunk so deep into the floor [m]."""
+def standing(far: float, frames: int = 3, name: str = "makehuman") -> Bodies:
+    """Somebody who stands still three metres away, seen in the right pixels but too far."""
     if name == "makehuman":
         model, base = open_body(), pose(ARMS_DOWN, frames)
     else:
         model = load_smpl(name)
-        base = zero_pose(frames, model)
+        base = rest_pose(frames, model)
     verts, _ = model.posed(base)
     low = float(verts[0, :, 1].min())
     middle = verts[0].mean(0)
-    shift = torch.stack([-middle[0], torch.tensor(GROUND - depth - low), -3.0 - middle[2]])
-    base = replace(base, transl=base.transl + shift)
+    shift = torch.stack([-middle[0], torch.tensor(GROUND - low), -3.0 - middle[2]])
+    pelvis = model.posed(base)[1][:, 0] + shift
+    base = replace(base, transl=base.transl + shift + far * pelvis)
     verts, joints = model.posed(base)
     bodies = people(pose(ARMS_DOWN, frames), 5.0)
     return replace(
@@ -64,23 +64,24 @@ def lowest(bodies: Bodies) -> torch.Tensor:
 
 
 def test_refine_lifts_people_out_of_the_floor_and_says_how_wrong_they_were(tmp_path, capsys):
-    out = finished(tmp_path / "out", standing(SUNK))
+    out = finished(tmp_path / "out", standing(FAR))
     truth = finished(tmp_path / "truth", standing(0.0))
     before = (out / "bodies.npz").read_bytes()
     answer = commands.run_command("refine", [str(out), "--truth", str(truth), "--rounds", "2"])
     assert answer == 0
     assert (out / "bodies.npz").read_bytes() == before
-    assert lowest(read_bodies(out / "refined" / "bodies.npz")).abs().max() < 0.02
+    found = read_bodies(out / "refined" / "bodies.npz")
+    assert lowest(found).abs().max() < 0.5 * lowest(read_bodies(out / "bodies.npz")).abs().min()
     values = json.loads((out / "refined" / "metrics.json").read_text())
-    assert values["result"]["pje"] == pytest.approx(SUNK, abs=2e-3)
-    assert values["refined"]["pje"] < 0.5 * SUNK
+    assert values["result"]["pje"] > 0.15
+    assert values["refined"]["pje"] < 0.75 * values["result"]["pje"]
     assert "3 bodies refined with their pose" in capsys.readouterr().out
 
 
 def test_without_the_floor_nobody_is_lifted(tmp_path):
-    out = finished(tmp_path / "out", standing(SUNK))
+    out = finished(tmp_path / "out", standing(FAR))
     assert commands.run_command("refine", [str(out), "--no-camgp", "--rounds", "1"]) == 0
-    assert lowest(read_bodies(out / "refined" / "bodies.npz")).max() < -0.9 * SUNK
+    assert lowest(read_bodies(out / "refined" / "bodies.npz")).max() < -0.02
 
 
 def test_a_result_without_people_is_refused_and_nothing_is_written(tmp_path, capsys):
@@ -93,7 +94,7 @@ def test_a_result_without_people_is_refused_and_nothing_is_written(tmp_path, cap
 def test_bodies_of_a_licensed_model_are_refined_with_their_parameters(tmp_path, monkeypatch):
     write_npz(make_model("smplx"), tmp_path / "models" / "smplx" / "SMPLX_NEUTRAL.npz")
     monkeypatch.setenv("MOVER_BODY_MODELS", str(tmp_path / "models"))
-    out = finished(tmp_path / "out", standing(SUNK, 2, "smplx"))
+    out = finished(tmp_path / "out", standing(FAR, 2, "smplx"))
     assert commands.run_command("refine", [str(out), "--rounds", "1"]) == 0
     found = read_bodies(out / "refined" / "bodies.npz")
     assert found.pose is not None

@@ -28,7 +28,7 @@ for needed in ("transformers", "av", "viser", "mujoco", "pxr"):
 ELSEWHERE = {
     "--ray.address auto": "a running Ray cluster",
     "--engine slurm": "a SLURM cluster",
-    "mover experiment": "hours: ten known rooms",
+    "mover experiment": "hours: many known rooms",
     "mover demo": "minutes: `make demo`",
 }
 RUN = [
@@ -149,7 +149,7 @@ def do(line: str, desk: Path) -> None:
     swaps = SWAPS.get(line.split("  #")[0].strip(), {})
     words = [w for w in (swaps.get(word, word) for word in rest) if w]
     words += [word.format(desk=desk) for word in QUICK.get(name, [])]
-    if name == "view" or "--view" in words:
+    if name == "view" or (name == "run" and "--view" in words):
         look_and_leave([name, *words])
     elif name == "batch":  # tyro marks what is missing by a value that no type check lets by
         ended = start([name, *words])

@@ -2,7 +2,9 @@
 
 import json
 import math
+import re
 from dataclasses import replace
+from html import escape
 
 import pytest
 import torch
@@ -22,10 +24,17 @@ from mover.geometry.volume import grid_around, signed_distance, union_bodies
 from mover.minimize import Energy
 from mover.presets import ROBUST
 from mover.readers.scene_file import read_scene, write_scene
+from mover.records import load, save
+from mover.report_doubts import doubts_list, draw_doubts
 from mover.stages.explain_bounds import bounds_of_objects
 from mover.stages.explain_curvature import bend_at, unvector, vector
 from mover.stages.explain_others import others_of
-from mover.stages.explain_placements import ExplainConfig, ExplainInputs, explain_placements
+from mover.stages.explain_placements import (
+    ExplainConfig,
+    Explained,
+    ExplainInputs,
+    explain_placements,
+)
 from mover.stages.explain_space import passing_by, side_of
 from mover.stages.explain_spread import (
     FLAT,
@@ -41,6 +50,7 @@ from mover.stages.place_objects import Placed
 from mover.stages.small import small_camera, small_views
 from mover.stages.starts import alone
 from mover.terms.depth import DepthRange
+from mover.viewer.layers import place_ellipses
 
 SIGMA = torch.tensor(UNKNOWN, dtype=torch.float64)
 ALL = torch.ones(2, 7, dtype=torch.bool)
@@ -411,6 +421,17 @@ class TestStage:
                     for _ in range(2))  # fmt: skip
         assert log_rows(one) == log_rows(two)
 
+    def test_facts_come_back_from_disk_as_they_were(self, tmp_path):
+        asked = self.inputs(make_inputs())
+        pairs = torch.tensor([[0, 0, 0], [3, 0, 0]])
+        found = explain_placements(replace(asked, pairs=pairs), ExplainConfig())
+        assert found.facts[0].touches
+        save(found, tmp_path / "facts")
+        back = load(Explained, tmp_path / "facts")
+        one, two = (explain(f.facts, Calibration()) for f in (found, back))
+        assert log_rows(one) == log_rows(two)
+        assert scene_fields(one) == scene_fields(two)
+
     def test_what_neither_image_nor_people_see_is_less_certain(self):
         priced = make_inputs()
         blind = replace(
@@ -470,3 +491,49 @@ def test_scene_files_carry_explanations_and_readers_pass_over_them(tmp_path):
     )
     assert "stands on the floor" in first["explanation"]["evidence"]
     assert [p.id for p in read_scene(path).pieces] == names
+
+
+class TestPictures:
+    def doubtful(self):
+        g = torch.Generator().manual_seed(2)
+        root = 0.1 * torch.randn(7, 7, generator=g, dtype=torch.float64)
+        told = facts(covariance=root @ root.mT, pulls=(pull("scale", 0.6), pull("bbox", 0.2)))
+        return explain((told,), Calibration())
+
+    def test_the_ellipse_of_the_viewer_holds_nine_tenths_of_the_places(self):
+        (told,) = self.doubtful()
+        ring = place_ellipses(log_rows([told]))["shelf_0"].double()
+        assert float((ring[:, 1] - told.facts.place[1]).abs().max()) < 1e-6
+        g = torch.Generator().manual_seed(3)
+        flat = told.covariance[[0, 2]][:, [0, 2]]
+        draw = torch.randn(4000, 2, generator=g, dtype=torch.float64)
+        points = draw @ torch.linalg.cholesky(flat).mT + told.facts.place[[0, 2]]
+        edge = ring[:, [0, 2]]
+        to, along = points[:, None] - edge, edge.roll(-1, 0) - edge
+        turn = along[:, 0] * to[..., 1] - along[:, 1] * to[..., 0]
+        inside = (turn > 0).all(-1) | (turn < 0).all(-1)
+        assert float(inside.double().mean()) == pytest.approx(0.9, abs=0.02)
+
+    def test_the_plan_has_the_same_ellipse(self):
+        (told,) = self.doubtful()
+        found = re.search(
+            r'cx="(.*?)" cy="(.*?)" rx="(.*?)" ry="(.*?)" transform="rotate\((.*?) ',
+            draw_doubts([told]),
+        )
+        assert found is not None
+        x, z, large, small, turn = (float(v) for v in found.groups())
+        angle = torch.tensor(math.radians(turn), dtype=torch.float64)
+        axes = torch.stack([torch.stack([angle.cos(), angle.sin()]),
+                            torch.stack([-angle.sin(), angle.cos()])])  # fmt: skip
+        expected = math.log(10) * 2 * told.covariance[[0, 2]][:, [0, 2]]
+        square = torch.tensor([large, small], dtype=torch.float64).square()
+        close(axes.mT @ (square[:, None] * axes), expected, rtol=0.01, atol=1e-3)
+        close(torch.tensor([x, z]), told.facts.place[[0, 2]].float(), atol=1e-3)
+
+    def test_the_report_tells_every_sentence(self):
+        (told,) = self.doubtful()
+        page = doubts_list([told])
+        for sentence in (told.verdict, *told.sentences):
+            assert escape(sentence) in page
+        assert "not calibrated" in page
+        assert doubts_list([]) == ""

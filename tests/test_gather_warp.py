@@ -266,6 +266,18 @@ def test_a_mesh_in_great_pieces_has_the_distances_of_libigl() -> None:
     assert (assert_same(verts[None], faces, part) < 0).all()
 
 
+def test_columns_that_know_nothing_of_each_other_find_the_same_bits() -> None:
+    """As on CUDA, where they are measured at the same time."""
+    verts, faces = posed_bodies(2)
+    grid = around(verts, 48)
+    tools = volume_warp._tools(verts.contiguous(), faces, grid)
+    scratch = volume_warp._scratch(tools)
+    scratch.work.beside = 0
+    for body in range(len(verts)):
+        volume_warp.add_body(tools, scratch, body)
+    assert torch.equal(scratch.field, volume_warp.union_bodies(verts, faces, grid, 1).values)
+
+
 def test_triangles_without_an_area_are_edges_and_points() -> None:
     one, faces = sphere([0.0, 0, 0], 0.5, level=2)
     a, b = one[faces[0, 0]], one[faces[0, 1]]

@@ -230,6 +230,28 @@ def test_people_keep_their_tracks_and_frames(plain: layouts.Room, tmp_path: Path
         assert (decode(people.masks, row).numpy() == truth).all()
 
 
+def test_one_person_in_many_frames_is_told_by_a_single_id(
+    plain: layouts.Room, tmp_path: Path
+) -> None:
+    """(n, 1, h, w) alone is n things; with one object id it is one thing in n frames."""
+    w, h = plain.size
+    stack = np.zeros((3, 1, h, w), dtype=bool)
+    for frame in range(3):
+        stack[frame, 0, 10:50, 10 + frame : 30 + frame] = True
+    np.savez(tmp_path / "people.npz", masks=stack, object_ids=np.array([4]))
+    source = layouts.write_total3d(tmp_path / "in", plain)
+    out = tmp_path / "out"
+    run_import(
+        ImportArgs("total3d", source, out, people_masks=tmp_path / "people.npz", fps=5.0), tmp_path
+    )
+    people = read_capture(out).people
+    assert people is not None
+    rows = list(zip(people.frame.tolist(), people.person.tolist(), strict=True))
+    assert rows == [(0, 4), (1, 4), (2, 4)]
+    for row in range(3):
+        assert (decode(people.masks, row).numpy() == stack[row, 0]).all()
+
+
 def test_masks_alone_make_a_part_and_what_is_missing_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,7 +5,7 @@ from functools import cache
 from typing import TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .geometry.camera import outermost, project, to_camera
@@ -158,6 +158,15 @@ def _fit(
     seen = image.boxes, image.sides, image.keep
     here = drawn, project(extent, camera.K)
     return fit_borders(here, seen, image.trust, _known(image.borders), (w.bbox, w.silhouette))
+
+
+def best_borders(
+    layout: Layout, objects: Objects, camera: Camera, image: ImageCues, weights: SceneWeights
+) -> Int[Tensor, "*starts objects"]:
+    """Number of the shift of each mask's border that suits a layout best (`ImageCues.borders`)."""
+    verts = place_in(objects.verts, layout, camera.R_cam_world)
+    drawn, _ = _draw(verts, objects, image.views, replace(weights, depth=0.0, free_space=0.0))
+    return _fit(drawn, outermost(verts, camera.K), camera, image, weights).shift
 
 
 def heard(weights: SceneWeights, image: ImageCues, humans: HumanCues) -> SceneWeights:

@@ -10,7 +10,7 @@ from .explanation_records import Bound, Facts, Other, Passing, Pull, Touching
 from .geometry.rotations import wrap
 
 NORMAL = 1.6448536269514722  # half width of the range that holds 90 % of a normal distribution
-LEVELS = ((0.03, "well known"), (0.08, "known"), (0.2, "uncertain"))
+LEVELS = ((0.03, "well known"), (0.08, "known"), (0.15, "uncertain"))
 WORST = "very uncertain"
 TERMS = {
     "bbox": "its box", "silhouette": "its silhouette", "scale": "its size",
@@ -145,7 +145,7 @@ def _other(place: Float[Tensor, "7"], other: Other) -> str:
     parts = [f"{_length(moved)} away"] if moved >= FELT[0] else []
     parts += [f"turned by {turned:.0f}°"] if turned >= 2 else []
     way = " and ".join(parts) or "of another size"
-    return f"may as well stand {way} ({100 * other.probability:.0f} %)"
+    return f"may also stand {way} ({100 * other.probability:.0f} %)"
 
 
 def _name(term: str) -> str:

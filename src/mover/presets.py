@@ -106,9 +106,10 @@ _ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading
 
 ROBUST = Config(
     correct_depth=True,
-    image=ImageConfig(size=128, form="robust"),
+    image=ImageConfig(128, "robust", (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)),
     layout=PlaceConfig(
-        _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, short=_SHORT, keep=3, tie=1.0
+        _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, distances=(0.9, 1.1), short=_SHORT, keep=3,
+        tie=1.0,
     ),
     refine=RefineConfig(rounds=1),
     gather=GatherConfig(erode=1, reach=0.1),

@@ -79,8 +79,13 @@ def _pull(pull: Pull) -> str:
     away = 100 * math.hypot(move[0], move[2])
     cells = (
         f"{pull.energy:.4f}", f"{100 * pull.share:.0f} %", f"{100 * pull.tells:.0f} %",
-        f"{force[0]:.3f}, {force[2]:.3f}", f"{force[3]:.3f}",
-        f"{away:.1f} cm, {math.degrees(move[3]):.1f}°",
+        f"{_plain(force[0], 3)}, {_plain(force[2], 3)}", _plain(force[3], 3),
+        f"{away:.1f} cm, {_plain(math.degrees(move[3]), 1)}°",
     )  # fmt: skip
     body = "".join(f"<td>{c}</td>" for c in cells)
     return f'<tr><th class="text">{escape(pull.term.replace("_", " "))}</th>{body}</tr>'
+
+
+def _plain(value: float, digits: int) -> str:
+    """Without a minus before zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"

@@ -55,7 +55,8 @@ def shown(metric: str, value: float | None, *, sign: bool = False) -> str:
     if value is None:
         return "-"
     column = COLUMNS[metric]
-    return f"{column.factor * value:{'+' if sign else ''}.{column.digits}f}"
+    rounded = round(column.factor * value, column.digits) + 0.0  # no negative zero
+    return f"{rounded:{'+' if sign else ''}.{column.digits}f}"
 
 
 def markdown(head: list[str], rows: list[list[str]]) -> str:

@@ -1,7 +1,7 @@
 """Make a set of rooms: in parallel, resumable, with a manifest that can be compared.
 
-The hashes of all held-out rooms are part of the package (assets/rooms): a room that another
-machine or another version makes differently is found by `--check`.
+Hashes of held-out rooms are part of the package (assets/rooms): a room that another machine or
+another version makes differently is found by `--check`, which also names those without a hash.
 """
 
 import json
@@ -142,7 +142,7 @@ def told(made: Made, check: bool) -> str:
         lines.append("mean: " + ", ".join(f"{n} {_mean(rows, n):.3g}" for n in names))
     lines += [f"room {seed} failed: {why}" for seed, why in made.failed.items()]
     lines += [f"room {seed} differs in {', '.join(n)}" for seed, n in made.changed.items()]
-    lines += [f"room {seed} is not held out: nothing to compare" for seed in made.unknown]
+    lines += [f"room {seed}: the package does not know it" for seed in made.unknown]
     if check and not made.changed:
         lines.append(f"{len(rows) - len(made.unknown)} rooms are as the package knows them")
     return "\n".join(lines)

@@ -81,8 +81,9 @@ def truncated_shares(scene: Scene) -> tuple[float, ...]:
     height, width = (max(1, round(zoom * side)) for side in (camera.height, camera.width))
     size = (BORDER * height, BORDER * width)
     top, left = (BORDER - 1) * height // 2, (BORDER - 1) * width // 2
-    K = camera.K * torch.tensor([[width / camera.width], [height / camera.height], [1.0]])
-    K = K + torch.tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    smaller = torch.tensor([[width / camera.width], [height / camera.height], [1.0]])
+    aside = torch.tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    K = camera.K * smaller + aside
     shares: list[float] = []
     for piece in scene.pieces:  # meshes differ in their number of triangles
         seen = _depth(piece, camera, K, size).isfinite()

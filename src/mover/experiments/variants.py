@@ -84,9 +84,10 @@ TERMS: dict[str, Variant] = {
 }
 """The paper's ablation: which terms of the people are on, under the same camera."""
 
+_FEET = replace(ROBUST, refine=replace(ROBUST.refine, rounds=0))
 PARTS: dict[str, Variant] = {
-    "no-refined-camera": Variant(replace(ROBUST, refine=replace(ROBUST.refine, rounds=0))),
-    "paper-camera": Variant(replace(ROBUST, align=AlignConfig(sigmas=(0.1,), votes="points"))),
+    "no-refined-camera": Variant(_FEET),
+    "paper-camera": Variant(replace(_FEET, align=AlignConfig(sigmas=(0.1,), votes="points"))),
     "no-yaw-starts": Variant(replace(ROBUST, layout=replace(ROBUST.layout, yaws=1))),
     "no-second-pass": Variant(replace(ROBUST, again=0)),
     "no-depth-factor": Variant(replace(ROBUST, correct_depth=False)),

@@ -25,7 +25,8 @@ def read_mask_arrays(
 
     `masks` is (n, h, w), (n, 1, h, w) or (frames, objects, h, w), as booleans, bytes or logits
     (above 0 is inside); or (h, w), a label map. Beside it may stand `scores`, `labels` (names),
-    `object_ids` and `frame`. Boxes are those of the masks.
+    `object_ids` and `frame`. With a single object id (n, 1, h, w) is one thing in n frames. Boxes
+    are those of the masks.
 
     Raises:
         InputError: If the arrays are wrong.
@@ -76,7 +77,7 @@ def _of_stack(
 ) -> Instances:
     """The things of a stack of masks."""
     del size
-    many = stack.ndim == 4 and stack.shape[1] != 1
+    many = stack.ndim == 4 and (stack.shape[1] != 1 or _is_one_track(at))
     if stack.ndim not in (2, 3, 4) or not stack.size:
         refuse(given, "an array of masks (n, h, w) or (frames, objects, h, w)")
     height, width = stack.shape[-2:]
@@ -94,6 +95,13 @@ def _of_stack(
         if code is not None:
             found.append(Instance(name, None, code, scores[i], int(frames[i]), track))
     return Instances(tuple(found), (width, height), at.file)
+
+
+def _is_one_track(at: At) -> bool:
+    """Whether a single id names all masks, and nothing else says which frames they are of."""
+    known = next((found for key in TRACKS if (found := maybe(at, key)) is not None), None)
+    ids = None if known is None or maybe(at, "frame") is not None else known.value
+    return isinstance(ids, np.ndarray) and ids.shape == (1,)
 
 
 def _frames(at: At, rows: int) -> NDArray[np.int64]:

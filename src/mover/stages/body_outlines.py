@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..geometry.camera import project
 from ..geometry.raster import Views, layers
-from ..terms.body_outline import BORDER, POINTS, TAIL, Outline
+from ..terms.body_outline import POINTS, Outline
 from ..types import Camera
 from .person_masks import MaskTable
 
@@ -21,6 +21,11 @@ MOST = 48  # points of one body's outline
 LEAST = 12  # fewer say nothing
 BEHIND = 0.1  # [m] a piece has to be behind a body for certain not to hide it
 SPREAD = 2  # [px of the window] around what may end a mask
+WIDER = 3.0  # [px], usual error of a mask's border that is the same all around
+SHIFT = 8.0  # [px], usual shift of a body against its mask
+LARGER = 0.04  # usual error of the size that a body is seen with, as a share
+ERROR = 2.0  # [px], usual error of one place of an outline
+INDEPENDENT = 16.0  # places of an outline
 
 
 @dataclass(frozen=True)
@@ -95,17 +100,36 @@ def _compare(
     if len(y) < LEAST:
         return None
     gap = (away[y, x] + 0.5) / zoom
+    gap = gap - _wider(gap, normal[:, y, x].mT, torch.stack([x, y], -1) / zoom)
     some = torch.linspace(0, len(y) - 1, min(MOST, len(y))).round().long()
     y, x = y[some], x[some]
     pixel = torch.stack([x, y], -1).float().add(0.5) / zoom + window[1][:2]
     skin = project(seen.skin[k], seen.camera.K.to(seen.skin))
     carrier = torch.cdist(pixel, skin.float()).argmin(-1)
-    odd = (gap[some] - gap.median()) / (TAIL * BORDER * seen.camera.width)
-    weight = POINTS / len(some) / (1 + odd.square()).square()
+    weight = torch.full_like(gap[some], POINTS / len(some))
     return Outline(
         torch.full_like(carrier, k), carrier, skin[carrier].float(), normal[:, y, x].mT,
         gap[some], weight,
     )  # fmt: skip
+
+
+def _wider(
+    gap: Float[Tensor, " points"], normal: Float[Tensor, "points 2"], at: Float[Tensor, "points 2"]
+) -> Tensor:
+    """By how much the mask is narrower all around, told from a body that is off or too large [px].
+
+    Least squares with a usual size for each: the border, two shifts, and the share of the size.
+    """
+    middle = at - at.mean(0)
+    size = middle.norm(dim=-1).amax().clamp_min(1.0)
+    ways = torch.cat([torch.ones_like(gap)[:, None], normal], -1)
+    ways = torch.cat([ways, (normal * middle).sum(-1, keepdim=True) / size], -1)
+    usual = gap.new_tensor([WIDER, SHIFT, SHIFT, LARGER * float(size)])
+    design = (ways * usual).double()
+    ridge = torch.eye(4, dtype=torch.float64) * ERROR**2
+    inner = design.mT @ design + ridge * len(gap) / INDEPENDENT
+    share = torch.linalg.solve(inner, design.mT @ gap.double())
+    return share[0].to(gap) * WIDER
 
 
 def _sampled(image: Tensor, window: Float[Tensor, "3"], camera: Camera) -> Tensor:

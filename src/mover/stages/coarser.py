@@ -33,9 +33,7 @@ def coarser_image(image: ImageCues, factor: int) -> ImageCues:
     borders = image.borders
     if borders is not None:
         borders = Borders(borders.shifts, _tiles(borders.masks, factor).mean((-3, -1)))
-    return replace(
-        image, views=small, masks=masks, keep=keep, outline=outline, borders=borders
-    )
+    return replace(image, views=small, masks=masks, keep=keep, outline=outline, borders=borders)
 
 
 def coarser_humans(humans: HumanCues, factor: int) -> HumanCues:

@@ -18,7 +18,7 @@ from ..terms.depth import DepthRange
 from ..types import Bodies, Camera
 from .small import small_camera
 
-FEW = 12  # pixels of each object and side whose body is looked for
+FEW = 8  # pixels of each object and side whose body is looked for
 CLOSE = 0.05  # [m], pixels whose slack is that near to the least one are held as well
 ODD = 0.05  # share of an object's pixels whose bounds may come from a wrong mask
 SAME = 0.005  # [m], between a bound and the surface that gave it

@@ -1,12 +1,14 @@
-r"""Correct the depth of people whose size is right: too near is too large for their mask.
+"""Correct the depth of people whose size is right: too near is too large for their mask.
 
 Not in the paper. Bodies estimated frame by frame keep their size while one person is 2 % too near
 or too far throughout; the floor under the feet, and the whole room with it, is then wrong by
-1-2 cm. One factor a person moves the body along its pelvis' ray so that it fills its visible masks
-best; the width of the mask's border is found with it, in every frame.
+1-2 cm. One factor a person moves the body along its pelvis' ray: the mean of that at which it fills
+its visible masks best, each with the border that suits it, and that at which it is as high in the
+image as they are (`body_extents`). An error of the pose makes the first too great (smaller bodies
+overlap better) and the second too small (bent bodies are lower) by about as much.
 
-What masks cannot tell is a wrong size at a wrong depth. Only a known height does: then the person
-is first scaled about the camera, which no picture sees.
+Masks cannot tell a wrong size at a wrong depth. A known height can: then the person is first scaled
+about the camera, which no picture sees.
 """
 
 import dataclasses
@@ -19,15 +21,15 @@ from torch import Tensor
 from ..bodies.parts import Parts
 from ..geometry.camera import project
 from ..geometry.raster import Views, layers
-from ..geometry.runs import decode
 from ..minimize import Observer, Step, silent
 from ..records import record
 from ..types import Bodies, Camera, Masks, People
+from .body_extents import compare_extents, pixels_of
+from .depth_peak import SYSTEMATIC, Peak, peak_of
 from .find_soles import SolesConfig, straight_legs
 from .mask_overlap import overlaps, small
 from .person_masks import MaskTable, mask_table
 
-SYSTEMATIC = 0.003  # error of the factor that more frames do not make smaller
 LIKELY_SIZE = (0.8, 1.25)  # a body whose size is off by more is a mistake in the height
 
 
@@ -57,6 +59,8 @@ class DepthConfig:
     """Use every so many of a person's frames ..."""
     most: int = 40
     """... and at most so many, spread over the video."""
+    whole: int = 150
+    """At most so many frames are searched for people who are wholly seen."""
     least: int = 5
     """Fewer frames than that tell nothing."""
     width: int = 240
@@ -97,8 +101,8 @@ def find_depth(
         rows = ((bodies.person == person) & inputs.keep).nonzero()[:, 0]
         size, note = _size(inputs, rows, str(person))
         rows = rows[torch.tensor([table.own[r] is not None for r in rows.tolist()]).bool()]
-        curves = _curves(inputs, config, rows, table, free)
-        *peak, weak = _peak(curves, config)
+        peak = peak_of(_curves(inputs, config, rows, table, free), config)
+        *peak, weak = _with_heights(inputs, config, rows, table, peak)
         found[:, index] = torch.tensor([*peak, size])
         warnings += note + [f"depth of person {person}: {w}" for w in weak]
         observe(Step("find_depth", index, len(tracks)))
@@ -113,9 +117,8 @@ def apply_depth(bodies: Bodies, factors: DepthFactors) -> Bodies:
     A changed size is beyond the pose's parameters, so they are dropped: the bodies stay meshes.
     """
     same = (bodies.person[:, None] == factors.person.to(bodies.person)).to(bodies.verts)
-    factor, size = (
-        1 + same @ (x.to(bodies.verts) - 1) for x in (factors.factor, factors.size)
-    )  # people without a factor keep their place
+    both = factors.factor, factors.size  # people without a factor keep their place
+    factor, size = (1 + same @ (x.to(bodies.verts) - 1) for x in both)
     shift = (factor - 1)[:, None] * pelvis(bodies) * size[:, None]
     verts = bodies.verts * size[:, None, None] + shift[:, None]
     joints, pose = bodies.joints, bodies.pose
@@ -123,11 +126,8 @@ def apply_depth(bodies: Bodies, factors: DepthFactors) -> Bodies:
         joints = joints * size[:, None, None] + shift[:, None]
     if pose is not None:
         resized = bool((factors.size != 1).any())
-        pose = (
-            None
-            if resized
-            else dataclasses.replace(pose, transl=pose.transl + shift.to(pose.transl))
-        )
+        moved = dataclasses.replace(pose, transl=pose.transl + shift.to(pose.transl))
+        pose = None if resized else moved
     return dataclasses.replace(bodies, verts=verts, joints=joints, pose=pose)
 
 
@@ -136,6 +136,22 @@ def pelvis(bodies: Bodies) -> Float[Tensor, "bodies 3"]:
     if bodies.joints is not None and "pelvis" in bodies.joint_names:
         return bodies.joints[:, bodies.joint_names.index("pelvis")]
     return bodies.verts.mean(1)
+
+
+def _with_heights(
+    inputs: DepthInputs, config: DepthConfig, rows: Tensor, table: MaskTable, peak: Peak
+) -> Peak:
+    """The mean of what overlaps and heights say; the one that there is if the other is missing."""
+    rows = _some(rows, config.whole)
+    found = compare_extents(inputs.bodies, rows, inputs.camera, table, inputs.objects)
+    if found is None or found.frames < config.least or abs(found.factor - 1) > config.span:
+        return peak
+    spread = (found.spread**2 + SYSTEMATIC**2) ** 0.5
+    if spread > config.spread:
+        return peak
+    if peak[1] > config.spread:
+        return found.factor, spread, []
+    return (found.factor + peak[0]) / 2, (spread**2 + peak[1] ** 2) ** 0.5 / 2, []
 
 
 def _size(inputs: DepthInputs, rows: Int[Tensor, " rows"], person: str) -> tuple[float, list[str]]:
@@ -158,10 +174,7 @@ def _size(inputs: DepthInputs, rows: Int[Tensor, " rows"], person: str) -> tuple
 
 def _free_of_objects(inputs: DepthInputs, config: DepthConfig) -> Bool[Tensor, "h w"]:
     """Pixels of the small picture that no object covers."""
-    covered = torch.zeros(inputs.people.masks.height, inputs.people.masks.width, dtype=torch.bool)
-    for row in range(len(inputs.objects.counts)):
-        covered = covered | decode(inputs.objects, row)
-    return small(covered, config.width) < 0.05
+    return small(pixels_of(inputs.objects), config.width) < 0.05
 
 
 def _curves(
@@ -192,10 +205,14 @@ def _spread_out(rows: Int[Tensor, " rows"], inputs: DepthInputs, config: DepthCo
     pixels = project(verts, camera.K.to(verts))
     size = pixels.new_tensor([camera.width, camera.height])
     inside = ((pixels > 0) & (pixels < size)).all(-1).float().mean(1) >= config.inside
-    rows = rows[inside]
-    if len(rows) > config.most:
-        rows = rows[torch.linspace(0, len(rows) - 1, config.most).round().long()]
-    return rows.tolist()
+    return _some(rows[inside], config.most).tolist()
+
+
+def _some(rows: Int[Tensor, " rows"], most: int) -> Int[Tensor, " some"]:
+    """At most so many, evenly spread."""
+    if len(rows) <= most:
+        return rows
+    return rows[torch.linspace(0, len(rows) - 1, most).round().long()]
 
 
 def _drawn(
@@ -210,32 +227,3 @@ def _drawn(
     K = (shrink @ camera.K.float()).expand(config.factors, 3, 3)
     verts = bodies.verts[row] + shift[:, None]
     return layers(verts.float(), bodies.faces, Views(K, height, width)).front.isfinite()
-
-
-def _peak(
-    curves: Float[Tensor, "used factors"], config: DepthConfig
-) -> tuple[float, float, list[str]]:
-    """Best factor by a parabola, its spread, and why it may not be used."""
-    unknown = 1.0, float("inf")
-    if len(curves) < config.least:
-        few = f"only {len(curves)} bodies are seen well enough, it stays as given"
-        return *unknown, [few]
-    total = curves.double().mean(0)
-    best, reach = int(total.argmax()), max(2, config.factors // 6)
-    low, high = max(0, best - reach), min(config.factors, best + reach + 1)
-    grid = torch.linspace(-config.span, config.span, config.factors).double()
-    x = grid[low:high] - grid[best]
-    design = torch.stack([x.square(), x, torch.ones_like(x)], -1)
-    bend, slope, _ = torch.linalg.lstsq(design, total[low:high]).solution.tolist()
-    if bend >= 0 or best in (0, config.factors - 1):
-        return *unknown, [
-            f"more than {100 * config.span:.0f} % wrong or unclear, it stays as given"
-        ]
-    factor = 1 + float(grid[best]) - slope / (2 * bend)
-    each = torch.linalg.lstsq(design, curves.double()[:, low:high].mT).solution
-    lean = each[1] + 2 * each[0] * (factor - 1 - float(grid[best]))
-    error = float(lean.std()) / len(curves) ** 0.5 / abs(2 * bend)
-    spread = (error**2 + SYSTEMATIC**2) ** 0.5
-    if spread > config.spread:
-        return *unknown, [f"uncertain by {100 * spread:.1f} %, it stays as given"]
-    return factor, spread, []

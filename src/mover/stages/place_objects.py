@@ -20,7 +20,7 @@ from ..types import Camera, Layout, Objects
 from .coarser import coarser_humans, coarser_image
 from .pinned import Pinned, hold
 from .some_objects import some_humans, some_image, some_objects, some_pinned
-from .starts import best_few, choose, joined, shaken, spread
+from .starts import best_few, choose, joined, shaken, spread, spread_distance
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class PlaceConfig:
     """A descent of the box term over the places alone, before all others (release)."""
     yaws: int = 1
     """Starts that are turned evenly round each object."""
+    distances: tuple[float, ...] = ()
+    """Further starts at these shares of its distance, turned as often."""
     short: Adam | Quasi = field(default_factory=lambda: Adam(steps=0))
     """A short descent from each of them."""
     keep: int = 1
@@ -98,6 +100,7 @@ def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = 
     starts, inputs = inputs.starts, with_trees(inputs, config.form)
     if config.first.steps:
         starts = _by_boxes(inputs, config, starts, observe)
+    starts = spread_distance(starts, config.distances)
     if config.yaws > 1:
         starts = spread(starts, config.yaws)
     if config.short.steps:
@@ -219,18 +222,13 @@ def _by_boxes(
     inputs: PlaceInputs, config: PlaceConfig, starts: Layout, observe: Observer
 ) -> Layout:
     """Release: the places alone, by the box term alone."""
-    energy = energy_of(inputs, replace(config, weights=_only(bbox=600.0)))
+    energy = energy_of(inputs, replace(config, weights=SceneWeights(600.0, *[0.0] * 10)))
 
     def at(free: Layout) -> Layout:
         return replace(starts, t_world_object=free.t_world_object)
 
     found = minimize(lambda free: energy(at(free)), starts, config.first, observe, "place_objects")
     return at(found.at)
-
-
-def _only(**weights: float) -> SceneWeights:
-    zeros = dict.fromkeys(SceneWeights.__dataclass_fields__, 0.0)
-    return SceneWeights(**(zeros | weights))
 
 
 def _bounded(free: Layout, span: Float[Tensor, " objects"]) -> Layout:

@@ -27,6 +27,7 @@ from ..geometry.placement import GROUND
 from ..minimize import Adam, Energy, Observer, minimize, silent
 from ..records import record
 from ..types import Camera, Layout, Objects
+from .fixed_borders import fixed_borders
 
 IMAGE_ONLY = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
 SOFT = 0.02  # [1], added to an object's own residual
@@ -46,7 +47,7 @@ class RefineConfig:
 
     rounds: int = 0
     """How often; 0: never (the paper)."""
-    feet: float = 0.25
+    feet: float = 0.04
     """Weight w of what the feet say; each object counts about one."""
     method: Adam = field(default_factory=lambda: Adam(400, rate=0.3, last_rate=0.02, beta2=0.98))
 
@@ -87,6 +88,7 @@ def refine_camera(
     """Minimise over the camera, the ground and all standing objects at once."""
     image = SceneConfig(IMAGE_ONLY, "robust")
     fixed, certainty = _start(inputs), torch.linalg.inv(inputs.covariance)
+    cues = fixed_borders(inputs.image, inputs.layout, inputs.objects, inputs.camera, IMAGE_ONLY)
     usable = _usable(inputs)
     zero = _Joint(
         *(torch.zeros_like(x) for x in (fixed.tilt, fixed.rays, fixed.yaw, fixed.log_scale))
@@ -94,7 +96,7 @@ def refine_camera(
 
     def objects_energy(joint: _Joint) -> Float[Tensor, " objects"]:
         camera, layout = _unpack(joint, inputs)
-        energy = scene_energy(layout, inputs.objects, camera, inputs.image, HumanCues(), image)
+        energy = scene_energy(layout, inputs.objects, camera, cues, HumanCues(), image)
         return energy.per_item
 
     with torch.no_grad():

@@ -24,6 +24,19 @@ def spread(layout: Layout, yaws: int) -> Layout:
     )
 
 
+def spread_distance(layout: Layout, factors: tuple[float, ...]) -> Layout:
+    """Each start also nearer and farther along the floor, as large in the image as before."""
+    found = [layout]
+    for factor in factors:
+        t = layout.t_world_object * layout.yaw.new_tensor([factor, 1.0, factor])
+        found.append(Layout(t, layout.yaw, layout.log_scale + math.log(factor)))
+    return Layout(
+        torch.cat([f.t_world_object for f in found]),
+        torch.cat([f.yaw for f in found]),
+        torch.cat([f.log_scale for f in found]),
+    )
+
+
 def shaken(layout: Layout, times: int) -> Layout:
     """Places around each start, the same in every run and for every object.
 

@@ -5,8 +5,8 @@ Not in the paper, whose refinement of bodies knows keypoints only.
 Evidence:  points of the drawn body's outline where nothing else can end the person's mask; for each
            the skin next to it, the outline's normal, and how far the mask's outline is from it.
 Price:     Geman-McClure of that distance along the normal, in usual errors of masks; the points of
-           one body share a weight. A mask that is too wide all around says little: what is common
-           to the points of one body is taken out, as far as masks usually are so.
+           one body share a weight. A mask that is too wide all around says nothing: that much is
+           taken out of the distances.
 """
 
 from jaxtyping import Float, Int
@@ -17,7 +17,6 @@ from ..minimize import geman_mcclure
 from ..records import record
 
 BORDER = 0.0025  # [image widths], usual error of a mask's outline that is not the same all around
-WIDER = 0.003  # [image widths], usual error that is the same all around
 TAIL = 3.0  # usual errors at which the price is half of the most
 POINTS = 16.0  # independent places of an outline
 
@@ -36,7 +35,7 @@ class Outline:
     gap: Float[Tensor, " points"]
     """How far the outline is outside its mask [px]; negative: inside."""
     weight: Float[Tensor, " points"]
-    """Share in the body's weight, less for odd ones; at most `POINTS` in sum."""
+    """Share in the body's weight, at most `POINTS` in sum."""
 
 
 def outline_term(
@@ -55,16 +54,5 @@ def outline_term(
     """
     here = project(skin_cam[outline.body, outline.skin], K)
     off = ((here - outline.pixel) * outline.normal).sum(-1) + outline.gap
-    off = off - _common(off, outline, len(skin_cam))[outline.body]
     price = 0.5 * TAIL**2 * outline.weight * geman_mcclure(off / (BORDER * width), TAIL)
     return skin_cam.new_zeros(len(skin_cam)).index_add(0, outline.body, price)
-
-
-def _common(
-    off: Float[Tensor, " points"], outline: Outline, bodies: int
-) -> Float[Tensor, " bodies"]:
-    """What is common to the points of each body, the likeliest border of its mask [px]."""
-    none = off.new_zeros(bodies)
-    total = none.index_add(0, outline.body, outline.weight)
-    mean = none.index_add(0, outline.body, outline.weight * off) / total.clamp_min(1e-6)
-    return mean * total / (total + (BORDER / WIDER) ** 2)

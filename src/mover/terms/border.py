@@ -1,7 +1,7 @@
 r"""Outlines of masks are too wide or too narrow by about the same all round (not in the paper).
 
-Price:     min over \delta of  \lambda_1 L_bbox(\delta) + \lambda_2 (L_occ-sil(\delta) + \rho \delta^2)
-           where mask and box of the object are taken in by \delta pixels of the image
+Price:     min_\delta  \lambda_1 L_bbox(\delta) + \lambda_2 (L_occ-sil(\delta) + \rho \delta^2)
+           where mask and box of the object are grown by \delta pixels of the image
 Robust:    \delta among some shifts, for each object and start on its own; \rho = 0.0005.
 
 A segmenter that draws every outline a pixel too wide makes a shelf whose base is hidden larger, and
@@ -57,8 +57,8 @@ def borders_of(
         within = (mask > 0.5).cpu().numpy()
         if not within.any():
             return torch.full_like(mask, -torch.inf)
-        far = distance_transform_edt(within) - distance_transform_edt(~within)
-        far = torch.from_numpy(far).to(mask)
+        near, beyond = (distance_transform_edt(x) for x in (within, ~within))
+        far = (torch.as_tensor(near) - torch.as_tensor(beyond)).to(mask)
         return torch.where(far.abs() < 1.5, mask - 0.5, far - 0.5 * far.sign())
 
     depth = torch.stack([inside(m) for m in masks]) if len(masks) else masks

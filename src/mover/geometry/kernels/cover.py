@@ -155,7 +155,6 @@ def flood(
         bits: One for each pixel, which are set.
     """
     pane = desk.scene.height * (desk.scene.width + 1)
-    things = given.things.starts.shape[0] - 1
     for row in range(box[0], box[1]):
         layers = int(0)
         begin = int(0)
@@ -174,12 +173,19 @@ def flood(
                             begin = column
                         if after == 0:
                             mark(bits, row * desk.across, begin, column)
-                            for i in range(given.windows.shifts.shape[0]):
-                                at = start + i * things * pane
-                                gained = given.windows.gain[at + column]
-                                gained -= given.windows.gain[at + begin]
-                                desk.squares[i] = desk.squares[i] + gained
+                            add(given, desk, start + begin, start + column)
                         layers = after
+
+
+@wp.func
+@no_type_check
+def add(given: Given, desk: Desk, begin: int, end: int) -> None:
+    """Add what covering a run of pixels changes, under each shift."""
+    things = given.things.starts.shape[0] - 1
+    all_panes = things * desk.scene.height * (desk.scene.width + 1)
+    for i in range(given.windows.shifts.shape[0]):
+        gained = given.windows.gain[i * all_panes + end] - given.windows.gain[i * all_panes + begin]
+        desk.squares[i] = desk.squares[i] + gained
 
 
 @wp.func

@@ -35,9 +35,7 @@ def side_of_box(
 
 @wp.func
 @no_type_check
-def price_box(
-    given: Given, desk: Desk, p: Pose, e: Extent, wider: float
-) -> tuple[float, Slope]:
+def price_box(given: Given, desk: Desk, p: Pose, e: Extent, wider: float) -> tuple[float, Slope]:
     """How far the drawn box is from the detected one, whose sides are farther out by `wider`."""
     a, da = side_of_box(given, desk, p, e.left, 0, wider)
     b, db = side_of_box(given, desk, p, e.top, 1, wider)
