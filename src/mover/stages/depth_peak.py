@@ -1,6 +1,6 @@
 """The factor of depth at which bodies fill their masks best."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,7 @@ Peak = tuple[float, float, list[str]]
 """Factor, its spread, and why it may not be used."""
 
 
+@runtime_checkable
 class Rules(Protocol):
     """When a factor is believed."""
 
