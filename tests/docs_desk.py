@@ -87,7 +87,7 @@ def write_captures(desk: Path, room: KnownRoom) -> None:
     (desk / "list.txt").write_text("captures/one  # a remark\n")
     piece = capture.scene.pieces[0]
     moved = dataclasses.replace(piece, t_world_object=piece.t_world_object + 0.1)
-    write_edits([Place(piece.id, placement_of(moved, capture.scene))], desk / "edits.json")
+    write_edits((Place(piece.id, placement_of(moved, capture.scene)),), desk / "edits.json")
     bare = desk / "C"
     bare.mkdir()
     for name in ("camera.json", "objects.json"):

@@ -28,7 +28,9 @@ for needed in ("transformers", "av", "viser", "mujoco", "pxr"):
 ELSEWHERE = {
     "--ray.address auto": "a running Ray cluster",
     "--engine slurm": "a SLURM cluster",
-    "mover experiment": "hours: many known rooms",
+    "mover experiment --": "hours: many known rooms",
+    "mover experiment study": "hours: many known rooms",
+    "mover experiment make": "many minutes: whole sets (tests/test_room_sets.py has little ones)",
     "mover demo": "minutes: `make demo`",
 }
 RUN = [
@@ -106,6 +108,14 @@ def full_desk(tmp_path_factory, small_room) -> Path:
     finally:
         os.chdir(here)
     return desk
+
+
+@pytest.fixture(autouse=True)
+def _ctrl_c() -> Iterator[None]:
+    """Programs that are started here end by Ctrl-C, even if the tests run in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

@@ -12,6 +12,8 @@ from mover.bodies.parts import parts_of
 from mover.geometry.camera import tilted
 from mover.geometry.raster import Views, layers
 from mover.readers.masks import encode
+from mover.stages.body_extents import Extents
+from mover.stages.depth_peak import SYSTEMATIC
 from mover.stages.find_depth import (
     DepthConfig,
     DepthFactors,
@@ -170,3 +172,47 @@ def test_pose_and_mesh_move_together():
     assert torch.allclose(again[1], result.joints, atol=1e-5)
     expected = joints[:, 0] * torch.tensor([1.05, 1.05, 0.97, 1.0])[:, None]
     assert torch.allclose(result.joints[:, 0], expected, atol=1e-5)
+
+
+class TestOverlapAndHeight:
+    """The one factor of what overlaps and what heights say."""
+
+    LOST = (1.0, math.inf, ["only 0 bodies are seen well enough, it stays as given"])
+
+    def told(self, monkeypatch, peak, heights):
+        module = "mover.stages.find_depth."
+        monkeypatch.setattr(module + "_curves", lambda *_: torch.zeros(0, QUICK.factors))
+        monkeypatch.setattr(module + "peak_of", lambda *_: peak)
+        monkeypatch.setattr(module + "compare_extents", lambda *_: heights)
+        true = film(spots(1))
+        blank = Masks(*SIZE, (encode(torch.zeros(SIZE, dtype=torch.bool)),))
+        found = find_depth(inputs_of(true, People(blank, true.frame, true.person, {})), QUICK)
+        return float(found.factor[0]), float(found.spread[0]), found.warnings
+
+    def test_two_that_are_certain_give_their_mean_and_its_spread(self, monkeypatch):
+        found = self.told(monkeypatch, (1.02, 0.004, []), Extents(0.99, 0.006, 9))
+        spread = math.hypot(0.006, SYSTEMATIC, 0.004) / 2
+        assert found == (pytest.approx(1.005), pytest.approx(spread), ())
+
+    def test_heights_alone_are_used_and_nothing_is_warned_of(self, monkeypatch):
+        found = self.told(monkeypatch, self.LOST, Extents(0.97, 0.004, QUICK.least))
+        assert found == (pytest.approx(0.97), pytest.approx(math.hypot(0.004, SYSTEMATIC)), ())
+
+    @pytest.mark.parametrize(
+        "heights",
+        [
+            None,
+            Extents(0.97, 0.001, QUICK.least - 1),
+            Extents(1 + 1.01 * QUICK.span, 0.001, 9),
+            Extents(1 - 1.01 * QUICK.span, 0.001, 9),
+            Extents(0.97, QUICK.spread, 9),
+        ],
+        ids=("nobody", "few", "far", "near", "uncertain"),
+    )
+    def test_heights_that_say_too_little_change_nothing(self, monkeypatch, heights):
+        factor, spread, warnings = self.told(monkeypatch, (1.02, 0.004, []), heights)
+        assert (factor, spread) == (pytest.approx(1.02), pytest.approx(0.004))
+        assert warnings == ()
+        factor, spread, warnings = self.told(monkeypatch, self.LOST, heights)
+        assert (factor, spread) == (1.0, math.inf)
+        assert warnings == ("depth of person 0: " + self.LOST[2][0],)

@@ -126,7 +126,7 @@ def scene_energy(
     pixels = cache(lambda: project(verts, camera.K))
     many = factors(objects, humans if w.contact else HumanCues(), form)
     fitted = cache(lambda: _fit(drawn()[0], outermost(verts, camera.K), camera, image, w))
-    loose = image.borders is not None and w.silhouette
+    loose = form == "robust" and image.borders is not None and w.silhouette
     return weigh(
         ("bbox", w.bbox, lambda: fitted().bbox if loose else bbox_term(
             project(_corners(objects, layout, camera) if form == "paper"

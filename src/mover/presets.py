@@ -114,7 +114,7 @@ ROBUST = Config(
     refine=RefineConfig(rounds=1),
     gather=GatherConfig(erode=1, reach=0.1),
     assign=_GROUPS,
-    place=PlaceConfig(_ROBUST_FULL, "robust", _DESCENT, tie=1.0),
+    place=PlaceConfig(_ROBUST_FULL, "robust", _DESCENT, tie=1.0, apart=0.3),
     again=1,
     slide=True,
     trust=True,

@@ -80,18 +80,7 @@ def build(
     share = float(passing.double().mean())
     if share < config.least_passing:
         raise RefusedError(f"furniture hides a part of only {share:.0%} of the bodies")
-    capture = Capture(
-        name=name,
-        scene=scene,
-        camera_height=None,
-        detections=detections,
-        reference=sight.picture,
-        reference_people=None,
-        bodies=crowd.bodies,
-        people=shown.people,
-        touch=None,
-        warnings=(),
-    )
+    capture = _capture(name, scene, detections, sight, (crowd.bodies, shown.people))
     touching = crowd.distance < GAPE
     touched = torch.where(touching, crowd.nearest, torch.full_like(crowd.nearest, NONE))
     furniture = tuple(p.furniture for p in plan.pieces)
@@ -107,6 +96,29 @@ def build(
         refused=refused,
         whole=shown.whole,
         passing=passing,
+    )
+
+
+def _capture(
+    name: str,
+    scene: Scene,
+    detections: tuple[Detection, ...],
+    sight: Sight,
+    crowd: tuple[Bodies, People],
+) -> Capture:
+    """What a perfect upstream would give."""
+    bodies, people = crowd
+    return Capture(
+        name=name,
+        scene=scene,
+        camera_height=None,
+        detections=detections,
+        reference=sight.picture,
+        reference_people=None,
+        bodies=bodies,
+        people=people,
+        touch=None,
+        warnings=(),
     )
 
 

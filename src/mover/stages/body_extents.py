@@ -22,7 +22,7 @@ from ..geometry.runs import decode
 from ..types import Bodies, Camera, Masks
 from .person_masks import MaskTable
 
-WHOLE = 0.01  # of the body's picture may be covered by objects, and no more
+WHOLE = 0.01  # of the body's picture may be covered by objects or others, and no more
 UPRIGHT = 1.8  # times as high as wide
 HEAD = 0.125  # of the height
 HIGH = 100.0  # [px]; of smaller people a pixel is more than a percent
@@ -38,7 +38,7 @@ class Extents:
     spread: float
     """Standard deviation of `factor`."""
     frames: int
-    """How many of them the person was wholly seen in."""
+    """How many showed the person wholly."""
 
 
 def compare_extents(
@@ -58,7 +58,7 @@ def compare_extents(
         objects: Masks of what may hide people.
 
     Returns:
-        None if nobody is wholly seen.
+        None if nobody is seen wholly, upright and high enough.
     """
     ratios: list[float] = []
     blocked = pixels_of(objects)

@@ -11,7 +11,10 @@ from ..types import Camera, Layout, Objects
 def fixed_borders(
     image: ImageCues, layout: Layout, objects: Objects, camera: Camera, weights: SceneWeights
 ) -> ImageCues:
-    """The masks and boxes under the shift that suits a layout best (`terms.border`)."""
+    """The masks and boxes under the shift that suits a layout best (`terms.border`).
+
+    The layout has one place for each object.
+    """
     borders = image.borders
     if borders is None:
         return image

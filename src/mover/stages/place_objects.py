@@ -18,6 +18,7 @@ from ..terms.contact_reach import together
 from ..terms.contact_trees import trees_of
 from ..types import Camera, Layout, Objects
 from .coarser import coarser_humans, coarser_image
+from .part_objects import part_objects
 from .pinned import Pinned, hold
 from .some_objects import some_humans, some_image, some_objects, some_pinned
 from .starts import best_few, choose, joined, shaken, spread, spread_distance
@@ -48,6 +49,8 @@ class PlaceConfig:
     """Further descents from places around the best one of each object."""
     tie: float = 0.0
     """How much a turn away from the reference yaw worsens a candidate: 1 doubles half a turn."""
+    apart: float = 0.0
+    """Weight of the space that objects share, in a last descent of all together."""
     span: float = 0.0
     """Release: scales stay within 1 +- span/2 by a sigmoid; 0: free."""
     chair_span: float = 0.0
@@ -123,22 +126,23 @@ def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = 
     candidates = best_few(found.at, found.value, len(found.value), apart=False)
     energy = found.value.sort(0).values
     at = choose(candidates, energy, inputs.reference, config.tie)
+    if config.apart:
+        energies = energy_of(inputs, config)
+        at = _upright(inputs, part_objects(energies, inputs.objects, at, config.apart, observe))
     return Placed(at, candidates, energy, found.trace)
 
 
 def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
     """The energy as a function of layouts whose heights are still to be eliminated."""
     scene = SceneConfig(config.weights, config.form)
-    objects = inputs.objects
-    heights = objects.size[:, 1]
-    price = pricing(objects, inputs.camera, inputs.image, inputs.humans, scene)
+    price = pricing(inputs.objects, inputs.camera, inputs.image, inputs.humans, scene)
+    return lambda layout: price(_upright(inputs, layout))
 
-    def energy(layout: Layout) -> Energy:
-        held = hold(layout, inputs.pinned)
-        standing = stand(held, objects.supports, heights, inputs.ground)
-        return price(standing)
 
-    return energy
+def _upright(inputs: PlaceInputs, layout: Layout) -> Layout:
+    """The layout with pinned objects in their places, all on their supports."""
+    objects, held = inputs.objects, hold(layout, inputs.pinned)
+    return stand(held, objects.supports, objects.size[:, 1], inputs.ground)
 
 
 def descend(
@@ -149,11 +153,10 @@ def descend(
     observe: Observer,
 ) -> Minimum[Layout]:
     """Follow the energy from each start; the result stands on its supports."""
-    objects, span = inputs.objects, _spans(inputs.objects, config)
+    span = _spans(inputs.objects, config)
 
     def at(free: Layout) -> Layout:
-        held = hold(_bounded(free, span), inputs.pinned)
-        return stand(held, objects.supports, objects.size[:, 1], inputs.ground)
+        return _upright(inputs, _bounded(free, span))
 
     def watched(step: Step) -> None:
         free = step.at

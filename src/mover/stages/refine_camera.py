@@ -10,6 +10,7 @@ floor. Objects whose shape fits tell the camera more exactly than noisy feet do.
 Each object's energy is divided by its own residual: exact shapes pull hard, wrong shapes softly. d
 is the change of pitch, roll and ground, C their covariance from the feet: a floor that was walked
 all around outweighs the objects, and what no foot told is left to them.
+The borders of the masks are held as they suit the objects at first (`fixed_borders`).
 An object is carried by the ray to the centre of its base, so a change of the camera leaves it where
 it is in the image.
 """

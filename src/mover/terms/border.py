@@ -4,8 +4,8 @@ Price:     min_\delta  \lambda_1 L_bbox(\delta) + \lambda_2 (L_occ-sil(\delta) +
            where mask and box of the object are grown by \delta pixels of the image
 Robust:    \delta among some shifts, for each object and start on its own; \rho = 0.0005.
 
-A segmenter that draws every outline a pixel too wide makes a shelf whose base is hidden larger, and
-with it farther, and the legs of a chair twice as thick: the place at which that costs least is not
+A segmenter that draws every outline a pixel too wide moves a shelf whose base is hidden, and makes
+the legs of a chair twice as thick: the place at which that costs least is not
 the true one. What all borders of an object have in common says nothing about where it stands.
 """
 

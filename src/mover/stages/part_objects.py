@@ -1,0 +1,96 @@
+"""Part objects that stand in each other, by a last descent of all of them together.
+
+Each object alone is placed by what is seen of it. A nightstand behind a bed may then stand partly
+in the bed at no price; together, both go where neither image nor people mind.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..geometry.boxes import Box, corners
+from ..geometry.volume import Volume, grid_around, union_bodies
+from ..minimize import Adam, Energy, Observer, minimize, silent
+from ..terms.apart import apart_term
+from ..types import Layout, Objects
+
+CELLS = 48  # along the longest side of a piece
+PADDING = 0.05  # [m]
+NEAR = 0.1  # [m], boxes whose circles are no nearer are not looked at
+METHOD = Adam(120, 0.01, 0.001, beta2=0.98)
+
+
+def part_objects(
+    energy: Callable[[Layout], Energy],
+    objects: Objects,
+    layout: Layout,
+    weight: float,
+    observe: Observer = silent,
+) -> Layout:
+    """Minimise the energy of all objects and what they share of space.
+
+    Args:
+        energy: Of layouts with one start.
+        objects: The objects.
+        layout: Where they were found alone.
+        weight: Of what they share.
+        observe: Told of every step.
+
+    Returns:
+        The same layout if none stands in another.
+    """
+    if weight == 0:
+        return layout
+    pairs = _pairs(objects, layout)
+    solids = tuple(_solid(objects, i) for i in range(len(objects.ids)))
+    with torch.no_grad():
+        if not bool((apart_term(layout, objects, solids, pairs) > 0).any()):
+            return layout
+
+    def together(free: Layout) -> Energy:
+        alone = energy(Layout(*(x.unsqueeze(0) for x in _parts(free))))
+        shared = weight * apart_term(free, objects, solids, pairs)
+        return Energy({"alone": alone.per_item[0], "apart": shared})
+
+    return minimize(together, layout, METHOD, observe, "place_objects").at
+
+
+def _parts(layout: Layout) -> tuple[Tensor, Tensor, Tensor]:
+    return layout.t_world_object, layout.yaw, layout.log_scale
+
+
+def _pairs(objects: Objects, layout: Layout) -> Int[Tensor, "pairs 2"]:
+    """Ordered pairs whose boxes are near each other and of which none carries the other."""
+    size = objects.size * layout.log_scale.exp()
+    ends = corners(Box(layout.t_world_object, size, layout.yaw))[..., [0, 2]]
+    middle = ends.mean(-2)
+    reach = (ends - middle.unsqueeze(-2)).norm(dim=-1).amax(-1)
+    gap = (middle[:, None] - middle[None]).norm(dim=-1) - reach[:, None] - reach[None]
+    return (gap < NEAR).logical_and(~_related(objects)).nonzero()
+
+
+def _related(objects: Objects) -> Bool[Tensor, "objects objects"]:
+    n = len(objects.ids)
+    related = torch.eye(n, dtype=torch.bool)
+    for index, carrier in enumerate(objects.supports.tolist()):
+        if carrier >= 0:
+            related[index, carrier] = related[carrier, index] = True
+    return related
+
+
+def _solid(objects: Objects, index: int) -> Volume:
+    """Signed distance to an object in its own frame, inside and just around it."""
+    verts = objects.verts[index][objects.real_verts[index]].float()
+    faces = objects.faces[index]
+    faces = faces[faces[:, 0] != faces[:, 1]]
+    grid = grid_around(verts.amin(0), verts.amax(0), CELLS, PADDING)
+    return union_bodies(verts[None], faces, grid, 1)
+
+
+def overlap(objects: Objects, layout: Layout) -> Float[Tensor, " objects"]:
+    """How much of each object stands in others (`terms.apart`) [1]."""
+    solids = tuple(_solid(objects, i) for i in range(len(objects.ids)))
+    with torch.no_grad():
+        return apart_term(layout, objects, solids, _pairs(objects, layout))
