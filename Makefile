@@ -8,13 +8,16 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 JOBS ?= 2
 
-.PHONY: demo test check lint docs slow clean
+.PHONY: demo test long check lint docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/mover demo --out demo
 
 test: $(VENV)/.developed
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) -m "not gpu and not licensed"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) -m "not gpu and not licensed and not long"
+
+long: $(VENV)/.developed
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m long
 
 check: lint test
 

@@ -13,6 +13,7 @@ import os
 import platform
 import resource
 from collections.abc import Callable
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -88,7 +89,7 @@ def deodr(room: Room) -> Tensor:
             verts[:, 2].double().numpy(), np.zeros(many, bool), np.zeros((1, 2)), np.zeros(count),
             np.ones((count, 1)), np.zeros(many, bool), flags, views.height, views.width, 1,
             np.zeros((0, 0, 1)), background_image=np.zeros((views.height, views.width, 1)),
-            integer_pixel_centers=False,
+            backface_culling=True, clockwise=True, integer_pixel_centers=False,
         )  # fmt: skip
         image, _ = drawn.render(1.0)
         drawn.render_backward(2 * (image - room.masks[item].double().numpy()[..., None]))
@@ -103,10 +104,17 @@ def signed_area(ij: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] > 0
 
 
+@cache
+def sides_of(table: bytes) -> np.ndarray:
+    """Number of the side that each corner of each triangle begins; once for each topology."""
+    faces = np.frombuffer(table, np.int64).reshape(-1, 3)
+    sides = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1), -1).reshape(-1, 2)
+    return np.unique(sides, axis=0, return_inverse=True)[1]
+
+
 def outline(faces: np.ndarray, front: np.ndarray) -> np.ndarray:
     """For each side of each triangle, whether its two triangles turn differently."""
-    sides = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1), -1).reshape(-1, 2)
-    _, index = np.unique(sides, axis=0, return_inverse=True)
+    index = sides_of(faces.tobytes())
     fronts = np.bincount(index.ravel(), np.repeat(front, 3))
     total = np.bincount(index.ravel())
     edge = (fronts > 0) & (fronts < total) | (total == 1)
@@ -121,7 +129,7 @@ def depth(threads: int) -> tuple[Work, Figures]:
     views = Views(K[None], given.camera.height, given.camera.width)
 
     def ours() -> Tensor:
-        with use_threads(threads):
+        with use_engine("warp"), use_threads(threads):
             return raster.layers(cam[:1], faces, views).front[0]
 
     work: Work = {"depth warp": ours}

@@ -21,7 +21,7 @@ from test_docs_commands import FENCE, PAGES, indented, words_of
 
 from mover.commands import run_command
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]  # transformers warns
+pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("default")]  # transformers warns
 for needed in ("transformers", "av", "viser", "mujoco", "pxr"):
     pytest.importorskip(needed)
 

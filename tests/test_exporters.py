@@ -417,7 +417,7 @@ def test_a_folder_without_a_result_is_refused(tmp_path: Path, capsys):
 
 def test_without_usd_core_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(mover.exporters.pxr_modules, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match=r"mover\[usd\]"):
+    with pytest.raises(InputError, match=r"\.\[usd\]"):
         export_usd(finished(tmp_path), tmp_path)
 
 
