@@ -59,7 +59,7 @@ def full() -> ReportContent:
         [{"name": "place_objects", "seconds": 12.5, "memory": 800.0, "kept": True}],
         {"place": {"weights": {"depth": 8.0}}, "seed": 0},
         [{"id": "sofa_0", "category": "sofa", "mask_pixels": 1234, "touched": True}],
-        "mover demo",
+        command="mover demo",
     )
 
 

@@ -264,7 +264,7 @@ def test_the_command_compares_initial_and_result(tmp_path: Path, capsys):
 
 def test_without_mujoco_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(mover.settle, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match=r"mover\[physics\]"):
+    with pytest.raises(InputError, match=r"\.\[physics\]"):
         settle(furnished(BOXES), Run(tmp_path))
 
 
