@@ -50,9 +50,8 @@ def wider(seen, pixels):
 
 
 def compared(bodies, seen, objects=NOBODY):
-    return compare_extents(
-        bodies, torch.arange(len(bodies.frame)), CAMERA, mask_table(seen, bodies), objects
-    )
+    rows, table = torch.arange(len(bodies.frame)), mask_table(seen, bodies)
+    return compare_extents(bodies, rows, CAMERA, table, pixels_of(objects))
 
 
 @pytest.mark.parametrize("pixels", [-2, -1, 0, 1, 2])

@@ -1,14 +1,13 @@
 """Gathering with Warp kernels: the same as without them, whoever does what."""
 
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from sm90 import ptx_of
 from test_volume import moving_spheres, posed_bodies, sphere
 from torch import Tensor
 
@@ -313,17 +312,6 @@ def test_trees_of_any_depth_have_the_distances_of_libigl(level: int) -> None:
 def test_kernels_compile_for_an_h100_without_a_driver(
     name: str, entries: list[str], tmp_path: Path
 ) -> None:
-    code = (
-        f"import sys, warp as wp; from mover.geometry.kernels import {name} as module;"
-        "90 in wp.get_cuda_supported_archs() or sys.exit(77);"
-        "wp.compile_aot_module(module, arch=90, module_dir=sys.argv[1], use_ptx=True)"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True)
-    if done.returncode == 77:
-        pytest.skip("this build of Warp has no CUDA compiler")
-    assert done.returncode == 0, done.stderr.decode()
-    text = "".join(p.read_text() for p in tmp_path.glob("*.ptx"))
-    assert ".target sm_90" in text
-    assert ".entry" in text
+    text = ptx_of(name, tmp_path)
     for entry in entries:
         assert f".entry {entry}_" in text

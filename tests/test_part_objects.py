@@ -6,7 +6,7 @@ import torch
 from analytic import make_inputs
 
 from mover.minimize import Energy
-from mover.stages.part_objects import overlap, part_objects
+from mover.stages.part_objects import part_objects, sharing
 from mover.types import Layout
 
 WEIGHT = 0.3
@@ -16,6 +16,10 @@ def start():
     inputs = make_inputs()
     at = Layout(*(x[0] for x in vars(inputs.starts).values()))
     return inputs.objects, at
+
+
+def overlap(objects, at):
+    return sharing(objects, at)(at)
 
 
 def indifferent(layout):

@@ -1,12 +1,11 @@
 """Eq. 1 by one kernel against the terms one by one, and against itself."""
 
-import subprocess
-import sys
 from dataclasses import fields, replace
 
 import pytest
 import torch
 from analytic import humans_at, image_at, make_inputs, moved
+from sm90 import ptx_of
 from test_raster import packed
 
 from mover.energy import SceneConfig, SceneWeights, scene_energy
@@ -193,18 +192,7 @@ class TestWhoPrices:
 
     @pytest.mark.parametrize("name", ["price", pytest.param("priced", marks=pytest.mark.slow)])
     def test_the_kernels_compile_for_an_h100_without_a_driver(self, name, tmp_path):
-        code = (
-            f"import sys, warp as wp; from mover.geometry.kernels import {name} as module;"
-            "90 in wp.get_cuda_supported_archs() or sys.exit(77);"
-            "wp.compile_aot_module(module, arch=90, module_dir=sys.argv[1], use_ptx=True)"
-        )
-        done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True)
-        if done.returncode == 77:
-            pytest.skip("this build of Warp has no CUDA compiler")
-        assert done.returncode == 0, done.stderr.decode()
-        text = "".join(p.read_text() for p in tmp_path.glob("*.ptx"))
-        assert ".target sm_90" in text
-        assert ".entry" in text
+        ptx_of(name, tmp_path)
 
 
 @record

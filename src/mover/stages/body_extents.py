@@ -46,7 +46,7 @@ def compare_extents(
     rows: Int[Tensor, " rows"],
     camera: Camera,
     table: MaskTable,
-    objects: Masks,
+    blocked: Bool[Tensor, "h w"],
 ) -> Extents | None:
     """Compare the heights of bodies that are wholly seen with those of their masks.
 
@@ -55,22 +55,22 @@ def compare_extents(
         rows: Bodies of one person.
         camera: Its image has the size of the masks.
         table: The person's masks.
-        objects: Masks of what may hide people.
+        blocked: Pixels of what may hide people.
 
     Returns:
         None if nobody is seen wholly, upright and high enough.
     """
     ratios: list[float] = []
-    blocked = pixels_of(objects)
     for row in rows.tolist():
         if not _inside(bodies.verts[row], camera):
             continue
         drawn = _drawn(bodies, row, camera)
+        high, wide = _extent(drawn)
+        if high <= UPRIGHT * wide:
+            continue
         own, others = table.decode(row)
         covered = drawn & (blocked | others) & ~own
-        high, wide = _extent(drawn)
-        whole = covered.sum() <= WHOLE * drawn.sum() and high > UPRIGHT * wide
-        if whole and min(high, _extent(own)[0]) >= HIGH:
+        if covered.sum() <= WHOLE * drawn.sum() and min(high, _extent(own)[0]) >= HIGH:
             body, mask = high - _thick(drawn), _extent(own)[0] - _thick(own)
             ratios.append(body / mask if mask > 0 else math.nan)
     found = torch.tensor([r for r in ratios if math.isfinite(r)], dtype=torch.float64)

@@ -24,7 +24,7 @@ from ..geometry.raster import Views, layers
 from ..minimize import Observer, Step, silent
 from ..records import record
 from ..types import Bodies, Camera, Masks, People
-from .body_extents import compare_extents, pixels_of
+from .body_extents import Extents, compare_extents, pixels_of
 from .depth_peak import SYSTEMATIC, Peak, peak_of
 from .find_soles import SolesConfig, straight_legs
 from .mask_overlap import overlaps, small
@@ -96,13 +96,16 @@ def find_depth(
     tracks = bodies.person.unique().tolist()
     found = torch.ones(3, len(tracks)) * torch.tensor([[1.0], [torch.inf], [1.0]])
     table = mask_table(inputs.people, bodies)
-    free = _free_of_objects(inputs, config)
+    blocked = pixels_of(inputs.objects)
+    free = small(blocked, config.width) < 0.05  # pixels of the small picture that nothing covers
     for index, person in enumerate(tracks):  # each has its own frames
         rows = ((bodies.person == person) & inputs.keep).nonzero()[:, 0]
         size, note = _size(inputs, rows, str(person))
         rows = rows[torch.tensor([table.own[r] is not None for r in rows.tolist()]).bool()]
         peak = peak_of(_curves(inputs, config, rows, table, free), config)
-        *peak, weak = _with_heights(inputs, config, rows, table, peak)
+        some = _some(rows, config.whole)
+        heights = compare_extents(bodies, some, inputs.camera, table, blocked)
+        *peak, weak = _with_heights(peak, heights, config)
         found[:, index] = torch.tensor([*peak, size])
         warnings += note + [f"depth of person {person}: {w}" for w in weak]
         observe(Step("find_depth", index, len(tracks)))
@@ -138,12 +141,8 @@ def pelvis(bodies: Bodies) -> Float[Tensor, "bodies 3"]:
     return bodies.verts.mean(1)
 
 
-def _with_heights(
-    inputs: DepthInputs, config: DepthConfig, rows: Tensor, table: MaskTable, peak: Peak
-) -> Peak:
+def _with_heights(peak: Peak, found: Extents | None, config: DepthConfig) -> Peak:
     """The mean of what overlaps and heights say; the one that there is if the other is missing."""
-    rows = _some(rows, config.whole)
-    found = compare_extents(inputs.bodies, rows, inputs.camera, table, inputs.objects)
     if found is None or found.frames < config.least or abs(found.factor - 1) > config.span:
         return peak
     spread = (found.spread**2 + SYSTEMATIC**2) ** 0.5
@@ -170,11 +169,6 @@ def _size(inputs: DepthInputs, rows: Int[Tensor, " rows"], person: str) -> tuple
     if not LIKELY_SIZE[0] < size < LIKELY_SIZE[1]:
         return 1.0, [f"person {person} is {tall:.2f} m tall, not {known:.2f} m: height not used"]
     return size, [f"person {person} is {tall:.2f} m tall and is scaled to {known:.2f} m"]
-
-
-def _free_of_objects(inputs: DepthInputs, config: DepthConfig) -> Bool[Tensor, "h w"]:
-    """Pixels of the small picture that no object covers."""
-    return small(pixels_of(inputs.objects), config.width) < 0.05
 
 
 def _curves(

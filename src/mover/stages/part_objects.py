@@ -15,6 +15,7 @@ from ..geometry.volume import Volume, grid_around, union_bodies
 from ..minimize import Adam, Energy, Observer, minimize, silent
 from ..terms.apart import apart_term
 from ..types import Layout, Objects
+from .starts import alone
 
 CELLS = 48  # along the longest side of a piece
 PADDING = 0.05  # [m]
@@ -43,22 +44,22 @@ def part_objects(
     """
     if weight == 0:
         return layout
-    pairs = _pairs(objects, layout)
-    solids = tuple(_solid(objects, i) for i in range(len(objects.ids)))
+    shared = sharing(objects, layout)
     with torch.no_grad():
-        if not bool((apart_term(layout, objects, solids, pairs) > 0).any()):
+        if not bool((shared(layout) > 0).any()):
             return layout
 
     def together(free: Layout) -> Energy:
-        alone = energy(Layout(*(x.unsqueeze(0) for x in _parts(free))))
-        shared = weight * apart_term(free, objects, solids, pairs)
-        return Energy({"alone": alone.per_item[0], "apart": shared})
+        return Energy({"alone": energy(alone(free)).per_item[0], "apart": weight * shared(free)})
 
     return minimize(together, layout, METHOD, observe, "place_objects").at
 
 
-def _parts(layout: Layout) -> tuple[Tensor, Tensor, Tensor]:
-    return layout.t_world_object, layout.yaw, layout.log_scale
+def sharing(objects: Objects, layout: Layout) -> Callable[[Layout], Float[Tensor, " objects"]]:
+    """How much of each object stands in others, for places near a layout (`terms.apart`) [1]."""
+    pairs = _pairs(objects, layout)
+    solids = {i: _solid(objects, i) for i in pairs.unique().tolist()}
+    return lambda at: apart_term(at, objects, solids, pairs)
 
 
 def _pairs(objects: Objects, layout: Layout) -> Int[Tensor, "pairs 2"]:
@@ -87,10 +88,3 @@ def _solid(objects: Objects, index: int) -> Volume:
     faces = faces[faces[:, 0] != faces[:, 1]]
     grid = grid_around(verts.amin(0), verts.amax(0), CELLS, PADDING)
     return union_bodies(verts[None], faces, grid, 1)
-
-
-def overlap(objects: Objects, layout: Layout) -> Float[Tensor, " objects"]:
-    """How much of each object stands in others (`terms.apart`) [1]."""
-    solids = tuple(_solid(objects, i) for i in range(len(objects.ids)))
-    with torch.no_grad():
-        return apart_term(layout, objects, solids, _pairs(objects, layout))

@@ -8,6 +8,8 @@ Price:     L_apart = \sum_i \sum_{j \ne i} 1000 mean_u \max(0, -s_j V_j(u_i) - m
 The robust form only, in a last descent of all objects together (`stages.part_objects`).
 """
 
+from collections.abc import Mapping
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -24,7 +26,7 @@ MARGIN = 0.02  # [m]
 def apart_term(
     layout: Layout,
     objects: Objects,
-    solids: tuple[Volume, ...],
+    solids: Mapping[int, Volume],
     pairs: Int[Tensor, "pairs 2"],
 ) -> Float[Tensor, " objects"]:
     """Price of the samples of each object that lie inside others [1].
@@ -32,7 +34,7 @@ def apart_term(
     Args:
         layout: One place for each object.
         objects: Their samples.
-        solids: Signed distance to each object in its own frame [m].
+        solids: Signed distance to each object of a pair in its own frame [m].
         pairs: Whose samples may lie in whom.
     """
     points = place(objects.samples, layout)

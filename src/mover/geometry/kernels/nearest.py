@@ -67,6 +67,21 @@ def in_group(c: Cloud, q: Query, group: int, best: float, place: int) -> tuple[f
     return best, place
 
 
+@wp.func
+@no_type_check
+def nearest_of(c: Cloud, q: Query, guess: int) -> int:
+    """Where the nearest point is; the first of those equally near. Any guess gives the same."""
+    best = FAR
+    place = int(0)
+    if guess >= 0:
+        place = guess
+        best = wp.length_sq(wp.cw_mul(c.points[q.item, guess], q.scale) - q.place)
+    for group in range(c.group_low.shape[1]):
+        if to_box(q, c.group_low[q.item, group], c.group_high[q.item, group]) <= best * SLACK:
+            best, place = in_group(c, q, group, best, place)
+    return place
+
+
 @wp.kernel
 @no_type_check
 def nearest(

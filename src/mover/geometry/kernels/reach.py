@@ -10,7 +10,7 @@ from typing import no_type_check
 
 import warp as wp
 
-from .nearest import FAR, SLACK, Cloud, Query, in_group, to_box
+from .nearest import Cloud, Query, nearest_of
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False, "optimization_level": 3})
 
@@ -59,21 +59,6 @@ def pose_of(row: Slope) -> Pose:
     p.place = wp.vec3(row[0], row[1], row[2])
     p.scale = wp.vec3(wp.exp(row[4]), wp.exp(row[5]), wp.exp(row[6]))
     return p
-
-
-@wp.func
-@no_type_check
-def nearest_of(c: Cloud, q: Query, guess: int) -> int:
-    """Where the nearest point is; the first of those equally near."""
-    best = FAR
-    place = int(0)
-    if guess >= 0:
-        place = guess
-        best = wp.length_sq(wp.cw_mul(c.points[q.item, guess], q.scale) - q.place)
-    for group in range(c.group_low.shape[1]):
-        if to_box(q, c.group_low[q.item, group], c.group_high[q.item, group]) <= best * SLACK:
-            best, place = in_group(c, q, group, best, place)
-    return place
 
 
 @wp.func

@@ -7,26 +7,11 @@ import warp as wp
 
 from .given import ASKED, SAMPLES, Given, Pose, Slope, slope_of
 from .lookup import interpolate
-from .nearest import FAR, SLACK, Cloud, Query, in_group, to_box
+from .nearest import Query, nearest_of
 
 CALM = wp.constant(wp.uint8(2))  # a brick without bodies
 BRICK = wp.constant(3)  # bits, as in `lookup`
 EPS = wp.constant(1.0e-12)  # [m²], as in `minimize.safe_norm`
-
-
-@wp.func
-@no_type_check
-def nearest_of(c: Cloud, q: Query, guess: int) -> int:
-    """The point that is nearest; the first of those equally near. Any guess gives the same."""
-    best = FAR
-    place = int(0)
-    if guess >= 0:
-        place = guess
-        best = wp.length_sq(wp.cw_mul(c.points[q.item, guess], q.scale) - q.place)
-    for group in range(c.group_low.shape[1]):
-        if to_box(q, c.group_low[q.item, group], c.group_high[q.item, group]) <= best * SLACK:
-            best, place = in_group(c, q, group, best, place)
-    return place
 
 
 @wp.func
