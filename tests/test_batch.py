@@ -308,6 +308,7 @@ def test_a_true_capture_runs_and_a_broken_one_says_what_is_broken(tmp_path: Path
         str(out),
     ]
     quick = ["--place.method.steps", "5", "--layout.method.steps", "5", "--workers", "2"]
+    quick.append("--refine")
     for expected in ("1 done, 1 failed", "1 done (1 of them before), 1 failed"):
         ended = subprocess.run(
             [*command, *quick], env=variables, capture_output=True, text=True, check=False
@@ -315,6 +316,7 @@ def test_a_true_capture_runs_and_a_broken_one_says_what_is_broken(tmp_path: Path
         assert ended.returncode == 1, ended.stderr
         assert expected in ended.stdout
     assert (out / "good" / "scene.json").is_file()
+    assert json.loads((out / "good" / "run.json").read_text())["people_refined"]
     record = json.loads((out / "failures" / "bad.json").read_text())
     assert record["kind"] == "input"
     assert "camera.json" in record["reason"]

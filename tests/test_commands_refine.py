@@ -5,16 +5,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from analytic import FACES, box_verts
 from figures import ARMS_DOWN, people, pose
 from little_room import camera
 from make_smpl import make_model, write_npz
+from test_pipeline import light
 
-from mover import commands
+from mover import commands, records
 from mover.bodies import open_body, rest_pose
 from mover.bodies.smpl_files import load_smpl
 from mover.readers.bodies_file import read_bodies, write_bodies
+from mover.readers.fields import write_json
 from mover.readers.mesh_file import write_mesh
 from mover.readers.scene_file import write_scene
 from mover.types import Bodies, Mesh, Piece, Scene
@@ -122,3 +125,26 @@ def test_contacts_without_their_source_name_the_missing_flag(tmp_path, capsys):
     write_bodies(standing(0.0), tmp_path / "bodies.npz")
     assert commands.run_command("contacts", ["files", str(tmp_path / "bodies.npz")]) != 0
     assert "--source" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_run_ends_with_the_people_that_refine_would_give(tmp_path, small_room):
+    """The room is the same, and its people are those of `mover refine` on the plain result."""
+    from docs_desk import thinned
+
+    from mover.readers.folder import write_capture
+    from mover.rooms.noise import NoiseConfig, add_noise
+
+    write_capture(thinned(add_noise(small_room, NoiseConfig(), 1)), tmp_path / "capture")
+    write_json({"config": records.plain(light("robust"))}, tmp_path / "config.json")
+    out = tmp_path / "out"
+    run = [str(tmp_path / "capture"), "--out", str(out), "--config", str(tmp_path / "config.json")]
+    assert commands.run_command("run", run) == 0
+    scene, given = (out / "scene.json").read_bytes(), read_bodies(out / "bodies.npz")
+    assert commands.run_command("refine", [str(out)]) == 0
+    assert commands.run_command("run", [*run, "--refine"]) == 0
+    found, wanted = (read_bodies(out / name) for name in ("bodies.npz", "refined/bodies.npz"))
+    torch.testing.assert_close(found.verts, wanted.verts, atol=2e-3, rtol=0)
+    assert (found.verts - given.verts).norm(dim=-1).median() > 0.01
+    assert (out / "scene.json").read_bytes() == scene
+    assert json.loads((out / "run.json").read_text())["people_refined"]

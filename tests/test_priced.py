@@ -9,7 +9,7 @@ from sm90 import ptx_of
 from test_raster import packed
 
 from mover.energy import SceneConfig, SceneWeights, scene_energy
-from mover.energy_warp import pricing
+from mover.energy_warp import pricing, pricing_rows
 from mover.geometry.mesh import edges_of
 from mover.geometry.raster_engine import use_engine, use_threads
 from mover.minimize import Adam, Energy, minimize
@@ -98,6 +98,20 @@ class TestAgreement:
         layout = starts_of(inputs)
         assert set(fast(layout).parts) == set(slow(layout).parts)
         agree(fast, slow, layout)
+
+    def test_some_rows_of_the_starts_cost_what_they_cost_among_all(self):
+        inputs = room()
+        rest = inputs.objects, inputs.camera, inputs.image, inputs.humans
+        fast, layout = both(inputs)[0], starts_of(inputs)
+        value, slope = (x.flatten(0, 1) for x in told(fast, layout))
+        some = pricing_rows(*rest, SceneConfig(WEIGHTS, "robust"))
+        assert some is not None
+        for numbers in ([4], [8, 0, 5], [5, 0], list(range(9)), [7, 1, 2, 3]):
+            rows = torch.tensor(numbers)
+            few = Layout(*(getattr(layout, f.name).flatten(0, 1)[rows] for f in fields(Layout)))
+            found = told(lambda at, rows=rows: some(at, rows), few)
+            assert torch.equal(found[0], value[rows])
+            assert torch.equal(found[1], slope[rows])
 
     @pytest.mark.parametrize("shift", [(0.0, 0.0, 2.5), (0.0, 0.0, 9.0), (40.0, 0.0, 0.0)])
     def test_so_are_those_of_objects_before_behind_and_beside_the_camera(self, shift):

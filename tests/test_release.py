@@ -9,8 +9,8 @@ from analytic import make_inputs
 from mover.energy import factors
 from mover.geometry.placement import place
 from mover.presets import RELEASE
-from mover.stages.place_objects import _bounded, _unbounded
 from mover.stages.reinitialize import ReinitConfig, ReinitInputs, by_release
+from mover.stages.spans import bounded, unbounded
 from mover.terms.contact import contact_term
 from mover.terms.depth import DepthRange, depth_term
 from mover.terms.silhouette import edge_term
@@ -38,10 +38,10 @@ def test_the_sigmoid_of_scales_is_inverted_with_its_denominator():
     scale = torch.tensor([1.0, 0.8]).log()[None, :, None].expand(1, 2, 3)
     layout = Layout(torch.zeros(1, 2, 3), torch.zeros(1, 2), scale)
     span = torch.tensor([0.8, 0.6])
-    back = _bounded(_unbounded(layout, span), span)
+    back = bounded(unbounded(layout, span), span)
     torch.testing.assert_close(back.log_scale, layout.log_scale)
     wild = replace(layout, log_scale=torch.full((1, 2, 3), 9.0))
-    assert _bounded(wild, span).log_scale.exp().amax((0, 2)).tolist() == pytest.approx(
+    assert bounded(wild, span).log_scale.exp().amax((0, 2)).tolist() == pytest.approx(
         [1.4, 1.3], abs=1e-3
     )
 

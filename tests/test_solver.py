@@ -8,6 +8,7 @@ from analytic import make_inputs, moved
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mover import energy_warp
 from mover.commands import parse_run
 from mover.energy import SceneWeights
 from mover.geometry.camera import outermost, project, to_camera
@@ -16,7 +17,7 @@ from mover.geometry.price_warp import squares
 from mover.geometry.raster import Depths
 from mover.geometry.raster_engine import use_engine
 from mover.minimize import Adam, Energy, silent
-from mover.minimize_newton import Problems, Quasi, settle
+from mover.minimize_newton import Problems, Quasi, _step, settle
 from mover.presets import Config
 from mover.records import built, plain, record
 from mover.stages.coarser import coarser_image
@@ -167,6 +168,28 @@ def test_a_cliff_of_nan_is_not_stepped_over():
     assert 0.2 < float(found.at.x) < 0.3
 
 
+@pytest.mark.parametrize("radius", [1e-6, 0.1, 1.0, 1e4])
+def test_a_step_is_the_least_of_its_model_within_the_radius(radius):
+    """The conditions of Moré and Sorensen: (B + k I) s = -g, k >= 0, k (r - |s|) = 0."""
+    r = torch.Generator().manual_seed(2)
+    axes, _ = torch.linalg.qr(torch.randn(40, 7, 7, generator=r).double())
+    curve = 10 ** (8 * torch.rand(40, 7, generator=r).double() - 4)
+    model, slope = axes * curve[:, None] @ axes.mT, torch.randn(40, 7, generator=r).double()
+    slope[0] = 0.0
+    step, promise = _step(model, slope, torch.full((40,), radius, dtype=torch.float64))
+    length, pull = step.norm(dim=-1), -(slope + (model @ step[..., None])[..., 0])
+    assert (length <= radius * (1 + 1e-9)).all()
+    inside = length < radius * (1 - 1e-6)
+    scale = slope.norm(dim=-1)
+    assert (pull[inside].norm(dim=-1) <= 1e-6 * scale[inside] + 1e-9).all()
+    along = (pull * step).sum(-1)
+    assert (along >= -1e-7 * scale * length).all()
+    across = pull - (along / length.square().clamp_min(1e-300))[:, None] * step
+    assert (across.norm(dim=-1) <= 1e-4 * scale + 1e-12).all()
+    told = -(slope * step).sum(-1) - 0.5 * (step * (model @ step[..., None])[..., 0]).sum(-1)
+    torch.testing.assert_close(promise, told, rtol=1e-6, atol=1e-9)
+
+
 def test_grouped_problems_decide_together():
     """The first one's unknown rules the second one's energy: alone it would raise the sum."""
 
@@ -209,6 +232,24 @@ class TestPlacing:
         found = descend(inputs, ROBUST, moved(inputs.starts, 1, 0.1), Quasi(steps=8), silent)
         there = energy_of(inputs, ROBUST)(found.at).per_item
         torch.testing.assert_close(found.value, there, rtol=1e-4, atol=1e-6)
+
+    def test_the_evidence_is_prepared_once_whoever_leaves_the_batch(self, monkeypatch):
+        pytest.importorskip("warp")
+        inputs, packed = with_trees(make_inputs(size=32)), []
+        prepare = energy_warp.pricer_of
+        monkeypatch.setattr(energy_warp, "pricer_of", lambda *a: packed.append(a) or prepare(*a))
+        descend(inputs, ROBUST, moved(inputs.starts, 1, 0.1), Quasi(steps=8, patience=1), silent)
+        assert len(packed) == 1
+
+    def test_rounds_of_shaking_never_worsen_the_result_and_are_the_same_in_every_run(self):
+        inputs = make_inputs(size=32)
+        inputs = replace(inputs, starts=alone(_first(moved(inputs.starts, 4, 0.1))))
+        once, thrice, again = (
+            place_objects(inputs, replace(ROBUST, method=Quasi(steps=6), shaken=2, rounds=n))
+            for n in (1, 3, 3)
+        )
+        assert (thrice.energy[0] <= once.energy[0]).all()
+        assert torch.equal(thrice.energy, again.energy)
 
     def test_pinned_objects_stay(self):
         inputs = make_inputs(size=32)

@@ -110,12 +110,12 @@ def _run(arguments: Sequence[str]) -> None:
 
     capture = read(args.format, args.source)
     edits = () if args.edits is None else read_edits(args.edits)
-    origin = Origin(str(args.source.resolve()), args.format, edits)
+    origin = Origin(str(args.source.resolve()), args.format, edits, args.refine)
     if args.view:
         view = importlib.import_module(".commands_view", __package__)
         view.run_in_view(capture, config, args.out, origin)
         return
-    reconstruct_into(args.out, capture, config, origin, refine=args.refine)
+    reconstruct_into(args.out, capture, config, origin)
     _say(f"report: {args.out / 'report.html'}")
 
 
@@ -125,7 +125,6 @@ def reconstruct_into(
     config: Config,
     origin: Any,  # noqa: ANN401
     watch: Any = None,  # noqa: ANN401
-    refine: bool = False,
 ) -> Any:  # noqa: ANN401
     """Run the main job on the edited capture and write its result; `watch` sees every step."""
     import torch
@@ -140,7 +139,7 @@ def reconstruct_into(
     with Bar() as bar:
         run = Run(out, bar if watch is None else both(bar, watch))
         room = reconstruct(capture, config, run, pinned)
-        if refine:
+        if origin.refine:
             from .refinement import refined_room
 
             room = refined_room(room, capture, bar)

@@ -71,6 +71,8 @@ class BatchArgs:
     """paper, release or robust: the settings that the other flags change."""
     config_from: Annotated[Path | None, arg(name="config")] = None
     """A run.json whose settings are used instead of a preset's."""
+    refine: bool = False
+    """At the end of each run, refine the people with the room they helped to find."""
     ray: RayOptions = field(default_factory=RayOptions)
     slurm: SlurmOptions = field(default_factory=SlurmOptions)
     config: Annotated[Config, arg(name="")] = field(default_factory=Config)
@@ -116,7 +118,7 @@ def batch(arguments: Sequence[str]) -> None:
         captures=captures,
         out=args.out,
         command=_command(args),
-        fingerprint=records.fingerprint(args.config, args.format, _version()),
+        fingerprint=records.fingerprint(args.config, args.format, _version(), args.refine),
         limit=args.limit,
         threads=args.threads,
     )
@@ -151,7 +153,8 @@ def _command(args: BatchArgs) -> tuple[str, ...]:
 
     write_json(tree, file)
     start = (sys.executable, "-m", "mover", "run", CAPTURE, "--out", OUT)
-    return (*start, "--format", args.format, "--config", str(file))
+    refine = ("--refine",) if args.refine else ()
+    return (*start, "--format", args.format, "--config", str(file), *refine)
 
 
 def _version() -> str:

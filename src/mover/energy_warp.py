@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from .energy import HumanCues, ImageCues, SceneConfig, SceneWeights, heard, scene_energy
@@ -15,6 +16,8 @@ from .minimize import Energy
 from .terms.contact_trees import trees_of
 from .types import Camera, Layout, Objects
 
+Rows = Int[Tensor, " rows"]
+
 
 def pricing(
     objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
@@ -23,19 +26,32 @@ def pricing(
 
     It can on a CPU in single precision, for the robust form and closed meshes.
     """
+    priced = pricing_rows(objects, camera, image, humans, config)
+    if priced is not None:
+        return lambda layout: priced(layout, None)
+    return window_pricing(objects, camera, image, humans, config) or (
+        lambda layout: scene_energy(layout, objects, camera, image, humans, config)
+    )
+
+
+def pricing_rows(
+    objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
+) -> Callable[[Layout, Rows | None], Energy] | None:
+    """The same for some starts of some objects, by their numbers; None without the kernel.
+
+    Rows count through (starts x objects); the layout has one row for each.
+    """
     weights = heard(config.weights, image, humans)
     if humans.touches is not None and humans.trees is None and weights.contact:
         humans = replace(humans, trees=trees_of(objects, humans.touches))
     can = _knows(weights, config.form, humans) and _plain(objects, camera, image, humans)
     if not can or not _closed(objects):
-        return window_pricing(objects, camera, image, humans, config) or (
-            lambda layout: scene_energy(layout, objects, camera, image, humans, config)
-        )
+        return None
     pricer = pricer_of(objects, camera, image, humans, weights)
     names = [(k, name) for k, name in enumerate(TERMS) if getattr(weights, name)]
 
-    def energy(layout: Layout) -> Energy:
-        whole, parts = price(pricer, layout.t_world_object, layout.yaw, layout.log_scale)
+    def energy(layout: Layout, rows: Rows | None) -> Energy:
+        whole, parts = price(pricer, layout.t_world_object, layout.yaw, layout.log_scale, rows)
         each = parts.unbind(-1)
         return Energy({name: each[k] for k, name in names}, whole)
 

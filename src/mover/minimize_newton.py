@@ -24,7 +24,7 @@ Rows = Int[Tensor, " few"]
 GOOD, BAD = 0.75, 0.25  # share of the promised decrease from which a radius grows, shrinks
 DAMPED = 0.2  # least curvature that is learned, as a share of the model's
 FLOOR = 1e-3  # energy below which decreases count as shares of this
-BISECTIONS = 40
+SECULAR = 12  # Newton's steps to the multiplier of a step as long as the radius
 
 
 @dataclass(frozen=True)
@@ -181,14 +181,17 @@ def _step(model: Tensor, slope: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]
     curve, axes = torch.linalg.eigh(model)
     curve = curve.clamp_min(1e-12)  # the update keeps them positive but for rounding
     along = (axes * slope.unsqueeze(-1)).sum(-2)
-    reach = radius.unsqueeze(-1)
-    low, high = torch.zeros_like(reach), along.norm(dim=-1, keepdim=True) / reach
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        far = (along / (curve + middle)).norm(dim=-1, keepdim=True) > reach
-        low, high = torch.where(far, middle, low), torch.where(far, high, middle)
-    inside = (along / curve).norm(dim=-1, keepdim=True) <= reach
-    move = -along / torch.where(inside, curve, curve + high)
+    reach, square = radius.unsqueeze(-1), along.square()
+    damping = torch.zeros_like(reach)
+    for _ in range(SECULAR):  # Nocedal, Wright, Algorithm 4.3: from below, never too far
+        damped = curve + damping
+        part = square / damped.square()
+        length = part.sum(-1, keepdim=True).sqrt()
+        bend = (part / damped).sum(-1, keepdim=True).clamp_min(1e-300)
+        more = (length - reach) / reach * (length.square() / bend)
+        damping = (damping + more).clamp_min(0)
+    move = -along / (curve + damping)
+    move = move * (reach / move.norm(dim=-1, keepdim=True).clamp_min(1e-300)).clamp_max(1)
     promise = -(along * move + 0.5 * curve * move.square()).sum(-1)
     return (axes * move.unsqueeze(-2)).sum(-1), promise
 

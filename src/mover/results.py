@@ -34,6 +34,8 @@ class Origin:
     format: str = "folder"
     edits: tuple[Edit, ...] = ()
     """What the user changed in it before."""
+    refine: bool = False
+    """Whether the people were refined with the room at the end."""
 
 
 def write_results(
@@ -118,6 +120,7 @@ def _write_log(room: Room, config: Config, run: Run, origin: Origin) -> None:
         "source": origin.source,
         "source_format": origin.format,
         "edits": len(origin.edits),
+        "people_refined": origin.refine,
         "python": platform.python_version(),
         "torch": torch.__version__,
         "device": "cpu",

@@ -9,7 +9,7 @@ from threading import Lock
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -50,14 +50,17 @@ class Pricer:
     asked: int
     """Number of skin points that ask what they touch."""
     held: list["_Bench"] = field(default_factory=list)
-    """Memory for the last number of items."""
+    """Memory for the most items so far."""
     lock: Any = field(default_factory=Lock)
 
 
 @dataclass(frozen=True)
 class _Bench:
-    """Memory for a number of items, and a launch for each thread."""
+    """Memory for all starts of all objects, and a launch for each thread."""
 
+    rows: list[Tensor]
+    """Which items `order` is about."""
+    order: Tensor
     layout: Tensor
     parts: Tensor
     slopes: Tensor
@@ -71,10 +74,20 @@ def price(
     t_world_object: Float[Tensor, "*starts objects 3"],
     yaw: Float[Tensor, "*starts objects"],
     log_scale: Float[Tensor, "*starts objects 3"],
+    rows: Int[Tensor, " objects"] | None = None,
 ) -> tuple[Float[Tensor, "*starts objects"], Float[Tensor, "*starts objects terms"]]:
-    """The sum of the terms and the terms, with their weights; differentiable once."""
+    """The sum of the terms and the terms, with their weights; differentiable once.
+
+    Args:
+        pricer: The kernel and its memory.
+        t_world_object: Places [m].
+        yaw: [rad].
+        log_scale: Logarithms of the scales.
+        rows: Which these are among the starts of all objects, counted through, each at most once;
+            None: all, in their order.
+    """
     layout = torch.cat([t_world_object, yaw.unsqueeze(-1), log_scale], -1)
-    whole, parts = _Price.apply(layout, pricer)
+    whole, parts = _Price.apply(layout, pricer, rows)
     return whole, parts
 
 
@@ -82,12 +95,19 @@ class _Price(torch.autograd.Function):
     """Keeps the gradient of each term."""
 
     @staticmethod
-    def forward(ctx: Any, layout: Tensor, pricer: Pricer) -> tuple[Tensor, Tensor]:  # noqa: ANN401
+    def forward(
+        ctx: Any,  # noqa: ANN401
+        layout: Tensor,
+        pricer: Pricer,
+        rows: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
         axes = layout.shape[:-1]
+        flat = layout.reshape(-1, layout.shape[-1])
+        rows = torch.arange(len(flat)) if rows is None else rows
         with pricer.lock:
-            bench = _run(pricer, layout.reshape(-1, layout.shape[-1]))
-            ctx.save_for_backward(bench.slope.clone(), bench.slopes.clone())
-            whole, parts = bench.whole.clone(), bench.parts.clone()
+            bench = _run(pricer, flat, rows)
+            ctx.save_for_backward(bench.slope[rows], bench.slopes[rows])
+            whole, parts = bench.whole[rows], bench.parts[rows]
         ctx.set_materialize_grads(False)
         return whole.view(axes), parts.view(*axes, -1)
 
@@ -96,7 +116,7 @@ class _Price(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any,  # noqa: ANN401
         *grads: Tensor | None,
-    ) -> tuple[Tensor | None, None]:
+    ) -> tuple[Tensor | None, None, None]:
         slope, slopes = ctx.saved_tensors
         whole, parts = grads
         found = None
@@ -105,17 +125,14 @@ class _Price(torch.autograd.Function):
         if parts is not None:
             more = (parts.unsqueeze(-1) * slopes.view(*parts.shape, -1)).sum(-2)
             found = more if found is None else found + more
-        return found, None
+        return found, None, None
 
 
-def _run(pricer: Pricer, rows: Tensor) -> _Bench:
-    """Price all rows, the largest objects first, on as many threads as are wanted."""
+def _run(pricer: Pricer, layout: Tensor, rows: Tensor) -> _Bench:
+    """Price these rows, the largest objects first, on as many threads as are wanted."""
     count = min(threads(), max(len(rows), 1))
-    bench = next(iter(pricer.held), None)
-    if bench is None or len(bench.layout) != len(rows) or len(bench.launches) != count:
-        bench = _bench(pricer, len(rows), count)
-        pricer.held[:] = [bench]
-    bench.layout.copy_(rows)
+    bench = _seated(pricer, rows, count)
+    bench.layout[rows] = layout
     todo = iter(_chunks(len(rows), count))
 
     def work(thread: int) -> None:
@@ -126,6 +143,20 @@ def _run(pricer: Pricer, rows: Tensor) -> _Bench:
             launch.launch()
 
     share(work, count)
+    return bench
+
+
+def _seated(pricer: Pricer, rows: Tensor, count: int) -> _Bench:
+    """Memory in which these rows are next; that of the last call where it is large enough."""
+    need = int(rows.max()) + 1 if len(rows) else 0
+    bench = next(iter(pricer.held), None)
+    if bench is None or len(bench.layout) < need or len(bench.launches) < count:
+        bench = _bench(pricer, need, count)
+        pricer.held[:] = [bench]
+    if not bench.rows or not torch.equal(bench.rows[0], rows):
+        effort = pricer.effort[rows % max(1, len(pricer.effort))]
+        bench.order[: len(rows)] = rows[effort.argsort(descending=True, stable=True)]
+        bench.rows[:] = [rows.clone()]
     return bench
 
 
@@ -148,12 +179,12 @@ def _bench(pricer: Pricer, items: int, count: int) -> _Bench:
     layout, whole = torch.empty(items, 7), torch.empty(items)
     parts, slope = torch.empty(items, TERMS), torch.empty(items, 7)
     slopes = torch.empty(items, TERMS, 7)
-    order = pricer.effort.repeat(-(-items // n))[:items].argsort(descending=True, stable=True)
+    order = torch.zeros(items, dtype=torch.int32)
     pricer.given.people.held = array(
         torch.full((max(1, pricer.asked * -(-items // n)),), -1, dtype=torch.int32), "int32"
     )
     answer = Answer()
-    answer.order = array(order.int(), "int32")
+    answer.order = array(order, "int32")
     answer.layout, answer.parts = (started().from_torch(x) for x in (layout, parts))
     answer.slopes, answer.slope = (_slopes(x) for x in (slopes, slope))
     answer.whole = array(whole, "float32")
@@ -167,7 +198,7 @@ def _bench(pricer: Pricer, items: int, count: int) -> _Bench:
         )
         for _ in range(count)
     )
-    return _Bench(layout, parts, slopes, whole, slope, launches)
+    return _Bench([], order, layout, parts, slopes, whole, slope, launches)
 
 
 def _slopes(values: Tensor) -> Any:  # noqa: ANN401

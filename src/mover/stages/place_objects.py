@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..energy import HumanCues, ImageCues, SceneConfig, SceneWeights
-from ..energy_warp import pricing
+from ..energy_warp import pricing, pricing_rows
 from ..geometry.placement import stand
 from ..minimize import Adam, Energy, Minimum, Observer, Step, minimize, silent
 from ..minimize_newton import Problems, Quasi, settle
@@ -21,6 +21,7 @@ from .coarser import coarser_humans, coarser_image
 from .part_objects import part_objects
 from .pinned import Pinned, hold
 from .some_objects import some_humans, some_image, some_objects, some_pinned
+from .spans import bounded, spans_of, unbounded
 from .starts import best_few, choose, joined, shaken, spread, spread_distance
 
 
@@ -47,6 +48,8 @@ class PlaceConfig:
     """Pixels of a window that are one, along each side, in the short descents."""
     shaken: int = 0
     """Further descents from places around the best one of each object."""
+    rounds: int = 1
+    """How often that is done; each time around the best so far, and half as far from it."""
     tie: float = 0.0
     """How much a turn away from the reference yaw worsens a candidate: 1 doubles half a turn."""
     apart: float = 0.0
@@ -115,8 +118,8 @@ def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = 
         found = descend(blurred, config, starts, config.short, observe)
         starts = best_few(found.at, found.value, config.keep)
     found = descend(inputs, config, starts, config.method, observe)
-    if config.shaken:
-        around = shaken(best_few(found.at, found.value, 1), config.shaken)
+    for number in range(config.rounds if config.shaken else 0):
+        around = shaken(best_few(found.at, found.value, 1), config.shaken, number)
         more = descend(inputs, config, around, config.method, observe)
         found = Minimum(
             joined(found.at, more.at),
@@ -128,19 +131,22 @@ def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = 
     at = choose(candidates, energy, inputs.reference, config.tie)
     if config.apart:
         energies = energy_of(inputs, config)
-        at = _upright(inputs, part_objects(energies, inputs.objects, at, config.apart, observe))
+        at = _standing(inputs, part_objects(energies, inputs.objects, at, config.apart, observe))
     return Placed(at, candidates, energy, found.trace)
 
 
 def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
     """The energy as a function of layouts whose heights are still to be eliminated."""
-    scene = SceneConfig(config.weights, config.form)
-    price = pricing(inputs.objects, inputs.camera, inputs.image, inputs.humans, scene)
-    return lambda layout: price(_upright(inputs, layout))
+    price = pricing(*_evidence(inputs), SceneConfig(config.weights, config.form))
+    return lambda layout: price(_standing(inputs, layout))
 
 
-def _upright(inputs: PlaceInputs, layout: Layout) -> Layout:
-    """The layout with pinned objects in their places, all on their supports."""
+def _evidence(inputs: PlaceInputs) -> tuple[Objects, Camera, ImageCues, HumanCues]:
+    return inputs.objects, inputs.camera, inputs.image, inputs.humans
+
+
+def _standing(inputs: PlaceInputs, layout: Layout) -> Layout:
+    """The layout with what is pinned at its place, and the rest on its supports."""
     objects, held = inputs.objects, hold(layout, inputs.pinned)
     return stand(held, objects.supports, objects.size[:, 1], inputs.ground)
 
@@ -153,17 +159,17 @@ def descend(
     observe: Observer,
 ) -> Minimum[Layout]:
     """Follow the energy from each start; the result stands on its supports."""
-    span = _spans(inputs.objects, config)
+    span = spans_of(inputs.objects, config.span, config.chair_span)
 
     def at(free: Layout) -> Layout:
-        return _upright(inputs, _bounded(free, span))
+        return _standing(inputs, bounded(free, span))
 
     def watched(step: Step) -> None:
         free = step.at
         assert free is not None
         observe(replace(step, at=lambda: Moment(at(free()), inputs.camera, inputs.ground)))
 
-    begin = _unbounded(starts, span)
+    begin = unbounded(starts, span)
     if isinstance(method, Quasi):
         found = settle(_problems(inputs, config, begin), method, watched, "place_objects")
     else:
@@ -184,25 +190,29 @@ def with_trees(inputs: PlaceInputs, form: Form = "robust") -> PlaceInputs:
 
 def _free_energy(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
     """The energy as a function of the unknowns of a descent."""
-    energy, span = energy_of(inputs, config), _spans(inputs.objects, config)
-    return (lambda free: energy(_bounded(free, span))) if bool(span.any()) else energy
+    span = spans_of(inputs.objects, config.span, config.chair_span)
+    energy = energy_of(inputs, config)
+    return (lambda free: energy(bounded(free, span))) if bool(span.any()) else energy
 
 
 def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Problems[Layout]:
     """Each start of each object as a problem of its own; loads belong to their carriers."""
     starts, n = begin.yaw.shape
+    price = pricing_rows(*_evidence(inputs), SceneConfig(config.weights, config.form))
+    span = spans_of(inputs.objects, config.span, config.chair_span)
 
     def of(rows: Tensor) -> Callable[[Layout], Energy]:
         index = rows % n
         few = replace(
             inputs,
             objects=some_objects(inputs.objects, rows),
-            image=some_image(inputs.image, index),
-            humans=some_humans(inputs.humans, index, n),
             reference=inputs.reference[index],
             pinned=some_pinned(inputs.pinned, index),
         )
-        return _free_energy(few, config)
+        if (known := price) is not None:
+            return lambda free: known(_standing(few, bounded(free, span[index])), rows)
+        image, humans = some_image(inputs.image, index), some_humans(inputs.humans, index, n)
+        return _free_energy(replace(few, image=image, humans=humans), config)
 
     carrier = inputs.objects.supports
     if not bool((carrier >= 0).any()):
@@ -212,13 +222,6 @@ def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Proble
         root = root[root]
     group = root + n * torch.arange(starts).to(root)[:, None]
     return Problems(of, begin, (starts, n), group.flatten())
-
-
-def _spans(objects: Objects, config: PlaceConfig) -> Float[Tensor, " objects"]:
-    """Range of the scale of each object, 0 where it is free."""
-    return torch.tensor(
-        [config.chair_span if c == "chair" else config.span for c in objects.categories]
-    )
 
 
 def _by_boxes(
@@ -232,19 +235,3 @@ def _by_boxes(
 
     found = minimize(lambda free: energy(at(free)), starts, config.first, observe, "place_objects")
     return at(found.at)
-
-
-def _bounded(free: Layout, span: Float[Tensor, " objects"]) -> Layout:
-    """Scales s = 1 + span (sigmoid(x) - 1/2), where there is a span."""
-    wide = span.unsqueeze(-1)
-    scale = 1 + wide * (free.log_scale.sigmoid() - 0.5)
-    return replace(free, log_scale=torch.where(wide > 0, scale.log(), free.log_scale))
-
-
-def _unbounded(layout: Layout, span: Float[Tensor, " objects"]) -> Layout:
-    """The inverse of `_bounded` (the release codes it without its denominator, by mistake)."""
-    wide = span.unsqueeze(-1)
-    share = (layout.log_scale.exp() - 1) / wide.clamp_min(1e-6) + 0.5
-    return replace(
-        layout, log_scale=torch.where(wide > 0, share.clamp(0.01, 0.99).logit(), layout.log_scale)
-    )

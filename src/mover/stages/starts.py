@@ -37,13 +37,18 @@ def spread_distance(layout: Layout, factors: tuple[float, ...]) -> Layout:
     )
 
 
-def shaken(layout: Layout, times: int) -> Layout:
+def shaken(layout: Layout, times: int, number: int = 0) -> Layout:
     """Places around each start, the same in every run and for every object.
 
     Minima of Eq. 1 are rugged within a pixel or two; from around one the next, deeper one is found.
+
+    Args:
+        layout: The starts.
+        times: Places around each.
+        number: Of the round; in each, places are half as far off as in the one before.
     """
-    generator = torch.Generator().manual_seed(0)
-    draw = torch.randn(times, 7, generator=generator).to(layout.yaw)
+    generator = torch.Generator().manual_seed(number)
+    draw = torch.randn(times, 7, generator=generator).to(layout.yaw) * 0.5**number
     place, turn, size = draw[:, None, :3], draw[:, None, 3], draw[:, None, 4:]
     t, yaw, log_scale = layout.t_world_object, layout.yaw, layout.log_scale
     return Layout(
