@@ -5,13 +5,17 @@
 The bodies have the errors of `NoiseConfig`: pose and depth errors that last. Every row is refined
 by the same terms of smoothness and of staying near; only what it knows of the room differs. The
 rows named `masks` know the outlines of people's masks too, which the paper's refinement does not.
+With `--estimated` layout, camera, floor and the people's depth are those that `robust` finds; the
+row `as found` is its result before refinement, and what follows begins there.
 """
 
 import argparse
 import dataclasses
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 
@@ -19,6 +23,7 @@ from mover.bodies.thinned import pose_rows
 from mover.geometry.watertight import close_mesh
 from mover.metrics_bodies import gather_twins, p_pje, p_v2v, pje, v2v
 from mover.outcome import carried
+from mover.pipeline import PRESETS, Run, reconstruct
 from mover.rooms.noise import add_noise
 from mover.rooms.noise_config import NoiseConfig
 from mover.rooms.room import make_room
@@ -26,7 +31,7 @@ from mover.stages.refine_bodies import ABLATION, RefineBodiesConfig, refine_bodi
 from mover.types import Bodies, Capture, Room, Scene
 
 METRICS = (pje, v2v, p_pje, p_v2v)
-GIVEN = "as given"
+GIVEN, FOUND = "as given", "as found"
 
 
 def rooms_of(seed: int, place: float) -> tuple[Capture, Bodies, Room, Room]:
@@ -60,6 +65,12 @@ def _flat(draw: torch.Generator) -> torch.Tensor:
     return both * torch.tensor([1.0, 0.0, 1.0])
 
 
+def found_room(capture: Capture) -> Room:
+    """The room that the preset `robust` finds."""
+    with tempfile.TemporaryDirectory() as work:
+        return reconstruct(capture, PRESETS["robust"], Run(Path(work)))
+
+
 def first_bodies(room: Room, most: int) -> Room:
     """The room with its first rows of bodies only."""
     bodies = room.bodies
@@ -88,14 +99,18 @@ def main() -> None:
     parser.add_argument("--rows", nargs="+", default=list(ABLATION))
     parser.add_argument("--place", type=float, default=0.0)
     parser.add_argument("--most", type=int, default=100_000, help="bodies of each room, the first")
+    parser.add_argument("--estimated", action="store_true", help="rooms that `robust` finds")
     args = parser.parse_args()
     torch.set_num_threads(1)
     table: dict[str, list[list[float]]] = {}
     for seed in args.seeds:
         capture, truth, guessed, known = rooms_of(seed, args.place)
+        known = found_room(capture) if args.estimated else known
         guessed, known = (first_bodies(r, args.most) for r in (guessed, known))
         assert guessed.bodies is not None
         table.setdefault(GIVEN, []).append(scores(guessed.bodies, truth))
+        if args.estimated and known.bodies is not None:
+            table.setdefault(FOUND, []).append(scores(known.bodies, truth))
         for name in args.rows:
             room, begin = guessed if name == "baseline" else known, time.perf_counter()
             config = RefineBodiesConfig(weights=ABLATION[name])

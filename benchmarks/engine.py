@@ -10,6 +10,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import get_args
 
 import fast_simplification
 import igl
@@ -17,12 +18,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mover.devices import Choice, device_of, finish, named
 from mover.geometry import crops, raster
 from mover.geometry.camera import tilted
 from mover.geometry.raster import Topology, Views
 from mover.geometry.raster_engine import Engine, use_engine, use_threads
 from mover.geometry.rotations import rot_y
 from mover.geometry.topology import edges_of
+from mover.records import to_device
 
 K = torch.tensor([[353.5, 0, 317.1], [0, 353.5, 178.9], [0, 0, 1]])  # an image of 640 x 360 pixels
 ROUND, CELLS = 0.02, 96
@@ -160,6 +163,7 @@ def task(name: Engine, threads: int, room: Room, run: Callable[[Room], None]) ->
         torch.set_num_threads(threads if name == "torch" else 1)
         with use_engine(name), use_threads(threads):
             run(room)
+        finish(room.verts.device)
 
     return work
 
@@ -172,14 +176,19 @@ def main() -> None:
     parser.add_argument("--windows", type=int, nargs="+", default=[128, 256])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--device", choices=get_args(Choice), default="cpu")
     args = parser.parse_args()
-    print(f"{args.objects} objects; least of {args.rounds} rounds, in ms: wall (processor)")
+    device = device_of(args.device)
+    print(
+        f"{args.objects} objects on {named(device)}; least of {args.rounds} rounds, in ms:"
+        " wall (processor)"
+    )
     print(
         f"{'faces':>6} {'window':>6} {'engine':>6} {'threads':>7} {'draw':>16} {'and gradient':>16}"
     )
     for n_faces in args.faces:
         for window in args.windows:
-            room = make_room(args.objects, n_faces, window)
+            room = to_device(make_room(args.objects, n_faces, window), device)
             rows = [(e, t) for e in ("torch", "warp") for t in args.threads]
             runs = {"draw": draw, "step": step}
             work = {f"{e} {t} {k}": task(e, t, room, f) for e, t in rows for k, f in runs.items()}

@@ -10,12 +10,15 @@ import argparse
 import os
 import time
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import torch
 
 from mover.bodies import open_body
+from mover.devices import Choice, device_of, finish, named
 from mover.minimize import Step
+from mover.records import to_device
 from mover.rooms.gait import walk
 from mover.rooms.person import make_person
 from mover.rooms.poses import angles
@@ -82,8 +85,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--cells", type=int, default=256)
+    parser.add_argument("--device", choices=get_args(Choice), default="cpu")
     options = parser.parse_args()
-    inputs = scene(options.frames)
+    device = device_of(options.device)
+    inputs = to_device(scene(options.frames), device)
     few = slice(0, 2)
     bodies = inputs.bodies
     warm = Bodies(
@@ -103,6 +108,7 @@ def main() -> None:
         spent[step.stage] = (time.perf_counter() - now, time.process_time() - cpu)
 
     gather_cues(inputs, config, note)
+    finish(device)
     last = (0.0, 0.0)
     for name, mark in spent.items():
         wall, busy = (1e3 * (x - y) / options.frames for x, y in zip(mark, last, strict=True))
@@ -110,7 +116,7 @@ def main() -> None:
         last = mark
     print(f"{options.frames} frames in {time.perf_counter() - now:.2f} s,",
           f"{time.process_time() - cpu:.2f} s of processor time, {options.workers} workers,",
-          f"load {os.getloadavg()[0]:.1f}")  # fmt: skip
+          f"{named(device)}, load {os.getloadavg()[0]:.1f}")  # fmt: skip
     print(
         f"memory: {before:.0f} MB with the bodies loaded, {memory() - before:.0f} MB more at most"
     )

@@ -35,12 +35,14 @@ def main() -> None:
             "image": rebuilt.image,
             "full": rebuilt.full,
         }
-        for name, scene in scenes.items():
-            with tempfile.TemporaryDirectory() as work:
+        with tempfile.TemporaryDirectory() as work:  # in which each shape is cut only once
+            for name, scene in scenes.items():
                 rows = settle(scene, Run(Path(work)))
-            found[name].extend(rows)
-            most = max(row.moved for row in rows)
-            print(f"seed {seed} {name:8} {len(rows)} pieces, farthest {100 * most:7.2f} cm")
+                found[name].extend(rows)
+                most = 100 * max(row.moved for row in rows)
+                print(
+                    f"seed {seed} {name:8} {len(rows)} pieces, farthest {most:7.2f} cm", flush=True
+                )
     print(f"\n{'scene':8} {'pieces':>6} {'moved, median, mean, max [cm]':>32} {'toppled':>8}")
     for name, rows in found.items():
         moved = [100 * row.moved for row in rows]

@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -76,3 +77,30 @@ def test_the_gallery_shows_a_piece_and_somebody_who_sits_on_it():
     assert page.size == (2 * gallery.CELL[0], gallery.CELL[1] + gallery.CAPTION)
     colours = cell.picture.getcolors(100_000)
     assert len(colours) > 500
+
+
+def test_the_picture_of_the_readme_shows_before_beside_after(tmp_path: Path, small_room):
+    import dataclasses
+
+    import picture
+    from PIL import Image
+
+    from mover.readers.bodies_file import write_bodies
+    from mover.readers.folder import write_capture
+    from mover.readers.scene_file import write_scene
+    from mover.results import initial_bodies
+    from mover.rooms.noise import NoiseConfig, add_noise
+
+    capture = add_noise(small_room, NoiseConfig(), 1)
+    first = next(p for p in small_room.truth.pieces if p.id == capture.scene.pieces[0].id)
+    scene = dataclasses.replace(capture.scene, pieces=(first, *capture.scene.pieces[1:]))
+    write_capture(capture, tmp_path / "capture")
+    write_scene(scene, tmp_path / "room" / "scene.json")
+    for name in ("initial_bodies.npz", "bodies.npz"):
+        write_bodies(initial_bodies(capture), tmp_path / "room" / name)
+    picture.main(tmp_path, tmp_path / "picture.png")
+    shown = np.asarray(Image.open(tmp_path / "picture.png").convert("RGB")).astype(int)
+    height, width = capture.reference.shape[:2]
+    assert shown.shape[:2] == (len(picture.SHOWN) * height // 2, width)
+    before, after = shown[:, : width // 2], shown[:, width // 2 :]
+    assert 0.001 < (np.abs(before - after).max(-1) > 30).mean() < 0.5  # one object stands elsewhere

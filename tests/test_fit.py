@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +24,9 @@ from mover.fitting.tracks import best_path, triples_of
 from mover.fitting.unknowns import Frame, Unknowns, points_of
 from mover.geometry.camera import project
 from mover.geometry.rotations import axis_angle
+from mover.readers.scene_file import write_scene
 from mover.records import InputError
+from mover.types import Scene
 
 QUICK = FitConfig(
     start_steps=20,
@@ -378,3 +381,18 @@ def test_the_command_reads_openpose_and_writes_bodies(tmp_path, walk, capsys):
     assert "keypoints missed by" in capsys.readouterr().out
     rows = bodies.frame
     assert (bodies.joints[:, 0] - walk.joints[rows, 0]).norm(dim=-1).median() < 0.3
+
+
+def test_a_second_pass_takes_camera_and_floor_of_a_result(tmp_path):
+    """One of camera and result, not both; a floor that is given counts before the result's."""
+    from mover.commands_fit import FitArgs, _world
+
+    write_scene(Scene(CAMERA, -1.25, ()), tmp_path / "scene.json")
+    camera, ground = _world(FitArgs(Path("k.npz"), room=tmp_path))
+    torch.testing.assert_close(camera.R_cam_world, CAMERA.R_cam_world, atol=1e-5, rtol=0)
+    torch.testing.assert_close(camera.K, CAMERA.K)
+    assert ground == pytest.approx(-1.25)
+    assert _world(FitArgs(Path("k.npz"), room=tmp_path, ground=-1.5))[1] == -1.5
+    for both in ({}, {"room": tmp_path, "camera": tmp_path / "camera.json"}):
+        with pytest.raises(InputError, match="--camera or --room"):
+            _world(FitArgs(Path("k.npz"), **both))

@@ -304,9 +304,6 @@ def test_trees_of_any_depth_have_the_distances_of_libigl(level: int) -> None:
         ("bodies", ["place", "leaves", "inner"]),
         ("crossings", ["cross"]),
         ("lower", ["blocks"]),
-        ("exits", []),
-        ("lookup", []),
-        ("nearest", []),
     ],
 )
 def test_kernels_compile_for_an_h100_without_a_driver(

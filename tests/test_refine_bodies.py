@@ -1,6 +1,7 @@
 """Refinement of the bodies with the room: terms, and what happens to bodies in simple rooms."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,24 +11,30 @@ from figures import ARMS_DOWN, SEATED, STRIDE, people, pose
 
 from mover.bodies.corrected import Correction, corrected, moved, no_correction, puppet_of
 from mover.bodies.parts import members, parts_of
+from mover.bodies.world import in_world
 from mover.geometry.mesh import vertex_normals
 from mover.geometry.volume import Volume
 from mover.minimize import Adam
+from mover.readers.people import Known, bodies_from
 from mover.records import InputError
+from mover.stages.align_camera import AlignInputs, align_camera
 from mover.stages.body_evidence import surroundings_of
+from mover.stages.find_soles import SolesInputs, find_soles
 from mover.stages.refine_bodies import ABLATION, SMOOTHED, RefineBodiesConfig, refine_bodies
 from mover.terms.body_contact import MatchConfig, Matches, Skin, Surface, gather_matches, touch_term
+from mover.terms.body_kept import without_kept
 from mover.terms.body_order import Bounds, Sighting, bounds_of_skin, order_term
 from mover.terms.body_room import sink_term, stand_term, under_term
 from mover.terms.body_start import angle_term, depth_share, image_term, range_term
 from mover.terms.body_time import gather_neighbours, lock_term, smooth_term, steady_term
 from mover.types import Camera, Mesh, Piece, Room, Scene
 
+SAM = Path(__file__).parents[2] / "shared" / "data" / "sam3d_body"
 K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 CAMERA = Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0])), 640, 480)
 GROUND = -1.4
 LINE = gather_neighbours(torch.arange(4), torch.zeros(4, dtype=torch.long), 5.0)
-WALL = Surface(torch.zeros(1, 3), torch.tensor([[0.0, 1.0, 0.0]]))
+WALL = Surface(torch.zeros(1, 3), torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1).long())
 
 
 def still_people(turns, count=1, at=(0.0, -3.0), lift=0.0, fps=5.0):
@@ -85,7 +92,8 @@ def random_points(seed, *shape):
 MATCHES = Matches(
     torch.tensor([0, 2]), torch.tensor([1, 0]), torch.zeros(2, 3, dtype=torch.float64),
     torch.tensor([[0.0, 1, 0], [1, 0, 0]], dtype=torch.float64),
-    torch.ones(2, dtype=torch.float64),
+    torch.ones(2, dtype=torch.float64), torch.full((2,), 0.02, dtype=torch.float64),
+    torch.tensor([0, 1]),
 )  # fmt: skip
 AWAY = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
 TERMS = {
@@ -144,6 +152,17 @@ def test_one_lasting_depth_error_of_a_person_costs_once():
     assert float(range_term(many, torch.arange(50)).sum()) == pytest.approx(25)
 
 
+def test_the_size_in_the_image_says_nothing_about_the_depth():
+    """Along the ray of the pelvis a body goes free; across it, and bent, it pays."""
+    start = AWAY + random_points(3, 4, 5, 3)
+    ray = start[:, :1] * torch.tensor([0.03, -0.02, 0.01, 0.05]).double()[:, None, None]
+    zero = torch.zeros(4, dtype=torch.float64)
+    torch.testing.assert_close(image_term(start + ray, start), zero, atol=1e-8, rtol=0)
+    assert (image_term(start + ray + torch.tensor([0.03, 0, 0]), start) > 0.5).all()
+    bent = torch.cat([start[:, :1], start[:, 1:] + torch.tensor([0, 0.03, 0])], 1)
+    assert (image_term(bent + ray, start) > 0.5).all()
+
+
 def test_points_behind_the_camera_have_finite_prices():
     behind = torch.tensor([[[0.1, 0.2, -1.0]]], requires_grad=True)
     start = torch.tensor([[[0.1, 0.2, 3.0]]])
@@ -151,11 +170,53 @@ def test_points_behind_the_camera_have_finite_prices():
     assert behind.grad.isfinite().all()
 
 
+def skin_of(points, normals, group, bent=0.0):
+    """Skin of one person about a pelvis at the origin, which touches."""
+    bodies, count = points.shape[:2]
+    return Skin(
+        points, torch.nn.functional.normalize(normals, dim=-1), torch.ones(bodies, count),
+        torch.tensor(group), torch.zeros(bodies).long(), torch.zeros(bodies, 3), bent,
+    )  # fmt: skip
+
+
+def test_a_thigh_lies_on_the_seat_and_not_on_its_front():
+    """One of its points is nearest to the front, and looks there too; the thigh looks down."""
+    points = torch.tensor([[[-0.3, 0.01, 0.0], [-0.2, 0.01, 0.0], [0.03, -0.02, 0.0]]])
+    normals = torch.tensor([[[0.0, -1, 0], [0.0, -1, 0], [-1.0, -0.9, 0]]])
+    seat = Surface(
+        torch.tensor([[-0.3, 0.0, 0.0], [-0.2, 0.0, 0.0], [0.0, -0.02, 0.0]]),
+        torch.tensor([[0.0, 1, 0], [0.0, 1, 0], [1.0, 0, 0]]), torch.zeros(3).long(),
+    )  # fmt: skip
+    found = gather_matches(skin_of(points, normals, [0, 0, 0]), seat, MatchConfig())
+    assert found.point.tolist() == [0, 1]
+    alone = gather_matches(skin_of(points, normals, [0, 0, 1]), seat, MatchConfig())
+    assert alone.point.tolist() == [0, 1, 2]
+
+
+def test_far_skin_is_believed_less_while_the_pose_may_be_wrong():
+    points = torch.tensor([[[0.4, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+    normals = torch.tensor([[[0.0, -1, 0], [0.0, -1, 0]]])
+    floor = replace(WALL, points=points[0], normals=-normals[0], piece=torch.zeros(2).long())
+    usual = gather_matches(skin_of(points, normals, [0, 1], 0.09), floor, MatchConfig()).usual
+    torch.testing.assert_close(usual, torch.tensor([(0.02**2 + 0.036**2) ** 0.5, 0.02]))
+
+
+def test_an_error_that_lasts_says_no_more_in_a_hundred_frames_than_in_one():
+    """The shared error is that of the normal equations; a lone error costs as without it."""
+    off, trust = torch.tensor([0.03, 0.05, 0.01]).double(), torch.tensor([4e3, 1e3, 2e3]).double()
+    rest, price = without_kept(off, trust, torch.tensor([0, 0, 1]), 0.02)
+    left = torch.tensor([[5e3 + 2500.0, 0], [0, 2e3 + 2500.0]]).double()
+    shared = torch.linalg.solve(left, torch.tensor([4e3 * 0.03 + 1e3 * 0.05, 2e3 * 0.01]).double())
+    torch.testing.assert_close(rest, off - shared[[0, 0, 1]])
+    torch.testing.assert_close(float(price.sum()), float((0.5 * (shared / 0.02) ** 2).sum()))
+    many = without_kept(off[:1].expand(100), trust[:1].expand(100), torch.zeros(100).long(), 0.02)
+    total = (0.5 * trust[0] * many[0].square() + many[1]).sum()
+    assert float(total) < 0.5 * (0.03 / 0.02) ** 2
+
+
 def test_only_surfaces_that_face_the_skin_are_touched():
     points = torch.tensor([[[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]])
-    skin = Skin(
-        points, torch.tensor([[[0.0, -1, 0], [0.0, 1, 0]]]), torch.ones(1, 2), torch.zeros(2).long()
-    )
+    skin = skin_of(points, torch.tensor([[[0.0, -1, 0], [0.0, 1, 0]]]), [0, 1])
     found = gather_matches(skin, WALL, MatchConfig())
     assert found.point.tolist() == [0]
     sunk = replace(skin, points=-points)
@@ -231,6 +292,32 @@ def test_bare_meshes_move_rigidly():
     torch.testing.assert_close(after, before, atol=1e-5, rtol=0)
     assert (found.verts - bodies.verts)[..., 1].mean() > 0.02
     assert lowest(found).min() > lowest(bodies).max() + 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SAM.is_dir(), reason="the real SAM 3D Body files are not here")
+def test_real_people_of_sam_3d_body_stand_on_the_floor_of_their_feet(tmp_path):
+    """A photograph of four people who jump: who is far above the floor stays in the air."""
+    for file in SAM.glob("img_*.npz"):
+        (tmp_path / file.name).symlink_to(file)
+    read = bodies_from("sam3dbody", tmp_path, Known(faces=SAM / "mhr_lod1_topology.ply"))
+    width, height = (int(2 * float(read.K[k, 2])) for k in (0, 1))
+    camera = Camera(read.K, CAMERA.R_cam_world, width, height)
+    parts = parts_of(read.bodies, camera.R_cam_world[:, 1])
+    keep = torch.ones(4, dtype=torch.bool)
+    soles = find_soles(SolesInputs(read.bodies, parts, keep, camera))
+    level = align_camera(AlignInputs(soles, camera, None, None))
+    scene = Scene(level.camera, level.ground, ())
+    given = in_world(read.bodies, level.camera)
+    found = refine_bodies(Room(scene, scene, scene, given, None, (), (), None, {}, ()), None, QUICK)
+    before, after = (b.verts[..., 1].amin(1) - level.ground for b in (given, found.bodies))
+    high = before > 0.3
+    assert int(high.sum()) == 1
+    assert (after[~high].abs() < 0.03).all()
+    assert (after[high] > 0.3).all()
+    some = torch.arange(0, 18439, 900)
+    shape, kept = (torch.cdist(b.verts[:, some], b.verts[:, some]) for b in (given, found.bodies))
+    torch.testing.assert_close(kept, shape, atol=1e-4, rtol=0)
 
 
 def test_who_touches_nothing_stays_where_they_are():

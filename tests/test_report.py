@@ -188,6 +188,13 @@ class TestTables:
         moods = re.findall(r'<td class="(\w*)">', metrics_table(metrics))
         assert moods == ["worse", "better"]
 
+    def test_every_metric_has_a_name_and_the_same_way_to_be_better(self):
+        from mover.evaluate import METRICS
+        from mover.report_numbers import QUANTITIES
+
+        ways = {key: QUANTITIES[key].more_is_better for key in METRICS}
+        assert ways == {key: metric.best > 0 for key, metric in METRICS.items()}
+
     def test_shows_a_missing_metric_as_missing(self):
         drawn = metrics_table({"initial": {}, "result": {"iou3d": 0.5, "contact": math.nan}})
         assert "0.500" in drawn

@@ -29,6 +29,7 @@ from mover.readers.scene_file import write_scene
 from mover.records import InputError
 from mover.run import Run
 from mover.settle import SettleConfig, Settled, settle
+from mover.settle_table import settle_table
 from mover.types import Mesh, Scene
 
 BOXES = ("chair", "table")
@@ -260,6 +261,22 @@ def test_the_command_compares_initial_and_result(tmp_path: Path, capsys):
     tree = json.loads((out / "settle.json").read_text())
     assert tree["scenes"]["initial"][0]["fell"] == pytest.approx(0.1, abs=0.002)
     assert tree["scenes"]["result"][0]["toppled"] is False
+
+
+def test_in_the_table_the_longest_words_stay_apart():
+    far = Settled(
+        "nightstand_0", "nightstand", 12.3456, 0.0, math.radians(127), 1.5, 0.287, 9.0, False
+    )
+    held = dataclasses.replace(far, id="lamp_0", fixed=True)
+    lines = settle_table({"initial": [far, held], "result": [held]}).splitlines()
+    assert lines[2].split() == [
+        "nightstand_0", "12346", "mm", "127", "deg", "287", "mm", "fell", "over", "-",
+    ]  # fmt: skip
+    assert lines[3].split() == ["lamp_0", "held", "held"]
+    starts = [
+        line.rfind(word) for line, word in zip(lines[1:4], ("moved", "-", "held"), strict=True)
+    ]
+    assert len(set(starts)) == 1
 
 
 def test_without_mujoco_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):

@@ -80,18 +80,26 @@ class Viewer:
         self.page.get_by_role("tab", name="Room").wait_for(timeout=60_000)
         self.page.wait_for_timeout(3000)
         with contextlib.suppress(Exception):  # a note that there is no GPU
-            self.page.locator("button.mantine-Notification-closeButton").click(timeout=2000)
+            self.page.locator("[role=alert] button").click(timeout=5000)
 
-    def see(self, name: str) -> np.ndarray:
+    def see(self, name: str, wait: int = 2000) -> np.ndarray:
         """The 3D view as it is now; also kept as a file to look at."""
         import io
 
         from PIL import Image
 
-        self.page.wait_for_timeout(2000)
+        self.page.wait_for_timeout(wait)
         raw = self.page.screenshot(path=self.shots / f"{name}.png")
         whole = np.asarray(Image.open(io.BytesIO(raw)).convert("RGB")).astype(int)
         return whole[:, : int(self.canvas()["width"])]
+
+    def see_until(self, text: str, name: str) -> list[np.ndarray]:
+        """The 3D view again and again until the page says `text`."""
+        ended, pictures = self.page.get_by_text(text), []
+        while not ended.is_visible():
+            assert len(pictures) < 600, f"the page never said {text!r}"
+            pictures.append(self.see(f"{name}_{len(pictures):03d}", wait=200))
+        return pictures
 
     def canvas(self) -> dict[str, float]:
         return self.page.locator("canvas").first.bounding_box()
@@ -173,7 +181,8 @@ class TestViewer:
             glass = viewer.see("glass")
             shots.append(glass)
             for name in ("People passed before", "Objects hid people", "People's space",
-                         "Contact points", "Camera doubt (95 %)"):  # fmt: skip
+                         "Contact points", "Camera doubt (95 %)",
+                         "Where it may stand (90 %)"):  # fmt: skip
                 page.get_by_label(name).check()
                 assert differ(glass, viewer.see(name.split()[0])) > 1e-4, name
                 page.get_by_label(name).uncheck()
@@ -216,7 +225,9 @@ class TestViewer:
             page.get_by_label("Pinned").check()
             viewer.tab("Solve")
             page.get_by_role("button", name="Solve again").click()
-            page.get_by_text("done; the result is in").wait_for(timeout=300_000)
+            live = viewer.see_until("done; the result is in", "solving")
+            assert sum(differ(a, b) > 1e-4 for a, b in pairwise(live)) >= 3  # furniture moves
+            assert page.locator(".uplot").is_visible()  # the energy of the last descent
             viewer.see("solved")
             assert viewer.troubles == []
         assert [e["do"] for e in edited(file)] == ["place", "pin"]
@@ -277,7 +288,8 @@ class TestViewer:
         run = ("run", folder / "capture", "--out", tmp_path / "out", "--view")
         with viewing(browser, tmp_path, *run, "--config", folder / "config.json") as viewer:
             viewer.tab("Solve")
-            viewer.page.get_by_text("done; the result is in").wait_for(timeout=300_000)
+            live = viewer.see_until("done; the result is in", "watching")
+            assert sum(differ(a, b) > 1e-4 for a, b in pairwise(live)) >= 3  # furniture moves
             viewer.see("watched")
             assert viewer.troubles == []
         a, b = ((folder / "out", tmp_path / "out")[i] / "scene.json" for i in (0, 1))

@@ -128,6 +128,28 @@ class TestLive:
             assert (piece.scale - wanted.scale).abs().max() < 1e-6
             assert float(piece.yaw - wanted.yaw) == 0
 
+    def test_the_curve_is_the_energy_of_the_rooms_that_are_shown(self, monkeypatch):
+        """Of the best starts, over all descents of a stage; a stage between begins it anew."""
+        monkeypatch.setattr("mover.viewer.live.PAUSE", 0.0)
+        scene, drawn = room(), []
+        count = len(scene.pieces)
+        layout = Layout(torch.zeros(2, count, 3), torch.zeros(2, count), torch.zeros(2, count, 3))
+        watch = Watch(scene.pieces, drawn.append, lambda _: None)
+
+        def descend(*energies: float) -> None:
+            for index, energy in enumerate(energies):
+                both = torch.tensor([energy, energy + 9]).expand(count, 2).mT
+                watch(Step("place_objects", index, 9, Energy({"e": both}),
+                           lambda: Moment(layout, camera(), GROUND)))  # fmt: skip
+
+        descend(4.0, 3.0)
+        descend(3.5, 2.0)
+        assert watch.energies == [count * e for e in (4.0, 3.0, 3.5, 2.0)]
+        watch(Step("gather_cues", 0, 1))
+        descend(8.0)
+        assert watch.energies == [count * 8.0]
+        assert len(drawn) == 5
+
     def test_other_steps_show_nothing_and_a_stop_ends_the_run(self):
         told, drawn = [], []
         watch = Watch(room().pieces, drawn.append, told.append)

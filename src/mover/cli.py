@@ -45,5 +45,6 @@ def main() -> None:
         say(f"mover: no command {arguments[0]!r}; there are {', '.join(COMMANDS)}\n{USAGE}")
         raise SystemExit(2)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    logging.getLogger("mover.geometry.kernels").setLevel(logging.INFO)  # what is compiled, once
     command = importlib.import_module(".commands", __package__)
     raise SystemExit(command.run_command(arguments[0], arguments[1:]))

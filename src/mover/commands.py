@@ -13,6 +13,7 @@ from tyro.conf import AvoidSubcommands, Positional, arg
 
 from . import records
 from .commands_config import chosen_config, preset_named
+from .devices import Choice, device_of
 from .presets import Config
 from .progress import Bar, both
 
@@ -38,6 +39,8 @@ class RunArgs:
     """A list of edits (edits.json of `mover view`) that is applied first."""
     view: bool = False
     """Watch the furniture move in the browser (extra `viewer`)."""
+    device: Choice = "cpu"
+    """Where the heavy stages compute: cpu, cuda (an NVIDIA GPU; see docs/engine.md) or auto."""
     refine: bool = False
     """At the end, refine the people with the room they helped to find: bodies.npz holds them."""
 
@@ -74,6 +77,8 @@ class DemoArgs:
     """Seed of the noise."""
     preset: str = "robust"
     """paper, release or robust."""
+    device: Choice = "cpu"
+    """cpu, cuda or auto."""
 
 
 def run_command(name: str, arguments: Sequence[str]) -> int:
@@ -108,9 +113,10 @@ def _run(arguments: Sequence[str]) -> None:
     from .readers.edits_file import read_edits
     from .results import Origin
 
+    device = device_of(args.device)
     capture = read(args.format, args.source)
     edits = () if args.edits is None else read_edits(args.edits)
-    origin = Origin(str(args.source.resolve()), args.format, edits, args.refine)
+    origin = Origin(str(args.source.resolve()), args.format, edits, args.refine, device)
     if args.view:
         view = importlib.import_module(".commands_view", __package__)
         view.run_in_view(capture, config, args.out, origin)
@@ -137,7 +143,8 @@ def reconstruct_into(
     torch.set_num_threads(THREADS)
     capture, pinned = apply_edits(capture, origin.edits)
     with Bar() as bar:
-        run = Run(out, bar if watch is None else both(bar, watch))
+        observe = bar if watch is None else both(bar, watch)
+        run = Run(out, observe, device=origin.device)
         room = reconstruct(capture, config, run, pinned)
         if origin.refine:
             from .refinement import refined_room
@@ -170,7 +177,7 @@ def _evaluate(arguments: Sequence[str]) -> None:
 
 def _demo(arguments: Sequence[str]) -> None:
     args = tyro.cli(DemoArgs, prog="mover demo", args=list(arguments))
-    config = preset_named(args.preset)
+    config, device = preset_named(args.preset), device_of(args.device)
     from .evaluate import evaluate_folder, table
     from .readers import read
     from .readers.folder import write_capture
@@ -187,7 +194,7 @@ def _demo(arguments: Sequence[str]) -> None:
         write_capture(add_noise(room, NoiseConfig(), args.seed), folder)
         write_truth(room.truth, room.bodies, folder / "truth")
     capture = read("folder", folder)
-    origin = Origin(str(folder.resolve()))
+    origin = Origin(str(folder.resolve()), device=device)
     found, run = reconstruct_into(args.out / "room", capture, config, origin)
     metrics = evaluate_folder(args.out / "room", folder / "truth")
     truth = read_scene(folder / "truth" / "scene.json", None)

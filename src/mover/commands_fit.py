@@ -19,8 +19,10 @@ class FitArgs:
 
     source: Annotated[Positional[Path], arg(metavar="KEYPOINTS")]
     """keypoints.npz, or a file or folder of a detector."""
-    camera: Path
+    camera: Path | None = None
     """The true lens (camera.json or a calibration); its pitch and roll are a first guess."""
+    room: Path | None = None
+    """The result of `mover run`, for a second pass: its camera and its floor count (Sec. 3.2)."""
     out: Path = Path("bodies.npz")
     """The file to write."""
     tool: Literal["openpose", "coco17", "halpe26", "wholebody"] = "openpose"
@@ -54,22 +56,21 @@ def fit(arguments: Sequence[str]) -> None:
     from .fitting import FitInputs, fit_bodies, load_vposer, smooth_keypoints, vposer_prior
     from .fitting.prior import ANGLES
     from .progress import Bar
-    from .readers.any_camera import read_camera_file
     from .readers.bodies_file import read_bodies, write_bodies
-    from .readers.camera_file import camera_of
 
     if args.fps is not None and not args.fps > 0:
         raise records.InputError(f"--fps: {args.fps:g}, expected more than 0")
     if args.model_folder is not None:
         os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
     keypoints = _keypoints(args)
+    camera, ground = _world(args)
     inputs = FitInputs(
         keypoints=smooth_keypoints(keypoints) if args.one_euro else keypoints,
-        camera=camera_of(read_camera_file(args.camera, None)),
+        camera=camera,
         model=load_model(args.model, args.gender),  # pyright: ignore[reportArgumentType]
         start=None if args.start is None else read_bodies(args.start),
         prior=ANGLES if args.vposer is None else vposer_prior(load_vposer(args.vposer)),
-        ground=args.ground,
+        ground=ground,
     )
     with Bar() as bar:
         found = fit_bodies(inputs, observe=bar)
@@ -80,6 +81,21 @@ def fit(arguments: Sequence[str]) -> None:
     people, frames = len(bodies.person.unique()), len(bodies.frame.unique())
     miss = float(found.miss.mean())
     say(f"{people} people in {frames} frames, keypoints missed by {miss:.1f} px: {args.out}")
+
+
+def _world(args: FitArgs) -> tuple[Any, float | None]:
+    """The camera, and the height of the floor where it is known."""
+    from .readers.any_camera import read_camera_file
+    from .readers.camera_file import camera_of
+    from .readers.scene_file import read_scene
+
+    if (args.camera is None) == (args.room is None):
+        raise records.InputError("fit: expected --camera or --room, one of the two")
+    if args.camera is not None:
+        return camera_of(read_camera_file(args.camera, None)), args.ground
+    assert args.room is not None
+    scene = read_scene(args.room / "scene.json")
+    return scene.camera, scene.ground if args.ground is None else args.ground
 
 
 def _keypoints(args: FitArgs) -> Any:  # noqa: ANN401

@@ -2,10 +2,10 @@
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional, arg
@@ -56,7 +56,8 @@ def view(arguments: Sequence[str]) -> None:
     capture = None if found is None else read(*found)
     shown = bare if capture is None else read_shown(args.out, capture)
     session = start_session(shown, args.edits or args.out / "edits.json", capture)
-    opened = open_viewer(session, args.address, _job(args.out, capture, found), NO_CAPTURE)
+    job = None if capture is None or found is None else _job(args.out, found, bare.log)
+    opened = open_viewer(session, args.address, job, NO_CAPTURE)
     _say(f"{opened.url} shows {args.out}; Ctrl-C ends it")
     wait(opened)
 
@@ -86,15 +87,15 @@ def wait(opened: Opened) -> None:
         opened.close()
 
 
-def _job(out: Path, capture: Capture | None, found: tuple[str, Path] | None) -> SolveJob | None:
-    if capture is None or found is None:
-        return None
+def _job(out: Path, found: tuple[str, Path], log: Mapping[str, Any]) -> SolveJob | None:
+    """How the capture `found` is solved again as `log` says; None: its settings are unknown."""
     kind, source = found
     try:
         config = read_config(out / "run.json")
     except InputError:
         return None
-    return SolveJob(out, config, Origin(str(source.resolve()), kind))
+    refine = bool(log.get("people_refined", False))
+    return SolveJob(out, config, Origin(str(source.resolve()), kind, refine=refine))
 
 
 def _say(text: str) -> None:

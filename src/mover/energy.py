@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from .constants import constant
 from .geometry.camera import outermost, project, to_camera
 from .geometry.placement import place, place_in
 from .geometry.raster import Depths, Topology, Views, look
@@ -28,6 +29,7 @@ from .terms.silhouette import edge_term, silhouette_term
 from .types import Camera, Layout, Objects
 
 E = TypeVar("E")
+UNIT = tuple((x, y, z) for x in (-0.5, 0.5) for y in (0.0, 1.0) for z in (-0.5, 0.5))
 CHAIRS = ("chair", "armchair", "office chair", "stool")  # one class in the authors' detector
 
 
@@ -192,7 +194,7 @@ def factors(objects: Objects, humans: HumanCues, form: Form) -> Factors:
     depth, collision = objects.verts.new_ones(2, len(objects.ids)).unbind()
 
     def is_one_of(*names: str) -> Tensor:
-        return torch.tensor([c in names for c in objects.categories]).to(depth)
+        return constant(tuple(c in names for c in objects.categories), depth)
 
     if form == "release":
         collision = 1 + is_one_of("sofa")
@@ -230,8 +232,7 @@ def _corners(
     objects: Objects, layout: Layout, camera: Camera
 ) -> Float[Tensor, "*starts objects 8 3"]:
     """The eight corners of each object's box in camera axes [m]."""
-    unit = torch.cartesian_prod(*(torch.tensor(s) for s in ((-0.5, 0.5), (0.0, 1.0), (-0.5, 0.5))))
-    corners = unit.to(objects.size) * objects.size.unsqueeze(-2)
+    corners = constant(UNIT, objects.size) * objects.size.unsqueeze(-2)
     return to_camera(place(corners, layout), camera.R_cam_world)
 
 

@@ -14,6 +14,7 @@ from .geometry.priced_warp import price
 from .geometry.raster_engine import engine
 from .minimize import Energy
 from .terms.contact_trees import trees_of
+from .terms.silhouette import outline_root
 from .types import Camera, Layout, Objects
 
 Rows = Int[Tensor, " rows"]
@@ -29,6 +30,8 @@ def pricing(
     priced = pricing_rows(objects, camera, image, humans, config)
     if priced is not None:
         return lambda layout: priced(layout, None)
+    if config.weights.edge and image.outline is None:
+        image = replace(image, outline=outline_root(image.masks))
     return window_pricing(objects, camera, image, humans, config) or (
         lambda layout: scene_energy(layout, objects, camera, image, humans, config)
     )
@@ -56,6 +59,14 @@ def pricing_rows(
         return Energy({name: each[k] for k, name in names}, whole)
 
     return energy
+
+
+def never_asks(objects: Objects) -> bool:
+    """Whether Eq. 1 of such objects asks the host for nothing, so that a GPU can replay it.
+
+    That is so where Warp draws: torch alone draws by lists whose lengths the host must know.
+    """
+    return engine() == "warp" and objects.verts.dtype == torch.float32
 
 
 def _knows(weights: SceneWeights, form: str, humans: HumanCues) -> bool:

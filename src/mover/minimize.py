@@ -10,9 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .records import map_tensors
+from .replay import stepper
 
 P = TypeVar("P")
 PerItem = Float[Tensor, "*items"]
+BETA1 = 0.9  # memory of the gradient
 
 
 def geman_mcclure(residual: Float[Tensor, "*any"], rho: float) -> Float[Tensor, "*any"]:
@@ -104,45 +106,60 @@ def minimize(
     method: Adam,
     observe: Observer = silent,
     stage: str = "",
+    *,
+    still: bool = False,
 ) -> Minimum[P]:
     """Follow the gradient of `energy` from `start`.
 
     Every field of `P` is a tensor; with `keep_best` its leading axes are those of the items.
 
+    Args:
+        energy: What to minimise.
+        start: From where.
+        method: How.
+        observe: Told of every step.
+        stage: Name for those who watch, and for errors.
+        still: The energy asks the host for nothing and makes no choice by its numbers, so that on
+            a GPU a step is recorded once and replayed (`replay.Replay`).
+
     Raises:
         ValueError: If the energy stops being finite.
     """
-    free = _Unknowns(start)
-    best, lowest = free.at.clone(), None
-    trace: list[Tensor] = []
+    free = _Unknowns(start, method)
+    step = stepper(lambda: free.step(energy), free.at.device, still=still)
     for index in range(method.steps):
-        free.slope.zero_()
-        value = energy(free.record)
-        value.total.backward()
-        items = value.per_item.detach()
-        if method.keep_best:
-            best, lowest = free.better(items, lowest, best)
-        trace.append(items.sum())
-        free.step(method, index)
+        value = step()
         observe(Step(stage, index, method.steps, value, lambda: free.record))
     with torch.no_grad():
         last = energy(free.record).per_item
-    if not torch.stack([*trace, last.sum()]).isfinite().all():
-        raise ValueError(f"{stage}: the energy is not finite")
-    if method.keep_best:
-        best, last = free.better(last, lowest, best)
-        free.at.copy_(best)
+        free.note(last)
+        if not torch.cat([free.trace, last.sum().view(1)]).isfinite().all():
+            raise ValueError(f"{stage}: the energy is not finite")
+        if method.keep_best:
+            last = free.lowest
+            free.at.copy_(free.best)
     at = map_tensors(lambda x: x.detach().clone(), free.record)
-    return Minimum(at, last, torch.stack(trace) if trace else last.new_zeros(0))
+    return Minimum(at, last, free.trace)
 
 
 class _Unknowns(Generic[P]):
-    """All fields of a record in one piece of memory, so that a step takes few operations."""
+    """All fields of a record in one piece of memory, and all that a step reads and changes.
 
-    def __init__(self, start: P) -> None:
+    Nothing of it moves, and a step asks the host for nothing, so that a GPU can replay it.
+    """
+
+    trace: Tensor
+    """Total energy before each step."""
+    lowest: Tensor
+    """Lowest energy of each item so far (`keep_best`)."""
+    owner: Tensor
+    """Number of the item that each unknown belongs to (`keep_best`)."""
+
+    def __init__(self, start: P, method: Adam) -> None:
         names = [f.name for f in dataclasses.fields(start)]  # type: ignore[arg-type]
         fields = [getattr(start, n).detach() for n in names]
         self.at = torch.cat([x.flatten() for x in fields])
+        self.best = self.at.clone()
         self.slope, self.mean, self.square = (torch.zeros_like(self.at) for _ in range(3))
         sizes = [x.numel() for x in fields]
         leaves: dict[str, Tensor] = {}
@@ -153,32 +170,64 @@ class _Unknowns(Generic[P]):
             leaves[name].grad = grad.view(x.shape)
         self.record: P = dataclasses.replace(start, **leaves)  # type: ignore[type-var]
         self.shapes = [x.shape for x in fields]
-        self.owner: Tensor | None = None
+        self.method, self.noted = method, False
+        self.table = torch.tensor(_table(method)).to(self.at)
+        self.index = torch.zeros(1, dtype=torch.int64, device=self.at.device)
 
-    def step(self, method: Adam, index: int) -> None:
+    def step(self, energy: Callable[[P], Energy]) -> Energy:
+        """One step down, and the energy before it."""
+        self.slope.zero_()
+        value = energy(self.record)
+        value.total.backward()
+        with torch.no_grad():
+            items = value.per_item.detach()
+            self.note(items)
+            self.trace.index_copy_(0, self.index, items.sum().view(1))
+            self.move()
+            self.index.add_(1)
+        return value
+
+    def move(self) -> None:
         """Adam's step, in the operations of `torch.optim.Adam`."""
-        beta1, beta2, grad = 0.9, method.beta2, self.slope
-        self.mean.lerp_(grad, 1 - beta1)
+        beta2, grad = self.method.beta2, self.slope
+        spread, rate = self.table.index_select(0, self.index)[0].unbind()
+        self.mean.lerp_(grad, 1 - BETA1)
         self.square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-        spread = (1 - beta2 ** (index + 1)) ** 0.5
-        rate = _rate(method, index) / (1 - beta1 ** (index + 1))
         length = (self.square.sqrt() / spread).add_(1e-8)
-        self.at.addcdiv_(self.mean, length, value=-rate)
+        self.at.add_((self.mean * rate).div_(length))
 
-    def better(self, items: Tensor, lowest: Tensor | None, best: Tensor) -> tuple[Tensor, Tensor]:
+    def note(self, items: Tensor) -> None:
         """Keep, item by item, the state with the lowest energy so far, and that energy."""
-        if lowest is None:
-            return self.at.clone(), items.clone()
-        if self.owner is None:
-            number = torch.arange(items.numel(), device=items.device).view(items.shape)
-            parts = [
-                number.reshape(items.shape + (1,) * (len(shape) - items.ndim)).expand(shape)
-                for shape in self.shapes
-            ]
-            self.owner = torch.cat([x.flatten() for x in parts])
-        wins = items < lowest
-        best = torch.where(wins.flatten()[self.owner], self.at, best)
-        return best, torch.where(wins, items, lowest)
+        if not self.noted:
+            self._begin(items)
+        if self.method.keep_best:
+            wins = items < self.lowest
+            torch.where(wins.flatten()[self.owner], self.at, self.best, out=self.best)
+            torch.where(wins, items, self.lowest, out=self.lowest)
+
+    def _begin(self, items: Tensor) -> None:
+        """Room for what is known of each item, once it is known how many there are."""
+        self.noted, self.trace = True, items.new_zeros(self.method.steps)
+        if not self.method.keep_best:
+            return
+        self.lowest = torch.full_like(items, torch.inf)
+        number = torch.arange(items.numel(), device=items.device).view(items.shape)
+        parts = [
+            number.reshape(items.shape + (1,) * (len(shape) - items.ndim)).expand(shape)
+            for shape in self.shapes
+        ]
+        self.owner = torch.cat([x.flatten() for x in parts])
+
+
+def _table(method: Adam) -> list[tuple[float, float]]:
+    """By what the root of the squares is divided, and how far to go, at each step."""
+    return [
+        (
+            (1 - method.beta2 ** (index + 1)) ** 0.5,
+            -_rate(method, index) / (1 - BETA1 ** (index + 1)),
+        )
+        for index in range(method.steps)
+    ]
 
 
 def _rate(method: Adam, index: int) -> float:

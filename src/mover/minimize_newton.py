@@ -39,7 +39,7 @@ class Quasi:
     """Largest radius."""
     least: float = 1e-4
     """Radius below which a problem has converged."""
-    gain: float = 1e-4
+    gain: float = 1e-5
     """Relative decrease below which a step counts as none."""
     patience: int = 3
     """Such steps in a row after which a problem has converged."""

@@ -19,6 +19,7 @@ from .run import Run as Run
 from .stages.align_camera import AlignInputs, align_camera
 from .stages.assign_touches import TouchInputs, assign_touches
 from .stages.find_depth import DepthInputs, apply_depth, find_depth
+from .stages.find_focal import FocalInputs, find_focal, zoomed
 from .stages.find_image_cues import ImageInputs, find_image_cues, order_of
 from .stages.find_soles import SolesInputs, find_soles
 from .stages.find_touches import FindTouchesInputs, find_touches
@@ -67,18 +68,28 @@ def people_of(capture: Capture, config: Config, run: Run) -> Crew | None:
         return None
     parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
     kept = run.stage(select_frames, SelectInputs(bodies), config.select).keep
-    warnings: tuple[str, ...] = ()
+    camera, warnings = _with_lens(capture, kept, config, run)
     if config.correct_depth and capture.people is not None:
-        inputs = DepthInputs(
-            bodies, parts, kept, capture.people, detected_masks(capture), scene.camera
-        )
+        inputs = DepthInputs(bodies, parts, kept, capture.people, detected_masks(capture), camera)
         depth = run.stage(find_depth, inputs, config.depth)
-        bodies, warnings = apply_depth(bodies, depth), depth.warnings
-    soles = run.stage(find_soles, SolesInputs(bodies, parts, kept, scene.camera), config.soles)
-    feet = AlignInputs(soles, scene.camera, scene.ground, capture.camera_height)
+        bodies, warnings = apply_depth(bodies, depth), (*warnings, *depth.warnings)
+    soles = run.stage(find_soles, SolesInputs(bodies, parts, kept, camera), config.soles)
+    feet = AlignInputs(soles, camera, scene.ground, capture.camera_height)
     alignment = run.stage(align_camera, feet, config.align)
     warnings = (*warnings, *soles.warnings, *alignment.warnings)
     return Crew(bodies, kept, parts, soles, alignment, warnings)
+
+
+def _with_lens(
+    capture: Capture, kept: Bool[Tensor, " bodies"], config: Config, run: Run
+) -> tuple[Camera, tuple[str, ...]]:
+    """The given camera, with the focal length that the people tell where one is looked for."""
+    camera, bodies, people = capture.scene.camera, capture.bodies, capture.people
+    if config.focal.spread <= 0 or bodies is None or people is None:
+        return camera, ()
+    inputs = FocalInputs(bodies, kept, people, detected_masks(capture), camera)
+    lens = run.stage(find_focal, inputs, config.focal)
+    return zoomed(camera, lens), lens.warnings
 
 
 def _from_image(job: Job, camera: Camera, ground: float) -> View:

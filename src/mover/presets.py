@@ -16,6 +16,7 @@ from .stages.align_camera import AlignConfig
 from .stages.assign_touches import AssignConfig
 from .stages.explain_placements import ExplainConfig
 from .stages.find_depth import DepthConfig
+from .stages.find_focal import FocalConfig
 from .stages.find_image_cues import ImageConfig
 from .stages.find_soles import SolesConfig
 from .stages.find_touches import TouchConfig
@@ -33,6 +34,8 @@ class Config:
 
     select: SelectConfig = field(default_factory=SelectConfig)
     """Which frames are believed."""
+    focal: FocalConfig = field(default_factory=FocalConfig)
+    """The focal length from the people; kept as given unless `focal.spread` is above 0."""
     depth: DepthConfig = field(default_factory=DepthConfig)
     """One depth factor a person."""
     correct_depth: bool = False
@@ -106,6 +109,7 @@ _ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading
 
 ROBUST = Config(
     correct_depth=True,
+    soles=SolesConfig(speed=0.6),
     image=ImageConfig(128, "robust", (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)),
     layout=PlaceConfig(
         _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, distances=(0.9, 1.1), short=_SHORT, keep=3,

@@ -1,10 +1,13 @@
 """One progress bar on a terminal, one line a stage elsewhere."""
 
+import logging
 import sys
 from types import TracebackType
 from typing import Any
 
 from .minimize import Observer, Step
+
+log = logging.getLogger("mover.geometry.kernels")  # tells what is compiled
 
 
 class Bar:
@@ -12,10 +15,14 @@ class Bar:
 
     def __init__(self) -> None:
         from rich.console import Console
+        from rich.logging import RichHandler
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
         self._stage, self._task = "", None
         self._console = Console(file=sys.stderr)
+        self._lines = RichHandler(
+            console=self._console, show_time=False, show_level=False, show_path=False
+        )
         columns = (
             TextColumn("{task.description:<28}"),
             BarColumn(),
@@ -26,6 +33,9 @@ class Bar:
         )
 
     def __enter__(self) -> "Bar":
+        log.addHandler(self._lines)
+        log.setLevel(logging.INFO)
+        log.propagate = False
         if self._console.is_terminal:
             self._progress.start()
         return self
@@ -37,6 +47,8 @@ class Bar:
         trace: TracebackType | None,
     ) -> None:
         self._progress.stop()
+        log.removeHandler(self._lines)
+        log.propagate = True
 
     def __call__(self, step: Step) -> None:
         """Show how far the stage is."""

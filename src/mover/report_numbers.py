@@ -42,6 +42,9 @@ QUANTITIES = {
     "v2v": Quantity("Error of the body's surface", *_CM),
     "p_pje": Quantity("Error of the joints, aligned", *_CM),
     "p_v2v": Quantity("Error of the body's surface, aligned", *_CM),
+    "foot_skate": Quantity("Speed of feet on the floor", "cm/s", 100.0, 1),
+    "float_height": Quantity("Height of the lower foot over the floor", *_CM),
+    "acceleration_error": Quantity("Error of the joints' acceleration", "m/s²", 1.0, 2),
 }
 
 

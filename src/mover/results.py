@@ -13,6 +13,7 @@ from torch import Tensor
 
 from . import __version__, records
 from .bodies.world import in_world
+from .devices import CPU, named
 from .edits import Edit
 from .explanation_file import log_rows, scene_fields
 from .export import write_glb
@@ -36,6 +37,8 @@ class Origin:
     """What the user changed in it before."""
     refine: bool = False
     """Whether the people were refined with the room at the end."""
+    device: torch.device = CPU
+    """Where the heavy stages computed."""
 
 
 def write_results(
@@ -123,7 +126,7 @@ def _write_log(room: Room, config: Config, run: Run, origin: Origin) -> None:
         "people_refined": origin.refine,
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "device": "cpu",
+        "device": named(run.device),
         "threads": torch.get_num_threads(),
         "config": records.plain(config),
         "stages": [dataclasses.asdict(s) for s in run.stages],

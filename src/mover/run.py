@@ -12,13 +12,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+import torch
+
 from . import __version__, records
+from .devices import CPU, named
 from .minimize import Observer, silent
 
 log = logging.getLogger(__name__)
 In = TypeVar("In")
 Conf = TypeVar("Conf")
 Out = TypeVar("Out")
+ON_DEVICE = ("refine_camera", "gather_cues", "place_objects")  # where the time goes
 
 
 @dataclass(frozen=True)
@@ -42,21 +46,27 @@ class Run:
     folder: Path
     observe: Observer = silent
     stages: list[StageLog] = field(default_factory=lambda: [])
+    device: torch.device = CPU
+    """Where the stages in `ON_DEVICE` compute; all others do on the processor."""
 
     def stage(self, fn: Callable[[In, Conf, Observer], Out], inputs: In, config: Conf) -> Out:
         """Return the stored output of `fn`, or compute and store it.
 
         The output is found by the content of its inputs and settings, the version of the package
         and its sources: a stale result cannot be read, and a killed run goes on where it stopped.
+        Inputs and output lie on the processor; what another device computed has another name.
         """
         name = getattr(fn, "__name__", "stage")
-        path = self.folder / "stages" / name / records.fingerprint(inputs, config, sources())
+        device = self.device if name in ON_DEVICE else CPU
+        where = () if device == CPU else (named(device),)
+        key = records.fingerprint(inputs, config, sources(), *where)
+        path = self.folder / "stages" / name / key
         begin = time.perf_counter()
         kept = path.with_suffix(".json").exists()
         if kept:
             output = records.load(typing.get_type_hints(fn)["return"], path)
         else:
-            output = fn(inputs, config, self.observe)
+            output = _computed(fn, inputs, config, (self.observe, device))
             records.save(output, path)
         seconds = time.perf_counter() - begin
         self.stages.append(StageLog(name, seconds, _peak_memory(), kept, path.name))
@@ -68,6 +78,19 @@ class Run:
             self.stages[-1].seconds,
         )
         return output
+
+
+def _computed(
+    fn: Callable[[In, Conf, Observer], Out],
+    inputs: In,
+    config: Conf,
+    where: tuple[Observer, torch.device],
+) -> Out:
+    """The output on the processor, wherever it is computed."""
+    observe, device = where
+    if device == CPU:
+        return fn(inputs, config, observe)
+    return records.to_device(fn(records.to_device(inputs, device), config, observe), CPU)
 
 
 def _peak_memory() -> float:

@@ -5,14 +5,16 @@ from collections.abc import Mapping, Sequence
 
 from .settle import Settled
 
+HEADS = ("moved", "turned", "stuck", "")
+WIDTHS = (9, 9, 8, 10)
+
 
 def settle_table(found: Mapping[str, Sequence[Settled]]) -> str:
     """For each piece, how far it moved, turned and was stuck, in each scene."""
     ids = list(dict.fromkeys(row.id for rows in found.values() for row in rows))
     width = max([len("object"), *map(len, ids)])
-    heads = "".join(f"   {name:<26}" for name in found)
-    units = "   moved    turned   stuck    " * len(found)
-    lines = [f"{'':<{width}}{heads}", f"{'object':<{width}}{units}"]
+    heads = "".join(f"   {name:<{sum(WIDTHS)}}" for name in found)
+    lines = [f"{'':<{width}}{heads}", f"{'object':<{width}}{_row(HEADS) * len(found)}"]
     for name in ids:
         cells = [_cell(next((r for r in rows if r.id == name), None)) for rows in found.values()]
         lines.append(f"{name:<{width}}{''.join(cells)}")
@@ -20,14 +22,16 @@ def settle_table(found: Mapping[str, Sequence[Settled]]) -> str:
     return "\n".join(line.rstrip() for line in (*lines, "", *sums))
 
 
+def _row(words: Sequence[str]) -> str:
+    return "   " + "".join(f"{w:<{size}}" for w, size in zip(words, WIDTHS, strict=True))
+
+
 def _cell(row: Settled | None) -> str:
-    if row is None:
-        return f"   {'-':<26}"
-    if row.fixed:
-        return f"   {'held':<26}"
-    mark = " fell over" if row.toppled else ""
+    if row is None or row.fixed:
+        return _row(("-" if row is None else "held", "", "", ""))
     moved, stuck = f"{1e3 * row.moved:.0f} mm", f"{1e3 * row.stuck:.0f} mm"
-    return f"   {f'{moved:<9}{math.degrees(row.turned):.0f} deg{mark}':<18}{stuck:<8}"
+    turned = f"{math.degrees(row.turned):.0f} deg"
+    return _row((moved, turned, stuck, "fell over" if row.toppled else ""))
 
 
 def _summary(name: str, rows: Sequence[Settled]) -> str:

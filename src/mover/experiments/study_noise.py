@@ -10,7 +10,11 @@ from .plots import Line, Panel, draw_panels
 from .statistics import Interval, interval, paired
 from .study_rows import Ask, Page, Plan
 
-METHODS = {"robust": ("scale", *(k for k in CHANGES if k != "scale")), "relaxed-scale": ("scale",)}
+METHODS = {
+    "robust": ("scale", *(k for k in CHANGES if k != "scale")),
+    "relaxed-scale": ("scale",),
+    "refined-focal": ("focal",),
+}
 """Kinds of errors that each variant is tried on."""
 
 

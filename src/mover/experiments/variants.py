@@ -114,6 +114,10 @@ TIMED: dict[str, Variant] = {
     f"time-{share:g}": Variant(ROBUST, cut=Cut(share=share), fresh=True) for share in SHARES
 }
 RELAXED: dict[str, Variant] = {"relaxed-scale": Variant(relaxed(ROBUST))}
+LENS: dict[str, Variant] = {
+    "refined-focal": Variant(replace(ROBUST, focal=replace(ROBUST.focal, spread=0.05)))
+}
+"""The focal length is looked for, as where it is guessed and not measured."""
 PEOPLE: dict[str, Variant] = {
     f"people-{name}": Variant(ROBUST, bodies=row)
     for name, row in {
@@ -126,7 +130,7 @@ PEOPLE: dict[str, Variant] = {
 
 VARIANTS: dict[str, Variant] = {
     **{name: Variant(config) for name, config in PRESETS.items()},
-    **TERMS, **PARTS, **NOBODY, **RELAXED, **SINGLE, **SEGMENT, **TIMED, **PEOPLE,
+    **TERMS, **PARTS, **NOBODY, **RELAXED, **LENS, **SINGLE, **SEGMENT, **TIMED, **PEOPLE,
 }  # fmt: skip
 """By the name of the job."""
 

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..constants import constant
 from .rotations import rot_x, rot_y, rot_z
 
 NEAR = 0.05  # [m], nothing nearer than this is drawn
@@ -47,7 +48,7 @@ def tilted(
     pitch: Float[Tensor, "*batch"], roll: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3 3"]:
     """R_cam_world of a camera with this pitch and roll [rad] and no heading (FORMAT.md)."""
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0])).to(pitch)
+    flip = constant(((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)), pitch)
     return flip @ rot_z(roll) @ rot_x(-pitch)
 
 

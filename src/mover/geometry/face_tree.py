@@ -73,9 +73,12 @@ def _order(center: np.ndarray, halvings: int) -> np.ndarray:
         groups = 1 << level
         first = np.arange(groups + 1) * count // groups
         group = np.repeat(np.arange(groups), np.diff(first))
-        starts = np.minimum(first[:-1], count - 1)
-        high = np.maximum.reduceat(center[order], starts)
-        low = np.minimum.reduceat(center[order], starts)
-        axis = (high - low).argmax(-1)
-        order = order[np.lexsort((center[order, axis[group]], group))]
+        starts, held = np.minimum(first[:-1], count - 1), center[order]
+        low, size = np.minimum.reduceat(held, starts), np.maximum.reduceat(held, starts)
+        with np.errstate(invalid="ignore"):  # bodies that are not finite are refused elsewhere
+            size = size - low
+            axis = size.argmax(-1)
+            off = held[np.arange(count), axis[group]] - low[group, axis[group]]
+            share = off / np.maximum(size.max(-1), 1e-30)[group]  # in its group, 0 to 1
+        order = order[np.argsort(group + 0.999 * share)]
     return order

@@ -1,12 +1,10 @@
 """First entry and first exit of rays as Warp kernels: same result as `raster_torch.layers`."""
 
-from typing import Any
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .kernels.start import kernels, started
+from .kernels.start import kernels, launch, name_of, started
 from .raster_records import Layers, Views
 
 
@@ -25,14 +23,9 @@ def layers(
         screen = wp.from_torch(torch.empty_like(points), dtype=wp.vec3)
         table = wp.from_torch(faces.to(points.device).long().contiguous(), dtype=wp.vec3l)
         maps = [wp.from_torch(front), wp.from_torch(leave)]
-        device = str(wp.device_from_torch(points.device))
-        exits = kernels("exits", device)
-
-        def launch(kernel: Any, dim: tuple[int, int], *inputs: Any) -> None:  # noqa: ANN401
-            wp.launch(kernel, dim, inputs, device=device)
-
+        exits = kernels("exits", name_of(points.device))
         verts = wp.from_torch(points, dtype=wp.vec3)
         windows = wp.from_torch(window, dtype=wp.vec4)
-        launch(exits.project, (items, n_verts), verts, windows, screen)
-        launch(exits.draw, (items, len(faces)), screen, table, *maps)
+        launch(exits.project, (items, n_verts), [verts, windows, screen], points.device)
+        launch(exits.draw, (items, len(faces)), [screen, table, *maps], points.device)
     return Layers(front.reciprocal_().to(verts_cam), leave.reciprocal_().to(verts_cam))

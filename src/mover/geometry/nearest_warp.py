@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..records import record
-from .kernels.start import kernels, started
+from .kernels.start import kernels, launch, name_of, started
 from .raster_engine import threads
 from .raster_warp_cpu import share
 
@@ -79,7 +79,7 @@ def nearest(
         scale: Size of each object, above 0.
     """
     wp = started()
-    kernels("nearest", str(wp.device_from_torch(query.device)))
+    kernels("nearest", name_of(query.device))
     from .kernels.nearest import Cloud, nearest
 
     rows = query.detach().float().reshape(prod(query.shape[:-2]), *query.shape[-2:]).contiguous()
@@ -95,14 +95,13 @@ def nearest(
                 setattr(cloud, f"{name}_{corner}", array)
         arrays = [wp.from_torch(rows, dtype=wp.vec3), wp.from_torch(sizes, dtype=wp.vec3)]
         arrays.append(wp.from_torch(found))
-        device = str(wp.device_from_torch(rows.device))
-        parts = min(threads(), len(rows)) if device == "cpu" else 1
+        parts = min(threads(), len(rows)) if rows.device.type == "cpu" else 1
         cuts = [len(rows) * k // parts for k in range(parts + 1)]
 
         def find(part: int) -> None:
             first, stop = cuts[part], cuts[part + 1]
             size = (stop - first, found.shape[1])
-            wp.launch(nearest, size, [cloud, *arrays, first], device=device)
+            launch(nearest, size, [cloud, *arrays, first], rows.device)
 
         share(find, parts)
     return found.reshape(query.shape[:-1])

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .kernels.start import kernels, started
-from .raster_engine import engine, threads
+from .kernels.start import kernels, launch, name_of, started
+from .raster_engine import DEVICES, engine, threads
 from .raster_warp_cpu import share
 
 
@@ -26,7 +26,7 @@ def squares(
 def bounds_depths(depth: Tensor, *bounds: Tensor) -> bool:
     """Whether `outside` can price these maps: Warp is the engine, all is constant float32."""
     here = {(x.device, x.dtype) for x in (depth, *bounds)} == {(depth.device, torch.float32)}
-    drawn = depth.device.type in ("cpu", "cuda") and depth.numel() > 0
+    drawn = depth.device.type in DEVICES and depth.numel() > 0
     return engine() == "warp" and here and drawn and not any(x.requires_grad for x in bounds)
 
 
@@ -105,12 +105,11 @@ def _launch(
     outputs: list[Tensor],
 ) -> None:
     """Price all rows, on a CPU a share of them in each thread."""
-    wp = started()
-    device = str(wp.device_from_torch(seen[0].device))
-    module = kernels("price", device)
+    device = seen[0].device
+    module = kernels("price", name_of(device))
     inputs, arrays = ([_flat(x) for x in maps] for maps in (seen, outputs))
     rows = len(outputs[0])
-    parts = min(threads(), rows) if device == "cpu" else 1
+    parts = min(threads(), rows) if device.type == "cpu" else 1
     cuts = [rows * k // parts for k in range(parts + 1)]
 
     def one(part: int) -> None:
@@ -119,7 +118,7 @@ def _launch(
         packed.width, packed.first = seen[0].shape[-1], cuts[part]
         packed.margin, packed.limit = slack
         size = cuts[part + 1] - cuts[part]
-        wp.launch(module.outside_rows, size, [*inputs, packed, *arrays], device=device)
+        launch(module.outside_rows, size, [*inputs, packed, *arrays], device)
 
     share(one, parts)
 

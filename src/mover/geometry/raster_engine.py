@@ -10,6 +10,8 @@ from typing import Literal, get_args
 
 Engine = Literal["auto", "torch", "warp"]
 CHOICES: tuple[str, ...] = get_args(Engine)
+DEVICES = ["cpu", "cuda"]
+"""Kinds of devices that the kernels are compiled for."""
 
 _engine: ContextVar[Engine | None] = ContextVar("engine", default=None)
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)

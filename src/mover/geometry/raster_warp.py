@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from . import raster_warp_cpu, raster_warp_cuda
+from .raster_engine import DEVICES
 from .raster_records import Depths, Topology, Views
 from .raster_torch import BORDER
 from .raster_warp_records import Asked, Gradients, Items, Maps
@@ -23,7 +24,7 @@ MOST = 1 << 30  # pixels or vertices of one drawing: the kernels count them in 3
 
 def draws(verts_cam: Tensor, K: Tensor) -> bool:
     """Whether this engine can draw such vertices: float32, CPU or CUDA, no gradient to `K`."""
-    device = verts_cam.device.type in ("cpu", "cuda")
+    device = verts_cam.device.type in DEVICES
     return device and verts_cam.dtype == torch.float32 and not K.requires_grad
 
 
@@ -53,7 +54,7 @@ def first_hit(
     size: tuple[int, int],
 ) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
     """See `raster.first_hit`."""
-    depth = torch.full(size, torch.inf).to(verts_cam)
+    depth = verts_cam.new_full(size, torch.inf)
     face = torch.full(size, -1, dtype=torch.int32, device=verts_cam.device)
     if len(verts_cam):
         shape = Topology(faces[None], faces.new_zeros(1, 0, 4))
@@ -96,7 +97,7 @@ def items_of(verts: Tensor, shape: Topology, views: Views, border: int) -> Items
 
 def _driver(items: Items) -> ModuleType:
     """Who launches the kernels on the device of the items."""
-    return raster_warp_cuda if items.verts.is_cuda else raster_warp_cpu
+    return raster_warp_cpu if items.verts.device.type == "cpu" else raster_warp_cuda
 
 
 class _Look(torch.autograd.Function):

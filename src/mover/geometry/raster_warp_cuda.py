@@ -4,13 +4,12 @@ The same kernels run on a CPU, one thread after the other, where the tests hold 
 others. Their speed on a GPU has not been measured.
 """
 
-from contextlib import nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .kernels.start import kernels, started
+from .kernels.start import kernels, launch, name_of
 from .raster_warp_pack import (
     Desk,
     blank,
@@ -33,17 +32,16 @@ def look(items: Items, asked: Asked) -> tuple[Maps, Trace]:
     scene, packed, desk = pack_scene(items), pack_maps(maps, *seen), _desk(items)
     n, edges = len(items.verts), items.edges.shape[1]
     _draw(items, scene, desk, FAR if asked.depth else NOWHERE)
-    cuts = 0
     if asked.silhouette:
         _launch(items, "enter_cuts", (n, edges), scene, desk.scratch)
-        cuts = int(desk.count[1])  # the size of what follows depends on data: this waits
     _launch(items, "show", (n, items.height, items.width), scene, desk.scratch, packed)
+    cuts = 2 * n * items.grid if asked.silhouette else 0  # as many as pairs: nobody waits for less
     table, targets = pack_cuts(desk, cuts)
     if cuts:
         _launch(items, "keep_cuts", (n, edges), scene, desk.scratch, packed)
         _launch(items, "mark_cuts", cuts, desk.scratch, packed)
         _launch(items, "bound_cuts", cuts, desk.scratch, packed)
-    return maps, Trace(*seen, table, targets, targets.new_tensor([0, cuts]))
+    return maps, Trace(*seen, table, targets, desk.count)
 
 
 def pull(items: Items, maps: Maps, trace: Trace, grads: Gradients) -> Tensor:
@@ -68,7 +66,7 @@ def first_hit(items: Items, depth: Tensor, face: Tensor) -> None:
 
 
 def _desk(items: Items) -> Desk:
-    """Working memory of all items together; the cuts are added when they are counted."""
+    """Working memory of all items together; that of the cuts is added when these are listed."""
     n, verts, _ = items.verts.shape
     room = (n * verts, n * items.faces.shape[1], n * items.edges.shape[1], n * items.grid)
     return desk_of(room, 0, items.verts.device)
@@ -84,8 +82,5 @@ def _draw(items: Items, scene: Any, desk: Desk, backs: int) -> None:  # noqa: AN
 
 def _launch(items: Items, name: str, dim: int | tuple[int, ...], *inputs: Any) -> None:  # noqa: ANN401
     """Launch a kernel on the device of the items, in the stream that torch uses there."""
-    wp, where = started(), items.verts.device
-    stream = wp.ScopedStream(wp.stream_from_torch(where)) if items.verts.is_cuda else nullcontext()
-    with stream:
-        kernel = getattr(kernels("grid", str(where)), name)
-        wp.launch(kernel, dim, list(inputs), device=str(where))
+    where = items.verts.device
+    launch(getattr(kernels("grid", name_of(where)), name), dim, list(inputs), where)

@@ -54,9 +54,9 @@ def desk_of(room: tuple[int, int, int, int], most_cuts: int, device: torch.devic
 
 
 def pack_cuts(desk: Desk, number: int) -> tuple[Tensor, Tensor]:
-    """Give a desk room for so many cuts and their targets, and return it; nothing is queued."""
+    """Give a desk room for so many cuts, and return it; no cut has a target, nothing is queued."""
     cuts = torch.empty(number, 4, dtype=torch.int32, device=desk.count.device)
-    targets = torch.empty(number, dtype=torch.int32, device=desk.count.device)
+    targets = torch.full((number,), -1, dtype=torch.int32, device=desk.count.device)
     desk.count.zero_()
     desk.scratch.cuts, desk.scratch.targets = array(cuts, "vec4i"), array(targets, "int32")
     return cuts, targets

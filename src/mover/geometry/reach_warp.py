@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .kernels.start import kernels, started
+from .kernels.start import kernels, launch, name_of, started
 from .nearest_warp import Clouds
 from .raster_engine import threads
 from .raster_warp_cpu import share
@@ -90,20 +90,19 @@ class _Reach(torch.autograd.Function):
 def _launch(rows: Tensor, item: Tensor, way: Way, outputs: tuple[Tensor, Tensor]) -> None:
     """Add one way, on a CPU by a share of the rows in each thread."""
     wp = started()
-    device = str(wp.device_from_torch(rows.device))
-    module = kernels("reach", device)
+    module = kernels("reach", name_of(rows.device))
     asked, cloud = _asked(module, rows, item, way), _cloud(way.to)
     slope = wp.from_torch(outputs[1], dtype=module.Slope)
     arrays = [wp.from_torch(outputs[0]), slope]
     kernel, inputs = module.from_world, [asked, cloud]
     if isinstance(way, FromObject):
         kernel, inputs = module.from_object, [asked, _points(way.points.points), cloud]
-    parts = min(threads(), len(rows)) if device == "cpu" else 1
+    parts = min(threads(), len(rows)) if rows.device.type == "cpu" else 1
     cuts = [len(rows) * k // parts for k in range(parts + 1)]
 
     def one(part: int) -> None:
         size = cuts[part + 1] - cuts[part]
-        wp.launch(kernel, size, [*inputs, cuts[part], *arrays], device=device)
+        launch(kernel, size, [*inputs, cuts[part], *arrays], rows.device)
 
     share(one, parts)
 

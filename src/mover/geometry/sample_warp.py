@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .kernels.start import kernels, started
+from .kernels.start import kernels, launch, name_of, started
 from .volume_record import Volume
 
 
@@ -24,7 +24,7 @@ class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, volume: Volume) -> Tensor:  # noqa: ANN401
         wp = started()
-        kernels("lookup", str(wp.device_from_torch(points.device)))
+        kernels("lookup", name_of(points.device))
         from .kernels.lookup import Field, lookup
 
         flat = points.detach().reshape(-1, 3).contiguous()
@@ -33,15 +33,14 @@ class _Lookup(torch.autograd.Function):
             field = Field()
             field.values = wp.from_torch(volume.values.detach())
             field.busy = wp.from_torch(volume.busy)
-            field.origin = wp.vec3(*volume.origin.tolist())
+            field.origin = wp.vec3(*volume.corner)
             field.cell = volume.cell
             arrays = [
                 wp.from_torch(flat, dtype=wp.vec3),
                 wp.from_torch(found),
                 wp.from_torch(slope, dtype=wp.vec3),
             ]
-            device = str(wp.device_from_torch(flat.device))
-            wp.launch(lookup, len(flat), [field, *arrays], device=device)
+            launch(lookup, len(flat), [field, *arrays], flat.device)
         ctx.save_for_backward(slope)
         return found.reshape(points.shape[:-1])
 

@@ -27,6 +27,12 @@ class Volume:
     """Edge of a cell [m]."""
 
     @cached_property
+    def corner(self) -> tuple[float, float, float]:
+        """The origin as numbers [m]."""
+        x, y, z = self.origin.tolist()
+        return x, y, z
+
+    @cached_property
     def busy(self) -> UInt8[Tensor, "bx by bz"]:
         """1 for each brick of 8 cells along an axis in which the values change, else 0."""
         low = high = self.values.detach()

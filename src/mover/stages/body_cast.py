@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..bodies.corrected import Correction, Puppet, corrected, moved, normals_after
+from ..bodies.corrected import Correction, Moved, Puppet, corrected, moved, normals_after
 from ..bodies.parts import PARTS, parts_of
 from ..bodies.touch import touching
 from ..geometry.camera import to_camera
@@ -14,6 +14,7 @@ from ..records import InputError, map_tensors
 from ..terms.body_contact import MatchConfig, Matches, Skin, gather_matches
 from ..terms.body_order import Bounds
 from ..terms.body_outline import Outline
+from ..terms.body_start import ANGLE
 from ..terms.body_time import gather_neighbours
 from ..types import Bodies, Capture, Room
 from .body_energy import BodyWeights, Evidence, Feet
@@ -110,7 +111,7 @@ def looked(
     matches: Matches | None = None
     bounds: Bounds | None = None
     if weights.touch:
-        skin = Skin(now.skin, normals, cast.chance[rows], cast.picked.group)
+        skin = _skin(cast, acted, known, (now, normals))
         matches = gather_matches(skin, cast.room.surface, match, cast.room.furniture)
     if weights.order and cast.watched is not None:
         even = cast.picked.even
@@ -119,6 +120,15 @@ def looked(
     if weights.outline and cast.watched is not None:
         outline = _outlines(cast, acted)
     return replace(known, matches=matches, bounds=bounds, outline=outline)
+
+
+def _skin(cast: Cast, acted: Acted, known: Evidence, at: tuple[Moved, Tensor]) -> Skin:
+    """The skin where it is now; errors of poses count where they are not corrected."""
+    return Skin(
+        points=at[0].skin, normals=at[1], chance=cast.chance[acted.rows], group=cast.picked.group,
+        track=known.near.track, pivot=at[0].points[:, 0],
+        bent=ANGLE if acted.puppet.model is None else 0.0,
+    )  # fmt: skip
 
 
 def _outlines(cast: Cast, acted: Acted) -> Outline:

@@ -113,9 +113,11 @@ def _volume(meshes: list[Mesh]) -> Volume | None:
 def _surface(meshes: list[Mesh]) -> Surface:
     found = [sample_surface(m, SAMPLES) for m in meshes]
     none = torch.zeros(0, 3)
+    pieces = [torch.full((len(p),), k) for k, (p, _) in enumerate(found)]
     return Surface(
         torch.cat([none, *(p.float() for p, _ in found)]),
         torch.cat([none, *(n.float() for _, n in found)]),
+        torch.cat([none[:, 0].long(), *pieces]),
     )
 
 

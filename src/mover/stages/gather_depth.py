@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..geometry.camera import to_camera
 from ..geometry.raster import layers
+from ..records import to_device
 from ..terms.depth import DepthMaps, Seen, bounds_of, merge
 from ..types import Bodies, Camera
 from .person_masks import MaskTable
@@ -31,7 +32,7 @@ class Sight:
     bodies: Bodies
     table: MaskTable
     masks: Bool[Tensor, "objects h w"]
-    """Of the objects, in the image 640 wide."""
+    """Of the objects, in the image 640 wide; on the CPU."""
     camera: Camera
     erode: int
     """Pixels by which masks and silhouettes shrink."""
@@ -62,7 +63,8 @@ def gather_depth(
     """The narrowest bounds of all frames; they do not depend on the number of workers.
 
     Memory is that of a few frames for each worker, however many frames there are. Bodies whose
-    track has no mask say nothing.
+    track has no mask say nothing. Bodies are drawn where their vertices are; the maps are on the
+    CPU.
 
     Args:
         sight: What is seen.
@@ -102,7 +104,7 @@ def _bounds(sight: Sight, block: list[int]) -> Iterator[tuple[Window, DepthMaps]
     views = small_views(sight.camera)
     verts = to_camera(sight.bodies.verts[torch.tensor(block)], sight.camera.R_cam_world)
     many = replace(views, K=views.K.expand(len(block), 3, 3))
-    drawn = layers(verts, sight.bodies.faces, many)
+    drawn = to_device(layers(verts, sight.bodies.faces, many), "cpu")  # where the masks are
     for k, row in enumerate(block):
         window = _window(drawn.front[k] < float("inf"), sight.erode)
         visible, others = (

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ..energy_warp import never_asks
 from ..geometry.boxes import Box, corners
 from ..geometry.volume import Volume, grid_around, union_bodies
 from ..minimize import Adam, Energy, Observer, minimize, silent
@@ -52,7 +53,8 @@ def part_objects(
     def together(free: Layout) -> Energy:
         return Energy({"alone": energy(alone(free)).per_item[0], "apart": weight * shared(free)})
 
-    return minimize(together, layout, METHOD, observe, "place_objects").at
+    still = never_asks(objects)
+    return minimize(together, layout, METHOD, observe, "place_objects", still=still).at
 
 
 def sharing(objects: Objects, layout: Layout) -> Callable[[Layout], Float[Tensor, " objects"]]:
@@ -63,13 +65,13 @@ def sharing(objects: Objects, layout: Layout) -> Callable[[Layout], Float[Tensor
 
 
 def _pairs(objects: Objects, layout: Layout) -> Int[Tensor, "pairs 2"]:
-    """Ordered pairs whose boxes are near each other and of which none carries the other."""
+    """Ordered pairs whose boxes are near each other, none carrying the other; on the CPU."""
     size = objects.size * layout.log_scale.exp()
     ends = corners(Box(layout.t_world_object, size, layout.yaw))[..., [0, 2]]
     middle = ends.mean(-2)
     reach = (ends - middle.unsqueeze(-2)).norm(dim=-1).amax(-1)
     gap = (middle[:, None] - middle[None]).norm(dim=-1) - reach[:, None] - reach[None]
-    return (gap < NEAR).logical_and(~_related(objects)).nonzero()
+    return (gap < NEAR).cpu().logical_and(~_related(objects)).nonzero()
 
 
 def _related(objects: Objects) -> Bool[Tensor, "objects objects"]:

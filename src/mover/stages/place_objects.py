@@ -8,11 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..energy import HumanCues, ImageCues, SceneConfig, SceneWeights
-from ..energy_warp import pricing, pricing_rows
+from ..energy_warp import never_asks, pricing, pricing_rows
 from ..geometry.placement import stand
 from ..minimize import Adam, Energy, Minimum, Observer, Step, minimize, silent
 from ..minimize_newton import Problems, Quasi, settle
-from ..records import record
+from ..records import record, to_device
 from ..terms import Form
 from ..terms.contact_reach import together
 from ..terms.contact_trees import trees_of
@@ -167,14 +167,18 @@ def descend(
     def watched(step: Step) -> None:
         free = step.at
         assert free is not None
-        observe(replace(step, at=lambda: Moment(at(free()), inputs.camera, inputs.ground)))
+        observe(replace(step, at=lambda: moment(at(free()))))
+
+    def moment(layout: Layout) -> Moment:
+        return to_device(Moment(layout, inputs.camera, inputs.ground), "cpu")
 
     begin = unbounded(starts, span)
     if isinstance(method, Quasi):
         found = settle(_problems(inputs, config, begin), method, watched, "place_objects")
     else:
         energy = _free_energy(inputs, config)
-        found = minimize(energy, begin, method, watched, "place_objects")
+        still = never_asks(inputs.objects)
+        found = minimize(energy, begin, method, watched, "place_objects", still=still)
     return Minimum(at(found.at), found.value, found.trace)
 
 
@@ -233,5 +237,8 @@ def _by_boxes(
     def at(free: Layout) -> Layout:
         return replace(starts, t_world_object=free.t_world_object)
 
-    found = minimize(lambda free: energy(at(free)), starts, config.first, observe, "place_objects")
+    found = minimize(
+        lambda free: energy(at(free)), starts, config.first, observe, "place_objects",
+        still=never_asks(inputs.objects),
+    )  # fmt: skip
     return at(found.at)

@@ -21,7 +21,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..constants import constant
 from ..energy import HumanCues, ImageCues, SceneConfig, SceneWeights, scene_energy
+from ..energy_warp import never_asks
 from ..geometry.camera import pitch_roll, tilted, to_camera
 from ..geometry.floor import LOWEST, hit_floor
 from ..geometry.placement import GROUND
@@ -112,7 +114,8 @@ def refine_camera(
 
     if not bool(usable.any()):
         return Refined(inputs.camera, inputs.ground, torch.zeros(0))
-    found = minimize(energy, zero, config.method, observe, "refine_camera")
+    still = never_asks(inputs.objects)
+    found = minimize(energy, zero, config.method, observe, "refine_camera", still=still)
     joint = _shift(fixed, found.at)
     camera, _ = _unpack(joint, inputs)
     return Refined(camera, float(joint.tilt[2]), found.trace)
@@ -122,7 +125,7 @@ def _start(inputs: RefineInputs) -> _Joint:
     base = to_camera(inputs.layout.t_world_object, inputs.camera.R_cam_world)
     rays = base[:, :2] / base[:, 2:].clamp_min(0.1)
     pitch, roll = pitch_roll(inputs.camera.R_cam_world)
-    tilt = torch.stack([pitch, roll, torch.tensor(inputs.ground).to(pitch)])
+    tilt = torch.stack([pitch, roll, pitch.new_tensor(inputs.ground)])
     return _Joint(tilt, rays, inputs.layout.yaw, inputs.layout.log_scale)
 
 
@@ -136,7 +139,7 @@ def _usable(inputs: RefineInputs) -> Float[Tensor, " objects"]:
 
 
 def _shift(fixed: _Joint, free: _Joint) -> _Joint:
-    units = fixed.tilt.new_tensor(UNITS)
+    units = constant(UNITS, fixed.tilt)
     return _Joint(
         fixed.tilt + free.tilt * units[:3],
         fixed.rays + free.rays * units[3],

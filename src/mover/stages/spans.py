@@ -11,7 +11,8 @@ from ..types import Layout, Objects
 
 def spans_of(objects: Objects, span: float, chair_span: float) -> Float[Tensor, " objects"]:
     """Range of the scale of each object, 0 where it is free."""
-    return torch.tensor([chair_span if c == "chair" else span for c in objects.categories])
+    spans = [chair_span if c == "chair" else span for c in objects.categories]
+    return torch.tensor(spans, device=objects.size.device)
 
 
 def bounded(free: Layout, span: Float[Tensor, " objects"]) -> Layout:

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..geometry.rotations import wrap
+from ..records import to_device
 from ..terms.contact import Touches
 from ..types import Layout
 
@@ -67,8 +68,9 @@ def best_few(
     """
     order = energy.argsort(0)
     if apart:
-        columns = [_differing(layout, order[:, i], i) for i in range(order.shape[1])]
-        order = torch.stack(columns, 1)
+        near = to_device(layout, "cpu")
+        columns = [_differing(near, order[:, i], i) for i in range(order.shape[1])]
+        order = torch.stack(columns, 1).to(order.device)
     return pick(layout, order[:keep])
 
 

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..constants import constant
 from ..geometry.placement import place
 from ..geometry.rotations import rot_y
 from ..geometry.volume import Volume, sample
@@ -35,15 +36,16 @@ def apart_term(
         layout: One place for each object.
         objects: Their samples.
         solids: Signed distance to each object of a pair in its own frame [m].
-        pairs: Whose samples may lie in whom.
+        pairs: Whose samples may lie in whom; on the CPU.
     """
     points = place(objects.samples, layout)
     total = torch.zeros_like(layout.yaw)
+    index = total.new_zeros(0, dtype=torch.long)
     for one, other in pairs.tolist():
         scale = layout.log_scale[other].exp()
         away = points[one] - layout.t_world_object[other]
         own = away @ rot_y(layout.yaw[other]) / scale
         deep = (-sample(solids[other], own) * layout.log_scale[other].mean().exp() - MARGIN).relu()
         price = ROBUST * deep.square().mean()
-        total = total.index_add(0, torch.tensor([one]), price[None])
+        total = total.index_add(0, constant((one,), index), price[None])
     return total

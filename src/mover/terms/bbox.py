@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..constants import constant
 from . import Form
 
 WIDTH = 640.0  # [px], the image width at which the weights of the paper have their meaning
@@ -40,7 +41,7 @@ def bbox_term(
     drawn = torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
     if form == "robust":
         size = (detected[:, 2:] - detected[:, :2]).clamp_min(1).prod(-1, keepdim=True).sqrt()
-        out = detected.new_tensor([-wider, -wider, wider, wider])
+        out = constant((-wider, -wider, wider, wider), detected)
         off = ((drawn - (detected + out)) / size).square()
         return (((off + SOFT**2).sqrt() - SOFT) * sides).sum(-1)
     off = (_corner_and_width(drawn) - _corner_and_width(detected)).abs() * (WIDTH / width)

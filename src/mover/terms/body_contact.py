@@ -19,12 +19,14 @@ from ..geometry.nearest import as_float64
 from ..geometry.volume import Volume, sample
 from ..minimize import geman_mcclure
 from ..records import record
+from .body_kept import without_kept
 
 FACING = -0.7071  # cosine of 135 degrees, PROX's 45 degrees with the sign
 BEND = 0.15  # [m], how much a normal counts beside a place
 USUAL = 0.02  # [m], usual distance of skin that touches
 LAYER = 0.015  # [m], skin of a group that is no farther than this from its foremost point touches
 POINTS = 3.0  # independent places of a group that touches
+KEPT = 0.01  # [m], usual error that a part of a person has on one piece in all frames
 EDGE = 0.03  # [m], by which a plane and the furniture's own distance may differ
 
 
@@ -36,6 +38,8 @@ class Surface:
     """[m]."""
     normals: Float[Tensor, "points 3"]
     """Outward unit normals."""
+    piece: Int[Tensor, " points"]
+    """Of the furniture, from 0."""
 
 
 @record
@@ -48,8 +52,14 @@ class Skin:
     """Outward unit normals."""
     chance: Float[Tensor, "bodies points"]
     group: Int[Tensor, " points"]
-    """From 0: parts of the body; points of one part on level, or on steep, surfaces share a weight
-    and have one foremost point, so that a thigh that hangs does not speak for the seat."""
+    """From 0: parts of the body; points of one part share a weight and have one foremost point, so
+    that a thigh that hangs does not speak for the seat."""
+    track: Int[Tensor, " bodies"]
+    """Number of each body's person, from 0."""
+    pivot: Float[Tensor, "bodies 3"]
+    """About which a body is turned by the errors of its pose: its pelvis [m]."""
+    bent: float
+    """Usual angle by which the pose is wrong [rad]; 0: it may be corrected."""
 
 
 @record
@@ -64,6 +74,10 @@ class Matches:
     normal: Float[Tensor, "matches 3"]
     weight: Float[Tensor, " matches"]
     """Share in its group's weight; at most `POINTS` in sum."""
+    usual: Float[Tensor, " matches"]
+    """Usual distance of skin that touches [m]."""
+    kept: Int[Tensor, " matches"]
+    """Which share an error that lasts: one part of one person on one piece; from 0."""
 
 
 @dataclass(frozen=True)
@@ -80,28 +94,66 @@ def gather_matches(
     skin: Skin, surface: Surface, config: MatchConfig, furniture: Volume | None = None
 ) -> Matches:
     """The nearest surface that faces each skin point that touches."""
-    from scipy.spatial import KDTree
-
     body, point = (skin.chance > config.least).nonzero(as_tuple=True)
     if not len(body) or not len(surface.points):
         return _nothing(skin)
     places, facing = skin.points[body, point].detach(), skin.normals[body, point].detach()
+    index = _nearest(places, facing, surface)
+    place, normal = surface.points[index], surface.normals[index]
+    off = ((places - place) * normal).sum(-1)
+    groups = int(skin.group.max()) + 1
+    part = body * groups + skin.group[point]
+    looks = _looks(facing, skin.chance[body, point], part)
+    keep = ((facing * normal).sum(-1) < FACING) & ((looks * normal).sum(-1) < FACING)
+    keep = keep & ((places - place).norm(dim=-1) < config.reach)
+    if furniture is not None:
+        keep = keep & _on_surface(sample(furniture, places), off)
+    body, point, place, normal, part, off, index = (
+        x[keep] for x in (body, point, place, normal, part, off, index)
+    )
+    arm = torch.linalg.cross(place - skin.pivot[body], normal).norm(dim=-1)
+    who = skin.track[body] * groups + skin.group[point]
+    kept = who * len(surface.points) + surface.piece[index]
+    return Matches(
+        body, point, place, normal,
+        weight=_shares(skin.chance[body, point] * _foremost(off, part), part),
+        usual=(USUAL**2 + (skin.bent * arm).square()).sqrt(),
+        kept=kept.unique(return_inverse=True)[1],
+    )  # fmt: skip
+
+
+def _nearest(
+    places: Float[Tensor, "asked 3"], facing: Float[Tensor, "asked 3"], surface: Surface
+) -> Int[Tensor, " asked"]:
+    """The surface point that is nearest in place and in the direction it faces."""
+    from scipy.spatial import KDTree
+
     known = np.concatenate([as_float64(surface.points), BEND * as_float64(surface.normals)], 1)
     asked = np.concatenate([as_float64(places), -BEND * as_float64(facing)], 1)
-    index = torch.from_numpy(np.asarray(KDTree(known).query(asked)[1])).long()
-    place, normal = surface.points[index], surface.normals[index]
-    opposed = (facing * normal).sum(-1) < FACING
-    keep = opposed & ((places - place).norm(dim=-1) < config.reach)
-    if furniture is not None:
-        keep = keep & _on_surface(sample(furniture, places), ((places - place) * normal).sum(-1))
-    body, point, place, normal = body[keep], point[keep], place[keep], normal[keep]
-    off = ((skin.points[body, point].detach() - place) * normal).sum(-1)
-    level = (normal[:, 1].abs() > -FACING).long()
-    group = 2 * (body * (int(skin.group.max()) + 1) + skin.group[point]) + level
-    weight = skin.chance[body, point] * _foremost(off, group)
-    total = weight.new_zeros(int(group.max()) + 1 if len(group) else 1)
-    total = total.index_add(0, group, weight)[group]
-    return Matches(body, point, place, normal, POINTS * weight / total.clamp_min(POINTS))
+    return torch.from_numpy(np.asarray(KDTree(known).query(asked)[1])).long()
+
+
+def _looks(
+    facing: Float[Tensor, "asked 3"], chance: Float[Tensor, " asked"], part: Int[Tensor, " asked"]
+) -> Float[Tensor, "asked 3"]:
+    """Where the whole part looks: a thigh lies on the seat, and not on the seat's front.
+
+    Args:
+        facing: Normals of skin that touches.
+        chance: That it does.
+        part: Body and part of each.
+    """
+    total = facing.new_zeros(int(part.max()) + 1, 3)
+    total = total.index_add(0, part, facing * chance[:, None])
+    return torch.nn.functional.normalize(total, dim=-1)[part]
+
+
+def _shares(
+    weight: Float[Tensor, " matches"], part: Int[Tensor, " matches"]
+) -> Float[Tensor, " matches"]:
+    """Weights of which each part of a body has at most `POINTS`."""
+    total = weight.new_zeros(int(part.max()) + 1 if len(part) else 1)
+    return POINTS * weight / total.index_add(0, part, weight)[part].clamp_min(POINTS)
 
 
 def _on_surface(
@@ -121,7 +173,7 @@ def _foremost(off: Float[Tensor, " matches"], group: Int[Tensor, " matches"]) ->
 
     Args:
         off: Distance from the plane, negative inside [m].
-        group: Body, group and steepness of each match.
+        group: Body and part of each match.
     """
     least = off.new_full((int(group.max()) + 1 if len(group) else 1,), torch.inf)
     least = least.scatter_reduce(0, group, off, "amin")[group]
@@ -139,12 +191,17 @@ def touch_term(
         rho: Distance at which half of the most is paid [m].
     """
     moved = skin[matches.body, matches.point] - matches.place
-    off = geman_mcclure((moved * matches.normal).sum(-1), rho)
-    price = 0.5 * (rho / USUAL) ** 2 * matches.weight * off
+    off = (moved * matches.normal).sum(-1)
+    robust = (rho**2 / (off.square() + rho**2)).square()
+    off, lasting = without_kept(
+        off, robust * matches.weight / matches.usual.square(), matches.kept, KEPT
+    )
+    price = 0.5 * (rho / matches.usual).square() * matches.weight * geman_mcclure(off, rho)
+    price = price + lasting
     return skin.new_zeros(len(skin)).index_add(0, matches.body, price)
 
 
 def _nothing(skin: Skin) -> Matches:
     empty = torch.zeros(0, dtype=torch.long)
     none = skin.points.new_zeros(0, 3)
-    return Matches(empty, empty, none, none, skin.points.new_zeros(0))
+    return Matches(empty, empty, none, none, none[:, 0], none[:, 0], empty)

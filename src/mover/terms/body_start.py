@@ -3,7 +3,8 @@ r"""Bodies stay near what was seen of them (Sec. "HPS estimation": the prior of 
 Evidence:  the bodies as they were given, whose pose is wrong by a few degrees, whose depth is
            wrong by a few percent, and which cover the right pixels.
 Price:     half the squared change over its usual size, in nats: of the joints' angles, of the
-           depth, and of the place in the image (robust, in metres at the body's depth).
+           depth, and of the place in the image (robust, in metres at the body's depth), but for
+           the size there.
 Departure: The paper fits the pose to the image anew (SMPLify-X's terms). Here the first fit is
            the datum, so that bodies of any source, meshes too, can be refined.
 """
@@ -59,11 +60,18 @@ def image_term(
 ) -> Float[Tensor, " bodies"]:
     """Price of leaving the pixels where the joints were seen.
 
+    A body that moves along the ray of its pelvis pays nothing for its size in the image: its size
+    is known no better than its depth, in all frames alike.
+
     Args:
-        points_cam: Joints in camera axes [m].
+        points_cam: Joints in camera axes, the pelvis first [m].
         start_cam: The same joints as they were given [m].
     """
-    z = start_cam[..., 2:].clamp_min(NEAR)
-    off = (points_cam[..., :2] / points_cam[..., 2:].clamp_min(NEAR) - start_cam[..., :2] / z) * z
+    here, there = points_cam[..., :2], start_cam[..., :2]
+    farther = points_cam[:, :1, 2:].clamp_min(NEAR) / start_cam[:, :1, 2:].clamp_min(NEAR)
+    along = (farther - 1) * there[:, :1]
+    z, now = (x[..., 2:].clamp_min(NEAR) for x in (start_cam, points_cam))
+    leans = now - start_cam[:, :1, 2:].clamp_min(NEAR) * (farther - 1)
+    off = ((here - along) / leans.clamp_min(NEAR) - there / z) * z
     robust = geman_mcclure(off.square().sum(-1).add(1e-12).sqrt(), LOST)
     return 0.5 * POINTS * (LOST / PLACE) ** 2 * robust.mean(-1)

@@ -9,6 +9,7 @@ the legs of a chair twice as thick: the place at which that costs least is not
 the true one. What all borders of an object have in common says nothing about where it stands.
 """
 
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -30,6 +31,11 @@ class Borders:
     """By how much the true outline lies outside the detected one [px of the image]."""
     masks: Float[Tensor, "shifts objects h w"]
     """Coverage of the window's pixels by what is really there."""
+
+    @cached_property
+    def steps(self) -> tuple[float, ...]:
+        """The shifts as numbers."""
+        return tuple(self.shifts.tolist())
 
 
 class Fitted(NamedTuple):
@@ -87,8 +93,8 @@ def fit_borders(
     """
     boxes, sides, keep = seen
     bbox, outline = [], []
-    for shift, mask in zip(borders.shifts, borders.masks, strict=True):
-        bbox.append(bbox_term(drawn[1], boxes, sides, 1.0, "robust", float(shift)))
+    for shift, mask in zip(borders.steps, borders.masks, strict=True):
+        bbox.append(bbox_term(drawn[1], boxes, sides, 1.0, "robust", shift))
         outline.append(trust * silhouette_term(drawn[0], mask, keep, "robust"))
     boxed, price = torch.stack(bbox), PRICE * borders.shifts.square()
     silhouette = torch.stack(outline)

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..constants import constant
 from ..minimize import geman_mcclure, safe_norm
 from ..records import record
 from ..types import Layout
@@ -81,7 +82,7 @@ def gap_term(
 def _price(near: Tensor, touches: Touches, form: Form) -> Float[Tensor, "*starts touched"]:
     if form == "paper":
         return (near * touches.weight).sum((-2, -1))
-    share = torch.tensor(SHARE).to(near)
+    share = constant(SHARE, near)
     mean = (geman_mcclure(near, RHO) * touches.weight).sum(-1)
     mean = mean / touches.weight.sum(-1).clamp_min(1e-9)
     return (mean * share).sum(-1) * (touches.bodies / ENOUGH).clamp_max(1)

@@ -1,5 +1,7 @@
 """The nearest points of the contact term from search trees that are built once."""
 
+from functools import cached_property
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -26,6 +28,12 @@ class Trees:
     """By top and back: whether points of the body, then of the hands, have a weight."""
     skin: tuple[Clouds, ...] | None = None
     """The points of the evidence, by part (`release` only); meaningless where none has a weight."""
+
+    @cached_property
+    def most(self) -> tuple[int, ...]:
+        """Most points that ask for the top, and for the back, of one object."""
+        counts = self.asking.sum(-1)
+        return tuple(counts.amax(0).tolist()) if len(counts) else (0, 0)
 
 
 def trees_of(objects: Objects, touches: Touches, form: Form = "robust") -> Trees | None:
@@ -81,7 +89,7 @@ def gaps(
     for k, (region, tree) in enumerate(((objects.top, held.top), (objects.back, held.back))):
         asking = held.asking[:, k]
         order = asking.byte().argsort(dim=-1, descending=True, stable=True)
-        order = order[:, : int(asking.sum(-1).max()) if len(index) else 0]
+        order = order[:, : trees.most[k]]
         query = points[:, k].gather(-2, order.unsqueeze(-1).expand(-1, -1, 3))
         gap = _gap(few, query, region[index], tree)
         whole = gap.new_zeros(*gap.shape[:-1], points.shape[-2])

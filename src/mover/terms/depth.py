@@ -156,10 +156,10 @@ def _thick(hidden: Bool[Tensor, "h w"], reach: float) -> Bool[Tensor, "h w"]:
     """
     from scipy.ndimage import distance_transform_edt
 
-    inner = torch.from_numpy(distance_transform_edt(hidden.numpy())) > reach
-    if not bool(inner.any()):
-        return inner
-    return hidden & (torch.from_numpy(distance_transform_edt(~inner.numpy())) < reach / 2)
+    inner = torch.from_numpy(distance_transform_edt(hidden.cpu().numpy())) > reach
+    if bool(inner.any()):
+        inner = torch.from_numpy(distance_transform_edt(~inner.numpy())) < reach / 2
+    return hidden & inner.to(hidden.device)
 
 
 def eroded(mask: Bool[Tensor, "*batch h w"], steps: int) -> Bool[Tensor, "*batch h w"]:

@@ -8,6 +8,7 @@ It sums over the vertices, so its weight depends on the mesh, as in the release.
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..constants import constant
 from ..types import Camera
 from .bbox import WIDTH
 
@@ -21,7 +22,7 @@ def offscreen_term(
     camera: Camera,
 ) -> Float[Tensor, "*starts objects"]:
     """Pixels by which vertices leave the image, and metres by which they leave 0-8 m."""
-    size = pixels.new_tensor([camera.width, camera.height])
+    size = constant((camera.width, camera.height), pixels)
     beyond = ((pixels - size).relu() + (-pixels).relu()).sum(-1) * (WIDTH / camera.width)
     z = verts_cam[..., 2]
     return (beyond + (-z).relu() + (z - FARTHEST).relu()).mul(real).sum(-1)

@@ -36,8 +36,8 @@ class Watch:
     """Set it to end the run at its next step."""
     last: float = field(default=-1e9)
     energies: list[float] = field(default_factory=lambda: [])
-    """Total energy of the present descent whenever it was shown."""
-    index: int = 0
+    """Of each room that was shown since furniture began to move, or began anew."""
+    stage: str = ""
 
     def __call__(self, step: Step) -> None:
         """Show the step if it is time.
@@ -50,15 +50,15 @@ class Watch:
         now = time.monotonic()
         if now - self.last < PAUSE and step.index + 1 < step.steps:
             return
-        if step.index < self.index:
-            self.energies.clear()
-        self.last, self.index = now, step.index
-        if step.energy is not None:
-            self.energies.append(float(step.energy.total.detach()))
-        self.tell(step)
+        self.last = now
         scene = seen_in(step, self.pieces)
-        if scene is not None:
+        if scene is not None and step.energy is not None:
+            if step.stage != self.stage:
+                self.energies.clear()
+            self.energies.append(float(step.energy.per_item.detach().amin(0).sum()))
             self.show(scene)
+        self.stage = step.stage
+        self.tell(step)
 
 
 def seen_in(step: Step, pieces: tuple[Piece, ...]) -> Scene | None:

@@ -1,7 +1,7 @@
 """The tab `Solve`: run the main job again from the edited room, and watch it."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,7 @@ def add_gauges(window: Window, text: str) -> Gauges:
 
 
 def _draw_curve(gauges: Gauges, watch: Watch) -> None:
-    """The energy of the present descent."""
+    """The energy of the rooms that were shown."""
     values = list(watch.energies)
     if len(values) > 1:
         gauges.curve.visible = True
@@ -99,7 +99,7 @@ def _solve(window: Window, job: SolveJob, gauges: Gauges) -> None:
     session = window.session
     edits, capture = session.edits, session.capture
     assert capture is not None
-    origin = Origin(job.origin.source, job.origin.format, edits)
+    origin = replace(job.origin, edits=edits)
     shown = None
     try:
         watch = begin_watching(window, started_from(capture, edits).scene, gauges)

@@ -10,6 +10,7 @@ from ..edits import Edit, apply_edits
 from ..minimize import Observer
 from ..pipeline import reconstruct
 from ..presets import Config
+from ..refinement import refined_room
 from ..results import Origin, write_results
 from ..run import Run
 from ..types import Capture
@@ -34,8 +35,10 @@ def solve_again(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        run = Run(folder, observe)
+        run = Run(folder, observe, device=origin.device)
         room = reconstruct(edited, config, run, pinned)
+        if origin.refine:
+            room = refined_room(room, edited, observe)
     finally:
         torch.set_num_threads(threads)
     write_results(edited, room, config, run, origin)

@@ -107,7 +107,7 @@ def outline_face(scene: Scene, scratch: Scratch, item: int, edge: wp.vec4l) -> i
 @wp.kernel
 @no_type_check
 def enter_cuts(scene: Scene, scratch: Scratch) -> None:
-    """Find, for each pair of centres, the outermost cut, and count the pairs."""
+    """Find, for each pair of centres, the outermost cut."""
     item, e = wp.tid()
     edge = scene.edges[item % scene.shapes * scene.n_edges + e]
     f = outline_face(scene, scratch, item, edge)
@@ -121,9 +121,7 @@ def enter_cuts(scene: Scene, scratch: Scratch) -> None:
                 inner = scratch.near[base + g.inner]
                 outer = scratch.near[base + g.outer]
                 if inner != wp.uint64(0) and outer == wp.uint64(0):
-                    old = wp.atomic_max(scratch.pairs, 2 * base + g.pair, key(g, e))
-                    if old == wp.uint64(0):
-                        wp.atomic_add(scratch.count, 1, 1)
+                    wp.atomic_max(scratch.pairs, 2 * base + g.pair, key(g, e))
 
 
 @wp.kernel
@@ -180,14 +178,14 @@ def mark_cuts(scratch: Scratch, maps: Maps) -> None:
     target = scratch.targets[i]
     if target >= 0:
         if maps.image[target] < 0.0 or maps.image[target] > 1.0:
-            scratch.targets[i] = -1 - target
+            scratch.targets[i] = -2 - target
 
 
 @wp.kernel
 @no_type_check
 def bound_cuts(scratch: Scratch, maps: Maps) -> None:
     """Bound the pixel of a marked cut to [0, 1]."""
-    target = -1 - scratch.targets[wp.tid()]
+    target = -2 - scratch.targets[wp.tid()]
     if target >= 0:
         maps.image[target] = wp.clamp(maps.image[target], 0.0, 1.0)
 

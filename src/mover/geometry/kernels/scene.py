@@ -59,7 +59,8 @@ class Scratch:
     cuts: wp.array(dtype=wp.vec4i)
     """Cuts that count: two vertices (over all items), line x 4 + flags, covered place."""
     targets: wp.array(dtype=wp.int32)
-    """Pixel of the window that each cut moves, over all items; -1 - pixel where it overshoots."""
+    """Pixel of the window that each cut moves, over all items; where it overshoots -1 - pixel
+    (`grid`: -2 - pixel; -1 where there is none)."""
     count: wp.array(dtype=wp.int32)
     """Number of entries of `queue`, of `cuts`."""
 

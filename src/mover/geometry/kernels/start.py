@@ -6,16 +6,25 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
-from threading import Lock
+from pathlib import Path
+from threading import RLock
 from types import ModuleType
+from typing import Any
+
+import torch
 
 log = logging.getLogger(__name__)
-_lock = Lock()
+_lock = RLock()  # of all that is done once; `cache` alone lets two threads do it
+
+
+def started() -> ModuleType:
+    """Warp, ready for use."""
+    with _lock:
+        return _started()
 
 
 @cache
-def started() -> ModuleType:
-    """Warp, ready for use."""
+def _started() -> ModuleType:
     import warp as wp
 
     with _quiet(wp):
@@ -26,8 +35,8 @@ def started() -> ModuleType:
 def kernels(name: str, device: str) -> ModuleType:
     """The module of that name in this package, compiled for the device.
 
-    The first call on a machine compiles (seconds, told by one line of the log); the result stays
-    in Warp's cache, and later runs load it.
+    The first call on a machine compiles (seconds, told before by a line of the log, which the
+    commands show); the result stays in Warp's cache, and later runs load it.
     """
     with _lock:
         return _loaded(name, device)
@@ -37,10 +46,39 @@ def kernels(name: str, device: str) -> ModuleType:
 def _loaded(name: str, device: str) -> ModuleType:
     wp = started()
     module = import_module(f"{__package__}.{name}")
-    log.info("loading kernels for %s; the first time on a machine they are compiled", device)
+    if _fresh(wp, module, device):
+        log.info("compiling kernels, once on this machine: %s for %s ...", name, device)
     with _quiet(wp):
         wp.load_module(module, device=device)
     return module
+
+
+def name_of(device: torch.device) -> str:
+    """What Warp calls a device of torch."""
+    return str(started().device_from_torch(device))
+
+
+def launch(
+    kernel: Any,  # noqa: ANN401
+    dim: int | tuple[int, ...],
+    inputs: list[Any],
+    device: torch.device,
+) -> None:
+    """Launch a kernel where torch works now: on a GPU in its stream, which may be recording."""
+    stream = _stream(torch.cuda.current_stream(device)) if device.type == "cuda" else None
+    started().launch(kernel, dim, inputs, device=name_of(device), stream=stream)
+
+
+@cache  # torch's streams live as long as the process
+def _stream(stream: Any) -> Any:  # noqa: ANN401
+    return started().stream_from_torch(stream)
+
+
+def _fresh(wp: ModuleType, module: ModuleType, device: str) -> bool:
+    """Whether Warp's cache does not hold a module as it is now."""
+    threads = 1 if device == "cpu" else None  # of a block; it is a part of the name
+    folder = wp.get_module(module.__name__).get_module_identifier(threads)
+    return not (Path(wp.config.kernel_cache_dir) / folder).is_dir()
 
 
 @contextmanager

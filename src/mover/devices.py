@@ -1,0 +1,39 @@
+"""Where the heavy work is done: on the processor, or on an NVIDIA GPU."""
+
+from typing import Literal
+
+import torch
+
+from .records import InputError
+
+Choice = Literal["auto", "cpu", "cuda"]
+CPU = torch.device("cpu")
+
+
+def device_of(choice: Choice) -> torch.device:
+    """The device that is meant; `auto`: the GPU where torch sees one.
+
+    Raises:
+        InputError: If there is no GPU, or torch was built without CUDA.
+    """
+    there = torch.cuda.is_available()
+    if choice == "cuda" and not there:
+        built = torch.backends.cuda.is_built()
+        reason = "torch finds no NVIDIA GPU" if built else f"torch {torch.__version__} has no CUDA"
+        raise InputError(f"--device cuda: {reason}, expected a GPU; --device cpu needs none")
+    return (
+        CPU if choice == "cpu" or not there else torch.device("cuda", torch.cuda.current_device())
+    )
+
+
+def finish(device: torch.device) -> None:
+    """Wait until a GPU has done what it was given: before a clock is read."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def named(device: torch.device) -> str:
+    """What a log calls it: `cpu`, or `cuda` and the name of the GPU."""
+    if device.type != "cuda":
+        return str(device)
+    return f"cuda ({torch.cuda.get_device_name(device)})"

@@ -1,0 +1,147 @@
+"""A device that is none: torch holds that its tensors lie elsewhere, and the CPU does the work.
+
+What would fail on a GPU fails here: tensors of two devices in one operation and, inside `asking`,
+whatever waits for a number or copies from the host. Kernels are launched as for a GPU.
+"""
+
+from collections.abc import Generator
+from contextlib import contextmanager
+from functools import cache
+
+import pytest
+import torch
+from torch.utils._python_dispatch import return_and_correct_aliasing
+from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
+
+aten = torch.ops.aten
+ASKS = (
+    aten._local_scalar_dense, aten.nonzero, aten.masked_select, aten.unique_consecutive,
+    aten._unique2, aten.equal, aten.is_nonzero, aten.item,
+)  # fmt: skip
+NAME = "elsewhere"
+_forbidden: list[bool] = [False]
+
+
+class Asked(RuntimeError):
+    """The host was asked where a recording would fail."""
+
+
+class Elsewhere(torch.Tensor):
+    """A tensor that says that it lies on the device; `here` is where it really is."""
+
+    here: torch.Tensor
+
+    @staticmethod
+    def __new__(cls, here):
+        x = torch.Tensor._make_wrapper_subclass(
+            cls, here.shape, strides=here.stride(), storage_offset=here.storage_offset(),
+            dtype=here.dtype, device=f"{NAME}:0",
+        )  # fmt: skip
+        x.here = here
+        return x
+
+    def __repr__(self):
+        return f"Elsewhere({self.here})"
+
+    def tolist(self):
+        """The numbers."""
+        ask("tolist")
+        return self.here.tolist()
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        _check(func, args, kwargs)
+        out = func(*tree_map(_here, args), **tree_map(_here, kwargs))
+        asked = kwargs.get("device")
+        if asked is not None and torch.device(asked).type == "cpu":
+            ask(str(func))
+            return out
+        out = tree_map(lambda x: Elsewhere(x) if isinstance(x, torch.Tensor) else x, out)
+        return return_and_correct_aliasing(func, args, kwargs, out)
+
+
+def _here(x):
+    if isinstance(x, torch.device):
+        return torch.device("cpu")
+    return x.here if isinstance(x, Elsewhere) else x
+
+
+def _check(func, args, kwargs):
+    """Refuse what a GPU would refuse."""
+    name = func.overloadpacket
+    tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, torch.Tensor)]
+    local = [x for x in tensors if not isinstance(x, Elsewhere)]
+    if name in ASKS or (name is aten.index and any(x.dtype == torch.bool for x in tensors[1:])):
+        ask(str(func))
+    if name is aten.copy_:
+        if local:
+            ask(str(func))
+    elif name in (aten.index, aten.index_put_, aten._index_put_impl_):
+        if local:
+            ask(str(func))  # numbers of the CPU are copied
+    elif any(x.dim() for x in local):
+        raise RuntimeError(f"{func}: tensors here and elsewhere, {[tuple(x.shape) for x in local]}")
+
+
+def ask(what):
+    """Note that the host is asked."""
+    if _forbidden[0]:
+        raise Asked(what)
+
+
+@contextmanager
+def asking_nothing() -> Generator[None, None, None]:
+    """Let nobody ask the host, as while a GPU records."""
+    _forbidden[0] = True
+    try:
+        yield
+    finally:
+        _forbidden[0] = False
+
+
+def _empty(size, dtype=None, **_rest):
+    return Elsewhere(torch.empty(size, dtype=dtype))
+
+
+def _empty_strided(size, stride, dtype=None, **_rest):
+    return Elsewhere(torch.empty_strided(size, stride, dtype=dtype))
+
+
+def _copy_from(source, to, *_):
+    ask("copy")
+    _here(to).copy_(_here(source))
+    return to
+
+
+@cache
+def registered() -> torch.library.Library:
+    """Make the device known to torch; skips where a GPU is, whose work torch would then neglect."""
+    if torch.cuda.is_available():
+        pytest.skip("a GPU is here: nothing is pretended")
+    _setup_privateuseone_for_python_backend(NAME)
+    library = torch.library.Library("aten", "IMPL")
+    library.impl("empty.memory_format", _empty, "PrivateUse1")
+    library.impl("empty_strided", _empty_strided, "PrivateUse1")
+    library.impl("_copy_from", _copy_from, "PrivateUse1")
+    return library
+
+
+@contextmanager
+def kernels_elsewhere() -> Generator[torch.device, None, None]:
+    """Warp reads what lies on the device, and is launched as for a GPU; gives the device."""
+    import warp as wp
+
+    from mover.geometry.raster_engine import DEVICES
+
+    registered()
+    from_torch, of = wp.from_torch, wp.device_from_torch
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wp, "from_torch", lambda x, **rest: from_torch(_here(x), **rest))
+        patch.setattr(wp, "device_from_torch", lambda d: of(_here(torch.device(d))))
+        DEVICES.append(NAME)
+        try:
+            yield torch.device(NAME)
+        finally:
+            DEVICES.remove(NAME)

@@ -1,0 +1,276 @@
+"""The main job on a device that is not the CPU: a pretended one, and a GPU where there is one."""
+
+import json
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+from pretended import Asked, Elsewhere, asking_nothing, kernels_elsewhere, registered
+from sm90 import ptx_of
+from test_pipeline import light
+from test_priced import WEIGHTS, room, starts_of, told
+from test_raster_warp import pulled, scene
+from test_volume import sphere
+
+import mover.geometry
+from mover import commands
+from mover import minimize as descent
+from mover.devices import CPU, device_of, named
+from mover.energy import SceneConfig, SceneWeights, scene_energy
+from mover.geometry import raster_torch, raster_warp
+from mover.geometry.nearest_warp import clouds, nearest, nearest_torch
+from mover.geometry.raster import Views, layers
+from mover.geometry.volume import grid_around, sample, sample_torch, union_bodies
+from mover.minimize import Adam, Energy, minimize
+from mover.pipeline import reconstruct
+from mover.records import InputError, record, to_device
+from mover.results import write_results
+from mover.run import Run
+from mover.stages.place_objects import PlaceConfig, energy_of, place_objects
+from mover.types import Layout
+
+pytest.importorskip("warp")
+GPU = pytest.param("cuda", marks=pytest.mark.gpu)
+RELEASE = SceneWeights(
+    1000.0, 0.3, 1000.0, 80.0, 1000.0, 1e5, edge=0.03, offscreen=1.0, free_space=80.0
+)
+ADAM = Adam(4, 0.03, 0.01, beta2=0.98, keep_best=True)
+
+
+@pytest.fixture(params=["pretended", GPU])
+def device(request):
+    """A device that is pretended, and a GPU."""
+    if request.param == "cuda":
+        if not torch.cuda.is_available():
+            pytest.skip("no NVIDIA GPU here")
+        yield torch.device("cuda", 0)
+        return
+    with kernels_elsewhere() as there:
+        yield there
+
+
+class TestPretended:
+    def test_what_a_gpu_refuses_is_refused(self):
+        registered()
+        there = torch.arange(4.0).to("elsewhere")
+        assert isinstance(there, Elsewhere)
+        with pytest.raises(RuntimeError, match="here and elsewhere"):
+            there + torch.ones(4)
+        with asking_nothing():
+            assert isinstance(there * 2 + torch.full_like(there, 3), Elsewhere)
+            for asks in (
+                lambda: float(there[0]),
+                lambda: there[there > 1],
+                lambda: there.tolist(),
+                lambda: there.cpu(),
+                lambda: there.new_tensor([1.0]),
+                lambda: torch.ones(4).to(there),
+            ):
+                with pytest.raises(Asked):
+                    asks()
+        assert torch.equal(there.cpu(), torch.arange(4.0))
+
+
+class TestGeometry:
+    def test_what_is_drawn_and_its_gradient_are_those_of_torch(self, device):
+        verts_cam, shape, views = scene(size=96, starts=2)
+        there = (to_device(x, device) for x in (verts_cam, shape, views))
+        found = pulled(raster_warp, *there)
+        exact = pulled(raster_torch, verts_cam.double(), shape, views)
+        assert torch.equal(found[3].cpu(), exact[3])
+        for values, truth in zip(found[:3], exact[:3], strict=True):
+            torch.testing.assert_close(values.cpu().double(), truth, atol=1e-5, rtol=0)
+        assert (found[4].cpu() - exact[4]).norm() <= 1e-3 * exact[4].norm()
+
+    def test_first_hits_and_layers_are_those_of_torch(self, device):
+        verts_cam, shape, views = scene(["sphere"], 50)
+        inputs = verts_cam[0], shape.faces[0], views.K[0]
+        there = [x.to(device) for x in inputs]
+        found, truth = (
+            r.first_hit(*x, (50, 40)) for r, x in ((raster_warp, there), (raster_torch, inputs))
+        )
+        for values, expected in zip(found, truth, strict=True):
+            assert torch.equal(values.cpu(), expected)
+        seen = layers(there[0][None], there[1], Views(there[2][None], 50, 40))
+        exact = raster_torch.layers(inputs[0][None], inputs[1], Views(inputs[2][None], 50, 40))
+        for values, expected in ((seen.front, exact.front), (seen.exit, exact.exit)):
+            torch.testing.assert_close(values.cpu(), expected, atol=1e-5, rtol=0)
+
+    def test_nearest_points_volumes_and_lookups_are_those_of_the_cpu(self, device):
+        g = torch.Generator().manual_seed(0)
+        points, query = (torch.rand(2, n, 3, generator=g) for n in (90, 30))
+        held, sizes = clouds(points), torch.rand(2, 3, generator=g) + 0.5
+        index = nearest(to_device(held, device), query.to(device), sizes.to(device))
+        assert torch.equal(index.cpu(), nearest_torch(held, query, sizes))
+        verts, faces = sphere([0.0, 0, 0], 0.5, 3)
+        grid = grid_around(verts.amin(0), verts.amax(0), 40, padding=0.1)
+        truth = union_bodies(verts[None], faces, grid)
+        found = union_bodies(verts[None].to(device), faces.to(device), to_device(grid, device))
+        torch.testing.assert_close(found.values.cpu(), truth.values, rtol=0, atol=2e-6)
+        places = torch.rand(50, 3, generator=g) - 0.5
+        value = sample(found, places.to(device)).cpu()
+        torch.testing.assert_close(value, sample_torch(truth, places), rtol=1e-5, atol=1e-5)
+
+    @pytest.mark.slow
+    def test_every_module_of_kernels_that_a_gpu_runs_compiles_for_an_h100(self, tmp_path):
+        folder = Path(mover.geometry.__file__).parent
+        text = "".join(p.read_text() for p in folder.glob("*.py") if p.stem != "raster_warp_cpu")
+        names = set(re.findall(r'kernels\("(\w+)", name_of', text)) | {
+            "bodies",
+            "crossings",
+            "lower",
+        }
+        assert {"grid", "exits", "nearest", "lookup", "price", "reach"} < names
+        for name in sorted(names):
+            (tmp_path / name).mkdir()
+            ptx_of(name, tmp_path / name)
+
+
+def priced(inputs, weights, form):
+    rest = inputs.objects, inputs.camera, inputs.image, inputs.humans
+    return lambda layout: scene_energy(layout, *rest, SceneConfig(weights, form))
+
+
+@pytest.mark.parametrize(
+    ("form", "weights"), [("robust", WEIGHTS), ("paper", SceneWeights()), ("release", RELEASE)]
+)
+def test_all_terms_and_their_gradients_are_those_of_the_cpu(device, form, weights):
+    inputs = room(32)
+    layout = starts_of(inputs, 2)
+    here = told(priced(inputs, weights, form), layout)
+    there = told(priced(to_device(inputs, device), weights, form), to_device(layout, device))
+    for value, truth in zip(there, here, strict=True):
+        assert value.device.type == device.type
+        assert (value.cpu() - truth).norm() <= 1e-3 * truth.norm()
+
+
+def replayed(step, _device, *, still):
+    """The steps after the first ones may not ask the host, as where they are recorded."""
+    assert still
+    taken = []
+
+    def take():
+        taken.append(1)
+        if len(taken) <= 2:
+            return step()
+        with asking_nothing():
+            return step()
+
+    return take
+
+
+@pytest.mark.parametrize(
+    ("form", "weights"), [("robust", WEIGHTS), ("paper", SceneWeights()), ("release", RELEASE)]
+)
+def test_a_recorded_descent_ends_where_the_plain_one_does(device, form, weights, monkeypatch):
+    if device.type != "cuda":
+        monkeypatch.setattr(descent, "stepper", replayed)
+    inputs = to_device(room(32), device)
+    config = PlaceConfig(weights, form)
+    start = to_device(starts_of(room(32), 2), device)
+    energy = energy_of(inputs, config)
+    with monkeypatch.context() as patch:
+        patch.setattr(descent, "stepper", lambda step, _device, **_: step)
+        plain = minimize(energy, start, ADAM)
+    recorded = minimize(energy, start, ADAM, still=True)
+    tolerance = {"rtol": 1e-3, "atol": 1e-3} if device.type == "cuda" else {"rtol": 0, "atol": 0}
+    for name in ("value", "trace"):
+        found, truth = getattr(recorded, name), getattr(plain, name)
+        torch.testing.assert_close(found.cpu(), truth.cpu(), **tolerance)
+    for field in fields(Layout):
+        found, truth = getattr(recorded.at, field.name), getattr(plain.at, field.name)
+        torch.testing.assert_close(found.cpu(), truth.cpu(), **tolerance)
+
+
+def test_a_whole_placing_ends_where_it_ends_on_the_cpu(device, monkeypatch):
+    if device.type != "cuda":
+        monkeypatch.setattr(descent, "stepper", replayed)
+    inputs = replace(room(32), starts=starts_of(room(32), 1))
+    config = PlaceConfig(
+        WEIGHTS, "robust", ADAM, yaws=2, short=Adam(3, 0.03), keep=1, tie=1.0, apart=0.3
+    )
+    here = place_objects(inputs, config)
+    found = to_device(place_objects(to_device(inputs, device), config), "cpu")
+    torch.testing.assert_close(found.energy, here.energy, rtol=0.05, atol=1e-3)
+    for name in ("t_world_object", "yaw", "log_scale"):
+        expected = getattr(here.layout, name)
+        torch.testing.assert_close(getattr(found.layout, name), expected, rtol=0, atol=0.02)
+
+
+@record
+class Point:
+    """One field of unknowns."""
+
+    x: torch.Tensor
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU here")
+@pytest.mark.parametrize("keep_best", [False, True])
+def test_a_replayed_step_has_the_numbers_of_the_step_itself(keep_best):
+    """Nothing in it depends on the order of threads, so that a recording may change no bit."""
+    start = Point(torch.linspace(-2, 2, 60, device="cuda").view(3, 20))
+
+    def energy(p):
+        return Energy({"rough": (3 * p.x).sin() + p.x.square()})
+
+    method = Adam(40, 0.1, 0.01, beta2=0.98, keep_best=keep_best)
+    plain, replay = (minimize(energy, start, method, still=still) for still in (False, True))
+    for name in ("value", "trace"):
+        assert torch.equal(getattr(plain, name), getattr(replay, name))
+    assert torch.equal(plain.at.x, replay.at.x)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["robust", "release"])
+def test_the_main_job_ends_where_it_ends_on_the_cpu(device, preset, small_room, tmp_path):
+    from mover.rooms.noise import NoiseConfig, add_noise
+
+    capture, config = add_noise(small_room, NoiseConfig(), 1), light(preset, steps=4)
+    here, there = (
+        reconstruct(capture, config, Run(tmp_path / d.type, device=d)) for d in (CPU, device)
+    )
+    run = Run(tmp_path / device.type, device=device)
+    again = reconstruct(capture, config, run)  # from disk, and as before
+    write_results(capture, again, config, run)
+    log = json.loads((run.folder / "run.json").read_text())
+    assert log["device"] == named(device)
+    assert all(stage["kept"] for stage in log["stages"])
+    for one, other in zip(here.scene.pieces, there.scene.pieces, strict=True):
+        assert other.t_world_object.device == CPU
+        torch.testing.assert_close(one.t_world_object, other.t_world_object, rtol=0, atol=0.1)
+
+
+class TestChoice:
+    def test_auto_is_the_processor_where_there_is_no_gpu(self, monkeypatch):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+        assert device_of("auto") == device_of("cpu") == CPU
+        with pytest.raises(InputError, match=r"--device cuda: torch .*, expected a GPU"):
+            device_of("cuda")
+
+    def test_a_run_on_a_gpu_that_is_not_there_ends_before_anything_is_read(
+        self, monkeypatch, tmp_path, capsys
+    ):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+        code = commands.run_command("run", [str(tmp_path / "none"), "--device", "cuda"])
+        assert code == 2
+        assert "mover run: --device cuda: torch" in capsys.readouterr().err
+
+    def test_what_a_device_computed_is_not_taken_for_the_processors(self, tmp_path):
+        names = []
+        for device in (CPU, torch.device("meta")):
+            run = Run(tmp_path, device=device)
+            run.stage(place_objects_like, Point(torch.zeros(2)), Adam())
+            names.append(run.stages[0])
+        assert not any(stage.kept for stage in names)
+        assert names[0].fingerprint != names[1].fingerprint
+
+
+def place_objects_like(inputs: Point, _config: Adam, _observe) -> Point:
+    """A stage that is computed on the device."""
+    return inputs if inputs.x.device.type == "cpu" else Point(torch.zeros(2))
+
+
+place_objects_like.__name__ = "place_objects"

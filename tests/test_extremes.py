@@ -1,0 +1,114 @@
+"""The main job on extreme captures: it ends, every number is finite, and two runs are the same."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from test_pipeline import light, run_in
+
+from mover.geometry.camera import to_camera
+from mover.geometry.runs import decode
+from mover.rooms.noise import NoiseConfig, add_noise
+from mover.rooms.render import encode
+from mover.types import Capture, Masks, Mesh
+
+pytestmark = pytest.mark.slow
+GROWN = 8  # 480 x 270 to 3,840 x 2,160
+
+
+@pytest.fixture(scope="module")
+def capture(small_room) -> Capture:
+    return add_noise(small_room, NoiseConfig(), 1)
+
+
+def changed(capture: Capture, **fields: object) -> Capture:
+    """The capture with its first object changed."""
+    first, *rest = capture.scene.pieces
+    pieces = (replace(first, **fields), *rest)
+    return replace(capture, scene=replace(capture.scene, pieces=pieces))
+
+
+def ends_finite(capture: Capture, folder: Path) -> list[torch.Tensor]:
+    """Where a short run puts everything; all of it is finite."""
+    room = run_in(folder, capture, light("robust", steps=5))
+    found = [torch.tensor(room.scene.ground), room.scene.camera.R_cam_world]
+    for piece in room.scene.pieces:
+        found += [piece.t_world_object, piece.yaw, piece.scale]
+    for value in found:
+        assert value.isfinite().all()
+    return found
+
+
+def behind(capture: Capture) -> torch.Tensor:
+    """A place three metres behind the camera."""
+    place = torch.tensor([0.0, -1.4, 3.0])
+    assert to_camera(place[None], capture.scene.camera.R_cam_world)[0, 2] < -1
+    return place
+
+
+def test_a_mesh_of_one_triangle(capture, tmp_path):
+    one = Mesh(torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [0, 0.8, 0]]), torch.tensor([[0, 1, 2]]))
+    ends_finite(changed(capture, mesh=one), tmp_path)
+
+
+def test_a_mesh_of_half_a_million_faces(capture, tmp_path):
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=7, radius=0.4)  # 327,680 faces
+    disc = trimesh.creation.icosphere(subdivisions=6, radius=0.3)
+    disc = trimesh.util.concatenate([disc, disc.copy().apply_translation([0.2, 0.3, 0])])
+    both = trimesh.util.concatenate([ball, disc])
+    assert len(both.faces) == 491520
+    mesh = Mesh(torch.tensor(both.vertices).float(), torch.tensor(both.faces))
+    ends_finite(changed(capture, mesh=mesh), tmp_path)
+
+
+def test_an_object_behind_the_camera(capture, tmp_path):
+    ends_finite(changed(capture, t_world_object=behind(capture)), tmp_path)
+
+
+def test_an_object_outside_of_the_image(capture, tmp_path):
+    place = torch.tensor([40.0, -1.4, -3.0])
+    ends_finite(changed(capture, t_world_object=place), tmp_path)
+
+
+def test_bodies_behind_the_camera(capture, tmp_path):
+    bodies = capture.bodies
+    moved = replace(bodies, verts=bodies.verts + torch.tensor([0.0, 0, 12.0]), pose=None)
+    ends_finite(replace(capture, bodies=moved), tmp_path)
+
+
+def test_an_image_of_4k(capture, tmp_path):
+    scene, people = capture.scene, capture.people
+    camera = replace(
+        scene.camera,
+        K=scene.camera.K * torch.tensor([[GROWN], [GROWN], [1.0]]),
+        width=GROWN * scene.camera.width,
+        height=GROWN * scene.camera.height,
+    )
+    assert (camera.width, camera.height) == (3840, 2160)
+    found = tuple(
+        replace(d, box=GROWN * d.box, mask=None if d.mask is None else enlarged(d.mask))
+        for d in capture.detections
+    )
+    large = replace(
+        capture,
+        scene=replace(scene, camera=camera),
+        reference=None,
+        reference_people=None,
+        detections=found,
+        people=None if people is None else replace(people, masks=enlarged(people.masks)),
+    )
+    ends_finite(large, tmp_path)
+
+
+def test_two_runs_are_the_same_to_the_bit(capture, tmp_path):
+    one, two = (ends_finite(capture, tmp_path / name) for name in ("one", "two"))
+    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
+
+
+def enlarged(masks: Masks) -> Masks:
+    """The same masks in an image of 4K."""
+    small = [decode(masks, row).numpy() for row in range(len(masks.counts))]
+    return encode([m.repeat(GROWN, 0).repeat(GROWN, 1) for m in small])

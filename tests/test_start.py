@@ -1,0 +1,78 @@
+"""Starting: Warp is initialised once, kernels are compiled once, and both are told."""
+
+import logging
+import os
+import subprocess
+import sys
+
+import pytest
+
+from mover.geometry.kernels import start
+from mover.minimize import Step
+from mover.progress import Bar
+
+pytest.importorskip("warp")
+
+RACE = """
+import threading, time, warp
+begun, init = [], warp.init
+def slow():
+    begun.append(1); time.sleep(0.2); init()
+warp.init = slow
+from mover.geometry.kernels.start import started
+folder = []
+ask = lambda: folder.append(started().config.kernel_cache_dir)
+threads = [threading.Thread(target=ask) for _ in range(4)]
+for t in threads: t.start()
+for t in threads: t.join()
+assert begun == [1], begun
+assert len(set(folder)) == 1, folder
+"""
+COMPILE = """
+from mover.geometry.kernels.start import kernels
+from mover.minimize import Step
+from mover.progress import Bar
+with Bar() as bar:
+    bar(Step("gather", 0, 1))
+    kernels("touched", "cpu")
+"""
+
+
+def said(code: str, **env: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | env, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+def test_threads_that_start_at_once_initialise_warp_once_and_say_nothing():
+    assert said(RACE) == ""
+
+
+@pytest.mark.slow
+def test_the_progress_tells_that_kernels_are_compiled_and_only_the_first_time(tmp_path):
+    first, second = (said(COMPILE, WARP_CACHE_PATH=str(tmp_path)) for _ in range(2))
+    assert "compiling kernels, once on this machine: touched for cpu" in first
+    assert second.strip() == "gather ..."
+
+
+def test_kernels_in_the_cache_are_loaded_without_a_word(caplog):
+    start.kernels("touched", "cpu")
+    start._loaded.cache_clear()
+    with caplog.at_level(logging.INFO):
+        start.kernels("touched", "cpu")
+    assert caplog.records == []
+
+
+def test_a_bar_shows_what_is_compiled_and_leaves_the_log_as_it_was(capsys):
+    log = logging.getLogger("mover.geometry.kernels.start")
+    with Bar() as bar:
+        bar(Step("place_objects", 0, 2))
+        log.info("compiling kernels, once on this machine: %s for %s ...", "grid", "cpu")
+    shown = capsys.readouterr().err
+    assert shown.splitlines()[0] == "place_objects ..."
+    assert "compiling kernels, once on this machine: grid for cpu" in shown
+    log.warning("after")
+    assert "after" not in capsys.readouterr().out
+    assert logging.getLogger("mover.geometry.kernels").handlers == []
