@@ -159,6 +159,16 @@ def test_a_failed_job_is_told(tmp_path: Path) -> None:
     assert "**Failed**: rooms 1000, depth: ValueError: not finite" in page.read_text()
 
 
+def test_looking_runs_nothing_and_says_what_is_missing(tmp_path: Path) -> None:
+    asked, table = StudyArgs("camera", seeds="1000,1001", out=tmp_path), Table()
+    jobs = [Job("rooms", 1000, name, tmp_path) for name in (ROOM, "robust")]
+    done = list(run_all(jobs, 1, table, store=False))
+    page = run_study(replace(asked, look=True), launch=table)[0].read_text()
+    assert [(job.rooms, job.seed, job.name) for job in done] == table.done
+    assert "**Not run**: 8 of 10 jobs" in page
+    assert "| feet and objects (robust) |" in page
+
+
 @pytest.mark.parametrize("name", [n for n in STUDIES if n != "sets"])
 def test_every_study_has_a_page_with_its_command_and_plots(name: str, tmp_path: Path) -> None:
     args = StudyArgs(name, seeds="1000,1001", out=tmp_path)

@@ -15,10 +15,10 @@ from . import study_noise, study_rows, study_video
 from .changes import set_named
 from .finished import Finished, read_finished
 from .job import ROOM, Job
-from .queue import Launch, failure_of, has_results, open_jobs, run_all, start
+from .queue import Launch, open_jobs, run_all, start
 from .run import parse_seeds
 from .sets import SETS
-from .study_page import commands_of, table_of, write_csv
+from .study_page import commands_of, missing_of, table_of, write_csv
 from .study_rows import Ask, Page, Plan
 from .tables import made_by
 
@@ -95,6 +95,8 @@ class StudyArgs:
     """How many jobs run at once; 0: as many as there are cores."""
     keep: bool = False
     """Take finished jobs of other versions or settings of the program as they are."""
+    look: bool = False
+    """Run nothing: write the pages from the jobs that are finished."""
 
 
 def run_study(
@@ -118,7 +120,7 @@ def run_study(
     asks = {name: ask_of(args, STUDIES[name]) for name in names}
     plans = {name: jobs_of(STUDIES[name].plan(ask), ask, args.out) for name, ask in asks.items()}
     jobs = in_order([job for plan in plans.values() for job in plan])
-    waiting = open_jobs(jobs, args.keep)
+    waiting = [] if args.look else open_jobs(jobs, args.keep)
     done, count = len(jobs) - len(waiting), len(jobs)
     workers = args.workers or os.cpu_count() or 1
     for job in run_all(waiting, workers, launch or start, store=False):
@@ -168,7 +170,7 @@ def write_study(name: str, args: StudyArgs, ask: Ask, jobs: Sequence[Job]) -> Pa
         f"    {command_of(name, args)}",
         f"{study.about} {SCALE}",
         f"{_rooms(ask)} {made_by(versions)}",
-        *_failures(jobs),
+        *missing_of(jobs),
         *(table_of(filled) for filled in page.tables),
         *page.sections,
         *(f"![{title}]({title}.svg)" for title in page.plots),
@@ -199,15 +201,6 @@ def _rooms(ask: Ask) -> str:
     """How many rooms there are of which set."""
     counts = ", ".join(f"{len(seeds)} of `{name}`" for name, seeds in ask.seeds.items())
     return f"Rooms: {counts}."
-
-
-def _failures(jobs: Sequence[Job]) -> list[str]:
-    """What failed, so that nothing is left out silently."""
-    return [
-        f"**Failed**: {job.rooms} {job.seed}, {job.name}: {failure_of(job).reason}"
-        for job in jobs
-        if not has_results(job)
-    ]
 
 
 def _commands(page: Page, jobs: Sequence[Job], seeds: Mapping[str, str]) -> list[str]:

@@ -8,7 +8,8 @@ from ..records import replacing
 from .columns import COLUMNS, head_of, markdown, shown
 from .compare import Cell, Filled, Row
 from .finished import Source
-from .job import ROOM
+from .job import ROOM, Job
+from .queue import FAILED, failure_of, has_results
 from .statistics import FEWEST, RESAMPLES, Interval
 
 MARKS = {"better": " ▲", "worse": " ▼", "": ""}
@@ -37,6 +38,20 @@ def table_of(filled: Filled) -> str:
             _differences(filled),
         ]
     return "\n\n".join(parts)
+
+
+def missing_of(jobs: Sequence[Job]) -> list[str]:
+    """What failed or was not run, so that nothing is left out silently."""
+    without = [job for job in jobs if not has_results(job)]
+    failed = [job for job in without if (job.folder / FAILED).exists()]
+    lines = [
+        f"**Failed**: {job.rooms} {job.seed}, {job.name}: {failure_of(job).reason}"
+        for job in failed
+    ]
+    if len(without) > len(failed):
+        count = f"{len(without) - len(failed):,} of {len(jobs):,}"
+        lines.append(f"**Not run**: {count} jobs; the tables hold what is finished.")
+    return lines
 
 
 def _row(filled: Filled, index: int) -> list[str]:
