@@ -28,6 +28,7 @@ for needed in ("transformers", "av", "viser", "mujoco", "pxr"):
 ELSEWHERE = {
     "--ray.address auto": "a running Ray cluster",
     "--engine slurm": "a SLURM cluster",
+    "--device cuda": "an NVIDIA GPU",
     "mover experiment --": "hours: many known rooms",
     "mover experiment study": "hours: many known rooms",
     "mover experiment make": "many minutes: whole sets (tests/test_room_sets.py has little ones)",
