@@ -11,7 +11,7 @@ from typing import Any
 import make_scenes as layouts
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mover.readers.fields import At
@@ -114,6 +114,7 @@ def test_the_little_room_itself_is_taken(
 
 @pytest.mark.slow
 @FUZZ
+@example(format="release", which=37, where=0.5, junk=b"(", cut=False)  # an .npy header that goes on
 @given(
     format=st.sampled_from(FORMATS), which=st.integers(0, 100), where=st.floats(0, 1),
     junk=st.binary(min_size=1, max_size=8), cut=st.booleans(),

@@ -5,6 +5,7 @@ import zipfile
 import zlib
 from functools import lru_cache
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,10 @@ from ..records import InputError
 from .smpl_arrays import FACE_KEYS, body_from, keys_of
 from .smpl_model import SmplBody
 
+BROKEN = (
+    OSError, zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, SyntaxError,
+    TokenError,
+)  # fmt: skip
 FOLDER = "MOVER_BODY_MODELS"
 """Environment variable with the folder of the user's body models."""
 ENDINGS = (".npz", ".pkl")
@@ -111,7 +116,7 @@ def _npz(path: Path, name: str) -> dict[str, Any]:
         with np.load(path, allow_pickle=False) as data:
             for key in sorted(wanted & set(sizes)):
                 arrays[key] = _member(data, key, file)
-    except (OSError, zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError) as error:
+    except BROKEN as error:
         why = " ".join(f"{type(error).__name__}: {error}".split())[:160]
         raise InputError(f"{file}: cannot be read ({why}), expected an .npz file") from error
     return arrays

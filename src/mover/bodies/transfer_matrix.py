@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -98,7 +99,7 @@ def _valid(path: Path, rows: int) -> Int[Tensor, " valid"]:
         return torch.arange(rows)
     try:
         ids = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+    except (ValueError, OSError, EOFError, SyntaxError, TokenError) as error:
         raise InputError(f"{path.name}: cannot be read, expected an .npy file") from error
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or not len(ids) or ids.max() >= rows:
         raise InputError(

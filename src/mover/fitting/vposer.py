@@ -11,6 +11,7 @@ Gram-Schmidt). The network is written anew from its description; no weights are 
 
 from collections.abc import Mapping
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, Literal
 
 import torch
@@ -75,7 +76,7 @@ def _arrays(file: Path) -> dict[str, Tensor]:
     try:
         with np.load(file, allow_pickle=False) as data:
             return {key: torch.from_numpy(data[key]) for key in data.files}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
         raise InputError(f"{file.name}: cannot be read as arrays ({error})") from error
 
 

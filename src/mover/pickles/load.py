@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from io import BytesIO
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ BROKEN = (
     ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, EOFError, OSError,
     RecursionError, MemoryError, AssertionError, struct.error, zlib.error, lzma.LZMAError,
     zipfile.BadZipFile, pickle.UnpicklingError, NotImplementedError, SyntaxError,
+    TokenError,
 )  # fmt: skip
 
 

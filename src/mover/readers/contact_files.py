@@ -11,7 +11,7 @@ from torch import Tensor
 from ..records import InputError
 from ..types import Bodies
 from .fields import At
-from .npz_file import check_array_header, read_npz
+from .npz_file import BROKEN, check_array_header, read_npz
 
 KEYS = ("probability", "contact", "contacts", "contact_label_smplx", "contact_label", "prob")
 """Names under which contacts are looked for in .npz files, the first that is there counts."""
@@ -57,10 +57,10 @@ def _array(path: Path) -> np.ndarray:
         return np.asarray(at.value[key])
     if not path.is_file():
         raise InputError(f"{path}: there is no such file, expected an .npy or .npz file")
-    check_array_header(path)
     try:
+        check_array_header(path)
         return np.asarray(np.load(path, allow_pickle=False))
-    except (ValueError, OSError, EOFError) as error:
+    except BROKEN as error:
         raise InputError(f"{path.name}: cannot be read ({error})") from error
 
 

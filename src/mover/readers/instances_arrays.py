@@ -60,7 +60,7 @@ def read_array(path: Path) -> At:
     try:
         check_array_header(path)
         return At(np.load(path, allow_pickle=False), path.name)
-    except (*BROKEN, MemoryError, SyntaxError) as error:
+    except BROKEN as error:
         raise InputError(
             f"{path.name}: cannot be read ({reason(error)}), expected an .npy file"
         ) from error

@@ -4,6 +4,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,10 @@ from numpy.typing import NDArray
 from ..records import InputError, replacing
 from .fields import LARGEST_FILE, At, reason
 
-BROKEN = (ValueError, OSError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
+BROKEN = (
+    ValueError, OSError, EOFError, KeyError, RuntimeError, MemoryError, zipfile.BadZipFile,
+    zlib.error, SyntaxError, TokenError,  # of headers, which are Python
+)  # fmt: skip
 
 
 def read_npz(path: Path) -> At:
@@ -29,7 +33,7 @@ def read_npz(path: Path) -> At:
         _check_headers(path)
         with np.load(path, allow_pickle=False) as arrays:
             return At({key: arrays[key] for key in arrays.files}, name)
-    except (*BROKEN, MemoryError, SyntaxError) as error:
+    except BROKEN as error:
         raise InputError(
             f"{name}: cannot be read ({reason(error)}), expected an .npz file"
         ) from error

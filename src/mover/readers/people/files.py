@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ def _read_npy(path: Path) -> object:
         return np.load(path, allow_pickle=False)
     except ValueError:
         return load_pickle(path)
-    except (OSError, EOFError) as error:
+    except (OSError, EOFError, SyntaxError, TokenError) as error:
         raise InputError(f"{path.name}: cannot be read ({reason(error)})") from error
 
 
