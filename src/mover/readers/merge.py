@@ -1,6 +1,7 @@
 """Put parts of several tools into one capture folder; what is there stays unless given anew."""
 
 import dataclasses
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,10 +74,16 @@ def import_into(folder: Path, *given: Parts) -> Imported:
     whole = _with_size(dataclasses.replace(whole, name=old.name))
     capture = _capture(whole)
     _check_rest(whole, capture)
+    new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    written = write_whole(whole, old, capture, folder)
-    if capture is not None:
-        capture = read_capture(folder)  # its warnings are those of what was written
+    try:
+        written = write_whole(whole, old, capture, folder)
+        if capture is not None:
+            capture = read_capture(folder)  # its warnings are those of what was written
+    except InputError:  # of a mesh that only its own tool can read
+        if new:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
     return Imported(capture, tuple(written), _missing(whole, capture), tuple(notes))
 
 
