@@ -7,9 +7,12 @@ import os
 import tempfile
 import types
 import typing
+import zipfile
+import zlib
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, TypeVar, dataclass_transform
 
 import numpy as np
@@ -19,6 +22,11 @@ from jaxtyping import jaxtyped
 from torch import Tensor
 
 T = TypeVar("T")
+BROKEN = (
+    OSError, ValueError, KeyError, IndexError, EOFError, RuntimeError, MemoryError,
+    zipfile.BadZipFile, zlib.error, SyntaxError, TokenError,  # numpy's headers are Python
+)  # fmt: skip
+"""What reading a broken file of arrays raises."""
 _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 

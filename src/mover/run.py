@@ -66,7 +66,7 @@ class Run:
         if kept:
             output = records.load(typing.get_type_hints(fn)["return"], path)
         else:
-            output = _computed(fn, inputs, config, (self.observe, device))
+            output = _computed(fn, inputs, config, self.observe, device)
             records.save(output, path)
         seconds = time.perf_counter() - begin
         self.stages.append(StageLog(name, seconds, _peak_memory(), kept, path.name))
@@ -84,10 +84,10 @@ def _computed(
     fn: Callable[[In, Conf, Observer], Out],
     inputs: In,
     config: Conf,
-    where: tuple[Observer, torch.device],
+    observe: Observer,
+    device: torch.device,
 ) -> Out:
     """The output on the processor, wherever it is computed."""
-    observe, device = where
     if device == CPU:
         return fn(inputs, config, observe)
     return records.to_device(fn(records.to_device(inputs, device), config, observe), CPU)

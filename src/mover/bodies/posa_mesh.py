@@ -9,11 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..records import InputError
+from ..records import BROKEN, InputError
 
 LEVELS = (10475, 2619, 655)
 """Vertices of the full body and of the two coarser ones."""
-BROKEN = (OSError, ValueError, KeyError, IndexError, EOFError)
 
 
 @dataclass(frozen=True)

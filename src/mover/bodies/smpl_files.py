@@ -2,23 +2,17 @@
 
 import os
 import zipfile
-import zlib
 from functools import lru_cache
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
 from ..pickles import load_pickle
-from ..records import InputError
+from ..records import BROKEN, InputError
 from .smpl_arrays import FACE_KEYS, body_from, keys_of
 from .smpl_model import SmplBody
 
-BROKEN = (
-    OSError, zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, SyntaxError,
-    TokenError,
-)  # fmt: skip
 FOLDER = "MOVER_BODY_MODELS"
 """Environment variable with the folder of the user's body models."""
 ENDINGS = (".npz", ".pkl")

@@ -2,7 +2,6 @@
 
 import os
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..pickles import load_pickle
-from ..records import InputError, record
+from ..records import BROKEN, InputError, record
 from .smpl_arrays import KINDS
 from .smpl_files import FOLDER
 
@@ -99,7 +98,7 @@ def _valid(path: Path, rows: int) -> Int[Tensor, " valid"]:
         return torch.arange(rows)
     try:
         ids = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError, SyntaxError, TokenError) as error:
+    except BROKEN as error:
         raise InputError(f"{path.name}: cannot be read, expected an .npy file") from error
     if ids.ndim != 1 or ids.dtype.kind not in "iu" or not len(ids) or ids.max() >= rows:
         raise InputError(

@@ -11,14 +11,13 @@ Gram-Schmidt). The network is written anew from its description; no weights are 
 
 from collections.abc import Mapping
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..records import InputError, record
+from ..records import BROKEN, InputError, record
 from .prior import PosePrior
 
 BODY_JOINTS = 21
@@ -76,7 +75,7 @@ def _arrays(file: Path) -> dict[str, Tensor]:
     try:
         with np.load(file, allow_pickle=False) as data:
             return {key: torch.from_numpy(data[key]) for key in data.files}
-    except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
+    except BROKEN as error:
         raise InputError(f"{file.name}: cannot be read as arrays ({error})") from error
 
 

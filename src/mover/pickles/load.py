@@ -8,13 +8,12 @@ import zipfile
 import zlib
 from io import BytesIO
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
 
-from ..records import InputError
+from ..records import BROKEN, InputError
 from .arrays import LARGEST
 from .machine import Machine
 from .parts import STORAGES
@@ -22,11 +21,9 @@ from .values import Settler
 
 TORCH = 0x1950A86A20F9469CFC6C
 """The number that old torch files start with."""
-BROKEN = (
-    ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, EOFError, OSError,
-    RecursionError, MemoryError, AssertionError, struct.error, zlib.error, lzma.LZMAError,
-    zipfile.BadZipFile, pickle.UnpicklingError, NotImplementedError, SyntaxError,
-    TokenError,
+BROKEN_PICKLE = (
+    *BROKEN, TypeError, AttributeError, OverflowError, AssertionError, struct.error,
+    lzma.LZMAError, pickle.UnpicklingError,
 )  # fmt: skip
 
 
@@ -50,7 +47,7 @@ def load_pickle(path: Path) -> object:
         return _loaded(path.read_bytes())
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
-    except BROKEN as error:
+    except BROKEN_PICKLE as error:
         why = " ".join(f"{type(error).__name__}: {error}".split())[:160]
         raise InputError(f"{name}: cannot be read ({why}), expected a pickle of arrays") from error
 

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..records import InputError
+from ..records import BROKEN, InputError
 from ..types import Bodies
 from .fields import At
-from .npz_file import BROKEN, check_array_header, read_npz
+from .npz_file import check_array_header, read_npz
 
 KEYS = ("probability", "contact", "contacts", "contact_label_smplx", "contact_label", "prob")
 """Names under which contacts are looked for in .npz files, the first that is there counts."""

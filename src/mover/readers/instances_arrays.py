@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..records import InputError
+from ..records import BROKEN, InputError
 from .fields import LAST_INDEX, At, array, get, maybe, reason, refuse
 from .instances import Instance, Instances, code_of
-from .npz_file import BROKEN, check_array_header, read_npz
+from .npz_file import check_array_header, read_npz
 from .parts import UNKNOWN
 
 MASKS = ("masks", "pred_masks", "mask", "segmentation", "arr_0")

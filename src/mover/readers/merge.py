@@ -64,8 +64,9 @@ def import_into(folder: Path, *given: Parts) -> Imported:
     Raises:
         InputError: If a part is wrong or does not fit the others.
     """
-    old = folder_parts(folder) if folder.exists() else Parts(name=folder.resolve().name)
-    if folder.exists() and not folder.is_dir():
+    new = not folder.exists()
+    old = Parts(name=folder.resolve().name) if new else folder_parts(folder)
+    if not new and not folder.is_dir():
         raise InputError(f"{folder}: is a file, expected a folder for the capture")
     whole, notes = old, list[str]()
     for part in given:
@@ -74,7 +75,6 @@ def import_into(folder: Path, *given: Parts) -> Imported:
     whole = _with_size(dataclasses.replace(whole, name=old.name))
     capture = _capture(whole)
     _check_rest(whole, capture)
-    new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     try:
         written = write_whole(whole, old, capture, folder)

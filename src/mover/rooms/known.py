@@ -80,7 +80,7 @@ def build(
     share = float(passing.double().mean())
     if share < config.least_passing:
         raise RefusedError(f"furniture hides a part of only {share:.0%} of the bodies")
-    capture = _capture(name, scene, detections, sight, (crowd.bodies, shown.people))
+    capture = _capture(name, scene, detections, sight, crowd.bodies, shown.people)
     touching = crowd.distance < GAPE
     touched = torch.where(touching, crowd.nearest, torch.full_like(crowd.nearest, NONE))
     furniture = tuple(p.furniture for p in plan.pieces)
@@ -104,10 +104,10 @@ def _capture(
     scene: Scene,
     detections: tuple[Detection, ...],
     sight: Sight,
-    crowd: tuple[Bodies, People],
+    bodies: Bodies,
+    people: People,
 ) -> Capture:
     """What a perfect upstream would give."""
-    bodies, people = crowd
     return Capture(
         name=name,
         scene=scene,

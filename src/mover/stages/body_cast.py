@@ -111,7 +111,7 @@ def looked(
     matches: Matches | None = None
     bounds: Bounds | None = None
     if weights.touch:
-        skin = _skin(cast, acted, known, (now, normals))
+        skin = _skin(cast, acted, known, now, normals)
         matches = gather_matches(skin, cast.room.surface, match, cast.room.furniture)
     if weights.order and cast.watched is not None:
         even = cast.picked.even
@@ -122,11 +122,11 @@ def looked(
     return replace(known, matches=matches, bounds=bounds, outline=outline)
 
 
-def _skin(cast: Cast, acted: Acted, known: Evidence, at: tuple[Moved, Tensor]) -> Skin:
+def _skin(cast: Cast, acted: Acted, known: Evidence, now: Moved, normals: Tensor) -> Skin:
     """The skin where it is now; errors of poses count where they are not corrected."""
     return Skin(
-        points=at[0].skin, normals=at[1], chance=cast.chance[acted.rows], group=cast.picked.group,
-        track=known.near.track, pivot=at[0].points[:, 0],
+        points=now.skin, normals=normals, chance=cast.chance[acted.rows], group=cast.picked.group,
+        track=known.near.track, pivot=now.points[:, 0],
         bent=ANGLE if acted.puppet.model is None else 0.0,
     )  # fmt: skip
 

@@ -12,6 +12,7 @@ from ..geometry.raster import Views, layers
 from ..terms.body_outline import POINTS, Outline
 from ..types import Camera
 from .person_masks import MaskTable
+from .thin_points import evenly
 
 SIDE = 160  # [px] of a body's window
 AROUND = 1.3  # window over the longer side of the body's box
@@ -101,7 +102,7 @@ def _compare(
         return None
     gap = (away[y, x] + 0.5) / zoom
     gap = gap - _wider(gap, normal[:, y, x].mT, torch.stack([x, y], -1) / zoom)
-    some = torch.linspace(0, len(y) - 1, min(MOST, len(y))).round().long()
+    some = evenly(torch.arange(len(y)), MOST)
     y, x = y[some], x[some]
     pixel = torch.stack([x, y], -1).float().add(0.5) / zoom + window[1][:2]
     skin = project(seen.skin[k], seen.camera.K.to(seen.skin))

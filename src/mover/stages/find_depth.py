@@ -27,8 +27,9 @@ from ..types import Bodies, Camera, Masks, People
 from .body_extents import Extents, compare_extents, pixels_of
 from .depth_peak import SYSTEMATIC, Peak, peak_of
 from .find_soles import SolesConfig, straight_legs
-from .mask_overlap import overlaps, small
+from .mask_overlap import overlaps, small, uncovered
 from .person_masks import MaskTable, mask_table
+from .thin_points import evenly
 
 LIKELY_SIZE = (0.8, 1.25)  # a body whose size is off by more is a mistake in the height
 
@@ -97,13 +98,13 @@ def find_depth(
     found = torch.ones(3, len(tracks)) * torch.tensor([[1.0], [torch.inf], [1.0]])
     table = mask_table(inputs.people, bodies)
     blocked = pixels_of(inputs.objects)
-    free = small(blocked, config.width) < 0.05  # pixels of the small picture that nothing covers
+    free = uncovered(blocked, config.width)
     for index, person in enumerate(tracks):  # each has its own frames
         rows = ((bodies.person == person) & inputs.keep).nonzero()[:, 0]
         size, note = _size(inputs, rows, str(person))
         rows = rows[torch.tensor([table.own[r] is not None for r in rows.tolist()]).bool()]
         peak = peak_of(_curves(inputs, config, rows, table, free), config)
-        some = _some(rows, config.whole)
+        some = evenly(rows, config.whole)
         heights = compare_extents(bodies, some, inputs.camera, table, blocked)
         *peak, weak = _with_heights(peak, heights, config)
         found[:, index] = torch.tensor([*peak, size])
@@ -182,7 +183,7 @@ def _curves(
     curves: list[Tensor] = []
     for row in _spread_out(rows[:: config.every], inputs, config):  # masks are decoded one by one
         own, others = table.decode(row)
-        known = free & (small(others, config.width) < 0.05)
+        known = free & uncovered(others, config.width)
         mask, drawn = small(own, config.width), _drawn(inputs, config, row, free)
         middle = drawn[config.factors // 2]
         seen = mask[middle & known].sum() / (middle & known).sum().clamp_min(1)
@@ -199,14 +200,7 @@ def _spread_out(rows: Int[Tensor, " rows"], inputs: DepthInputs, config: DepthCo
     pixels = project(verts, camera.K.to(verts))
     size = pixels.new_tensor([camera.width, camera.height])
     inside = ((pixels > 0) & (pixels < size)).all(-1).float().mean(1) >= config.inside
-    return _some(rows[inside], config.most).tolist()
-
-
-def _some(rows: Int[Tensor, " rows"], most: int) -> Int[Tensor, " some"]:
-    """At most so many, evenly spread."""
-    if len(rows) <= most:
-        return rows
-    return rows[torch.linspace(0, len(rows) - 1, most).round().long()]
+    return evenly(rows[inside], config.most).tolist()
 
 
 def _drawn(

@@ -23,8 +23,9 @@ from ..minimize import Observer, Step, silent
 from ..records import record
 from ..types import Bodies, Camera, Masks, People
 from .body_extents import pixels_of
-from .mask_overlap import small
+from .mask_overlap import small, uncovered
 from .person_masks import MaskTable, mask_table
+from .thin_points import evenly
 from .zoom_fit import Sightings, fit_zoom
 
 EDGE = 0.1  # of the image's width: people may be drawn so far from where they are seen
@@ -83,7 +84,7 @@ def find_focal(inputs: FocalInputs, config: FocalConfig, observe: Observer = sil
     if config.spread <= 0:
         raise ValueError(f"find_focal: spread {config.spread}, expected above 0")
     table = mask_table(inputs.people, inputs.bodies)
-    free = small(pixels_of(inputs.objects), config.width) < 0.05
+    free = uncovered(pixels_of(inputs.objects), config.width)
     found: list[tuple[int, Tensor]] = []
     for row in _rows(inputs, config, table):
         places = _sighting(inputs, config, row, table, free)
@@ -114,9 +115,7 @@ def _rows(inputs: FocalInputs, config: FocalConfig, table: MaskTable) -> list[in
     good = (bodies.verts[..., 2] > NEAREST).all(-1) & inputs.keep & masked
     for person in bodies.person.unique():
         mine = (good & (bodies.person == person)).nonzero()[:, 0]
-        if len(mine) > config.most:
-            mine = mine[torch.linspace(0, len(mine) - 1, config.most).round().long()]
-        chosen += mine.tolist()
+        chosen += evenly(mine, config.most).tolist()
     return chosen
 
 
@@ -135,7 +134,7 @@ def _sighting(
     own, others = table.decode(row)
     mask = small(own, config.width)
     edge = round(EDGE * config.width)
-    known = (free & (small(others, config.width) < 0.05)) | (mask > 0.5)
+    known = (free & uncovered(others, config.width)) | (mask > 0.5)
     drawn = _drawn(inputs, row, mask.shape, edge)
     mask, known = (pad(x.to(mask), [edge] * 4) for x in (mask, known))
     shift = best_shift(drawn.float(), mask, known, edge, config.seen)

@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
+COVERED = 0.05  # of a pixel of the smaller picture, from which it counts as covered
 MARGINS = 9  # borders from one pixel too narrow to one pixel too wide are tried
 
 
@@ -12,6 +13,11 @@ def small(mask: Bool[Tensor, "h w"], width: int) -> Float[Tensor, "small_h small
     """Share of each pixel of a smaller picture that is set."""
     height = max(1, round(mask.shape[0] * width / mask.shape[1]))
     return interpolate(mask[None, None].float(), (height, width), mode="area")[0, 0]
+
+
+def uncovered(mask: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "small_h small_w"]:
+    """The pixels of a smaller picture in which next to nothing is set."""
+    return small(mask, width) < COVERED
 
 
 def overlaps(

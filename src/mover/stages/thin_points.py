@@ -28,7 +28,7 @@ def thin(
     rows: list[tuple[Tensor, Tensor]] = []
     for g in range(groups):
         mine = (cells[:, 0] == g).nonzero()[:, 0]
-        kept = mine[torch.linspace(0, len(mine) - 1, min(most, len(mine))).round().long()]
+        kept = evenly(mine, most)
         total = count[mine].sum().to(points)
         share = count[kept].to(points)
         rows.append((means[kept], share * (total / share.sum().clamp_min(1))))
@@ -36,3 +36,8 @@ def thin(
     padded = [torch.nn.functional.pad(p, (0, 0, 0, longest - len(p))) for p, _ in rows]
     weight = [torch.nn.functional.pad(w, (0, longest - len(w))) for _, w in rows]
     return torch.stack(padded), torch.stack(weight)
+
+
+def evenly(rows: Int[Tensor, " rows"], most: int) -> Int[Tensor, " some"]:
+    """At most so many of them, evenly spread, the first and the last among them."""
+    return rows[torch.linspace(0, len(rows) - 1, min(most, len(rows))).round().long()]

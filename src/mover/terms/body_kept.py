@@ -1,7 +1,7 @@
 r"""An error that lasts says no more in a hundred frames than in one.
 
-Evidence:  signed distances that should be zero, in groups whose items share an error: the height of
-           a person's soles, of a part of the skin over a piece that it touches.
+Evidence:  signed distances that should be zero, in groups whose items share an error: of a part of
+           a person's skin over a piece that it touches.
 Price:     the shared error in its usual size, and the rest of each distance without it. The shared
            error is the one that is cheapest, in closed form (ridge mean with robust weights).
 """

@@ -3,13 +3,12 @@
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 import torch
 
-from ...records import InputError
+from ...records import BROKEN, InputError
 from ..fields import LARGEST_FILE, At, read_json, reason
 from ..npz_file import read_npz
 from ..safe_pickle import load_pickle
@@ -50,7 +49,7 @@ def _read_npy(path: Path) -> object:
         return np.load(path, allow_pickle=False)
     except ValueError:
         return load_pickle(path)
-    except (OSError, EOFError, SyntaxError, TokenError) as error:
+    except BROKEN as error:
         raise InputError(f"{path.name}: cannot be read ({reason(error)})") from error
 
 
