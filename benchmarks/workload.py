@@ -12,6 +12,7 @@ from mover.geometry.raster import Depths, Topology, look
 from mover.geometry.topology import edges_of
 from mover.geometry.volume import Volume, grid_around
 from mover.stages.place_objects import PlaceInputs
+from mover.terms.bbox import SEEN
 from mover.terms.collision import BodySpace
 from mover.terms.contact import Touches
 from mover.terms.depth import DepthRange
@@ -64,7 +65,7 @@ def seen(objects: Objects, layout: Layout, window: int) -> tuple[ImageCues, Dept
     image, found = look(cam, Topology(objects.faces, objects.edges), views)
     assert found is not None
     n = len(boxes)
-    sides, keep = torch.ones(n, 4).bool(), torch.ones_like(image).bool()
+    sides, keep = torch.full((n, 4), SEEN), torch.ones_like(image).bool()
     return ImageCues(boxes, sides, views, image, keep, torch.ones(n)), found
 
 

@@ -12,6 +12,7 @@ from mover.geometry.placement import place
 from mover.geometry.raster import Topology, look
 from mover.geometry.volume import Volume
 from mover.stages.place_objects import PlaceInputs
+from mover.terms.bbox import SEEN
 from mover.terms.collision import BodySpace
 from mover.terms.contact import Touches
 from mover.terms.depth import DepthRange
@@ -87,7 +88,7 @@ def image_at(objects, layout, camera, size):
     n = len(boxes)
     keep = torch.ones(n, size, size, dtype=torch.bool)
     return ImageCues(
-        boxes, torch.ones(n, 4, dtype=torch.bool), views, drawn, keep, torch.ones(n).to(boxes),
+        boxes, torch.full((n, 4), SEEN), views, drawn, keep, torch.ones(n).to(boxes),
         layout.t_world_object.norm(dim=-1),
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ from mover.stages.fixed_borders import fixed_borders
 from mover.stages.place_objects import PlaceInputs, place_objects
 from mover.stages.some_objects import some_image, some_objects
 from mover.stages.starts import alone
-from mover.terms.bbox import bbox_term
+from mover.terms.bbox import SEEN, bbox_term
 from mover.terms.border import PRICE, borders_of, fit_borders
 from mover.terms.silhouette import silhouette_term
 from mover.types import Layout
@@ -92,7 +92,7 @@ class TestMasks:
 class TestTerm:
     @pytest.mark.parametrize("grow", [-1, 1])
     def test_a_mask_one_pixel_off_all_round_costs_only_its_shift(self, grow):
-        seen = box_of(grow), torch.ones(1, 4).bool(), torch.ones(1, 64, 64).bool()
+        seen = box_of(grow), torch.full((1, 4), SEEN), torch.ones(1, 64, 64).bool()
         drawn = rectangle(0), box_of(0).view(1, 2, 2)
         borders = borders_of(rectangle(grow), torch.ones(1), SHIFTS)
         found = fit_borders(drawn, seen, torch.ones(1), borders, (1.0, 1.0))
@@ -101,7 +101,7 @@ class TestTerm:
         assert float(found.silhouette) == pytest.approx(PRICE, rel=1e-6)
 
     def test_the_box_alone_tells_the_shift_where_the_mask_is_unknown(self):
-        seen = box_of(1), torch.ones(1, 4).bool(), torch.zeros(1, 64, 64).bool()
+        seen = box_of(1), torch.full((1, 4), SEEN), torch.zeros(1, 64, 64).bool()
         drawn = rectangle(0), box_of(0).view(1, 2, 2)
         borders = borders_of(rectangle(1), torch.ones(1), SHIFTS)
         found = fit_borders(drawn, seen, torch.ones(1), borders, (1.0, 1.0))
@@ -109,7 +109,7 @@ class TestTerm:
         assert float(found.bbox) == pytest.approx(0.0, abs=1e-7)
 
     def test_a_mask_that_is_off_to_one_side_is_not_widened(self):
-        seen = box_of(0) + 4, torch.ones(1, 4).bool(), torch.ones(1, 64, 64).bool()
+        seen = box_of(0) + 4, torch.full((1, 4), SEEN), torch.ones(1, 64, 64).bool()
         drawn = rectangle(0), box_of(0).view(1, 2, 2)
         borders = borders_of(rectangle(0).roll((4, 4), (1, 2)), torch.ones(1), SHIFTS)
         found = fit_borders(drawn, seen, torch.ones(1), borders, (1.0, 0.0))
@@ -274,7 +274,7 @@ class TestFixed:
     def test_masks_too_wide_are_taken_in_and_masks_too_narrow_are_grown(self, grow):
         inputs, cues = seen_room(grow, hide=False)
         true = Layout(*(getattr(inputs.starts, f.name)[0] for f in fields(Layout)))
-        image = cues(ImageConfig(128, "robust", SHIFTS))
+        image = cues(ImageConfig(128, "robust", borders=SHIFTS))
         found = fixed_borders(image, true, inputs.objects, inputs.camera, WEIGHTS)
         assert float(found.boxes[0, 2] - image.boxes[0, 2]) * grow < 0
         assert float(found.masks.sum() - image.masks.sum()) * grow < 0
@@ -321,7 +321,7 @@ def test_an_object_whose_base_is_hidden_is_placed_nearer_to_the_truth_if_borders
     true = inputs.starts.t_world_object[0]
 
     def error(borders):
-        image = cues(ImageConfig(128, "robust", borders))
+        image = cues(ImageConfig(128, "robust", borders=borders))
         room = PlaceInputs(
             inputs.objects, inputs.camera, GROUND, image, HumanCues(), inputs.starts,
             inputs.starts.yaw[0],

@@ -25,6 +25,7 @@ from mover.readers.masks import encode, tight_box
 from mover.readers.mesh_file import write_mesh
 from mover.records import InputError
 from mover.run import Run
+from mover.terms.bbox import SEEN
 from mover.types import Camera, Detection, Masks, Piece
 
 W, H, FOCAL = 480, 320, 420.0
@@ -107,7 +108,7 @@ def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[Piece]):
     low = [(s.mesh.verts - torch.tensor([0, float(s.mesh.verts[:, 1].min()), 0])) for s in shapes]
     inputs = ScreenInputs(
         camera(), torch.stack([d.box for d in seen.detections]),
-        torch.ones(4, 4, dtype=torch.bool), torch.full((4,), torch.nan), torch.arange(4),
+        torch.full((4, 4), SEEN), torch.full((4,), torch.nan), torch.arange(4),
         torch.stack([outermost(v) for v in low]), None,
     )  # fmt: skip
     found = screen(inputs, ScreenConfig(heights=(0.9, 1.2, 1.5, 1.9)))

@@ -15,6 +15,7 @@ from mover.geometry.raster_engine import use_engine, use_threads
 from mover.minimize import Adam, Energy, minimize
 from mover.records import record
 from mover.stages.place_objects import with_trees
+from mover.terms.bbox import LEAST, UNKNOWN
 from mover.terms.depth import DepthRange
 from mover.types import Layout
 
@@ -141,7 +142,8 @@ class TestAgreement:
         keep[:, :, 20:40] = False
         masks = torch.nn.functional.avg_pool2d(image.masks, 5, 1, 2)
         sides = image.sides.clone()
-        sides[0, 1] = sides[1] = False
+        sides[0, 1] = sides[1] = UNKNOWN
+        sides[2, ::2] = sides[0, 2] = LEAST
         trust = torch.tensor([0.2, 1.0, 0.7])
         image = replace(image, keep=keep, masks=masks, sides=sides, trust=trust)
         inputs = replace(inputs, image=image)

@@ -291,12 +291,14 @@ def _first(layout):
 
 class TestCommandLine:
     def test_a_method_is_chosen_by_name_and_set_by_its_own_flags(self):
-        args = ["room", "--place.method", "newton", "--place.method.gain", "0.5"]
+        args = ["room", "--place.method", "adam", "--place.method.beta2", "0.5"]
         run, config = parse_run([*args, "--layout.method.steps", "3"])
         assert run.source.name == "room"
-        assert config.place.method == Quasi(gain=0.5)
-        assert isinstance(config.layout.method, Adam)
-        assert config.layout.method.steps == 3
+        assert config.place.method == Adam(beta2=0.5)
+        assert config.layout.method == Quasi(steps=3)
+        _, config = parse_run(["room", "--preset", "paper", "--place.method", "newton"])
+        assert config.place.method == Quasi()
+        assert config.layout.method == Adam(1000)
 
     def test_settings_come_back_from_a_file_with_the_right_method(self):
         _, config = parse_run(["room", "--place.method", "newton", "--preset", "paper"])

@@ -165,7 +165,7 @@ def test_looking_runs_nothing_and_says_what_is_missing(tmp_path: Path) -> None:
     done = list(run_all(jobs, 1, table, store=False))
     page = run_study(replace(asked, look=True), launch=table)[0].read_text()
     assert [(job.rooms, job.seed, job.name) for job in done] == table.done
-    assert "**Not run**: 8 of 10 jobs" in page
+    assert "**Not run**: 10 of 12 jobs" in page
     assert "| feet and objects (robust) |" in page
 
 

@@ -9,6 +9,8 @@ import raycast
 import torch
 import trimesh
 
+from mover import pipeline
+from mover.bodies.world import in_world
 from mover.geometry.runs import decode
 from mover.pipeline import PRESETS, Run
 from mover.readers.scene_file import write_scene
@@ -21,8 +23,6 @@ FLIP_X, FLIP_Y = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0])
 
 def at_truth(room, preset, folder):
     """The evidence of a noiseless room, gathered at the truth, and the true layout."""
-    from mover import pipeline
-
     config = PRESETS[preset]
     config = replace(config, correct_depth=False, refine=replace(config.refine, rounds=0), again=0)
     config = replace(config, gather=replace(config.gather, cells=192))
@@ -69,6 +69,30 @@ def perturbed(truth, count, seed):
     turn = draw((count, n), np.radians(2), np.radians(30))
     size = (1 + draw((count, n, 3), 0.03, 0.20)).log()
     return Layout(truth.t_world_object + step, truth.yaw + turn, truth.log_scale + size)
+
+
+@pytest.mark.slow
+def test_sitters_tell_the_front_of_seats_with_a_back_and_of_no_other(demo_room, tmp_path):
+    inputs, config = at_truth(demo_room, "robust", tmp_path)
+    touches, objects = inputs.humans.touches, inputs.objects
+    told = touches.heading.norm(dim=-1) > 0
+    assert bool(told.any())
+    assert bool(objects.has_back[touches.object_of[told]].all())
+    facing = torch.atan2(*touches.heading[told].unbind(-1))
+    off = (facing - inputs.starts.yaw[0, touches.object_of[told]]).cos()
+    assert float(off.min()) > np.cos(np.radians(20))
+    crew = pipeline.people_of(demo_room.capture, config, Run(tmp_path))
+    flat = replace(objects, has_back=torch.zeros_like(objects.has_back))
+    found = pipeline.assign_touches(
+        pipeline.TouchInputs(
+            in_world(crew.bodies, inputs.camera), demo_room.touching.float(), crew.parts,
+            pipeline.image_evidence(demo_room.capture).masks, inputs.image.boxes, inputs.camera,
+            flat, Layout(*(x[0] for x in vars(inputs.starts).values())),
+        ),
+        config.assign,
+    )  # fmt: skip
+    assert found.touches is not None
+    assert float(found.touches.heading.abs().max()) == 0
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from mover import records
 from mover.edits import Pin, Place, edit_scene, placement_of
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import rot_y
+from mover.minimize import Adam
 from mover.readers import read
 from mover.readers.edits_file import read_edits, write_edits
 from mover.readers.fields import write_json
@@ -49,7 +50,13 @@ def folder(tmp_path_factory, small_room) -> Path:
 
     folder = tmp_path_factory.mktemp("view")
     write_capture(add_noise(small_room, NoiseConfig(), 1), folder / "capture")
-    write_json({"config": records.plain(light("robust"))}, folder / "config.json")
+    config, slow = light("robust"), Adam(15, 0.03)  # slow enough to be watched
+    config = dataclasses.replace(
+        config,
+        layout=dataclasses.replace(config.layout, method=slow, yaws=8, keep=3, coarse=1, shaken=0),
+        place=dataclasses.replace(config.place, method=slow, shaken=0),
+    )
+    write_json({"config": records.plain(config)}, folder / "config.json")
     call("run", folder / "capture", "--out", folder / "out", "--config", folder / "config.json")
     return folder
 

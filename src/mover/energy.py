@@ -76,8 +76,8 @@ class ImageCues:
 
     boxes: Float[Tensor, "objects 4"]
     """Detected x_min, y_min, x_max, y_max [px]."""
-    sides: Bool[Tensor, "objects 4"]
-    """Sides of the box that are really seen."""
+    sides: Int[Tensor, "objects 4"]
+    """What is known of each side of the box, see `terms.bbox`."""
     views: Views
     """The window of each object."""
     masks: Float[Tensor, "objects h w"]

@@ -138,7 +138,7 @@ def settle(
 
 def _begin(price: Price, at: Tensor, method: Quasi) -> _Live:
     """A round model whose minimum lies at the first radius."""
-    index = torch.arange(len(at), device=at.device)
+    index = torch.arange(len(at)).to(at.device)
     value, slope = price(index, at)
     radius = torch.full_like(value, method.reach)
     model = _round(slope, radius)

@@ -37,7 +37,7 @@ from .stages.prepare_objects import PrepareInputs, prepare_objects
 from .stages.refine_camera import RefineInputs, refine_camera
 from .stages.reinitialize import ReinitInputs, by_release, contact_start
 from .stages.select_frames import SelectInputs, select_frames
-from .stages.starts import alone, first, joined, reference_yaw
+from .stages.starts import alone, best_few, joined, reference_yaw
 from .types import Camera, Capture, Layout, Room
 
 NOBODY = HumanCues()
@@ -177,7 +177,8 @@ def _place_with(job: Job, view: View, fit: Float[Tensor, " objects"]) -> View:
     starts = alone(run.stage(by_release, seats, config.reinit))
     if config.layout.keep > 1:
         contact = contact_start(view.placed.layout, objects, touches)
-        starts = joined(first(view.placed.candidates, config.layout.keep), alone(contact))
+        different = best_few(view.placed.candidates, view.placed.energy, config.layout.keep)
+        starts = joined(different, alone(contact))
     reference = reference_yaw(view.start.yaw, touches)
     inputs = PlaceInputs(
         objects, view.camera, view.ground, image, humans, starts, reference,

@@ -101,7 +101,6 @@ RELEASE = Config(
     place=PlaceConfig(_RELEASE_FULL, "release", Adam(2500), span=0.8, chair_span=0.6),
 )
 
-_DESCENT = Adam(200, 0.03, 0.002, beta2=0.98, keep_best=True)
 _GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300, hand_reach=0.25)
 _SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
 _ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0, distance=0.02)
@@ -110,15 +109,15 @@ _ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading
 ROBUST = Config(
     correct_depth=True,
     soles=SolesConfig(speed=0.6),
-    image=ImageConfig(128, "robust", (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)),
+    image=ImageConfig(128, "robust", 0.2, (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)),
     layout=PlaceConfig(
-        _ROBUST_IMAGE, "robust", _DESCENT, yaws=8, distances=(0.9, 1.1), short=_SHORT, keep=3,
-        tie=1.0,
+        _ROBUST_IMAGE, "robust", Quasi(), yaws=16, distances=(0.9, 1.1), short=_SHORT, keep=6,
+        coarse=2, shaken=4, rounds=2, tie=1.0,
     ),
     refine=RefineConfig(rounds=1),
     gather=GatherConfig(erode=1, reach=0.1),
     assign=_GROUPS,
-    place=PlaceConfig(_ROBUST_FULL, "robust", _DESCENT, tie=1.0, apart=0.3),
+    place=PlaceConfig(_ROBUST_FULL, "robust", Quasi(), shaken=4, rounds=2, tie=1.0, apart=0.3),
     again=1,
     slide=True,
     trust=True,

@@ -9,7 +9,7 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from ..minimize import Observer, silent
 from ..pipeline import reconstruct
 from ..rooms import KnownRoom, RoomConfig, add_noise, make_room
 from ..run import Run, sources
+from ..stages.refine_bodies import RefineBodiesConfig, refine_bodies
 from ..types import Scene
 from .changes import set_named
 from .measures import Trial, carry_all, measure, measure_people, measure_truth, timing
@@ -153,6 +154,8 @@ def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None)
     room = reconstruct(capture, variant.config, run)
     if room.bodies is None or variant.cut is not None:
         room = carry_all(room, trial.capture)
+    if variant.refined:
+        room = replace(room, bodies=refine_bodies(room, capture, RefineBodiesConfig()).bodies)
     stages = timing(run.stages)
     if variant.bodies:
         found = measure_people(trial, room, variant.bodies)

@@ -12,6 +12,7 @@ from ..metrics_pairs import unmatched
 from ..metrics_scene import measure as measured
 from ..minimize import Observer, silent
 from ..outcome import carried
+from ..readers.pose_file import into_camera
 from ..records import record
 from ..run import Run, StageLog
 from ..stages.refine_bodies import ABLATION, RefineBodiesConfig, refine_bodies
@@ -19,6 +20,7 @@ from ..types import Bodies, Camera, Capture, Room, Scene
 from .traits import Traits
 
 GIVEN, TRUE_GIVEN, TRUE_ROOM = "given", "true given", "true room"
+TRAITS = ("id", "category", "touched", "hidden", "truncated", "flipped", "stays")
 PROX = "+CamGP+SDF+Contact"  # what refines bodies in the true room
 
 
@@ -67,40 +69,40 @@ def measure(
 ) -> dict[str, Any]:
     """All metrics of the initial scene, of Stage 1 and of the full method, object by object.
 
-    Stage 1 has camera, ground and people of the full method: only the furniture differs.
+    Stage 1 has camera, ground and people of the full method: only the furniture differs. The true
+    room with the same people says what their own errors cost.
     """
-    bodies = EvaluatedBodies(trial.capture.bodies, room.bodies, trial.bodies)
     config = replace(densities or EvaluateConfig(), by_place=False)  # it is known who is who
-    image, full = (
-        json.loads(
-            run.stage(judge, Judged(trial.capture.scene, scene, trial.truth, bodies), config).text
-        )
-        for scene in (room.image_only, room.scene)
-    )
+
+    def judged(scene: Scene, people: Bodies | None) -> dict[str, Any]:
+        bodies = EvaluatedBodies(trial.capture.bodies, people, trial.bodies)
+        asked = Judged(trial.capture.scene, scene, trial.truth, bodies)
+        return json.loads(run.stage(judge, asked, config).text)
+
+    image, full = (judged(scene, room.bodies) for scene in (room.image_only, room.scene))
+    true_room = judged(trial.truth, seen_from(trial.truth.camera, room))
     rows = zip(trial.traits, image["objects"], full["objects"], strict=True)
     objects = [
-        {
-            "id": traits.id,
-            "category": traits.category,
-            "touched": traits.touched,
-            "hidden": traits.hidden,
-            "truncated": traits.truncated,
-            "flipped": traits.flipped,
-            "stays": traits.stays,
-            "initial": one["initial"],
-            "image": one["result"],
-            "full": other["result"],
-        }
+        {name: getattr(traits, name) for name in TRAITS}
+        | {"initial": one["initial"], "image": one["result"], "full": other["result"]}
         for traits, one, other in rows
     ]
     return {
         "initial": full["initial"],
         "image": image["result"],
         "full": full["result"],
+        "true_room": true_room["result"],
         "objects": objects,
         "unmatched": unmatched(trial.capture.scene, room.scene, trial.truth, by_place=False),
         "warnings": list(room.warnings),
     }
+
+
+def seen_from(camera: Camera, room: Room) -> Bodies | None:
+    """The people of a room in the world of another camera that sees them alike."""
+    if room.bodies is None:
+        return None
+    return carried(into_camera(room.bodies, room.scene.camera.R_cam_world), camera)
 
 
 def measure_truth(trial: Trial, densities: EvaluateConfig | None = None) -> dict[str, float]:

@@ -42,6 +42,8 @@ class Variant:
     """Part of the video; None: all of it."""
     bodies: str = ""
     """People refined afterwards: a row of the paper's table of bodies; empty: they are not."""
+    refined: bool = False
+    """The room refines the people before anything is measured."""
     fresh: bool = False
     """Nothing is taken from stages that other variants have finished: it is timed."""
 
@@ -128,9 +130,12 @@ PEOPLE: dict[str, Variant] = {
 }  # fmt: skip
 """The people after the room is known; the last two in the true room."""
 
+REFINED: dict[str, Variant] = {"refined-people": Variant(ROBUST, refined=True)}
+
 VARIANTS: dict[str, Variant] = {
     **{name: Variant(config) for name, config in PRESETS.items()},
-    **TERMS, **PARTS, **NOBODY, **RELAXED, **LENS, **SINGLE, **SEGMENT, **TIMED, **PEOPLE,
+    **TERMS, **PARTS, **NOBODY, **RELAXED, **LENS, **REFINED, **SINGLE, **SEGMENT, **TIMED,
+    **PEOPLE,
 }  # fmt: skip
 """By the name of the job."""
 

@@ -12,14 +12,14 @@ import math
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..geometry.camera import pitch_roll, project, tilted, to_world
 from ..geometry.placement import place
 from ..minimize import Adam, Energy, Observer, minimize, silent
 from ..records import record
-from ..terms.bbox import bbox_term
+from ..terms.bbox import SEEN, bbox_term
 from ..terms.scale import scale_term
 from ..types import Camera, Layout
 
@@ -63,8 +63,8 @@ class ScreenInputs:
 
     camera: Camera
     boxes: Float[Tensor, "things 4"]
-    sides: Bool[Tensor, "things 4"]
-    """Sides of the box that are really seen."""
+    sides: Int[Tensor, "things 4"]
+    """What is known of each side of the box, see `terms.bbox`."""
     depth: Float[Tensor, " things"]
     """Measured distance along the view of the visible surface [m]; NaN: unknown."""
     thing: Int[Tensor, " items"]
@@ -224,7 +224,7 @@ def _starts(inputs: ScreenInputs, config: ScreenConfig, heights: Tensor) -> Gues
         NEAREST, FARTHEST
     )
     far = -heights[:, None] / rays[0][:, 1].clamp_max(-1e-3) + extent[:, 2] / 2
-    usable = (rays[0][:, 1] < -0.02) & inputs.sides[inputs.thing][:, 3] & (far < FARTHEST)
+    usable = (rays[0][:, 1] < -0.02) & (inputs.sides[inputs.thing][:, 3] == SEEN) & (far < FARTHEST)
     distance = torch.where(usable, far, by_size.expand_as(far)).clamp(NEAREST, FARTHEST)
     t = distance[..., None] * torch.where(usable[..., None], rays[0], rays[1])
     yaw = torch.arange(config.yaws) * (2 * math.pi / config.yaws)

@@ -86,12 +86,16 @@ def _pack(
 
 
 def _headings(rows: ContactRows, touched: Int[Tensor, " touched"], inputs: TouchInputs) -> Tensor:
-    """Mean horizontal direction of those who sit on each touched object; zero for none."""
+    """Mean horizontal direction of those who sit on each touched object; zero for none.
+
+    Only of objects with a back: one sits on the side of a bed, and round a stool.
+    """
     facing = headings(inputs.bodies, inputs.parts)[:, [0, 2]]
     sits = postures(inputs.bodies, inputs.parts).sitting
     means: list[Tensor] = []
     for o in touched.tolist():
         seated = rows.body[(rows.object_of == o) & ~rows.hand].unique()
         mean = facing[seated[sits[seated]]].sum(0)
-        means.append(mean / mean.norm().clamp_min(1e-9) if mean.norm() > 0.1 else 0 * mean)
+        told = bool(inputs.objects.has_back[o]) and float(mean.norm()) > 0.1
+        means.append(mean / mean.norm() if told else 0 * mean)
     return torch.stack(means)

@@ -16,6 +16,7 @@ from ..geometry.placement import FREE, GROUND, place_in
 from ..geometry.raster import Depths, Topology, look
 from ..minimize import Observer, Step, silent
 from ..records import record
+from ..terms.bbox import SEEN
 from ..types import Bodies, Layout, Objects
 from .explain_bounds import bounds_of_objects
 from .explain_curvature import Bend, bend_at, vector
@@ -162,7 +163,7 @@ def _facts(inputs: ExplainInputs, index: int, shape: _Shape, found: _Evidence) -
         passing=found.passing[index],
         touches=found.touches[index],
         overlap=found.overlap[index],
-        hidden_sides=tuple(s for s, seen in zip(SIDES, sides, strict=True) if not seen),
+        hidden_sides=tuple(s for s, seen in zip(SIDES, sides, strict=True) if seen != SEEN),
         support=_support(priced.objects, index),
         pinned=pinned is not None and bool(pinned.fixed[index]),
     )

@@ -11,13 +11,13 @@ from ..geometry.crops import area_mean, crop_views
 from ..minimize import Observer, silent
 from ..records import record
 from ..terms import Form
+from ..terms.bbox import LEAST, SEEN, UNKNOWN
 from ..terms.border import borders_of
 from ..terms.silhouette import outline_root
 from ..types import Camera
 
 BORDER = 1.5  # [px], a side this close to the image's border is cut by it
 STRIP = 0.06  # of the box's size: how far beyond a side one looks for what may hide it
-HIDDEN = 0.5  # share of the strip that makes a side unknown
 MARGIN = 0.3  # of the box's larger side: how much a window is larger than the box (PHOSA)
 
 
@@ -28,7 +28,9 @@ class ImageConfig:
     size: int = 256
     """Pixels along a side of each object's window."""
     form: Form = "paper"
-    """`release`: what lies beyond the border is background; `robust`: hidden sides are dropped."""
+    """`release`: beyond the border is background; `robust`: hidden sides are lower bounds."""
+    hidden: float = 0.5
+    """Share of the strip beyond a side from which on more may be hidden there (`robust`)."""
     borders: tuple[float, ...] = ()
     """By how much outlines of masks may be off, with 0 among them [px of the image] (`robust`)."""
 
@@ -66,9 +68,10 @@ def find_image_cues(
     if config.form == "release":
         own, hidden, inside = (own - hidden > 0).float(), (own < hidden).float(), inside | True
     keep = (hidden < 1e-6) & inside & known
-    sides = inputs.seen.unsqueeze(-1).expand(-1, 4)
+    sides = torch.where(inputs.seen, SEEN, UNKNOWN).unsqueeze(-1).expand(-1, 4)
     if config.form == "robust":
-        sides = sides & _seen_sides(inputs, others)
+        unsure = (sides == SEEN) & ~_seen_sides(inputs, others, config.hidden)
+        sides = torch.where(unsure, LEAST, sides)
     trust = torch.ones(len(own))
     outline = outline_root(own) if config.form == "release" else None
     borders = None
@@ -92,14 +95,18 @@ def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:
 
 
 def _seen_sides(
-    inputs: ImageInputs, others: Bool[Tensor, "objects h w"]
+    inputs: ImageInputs, others: Bool[Tensor, "objects h w"], hidden: float
 ) -> Bool[Tensor, "objects 4"]:
-    """Sides of boxes that neither the image's border nor something in front cuts off."""
+    """Sides of boxes that neither the image's border nor something in front may cut off.
+
+    A table's legs may be hidden where nothing is in front of most of its top's lower edge: a small
+    share is enough.
+    """
     size = inputs.boxes.new_tensor([inputs.camera.width, inputs.camera.height])
     low, high = inputs.boxes[:, :2] > BORDER, inputs.boxes[:, 2:] < size - BORDER
     free = torch.cat([low, high], -1)
     return free & torch.stack([
-        torch.stack([_share(others[i], _strip(box, side)) < HIDDEN for side in range(4)])
+        torch.stack([_share(others[i], _strip(box, side)) < hidden for side in range(4)])
         for i, box in enumerate(inputs.boxes)
     ])  # fmt: skip
 

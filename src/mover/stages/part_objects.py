@@ -5,6 +5,7 @@ in the bed at no price; together, both go where neither image nor people mind.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,16 +13,14 @@ from torch import Tensor
 
 from ..energy_warp import never_asks
 from ..geometry.boxes import Box, corners
-from ..geometry.volume import Volume, grid_around, union_bodies
+from ..geometry.sections import Sections, sections_of
 from ..minimize import Adam, Energy, Observer, minimize, silent
-from ..terms.apart import apart_term
+from ..terms.apart import apart_term, gather_solids
 from ..types import Layout, Objects
 from .starts import alone
 
-CELLS = 48  # along the longest side of a piece
-PADDING = 0.05  # [m]
 NEAR = 0.1  # [m], boxes whose circles are no nearer are not looked at
-METHOD = Adam(120, 0.01, 0.001, beta2=0.98)
+METHOD = Adam(200, 0.01, 0.001, beta2=0.98)  # 80 cm at most
 
 
 def part_objects(
@@ -41,7 +40,8 @@ def part_objects(
         observe: Told of every step.
 
     Returns:
-        The same layout if none stands in another.
+        The same layout if none stands in another; in any case the same place of each object that
+        has no part in it.
     """
     if weight == 0:
         return layout
@@ -54,14 +54,29 @@ def part_objects(
         return Energy({"alone": energy(alone(free)).per_item[0], "apart": weight * shared(free)})
 
     still = never_asks(objects)
-    return minimize(together, layout, METHOD, observe, "place_objects", still=still).at
+    found = minimize(together, layout, METHOD, observe, "place_objects", still=still).at
+    concerned = _pushed(shared, layout) | _pushed(shared, found)
+    return Layout(
+        torch.where(concerned[:, None], found.t_world_object, layout.t_world_object),
+        torch.where(concerned, found.yaw, layout.yaw),
+        torch.where(concerned[:, None], found.log_scale, layout.log_scale),
+    )
+
+
+def _pushed(shared: Callable[[Layout], Tensor], layout: Layout) -> Bool[Tensor, " objects"]:
+    """The objects that stand in another, and those in which another stands."""
+    t = layout.t_world_object.detach().clone().requires_grad_()
+    with torch.enable_grad():
+        (slope,) = torch.autograd.grad(shared(replace(layout, t_world_object=t)).sum(), t)
+    return (slope != 0).any(-1)
 
 
 def sharing(objects: Objects, layout: Layout) -> Callable[[Layout], Float[Tensor, " objects"]]:
     """How much of each object stands in others, for places near a layout (`terms.apart`) [1]."""
     pairs = _pairs(objects, layout)
-    solids = {i: _solid(objects, i) for i in pairs.unique().tolist()}
-    return lambda at: apart_term(at, objects, solids, pairs)
+    sections = {i: _sections(objects, i) for i in pairs.unique().tolist()}
+    solids = gather_solids(objects, sections, pairs)
+    return lambda at: apart_term(at, objects, solids)
 
 
 def _pairs(objects: Objects, layout: Layout) -> Int[Tensor, "pairs 2"]:
@@ -83,10 +98,8 @@ def _related(objects: Objects) -> Bool[Tensor, "objects objects"]:
     return related
 
 
-def _solid(objects: Objects, index: int) -> Volume:
-    """Signed distance to an object in its own frame, inside and just around it."""
-    verts = objects.verts[index][objects.real_verts[index]].float()
+def _sections(objects: Objects, index: int) -> Sections:
+    """What an object fills, in its own frame."""
     faces = objects.faces[index]
     faces = faces[faces[:, 0] != faces[:, 1]]
-    grid = grid_around(verts.amin(0), verts.amax(0), CELLS, PADDING)
-    return union_bodies(verts[None], faces, grid, 1)
+    return sections_of(objects.verts[index][objects.real_verts[index]].float(), faces)

@@ -122,11 +122,6 @@ def alone(layout: Layout) -> Layout:
     return Layout(layout.t_world_object[None], layout.yaw[None], layout.log_scale[None])
 
 
-def first(layout: Layout, count: int) -> Layout:
-    """The first of the starts."""
-    return Layout(layout.t_world_object[:count], layout.yaw[:count], layout.log_scale[:count])
-
-
 def joined(a: Layout, b: Layout) -> Layout:
     """All starts of both."""
     return Layout(

@@ -4,26 +4,28 @@ Price:     L_bbox = \sum_i \| Proj_i^a - Det_i^a \|,  a in {x_min, y_min, width}
 Paper:     Proj_i is the projected 3D box (its eight corners); an l1 norm, in pixels of an image
            that is 640 wide.
 Release:   Proj_i is the extent of the projected mesh; smooth l1 with a knee of one pixel.
-Robust:    extent of the mesh, all four sides that are really seen, each divided by the box's size
-           \sqrt{w h}, so that near and far objects count alike. A side on the image border, or
-           behind another object's mask, says nothing and is left out.
+Robust:    extent of the mesh, all four sides, each divided by the box's size \sqrt{w h}, so that
+           near and far objects count alike. Where the image's border or something in front may hide
+           more of the object, it reaches at least as far as it is seen, and may reach farther.
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..constants import constant
 from . import Form
 
 WIDTH = 640.0  # [px], the image width at which the weights of the paper have their meaning
+UNKNOWN, SEEN, LEAST = 0, 1, 2
+"""What is known of a side: nothing, where it is, or how far the object reaches at least."""
 SOFT = 0.01  # of a box's size: half width of the rounded tip of the robust price
 
 
 def bbox_term(
     pixels: Float[Tensor, "*starts objects points 2"],
     detected: Float[Tensor, "objects 4"],
-    sides: Bool[Tensor, "objects 4"],
+    sides: Int[Tensor, "objects 4"],
     width: float,
     form: Form,
     wider: float = 0.0,
@@ -33,7 +35,7 @@ def bbox_term(
     Args:
         pixels: Projected corners (`paper`) or vertices [px].
         detected: x_min, y_min, x_max, y_max [px].
-        sides: Which sides are known; an object without a box has none and costs nothing.
+        sides: `UNKNOWN`, `SEEN` or `LEAST`; an object without a box knows none and costs nothing.
         width: Width of the image [px].
         form: How it is priced; [px at 640] for `paper` and `release`, else box sizes.
         wider: How far the true sides lie outside the detected ones [px] (`robust` only).
@@ -42,8 +44,10 @@ def bbox_term(
     if form == "robust":
         size = (detected[:, 2:] - detected[:, :2]).clamp_min(1).prod(-1, keepdim=True).sqrt()
         out = constant((-wider, -wider, wider, wider), detected)
-        off = ((drawn - (detected + out)) / size).square()
-        return (((off + SOFT**2).sqrt() - SOFT) * sides).sum(-1)
+        off = (drawn - (detected + out)) / size
+        outside = off * constant((-1.0, -1.0, 1.0, 1.0), detected) > 0
+        counts = (sides == SEEN) | ((sides == LEAST) & ~outside)
+        return (((off.square() + SOFT**2).sqrt() - SOFT) * counts).sum(-1)
     off = (_corner_and_width(drawn) - _corner_and_width(detected)).abs() * (WIDTH / width)
     if form == "release":
         off = torch.where(off < 1, 0.5 * off.square(), off - 0.5)

@@ -77,7 +77,7 @@ def borders_of(
 
 def fit_borders(
     drawn: tuple[Float[Tensor, "*starts objects h w"], Float[Tensor, "*starts objects verts 2"]],
-    seen: tuple[Float[Tensor, "objects 4"], Bool[Tensor, "objects 4"], Bool[Tensor, "objects h w"]],
+    seen: tuple[Float[Tensor, "objects 4"], Int[Tensor, "objects 4"], Bool[Tensor, "objects h w"]],
     trust: Float[Tensor, " objects"],
     borders: Borders,
     weights: tuple[float, float],
@@ -86,7 +86,7 @@ def fit_borders(
 
     Args:
         drawn: Silhouettes, and vertices in the image [px].
-        seen: Detected boxes [px], which of their sides are known, and which pixels are.
+        seen: Detected boxes [px], what is known of their sides, and which pixels are.
         trust: Weight of each silhouette.
         borders: What the masks may be.
         weights: Of the box and of the silhouette.

@@ -92,8 +92,10 @@ class Given:
     people: People
     boxes: wp.array(dtype=wp.vec4)
     """Detected boxes [px]."""
-    sides: wp.array(dtype=wp.vec4)
-    """Whether a side is known."""
+    within: wp.array(dtype=wp.vec4)
+    """Whether it costs that the object does not reach a side."""
+    beyond: wp.array(dtype=wp.vec4)
+    """Whether it costs that it sticks out."""
     facts: wp.array2d(dtype=wp.float32)
     turn: wp.mat33
     """From the world to the camera."""

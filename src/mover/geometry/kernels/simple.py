@@ -25,12 +25,14 @@ def side_of_box(
     known = given.boxes[p.thing][k] + wp.where(k < 2, -wider, wider)
     off = (at[axis] / z * focal + given.lens[axis + 2] - known) / size
     length = wp.sqrt(off * off + soft * soft)
-    pull = given.sides[p.thing][k] * off / (length * size) * focal / z
+    outside = off * wp.where(k < 2, -1.0, 1.0) > 0.0
+    counts = wp.where(outside, given.beyond[p.thing][k], given.within[p.thing][k])
+    pull = counts * off / (length * size) * focal / z
     force = wp.vec3(0.0, 0.0, wp.where(at[2] >= NEAR, -at[axis] / z * pull, 0.0))
     force[axis] = pull
     arm = wp.cw_mul(given.things.verts[given.things.starts[p.thing, VERTS] + v], p.scale)
     slope = slope_of(wp.transpose(p.view) * force, arm)
-    return given.sides[p.thing][k] * (length - soft), slope
+    return counts * (length - soft), slope
 
 
 @wp.func

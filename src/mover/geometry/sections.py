@@ -1,0 +1,91 @@
+"""How deep a place lies in a solid, by the horizontal way out of it.
+
+Furniture stands on the floor: what stands in a table top cannot leave through its thickness. So the
+depth is measured within the horizontal section of the solid at the height of the place. 20 cm from
+the edge of a table top it is 20 cm, however thin the top; below the top it is nothing.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..records import record
+from .nearest import as_float64, as_int64
+from .volume import Volume, sample
+from .voxels import outward, winding
+
+WIDE = 96  # cells along the longest horizontal side, at most
+CELL = 0.01  # [m], the smallest cell
+RISE = 0.005  # [m] from section to section
+AROUND = 2  # cells outside, on every side
+
+
+@record
+class Sections:
+    """Horizontal sections of a solid, in its own frame."""
+
+    outline: Volume
+    """Signed distance to the outline of the section at each height [m], negative inside; heights
+    are stretched, so that cells are cubes."""
+    stretch: float
+    """By what."""
+
+
+def sections_of(verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]) -> Sections:
+    """The sections of a closed mesh; half a cell is how well their outlines are known.
+
+    Args:
+        verts: Of the mesh [m].
+        faces: Its triangles, one orientation, outward or inward.
+    """
+    points, triangles = as_float64(verts), as_int64(faces)
+    low, high = points.min(0), points.max(0)
+    cell = max(float((high - low)[[0, 2]].max()) / WIDE, CELL)
+    edges = np.array([cell, RISE, cell])
+    counts = np.ceil((high - low) / edges).astype(np.int64) + 2 * AROUND
+    first = (low + high) / 2 - edges * (counts - 1) / 2
+    inside = winding((points - first) / edges, outward(points, triangles), counts) > 0
+    stretch = cell / RISE
+    return Sections(
+        Volume(
+            torch.from_numpy(_outlines(inside, cell)).to(verts),
+            torch.from_numpy(first * [1.0, stretch, 1.0]).to(verts),
+            cell,
+        ),
+        stretch,
+    )
+
+
+def outline(sections: Sections, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    """Signed distance to the outline of the section nearest in height to each point [m].
+
+    The gradient is horizontal: nothing is told to grow or to shrink out of a place.
+    """
+    volume = sections.outline
+    x, y, z = points.unbind(-1)
+    first = volume.origin[1].to(y)
+    number = ((y.detach() * sections.stretch - first) / volume.cell).round()
+    return sample(volume, torch.stack([x, first + volume.cell * number, z], -1))
+
+
+def _outlines(inside: np.ndarray, cell: float) -> np.ndarray:
+    """Signed distance in each section, a cell outside at most [m]; half of it is uncertain."""
+    found = np.full(inside.shape, cell, dtype=np.float32)
+    known: dict[bytes, np.ndarray] = {}  # many sections of a piece are the same
+    for height in np.flatnonzero(inside.any((0, 2))):
+        section = np.ascontiguousarray(inside[:, height])
+        key = section.tobytes()
+        if key not in known:
+            known[key] = _outline(section) * cell
+        found[:, height] = known[key]
+    return found
+
+
+def _outline(section: np.ndarray) -> np.ndarray:
+    """Signed distance to the border between cells [cells]."""
+    from scipy.ndimage import distance_transform_edt
+
+    outside = np.asarray(distance_transform_edt(~section)).clip(max=1.5)
+    depth = np.asarray(distance_transform_edt(section))
+    return np.where(section, 0.5 - depth, outside - 0.5)

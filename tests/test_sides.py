@@ -1,0 +1,107 @@
+"""What is known of the sides of a box: where they are, or how far an object reaches at least."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import make_inputs
+
+from mover.stages.find_image_cues import ImageConfig, ImageInputs, find_image_cues
+from mover.terms.bbox import LEAST, SEEN, SOFT, UNKNOWN, bbox_term
+
+HEIGHT, WIDTH = 120, 200
+LEFT, TOP, RIGHT, BOTTOM = range(4)
+
+
+def rectangle(x0, y0, x1, y1):
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[y0:y1, x0:x1] = True
+    return mask
+
+
+def box_of(mask):
+    y, x = mask.nonzero().T
+    return torch.tensor([x.min(), y.min(), x.max() + 1, y.max() + 1]).float()
+
+
+def sides_of(first, *others, form="robust", people=None, behind=()):
+    """What is known of the first of some masks."""
+    masks = torch.stack([first, *others])
+    hidden_by = torch.zeros(len(masks), len(masks), dtype=torch.bool)
+    for k in behind:
+        hidden_by[0, k] = True
+    camera = replace(make_inputs().camera, width=WIDTH, height=HEIGHT)
+    seen = torch.ones(len(masks), dtype=torch.bool)
+    boxes = torch.stack([box_of(m) for m in masks])
+    nobody = torch.zeros_like(first) if people is None else people
+    inputs = ImageInputs(camera, boxes, seen, masks, nobody, hidden_by)
+    return find_image_cues(inputs, ImageConfig(32, form, 0.1)).sides[0].tolist()
+
+
+class TestWhatIsKnown:
+    def test_an_object_alone_is_seen_on_all_sides(self):
+        assert sides_of(rectangle(50, 30, 90, 80)) == [SEEN] * 4
+
+    def test_what_stands_in_front_makes_a_side_a_lower_bound(self):
+        sofa = rectangle(90, 20, 150, 90)
+        assert sides_of(rectangle(50, 30, 90, 80), sofa) == [SEEN, SEEN, LEAST, SEEN]
+
+    def test_so_do_people_and_the_border_of_the_image(self):
+        body = rectangle(50, 80, 90, 120)
+        found = sides_of(rectangle(0, 30, 90, 80), people=body)
+        assert found == [LEAST, SEEN, SEEN, LEAST]
+
+    def test_what_is_known_to_stand_behind_hides_nothing(self):
+        sofa = rectangle(90, 20, 150, 90)
+        assert sides_of(rectangle(50, 30, 90, 80), sofa, behind=(1,)) == [SEEN] * 4
+
+    def test_the_other_presets_know_every_side_of_a_detected_box(self):
+        sofa = rectangle(90, 20, 150, 90)
+        assert sides_of(rectangle(50, 30, 90, 80), sofa, form="paper") == [SEEN] * 4
+
+    def test_the_legs_of_a_table_may_be_hidden_at_both_ends_of_its_top(self):
+        top = rectangle(60, 40, 120, 52)
+        wardrobe, armchair = rectangle(10, 10, 60, 100), rectangle(112, 52, 150, 100)
+        assert sides_of(top, wardrobe, armchair)[BOTTOM] == LEAST
+
+    def test_a_piece_without_a_detection_knows_none(self):
+        mask = rectangle(50, 30, 90, 80)
+        camera = replace(make_inputs().camera, width=WIDTH, height=HEIGHT)
+        whole = torch.tensor([[0.0, 0, WIDTH, HEIGHT]])
+        inputs = ImageInputs(
+            camera, whole, torch.tensor([False]), (mask & False)[None], mask & False,
+            torch.zeros(1, 1, dtype=torch.bool),
+        )  # fmt: skip
+        for form in ("paper", "release", "robust"):
+            assert find_image_cues(inputs, ImageConfig(32, form)).sides.tolist() == [[UNKNOWN] * 4]
+
+
+class TestPrice:
+    detected = torch.tensor([[40.0, 30.0, 80.0, 70.0]])
+
+    def price(self, drawn, sides):
+        corners = torch.tensor([[drawn[:2], drawn[2:]]])
+        return float(bbox_term(corners, self.detected, torch.tensor([sides]), 200.0, "robust"))
+
+    @pytest.mark.parametrize("side", range(4))
+    def test_a_lower_bound_is_priced_as_a_seen_side_where_the_object_falls_short(self, side):
+        short = self.detected[0].clone()
+        short[side] += 8.0 if side < 2 else -8.0
+        sides = [SEEN] * 4
+        expected = self.price(short.tolist(), sides)
+        sides[side] = LEAST
+        assert self.price(short.tolist(), sides) == expected
+        assert expected == pytest.approx((0.2**2 + SOFT**2) ** 0.5 - SOFT, rel=1e-5)
+
+    @pytest.mark.parametrize("side", range(4))
+    def test_beyond_it_costs_nothing(self, side):
+        wide = self.detected[0].clone()
+        wide[side] += -25.0 if side < 2 else 25.0
+        sides = [SEEN] * 4
+        sides[side] = LEAST
+        assert self.price(wide.tolist(), sides) == 0
+
+    def test_an_unknown_side_never_costs(self):
+        for off in (-20.0, 20.0):
+            drawn = (self.detected[0] + off).tolist()
+            assert self.price(drawn, [UNKNOWN] * 4) == 0
