@@ -103,21 +103,8 @@ class Placed:
 
 def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = silent) -> Placed:
     """Minimise Eq. 1 over the layout, from one start or from many."""
-    starts, inputs = inputs.starts, with_trees(inputs, config.form)
-    if config.first.steps:
-        starts = _by_boxes(inputs, config, starts, observe)
-    starts = spread_distance(starts, config.distances)
-    if config.yaws > 1:
-        starts = spread(starts, config.yaws)
-    if config.short.steps:
-        blurred = replace(
-            inputs,
-            image=coarser_image(inputs.image, config.coarse),
-            humans=coarser_humans(inputs.humans, config.coarse),
-        )
-        found = descend(blurred, config, starts, config.short, observe)
-        starts = best_few(found.at, found.value, config.keep)
-    found = descend(inputs, config, starts, config.method, observe)
+    inputs = with_trees(inputs, config.form)
+    found = descend(inputs, config, starts_left(inputs, config, observe), config.method, observe)
     for number in range(config.rounds if config.shaken else 0):
         around = shaken(best_few(found.at, found.value, 1), config.shaken, number)
         more = descend(inputs, config, around, config.method, observe)
@@ -133,6 +120,25 @@ def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = 
         energies = energy_of(inputs, config)
         at = _standing(inputs, part_objects(energies, inputs.objects, at, config.apart, observe))
     return Placed(at, candidates, energy, found.trace)
+
+
+def starts_left(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = silent) -> Layout:
+    """The starts of the main descents: spread, and thinned out by short descents."""
+    starts = inputs.starts
+    if config.first.steps:
+        starts = _by_boxes(inputs, config, starts, observe)
+    starts = spread_distance(starts, config.distances)
+    if config.yaws > 1:
+        starts = spread(starts, config.yaws)
+    if not config.short.steps:
+        return starts
+    blurred = replace(
+        inputs,
+        image=coarser_image(inputs.image, config.coarse),
+        humans=coarser_humans(inputs.humans, config.coarse),
+    )
+    found = descend(blurred, config, starts, config.short, observe)
+    return best_few(found.at, found.value, config.keep)
 
 
 def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
