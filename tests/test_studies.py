@@ -7,20 +7,26 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from test_experiments import FEW, Ended, quick, trial
 
 from mover import records
 from mover.commands import run_command
 from mover.experiments.changes import CHANGES, changed_set, set_named
 from mover.experiments.job import DONE, ROOM, Job, key_of, rebuild, store_room
+from mover.experiments.measures import seen_from
 from mover.experiments.queue import open_jobs, run_all
 from mover.experiments.run import by_room
 from mover.experiments.sets import SETS
 from mover.experiments.study import STUDIES, StudyArgs, ask_of, jobs_of, run_study
 from mover.experiments.variants import PARTS, TERMS, VARIANTS, Cut, Variant
 from mover.experiments.withheld import frames_of, withheld
+from mover.geometry.camera import project, to_camera
 from mover.minimize import Step
+from mover.outcome import carried
 from mover.presets import PRESETS
+from mover.stages.refine_bodies import RefinedBodies
+from mover.types import Room
 
 SEEDS = "1000-1019"
 
@@ -368,6 +374,51 @@ def test_people_who_are_not_told_are_measured_all_the_same(tmp_path: Path) -> No
     assert tree["full"]["pitch_error"] == tree["initial"]["pitch_error"]
     assert "contact_f1" in tree["full"]
     assert tree["frames"] == 0
+
+
+def test_refined_people_change_what_is_measured_of_people_only(tmp_path: Path, monkeypatch) -> None:
+    def sunk(room, _capture, _config):
+        down = torch.tensor([0.0, -0.05, 0.0])
+        n = len(room.bodies.verts)
+        moved = replace(room.bodies, verts=room.bodies.verts + down)
+        return RefinedBodies(moved, down.expand(n, 3), torch.zeros(n))
+
+    monkeypatch.setattr("mover.experiments.job.refine_bodies", sunk)
+    store_room(Job("rooms", 0, ROOM, tmp_path), trial(), FEW)
+    plain = Variant(quick(PRESETS["robust"]))
+    trees = []
+    for name, variant in (("robust", plain), ("refined-people", replace(plain, refined=True))):
+        job = Job("rooms", 0, name, tmp_path)
+        rebuild(job, variant, FEW)
+        trees.append(json.loads((job.folder / DONE).read_text()))
+    before, after = (tree["full"] for tree in trees)
+    assert before["iou3d"] == after["iou3d"]
+    assert before["pitch_error"] == after["pitch_error"]
+    assert before["ground_penetration_frequency"] < after["ground_penetration_frequency"] == 1
+
+
+def test_the_true_room_is_measured_with_the_people_of_the_result(tmp_path: Path) -> None:
+    store_room(Job("rooms", 0, ROOM, tmp_path), trial(), FEW)
+    job = Job("rooms", 0, "robust", tmp_path)
+    rebuild(job, Variant(quick(PRESETS["robust"])), FEW)
+    tree = json.loads((job.folder / DONE).read_text())
+    assert tree["true_room"]["iou3d"] == pytest.approx(1, abs=1e-4)
+    assert tree["true_room"]["pitch_error"] == 0
+    assert tree["true_room"]["contact_f1"] == 1  # this room has true people
+
+
+def test_people_seen_from_another_camera_stay_in_their_pixels() -> None:
+    known = trial()
+    bodies = carried(known.capture.bodies, known.capture.scene.camera)
+    room = Room(
+        known.capture.scene, known.capture.scene, known.capture.scene, bodies, None, (), (), None,
+        {}, (),
+    )  # fmt: skip
+    true = known.truth.camera
+    moved = seen_from(true, room)
+    pixels = project(to_camera(moved.verts, true.R_cam_world), true.K)
+    given = project(known.capture.bodies.verts, true.K)
+    torch.testing.assert_close(pixels, given, atol=0.01, rtol=0)
 
 
 @pytest.mark.parametrize(
