@@ -177,7 +177,7 @@ def test_pose_and_mesh_move_together():
 class TestOverlapAndHeight:
     """The one factor of what overlaps and what heights say."""
 
-    LOST = (1.0, math.inf, ["only 0 bodies are seen well enough, it stays as given"])
+    LOST = (1.0, math.inf, ["0 of at least 5 bodies are seen well enough, it stays as given"])
 
     def told(self, monkeypatch, peak, heights):
         module = "mover.stages.find_depth."

@@ -36,7 +36,8 @@ def peak_of(curves: Float[Tensor, "used factors"], rules: Rules) -> Peak:
     """Best factor by a parabola, its spread, and why it may not be used."""
     unknown, factors = (1.0, float("inf")), curves.shape[1]
     if len(curves) < rules.least:
-        return *unknown, [f"only {len(curves)} bodies are seen well enough, it stays as given"]
+        seen = f"{len(curves)} of at least {rules.least} bodies are seen well enough"
+        return *unknown, [f"{seen}, it stays as given"]
     total = curves.double().mean(0)
     best, reach = int(total.argmax()), max(2, factors // 6)
     low, high = max(0, best - reach), min(factors, best + reach + 1)

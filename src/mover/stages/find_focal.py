@@ -92,8 +92,9 @@ def find_focal(inputs: FocalInputs, config: FocalConfig, observe: Observer = sil
             found.append((row, places))
     observe(Step("find_focal", 0, 1))
     if len(found) < config.least:
-        few = f"focal length: only {len(found)} bodies are seen well enough, it stays as given"
-        return Focal(1.0, config.spread, len(found), (few,))
+        few = f"{len(found)} of at least {config.least} bodies are seen well enough"
+        told = f"focal length: {few}, it stays as given"
+        return Focal(1.0, config.spread, len(found), (told,))
     chosen = torch.tensor([row for row, _ in found])
     zoom, spread = fit_zoom(_sightings(inputs, chosen, torch.stack([p for _, p in found])),
                             config.spread)  # fmt: skip
