@@ -137,7 +137,7 @@ def test_a_track_without_masks_is_told():
     other = dataclasses.replace(seen, person=seen.person + 1)
     found = find_depth(inputs_of(true, other), QUICK)
     assert found.factor.tolist() == [1.0]
-    assert "only 0 bodies" in found.warnings[0]
+    assert "0 of at least 5 bodies" in found.warnings[0]
 
 
 def test_a_known_height_scales_the_person_about_the_camera():

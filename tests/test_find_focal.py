@@ -82,7 +82,7 @@ def test_nobody_who_is_seen_moves_nothing():
     assert (hidden.zoom, hidden.spread, hidden.sightings) == (1.0, 0.05, 0)
     few = find_focal(asked(true, masks_of(true), 1.05), LOOSE)
     assert (few.zoom, few.sightings) == (1.0, 3)
-    assert "only 3 bodies" in few.warnings[0]
+    assert "3 of at least 5 bodies" in few.warnings[0]
 
 
 def test_without_a_spread_no_preset_looks_for_it_and_the_stage_refuses():
