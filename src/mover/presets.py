@@ -109,7 +109,9 @@ _ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading
 ROBUST = Config(
     correct_depth=True,
     soles=SolesConfig(speed=0.6),
-    image=ImageConfig(128, "robust", 0.2, (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)),
+    image=ImageConfig(
+        128, "robust", hidden=0.2, borders=(-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
+    ),
     layout=PlaceConfig(
         _ROBUST_IMAGE, "robust", Quasi(), yaws=16, distances=(0.9, 1.1), short=_SHORT, keep=6,
         coarse=2, shaken=4, rounds=2, tie=1.0,

@@ -24,7 +24,15 @@ from ..run import Run, sources
 from ..stages.refine_bodies import RefineBodiesConfig, refine_bodies
 from ..types import Scene
 from .changes import set_named
-from .measures import Trial, carry_all, measure, measure_people, measure_truth, timing
+from .measures import (
+    Trial,
+    carry_all,
+    measure,
+    measure_people,
+    measure_true_room,
+    measure_truth,
+    timing,
+)
 from .sets import RoomSet
 from .traits import traits_of
 from .variants import VARIANTS, Variant
@@ -162,6 +170,8 @@ def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None)
     else:
         records.save(Rebuilt(room.image_only, room.scene), job.folder / "scenes")
         found = measure(trial, room, run, densities)
+        if variant.cut is None:  # no table shows it of parts of a video
+            found["true_room"] = measure_true_room(trial, room, run, densities)
     _finish(job, found | {"stages": stages, **_length(trial, variant)})
     shutil.rmtree(job.folder / "stages", ignore_errors=True)
 

@@ -69,18 +69,12 @@ def measure(
 ) -> dict[str, Any]:
     """All metrics of the initial scene, of Stage 1 and of the full method, object by object.
 
-    Stage 1 has camera, ground and people of the full method: only the furniture differs. The true
-    room with the same people says what their own errors cost.
+    Stage 1 has camera, ground and people of the full method: only the furniture differs.
     """
-    config = replace(densities or EvaluateConfig(), by_place=False)  # it is known who is who
-
-    def judged(scene: Scene, people: Bodies | None) -> dict[str, Any]:
-        bodies = EvaluatedBodies(trial.capture.bodies, people, trial.bodies)
-        asked = Judged(trial.capture.scene, scene, trial.truth, bodies)
-        return json.loads(run.stage(judge, asked, config).text)
-
-    image, full = (judged(scene, room.bodies) for scene in (room.image_only, room.scene))
-    true_room = judged(trial.truth, seen_from(trial.truth.camera, room))
+    image, full = (
+        _judged(trial, scene, room.bodies, run, densities)
+        for scene in (room.image_only, room.scene)
+    )
     rows = zip(trial.traits, image["objects"], full["objects"], strict=True)
     objects = [
         {name: getattr(traits, name) for name in TRAITS}
@@ -91,11 +85,27 @@ def measure(
         "initial": full["initial"],
         "image": image["result"],
         "full": full["result"],
-        "true_room": true_room["result"],
         "objects": objects,
         "unmatched": unmatched(trial.capture.scene, room.scene, trial.truth, by_place=False),
         "warnings": list(room.warnings),
     }
+
+
+def measure_true_room(
+    trial: Trial, room: Room, run: Run, densities: EvaluateConfig | None = None
+) -> dict[str, Any]:
+    """The true room with the people of a rebuilt one: what their own errors cost."""
+    people = seen_from(trial.truth.camera, room)
+    return _judged(trial, trial.truth, people, run, densities)["result"]
+
+
+def _judged(
+    trial: Trial, scene: Scene, people: Bodies | None, run: Run, densities: EvaluateConfig | None
+) -> dict[str, Any]:
+    config = replace(densities or EvaluateConfig(), by_place=False)  # it is known who is who
+    bodies = EvaluatedBodies(trial.capture.bodies, people, trial.bodies)
+    asked = Judged(trial.capture.scene, scene, trial.truth, bodies)
+    return json.loads(run.stage(judge, asked, config).text)
 
 
 def seen_from(camera: Camera, room: Room) -> Bodies | None:

@@ -43,10 +43,9 @@ def bbox_term(
     drawn = torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
     if form == "robust":
         size = (detected[:, 2:] - detected[:, :2]).clamp_min(1).prod(-1, keepdim=True).sqrt()
-        out = constant((-wider, -wider, wider, wider), detected)
-        off = (drawn - (detected + out)) / size
-        outside = off * constant((-1.0, -1.0, 1.0, 1.0), detected) > 0
-        counts = (sides == SEEN) | ((sides == LEAST) & ~outside)
+        outward = constant((-1.0, -1.0, 1.0, 1.0), detected)
+        off = (drawn - (detected + wider * outward)) / size
+        counts = (sides == SEEN) | ((sides == LEAST) & (off * outward <= 0))
         return (((off.square() + SOFT**2).sqrt() - SOFT) * counts).sum(-1)
     off = (_corner_and_width(drawn) - _corner_and_width(detected)).abs() * (WIDTH / width)
     if form == "release":
