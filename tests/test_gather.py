@@ -1,9 +1,10 @@
+import itertools
 from dataclasses import replace
 
 import pytest
 import torch
 
-from mover.stages.thin_points import thin
+from mover.stages.thin_points import in_turns, thin
 from mover.terms.depth import DepthMaps, Seen, bounds_of, merge
 
 H, W = 12, 20
@@ -97,3 +98,13 @@ def test_what_a_wrong_outline_explains_is_not_hidden():
     found = bounds_of(replace(seen(nothing), reach=2.0), columns(0, 20)[None], 0, vote=False)
     assert (found.far[:, 6:14] == 2.0).all()
     assert not found.far[:, [4, 15]].isfinite().any()
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 150, 1000])
+def test_every_beginning_of_an_order_in_turns_is_spread_evenly(count):
+    order = in_turns(count)
+    assert sorted(order.tolist()) == list(range(count))
+    for some in range(1, count + 1, max(1, count // 20)):
+        places = [-1, *sorted(order[:some].tolist()), count]
+        gaps = [b - a for a, b in itertools.pairwise(places)]
+        assert max(gaps) <= 1 + 2 * count / some

@@ -11,6 +11,7 @@ from torch import Tensor
 from mover.geometry import mesh as m
 from mover.geometry.nearest import nearest_points, to_surface
 from mover.geometry.rotations import axis_angle
+from mover.geometry.thinning import farthest_first
 from mover.geometry.topology import manifold
 from mover.types import Mesh
 
@@ -220,3 +221,21 @@ def test_decimation_never_opens_a_mesh_that_cannot_be_made_simpler():
     assert m.signed_volume(small) > 20
     assert m.decimate(cube(), 100) is not None
     assert torch.equal(m.decimate(cube(), 12).faces, cube().faces)
+
+
+@pytest.mark.parametrize("kind", ["random", "grid", "line", "one place"])
+def test_each_sample_is_the_farthest_from_those_before(kind: str):
+    rng = torch.Generator().manual_seed(1)
+    points = {
+        "random": torch.rand(700, 3, generator=rng),
+        "grid": torch.cartesian_prod(*[torch.arange(6.0)] * 3),  # many are equally far
+        "line": torch.rand(100, 1, generator=rng) * torch.tensor([[1.0, 0.0, 0.0]]),
+        "one place": torch.ones(5, 3),
+    }[kind]
+    count = min(150, len(points))
+    expected, nearest = [0], torch.full((len(points),), torch.inf)
+    for _ in range(count - 1):
+        away = (points - points[expected[-1]]).square()
+        nearest = torch.minimum(nearest, away[:, 0] + away[:, 1] + away[:, 2])
+        expected.append(int((nearest == nearest.max()).nonzero()[0]))
+    assert farthest_first(points, count).tolist() == expected

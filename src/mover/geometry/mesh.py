@@ -8,6 +8,7 @@ from torch import Tensor
 from ..types import Mesh
 from .nearest import as_float64, as_int64, closest
 from .solids import volumes
+from .thinning import farthest_first
 from .topology import edges_of as edges_of
 from .topology import is_closed as is_closed
 from .topology import manifold
@@ -92,14 +93,7 @@ def sample_surface(
         ValueError: If the mesh has no area.
     """
     points, face = _scatter(mesh, OVERSAMPLING * count, np.random.default_rng(seed))
-    x, y, z = points.unbind(-1)
-    chosen = torch.zeros(count, dtype=torch.long, device=points.device)
-    nearest = torch.full_like(x, torch.inf)
-    for row in range(count):  # each choice depends on those before it
-        last = chosen[max(row - 1, 0)]
-        apart = (x - x[last]).square() + (y - y[last]).square() + (z - z[last]).square()
-        nearest = torch.minimum(nearest, apart)
-        chosen[row] = 0 if row == 0 else nearest.argmax()
+    chosen = farthest_first(points, count)
     return points[chosen], face_normals(mesh.verts.detach(), mesh.faces)[face[chosen]]
 
 

@@ -8,12 +8,11 @@ from torch import Tensor
 
 from ..geometry.nearest_warp import Clouds
 from ..geometry.reach_warp import FromObject, FromWorld, Way, reach
+from ..geometry.thinning import BITS, z_order
 from ..types import Layout
 from . import Form
 from .contact import PARTS, Touches
 from .contact_trees import Trees
-
-BITS = 10  # of a place along each axis, where neighbours are put together
 
 
 def reach_term(
@@ -58,12 +57,7 @@ def together(touches: Touches) -> Touches:
     known, points = (touches.weight > 0).unsqueeze(-1), touches.points
     low = torch.where(known, points, torch.inf).amin(-2, keepdim=True)
     high = torch.where(known, points, -torch.inf).amax(-2, keepdim=True)
-    most = (1 << BITS) - 1
-    cell = torch.where(known, (points - low) / (high - low).clamp_min(1e-6) * most, 0.0).long()
-    code = torch.where(known[..., 0], 0, 1 << 3 * BITS)
-    for bit in range(BITS):
-        for axis in range(3):
-            code = code | ((cell[..., axis] >> bit & 1) << (3 * bit + axis))
+    code = torch.where(known[..., 0], z_order(points, low, high), 1 << 3 * BITS)
     order = code.argsort(dim=-1, stable=True)
     return replace(
         touches,
