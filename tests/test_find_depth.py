@@ -131,6 +131,19 @@ def test_few_or_cut_off_or_hidden_people_stay_where_they_are():
         assert "are seen well enough" in found.warnings[0]
 
 
+def test_frames_that_are_seen_stand_in_for_those_that_are_not():
+    true = film(spots(48))
+    seen = masks_of(true)
+    nothing = encode(torch.zeros(SIZE, dtype=torch.bool))
+    shown = {1, 6, 14, 22, 29, 35, 42, 46}
+    counts = tuple(c if k in shown else nothing for k, c in enumerate(seen.masks.counts))
+    seen = dataclasses.replace(seen, masks=dataclasses.replace(seen.masks, counts=counts))
+    few = dataclasses.replace(QUICK, most=8)  # of 48 evenly spread ones none is shown
+    found = find_depth(inputs_of(moved(true, 1.03), seen), few)
+    assert found.warnings == ()
+    assert float(found.factor[0]) == pytest.approx(1 / 1.03, abs=0.004)
+
+
 def test_a_track_without_masks_is_told():
     true = film(spots())
     seen = masks_of(true)

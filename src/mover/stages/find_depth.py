@@ -29,7 +29,7 @@ from .depth_peak import SYSTEMATIC, Peak, peak_of
 from .find_soles import SolesConfig, straight_legs
 from .mask_overlap import overlaps, small, uncovered
 from .person_masks import MaskTable, mask_table
-from .thin_points import evenly
+from .thin_points import evenly, in_turns
 
 LIKELY_SIZE = (0.8, 1.25)  # a body whose size is off by more is a mistake in the height
 
@@ -59,9 +59,9 @@ class DepthConfig:
     every: int = 3
     """Use every so many of a person's frames ..."""
     most: int = 40
-    """... and at most so many, spread over the video."""
+    """... and at most so many in which it is seen well, spread over the video."""
     whole: int = 150
-    """At most so many frames are searched for people who are wholly seen."""
+    """At most so many frames are searched for people who are seen well, or wholly."""
     least: int = 5
     """Fewer frames than that tell nothing."""
     width: int = 240
@@ -180,38 +180,43 @@ def _curves(
     free: Bool[Tensor, "h w"],
 ) -> Float[Tensor, "used factors"]:
     """Overlap of silhouette and mask over the factors, for each body that is seen well."""
+    factors = torch.linspace(1 - config.span, 1 + config.span, config.factors)
     curves: list[Tensor] = []
     for row in _spread_out(rows[:: config.every], inputs, config):  # masks are decoded one by one
+        if len(curves) == config.most:
+            break
         own, others = table.decode(row)
         known = free & uncovered(others, config.width)
-        mask, drawn = small(own, config.width), _drawn(inputs, config, row, free)
-        middle = drawn[config.factors // 2]
+        mask = small(own, config.width)
+        middle = _drawn(inputs, row, free, torch.ones(1))[0]
         seen = mask[middle & known].sum() / (middle & known).sum().clamp_min(1)
         open_share = (middle & known).sum() / middle.sum().clamp_min(1)
         if min(float(seen), float(open_share)) < config.seen:
             continue
-        curves.append(overlaps(drawn, mask, known))
+        curves.append(overlaps(_drawn(inputs, row, free, factors), mask, known))
     return torch.stack(curves) if curves else torch.zeros(0, config.factors)
 
 
 def _spread_out(rows: Int[Tensor, " rows"], inputs: DepthInputs, config: DepthConfig) -> list[int]:
-    """Bodies that are inside the image, so many of them as wanted."""
+    """Bodies inside the image: evenly spread ones, then those that stand in for hidden ones."""
     camera, verts = inputs.camera, inputs.bodies.verts[rows]
     pixels = project(verts, camera.K.to(verts))
     size = pixels.new_tensor([camera.width, camera.height])
     inside = ((pixels > 0) & (pixels < size)).all(-1).float().mean(1) >= config.inside
-    return evenly(rows[inside], config.most).tolist()
+    tried = evenly(rows[inside], config.whole)
+    first = evenly(tried, config.most)
+    others = tried[~torch.isin(tried, first)]
+    return torch.cat([first, others[in_turns(len(others))]]).tolist()
 
 
 def _drawn(
-    inputs: DepthInputs, config: DepthConfig, row: int, like: Bool[Tensor, "h w"]
+    inputs: DepthInputs, row: int, like: Bool[Tensor, "h w"], factors: Float[Tensor, " factors"]
 ) -> Bool[Tensor, "factors h w"]:
-    """Silhouettes of one body at all depths."""
+    """Silhouettes of one body at some depths."""
     bodies, camera = inputs.bodies, inputs.camera
-    factors = torch.linspace(1 - config.span, 1 + config.span, config.factors).to(bodies.verts)
-    shift = (factors - 1)[:, None] * pelvis(bodies)[row]
+    shift = (factors.to(bodies.verts) - 1)[:, None] * pelvis(bodies)[row]
     height, width = like.shape
     shrink = torch.tensor([width / camera.width, height / camera.height, 1.0]).diag()
-    K = (shrink @ camera.K.float()).expand(config.factors, 3, 3)
+    K = (shrink @ camera.K.float()).expand(len(factors), 3, 3)
     verts = bodies.verts[row] + shift[:, None]
     return layers(verts.float(), bodies.faces, Views(K, height, width)).front.isfinite()

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fill the unit interval evenly
+
 
 def thin(
     points: Float[Tensor, "points 3"],
@@ -41,3 +43,8 @@ def thin(
 def evenly(rows: Int[Tensor, " rows"], most: int) -> Int[Tensor, " some"]:
     """At most so many of them, evenly spread, the first and the last among them."""
     return rows[torch.linspace(0, len(rows) - 1, min(most, len(rows))).round().long()]
+
+
+def in_turns(count: int) -> Int[Tensor, " count"]:
+    """An order of so many rows whose beginnings are all spread evenly (golden ratio)."""
+    return (torch.arange(count, dtype=torch.float64) * GOLDEN % 1).argsort()
