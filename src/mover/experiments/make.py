@@ -8,8 +8,6 @@ import json
 import math
 import os
 import platform
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,7 +23,8 @@ from ..records import InputError, plain, replacing
 from .digests import differences
 from .job import DONE, Job
 from .made import MADE, is_made
-from .queue import LOG, Launch, Running, failure_of, has_results, run_all
+from .processes import Running, start_process
+from .queue import LOG, Launch, failure_of, has_results, run_all
 from .run import parse_seeds
 from .sets import SETS
 
@@ -106,18 +105,9 @@ def make_set(args: MakeArgs, observe: Observer = silent, launch: Launch | None =
 
 
 def start(job: Job, captures: bool) -> Running:
-    """Start the making of a room as a process with one thread; what it says goes to its log."""
-    job.folder.mkdir(parents=True, exist_ok=True)
+    """Start the making of a room; what it says goes to its log."""
     words = [job.rooms, str(job.seed), str(job.out), *(["captures"] if captures else [])]
-    single = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    with (job.folder / LOG).open("w") as file:
-        return subprocess.Popen(
-            [sys.executable, "-m", "mover.experiments.made", *words],
-            stdout=file,
-            stderr=file,
-            stdin=subprocess.DEVNULL,
-            env={**os.environ, **single},
-        )
+    return start_process("mover.experiments.made", words, job.folder / LOG)
 
 
 def known_hashes(name: str) -> dict[str, dict[str, Any]]:

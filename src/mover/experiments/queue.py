@@ -2,17 +2,14 @@
 
 import json
 import logging
-import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol, runtime_checkable
 
 from ..records import replacing
 from .job import DONE, ROOM, Job, key_of
+from .processes import Running, start_process
 from .tables import Failure
 
 log = logging.getLogger(__name__)
@@ -21,36 +18,13 @@ FAILED = "failure.json"
 LOG = "log.txt"
 
 
-@runtime_checkable
-class Running(Protocol):
-    """A job that was started."""
-
-    def poll(self) -> int | None:
-        """The exit code; None: it still runs."""
-        ...
-
-    def terminate(self) -> None:
-        """Stop it."""
-        ...
-
-
 Launch = Callable[[Job], Running]
 
 
 def start(job: Job) -> Running:
-    """Start a job as a process with one thread; what it says goes to its log."""
-    job.folder.mkdir(parents=True, exist_ok=True)
+    """Start a job; what it says goes to its log."""
     words = (job.rooms, str(job.seed), job.name, str(job.out))
-    command = [sys.executable, "-m", "mover.experiments.job", *words]
-    single = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    with (job.folder / LOG).open("w") as file:
-        return subprocess.Popen(
-            command,
-            stdout=file,
-            stderr=file,
-            stdin=subprocess.DEVNULL,
-            env={**os.environ, **single},
-        )
+    return start_process("mover.experiments.job", words, job.folder / LOG)
 
 
 def open_jobs(jobs: Sequence[Job], keep: bool) -> list[Job]:
