@@ -1,9 +1,10 @@
 """Are stated doubts true? Learns their factors on some known rooms, and tests them on others.
 
-    python benchmarks/calibrate.py --learn 100-111 --check 112-117 --out calibration --write
+    python benchmarks/calibrate.py --learn 100-117 --check 118-124 --out calibration --write
 
 rebuilds the rooms (finished ones are kept in `--out`), prints how many true values the 90 % ranges
-hold, how wide they are and whether their widths rank with the errors, and with `--write` replaces
+hold, how wide they are and whether their widths rank with the errors, in each room learnt on with
+what the others teach and in those to check, and with `--write` replaces
 `src/mover/assets/calibration.json`. Rooms 0-9 and from 1000 on are for results and never used.
 """
 
@@ -13,39 +14,29 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import torch
+from calibrate_learn import USED, Judged, in_turn, learn
 from jaxtyping import Float
 from scipy.stats import spearmanr
 from torch import Tensor
 
 from mover import records
-from mover.calibration import KIND_OF, Calibration, calibration_of, learn_factor, learn_share
+from mover.calibration import KIND_OF, Calibration, calibration_of, learn_factor
 from mover.experiments.run import parse_seeds
 from mover.explanation import LEVEL, explain, held, offs, ways_of, width
 from mover.explanation_records import Explanation, Facts
-from mover.explanation_words import NORMAL
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import wrap
 from mover.pipeline import PRESETS, Run, reconstruct
-from mover.records import record
 from mover.rooms import NoiseConfig, add_noise, make_room
-from mover.stages.starts import MOVED, TURNED
 from mover.types import Piece, Scene
 
 ASSET = Path(__file__).parents[1] / "src" / "mover" / "assets" / "calibration.json"
-USED = ("distance", "sideways", "yaw", "size")  # kinds that the table tells
-
-
-@record
-class Judged:
-    """What was stated of the objects of a room, and what is true."""
-
-    facts: tuple[Facts, ...]
-    truth: Float[Tensor, "objects 7"]
 
 
 def judged(facts: tuple[Facts, ...], result: Scene, truth: Scene) -> Judged:
@@ -75,46 +66,11 @@ def rebuild(seed: int, preset: str, folder: Path) -> None:
     records.save(judged(facts, room.scene, known.truth), folder / f"{preset}_{seed}")
 
 
-def learn(rooms: list[Judged]) -> Calibration:
-    """Alternatives and camera first, then one factor for each other kind of unknown."""
-    pairs = [(f, t) for room in rooms for f, t in zip(room.facts, room.truth, strict=True)]
-    share = learn_share([([a.rise for a in f.alternatives], _nearest(f, t)) for f, t in pairs])
-    plain = explain([f for f, _ in pairs], Calibration(share=share))
-    told = list(zip(plain, (t for _, t in pairs), strict=True))
-    factors = {"height": learn_factor(_needed(told, "height", 0.0), LEVEL)}
-    for kind in USED:
-        factors[kind] = learn_factor(_needed(told, kind, factors["height"]), LEVEL)
-    return Calibration(factors, share, True)
-
-
-def _needed(
-    told: list[tuple[Explanation, Float[Tensor, "7"]]], kind: str, camera: float
-) -> list[float]:
-    """For each error the least factor with which its range holds it; `camera` is settled."""
-    needed: list[float] = []
-    for e, truth in told:
-        for way in ways_of(e.facts.place)[[k == kind for k in KIND_OF]]:
-            own, tilt = (float(way @ c @ way) for c in (e.facts.covariance, e.facts.tilt))
-            if kind == "height":
-                own, tilt = own + tilt, 0.0
-            if own > 0:
-                off = min(offs(e, way, truth)) / NORMAL
-                needed.append((max(0.0, off**2 - camera**2 * tilt) / own) ** 0.5)
-    return needed
-
-
-def _nearest(facts: Facts, truth: Float[Tensor, "7"]) -> int:
-    """Which of the result (0) and its alternatives is nearest to the truth."""
-    rows = torch.stack([facts.place, *(a.place for a in facts.alternatives)]) - truth
-    away = rows[:, [0, 2]].norm(dim=-1) / MOVED
-    return int((away.square() + (wrap(rows[:, 3]) / TURNED).square()).argmin())
-
-
-def table(rooms: list[Judged], calibration: Calibration) -> str:
-    """Coverage, width and rank, by kind of unknown."""
-    facts = [f for room in rooms for f in room.facts]
+def table(rooms: list[Judged], calibrations: Sequence[Calibration]) -> str:
+    """Coverage, width and rank, by kind of unknown; each room with a calibration."""
+    pairs = zip(rooms, calibrations, strict=True)
+    told = tuple(e for room, known in pairs for e in explain(room.facts, known))
     truth = torch.cat([room.truth for room in rooms])
-    told = explain(facts, calibration)
     head = f"{'':8} {'values':>7} {'held':>7} {'width':>8} {'best constant':>14} {'Spearman':>9}"
     return "\n".join([head, *(_line(kind, told, truth) for kind in USED)])
 
@@ -160,7 +116,7 @@ def allowed(text: str) -> tuple[int, ...]:
 def main() -> None:
     """Learn on some rooms and test on others."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--learn", default="100-111", help="rooms to learn on; '' takes the asset")
+    parser.add_argument("--learn", default="100-117", help="rooms to learn on; '' takes the asset")
     parser.add_argument("--check", default="", help="rooms to test on")
     parser.add_argument("--preset", default="robust")
     parser.add_argument("--out", type=Path, default=Path("calibration"))
@@ -176,11 +132,15 @@ def main() -> None:
     if args.learn:
         rooms = finished(allowed(args.learn), args)
         calibration = learn(rooms)
-        print(f"learnt on {args.learn}: {dict(calibration.factors)}, share {calibration.share:.3f}")
-        print(table(rooms, calibration))
+        print(f"learnt on {args.learn}: {dict(calibration.factors)}")
+        print(f"share {calibration.share:.3f}")
+        if len(rooms) > 2:
+            print(f"each of {args.learn} tested with what the others teach")
+            print(table(rooms, in_turn(rooms)))
     if args.check:
         print(f"\ntested on {args.check}")
-        print(table(finished(allowed(args.check), args), calibration))
+        rooms = finished(allowed(args.check), args)
+        print(table(rooms, [calibration] * len(rooms)))
     if args.write:
         write(form, calibration, args.learn)
 

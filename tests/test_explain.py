@@ -11,7 +11,18 @@ import torch
 from analytic import make_inputs, moved
 from little_room import camera, room, walkers
 
-from mover.calibration import Calibration, calibration_of, learn_factor, learn_share
+from mover.calibration import (
+    FORMAT,
+    KINDS,
+    SCALES,
+    VERSION,
+    Calibration,
+    calibration_of,
+    forms_of,
+    learn_factor,
+    learn_share,
+    surprise,
+)
 from mover.explanation import calibrated, explain, held, offs, ways_of, width
 from mover.explanation_file import log_rows, scene_fields
 from mover.explanation_records import Alternative, Bound, Facts, Pull, Touching
@@ -352,7 +363,14 @@ class TestWords:
         )
 
     def test_calibration_scales_spreads_by_kind_and_the_camera_by_itself(self):
-        factors = {"distance": 2.0, "sideways": 0.5, "height": 3.0, "yaw": 4.0, "size": 1.0}
+        factors = {
+            "distance": 2.0,
+            "sideways": 0.5,
+            "height": 3.0,
+            "yaw": 4.0,
+            "size": 1.0,
+            "roll": 3.0,
+        }
         place = torch.tensor([3.0, -1.4, -4.0, 0, 0, 0, 0], dtype=torch.float64)
         tilt = torch.zeros(7, 7, dtype=torch.float64)
         tilt[0, 0] = 0.01
@@ -367,6 +385,18 @@ class TestWords:
         assert abs(float(ray @ rest @ side)) < 1e-12
         close(ways_of(place)[0], ray)
         close(ways_of(place)[2], side)
+
+    def test_the_roll_counts_across_the_ray_alone(self):
+        place = torch.tensor([0, -1.4, -8.0, 0, 0, 0, 0], dtype=torch.float64)
+        one = torch.eye(7, dtype=torch.float64)
+        asked = facts(place=place, energy=0.08, covariance=one, tilt=one)
+        factors = dict.fromkeys(KINDS, 1.0) | {"height": 3.0, "roll": 0.5, "yaw": 2.0}
+        found = calibrated(asked, Calibration(factors, 1.0, True))
+        expected = torch.tensor([1, 9, 1, 4, 1, 1, 1], dtype=torch.float64)
+        expected += torch.tensor([0.25, 9, 9, 9, 9, 9, 9], dtype=torch.float64)  # x is across
+        close(found, torch.diag(expected))
+        plain = calibrated(asked, Calibration())
+        close(plain, 2 * one)
 
     def test_a_likely_alternative_belongs_to_what_holds(self):
         there = facts().place.clone()
@@ -395,6 +425,44 @@ class TestCalibration:
         assert factor == pytest.approx(0.3, abs=0.06)
         share = (errors[200:].abs() <= 1.645 * factor * spread[200:]).float().mean()
         assert 0.84 <= float(share) <= 0.96
+
+    def test_errors_are_likeliest_under_the_variances_that_they_were_drawn_with(self):
+        g = torch.Generator().manual_seed(5)
+        own, rest = (torch.rand(2, 4000, generator=g, dtype=torch.float64) + 0.05).square()
+        spread = (0.3**2 * own + 0.2**2 * rest).sqrt()
+        normal = torch.randn(4000, generator=g, dtype=torch.float64)
+        chi = torch.randn(4000, 2, generator=g, dtype=torch.float64).square().mean(-1)
+        errors = (spread * normal / chi.sqrt()).abs()
+        shares = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8)
+        assert min(shares, key=lambda r: surprise(own, r**2 * rest, errors)) == 0.2
+        powers = (0.5, 1.0, 2.0)
+        assert min(powers, key=lambda p: surprise(own**p, 0.2**2 * rest, errors)) == 1.0
+
+    def test_the_surprise_is_the_least_over_all_factors(self):
+        own = torch.tensor([0.1, 0.4, 0.02], dtype=torch.float64)
+        rest, errors = own.flip(0) / 50, torch.tensor([0.03, 0.2, 0.01], dtype=torch.float64)
+        total = []
+        for scale in SCALES:
+            variances = [scale**2 * a + b for a, b in zip(own.tolist(), rest.tolist(), strict=True)]
+            pairs = zip(variances, errors.tolist(), strict=True)
+            total.append(
+                sum(math.log(v) / 2 + 1.5 * math.log(1 + e * e / (2 * v)) for v, e in pairs)
+            )
+        assert surprise(own, rest, errors) == pytest.approx(min(total))
+
+    @pytest.mark.parametrize(
+        "wrong",
+        [
+            {"format": "another"},
+            {"version": VERSION - 1},
+            {"forms": {"robust": {"factors": {}, "share": 1.0}}},
+        ],
+    )
+    def test_a_file_of_another_kind_is_refused(self, wrong):
+        right = {"format": FORMAT, "version": VERSION, "forms": {}}
+        assert forms_of(right) == {}
+        with pytest.raises(ValueError, match=r"calibration\.json"):
+            forms_of(right | wrong)
 
     def test_too_few_errors_teach_nothing(self):
         with pytest.raises(ValueError, match="too few"):

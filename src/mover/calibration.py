@@ -9,15 +9,24 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from .terms import Form
 
 KIND_OF = ("distance", "height", "sideways", "yaw", "size", "size", "size")
 """What is calibrated together, by direction (`explanation.ways_of`); the factor of the height
 holds for all that the camera's and the floor's doubt does."""
-KINDS = tuple(dict.fromkeys(KIND_OF))
+KINDS = (*dict.fromkeys(KIND_OF), "roll")
+"""`roll`: the factor of what the camera's doubt does across the ray: objects tell its roll better
+than the feet do, of which the stated doubt is."""
 FILE = "calibration.json"
+FORMAT, VERSION = "mover-calibration", 2
 SHARES = tuple(0.01 * 1.2**k for k in range(30))  # weights that are tried
+SCALES = tuple(1e-3 * 1.1**k for k in range(100))  # factors that are tried for likelihoods
 
 
 @dataclass(frozen=True)
@@ -33,11 +42,27 @@ class Calibration:
 
 def calibration_of(form: Form) -> Calibration:
     """What is known for a form of the prices; factors of one where nothing is."""
-    found = json.loads(files("mover").joinpath("assets", FILE).read_text(encoding="utf-8"))
-    learnt = found["forms"].get(form)
-    if learnt is None:
-        return Calibration()
-    return Calibration(learnt["factors"], learnt["share"], True)
+    text = files("mover").joinpath("assets", FILE).read_text(encoding="utf-8")
+    learnt = forms_of(json.loads(text)).get(form)
+    return Calibration() if learnt is None else learnt
+
+
+def forms_of(tree: Mapping[str, Any]) -> dict[str, Calibration]:
+    """The calibrations of a file, by form.
+
+    Raises:
+        ValueError: If the file is of another kind or version, or names what is not known.
+    """
+    if (tree.get("format"), tree.get("version")) != (FORMAT, VERSION):
+        raise ValueError(f"{FILE}: not {FORMAT} of version {VERSION}")
+    return {form: _read(row) for form, row in tree["forms"].items()}
+
+
+def _read(row: Mapping[str, Any]) -> Calibration:
+    factors = row["factors"]
+    if set(factors) != set(KINDS):
+        raise ValueError(f"{FILE}: kinds are {', '.join(KINDS)}")
+    return Calibration(factors, row["share"], True)
 
 
 def learn_factor(needed: Sequence[float], level: float) -> float:
@@ -54,6 +79,20 @@ def learn_factor(needed: Sequence[float], level: float) -> float:
     if rank > len(needed):
         raise ValueError(f"learn_factor: {len(needed)} errors are too few for {level:.0%}")
     return sorted(needed)[rank - 1]
+
+
+def surprise(
+    own: Float[Tensor, " errors"], rest: Float[Tensor, " errors"], errors: Float[Tensor, " errors"]
+) -> float:
+    """How unlikely errors are whose variances are said to be `own` times some factor plus `rest`.
+
+    Errors count as Student's t with two degrees of freedom: a wrong yaw is as wrong as can be, and
+    must not decide alone. The factor is the one with which they are likeliest.
+    """
+    square = torch.tensor(SCALES, dtype=torch.float64).square()[:, None] * own + rest
+    square = square.clamp_min(1e-12)
+    each = square.log() / 2 + 1.5 * (1 + errors.square() / square / 2).log()
+    return float(each.sum(1).min())
 
 
 def learn_share(cases: Sequence[tuple[Sequence[float], int]]) -> float:

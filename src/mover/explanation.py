@@ -56,11 +56,15 @@ def ways_of(place: Float[Tensor, "7"]) -> Float[Tensor, "7 7"]:
 
 def calibrated(facts: Facts, calibration: Calibration) -> Float[Tensor, "7 7"]:
     """The covariance with one factor on the spread of each kind, and the camera's with its own."""
-    ways = ways_of(facts.place)
-    kinds = [calibration.factors[kind] for kind in KIND_OF]
-    factor = ways.mT @ (torch.tensor(kinds, dtype=torch.float64)[:, None] * ways)
-    camera = calibration.factors["height"] ** 2 * facts.tilt
-    return factor @ facts.covariance @ factor.mT + camera
+    known, ways = calibration.factors, ways_of(facts.place)
+    factor = _along(ways, [known[kind] for kind in KIND_OF])
+    tilt = _along(ways, [known["roll" if k == "sideways" else "height"] for k in KIND_OF])
+    return factor @ facts.covariance @ factor.mT + tilt @ facts.tilt @ tilt.mT
+
+
+def _along(ways: Float[Tensor, "7 7"], factors: list[float]) -> Float[Tensor, "7 7"]:
+    """The matrix that stretches each direction by its factor."""
+    return ways.mT @ (torch.tensor(factors, dtype=torch.float64)[:, None] * ways)
 
 
 def _others(facts: Facts, calibration: Calibration) -> tuple[Other, ...]:
