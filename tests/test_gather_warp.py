@@ -158,12 +158,13 @@ def test_rays_enter_and_leave_bodies_where_the_torch_version_says() -> None:
 
 def test_what_is_behind_the_camera_or_beside_the_image_is_not_drawn() -> None:
     verts, faces = posed_bodies(4)
-    shift = torch.tensor([[0.0, 0.2, 0.1], [0.0, 0, -4.0], [9.0, 0, 3.0], [0.5, 0.8, 2.0]])
+    shift = torch.tensor([[0.0, 0.2, 0.3], [0.0, 0, -4.0], [9.0, 0, 3.0], [0.5, 0.8, 2.0]])
     turned = verts * torch.tensor([1.0, -1.0, -1.0]) + shift[:, None]
     views = cameras(4, (90, 120), 110.0)
     assert_same_layers(turned, faces, views)
     found = layers_warp.layers(turned, faces, views)
     assert not found.front[1:3].isfinite().any()
+    assert (turned[0, :, 2] < 0).any()  # a part of it is behind the camera
     assert found.front[0].isfinite().any()
     assert found.front[3].isfinite().any()
 

@@ -4,6 +4,7 @@ The opcodes and their arguments are parsed by the standard library's `pickletool
 """
 
 import pickletools
+import warnings
 from collections.abc import Callable
 from io import BytesIO
 from typing import Any
@@ -32,13 +33,15 @@ class Machine:
             ValueError: If an opcode is not one of data.
             InputError: If a class is named that is not in the table.
         """
-        for opcode, arg, _ in pickletools.genops(self.stream):
-            if opcode.name == "STOP":
-                return self.stack.pop()
-            act = ACTS.get(opcode.name)
-            if act is None:
-                raise ValueError(f"opcode {opcode.name}")
-            act(self, arg)
+        with warnings.catch_warnings():  # of escapes that are none, in texts that are broken
+            warnings.simplefilter("ignore", DeprecationWarning)
+            for opcode, arg, _ in pickletools.genops(self.stream):
+                if opcode.name == "STOP":
+                    return self.stack.pop()
+                act = ACTS.get(opcode.name)
+                if act is None:
+                    raise ValueError(f"opcode {opcode.name}")
+                act(self, arg)
         raise ValueError("no end")
 
     def marked(self) -> list[Any]:
