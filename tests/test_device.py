@@ -223,12 +223,18 @@ def test_a_replayed_step_has_the_numbers_of_the_step_itself(keep_best):
     assert torch.equal(plain.at.x, replay.at.x)
 
 
+def calm(config):
+    """A few long steps magnify what is rounded otherwise: the camera takes short ones."""
+    method = replace(config.refine.method, rate=0.03)
+    return replace(config, refine=replace(config.refine, method=method))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["robust", "release"])
 def test_the_main_job_ends_where_it_ends_on_the_cpu(device, preset, small_room, tmp_path):
     from mover.rooms.noise import NoiseConfig, add_noise
 
-    capture, config = add_noise(small_room, NoiseConfig(), 1), light(preset, steps=4)
+    capture, config = add_noise(small_room, NoiseConfig(), 1), calm(light(preset, steps=4))
     here, there = (
         reconstruct(capture, config, Run(tmp_path / d.type, device=d)) for d in (CPU, device)
     )
@@ -238,9 +244,13 @@ def test_the_main_job_ends_where_it_ends_on_the_cpu(device, preset, small_room, 
     log = json.loads((run.folder / "run.json").read_text())
     assert log["device"] == named(device)
     assert all(stage["kept"] for stage in log["stages"])
-    for one, other in zip(here.scene.pieces, there.scene.pieces, strict=True):
-        assert other.t_world_object.device == CPU
-        torch.testing.assert_close(one.t_world_object, other.t_world_object, rtol=0, atol=0.1)
+    assert all(piece.t_world_object.device == CPU for piece in there.scene.pieces)
+    places = (torch.stack([p.t_world_object for p in x.scene.pieces]) for x in (here, there))
+    off = (next(places) - next(places)).abs()
+    doubt = torch.stack([e.facts.covariance.diagonal()[:3].sqrt() for e in here.explanations])
+    assert off[:, 1].max() <= 0.005
+    assert off.norm(dim=-1).median() <= 0.02
+    assert bool((off <= 0.01 + doubt).all())  # rounding may choose where the evidence does not
 
 
 class TestChoice:

@@ -19,6 +19,7 @@ class Bar:
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
         self._stage, self._task = "", None
+        self._level = log.level
         self._console = Console(file=sys.stderr)
         self._lines = RichHandler(
             console=self._console, show_time=False, show_level=False, show_path=False
@@ -34,6 +35,7 @@ class Bar:
 
     def __enter__(self) -> "Bar":
         log.addHandler(self._lines)
+        self._level = log.level
         log.setLevel(logging.INFO)
         log.propagate = False
         if self._console.is_terminal:
@@ -48,6 +50,7 @@ class Bar:
     ) -> None:
         self._progress.stop()
         log.removeHandler(self._lines)
+        log.setLevel(self._level)
         log.propagate = True
 
     def __call__(self, step: Step) -> None:
