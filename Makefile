@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 JOBS ?= 2
 
-.PHONY: demo test long check lint docs clean
+.PHONY: demo test long check lint docs tables clean
 
 demo: $(VENV)/.installed
 	$(BIN)/mover demo --out demo
@@ -48,6 +48,9 @@ $(VENV)/.developed: $(VENV)/.installed
 $(VENV)/.documented: $(VENV)/.installed
 	$(PIP) --constraint constraints.txt --editable ".[docs]"
 	touch $@
+
+tables: $(VENV)/.installed
+	$(BIN)/python benchmarks/tables.py --out experiments --write
 
 clean:
 	rm -rf $(VENV) demo out build dist docs/_build .pytest_cache .ruff_cache

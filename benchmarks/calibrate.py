@@ -1,11 +1,12 @@
 """Are stated doubts true? Learns their factors on some known rooms, and tests them on others.
 
-    python benchmarks/calibrate.py --learn 100-117 --check 118-124 --out calibration --write
+    python benchmarks/calibrate.py --learn 100-117 --check 118-129 --out calibration --write
 
-rebuilds the rooms (finished ones are kept in `--out`), prints how many true values the 90 % ranges
-hold, how wide they are and whether their widths rank with the errors, in each room learnt on with
-what the others teach and in those to check, and with `--write` replaces
-`src/mover/assets/calibration.json`. Rooms 0-9 and from 1000 on are for results and never used.
+rebuilds the rooms with true meshes and with wrong ones (the sets `rooms` and `wrong-shape`; what is
+finished is kept in `--out`), prints how many true values the 90 % ranges hold, how wide they are
+and whether their widths rank with the errors, in each room learnt on with what the others teach and
+in those to check, and with `--write` replaces `src/mover/assets/calibration.json`. Rooms 0-9 and
+from 1000 on are for results and never used.
 """
 
 import argparse
@@ -20,22 +21,32 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from calibrate_learn import USED, Judged, in_turn, learn
+from calibrate_learn import Judged, in_turn, learn
 from jaxtyping import Float
 from scipy.stats import spearmanr
 from torch import Tensor
 
 from mover import records
-from mover.calibration import KIND_OF, Calibration, calibration_of, learn_factor
+from mover.calibration import (
+    FORMAT,
+    GROWING,
+    KIND_OF,
+    VERSION,
+    Calibration,
+    calibration_of,
+    learn_factor,
+)
 from mover.experiments.run import parse_seeds
+from mover.experiments.sets import SETS
 from mover.explanation import LEVEL, explain, held, offs, ways_of, width
 from mover.explanation_records import Explanation, Facts
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import wrap
 from mover.pipeline import PRESETS, Run, reconstruct
-from mover.rooms import NoiseConfig, add_noise, make_room
+from mover.rooms import add_noise, make_room
 from mover.types import Piece, Scene
 
+USED = ("rooms", "wrong-shape")  # true meshes, and meshes of other pieces
 ASSET = Path(__file__).parents[1] / "src" / "mover" / "assets" / "calibration.json"
 
 
@@ -55,15 +66,15 @@ def _row(facts: Facts, ours: Piece, true: Piece) -> Float[Tensor, "7"]:
     return torch.cat([base, yaw[None], size])
 
 
-def rebuild(seed: int, preset: str, folder: Path) -> None:
-    """Rebuild one room and keep what was stated and what is true."""
+def rebuild(name: str, seed: int, preset: str, folder: Path) -> None:
+    """Rebuild one room of a set and keep what was stated and what is true."""
     torch.set_num_threads(1)
-    known = make_room(seed)
-    capture = add_noise(known, NoiseConfig(), seed)
+    known = make_room(seed, SETS[name].room)
+    capture = add_noise(known, SETS[name].noise, seed)
     with tempfile.TemporaryDirectory() as work:
         room = reconstruct(capture, PRESETS[preset], Run(Path(work)))
     facts = tuple(e.facts for e in room.explanations)
-    records.save(judged(facts, room.scene, known.truth), folder / f"{preset}_{seed}")
+    records.save(judged(facts, room.scene, known.truth), folder / f"{preset}_{name}_{seed}")
 
 
 def table(rooms: list[Judged], calibrations: Sequence[Calibration]) -> str:
@@ -72,7 +83,7 @@ def table(rooms: list[Judged], calibrations: Sequence[Calibration]) -> str:
     told = tuple(e for room, known in pairs for e in explain(room.facts, known))
     truth = torch.cat([room.truth for room in rooms])
     head = f"{'':8} {'values':>7} {'held':>7} {'width':>8} {'best constant':>14} {'Spearman':>9}"
-    return "\n".join([head, *(_line(kind, told, truth) for kind in USED)])
+    return "\n".join([head, *(_line(kind, told, truth) for kind in GROWING)])
 
 
 def _line(kind: str, told: tuple[Explanation, ...], truth: Float[Tensor, "objects 7"]) -> str:
@@ -91,18 +102,33 @@ def _line(kind: str, told: tuple[Explanation, ...], truth: Float[Tensor, "object
     )
 
 
-def finished(seeds: tuple[int, ...], args: argparse.Namespace) -> list[Judged]:
-    """The judged rooms; those that are not in the folder are made, each by a process of its own."""
-    missing = [s for s in seeds if not (args.out / f"{args.preset}_{s}.json").exists()]
+def finished(seeds: tuple[int, ...], args: argparse.Namespace) -> list[list[Judged]]:
+    """The judged rooms of each set, seed by seed.
+
+    Those that are not in the folder are made, each by a process of its own.
+    """
+    named = {(name, s): args.out / f"{args.preset}_{name}_{s}" for s in seeds for name in USED}
+    missing = [key for key, path in named.items() if not path.with_suffix(".json").exists()]
     single = {**os.environ, "OMP_NUM_THREADS": "1"}
 
-    def make(seed: int) -> None:
-        command = [sys.executable, __file__, "--one", str(seed), "--preset", args.preset]
-        subprocess.run([*command, "--out", str(args.out)], env=single, check=True)
+    def make(key: tuple[str, int]) -> None:
+        command = [sys.executable, __file__, "--one", key[0], str(key[1])]
+        command += ["--preset", args.preset, "--out", str(args.out)]
+        subprocess.run(command, env=single, check=True)
 
     with ThreadPoolExecutor(args.workers) as pool:
         list(pool.map(make, missing))
-    return [records.load(Judged, args.out / f"{args.preset}_{s}") for s in seeds]
+    return [[records.load(Judged, named[name, s]) for name in USED] for s in seeds]
+
+
+def tables(groups: list[list[Judged]], calibrations: Sequence[Calibration]) -> str:
+    """A table for each set, and one for all; each seed with a calibration."""
+    parts: list[str] = []
+    for k, name in enumerate(USED):
+        parts += [name, table([group[k] for group in groups], calibrations)]
+    flat = [room for group in groups for room in group]
+    parts += ["both", table(flat, [c for c in calibrations for _ in USED])]
+    return "\n".join(parts)
 
 
 def allowed(text: str) -> tuple[int, ...]:
@@ -115,41 +141,41 @@ def allowed(text: str) -> tuple[int, ...]:
 
 def main() -> None:
     """Learn on some rooms and test on others."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Learn and test the doubts' calibration.")
     parser.add_argument("--learn", default="100-117", help="rooms to learn on; '' takes the asset")
     parser.add_argument("--check", default="", help="rooms to test on")
     parser.add_argument("--preset", default="robust")
     parser.add_argument("--out", type=Path, default=Path("calibration"))
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--write", action="store_true", help="replace the package's factors")
-    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one is not None:
-        rebuild(args.one, args.preset, args.out)
+        rebuild(args.one[0], int(args.one[1]), args.preset, args.out)
         return
     form = PRESETS[args.preset].place.form
     calibration = calibration_of(form)
     if args.learn:
-        rooms = finished(allowed(args.learn), args)
-        calibration = learn(rooms)
-        print(f"learnt on {args.learn}: {dict(calibration.factors)}")
-        print(f"share {calibration.share:.3f}")
-        if len(rooms) > 2:
+        groups = finished(allowed(args.learn), args)
+        calibration = learn([room for group in groups for room in group])
+        print(f"learnt on {args.learn}: {calibration}")
+        if len(groups) > 2:
             print(f"each of {args.learn} tested with what the others teach")
-            print(table(rooms, in_turn(rooms)))
+            print(tables(groups, in_turn(groups)))
     if args.check:
         print(f"\ntested on {args.check}")
-        rooms = finished(allowed(args.check), args)
-        print(table(rooms, [calibration] * len(rooms)))
+        groups = finished(allowed(args.check), args)
+        print(tables(groups, [calibration] * len(groups)))
     if args.write:
         write(form, calibration, args.learn)
 
 
 def write(form: str, calibration: Calibration, seeds: str) -> None:
     """Put the factors of one form of the prices into the package."""
-    tree = json.loads(ASSET.read_text())
+    tree = json.loads(ASSET.read_text()) | {"format": FORMAT, "version": VERSION}
     tree["forms"][form] = {
         "factors": {kind: round(f, 4) for kind, f in calibration.factors.items()},
+        "powers": dict(calibration.powers),
         "share": round(calibration.share, 4),
         "command": f"python benchmarks/calibrate.py --learn {seeds} --write",
     }

@@ -13,6 +13,7 @@ from little_room import camera, room, walkers
 
 from mover.calibration import (
     FORMAT,
+    GROWING,
     KINDS,
     SCALES,
     VERSION,
@@ -375,7 +376,7 @@ class TestWords:
         tilt = torch.zeros(7, 7, dtype=torch.float64)
         tilt[0, 0] = 0.01
         asked = facts(place=place, covariance=torch.eye(7, dtype=torch.float64), tilt=tilt)
-        found = calibrated(asked, Calibration(factors, 1.0, True))
+        found = calibrated(asked, Calibration(factors))
         ray = torch.tensor([0.6, 0, -0.8, 0, 0, 0, 0], dtype=torch.float64)
         side = torch.tensor([0.8, 0, 0.6, 0, 0, 0, 0], dtype=torch.float64)
         rest = found - 9 * tilt
@@ -391,12 +392,22 @@ class TestWords:
         one = torch.eye(7, dtype=torch.float64)
         asked = facts(place=place, energy=0.08, covariance=one, tilt=one)
         factors = dict.fromkeys(KINDS, 1.0) | {"height": 3.0, "roll": 0.5, "yaw": 2.0}
-        found = calibrated(asked, Calibration(factors, 1.0, True))
+        found = calibrated(asked, Calibration(factors))
         expected = torch.tensor([1, 9, 1, 4, 1, 1, 1], dtype=torch.float64)
         expected += torch.tensor([0.25, 9, 9, 9, 9, 9, 9], dtype=torch.float64)  # x is across
         close(found, torch.diag(expected))
         plain = calibrated(asked, Calibration())
         close(plain, 2 * one)
+
+    def test_doubts_grow_where_the_silhouette_does_not_fit(self):
+        one = torch.eye(7, dtype=torch.float64)
+        powers = dict.fromkeys(GROWING, 0.0) | {"yaw": 2.0, "distance": 1.0}
+        known = Calibration(powers=powers)
+        place = torch.tensor([0, -1.4, -8.0, 0, 0, 0, 0], dtype=torch.float64)
+        for overlap, grown in ((None, 1.0), (1.0, 1.0), (0.6, 3.0)):
+            asked = facts(place=place, covariance=one, overlap=overlap)
+            expected = torch.tensor([1, 1, grown**2, grown**4, 1, 1, 1], dtype=torch.float64)
+            close(calibrated(asked, known), torch.diag(expected))
 
     def test_a_likely_alternative_belongs_to_what_holds(self):
         there = facts().place.clone()
@@ -455,7 +466,8 @@ class TestCalibration:
         [
             {"format": "another"},
             {"version": VERSION - 1},
-            {"forms": {"robust": {"factors": {}, "share": 1.0}}},
+            {"forms": {"robust": {"factors": {}, "powers": dict.fromkeys(GROWING, 1), "share": 1}}},
+            {"forms": {"robust": {"factors": dict.fromkeys(KINDS, 1), "powers": {}, "share": 1}}},
         ],
     )
     def test_a_file_of_another_kind_is_refused(self, wrong):

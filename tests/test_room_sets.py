@@ -324,7 +324,7 @@ class TestPromises:
         assert len(read_bodies(job.home / CAPTURE / "truth" / "bodies.npz").frame) == row["frames"]
 
     def test_in_two_there_are_two_who_do_not_run_into_each_other(self) -> None:
-        room = make_room(1000, SETS["two"].room)
+        room = make_room(1003, SETS["two"].room)
         assert set(room.bodies.person.tolist()) == {0, 1}
         assert room.bodies.joints is not None
         places = {

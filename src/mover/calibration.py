@@ -24,7 +24,10 @@ KINDS = (*dict.fromkeys(KIND_OF), "roll")
 """`roll`: the factor of what the camera's doubt does across the ray: objects tell its roll better
 than the feet do, of which the stated doubt is."""
 FILE = "calibration.json"
-FORMAT, VERSION = "mover-calibration", 2
+FORMAT, VERSION = "mover-calibration", 3
+GROWING = tuple(kind for kind in KINDS if kind not in ("height", "roll"))
+"""What is known less well of an object whose silhouette does not fit its mask."""
+MISFIT = 0.2  # [1], share of a silhouette: spreads grow by a power of (1 + misfit / MISFIT)
 SHARES = tuple(0.01 * 1.2**k for k in range(30))  # weights that are tried
 SCALES = tuple(1e-3 * 1.1**k for k in range(100))  # factors that are tried for likelihoods
 
@@ -34,6 +37,8 @@ class Calibration:
     """Factors on the spreads that the energy gives, by kind of unknown."""
 
     factors: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(KINDS, 1.0))
+    powers: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(GROWING, 0.0))
+    """How fast the spreads of each kind grow with the misfit of the silhouette."""
     share: float = 1.0
     """Weight of an alternative whose energy is as low as that of the result, which has 1."""
     learnt: bool = False
@@ -59,10 +64,19 @@ def forms_of(tree: Mapping[str, Any]) -> dict[str, Calibration]:
 
 
 def _read(row: Mapping[str, Any]) -> Calibration:
-    factors = row["factors"]
-    if set(factors) != set(KINDS):
-        raise ValueError(f"{FILE}: kinds are {', '.join(KINDS)}")
-    return Calibration(factors, row["share"], True)
+    for name, kinds in (("factors", KINDS), ("powers", GROWING)):
+        if set(row[name]) != set(kinds):
+            raise ValueError(f"{FILE}: kinds of {name} are {', '.join(kinds)}")
+    return Calibration(row["factors"], row["powers"], row["share"], True)
+
+
+def growth(overlap: float | None) -> float:
+    """What is raised to the power of a kind: one where the silhouette fits its mask.
+
+    Args:
+        overlap: IoU of silhouette and mask; None: there is no mask, and nothing misfits.
+    """
+    return 1.0 if overlap is None else 1 + (1 - overlap) / MISFIT
 
 
 def learn_factor(needed: Sequence[float], level: float) -> float:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .calibration import KIND_OF, Calibration
+from .calibration import KIND_OF, Calibration, growth
 from .explanation_records import UNKNOWNS, Explanation, Facts, Other, Range
 from .explanation_words import NORMAL, sentences_of, verdict_of
 from .geometry.rotations import wrap
@@ -55,9 +55,13 @@ def ways_of(place: Float[Tensor, "7"]) -> Float[Tensor, "7 7"]:
 
 
 def calibrated(facts: Facts, calibration: Calibration) -> Float[Tensor, "7 7"]:
-    """The covariance with one factor on the spread of each kind, and the camera's with its own."""
-    known, ways = calibration.factors, ways_of(facts.place)
-    factor = _along(ways, [known[kind] for kind in KIND_OF])
+    """The covariance with one factor on the spread of each kind, and the camera's with its own.
+
+    Spreads grow with a power of the misfit of an object's silhouette.
+    """
+    known, ways, grown = calibration.factors, ways_of(facts.place), growth(facts.overlap)
+    own = {kind: known[kind] * grown ** calibration.powers.get(kind, 0.0) for kind in KIND_OF}
+    factor = _along(ways, [own[kind] for kind in KIND_OF])
     tilt = _along(ways, [known["roll" if k == "sideways" else "height"] for k in KIND_OF])
     return factor @ facts.covariance @ factor.mT + tilt @ facts.tilt @ tilt.mT
 

@@ -89,29 +89,29 @@ SETS: dict[str, RoomSet] = {
     ),
     "rooms": RoomSet(
         "A person uses the furniture of a room: the standard set.",
-        "1000-1029", "100-107",
+        "1000-1029", "100-129",
     ),
     "two": RoomSet(
         "Two people use one room.",
-        "1000-1019", "100-107", RoomConfig(people=2),
+        "1000-1019", "100-129", RoomConfig(people=2),
     ),
     "free": RoomSet(
         "A person walks between the pieces and behind them and touches nothing but the floor.",
-        "1000-1019", "100-107", _FREE,
+        "1000-1019", "100-129", _FREE,
     ),
     "wrong-shape": RoomSet(
         "The rooms of `rooms`; every mesh that is given is another piece of the same class.",
-        "1000-1029", "100-107", noise=NoiseConfig(other_shapes=1.0),
+        "1000-1029", "100-129", noise=NoiseConfig(other_shapes=1.0),
     ),
     "clutter": RoomSet(
         "More furniture, seen by a lower and narrower camera: pieces hide each other and are cut"
         " by the border of the image.",
-        "1000-1029", "100-107", _CROWDED,
+        "1000-1029", "100-129", _CROWDED,
     ),
     "detected": RoomSet(
         "The rooms of `rooms`; masks and boxes as a detector gives them, with objects missed,"
         " invented, run together and called by wrong names.",
-        "1000-1029", "100-107", noise=_DETECTED,
+        "1000-1029", "100-129", noise=_DETECTED,
     ),
     "long": RoomSet(
         "A minute in which a person uses many pieces, some of them repeatedly, each for a short"
