@@ -24,6 +24,7 @@ from mover.stages.starts import MOVED, TURNED
 
 POWERS = tuple(0.25 * k for k in range(13))  # of the misfit, that are tried
 ROLLS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.13, 0.09, 0.06, 0.04, 0.03, 0.02, 0.01, 0.0)
+"""Shares of the floor's factor that are tried for the roll."""
 
 
 @record
