@@ -16,6 +16,7 @@ from PIL import Image
 from mover import records
 from mover.commands import run_command
 from mover.evaluate import EvaluateConfig
+from mover.experiments import pictures
 from mover.experiments.job import DONE, ROOM, Job, Trial, rebuild, store_room
 from mover.experiments.page import Line, fill_page
 from mover.experiments.queue import start
@@ -243,6 +244,23 @@ def test_pictures_show_the_worst_objects_of_the_last_preset(finished) -> None:
             assert len(picture.convert("L").getcolors()) > 20
     assert "mover experiment --set rooms --seeds 0,1 --presets release paper" in page
     assert "2 of 2 rooms, 4 objects: 2 touched" in page
+
+
+def test_pictures_of_rooms_that_a_study_did_not_keep_are_the_same(finished, tmp_path, monkeypatch):
+    args = replace(finished[0], out=tmp_path / "out")
+    shutil.copytree(finished[0].out, args.out)
+    jobs = {seed: Job("rooms", seed, ROOM, args.out) for seed in (0, 1)}
+    trials = {seed: records.load(Trial, job.room) for seed, job in jobs.items()}
+    for job in jobs.values():
+        for path in job.folder.glob("room.*"):
+            path.unlink()
+    monkeypatch.setattr(pictures, "noisy_room", lambda seed, _rooms: trials[seed])
+    idle = Bench()
+    run_experiment(args, launch=idle)
+    assert idle.done == []
+    for place in (1, 2, 3):
+        name = f"rooms/worst_{place}.png"
+        assert (args.out / name).read_bytes() == (finished[0].out / name).read_bytes()
 
 
 def test_a_failure_is_told_and_tried_again(finished, tmp_path: Path) -> None:

@@ -16,7 +16,8 @@ from ..records import load, map_tensors, replacing
 from ..report_overlay import draw_overlay
 from ..report_pictures import bitmap, canvas
 from ..types import Piece, Scene
-from .job import Job, Rebuilt, Trial
+from .changes import set_named
+from .job import Job, Rebuilt, Trial, noisy_room
 from .page import shown
 from .tables import Experiment
 
@@ -58,7 +59,7 @@ def draw_worst(experiment: Experiment, rooms: str, out: Path) -> list[str]:
     names: list[str] = []
     for place, worst in enumerate(worst_objects(experiment), 1):
         job = Job(rooms, worst.seed, worst.preset, out)
-        trial = map_tensors(_plain, load(Trial, job.room))
+        trial = map_tensors(_plain, _trial(job))
         rebuilt = map_tensors(_plain, load(Rebuilt, job.folder / "scenes"))
         names.append(f"worst_{place}.png")
         with replacing(out / rooms / names[-1]) as part:
@@ -79,6 +80,13 @@ def draw_object(worst: Worst, trial: Trial, rebuilt: Rebuilt) -> Image.Image:
         panels.append((title, _crop(bitmap(overlay), region)))
     panels.append(("above: before blue, after red, truth green", _plan(trial.truth, found)))
     return _joined(panels)
+
+
+def _trial(job: Job) -> Trial:
+    """The room of a job; studies do not keep theirs, so that it may have to be made again."""
+    if job.room.with_suffix(".json").exists():
+        return load(Trial, job.room)
+    return noisy_room(job.seed, set_named(job.rooms))
 
 
 def _plain(tensor: Tensor) -> Tensor:
