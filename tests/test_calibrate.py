@@ -28,10 +28,9 @@ def drawn(seed: int, objects: int = 150) -> Judged:
         overlap = 1 - 0.6 * float(torch.rand((), generator=g))
         tilt = torch.zeros(7, 7, dtype=torch.float64)
         tilt[1, 1] = 1e-6
-        fixed = ("ground", False)
         facts.append(
             Facts(str(k), 0.1, place, torch.diag(spread**2), tilt, (), (), (), None, (), overlap,
-                  (), *fixed)
+                  (), "ground", False)
         )  # fmt: skip
         error = 1e-3 * torch.randn(7, generator=g, dtype=torch.float64)
         for kind, columns in WAYS.items():
@@ -52,9 +51,8 @@ def test_the_rule_that_errors_were_drawn_by_is_learnt_and_holds_for_others():
     told = explain(room.facts, known)
     for kind, columns in WAYS.items():
         ways = torch.eye(7, dtype=torch.float64)[list(columns)]
-        good = [
-            held(e, way, t) for e, t in zip(told, room.truth, strict=True) for way in ways
-        ]  # fmt: skip
+        pairs = zip(told, room.truth, strict=True)
+        good = [held(e, way, t) for e, t in pairs for way in ways]
         assert 0.85 <= sum(good) / len(good) <= 0.95, kind
     assert abs(float(ways_of(room.facts[0].place)[0, 2])) == 1  # along the ray is along z
 

@@ -118,11 +118,11 @@ def learn_share(cases: Sequence[tuple[Sequence[float], int]]) -> float:
     """
     told = [(rises, true) for rises, true in cases if rises]
 
-    def surprise(share: float) -> float:
+    def unlikely(share: float) -> float:
         total = 0.0
         for rises, true in told:
             weights = [1.0, *(share * math.exp(-max(r, 0.0)) for r in rises)]
             total -= math.log(weights[true] / sum(weights))
         return total
 
-    return min(SHARES, key=surprise) if told else 1.0
+    return min(SHARES, key=unlikely) if told else 1.0

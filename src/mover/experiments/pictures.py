@@ -57,13 +57,15 @@ def draw_worst(experiment: Experiment, rooms: str, out: Path) -> list[str]:
     Each shows the object before, after and in truth in the image, and all three from above.
     """
     names: list[str] = []
+    trials: dict[Job, Trial] = {}
     for place, worst in enumerate(worst_objects(experiment), 1):
         job = Job(rooms, worst.seed, worst.preset, out)
-        trial = map_tensors(_plain, _trial(job))
+        if job not in trials:
+            trials[job] = map_tensors(_plain, _trial(job))
         rebuilt = map_tensors(_plain, load(Rebuilt, job.folder / "scenes"))
         names.append(f"worst_{place}.png")
         with replacing(out / rooms / names[-1]) as part:
-            draw_object(worst, trial, rebuilt).save(part)
+            draw_object(worst, trials[job], rebuilt).save(part)
     return names
 
 
