@@ -28,6 +28,11 @@ STUDIES = (
     StudyArgs("camera", "", "1000-1011"),
     StudyArgs("video-length", "", "1000-1001"),
     StudyArgs("interactions", "", "1000-1001"),
+    StudyArgs("sensitivity", "", "1000-1003"),
+    StudyArgs("bodies", "", "1000-1003"),
+    StudyArgs("time", "", "1000", workers=1),
+    StudyArgs("sets", "two", "1000-1003", ROBUST),
+    StudyArgs("sets", "free", "1000-1003", ROBUST),
 )
 """What is shown: studies, sets, and as many held-out rooms as two cores do in some hours."""
 PAGES = (

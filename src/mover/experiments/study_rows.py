@@ -50,6 +50,7 @@ class Page:
 
 Plan = Sequence[tuple[str, str]]
 """The jobs of a study: set and variant."""
+Seeds = Sequence[int]
 
 
 def quoted_rows(names: Sequence[str], rows: Mapping[str, published.Values]) -> list[Row]:
@@ -191,21 +192,29 @@ def _gains(ask: Ask, finished: Finished) -> str:
     columns = ("iou3d_touched", "iou3d_untouched", "iou3d", "p2s")
     rows: list[list[str]] = []
     for rooms, seeds in ask.seeds.items():
-        cells: list[str] = []
-        for metric in columns:
-            full, image = (
-                by_room(finished, Source(rooms, ("robust",), stage), metric, seeds)
-                for stage in ("full", "image")
-            )
-            shared = [seed for seed in full if seed in image]
-            if not shared:
-                cells.append("-")
-                continue
-            gain = paired([full[s] for s in shared], [image[s] for s in shared])
-            cells.append(difference_text(metric, gain))
-        rows.append([rooms, *cells])
+        full = Source(rooms, ("robust",))
+        for label, other in _images(rooms).items():
+            cells = [_gain(finished, (full, other), metric, seeds) for metric in columns]
+            rows.append([f"{rooms}, {label}", *cells])
     table = markdown(["", *(head_of(name) for name in columns)], rows)
-    return f"## What people add\n\n`robust` minus its image-only stage, 95 % interval.\n\n{table}"
+    return f"## What people add\n\n`robust` minus the image alone, 95 % interval.\n\n{table}"
+
+
+def _images(rooms: str) -> dict[str, Source]:
+    """The image alone: as it is where there are no people, and with the camera they gave."""
+    return {
+        "first camera": Source(rooms, ("nobody",)),
+        "camera of the people": Source(rooms, ("robust",), "image"),
+    }
+
+
+def _gain(finished: Finished, pair: tuple[Source, Source], metric: str, seeds: Seeds) -> str:
+    """The first less the second, in the rooms that both have."""
+    full, image = (by_room(finished, source, metric, seeds) for source in pair)
+    shared = [seed for seed in full if seed in image]
+    if not shared:
+        return "-"
+    return difference_text(metric, paired([full[s] for s in shared], [image[s] for s in shared]))
 
 
 def _turned(ask: Ask, finished: Finished) -> str:
