@@ -23,20 +23,20 @@ STUDIES = (
     StudyArgs("sets", "wrong-shape", "1000-1011", ROBUST),
     StudyArgs("sets", "detected", "1000-1011", ROBUST),
     StudyArgs("sets", "clutter", "1000-1011", ROBUST),
-    StudyArgs("ablation", "", "1000-1011"),
-    StudyArgs("sets", "rooms", "1000-1011"),
-    StudyArgs("camera", "", "1000-1011"),
+    StudyArgs("ablation", "", "1000-1013"),
+    StudyArgs("sets", "rooms", "1000-1013"),
+    StudyArgs("camera", "", "1000-1013"),
     StudyArgs("video-length", "", "1000-1001"),
     StudyArgs("interactions", "", "1000-1001"),
     StudyArgs("sensitivity", "", "1000-1003"),
-    StudyArgs("bodies", "", "1000-1003"),
-    StudyArgs("time", "", "1000", workers=1),
+    StudyArgs("bodies", "", "1000-1007"),
+    StudyArgs("time", "", "1000-1003", workers=1),
     StudyArgs("sets", "two", "1000-1003", ROBUST),
     StudyArgs("sets", "free", "1000-1003", ROBUST),
 )
 """What is shown: studies, sets, and as many held-out rooms as two cores do in some hours."""
 PAGES = (
-    ExperimentArgs("1000-1011"),
+    ExperimentArgs("1000-1013"),
     ExperimentArgs("1000-1011", ROBUST, set="wrong-shape"),
 )
 """The same jobs object by object, with the worst as pictures."""

@@ -150,7 +150,7 @@ def bodies(ask: Ask, finished: Finished) -> Page:
         "+ CamGP": "people-camgp",
         "+ CamGP + SDF": "people-sdf",
         "+ CamGP + SDF + Contact": "people-contact",
-        "+ CamGP + SDF + Contact + depth order": "people-order",
+        "+ CamGP + SDF + Contact + depth order + masks": "people-order",
     }
     rows = [Row(label, Source(ask.rooms, (name,))) for label, name in labels.items()]
     quoted = quoted_rows(published.BODY_COLUMNS, published.BODIES)
