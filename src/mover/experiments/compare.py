@@ -6,7 +6,7 @@ from typing import Literal, TypeVar
 
 from .columns import COLUMNS
 from .finished import Finished, Source, by_room
-from .statistics import Interval, holm, interval, is_significant, paired
+from .statistics import Interval, holm, interval, is_significant, paired_rooms
 
 T = TypeVar("T")
 Mark = Literal["better", "worse", ""]
@@ -115,11 +115,7 @@ def _cell(
     if other is None or not row.tested or other == source:
         return Cell(metric, mean)
     theirs = by_room(finished, other, metric, seeds[other.rooms])
-    both = [seed for seed in values if seed in theirs]
-    if not both:
-        return Cell(metric, mean)
-    difference = paired([values[s] for s in both], [theirs[s] for s in both])
-    return Cell(metric, mean, difference)
+    return Cell(metric, mean, paired_rooms(values, theirs))
 
 
 def _known(value: T | None) -> T:

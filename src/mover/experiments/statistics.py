@@ -1,6 +1,6 @@
 """Whether a row of a table differs from another: paired bootstrap over rooms, corrected by Holm."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +42,12 @@ def paired(
     if len(values) != len(reference) or not values:
         raise ValueError(f"{len(values)} and {len(reference)} rooms, expected as many, at least 1")
     return interval(np.subtract(values, reference), seed, resamples)
+
+
+def paired_rooms(values: Mapping[int, float], reference: Mapping[int, float]) -> Interval | None:
+    """The same for values by room, in the rooms that both have; None: they share none."""
+    both = [room for room in values if room in reference]
+    return paired([values[r] for r in both], [reference[r] for r in both]) if both else None
 
 
 def interval(

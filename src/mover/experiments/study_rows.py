@@ -8,7 +8,7 @@ from .changes import set_named
 from .columns import COLUMNS, head_of, markdown
 from .compare import Filled, Row, Table, fill_tables
 from .finished import Finished, Source, by_room, recovered, truth_source
-from .statistics import paired
+from .statistics import paired_rooms
 from .study_page import difference_text
 from .variants import PARTS, PEOPLE, REFINED, SINGLE, TERMS
 
@@ -50,7 +50,6 @@ class Page:
 
 Plan = Sequence[tuple[str, str]]
 """The jobs of a study: set and variant."""
-Seeds = Sequence[int]
 
 
 def quoted_rows(names: Sequence[str], rows: Mapping[str, published.Values]) -> list[Row]:
@@ -193,8 +192,11 @@ def _gains(ask: Ask, finished: Finished) -> str:
     rows: list[list[str]] = []
     for rooms, seeds in ask.seeds.items():
         full = Source(rooms, ("robust",))
-        for label, other in _images(rooms).items():
-            cells = [_gain(finished, (full, other), metric, seeds) for metric in columns]
+        for label, image in _images(rooms).items():
+            cells = [
+                _gain(metric, *(by_room(finished, s, metric, seeds) for s in (full, image)))
+                for metric in columns
+            ]
             rows.append([f"{rooms}, {label}", *cells])
     table = markdown(["", *(head_of(name) for name in columns)], rows)
     return f"## What people add\n\n`robust` minus the image alone, 95 % interval.\n\n{table}"
@@ -208,13 +210,10 @@ def _images(rooms: str) -> dict[str, Source]:
     }
 
 
-def _gain(finished: Finished, pair: tuple[Source, Source], metric: str, seeds: Seeds) -> str:
+def _gain(metric: str, full: Mapping[int, float], image: Mapping[int, float]) -> str:
     """The first less the second, in the rooms that both have."""
-    full, image = (by_room(finished, source, metric, seeds) for source in pair)
-    shared = [seed for seed in full if seed in image]
-    if not shared:
-        return "-"
-    return difference_text(metric, paired([full[s] for s in shared], [image[s] for s in shared]))
+    found = paired_rooms(full, image)
+    return "-" if found is None else difference_text(metric, found)
 
 
 def _turned(ask: Ask, finished: Finished) -> str:

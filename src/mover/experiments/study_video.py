@@ -8,7 +8,7 @@ from .. import published
 from .columns import markdown
 from .finished import Finished, Source, by_room, value_of
 from .plots import Line, Panel, draw_panels
-from .statistics import Interval, interval, paired
+from .statistics import Interval, interval, paired_rooms
 from .study_rows import Ask, Page, Plan
 from .variants import LENGTHS, SEGMENTS, SHARES
 
@@ -78,10 +78,8 @@ def _length_cells(
         statistics.stdev(y for _, y in segments_of(ask, finished, seconds, [seed]))
         for seed in values
     ]
-    both = [seed for seed in values if seed in whole]
-    difference = "-"
-    if both:
-        found = paired([values[s] for s in both], [whole[s] for s in both])
+    difference, found = "-", paired_rooms(values, whole)
+    if found is not None:
         difference = f"{found.mean:+.3f} [{found.low:+.3f}, {found.high:+.3f}]"
     mean, spread = (sum(x) / len(x) for x in (list(values.values()), spreads))
     return [f"{mean:.3f}", f"{spread:.3f}", difference, str(len(values))]
