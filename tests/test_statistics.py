@@ -16,6 +16,7 @@ from mover.experiments.statistics import (
     interval,
     is_significant,
     paired,
+    paired_rooms,
 )
 
 VALUES = st.lists(st.floats(-1, 1), min_size=2, max_size=20)
@@ -25,6 +26,12 @@ def test_equal_rows_have_no_difference() -> None:
     values = np.random.default_rng(0).normal(size=20).tolist()
     found = paired(values, values)
     assert (found.mean, found.low, found.high, found.p) == (0, 0, 0, 1)
+
+
+def test_rows_are_compared_in_the_rooms_that_both_have() -> None:
+    ours, theirs = {3: 1.0, 1: 0.5, 7: 0.2}, {1: 0.1, 2: 9.0, 3: 0.4}
+    assert paired_rooms(ours, theirs) == paired([1.0, 0.5], [0.4, 0.1])
+    assert paired_rooms(ours, {2: 9.0}) is None
 
 
 def test_a_known_shift_is_found_under_larger_differences_between_rooms() -> None:
