@@ -24,7 +24,7 @@ STUDIES = (
     StudyArgs("sets", "detected", "1000-1011", ROBUST),
     StudyArgs("sets", "clutter", "1000-1011", ROBUST),
     StudyArgs("ablation", "", "1000-1013"),
-    StudyArgs("sets", "rooms", "1000-1013"),
+    StudyArgs("sets", "rooms", "1000-1029"),
     StudyArgs("camera", "", "1000-1013"),
     StudyArgs("video-length", "", "1000-1001"),
     StudyArgs("interactions", "", "1000-1001"),
@@ -36,7 +36,7 @@ STUDIES = (
 )
 """What is shown: studies, sets, and as many held-out rooms as two cores do in some hours."""
 PAGES = (
-    ExperimentArgs("1000-1013"),
+    ExperimentArgs("1000-1029"),
     ExperimentArgs("1000-1011", ROBUST, set="wrong-shape"),
 )
 """The same jobs object by object, with the worst as pictures."""
