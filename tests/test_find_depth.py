@@ -13,7 +13,7 @@ from mover.geometry.camera import tilted
 from mover.geometry.raster import Views, layers
 from mover.readers.masks import encode
 from mover.stages.body_extents import Extents
-from mover.stages.depth_peak import SYSTEMATIC
+from mover.stages.depth_peak import BENT, COMMON, FULL, NEAR, SYSTEMATIC, Peak, peak_of
 from mover.stages.find_depth import (
     DepthConfig,
     DepthFactors,
@@ -116,13 +116,20 @@ def test_masks_that_are_too_wide_or_too_narrow_do_not_move_people(grow):
     assert float(found.factor[0]) == pytest.approx(1 / 1.02, abs=0.005)
 
 
+@pytest.mark.parametrize("bias", [1.03, 0.975])
+def test_people_whom_the_image_cuts_off_are_found_by_the_rest_of_them(bias):
+    true = film([(x, -1.75) for x in (-0.3, 0.0, 0.3, -0.2, 0.1, 0.2)])
+    found = find_depth(inputs_of(moved(true, bias), masks_of(true)), QUICK)
+    assert float(found.factor[0]) == pytest.approx(1 / bias, abs=0.006)
+
+
 def test_few_or_cut_off_or_hidden_people_stay_where_they_are():
-    true = film(spots(3))
+    true = film(spots(2))
     few = find_depth(inputs_of(moved(true, 1.03), masks_of(true)), QUICK)
-    near = film([(0.0, -1.0)] * 6)
+    near = film([(0.0, -0.6)] * 6)
     cut = find_depth(inputs_of(near, masks_of(near)), QUICK)
     wall = torch.ones(SIZE, dtype=torch.bool)
-    wall[:170] = False
+    wall[:130] = False
     many = film(spots())
     hidden = find_depth(inputs_of(many, masks_of(many, hidden=wall), [wall]), QUICK)
     for found in (few, cut, hidden):
@@ -150,7 +157,7 @@ def test_a_track_without_masks_is_told():
     other = dataclasses.replace(seen, person=seen.person + 1)
     found = find_depth(inputs_of(true, other), QUICK)
     assert found.factor.tolist() == [1.0]
-    assert "0 of at least 5 bodies" in found.warnings[0]
+    assert "0 of at least 3 bodies" in found.warnings[0]
 
 
 def test_a_known_height_scales_the_person_about_the_camera():
@@ -190,7 +197,7 @@ def test_pose_and_mesh_move_together():
 class TestOverlapAndHeight:
     """The one factor of what overlaps and what heights say."""
 
-    LOST = (1.0, math.inf, ["0 of at least 5 bodies are seen well enough, it stays as given"])
+    LOST = Peak(1.0, math.inf, FULL, ("0 of at least 3 bodies are seen well enough",))
 
     def told(self, monkeypatch, peak, heights):
         module = "mover.stages.find_depth."
@@ -202,14 +209,30 @@ class TestOverlapAndHeight:
         found = find_depth(inputs_of(true, People(blank, true.frame, true.person, {})), QUICK)
         return float(found.factor[0]), float(found.spread[0]), found.warnings
 
-    def test_two_that_are_certain_give_their_mean_and_its_spread(self, monkeypatch):
-        found = self.told(monkeypatch, (1.02, 0.004, []), Extents(0.99, 0.006, 9))
-        spread = math.hypot(0.006, SYSTEMATIC, 0.004) / 2
+    def test_two_that_are_as_certain_give_their_mean_and_half_the_variance(self, monkeypatch):
+        alike = math.hypot(0.006, SYSTEMATIC)
+        found = self.told(monkeypatch, Peak(1.02, alike, 0.1), Extents(0.99, 0.006, 9))
+        spread = math.hypot(alike, COMMON) / math.sqrt(2)
         assert found == (pytest.approx(1.005), pytest.approx(spread), ())
+
+    def test_the_one_that_is_more_certain_counts_more(self, monkeypatch):
+        found = self.told(monkeypatch, Peak(1.02, 0.004, 0.1), Extents(0.99, 0.02, 9))
+        near, far = (s**2 + COMMON**2 for s in (0.004, math.hypot(0.02, SYSTEMATIC)))
+        assert found[0] == pytest.approx((1.02 * far + 0.99 * near) / (near + far))
+        assert found[1] == pytest.approx((near * far / (near + far)) ** 0.5)
+
+    @pytest.mark.parametrize("misfit", [0.0, BENT, 0.25, 0.4])
+    def test_heights_of_people_who_do_not_fit_their_masks_count_as_too_low(
+        self, monkeypatch, misfit
+    ):
+        lost = dataclasses.replace(self.LOST, misfit=misfit)
+        factor, _, _ = self.told(monkeypatch, lost, Extents(0.97, 0.004, 9))
+        assert factor == pytest.approx(0.97 + NEAR * max(0, misfit - BENT))
 
     def test_heights_alone_are_used_and_nothing_is_warned_of(self, monkeypatch):
         found = self.told(monkeypatch, self.LOST, Extents(0.97, 0.004, QUICK.least))
-        assert found == (pytest.approx(0.97), pytest.approx(math.hypot(0.004, SYSTEMATIC)), ())
+        spread = math.hypot(0.004, SYSTEMATIC, COMMON)
+        assert found == (pytest.approx(0.97 + self.LOST.lower), pytest.approx(spread), ())
 
     @pytest.mark.parametrize(
         "heights",
@@ -223,9 +246,30 @@ class TestOverlapAndHeight:
         ids=("nobody", "few", "far", "near", "uncertain"),
     )
     def test_heights_that_say_too_little_change_nothing(self, monkeypatch, heights):
-        factor, spread, warnings = self.told(monkeypatch, (1.02, 0.004, []), heights)
-        assert (factor, spread) == (pytest.approx(1.02), pytest.approx(0.004))
+        factor, spread, warnings = self.told(monkeypatch, Peak(1.02, 0.004, 0.1), heights)
+        assert (factor, spread) == (pytest.approx(1.02), pytest.approx(math.hypot(0.004, COMMON)))
         assert warnings == ()
         factor, spread, warnings = self.told(monkeypatch, self.LOST, heights)
         assert (factor, spread) == (1.0, math.inf)
-        assert warnings == ("depth of person 0: " + self.LOST[2][0],)
+        assert warnings == ("depth of person 0: " + self.LOST.warnings[0],)
+
+
+class TestBias:
+    """Errors of the pose make smaller, farther bodies overlap better."""
+
+    def peak(self, best, at=0.02):
+        """Of ten alike parabolas whose highest value is `best` at the factor 1 + `at`."""
+        grid = torch.linspace(-QUICK.span, QUICK.span, QUICK.factors).double()
+        curve = best - 20 * (grid - at).square()
+        return peak_of(curve.expand(10, -1), QUICK)
+
+    @pytest.mark.parametrize(
+        ("best", "bias"), [(0.97, 0.0), (0.85, 0.004), (0.7, 0.01), (0.5, 0.01)]
+    )
+    def test_the_factor_is_smaller_by_what_the_misfit_explains_up_to_a_percent(self, best, bias):
+        grid = torch.linspace(-QUICK.span, QUICK.span, QUICK.factors)
+        at = float(grid[8])
+        found = self.peak(best, at)
+        assert found.misfit == pytest.approx(1 - best, abs=1e-6)
+        assert found.factor == pytest.approx(1 + at - bias, abs=1e-6)
+        assert found.warnings == ()

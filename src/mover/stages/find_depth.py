@@ -4,8 +4,9 @@ Not in the paper. Bodies estimated frame by frame keep their size while one pers
 or too far throughout; the floor under the feet, and the whole room with it, is then wrong by
 1-2 cm. One factor a person moves the body along its pelvis' ray: the mean of that at which it fills
 its visible masks best, each with the border that suits it, and that at which it is as high in the
-image as they are (`body_extents`). An error of the pose makes the first too great (smaller bodies
-overlap better) and the second too small (bent bodies are lower) by about as much.
+image as they are (`body_extents`), by their certainty. An error of the pose makes the first too
+great (smaller bodies overlap better) and the second too small (bent bodies are lower): both are
+corrected for it (`depth_peak`), since one of them is often missing.
 
 Masks cannot tell a wrong size at a wrong depth. A known height can: then the person is first scaled
 about the camera, which no picture sees.
@@ -25,7 +26,7 @@ from ..minimize import Observer, Step, silent
 from ..records import record
 from ..types import Bodies, Camera, Masks, People
 from .body_extents import Extents, compare_extents, pixels_of
-from .depth_peak import SYSTEMATIC, Peak, peak_of
+from .depth_peak import SYSTEMATIC, Peak, fused, peak_of
 from .find_soles import SolesConfig, straight_legs
 from .mask_overlap import overlaps, small, uncovered
 from .person_masks import MaskTable, mask_table
@@ -56,21 +57,21 @@ class DepthConfig:
     """Factors from 1 - span to 1 + span are tried."""
     factors: int = 13
     """How many."""
-    every: int = 3
+    every: int = 1
     """Use every so many of a person's frames ..."""
     most: int = 40
     """... and at most so many in which it is seen well, spread over the video."""
     whole: int = 150
     """At most so many frames are searched for people who are seen well, or wholly."""
-    least: int = 5
+    least: int = 3
     """Fewer frames than that tell nothing."""
     width: int = 240
     """Width of the pictures that are compared [px]."""
-    seen: float = 0.7
+    seen: float = 0.6
     """Share of a body's picture that its mask has to fill, and that no object may cover."""
-    inside: float = 0.97
+    inside: float = 0.6
     """Share of the body that has to be inside the image."""
-    spread: float = 0.02
+    spread: float = 0.04
     """A factor less certain than that is not used."""
 
 
@@ -106,9 +107,9 @@ def find_depth(
         peak = peak_of(_curves(inputs, config, rows, table, free), config)
         some = evenly(rows, config.whole)
         heights = compare_extents(bodies, some, inputs.camera, table, blocked)
-        *peak, weak = _with_heights(peak, heights, config)
-        found[:, index] = torch.tensor([*peak, size])
-        warnings += note + [f"depth of person {person}: {w}" for w in weak]
+        peak = _with_heights(peak, heights, config)
+        found[:, index] = torch.tensor([peak.factor, peak.spread, size])
+        warnings += note + [f"depth of person {person}: {w}" for w in peak.warnings]
         observe(Step("find_depth", index, len(tracks)))
     factor, spread, size = found.to(bodies.verts)
     person = torch.tensor(tracks, dtype=torch.long)
@@ -144,14 +145,12 @@ def pelvis(bodies: Bodies) -> Float[Tensor, "bodies 3"]:
 
 def _with_heights(peak: Peak, found: Extents | None, config: DepthConfig) -> Peak:
     """The mean of what overlaps and heights say; the one that there is if the other is missing."""
-    if found is None or found.frames < config.least or abs(found.factor - 1) > config.span:
-        return peak
-    spread = (found.spread**2 + SYSTEMATIC**2) ** 0.5
-    if spread > config.spread:
-        return peak
-    if peak[1] > config.spread:
-        return found.factor, spread, []
-    return (found.factor + peak[0]) / 2, (spread**2 + peak[1] ** 2) ** 0.5 / 2, []
+    told = [(peak.factor, peak.spread)] if peak.spread <= config.spread else []
+    if found is not None and found.frames >= config.least and abs(found.factor - 1) <= config.span:
+        spread = (found.spread**2 + SYSTEMATIC**2) ** 0.5
+        if spread <= config.spread:
+            told.append((found.factor + peak.lower, spread))
+    return Peak(*fused(told), peak.misfit) if told else peak
 
 
 def _size(inputs: DepthInputs, rows: Int[Tensor, " rows"], person: str) -> tuple[float, list[str]]:
