@@ -16,6 +16,7 @@ from mover.terms.bbox import SEEN
 from mover.terms.collision import BodySpace
 from mover.terms.contact import Touches
 from mover.terms.depth import DepthRange
+from mover.terms.wall import Walls, rears_of
 from mover.types import Camera, Layout, Objects
 
 GROUND = -1.4
@@ -49,24 +50,30 @@ def grid_on_top(size, n=6):
     )
 
 
+def boxes_of(categories, sizes, dtype=torch.float32):
+    """Boxes on the floor, named after their classes; all have tops, stools are seats."""
+    n = len(sizes)
+    top = torch.stack([grid_on_top(s) for s in sizes]).to(dtype)
+    return Objects(
+        ids=tuple(categories), categories=tuple(categories),
+        verts=torch.stack([box_verts(s) for s in sizes]).to(dtype),
+        real_verts=torch.ones(n, 8, dtype=torch.bool), faces=FACES.expand(n, -1, -1).clone(),
+        edges=edges_of(FACES).expand(n, -1, -1).clone(), samples=top,
+        size=torch.tensor(sizes, dtype=dtype),
+        top=top, back=torch.zeros_like(top), has_top=torch.ones(n, dtype=torch.bool),
+        has_back=torch.zeros(n, dtype=torch.bool),
+        is_seat=torch.tensor([c == "stool" for c in categories]),
+        supports=torch.full((n,), -1),
+    )  # fmt: skip
+
+
 def make_inputs(dtype=torch.float32, size=96):
     """Everything that `place_objects` needs, at the truth."""
     camera = Camera(
         torch.tensor([[500.0, 0, 320], [0, 500.0, 180], [0, 0, 1]], dtype=dtype),
         tilted(torch.tensor(-0.2, dtype=dtype), torch.tensor(0.03, dtype=dtype)), 640, 360,
     )  # fmt: skip
-    verts = torch.stack([box_verts(s) for s in SIZES]).to(dtype)
-    n = len(SIZES)
-    top = torch.stack([grid_on_top(s) for s in SIZES]).to(dtype)
-    objects = Objects(
-        ids=("stool", "table", "cabinet"), categories=("stool", "table", "cabinet"), verts=verts,
-        real_verts=torch.ones(n, 8, dtype=torch.bool), faces=FACES.expand(n, -1, -1).clone(),
-        edges=edges_of(FACES).expand(n, -1, -1).clone(), samples=top,
-        size=torch.tensor(SIZES, dtype=dtype),
-        top=top, back=torch.zeros_like(top), has_top=torch.ones(n, dtype=torch.bool),
-        has_back=torch.zeros(n, dtype=torch.bool), is_seat=torch.tensor([True, False, False]),
-        supports=torch.full((n,), -1),
-    )  # fmt: skip
+    n, objects = len(SIZES), boxes_of(("stool", "table", "cabinet"), SIZES, dtype)
     truth = Layout(
         torch.tensor(PLACES, dtype=dtype),
         torch.tensor(YAWS, dtype=dtype),
@@ -91,6 +98,13 @@ def image_at(objects, layout, camera, size):
         boxes, torch.full((n, 4), SEEN), views, drawn, keep, torch.ones(n).to(boxes),
         layout.t_world_object.norm(dim=-1),
     )  # fmt: skip
+
+
+def walls_at(objects, layout):
+    """A line along the rear of each object, which tells the others little."""
+    rears = rears_of(layout, objects.size)
+    trust = 0.2 + 0.7 * torch.eye(len(objects.ids)).to(rears.out)
+    return Walls(rears.out, (rears.ends.mean(-2) * rears.out).sum(-1), trust)
 
 
 def humans_at(objects, layout, camera, image):

@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from html import escape
 
 import pytest
@@ -24,10 +24,11 @@ from mover.calibration import (
     learn_share,
     surprise,
 )
+from mover.energy import SceneWeights
 from mover.explanation import calibrated, explain, held, offs, ways_of, width
 from mover.explanation_file import log_rows, scene_fields
 from mover.explanation_records import Alternative, Bound, Facts, Pull, Touching
-from mover.explanation_words import sentences_of, verdict_of
+from mover.explanation_words import TERMS, sentences_of, verdict_of
 from mover.geometry.camera import pitch_roll, tilted, to_camera
 from mover.geometry.crops import crop_views, sample_nearest
 from mover.geometry.floor import hit_floor
@@ -343,6 +344,9 @@ def pull(term, tells):
 
 
 class TestWords:
+    def test_every_term_has_a_name(self):
+        assert set(TERMS) == {f.name for f in fields(SceneWeights)}
+
     def test_a_far_bound_and_a_touch_are_sentences(self):
         bound = Bound("far", 2.312, 0.05, 412, 1, 30)
         touch = Touching("seat", False, 0, ((120, 180), (300, 310)), 60, 0.012)

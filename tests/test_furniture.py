@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mover.furniture import PIECES, SEATS, Furniture, canonical, make_piece
-from mover.furniture.library import BACKS, BEDS, SIZES, STYLES, TOPS, another
+from mover.furniture.library import BACKS, BEDS, SIZES, STYLES, TOPS, WALL_PIECES, another
 
 ALL = [(name, style) for name in PIECES for style in range(STYLES[name])]
 
@@ -127,7 +127,7 @@ def test_names_are_matched_without_case_through_synonyms() -> None:
 
 def test_tables_of_classes_name_known_classes() -> None:
     known = {canonical(name) for name in PIECES}
-    assert known >= SEATS | BACKS | TOPS | BEDS
+    assert known >= SEATS | BACKS | TOPS | BEDS | WALL_PIECES
     assert set(SIZES) == known
     assert set(STYLES) == set(PIECES)
     with pytest.raises(ValueError, match="no piece 'throne', expected one of"):

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from mover.pipeline import PRESETS, Run, reconstruct
 from mover.readers import read
 from mover.readers.scene_file import read_scene
 from mover.results import read_config, write_results
+from mover.stages.explain_placements import ExplainInputs
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 PHOTO, TOTAL3D = SHARED / "photo_bench", SHARED / "total3d_1"
@@ -55,6 +56,18 @@ def run_in(folder, capture, config, observe=silent):
     room = reconstruct(capture, config, run)
     write_results(capture, room, config, run)
     return room
+
+
+@dataclass(frozen=True)
+class Listening(Run):
+    """Keeps what is explained."""
+
+    heard: list[ExplainInputs] = field(default_factory=list)
+
+    def stage(self, fn, inputs, config):
+        if isinstance(inputs, ExplainInputs):
+            self.heard.append(inputs)
+        return super().stage(fn, inputs, config)
 
 
 class Killed(Exception):
@@ -134,6 +147,23 @@ class TestRun:
         room = run_in(tmp_path / "out", read("folder", alone), light("robust"))
         assert room.bodies is None
         assert any("bodies" in w for w in room.warnings)
+
+    @pytest.mark.parametrize("alone", [False, True])
+    def test_placements_are_explained_with_the_lines_of_walls_that_were_priced(
+        self, capture_folder, tmp_path, alone
+    ):
+        capture, run = read("folder", capture_folder), Listening(tmp_path)
+        if alone:
+            capture = replace(capture, bodies=None, people=None, touch=None)
+        room = reconstruct(capture, light("robust", steps=4), run)
+        (asked,) = run.heard
+        walls = asked.priced.image.walls
+        assert walls is not None
+        assert torch.equal(walls.trust, asked.placed.walls.trust)
+        told = [asked.priced.objects.categories[i] for i in walls.trust.amax(-1).nonzero()]
+        assert set(told) == {"bed", "desk", "shelf", "cabinet"}
+        for explained in room.explanations:
+            assert "wall" in {pull.term for pull in explained.facts.pulls}
 
     def test_a_room_without_objects_still_has_a_floor_and_people(self, capture_folder, tmp_path):
         capture = read("folder", capture_folder)

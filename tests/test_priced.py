@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from analytic import humans_at, image_at, make_inputs, moved
+from analytic import humans_at, image_at, make_inputs, moved, walls_at
 from sm90 import ptx_of
 from test_raster import packed
 
@@ -20,8 +20,10 @@ from mover.terms.depth import DepthRange
 from mover.types import Layout
 
 pytest.importorskip("warp")
-WEIGHTS = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1)
-TERMS = ("bbox", "silhouette", "scale", "depth", "collision", "contact", "distance", "heading")
+WEIGHTS = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.05)
+TERMS = (
+    "bbox", "silhouette", "scale", "depth", "collision", "contact", "distance", "heading", "wall"
+)  # fmt: skip
 
 
 def room(size=64, names=("chair", "torus", "sofa"), **changes):
@@ -40,8 +42,9 @@ def room(size=64, names=("chair", "torus", "sofa"), **changes):
     )  # fmt: skip
     at = Layout(*(getattr(inputs.starts, f.name)[0] for f in fields(Layout)))
     image = replace(
-        image_at(objects, at, inputs.camera, size), distance=at.t_world_object.norm(dim=-1)
-    )
+        image_at(objects, at, inputs.camera, size), distance=at.t_world_object.norm(dim=-1),
+        walls=walls_at(objects, at),
+    )  # fmt: skip
     humans = humans_at(objects, at, inputs.camera, image)
     inputs = replace(inputs, objects=objects, image=image, humans=humans)
     return with_trees(replace(inputs, **changes))
@@ -98,6 +101,14 @@ class TestAgreement:
         fast, slow = both(inputs, replace(WEIGHTS, depth=0.0, contact=0.0))
         layout = starts_of(inputs)
         assert set(fast(layout).parts) == set(slow(layout).parts)
+        agree(fast, slow, layout)
+
+    def test_lines_that_nobody_knows_leave_no_term(self):
+        inputs = room()
+        inputs = replace(inputs, image=replace(inputs.image, walls=None))
+        fast, slow = both(inputs)
+        layout = starts_of(inputs)
+        assert set(fast(layout).parts) == set(slow(layout).parts) == set(TERMS) - {"wall"}
         agree(fast, slow, layout)
 
     def test_some_rows_of_the_starts_cost_what_they_cost_among_all(self):

@@ -6,13 +6,13 @@ import pytest
 import torch
 from analytic import make_inputs
 
-from mover.energy import factors
 from mover.geometry.placement import place
 from mover.presets import RELEASE
 from mover.stages.reinitialize import ReinitConfig, ReinitInputs, by_release
 from mover.stages.spans import bounded, unbounded
 from mover.terms.contact import contact_term
 from mover.terms.depth import DepthRange, depth_term
+from mover.terms.factors import factors
 from mover.terms.silhouette import edge_term
 from mover.types import Layout
 
@@ -23,14 +23,14 @@ def renamed(inputs, *categories):
 
 def test_used_chairs_and_sofas_are_spared_by_depth_and_collision():
     inputs = make_inputs(size=16)
-    found = factors(renamed(inputs, "chair", "sofa", "table"), inputs.humans, "release")
+    found = factors(renamed(inputs, "chair", "sofa", "table"), inputs.humans.touches, "release")
     assert found.depth.tolist() == pytest.approx([0.3, 0.01, 1.0])
     assert found.collision.tolist() == pytest.approx([0.1, 2.0, 1.0])
 
 
 def test_paper_spares_nobody():
     inputs = make_inputs(size=16)
-    found = factors(renamed(inputs, "chair", "sofa", "table"), inputs.humans, "paper")
+    found = factors(renamed(inputs, "chair", "sofa", "table"), inputs.humans.touches, "paper")
     assert found.depth.tolist() == found.collision.tolist() == [1, 1, 1]
 
 

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from analytic import FACES, GROUND, SIZES, make_inputs, moved
+from analytic import FACES, GROUND, SIZES, make_inputs, moved, walls_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,6 +14,7 @@ from mover.energy import HumanCues, SceneWeights
 from mover.geometry.camera import project, to_camera
 from mover.geometry.placement import place, stand
 from mover.geometry.raster import Topology, look
+from mover.stages.place_inputs import with_walls
 from mover.stages.place_objects import PlaceConfig, energy_of
 from mover.types import Layout
 
@@ -30,7 +31,12 @@ FORMS = ("paper", "release", "robust")
 
 
 def energy(inputs, layout, term, form="paper"):
-    return energy_of(inputs, PlaceConfig(ONLY[term], form))(layout)
+    walls = walls_at(inputs.objects, first_of(inputs.starts))
+    return energy_of(with_walls(inputs, walls), PlaceConfig(ONLY[term], form))(layout)
+
+
+def first_of(layout):
+    return Layout(*(getattr(layout, f.name)[0] for f in fields(Layout)))
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -23,14 +23,15 @@ from .terms.contact_reach import reach_term
 from .terms.contact_trees import Trees, gaps
 from .terms.depth import DepthRange, depth_term, free_space_term
 from .terms.distance import distance_term
+from .terms.factors import factors
 from .terms.offscreen import offscreen_term
 from .terms.scale import scale_term
 from .terms.silhouette import edge_term, silhouette_term
+from .terms.wall import Walls, wall_term
 from .types import Camera, Layout, Objects
 
 E = TypeVar("E")
 UNIT = tuple((x, y, z) for x in (-0.5, 0.5) for y in (0.0, 1.0) for z in (-0.5, 0.5))
-CHAIRS = ("chair", "armchair", "office chair", "stool")  # one class in the authors' detector
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ class SceneWeights:
     """Objects stay at the distance they were given, where nothing else tells it (robust only)."""
     heading: float = 0.0
     """Seats face where their sitters face (robust only)."""
+    wall: float = 0.0
+    """Furniture along a wall stands in one line (robust only)."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,8 @@ class ImageCues:
     """Root of the distance to the mask's outline [px^0.5]; None: the edge term finds it anew."""
     borders: Borders | None = None
     """What the masks may be if their outlines are too wide or too narrow; None: they are not."""
+    walls: Walls | None = None
+    """Lines along which furniture stands; None: none are known."""
 
 
 @record
@@ -103,14 +108,6 @@ class HumanCues:
     touches: Touches | None = None
     trees: Trees | None = None
     """Finds what is touched faster; None: all points are compared."""
-
-
-@record
-class Factors:
-    """How much depth order and collision count for each object."""
-
-    depth: Float[Tensor, " objects"]
-    collision: Float[Tensor, " objects"]
 
 
 def scene_energy(
@@ -126,7 +123,7 @@ def scene_energy(
     verts = place_in(objects.verts, layout, camera.R_cam_world)
     drawn = cache(lambda: _draw(verts, objects, image.views, w))
     pixels = cache(lambda: project(verts, camera.K))
-    many = factors(objects, humans if w.contact else HumanCues(), form)
+    many = factors(objects, humans.touches if w.contact else None, form)
     fitted = cache(lambda: _fit(drawn()[0], outermost(verts, camera.K), camera, image, w))
     loose = form == "robust" and image.borders is not None and w.silhouette
     return weigh(
@@ -150,6 +147,7 @@ def scene_energy(
             _known(drawn()[1]), image.masks, _known(humans.depth))),
         ("distance", w.distance, lambda: distance_term(layout, _known(image.distance))),
         ("heading", w.heading, lambda: heading_term(layout, _known(humans.touches))),
+        ("wall", w.wall, lambda: wall_term(layout, objects.size, _known(image.walls))),
     )  # fmt: skip
 
 
@@ -174,6 +172,8 @@ def best_borders(
 def heard(weights: SceneWeights, image: ImageCues, humans: HumanCues) -> SceneWeights:
     """The weights without those whose evidence is missing."""
     missing: dict[str, float] = {} if image.distance is not None else {"distance": 0.0}
+    if image.walls is None:
+        missing["wall"] = 0.0
     if humans.depth is None:
         missing |= {"depth": 0.0, "free_space": 0.0}
     if humans.space is None:
@@ -181,31 +181,6 @@ def heard(weights: SceneWeights, image: ImageCues, humans: HumanCues) -> SceneWe
     if humans.touches is None:
         missing |= {"contact": 0.0, "heading": 0.0}
     return replace(weights, **missing)
-
-
-def factors(objects: Objects, humans: HumanCues, form: Form) -> Factors:
-    """Weigh down evidence that pushes used seats away from their sitters.
-
-    A body is soft and a seat's shape is often wrong: the sitter's body then lies inside the mesh
-    and the seat would flee. Release: depth x 0.3 (chair) and x 0.01 (sofa), collision x 0.1
-    (chair); it takes twice as many samples from a sofa. Robust: collision x 0.1 for every seat.
-    Paper: no factor.
-    """
-    depth, collision = objects.verts.new_ones(2, len(objects.ids)).unbind()
-
-    def is_one_of(*names: str) -> Tensor:
-        return constant(tuple(c in names for c in objects.categories), depth)
-
-    if form == "release":
-        collision = 1 + is_one_of("sofa")
-    if humans.touches is None or form == "paper":
-        return Factors(depth, collision)
-    used = torch.zeros_like(depth).index_fill(0, humans.touches.object_of, 1.0)
-    if form == "release":
-        chairs = used * is_one_of(*CHAIRS)
-        depth = 1 - 0.7 * chairs - 0.99 * used * is_one_of("sofa")
-        return Factors(depth, collision * (1 - 0.9 * chairs))
-    return Factors(depth, 1 - 0.9 * used * objects.is_seat.to(used))
 
 
 def _draw(

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .energy import HumanCues, ImageCues, SceneWeights, factors
+from .energy import HumanCues, ImageCues, SceneWeights
 from .geometry.kernels.start import started
 from .geometry.nearest_warp import Clouds
 from .geometry.priced_warp import BORDER, Pricer, Room
@@ -14,6 +14,7 @@ from .geometry.volume import Volume
 from .terms import bbox, border, contact, depth, distance, scale
 from .terms.collision import ROBUST
 from .terms.contact import Touches
+from .terms.factors import factors
 from .types import Camera, Objects
 
 BRICK = 8  # [cells], as in `Volume.busy`
@@ -202,7 +203,7 @@ def _field(volume: Volume) -> Any:  # noqa: ANN401
 def _facts(objects: Objects, image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Tensor:
     """See `kernels.given.SIZE` and those after it."""
     n, boxes = len(objects.ids), image.boxes
-    many = factors(objects, humans if weights.contact else HumanCues(), "robust")
+    many = factors(objects, humans.touches if weights.contact else None, "robust")
     facts = torch.zeros(n, 7)
     facts[:, 0] = (boxes[:, 2:] - boxes[:, :2]).clamp_min(1).prod(-1).sqrt()
     facts[:, 1] = many.depth

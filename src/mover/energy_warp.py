@@ -1,4 +1,7 @@
-"""Eq. 1 in its robust form as one kernel: the same numbers as `energy.scene_energy`, sooner."""
+"""Eq. 1 in its robust form as one kernel: the same numbers as `energy.scene_energy`, sooner.
+
+Lines of walls are not in the kernel: only a few pieces stand along one, in the last descents.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,9 +18,11 @@ from .geometry.raster_engine import engine
 from .minimize import Energy
 from .terms.contact_trees import trees_of
 from .terms.silhouette import outline_root
+from .terms.wall import Walls, some_walls, wall_term
 from .types import Camera, Layout, Objects
 
 Rows = Int[Tensor, " rows"]
+PricedRows = Callable[[Layout, Rows | None], Energy]
 
 
 def pricing(
@@ -39,7 +44,7 @@ def pricing(
 
 def pricing_rows(
     objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
-) -> Callable[[Layout, Rows | None], Energy] | None:
+) -> PricedRows | None:
     """The same for some starts of some objects, by their numbers; None without the kernel.
 
     Rows count through (starts x objects); the layout has one row for each.
@@ -57,6 +62,21 @@ def pricing_rows(
         whole, parts = price(pricer, layout.t_world_object, layout.yaw, layout.log_scale, rows)
         each = parts.unbind(-1)
         return Energy({name: each[k] for k, name in names}, whole)
+
+    if image.walls is None or not weights.wall:
+        return energy
+    return _with_walls(energy, objects, image.walls, weights.wall)
+
+
+def _with_walls(kernel: PricedRows, objects: Objects, walls: Walls, weight: float) -> PricedRows:
+    """The energy of the kernel and the price of standing off lines."""
+    n = len(objects.ids)
+
+    def energy(layout: Layout, rows: Rows | None) -> Energy:
+        known = kernel(layout, rows)
+        index = torch.arange(n) if rows is None else rows % n
+        wall = weight * wall_term(layout, objects.size[index], some_walls(walls, index))
+        return Energy({**known.parts, "wall": wall}, known.per_item + wall)
 
     return energy
 

@@ -6,13 +6,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from .energy import HumanCues, ImageCues, SceneConfig, SceneWeights, factors, heard, scene_energy
+from .energy import HumanCues, ImageCues, SceneConfig, SceneWeights, heard, scene_energy
 from .geometry.placement import place_in
 from .geometry.raster import Topology
 from .geometry.raster_engine import engine
 from .geometry.windows_warp import Evidence, Rules, Windows, prices, windows
 from .minimize import Energy
 from .terms.depth import CLAMP, eroded
+from .terms.factors import factors
 from .terms.silhouette import RING, outline_root
 from .types import Camera, Layout, Objects
 
@@ -34,7 +35,7 @@ def window_pricing(
         return None
     held = _windows(objects, image, humans, config, w)
     rest = replace(config, weights=replace(config.weights, **dict.fromkeys(DRAWN, 0.0)))
-    many = factors(objects, humans if w.contact else HumanCues(), config.form)
+    many = factors(objects, humans.touches if w.contact else None, config.form)
     area = torch.ones_like(image.trust) if humans.depth is None else humans.depth.area
     factor = torch.stack(
         [image.trust, torch.full_like(area, 0.5), many.depth * area, area], -1

@@ -17,6 +17,7 @@ TERMS = {
     "depth": "who hides whom", "collision": "free space", "contact": "touch", "edge": "its outline",
     "offscreen": "the border of the image", "free_space": "people seen beside it",
     "distance": "the distance it was given", "heading": "where its sitters face",
+    "wall": "the line of the furniture beside it",
 }  # fmt: skip
 PRIORS = ("scale", "distance")  # terms that are no evidence of this room
 LITTLE = 0.1  # share of a term in what tells a distance, below which it is not named

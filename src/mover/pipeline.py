@@ -32,6 +32,7 @@ from .stages.inputs import (
 )
 from .stages.other_starts import other_starts
 from .stages.pinned import Pinned
+from .stages.place_inputs import with_walls
 from .stages.place_objects import PlaceInputs, place_objects
 from .stages.prepare_objects import PrepareInputs, prepare_objects
 from .stages.refine_camera import RefineInputs, refine_camera
@@ -119,7 +120,7 @@ def _from_image(job: Job, camera: Camera, ground: float) -> View:
     )
     placed = job.run.stage(place_objects, inputs, job.config.layout)
     found = View(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
-    return replace(found, priced=(inputs, job.config.layout))
+    return replace(found, priced=(with_walls(inputs, placed.walls), job.config.layout))
 
 
 def _refine(job: Job, crew: Crew, view: View) -> View:
@@ -186,7 +187,8 @@ def _place_with(job: Job, view: View, fit: Float[Tensor, " objects"]) -> View:
     )  # fmt: skip
     placed = run.stage(place_objects, inputs, config.place)
     traces = {**view.traces, f"people {len(view.traces)}": placed.trace}
-    return replace(view, placed=placed, traces=traces, priced=(inputs, config.place))
+    priced = with_walls(inputs, placed.walls), config.place
+    return replace(view, placed=placed, traces=traces, priced=priced)
 
 
 def _is_pinned(job: Job) -> Bool[Tensor, " objects"]:

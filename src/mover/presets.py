@@ -103,8 +103,8 @@ RELEASE = Config(
 
 _GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300, hand_reach=0.25)
 _SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
-_ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0, distance=0.02)
-_ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1)
+_ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0, distance=0.02, wall=0.01)
+_ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.01)
 
 ROBUST = Config(
     correct_depth=True,
@@ -114,12 +114,14 @@ ROBUST = Config(
     ),
     layout=PlaceConfig(
         _ROBUST_IMAGE, "robust", Quasi(), yaws=16, distances=(0.9, 1.1), short=_SHORT, keep=6,
-        coarse=2, shaken=4, rounds=2, tie=1.0,
+        coarse=2, shaken=4, rounds=2, lined=2, tie=1.0,
     ),
     refine=RefineConfig(rounds=1),
     gather=GatherConfig(erode=1, reach=0.1),
     assign=_GROUPS,
-    place=PlaceConfig(_ROBUST_FULL, "robust", Quasi(), shaken=4, rounds=2, tie=1.0, apart=0.3),
+    place=PlaceConfig(
+        _ROBUST_FULL, "robust", Quasi(), shaken=4, rounds=2, lined=2, tie=1.0, apart=0.3
+    ),
     again=1,
     slide=True,
     trust=True,

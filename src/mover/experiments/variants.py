@@ -74,6 +74,12 @@ def _far(config: Config) -> Config:
     return weighed(replace(config, layout=layout), distance=0.0)
 
 
+def _unlined(config: Config) -> Config:
+    """Without the lines along which furniture stands."""
+    layout, place = replace(config.layout, lined=0), replace(config.place, lined=0)
+    return replace(config, layout=layout, place=place)
+
+
 _SILENT = {"contact": 0.0, "heading": 0.0}
 TERMS: dict[str, Variant] = {
     "again-alone": Variant(weighed(ROBUST, depth=0.0, collision=0.0, **_SILENT), "no contact"),
@@ -95,6 +101,7 @@ PARTS: dict[str, Variant] = {
     "no-depth-factor": Variant(replace(ROBUST, correct_depth=False)),
     "no-distance": Variant(_far(ROBUST)),
     "no-heading": Variant(weighed(ROBUST, heading=0.0)),
+    "no-walls": Variant(_unlined(ROBUST)),
     "no-trust": Variant(replace(ROBUST, trust=False)),
     "no-slide": Variant(replace(ROBUST, slide=False)),
     "no-groups": Variant(replace(ROBUST, assign=AssignConfig())),

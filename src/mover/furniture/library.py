@@ -84,6 +84,9 @@ TOPS = frozenset({"table", "desk", "coffee table", "cabinet", "nightstand", "she
 BEDS = frozenset({"bed", "sofa"})
 """Classes that one may lie on."""
 
+WALL_PIECES = frozenset({"sofa", "bed", "desk", "shelf", "cabinet", "wardrobe", "nightstand"})
+"""Classes that usually stand with their back to a wall."""
+
 
 def canonical(category: str) -> str:
     """The class that `category` names, without case; unknown names are kept in lower case."""

@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..energy import CHAIRS
 from ..geometry.boxes import iou2d
 from ..records import record
+from ..terms.factors import CHAIRS
 
 TABLES = ("table", "coffee table", "dining table", "round table", "desk")
 KEPT = (*CHAIRS, *TABLES, "bed", "sofa")

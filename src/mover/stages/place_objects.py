@@ -1,10 +1,9 @@
 """Move the objects until the image and the people agree (Sec. 3.2, "Optimization")."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from ..energy import HumanCues, ImageCues, SceneConfig, SceneWeights
@@ -12,93 +11,23 @@ from ..energy_warp import never_asks, pricing, pricing_rows
 from ..geometry.placement import stand
 from ..minimize import Adam, Energy, Minimum, Observer, Step, minimize, silent
 from ..minimize_newton import Problems, Quasi, settle
-from ..records import record, to_device
+from ..records import to_device
 from ..terms import Form
 from ..terms.contact_reach import together
 from ..terms.contact_trees import trees_of
 from ..types import Camera, Layout, Objects
 from .coarser import coarser_humans, coarser_image
+from .line_up import line_up
 from .part_objects import part_objects
-from .pinned import Pinned, hold
+from .pinned import hold
+from .place_inputs import Moment as Moment
+from .place_inputs import PlaceConfig as PlaceConfig
+from .place_inputs import Placed as Placed
+from .place_inputs import PlaceInputs as PlaceInputs
+from .place_inputs import with_walls
 from .some_objects import some_humans, some_image, some_objects, some_pinned
 from .spans import bounded, spans_of, unbounded
 from .starts import best_few, choose, joined, shaken, spread, spread_distance
-
-
-@dataclass(frozen=True)
-class PlaceConfig:
-    """How the objects are placed."""
-
-    weights: SceneWeights = field(default_factory=SceneWeights)
-    form: Form = "paper"
-    """How the terms are priced."""
-    method: Adam | Quasi = field(default_factory=Adam)
-    """The descent from each start that is left."""
-    first: Adam = field(default_factory=lambda: Adam(steps=0))
-    """A descent of the box term over the places alone, before all others (release)."""
-    yaws: int = 1
-    """Starts that are turned evenly round each object."""
-    distances: tuple[float, ...] = ()
-    """Further starts at these shares of its distance, turned as often."""
-    short: Adam | Quasi = field(default_factory=lambda: Adam(steps=0))
-    """A short descent from each of them."""
-    keep: int = 1
-    """Starts of each object that are left after the short descents."""
-    coarse: int = 1
-    """Pixels of a window that are one, along each side, in the short descents."""
-    shaken: int = 0
-    """Further descents from places around the best one of each object."""
-    rounds: int = 1
-    """How often that is done; each time around the best so far, and half as far from it."""
-    tie: float = 0.0
-    """How much a turn away from the reference yaw worsens a candidate: 1 doubles half a turn."""
-    apart: float = 0.0
-    """Weight of the space that objects share, in a last descent of all together."""
-    span: float = 0.0
-    """Release: scales stay within 1 +- span/2 by a sigmoid; 0: free."""
-    chair_span: float = 0.0
-    """The same for chairs."""
-
-
-@record
-class PlaceInputs:
-    """What placing the objects needs."""
-
-    objects: Objects
-    camera: Camera
-    ground: float
-    image: ImageCues
-    humans: HumanCues
-    starts: Layout
-    """Candidates on a leading axis."""
-    reference: Float[Tensor, " objects"]
-    """Yaw that breaks ties: of the sitters where there are any, else the initial one [rad]."""
-    pinned: Pinned | None = None
-    """Objects that stay where they are; None: all may move."""
-
-
-@record
-class Moment:
-    """The room in the middle of a descent, for those who watch."""
-
-    layout: Layout
-    """All starts."""
-    camera: Camera
-    ground: float
-
-
-@record
-class Placed:
-    """Where the objects ended."""
-
-    layout: Layout
-    """The chosen candidate of each object."""
-    candidates: Layout
-    """All that were left, best first."""
-    energy: Float[Tensor, "starts objects"]
-    """Of the candidates."""
-    trace: Float[Tensor, " steps"]
-    """Total energy before each step of the last descent, summed over the candidates."""
 
 
 def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = silent) -> Placed:
@@ -113,13 +42,24 @@ def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = 
             torch.cat([found.value, more.value]),
             torch.cat([found.trace, more.trace]),
         )
+
+    def lower(given: PlaceInputs, starts: Layout) -> Placed:
+        return _best_first(descend(given, config, starts, config.method, observe), given, config)
+
+    placed = line_up(_best_first(found, inputs, config), inputs, config.lined, lower)
+    if not config.apart:
+        return placed
+    energies = energy_of(with_walls(inputs, placed.walls), config)
+    at = part_objects(energies, inputs.objects, placed.layout, config.apart, observe)
+    return replace(placed, layout=_standing(inputs, at))
+
+
+def _best_first(found: Minimum[Layout], inputs: PlaceInputs, config: PlaceConfig) -> Placed:
+    """The ends of descents, and the one of each object that is chosen."""
     candidates = best_few(found.at, found.value, len(found.value), apart=False)
     energy = found.value.sort(0).values
     at = choose(candidates, energy, inputs.reference, config.tie)
-    if config.apart:
-        energies = energy_of(inputs, config)
-        at = _standing(inputs, part_objects(energies, inputs.objects, at, config.apart, observe))
-    return Placed(at, candidates, energy, found.trace)
+    return Placed(at, candidates, energy, found.trace, inputs.image.walls)
 
 
 def starts_left(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = silent) -> Layout:

@@ -13,12 +13,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..energy import CHAIRS, HumanCues
+from ..energy import HumanCues
 from ..geometry.camera import to_camera
 from ..geometry.rotations import rot_y, wrap
 from ..minimize import Observer, silent
 from ..records import record
 from ..terms.contact import Touches
+from ..terms.factors import CHAIRS
 from ..types import Camera, Layout, Objects
 
 BOUNDED = 500.0  # pixels (of an image 640 wide) bounded from both sides

@@ -11,6 +11,7 @@ from ..geometry.raster import Views
 from ..terms.border import Borders
 from ..terms.contact import Touches
 from ..terms.contact_trees import some_trees
+from ..terms.wall import some_walls
 from ..types import Objects
 from .pinned import Pinned
 
@@ -53,7 +54,10 @@ def some_image(image: ImageCues, index: Rows) -> ImageCues:
     borders = image.borders
     if borders is not None:
         borders = Borders(borders.shifts, borders.masks[:, index])
-    return ImageCues(views=views, distance=distance, outline=outline, borders=borders, **rest)
+    walls = None if image.walls is None else some_walls(image.walls, index)
+    return ImageCues(
+        views=views, distance=distance, outline=outline, borders=borders, walls=walls, **rest
+    )
 
 
 def some_humans(humans: HumanCues, index: Rows, n: int) -> HumanCues:
