@@ -138,7 +138,7 @@ def _moved(layout: Layout, objects: Objects, walls: Walls, number: int) -> Layou
     out = rears_of(layout, objects.size).out
     turn = wrap(torch.atan2(line[0], line[1]) - torch.atan2(out[:, 0], out[:, 1]))
     depth = objects.size[:, 2] * layout.log_scale[:, 2].exp()
-    ahead = layout.t_world_object[:, [0, 2]] @ line
+    ahead = layout.t_world_object[:, ::2] @ line
     share = walls.offset[number] / (ahead + depth / 2).clamp_min(1e-6)
     low, high = STRETCH
     goes = (walls.trust[:, number] > 0) & (turn.abs() < TURN) & (share > low) & (share < high)

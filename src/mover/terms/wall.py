@@ -49,7 +49,7 @@ class Rears:
 def rears_of(layout: Layout, size: Float[Tensor, "objects 3"]) -> Rears:
     """The rear side of each object; `size` is that of its mesh [m]."""
     half = size * layout.log_scale.exp() / 2
-    place = layout.t_world_object[..., [0, 2]]
+    place = layout.t_world_object[..., ::2]
     front = torch.stack([layout.yaw.sin(), layout.yaw.cos()], -1)
     away = ((front * place).sum(-1, keepdim=True) >= 0).detach().to(front) * 2 - 1
     out = front * away
