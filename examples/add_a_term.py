@@ -2,7 +2,7 @@ r"""A new term of the objective: python examples/add_a_term.py.
 
 A wall stands behind the room, and no object stands in it:
 
-    L_wall = \sum_i relu(z_wall - z_i)^2
+    L_behind = \sum_i relu(z_wall - z_i)^2
 
 where z_i is the farthest point of object i. A term takes tensors and returns one value for each
 start and object; it sums over nothing else, so that starts stay independent.
@@ -20,7 +20,7 @@ from mover.types import Layout
 WALL = -4.0  # [m], z of the wall
 
 
-def wall_term(
+def behind_term(
     verts: Float[Tensor, "*starts objects verts 3"], wall: float
 ) -> Float[Tensor, "*starts objects"]:
     """Squared depth of the objects in the wall [m²]."""
@@ -37,7 +37,7 @@ def main() -> Layout:
     def energy(layout: Layout) -> Energy:
         return weigh(
             ("scale", 1.0, lambda: scale_term(layout.log_scale, "robust")),
-            ("wall", 10.0, lambda: wall_term(place(boxes, layout), WALL)),
+            ("behind", 10.0, lambda: behind_term(place(boxes, layout), WALL)),
         )
 
     found = minimize(energy, start, Adam(200, 0.02, 0.002), stage="two boxes")

@@ -44,14 +44,14 @@ def test_a_run_from_python_puts_the_table_on_its_mask(tmp_path: Path):
 
 def test_the_new_term_moves_the_box_out_of_the_wall():
     import add_a_term
-    from add_a_term import WALL, wall_term
+    from add_a_term import WALL, behind_term
 
     layout = add_a_term.main()
     assert float(layout.t_world_object[0, 1, 2]) > WALL + 0.4
     assert torch.allclose(layout.t_world_object[0, 0], torch.tensor([0.0, 0.0, -3.0]))
     verts = torch.tensor([[[0.0, 0.0, WALL]]])
-    assert float(wall_term(verts, WALL)) == 0
-    assert float(wall_term(verts - 0.5, WALL)) == pytest.approx(0.25)
+    assert float(behind_term(verts, WALL)) == 0
+    assert float(behind_term(verts - 0.5, WALL)) == pytest.approx(0.25)
 
 
 def test_the_better_scene_is_measured_as_better():

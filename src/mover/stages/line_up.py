@@ -19,7 +19,7 @@ from ..terms.bbox import SEEN
 from ..terms.wall import ALONG, Walls, rears_of
 from ..types import Layout, Objects
 from .place_inputs import Placed, PlaceInputs, with_walls
-from .starts import alone, best_few, joined
+from .starts import alone, best_few, joined, merged
 
 NEAR = 0.3  # [m], root mean square distance of a rear from the line that it belongs to
 UNSEEN = 0.2  # how much an object whose base is not seen counts against one whose base is
@@ -52,25 +52,18 @@ def line_up(found: Placed, inputs: PlaceInputs, rounds: int, lower: Lower) -> Pl
         starts = starts_at(lined.layout, inputs.objects, walls)
         few = best_few(found.candidates, found.energy, KEPT)
         more = lower(with_walls(inputs, walls), joined(starts, few))
-        lined = _merged(more, found, walls)
+        lined = _where_told(more, found, walls)
     return lined
 
 
-def _merged(lined: Placed, found: Placed, walls: Walls) -> Placed:
+def _where_told(lined: Placed, found: Placed, walls: Walls) -> Placed:
     """What is lined up where a line is told, else what was found; both as many candidates."""
     told = walls.trust.amax(-1) > 0
     count = min(len(lined.energy), len(found.energy))
-
-    def chosen(one: Layout, other: Layout) -> Layout:
-        return Layout(
-            torch.where(told[:, None], one.t_world_object, other.t_world_object),
-            torch.where(told, one.yaw, other.yaw),
-            torch.where(told[:, None], one.log_scale, other.log_scale),
-        )
-
+    few = (_first(placed.candidates, count) for placed in (lined, found))
     return Placed(
-        chosen(lined.layout, found.layout),
-        chosen(_first(lined.candidates, count), _first(found.candidates, count)),
+        merged(told, lined.layout, found.layout),
+        merged(told, *few),
         torch.where(told, lined.energy[:count], found.energy[:count]),
         found.trace,
         walls,

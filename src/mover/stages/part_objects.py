@@ -17,7 +17,7 @@ from ..geometry.sections import Sections, sections_of
 from ..minimize import Adam, Energy, Observer, minimize, silent
 from ..terms.apart import apart_term, gather_solids
 from ..types import Layout, Objects
-from .starts import alone
+from .starts import alone, merged
 
 NEAR = 0.1  # [m], boxes whose circles are no nearer are not looked at
 METHOD = Adam(200, 0.01, 0.001, beta2=0.98)  # 80 cm at most
@@ -56,11 +56,7 @@ def part_objects(
     still = never_asks(objects)
     found = minimize(together, layout, METHOD, observe, "place_objects", still=still).at
     concerned = _pushed(shared, layout) | _pushed(shared, found)
-    return Layout(
-        torch.where(concerned[:, None], found.t_world_object, layout.t_world_object),
-        torch.where(concerned, found.yaw, layout.yaw),
-        torch.where(concerned[:, None], found.log_scale, layout.log_scale),
-    )
+    return merged(concerned, found, layout)
 
 
 def _pushed(shared: Callable[[Layout], Tensor], layout: Layout) -> Bool[Tensor, " objects"]:

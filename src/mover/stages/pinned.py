@@ -5,6 +5,7 @@ from jaxtyping import Bool
 
 from ..records import record
 from ..types import Layout
+from .starts import merged
 
 
 @record
@@ -20,9 +21,4 @@ def hold(layout: Layout, pinned: Pinned | None) -> Layout:
     """The layout with the pinned objects at their places, in every start; no gradient there."""
     if pinned is None:
         return layout
-    fixed, there = pinned.fixed, pinned.layout
-    return Layout(
-        torch.where(fixed[:, None], there.t_world_object, layout.t_world_object),
-        torch.where(fixed, there.yaw, layout.yaw),
-        torch.where(fixed[:, None], there.log_scale, layout.log_scale),
-    )
+    return merged(pinned.fixed, pinned.layout, layout)

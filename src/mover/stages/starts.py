@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..geometry.rotations import wrap
@@ -115,6 +115,15 @@ def choose(
     rank = (energy + 0.01) * (1 + tie * turned / 2)
     best = pick(layout, rank.argmin(0, keepdim=True))
     return Layout(best.t_world_object[0], best.yaw[0], best.log_scale[0])
+
+
+def merged(first: Bool[Tensor, " objects"], one: Layout, other: Layout) -> Layout:
+    """The first layout where `first`, else the other; either may have an axis of starts."""
+    return Layout(
+        torch.where(first[:, None], one.t_world_object, other.t_world_object),
+        torch.where(first, one.yaw, other.yaw),
+        torch.where(first[:, None], one.log_scale, other.log_scale),
+    )
 
 
 def alone(layout: Layout) -> Layout:
