@@ -116,6 +116,7 @@ def test_the_little_room_itself_is_taken(
 @FUZZ
 @example(format="release", which=37, where=0.5, junk=b"(", cut=False)  # an .npy header that goes on
 @example(format="total3d", which=3, where=1.0, junk=b"\x80", cut=False)  # no text at an .obj's end
+@example(format="total3d", which=0, where=0.0, junk=b"\t", cut=True)  # nothing but a space: .txt
 @given(
     format=st.sampled_from(FORMATS), which=st.integers(0, 100), where=st.floats(0, 1),
     junk=st.binary(min_size=1, max_size=8), cut=st.booleans(),

@@ -1,6 +1,7 @@
 """Cameras as calibration tools write them, turned into the fields of camera.json."""
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -94,7 +95,9 @@ def read_intrinsics(path: Path) -> NDArray[np.float64]:
     try:
         if path.stat().st_size > LARGEST_TEXT:
             raise ValueError("the file is too large")
-        K = np.atleast_2d(np.loadtxt(path, dtype=np.float64))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that an empty file is empty: its shape is refused
+            K = np.atleast_2d(np.loadtxt(path, dtype=np.float64))
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path.name}: cannot be read ({reason(error)}), expected 3 x 3 numbers"
