@@ -1,7 +1,6 @@
 """The files of Total3D and Implicit3D: boxes and matrices (.mat), meshes."""
 
 import math
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..records import InputError
-from .fields import At, array, get, reason, refuse
+from .fields import At, array, get, refuse
+from .mat_file import load_mat
 from .mesh_file import KINDS, read_mesh
 from .nyu40 import CLASSES
 
@@ -25,22 +25,6 @@ class Box:
     half: NDArray[np.float64]
     yaw: float
     name: str
-
-
-def load_mat(path: Path) -> At:
-    """The arrays of a MATLAB file."""
-    from scipy.io import loadmat
-
-    if not path.is_file():
-        raise InputError(f"{path.name}: there is no such file in {path.parent}")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return At(loadmat(str(path)), path.name)
-    except Exception as error:  # the parser raises anything on broken files
-        raise InputError(
-            f"{path.name}: cannot be read ({reason(error)}), expected a .mat file"
-        ) from error
 
 
 def matrix(path: Path, key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
