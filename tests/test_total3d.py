@@ -158,3 +158,14 @@ class TestRealOutput:
         for a, b in zip(first.scene.pieces, second.scene.pieces, strict=True):
             assert torch.allclose(place_piece(a).verts, place_piece(b).verts, atol=1e-5)
             assert torch.equal(a.mesh.faces, b.mesh.faces)
+
+
+@pytest.mark.parametrize(("at", "byte"), [(144, 7), (320, 0), (321, 255)])
+def test_a_file_that_kills_its_reader_is_refused(tmp_path: Path, at: int, byte: int) -> None:
+    path = write(tmp_path / "room") / "output" / "bdb_3d.mat"
+    content = bytearray(path.read_bytes())
+    assert content[at] != byte
+    content[at] = byte  # scipy 1.17 dies of each of these
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"^bdb_3d\.mat: cannot be read \(.*\), expected a \.mat"):
+        read("total3d", tmp_path / "room")
