@@ -29,6 +29,7 @@ STUDIES = (
     StudyArgs("video-length", "", "1000-1001"),
     StudyArgs("interactions", "", "1000-1001"),
     StudyArgs("sensitivity", "", "1000-1003"),
+    StudyArgs("sensitivity", "", "1000-1011", errors=("scale",)),
     StudyArgs("bodies", "", "1000-1007"),
     StudyArgs("time", "", "1000-1003", workers=1),
     StudyArgs("sets", "two", "1000-1003", ROBUST),

@@ -20,7 +20,9 @@ from mover.terms.depth import DepthRange
 from mover.types import Layout
 
 pytest.importorskip("warp")
-WEIGHTS = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.05)
+WEIGHTS = SceneWeights(
+    1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.05, growth=2.5
+)
 TERMS = (
     "bbox", "silhouette", "scale", "depth", "collision", "contact", "distance", "heading", "wall"
 )  # fmt: skip

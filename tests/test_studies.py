@@ -432,6 +432,8 @@ def test_people_seen_from_another_camera_stay_in_their_pixels() -> None:
         (["ablation", "--seeds", "x"], "--seeds: 'x'"),
         (["sets", "--presets", "paper"], "--presets: robust is missing"),
         (["sensitivity", "--set", "rooms+scale=0"], "is changed already"),
+        (["sensitivity", "--errors", "size"], "--errors: 'size' is none of scale, place"),
+        (["camera", "--errors", "scale"], "--errors: the study camera tries none"),
     ],
 )
 def test_the_command_names_what_it_does_not_know(flags, said, tmp_path, capsys) -> None:
@@ -453,3 +455,16 @@ def test_a_plan_has_the_room_of_every_job(tmp_path: Path) -> None:
     jobs = jobs_of(STUDIES["sensitivity"].plan(ask), ask, tmp_path)
     assert {j.rooms for j in jobs if j.name == ROOM} == {j.rooms for j in jobs}
     assert {j.seed for j in jobs} == {5}
+
+
+def test_some_errors_by_themselves_have_their_jobs_and_a_page_of_their_own(tmp_path: Path) -> None:
+    table = Table()
+    args = StudyArgs("sensitivity", seeds="5", errors=("turn", "scale"), out=tmp_path)
+    page = run_study(args, launch=table)[0]
+    text = page.read_text()
+    assert page.parent.name == "sensitivity-turn-scale"
+    assert "mover experiment study sensitivity --seeds 5 --errors turn scale\n" in text
+    heads = [line for line in text.splitlines() if line.startswith("## Error")]
+    assert heads == ["## Error in the orientation of objects", "## Error in the size of objects"]
+    kinds = {rooms.partition("+")[2].partition("=")[0] for rooms, _, _ in table.done}
+    assert kinds == {"turn", "scale", ""}

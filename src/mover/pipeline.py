@@ -38,6 +38,7 @@ from .stages.prepare_objects import PrepareInputs, prepare_objects
 from .stages.refine_camera import RefineInputs, refine_camera
 from .stages.reinitialize import ReinitInputs, by_release, contact_start
 from .stages.select_frames import SelectInputs, select_frames
+from .stages.size_spread import learnt_sizes
 from .stages.starts import alone, best_few, joined, reference_yaw
 from .types import Camera, Capture, Layout, Room
 
@@ -57,9 +58,21 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
         view = _from_image(job, capture.scene.camera, ground_without_people(capture, prepared))
         return room_of(job, view, None)
     view = _from_image(job, crew.alignment.camera, crew.alignment.ground)
+    job = _with_sizes(job, view)
     for _ in range(config.refine.rounds):
         view = _refine(job, crew, view)
     return room_of(job, _with_people(job, crew, view), crew)
+
+
+def _with_sizes(job: Job, view: View) -> Job:
+    """The given sizes believed as far as this room's furniture bears them out."""
+    config, layout = job.config, view.placed.layout
+    stages = {"layout": config.layout, "refine": config.refine, "place": config.place}
+    found = {
+        name: replace(stage, weights=learnt_sizes(stage.weights, layout, config.sizes))
+        for name, stage in stages.items()
+    }
+    return replace(job, config=replace(config, **found))
 
 
 def people_of(capture: Capture, config: Config, run: Run) -> Crew | None:

@@ -26,6 +26,7 @@ from .stages.prepare_objects import PrepareConfig
 from .stages.refine_camera import RefineConfig
 from .stages.reinitialize import ReinitConfig
 from .stages.select_frames import SelectConfig
+from .stages.size_spread import SpreadConfig
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ class Config:
     """Stage 1: objects from the image alone."""
     refine: RefineConfig = field(default_factory=RefineConfig)
     """Camera and ground refined with the objects."""
+    sizes: SpreadConfig = field(default_factory=SpreadConfig)
+    """How far the given sizes are believed in this room."""
     gather: GatherConfig = field(default_factory=GatherConfig)
     """Evidence from all people."""
     assign: AssignConfig = field(default_factory=AssignConfig)
@@ -117,6 +120,7 @@ ROBUST = Config(
         coarse=2, shaken=4, rounds=2, lined=2, tie=1.0,
     ),
     refine=RefineConfig(rounds=1),
+    sizes=SpreadConfig(0.05),
     gather=GatherConfig(erode=1, reach=0.1),
     assign=_GROUPS,
     place=PlaceConfig(

@@ -12,7 +12,7 @@ from ..minimize import Observer, Step, silent
 from ..presets import PRESETS
 from ..records import InputError, replacing
 from . import study_noise, study_rows, study_video
-from .changes import set_named
+from .changes import CHANGES, set_named
 from .finished import Finished, read_finished
 from .job import ROOM, Job
 from .queue import Launch, open_jobs, run_all, start
@@ -89,6 +89,8 @@ class StudyArgs:
     """Which of them: 1000-1009, or 1000,1003; empty: all that are held out."""
     presets: tuple[str, ...] = ("paper", "release", "robust")
     """Which presets the study `sets` compares."""
+    errors: tuple[str, ...] = ()
+    """Which errors of the input the study `sensitivity` tries: scale, place, ...; empty: all."""
     out: Path = Path("experiments")
     """Folder for the results."""
     workers: int = 0
@@ -134,7 +136,7 @@ def ask_of(args: StudyArgs, study: Study) -> Ask:
     rooms = args.set or study.rooms
     names = [rooms] if rooms else list(SETS)
     seeds = {name: parse_seeds(args.seeds or set_named(name).seeds) for name in names}
-    return Ask(names[0], seeds, args.presets)
+    return Ask(names[0], seeds, args.presets, args.errors or tuple(CHANGES))
 
 
 def jobs_of(plan: Plan, ask: Ask, out: Path) -> list[Job]:
@@ -182,9 +184,10 @@ def write_study(name: str, args: StudyArgs, ask: Ask, jobs: Sequence[Job]) -> Pa
 
 
 def folder_of(name: str, args: StudyArgs) -> Path:
-    """Where a study is written; studies on other sets than the usual one have its name, too."""
+    """Where a study is written; studies on other sets or of some errors have their names, too."""
     usual = args.set in ("", STUDIES[name].rooms)
-    return args.out / "studies" / (name if usual else f"{name}-{args.set}")
+    words = [name, *([] if usual else [args.set]), *args.errors]
+    return args.out / "studies" / "-".join(words)
 
 
 def command_of(name: str, args: StudyArgs) -> str:
@@ -194,6 +197,7 @@ def command_of(name: str, args: StudyArgs) -> str:
     words += ["--seeds", args.seeds] if args.seeds else []
     if name == "sets" and args.presets != StudyArgs.presets:
         words += ["--presets", *args.presets]
+    words += ["--errors", *args.errors] if args.errors else []
     return " ".join(words)
 
 
@@ -231,6 +235,7 @@ def _check(args: StudyArgs) -> None:
     for name in args.presets:
         if name not in PRESETS:
             raise InputError(f"--presets: {name!r} is none of {', '.join(PRESETS)}")
+    study_noise.check_errors(args.name, args.errors)
     if "robust" not in args.presets:
         raise InputError("--presets: robust is missing, with which the others are compared")
     if args.workers < 0:

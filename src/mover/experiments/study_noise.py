@@ -1,8 +1,10 @@
 """How much wrong input costs: one kind of error after the other, in growing sizes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from .. import published
+from ..records import InputError
 from .changes import CHANGES, Change, changed_set
 from .columns import markdown
 from .finished import Finished, Source, by_room
@@ -28,12 +30,22 @@ class Level:
     """Share of IoU3D that is lost against no error of this kind."""
 
 
+def check_errors(study: str, kinds: Sequence[str]) -> None:
+    """They must be kinds that are known, and asked of the study that tries them."""
+    if kinds and study != "sensitivity":
+        raise InputError(f"--errors: the study {study} tries none, expected sensitivity")
+    for kind in kinds:
+        if kind not in CHANGES:
+            raise InputError(f"--errors: {kind!r} is none of {', '.join(CHANGES)}")
+
+
 def plan(ask: Ask) -> Plan:
     """The same rooms with changed noise."""
     jobs = [
         (changed_set(ask.rooms, kind, level), name)
         for name, kinds in METHODS.items()
         for kind in kinds
+        if kind in ask.errors
         for level in CHANGES[kind].levels
     ]
     return list(dict.fromkeys(jobs))
@@ -42,7 +54,8 @@ def plan(ask: Ask) -> Plan:
 def page(ask: Ask, finished: Finished) -> Page:
     """A table and a panel for each kind of error."""
     sections, panels = list[str](), list[Panel]()
-    for kind, change in CHANGES.items():
+    for kind in ask.errors:
+        change = CHANGES[kind]
         found = {
             name: levels_of(ask, finished, name, kind)
             for name, kinds in METHODS.items()

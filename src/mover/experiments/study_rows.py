@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from .. import published
-from .changes import set_named
+from .changes import CHANGES, set_named
 from .columns import COLUMNS, head_of, markdown
 from .compare import Filled, Row, Table, fill_tables
 from .finished import Finished, Source, by_room, recovered, truth_source
@@ -35,6 +35,8 @@ class Ask:
     """The rooms of each set that takes part."""
     presets: tuple[str, ...] = ("paper", "release", "robust")
     """Which of them the study `sets` compares."""
+    errors: tuple[str, ...] = tuple(CHANGES)
+    """Which of them the study `sensitivity` tries."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from ..presets import PRESETS, Config
 from ..stages.align_camera import AlignConfig
 from ..stages.assign_touches import AssignConfig
+from ..stages.size_spread import SpreadConfig
 
 Hears = Literal["all", "no contact", "nobody"]
 SEGMENTS = 10  # of each length, as in the paper
@@ -59,13 +60,14 @@ def weighed(config: Config, **weights: float) -> Config:
 
 
 def relaxed(config: Config, factor: float = 0.1) -> Config:
-    """A weaker prior on the sizes of objects, in both stages."""
+    """A weaker prior on the sizes of objects in all stages, the same in all rooms."""
 
     def of(stage: Any) -> Any:  # noqa: ANN401
         weights = replace(stage.weights, scale=factor * stage.weights.scale)
         return replace(stage, weights=weights)
 
-    return replace(config, layout=of(config.layout), place=of(config.place))
+    stages = {name: of(getattr(config, name)) for name in ("layout", "refine", "place")}
+    return replace(config, **stages, sizes=SpreadConfig())
 
 
 def _far(config: Config) -> Config:
@@ -102,6 +104,7 @@ PARTS: dict[str, Variant] = {
     "no-distance": Variant(_far(ROBUST)),
     "no-heading": Variant(weighed(ROBUST, heading=0.0)),
     "no-walls": Variant(_unlined(ROBUST)),
+    "no-learnt-sizes": Variant(replace(ROBUST, sizes=SpreadConfig())),
     "no-trust": Variant(replace(ROBUST, trust=False)),
     "no-slide": Variant(replace(ROBUST, slide=False)),
     "no-groups": Variant(replace(ROBUST, assign=AssignConfig())),

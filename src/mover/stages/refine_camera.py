@@ -52,6 +52,8 @@ class RefineConfig:
     """How often; 0: never (the paper)."""
     feet: float = 0.04
     """Weight w of what the feet say; each object counts about one."""
+    weights: SceneWeights = IMAGE_ONLY
+    """Of what the image says."""
     method: Adam = field(default_factory=lambda: Adam(400, rate=0.3, last_rate=0.02, beta2=0.98))
 
 
@@ -89,9 +91,9 @@ def refine_camera(
     inputs: RefineInputs, config: RefineConfig, observe: Observer = silent
 ) -> Refined:
     """Minimise over the camera, the ground and all standing objects at once."""
-    image = SceneConfig(IMAGE_ONLY, "robust")
+    image = SceneConfig(config.weights, "robust")
     fixed, certainty = _start(inputs), torch.linalg.inv(inputs.covariance)
-    cues = fixed_borders(inputs.image, inputs.layout, inputs.objects, inputs.camera, IMAGE_ONLY)
+    cues = fixed_borders(inputs.image, inputs.layout, inputs.objects, inputs.camera, config.weights)
     usable = _usable(inputs)
     zero = _Joint(
         *(torch.zeros_like(x) for x in (fixed.tilt, fixed.rays, fixed.yaw, fixed.log_scale))

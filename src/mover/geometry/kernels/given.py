@@ -106,6 +106,8 @@ class Given:
     """Half width of the rounded tip of the price of a box."""
     sizes: wp.vec2
     """Logarithms of the lowest and highest scale that are usual."""
+    growth: float
+    """Price of another size as a whole, against another shape."""
     rho: float
     """Change of the logarithm of the distance that costs a half."""
 

@@ -51,8 +51,9 @@ def price_box(given: Given, desk: Desk, p: Pose, e: Extent, wider: float) -> tup
 def price_scale(given: Given, logs: wp.vec3) -> tuple[float, Slope]:
     """How far the size is from the initial one, see `terms.scale`."""
     mean = (logs[0] + logs[1] + logs[2]) / 3.0
-    price = 1.5 * mean * mean
-    slope = wp.vec3(mean, mean, mean)
+    price = given.growth * mean * mean
+    pull = 2.0 / 3.0 * given.growth * mean
+    slope = wp.vec3(pull, pull, pull)
     for k in range(3):
         out = wp.max(logs[k] - given.sizes[1], 0.0) + wp.max(given.sizes[0] - logs[k], 0.0)
         sign = wp.where(

@@ -1,0 +1,54 @@
+r"""How far the given sizes of a room's furniture are off, as its image tells (not in the paper).
+
+The price of sizes (`terms.scale`) suits tools whose sizes err as much as usual. Where the image
+alone changes the shapes of a room's furniture more than that, the sizes that it cannot tell (the
+depth of a cabinet that is seen from the front) are worth less too. Logarithms of the three sizes
+of a piece are c + e_k, with c common (a piece that was placed too far was made too large) and e_k
+independent; then the price of a normal distribution is
+
+    \sum_k (l_k - m)^2 / v + 3 m^2 / (v + 3 w),   m = mean l_k,  v = var e_k,  w = var c,
+
+of which v is learnt from the room (empirical Bayes) and w is not.
+"""
+
+from dataclasses import dataclass, replace
+
+from ..energy import SceneWeights
+from ..types import Layout
+
+
+@dataclass(frozen=True)
+class SpreadConfig:
+    """How the price of sizes follows the room."""
+
+    usual: float = 0.0
+    """Usual standard deviation of the logarithm of a size; 0: nothing is learnt."""
+    common: float = 0.03
+    """That of what the three sizes of a piece have in common."""
+    known: float = 2.0
+    """How many pieces of a usual room count as if they were seen."""
+    most: float = 4.0
+    """The largest spread that is believed, in usual ones; the smallest is 1."""
+
+
+def learnt_sizes(weights: SceneWeights, layout: Layout, config: SpreadConfig) -> SceneWeights:
+    """The weights with the price of sizes that suits this room.
+
+    Args:
+        weights: With the usual price.
+        layout: Where and how large the image alone has the objects, of one start.
+        config: What is usual.
+    """
+    if config.usual <= 0:
+        return weights
+    log_scale, usual = layout.log_scale, config.usual**2
+    shape = (log_scale - log_scale.mean(-1, keepdim=True)).square().sum() / 2
+    found = (config.known * usual + float(shape)) / (config.known + len(log_scale))
+    found = min(max(found, usual), usual * config.most**2)
+    together = 3 * config.common**2
+    shape_factor, growth_factor = usual / found, (usual + together) / (found + together)
+    return replace(
+        weights,
+        scale=weights.scale * shape_factor,
+        growth=weights.growth * growth_factor / shape_factor,
+    )
