@@ -11,7 +11,14 @@ import torch
 from judged import CAMERA, FAST, GROUND, SELF_CONTAINED, cuboid, moved, pair, people, piece, room
 
 from mover.bodies.world import in_world
-from mover.evaluate import METRICS, EvaluatedBodies, evaluate, evaluate_folder, table
+from mover.evaluate import (
+    METRICS,
+    EvaluatedBodies,
+    evaluate,
+    evaluate_folder,
+    table,
+    touch_in_truth,
+)
 from mover.geometry.camera import tilted, to_camera
 from mover.metrics_bodies import soles_of
 from mover.metrics_pairs import unmatched
@@ -227,6 +234,21 @@ def test_a_seat_in_the_way_of_a_standing_person_costs_non_collision() -> None:
     assert metrics["result"]["non_collision"] == 1
     assert metrics["result"]["contact"] == 0
     assert metrics["result"]["contact_f1"] == 1
+
+
+def test_one_side_by_itself_and_a_known_touch_of_the_truth_change_no_number() -> None:
+    scene, bodies = room(), people(3)
+    wrong = replace(scene, pieces=tuple(moved(p, 0.1, 0, 0.05) for p in scene.pieces))
+    alone = EvaluatedBodies(None, bodies, bodies)
+    whole = evaluate(wrong, scene, scene, EvaluatedBodies(bodies, bodies, bodies), FAST)
+    known = replace(alone, touch=touch_in_truth(scene, alone, FAST))
+    for side, judged in (("initial", wrong), ("result", scene)):
+        for people_there in (alone, known):
+            found = evaluate(wrong, judged, scene, people_there, FAST, ("result",))
+            assert found["result"] == whole[side]
+            assert set(found) == {"result", "objects"}
+            for one, all_sides in zip(found["objects"], whole["objects"], strict=True):
+                assert one == {"id": all_sides["id"], "result": all_sides[side]}
 
 
 def test_a_floor_that_rises_over_standing_feet_is_penetrated_by_its_rise() -> None:

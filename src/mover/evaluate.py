@@ -30,22 +30,20 @@ from .metrics_contact import (
     gather_truth,
 )
 from .metrics_motion import MOTION_METRICS, gather_gait
-from .metrics_pairs import pairs, unmatched
+from .metrics_pairs import SIDES, means_of, measure_objects, unmatched
 from .metrics_scene import (
     CAMERA_METRICS,
     OBJECT_METRICS,
     Metric,
-    Pair,
     Sight,
     measure,
-    measure_missing,
 )
 from .readers.bodies_file import read_bodies
 from .readers.camera_file import camera_of
 from .readers.fields import read_json
 from .readers.scene_file import read_scene
 from .records import map_tensors, record, replacing
-from .types import Bodies, Mesh, Piece, Scene
+from .types import Bodies, Mesh, Scene
 
 T = TypeVar("T")
 
@@ -82,6 +80,8 @@ class EvaluatedBodies:
     initial: Bodies | None
     result: Bodies | None
     truth: Bodies | None
+    touch: TrueTouch | None = None
+    """The true people beside the true furniture (`touch_in_truth`); None: it is measured."""
 
 
 @record
@@ -102,6 +102,7 @@ def evaluate(
     truth: Scene,
     bodies: EvaluatedBodies | None = None,
     config: EvaluateConfig | None = None,
+    sides: Sequence[str] = SIDES,
 ) -> dict[str, Any]:
     """Measure a scene before and after against the truth.
 
@@ -111,22 +112,34 @@ def evaluate(
         truth: The true scene.
         bodies: The people of the three; without them their metrics are absent.
         config: Densities and thresholds.
+        sides: Which of `initial` and `result` is measured.
 
     Returns:
         What metrics.json holds: the means `initial` and `result`, and each of the `objects`.
     """
     config = config or EvaluateConfig()
-    before, after, true = _populate(
-        (initial, result, truth), bodies or EvaluatedBodies(None, None, None)
-    )
-    objects = _objects((before.scene, after.scene, true.scene), config)
-    touch = _true_touch(true, after.bodies or before.bodies, config)
+    bodies = bodies or EvaluatedBodies(None, None, None)
+    before, after, true = _populate((initial, result, truth), bodies)
+    asked = {
+        key: judged for key, judged in zip(SIDES, (before, after), strict=True) if key in sides
+    }
+    scenes = before.scene, after.scene, true.scene
+    objects = measure_objects(scenes, sides, config.samples, config.by_place)
+    touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)
     return {
-        key: _means(objects, key)
+        key: means_of(objects, key)
         | measure(CAMERA_METRICS, Sight(judged.scene, true.scene))
         | _people(judged, true, touch, config)
-        for key, judged in (("initial", before), ("result", after))
+        for key, judged in asked.items()
     } | {"objects": objects}
+
+
+def touch_in_truth(
+    truth: Scene, bodies: EvaluatedBodies, config: EvaluateConfig
+) -> TrueTouch | None:
+    """The true people beside the true furniture, of the bodies that are judged; None: no truth."""
+    true = _populate((truth, truth, truth), EvaluatedBodies(None, None, bodies.truth))[-1]
+    return _true_touch(true, bodies.result or bodies.initial, config)
 
 
 def evaluate_folder(out: Path, truth: Path, config: EvaluateConfig | None = None) -> dict[str, Any]:
@@ -135,12 +148,11 @@ def evaluate_folder(out: Path, truth: Path, config: EvaluateConfig | None = None
     Raises:
         InputError: If a scene or a bodies file is missing or wrong.
     """
-    bodies = EvaluatedBodies(
-        *(
-            read_bodies(path) if path.exists() else None
-            for path in (out / "initial_bodies.npz", out / "bodies.npz", truth / "bodies.npz")
-        )
+    initial_people, people, true_people = (
+        read_bodies(path) if path.exists() else None
+        for path in (out / "initial_bodies.npz", out / "bodies.npz", truth / "bodies.npz")
     )
+    bodies = EvaluatedBodies(initial_people, people, true_people)
     initial, result = read_scene(out / "initial.json"), read_scene(out / "scene.json")
     own = truth / "camera.json"
     true = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
@@ -198,30 +210,6 @@ def _populated(scene: Scene, bodies: Bodies | None, closed: Mapping[str, Mesh]) 
 
 def _double(value: T) -> T:
     return map_tensors(lambda x: x.double() if x.is_floating_point() else x, value)
-
-
-def _objects(scenes: Sequence[Scene], config: EvaluateConfig) -> list[dict[str, Any]]:
-    """Each true object before and after."""
-    initial, result, truth = scenes
-    before, after = pairs(initial, result, truth, config.by_place)
-
-    def of(scene: Scene, piece: Piece | None, true: Piece) -> dict[str, float]:
-        if piece is None:
-            return measure_missing(true, truth.camera)
-        pair = Pair(piece, scene.camera, true, truth.camera, config.samples)
-        return measure(OBJECT_METRICS, pair)
-
-    rows = [(p, before.get(p.id), after.get(p.id)) for p in truth.pieces]
-    return [
-        {"id": true.id, "initial": of(initial, one, true), "result": of(result, other, true)}
-        for true, one, other in rows
-    ]
-
-
-def _means(objects: list[dict[str, Any]], key: str) -> dict[str, float]:
-    """Means over those objects that have the metric."""
-    values = {n: [item[key][n] for item in objects if n in item[key]] for n in OBJECT_METRICS}
-    return {name: sum(found) / len(found) for name, found in values.items() if found}
 
 
 def _true_touch(

@@ -1,7 +1,12 @@
 """Who is who: the true objects, and what stands for them before and after (docs/metrics.md)."""
 
-from .metrics_scene import match
+from collections.abc import Sequence
+from typing import Any
+
+from .metrics_scene import OBJECT_METRICS, Pair, match, measure, measure_missing
 from .types import Piece, Scene
+
+SIDES = ("initial", "result")
 
 
 def pairs(
@@ -28,3 +33,36 @@ def unmatched(
         "missed": [piece.id for piece in truth.pieces if piece.id not in found],
         "false": [piece.id for piece in result.pieces if piece.id not in partners],
     }
+
+
+def measure_objects(
+    scenes: tuple[Scene, Scene, Scene], sides: Sequence[str], samples: int, by_place: bool
+) -> list[dict[str, Any]]:
+    """Each true object in the initial scene and in the result, as far as they are asked for.
+
+    Args:
+        scenes: The initial one, the result and the truth.
+        sides: Some of `SIDES`.
+        samples: Points on each true surface.
+        by_place: Whether objects that bear no true name are paired by place.
+    """
+    initial, result, truth = scenes
+    found: dict[str, dict[str, Piece]] = dict(
+        zip(SIDES, pairs(initial, result, truth, by_place), strict=True)
+    )
+    there: dict[str, Scene] = dict(zip(SIDES, (initial, result), strict=True))
+
+    def of(side: str, true: Piece) -> dict[str, float]:
+        piece = found[side].get(true.id)
+        if piece is None:
+            return measure_missing(true, truth.camera)
+        pair = Pair(piece, there[side].camera, true, truth.camera, samples)
+        return measure(OBJECT_METRICS, pair)
+
+    return [{"id": true.id} | {side: of(side, true) for side in sides} for true in truth.pieces]
+
+
+def means_of(objects: Sequence[dict[str, Any]], side: str) -> dict[str, float]:
+    """Means over those objects that have the metric."""
+    values = {n: [item[side][n] for item in objects if n in item[side]] for n in OBJECT_METRICS}
+    return {name: sum(found) / len(found) for name, found in values.items() if found}

@@ -4,9 +4,10 @@ import json
 from dataclasses import asdict, replace
 from typing import Any
 
-from ..evaluate import EvaluateConfig, EvaluatedBodies, evaluate
+from ..evaluate import EvaluateConfig, EvaluatedBodies, evaluate, touch_in_truth
 from ..geometry.watertight import close_mesh
 from ..metrics_bodies import POSE_METRICS, gather_twins
+from ..metrics_contact import TrueTouch
 from ..metrics_motion import MOTION_METRICS, gather_gait
 from ..metrics_pairs import unmatched
 from ..metrics_scene import measure as measured
@@ -50,6 +51,13 @@ class Judged:
 
 
 @record
+class Beside:
+    """True people beside the true furniture."""
+
+    touch: TrueTouch | None
+
+
+@record
 class Verdict:
     """The metrics of a scene."""
 
@@ -60,8 +68,14 @@ class Verdict:
 def judge(inputs: Judged, config: EvaluateConfig, observe: Observer = silent) -> Verdict:
     """All metrics of a scene, as a stage: equal scenes of a room are measured once."""
     del observe
-    found = evaluate(inputs.initial, inputs.result, inputs.truth, inputs.bodies, config)
-    return Verdict(json.dumps(found))
+    scenes = inputs.initial, inputs.result, inputs.truth
+    return Verdict(json.dumps(evaluate(*scenes, inputs.bodies, config, ("result",))))
+
+
+def truly(inputs: Judged, config: EvaluateConfig, observe: Observer = silent) -> Beside:
+    """How the true people touch the true room, as a stage: all jobs of a room measure it once."""
+    del observe
+    return Beside(touch_in_truth(inputs.truth, inputs.bodies, config))
 
 
 def measure(
@@ -71,22 +85,25 @@ def measure(
 
     Stage 1 has camera, ground and people of the full method: only the furniture differs.
     """
-    image, full = (
-        _judged(trial, scene, room.bodies, run, densities)
-        for scene in (room.image_only, room.scene)
-    )
-    rows = zip(trial.traits, image["objects"], full["objects"], strict=True)
+    capture = trial.capture
+    asked = {
+        "initial": (capture.scene, capture.bodies),
+        "image": (room.image_only, room.bodies),
+        "full": (room.scene, room.bodies),
+    }
+    found = {
+        name: _judged(trial, scene, people, run, densities)
+        for name, (scene, people) in asked.items()
+    }
     objects = [
         {name: getattr(traits, name) for name in TRAITS}
-        | {"initial": one["initial"], "image": one["result"], "full": other["result"]}
-        for traits, one, other in rows
+        | {name: verdict["objects"][place]["result"] for name, verdict in found.items()}
+        for place, traits in enumerate(trial.traits)
     ]
     return {
-        "initial": full["initial"],
-        "image": image["result"],
-        "full": full["result"],
+        **{name: verdict["result"] for name, verdict in found.items()},
         "objects": objects,
-        "unmatched": unmatched(trial.capture.scene, room.scene, trial.truth, by_place=False),
+        "unmatched": unmatched(capture.scene, room.scene, trial.truth, by_place=False),
         "warnings": list(room.warnings),
     }
 
@@ -103,8 +120,11 @@ def _judged(
     trial: Trial, scene: Scene, people: Bodies | None, run: Run, densities: EvaluateConfig | None
 ) -> dict[str, Any]:
     config = replace(densities or EvaluateConfig(), by_place=False)  # it is known who is who
-    bodies = EvaluatedBodies(trial.capture.bodies, people, trial.bodies)
-    asked = Judged(trial.capture.scene, scene, trial.truth, bodies)
+    given, truth = trial.capture, trial.truth
+    rows = EvaluatedBodies(None, given.bodies, trial.bodies)  # no job loses any of them
+    known = run.stage(truly, Judged(given.scene, truth, truth, rows), config)
+    bodies = EvaluatedBodies(None, people, trial.bodies, known.touch)
+    asked = Judged(given.scene, scene, truth, bodies)
     return json.loads(run.stage(judge, asked, config).text)
 
 
@@ -117,8 +137,9 @@ def seen_from(camera: Camera, room: Room) -> Bodies | None:
 
 def measure_truth(trial: Trial, densities: EvaluateConfig | None = None) -> dict[str, float]:
     """The metrics of the truth itself: people touch and even sink into true furniture, too."""
-    bodies = EvaluatedBodies(trial.bodies, trial.bodies, trial.bodies)
-    return evaluate(trial.truth, trial.truth, trial.truth, bodies, densities)["result"]
+    bodies = EvaluatedBodies(None, trial.bodies, trial.bodies)
+    scenes = trial.truth, trial.truth, trial.truth
+    return evaluate(*scenes, bodies, densities, ("result",))["result"]
 
 
 def measure_people(trial: Trial, room: Room, row: str) -> dict[str, Any]:
@@ -145,7 +166,8 @@ def measure_people(trial: Trial, room: Room, row: str) -> dict[str, Any]:
 
 def timing(stages: list[StageLog]) -> list[dict[str, Any]]:
     """What each stage cost, without the measuring."""
-    return [asdict(stage) for stage in stages if stage.name != judge.__name__]
+    ours = judge.__name__, truly.__name__
+    return [asdict(stage) for stage in stages if stage.name not in ours]
 
 
 def carry_all(room: Room, capture: Capture) -> Room:
