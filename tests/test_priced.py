@@ -20,9 +20,7 @@ from mover.terms.depth import DepthRange
 from mover.types import Layout
 
 pytest.importorskip("warp")
-WEIGHTS = SceneWeights(
-    1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.05, growth=2.5
-)
+WEIGHTS = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.05)
 TERMS = (
     "bbox", "silhouette", "scale", "depth", "collision", "contact", "distance", "heading", "wall"
 )  # fmt: skip
@@ -45,7 +43,7 @@ def room(size=64, names=("chair", "torus", "sofa"), **changes):
     at = Layout(*(getattr(inputs.starts, f.name)[0] for f in fields(Layout)))
     image = replace(
         image_at(objects, at, inputs.camera, size), distance=at.t_world_object.norm(dim=-1),
-        walls=walls_at(objects, at),
+        walls=walls_at(objects, at), growth=2.5,
     )  # fmt: skip
     humans = humans_at(objects, at, inputs.camera, image)
     inputs = replace(inputs, objects=objects, image=image, humans=humans)

@@ -62,8 +62,6 @@ class SceneWeights:
     """Seats face where their sitters face (robust only)."""
     wall: float = 0.0
     """Furniture along a wall stands in one line (robust only)."""
-    growth: float = 1.5
-    """What an object pays for another size as a whole, against another shape (robust only)."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +97,8 @@ class ImageCues:
     """What the masks may be if their outlines are too wide or too narrow; None: they are not."""
     walls: Walls | None = None
     """Lines along which furniture stands; None: none are known."""
+    growth: float = 1.5
+    """Price of another size as a whole, against that of another shape (robust only)."""
 
 
 @record
@@ -135,7 +135,7 @@ def scene_energy(
             image.boxes, image.sides, float(camera.width), form)),
         ("silhouette", w.silhouette, lambda: fitted().silhouette if loose
             else image.trust * silhouette_term(drawn()[0], image.masks, image.keep, form)),
-        ("scale", w.scale, lambda: scale_term(layout.log_scale, form, w.growth)),
+        ("scale", w.scale, lambda: scale_term(layout.log_scale, form, image.growth)),
         ("depth", w.depth, lambda: many.depth * depth_term(
             _known(drawn()[1]), image.masks, _known(humans.depth), form)),
         ("collision", w.collision, lambda: many.collision * collision_term(

@@ -46,7 +46,7 @@ def pricer_of(
     given.lens = wp.vec4(K[0][0], K[1][1], K[0][2], K[1][2])
     given.weights = tuple(getattr(weights, name) for name in TERMS)
     given.soft, given.rho = bbox.SOFT, distance.RHO
-    given.sizes, given.growth = (scale.LOWEST, scale.HIGHEST), weights.growth
+    given.sizes, given.growth = (scale.LOWEST, scale.HIGHEST), image.growth
     views = image.views
     verts, faces, edges = (int(c.max()) for c in counts)
     shifts = 1 if image.borders is None else len(image.borders.shifts)

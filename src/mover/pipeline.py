@@ -66,13 +66,15 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
 
 def _with_sizes(job: Job, view: View) -> Job:
     """The given sizes believed as far as this room's furniture bears them out."""
-    config, layout = job.config, view.placed.layout
+    config = job.config
+    shape, whole = learnt_sizes(view.placed.layout, config.sizes)
     stages = {"layout": config.layout, "refine": config.refine, "place": config.place}
     found = {
-        name: replace(stage, weights=learnt_sizes(stage.weights, layout, config.sizes))
+        name: replace(stage, weights=replace(stage.weights, scale=shape * stage.weights.scale))
         for name, stage in stages.items()
     }
-    return replace(job, config=replace(config, **found))
+    image = replace(config.image, growth=config.image.growth * whole / shape)
+    return replace(job, config=replace(config, image=image, **found))
 
 
 def people_of(capture: Capture, config: Config, run: Run) -> Crew | None:

@@ -11,9 +11,8 @@ independent; then the price of a normal distribution is
 of which v is learnt from the room (empirical Bayes) and w is not.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from ..energy import SceneWeights
 from ..types import Layout
 
 
@@ -31,24 +30,18 @@ class SpreadConfig:
     """The largest spread that is believed, in usual ones; the smallest is 1."""
 
 
-def learnt_sizes(weights: SceneWeights, layout: Layout, config: SpreadConfig) -> SceneWeights:
-    """The weights with the price of sizes that suits this room.
+def learnt_sizes(layout: Layout, config: SpreadConfig) -> tuple[float, float]:
+    """Factors on the price of another shape, and on that of another size as a whole.
 
     Args:
-        weights: With the usual price.
         layout: Where and how large the image alone has the objects, of one start.
         config: What is usual.
     """
     if config.usual <= 0:
-        return weights
+        return 1.0, 1.0
     log_scale, usual = layout.log_scale, config.usual**2
     shape = (log_scale - log_scale.mean(-1, keepdim=True)).square().sum() / 2
     found = (config.known * usual + float(shape)) / (config.known + len(log_scale))
     found = min(max(found, usual), usual * config.most**2)
     together = 3 * config.common**2
-    shape_factor, growth_factor = usual / found, (usual + together) / (found + together)
-    return replace(
-        weights,
-        scale=weights.scale * shape_factor,
-        growth=weights.growth * growth_factor / shape_factor,
-    )
+    return usual / found, (usual + together) / (found + together)
