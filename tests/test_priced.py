@@ -21,6 +21,7 @@ from mover.types import Layout
 
 pytest.importorskip("warp")
 WEIGHTS = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.05)
+GROWTH = 2.5  # not the usual one
 TERMS = (
     "bbox", "silhouette", "scale", "depth", "collision", "contact", "distance", "heading", "wall"
 )  # fmt: skip
@@ -43,7 +44,7 @@ def room(size=64, names=("chair", "torus", "sofa"), **changes):
     at = Layout(*(getattr(inputs.starts, f.name)[0] for f in fields(Layout)))
     image = replace(
         image_at(objects, at, inputs.camera, size), distance=at.t_world_object.norm(dim=-1),
-        walls=walls_at(objects, at), growth=2.5,
+        walls=walls_at(objects, at),
     )  # fmt: skip
     humans = humans_at(objects, at, inputs.camera, image)
     inputs = replace(inputs, objects=objects, image=image, humans=humans)
@@ -58,7 +59,7 @@ def starts_of(inputs, count=3, amount=0.1):
 
 def both(inputs, weights=WEIGHTS):
     """The energy by one kernel, and term by term."""
-    config = SceneConfig(weights, "robust")
+    config = SceneConfig(weights, "robust", GROWTH)
     rest = inputs.objects, inputs.camera, inputs.image, inputs.humans, config
     fast = pricing(*rest)
     assert fast(inputs.starts).whole is not None
@@ -116,7 +117,7 @@ class TestAgreement:
         rest = inputs.objects, inputs.camera, inputs.image, inputs.humans
         fast, layout = both(inputs)[0], starts_of(inputs)
         value, slope = (x.flatten(0, 1) for x in told(fast, layout))
-        some = pricing_rows(*rest, SceneConfig(WEIGHTS, "robust"))
+        some = pricing_rows(*rest, SceneConfig(WEIGHTS, "robust", GROWTH))
         assert some is not None
         for numbers in ([4], [8, 0, 5], [5, 0], list(range(9)), [7, 1, 2, 3]):
             rows = torch.tensor(numbers)

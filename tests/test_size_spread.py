@@ -79,7 +79,7 @@ class Weighing(Run):
     def stage(self, fn, inputs, config):
         weights = getattr(config, "weights", None)
         if isinstance(weights, SceneWeights):
-            self.heard.append((fn.__name__, weights.scale, inputs.image.growth))
+            self.heard.append((fn.__name__, weights.scale, config.growth))
         return super().stage(fn, inputs, config)
 
 

@@ -25,7 +25,7 @@ from .terms.depth import DepthRange, depth_term, free_space_term
 from .terms.distance import distance_term
 from .terms.factors import factors
 from .terms.offscreen import offscreen_term
-from .terms.scale import scale_term
+from .terms.scale import GROWTH, scale_term
 from .terms.silhouette import edge_term, silhouette_term
 from .terms.wall import Walls, wall_term
 from .types import Camera, Layout, Objects
@@ -71,6 +71,8 @@ class SceneConfig:
     weights: SceneWeights = field(default_factory=SceneWeights)
     form: Form = "paper"
     """As printed, as the authors released it, or normalised and robust."""
+    growth: float = GROWTH
+    """Price of another size as a whole, against that of another shape (robust only)."""
 
 
 @record
@@ -97,8 +99,6 @@ class ImageCues:
     """What the masks may be if their outlines are too wide or too narrow; None: they are not."""
     walls: Walls | None = None
     """Lines along which furniture stands; None: none are known."""
-    growth: float = 1.5
-    """Price of another size as a whole, against that of another shape (robust only)."""
 
 
 @record
@@ -135,7 +135,7 @@ def scene_energy(
             image.boxes, image.sides, float(camera.width), form)),
         ("silhouette", w.silhouette, lambda: fitted().silhouette if loose
             else image.trust * silhouette_term(drawn()[0], image.masks, image.keep, form)),
-        ("scale", w.scale, lambda: scale_term(layout.log_scale, form, image.growth)),
+        ("scale", w.scale, lambda: scale_term(layout.log_scale, form, config.growth)),
         ("depth", w.depth, lambda: many.depth * depth_term(
             _known(drawn()[1]), image.masks, _known(humans.depth), form)),
         ("collision", w.collision, lambda: many.collision * collision_term(

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .energy import HumanCues, ImageCues, SceneWeights
+from .energy import HumanCues, ImageCues, SceneConfig, SceneWeights
 from .geometry.kernels.start import started
 from .geometry.nearest_warp import Clouds
 from .geometry.priced_warp import BORDER, Pricer, Room
@@ -25,12 +25,12 @@ TERMS = (
 
 
 def pricer_of(
-    objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, weights: SceneWeights
+    objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
 ) -> Pricer:
     """The kernel of Eq. 1 with all that it needs to know."""
     from .geometry.kernels.given import Given
 
-    wp = started()
+    wp, weights = started(), config.weights
     asked, share, ends = _asked(objects, humans, weights)
     things, counts = _things(objects, ends)
     given = Given()
@@ -46,7 +46,7 @@ def pricer_of(
     given.lens = wp.vec4(K[0][0], K[1][1], K[0][2], K[1][2])
     given.weights = tuple(getattr(weights, name) for name in TERMS)
     given.soft, given.rho = bbox.SOFT, distance.RHO
-    given.sizes, given.growth = (scale.LOWEST, scale.HIGHEST), image.growth
+    given.sizes, given.growth = (scale.LOWEST, scale.HIGHEST), config.growth
     views = image.views
     verts, faces, edges = (int(c.max()) for c in counts)
     shifts = 1 if image.borders is None else len(image.borders.shifts)

@@ -55,7 +55,7 @@ def pricing_rows(
     can = _knows(weights, config.form, humans) and _plain(objects, camera, image, humans)
     if not can or not _closed(objects):
         return None
-    pricer = pricer_of(objects, camera, image, humans, weights)
+    pricer = pricer_of(objects, camera, image, humans, replace(config, weights=weights))
     names = [(k, name) for k, name in enumerate(TERMS) if getattr(weights, name)]
 
     def energy(layout: Layout, rows: Rows | None) -> Energy:

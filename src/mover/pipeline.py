@@ -15,6 +15,7 @@ from .geometry.placement import GROUND, place, stand
 from .outcome import Crew, Job, View, room_of, unfurnished
 from .presets import PRESETS as PRESETS
 from .presets import Config as Config
+from .presets import with_sizes
 from .run import Run as Run
 from .stages.align_camera import AlignInputs, align_camera
 from .stages.assign_touches import TouchInputs, assign_touches
@@ -66,15 +67,8 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
 
 def _with_sizes(job: Job, view: View) -> Job:
     """The given sizes believed as far as this room's furniture bears them out."""
-    config = job.config
-    shape, whole = learnt_sizes(view.placed.layout, config.sizes)
-    stages = {"layout": config.layout, "refine": config.refine, "place": config.place}
-    found = {
-        name: replace(stage, weights=replace(stage.weights, scale=shape * stage.weights.scale))
-        for name, stage in stages.items()
-    }
-    image = replace(config.image, growth=config.image.growth * whole / shape)
-    return replace(job, config=replace(config, image=image, **found))
+    learnt = learnt_sizes(view.placed.layout, job.config.sizes)
+    return replace(job, config=with_sizes(job.config, *learnt))
 
 
 def people_of(capture: Capture, config: Config, run: Run) -> Crew | None:

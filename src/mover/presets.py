@@ -8,6 +8,7 @@
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 from .energy import SceneWeights
 from .minimize import Adam
@@ -152,3 +153,16 @@ def with_methods(config: Config, arguments: Sequence[str]) -> tuple[Config, list
 
 
 PRESETS = {"paper": PAPER, "release": RELEASE, "robust": ROBUST}
+_Pricing = TypeVar("_Pricing", PlaceConfig, RefineConfig)
+
+
+def with_sizes(config: Config, shape: float, whole: float) -> Config:
+    """The price of another shape, and of another size as a whole, multiplied in all stages."""
+
+    def of(stage: _Pricing) -> _Pricing:
+        weights = replace(stage.weights, scale=shape * stage.weights.scale)
+        return replace(stage, weights=weights, growth=stage.growth * whole / shape)
+
+    return replace(
+        config, layout=of(config.layout), refine=of(config.refine), place=of(config.place)
+    )

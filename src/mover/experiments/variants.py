@@ -5,9 +5,9 @@ differs is computed anew.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
-from ..presets import PRESETS, Config
+from ..presets import PRESETS, Config, with_sizes
 from ..stages.align_camera import AlignConfig
 from ..stages.assign_touches import AssignConfig
 from ..stages.size_spread import SpreadConfig
@@ -61,13 +61,7 @@ def weighed(config: Config, **weights: float) -> Config:
 
 def relaxed(config: Config, factor: float = 0.1) -> Config:
     """A weaker prior on the sizes of objects in all stages, the same in all rooms."""
-
-    def of(stage: Any) -> Any:  # noqa: ANN401
-        weights = replace(stage.weights, scale=factor * stage.weights.scale)
-        return replace(stage, weights=weights)
-
-    stages = {name: of(getattr(config, name)) for name in ("layout", "refine", "place")}
-    return replace(config, **stages, sizes=SpreadConfig())
+    return replace(with_sizes(config, factor, factor), sizes=SpreadConfig())
 
 
 def _far(config: Config) -> Config:

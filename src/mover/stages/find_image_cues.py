@@ -33,8 +33,6 @@ class ImageConfig:
     """Share of the strip beyond a side from which on more may be hidden there (`robust`)."""
     borders: tuple[float, ...] = ()
     """By how much outlines of masks may be off, with 0 among them [px of the image] (`robust`)."""
-    growth: float = 1.5
-    """Price of another size as a whole, against that of another shape (`robust`)."""
 
 
 @record
@@ -81,9 +79,8 @@ def find_image_cues(
         zoom = views.K[:, 0, 0] / inputs.camera.K[0, 0]
         borders = borders_of(own, zoom, config.borders)
     return ImageCues(
-        inputs.boxes, sides, views, own, keep, trust, inputs.distance, outline, borders,
-        growth=config.growth,
-    )  # fmt: skip
+        inputs.boxes, sides, views, own, keep, trust, inputs.distance, outline, borders
+    )
 
 
 def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:

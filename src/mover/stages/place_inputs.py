@@ -10,6 +10,7 @@ from ..minimize import Adam
 from ..minimize_newton import Quasi
 from ..records import record
 from ..terms import Form
+from ..terms.scale import GROWTH
 from ..terms.wall import Walls
 from ..types import Camera, Layout, Objects
 from .pinned import Pinned
@@ -50,6 +51,8 @@ class PlaceConfig:
     """Release: scales stay within 1 +- span/2 by a sigmoid; 0: free."""
     chair_span: float = 0.0
     """The same for chairs."""
+    growth: float = GROWTH
+    """Price of another size as a whole, against that of another shape (robust)."""
 
 
 @record

@@ -83,8 +83,13 @@ def starts_left(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = si
 
 def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
     """The energy as a function of layouts whose heights are still to be eliminated."""
-    price = pricing(*_evidence(inputs), SceneConfig(config.weights, config.form))
+    price = pricing(*_evidence(inputs), priced(config))
     return lambda layout: price(_standing(inputs, layout))
+
+
+def priced(config: PlaceConfig) -> SceneConfig:
+    """How the stage prices the room."""
+    return SceneConfig(config.weights, config.form, config.growth)
 
 
 def _evidence(inputs: PlaceInputs) -> tuple[Objects, Camera, ImageCues, HumanCues]:
@@ -148,7 +153,7 @@ def _free_energy(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout],
 def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Problems[Layout]:
     """Each start of each object as a problem of its own; loads belong to their carriers."""
     starts, n = begin.yaw.shape
-    price = pricing_rows(*_evidence(inputs), SceneConfig(config.weights, config.form))
+    price = pricing_rows(*_evidence(inputs), priced(config))
     span = spans_of(inputs.objects, config.span, config.chair_span)
 
     def of(rows: Tensor) -> Callable[[Layout], Energy]:

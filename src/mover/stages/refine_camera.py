@@ -29,6 +29,7 @@ from ..geometry.floor import LOWEST, hit_floor
 from ..geometry.placement import GROUND
 from ..minimize import Adam, Energy, Observer, minimize, silent
 from ..records import record
+from ..terms.scale import GROWTH
 from ..types import Camera, Layout, Objects
 from .fixed_borders import fixed_borders
 
@@ -54,6 +55,8 @@ class RefineConfig:
     """Weight w of what the feet say; each object counts about one."""
     weights: SceneWeights = IMAGE_ONLY
     """Of what the image says."""
+    growth: float = GROWTH
+    """Price of another size as a whole, against that of another shape."""
     method: Adam = field(default_factory=lambda: Adam(400, rate=0.3, last_rate=0.02, beta2=0.98))
 
 
@@ -91,7 +94,7 @@ def refine_camera(
     inputs: RefineInputs, config: RefineConfig, observe: Observer = silent
 ) -> Refined:
     """Minimise over the camera, the ground and all standing objects at once."""
-    image = SceneConfig(config.weights, "robust")
+    image = SceneConfig(config.weights, "robust", config.growth)
     fixed, certainty = _start(inputs), torch.linalg.inv(inputs.covariance)
     cues = fixed_borders(inputs.image, inputs.layout, inputs.objects, inputs.camera, config.weights)
     usable = _usable(inputs)

@@ -55,8 +55,8 @@ def some_image(image: ImageCues, index: Rows) -> ImageCues:
     if borders is not None:
         borders = Borders(borders.shifts, borders.masks[:, index])
     walls = None if image.walls is None else some_walls(image.walls, index)
-    return replace(
-        image, views=views, distance=distance, outline=outline, borders=borders, walls=walls, **rest
+    return ImageCues(
+        views=views, distance=distance, outline=outline, borders=borders, walls=walls, **rest
     )
 
 

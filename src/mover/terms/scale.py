@@ -21,10 +21,11 @@ from ..minimize import safe_norm
 from . import Form
 
 LOWEST, HIGHEST = math.log(0.6), math.log(1.6)
+GROWTH = 1.5  # price of another size as a whole, against that of another shape
 
 
 def scale_term(
-    log_scale: Float[Tensor, "*starts objects 3"], form: Form, growth: float = 1.5
+    log_scale: Float[Tensor, "*starts objects 3"], form: Form, growth: float = GROWTH
 ) -> Float[Tensor, "*starts objects"]:
     """Distance of the size from the initial one [1]; `growth`: price of all three together."""
     if form == "paper":
