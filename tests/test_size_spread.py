@@ -10,7 +10,7 @@ from mover.energy import SceneWeights
 from mover.pipeline import Run, reconstruct
 from mover.presets import PRESETS
 from mover.rooms.noise import NoiseConfig, add_noise
-from mover.stages.size_spread import SpreadConfig, learnt_sizes
+from mover.stages.size_spread import SpreadConfig, believed, learnt_sizes
 from mover.terms.scale import scale_term
 from mover.types import Layout
 
@@ -25,6 +25,11 @@ def layout_of(log_scale: torch.Tensor) -> Layout:
     return Layout(torch.zeros(count, 3), torch.zeros(count), log_scale)
 
 
+def taught(log_scale: torch.Tensor, config: SpreadConfig) -> tuple[float, float]:
+    """What pieces teach whose shapes are all right."""
+    return learnt_sizes(layout_of(log_scale), torch.ones(len(log_scale)), config)
+
+
 def drawn(spread: float, count: int = 4000) -> torch.Tensor:
     """Logarithms of sizes as the model has them: something common, and each its own."""
     r = torch.Generator().manual_seed(7)
@@ -34,7 +39,7 @@ def drawn(spread: float, count: int = 4000) -> torch.Tensor:
 
 @pytest.mark.parametrize("spread", [0.07, 0.1, 0.15])
 def test_the_price_is_that_of_the_normal_distribution_the_room_was_drawn_from(spread: float):
-    shape, whole = learnt_sizes(layout_of(drawn(spread)), CONFIG)
+    shape, whole = taught(drawn(spread), CONFIG)
     within = (torch.rand(50, 3) - 0.5) * 0.6  # no size beyond 0.6 or 1.6
     price = shape * scale_term(within, "robust", GROWTH * whole / shape)
     covariance = spread**2 * torch.eye(3) + COMMON**2 * torch.ones(3, 3)
@@ -44,30 +49,44 @@ def test_the_price_is_that_of_the_normal_distribution_the_room_was_drawn_from(sp
 
 @pytest.mark.parametrize("spread", [0.0, 0.03, 0.065])
 def test_less_than_the_usual_spread_changes_nothing(spread: float):
-    assert learnt_sizes(layout_of(drawn(spread)), CONFIG) == (1, 1)
+    assert taught(drawn(spread), CONFIG) == (1, 1)
 
 
 def test_what_is_common_to_the_sizes_of_a_piece_teaches_nothing():
     whole = 0.4 * torch.randn(30, 1, generator=torch.Generator().manual_seed(0))
-    assert learnt_sizes(layout_of(whole.expand(30, 3)), CONFIG) == (1, 1)
+    assert taught(whole.expand(30, 3), CONFIG) == (1, 1)
 
 
 def test_one_wild_piece_among_few_is_held_by_what_is_usual_and_never_believed_beyond_a_limit():
-    one = layout_of(torch.tensor([[0.3, -0.3, 0.0]]))
-    assert learnt_sizes(one, CONFIG)[0] == pytest.approx(1 / CONFIG.most**2)
+    one = torch.tensor([[0.3, -0.3, 0.0]])
+    assert taught(one, CONFIG)[0] == pytest.approx(1 / CONFIG.most**2)
     found = (4 * USUAL**2 + 0.09) / 5  # 0.3^2 + 0.3^2 of two degrees of freedom
-    held = learnt_sizes(one, replace(CONFIG, known=4.0))
+    held = taught(one, replace(CONFIG, known=4.0))
     assert held[0] == pytest.approx(USUAL**2 / found)
     assert held[1] == pytest.approx((USUAL**2 + 3 * COMMON**2) / (found + 3 * COMMON**2))
 
 
+def test_pieces_whose_silhouettes_cannot_be_made_to_fit_teach_hardly_anything():
+    right = drawn(0.1)
+    wrong = 0.5 * torch.randn(4000, 3, generator=torch.Generator().manual_seed(3))
+    trust = believed(torch.tensor([0.02, 5.0]).repeat_interleave(4000))
+    assert trust.unique().tolist() == pytest.approx([0.1, 1])
+    shape, _ = learnt_sizes(layout_of(torch.cat([right, wrong])), trust, CONFIG)
+    assert USUAL**2 / shape == pytest.approx((0.1**2 + 0.01 * 0.5**2) / 1.01, rel=0.05)
+
+
+def test_a_silhouette_is_believed_less_the_worse_it_can_be_made_to_fit():
+    trust = believed(torch.tensor([0.0, 0.05, 0.1, 0.2, 0.4, 3.0]))
+    torch.testing.assert_close(trust, torch.tensor([1, 1, 1, 0.5, 0.25, 0.1]))
+
+
 def test_the_paper_and_the_release_learn_nothing():
     for name in ("paper", "release"):
-        assert learnt_sizes(layout_of(drawn(0.2, 8)), PRESETS[name].sizes) == (1, 1)
+        assert taught(drawn(0.2, 8), PRESETS[name].sizes) == (1, 1)
 
 
 def test_a_room_without_furniture_has_the_usual_price():
-    assert learnt_sizes(layout_of(torch.zeros(0, 3)), SpreadConfig(0.07)) == (1, 1)
+    assert taught(torch.zeros(0, 3), SpreadConfig(0.07)) == (1, 1)
 
 
 @dataclass(frozen=True)

@@ -39,12 +39,11 @@ from .stages.prepare_objects import PrepareInputs, prepare_objects
 from .stages.refine_camera import RefineInputs, refine_camera
 from .stages.reinitialize import ReinitInputs, by_release, contact_start
 from .stages.select_frames import SelectInputs, select_frames
-from .stages.size_spread import learnt_sizes
+from .stages.size_spread import believed, learnt_sizes
 from .stages.starts import alone, best_few, joined, reference_yaw
 from .types import Camera, Capture, Layout, Room
 
 NOBODY = HumanCues()
-FIT = 0.1  # image energy (robust form) from which on an object's shape is believed less
 
 
 def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...] = ()) -> Room:
@@ -67,7 +66,8 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
 
 def _with_sizes(job: Job, view: View) -> Job:
     """The given sizes believed as far as this room's furniture bears them out."""
-    learnt = learnt_sizes(view.placed.layout, job.config.sizes)
+    placed = view.placed
+    learnt = learnt_sizes(placed.layout, believed(placed.energy[0]), job.config.sizes)
     return replace(job, config=with_sizes(job.config, *learnt))
 
 
@@ -182,7 +182,7 @@ def _place_with(job: Job, view: View, fit: Float[Tensor, " objects"]) -> View:
     image = run.stage(find_image_cues, view.image, config.image)
     humans = cues_in_windows(view.cues, touches, image.views, view.camera)
     if config.trust:
-        image = replace(image, trust=(FIT / fit.clamp_min(1e-6)).clamp(0.1, 1))
+        image = replace(image, trust=believed(fit))
     seats = ReinitInputs(objects, view.camera, humans, image.masks, view.placed.layout)
     starts = alone(run.stage(by_release, seats, config.reinit))
     if config.layout.keep > 1:

@@ -17,6 +17,7 @@ import torch
 
 from .. import __version__, records
 from ..evaluate import EvaluateConfig
+from ..explanation_records import Facts
 from ..minimize import Observer, silent
 from ..pipeline import reconstruct
 from ..rooms import KnownRoom, RoomConfig, add_noise, make_room
@@ -82,10 +83,11 @@ class Job:
 
 @records.record
 class Rebuilt:
-    """The scenes of a job that pictures are drawn from."""
+    """The scenes of a job that pictures are drawn from, and why the objects stand there."""
 
     image: Scene
     full: Scene
+    facts: tuple[Facts, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,8 @@ def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None)
     if variant.bodies:
         found = measure_people(trial, room, variant.bodies)
     else:
-        records.save(Rebuilt(room.image_only, room.scene), job.folder / "scenes")
+        facts = tuple(e.facts for e in room.explanations)
+        records.save(Rebuilt(room.image_only, room.scene, facts), job.folder / "scenes")
         found = measure(trial, room, run, densities)
         if variant.cut is None:  # no table shows it of parts of a video
             found["true_room"] = measure_true_room(trial, room, run, densities)
