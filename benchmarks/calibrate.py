@@ -1,23 +1,19 @@
 """Are stated doubts true? Learns their factors on some known rooms, and tests them on others.
 
-    python benchmarks/calibrate.py --learn 100-117 --check 118-129 --out calibration --write
+    python benchmarks/calibrate.py --learn 100-117 --check 118-129 --write
 
-rebuilds the rooms with true meshes and with wrong ones (the sets `rooms` and `wrong-shape`; what is
-finished is kept in `--out`), prints how many true values the 90 % ranges hold, how wide they are
-and whether their widths rank with the errors, in each room learnt on with what the others teach and
-in those to check, and with `--write` replaces `src/mover/assets/calibration.json`. Rooms 0-9 and
-from 1000 on are for results: nothing is learnt on them. `--learn "" --check 1000-1029` tests what
-the package holds on the held-out rooms.
+rebuilds the rooms with true meshes and with wrong ones (`mover experiment` on the sets `rooms` and
+`wrong-shape`; jobs that are finished in `--out` are not done again), prints how many true values
+the 90 % ranges hold, how wide they are and whether their widths rank with the errors, in each room
+learnt on with what the others teach and in those to check, and with `--write` replaces
+`src/mover/assets/calibration.json`. Rooms 0-9 and from 1000 on are for results: nothing is learnt
+on them. `--learn "" --check 1000-1029` tests what the package holds on the held-out rooms.
 """
 
 import argparse
 import json
-import os
-import subprocess
-import sys
-import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,17 +33,22 @@ from mover.calibration import (
     calibration_of,
     learn_factor,
 )
-from mover.experiments.run import parse_seeds
-from mover.experiments.sets import SETS
+from mover.experiments.job import Job, Rebuilt
+from mover.experiments.measures import Trial
+from mover.experiments.run import ExperimentArgs, parse_seeds, run_experiment
 from mover.explanation import LEVEL, explain, held, offs, ways_of, width
 from mover.explanation_records import Explanation, Facts
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import wrap
-from mover.pipeline import PRESETS, Run, reconstruct
-from mover.rooms import add_noise, make_room
+from mover.pipeline import PRESETS
+from mover.progress import Bar
 from mover.types import Piece, Scene
 
 USED = ("rooms", "wrong-shape")  # true meshes, and meshes of other pieces
+HEAD = (
+    "| | values | held by 90 % ranges | median width | best constant width | Spearman |",
+    "| --- | --: | --: | --: | --: | --: |",
+)
 ASSET = Path(__file__).parents[1] / "src" / "mover" / "assets" / "calibration.json"
 
 
@@ -67,24 +68,12 @@ def _row(facts: Facts, ours: Piece, true: Piece) -> Float[Tensor, "7"]:
     return torch.cat([base, yaw[None], size])
 
 
-def rebuild(name: str, seed: int, preset: str, folder: Path) -> None:
-    """Rebuild one room of a set and keep what was stated and what is true."""
-    torch.set_num_threads(1)
-    known = make_room(seed, SETS[name].room)
-    capture = add_noise(known, SETS[name].noise, seed)
-    with tempfile.TemporaryDirectory() as work:
-        room = reconstruct(capture, PRESETS[preset], Run(Path(work)))
-    facts = tuple(e.facts for e in room.explanations)
-    records.save(judged(facts, room.scene, known.truth), folder / f"{preset}_{name}_{seed}")
-
-
 def table(rooms: list[Judged], calibrations: Sequence[Calibration]) -> str:
     """Coverage, width and rank, by kind of unknown; each room with a calibration."""
     pairs = zip(rooms, calibrations, strict=True)
     told = tuple(e for room, known in pairs for e in explain(room.facts, known))
     truth = torch.cat([room.truth for room in rooms])
-    head = f"{'':8} {'values':>7} {'held':>7} {'width':>8} {'best constant':>14} {'Spearman':>9}"
-    return "\n".join([head, *(_line(kind, told, truth) for kind in GROWING)])
+    return "\n".join([*HEAD, *(_line(kind, told, truth) for kind in GROWING)])
 
 
 def _line(kind: str, told: tuple[Explanation, ...], truth: Float[Tensor, "objects 7"]) -> str:
@@ -98,38 +87,33 @@ def _line(kind: str, told: tuple[Explanation, ...], truth: Float[Tensor, "object
     errors = np.array([offs(*row)[0] for row in rows])
     constant = 2 * learn_factor(errors.tolist(), LEVEL)
     rank = float(spearmanr(widths, errors)[0])
-    return (
-        f"{kind:8} {len(rows):7} {hold:7.1%} {np.median(widths):8.3f} {constant:14.3f} {rank:9.2f}"
-    )
+    cells = kind, len(rows), f"{hold:.1%}", f"{np.median(widths):.3f}", f"{constant:.3f}"
+    return "| " + " | ".join(map(str, cells)) + f" | {rank:.2f} |"
 
 
-def finished(seeds: tuple[int, ...], args: argparse.Namespace) -> list[list[Judged]]:
-    """The judged rooms of each set, seed by seed.
+def finished(seeds: tuple[int, ...], asked: ExperimentArgs) -> list[list[Judged]]:
+    """The judged rooms of each set, seed by seed; jobs that are not finished are done first."""
+    (preset,) = asked.presets
+    with Bar() as bar:
+        for name in USED:
+            run_experiment(replace(asked, seeds=",".join(map(str, seeds)), set=name), bar)
+    return [[of_job(Job(name, s, preset, asked.out)) for name in USED] for s in seeds]
 
-    Those that are not in the folder are made, each by a process of its own.
-    """
-    named = {(name, s): args.out / f"{args.preset}_{name}_{s}" for s in seeds for name in USED}
-    missing = [key for key, path in named.items() if not path.with_suffix(".json").exists()]
-    single = {**os.environ, "OMP_NUM_THREADS": "1"}
 
-    def make(key: tuple[str, int]) -> None:
-        command = [sys.executable, __file__, "--one", key[0], str(key[1])]
-        command += ["--preset", args.preset, "--out", str(args.out)]
-        subprocess.run(command, env=single, check=True)
-
-    with ThreadPoolExecutor(args.workers) as pool:
-        list(pool.map(make, missing))
-    return [[records.load(Judged, named[name, s]) for name in USED] for s in seeds]
+def of_job(job: Job) -> Judged:
+    """What a finished job stated, and the truth of its room."""
+    rebuilt = records.load(Rebuilt, job.folder / "scenes")
+    return judged(rebuilt.facts, rebuilt.full, records.load(Trial, job.room).truth)
 
 
 def tables(groups: list[list[Judged]], calibrations: Sequence[Calibration]) -> str:
     """A table for each set, and one for all; each seed with a calibration."""
     parts: list[str] = []
     for k, name in enumerate(USED):
-        parts += [name, table([group[k] for group in groups], calibrations)]
+        parts += [f"## {name}", table([group[k] for group in groups], calibrations)]
     flat = [room for group in groups for room in group]
-    parts += ["both", table(flat, [c for c in calibrations for _ in USED])]
-    return "\n".join(parts)
+    parts += ["## Both", table(flat, [c for c in calibrations for _ in USED])]
+    return "\n\n".join(parts)
 
 
 def learnable(text: str) -> tuple[int, ...]:
@@ -146,18 +130,16 @@ def main() -> None:
     parser.add_argument("--learn", default="100-117", help="rooms to learn on; '' takes the asset")
     parser.add_argument("--check", default="", help="rooms to test on")
     parser.add_argument("--preset", default="robust")
-    parser.add_argument("--out", type=Path, default=Path("calibration"))
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("experiments"))
+    parser.add_argument("--workers", type=int, default=0)
+    parser.add_argument("--keep", action="store_true", help="take what other versions finished")
     parser.add_argument("--write", action="store_true", help="replace the package's factors")
-    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.one is not None:
-        rebuild(args.one[0], int(args.one[1]), args.preset, args.out)
-        return
+    asked = ExperimentArgs("", (args.preset,), args.out, args.workers, keep=args.keep)
     form = PRESETS[args.preset].place.form
     calibration = calibration_of(form)
     if args.learn:
-        groups = finished(learnable(args.learn), args)
+        groups = finished(learnable(args.learn), asked)
         calibration = learn([room for group in groups for room in group])
         print(f"learnt on {args.learn}: {calibration}")
         if len(groups) > 2:
@@ -165,7 +147,7 @@ def main() -> None:
             print(tables(groups, in_turn(groups)))
     if args.check:
         print(f"\ntested on {args.check}")
-        groups = finished(parse_seeds(args.check), args)
+        groups = finished(parse_seeds(args.check), asked)
         print(tables(groups, [calibration] * len(groups)))
     if args.write:
         write(form, calibration, args.learn)

@@ -13,7 +13,10 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from mover.experiments.run import ExperimentArgs, run_experiment
+from calibrate import finished, tables
+
+from mover.calibration import calibration_of
+from mover.experiments.run import ExperimentArgs, parse_seeds, run_experiment
 from mover.experiments.study import StudyArgs, run_study
 from mover.progress import Bar
 
@@ -29,7 +32,7 @@ STUDIES = (
     StudyArgs("video-length", "", "1000-1001"),
     StudyArgs("interactions", "", "1000-1001"),
     StudyArgs("sensitivity", "", "1000-1003"),
-    StudyArgs("sensitivity", "", "1000-1011", errors=("scale",)),
+    StudyArgs("sensitivity", "", "1000-1029", errors=("scale",)),
     StudyArgs("bodies", "", "1000-1007"),
     StudyArgs("time", "", "1000-1003", workers=1),
     StudyArgs("sets", "two", "1000-1003", ROBUST),
@@ -41,6 +44,8 @@ PAGES = (
     ExperimentArgs("1000-1011", ROBUST, set="wrong-shape"),
 )
 """The same jobs object by object, with the worst as pictures."""
+DOUBTS = ExperimentArgs("1000-1029", ROBUST)
+"""Rooms on which the stated doubts are tested, with true meshes and with wrong ones."""
 
 
 def main() -> None:
@@ -63,6 +68,19 @@ def main() -> None:
             with Bar() as bar:
                 page = run_experiment(replace(asked, out=args.out, keep=args.keep), bar)
             told([page], begun, args.write)
+        begun = time.monotonic()
+        told([doubts(replace(DOUBTS, out=args.out, keep=args.keep))], begun, args.write)
+
+
+def doubts(asked: ExperimentArgs) -> Path:
+    """Write the page that says how true the stated doubts are."""
+    groups = finished(parse_seeds(asked.seeds), asked)
+    command = f'python benchmarks/calibrate.py --learn "" --check {asked.seeds}'
+    about = f"# Stated doubts\n\n    {command}\n\nWidths in metres, radians and shares of a size."
+    page = asked.out / "studies" / "doubts" / "summary.md"
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text(f"{about}\n\n{tables(groups, [calibration_of('robust')] * len(groups))}\n")
+    return page
 
 
 def told(pages: list[Path], begun: float, write: bool) -> None:
