@@ -12,7 +12,9 @@ on them. `--learn "" --check 1000-1029` tests what the package holds on the held
 
 import argparse
 import json
+import os
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,8 +35,8 @@ from mover.calibration import (
     calibration_of,
     learn_factor,
 )
+from mover.experiments.changes import set_named
 from mover.experiments.job import Job, Rebuilt
-from mover.experiments.measures import Trial
 from mover.experiments.run import ExperimentArgs, parse_seeds, run_experiment
 from mover.explanation import LEVEL, explain, held, offs, ways_of, width
 from mover.explanation_records import Explanation, Facts
@@ -42,6 +44,7 @@ from mover.geometry.boxes import box_of
 from mover.geometry.rotations import wrap
 from mover.pipeline import PRESETS
 from mover.progress import Bar
+from mover.rooms import make_room
 from mover.types import Piece, Scene
 
 USED = ("rooms", "wrong-shape")  # true meshes, and meshes of other pieces
@@ -97,13 +100,22 @@ def finished(seeds: tuple[int, ...], asked: ExperimentArgs) -> list[list[Judged]
     with Bar() as bar:
         for name in USED:
             run_experiment(replace(asked, seeds=",".join(map(str, seeds)), set=name), bar)
-    return [[of_job(Job(name, s, preset, asked.out)) for name in USED] for s in seeds]
+    with ProcessPoolExecutor(asked.workers or os.cpu_count()) as pool:
+        truths = list(pool.map(truth_of, seeds))
+    pairs = list(zip(seeds, truths, strict=True))
+    return [[of_job(Job(n, s, preset, asked.out), truth) for n in USED] for s, truth in pairs]
 
 
-def of_job(job: Job) -> Judged:
-    """What a finished job stated, and the truth of its room."""
+def truth_of(seed: int) -> Scene:
+    """The true furniture of a room, the same in all of `USED`."""
+    torch.set_num_threads(1)
+    return make_room(seed, set_named(USED[0]).room).truth
+
+
+def of_job(job: Job, truth: Scene) -> Judged:
+    """What a finished job stated, and the truth."""
     rebuilt = records.load(Rebuilt, job.folder / "scenes")
-    return judged(rebuilt.facts, rebuilt.full, records.load(Trial, job.room).truth)
+    return judged(rebuilt.facts, rebuilt.full, truth)
 
 
 def tables(groups: list[list[Judged]], calibrations: Sequence[Calibration]) -> str:
