@@ -2,8 +2,8 @@
 
     python benchmarks/calibrate.py --learn 100-117 --check 118-129 --write
 
-rebuilds the rooms with true meshes and with wrong ones (`mover experiment` on the sets `rooms` and
-`wrong-shape`; jobs that are finished in `--out` are not done again), prints how many true values
+rebuilds the rooms with true meshes and with wrong ones (jobs of `mover experiment` on the sets
+`rooms` and `wrong-shape`; what is finished in `--out` is not done again), prints how many values
 the 90 % ranges hold, how wide they are and whether their widths rank with the errors, in each room
 learnt on with what the others teach and in those to check, and with `--write` replaces
 `src/mover/assets/calibration.json`. Rooms 0-9 and from 1000 on are for results: nothing is learnt
@@ -13,9 +13,9 @@ on them. `--learn "" --check 1000-1029` tests what the package holds on the held
 import argparse
 import json
 import os
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,14 +36,14 @@ from mover.calibration import (
     learn_factor,
 )
 from mover.experiments.changes import set_named
-from mover.experiments.job import Job, Rebuilt
-from mover.experiments.run import ExperimentArgs, parse_seeds, run_experiment
+from mover.experiments.job import ROOM, Job, Rebuilt
+from mover.experiments.queue import open_jobs, run_all, start
+from mover.experiments.run import ExperimentArgs, parse_seeds
 from mover.explanation import LEVEL, explain, held, offs, ways_of, width
 from mover.explanation_records import Explanation, Facts
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import wrap
 from mover.pipeline import PRESETS
-from mover.progress import Bar
 from mover.rooms import make_room
 from mover.types import Piece, Scene
 
@@ -97,10 +97,11 @@ def _line(kind: str, told: tuple[Explanation, ...], truth: Float[Tensor, "object
 def finished(seeds: tuple[int, ...], asked: ExperimentArgs) -> list[list[Judged]]:
     """The judged rooms of each set, seed by seed; jobs that are not finished are done first."""
     (preset,) = asked.presets
-    with Bar() as bar:
-        for name in USED:
-            run_experiment(replace(asked, seeds=",".join(map(str, seeds)), set=name), bar)
-    with ProcessPoolExecutor(asked.workers or os.cpu_count()) as pool:
+    workers = asked.workers or os.cpu_count() or 1
+    jobs = [Job(n, s, job, asked.out) for s in seeds for n in USED for job in (ROOM, preset)]
+    for job in run_all(open_jobs(jobs, asked.keep), workers, start, store=False):
+        print(f"{job.rooms} {job.seed}: {job.name}", file=sys.stderr)
+    with ProcessPoolExecutor(workers) as pool:
         truths = list(pool.map(truth_of, seeds))
     pairs = list(zip(seeds, truths, strict=True))
     return [[of_job(Job(n, s, preset, asked.out), truth) for n in USED] for s, truth in pairs]
