@@ -41,7 +41,7 @@ STUDIES = (
 """What is shown: studies, sets, and as many held-out rooms as two cores do in some hours."""
 PAGES = (
     ExperimentArgs("1000-1029"),
-    ExperimentArgs("1000-1011", ROBUST, set="wrong-shape"),
+    ExperimentArgs("1000-1029", ROBUST, set="wrong-shape"),
 )
 """The same jobs object by object, with the worst as pictures."""
 DOUBTS = ExperimentArgs("1000-1029", ROBUST)
