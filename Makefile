@@ -1,4 +1,5 @@
-# make demo | make test | make check: each works on a fresh machine with Python >= 3.11 and make.
+# make demo | make test | make test-all | make check: each works on a fresh machine with Python >= 3.11
+# and make.
 PYTHON ?= python3
 # Where torch comes from. Installed first and pinned, so that nothing else chooses a build.
 # Another build:  make demo TORCH="torch --index-url URL"
@@ -8,16 +9,21 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 JOBS ?= 2
 
-.PHONY: demo test long check lint docs tables clean
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q
+EXTRA := slow or browser or docs or long
+
+.PHONY: demo test test-rest test-all check lint docs tables clean
 
 demo: $(VENV)/.installed
 	$(BIN)/mover demo --out demo
 
 test: $(VENV)/.developed
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) -m "not gpu and not licensed and not long"
+	$(PYTEST) -n $(JOBS) -m "not ($(EXTRA)) and not gpu and not licensed"
 
-long: $(VENV)/.developed
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m long
+test-rest: $(VENV)/.developed
+	$(PYTEST) -n $(JOBS) -m "($(EXTRA)) and not gpu and not licensed"
+
+test-all: test test-rest
 
 check: lint test
 

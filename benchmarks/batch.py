@@ -16,8 +16,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from mover.batch import BatchPlan, captures_in, run_batch
-from mover.batch_engines import EngineOptions, SlurmOptions
+from mover.app.batch import BatchPlan, captures_in, run_batch
+from mover.app.batch.engines import EngineOptions, SlurmOptions
 
 EMPTY = """
 import sys

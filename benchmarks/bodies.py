@@ -19,16 +19,19 @@ from pathlib import Path
 
 import torch
 
-from mover.bodies.thinned import pose_rows
+from mover.bodies.smpl_model import pose_rows
+from mover.core.run import Run
+from mover.core.types import Bodies, Capture, Room, Scene
+from mover.evaluate.bodies import gather_twins, p_pje, p_v2v, pje, v2v
 from mover.geometry.watertight import close_mesh
-from mover.metrics_bodies import gather_twins, p_pje, p_v2v, pje, v2v
-from mover.outcome import carried
-from mover.pipeline import PRESETS, Run, reconstruct
-from mover.rooms.noise import add_noise
-from mover.rooms.noise_config import NoiseConfig
-from mover.rooms.room import make_room
-from mover.stages.refine_bodies import ABLATION, RefineBodiesConfig, refine_bodies
-from mover.types import Bodies, Capture, Room, Scene
+from mover.pipeline.outcome import to_world
+from mover.pipeline.presets import PRESETS
+from mover.pipeline.reconstruct import reconstruct
+from mover.stages.config import RefineBodiesConfig
+from mover.stages.people.refine_bodies import ABLATION, refine_bodies
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.room import make_room
 
 METRICS = (pje, v2v, p_pje, p_v2v)
 GIVEN, FOUND = "as given", "as found"
@@ -46,7 +49,7 @@ def rooms_of(seed: int, place: float) -> tuple[Capture, Bodies, Room, Room]:
     draw = torch.Generator().manual_seed(seed)
     pieces = tuple(
         dataclasses.replace(p, t_world_object=p.t_world_object + place * _flat(draw))
-        for p in known.truth.pieces
+        for p in known.truth.objects
     )
     proxies = tuple(close_mesh(p.mesh) for p in pieces)
     assert capture.bodies is not None
@@ -54,10 +57,10 @@ def rooms_of(seed: int, place: float) -> tuple[Capture, Bodies, Room, Room]:
     for camera in (capture.scene.camera, known.truth.camera):
         scene = Scene(camera, known.truth.ground, pieces)
         found.append(
-            Room(scene, capture.scene, scene, carried(capture.bodies, camera), None, proxies, (),
+            Room(scene, capture.scene, scene, to_world(capture.bodies, camera), None, proxies, (),
                  None, {}, ())
         )  # fmt: skip
-    return capture, carried(known.bodies, known.truth.camera), found[0], found[1]
+    return capture, to_world(known.bodies, known.truth.camera), found[0], found[1]
 
 
 def _flat(draw: torch.Generator) -> torch.Tensor:

@@ -6,7 +6,7 @@ rebuilds the rooms with true meshes and with wrong ones (jobs of `mover experime
 `rooms` and `wrong-shape`; what is finished in `--out` is not done again), prints how many values
 the 90 % ranges hold, how wide they are and whether their widths rank with the errors, in each room
 learnt on with what the others teach and in those to check, and with `--write` replaces
-`src/mover/assets/calibration.json`. Rooms 0-9 and from 1000 on are for results: nothing is learnt
+`src/mover/evaluate/calibration.json`. Rooms 0-9 and from 1000 on are for results: nothing is learnt
 on them. `--learn "" --check 1000-1029` tests what the package holds on the held-out rooms.
 """
 
@@ -20,49 +20,50 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from calibrate_learn import Judged, in_turn, learn
+from calibrate_learn import Judged, held, in_turn, learn, learn_factor, offs, width
 from jaxtyping import Float
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from mover import records
-from mover.calibration import (
+from mover.core import records
+from mover.core.explanation import Explanation, Facts
+from mover.core.files import replacing
+from mover.core.types import Scene, SceneObject
+from mover.evaluate.calibration import (
     FORMAT,
     GROWING,
     KIND_OF,
     VERSION,
     Calibration,
     calibration_of,
-    learn_factor,
 )
-from mover.experiments.changes import set_named
-from mover.experiments.job import ROOM, Job, Rebuilt
-from mover.experiments.queue import open_jobs, run_all, start
-from mover.experiments.run import ExperimentArgs, parse_seeds
-from mover.explanation import LEVEL, explain, held, offs, ways_of, width
-from mover.explanation_records import Explanation, Facts
+from mover.evaluate.explanation import LEVEL, explain, ways_of
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import wrap
-from mover.pipeline import PRESETS
-from mover.rooms import make_room
-from mover.types import Piece, Scene
+from mover.pipeline.presets import PRESETS
+from mover_bench.rooms.room import make_room
+from mover_bench.studies.args import ExperimentArgs
+from mover_bench.studies.job import ROOM, Job, Rebuilt
+from mover_bench.studies.queue import open_jobs, run_all, start
+from mover_bench.studies.run import parse_seeds
+from mover_bench.studies.sets import set_named
 
 USED = ("rooms", "wrong-shape")  # true meshes, and meshes of other pieces
 HEAD = (
     "| | values | held by 90 % ranges | median width | best constant width | Spearman |",
     "| --- | --: | --: | --: | --: | --: |",
 )
-ASSET = Path(__file__).parents[1] / "src" / "mover" / "assets" / "calibration.json"
+ASSET = Path(__file__).parents[1] / "src" / "mover" / "evaluate" / "calibration.json"
 
 
 def judged(facts: tuple[Facts, ...], result: Scene, truth: Scene) -> Judged:
     """The true unknowns beside the stated ones: each scene in its own upright world."""
-    true = {piece.id: piece for piece in truth.pieces}
-    rows = [_row(f, p, true[p.id]) for f, p in zip(facts, result.pieces, strict=True)]
+    true = {piece.id: piece for piece in truth.objects}
+    rows = [_row(f, p, true[p.id]) for f, p in zip(facts, result.objects, strict=True)]
     return Judged(facts, torch.stack(rows))
 
 
-def _row(facts: Facts, ours: Piece, true: Piece) -> Float[Tensor, "7"]:
+def _row(facts: Facts, ours: SceneObject, true: SceneObject) -> Float[Tensor, "7"]:
     a, b = box_of(ours), box_of(true)
     base = b.center.double()
     base[1] -= b.size[1].double() / 2
@@ -175,7 +176,7 @@ def write(form: str, calibration: Calibration, seeds: str) -> None:
         "share": round(calibration.share, 4),
         "command": f"python benchmarks/calibrate.py --learn {seeds} --write",
     }
-    with records.replacing(ASSET) as part:
+    with replacing(ASSET) as part:
         part.write_text(json.dumps(tree, indent=1) + "\n")
 
 

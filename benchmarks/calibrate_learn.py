@@ -1,30 +1,30 @@
 """What `calibrate.py` learns from rooms with known truth."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mover.calibration import (
-    GROWING,
-    KIND_OF,
-    Calibration,
-    growth,
-    learn_factor,
-    learn_share,
-    surprise,
-)
-from mover.explanation import LEVEL, explain, offs, ways_of
-from mover.explanation_records import Explanation, Facts
-from mover.explanation_words import NORMAL
+from mover.core.explanation import UNKNOWNS, Explanation, Facts
+from mover.core.records import record
+from mover.evaluate.calibration import GROWING, KIND_OF, Calibration, growth
+from mover.evaluate.explanation import LEVEL, NORMAL, explain, ways_of
 from mover.geometry.rotations import wrap
-from mover.records import record
-from mover.stages.starts import MOVED, TURNED
+from mover.stages.objects.starts import MOVED, TURNED
 
 POWERS = tuple(0.25 * k for k in range(13))  # of the misfit, that are tried
 ROLLS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.13, 0.09, 0.06, 0.04, 0.03, 0.02, 0.01, 0.0)
 """Shares of the floor's factor that are tried for the roll."""
+SHARES = tuple(0.01 * 1.2**k for k in range(30))  # weights that are tried
+SCALES = tuple(1e-3 * 1.1**k for k in range(100))  # factors that are tried for likelihoods
+COUNTS = 0.1  # alternatives from this probability on belong to what holds 90 %
+YAW = UNKNOWNS.index("yaw")
+
+Way = Float[Tensor, "7"]
+"""A direction in the space of the unknowns, of length one."""
 
 
 @record
@@ -112,3 +112,89 @@ def in_turn(groups: list[list[Judged]]) -> list[Calibration]:
     """For each group of rooms what is learnt on all others."""
     rest = (groups[:k] + groups[k + 1 :] for k in range(len(groups)))
     return [learn([room for group in some for room in group]) for some in rest]
+
+
+def learn_factor(needed: Sequence[float], level: float) -> float:
+    """The factor with which intervals hold a share `level` of errors (split conformal prediction).
+
+    Args:
+        needed: For each error the least factor with which its interval holds it.
+        level: The probability that an interval holds.
+
+    Raises:
+        ValueError: If there are too few errors for that probability.
+    """
+    rank = math.ceil(level * (len(needed) + 1) - 1e-9)
+    if rank > len(needed):
+        raise ValueError(f"learn_factor: {len(needed)} errors are too few for {level:.0%}")
+    return sorted(needed)[rank - 1]
+
+
+def surprise(
+    own: Float[Tensor, " errors"], rest: Float[Tensor, " errors"], errors: Float[Tensor, " errors"]
+) -> float:
+    """How unlikely errors are whose variances are said to be `own` times some factor plus `rest`.
+
+    Errors count as Student's t with two degrees of freedom: a wrong yaw is as wrong as can be, and
+    must not decide alone. The factor is the one with which they are likeliest.
+    """
+    square = torch.tensor(SCALES, dtype=torch.float64).square()[:, None] * own + rest
+    square = square.clamp_min(1e-12)
+    each = square.log() / 2 + 1.5 * (1 + errors.square() / square / 2).log()
+    return float(each.sum(1).min())
+
+
+def learn_share(cases: Sequence[tuple[Sequence[float], int]]) -> float:
+    """The weight of alternatives under which it was likeliest that the true ones were true.
+
+    Args:
+        cases: For each object the rises of its alternatives, and which one is nearest to the
+            truth, counted from 1; 0: the result itself. Objects without alternatives say nothing.
+    """
+    told = [(rises, true) for rises, true in cases if rises]
+
+    def unlikely(share: float) -> float:
+        total = 0.0
+        for rises, true in told:
+            weights = [1.0, *(share * math.exp(-max(r, 0.0)) for r in rises)]
+            total -= math.log(weights[true] / sum(weights))
+        return total
+
+    return min(SHARES, key=unlikely) if told else 1.0
+
+
+def spread_along(explanation: Explanation, way: Way) -> float:
+    """Spread about the result in one direction."""
+    return float((way @ explanation.covariance @ way).clamp_min(0).sqrt())
+
+
+def held(explanation: Explanation, way: Way, truth: Float[Tensor, "7"]) -> bool:
+    """Whether a range holds the truth in one direction, about the result or an alternative."""
+    return min(offs(explanation, way, truth)) <= NORMAL * spread_along(explanation, way)
+
+
+def offs(explanation: Explanation, way: Way, truth: Float[Tensor, "7"]) -> list[float]:
+    """Distance of the truth in one direction from the result and each likely alternative."""
+    likely = [o.place for o in explanation.others if o.probability >= COUNTS]
+    return [
+        abs(float(_between(place, truth) @ way)) for place in (explanation.facts.place, *likely)
+    ]
+
+
+def width(explanation: Explanation, way: Way) -> float:
+    """Full width of what holds 90 % in one direction: overlaps count once."""
+    half = NORMAL * spread_along(explanation, way)
+    likely = [o.place for o in explanation.others if o.probability >= COUNTS]
+    middles = [0.0, *(float(_between(explanation.facts.place, p) @ way) for p in likely)]
+    total, reach = 0.0, -math.inf
+    for middle in sorted(middles):
+        total += max(0.0, middle + half - max(middle - half, reach))
+        reach = max(reach, middle + half)
+    return min(total, 2 * math.pi) if bool(way[YAW] != 0) else total
+
+
+def _between(start: Float[Tensor, "7"], end: Float[Tensor, "7"]) -> Float[Tensor, "7"]:
+    """From one place to another, the shorter way round."""
+    off = end.double() - start.double()
+    off[YAW] = wrap(off[YAW])
+    return off

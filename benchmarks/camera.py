@@ -3,9 +3,9 @@
     PYTHONPATH=src python benchmarks/camera.py --seeds 100-111 --out camera
 
 Makes the rooms (finished ones are kept in `--out`) and prints for each, and on average, the errors
-of `robust` before any object is looked at, with feet at rest only (`--soles.speed 0.2`) and as
-the preset has it, and the error of a focal length that is looked for, given the true one and one
-that is 4 % too long. Rooms 0-9 and from 1000 on are for results and never used.
+of `robust` before any object is looked at, with feet at rest only (`--foot_contacts.speed 0.2`)
+and as the preset has it, and the error of a focal length that is looked for, given the true one and
+one that is 4 % too long. Rooms 0-9 and from 1000 on are for results and never used.
 """
 
 import argparse
@@ -15,17 +15,17 @@ from pathlib import Path
 
 import torch
 
-from mover.experiments.job import noisy_room
-from mover.experiments.measures import Trial
-from mover.experiments.run import parse_seeds
-from mover.experiments.sets import SETS
+from mover.core.run import Run
 from mover.geometry.camera import pitch_roll
-from mover.pipeline import people_of
-from mover.presets import ROBUST, Config
-from mover.run import Run
-from mover.stages.find_focal import Focal, zoomed
+from mover.pipeline.presets import ROBUST, Config
+from mover.pipeline.reconstruct import people_of
+from mover.stages.camera.find_focal import Focal, zoomed
+from mover_bench.studies.job import noisy_room
+from mover_bench.studies.measures import Trial
+from mover_bench.studies.run import parse_seeds
+from mover_bench.studies.sets import SETS
 
-STRICT = replace(ROBUST, soles=replace(ROBUST.soles, speed=0.2))
+STRICT = replace(ROBUST, foot_contacts=replace(ROBUST.foot_contacts, speed=0.2))
 GUESSED = replace(ROBUST, focal=replace(ROBUST.focal, spread=0.05))
 LONGER = 1.04
 

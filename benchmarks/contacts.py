@@ -14,17 +14,17 @@ from collections import defaultdict
 import torch
 from torch import Tensor
 
+from mover.bodies.corrected import in_world
 from mover.bodies.parts import members, parts_of
-from mover.bodies.touch import touching
-from mover.bodies.world import in_world
-from mover.geometry.placement import place_piece
+from mover.bodies.posture import touching
+from mover.core.types import Mesh
+from mover.evaluate.bodies import shared_rows
+from mover.evaluate.contact import nearness
+from mover.geometry.placement import place_object
 from mover.geometry.watertight import close_mesh
-from mover.metrics_bodies import shared_rows
-from mover.metrics_contact import nearness
-from mover.rooms.noise import add_noise
-from mover.rooms.noise_config import NoiseConfig
-from mover.rooms.room import make_room
-from mover.types import Mesh
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.room import make_room
 
 PARTS = {
     "soles": ("left_sole", "right_sole"),
@@ -43,7 +43,7 @@ def add(counts: Counts, seed: int) -> None:
     noisy = add_noise(room, NoiseConfig(), seed + 1000).bodies
     assert noisy is not None
     true_world = in_world(room.bodies, room.truth.camera)
-    furniture = [place_piece(p) for p in room.truth.pieces]
+    furniture = [place_object(p) for p in room.truth.objects]
     closed = [close_mesh(Mesh(f.verts, f.faces)) for f in furniture]
     close = nearness(true_world.verts, closed, REACH).surface
     close = torch.minimum(close, (true_world.verts[..., 1] - room.truth.ground).abs()) <= REACH

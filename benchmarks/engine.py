@@ -1,4 +1,4 @@
-"""How long the rasterisers take: PYTHONPATH=src python benchmarks/engine.py.
+"""How long the rasterisers take: PYTHONPATH=src:tests python benchmarks/engine.py.
 
 Ten pieces of furniture in square windows are drawn (silhouette, first and last depth), and the
 gradient of a price is taken back to the vertices. The price has the shape of Eq. 1: squared
@@ -16,16 +16,17 @@ import fast_simplification
 import igl
 import numpy as np
 import torch
+from reference import use_engine
 from torch import Tensor
 
-from mover.devices import Choice, device_of, finish, named
+from mover.core.devices import Choice, device_of, finish, named
+from mover.core.records import to_device
 from mover.geometry import crops, raster
 from mover.geometry.camera import tilted
-from mover.geometry.raster import Topology, Views
-from mover.geometry.raster_engine import Engine, use_engine, use_threads
+from mover.geometry.kernels.start import use_threads
+from mover.geometry.raster import Crops, Topology
 from mover.geometry.rotations import rot_y
 from mover.geometry.topology import edges_of
-from mover.records import to_device
 
 K = torch.tensor([[353.5, 0, 317.1], [0, 353.5, 178.9], [0, 0, 1]])  # an image of 640 x 360 pixels
 ROUND, CELLS = 0.02, 96
@@ -57,7 +58,7 @@ class Room:
 
     verts: Tensor
     shape: Topology
-    views: Views
+    views: Crops
     masks: Tensor
     bound: Tensor
     bounded: Tensor
@@ -156,7 +157,7 @@ def measure(work: dict[str, Callable[[], None]], rounds: int) -> dict[str, tuple
     return best
 
 
-def task(name: Engine, threads: int, room: Room, run: Callable[[Room], None]) -> Callable[[], None]:
+def task(name: str, threads: int, room: Room, run: Callable[[Room], None]) -> Callable[[], None]:
     """Work bound to an engine and a number of threads."""
 
     def work() -> None:

@@ -21,22 +21,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mover.bodies import open_body
 from mover.bodies.keypoints import LAYOUTS, keypoints_of
 from mover.bodies.parts import parts_of
-from mover.fitting import FitInputs, Fitted, fit_bodies
+from mover.bodies.skinning import open_body
+from mover.core.types import Bodies, Camera, Keypoints
+from mover.fitting.bodies import FitInputs, Fitted, fit_bodies
 from mover.geometry.camera import pitch_roll, project
-from mover.geometry.runs import decode
-from mover.readers.people import Known, keypoints_from
-from mover.rooms.known import KnownRoom, RoomConfig
-from mover.rooms.noise import add_noise
-from mover.rooms.noise_config import NoiseConfig
-from mover.rooms.render import see, see_body
-from mover.rooms.room import make_room
-from mover.stages.align_camera import AlignInputs, Alignment, align_camera
-from mover.stages.find_soles import SolesInputs, find_soles
-from mover.stages.select_frames import SelectInputs, select_frames
-from mover.types import Bodies, Camera, Keypoints
+from mover.geometry.rle import decode
+from mover.io.people.found import Known
+from mover.io.people.keypoints import keypoints_from
+from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camera
+from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
+from mover.stages.people.select_frames import SelectInputs, select_frames
+from mover_bench.rooms.config import NoiseConfig, RoomConfig
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.render import see, see_body
+from mover_bench.rooms.room import make_room
 
 LEGS = ("knee", "ankle", "toe", "heel")
 SEATED, LYING = ("sit", "lean"), ("lie", "lie down", "get up")
@@ -112,7 +113,7 @@ def aligned_by(bodies: Bodies, camera: Camera) -> Alignment:
     """Camera and floor from the feet of fitted bodies, as `mover run` finds them."""
     keep = select_frames(SelectInputs(bodies)).keep
     parts = parts_of(bodies, camera.R_cam_world[:, 1])
-    soles = find_soles(SolesInputs(bodies, parts, keep, camera))
+    soles = find_foot_contacts(FootContactInputs(bodies, parts, keep, camera))
     return align_camera(AlignInputs(soles, camera, None, None))
 
 

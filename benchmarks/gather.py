@@ -15,16 +15,15 @@ from typing import get_args
 import numpy as np
 import torch
 
-from mover.bodies import open_body
-from mover.devices import Choice, device_of, finish, named
-from mover.minimize import Step
-from mover.records import to_device
-from mover.rooms.gait import walk
-from mover.rooms.person import make_person
-from mover.rooms.poses import angles
-from mover.rooms.steps import duration, stations
-from mover.stages.gather_cues import GatherConfig, GatherInputs, gather_cues
-from mover.types import Bodies, Camera, Masks, People
+from mover.bodies.skinning import open_body
+from mover.core.devices import Choice, device_of, finish, named
+from mover.core.observe import Step
+from mover.core.records import to_device
+from mover.core.types import Bodies, Camera, Masks, People
+from mover.stages.config import GatherConfig
+from mover.stages.contacts.gather_cues import GatherInputs, gather_cues
+from mover_bench.rooms.gait import duration, stations, walk
+from mover_bench.rooms.poses import angles, make_person
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 500.0
 OBJECTS = 10

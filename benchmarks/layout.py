@@ -18,15 +18,20 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from mover.furniture.choose import catalogue
+from mover.core.run import Run
+from mover.core.types import Capture, Scene
+from mover.furniture.library import catalogue
 from mover.geometry.boxes import box_of, iou3d
-from mover.geometry.runs import decode
-from mover.perceive.layout import FirstScene, LayoutConfig, Picture, first_scene
-from mover.pipeline import PRESETS, reconstruct
-from mover.readers.mesh_file import write_mesh
-from mover.rooms import KnownRoom, NoiseConfig, add_noise, make_room
-from mover.run import Run
-from mover.types import Capture, Scene
+from mover.geometry.rle import decode
+from mover.io.files.meshes import write_mesh
+from mover.perceive.config import LayoutConfig
+from mover.perceive.layout import FirstScene, Picture, first_scene
+from mover.pipeline.presets import PRESETS
+from mover.pipeline.reconstruct import reconstruct
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.room import make_room
 
 
 def picture_of(capture: Capture) -> Picture:
@@ -39,10 +44,10 @@ def picture_of(capture: Capture) -> Picture:
 
 def iou(scene: Scene, truth: Scene) -> float:
     """Mean IoU3D; objects are matched by their annotation, a missing one scores 0."""
-    by_note = {p.annotation: p for p in scene.pieces}
+    by_note = {p.annotation: p for p in scene.objects}
     values = [
         float(iou3d(box_of(by_note[p.annotation]), box_of(p))) if p.annotation in by_note else 0.0
-        for p in truth.pieces
+        for p in truth.objects
     ]
     return sum(values) / len(values)
 
@@ -68,7 +73,7 @@ def trial(seed: int, args: argparse.Namespace) -> dict[str, float]:
         first = first_scene(picture_of(capture), LayoutConfig(), Run(Path(folder)), meshes)
         row = {
             "seed": seed,
-            "objects": len(room.truth.pieces),
+            "objects": len(room.truth.objects),
             "seconds": time.perf_counter() - begin,
             "noise": iou(capture.scene, room.truth),
             "layout": iou(first.scene, room.truth),
@@ -91,12 +96,12 @@ def best_hypothesis(first: FirstScene, truth: Scene) -> float:
         group[0].piece.annotation: max(
             float(iou3d(box_of(h.piece), box_of(true)))
             for h in group
-            for true in truth.pieces
+            for true in truth.objects
             if true.annotation == h.piece.annotation
         )
         for group in first.others
     }
-    return sum(best.get(p.annotation, 0.0) for p in truth.pieces) / len(truth.pieces)
+    return sum(best.get(p.annotation, 0.0) for p in truth.objects) / len(truth.objects)
 
 
 def main() -> None:

@@ -1,10 +1,10 @@
 """The engine's stages beside what a user would pick instead, in one run.
 
-    PYTHONPATH=src python benchmarks/peers.py --scaling --frames 3000 --gate
+    PYTHONPATH=src:tests python benchmarks/peers.py --scaling --frames 3000 --gate
 
 The workloads: ten objects of 2,000, 10,000 and 20,000 faces in windows of 256 pixels; one body at
 640 x 360; with `--frames`, all frames of a walk. The others: the torch oracle, DEODR, Embree,
-Open3D, libigl, SciPy and PyTorch3D (`pip install mover[bench]`; what is not installed is left out
+Open3D, libigl, SciPy and PyTorch3D (`pip install mover[peers]`; what is not installed is left out
 with a line). Rows of a stage take turns, so that a busy machine slows all of them; beside each
 time stands that of the processor, and the largest memory beyond what was loaded. Then, how far
 results are apart. `--gate` fails where a figure is worse than `baseline.json` allows, and only
@@ -27,11 +27,13 @@ from gate import held, judge
 from gather import memory
 from gather import scene as walk
 from peers_rows import STAGES, Figures, Work
+from reference import use_engine
 
-from mover.geometry.raster_engine import use_engine, use_threads
-from mover.minimize import Step
-from mover.stages.gather_cues import GatherConfig, GatherInputs, gather_cues
-from mover.types import Bodies
+from mover.core.observe import Step
+from mover.core.types import Bodies
+from mover.geometry.kernels.start import use_threads
+from mover.stages.config import GatherConfig
+from mover.stages.contacts.gather_cues import GatherInputs, gather_cues
 
 BASELINE = Path(__file__).parent / "baseline.json"
 Times = dict[str, tuple[float, float, float]]

@@ -14,16 +14,20 @@ from peers_tools import (
     pytorch3d,
     rays,
 )
+from reference import use_engine
 from solver import told
 from torch import Tensor
 from workload import workload
 
-from mover.energy import SceneConfig, scene_energy
-from mover.energy_warp import pricing
+from mover.core.observe import silent
+from mover.core.types import Layout
+from mover.energy.config import Adam, SceneConfig
+from mover.energy.fused.energy import energy_function
+from mover.energy.objective import scene_energy
 from mover.geometry import raster
+from mover.geometry.kernels.start import use_threads
 from mover.geometry.nearest_warp import clouds, nearest
-from mover.geometry.raster import Views
-from mover.geometry.raster_engine import Engine, use_engine, use_threads
+from mover.geometry.raster import Crops
 from mover.geometry.volume import (
     BAND,
     SHELL,
@@ -32,13 +36,12 @@ from mover.geometry.volume import (
     sample,
     sample_torch,
     signed_distance,
-    union_bodies,
 )
-from mover.minimize import Adam, silent
-from mover.presets import ROBUST
-from mover.stages.gather_cues import GatherConfig, gather_cues
-from mover.stages.place_objects import descend, with_trees
-from mover.types import Layout
+from mover.geometry.volume_warp import union_bodies
+from mover.pipeline.presets import ROBUST
+from mover.stages.config import GatherConfig
+from mover.stages.contacts.gather_cues import gather_cues
+from mover.stages.objects.place_objects import descend, with_trees
 
 Work = dict[str, Callable[[], object]]
 Figures = dict[str, float]
@@ -52,14 +55,14 @@ def iteration(threads: int) -> tuple[Work, Figures]:
         given = with_trees(workload(COUNT, faces, WINDOW))
         rest = given.objects, given.camera, given.image, given.humans
         scene = SceneConfig(ROBUST.place.weights, ROBUST.place.form)
-        fast = pricing(*rest, scene)
+        fast = energy_function(*rest, scene)
 
         def one(fast: object = fast, start: Layout = given.starts) -> Tensor:
             with use_threads(threads):
                 return told(fast, start)
 
         def terms(
-            engine: Engine,
+            engine: str,
             rest: tuple[object, ...] = rest,
             scene: SceneConfig = scene,
             start: Layout = given.starts,
@@ -78,7 +81,7 @@ def energies() -> Figures:
     given = with_trees(workload(4, 2000, 64))
     rest = given.objects, given.camera, given.image, given.humans
     scene = SceneConfig(ROBUST.place.weights, ROBUST.place.form)
-    fast = told(pricing(*rest, scene), given.starts)
+    fast = told(energy_function(*rest, scene), given.starts)
     figures = {}
     for engine in ("warp", "torch"):
         with use_engine(engine):
@@ -106,7 +109,7 @@ def silhouettes(threads: int) -> tuple[Work, Figures]:
     for faces in FACES:
         room = make_room(COUNT, faces, WINDOW)
 
-        def ours(engine: Engine, room: Room = room) -> tuple[Tensor, Tensor]:
+        def ours(engine: str, room: Room = room) -> tuple[Tensor, Tensor]:
             free = room.verts.clone().requires_grad_()
             with use_engine(engine), use_threads(threads):
                 image = raster.silhouettes(free, room.shape, room.views)
@@ -172,9 +175,9 @@ def depth(threads: int) -> tuple[Work, Figures]:
     given = walk(2)
     cam = given.bodies.verts[:1] @ given.camera.R_cam_world.T
     faces = given.bodies.faces
-    views = Views(given.camera.K[None], given.camera.height, given.camera.width)
+    views = Crops(given.camera.K[None], given.camera.height, given.camera.width)
 
-    def ours(engine: Engine) -> Tensor:
+    def ours(engine: str) -> Tensor:
         with use_engine(engine), use_threads(threads):
             return raster.layers(cam, faces, views).front[0]
 
@@ -252,7 +255,7 @@ def lookup(threads: int) -> tuple[Work, Figures]:
     volume = Volume(ball, torch.full((3,), -1.0), 2 / 255)
     points = torch.rand(50000, 3, generator=draw) * 1.9 - 0.95
 
-    def ask(engine: Engine) -> tuple[Tensor, Tensor]:
+    def ask(engine: str) -> tuple[Tensor, Tensor]:
         free = points.clone().requires_grad_()
         with use_engine(engine), use_threads(threads):
             value = (sample if engine == "warp" else sample_torch)(volume, free)

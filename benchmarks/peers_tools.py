@@ -8,7 +8,7 @@ import torch
 from engine import Room
 from torch import Tensor
 
-from mover.geometry.raster import Views
+from mover.geometry.raster import Crops
 
 SOFT, LAYERS = 1e-4, 10  # PyTorch3D: softness of an edge, triangles blended in a pixel
 
@@ -108,7 +108,7 @@ def pytorch3d(room: Room, layers: int = LAYERS) -> tuple[Tensor, Tensor]:
     return image.detach(), first.detach()
 
 
-def rays(views: Views) -> np.ndarray:
+def rays(views: Crops) -> np.ndarray:
     """A ray through the centre of each pixel of the first view, one long along z (h w 3)."""
     y, x = torch.meshgrid(
         torch.arange(views.height) + 0.5, torch.arange(views.width) + 0.5, indexing="ij"
@@ -116,7 +116,7 @@ def rays(views: Views) -> np.ndarray:
     return (torch.stack([x, y, torch.ones_like(x)], -1) @ views.K[0].inverse().T).float().numpy()
 
 
-def boxed(verts: Tensor, views: Views) -> tuple[slice, slice]:
+def boxed(verts: Tensor, views: Crops) -> tuple[slice, slice]:
     """Rows and columns that a mesh is seen in: outside of them no ray is needed."""
     flat = verts @ views.K[0].T
     flat = flat[:, :2] / flat[:, 2:]
@@ -126,7 +126,7 @@ def boxed(verts: Tensor, views: Views) -> tuple[slice, slice]:
     return slice(low[1], high[1]), slice(low[0], high[0])
 
 
-def embree(verts: Tensor, faces: Tensor, views: Views, every: np.ndarray) -> Tensor:
+def embree(verts: Tensor, faces: Tensor, views: Crops, every: np.ndarray) -> Tensor:
     """Depth of the first hit by Embree (embreex); the tree is built for this pose."""
     from embreex import rtcore_scene
     from embreex.mesh_construction import TriangleMesh
@@ -142,7 +142,7 @@ def embree(verts: Tensor, faces: Tensor, views: Views, every: np.ndarray) -> Ten
     return depth
 
 
-def open3d_depth(verts: Tensor, faces: Tensor, views: Views, every: np.ndarray) -> Tensor:
+def open3d_depth(verts: Tensor, faces: Tensor, views: Crops, every: np.ndarray) -> Tensor:
     """Depth of the first hit by Open3D, which asks Embree too; the tree is built for this pose."""
     import open3d
 

@@ -18,18 +18,21 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 from workload import CAMERA, FLOOR, furniture, seen, truth
 
-from mover.energy import HumanCues, SceneWeights
+from mover.core.observe import Energy
+from mover.core.types import Layout, Objects
+from mover.energy.config import Adam, BatchedBFGS, SceneWeights
+from mover.energy.minimize import minimize
+from mover.energy.objective import HumanCues
+from mover.energy.terms.bbox import bbox_term
+from mover.energy.terms.scale import scale_term
 from mover.geometry.camera import outermost, project
-from mover.geometry.placement import place_in, stand
+from mover.geometry.placement import place_in, rest_on_support
 from mover.geometry.raster import Topology, look
 from mover.geometry.rotations import wrap
-from mover.minimize import Adam, Energy, minimize
-from mover.minimize_newton import Quasi
-from mover.stages.place_objects import PlaceConfig, PlaceInputs, place_objects
-from mover.stages.starts import alone, best_few, spread
-from mover.terms.bbox import bbox_term
-from mover.terms.scale import scale_term
-from mover.types import Layout, Objects
+from mover.stages.config import PlaceConfig
+from mover.stages.objects.place_inputs import PlaceInputs
+from mover.stages.objects.place_objects import place_objects
+from mover.stages.objects.starts import alone, best_few, spread
 
 LONG = Adam(300, 0.03, 0.002, beta2=0.98, keep_best=True)
 SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
@@ -76,7 +79,7 @@ def energy(inputs: PlaceInputs, box: float, weight: float, far: bool) -> Callabl
     area = image.masks.sum((-2, -1)).clamp_min(1)
 
     def of(layout: Layout) -> Energy:
-        at = stand(layout, objects.supports, objects.size[:, 1], FLOOR)
+        at = rest_on_support(layout, objects.supports, objects.size[:, 1], FLOOR)
         verts = place_in(objects.verts, at, CAMERA.R_cam_world)
         drawn, _ = look(verts, Topology(objects.faces, objects.edges), image.views, depth=False)
         price = _Far.apply if far else lambda d, m: (d - m).square().sum((-2, -1))
@@ -150,8 +153,14 @@ def main() -> None:
         return lambda inputs: place_objects(inputs, config).layout
 
     single = PlaceConfig(IMAGE, "robust", DESCENT)
-    eight = replace(single, yaws=8, short=SHORT, keep=3)
-    fast = replace(eight, method=Quasi(), short=Quasi(steps=40, reach=0.2), coarse=2, shaken=3)
+    eight = replace(single, yaws=8, short=SHORT, num_hypotheses=3)
+    fast = replace(
+        eight,
+        method=BatchedBFGS(),
+        short=BatchedBFGS(steps=40, reach=0.2),
+        coarse=2,
+        perturbations=3,
+    )
     rows = {
         "exact": one(0, 1.0, False),
         "exact, weight 10": one(0, 10.0, False),
@@ -161,10 +170,10 @@ def main() -> None:
         "far + box": one(1.0, 1.0, True),
         "far + box, weight 0.1": one(1.0, 0.1, True),
         "far + box, 8 yaws": turned,
-        "exact + box, Newton": many(replace(single, method=Quasi())),
+        "exact + box, Newton": many(replace(single, method=BatchedBFGS())),
         "exact + box, 8 yaws": many(eight),
-        "exact + box, 8 yaws, Newton, fine": many(replace(fast, coarse=1, shaken=0)),
-        "exact + box, 8 yaws, Newton, 64 -> 128": many(replace(fast, shaken=0)),
+        "exact + box, 8 yaws, Newton, fine": many(replace(fast, coarse=1, perturbations=0)),
+        "exact + box, 8 yaws, Newton, 64 -> 128": many(replace(fast, perturbations=0)),
         "the same, shaken": many(fast),
     }
     for name, run in rows.items():

@@ -9,11 +9,12 @@ import statistics
 import tempfile
 from pathlib import Path
 
-from mover import records
-from mover.experiments.job import Rebuilt, Trial
-from mover.run import Run
-from mover.settle import Settled, settle
-from mover.types import Scene
+from mover.app.simulate import SimulatedObject, simulate
+from mover.core import records
+from mover.core.run import Run
+from mover.core.types import Scene
+from mover_bench.studies.job import Rebuilt
+from mover_bench.studies.measures import Trial
 
 
 def main() -> None:
@@ -23,7 +24,7 @@ def main() -> None:
     parser.add_argument("--set", default="rooms", help="set of rooms")
     parser.add_argument("--preset", default="robust", help="whose results")
     args = parser.parse_args()
-    found: dict[str, list[Settled]] = {"truth": [], "initial": [], "image": [], "full": []}
+    found: dict[str, list[SimulatedObject]] = {"truth": [], "initial": [], "image": [], "full": []}
     seeds = sorted(int(p.name) for p in (args.out / args.set).iterdir() if p.name.isdigit())
     for seed in seeds:
         folder = args.out / args.set / str(seed)
@@ -37,7 +38,7 @@ def main() -> None:
         }
         with tempfile.TemporaryDirectory() as work:  # in which each shape is cut only once
             for name, scene in scenes.items():
-                rows = settle(scene, Run(Path(work)))
+                rows = simulate(scene, Run(Path(work)))
                 found[name].extend(rows)
                 most = 100 * max(row.moved for row in rows)
                 print(

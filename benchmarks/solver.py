@@ -30,32 +30,31 @@ import torch
 from torch import Tensor
 from workload import workload
 
-from mover.devices import CPU, Choice, device_of, finish, named
-from mover.energy import SceneConfig, scene_energy
-from mover.energy_warp import pricing
-from mover.geometry.raster_engine import use_threads
-from mover.minimize import Adam, Energy, silent
-from mover.minimize_newton import Quasi
-from mover.pipeline import reconstruct
-from mover.presets import ROBUST
-from mover.records import to_device
-from mover.rooms.noise import NoiseConfig, add_noise
-from mover.rooms.room import make_room
-from mover.run import Run
-from mover.stages.place_objects import (
-    PlaceConfig,
-    PlaceInputs,
-    descend,
-    place_objects,
-    starts_left,
-    with_trees,
-)
-from mover.types import Layout
+from mover.core.devices import CPU, Choice, device_of, finish, named
+from mover.core.observe import Energy, silent
+from mover.core.records import to_device
+from mover.core.run import Run
+from mover.core.types import Layout
+from mover.energy.config import Adam, BatchedBFGS, SceneConfig
+from mover.energy.fused.energy import energy_function
+from mover.energy.objective import scene_energy
+from mover.geometry.kernels.start import use_threads
+from mover.pipeline.presets import ROBUST
+from mover.pipeline.reconstruct import reconstruct
+from mover.stages.config import PlaceConfig
+from mover.stages.objects.place_inputs import PlaceInputs
+from mover.stages.objects.place_objects import descend, place_objects, starts_left, with_trees
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.room import make_room
 
 WITHIN = 1.001  # of Adam's energy
 PAPER = Adam(3000, 0.002, 0.002, keep_best=True)
 DESCENT = Adam(200, 0.03, 0.002, beta2=0.98, keep_best=True)
-SHAKES = {"robust": (ROBUST.place.shaken, ROBUST.place.rounds), "second order": (12, 4)}
+SHAKES = {
+    "robust": (ROBUST.place.perturbations, ROBUST.place.perturbation_rounds),
+    "second order": (12, 4),
+}
 
 
 @dataclass(frozen=True)
@@ -103,9 +102,9 @@ def adam(inputs: PlaceInputs, config: PlaceConfig, method: Adam) -> Tensor:
     return descend(inputs, config, starts, method, silent).value.amin(0)
 
 
-def newton(inputs: PlaceInputs, config: PlaceConfig, shaken: int, rounds: int) -> Tensor:
+def newton(inputs: PlaceInputs, config: PlaceConfig, count: int, rounds: int) -> Tensor:
     """The same by second-order descents."""
-    fast = replace(config, method=Quasi(), shaken=shaken, rounds=rounds)
+    fast = replace(config, method=BatchedBFGS(), perturbations=count, perturbation_rounds=rounds)
     return place_objects(inputs, fast).energy.amin(0)
 
 
@@ -181,7 +180,7 @@ def iteration(threads: int, device: torch.device = CPU) -> bool:
         place, start = ROBUST.place, inputs.starts
         rest = inputs.objects, inputs.camera, inputs.image, inputs.humans
         scene = SceneConfig(place.weights, place.form)
-        fast = pricing(*rest, scene)
+        fast = energy_function(*rest, scene)
 
         def slow(layout: Layout, rest: Any = rest, scene: SceneConfig = scene) -> Energy:  # noqa: ANN401
             return scene_energy(layout, *rest, scene)

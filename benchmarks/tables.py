@@ -15,10 +15,11 @@ from pathlib import Path
 
 from calibrate import finished, tables
 
-from mover.calibration import calibration_of
-from mover.experiments.run import ExperimentArgs, parse_seeds, run_experiment
-from mover.experiments.study import StudyArgs, run_study
-from mover.progress import Bar
+from mover.app.cli.progress import Bar
+from mover.evaluate.calibration import calibration_of
+from mover_bench.studies.args import ExperimentArgs, StudyArgs
+from mover_bench.studies.run import parse_seeds, run_experiment
+from mover_bench.studies.study import run_study
 
 DOCS = Path(__file__).parents[1] / "docs" / "tables"
 ROBUST = ("robust",)

@@ -18,8 +18,8 @@ from mover.geometry import mesh as m
 from mover.geometry.nearest import to_surface
 from mover.geometry.volume import signed_distance
 from mover.geometry.watertight import close_mesh
-from mover.readers.fields import At
-from mover.readers.mesh_file import KINDS, read_mesh
+from mover.io.files.fields import At
+from mover.io.files.meshes import KINDS, read_mesh
 
 
 def measure(path: Path) -> dict[str, float]:

@@ -4,19 +4,19 @@ import torch
 from engine import K, bed, chair, mesh, padded, sofa, table
 from torch import Tensor
 
-from mover.energy import HumanCues, ImageCues
+from mover.core.types import Camera, Layout, Objects
+from mover.energy.objective import HumanCues, ImageCues
+from mover.energy.terms.bbox import SEEN
+from mover.energy.terms.collision import BodySpace
+from mover.energy.terms.contact import ContactPoints
+from mover.energy.terms.depth import DepthRange
 from mover.geometry.camera import project, tilted, to_camera
 from mover.geometry.crops import crop_views
 from mover.geometry.placement import place
 from mover.geometry.raster import Depths, Topology, look
 from mover.geometry.topology import edges_of
 from mover.geometry.volume import Volume, grid_around
-from mover.stages.place_objects import PlaceInputs
-from mover.terms.bbox import SEEN
-from mover.terms.collision import BodySpace
-from mover.terms.contact import Touches
-from mover.terms.depth import DepthRange
-from mover.types import Camera, Layout, Objects
+from mover.stages.objects.place_inputs import PlaceInputs
 
 FLOOR = -1.4
 CAMERA = Camera(K, tilted(torch.tensor(-0.2), torch.tensor(0.0)), 640, 360)
@@ -89,7 +89,7 @@ def people(objects: Objects, layout: Layout, depths: Depths, rng: torch.Generato
     points = place(objects.top, layout)[:, torch.randint(400, (1200,), generator=rng)]
     points = points.view(n, 4, 300, 3) + 0.05 * torch.randn(n, 4, 300, 3, generator=rng)
     facing = torch.stack([layout.yaw.sin(), layout.yaw.cos()], -1)
-    touches = Touches(torch.arange(n), points, weight, torch.full((n,), 8.0), facing)
+    touches = ContactPoints(torch.arange(n), points, weight, torch.full((n,), 8.0), facing)
     return HumanCues(DepthRange(near, far, near, torch.ones(n)), BodySpace(volume), touches)
 
 

@@ -12,10 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mover.core.observe import Energy
+from mover.core.types import Layout
+from mover.energy.config import Adam
+from mover.energy.minimize import minimize, weigh
+from mover.energy.terms.scale import scale_term
 from mover.geometry.placement import place
-from mover.minimize import Adam, Energy, minimize, weigh
-from mover.terms.scale import scale_term
-from mover.types import Layout
 
 WALL = -4.0  # [m], z of the wall
 

@@ -5,9 +5,9 @@ A table that a detector saw in a picture of 320 x 240 pixels, with a first guess
 
 import numpy as np
 
-from mover.furniture import make_piece
-from mover.readers import ObjectArrays, capture_from_arrays
-from mover.types import Capture
+from mover.core.types import Capture
+from mover.furniture.library import make_piece
+from mover.io.capture.arrays import ObjectArrays, capture_from_arrays
 
 
 def make_capture() -> Capture:
@@ -31,7 +31,7 @@ def make_capture() -> Capture:
 def main() -> Capture:
     """Make it and say what is in it."""
     capture = make_capture()
-    for piece in capture.scene.pieces:
+    for piece in capture.scene.objects:
         print(piece.id, piece.category, piece.t_world_object.tolist())
     for warning in capture.warnings:
         print("warning:", warning)

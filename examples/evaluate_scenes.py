@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import torch
 
-from mover.evaluate import evaluate, table
-from mover.furniture import make_piece
+from mover.core.types import Camera, Scene, SceneObject
+from mover.evaluate.evaluation import evaluate, table
+from mover.furniture.library import make_piece
 from mover.geometry.camera import tilted
-from mover.types import Camera, Piece, Scene
 
 
 def make_truth() -> Scene:
@@ -16,7 +16,7 @@ def make_truth() -> Scene:
     K = torch.tensor([[250.0, 0, 160], [0, 250, 120], [0, 0, 1]])
     camera = Camera(K, tilted(torch.tensor(-0.2), torch.tensor(0.0)), 320, 240)
     pieces = tuple(
-        Piece(
+        SceneObject(
             id=f"{name}_0",
             category=name,
             mesh=make_piece(name, np.random.default_rng(0), style=0).mesh,
@@ -36,9 +36,9 @@ def shifted(scene: Scene, by: float) -> Scene:
     """The same scene with its objects a little off [m]."""
     off = torch.tensor([by, 0.0, -by])
     pieces = tuple(
-        dataclasses.replace(p, t_world_object=p.t_world_object + off) for p in scene.pieces
+        dataclasses.replace(p, t_world_object=p.t_world_object + off) for p in scene.objects
     )
-    return dataclasses.replace(scene, pieces=pieces)
+    return dataclasses.replace(scene, objects=pieces)
 
 
 def main() -> dict:

@@ -15,20 +15,20 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from mover.bodies import open_body
+from mover.app.pictures.board import set_up, show
+from mover.app.pictures.eye import orbit_eye
+from mover.app.pictures.film import pixels
+from mover.app.pictures.floor import ground_under
+from mover.app.pictures.paint import Surfaces, furniture, joined, people
+from mover.bodies.skinning import open_body
+from mover.core.types import Bodies, Camera, Scene, SceneObject
 from mover.furniture.library import STYLES, make_piece
-from mover.render_board import set_up, show
-from mover.render_eye import orbit_eye
-from mover.render_film import pixels
-from mover.render_floor import ground_under
-from mover.render_paint import Surfaces, furniture, joined, people
-from mover.rooms.motion import Performance, Stage, Stop, Task, perform
-from mover.rooms.person import make_person
-from mover.rooms.placed import Placed
-from mover.rooms.poses import rows, skinned
-from mover.rooms.render import COLOURS
-from mover.rooms.room import RoomConfig, draw_frame, make_room
-from mover.types import Bodies, Camera, Piece, Scene
+from mover_bench.rooms.config import RoomConfig
+from mover_bench.rooms.motion import Performance, Stage, Stop, Task, perform
+from mover_bench.rooms.placed import Placed
+from mover_bench.rooms.poses import make_person, rows, skinned
+from mover_bench.rooms.render import COLOURS
+from mover_bench.rooms.room import draw_frame, make_room
 
 CELL, CAPTION, MOST = (230, 200), 20, 250_000  # [px], [px], [bytes] of a sheet
 SEATS = ("chair", "armchair", "office chair", "stool", "bench", "sofa")
@@ -46,7 +46,7 @@ class Cell:
 def scene_of(pieces: tuple[Placed, ...]) -> Scene:
     """Pieces on a floor at y = 0, for the painter."""
     placed = [
-        Piece(p.id, p.furniture.category, p.furniture.mesh, "", None, "ground",
+        SceneObject(p.id, p.furniture.category, p.furniture.mesh, "", None, "ground",
               torch.tensor([p.at[0], 0.0, p.at[1]]), torch.tensor(float(p.heading)), torch.ones(3))
         for p in pieces
     ]  # fmt: skip

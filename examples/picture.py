@@ -8,11 +8,11 @@ from pathlib import Path
 
 import torch
 
-from mover.readers import read
-from mover.readers.bodies_file import read_bodies
-from mover.readers.scene_file import read_scene
-from mover.report import draw_overlay
-from mover.types import Mesh
+from mover.app.pictures.overlay import draw_overlay
+from mover.core.types import Mesh
+from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.scene_file import read_scene
+from mover.io.formats import read
 
 SHOWN = (0.19, 0.38, 0.83)  # where in the video: on the chair, on the sofa, on the bed
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from capture_from_arrays import make_capture
 
 import mover
-from mover.minimize import Adam, Step
+from mover.core.observe import Step
+from mover.energy.config import Adam
 
 
 def main(folder: Path, steps: int = 60) -> mover.Room:
@@ -27,7 +28,7 @@ def main(folder: Path, steps: int = 60) -> mover.Room:
 
     run = mover.Run(folder, watch)  # finished stages are kept there: a second run takes no time
     room = mover.reconstruct(make_capture(), config, run)
-    for piece, held in zip(room.scene.pieces, room.evidence, strict=True):
+    for piece, held in zip(room.scene.objects, room.evidence, strict=True):
         print(piece.id, piece.t_world_object.tolist(), float(piece.yaw), held.mask_pixels, "px")
     for stage in run.stages:
         print(f"{stage.name}: {stage.seconds:.2f} s, {'kept' if stage.kept else 'made'}")

@@ -4,20 +4,20 @@ from dataclasses import replace
 
 import torch
 
-from mover.energy import HumanCues, ImageCues
+from mover.core.types import Camera, Layout, Objects
+from mover.energy.objective import HumanCues, ImageCues
+from mover.energy.terms.bbox import SEEN
+from mover.energy.terms.collision import BodySpace
+from mover.energy.terms.contact import ContactPoints
+from mover.energy.terms.depth import DepthRange
+from mover.energy.terms.wall import Walls, rears_of
 from mover.geometry.camera import project, tilted, to_camera
 from mover.geometry.crops import crop_views
-from mover.geometry.mesh import edges_of
 from mover.geometry.placement import place
 from mover.geometry.raster import Topology, look
+from mover.geometry.topology import edges_of
 from mover.geometry.volume import Volume
-from mover.stages.place_objects import PlaceInputs
-from mover.terms.bbox import SEEN
-from mover.terms.collision import BodySpace
-from mover.terms.contact import Touches
-from mover.terms.depth import DepthRange
-from mover.terms.wall import Walls, rears_of
-from mover.types import Camera, Layout, Objects
+from mover.stages.objects.place_inputs import PlaceInputs
 
 GROUND = -1.4
 SIZES = ((0.5, 0.45, 0.5), (1.2, 0.7, 0.8), (0.4, 1.8, 0.9))
@@ -122,7 +122,7 @@ def humans_at(objects, layout, camera, image):
     weight = torch.zeros(points.shape[:-1]).to(near)
     weight[:, 0] = 1.0
     heading = torch.stack([layout.yaw[:2].sin(), layout.yaw[:2].cos()], -1)
-    touches = Touches(
+    touches = ContactPoints(
         torch.tensor([0, 1]),
         points.contiguous(),
         weight,

@@ -4,17 +4,37 @@ import torch
 torch.set_num_threads(1)  # threads that wait for one another are slower than one
 
 
+def pytest_sessionstart():
+    """Tests draw in double precision, too, which the program never does."""
+    from reference import drawer
+
+    from mover.geometry import raster
+
+    raster._drawer = drawer
+
+
+def pytest_collection_modifyitems(items):
+    """Tests of the documentation and of pages in a browser are marked by where they stand."""
+    for item in items:
+        if item.path.stem.startswith("test_docs"):
+            item.add_marker(pytest.mark.docs)
+        if "browser" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.browser)
+
+
 @pytest.fixture(scope="session")
 def small_room():
-    """A known room with few frames, made once."""
-    from mover.rooms.room import RoomConfig, make_room
+    """A known room with few frames."""
+    from kept_rooms import drawn, kept
 
-    return make_room(3, RoomConfig(width=480, height=270, stay=0.3, least_frames=60))
+    from mover_bench.rooms.config import RoomConfig
+
+    return kept(drawn, 3, RoomConfig(width=480, height=270, stay=0.3, least_frames=60))
 
 
 @pytest.fixture(scope="session")
 def demo_room():
     """The room of `mover demo`."""
-    from mover.rooms import room
+    from kept_rooms import demo, kept
 
-    return room.demo_room()
+    return kept(demo)

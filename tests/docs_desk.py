@@ -18,19 +18,20 @@ from PIL import Image
 from test_posa import write_checkpoint, write_meshes
 from tiny_models import tiny_mask2former, tiny_sam2, tiny_vitpose
 
-from mover.bodies import BodyModel, load_smpl
-from mover.edits import Place, placement_of
-from mover.readers.bodies_file import write_bodies
-from mover.readers.camera_file import camera_to_json
-from mover.readers.edits_file import write_edits
-from mover.readers.fields import write_json
-from mover.readers.folder import write_capture
-from mover.readers.people.keypoints_file import write_keypoints
-from mover.results import write_truth
-from mover.rooms import KnownRoom
-from mover.rooms.noise import NoiseConfig, add_noise
-from mover.stages.inputs import rows_of
-from mover.types import Bodies, BodyPose, Capture
+from mover.app.results import write_truth
+from mover.bodies import BodyModel
+from mover.bodies.corrected import rows_of
+from mover.bodies.smpl_files import load_smpl
+from mover.core.types import Bodies, BodyPose, Capture
+from mover.io.capture.bodies_file import write_bodies
+from mover.io.capture.camera_file import camera_to_json
+from mover.io.capture.edits import Place, placement_of, write_edits
+from mover.io.capture.folder import write_capture
+from mover.io.files.fields import write_json
+from mover.io.people.keypoints import write_keypoints
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.noise import add_noise
 
 NAMES = {
     "floor lamp": "lamp", "coffee table": "table", "shelf": "shelves", "wardrobe": "cabinet",
@@ -48,7 +49,7 @@ def plain(room: KnownRoom, factor: float = 1.0) -> layouts.Room:
             piece.mesh.verts.double().numpy(), piece.mesh.faces.numpy(),
             piece.t_world_object.double().numpy(), float(piece.yaw), piece.scale.double().numpy(),
         )
-        for piece in room.truth.pieces
+        for piece in room.truth.objects
     ]  # fmt: skip
     K = camera.K.double().numpy() * [[factor]]
     K[2, 2] = 1
@@ -85,7 +86,7 @@ def write_captures(desk: Path, room: KnownRoom) -> None:
         (desk / home).mkdir()
         (desk / home / "one").symlink_to(Path("..") / "CAPTURE")
     (desk / "list.txt").write_text("captures/one  # a remark\n")
-    piece = capture.scene.pieces[0]
+    piece = capture.scene.objects[0]
     moved = dataclasses.replace(piece, t_world_object=piece.t_world_object + 0.1)
     write_edits((Place(piece.id, placement_of(moved, capture.scene)),), desk / "edits.json")
     bare = desk / "C"

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import torch
 
-from mover.bodies import open_body, zero_pose
 from mover.bodies.skeleton import JOINTS
-from mover.types import Bodies, BodyPose
+from mover.bodies.skinning import open_body, zero_pose
+from mover.core.types import Bodies, BodyPose
 
 ARMS_DOWN = {"left_shoulder": (0.0, 0.0, -1.2), "right_shoulder": (0.0, 0.0, 1.2)}
 SEATED = {

@@ -8,12 +8,11 @@ import numpy as np
 import torch
 from little_room import GROUND, camera
 
-from mover.bodies import open_body
-from mover.bodies.skinning import zero_pose
-from mover.furniture import make_piece
-from mover.readers.bodies_file import write_bodies
-from mover.readers.scene_file import write_scene
-from mover.types import Bodies, BodyPose, Piece, Scene
+from mover.bodies.skinning import open_body, zero_pose
+from mover.core.types import Bodies, BodyPose, Scene, SceneObject
+from mover.furniture.library import make_piece
+from mover.io.capture.bodies_file import write_bodies
+from mover.io.capture.scene_file import write_scene
 
 SPOTS = {
     "chair": (0.9, -2.6, 0.3), "sofa": (-1.6, -4.2, 0.8), "table": (0.4, -4.6, -0.1),
@@ -27,14 +26,14 @@ def furnished(
 ) -> Scene:
     """Pieces of the library on the floor, none near another."""
     rng = np.random.default_rng(seed)
-    pieces: list[Piece] = []
+    pieces: list[SceneObject] = []
     for name in names:
         x, z, yaw = SPOTS[name]
         mesh = make_piece(name, rng).mesh
         key = f"{name.replace(' ', '_')}_0"
         t = torch.tensor([x, ground, z])
         pieces.append(
-            Piece(key, name, mesh, "", None, "ground", t, torch.tensor(yaw), torch.ones(3))
+            SceneObject(key, name, mesh, "", None, "ground", t, torch.tensor(yaw), torch.ones(3))
         )
     return Scene(camera(), ground, tuple(pieces))
 

@@ -6,11 +6,11 @@ from typing import Literal
 import torch
 import trimesh
 
-from mover.bodies import open_body, zero_pose
-from mover.evaluate import EvaluateConfig
+from mover.bodies.skinning import open_body, zero_pose
+from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject
+from mover.evaluate.evaluation import EvaluateConfig
+from mover.evaluate.scene import Pair
 from mover.geometry.camera import tilted
-from mover.metrics_scene import Pair
-from mover.types import Bodies, Camera, Mesh, Piece, Scene
 
 F64 = torch.float64
 K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=F64)
@@ -35,19 +35,19 @@ def cuboid(x: float, y: float, z: float) -> Mesh:
     return Mesh(mesh.verts + torch.tensor([0, y / 2, 0], dtype=F64), mesh.faces)
 
 
-def piece(mesh: Mesh, t: tuple[float, ...], yaw: float = 0.0, name: str = "a") -> Piece:
-    return Piece(
+def piece(mesh: Mesh, t: tuple[float, ...], yaw: float = 0.0, name: str = "a") -> SceneObject:
+    return SceneObject(
         id=name, category="chair", mesh=mesh, mesh_file="", annotation=None, support="ground",
         t_world_object=torch.tensor(t, dtype=F64), yaw=torch.tensor(yaw, dtype=F64),
         scale=torch.ones(3, dtype=F64),
     )  # fmt: skip
 
 
-def pair(estimate: Piece, truth: Piece, samples: int = 2000) -> Pair:
+def pair(estimate: SceneObject, truth: SceneObject, samples: int = 2000) -> Pair:
     return Pair(estimate, CAMERA, truth, CAMERA, samples)
 
 
-def moved(item: Piece, *shift: float) -> Piece:
+def moved(item: SceneObject, *shift: float) -> SceneObject:
     return replace(item, t_world_object=item.t_world_object + torch.tensor(shift, dtype=F64))
 
 
@@ -95,7 +95,7 @@ def grid_body(low: float, high: float, n: int = 5) -> torch.Tensor:
     return torch.stack([x, y, torch.zeros_like(x)], -1).reshape(1, -1, 3).double()
 
 
-def random_piece(v: list[float]) -> Piece:
+def random_piece(v: list[float]) -> SceneObject:
     mesh = cuboid(1 + 0.6 * v[0], 1 + 0.6 * v[1], 1 + 0.6 * v[2])
     mesh = Mesh(mesh.verts + 0.3 * torch.tensor(v[3:6], dtype=F64), mesh.faces)
     shape = piece(mesh, (0.5 * v[6], 0.3 * v[7] - 1, -3 + 0.5 * v[8]), 3 * v[9])

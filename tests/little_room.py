@@ -5,8 +5,8 @@ import math
 import torch
 import trimesh
 
+from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject
 from mover.geometry.camera import tilted
-from mover.types import Bodies, Camera, Mesh, Piece, Scene
 
 GROUND = -1.5
 
@@ -22,9 +22,11 @@ def box(width: float, height: float, depth: float) -> Mesh:
     return mesh_of(shape)
 
 
-def piece(name: str, mesh: Mesh, place: tuple[float, float], yaw: float, ground: float) -> Piece:
+def piece(
+    name: str, mesh: Mesh, place: tuple[float, float], yaw: float, ground: float
+) -> SceneObject:
     t = torch.tensor([place[0], ground, place[1]])
-    return Piece(
+    return SceneObject(
         name, name.split("_")[0], mesh, "", 1, "ground", t, torch.tensor(yaw), torch.ones(3)
     )
 

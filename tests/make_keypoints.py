@@ -3,12 +3,12 @@
 import numpy as np
 import torch
 
-from mover.bodies import open_body, zero_pose
 from mover.bodies.keypoints import LAYOUTS, has_keypoints, keypoints_of
 from mover.bodies.skeleton import BODY
+from mover.bodies.skinning import open_body, zero_pose
+from mover.core.types import Bodies, BodyPose, Camera, Keypoints
 from mover.geometry.camera import project, tilted
 from mover.geometry.rotations import rot_y
-from mover.types import Bodies, BodyPose, Camera, Keypoints
 
 WIDTH, HEIGHT = 960, 540
 CAMERA = Camera(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-OPEN = Path(__file__).parents[1] / "src" / "mover" / "assets" / "open_body_small.npz"
+OPEN = Path(__file__).parents[1] / "src" / "mover" / "bodies" / "assets" / "open_body_small.npz"
 NUMBERED = {
     "smplx": {
         "nose": 9120, "reye": 9929, "leye": 9448, "rear": 616, "lear": 6, "LBigToe": 5770,

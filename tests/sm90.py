@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 
-def ptx_of(name: str, folder: Path) -> str:
-    """The code of `mover.geometry.kernels.NAME` for sm_90; skips where Warp cannot make it."""
+def ptx_of(name: str, folder: Path, package: str = "mover.geometry.kernels") -> str:
+    """The code of a module of kernels for sm_90; skips where Warp cannot make it."""
     code = (
-        f"import sys, warp as wp; from mover.geometry.kernels import {name} as module;"
+        f"import sys, warp as wp; from {package} import {name} as module;"
         "90 in wp.get_cuda_supported_archs() or sys.exit(77);"
         "wp.compile_aot_module(module, arch=90, module_dir=sys.argv[1], use_ptx=True)"
     )

@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 import torch
 
+from mover.core.types import Camera
+from mover.energy.terms.feet import FootContacts, feet_term, heights, tilt_prior, up_cam
 from mover.geometry.camera import pitch_roll, tilted
-from mover.stages.align_camera import AlignConfig, AlignInputs, align_camera
-from mover.stages.plane_fit import Prior, covariance_of, fit_plane, price, vote
-from mover.terms.feet import Soles, feet_term, heights, tilt_prior, up_cam
-from mover.types import Camera
+from mover.stages.camera.align_camera import (
+    AlignInputs,
+    Prior,
+    align_camera,
+    covariance_of,
+    fit_plane,
+    price,
+    vote,
+)
+from mover.stages.config import AlignConfig
 
 PITCH, ROLL, GROUND = math.radians(-11), math.radians(1.5), -1.6
 K = torch.tensor([[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]])
@@ -38,7 +46,7 @@ def soles_at(spots, seed=0, frames=3, noise=0.0, wrong=0.0, person=0, bias=0.0):
             points += [(x + a, y, z + b) for a, b in patch]
     cam = torch.tensor(np.array(points)) @ rotation(PITCH, ROLL).mT
     frame = torch.arange(len(points)) // 4
-    return Soles(cam.float(), torch.full_like(frame, person), frame, ())
+    return FootContacts(cam.float(), torch.full_like(frame, person), frame, ())
 
 
 def room(n=20, seed=0):
@@ -57,7 +65,7 @@ def joined(*parts):
     points, person, frame = (
         torch.cat([getattr(p, name) for p in parts]) for name in ("points_cam", "person", "frame")
     )
-    return Soles(points, person, frame, ())
+    return FootContacts(points, person, frame, ())
 
 
 def errors(found):
@@ -101,7 +109,7 @@ def test_a_straight_walk_is_never_worse_than_the_guess(spots, seed):
 def test_the_tilt_about_an_exact_line_stays_at_the_guess():
     spots = line(feet=0.0, angle=0.0)
     still = soles_at(spots, noise=0.0)
-    flat = Soles(
+    flat = FootContacts(
         still.points_cam.reshape(-1, 4, 3).mean(1), still.person[::4], still.frame[::4], ()
     )
     pitch, roll, _ = errors(align(flat, camera_off((3.0, 3.0))))
@@ -166,7 +174,7 @@ def test_frames_of_one_pose_are_no_new_evidence():
         for i, s in enumerate(spots)
     ]
     stood = joined(*parts)
-    stood = Soles(stood.points_cam, stood.person, torch.arange(len(stood.person)) // 4, ())
+    stood = FootContacts(stood.points_cam, stood.person, torch.arange(len(stood.person)) // 4, ())
     found = align(stood, camera_off((2.0, 2.0)))
     spread = found.covariance.diag().sqrt().numpy() * [180 / math.pi, 180 / math.pi, 1]
     assert (np.abs(errors(found)) < 2.5 * spread).all()
@@ -184,7 +192,7 @@ def test_a_known_camera_height_is_the_ground_and_people_of_a_wrong_size_are_told
 
 def test_without_feet_everything_stays_and_a_warning_says_so():
     none = torch.zeros(0, dtype=torch.long)
-    soles = Soles(torch.zeros(0, 3), none, none, ())
+    soles = FootContacts(torch.zeros(0, 3), none, none, ())
     for ground, height, expected in ((-1.3, None, -1.3), (-1.3, 1.4, -1.4), (None, None, -1.5)):
         found = align(soles, camera_off((1.0, 2.0)), ground, height)
         assert np.allclose(errors(found)[:2], [1, 2], atol=1e-4)
@@ -211,7 +219,9 @@ def test_the_result_is_a_minimum_of_feet_term_and_prior():
 
 def test_places_share_their_votes():
     once, often = soles_at(room(3), frames=1), soles_at([(0.0, -3.0)], frames=50)
-    votes = vote(joined(once, Soles(often.points_cam, often.person, often.frame + 3, ())), "places")
+    votes = vote(
+        joined(once, FootContacts(often.points_cam, often.person, often.frame + 3, ())), "places"
+    )
     stood, walked = votes.weight[12:].sum(), votes.weight[:4].sum()
     assert len(votes.place_of.unique()) == 4
     assert 2 < stood / walked < 6

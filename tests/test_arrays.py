@@ -8,9 +8,10 @@ import tiny_capture as tiny
 import torch
 from test_folder import close
 
-from mover.readers import ObjectArrays, PeopleArrays, capture_from_arrays, read_capture
-from mover.records import InputError
-from mover.types import Capture
+from mover.core.errors import InputError
+from mover.core.types import Capture
+from mover.io.capture.arrays import ObjectArrays, PeopleArrays, capture_from_arrays
+from mover.io.capture.folder import read_capture
 
 STEP = {"vertices": tiny.STEP, "faces": tiny.STEP_FACES}
 

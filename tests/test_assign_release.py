@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mover.stages.assign_release import Candidates, decide_by_release
+from mover.stages.contacts.contact_association import Candidates, decide_by_release
 
 H, W = 40, 60
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import tiny_capture as tiny
 
-from mover.readers import read_capture
-from mover.records import InputError
+from mover.core.errors import InputError
+from mover.io.capture.folder import read_capture
 
 NAN = float("nan")
 

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 from tiny_capture import write_capture
 
-from mover.batch import BatchPlan, captures_in, jobs_of, names_of, run_batch, write_summary
-from mover.batch_engines import EngineOptions, RayOptions, SlurmOptions
-from mover.batch_job import earlier, run_job
-from mover.records import InputError
+from mover.app.batch import BatchPlan, captures_in, jobs_of, names_of, run_batch, write_summary
+from mover.app.batch.engines import EngineOptions, RayOptions, SlurmOptions
+from mover.app.batch.job import earlier, run_job
+from mover.core.errors import InputError
 
 FAKE = """
 import json, os, sys, time
@@ -77,9 +77,21 @@ def run_here(plan: BatchPlan, workers: int = 2, **more: object) -> list[str]:
     return [outcome.state for outcome in outcomes]
 
 
-def test_each_way_to_fail_leaves_its_own_clear_record(tmp_path: Path):
+class Clock:
+    """Stands still until all captures but one have ended; then the limit of the last is over."""
+
+    def __init__(self, out: Path, others: int) -> None:
+        self.out, self.others = out, others
+
+    def monotonic(self) -> float:
+        ended = [*self.out.glob("failures/*.json"), *self.out.glob("*/batch.json")]
+        return 100.0 if len(ended) >= self.others else 0.0
+
+
+def test_each_way_to_fail_leaves_its_own_clear_record(tmp_path: Path, monkeypatch):
     ways = {0: "refuse", 1: "crash", 2: "slow", 3: "killed", 4: "silent"}
     plan = plan_of(tmp_path, fakes(tmp_path, 7, ways), limit=1.5)
+    monkeypatch.setattr("mover.app.batch.job.time", Clock(plan.out, 6))
     found = run_here(plan)
     assert found == ["failed"] * 5 + ["done"] * 2
     records = list(failures(tmp_path).values())
@@ -133,8 +145,8 @@ def test_a_result_that_lost_a_file_is_made_again(tmp_path: Path):
 BATCH = """
 import sys
 from pathlib import Path
-from mover.batch import BatchPlan, captures_in, run_batch
-from mover.batch_engines import EngineOptions
+from mover.app.batch import BatchPlan, captures_in, run_batch
+from mover.app.batch.engines import EngineOptions
 folder = Path(sys.argv[1])
 command = (sys.executable, "-S", "-E", str(folder / "fake.py"), "{capture}", "{out}")
 plan = BatchPlan(captures_in(folder / "captures"), folder / "out", command, "settings", 4.0)
@@ -172,6 +184,7 @@ def test_forty_captures_survive_a_kill_half_way_and_three_bad_ones(tmp_path: Pat
     assert len(twice) <= 4  # those that ran when the batch was killed
 
 
+@pytest.mark.slow
 def test_a_killed_batch_takes_its_processes_along(tmp_path: Path):
     fakes(tmp_path, 1, {0: "slow"})
     root = Path(__file__).parents[1]

@@ -9,12 +9,12 @@ import torch
 
 from mover.bodies import load_model
 from mover.bodies.skinning import open_body, zero_pose
+from mover.core.errors import InputError
+from mover.core.types import BodyPose
 from mover.geometry.rotations import axis_angle
-from mover.readers import read_capture
-from mover.readers.bodies_file import read_bodies, write_bodies
-from mover.readers.pose_file import into_camera
-from mover.records import InputError
-from mover.types import BodyPose
+from mover.io.capture.bodies_file import read_bodies, write_bodies
+from mover.io.capture.folder import read_capture
+from mover.io.capture.pose_file import into_camera
 
 ROWS = 3
 
@@ -174,7 +174,7 @@ class Puppet:
 
 
 def test_the_root_turns_about_the_pelvis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mover.readers.pose_file.load_model", lambda *_: Puppet())
+    monkeypatch.setattr("mover.io.capture.pose_file.load_model", lambda *_: Puppet())
     given = {**parameters(), "model": np.array("smplx")}
     world, _ = told(save(tmp_path, **{**rows(), "space": np.array("world")}, **given))
     found = into_camera(world, torch.from_numpy(tiny.rotation(-0.3, 0.1, 0.8)).float())

@@ -5,6 +5,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import build as builder
 import numpy as np
 import pytest
 import torch
@@ -13,11 +14,12 @@ from figures import ARMS_DOWN, SEATED, pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mover.assets import build_open_body as builder
-from mover.bodies import BODY_MODELS, BodyModel, load_model, open_body, zero_pose
+from mover.bodies import BODY_MODELS, BodyModel, load_model
 from mover.bodies.skeleton import BODY, HANDS, JOINTS, PARENTS
+from mover.bodies.skinning import ASSETS, open_body, zero_pose
+from mover.core.errors import InputError
+from mover.core.records import map_tensors
 from mover.geometry.rotations import axis_angle
-from mover.records import InputError, map_tensors
 
 DETAILS = ("small", "full")
 HEIGHT = 1.70  # [m], of the mean body
@@ -276,11 +278,11 @@ def test_the_shipped_files_are_what_the_script_builds(tmp_path: Path):
     except InputError as error:
         pytest.skip(str(error))
     subprocess.run(
-        [sys.executable, "-m", "mover.assets.build_open_body", "--wheel", wheel, "--out", tmp_path],
+        [sys.executable, builder.__file__, "--wheel", wheel, "--out", tmp_path],
         check=True, capture_output=True,
     )  # fmt: skip
     for name in ("open_body.npz", "open_body_small.npz"):
-        shipped = np.load(Path(builder.__file__).parent / name)
+        shipped = np.load(ASSETS / name)
         built = np.load(tmp_path / name)
         assert set(shipped.files) == set(built.files)
         for key in shipped.files:
@@ -291,5 +293,6 @@ def test_the_shipped_files_are_what_the_script_builds(tmp_path: Path):
 
 
 def test_both_files_together_are_small():
-    folder = Path(builder.__file__).parent
-    assert sum(f.stat().st_size for f in folder.glob("open_body*.npz")) < 2_000_000
+    sizes = [f.stat().st_size for f in ASSETS.glob("open_body*.npz")]
+    assert len(sizes) == 2
+    assert sum(sizes) < 2_000_000

@@ -8,11 +8,9 @@ from figures import STRIDE, people, pose, turned
 from scipy.ndimage import distance_transform_edt
 from test_find_depth import CAMERA, SIZE, masks_of, moved
 
-from mover.geometry.runs import decode
-from mover.readers.masks import encode
-from mover.stages.body_extents import compare_extents, pixels_of
-from mover.stages.person_masks import mask_table
-from mover.types import Masks
+from mover.core.types import Masks
+from mover.geometry.rle import decode, encode
+from mover.stages.masks import compare_extents, mask_table, pixels_of
 
 NOBODY = Masks(*SIZE, ())
 UPRIGHT = {"left_shoulder": (0.0, 0.0, -1.45), "right_shoulder": (0.0, 0.0, 1.45)}

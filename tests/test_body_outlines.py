@@ -6,13 +6,13 @@ import pytest
 import torch
 from analytic import FACES, box_verts
 
+from mover.core.types import Camera
+from mover.energy.body_terms.outline import POINTS, Outline, outline_term
 from mover.geometry.camera import project
-from mover.geometry.raster import Views, layers
-from mover.rooms.render import encode
-from mover.stages.body_outlines import Seen, gather_outlines
-from mover.stages.person_masks import MaskTable
-from mover.terms.body_outline import POINTS, Outline, outline_term
-from mover.types import Camera
+from mover.geometry.raster import Crops, layers
+from mover.stages.masks import MaskTable
+from mover.stages.people.body_outlines import Seen, gather_outlines
+from mover_bench.rooms.render import encode
 
 K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 CAMERA = Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0])), 640, 480)
@@ -26,7 +26,7 @@ def seen_box(x: float, front: torch.Tensor = NOTHING, deep: float = 4.0) -> Seen
 
 
 def drawn(seen: Seen) -> torch.Tensor:
-    return layers(seen.verts, seen.faces, Views(K[None], 480, 640)).front[0].isfinite()
+    return layers(seen.verts, seen.faces, Crops(K[None], 480, 640)).front[0].isfinite()
 
 
 def table_of(mask: torch.Tensor | None) -> MaskTable:

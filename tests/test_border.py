@@ -7,23 +7,23 @@ import torch
 from analytic import GROUND, make_inputs
 from test_priced import agree, room, starts_of
 
-from mover.energy import HumanCues, SceneConfig, SceneWeights, best_borders, scene_energy
-from mover.energy_warp import pricing
+from mover.core.types import Layout
+from mover.energy.config import Adam, SceneConfig, SceneWeights
+from mover.energy.fused.energy import energy_function
+from mover.energy.objective import HumanCues, best_borders, of_objects, scene_energy, some_objects
+from mover.energy.terms.bbox import SEEN, bbox_term
+from mover.energy.terms.border import PRICE, borders_of, fit_borders
+from mover.energy.terms.silhouette import silhouette_term
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import place
-from mover.geometry.raster import Topology, Views, look
-from mover.minimize import Adam
-from mover.presets import ROBUST
-from mover.stages.coarser import coarser_image
-from mover.stages.find_image_cues import ImageConfig, ImageInputs, find_image_cues
-from mover.stages.fixed_borders import fixed_borders
-from mover.stages.place_objects import PlaceInputs, place_objects
-from mover.stages.some_objects import some_image, some_objects
-from mover.stages.starts import alone
-from mover.terms.bbox import SEEN, bbox_term
-from mover.terms.border import PRICE, borders_of, fit_borders
-from mover.terms.silhouette import silhouette_term
-from mover.types import Layout
+from mover.geometry.raster import Crops, Topology, look
+from mover.pipeline.presets import ROBUST
+from mover.stages.camera.refine_camera import fixed_borders
+from mover.stages.config import ImageConfig
+from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
+from mover.stages.objects.place_inputs import PlaceInputs, coarser_image
+from mover.stages.objects.place_objects import place_objects
+from mover.stages.objects.starts import alone
 
 SHIFTS = (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
 WEIGHTS = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
@@ -170,7 +170,7 @@ class TestKernel:
     def test_values_and_gradients_are_those_of_the_terms(self, size, amount):
         pytest.importorskip("warp")
         inputs = loosened(room(size))
-        fast = pricing(*rest_of(inputs), ROBUSTLY)
+        fast = energy_function(*rest_of(inputs), ROBUSTLY)
         layout = starts_of(inputs, 5, amount)
         assert fast(layout).whole is not None
         for term in (None, "bbox", "silhouette"):
@@ -185,7 +185,9 @@ class TestKernel:
         names = ("bbox", "silhouette")
 
         def fit(image):
-            parts = pricing(inputs.objects, inputs.camera, image, inputs.humans, ROBUSTLY)(layout)
+            parts = energy_function(inputs.objects, inputs.camera, image, inputs.humans, ROBUSTLY)(
+                layout
+            )
             return torch.stack([parts.parts[n].detach() for n in names])
 
         each = torch.stack([
@@ -209,7 +211,8 @@ class TestKernel:
         inputs = room()
         layout = starts_of(inputs)
         free, bound = (
-            pricing(*rest_of(i), config)(layout).parts["bbox"] for i in (loosened(inputs), inputs)
+            energy_function(*rest_of(i), config)(layout).parts["bbox"]
+            for i in (loosened(inputs), inputs)
         )
         assert torch.equal(free, bound)
         slow = scene_energy(layout, *rest_of(loosened(inputs)), config).parts["bbox"]
@@ -235,7 +238,7 @@ class TestParts:
         rows = torch.tensor([7, 2, 3, 3])
         index = rows % 3
         few = Layout(*(getattr(layout, f.name).flatten(0, 1)[rows] for f in fields(Layout)))
-        objects, image = some_objects(inputs.objects, rows), some_image(inputs.image, index)
+        objects, image = some_objects(inputs.objects, rows), of_objects(inputs.image, index, 3)
         found = scene_energy(few, objects, inputs.camera, image, HumanCues(), ROBUSTLY)
         whole = scene_energy(layout, inputs.objects, inputs.camera, inputs.image, HumanCues(),
                              ROBUSTLY)  # fmt: skip
@@ -287,7 +290,7 @@ def seen_room(grow, hide):
     true = Layout(*(getattr(inputs.starts, f.name)[0, 2:] for f in fields(Layout)))
     camera = inputs.camera
     verts = to_camera(place(cabinet.verts, true), camera.R_cam_world)
-    views = Views(camera.K[None], camera.height, camera.width)
+    views = Crops(camera.K[None], camera.height, camera.width)
     drawn, _ = look(verts, Topology(cabinet.faces, cabinet.edges), views, depth=False)
     mask = drawn[0] > 0.5
     if grow:
@@ -306,7 +309,7 @@ def seen_room(grow, hide):
     )  # fmt: skip
     room = replace(
         inputs, objects=cabinet, starts=alone(true), humans=HumanCues(), reference=true.yaw,
-        image=some_image(inputs.image, torch.tensor([2])),
+        image=of_objects(inputs.image, torch.tensor([2]), 3),
     )  # fmt: skip
     return room, lambda config: find_image_cues(seen, config)
 
@@ -316,7 +319,7 @@ def test_an_object_whose_base_is_hidden_is_placed_nearer_to_the_truth_if_borders
     inputs, cues = seen_room(grow, hide=True)
     config = replace(
         ROBUST.layout, weights=WEIGHTS, method=Adam(120, 0.03, 0.002, beta2=0.98, keep_best=True),
-        yaws=1, distances=(), short=Adam(0), keep=1,
+        yaws=1, distances=(), short=Adam(0), num_hypotheses=1,
     )  # fmt: skip
     true = inputs.starts.t_world_object[0]
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from mover.core.types import Mesh, SceneObject
 from mover.geometry.boxes import Box, box_of, corners, iou2d, iou3d
-from mover.geometry.placement import place_piece
+from mover.geometry.placement import place_object
 from mover.geometry.rotations import rot_y
-from mover.types import Mesh, Piece
 
 
 def as_solid(box: Box, index: int) -> manifold3d.Manifold:
@@ -105,7 +105,7 @@ def test_the_box_of_a_piece_has_the_corners_of_its_placed_box_mesh():
     verts = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3) * torch.tensor([1.0, 2.0, 0.5])
     faces = torch.tensor([[0, 1, 2], [3, 4, 5], [5, 6, 7]])
     unused = torch.full((1, 3), 50.0)
-    piece = Piece(
+    piece = SceneObject(
         id="shelf_0",
         category="shelf",
         mesh=Mesh(torch.cat([verts, unused]), faces),
@@ -118,7 +118,7 @@ def test_the_box_of_a_piece_has_the_corners_of_its_placed_box_mesh():
     )
     box = box_of(piece)
     torch.testing.assert_close(box.size, torch.tensor([1.5, 1.0, 1.0]))
-    torch.testing.assert_close(corners(box), place_piece(piece).verts[:8])
+    torch.testing.assert_close(corners(box), place_object(piece).verts[:8])
 
 
 def test_iou_of_image_boxes():

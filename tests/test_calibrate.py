@@ -5,13 +5,13 @@ from pathlib import Path
 
 import torch
 
-from mover.calibration import GROWING, MISFIT
-from mover.explanation import explain, held, ways_of
-from mover.explanation_records import Facts
+from mover.core.explanation import Facts
+from mover.evaluate.calibration import GROWING, MISFIT
+from mover.evaluate.explanation import explain, ways_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-from calibrate_learn import Judged, in_turn, learn
+from calibrate_learn import Judged, held, in_turn, learn
 
 FACTORS = {"distance": 0.5, "sideways": 0.2, "yaw": 0.4, "size": 0.3}
 POWERS = {"distance": 1.0, "sideways": 2.0, "yaw": 1.5, "size": 0.0}

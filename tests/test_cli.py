@@ -1,4 +1,7 @@
+import errno
+import functools
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -7,8 +10,11 @@ import numpy as np
 import pytest
 import tiny_capture
 
-from mover import commands
-from mover.presets import PRESETS
+from mover.app import cli
+from mover.app.cli.run import parse_run
+from mover.app.results import read_config
+from mover.core.records import plain
+from mover.pipeline.presets import OLD_NAMES, PRESETS
 
 
 def call(*arguments, cwd=None):
@@ -20,12 +26,12 @@ def call(*arguments, cwd=None):
 
 def test_help_names_every_command_and_imports_nothing_heavy():
     code = (
-        "import sys; sys.argv = ['mover', '--help']; from mover.cli import main; main();"
+        "import sys; sys.argv = ['mover', '--help']; from mover.app.cli import main; main();"
         "heavy = {'torch', 'numpy', 'tyro', 'scipy', 'trimesh'} & set(sys.modules);"
         "assert not heavy, heavy"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    for name in ("demo", "check", "run", "evaluate", "experiment", "export", "settle", "batch"):
+    for name in ("demo", "check", "run", "evaluate", "experiment", "export", "simulate", "batch"):
         assert f"  {name} " in found.stdout
 
 
@@ -39,14 +45,45 @@ def test_an_unknown_command_is_answered_with_the_known_ones():
 def test_flags_change_a_preset_wherever_they_stand(before):
     flags, preset = ["--place.weights.depth", "80"], ["--preset", "paper"]
     order = [*flags, *preset] if before else [*preset, *flags]
-    args, config = commands.parse_run(["capture", *order])
+    args, config = parse_run(["capture", *order])
     assert args.source == Path("capture")
     assert config.place.weights.depth == 80
     assert config.place.method == PRESETS["paper"].place.method
 
 
+FLAGS = {bool: "--no-{}", int: "--{}=7", float: "--{}=0.25"}  # another value than `robust` has
+INSIDE = {"soles": "--{}.points=7", "touches": "--{}.no-given"}  # of groups of settings
+
+
+@pytest.mark.parametrize(("old", "new"), OLD_NAMES.items())
+def test_an_old_flag_does_what_the_present_one_does_and_says_its_name(old, new, capsys):
+    before = functools.reduce(getattr, new.split("."), PRESETS["robust"])
+    flag = INSIDE.get(old) or FLAGS[type(before)]
+    _, config = parse_run(["capture", *flag.format(old).split("=")])
+    assert f"is called {flag.format(new).split('=')[0]} now" in capsys.readouterr().err
+    for present in (flag.format(new), flag.format(new).replace("_", "-")):
+        _, expected = parse_run(["capture", present])
+        assert config == expected != PRESETS["robust"]
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_run_of_before_gives_its_settings_and_says_their_names(preset, tmp_path, caplog):
+    tree = plain(PRESETS[preset])
+    for old, new in OLD_NAMES.items():
+        *stage, key = new.split(".")
+        settings = tree[stage[0]] if stage else tree
+        settings[old.rpartition(".")[2]] = settings.pop(key)
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps({"config": tree}))
+    assert read_config(path) == PRESETS[preset]
+    assert len(caplog.messages) == len(OLD_NAMES)
+    for old, new in OLD_NAMES.items():
+        assert f"{path}: config.{old} is called config.{new} now" in caplog.messages
+
+
 def test_a_wrong_preset_is_answered_with_the_known_ones(capsys):
-    assert commands.run_command("run", ["capture", "--preset", "best"]) == 2
+    assert cli.run_command("run", ["capture", "--preset", "best"]) == 2
     assert "paper, release, robust" in capsys.readouterr().err
 
 
@@ -57,7 +94,7 @@ def folder(tmp_path):
 
 
 def check(folder):
-    return commands.run_command("check", [str(folder), "--out", str(folder.parent / "check.png")])
+    return cli.run_command("check", [str(folder), "--out", str(folder.parent / "check.png")])
 
 
 def test_check_draws_a_picture_and_lists_every_object(folder, capsys):
@@ -88,5 +125,78 @@ def test_nan_in_the_bodies_is_named(folder, capsys):
 
 
 def test_a_missing_folder_is_named(capsys):
-    assert commands.run_command("run", [str(Path("nowhere"))]) == 2
+    assert cli.run_command("run", [str(Path("nowhere"))]) == 2
     assert "nowhere" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("old", "new"), sorted(cli.ALIASES.items()))
+def test_a_command_of_before_works_and_says_its_new_name(old, new, capsys):
+    with pytest.raises(SystemExit) as done:
+        cli.run_command(old, ["--help"])
+    assert done.value.code == 0
+    found = capsys.readouterr()
+    assert f"mover {old} is called mover {new} now" in found.err
+    assert f"usage: mover {new}" in found.out
+
+
+def test_a_file_as_the_folder_of_results_is_one_sentence(folder, tmp_path, capsys):
+    (tmp_path / "out").write_text("mine")
+    assert cli.run_command("run", [str(folder), "--out", str(tmp_path / "out")]) == 2
+    found = capsys.readouterr().err.strip().splitlines()[-1]
+    assert found.startswith(f"mover run: {tmp_path / 'out'}")
+    assert found.endswith("what was finished is kept")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_a_full_disk_is_one_sentence_and_loses_nothing(folder, tmp_path, capsys, monkeypatch):
+    out, real, written = tmp_path / "out", os.replace, []
+
+    def fills(source, target):
+        if len(written) == 4:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
+        written.append(Path(target))
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", fills)
+    assert cli.run_command("run", [str(folder), "--out", str(out)]) == 2
+    assert "No space left on device" in capsys.readouterr().err
+    assert all(path.exists() for path in written)
+    assert not list(out.rglob(".*-*"))
+
+
+LIGHT = """
+import contextlib, io, sys
+from mover.app.cli import COMMANDS, run_command
+from mover.app.cli import main
+
+def silent(call):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        try:
+            call()
+        except SystemExit as end:
+            return end.code
+    return None
+
+for name in COMMANDS:
+    assert silent(lambda: run_command(name, ["--help"])) == 0, name
+    assert "torch" not in sys.modules, name
+    assert silent(lambda: run_command(name, ["--no-such-flag"])) == 2, name
+    assert "torch" not in sys.modules, name
+for words in (["import", "nosuch", "path", "--out", "x"], ["import-bodies", "nosuch", "path"],
+              ["run", "x", "--preset", "nosuch"], ["run", "x", "--format", "nosuch"],
+              ["check", "x", "--format", "nosuch"], ["export", "x", "--to", "nosuch"]):
+    assert (silent(lambda: run_command(words[0], words[1:])) or 2) == 2, words
+    assert "torch" not in sys.modules, words
+assert {"numpy", "scipy", "trimesh", "warp"}.isdisjoint(sys.modules)
+"""
+
+
+def test_help_and_mistyped_names_of_every_command_import_nothing_heavy():
+    found = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_an_unknown_format_is_answered_with_the_known_ones(command, capsys):
+    assert cli.run_command(command, ["capture", "--format", "nope"]) == 2
+    assert "--format: 'nope' is none of folder, total3d" in capsys.readouterr().err

@@ -13,14 +13,16 @@ from little_room import camera
 from make_smpl import make_model, write_npz
 from test_pipeline import light
 
-from mover import commands, records
-from mover.bodies import open_body, rest_pose
+from mover.app import cli
+from mover.bodies.skinning import open_body
 from mover.bodies.smpl_files import load_smpl
-from mover.readers.bodies_file import read_bodies, write_bodies
-from mover.readers.fields import write_json
-from mover.readers.mesh_file import write_mesh
-from mover.readers.scene_file import write_scene
-from mover.types import Bodies, Mesh, Piece, Scene
+from mover.bodies.smpl_model import rest_pose
+from mover.core import records
+from mover.core.types import Bodies, Mesh, Scene, SceneObject
+from mover.io.capture.bodies_file import read_bodies, write_bodies
+from mover.io.capture.scene_file import write_scene
+from mover.io.files.fields import write_json
+from mover.io.files.meshes import write_mesh
 
 GROUND = -1.4
 FAR = 0.06  # share by which somebody seems too far away: they then sink into the floor
@@ -50,7 +52,7 @@ def standing(far: float, frames: int = 3, name: str = "makehuman") -> Bodies:
 def finished(out: Path, bodies: Bodies | None) -> Path:
     """A result: a box on a floor, and people."""
     mesh = Mesh(box_verts((0.5, 0.5, 0.5)).float(), FACES)
-    box = Piece(
+    box = SceneObject(
         "box_0", "stool", mesh, "", None, "ground", torch.tensor([1.0, GROUND, -3.0]),
         torch.tensor(0.0), torch.ones(3),
     )  # fmt: skip
@@ -70,7 +72,7 @@ def test_refine_lifts_people_out_of_the_floor_and_says_how_wrong_they_were(tmp_p
     out = finished(tmp_path / "out", standing(FAR))
     truth = finished(tmp_path / "truth", standing(0.0))
     before = (out / "bodies.npz").read_bytes()
-    answer = commands.run_command("refine", [str(out), "--truth", str(truth), "--rounds", "2"])
+    answer = cli.run_command("refine", [str(out), "--truth", str(truth), "--rounds", "2"])
     assert answer == 0
     assert (out / "bodies.npz").read_bytes() == before
     found = read_bodies(out / "refined" / "bodies.npz")
@@ -83,13 +85,13 @@ def test_refine_lifts_people_out_of_the_floor_and_says_how_wrong_they_were(tmp_p
 
 def test_without_the_floor_nobody_is_lifted(tmp_path):
     out = finished(tmp_path / "out", standing(FAR))
-    assert commands.run_command("refine", [str(out), "--no-camgp", "--rounds", "1"]) == 0
+    assert cli.run_command("refine", [str(out), "--no-camgp", "--rounds", "1"]) == 0
     assert lowest(read_bodies(out / "refined" / "bodies.npz")).max() < -0.02
 
 
 def test_a_result_without_people_is_refused_and_nothing_is_written(tmp_path, capsys):
     out = finished(tmp_path / "out", None)
-    assert commands.run_command("refine", [str(out)]) != 0
+    assert cli.run_command("refine", [str(out)]) != 0
     assert "nobody to refine" in capsys.readouterr().err
     assert not (out / "refined").exists()
 
@@ -98,7 +100,7 @@ def test_bodies_of_a_licensed_model_are_refined_with_their_parameters(tmp_path, 
     write_npz(make_model("smplx"), tmp_path / "models" / "smplx" / "SMPLX_NEUTRAL.npz")
     monkeypatch.setenv("MOVER_BODY_MODELS", str(tmp_path / "models"))
     out = finished(tmp_path / "out", standing(FAR, 2, "smplx"))
-    assert commands.run_command("refine", [str(out), "--rounds", "1"]) == 0
+    assert cli.run_command("refine", [str(out), "--rounds", "1"]) == 0
     found = read_bodies(out / "refined" / "bodies.npz")
     assert found.pose is not None
     assert found.pose.model == "smplx"
@@ -115,7 +117,7 @@ def test_contacts_of_another_tool_become_contacts_npz(tmp_path, capsys):
     np.save(tmp_path / "deco.npy", chance)
     out = tmp_path / "contacts.npz"
     flags = ["--source", str(tmp_path / "deco.npy"), "--out", str(out)]
-    answer = commands.run_command("contacts", ["files", str(tmp_path / "bodies.npz"), *flags])
+    answer = cli.run_command("contacts", ["files", str(tmp_path / "bodies.npz"), *flags])
     assert answer == 0
     np.testing.assert_array_equal(np.load(out)["probability"], chance)
     assert "1 of 3 bodies touch something" in capsys.readouterr().out
@@ -123,7 +125,7 @@ def test_contacts_of_another_tool_become_contacts_npz(tmp_path, capsys):
 
 def test_contacts_without_their_source_name_the_missing_flag(tmp_path, capsys):
     write_bodies(standing(0.0), tmp_path / "bodies.npz")
-    assert commands.run_command("contacts", ["files", str(tmp_path / "bodies.npz")]) != 0
+    assert cli.run_command("contacts", ["files", str(tmp_path / "bodies.npz")]) != 0
     assert "--source" in capsys.readouterr().err
 
 
@@ -132,17 +134,18 @@ def test_a_run_ends_with_the_people_that_refine_would_give(tmp_path, small_room)
     """The room is the same, and its people are those of `mover refine` on the plain result."""
     from docs_desk import thinned
 
-    from mover.readers.folder import write_capture
-    from mover.rooms.noise import NoiseConfig, add_noise
+    from mover.io.capture.folder import write_capture
+    from mover_bench.rooms.config import NoiseConfig
+    from mover_bench.rooms.noise import add_noise
 
     write_capture(thinned(add_noise(small_room, NoiseConfig(), 1)), tmp_path / "capture")
     write_json({"config": records.plain(light("robust"))}, tmp_path / "config.json")
     out = tmp_path / "out"
     run = [str(tmp_path / "capture"), "--out", str(out), "--config", str(tmp_path / "config.json")]
-    assert commands.run_command("run", run) == 0
+    assert cli.run_command("run", run) == 0
     scene, given = (out / "scene.json").read_bytes(), read_bodies(out / "bodies.npz")
-    assert commands.run_command("refine", [str(out)]) == 0
-    assert commands.run_command("run", [*run, "--refine"]) == 0
+    assert cli.run_command("refine", [str(out)]) == 0
+    assert cli.run_command("run", [*run, "--refine"]) == 0
     found, wanted = (read_bodies(out / name) for name in ("bodies.npz", "refined/bodies.npz"))
     torch.testing.assert_close(found.verts, wanted.verts, atol=2e-3, rtol=0)
     assert (found.verts - given.verts).norm(dim=-1).median() > 0.01

@@ -6,7 +6,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
+import raster_torch
 import torch
+from nearest_torch import nearest_torch
 from pretended import Asked, Elsewhere, asking_nothing, kernels_elsewhere, registered
 from sm90 import ptx_of
 from test_pipeline import light
@@ -15,21 +17,26 @@ from test_raster_warp import pulled, scene
 from test_volume import sphere
 
 import mover.geometry
-from mover import commands
-from mover import minimize as descent
-from mover.devices import CPU, device_of, named
-from mover.energy import SceneConfig, SceneWeights, scene_energy
-from mover.geometry import raster_torch, raster_warp
-from mover.geometry.nearest_warp import clouds, nearest, nearest_torch
-from mover.geometry.raster import Views, layers
-from mover.geometry.volume import grid_around, sample, sample_torch, union_bodies
-from mover.minimize import Adam, Energy, minimize
-from mover.pipeline import reconstruct
-from mover.records import InputError, record, to_device
-from mover.results import write_results
-from mover.run import Run
-from mover.stages.place_objects import PlaceConfig, energy_of, place_objects
-from mover.types import Layout
+from mover.app import cli
+from mover.app.results import write_results
+from mover.core.devices import CPU, device_of, named
+from mover.core.errors import InputError
+from mover.core.observe import Energy
+from mover.core.records import record, to_device
+from mover.core.run import Run
+from mover.core.types import Layout
+from mover.energy import minimize as descent
+from mover.energy.config import Adam, SceneConfig, SceneWeights
+from mover.energy.minimize import minimize
+from mover.energy.objective import scene_energy
+from mover.geometry.nearest_warp import clouds, nearest
+from mover.geometry.raster import Crops, layers
+from mover.geometry.raster import warp as raster_warp
+from mover.geometry.volume import grid_around, sample, sample_torch
+from mover.geometry.volume_warp import union_bodies
+from mover.pipeline.reconstruct import reconstruct
+from mover.stages.config import PlaceConfig
+from mover.stages.objects.place_objects import energy_of, place_objects
 
 pytest.importorskip("warp")
 GPU = pytest.param("cuda", marks=pytest.mark.gpu)
@@ -93,8 +100,8 @@ class TestGeometry:
         )
         for values, expected in zip(found, truth, strict=True):
             assert torch.equal(values.cpu(), expected)
-        seen = layers(there[0][None], there[1], Views(there[2][None], 50, 40))
-        exact = raster_torch.layers(inputs[0][None], inputs[1], Views(inputs[2][None], 50, 40))
+        seen = layers(there[0][None], there[1], Crops(there[2][None], 50, 40))
+        exact = raster_torch.layers(inputs[0][None], inputs[1], Crops(inputs[2][None], 50, 40))
         for values, expected in ((seen.front, exact.front), (seen.exit, exact.exit)):
             torch.testing.assert_close(values.cpu(), expected, atol=1e-5, rtol=0)
 
@@ -116,13 +123,12 @@ class TestGeometry:
     @pytest.mark.slow
     def test_every_module_of_kernels_that_a_gpu_runs_compiles_for_an_h100(self, tmp_path):
         folder = Path(mover.geometry.__file__).parent
-        text = "".join(p.read_text() for p in folder.glob("*.py") if p.stem != "raster_warp_cpu")
+        text = "".join(p.read_text() for p in folder.rglob("*.py"))
         names = set(re.findall(r'kernels\("(\w+)", name_of', text)) | {
             "bodies",
-            "crossings",
             "lower",
         }
-        assert {"grid", "exits", "nearest", "lookup", "price", "reach"} < names
+        assert {"grid", "exits", "nearest", "lookup"} < names
         for name in sorted(names):
             (tmp_path / name).mkdir()
             ptx_of(name, tmp_path / name)
@@ -189,7 +195,14 @@ def test_a_whole_placing_ends_where_it_ends_on_the_cpu(device, monkeypatch):
         monkeypatch.setattr(descent, "stepper", replayed)
     inputs = replace(room(32), starts=starts_of(room(32), 1))
     config = PlaceConfig(
-        WEIGHTS, "robust", ADAM, yaws=2, short=Adam(3, 0.03), keep=1, tie=1.0, apart=0.3
+        WEIGHTS,
+        "robust",
+        ADAM,
+        yaws=2,
+        short=Adam(3, 0.03),
+        num_hypotheses=1,
+        yaw_prior_weight=1.0,
+        apart=0.3,
     )
     here = place_objects(inputs, config)
     found = to_device(place_objects(to_device(inputs, device), config), "cpu")
@@ -232,7 +245,8 @@ def calm(config):
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["robust", "release"])
 def test_the_main_job_ends_where_it_ends_on_the_cpu(device, preset, small_room, tmp_path):
-    from mover.rooms.noise import NoiseConfig, add_noise
+    from mover_bench.rooms.config import NoiseConfig
+    from mover_bench.rooms.noise import add_noise
 
     capture, config = add_noise(small_room, NoiseConfig(), 1), calm(light(preset, steps=4))
     here, there = (
@@ -244,8 +258,8 @@ def test_the_main_job_ends_where_it_ends_on_the_cpu(device, preset, small_room, 
     log = json.loads((run.folder / "run.json").read_text())
     assert log["device"] == named(device)
     assert all(stage["kept"] for stage in log["stages"])
-    assert all(piece.t_world_object.device == CPU for piece in there.scene.pieces)
-    places = (torch.stack([p.t_world_object for p in x.scene.pieces]) for x in (here, there))
+    assert all(piece.t_world_object.device == CPU for piece in there.scene.objects)
+    places = (torch.stack([p.t_world_object for p in x.scene.objects]) for x in (here, there))
     off = (next(places) - next(places)).abs()
     doubt = torch.stack([e.facts.covariance.diagonal()[:3].sqrt() for e in here.explanations])
     assert off[:, 1].max() <= 0.005
@@ -266,7 +280,7 @@ class TestChoice:
         self, monkeypatch, tmp_path, capsys
     ):
         monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-        code = commands.run_command("run", [str(tmp_path / "none"), "--device", "cuda"])
+        code = cli.run_command("run", [str(tmp_path / "none"), "--device", "cuda"])
         assert code == 2
         assert "mover run: --device cuda: torch" in capsys.readouterr().err
 

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 import tyro
 
-from mover import commands, results
-from mover.cli import COMMANDS
-from mover.presets import PRESETS
+from mover.app import results
+from mover.app.cli import COMMANDS, command_of
+from mover.pipeline.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -79,7 +79,7 @@ def _only_parse(monkeypatch: pytest.MonkeyPatch):
 
 def parse(name: str, words: list[str]) -> None:
     with pytest.raises(ParsedError):
-        commands._COMMANDS[name](words)
+        command_of(name)(words)
 
 
 @pytest.mark.usefixtures("_only_parse")
@@ -92,11 +92,12 @@ def test_a_command_in_a_block_is_understood(line: str):
 
 ELSEWHERE = """
 import json, sys, tyro
-from mover import commands_share, results
-from mover.presets import PRESETS
+from mover.app import results
+from mover.app.cli import batch
+from mover.pipeline.presets import PRESETS
 results.read_config = lambda path: PRESETS["robust"]
 for words in json.loads(sys.argv[1]):
-    commands_share._parse_batch(words)
+    batch._parse_batch(words)
 """
 
 
@@ -113,7 +114,7 @@ def test_batches_in_blocks_are_understood():
 def help_of(name: str) -> str:
     text = io.StringIO()
     with contextlib.redirect_stdout(text), pytest.raises(SystemExit):
-        commands._COMMANDS[name](["--help"])
+        command_of(name)(["--help"])
     return text.getvalue()
 
 
@@ -141,4 +142,4 @@ def test_there_are_commands_to_check():
 def test_a_wrong_command_would_be_found(line: str):
     name, *words = words_of(line)
     with pytest.raises(SystemExit), contextlib.redirect_stderr(io.StringIO()):
-        commands._COMMANDS[name](words)
+        command_of(name)(words)

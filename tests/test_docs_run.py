@@ -19,7 +19,7 @@ import pytest
 from docs_desk import write_desk
 from test_docs_commands import FENCE, PAGES, indented, words_of
 
-from mover.commands import run_command
+from mover.app.cli import run_command
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("default")]  # transformers warns
 for needed in ("transformers", "av", "viser", "mujoco", "pxr"):

@@ -9,7 +9,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from mover.presets import PRESETS
+from mover.pipeline.presets import PRESETS
 
 DOCS = Path(__file__).parents[1] / "docs"
 LOADS = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}

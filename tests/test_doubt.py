@@ -8,9 +8,9 @@ from analytic import make_inputs
 from figures import SEATED, people, pose
 
 from mover.bodies.parts import parts_of
-from mover.readers.masks import encode
-from mover.stages.doubt import DoubtInputs, doubts
-from mover.types import Masks, People
+from mover.core.types import Masks, People
+from mover.geometry.rle import encode
+from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
 
 
 def inputs_with(seated, touches=None, masks=None):
@@ -20,27 +20,27 @@ def inputs_with(seated, touches=None, masks=None):
         room.starts, t_world_object=room.starts.t_world_object[0], yaw=room.starts.yaw[0],
         log_scale=room.starts.log_scale[0],
     )  # fmt: skip
-    return DoubtInputs(
+    return DiagnosticInputs(
         bodies, parts_of(bodies), masks, room.camera, room.objects, layout, touches,
         torch.full((6,), seated),
     )  # fmt: skip
 
 
 def test_a_person_who_sits_on_nothing_is_named():
-    (text,) = doubts(inputs_with(seated=False))
+    (text,) = diagnostics(inputs_with(seated=False))
     assert "person 0 sits on nothing in 6 bodies" in text
     assert "missing" in text
 
 
 def test_a_person_who_sits_on_something_gives_no_warning():
-    assert doubts(inputs_with(seated=True)) == ()
+    assert diagnostics(inputs_with(seated=True)) == ()
 
 
 @pytest.mark.parametrize(("lift", "side"), [(0.2, "above"), (-0.2, "below")])
 def test_a_seat_of_another_height_than_its_sitters_is_named(lift, side):
     touches = make_inputs(size=16).humans.touches
     moved = replace(touches, points=touches.points + torch.tensor([0.0, lift, 0.0]))
-    (text,) = doubts(inputs_with(seated=True, touches=moved))
+    (text,) = diagnostics(inputs_with(seated=True, touches=moved))
     assert text.startswith("stool: its sitters touch 20 cm " + side)
 
 
@@ -57,5 +57,5 @@ def test_hidden_legs_are_named():
                       torch.zeros(18, dtype=torch.long), {}),
         seated_on=torch.ones(18, dtype=torch.bool),
     )  # fmt: skip
-    (text,) = doubts(many)
+    (text,) = diagnostics(many)
     assert "lower body of person 0 is hidden" in text

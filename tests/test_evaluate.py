@@ -10,8 +10,11 @@ import pytest
 import torch
 from judged import CAMERA, FAST, GROUND, SELF_CONTAINED, cuboid, moved, pair, people, piece, room
 
-from mover.bodies.world import in_world
-from mover.evaluate import (
+from mover.bodies.corrected import in_world
+from mover.core.errors import InputError
+from mover.core.types import SceneObject
+from mover.evaluate.bodies import soles_of
+from mover.evaluate.evaluation import (
     METRICS,
     EvaluatedBodies,
     evaluate,
@@ -19,13 +22,10 @@ from mover.evaluate import (
     table,
     touch_in_truth,
 )
+from mover.evaluate.scene import unmatched
 from mover.geometry.camera import tilted, to_camera
-from mover.metrics_bodies import soles_of
-from mover.metrics_pairs import unmatched
-from mover.readers.bodies_file import write_bodies
-from mover.readers.scene_file import write_scene
-from mover.records import InputError
-from mover.types import Piece
+from mover.io.capture.bodies_file import write_bodies
+from mover.io.capture.scene_file import write_scene
 
 
 def test_the_truth_scores_best_in_every_metric() -> None:
@@ -52,7 +52,7 @@ def test_the_truth_scores_best_in_every_metric() -> None:
     ],
 )
 def test_a_larger_fault_never_scores_better(
-    names: tuple[str, ...], change: Callable[[Piece, int], Piece]
+    names: tuple[str, ...], change: Callable[[SceneObject, int], SceneObject]
 ) -> None:
     truth = piece(cuboid(0.6, 0.9, 0.45), (-0.5, GROUND, -2.8), 0.1)
     rows = []
@@ -67,7 +67,7 @@ def test_a_larger_fault_never_scores_better(
 
 def test_a_missing_object_scores_zero_in_both_overlaps_and_nothing_else() -> None:
     truth = room()
-    fewer = replace(truth, pieces=truth.pieces[1:])
+    fewer = replace(truth, objects=truth.objects[1:])
     metrics = evaluate(fewer, truth, truth, config=FAST)
     assert metrics["objects"][0]["initial"] == {"iou3d": 0.0, "iou2d": 0.0}
     assert metrics["initial"]["iou3d"] == pytest.approx(2 / 3)
@@ -76,15 +76,17 @@ def test_a_missing_object_scores_zero_in_both_overlaps_and_nothing_else() -> Non
 
 def test_objects_that_the_truth_does_not_know_cost_nothing() -> None:
     truth = room()
-    extra = replace(truth, pieces=(*truth.pieces, piece(cuboid(1, 1, 1), (3, GROUND, -3), 0, "x")))
+    extra = replace(
+        truth, objects=(*truth.objects, piece(cuboid(1, 1, 1), (3, GROUND, -3), 0, "x"))
+    )
     assert evaluate(extra, extra, truth, config=FAST) == evaluate(truth, truth, truth, config=FAST)
 
 
 def test_missed_and_false_objects_are_named_and_a_missed_one_counts_as_nothing_found() -> None:
     truth = room()
-    ghost = replace(moved(truth.pieces[0], 0.1, 0, 0), id="ghost")
-    given = replace(truth, pieces=(*truth.pieces[1:], ghost))
-    names = [p.id for p in truth.pieces]
+    ghost = replace(moved(truth.objects[0], 0.1, 0, 0), id="ghost")
+    given = replace(truth, objects=(*truth.objects[1:], ghost))
+    names = [p.id for p in truth.objects]
     assert unmatched(given, given, truth) == {"missed": [], "false": []}
     known = unmatched(given, given, truth, by_place=False)
     assert known == {"missed": names[:1], "false": ["ghost"]}
@@ -98,7 +100,7 @@ def test_missed_and_false_objects_are_named_and_a_missed_one_counts_as_nothing_f
 
 def test_what_lacks_its_truth_is_absent() -> None:
     scene, bodies = room(), people()
-    blind = replace(scene, ground=None, pieces=())
+    blind = replace(scene, ground=None, objects=())
     bare = replace(bodies, joints=None, joint_names=())
     metrics = evaluate(scene, scene, blind, EvaluatedBodies(None, bodies, None), FAST)
     assert set(metrics["initial"]) == {"pitch_error", "roll_error"}
@@ -150,7 +152,7 @@ def test_bodies_in_the_camera_frame_are_taken_to_the_world_of_their_scene() -> N
 
 def test_the_folder_gives_the_same_numbers_and_writes_them(tmp_path: Path) -> None:
     truth, bodies = room(), people()
-    wrong = replace(truth, pieces=tuple(moved(p, 0.2, 0, 0) for p in truth.pieces))
+    wrong = replace(truth, objects=tuple(moved(p, 0.2, 0, 0) for p in truth.objects))
     out, true = tmp_path / "out", tmp_path / "truth"
     write_scene(truth, true / "scene.json")
     write_scene(truth, out / "scene.json")
@@ -210,9 +212,9 @@ def test_the_result_keeps_the_partners_of_the_initial_scene() -> None:
     left, right = (
         piece(cuboid(0.5, 0.9, 0.5), (x, GROUND, -3), 0, n) for x, n in ((-1, "l"), (1, "r"))
     )
-    truth = replace(scene, pieces=(left, right))
-    initial = replace(scene, pieces=(replace(left, id="p"), replace(right, id="q")))
-    crossed = replace(scene, pieces=(replace(right, id="p"), replace(left, id="q")))
+    truth = replace(scene, objects=(left, right))
+    initial = replace(scene, objects=(replace(left, id="p"), replace(right, id="q")))
+    crossed = replace(scene, objects=(replace(right, id="p"), replace(left, id="q")))
     metrics = evaluate(initial, crossed, truth, config=FAST)
     assert metrics["initial"]["iou3d"] == pytest.approx(1)
     assert metrics["result"]["center_error"] == pytest.approx(2)
@@ -222,8 +224,8 @@ def test_a_seat_in_the_way_of_a_standing_person_costs_non_collision() -> None:
     scene, bodies = room(), people(1)
     feet = bodies.verts[0].mean(0).double()
     block = piece(cuboid(0.6, 0.5, 0.6), (float(feet[0]), GROUND, float(feet[2])), 0, "block")
-    hit = replace(scene, pieces=(block,))
-    free = replace(scene, pieces=(moved(block, 3, 0, 0),))
+    hit = replace(scene, objects=(block,))
+    free = replace(scene, objects=(moved(block, 3, 0, 0),))
     everyone = EvaluatedBodies(bodies, bodies, bodies)
     metrics = evaluate(hit, free, free, everyone, FAST)
     height = bodies.verts[0, :, 1] - GROUND
@@ -238,7 +240,7 @@ def test_a_seat_in_the_way_of_a_standing_person_costs_non_collision() -> None:
 
 def test_one_side_by_itself_and_a_known_touch_of_the_truth_change_no_number() -> None:
     scene, bodies = room(), people(3)
-    wrong = replace(scene, pieces=tuple(moved(p, 0.1, 0, 0.05) for p in scene.pieces))
+    wrong = replace(scene, objects=tuple(moved(p, 0.1, 0, 0.05) for p in scene.objects))
     alone = EvaluatedBodies(None, bodies, bodies)
     whole = evaluate(wrong, scene, scene, EvaluatedBodies(bodies, bodies, bodies), FAST)
     known = replace(alone, touch=touch_in_truth(scene, alone, FAST))

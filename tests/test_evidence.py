@@ -6,9 +6,10 @@ import pytest
 import tiny_capture as tiny
 from scipy.ndimage import binary_erosion
 
-from mover.readers import ObjectArrays, PeopleArrays, capture_from_arrays, read_capture
-from mover.readers.evidence import BORDER, evidence_table, gather_evidence
-from mover.types import Capture
+from mover.core.types import Capture
+from mover.io.capture.arrays import ObjectArrays, PeopleArrays, capture_from_arrays
+from mover.io.capture.evidence import BORDER, evidence_table, gather_evidence
+from mover.io.capture.folder import read_capture
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 100.0
 CAMERA = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": 80.0, "cy": 60.0}

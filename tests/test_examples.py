@@ -19,7 +19,7 @@ def test_a_capture_is_made_from_arrays(capsys: pytest.CaptureFixture[str]):
     import capture_from_arrays
 
     capture = capture_from_arrays.main()
-    assert [piece.id for piece in capture.scene.pieces] == ["table_0"]
+    assert [piece.id for piece in capture.scene.objects] == ["table_0"]
     assert capture.detections[0].mask is not None
     assert "table_0" in capsys.readouterr().out
 
@@ -28,13 +28,13 @@ def test_a_run_from_python_puts_the_table_on_its_mask(tmp_path: Path):
     import capture_from_arrays
     import run_from_python
 
-    from mover.metrics_scene import image_box
+    from mover.evaluate.scene import image_box
 
     room = run_from_python.main(tmp_path, steps=30)
     given = capture_from_arrays.make_capture()
 
     def miss(scene):
-        seen = image_box(scene.pieces[0], scene.camera)
+        seen = image_box(scene.objects[0], scene.camera)
         size = torch.tensor([320.0, 240, 320, 240])
         return float((seen.float() * size - given.detections[0].box).abs().max())
 
@@ -67,7 +67,7 @@ def test_the_better_scene_is_measured_as_better():
 def test_the_gallery_shows_a_piece_and_somebody_who_sits_on_it():
     import gallery
 
-    from mover.rooms.motion import Task
+    from mover_bench.rooms.motion import Task
 
     play = gallery.played(gallery.one("chair", 0, 1), (Task("sit", 0),))
     frames = gallery.first_run(play.done.labels, "sit")
@@ -79,21 +79,23 @@ def test_the_gallery_shows_a_piece_and_somebody_who_sits_on_it():
     assert len(colours) > 500
 
 
+@pytest.mark.slow
 def test_the_picture_of_the_readme_shows_before_beside_after(tmp_path: Path, small_room):
     import dataclasses
 
     import picture
     from PIL import Image
 
-    from mover.readers.bodies_file import write_bodies
-    from mover.readers.folder import write_capture
-    from mover.readers.scene_file import write_scene
-    from mover.results import initial_bodies
-    from mover.rooms.noise import NoiseConfig, add_noise
+    from mover.app.results import initial_bodies
+    from mover.io.capture.bodies_file import write_bodies
+    from mover.io.capture.folder import write_capture
+    from mover.io.capture.scene_file import write_scene
+    from mover_bench.rooms.config import NoiseConfig
+    from mover_bench.rooms.noise import add_noise
 
     capture = add_noise(small_room, NoiseConfig(), 1)
-    first = next(p for p in small_room.truth.pieces if p.id == capture.scene.pieces[0].id)
-    scene = dataclasses.replace(capture.scene, pieces=(first, *capture.scene.pieces[1:]))
+    first = next(p for p in small_room.truth.objects if p.id == capture.scene.objects[0].id)
+    scene = dataclasses.replace(capture.scene, objects=(first, *capture.scene.objects[1:]))
     write_capture(capture, tmp_path / "capture")
     write_scene(scene, tmp_path / "room" / "scene.json")
     for name in ("initial_bodies.npz", "bodies.npz"):

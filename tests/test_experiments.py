@@ -11,38 +11,37 @@ import judged
 import little_room
 import pytest
 import torch
+from pandas import DataFrame
 from PIL import Image
 
-from mover import records
-from mover.commands import run_command
-from mover.evaluate import EvaluateConfig
-from mover.experiments import pictures
-from mover.experiments.job import DONE, ROOM, Job, Trial, rebuild, store_room
-from mover.experiments.page import Line, fill_page
-from mover.experiments.queue import start
-from mover.experiments.run import (
-    ExperimentArgs,
-    parse_seeds,
-    run_experiment,
-)
-from mover.experiments.tables import mean_of
-from mover.experiments.traits import Traits, hidden_shares
-from mover.experiments.variants import Variant
+from mover.app.cli import run_command
+from mover.core import records
+from mover.core.errors import InputError
+from mover.core.observe import Step
+from mover.core.types import Camera, Capture, Detection, Masks, Scene
+from mover.energy.config import Adam
+from mover.evaluate.evaluation import EvaluateConfig
 from mover.geometry.camera import to_camera
-from mover.geometry.placement import place_piece
+from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
-from mover.minimize import Adam, Step
-from mover.presets import PRESETS, Config
-from mover.readers.masks import encode, tight_box
-from mover.types import Camera, Capture, Detection, Masks, Scene
+from mover.geometry.rle import encode, tight_box
+from mover.pipeline.presets import PRESETS, Config
+from mover_bench.studies import pictures, tables
+from mover_bench.studies.args import ExperimentArgs
+from mover_bench.studies.job import DONE, ROOM, Job, rebuild, store_room
+from mover_bench.studies.measures import Traits, Trial, hidden_shares
+from mover_bench.studies.queue import start
+from mover_bench.studies.run import parse_seeds, run_experiment
+from mover_bench.studies.tables import fill_page, means
+from mover_bench.studies.variants import Variant
 
 FEW = EvaluateConfig(samples=200, bodies=2)
 
 
 def true_scene() -> Scene:
     scene = little_room.room()
-    pieces = [replace(p, annotation=i) for i, p in enumerate(scene.pieces[:2])]
-    return replace(scene, pieces=tuple(pieces))
+    pieces = [replace(p, annotation=i) for i, p in enumerate(scene.objects[:2])]
+    return replace(scene, objects=tuple(pieces))
 
 
 def small(camera: Camera) -> Camera:
@@ -54,8 +53,8 @@ def small(camera: Camera) -> Camera:
 def detections(scene: Scene) -> tuple[Detection, ...]:
     """Each object alone in the image."""
     camera, found = scene.camera, []
-    for index, piece in enumerate(scene.pieces):
-        mesh = place_piece(piece)
+    for index, piece in enumerate(scene.objects):
+        mesh = place_object(piece)
         verts = to_camera(mesh.verts, camera.R_cam_world)
         mask = first_hit(verts, mesh.faces, camera.K, (camera.height, camera.width))[1] >= 0
         coded = Masks(camera.height, camera.width, (encode(mask),))
@@ -69,7 +68,7 @@ def trial(shift: float = 0.2) -> Trial:
     truth = replace(truth, camera=small(truth.camera))
     guess = tuple(
         replace(p, t_world_object=p.t_world_object + torch.tensor([shift, 0.0, -shift]))
-        for p in truth.pieces
+        for p in truth.objects
     )
     initial = Scene(small(little_room.camera(-0.25, 0.02)), None, guess)
     people = records.map_tensors(
@@ -85,7 +84,7 @@ def trial(shift: float = 0.2) -> Trial:
     capture = Capture(
         "two boxes", initial, None, detections(truth), None, None, shown, None, None, ()
     )
-    traits = tuple(Traits(p.id, p.category, i == 0, 0.5 * i) for i, p in enumerate(truth.pieces))
+    traits = tuple(Traits(p.id, p.category, i == 0, 0.5 * i) for i, p in enumerate(truth.objects))
     return Trial(capture, truth, shown, traits)
 
 
@@ -95,13 +94,15 @@ def quick(config: Config) -> Config:
     return replace(
         config,
         image=replace(config.image, size=32),
-        layout=replace(config.layout, method=few, first=Adam(0), short=Adam(0), yaws=1, keep=1),
+        layout=replace(
+            config.layout, method=few, first=Adam(0), short=Adam(0), yaws=1, num_hypotheses=1
+        ),
         place=replace(config.place, method=few, first=Adam(0)),
         refine=replace(config.refine, rounds=0),
         gather=replace(config.gather, cells=16, workers=1),
         prepare=replace(config.prepare, cells=16, samples=100),
         correct_depth=False,
-        again=0,
+        outer_iterations=0,
     )
 
 
@@ -160,7 +161,7 @@ class TestSeeds:
 
     @pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-2", "1..3", "1,,2", "²"])
     def test_anything_else_is_refused(self, text: str) -> None:
-        with pytest.raises(records.InputError, match="--seeds"):
+        with pytest.raises(InputError, match="--seeds"):
             parse_seeds(text)
 
 
@@ -263,6 +264,7 @@ def test_pictures_of_rooms_that_a_study_did_not_keep_are_the_same(finished, tmp_
         assert (args.out / name).read_bytes() == (finished[0].out / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_failure_is_told_and_tried_again(finished, tmp_path: Path) -> None:
     args = replace(finished[0], out=tmp_path / "out")
     shutil.copytree(finished[0].out, args.out)
@@ -279,6 +281,7 @@ def test_a_failure_is_told_and_tried_again(finished, tmp_path: Path) -> None:
     assert not (folder / "failure.json").exists()
 
 
+@pytest.mark.slow
 def test_a_finished_job_of_other_sources_is_done_again_unless_kept(
     finished, tmp_path: Path
 ) -> None:
@@ -345,7 +348,7 @@ def test_running_jobs_are_stopped_when_the_user_stops(tmp_path: Path) -> None:
 @pytest.mark.parametrize("copied", [True, False])
 def test_a_job_is_a_process_whose_last_words_are_kept(copied, tmp_path, monkeypatch) -> None:
     if not copied:
-        monkeypatch.setattr("mover.experiments.processes.can_fork", lambda: False)
+        monkeypatch.setattr("mover.app.batch.runner.can_fork", lambda: False)
     job = Job("rooms", 0, "paper", tmp_path)
     process = start(job)
     assert process.wait() == 1
@@ -367,15 +370,26 @@ def test_the_command_names_what_it_does_not_know(flags, said, tmp_path, capsys) 
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words", [["--seeds", "0"], ["study", "camera"]])
+def test_a_missing_extra_is_one_sentence_before_anything_runs(
+    words, tmp_path, capsys, monkeypatch
+) -> None:
+    monkeypatch.setattr(tables, "find_spec", lambda name: None if name == "matplotlib" else name)
+    assert run_command("experiment", [*words, "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "matplotlib is not installed; pip install '.[bench]' in mover's folder" in said
+    assert not list(tmp_path.iterdir())
+
+
 def test_shares_that_others_hide_agree_with_a_plain_count() -> None:
-    behind, before = true_scene().pieces
+    behind, before = true_scene().objects
     wall = little_room.piece("wall_0", little_room.box(4.0, 3.0, 0.1), (2.0, -2.0), 0.0, -1.5)
-    scene = replace(true_scene(), pieces=(behind, before, wall))
+    scene = replace(true_scene(), objects=(behind, before, wall))
     camera = little_room.camera()
     zoom = torch.tensor([0.75, 0.75, 1.0])
     depths = []
-    for piece in scene.pieces:
-        mesh = place_piece(piece)
+    for piece in scene.objects:
+        mesh = place_object(piece)
         verts = to_camera(mesh.verts, camera.R_cam_world)
         depths.append(first_hit(verts, mesh.faces, camera.K * zoom[:, None], (270, 480))[0])
     for index, share in enumerate(hidden_shares(scene)):
@@ -387,9 +401,9 @@ def test_shares_that_others_hide_agree_with_a_plain_count() -> None:
 
 def test_what_nobody_can_see_is_hidden() -> None:
     scene = true_scene()
-    lost = replace(scene.pieces[0], t_world_object=torch.tensor([0.0, -1.5, 9.0]))
-    assert hidden_shares(replace(scene, pieces=(lost,))) == (1.0,)
-    assert hidden_shares(replace(scene, pieces=())) == ()
+    lost = replace(scene.objects[0], t_world_object=torch.tensor([0.0, -1.5, 9.0]))
+    assert hidden_shares(replace(scene, objects=(lost,))) == (1.0,)
+    assert hidden_shares(replace(scene, objects=())) == ()
 
 
 def test_means_leave_out_what_is_missing() -> None:
@@ -398,7 +412,7 @@ def test_means_leave_out_what_is_missing() -> None:
         {"object": "b", "iou3d": 0.4, "p2s": 0.1, "yaw_error": 0.1},
         {"object": "c", "iou3d": 0.0},
     ]
-    found = mean_of(rows)
+    found = means("objects", DataFrame(rows).assign(preset="", stage="full")).iloc[0]
     assert found["iou3d"] == pytest.approx(0.2)
     assert found["p2s"] == pytest.approx(0.1)
     assert found["yaw_error"] == pytest.approx(0.55)
@@ -407,7 +421,8 @@ def test_means_leave_out_what_is_missing() -> None:
 
 def test_the_page_speaks_of_centimetres_and_degrees() -> None:
     values = {"iou3d": 0.5, "p2s": 0.123, "pitch_error": math.radians(0.25), "ground_error": 0.02}
-    page = fill_page("mover experiment", "", [Line("rooms", "paper", "full", 2, values)], [])
+    line = {"over": "rooms", "preset": "paper", "stage": "full", "count": 2, **values}
+    page = fill_page("mover experiment", "", DataFrame([line]), [])
     head, row = (
         [cell.strip() for cell in line.split("|")[1:-1]]
         for line in page.splitlines()

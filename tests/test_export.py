@@ -14,9 +14,9 @@ import trimesh
 from little_room import box, camera, piece, room, walkers
 from PIL import Image
 
-from mover.export import write_glb
-from mover.geometry.placement import place_piece
-from mover.types import Piece, Scene
+from mover.core.types import Scene, SceneObject
+from mover.geometry.placement import place_object
+from mover.io.export.scene_glb import write_glb
 
 
 def placed(path: Path, name: str) -> trimesh.Trimesh:
@@ -37,7 +37,7 @@ def tree_of(path: Path) -> dict[str, Any]:
     return json.loads(raw[20 : 20 + struct.unpack("<I", raw[12:16])[0]])
 
 
-def with_file(file: Path) -> Piece:
+def with_file(file: Path) -> SceneObject:
     given = piece("chair_0", box(0.5, 0.9, 0.5), (0.4, -3.0), 0.7, -1.5)
     return dataclasses.replace(given, mesh_file=str(file), scale=torch.tensor([1.2, 0.8, 1.0]))
 
@@ -54,15 +54,15 @@ def textured() -> trimesh.Trimesh:
 def test_objects_are_nodes_of_their_ids_where_they_stand(tmp_path: Path):
     scene = room()
     path = write_glb(scene, None, tmp_path / "scene.glb")
-    for given in scene.pieces:
-        truth = place_piece(given).verts.numpy()
+    for given in scene.objects:
+        truth = place_object(given).verts.numpy()
         assert placed(path, given.id).bounds == pytest.approx(
             np.stack([truth.min(0), truth.max(0)]), abs=1e-5
         )
 
 
 def test_a_node_holds_the_placement_and_its_mesh_keeps_its_own_frame(tmp_path: Path):
-    turned = dataclasses.replace(room().pieces[0], scale=torch.tensor([1.2, 0.8, 1.0]))
+    turned = dataclasses.replace(room().objects[0], scale=torch.tensor([1.2, 0.8, 1.0]))
     path = write_glb(Scene(camera(), None, (turned,)), None, tmp_path / "scene.glb")
     node = next(n for n in tree_of(path)["nodes"] if n.get("name") == "chair_0")
     matrix = np.array(node["matrix"]).reshape(4, 4).T
@@ -116,7 +116,7 @@ def test_the_floor_is_level_under_everything_and_faces_up(tmp_path: Path):
     floor = placed(write_glb(scene, None, tmp_path / "scene.glb"), "ground")
     assert floor.bounds[:, 1] == pytest.approx([scene.ground, scene.ground])
     assert np.allclose(floor.face_normals, [0, 1, 0])
-    stands = torch.cat([place_piece(p).verts for p in scene.pieces]).numpy()
+    stands = torch.cat([place_object(p).verts for p in scene.objects]).numpy()
     assert (floor.bounds[0, [0, 2]] < stands.min(0)[[0, 2]]).all()
     assert (floor.bounds[1, [0, 2]] > stands.max(0)[[0, 2]]).all()
 

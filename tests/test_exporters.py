@@ -21,22 +21,19 @@ from furnished import (
 )
 from little_room import walkers
 
-import mover.exporters.pxr_modules
-from mover.bodies import open_body
-from mover.commands import run_command
-from mover.exporters import (
-    EXPORTERS,
-    Finished,
-    export_bodies,
-    export_glb,
-    export_objects,
-    export_usd,
-    read_finished,
-)
-from mover.exporters.keyframes import keyframes
-from mover.geometry.placement import place_piece
-from mover.records import InputError
-from mover.types import Bodies, BodyPose, Piece, Scene
+import mover.io.export.usd
+from mover.app.cli import run_command
+from mover.bodies.skinning import open_body
+from mover.core.errors import InputError
+from mover.core.types import Bodies, BodyPose, Scene, SceneObject
+from mover.geometry.placement import place_object
+from mover.io.export.amass import export_bodies
+from mover.io.export.finished import Finished, read_finished
+from mover.io.export.glb import export_glb
+from mover.io.export.people import keyframes
+from mover.io.export.scene_glb import export_objects
+from mover.io.export.usd import export_usd
+from mover.io.formats import chosen
 
 TYPES = {5126: np.float32, 5125: np.uint32, 5123: np.uint16, 5121: np.uint8}
 WIDTH = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -45,17 +42,17 @@ WIDTH = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 def scaled(scene: Scene) -> Scene:
     pieces = [
         dataclasses.replace(p, scale=torch.tensor([1.2, 0.9, 1.1]) + 0.05 * k)
-        for k, p in enumerate(scene.pieces)
+        for k, p in enumerate(scene.objects)
     ]
-    return dataclasses.replace(scene, pieces=tuple(pieces))
+    return dataclasses.replace(scene, objects=tuple(pieces))
 
 
 def finished(tmp_path: Path, bodies: Bodies | None = None) -> Finished:
     return read_finished(write_out(tmp_path / "out", scaled(furnished()), bodies))
 
 
-def world(piece: Piece) -> np.ndarray:
-    verts = place_piece(piece).verts.numpy()
+def world(piece: SceneObject) -> np.ndarray:
+    verts = place_object(piece).verts.numpy()
     return np.stack([verts.min(0), verts.max(0)])
 
 
@@ -249,7 +246,7 @@ def test_the_validator_of_gltf_finds_nothing(tmp_path: Path):
 def test_trimesh_opens_the_file_with_the_objects_in_place(tmp_path: Path):
     home = finished(tmp_path, two_people(4))
     scene = trimesh.load_scene(export_glb(home, tmp_path).files[0])
-    for piece in home.scene.pieces:
+    for piece in home.scene.objects:
         node = next(n for n in scene.graph.nodes_geometry if n.startswith(f"{piece.id}_mesh"))
         transform, name = scene.graph[node]
         part = scene.geometry[name].copy().apply_transform(transform)
@@ -293,7 +290,7 @@ class TestUsd:
 
         assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
         assert UsdGeom.GetStageUpAxis(stage) == "Y"
-        for piece in self.home.scene.pieces:
+        for piece in self.home.scene.objects:
             mesh = stage.GetPrimAtPath(f"/room/{piece.id}/mesh")
             points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get(), float)
             matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh))
@@ -343,10 +340,10 @@ def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path: Path):
     box.export(tmp_path / "box.glb")
     scene = furnished(("chair",))
     pieces = [
-        dataclasses.replace(scene.pieces[0], id=name, mesh_file=str(tmp_path / "box.glb"))
+        dataclasses.replace(scene.objects[0], id=name, mesh_file=str(tmp_path / "box.glb"))
         for name in ("0-chair.a", "0-chair_a")
     ]
-    home = Finished(tmp_path, dataclasses.replace(scene, pieces=tuple(pieces)), None, None)
+    home = Finished(tmp_path, dataclasses.replace(scene, objects=tuple(pieces)), None, None)
     stage = Usd.Stage.Open(str(export_usd(home, tmp_path / "usd").files[0]))
     ids = {p.GetCustomDataByKey("mover:id") for p in stage.Traverse()} - {None}
     assert ids == {"0-chair.a", "0-chair_a"}
@@ -391,13 +388,15 @@ def test_bodies_without_parameters_are_refused_with_the_way_out(tmp_path: Path):
 def test_single_objects_stand_in_the_world_in_both_formats(tmp_path: Path):
     home = finished(tmp_path)
     files = export_objects(home, tmp_path).files
-    assert len(files) == 2 * len(home.scene.pieces)
-    for k, piece in enumerate(home.scene.pieces):
+    assert len(files) == 2 * len(home.scene.objects)
+    for k, piece in enumerate(home.scene.objects):
         for file in files[2 * k : 2 * k + 2]:
             found = trimesh.load_mesh(file)
             assert found.bounds == pytest.approx(world(piece), abs=1e-5), file
             assert found.area == pytest.approx(
-                trimesh.Trimesh(*(x.numpy() for x in dataclasses.astuple(place_piece(piece)))).area,
+                trimesh.Trimesh(
+                    *(x.numpy() for x in dataclasses.astuple(place_object(piece)))
+                ).area,
                 rel=1e-4,
             )
 
@@ -416,7 +415,7 @@ def test_a_folder_without_a_result_is_refused(tmp_path: Path, capsys):
 
 
 def test_without_usd_core_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(mover.exporters.pxr_modules, "find_spec", lambda _: None)
+    monkeypatch.setattr(mover.io.export.usd, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=r"\.\[usd\]"):
         export_usd(finished(tmp_path), tmp_path)
 
@@ -424,8 +423,8 @@ def test_without_usd_core_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch)
 def test_a_second_export_gives_the_same_bytes(tmp_path: Path):
     home = finished(tmp_path, two_people(5))
     for name in ("glb", "ply", "bodies"):
-        one = EXPORTERS[name](home, tmp_path / "a").files
-        two = EXPORTERS[name](home, tmp_path / "b").files
+        one = chosen("--to", name, "export")(home, tmp_path / "a").files
+        two = chosen("--to", name, "export")(home, tmp_path / "b").files
         assert [f.read_bytes() for f in one] == [f.read_bytes() for f in two]
 
 

@@ -7,11 +7,12 @@ import pytest
 import torch
 from test_pipeline import light, run_in
 
+from mover.core.types import Capture, Masks, Mesh
 from mover.geometry.camera import to_camera
-from mover.geometry.runs import decode
-from mover.rooms.noise import NoiseConfig, add_noise
-from mover.rooms.render import encode
-from mover.types import Capture, Masks, Mesh
+from mover.geometry.rle import decode
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.render import encode
 
 pytestmark = pytest.mark.slow
 GROWN = 8  # 480 x 270 to 3,840 x 2,160
@@ -24,16 +25,16 @@ def capture(small_room) -> Capture:
 
 def changed(capture: Capture, **fields: object) -> Capture:
     """The capture with its first object changed."""
-    first, *rest = capture.scene.pieces
+    first, *rest = capture.scene.objects
     pieces = (replace(first, **fields), *rest)
-    return replace(capture, scene=replace(capture.scene, pieces=pieces))
+    return replace(capture, scene=replace(capture.scene, objects=pieces))
 
 
 def ends_finite(capture: Capture, folder: Path) -> list[torch.Tensor]:
     """Where a short run puts everything; all of it is finite."""
     room = run_in(folder, capture, light("robust", steps=5))
     found = [torch.tensor(room.scene.ground), room.scene.camera.R_cam_world]
-    for piece in room.scene.pieces:
+    for piece in room.scene.objects:
         found += [piece.t_world_object, piece.yaw, piece.scale]
     for value in found:
         assert value.isfinite().all()

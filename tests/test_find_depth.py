@@ -7,22 +7,28 @@ import pytest
 import torch
 from figures import ARMS_DOWN, AT_TABLE, SEATED, STRIDE, people, pose
 
-from mover.bodies import open_body
 from mover.bodies.parts import parts_of
+from mover.bodies.skinning import open_body
+from mover.core.types import Bodies, Camera, Masks, People
 from mover.geometry.camera import tilted
-from mover.geometry.raster import Views, layers
-from mover.readers.masks import encode
-from mover.stages.body_extents import Extents
-from mover.stages.depth_peak import BENT, COMMON, FULL, NEAR, SYSTEMATIC, Peak, peak_of
-from mover.stages.find_depth import (
-    DepthConfig,
+from mover.geometry.raster import Crops, layers
+from mover.geometry.rle import encode
+from mover.stages.config import DepthConfig
+from mover.stages.masks import Extents
+from mover.stages.people.find_depth import (
+    BENT,
+    COMMON,
+    FULL,
+    NEAR,
+    SYSTEMATIC,
     DepthFactors,
     DepthInputs,
+    Peak,
     apply_depth,
     find_depth,
+    peak_of,
     pelvis,
 )
-from mover.types import Bodies, Camera, Masks, People
 
 SIZE = (360, 640)
 K = torch.tensor([[520.0, 0, 320], [0, 520, 180], [0, 0, 1]])
@@ -55,7 +61,7 @@ def spots(n=8, seed=0):
 
 
 def masks_of(bodies, hidden=None, grow=0):
-    views = Views(K.expand(len(bodies.verts), 3, 3), *SIZE)
+    views = Crops(K.expand(len(bodies.verts), 3, 3), *SIZE)
     drawn = layers(bodies.verts, bodies.faces, views).front.isfinite()
     if grow:
         grown = torch.nn.functional.max_pool2d(grow * drawn.float(), 3, 1, 1)
@@ -200,7 +206,7 @@ class TestOverlapAndHeight:
     LOST = Peak(1.0, math.inf, FULL, ("0 of at least 3 bodies are seen well enough",))
 
     def told(self, monkeypatch, peak, heights):
-        module = "mover.stages.find_depth."
+        module = "mover.stages.people.find_depth."
         monkeypatch.setattr(module + "_curves", lambda *_: torch.zeros(0, QUICK.factors))
         monkeypatch.setattr(module + "peak_of", lambda *_: peak)
         monkeypatch.setattr(module + "compare_extents", lambda *_: heights)

@@ -8,16 +8,27 @@ import torch
 from test_find_depth import CAMERA, SIZE, film, inputs_of, masks_of, moved, table
 from torch.nn.functional import pad
 
-from mover import records
-from mover.experiments.study import STUDIES, StudyArgs, ask_of
-from mover.experiments.variants import VARIANTS
-from mover.minimize import Step
-from mover.pipeline import people_of
-from mover.presets import PRESETS, ROBUST, Config
-from mover.rooms.noise import NoiseConfig, add_noise
-from mover.run import Run
-from mover.stages.find_focal import Focal, FocalConfig, FocalInputs, best_shift, find_focal, zoomed
-from mover.stages.zoom_fit import OFFSET, Sightings, fit_zoom
+from mover.core import records
+from mover.core.observe import Step
+from mover.core.run import Run
+from mover.pipeline.presets import PRESETS, ROBUST, Config
+from mover.pipeline.reconstruct import people_of
+from mover.stages.camera.find_focal import (
+    OFFSET,
+    Focal,
+    FocalInputs,
+    Sightings,
+    best_shift,
+    find_focal,
+    fit_zoom,
+    zoomed,
+)
+from mover.stages.config import FocalConfig
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.noise import add_noise
+from mover_bench.studies.args import StudyArgs
+from mover_bench.studies.study import STUDIES, ask_of
+from mover_bench.studies.variants import VARIANTS
 
 WIDE = [(x, z) for z in (-3.6, -4.6) for x in (-1.6, -1.0, -0.4, 0.4, 1.0, 1.6)]
 LOOSE = FocalConfig(spread=0.05)

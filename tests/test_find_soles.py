@@ -10,10 +10,15 @@ import torch
 from figures import ARMS_DOWN, SEATED, STRIDE, people, pose, turned
 
 from mover.bodies.parts import parts_of
+from mover.core.types import Bodies, Camera
 from mover.geometry.camera import pitch_roll, tilted
-from mover.stages.align_camera import AlignInputs, align_camera
-from mover.stages.find_soles import SolesConfig, SolesInputs, find_soles, straight_legs
-from mover.types import Bodies, Camera
+from mover.stages.camera.align_camera import AlignInputs, align_camera
+from mover.stages.camera.find_foot_contacts import (
+    FootContactInputs,
+    find_foot_contacts,
+    straight_legs,
+)
+from mover.stages.config import FootContactConfig
 
 SHARED = Path(__file__).parents[2] / "shared"
 PITCH, ROLL, GROUND = math.radians(-12), math.radians(2), -1.5
@@ -52,8 +57,8 @@ def filmed(*parts, fps=5.0, person=None):
 
 def soles_of(bodies, camera=None, keep=None, config=None):
     keep = torch.ones(len(bodies.frame), dtype=torch.bool) if keep is None else keep
-    inputs = SolesInputs(bodies, parts_of(bodies), keep, camera or camera_off(3.0, -3.0))
-    return find_soles(inputs, config or SolesConfig())
+    inputs = FootContactInputs(bodies, parts_of(bodies), keep, camera or camera_off(3.0, -3.0))
+    return find_foot_contacts(inputs, config or FootContactConfig())
 
 
 def heights_of(soles):
@@ -85,7 +90,7 @@ def test_the_camera_is_levelled_by_the_standing_feet_of_a_sitter():
 def test_the_standing_leg_of_a_stride_carries_and_the_lifted_one_does_not():
     bodies = filmed(at({**STRIDE, "right_knee": (0.9, 0.0, 0.0)}, SPOTS))
     straight = straight_legs(
-        bodies, parts_of(bodies), camera_off().R_cam_world[:, 1], SolesConfig()
+        bodies, parts_of(bodies), camera_off().R_cam_world[:, 1], FootContactConfig()
     )
     assert straight[:, 0].all()
     assert not straight[:, 1].any()
@@ -137,7 +142,7 @@ def test_a_mesh_that_is_no_person_gives_its_lowest_points(caplog):
     rows = torch.arange(4)
     bodies = Bodies(verts, faces, None, (), rows, rows * 0, 5.0, "camera", None)
     with caplog.at_level(logging.ERROR):
-        soles = soles_of(bodies, config=SolesConfig(points=3))
+        soles = soles_of(bodies, config=FootContactConfig(points=3))
     assert heights_of(soles).abs().max() < 1e-5
 
 

@@ -10,23 +10,30 @@ import torch
 from make_keypoints import CAMERA, as_bodies, leg_columns, seen, walker
 from make_smpl import make_model, write_npz
 
-from mover.bodies import load_smpl, open_body, zero_pose
 from mover.bodies.keypoints import keypoints_of
-from mover.fitting import FitConfig, FitInputs, fit_bodies
-from mover.fitting.config import PUBLISHED, STAGES, Stage
+from mover.bodies.skinning import open_body, zero_pose
+from mover.bodies.smpl_files import load_smpl
+from mover.core.errors import InputError
+from mover.core.types import Scene
+from mover.fitting.bodies import FitInputs, fit_bodies
+from mover.fitting.config import (
+    PUBLISHED,
+    STAGES,
+    FitConfig,
+    Stage,
+    limit_price,
+    limit_table,
+    resting,
+)
 from mover.fitting.energy import Weighed, bending_price, body_energy, geman_mcclure
-from mover.fitting.gather import seen_of
-from mover.fitting.limits import limit_price, limit_table, resting
 from mover.fitting.prior import ANGLES, same
 from mover.fitting.rig import move, rig_of
 from mover.fitting.start import placed
-from mover.fitting.tracks import best_path, triples_of
+from mover.fitting.tracks import best_path, seen_of, triples_of
 from mover.fitting.unknowns import Frame, Unknowns, points_of
 from mover.geometry.camera import project
 from mover.geometry.rotations import axis_angle
-from mover.readers.scene_file import write_scene
-from mover.records import InputError
-from mover.types import Scene
+from mover.io.capture.scene_file import write_scene
 
 QUICK = FitConfig(
     start_steps=20,
@@ -360,9 +367,9 @@ def test_models_of_the_users_files_are_fitted_with_hands_and_face(name, tmp_path
 
 @pytest.mark.slow
 def test_the_command_reads_openpose_and_writes_bodies(tmp_path, walk, capsys):
-    from mover.commands_fit import fit
-    from mover.readers.bodies_file import read_bodies
-    from mover.readers.camera_file import camera_to_json
+    from mover.app.cli.fit import fit
+    from mover.io.capture.bodies_file import read_bodies
+    from mover.io.capture.camera_file import camera_to_json
 
     keypoints = seen(walk, noise=1.0)
     folder = tmp_path / "keypoints"
@@ -385,7 +392,7 @@ def test_the_command_reads_openpose_and_writes_bodies(tmp_path, walk, capsys):
 
 def test_a_second_pass_takes_camera_and_floor_of_a_result(tmp_path):
     """One of camera and result, not both; a floor that is given counts before the result's."""
-    from mover.commands_fit import FitArgs, _world
+    from mover.app.cli.fit import FitArgs, _world
 
     write_scene(Scene(CAMERA, -1.25, ()), tmp_path / "scene.json")
     camera, ground = _world(FitArgs(Path("k.npz"), room=tmp_path))

@@ -2,10 +2,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mover.core.types import Layout
 from mover.geometry.camera import pitch_roll, tilted, to_camera, without_heading
-from mover.geometry.floor import hit_floor, recast, slide_to_floor
+from mover.geometry.placement import hit_floor, reproject, slide_to_floor
 from mover.geometry.rotations import rot_y
-from mover.types import Layout
 
 ANGLE = st.floats(-0.5, 0.5)
 
@@ -51,12 +51,12 @@ def test_a_new_camera_keeps_box_centres_in_the_camera_frame():
     )
     layout = Layout(torch.tensor([[0.5, -1.2, -3.0]]), torch.tensor([0.7]), torch.zeros(1, 3))
     heights = torch.tensor([0.8])
-    found = recast(layout, heights, old, new)
+    found = reproject(layout, heights, old, new)
     half = torch.tensor([0.0, 0.4, 0.0])
     torch.testing.assert_close(
         to_camera(found.t_world_object + half, new), to_camera(layout.t_world_object + half, old)
     )
-    torch.testing.assert_close(recast(found, heights, new, new).yaw, found.yaw)
+    torch.testing.assert_close(reproject(found, heights, new, new).yaw, found.yaw)
 
 
 def test_sliding_to_the_floor_keeps_the_picture():

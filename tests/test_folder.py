@@ -1,5 +1,7 @@
 import dataclasses
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,11 +9,13 @@ import pytest
 import tiny_capture as tiny
 import torch
 
+from mover.core.errors import InputError
+from mover.core.records import map_tensors
+from mover.core.types import Capture
 from mover.geometry.camera import pitch_roll
-from mover.readers import READERS, read, read_capture, write_capture
-from mover.readers.masks import decode
-from mover.records import map_tensors
-from mover.types import Capture
+from mover.geometry.rle import decode
+from mover.io.capture.folder import read_capture, write_capture
+from mover.io.formats import FORMATS, IMPORTED, chosen, names, read
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -54,7 +58,7 @@ def test_every_field_of_a_capture_arrives(folder: Path) -> None:
     assert [float(v) for v in pitch_roll(camera.R_cam_world)] == pytest.approx(
         [tiny.PITCH, tiny.ROLL], abs=1e-6
     )
-    chair, lamp = found.scene.pieces
+    chair, lamp = found.scene.objects
     assert (chair.id, chair.category, chair.annotation, chair.support) == (
         "chair_0", "chair", 11, "ground",
     )  # fmt: skip
@@ -69,7 +73,7 @@ def test_every_field_of_a_capture_arrives(folder: Path) -> None:
 
 
 def test_meshes_come_with_the_transforms_of_their_nodes(folder: Path) -> None:
-    chair, lamp = read_capture(folder).scene.pieces
+    chair, lamp = read_capture(folder).scene.objects
     step = torch.from_numpy(tiny.STEP).float()
     assert torch.allclose(chair.mesh.verts, step)
     assert chair.mesh.faces.tolist() == tiny.STEP_FACES.tolist()
@@ -181,9 +185,9 @@ def test_a_heading_turns_the_world_and_leaves_the_view(folder: Path) -> None:
         straight,
         scene=dataclasses.replace(
             straight.scene,
-            pieces=tuple(
+            objects=tuple(
                 dataclasses.replace(p, yaw=torch.atan2(p.yaw.sin(), p.yaw.cos()))
-                for p in straight.scene.pieces
+                for p in straight.scene.objects
             ),
         ),
     )
@@ -203,8 +207,27 @@ def test_truth_is_not_looked_at(folder: Path) -> None:
 
 
 def test_an_unknown_format_names_the_choices() -> None:
-    with pytest.raises(ValueError, match=", ".join(sorted(READERS))):
+    with pytest.raises(ValueError, match=", ".join(sorted(names("capture")))):
         read("prose", Path())
+
+
+def test_every_row_of_the_table_of_formats_has_a_function_and_a_name_of_its_own() -> None:
+    homes = [*((kind,) for kind in ("capture", "people", "keypoints", "export")), IMPORTED]
+    for kinds in homes:
+        known = names(*kinds)
+        assert len(known) == len(set(known)) > 0
+        assert all(callable(chosen("it", name, *kinds)) for name in known)
+    assert sum(len(names(*kinds)) for kinds in homes) == len(FORMATS)
+    with pytest.raises(InputError, match="--to: 'dwg' is none of glb, usd"):
+        chosen("--to", "dwg", "export")
+
+
+def test_the_table_of_formats_is_listed_without_anything_heavy() -> None:
+    code = (
+        "import sys; from mover.io.formats import FORMATS, listing; assert listing('scene');"
+        "assert not {'torch', 'numpy', 'trimesh'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the shared data is not here")

@@ -7,8 +7,20 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mover.furniture import PIECES, SEATS, Furniture, canonical, make_piece
-from mover.furniture.library import BACKS, BEDS, SIZES, STYLES, TOPS, WALL_PIECES, another
+from mover.furniture.library import (
+    BACKS,
+    BEDS,
+    PIECES,
+    SEATS,
+    SIZES,
+    STYLES,
+    TOPS,
+    WALL_PIECES,
+    another,
+    canonical,
+    make_piece,
+)
+from mover.furniture.pieces import Furniture
 
 ALL = [(name, style) for name in PIECES for style in range(STYLES[name])]
 

@@ -13,8 +13,8 @@ import tiny_capture as tiny
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mover.readers import read_capture
-from mover.records import InputError
+from mover.core.errors import InputError
+from mover.io.capture.folder import read_capture
 
 NAN = float("nan")
 

@@ -13,8 +13,10 @@ import trimesh
 from test_readers_people import CAMERA, Toy
 
 from mover.bodies import BODY_MODELS
-from mover.readers.people import Known, bodies_from, keypoints_from
-from mover.records import InputError
+from mover.core.errors import InputError
+from mover.io.people.bodies import bodies_from
+from mover.io.people.found import Known
+from mover.io.people.keypoints import keypoints_from
 
 joblib = pytest.importorskip("joblib", reason="the fixtures are written by joblib")
 CHANGES = 10

@@ -4,8 +4,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mover.stages.thin_points import in_turns, thin
-from mover.terms.depth import DepthMaps, Seen, bounds_of, merge
+from mover.energy.terms.depth import DepthMaps, Seen, bounds_of, merge
+from mover.stages.contacts.assign_contacts import in_turns, thin
 
 H, W = 12, 20
 

@@ -5,21 +5,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import raster_torch
 import torch
 import trimesh
+import volume_igl
 from sm90 import ptx_of
 from test_volume import moving_spheres, posed_bodies, sphere
 from torch import Tensor
 
-from mover.geometry import layers_warp, raster_torch, sample_warp, volume_igl, volume_warp
-from mover.geometry.face_tree import face_tree
-from mover.geometry.raster import Views
-from mover.geometry.volume import Volume, grid_around, sample_torch
-from mover.rooms.render import encode
-from mover.stages.gather_depth import Sight, gather_depth
-from mover.stages.person_masks import mask_table
-from mover.terms.depth import DepthMaps, Seen, bounds_of, merge
-from mover.types import Bodies, Camera, People
+from mover.core.types import Bodies, Camera, People
+from mover.energy.terms.depth import DepthMaps, Seen, bounds_of, merge
+from mover.geometry import volume_warp
+from mover.geometry.raster import Crops
+from mover.geometry.raster.warp import layers as layers_warp
+from mover.geometry.volume import Volume, grid_around, sample, sample_torch
+from mover.geometry.volume_warp import face_tree
+from mover.stages.contacts.gather_cues import Sight, gather_depth
+from mover.stages.masks import mask_table
+from mover_bench.rooms.render import encode
 
 pytest.importorskip("warp")
 
@@ -133,14 +136,14 @@ def test_each_triangle_is_in_one_leaf_and_each_leaf_under_the_first_pack(count: 
     assert 8 * tree.levels[-1] == tree.base + leaves
 
 
-def cameras(items: int, size: tuple[int, int], focal: float) -> Views:
+def cameras(items: int, size: tuple[int, int], focal: float) -> Crops:
     height, width = size
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return Views(K.expand(items, 3, 3), height, width)
+    return Crops(K.expand(items, 3, 3), height, width)
 
 
-def assert_same_layers(verts: Tensor, faces: Tensor, views: Views) -> None:
-    found, exact = (m.layers(verts, faces, views) for m in (layers_warp, raster_torch))
+def assert_same_layers(verts: Tensor, faces: Tensor, views: Crops) -> None:
+    found, exact = (draw(verts, faces, views) for draw in (layers_warp, raster_torch.layers))
     for mine, other in ((found.front, exact.front), (found.exit, exact.exit)):
         assert mine.dtype == other.dtype
         assert torch.equal(mine.isfinite(), other.isfinite())
@@ -151,7 +154,7 @@ def test_rays_enter_and_leave_bodies_where_the_torch_version_says() -> None:
     verts, faces = posed_bodies(3)
     turned = verts * torch.tensor([1.0, -1.0, -1.0]) + torch.tensor([0.1, 0.2, 3.0])
     views = cameras(3, (120, 160), 150.0)
-    assert layers_warp.layers(turned, faces, views).front.isfinite().any((-2, -1)).all()
+    assert layers_warp(turned, faces, views).front.isfinite().any((-2, -1)).all()
     assert_same_layers(turned, faces, views)
     assert_same_layers(turned, faces.int(), views)
 
@@ -162,7 +165,7 @@ def test_what_is_behind_the_camera_or_beside_the_image_is_not_drawn() -> None:
     turned = verts * torch.tensor([1.0, -1.0, -1.0]) + shift[:, None]
     views = cameras(4, (90, 120), 110.0)
     assert_same_layers(turned, faces, views)
-    found = layers_warp.layers(turned, faces, views)
+    found = layers_warp(turned, faces, views)
     assert not found.front[1:3].isfinite().any()
     assert (turned[0, :, 2] < 0).any()  # a part of it is behind the camera
     assert found.front[0].isfinite().any()
@@ -200,7 +203,7 @@ def test_bounds_are_those_of_whole_images_one_after_another() -> None:
     sight = passing(13)
     blank = torch.full((60, 80), torch.inf)
     expected = DepthMaps(-blank, blank, -blank)
-    views = Views(sight.camera.K[None], 60, 80)
+    views = Crops(sight.camera.K[None], 60, 80)
     for row, verts in enumerate(sight.bodies.verts):
         cam = verts @ sight.camera.R_cam_world.mT
         drawn = raster_torch.layers(cam[None], sight.bodies.faces, views)
@@ -237,7 +240,7 @@ def test_lookups_and_their_gradients_are_those_of_torch(size: tuple[int, int, in
     share = torch.rand(3, 400, 3, generator=torch.Generator().manual_seed(4)) * 1.4 - 0.2
     points = (field.origin + share * span).requires_grad_()
     weights = torch.randn(3, 400, generator=torch.Generator().manual_seed(5))
-    found, exact = sample_warp.sample(field, points), sample_torch(field, points)
+    found, exact = sample(field, points), sample_torch(field, points)
     torch.testing.assert_close(found, exact, rtol=0, atol=1e-5)
     slopes = [torch.autograd.grad((v * weights).sum(), points)[0] for v in (found, exact)]
     torch.testing.assert_close(slopes[0], slopes[1], rtol=1e-3, atol=1e-3)
@@ -246,8 +249,8 @@ def test_lookups_and_their_gradients_are_those_of_torch(size: tuple[int, int, in
 
 def test_lookups_of_no_points_and_of_points_that_are_no_numbers() -> None:
     field = some_field((9, 9, 9))
-    assert sample_warp.sample(field, torch.zeros(2, 0, 3)).shape == (2, 0)
-    assert sample_warp.sample(field, torch.full((1, 3), torch.nan)).shape == (1,)
+    assert sample(field, torch.zeros(2, 0, 3)).shape == (2, 0)
+    assert sample(field, torch.full((1, 3), torch.nan)).shape == (1,)
 
 
 def test_bricks_are_busy_where_the_field_changes() -> None:
@@ -303,7 +306,6 @@ def test_trees_of_any_depth_have_the_distances_of_libigl(level: int) -> None:
     ("name", "entries"),
     [
         ("bodies", ["place", "leaves", "inner"]),
-        ("crossings", ["cross"]),
         ("lower", ["blocks"]),
     ],
 )

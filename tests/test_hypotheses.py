@@ -10,16 +10,18 @@ import torch
 from test_folder import close
 from test_pipeline import light
 
-from mover.furniture import make_piece
+from mover.core.errors import InputError
+from mover.core.run import Run
+from mover.core.types import Capture, SceneObject
+from mover.furniture.library import make_piece
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import rot_y
-from mover.pipeline import Run, reconstruct
-from mover.readers import read_capture, write_capture
-from mover.records import InputError
-from mover.stages.other_starts import other_starts
-from mover.stages.place_objects import PlaceInputs
-from mover.stages.prepare_objects import PrepareConfig, PrepareInputs, prepare_objects
-from mover.types import Capture, Piece
+from mover.io.capture.folder import read_capture, write_capture
+from mover.pipeline.reconstruct import reconstruct
+from mover.stages.config import PrepareConfig
+from mover.stages.objects.place_inputs import PlaceInputs
+from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
+from mover.stages.objects.starts import other_starts
 
 QUICK = PrepareConfig(cells=24, faces=200, samples=50, region=10)
 
@@ -29,7 +31,7 @@ def capture(tmp_path: Path) -> Capture:
     return read_capture(tiny.write_capture(tmp_path / "tiny"))
 
 
-def elsewhere(piece: Piece, step: float) -> Piece:
+def elsewhere(piece: SceneObject, step: float) -> SceneObject:
     """Another shape in another place."""
     import numpy as np
 
@@ -44,7 +46,7 @@ def elsewhere(piece: Piece, step: float) -> Piece:
 
 
 def with_others(capture: Capture) -> Capture:
-    first, second = capture.scene.pieces
+    first, second = capture.scene.objects
     others = (elsewhere(first, 0.4), elsewhere(second, -0.3), elsewhere(first, 0.9))
     return replace(capture, hypotheses=others)
 
@@ -64,7 +66,7 @@ def test_hypotheses_of_another_scene_are_left_out_and_told(capture: Capture, tmp
     scene["objects"][0]["translation"][0] += 0.5
     (tmp_path / "out" / "scene.json").write_text(json.dumps(scene))
     found = read_capture(tmp_path / "out")
-    assert {p.id for p in found.hypotheses} == {capture.scene.pieces[1].id}
+    assert {p.id for p in found.hypotheses} == {capture.scene.objects[1].id}
     assert [w for w in found.warnings if "not of this scene" in w and "chair_0" in w]
 
 
@@ -101,7 +103,7 @@ def test_a_mesh_outside_of_the_capture_is_refused(capture: Capture, tmp_path: Pa
 def test_starts_have_the_boxes_of_the_hypotheses(capture: Capture):
     """The object's own shape fills the box that another shape had."""
     others = with_others(capture).hypotheses
-    prepared = prepare_objects(PrepareInputs(capture.scene.pieces), QUICK)
+    prepared = prepare_objects(PrepareInputs(capture.scene.objects), QUICK)
     found = other_starts(others, prepared.objects, prepared.start)
     assert found.yaw.shape == (2, 2)
     for rank, index, piece in ((0, 0, others[0]), (0, 1, others[1]), (1, 0, others[2])):
@@ -116,8 +118,8 @@ def test_starts_have_the_boxes_of_the_hypotheses(capture: Capture):
 
 
 def test_strangers_and_nothing_give_no_starts(capture: Capture):
-    prepared = prepare_objects(PrepareInputs(capture.scene.pieces), QUICK)
-    stranger = replace(capture.scene.pieces[0], id="nobody")
+    prepared = prepare_objects(PrepareInputs(capture.scene.objects), QUICK)
+    stranger = replace(capture.scene.objects[0], id="nobody")
     assert len(other_starts((stranger,), prepared.objects, prepared.start).yaw) == 0
     assert len(other_starts((), prepared.objects, prepared.start).yaw) == 0
 

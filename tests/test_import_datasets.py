@@ -11,15 +11,14 @@ from PIL import Image
 from test_import_scenes import check_truth, imported
 from test_import_scenes import plain as plain  # the fixture
 
-from mover.geometry.placement import place_piece
+from mover.core.errors import InputError
+from mover.geometry.placement import place_object
 from mover.geometry.volume import sample
-from mover.readers import read_capture
-from mover.readers.evidence import gather_evidence
-from mover.readers.kinect import NAMES, capsule_people
-from mover.readers.pigraphs import read_segments
-from mover.readers.prox_files import read_sdf, recordings_of
-from mover.readers.scene_file import read_scene
-from mover.records import InputError
+from mover.io.capture.evidence import gather_evidence
+from mover.io.capture.folder import read_capture
+from mover.io.capture.scene_file import read_scene
+from mover.io.datasets.pigraphs import NAMES, capsule_people, read_segments
+from mover.io.datasets.prox_files import read_sdf, recordings_of
 
 RECORDING = "MPH8_00034_01"
 
@@ -67,9 +66,9 @@ def check_scan(folder: Path, room: layouts.Room) -> None:
     """What the scan has in the boxes are the objects themselves, with some floor at most."""
     truth = read_scene(folder / "scene.json")
     known = {t.name: t for t in room.things}
-    assert len(truth.pieces) == len(known)
-    for piece, thing in zip(truth.pieces, room.things, strict=True):
-        verts = place_piece(piece).verts.numpy()
+    assert len(truth.objects) == len(known)
+    for piece, thing in zip(truth.objects, room.things, strict=True):
+        verts = place_object(piece).verts.numpy()
         gap = np.linalg.norm(thing.world[:, None] - verts[None], axis=-1).min(1)
         assert gap.max() < 1e-3, thing.name
 
@@ -179,7 +178,7 @@ def test_the_papers_table_of_a_perfect_copy_has_perfect_rows(
     """A result that is the truth scores 1 in both overlaps; the published rows stand below."""
     import shutil
 
-    from mover.paper_table import paper_table
+    from mover_bench.tables.paper_table import paper_table
 
     room = prox_room(plain)
     out = tmp_path / "captures" / RECORDING

@@ -14,12 +14,12 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from mover.readers.fields import At
-from mover.readers.importers import IMPORTERS
-from mover.readers.instance_files import read_instances
-from mover.readers.merge import import_into
-from mover.readers.parts import Hints
-from mover.records import InputError
+from mover.core.errors import InputError
+from mover.io.capture.merge import import_into
+from mover.io.capture.parts import Hints
+from mover.io.files.fields import At
+from mover.io.formats import IMPORTED, chosen
+from mover.io.masks.instance_files import read_instances
 
 SLOW = (HealthCheck.too_slow, HealthCheck.function_scoped_fixture)
 FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=SLOW)
@@ -77,7 +77,7 @@ def import_or_refuse(format: str, source: Path, home: Path) -> bool:
     before = sorted(p for p in home.rglob("*") if not p.is_relative_to(work))
     try:
         hints = Hints(work=work, camera=None if format == "total3d" else camera())
-        import_into(out, IMPORTERS[format.split(":")[0]].read(source, hints))
+        import_into(out, chosen("FORMAT", format.split(":")[0], *IMPORTED)(source, hints))
     except InputError as error:
         assert str(error)  # noqa: PT017
         assert sorted(p for p in home.rglob("*") if not p.is_relative_to(work)) == before
@@ -255,11 +255,11 @@ def test_a_gltf_cannot_bring_other_files_along(tmp_path: Path) -> None:
     head = content[:8] + total + len(chunk).to_bytes(4, "little") + b"JSON"
     path.write_bytes(head + chunk + body)
     with pytest.raises(InputError, match="images beside it"):
-        IMPORTERS["glb"].read(path, Hints(work=tmp_path))
+        chosen("FORMAT", "glb", *IMPORTED)(path, Hints(work=tmp_path))
 
 
 def test_xml_bombs_are_refused(tmp_path: Path) -> None:
-    from mover.readers.any_camera import read_camera_file
+    from mover.io.files.cameras import read_camera_file
 
     path = tmp_path / "a.xml"
     path.write_text('<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><x>&b;</x>')

@@ -11,15 +11,15 @@ from PIL import Image
 from test_import_scenes import camera_at, capture_of, imported
 from test_import_scenes import plain as plain  # the fixture
 
-from mover.commands_import import ImportArgs, run_import
-from mover.readers import read_capture
-from mover.readers.instance_files import read_instances
-from mover.readers.instances import fitted
-from mover.readers.masks import decode
-from mover.readers.merge import import_into
-from mover.readers.parts import Parts
-from mover.records import InputError
-from mover.types import Masks
+from mover.app.cli.imports import ImportArgs, run_import
+from mover.core.errors import InputError
+from mover.core.types import Masks
+from mover.geometry.rle import decode
+from mover.io.capture.folder import read_capture
+from mover.io.capture.merge import import_into
+from mover.io.capture.parts import Parts
+from mover.io.masks.instance_files import read_instances
+from mover.io.masks.instances import fitted
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 WORDS = ["chair", "couch", "chair", "person"]
@@ -123,7 +123,7 @@ class TestRealFiles:
         run_import(args, tmp_path)
         found = read_capture(tmp_path / "out")
         known = {d.id: d for d in found.detections}
-        assert [p.annotation for p in found.scene.pieces] == list(range(18))
+        assert [p.annotation for p in found.scene.objects] == list(range(18))
         for i, mask in enumerate(masks):
             code = known[i].mask
             assert code is not None
@@ -131,8 +131,8 @@ class TestRealFiles:
 
 
 def read_list(rows: list[dict[str, object]], name: str) -> list[layouts.Any]:
-    from mover.readers.fields import At
-    from mover.readers.instances_lists import list_instances
+    from mover.io.files.fields import At
+    from mover.io.masks.instances_json import list_instances
 
     return list(list_instances(At(rows, name), {}, None).items)
 
@@ -162,9 +162,9 @@ def test_parts_come_in_any_order_and_stay(plain: layouts.Room, tmp_path: Path) -
     for capture in found:
         assert all(d.mask is not None for d in capture.detections)
         assert len(capture.detections) == len(plain.things)
-        used = {p.annotation: p.category for p in capture.scene.pieces}
+        used = {p.annotation: p.category for p in capture.scene.objects}
         assert {d.id: d.category for d in capture.detections} == used
-    for piece, other in zip(found[0].scene.pieces, found[1].scene.pieces, strict=True):
+    for piece, other in zip(found[0].scene.objects, found[1].scene.objects, strict=True):
         a = next(d for d in found[0].detections if d.id == piece.annotation)
         b = next(d for d in found[1].detections if d.id == other.annotation)
         assert torch.allclose(a.box, b.box)
@@ -186,7 +186,7 @@ def test_a_scene_without_annotations_finds_its_masks(plain: layouts.Room, tmp_pa
     run_import(args, tmp_path)
     found = read_capture(tmp_path / "out")
     order = [t.name for t in plain.things[::-1]]
-    assert {p.id: p.annotation for p in found.scene.pieces} == {n: i for i, n in enumerate(order)}
+    assert {p.id: p.annotation for p in found.scene.objects} == {n: i for i, n in enumerate(order)}
 
 
 def test_a_new_tilt_keeps_box_centres_in_the_camera(plain: layouts.Room, tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_a_new_tilt_keeps_box_centres_in_the_camera(plain: layouts.Room, tmp_pat
     from mover.geometry.boxes import box_of
     from mover.geometry.camera import to_camera
 
-    for a, b in zip(first.scene.pieces, second.scene.pieces, strict=True):
+    for a, b in zip(first.scene.objects, second.scene.objects, strict=True):
         before = to_camera(box_of(a).center, first.scene.camera.R_cam_world)
         after = to_camera(box_of(b).center, second.scene.camera.R_cam_world)
         assert torch.allclose(before, after, atol=1e-4)

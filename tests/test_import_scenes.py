@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
+from mover.core.errors import InputError
+from mover.core.types import Capture
 from mover.geometry.boxes import box_of, iou3d
 from mover.geometry.camera import pitch_roll
-from mover.geometry.placement import place_piece
-from mover.readers import read_capture
-from mover.readers.fields import At
-from mover.readers.importers import IMPORTERS
-from mover.readers.merge import Imported, import_into
-from mover.readers.odd_world import odd_world, overlap
-from mover.readers.parts import Hints
-from mover.records import InputError
-from mover.rooms.known import KnownRoom
-from mover.types import Capture
+from mover.geometry.placement import place_object
+from mover.io.capture.folder import read_capture
+from mover.io.capture.merge import Imported, import_into
+from mover.io.capture.pairing import odd_world, overlap
+from mover.io.capture.parts import Hints
+from mover.io.files.fields import At
+from mover.io.formats import IMPORTED, chosen
+from mover_bench.rooms.known import KnownRoom
 
 NAMES = {
     "floor lamp": "lamp", "coffee table": "table", "shelf": "shelves", "wardrobe": "cabinet",
@@ -35,7 +35,7 @@ def plain(small_room: KnownRoom) -> layouts.Room:
     """The room as numbers, with sizes that are not those of the meshes."""
     camera = small_room.truth.camera
     things = []
-    for i, piece in enumerate(small_room.truth.pieces):
+    for i, piece in enumerate(small_room.truth.objects):
         stretch = np.array([1.1, 0.9, 1.2]) if i % 2 else np.ones(3)
         things.append(
             layouts.Thing(
@@ -52,7 +52,7 @@ def plain(small_room: KnownRoom) -> layouts.Room:
 
 
 def imported(format: str, source: Path, out: Path, work: Path, **hints: object) -> Imported:
-    parts = IMPORTERS[format].read(source, Hints(work=work, **hints))  # pyright: ignore
+    parts = chosen("FORMAT", format, *IMPORTED)(source, Hints(work=work, **hints))  # pyright: ignore
     return import_into(out, parts)
 
 
@@ -65,10 +65,10 @@ def capture_of(format: str, source: Path, tmp: Path, **hints: object) -> Capture
 
 def worst(found: Capture, room: layouts.Room) -> float:
     """Largest distance between the vertices of an object and the true ones [m]."""
-    assert len(found.scene.pieces) == len(room.things)
+    assert len(found.scene.objects) == len(room.things)
     gaps = []
-    for piece, thing in zip(found.scene.pieces, room.things, strict=True):
-        verts = place_piece(piece).verts.double().numpy()
+    for piece, thing in zip(found.scene.objects, room.things, strict=True):
+        verts = place_object(piece).verts.double().numpy()
         assert verts.shape == thing.verts.shape
         gaps.append(np.abs(verts - thing.world).max())
     return float(max(gaps))
@@ -118,7 +118,7 @@ def test_sam_3d_objects_gives_the_room_back_with_the_tilt_of_its_objects(
     found = capture_of("sam3d", source, tmp_path, camera=level)
     assert tilt_error(found, plain) < FINE
     assert worst(found, plain) < FINE
-    assert [p.category for p in found.scene.pieces] == [t.category for t in plain.things]
+    assert [p.category for p in found.scene.objects] == [t.category for t in plain.things]
 
 
 def test_meshes_that_sam_3d_has_placed_lie_where_they_are(
@@ -138,7 +138,7 @@ def test_gen3dsr_gives_the_room_back_under_any_pose(plain: layouts.Room, tmp_pat
         source = layouts.write_gen3dsr(tmp / "in", plain, pose)
         found = capture_of("gen3dsr", source, tmp, camera=camera_at(plain))
         order = [f"{i}_{t.category}" for i, t in enumerate(plain.things)]
-        assert [p.id for p in found.scene.pieces] == order
+        assert [p.id for p in found.scene.objects] == order
         assert worst(found, plain) < FINE
         assert float(found.scene.camera.K[0, 2]) == pytest.approx(plain.K[0, 2], abs=1e-4)
 
@@ -148,7 +148,7 @@ def test_gen3dsr_boxes_are_as_tight_as_the_true_ones_and_seats_face_forward(
 ) -> None:
     source = layouts.write_gen3dsr(tmp_path / "in", plain)
     found = capture_of("gen3dsr", source, tmp_path, camera=camera_at(plain))
-    for piece, thing in zip(found.scene.pieces, plain.things, strict=True):
+    for piece, thing in zip(found.scene.objects, plain.things, strict=True):
         low, high = thing.verts.min(0), thing.verts.max(0)
         true = float(np.prod(thing.scale * (high - low)))
         assert float(box_of(piece).size.prod()) <= 1.02 * true
@@ -170,9 +170,9 @@ def test_a_gltf_scene_gives_the_room_back_whichever_way_is_up(
     source = layouts.write_glb(tmp_path / "in.glb", plain, world, camera)
     given = {} if camera else {"camera": camera_at(plain)}
     found = capture_of("glb", source, tmp_path, up=up, **given)
-    order = {p.id: p for p in found.scene.pieces}
+    order = {p.id: p for p in found.scene.objects}
     pieces = tuple(order[t.name] for t in plain.things)
-    found = dataclasses.replace(found, scene=dataclasses.replace(found.scene, pieces=pieces))
+    found = dataclasses.replace(found, scene=dataclasses.replace(found.scene, objects=pieces))
     assert worst(found, plain) < FINE
     assert tilt_error(found, plain) < FINE
     assert all(
@@ -188,7 +188,7 @@ def test_boxes_come_back_with_furniture_of_their_class(
     source = layouts.write_boxes(tmp_path / "in.json", plain, frame=frame)
     found = capture_of("boxes", source, tmp_path)
     assert tilt_error(found, plain) < FINE
-    for piece, thing in zip(found.scene.pieces, plain.things, strict=True):
+    for piece, thing in zip(found.scene.objects, plain.things, strict=True):
         mine = box_of(piece)
         low, high = thing.verts.min(0), thing.verts.max(0)
         centre = layouts.about_y(thing.yaw) @ (thing.scale * (low + high) / 2) + thing.t
@@ -196,7 +196,7 @@ def test_boxes_come_back_with_furniture_of_their_class(
         assert np.allclose(mine.size.numpy(), thing.scale * (high - low), atol=FINE)
         assert math.cos(float(piece.yaw) - thing.yaw) == pytest.approx(1, abs=1e-6)
         assert len(piece.mesh.faces) > 12
-    assert all(p.annotation is not None for p in found.scene.pieces)
+    assert all(p.annotation is not None for p in found.scene.objects)
 
 
 @pytest.mark.parametrize(
@@ -217,11 +217,11 @@ def test_a_scene_in_another_world_is_told_by_name(
     boxes = {t.name: d.box for t, d in zip(plain.things, detections, strict=True)}
     source = layouts.write_glb(tmp_path / "in.glb", plain, world, camera=False)
     found = capture_of("glb", source, tmp_path / "b", camera=camera_at(plain))
-    pieces = tuple(dataclasses.replace(p, annotation=i) for i, p in enumerate(found.scene.pieces))
+    pieces = tuple(dataclasses.replace(p, annotation=i) for i, p in enumerate(found.scene.objects))
     seen = tuple(
         dataclasses.replace(detections[0], id=i, box=boxes[p.id]) for i, p in enumerate(pieces)
     )
-    told = odd_world(dataclasses.replace(found.scene, pieces=pieces), seen)
+    told = odd_world(dataclasses.replace(found.scene, objects=pieces), seen)
     assert told is not None
     assert word in told
 
@@ -240,7 +240,7 @@ def test_a_tilted_object_stands_upright_about_its_centre(
     result = imported("glb", source, tmp_path / "out", tmp_path, camera=camera_at(plain))
     assert result.capture is not None
     assert sum("a tilt of" in note for note in result.notes) == len(plain.things)
-    for piece in result.capture.scene.pieces:
+    for piece in result.capture.scene.objects:
         thing = next(t for t in plain.things if t.name == piece.id)
         low, high = thing.verts.min(0), thing.verts.max(0)
         centre = layouts.about_y(thing.yaw) @ (thing.scale * (low + high) / 2) + thing.t
@@ -265,23 +265,23 @@ def test_the_release_of_the_authors_comes_back_with_their_result_and_the_truth(
     assert found.touch[:, 0].tolist() == [0, 0.25, 0.5, 0.75]
     assert sorted(p.name for p in (tmp_path / "out" / "frames").iterdir())[0] == "000000.jpg"
     check_truth(tmp_path / "out" / "truth", plain)
-    from mover.readers.scene_file import read_scene
+    from mover.io.capture.scene_file import read_scene
 
     authors = read_scene(tmp_path / "out" / "authors" / "scene.json")
-    for piece, thing in zip(authors.pieces, plain.things, strict=True):
-        assert np.abs(place_piece(piece).verts.numpy() - thing.world).max() < FINE
+    for piece, thing in zip(authors.objects, plain.things, strict=True):
+        assert np.abs(place_object(piece).verts.numpy() - thing.world).max() < FINE
 
 
 def check_truth(folder: Path, plain: layouts.Room) -> None:
     """True boxes are those of the room, and so is its floor."""
-    from mover.readers.scene_file import read_scene
+    from mover.io.capture.scene_file import read_scene
 
     truth = read_scene(folder / "scene.json")
     assert truth.ground == pytest.approx(plain.ground, abs=0.02)
     assert tilt_error_of(truth.camera.R_cam_world, plain) < FINE
     known = {t.name: t for t in plain.things}
-    assert len(truth.pieces) == len(known)
-    for piece, thing in zip(truth.pieces, plain.things, strict=True):
+    assert len(truth.objects) == len(known)
+    for piece, thing in zip(truth.objects, plain.things, strict=True):
         low, high = thing.verts.min(0), thing.verts.max(0)
         size = torch.from_numpy(thing.scale * (high - low)).float()
         centre = layouts.about_y(thing.yaw) @ (thing.scale * (low + high) / 2) + thing.t

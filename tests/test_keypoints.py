@@ -7,8 +7,10 @@ import torch
 from figures import SEATED, pose, turned
 from make_smpl import make_model, write_npz
 
-from mover.bodies import load_smpl, open_body, rest_pose, zero_pose
 from mover.bodies.keypoints import LAYOUTS, has_keypoints, keypoints_of
+from mover.bodies.skinning import open_body, zero_pose
+from mover.bodies.smpl_files import load_smpl
+from mover.bodies.smpl_model import rest_pose
 from mover.geometry.mesh import vertex_normals
 
 BODIES = ("small", "full")

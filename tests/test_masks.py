@@ -11,9 +11,10 @@ from hypothesis.extra.numpy import arrays
 from pycocotools import mask as coco
 from tiny_capture import compressed, runs
 
-from mover.readers.masks import area, decode, encode, from_coco, run_lengths, tight_box
-from mover.records import InputError
-from mover.types import Masks
+from mover.core.errors import InputError
+from mover.core.types import Masks
+from mover.geometry.rle import area, decode, encode, run_lengths, tight_box
+from mover.io.masks.coco import from_coco
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 WHERE = "objects.json: field 'segmentation'"

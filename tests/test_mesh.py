@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from mover.core.types import Mesh
 from mover.geometry import mesh as m
 from mover.geometry.nearest import nearest_points, to_surface
 from mover.geometry.rotations import axis_angle
 from mover.geometry.thinning import farthest_first
 from mover.geometry.topology import manifold
-from mover.types import Mesh
 
 
 def as_mesh(shape: trimesh.Trimesh) -> Mesh:

@@ -7,7 +7,7 @@ import torch
 from figures import ARMS_DOWN, moving, people, pose
 
 from mover.bodies.parts import members, parts_of
-from mover.metrics_motion import acceleration_error, float_height, foot_skate, gather_gait
+from mover.evaluate.bodies import acceleration_error, float_height, foot_skate, gather_gait
 
 
 def standing(count=4, fps=5.0):

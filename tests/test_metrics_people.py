@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from judged import F64, cuboid, grid_body, mesh_of, people, some_people
 from scipy.spatial.transform import Rotation
 
-from mover.metrics_bodies import (
+from mover.evaluate.bodies import (
     Standing,
     Twins,
     gather_twins,
@@ -24,7 +24,7 @@ from mover.metrics_bodies import (
     procrustes,
     v2v,
 )
-from mover.metrics_contact import (
+from mover.evaluate.contact import (
     Nearness,
     Touch,
     contact,

@@ -12,11 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from judged import CAMERA, F64, GROUND, K, cuboid, mesh_of, moved, pair, piece, random_piece, room
 
-from mover.geometry.camera import project, tilted, to_camera
-from mover.geometry.nearest import to_surface
-from mover.geometry.placement import place_piece
-from mover.geometry.rotations import rot_y
-from mover.metrics_scene import (
+from mover.core.types import Camera, Mesh
+from mover.evaluate.scene import (
     Sight,
     area_samples,
     center_error,
@@ -30,7 +27,10 @@ from mover.metrics_scene import (
     size_error,
     yaw_error,
 )
-from mover.types import Camera, Mesh
+from mover.geometry.camera import project, tilted, to_camera
+from mover.geometry.nearest import to_surface
+from mover.geometry.placement import place_object
+from mover.geometry.rotations import rot_y
 
 
 def test_two_cubes_that_share_a_half_overlap_by_a_third() -> None:
@@ -53,7 +53,7 @@ def test_overlap_of_turned_boxes_is_that_of_a_solid_modeller(
 ) -> None:
     solids = []
     for item in (random_piece(a), random_piece(b)):
-        mesh = place_piece(item)
+        mesh = place_object(item)
         verts = mesh.verts.numpy()
         solids.append(
             manifold3d.Manifold(manifold3d.Mesh64(verts, mesh.faces.numpy().astype(np.uint64)))
@@ -76,7 +76,7 @@ def test_swapping_estimate_and_truth_changes_no_symmetric_metric(
 
 
 def test_a_flat_object_at_its_place_overlaps_itself() -> None:
-    rug = room().pieces[2]
+    rug = room().objects[2]
     assert iou3d(pair(rug, rug)) == pytest.approx(1)
     assert iou3d(pair(moved(rug, 0.5, 0, 0), rug)) < 0.6
 
@@ -142,7 +142,7 @@ def test_camera_errors_are_differences_of_pitch_and_roll() -> None:
 
 def test_the_image_box_holds_the_drawn_mesh_and_is_cut_at_the_border() -> None:
     item = piece(cuboid(0.5, 0.9, 0.5), (-0.6, GROUND, -2.5), 0.4)
-    pixels = project(to_camera(place_piece(item).verts, CAMERA.R_cam_world), K)
+    pixels = project(to_camera(place_object(item).verts, CAMERA.R_cam_world), K)
     expected = torch.cat([pixels.amin(0), pixels.amax(0)]) / torch.tensor([640, 480, 640, 480])
     found = image_box(item, CAMERA)
     assert found is not None
@@ -180,10 +180,11 @@ def test_an_object_off_the_image_scores_zero_and_a_true_one_cannot_be_scored() -
 def test_names_decide_before_places() -> None:
     scene = room()
     swapped = tuple(
-        replace(p, id=name) for p, name in zip(scene.pieces, ("table", "chair", "rug"), strict=True)
+        replace(p, id=name)
+        for p, name in zip(scene.objects, ("table", "chair", "rug"), strict=True)
     )
-    names = {p.id: p.id for p in scene.pieces}
-    found = match(replace(scene, pieces=swapped), scene, names)
+    names = {p.id: p.id for p in scene.objects}
+    found = match(replace(scene, objects=swapped), scene, names)
     assert {k: p.id for k, p in found.items()} == names
 
 
@@ -194,8 +195,8 @@ def test_without_names_the_best_overlaps_within_a_class_decide() -> None:
     sofa = replace(moved(row[1], 0, 0, 0), id="couch", category="Couch")
     true_sofa = replace(moved(row[1], 5, 0, 0), id="s", category="sofa")
     found = match(
-        replace(truth, pieces=(*shifted[::-1], sofa)),
-        replace(truth, pieces=(*row, true_sofa)),
+        replace(truth, objects=(*shifted[::-1], sofa)),
+        replace(truth, objects=(*row, true_sofa)),
         {"c0.6": "nobody"},
     )
     assert {k: p.id for k, p in found.items()} == {
@@ -207,7 +208,7 @@ def test_without_names_the_best_overlaps_within_a_class_decide() -> None:
 
 
 def test_of_two_that_stand_for_one_the_nearer_is_taken() -> None:
-    truth = replace(room(), pieces=room().pieces[:1])
-    far, near = (replace(moved(truth.pieces[0], x, 0, 0), id=f"at{x}") for x in (-30, 20))
-    found = match(replace(truth, pieces=(far, near)), truth, {})
+    truth = replace(room(), objects=room().objects[:1])
+    far, near = (replace(moved(truth.objects[0], x, 0, 0), id=f"at{x}") for x in (-30, 20))
+    found = match(replace(truth, objects=(far, near)), truth, {})
     assert found["chair"].id == "at20"

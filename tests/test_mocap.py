@@ -7,10 +7,20 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mover.bodies import open_body
-from mover.records import InputError, fingerprint
-from mover.rooms.mocap import retarget, swing
-from mover.types import Bodies
+from mover.app.cli import run_command
+from mover.bodies.skinning import open_body
+from mover.core.errors import InputError
+from mover.core.records import fingerprint
+from mover.core.types import Bodies
+from mover.geometry.camera import to_world
+from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.scene_file import read_scene
+from mover.io.formats import read
+from mover_bench.rooms import clip as clips
+from mover_bench.rooms.clip import clip_room
+from mover_bench.rooms.config import RoomConfig
+from mover_bench.rooms.mocap import retarget, swing
+from mover_bench.rooms.placed import distances
 
 CMU = Path(__file__).parents[2] / "shared" / "data" / "cmu"
 ASF, AMC = CMU / "01.asf", CMU / "01_08.amc"
@@ -195,3 +205,64 @@ def test_parameters_give_the_bodies_and_the_same_files_the_same_bodies(clip: Bod
     assert clip.pose is not None
     assert torch.allclose(open_body().posed(clip.pose)[0], clip.verts, atol=1e-4)
     assert fingerprint(clip) == fingerprint(retarget(ASF, AMC, 4.0))
+
+
+LITTLE = RoomConfig(
+    width=320, height=180, pieces=4, least_pixels=30, least_frames=1, least_touches=0
+)
+TURNING = "".join(f"{k + 1}\nroot {0.02 * k} 4 0 0 {k} 0\n" for k in range(73))
+
+
+def test_a_clip_takes_place_in_a_known_room_out_of_furniture_and_in_view(tmp_path: Path) -> None:
+    files = stick_figure(tmp_path, TURNING)
+    room, clip = clip_room(files, 3, LITTLE), retarget(*files, LITTLE.fps)
+    assert len(room.bodies.frame) == len(clip.frame) == 4
+    world = to_world(room.bodies.verts, room.truth.camera.R_cam_world)
+    for row in range(4):  # turned and moved as a whole
+        apart = torch.cdist(world[row, ::500], world[0, ::500])
+        assert torch.allclose(
+            apart, torch.cdist(clip.verts[row, ::500], clip.verts[0, ::500]), atol=1e-3
+        )
+    assert torch.allclose(world[..., 1] - room.truth.ground, clip.verts[..., 1], atol=1e-3)
+    for piece in room.plan.pieces:
+        skin = world.reshape(-1, 3).double().numpy() - [0, float(room.truth.ground), 0]
+        assert distances(piece, skin).min() > -0.021
+    assert room.capture.people is not None
+    assert len(room.capture.people.frame) == 4
+    assert int(room.whole.min()) > 0
+    assert fingerprint(room.bodies) == fingerprint(clip_room(files, 3, LITTLE).bodies)
+
+
+def test_a_part_of_a_clip_is_its_beginning(tmp_path: Path) -> None:
+    files = stick_figure(tmp_path, TURNING)
+    assert len(clip_room(files, 3, LITTLE, seconds=0.4).bodies.frame) == 2
+
+
+def test_a_clip_that_needs_more_floor_than_a_room_has_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clips, "DRAFTS", 1)
+    files = stick_figure(tmp_path, "".join(f"{k + 1}\nroot {k} 4 0 0 0 0\n" for k in range(49)))
+    with pytest.raises(InputError, match=r"a\.amc: 0\.6 s over .* fit into none of 1 rooms"):
+        clip_room(files, 0, LITTLE)
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_capture_with_its_truth(tmp_path: Path) -> None:
+    asf, amc = stick_figure(tmp_path, TURNING)
+    out = tmp_path / "room"
+    assert run_command("rooms", [str(asf), str(amc), "--out", str(out)]) == 0
+    capture = read("folder", out)
+    assert capture.bodies is not None
+    truth = read_bodies(out / "truth" / "bodies.npz")
+    assert set(capture.bodies.frame.tolist()) <= set(truth.frame.tolist())
+    assert {p.id for p in read_scene(out / "truth" / "scene.json").objects} == {
+        p.id for p in capture.scene.objects
+    }
+
+
+@pytest.mark.parametrize("flags", [["--fps", "0"], ["--fps", "240"], ["--seconds", "-1"]])
+def test_the_command_refuses_impossible_rates(flags: list[str], tmp_path: Path, capsys) -> None:
+    asf, amc = stick_figure(tmp_path, TURNING)
+    assert run_command("rooms", [str(asf), str(amc), *flags]) == 2
+    assert flags[0] in capsys.readouterr().err

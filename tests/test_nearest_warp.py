@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from nearest_torch import nearest_torch
 from scipy.spatial import KDTree
 
-from mover.geometry.nearest_warp import clouds, nearest, nearest_torch
+from mover.geometry.nearest_warp import clouds, nearest
 
 pytest.importorskip("warp")
 

@@ -6,19 +6,20 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_rooms import tiny_room
+from test_rooms import shared_room
 
-from mover.bodies import open_body
+from mover.bodies.skinning import open_body
+from mover.core.records import fingerprint
+from mover.core.types import SceneObject
 from mover.geometry.camera import pitch_roll
 from mover.geometry.mesh import signed_volume
+from mover.geometry.rle import decode
 from mover.geometry.rotations import axis_angle, rot_y
-from mover.geometry.runs import decode
 from mover.geometry.topology import is_closed
-from mover.records import fingerprint
-from mover.rooms import KnownRoom, NoiseConfig, add_noise
-from mover.rooms.noise_masks import grown, leaked
-from mover.rooms.noise_people import slow
-from mover.types import Piece
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.noise import add_noise, slow
+from mover_bench.rooms.noise_masks import grown, leaked
 
 SIDES = ("left", "right")
 SILENT = NoiseConfig(
@@ -29,21 +30,21 @@ SILENT = NoiseConfig(
 
 @pytest.fixture(scope="module")
 def room() -> KnownRoom:
-    return tiny_room()
+    return shared_room()
 
 
-def centre(piece: Piece) -> torch.Tensor:
+def centre(piece: SceneObject) -> torch.Tensor:
     low, high = piece.mesh.verts.amin(0), piece.mesh.verts.amax(0)
     return rot_y(piece.yaw) @ ((low + high) / 2 * piece.scale) + piece.t_world_object
 
 
-def size(piece: Piece) -> torch.Tensor:
+def size(piece: SceneObject) -> torch.Tensor:
     return (piece.mesh.verts.amax(0) - piece.mesh.verts.amin(0)) * piece.scale
 
 
 def test_no_noise_gives_the_truth_back(room: KnownRoom) -> None:
     capture = add_noise(room, SILENT, 3)
-    for given, true in zip(capture.scene.pieces, room.truth.pieces, strict=True):
+    for given, true in zip(capture.scene.objects, room.truth.objects, strict=True):
         assert torch.allclose(given.t_world_object, true.t_world_object, atol=1e-6)
         assert torch.allclose(given.yaw, true.yaw, atol=1e-6)
         assert torch.allclose(given.scale, true.scale, atol=1e-6)
@@ -68,7 +69,7 @@ def test_a_wrong_camera_keeps_centres_in_the_camera_frame_and_projects_fronts(
 ) -> None:
     capture = add_noise(room, dataclasses.replace(SILENT, camera=5.0), 0)
     true, wrong = room.truth.camera.R_cam_world, capture.scene.camera.R_cam_world
-    for given, piece in zip(capture.scene.pieces, room.truth.pieces, strict=True):
+    for given, piece in zip(capture.scene.objects, room.truth.objects, strict=True):
         assert torch.allclose(wrong @ centre(given), true @ centre(piece), atol=1e-5)
         front = true @ torch.stack([piece.yaw.sin(), torch.tensor(0.0), piece.yaw.cos()])
         projected = wrong.mT @ front
@@ -131,7 +132,7 @@ def test_object_errors_have_the_stated_ranges_and_lie_along_the_ray(room: KnownR
     along, turn = [], []
     for seed in range(60):
         for given, true in zip(
-            add_noise(light, ray_only, seed).scene.pieces, room.truth.pieces, strict=True
+            add_noise(light, ray_only, seed).scene.objects, room.truth.objects, strict=True
         ):
             c = centre(true)
             off = centre(given) - c
@@ -154,7 +155,7 @@ def test_sizes_and_flips_follow_their_configuration(room: KnownRoom) -> None:
     factors, quarters = [], []
     for seed in range(60):
         for given, true in zip(
-            add_noise(light, config, seed).scene.pieces, room.truth.pieces, strict=True
+            add_noise(light, config, seed).scene.objects, room.truth.objects, strict=True
         ):
             factors.append(size(given) / size(true))
             turned = float(torch.remainder((given.yaw - true.yaw) / (math.pi / 2) + 0.5, 4) - 0.5)
@@ -170,7 +171,7 @@ def test_sizes_and_flips_follow_their_configuration(room: KnownRoom) -> None:
 
 def test_other_shapes_fill_the_same_box(room: KnownRoom) -> None:
     capture = add_noise(room, dataclasses.replace(SILENT, other_shapes=1.0), 0)
-    for given, true in zip(capture.scene.pieces, room.truth.pieces, strict=True):
+    for given, true in zip(capture.scene.objects, room.truth.objects, strict=True):
         assert given.mesh.verts.shape != true.mesh.verts.shape
         assert torch.allclose(size(given), size(true), atol=1e-5)
         assert torch.allclose(centre(given), centre(true), atol=1e-5)
@@ -303,15 +304,15 @@ def test_detections_and_pieces_are_missed_and_invented_together(room: KnownRoom)
         capture = add_noise(light, dataclasses.replace(SILENT, missed=0.3, false=0.2), seed)
         found = {d.id: d for d in capture.detections}
         assert len(found) == len(capture.detections)
-        assert sorted(found) == sorted(p.annotation or 0 for p in capture.scene.pieces)
-        for piece in capture.scene.pieces:
+        assert sorted(found) == sorted(p.annotation or 0 for p in capture.scene.objects)
+        for piece in capture.scene.objects:
             one = found[piece.annotation or 0]
             assert one.category == piece.category
             assert float((one.box[2:] - one.box[:2]).min()) >= 1
-        real = {p.id for p in capture.scene.pieces} & {p.id for p in room.truth.pieces}
+        real = {p.id for p in capture.scene.objects} & {p.id for p in room.truth.objects}
         missed += 3 - len(real)
-        invented += len(capture.scene.pieces) - len(real)
-        assert all(p.id in real or p.id.startswith("false_") for p in capture.scene.pieces)
+        invented += len(capture.scene.objects) - len(real)
+        assert all(p.id in real or p.id.startswith("false_") for p in capture.scene.objects)
     assert abs(missed / 120 - 0.3) < 0.12
     assert abs(invented / (120 - missed) - 0.2) < 0.12
 
@@ -320,7 +321,7 @@ def test_merged_masks_are_the_union_of_two_and_one_object_is_missing(room: Known
     capture = add_noise(room, dataclasses.replace(SILENT, merged=1.0), 0)
     true = {d.id: decode(d.mask, 0) for d in room.capture.detections if d.mask is not None}
     assert len(capture.detections) < len(true)
-    assert {p.annotation for p in capture.scene.pieces} == {d.id for d in capture.detections}
+    assert {p.annotation for p in capture.scene.objects} == {d.id for d in capture.detections}
     left = {d.id: d for d in capture.detections}
     gone = [true[k] for k in true if k not in left]
     unions = torch.stack([decode(d.mask, 0) for d in left.values() if d.mask is not None])
@@ -332,7 +333,7 @@ def test_merged_masks_are_the_union_of_two_and_one_object_is_missing(room: Known
 def test_a_wrong_class_has_another_mesh_in_the_same_box(room: KnownRoom) -> None:
     capture = add_noise(room, dataclasses.replace(SILENT, wrong_class=1.0), 0)
     for given, true, found in zip(
-        capture.scene.pieces, room.truth.pieces, capture.detections, strict=True
+        capture.scene.objects, room.truth.objects, capture.detections, strict=True
     ):
         assert given.id == true.id
         assert given.category != true.category
@@ -342,9 +343,9 @@ def test_a_wrong_class_has_another_mesh_in_the_same_box(room: KnownRoom) -> None
 
 
 def test_holes_open_meshes_and_inverted_meshes_have_negative_volume(room: KnownRoom) -> None:
-    holed = add_noise(room, dataclasses.replace(SILENT, holes=1.0), 0).scene.pieces
-    turned = add_noise(room, dataclasses.replace(SILENT, inverted=1.0), 0).scene.pieces
-    for hole, inside_out, true in zip(holed, turned, room.truth.pieces, strict=True):
+    holed = add_noise(room, dataclasses.replace(SILENT, holes=1.0), 0).scene.objects
+    turned = add_noise(room, dataclasses.replace(SILENT, inverted=1.0), 0).scene.objects
+    for hole, inside_out, true in zip(holed, turned, room.truth.objects, strict=True):
         assert is_closed(true.mesh.faces)
         assert not is_closed(hole.mesh.faces)
         lost = len(true.mesh.faces) - len(hole.mesh.faces)

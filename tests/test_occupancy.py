@@ -6,11 +6,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from mover.geometry.mesh import box, is_closed, signed_volume
-from mover.geometry.occupancy import OccupancyNetwork, load_occupancy, network_of
-from mover.geometry.occupancy_mesh import ExtractConfig, extract, occupied_mesh, refined
-from mover.records import InputError
-from mover.types import Mesh
+from mover.core.errors import InputError
+from mover.core.types import Mesh
+from mover.geometry.mesh import box, signed_volume
+from mover.geometry.occupancy import (
+    ExtractConfig,
+    OccupancyNetwork,
+    extract,
+    load_occupancy,
+    network_of,
+    occupied_mesh,
+    refined,
+)
+from mover.geometry.topology import is_closed
 
 SMALL = ExtractConfig(coarse=8, levels=2)
 

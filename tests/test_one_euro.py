@@ -7,10 +7,9 @@ import pytest
 import torch
 from make_keypoints import as_bodies, seen, walker
 
-from mover.fitting import OneEuroConfig, smooth_bodies, smooth_keypoints
-from mover.fitting.finish import rows_of_bodies
-from mover.fitting.one_euro import one_euro
-from mover.stages.select_frames import SelectInputs, select_frames
+from mover.bodies.corrected import rows_of
+from mover.fitting.one_euro import OneEuroConfig, one_euro, smooth_bodies, smooth_keypoints
+from mover.stages.people.select_frames import SelectInputs, select_frames
 
 
 def naive(x, t, config):
@@ -96,7 +95,7 @@ def test_bodies_that_jump_are_dropped_by_the_filter_of_the_pipeline(fps):
     transl[wrong] += torch.tensor([0.0, 0.0, 0.8])
     bodies = as_bodies(dataclasses.replace(pose, transl=transl), frame, fps)
     keep = select_frames(SelectInputs(bodies)).keep
-    left = rows_of_bodies(bodies, keep)
+    left = rows_of(bodies, keep)
     assert sorted(set(range(30)) - set(left.frame.tolist())) == wrong
     images = dataclasses.replace(bodies, fps=None)
     assert select_frames(SelectInputs(images)).keep.all()

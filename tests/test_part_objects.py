@@ -7,10 +7,10 @@ import pytest
 import torch
 from analytic import FACES, box_verts, make_inputs
 
+from mover.core.observe import Energy
+from mover.core.types import Layout, Mesh
 from mover.geometry.mesh import sample_surface
-from mover.minimize import Energy
-from mover.stages.part_objects import part_objects, sharing
-from mover.types import Layout, Mesh
+from mover.stages.objects.place_objects import part_objects, sharing
 
 WEIGHT = 0.3
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from analytic import FACES, SIZES, box_verts, make_inputs
 
+from mover.core.types import Layout, Mesh
+from mover.energy.terms.apart import FAR, MARGIN, UPRIGHT
 from mover.geometry.mesh import sample_surface
 from mover.geometry.rotations import rot_y
 from mover.geometry.sections import CELL, WIDE, Sections, outline, sections_of
-from mover.stages.part_objects import sharing
-from mover.terms.apart import FAR, MARGIN, UPRIGHT
-from mover.types import Layout, Mesh
+from mover.stages.objects.place_objects import sharing
 
 
 def union(*boxes):

@@ -6,14 +6,16 @@ import pytest
 import torch
 from figures import ARMS_DOWN, ARMS_UP, SEATED, STRIDE, people, pose, turned
 
-from mover.bodies import open_body, zero_pose
-from mover.bodies.parts import LANDMARKS, PARTS, members, parts_of
+from mover.bodies.bone_frames import LANDMARKS
+from mover.bodies.parts import members, parts_of
 from mover.bodies.posture import landmarks
+from mover.bodies.skin import PARTS
+from mover.bodies.skinning import open_body, zero_pose
+from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals
-from mover.types import Bodies
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
-ASSETS = Path(__file__).parents[1] / "src" / "mover" / "assets"
+ASSETS = Path(__file__).parents[1] / "src" / "mover" / "bodies" / "assets"
 POSTURES = {"tpose": {}, "stand": ARMS_DOWN, "seated": SEATED, "walk": STRIDE, "up": ARMS_UP}
 
 

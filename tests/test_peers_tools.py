@@ -14,7 +14,7 @@ import peers_tools
 from engine import Room
 
 from mover.geometry import raster
-from mover.geometry.raster import Topology, Views
+from mover.geometry.raster import Crops, Topology
 
 SIZE = 32
 
@@ -25,7 +25,7 @@ def wedge() -> Room:
     verts = torch.tensor([[[0.0, 0, 3], [0.9, 0.1, 3.4], [0.1, 0.5, 3.2], [0.3, 0.2, 2.5]]])
     faces = torch.tensor([[[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]])
     K = torch.tensor([[[61.3, 0, 6.37], [0, 59.1, 10.21], [0, 0, 1]]])
-    views, edges = Views(K, SIZE, SIZE), torch.zeros(1, 0, 4, dtype=torch.long)
+    views, edges = Crops(K, SIZE, SIZE), torch.zeros(1, 0, 4, dtype=torch.long)
     mask = torch.zeros(1, SIZE, SIZE)
     return Room(verts, Topology(faces, edges), views, mask, mask, mask.bool())
 

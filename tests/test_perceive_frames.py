@@ -1,6 +1,7 @@
 """Frames, the steady camera, the clean picture and the lens."""
 
 import math
+import sys
 from fractions import Fraction
 from pathlib import Path
 
@@ -9,27 +10,22 @@ import pytest
 import torch
 from PIL import Image
 
-from mover.perceive.clean import CleanConfig, clean_picture, spread_frames
-from mover.perceive.homography import align, centres, moved, warp
-from mover.perceive.lens import exif_focal, lens_of
+from mover.core.errors import InputError
+from mover.core.run import Run
+from mover.perceive.capture import exif_focal, lens_of, perceive
+from mover.perceive.config import CleanConfig, FramesConfig, Lens, PerceiveConfig, SteadyConfig
+from mover.perceive.reference import clean_picture, spread_frames
 from mover.perceive.steady import (
-    SteadyConfig,
     SteadyInputs,
+    align,
     find_drift,
+    moved,
     seen_share,
     steady_frames,
     warning_of,
+    warp,
 )
-from mover.perceive.video import (
-    Clip,
-    FramesConfig,
-    TakeInputs,
-    load_frame,
-    stamp_of,
-    take_frames,
-    write_jpeg,
-)
-from mover.records import InputError
+from mover.perceive.video import Clip, TakeInputs, load_frame, stamp_of, take_frames, write_jpeg
 
 BEDROOM = Path(__file__).parents[2] / "shared" / "data" / "sam2_bedroom" / "bedroom.mp4"
 W, H = 320, 180
@@ -64,7 +60,12 @@ def turn(pan: float, tilt: float, roll: float, zoom: float, f: float) -> torch.T
 def view(world: torch.Tensor, M: torch.Tensor) -> torch.Tensor:
     """What a turned camera sees of a picture that is larger than its own."""
     shift = torch.tensor([[1.0, 0, 50], [0, 1, 40], [0, 0, 1]])
-    return warp(world, shift @ torch.linalg.inv(M), (H, W))[0]
+    return torch.from_numpy(warp(world.numpy(), shift @ torch.linalg.inv(M), (H, W)))
+
+
+def grey(picture: torch.Tensor) -> np.ndarray:
+    """Brightness in whole steps."""
+    return (picture.mean(-1) * 255).round().to(torch.uint8).numpy()
 
 
 def worst(found: torch.Tensor, true: torch.Tensor) -> float:
@@ -77,7 +78,7 @@ def test_a_turned_camera_is_found(focal: float | None, error: float):
     """To a fifth of a pixel with its lens; to a tenth of its motion with a lens 15 % off."""
     world = texture()
     M = turn(0.05, -0.03, 0.02, 1.01, 250.0)
-    fit = align(view(world, torch.eye(3)).mean(-1), view(world, M).mean(-1), torch.eye(3), focal)
+    fit = align(grey(view(world, torch.eye(3))), grey(view(world, M)), torch.eye(3), focal)
     assert worst(fit.H, M) < error
     assert worst(torch.eye(3), M) > 20
     assert fit.agree > 0.85
@@ -86,8 +87,8 @@ def test_a_turned_camera_is_found(focal: float | None, error: float):
 def test_people_and_light_do_not_pull_the_camera():
     world = texture(1)
     M = turn(-0.03, 0.02, 0.0, 1.0, 288.0)
-    a, b = view(world, torch.eye(3)).mean(-1), view(world, M).mean(-1) * 0.8 + 0.1
-    other = texture(2).mean(-1)
+    a, b = grey(view(world, torch.eye(3))), grey(view(world, M) * 0.8 + 0.1)
+    other = grey(texture(2))
     a[40:150, 60:120], b[30:140, 150:210] = other[40:150, 60:120], other[40:150, 60:120]
     assert worst(align(a, b, torch.eye(3)).H, M) < 0.5
 
@@ -142,6 +143,16 @@ def test_a_walking_camera_is_told(tmp_path: Path):
     drift = find_drift(SteadyInputs(clip), SteadyConfig())
     assert drift.verdict == "moves"
     assert "stands still" in (warning_of(drift) or "")
+
+
+def test_without_opencv_one_sentence_comes_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    run = Run(tmp_path / "out" / "perceived")
+    with pytest.raises(InputError, match=r"needs OpenCV: pip install '\.\[perceive\]'"):
+        perceive(tmp_path, tmp_path / "out", Lens(), PerceiveConfig(), run, print)
+    assert not any(tmp_path.rglob("*.jpg"))
 
 
 def write_video(path: Path, colours: list[int], times: list[int], rate: int = 30) -> None:
@@ -221,7 +232,6 @@ def test_the_clean_picture_is_the_room_that_people_never_hide_for_long():
     masks[3][:] = False
     assert clean_picture(range(6), load, CleanConfig()).frame == 3
     assert spread_frames(100, 3) == [0, 50, 99]
-    assert len(centres(2, 3)) == 6
 
 
 def test_the_lens_comes_from_the_file_the_angle_or_the_photo(tmp_path: Path):

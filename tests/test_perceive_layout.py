@@ -9,24 +9,24 @@ import numpy as np
 import pytest
 import torch
 
-from mover.commands import run_command
-from mover.furniture import make_piece
+from mover.app.cli import run_command
+from mover.core.errors import InputError
+from mover.core.run import Run
+from mover.core.types import Camera, Detection, Masks, SceneObject
+from mover.energy.terms.bbox import SEEN
+from mover.furniture.library import make_piece
 from mover.geometry.boxes import box_of, iou3d
 from mover.geometry.camera import pitch_roll, tilted, to_camera, to_world
-from mover.geometry.mesh import edges_of
-from mover.geometry.placement import place_piece
-from mover.geometry.raster import Topology, Views, look
-from mover.perceive.candidates import is_placed, shapes_of
+from mover.geometry.placement import place_object
+from mover.geometry.raster import Crops, Topology, look
+from mover.geometry.rle import encode, tight_box
+from mover.geometry.topology import edges_of
+from mover.io.files.meshes import write_mesh
+from mover.io.formats import read
+from mover.perceive.config import LayoutConfig, ScreenConfig
 from mover.perceive.depth_map import floor_height, median_depths, read_depth
-from mover.perceive.layout import LayoutConfig, Picture, first_scene
-from mover.perceive.screen import ScreenConfig, ScreenInputs, outermost, screen
-from mover.readers import read
-from mover.readers.masks import encode, tight_box
-from mover.readers.mesh_file import write_mesh
-from mover.records import InputError
-from mover.run import Run
-from mover.terms.bbox import SEEN
-from mover.types import Camera, Detection, Masks, Piece
+from mover.perceive.layout import Picture, first_scene, is_placed, shapes_of
+from mover.perceive.screen import ScreenInputs, outermost, screen
 
 W, H, FOCAL = 480, 320, 420.0
 HEIGHT = 1.35
@@ -37,31 +37,31 @@ def camera(pitch: float = -0.25, roll: float = 0.03) -> Camera:
     return Camera(K, tilted(torch.tensor(pitch), torch.tensor(roll)), W, H)
 
 
-def furniture(names: dict[str, tuple[float, float, float]], seed: int = 50) -> list[Piece]:
+def furniture(names: dict[str, tuple[float, float, float]], seed: int = 50) -> list[SceneObject]:
     rng = np.random.default_rng(seed)
     pieces = []
     for k, (name, (x, z, yaw)) in enumerate(names.items()):
         mesh = make_piece(name, rng).mesh
         t = torch.tensor([x, -HEIGHT, z])
         pieces.append(
-            Piece(f"p{k}", name, mesh, "", k, "ground", t, torch.tensor(yaw), torch.ones(3))
+            SceneObject(f"p{k}", name, mesh, "", k, "ground", t, torch.tensor(yaw), torch.ones(3))
         )
     return pieces
 
 
-def drawn(piece: Piece, view: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+def drawn(piece: SceneObject, view: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     """Mask and depth of one piece."""
-    mesh = place_piece(piece)
+    mesh = place_object(piece)
     verts = to_camera(mesh.verts, view.R_cam_world)[None]
     faces = mesh.faces[None]
-    views = Views(view.K[None], H, W)
+    views = Crops(view.K[None], H, W)
     cover, depths = look(verts, Topology(faces, edges_of(mesh.faces)[None]), views, depth=True)
     assert depths is not None
     depth = torch.where(depths.covered[0], depths.nearest[0], torch.inf)
     return cover[0] > 0.5, depth
 
 
-def picture(pieces: list[Piece], view: Camera, depth: bool = False) -> Picture:
+def picture(pieces: list[SceneObject], view: Camera, depth: bool = False) -> Picture:
     """What a perfect detector gives; the floor fills the rest of the depth map."""
     seen = [drawn(piece, view) for piece in pieces]
     nearest = torch.stack([d for _, d in seen]).amin(0)
@@ -90,11 +90,11 @@ QUICK = LayoutConfig(shapes=4, keep=2, turns=4)
 
 
 @pytest.fixture(scope="module")
-def pieces() -> list[Piece]:
+def pieces() -> list[SceneObject]:
     return furniture(ROOM)
 
 
-def test_outermost_points_have_the_box_of_the_shape(pieces: list[Piece]):
+def test_outermost_points_have_the_box_of_the_shape(pieces: list[SceneObject]):
     verts = pieces[0].mesh.verts
     points = outermost(verts)
     size = verts.amax(0) - verts.amin(0)
@@ -102,7 +102,7 @@ def test_outermost_points_have_the_box_of_the_shape(pieces: list[Piece]):
 
 
 @pytest.mark.slow
-def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[Piece]):
+def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[SceneObject]):
     seen = picture(pieces, camera())
     shapes = [shape for p in pieces for shape in shapes_of(p.category, 1)]
     low = [(s.mesh.verts - torch.tensor([0, float(s.mesh.verts[:, 1].min()), 0])) for s in shapes]
@@ -124,13 +124,15 @@ def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[Piece]):
 
 
 @pytest.mark.slow
-def test_a_perfect_picture_gives_furniture_near_the_true_one(pieces: list[Piece], tmp_path: Path):
+def test_a_perfect_picture_gives_furniture_near_the_true_one(
+    pieces: list[SceneObject], tmp_path: Path
+):
     run = Run(tmp_path)
     first = first_scene(picture(pieces, camera()), QUICK, run)
-    assert [p.category for p in first.scene.pieces] == list(ROOM)
-    assert [p.annotation for p in first.scene.pieces] == [0, 1, 2, 3]
+    assert [p.category for p in first.scene.objects] == list(ROOM)
+    assert [p.annotation for p in first.scene.objects] == [0, 1, 2, 3]
     overlaps = [
-        float(iou3d(box_of(a), box_of(b))) for a, b in zip(first.scene.pieces, pieces, strict=True)
+        float(iou3d(box_of(a), box_of(b))) for a, b in zip(first.scene.objects, pieces, strict=True)
     ]
     assert sum(overlaps) / 4 > 0.3
     for group in first.others:
@@ -141,7 +143,7 @@ def test_a_perfect_picture_gives_furniture_near_the_true_one(pieces: list[Piece]
 
 
 @pytest.mark.slow
-def test_measured_depth_makes_it_better(pieces: list[Piece], tmp_path: Path):
+def test_measured_depth_makes_it_better(pieces: list[SceneObject], tmp_path: Path):
     view = camera()
     seen = picture(pieces, view, depth=True)
     assert seen.depth is not None
@@ -156,7 +158,7 @@ def test_measured_depth_makes_it_better(pieces: list[Piece], tmp_path: Path):
     deep = first_scene(seen, config, Run(tmp_path))
 
     def score(first) -> float:
-        pairs = zip(first.scene.pieces, pieces, strict=True)
+        pairs = zip(first.scene.objects, pieces, strict=True)
         return sum(float((box_of(a).center - box_of(b).center).norm()) for a, b in pairs) / 4
 
     assert score(deep) < min(0.3, score(plain))
@@ -189,7 +191,7 @@ def test_shapes_are_those_of_the_class_and_differ():
     assert is_placed("dining table")
 
 
-def test_the_users_own_shapes_come_first(tmp_path: Path, pieces: list[Piece]):
+def test_the_users_own_shapes_come_first(tmp_path: Path, pieces: list[SceneObject]):
     write_mesh(pieces[1].mesh, tmp_path / "chair_0.glb")
     write_mesh(pieces[0].mesh, tmp_path / "sofa-1.glb")
     (own,) = shapes_of("chair", 5, tmp_path)
@@ -242,9 +244,9 @@ def test_depth_maps_without_a_unit_or_of_another_shape_are_refused(tmp_path: Pat
 
 
 def write_capture_without_scene(folder: Path, seen: Picture) -> None:
-    from mover.readers.camera_file import camera_to_json
-    from mover.readers.fields import write_json
-    from mover.readers.objects_file import detections_to_json
+    from mover.io.capture.camera_file import camera_to_json
+    from mover.io.capture.objects_file import detections_to_json
+    from mover.io.files.fields import write_json
 
     folder.mkdir()
     write_json(camera_to_json(seen.camera), folder / "camera.json")
@@ -253,7 +255,7 @@ def write_capture_without_scene(folder: Path, seen: Picture) -> None:
 
 @pytest.mark.slow
 def test_the_command_turns_masks_into_a_capture(
-    pieces: list[Piece], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    pieces: list[SceneObject], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     folder = tmp_path / "c"
     write_capture_without_scene(folder, picture(pieces[:2], camera()))
@@ -261,12 +263,12 @@ def test_the_command_turns_masks_into_a_capture(
     assert run_command("layout", [str(folder), *quick, "--screen.method.steps", "20"]) == 0
     assert "first scene of 2 objects" in capsys.readouterr().out
     capture = read("folder", folder)
-    assert [p.id for p in capture.scene.pieces] == ["sofa_0", "chair_0"]
+    assert [p.id for p in capture.scene.objects] == ["sofa_0", "chair_0"]
     others = json.loads((folder / "hypotheses.json").read_text())["objects"]
     for name, rows in others.items():
         assert len(rows) == 2
         assert all((folder / row["mesh"]).is_file() for row in rows)
-        piece = next(p for p in capture.scene.pieces if p.id == name)
+        piece = next(p for p in capture.scene.objects if p.id == name)
         assert rows[0]["yaw"] == pytest.approx(float(piece.yaw), abs=1e-5)
     assert run_command("layout", [str(tmp_path / "none")]) == 2
     (folder / "objects.json").unlink()

@@ -10,23 +10,27 @@ import pytest
 import torch
 from tiny_models import tiny_mask2former, tiny_oneformer, tiny_sam2, tiny_vitpose
 
-from mover.geometry.runs import decode
+from mover.core.errors import InputError
+from mover.core.types import Masks
+from mover.geometry.rle import decode, encode
+from mover.perceive.config import DetectConfig, JointsConfig, ModelsConfig, TrackConfig
 from mover.perceive.detect import (
-    DetectConfig,
     DetectInputs,
     Finds,
+    Network,
     find_instances,
     instances,
+    network,
     overlap,
     people_in,
 )
-from mover.perceive.joints import JointsConfig, JointsInputs, find_joints, joints_in
-from mover.perceive.models import ModelsConfig, Network, network
 from mover.perceive.track import (
+    JointsInputs,
     SegmentInputs,
-    TrackConfig,
     Tracks,
+    find_joints,
     full_masks,
+    joints_in,
     link_people,
     matched,
     nobody,
@@ -34,9 +38,6 @@ from mover.perceive.track import (
     track_people,
 )
 from mover.perceive.video import Clip, write_jpeg
-from mover.readers.masks import encode
-from mover.records import InputError
-from mover.types import Masks
 
 pytest.importorskip("transformers")
 pytestmark = pytest.mark.filterwarnings("default")  # transformers warns about itself

@@ -9,20 +9,18 @@ import torch
 from PIL import Image
 from tiny_models import tiny_mask2former, tiny_sam2, tiny_vitpose
 
-from mover.commands import run_command
-from mover.geometry.runs import decode
-from mover.perceive.capture import PerceiveConfig, people_of_clip
-from mover.perceive.clean import Clean
-from mover.perceive.detect import DetectConfig, Finds
-from mover.perceive.models import ModelsConfig
-from mover.perceive.reference import detections_in, grown, hidden_mask, reference_of
+from mover.app.cli import run_command
+from mover.core.run import Run
+from mover.core.types import Masks
+from mover.geometry.rle import decode, encode
+from mover.io.people.keypoints import read_keypoints
+from mover.perceive.capture import people_of_clip
+from mover.perceive.config import DetectConfig, ModelsConfig, PerceiveConfig
+from mover.perceive.detect import Finds
+from mover.perceive.reference import Clean, detections_in, grown, hidden_mask, reference_of
 from mover.perceive.steady import Drift
 from mover.perceive.track import Tracks
 from mover.perceive.video import Clip, write_jpeg
-from mover.readers.masks import encode
-from mover.readers.people.keypoints_file import read_keypoints
-from mover.run import Run
-from mover.types import Masks
 
 pytest.importorskip("transformers")
 pytestmark = pytest.mark.filterwarnings("default")  # transformers warns about itself

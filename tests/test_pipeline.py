@@ -10,13 +10,16 @@ import pytest
 import raycast
 import torch
 
-from mover.geometry.runs import decode
-from mover.minimize import Adam, Step, silent
-from mover.pipeline import PRESETS, Run, reconstruct
-from mover.readers import read
-from mover.readers.scene_file import read_scene
-from mover.results import read_config, write_results
-from mover.stages.explain_placements import ExplainInputs
+from mover.app.results import read_config, write_results
+from mover.core.observe import Step, silent
+from mover.core.run import Run
+from mover.energy.config import Adam
+from mover.geometry.rle import decode
+from mover.io.capture.scene_file import read_scene
+from mover.io.formats import read
+from mover.pipeline.presets import PRESETS
+from mover.pipeline.reconstruct import reconstruct
+from mover.stages.explain.placements import ExplainInputs
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 PHOTO, TOTAL3D = SHARED / "photo_bench", SHARED / "total3d_1"
@@ -41,9 +44,10 @@ def light(name, steps=15):
 
 @pytest.fixture(scope="module")
 def capture_folder(tmp_path_factory, small_room):
-    from mover.readers.folder import write_capture
-    from mover.results import write_truth
-    from mover.rooms.noise import NoiseConfig, add_noise
+    from mover.app.results import write_truth
+    from mover.io.capture.folder import write_capture
+    from mover_bench.rooms.config import NoiseConfig
+    from mover_bench.rooms.noise import add_noise
 
     folder = tmp_path_factory.mktemp("capture")
     write_capture(add_noise(small_room, NoiseConfig(), 1), folder)
@@ -122,19 +126,19 @@ class TestRun:
         ):
             assert (tmp_path / file).stat().st_size > 100, file
         scene = read_scene(tmp_path / "scene.json")
-        assert [p.id for p in scene.pieces] == [p.id for p in capture.scene.pieces]
-        assert len(list((tmp_path / "watertight").iterdir())) == len(scene.pieces)
+        assert [p.id for p in scene.objects] == [p.id for p in capture.scene.objects]
+        assert len(list((tmp_path / "watertight").iterdir())) == len(scene.objects)
         assert len(room.bodies.frame) == len(capture.bodies.frame)
         log = json.loads((tmp_path / "run.json").read_text())
         assert {"place_objects", "align_camera"} <= {s["name"] for s in log["stages"]}
         assert read_config(tmp_path / "run.json") == config
 
     def test_objects_of_the_result_stand_on_the_ground(self, capture_folder, tmp_path):
-        from mover.geometry.placement import place_piece
+        from mover.geometry.placement import place_object
 
         room = run_in(tmp_path, read("folder", capture_folder), light("robust"))
-        for piece in room.scene.pieces:
-            lowest = float(place_piece(piece).verts[:, 1].min())
+        for piece in room.scene.objects:
+            lowest = float(place_object(piece).verts[:, 1].min())
             assert abs(lowest - room.scene.ground) < 1e-4, piece.id
 
     def test_without_people_only_the_image_speaks_and_the_run_says_so(
@@ -167,9 +171,9 @@ class TestRun:
 
     def test_a_room_without_objects_still_has_a_floor_and_people(self, capture_folder, tmp_path):
         capture = read("folder", capture_folder)
-        empty = replace(capture, scene=replace(capture.scene, pieces=()))
+        empty = replace(capture, scene=replace(capture.scene, objects=()))
         room = run_in(tmp_path, empty, light("robust"))
-        assert room.scene.pieces == ()
+        assert room.scene.objects == ()
         assert room.scene.ground < -1
         assert (tmp_path / "report.html").stat().st_size > 100
 
@@ -190,13 +194,13 @@ class TestRun:
 @pytest.mark.skipif(not PHOTO.exists(), reason="the photograph is not here")
 def test_the_bench_of_a_real_photograph_stands_where_the_soles_stand(tmp_path):
     from mover.geometry.camera import pitch_roll, to_camera
-    from mover.geometry.placement import place_piece
+    from mover.geometry.placement import place_object
 
     capture = read("folder", PHOTO)
     room = run_in(tmp_path, capture, PRESETS["robust"])
     ground, camera = room.scene.ground, room.scene.camera
     assert abs(float(room.bodies.verts[..., 1].min()) - ground) < 0.02
-    bench = place_piece(room.scene.pieces[0])
+    bench = place_object(room.scene.objects[0])
     assert abs(float(bench.verts[:, 1].min()) - ground) < 1e-3
     assert abs(float(pitch_roll(camera.R_cam_world)[0])) < np.radians(5)
     front = raycast.cast(
@@ -213,17 +217,19 @@ def test_the_bench_of_a_real_photograph_stands_where_the_soles_stand(tmp_path):
 def test_the_outputs_of_a_network_run_through_the_image_only_stage(tmp_path):
     from mover.geometry.boxes import iou2d
     from mover.geometry.camera import project, to_camera
-    from mover.geometry.placement import place_piece
+    from mover.geometry.placement import place_object
 
     capture = read("total3d", TOTAL3D)
-    config = replace(PRESETS["robust"], layout=replace(PRESETS["robust"].layout, yaws=1, keep=1))
+    config = replace(
+        PRESETS["robust"], layout=replace(PRESETS["robust"].layout, yaws=1, num_hypotheses=1)
+    )
     room = run_in(tmp_path, capture, config)
 
     def fit(scene):
         boxes = {d.id: d.box for d in capture.detections}
         values = []
-        for piece in scene.pieces:
-            verts = to_camera(place_piece(piece).verts, scene.camera.R_cam_world)
+        for piece in scene.objects:
+            verts = to_camera(place_object(piece).verts, scene.camera.R_cam_world)
             pixels = project(verts, scene.camera.K)
             drawn = torch.cat([pixels.amin(0), pixels.amax(0)])
             values.append(float(iou2d(drawn, boxes[piece.annotation])))

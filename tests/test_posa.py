@@ -10,10 +10,10 @@ from scipy import sparse
 
 from mover.bodies.half_edges import half_edges, spirals
 from mover.bodies.posa import canonical, decode, load_posa, posa_contacts
+from mover.core.errors import InputError
+from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle, rot_y
-from mover.readers.contact_files import read_contacts
-from mover.records import InputError
-from mover.types import Bodies, BodyPose
+from mover.io.capture.bodies_file import read_contacts
 
 OCTAHEDRON = np.array(
     [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]

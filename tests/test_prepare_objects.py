@@ -3,18 +3,19 @@ import pytest
 import torch
 from analytic import FACES, box_verts
 
+from mover.core.types import Layout, Mesh, SceneObject
 from mover.furniture.library import BACKS, PIECES, SEATS, make_piece
-from mover.geometry.mesh import box, is_closed, signed_volume
-from mover.geometry.placement import place, place_piece
-from mover.stages.prepare_objects import (
-    PrepareConfig,
+from mover.geometry.mesh import box, signed_volume
+from mover.geometry.placement import place, place_object
+from mover.geometry.topology import is_closed
+from mover.stages.config import PrepareConfig
+from mover.stages.objects.prepare_objects import (
     PrepareInputs,
+    find_regions,
     prepare_objects,
     proxy_meshes,
-    restore,
+    to_objects,
 )
-from mover.stages.regions import find_regions
-from mover.types import Layout, Mesh, Piece
 
 LIGHT = PrepareConfig(cells=48, samples=200, region=100)
 
@@ -24,7 +25,7 @@ def piece_of(mesh, category="chair", name="a", **fields):
         "t_world_object": torch.tensor([0.4, -1.2, -3.0]), "yaw": torch.tensor(0.7),
         "scale": torch.tensor([1.1, 0.9, 1.2]),
     } | fields  # fmt: skip
-    return Piece(name, category, mesh, "", None, "ground", **values)
+    return SceneObject(name, category, mesh, "", None, "ground", **values)
 
 
 def off_centre_box():
@@ -54,7 +55,7 @@ def test_seats_backs_and_tops_are_where_the_furniture_has_them(name):
 def test_a_layout_and_back_gives_the_same_placement_whatever_the_origin():
     pieces = (piece_of(off_centre_box()),)
     prepared = prepare_objects(PrepareInputs(pieces), LIGHT)
-    back = restore(pieces, prepared, prepared.start)
+    back = to_objects(pieces, prepared, prepared.start)
     torch.testing.assert_close(back[0].t_world_object, pieces[0].t_world_object)
     torch.testing.assert_close(back[0].scale, pieces[0].scale)
 
@@ -65,8 +66,8 @@ def test_proxy_and_mesh_stand_in_the_same_place_after_any_move():
     layout = Layout(
         torch.tensor([[0.1, -1.5, -2.0]]), torch.tensor([2.0]), torch.tensor([[0.1, -0.2, 0.3]])
     )
-    restored = restore(pieces, prepared, layout)[0]
-    low, high = box(place_piece(restored).verts)
+    restored = to_objects(pieces, prepared, layout)[0]
+    low, high = box(place_object(restored).verts)
     verts = place(prepared.objects.verts, layout)[0]
     plow, phigh = box(verts)
     torch.testing.assert_close(low, plow, atol=2e-5, rtol=0)
@@ -79,7 +80,7 @@ def test_scaling_and_turning_act_about_the_centre_of_the_bottom():
     prepared = prepare_objects(PrepareInputs(pieces), LIGHT)
     start = prepared.start
     turned = Layout(start.t_world_object, start.yaw + 1.0, start.log_scale + 0.3)
-    low, high = box(place_piece(restore(pieces, prepared, turned)[0]).verts)
+    low, high = box(place_object(to_objects(pieces, prepared, turned)[0]).verts)
     center = (low + high) / 2
     torch.testing.assert_close(center[[0, 2]], start.t_world_object[0, [0, 2]], atol=2e-5, rtol=0)
     assert abs(float(low[1] - start.t_world_object[0, 1])) < 2e-5
@@ -96,7 +97,7 @@ def test_open_and_inverted_meshes_become_closed_proxies():
 
 def test_supports_name_the_carrying_object():
     table = piece_of(off_centre_box(), "table", "table")
-    lamp = Piece("lamp", "lamp", off_centre_box(), "", None, "table", *(
+    lamp = SceneObject("lamp", "lamp", off_centre_box(), "", None, "table", *(
         torch.zeros(3), torch.tensor(0.0), torch.ones(3)))  # fmt: skip
     prepared = prepare_objects(PrepareInputs((table, lamp)), LIGHT)
     assert prepared.objects.supports.tolist() == [-1, 0]

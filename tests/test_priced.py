@@ -5,19 +5,22 @@ from dataclasses import fields, replace
 import pytest
 import torch
 from analytic import humans_at, image_at, make_inputs, moved, walls_at
+from reference import use_engine
 from sm90 import ptx_of
 from test_raster import packed
 
-from mover.energy import SceneConfig, SceneWeights, scene_energy
-from mover.energy_warp import pricing, pricing_rows
-from mover.geometry.mesh import edges_of
-from mover.geometry.raster_engine import use_engine, use_threads
-from mover.minimize import Adam, Energy, minimize
-from mover.records import record
-from mover.stages.place_objects import with_trees
-from mover.terms.bbox import LEAST, UNKNOWN
-from mover.terms.depth import DepthRange
-from mover.types import Layout
+from mover.core.observe import Energy
+from mover.core.records import record
+from mover.core.types import Layout
+from mover.energy.config import Adam, SceneConfig, SceneWeights
+from mover.energy.fused.energy import energy_function, energy_of_rows
+from mover.energy.minimize import minimize
+from mover.energy.objective import scene_energy
+from mover.energy.terms.bbox import LEAST, UNKNOWN
+from mover.energy.terms.depth import DepthRange
+from mover.geometry.kernels.start import use_threads
+from mover.geometry.topology import edges_of
+from mover.stages.objects.place_objects import with_trees
 
 pytest.importorskip("warp")
 WEIGHTS = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.05)
@@ -61,7 +64,7 @@ def both(inputs, weights=WEIGHTS):
     """The energy by one kernel, and term by term."""
     config = SceneConfig(weights, "robust", GROWTH)
     rest = inputs.objects, inputs.camera, inputs.image, inputs.humans, config
-    fast = pricing(*rest)
+    fast = energy_function(*rest)
     assert fast(inputs.starts).whole is not None
     return fast, lambda layout: scene_energy(layout, *rest)
 
@@ -117,12 +120,11 @@ class TestAgreement:
         rest = inputs.objects, inputs.camera, inputs.image, inputs.humans
         fast, layout = both(inputs)[0], starts_of(inputs)
         value, slope = (x.flatten(0, 1) for x in told(fast, layout))
-        some = pricing_rows(*rest, SceneConfig(WEIGHTS, "robust", GROWTH))
-        assert some is not None
+        some = energy_of_rows(*rest, SceneConfig(WEIGHTS, "robust", GROWTH))
         for numbers in ([4], [8, 0, 5], [5, 0], list(range(9)), [7, 1, 2, 3]):
             rows = torch.tensor(numbers)
             few = Layout(*(getattr(layout, f.name).flatten(0, 1)[rows] for f in fields(Layout)))
-            found = told(lambda at, rows=rows: some(at, rows), few)
+            found = told(some(rows), few)
             assert torch.equal(found[0], value[rows])
             assert torch.equal(found[1], slope[rows])
 
@@ -200,14 +202,14 @@ class TestWhoPrices:
         inputs = room()
         rest = inputs.objects, inputs.camera, inputs.image, inputs.humans
         for form in ("paper", "release"):
-            energy = pricing(*rest, SceneConfig(WEIGHTS, form))
+            energy = energy_function(*rest, SceneConfig(WEIGHTS, form))
             assert energy(layout).whole is None
-        assert pricing(*rest, SceneConfig(WEIGHTS, "robust"))(layout).whole is not None
+        assert energy_function(*rest, SceneConfig(WEIGHTS, "robust"))(layout).whole is not None
         with use_engine("torch"):
-            assert pricing(*rest, SceneConfig(WEIGHTS, "robust"))(layout).whole is None
+            assert energy_function(*rest, SceneConfig(WEIGHTS, "robust"))(layout).whole is None
         double = make_inputs(torch.float64, size=16)
         rest = double.objects, double.camera, double.image, double.humans
-        assert pricing(*rest, SceneConfig(WEIGHTS, "robust"))(double.starts).whole is None
+        assert energy_function(*rest, SceneConfig(WEIGHTS, "robust"))(double.starts).whole is None
 
     def test_an_open_mesh_is_priced_term_by_term(self):
         inputs = room()
@@ -215,12 +217,12 @@ class TestWhoPrices:
         faces[0, 3] = 0
         objects = replace(inputs.objects, faces=faces)
         config = SceneConfig(WEIGHTS, "robust")
-        energy = pricing(objects, inputs.camera, inputs.image, inputs.humans, config)
+        energy = energy_function(objects, inputs.camera, inputs.image, inputs.humans, config)
         assert energy(inputs.starts).whole is None
 
     @pytest.mark.slow
     def test_the_kernel_compiles_for_an_h100_without_a_driver(self, tmp_path):
-        ptx_of("priced", tmp_path)
+        ptx_of("cost", tmp_path, "mover.energy.fused.kernels")
 
 
 @record

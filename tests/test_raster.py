@@ -5,15 +5,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import raster_torch
 import torch
 import trimesh
+from raster_torch_spans import coverage, on_screen, signed_areas, spans
 from raycast import cast, cast_backs, draw
+from reference import use_engine
 
-from mover.geometry import raster_torch
 from mover.geometry.camera import NEAR, tilted
-from mover.geometry.raster import Topology, Views, depths, first_hit, layers, look, silhouettes
-from mover.geometry.raster_engine import use_engine
-from mover.geometry.raster_spans import coverage, on_screen, signed_areas, spans
+from mover.geometry.raster import Crops, Topology, depths, first_hit, layers, look, silhouettes
 from mover.geometry.rotations import rot_y
 
 FOCAL = 500.0
@@ -108,7 +108,7 @@ def window(verts_cam, size, margin=1.15):
     K = torch.eye(3).to(verts).repeat(len(verts), 1, 1)
     K[:, 0, 0] = K[:, 1, 1] = FOCAL * size / side
     K[:, :2, 2] = size / 2 - (low + high) / 2 * (size / side)[:, None]
-    return Views(K, size, size)
+    return Crops(K, size, size)
 
 
 def supersampled(verts_cam, shape, views, by=16):
@@ -179,7 +179,7 @@ class TestSilhouettes:
     @pytest.mark.parametrize("shift", [0.0, 0.3, 0.5, 0.75])
     def test_rim_of_an_upright_rectangle_is_covered_by_its_exact_share(self, shift):
         verts, shape = slab((10 + shift, 6 + shift), (22 + shift, 20 + shift), 2.0, 2.5, PINHOLE)
-        image = silhouettes(verts[None], shape, Views(PINHOLE[None], 32, 32))[0]
+        image = silhouettes(verts[None], shape, Crops(PINHOLE[None], 32, 32))[0]
 
         def share(low, high):
             centre = torch.arange(32, dtype=torch.float64)
@@ -202,7 +202,7 @@ class TestSilhouettes:
         K = wide.K.clone()
         K[:, 0, 2] -= 40
         K[:, 1, 2] -= 25
-        whole, crop = (look(verts_cam, shape, v) for v in (wide, Views(K, 50, 33)))
+        whole, crop = (look(verts_cam, shape, v) for v in (wide, Crops(K, 50, 33)))
         torch.testing.assert_close(crop[0], whole[0][:, 25:75, 40:73], atol=1e-3, rtol=0)
         torch.testing.assert_close(
             crop[1].nearest, whole[1].nearest[:, 25:75, 40:73], atol=1e-4, rtol=0
@@ -215,7 +215,7 @@ class TestSilhouettes:
         uv = (verts @ K.T)[:, :2] / verts[:, 2:]
         (ax, ay), (bx, by) = (uv[1] - uv[0]).tolist(), (uv[2] - uv[0]).tolist()
         image = silhouettes(
-            verts[None], Topology(faces[None], edges_of(faces)[None]), Views(K[None], 120, 120)
+            verts[None], Topology(faces[None], edges_of(faces)[None]), Crops(K[None], 120, 120)
         )
         assert image.sum().item() == pytest.approx(abs(ax * by - ay * bx) / 2, rel=1e-3)
 
@@ -268,7 +268,7 @@ class TestBatches:
         for i, name in enumerate(names):
             one, alone = packed([name])
             own = free.detach()[i : i + 1, : one.shape[1]].clone().requires_grad_()
-            image1, seen1 = look(own, alone, Views(views.K[i : i + 1], 64, 64))
+            image1, seen1 = look(own, alone, Crops(views.K[i : i + 1], 64, 64))
             (image1.square().sum() + seen1.nearest.square().sum()).backward()
             torch.testing.assert_close(image[i], image1[0])
             torch.testing.assert_close(seen.farthest[i], seen1.farthest[0])
@@ -300,7 +300,7 @@ class TestLayers:
         places = torch.tensor([[0.0, 0, 3], [0.5, -0.3, 2.5], [-2.4, 0, 3]])
         verts = torch.tensor(np.array(both.vertices), dtype=torch.float32) + places[:, None]
         K = torch.tensor([[80.0, 0, 50], [0, 80, 40], [0, 0, 1]]).repeat(3, 1, 1)
-        return verts, torch.tensor(np.array(both.faces)), Views(K, 80, 100)
+        return verts, torch.tensor(np.array(both.faces)), Crops(K, 80, 100)
 
     @pytest.mark.parametrize("pixels", [1, 1 << 20])
     def test_rays_enter_and_first_leave_where_a_ray_caster_says(self, bodies, pixels, monkeypatch):
@@ -372,13 +372,13 @@ def degenerate():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_degenerate_items_give_finite_values_and_gradients(verts, shape, dtype):
     free = verts.to(dtype).clone().requires_grad_()
-    image, seen = look(free, shape, Views(PINHOLE[None], 24, 32))
+    image, seen = look(free, shape, Crops(PINHOLE[None], 24, 32))
     (image.sum() + seen.nearest.sum() + seen.farthest.sum()).backward()
     assert image.dtype == seen.nearest.dtype == dtype
     for values in (image, seen.nearest, seen.farthest, free.grad):
         assert torch.isfinite(values).all()
     assert ((image >= 0) & (image <= 1)).all()
-    front = layers(free.detach(), shape.faces[0], Views(PINHOLE[None], 24, 32)).front
+    front = layers(free.detach(), shape.faces[0], Crops(PINHOLE[None], 24, 32)).front
     assert not torch.isnan(front).any()
     assert (
         first_hit(free.detach()[0], shape.faces[0], PINHOLE, (24, 32))[1].max()
@@ -389,7 +389,7 @@ def test_degenerate_items_give_finite_values_and_gradients(verts, shape, dtype):
 def test_no_items_give_empty_images():
     verts, shape = packed(["chair"])
     none = Topology(shape.faces[:0], shape.edges[:0])
-    image, seen = look(verts[:0], none, Views(PINHOLE[None][:0], 8, 9))
+    image, seen = look(verts[:0], none, Crops(PINHOLE[None][:0], 8, 9))
     assert image.shape == seen.covered.shape == (0, 8, 9)
 
 

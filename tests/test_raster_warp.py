@@ -1,27 +1,24 @@
 """The Warp rasteriser against the torch rasteriser, itself, and input that must not hurt."""
 
 import gc
-import os
 import subprocess
 import sys
 import weakref
 
 import pytest
+import raster_torch
 import torch
 import trimesh
 from sm90 import ptx_of
 from test_raster import PINHOLE, edges_of, packed, posed, poses, slab, window
 
-from mover.geometry import (
-    raster,
-    raster_engine,
-    raster_torch,
-    raster_warp,
-    raster_warp_cpu,
-    raster_warp_cuda,
-)
-from mover.geometry.raster import Topology, Views
-from mover.geometry.raster_engine import engine, threads, use_engine, use_threads
+from mover.geometry import raster
+from mover.geometry.kernels.start import _cores, threads, use_threads
+from mover.geometry.raster import Crops, Topology
+from mover.geometry.raster import warp as raster_warp
+from mover.geometry.raster import warp_cpu as raster_warp_cpu
+from mover.geometry.raster import warp_cuda as raster_warp_cuda
+from mover.geometry.raster.engine import drawn_by, engine
 
 wp = pytest.importorskip("warp")
 NAMES = ["sphere", "torus", "chair", "table", "sofa"]
@@ -78,7 +75,7 @@ class TestAgreement:
     def test_edges_through_pixel_centres_are_decided_as_by_torch(self, shift):
         """Both test centres with the same operations, so not even a tie may differ."""
         verts, shape = slab((9.5 + shift, 5.5), (21.5, 20.5 + shift), 2.0, 2.5, PINHOLE)
-        views = Views(PINHOLE[None], 32, 32)
+        views = Crops(PINHOLE[None], 32, 32)
         verts = verts[None].float()
         found, truth = (pulled(r, verts, shape, views) for r in (raster_warp, raster_torch))
         assert torch.equal(found[0], truth[0])
@@ -99,7 +96,7 @@ class TestAgreement:
         verts = torch.tensor([[-9.0, 1, 9], [9, 1, 9], [0, 1, 0.5], [0, 2, 5]])
         faces = torch.tensor([[0, 1, 2], [0, 2, 3], [2, 1, 3], [1, 0, 3]])
         inputs = verts[None], Topology(faces[None], edges_of(faces)[None])
-        views = Views(PINHOLE[None] * torch.tensor([[4.0], [4], [1]]), 200, 130)
+        views = Crops(PINHOLE[None] * torch.tensor([[4.0], [4], [1]]), 200, 130)
         found, truth = (pulled(r, *inputs, views) for r in (raster_warp, raster_torch))
         assert found[3].float().mean() > 0.2
         for values, expected in zip(found[:4], truth[:4], strict=True):
@@ -166,7 +163,7 @@ class TestBadInput:
     def test_objects_out_of_sight_draw_nothing_that_is_not_finite(self, factor, shift):
         verts, shape = packed(["chair"])
         verts = verts * factor + torch.tensor([0, 0, 3.0]) + torch.tensor(shape and shift)
-        views = Views(PINHOLE[None], 32, 32)
+        views = Crops(PINHOLE[None], 32, 32)
         found, truth = (pulled(r, verts, shape, views) for r in (raster_warp, raster_torch))
         for values, expected in zip(found[:4], truth[:4], strict=True):
             torch.testing.assert_close(values, expected, atol=1e-5, rtol=1e-5)
@@ -180,7 +177,7 @@ class TestBadInput:
         verts = torch.tensor([[[-0.3, -0.2, 2.0], [0.04, 0.33, 1.9], [0.31, -0.14, 2.1]]])
         shape = Topology(torch.tensor([[[0, 1, 2]]]), torch.zeros(1, 0, 4, dtype=torch.int64))
         K = PINHOLE * torch.tensor([[4.0], [4.0], [1.0]])
-        image = raster_warp.look(verts, shape, Views(K[None], 128, 128), depth=False)[0]
+        image = raster_warp.look(verts, shape, Crops(K[None], 128, 128), depth=False)[0]
         uv = (verts[0] @ K.T)[:, :2] / verts[0, :, 2:]
         area = torch.linalg.det(uv[1:] - uv[0]).abs().item() / 2
         assert image.sum().item() == pytest.approx(area, rel=0.01)
@@ -190,13 +187,13 @@ class TestBadInput:
     def test_no_objects_give_empty_images(self):
         verts_cam, shape, views = scene(["chair"], 16)
         none = Topology(shape.faces[:0], shape.edges[:0])
-        image, seen = raster_warp.look(verts_cam[:0], none, Views(views.K[:0], 8, 9))
+        image, seen = raster_warp.look(verts_cam[:0], none, Crops(views.K[:0], 8, 9))
         assert image.shape == seen.covered.shape == (0, 8, 9)
 
     def test_a_window_of_4k_is_drawn(self):
         verts_cam, shape, views = scene(["chair"], 2160)
         K = views.K + torch.tensor([[0, 0, 840.0], [0, 0, 0], [0, 0, 0]])
-        image, seen = raster_warp.look(verts_cam, shape, Views(K, 2160, 3840))
+        image, seen = raster_warp.look(verts_cam, shape, Crops(K, 2160, 3840))
         small = raster_warp.look(verts_cam, shape, scene(["chair"], 216)[2])[0]
         assert image.sum().item() == pytest.approx(100 * small.sum().item(), rel=0.01)
         assert torch.isfinite(seen.nearest).all()
@@ -217,42 +214,35 @@ class TestBadInput:
 
 
 class TestEngine:
-    def test_the_block_wins_over_the_environment_and_that_over_auto(self, monkeypatch):
-        monkeypatch.delenv("MOVER_ENGINE", raising=False)
+    def test_a_reference_draws_inside_its_block_only(self):
+        inputs = scene(["sphere"], 24)
         assert engine() == "warp"
-        monkeypatch.setenv("MOVER_ENGINE", "torch")
-        assert engine() == "torch"
-        with use_engine("warp"):
-            assert engine() == "warp"
-        with use_engine("auto"):
-            assert engine() == "warp"
-        assert engine() == "torch"
-
-    def test_an_unknown_engine_is_refused_with_the_choices(self, monkeypatch):
-        monkeypatch.setenv("MOVER_ENGINE", "cuda")
-        with pytest.raises(ValueError, match="'cuda', expected one of auto, torch, warp"):
-            engine()
-
-    def test_without_warp_auto_is_torch(self, monkeypatch):
-        monkeypatch.delenv("MOVER_ENGINE", raising=False)
-        monkeypatch.setattr(raster_engine, "_has_warp", lambda: False)
-        assert engine() == "torch"
+        with drawn_by(raster_torch):
+            assert engine() == "torch"
+            assert torch.equal(raster.look(*inputs)[0], raster_torch.look(*inputs)[0])
+        assert engine() == "warp"
 
     @pytest.mark.parametrize(("asked", "count"), [("3", 3), ("0", None), ("many", None)])
     def test_threads_are_those_of_openmp_else_one_a_core(self, asked, count, monkeypatch):
         monkeypatch.setenv("OMP_NUM_THREADS", asked)
-        assert threads() == (count or raster_engine._cores())
+        assert threads() == (count or _cores())
         with use_threads(5):
             assert threads() == 5
 
-    def test_what_warp_cannot_draw_goes_to_torch(self):
+    def test_double_precision_is_drawn_in_single_and_handed_back(self):
         verts_cam, shape, views = scene(["sphere"], 24)
-        K = views.K.clone().requires_grad_()
-        with use_engine("warp"):
-            image = raster.look(verts_cam, shape, Views(K, 24, 24))[0]
-            image.square().sum().backward()
-            assert K.grad.abs().sum() > 0
-            assert raster.look(verts_cam.double(), shape, views)[0].dtype == torch.float64
+        free, same = (v.clone().requires_grad_() for v in (verts_cam.double(), verts_cam))
+        (image, seen), (single, _) = (raster_warp.look(v, shape, views) for v in (free, same))
+        assert image.dtype == seen.nearest.dtype == torch.float64
+        assert torch.equal(image, single.double())
+        image.square().sum().backward()
+        single.square().sum().backward()
+        assert torch.equal(free.grad, same.grad.double())
+
+    def test_intrinsics_that_ask_for_a_gradient_are_refused(self):
+        verts_cam, shape, views = scene(["sphere"], 24)
+        with pytest.raises(ValueError, match="no gradient"):
+            raster_warp.look(verts_cam, shape, Crops(views.K.clone().requires_grad_(), 24, 24))
 
     @pytest.mark.slow
     def test_drawing_says_nothing(self):
@@ -261,10 +251,9 @@ class TestEngine:
             "e = torch.zeros(1, 0, 4).long(); f = torch.tensor([[[0, 1, 2]]]);"
             "v = torch.tensor([[[0., 0, 2], [0, 1, 2], [1, 0, 2]]]);"
             "K = torch.tensor([[[9., 0, 8], [0, 9, 8], [0, 0, 1]]]);"
-            "assert look(v, Topology(f, e), Views(K, 16, 16))[0].sum() > 5"
+            "assert look(v, Topology(f, e), Crops(K, 16, 16))[0].sum() > 5"
         )
-        env = {**os.environ, "MOVER_ENGINE": "warp"}
-        done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
     @pytest.mark.slow

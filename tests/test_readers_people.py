@@ -13,29 +13,21 @@ import make_smpl
 import numpy as np
 import pytest
 import torch
+from test_safe_pickle import BOMBS
 
-from mover import commands
+from mover.app import cli
 from mover.bodies import BODY_MODELS, load_model
 from mover.bodies.skeleton import JOINTS
+from mover.core.errors import InputError
+from mover.core.types import BodyPose, Keypoints
 from mover.geometry.camera import project
-from mover.readers.bodies_file import read_bodies, write_bodies
-from mover.readers.camera_file import camera_of
-from mover.readers.fields import At
-from mover.readers.people import (
-    BODIES_FROM,
-    KEYPOINTS_FROM,
-    Known,
-    as_openpose,
-    attitude,
-    bodies_from,
-    camera_from,
-    in_world,
-    keypoints_from,
-    read_keypoints,
-    write_keypoints,
-)
-from mover.records import InputError
-from mover.types import BodyPose, Keypoints
+from mover.io.capture.bodies_file import read_bodies, write_bodies
+from mover.io.capture.camera_file import camera_of
+from mover.io.files.fields import At
+from mover.io.formats import names
+from mover.io.people.bodies import attitude, bodies_from, camera_from, in_world
+from mover.io.people.found import Known
+from mover.io.people.keypoints import as_openpose, keypoints_from, read_keypoints, write_keypoints
 
 pytest.importorskip("joblib", reason="the fixtures are written by joblib, as the tools do")
 
@@ -176,8 +168,8 @@ def test_what_is_written_is_read_again(tool, tmp_path, faces):
 
 
 def test_every_tool_has_a_fixture():
-    assert {name.split(":")[0] for name in made.BODIES} == set(BODIES_FROM)
-    assert {name.split(":")[0] for name in made.KEYPOINTS} == set(KEYPOINTS_FROM)
+    assert {name.split(":")[0] for name in made.BODIES} == set(names("people"))
+    assert {name.split(":")[0] for name in made.KEYPOINTS} == set(names("keypoints"))
 
 
 @pytest.mark.parametrize("tool", ["phalp", "slahmr", "wham", "gvhmr", "tram", "smplifyx"])
@@ -381,6 +373,27 @@ def test_hostile_pickles_are_refused_and_not_run(tool, tmp_path, monkeypatch):
     assert not (tmp_path / "owned").exists()
 
 
+@pytest.mark.parametrize("bomb", BOMBS)
+@pytest.mark.parametrize("tool", made.BODIES)
+def test_bombs_in_pickles_of_every_tool_are_refused_at_once(tool, bomb, tmp_path):
+    path = made.BODIES[tool](tmp_path)
+    files = [f for f in tmp_path.rglob("*") if f.suffix in (".pkl", ".npy", ".pt")]
+    value = {"pose": BOMBS[bomb]()}
+    for file in files:
+        kept = file.read_bytes()
+        if file.suffix == ".npy":
+            np.save(file, value, allow_pickle=True)
+        elif file.suffix == ".pt":
+            torch.save(value, file)
+        else:
+            file.write_bytes(pickle.dumps(value))
+        with pytest.raises(InputError, match=rf"{file.name}: (unfolds|holds a list)"):
+            bodies_from(tool.split(":")[0], path, KNOWN)
+        file.write_bytes(kept)
+    others = {f.suffix for f in tmp_path.rglob("*") if f.is_file()} - {".pkl", ".npy", ".pt"}
+    assert others <= {".npz", ".json"}  # these hold no pickles
+
+
 def test_an_npz_with_pickled_objects_is_refused(tmp_path):
     path = tmp_path / "a_world_results.npz"
     np.savez(path, trans=np.array([{"a": 1}], dtype=object))
@@ -406,7 +419,7 @@ def test_pare_without_a_lens_asks_for_it(tmp_path):
 
 
 def test_an_unknown_tool_is_answered_with_the_known_ones(tmp_path):
-    with pytest.raises(ValueError, match="gvhmr"):
+    with pytest.raises(InputError, match="gvhmr"):
         bodies_from("hmr", tmp_path)
 
 
@@ -509,7 +522,7 @@ def test_the_command_writes_bodies_and_a_camera(tmp_path, capsys):
     out, camera = tmp_path / "bodies.npz", tmp_path / "found.json"
     line = ["gvhmr", path, "--out", out, "--camera", tmp_path / "camera.json"]
     line += ["--write-camera", camera, "--fps", "30", "--space", "world"]
-    assert commands.run_command("bodies", [str(word) for word in line]) == 0
+    assert cli.run_command("import-bodies", [str(word) for word in line]) == 0
     text = capsys.readouterr().out
     assert "5 rows, 1 people in 5 frames" in text
     assert f"pitch {made.PITCH:.3f} rad" in text
@@ -527,21 +540,21 @@ def test_an_import_takes_the_bodies_of_a_tool_by_their_path(tmp_path):
     room = {"camera": made.camera_json(), "ground": -1.4, "objects": [{**box, "yaw": 0.3}]}
     (tmp_path / "boxes.json").write_text(json.dumps(room))
     line = ["boxes", tmp_path / "boxes.json", "--out", tmp_path / "room", "--bodies", path]
-    assert commands.run_command("import", [*map(str, line), "--bodies-from", "gvhmr"]) == 0
+    assert cli.run_command("import", [*map(str, line), "--bodies-from", "gvhmr"]) == 0
     found = read_bodies(tmp_path / "room" / "bodies.npz")
     direct = bodies_from("gvhmr", path, KNOWN).bodies
     assert found.frame.tolist() == direct.frame.tolist()
     assert (found.verts - direct.verts).abs().max() < 1e-4
     assert found.pose is not None
     bad = [*map(str, line), "--bodies-from", "nobody"]
-    assert commands.run_command("import", bad) == 2
+    assert cli.run_command("import", bad) == 2
 
 
 def test_the_command_writes_keypoints_and_names_the_tools(tmp_path, capsys):
     path, out = made.write_coco17(tmp_path), tmp_path / "k.npz"
-    assert commands.run_command("bodies", ["coco17", str(path), "--out", str(out)]) == 0
+    assert cli.run_command("import-bodies", ["coco17", str(path), "--out", str(out)]) == 0
     assert read_keypoints(out).layout == "coco17"
-    assert commands.run_command("bodies", ["smpl", str(path)]) == 2
+    assert cli.run_command("import-bodies", ["smpl", str(path)]) == 2
     assert "sam3dbody" in capsys.readouterr().err
 
 

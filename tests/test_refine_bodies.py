@@ -9,25 +9,32 @@ import torch
 from analytic import FACES, box_verts
 from figures import ARMS_DOWN, SEATED, STRIDE, people, pose
 
-from mover.bodies.corrected import Correction, corrected, moved, no_correction, puppet_of
+from mover.bodies.corrected import Correction, corrected, in_world, moved, no_correction, puppet_of
 from mover.bodies.parts import members, parts_of
-from mover.bodies.world import in_world
+from mover.core.errors import InputError
+from mover.core.types import Camera, Mesh, Room, Scene, SceneObject
+from mover.energy.body_terms.contact import (
+    Matches,
+    Skin,
+    Surface,
+    gather_matches,
+    touch_term,
+    without_kept,
+)
+from mover.energy.body_terms.order import Bounds, Sighting, bounds_of_skin, order_term
+from mover.energy.body_terms.room import sink_term, stand_term, under_term
+from mover.energy.body_terms.start import angle_term, depth_share, image_term, range_term
+from mover.energy.body_terms.time import gather_neighbours, lock_term, smooth_term, steady_term
+from mover.energy.config import Adam, MatchConfig
 from mover.geometry.mesh import vertex_normals
 from mover.geometry.volume import Volume
-from mover.minimize import Adam
-from mover.readers.people import Known, bodies_from
-from mover.records import InputError
-from mover.stages.align_camera import AlignInputs, align_camera
-from mover.stages.body_evidence import surroundings_of
-from mover.stages.find_soles import SolesInputs, find_soles
-from mover.stages.refine_bodies import ABLATION, SMOOTHED, RefineBodiesConfig, refine_bodies
-from mover.terms.body_contact import MatchConfig, Matches, Skin, Surface, gather_matches, touch_term
-from mover.terms.body_kept import without_kept
-from mover.terms.body_order import Bounds, Sighting, bounds_of_skin, order_term
-from mover.terms.body_room import sink_term, stand_term, under_term
-from mover.terms.body_start import angle_term, depth_share, image_term, range_term
-from mover.terms.body_time import gather_neighbours, lock_term, smooth_term, steady_term
-from mover.types import Camera, Mesh, Piece, Room, Scene
+from mover.io.people.bodies import bodies_from
+from mover.io.people.found import Known
+from mover.stages.camera.align_camera import AlignInputs, align_camera
+from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
+from mover.stages.config import RefineBodiesConfig
+from mover.stages.people.body_evidence import surroundings_of
+from mover.stages.people.refine_bodies import ABLATION, SMOOTHED, refine_bodies
 
 SAM = Path(__file__).parents[2] / "shared" / "data" / "sam3d_body"
 K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -61,7 +68,7 @@ def room_with(bodies, *boxes):
         mesh = Mesh(box_verts(size).float(), FACES)
         proxies.append(mesh)
         pieces.append(
-            Piece(f"box_{k}", "stool", mesh, "", None, "ground", torch.tensor(place),
+            SceneObject(f"box_{k}", "stool", mesh, "", None, "ground", torch.tensor(place),
                   torch.tensor(0.0), torch.ones(3))
         )  # fmt: skip
     scene = Scene(CAMERA, GROUND, tuple(pieces))
@@ -305,7 +312,7 @@ def test_real_people_of_sam_3d_body_stand_on_the_floor_of_their_feet(tmp_path):
     camera = Camera(read.K, CAMERA.R_cam_world, width, height)
     parts = parts_of(read.bodies, camera.R_cam_world[:, 1])
     keep = torch.ones(4, dtype=torch.bool)
-    soles = find_soles(SolesInputs(read.bodies, parts, keep, camera))
+    soles = find_foot_contacts(FootContactInputs(read.bodies, parts, keep, camera))
     level = align_camera(AlignInputs(soles, camera, None, None))
     scene = Scene(level.camera, level.ground, ())
     given = in_world(read.bodies, level.camera)

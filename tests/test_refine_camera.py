@@ -3,15 +3,16 @@ from dataclasses import replace
 import torch
 from analytic import GROUND, make_inputs
 
-from mover.energy import HumanCues
+from mover.energy.config import Adam
+from mover.energy.objective import HumanCues
 from mover.geometry.camera import pitch_roll, tilted
-from mover.geometry.floor import recast
-from mover.geometry.placement import stand
-from mover.minimize import Adam
-from mover.presets import ROBUST
-from mover.stages.place_objects import PlaceInputs, place_objects
-from mover.stages.refine_camera import RefineConfig, RefineInputs, refine_camera
-from mover.stages.starts import alone
+from mover.geometry.placement import reproject, rest_on_support
+from mover.pipeline.presets import ROBUST
+from mover.stages.camera.refine_camera import RefineInputs, refine_camera
+from mover.stages.config import RefineConfig
+from mover.stages.objects.place_inputs import PlaceInputs
+from mover.stages.objects.place_objects import place_objects
+from mover.stages.objects.starts import alone
 
 LOOSE = torch.diag(torch.tensor([0.07, 0.07, 0.1]).square())
 TIGHT = torch.diag(torch.tensor([1e-4, 1e-4, 1e-4]).square())
@@ -24,8 +25,8 @@ def wrong_camera(covariance):
     wrong = tilted(pitch + 0.026, roll - 0.02)
     objects, truth = inputs.objects, inputs.starts
     ground = GROUND + 0.03
-    start = recast(truth, objects.size[:, 1], inputs.camera.R_cam_world, wrong)
-    start = stand(start, objects.supports, objects.size[:, 1], ground)
+    start = reproject(truth, objects.size[:, 1], inputs.camera.R_cam_world, wrong)
+    start = rest_on_support(start, objects.supports, objects.size[:, 1], ground)
     start = replace(
         start,
         t_world_object=start.t_world_object[0],

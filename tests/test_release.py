@@ -6,15 +6,16 @@ import pytest
 import torch
 from analytic import make_inputs
 
+from mover.core.types import Layout
+from mover.energy.terms.contact import contact_term
+from mover.energy.terms.depth import DepthRange, depth_term
+from mover.energy.terms.factors import factors
+from mover.energy.terms.silhouette import edge_term
 from mover.geometry.placement import place
-from mover.presets import RELEASE
-from mover.stages.reinitialize import ReinitConfig, ReinitInputs, by_release
-from mover.stages.spans import bounded, unbounded
-from mover.terms.contact import contact_term
-from mover.terms.depth import DepthRange, depth_term
-from mover.terms.factors import factors
-from mover.terms.silhouette import edge_term
-from mover.types import Layout
+from mover.pipeline.presets import RELEASE
+from mover.stages.config import ReinitConfig
+from mover.stages.objects.place_objects import bounded, unbounded
+from mover.stages.objects.starts import ReinitInputs, by_release
 
 
 def renamed(inputs, *categories):

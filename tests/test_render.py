@@ -10,16 +10,24 @@ import torch
 from little_room import GROUND, room, walkers
 from PIL import Image
 
+from mover.app.pictures.board import set_up, show
+from mover.app.pictures.config import RenderConfig
+from mover.app.pictures.eye import (
+    above_eye,
+    floor_seen,
+    orbit_eye,
+    seen_from,
+    spinning_eyes,
+    video_eye,
+)
+from mover.app.pictures.film import save_film, video_pictures
+from mover.app.pictures.floor import ground_under, shadows
+from mover.app.pictures.paint import NOBODY, PERSON, draw, furniture, joined, people
+from mover.app.pictures.render import Moment, render_result, render_worlds, world_of
+from mover.core.errors import InputError
 from mover.geometry.camera import project, to_camera
-from mover.readers.masks import thinned
-from mover.records import InputError
-from mover.render import Moment, RenderConfig, render_result, render_worlds, world_of
-from mover.render_board import set_up, show
-from mover.render_eye import above_eye, floor_seen, orbit_eye, seen_from, spinning_eyes, video_eye
-from mover.render_film import save_film, video_pictures
-from mover.render_floor import ground_under, shadows
-from mover.render_paint import NOBODY, PERSON, draw, furniture, joined, people
-from mover.rooms.render import see
+from mover.geometry.rle import thinned
+from mover_bench.rooms.render import see
 
 
 def pixels_of(points_world, eye):
@@ -31,7 +39,7 @@ def test_an_object_is_drawn_on_the_pixels_of_its_mask(small_room):
     owner = draw(furniture(small_room.truth), video_eye(camera, camera.width)).owner
     masks = see(small_room.plan).piece
     assert owner.shape == masks.shape
-    for index in range(len(small_room.truth.pieces)):
+    for index in range(len(small_room.truth.objects)):
         mine, mask = owner == index, masks == index
         assert (mine & mask).sum() >= 0.98 * (mine | mask).sum()
 
@@ -60,7 +68,7 @@ def test_the_eye_of_the_video_sees_the_same_points_at_any_size():
 @pytest.mark.parametrize("azimuth", [0.0, 0.7, 2.0, -2.5])
 @pytest.mark.parametrize("elevation", [0.0, 0.4, 1.2, -0.3])
 def test_an_eye_around_the_room_sees_everything_upright(azimuth: float, elevation: float):
-    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().pieces])
+    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().objects])
     eye = orbit_eye(points, (400, 300), azimuth, elevation)
     assert torch.allclose(eye.R_eye_world @ eye.R_eye_world.mT, torch.eye(3), atol=1e-6)
     assert torch.linalg.det(eye.R_eye_world) == pytest.approx(1, abs=1e-5)
@@ -73,7 +81,7 @@ def test_an_eye_around_the_room_sees_everything_upright(azimuth: float, elevatio
 
 
 def test_from_the_right_the_right_of_the_image_is_near():
-    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().pieces])
+    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().objects])
     right = torch.tensor([1.0, -1.0, -3.5])
     front, side = (orbit_eye(points, (400, 300), a, 0.3) for a in (0.0, math.pi / 2))
     centre = points.mean(0)
@@ -82,7 +90,7 @@ def test_from_the_right_the_right_of_the_image_is_near():
 
 
 def test_from_above_the_plan_lies_as_in_the_report():
-    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().pieces])
+    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().objects])
     eye = above_eye(points, (400, 300))
     near_left, near_right, far_left = (
         pixels_of(torch.tensor([x, -1.0, z]), eye) for x, z in ((-1, -3), (1, -3), (-1, -4))
@@ -92,7 +100,7 @@ def test_from_above_the_plan_lies_as_in_the_report():
 
 
 def test_eyes_that_go_around_keep_their_distance():
-    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().pieces])
+    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().objects])
     eyes = spinning_eyes(points, (400, 300), [0.0, 1.0, 2.0, 4.0], 0.4)
     middle = (points.amin(0) + points.amax(0)) / 2
     far = torch.stack([(e.t_world_eye - middle).norm() for e in eyes])
@@ -135,13 +143,13 @@ def test_a_shadow_is_darkest_where_something_stands():
 
 
 def unannotated(scene):
-    pieces = tuple(dataclasses.replace(p, annotation=None) for p in scene.pieces)
-    return dataclasses.replace(scene, pieces=pieces)
+    pieces = tuple(dataclasses.replace(p, annotation=None) for p in scene.objects)
+    return dataclasses.replace(scene, objects=pieces)
 
 
 def folder(tmp_path: Path) -> Path:
-    from mover.readers.bodies_file import write_bodies
-    from mover.readers.scene_file import write_scene
+    from mover.io.capture.bodies_file import write_bodies
+    from mover.io.capture.scene_file import write_scene
 
     for name, shift in (("scene", 0.0), ("initial", 0.3)):
         write_scene(unannotated(room(shift)), tmp_path / f"{name}.json")
@@ -207,7 +215,7 @@ def test_frames_of_a_film_are_found_by_their_number(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["room.gif", "room", "room.mp4"])
 def test_what_cannot_be_drawn_is_said(tmp_path: Path, name: str):
-    from mover.readers.scene_file import write_scene
+    from mover.io.capture.scene_file import write_scene
 
     pytest.importorskip("av")
     write_scene(unannotated(room()), tmp_path / "scene.json")
@@ -224,7 +232,7 @@ def test_a_room_without_people_turns():
 
 
 def test_the_command_says_what_it_drew(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    from mover.commands import run_command
+    from mover.app.cli import run_command
 
     out, path = folder(tmp_path), tmp_path / "room.jpg"
     assert run_command("render", [str(out), "--to", str(path), "--width", "64"]) == 0

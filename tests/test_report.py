@@ -17,17 +17,19 @@ import trimesh
 from little_room import GROUND, box, camera, mesh_of, piece, room, walkers
 from PIL import Image, ImageColor
 
+from mover.app.pictures.overlay import draw_overlay, save_overlay
+from mover.app.report.content import ReportContent
+from mover.app.report.curves import draw_curve, draw_curves
+from mover.app.report.page import write_report
+from mover.app.report.plan import draw_top, extent_of
+from mover.app.report.scene_view import pack_view
+from mover.app.report.tables import find_changes, metrics_table, objects_table
+from mover.app.report.vertex_subset import thin, thin_choice
+from mover.core.colours import colour, css
+from mover.core.types import Bodies, Capture, Scene
 from mover.geometry.camera import to_camera, to_world
-from mover.geometry.placement import place_piece
+from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
-from mover.report import ReportContent, draw_overlay, draw_top, save_overlay, write_report
-from mover.report_colours import colour, css
-from mover.report_curves import draw_curve, draw_curves
-from mover.report_plan import extent_of
-from mover.report_tables import find_changes, metrics_table, objects_table
-from mover.report_thin import thin, thin_choice
-from mover.report_view import pack_view
-from mover.types import Bodies, Capture, Scene
 
 CHROMIUM = Path("/usr/bin/chromium")
 FLAGS = [
@@ -69,7 +71,7 @@ class TestOverlay:
         scene = Scene(camera(), None, (alone,))  # no floor: no grid
         image = torch.rand(180, 320, 3, generator=torch.Generator().manual_seed(0))
         drawn = draw_overlay(image, scene)
-        verts = to_camera(place_piece(alone).verts, scene.camera.R_cam_world)
+        verts = to_camera(place_object(alone).verts, scene.camera.R_cam_world)
         half = torch.tensor([0.5, 0.5, 1.0])[:, None] * scene.camera.K
         hit = first_hit(verts, alone.mesh.faces, half, (180, 320))[1] >= 0
         changed = (drawn - image).abs().amax(-1) > 0.01
@@ -163,20 +165,20 @@ class TestTables:
         before = room(pitch=-0.05)
         after = room(pitch=-0.3)
         moved = []
-        for p in before.pieces:
-            verts = place_piece(p).verts
+        for p in before.objects:
+            verts = place_object(p).verts
             middle = (verts.amin(0) + verts.amax(0)) / 2
             seen = to_camera(middle, before.camera.R_cam_world)
             step = to_world(seen, after.camera.R_cam_world) - middle
             moved.append(dataclasses.replace(p, t_world_object=p.t_world_object + step))
-        after = dataclasses.replace(after, pieces=tuple(moved))
+        after = dataclasses.replace(after, objects=tuple(moved))
         assert max(c.moved for c in find_changes(before, after).values()) < 1e-5
 
     def test_tells_turn_and_size(self):
         before = room()
         first = dataclasses.replace(
-            before.pieces[0],
-            yaw=before.pieces[0].yaw + 2 * math.pi - 0.5,
+            before.objects[0],
+            yaw=before.objects[0].yaw + 2 * math.pi - 0.5,
             scale=torch.tensor([1.1, 1.0, 0.5]),
         )
         change = find_changes(before, Scene(before.camera, GROUND, (first,)))["chair_0"]
@@ -189,8 +191,8 @@ class TestTables:
         assert moods == ["worse", "better"]
 
     def test_every_metric_has_a_name_and_the_same_way_to_be_better(self):
-        from mover.evaluate import METRICS
-        from mover.report_numbers import QUANTITIES
+        from mover.app.report.tables import QUANTITIES
+        from mover.evaluate.evaluation import METRICS
 
         ways = {key: QUANTITIES[key].more_is_better for key in METRICS}
         assert ways == {key: metric.best > 0 for key, metric in METRICS.items()}
@@ -254,7 +256,7 @@ class TestView:
     def test_objects_come_back_at_their_place(self):
         scene = room()
         tree, block = self.unpack(pack_view({"result": scene}, {}))
-        for given, packed in zip(scene.pieces, tree["scenes"]["result"]["pieces"], strict=True):
+        for given, packed in zip(scene.objects, tree["scenes"]["result"]["pieces"], strict=True):
             mesh = tree["meshes"][packed["mesh"]]
             whole = np.frombuffer(block, np.int16, mesh["n_verts"] * 3, mesh["verts"])
             verts = whole.reshape(-1, 3) * mesh["step"] + mesh["middle"]
@@ -308,10 +310,18 @@ class TestPage:
         assert not re.search(r"\{\{\w+\}\}", page)
 
     def test_an_object_named_like_a_tag_cannot_end_the_data(self, tmp_path: Path):
-        odd = dataclasses.replace(room().pieces[0], id="</script><b>", category="{{title}}")
+        odd = dataclasses.replace(room().objects[0], id="</script><b>", category="{{title}}")
         page = write_report(tmp_path, bare(Scene(camera(), GROUND, (odd,)))).read_text()
         data = re.search(r'id="view-data">(.*?)</script>', page, re.S)[1]
         assert json.loads(data)["scenes"]["result"]["pieces"][0]["id"] == "</script><b>"
+
+    @pytest.mark.parametrize("category", ["<!--<script>", "{% raw %}", "{{ content }}"])
+    def test_data_of_any_category_leave_the_page_whole(self, tmp_path: Path, category: str):
+        odd = dataclasses.replace(room().objects[0], category=category)
+        page = write_report(tmp_path, bare(Scene(camera(), GROUND, (odd,)))).read_text()
+        data = re.search(r'id="view-data">(.*?)</script>', page, re.S)[1]
+        assert "<" not in data
+        assert json.loads(data)["scenes"]["result"]["pieces"][0]["category"] == category
 
     @pytest.mark.parametrize("scene", [room(), Scene(camera(), None, ())], ids=["room", "empty"])
     def test_missing_parts_leave_no_hole(self, tmp_path: Path, scene: Scene):
@@ -331,9 +341,9 @@ class TestPage:
         scene = room()
         grown = tuple(
             dataclasses.replace(p, t_world_object=p.t_world_object.double().requires_grad_())
-            for p in scene.pieces
+            for p in scene.objects
         )
-        assert write_report(tmp_path, bare(dataclasses.replace(scene, pieces=grown))).exists()
+        assert write_report(tmp_path, bare(dataclasses.replace(scene, objects=grown))).exists()
 
     def test_has_one_colour_for_an_object_everywhere(self, tmp_path: Path):
         page = write_report(tmp_path, full()).read_text()
@@ -438,8 +448,8 @@ class TestBrowser:
         scene = content.result
         fit = min(view.shape[1] / 640, view.shape[0] / 360)
         shift = [(view.shape[1] - fit * 640) / 2, (view.shape[0] - fit * 360) / 2]
-        for index, p in enumerate(scene.pieces):
-            verts = place_piece(p).verts
+        for index, p in enumerate(scene.objects):
+            verts = place_object(p).verts
             top = torch.stack([verts[:, 0].mean(), verts[:, 1].amax(), verts[:, 2].mean()])
             u, v, w = (scene.camera.K @ to_camera(top, scene.camera.R_cam_world)).tolist()
             seen = view[round(fit * v / w + shift[1]), round(fit * u / w + shift[0])]

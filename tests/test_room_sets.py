@@ -10,44 +10,56 @@ import little_room
 import numpy as np
 import pytest
 import torch
-from test_rooms import exact, tiny_room
+from test_rooms import exact, shared_room, tiny_room
 
-from mover import records
-from mover.evaluate import evaluate_folder
-from mover.experiments import make
-from mover.experiments.digests import capture_hash, differences, mask_pixels, truth_hash
-from mover.experiments.job import DONE, Job, spoilt
-from mover.experiments.made import CAPTURE, MADE, key_of, make_one, row_of
-from mover.experiments.make import MakeArgs, known_hashes, make_set, told
-from mover.experiments.run import parse_seeds
-from mover.experiments.sets import SETS
-from mover.experiments.traits import (
+from mover.core.errors import InputError
+from mover.core.types import SceneObject
+from mover.evaluate.evaluation import evaluate_folder
+from mover.geometry.camera import to_world
+from mover.geometry.placement import place_object
+from mover.io.formats import read
+from mover_bench.rooms.config import NoiseConfig, RoomConfig
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.placed import BODY, free_of, way
+from mover_bench.rooms.room import make_room
+from mover_bench.studies import make
+from mover_bench.studies.args import MakeArgs
+from mover_bench.studies.job import DONE, Job, spoilt
+from mover_bench.studies.made import (
+    CAPTURE,
+    MADE,
+    capture_hash,
+    differences,
+    key_of,
+    make_one,
+    mask_pixels,
+    row_of,
+    truth_hash,
+)
+from mover_bench.studies.make import known_hashes, make_set, told
+from mover_bench.studies.measures import (
     hidden_shares,
     is_flipped,
     stays_at,
     traits_of,
     truncated_shares,
 )
-from mover.geometry.camera import to_world
-from mover.geometry.placement import place_piece
-from mover.readers import read
-from mover.rooms import KnownRoom, NoiseConfig, RoomConfig, add_noise, make_room
-from mover.rooms.paths import BODY, way
-from mover.rooms.placed import free_of
-from mover.types import Piece
+from mover_bench.studies.run import parse_seeds
+from mover_bench.studies.sets import SETS
 
 
 @pytest.fixture(scope="module")
 def tiny() -> KnownRoom:
-    return tiny_room()
+    return shared_room()
 
 
 def moved(room: KnownRoom, step: float) -> KnownRoom:
     """The same room with its first piece moved along x [m]."""
-    first = room.truth.pieces[0]
+    first = room.truth.objects[0]
     place = first.t_world_object + torch.tensor([step, 0.0, 0.0])
-    pieces = (replace(first, t_world_object=place), *room.truth.pieces[1:])
-    return replace(room, truth=replace(room.truth, pieces=pieces))
+    pieces = (replace(first, t_world_object=place), *room.truth.objects[1:])
+    return replace(room, truth=replace(room.truth, objects=pieces))
 
 
 class TestHashes:
@@ -61,7 +73,7 @@ class TestHashes:
         assert truth_hash(moved(tiny, 1e-3)) != before
 
     def test_every_part_of_a_room_is_in_its_hash(self, tiny: KnownRoom) -> None:
-        bodies, first = tiny.bodies, tiny.truth.pieces[0]
+        bodies, first = tiny.bodies, tiny.truth.objects[0]
         assert bodies.pose is not None
         turned = replace(bodies.pose, body_pose=bodies.pose.body_pose + 0.001)
         mesh = replace(first.mesh, faces=first.mesh.faces.flip(0))
@@ -69,8 +81,8 @@ class TestHashes:
             replace(tiny, actions=("jump", *tiny.actions[1:])),
             replace(tiny, bodies=replace(bodies, pose=turned)),
             replace(tiny, bodies=replace(bodies, frame=bodies.frame + 1)),
-            replace(tiny, truth=replace(tiny.truth, pieces=tiny.truth.pieces[1:])),
-            replace(tiny, truth=replace(tiny.truth, pieces=(replace(first, mesh=mesh),))),
+            replace(tiny, truth=replace(tiny.truth, objects=tiny.truth.objects[1:])),
+            replace(tiny, truth=replace(tiny.truth, objects=(replace(first, mesh=mesh),))),
             replace(tiny, truth=replace(tiny.truth, ground=-1.5)),
         )
         hashes = {truth_hash(room) for room in (tiny, *others)}
@@ -122,13 +134,13 @@ class TestTraits:
         shares = []
         for x in (0.0, edge, 2 * edge):
             piece = little_room.piece("picture_0", flat, (x, -3.0), 0.0, -0.2)
-            shares.append(truncated_shares(replace(scene, pieces=(piece,)))[0])
+            shares.append(truncated_shares(replace(scene, objects=(piece,)))[0])
         assert shares == pytest.approx([0.0, 0.5, 1.0], abs=0.03)
-        assert truncated_shares(replace(scene, pieces=())) == ()
+        assert truncated_shares(replace(scene, objects=())) == ()
 
     @pytest.mark.parametrize(("degrees", "flipped"), [(0, 0), (59, 0), (61, 1), (180, 1), (301, 0)])
     def test_flipped_is_a_turn_of_more_than_60_degrees(self, degrees: int, flipped: int) -> None:
-        piece = little_room.room().pieces[0]
+        piece = little_room.room().objects[0]
         guess = replace(piece, yaw=piece.yaw + math.radians(degrees))
         assert is_flipped(piece, guess) == bool(flipped)
         assert not is_flipped(piece, None)
@@ -136,8 +148,8 @@ class TestTraits:
     def test_traits_are_those_of_the_true_objects_even_if_a_guess_is_missing(
         self, tiny: KnownRoom
     ) -> None:
-        traits = traits_of(tiny, replace(tiny.truth, pieces=tiny.truth.pieces[1:]))
-        assert [t.id for t in traits] == [p.id for p in tiny.truth.pieces]
+        traits = traits_of(tiny, replace(tiny.truth, objects=tiny.truth.objects[1:]))
+        assert [t.id for t in traits] == [p.id for p in tiny.truth.objects]
         assert [t.touched for t in traits] == [True, True, False]
         assert [t.stays > 0 for t in traits] == [True, True, False]
         assert [t.hidden for t in traits] == list(hidden_shares(tiny.truth))
@@ -227,17 +239,17 @@ class TestMake:
 
     def test_hashes_of_another_version_are_refused(self, hashes: Path) -> None:
         hashes.write_text(json.dumps({**json.loads(hashes.read_text()), "version": 0}))
-        with pytest.raises(records.InputError, match="no hashes of mini 1"):
+        with pytest.raises(InputError, match="no hashes of mini 1"):
             known_hashes("mini")
-        with pytest.raises(records.InputError, match="no hashes of rooms 1"):
+        with pytest.raises(InputError, match="no hashes of rooms 1"):
             known_hashes("rooms")
 
     def test_what_is_no_set_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(records.InputError, match="SET: 'flats' is none of mini, rooms, two"):
+        with pytest.raises(InputError, match="SET: 'flats' is none of mini, rooms, two"):
             make_set(MakeArgs("flats", tmp_path))
-        with pytest.raises(records.InputError, match="--workers: -1"):
+        with pytest.raises(InputError, match="--workers: -1"):
             make_set(MakeArgs("mini", tmp_path, workers=-1))
-        with pytest.raises(records.InputError, match="--seeds"):
+        with pytest.raises(InputError, match="--seeds"):
             make_set(MakeArgs("mini", tmp_path, "x"))
 
 
@@ -282,8 +294,8 @@ def nearest(room: KnownRoom) -> np.ndarray:
     """Distance of each body's skin to the furniture by winding numbers, 10 cm at most [m]."""
     world = to_world(room.bodies.verts, room.truth.camera.R_cam_world).double().numpy()
     out = np.full(len(world), 0.1)
-    for piece in room.truth.pieces:
-        mesh = place_piece(piece)
+    for piece in room.truth.objects:
+        mesh = place_object(piece)
         verts, faces = mesh.verts.double().numpy(), mesh.faces.numpy()
         low, high = verts.min(0) - 0.1, verts.max(0) + 0.1
         near = ((world > low) & (world < high)).all(-1)
@@ -297,7 +309,7 @@ def furniture_in_use(room: KnownRoom) -> set[int]:
     return {k for k in room.touched.unique().tolist() if k >= 0}
 
 
-def by_id(pieces: tuple[Piece, ...]) -> dict[str, Piece]:
+def by_id(pieces: tuple[SceneObject, ...]) -> dict[str, SceneObject]:
     return {piece.id: piece for piece in pieces}
 
 
@@ -316,11 +328,11 @@ class TestPromises:
         assert (capture.scene.camera.width, capture.scene.camera.height) == (320, 180)
         assert capture.bodies is not None
         assert capture.people is not None
-        from mover.readers.bodies_file import read_bodies
-        from mover.readers.scene_file import read_scene
+        from mover.io.capture.bodies_file import read_bodies
+        from mover.io.capture.scene_file import read_scene
 
         truth = read_scene(job.home / CAPTURE / "truth" / "scene.json")
-        assert {p.id for p in truth.pieces} == {p.id for p in capture.scene.pieces}
+        assert {p.id for p in truth.objects} == {p.id for p in capture.scene.objects}
         assert len(read_bodies(job.home / CAPTURE / "truth" / "bodies.npz").frame) == row["frames"]
 
     def test_in_two_there_are_two_who_do_not_run_into_each_other(self) -> None:
@@ -354,7 +366,7 @@ class TestPromises:
     def test_clutter_is_cluttered(self) -> None:
         room = make_room(1000, SETS["clutter"].room)
         hidden, cut = hidden_shares(room.truth), truncated_shares(room.truth)
-        assert 9 <= len(room.truth.pieces) <= 14
+        assert 9 <= len(room.truth.objects) <= 14
         assert sum(share >= 0.3 for share in hidden) >= 4
         assert sum(share >= 0.1 for share in cut) >= 2
         assert len(furniture_in_use(room)) >= 3
@@ -368,18 +380,18 @@ class TestPromises:
 
     def test_rooms_are_used_and_their_noise_is_that_of_their_set(self) -> None:
         room = make_room(1000, SETS["rooms"].room)
-        true = by_id(room.truth.pieces)
+        true = by_id(room.truth.objects)
         assert 6 <= len(true) <= 9
         assert int(room.bodies.frame.max()) + 1 >= 200
         assert len(furniture_in_use(room)) >= 3
         shapes = spoilt(room, 1000, SETS["wrong-shape"])
-        for name, piece in by_id(shapes.capture.scene.pieces).items():
+        for name, piece in by_id(shapes.capture.scene.objects).items():
             assert piece.category == true[name].category
             same = piece.mesh.verts.shape == true[name].mesh.verts.shape
             assert not same or not torch.allclose(piece.mesh.verts, true[name].mesh.verts)
         missed = invented = renamed = 0
         for seed in range(20):
-            given = by_id(spoilt(room, seed, SETS["detected"]).capture.scene.pieces)
+            given = by_id(spoilt(room, seed, SETS["detected"]).capture.scene.objects)
             missed += len(set(true) - set(given))
             invented += len(set(given) - set(true))
             found = set(true) & set(given)
@@ -397,7 +409,7 @@ def test_the_command_makes_what_mover_evaluate_reads(tmp_path: Path) -> None:
     make_one(job, captures=True)
     folder, out = job.home / CAPTURE, tmp_path / "result"
     out.mkdir()
-    from mover.readers.scene_file import read_scene, write_scene
+    from mover.io.capture.scene_file import read_scene, write_scene
 
     capture = read("folder", folder)
     for name in ("initial.json", "scene.json"):

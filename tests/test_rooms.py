@@ -1,6 +1,7 @@
 """Known rooms: people walk on planted feet, sit on seats, and masks tell what the camera sees."""
 
 import dataclasses
+import functools
 import itertools
 
 import igl
@@ -9,27 +10,24 @@ import pytest
 import torch
 from raycast import draw
 
-from mover.bodies import open_body
-from mover.furniture import make_piece
+from mover.bodies.skinning import open_body
+from mover.core.records import fingerprint
+from mover.furniture.library import make_piece
 from mover.geometry.camera import to_world
-from mover.geometry.placement import place_piece
-from mover.geometry.runs import decode
-from mover.records import fingerprint
-from mover.rooms import KnownRoom, RoomConfig, demo_room, make_room
-from mover.rooms.compose import Plan, draw_plan, make_view, overlap
-from mover.rooms.gait import walk
-from mover.rooms.known import Actor, build
-from mover.rooms.lying import berth, on_side, supine
-from mover.rooms.motion import Stage, Stop, Task, perform
-from mover.rooms.paths import NoWayError, way
-from mover.rooms.person import Person, make_person
-from mover.rooms.placed import Placed, free_of
-from mover.rooms.poses import Posture, skinned
-from mover.rooms.reaching import hand_on, table_stand
-from mover.rooms.render import see
-from mover.rooms.seating import leaning, seat_spot, seated
-from mover.rooms.settle import part
-from mover.rooms.steps import duration, stations
+from mover.geometry.placement import place_object
+from mover.geometry.rle import decode
+from mover_bench.rooms.compose import Plan, draw_plan, make_view, overlap
+from mover_bench.rooms.config import RoomConfig
+from mover_bench.rooms.gait import duration, stations, walk
+from mover_bench.rooms.known import Actor, KnownRoom, build
+from mover_bench.rooms.lying import berth, on_side, supine
+from mover_bench.rooms.motion import Stage, Stop, Task, perform
+from mover_bench.rooms.placed import NoWayError, Placed, free_of, way
+from mover_bench.rooms.poses import Person, Posture, make_person, skinned
+from mover_bench.rooms.render import see
+from mover_bench.rooms.room import demo_room, make_room
+from mover_bench.rooms.seating import hand_on, leaning, seat_spot, seated, table_stand
+from mover_bench.rooms.truth import part
 
 SHAPES = ([0.0] * 10, [1.3, -1.0, 0.5] + [0.0] * 7)
 
@@ -104,7 +102,7 @@ def test_a_walk_ends_where_and_how_it_should(person: Person) -> None:
 def test_knees_and_elbows_bend_the_human_way(person: Person) -> None:
     route = stations(np.array([[0.0, 0.0], [0.0, 2.0]]), 0.0, 0.0)
     posture = walk(person, route, np.arange(0, duration(route), 0.1))
-    from mover.rooms.poses import angles
+    from mover_bench.rooms.poses import angles
 
     pose = angles(person, posture)
     names = open_body().joint_names[1:22]
@@ -199,13 +197,19 @@ def tiny_room() -> KnownRoom:
     return build(plan, (Actor(stage, acts),), config, "tiny", acts.refused)
 
 
-@pytest.fixture(scope="module")
-def tiny() -> KnownRoom:
+@functools.cache
+def shared_room() -> KnownRoom:
+    """The tiny room, made once for all files of tests."""
     return tiny_room()
 
 
+@pytest.fixture(scope="module")
+def tiny() -> KnownRoom:
+    return shared_room()
+
+
 def test_masks_are_what_an_independent_ray_caster_sees(tiny: KnownRoom) -> None:
-    meshes = [place_piece(p) for p in tiny.truth.pieces]
+    meshes = [place_object(p) for p in tiny.truth.objects]
     seen = draw([(m.verts.numpy(), m.faces.numpy()) for m in meshes], tiny.truth.camera)
     counts = np.zeros(seen.shape, dtype=int)
     for index, detection in enumerate(tiny.capture.detections):
@@ -217,7 +221,7 @@ def test_masks_are_what_an_independent_ray_caster_sees(tiny: KnownRoom) -> None:
         rows, cols = np.nonzero(mask)
         box = [cols.min(), rows.min(), cols.max() + 1, rows.max() + 1]
         assert detection.box.tolist() == box
-        assert detection.category == tiny.truth.pieces[index].category
+        assert detection.category == tiny.truth.objects[index].category
     assert counts.max() == 1, "no pixel belongs to two objects"
 
 
@@ -229,7 +233,7 @@ def test_visible_people_and_furniture_share_the_image(tiny: KnownRoom) -> None:
             to_world(bodies.verts[row], tiny.truth.camera.R_cam_world).numpy(),
             bodies.faces.numpy(),
         )
-        rest = [place_piece(p) for p in tiny.truth.pieces]
+        rest = [place_object(p) for p in tiny.truth.objects]
         seen = draw([body, *((m.verts.numpy(), m.faces.numpy()) for m in rest)], tiny.truth.camera)
         mask = decode(people.masks, row).numpy()
         assert (mask & (seen == 0)).sum() / (mask | (seen == 0)).sum() > 0.97
@@ -251,8 +255,8 @@ def test_truth_neither_sinks_nor_gapes(tiny: KnownRoom) -> None:
     assert np.abs(low).max() < 0.01
     count = len(world)
     nearest = np.full(world.shape[:2], np.inf)
-    for index, piece in enumerate(tiny.truth.pieces):
-        mesh = place_piece(piece)
+    for index, piece in enumerate(tiny.truth.objects):
+        mesh = place_object(piece)
         verts, faces = mesh.verts.double().numpy(), mesh.faces.numpy()
         far = near_box(world.reshape(-1, 3), verts, faces).reshape(count, -1)
         assert far.min() > -0.02
@@ -310,7 +314,7 @@ class TestWholeRooms:
         assert room.refused == ()
         assert len(room.actions) >= 200
         assert {"walk", "sit", "lean", "lie", "left hand"} <= set(room.actions)
-        assert len(room.truth.pieces) >= 6
+        assert len(room.truth.objects) >= 6
 
     @pytest.mark.parametrize(("seed", "people"), [(0, 1), (1, 1), (2, 1), (21, 2)])
     def test_a_drawn_room_is_rich_free_of_overlap_and_repeatable(
@@ -318,13 +322,13 @@ class TestWholeRooms:
     ) -> None:
         config = RoomConfig(people=people)
         room = make_room(seed, config)
-        assert 6 <= len(room.truth.pieces) <= 9
+        assert 6 <= len(room.truth.objects) <= 9
         assert int(room.bodies.frame.max()) + 1 >= 200
         assert len(set(room.bodies.person.tolist())) == people
         placed, ground = room.plan.pieces, room.truth.ground
         assert ground is not None
         assert not any(overlap(a, b, 0.0) for k, a in enumerate(placed) for b in placed[k + 1 :])
-        assert all(abs(float(p.t_world_object[1]) - ground) < 1e-6 for p in room.truth.pieces)
+        assert all(abs(float(p.t_world_object[1]) - ground) < 1e-6 for p in room.truth.objects)
         assert fingerprint(room) == fingerprint(make_room(seed, config))
         other = make_room(seed + 100, dataclasses.replace(config, people=1))
         assert not torch.equal(room.bodies.verts[0], other.bodies.verts[0])

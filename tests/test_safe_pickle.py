@@ -21,9 +21,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from mover.pickles import arrays, load
-from mover.readers.safe_pickle import load_pickle
-from mover.records import InputError
+from mover.bodies.smpl_files import load_smpl
+from mover.bodies.transfer_matrix import read_matrix
+from mover.core import pickle_parts, pickles
+from mover.core.errors import InputError
+from mover.core.pickles import load_pickle, load_plain
 
 PLAIN = {
     "row": np.arange(6.0).reshape(2, 3),
@@ -137,15 +139,15 @@ def test_code_written_by_hand_ends_in_an_input_error(file, code):
 
 def test_no_opcode_can_call_import_or_set_an_attribute_of_a_thing():
     """Every class and function is a word; the table of makers holds functions of the package."""
-    from mover.pickles import machine, parts
-
-    for maker in parts.CONTAINERS.values():
-        assert maker.__module__ == "mover.pickles.parts"
-    assert {"INST", "OBJ", "EXT1", "EXT2", "EXT4", "PERSID", "NEXT_BUFFER", "NEWOBJ_EX"}.isdisjoint(
-        machine.ACTS
-    )
-    known = {op.name for op in pickletools.opcodes}
-    assert set(machine.ACTS) <= known
+    for maker in (*pickle_parts.MAKERS.values(), *pickle_parts.CONTENT.values()):
+        assert maker.__module__ == "mover.core.pickle_parts"
+    codes = {opcode.name: ord(opcode.code) for opcode in pickletools.opcodes}
+    refused = ("INST", "OBJ", "EXT1", "EXT2", "EXT4", "PERSID", "NEXT_BUFFER", "NEWOBJ_EX")
+    assert {codes[name] for name in refused}.isdisjoint(pickles.Reader.dispatch)
+    assert set(pickles.Reader.dispatch) <= set(codes.values())
+    own = {codes[n] for n in ("REDUCE", "NEWOBJ", "BUILD", "SETITEM", "SETITEMS", "DICT")}
+    assert all(pickles.Reader.dispatch[code].__module__ == "mover.core.pickles" for code in own)
+    assert pickles.Reader.find_class is not pickle._Unpickler.find_class
 
 
 @pytest.mark.parametrize("protocol", range(1, 6))
@@ -223,6 +225,64 @@ def test_a_pickle_whose_parts_double_each_time_is_read_in_no_time(file):
         nested = (nested, nested)
     found = load_pickle(file(pickle.dumps(nested)))
     assert found[0] is found[1]
+
+
+def shared_lists() -> list:
+    """40 lists, each twice in the next: 130 bytes that unfold to 2 ** 40 items."""
+    nested: list = [1.0]
+    for _ in range(40):
+        nested = [nested, nested]
+    return nested
+
+
+def itself() -> list:
+    loop: list = [1.0]
+    loop += [loop, loop]
+    return loop
+
+
+BOMBS = {"shared lists": shared_lists, "a list that contains itself": itself}
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_a_tree_of_a_bomb_is_refused_at_once(file, bomb):
+    data = pickle.dumps({"betas": BOMBS[bomb]()})
+    wanted = "contains itself" if "itself" in bomb else "unfolds to more than"
+    with pytest.raises(InputError, match=rf"^x\.pkl: .*{wanted}"):
+        load_plain(file(data))
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_bombs_in_files_of_body_models_and_matrices_are_refused_at_once(file, bomb):
+    path = file(pickle.dumps({"v_template": BOMBS[bomb](), "mtx": BOMBS[bomb]()}))
+    for read in (lambda: load_smpl("smpl", place=path), lambda: read_matrix(path, "smpl", "smplx")):
+        with pytest.raises(InputError, match=r"^x\.pkl: (unfolds|holds a list)"):
+            read()
+
+
+def test_shared_arrays_count_as_often_as_they_stand_there_and_plain_ones_are_read(file):
+    array, nested = np.zeros(1 << 20), [[1, [2.5, "a"]], ({"k": None}, np.float32(3))]
+    with pytest.raises(InputError, match="unfolds to more than"):
+        load_plain(file(pickle.dumps([array] * 300)))
+    found = load_plain(file(pickle.dumps({7: nested, "o": np.array([[1, None]], object)})))
+    assert found == {"7": [[1, [2.5, "a"]], [{"k": None}, 3]], "o": [[1, None]]}
+
+
+@pytest.mark.parametrize("kind", [list, tuple])
+def test_lists_that_are_too_deep_are_refused(file, kind):
+    lists = b"".join((b"](" * 5000, b"e" * 5000)) if kind is list else b")" + b"\x85" * 5000
+    with pytest.raises(InputError, match=r"^x\.pkl: .*64 levels"):
+        load_plain(file(b"\x80\x02" + lists + b"."))
+
+
+def test_keys_that_are_deep_or_double_each_time_are_refused_before_they_are_hashed(file):
+    deep_key = b")" + b"\x85" * 20_000
+    doubled = b")" + b"2\x86" * 60
+    for key in (deep_key, doubled):
+        for form in (b"}%sK\x01s", b"(%sK\x01d", b"}(%sK\x01u", b"\x8f(%s\x90", b"(%s\x91",
+                     b"cbuiltins\nfrozenset\n(]%satR", b"cbuiltins\nset\n(]%satR"):  # fmt: skip
+            with pytest.raises(InputError, match="key that is no text"):
+                load_pickle(file(b"\x80\x04" + form % key + b"."))
 
 
 @pytest.mark.parametrize("form", ["csc", "csr", "coo"])
@@ -318,6 +378,16 @@ def test_a_tensor_that_reaches_beyond_its_storage_is_refused(file):
         load_pickle(file(huge))
 
 
+def test_a_tensor_that_repeats_a_number_too_often_is_refused(file):
+    for count, fine in ((1000, True), (1 << 29, False)):
+        data = pickle.dumps(torch.ones(1).expand(count), protocol=2)
+        if fine:
+            assert load_pickle(file(data)).shape == (count,)
+        else:
+            with pytest.raises(InputError, match="larger than what it holds"):
+                load_pickle(file(data))
+
+
 def test_an_array_that_claims_more_than_its_bytes_is_refused(file):
     data = pickle.dumps(np.zeros((2, 3), np.float32), protocol=2)
     huge = data.replace(b"K\x02K\x03\x86", b"J\xff\xff\xff\x7fK\x03\x86")
@@ -342,19 +412,19 @@ def test_packed_pickles_are_unpacked_but_bombs_are_not(file, pack, monkeypatch):
     np.testing.assert_array_equal(load_pickle(file(data)), PLAIN["row"])
     with pytest.raises(InputError, match="ends too early"):
         load_pickle(file(data[:-3]))
-    monkeypatch.setattr(load, "LARGEST", 100_000)
+    monkeypatch.setattr(pickles, "LARGEST", 100_000)
     bomb = pack(bytes(10_000_000))
     with pytest.raises(InputError, match="unpacks to more than 100000 bytes"):
         load_pickle(file(bomb))
 
 
 def test_a_file_that_is_too_large_or_missing_is_refused(file, tmp_path, monkeypatch):
-    monkeypatch.setattr(load, "LARGEST", 100)
+    monkeypatch.setattr(pickles, "LARGEST", 100)
     with pytest.raises(InputError, match="expected at most 100"):
         load_pickle(file(pickle.dumps(np.zeros(100))))
     with pytest.raises(InputError, match="no such file"):
         load_pickle(tmp_path / "none.pkl")
-    assert arrays.LARGEST > 1 << 30
+    assert pickle_parts.LARGEST > 1 << 30
 
 
 def joblibs_bytes(array: np.ndarray) -> bytes:

@@ -6,10 +6,10 @@ import pytest
 import tiny_capture as tiny
 import torch
 
-from mover.geometry.placement import place_piece
-from mover.readers.scene_file import read_scene, write_scene
-from mover.records import InputError
-from mover.types import Camera, Mesh, Piece, Scene
+from mover.core.errors import InputError
+from mover.core.types import Camera, Mesh, Scene, SceneObject
+from mover.geometry.placement import place_object
+from mover.io.capture.scene_file import read_scene, write_scene
 
 CAMERA = Camera(torch.eye(3) * 50, torch.diag(torch.tensor([1.0, -1, -1])), 20, 10)
 
@@ -18,9 +18,9 @@ def step() -> Mesh:
     return Mesh(torch.from_numpy(tiny.STEP).float(), torch.from_numpy(tiny.STEP_FACES))
 
 
-def piece(name: str = "a", file: str = "") -> Piece:
+def piece(name: str = "a", file: str = "") -> SceneObject:
     place, scale = torch.tensor([0.1, -1.0, -2.0]), torch.tensor([1.0, 2.0, 3.0])
-    return Piece(name, "chair", step(), file, None, "free", place, torch.tensor(0.3), scale)
+    return SceneObject(name, "chair", step(), file, None, "free", place, torch.tensor(0.3), scale)
 
 
 def test_a_mesh_without_a_file_becomes_glb_with_the_same_triangles(tmp_path: Path) -> None:
@@ -28,10 +28,10 @@ def test_a_mesh_without_a_file_becomes_glb_with_the_same_triangles(tmp_path: Pat
     assert [p.name for p in (tmp_path / "meshes").iterdir()] == ["a.glb"]
     found = read_scene(tmp_path / "scene.json")
     assert found.ground is None
-    assert found.pieces[0].support == "free"
-    assert found.pieces[0].annotation is None
-    assert torch.allclose(place_piece(found.pieces[0]).verts, place_piece(piece()).verts)
-    assert found.pieces[0].mesh.faces.tolist() == tiny.STEP_FACES.tolist()
+    assert found.objects[0].support == "free"
+    assert found.objects[0].annotation is None
+    assert torch.allclose(place_object(found.objects[0]).verts, place_object(piece()).verts)
+    assert found.objects[0].mesh.faces.tolist() == tiny.STEP_FACES.tolist()
 
 
 def test_a_users_mesh_is_copied_byte_by_byte(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_materials_and_textures_go_with_an_obj_and_two_do_not_mix(tmp_path: Path
         ).read_bytes()
         assert colour in (home / "my stuff.mtl").read_text()
         assert (home / "maps" / "wood.png").read_text() == colour
-    assert len(read_scene(tmp_path / "out" / "scene.json").pieces) == 2
+    assert len(read_scene(tmp_path / "out" / "scene.json").objects) == 2
 
 
 def test_the_buffer_of_a_gltf_goes_with_it(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_the_buffer_of_a_gltf_goes_with_it(tmp_path: Path) -> None:
     write_scene(
         Scene(CAMERA, None, (piece("a", str(tmp_path / "model.gltf")),)), tmp_path / "o" / "s.json"
     )
-    found = read_scene(tmp_path / "o" / "s.json").pieces[0]
+    found = read_scene(tmp_path / "o" / "s.json").objects[0]
     assert torch.equal(found.mesh.verts, step().verts)
 
 
@@ -99,7 +99,7 @@ def test_vertices_that_no_face_uses_and_faces_without_area_do_not_count(tmp_path
     lines += ["f " + " ".join(str(i + 2) for i in f) for f in tiny.STEP_FACES.tolist()]
     folder = tiny.write_capture(tmp_path / "tiny")
     (folder / "meshes" / "step.obj").write_text("\n".join([*lines, "f 1 1 1", ""]))
-    mesh = read_scene(folder / "scene.json", CAMERA).pieces[0].mesh
+    mesh = read_scene(folder / "scene.json", CAMERA).objects[0].mesh
     assert torch.equal(mesh.verts, step().verts)
     assert torch.equal(mesh.faces, step().faces)
 

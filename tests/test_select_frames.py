@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from mover.stages.select_frames import LOCAL, SelectConfig, SelectInputs, select_frames
-from mover.types import Bodies
+from mover.core.types import Bodies
+from mover.stages.config import SelectConfig
+from mover.stages.people.select_frames import LOCAL, SelectInputs, select_frames
 
 SHARED = Path(__file__).parents[2] / "shared"
 

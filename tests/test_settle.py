@@ -14,27 +14,27 @@ import trimesh
 from furnished import furnished, write_out
 from little_room import GROUND, box, camera, mesh_of, piece
 
-import mover.settle
-from mover.commands import run_command
-from mover.exporters import export_mjcf, export_urdf, read_finished
-from mover.exporters.convex import ConvexConfig, ConvexInputs, cut_into_convex
-from mover.exporters.solids import DENSITY, solids_of
-from mover.furniture import make_piece
-from mover.furniture.library import PIECES, canonical
-from mover.geometry.mesh import is_closed
-from mover.geometry.placement import place_piece
+import mover.app.simulate
+from mover.app.cli import run_command
+from mover.app.simulate import SimulatedObject, SimulationConfig, simulate, simulation_table
+from mover.core.errors import InputError
+from mover.core.run import Run
+from mover.core.types import Mesh, Scene
+from mover.furniture.library import PIECES, canonical, make_piece
+from mover.geometry.placement import place_object
+from mover.geometry.topology import is_closed
 from mover.geometry.watertight import close_mesh
-from mover.readers.mesh_file import write_mesh
-from mover.readers.scene_file import write_scene
-from mover.records import InputError
-from mover.run import Run
-from mover.settle import SettleConfig, Settled, settle
-from mover.settle_table import settle_table
-from mover.types import Mesh, Scene
+from mover.io.capture.scene_file import write_scene
+from mover.io.export.convex import ConvexConfig, ConvexInputs, cut_into_convex
+from mover.io.export.finished import read_finished
+from mover.io.export.mjcf import export_mjcf
+from mover.io.export.solids import DENSITY, solids_of
+from mover.io.export.urdf import export_urdf
+from mover.io.files.meshes import write_mesh
 
 BOXES = ("chair", "table")
 needs_mujoco = pytest.mark.skipif(
-    not mover.settle.find_spec("mujoco"), reason="needs the extra physics"
+    not mover.app.simulate.find_spec("mujoco"), reason="needs the extra physics"
 )
 
 
@@ -50,8 +50,8 @@ def alone(mesh: Mesh, lift: float = 0.0, **changes: Any) -> Scene:
     return Scene(camera(), GROUND, (dataclasses.replace(given, **changes),))
 
 
-def settled(scene: Scene, tmp_path: Path) -> Settled:
-    return settle(scene, Run(tmp_path))[0]
+def settled(scene: Scene, tmp_path: Path) -> SimulatedObject:
+    return simulate(scene, Run(tmp_path))[0]
 
 
 @pytest.mark.parametrize("method", ["coacd", "slices"])
@@ -104,7 +104,7 @@ def test_the_closed_proxies_of_the_run_are_what_collides(tmp_path: Path):
 
 def test_mass_and_inertia_are_those_of_the_stretched_solid(tmp_path: Path):
     """Against trimesh, on the mesh in the simulator's axes."""
-    given = furnished(("chair",)).pieces[0]
+    given = furnished(("chair",)).objects[0]
     given = dataclasses.replace(given, scale=torch.tensor([1.3, 0.8, 1.1]))
     solid = solids_of(Scene(camera(), GROUND, (given,)), Run(tmp_path))[0]
     x, y, z = (close_mesh(given.mesh).verts * given.scale).double().numpy().T
@@ -128,9 +128,9 @@ def test_mujoco_reads_the_model_with_everything_in_place(tmp_path: Path):
     scene = furnished((*BOXES, "shelf"))
     pieces = [
         dataclasses.replace(p, scale=torch.tensor([1.1, 0.9, 1.2]), support=s)
-        for p, s in zip(scene.pieces, ("ground", "free", "ground"), strict=True)
+        for p, s in zip(scene.objects, ("ground", "free", "ground"), strict=True)
     ]
-    scene = dataclasses.replace(scene, pieces=tuple(pieces))
+    scene = dataclasses.replace(scene, objects=tuple(pieces))
     home = read_finished(write_out(tmp_path / "out", scene))
     path = export_mjcf(home, tmp_path).files[0]
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -145,7 +145,7 @@ def test_mujoco_reads_the_model_with_everything_in_place(tmp_path: Path):
         ]
         collide = np.concatenate([p for p, group in points if group == 3])
         look = np.concatenate([p for p, group in points if group == 2])
-        x, y, z = place_piece(given).verts.double().numpy().T
+        x, y, z = place_object(given).verts.double().numpy().T
         truth = np.stack([x, -z, y - GROUND], -1)
         bounds = np.stack([truth.min(0), truth.max(0)])
         assert np.stack([look.min(0), look.max(0)]) == pytest.approx(bounds, abs=1e-4)
@@ -182,7 +182,7 @@ def test_mujoco_reads_the_urdf_with_everything_in_place(tmp_path: Path):
     mujoco.mj_forward(model, data)
     every = [corners(model, data, g)[0] for g in range(model.ngeom) if model.geom_dataid[g] >= 0]
     flat = np.concatenate(every)
-    x, y, z = np.concatenate([place_piece(p).verts.numpy() for p in home.scene.pieces]).T
+    x, y, z = np.concatenate([place_object(p).verts.numpy() for p in home.scene.objects]).T
     truth = np.stack([x, -z, y - GROUND], -1)
     assert flat.min(0) == pytest.approx(truth.min(0), abs=2e-3)
     assert flat.max(0) == pytest.approx(truth.max(0), abs=2e-3)
@@ -197,7 +197,7 @@ def test_mujoco_reads_the_urdf_with_everything_in_place(tmp_path: Path):
 
 @needs_mujoco
 def test_what_stands_on_the_floor_stays(tmp_path: Path):
-    for found in settle(furnished(), Run(tmp_path)):
+    for found in simulate(furnished(), Run(tmp_path)):
         assert found.moved < 0.001, found
         assert found.turned < math.radians(0.2), found
         assert found.stuck < 0.001
@@ -240,21 +240,21 @@ def test_what_stands_on_a_table_stays_on_it(tmp_path: Path):
     table = piece("table_0", box(1.2, 0.7, 0.8), (0, -3), 0.2, GROUND)
     lamp = piece("lamp_0", box(0.2, 0.4, 0.2), (0.1, -3.1), 0.0, GROUND + 0.7)
     lamp = dataclasses.replace(lamp, support="table_0")
-    for found in settle(Scene(camera(), GROUND, (table, lamp)), Run(tmp_path)):
+    for found in simulate(Scene(camera(), GROUND, (table, lamp)), Run(tmp_path)):
         assert found.moved < 0.002
 
 
 @needs_mujoco
 def test_a_scene_whose_floor_nobody_knows_stands_on_its_lowest_point(tmp_path: Path):
     scene = dataclasses.replace(furnished(BOXES), ground=None)
-    assert max(found.moved for found in settle(scene, Run(tmp_path))) < 0.001
+    assert max(found.moved for found in simulate(scene, Run(tmp_path))) < 0.001
 
 
 @needs_mujoco
 def test_the_command_compares_initial_and_result(tmp_path: Path, capsys):
     out = write_out(tmp_path / "out", alone(box(0.6, 0.5, 0.6)))
     write_scene(alone(box(0.6, 0.5, 0.6), lift=0.1), out / "initial.json")
-    assert run_command("settle", [str(out)]) == 0
+    assert run_command("simulate", [str(out)]) == 0
     text = capsys.readouterr().out
     assert "initial: median 100 mm" in text
     assert "result: median 0 mm" in text
@@ -264,11 +264,11 @@ def test_the_command_compares_initial_and_result(tmp_path: Path, capsys):
 
 
 def test_in_the_table_the_longest_words_stay_apart():
-    far = Settled(
+    far = SimulatedObject(
         "nightstand_0", "nightstand", 12.3456, 0.0, math.radians(127), 1.5, 0.287, 9.0, False
     )
     held = dataclasses.replace(far, id="lamp_0", fixed=True)
-    lines = settle_table({"initial": [far, held], "result": [held]}).splitlines()
+    lines = simulation_table({"initial": [far, held], "result": [held]}).splitlines()
     assert lines[2].split() == [
         "nightstand_0", "12346", "mm", "127", "deg", "287", "mm", "fell", "over", "-",
     ]  # fmt: skip
@@ -280,17 +280,17 @@ def test_in_the_table_the_longest_words_stay_apart():
 
 
 def test_without_mujoco_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(mover.settle, "find_spec", lambda _: None)
+    monkeypatch.setattr(mover.app.simulate, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=r"\.\[physics\]"):
-        settle(furnished(BOXES), Run(tmp_path))
+        simulate(furnished(BOXES), Run(tmp_path))
 
 
 @pytest.mark.slow
 @needs_mujoco
 @pytest.mark.parametrize("seed", range(10))
 def test_the_truth_of_known_rooms_stands_still(seed: int, tmp_path: Path):
-    from mover.rooms import make_room
+    from mover_bench.rooms.room import make_room
 
     truth = make_room(seed).truth
-    for found in settle(truth, Run(tmp_path), SettleConfig(3.0)):
+    for found in simulate(truth, Run(tmp_path), SimulationConfig(3.0)):
         assert found.moved < 0.01, found

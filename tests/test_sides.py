@@ -6,8 +6,9 @@ import pytest
 import torch
 from analytic import make_inputs
 
-from mover.stages.find_image_cues import ImageConfig, ImageInputs, find_image_cues
-from mover.terms.bbox import LEAST, SEEN, SOFT, UNKNOWN, bbox_term
+from mover.energy.terms.bbox import LEAST, SEEN, SOFT, UNKNOWN, bbox_term
+from mover.stages.config import ImageConfig
+from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
 
 HEIGHT, WIDTH = 120, 200
 LEFT, TOP, RIGHT, BOTTOM = range(4)

@@ -6,13 +6,16 @@ import pytest
 import torch
 from test_pipeline import light
 
-from mover.energy import SceneWeights
-from mover.pipeline import Run, reconstruct
-from mover.presets import PRESETS
-from mover.rooms.noise import NoiseConfig, add_noise
-from mover.stages.size_spread import SpreadConfig, believed, learnt_sizes
-from mover.terms.scale import scale_term
-from mover.types import Layout
+from mover.core.run import Run
+from mover.core.types import Layout
+from mover.energy.config import SceneWeights
+from mover.energy.terms.scale import scale_term
+from mover.pipeline.presets import PRESETS
+from mover.pipeline.reconstruct import reconstruct
+from mover.stages.config import SpreadConfig
+from mover.stages.objects.place_objects import estimate_size_prior, inlier_weights
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.noise import add_noise
 
 USUAL, COMMON = 0.07, 0.045
 CONFIG = SpreadConfig(usual=USUAL, common=COMMON, known=0.0)
@@ -27,7 +30,7 @@ def layout_of(log_scale: torch.Tensor) -> Layout:
 
 def taught(log_scale: torch.Tensor, config: SpreadConfig) -> tuple[float, float]:
     """What pieces teach whose shapes are all right."""
-    return learnt_sizes(layout_of(log_scale), torch.ones(len(log_scale)), config)
+    return estimate_size_prior(layout_of(log_scale), torch.ones(len(log_scale)), config)
 
 
 def drawn(spread: float, count: int = 4000) -> torch.Tensor:
@@ -69,14 +72,14 @@ def test_one_wild_piece_among_few_is_held_by_what_is_usual_and_never_believed_be
 def test_pieces_whose_silhouettes_cannot_be_made_to_fit_teach_hardly_anything():
     right = drawn(0.1)
     wrong = 0.5 * torch.randn(4000, 3, generator=torch.Generator().manual_seed(3))
-    trust = believed(torch.tensor([0.02, 5.0]).repeat_interleave(4000))
+    trust = inlier_weights(torch.tensor([0.02, 5.0]).repeat_interleave(4000))
     assert trust.unique().tolist() == pytest.approx([0.1, 1])
-    shape, _ = learnt_sizes(layout_of(torch.cat([right, wrong])), trust, CONFIG)
+    shape, _ = estimate_size_prior(layout_of(torch.cat([right, wrong])), trust, CONFIG)
     assert USUAL**2 / shape == pytest.approx((0.1**2 + 0.01 * 0.5**2) / 1.01, rel=0.05)
 
 
 def test_a_silhouette_is_believed_less_the_worse_it_can_be_made_to_fit():
-    trust = believed(torch.tensor([0.0, 0.05, 0.1, 0.2, 0.4, 3.0]))
+    trust = inlier_weights(torch.tensor([0.0, 0.05, 0.1, 0.2, 0.4, 3.0]))
     torch.testing.assert_close(trust, torch.tensor([1, 1, 1, 0.5, 0.25, 0.1]))
 
 

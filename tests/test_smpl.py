@@ -7,16 +7,18 @@ import pytest
 import torch
 from make_smpl import make_model, write_npz, write_old_pickle
 
-from mover.bodies import BODY_MODELS, BodyModel, load_model, load_smpl, rest_pose
-from mover.bodies.parts import PARTS, members, parts_of
+from mover.bodies import BODY_MODELS, BodyModel, load_model
+from mover.bodies.parts import members, parts_of
 from mover.bodies.skeleton import JOINTS, PARENTS
-from mover.bodies.smpl_files import FOLDER, find_file
-from mover.bodies.smpl_model import FLAT
+from mover.bodies.skin import PARTS
+from mover.bodies.smpl_files import FOLDER, find_file, load_smpl
+from mover.bodies.smpl_model import FLAT, rest_pose
+from mover.core.errors import InputError
+from mover.core.records import map_tensors
+from mover.core.types import Bodies, BodyPose
 from mover.geometry.mesh import vertex_normals
 from mover.geometry.rotations import axis_angle
-from mover.readers.bodies_file import read_bodies, write_bodies
-from mover.records import InputError, map_tensors
-from mover.types import Bodies, BodyPose
+from mover.io.capture.bodies_file import read_bodies, write_bodies
 
 COUNTS = {"smpl": (6890, 24, 69), "smplh": (6890, 52, 63), "smplx": (10475, 55, 63)}
 

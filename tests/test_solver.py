@@ -8,26 +8,23 @@ from analytic import make_inputs, moved
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mover import energy_warp
-from mover.commands import parse_run
-from mover.energy import SceneWeights
+from mover.app.cli.run import parse_run
+from mover.core.observe import Energy, silent
+from mover.core.records import built, plain, record
+from mover.core.types import Layout
+from mover.energy.config import Adam, BatchedBFGS, SceneWeights
+from mover.energy.fused import energy as energy_warp
+from mover.energy.newton import Problems, _step, settle
+from mover.energy.terms.silhouette import squares
 from mover.geometry.camera import outermost, project, to_camera
 from mover.geometry.placement import place, place_in
-from mover.geometry.price_warp import squares
-from mover.geometry.raster import Depths
-from mover.geometry.raster_engine import use_engine
-from mover.minimize import Adam, Energy, silent
-from mover.minimize_newton import Problems, Quasi, _step, settle
-from mover.presets import Config
-from mover.records import built, plain, record
-from mover.stages.coarser import coarser_image
-from mover.stages.pinned import Pinned
-from mover.stages.place_objects import PlaceConfig, descend, energy_of, place_objects, with_trees
-from mover.stages.starts import alone
-from mover.terms.depth import DepthRange, depth_term
-from mover.types import Layout
+from mover.pipeline.presets import Config
+from mover.stages.config import PlaceConfig
+from mover.stages.objects.place_inputs import Pinned, coarser_image
+from mover.stages.objects.place_objects import descend, energy_of, place_objects, with_trees
+from mover.stages.objects.starts import alone
 
-EXACT = Quasi(steps=400, gain=1e-12, least=1e-9, patience=10)
+EXACT = BatchedBFGS(steps=400, gain=1e-12, least=1e-9, patience=10)
 
 
 @record
@@ -93,13 +90,13 @@ def test_the_end_of_each_of_rosenbrocks_valleys_is_found():
 
 @pytest.mark.parametrize("k", [0, 3, 11])
 def test_a_problem_goes_its_way_whatever_else_is_in_the_batch(k):
-    together, one = settle(valleys(12), Quasi()), settle(only(valleys(12), k), Quasi())
+    together, one = settle(valleys(12), BatchedBFGS()), settle(only(valleys(12), k), BatchedBFGS())
     torch.testing.assert_close(one.at.x[0], together.at.x[k], rtol=0, atol=1e-6)
     torch.testing.assert_close(one.value[0], together.value[k], rtol=1e-6, atol=1e-9)
 
 
 def test_two_runs_give_the_same_bits():
-    a, b = settle(valleys(9), Quasi()), settle(valleys(9), Quasi())
+    a, b = settle(valleys(9), BatchedBFGS()), settle(valleys(9), BatchedBFGS())
     assert torch.equal(a.at.x, b.at.x)
     assert torch.equal(a.value, b.value)
 
@@ -118,7 +115,7 @@ def test_what_has_converged_leaves_the_batch_and_the_rest_goes_on():
         return counted
 
     steps = []
-    found = settle(replace(problems, of=of), Quasi(steps=500), steps.append)
+    found = settle(replace(problems, of=of), BatchedBFGS(steps=500), steps.append)
     assert sizes[0] == 12
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 12
@@ -144,7 +141,7 @@ def test_no_problem_ends_higher_than_it_starts_and_the_trace_falls(seed, steps):
 
     start = Point(torch.randn(6, generator=r).double(), torch.randn(6, 2, generator=r).double())
     problems = Problems(of, start, (6,))
-    found = settle(problems, Quasi(steps=steps))
+    found = settle(problems, BatchedBFGS(steps=steps))
     before = of(torch.arange(6))(start).per_item
     assert (found.value <= before).all()
     assert (found.trace.diff() <= 0).all()
@@ -156,7 +153,7 @@ def test_an_energy_that_is_not_finite_at_the_start_is_an_error():
     problems, _ = bowls(3)
     start = Point(problems.start.x * torch.nan, problems.start.y)
     with pytest.raises(ValueError, match="somewhere: the energy is not finite"):
-        settle(replace(problems, start=start), Quasi(), silent, "somewhere")
+        settle(replace(problems, start=start), BatchedBFGS(), silent, "somewhere")
 
 
 def test_a_cliff_of_nan_is_not_stepped_over():
@@ -164,7 +161,7 @@ def test_a_cliff_of_nan_is_not_stepped_over():
         return lambda p: Energy({"cliff": torch.where(p.x < 0.3, -p.x, torch.nan) + 0 * p.y[:, 0]})
 
     start = Point(torch.zeros(1).double(), torch.zeros(1, 1).double())
-    found = settle(Problems(of, start, (1,)), Quasi())
+    found = settle(Problems(of, start, (1,)), BatchedBFGS())
     assert 0.2 < float(found.at.x) < 0.3
 
 
@@ -206,7 +203,7 @@ def test_grouped_problems_decide_together():
 
 
 WEIGHTS = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, heading=0.1)
-ROBUST = PlaceConfig(WEIGHTS, "robust", Quasi())
+ROBUST = PlaceConfig(WEIGHTS, "robust", BatchedBFGS())
 
 
 class TestPlacing:
@@ -216,36 +213,43 @@ class TestPlacing:
         adam = descend(
             inputs, ROBUST, starts, Adam(60, 0.02, 0.002, beta2=0.98, keep_best=True), silent
         )
-        fast = descend(inputs, ROBUST, starts, Quasi(), silent)
+        fast = descend(inputs, ROBUST, starts, BatchedBFGS(), silent)
         assert (fast.value <= adam.value * 1.05 + 1e-3).all()
 
     def test_each_start_of_each_object_ends_where_it_ends_alone(self):
         inputs = make_inputs(size=32)
         many = [moved(inputs.starts, s, 0.1) for s in range(3)]
         batch = Layout(*(torch.cat([getattr(m, f.name) for m in many]) for f in fields(Layout)))
-        together = descend(inputs, ROBUST, batch, Quasi(steps=5), silent)
-        one = descend(inputs, ROBUST, many[1], Quasi(steps=5), silent)
+        together = descend(inputs, ROBUST, batch, BatchedBFGS(steps=5), silent)
+        one = descend(inputs, ROBUST, many[1], BatchedBFGS(steps=5), silent)
         torch.testing.assert_close(together.value[1:2], one.value, rtol=1e-3, atol=1e-5)
 
     def test_its_energies_are_those_of_the_layout_it_returns(self):
         inputs = make_inputs(size=32)
-        found = descend(inputs, ROBUST, moved(inputs.starts, 1, 0.1), Quasi(steps=8), silent)
+        found = descend(inputs, ROBUST, moved(inputs.starts, 1, 0.1), BatchedBFGS(steps=8), silent)
         there = energy_of(inputs, ROBUST)(found.at).per_item
         torch.testing.assert_close(found.value, there, rtol=1e-4, atol=1e-6)
 
     def test_the_evidence_is_prepared_once_whoever_leaves_the_batch(self, monkeypatch):
         pytest.importorskip("warp")
         inputs, packed = with_trees(make_inputs(size=32)), []
-        prepare = energy_warp.pricer_of
-        monkeypatch.setattr(energy_warp, "pricer_of", lambda *a: packed.append(a) or prepare(*a))
-        descend(inputs, ROBUST, moved(inputs.starts, 1, 0.1), Quasi(steps=8, patience=1), silent)
+        prepare = energy_warp.kernel_of
+        monkeypatch.setattr(energy_warp, "kernel_of", lambda *a: packed.append(a) or prepare(*a))
+        descend(
+            inputs, ROBUST, moved(inputs.starts, 1, 0.1), BatchedBFGS(steps=8, patience=1), silent
+        )
         assert len(packed) == 1
 
     def test_rounds_of_shaking_never_worsen_the_result_and_are_the_same_in_every_run(self):
         inputs = make_inputs(size=32)
         inputs = replace(inputs, starts=alone(_first(moved(inputs.starts, 4, 0.1))))
         once, thrice, again = (
-            place_objects(inputs, replace(ROBUST, method=Quasi(steps=6), shaken=2, rounds=n))
+            place_objects(
+                inputs,
+                replace(
+                    ROBUST, method=BatchedBFGS(steps=6), perturbations=2, perturbation_rounds=n
+                ),
+            )
             for n in (1, 3, 3)
         )
         assert (thrice.energy[0] <= once.energy[0]).all()
@@ -258,7 +262,7 @@ class TestPlacing:
         held = Layout(off.t_world_object[0] + 0.05, off.yaw[0] + 0.1, off.log_scale[0])
         fixed = torch.arange(n) == 0
         inputs = replace(inputs, starts=off, pinned=Pinned(fixed, held))
-        placed = place_objects(inputs, replace(ROBUST, shaken=1)).layout
+        placed = place_objects(inputs, replace(ROBUST, perturbations=1)).layout
         assert torch.equal(placed.yaw[0], held.yaw[0])
         assert torch.equal(placed.t_world_object[0, [0, 2]], held.t_world_object[0, [0, 2]])
         assert not torch.equal(placed.yaw[1:], off.yaw[0, 1:])
@@ -269,7 +273,7 @@ class TestPlacing:
         supports[1] = 0
         inputs = replace(inputs, objects=replace(inputs.objects, supports=supports))
         starts = moved(inputs.starts, 2, 0.1)
-        found = descend(inputs, ROBUST, starts, Quasi(steps=6), silent)
+        found = descend(inputs, ROBUST, starts, BatchedBFGS(steps=6), silent)
         before = energy_of(inputs, ROBUST)(starts).per_item
         assert (found.value[:, :2].sum(1) <= before[:, :2].sum(1)).all()
         there = energy_of(inputs, ROBUST)(found.at).per_item
@@ -279,9 +283,9 @@ class TestPlacing:
         inputs = make_inputs(size=32)
         inputs = replace(inputs, starts=alone(_first(moved(inputs.starts, 4, 0.1))))
         plain_ = place_objects(inputs, ROBUST)
-        more = place_objects(inputs, replace(ROBUST, shaken=2))
+        more = place_objects(inputs, replace(ROBUST, perturbations=2))
         assert (more.energy[0] <= plain_.energy[0]).all()
-        quick = replace(ROBUST, yaws=4, short=Quasi(steps=6), keep=2, coarse=2)
+        quick = replace(ROBUST, yaws=4, short=BatchedBFGS(steps=6), num_hypotheses=2, coarse=2)
         assert place_objects(inputs, quick).layout.yaw.isfinite().all()
 
 
@@ -295,15 +299,15 @@ class TestCommandLine:
         run, config = parse_run([*args, "--layout.method.steps", "3"])
         assert run.source.name == "room"
         assert config.place.method == Adam(beta2=0.5)
-        assert config.layout.method == Quasi(steps=3)
+        assert config.layout.method == BatchedBFGS(steps=3)
         _, config = parse_run(["room", "--preset", "paper", "--place.method", "newton"])
-        assert config.place.method == Quasi()
+        assert config.place.method == BatchedBFGS()
         assert config.layout.method == Adam(1000)
 
     def test_settings_come_back_from_a_file_with_the_right_method(self):
         _, config = parse_run(["room", "--place.method", "newton", "--preset", "paper"])
         again = built(Config, plain(config))
-        assert again.place.method == Quasi()
+        assert again.place.method == BatchedBFGS()
         assert again.layout.method == config.layout.method
 
 
@@ -321,18 +325,6 @@ def random_maps(seed, n=3, starts=2, size=24):
 
 class TestFasterTerms:
     """What was made faster against the plain way to compute it."""
-
-    @pytest.mark.parametrize("seed", range(3))
-    def test_depths_out_of_bounds_and_their_gradient_are_those_of_torch(self, seed):
-        depth, covered, mask, near, far = random_maps(seed)
-        allowed = DepthRange(near, far, near, torch.ones(len(mask)))
-        found = []
-        for name in ("torch", "warp"):
-            free = depth.clone().requires_grad_()
-            with use_engine(name):
-                term = depth_term(Depths(free, free.detach(), covered), mask, allowed, "robust")
-            found.append((term.detach(), *torch.autograd.grad(term.sum(), free)))
-        torch.testing.assert_close(found[0], found[1], rtol=1e-5, atol=1e-6)
 
     def test_squares_and_their_gradient_are_those_of_autograd(self):
         drawn, keep, mask, _, _ = random_maps(7)

@@ -7,9 +7,9 @@ import sys
 
 import pytest
 
+from mover.app.cli.progress import Bar
+from mover.core.observe import Step
 from mover.geometry.kernels import start
-from mover.minimize import Step
-from mover.progress import Bar
 
 pytest.importorskip("warp")
 
@@ -30,11 +30,11 @@ assert len(set(folder)) == 1, folder
 """
 COMPILE = """
 from mover.geometry.kernels.start import kernels
-from mover.minimize import Step
-from mover.progress import Bar
+from mover.energy.minimize import Step
+from mover.app.cli.progress import Bar
 with Bar() as bar:
     bar(Step("gather", 0, 1))
-    kernels("touched", "cpu")
+    kernels("lookup", "cpu")
 """
 
 
@@ -53,16 +53,16 @@ def test_threads_that_start_at_once_initialise_warp_once_and_say_nothing():
 @pytest.mark.slow
 def test_the_progress_tells_that_kernels_are_compiled_and_only_the_first_time(tmp_path):
     first, second = (said(COMPILE, WARP_CACHE_PATH=str(tmp_path)) for _ in range(2))
-    assert "compiling kernels, once on this machine: touched for cpu" in first
+    assert "compiling kernels, once on this machine: lookup for cpu" in first
     assert second.strip() == "gather ..."
 
 
 def test_kernels_in_the_cache_are_loaded_without_a_word(caplog):
-    start.kernels("touched", "cpu")  # the first on this machine may tell
+    start.kernels("lookup", "cpu")  # the first on this machine may tell
     start._loaded.cache_clear()
     caplog.clear()
     with caplog.at_level(logging.INFO):
-        start.kernels("touched", "cpu")
+        start.kernels("lookup", "cpu")
     assert caplog.records == []
 
 

@@ -1,10 +1,10 @@
 import torch
 from analytic import box_verts
 
+from mover.core.types import Layout
 from mover.geometry.camera import project, to_camera
 from mover.geometry.placement import place
-from mover.stages.starts import best_few, choose, spread, spread_distance
-from mover.types import Layout
+from mover.stages.objects.starts import best_few, choose, spread, spread_distance
 
 
 def layout_of(yaws, x=None):

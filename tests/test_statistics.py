@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, false_discovery_control, norm
 
-from mover.experiments.statistics import (
+from mover_bench.studies.compare import (
     FEWEST,
     RESAMPLES,
     Interval,

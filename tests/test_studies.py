@@ -10,23 +10,23 @@ import pytest
 import torch
 from test_experiments import FEW, Ended, quick, trial
 
-from mover import records
-from mover.commands import run_command
-from mover.experiments.changes import CHANGES, changed_set, set_named
-from mover.experiments.job import DONE, ROOM, Job, key_of, rebuild, store_room
-from mover.experiments.measures import seen_from
-from mover.experiments.queue import open_jobs, run_all
-from mover.experiments.run import by_room
-from mover.experiments.sets import SETS
-from mover.experiments.study import STUDIES, StudyArgs, ask_of, jobs_of, run_study
-from mover.experiments.variants import PARTS, TERMS, VARIANTS, Cut, Variant
-from mover.experiments.withheld import frames_of, withheld
+from mover.app.cli import run_command
+from mover.core import records
+from mover.core.errors import InputError
+from mover.core.observe import Step
+from mover.core.types import Room
 from mover.geometry.camera import project, to_camera
-from mover.minimize import Step
-from mover.outcome import carried
-from mover.presets import PRESETS
-from mover.stages.refine_bodies import RefinedBodies
-from mover.types import Room
+from mover.pipeline.outcome import to_world
+from mover.pipeline.presets import PRESETS
+from mover.stages.people.refine_bodies import RefinedBodies
+from mover_bench.studies.args import StudyArgs
+from mover_bench.studies.job import DONE, ROOM, Job, key_of, rebuild, store_room
+from mover_bench.studies.measures import seen_from
+from mover_bench.studies.queue import open_jobs, run_all
+from mover_bench.studies.run import by_room
+from mover_bench.studies.sets import CHANGES, SETS, changed_set, set_named
+from mover_bench.studies.study import STUDIES, ask_of, jobs_of, run_study
+from mover_bench.studies.variants import PARTS, TERMS, VARIANTS, Cut, Variant, frames_of, withheld
 
 SEEDS = "1000-1019"
 
@@ -294,7 +294,7 @@ class TestChanges:
 
     @pytest.mark.parametrize("name", ["flats", "rooms+colour=1", "rooms+scale=big", "rooms+scale"])
     def test_other_names_are_refused(self, name: str) -> None:
-        with pytest.raises(records.InputError, match="--set"):
+        with pytest.raises(InputError, match="--set"):
             set_named(name)
 
 
@@ -386,7 +386,7 @@ def test_refined_people_change_what_is_measured_of_people_only(tmp_path: Path, m
         moved = replace(room.bodies, verts=room.bodies.verts + down)
         return RefinedBodies(moved, down.expand(n, 3), torch.zeros(n))
 
-    monkeypatch.setattr("mover.experiments.job.refine_bodies", sunk)
+    monkeypatch.setattr("mover_bench.studies.job.refine_bodies", sunk)
     store_room(Job("rooms", 0, ROOM, tmp_path), trial(), FEW)
     plain = Variant(quick(PRESETS["robust"]))
     trees = []
@@ -412,7 +412,7 @@ def test_the_true_room_is_measured_with_the_people_of_the_result(tmp_path: Path)
 
 def test_people_seen_from_another_camera_stay_in_their_pixels() -> None:
     known = trial()
-    bodies = carried(known.capture.bodies, known.capture.scene.camera)
+    bodies = to_world(known.capture.bodies, known.capture.scene.camera)
     room = Room(
         known.capture.scene, known.capture.scene, known.capture.scene, bodies, None, (), (), None,
         {}, (),

@@ -10,13 +10,15 @@ from analytic import FACES, GROUND, SIZES, make_inputs, moved, walls_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mover.energy import HumanCues, SceneWeights
+from mover.core.types import Layout
+from mover.energy.config import SceneWeights
+from mover.energy.objective import HumanCues
 from mover.geometry.camera import project, to_camera
-from mover.geometry.placement import place, stand
+from mover.geometry.placement import place, rest_on_support
 from mover.geometry.raster import Topology, look
-from mover.stages.place_inputs import with_walls
-from mover.stages.place_objects import PlaceConfig, energy_of
-from mover.types import Layout
+from mover.stages.config import PlaceConfig
+from mover.stages.objects.place_inputs import with_walls
+from mover.stages.objects.place_objects import energy_of
 
 TERMS = [f.name for f in fields(SceneWeights)]
 ONLY = {t: SceneWeights(**{n: float(n == t) for n in TERMS}) for t in TERMS}
@@ -85,7 +87,7 @@ class TestPaperAsPrinted:
     def at(self, seed=3):
         layout = moved(self.inputs.starts, seed, 0.15)
         objects = self.inputs.objects
-        return stand(layout, objects.supports, objects.size[:, 1], GROUND)
+        return rest_on_support(layout, objects.supports, objects.size[:, 1], GROUND)
 
     def value(self, term, layout):
         return energy(self.inputs, layout, term).per_item[0].numpy()

@@ -10,10 +10,11 @@ import torch
 from PIL import Image
 from scipy.io import savemat
 
+from mover.core.errors import InputError
 from mover.geometry.camera import pitch_roll, project, to_camera
-from mover.geometry.placement import place_piece
-from mover.readers import read, read_capture, write_capture
-from mover.records import InputError
+from mover.geometry.placement import place_object
+from mover.io.capture.folder import read_capture, write_capture
+from mover.io.formats import read
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "total3d_1"
 PITCH, ROLL = -0.25, 0.06
@@ -65,20 +66,20 @@ def write(folder: Path) -> Path:
 
 def test_a_vertex_lands_on_the_pixel_that_total3d_says(tmp_path: Path) -> None:
     found = read("total3d", write(tmp_path / "room"))
-    assert [p.id for p in found.scene.pieces] == ["chair_0", "television_2"]
-    assert [p.support for p in found.scene.pieces] == ["ground", "free"]
+    assert [p.id for p in found.scene.objects] == ["chair_0", "television_2"]
+    assert [p.support for p in found.scene.objects] == ["ground", "free"]
     assert found.scene.ground == pytest.approx(-1.45)
     bounds = np.concatenate([tiny.STEP, [[0, -0.5, 0]]])
     low, high = bounds.min(0), bounds.max(0)
-    for piece, box in zip(found.scene.pieces, (BOXES[0], BOXES[2]), strict=True):
+    for piece, box in zip(found.scene.objects, (BOXES[0], BOXES[2]), strict=True):
         parts = cell(*box[1:])
         local = (tiny.STEP - (low + high) / 2) / ((high - low) / 2) * parts["coeffs"]
         points = local @ parts["basis"] + parts["centroid"]  # rows, in Total3D's world
         image = points @ attitude() @ np.array([[0, 0, 1], [0, -1, 0], [1, 0, 0]]).T @ K.T
         camera = found.scene.camera
-        seen = project(to_camera(place_piece(piece).verts, camera.R_cam_world), camera.K)
+        seen = project(to_camera(place_object(piece).verts, camera.R_cam_world), camera.K)
         assert np.allclose(seen.numpy(), image[:, :2] / image[:, 2:], atol=1e-3)
-        assert place_piece(piece).faces.tolist() == tiny.STEP_FACES.tolist()
+        assert place_object(piece).faces.tolist() == tiny.STEP_FACES.tolist()
 
 
 def test_the_camera_keeps_its_pitch_and_roll(tmp_path: Path) -> None:
@@ -127,9 +128,9 @@ class TestRealOutput:
     def test_its_meshes_lie_on_their_detections_as_loosely_as_known(self) -> None:
         found = read("total3d", DATA)
         camera, ious = found.scene.camera, []
-        assert [p.annotation for p in found.scene.pieces] == list(range(18))
-        for piece, detection in zip(found.scene.pieces, found.detections, strict=True):
-            verts = to_camera(place_piece(piece).verts, camera.R_cam_world)
+        assert [p.annotation for p in found.scene.objects] == list(range(18))
+        for piece, detection in zip(found.scene.objects, found.detections, strict=True):
+            verts = to_camera(place_object(piece).verts, camera.R_cam_world)
             seen = project(verts, camera.K)
             low = torch.maximum(seen.amin(0), torch.zeros(2))
             high = torch.minimum(seen.amax(0), torch.tensor([camera.width, camera.height]))
@@ -155,8 +156,8 @@ class TestRealOutput:
         second = read_capture(tmp_path)
         copy = tmp_path / "meshes" / "chair_10.obj"
         assert copy.read_bytes() == (DATA / "output" / "10_5.obj").read_bytes()
-        for a, b in zip(first.scene.pieces, second.scene.pieces, strict=True):
-            assert torch.allclose(place_piece(a).verts, place_piece(b).verts, atol=1e-5)
+        for a, b in zip(first.scene.objects, second.scene.objects, strict=True):
+            assert torch.allclose(place_object(a).verts, place_object(b).verts, atol=1e-5)
             assert torch.equal(a.mesh.faces, b.mesh.faces)
 
 

@@ -6,9 +6,9 @@ from figures import ARMS_DOWN, ARMS_UP, AT_TABLE, SEATED, STRIDE, moving, people
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mover.bodies import open_body
 from mover.bodies.parts import members, parts_of
-from mover.bodies.touch import headings, postures, touching
+from mover.bodies.posture import headings, postures, touching
+from mover.bodies.skinning import open_body
 from mover.geometry.rotations import rot_y
 
 LEANING = {**SEATED, **{f"{s}_hip": (-1.2, 0.0, 0.0) for s in ("left", "right")}}

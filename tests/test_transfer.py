@@ -8,12 +8,12 @@ from figures import SEATED, pose
 from make_smpl import make_model, write_npz
 from scipy import sparse
 
-from mover.bodies import load_smpl, open_body, rest_pose
-from mover.bodies.smpl_files import FOLDER
-from mover.bodies.smpl_model import FLAT
+from mover.bodies.skinning import open_body
+from mover.bodies.smpl_files import FOLDER, load_smpl
+from mover.bodies.smpl_model import FLAT, rest_pose
 from mover.bodies.transfer import TransferConfig, copy_pose, transfer
 from mover.bodies.transfer_matrix import find_matrix, read_matrix
-from mover.records import InputError
+from mover.core.errors import InputError
 
 COMMON = 22
 

@@ -9,13 +9,15 @@ import raycast
 import torch
 import trimesh
 
-from mover import pipeline
-from mover.bodies.world import in_world
-from mover.geometry.runs import decode
-from mover.pipeline import PRESETS, Run
-from mover.readers.scene_file import write_scene
-from mover.stages.place_objects import Placed, PlaceInputs, energy_of
-from mover.types import Layout
+from mover.bodies.corrected import in_world
+from mover.core.run import Run
+from mover.core.types import Layout
+from mover.geometry.rle import decode
+from mover.io.capture.scene_file import write_scene
+from mover.pipeline import reconstruct as pipeline
+from mover.pipeline.presets import PRESETS
+from mover.stages.objects.place_inputs import Placed, PlaceInputs
+from mover.stages.objects.place_objects import energy_of
 
 COUNT = 200  # perturbations of each object
 FLIP_X, FLIP_Y = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0])
@@ -24,15 +26,17 @@ FLIP_X, FLIP_Y = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0])
 def at_truth(room, preset, folder):
     """The evidence of a noiseless room, gathered at the truth, and the true layout."""
     config = PRESETS[preset]
-    config = replace(config, correct_depth=False, refine=replace(config.refine, rounds=0), again=0)
+    config = replace(
+        config, correct_depth=False, refine=replace(config.refine, rounds=0), outer_iterations=0
+    )
     config = replace(config, gather=replace(config.gather, cells=192))
     capture = room.capture
     seen = pipeline.image_evidence(capture)
     run = Run(folder)
     prepared = run.stage(
-        pipeline.prepare_objects, pipeline.PrepareInputs(room.truth.pieces), config.prepare
+        pipeline.prepare_objects, pipeline.PrepareInputs(room.truth.objects), config.prepare
     )
-    job = pipeline.Job(capture, config, run, seen, prepared)
+    job = pipeline.ReconstructionContext(capture, config, run, seen, prepared)
     crew = pipeline.people_of(capture, config, run)
     unordered = torch.zeros(len(seen.boxes), len(seen.boxes), dtype=torch.bool)
     camera, ground = room.truth.camera, room.truth.ground
@@ -45,10 +49,10 @@ def at_truth(room, preset, folder):
         torch.zeros(1, len(seen.boxes)),
         torch.zeros(0),
     )
-    view = pipeline.View(camera, ground, image, prepared.start, placed, {}, prepared.start)
+    view = pipeline.SceneState(camera, ground, image, prepared.start, placed, {}, prepared.start)
     view = pipeline.assigned(job, crew, pipeline.gathered(job, crew, view))
     cues = run.stage(pipeline.find_image_cues, image, config.image)
-    humans = pipeline.cues_in_windows(view.cues, view.contacts.touches, cues.views, camera)
+    humans = pipeline.cues_in_windows(view.cues, view.contacts.points, cues.views, camera)
     starts = pipeline.alone(prepared.start)
     inputs = PlaceInputs(prepared.objects, camera, ground, cues, humans, starts, prepared.start.yaw)
     return inputs, config
@@ -83,16 +87,16 @@ def test_sitters_tell_the_front_of_seats_with_a_back_and_of_no_other(demo_room, 
     assert float(off.min()) > np.cos(np.radians(20))
     crew = pipeline.people_of(demo_room.capture, config, Run(tmp_path))
     flat = replace(objects, has_back=torch.zeros_like(objects.has_back))
-    found = pipeline.assign_touches(
-        pipeline.TouchInputs(
+    found = pipeline.assign_contacts(
+        pipeline.AssignInputs(
             in_world(crew.bodies, inputs.camera), demo_room.touching.float(), crew.parts,
             pipeline.image_evidence(demo_room.capture).masks, inputs.image.boxes, inputs.camera,
             flat, Layout(*(x[0] for x in vars(inputs.starts).values())),
         ),
         config.assign,
     )  # fmt: skip
-    assert found.touches is not None
-    assert float(found.touches.heading.abs().max()) == 0
+    assert found.points is not None
+    assert float(found.points.heading.abs().max()) == 0
 
 
 @pytest.mark.slow

@@ -18,16 +18,15 @@ import torch
 from test_pipeline import light
 from test_report import Visit, browser, differ
 
-from mover import records
-from mover.edits import Pin, Place, edit_scene, placement_of
+from mover.app.viewer.session import read_shown
+from mover.core import records
+from mover.energy.config import Adam
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import rot_y
-from mover.minimize import Adam
-from mover.readers import read
-from mover.readers.edits_file import read_edits, write_edits
-from mover.readers.fields import write_json
-from mover.readers.scene_file import read_scene
-from mover.viewer import read_shown
+from mover.io.capture.edits import Pin, Place, edit_scene, placement_of, read_edits, write_edits
+from mover.io.capture.scene_file import read_scene
+from mover.io.files.fields import write_json
+from mover.io.formats import read
 
 __all__ = ["browser"]  # the fixture
 SQUARE = 0.9 / 7 * 1.7  # [m] along x and z, from the foot of the gizmo to its square's middle
@@ -45,16 +44,19 @@ def call(*arguments: object) -> None:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, small_room) -> Path:
     """A small capture, its settings, and its result in `out`."""
-    from mover.readers.folder import write_capture
-    from mover.rooms.noise import NoiseConfig, add_noise
+    from mover.io.capture.folder import write_capture
+    from mover_bench.rooms.config import NoiseConfig
+    from mover_bench.rooms.noise import add_noise
 
     folder = tmp_path_factory.mktemp("view")
     write_capture(add_noise(small_room, NoiseConfig(), 1), folder / "capture")
     config, slow = light("robust"), Adam(15, 0.03)  # slow enough to be watched
     config = dataclasses.replace(
         config,
-        layout=dataclasses.replace(config.layout, method=slow, yaws=8, keep=3, coarse=1, shaken=0),
-        place=dataclasses.replace(config.place, method=slow, shaken=0),
+        layout=dataclasses.replace(
+            config.layout, method=slow, yaws=8, num_hypotheses=3, coarse=1, perturbations=0
+        ),
+        place=dataclasses.replace(config.place, method=slow, perturbations=0),
     )
     write_json({"config": records.plain(config)}, folder / "config.json")
     call("run", folder / "capture", "--out", folder / "out", "--config", folder / "config.json")
@@ -146,7 +148,7 @@ def viewing(browser: Any, shots: Path, *arguments: object):
 
 def where(point: torch.Tensor, scene, canvas: dict[str, float]) -> tuple[float, float]:
     """Where the first view of the room shows a point of the world [px]."""
-    middle = torch.stack([box_of(p).center for p in scene.pieces]).mean(0).double()
+    middle = torch.stack([box_of(p).center for p in scene.objects]).mean(0).double()
     eye = torch.tensor([float(middle[0]) + 1.0, 2.2, 1.8], dtype=torch.float64)
     ahead = torch.nn.functional.normalize(middle - eye, dim=0)
     right = torch.linalg.cross(ahead, torch.tensor([0.0, 1, 0]).double())
@@ -161,7 +163,7 @@ def where(point: torch.Tensor, scene, canvas: dict[str, float]) -> tuple[float, 
 
 def nearest(scene):
     """The object in front."""
-    return max(scene.pieces, key=lambda p: float(box_of(p).center[2]))
+    return max(scene.objects, key=lambda p: float(box_of(p).center[2]))
 
 
 def edited(file: Path) -> list[dict[str, Any]]:
@@ -305,8 +307,8 @@ class TestViewer:
 
 def stays(place: Place, result) -> None:
     """The object stands where the edit puts it, on the floor of the result."""
-    wanted = {p.id: p for p in edit_scene(result, [place]).pieces}[place.id]
-    found = {p.id: p for p in result.pieces}[place.id]
+    wanted = {p.id: p for p in edit_scene(result, [place]).objects}[place.id]
+    found = {p.id: p for p in result.objects}[place.id]
     assert (wanted.t_world_object - found.t_world_object)[[0, 2]].abs().max() < 1e-4
     assert float((wanted.yaw - found.yaw).abs()) < 2e-4
     assert (wanted.scale - found.scale).abs().max() < 1e-5

@@ -10,7 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from little_room import GROUND, room
 
-from mover.edits import (
+from mover.core.errors import InputError
+from mover.core.types import Camera, Capture, Layout, Scene
+from mover.geometry.boxes import box_of
+from mover.geometry.camera import pitch_roll, tilted, to_camera
+from mover.geometry.placement import reproject
+from mover.geometry.rotations import wrap
+from mover.io.capture.edits import (
     Add,
     Delete,
     Pin,
@@ -21,15 +27,10 @@ from mover.edits import (
     edit_scene,
     joined,
     pinned_ids,
+    read_edits,
+    write_edits,
 )
-from mover.geometry.boxes import box_of
-from mover.geometry.camera import pitch_roll, tilted, to_camera
-from mover.geometry.floor import recast
-from mover.geometry.rotations import wrap
-from mover.readers.edits_file import read_edits, write_edits
-from mover.records import InputError
-from mover.stages.pinned import Pinned, hold
-from mover.types import Camera, Capture, Layout, Scene
+from mover.stages.objects.place_inputs import Pinned, hold
 
 
 def at(x=0.5, z=-2.0, yaw=1.0, scale=(1.0, 1.1, 0.9), pitch=-0.2, roll=0.0):
@@ -57,7 +58,7 @@ def under(scene: Scene, pitch: float, roll: float) -> Scene:
 
 
 def by_id(scene: Scene):
-    return {piece.id: piece for piece in scene.pieces}
+    return {piece.id: piece for piece in scene.objects}
 
 
 class TestEdits:
@@ -80,10 +81,10 @@ class TestEdits:
         edited, pinned = apply_edits(capture, every_edit())
         assert pinned == ("chair_0",)
         assert dataclasses.replace(edited, scene=capture.scene).name == "c"
-        for old, kept in zip(copy.pieces, capture.scene.pieces, strict=True):
+        for old, kept in zip(copy.objects, capture.scene.objects, strict=True):
             assert torch.equal(old.t_world_object, kept.t_world_object)
         again, _ = apply_edits(capture, every_edit())
-        for a, b in zip(edited.scene.pieces, again.scene.pieces, strict=True):
+        for a, b in zip(edited.scene.objects, again.scene.objects, strict=True):
             assert torch.equal(a.mesh.verts, b.mesh.verts)
             assert torch.equal(a.t_world_object, b.t_world_object)
 
@@ -100,7 +101,7 @@ class TestEdits:
         assert (centers[0] - centers[1]).abs().max() < 1e-5
         seen = by_id(there)["chair_0"].yaw[None]
         level = Layout(torch.zeros(1, 3), seen, torch.zeros(1, 3))
-        back = recast(level, torch.zeros(1), there.camera.R_cam_world, here.camera.R_cam_world)
+        back = reproject(level, torch.zeros(1), there.camera.R_cam_world, here.camera.R_cam_world)
         assert float(wrap(back.yaw[0] - put.yaw).abs()) < 1e-5
 
     def test_a_place_in_its_own_world_is_exact(self):
@@ -112,10 +113,10 @@ class TestEdits:
         assert float((piece.yaw - put.yaw).abs()) < 1e-6
 
     def test_what_a_deleted_object_carried_stands_where_it_stood(self):
-        pieces = list(room().pieces)
+        pieces = list(room().objects)
         pieces[0] = dataclasses.replace(pieces[0], support="table_0")
         pieces[2] = dataclasses.replace(pieces[2], support="sofa_0")
-        scene = edit_scene(dataclasses.replace(room(), pieces=tuple(pieces)), [Delete("table_0")])
+        scene = edit_scene(dataclasses.replace(room(), objects=tuple(pieces)), [Delete("table_0")])
         assert by_id(scene)["chair_0"].support == "sofa_0"
 
     @pytest.mark.parametrize(
@@ -145,7 +146,7 @@ class TestFile:
         write_edits(back, tmp_path / "again.json")
         assert (tmp_path / "again.json").read_bytes() == (tmp_path / "edits.json").read_bytes()
         a, b = (edit_scene(room(), e) for e in (back, every_edit()))
-        for one, other in zip(a.pieces, b.pieces, strict=True):
+        for one, other in zip(a.objects, b.objects, strict=True):
             assert torch.equal(one.t_world_object, other.t_world_object)
 
     @pytest.mark.parametrize(
@@ -190,11 +191,12 @@ class TestPinned:
 
 @pytest.mark.parametrize("refined", [False, True])
 def test_solving_again_refines_people_where_the_first_run_did(tmp_path, monkeypatch, refined):
-    from mover import commands_view, records
-    from mover.minimize import silent
-    from mover.presets import PRESETS
-    from mover.readers.fields import write_json
-    from mover.viewer import solve
+    from mover.app.viewer import show as commands_view
+    from mover.app.viewer import solve
+    from mover.core import records
+    from mover.core.observe import silent
+    from mover.io.files.fields import write_json
+    from mover.pipeline.presets import PRESETS
 
     config = records.plain(PRESETS["robust"])
     write_json({"config": config, "people_refined": refined}, tmp_path / "run.json")

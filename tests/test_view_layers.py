@@ -9,24 +9,23 @@ import pytest
 import torch
 from little_room import GROUND, camera, room, walkers
 
-from mover.edits import Place
+from mover.app.viewer.drawing import cast_of
+from mover.app.viewer.layers import contact_points, depth_points, floor_ellipses, space_surface
+from mover.app.viewer.panel_object import numbers_of
+from mover.app.viewer.session import Shown, start_session
+from mover.app.viewer.solve import Stopped, Watch, seen_in
+from mover.core.observe import Energy, Step
+from mover.core.types import Layout
+from mover.energy.terms.contact import ContactPoints
+from mover.energy.terms.depth import DepthMaps
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, project, tilted, to_camera
-from mover.geometry.floor import hit_floor
+from mover.geometry.placement import hit_floor
 from mover.geometry.volume import Volume
-from mover.minimize import Energy, Step
-from mover.readers.edits_file import read_edits
-from mover.stages.place_objects import Moment
-from mover.stages.prepare_objects import PrepareConfig, PrepareInputs, prepare_objects, restore
-from mover.terms.contact import Touches
-from mover.terms.depth import DepthMaps
-from mover.types import Layout
-from mover.viewer.layers import contact_points, depth_points, floor_ellipses, space_surface
-from mover.viewer.live import Stopped, Watch, seen_in
-from mover.viewer.numbers import numbers_of
-from mover.viewer.people import cast_of
-from mover.viewer.result import Shown
-from mover.viewer.session import start_session
+from mover.io.capture.edits import Place, read_edits
+from mover.stages.config import PrepareConfig
+from mover.stages.objects.place_inputs import Moment
+from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects, to_objects
 
 INF = float("inf")
 
@@ -74,7 +73,9 @@ class TestLayers:
         points = torch.arange(2 * 4 * 3 * 3).reshape(2, 4, 3, 3).float()
         weight = torch.zeros(2, 4, 3)
         weight[0, 1, 2], weight[1, 0, 0], weight[1, 3, 1] = 5.0, 1.0, 2.0
-        touches = Touches(torch.tensor([2, 0]), points, weight, torch.ones(2), torch.zeros(2, 2))
+        touches = ContactPoints(
+            torch.tensor([2, 0]), points, weight, torch.ones(2), torch.zeros(2, 2)
+        )
         found = contact_points(touches, ("a", "b", "c"))
         assert set(found) == {"a", "c"}
         assert torch.equal(found["c"], points[0, 1, 2][None])
@@ -85,9 +86,9 @@ class TestLayers:
         scene, generator = room(), torch.Generator().manual_seed(1)
         root = torch.tensor([[0.006, 0, 0], [0.002, 0.005, 0], [-0.004, 0.002, 0.01]]).double()
         rings = floor_ellipses(scene, (root @ root.mT).float())
-        assert set(rings) == {p.id for p in scene.pieces}
+        assert set(rings) == {p.id for p in scene.objects}
         pitch, roll = pitch_roll(scene.camera.R_cam_world)
-        piece = scene.pieces[0]
+        piece = scene.objects[0]
         box = box_of(piece)
         base = box.center - torch.tensor([0, 0.5, 0]) * box.size
         ray = to_camera(base, scene.camera.R_cam_world)
@@ -110,7 +111,7 @@ class TestLive:
     def test_shows_each_object_at_its_best_start_as_the_result_would(self):
         scene = room()
         prepared = prepare_objects(
-            PrepareInputs(scene.pieces), PrepareConfig(cells=24, faces=100, samples=50, region=20)
+            PrepareInputs(scene.objects), PrepareConfig(cells=24, faces=100, samples=50, region=20)
         )
         generator = torch.Generator().manual_seed(0)
         layout = Layout(
@@ -119,22 +120,22 @@ class TestLive:
         )  # fmt: skip
         energy = torch.rand(4, 3, generator=generator)
         step = Step("x", 0, 9, Energy({"e": energy}), lambda: Moment(layout, camera(), GROUND))
-        seen = seen_in(step, scene.pieces)
-        for i, piece in enumerate(seen.pieces):
+        seen = seen_in(step, scene.objects)
+        for i, piece in enumerate(seen.objects):
             best = int(energy[:, i].argmin())
             one = Layout(layout.t_world_object[best], layout.yaw[best], layout.log_scale[best])
-            wanted = restore(scene.pieces, prepared, one)[i]
+            wanted = to_objects(scene.objects, prepared, one)[i]
             assert (piece.t_world_object - wanted.t_world_object).abs().max() < 1e-5
             assert (piece.scale - wanted.scale).abs().max() < 1e-6
             assert float(piece.yaw - wanted.yaw) == 0
 
     def test_the_curve_is_the_energy_of_the_rooms_that_are_shown(self, monkeypatch):
         """Of the best starts, over all descents of a stage; a stage between begins it anew."""
-        monkeypatch.setattr("mover.viewer.live.PAUSE", 0.0)
+        monkeypatch.setattr("mover.app.viewer.solve.PAUSE", 0.0)
         scene, drawn = room(), []
-        count = len(scene.pieces)
+        count = len(scene.objects)
         layout = Layout(torch.zeros(2, count, 3), torch.zeros(2, count), torch.zeros(2, count, 3))
-        watch = Watch(scene.pieces, drawn.append, lambda _: None)
+        watch = Watch(scene.objects, drawn.append, lambda _: None)
 
         def descend(*energies: float) -> None:
             for index, energy in enumerate(energies):
@@ -152,7 +153,7 @@ class TestLive:
 
     def test_other_steps_show_nothing_and_a_stop_ends_the_run(self):
         told, drawn = [], []
-        watch = Watch(room().pieces, drawn.append, told.append)
+        watch = Watch(room().objects, drawn.append, told.append)
         watch(Step("select_frames", 0, 1))
         assert (len(told), drawn) == (1, [])
         watch.stop = True
@@ -183,7 +184,7 @@ class TestSession:
         session.delete("sofa_0")
         solved = dataclasses.replace(shown(session.scene), log={"edits": 2})
         session.rebase(solved, 2)
-        assert {p.id for p in session.scene.pieces} == {"chair_0", "table_0", key}
+        assert {p.id for p in session.scene.objects} == {"chair_0", "table_0", key}
         assert session.add("stool", 0, None, (0.5, -2.0)) != key
 
     def test_a_drag_after_a_run_does_not_replace_what_the_run_has_seen(self):
@@ -209,7 +210,7 @@ class TestNumbers:
         log = {"evidence": [{"id": "chair_0", "mask_pixels": 4321, "energy": 0.25}]}
         row = {"id": "chair_0", "initial": {"iou3d": 0.25}, "result": {"iou3d": 0.75}}
         full = dataclasses.replace(shown(), log=log, metrics={"objects": [row]})
-        table = numbers_of(room().pieces[0], room(), full)
+        table = numbers_of(room().objects[0], room(), full)
         for said in ("4,321", "0.250 → 0.750", "50, 90, 50 cm", "17°", "moved since the start"):
             assert said in table
         assert "nan" not in json.dumps(table)

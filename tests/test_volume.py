@@ -8,17 +8,11 @@ import torch
 import trimesh
 from torch import Tensor
 
-from mover.geometry.mesh import is_closed
 from mover.geometry.nearest import nearest_points, to_surface
 from mover.geometry.rotations import axis_angle
-from mover.geometry.volume import (
-    Volume,
-    grid_around,
-    sample,
-    signed_distance,
-    union_bodies,
-)
-from mover.geometry.voxels import winding
+from mover.geometry.topology import is_closed
+from mover.geometry.volume import Volume, grid_around, sample, signed_distance, winding
+from mover.geometry.volume_warp import union_bodies
 
 BODY = Path(__file__).parents[2] / "shared" / "prototypes" / "body" / "body_10kf.npz"
 
@@ -290,3 +284,12 @@ def test_nearest_points_and_distances_are_those_of_naive_loops():
         nearest_points(query, points[:0])
     with pytest.raises(ValueError, match="empty"):
         to_surface(query, verts, faces[:0])
+
+
+def test_a_grid_in_double_precision_is_measured_in_single():
+    verts, faces = moving_spheres(2)
+    grid = grid_around(verts.amin((0, 1)), verts.amax((0, 1)), cells=20)
+    double = Volume(grid.values.double(), grid.origin.double(), grid.cell)
+    found = union_bodies(verts.double(), faces, double).values
+    assert found.dtype == torch.float64
+    assert torch.equal(found, union_bodies(verts, faces, grid).values.double())

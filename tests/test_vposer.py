@@ -8,13 +8,20 @@ import torch
 from make_keypoints import CAMERA, as_bodies, seen, walker
 from torch import nn
 
-from mover.bodies import open_body
-from mover.fitting import FitConfig, FitInputs, fit_bodies, load_vposer, vposer_prior
-from mover.fitting.config import STAGES
+from mover.bodies.skinning import open_body
+from mover.core.errors import InputError
+from mover.fitting.bodies import FitInputs, fit_bodies
+from mover.fitting.config import STAGES, FitConfig
 from mover.fitting.prior import encoded
-from mover.fitting.vposer import decoded, gram_schmidt, nearest_rotations, vectors_of
+from mover.fitting.vposer import (
+    decoded,
+    gram_schmidt,
+    load_vposer,
+    nearest_rotations,
+    vectors_of,
+    vposer_prior,
+)
 from mover.geometry.rotations import axis_angle
-from mover.records import InputError
 
 
 class First(nn.Module):

@@ -9,22 +9,19 @@ from analytic import GROUND, boxes_of, image_at, make_inputs, walls_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mover.energy import HumanCues, SceneConfig, SceneWeights, scene_energy
+from mover.core.records import load, save
+from mover.core.types import Layout
+from mover.energy.config import BatchedBFGS, SceneConfig, SceneWeights
+from mover.energy.objective import HumanCues, of_objects, scene_energy, some_objects
+from mover.energy.terms.bbox import LEAST, SEEN, UNKNOWN
+from mover.energy.terms.wall import ALONG, RHO, Walls, wall_term
 from mover.furniture.library import WALL_PIECES
 from mover.geometry.rotations import wrap
-from mover.minimize_newton import Quasi
-from mover.presets import ROBUST
-from mover.records import load, save
-from mover.stages.coarser import coarser_image
-from mover.stages.line_up import NEAR, STRETCH, TURN, UNSEEN, find_walls, starts_at
-from mover.stages.pinned import Pinned
-from mover.stages.place_inputs import Placed, PlaceInputs, with_walls
-from mover.stages.place_objects import energy_of, place_objects
-from mover.stages.some_objects import some_image, some_objects
-from mover.stages.starts import alone
-from mover.terms.bbox import LEAST, SEEN, UNKNOWN
-from mover.terms.wall import ALONG, RHO, Walls, wall_term
-from mover.types import Layout
+from mover.pipeline.presets import ROBUST
+from mover.stages.objects.place_inputs import Pinned, Placed, PlaceInputs, coarser_image, with_walls
+from mover.stages.objects.place_objects import energy_of, place_objects
+from mover.stages.objects.starts import alone
+from mover.stages.objects.wall_alignment import NEAR, STRETCH, TURN, UNSEEN, find_walls, starts_at
 
 BOTTOM = 3
 WALL = -5.0  # [m], where the rears of the rows below stand
@@ -173,7 +170,7 @@ class TestPrice:
             ]
 
         whole = price(layout, inputs.objects, image)
-        found = price(few, some_objects(inputs.objects, rows), some_image(image, rows % 3))
+        found = price(few, some_objects(inputs.objects, rows), of_objects(image, rows % 3, 3))
         torch.testing.assert_close(found, whole.flatten()[rows])
         assert torch.equal(whole, 2 * wall_term(layout, inputs.objects.size, walls))
         assert coarser_image(image, 2).walls is walls
@@ -365,8 +362,8 @@ def a_hidden_shelf(given_at, size=48):
     return truth, PlaceInputs(objects, camera, GROUND, image, HumanCues(), start, truth.yaw)
 
 
-CONFIG = replace(ROBUST.place, method=Quasi(), shaken=2, rounds=1)
-UNLINED = replace(CONFIG, lined=0)
+CONFIG = replace(ROBUST.place, method=BatchedBFGS(), perturbations=2, perturbation_rounds=1)
+UNLINED = replace(CONFIG, wall_alignment_steps=0)
 
 
 class TestPlacing:

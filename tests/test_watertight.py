@@ -8,11 +8,11 @@ import pytest
 import torch
 import trimesh
 
+from mover.core.types import Mesh
 from mover.geometry import mesh as m
 from mover.geometry.nearest import to_surface
 from mover.geometry.volume import signed_distance
 from mover.geometry.watertight import close_mesh
-from mover.types import Mesh
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 REAL = [

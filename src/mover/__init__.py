@@ -5,22 +5,22 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .pipeline import PRESETS as PRESETS
-    from .pipeline import Config as Config
-    from .pipeline import Run as Run
-    from .pipeline import reconstruct as reconstruct
-    from .readers import read as read
-    from .records import InputError as InputError
-    from .types import Camera as Camera
-    from .types import Capture as Capture
-    from .types import Layout as Layout
-    from .types import Room as Room
-    from .types import Scene as Scene
+    from mover.core.errors import InputError as InputError
+    from mover.core.run import Run as Run
+    from mover.core.types import Camera as Camera
+    from mover.core.types import Capture as Capture
+    from mover.core.types import Layout as Layout
+    from mover.core.types import Room as Room
+    from mover.core.types import Scene as Scene
+    from mover.io.formats import read as read
+    from mover.pipeline.presets import PRESETS as PRESETS
+    from mover.pipeline.presets import Config as Config
+    from mover.pipeline.reconstruct import reconstruct as reconstruct
 
 _HOMES = {
-    "PRESETS": "pipeline", "Config": "pipeline", "Run": "pipeline", "reconstruct": "pipeline",
-    "read": "readers", "InputError": "records", "Camera": "types", "Capture": "types",
-    "Layout": "types", "Room": "types", "Scene": "types",
+    "PRESETS": "pipeline.presets", "Config": "pipeline.presets", "Run": "core.run",
+    "reconstruct": "pipeline.reconstruct", "read": "io.formats", "InputError": "core.errors",
+    **dict.fromkeys(("Camera", "Capture", "Layout", "Room", "Scene"), "core.types"),
 }  # fmt: skip
 
 

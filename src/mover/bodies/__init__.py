@@ -7,21 +7,10 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..records import InputError
-from ..types import BodyPose
-from .skinning import open_body, zero_pose
-from .smpl_files import load_smpl
-from .smpl_model import rest_pose
-
-__all__ = [
-    "BODY_MODELS",
-    "BodyModel",
-    "load_model",
-    "load_smpl",
-    "open_body",
-    "rest_pose",
-    "zero_pose",
-]
+from mover.bodies.skinning import open_body
+from mover.bodies.smpl_files import load_smpl
+from mover.core.errors import InputError
+from mover.core.types import BodyPose
 
 
 @runtime_checkable

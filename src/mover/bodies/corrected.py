@@ -1,4 +1,4 @@
-"""Bodies that are moved a little: as a whole about the pelvis, and by a model joint by joint."""
+"""Bodies that are moved: into the world, as a whole about the pelvis, by a model joint by joint."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -7,13 +7,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..geometry.mesh import vertex_normals
-from ..geometry.rotations import axis_angle
-from ..records import map_tensors, record
-from ..types import Bodies, BodyPose
-from . import BodyModel, load_model
-from .skeleton import BODY
-from .thinned import pose_rows, spread, thinned
+from mover.bodies import BodyModel, load_model
+from mover.bodies.skeleton import BODY
+from mover.bodies.smpl_model import Rows, pose_rows, vertex_subset
+from mover.core.records import map_tensors, record
+from mover.core.types import Bodies, BodyPose, Camera
+from mover.geometry.camera import to_world
+from mover.geometry.mesh import vertex_normals
+from mover.geometry.rotations import axis_angle
 
 LOOSE_POINTS = 16  # vertices that stand for the joints of a body without any
 CHUNK = 64  # bodies posed at once
@@ -64,7 +65,7 @@ def puppet_of(bodies: Bodies, picked: Int[Tensor, " picked"]) -> Puppet:
         return Puppet(None, None, skin, normals, _loose_points(bodies), joints)
     full = load_model(pose.model, pose.gender)
     joints = torch.tensor([full.joint_names.index(n) for n in BODY if n in full.joint_names])
-    model = thinned(full, picked)
+    model = vertex_subset(full, picked)
     with torch.no_grad():
         skin, places = model.posed(pose)
     return Puppet(model, pose, skin, normals, places[:, joints], joints)
@@ -147,3 +148,35 @@ def _new_pose(pose: BodyPose, by: Correction) -> BodyPose:
         body_pose=pose.body_pose + by.angles,
     )  # fmt: skip
     return map_tensors(lambda x: x.detach(), found)
+
+
+def spread(verts: Float[Tensor, "verts 3"], count: int) -> Int[Tensor, " picked"]:
+    """Vertices that lie evenly over a mesh: each next one is the farthest from those before."""
+    count = min(count, len(verts))
+    chosen = torch.zeros(count, dtype=torch.long, device=verts.device)
+    nearest = torch.full_like(verts[:, 0], torch.inf)
+    for k in range(1, count):  # each choice depends on those before it
+        apart = (verts - verts[chosen[k - 1]]).square().sum(-1)
+        nearest = torch.minimum(nearest, apart)
+        chosen[k] = nearest.argmax()
+    return chosen.sort().values
+
+
+def rows_of(bodies: Bodies, rows: Rows) -> Bodies:
+    """Some rows of the bodies."""
+    return dataclasses.replace(
+        bodies, verts=bodies.verts[rows],
+        joints=None if bodies.joints is None else bodies.joints[rows],
+        frame=bodies.frame[rows], person=bodies.person[rows],
+        pose=None if bodies.pose is None else pose_rows(bodies.pose, rows),
+    )  # fmt: skip
+
+
+def in_world(bodies: Bodies, camera: Camera) -> Bodies:
+    """Bodies from camera axes into the world (vertices and joints; parameters stay behind)."""
+    verts, joints = bodies.verts, bodies.joints
+    if bodies.space == "camera":
+        R = camera.R_cam_world.to(verts)
+        verts = to_world(verts, R)
+        joints = None if joints is None else to_world(joints, R.to(joints))
+    return dataclasses.replace(bodies, verts=verts, joints=joints, space="world", pose=None)

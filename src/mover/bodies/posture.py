@@ -1,15 +1,21 @@
-"""How people hold themselves: standing, sitting, lying, leaning back; where sitters face.
+"""How people hold themselves (standing, sitting, lying, leaning back) and what of them touches.
 
 World frame, +y up. People are told apart by track; speeds are taken within a track over real time.
+What touches is told from posture, motion and normals alone: sitting, lying, leaning back, hands at
+rest and still soles. It stands in for POSA, whose weights cannot be shipped, and says nothing about
+what is touched.
 """
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..records import record
-from ..types import Bodies
-from .parts import LANDMARKS, Parts
+from mover.bodies.bone_frames import LANDMARKS
+from mover.bodies.parts import Parts, members
+from mover.bodies.skin import PARTS
+from mover.core.records import record
+from mover.core.types import Bodies
+from mover.geometry.mesh import vertex_normals
 
 LEVEL_THIGH = 37.0  # [degrees] from level, at most, of a sitter's thighs
 UPRIGHT = 35.0  # [degrees] above level, at least, of an upright trunk
@@ -158,3 +164,168 @@ def headings(
     both = _level(facing(places) + knees)
     sitting = postures(bodies, parts, ground).sitting
     return torch.where(sitting[:, None], both, torch.zeros_like(both))
+
+
+FACING = (0.3, 0.7)  # cosine between normal and the direction of touch: never, surely
+RECLINE = (0.12, 0.3)  # [rad] of the trunk behind upright: not leaning, surely leaning
+LAYER = (
+    0.07,
+    0.03,
+)  # [m] from what reaches farthest: a flat surface is not touched, surely touched
+PALM = (0.04, 0.015)  # the same for a hand
+STILL = (0.1, 0.3)  # [m/s] of hands: at rest, surely moving
+STANCE = (0.3, 0.8)  # [m/s] of soles, which tremble more and swing faster
+SURFACE = (0.25, 1.1)  # [m] over the ground: where hands find something to rest on
+LAP = 0.17  # [m] from the middle of the own thigh: a hand there rests on the lap
+LEVEL_ARM = 35.0  # [degrees] from level, at most, of a forearm that rests
+SOLE = (0.03, 0.07)  # [m] over the lowest point of the body: stands on it, surely not
+FLOATS = (0.08, 0.16)  # [m] of that point from the ground: on the floor, surely not
+UNDERSIDE = 0.1  # [m] over the lowest point: where a body that lies on its front or side touches
+
+
+def touching(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies verts"]:
+    """Chance that each vertex touches something.
+
+    Args:
+        bodies: People in the world (+y up).
+        parts: Parts of their mesh.
+        ground: Height of the floor [m].
+
+    Raises:
+        ValueError: If the bodies are not in the world.
+    """
+    if bodies.space != "world":
+        raise ValueError(f"touching: bodies are in space '{bodies.space}', expected 'world'")
+    pose = postures(bodies, parts, ground)
+    places = landmarks(bodies, parts)
+    normals = vertex_normals(bodies.verts, bodies.faces)
+    down = _ramp(-normals[..., 1], *FACING)
+    chance = _sit(bodies, parts, pose, down)
+    trunk = at(places, "neck") - at(places, "hips")
+    chance = torch.maximum(chance, _recline(bodies, parts, pose, facing(places), trunk, normals))
+    chance = torch.maximum(chance, _lie(bodies, parts, pose, down))
+    chance = torch.maximum(chance, _rest_arms(bodies, parts, places, down, ground))
+    return torch.maximum(chance, _stand(bodies, parts, ground))
+
+
+def _ramp(value: Tensor, zero: float, one: float) -> Tensor:
+    """0 up to `zero`, 1 from `one` on, smooth between; `one` may be the smaller."""
+    share = ((value - zero) / (one - zero)).clamp(0, 1)
+    return torch.nan_to_num(share * share * (3 - 2 * share))
+
+
+def _flat(
+    reach: Float[Tensor, "bodies verts"],
+    chance: Float[Tensor, "bodies verts"],
+    layer: tuple[float, float],
+) -> Float[Tensor, "bodies verts"]:
+    """Leave only what lies in the layer that reaches farthest: furniture is flatter than bodies.
+
+    Args:
+        reach: How far each vertex reaches towards the surface [m].
+        chance: Which vertices could touch.
+        layer: Distances from the farthest at which they do not, and surely do [m].
+    """
+    could = torch.where(chance > 0.5, reach, torch.full_like(reach, -torch.inf))
+    farthest = could.topk(min(5, could.shape[1]), dim=1).values[:, -1:]
+    return chance * _ramp(farthest - reach, *layer)
+
+
+def _sit(
+    bodies: Bodies, parts: Parts, pose: Postures, down: Float[Tensor, "bodies verts"]
+) -> Float[Tensor, "bodies verts"]:
+    """Sitting: what faces down of seat and thighs, as far as it is low enough."""
+    part = members(parts, "seat", "left_thigh", "right_thigh")
+    return _flat(-bodies.verts[..., 1], down * part * pose.sitting[:, None], LAYER)
+
+
+def _recline(
+    bodies: Bodies,
+    parts: Parts,
+    pose: Postures,
+    front: Float[Tensor, "bodies 3"],
+    trunk: Float[Tensor, "bodies 3"],
+    normals: Float[Tensor, "bodies verts 3"],
+) -> Float[Tensor, "bodies verts"]:
+    """Leaning back in a seat: what faces backwards of the back and reaches far enough."""
+    behind = _ramp(-torch.einsum("bvi,bi->bv", normals, front), *FACING)
+    lean = _ramp(pose.recline, *RECLINE) * pose.sitting
+    axis = trunk / trunk.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    backward = torch.linalg.cross(axis, torch.linalg.cross(axis, front))
+    backward = torch.nan_to_num(backward / backward.norm(dim=-1, keepdim=True).clamp_min(1e-9))
+    reach = torch.einsum("bvi,bi->bv", bodies.verts, backward)
+    return _flat(reach, behind * members(parts, "back") * lean[:, None], LAYER)
+
+
+def _lie(
+    bodies: Bodies, parts: Parts, pose: Postures, down: Float[Tensor, "bodies verts"]
+) -> Float[Tensor, "bodies verts"]:
+    """Lying on the back: back, seat and thighs; else whatever lies lowest and faces down."""
+    rear = members(parts, "back", "seat", "left_thigh", "right_thigh")
+    spine = members(parts, "back")
+    supine = (down * spine).sum(1) > 0.4 * spine.sum()
+    height = bodies.verts[..., 1]
+    lowest = height < height.amin(1, keepdim=True) + UNDERSIDE
+    region = torch.where(supine[:, None], rear, lowest)
+    return _flat(-height, down * region * pose.lying[:, None], (2 * LAYER[0], 2 * LAYER[1]))
+
+
+def _rest_arms(
+    bodies: Bodies,
+    parts: Parts,
+    places: Float[Tensor, "bodies landmarks 3"],
+    down: Float[Tensor, "bodies verts"],
+    ground: float,
+) -> Float[Tensor, "bodies verts"]:
+    """Hands and forearms at rest on a surface, not on the own lap: what faces down of them."""
+    chance = torch.zeros_like(down)
+    for name in ("left_palm", "right_palm", "left_forearm", "right_forearm"):
+        part = members(parts, name)
+        if not part.any():
+            continue
+        side, _, kind = name.partition("_")
+        middle = bodies.verts[:, part].mean(1)
+        rest = _ramp(speeds(middle[:, None], bodies)[:, 0], STILL[1], STILL[0])
+        height = middle[:, 1] - ground
+        free = (_from_lap(middle, places) > LAP) & (height > SURFACE[0]) & (height < SURFACE[1])
+        if kind == "forearm":
+            arm = at(places, f"{side}_wrist") - at(places, f"{side}_elbow")
+            free = free & (elevation(arm).abs() < LEVEL_ARM)
+        mostly = _ramp(down[:, part].mean(1), 0.2, 0.5)
+        hand = down * part * (rest * free * mostly)[:, None]
+        chance = torch.maximum(chance, _flat(-bodies.verts[..., 1], hand, PALM))
+    return chance
+
+
+def _from_lap(
+    point: Float[Tensor, "bodies 3"], places: Float[Tensor, "bodies landmarks 3"]
+) -> Float[Tensor, " bodies"]:
+    """Distance to the nearer of the own thighs' middle lines [m]."""
+    ways: list[Tensor] = []
+    for side in ("left", "right"):
+        hip, knee = at(places, f"{side}_hip"), at(places, f"{side}_knee")
+        thigh = knee - hip
+        along = ((point - hip) * thigh).sum(-1) / thigh.square().sum(-1).clamp_min(1e-9)
+        nearest = hip + along.clamp(0, 1)[:, None] * thigh
+        ways.append((point - nearest).norm(dim=-1))
+    return torch.minimum(*ways)
+
+
+def _stand(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies verts"]:
+    """Soles: hardly moving, and as low as the body reaches, which is about the ground.
+
+    A body whose depth is wrong floats or sinks by some centimetres: its own lowest point tells
+    which foot carries it, the ground only whether it stands on the floor at all.
+    """
+    height = bodies.verts[..., 1]
+    lowest = height.amin(1, keepdim=True)
+    floor = _ramp((lowest - ground).abs(), FLOATS[1], FLOATS[0])
+    near = _ramp(height - lowest, SOLE[1], SOLE[0]) * floor
+    chance = torch.zeros_like(near)
+    for name in PARTS[:2]:
+        part = members(parts, name)
+        if part.any():
+            middle = bodies.verts[:, part].mean(1, keepdim=True)
+            rest = _ramp(speeds(middle, bodies)[:, 0], STANCE[1], STANCE[0])
+            chance = torch.maximum(chance, near * part * rest[:, None])
+    return chance

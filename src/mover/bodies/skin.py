@@ -1,13 +1,50 @@
-"""Parts of a skinned body, from its weights and from normals and heights in the zero pose."""
+"""Names of the parts of a body that touch things."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..geometry.mesh import vertex_normals
-from .part_names import PARTS
-from .skeleton import FINGERS, SIDES
-from .skinning import SkinnedBody, zero_pose
+from mover.bodies.skeleton import FINGERS, SIDES
+from mover.bodies.skinning import SkinnedBody, zero_pose
+from mover.geometry.mesh import vertex_normals
+
+PARTS = (
+    "left_sole", "right_sole", "seat", "left_thigh", "right_thigh", "back",
+    "left_palm", "right_palm", "left_forearm", "right_forearm",
+)  # fmt: skip
+"""Patches of skin; of thighs and forearms only the undersides."""
+
+
+# Soles of a mesh that is no whole human body: what lies lowest and faces down.
+
+
+HEIGHT = 0.03
+"""A sole is that near the lowest point [heights of the mesh]."""
+
+
+def lowest_soles(
+    meshes: Float[Tensor, "meshes verts 3"],
+    faces: Int[Tensor, "faces 3"],
+    up: Float[Tensor, "3"],
+) -> Int[Tensor, " verts"]:
+    """Index into `PARTS` (a sole) or -1 of each vertex; sides are told apart by place only."""
+    height = meshes @ up
+    low, high = height.amin(1, keepdim=True), height.amax(1, keepdim=True)
+    near = height < low + HEIGHT * (high - low)
+    down = vertex_normals(meshes, faces) @ up < -0.6
+    sole = (near & down).double().mean(0) >= 0.5
+    part = torch.full((meshes.shape[1],), -1)
+    if sole.any():
+        points = meshes[0, sole] - up * (meshes[0, sole] @ up)[:, None]
+        points = points - (points.amax(0) + points.amin(0)) / 2
+        widest = torch.linalg.eigh(points.T @ points).eigenvectors[:, -1]
+        first, second = PARTS.index("left_sole"), PARTS.index("right_sole")
+        part[sole] = torch.where(points @ widest > 0, first, second)
+    return part
+
+
+# Parts of a skinned body, from its weights and from normals and heights in the zero pose.
+
 
 SOLE_HEIGHT = 0.025
 """A sole is that near the lowest point [statures]: 4 cm of an adult."""

@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..geometry.rotations import axis_angle
-from ..records import InputError, record
-from ..types import BodyPose
+from mover.core.errors import InputError
+from mover.core.records import record
+from mover.core.types import BodyPose
+from mover.geometry.rotations import axis_angle
 
-ASSETS = Path(__file__).parents[1] / "assets"
+ASSETS = Path(__file__).parent / "assets"
 
 
 @record

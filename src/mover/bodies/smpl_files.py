@@ -1,17 +1,213 @@
-"""Finds and reads the user's own files of the SMPL family; none is shipped."""
+"""The arrays of a file of the SMPL family, checked, as a body model."""
 
 import os
 import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
-from ..pickles import load_pickle
-from ..records import BROKEN, InputError
-from .smpl_arrays import FACE_KEYS, body_from, keys_of
-from .smpl_model import SmplBody
+from mover.bodies.skeleton import BODY, HANDS, JOINTS, PARENTS
+from mover.bodies.skinning import SkinnedBody
+from mover.bodies.smpl_model import FacePoints, Hands, SmplBody
+from mover.core.errors import InputError
+from mover.core.pickles import load_plain
+from mover.core.records import BROKEN
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What every file of one model has."""
+
+    verts: int
+    joints: tuple[str, ...]
+    hands: bool
+
+
+KINDS = {
+    "smpl": Kind(6890, (*BODY, "left_hand", "right_hand"), False),
+    "smplh": Kind(6890, (*BODY, *HANDS), True),
+    "smplx": Kind(10475, JOINTS, True),
+}
+"""The models of the family by name."""
+NEEDED = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
+HAND_KEYS = ("hands_componentsl", "hands_componentsr", "hands_meanl", "hands_meanr")
+FACE_KEYS = ("lmk_faces_idx", "lmk_bary_coords")
+CORE = 10  # numbers of shape and of expression of SMPL-X in files of version 1.0
+SHAPE_1_1 = 300  # numbers of shape of SMPL-X in files of version 1.1; 100 of expression follow
+
+
+def keys_of(name: str) -> tuple[str, ...]:
+    """The arrays that a file of this model must have."""
+    return (*NEEDED, *(HAND_KEYS if KINDS[name].hands else ()))
+
+
+def body_from(arrays: Mapping[str, Any], name: str, gender: str, file: str) -> SmplBody:
+    """The body model in the arrays of a file.
+
+    Raises:
+        InputError: If an array is missing or does not have the model's shape.
+    """
+    kind = KINDS[name]
+    _check_keys(arrays, name, file)
+    verts, joints = kind.verts, len(kind.joints)
+    _check_size(arrays["v_template"], name, file)
+    template = _numbers(arrays, "v_template", (verts, 3), file)
+    dirs = _numbers(arrays, "shapedirs", (verts, 3, None), file)
+    poses = _numbers(arrays, "posedirs", (verts, 3, 9 * (joints - 1)), file)
+    regressor = _numbers(arrays, "J_regressor", (joints, verts), file)
+    weights = _numbers(arrays, "weights", (verts, joints), file)
+    shape, expression = _split(dirs, name, file)
+    faces = _indices(arrays, "f", (None, 3), verts, file)
+    at_joints = (regressor @ dirs.reshape(verts, -1)).reshape(joints, 3, -1)
+    skin = SkinnedBody(
+        name=name,
+        faces=torch.from_numpy(faces),
+        joint_names=kind.joints,
+        parents=_parents(arrays, name, file),
+        verts=_tensor(template),
+        joints=_tensor(regressor @ template),
+        weights=_tensor(weights),
+        shape_dirs=_tensor(dirs[..., shape]),
+        joint_dirs=_tensor(at_joints[..., shape]),
+        tpose=torch.eye(3).expand(joints, 3, 3).clone(),
+    )
+    return SmplBody(
+        skin=skin,
+        pose_dirs=_tensor(poses.transpose(2, 0, 1)),
+        expression_dirs=_tensor(dirs[..., expression]),
+        expression_joint_dirs=_tensor(at_joints[..., expression]),
+        hands=_hands(arrays, file) if kind.hands else None,
+        face=_face(arrays, faces, file),
+        gender=gender,
+    )
+
+
+def _tensor(value: Array) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(value, np.float32))
+
+
+def _check_keys(arrays: Mapping[str, Any], name: str, file: str) -> None:
+    missing = [key for key in keys_of(name) if key not in arrays]
+    if missing:
+        found = ", ".join(sorted(str(key) for key in arrays)[:30]) or "nothing"
+        raise InputError(
+            f"{file}: field '{missing[0]}' is missing, expected {', '.join(keys_of(name))} "
+            f"for the model '{name}'; found {found}"
+        )
+
+
+def _check_size(template: Any, name: str, file: str) -> None:  # noqa: ANN401
+    """Refuse the mesh of another model.
+
+    Raises:
+        InputError: If it has as many vertices as another model.
+    """
+    found = np.shape(template)
+    others = [other for other, kind in KINDS.items() if found == (kind.verts, 3)]
+    if others and name not in others:
+        raise InputError(
+            f"{file}: field 'v_template' has {found[0]} vertices, those of {' and '.join(others)}, "
+            f"expected {KINDS[name].verts} of '{name}'"
+        )
+
+
+def _plain(value: Any) -> Array:  # noqa: ANN401
+    """A dense array, also of a sparse matrix."""
+    return np.asarray(value.toarray() if hasattr(value, "toarray") else value)
+
+
+def _numbers(
+    arrays: Mapping[str, Any], key: str, shape: tuple[int | None, ...], file: str
+) -> NDArray[np.float64]:
+    """An array of finite numbers of this shape; None stands for any size.
+
+    Raises:
+        InputError: If it is anything else.
+    """
+    value = arrays[key]
+    if tuple(getattr(value, "shape", ())) and not _fits(value.shape, shape):
+        raise InputError(_wrong(file, key, f"shape {tuple(value.shape)}", shape))
+    array = _plain(value)
+    if array.dtype.kind not in "fiu" or not _fits(array.shape, shape):
+        raise InputError(_wrong(file, key, f"shape {array.shape} of {array.dtype}", shape))
+    if not np.isfinite(array).all():
+        raise InputError(_wrong(file, key, "numbers that are not finite", shape))
+    return array.astype(np.float64)
+
+
+def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
+    return len(found) == len(shape) and all(
+        want is None or have == want for have, want in zip(found, shape, strict=True)
+    )
+
+
+def _wrong(file: str, key: str, found: str, shape: tuple[int | None, ...]) -> str:
+    sizes = ", ".join("N" if n is None else str(n) for n in shape)
+    return f"{file}: field '{key}' has {found}, expected finite numbers of shape ({sizes})"
+
+
+def _indices(
+    arrays: Mapping[str, Any], key: str, shape: tuple[int | None, ...], below: int, file: str
+) -> NDArray[np.int64]:
+    value = _numbers(arrays, key, shape, file)
+    if not value.size or value.min() < 0 or value.max() >= below:
+        raise InputError(f"{file}: field '{key}' has odd numbers, expected 0 to {below - 1}")
+    return value.astype(np.int64)
+
+
+def _parents(arrays: Mapping[str, Any], name: str, file: str) -> tuple[int, ...]:
+    """Parents of the joints; the files differ in the number that the root has."""
+    count = len(KINDS[name].joints)
+    table = _numbers(arrays, "kintree_table", (2, count), file)
+    parents = (-1, *(int(p) for p in table[0, 1:]))
+    expected = {"smplx": PARENTS, "smpl": (*PARENTS[:22], 20, 21)}.get(
+        name, (*PARENTS[:22], *(p if p < 22 else p - 3 for p in PARENTS[25:]))
+    )
+    if parents != expected:
+        raise InputError(f"{file}: field 'kintree_table' is not the skeleton of '{name}'")
+    return parents
+
+
+def _split(dirs: NDArray[np.float64], name: str, file: str) -> tuple[slice, slice]:
+    """Which displacements are of the shape and which of the expression."""
+    count = dirs.shape[-1]
+    if name != "smplx":
+        return slice(0, count), slice(0, 0)
+    if count < 2 * CORE:
+        found = f"has {count} components"
+        raise InputError(f"{file}: field 'shapedirs' {found}, expected 20 (v1.0) or 400 (v1.1)")
+    if count < SHAPE_1_1 + 100:
+        return slice(0, CORE), slice(CORE, 2 * CORE)
+    return slice(0, SHAPE_1_1), slice(SHAPE_1_1, count)
+
+
+def _hands(arrays: Mapping[str, Any], file: str) -> Hands:
+    components = [_numbers(arrays, key, (None, 45), file) for key in HAND_KEYS[:2]]
+    mean = [_numbers(arrays, key, (45,), file) for key in HAND_KEYS[2:]]
+    if len(components[0]) != len(components[1]):
+        raise InputError(f"{file}: fields 'hands_componentsl' and 'hands_componentsr' differ")
+    return Hands(_tensor(np.stack(mean)), _tensor(np.stack(components)))
+
+
+def _face(arrays: Mapping[str, Any], faces: NDArray[np.int64], file: str) -> FacePoints | None:
+    """Points of the face where the file has them."""
+    if any(key not in arrays for key in FACE_KEYS):
+        return None
+    index = _indices(arrays, "lmk_faces_idx", (51,), len(faces), file)
+    share = _numbers(arrays, "lmk_bary_coords", (51, 3), file)
+    return FacePoints(torch.from_numpy(faces[index]), _tensor(share))
+
+
+# Finds and reads the user's own files of the SMPL family; none is shipped.
+
 
 FOLDER = "MOVER_BODY_MODELS"
 """Environment variable with the folder of the user's body models."""
@@ -85,7 +281,7 @@ def _read(path: Path, name: str, gender: str, _changed: int) -> SmplBody:
     if path.suffix == ".npz":
         arrays: dict[str, Any] = _npz(path, name)
     else:
-        found = load_pickle(path)
+        found = load_plain(path)
         if not isinstance(found, dict):
             raise InputError(f"{path.name}: is no dictionary, expected a file of '{name}'")
         arrays = {str(key): value for key, value in found.items()}

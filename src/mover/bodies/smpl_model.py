@@ -10,15 +10,16 @@ The mathematics is written from the papers; no file of these models is shipped.
 import dataclasses
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..geometry.rotations import axis_angle
-from ..records import InputError, record
-from ..types import BodyPose
-from .skinning import SkinnedBody, angles_of, shaped, skinned, zero_pose
+from mover.bodies.skinning import SkinnedBody, angles_of, shaped, skinned, zero_pose
+from mover.core.errors import InputError
+from mover.core.records import record
+from mover.core.types import BodyPose
+from mover.geometry.rotations import axis_angle
 
-HANDS = ("left_hand_pose", "right_hand_pose")
+HAND_POSES = ("left_hand_pose", "right_hand_pose")
 FLAT = "flat_hand_mean"
 """Key of `BodyPose.extra`: not zero where hands are turned from flat, not from the mean hand."""
 
@@ -103,6 +104,10 @@ class SmplBody:
         return skinned(self.skin, turns, verts, joints, pose.transl)
 
 
+Model = SkinnedBody | SmplBody
+"""What `mover.bodies.load_model` gives."""
+
+
 def with_full_hands(model: SmplBody, pose: BodyPose) -> BodyPose:
     """The same pose with hands as 45 angles each, the mean hand added; SMPL's palms stay straight.
 
@@ -118,7 +123,7 @@ def with_full_hands(model: SmplBody, pose: BodyPose) -> BodyPose:
     flat = pose.extra.get(FLAT)
     added = 1.0 if flat is None else (flat == 0).to(body).reshape(-1, 1)
     full: dict[str, Tensor] = {}
-    for side, name in enumerate(HANDS):
+    for side, name in enumerate(HAND_POSES):
         given = pose.extra.get(name)
         angles = body.new_zeros(bodies, 45) if given is None else given
         if angles.shape[-1] != 45:
@@ -142,9 +147,49 @@ def skin_of_model(model: object) -> SkinnedBody | None:
             return None
 
 
-def rest_pose(bodies: int, model: SkinnedBody | SmplBody) -> BodyPose:
+def rest_pose(bodies: int, model: Model) -> BodyPose:
     """So many people of the mean shape (ten numbers) in the zero pose, `transl` zero."""
     if isinstance(model, SkinnedBody):
         return zero_pose(bodies, model)
     zero = zero_pose(bodies, model.skin)
     return dataclasses.replace(zero, gender=model.gender, betas=zero.betas[:, :10].clone())
+
+
+def vertex_subset(model: object, index: Int[Tensor, " picked"]) -> Model:
+    """The model with these vertices only, and without faces; its joints and poses are the same.
+
+    Raises:
+        ValueError: If it is no skinned model.
+    """
+    match model:
+        case SkinnedBody():
+            return _skin(model, index)
+        case SmplBody():
+            return dataclasses.replace(
+                model, skin=_skin(model.skin, index), pose_dirs=model.pose_dirs[:, index],
+                expression_dirs=model.expression_dirs[index], face=None,
+            )  # fmt: skip
+        case _:
+            raise ValueError(
+                f"vertex_subset: {type(model).__name__} is none of the skinned body models"
+            )
+
+
+def _skin(model: SkinnedBody, index: Int[Tensor, " picked"]) -> SkinnedBody:
+    return dataclasses.replace(
+        model, faces=model.faces[:0], verts=model.verts[index], weights=model.weights[index],
+        shape_dirs=model.shape_dirs[index],
+    )  # fmt: skip
+
+
+Rows = Int[Tensor, " rows"] | Bool[Tensor, " rows"]
+"""Numbers of rows, or which are kept."""
+
+
+def pose_rows(pose: BodyPose, rows: Rows) -> BodyPose:
+    """Some rows of parameters."""
+    return dataclasses.replace(
+        pose, betas=pose.betas[rows], global_orient=pose.global_orient[rows],
+        body_pose=pose.body_pose[rows], transl=pose.transl[rows],
+        extra={name: value[rows] for name, value in pose.extra.items()},
+    )  # fmt: skip

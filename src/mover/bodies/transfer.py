@@ -17,14 +17,79 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..records import record
-from ..types import BodyPose
-from .correspondence import Pairs, pairs_of, thinned
-from .skinning import SkinnedBody, widths_of
-from .smpl_model import FLAT, HANDS, SmplBody, skin_of_model, with_full_hands
-from .transfer_matrix import TransferMatrix
+from mover.bodies.keypoints import marks_of
+from mover.bodies.skeleton import BODY, HANDS
+from mover.bodies.skinning import SkinnedBody, widths_of
+from mover.bodies.smpl_model import (
+    FLAT,
+    HAND_POSES,
+    Model,
+    SmplBody,
+    skin_of_model,
+    vertex_subset,
+    with_full_hands,
+)
+from mover.bodies.transfer_matrix import TransferMatrix
+from mover.core.records import record
+from mover.core.types import BodyPose
 
-Model = SkinnedBody | SmplBody
+SAMPLED = 1200
+"""Vertices that stand for a whole mesh."""
+
+
+@record
+class Pairs:
+    """Corresponding points: joints first, then vertices."""
+
+    source_joints: Int[Tensor, " joints"]
+    target_joints: Int[Tensor, " joints"]
+    source: Int[Tensor, " source_verts"]
+    target: Int[Tensor, " target_verts"]
+    mix: Float[Tensor, "target_verts source_verts"] | None
+    """Share of each of the source's vertices in the points; None: one to one."""
+
+
+def pairs_of(source: Model, target: Model, matrix: TransferMatrix | None = None) -> Pairs:
+    """Corresponding points of two models.
+
+    Vertices where the meshes are the same or a matrix is given, else joints and points by name.
+
+    Raises:
+        ValueError: If the matrix is not for these models.
+    """
+    first, second = skin_of_model(source), skin_of_model(target)
+    assert first is not None
+    assert second is not None
+    none = torch.zeros(0, dtype=torch.long)
+    if matrix is not None:
+        counts = (len(second.verts), len(first.verts))
+        if matrix.shape != counts:
+            raise ValueError(f"the matrix is {matrix.shape}, the models have {counts} vertices")
+        rows = spread(matrix.valid)
+        columns, mix = matrix.rows(rows)
+        return Pairs(none, none, columns, rows, mix)
+    if torch.equal(first.faces, second.faces):
+        rows = spread(torch.arange(len(first.verts)))
+        return Pairs(none, none, rows, rows, None)
+    names = [n for n in (*BODY, *HANDS) if n in first.joint_names and n in second.joint_names]
+    marks = marks_of(first), marks_of(second)
+    both = sorted(set(marks[0]) & set(marks[1]))
+    return Pairs(
+        torch.tensor([first.joint_names.index(n) for n in names]),
+        torch.tensor([second.joint_names.index(n) for n in names]),
+        torch.tensor([marks[0][n] for n in both]),
+        torch.tensor([marks[1][n] for n in both]),
+        None,
+    )
+
+
+def spread(rows: Int[Tensor, " rows"]) -> Int[Tensor, " some"]:
+    """At most `SAMPLED` of these, evenly."""
+    if len(rows) <= SAMPLED:
+        return rows
+    return rows[torch.linspace(0, len(rows) - 1, SAMPLED).round().long()]
+
+
 SHAPES = 10
 """Numbers of shape that are solved."""
 
@@ -87,7 +152,7 @@ def transfer(
     goal = _goal(pose, source, pairs)
     person = torch.unique(pose.betas, dim=0, return_inverse=True)[1]
     copied = copy_pose(pose, source, target)
-    small = thinned(target, pairs.target)
+    small = vertex_subset(target, pairs.target)
     sigma = config.sigma_joint if len(pairs.source_joints) else config.sigma_vertex
 
     def points(at: Unknowns) -> Float[Tensor, "bodies points 3"]:
@@ -126,7 +191,7 @@ def copy_pose(pose: BodyPose, source: Model, target: Model) -> BodyPose:
     body = torch.cat([body, body.new_zeros(len(body), widths["body_pose"] - 63)], -1)
     wanted = {*widths} | ({"expression"} if source.name == target.name else set())
     extra = {name: value for name, value in full.extra.items() if name in wanted}
-    if any(name in extra for name in HANDS):
+    if any(name in extra for name in HAND_POSES):
         extra[FLAT] = body.new_ones(len(body), 1)
     shapes = min(SHAPES, _skin(target).shape_dirs.shape[-1])
     gender = target.gender if isinstance(target, SmplBody) else "neutral"
@@ -145,7 +210,7 @@ def _skin(model: Model) -> SkinnedBody:
 def _goal(pose: BodyPose, source: Model, pairs: Pairs) -> Float[Tensor, "bodies points 3"]:
     """Where the points of the source are [m]."""
     with torch.no_grad():
-        verts, joints = thinned(source, pairs.source).posed(pose)
+        verts, joints = vertex_subset(source, pairs.source).posed(pose)
     if pairs.mix is not None:
         verts = torch.einsum("kv,bvi->bki", pairs.mix.to(verts), verts)
     return torch.cat([joints[:, pairs.source_joints], verts], 1)

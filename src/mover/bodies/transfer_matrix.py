@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..pickles import load_pickle
-from ..records import BROKEN, InputError, record
-from .smpl_arrays import KINDS
-from .smpl_files import FOLDER
+from mover.bodies.smpl_files import FOLDER, KINDS
+from mover.core.errors import InputError
+from mover.core.pickles import load_plain
+from mover.core.records import BROKEN, record
 
 
 @record
@@ -66,7 +66,7 @@ def read_matrix(path: Path, source: str, target: str) -> TransferMatrix:
     """
     from scipy import sparse
 
-    found: Any = load_pickle(path)
+    found: Any = load_plain(path)
     keys = list(found) if isinstance(found, dict) else []
     key = next((k for k in ("mtx", "matrix") if k in keys), None)
     if key is None:

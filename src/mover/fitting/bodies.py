@@ -7,22 +7,41 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..bodies.correspondence import Model
-from ..bodies.keypoints import LAYOUTS
-from ..minimize import Energy, Observer, Step, silent
-from ..records import record
-from ..types import Bodies, Camera, Keypoints
-from .config import FitConfig
-from .energy import Seen, Weighed, body_energy
-from .finish import bodies_of, miss_of, pose_of
-from .gather import at_stage, rows_of, seen_at_all, seen_of, usable_rows
-from .given import begin_from
-from .prior import ANGLES, PosePrior, encoded
-from .rig import Rig, rig_of
-from .solve import EVERYTHING, solve
-from .start import Begun, begin
-from .unknowns import HAND, Frame, Unknowns
-from .windows import Window, rows_at, windows_of
+from mover.bodies import BodyModel
+from mover.bodies.keypoints import LAYOUTS
+from mover.bodies.skinning import shaped, widths_of
+from mover.bodies.smpl_model import FLAT, Model, SmplBody, pose_rows, skin_of_model
+from mover.core.observe import Energy, Observer, Step, silent
+from mover.core.records import record
+from mover.core.types import Bodies, BodyPose, Camera, Keypoints
+from mover.fitting.config import FitConfig
+from mover.fitting.energy import Seen, Weighed, body_energy
+from mover.fitting.given import begin_from
+from mover.fitting.prior import ANGLES, PosePrior, encoded
+from mover.fitting.rig import Rig, rig_of
+from mover.fitting.start import Begun, begin
+from mover.fitting.tracks import (
+    Window,
+    at_stage,
+    rows_at,
+    rows_of,
+    seen_at_all,
+    seen_of,
+    usable_rows,
+    windows_of,
+)
+from mover.fitting.unknowns import (
+    EVERYTHING,
+    HAND,
+    Frame,
+    Unknowns,
+    hand_angles,
+    pelvis_of,
+    points_of,
+    solve,
+    turns_of,
+)
+from mover.geometry.camera import project
 
 SHAPES = 10
 EXPRESSION = 10
@@ -167,3 +186,78 @@ def _stages(
 def _extremities(job: _Job) -> bool:
     """Whether hands or faces are seen."""
     return any("index" in name or name.startswith("face_") for name in job.names)
+
+
+# What was solved, as bodies.
+
+
+CHUNK = 128  # rows that are posed at once
+
+
+def pose_of(at: Unknowns, frame: Frame, model: Model, prior: PosePrior) -> BodyPose:
+    """Parameters of the fitted bodies."""
+    angles = prior.decode(at.code)
+    skin = skin_of_model(model)
+    assert skin is not None
+    width = widths_of(skin)["body_pose"]
+    body = torch.cat([angles, angles.new_zeros(len(angles), width - angles.shape[1])], -1)
+    betas = at.betas[frame.person]
+    rest = shaped(skin, betas)[1][:, 0]
+    extra: dict[str, Tensor] = {}
+    if at.face.shape[1]:
+        extra = {"jaw_pose": at.face[:, :3], "expression": at.face[:, 3:]}
+    if at.face.shape[1] and isinstance(model, SmplBody):
+        count = at.face.shape[1] - 3
+        dirs = model.expression_joint_dirs[0, :, :count].to(rest)
+        rest = rest + at.face[:, 3:] @ dirs.mT
+    if at.hands.shape[1]:
+        extra["left_hand_pose"], extra["right_hand_pose"] = (
+            hand_angles(frame.rig, at.hands, side) for side in (0, 1)
+        )
+        extra[FLAT] = body.new_ones(len(body), 1)
+    return BodyPose(
+        model=model.name,
+        gender=model.gender if isinstance(model, SmplBody) else "neutral",
+        betas=betas,
+        global_orient=_vectors(turns_of(at, frame, angles)[:, 0]),
+        body_pose=body,
+        transl=pelvis_of(at) - rest,
+        extra=extra,
+    )
+
+
+def _vectors(turns: Float[Tensor, "bodies 3 3"]) -> Float[Tensor, "bodies 3"]:
+    """Axis-angle vectors of rotations [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    vectors = Rotation.from_matrix(turns.detach().double().cpu().numpy()).as_rotvec()
+    return torch.from_numpy(vectors).to(turns)
+
+
+def bodies_of(pose: BodyPose, model: BodyModel, keypoints: Keypoints) -> Bodies:
+    """Meshes and joints, in the camera frame."""
+    with torch.no_grad():
+        parts = [
+            model.posed(pose_rows(pose, rows))
+            for rows in torch.arange(len(pose.transl)).split(CHUNK)
+        ]
+    return Bodies(
+        verts=torch.cat([verts for verts, _ in parts]),
+        faces=model.faces,
+        joints=torch.cat([joints for _, joints in parts]),
+        joint_names=model.joint_names,
+        frame=keypoints.frame,
+        person=keypoints.person,
+        fps=keypoints.fps,
+        space="camera",
+        pose=pose,
+    )
+
+
+def miss_of(at: Unknowns, frame: Frame, seen: Seen, prior: PosePrior) -> Float[Tensor, " bodies"]:
+    """Root mean square distance of the keypoints that are seen from their projections [px]."""
+    with torch.no_grad():
+        pixels = project(points_of(at, frame, prior.decode).keypoints, seen.K)
+    there = (seen.weight > 0).to(pixels)
+    squared = (pixels - seen.pixels).square().sum(-1) * there
+    return (squared.sum(1) / there.sum(1).clamp_min(1)).sqrt()

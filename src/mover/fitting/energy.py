@@ -18,13 +18,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..geometry.camera import project
-from ..minimize import Energy, weigh
-from ..records import record
-from .config import FitConfig, Stage
-from .limits import limit_price
-from .rig import Points
-from .unknowns import Decode, Frame, Unknowns, points_of
+from mover.core.observe import Energy
+from mover.core.records import record
+from mover.energy.minimize import weigh
+from mover.fitting.config import FitConfig, Stage, limit_price
+from mover.fitting.rig import Points
+from mover.fitting.unknowns import Decode, Frame, Unknowns, points_of
+from mover.geometry.camera import project
 
 LIFTED = 10.0  # weight of joints that are known in 3D
 HEIGHT = 1000.0  # [px], the image height at which the published weights were chosen

@@ -1,4 +1,4 @@
-"""Where a fit begins that is given bodies of another tool: their pose, under the true camera."""
+"""Which given body is which person of the keypoints."""
 
 import dataclasses
 import math
@@ -7,23 +7,88 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..bodies import load_model
-from ..bodies.keypoints import LAYOUTS
-from ..bodies.skeleton import BODY
-from ..bodies.smpl_model import skin_of_model
-from ..bodies.transfer import copy_pose
-from ..geometry.rotations import axis_angle
-from ..records import InputError
-from ..types import Bodies, Keypoints
-from .config import FitConfig, Stage
-from .energy import Seen, Weighed, body_energy
-from .limits import resting
-from .pairing import start_rows
-from .prior import same
-from .rig import Rig
-from .solve import solve
-from .start import BEFORE, Begun, chosen, placed, torso_first, unknowns_at
-from .unknowns import Frame, place_of, points_of
+from mover.bodies import load_model
+from mover.bodies.keypoints import LAYOUTS
+from mover.bodies.skeleton import BODY
+from mover.bodies.smpl_model import skin_of_model
+from mover.bodies.transfer import copy_pose
+from mover.core.errors import InputError
+from mover.core.types import Bodies, Keypoints
+from mover.fitting.config import FitConfig, Stage, resting
+from mover.fitting.energy import Seen, Weighed, body_energy
+from mover.fitting.prior import same
+from mover.fitting.rig import Rig
+from mover.fitting.start import BEFORE, Begun, chosen, placed, torso_first, unknowns_at
+from mover.fitting.unknowns import Frame, place_of, points_of, solve
+from mover.geometry.camera import project
+from mover.geometry.rotations import axis_angle
+
+Boxes = dict[int, dict[int, Tensor]]
+
+
+def start_rows(
+    start: Bodies, keypoints: Keypoints, K: Float[Tensor, "3 3"]
+) -> Int[Tensor, " rows"]:
+    """The row of `start` for each row of the keypoints: the same person, the nearest frame.
+
+    People are paired by where they are in the image.
+
+    Raises:
+        InputError: If a person of the keypoints has no body.
+    """
+    pairs = _pairs(start, keypoints, K)
+    found = torch.zeros(len(keypoints.frame), dtype=torch.long)
+    for row, (frame, person) in enumerate(
+        zip(keypoints.frame.tolist(), keypoints.person.tolist(), strict=True)
+    ):
+        if person not in pairs:
+            raise InputError(
+                f"bodies to start from: there is none for person {person} of the keypoints "
+                f"(there are tracks {sorted(set(start.person.tolist()))})"
+            )
+        own = torch.nonzero(start.person == pairs[person])[:, 0]
+        found[row] = own[(start.frame[own] - frame).abs().argmin()]
+    return found
+
+
+def _pairs(start: Bodies, keypoints: Keypoints, K: Float[Tensor, "3 3"]) -> dict[int, int]:
+    """For each person of the keypoints, the track of the bodies that lies nearest."""
+    from scipy.optimize import linear_sum_assignment
+
+    points = start.joints if start.joints is not None else start.verts[:, ::50]
+    theirs = _middles(project(points, K.to(points)), start.frame, start.person)
+    seen = keypoints.points.where(keypoints.confidence[..., None] > 0, torch.nan)
+    ours = _middles(seen, keypoints.frame, keypoints.person)
+    people, tracks = sorted(ours), sorted(theirs)
+    cost = torch.tensor([[_apart(ours[p], theirs[t]) for t in tracks] for p in people])
+    rows, columns = linear_sum_assignment(cost.clamp_max(1e6).numpy())
+    return {people[r]: tracks[c] for r, c in zip(rows, columns, strict=True)}
+
+
+def _middles(
+    pixels: Float[Tensor, "rows points 2"],
+    frame: Int[Tensor, " rows"],
+    person: Int[Tensor, " rows"],
+) -> Boxes:
+    """Middle of each person in each frame [px]."""
+    found: Boxes = {}
+    middle = pixels.nanmean(1)
+    for row, (f, p) in enumerate(zip(frame.tolist(), person.tolist(), strict=True)):
+        found.setdefault(p, {})[f] = middle[row]
+    return found
+
+
+def _apart(ours: dict[int, Tensor], theirs: dict[int, Tensor]) -> float:
+    """Mean distance in the frames that both have [px]; large where there is none."""
+    shared = [f for f in ours if f in theirs]
+    if not shared:
+        return 1e6
+    far = torch.stack([(ours[f] - theirs[f]).norm() for f in shared])
+    return float(far.nan_to_num(1e6).mean())
+
+
+# Where a fit begins that is given bodies of another tool: their pose, under the true camera.
+
 
 TRUNK = ("pelvis", "left_hip", "right_hip", "neck", "left_shoulder", "right_shoulder")
 LIFTED = Stage(pose=1.0, shape=100.0, smooth=0.0, steps=60)

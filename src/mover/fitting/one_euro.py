@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..types import Bodies, Keypoints
-from .tracks import tracks_of
+from mover.core.types import Bodies, Keypoints
+from mover.fitting.tracks import tracks_of
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from ..geometry.rotations import axis_angle
-from ..minimize import Energy
-from .solve import lowered
+from mover.core.observe import Energy
+from mover.fitting.unknowns import lowered
+from mover.geometry.rotations import axis_angle
 
 Decode = Callable[[Float[Tensor, "bodies code"]], Float[Tensor, "bodies angles"]]
 ENCODING_STEPS = 100

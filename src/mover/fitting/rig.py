@@ -10,12 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..bodies.correspondence import Model, thinned
-from ..bodies.keypoints import LAYOUTS, spots_of
-from ..bodies.skeleton import BODY
-from ..bodies.skinning import SkinnedBody, shaped
-from ..bodies.smpl_model import SmplBody, skin_of_model
-from ..records import record
+from mover.bodies.keypoints import LAYOUTS, spots_of
+from mover.bodies.skeleton import BODY
+from mover.bodies.skinning import SkinnedBody, shaped
+from mover.bodies.smpl_model import Model, SmplBody, skin_of_model, vertex_subset
+from mover.core.records import record
 
 
 @record
@@ -57,7 +56,7 @@ def rig_of(model: Model, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
     index = torch.nonzero(used.cpu() & spots.there)[:, 0]
     vertex, share, joint = spots.vertex[index], spots.share[index], spots.joint[index]
     needed = torch.unique(vertex[joint < 0])
-    small = thinned(model, needed)
+    small = vertex_subset(model, needed)
     names = [LAYOUTS[layout][k] for k in index.tolist()]
     if isinstance(small, SkinnedBody) and all(n in BODY or _on_body(n) for n in names):
         small = _cut(small, len(BODY))

@@ -13,18 +13,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..bodies.keypoints import LAYOUTS
-from ..bodies.skeleton import BODY
-from ..geometry.rotations import rot_x, rot_y, rot_z
-from ..records import record
-from ..types import Camera, Keypoints
-from .config import FitConfig, Stage
-from .energy import Seen, Weighed, body_energy
-from .limits import resting
-from .rig import Rig
-from .solve import solve
-from .tracks import best_path, every_so_often, tracks_of
-from .unknowns import Frame, Unknowns, place_of, points_of
+from mover.bodies.keypoints import LAYOUTS
+from mover.bodies.skeleton import BODY
+from mover.core.records import record
+from mover.core.types import Camera, Keypoints
+from mover.fitting.config import FitConfig, Stage, resting
+from mover.fitting.energy import Seen, Weighed, body_energy
+from mover.fitting.rig import Rig
+from mover.fitting.tracks import best_path, every_so_often, tracks_of
+from mover.fitting.unknowns import Frame, Unknowns, place_of, points_of, solve
+from mover.geometry.rotations import rot_x, rot_y, rot_z
 
 YAWS = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)
 ROLLS = (0.0,)

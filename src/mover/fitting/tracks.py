@@ -1,11 +1,77 @@
-"""Rows of the same person in the order of time."""
+"""Which keypoints count, rows in the order of time, and stretches of a long video."""
+
+import dataclasses
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .config import FitConfig
-from .energy import Triples
+from mover.bodies.keypoints import LAYOUTS
+from mover.core.errors import InputError
+from mover.core.records import record
+from mover.core.types import Camera, Keypoints
+from mover.fitting.config import FitConfig, Stage, resting, spreads
+from mover.fitting.energy import Seen, Triples
+from mover.fitting.rig import Rig
+from mover.fitting.unknowns import Frame, Unknowns
+
+MARGIN = 20  # rows of its neighbours that a stretch solves as well, at most
+
+
+@record
+class Window:
+    """Rows that are solved together, with their neighbours in time."""
+
+    rows: Int[Tensor, " rows"]
+    keep: Bool[Tensor, " rows"]
+    """Rows that are taken from this window; its neighbours have the others."""
+    frame: Int[Tensor, " rows"]
+    person: Int[Tensor, " rows"]
+    fps: float | None
+
+
+def windows_of(keypoints: Keypoints, config: FitConfig) -> list[Window]:
+    """One window of all rows; or first some rows of the whole video, and then its stretches."""
+    count = len(keypoints.frame)
+    order = torch.argsort(keypoints.frame, stable=True)
+    if count <= config.chunk:
+        return [_window(order, torch.ones(count, dtype=torch.bool), keypoints)]
+    spread = torch.linspace(0, count - 1, config.chunk // 2).round().long().unique()
+    found = [_window(order[spread], torch.ones(len(spread), dtype=torch.bool), keypoints)]
+    margin = min(MARGIN, config.chunk // 4)
+    inner = max(1, config.chunk - 2 * margin)
+    for first in range(0, count, inner):
+        low, high = max(0, first - margin), min(count, first + inner + margin)
+        place = torch.arange(low, high)
+        keep = (place >= first) & (place < first + inner)
+        found.append(_window(order[low:high], keep, keypoints))
+    return found
+
+
+def _window(rows: Tensor, keep: Tensor, keypoints: Keypoints) -> Window:
+    return Window(rows, keep, keypoints.frame[rows], keypoints.person[rows], keypoints.fps)
+
+
+def rows_at(
+    at: Unknowns, frame: Frame, seen: Seen, window: Window, config: FitConfig
+) -> tuple[Unknowns, Frame, Seen]:
+    """The rows of a window."""
+    rows = window.rows
+    fields = {n: getattr(at, n)[rows] for n in ("turn", "code", "place", "hands", "face")}
+    triples = triples_of(window.frame, window.person, window.fps, config)
+    part = dataclasses.replace(
+        seen,
+        pixels=seen.pixels[rows],
+        weight=seen.weight[rows],
+        triples=triples,
+        centre=seen.centre[rows],
+        joints=None if seen.joints is None else seen.joints[rows],
+    )
+    small = Frame(frame.rig, frame.root[rows], frame.person[rows])
+    return dataclasses.replace(at, **fields), small, part
+
+
+# Rows of the same person in the order of time.
 
 
 def tracks_of(
@@ -71,3 +137,93 @@ def best_path(
     for origin in reversed(came):
         path.append(int(origin[path[-1]]))
     return torch.tensor(path[::-1])
+
+
+# Which keypoints count, and how much.
+
+
+LOOSE = ("neck", "left_hip", "right_hip", "pelvis")
+HAND = ("index", "middle", "ring", "pinky", "thumb")
+
+
+def kind_of(name: str) -> str:
+    """`body`, `hand` or `face`: whose weight a keypoint has."""
+    if name.startswith("face_"):
+        return "face"
+    return "hand" if any(part in name for part in HAND) else "body"
+
+
+def confidence_of(keypoints: Keypoints, config: FitConfig) -> Float[Tensor, "rows layout"]:
+    """Confidence of keypoints, 0 where they are missing, not finite, or doubtful."""
+    sure = keypoints.confidence.nan_to_num(0).clamp(0, 1)
+    there = keypoints.points.isfinite().all(-1) & (sure >= config.least_confidence)
+    factor = [config.loose if n in LOOSE else 1.0 for n in LAYOUTS[keypoints.layout]]
+    # A hand that is written twice (as wrist of the body and of the hand) counts twice.
+    return torch.where(there, sure, torch.zeros_like(sure)) * sure.new_tensor(factor)
+
+
+def usable_rows(
+    keypoints: Keypoints, config: FitConfig
+) -> tuple[Int[Tensor, " some"], tuple[str, ...]]:
+    """Rows with enough keypoints of the body, and a warning where others are left out.
+
+    Raises:
+        InputError: If there is none.
+    """
+    body = torch.tensor([kind_of(name) == "body" for name in LAYOUTS[keypoints.layout]])
+    count = ((confidence_of(keypoints, config) > 0) & body).sum(1)
+    rows = torch.nonzero(count >= config.least_joints)[:, 0]
+    if not len(rows):
+        found = f"{len(count)} rows with at most {int(count.max()) if len(count) else 0}"
+        raise InputError(
+            f"keypoints: {found} joints of the body, expected a row with {config.least_joints}"
+        )
+    left = len(count) - len(rows)
+    text = f"{left} of {len(count)} rows have fewer than {config.least_joints} joints: left out"
+    return rows, (text,) if left else ()
+
+
+def rows_of(keypoints: Keypoints, rows: Int[Tensor, " some"]) -> Keypoints:
+    """Some rows."""
+    return dataclasses.replace(
+        keypoints, points=keypoints.points[rows], confidence=keypoints.confidence[rows],
+        frame=keypoints.frame[rows], person=keypoints.person[rows],
+    )  # fmt: skip
+
+
+def seen_at_all(keypoints: Keypoints, config: FitConfig) -> Bool[Tensor, " layout"]:
+    """Keypoints that some row sees and some stage looks at."""
+    stages = config.stages
+    wanted = {
+        "body": True,
+        "hand": any(stage.hand_joints > 0 for stage in stages),
+        "face": any(stage.face_joints > 0 for stage in stages),
+    }
+    looked_at = torch.tensor([wanted[kind_of(n)] for n in LAYOUTS[keypoints.layout]])
+    return (confidence_of(keypoints, config) > 0).any(0) & looked_at
+
+
+def seen_of(keypoints: Keypoints, rig: Rig, camera: Camera, config: FitConfig) -> Seen:
+    """What the fit looks at."""
+    weight = confidence_of(keypoints, config)[:, rig.keypoints]
+    pixels = keypoints.points[:, rig.keypoints]
+    return Seen(
+        pixels=torch.where(weight[..., None] > 0, pixels, torch.zeros_like(pixels)),
+        weight=weight,
+        K=camera.K.to(pixels),
+        height=camera.height,
+        up=camera.R_cam_world[:, 1].to(pixels),
+        floor=None,
+        triples=triples_of(keypoints.frame, keypoints.person, keypoints.fps, config),
+        centre=resting(len(weight), pixels),
+        spread=spreads(pixels),
+        joints=None,
+    )
+
+
+def at_stage(seen: Seen, names: list[str], stage: Stage) -> Seen:
+    """The same with the weights that hands and face have in a stage."""
+    factor = {"body": 1.0, "hand": stage.hand_joints, "face": stage.face_joints}
+    return dataclasses.replace(
+        seen, weight=seen.weight * seen.weight.new_tensor([factor[kind_of(n)] for n in names])
+    )

@@ -17,8 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..records import BROKEN, InputError, record
-from .prior import PosePrior
+from mover.core.errors import InputError
+from mover.core.records import BROKEN, record
+from mover.fitting.prior import PosePrior
 
 BODY_JOINTS = 21
 SLOPES = {"v1": 0.2, "v2": 0.01, "arrays": 0.0}

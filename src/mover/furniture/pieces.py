@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ..records import record
-from ..types import Mesh
+from mover.core.records import record
+from mover.core.types import Mesh
 
 Part = Float[np.ndarray, "_ 3"]
 Span = tuple[float, float]

@@ -4,7 +4,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from .pieces import Furniture, Part, block, disc, draw, finish, legs, post, rod, turned
+from mover.furniture.pieces import (
+    Furniture,
+    Part,
+    block,
+    disc,
+    draw,
+    finish,
+    legs,
+    post,
+    rod,
+    turned,
+)
 
 
 def table(rng: np.random.Generator, style: int) -> Furniture:

@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..records import record
-from ..types import Piece
-from .mesh import box, used
-from .rotations import rot_y
+from mover.core.records import record
+from mover.core.types import SceneObject
+from mover.geometry.mesh import box, used
+from mover.geometry.rotations import rot_y
 
 
 @record
@@ -22,7 +22,7 @@ class Box:
     """Right-handed rotation about +y [rad]."""
 
 
-def box_of(piece: Piece) -> Box:
+def box_of(piece: SceneObject) -> Box:
     """The placed box of a piece: of the vertices that its faces use, in the mesh's own axes."""
     low, high = box(used(piece.mesh).verts)
     center = rot_y(piece.yaw) @ (piece.scale * (low + high) / 2) + piece.t_world_object

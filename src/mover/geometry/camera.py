@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..constants import constant
-from .rotations import rot_x, rot_y, rot_z
+from mover.core.devices import constant
+from mover.geometry.rotations import rot_x, rot_y, rot_z
 
 NEAR = 0.05  # [m], nothing nearer than this is drawn
 

@@ -4,12 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .raster import Views
+from mover.geometry.raster import Crops
 
 
 def crop_views(
     K: Float[Tensor, "3 3"], boxes: Float[Tensor, "items 4"], margin: float, size: int
-) -> Views:
+) -> Crops:
     """One square window around each box.
 
     Args:
@@ -24,10 +24,10 @@ def crop_views(
     crop = K.expand(len(boxes), 3, 3).clone()
     crop[:, :2, 2] -= center - side.unsqueeze(-1) / 2
     crop[:, :2] *= zoom[:, None, None]
-    return Views(crop, size, size)
+    return Crops(crop, size, size)
 
 
-def grid_in_image(views: Views, K: Float[Tensor, "3 3"]) -> tuple[Tensor, Tensor]:
+def grid_in_image(views: Crops, K: Float[Tensor, "3 3"]) -> tuple[Tensor, Tensor]:
     """Image coordinates [px] of the lines between window pixels: x (items, w+1), y (items, h+1)."""
     zoom = views.K[:, 0, 0] / K[0, 0]
     corner = K[:2, 2] - views.K[:, :2, 2] / zoom.unsqueeze(-1)
@@ -37,7 +37,7 @@ def grid_in_image(views: Views, K: Float[Tensor, "3 3"]) -> tuple[Tensor, Tensor
 
 
 def area_mean(
-    images: Float[Tensor, "items h w"], views: Views, K: Float[Tensor, "3 3"]
+    images: Float[Tensor, "items h w"], views: Crops, K: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "items wh ww"]:
     """Exact mean of each image over each pixel of its window; zero outside the image."""
     height, width = images.shape[-2:]
@@ -60,7 +60,7 @@ def _between(
 
 
 def sample_nearest(
-    image: Float[Tensor, "h w"], views: Views, K: Float[Tensor, "3 3"], outside: float
+    image: Float[Tensor, "h w"], views: Crops, K: Float[Tensor, "3 3"], outside: float
 ) -> Float[Tensor, "items wh ww"]:
     """Value of an image with intrinsics `K` at the centre of each window pixel."""
     x, y = grid_in_image(views, K)

@@ -5,13 +5,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..types import Mesh
-from .nearest import as_float64, as_int64, closest
-from .solids import volumes
-from .thinning import farthest_first
-from .topology import edges_of as edges_of
-from .topology import is_closed as is_closed
-from .topology import manifold
+from mover.core.types import Mesh
+from mover.geometry.nearest import as_float64, as_int64, closest
+from mover.geometry.thinning import farthest_first
+from mover.geometry.topology import edges_of as edges_of
+from mover.geometry.topology import is_closed as is_closed
+from mover.geometry.topology import manifold, volumes
 
 OVERSAMPLING = 5  # candidates for each even sample
 STRAY = 0.03  # of the longest side; no vertex may be further from the decimated surface

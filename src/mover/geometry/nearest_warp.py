@@ -5,15 +5,14 @@ from R^T (q - t) to diag(s) x: boxes in the object's own frame, stretched by s, 
 """
 
 from math import prod
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..records import record
-from .kernels.start import kernels, launch, name_of, started
-from .raster_engine import threads
-from .raster_warp_cpu import share
+from mover.core.records import record
+from mover.geometry.kernels.start import kernels, launch, name_of, share, started, threads
 
 FAN = 8  # points of a leaf, leaves of a group
 
@@ -66,6 +65,20 @@ def _boxes(low: Tensor, high: Tensor) -> Tensor:
     return torch.stack([lows, highs], 1)
 
 
+def packed(held: Clouds) -> Any:  # noqa: ANN401
+    """`kernels.nearest.Cloud` of the points."""
+    from mover.geometry.kernels.nearest import Cloud
+
+    wp, cloud = started(), Cloud()
+    cloud.points = wp.from_torch(held.points.float().contiguous(), dtype=wp.vec3)
+    cloud.index = wp.from_torch(held.index.contiguous())
+    for name, boxes in (("leaf", held.leaves), ("group", held.groups)):
+        for side, corner in enumerate(("low", "high")):
+            array = wp.from_torch(boxes[:, side].float().contiguous(), dtype=wp.vec3)
+            setattr(cloud, f"{name}_{corner}", array)
+    return cloud
+
+
 def nearest(
     held: Clouds,
     query: Float[Tensor, "*starts objects queries 3"],
@@ -80,19 +93,13 @@ def nearest(
     """
     wp = started()
     kernels("nearest", name_of(query.device))
-    from .kernels.nearest import Cloud, nearest
+    from mover.geometry.kernels.nearest import nearest
 
     rows = query.detach().float().reshape(prod(query.shape[:-2]), *query.shape[-2:]).contiguous()
     sizes = scale.detach().float().reshape(-1, 3).contiguous()
     found = torch.zeros(rows.shape[:2], dtype=torch.int64, device=rows.device)
     if found.numel():
-        cloud = Cloud()
-        cloud.points = wp.from_torch(held.points.float().contiguous(), dtype=wp.vec3)
-        cloud.index = wp.from_torch(held.index.contiguous())
-        for name, boxes in (("leaf", held.leaves), ("group", held.groups)):
-            for side, corner in enumerate(("low", "high")):
-                array = wp.from_torch(boxes[:, side].float().contiguous(), dtype=wp.vec3)
-                setattr(cloud, f"{name}_{corner}", array)
+        cloud = packed(held)
         arrays = [wp.from_torch(rows, dtype=wp.vec3), wp.from_torch(sizes, dtype=wp.vec3)]
         arrays.append(wp.from_torch(found))
         parts = min(threads(), len(rows)) if rows.device.type == "cpu" else 1
@@ -105,15 +112,3 @@ def nearest(
 
         share(find, parts)
     return found.reshape(query.shape[:-1])
-
-
-def nearest_torch(
-    held: Clouds,
-    query: Float[Tensor, "*starts objects queries 3"],
-    scale: Float[Tensor, "*starts objects 3"],
-) -> Int[Tensor, "*starts objects queries"]:
-    """See `nearest`: all distances, the oracle of the kernel."""
-    placed = held.points * scale.detach().unsqueeze(-2)
-    gap = query.detach().unsqueeze(-2) - placed.unsqueeze(-3)
-    closest = gap.square().sum(-1).argmin(-1)
-    return held.index.expand(*query.shape[:-2], -1).gather(-1, closest)

@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..records import record
-from .nearest import as_float64, as_int64
-from .volume import Volume, sample
-from .voxels import outward, winding
+from mover.core.records import record
+from mover.geometry.nearest import as_float64, as_int64
+from mover.geometry.volume import Volume, outward, sample, winding
 
 WIDE = 96  # cells along the longest horizontal side, at most
 CELL = 0.01  # [m], the smallest cell

@@ -1,33 +1,55 @@
-"""Signed distance on a regular grid: the space that bodies have moved through.
+"""Signed distance on a regular grid: a volume, its values between the cells, what is inside.
 
 The sign is the winding number of the cell centres, found from signed crossings of vertical lines
 with the triangles, so that a hand inside a thigh is inside. The distance is exact, and computed
 only where the collision term looks: inside, and up to two cells from the surface.
 """
 
-from collections.abc import Callable
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from . import sample_warp, volume_igl, volume_warp
-from .nearest import as_float64, as_int64, closest
-from .raster_engine import engine
-from .volume_record import BAND, SHELL, Volume
-from .voxels import outward
+from mover.core.records import record
+from mover.geometry.kernels.start import kernels, launch, name_of, started
+from mover.geometry.nearest import as_float64, as_int64, closest
 
-__all__ = [
-    "BAND",
-    "SHELL",
-    "Volume",
-    "grid_around",
-    "sample",
-    "sample_torch",
-    "signed_distance",
-    "union_bodies",
-]
+SHELL = 2.0  # [cells], up to where it is exact outside: more than a cell's diagonal
+BAND = 4.0  # [cells], what stands for any larger distance
+BRICK = 8  # [cells]
+
+
+@record
+class Volume:
+    """A scalar field sampled at the centres of cubic cells."""
+
+    values: Float[Tensor, "x y z"]
+    """Signed distance [m], negative inside; a positive constant away from the bodies."""
+    origin: Float[Tensor, "3"]
+    """Centre of cell (0, 0, 0) in the world [m]."""
+    cell: float
+    """Edge of a cell [m]."""
+
+    @cached_property
+    def corner(self) -> tuple[float, float, float]:
+        """The origin as numbers [m]."""
+        x, y, z = self.origin.tolist()
+        return x, y, z
+
+    @cached_property
+    def busy(self) -> UInt8[Tensor, "bx by bz"]:
+        """1 for each brick of 8 cells along an axis in which the values change, else 0."""
+        low = high = self.values.detach()
+        for axis, size in enumerate(self.values.shape):
+            index = torch.arange(-(-(size - 1) // BRICK) * BRICK + 1, device=low.device)
+            index = index.clamp_max(size - 1)
+            low = low.index_select(axis, index).unfold(axis, BRICK + 1, BRICK).amin(-1)
+            high = high.index_select(axis, index).unfold(axis, BRICK + 1, BRICK).amax(-1)
+        return (low != high).to(torch.uint8)
 
 
 def sample(volume: Volume, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -37,9 +59,47 @@ def sample(volume: Volume, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "
     negative, and no gradient.
     """
     plain = {volume.values.dtype, points.dtype} == {torch.float32}
-    if engine() == "warp" and plain and points.device == volume.values.device:
-        return sample_warp.sample(volume, points)
+    if plain and points.device == volume.values.device:
+        found = _Lookup.apply(points, volume)
+        assert isinstance(found, Tensor)
+        return found
     return sample_torch(volume, points)
+
+
+class _Lookup(torch.autograd.Function):
+    """The lookup as a kernel: value and gradient in one pass, skipping empty space."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, volume: Volume) -> Tensor:  # noqa: ANN401
+        wp = started()
+        kernels("lookup", name_of(points.device))
+        from mover.geometry.kernels.lookup import Field, lookup
+
+        flat = points.detach().reshape(-1, 3).contiguous()
+        found, slope = flat.new_empty(len(flat)), torch.empty_like(flat)
+        if len(flat):
+            field = Field()
+            field.values = wp.from_torch(volume.values.detach())
+            field.busy = wp.from_torch(volume.busy)
+            field.origin = wp.vec3(*volume.corner)
+            field.cell = volume.cell
+            arrays = [
+                wp.from_torch(flat, dtype=wp.vec3),
+                wp.from_torch(found),
+                wp.from_torch(slope, dtype=wp.vec3),
+            ]
+            launch(lookup, len(flat), [field, *arrays], flat.device)
+        ctx.save_for_backward(slope)
+        return found.reshape(points.shape[:-1])
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any,  # noqa: ANN401
+        *grads: Tensor,
+    ) -> tuple[Tensor, None]:
+        (slope,) = ctx.saved_tensors
+        return slope.reshape(*grads[0].shape, 3) * grads[0].unsqueeze(-1), None
 
 
 def sample_torch(volume: Volume, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -84,33 +144,6 @@ def grid_around(
     return Volume(values, first.to(low), cell)
 
 
-def union_bodies(
-    verts: Float[Tensor, "bodies verts 3"],
-    faces: Int[Tensor, "faces 3"],
-    grid: Volume,
-    workers: int = 2,
-    observe: Callable[[int, int], None] | None = None,
-) -> Volume:
-    """V = min over the bodies, and what `grid` holds, of the signed distance to each [m].
-
-    Exact inside the bodies and up to two cells outside; further away as in `grid`. The result
-    does not depend on the number of workers, and memory not on that of bodies.
-
-    Args:
-        verts: Closed bodies in the world [m].
-        faces: Their triangles, one orientation, outward or inward.
-        grid: Where to measure; `grid_around` makes an empty one.
-        workers: Bodies measured at the same time.
-        observe: Called with (bodies done, bodies) after each body.
-
-    Raises:
-        ValueError: If a vertex is not finite.
-    """
-    warped = grid.values.dtype == torch.float32 and engine() == "warp"
-    measure = volume_warp.union_bodies if warped else volume_igl.union_bodies
-    return measure(verts, faces, grid, workers, observe)
-
-
 def signed_distance(
     points: Float[Tensor, "points 3"],
     verts: Float[Tensor, "verts 3"],
@@ -124,3 +157,73 @@ def signed_distance(
     distance = np.sqrt(closest(query, corners, triangles)[0])
     inside = np.asarray(igl.fast_winding_number(corners, triangles, query)) > 0.5
     return torch.from_numpy(np.where(inside, -distance, distance)).to(points)
+
+
+# Closed triangle meshes on a grid: winding numbers of places.
+#
+# Vertices are in cells here: the centres of the grid's cells have integer coordinates.
+
+
+SNAP = 1 << 16  # vertices snap to this part of a cell, so that crossings are exact
+
+
+def outward(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The faces, turned over if they enclose a negative volume (as in a mirrored body)."""
+    a, b, c = (verts[faces[:, k]] - verts[0] for k in range(3))
+    return faces if (np.cross(a, b) * c).sum() >= 0 else faces[:, ::-1].copy()
+
+
+def winding(verts: np.ndarray, faces: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Winding number of the surface at integer places (x, y, z) below `shape`.
+
+    Counts signed crossings along the y lines. Coordinates x and z are snapped to fixed point and
+    the top-left rule decides ties, so that a line through a shared edge or vertex counts once.
+    """
+    flat = np.rint(verts[:, [0, 2]] * SNAP).astype(np.int64)[faces]
+    area = _cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
+    flip = area < 0  # seen from below, a triangle that faces down winds counter-clockwise
+    flat[flip] = flat[flip][:, [0, 2, 1]]
+    heights = verts[:, 1][faces]
+    heights[flip] = heights[flip][:, [0, 2, 1]]
+    triangle, column = _pairs(flat, area != 0, shape)
+    covered, height = _crossings(flat[triangle], heights[triangle], column)
+    triangle, column = triangle[covered], column[covered]
+    first = np.clip(np.ceil(height), 0, shape[1]).astype(np.int64)
+    place = (column[:, 0] * (shape[1] + 1) + first) * shape[2] + column[:, 1]
+    steps = np.bincount(
+        place, np.sign(area[triangle]), minlength=int(shape[0] * (shape[1] + 1) * shape[2])
+    ).reshape(shape[0], shape[1] + 1, shape[2])
+    return np.cumsum(steps[:, :-1], axis=1).astype(np.int32)
+
+
+def _pairs(flat: np.ndarray, keep: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles and the columns (x, z) that their boxes hold, as one ragged list of pairs."""
+    low = np.maximum(-(-flat.min(1) // SNAP), 0)
+    high = np.minimum(flat.max(1) // SNAP, shape[[0, 2]] - 1)
+    sides = np.where(keep[:, None], np.maximum(high - low + 1, 0), 0)
+    counts = sides.prod(-1)
+    triangle = np.repeat(np.arange(len(flat)), counts)
+    rank = np.arange(len(triangle)) - np.repeat(np.cumsum(counts) - counts, counts)
+    wide = sides[triangle, 1]
+    return triangle, low[triangle] + np.stack([rank // wide, rank % wide], -1)
+
+
+def _crossings(
+    corners: np.ndarray, heights: np.ndarray, column: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether each triangle holds its column, and at what height [cells] the ones that do."""
+    point = column * SNAP
+    covered = np.ones(len(column), dtype=bool)
+    weights = np.empty((len(column), 3), dtype=np.int64)
+    for k in range(3):
+        start = corners[:, (k + 1) % 3]
+        edge = corners[:, (k + 2) % 3] - start
+        weights[:, k] = _cross(edge, point - start)
+        owns = (edge[:, 1] < 0) | ((edge[:, 1] == 0) & (edge[:, 0] > 0))
+        covered &= (weights[:, k] > 0) | ((weights[:, k] == 0) & owns)
+    share = weights[covered] / weights[covered].sum(-1, keepdims=True)
+    return covered, (share * heights[covered]).sum(-1)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -1,10 +1,10 @@
-"""The union of bodies as Warp kernels: same result as `volume` without them, on CPU and CUDA.
+"""The space that bodies have moved through: the union of bodies by Warp kernels, on CPU and CUDA.
 
 A launch on the CPU is serial but leaves Python's lock, so bodies are measured in threads, each
 with a volume of its own; the least of these is the result, whoever measured what.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,12 +16,82 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .face_tree import EIGHT, FaceTree, face_tree
-from .kernels.start import kernels, started
-from .nearest import as_int64
-from .volume_record import Volume
+from mover.geometry.kernels.start import kernels, started
+from mover.geometry.nearest import as_float64, as_int64
+from mover.geometry.volume import Volume
 
 REACH = 2  # [cells], that the shell reaches out of the body
+EIGHT = 8  # children of a node, and faces of a leaf: one instruction serves all of them
+
+
+@dataclass(frozen=True)
+class FaceTree:
+    """A balanced tree over the triangles of a mesh; only its boxes follow the poses.
+
+    Slot s is lane s % 8 of pack s // 8; the children of slot s are the pack s + `shift`.
+
+    The first pack holds the nodes of the first level in its last lanes.
+    """
+
+    corners: np.ndarray
+    """Of each leaf (leaves 4 8): lowest, second and highest vertex of its eight faces, and 1, or -1
+    where that order turns a face over, or 0 where a face stands there a second time."""
+    shift: int
+    base: int
+    """Slot of the first leaf."""
+    levels: tuple[int, ...]
+    """First pack of each level, and the number of packs."""
+
+    def inner(self) -> list[tuple[int, int, int]]:
+        """Levels above the leaves, from below: first pack of the children, first slot, nodes."""
+        pairs = list(zip(self.levels[1:-1], self.levels[2:], strict=True))
+        return [(first, first - self.shift, end - first) for first, end in reversed(pairs)]
+
+
+def face_tree(verts: Tensor, faces: Int[Tensor, "faces 3"]) -> FaceTree:
+    """Halve the triangles again and again across their longest side."""
+    triangles = as_int64(faces)
+    halvings = max(0, int(np.ceil(np.log2(len(triangles) / EIGHT))))
+    top = 1 << ((halvings - 1) % 3 + 1) if halvings else 1
+    order = _order(as_float64(verts)[triangles].mean(1), halvings)
+    packs, nodes = [0, 1], top
+    while nodes < 1 << halvings:
+        packs.append(packs[-1] + nodes)
+        nodes *= EIGHT
+    base = EIGHT * packs[-2] if len(packs) > 2 else EIGHT - top
+    return FaceTree(_corners(triangles[order], halvings), top - EIGHT + 1, base, tuple(packs))
+
+
+def _corners(triangles: np.ndarray, halvings: int) -> np.ndarray:
+    """See `FaceTree.corners`."""
+    first = np.arange((1 << halvings) + 1) * len(triangles) // (1 << halvings)
+    lane = np.arange(EIGHT)
+    count = np.diff(first)[:, None]
+    picked = triangles[first[:-1, None] + np.minimum(lane, count - 1)]
+    rank = picked.argsort(-1, kind="stable")
+    turned = (rank[..., 1] - rank[..., 0]) % 3 == 1
+    side = np.where(turned, 1, -1) * (lane < count)
+    ordered = np.take_along_axis(picked, rank, -1)
+    return np.concatenate([ordered, side[..., None]], -1).swapaxes(1, 2).astype(np.int32)
+
+
+def _order(center: np.ndarray, halvings: int) -> np.ndarray:
+    """Indices such that each half, quarter, ... of them is a compact group."""
+    count = len(center)
+    order = np.arange(count)
+    for level in range(halvings):
+        groups = 1 << level
+        first = np.arange(groups + 1) * count // groups
+        group = np.repeat(np.arange(groups), np.diff(first))
+        starts, held = np.minimum(first[:-1], count - 1), center[order]
+        low, size = np.minimum.reduceat(held, starts), np.maximum.reduceat(held, starts)
+        with np.errstate(invalid="ignore"):  # bodies that are not finite are refused elsewhere
+            size = size - low
+            axis = size.argmax(-1)
+            off = held[np.arange(count), axis[group]] - low[group, axis[group]]
+            share = off / np.maximum(size.max(-1), 1e-30)[group]  # in its group, 0 to 1
+        order = order[np.argsort(group + 0.999 * share)]
+    return order
 
 
 @dataclass(frozen=True)
@@ -50,34 +120,24 @@ class Scratch:
     stacks: int = 0
 
 
-def union_bodies(
-    verts: Float[Tensor, "bodies verts 3"],
-    faces: Int[Tensor, "faces 3"],
-    grid: Volume,
-    workers: int,
-    observe: Callable[[int, int], None] | None = None,
-) -> Volume:
-    """See `volume.union_bodies`; the grid's values are float32.
-
-    Raises:
-        ValueError: If a vertex is not finite.
-    """
-    if len(verts) == 0 or len(faces) == 0:
-        return grid
-    tools = _tools(verts.detach().float().contiguous(), faces, grid)
-    count = max(1, min(workers, len(verts))) if tools.device == "cpu" else 1
+def _in_a_ring(every: list[Scratch]) -> "SimpleQueue[Scratch]":
+    """All that wait for a body; each may look into the next one's field."""
     idle: SimpleQueue[Scratch] = SimpleQueue()
-    every = [_scratch(tools) for _ in range(count)]
     for scratch, other in zip(every, every[1:] + every[:1], strict=True):
         scratch.work.other = other.work.field
         idle.put(scratch)
+    return idle
 
-    def add(body: int) -> None:
-        with _borrowed(idle) as scratch:
-            add_body(tools, scratch, body)
 
+def _in_threads(
+    add: Callable[[int], None],
+    bodies: Iterable[int],
+    count: int,
+    observe: Callable[[int, int], None] | None,
+) -> None:
+    """Add all bodies; the first error ends the others."""
     with ThreadPoolExecutor(count) as pool:
-        jobs = [pool.submit(add, body) for body in _spread(len(verts))]
+        jobs = [pool.submit(add, body) for body in bodies]
         try:
             for done, job in enumerate(as_completed(jobs), 1):
                 job.result()
@@ -86,10 +146,46 @@ def union_bodies(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def union_bodies(
+    verts: Float[Tensor, "bodies verts 3"],
+    faces: Int[Tensor, "faces 3"],
+    grid: Volume,
+    workers: int = 2,
+    observe: Callable[[int, int], None] | None = None,
+) -> Volume:
+    """V = min over the bodies, and what `grid` holds, of the signed distance to each [m].
+
+    Exact inside the bodies and up to two cells outside; further away as in `grid`. The result
+    does not depend on the number of workers, and memory not on that of bodies.
+
+    Args:
+        verts: Closed bodies in the world [m].
+        faces: Their triangles, one orientation, outward or inward.
+        grid: Where to measure; `grid_around` makes an empty one.
+        workers: Bodies measured at the same time.
+        observe: Called with (bodies done, bodies) after each body.
+
+    Raises:
+        ValueError: If a vertex is not finite.
+    """
+    if len(verts) == 0 or len(faces) == 0:
+        return grid
+    tools = _tools(verts.detach().float().contiguous(), faces, grid)
+    count = max(1, min(workers, len(verts))) if tools.device == "cpu" else 1
+    every = [_scratch(tools) for _ in range(count)]
+    idle = _in_a_ring(every)
+
+    def add(body: int) -> None:
+        with _borrowed(idle) as scratch:
+            add_body(tools, scratch, body)
+
+    _in_threads(add, _spread(len(verts)), count, observe)
     values = every[0].field
     for scratch in every[1:]:
         torch.minimum(values, scratch.field, out=values)
-    return replace(grid, values=values)
+    return replace(grid, values=values.to(grid.values))
 
 
 def _spread(count: int) -> list[int]:
@@ -110,7 +206,7 @@ def _borrowed(idle: SimpleQueue[Scratch]) -> Generator[Scratch]:
 
 def _tools(verts: Tensor, faces: Tensor, grid: Volume) -> Tools:
     device = str(started().device_from_torch(verts.device))
-    for name in ("bodies", "crossings", "lower"):
+    for name in ("bodies", "lower"):
         kernels(name, device)  # before there are threads
     return Tools(face_tree(verts[0], faces), as_int64(faces).astype(np.int32), verts, grid, device)
 
@@ -118,9 +214,9 @@ def _tools(verts: Tensor, faces: Tensor, grid: Volume) -> Tools:
 def _scratch(tools: Tools) -> Scratch:
     import warp as wp
 
-    from .kernels.bodies import Pair, Work
+    from mover.geometry.kernels.bodies import Pair, Work
 
-    field, tree = tools.grid.values.detach().clone().contiguous(), tools.tree
+    field, tree = tools.grid.values.detach().float().clone().contiguous(), tools.tree
 
     work = Work()
     work.origin = wp.vec3d(*tools.grid.origin.double().tolist())
@@ -141,7 +237,7 @@ def _scratch(tools: Tools) -> Scratch:
 def _tree(shape: FaceTree, device: str) -> Any:  # noqa: ANN401
     import warp as wp
 
-    from .kernels.bodies import Tree
+    from mover.geometry.kernels.bodies import Tree
 
     tree, packs = Tree(), shape.levels[-1]
     tree.shift, tree.base, tree.longest = shape.shift, shape.base, EIGHT * (len(shape.levels) + 1)
@@ -161,7 +257,7 @@ def add_body(tools: Tools, scratch: Scratch, body: int) -> None:
     """
     import warp as wp
 
-    from .kernels import bodies, crossings, lower
+    from mover.geometry.kernels import bodies, lower
 
     verts = tools.verts[body]
     box = torch.stack([torch.stack(verts[:, k].aminmax()) for k in range(3)], 1).double().cpu()
@@ -185,7 +281,7 @@ def add_body(tools: Tools, scratch: Scratch, body: int) -> None:
     launch(bodies.leaves, len(tools.tree.corners))
     for pack, first, count in tools.tree.inner():
         launch(bodies.inner, count, pack, first)
-    launch(crossings.cross, work.faces.shape[0])
+    launch(bodies.cross, work.faces.shape[0])
     launch(lower.blocks, _columns(shape))
 
 

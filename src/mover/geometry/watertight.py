@@ -1,18 +1,128 @@
-"""Any furniture mesh as one closed solid in the same box.
+"""A closed surface around any triangles, drawn tight.
 
-Closed parts are kept as they are (solids.py): wound outward, flat holes capped, and united where
-there are several, so that no walls stand inside walls. Everything else is wrapped (wrap.py).
+The distance to the triangles on a grid has no inside and needs none: what cannot be reached from
+outside through cells that are far from every triangle is matter. Where holes are small, the winding
+number (of either sign) tells the inside as well. The level of that field, a wall of constant
+thickness around the triangles, is a closed surface; its vertices then fall back onto the triangles
+up to a small rest, so that neither thickness nor box change and sheets keep two sides.
 """
 
 import numpy as np
 import torch
 
-from ..types import Mesh
-from .mesh import fit_box, used
-from .nearest import as_float64, as_int64
-from .solids import areas, solid
-from .topology import labels
-from .wrap import wrap
+from mover.core.types import Mesh
+from mover.geometry.mesh import fit_box, used
+from mover.geometry.nearest import as_float64, as_int64, closest
+from mover.geometry.topology import Triangles, areas, labels, manifold, solid, volumes
+
+WALL = 0.75  # [cells], more than the half diagonal of a step, or the flood would leak through
+REST = 0.3  # of the thickness of the wall that stays: sheets need two sides that are apart
+REACH = 3.0  # [walls], vertices further from the triangles stay where they are: lids over holes
+INSIDE = 0.85  # winding number from which a place that the flood reached still counts as matter
+LID = 4.0  # [cells] over which a winding number that is larger by 1 would lower the field
+COARSE = 4  # [cells], step of the first look at the distances
+MARGIN = 2  # [cells] of air around the box
+SPECK = 1e-3  # of the largest component's volume: what is smaller is no part of the furniture
+
+
+def wrap(verts: np.ndarray, faces: np.ndarray, cells: int) -> Triangles:
+    """A closed, outward-wound surface around the triangles; `cells` along the longest side."""
+    import igl
+
+    low, high = verts[faces].min((0, 1)), verts[faces].max((0, 1))
+    cell = float((high - low).max()) / cells
+    counts = np.ceil((high - low) / cell).astype(np.int64) + 1 + 2 * MARGIN
+    start = (low + high) / 2 - cell * (counts - 1) / 2
+    field = _field(verts, faces, start, cell, counts)
+    axes = [start[k] + cell * np.arange(counts[k]) for k in range(3)]
+    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+    places = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
+    level = np.ascontiguousarray(field.transpose(2, 1, 0).ravel())
+    points, shell, _ = igl.marching_cubes(level, places, *counts.tolist(), isovalue=WALL * cell)
+    points, shell = _bodies(np.asarray(points), np.asarray(shell))
+    return _drawn_tight(points, verts, faces, WALL * cell), shell
+
+
+def _field(
+    verts: np.ndarray, faces: np.ndarray, start: np.ndarray, cell: float, counts: np.ndarray
+) -> np.ndarray:
+    """Distance to the triangles [m] where air is; at most that, and below the wall, in matter."""
+    import igl
+
+    wall = WALL * cell
+    distance = _distances(verts, faces, start, cell, counts)
+    air = _outside(distance > wall)
+    field = np.where(air, distance, np.minimum(distance, wall / 2))
+    shell = ~air & (distance <= wall)
+    field[shell] = distance[shell]
+    reached = np.argwhere(air)
+    places = start + cell * reached
+    within = ((places > verts.min(0)) & (places < verts.max(0))).all(-1)
+    reached, places = reached[within], places[within]
+    winding = np.abs(igl.fast_winding_number(verts, faces, places))
+    lid = wall + (INSIDE - winding) * LID * cell
+    field[tuple(reached.T)] = np.minimum(field[tuple(reached.T)], lid)
+    return field
+
+
+def _outside(free: np.ndarray) -> np.ndarray:
+    """The free cells that can be reached from the grid's first corner in steps along the axes."""
+    index = np.arange(free.size).reshape(free.shape)
+    links: list[tuple[np.ndarray, np.ndarray]] = []
+    for axis in range(3):
+        here, there = np.moveaxis(index, axis, 0)[:-1], np.moveaxis(index, axis, 0)[1:]
+        both = np.moveaxis(free, axis, 0)[:-1] & np.moveaxis(free, axis, 0)[1:]
+        links.append((here[both], there[both]))
+    a, b = (np.concatenate(ends) for ends in zip(*links, strict=True))
+    region = labels(a, b, free.size).reshape(free.shape)
+    return region == region[0, 0, 0]
+
+
+def _distances(
+    verts: np.ndarray, faces: np.ndarray, start: np.ndarray, cell: float, counts: np.ndarray
+) -> np.ndarray:
+    """Distance to the triangles at the grid's places [m]: exact near them, else too small.
+
+    The distance changes by no more than the way one goes: a coarse grid tells where to look.
+    """
+    blocks = (-(-counts // COARSE)).tolist()
+    coarse = np.indices(blocks).reshape(3, -1).T * COARSE + (COARSE - 1) / 2
+    far = np.sqrt(closest(start + cell * coarse, verts, faces)[0]).reshape(blocks)
+    for axis in range(3):
+        far = far.repeat(COARSE, axis).take(np.arange(int(counts[axis])), axis)
+    distance = far - cell * np.sqrt(3) * (COARSE - 1) / 2
+    near = np.argwhere(distance < 2 * cell)
+    distance[tuple(near.T)] = np.sqrt(closest(start + cell * near, verts, faces)[0])
+    return distance
+
+
+def _bodies(points: np.ndarray, shell: np.ndarray) -> Triangles:
+    """The outer surfaces of the larger bodies, each edge with two faces."""
+    part_of, volume = volumes(points, shell)
+    if volume[np.abs(volume).argmax()] < 0:
+        shell, volume = shell[:, ::-1].copy(), -volume
+    shell = shell[(volume > SPECK * volume.max())[part_of]]
+    closed = manifold(points, shell)
+    assert closed is not None  # the border of the grid is air
+    return closed
+
+
+def _drawn_tight(
+    points: np.ndarray, verts: np.ndarray, faces: np.ndarray, wall: float
+) -> np.ndarray:
+    """Points that lay a wall's thickness away from the triangles, moved to the rest of it."""
+    squared, _, onto = closest(points, verts, faces)
+    distance = np.sqrt(squared)[:, None]
+    pull = np.clip((REACH * wall - distance) / ((REACH - 1) * wall), 0, 1)
+    step = np.minimum((1 - REST) * wall * pull / np.maximum(distance, 1e-300), 1)
+    return points + step * (onto - points)
+
+
+# Any furniture mesh as one closed solid in the same box.
+#
+# Closed parts are kept as they are (solids.py): wound outward, flat holes capped, and united where
+# there are several, so that no walls stand inside walls. Everything else is wrapped (wrap.py).
+
 
 WELD = 1e-6  # [longest side], vertices this near are one
 

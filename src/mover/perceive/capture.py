@@ -6,60 +6,54 @@ CAPTURE/frames             frames of a camera that stands still
 CAPTURE/reference.png, objects.json, people.json, keypoints.npz, camera.json, scene.json, meshes/
 """
 
+import logging
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
-from ..readers.camera_file import camera_of, camera_to_json
-from ..readers.fields import write_json
-from ..readers.image_file import write_image
-from ..readers.objects_file import detections_to_json
-from ..readers.people.keypoints_file import write_keypoints
-from ..readers.people_file import people_to_json
-from ..records import fingerprint
-from ..run import Run
-from ..types import Camera, People
-from .clean import Clean, CleanConfig
-from .detect import DetectConfig, DetectInputs, find_instances, joined_finds, people_in
-from .joints import JointsConfig, JointsInputs, find_joints
-from .lens import lens_of
-from .models import ModelsConfig
-from .reference import detections_in, furniture_of, hidden_mask, reference_of
-from .steady import Drift, SteadyConfig, SteadyInputs, find_drift, steady_frames, warning_of
-from .track import SegmentInputs, TrackConfig, Tracks, link_people, nobody, track_people
-from .video import Clip, FramesConfig, TakeInputs, stamp_of, take_frames
+from mover.core.errors import InputError
+from mover.core.records import fingerprint
+from mover.core.run import Run
+from mover.core.types import Camera, People
+from mover.geometry.rle import decode, joined
+from mover.io.capture.camera_file import camera_of, camera_to_json
+from mover.io.capture.folder import folder_parts
+from mover.io.capture.objects_file import detections_of, detections_to_json
+from mover.io.capture.people_file import people_of, people_to_json
+from mover.io.capture.scene_file import write_hypotheses, write_scene
+from mover.io.files.cameras import of_view, read_camera_file
+from mover.io.files.fields import At, maybe, number, write_json
+from mover.io.files.images import write_image
+from mover.io.people.keypoints import write_keypoints
+from mover.perceive.config import DetectConfig, JointsConfig, Lens, PerceiveConfig
+from mover.perceive.depth_map import read_depth
+from mover.perceive.detect import DetectInputs, find_instances, joined_finds, people_in
+from mover.perceive.layout import FirstScene, Picture
+from mover.perceive.reference import Clean, detections_in, furniture_of, hidden_mask, reference_of
+from mover.perceive.steady import Drift, SteadyInputs, find_drift, opencv, steady_frames, warning_of
+from mover.perceive.track import (
+    JointsInputs,
+    SegmentInputs,
+    Tracks,
+    find_joints,
+    link_people,
+    nobody,
+    track_people,
+)
+from mover.perceive.video import Clip, TakeInputs, opened_picture, stamp_of, take_frames
 
+log = logging.getLogger(__name__)
 CHUNK = 50  # frames whose detections are kept together
+FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal lengths refer
+USUAL = 60.0  # [degrees], horizontal field of view of phones held level, where nothing is known
+EXIF_IFD, FOCAL_35 = 0x8769, 0xA405
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class PerceiveConfig:
-    """How a video is read."""
-
-    frames: FramesConfig = field(default_factory=FramesConfig)
-    """Which frames."""
-    steady: SteadyConfig = field(default_factory=SteadyConfig)
-    """What counts as a camera that stands still."""
-    clean: CleanConfig = field(default_factory=CleanConfig)
-    """The reference picture without people."""
-    models: ModelsConfig = field(default_factory=ModelsConfig)
-    """Which networks do what."""
-    detect: DetectConfig = field(default_factory=DetectConfig)
-    """Furniture and people in pictures (its models are those above)."""
-    track: TrackConfig = field(default_factory=TrackConfig)
-    """People through the video (its models are those above)."""
-
-
-@dataclass(frozen=True)
-class Lens:
-    """What is known of the camera."""
-
-    file: Path | None = None
-    fov: float | None = None
-    photo: Path | None = None
 
 
 def perceive(
@@ -68,8 +62,9 @@ def perceive(
     """Fill a capture folder with all that a video tells of its pictures; gives the camera.
 
     Raises:
-        InputError: If the source or a network is missing.
+        InputError: If the source, OpenCV or a network is missing.
     """
+    opencv()
     clip, drift = steady_clip(source, out, config, run, say)
     size = clip.width, clip.height
     at, text = lens_of(size, file=lens.file, fov=lens.fov, photo=lens.photo)
@@ -141,35 +136,117 @@ def people_of_clip(clip: Clip, detect: DetectConfig, config: PerceiveConfig, run
         found = people_in(run.stage(find_instances, DetectInputs(clip, (first,)), detect))
         last = min(first + track.segment, count - 1)  # it is also the next one's first
         part = run.stage(track_people, SegmentInputs(clip, first, last, found, carried), track)
-        carried = rows_at(part, last)
-        own = part if last == count - 1 else without_frame(part, last)
-        parts.append(own)
+        carried = where(part, part.frame == last)
+        parts.append(part if last == count - 1 else where(part, part.frame != last))
         if last == count - 1:
             break
     return _joined(parts)
 
 
-def rows_at(tracks: Tracks, frame: int) -> Tracks:
-    """The rows of one frame."""
-    return _some(tracks, (tracks.frame == frame).nonzero()[:, 0].tolist())
-
-
-def without_frame(tracks: Tracks, frame: int) -> Tracks:
-    """The rows of all other frames."""
-    return _some(tracks, (tracks.frame != frame).nonzero()[:, 0].tolist())
-
-
-def _some(tracks: Tracks, rows: Sequence[int]) -> Tracks:
-    index = torch.tensor(list(rows), dtype=torch.long)
-    masks = replace(tracks.masks, counts=tuple(tracks.masks.counts[k] for k in rows))
-    return Tracks(masks, tracks.frame[index], tracks.person[index], tracks.people)
+def where(tracks: Tracks, keep: Bool[Tensor, " rows"]) -> Tracks:
+    """The rows that are kept."""
+    counts = tuple(tracks.masks.counts[k] for k in keep.nonzero()[:, 0].tolist())
+    masks = replace(tracks.masks, counts=counts)
+    return Tracks(masks, tracks.frame[keep], tracks.person[keep], tracks.people)
 
 
 def _joined(parts: Sequence[Tracks]) -> Tracks:
-    counts = tuple(c for p in parts for c in p.masks.counts)
     return Tracks(
-        replace(parts[0].masks, counts=counts),
+        joined([p.masks for p in parts]),
         torch.cat([p.frame for p in parts]),
         torch.cat([p.person for p in parts]),
         max(p.people for p in parts),
     )
+
+
+def lens_of(
+    size: tuple[int, int], *, file: Path | None, fov: float | None, photo: Path | None
+) -> tuple[At, str | None]:
+    """The fields of camera.json, and a warning where the lens is a guess.
+
+    Args:
+        size: Width and height of the frames [px].
+        file: A calibration of any known kind; GeoCalib's also tells pitch and roll.
+        fov: Horizontal field of view [degrees].
+        photo: A picture whose EXIF tells the focal length.
+
+    Raises:
+        InputError: If what is given cannot be used.
+    """
+    if file is not None:
+        return read_camera_file(file, size), None
+    if fov is not None:
+        return of_view(fov, size, "--fov"), None
+    focal = None if photo is None else exif_focal(photo, size)
+    if focal is not None:
+        return _centred(focal, size), None
+    text = (
+        f"the lens is not known: {USUAL:.0f} degrees across are assumed; give --camera FILE or "
+        "--fov DEGREES (GeoCalib, MoGe and others tell both lens and tilt)"
+    )
+    return of_view(USUAL, size, "assumed"), text
+
+
+def exif_focal(photo: Path, size: tuple[int, int]) -> float | None:
+    """Focal length of a picture's EXIF [px]; None: it tells none.
+
+    The 35 mm equivalent refers to the diagonal, so it holds for any format and either way up.
+
+    Raises:
+        InputError: If it is no picture.
+    """
+    with opened_picture(photo, large="ignore") as picture:
+        found: Any = picture.getexif().get_ifd(EXIF_IFD).get(FOCAL_35)
+    if found is None or not 1 <= float(found) <= 2000:
+        return None
+    return float(found) / FULL_FRAME * math.hypot(*size)
+
+
+def _centred(focal: float, size: tuple[int, int]) -> At:
+    w, h = size
+    fields = {"w": w, "h": h, "fl_x": focal, "fl_y": focal, "cx": w / 2, "cy": h / 2}
+    return At(fields, "EXIF")
+
+
+def read_picture_of(folder: Path, depth: Path | None = None) -> Picture:
+    """Camera, annotations and hidden pixels of a capture that needs no scene yet.
+
+    Raises:
+        InputError: If camera.json or objects.json is missing or wrong.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder, expected a capture")
+    parts = folder_parts(folder)
+    if parts.camera is None or parts.objects is None:
+        raise InputError(f"{folder}: a first scene needs camera.json and objects.json in it")
+    camera = camera_of(parts.camera)
+    detections = detections_of(parts.objects, camera, log.warning)
+    blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    masks = [blank if d.mask is None else decode(d.mask, 0) for d in detections]
+    hidden = blank
+    if parts.people is not None:
+        reference = people_of(parts.people, camera, log.warning).reference
+        for row in range(0 if reference is None else len(reference.counts)):
+            assert reference is not None
+            hidden = hidden | decode(reference, row)
+    known = maybe(parts.camera, "height")
+    return Picture(
+        camera=camera,
+        detections=detections,
+        masks=torch.stack(masks) if masks else blank[None][:0],
+        people=hidden,
+        height=None if known is None else number(known, 0.1, 100.0),
+        depth=None if depth is None else read_depth(depth, camera),
+    )
+
+
+def write_first_scene(first: FirstScene, folder: Path) -> None:
+    """Write scene.json with its meshes, the tilt into camera.json, and what else is possible."""
+    write_scene(first.scene, folder / "scene.json")
+    parts = folder_parts(folder)
+    assert parts.camera is not None
+    given = {k: v for k, v in parts.camera.value.items() if k == "height"}
+    write_json({**camera_to_json(first.scene.camera), **given}, folder / "camera.json")
+    groups = {group[0].piece.id: [h.piece for h in group] for group in first.others}
+    energies = {group[0].piece.id: [h.energy for h in group] for group in first.others}
+    write_hypotheses(folder, groups, energies)

@@ -1,6 +1,5 @@
 """Metric depth of the picture, as Depth Anything, MoGe, UniDepth or Depth Pro give it."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +8,15 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..energy import ImageCues
-from ..geometry.camera import to_world
-from ..geometry.crops import sample_nearest
-from ..readers.fields import At, array, maybe, reason, refuse
-from ..readers.npz_file import read_npz
-from ..records import InputError
-from ..terms.depth import DepthRange
-from ..types import Camera
+from mover.core.errors import InputError
+from mover.core.types import Camera
+from mover.energy.objective import ImageCues
+from mover.energy.terms.depth import DepthRange
+from mover.geometry.camera import to_world
+from mover.geometry.crops import sample_nearest
+from mover.io.files.fields import At, array, maybe, refuse
+from mover.io.files.npz import read_npz
+from mover.perceive.video import opened_picture
 
 NAMES = ("depth", "depth_metric", "metric_depth", "predicted_depth", "depths", "arr_0")
 FARTHEST = 100.0  # [m], what is farther is sky or nonsense
@@ -39,7 +39,7 @@ def read_depth(path: Path, camera: Camera) -> Float[Tensor, "h w"]:
         case ".npz":
             values = _of_npz(path)
         case ".npy":
-            from ..readers.instances_arrays import read_array
+            from mover.io.masks.instances_pixels import read_array
 
             values = _two_axes(read_array(path))
         case ".png":
@@ -80,17 +80,8 @@ def _two_axes(at: At) -> NDArray[np.float64]:
 
 
 def _of_png(path: Path) -> NDArray[np.float64]:
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(path) as picture:
-                mode, values = picture.mode, np.asarray(picture)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Warning) as error:
-        raise InputError(
-            f"{path.name}: cannot be read ({reason(error)}), expected a depth map"
-        ) from error
+    with opened_picture(path, "a depth map") as picture:
+        mode, values = picture.mode, np.asarray(picture)
     if not mode.startswith("I"):
         raise InputError(
             f"{path.name}: has {mode} pixels, expected 16 bits of millimetres (8 bits or colours "

@@ -1,36 +1,131 @@
-"""Furniture and people in single pictures: instance masks of COCO's classes."""
+"""Furniture and people in pictures: masks of COCO's classes, by pretrained networks.
 
+Networks come by name, from a folder or from the cache of Hugging Face; nothing else.
+"""
+
+import importlib
+import logging
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..minimize import Observer, Step, silent
-from ..readers.masks import encode
-from ..records import record
-from ..types import Masks
-from .models import ModelsConfig, Network, instance_reader, network
-from .video import Clip, read_picture
+from mover.core.errors import InputError
+from mover.core.observe import Observer, Step, silent
+from mover.core.records import record
+from mover.core.types import Masks
+from mover.geometry.rle import encode, joined
+from mover.perceive.config import DetectConfig, ModelsConfig
+from mover.perceive.video import Clip, read_picture
 
+log = logging.getLogger(__name__)
+KINDS = {
+    "masks": ("AutoModelForUniversalSegmentation", "AutoImageProcessor"),
+    "tracker": ("Sam2VideoModel", ""),
+    "keypoints": ("VitPoseForPoseEstimation", "AutoImageProcessor"),
+}
+"""Classes of transformers for each task: of the network, and of what prepares its input."""
+OWN_PROCESSOR = {"oneformer": "OneFormerProcessor"}
+"""Networks that are told their task in words, too."""
+CLASSES = "shi-labs/oneformer_demo"
+"""Where OneFormer's processor looks for the names of its classes, if they are not in its folder."""
 PERSON = "person"
 TASK = "instance"  # what OneFormer is asked for
 
 
 @dataclass(frozen=True)
-class DetectConfig:
-    """How instances are found."""
+class Network:
+    """A network that is ready, and what prepares its input."""
 
-    models: ModelsConfig = field(default_factory=ModelsConfig)
-    """Which network."""
-    score: float = 0.5
-    """Least score."""
-    batch: int = 4
-    """Pictures that the network sees at once."""
-    least: float = 0.0004
-    """Smallest instance, as a share of the picture."""
+    model: Any
+    processor: Any
+    device: str
+
+
+def network(kind: str, name: str, config: ModelsConfig) -> Network:
+    """A network of a kind; it is loaded once.
+
+    Raises:
+        InputError: If transformers or the weights are missing; the message says what to do.
+    """
+    return _loaded(kind, name, device_of(config.device), config.download)
+
+
+def instance_reader(net: Network) -> Any:  # noqa: ANN401
+    """What turns the queries' logits of a network for masks into instances.
+
+    OneFormer reads instances off as Mask2Former does. Its own processor in transformers (up to 5.x)
+    forgets the sigmoid of the masks, so that the best mask of all also gets every pixel where
+    nothing is, and needs torchvision; Mask2Former's is used for both.
+    """
+    if net.model.config.model_type not in OWN_PROCESSOR:
+        return net.processor
+    library: Any = importlib.import_module("transformers")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return library.Mask2FormerImageProcessor()
+
+
+def device_of(name: str) -> str:
+    """The device that a name stands for.
+
+    Raises:
+        InputError: If there is no such device.
+    """
+    import torch
+
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name.split(":")[0] not in ("cpu", "cuda"):
+        raise InputError(f"--models.device: {name!r} is none of auto, cpu, cuda")
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise InputError("--models.device: there is no GPU that torch can use, expected cpu")
+    return name
+
+
+@lru_cache(maxsize=4)
+def _loaded(kind: str, name: str, device: str, download: bool) -> Network:
+    try:
+        library: Any = importlib.import_module("transformers")
+    except ImportError as error:
+        raise InputError(
+            "perceive needs transformers: pip install '.[perceive]' in mover's folder"
+        ) from error
+    model_class, processor_class = KINDS[kind]
+    own: dict[str, Any] = {"local_files_only": not download}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model = getattr(library, model_class).from_pretrained(name, **own)
+            processor = None
+            processor_class = OWN_PROCESSOR.get(model.config.model_type, processor_class)
+            if processor_class:
+                processor = getattr(library, processor_class).from_pretrained(name, **own)
+    except (OSError, ValueError, KeyError, ImportError) as error:
+        log.debug("loading %s: %s", name, error)
+        raise InputError(missing_text(kind, name)) from error
+    return Network(model.to(device).eval(), processor, device)
+
+
+def missing_text(kind: str, name: str) -> str:
+    """The one sentence that says what to do about a network that cannot be loaded."""
+    if Path(name).is_dir():
+        return (
+            f"--models.{kind}: the folder {name} holds no network for this task, expected "
+            "config.json and model.safetensors as transformers save them"
+        )
+    more = f" and `hf download {CLASSES}`" if "oneformer" in name.lower() else ""
+    return (
+        f"--models.{kind}: {name!r} is not on this machine; where there is a network, run "
+        f"`hf download {name}`{more} once (or add --models.download), or name a folder that holds "
+        "it"
+    )
 
 
 @record
@@ -121,30 +216,19 @@ def _binary(maps: Any, index: int, name: int) -> Bool[Tensor, "h w"]:  # noqa: A
 
 def joined_finds(parts: Sequence[Finds]) -> Finds:
     """Rows of several batches."""
-    first = parts[0].masks
     return Finds(
-        Masks(first.height, first.width, tuple(c for p in parts for c in p.masks.counts)),
+        joined([p.masks for p in parts]),
         torch.cat([p.frame for p in parts]),
         tuple(c for p in parts for c in p.category),
         torch.cat([p.score for p in parts]),
     )
 
 
-def picked(finds: Finds, rows: Sequence[int]) -> Finds:
-    """Some of the rows."""
-    index = torch.tensor(list(rows), dtype=torch.long)
-    counts = tuple(finds.masks.counts[k] for k in rows)
-    return Finds(
-        Masks(finds.masks.height, finds.masks.width, counts),
-        finds.frame[index],
-        tuple(finds.category[k] for k in rows),
-        finds.score[index],
-    )
-
-
 def people_in(finds: Finds) -> Finds:
     """The rows that are people."""
-    return picked(finds, [k for k, name in enumerate(finds.category) if name == PERSON])
+    rows = [k for k, name in enumerate(finds.category) if name == PERSON]
+    masks = replace(finds.masks, counts=tuple(finds.masks.counts[k] for k in rows))
+    return Finds(masks, finds.frame[rows], (PERSON,) * len(rows), finds.score[rows])
 
 
 def overlap(a: Bool[Tensor, "n h w"], b: Bool[Tensor, "m h w"]) -> Float[Tensor, "n m"]:

@@ -1,6 +1,6 @@
 """A first scene from masks, boxes and classes of one picture, without any network.
 
-1. Each detected thing gets a few shapes of its class (candidates.py).
+1. Each detected thing gets a few shapes of its class: the library's designs, or the user's meshes.
 2. Boxes alone tell the camera's height and which shapes and turns are possible (screen.py).
 3. Silhouettes decide: the descent of the main job (Eq. 1 with its image terms alone, in the robust
    form) from several turns of several shapes of each thing, all at once.
@@ -10,62 +10,186 @@ each thing are kept beside it.
 """
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..energy import HumanCues, ImageCues, SceneWeights
-from ..furniture.library import canonical
-from ..minimize import Adam
-from ..records import record
-from ..run import Run
-from ..stages.find_image_cues import ImageConfig, ImageInputs, find_image_cues
-from ..stages.place_objects import PlaceConfig, PlaceInputs, place_objects
-from ..stages.prepare_objects import (
-    PrepareConfig,
+from mover.core.errors import InputError
+from mover.core.records import record
+from mover.core.run import Run
+from mover.core.types import Camera, Detection, Layout, Mesh, Scene, SceneObject
+from mover.energy.objective import HumanCues, ImageCues
+from mover.furniture.library import canonical, catalogue, choose_piece
+from mover.geometry.mesh import box, used
+from mover.geometry.raster import Crops
+from mover.io.files.fields import At
+from mover.io.files.meshes import KINDS, read_mesh
+from mover.perceive.config import LayoutConfig
+from mover.perceive.depth_map import floor_height, median_depths, range_in
+from mover.perceive.screen import Screened, ScreenInputs, outermost, screen
+from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
+from mover.stages.objects.place_inputs import PlaceInputs
+from mover.stages.objects.place_objects import place_objects
+from mover.stages.objects.prepare_objects import (
     Prepared,
     PrepareInputs,
     prepare_objects,
-    restore,
+    to_objects,
 )
-from ..types import Camera, Detection, Layout, Piece, Scene
-from .candidates import Shape, is_placed, shapes_of
-from .depth_map import floor_height, median_depths, range_in
-from .layout_items import best_items, outer_points, piece_of, repeated, starts_of
-from .screen import ScreenConfig, ScreenInputs, screen
 
+WIDE_CLASSES = {"dining table": ("table", "coffee table", "desk"), "couch": ("sofa", "armchair")}
+"""COCO has one name for what the library tells apart."""
+
+OTHER_SIZES: dict[str, tuple[float, float, float]] = {
+    "refrigerator": (0.70, 1.70, 0.70), "oven": (0.60, 0.90, 0.60), "toilet": (0.40, 0.78, 0.66),
+    "potted plant": (0.50, 0.90, 0.50), "piano": (1.50, 1.15, 0.60), "bathtub": (1.60, 0.58, 0.75),
+    "washing machine": (0.60, 0.86, 0.60), "box": (0.50, 0.40, 0.50),
+}  # fmt: skip
+"""Usual width, height and depth of things that the library lacks [m]; they become blocks."""
+
+NOT_ON_FLOOR = frozenset({
+    "tv", "television", "laptop", "sink", "microwave", "toaster", "book", "vase", "clock", "pillow",
+    "window", "door", "wall", "floor", "ceiling", "picture", "mirror", "curtain", "blinds",
+    "keyboard", "mouse", "remote", "cell phone", "bottle", "cup", "bowl", "person",
+})  # fmt: skip
+"""What does not stand on the ground by itself: it is not placed."""
+
+UNKNOWN_SIZE = (0.60, 0.80, 0.60)
 SLACK = 0.05  # error of measured depth [share]
-SHORT = Adam(40, 0.03, 0.01, beta2=0.98, keep_best=True)
-LONG = Adam(100, 0.02, 0.003, beta2=0.98, keep_best=True)
+TURNED_APART = 0.6  # [rad], turns that are nearer count as one start
 
 
 @dataclass(frozen=True)
-class LayoutConfig:
-    """How the first scene is found."""
+class Shape:
+    """One possible shape at its usual size."""
 
-    shapes: int = 8
-    """Shapes of each thing that the boxes judge."""
-    keep: int = 3
-    """Shapes of each thing that the silhouettes judge."""
-    turns: int = 6
-    """Starts of each of them."""
-    screen: ScreenConfig = field(default_factory=ScreenConfig)
-    """The quick look by boxes."""
-    image: ImageConfig = field(default_factory=lambda: ImageConfig(size=96, form="robust"))
-    """How the picture is sampled."""
-    prepare: PrepareConfig = field(
-        default_factory=lambda: PrepareConfig(faces=600, samples=200, region=20)
+    mesh: Mesh
+    file: str
+    """Where it came from; empty: the library."""
+    size: tuple[float, float, float]
+    """Edges of its box [m]."""
+
+
+def is_placed(category: str) -> bool:
+    """Whether a thing of this class stands on the ground."""
+    return canonical(category) not in NOT_ON_FLOOR
+
+
+def shapes_of(category: str, count: int, folder: Path | None = None) -> tuple[Shape, ...]:
+    """At most `count` shapes of a class that differ most in size and design.
+
+    Args:
+        category: Free text.
+        count: Most shapes.
+        folder: The user's meshes, named after their class: `chair_0.obj`; they come before the
+            library's.
+
+    Raises:
+        InputError: If a mesh cannot be read.
+    """
+    own = () if folder is None else _own_shapes(canonical(category), folder)
+    if own:
+        return _different(own, count)
+    names = WIDE_CLASSES.get(category.lower(), (canonical(category),))
+    known = [
+        Shape(piece.mesh, "", piece.size) for name in names for piece in catalogue(canonical(name))
+    ]
+    if not known:
+        size = OTHER_SIZES.get(canonical(category), UNKNOWN_SIZE)
+        return (Shape(choose_piece(category, size), "", size),)
+    return _different(tuple(known), count)
+
+
+def _different(shapes: tuple[Shape, ...], count: int) -> tuple[Shape, ...]:
+    """The most usual shape, then always the one that is farthest from all that are taken."""
+    if len(shapes) <= count:
+        return shapes
+    logs = np.log(np.array([shape.size for shape in shapes]))
+    taken = [int(np.abs(logs - np.median(logs, axis=0)).sum(1).argmin())]
+    far = np.full(len(shapes), np.inf)
+    while len(taken) < count:
+        far = np.minimum(far, np.square(logs - logs[taken[-1]]).sum(1))
+        taken.append(int(far.argmax()))
+    return tuple(shapes[k] for k in taken)
+
+
+def _own_shapes(category: str, folder: Path) -> tuple[Shape, ...]:
+    """The user's meshes of a class."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder, expected meshes like chair_0.obj")
+    found: list[Shape] = []
+    for path in sorted(folder.iterdir()):
+        name = path.stem.rstrip("0123456789_- ")
+        if path.suffix.lower() in KINDS and canonical(name) == category:
+            mesh, file = read_mesh(At(path.name, path.name), folder)
+            low, high = box(used(mesh).verts)
+            x, y, z = (high - low).tolist()
+            found.append(Shape(mesh, file, (x, y, z)))
+    return tuple(found)
+
+
+def outer_points(shape: Shape) -> Float[Tensor, "points 3"]:
+    """The outermost points of a shape, from the centre of its bottom [m]."""
+    verts = used(shape.mesh).verts
+    low, high = box(verts)
+    origin = torch.stack([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    return outermost(verts - origin).float()
+
+
+def best_items(screened: Screened, owner: list[int], keep: int) -> list[int]:
+    """The `keep` best shapes of each thing, in the order of the things, best first."""
+    best = screened.energy.amin(0)
+    found: list[int] = []
+    for thing in sorted(set(owner)):
+        own = [k for k, o in enumerate(owner) if o == thing]
+        found += sorted(own, key=lambda k: float(best[k]))[:keep]
+    return found
+
+
+def starts_of(screened: Screened, items: list[int], turns: int) -> Layout:
+    """The best turns of each item, spread so that both fronts of a box are tried."""
+    yaw = screened.layout.yaw[:, items]
+    energy = screened.energy[:, items]
+    picks = torch.stack([_apart(yaw[:, k], energy[:, k], turns) for k in range(len(items))], 1)
+    wide = picks[..., None].expand(-1, -1, 3)
+    return Layout(
+        screened.layout.t_world_object[:, items].gather(0, wide),
+        yaw.gather(0, picks),
+        screened.layout.log_scale[:, items].gather(0, wide),
     )
-    """How shapes are made fit."""
-    place: PlaceConfig = field(
-        default_factory=lambda: PlaceConfig(
-            SceneWeights(1.0, 1.0, 0.3, 1.0, 0.0, 0.0), "robust", LONG, short=SHORT, keep=2
-        )
-    )
-    """The descent by silhouettes."""
+
+
+def _apart(yaw: Float[Tensor, " yaws"], energy: Tensor, turns: int) -> Int[Tensor, " turns"]:
+    """Indices of the best turns that differ; the best of the rest fill up."""
+    kept: list[int] = []
+    rest: list[int] = []
+    for k in energy.argsort().tolist():
+        near = [abs(float(torch.remainder(yaw[k] - yaw[j] + torch.pi, 2 * torch.pi)) - torch.pi)
+                for j in kept]  # fmt: skip
+        (kept if all(d > TURNED_APART for d in near) else rest).append(k)
+    return torch.tensor((kept + rest)[:turns])
+
+
+def piece_of(detection: Detection, shape: Shape, name: str) -> SceneObject:
+    """A shape at the origin, standing for a detection."""
+    return SceneObject(
+        id=name, category=detection.category, mesh=shape.mesh, mesh_file=shape.file,
+        annotation=detection.id, support="ground", t_world_object=torch.zeros(3),
+        yaw=torch.tensor(0.0), scale=torch.ones(3),
+    )  # fmt: skip
+
+
+def repeated(cues: ImageCues, things: Int[Tensor, " items"]) -> ImageCues:
+    """The cues of each item's thing."""
+    views = Crops(cues.views.K[things], cues.views.height, cues.views.width)
+    return ImageCues(
+        cues.boxes[things], cues.sides[things], views, cues.masks[things], cues.keep[things],
+        cues.trust[things],
+    )  # fmt: skip
 
 
 @record
@@ -88,7 +212,7 @@ class Picture:
 class Hypothesis:
     """One way in which a thing may stand."""
 
-    piece: Piece
+    piece: SceneObject
     energy: float
     """What is left of the image terms there."""
 
@@ -137,7 +261,7 @@ def first_scene(
     starts = starts_of(screened, items, config.turns)
     inputs = _place_inputs(picture, repeated(cues, things), prepared, starts, screened.height)
     placed = run.stage(place_objects, inputs, config.place)
-    found = restore(pieces, prepared, placed.layout)
+    found = to_objects(pieces, prepared, placed.layout)
     return _scene(picture, (found, things, placed.energy[0]), screened.height, skipped)
 
 
@@ -167,9 +291,9 @@ def _screen_inputs(
     )
 
 
-def _pieces(picture: Picture, pairs: list[tuple[int, Shape]]) -> tuple[Piece, ...]:
+def _pieces(picture: Picture, pairs: list[tuple[int, Shape]]) -> tuple[SceneObject, ...]:
     """One piece for each item; the name tells thing and rank."""
-    found: list[Piece] = []
+    found: list[SceneObject] = []
     for index, (thing, shape) in enumerate(pairs):
         rank = sum(1 for other, _ in pairs[:index] if other == thing)
         found.append(piece_of(picture.detections[thing], shape, f"{thing}_{rank}"))
@@ -190,7 +314,7 @@ def _place_inputs(
 
 def _scene(
     picture: Picture,
-    found: tuple[tuple[Piece, ...], Int[Tensor, " items"], Float[Tensor, " items"]],
+    found: tuple[tuple[SceneObject, ...], Int[Tensor, " items"], Float[Tensor, " items"]],
     height: float,
     skipped: tuple[str, ...],
 ) -> FirstScene:

@@ -1,5 +1,6 @@
-"""The clean picture of a steadied clip, and the furniture in it."""
+"""One picture of the room in which nobody hides furniture: found, or put together from many."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,16 +9,85 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..geometry.runs import decode
-from ..readers.masks import encode, tight_box
-from ..records import fingerprint
-from ..run import Run
-from ..types import Detection, Masks
-from .clean import Clean, CleanConfig, clean_picture, spread_frames
-from .detect import DetectConfig, DetectInputs, Finds, find_instances, overlap
-from .steady import Drift, seen_share
-from .track import Tracks, stack_of
-from .video import Clip, load_frame, write_jpeg
+from mover.core.records import fingerprint, record
+from mover.core.run import Run
+from mover.core.types import Detection, Masks
+from mover.geometry.rle import decode, encode, tight_box
+from mover.perceive.config import CleanConfig, DetectConfig
+from mover.perceive.detect import DetectInputs, Finds, find_instances, overlap
+from mover.perceive.steady import Drift, seen_share
+from mover.perceive.track import Tracks, stack_of
+from mover.perceive.video import Clip, load_frame, write_jpeg
+
+Load = Callable[[int], tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]]
+"""Picture of a frame, and where it shows the empty room."""
+
+
+@record
+class Clean:
+    """The reference picture."""
+
+    picture: Float[Tensor, "h w 3"]
+    """In [0, 1]."""
+    hidden: Bool[Tensor, "h w"]
+    """Pixels that no frame, or too few, show empty."""
+    frame: int
+    """The frame that it is; -1: put together."""
+
+
+def spread_frames(count: int, most: int) -> list[int]:
+    """At most so many frames, evenly over all."""
+    return sorted({round(k) for k in np.linspace(0, count - 1, min(count, most)).tolist()})
+
+
+def clean_picture(frames: Sequence[int], load: Load, config: CleanConfig) -> Clean:
+    """The frame that shows most of the room, or the median of what all frames show.
+
+    Args:
+        frames: Which may be used.
+        load: Gives a frame and where nobody is in it.
+        config: How.
+    """
+    empty = [float(load(frame)[1].float().mean()) for frame in frames]
+    best = int(np.argmax(empty))
+    picture, shown = load(frames[best])
+    if 1 - empty[best] <= config.free or len(frames) < config.least:
+        return Clean(picture, ~shown, frames[best])
+    return _median(frames, load, picture, config)
+
+
+def _median(
+    frames: Sequence[int], load: Load, best: Float[Tensor, "h w 3"], config: CleanConfig
+) -> Clean:
+    """The median of the frames that show a pixel; the best frame where too few do."""
+    rows = torch.arange(best.shape[0]).chunk(config.strips)
+    stacks: list[list[Tensor]] = [[] for _ in rows]
+    for frame in frames:
+        picture, shown = load(frame)
+        bytes_ = (picture * 255).round().to(torch.int16)
+        seen = torch.where(shown[..., None], bytes_, torch.full_like(bytes_, -1))
+        for strip, part in zip(stacks, rows, strict=True):
+            strip.append(seen[part])
+    parts = [_of_strip(torch.stack(strip)) for strip in stacks]
+    picture, times = torch.cat([p for p, _ in parts]), torch.cat([n for _, n in parts])
+    hidden = times < config.least
+    return Clean(torch.where(hidden[..., None], best, picture), hidden, -1)
+
+
+def _of_strip(
+    values: Tensor,
+) -> tuple[Float[Tensor, "h w 3"], Tensor]:
+    """Median of what is not -1, and how many there are."""
+    times = (values[..., 0] >= 0).sum(0)
+    ordered = values.sort(0).values
+    skipped = len(values) - times
+    index = (skipped + (times - 1).clamp_min(0) // 2).clamp_max(len(values) - 1)
+    middle = ordered.gather(0, index[None, ..., None].expand(-1, -1, -1, 3))[0]
+    return middle.clamp_min(0).float() / 255, times
+
+
+# The clean picture of a steadied clip, and the furniture in it.
+
 
 MARGIN = 0.008  # of the picture's width: how far beyond a mask a person may reach
 THINGS = frozenset({

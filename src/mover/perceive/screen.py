@@ -9,52 +9,25 @@ of the tilt) at which all objects together are most usual is the camera's; outli
 """
 
 import math
-from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..geometry.camera import pitch_roll, project, tilted, to_world
-from ..geometry.placement import place
-from ..minimize import Adam, Energy, Observer, minimize, silent
-from ..records import record
-from ..terms.bbox import SEEN, bbox_term
-from ..terms.scale import scale_term
-from ..types import Camera, Layout
+from mover.core.observe import Energy, Observer, silent
+from mover.core.records import record
+from mover.core.types import Camera, Layout
+from mover.energy.minimize import minimize
+from mover.energy.terms.bbox import SEEN, bbox_term
+from mover.energy.terms.scale import scale_term
+from mover.geometry.camera import pitch_roll, project, tilted, to_world
+from mover.geometry.placement import place
+from mover.perceive.config import ScreenConfig
 
 DIRECTIONS = 60  # in which the outermost point of a shape is kept
 LITTLE = 0.01  # share of items that are not the best
 NEAREST = 0.6  # [m], where a start is put at least
 FARTHEST = 15.0  # [m], and at most
-
-
-@dataclass(frozen=True)
-class ScreenConfig:
-    """How the quick look is done."""
-
-    heights: tuple[float, ...] = (0.8, 0.95, 1.1, 1.25, 1.4, 1.6, 1.8, 2.05, 2.35)
-    """Heights of the camera that are tried [m]."""
-    usual: float = 1.5
-    """The usual one [m],"""
-    spread: float = 0.4
-    """and how much it varies (of its logarithm)."""
-    yaws: int = 8
-    """Turns that are tried."""
-    scale: float = 0.3
-    """Weight of usual sizes against boxes."""
-    depth: float = 0.5
-    """Weight of measured depth, where there is any."""
-    tilt: float = math.radians(3)
-    """How wrong pitch and roll may be [rad]; 0: not at all."""
-    prior: float = 0.03
-    """Weight of usual heights and tilts."""
-    cap: float = 0.3
-    """Most that one object may say about the height."""
-    soft: float = 0.05
-    """Shapes that fit worse than the best by so much hardly count."""
-    method: Adam = field(default_factory=lambda: Adam(100, 0.05, 0.005, beta2=0.98))
-    """The descent."""
 
 
 @record

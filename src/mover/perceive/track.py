@@ -3,11 +3,11 @@
 The video is cut into segments. At the first frame of each, people are detected; who overlaps
 somebody that is already followed stays the same person, all others are new. SAM 2 then carries all
 masks through the segment. Each segment is kept on disk, so a killed run goes on with the next.
-Without a tracker detections in all frames are linked by their overlap.
+Without a tracker detections in all frames are linked by their overlap. ViTPose then finds the
+joints of everybody in the box of their mask.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
@@ -16,34 +16,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..geometry.runs import decode
-from ..minimize import Observer, Step, silent
-from ..readers.masks import encode
-from ..records import record
-from ..types import Masks
-from .detect import Finds, overlap
-from .models import ModelsConfig, Network, network
-from .video import Clip, load_frame
+from mover.core.observe import Observer, Step, silent
+from mover.core.records import record
+from mover.core.types import Keypoints, Masks
+from mover.geometry.rle import decode, encode, tight_box
+from mover.perceive.config import JointsConfig, TrackConfig
+from mover.perceive.detect import Finds, Network, network, overlap
+from mover.perceive.video import Clip, load_frame, read_picture
 
 MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as SAM 2 was trained
-
-
-@dataclass(frozen=True)
-class TrackConfig:
-    """How people are followed."""
-
-    models: ModelsConfig = field(default_factory=ModelsConfig)
-    """Which network."""
-    segment: int = 50
-    """Frames between two detections."""
-    same: float = 0.3
-    """Overlap from which on a detection is somebody who is already followed."""
-    present: float = 0.0
-    """Least score (logit) of SAM 2 that a person is in the picture."""
-    least: float = 0.0004
-    """Smallest mask, as a share of the picture."""
-    patience: int = 10
-    """Frames for which somebody who is not detected is remembered (without a tracker)."""
+LAYOUT = "coco17"  # of ViTPose's joints
 
 
 @record
@@ -214,3 +196,59 @@ def _tracks(
 ) -> Tracks:
     frame, person = (torch.tensor([r[k] for r in rows], dtype=torch.long) for k in (0, 1))
     return Tracks(Masks(*size, tuple(codes)), frame, person, used)
+
+
+@record
+class JointsInputs:
+    """People in the frames of a clip."""
+
+    clip: Clip
+    tracks: Tracks
+
+
+def find_joints(
+    inputs: JointsInputs, config: JointsConfig, observe: Observer = silent
+) -> Keypoints:
+    """Joints of everybody whose mask is known.
+
+    Raises:
+        InputError: If the network is not there.
+    """
+    net = network("keypoints", config.models.keypoints, config.models)
+    tracks = inputs.tracks
+    points: list[Tensor] = []
+    scores: list[Tensor] = []
+    for begin in range(0, len(tracks.frame), config.batch):
+        rows = range(begin, min(begin + config.batch, len(tracks.frame)))
+        boxes = [tight_box(decode(tracks.masks, row)) for row in rows]
+        pictures = [read_picture(inputs.clip.path(int(tracks.frame[row]))) for row in rows]
+        for one in joints_in(net, pictures, boxes):
+            points.append(one[:, :2])
+            scores.append(one[:, 2].clamp(0, 1))
+        observe(Step("find_joints", rows[-1] + 1, len(tracks.frame)))
+    none = torch.zeros(0, 17)
+    return Keypoints(
+        points=torch.stack(points) if points else none[..., None].expand(0, 17, 2),
+        confidence=torch.stack(scores) if scores else none,
+        layout=LAYOUT,
+        frame=tracks.frame,
+        person=tracks.person,
+        fps=inputs.clip.fps,
+    )
+
+
+def joints_in(
+    net: Network, pictures: list[Any], boxes: list[Float[Tensor, "4"]]
+) -> list[Float[Tensor, "joints 3"]]:
+    """x, y [px] and confidence of one person's joints in each picture."""
+    corners = [
+        [[x, y, right - x, bottom - y]] for x, y, right, bottom in (b.tolist() for b in boxes)
+    ]
+    inputs = net.processor(images=pictures, boxes=corners, return_tensors="pt").to(net.device)
+    with torch.inference_mode():
+        outputs = net.model(**inputs)
+    found = net.processor.post_process_pose_estimation(outputs, boxes=corners)
+    return [
+        torch.cat([one[0]["keypoints"], one[0]["scores"].reshape(-1, 1)], -1).float().cpu()
+        for one in found
+    ]

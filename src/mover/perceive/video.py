@@ -1,20 +1,24 @@
 """Frames of a video or of a folder of pictures, at an even rate, as files."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from ..minimize import Observer, Step, silent
-from ..readers.fields import reason
-from ..readers.people.files import natural
-from ..records import InputError, fingerprint, record, replacing
+from mover.core.errors import InputError
+from mover.core.files import replacing
+from mover.core.observe import Observer, Step, silent
+from mover.core.records import fingerprint, record
+from mover.io.files.fields import reason
+from mover.io.people.values import natural
+from mover.perceive.config import FramesConfig
 
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 LARGEST_AREA = 1 << 26  # [px²], of a frame
@@ -22,20 +26,6 @@ QUALITY = 95  # of JPEG
 EARLY = 0.05  # of the time between two frames: how early one may be taken
 
 Picture = UInt8[np.ndarray, "h w 3"]
-
-
-@dataclass(frozen=True)
-class FramesConfig:
-    """Which frames are taken."""
-
-    fps: float = 5.0
-    """Frames a second; 0: all."""
-    start: float = 0.0
-    """Where to begin [s]."""
-    end: float = 0.0
-    """Where to stop [s]; 0: at the end."""
-    folder_fps: float = 0.0
-    """Frames a second of a folder of pictures; 0: unknown, all are taken."""
 
 
 @record
@@ -165,16 +155,36 @@ def read_picture(path: Path) -> Picture:
     Raises:
         InputError: If it cannot be read.
     """
-    from PIL import Image, ImageOps
+    from PIL import ImageOps
+
+    with opened_picture(path) as picture:
+        return np.array(ImageOps.exif_transpose(picture).convert("RGB"))
+
+
+@contextmanager
+def opened_picture(
+    path: Path, expected: str = "a picture", large: Literal["error", "ignore"] = "error"
+) -> Generator[Any]:
+    """An open picture of PIL; what goes wrong while it is used is told in one sentence.
+
+    Args:
+        path: The file.
+        expected: What it should be.
+        large: What becomes of one with suspiciously many pixels.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    from PIL import Image
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            warnings.simplefilter(large, Image.DecompressionBombWarning)
             with Image.open(path) as picture:
-                return np.array(ImageOps.exif_transpose(picture).convert("RGB"))
+                yield picture
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Warning) as error:
         raise InputError(
-            f"{path.name}: cannot be read ({reason(error)}), expected a picture"
+            f"{path.name}: cannot be read ({reason(error)}), expected {expected}"
         ) from error
 
 

@@ -1,15 +1,15 @@
 # pyright: basic, reportInvalidTypeForm=false
-"""Where the outline of an item passes between pixel centres, as in `raster_contour`."""
+"""Where the outline of an item passes between pixel centres."""
 
 from typing import no_type_check
 
 import warp as wp
 
-from ..raster_contour import LEVEL
-from ..raster_spans import TINY
-from .scene import Scene, Scratch
+from mover.geometry.kernels.scene import Scene, Scratch
+from mover.geometry.kernels.spans import TINY
 
 HALF = wp.constant(wp.uint64(32))
+LEVEL = 1e-6  # [px], edges shorter than this along their lines have no place to be cut
 STEEP, OUTWARD = 2, 1  # flags of a cut
 
 

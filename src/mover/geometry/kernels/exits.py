@@ -5,8 +5,7 @@ from typing import no_type_check
 
 import warp as wp
 
-from ..raster_spans import TINY
-from .spans import SLACK, Triangle, on_screen, signed_area, triangle
+from mover.geometry.kernels.spans import SLACK, TINY, Triangle, on_screen, signed_area, triangle
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -26,7 +25,7 @@ def project(
 @wp.func
 @no_type_check
 def fill(t: Triangle, row: int, item: int, out: wp.array3d(dtype=wp.float32)) -> None:
-    """Raise the inverse depth of the run of one row, as in `raster_spans.spans` and `zbuffer`."""
+    """Raise the inverse depth of the run of one row."""
     y = float(row) + 0.5
     x = t.across.x + (y - t.across.y) * t.across.x_step
     q = t.across.q + (y - t.across.y) * t.across.q_step

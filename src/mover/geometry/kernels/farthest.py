@@ -5,7 +5,7 @@ from typing import no_type_check
 
 import warp as wp
 
-from .nearest import SLACK
+from mover.geometry.kernels.nearest import SLACK
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -9,11 +9,11 @@ from typing import no_type_check
 
 import warp as wp
 
-from .contour import contour, crossing, cut_of, gap, key, pull_cut
-from .items import NEAR, NOWHERE
-from .scene import Maps, Pull, Scene, Scratch
-from .spans import Triangle, on_screen, paint, signed_area, triangle
-from .surface import face_of, inverse_depth, pull_pixel, show_pixel
+from mover.geometry.kernels.contour import contour, crossing, cut_of, gap, key, pull_cut
+from mover.geometry.kernels.items import NEAR, NOWHERE
+from mover.geometry.kernels.scene import Maps, Pull, Scene, Scratch
+from mover.geometry.kernels.spans import Triangle, on_screen, paint, signed_area, triangle
+from mover.geometry.kernels.surface import face_of, inverse_depth, pull_pixel, show_pixel
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

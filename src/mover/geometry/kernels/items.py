@@ -8,10 +8,10 @@ from typing import no_type_check
 
 import warp as wp
 
-from .contour import contour, crossing, cut_of, gap, key, pull_cut
-from .scene import Maps, Pull, Scene, Scratch
-from .spans import on_screen, paint, signed_area, triangle
-from .surface import face_of, inverse_depth, pixel_of, pull_pixel, show_pixel
+from mover.geometry.kernels.contour import contour, crossing, cut_of, gap, key, pull_cut
+from mover.geometry.kernels.scene import Maps, Pull, Scene, Scratch
+from mover.geometry.kernels.spans import on_screen, paint, signed_area, triangle
+from mover.geometry.kernels.surface import face_of, inverse_depth, pixel_of, pull_pixel, show_pixel
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -11,8 +11,8 @@ from typing import no_type_check
 
 import warp as wp
 
-from .bodies import BESIDE, SHELL, SLACK, WITHIN, Work
-from .packs import Eight, expand, look, reached, to_leaf
+from mover.geometry.kernels.bodies import BESIDE, SHELL, SLACK, WITHIN, Work
+from mover.geometry.kernels.packs import Eight, expand, look, reached, to_leaf
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

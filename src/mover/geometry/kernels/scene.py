@@ -5,8 +5,6 @@ from typing import no_type_check
 
 import warp as wp
 
-BORDER = 1  # [px], so that an outline just outside the window still moves the window's pixels
-
 
 @wp.struct
 @no_type_check

@@ -1,18 +1,19 @@
 # pyright: basic, reportInvalidTypeForm=false, reportGeneralTypeIssues=false
-"""A triangle's runs of pixel centres, row by row, as `raster_spans` makes them.
+"""A triangle's runs of pixel centres, row by row.
 
-The order of the operations is that of the torch version, and products are not fused with sums, so
-that both decide alike for centres on an edge.
+The order of the operations is that of the reference in torch, and products are not fused with sums,
+so that both decide alike for centres on an edge.
 """
 
 from typing import no_type_check
 
 import warp as wp
 
-from ..camera import NEAR
-from ..raster_spans import AWAY, TINY
-from .scene import Scene, Scratch
+from mover.geometry.camera import NEAR
+from mover.geometry.kernels.scene import Scene, Scratch
 
+TINY = 1e-12  # [px], keeps the slope of level edges finite; their rows use its sign only
+AWAY = 1e9  # [px], vertices further off would overflow; their triangles are left out
 SLACK = 0.01  # [px], far more than the rounding of a cut near the window
 FULL = wp.constant(wp.uint32(0x7FFFFFFF))
 HALF = wp.constant(wp.uint64(32))

@@ -1,9 +1,11 @@
-"""Starts Warp without a word and compiles the kernels once."""
+"""Starts Warp without a word, compiles the kernels once, and shares their work among threads."""
 
 import logging
 import os
-from collections.abc import Generator
+from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -12,8 +14,10 @@ from types import ModuleType
 from typing import Any
 
 import torch
+from torch import Tensor
 
 log = logging.getLogger(__name__)
+_threads: ContextVar[int | None] = ContextVar("threads", default=None)
 _lock = RLock()  # of all that is done once; `cache` alone lets two threads do it
 
 
@@ -32,20 +36,20 @@ def _started() -> ModuleType:
     return wp
 
 
-def kernels(name: str, device: str) -> ModuleType:
-    """The module of that name in this package, compiled for the device.
+def kernels(name: str, device: str, package: str = __package__ or "") -> ModuleType:
+    """The module of that name in a package of kernels, compiled for the device.
 
     The first call on a machine compiles (seconds, told before by a line of the log, which the
     commands show); the result stays in Warp's cache, and later runs load it.
     """
     with _lock:
-        return _loaded(name, device)
+        return _loaded(package, name, device)
 
 
 @cache
-def _loaded(name: str, device: str) -> ModuleType:
+def _loaded(package: str, name: str, device: str) -> ModuleType:
     wp = started()
-    module = import_module(f"{__package__}.{name}")
+    module = import_module(f"{package}.{name}")
     if _fresh(wp, module, device):
         log.info("compiling kernels, once on this machine: %s for %s ...", name, device)
     with _quiet(wp):
@@ -95,3 +99,55 @@ def _quiet(wp: ModuleType) -> Generator[None, None, None]:
         os.close(keep)
         os.close(sink)
         wp.config.log_level = level
+
+
+def array(tensor: Tensor, dtype: str) -> Any:  # noqa: ANN401
+    """The tensor's memory as an array of Warp."""
+    wp = started()
+    return wp.from_torch(tensor.detach(), dtype=getattr(wp, dtype))
+
+
+def threads() -> int:
+    """Threads that draw on a CPU: of `use_threads`, else of OMP_NUM_THREADS, else one a core.
+
+    They never wait for one another within an item, so that, unlike torch's, they pay for small
+    work too.
+    """
+    asked = os.environ.get("OMP_NUM_THREADS", "")
+    return _threads.get() or (int(asked) if asked.isdigit() and int(asked) else _cores())
+
+
+@contextmanager
+def use_threads(count: int) -> Generator[None, None, None]:
+    """Let so many threads draw inside the block (or the decorated function)."""
+    token = _threads.set(count)
+    try:
+        yield
+    finally:
+        _threads.reset(token)
+
+
+@cache
+def _cores() -> int:
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def share(work: Callable[[int], object], n: int) -> None:
+    """Do the work for 0 ... n - 1 on as many threads as are wanted, this one among them."""
+    todo = iter(range(n))
+
+    def run() -> None:
+        for item in todo:
+            work(item)
+
+    others = [_pool().submit(run) for _ in range(min(threads(), n) - 1)]
+    run()
+    for other in others:
+        if not other.cancel():
+            other.result()
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(thread_name_prefix="mover-draw")

@@ -1,5 +1,5 @@
 # pyright: basic, reportInvalidTypeForm=false
-"""Depth of the surface that a pixel sees, and its gradient, as in `raster_depth`.
+"""Depth of the surface that a pixel sees, and its gradient.
 
 The depth itself is that of the run of pixels: in single precision it is nearer to the exact value
 than the plane through the vertices, from which the gradient comes.
@@ -9,9 +9,10 @@ from typing import no_type_check
 
 import warp as wp
 
-from ..raster_depth import AGREE, GRAZING
-from .scene import Maps, Pull, Scene
+from mover.geometry.kernels.scene import Maps, Pull, Scene
 
+GRAZING = 0.01  # sine of the angle below which a triangle's depth has no gradient
+AGREE = 1e-3  # relative difference of plane and scan line in 1/z beyond which the plane is noise
 FULL = wp.constant(wp.uint32(0x7FFFFFFF))
 LOW = wp.constant(wp.uint64(0xFFFFFFFF))
 HALF = wp.constant(wp.uint64(32))

@@ -1,0 +1,1 @@
+"""What a user meets: commands, report, viewer, pictures, batches."""

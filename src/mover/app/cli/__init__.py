@@ -1,0 +1,140 @@
+"""The command line. This file imports nothing heavy: `mover --help` answers at once."""
+
+import importlib
+import logging
+import sys
+from collections.abc import Callable, Sequence
+
+from mover.app.cli.console import say
+from mover.core.errors import InputError
+
+COMMANDS = {
+    "demo": (
+        "mover_bench.cli:demo",
+        "Make a known room, reconstruct it, compare it with the truth.",
+    ),
+    "import": (
+        "mover.app.cli.imports:import_",
+        "Turn what other tools wrote into a capture folder.",
+    ),
+    "perceive": (
+        "mover.app.cli.perceive:perceive",
+        "From a video to a capture: frames, masks, joints, a first scene.",
+    ),
+    "layout": (
+        "mover.app.cli.perceive:layout",
+        "Find a first scene of library furniture in one picture's masks or boxes.",
+    ),
+    "import-bodies": (
+        "mover.app.cli.people:bodies",
+        "Turn what another tool found of people into bodies.npz or keypoints.npz.",
+    ),
+    "fit": (
+        "mover.app.cli.fit:fit",
+        "Fit bodies to the 2D joints of a video.",
+    ),
+    "check": (
+        "mover.app.cli.check:check",
+        "Validate a capture, list the evidence of each object, draw the initial overlay.",
+    ),
+    "run": (
+        "mover.app.cli.run:run",
+        "Reconstruct a room from a capture folder.",
+    ),
+    "refine": (
+        "mover.app.cli.refine:refine",
+        "Refine the people of a result with its room: their pose, or their place.",
+    ),
+    "contacts": (
+        "mover.app.cli.refine:contacts",
+        "Which vertices touch something, by POSA's network or from files.",
+    ),
+    "evaluate": (
+        "mover.app.cli.check:evaluate",
+        "Compare a result with the truth.",
+    ),
+    "paper-table": (
+        "mover_bench.cli:show_paper_table",
+        "Print the paper's table for your copy of PROX or PiGraphs.",
+    ),
+    "rooms": (
+        "mover_bench.cli:clip_rooms",
+        "Make a known room in which somebody moves as in a clip of motion capture.",
+    ),
+    "experiment": (
+        "mover_bench.cli:run_presets",
+        "Rebuild known rooms with each preset and compare them with the truth.",
+    ),
+    "export": (
+        "mover.app.cli.export:export",
+        "Write a result for other programs: GLB, USD, MJCF, URDF, PLY, bodies.",
+    ),
+    "render": (
+        "mover.app.cli.render:render",
+        "Draw a result without a screen: a picture or a film.",
+    ),
+    "view": (
+        "mover.app.cli.view:view",
+        "Look at a result in the browser, correct it, solve it again.",
+    ),
+    "simulate": (
+        "mover.app.cli.export:simulate",
+        "Let gravity act on a result: how far does each piece move?",
+    ),
+    "batch": (
+        "mover.app.cli.batch:batch",
+        "Run thousands of captures; what is finished is not run again.",
+    ),
+}
+"""Where a command is, and what it does."""
+ALIASES = {"bodies": "import-bodies", "settle": "simulate"}
+"""Names of before, for one release: they work and say so."""
+USAGE = "usage: mover COMMAND [OPTIONS]; mover COMMAND --help tells more"
+
+
+def main() -> None:
+    """Run the command that is named first."""
+    arguments = sys.argv[1:]
+    if not arguments or arguments[0] in ("-h", "--help"):
+        lines = [f"  {name:<12} {text}" for name, (_, text) in COMMANDS.items()]
+        say("\n".join([USAGE, "", "Rooms from the people who move in them.", "", *lines]))
+        return
+    if arguments[0] == "--version":
+        from mover import __version__
+
+        say(f"mover {__version__}")
+        return
+    if arguments[0] not in COMMANDS and arguments[0] not in ALIASES:
+        say(f"mover: no command {arguments[0]!r}; there are {', '.join(COMMANDS)}\n{USAGE}")
+        raise SystemExit(2)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    logging.getLogger("mover.geometry.kernels").setLevel(logging.INFO)  # what is compiled, once
+    raise SystemExit(run_command(arguments[0], arguments[1:]))
+
+
+def run_command(name: str, arguments: Sequence[str]) -> int:
+    """Parse the arguments of a command and run it; the exit code."""
+    if name in ALIASES:
+        say(f"mover {name} is called mover {ALIASES[name]} now", sys.stderr)
+        name = ALIASES[name]
+    try:
+        command_of(name)(arguments)
+    except InputError as error:
+        say(f"mover {name}: {error}", sys.stderr)
+        return 2
+    except OSError as error:  # a full disk, a folder that may not be written, a file as --out
+        where = f"{error.filename}: " if error.filename else ""
+        say(
+            f"mover {name}: {where}{error.strerror or error}; what was finished is kept", sys.stderr
+        )
+        return 2
+    except KeyboardInterrupt:
+        say(f"\nmover {name}: stopped; the same command goes on from here", sys.stderr)
+        return 130
+    return 0
+
+
+def command_of(name: str) -> Callable[[Sequence[str]], None]:
+    """The function of a command; its module is imported now."""
+    module, _, function = COMMANDS[name][0].partition(":")
+    return getattr(importlib.import_module(module), function)

@@ -1,0 +1,41 @@
+"""Which settings a command line asks for: a preset, a file, and the methods of descents."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from mover.app.cli.console import say
+from mover.core.errors import InputError
+from mover.pipeline.presets import PRESETS, Config, with_methods, with_present_flags
+
+Device = Literal["auto", "cpu", "cuda"]
+"""Where the heavy stages compute, see `core.devices.device_of`."""
+
+
+def chosen_config(arguments: Sequence[str]) -> tuple[Config, list[str]]:
+    """The preset or file is read first, so that the other flags may stand before or after it."""
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--preset", default="robust")
+    early.add_argument("--config", type=Path)
+    arguments, renamed = with_present_flags(arguments)
+    for sentence in renamed:
+        say(f"warning: {sentence}", sys.stderr)
+    chosen, _ = early.parse_known_args(arguments)
+    if chosen.config is None:
+        return with_methods(preset_named(chosen.preset), arguments)
+    from mover.app.results import read_config
+
+    return with_methods(read_config(chosen.config), arguments)
+
+
+def preset_named(name: str) -> Config:
+    """A preset by its name.
+
+    Raises:
+        InputError: If there is none of that name.
+    """
+    if name not in PRESETS:
+        raise InputError(f"--preset: {name!r} is none of {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -1,0 +1,73 @@
+"""What `export` and `simulate` do."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from mover.app.cli.console import say
+from mover.core.errors import InputError
+from mover.io.formats import chosen, names
+
+if TYPE_CHECKING:
+    Target = str
+else:
+    Target = Literal[tuple(names("export"))]  # the table's names are refused or shown by the parser
+
+
+@dataclass(frozen=True)
+class ExportArgs:
+    """Write a result for other programs, into OUT/export."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder of the result."""
+    to: tuple[Target, ...] = ("glb",)
+    """What to write; several with spaces between them."""
+    capture: Path | None = None
+    """Folder of the capture: its bodies.npz tells the parameters of the bodies."""
+    body: Literal["auto", "skin", "morph", "none"] = "auto"
+    """glb: how people move: on bones, by exact shapes of some frames, or not at all."""
+    up: Literal["y", "z"] = "y"
+    """bodies: y is the world of scene.json, z that of AMASS."""
+
+
+@dataclass(frozen=True)
+class SimulateArgs:
+    """Let gravity act on a result; writes OUT/settle.json."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder of the result."""
+    truth: Path | None = None
+    """Folder with the true scene.json, to settle it as well."""
+    seconds: float = 3.0
+    """Time of the simulation [s]."""
+
+
+def export(arguments: Sequence[str]) -> None:
+    """`mover export`."""
+    args = tyro.cli(ExportArgs, prog="mover export", args=list(arguments))
+    from mover.io.export.finished import Exported, read_finished
+
+    writers = {target: chosen("--to", target, "export") for target in args.to}
+    finished, folder = read_finished(args.out, args.capture), args.out / "export"
+    options = {"glb": {"body": args.body}, "bodies": {"up": args.up}}
+    for target, write in writers.items():
+        found: Exported = write(finished, folder, **options.get(target, {}))
+        shown = found.files if len(found.files) <= 3 else found.files[:1]
+        more = f" and {len(found.files) - 1} more" if len(found.files) > 3 else ""
+        say(f"{target}: {', '.join(str(file) for file in shown)}{more}")
+        for note in found.notes:
+            say(f"  {note}")
+
+
+def simulate(arguments: Sequence[str]) -> None:
+    """`mover simulate`."""
+    args = tyro.cli(SimulateArgs, prog="mover simulate", args=list(arguments))
+    from mover.app.simulate import SimulationConfig, simulate_folder, simulation_table
+
+    if not 0 < args.seconds <= 60:
+        raise InputError(f"--seconds: {args.seconds:g}, expected more than 0, at most 60")
+    say(simulation_table(simulate_folder(args.out, args.truth, SimulationConfig(args.seconds))))

@@ -1,0 +1,227 @@
+"""What `import` does."""
+
+import dataclasses
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+from mover.app.cli.console import say
+from mover.core.errors import InputError
+from mover.io.formats import IMPORTED, chosen, listing
+
+if TYPE_CHECKING:
+    from mover.io.capture.merge import Imported
+    from mover.io.capture.parts import Hints, Parts
+    from mover.io.files.fields import At
+    from mover.io.masks.instances import Instances
+
+
+FORMATS = f"How the source is written; see docs/your-own-data.md.\n{listing(*IMPORTED)}"
+
+
+@dataclass(frozen=True)
+class ImportArgs:
+    """Turn what other tools wrote into a capture folder, part by part.
+
+    A part that is there already stays, unless it is given anew. Say `masks` as the format to add
+    masks alone. Afterwards the command tells what is still missing.
+    """
+
+    format: Annotated[Positional[str], arg(metavar="FORMAT", help=FORMATS)]
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")]
+    """The file or folder."""
+    out: Path
+    """The capture folder: new, or one to which this is added."""
+    image: Path | None = None
+    """The reference image."""
+    camera: Path | None = None
+    """A calibration: camera.json, transforms of nerfstudio, cam_K.txt, OpenCV's XML, fov.json."""
+    fov: float | None = None
+    """Horizontal field of view, where there is no calibration [degrees]."""
+    objects_masks: Path | None = None
+    """Masks of the furniture in the reference image."""
+    people_masks: Path | None = None
+    """Masks of people in the frames."""
+    reference_people: Path | None = None
+    """Masks of people who hide furniture in the reference image."""
+    bodies: Path | None = None
+    """bodies.npz, or what the tool of --bodies-from wrote."""
+    bodies_from: str = ""
+    """The tool that found the bodies, as gvhmr, wham, tram or smplifyx; else bodies.npz."""
+    gender: str | None = None
+    """Of the bodies, where the tool does not tell: neutral, female or male."""
+    fps: float | None = None
+    """Frames a second of the people's masks and bodies."""
+    up: str = ""
+    """Which way is up in a glTF scene or in boxes: y, -y or z."""
+    names: tuple[str, ...] = ()
+    """Categories of what has only a number or a file name, as 1=chair 2=sofa."""
+    recording: str = ""
+    """Which recording of a data set (PROX, PiGraphs)."""
+    boxes: Path | None = None
+    """bbox3d.json of MOVER's authors: the true furniture of a room of PROX."""
+
+
+def import_(arguments: Sequence[str]) -> None:
+    """`mover import`."""
+    args = tyro.cli(ImportArgs, prog="mover import", args=list(arguments))
+    chosen("FORMAT", args.format, *IMPORTED)
+    with tempfile.TemporaryDirectory(prefix="mover-import-") as work:
+        run_import(args, Path(work))
+
+
+def run_import(args: ImportArgs, work: Path) -> None:
+    """Import one source.
+
+    Args:
+        args: What was typed.
+        work: A folder for meshes on the way.
+    """
+    from mover.io.capture.merge import import_into
+
+    hints = _hints(args, work)
+    main: Parts = chosen("FORMAT", args.format, *IMPORTED)(args.source, hints)
+    imported = import_into(args.out, *_parts(args, main, hints))
+    tell(imported, args.out)
+
+
+def _hints(args: ImportArgs, work: Path) -> "Hints":
+    """What the options say; a camera of the folder counts where none is given."""
+    from mover.io.capture.folder import folder_parts
+    from mover.io.capture.parts import Hints
+    from mover.io.files.cameras import of_view, read_camera_file
+    from mover.io.files.images import image_size
+
+    size = None if args.image is None else image_size(args.image)
+    camera: At | None = None
+    old = folder_parts(args.out) if args.out.is_dir() else None
+    if size is None and old is not None:
+        size = old.image_size
+    if args.camera is not None:
+        camera = read_camera_file(args.camera, size)
+    elif args.fov is not None:
+        if size is None:
+            raise InputError("--fov: needs the size of the image, expected --image too")
+        camera = of_view(args.fov, size, "--fov")
+    elif old is not None:
+        camera = old.camera
+    return Hints(camera, args.image, args.up, _names(args.names), args.recording, args.boxes, work)
+
+
+def _names(given: Sequence[str]) -> dict[str, str]:
+    """`1=chair` as a table."""
+    pairs = [item.partition("=") for item in given]
+    for key, equals, value in pairs:
+        if not key or not equals or not value.strip():
+            raise InputError(f"--names: has {key + equals + value!r}, expected 1=chair")
+    return {key: value.strip() for key, _, value in pairs}
+
+
+def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
+    """The source and what the options add."""
+    from mover.io.capture.bodies_file import read_body_arrays
+    from mover.io.capture.parts import Parts, image_parts
+
+    found = [main]
+    extra = Parts(name=args.out.name)
+    if args.camera is not None or args.fov is not None:
+        extra = dataclasses.replace(extra, camera=hints.camera)
+    if args.image is not None:
+        load, size = image_parts(args.image)
+        extra = dataclasses.replace(extra, load_image=load, image_size=size)
+    if args.bodies is not None:
+        bodies = read_body_arrays(args.bodies, args.fps) if not args.bodies_from else None
+        bodies = bodies or _bodies_of_tool(args, [*found, extra], hints)
+        extra = dataclasses.replace(extra, bodies=bodies)
+    return [*found, extra, *_masks(args, [*found, extra], hints)]
+
+
+def _bodies_of_tool(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "At":
+    """Bodies of another tool, as the arrays of bodies.npz."""
+    from mover.io.capture.bodies_file import bodies_to_arrays
+    from mover.io.capture.camera_file import camera_of
+    from mover.io.files.fields import At
+    from mover.io.people.bodies import bodies_from
+    from mover.io.people.found import Known
+
+    assert args.bodies is not None
+    chosen("--bodies-from", args.bodies_from, "people")
+    lens = next((p.camera for p in reversed(parts) if p.camera is not None), hints.camera)
+    known = Known(
+        camera=None if lens is None else camera_of(lens), fps=args.fps, gender=args.gender
+    )
+    found = bodies_from(args.bodies_from, args.bodies, known)
+    for text in found.warnings:
+        say(f"note: {text}")
+    return At(bodies_to_arrays(found.bodies), args.bodies.name)
+
+
+def _masks(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "list[Parts]":
+    """Masks of the options, in an image of the size that the camera says."""
+    from mover.io.capture.parts import Parts
+    from mover.io.masks.instances import (
+        fitted,
+        is_person,
+        objects_tree,
+        people_tree,
+        with_reference_people,
+    )
+
+    camera = next((p.camera for p in reversed(parts) if p.camera is not None), hints.camera)
+    size = None if camera is None else (camera.value.get("w"), camera.value.get("h"))
+    found: list[Parts] = []
+    if args.objects_masks is not None:
+        masks = fitted(_read(args.objects_masks, hints), size)
+        things = [item for item in masks.items if not is_person(item)]
+        found.append(Parts(name="", objects=objects_tree(masks, things)))
+    if args.people_masks is not None:
+        masks = only_people(fitted(_read(args.people_masks, hints), size))
+        found.append(Parts(name="", people=people_tree(masks, args.fps)))
+    if args.reference_people is not None:
+        masks = only_people(fitted(_read(args.reference_people, hints), size))
+        people = next((p.people for p in reversed([*parts, *found]) if p.people is not None), None)
+        found.append(Parts(name="", people=with_reference_people(people, masks, args.out)))
+    return found
+
+
+def _read(path: Path, hints: "Hints") -> "Instances":
+    """Masks of an option."""
+    from mover.io.files.images import image_size
+    from mover.io.masks.instance_files import read_instances
+
+    size = None if hints.image is None else image_size(hints.image)
+    return read_instances(path, hints.names, size)
+
+
+def only_people(found: "Instances") -> "Instances":
+    """The people among the instances; all of them where nothing has a name."""
+    from mover.io.capture.parts import UNKNOWN
+    from mover.io.masks.instances import is_person
+
+    kept = tuple(i for i in found.items if is_person(i) or i.category == UNKNOWN)
+    return dataclasses.replace(found, items=kept)
+
+
+def tell(imported: "Imported", folder: Path) -> None:
+    """Say what the capture has and what it lacks."""
+    from mover.io.capture.evidence import evidence_table, gather_evidence
+    from mover.io.capture.pairing import odd_world
+
+    say(f"{folder}: wrote {', '.join(imported.written) or 'nothing'}")
+    for note in imported.notes:
+        say(f"note: {note}")
+    capture = imported.capture
+    if capture is not None:
+        say(evidence_table(capture, gather_evidence(capture)))
+        odd = odd_world(capture.scene, capture.detections)
+        if odd is not None:
+            say(f"warning: {odd}")
+    for text in imported.missing:
+        say(f"still missing: {text}")
+    if capture is not None:
+        say(f"next: mover check {folder}; mover run {folder} --out OUT")

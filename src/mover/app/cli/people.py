@@ -1,0 +1,124 @@
+"""`mover import-bodies`."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from mover.app.cli.console import say
+from mover.core.errors import InputError
+from mover.io.formats import listing, names
+
+TOOLS = f"The tool that wrote the source; see docs/data.md.\n{listing('people', 'keypoints')}"
+
+
+@dataclass(frozen=True)
+class BodiesArgs:
+    """Turn what another tool found of people into bodies.npz, or keypoints.npz for 2D joints."""
+
+    tool: Annotated[Positional[str], arg(metavar="TOOL", help=TOOLS)]
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")]
+    """Its file or folder."""
+    out: Path | None = None
+    """The file to write: bodies.npz, or keypoints.npz."""
+    camera: Path | None = None
+    """The true lens (camera.json or a calibration): bodies keep their pixels under it."""
+    focal: float | None = None
+    """The focal length that the tool assumed, where its files do not tell [px]."""
+    model_folder: Path | None = None
+    """Folder of the licensed body models; by default what MOVER_BODY_MODELS names."""
+    faces: Path | None = None
+    """A mesh file with the triangles of the bodies, for meshes without a model."""
+    gender: Literal["neutral", "female", "male"] | None = None
+    """Of the body model; by default what the files say, else neutral."""
+    fps: float | None = None
+    """Frames a second."""
+    first: int = 0
+    """The number in the name of the first frame's file, 1 where they count from 1."""
+    space: Literal["camera", "world"] = "camera"
+    """world: upright, +y up, by the gravity that the tool knows."""
+    write_camera: Path | None = None
+    """Write a camera.json here: the lens, and pitch and roll by the tool's gravity."""
+
+
+def bodies(arguments: Sequence[str]) -> None:
+    """`mover import-bodies`."""
+    args = tyro.cli(BodiesArgs, prog="mover import-bodies", args=list(arguments))
+    if args.fps is not None and not args.fps > 0:
+        raise InputError(f"--fps: {args.fps:g}, expected more than 0")
+    if args.model_folder is not None:
+        os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
+    if args.tool in names("keypoints"):
+        _keypoints(args)
+    elif args.tool in names("people"):
+        _bodies(args)
+    else:
+        known = ", ".join(names("people", "keypoints"))
+        raise InputError(f"TOOL: {args.tool!r} is none of {known}")
+
+
+def _keypoints(args: BodiesArgs) -> None:
+    """2D joints."""
+    from mover.io.people.keypoints import keypoints_from, write_keypoints
+
+    found = keypoints_from(args.tool, args.source, _known(args))
+    out = args.out or Path("keypoints.npz")
+    write_keypoints(found, out)
+    say(f"{_counted(found)}, joints: {found.layout}: {out}")
+
+
+def _bodies(args: BodiesArgs) -> None:
+    """Bodies, and a camera where it is asked for."""
+    from mover.io.capture.bodies_file import write_bodies
+    from mover.io.people.bodies import bodies_from, in_world
+
+    known = _known(args)
+    found = bodies_from(args.tool, args.source, known)
+    out = args.out or Path("bodies.npz")
+    people = found.bodies if args.space == "camera" else in_world(found, args.source.name)
+    write_bodies(people, out)
+    for warning in found.warnings:
+        say(f"warning: {warning}")
+    model = "meshes only" if people.pose is None else f"parameters of {people.pose.model}"
+    say(f"{_counted(people)}, {people.verts.shape[1]} vertices, {model}: {out}")
+    _tell_gravity(found)
+    if args.write_camera is not None:
+        _write_camera(found, known, args.write_camera)
+
+
+def _tell_gravity(found: Any) -> None:  # noqa: ANN401
+    from mover.io.people.bodies import attitude
+
+    if found.up is not None:
+        pitch, roll = attitude(found.up)
+        say(f"its gravity: pitch {pitch:.3f} rad, roll {roll:.3f} rad")
+
+
+def _write_camera(found: Any, known: Any, path: Path) -> None:  # noqa: ANN401
+    """camera.json; the image is as large as the user's, else twice the principal point."""
+    from mover.io.capture.camera_file import camera_to_json
+    from mover.io.files.fields import write_json
+    from mover.io.people.bodies import camera_from
+
+    write_json(camera_to_json(camera_from(found, known)), path)
+    say(f"camera: {path}")
+
+
+def _known(args: BodiesArgs) -> Any:  # noqa: ANN401
+    """What the options say."""
+    from mover.io.capture.camera_file import camera_of
+    from mover.io.files.cameras import read_camera_file
+    from mover.io.people.found import Known
+
+    camera = None if args.camera is None else camera_of(read_camera_file(args.camera, None))
+    return Known(camera, args.focal, args.faces, args.fps, args.gender, args.first)
+
+
+def _counted(found: Any) -> str:  # noqa: ANN401
+    """`12 rows, 2 people in 6 frames`."""
+    people, frames = len(found.person.unique()), len(found.frame.unique())
+    return f"{len(found.frame)} rows, {people} people in {frames} frames"

@@ -1,0 +1,105 @@
+"""What `perceive` and `layout` do."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+from mover.app.cli.console import say
+from mover.perceive.config import LayoutConfig, PerceiveConfig
+
+THREADS = 1  # of torch, as in `run`
+
+
+@dataclass(frozen=True)
+class LayoutArgs:
+    """Find a first scene: furniture of the library (or yours) where the picture shows some.
+
+    Needs camera.json and objects.json in the capture; writes scene.json, meshes/ and
+    hypotheses.json.
+    """
+
+    capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """The capture folder."""
+    depth: Path | None = None
+    """Metric depth of the reference picture (.npz, .npy [m], 16-bit .png [mm])."""
+    meshes: Path | None = None
+    """Folder with your own shapes, named after their class: chair_0.obj."""
+    config: Annotated[LayoutConfig, arg(name="")] = field(default_factory=LayoutConfig)
+
+
+@dataclass(frozen=True)
+class PerceiveArgs:
+    """From a video to a capture: frames, masks, joints, a clean picture and a first scene.
+
+    A run that was killed goes on where it stopped. Bodies in 3D are still missing afterwards.
+    """
+
+    source: Annotated[Positional[Path], arg(metavar="VIDEO")]
+    """A video, or a folder of pictures."""
+    out: Path
+    """The capture folder."""
+    camera: Path | None = None
+    """A calibration; GeoCalib's also tells pitch and roll."""
+    fov: float | None = None
+    """Horizontal field of view, where there is no calibration [degrees]."""
+    photo: Path | None = None
+    """A photo of the same camera, whose EXIF tells the focal length."""
+    depth: Path | None = None
+    """Metric depth of the reference picture, for the first scene."""
+    meshes: Path | None = None
+    """Folder with your own shapes, for the first scene."""
+    layout: bool = True
+    """Find the first scene, too."""
+    config: Annotated[PerceiveConfig, arg(name="")] = field(default_factory=PerceiveConfig)
+
+
+def perceive(arguments: Sequence[str]) -> None:
+    """`mover perceive`."""
+    args = tyro.cli(PerceiveArgs, prog="mover perceive", args=list(arguments))
+    import torch
+
+    from mover.app.cli.progress import Bar
+    from mover.core.run import Run
+    from mover.perceive.capture import perceive as fill
+    from mover.perceive.config import Lens
+
+    torch.set_num_threads(THREADS)
+    lens = Lens(args.camera, args.fov, args.photo)
+    with Bar() as bar:
+        run = Run(args.out / "perceived", bar)
+        fill(args.source, args.out, lens, args.config, run, say)
+    say(f"{args.out}: wrote frames/, reference.png, objects.json, people.json, camera.json")
+    if args.layout:
+        _layout(LayoutArgs(args.out, args.depth, args.meshes))
+    say("still missing: bodies.npz (mover import-bodies TOOL PATH --out CAPTURE/bodies.npz)")
+
+
+def layout(arguments: Sequence[str]) -> None:
+    """`mover layout`."""
+    _layout(tyro.cli(LayoutArgs, prog="mover layout", args=list(arguments)))
+
+
+def _layout(args: LayoutArgs) -> None:
+    import torch
+
+    from mover.app.cli.progress import Bar
+    from mover.core.run import Run
+    from mover.perceive.capture import read_picture_of, write_first_scene
+    from mover.perceive.layout import first_scene
+
+    torch.set_num_threads(THREADS)
+    picture = read_picture_of(args.capture, args.depth)
+    with Bar() as bar:
+        run = Run(args.capture / "perceived", bar)
+        first = first_scene(picture, args.config, run, args.meshes)
+    write_first_scene(first, args.capture)
+    ground = first.scene.ground
+    height = "" if ground is None else f", camera {-ground:.2f} m above the floor"
+    say(f"{args.capture}: first scene of {len(first.scene.objects)} objects{height}")
+    if first.skipped:
+        say(f"note: not on the floor, left out: {', '.join(sorted(set(first.skipped)))}")
+    say(f"next: mover check {args.capture}; mover run {args.capture} --out OUT")

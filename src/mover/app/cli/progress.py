@@ -1,0 +1,81 @@
+"""One progress bar on a terminal, one line a stage elsewhere."""
+
+import logging
+import sys
+from types import TracebackType
+from typing import Any
+
+from mover.core.observe import Observer, Step
+
+log = logging.getLogger("mover.geometry.kernels")  # tells what is compiled
+
+
+class Bar:
+    """An observer that draws what the stages tell."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.logging import RichHandler
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self._stage, self._task = "", None
+        self._level = log.level
+        self._console = Console(file=sys.stderr)
+        self._lines = RichHandler(
+            console=self._console, show_time=False, show_level=False, show_path=False
+        )
+        columns = (
+            TextColumn("{task.description:<28}"),
+            BarColumn(),
+            TextColumn("{task.completed:>5}/{task.total}"),
+        )
+        self._progress = Progress(
+            *columns, TimeElapsedColumn(), console=self._console, transient=True
+        )
+
+    def __enter__(self) -> "Bar":
+        log.addHandler(self._lines)
+        self._level = log.level
+        log.setLevel(logging.INFO)
+        log.propagate = False
+        if self._console.is_terminal:
+            self._progress.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._progress.stop()
+        log.removeHandler(self._lines)
+        log.setLevel(self._level)
+        log.propagate = True
+
+    def __call__(self, step: Step) -> None:
+        """Show how far the stage is."""
+        if step.stage != self._stage:
+            self._begin(step)
+        task: Any = self._task
+        if task is not None:
+            self._progress.update(task, completed=step.index + 1, total=step.steps)
+
+    def _begin(self, step: Step) -> None:
+        self._stage = step.stage
+        if not self._console.is_terminal:
+            self._console.print(f"{step.stage} ...", highlight=False)
+            return
+        if self._task is not None:
+            self._progress.remove_task(self._task)
+        self._task = self._progress.add_task(step.stage, total=step.steps)
+
+
+def both(first: Observer, second: Observer) -> Observer:
+    """An observer that passes each step on to two."""
+
+    def observe(step: Step) -> None:
+        first(step)
+        second(step)
+
+    return observe

@@ -1,0 +1,116 @@
+"""What `refine` and `contacts` do."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from mover.app.cli.console import say
+from mover.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class RefineArgs:
+    """Refine the people of a result with its room; writes OUT/refined/bodies.npz."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder of a finished `mover run`."""
+    capture: Path | None = None
+    """Folder of its capture, for masks and contacts; by default where run.json says."""
+    truth: Path | None = None
+    """Folder with the true people: their errors before and after go to OUT/refined/metrics.json."""
+    camgp: bool = True
+    """Use the floor: nobody under it, soles at rest on it."""
+    sdf: bool = True
+    """Use the furniture's signed distance: nobody inside it."""
+    contact: bool = True
+    """Use contacts: seats, backs and hands at rest lie on furniture."""
+    order: bool = True
+    """Use who hides whom."""
+    masks: bool = True
+    """Use the outlines of people's masks."""
+    rounds: int = 3
+    """How often contacts and outlines are looked for anew while poses change."""
+
+
+@dataclass(frozen=True)
+class ContactsArgs:
+    """Which vertices touch something, by POSA's network or files of another tool: contacts.npz."""
+
+    tool: Annotated[Positional[Literal["posa", "files"]], arg(metavar="TOOL")]
+    """posa: run the network; files: per-vertex chances (of DECO, POSA), one file or one a frame."""
+    bodies: Annotated[Positional[Path], arg(metavar="BODIES")]
+    """bodies.npz."""
+    source: Path | None = None
+    """files: the .npy or .npz file, or the folder of them."""
+    first: int = 0
+    """files: the number in the name of the first frame's file."""
+    weights: Path | None = None
+    """posa: contact.pt or contact_semantics.pt."""
+    mesh_folder: Path | None = None
+    """posa: the folder mesh_ds."""
+    camera: Path | None = None
+    """posa: a camera.json with the true pitch and roll, for bodies in camera axes."""
+    samples: int = 0
+    """posa: mean of so many random answers; 0: the one of the mean code."""
+    model_folder: Path | None = None
+    """Folder of the licensed body models; by default what MOVER_BODY_MODELS names."""
+    out: Path = Path("contacts.npz")
+    """The file to write."""
+
+
+def refine(arguments: Sequence[str]) -> None:
+    """`mover refine`."""
+    args = tyro.cli(RefineArgs, prog="mover refine", args=list(arguments))
+    import torch
+
+    from mover.app.cli.progress import Bar
+    from mover.pipeline.refinement import measure_people, refine_result, switched
+    from mover.stages.config import RefineBodiesConfig
+
+    torch.set_num_threads(1)
+    off = {
+        "camgp": not args.camgp, "sdf": not args.sdf, "contact": not args.contact,
+        "order": not args.order, "masks": not args.masks,
+    }  # fmt: skip
+    config = switched(RefineBodiesConfig(rounds=args.rounds), off)
+    with Bar() as bar:
+        found = refine_result(args.out, config, args.capture, bar)
+    way = found.shift.norm(dim=-1).median()
+    how = "rigidly" if found.bodies.pose is None else "with their pose"
+    say(f"{len(found.shift)} bodies refined {how}, moved by {1000 * float(way):.0f} mm (median): "
+         f"{args.out / 'refined' / 'bodies.npz'}")  # fmt: skip
+    if args.truth is not None:
+        values = measure_people(args.out, args.truth)
+        for name in values["result"]:
+            say(f"{name:20}{values['result'][name]:10.4f}{values['refined'].get(name, 0):10.4f}")
+
+
+def contacts(arguments: Sequence[str]) -> None:
+    """`mover contacts`."""
+    args = tyro.cli(ContactsArgs, prog="mover contacts", args=list(arguments))
+    from mover.io.capture.bodies_file import read_bodies
+    from mover.pipeline.refinement import contacts_from, find_posa, write_contacts
+
+    if args.model_folder is not None:
+        os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
+    people = read_bodies(args.bodies)
+    if args.tool == "files":
+        chance = contacts_from(_needed(args.source, "--source"), people, args.first)
+    else:
+        weights = _needed(args.weights, "--weights")
+        meshes = _needed(args.mesh_folder, "--mesh-folder")
+        chance = find_posa(people, weights, meshes, args.samples, args.camera)
+    write_contacts(chance, args.out)
+    touching = int((chance > 0.5).any(1).sum())
+    say(f"{touching} of {len(chance)} bodies touch something: {args.out}")
+
+
+def _needed(path: Path | None, name: str) -> Path:
+    if path is None:
+        raise InputError(f"{name}: is missing, expected a path")
+    return path

@@ -1,0 +1,106 @@
+"""What `run` does: the main job."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import AvoidSubcommands, Positional, arg
+
+from mover.app.cli.config import Device, chosen_config
+from mover.app.cli.console import say
+from mover.io.formats import chosen
+from mover.pipeline.presets import Config
+
+THREADS = 1  # of torch: its operations here are small, and threads that wait for others cost more
+
+
+@dataclass(frozen=True)
+class RunArgs:
+    """Reconstruct a room from a capture folder."""
+
+    source: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """The capture folder (or whatever --format reads)."""
+    out: Path = Path("out")
+    """Folder for the result; a run that was killed goes on there."""
+    format: str = "folder"
+    """How the capture is written; see docs/data.md."""
+    preset: str = "robust"
+    """paper, release or robust: the settings that the other flags change."""
+    config_from: Annotated[Path | None, arg(name="config")] = None
+    """A run.json whose settings are used instead of a preset's."""
+    edits: Path | None = None
+    """A list of edits (edits.json of `mover view`) that is applied first."""
+    view: bool = False
+    """Watch the furniture move in the browser (extra `viewer`)."""
+    device: Device = "cpu"
+    """Where the heavy stages compute: cpu, cuda (an NVIDIA GPU; see docs/engine.md) or auto."""
+    refine: bool = False
+    """At the end, refine the people with the room they helped to find: bodies.npz holds them."""
+
+
+def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
+    """What `mover run` is asked for, and the settings."""
+    config, rest = chosen_config(arguments)
+
+    def both(
+        args: Annotated[RunArgs, arg(name="")], config: Annotated[Config, arg(name="")] = config
+    ) -> tuple[RunArgs, Config]:
+        """Reconstruct a room from a capture folder."""
+        return args, config
+
+    return tyro.cli(both, prog="mover run", args=rest, config=(AvoidSubcommands,))
+
+
+def run(arguments: Sequence[str]) -> None:
+    """`mover run`."""
+    args, config = parse_run(arguments)
+    read = chosen("--format", args.format, "capture")
+    from mover.app.results import Origin
+    from mover.core.devices import device_of
+    from mover.io.capture.edits import read_edits
+
+    device = device_of(args.device)
+    capture = read(args.source)
+    edits = () if args.edits is None else read_edits(args.edits)
+    origin = Origin(str(args.source.resolve()), args.format, edits, args.refine, device)
+    if args.view:
+        from mover.app.viewer.show import run_in_view
+
+        run_in_view(capture, config, args.out, origin)
+        return
+    reconstruct_into(args.out, capture, config, origin)
+    say(f"report: {args.out / 'report.html'}")
+
+
+def reconstruct_into(
+    out: Path,
+    capture: Any,  # noqa: ANN401
+    config: Config,
+    origin: Any,  # noqa: ANN401
+    watch: Any = None,  # noqa: ANN401
+) -> Any:  # noqa: ANN401
+    """Run the main job on the edited capture and write its result; `watch` sees every step."""
+    import torch
+
+    from mover.app.cli.progress import Bar, both
+    from mover.app.results import write_results
+    from mover.core.run import Run
+    from mover.io.capture.edits import apply_edits
+    from mover.pipeline.reconstruct import reconstruct
+
+    torch.set_num_threads(THREADS)
+    capture, pinned = apply_edits(capture, origin.edits)
+    with Bar() as bar:
+        observe = bar if watch is None else both(bar, watch)
+        run = Run(out, observe, device=origin.device)
+        room = reconstruct(capture, config, run, pinned)
+        if origin.refine:
+            from mover.pipeline.refinement import refined_room
+
+            room = refined_room(room, capture, bar)
+    write_results(capture, room, config, run, origin)
+    for warning in room.warnings:
+        say(f"warning: {warning}")
+    return room, run

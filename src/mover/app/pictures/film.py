@@ -1,0 +1,136 @@
+"""Pictures on disk: a still as PNG or JPEG, a film as MP4 (H.264), and the pictures of a video."""
+
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from mover.core.errors import InputError
+from mover.core.files import replacing
+
+STILL, FILM = (".png", ".jpg", ".jpeg"), (".mp4",)
+FRAMES, VIDEO = "frames", "video.mp4"
+QUALITY = {"crf": "18", "preset": "veryfast"}  # of H.264: nearly without visible loss
+
+
+def save_still(picture: Float[Tensor, "h w 3"], path: Path) -> None:
+    """Write a picture; the ending chooses the format."""
+    with replacing(path) as part:
+        Image.fromarray(pixels(picture)).save(part, quality=92)
+
+
+def save_film(pictures: Iterable[Float[Tensor, "h w 3"]], rate: float, path: Path) -> int:
+    """Write a film and return its number of pictures, which all have one even size.
+
+    Args:
+        pictures: One after the other.
+        rate: Pictures a second.
+        path: Of the .mp4.
+
+    Raises:
+        InputError: If PyAV is not installed.
+    """
+    av = video_library(str(path))
+    count = 0
+    with replacing(path) as part, av.open(str(part), "w") as film:
+        stream = film.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
+        stream.pix_fmt, stream.options = "yuv420p", dict(QUALITY)
+        for picture in pictures:
+            frame = av.VideoFrame.from_ndarray(pixels(picture), format="rgb24")
+            if count == 0:
+                stream.height, stream.width = picture.shape[:2]
+            film.mux(stream.encode(frame))
+            count += 1
+        film.mux(stream.encode(None))
+    return count
+
+
+def video_library(why: str) -> Any:  # noqa: ANN401
+    """PyAV.
+
+    Raises:
+        InputError: If it is not installed; `why` says what needs it.
+    """
+    if find_spec("av") is None:
+        raise InputError(f"{why}: PyAV is not installed; pip install '.[render]' in mover's folder")
+    import av
+
+    return av
+
+
+def pixels(picture: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """8 bits a channel."""
+    return (picture.detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+def has_video(capture: Path) -> bool:
+    """Whether a capture folder has the pictures of its video."""
+    return any((capture / name).exists() for name in (FRAMES, VIDEO))
+
+
+def video_pictures(
+    capture: Path, frames: list[int], size: tuple[int, int]
+) -> Iterator[Float[Tensor, "h w 3"] | None]:
+    """The wanted pictures of a capture's video in order, None for those that are missing.
+
+    Args:
+        capture: Folder with frames/000000.jpg, ... or video.mp4.
+        frames: Their numbers, rising.
+        size: Width and height that they get [px].
+    """
+    film = next((f for f in (capture / VIDEO, capture / FRAMES / VIDEO) if f.is_file()), None)
+    if film is not None:
+        yield from _decoded(film, frames, size)
+        return
+    for frame in frames:
+        names = (capture / FRAMES / f"{frame:06d}{ending}" for ending in (".jpg", ".png"))
+        path = next((name for name in names if name.is_file()), None)
+        if path is None:
+            yield None
+        else:
+            with Image.open(path) as picture:
+                yield sized(picture, size)
+
+
+def _decoded(
+    film: Path, frames: list[int], size: tuple[int, int]
+) -> Iterator[Float[Tensor, "h w 3"] | None]:
+    av = video_library(str(film))
+    wanted = iter(frames)
+    frame = next(wanted, None)
+    with av.open(str(film)) as video:
+        for number, picture in enumerate(video.decode(video=0)):
+            if frame is None:
+                return
+            if number == frame:
+                yield sized(picture.to_image(), size)
+                frame = next(wanted, None)
+    while frame is not None:
+        yield None
+        frame = next(wanted, None)
+
+
+def sized(picture: Image.Image, size: tuple[int, int]) -> Float[Tensor, "h w 3"]:
+    """A picture in [0, 1] at a width and height [px]."""
+    small = picture.convert("RGB").resize(size, Image.Resampling.LANCZOS)
+    return torch.from_numpy(np.asarray(small).copy()).float() / 255
+
+
+def captioned(picture: Float[Tensor, "h w 3"], text: str) -> Float[Tensor, "h w 3"]:
+    """A picture with a word in its corner."""
+    page = Image.fromarray(pixels(picture))
+    pen, height = ImageDraw.Draw(page), max(12.0, picture.shape[1] / 48)
+    font = ImageFont.load_default(height)
+    wide = pen.textlength(text, font)
+    box = (height * 0.6, height * 0.6, height * 1.8 + wide, height * 2.2)
+    pen.rounded_rectangle(box, height * 0.4, fill=(38, 42, 50))
+    middle = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
+    pen.text(middle, text, fill="white", font=font, anchor="mm")
+    return torch.from_numpy(np.asarray(page).copy()).float() / 255

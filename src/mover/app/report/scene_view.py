@@ -1,0 +1,190 @@
+"""What the 3D view of the report shows, packed into one text and one block of bytes."""
+
+import base64
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.app.report.vertex_subset import Thinning, thin, thin_choice
+from mover.core.colours import colour, css, person_colour
+from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject
+from mover.geometry.placement import place_object
+
+FACES_OBJECT = 3000  # at most, of each object
+FACES_BODY = 1600
+MOMENTS = 120  # at most so many frames
+ROWS = 240  # and so many bodies in them
+STEPS = 32767  # half of the range of a 16-bit coordinate
+EYE_HEIGHT = 1.5  # [m], of a camera above a floor that nobody knows
+
+
+@dataclass(frozen=True)
+class ReportScene:
+    """Data of the 3D view."""
+
+    text: str
+    """JSON: placements, cameras, and where each array lies in `block`."""
+    block: str
+    """Little-endian arrays, base64."""
+
+
+class Block:
+    """Bytes that grow by arrays; each starts at a multiple of four."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.size = 0
+
+    def add(self, array: Tensor) -> int:
+        """Append `array` and return where it starts [bytes]."""
+        start, raw = self.size, array.contiguous().numpy().tobytes()
+        raw += bytes(-len(raw) % 4)
+        self.parts.append(raw)
+        self.size += len(raw)
+        return start
+
+
+def pack_view(scenes: dict[str, Scene], bodies: dict[str, Bodies]) -> ReportScene:
+    """Pack the scenes (`initial`, `result`, `truth`) and the bodies in the world of each."""
+    block = Block()
+    meshes: list[tuple[Mesh, int]] = []
+    packed: list[dict[str, Any]] = []
+    tree: dict[str, Any] = {"scenes": {}}
+    for name, scene in scenes.items():
+        pieces = [
+            _pack_object(p, i, _shared(p.mesh, meshes, packed, block))
+            for i, p in enumerate(scene.objects)
+        ]
+        floor = _floor(scene, bodies.get(name))
+        tree["scenes"][name] = {
+            "camera": _pack_camera(scene.camera),
+            "floor": floor,
+            "pieces": pieces,
+        }
+    tree["meshes"] = packed
+    tree["people"] = _pack_people(bodies, block)
+    text = json.dumps(tree, separators=(",", ":")).replace("<", "\\u003c")
+    return ReportScene(text, base64.b64encode(b"".join(block.parts)).decode())
+
+
+def _shared(
+    mesh: Mesh, seen: list[tuple[Mesh, int]], packed: list[dict[str, Any]], block: Block
+) -> int:
+    """Index of the packed mesh; a mesh that several scenes hold is packed once."""
+    for other, index in seen:
+        same = other is mesh or (
+            other.verts.shape == mesh.verts.shape
+            and other.faces.shape == mesh.faces.shape
+            and bool((other.verts == mesh.verts).all() and (other.faces == mesh.faces).all())
+        )
+        if same:
+            return index
+    fewer = thin(mesh, FACES_OBJECT)
+    low, step, coarse = _coarse(fewer.verts)
+    packed.append(
+        {
+            "verts": block.add(coarse),
+            "n_verts": len(coarse),
+            "faces": block.add(
+                fewer.faces.to(torch.uint16 if len(coarse) < 2**16 else torch.int32)
+            ),
+            "n_faces": len(fewer.faces),
+            "wide": len(coarse) >= 2**16,
+            "middle": low,
+            "step": step,
+        }
+    )
+    seen.append((mesh, len(packed) - 1))
+    return len(packed) - 1
+
+
+def _coarse(points: Float[Tensor, "*any 3"]) -> tuple[list[float], float, Tensor]:
+    """Middle [m], step [m] and the points in steps from the middle, as 16-bit integers."""
+    flat = points.detach().cpu().double().reshape(-1, 3)
+    low, high = flat.amin(0), flat.amax(0)
+    middle, step = (low + high) / 2, max(float((high - low).amax()) / 2 / STEPS, 1e-9)
+    whole = ((points.detach().cpu().double() - middle) / step).round().to(torch.int16)
+    return [round(v, 6) for v in middle.tolist()], step, whole
+
+
+def _pack_object(piece: SceneObject, index: int, mesh: int) -> dict[str, Any]:
+    return {
+        "id": piece.id,
+        "category": piece.category,
+        "colour": css(colour(index)),
+        "mesh": mesh,
+        "t": _numbers(piece.t_world_object),
+        "yaw": round(float(piece.yaw), 6),
+        "scale": _numbers(piece.scale),
+    }
+
+
+def _pack_camera(camera: Camera) -> dict[str, Any]:
+    K = camera.K.tolist()
+    return {
+        "R": _numbers(camera.R_cam_world.reshape(-1)),
+        "f": [K[0][0], K[1][1]],
+        "c": [K[0][2], K[1][2]],
+        "size": [camera.width, camera.height],
+    }
+
+
+def _numbers(values: Tensor) -> list[float]:
+    return [round(v, 6) for v in values.detach().tolist()]
+
+
+def _floor(scene: Scene, bodies: Bodies | None) -> float:
+    """Height of the floor, or of the lowest thing where no floor is known [m]."""
+    if scene.ground is not None:
+        return scene.ground
+    lows = [place_object(p).verts[p.mesh.faces.unique(), 1].amin() for p in scene.objects]
+    if bodies is not None and len(bodies.verts):
+        lows.append(bodies.verts[..., 1].amin())
+    return float(torch.stack(lows).amin()) if lows else -EYE_HEIGHT
+
+
+def _pack_people(bodies: dict[str, Bodies], block: Block) -> dict[str, Any] | None:
+    """Evenly chosen frames of everybody, in each world, with one thinned topology."""
+    bodies = {name: b for name, b in bodies.items() if len(b.verts)}
+    if not bodies:
+        return None
+    main = bodies.get("result", next(iter(bodies.values())))
+    bodies = {n: b for n, b in bodies.items() if b.verts.shape == main.verts.shape}
+    people = main.person.unique().tolist()
+    frames = _moments(main, max(1, min(MOMENTS, ROWS // len(people))))
+    few = thin_choice(main.verts[len(main.verts) // 2], main.faces, FACES_BODY)
+    rows = [r for r in range(len(main.verts)) if int(main.frame[r]) in set(frames)]
+    return {
+        "faces": block.add(few.faces.to(torch.uint16)),
+        "n_faces": len(few.faces),
+        "n_verts": len(few.kept),
+        "fps": main.fps,
+        "frames": frames,
+        "colours": {str(p): css(person_colour(p)) for p in people},
+        "rows": [[int(main.frame[r]), int(main.person[r])] for r in rows],
+        "worlds": {name: _pack_rows(b, rows, few, block) for name, b in bodies.items()},
+        "opening": _opening(main, frames),
+    }
+
+
+def _pack_rows(bodies: Bodies, rows: list[int], few: Thinning, block: Block) -> dict[str, Any]:
+    middle, step, coarse = _coarse(bodies.verts[rows][:, few.kept])
+    return {"verts": block.add(coarse), "middle": middle, "step": step}
+
+
+def _moments(bodies: Bodies, count: int) -> list[int]:
+    """At most `count` frames, evenly chosen, the first and the last among them."""
+    frames = bodies.frame.unique()
+    picks = torch.linspace(0, len(frames) - 1, min(count, len(frames))).round().long()
+    return frames[picks.unique()].tolist()
+
+
+def _opening(bodies: Bodies, frames: list[int]) -> int:
+    """The moment to open with: where somebody's body is lowest (sitting or lying)."""
+    rows = [(bodies.frame == f).nonzero()[:, 0] for f in frames]
+    tops = torch.stack([bodies.verts[r, :, 1].amax(-1).amin() for r in rows])
+    return int(tops.argmin())

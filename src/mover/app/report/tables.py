@@ -1,0 +1,240 @@
+"""The report's numbers: objects, metrics, stages and settings, and how each is written."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from mover.app.report.templates import fill
+from mover.core.colours import colour, css
+from mover.core.types import Scene, SceneObject
+from mover.geometry.camera import to_camera
+from mover.geometry.placement import place_object
+from mover.geometry.rotations import wrap
+
+NOTHING = "\N{EN DASH}"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """How a number of metrics.json is written."""
+
+    label: str
+    unit: str = ""
+    factor: float = 1.0
+    digits: int = 3
+    more_is_better: bool = False
+    short: str = ""
+    """Title of a narrow column."""
+
+
+_CM, _DEG, _PERCENT = ("cm", 100.0, 1), ("°", 180 / math.pi, 2), ("%", 100.0, 1)
+QUANTITIES = {
+    "iou3d": Quantity("3D overlap with the truth (IoU)", more_is_better=True, short="3D IoU"),
+    "iou2d": Quantity("Overlap of the image boxes (IoU)", more_is_better=True),
+    "p2s": Quantity("True surface to estimated surface", *_CM),
+    "center_error": Quantity("Error of the centre", *_CM, short="Centre error"),
+    "yaw_error": Quantity("Error of the orientation", *_DEG),
+    "size_error": Quantity("Error of the size", *_CM),
+    "contact": Quantity("Contacts that touch furniture", *_PERCENT, True),
+    "contact_f1": Quantity("Contact F1", more_is_better=True),
+    "non_collision": Quantity("Body outside furniture", *_PERCENT, True),
+    "penetration_depth": Quantity("Depth of bodies in furniture", *_CM),
+    "pitch_error": Quantity("Error of the camera's pitch", *_DEG),
+    "roll_error": Quantity("Error of the camera's roll", *_DEG),
+    "ground_error": Quantity("Error of the floor's height", *_CM),
+    "ground_penetration_frequency": Quantity("Frames with soles under the floor", *_PERCENT),
+    "ground_penetration_distance": Quantity("Depth of soles under the floor", *_CM),
+    "pje": Quantity("Error of the joints", *_CM),
+    "v2v": Quantity("Error of the body's surface", *_CM),
+    "p_pje": Quantity("Error of the joints, aligned", *_CM),
+    "p_v2v": Quantity("Error of the body's surface, aligned", *_CM),
+    "foot_skate": Quantity("Speed of feet on the floor", "cm/s", 100.0, 1),
+    "float_height": Quantity("Height of the lower foot over the floor", *_CM),
+    "acceleration_error": Quantity("Error of the joints' acceleration", "m/s²", 1.0, 2),
+}
+
+
+def write_quantity(key: str, value: float | None, unit: bool = True) -> str:
+    """A number of metrics.json with its unit."""
+    quantity = QUANTITIES.get(key, Quantity(key))
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    text = f"{quantity.factor * value:.{quantity.digits}f}"
+    if not unit or not quantity.unit:
+        return text
+    return text + ("" if quantity.unit == "°" else "\N{NO-BREAK SPACE}") + quantity.unit
+
+
+def write_value(value: Any) -> str:  # noqa: ANN401
+    """Any plain value as text."""
+    match value:
+        case None:
+            return NOTHING
+        case bool():
+            return "yes" if value else "no"
+        case int():
+            return f"{value:,}"
+        case float():
+            return f"{value:.3g}" if math.isfinite(value) else NOTHING
+        case list() | tuple():
+            return ", ".join(write_value(v) for v in value) or NOTHING
+        case _:
+            return str(value)
+
+
+def is_number(value: Any) -> bool:  # noqa: ANN401
+    """Whether a plain value is a number, not a truth value."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def signed(value: float, digits: int) -> str:
+    """A number with its sign, a true minus."""
+    return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
+
+
+JUDGED = ("iou3d", "center_error")  # metrics that stand beside each object
+
+
+@dataclass(frozen=True)
+class Change:
+    """What the run did to an object."""
+
+    moved: float
+    """Distance between the centres of its box, seen from the camera [m]."""
+    turned: float
+    """Turn about its own vertical [rad]."""
+    grown: tuple[float, ...]
+    """Factor of its size along each of its axes."""
+
+
+def find_changes(initial: Scene, result: Scene) -> dict[str, Change]:
+    """What happened to each object that both scenes hold."""
+    old = {piece.id: piece for piece in initial.objects}
+    return {
+        piece.id: Change(
+            float((_centre(piece, result) - _centre(old[piece.id], initial)).norm()),
+            float(wrap(piece.yaw - old[piece.id].yaw)),
+            tuple((piece.scale / old[piece.id].scale).tolist()),
+        )
+        for piece in result.objects
+        if piece.id in old
+    }
+
+
+def _centre(piece: SceneObject, scene: Scene) -> torch.Tensor:
+    verts = place_object(piece).verts[piece.mesh.faces.unique()]
+    return to_camera((verts.amin(0) + verts.amax(0)) / 2, scene.camera.R_cam_world)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a table."""
+
+    text: str
+    kind: str = ""
+    """A class of report.css."""
+    tint: str = ""
+    """Colour of a dot before the text."""
+
+
+def draw_table(titles: Sequence[Cell], rows: Sequence[Sequence[Cell]]) -> str:
+    """A table whose rows begin with their heads; without rows there is none."""
+    return fill("table.html", titles=titles, rows=rows) if rows else ""
+
+
+def metrics_table(metrics: Mapping[str, Any]) -> str:
+    """Each metric before and after, coloured by whether it became better."""
+    before, after = metrics.get("initial") or {}, metrics.get("result") or {}
+    keys = [k for k in QUANTITIES if k in before or k in after]
+    keys += [
+        k
+        for k in (*before, *after)
+        if k not in QUANTITIES and is_number(before.get(k, after.get(k)))
+    ]
+    rows = [_metric_row(k, before.get(k), after.get(k)) for k in dict.fromkeys(keys)]
+    return draw_table([Cell("Metric", "text"), *map(Cell, ("Before", "After", "Change"))], rows)
+
+
+def _metric_row(key: str, before: float | None, after: float | None) -> list[Cell]:
+    quantity = QUANTITIES.get(key, Quantity(key))
+    change, mood = NOTHING, ""
+    if before is not None and after is not None and math.isfinite(before) and math.isfinite(after):
+        grown = quantity.factor * (after - before)
+        change = signed(grown, quantity.digits)
+        if key in QUANTITIES and float(f"{grown:.{quantity.digits}f}"):
+            mood = "better" if (grown > 0) == quantity.more_is_better else "worse"
+    values = (quantity.label, write_quantity(key, before), write_quantity(key, after))
+    return [*map(Cell, values), Cell(change, mood)]
+
+
+def objects_table(
+    initial: Scene,
+    result: Scene,
+    rows: Sequence[Mapping[str, Any]],
+    metrics: Mapping[str, Any] | None,
+) -> str:
+    """What happened to each object, and the evidence and numbers that `rows` give for it."""
+    changes = find_changes(initial, result)
+    extra = {str(row.get("id")): row for row in rows}
+    fields = list(dict.fromkeys(k for row in rows for k in row if k not in ("id", "category")))
+    scores = {str(o.get("id")): o for o in (metrics or {}).get("objects") or ()}
+    judged = [k for k in JUDGED if any(k in (o.get("result") or {}) for o in scores.values())]
+    titles = ["Moved", "Turned", "Size", *(QUANTITIES[k].short for k in judged)]
+    titles += [f.replace("_", " ") for f in fields]
+    lines: list[list[Cell]] = []
+    for index, piece in enumerate(result.objects):
+        head = [Cell(piece.id, tint=css(colour(index))), Cell(piece.category, "text")]
+        values = [*_change_cells(changes.get(piece.id))]
+        values += [_score_cell(scores.get(piece.id), k) for k in judged]
+        values += [write_value(extra.get(piece.id, {}).get(f)) for f in fields]
+        lines.append([*head, *map(Cell, values)])
+    return draw_table([Cell("Object"), Cell("Category", "text"), *map(Cell, titles)], lines)
+
+
+def _change_cells(change: Change | None) -> tuple[str, str, str]:
+    if change is None:
+        return ("new", NOTHING, NOTHING)
+    grown = [signed(100 * (g - 1), 0) for g in change.grown]
+    size = f"{grown[0]} %" if len(set(grown)) == 1 else f"{' / '.join(grown)} %"
+    turned = f"{signed(math.degrees(change.turned), 1)}°"
+    return (f"{100 * change.moved:.0f} cm", turned, size)
+
+
+def _score_cell(score: Mapping[str, Any] | None, key: str) -> str:
+    before, after = ((score or {}).get(k) or {} for k in ("initial", "result"))
+    return f"{write_quantity(key, before.get(key), False)} → {write_quantity(key, after.get(key))}"
+
+
+def stage_bars(stages: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Seconds, their share of the longest stage's [%], and peak memory of each stage."""
+    longest = max([float(s.get("seconds") or 0) for s in stages], default=0.0) or 1.0
+    bars: list[dict[str, Any]] = []
+    for stage in stages:
+        seconds = float(stage.get("seconds") or 0)
+        memory = float(stage.get("memory") or stage.get("peak_memory") or 0)
+        bars.append(
+            {
+                "name": str(stage.get("name", "")),
+                "kept": bool(stage.get("kept")),
+                "share": f"{100 * seconds / longest:.1f}",
+                "seconds": f"{seconds:,.1f}",
+                "memory": f"{memory:,.0f} MB" if memory else "",
+            }
+        )
+    return bars
+
+
+def settings_of(config: Mapping[str, Any], above: str = "") -> list[tuple[str, str]]:
+    """Each setting under its full name, `place.weights.depth`."""
+    leaves: list[tuple[str, str]] = []
+    for key, value in config.items():
+        name = f"{above}.{key}" if above else str(key)
+        if isinstance(value, Mapping) and value:
+            leaves += settings_of(value, name)
+        else:
+            leaves.append((name, json.dumps(value, default=str)))
+    return leaves

@@ -1,0 +1,39 @@
+"""The page's templates and assets, which are files beside the code."""
+
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+HOME = files("mover.app.report")
+
+
+@cache
+def _environment() -> Any:  # noqa: ANN401
+    """Everything that is filled in is escaped, and what is missing is an error."""
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    return Environment(
+        autoescape=True,
+        loader=FunctionLoader(lambda name: _text("templates", name)),
+        lstrip_blocks=True,
+        trim_blocks=True,
+        undefined=StrictUndefined,
+    )
+
+
+def fill(name: str, **parts: Any) -> str:  # noqa: ANN401
+    """The text of a template with `parts` in it, which other templates do not escape again."""
+    from markupsafe import Markup
+
+    return Markup(_environment().get_template(name).render(parts))
+
+
+def asset(name: str) -> str:
+    """Text of a file that stands in the page as it is."""
+    from markupsafe import Markup
+
+    return Markup(_text("assets", name))
+
+
+def _text(folder: str, name: str) -> str:
+    return HOME.joinpath(folder, name).read_text(encoding="utf-8")

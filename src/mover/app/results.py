@@ -1,0 +1,166 @@
+"""Write a room to disk: scene, meshes, proxies, bodies, log and report (FORMAT.md, "Result")."""
+
+import dataclasses
+import json
+import logging
+import platform
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mover import __version__
+from mover.app.report.content import ReportContent
+from mover.app.report.page import write_report
+from mover.bodies.corrected import in_world
+from mover.core import records
+from mover.core.devices import CPU, named
+from mover.core.errors import InputError
+from mover.core.files import replacing
+from mover.core.run import Run
+from mover.core.types import Bodies, Capture, Mesh, Room, Scene
+from mover.evaluate.explanation import log_rows, scene_fields
+from mover.io.capture.bodies_file import write_bodies
+from mover.io.capture.edits import Edit, write_edits
+from mover.io.capture.scene_file import write_scene
+from mover.io.export.scene_glb import write_glb
+from mover.pipeline.presets import Config, with_present_keys
+
+log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Where a result comes from, so that it can be computed again."""
+
+    source: str = ""
+    """Full path of the capture."""
+    format: str = "folder"
+    edits: tuple[Edit, ...] = ()
+    """What the user changed in it before."""
+    refine: bool = False
+    """Whether the people were refined with the room at the end."""
+    device: torch.device = CPU
+    """Where the heavy stages computed."""
+
+
+def write_results(
+    capture: Capture, room: Room, config: Config, run: Run, origin: Origin | None = None
+) -> Path:
+    """Write everything but metrics.json; returns the report's path."""
+    origin = origin or Origin()
+    out = run.folder
+    write_scene(room.initial, out / "initial.json")
+    if room.bodies is not None:
+        write_bodies(room.bodies, out / "bodies.npz")
+        write_bodies(initial_bodies(capture), out / "initial_bodies.npz")
+    for piece, proxy in zip(room.scene.objects, room.proxies, strict=True):
+        _write_mesh(proxy, out / "watertight" / f"{piece.id}.glb")
+    write_glb(room.scene, room.bodies, out / "scene.glb")
+    if origin.edits:
+        write_edits(origin.edits, out / "edits.json")
+    _write_log(room, config, run, origin)
+    write_scene(room.scene, out / "scene.json", scene_fields(room.explanations))
+    return write_report(out, report_of(capture, room, config, run))
+
+
+def write_truth(scene: Scene, bodies: Bodies, folder: Path) -> None:
+    """The truth of a known room, for `mover evaluate`."""
+    write_bodies(bodies, folder / "bodies.npz")
+    write_scene(scene, folder / "scene.json")
+
+
+def initial_bodies(capture: Capture) -> Bodies:
+    """The bodies in the world of the initial camera."""
+    assert capture.bodies is not None
+    return in_world(capture.bodies, capture.scene.camera)
+
+
+def report_of(
+    capture: Capture,
+    room: Room,
+    config: Config,
+    run: Run,
+    *,
+    truth: Scene | None = None,
+    metrics: dict[str, Any] | None = None,
+) -> ReportContent:
+    """What the report shows."""
+    return ReportContent(
+        title=capture.name,
+        image=capture.reference,
+        initial=room.initial,
+        result=room.scene,
+        truth=truth,
+        initial_bodies=None if room.bodies is None else initial_bodies(capture),
+        bodies=room.bodies,
+        traces={name: trace.tolist() for name, trace in room.traces.items()},
+        metrics=metrics,
+        warnings=room.warnings,
+        stages=[dataclasses.asdict(s) for s in run.stages],
+        config=records.plain(config),
+        objects=[dataclasses.asdict(e) for e in room.evidence],
+        explanations=room.explanations,
+        command=command_line(),
+    )
+
+
+def command_line() -> str:
+    """What was typed."""
+    return " ".join(["mover", *sys.argv[1:]])
+
+
+def _write_mesh(mesh: Mesh, path: Path) -> None:
+    import trimesh
+
+    shape = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)
+    with replacing(path) as part:
+        shape.export(part)
+
+
+def _write_log(room: Room, config: Config, run: Run, origin: Origin) -> None:
+    log = {
+        "format": "mover-run",
+        "version": __version__,
+        "command": command_line(),
+        "source": origin.source,
+        "source_format": origin.format,
+        "edits": len(origin.edits),
+        "people_refined": origin.refine,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "device": named(run.device),
+        "threads": torch.get_num_threads(),
+        "config": records.plain(config),
+        "stages": [dataclasses.asdict(s) for s in run.stages],
+        "warnings": list(room.warnings),
+        "evidence": [dataclasses.asdict(e) for e in room.evidence],
+        "explanations": log_rows(room.explanations),
+        "camera_covariance": _rows(room.covariance),
+        "traces": {name: _thinned(trace) for name, trace in room.traces.items()},
+    }
+    with replacing(run.folder / "run.json") as part:
+        part.write_text(json.dumps(log, indent=1))
+
+
+def _rows(matrix: Tensor | None) -> Sequence[Sequence[float]] | None:
+    return None if matrix is None else matrix.tolist()
+
+
+def _thinned(trace: Tensor, most: int = 500) -> list[float]:
+    return trace[:: max(1, len(trace) // most)].tolist()
+
+
+def read_config(path: Path) -> Config:
+    """The configuration of an earlier run, from its run.json."""
+    try:
+        tree: Mapping[str, Any] = json.loads(path.read_text())
+        config, renamed = with_present_keys(tree["config"])
+        for sentence in renamed:
+            log.warning("%s: %s", path, sentence)
+        return records.built(Config, config)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: no configuration of a run in it ({error})") from error

@@ -1,0 +1,1 @@
+"""What all share: records, nouns, errors, the resumable run."""

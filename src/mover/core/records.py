@@ -1,0 +1,181 @@
+"""Records: frozen dataclasses of tensors that are checked, mapped, moved, saved and hashed."""
+
+import dataclasses
+import hashlib
+import json
+import types
+import typing
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from tokenize import TokenError
+from typing import Any, TypeVar, dataclass_transform
+
+import numpy as np
+import torch
+from beartype import BeartypeConf, beartype
+from jaxtyping import jaxtyped
+from torch import Tensor
+
+from mover.core.errors import InputError
+from mover.core.files import replacing
+
+T = TypeVar("T")
+BROKEN = (
+    OSError, ValueError, KeyError, IndexError, EOFError, RuntimeError, MemoryError,
+    TypeError, AttributeError, zipfile.BadZipFile, zlib.error,
+    SyntaxError, TokenError,  # numpy's headers are Python
+)  # fmt: skip
+"""What reading a broken file of arrays raises."""
+_check = beartype(conf=BeartypeConf(is_pep484_tower=True))
+
+
+@dataclass_transform(frozen_default=True)
+def record(cls: type[T]) -> type[T]:
+    """Make a frozen dataclass whose dtypes and shapes are checked when it is built."""
+    return jaxtyped(typechecker=_check)(dataclasses.dataclass(frozen=True, eq=False)(cls))
+
+
+def map_tensors(fn: Callable[[Tensor], Tensor], value: T) -> T:
+    """Return a copy of `value` with `fn` applied to each tensor inside."""
+    return typing.cast(T, _map(fn, value))
+
+
+def _map(fn: Callable[[Tensor], Tensor], value: Any) -> Any:  # noqa: ANN401
+    match value:
+        case Tensor():
+            return fn(value)
+        case tuple():
+            return tuple(_map(fn, v) for v in value)
+        case Mapping():
+            return {k: _map(fn, v) for k, v in value.items()}
+        case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            names = [f.name for f in dataclasses.fields(value)]
+            return dataclasses.replace(value, **{n: _map(fn, getattr(value, n)) for n in names})
+        case _:
+            return value
+
+
+def to_device(value: T, device: torch.device | str) -> T:
+    """Return a copy of `value` on `device`."""
+    return map_tensors(lambda x: x.to(device), value)
+
+
+def save(value: Any, path: Path) -> None:  # noqa: ANN401
+    """Write `value` as `path`.npz for the tensors and then `path`.json for the structure.
+
+    The JSON file also holds a digest of both and of the path's last two names.
+    """
+    tensors: dict[str, Any] = {}
+    tree = _split(value, "", tensors)
+    with replacing(path.with_suffix(".npz")) as part:
+        np.savez(part, **tensors)
+    with replacing(path.with_suffix(".json")) as part:
+        digest = _digest(tree, tensors, path)
+        part.write_text(json.dumps({"digest": digest, "record": tree}))
+
+
+def load(kind: type[T], path: Path) -> T:
+    """Read a record of type `kind` written by `save`.
+
+    Raises:
+        InputError: If the files are damaged, incomplete, or were written under another name.
+    """
+    try:
+        whole = json.loads(path.with_suffix(".json").read_text())
+        with path.with_suffix(".npz").open("rb") as file:
+            tree, arrays = whole["record"], dict(np.load(file, allow_pickle=False))
+        if whole["digest"] == _digest(tree, arrays, path):
+            return typing.cast(T, _join(kind, tree, arrays))
+        reason = "its digest is another"
+    except BROKEN as error:
+        reason = f"{type(error).__name__}: {error}"
+    raise InputError(f"{path}: is damaged ({reason}), expected the files as they were written")
+
+
+def fingerprint(*values: Any) -> str:  # noqa: ANN401
+    """Short hash of the content of records: equal content, equal name on disk."""
+    tensors: dict[str, Any] = {}
+    tree = [_split(v, str(i), tensors) for i, v in enumerate(values)]
+    return _hashed(tree, tensors)[:16]
+
+
+def _digest(tree: Any, tensors: dict[str, Any], path: Path) -> str:  # noqa: ANN401
+    """Of a record under its name, so that another's file is not taken for it."""
+    return _hashed([path.parent.name, path.name, tree], tensors)
+
+
+def _hashed(tree: Any, tensors: dict[str, Any]) -> str:  # noqa: ANN401
+    digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode())
+    for name in sorted(tensors):
+        array = np.ascontiguousarray(tensors[name])
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
+
+
+def _split(value: Any, key: str, tensors: dict[str, Any]) -> Any:  # noqa: ANN401
+    match value:
+        case Tensor():
+            tensors[key] = value.detach().cpu().numpy()
+            return {"tensor": key}
+        case bytes():
+            return {"bytes": value.decode("latin-1")}
+        case tuple() | list():
+            return [_split(v, f"{key}.{i}", tensors) for i, v in enumerate(value)]
+        case Mapping():
+            return {k: _split(v, f"{key}.{k}", tensors) for k, v in value.items()}
+        case Path():
+            return str(value)
+        case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            names = [f.name for f in dataclasses.fields(value)]
+            return {n: _split(getattr(value, n), f"{key}.{n}", tensors) for n in names}
+        case _:
+            return value
+
+
+def _join(kind: Any, tree: Any, arrays: dict[str, Any]) -> Any:  # noqa: ANN401
+    if tree is None:
+        return None
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):
+        kind = _chosen([k for k in typing.get_args(kind) if k is not types.NoneType], tree)
+    if isinstance(tree, dict) and set(tree) == {"tensor"}:
+        return torch.from_numpy(arrays[tree["tensor"]])
+    if isinstance(tree, dict) and set(tree) == {"bytes"}:
+        return tree["bytes"].encode("latin-1")
+    origin, args = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if dataclasses.is_dataclass(origin):
+        hints = typing.get_type_hints(origin)
+        return kind(**{k: _join(hints[k], v, arrays) for k, v in tree.items()})
+    if isinstance(tree, dict):
+        return {k: _join(args[1], v, arrays) for k, v in tree.items()}
+    if isinstance(tree, list):
+        return tuple(
+            _join(k, v, arrays) for k, v in zip(_kinds(args, len(tree)), tree, strict=True)
+        )
+    return tree
+
+
+def _chosen(kinds: list[Any], tree: Any) -> Any:  # noqa: ANN401
+    """Of several kinds the one whose fields the tree has, else the first."""
+    names = set(tree) if isinstance(tree, dict) else set[str]()
+    for kind in kinds:
+        if dataclasses.is_dataclass(kind) and {f.name for f in dataclasses.fields(kind)} == names:
+            return kind
+    return kinds[0]
+
+
+def _kinds(args: tuple[Any, ...], length: int) -> tuple[Any, ...]:
+    """Types of the items of a tuple: one for all (`tuple[X, ...]`) or one for each."""
+    return args[:1] * length if Ellipsis in args else args
+
+
+def plain(value: Any) -> Any:  # noqa: ANN401
+    """A record without tensors as plain JSON values; `built` is the way back."""
+    return _split(value, "", {})
+
+
+def built(kind: type[T], tree: Any) -> T:  # noqa: ANN401
+    """A record of type `kind` from plain JSON values."""
+    return typing.cast(T, _join(kind, tree, {}))

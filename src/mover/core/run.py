@@ -1,0 +1,125 @@
+"""A folder of finished stages: equal inputs and settings are not computed twice."""
+
+import functools
+import hashlib
+import logging
+import resource
+import sys
+import time
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+
+from mover import __version__
+from mover.core import records
+from mover.core.devices import CPU, named
+from mover.core.errors import InputError
+from mover.core.observe import Observer, silent
+
+log = logging.getLogger(__name__)
+In = TypeVar("In")
+Conf = TypeVar("Conf")
+Out = TypeVar("Out")
+ON_DEVICE = ("refine_camera", "gather_cues", "place_objects")  # where the time goes
+
+
+@dataclass(frozen=True)
+class StageLog:
+    """What a stage cost."""
+
+    name: str
+    seconds: float
+    peak_memory: float
+    """Peak resident memory of the process until then [MB]."""
+    kept: bool
+    """True: read from disk, not computed."""
+    fingerprint: str = ""
+    """Name of its files in stages/<name>."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A folder of finished stages, and the log of this pass over them."""
+
+    folder: Path
+    observe: Observer = silent
+    stages: list[StageLog] = field(default_factory=lambda: [])
+    device: torch.device = CPU
+    """Where the stages in `ON_DEVICE` compute; all others do on the processor."""
+
+    def stage(self, fn: Callable[[In, Conf, Observer], Out], inputs: In, config: Conf) -> Out:
+        """Return the stored output of `fn`, or compute and store it.
+
+        The output is found by the content of its inputs and settings, the version of the package
+        and its sources: a stale result cannot be read, and a killed run goes on where it stopped.
+        Inputs and output lie on the processor; what another device computed has another name.
+        """
+        name = getattr(fn, "__name__", "stage")
+        device = self.device if name in ON_DEVICE else CPU
+        where = () if device == CPU else (named(device),)
+        key = records.fingerprint(inputs, config, sources(_package(fn)), *where)
+        path = self.folder / "stages" / name / key
+        begin = time.perf_counter()
+        output: Out | None = _stored(typing.get_type_hints(fn)["return"], path)
+        kept = output is not None
+        if output is None:
+            output = _computed(fn, inputs, config, self.observe, device)
+            records.save(output, path)
+        seconds = time.perf_counter() - begin
+        self.stages.append(StageLog(name, seconds, _peak_memory(), kept, path.name))
+        log.info(
+            "%s: %s %s in %.1f s",
+            name,
+            "kept" if kept else "made",
+            path.name,
+            self.stages[-1].seconds,
+        )
+        return output
+
+
+def _stored(kind: type[Out], path: Path) -> Out | None:
+    """A finished output; None where there is none, or none that can be trusted, which is said."""
+    if not path.with_suffix(".json").exists():
+        return None
+    try:
+        return records.load(kind, path)
+    except InputError as error:
+        log.warning("warning: %s; it is computed anew", error)
+        return None
+
+
+def _computed(
+    fn: Callable[[In, Conf, Observer], Out],
+    inputs: In,
+    config: Conf,
+    observe: Observer,
+    device: torch.device,
+) -> Out:
+    """The output on the processor, wherever it is computed."""
+    if device == CPU:
+        return fn(inputs, config, observe)
+    return records.to_device(fn(records.to_device(inputs, device), config, observe), CPU)
+
+
+def _peak_memory() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+def _package(fn: Callable[..., object]) -> str:
+    return (getattr(fn, "__module__", None) or "").partition(".")[0]
+
+
+@functools.cache
+def sources(package: str = "mover") -> str:
+    """Digest of the version and sources of `mover`, and of another package that builds on it."""
+    digest = hashlib.sha256(__version__.encode())
+    for name in dict.fromkeys(("mover", package)):
+        for folder in getattr(sys.modules.get(name), "__path__", ()):
+            for path in sorted(Path(folder).rglob("*.py")):
+                digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,250 @@
+"""The nouns of the package, with shapes and units. Frames, axes and pixels: docs/conventions.md."""
+
+from typing import Literal
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.core.explanation import Explanation
+from mover.core.records import record
+
+
+@record
+class Camera:
+    """A pinhole camera, still at the world origin (x right, y down, z forward); picture in [px]."""
+
+    K: Float[Tensor, "3 3"]
+    """Intrinsics [px]; the centre of the top-left pixel is (0.5, 0.5)."""
+    R_cam_world: Float[Tensor, "3 3"]
+    """Maps world (+y up, viewing direction without x) to camera axes."""
+    width: int
+    height: int
+
+
+@record
+class Mesh:
+    """A triangle mesh in its own canonical frame (+y up, +z front) [m], or of a body."""
+
+    verts: Float[Tensor, "verts 3"]
+    faces: Int[Tensor, "faces 3"]
+
+
+@record
+class SceneObject:
+    """One object of a scene: x_world = R_y(yaw) @ (scale * x_mesh) + t_world_object."""
+
+    id: str
+    category: str
+    mesh: Mesh
+    mesh_file: str
+    """Where the mesh came from; it is copied, never rewritten."""
+    annotation: int | None
+    """Id of its annotation in the reference image; None: no image evidence."""
+    support: str
+    """`ground`, `free`, or the id of the object that carries it."""
+    t_world_object: Float[Tensor, "3"]
+    """Place of the mesh origin in the world [m]."""
+    yaw: Float[Tensor, ""]
+    """Right-handed rotation about +y [rad]."""
+    scale: Float[Tensor, "3"]
+    """Factor along each mesh axis."""
+
+
+@record
+class Scene:
+    """A furnished room: initial guess, result or truth."""
+
+    camera: Camera
+    ground: float | None
+    """Height of the floor in the world [m], negative below the camera; None: unknown."""
+    objects: tuple[SceneObject, ...]
+
+
+@record
+class Masks:
+    """Binary images of one size, kept run-length encoded (COCO's compressed counts)."""
+
+    height: int
+    width: int
+    counts: tuple[bytes, ...]
+
+
+@record
+class Detection:
+    """One annotated instance of the reference image."""
+
+    id: int
+    category: str
+    box: Float[Tensor, "4"]
+    """x_min, y_min, x_max, y_max [px]."""
+    mask: Masks | None
+    """One mask; None: only the box is known."""
+    score: float
+
+
+@record
+class People:
+    """Visible masks of tracked people, one row for each (frame, person)."""
+
+    masks: Masks
+    frame: Int[Tensor, " rows"]
+    person: Int[Tensor, " rows"]
+    heights: dict[str, float]
+    """Known body heights by track [m]."""
+
+
+@record
+class BodyPose:
+    """Parameters of a body model, with the names and meaning of the smplx package."""
+
+    model: str
+    gender: str
+    betas: Float[Tensor, "bodies shape"]
+    global_orient: Float[Tensor, "bodies 3"]
+    body_pose: Float[Tensor, "bodies angles"]
+    transl: Float[Tensor, "bodies 3"]
+    extra: dict[str, Tensor]
+    """left_hand_pose, right_hand_pose, jaw_pose, leye_pose, reye_pose, expression where given; one
+    row a body. `flat_hand_mean` (bodies, 1): not 0 where hands turn from flat, not mean, hands."""
+
+
+@record
+class Bodies:
+    """People in all frames: one row for each (frame, person), one topology; places in [m]."""
+
+    verts: Float[Tensor, "bodies verts 3"]
+    faces: Int[Tensor, "faces 3"]
+    joints: Float[Tensor, "bodies joints 3"] | None
+    joint_names: tuple[str, ...]
+    frame: Int[Tensor, " bodies"]
+    person: Int[Tensor, " bodies"]
+    fps: float | None
+    """Frames a second; None: unordered images."""
+    space: Literal["camera", "world"]
+    """Frame of vertices and joints."""
+    pose: BodyPose | None
+
+
+@record
+class Keypoints:
+    """Joints that a detector saw in the images [px]: one row for each (frame, person)."""
+
+    points: Float[Tensor, "rows joints 2"]
+    confidence: Float[Tensor, "rows joints"]
+    """From 0 to 1; 0: the joint is missing."""
+    layout: str
+    """Which joints: a name in `bodies.keypoints.LAYOUTS`."""
+    frame: Int[Tensor, " rows"]
+    person: Int[Tensor, " rows"]
+    fps: float | None
+
+
+@record
+class Capture:
+    """Everything that is known before the method runs; it never holds the truth."""
+
+    name: str
+    scene: Scene
+    """The initial scene; its camera holds the first guess of pitch and roll."""
+    camera_height: float | None
+    """Known height of the camera above the floor [m]."""
+    detections: tuple[Detection, ...]
+    reference: Float[Tensor, "h w 3"] | None
+    """The clean reference image, in [0, 1]."""
+    reference_people: Masks | None
+    """People in the reference image: what they hide is unknown."""
+    bodies: Bodies | None
+    people: People | None
+    touch: Float[Tensor, "bodies verts"] | None
+    """Chance that a body's vertex touches something, where the user has it (POSA, DECO)."""
+    warnings: tuple[str, ...]
+    hypotheses: tuple[SceneObject, ...] = ()
+    """Other places and shapes of the scene's objects, under their ids: further starts."""
+
+
+@record
+class Objects:
+    """The furniture, packed: closed proxies at their initial size [m], each in its own frame.
+
+    The origin of a frame is the centre of the box's bottom, +y is up, +z the front. Arrays are
+    padded: vertices and points by repetition, faces and edges by zeros (degenerate).
+    """
+
+    ids: tuple[str, ...]
+    categories: tuple[str, ...]
+    """Canonical names."""
+    verts: Float[Tensor, "objects verts 3"]
+    real_verts: Bool[Tensor, "objects verts"]
+    """False where vertices pad."""
+    faces: Int[Tensor, "objects faces 3"]
+    edges: Int[Tensor, "objects edges 4"]
+    """Two vertices and the two faces beside them."""
+    samples: Float[Tensor, "objects samples 3"]
+    """Points spread evenly over the surface [m]."""
+    size: Float[Tensor, "objects 3"]
+    """Edges of the box [m]."""
+    top: Float[Tensor, "objects region 3"]
+    """Points of the region that carries: a seat, a mattress, a table top [m]."""
+    back: Float[Tensor, "objects region 3"]
+    """Points of the region that one leans against [m]."""
+    has_top: Bool[Tensor, " objects"]
+    has_back: Bool[Tensor, " objects"]
+    is_seat: Bool[Tensor, " objects"]
+    """People can sit or lie on it."""
+    supports: Int[Tensor, " objects"]
+    """-1: the ground, -2: free, else the index of the carrying object."""
+
+
+@record
+class Layout:
+    """Where the objects stand: the unknowns of Eq. 1. Leading axes hold several starts."""
+
+    t_world_object: Float[Tensor, "*starts objects 3"]
+    """Centre of the box's bottom [m]."""
+    yaw: Float[Tensor, "*starts objects"]
+    """Rotation about gravity [rad]."""
+    log_scale: Float[Tensor, "*starts objects 3"]
+    """Logarithm of the scale along each object axis; 0 keeps the initial size."""
+
+
+@record
+class Evidence:
+    """What held an object in its place."""
+
+    id: str
+    mask_pixels: int
+    """Pixels of its mask in the image."""
+    near_pixels: int
+    """Pixels (of an image 640 wide) where people passed in front of it."""
+    far_pixels: int
+    """Pixels where it hid people."""
+    touching_bodies: int
+    """Bodies that touch it."""
+    energy: float
+    """What is left of Eq. 1 at its place."""
+
+
+@record
+class Room:
+    """What `reconstruct` returns."""
+
+    scene: Scene
+    """The refined scene: every object of the input."""
+    initial: Scene
+    """The scene as it was given."""
+    image_only: Scene
+    """The same objects under the refined camera as the image alone places them (stage 1)."""
+    bodies: Bodies | None
+    """All rows of the input, in the world of `scene`."""
+    kept: Bool[Tensor, " bodies"] | None
+    """Rows that served as evidence."""
+    proxies: tuple[Mesh, ...]
+    """The closed meshes that were optimised, in the coordinates of the pieces' own meshes."""
+    evidence: tuple[Evidence, ...]
+    covariance: Float[Tensor, "3 3"] | None
+    """Of pitch [rad], roll [rad] and ground [m] as the feet give them."""
+    traces: dict[str, Tensor]
+    """Total energy before each step, by stage."""
+    warnings: tuple[str, ...]
+    explanations: tuple[Explanation, ...] = ()
+    """Why each object stands where it stands; empty: nobody asked."""

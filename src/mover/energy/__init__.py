@@ -1,0 +1,1 @@
+"""Eq. 1: its terms, their sum, and how it is minimised."""

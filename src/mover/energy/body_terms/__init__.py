@@ -1,0 +1,1 @@
+"""The terms that refine bodies in a room."""

@@ -1,0 +1,228 @@
+"""An error that lasts says no more in a hundred frames than in one.
+
+Evidence:  signed distances that should be zero, in groups whose items share an error: of a part of
+           a person's skin over a piece that it touches.
+Price:     the shared error in its usual size, and the rest of each distance without it. The shared
+           error is the one that is cheapest, in closed form (ridge mean with robust weights).
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.core.records import record
+from mover.energy.config import MatchConfig
+from mover.energy.minimize import geman_mcclure
+from mover.geometry.nearest import as_float64
+from mover.geometry.volume import Volume, sample
+
+
+def without_kept(
+    off: Float[Tensor, " items"],
+    trust: Float[Tensor, " items"],
+    group: Int[Tensor, " items"],
+    usual: float,
+) -> tuple[Float[Tensor, " items"], Float[Tensor, " items"]]:
+    """What is left of distances without the error that their group shares, and its price.
+
+    Args:
+        off: Signed distances [m].
+        trust: One over the variance of each alone [1/m²].
+        group: Which items share an error, from 0.
+        usual: Size of the shared error [m].
+
+    Returns:
+        The rest [m], and each item's share of the price [nats].
+    """
+    count = int(group.max()) + 1 if len(group) else 0
+    total = off.new_zeros(count).index_add(0, group, trust)
+    mean = off.new_zeros(count).index_add(0, group, trust * off) / (total + usual**-2)
+    part = trust / total.clamp_min(1e-9)[group]
+    return off - mean[group], 0.5 * (mean / usual).square()[group] * part
+
+
+# Skin that touches lies on a surface that faces it (after PROX, contact term).
+#
+# Evidence:  for each skin point that touches, the nearest surface point whose normal is opposed to
+#            the skin's within 45 degrees, and the plane there; found anew as the body moves. Where
+#            the distance to the furniture contradicts the plane, the surface ends before it.
+# Price:     Geman-McClure of the distance from the plane; the points of one group share one weight.
+# Paper:     distance to the nearest vertex of the scene, normals up to their sign: a thigh inside a
+#            seat may be drawn through it. Here the surface must face the skin, and one may slide.
+
+
+FACING = -0.7071  # cosine of 135 degrees, PROX's 45 degrees with the sign
+BEND = 0.15  # [m], how much a normal counts beside a place
+USUAL = 0.02  # [m], usual distance of skin that touches
+LAYER = 0.015  # [m], skin of a group that is no farther than this from its foremost point touches
+POINTS = 3.0  # independent places of a group that touches
+KEPT = 0.01  # [m], usual error that a part of a person has on one piece in all frames
+EDGE = 0.03  # [m], by which a plane and the furniture's own distance may differ
+
+
+@record
+class Surface:
+    """Points of the furniture."""
+
+    points: Float[Tensor, "points 3"]
+    """[m]."""
+    normals: Float[Tensor, "points 3"]
+    """Outward unit normals."""
+    piece: Int[Tensor, " points"]
+    """Of the furniture, from 0."""
+
+
+@record
+class Skin:
+    """Skin points and the chance that they touch."""
+
+    points: Float[Tensor, "bodies points 3"]
+    """[m]."""
+    normals: Float[Tensor, "bodies points 3"]
+    """Outward unit normals."""
+    chance: Float[Tensor, "bodies points"]
+    group: Int[Tensor, " points"]
+    """From 0: parts of the body; points of one part share a weight and have one foremost point, so
+    that a thigh that hangs does not speak for the seat."""
+    track: Int[Tensor, " bodies"]
+    """Number of each body's person, from 0."""
+    pivot: Float[Tensor, "bodies 3"]
+    """About which a body is turned by the errors of its pose: its pelvis [m]."""
+    bent: float
+    """Usual angle by which the pose is wrong [rad]; 0: it may be corrected."""
+
+
+@record
+class Matches:
+    """Which skin touches which plane."""
+
+    body: Int[Tensor, " matches"]
+    point: Int[Tensor, " matches"]
+    """Index of the skin point."""
+    place: Float[Tensor, "matches 3"]
+    """A point of the plane [m]."""
+    normal: Float[Tensor, "matches 3"]
+    weight: Float[Tensor, " matches"]
+    """Share in its group's weight; at most `POINTS` in sum."""
+    usual: Float[Tensor, " matches"]
+    """Usual distance of skin that touches [m]."""
+    kept: Int[Tensor, " matches"]
+    """Which share an error that lasts: one part of one person on one piece; from 0."""
+
+
+def gather_matches(
+    skin: Skin, surface: Surface, config: MatchConfig, furniture: Volume | None = None
+) -> Matches:
+    """The nearest surface that faces each skin point that touches."""
+    body, point = (skin.chance > config.least).nonzero(as_tuple=True)
+    if not len(body) or not len(surface.points):
+        return _nothing(skin)
+    places, facing = skin.points[body, point].detach(), skin.normals[body, point].detach()
+    index = _nearest(places, facing, surface)
+    place, normal = surface.points[index], surface.normals[index]
+    off = ((places - place) * normal).sum(-1)
+    groups = int(skin.group.max()) + 1
+    part = body * groups + skin.group[point]
+    looks = _looks(facing, skin.chance[body, point], part)
+    keep = ((facing * normal).sum(-1) < FACING) & ((looks * normal).sum(-1) < FACING)
+    keep = keep & ((places - place).norm(dim=-1) < config.reach)
+    if furniture is not None:
+        keep = keep & _on_surface(sample(furniture, places), off)
+    body, point, place, normal, part, off, index = (
+        x[keep] for x in (body, point, place, normal, part, off, index)
+    )
+    arm = torch.linalg.cross(place - skin.pivot[body], normal).norm(dim=-1)
+    who = skin.track[body] * groups + skin.group[point]
+    kept = who * len(surface.points) + surface.piece[index]
+    return Matches(
+        body, point, place, normal,
+        weight=_shares(skin.chance[body, point] * _foremost(off, part), part),
+        usual=(USUAL**2 + (skin.bent * arm).square()).sqrt(),
+        kept=kept.unique(return_inverse=True)[1],
+    )  # fmt: skip
+
+
+def _nearest(
+    places: Float[Tensor, "asked 3"], facing: Float[Tensor, "asked 3"], surface: Surface
+) -> Int[Tensor, " asked"]:
+    """The surface point that is nearest in place and in the direction it faces."""
+    from scipy.spatial import KDTree
+
+    known = np.concatenate([as_float64(surface.points), BEND * as_float64(surface.normals)], 1)
+    asked = np.concatenate([as_float64(places), -BEND * as_float64(facing)], 1)
+    return torch.from_numpy(np.asarray(KDTree(known).query(asked)[1])).long()
+
+
+def _looks(
+    facing: Float[Tensor, "asked 3"], chance: Float[Tensor, " asked"], part: Int[Tensor, " asked"]
+) -> Float[Tensor, "asked 3"]:
+    """Where the whole part looks: a thigh lies on the seat, and not on the seat's front.
+
+    Args:
+        facing: Normals of skin that touches.
+        chance: That it does.
+        part: Body and part of each.
+    """
+    total = facing.new_zeros(int(part.max()) + 1, 3)
+    total = total.index_add(0, part, facing * chance[:, None])
+    return torch.nn.functional.normalize(total, dim=-1)[part]
+
+
+def _shares(
+    weight: Float[Tensor, " matches"], part: Int[Tensor, " matches"]
+) -> Float[Tensor, " matches"]:
+    """Weights of which each part of a body has at most `POINTS`."""
+    total = weight.new_zeros(int(part.max()) + 1 if len(part) else 1)
+    return POINTS * weight / total.index_add(0, part, weight)[part].clamp_min(POINTS)
+
+
+def _on_surface(
+    distance: Float[Tensor, " matches"], off: Float[Tensor, " matches"]
+) -> Bool[Tensor, " matches"]:
+    """Whether a plane still is the surface of the furniture where the skin is.
+
+    Args:
+        distance: Of the skin from the furniture, negative inside [m].
+        off: Of the skin from the plane [m].
+    """
+    return ((distance - off).abs() < EDGE) | ((distance < 0) & (off < 0))
+
+
+def _foremost(off: Float[Tensor, " matches"], group: Int[Tensor, " matches"]) -> Tensor:
+    """1 for the skin of each group that reaches farthest: what is round touches little.
+
+    Args:
+        off: Distance from the plane, negative inside [m].
+        group: Body and part of each match.
+    """
+    least = off.new_full((int(group.max()) + 1 if len(group) else 1,), torch.inf)
+    least = least.scatter_reduce(0, group, off, "amin")[group]
+    return (off < least + LAYER).to(off)
+
+
+def touch_term(
+    skin: Float[Tensor, "bodies points 3"], matches: Matches, rho: float
+) -> Float[Tensor, " bodies"]:
+    """Price of the distance between skin and what it touches [nats].
+
+    Args:
+        skin: The skin points [m].
+        matches: What they touch.
+        rho: Distance at which half of the most is paid [m].
+    """
+    moved = skin[matches.body, matches.point] - matches.place
+    off = (moved * matches.normal).sum(-1)
+    robust = (rho**2 / (off.square() + rho**2)).square()
+    off, lasting = without_kept(
+        off, robust * matches.weight / matches.usual.square(), matches.kept, KEPT
+    )
+    price = 0.5 * (rho / matches.usual).square() * matches.weight * geman_mcclure(off, rho)
+    price = price + lasting
+    return skin.new_zeros(len(skin)).index_add(0, matches.body, price)
+
+
+def _nothing(skin: Skin) -> Matches:
+    empty = torch.zeros(0, dtype=torch.long)
+    none = skin.points.new_zeros(0, 3)
+    return Matches(empty, empty, none, none, none[:, 0], none[:, 0], empty)

@@ -1,0 +1,130 @@
+"""Weights of Eq. 1 and the ways down it. Imports no torch: `--help` is quick."""
+
+from dataclasses import dataclass, field, fields
+from typing import Literal
+
+Variant = Literal["paper", "release", "robust"]
+"""How a term is priced: as printed, as in the authors' released code, or normalised and robust."""
+
+
+GROWTH = 1.5  # price of another size as a whole, against that of another shape
+
+
+@dataclass(frozen=True)
+class SceneWeights:
+    """Weights of Eq. 1 in its order; zero removes a term and the need for its evidence."""
+
+    bbox: float = 1000.0
+    """lambda 1: objects fill their detected boxes."""
+    silhouette: float = 0.3
+    """lambda 2: objects cover their masks."""
+    scale: float = 1000.0
+    """lambda 3: objects keep their initial size."""
+    depth: float = 8.0
+    """lambda 4: who hides whom bounds the depth."""
+    collision: float = 1000.0
+    """lambda 5: people move through free space."""
+    contact: float = 1e5
+    """lambda 6: touching surfaces share a place."""
+    edge: float = 0.0
+    """Outlines follow the outlines of the masks (release only)."""
+    offscreen: float = 0.0
+    """Objects stay inside the image (release only)."""
+    free_space: float = 0.0
+    """Nothing hides a person that is seen (release only)."""
+    distance: float = 0.0
+    """Objects stay at the distance they were given, where nothing else tells it (robust only)."""
+    heading: float = 0.0
+    """Seats face where their sitters face (robust only)."""
+    wall: float = 0.0
+    """Furniture along a wall stands in one line (robust only)."""
+
+
+def only(**weights: float) -> SceneWeights:
+    """These weights, and none of the others."""
+    return SceneWeights(**{f.name: weights.get(f.name, 0.0) for f in fields(SceneWeights)})
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """How the room is priced."""
+
+    weights: SceneWeights = field(default_factory=SceneWeights)
+    form: Variant = "paper"
+    """As printed, as the authors released it, or normalised and robust."""
+    growth: float = GROWTH
+    """Price of another size as a whole, against that of another shape (robust only)."""
+
+
+@dataclass(frozen=True)
+class Adam:
+    """Adam with a step that falls geometrically from `rate` to `last_rate`."""
+
+    steps: int = 3000
+    """Number of steps."""
+    rate: float = 0.002
+    """First step size (Sec. "Optimization" of the supplement)."""
+    last_rate: float = 0.002
+    """Last step size; equal to `rate`: constant."""
+    beta2: float = 0.999
+    """Memory of the squared gradient."""
+    keep_best: bool = False
+    """Return the best state of each item instead of the last one."""
+
+
+@dataclass(frozen=True)
+class BatchedBFGS:
+    """Second-order steps of each problem within its own radius, until each has converged."""
+
+    steps: int = 100
+    """Most steps: a problem that still moves stops then."""
+    reach: float = 0.05
+    """First radius, in units of the unknowns [m, rad, log scale]."""
+    widest: float = 0.5
+    """Largest radius."""
+    least: float = 1e-4
+    """Radius below which a problem has converged."""
+    gain: float = 1e-5
+    """Relative decrease below which a step counts as none."""
+    patience: int = 3
+    """Such steps in a row after which a problem has converged."""
+
+
+@dataclass(frozen=True)
+class MatchConfig:
+    """Which skin is believed to touch."""
+
+    least: float = 0.5
+    """Chance above which a point of the skin touches (the paper's threshold)."""
+    reach: float = 0.25
+    """Farther no surface is touched [m]."""
+
+
+@dataclass(frozen=True)
+class BodyWeights:
+    """How much each term counts; 0: it is left out. All are in nats, so 1 is the natural weight."""
+
+    angles: float = 1.0
+    """Distance of all angles from those that were given."""
+    image: float = 1.0
+    """Distance of the joints from where they were seen."""
+    range: float = 1.0
+    """Change of the depth."""
+    smooth: float = 1.0
+    """E_smooth: joints between their neighbours in time."""
+    steady: float = 0.5
+    """Corrections that come and go."""
+    under: float = 1.0
+    """CamGP: skin below the floor."""
+    stand: float = 1.0
+    """CamGP: soles at rest off the floor."""
+    lock: float = 1.0
+    """CamGP: soles at rest that slide."""
+    sink: float = 1.0
+    """SDF: skin inside furniture."""
+    touch: float = 1.0
+    """Contact: skin that touches, off the furniture."""
+    order: float = 0.3
+    """Depth order: skin before what hides it, or behind what it hides."""
+    outline: float = 1.0
+    """Masks: the outline of the body on the outline of its mask."""

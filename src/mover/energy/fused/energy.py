@@ -1,0 +1,147 @@
+"""Eq. 1 as a run uses it: the fused kernel for the terms that it has, torch for the rest."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mover.core.observe import Energy
+from mover.core.types import Camera, Layout, Objects
+from mover.energy.config import SceneConfig, SceneWeights
+from mover.energy.fused.launch import FusedEnergy, fused_cost
+from mover.energy.fused.pack import FUSED, kernel_of, real_parts
+from mover.energy.objective import (
+    SCENE_TERMS,
+    HumanCues,
+    ImageCues,
+    Rows,
+    SceneEvidence,
+    active_config,
+    energy_of_terms,
+)
+from mover.energy.terms.contact import trees_of
+from mover.energy.terms.silhouette import outline_root
+from mover.geometry.raster.engine import engine
+
+EnergyOf = Callable[[Layout], Energy]
+
+
+def energy_function(
+    objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
+) -> EnergyOf:
+    """Eq. 1 as a function of the layout."""
+    return energy_of_rows(objects, camera, image, humans, config)(None)
+
+
+def energy_of_rows(
+    objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
+) -> Callable[[Rows | None], EnergyOf]:
+    """The same for some starts of some objects, by their numbers; None: for all.
+
+    Rows count through (starts x objects); the layout has one row for each.
+    """
+    if config.weights.edge and image.outline is None:
+        image = replace(image, outline=outline_root(image.masks))
+    known = SceneEvidence(objects, camera, image, humans)
+    config = active_config(config, known)
+    kernel = fused_energy(known, config)
+    left = [t for t in SCENE_TERMS if kernel is None or not t.fused]
+    rest = [t for t in left if getattr(config.weights, t.name)]
+
+    def of(rows: Rows | None) -> EnergyOf:
+        few = known if rows is None or not rest else known.some(rows)
+
+        def energy(layout: Layout) -> Energy:
+            if kernel is None:
+                return energy_of_terms(rest, layout, few, config)
+            found = _by_kernel(kernel, config.weights, layout, rows)
+            if not rest:
+                return found
+            others = energy_of_terms(rest, layout, few, config)
+            return Energy({**found.parts, **others.parts}, found.per_item + others.per_item)
+
+        return energy
+
+    return of
+
+
+def _by_kernel(
+    kernel: FusedEnergy, weights: SceneWeights, layout: Layout, rows: Rows | None
+) -> Energy:
+    whole, parts = fused_cost(kernel, layout.t_world_object, layout.yaw, layout.log_scale, rows)
+    each = zip(FUSED, parts.unbind(-1), strict=True)
+    return Energy({name: part for name, part in each if getattr(weights, name)}, whole)
+
+
+def fused_energy(known: SceneEvidence, config: SceneConfig) -> FusedEnergy | None:
+    """The kernel with all that it needs to know, for active weights; None where it cannot help.
+
+    It can on a CPU in single precision, for the robust form and closed meshes.
+    """
+    humans = known.humans
+    if engine() != "warp" or config.form != "robust" or not _plain(known):
+        return None
+    if humans.touches is not None and humans.trees is None and config.weights.contact:
+        humans = replace(humans, trees=trees_of(known.objects, humans.touches))
+    if config.weights.contact and humans.trees is None:
+        return None
+    if not _once(humans) or not _closed(known.objects):
+        return None
+    return kernel_of(known.objects, known.camera, known.image, humans, config)
+
+
+def never_asks(objects: Objects) -> bool:
+    """Whether Eq. 1 of such objects asks the host for nothing, so that a GPU can replay it.
+
+    That is so where Warp draws: torch alone draws by lists whose lengths the host must know.
+    """
+    return engine() == "warp" and objects.verts.dtype == torch.float32
+
+
+def _once(humans: HumanCues) -> bool:
+    """Whether the touched objects are told one after the other."""
+    touched = None if humans.touches is None else humans.touches.object_of
+    return touched is None or len(touched.unique()) == len(touched)
+
+
+def _plain(known: SceneEvidence) -> bool:
+    """Whether all is constant, in single precision on a CPU, and seen by pinholes."""
+    objects, camera, image, humans = known.objects, known.camera, known.image, known.humans
+    tensors = [objects.verts, objects.samples, camera.K, camera.R_cam_world]
+    tensors += [image.boxes, image.views.K, image.masks, image.trust]
+    if humans.depth is not None:
+        tensors += [humans.depth.near, humans.depth.far]
+    if humans.space is not None:
+        tensors += [humans.space.volume.values]
+    if humans.touches is not None:
+        tensors += [humans.touches.points, humans.touches.weight, humans.touches.heading]
+    here = all(x.dtype == torch.float32 and x.device.type == "cpu" for x in tensors)
+    if not here or any(x.requires_grad for x in tensors) or not len(objects.ids):
+        return False
+    turned = float(torch.linalg.det(camera.R_cam_world)) > 0
+    return turned and _pinhole(camera.K[None]) and _pinhole(image.views.K)
+
+
+def _pinhole(K: Tensor) -> bool:
+    """Whether there is no skew, and nothing is mirrored."""
+    zero = torch.cat([K[:, 0, 1], K[:, 1, 0], K[:, 2, 0], K[:, 2, 1], K[:, 2, 2] - 1])
+    return not bool(zero.any()) and bool((K[:, 0, 0] > 0).all() and (K[:, 1, 1] > 0).all())
+
+
+def _closed(objects: Objects) -> bool:
+    """Whether each edge lies between two faces that turn alike, as `topology.edges_of` has it."""
+    _, faces, edges = real_parts(objects)
+    if not bool((2 * edges.sum(-1) == 3 * faces.sum(-1)).all()) or not bool(faces.any(-1).all()):
+        return False
+    row, _ = torch.nonzero(edges, as_tuple=True)
+    v0, v1, one, two = objects.edges[edges].unbind(-1)
+    return bool(
+        (_runs(objects.faces[row, one], v0, v1) & _runs(objects.faces[row, two], v1, v0)).all()
+    )
+
+
+def _runs(face: Tensor, tail: Tensor, head: Tensor) -> Tensor:
+    """Whether a face runs from one vertex to the other."""
+    after = face.roll(-1, -1)
+    return ((face == tail[:, None]) & (after == head[:, None])).any(-1)

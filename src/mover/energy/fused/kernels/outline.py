@@ -1,0 +1,162 @@
+# pyright: basic, reportInvalidTypeForm=false
+"""The cost of a silhouette (`terms.silhouette`) and its gradient, from the outline alone.
+
+The pixels that the outline moves are counted anew; of the others only those that are covered.
+"""
+
+from typing import no_type_check
+
+import warp as wp
+
+from mover.energy.fused.kernels.cover import FRONT, is_marked
+from mover.energy.fused.kernels.given import FACES, VERTS, Given, Pose, Slope, Workspace, slope_of
+from mover.geometry.kernels.contour import (
+    STEEP,
+    Contour,
+    Gap,
+    contour,
+    crossing,
+    cut_of,
+    gap,
+    key,
+    pulled,
+)
+
+
+@wp.func
+@no_type_check
+def edge_of_outline(given: Given, work: Workspace, p: Pose, e: int) -> Contour:
+    """An edge between a front and what is none."""
+    edge = given.things.edges[e]
+    front = wp.where(work.scratch.front[edge[2]] == FRONT, edge[2], edge[3])
+    face = given.things.faces[given.things.starts[p.thing, FACES] + front]
+    wide = wp.vec4l(wp.int64(edge[0]), wp.int64(edge[1]), wp.int64(edge[2]), wp.int64(edge[3]))
+    corners = wp.vec3l(wp.int64(face[0]), wp.int64(face[1]), wp.int64(face[2]))
+    return contour(work.scene, work.scratch, 0, wide, corners)
+
+
+@wp.func
+@no_type_check
+def enter(given: Given, work: Workspace, p: Pose, edges: int) -> int:
+    """List the cuts of pairs of a covered and an uncovered centre; their number.
+
+    Of each pair, the outermost is remembered.
+    """
+    n = int(0)
+    for i in range(edges):
+        e = work.scratch.queue[i]
+        c = edge_of_outline(given, work, p, e)
+        for line in range(c.first, c.last + 1):
+            g = gap(work.scene, c, line)
+            if g.distance >= 0.0 and parts(work, c, g, line) and n < work.pairs.shape[0]:
+                k = key(g, e)
+                work.scratch.cuts[n] = cut_of(work.scene, 0, c, g, line)
+                work.pairs[n] = g.pair
+                work.keys[n] = k
+                n += 1
+                if k > work.scratch.pairs[g.pair]:
+                    work.scratch.pairs[g.pair] = k
+    return n
+
+
+@wp.func
+@no_type_check
+def parts(work: Workspace, c: Contour, g: Gap, line: int) -> bool:
+    """Whether the inner centre is covered and the outer one is not."""
+    beyond = g.place + c.outward
+    if c.steep:
+        inner = is_marked(work, work.seen, line, g.place)
+        return inner and not is_marked(work, work.seen, line, beyond)
+    inner = is_marked(work, work.seen, g.place, line)
+    return inner and not is_marked(work, work.seen, beyond, line)
+
+
+@wp.func
+@no_type_check
+def list_cuts(work: Workspace, found: int) -> int:
+    """Keep the cuts that count, and add up what they change; their number."""
+    n = int(0)
+    for i in range(found):
+        pair = work.pairs[i]
+        if work.scratch.pairs[pair] == work.keys[i]:
+            work.scratch.pairs[pair] = wp.uint64(0)
+            cut = work.scratch.cuts[i]
+            x = crossing(work.scene, cut)
+            if x.target >= 0:
+                target = on_grid(work, x.target)
+                covered = wp.where(x.shift < 0.0, 1.0, 0.0)
+                work.scratch.cuts[n] = cut
+                work.scratch.targets[n] = target
+                work.crossings[n] = wp.vec4(x.share, x.slope, x.outward, covered)
+                work.shift[target] = work.shift[target] + x.shift
+                n += 1
+    return n
+
+
+@wp.func
+@no_type_check
+def on_grid(work: Workspace, pixel: int) -> int:
+    """The pixel of the grid for one of the window."""
+    border = work.scene.border
+    wide = work.scene.width - 2 * border
+    return (pixel / wide + border) * work.scene.width + pixel % wide + border
+
+
+@wp.func
+@no_type_check
+def pull_cuts(given: Given, work: Workspace, p: Pose, cuts: int, number: int) -> Slope:
+    """Change of the sum of squares under a shift, by its number, with the pose."""
+    total = Slope()
+    lens = work.scene.window[0]
+    there = p.thing * work.scene.height * work.scene.width
+    shifted = pane_of(given, work, p, number)
+    verts = given.things.starts[p.thing, VERTS]
+    back = wp.transpose(p.view)
+    for i in range(cuts):
+        pixel = work.scratch.targets[i]
+        x = work.crossings[i]
+        drawn = x[3] + work.moved[i]
+        keep = given.windows.keep[there + pixel]
+        if keep > 0.0 and drawn >= 0.0 and drawn <= 1.0:
+            cut = work.scratch.cuts[i]
+            across = 2.0 * keep * (drawn - given.windows.mask[shifted + pixel]) * x[2]
+            along = -across * x[1]
+            steep = (cut[2] & STEEP) != 0
+            du = wp.where(steep, across, along) * lens[0]
+            dv = wp.where(steep, along, across) * lens[1]
+            a = (1.0 - x[0]) * pulled(work.scene.verts[cut[0]], du, dv)
+            b = x[0] * pulled(work.scene.verts[cut[1]], du, dv)
+            arm = wp.cw_mul(given.things.verts[verts + cut[0]], p.scale)
+            total += slope_of(back * a, arm)
+            arm = wp.cw_mul(given.things.verts[verts + cut[1]], p.scale)
+            total += slope_of(back * b, arm)
+    return total
+
+
+@wp.func
+@no_type_check
+def pane_of(given: Given, work: Workspace, p: Pose, number: int) -> int:
+    """Where the masks under a shift, by its number, begin."""
+    things = given.things.starts.shape[0] - 1
+    return (number * things + p.thing) * work.scene.height * work.scene.width
+
+
+@wp.func
+@no_type_check
+def add_cuts(given: Given, work: Workspace, p: Pose, cuts: int) -> None:
+    """Add what the outline changes to `squares`; what it adds to pixels is kept by cuts only."""
+    for i in range(cuts):
+        work.moved[i] = work.shift[work.scratch.targets[i]]
+    there = p.thing * work.scene.height * work.scene.width
+    for i in range(cuts):
+        pixel = work.scratch.targets[i]
+        shift = work.shift[pixel]
+        if shift != 0.0:
+            work.shift[pixel] = 0.0
+            keep = given.windows.keep[there + pixel]
+            for k in range(given.windows.shifts.shape[0]):
+                mask = given.windows.mask[pane_of(given, work, p, k) + pixel]
+                old = work.crossings[i][3] - mask
+                new = wp.clamp(work.crossings[i][3] + shift, 0.0, 1.0) - mask
+                more = wp.float64(keep * (new * new - old * old))
+                work.squares[k] = work.squares[k] + more

@@ -1,0 +1,203 @@
+"""What the kernel of Eq. 1 is given: objects without padding, windows with a border, people."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mover.core.types import Camera, Objects
+from mover.energy.config import SceneConfig, SceneWeights
+from mover.energy.fused.launch import BORDER, FusedEnergy, Room
+from mover.energy.objective import SCENE_TERMS, HumanCues, ImageCues
+from mover.energy.terms import bbox, border, contact, depth, distance, scale
+from mover.energy.terms.collision import ROBUST
+from mover.energy.terms.contact import ContactPoints
+from mover.energy.terms.factors import factors
+from mover.geometry.kernels.start import array, started
+from mover.geometry.nearest_warp import packed
+from mover.geometry.volume import Volume
+
+BRICK = 8  # [cells], as in `Volume.busy`
+CALM = 2  # a brick without bodies, as in `kernels.simple`
+FUSED = tuple(t.name for t in SCENE_TERMS if t.fused)
+"""Terms of the kernel, in the order of `kernels.given.BBOX` and those after it."""
+
+
+def kernel_of(
+    objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
+) -> FusedEnergy:
+    """The kernel of Eq. 1 with all that it needs to know."""
+    from mover.energy.fused.kernels.given import Given
+
+    wp, weights = started(), config.weights
+    asked, share, ends = _asked(objects, humans, weights)
+    things, counts = _things(objects, ends)
+    given = Given()
+    given.things = things
+    given.windows = _windows(image, humans, weights)
+    given.people = _people(humans, weights, asked, share)
+    given.boxes = array(image.boxes.contiguous(), "vec4")
+    given.within = array((image.sides != bbox.UNKNOWN).float(), "vec4")
+    given.beyond = array((image.sides == bbox.SEEN).float(), "vec4")
+    given.facts = wp.from_torch(_facts(objects, image, humans, weights))
+    given.turn = wp.mat33(*camera.R_cam_world.flatten().tolist())
+    K = camera.K.tolist()
+    given.lens = wp.vec4(K[0][0], K[1][1], K[0][2], K[1][2])
+    given.weights = tuple(getattr(weights, name) for name in FUSED)
+    given.soft, given.rho = bbox.SOFT, distance.RHO
+    given.sizes, given.growth = (scale.LOWEST, scale.HIGHEST), config.growth
+    views = image.views
+    verts, faces, edges = (int(c.max()) for c in counts)
+    shifts = 1 if image.borders is None else len(image.borders.shifts)
+    room = Room(verts, faces, edges, views.height + 2 * BORDER, views.width + 2 * BORDER, shifts)
+    return FusedEnergy(given, room, counts[1], len(asked))
+
+
+def _things(objects: Objects, asked: Tensor) -> tuple[Any, list[Tensor]]:
+    """The objects without padding, and how many vertices, faces and edges each has."""
+    from mover.energy.fused.kernels.given import Things
+
+    real = real_parts(objects)
+    counts = [r.sum(-1) for r in real]
+    n, samples = objects.samples.shape[:2]
+    per = torch.full((n,), samples)
+    starts = [torch.cat([c.new_zeros(1), c.cumsum(0)]) for c in (*counts, per)]
+    things = Things()
+    things.verts = array(objects.verts.detach()[real[0]], "vec3")
+    things.faces = array(objects.faces[real[1]].int(), "vec3i")
+    things.edges = array(objects.edges[real[2]].int(), "vec4i")
+    things.samples = array(objects.samples.detach().reshape(-1, 3).contiguous(), "vec3")
+    things.starts = started().from_torch(torch.stack([*starts, asked], -1).int().contiguous())
+    return things, counts
+
+
+def real_parts(objects: Objects) -> list[Tensor]:
+    """Which vertices, faces and edges do not pad; up to the last real one of each object."""
+    real = [
+        objects.real_verts,
+        objects.faces[..., 0] != objects.faces[..., 1],
+        objects.edges[..., 0] != objects.edges[..., 1],
+    ]
+    return [r.flip(-1).cummax(-1).values.flip(-1) if r.numel() else r for r in real]
+
+
+def _windows(image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Any:  # noqa: ANN401
+    from mover.energy.fused.kernels.given import Windows
+
+    views, windows = image.views, Windows()
+    K = views.K.detach()
+    lens = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2] + BORDER, K[:, 1, 2] + BORDER], -1)
+    mask, keep = image.masks.detach(), image.keep.to(image.masks)
+    windows.lens = array(lens.contiguous(), "vec4")
+    shifts, masks = mask.new_zeros(1), mask.unsqueeze(0)
+    if image.borders is not None:
+        shifts, masks = image.borders.shifts, image.borders.masks.detach()
+    windows.shifts, windows.loose = array(shifts.contiguous(), "float32"), border.PRICE
+    windows.mask, windows.keep = _grid(masks, 0.0), _grid(keep, 0.0)
+    windows.gain = array(_sums(keep * (1 - 2 * masks)), "float64")
+    windows.empty = array((keep * masks.double().square()).sum((-2, -1)).view(-1), "float64")
+    area = (masks * keep).sum((-2, -1)).clamp_min(1)
+    windows.trust = array((image.trust / area).view(-1).contiguous(), "float32")
+    lower, upper, bounded = _bounds(mask, humans, weights)
+    windows.lower, windows.upper = lower, upper
+    windows.bounded = array(bounded, "vec4i")
+    windows.limit, windows.fewest = depth.CLAMP, depth.FEWEST
+    return windows
+
+
+def _sums(gain: Tensor) -> Tensor:
+    """Sum of the pixels of a row before each, on the grid and one column more, flat."""
+    padded = torch.nn.functional.pad(gain.double(), [BORDER + 1, BORDER, BORDER, BORDER])
+    return padded.cumsum(-1).view(-1)
+
+
+def _grid(maps: Tensor, border: float) -> Any:  # noqa: ANN401
+    """Maps with a border, flat."""
+    padded = torch.nn.functional.pad(maps, [BORDER] * 4, value=border)
+    return array(padded.contiguous().view(-1), "float32")
+
+
+def _bounds(mask: Tensor, humans: HumanCues, weights: SceneWeights) -> tuple[Any, Any, Tensor]:
+    """Lowest and highest depth of each pixel, and the rows and columns that have any."""
+    n = len(mask)
+    if humans.depth is None or not weights.depth:
+        nothing = torch.zeros(n, 4, dtype=torch.int32)
+        return *(array(mask.new_zeros(1), "float32") for _ in range(2)), nothing
+    near, far = humans.depth.near, humans.depth.far
+    known = (mask > 0.5) & (near < far) & (near.isfinite() | far.isfinite())
+    lower = torch.where(known, near - depth.MARGIN, torch.inf)
+    box = [_range(known.any(2)), _range(known.any(1))]
+    return _grid(lower, torch.inf), _grid(far + depth.MARGIN, 0.0), torch.cat(box, -1).int()
+
+
+def _range(known: Tensor) -> Tensor:
+    """First index, and the one after the last, of each row's marks, in the grid."""
+    size, number = known.shape[1], torch.arange(known.shape[1])
+    first = torch.where(known, number, size).amin(1)
+    return torch.stack([first, torch.where(known, number + 1, 0).amax(1)], -1) + BORDER
+
+
+def _asked(
+    objects: Objects, humans: HumanCues, weights: SceneWeights
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Skin that touches, object by object; its share in the price; where each object begins."""
+    n, touches = len(objects.ids), humans.touches
+    if touches is None or not weights.contact:
+        none = torch.zeros(1, 3)
+        return none, none[:, 0].contiguous(), torch.zeros(n + 1, dtype=torch.long)
+    weight = touches.weight
+    part = torch.tensor(contact.SHARE).to(weight)
+    whole = weight.sum(-1, keepdim=True).clamp_min(1e-9)
+    full = (touches.bodies / contact.ENOUGH).clamp_max(1)[:, None, None]
+    share = weight / whole * part[:, None] * full * torch.tensor([1.0, -1.0, 1.0, -1.0])[:, None]
+    order = touches.object_of.argsort()
+    share, points = share[order].flatten(1), touches.points[order].flatten(1, 2)
+    count = torch.zeros(n + 1, dtype=torch.long)
+    count[touches.object_of[order] + 1] = (share != 0).sum(-1)
+    asking = share != 0
+    few, shares = points[asking].contiguous(), share[asking].contiguous()
+    return few, shares, count.cumsum(0)
+
+
+def _people(humans: HumanCues, weights: SceneWeights, asked: Tensor, share: Tensor) -> Any:  # noqa: ANN401
+    from mover.energy.fused.kernels.given import People
+
+    people = People()
+    people.asked, people.share = array(asked, "vec3"), array(share, "float32")
+    people.rho = contact.RHO
+    if weights.contact and humans.trees is not None:
+        people.top, people.back = packed(humans.trees.top), packed(humans.trees.back)
+    if weights.collision and humans.space is not None:
+        people.field = _field(humans.space.volume)
+    return people
+
+
+def _field(volume: Volume) -> Any:  # noqa: ANN401
+    """`kernels.lookup.Field` in which bricks without bodies are told apart."""
+    from mover.geometry.kernels.lookup import Field
+
+    wp, field = started(), Field()
+    some = volume.values[::BRICK, ::BRICK, ::BRICK]
+    x, y, z = volume.busy.shape
+    calm = (volume.busy == 0) & (some[:x, :y, :z] >= 0)
+    field.values = wp.from_torch(volume.values.detach())
+    field.busy = wp.from_torch(torch.where(calm, CALM, 1).to(torch.uint8))
+    field.origin, field.cell = wp.vec3(*volume.origin.tolist()), volume.cell
+    return field
+
+
+def _facts(objects: Objects, image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Tensor:
+    """See `kernels.given.SIZE` and those after it."""
+    n, boxes = len(objects.ids), image.boxes
+    many = factors(objects, humans.touches if weights.contact else None, "robust")
+    facts = torch.zeros(n, 7)
+    facts[:, 0] = (boxes[:, 2:] - boxes[:, :2]).clamp_min(1).prod(-1).sqrt()
+    facts[:, 1] = many.depth
+    facts[:, 2] = many.collision * ROBUST / max(1, objects.samples.shape[1])
+    if image.distance is not None:
+        facts[:, 3] = image.distance.clamp_min(1e-3).log()
+    touches: ContactPoints | None = humans.touches
+    if touches is not None:
+        facts[touches.object_of, 4:6] = touches.heading
+        facts[touches.object_of, 6] = (touches.heading.square().sum(-1) > 0).to(facts)
+    return facts

@@ -1,0 +1,225 @@
+r"""Second-order descent of many small problems at once: each steps, judges and stops on its own.
+
+A problem keeps a model of its energy, E + g.s + s.B.s / 2, and steps to the model's minimum within
+the radius in which it trusts the model (Conn, Gould, Toint: Trust-Region Methods, 2000, Sec. 7.3).
+B learns from pairs of gradients by Powell's damped BFGS update (Nocedal, Wright: Numerical
+Optimization, 2006, Procedure 18.2), also from steps that were refused. A step is taken only if it
+lowers the energy; a problem whose energy or radius no longer changes leaves the batch.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import prod
+from typing import Generic, TypeVar
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from mover.core.observe import Energy, Observer, Step, silent
+from mover.energy.config import BatchedBFGS
+from mover.energy.minimize import Minimum
+
+P = TypeVar("P")
+Rows = Int[Tensor, " few"]
+GOOD, BAD = 0.75, 0.25  # share of the promised decrease from which a radius grows, shrinks
+DAMPED = 0.2  # least curvature that is learned, as a share of the model's
+FLOOR = 1e-3  # energy below which decreases count as shares of this
+SECULAR = 12  # Newton's steps to the multiplier of a step as long as the radius
+
+
+@dataclass(frozen=True)
+class Problems(Generic[P]):
+    """Many small problems; every field of `P` is a tensor whose first axes count them."""
+
+    of: Callable[[Rows], Callable[[P], Energy]]
+    """Energy of some, by their numbers in the flattened axes; its `P` has one such axis."""
+    start: P
+    axes: tuple[int, ...]
+    """Lengths of those first axes."""
+    group: Int[Tensor, " items"] | None = None
+    """Problems with one number share a decision, because one's unknowns enter another's energy."""
+
+
+@dataclass(frozen=True)
+class _Live:
+    """The problems that still move; rows are problems, columns unknowns."""
+
+    index: Tensor
+    at: Tensor
+    value: Tensor
+    slope: Tensor
+    model: Tensor
+    """B, (problems, unknowns, unknowns)."""
+    radius: Tensor
+    idle: Tensor
+    """Steps in a row without gain."""
+
+    def only(self, stay: Tensor) -> "_Live":
+        """Some of them; the same record where all stay."""
+        if bool(stay.all()):
+            return self
+        return _Live(*(getattr(self, f.name)[stay] for f in dataclasses.fields(self)))
+
+
+Price = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+def _pricing(problems: Problems[P]) -> Price:
+    """Energy and gradient of rows by number and place; the last energy asked for is kept."""
+    start, axes = problems.start, len(problems.axes)
+    held: list[tuple[Tensor, Callable[[P], Energy]]] = []
+
+    def price(index: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+        if not held or not torch.equal(held[0][0], index):
+            held[:] = [(index, problems.of(index))]
+        free = at.clone().requires_grad_()
+        value = held[0][1](_shaped(free, start, (len(index),), axes)).per_item
+        (slope,) = torch.autograd.grad(value.sum(), free)
+        return value.detach().double(), slope
+
+    return price
+
+
+def settle(
+    problems: Problems[P], method: BatchedBFGS, observe: Observer = silent, stage: str = ""
+) -> Minimum[P]:
+    """Lower the energy of each problem from its start until all have converged.
+
+    The result is never higher than the start, does not depend on what else is in the batch, and is
+    the same for every run on a CPU.
+
+    Raises:
+        ValueError: If an energy is not finite at the start.
+    """
+    start, axes, price = problems.start, problems.axes, _pricing(problems)
+    live = _begin(price, _flat(start, len(axes)), method)
+    ends, values, trace = live.at.clone(), live.value.clone(), [live.value.sum()]
+    if not bool(values.isfinite().all() and live.slope.isfinite().all()):
+        raise ValueError(f"{stage}: the energy is not finite")
+
+    def told(index: int) -> Step:
+        seen = Energy({"energy": values.reshape(axes)})
+        return Step(stage, index, method.steps, seen, lambda: _shaped(ends, start, axes, len(axes)))
+
+    live = live.only(_pooled(problems, live, live.slope.norm(dim=-1)) > 0)
+    for index in range(method.steps):
+        if not len(live.index):
+            break
+        live = _advance(problems, price, live, method)
+        ends[live.index], values[live.index] = live.at, live.value
+        trace.append(values.sum())
+        observe(told(index))
+        moves = (live.idle < method.patience) & (live.radius > method.least)
+        live = live.only(_pooled(problems, live, moves.double()) > 0)
+    if method.steps:
+        observe(told(method.steps - 1))
+    value = values.to(_first(start).dtype).reshape(axes)
+    end = _shaped(ends, start, axes, len(axes))
+    return Minimum(end, value, torch.stack(trace).to(value.dtype))
+
+
+def _begin(price: Price, at: Tensor, method: BatchedBFGS) -> _Live:
+    """A round model whose minimum lies at the first radius."""
+    index = torch.arange(len(at)).to(at.device)
+    value, slope = price(index, at)
+    radius = torch.full_like(value, method.reach)
+    model = _round(slope, radius)
+    return _Live(index, at, value, slope, model, radius, torch.zeros_like(index))
+
+
+def _round(slope: Tensor, radius: Tensor) -> Tensor:
+    """A model of the same curvature in all directions, with its minimum at the radius."""
+    steep = slope.norm(dim=-1) / radius
+    return steep[:, None, None] * torch.eye(slope.shape[1]).to(slope)
+
+
+def _advance(problems: Problems[P], price: Price, live: _Live, method: BatchedBFGS) -> _Live:
+    """One step of each problem, taken or refused."""
+    step, promise = _step(live.model, live.slope, live.radius)
+    value, slope = price(live.index, live.at + step)
+    before, gain = (_pooled(problems, live, x) for x in (live.value, live.value - value))
+    share = gain / _pooled(problems, live, promise).clamp_min(1e-300)
+    taken = gain > 0  # not so where the energy is not finite
+    small = gain <= method.gain * before.abs().clamp_min(FLOOR)
+    known = slope.isfinite().all(-1)
+    taken = taken & known
+    learned = _learned(live.model, step, slope - live.slope)
+    length = step.norm(dim=-1)
+    grown = torch.where((share > GOOD) & (length > 0.9 * live.radius), 2.0, 1.0) * live.radius
+    radius = torch.where(share >= BAD, grown.clamp_max(method.widest), 0.5 * length)
+    return _Live(
+        live.index,
+        torch.where(taken[:, None], live.at + step, live.at),
+        torch.where(taken, value, live.value),
+        torch.where(taken[:, None], slope, live.slope),
+        torch.where(known[:, None, None], learned, live.model),
+        radius,
+        torch.where(taken, torch.where(small, live.idle + 1, 0), live.idle),
+    )
+
+
+def _step(model: Tensor, slope: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """Minimum of the model within the radius, and the decrease that it promises."""
+    curve, axes = torch.linalg.eigh(model)
+    curve = curve.clamp_min(1e-12)  # the update keeps them positive but for rounding
+    along = (axes * slope.unsqueeze(-1)).sum(-2)
+    reach, square = radius.unsqueeze(-1), along.square()
+    damping = torch.zeros_like(reach)
+    for _ in range(SECULAR):  # Nocedal, Wright, Algorithm 4.3: from below, never too far
+        damped = curve + damping
+        part = square / damped.square()
+        length = part.sum(-1, keepdim=True).sqrt()
+        bend = (part / damped).sum(-1, keepdim=True).clamp_min(1e-300)
+        more = (length - reach) / reach * (length.square() / bend)
+        damping = (damping + more).clamp_min(0)
+    move = -along / (curve + damping)
+    move = move * (reach / move.norm(dim=-1, keepdim=True).clamp_min(1e-300)).clamp_max(1)
+    promise = -(along * move + 0.5 * curve * move.square()).sum(-1)
+    return (axes * move.unsqueeze(-2)).sum(-1), promise
+
+
+def _learned(model: Tensor, step: Tensor, change: Tensor) -> Tensor:
+    """The model with the gradient's change along a step, damped so that it stays convex."""
+    told = (model * step.unsqueeze(-2)).sum(-1)
+    curve, seen = (step * told).sum(-1), (step * change).sum(-1)
+    short = seen < DAMPED * curve
+    part = torch.where(short, (1 - DAMPED) * curve / (curve - seen).clamp_min(1e-300), 1.0)
+    change = part.unsqueeze(-1) * change + (1 - part).unsqueeze(-1) * told
+    seen = (step * change).sum(-1)
+    usable = (curve > 1e-300) & (seen > 1e-300)
+    old, new = (torch.where(usable, x, torch.inf)[:, None, None] for x in (curve, seen))
+    outer = told[:, :, None] * told[:, None, :] / old
+    return model - outer + change[:, :, None] * change[:, None, :] / new
+
+
+def _pooled(problems: Problems[P], live: _Live, x: Tensor) -> Tensor:
+    """The sum over each row's group."""
+    if problems.group is None:
+        return x
+    names, row = problems.group[live.index].unique(return_inverse=True)
+    return x.new_zeros(len(names)).index_add(0, row, x)[row]
+
+
+def _first(record: object) -> Tensor:
+    return getattr(record, dataclasses.fields(record)[0].name)  # type: ignore[arg-type]
+
+
+def _flat(start: object, axes: int) -> Tensor:
+    """Rows of unknowns, in double precision."""
+    fields = [getattr(start, f.name).detach() for f in dataclasses.fields(start)]  # type: ignore[arg-type]
+    n = prod(fields[0].shape[:axes])
+    return torch.cat([x.reshape(n, prod(x.shape[axes:])) for x in fields], 1).double()
+
+
+def _shaped(rows: Tensor, like: P, lead: tuple[int, ...], axes: int) -> P:
+    """The inverse of `_flat`, with other first axes."""
+    fields, at = {}, 0
+    for field in dataclasses.fields(like):  # type: ignore[arg-type]
+        old = getattr(like, field.name)
+        width = prod(old.shape[axes:])
+        part = rows[:, at : at + width].to(old.dtype)
+        fields[field.name] = part.reshape(*lead, *old.shape[axes:])
+        at += width
+    return dataclasses.replace(like, **fields)  # type: ignore[type-var]

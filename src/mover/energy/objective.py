@@ -1,0 +1,346 @@
+"""Eq. 1 as a list of terms: what each costs, the evidence that it needs, and its word for people.
+
+A new term is a file in `terms`, a weight in `SceneWeights` and a row in `SCENE_TERMS`; its evidence
+is a field of `ImageCues` or `HumanCues`, indexed by its axis `objects`.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache, cached_property
+from typing import Any, TypeVar, cast, get_args
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.core.devices import constant
+from mover.core.observe import Energy, PerItem
+from mover.core.records import record
+from mover.core.types import Camera, Layout, Objects
+from mover.energy.config import SceneConfig, SceneWeights
+from mover.energy.minimize import Term, active_weights, sum_terms, there
+from mover.energy.terms.bbox import bbox_term
+from mover.energy.terms.border import Borders, Fitted, fit_borders
+from mover.energy.terms.collision import BodySpace, collision_term
+from mover.energy.terms.contact import (
+    ContactPoints,
+    Trees,
+    contact_term,
+    gap_term,
+    gaps,
+    heading_term,
+    some_touches,
+)
+from mover.energy.terms.depth import DepthRange, depth_term, free_space_term
+from mover.energy.terms.distance import distance_term
+from mover.energy.terms.factors import Factors, factors
+from mover.energy.terms.offscreen import offscreen_term
+from mover.energy.terms.scale import scale_term
+from mover.energy.terms.silhouette import edge_term, silhouette_term
+from mover.energy.terms.wall import Walls, wall_term
+from mover.geometry.camera import outermost, project, to_camera
+from mover.geometry.placement import place, place_in
+from mover.geometry.raster import Crops, Depths, Topology, look
+
+E = TypeVar("E")
+Rows = Int[Tensor, " rows"]
+UNIT = tuple((x, y, z) for x in (-0.5, 0.5) for y in (0.0, 1.0) for z in (-0.5, 0.5))
+
+
+@record
+class ImageCues:
+    """What the still image says about each object."""
+
+    boxes: Float[Tensor, "objects 4"]
+    """Detected x_min, y_min, x_max, y_max [px]."""
+    sides: Int[Tensor, "objects 4"]
+    """What is known of each side of the box, see `terms.bbox`."""
+    views: Crops
+    """The window of each object."""
+    masks: Float[Tensor, "objects h w"]
+    """Detected coverage of the window's pixels in [0, 1]."""
+    keep: Bool[Tensor, "objects h w"]
+    """False where it is unknown what would be seen; everywhere without a mask."""
+    trust: Float[Tensor, " objects"]
+    """Weight of the silhouette, below one where the shape is known to be wrong."""
+    distance: Float[Tensor, " objects"] | None = None
+    """From the camera to the middle of the base in the initial scene [m]; None: not known."""
+    outline: Float[Tensor, "objects h w"] | None = None
+    """Root of the distance to the mask's outline [px^0.5]; None: the edge term finds it anew."""
+    borders: Borders | None = None
+    """What the masks may be if their outlines are too wide or too narrow; None: they are not."""
+    walls: Walls | None = None
+    """Lines along which furniture stands; None: none are known."""
+
+
+@record
+class HumanCues:
+    """What the people of all frames say about the room; None: that evidence is missing."""
+
+    depth: DepthRange | None = None
+    space: BodySpace | None = None
+    touches: ContactPoints | None = None
+    trees: Trees | None = None
+    """Finds what is touched faster; None: all points are compared."""
+
+
+@dataclass(frozen=True)
+class SceneEvidence:
+    """All that Eq. 1 knows, whatever the layout."""
+
+    objects: Objects
+    camera: Camera
+    image: ImageCues
+    humans: HumanCues
+
+    def has(self, name: str) -> bool:
+        """Whether a field of the cues is known."""
+        return {**vars(self.image), **vars(self.humans)}[name] is not None
+
+    def some(self, rows: Rows) -> "SceneEvidence":
+        """That about rows of (starts x objects), counted through."""
+        n = len(self.objects.ids)
+        image = of_objects(self.image, rows % n, n)
+        humans = of_objects(self.humans, rows % n, n)
+        return SceneEvidence(some_objects(self.objects, rows), self.camera, image, humans)
+
+
+@dataclass(frozen=True)
+class PlacedScene:
+    """The room under some layouts, with what several terms need: found when first asked for."""
+
+    layout: Layout
+    known: SceneEvidence
+    config: SceneConfig
+    """Its weights are those whose evidence is there."""
+
+    @cached_property
+    def verts_cam(self) -> Float[Tensor, "*starts objects verts 3"]:
+        """Vertices in camera axes [m]."""
+        return place_in(self.known.objects.verts, self.layout, self.known.camera.R_cam_world)
+
+    @cached_property
+    def pixels(self) -> Float[Tensor, "*starts objects verts 2"]:
+        """Vertices in the image [px]."""
+        return project(self.verts_cam, self.known.camera.K)
+
+    @cached_property
+    def extent(self) -> Float[Tensor, "*starts objects 4 2"]:
+        """The outermost vertices in the image [px]."""
+        K = self.known.camera.K
+        return project(outermost(self.verts_cam, K), K)
+
+    @cached_property
+    def _drawn(self) -> tuple[Tensor, Depths | None]:
+        """Silhouettes and, where a term has bounds for them, depths."""
+        weights, objects = self.config.weights, self.known.objects
+        bounded = any(getattr(weights, t.name) for t in SCENE_TERMS if "depth" in t.needs)
+        shape = Topology(objects.faces, objects.edges)
+        return look(self.verts_cam, shape, self.known.image.views, depth=bounded)
+
+    @property
+    def silhouettes(self) -> Float[Tensor, "*starts objects h w"]:
+        """Drawn coverage of the windows' pixels in [0, 1]."""
+        return self._drawn[0]
+
+    @property
+    def depths(self) -> Depths:
+        """First and last surfaces, for terms that need the evidence `depth`."""
+        return there(self._drawn[1])
+
+    @cached_property
+    def factors(self) -> Factors:
+        """How much depth order and collision count for seats that are used."""
+        touches = self.known.humans.touches if self.config.weights.contact else None
+        return factors(self.known.objects, touches, self.config.form)
+
+    @property
+    def loose(self) -> bool:
+        """Whether box and silhouette choose the border of the mask."""
+        free = self.known.image.borders is not None and self.config.weights.silhouette
+        return self.config.form == "robust" and bool(free)
+
+    @cached_property
+    def fitted(self) -> Fitted:
+        """Box and silhouette under the border of each mask that suits them best."""
+        image, w = self.known.image, self.config.weights
+        seen = image.boxes, image.sides, image.keep
+        drawn = self.silhouettes, self.extent
+        return fit_borders(drawn, seen, image.trust, there(image.borders), (w.bbox, w.silhouette))
+
+
+def _bbox(s: PlacedScene) -> PerItem:
+    camera, image, form = s.known.camera, s.known.image, s.config.form
+    if s.loose:
+        return s.fitted.bbox
+    pixels = project(_corners(s), camera.K) if form == "paper" else s.extent
+    return bbox_term(pixels, image.boxes, image.sides, float(camera.width), form)
+
+
+def _silhouette(s: PlacedScene) -> PerItem:
+    image = s.known.image
+    if s.loose:
+        return s.fitted.silhouette
+    return image.trust * silhouette_term(s.silhouettes, image.masks, image.keep, s.config.form)
+
+
+def _depth(s: PlacedScene) -> PerItem:
+    bounds = there(s.known.humans.depth)
+    return s.factors.depth * depth_term(s.depths, s.known.image.masks, bounds, s.config.form)
+
+
+def _collision(s: PlacedScene) -> PerItem:
+    """Of the meshes' vertices (`paper`; the padding is sent far away) or of even samples."""
+    objects, form = s.known.objects, s.config.form
+    points = place(objects.verts if form == "paper" else objects.samples, s.layout)
+    if form == "paper":
+        points = torch.where(objects.real_verts.unsqueeze(-1), points, 1e3)
+    return s.factors.collision * collision_term(points, there(s.known.humans.space), form)
+
+
+def _contact(s: PlacedScene) -> PerItem:
+    """By search trees where there are any."""
+    objects, humans, form = s.known.objects, s.known.humans, s.config.form
+    touches = there(humans.touches)
+    if humans.trees is None or form == "release":
+        regions = place(objects.top, s.layout), place(objects.back, s.layout)
+        return contact_term(regions, touches, form)
+    found = gaps(s.layout, objects, touches, humans.trees)
+    return gap_term(found, touches, len(objects.ids), form)
+
+
+def _edge(s: PlacedScene) -> PerItem:
+    image = s.known.image
+    return edge_term(s.silhouettes, image.masks, image.keep, image.outline)
+
+
+def _corners(s: PlacedScene) -> Float[Tensor, "*starts objects 8 3"]:
+    """The eight corners of each object's box in camera axes [m]."""
+    size = s.known.objects.size
+    corners = constant(UNIT, size) * size.unsqueeze(-2)
+    return to_camera(place(corners, s.layout), s.known.camera.R_cam_world)
+
+
+SCENE_TERMS: tuple[Term[PlacedScene], ...] = (
+    Term("bbox", _bbox, "its box", fused=True),
+    Term("silhouette", _silhouette, "its silhouette", fused=True),
+    Term(
+        "scale", lambda s: scale_term(s.layout.log_scale, s.config.form, s.config.growth),
+        "its size", fused=True,
+    ),
+    Term("depth", _depth, "who hides whom", ("depth",), fused=True),
+    Term("collision", _collision, "free space", ("space",), fused=True),
+    Term("contact", _contact, "touch", ("touches",), fused=True),
+    Term("edge", _edge, "its outline"),
+    Term(
+        "offscreen", lambda s: offscreen_term(
+            s.pixels, s.verts_cam, s.known.objects.real_verts, s.known.camera),
+        "the border of the image",
+    ),
+    Term(
+        "free_space", lambda s: free_space_term(
+            s.depths, s.known.image.masks, there(s.known.humans.depth)),
+        "people seen beside it", ("depth",),
+    ),
+    Term(
+        "distance", lambda s: distance_term(s.layout, there(s.known.image.distance)),
+        "the distance it was given", ("distance",), fused=True,
+    ),
+    Term(
+        "heading", lambda s: heading_term(s.layout, there(s.known.humans.touches)),
+        "where its sitters face", ("touches",), fused=True,
+    ),
+    Term(
+        "wall", lambda s: wall_term(s.layout, s.known.objects.size, there(s.known.image.walls)),
+        "the line of the furniture beside it", ("walls",),
+    ),
+)  # fmt: skip
+"""All terms of Eq. 1; what is not in this list does not count, what is cannot be forgotten."""
+
+
+def scene_energy(
+    layout: Layout,
+    objects: Objects,
+    camera: Camera,
+    image: ImageCues,
+    humans: HumanCues,
+    config: SceneConfig,
+) -> Energy:
+    """Eq. 1: what the image and the people say about where the objects stand."""
+    known = SceneEvidence(objects, camera, image, humans)
+    return energy_of_terms(SCENE_TERMS, layout, known, active_config(config, known))
+
+
+def energy_of_terms(
+    terms: Iterable[Term[PlacedScene]], layout: Layout, known: SceneEvidence, config: SceneConfig
+) -> Energy:
+    """Some terms of Eq. 1, for weights whose evidence is there (see `active_config`)."""
+    return sum_terms(config.weights, terms, PlacedScene(layout, known, config))
+
+
+def active_config(config: SceneConfig, known: SceneEvidence) -> SceneConfig:
+    """The same without the weights whose evidence is missing."""
+    return replace(config, weights=active_weights(config.weights, SCENE_TERMS, known.has))
+
+
+def best_borders(
+    layout: Layout, objects: Objects, camera: Camera, image: ImageCues, weights: SceneWeights
+) -> Int[Tensor, "*starts objects"]:
+    """Number of the shift of each mask's border that suits a layout best (`ImageCues.borders`)."""
+    known = SceneEvidence(objects, camera, image, HumanCues())
+    config = active_config(SceneConfig(weights, "robust"), known)
+    return PlacedScene(layout, known, config).fitted.shift
+
+
+def of_objects(evidence: E, index: Rows, count: int) -> E:
+    """What evidence says about the objects of this index, along the axis `objects` of its tensors.
+
+    Args:
+        evidence: A record; its axes have names (`items` is one for each object, too).
+        index: Objects, each as often as it is asked for.
+        count: Number of all objects.
+    """
+    if isinstance(evidence, ContactPoints):
+        return cast(E, some_touches(evidence, index, count))
+    found: dict[str, Any] = {}
+    for field in fields(cast(Any, evidence)):
+        value, axis = getattr(evidence, field.name), _axis_of_objects(field.type)
+        if isinstance(value, Tensor) and axis is not None:
+            found[field.name] = value.index_select(axis, index)
+        elif is_dataclass(value):
+            found[field.name] = of_objects(value, index, count)
+    return replace(cast(Any, evidence), **found)
+
+
+@cache
+def _axis_of_objects(kind: Any) -> int | None:  # noqa: ANN401
+    """The axis of a tensor that counts the objects, by its annotation; None: none does."""
+    for one in (kind, *get_args(kind)):
+        names = getattr(one, "dim_str", "").split()
+        for axis, name in enumerate(names):
+            if name in ("objects", "items"):
+                return axis - len(names)  # from the end: starts lead
+    return None
+
+
+def some_objects(objects: Objects, rows: Rows) -> Objects:
+    """The objects of rows of (starts x objects), counted through; carriers come with their loads.
+
+    Raises:
+        ValueError: If an object is asked for without what carries it.
+    """
+    n = len(objects.ids)
+    index = rows % n
+    place = torch.full((int(rows.max()) // n * n + n if len(rows) else n,), -1).to(rows)
+    place[rows] = torch.arange(len(rows)).to(rows)
+    below = objects.supports[index]
+    carrier = place[(rows - index + below).clamp_min(0)]
+    if bool(((below >= 0) & (carrier < 0)).any()):
+        raise ValueError("some_objects: an object without the one that carries it")
+    names = index.tolist()
+    return replace(
+        of_objects(objects, index, n),
+        supports=torch.where(below >= 0, carrier, below),
+        ids=tuple(objects.ids[i] for i in names),
+        categories=tuple(objects.categories[i] for i in names),
+    )

@@ -1,0 +1,57 @@
+r"""Objects fill their detected 2D boxes (supplement, "Loss Terms").
+
+Price:     L_bbox = \sum_i \| Proj_i^a - Det_i^a \|,  a in {x_min, y_min, width}
+Paper:     Proj_i is the projected 3D box (its eight corners); an l1 norm, in pixels of an image
+           that is 640 wide.
+Release:   Proj_i is the extent of the projected mesh; smooth l1 with a knee of one pixel.
+Robust:    extent of the mesh, all four sides, each divided by the box's size \sqrt{w h}, so that
+           near and far objects count alike. Where the image's border or something in front may hide
+           more of the object, it reaches at least as far as it is seen, and may reach farther.
+"""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mover.core.devices import constant
+from mover.energy.config import Variant
+
+WIDTH = 640.0  # [px], the image width at which the weights of the paper have their meaning
+UNKNOWN, SEEN, LEAST = 0, 1, 2
+"""What is known of a side: nothing, where it is, or how far the object reaches at least."""
+SOFT = 0.01  # of a box's size: half width of the rounded tip of the robust price
+
+
+def bbox_term(
+    pixels: Float[Tensor, "*starts objects points 2"],
+    detected: Float[Tensor, "objects 4"],
+    sides: Int[Tensor, "objects 4"],
+    width: float,
+    form: Variant,
+    wider: float = 0.0,
+) -> Float[Tensor, "*starts objects"]:
+    """Distance between projected and detected boxes.
+
+    Args:
+        pixels: Projected corners (`paper`) or vertices [px].
+        detected: x_min, y_min, x_max, y_max [px].
+        sides: `UNKNOWN`, `SEEN` or `LEAST`; an object without a box knows none and costs nothing.
+        width: Width of the image [px].
+        form: How it is priced; [px at 640] for `paper` and `release`, else box sizes.
+        wider: How far the true sides lie outside the detected ones [px] (`robust` only).
+    """
+    drawn = torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
+    if form == "robust":
+        size = (detected[:, 2:] - detected[:, :2]).clamp_min(1).prod(-1, keepdim=True).sqrt()
+        outward = constant((-1.0, -1.0, 1.0, 1.0), detected)
+        off = (drawn - (detected + wider * outward)) / size
+        counts = (sides == SEEN) | ((sides == LEAST) & (off * outward <= 0))
+        return (((off.square() + SOFT**2).sqrt() - SOFT) * counts).sum(-1)
+    off = (_corner_and_width(drawn) - _corner_and_width(detected)).abs() * (WIDTH / width)
+    if form == "release":
+        off = torch.where(off < 1, 0.5 * off.square(), off - 0.5)
+    return off.sum(-1) * sides.any(-1)
+
+
+def _corner_and_width(box: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
+    return torch.cat([box[..., :2], box[..., 2:3] - box[..., :1]], -1)

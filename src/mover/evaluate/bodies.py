@@ -1,0 +1,239 @@
+"""How far the bodies are from the true ones, and how they stand on the floor of their scene.
+
+Both are measured in the gravity-aligned worlds of their scenes, without alignment.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mover.bodies.parts import members, parts_of
+from mover.bodies.skeleton import BODY
+from mover.core.records import record
+from mover.core.types import Bodies, Camera
+from mover.energy.body_terms.time import Neighbours, gather_neighbours
+from mover.evaluate.scene import Metric
+
+SOLES = ("left_sole", "right_sole")
+
+
+@record
+class Standing:
+    """The soles of all bodies above the floor of their scene."""
+
+    heights: Float[Tensor, "bodies soles"]
+    """Height of each sole vertex above the floor, negative below [m]."""
+    tolerance: float
+    """How far a sole may be under the floor before it counts [m]."""
+
+
+@record
+class Twins:
+    """Points of the bodies and of their true counterparts; None where they do not correspond."""
+
+    verts: Float[Tensor, "bodies verts 3"] | None
+    true_verts: Float[Tensor, "bodies verts 3"] | None
+    joints: Float[Tensor, "bodies joints 3"] | None
+    true_joints: Float[Tensor, "bodies joints 3"] | None
+
+
+def ground_penetration_frequency(standing: Standing) -> float:
+    """Share of the sole vertices of all bodies that are under the floor."""
+    return float((standing.heights < -standing.tolerance).double().mean())
+
+
+def ground_penetration_distance(standing: Standing) -> float:
+    """Mean depth of those sole vertices that are under the floor [m]; 0 where none is."""
+    below = standing.heights < -standing.tolerance
+    return float(-standing.heights[below].mean()) if bool(below.any()) else 0.0
+
+
+def pje(twins: Twins) -> float | None:
+    """Mean distance of the joints [m], without any alignment."""
+    return _distance(twins.joints, twins.true_joints)
+
+
+def v2v(twins: Twins) -> float | None:
+    """Mean distance of corresponding vertices [m], without any alignment."""
+    return _distance(twins.verts, twins.true_verts)
+
+
+def p_pje(twins: Twins) -> float | None:
+    """Mean distance of the joints [m] after the best similarity transform of each body."""
+    return _distance(_aligned(twins.joints, twins.true_joints), twins.true_joints)
+
+
+def p_v2v(twins: Twins) -> float | None:
+    """Mean distance of the vertices [m] after the best similarity transform of each body."""
+    return _distance(_aligned(twins.verts, twins.true_verts), twins.true_verts)
+
+
+GROUND_METRICS: dict[str, Metric[Standing]] = {
+    "ground_penetration_frequency": Metric("", 0.0, ground_penetration_frequency),
+    "ground_penetration_distance": Metric("m", 0.0, ground_penetration_distance),
+}
+POSE_METRICS: dict[str, Metric[Twins]] = {
+    "pje": Metric("m", 0.0, pje),
+    "v2v": Metric("m", 0.0, v2v),
+    "p_pje": Metric("m", 0.0, p_pje),
+    "p_v2v": Metric("m", 0.0, p_v2v),
+}
+
+
+def soles_of(bodies: Bodies, camera: Camera) -> Int[Tensor, " soles"]:
+    """Indices of the vertices under the feet; empty where these bodies do not tell them."""
+    up_world = torch.tensor([0.0, 1.0, 0.0]).to(bodies.verts)
+    up_cam = camera.R_cam_world[:, 1].to(bodies.verts)
+    parts = parts_of(bodies, up_cam if bodies.space == "camera" else up_world)
+    return members(parts, *SOLES).nonzero()[:, 0]
+
+
+def gather_twins(bodies: Bodies, truth: Bodies) -> Twins | None:
+    """Points of the bodies that the truth knows; None: it knows none of them."""
+    rows, true_rows = shared_rows(bodies, truth)
+    if len(rows) == 0:
+        return None
+    same = bodies.verts.shape[1] == truth.verts.shape[1]
+    verts = (bodies.verts[rows], truth.verts[true_rows]) if same else (None, None)
+    ours, theirs = _common_joints(bodies.joint_names, truth.joint_names)
+    if not ours or bodies.joints is None or truth.joints is None:
+        return Twins(*verts, None, None)
+    return Twins(*verts, bodies.joints[rows][:, ours], truth.joints[true_rows][:, theirs])
+
+
+def procrustes(
+    points: Float[Tensor, "*batch points 3"], target: Float[Tensor, "*batch points 3"]
+) -> Float[Tensor, "*batch points 3"]:
+    """The points after the rotation, scale and shift that bring them nearest to the target."""
+    center, goal = points.mean(-2, keepdim=True), target.mean(-2, keepdim=True)
+    source, aim = points - center, target - goal
+    u, s, vt = torch.linalg.svd(source.mT @ aim)
+    last = torch.where(torch.linalg.det(u @ vt) < 0, -1.0, 1.0).to(points)
+    signs = torch.stack([torch.ones_like(last), torch.ones_like(last), last], -1)
+    spread = source.square().sum((-2, -1)).clamp_min(torch.finfo(points.dtype).tiny)
+    scale = (s * signs).sum(-1) / spread
+    return scale[..., None, None] * (source @ ((u * signs.unsqueeze(-2)) @ vt)) + goal
+
+
+def shared_rows(bodies: Bodies, truth: Bodies) -> tuple[Int[Tensor, " rows"], Int[Tensor, " rows"]]:
+    """Rows of the two that are the same person in the same frame."""
+    there = {key: row for row, key in enumerate(_keys(truth))}
+    rows = [(row, there[key]) for row, key in enumerate(_keys(bodies)) if key in there]
+    pairs = torch.tensor(rows, dtype=torch.long).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _keys(bodies: Bodies) -> list[tuple[int, int]]:
+    return list(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True))
+
+
+def _common_joints(names: Sequence[str], true_names: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Places of the joints that both have: of the 22 of the body, where they have any of those."""
+    common = [name for name in names if name in true_names]
+    body = [name for name in common if name in BODY] or common
+    return [names.index(name) for name in body], [true_names.index(name) for name in body]
+
+
+def _aligned(points: Tensor | None, target: Tensor | None) -> Tensor | None:
+    return points if points is None or target is None else procrustes(points, target)
+
+
+def _distance(points: Tensor | None, target: Tensor | None) -> float | None:
+    if points is None or target is None:
+        return None
+    return float((points - target).norm(dim=-1).mean())
+
+
+# How people move over the floor: sliding and floating feet, and jerky joints.
+
+
+STEP = 0.1  # [m] over the floor: a sole that is lower may stand
+
+
+@record
+class Gait:
+    """The feet and joints of people who move."""
+
+    soles: Float[Tensor, "bodies feet 3"] | None
+    """Lowest place of each sole [m]; None: no video or no soles."""
+    ground: float | None
+    """Height of the floor [m]."""
+    near: Neighbours
+    joints: Float[Tensor, "twins joints 3"] | None
+    """Joints that the truth knows as well [m]."""
+    true_joints: Float[Tensor, "twins joints 3"] | None
+    twins: Neighbours
+    """Which rows of these follow each other."""
+
+
+def foot_skate(gait: Gait) -> float | None:
+    """Mean speed of soles near the floor along it [m/s], the nearer the more it counts (HuMoR)."""
+    if gait.soles is None or gait.ground is None or not len(gait.near.pairs):
+        return None
+    i, j = gait.near.pairs.unbind(-1)
+    height = ((gait.soles[i, :, 1] + gait.soles[j, :, 1]) / 2 - gait.ground).clamp_min(0)
+    share = 2 - 2 ** (height / STEP).clamp(0, 1)
+    way = (gait.soles[j] - gait.soles[i])[..., [0, 2]].norm(dim=-1)
+    speed = way / gait.near.gaps.to(way)[:, None]
+    slower = speed.argmin(1, keepdim=True)  # the foot that carries; the other may swing
+    share, speed = share.gather(1, slower), speed.gather(1, slower)
+    return float((share * speed).sum() / share.sum()) if bool(share.sum() > 0) else 0.0
+
+
+def float_height(gait: Gait) -> float | None:
+    """Mean height of the lower sole over the floor [m]; 0 where it is below."""
+    if gait.soles is None or gait.ground is None:
+        return None
+    return float((gait.soles[..., 1].amin(1) - gait.ground).clamp_min(0).mean())
+
+
+def acceleration_error(gait: Gait) -> float | None:
+    """Mean difference of the joints' accelerations [m/s²]."""
+    if gait.joints is None or gait.true_joints is None or not len(gait.twins.triples):
+        return None
+    found, true = (_accelerations(x, gait.twins) for x in (gait.joints, gait.true_joints))
+    return float((found - true).norm(dim=-1).mean())
+
+
+MOTION_METRICS: dict[str, Metric[Gait]] = {
+    "foot_skate": Metric("m/s", 0.0, foot_skate),
+    "float_height": Metric("m", 0.0, float_height),
+    "acceleration_error": Metric("m/s²", 0.0, acceleration_error),
+}
+
+
+def gather_gait(bodies: Bodies, truth: Bodies | None, ground: float | None) -> Gait:
+    """Feet and joints of bodies in the world, and of the true ones where they are known."""
+    soles = _soles(bodies)
+    near = gather_neighbours(bodies.frame, bodies.person, bodies.fps)
+    none = gather_neighbours(bodies.frame[:0], bodies.person[:0], bodies.fps)
+    twins = None if truth is None else gather_twins(bodies, truth)
+    if truth is None or twins is None or twins.joints is None:
+        return Gait(soles, ground, near, None, None, none)
+    rows, _ = shared_rows(bodies, truth)
+    both = gather_neighbours(bodies.frame[rows], bodies.person[rows], bodies.fps)
+    return Gait(soles, ground, near, twins.joints, twins.true_joints, both)
+
+
+def _soles(bodies: Bodies) -> Tensor | None:
+    """Middle of each sole at the height of its lowest point [m]."""
+    parts = parts_of(bodies)
+    found: list[Tensor] = []
+    for name in ("left_sole", "right_sole"):
+        own = members(parts, name)
+        if not own.any():
+            return None
+        sole = bodies.verts[:, own]
+        x, _, z = sole.mean(1).unbind(-1)
+        found.append(torch.stack([x, sole[..., 1].amin(1), z], -1))
+    return torch.stack(found, 1)
+
+
+def _accelerations(joints: Tensor, near: Neighbours) -> Tensor:
+    """At the middle of three frames [m/s²]."""
+    i, j, k = near.triples.unbind(-1)
+    before, after = (s[:, None, None] for s in near.steps.to(joints).unbind(-1))
+    slope = (joints[k] - joints[j]) / after - (joints[j] - joints[i]) / before
+    return 2 * slope / (before + after)

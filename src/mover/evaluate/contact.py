@@ -1,0 +1,168 @@
+"""Whether people and furniture fit: collision, contact and depth of penetration.
+
+Each body is measured against the furniture of its own scene; the floor is left out.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mover.core.records import fingerprint, record
+from mover.core.types import Bodies, Mesh, SceneObject
+from mover.evaluate.bodies import shared_rows
+from mover.evaluate.scene import Metric
+from mover.geometry.placement import place_object
+from mover.geometry.volume import signed_distance
+from mover.geometry.watertight import close_mesh
+
+
+@record
+class Nearness:
+    """How the vertices of some bodies lie to the furniture; inf where nothing is near."""
+
+    signed: Float[Tensor, "bodies verts"]
+    """Signed distance to the object that the vertex is deepest in or nearest to [m]."""
+    surface: Float[Tensor, "bodies verts"]
+    """Distance to the nearest surface [m]."""
+
+
+@record
+class Touch:
+    """Bodies beside the furniture of their scene, and the same bodies in the true one."""
+
+    near: Nearness
+    """All bodies that are judged."""
+    shared: Nearness | None
+    """Those that the truth knows as well, vertex by vertex; None: no truth."""
+    true_shared: Nearness | None
+    reach: float
+    """A vertex touches what is at most so far away [m]."""
+
+
+@record
+class TrueTouch:
+    """Some true bodies beside the true furniture."""
+
+    bodies: Bodies
+    near: Nearness
+
+
+def non_collision(touch: Touch) -> float:
+    """Share of a body's vertices that are inside no object, mean over bodies (the paper's)."""
+    return float((touch.near.signed >= 0).double().mean(-1).mean())
+
+
+def contact(touch: Touch) -> float:
+    """Share of the bodies of which at least one vertex is inside an object (the paper's)."""
+    return float((touch.near.signed < 0).any(-1).double().mean())
+
+
+def penetration_depth(touch: Touch) -> float:
+    """Depth of a body's deepest vertex inside an object [m], 0 outside; mean over bodies."""
+    return float((-touch.near.signed).clamp_min(0).amax(-1).mean())
+
+
+def contact_f1(touch: Touch) -> float | None:
+    """F1 score of the vertices that touch furniture, over all bodies; 1 if none should or does."""
+    if touch.shared is None or touch.true_shared is None:
+        return None
+    found, true = touch.shared.surface <= touch.reach, touch.true_shared.surface <= touch.reach
+    both, either = int((found & true).sum()), int(found.sum() + true.sum())
+    return 2 * both / either if either else 1.0
+
+
+TOUCH_METRICS: dict[str, Metric[Touch]] = {
+    "non_collision": Metric("", 1.0, non_collision),
+    "contact": Metric("", 1.0, contact),
+    "contact_f1": Metric("", 1.0, contact_f1),
+    "penetration_depth": Metric("m", 0.0, penetration_depth),
+}
+
+
+def close_meshes(pieces: Iterable[SceneObject]) -> dict[str, Mesh]:
+    """The closed proxies of all meshes by the fingerprint of the mesh; equal ones only once."""
+    meshes = {fingerprint(piece.mesh): piece.mesh for piece in pieces}
+    return {key: close_mesh(mesh) for key, mesh in meshes.items()}
+
+
+def furniture_of(pieces: Iterable[SceneObject], closed: Mapping[str, Mesh]) -> list[Mesh]:
+    """The closed proxies of the pieces where they stand in the world."""
+    return [place_object(replace(p, mesh=closed[fingerprint(p.mesh)])) for p in pieces]
+
+
+def gather_truth(
+    truth: Bodies, furniture: Sequence[Mesh], judged: Bodies, count: int, reach: float
+) -> TrueTouch | None:
+    """True bodies beside the true furniture: at most `count` of those that are to be judged."""
+    rows = shared_rows(truth, judged)[0]
+    if len(rows) == 0 or truth.verts.shape[1] != judged.verts.shape[1]:
+        return None
+    bodies = _take(truth, rows[evenly(len(rows), count)])
+    return TrueTouch(bodies, nearness(bodies.verts, furniture, reach))
+
+
+def gather_touch(
+    bodies: Bodies, furniture: Sequence[Mesh], truth: TrueTouch | None, count: int, reach: float
+) -> Touch:
+    """Bodies beside the furniture of their scene: `count` of them, and those the truth knows.
+
+    Args:
+        bodies: People in the world of their scene.
+        furniture: The closed objects of the same scene.
+        truth: The truth's side of it.
+        count: At most so many bodies, spread evenly over the rows.
+        reach: A vertex touches what is at most so far away [m].
+    """
+    picked = evenly(len(bodies.frame), count)
+    near = nearness(bodies.verts[picked], furniture, reach)
+    if truth is None or bodies.verts.shape[1] != truth.bodies.verts.shape[1]:
+        return Touch(near, None, None, reach)
+    rows, true_rows = shared_rows(bodies, truth.bodies)
+    if len(rows) == 0:
+        return Touch(near, None, None, reach)
+    same = torch.equal(rows, picked)
+    shared = near if same else nearness(bodies.verts[rows], furniture, reach)
+    true = Nearness(truth.near.signed[true_rows], truth.near.surface[true_rows])
+    return Touch(near, shared, true, reach)
+
+
+def nearness(
+    verts: Float[Tensor, "bodies verts 3"], furniture: Sequence[Mesh], reach: float
+) -> Nearness:
+    """Distances of body vertices to closed meshes in the same world, exact up to `reach` [m].
+
+    Args:
+        verts: Body vertices [m].
+        furniture: Closed meshes, wound outwards.
+        reach: Vertices farther than this from an object's box are not measured against it [m].
+    """
+    points = verts.reshape(-1, 3)
+    signed = torch.full_like(points[:, 0], torch.inf)
+    surface = signed.clone()
+    for mesh in furniture:  # one tree for each mesh: there is no batched exact distance
+        low, high = mesh.verts.amin(0) - reach, mesh.verts.amax(0) + reach
+        close = ((points >= low) & (points <= high)).all(-1).nonzero()[:, 0]
+        if len(close):
+            distance = signed_distance(points[close], mesh.verts, mesh.faces).to(signed)
+            signed[close] = torch.minimum(signed[close], distance)
+            surface[close] = torch.minimum(surface[close], distance.abs())
+    return Nearness(signed.reshape(verts.shape[:2]), surface.reshape(verts.shape[:2]))
+
+
+def evenly(rows: int, count: int) -> Int[Tensor, " picked"]:
+    """At most `count` of so many rows, spread evenly, the first and the last among them."""
+    if rows <= count:
+        return torch.arange(rows)
+    return torch.linspace(0, rows - 1, count, dtype=torch.float64).round().long()
+
+
+def _take(bodies: Bodies, rows: Int[Tensor, " rows"]) -> Bodies:
+    """Some rows of people without parameters."""
+    joints = bodies.joints
+    return replace(
+        bodies, verts=bodies.verts[rows], joints=None if joints is None else joints[rows],
+        frame=bodies.frame[rows], person=bodies.person[rows], pose=None,
+    )  # fmt: skip

@@ -1,0 +1,242 @@
+"""Every metric of the paper, before and after: how far a scene is from the truth.
+
+Definitions, matching rules and sampling densities: docs/metrics.md.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from mover.bodies.corrected import in_world
+from mover.core.files import replacing
+from mover.core.records import map_tensors, record
+from mover.core.types import Bodies, Mesh, Scene
+from mover.evaluate.bodies import (
+    GROUND_METRICS,
+    MOTION_METRICS,
+    POSE_METRICS,
+    Standing,
+    gather_gait,
+    gather_twins,
+    soles_of,
+)
+from mover.evaluate.contact import (
+    TOUCH_METRICS,
+    TrueTouch,
+    close_meshes,
+    furniture_of,
+    gather_touch,
+    gather_truth,
+)
+from mover.evaluate.scene import (
+    CAMERA_METRICS,
+    OBJECT_METRICS,
+    SIDES,
+    Metric,
+    Sight,
+    means_of,
+    measure,
+    measure_objects,
+    unmatched,
+)
+from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.camera_file import camera_of
+from mover.io.capture.scene_file import read_scene
+from mover.io.files.fields import read_json
+
+T = TypeVar("T")
+
+METRICS: dict[str, Metric[Any]] = {
+    **OBJECT_METRICS,
+    **TOUCH_METRICS,
+    **CAMERA_METRICS,
+    **GROUND_METRICS,
+    **POSE_METRICS,
+    **MOTION_METRICS,
+}
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """How densely the metrics are measured."""
+
+    samples: int = 10_000
+    """Points on each true surface, of equal area, for the distance to the estimated one."""
+    bodies: int = 100
+    """At most so many bodies, spread evenly over the rows, for contact and collision."""
+    reach: float = 0.05
+    """A vertex touches furniture that is at most so far away [m]."""
+    ground_tolerance: float = 0.01
+    """How far a sole may be under the floor before it counts as penetration [m]."""
+    by_place: bool = True
+    """Objects that bear no true name are paired by place; False: they are false."""
+
+
+@record
+class EvaluatedBodies:
+    """The people of the three scenes, in the camera's or the world's frame; None: not known."""
+
+    initial: Bodies | None
+    result: Bodies | None
+    truth: Bodies | None
+    touch: TrueTouch | None = None
+    """The true people beside the true furniture (`touch_in_truth`); None: it is measured."""
+
+
+@record
+class _Populated:
+    """A scene and its people, in one world."""
+
+    scene: Scene
+    bodies: Bodies | None
+    soles: Int[Tensor, " soles"]
+    """The vertices under their feet."""
+    furniture: tuple[Mesh, ...]
+    """The closed objects where they stand; none where there are no people."""
+
+
+def evaluate(
+    initial: Scene,
+    result: Scene,
+    truth: Scene,
+    bodies: EvaluatedBodies | None = None,
+    config: EvaluateConfig | None = None,
+    sides: Sequence[str] = SIDES,
+) -> dict[str, Any]:
+    """Measure a scene before and after against the truth.
+
+    Args:
+        initial: The scene that the run was given.
+        result: The scene that it made of it.
+        truth: The true scene.
+        bodies: The people of the three; without them their metrics are absent.
+        config: Densities and thresholds.
+        sides: Which of `initial` and `result` is measured.
+
+    Returns:
+        What metrics.json holds: the means `initial` and `result`, and each of the `objects`.
+    """
+    config = config or EvaluateConfig()
+    bodies = bodies or EvaluatedBodies(None, None, None)
+    before, after, true = _populate((initial, result, truth), bodies)
+    asked = {
+        key: judged for key, judged in zip(SIDES, (before, after), strict=True) if key in sides
+    }
+    scenes = before.scene, after.scene, true.scene
+    objects = measure_objects(scenes, sides, config.samples, config.by_place)
+    touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)
+    return {
+        key: means_of(objects, key)
+        | measure(CAMERA_METRICS, Sight(judged.scene, true.scene))
+        | _people(judged, true, touch, config)
+        for key, judged in asked.items()
+    } | {"objects": objects}
+
+
+def touch_in_truth(
+    truth: Scene, bodies: EvaluatedBodies, config: EvaluateConfig
+) -> TrueTouch | None:
+    """The true people beside the true furniture, of the bodies that are judged; None: no truth."""
+    true = _populate((truth, truth, truth), EvaluatedBodies(None, None, bodies.truth))[-1]
+    return _true_touch(true, bodies.result or bodies.initial, config)
+
+
+def evaluate_folder(out: Path, truth: Path, config: EvaluateConfig | None = None) -> dict[str, Any]:
+    """Measure the result folder `out` against the folder `truth` and write out/metrics.json.
+
+    Raises:
+        InputError: If a scene or a bodies file is missing or wrong.
+    """
+    initial_people, people, true_people = (
+        read_bodies(path) if path.exists() else None
+        for path in (out / "initial_bodies.npz", out / "bodies.npz", truth / "bodies.npz")
+    )
+    bodies = EvaluatedBodies(initial_people, people, true_people)
+    initial, result = read_scene(out / "initial.json"), read_scene(out / "scene.json")
+    own = truth / "camera.json"
+    true = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
+    metrics = evaluate(initial, result, true, bodies, config)
+    metrics["unmatched"] = unmatched(initial, result, true)
+    with replacing(out / "metrics.json") as part:
+        part.write_text(json.dumps(metrics, indent=1, allow_nan=False))
+    return metrics
+
+
+def table(metrics: Mapping[str, Any]) -> str:
+    """The metrics before and after as plain text, then the place of each object."""
+    initial, result = metrics["initial"], metrics["result"]
+    lines = [f"{'metric':34}{'before':>10}{'after':>10}{'best':>8}"]
+    for name, metric in METRICS.items():
+        if name in initial or name in result:
+            title = f"{name} [{metric.unit}]" if metric.unit else name
+            values = _cell(initial, name) + _cell(result, name)
+            lines.append(f"{title:34}{values}{metric.best:8.0f}")
+    lines += ["", f"{'object':34}{'iou3d before, after':>20}{'center_error [m]':>20}"]
+    for item in metrics["objects"]:
+        cells = "".join(
+            _cell(item[key], name)
+            for name in ("iou3d", "center_error")
+            for key in ("initial", "result")
+        )
+        lines.append(f"{item['id']:34.34}{cells}")
+    for name, ids in metrics.get("unmatched", {}).items():
+        lines += [f"{name}: {', '.join(ids)}"] if ids else []
+    return "\n".join(lines)
+
+
+def _cell(values: Mapping[str, float], name: str) -> str:
+    return f"{values[name]:10.3f}" if name in values else f"{'-':>10}"
+
+
+def _populate(scenes: tuple[Scene, Scene, Scene], people: EvaluatedBodies) -> list[_Populated]:
+    """Scenes and people in double precision and in one world; no rows are no people."""
+    rows = [
+        b if b and len(b.frame) else None for b in (people.initial, people.result, people.truth)
+    ]
+    pairs = list(zip(scenes, rows, strict=True))
+    closed = close_meshes(piece for scene, b in pairs if b is not None for piece in scene.objects)
+    return [_populated(scene, b, closed) for scene, b in pairs]
+
+
+def _populated(scene: Scene, bodies: Bodies | None, closed: Mapping[str, Mesh]) -> _Populated:
+    if bodies is None:
+        return _Populated(_double(scene), None, torch.zeros(0, dtype=torch.long), ())
+    soles = soles_of(bodies, scene.camera)
+    furniture = _double(tuple(furniture_of(scene.objects, closed)))
+    scene = _double(scene)
+    return _Populated(scene, in_world(_double(bodies), scene.camera), soles, furniture)
+
+
+def _double(value: T) -> T:
+    return map_tensors(lambda x: x.double() if x.is_floating_point() else x, value)
+
+
+def _true_touch(
+    truth: _Populated, judged: Bodies | None, config: EvaluateConfig
+) -> TrueTouch | None:
+    if truth.bodies is None or judged is None:
+        return None
+    return gather_truth(truth.bodies, truth.furniture, judged, config.bodies, config.reach)
+
+
+def _people(
+    judged: _Populated, truth: _Populated, touch: TrueTouch | None, config: EvaluateConfig
+) -> dict[str, float]:
+    """The metrics of a scene's people; what they or the truth do not tell is left out."""
+    bodies, ground = judged.bodies, judged.scene.ground
+    if bodies is None:
+        return {}
+    near = gather_touch(bodies, judged.furniture, touch, config.bodies, config.reach)
+    values = measure(TOUCH_METRICS, near)
+    if ground is not None and len(judged.soles):
+        heights = bodies.verts[:, judged.soles, 1] - ground
+        values |= measure(GROUND_METRICS, Standing(heights, config.ground_tolerance))
+    values |= measure(MOTION_METRICS, gather_gait(bodies, truth.bodies, ground))
+    twins = None if truth.bodies is None else gather_twins(bodies, truth.bodies)
+    return values | (measure(POSE_METRICS, twins) if twins is not None else {})

@@ -1,0 +1,303 @@
+"""What a scene is worth against the truth: its objects one by one, its camera and its ground.
+
+Objects are compared in the gravity-aligned world of their own scene (docs/metrics.md).
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mover.core.records import record
+from mover.core.types import Camera, Mesh, Scene, SceneObject
+from mover.furniture.library import canonical
+from mover.geometry.boxes import Box, box_of
+from mover.geometry.boxes import iou2d as rectangle_iou
+from mover.geometry.boxes import iou3d as box_iou
+from mover.geometry.camera import NEAR, pitch_roll, project, to_camera
+from mover.geometry.nearest import to_surface
+from mover.geometry.placement import place_object
+from mover.geometry.rotations import wrap
+
+T = TypeVar("T")
+THINNEST = 1e-3  # [m], flat objects (rugs, pictures) count as this thick in the 3D IoU
+PLASTIC = 1.32471795724474602596  # x³ = x + 1: its powers spread points evenly over a square
+NEARER = 1e-3  # [1/m], boxes that do not overlap are paired by distance: this breaks the tie
+
+
+@dataclass(frozen=True)
+class Metric(Generic[T]):
+    """One line of the table of metrics."""
+
+    unit: str
+    """`m`, `rad` or nothing."""
+    best: float
+    """What a perfect reconstruction scores: 1 where more is better, 0 where less is."""
+    measure: Callable[[T], float | None]
+    """The value, or None where the truth that it needs is missing."""
+
+
+@record
+class Pair:
+    """An object of a scene and the true object that it stands for."""
+
+    estimate: SceneObject
+    estimate_camera: Camera
+    truth: SceneObject
+    truth_camera: Camera
+    samples: int
+    """Number of points on the true surface."""
+
+
+@record
+class Sight:
+    """An estimated scene and the true one, seen for their camera and ground."""
+
+    estimate: Scene
+    truth: Scene
+
+
+def iou3d(pair: Pair) -> float:
+    """Overlap of the two upright oriented boxes: intersection over union of their volumes."""
+    return float(box_iou(_thick(box_of(pair.estimate)), _thick(box_of(pair.truth))))
+
+
+def iou2d(pair: Pair) -> float | None:
+    """Overlap in the image of the boxes around the two drawn meshes, both cut at its border."""
+    truth = image_box(pair.truth, pair.truth_camera)
+    estimate = image_box(pair.estimate, pair.estimate_camera)
+    if truth is None:
+        return None
+    return 0.0 if estimate is None else float(rectangle_iou(estimate, truth))
+
+
+def p2s(pair: Pair) -> float:
+    """Mean distance from points of the true surface to the estimated surface [m]."""
+    points = area_samples(place_object(pair.truth), pair.samples)
+    mesh = place_object(pair.estimate)
+    return float(to_surface(points, mesh.verts, mesh.faces).mean())
+
+
+def yaw_error(pair: Pair) -> float:
+    """Angle between the two fronts [rad]; symmetries of a piece are not taken into account."""
+    return float(wrap(pair.estimate.yaw - pair.truth.yaw).abs())
+
+
+def center_error(pair: Pair) -> float:
+    """Distance between the centres of the two boxes [m]."""
+    return float((box_of(pair.estimate).center - box_of(pair.truth).center).norm())
+
+
+def size_error(pair: Pair) -> float:
+    """Mean difference of width, height and depth of the two boxes, each along its own axes [m]."""
+    return float((box_of(pair.estimate).size - box_of(pair.truth).size).abs().mean())
+
+
+def pitch_error(sight: Sight) -> float:
+    """Difference of the cameras' pitch [rad]."""
+    return _tilt_errors(sight)[0]
+
+
+def roll_error(sight: Sight) -> float:
+    """Difference of the cameras' roll [rad]."""
+    return _tilt_errors(sight)[1]
+
+
+def ground_error(sight: Sight) -> float | None:
+    """Difference of the floor's height below the camera [m]."""
+    if sight.estimate.ground is None or sight.truth.ground is None:
+        return None
+    return abs(sight.estimate.ground - sight.truth.ground)
+
+
+OBJECT_METRICS: dict[str, Metric[Pair]] = {
+    "iou3d": Metric("", 1.0, iou3d),
+    "iou2d": Metric("", 1.0, iou2d),
+    "p2s": Metric("m", 0.0, p2s),
+    "yaw_error": Metric("rad", 0.0, yaw_error),
+    "center_error": Metric("m", 0.0, center_error),
+    "size_error": Metric("m", 0.0, size_error),
+}
+CAMERA_METRICS: dict[str, Metric[Sight]] = {
+    "pitch_error": Metric("rad", 0.0, pitch_error),
+    "roll_error": Metric("rad", 0.0, roll_error),
+    "ground_error": Metric("m", 0.0, ground_error),
+}
+
+
+def measure(table: Mapping[str, Metric[T]], subject: T) -> dict[str, float]:
+    """Every metric of a table that can be told of the subject; what lacks its truth is left out."""
+    values = {name: metric.measure(subject) for name, metric in table.items()}
+    return {name: v for name, v in values.items() if v is not None and math.isfinite(v)}
+
+
+def measure_missing(truth: SceneObject, camera: Camera) -> dict[str, float]:
+    """A missing object scores 0 in both overlaps, if the truth has them, and nothing else."""
+    seen = image_box(truth, camera) is not None
+    return {"iou3d": 0.0, "iou2d": 0.0} if seen else {"iou3d": 0.0}
+
+
+def area_samples(mesh: Mesh, count: int) -> Float[Tensor, "count 3"]:
+    """Points of a surface that stand for equal shares of its area, without random numbers.
+
+    Thin boards get as many points on each side as wide ones: the mean over the points is the mean
+    over the surface.
+    """
+    a, b, c = mesh.verts[mesh.faces].unbind(1)
+    area = torch.linalg.cross(b - a, c - a).norm(dim=-1).double().cumsum(0)
+    steps = torch.arange(count, dtype=torch.float64) + 0.5
+    face = torch.searchsorted(area, steps / count * area[-1]).clamp_max(len(area) - 1)
+    u, v = (steps * PLASTIC**-1 % 1).to(a), (steps * PLASTIC**-2 % 1).to(a)
+    u, v = torch.where(u + v > 1, 1 - u, u)[:, None], torch.where(u + v > 1, 1 - v, v)[:, None]
+    return a[face] + u * (b - a)[face] + v * (c - a)[face]
+
+
+def match(
+    estimate: Scene, truth: Scene, known: Mapping[str, str], by_place: bool = True
+) -> dict[str, SceneObject]:
+    """Say which estimated object stands for which true one.
+
+    Names decide first. What they leave over is paired one to one within its class so that the
+    sum of the overlaps, in 3D and in the image, is greatest; without overlap the nearer one wins.
+
+    Args:
+        estimate: The scene that is judged.
+        truth: The true scene.
+        known: Id of the estimated object by id of the true one; unknown names are skipped.
+        by_place: Pair what names leave over; else it is missing, or stands for nothing.
+
+    Returns:
+        The estimated object by id of the true one; a true object that is missing is not in it.
+    """
+    by_id = {piece.id: piece for piece in estimate.objects}
+    found = {p.id: by_id[known[p.id]] for p in truth.objects if known.get(p.id) in by_id}
+    if not by_place:
+        return found
+    taken = {piece.id for piece in found.values()}
+    rest = [p for p in truth.objects if p.id not in found]
+    free = [p for p in estimate.objects if p.id not in taken]
+    for category in sorted({canonical(p.category) for p in rest}):
+        ours = [p for p in free if canonical(p.category) == category]
+        theirs = [p for p in rest if canonical(p.category) == category]
+        found |= _assign(ours, estimate.camera, theirs, truth.camera)
+    return found
+
+
+def image_box(piece: SceneObject, camera: Camera) -> Float[Tensor, "4"] | None:
+    """Box around the drawn mesh, cut at the image border, as shares of its width and height.
+
+    None: nothing of the mesh is on the image.
+    """
+    mesh = place_object(piece)
+    visible = _in_front(to_camera(mesh.verts, camera.R_cam_world), mesh.faces)
+    if len(visible) == 0:
+        return None
+    size = torch.tensor([camera.width, camera.height]).to(visible)
+    pixels = project(visible, camera.K) / size
+    low, high = pixels.amin(0).clamp(0, 1), pixels.amax(0).clamp(0, 1)
+    return torch.cat([low, high]) if bool((low < high).all()) else None
+
+
+def _in_front(
+    points_cam: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]
+) -> Float[Tensor, "visible 3"]:
+    """Corners of the triangles, cut where they come nearer than `NEAR`."""
+    ends = points_cam[torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])]
+    depth = ends[..., 2]
+    cut = (depth[:, 0] < NEAR) != (depth[:, 1] < NEAR)
+    start, stop = ends[cut].unbind(1)
+    share = (NEAR - start[:, 2:]) / (stop[:, 2:] - start[:, 2:])
+    return torch.cat([ends[depth >= NEAR], start + share * (stop - start)])
+
+
+def _assign(
+    ours: list[SceneObject], our_camera: Camera, theirs: list[SceneObject], their_camera: Camera
+) -> dict[str, SceneObject]:
+    """The pairing of one class with the greatest sum of overlaps."""
+    from scipy.optimize import linear_sum_assignment
+
+    pairs = [[Pair(a, our_camera, b, their_camera, 0) for a in ours] for b in theirs]
+    gain = [[iou3d(p) + (iou2d(p) or 0.0) - NEARER * center_error(p) for p in row] for row in pairs]
+    if not ours:
+        return {}
+    rows, columns = linear_sum_assignment(gain, maximize=True)
+    return {theirs[row].id: ours[column] for row, column in zip(rows, columns, strict=True)}
+
+
+def _thick(box: Box) -> Box:
+    return Box(box.center, box.size.clamp_min(THINNEST), box.yaw)
+
+
+def _tilt_errors(sight: Sight) -> tuple[float, float]:
+    pitch, roll = pitch_roll(sight.estimate.camera.R_cam_world)
+    true_pitch, true_roll = pitch_roll(sight.truth.camera.R_cam_world)
+    return float((pitch - true_pitch).abs()), float(wrap(roll - true_roll).abs())
+
+
+# Who is who: the true objects, and what stands for them before and after (docs/metrics.md).
+
+
+SIDES = ("initial", "result")
+
+
+def pairs(
+    initial: Scene, result: Scene, truth: Scene, by_place: bool = True
+) -> tuple[dict[str, SceneObject], dict[str, SceneObject]]:
+    """Initial objects and those of the result by true id; settled on the initial scene."""
+    same = {piece.id: piece.id for piece in truth.objects}
+    before = match(initial, truth, same, by_place)
+    known = same | {name: piece.id for name, piece in before.items()}
+    return before, match(result, truth, known, by_place)
+
+
+def unmatched(
+    initial: Scene, result: Scene, truth: Scene, by_place: bool = True
+) -> dict[str, list[str]]:
+    """Ids of true objects that the result lacks, and of its objects that stand for no true one.
+
+    Returns:
+        `missed`, which count as IoU 0 in the means, and `false`, which are in no mean.
+    """
+    found = pairs(initial, result, truth, by_place)[1]
+    partners = {piece.id for piece in found.values()}
+    return {
+        "missed": [piece.id for piece in truth.objects if piece.id not in found],
+        "false": [piece.id for piece in result.objects if piece.id not in partners],
+    }
+
+
+def measure_objects(
+    scenes: tuple[Scene, Scene, Scene], sides: Sequence[str], samples: int, by_place: bool
+) -> list[dict[str, Any]]:
+    """Each true object in the initial scene and in the result, as far as they are asked for.
+
+    Args:
+        scenes: The initial one, the result and the truth.
+        sides: Some of `SIDES`.
+        samples: Points on each true surface.
+        by_place: Whether objects that bear no true name are paired by place.
+    """
+    initial, result, truth = scenes
+    found: dict[str, dict[str, SceneObject]] = dict(
+        zip(SIDES, pairs(initial, result, truth, by_place), strict=True)
+    )
+    there: dict[str, Scene] = dict(zip(SIDES, (initial, result), strict=True))
+
+    def of(side: str, true: SceneObject) -> dict[str, float]:
+        piece = found[side].get(true.id)
+        if piece is None:
+            return measure_missing(true, truth.camera)
+        pair = Pair(piece, there[side].camera, true, truth.camera, samples)
+        return measure(OBJECT_METRICS, pair)
+
+    return [{"id": true.id} | {side: of(side, true) for side in sides} for true in truth.objects]
+
+
+def means_of(objects: Sequence[dict[str, Any]], side: str) -> dict[str, float]:
+    """Means over those objects that have the metric."""
+    values = {n: [item[side][n] for item in objects if n in item[side]] for n in OBJECT_METRICS}
+    return {name: sum(found) / len(found) for name, found in values.items() if found}

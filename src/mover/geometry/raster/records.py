@@ -1,0 +1,124 @@
+"""What is drawn and what comes of it: windows, padded triangles, maps; and what drivers hold."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.core.records import record
+
+BORDER = 1  # [px], so that an outline just outside the window still moves the window's pixels
+
+
+@record
+class Crops:
+    """Pinhole windows of one size, one for each item."""
+
+    K: Float[Tensor, "items 3 3"]
+    """Intrinsics of each window [px of the window]; no skew."""
+    height: int
+    """Rows of each window [px]."""
+    width: int
+    """Columns of each window [px]."""
+
+
+@record
+class Topology:
+    """Padded triangles of closed meshes, counter-clockwise seen from outside."""
+
+    faces: Int[Tensor, "items faces 3"]
+    """Vertices of each triangle; padding is (0, 0, 0)."""
+    edges: Int[Tensor, "items edges 4"]
+    """Two vertices and the two faces beside them; padding is zeros."""
+
+
+@record
+class Depths:
+    """First and last surface on the ray of each pixel centre."""
+
+    nearest: Float[Tensor, "*starts items h w"]
+    """Camera z of the front-most surface [m]; 0 where not covered."""
+    farthest: Float[Tensor, "*starts items h w"]
+    """Camera z of the last surface [m]; 0 where not covered."""
+    covered: Bool[Tensor, "*starts items h w"]
+    """Whether the ray of the pixel centre meets both a front and a back."""
+
+
+@record
+class Layers:
+    """Where rays enter and first leave closed bodies; not differentiable."""
+
+    front: Float[Tensor, "items h w"]
+    """Camera z of the nearest front-facing surface [m]; inf where there is none."""
+    exit: Float[Tensor, "items h w"]
+    """Camera z of the nearest back-facing surface [m]; -inf where there is none."""
+
+
+@dataclass(frozen=True)
+class Items:
+    """Items on their grids; item i has topology i % shapes and window i % views."""
+
+    verts: Tensor
+    """Vertices in camera axes (items, verts, 3), contiguous, without gradient [m]."""
+    window: Tensor
+    """Focal lengths and principal points of the windows (views, 4), with the border [px]."""
+    faces: Tensor
+    """Triangles (shapes, faces, 3), int64, contiguous."""
+    edges: Tensor
+    """Two vertices and two faces (shapes, edges, 4), int64, contiguous."""
+    height: int
+    """Rows of a window, without the border [px]."""
+    width: int
+    """Columns of a window, without the border [px]."""
+    border: int
+    """Rows and columns of the grid around the window [px]."""
+
+    @property
+    def grid(self) -> int:
+        """Pixels of one grid."""
+        return (self.height + 2 * self.border) * (self.width + 2 * self.border)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be drawn."""
+
+    silhouette: bool
+    depth: bool
+
+
+@dataclass(frozen=True)
+class Maps:
+    """What was drawn (items, h, w); empty where it was not asked for."""
+
+    image: Tensor
+    nearest: Tensor
+    farthest: Tensor
+    covered: Tensor
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What the gradients need to know of a drawing."""
+
+    near_face: Tensor
+    """Face that is seen first (items, h, w); unset where not covered."""
+    far_face: Tensor
+    """Face that is seen last (items, h, w); unset where not covered."""
+    box: Tensor
+    """Rows and columns that each item may touch (items, 4); unset where nobody asks."""
+    cuts: Tensor
+    """Cuts of the outline, 4 numbers each: see `kernels.scene`."""
+    targets: Tensor
+    """Pixel that each cut moves; negative where it has no gradient."""
+    starts: Tensor
+    """First cut of each item, and the number of all."""
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Gradients of the maps, contiguous; None where there is none."""
+
+    image: Tensor | None
+    nearest: Tensor | None
+    farthest: Tensor | None

@@ -1,0 +1,77 @@
+"""COCO's compressed run-length code of masks; the codes that are read are checked first."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mover.core.types import Masks
+
+
+def decode(masks: Masks, index: int) -> Bool[Tensor, "h w"]:
+    """One of the masks as an image."""
+    runs = run_lengths(masks.counts[index])
+    flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+    image = flat.reshape(masks.width, masks.height).T
+    return torch.from_numpy(np.ascontiguousarray(image))
+
+
+def run_lengths(counts: bytes) -> NDArray[np.int64]:
+    """The runs (background first, down the columns) of a compressed code.
+
+    Each run is written in groups of five bits, least first, as the difference from the run two
+    before; the sixth bit of a character says that another follows.
+
+    Raises:
+        ValueError: If the code is malformed.
+    """
+    codes = np.frombuffer(counts, np.uint8).astype(np.int64) - 48
+    if ((codes < 0) | (codes > 63)).any():
+        raise ValueError("characters outside of '0' to 'o'")
+    ends = np.flatnonzero(codes < 32)
+    if not len(ends) or ends[-1] != len(codes) - 1:
+        raise ValueError("a code that is cut off")
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    lengths = ends - starts + 1
+    if lengths.max() > 7:
+        raise ValueError("a run of more than 35 bits")
+    shift = 5 * (np.arange(len(codes)) - np.repeat(starts, lengths))
+    values = np.add.reduceat((codes & 31) << shift, starts)
+    values -= np.where(codes[ends] & 16, np.int64(1) << (5 * lengths), 0)
+    values[1::2], values[2::2] = np.cumsum(values[1::2]), np.cumsum(values[2::2])
+    return values
+
+
+def encode(mask: Bool[Tensor, "h w"]) -> bytes:
+    """The compressed run-length code of a mask."""
+    from pycocotools import mask as coco
+
+    code: Any = coco.encode(np.asfortranarray(mask.cpu().numpy(), dtype=np.uint8))
+    return code["counts"]
+
+
+def thinned(masks: Masks, index: int, step: int) -> NDArray[np.bool_]:
+    """Every `step`-th pixel of one of the masks, from the middle of the first step."""
+    return decode(masks, index).numpy()[step // 2 :: step, step // 2 :: step]
+
+
+def area(masks: Masks, index: int) -> int:
+    """How many pixels of one of the masks are set."""
+    return int(run_lengths(masks.counts[index])[1::2].sum())
+
+
+def joined(masks: Sequence[Masks]) -> Masks:
+    """Masks of one image size, one after the other."""
+    counts = tuple(code for m in masks for code in m.counts)
+    return Masks(masks[0].height, masks[0].width, counts)
+
+
+def tight_box(mask: Bool[Tensor, "h w"]) -> Float[Tensor, "4"]:
+    """x_min, y_min, x_max, y_max of the pixels that are set [px]."""
+    rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+    box = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
+    return torch.stack(box).to(torch.get_default_dtype())

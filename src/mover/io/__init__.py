@@ -1,0 +1,1 @@
+"""Files of others and our own: captures, scenes, people, masks, data sets, exports."""

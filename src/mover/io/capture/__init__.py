@@ -1,0 +1,1 @@
+"""The capture folder of docs/conventions.md, and how captures are built and merged."""

@@ -1,0 +1,211 @@
+"""A capture from arrays, for notebooks and other readers; the checks are the same."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mover.core.types import Camera, Capture, Mesh
+from mover.geometry.rle import encode, tight_box
+from mover.io.capture.build import build_capture
+from mover.io.capture.parts import Parts
+from mover.io.capture.scene_file import scene_tree
+from mover.io.files.fields import At, array, mapping, refuse
+from mover.io.files.meshes import mesh_of
+
+Numbers = Tensor | NDArray[Any] | np.generic | Sequence[Any] | float
+"""One number or many, of any library."""
+FILE = "arrays"
+"""How messages call what has no file."""
+
+
+@dataclass(frozen=True)
+class ObjectArrays:
+    """One object: x_world = R_y(yaw) @ (scale * vertex) + translation."""
+
+    id: str
+    category: str
+    vertices: Numbers
+    """(vertices, 3) in its own frame: +y up, +z front [m]."""
+    faces: Numbers
+    """(faces, 3)."""
+    translation: Numbers
+    """[m]."""
+    yaw: Numbers
+    """About +y [rad]."""
+    scale: Numbers = (1.0, 1.0, 1.0)
+    support: str = "ground"
+    """`ground`, `free` or the id of the object that carries it."""
+    mask: Numbers | None = None
+    """(h, w) of booleans: its pixels in the reference image."""
+    box: Numbers | None = None
+    """x_min, y_min, x_max, y_max [px]; by default that of the mask."""
+    score: float = 1.0
+    mesh_file: str = ""
+    """The file that the mesh is from, where it has one."""
+
+
+@dataclass(frozen=True)
+class PeopleArrays:
+    """Visible masks of people."""
+
+    masks: Numbers
+    """(rows, h, w) of booleans."""
+    frame: Numbers
+    person: Numbers
+    heights: Mapping[str, float] | None = None
+    """Known body heights by track [m]."""
+    reference: Numbers | None = None
+    """(people, h, w) of booleans: people in the reference image."""
+
+
+def capture_from_arrays(
+    camera: Mapping[str, Any],
+    objects: Sequence[ObjectArrays],
+    *,
+    bodies: Mapping[str, Any] | None = None,
+    people: PeopleArrays | None = None,
+    image: Numbers | None = None,
+    name: str = "arrays",
+) -> Capture:
+    """Make a capture in memory.
+
+    Args:
+        camera: The fields of camera.json: w, h, fl_x, fl_y, cx, cy, R_cam_world, height.
+        objects: The initial scene with what the reference image shows of it.
+        bodies: The arrays of bodies.npz, and `probability` of contacts.npz.
+        people: Visible masks in the frames.
+        image: (h, w, 3), the reference image, bytes or from 0 to 1.
+        name: Of the capture.
+
+    Raises:
+        InputError: If anything is wrong.
+    """
+    fields = {k: np.asarray(v).tolist() for k, v in camera.items()}
+    arrays = None if bodies is None else {k: np.asarray(v) for k, v in bodies.items()}
+    touch = None if arrays is None or "probability" not in arrays else At(arrays, FILE, "bodies")
+
+    return build_capture(
+        Parts(
+            name=name,
+            camera=At(fields, FILE, "camera"),
+            scene=_scene(objects),
+            objects=At(_annotations(objects), FILE),
+            people=None if people is None else At(_people(people), FILE, "people"),
+            bodies=None if arrays is None else At(arrays, FILE, "bodies"),
+            contacts=touch,
+            load_mesh=partial(_load_mesh, objects),
+            load_image=None if image is None else partial(_load_image, image),
+            no_image=FILE,
+        )
+    )
+
+
+def _load_mesh(objects: Sequence[ObjectArrays], at: At) -> tuple[Mesh, str]:
+    """The mesh of an object that is named by its index."""
+    given, field = objects[int(at.value)], f"objects[{at.value}]"
+    verts = array(At(np.asarray(given.vertices), FILE, f"{field}.vertices"), ("V", 3))
+    faces = At(np.asarray(given.faces), FILE, f"{field}.faces")
+    return mesh_of(verts, array(faces, ("F", 3), "whole"), faces), given.mesh_file
+
+
+def _scene(objects: Sequence[ObjectArrays]) -> At:
+    """The content of scene.json, where a mesh is named by its index."""
+    rows = [
+        {
+            "id": o.id,
+            "category": o.category,
+            "mesh": str(i),
+            "annotation": None if o.mask is None and o.box is None else i,
+            "translation": _list(o.translation),
+            "yaw": _list(o.yaw),
+            "scale": _list(o.scale),
+            "support": o.support,
+        }
+        for i, o in enumerate(objects)
+    ]
+    return scene_tree(rows, FILE)
+
+
+def _list(value: Numbers) -> Any:  # noqa: ANN401
+    """Numbers of any array library as JSON has them."""
+    return np.asarray(value).tolist()
+
+
+def _annotations(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
+    """The content of objects.json."""
+    names = list(dict.fromkeys(o.category for o in objects))
+    rows: list[dict[str, Any]] = []
+    for i, o in enumerate(objects):
+        if o.mask is None and o.box is None:
+            continue
+        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": names.index(o.category)}
+        box = o.box
+        if o.mask is not None:
+            mask = _mask(At(o.mask, FILE, f"objects[{i}].mask"))
+            box = tight_box(mask).tolist() if box is None else box
+            row["segmentation"] = _code(mask)
+        x, y, right, bottom = array(At(np.asarray(box), FILE, f"objects[{i}].box"), (4,)).tolist()
+        rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": _list(o.score)})
+    categories = [{"id": i, "name": name} for i, name in enumerate(names)]
+    return {"images": [{"id": 0}], "categories": categories, "annotations": rows}
+
+
+def _mask(at: At) -> Tensor:
+    """One mask that is not empty."""
+    value: NDArray[Any] = np.asarray(at.value)
+    if value.dtype != np.bool_ or value.ndim != 2:
+        refuse(At(value, at.file, at.field), "an array of booleans of shape (h, w)")
+    if not value.any():
+        refuse(at, "a mask with pixels", "an empty mask")
+    return torch.from_numpy(value)
+
+
+def _code(mask: Tensor) -> dict[str, Any]:
+    """COCO's run-length code of a mask."""
+    return {"size": list(mask.shape), "counts": encode(mask)}
+
+
+def _people(people: PeopleArrays) -> dict[str, Any]:
+    """The content of people.json."""
+    masks = _stack(people.masks, "people.masks")
+    rows_of = (len(masks),)
+    frames = array(At(np.asarray(people.frame), FILE, "people.frame"), rows_of, "whole").tolist()
+    persons = array(At(np.asarray(people.person), FILE, "people.person"), rows_of, "whole").tolist()
+    rows = [
+        {"image_id": frame, "track_id": person, "segmentation": _code(mask)}
+        for frame, person, mask in zip(frames, persons, masks, strict=True)
+    ]
+    heights = {} if people.heights is None else mapping(At(people.heights, FILE, "people.heights"))
+    hidden = [] if people.reference is None else _stack(people.reference, "people.reference")
+    return {
+        "info": {"heights": heights},
+        "images": [{"id": frame} for frame in dict.fromkeys(frames)],
+        "annotations": rows,
+        "reference_people": [{"segmentation": _code(mask)} for mask in hidden],
+    }
+
+
+def _stack(value: Numbers, field: str) -> Tensor:
+    """Several masks, some of which may be empty."""
+    given: NDArray[Any] = np.asarray(value)
+    if given.dtype != np.bool_ or given.ndim != 3:
+        refuse(At(given, FILE, field), "an array of booleans of shape (rows, h, w)")
+    return torch.from_numpy(given)
+
+
+def _load_image(image: Numbers, camera: Camera) -> Float[Tensor, "h w 3"]:
+    """The reference image in [0, 1]."""
+    at = At(np.asarray(image), FILE, "image")
+    value = array(at, (camera.height, camera.width, 3)).astype(np.float32)
+    if at.value.dtype == np.uint8:
+        value = value / np.float32(255)
+    if value.min() < 0 or value.max() > 1:
+        refuse(at, "bytes, or numbers from 0 to 1")
+    return torch.from_numpy(value)

@@ -1,0 +1,248 @@
+"""bodies.npz: people's meshes, or the parameters of a body model, or both."""
+
+import dataclasses
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mover.core.errors import InputError
+from mover.core.records import BROKEN
+from mover.core.types import Bodies
+from mover.io.capture.pose_file import pose_of, pose_to_arrays, posed, reproduces
+from mover.io.files.fields import LAST_INDEX, At, Warn, array, choice, get, maybe, refuse
+from mover.io.files.npz import check_array_header, read_npz, write_npz
+
+log = logging.getLogger(__name__)
+
+TALLEST, SMALLEST = 3.5, 0.2  # [m], of a body that is in metres
+
+
+def read_bodies(path: Path, warn: Warn = log.warning) -> Bodies:
+    """Read and check bodies, in the space that the file says.
+
+    Raises:
+        InputError: If anything in it is wrong.
+    """
+    return bodies_of(read_npz(path), warn)
+
+
+def read_body_arrays(path: Path, fps: float | None = None) -> At:
+    """The arrays of bodies.npz as they are, with a frame rate where one is given.
+
+    Raises:
+        InputError: If the file cannot be read.
+    """
+    at = read_npz(path)
+    return at if fps is None else At({**at.value, "fps": np.array(fps)}, at.file)
+
+
+def bodies_of(at: At, warn: Warn) -> Bodies:
+    """The bodies of named arrays: meshes where they are given, else the posed model."""
+    frame = _indices(get(at, "frame"), "B")
+    person = _indices(get(at, "person"), len(frame))
+    _check_rows(at, frame, person)
+    pose = pose_of(at, len(frame))
+    given = maybe(at, "vertices")
+    if given is None and pose is None:
+        refuse(get(at, "vertices"), "meshes ('vertices', 'faces') or parameters ('body_pose', ...)")
+    if given is None:
+        assert pose is not None
+        verts, faces, joints, names = posed(pose, at)
+    else:
+        verts = _places(given, (len(frame), "V", 3))
+        faces = _faces(get(at, "faces"), verts.shape[1])
+        joints, names = _joints(at, len(frame))
+    bodies = Bodies(
+        verts, faces, joints, names, frame, person, _fps(at), _space(get(at, "space")), pose
+    )
+    extent = (bodies.verts.amax(1) - bodies.verts.amin(1)).norm(dim=-1).median()
+    if not SMALLEST < extent < TALLEST:
+        warn(f"{at.file}: the bodies measure {float(extent):.3g} across; are they in metres?")
+    return _with_checked_pose(bodies, at, warn) if given is not None else bodies
+
+
+def _with_checked_pose(bodies: Bodies, at: At, warn: Warn) -> Bodies:
+    """The bodies without their parameters where the model does not give the same meshes."""
+    if bodies.pose is None:
+        return bodies
+    reason = reproduces(bodies.pose, bodies.verts, at)
+    if reason is None:
+        return bodies
+    warn(f"{at.file}: {reason}; the bodies can only be refined rigidly")
+    return dataclasses.replace(bodies, pose=None)
+
+
+def _indices(at: At, count: int | str) -> Int[Tensor, " rows"]:
+    """Frames or tracks."""
+    value = array(at, (count,), "whole")
+    bad = (value < 0) | (value > LAST_INDEX)
+    if bad.any():
+        refuse(at, f"whole numbers from 0 to {LAST_INDEX}", f"{value[bad][0]}")
+    return torch.from_numpy(value.astype(np.int64))
+
+
+def _check_rows(at: At, frame: Int[Tensor, " rows"], person: Int[Tensor, " rows"]) -> None:
+    """Refuse an empty file and a person who is twice in a frame."""
+    if not len(frame):
+        refuse(get(at, "frame"), "at least one row", "no rows")
+    pairs, times = torch.stack([frame, person], 1).unique(dim=0, return_counts=True)
+    if (times > 1).any():
+        twice = pairs[times > 1][0].tolist()
+        found = f"frame {twice[0]} of person {twice[1]} twice"
+        refuse(get(at, "frame"), "one row for each frame and person", found)
+
+
+def _places(at: At, shape: tuple[int | str, ...]) -> Float[Tensor, "bodies points 3"]:
+    """Vertices or joints [m]."""
+    value = array(at, shape)
+    if not value.shape[1]:
+        refuse(at, "at least one point", "none")
+    return torch.from_numpy(value.astype(np.float32))
+
+
+def _faces(at: At, n_verts: int) -> Int[Tensor, "faces 3"]:
+    """Triangles of the bodies."""
+    value = array(at, ("F", 3), "whole").astype(np.int64)
+    if not len(value):
+        refuse(at, "at least one face", "an empty mesh")
+    if value.min() < 0 or value.max() >= n_verts:
+        found = f"faces that name vertices {value.min()} to {value.max()}"
+        refuse(at, f"vertices 0 to {n_verts - 1}", found)
+    return torch.from_numpy(value)
+
+
+def _joints(at: At, rows: int) -> tuple[Float[Tensor, "bodies joints 3"] | None, tuple[str, ...]]:
+    """Joints and their names, both or neither."""
+    given, names = maybe(at, "joints"), maybe(at, "joint_names")
+    if given is None and names is None:
+        return None, ()
+    joints = _places(get(at, "joints"), (rows, "J", 3))
+    words = array(get(at, "joint_names"), (joints.shape[1],), "text")
+    return joints, tuple(str(word) for word in words)
+
+
+def _fps(at: At) -> float | None:
+    """Frames a second."""
+    given = maybe(at, "fps")
+    if given is None:
+        return None
+    value = float(array(given, ())[()])
+    if not value > 0:
+        refuse(given, "a number above 0", f"{value:g}")
+    return value
+
+
+def _space(at: At) -> Any:  # noqa: ANN401
+    """`camera` or `world`."""
+    return choice(At(str(array(at, (), "text")), at.file, at.field), ("camera", "world"))
+
+
+def write_bodies(bodies: Bodies, path: Path) -> None:
+    """Write bodies as they are, parameters included."""
+    write_npz(bodies_to_arrays(bodies), path)
+
+
+def bodies_to_arrays(bodies: Bodies) -> dict[str, NDArray[Any]]:
+    """The arrays of bodies.npz."""
+    arrays: dict[str, NDArray[Any]] = {
+        "frame": bodies.frame.cpu().numpy(),
+        "person": bodies.person.cpu().numpy(),
+        "space": np.array(bodies.space),
+        "vertices": bodies.verts.detach().cpu().numpy(),
+        "faces": bodies.faces.cpu().numpy(),
+    }
+    if bodies.fps is not None:
+        arrays["fps"] = np.array(bodies.fps)
+    if bodies.joints is not None:
+        arrays["joints"] = bodies.joints.detach().cpu().numpy()
+        arrays["joint_names"] = np.array(bodies.joint_names, dtype=np.str_)
+    if bodies.pose is not None:
+        arrays |= pose_to_arrays(bodies.pose)
+    return arrays
+
+
+def read_touch(at: At, bodies: Bodies) -> Float[Tensor, "bodies verts"]:
+    """contacts.npz: the chance that a body's vertex touches something.
+
+    Raises:
+        InputError: If it does not fit the bodies or is no probability.
+    """
+    field = get(at, "probability")
+    value = array(field, tuple(bodies.verts.shape[:2]))
+    if value.min() < 0 or value.max() > 1:
+        refuse(field, "probabilities from 0 to 1", f"{value.min():g} to {value.max():g}")
+    return torch.from_numpy(value.astype(np.float32))
+
+
+# Contacts of every vertex from files of other tools (POSA's, DECO's): one file, or one a frame.
+
+
+KEYS = ("probability", "contact", "contacts", "contact_label_smplx", "contact_label", "prob")
+"""Names under which contacts are looked for in .npz files, the first that is there counts."""
+
+
+def read_contacts(source: Path, bodies: Bodies, first: int = 0) -> Float[Tensor, "bodies verts"]:
+    """Chance of touching for each vertex of these bodies, in [0, 1].
+
+    Args:
+        source: An array (bodies, vertices) or, of one body, (vertices,) in an .npy or .npz file; or
+            a folder with one such file for each frame, whose names begin with the frame's number.
+        bodies: Whose vertices these are.
+        first: The number in the name of the first frame's file.
+
+    Raises:
+        InputError: If a file is missing or has other rows or vertices.
+    """
+    if not source.is_dir():
+        return _checked(_array(source), source, bodies)
+    files = sorted(p for p in source.iterdir() if p.suffix in (".npy", ".npz"))
+    by_frame = {number - first: p for p in files if (number := _number(p)) is not None}
+    missing = sorted(set(bodies.frame.tolist()) - set(by_frame))
+    if missing:
+        raise InputError(f"{source}: has no file for frame {missing[0]}, expected an .npy or .npz")
+    if len(set(bodies.frame.tolist())) < len(bodies.frame):
+        raise InputError(f"{source}: one file a frame, but the bodies have several people a frame")
+    rows = [_array(by_frame[k]) for k in bodies.frame.tolist()]
+    return _checked(np.concatenate([r.reshape(1, -1) for r in rows]), source, bodies)
+
+
+def _number(path: Path) -> int | None:
+    found = re.match(r"\D*(\d+)", path.stem)
+    return int(found.group(1)) if found else None
+
+
+def _array(path: Path) -> np.ndarray:
+    """The contacts of a file, as numbers."""
+    if path.suffix == ".npz":
+        at: At = read_npz(path)
+        key = next((k for k in KEYS if k in at.value), None)
+        if key is None:
+            raise InputError(f"{path.name}: has {sorted(at.value)}, expected one of {list(KEYS)}")
+        return np.asarray(at.value[key])
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file, expected an .npy or .npz file")
+    try:
+        check_array_header(path)
+        return np.asarray(np.load(path, allow_pickle=False))
+    except BROKEN as error:
+        raise InputError(f"{path.name}: cannot be read ({error})") from error
+
+
+def _checked(value: np.ndarray, source: Path, bodies: Bodies) -> Float[Tensor, "bodies verts"]:
+    rows, verts = bodies.verts.shape[:2]
+    if value.dtype.kind not in "biuf" or value.size != rows * verts:
+        raise InputError(
+            f"{source.name}: has {value.dtype} of shape {value.shape}, expected "
+            f"numbers of shape ({rows}, {verts})"
+        )
+    chance = torch.from_numpy(value.reshape(rows, verts).astype(np.float32))
+    if not bool(chance.isfinite().all()):
+        raise InputError(f"{source.name}: has values that are not finite, expected chances")
+    return chance.clamp(0, 1)

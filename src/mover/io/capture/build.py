@@ -1,0 +1,148 @@
+"""The one builder of captures: put the parts together and check that they fit one another."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.core.errors import InputError
+from mover.core.types import Bodies, Camera, Capture, Detection, People, Scene, SceneObject
+from mover.geometry.rotations import rot_y
+from mover.io.capture.bodies_file import bodies_of, read_touch
+from mover.io.capture.camera_file import camera_of
+from mover.io.capture.objects_file import detections_of
+from mover.io.capture.parts import Parts
+from mover.io.capture.people_file import PeopleFile, people_of
+from mover.io.capture.pose_file import into_camera
+from mover.io.capture.scene_file import hypotheses_of, scene_of
+from mover.io.files.fields import At, Warn, get, items, listed, maybe, number, refuse
+
+LEAST_HEIGHT, MOST_HEIGHT = 0.1, 100.0  # [m], of the camera above the floor
+NOBODY = PeopleFile(None, None, None, frozenset())
+
+
+def build_capture(parts: Parts) -> Capture:
+    """Check everything that is known of a capture and build it; there is no other way to one.
+
+    Raises:
+        InputError: If anything is wrong, or camera, scene or objects are missing.
+    """
+    if parts.camera is None or parts.scene is None or parts.objects is None:
+        lacking = [f"{n}.json" for n in ("camera", "scene", "objects") if not getattr(parts, n)]
+        raise InputError(f"{parts.name}: has no {lacking[0]}, expected one (see `mover import`)")
+    warnings: list[str] = []
+    warn = warnings.append
+    other = camera_of(parts.camera)
+    scene, turn = scene_of(parts.scene, parts.load_mesh, other, warn)
+    detections = detections_of(parts.objects, scene.camera, warn)
+    _check_annotations(parts.scene, parts.objects.file, scene, detections, warn)
+    found = NOBODY
+    if parts.people is not None:
+        found = people_of(parts.people, scene.camera, warn)
+    bodies = _bodies_of(parts.bodies, scene.camera, turn, found.fps, warn)
+    touch = _touch_of(parts.contacts, bodies, warn)
+    _check_frames(parts, found, bodies)
+    _check_people(found.people, bodies, warn)
+    others: tuple[SceneObject, ...] = ()
+    if parts.hypotheses is not None:
+        others = hypotheses_of(parts.hypotheses, parts.load_mesh, scene, warn)
+    return Capture(
+        name=parts.name,
+        scene=scene,
+        camera_height=_camera_height(parts.camera),
+        detections=detections,
+        reference=_image_of(parts, scene.camera, warn),
+        reference_people=found.reference,
+        bodies=bodies,
+        people=found.people,
+        touch=touch,
+        warnings=tuple(warnings),
+        hypotheses=others,
+    )
+
+
+def _image_of(parts: Parts, camera: Camera, warn: Warn) -> Float[Tensor, "h w 3"] | None:
+    """The reference image."""
+    if parts.load_image is None:
+        warn(f"{parts.no_image}: there is no picture to draw on")
+        return None
+    return parts.load_image(camera)
+
+
+def _camera_height(at: At) -> float | None:
+    """Known height of the camera above the floor [m]."""
+    given = maybe(at, "height")
+    return None if given is None else number(given, LEAST_HEIGHT, MOST_HEIGHT)
+
+
+def _check_annotations(
+    tree: At, file: str, scene: Scene, detections: tuple[Detection, ...], warn: Warn
+) -> None:
+    """Objects name annotations that exist; what has no partner is told."""
+    known, used = {d.id for d in detections}, {p.annotation for p in scene.objects}
+    for item, piece in zip(items(get(tree, "objects")), scene.objects, strict=True):
+        if piece.annotation is not None and piece.annotation not in known:
+            refuse(get(item, "annotation"), f"the id of an annotation in {file}")
+    if bare := [piece.id for piece in scene.objects if piece.annotation is None]:
+        warn(f"scene.json: {listed('object', bare)} without annotation, no evidence in the image")
+    if alone := [f"{d.id} {d.category}" for d in detections if d.id not in used]:
+        warn(f"{file}: {listed('annotation', alone)} without object in the scene")
+    if not scene.objects:
+        warn("scene.json: there are no objects")
+
+
+def _bodies_of(
+    at: At | None, camera: Camera, turn: float, fps: float | None, warn: Warn
+) -> Bodies | None:
+    """Bodies in the camera frame."""
+    if at is None:
+        warn("bodies.npz: there is none, so only the image speaks")
+        return None
+    bodies = bodies_of(at, warn)
+    if bodies.space == "world":
+        # The file's world is that of scene.json, before its heading was taken out.
+        bodies = into_camera(bodies, camera.R_cam_world @ rot_y(torch.tensor(turn)))
+    if float(bodies.verts[..., 2].median()) <= 0:
+        axes = "the camera frame is x right, y down, z forward"
+        warn(f"bodies.npz: most of the bodies are behind the camera; {axes}")
+    return dataclasses.replace(bodies, fps=fps) if bodies.fps is None else bodies
+
+
+def _touch_of(
+    at: At | None, bodies: Bodies | None, warn: Warn
+) -> Float[Tensor, "bodies verts"] | None:
+    """The user's own chances of contact."""
+    if at is None:
+        return None
+    if bodies is None:
+        warn("contacts.npz: there are no bodies, so it is not used")
+        return None
+    return read_touch(at, bodies)
+
+
+def _check_people(people: People | None, bodies: Bodies | None, warn: Warn) -> None:
+    """Rows of bodies and of masks that have no partner are told."""
+    if people is None:
+        warn("people.json: there are no masks of people, so nothing is known about depth order")
+        return
+    if bodies is None:
+        return
+    masks = set(zip(people.frame.tolist(), people.person.tolist(), strict=True))
+    rows = set(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True))
+    if alone := len(rows - masks):
+        warn(f"people.json: {alone} of {len(rows)} bodies have no mask and no depth order")
+    if alone := len(masks - rows):
+        warn(f"bodies.npz: {alone} of {len(masks)} masks of people have no body")
+
+
+def _check_frames(parts: Parts, found: PeopleFile, bodies: Bodies | None) -> None:
+    """No frame lies behind the end of the video."""
+    count = parts.n_frames
+    if count is None:
+        return
+    expected = f"a frame from 0 to {count - 1}, as frames/ has {count}"
+    if bodies is not None and parts.bodies is not None and bodies.frame.max() >= count:
+        refuse(get(parts.bodies, "frame"), expected, f"{int(bodies.frame.max())}")
+    if found.frames and parts.people is not None and max(found.frames) >= count:
+        refuse(get(parts.people, "images"), expected, f"{max(found.frames)}")

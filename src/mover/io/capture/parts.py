@@ -1,0 +1,105 @@
+"""Parts of a capture: what one tool knows. Parts of several tools make a capture (build.py)."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn
+
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.core.errors import InputError
+from mover.core.types import Bodies, Camera, Mesh, Scene
+from mover.io.files.fields import At
+from mover.io.files.images import image_size, read_image_file
+
+LoadMesh = Callable[[At], tuple[Mesh, str]]
+LoadImage = Callable[[Camera], Float[Tensor, "h w 3"]]
+UNKNOWN = "object"
+"""The category of what a tool gives no name; it fits any other."""
+
+
+def no_mesh(at: At) -> NoReturn:
+    """There are no meshes."""
+    raise InputError(f"{at.place} names a mesh, expected none here")
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a source knows of a capture; None: nothing of that file of the format."""
+
+    name: str
+    camera: At | None = None
+    """The fields of camera.json; the rotation may be missing."""
+    scene: At | None = None
+    """The fields of scene.json, without its camera."""
+    tilt: Any = None
+    """R_cam_world of the world in which `scene` is, where it is not that of `camera`."""
+    objects: At | None = None
+    """The fields of objects.json."""
+    people: At | None = None
+    """The fields of people.json."""
+    bodies: At | None = None
+    """The arrays of bodies.npz."""
+    contacts: At | None = None
+    """The arrays of contacts.npz."""
+    load_mesh: LoadMesh = no_mesh
+    """Gives the mesh that a field of `scene` names."""
+    load_image: LoadImage | None = None
+    no_image: str = "reference.jpg"
+    """What the warning names where there is no picture."""
+    image_size: tuple[int, int] | None = None
+    """Width and height of the image, where it is known [px]."""
+    n_frames: int | None = None
+    """How many frames the video has, where that is known."""
+    hypotheses: At | None = None
+    """The fields of hypotheses.json."""
+    copies: Mapping[str, Path] = field(default_factory=dict[str, Path])
+    """Files that are taken as they are, by their place in the capture."""
+    trees: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """JSON files beside the rest, by their place in the capture."""
+    scenes: Mapping[str, Scene] = field(default_factory=dict[str, Scene])
+    """Scenes beside the initial one, by their folder: `truth`, ..."""
+    people_of: Mapping[str, Bodies] = field(default_factory=dict[str, Bodies])
+    """People of those scenes, by their folder."""
+    notes: tuple[str, ...] = ()
+    """What a reader wants to tell."""
+
+
+@dataclass(frozen=True)
+class Hints:
+    """What the user says beside the source itself."""
+
+    camera: At | None = None
+    """The fields of camera.json, complete or in part."""
+    image: Path | None = None
+    """The reference image."""
+    up: str = ""
+    """Which way is up in the source, where its format leaves that open: y, -y or z."""
+    names: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Categories by number, file name or index, where the source has none."""
+    recording: str = ""
+    """Which recording of a data set."""
+    boxes: Path | None = None
+    """bbox3d.json: the true boxes of MOVER's authors."""
+    work: Path = Path()
+    """A folder for meshes that a reader makes; it goes away after the import."""
+
+
+def image_parts(path: Path, *, mirrored: bool = False) -> tuple[LoadImage, tuple[int, int]]:
+    """How to load a picture, and its size.
+
+    Args:
+        path: Of the picture.
+        mirrored: It is stored mirrored and must be flipped left to right.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    size = image_size(path)
+
+    def load(camera: Camera) -> Float[Tensor, "h w 3"]:
+        picture = read_image_file(At(path.name, path.name), path, camera)
+        return picture.flip(1) if mirrored else picture
+
+    return load, size

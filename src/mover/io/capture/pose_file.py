@@ -1,0 +1,165 @@
+"""Parameters of body models in bodies.npz, with the names and meaning of the smplx package."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mover.bodies import BodyModel, load_model
+from mover.core.errors import InputError
+from mover.core.types import Bodies, BodyPose
+from mover.geometry.rotations import axis_angle
+from mover.io.files.fields import At, array, choice, get, maybe, reason, refuse
+
+NEEDED = ("betas", "global_orient", "body_pose", "transl")
+HANDS = ("left_hand_pose", "right_hand_pose", "flat_hand_mean")
+EXTRA = (*HANDS, "jaw_pose", "leye_pose", "reye_pose", "expression")
+MODELS = ("smplx", "smplh", "smpl", "makehuman")
+GENDERS = ("neutral", "female", "male")
+ANGLES = (63, 69)  # of SMPL-X and SMPL-H, of SMPL
+SAME = 0.01  # [m], a model that comes so close gives the same meshes
+LOOKED_AT = 64  # so many rows are compared, spread over the video
+CHUNK = 128  # rows posed at once
+
+
+def pose_of(at: At, rows: int) -> BodyPose | None:
+    """The parameters among the arrays of a file, None if it has none."""
+    if all(maybe(at, key) is None for key in ("model", *NEEDED, *EXTRA)):
+        return None
+    model = choice(_word(get(at, "model")), MODELS)
+    gender = maybe(at, "gender")
+    body = get(at, "body_pose")
+    angles = array(body, (rows, "63 or 69"))
+    if angles.shape[1] not in ANGLES:
+        refuse(body, f"{ANGLES[0]} or {ANGLES[1]} angles a row", f"{angles.shape[1]}")
+    extra = {key: _rows(found, rows) for key in EXTRA if (found := maybe(at, key)) is not None}
+    return BodyPose(
+        model=model,
+        gender="neutral" if gender is None else choice(_word(gender), GENDERS),
+        betas=_betas(get(at, "betas"), rows),
+        global_orient=_tensor(array(get(at, "global_orient"), (rows, 3))),
+        body_pose=_tensor(angles),
+        transl=_tensor(array(get(at, "transl"), (rows, 3))),
+        extra=extra,
+    )
+
+
+def _word(at: At) -> At:
+    """A 0-d array of text as text."""
+    return At(str(array(at, (), "text")), at.file, at.field)
+
+
+def _tensor(value: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(value.astype(np.float32))
+
+
+def _betas(at: At, rows: int) -> Float[Tensor, "bodies shape"]:
+    """Shapes, of one person or of each row."""
+    shape = ("S",) if isinstance(at.value, np.ndarray) and at.value.ndim == 1 else (rows, "S")
+    return _tensor(array(at, shape)).expand(rows, -1).clone()
+
+
+def _rows(at: At, rows: int) -> Float[Tensor, "bodies values"]:
+    """Values for each row; the axes behind the first are joined."""
+    value = at.value
+    axes = value.ndim - 1 if isinstance(value, np.ndarray) and value.ndim > 1 else 1
+    return _tensor(array(at, (rows, *("N" * axes)))).flatten(1)
+
+
+def _rows_of(pose: BodyPose, index: Int[Tensor, " rows"]) -> BodyPose:
+    """Some rows of a pose."""
+    names = ("betas", "global_orient", "body_pose", "transl")
+    extra = {key: value[index] for key, value in pose.extra.items()}
+    return dataclasses.replace(
+        pose, extra=extra, **{name: getattr(pose, name)[index] for name in names}
+    )
+
+
+def _run(
+    model: BodyModel, pose: BodyPose
+) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+    """Pose a model row by row in chunks, to bound the memory."""
+    with torch.no_grad():
+        parts = [
+            model.posed(_rows_of(pose, index))
+            for index in torch.arange(len(pose.transl)).split(CHUNK)
+        ]
+    return torch.cat([verts for verts, _ in parts]), torch.cat([joints for _, joints in parts])
+
+
+def posed(
+    pose: BodyPose, at: At
+) -> tuple[
+    Float[Tensor, "bodies verts 3"],
+    Int[Tensor, "faces 3"],
+    Float[Tensor, "bodies joints 3"],
+    tuple[str, ...],
+]:
+    """Meshes and joints of a file that has parameters only.
+
+    Raises:
+        InputError: If the model is not to be had or cannot take the parameters.
+    """
+    try:
+        model = load_model(pose.model, pose.gender)
+        verts, joints = _run(model, pose)
+    except (InputError, ValueError, RuntimeError, KeyError, OSError) as error:
+        message = f"{str(pose.model)!r}, which gives no meshes ({reason(error)})"
+        refuse(
+            get(at, "model"), "a body model that can be posed, or 'vertices' and 'faces'", message
+        )
+    return verts, model.faces, joints, model.joint_names
+
+
+def reproduces(pose: BodyPose, verts: Float[Tensor, "bodies verts 3"], at: At) -> str | None:
+    """Why the model does not give these meshes, None if it does within 1 cm."""
+    try:
+        model = load_model(pose.model, pose.gender)
+        count = min(LOOKED_AT, len(verts))
+        index = torch.linspace(0, len(verts) - 1, count).round().long()
+        found, _ = _run(model, _rows_of(pose, index))
+    except (InputError, ValueError, RuntimeError, KeyError, OSError) as error:
+        return f"the parameters of '{pose.model}' cannot be used ({reason(error)})"
+    if found.shape[1] != verts.shape[1]:
+        return f"{pose.model} has {found.shape[1]} vertices, {at.file} has {verts.shape[1]}"
+    worst = float((found - verts[index]).norm(dim=-1).max())
+    if not worst <= SAME:
+        return f"the parameters of '{pose.model}' miss the meshes by up to {worst:.3g} m"
+    return None
+
+
+def into_camera(bodies: Bodies, R_cam_world: Float[Tensor, "3 3"]) -> Bodies:
+    """World bodies in the camera frame, parameters included."""
+    if bodies.space == "camera":
+        return bodies
+    R = R_cam_world.to(bodies.verts)
+    joints = None if bodies.joints is None else bodies.joints @ R.mT
+    pose = None if bodies.pose is None else _turned(bodies.pose, R)
+    return dataclasses.replace(
+        bodies, verts=bodies.verts @ R.mT, joints=joints, pose=pose, space="camera"
+    )
+
+
+def _turned(pose: BodyPose, R: Float[Tensor, "3 3"]) -> BodyPose:
+    """The parameters of the turned body: its root turns about the pelvis, not about the origin."""
+    from scipy.spatial.transform import Rotation
+
+    _, joints = _run(load_model(pose.model, pose.gender), pose)
+    pelvis = joints[:, 0] - pose.transl
+    turned = (R @ axis_angle(pose.global_orient)).double().numpy()
+    vectors = torch.from_numpy(Rotation.from_matrix(turned).as_rotvec())
+    transl = joints[:, 0] @ R.mT - pelvis
+    return dataclasses.replace(
+        pose, global_orient=vectors.to(pose.global_orient), transl=transl.to(pose.transl)
+    )
+
+
+def pose_to_arrays(pose: BodyPose) -> dict[str, NDArray[Any]]:
+    """The arrays of a file."""
+    tensors = {key: getattr(pose, key) for key in NEEDED} | pose.extra
+    words = {"model": np.array(pose.model), "gender": np.array(pose.gender)}
+    return words | {key: value.detach().cpu().numpy() for key, value in tensors.items()}

@@ -1,0 +1,1 @@
+"""PROX and PiGraphs as they are published."""

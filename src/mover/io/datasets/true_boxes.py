@@ -1,0 +1,172 @@
+"""True boxes of data sets, and what a scan has inside them: scenes for `mover evaluate`."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mover.core.errors import InputError
+from mover.core.types import Mesh, Scene
+from mover.io.capture.camera_file import camera_of
+from mover.io.capture.scene_file import scene_of, scene_tree
+from mover.io.files.fields import At, get, mapping, refuse, vector
+from mover.io.scenes.placing import Matrix, category_of_name, free_id, load_from
+
+SIGNS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=float)
+FACES = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+     [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+)  # fmt: skip
+"""Triangles of a box whose corners are in the order of `SIGNS`, seen from outside."""
+MARGIN = 0.02  # [m], a scan's surface lies so far outside of its box
+LEAST = 12  # triangles, fewer are no object
+
+
+@dataclass(frozen=True)
+class TrueBox:
+    """An upright box of a data set in the frame of its file."""
+
+    name: str
+    category: str
+    center: Matrix
+    half: Matrix
+    axes: Matrix
+    """Its axes as rows, in the order of `half`."""
+
+
+def read_bbox3d(path: Path, names: Mapping[str, str], file: At) -> list[TrueBox]:
+    """The boxes of MOVER's authors: {id: {centroid, basis, coeffs}}, with half sizes.
+
+    The page does not say whether the axes are the rows or the columns of `basis`: the reading in
+    which the boxes agree better on what is up counts.
+
+    Args:
+        path: For messages.
+        names: Categories by id, where the id does not tell.
+        file: The content of bbox3d.json.
+
+    Raises:
+        InputError: If a field is wrong.
+    """
+    rows = {key: get(file, key) for key in mapping(file)}
+    if not rows:
+        raise InputError(f"{path.name}: has no boxes, expected {{id: {{centroid, basis, coeffs}}}}")
+    bases = {key: _basis(get(row, "basis")) for key, row in rows.items()}
+    turned = _agree([b.T for b in bases.values()]) > _agree(list(bases.values())) + 1e-6
+    return [
+        TrueBox(
+            name=key,
+            category=names.get(key) or category_of_name(key),
+            center=np.array(_flat(get(row, "centroid"))),
+            half=np.abs(np.array(_flat(get(row, "coeffs")))),
+            axes=bases[key].T if turned else bases[key],
+        )
+        for key, row in rows.items()
+    ]
+
+
+def _flat(at: At) -> list[float]:
+    """Three numbers, maybe in a list of one list."""
+    inner = at.value[0] if isinstance(at.value, list) and len(at.value) == 1 else at.value
+    return vector(At(inner, at.file, at.field), 3)
+
+
+def _basis(at: At) -> Matrix:
+    """Three axes of length 1."""
+    if not isinstance(at.value, list) or len(at.value) != 3:
+        refuse(at, "three axes of three numbers")
+    rows = np.array([vector(At(r, at.file, f"{at.field}[{i}]"), 3) for i, r in enumerate(at.value)])
+    if np.abs(rows @ rows.T - np.eye(3)).max() > 1e-2:
+        refuse(at, "three axes at right angles, of length 1")
+    return rows
+
+
+def _agree(bases: Sequence[Matrix]) -> float:
+    """How well upright boxes agree on the vertical: the best axis of the first, over all others."""
+    scores = [
+        sum(float(np.abs(other @ axis).max()) for other in bases) for axis in bases[0]
+    ]  # the axis of each that is nearest to this one
+    return max(scores) / len(bases)
+
+
+def vertical_of(boxes: Sequence[TrueBox], guess: Matrix) -> Matrix:
+    """The direction that the boxes share and that is nearest to a guess of what is up."""
+    found: list[Matrix] = []
+    for box in boxes:
+        along = box.axes @ guess
+        best = int(np.abs(along).argmax())
+        found.append(box.axes[best] * np.sign(along[best]))
+    mean = np.sum(found, axis=0)
+    return mean / np.linalg.norm(mean)
+
+
+def boxes_scene(
+    boxes: Sequence[TrueBox],
+    world: Matrix,
+    camera: Mapping[str, Any],
+    ground: float | None,
+    scan: Mesh | None = None,
+) -> Scene:
+    """A scene of the boxes, or of what a scan has inside them.
+
+    Args:
+        boxes: In the frame of their file.
+        world: Our world (+y up, the camera at the origin) from that frame (4, 4).
+        camera: The fields of camera.json with its true rotation.
+        ground: Height of the floor in our world [m].
+        scan: In the frame of the boxes; None: the boxes themselves.
+    """
+    rows: list[dict[str, Any]] = []
+    meshes: dict[str, tuple[Mesh, str]] = {}
+    for box in boxes:
+        order, signs, yaw = _upright(box.axes @ world[:3, :3].T)
+        mesh = _cuboid(box, order) if scan is None else _inside(scan, box, order, signs)
+        if mesh is None:
+            continue
+        name = free_id(box.category, box.name, meshes)
+        meshes[name] = mesh, ""
+        place = world[:3, :3] @ box.center + world[:3, 3]
+        row = {"id": name, "category": box.category, "mesh": name, "scale": [1.0, 1.0, 1.0]}
+        rows.append({**row, "translation": place.tolist(), "yaw": yaw, "support": "free"})
+    lens = camera_of(At(dict(camera), "camera"))
+    return scene_of(scene_tree(rows, "truth", ground), partial(load_from, meshes), lens, _silent)[0]
+
+
+def _silent(text: str) -> None:
+    del text
+
+
+def _upright(axes: Matrix) -> tuple[list[int], Matrix, float]:
+    """Width, height and depth among the rows, the signs that make them right-handed, the yaw."""
+    up = int(np.abs(axes[:, 1]).argmax())
+    right, front = [i for i in range(3) if i != up]
+    order = [right, up, front]
+    signs = np.array([1.0, math.copysign(1.0, axes[up, 1]), 1.0])
+    signs[0] = math.copysign(1.0, float(np.linalg.det(axes[order] * signs[:, None])))
+    return order, signs, math.atan2(axes[front, 0], axes[front, 2])
+
+
+def _cuboid(box: TrueBox, order: Sequence[int]) -> Mesh:
+    """The box itself, about its centre."""
+    verts = SIGNS * box.half[list(order)]
+    return Mesh(torch.from_numpy(verts).float(), torch.from_numpy(FACES))
+
+
+def _inside(scan: Mesh, box: TrueBox, order: Sequence[int], signs: Matrix) -> Mesh | None:
+    """The triangles of a scan inside a box, in the box's own axes; None where there are few."""
+    axes = box.axes[list(order)] * signs[:, None]
+    local: Matrix = (scan.verts.double().numpy() - box.center) @ axes.T
+    within: NDArray[np.bool_] = np.all(np.abs(local) <= box.half[list(order)] + MARGIN, axis=1)
+    faces = scan.faces.numpy()
+    faces = faces[within[faces].all(1)]
+    if len(faces) < LEAST:
+        return None
+    kept, flat = np.unique(faces, return_inverse=True)
+    verts = torch.from_numpy(np.ascontiguousarray(local[kept])).float()
+    return Mesh(verts, torch.from_numpy(flat.reshape(-1, 3)))

@@ -1,0 +1,126 @@
+"""Bodies as AMASS and the tools around SMPL-X keep them: one npz a person."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mover.core.errors import InputError
+from mover.core.types import Bodies, BodyPose
+from mover.geometry.rotations import axis_angle, rot_x
+from mover.io.export.finished import Exported, Finished
+from mover.io.export.people import FPS, Track, tracks_of
+from mover.io.export.posed import (
+    Motion,
+    all_angles,
+    misses,
+    motion_of,
+    pelvis_of,
+    skin_of,
+    vectors_of,
+)
+from mover.io.files.npz import write_npz
+
+Up = Literal["y", "z"]
+WIDTHS = {"smpl": 72, "smplh": 156, "smplx": 165, "makehuman": 165}
+"""Angles of `poses` for each model."""
+
+
+def export_bodies(finished: Finished, folder: Path, up: Up = "y") -> Exported:
+    """Write `bodies_<person>.npz` with the keys of AMASS.
+
+    Args:
+        finished: The result.
+        folder: Where the files go.
+        up: y: the world of scene.json; z: AMASS' own, (x, y, z) becoming (x, -z, y).
+
+    Raises:
+        InputError: If the parameters of the bodies are not known.
+    """
+    motion = motion_of(finished)
+    if isinstance(motion, str):
+        raise InputError(f"--to bodies: {motion}")
+    assert finished.bodies is not None
+    bodies, files = finished.bodies, list[Path]()
+    moved = motion if up == "y" else upright(motion)
+    for track in tracks_of(bodies):
+        path = folder / f"bodies_{track.person}.npz"
+        write_npz({**_arrays(moved, track, bodies), "up_axis": np.array(up)}, path)
+        files.append(path)
+    return Exported(tuple(files), tuple(_notes(motion, bodies)))
+
+
+def _arrays(motion: Motion, track: Track, bodies: Bodies) -> dict[str, NDArray[Any]]:
+    """One person; rows are frames of the video, told by `frame` where some are missing."""
+    pose, rows = motion.pose, track.rows
+    poses = angles_of(pose)[rows].numpy()
+    steps = track.frame.diff()
+    stride = int(steps.median()) if len(steps) else 1
+    rate = np.array((bodies.fps or FPS) / stride)
+    shape = pose.betas[rows].double().mean(0).numpy()
+    return {
+        "trans": pose.transl[rows].numpy(),
+        "root_orient": pose.global_orient[rows].numpy(),
+        "poses": poses,
+        "betas": shape,
+        "gender": np.array(pose.gender),
+        "mocap_framerate": rate,
+        "mocap_frame_rate": rate,
+        "surface_model_type": np.array(pose.model),
+        "frame": track.frame.numpy(),
+        "size": motion.size[rows].numpy(),
+        **{name: values[rows].numpy() for name, values in pose.extra.items()},
+        **_named_parts(poses, pose.model),
+    }
+
+
+def angles_of(pose: BodyPose) -> torch.Tensor:
+    """All angles of each row in the model's own order."""
+    if pose.model == "smpl":
+        return torch.cat([pose.global_orient, pose.body_pose], -1)
+    whole = all_angles(pose).flatten(1)
+    if pose.model == "smplh":
+        return torch.cat([whole[:, :66], whole[:, 75:]], -1)
+    return whole
+
+
+def _named_parts(poses: NDArray[Any], model: str) -> dict[str, NDArray[Any]]:
+    """The parts of `poses` under the names that AMASS gives those of SMPL-X."""
+    if WIDTHS.get(model) != WIDTHS["smplx"]:
+        return {}
+    parts = {
+        "pose_body": (3, 66),
+        "pose_jaw": (66, 69),
+        "pose_eye": (69, 75),
+        "pose_hand": (75, 165),
+    }
+    return {name: poses[:, start:end] for name, (start, end) in parts.items()}
+
+
+def upright(motion: Motion) -> Motion:
+    """The same motion in a world with +z up; the root turns about the pelvis."""
+    import dataclasses
+
+    pose = motion.pose
+    turn = rot_x(torch.tensor(torch.pi / 2))
+    offset = pelvis_of(pose)
+    place = (pose.transl + offset) @ turn.mT - offset
+    root = vectors_of(turn @ axis_angle(pose.global_orient))
+    return Motion(dataclasses.replace(pose, transl=place, global_orient=root), motion.size)
+
+
+def _notes(motion: Motion, bodies: Bodies) -> list[str]:
+    notes: list[str] = []
+    model = skin_of(motion.pose, bodies)
+    if model is not None:
+        notes.append(
+            f"the parameters give the result's meshes within {misses(motion, model, bodies):.4f} m"
+        )
+    if float((motion.size - 1).abs().max()) > 1e-3:
+        low, high = float(motion.size.min()), float(motion.size.max())
+        notes.append(
+            f"bodies are {low:.3f} to {high:.3f} times the size that their betas say ('size')"
+        )
+    return notes

@@ -1,0 +1,320 @@
+"""scene.glb: objects as nodes, floor, camera, and people who move on bones or by shapes."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mover.bodies.skinning import SkinnedBody
+from mover.core.colours import Colour, person_colour
+from mover.core.errors import InputError
+from mover.core.records import record
+from mover.core.types import Bodies
+from mover.geometry.mesh import vertex_normals
+from mover.io.export.finished import Exported, Finished
+from mover.io.export.gltf import (
+    INDICES,
+    VERTICES,
+    Channel,
+    Document,
+    add_material,
+    add_presence,
+    add_sampler,
+)
+from mover.io.export.people import FPS, Track, keyframes, tracks_of
+from mover.io.export.posed import Motion, all_angles, misses, motion_of, skin_of
+from mover.io.export.scene_glb import write_glb
+
+TOLERANCE = 0.005  # [m]
+MOST = 60  # shapes of one person
+
+
+def add_morphing(
+    document: Document, animation: int, bodies: Bodies, track: Track, tint: Colour
+) -> tuple[list[Channel], float]:
+    """Append a person; what moves, and how far the shapes between miss the truth [m]."""
+    verts = bodies.verts[track.rows].detach().cpu().float()
+    keys, miss = keyframes(verts, track.time, TOLERANCE, MOST)
+    name = f"person_{track.person}"
+    shapes = verts[keys]
+    mesh = _add_shapes(document, shapes, bodies, add_material(document, tint, name), name)
+    body = document.add("nodes", {"name": f"{name}_body", "mesh": mesh})
+    node = document.add("nodes", {"name": name, "children": [body]})
+    document.add_root(node)
+    channels = add_presence(document, animation, node, track)
+    if len(keys) > 1:
+        times = document.add_array(track.time[keys].numpy().astype(np.float32), bounds=True)
+        weights = np.eye(len(keys), dtype=np.float32)[:, 1:].reshape(-1)
+        channels.append((add_sampler(document, animation, times, weights), body, "weights"))
+    return channels, miss
+
+
+def _add_shapes(
+    document: Document,
+    shapes: Float[Tensor, "keys verts 3"],
+    bodies: Bodies,
+    material: int,
+    name: str,
+) -> int:
+    """A mesh with its first shape and the way to each of the others."""
+    normals = _normals(shapes, bodies)
+    faces = bodies.faces.cpu().numpy().astype(np.uint32).reshape(-1)
+    targets = [
+        {
+            "POSITION": document.add_array(_moved(shapes, key), VERTICES, bounds=True),
+            "NORMAL": document.add_array(_moved(normals, key), VERTICES),
+        }
+        for key in range(1, len(shapes))
+    ]
+    primitive: dict[str, Any] = {
+        "attributes": {
+            "POSITION": document.add_array(shapes[0].numpy(), VERTICES, bounds=True),
+            "NORMAL": document.add_array(normals[0].numpy(), VERTICES),
+        },
+        "indices": document.add_array(faces, INDICES),
+        "material": material,
+    }
+    mesh: dict[str, Any] = {"name": name, "primitives": [primitive]}
+    if targets:
+        primitive["targets"] = targets
+        mesh["weights"] = [0.0] * len(targets)
+    return document.add("meshes", mesh)
+
+
+def _moved(values: Float[Tensor, "keys verts 3"], key: int) -> NDArray[np.float32]:
+    return (values[key] - values[0]).numpy()
+
+
+def _normals(
+    shapes: Float[Tensor, "keys verts 3"], bodies: Bodies
+) -> Float[Tensor, "keys verts 3"]:
+    """Unit normals; up at vertices that no face uses."""
+    found = vertex_normals(shapes, bodies.faces.cpu())
+    up = torch.tensor([0.0, 1.0, 0.0])
+    return torch.where(found.norm(dim=-1, keepdim=True) > 0.5, found, up)
+
+
+# A body that moves on the bones of its model.
+
+
+INFLUENCES = 4  # joints that move a vertex: what every viewer draws
+STILL = 1e-6  # [rad], [m]; what moves less is not animated
+
+
+@record
+class Skin:
+    """Bones of everybody, each person with one shape."""
+
+    motion: Motion
+    model: SkinnedBody
+    """With four weights a vertex."""
+    miss: float
+    """How far the skin is off the meshes of the result at most [m]."""
+
+
+def fit_skin(motion: Motion, model: SkinnedBody, bodies: Bodies) -> Skin:
+    """One shape for each person, four weights for each vertex, and what they cost."""
+    share, joint = model.weights.topk(INFLUENCES, dim=1)
+    weights = torch.zeros_like(model.weights).scatter(1, joint, share / share.sum(1, keepdim=True))
+    simple = dataclasses.replace(model, weights=weights)
+    betas = motion.pose.betas.clone()
+    for track in tracks_of(bodies):
+        betas[track.rows] = betas[track.rows].mean(0)
+    posed = Motion(dataclasses.replace(motion.pose, betas=betas), motion.size)
+    return Skin(posed, simple, misses(posed, simple, bodies))
+
+
+def add_skinned(
+    document: Document, animation: int, skin: Skin, track: Track, tint: Colour
+) -> list[Channel]:
+    """Append a person: mesh, bones and their motion; what moves."""
+    pose, model, name = skin.motion.pose, skin.model, f"person_{track.person}"
+    betas = pose.betas[track.rows[0]]
+    count = len(betas)
+    rest = model.verts + model.shape_dirs[..., :count] @ betas
+    joints = model.joints + model.joint_dirs[..., :count] @ betas
+    bones = _add_bones(document, model, joints)
+    top = document.add("nodes", {"name": name, "children": [bones[0]]})
+    document.add_root(top)
+    mesh = _add_skin_mesh(document, model, rest, add_material(document, tint, name), name)
+    inverse = document.add_array(_inverse_bind(model, joints))
+    bind = document.add("skins", {"joints": bones, "inverseBindMatrices": inverse, "name": name})
+    document.add_root(document.add("nodes", {"name": f"{name}_body", "mesh": mesh, "skin": bind}))
+    channels = add_presence(document, animation, top, track)
+    return channels + _move(document, animation, skin, track, (bones, joints[0]))
+
+
+def _add_bones(
+    document: Document, model: SkinnedBody, joints: Float[Tensor, "joints 3"]
+) -> list[int]:
+    """A node for each joint, at its place in its parent; the indices."""
+    first = len(document.tree["nodes"])
+    for joint, parent in enumerate(model.parents):
+        node: dict[str, Any] = {"name": model.joint_names[joint]}
+        below = [first + k for k, p in enumerate(model.parents) if p == joint]
+        if below:
+            node["children"] = below
+        if parent >= 0:
+            bone = model.tpose[parent] @ (joints[joint] - joints[parent])
+            node["translation"] = bone.tolist()
+        document.add("nodes", node)
+    return list(range(first, first + len(model.parents)))
+
+
+def _inverse_bind(model: SkinnedBody, joints: Float[Tensor, "joints 3"]) -> NDArray[np.float32]:
+    """From the rest shape to the axes of each joint, by columns."""
+    matrix = torch.eye(4).repeat(len(joints), 1, 1)
+    matrix[:, :3, :3] = model.tpose
+    matrix[:, :3, 3] = -(model.tpose @ joints[..., None])[..., 0]
+    return matrix.mT.contiguous().numpy()
+
+
+def _add_skin_mesh(
+    document: Document,
+    model: SkinnedBody,
+    rest: Float[Tensor, "verts 3"],
+    material: int,
+    name: str,
+) -> int:
+    """The rest shape with its weights; joints without a share are number 0."""
+    share, joint = model.weights.topk(INFLUENCES, dim=1)
+    joint = torch.where(share > 0, joint, 0)
+    normals = vertex_normals(rest, model.faces)
+    faces = model.faces.numpy().astype(np.uint32).reshape(-1)
+    attributes = {
+        "POSITION": document.add_array(rest.numpy(), VERTICES, bounds=True),
+        "NORMAL": document.add_array(normals.numpy(), VERTICES),
+        "JOINTS_0": document.add_array(joint.numpy().astype(np.uint8), VERTICES),
+        "WEIGHTS_0": document.add_array(share.numpy(), VERTICES),
+    }
+    primitive = {
+        "attributes": attributes,
+        "indices": document.add_array(faces, INDICES),
+        "material": material,
+    }
+    return document.add("meshes", {"name": name, "primitives": [primitive]})
+
+
+def _move(
+    document: Document,
+    animation: int,
+    skin: Skin,
+    track: Track,
+    root: tuple[list[int], Float[Tensor, "3"]],
+) -> list[Channel]:
+    """Turns of all joints, and the place and size of the pelvis."""
+    bones, pelvis = root
+    times = document.add_array(track.time.numpy().astype(np.float32), bounds=True)
+    place = (skin.motion.pose.transl[track.rows] + pelvis).numpy()
+    size = skin.motion.size[track.rows, None].expand(-1, 3).contiguous().numpy()
+    turns = quaternions(all_angles(skin.motion.pose)[track.rows])
+    moving = [(bones[0], "translation", place), (bones[0], "scale", size)]
+    moving += [(bone, "rotation", turns[:, k]) for k, bone in enumerate(bones)]
+    channels: list[Channel] = []
+    for node, path, values in moving:
+        if np.ptp(values, axis=0).max() < STILL:
+            document.tree["nodes"][node][path] = values[0].tolist()
+        else:
+            values = np.ascontiguousarray(values, dtype=np.float32)
+            channels.append((add_sampler(document, animation, times, values), node, path))
+    return channels
+
+
+def quaternions(vectors: Float[Tensor, "frames joints 3"]) -> NDArray[np.float32]:
+    """Rotations (x, y, z, w) of axis-angle vectors; neighbours in time are on one side."""
+    angle = vectors.double().norm(dim=-1, keepdim=True)
+    half = torch.where(angle > 1e-9, (angle / 2).sin() / angle.clamp_min(1e-9), 0.5)
+    found = torch.cat([vectors.double() * half, (angle / 2).cos()], -1)
+    dots = (found[1:] * found[:-1]).sum(-1)
+    side = torch.where(dots < 0, -1.0, 1.0).cumprod(0)
+    return torch.cat([found[:1], found[1:] * side[..., None]]).float().numpy()
+
+
+# The file with everything in it.
+
+
+BodyForm = Literal["auto", "skin", "morph", "none"]
+FAR_OFF = 0.01  # [m]
+SKIN_MISS = 0.02  # [m], the most that a skinned body may miss the result's mesh
+
+
+def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exported:
+    """Write the room with moving people as one binary glTF file.
+
+    Args:
+        finished: The result.
+        folder: Where `scene.glb` goes.
+        body: How people move: on the bones of their model (skin: small, a copy within 2 cm), by
+            shapes of chosen frames (morph: those are exact), or not at all (none); auto: on bones
+            where the parameters are known.
+
+    Raises:
+        InputError: If bones are asked for and there are none.
+    """
+    path = write_glb(finished.scene, None, folder / "scene.glb")
+    bodies = finished.bodies
+    if bodies is None or body == "none":
+        return Exported((path,), ("no people",))
+    skin = _fit(finished) if body in ("auto", "skin") else "morph was asked for"
+    document = Document(path.read_bytes())
+    first, step = int(bodies.frame.min()), 1 / (bodies.fps or FPS)
+    notes = [f"frame {first} of the video is at 0 s, each next one {step:g} s later"]
+    if isinstance(skin, str) and body == "skin":
+        raise InputError(f"--body skin: {skin}")
+    if isinstance(skin, str):
+        notes += [] if body == "morph" else [f"people move by shapes, not on bones: {skin}"]
+    else:
+        notes.append(f"people move on bones, at most {1e3 * skin.miss:.0f} mm off the result")
+    notes += _add_people(document, bodies, None if isinstance(skin, str) else skin)
+    document.write(path)
+    return Exported((path,), tuple(notes))
+
+
+def _add_people(document: Document, bodies: Bodies, skin: Skin | None) -> list[str]:
+    """Append everybody and the one animation; what there is to say about it."""
+    channels: list[Channel] = []
+    notes: list[str] = []
+    animation = document.add("animations", {"name": "motion", "channels": [], "samplers": []})
+    for track in tracks_of(bodies):
+        tint = person_colour(track.person)
+        if skin is None:
+            moved, miss = add_morphing(document, animation, bodies, track, tint)
+            if miss > FAR_OFF:
+                notes.append(f"person {track.person}: up to {100 * miss:.1f} cm off between shapes")
+        else:
+            moved = add_skinned(document, animation, skin, track, tint)
+        channels += moved
+    _connect(document, animation, channels)
+    return notes
+
+
+def _fit(finished: Finished) -> Skin | str:
+    """The bones that move the result's bodies, or why there are none."""
+    motion = motion_of(finished)
+    if isinstance(motion, str):
+        return motion
+    assert finished.bodies is not None
+    model = skin_of(motion.pose, finished.bodies)
+    if model is None:
+        return f"the model {motion.pose.model!r} has no bones that are known here"
+    skin = fit_skin(motion, model, finished.bodies)
+    if not skin.miss <= SKIN_MISS:
+        return f"its bones miss the result's meshes by {skin.miss:.3f} m"
+    return skin
+
+
+def _connect(document: Document, animation: int, channels: list[Channel]) -> None:
+    """Fill the animation: which sampler moves which property of which node."""
+    animations = document.tree["animations"]
+    if not channels:
+        del document.tree["animations"]
+        return
+    animations[animation]["channels"] = [
+        {"sampler": sampler, "target": {"node": node, "path": path}}
+        for sampler, node, path in channels
+    ]

@@ -1,0 +1,128 @@
+"""room.xml: the room for MuJoCo, furniture as free bodies of convex pieces."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+import torch
+
+from mover.core.colours import colour
+from mover.core.files import replacing
+from mover.core.run import Run
+from mover.core.types import Camera, Scene
+from mover.io.export.finished import Exported, Finished
+from mover.io.export.solids import AXES, Solid, floor_height, mesh_bytes, numbers, solids_of
+
+STEP = 0.002  # [s]
+FRICTION = (0.8, 0.005, 0.0001)  # wood on wood or carpet; slip, spin, roll
+RESERVED = "world"
+
+
+def export_mjcf(finished: Finished, folder: Path) -> Exported:
+    """Write `mjcf/room.xml` and its meshes.
+
+    Args:
+        finished: The result.
+        folder: Gets the folder `mjcf`.
+    """
+    solids = solids_of(finished.scene, Run(finished.out))
+    text, meshes = mjcf_of(finished.scene, solids)
+    home = folder / "mjcf"
+    for name, content in meshes.items():
+        with replacing(home / name) as part:
+            part.write_bytes(content)
+    with replacing(home / "room.xml") as part:
+        part.write_text(text)
+    kilos = ", ".join(f"{s.id} {s.mass:.0f} kg" for s in solids)
+    return Exported((home / "room.xml",), ("+z is up and the floor is at 0", kilos))
+
+
+def mjcf_of(
+    scene: Scene, solids: Sequence[Solid], looks: bool = True
+) -> tuple[str, dict[str, bytes]]:
+    """The model as text, and its mesh files by name.
+
+    Args:
+        scene: Gives the camera and the floor.
+        solids: Its furniture.
+        looks: Whether the meshes that are seen are part of it, beside those that collide.
+    """
+    root = Element("mujoco", model="room")
+    SubElement(root, "compiler", angle="radian", autolimits="true")
+    option = SubElement(root, "option", timestep=f"{STEP}", integrator="implicitfast")
+    option.set("cone", "elliptic")
+    SubElement(option, "flag", multiccd="enable")
+    _add_defaults(root)
+    asset, world = SubElement(root, "asset"), SubElement(root, "worldbody")
+    lamp = {"ambient": "0.4 0.4 0.4", "diffuse": "0.5 0.5 0.5"}
+    SubElement(SubElement(root, "visual"), "headlight", lamp)
+    SubElement(world, "light", pos="0 0 4", dir="0 0 -1", diffuse="0.5 0.5 0.5")
+    _add_camera(world, scene.camera, floor_height(scene))
+    size = _reach(solids)
+    ground = {"name": "ground", "type": "plane", "size": f"{size:g} {size:g} 0.1"}
+    SubElement(world, "geom", ground, rgba="0.86 0.85 0.83 1", friction=numbers(FRICTION))
+    meshes: dict[str, bytes] = {}
+    for index, solid in enumerate(solids):
+        meshes |= _add_solid(asset, world, solid, (index, looks))
+    indent(root)
+    return tostring(root, encoding="unicode") + "\n", meshes
+
+
+def _reach(solids: Sequence[Solid]) -> float:
+    """Half of the width of the floor that is drawn [m]."""
+    far = max((float(s.place[:2].abs().max()) for s in solids), default=0.0)
+    return far + 5.0
+
+
+def _add_defaults(root: Element) -> None:
+    default = SubElement(root, "default")
+    collide = SubElement(default, "default", {"class": "collide"})
+    SubElement(collide, "geom", type="mesh", group="3", friction=numbers(FRICTION), condim="4")
+    look = SubElement(default, "default", {"class": "look"})
+    SubElement(look, "geom", type="mesh", group="2", contype="0", conaffinity="0", mass="0")
+
+
+def _add_camera(world: Element, camera: Camera, floor: float) -> None:
+    """At the origin of scene.json; MuJoCo's cameras look along -z with +y up."""
+    turn = AXES @ camera.R_cam_world.detach().cpu().double().mT
+    x, y = turn[:, 0].tolist(), (-turn[:, 1]).tolist()
+    up = 2 * math.degrees(math.atan(camera.height / (2 * float(camera.K[1, 1]))))
+    view = {"name": "camera", "pos": numbers((0, 0, -floor)), "xyaxes": numbers((*x, *y))}
+    SubElement(world, "camera", view, fovy=f"{up:.8g}")
+
+
+def body_name(solid: Solid) -> str:
+    """Its id, but for the one name that MuJoCo keeps for itself."""
+    return solid.id if solid.id != RESERVED else f"{solid.id}_"
+
+
+def _add_solid(
+    asset: Element, world: Element, solid: Solid, drawn: tuple[int, bool]
+) -> dict[str, bytes]:
+    """A body with its convex pieces; its mesh files."""
+    index, looks = drawn
+    name = body_name(solid)
+    half = torch.tensor(solid.yaw / 2, dtype=torch.float64)
+    quat = (float(half.cos()), 0.0, 0.0, float(half.sin()))
+    place = {"name": name, "pos": numbers(solid.place.tolist()), "quat": numbers(quat)}
+    body = SubElement(world, "body", place)
+    if solid.free:
+        SubElement(body, "freejoint", name=name)
+    i = solid.inertia
+    full = (i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2])
+    mass = {"pos": numbers(solid.centre.tolist()), "mass": f"{solid.mass:.8g}"}
+    SubElement(body, "inertial", mass, fullinertia=numbers([float(v) for v in full]))
+    files: dict[str, bytes] = {}
+    for k, hull in enumerate(solid.hulls):
+        part = f"{name}_{k}"
+        files[f"meshes/{part}.obj"] = mesh_bytes(hull, "obj")
+        SubElement(asset, "mesh", name=part, file=f"meshes/{part}.obj", inertia="shell")
+        SubElement(body, "geom", {"class": "collide", "mesh": part})
+    if looks:
+        files[f"meshes/{name}_look.obj"] = mesh_bytes(solid.look, "obj")
+        mesh = {"name": f"{name}_look", "file": f"meshes/{name}_look.obj", "inertia": "shell"}
+        SubElement(asset, "mesh", mesh)
+        tint = numbers((*colour(index), 1.0))
+        SubElement(body, "geom", {"class": "look", "mesh": f"{name}_look", "rgba": tint})
+    return files

@@ -1,0 +1,147 @@
+"""The parameters of people's bodies in the world of the result."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.bodies import load_model
+from mover.bodies.skinning import SkinnedBody
+from mover.core.records import map_tensors, record
+from mover.core.types import Bodies, BodyPose
+from mover.geometry.rotations import axis_angle
+from mover.io.export.finished import Finished
+
+SAME = 0.01  # [m], a similarity that leaves more did not make the result's body
+HANDS = ("left_hand_pose", "right_hand_pose")
+
+
+@record
+class Motion:
+    """Parameters of bodies, row by row, in the world."""
+
+    pose: BodyPose
+    size: Float[Tensor, " bodies"]
+    """Factor by which each body grew about its pelvis; 1 where the parameters say it all."""
+
+
+def motion_of(finished: Finished) -> Motion | str:
+    """The parameters of the result's bodies, or why there are none.
+
+    A result that was moved and sized as a whole takes over the capture's parameters: its root is
+    turned, its pelvis is where the result has it.
+    """
+    bodies, given = finished.bodies, finished.given
+    if bodies is None:
+        return "the result has no bodies"
+    if bodies.pose is not None:
+        return Motion(bodies.pose, torch.ones(len(bodies.verts)))
+    if given is None:
+        return "bodies.npz has no parameters; --capture names the capture that has them"
+    if given.pose is None:
+        return "the capture's bodies.npz has no parameters that reproduce its meshes"
+    same = given.verts.shape == bodies.verts.shape
+    if not (same and (given.frame == bodies.frame).all() and (given.person == bodies.person).all()):
+        return "the capture's bodies are not those of the result"
+    return _carried(given, given.pose, bodies)
+
+
+def _carried(given: Bodies, pose: BodyPose, bodies: Bodies) -> Motion | str:
+    """The capture's parameters in the result's world."""
+    size, turn, shift, error = similarity(given.verts.double(), bodies.verts.double())
+    if float(error.max()) > SAME:
+        return f"the result's bodies are not those of the capture, by {float(error.max()):.3f} m"
+    offset = pelvis_of(pose)
+    pelvis = (pose.transl + offset).double()
+    there = size[:, None] * (turn @ pelvis[..., None])[..., 0] + shift
+    root = vectors_of(turn @ axis_angle(pose.global_orient.double()))
+    moved = dataclasses.replace(
+        pose, global_orient=root.to(pose.transl), transl=there.to(pose.transl) - offset
+    )
+    return Motion(moved, size.to(pose.transl))
+
+
+def pelvis_of(pose: BodyPose) -> Float[Tensor, "bodies 3"]:
+    """From `transl` to the pelvis, about which the root turns [m]."""
+    straight = {name: torch.zeros_like(getattr(pose, name)) for name in ("transl", "global_orient")}
+    _, joints = load_model(pose.model, pose.gender).posed(dataclasses.replace(pose, **straight))
+    return joints[:, 0]
+
+
+def similarity(
+    start: Float[Tensor, "rows points 3"], end: Float[Tensor, "rows points 3"]
+) -> tuple[
+    Float[Tensor, " rows"],
+    Float[Tensor, "rows 3 3"],
+    Float[Tensor, "rows 3"],
+    Float[Tensor, " rows"],
+]:
+    """Size, rotation and shift that best take `start` to `end`, and the largest miss [m]."""
+    a, b = start.mean(1, keepdim=True), end.mean(1, keepdim=True)
+    cross = (end - b).mT @ (start - a)
+    u, s, vt = torch.linalg.svd(cross)
+    flip = torch.ones_like(s)
+    flip[:, 2] = (torch.linalg.det(u) * torch.linalg.det(vt)).sign()
+    turn = u @ (flip[..., None] * vt)
+    size = (s * flip).sum(-1) / (start - a).square().sum((1, 2)).clamp_min(1e-12)
+    shift = (b - size[:, None, None] * a @ turn.mT)[:, 0]
+    miss = size[:, None, None] * start @ turn.mT + shift[:, None] - end
+    return size, turn, shift, miss.norm(dim=-1).amax(-1)
+
+
+def vectors_of(turns: Float[Tensor, "rows 3 3"]) -> Float[Tensor, "rows 3"]:
+    """Axis-angle vectors of rotation matrices [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    found = Rotation.from_matrix(turns.detach().cpu().double().numpy()).as_rotvec()
+    return torch.from_numpy(found).to(turns)
+
+
+def all_angles(pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
+    """Axis-angle vectors of all 55 joints in SMPL-X's order; what is not given stays straight."""
+    rows = pose.global_orient.shape[0]
+    hands = [pose.extra.get(name) for name in HANDS]
+    parts = [
+        pose.global_orient,
+        pose.body_pose[:, :63],
+        _or_zeros(pose.extra.get("jaw_pose"), rows, 3),
+        torch.zeros(rows, 6),
+        *(_or_zeros(hand, rows, 45) for hand in hands),
+    ]
+    return torch.cat([part.to(pose.global_orient) for part in parts], -1).reshape(rows, 55, 3)
+
+
+def _or_zeros(given: Tensor | None, rows: int, width: int) -> Tensor:
+    """The angles where they are given as angles; hands given as PCA weights stay straight."""
+    fits = given is not None and given.shape[-1] == width
+    return given if given is not None and fits else torch.zeros(rows, width)
+
+
+def skin_of(pose: BodyPose, bodies: Bodies) -> SkinnedBody | None:
+    """The skinned model of the bodies.
+
+    None if the model is not skinned, has other vertices, or other joints than SMPL-X.
+    """
+    model = load_model(pose.model, pose.gender)
+    if not isinstance(model, SkinnedBody) or len(model.parents) != 55:
+        return None
+    return model if len(model.verts) == bodies.verts.shape[1] else None
+
+
+def misses(motion: Motion, model: SkinnedBody, bodies: Bodies) -> float:
+    """How far a skinned model in this motion is off the meshes at most [m]."""
+    worst = 0.0
+    for rows in torch.arange(len(bodies.verts)).split(128):
+        verts, joints = model.posed(rows_of(motion.pose, rows))
+        root = joints[:, :1]
+        sized = root + motion.size[rows, None, None] * (verts - root)
+        worst = max(worst, float((sized - bodies.verts[rows]).norm(dim=-1).max()))
+    return worst
+
+
+def rows_of(pose: BodyPose, rows: Tensor) -> BodyPose:
+    """The parameters of some rows."""
+    names = ("betas", "global_orient", "body_pose", "transl", "extra")
+    chosen = map_tensors(lambda x: x[rows], {name: getattr(pose, name) for name in names})
+    return dataclasses.replace(pose, **chosen)

@@ -1,0 +1,102 @@
+"""URDF: one file for each piece of furniture, and one for the whole room as fixed obstacles."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+from mover.core.colours import colour
+from mover.core.files import replacing
+from mover.core.run import Run
+from mover.io.export.finished import Exported, Finished
+from mover.io.export.solids import Solid, mesh_bytes, numbers, solids_of
+
+SLAB = 0.1  # [m], thickness of the floor
+FLOOR = 20.0  # [m], its width
+BASE = "room"
+
+
+def export_urdf(finished: Finished, folder: Path) -> Exported:
+    """Write `urdf/<id>.urdf` (a loose body each) and `urdf/room.urdf` (everything fixed).
+
+    Args:
+        finished: The result.
+        folder: Gets the folder `urdf`.
+    """
+    solids, home = solids_of(finished.scene, Run(finished.out)), folder / "urdf"
+    files = [home / "room.urdf"]
+    for solid in solids:
+        for k, hull in enumerate(solid.hulls):
+            _save(home / "meshes" / f"{solid.id}_{k}.stl", mesh_bytes(hull, "stl"))
+        _save(home / "meshes" / f"{solid.id}.obj", mesh_bytes(solid.look, "obj"))
+    for index, solid in enumerate(solids):
+        robot = _robot(solid.id)
+        _add_link(robot, solid, index)
+        files.append(home / f"{_apart(solid.id)}.urdf")
+        _save(files[-1], _text(robot))
+    _save(files[0], _text(_room(solids)))
+    note = "+z is up and the floor is at 0; room.urdf holds every piece still"
+    return Exported(tuple(files), (note,))
+
+
+def _apart(name: str) -> str:
+    """The file name of a piece; `room` is taken."""
+    return name if name.casefold() != BASE else f"{name}_"
+
+
+def _robot(name: str) -> Element:
+    """The root; MuJoCo is told to leave the folders of meshes in their names."""
+    robot = Element("robot", name=name)
+    SubElement(SubElement(robot, "mujoco"), "compiler", strippath="false", discardvisual="false")
+    return robot
+
+
+def _room(solids: Sequence[Solid]) -> Element:
+    robot = _robot(BASE)
+    link = SubElement(robot, "link", name="floor")
+    for kind in ("visual", "collision"):
+        shape = SubElement(link, kind)
+        SubElement(shape, "origin", xyz=numbers((0, 0, -SLAB / 2)), rpy="0 0 0")
+        box = SubElement(shape, "geometry")
+        SubElement(box, "box", size=numbers((FLOOR, FLOOR, SLAB)))
+    for index, solid in enumerate(solids):
+        _add_link(robot, solid, index)
+        joint = SubElement(robot, "joint", name=f"{_link(solid)}_joint", type="fixed")
+        SubElement(joint, "parent", link="floor")
+        SubElement(joint, "child", link=_link(solid))
+        place, turn = numbers(solid.place.tolist()), numbers((0, 0, solid.yaw))
+        SubElement(joint, "origin", xyz=place, rpy=turn)
+    return robot
+
+
+def _link(solid: Solid) -> str:
+    """Name of its link; `floor` is taken, and MuJoCo keeps `world`."""
+    return solid.id if solid.id not in ("floor", "world") else f"{solid.id}_"
+
+
+def _add_link(robot: Element, solid: Solid, index: int) -> None:
+    link = SubElement(robot, "link", name=_link(solid))
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "origin", xyz=numbers(solid.centre.tolist()), rpy="0 0 0")
+    SubElement(inertial, "mass", value=f"{solid.mass:.8g}")
+    i = solid.inertia.tolist()
+    moments = {"ixx": i[0][0], "iyy": i[1][1], "izz": i[2][2]}
+    moments |= {"ixy": i[0][1], "ixz": i[0][2], "iyz": i[1][2]}
+    SubElement(inertial, "inertia", {key: f"{value:.8g}" for key, value in moments.items()})
+    visual = SubElement(link, "visual")
+    mesh = SubElement(visual, "geometry")
+    SubElement(mesh, "mesh", filename=f"meshes/{solid.id}.obj")
+    material = SubElement(visual, "material", name=f"{solid.id}_colour")
+    SubElement(material, "color", rgba=numbers((*colour(index), 1.0)))
+    for k in range(len(solid.hulls)):
+        shape = SubElement(SubElement(link, "collision"), "geometry")
+        SubElement(shape, "mesh", filename=f"meshes/{solid.id}_{k}.stl")
+
+
+def _text(robot: Element) -> bytes:
+    indent(robot)
+    return b'<?xml version="1.0"?>\n' + tostring(robot, encoding="utf-8") + b"\n"
+
+
+def _save(path: Path, content: bytes) -> None:
+    with replacing(path) as part:
+        part.write_bytes(content)

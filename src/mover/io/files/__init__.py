@@ -1,0 +1,1 @@
+"""Checked fields, arrays, meshes, images and cameras in files of any maker."""

@@ -1,0 +1,204 @@
+"""Cameras as calibration tools write them, turned into the fields of camera.json."""
+
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mover.core.errors import InputError
+from mover.io.files.fields import (
+    At,
+    array,
+    items,
+    maybe,
+    number,
+    positive,
+    read_json,
+    reason,
+    refuse,
+    vector,
+)
+
+LARGEST_TEXT = 1 << 20  # [bytes], of a calibration
+HALF = 0.5  # [px], calibrations count from the centre of the first pixel
+WIDEST = 175.0  # [degrees], of a pinhole camera
+
+
+def read_camera_file(path: Path, size: tuple[int, int] | None) -> At:
+    """The camera of a file of any known kind, in the fields of camera.json.
+
+    Known are our own and nerfstudio's .json, 3 x 3 numbers in a text file (cam_K.txt), OpenCV's
+    .json with `camera_mtx` (PROX, whose fits leave out its distortion `k`) and .xml with
+    `Intrinsics`, Gen3DSR's cam_params.json, MoGe's fov.json, GeoCalib's {"f", "roll", "pitch"} and
+    SAM 3D Body's focal_length.json.
+
+    Args:
+        path: Of the file.
+        size: Width and height of the image, which most of them do not tell [px].
+
+    Raises:
+        InputError: If the file cannot be understood, or the size is needed and not known.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file, expected a camera")
+    match path.suffix.lower():
+        case ".json":
+            return camera_of_tree(read_json(path), size)
+        case ".xml":
+            return _of_opencv(path, size)
+        case _:
+            at = At(None, path.name)
+            return with_intrinsics(read_intrinsics(path), size, at, shift=0.0)
+
+
+def camera_of_tree(at: At, size: tuple[int, int] | None) -> At:
+    """The fields of camera.json from a JSON object of any known kind."""
+    if maybe(at, "fl_x") is not None:
+        return At({"w": size[0], "h": size[1], **at.value} if size else at.value, at.file)
+    if (mtx := maybe(at, "camera_mtx")) is not None:
+        return with_intrinsics(_matrix(mtx), size, mtx, shift=HALF)
+    if (mtx := maybe(at, "K")) is not None:
+        own = [maybe(at, key) for key in ("W", "H")]
+        if own[0] is not None and own[1] is not None:
+            size = int(number(own[0], 1, 1e5)), int(number(own[1], 1, 1e5))
+        return with_intrinsics(_matrix(mtx), size, mtx, shift=HALF)
+    return _of_lens(at, _known(size, at))
+
+
+def with_intrinsics(
+    K: NDArray[np.float64], size: tuple[int, int] | None, at: At, *, shift: float
+) -> At:
+    """The fields of camera.json of a matrix.
+
+    Args:
+        K: [fx 0 cx; 0 fy cy; 0 0 1] [px].
+        size: Width and height of the image [px].
+        at: Where the matrix is from.
+        shift: What its principal point lacks [px].
+    """
+    w, h = _known(size, at)
+    cx, cy = K[0, 2].item() + shift, K[1, 2].item() + shift
+    return At({"w": w, "h": h, "fl_x": K[0, 0].item(), "fl_y": K[1, 1].item(), "cx": cx, "cy": cy},
+              at.file)  # fmt: skip
+
+
+def of_view(degrees: float, size: tuple[int, int], file: str) -> At:
+    """The camera with this horizontal field of view and the principal point in the middle.
+
+    Raises:
+        InputError: If the angle is not that of a pinhole camera.
+    """
+    angle = number(At(degrees, file), 1, WIDEST)
+    focal = size[0] / 2 / math.tan(math.radians(angle) / 2)
+    return _centred(focal, focal, size, file)
+
+
+def read_intrinsics(path: Path) -> NDArray[np.float64]:
+    """The 3 x 3 numbers of a text file [fx 0 cx; 0 fy cy; 0 0 1].
+
+    Raises:
+        InputError: If it is missing or something else.
+    """
+    try:
+        if path.stat().st_size > LARGEST_TEXT:
+            raise ValueError("the file is too large")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that an empty file is empty: its shape is refused
+            K = np.atleast_2d(np.loadtxt(path, dtype=np.float64))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path.name}: cannot be read ({reason(error)}), expected 3 x 3 numbers"
+        ) from error
+    return _checked(array(At(K, path.name), (3, 3)), At(K.tolist(), path.name))
+
+
+def tilt_of(pitch: float, roll: float) -> list[list[float]]:
+    """R_cam_world of angles [rad]: diag(1, -1, -1) R_z(roll) R_x(-pitch)."""
+    c, s, cr, sr = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
+    Rx = np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
+    Rz = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]])
+    return (np.diag([1.0, -1.0, -1.0]) @ Rz @ Rx).tolist()
+
+
+def _matrix(at: At) -> NDArray[np.float64]:
+    return _checked(np.array([vector(row, 3) for row in items(at, 3)]), at)
+
+
+def _checked(K: NDArray[np.float64], at: At) -> NDArray[np.float64]:
+    if [K[0, 1], K[1, 0], *K[2]] != [0, 0, 0, 0, 1] or K[0, 0] <= 0 or K[1, 1] <= 0:
+        refuse(at, "intrinsics [fx 0 cx; 0 fy cy; 0 0 1]")
+    return K
+
+
+def _known(size: tuple[int, int] | None, at: At) -> tuple[int, int]:
+    if size is None:
+        refuse(at, "the size of the image beside it: give --image", "no width and height")
+    return size
+
+
+def _of_lens(at: At, size: tuple[int, int]) -> At:
+    """A camera from a focal length or a field of view, with its tilt where that is told."""
+    tilt: dict[str, Any] = {}
+    if (pitch := maybe(at, "pitch")) is not None and (roll := maybe(at, "roll")) is not None:
+        tilt["R_cam_world"] = tilt_of(number(pitch, -1.6, 1.6), number(roll, -1.6, 1.6))
+    for key in ("focal_length", "f", "focal"):
+        if (focal := maybe(at, key)) is not None:
+            value = positive(focal)
+            return At({**_centred(value, value, size, at.file).value, **tilt}, at.file)
+    if (across := maybe(at, "fov_x")) is not None:
+        up = maybe(at, "fov_y")
+        fx = size[0] / 2 / math.tan(math.radians(number(across, 1, WIDEST)) / 2)
+        fy = fx if up is None else size[1] / 2 / math.tan(math.radians(number(up, 1, WIDEST)) / 2)
+        return At({**_centred(fx, fy, size, at.file).value, **tilt}, at.file)
+    known = "fl_x, K, camera_mtx, focal_length, f or fov_x"
+    return refuse(at, f"a camera with one of the fields {known}")
+
+
+def _centred(fx: float, fy: float, size: tuple[int, int], file: str) -> At:
+    w, h = size
+    return At({"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": w / 2, "cy": h / 2}, file)
+
+
+def _of_opencv(path: Path, size: tuple[int, int] | None) -> At:
+    """OpenCV's FileStorage: `Intrinsics`, and in `CameraMatrix` [R | 0] of world and camera."""
+    tree = _read_xml(path)
+    K = _checked(_of_node(tree, path, "Intrinsics", (3, 3)), At(None, path.name, "Intrinsics"))
+    if tree.find("Distortion") is not None and _of_node(tree, path, "Distortion", None).any():
+        refuse(At(None, path.name, "Distortion"), "zeros: undistort the images first", "a lens's")
+    found = with_intrinsics(K, size, At(None, path.name), shift=HALF).value
+    if tree.find("CameraMatrix") is not None:
+        R = _of_node(tree, path, "CameraMatrix", (3, 4))[:, :3]
+        found["R_cam_world"] = (R @ np.diag([1.0, -1.0, -1.0])).tolist()  # their world is y-down
+    return At(found, path.name)
+
+
+def _read_xml(path: Path) -> ElementTree.Element:
+    """The root of an XML file without entities, which could be bombs."""
+    try:
+        content = path.read_bytes()[: LARGEST_TEXT + 1]
+        if len(content) > LARGEST_TEXT or b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+            raise ValueError("the file is too large or has entities")
+        return ElementTree.fromstring(content)
+    except (OSError, ValueError, ElementTree.ParseError) as error:
+        raise InputError(
+            f"{path.name}: cannot be read ({reason(error)}), expected OpenCV's XML"
+        ) from error
+
+
+def _of_node(
+    tree: ElementTree.Element, path: Path, name: str, shape: tuple[int, int] | None
+) -> NDArray[np.float64]:
+    """A matrix of OpenCV's XML."""
+    at = At(None, path.name, name)
+    node = tree.find(name)
+    data = None if node is None else node.find("data")
+    try:
+        values = np.array((data.text or "").split() if data is not None else [], dtype=np.float64)
+        values = values if shape is None else values.reshape(shape)
+    except ValueError:
+        return refuse(at, f"{shape} numbers", "something else")
+    return array(At(values, path.name, name), values.shape)

@@ -1,0 +1,211 @@
+"""Values from a user's file that know their place, and the checks that every reader shares."""
+
+import json
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mover.core.errors import InputError
+
+log = logging.getLogger(__name__)
+Warn = Callable[[str], None]
+"""Takes a warning; readers of whole captures collect them."""
+
+LARGEST_FILE = 4 << 30  # [bytes], of a JSON file or of all arrays of an .npz
+LARGEST = 1e9  # no number of the format is larger; keeps float32 finite
+LAST_INDEX = 10_000_000  # frames, tracks
+LAST_ID = 1 << 62
+
+
+class Missing:
+    """The value of a field that is not there."""
+
+
+MISSING = Missing()
+
+
+@dataclass(frozen=True)
+class At:
+    """A value of the user and where it stands."""
+
+    value: Any
+    file: str
+    field: str = ""
+
+    @property
+    def place(self) -> str:
+        """How an error message calls it."""
+        return f"{self.file}: field '{self.field}'" if self.field else self.file
+
+
+def refuse(at: At, expected: str, found: str | None = None) -> NoReturn:
+    """Raise the error that names file, field, found and expected."""
+    raise InputError(f"{at.place} has {found or shown(at.value)}, expected {expected}")
+
+
+def shown(value: Any) -> str:  # noqa: ANN401
+    """A short picture of any value for a message."""
+    if value is MISSING:
+        return "nothing"
+    if isinstance(value, np.ndarray):
+        return f"shape {value.shape} of {value.dtype}"
+    if isinstance(value, int) and abs(value) > 10**18:
+        return "a huge number"
+    text = json.dumps(value) if isinstance(value, str) else repr(value)
+    return text if len(text) <= 60 else f"{text[:56]} ..."
+
+
+def reason(error: Exception) -> str:
+    """What another library says, on one short line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:160]
+
+
+def listed(what: str, names: Sequence[object]) -> str:
+    """`3 chairs (1, 2, 3)` for a warning about many."""
+    some = ", ".join(map(str, names[:6])) + (", ..." if len(names) > 6 else "")
+    return f"{what} {some}" if len(names) == 1 else f"{len(names)} {what}s ({some})"
+
+
+def get(at: At, key: str) -> At:
+    """The field `key` of a mapping; its value is MISSING where it has none."""
+    value = mapping(at).get(key, MISSING)
+    return At(value, at.file, f"{at.field}.{key}" if at.field else key)
+
+
+def maybe(at: At, key: str) -> At | None:
+    """The field `key`, or None where it is missing or null."""
+    found = get(at, key)
+    return None if found.value is MISSING or found.value is None else found
+
+
+def mapping(at: At) -> Mapping[str, Any]:
+    """A JSON object."""
+    if not isinstance(at.value, Mapping):
+        refuse(at, "an object {...}")
+    return at.value
+
+
+def items(at: At, count: int | None = None) -> list[At]:
+    """The items of a list, of `count` of them if given."""
+    expected = "a list" if count is None else f"a list of {count}"
+    if not isinstance(at.value, list | tuple):
+        refuse(at, expected)
+    if count is not None and len(at.value) != count:
+        refuse(at, expected, f"{len(at.value)} items")
+    return [At(v, at.file, f"{at.field}[{i}]") for i, v in enumerate(at.value)]
+
+
+def text(at: At) -> str:
+    """Printable text that is not blank."""
+    if not isinstance(at.value, str) or not at.value.strip() or not at.value.isprintable():
+        refuse(at, "printable text")
+    return at.value
+
+
+def choice(at: At, choices: tuple[str, ...]) -> str:
+    """One of `choices`."""
+    if not isinstance(at.value, str) or at.value not in choices:
+        refuse(at, "one of " + ", ".join(choices))
+    return at.value
+
+
+def number(at: At, low: float = -LARGEST, high: float = LARGEST) -> float:
+    """A finite number between the bounds."""
+    bounds = "" if (low, high) == (-LARGEST, LARGEST) else f" from {low:g} to {high:g}"
+    value = at.value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        refuse(at, f"a finite number{bounds}")
+    if not (low <= value <= high):  # false for NaN as well
+        refuse(at, f"a finite number{bounds}")
+    return float(value)
+
+
+def positive(at: At) -> float:
+    """A number above zero."""
+    value = number(at)
+    if value < 1 / LARGEST:
+        refuse(at, "a number above 0")
+    return value
+
+
+def integer(at: At, low: int = 0, high: int = LAST_INDEX) -> int:
+    """A whole number between the bounds."""
+    value = at.value
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        refuse(at, f"a whole number from {low} to {high}")
+    return value
+
+
+def vector(at: At, count: int) -> list[float]:
+    """A list of `count` finite numbers."""
+    return [number(item) for item in items(at, count)]
+
+
+def unique(at: At, seen: set[Any], key: object, what: str) -> None:
+    """Refuse a key that was seen before, and remember it."""
+    if key in seen:
+        refuse(at, f"{what} that is not used twice")
+    seen.add(key)
+
+
+def array(
+    at: At, shape: tuple[int | str, ...], kind: Literal["real", "whole", "text"] = "real"
+) -> NDArray[Any]:
+    """An array of this shape, where a letter stands for any size, with finite values."""
+    value = at.value
+    wanted = f"{kind} numbers" if kind != "text" else "text"
+    expected = f"an array of {wanted} of shape ({', '.join(map(str, shape))})"
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in _KINDS[kind]:
+        refuse(at, expected)
+    fits = all(isinstance(n, str) or n == m for n, m in zip(shape, value.shape, strict=False))
+    if value.ndim != len(shape) or not fits:
+        refuse(at, expected)
+    if kind == "real":
+        with np.errstate(invalid="ignore"):
+            bad = ~(np.abs(value.astype(np.float64, copy=False)) <= LARGEST)
+        if bad.any():
+            first = tuple(int(i) for i in np.argwhere(bad)[0])
+            refuse(at, "finite numbers", f"{value[first]} at {list(first)}")
+    return value
+
+
+_KINDS = {"real": "fiu", "whole": "iu", "text": "U"}
+
+
+def read_json(path: Path) -> At:
+    """The content of a JSON file.
+
+    Raises:
+        InputError: If the file is missing or is not JSON.
+    """
+    name = path.name
+    if not path.is_file():
+        raise InputError(f"{name}: there is no such file in {path.parent}, expected a JSON file")
+    if path.stat().st_size > LARGEST_FILE:
+        size = path.stat().st_size
+        raise InputError(f"{name}: has {size} bytes, expected at most {LARGEST_FILE}")
+    try:
+        return At(json.loads(path.read_text(encoding="utf-8-sig")), name)
+    except (ValueError, RecursionError, OSError) as error:
+        raise InputError(f"{name}: is not JSON ({reason(error)}), expected a JSON file") from error
+
+
+def write_json(value: object, path: Path) -> None:
+    """Write JSON in one step, always the same bytes for the same value."""
+    from mover.core.files import replacing
+
+    body = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    with replacing(path) as part:
+        part.write_text(body, encoding="utf-8")
+
+
+def plain(value: Any) -> Any:  # noqa: ANN401
+    """A tensor as nested lists of the shortest decimals that read back the same."""
+    if value.ndim:
+        return [plain(v) for v in value]
+    return float(str(np.asarray(value.detach().cpu())))

@@ -1,0 +1,242 @@
+"""Mesh files: read any, copy them with what belongs to them, write new ones."""
+
+import json
+import re
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mover.core.errors import InputError
+from mover.core.files import replacing
+from mover.core.types import Mesh
+from mover.io.files.fields import LARGEST, LARGEST_FILE, At, reason, refuse, shown, text
+
+KINDS = (".glb", ".gltf", ".obj", ".ply", ".off", ".stl")
+MOST_NUMBERS = 1 << 27  # in one array of a glTF file
+THINNEST = 1e-9  # a mesh that is thinner along two axes has no surface
+
+
+def inside(at: At, folder: Path) -> Path:
+    """The file that a relative path names, which may not lie outside of the folder."""
+    name = text(at)
+    path = Path(name)
+    if path.is_absolute() or ".." in path.parts or "\0" in name or "\\" in name:
+        refuse(at, "a relative path with forward slashes inside the capture's folder")
+    try:
+        full = (folder / path).resolve()
+        if not full.is_relative_to(folder.resolve()):
+            refuse(at, "a file inside the capture's folder", f"{name!r}, a link that leaves it")
+        if not full.is_file():
+            refuse(at, "a file", f"{shown(name)}, which does not exist")
+    except (OSError, RuntimeError) as error:  # names that are too long, links in a circle
+        refuse(at, "a file", f"{shown(name)}, which cannot be found ({reason(error)})")
+    return full
+
+
+def read_mesh(at: At, folder: Path) -> tuple[Mesh, str]:
+    """The mesh that a field names, with the transforms of its nodes applied, and its full path.
+
+    Raises:
+        InputError: If it leaves the folder, cannot be read, is empty or is not finite.
+    """
+    path = inside(at, folder)
+    if path.suffix.lower() not in KINDS:
+        refuse(at, f"a file of kind {', '.join(KINDS)}")
+    if path.stat().st_size > LARGEST_FILE:
+        refuse(at, f"at most {LARGEST_FILE} bytes", f"a file of {path.stat().st_size}")
+    verts, faces = _load(at, path)
+    return mesh_of(verts, faces, at), str(path)
+
+
+def _load(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Vertices and faces of all parts of a file."""
+    import trimesh
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of parsers about things that are checked here
+        try:
+            check_gltf(at, path)
+            scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
+            for part in scene.geometry.values():
+                _check_faces(at, np.asarray(part.faces), len(part.vertices))
+            whole = scene.to_mesh()
+            return np.asarray(whole.vertices), np.asarray(whole.faces)
+        except InputError:
+            raise
+        except Exception as error:  # the parsers of six formats raise anything on broken files
+            found = f"{at.value!r}, which cannot be read ({reason(error)})"
+            refuse(at, "a readable mesh", found)
+
+
+def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
+    """Refuse buffers outside of the file's folder, and more numbers than a file can hold.
+
+    Args:
+        at: How messages call the file.
+        path: Of a mesh; other kinds than glTF pass.
+        pictures: Refuse pictures outside of the folder as well.
+
+    Raises:
+        InputError: If it does so.
+    """
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        return
+    tree = gltf_tree(path)
+    for kind in ("buffers", "images") if pictures else ("buffers",):
+        for part in tree.get(kind, []):
+            uri = part.get("uri", "data:")
+            if not uri.startswith("data:") and not _is_companion(path, unquote(uri)):
+                refuse(at, f"{kind} beside it", f"{at.value!r} with the file {shown(uri)}")
+    for part in tree.get("accessors", []):
+        if part["count"] > MOST_NUMBERS:
+            refuse(at, f"at most {MOST_NUMBERS} items", f"{at.value!r} with {part['count']}")
+
+
+def gltf_tree(path: Path) -> Any:  # noqa: ANN401
+    """The JSON of a .gltf or .glb; what it holds is not checked."""
+    content = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        start, size = 20, int.from_bytes(content[12:16], "little")
+        content = content[start : start + size]
+    return json.loads(content)
+
+
+def _check_faces(at: At, faces: NDArray[Any], count: int) -> None:
+    """Refuse faces that name vertices which do not exist."""
+    if faces.size and (faces.min() < 0 or faces.max() >= count):
+        found = f"faces that name vertices {faces.min()} to {faces.max()}"
+        refuse(at, f"vertices 0 to {count - 1}", found)
+
+
+def mesh_of(verts: NDArray[Any], faces: NDArray[Any], at: At) -> Mesh:
+    """A checked mesh without vertices that no face uses and without faces of repeated vertices.
+
+    Raises:
+        InputError: If it is empty, not finite, or its faces name missing vertices.
+    """
+    if verts.ndim != 2 or verts.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
+        found = f"vertices of shape {verts.shape} and faces of shape {faces.shape}"
+        refuse(at, "triangles: (vertices, 3) and (faces, 3)", found)
+    _check_faces(at, faces, len(verts))
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    if not len(faces):
+        refuse(at, "a mesh with faces", "an empty mesh")
+    kept, flat = np.unique(faces, return_inverse=True)
+    verts = verts[kept]
+    if not (np.abs(verts) <= LARGEST).all():
+        refuse(at, "finite vertices", "a mesh with NaN or infinite vertices")
+    if np.sort(np.ptp(verts, axis=0))[1] < THINNEST:
+        refuse(at, "a mesh with a surface", "a mesh that is a line or a point")
+    places = torch.from_numpy(np.ascontiguousarray(verts, dtype=np.float32))
+    return Mesh(places, torch.from_numpy(flat.reshape(-1, 3).astype(np.int64)))
+
+
+def write_mesh(mesh: Mesh, path: Path) -> None:
+    """Write a mesh as binary glTF."""
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+
+    body = trimesh.Trimesh(mesh.verts.cpu().numpy(), mesh.faces.cpu().numpy(), process=False)
+    with replacing(path) as part:
+        part.write_bytes(export_glb(trimesh.Scene({"object": body})))
+
+
+def copy_mesh(source: Path, folder: Path, name: str) -> Path:
+    """Copy a mesh file as it is, into a folder of its own where other files belong to it.
+
+    Args:
+        source: The user's file.
+        folder: Where meshes are kept.
+        name: New name without its ending.
+
+    Returns:
+        The copy.
+    """
+    beside = companions(source)
+    home = folder / name if beside else folder
+    target = home / (name + source.suffix)
+    _copy(source, target)
+    for file in beside:
+        _copy(source.parent / file, home / file)
+    return target
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy the bytes of a file in one step."""
+    if target.exists() and target.samefile(source):
+        return
+    with replacing(target) as part:
+        shutil.copyfile(source, part)
+
+
+def companions(path: Path) -> tuple[Path, ...]:
+    """Files that an .obj or .gltf names (materials, textures, buffers), relative to its folder."""
+    match path.suffix.lower():
+        case ".obj":
+            names = _named_in(path, r"^mtllib\s+(.+?)\s*$")
+            for library in [n for n in names if _is_companion(path, n)]:
+                options = r"^\s*(?:map_\w+|bump|disp|decal|refl|norm)\s+(?:-.*\s)?(.+?)\s*$"
+                home = Path(library).parent
+                names += [str(home / n) for n in _named_in(path.parent / library, options)]
+        case ".gltf":
+            tree = json.loads(path.read_text(encoding="utf-8"))
+            parts = [*tree.get("buffers", []), *tree.get("images", [])]
+            names = [unquote(part["uri"]) for part in parts if "uri" in part]
+        case _:
+            names = []
+    return tuple(Path(n) for n in dict.fromkeys(names) if _is_companion(path, n))
+
+
+def _named_in(path: Path, pattern: str) -> list[str]:
+    """The first group of each match of a pattern in a text file."""
+    found = re.findall(pattern, path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE)
+    return [str(name).replace("\\", "/") for name in found]
+
+
+def _is_companion(path: Path, name: str) -> bool:
+    """Whether a name is that of a file at or below the folder of `path`."""
+    if name.startswith("data:") or "\0" in name:
+        return False
+    full = (path.parent / name).resolve()
+    return full.is_file() and full.is_relative_to(path.parent.resolve())
+
+
+# Scans of rooms and their floors.
+
+
+BIN = 0.02  # [m], of the histogram of heights
+REACH = 0.6  # [m], the floor is so near to the lowest points
+SHARE = 0.25  # of the fullest bin there: less is noise below the floor
+OUTLIERS = 0.002  # share of the lowest points that may be anything
+
+
+def read_scan(path: Path) -> Mesh:
+    """A scan in the frame of its file.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    return read_mesh(At(path.name, path.name), path.parent)[0]
+
+
+def floor_of(heights: NDArray[np.float64]) -> float:
+    """The height at which a scan has its lowest large level part [m].
+
+    Args:
+        heights: Of its vertices, upwards [m].
+    """
+    lowest = float(np.quantile(heights, OUTLIERS))
+    near = heights[(heights >= lowest - BIN) & (heights <= lowest + REACH)]
+    edges = np.arange(lowest - BIN, lowest + REACH + BIN, BIN)
+    counts, _ = np.histogram(near, edges)
+    full = int(np.flatnonzero(counts >= SHARE * counts.max())[0])
+    best = full + int(counts[full : full + 3].argmax())
+    close = near[np.abs(near - (edges[best] + BIN / 2)) <= BIN]
+    return float(np.median(close)) if len(close) else float(edges[best] + BIN / 2)

@@ -1,0 +1,88 @@
+"""Read and write .npz files that others made: no pickles, no bombs, the same bytes each time."""
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from mover.core.errors import InputError
+from mover.core.files import replacing
+from mover.core.records import BROKEN
+from mover.io.files.fields import LARGEST_FILE, At, reason
+
+
+def read_npz(path: Path) -> At:
+    """The arrays of an .npz file by name.
+
+    Raises:
+        InputError: If it is missing, broken, too large, or holds pickled objects.
+    """
+    name = path.name
+    if not path.is_file():
+        raise InputError(f"{name}: there is no such file in {path.parent}, expected an .npz file")
+    try:
+        _check_headers(path)
+        with np.load(path, allow_pickle=False) as arrays:
+            return At({key: arrays[key] for key in arrays.files}, name)
+    except BROKEN as error:
+        raise InputError(
+            f"{name}: cannot be read ({reason(error)}), expected an .npz file"
+        ) from error
+
+
+def _check_headers(path: Path) -> None:
+    """Look at the sizes and types that the file promises before anything is unpacked."""
+    total = 0
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            with archive.open(entry) as stream:
+                dtype, size = _header(stream)
+            total += size
+            key = entry.filename.removesuffix(".npy")
+            if dtype.hasobject or dtype.fields:
+                found = f"has {dtype}, expected plain numbers or text (no pickled objects)"
+                raise InputError(f"{path.name}: field '{key}' {found}")
+            if total > LARGEST_FILE:
+                found = f"has {total} bytes or more, expected at most {LARGEST_FILE} in the file"
+                raise InputError(f"{path.name}: field '{key}' {found}")
+
+
+def _header(stream: Any) -> tuple[np.dtype[Any], int]:  # noqa: ANN401
+    """Type and bytes of an .npy file."""
+    match npy.read_magic(stream):
+        case (1, 0):
+            shape, _, dtype = npy.read_array_header_1_0(stream)
+        case (2, 0):
+            shape, _, dtype = npy.read_array_header_2_0(stream)
+        case version:
+            raise ValueError(f"version {version} of the .npy format")
+    if any(n < 0 for n in shape):
+        raise ValueError(f"an array of shape {shape}")
+    size = dtype.itemsize
+    for n in shape:
+        size *= n
+    return dtype, size
+
+
+def check_array_header(path: Path) -> None:
+    """Refuse an .npy file that holds objects or promises more than it has.
+
+    Raises:
+        InputError: If it does.
+    """
+    with path.open("rb") as stream:
+        dtype, size = _header(stream)
+    if dtype.hasobject or dtype.fields:
+        raise InputError(f"{path.name}: has {dtype}, expected plain numbers (no pickled objects)")
+    if size > min(LARGEST_FILE, path.stat().st_size):
+        raise InputError(f"{path.name}: promises {size} bytes, expected no more than it has")
+
+
+def write_npz(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
+    """Write arrays in one step, always the same bytes for the same arrays."""
+    with replacing(path) as part:
+        np.savez(part, allow_pickle=False, **dict(arrays))

@@ -1,0 +1,157 @@
+"""All formats that are read and written: a format is a file with a function, and a row here.
+
+Listing them imports nothing; a function is imported when it is asked for.
+"""
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mover.core.errors import InputError
+
+if TYPE_CHECKING:
+    from mover.core.types import Capture
+
+Kind = Literal["capture", "scene", "dataset", "masks", "people", "keypoints", "export"]
+"""What a function gives: a whole capture of a path; parts of one of a path and hints (scenes, data
+sets, masks); people or keypoints of a path and what is known; or files of a result and a folder."""
+IMPORTED: tuple[Kind, ...] = ("scene", "dataset", "masks")
+"""What `mover import` takes."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """One row."""
+
+    kind: Kind
+    name: str
+    what: str
+    """What the path is, or what is written, for people."""
+    function: str
+    """`module:function` below mover.io."""
+    options: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Arguments that the function takes by name."""
+
+    def load(self) -> Callable[..., Any]:
+        """The function; its module is imported now."""
+        module, _, name = self.function.partition(":")
+        found = getattr(importlib.import_module(f"mover.io.{module}"), name)
+        return partial(found, **self.options) if self.options else found
+
+
+FORMATS = (
+    Format("capture", "folder", "a capture folder", "capture.folder:read_capture"),
+    Format("capture", "total3d", "a folder of Total3D or Im3D", "scenes.total3d:read_total3d"),
+    Format("scene", "folder", "another capture, or a part of one", "capture.folder:folder_parts"),
+    Format(
+        "scene", "total3d", "a folder of Total3D or Implicit3D (input/ and output/, or one)",
+        "scenes.total3d:total3d_parts",
+    ),
+    Format(
+        "scene", "sam3d", "a folder of SAM 3D Objects: meshes and their poses",
+        "scenes.sam3d:sam3d_parts",
+    ),
+    Format(
+        "scene", "gen3dsr", "a folder of Gen3DSR: reconstruction/ and cam_params.json",
+        "scenes.gen3dsr:gen3dsr_parts",
+    ),
+    Format("scene", "glb", "a glTF scene: each node an object", "scenes.glb_scene:glb_parts"),
+    Format(
+        "scene", "boxes", "3D boxes (JSON); meshes come from the furniture library",
+        "scenes.box_scene:box_parts",
+    ),
+    Format(
+        "scene", "release", "a sequence of the MOVER authors' release",
+        "scenes.release:release_parts",
+    ),
+    Format(
+        "dataset", "prox", "PROX, qualitative or quantitative: one --recording",
+        "datasets.prox:prox_parts",
+    ),
+    Format("dataset", "pigraphs", "PiGraphs: one --recording", "datasets.pigraphs:pigraphs_parts"),
+    Format(
+        "masks", "masks", "masks alone: COCO, detectron2, SA-V, SAM 3, PNG, npz",
+        "masks.instance_files:mask_parts",
+    ),
+    Format("people", "4dhumans", "results/demo_*.pkl of 4DHumans", "people.phalp:read_phalp"),
+    Format("people", "gem", "smpl_params.pt of GEM", "people.gvhmr:read_gvhmr"),
+    Format("people", "gvhmr", "hmr4d_results.pt of GVHMR", "people.gvhmr:read_gvhmr"),
+    Format("people", "mover", "001_all.pkl of MOVER's authors", "people.smplify:read_mover"),
+    Format("people", "multihmr", "a folder of Multi-HMR", "people.multihmr:read_multihmr"),
+    Format("people", "pare", "pare_output.pkl of PARE", "people.pare:read_pare"),
+    Format("people", "phalp", "results/demo_*.pkl of PHALP", "people.phalp:read_phalp"),
+    Format("people", "prompthmr", "results.pkl of PromptHMR", "people.prompthmr:read_prompthmr"),
+    Format("people", "prox", "results/ of PROX's fits", "people.smplify:read_prox"),
+    Format("people", "sam3dbody", "a folder of SAM 3D Body", "people.sam3d:read_sam3d"),
+    Format("people", "slahmr", "*_world_results.npz of SLAHMR", "people.slahmr:read_slahmr"),
+    Format("people", "smplifyx", "results/ of SMPLify-X", "people.smplify:read_smplifyx"),
+    Format("people", "tram", "a folder of TRAM", "people.tram:read_tram"),
+    Format("people", "wham", "wham_output.pkl of WHAM", "people.wham:read_wham"),
+    Format(
+        "keypoints", "coco17", "COCO's 17 joints: JSON or npz", "people.joint_lists:read_instances",
+        {"layout": "coco17"},
+    ),
+    Format(
+        "keypoints", "halpe26", "Halpe's 26 joints: JSON or npz",
+        "people.joint_lists:read_instances", {"layout": "halpe26"},
+    ),
+    Format("keypoints", "openpose", "a folder of OpenPose", "people.openpose:read_openpose"),
+    Format(
+        "keypoints", "wholebody", "COCO-WholeBody's 133 joints: JSON or npz",
+        "people.joint_lists:read_instances", {"layout": "wholebody133"},
+    ),
+    Format("export", "glb", "the room with moving people, one file", "export.glb:export_glb"),
+    Format("export", "usd", "the same as binary USD", "export.usd:export_usd"),
+    Format("export", "mjcf", "a world of MuJoCo", "export.mjcf:export_mjcf"),
+    Format("export", "urdf", "each object and the whole room", "export.urdf:export_urdf"),
+    Format("export", "ply", "each object by itself", "export.scene_glb:export_objects"),
+    Format("export", "bodies", "people as AMASS has them", "export.amass:export_bodies"),
+)  # fmt: skip
+"""Names are unique within `capture`, `people`, `keypoints`, `export`, and within `IMPORTED`."""
+
+
+def names(*kinds: Kind) -> list[str]:
+    """Names of the formats of some kinds."""
+    return [row.name for row in FORMATS if row.kind in kinds]
+
+
+def listing(*kinds: Kind) -> str:
+    """`  name: what it is`, one a line, for the help."""
+    return "\n".join(f"  {row.name}: {row.what}" for row in FORMATS if row.kind in kinds)
+
+
+def chosen(asked: str, name: str, *kinds: Kind) -> Callable[..., Any]:
+    """The function of a format.
+
+    Args:
+        asked: How a message calls the option, as `--format`.
+        name: What was given.
+        kinds: Among which it is looked for.
+
+    Raises:
+        InputError: If there is no such format.
+    """
+    row = next((row for row in FORMATS if row.name == name and row.kind in kinds), None)
+    if row is None:
+        raise InputError(f"{asked}: {name!r} is none of {', '.join(names(*kinds))}")
+    return row.load()
+
+
+def read(format: str, path: Path) -> "Capture":
+    """Read a whole capture.
+
+    Args:
+        format: A name of the kind `capture`.
+        path: The file or folder.
+
+    Raises:
+        ValueError: If there is no such format.
+        InputError: If the data is wrong.
+    """
+    known = names("capture")
+    if format not in known:
+        raise ValueError(f"format is {format!r}, choose one of {', '.join(sorted(known))}")
+    return chosen("format", format, "capture")(Path(path))

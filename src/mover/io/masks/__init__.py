@@ -1,0 +1,1 @@
+"""Instance masks and boxes that other tools wrote."""

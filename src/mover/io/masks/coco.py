@@ -1,0 +1,159 @@
+"""What every COCO file has: images, categories, masks as polygons or run-length codes."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mover.core.errors import InputError
+from mover.core.types import Camera, Masks
+from mover.geometry.rle import run_lengths
+from mover.io.files.fields import (
+    LAST_ID,
+    At,
+    Warn,
+    get,
+    integer,
+    items,
+    maybe,
+    refuse,
+    text,
+    unique,
+)
+
+CORNERS = 3  # a polygon has at least so many
+
+
+def from_coco(segmentation: Any, height: int, width: int, where: str) -> bytes:  # noqa: ANN401
+    """The compressed run-length code of COCO's polygons or of either of its run-length codes.
+
+    Args:
+        segmentation: The value of an annotation's field.
+        height: Of the image [px].
+        width: Of the image [px].
+        where: File and field, for messages.
+
+    Raises:
+        InputError: If it is malformed or does not fit the image. It may be empty.
+    """
+    if isinstance(segmentation, list | tuple):
+        return _from_polygons(segmentation, height, width, where)
+    if not isinstance(segmentation, dict):
+        kinds = "polygons [[x, y, ...], ...] or a run-length code {size, counts}"
+        raise InputError(f"{where} has {type(segmentation).__name__}, expected {kinds}")
+    size, counts = segmentation.get("size"), segmentation.get("counts")
+    if not isinstance(size, list | tuple) or tuple(size) != (height, width):
+        at_most = str(size)[:40]
+        raise InputError(f"{where} has size {at_most}, expected [{height}, {width}] (h, w)")
+    runs = _runs(counts, where)
+    if (runs < 0).any() or runs.sum() != height * width:
+        found = f"runs that sum to {runs.sum()}" if (runs >= 0).all() else "a negative run"
+        raise InputError(
+            f"{where} has counts with {found}, expected runs that sum to {height} x {width}"
+        )
+    return counts if isinstance(counts, bytes) else _compressed(runs, height, width)
+
+
+def _runs(counts: Any, where: str) -> NDArray[np.int64]:  # noqa: ANN401
+    """The runs of a code of either kind."""
+    if isinstance(counts, list | tuple):
+        if not all(type(n) is int and abs(n) < 1 << 40 for n in counts):
+            raise InputError(f"{where} has a list of counts, expected whole numbers in it")
+        return np.array(counts, dtype=np.int64)
+    if not isinstance(counts, str | bytes):
+        kinds = "a list of runs or a compressed code"
+        raise InputError(f"{where} has {type(counts).__name__} as counts, expected {kinds}")
+    try:
+        return run_lengths(counts if isinstance(counts, bytes) else counts.encode("ascii"))
+    except ValueError as error:
+        raise InputError(
+            f"{where} has counts with {error}, expected COCO's compressed code"
+        ) from error
+
+
+def _compressed(runs: NDArray[np.int64], height: int, width: int) -> bytes:
+    """The compressed code of runs."""
+    from pycocotools import mask as coco
+
+    code: Any = {"size": [height, width], "counts": [int(n) for n in runs]}
+    return coco.frPyObjects(code, height, width)["counts"]  # pyright: ignore
+
+
+def _from_polygons(polygons: Sequence[Any], height: int, width: int, where: str) -> bytes:
+    """The union of polygons, clipped to the image."""
+    from pycocotools import mask as coco
+
+    if not polygons:
+        raise InputError(f"{where} has no polygon, expected [[x, y, ...], ...]")
+    for i, polygon in enumerate(polygons):
+        _check_polygon(polygon, height, width, f"{where} has polygon {i} with")
+    outlines: Any = [[float(v) for v in polygon] for polygon in polygons]
+    codes: Any = coco.frPyObjects(outlines, height, width)
+    return coco.merge(codes)["counts"]  # pyright: ignore
+
+
+def _check_polygon(polygon: Any, height: int, width: int, where: str) -> None:  # noqa: ANN401
+    """Refuse what the rasteriser would crash on or draw as nonsense."""
+    real = isinstance(polygon, list | tuple) and all(type(v) in (int, float) for v in polygon)
+    if not real or len(polygon) < 2 * CORNERS or len(polygon) % 2:
+        found = f"{len(polygon)} items" if isinstance(polygon, list | tuple) else str(polygon)[:40]
+        raise InputError(f"{where} {found}, expected numbers x, y of {CORNERS} corners or more")
+    reach = 2 * max(height, width)
+    if not all(-reach <= v <= reach for v in polygon):
+        raise InputError(f"{where} a corner far outside, expected pixels of the image")
+
+
+def leaves_image(segmentation: Any, height: int, width: int) -> bool:  # noqa: ANN401
+    """Whether polygons reach more than a pixel beyond the image and are clipped."""
+    if not isinstance(segmentation, list):
+        return False
+    xs = [v for polygon in segmentation for v in polygon[0::2]]
+    ys = [v for polygon in segmentation for v in polygon[1::2]]
+    return min(xs) < -1 or max(xs) > width + 1 or min(ys) < -1 or max(ys) > height + 1
+
+
+def check_image(at: At, camera: Camera) -> int:
+    """The id of an image, whose size must be the camera's."""
+    for key, size in (("width", camera.width), ("height", camera.height)):
+        given = maybe(at, key)
+        if given is not None and integer(given) != size:
+            refuse(given, f"{size}, as the camera has")
+    return integer(get(at, "id"))
+
+
+def categories_of(at: At) -> dict[int, str]:
+    """Names by id."""
+    names: dict[int, str] = {}
+    seen: set[object] = set()
+    for item in items(at):
+        key = integer(get(item, "id"), 0, LAST_ID)
+        unique(get(item, "id"), seen, key, "an id")
+        names[key] = text(get(item, "name"))
+    return names
+
+
+def category_of(at: At, names: dict[int, str]) -> str:
+    """The name of a category."""
+    key = integer(at, 0, LAST_ID)
+    if key not in names:
+        refuse(at, "the id of one of the categories")
+    return names[key]
+
+
+def mask_of(at: At, camera: Camera, warn: Warn) -> Masks | None:
+    """The mask of an annotation, None without segmentation."""
+    given = maybe(at, "segmentation")
+    if given is None:
+        return None
+    size = camera.height, camera.width
+    code = from_coco(given.value, *size, given.place)
+    if leaves_image(given.value, *size):
+        warn(f"{given.place} leaves the image and was clipped")
+    return Masks(*size, (code,))
+
+
+def segmentation(masks: Masks, index: int) -> dict[str, Any]:
+    """The JSON object of a mask."""
+    counts = masks.counts[index].decode("ascii")
+    return {"size": [masks.height, masks.width], "counts": counts}

@@ -1,0 +1,208 @@
+"""Instances in images: what mask tools find, on the way to objects.json and people.json."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mover.core.errors import InputError
+from mover.core.types import Masks
+from mover.geometry.rle import area, decode, encode, tight_box
+from mover.io.files.fields import At, read_json, refuse
+from mover.io.masks.coco import from_coco
+
+PERSON = frozenset({"person", "people", "human", "man", "woman", "child"})
+LARGEST_SIDE = 32768  # [px]
+SAME_SHAPE = 0.02  # masks of another size fit an image whose sides have this ratio, nearly
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One thing in one image."""
+
+    category: str
+    box: tuple[float, ...] | None
+    """x_min, y_min, x_max, y_max [px]; None: that of the mask."""
+    mask: bytes | None
+    """COCO's compressed counts."""
+    score: float = 1.0
+    frame: int = 0
+    track: int | None = None
+
+
+@dataclass(frozen=True)
+class Instances:
+    """All things that a source found."""
+
+    items: tuple[Instance, ...]
+    size: tuple[int, int] | None
+    """Width and height of the images [px]; None: the source does not tell."""
+    file: str
+
+
+def mask_code(at: At) -> dict[str, Any]:
+    """The run-length code of rows of booleans, as MOVER's detections.json holds them.
+
+    Raises:
+        InputError: If they are no image of booleans.
+    """
+    try:
+        pixels = np.asarray(at.value)
+    except ValueError:
+        return refuse(at, "rows of booleans of one length")
+    if pixels.ndim != 2 or pixels.dtype.kind not in "bui" or not pixels.size:
+        refuse(at, "rows of booleans of one length")
+    return {"size": list(pixels.shape), "counts": encode(torch.from_numpy(pixels != 0)).decode()}
+
+
+def code_of(pixels: NDArray[Any]) -> bytes | None:
+    """The run-length code of an image of booleans; None where it is empty."""
+    return encode(torch.from_numpy(np.ascontiguousarray(pixels))) if pixels.any() else None
+
+
+def checked_code(segmentation: Any, size: tuple[int, int], at: At) -> bytes | None:  # noqa: ANN401
+    """The code of COCO's polygons or run lengths; None where it is empty."""
+    width, height = size
+    code = from_coco(segmentation, height, width, at.place)
+    return code if area(Masks(height, width, (code,)), 0) else None
+
+
+def box_of_code(code: bytes, size: tuple[int, int]) -> tuple[float, ...]:
+    """The box of a mask that is not empty [px]."""
+    mask = decode(Masks(size[1], size[0], (code,)), 0)
+    return tuple(float(v) for v in tight_box(mask))
+
+
+def fitted(found: Instances, size: tuple[int, int] | None) -> Instances:
+    """The instances in an image of this size, resampled where theirs has the same shape.
+
+    Raises:
+        InputError: If the shapes of the images differ.
+    """
+    if size is None or found.size is None or found.size == size:
+        return found if found.size is not None else dataclasses.replace(found, size=size)
+    (w, h), (width, height) = found.size, size
+    if abs(w * height / (h * width) - 1) > SAME_SHAPE:
+        at = f"{found.file}: masks of {w} x {h} pixels"
+        raise InputError(f"{at}, expected those of an image of {width} x {height}")
+    items = tuple(_resized(item, found.size, size) for item in found.items)
+    return Instances(items, size, found.file)
+
+
+def _resized(item: Instance, old: tuple[int, int], new: tuple[int, int]) -> Instance:
+    """An instance in an image of another size."""
+    factor = new[0] / old[0], new[1] / old[1]
+    box, mask = item.box, item.mask
+    if box is not None:
+        box = tuple(v * factor[i % 2] for i, v in enumerate(box))
+    if mask is not None:
+        pixels = decode(Masks(old[1], old[0], (mask,)), 0).numpy()
+        rows = ((np.arange(new[1]) + 0.5) / factor[1]).astype(np.int64)
+        columns = ((np.arange(new[0]) + 0.5) / factor[0]).astype(np.int64)
+        mask = code_of(pixels[rows.clip(0, old[1] - 1)][:, columns.clip(0, old[0] - 1)])
+    return dataclasses.replace(item, box=box, mask=mask)
+
+
+def is_person(item: Instance) -> bool:
+    """Whether an instance is somebody."""
+    return item.category.lower() in PERSON
+
+
+def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
+    """The fields of objects.json; ids are the places in `items`.
+
+    Raises:
+        InputError: If the size of the image is not known.
+    """
+    if found.size is None:
+        raise InputError(f"{found.file}: has no size of the image, expected --image beside it")
+    names = list(dict.fromkeys(item.category for item in items))
+    rows: list[dict[str, Any]] = []
+    for i, item in enumerate(items):
+        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": names.index(item.category)}
+        box = item.box
+        if item.mask is not None:
+            row["segmentation"] = _segmentation(item.mask, found.size)
+            box = box_of_code(item.mask, found.size)
+        if box is None or box[2] <= box[0] or box[3] <= box[1]:
+            continue  # empty: there is nothing of it in the image
+        x, y, right, bottom = box
+        rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": item.score})
+    width, height = found.size
+    tree = {
+        "images": [{"id": 0, "width": width, "height": height}],
+        "categories": [{"id": i, "name": name} for i, name in enumerate(names)],
+        "annotations": rows,
+    }
+    return At(tree, found.file)
+
+
+def people_tree(found: Instances, fps: float | None = None) -> At:
+    """The fields of people.json: everything in `found` is somebody.
+
+    Raises:
+        InputError: If the size of the images is not known.
+    """
+    if found.size is None:
+        raise InputError(f"{found.file}: has no size of the images, expected --image beside it")
+    rows: list[dict[str, Any]] = []
+    for item in followed(found.items):
+        row = {"id": len(rows), "image_id": item.frame, "track_id": item.track, "category_id": 1}
+        if item.mask is not None:
+            rows.append({**row, "segmentation": _segmentation(item.mask, found.size)})
+    frames = sorted({item.frame for item in found.items})
+    tree = {
+        "info": {} if fps is None else {"fps": fps},
+        "images": [{"id": f, "width": found.size[0], "height": found.size[1]} for f in frames],
+        "categories": [{"id": 1, "name": "person"}],
+        "annotations": rows,
+    }
+    return At(tree, found.file)
+
+
+def followed(items: Sequence[Instance]) -> list[Instance]:
+    """Instances with a track each: those without one are numbered by size in their frame."""
+    frames: dict[int, list[Instance]] = {}
+    for item in items:
+        frames.setdefault(item.frame, []).append(item)
+    found: list[Instance] = []
+    for frame in sorted(frames):
+        used = {item.track for item in frames[frame]}
+        free = (n for n in range(len(frames[frame]) + len(used)) if n not in used)
+        seen: set[int | None] = set()
+        for item in sorted(frames[frame], key=lambda i: -i.score):
+            if item.track is None:
+                item = dataclasses.replace(item, track=next(free))
+            if item.track not in seen:
+                found.append(item)
+            seen.add(item.track)
+    return found
+
+
+def _segmentation(code: bytes, size: tuple[int, int]) -> dict[str, Any]:
+    return {"size": [size[1], size[0]], "counts": code.decode("ascii")}
+
+
+def with_reference_people(people: At | None, found: Instances, folder: Path) -> At:
+    """people.json with these masks as the people of the reference image.
+
+    Args:
+        people: The fields that are to be written; None: those of the folder, or none.
+        found: Their masks.
+        folder: The capture.
+    """
+    if people is None and (folder / "people.json").exists():
+        people = read_json(folder / "people.json")
+    empty = {"images": [], "annotations": [], "categories": [{"id": 1, "name": "person"}]}
+    tree: dict[str, Any] = dict(empty if people is None else people.value)
+    tree["reference_people"] = [
+        {"segmentation": _segmentation(item.mask, found.size or (0, 0))}
+        for item in found.items
+        if item.mask is not None
+    ]
+    return At(tree, found.file)

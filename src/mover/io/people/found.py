@@ -1,0 +1,177 @@
+"""What the user knows, and what a tool found: rows of bodies before anything is settled."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mover.bodies import BodyModel, load_model
+from mover.core.errors import InputError
+from mover.core.records import record
+from mover.core.types import BodyPose, Camera
+from mover.geometry.rotations import axis_angle
+from mover.io.files.fields import At
+from mover.io.people.values import Numbers, tensor, vectors
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the user knows beyond the files of a tool."""
+
+    camera: Camera | None = None
+    """The true lens: bodies are moved so that they keep their pixels under it."""
+    focal: float | None = None
+    """The focal length that the tool assumed, where its files do not tell [px]."""
+    faces: Path | None = None
+    """A mesh file with the triangles of the bodies, where their model is not at hand."""
+    fps: float | None = None
+    """Frames a second."""
+    gender: str | None = None
+    """neutral, female or male; None: what the files say, else neutral."""
+    first: int = 0
+    """The number in the name of the first frame's file."""
+
+
+ROOT = 3  # angles of the root
+
+
+@record
+class Found:
+    """People in the camera axes of each frame; a row may hold NaN where the tool failed."""
+
+    model: str
+    """Whose vertices: smpl, smplh, smplx or mhr."""
+    frame: Int[Tensor, " bodies"]
+    person: Int[Tensor, " bodies"]
+    pose: BodyPose | None
+    verts: Float[Tensor, "bodies verts 3"] | None = None
+    """[m]."""
+    joints: Float[Tensor, "bodies joints 3"] | None = None
+    """As the model places them [m]."""
+    pelvis: Float[Tensor, "bodies 3"] | None = None
+    """Place of the pelvis where the tool tells it instead of `pose.transl` [m]."""
+    K: Float[Tensor, "bodies 3 3"] | None = None
+    """The lens that the tool assumed [px]."""
+    up: Float[Tensor, "bodies 3"] | None = None
+    """Away from the ground, where the tool knows gravity."""
+    fps: float | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def pose_of(
+    model: str, gender: str | None, whole: Numbers, betas: Numbers, transl: Numbers | None
+) -> BodyPose:
+    """Parameters of rows: angles of root and body, shape, and place (None: not told)."""
+    angles, shape = tensor(whole), tensor(betas)
+    place = torch.full((len(angles), 3), torch.nan) if transl is None else tensor(transl)
+    root, body = angles[:, :ROOT], angles[:, ROOT:]
+    return BodyPose(model, gender or "neutral", shape, root, body, place, {})
+
+
+def joined(parts: Sequence[Found]) -> Found:
+    """Rows of several people or frames together; all are of one tool.
+
+    Raises:
+        InputError: If their meshes have different numbers of vertices.
+    """
+    first = parts[0]
+    sizes = sorted({part.verts.shape[1] for part in parts if part.verts is not None})
+    if len(sizes) > 1:
+        found = f"meshes of {' and of '.join(map(str, sizes))} vertices"
+        raise InputError(f"the files hold {found}, expected one topology")
+    if len(parts) == 1:
+        return first
+    values = {name: [getattr(part, name) for part in parts] for name in _TENSORS}
+    whole = {
+        name: None if any(v is None for v in each) else torch.cat(each)
+        for name, each in values.items()
+    }
+    poses = [part.pose for part in parts if part.pose is not None]
+    pose = _joined_poses(poses) if len(poses) == len(parts) else None
+    warnings = tuple(dict.fromkeys(w for part in parts for w in part.warnings))
+    return dataclasses.replace(first, **whole, pose=pose, warnings=warnings)
+
+
+def _joined_poses(poses: Sequence[BodyPose]) -> BodyPose:
+    """Parameters of several; shapes are filled up with zeros."""
+    width = max(pose.betas.shape[1] for pose in poses)
+    betas = [torch.nn.functional.pad(p.betas, (0, width - p.betas.shape[1])) for p in poses]
+    names = set.intersection(*(set(pose.extra) for pose in poses))
+    names = {n for n in names if len({p.extra[n].shape[1] for p in poses}) == 1}
+    return dataclasses.replace(
+        poses[0],
+        betas=torch.cat(betas),
+        **{name: torch.cat([getattr(p, name) for p in poses]) for name in _POSE},
+        extra={name: torch.cat([p.extra[name] for p in poses]) for name in sorted(names)},
+    )
+
+
+def chosen(found: Found, index: Int[Tensor, " rows"]) -> Found:
+    """Some rows."""
+    values = {name: getattr(found, name) for name in _TENSORS}
+    picked = {name: None if v is None else v[index] for name, v in values.items()}
+    pose = None if found.pose is None else chosen_pose(found.pose, index)
+    return dataclasses.replace(found, **picked, pose=pose)
+
+
+def chosen_pose(pose: BodyPose, index: Int[Tensor, " rows"]) -> BodyPose:
+    """Some rows of parameters."""
+    extra = {name: value[index] for name, value in pose.extra.items()}
+    values = {name: getattr(pose, name)[index] for name in ("betas", *_POSE)}
+    return dataclasses.replace(pose, **values, extra=extra)
+
+
+_TENSORS = ("frame", "person", "verts", "joints", "pelvis", "K", "up")
+_POSE = ("global_orient", "body_pose", "transl")
+
+
+# Parameters of bodies: posed, and moved as rigid bodies, whose root turns about the pelvis.
+
+
+NO_TURN = 1e-6
+CHUNK = 128  # rows posed at once
+
+
+def run_model(
+    model: BodyModel, pose: BodyPose
+) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+    """Vertices and joints, some rows at a time to bound the memory [m]."""
+    with torch.no_grad():
+        parts = [
+            model.posed(chosen_pose(pose, index))
+            for index in torch.arange(len(pose.transl)).split(CHUNK)
+        ]
+    return torch.cat([verts for verts, _ in parts]), torch.cat([joints for _, joints in parts])
+
+
+def rest_pelvis(model: BodyModel, pose: BodyPose) -> Float[Tensor, "bodies 3"]:
+    """From `transl` to the pelvis, about which the root turns [m]."""
+    straight = dataclasses.replace(
+        pose,
+        transl=torch.zeros_like(pose.transl),
+        global_orient=torch.zeros_like(pose.global_orient),
+    )
+    return run_model(model, straight)[1][:, 0]
+
+
+def moved(pose: BodyPose, R: Float[Tensor, "bodies 3 3"], t: Float[Tensor, "bodies 3"]) -> BodyPose:
+    """The parameters of the bodies x' = R x + t.
+
+    Raises:
+        InputError: If the body turns and its model, which knows the pelvis, is not at hand.
+    """
+    if (R - torch.eye(3).to(R)).abs().nan_to_num(0).amax() < NO_TURN:
+        return dataclasses.replace(pose, transl=pose.transl + t)
+    offset = rest_pelvis(load_model(pose.model, pose.gender), pose)
+    place = (R @ (offset + pose.transl)[..., None])[..., 0] + t - offset
+    return dataclasses.replace(pose, transl=place, global_orient=turned(pose.global_orient, R))
+
+
+def turned(root: Float[Tensor, "bodies 3"], R: Float[Tensor, "bodies 3 3"]) -> Tensor:
+    """Axis-angle vectors of roots that are turned by R; NaN stays NaN [rad]."""
+    whole = (R.double() @ axis_angle(root.double())).numpy()
+    return torch.from_numpy(vectors(whole, At(whole, "the camera"))).to(root)

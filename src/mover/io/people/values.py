@@ -1,0 +1,268 @@
+"""What a tool left on disk, as plain values: arrays, numbers, text, lists and mappings."""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mover.core.errors import InputError
+from mover.core.pickles import load_plain
+from mover.core.records import BROKEN
+from mover.io.files.fields import (
+    LARGEST,
+    LARGEST_FILE,
+    LAST_INDEX,
+    At,
+    get,
+    mapping,
+    read_json,
+    reason,
+    refuse,
+)
+from mover.io.files.npz import read_npz
+
+KINDS = (".npz", ".npy", ".pkl", ".pickle", ".joblib", ".pt", ".pth", ".json")
+
+
+def read_any(path: Path) -> At:
+    """The content of a file, read without running anything in it.
+
+    Raises:
+        InputError: If it is missing, too large, of another kind, broken, or holds objects.
+    """
+    if not path.is_file():
+        raise InputError(f"{path.name}: there is no such file in {path.parent}")
+    if path.stat().st_size > LARGEST_FILE:
+        size = path.stat().st_size
+        raise InputError(f"{path.name}: has {size} bytes, expected at most {LARGEST_FILE}")
+    match path.suffix.lower():
+        case ".npz":
+            return read_npz(path)
+        case ".json":
+            return read_json(path)
+        case ".npy":
+            value = _read_npy(path)
+        case ".pkl" | ".pickle" | ".joblib" | ".pt" | ".pth":
+            value = load_plain(path)
+        case _:
+            raise InputError(f"{path.name}: is no file of kind {', '.join(KINDS)}")
+    return At(value, path.name)
+
+
+def _read_npy(path: Path) -> object:
+    """An array of plain numbers, or the pickled object in its place."""
+    try:
+        return np.load(path, allow_pickle=False)
+    except ValueError:
+        return load_plain(path)
+    except BROKEN as error:
+        raise InputError(f"{path.name}: cannot be read ({reason(error)})") from error
+
+
+def files_of(path: Path, pattern: str, what: str) -> list[Path]:
+    """The file itself, or the files of a folder, 2 before 10.
+
+    Raises:
+        InputError: If the folder has none.
+    """
+    files = sorted(path.glob(pattern), key=natural) if path.is_dir() else [path]
+    if not files:
+        raise InputError(f"{path}: has no {pattern.removeprefix('**/')}, expected {what}")
+    return files
+
+
+def number_in(name: str, index: int) -> int:
+    """The last number in a file's name, else its place among the files."""
+    found = re.findall(r"\d+", name)
+    return int(found[-1]) if found else index
+
+
+def natural(path: Path) -> tuple[tuple[int, str], ...]:
+    """A key that sorts names as people do: 2 before 10."""
+    parts = re.split(r"(\d+)", str(path))
+    return tuple((int(p), "") if p.isdigit() else (-1, p) for p in parts)
+
+
+# Values from the files of other tools: found under any of their names, NaN let through.
+
+
+Numbers = NDArray[Any] | Tensor
+SHOWN_KEYS = 24
+LEAST_TURN = 0.05  # an array of matrices whose rows are not unit vectors within this is none
+
+
+def need(at: At, *names: str) -> At:
+    """The first of several names of a field that is there.
+
+    Raises:
+        InputError: If there is none; the message tells the keys that were found.
+    """
+    found = either(at, *names)
+    if found is None:
+        place = f"{at.place}: " if at.field else f"{at.file}: "
+        wanted = " or ".join(f"'{name}'" for name in names)
+        raise InputError(f"{place}there is no key {wanted}, found {keys_of(at)}")
+    return found
+
+
+def either(at: At, *names: str) -> At | None:
+    """The first of several names of a field that is there and not null, None without."""
+    given = mapping(at)
+    for name in names:
+        if name in given and given[name] is not None:
+            return get(at, name)
+    return None
+
+
+def keys_of(at: At) -> str:
+    """The keys of a mapping for a message."""
+    keys = [str(key) for key in mapping(at)]
+    more = f" and {len(keys) - SHOWN_KEYS} more" if len(keys) > SHOWN_KEYS else ""
+    return (", ".join(f"'{key}'" for key in keys[:SHOWN_KEYS]) or "none") + more
+
+
+def numbers(at: At) -> NDArray[np.float64]:
+    """An array of real numbers of any shape; NaN and infinity are let through.
+
+    Raises:
+        InputError: If it is no array of numbers.
+    """
+    try:
+        value = np.asarray(at.value)
+    except ValueError:  # lists of different lengths
+        refuse(at, "an array of numbers", "lists of different lengths")
+    if value.dtype.kind not in "fiub":
+        refuse(at, "an array of numbers")
+    return value.astype(np.float64)
+
+
+def rows(at: At, count: int | None, *widths: int) -> NDArray[np.float64]:
+    """An array with `count` rows (any number: None), flattened to one of the widths.
+
+    One row may stand for all.
+
+    Raises:
+        InputError: If it has another shape.
+    """
+    value = numbers(at)
+    if value.ndim > 2 and len(value) == 1 and count not in (None, 1):
+        value = value[0]  # a batch of one
+    if value.size in widths and (count == 1 or value.ndim == 1):
+        value = value.reshape(1, -1)
+    flat = value.reshape(len(value), -1) if value.size and value.ndim else np.zeros((0, 0))
+    fits = flat.shape[1] in widths and (count is None or len(flat) in (count, 1))
+    if not fits:
+        shape = f"({'n' if count is None else count}, {' or '.join(map(str, widths))})"
+        refuse(at, f"numbers that give {shape}", f"shape {numbers(at).shape}")
+    return flat if count is None else np.broadcast_to(flat, (count, flat.shape[1]))
+
+
+def wide(at: At, count: int) -> NDArray[np.float64]:
+    """Rows of whatever width, at least one number each.
+
+    Raises:
+        InputError: If they are not `count` rows, or one for all.
+    """
+    value = numbers(at)
+    if not value.ndim or not value.size:
+        refuse(at, f"{count} rows of numbers", f"shape {value.shape}")
+    flat = value[None] if value.ndim == 1 else value.reshape(len(value), -1)
+    return rows(At(flat, at.file, at.field), count, flat.shape[1])
+
+
+def stacked(at: At, *tail: int) -> NDArray[np.float64]:
+    """An array of any number of items of this shape.
+
+    Raises:
+        InputError: If its numbers do not give whole items, or none.
+    """
+    value = numbers(at)
+    if not value.size or value.size % math.prod(tail):
+        shape = ", ".join(map(str, ("n", *tail)))
+        refuse(at, f"numbers that give ({shape})", f"shape {value.shape}")
+    return value.reshape(-1, *tail)
+
+
+def one_number(at: At) -> float:
+    """The first number of an array, finite."""
+    value = float(stacked(at, 1)[0, 0])
+    if not abs(value) <= LARGEST:
+        refuse(at, "a finite number", f"{value}")
+    return value
+
+
+def whole(at: At, count: int | None = None) -> NDArray[np.int64]:
+    """Whole numbers along one axis.
+
+    Raises:
+        InputError: If they are not, or there are others than `count`.
+    """
+    value = numbers(at).reshape(-1)
+    if not (np.abs(value) <= LAST_INDEX).all() or (value != np.round(value)).any():
+        refuse(at, f"whole numbers up to {LAST_INDEX}")
+    if count is not None and len(value) != count:
+        refuse(at, f"{count} whole numbers", f"{len(value)}")
+    return value.astype(np.int64)
+
+
+def angles(at: At, count: int | None, *joints: int) -> NDArray[np.float64]:
+    """Axis-angle vectors of so many joints, given as such or as rotation matrices.
+
+    Returns:
+        (count, joints * 3) [rad].
+
+    Raises:
+        InputError: If it is neither.
+    """
+    flat = rows(at, count, *[j * 3 for j in joints], *[j * 9 for j in joints])
+    if flat.shape[1] in [j * 3 for j in joints]:
+        return flat
+    return vectors(flat.reshape(len(flat), -1, 3, 3), at)
+
+
+def vectors(matrices: NDArray[np.float64], at: At) -> NDArray[np.float64]:
+    """Axis-angle vectors of rotation matrices; NaN stays NaN.
+
+    Raises:
+        InputError: If the matrices are no rotations.
+    """
+    from scipy.spatial.transform import Rotation
+
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(matrices).all((-1, -2)))
+    safe = np.where(known[..., None, None], matrices, np.eye(3))
+    off = np.abs(safe @ np.swapaxes(safe, -1, -2) - np.eye(3)).max(initial=0.0)
+    if off > LEAST_TURN or (np.linalg.det(safe) < 0).any():
+        refuse(at, "rotation matrices (orthonormal, determinant +1)", "matrices that are none")
+    found = Rotation.from_matrix(safe.reshape(-1, 3, 3)).as_rotvec().reshape(*known.shape, 3)
+    return np.where(known[..., None], found, np.nan).reshape(len(matrices), -1)
+
+
+def tensor(value: Numbers) -> Float[Tensor, "*shape"]:
+    """Numbers as the package keeps them."""
+    if isinstance(value, Tensor):
+        return value
+    return torch.from_numpy(np.ascontiguousarray(value, dtype=np.float32))
+
+
+def frames_of(at: At, count: int | None, *names: str) -> Int[Tensor, " rows"]:
+    """The frames of the rows, under the first of several names that is there.
+
+    Raises:
+        InputError: If there is none, or there are others than `count`.
+    """
+    return torch.from_numpy(whole(need(at, *names), count))
+
+
+def meshes(at: At | None, verts: int, count: int) -> Float[Tensor, "rows verts 3"] | None:
+    """Vertices of `count` bodies, None where they are not told.
+
+    Raises:
+        InputError: If they are not so many.
+    """
+    return None if at is None else tensor(rows(at, count, verts * 3).reshape(count, -1, 3))

@@ -1,0 +1,1 @@
+"""Scenes that other tools wrote."""

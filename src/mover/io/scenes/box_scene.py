@@ -1,0 +1,162 @@
+"""Boxes only (JSON): each gets the piece of the furniture library that is most like it.
+
+Schema: docs/data.md, "Boxes". A box is what a 3D detector or a person with a ruler gives: class,
+centre, full size, and yaw or a rotation.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from mover.core.types import Mesh
+from mover.furniture.library import choose_piece
+from mover.io.capture.parts import Hints, Parts
+from mover.io.capture.scene_file import scene_tree
+from mover.io.files.cameras import camera_of_tree
+from mover.io.files.fields import At, get, integer, items, maybe, read_json, refuse
+from mover.io.files.images import image_size
+from mover.io.files.schema import (
+    Box,
+    Id,
+    Number,
+    Rows,
+    Share,
+    Sizes,
+    Text,
+    Vector,
+    checked,
+    rotation,
+)
+from mover.io.masks.instances import Instance, Instances, objects_tree
+from mover.io.scenes.glb_scene import up_axes
+from mover.io.scenes.placing import LEVEL, Matrix, about_y, free_id, load_from
+
+
+class BoxFields(Struct, frozen=True):
+    """One box."""
+
+    category: Text
+    size: Sizes
+    center: Vector
+    yaw: Annotated[float, Meta(ge=-10, le=10)] | None = None
+    rotation: Rows | None = None
+    id: Any = None
+    box2d: Box | None = None
+    score: Share | None = None
+    support: Text | None = None
+
+
+class BoxesFields(Struct, frozen=True):
+    """The whole file."""
+
+    objects: list[BoxFields]
+    camera: Any = None
+    frame: Literal["world", "camera"] | None = None
+    up: Literal["y", "-y", "z"] | None = None
+    ground: Number | None = None
+
+
+def box_parts(path: Path, hints: Hints) -> Parts:
+    """Furniture in boxes.
+
+    Raises:
+        InputError: If a field is wrong.
+    """
+    at = read_json(path)
+    tree = checked(at, BoxesFields)
+    camera = hints.camera
+    if camera is None and tree.camera is not None:
+        size = None if hints.image is None else image_size(hints.image)
+        camera = camera_of_tree(At(tree.camera, at.file, "camera"), size)
+    turn = _world(tree, camera, hints.up)
+    rows: list[dict[str, Any]] = []
+    meshes: dict[str, tuple[Mesh, str]] = {}
+    for item, box in zip(items(get(at, "objects")), tree.objects, strict=True):
+        row, mesh = _piece(item, box, turn, meshes)
+        meshes[row["id"]] = mesh, ""
+        rows.append(row)
+    return Parts(
+        name=path.stem,
+        camera=camera,
+        scene=scene_tree(rows, path.name, tree.ground),
+        objects=_annotations(tree.objects, camera, at.file),
+        load_mesh=partial(load_from, meshes),
+    )
+
+
+def _world(tree: BoxesFields, camera: At | None, up: str) -> Matrix:
+    """Our world from the file's: its `up` in a world, or the camera's axes."""
+    if tree.frame != "camera":
+        return up_axes(up or tree.up or "y")
+    tilt = None if camera is None else maybe(camera, "R_cam_world")
+    return (np.array(LEVEL) if tilt is None else rotation(tilt)).T
+
+
+def _piece(
+    at: At, box: BoxFields, turn: Matrix, used: dict[str, tuple[Mesh, str]]
+) -> tuple[dict[str, Any], Mesh]:
+    """The fields of an object, and the mesh of the library that fills its box."""
+    category, centre = str(box.category), turn @ np.array(box.center)
+    order, yaw = _upright(at, _axes(at, box, turn))
+    size = np.array(box.size)[order]
+    mesh = choose_piece(category, (float(size[0]), float(size[1]), float(size[2])))
+    low, high = mesh.verts.double().numpy().min(0), mesh.verts.double().numpy().max(0)
+    place = centre - np.array([0.0, size[1] / 2, 0.0])  # the library stands on its bottom
+    given = (
+        "" if box.id is None else checked(get(at, "id"), Id if isinstance(box.id, int) else Text)
+    )
+    name = free_id(category, str(given), used)
+    return {
+        "id": name,
+        "category": category,
+        "mesh": name,
+        "annotation": None if box.box2d is None else len(used),
+        "translation": place.tolist(),
+        "yaw": yaw,
+        "scale": (size / (high - low)).tolist(),
+        "support": "ground" if box.support is None else str(box.support),
+    }, mesh
+
+
+def _axes(at: At, box: BoxFields, turn: Matrix) -> Matrix:
+    """The box's axes as columns in our world; a yaw is about the vertical, from the front at +z."""
+    if box.rotation is not None:
+        return turn @ rotation(get(at, "rotation"))
+    if box.yaw is None:
+        refuse(get(at, "yaw"), "an angle, or a 'rotation'")
+    return about_y(box.yaw)
+
+
+def _upright(at: At, axes: Matrix) -> tuple[Sequence[int], float]:
+    """Which axes are width, height and depth, and the yaw of the front, in our world.
+
+    The axis nearest to the vertical is the height, even if the file's y is another. The front is
+    the box's own z where that is level, else the axis that leads to it by turning the box upright.
+    """
+    up = int(np.abs(axes[1]).argmax())
+    if up == 1:
+        order = [0, 1, 2]
+    elif up == 2:
+        order = [0, 2, 1]  # z-up boxes: x stays, their -y is the front
+    else:
+        order = [1, 0, 2]
+    front = axes[:, order[2]] * (-1.0 if up == 2 and axes[1, 2] > 0 else 1.0)
+    if math.hypot(front[0], front[2]) < 0.1:
+        refuse(get(at, "rotation"), "a box with an axis that is nearly level")
+    return order, math.atan2(front[0], front[2])
+
+
+def _annotations(boxes: Sequence[BoxFields], camera: At | None, file: str) -> At | None:
+    """What objects.json says of boxes that tell their rectangle in the image."""
+    if camera is None or all(box.box2d is None for box in boxes):
+        return None
+    found = [
+        Instance(str(b.category), b.box2d, None, 1.0 if b.score is None else b.score) for b in boxes
+    ]
+    size = integer(get(camera, "w"), 1), integer(get(camera, "h"), 1)
+    return objects_tree(Instances(tuple(found), size, file), found)

@@ -1,0 +1,73 @@
+"""Gen3DSR: reconstruction/<i>_<label>.glb, all in one world, and cam_params.json {K, c2w, W, H}.
+
+The world is the camera's own (x right, y down, z forward) unless a true pose was given, which c2w
+holds. Meshes have no axes of their own: an object gets an upright box around it, and its front is
+guessed (placing.py). Gravity is not known either: the camera is level unless --camera says more.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mover.core.errors import InputError
+from mover.core.types import Mesh
+from mover.io.capture.parts import Hints, Parts, image_parts
+from mover.io.capture.scene_file import scene_tree
+from mover.io.files.cameras import camera_of_tree
+from mover.io.files.fields import At, get, maybe, read_json
+from mover.io.files.schema import rigid, rotation
+from mover.io.scenes.placing import (
+    LEVEL,
+    Matrix,
+    category_of_name,
+    free_id,
+    load_from,
+    without_axes,
+)
+
+WHOLE = ("full_scene", "background", "depth_scene")
+
+
+def gen3dsr_parts(folder: Path, hints: Hints) -> Parts:
+    """What Gen3DSR made of one picture.
+
+    Raises:
+        InputError: If a file is missing or wrong.
+    """
+    lens = read_json(folder / "cam_params.json")
+    given = camera_of_tree(lens, None)
+    tilt = None if hints.camera is None else maybe(hints.camera, "R_cam_world")
+    R = np.array(LEVEL) if tilt is None else rotation(tilt)
+    camera = At({**given.value, "R_cam_world": R.tolist()}, given.file)
+    turn = np.eye(4)
+    turn[:3, :3] = R.T
+    world: Matrix = turn @ np.linalg.inv(rigid(get(lens, "c2w")))
+    paths = [p for p in (folder / "reconstruction").glob("*.glb") if p.stem not in WHOLE]
+    if not paths:
+        raise InputError(f"{folder}: has no reconstruction/<i>_<label>.glb, expected meshes")
+    rows: list[dict[str, Any]] = []
+    meshes: dict[str, tuple[Mesh, str]] = {}
+    for path in sorted(paths, key=_number):
+        category = hints.names.get(path.stem) or category_of_name(path.stem)
+        name = free_id(category, path.stem, meshes)
+        fields, meshes[name] = without_axes(path, world, category, hints.work / f"{name}.glb")
+        rows.append({"id": name, "category": category, "mesh": name, **fields})
+    image = folder / "input.png"
+    load, size = image_parts(image) if image.is_file() else (None, None)
+    how = "level" if tilt is None else "as given"
+    return Parts(
+        name=folder.resolve().name,
+        camera=camera,
+        scene=scene_tree(rows, folder.name),
+        load_mesh=partial(load_from, meshes),
+        load_image=load if size == (given.value["w"], given.value["h"]) else None,
+        image_size=size,
+        notes=(f"the camera is {how}; the fronts of the objects are guesses",),
+    )
+
+
+def _number(path: Path) -> tuple[int, str]:
+    head = path.stem.split("_")[0]
+    return (int(head), "") if head.isdecimal() else (1 << 30, path.stem)

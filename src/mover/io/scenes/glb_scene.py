@@ -1,0 +1,244 @@
+"""A glTF scene: each node with a mesh below it is an object, placed by its node.
+
+A camera of the file is the camera of the capture, where the user gives none. Without one the
+scene's origin is the camera, which looks along -z: glTF's axes are ours. Scenes of other tools
+that were written with y down or z up are turned by --up.
+"""
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mover.core.errors import InputError
+from mover.core.types import Mesh
+from mover.io.capture.parts import Hints, Parts
+from mover.io.capture.scene_file import scene_tree
+from mover.io.files.fields import At, maybe, reason
+from mover.io.files.images import image_size
+from mover.io.files.meshes import gltf_tree
+from mover.io.scenes.placing import (
+    FLIP,
+    Matrix,
+    category_of_name,
+    corners,
+    free_id,
+    load_from,
+    load_parts,
+    posed,
+    write_parts,
+)
+
+UP: dict[str, Matrix] = {
+    "y": np.eye(3),
+    "-y": np.diag([1.0, -1.0, -1.0]),
+    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+}
+"""The user's world -> +y up, right-handed."""
+OURS = ("ground", "camera", "light")
+NO_ROOM = 1e-5  # [share], a transform that is nothing but rounding
+
+
+def glb_parts(path: Path, hints: Hints) -> Parts:
+    """The objects of a .glb or .gltf.
+
+    Raises:
+        InputError: If it cannot be read or has no objects.
+    """
+    if not path.is_file() or path.suffix.lower() not in (".glb", ".gltf"):
+        raise InputError(f"{path}: is no .glb or .gltf file, expected a glTF scene")
+    scene = load_parts(path)
+    turn = np.eye(4)
+    turn[:3, :3] = up_axes(hints.up)
+    view = None if hints.camera is not None else _view(path, hints)
+    if view is not None:
+        fields, pose = view
+        turn[:3, 3] = -turn[:3, :3] @ pose[:3, 3]
+        R = FLIP @ pose[:3, :3].T @ turn[:3, :3].T
+        camera = At({**fields, "R_cam_world": R.tolist()}, path.name, "cameras")
+    else:
+        camera = hints.camera
+    rows, meshes, notes = _objects(scene, turn, hints)
+    if not rows:
+        raise InputError(f"{path.name}: has no meshes, expected a glTF scene of furniture")
+    return Parts(
+        name=path.stem,
+        camera=camera,
+        scene=scene_tree(rows, path.name, _ground(scene, turn)),
+        load_mesh=partial(load_from, meshes),
+        notes=tuple(notes),
+    )
+
+
+def up_axes(up: str) -> Matrix:
+    """The rotation of the user's world into ours.
+
+    Raises:
+        InputError: If the axis is none of those known.
+    """
+    if (up or "y") not in UP:
+        raise InputError(f"--up: {up!r} is none of {', '.join(UP)}")
+    return UP[up or "y"]
+
+
+def _objects(
+    scene: Any,  # noqa: ANN401
+    turn: Matrix,
+    hints: Hints,
+) -> tuple[list[dict[str, Any]], dict[str, tuple[Mesh, str]], list[str]]:
+    """Objects of scene.json, their meshes, and what was lost."""
+    rows: list[dict[str, Any]] = []
+    meshes: dict[str, tuple[Mesh, str]] = {}
+    notes: list[str] = []
+    for node in _nodes(scene):
+        matrix, _ = scene.graph[node]
+        own = _below(scene, node)
+        category = hints.names.get(node) or category_of_name(node)
+        name = free_id(category, node, meshes)
+        file = hints.work / f"{name}.glb"
+        mesh, _ = found = write_parts(own, np.eye(4), file)
+        place = posed(turn @ np.asarray(matrix), *corners(mesh))
+        if place.bake is not None:
+            found = write_parts(own, place.bake, file)
+        meshes[name] = found
+        notes += [f"{name}: {place.note}"] if place.note else []
+        rows.append({"id": name, "category": category, "mesh": name, **place.fields})
+    return rows, meshes, notes
+
+
+def _nodes(scene: Any) -> list[str]:  # noqa: ANN401
+    """The nodes that are objects: the highest ones that are not mere groups, in order."""
+    children: dict[str, list[str]] = scene.graph.transforms.children
+    full = {node for leaf in scene.graph.nodes_geometry for node in _up(scene, leaf)}
+
+    def walk(node: str) -> Iterator[str]:
+        below = [child for child in children.get(node, []) if child in full]
+        if _is_ours(node):
+            return
+        if node == scene.graph.base_frame or _is_group(scene, node, below):
+            for child in below:
+                yield from walk(child)
+        else:
+            yield node
+
+    return sorted(walk(scene.graph.base_frame), key=_natural)
+
+
+def _up(scene: Any, leaf: str) -> Iterator[str]:  # noqa: ANN401
+    """A node and all above it."""
+    parents: dict[str, str] = scene.graph.transforms.parents
+    node: str | None = leaf
+    while node is not None:
+        yield node
+        node = parents.get(node)
+
+
+def _is_ours(node: str) -> bool:
+    """What a scene.glb of this program has beside its furniture."""
+    return node.startswith("body_") or node.rstrip("_") in OURS
+
+
+def _is_group(scene: Any, node: str, below: list[str]) -> bool:  # noqa: ANN401
+    """A node without mesh above several that have places of their own."""
+    edges = scene.graph.transforms.edge_data
+    _, geometry = scene.graph[node]
+    places = [np.asarray(edges[(node, c)].get("matrix", np.eye(4))) for c in below]
+    moved = [bool(np.abs(p - np.eye(4)).max() > NO_ROOM) for p in places]
+    return geometry is None and len(below) > 1 and sum(moved) > 1
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """A key that sorts numbers as numbers."""
+    import re
+
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts]
+
+
+def _below(scene: Any, node: str) -> Any:  # noqa: ANN401
+    """The meshes at and below a node, in its own axes."""
+    import trimesh
+
+    out = trimesh.Scene()
+    back = np.linalg.pinv(np.asarray(scene.graph[node][0]))
+    for leaf in sorted(scene.graph.nodes_geometry):
+        if node in set(_up(scene, leaf)):
+            matrix, geometry = scene.graph[leaf]
+            transform = np.eye(4) if leaf == node else back @ np.asarray(matrix)
+            out.add_geometry(scene.geometry[geometry], node_name=leaf, transform=transform)
+    return out
+
+
+def _ground(scene: Any, turn: Matrix) -> float | None:  # noqa: ANN401
+    """Height of a node that is called ground, None where there is none."""
+    for node in scene.graph.nodes_geometry:
+        if node.rstrip("_") == "ground":
+            matrix, geometry = scene.graph[node]
+            verts = np.asarray(scene.geometry[geometry].vertices)
+            world = verts @ (turn @ matrix)[:3, :3].T + (turn @ matrix)[:3, 3]
+            return float(np.median(world[:, 1]))
+    return None
+
+
+def _view(path: Path, hints: Hints) -> tuple[dict[str, Any], Matrix] | None:
+    """The first camera of the file: fields of camera.json, and its place in the file's world."""
+    try:
+        tree: Any = gltf_tree(path)
+        nodes = tree.get("nodes", [])
+        index = next((i for i, node in enumerate(nodes) if "camera" in node), None)
+        if index is None:
+            return None
+        lens = tree["cameras"][nodes[index]["camera"]]["perspective"]
+        at = At(lens, path.name, "cameras.perspective")
+        tall = float(lens["yfov"])
+        ratio = maybe(at, "aspectRatio")
+        pose = _pose_of(nodes, index)
+        return _fields(tall, None if ratio is None else float(ratio.value), hints), pose
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+        raise InputError(
+            f"{path.name}: has a camera that cannot be read ({reason(error)}), "
+            "expected a perspective camera"
+        ) from error
+
+
+def _fields(tall: float, ratio: float | None, hints: Hints) -> dict[str, Any]:
+    """Fields of camera.json of a lens; without an image it is 1080 pixels high."""
+    if hints.image is not None:
+        w, h = image_size(hints.image)
+    else:
+        h = 1080
+        w = round(h * (ratio or 16 / 9))
+    fy = h / 2 / math.tan(tall / 2)
+    fx = fy if ratio is None else w / 2 / (math.tan(tall / 2) * ratio)
+    return {"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": w / 2, "cy": h / 2}
+
+
+def _pose_of(nodes: Any, index: int) -> Matrix:  # noqa: ANN401
+    """World from a node, without scale."""
+    parent = {child: i for i, node in enumerate(nodes) for child in node.get("children", [])}
+    pose, seen = np.eye(4), set[int]()
+    at: int | None = index
+    while at is not None and at not in seen:
+        seen.add(at)
+        pose = _local(nodes[at]) @ pose
+        at = parent.get(at)
+    u, _, v = np.linalg.svd(pose[:3, :3])
+    pose[:3, :3] = u @ v
+    return pose
+
+
+def _local(node: Any) -> Matrix:  # noqa: ANN401
+    """The transform of a node: a matrix by columns, or translation, rotation and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    from scipy.spatial.transform import Rotation
+
+    out: NDArray[np.float64] = np.eye(4)
+    turn = Rotation.from_quat(node.get("rotation", [0.0, 0.0, 0.0, 1.0])).as_matrix()
+    out[:3, :3] = turn @ np.diag(node.get("scale", [1.0, 1.0, 1.0]))
+    out[:3, 3] = node.get("translation", [0.0, 0.0, 0.0])
+    return out

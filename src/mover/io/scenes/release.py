@@ -1,0 +1,266 @@
+"""The folder of the MOVER authors' release: one sequence with all inputs, and their results.
+
+    Total3D_label_occNet_results/Total3D_input/   the initial scene; its objects' detections
+    Color_flip_rename/000001.jpg ...              frames, numbered from 1
+    Color_flip_rename_pointrend_.../000001/detections.json      masks of every frame
+    smplifyx_results_st2_.../{meshes/*.obj, smplifyx_cam/001.xml}   bodies in their world (y down)
+    smplifyx_results_st0/results/posa_contact_.../000000_sample_00.npy   contacts, from 0
+    prox_scans_pre/{bbox3d.json, scan_cam_cooridnates.ply}      the truth, in the camera's frame
+    refine_results/**/f000_world.obj              their result
+
+Folders are found by what they hold, so that renamed ones do as well.
+"""
+
+import dataclasses
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mover.core.errors import InputError
+from mover.core.types import Scene
+from mover.io.capture.camera_file import camera_of
+from mover.io.capture.parts import Hints, Parts
+from mover.io.capture.scene_file import scene_of, scene_tree
+from mover.io.datasets.true_boxes import boxes_scene, read_bbox3d, vertical_of
+from mover.io.files.cameras import read_camera_file
+from mover.io.files.fields import At, get, items, maybe, read_json
+from mover.io.files.meshes import floor_of, read_scan
+from mover.io.masks.instance_files import DETECTIONS, read_instances
+from mover.io.masks.instances import Instances, fitted, is_person, people_tree
+from mover.io.masks.instances_pixels import read_array
+from mover.io.scenes.placing import FLIP, Matrix, level_of, load_from, posed
+from mover.io.scenes.total3d import read_shape, total3d_parts
+
+FPS = 30.0
+STAGES = ("smplifyx_results_st2*", "smplifyx_results_st0*", "*")
+CONTACTS = "*_sample_00.npy"
+
+
+def body_arrays(folder: Path, R: Matrix | None, notes: list[str]) -> tuple[At | None, int]:
+    """The arrays of bodies.npz in the camera's frame, and the number of frame 0.
+
+    Args:
+        folder: The sequence.
+        R: R_cam_world of the world of the meshes, whose y is down; None: not known.
+        notes: Takes what is odd.
+
+    Raises:
+        InputError: If a mesh cannot be read or has another topology than the first.
+    """
+    paths = _meshes(folder)
+    if not paths or R is None:
+        return None, 1
+    numbers = [int(p.stem) for p in paths]
+    verts: list[Matrix] = []
+    faces = read_shape(paths[0])[1]
+    for path in paths:
+        points, own = read_shape(path)
+        if own.shape != faces.shape or len(points) != len(verts[0] if verts else points):
+            raise InputError(f"{path.name}: has another topology, expected that of {paths[0].name}")
+        verts.append(points @ FLIP @ R.T)
+    notes.append(f"{len(paths)} bodies are those of {paths[0].parent.parent.name}")
+    arrays: dict[str, Any] = {
+        "vertices": np.stack(verts).astype(np.float32),
+        "faces": faces,
+        "frame": np.array(numbers) - numbers[0],
+        "person": np.zeros(len(numbers), dtype=np.int64),
+        "space": np.array("camera"),
+        "fps": np.array(FPS),
+    }
+    return At(arrays, paths[0].parent.name), numbers[0]
+
+
+def _meshes(folder: Path) -> list[Path]:
+    """The meshes of the last stage that has any, by number."""
+    for stage in STAGES:
+        for home in sorted(folder.glob(f"{stage}/meshes")):
+            kinds = [p for p in home.iterdir() if p.suffix in (".obj", ".ply")]
+            paths = [p for p in kinds if p.stem.isdecimal()]
+            if paths:
+                return sorted(paths, key=lambda p: int(p.stem))
+    return []
+
+
+def contact_arrays(folder: Path, bodies: At | None, notes: list[str]) -> At | None:
+    """The arrays of contacts.npz, where there is one file for each body.
+
+    Raises:
+        InputError: If a file cannot be read.
+    """
+    if bodies is None:
+        return None
+    rows, count = bodies.value["vertices"].shape[:2]
+    home = next(iter(sorted({p.parent for p in folder.rglob(CONTACTS)})), None)
+    if home is None:
+        return None
+    paths = [home / f"{frame:06d}_sample_00.npy" for frame in bodies.value["frame"].tolist()]
+    there = [path for path in paths if path.is_file()]
+    if len(there) < rows:
+        notes.append(f"contacts: only {len(there)} of {rows} bodies have a file, so none is used")
+        return None
+    values = [read_array(path) for path in paths]
+    for at in values:
+        if at.value.dtype.kind != "f" or at.value.size != count:
+            raise InputError(f"{at.file}: has shape {at.value.shape}, expected ({count}, 1)")
+    stack = np.stack([at.value.reshape(-1) for at in values]).astype(np.float32)
+    return At({"probability": stack.clip(0, 1)}, home.name)
+
+
+DEEPEST = 5  # folders below the sequence's own that are looked through
+SURE = 0.7  # the authors drop detections of the reference image that are less so
+LEAST = 4  # points that settle a transform
+
+
+def release_parts(folder: Path, hints: Hints) -> Parts:
+    """One sequence of the authors' release.
+
+    Raises:
+        InputError: If the initial scene is missing, or a file is wrong.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder, expected a sequence of MOVER")
+    home = found(folder, "bdb_3d.mat")
+    if home is None:
+        raise InputError(f"{folder}: has no bdb_3d.mat in it, expected Total3D_input")
+    parts = _unsure_dropped(total3d_parts(home.parent, hints))
+    assert parts.camera is not None
+    lens: dict[str, Any] = dict(parts.camera.value)
+    size = lens["w"], lens["h"]
+    notes: list[str] = []
+    R = _rotation(folder, size, notes)
+    bodies, first = body_arrays(folder, R, notes)
+    people = _people(folder, home.parent, size)
+    parts = dataclasses.replace(
+        parts,
+        name=folder.resolve().name,
+        bodies=bodies,
+        contacts=contact_arrays(folder, bodies, notes),
+        people=people,
+        copies=_frames(folder, first),
+    )
+    authors = _authors(folder, parts, R, notes)
+    truth = _truth(folder, lens, hints)
+    return dataclasses.replace(parts, scenes={**truth, **authors}, notes=tuple(notes))
+
+
+def found(folder: Path, name: str) -> Path | None:
+    """The first file of this name in a folder or some folders below it."""
+    for depth in range(DEEPEST):
+        paths = sorted(folder.glob("*/" * depth + name))
+        if paths:
+            return paths[0]
+    return None
+
+
+def _unsure_dropped(parts: Parts) -> Parts:
+    """Without objects whose detection is not sure enough, as the authors do."""
+    assert parts.objects is not None
+    assert parts.scene is not None
+    tree, scene = parts.objects.value, parts.scene.value
+    kept = [a for a in tree["annotations"] if a.get("score", 1.0) >= SURE]
+    ids = {a["id"] for a in kept}
+    rows = [row for row in scene["objects"] if row["annotation"] in ids]
+    return dataclasses.replace(
+        parts,
+        objects=At({**tree, "annotations": kept}, parts.objects.file),
+        scene=At({**scene, "objects": rows}, parts.scene.file),
+    )
+
+
+def _rotation(folder: Path, size: tuple[int, int], notes: list[str]) -> Matrix | None:
+    """R_cam_world of the authors' camera stage, whose world the bodies are in."""
+    path = found(folder, "001.xml")
+    if path is None:
+        notes.append("there is no smplifyx_cam/001.xml, so the bodies' world is not known")
+        return None
+    return np.array(get(read_camera_file(path, size), "R_cam_world").value)
+
+
+def _people(folder: Path, home: Path, size: tuple[int, int]) -> At | None:
+    """The first person of every frame, in frames numbered from 0."""
+    paths = sorted(p for p in folder.rglob(f"[0-9]*/{DETECTIONS}") if p.parent != home)
+    if not paths:
+        return None
+    seen = fitted(read_instances(paths[0].parent.parent, {}, size), size)
+    items_of = [dataclasses.replace(i, track=0) for i in seen.items if is_person(i)]
+    first = {item.frame: item for item in reversed(items_of)}
+    return people_tree(Instances(tuple(first.values()), size, seen.file))
+
+
+def _frames(folder: Path, first: int) -> dict[str, Path]:
+    """Pictures by their place in the capture."""
+    one = found(folder, f"{first:06d}.jpg")
+    if one is None:
+        return {}
+    paths = sorted(one.parent.glob("[0-9]*.jpg"))
+    return {f"frames/{int(p.stem) - first:06d}.jpg": p for p in paths if p.stem.isdecimal()}
+
+
+def _authors(folder: Path, parts: Parts, R: Matrix | None, notes: list[str]) -> dict[str, Scene]:
+    """Their result as a scene, to compare with: its meshes are ours, moved."""
+    paths = sorted(folder.glob("**/f[0-9][0-9][0-9]_world.obj"), key=lambda p: (p.parent, p.name))
+    assert parts.scene is not None
+    assert parts.camera is not None
+    rows = items(get(parts.scene, "objects"))
+    last = [p for p in paths if p.parent == paths[-1].parent] if paths else []
+    if R is None or len(last) != len(rows):
+        if last:
+            notes.append(f"their result has {len(last)} objects, {len(rows)} are known: left out")
+        return {}
+    placed: list[dict[str, Any]] = []
+    meshes = {row.value["mesh"]: parts.load_mesh(get(row, "mesh")) for row in rows}
+    for row, path in zip(rows, last, strict=True):
+        verts = meshes[row.value["mesh"]][0].verts.double().numpy()
+        theirs = _used(path, len(verts)) @ FLIP
+        matrix = _moved(verts, theirs, path)
+        place = posed(matrix, verts.min(0), verts.max(0))
+        placed.append({**row.value, **place.fields, "annotation": None})
+    lens = camera_of(At({**parts.camera.value, "R_cam_world": R.tolist()}, "refine_results"))
+    tree = scene_tree(placed, "refine_results")
+    scene, _ = scene_of(tree, partial(load_from, meshes), lens, notes.append)
+    return {"authors": scene}
+
+
+def _used(path: Path, count: int) -> Matrix:
+    """The vertices of an object of theirs that triangles use, `count` of them."""
+    verts, faces = read_shape(path)
+    a, b, c = faces.T
+    kept = np.unique(faces[(a != b) & (b != c) & (c != a)])
+    if len(kept) != count or kept.max(initial=-1) >= len(verts):
+        raise InputError(f"{path.name}: has {len(kept)} vertices, expected the {count} of its mesh")
+    return verts[kept]
+
+
+def _moved(verts: Matrix, theirs: Matrix, path: Path) -> Matrix:
+    """The affine transform between two meshes of one topology (4, 4)."""
+    if len(verts) < LEAST:
+        raise InputError(f"{path.name}: has {len(verts)} vertices, expected {LEAST} or more")
+    rows = np.concatenate([verts, np.ones((len(verts), 1))], axis=1)
+    solution = np.linalg.lstsq(rows, theirs, rcond=None)[0]
+    out = np.eye(4)
+    out[:3] = solution.T
+    return out
+
+
+def _truth(folder: Path, camera: dict[str, Any], hints: Hints) -> dict[str, Scene]:
+    """The boxes and the scan in them; gravity is what the boxes share."""
+    path = hints.boxes or found(folder, "bbox3d.json")
+    if path is None:
+        return {}
+    boxes = read_bbox3d(path, hints.names, read_json(path))
+    guess = maybe(At(camera, "camera"), "R_cam_world")
+    first = FLIP if guess is None else np.array(guess.value)
+    R = level_of(vertical_of(boxes, first[:, 1]))
+    world = np.eye(4)
+    world[:3, :3] = R.T
+    lens = {**camera, "R_cam_world": R.tolist()}
+    scans = [found(folder, n) for n in ("scan_cam_cooridnates.ply", "scan_cam_coordinates.ply")]
+    file = next((p for p in scans if p is not None), None)
+    if file is None:
+        return {"truth": boxes_scene(boxes, world, lens, None)}
+    scan = read_scan(file)
+    ground = floor_of(scan.verts.double().numpy() @ world[1, :3])
+    inside = boxes_scene(boxes, world, lens, ground, scan)
+    return {"truth": boxes_scene(boxes, world, lens, ground), "truth_scan": inside}

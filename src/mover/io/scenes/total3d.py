@@ -1,0 +1,301 @@
+"""Total3D and Implicit3D (Im3D): picture, intrinsics, detections; camera, boxes, layout, meshes.
+
+The files lie in input/ and output/, or all in one folder. The world has x forward, y up, z right,
+and the camera at the origin. Boxes have half sizes and rows of axes; a mesh is stretched to its
+box. The intrinsics belong to the tool's own pixel grid, which is taken as the image's: no half
+pixel is added. Meshes are numbered like the detections; numbers are compared as numbers.
+"""
+
+import math
+import pickle
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mover.core.errors import InputError
+from mover.core.types import Capture, Mesh
+from mover.io.capture.build import build_capture
+from mover.io.capture.parts import Hints, Parts
+from mover.io.capture.scene_file import scene_tree
+from mover.io.files.cameras import read_intrinsics
+from mover.io.files.fields import (
+    At,
+    array,
+    choice,
+    get,
+    items,
+    maybe,
+    number,
+    read_json,
+    refuse,
+    vector,
+)
+from mover.io.files.images import image_size, read_image
+from mover.io.files.meshes import KINDS, mesh_of, read_mesh
+from mover.io.masks.instances import mask_code
+
+CLASSES = (
+    "void", "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window",
+    "bookshelf", "picture", "counter", "blinds", "desk", "shelves", "curtain", "dresser",
+    "pillow", "mirror", "floor_mat", "clothes", "ceiling", "books", "refridgerator",
+    "television", "paper", "towel", "shower_curtain", "box", "whiteboard", "person",
+    "night_stand", "toilet", "sink", "lamp", "bathtub", "bag", "otherstructure",
+    "otherfurniture", "otherprop",
+)  # fmt: skip
+"""NYU40's names, by class id."""
+FURNITURE = (
+    "cabinet", "bed", "chair", "sofa", "table", "bookshelf", "counter", "desk", "shelves",
+    "dresser", "refridgerator", "television", "box", "night_stand", "toilet", "sink", "lamp",
+    "bathtub", "otherfurniture",
+)  # fmt: skip
+"""Those that stand in a room and are worth placing."""
+LIFTED = ("television", "box", "sink", "lamp")
+"""What may stand on something else or hang on a wall."""
+
+
+# MATLAB files, read in a process of their own: scipy's reader can die of a damaged one.
+
+
+READ = """
+import pickle, sys, warnings
+from scipy.io import loadmat
+warnings.simplefilter("ignore")
+try:
+    said = loadmat(sys.argv[1])
+except Exception as error:  # the parser raises anything on broken files
+    said = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+sys.stdout.buffer.write(pickle.dumps(said))
+"""
+"""Writes the arrays, or the error in one line."""
+
+
+def load_mat(path: Path) -> At:
+    """The arrays of a MATLAB file.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    if not path.is_file():
+        raise InputError(f"{path.name}: there is no such file in {path.parent}")
+    call = [sys.executable, "-P", "-c", READ, str(path.resolve())]
+    done = subprocess.run(call, capture_output=True, check=False)
+    said = pickle.loads(done.stdout) if done.returncode == 0 else "its reader died"
+    if isinstance(said, str):
+        raise InputError(f"{path.name}: cannot be read ({said}), expected a .mat file")
+    return At(said, path.name)
+
+
+# The files of Total3D and Implicit3D: boxes and matrices (.mat), meshes.
+
+
+Shape = tuple[NDArray[np.float64], NDArray[np.int64]]
+"""All vertices and triangles of a mesh, used or not."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box of bdb_3d.mat in Total3D's world."""
+
+    center: NDArray[np.float64]
+    half: NDArray[np.float64]
+    yaw: float
+    name: str
+
+
+def matrix(path: Path, key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """A matrix of a MATLAB file."""
+    return array(get(load_mat(path), key), shape).astype(np.float64)
+
+
+def read_boxes(path: Path) -> list[Box]:
+    """All boxes, in the order of the detections."""
+    content = load_mat(path)
+    cells = get(content, "bdb")
+    if not isinstance(cells.value, np.ndarray) or cells.value.dtype != object:
+        refuse(cells, "a cell of boxes")
+    ids = array(get(content, "class_id"), (1, cells.value.size), "whole")[0]
+    found: list[Box] = []
+    for i, (cell, key) in enumerate(zip(cells.value.ravel(), ids.tolist(), strict=True)):
+        at = At(cell, content.file, f"bdb[{i}]")
+        if not 0 <= key < len(CLASSES):
+            refuse(get(content, "class_id"), f"ids from 0 to {len(CLASSES) - 1}", f"{key}")
+        found.append(_box(at, CLASSES[key]))
+    return found
+
+
+def _box(at: At, name: str) -> Box:
+    """One box: its axes are the rows of `basis`, upright; p = p_local @ basis + centroid."""
+    names = (
+        at.value.dtype.names if isinstance(at.value, np.ndarray) and at.value.size == 1 else None
+    )
+    if not names or not {"basis", "coeffs", "centroid"} <= set(names):
+        refuse(at, "a struct with basis, coeffs, centroid")
+    struct = at.value.ravel()[0]
+    parts = {key: At(struct[key], at.file, f"{at.field}.{key}") for key in names}
+    basis = array(parts["basis"], (3, 3)).astype(np.float64)
+    half = array(parts["coeffs"], (1, 3)).astype(np.float64)[0]
+    if (half <= 0).any():
+        refuse(parts["coeffs"], "half sizes above 0", f"{half.tolist()}")
+    yaw = math.atan2(basis[2, 0], basis[2, 2])
+    c, s = math.cos(yaw), math.sin(yaw)
+    if abs(basis - np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])).max() > 1e-3:
+        refuse(parts["basis"], "the axes of an upright box", f"{basis.round(3).tolist()}")
+    return Box(array(parts["centroid"], (1, 3)).astype(np.float64)[0], half, yaw, name)
+
+
+def find_mesh(folder: Path, index: int, name: str) -> Path:
+    """The mesh of a box: `<index>_<class id>.obj`, or another kind of mesh with this name.
+
+    Raises:
+        InputError: If there is none.
+    """
+    stem = f"{index}_{CLASSES.index(name)}"
+    for kind in (".obj", *KINDS):
+        if (path := folder / (stem + kind)).is_file():
+            return path
+    raise InputError(f"{stem}.obj: there is no such file in {folder}, expected a mesh")
+
+
+def read_shape(path: Path) -> Shape:
+    """All vertices and triangles of a mesh; of an .obj also those vertices that are not used.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    if path.suffix != ".obj":
+        mesh, _ = read_mesh(At(path.name, path.name), path.parent)
+        return mesh.verts.double().numpy(), mesh.faces.numpy()
+    lines = [line.split() for line in path.read_text(errors="replace").splitlines()]
+    try:
+        verts = np.array([line[1:4] for line in lines if line[:1] == ["v"]], dtype=np.float64)
+        corners = [[c.split("/")[0] for c in line[1:]] for line in lines if line[:1] == ["f"]]
+        faces = np.array(corners, dtype=np.int64).reshape(-1, 3) - 1
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{path.name}: has {error}, expected vertices and triangles") from error
+    array(At(verts, path.name, "v"), ("V", 3))
+    if not len(verts):
+        raise InputError(f"{path.name}: has an empty mesh, expected vertices and triangles")
+    return verts, faces
+
+
+ON_FLOOR = 0.3  # [m], such a thing stands on the floor if its box ends so close above it
+TO_OURS = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+"""x forward, y up, z right -> x right, y up, z backward."""
+TO_IMAGE = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])
+"""x forward, y up, z right -> x right, y down, z forward."""
+
+
+def read_total3d(folder: Path) -> Capture:
+    """Read the input and the output of Total3D or Im3D for one picture.
+
+    Raises:
+        InputError: If a file is missing or wrong.
+    """
+    return build_capture(total3d_parts(folder, Hints()))
+
+
+def total3d_parts(folder: Path, hints: Hints) -> Parts:
+    """What Total3D or Im3D knows of one picture.
+
+    Raises:
+        InputError: If a file is missing or wrong.
+    """
+    del hints
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder, expected one of Total3D")
+    parts = [folder / name for name in ("input", "output")]
+    source, result = [part if part.is_dir() else folder for part in parts]
+    at = read_json(source / "detections.json")
+    rows = [choice(get(item, "class"), CLASSES) for item in items(at)]
+    boxes = read_boxes(result / "bdb_3d.mat")
+    floor = float(matrix(result / "layout.mat", "layout", (8, 3))[:, 1].min())
+    if rows != [box.name for box in boxes]:
+        found = f"{len(boxes)} boxes of {[b.name for b in boxes][:4]} ..."
+        expected = "the classes of detections.json, in order"
+        raise InputError(f"bdb_3d.mat: field 'class_id' has {found}, expected {expected}")
+    kept = {i: box for i, box in enumerate(boxes) if box.name in FURNITURE}
+    files = {i: find_mesh(result, i, box.name) for i, box in kept.items()}
+    shapes = {path.name: read_shape(path) for path in files.values()}
+    pieces = [_piece(i, box, files[i].name, shapes, floor) for i, box in kept.items()]
+    return Parts(
+        name=folder.resolve().name,
+        camera=_camera(source, result / "r_ex.mat"),
+        scene=scene_tree(pieces, result.name, floor),
+        objects=At(_annotations(items(at), list(kept)), "detections.json"),
+        load_mesh=partial(_load_mesh, result, shapes),
+        load_image=partial(read_image, At("img.jpg", "input"), source),
+    )
+
+
+def _load_mesh(result: Path, shapes: Mapping[str, Shape], at: At) -> tuple[Mesh, str]:
+    """The mesh of an object, as it is in the file."""
+    return mesh_of(*shapes[at.value], At(None, at.value)), str((result / at.value).resolve())
+
+
+def _camera(source: Path, attitude: Path) -> At:
+    """The fields of camera.json; p_total3d = cam_R @ (camera axes: forward, up, right)."""
+    K = read_intrinsics(source / "cam_K.txt")
+    R = TO_IMAGE @ matrix(attitude, "cam_R", (3, 3)).T @ TO_OURS.T
+    width, height = image_size(source / "img.jpg")
+    return At(
+        {
+            "w": width, "h": height,
+            "fl_x": K[0, 0].item(), "fl_y": K[1, 1].item(),
+            "cx": K[0, 2].item(), "cy": K[1, 2].item(),
+            "R_cam_world": R.tolist(),
+        },
+        "cam_K.txt, r_ex.mat",
+    )  # fmt: skip
+
+
+def _annotations(rows: Sequence[At], kept: Sequence[int]) -> dict[str, Any]:
+    """The content of objects.json: boxes, and scores and masks where the file has them."""
+    annotations: list[dict[str, Any]] = []
+    for i in kept:
+        name, box = choice(get(rows[i], "class"), CLASSES), get(rows[i], "bbox")
+        scored = isinstance(box.value, list) and len(box.value) == 5
+        left, top, right, bottom, *score = vector(box, 5 if scored else 4)
+        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": CLASSES.index(name)}
+        row |= {"bbox": [left, top, right - left, bottom - top]}
+        if score:
+            row["score"] = number(At(score[0], box.file, f"{box.field}[4]"), 0, 1)
+        mask = maybe(rows[i], "mask")
+        annotations.append(row if mask is None else {**row, "segmentation": mask_code(mask)})
+    categories = [{"id": i, "name": name} for i, name in enumerate(CLASSES)]
+    return {"images": [{"id": 0}], "categories": categories, "annotations": annotations}
+
+
+def _piece(
+    index: int, box: Box, file: str, shapes: Mapping[str, Shape], floor: float
+) -> dict[str, Any]:
+    """The fields of an object of scene.json; its mesh stays as it is in the file.
+
+    The bounds that are stretched to the box are those of all vertices, used or not.
+    """
+    verts: NDArray[np.float64] = shapes[file][0]
+    low, high = verts.min(0), verts.max(0)
+    if (high <= low).any():
+        refuse(At(None, file), "a solid mesh", "a flat mesh")
+    scale = 2 * box.half / (high - low)
+    yaw = box.yaw + math.pi / 2  # TO_OURS is R_y of a quarter turn
+    c, s = math.cos(yaw), math.sin(yaw)
+    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    place = TO_OURS @ box.center - R @ (scale * (low + high) / 2)
+    lifted = box.name in LIFTED and box.center[1] - box.half[1] > floor + ON_FLOOR
+    return {
+        "id": f"{box.name}_{index}",
+        "category": box.name,
+        "mesh": file,
+        "annotation": index,
+        "translation": place.tolist(),
+        "yaw": math.atan2(math.sin(yaw), math.cos(yaw)),
+        "scale": scale.tolist(),
+        "support": "free" if lifted else "ground",
+    }

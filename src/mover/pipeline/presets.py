@@ -1,0 +1,232 @@
+"""The settings of all stages, and the three presets.
+
+`paper`:   each formula and number as printed.
+`release`: what the authors' released code computes, without its bugs.
+`robust`:  ours; docs/method.md gives the reason for each departure.
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
+
+from mover.energy.config import Adam, BatchedBFGS, SceneWeights
+from mover.stages.config import (
+    AlignConfig,
+    AssignConfig,
+    ContactConfig,
+    DepthConfig,
+    ExplainConfig,
+    FocalConfig,
+    FootContactConfig,
+    GatherConfig,
+    ImageConfig,
+    PlaceConfig,
+    PrepareConfig,
+    RefineConfig,
+    ReinitConfig,
+    SelectConfig,
+    SpreadConfig,
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of all stages, in their order."""
+
+    select: SelectConfig = field(default_factory=SelectConfig)
+    """Which frames are believed."""
+    focal: FocalConfig = field(default_factory=FocalConfig)
+    """The focal length from the people; kept as given unless `focal.spread` is above 0."""
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    """One depth factor a person."""
+    correct_depth: bool = False
+    """Whether it is looked for and applied."""
+    foot_contacts: FootContactConfig = field(default_factory=FootContactConfig)
+    """Feet at rest."""
+    align: AlignConfig = field(default_factory=AlignConfig)
+    """Camera pitch, roll and ground from the feet."""
+    contacts: ContactConfig = field(default_factory=ContactConfig)
+    """Where contacts come from."""
+    prepare: PrepareConfig = field(default_factory=PrepareConfig)
+    """How meshes are made fit."""
+    image: ImageConfig = field(default_factory=ImageConfig)
+    """How the image is sampled."""
+    layout: PlaceConfig = field(default_factory=PlaceConfig)
+    """Stage 1: objects from the image alone."""
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    """Camera and ground refined with the objects."""
+    sizes: SpreadConfig = field(default_factory=SpreadConfig)
+    """How far the given sizes are believed in this room."""
+    gather: GatherConfig = field(default_factory=GatherConfig)
+    """Evidence from all people."""
+    assign: AssignConfig = field(default_factory=AssignConfig)
+    """Which object each touching body part touches."""
+    reinit: ReinitConfig = field(default_factory=ReinitConfig)
+    """Seats put where their contacts are (release)."""
+    place: PlaceConfig = field(default_factory=PlaceConfig)
+    """Stage 2: objects from the image and the people."""
+    explain: ExplainConfig = field(default_factory=ExplainConfig)
+    """What holds each object, and how well its place is known."""
+    outer_iterations: int = 0
+    """Further passes of stage 2 with assignment and occlusion order renewed."""
+    slide_to_floor: bool = False
+    """Start on the floor along the rays with the size in the image kept; else dropped straight."""
+    silhouette_confidence: bool = False
+    """Believe the silhouette of an object less whose shape does not fit."""
+
+
+IMAGE_ONLY = SceneWeights(depth=0.0, collision=0.0, contact=0.0)
+"""L_scene: Eq. 1 without people."""
+
+PAPER = Config(
+    select=SelectConfig("each"),
+    align=AlignConfig(sigmas=(0.1,), votes="points"),
+    layout=PlaceConfig(weights=IMAGE_ONLY, method=Adam(1000)),
+    place=PlaceConfig(),
+)
+
+_RELEASE_IMAGE = SceneWeights(600.0, 0.5, 1000.0, 0.0, 0.0, 0.0, edge=0.05, offscreen=1.0)
+_RELEASE_FULL = SceneWeights(
+    1000.0, 0.3, 1000.0, 80.0, 1000.0, 1e5, edge=0.03, offscreen=1.0, free_space=80.0
+)
+
+RELEASE = Config(
+    select=SelectConfig("each", 0.0, 0.18, 0.0, 0.09, "vector", 1, 0.2),
+    align=AlignConfig(sigmas=(0.1,), votes="points"),
+    prepare=PrepareConfig(rule="release"),
+    image=ImageConfig(form="release"),
+    layout=PlaceConfig(
+        _RELEASE_IMAGE, "release", Adam(1000), first=Adam(200, 0.01, 0.01), span=0.8, chair_span=0.6
+    ),
+    gather=GatherConfig(erode=2),
+    assign=AssignConfig(by="release"),
+    reinit=ReinitConfig(use=True),
+    place=PlaceConfig(_RELEASE_FULL, "release", Adam(2500), span=0.8, chair_span=0.6),
+)
+
+_GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300, hand_reach=0.25)
+_SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
+_ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0, distance=0.02, wall=0.01)
+_ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.01)
+
+ROBUST = Config(
+    correct_depth=True,
+    foot_contacts=FootContactConfig(speed=0.6),
+    image=ImageConfig(
+        128, "robust", hidden=0.2, borders=(-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
+    ),
+    layout=PlaceConfig(
+        _ROBUST_IMAGE, "robust", BatchedBFGS(), yaws=16, distances=(0.9, 1.1), short=_SHORT,
+        num_hypotheses=6, coarse=2, perturbations=4, perturbation_rounds=2, wall_alignment_steps=2,
+        yaw_prior_weight=1.0,
+    ),
+    refine=RefineConfig(rounds=1),
+    sizes=SpreadConfig(0.05),
+    gather=GatherConfig(erode=1, reach=0.1),
+    assign=_GROUPS,
+    place=PlaceConfig(
+        _ROBUST_FULL, "robust", BatchedBFGS(), perturbations=4, perturbation_rounds=2,
+        wall_alignment_steps=2, yaw_prior_weight=1.0, apart=0.3,
+    ),
+    outer_iterations=1,
+    slide_to_floor=True,
+    silhouette_confidence=True,
+)  # fmt: skip
+
+METHODS = {"adam": Adam, "newton": BatchedBFGS}
+"""How a descent goes down: `--place.method newton` chooses one, with its own settings."""
+
+
+OLD_NAMES = {
+    "soles": "foot_contacts",
+    "touches": "contacts",
+    "again": "outer_iterations",
+    "slide": "slide_to_floor",
+    "trust": "silhouette_confidence",
+    "refine.growth": "refine.uniform_scale_weight",
+    **{
+        f"{stage}.{old}": f"{stage}.{new}"
+        for stage in ("layout", "place")
+        for old, new in (
+            ("keep", "num_hypotheses"), ("shaken", "perturbations"),
+            ("rounds", "perturbation_rounds"), ("lined", "wall_alignment_steps"),
+            ("tie", "yaw_prior_weight"), ("growth", "uniform_scale_weight"),
+        )
+    },
+}  # fmt: skip
+"""What settings were called before, for one release: flags and run.json may still say so."""
+
+
+def with_present_flags(arguments: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
+    """The arguments with the present names of settings, and a sentence for each that had another.
+
+    A flag may have its value after `=`, dashes in place of underscores, and `no-` before a switch.
+    """
+    present: list[str] = []
+    sentences: list[str] = []
+    for argument in arguments:
+        flag, equals, value = argument.partition("=")
+        prefix = "--no-" if flag.startswith("--no-") else "--"
+        old = flag.removeprefix(prefix)
+        new = _present_name(old)
+        if flag.startswith("--") and new != old:
+            sentences.append(f"{flag} is called {prefix}{new} now")
+            argument = f"{prefix}{new}{equals}{value}"
+        present.append(argument)
+    return present, tuple(sentences)
+
+
+def _present_name(name: str) -> str:
+    """`soles.speed` is `foot_contacts.speed`."""
+    plain = name.replace("-", "_")
+    for old, new in OLD_NAMES.items():
+        if plain == old or plain.startswith(f"{old}."):
+            return new + name[len(old) :]
+    return name
+
+
+def with_present_keys(tree: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The settings of a run.json under their present names, and a sentence for each old one."""
+    present = {k: dict(v) if isinstance(v, Mapping) else v for k, v in tree.items()}
+    sentences: list[str] = []
+    for old, new in OLD_NAMES.items():
+        stage, _, key = old.rpartition(".")
+        settings = present.get(stage) if stage else present
+        if isinstance(settings, dict) and key in settings:
+            settings[new.rpartition(".")[2]] = settings.pop(key)
+            sentences.append(f"config.{old} is called config.{new} now")
+    return present, tuple(sentences)
+
+
+def with_methods(config: Config, arguments: Sequence[str]) -> tuple[Config, list[str]]:
+    """Replace the methods of descents that are named, and return the other arguments."""
+    parser = argparse.ArgumentParser(prog="mover run", add_help=False, allow_abbrev=False)
+    names = [f"{stage}.{use}" for stage in ("layout", "place") for use in ("short", "method")]
+    for name in names:
+        parser.add_argument(f"--{name}", dest=name, choices=tuple(METHODS))
+    chosen, rest = parser.parse_known_args(list(arguments))
+    for name in names:
+        stage, use = name.split(".")
+        method = getattr(chosen, name)
+        if method is not None:
+            changed = replace(getattr(config, stage), **{use: METHODS[method]()})
+            config = replace(config, **{stage: changed})
+    return config, rest
+
+
+PRESETS = {"paper": PAPER, "release": RELEASE, "robust": ROBUST}
+_Pricing = TypeVar("_Pricing", PlaceConfig, RefineConfig)
+
+
+def with_sizes(config: Config, shape: float, whole: float) -> Config:
+    """The price of another shape, and of another size as a whole, multiplied in all stages."""
+
+    def of(stage: _Pricing) -> _Pricing:
+        weights = replace(stage.weights, scale=shape * stage.weights.scale)
+        growth = stage.uniform_scale_weight * whole / shape
+        return replace(stage, weights=weights, uniform_scale_weight=growth)
+
+    return replace(
+        config, layout=of(config.layout), refine=of(config.refine), place=of(config.place)
+    )

@@ -1,0 +1,231 @@
+"""The order of the stages, each kept on disk: from a capture to a consistent room."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mover.bodies.corrected import in_world, rows_of
+from mover.bodies.parts import parts_of
+from mover.core.run import Run as Run
+from mover.core.types import Camera, Capture, Layout, Room
+from mover.energy.objective import HumanCues
+from mover.geometry.camera import to_camera
+from mover.geometry.placement import GROUND, place, reproject, rest_on_support, slide_to_floor
+from mover.pipeline.outcome import (
+    PeopleState,
+    ReconstructionContext,
+    SceneState,
+    room_of,
+    unfurnished,
+)
+from mover.pipeline.presets import PRESETS as PRESETS
+from mover.pipeline.presets import Config as Config
+from mover.pipeline.presets import with_sizes
+from mover.stages.camera.align_camera import AlignInputs, align_camera
+from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
+from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
+from mover.stages.camera.refine_camera import RefineInputs, refine_camera
+from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
+from mover.stages.contacts.contact_association import AssignInputs
+from mover.stages.contacts.gather_cues import GatherInputs, cues_in_windows, gather_cues
+from mover.stages.objects.find_image_cues import (
+    ImageInputs,
+    detected_masks,
+    find_image_cues,
+    ground_without_people,
+    image_evidence,
+    order_of,
+)
+from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
+from mover.stages.objects.place_objects import estimate_size_prior, inlier_weights, place_objects
+from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
+from mover.stages.objects.starts import (
+    ReinitInputs,
+    alone,
+    best_few,
+    by_release,
+    contact_start,
+    joined,
+    other_starts,
+    reference_yaw,
+)
+from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
+from mover.stages.people.select_frames import SelectInputs, select_frames
+
+NOBODY = HumanCues()
+
+
+def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...] = ()) -> Room:
+    """From a capture to a consistent room (Sec. 3); `pinned` objects stay where they start."""
+    people = people_of(capture, config, run)
+    if not capture.scene.objects:
+        return unfurnished(capture, people)
+    seen = image_evidence(capture)
+    prepared = run.stage(prepare_objects, PrepareInputs(capture.scene.objects), config.prepare)
+    context = ReconstructionContext(capture, config, run, seen, prepared, pinned)
+    if people is None:
+        ground = ground_without_people(capture, prepared)
+        return room_of(context, placed_by_image(context, capture.scene.camera, ground), None)
+    state = placed_by_image(context, people.alignment.camera, people.alignment.ground)
+    context = with_size_prior(context, state)
+    for _ in range(config.refine.rounds):
+        state = with_refined_camera(context, people, state)
+    state = gathered(context, people, state)
+    image_energy = state.placed.energy[0]
+    state = placed_with_people(context, assigned(context, people, state), image_energy)
+    for _ in range(config.outer_iterations):
+        state = assigned(context, people, with_order(context, state))
+        state = placed_with_people(context, state, image_energy)
+    return room_of(context, state, people)
+
+
+def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
+    """Choose frames, find the people's depth and their feet, and from these camera and ground."""
+    bodies, scene = capture.bodies, capture.scene
+    if bodies is None:
+        return None
+    parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
+    kept = run.stage(select_frames, SelectInputs(bodies), config.select).keep
+    camera, warnings = _with_lens(capture, kept, config, run)
+    if config.correct_depth and capture.people is not None:
+        inputs = DepthInputs(bodies, parts, kept, capture.people, detected_masks(capture), camera)
+        depth = run.stage(find_depth, inputs, config.depth)
+        bodies, warnings = apply_depth(bodies, depth), (*warnings, *depth.warnings)
+    standing = FootContactInputs(bodies, parts, kept, camera)
+    feet = run.stage(find_foot_contacts, standing, config.foot_contacts)
+    known = AlignInputs(feet, camera, scene.ground, capture.camera_height)
+    alignment = run.stage(align_camera, known, config.align)
+    warnings = (*warnings, *feet.warnings, *alignment.warnings)
+    return PeopleState(bodies, kept, parts, feet, alignment, warnings)
+
+
+def _with_lens(
+    capture: Capture, kept: Bool[Tensor, " bodies"], config: Config, run: Run
+) -> tuple[Camera, tuple[str, ...]]:
+    """The given camera, with the focal length that the people tell where one is looked for."""
+    camera, bodies, people = capture.scene.camera, capture.bodies, capture.people
+    if config.focal.spread <= 0 or bodies is None or people is None:
+        return camera, ()
+    inputs = FocalInputs(bodies, kept, people, detected_masks(capture), camera)
+    lens = run.stage(find_focal, inputs, config.focal)
+    return zoomed(camera, lens), lens.warnings
+
+
+def with_size_prior(context: ReconstructionContext, state: SceneState) -> ReconstructionContext:
+    """The given sizes believed as far as this room's furniture bears them out."""
+    weights = inlier_weights(state.placed.energy[0])
+    learnt = estimate_size_prior(state.placed.layout, weights, context.config.sizes)
+    return replace(context, config=with_sizes(context.config, *learnt))
+
+
+def placed_by_image(context: ReconstructionContext, camera: Camera, ground: float) -> SceneState:
+    """Carry the initial scene into this world and place the objects by the image alone."""
+    objects, seen = context.prepared.objects, context.seen
+    old = context.capture.scene.camera.R_cam_world
+
+    def carried(layout: Layout) -> Layout:
+        there = reproject(layout, objects.size[:, 1], old, camera.R_cam_world)
+        if context.config.slide_to_floor:
+            slides = (objects.supports == GROUND) & ~_is_pinned(context)
+            there = slide_to_floor(there, ground, slides)
+        return rest_on_support(there, objects.supports, objects.size[:, 1], ground)
+
+    start = carried(context.prepared.start)
+    starts = alone(start)
+    if context.config.layout.num_hypotheses > 1 and context.capture.hypotheses:
+        others = other_starts(context.capture.hypotheses, objects, context.prepared.start)
+        starts = joined(starts, carried(others))
+    unordered = torch.zeros(len(objects.ids), len(objects.ids), dtype=torch.bool)
+    given = context.prepared.start.t_world_object.norm(dim=-1)
+    image = ImageInputs(
+        camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered, given
+    )
+    cues = context.run.stage(find_image_cues, image, context.config.image)
+    inputs = PlaceInputs(
+        objects, camera, ground, cues, NOBODY, starts, start.yaw, _pinned(context, start)
+    )
+    placed = context.run.stage(place_objects, inputs, context.config.layout)
+    found = SceneState(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
+    return replace(found, priced=(with_walls(inputs, placed.walls), context.config.layout))
+
+
+def with_refined_camera(
+    context: ReconstructionContext, people: PeopleState, state: SceneState
+) -> SceneState:
+    """Camera and ground refined with the objects, and the objects placed anew under them."""
+    cues = context.run.stage(find_image_cues, state.image, context.config.image)
+    spread, objects = people.alignment.covariance, context.prepared.objects
+    inputs = RefineInputs(state.camera, state.ground, spread, objects, cues, state.placed.layout)
+    better = context.run.stage(refine_camera, inputs, context.config.refine)
+    found = placed_by_image(context, better.camera, better.ground)
+    return replace(found, traces={**state.traces, "camera": better.trace, **found.traces})
+
+
+def gathered(context: ReconstructionContext, people: PeopleState, state: SceneState) -> SceneState:
+    """The state with depth maps and free space from all frames."""
+    bodies = in_world(rows_of(people.bodies, people.kept), state.camera)
+    inputs = GatherInputs(bodies, context.capture.people, context.seen.masks, state.camera)
+    return replace(state, cues=context.run.stage(gather_cues, inputs, context.config.gather))
+
+
+def assigned(context: ReconstructionContext, people: PeopleState, state: SceneState) -> SceneState:
+    """The state with contact points, each given to an object where it stands now."""
+    bodies = in_world(rows_of(people.bodies, people.kept), state.camera)
+    capture, config, seen, run = context.capture, context.config, context.seen, context.run
+    given = None if capture.touch is None else capture.touch[people.kept]
+    inputs = ContactInputs(bodies, people.parts, state.ground, given)
+    chance = run.stage(find_contacts, inputs, config.contacts).probability
+    contacts = AssignInputs(
+        bodies, chance, people.parts, seen.masks, seen.boxes, state.camera,
+        context.prepared.objects, state.placed.layout, capture.people,
+    )  # fmt: skip
+    return replace(state, contacts=run.stage(assign_contacts, contacts, config.assign))
+
+
+def placed_with_people(
+    context: ReconstructionContext, state: SceneState, image_energy: Float[Tensor, " objects"]
+) -> SceneState:
+    """One descent of the whole of Eq. 1."""
+    objects, config, run = context.prepared.objects, context.config, context.run
+    assert state.cues is not None
+    assert state.contacts is not None
+    contacts = state.contacts.points
+    image = run.stage(find_image_cues, state.image, config.image)
+    humans = cues_in_windows(state.cues, contacts, image.views, state.camera)
+    if config.silhouette_confidence:
+        image = replace(image, trust=inlier_weights(image_energy))
+    seats = ReinitInputs(objects, state.camera, humans, image.masks, state.placed.layout)
+    starts = alone(run.stage(by_release, seats, config.reinit))
+    if config.layout.num_hypotheses > 1:
+        contact = contact_start(state.placed.layout, objects, contacts)
+        placed = state.placed
+        different = best_few(placed.candidates, placed.energy, config.layout.num_hypotheses)
+        starts = joined(different, alone(contact))
+    reference = reference_yaw(state.start.yaw, contacts)
+    inputs = PlaceInputs(
+        objects, state.camera, state.ground, image, humans, starts, reference,
+        _pinned(context, state.start),
+    )  # fmt: skip
+    placed = run.stage(place_objects, inputs, config.place)
+    traces = {**state.traces, f"people {len(state.traces)}": placed.trace}
+    priced = with_walls(inputs, placed.walls), config.place
+    return replace(state, placed=placed, traces=traces, priced=priced)
+
+
+def _is_pinned(context: ReconstructionContext) -> Bool[Tensor, " objects"]:
+    ids = context.prepared.objects.ids
+    return torch.tensor([name in context.pinned for name in ids], dtype=torch.bool)
+
+
+def _pinned(context: ReconstructionContext, start: Layout) -> Pinned | None:
+    return Pinned(_is_pinned(context), start) if context.pinned else None
+
+
+def with_order(context: ReconstructionContext, state: SceneState) -> SceneState:
+    """The state with what stands behind what, as the objects are placed now."""
+    verts = place(context.prepared.objects.verts, state.placed.layout)
+    z = to_camera(verts, state.camera.R_cam_world)[..., 2]
+    behind = order_of(z.amin(-1), z.amax(-1))
+    return replace(state, image=replace(state.image, behind=behind))

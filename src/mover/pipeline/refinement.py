@@ -1,0 +1,153 @@
+"""Refine the people of a finished result with its room; find the contacts of bodies."""
+
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.bodies.posa import load_posa, posa_contacts
+from mover.core.errors import InputError
+from mover.core.files import replacing
+from mover.core.observe import Observer, silent
+from mover.core.types import Bodies, Capture, Mesh, Room, Scene
+from mover.evaluate.bodies import MOTION_METRICS, POSE_METRICS, gather_gait, gather_twins
+from mover.evaluate.scene import measure
+from mover.io.capture.bodies_file import read_bodies, read_contacts, write_bodies
+from mover.io.capture.camera_file import camera_of
+from mover.io.capture.scene_file import read_scene
+from mover.io.export.finished import read_finished
+from mover.io.files.fields import At, read_json
+from mover.io.files.meshes import read_mesh
+from mover.io.files.npz import write_npz
+from mover.io.formats import read
+from mover.pipeline.outcome import to_world
+from mover.stages.config import RefineBodiesConfig
+from mover.stages.people.refine_bodies import RefinedBodies, refine_bodies
+
+log = logging.getLogger(__name__)
+
+
+def finished_room(out: Path) -> Room:
+    """The room of a result folder, with its closed proxies and its people.
+
+    Raises:
+        InputError: If there is no result, or something in it is wrong.
+    """
+    done = read_finished(out)
+    folder = out / "watertight"
+    proxies = tuple(_proxy(piece.id, folder) for piece in done.scene.objects)
+    return Room(
+        scene=done.scene, initial=done.scene, image_only=done.scene, bodies=done.bodies, kept=None,
+        proxies=proxies, evidence=(), covariance=None, traces={}, warnings=(),
+    )  # fmt: skip
+
+
+def _proxy(name: str, folder: Path) -> Mesh:
+    return read_mesh(At(f"{name}.glb", "scene.json", f"watertight mesh of '{name}'"), folder)[0]
+
+
+def source_capture(out: Path, given: Path | None) -> Capture | None:
+    """The capture that a result was made of: as given, else where its run.json says; None: gone."""
+    if given is not None:
+        return read("folder", given)
+    log_file = out / "run.json"
+    tree = read_json(log_file).value if log_file.is_file() else {}
+    source = str(tree.get("source", "")) if isinstance(tree, Mapping) else ""
+    if not source or not Path(source).exists():
+        log.warning("the capture of %s is not there: no masks and no given contacts", out)
+        return None
+    return read(str(tree.get("source_format", "folder")), Path(source))
+
+
+def refine_result(
+    out: Path, config: RefineBodiesConfig, capture: Path | None = None, observe: Observer = silent
+) -> RefinedBodies:
+    """Refine the people of a result and write OUT/refined/bodies.npz.
+
+    Raises:
+        InputError: If the result lacks people or a floor, or cannot be read.
+    """
+    room = finished_room(out)
+    if room.bodies is None:
+        raise InputError(f"{out}: has no bodies.npz: there is nobody to refine")
+    found = refine_bodies(room, source_capture(out, capture), config, observe)
+    write_bodies(found.bodies, out / "refined" / "bodies.npz")
+    return found
+
+
+def refined_room(room: Room, capture: Capture, observe: Observer = silent) -> Room:
+    """The room with its people refined, where there are people and a floor."""
+    if room.bodies is None or not len(room.bodies.frame) or room.scene.ground is None:
+        return room
+    found = refine_bodies(room, capture, RefineBodiesConfig(), observe)
+    return replace(room, bodies=found.bodies)
+
+
+def measure_people(out: Path, truth: Path) -> dict[str, dict[str, float]]:
+    """The people of a result before and after their refinement against the true ones.
+
+    Writes OUT/refined/metrics.json.
+
+    Raises:
+        InputError: If a file is missing or wrong.
+    """
+    own = truth / "camera.json"
+    camera = camera_of(read_json(own)) if own.exists() else None
+    scene = read_scene(truth / "scene.json", camera)
+    true = to_refined_world(read_bodies(truth / "bodies.npz"), scene)
+    ground = read_scene(out / "scene.json").ground
+    values: dict[str, dict[str, float]] = {}
+    for name, path in (("result", out / "bodies.npz"), ("refined", out / "refined" / "bodies.npz")):
+        bodies = read_bodies(path)
+        twins = gather_twins(bodies, true)
+        values[name] = {} if twins is None else measure(POSE_METRICS, twins)
+        values[name] |= measure(MOTION_METRICS, gather_gait(bodies, true, ground))
+    with replacing(out / "refined" / "metrics.json") as part:
+        part.write_text(json.dumps(values, indent=1, allow_nan=False))
+    return values
+
+
+def to_refined_world(bodies: Bodies, scene: Scene) -> Bodies:
+    """Bodies in the world of a scene."""
+    return bodies if bodies.space == "world" else to_world(bodies, scene.camera)
+
+
+def find_posa(
+    bodies: Bodies, weights: Path, meshes: Path, samples: int, camera: Path | None
+) -> Float[Tensor, "bodies verts"]:
+    """Contacts by POSA, upright by the camera's pitch and roll where the bodies are in its axes.
+
+    Raises:
+        InputError: If a file is missing or wrong, or gravity is not known.
+    """
+    if bodies.space == "camera":
+        if camera is None:
+            raise InputError("bodies.npz: in the camera's axes; --camera must say where up is")
+        bodies = to_world(bodies, camera_of(read_json(camera)))
+    return posa_contacts(load_posa(weights, meshes), bodies, samples)
+
+
+def write_contacts(chance: Float[Tensor, "bodies verts"], out: Path) -> None:
+    """Write contacts.npz of a capture."""
+    write_npz({"probability": chance.to(torch.float32).numpy()}, out)
+
+
+def contacts_from(source: Path, bodies: Bodies, first: int) -> Float[Tensor, "bodies verts"]:
+    """Contacts from files of another tool, see `io.capture.bodies_file`."""
+    return read_contacts(source, bodies, first)
+
+
+def switched(config: RefineBodiesConfig, off: Mapping[str, bool]) -> RefineBodiesConfig:
+    """The settings without some of the evidence: camgp, sdf, contact, order, masks."""
+    terms = {
+        "camgp": ("under", "stand", "lock"), "sdf": ("sink",), "contact": ("touch",),
+        "order": ("order",), "masks": ("outline",),
+    }  # fmt: skip
+    zero: dict[str, Any] = {t: 0.0 for name, is_off in off.items() if is_off for t in terms[name]}
+    return replace(config, weights=replace(config.weights, **zero))

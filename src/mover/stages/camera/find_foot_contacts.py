@@ -1,0 +1,188 @@
+"""Find the soles that carry people: still feet under straight legs (Sec. 3.2, C^feet).
+
+Departure: The paper takes every foot vertex that a network calls a contact. But feet of people who
+sit or lie hang in the air or lie on furniture; here a foot counts only if it is the lower one, does
+not move, and its leg is straight, which is judged without knowing the floor. Where nobody ever
+stands like this, the best there is counts, with a warning.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mover.bodies.parts import Parts, members
+from mover.bodies.posture import at, landmarks
+from mover.core.observe import Observer, Step, silent
+from mover.core.records import record
+from mover.core.types import Bodies, Camera
+from mover.energy.terms.feet import FootContacts
+from mover.stages.config import FootContactConfig
+
+SIDES = ("left", "right")
+WITHIN = 0.5  # [s] between two frames that still tell whether a foot moved
+FAR_ENOUGH = 0.15  # [s] between them, at least, where the video has them: jitter is no motion
+JITTER = 0.03  # [m] that a still foot seems to move
+TALL = 0.9  # of a person's usual height, from head to foot: who is lower does not stand
+USUAL = 0.95  # quantile of the heights that is called usual
+
+
+@record
+class FootContactInputs:
+    """People, in camera axes, and a rough idea of where up is."""
+
+    bodies: Bodies
+    parts: Parts
+    keep: Bool[Tensor, " bodies"]
+    """Which rows are sound, from `select_frames`."""
+    camera: Camera
+    """Its pitch and roll may be off by several degrees."""
+
+
+@record
+class _Feet:
+    """The lower foot of each body."""
+
+    points: Float[Tensor, "bodies points 3"]
+    carries: Bool[Tensor, " bodies"]
+    """Its leg is straight, as far as can be told."""
+    still: Bool[Tensor, " bodies"]
+
+
+def find_foot_contacts(
+    inputs: FootContactInputs,
+    config: FootContactConfig = FootContactConfig(),
+    observe: Observer = silent,
+) -> FootContacts:
+    """Collect the lowest points of the feet that carry people.
+
+    Raises:
+        ValueError: If the bodies are not in camera axes.
+    """
+    bodies = inputs.bodies
+    if bodies.space != "camera":
+        raise ValueError(f"find_foot_contacts needs bodies in 'camera' space, not '{bodies.space}'")
+    sound = inputs.keep if bool(inputs.keep.any()) else torch.ones_like(inputs.keep)
+    if not len(bodies.frame):
+        none = bodies.frame
+        return FootContacts(bodies.verts.new_zeros(0, 3), none, none, ())
+    feet = _lower_feet(inputs, config)
+    use, warnings = _best_evidence(feet, sound)
+    observe(Step("find_foot_contacts", 0, 1))
+    count = feet.points.shape[1]
+    return FootContacts(
+        points_cam=feet.points[use].reshape(-1, 3),
+        person=bodies.person[use].repeat_interleave(count),
+        frame=bodies.frame[use].repeat_interleave(count),
+        warnings=warnings,
+    )
+
+
+def _best_evidence(
+    feet: _Feet, sound: Bool[Tensor, " bodies"]
+) -> tuple[Bool[Tensor, " bodies"], tuple[str, ...]]:
+    """The strictest choice that leaves something, and what to say about it."""
+    levels = (
+        (feet.carries & feet.still, ()),
+        (feet.carries, ("no standing foot is ever still: moving feet tell the floor",)),
+        (
+            feet.still,
+            ("nobody ever stands on a straight leg: the lowest still feet tell the floor",),
+        ),
+        (sound, ("no foot is ever still: the lowest point of every body tells the floor",)),
+    )
+    for chosen, warnings in levels:
+        if bool((chosen & sound).any()):
+            return chosen & sound, warnings
+    raise AssertionError("some body is sound")
+
+
+def _lower_feet(inputs: FootContactInputs, config: FootContactConfig) -> _Feet:
+    """Points, posture and motion of the lower foot of each body."""
+    bodies, up = inputs.bodies, inputs.camera.R_cam_world[:, 1].to(inputs.bodies.verts)
+    straight = straight_legs(bodies, inputs.parts, up, config)
+    points, still, height = [], [], []
+    for side in SIDES:
+        sole = members(inputs.parts, f"{side}_sole")
+        verts = bodies.verts[:, sole] if bool(sole.any()) else bodies.verts
+        lowest = (verts @ up).topk(min(config.points, verts.shape[1]), dim=1, largest=False)
+        points.append(verts.take_along_dim(lowest.indices[..., None], 1))
+        height.append(lowest.values.mean(1))
+        still.append(_still(verts.mean(1), bodies, config.speed))
+    right = (height[1] < height[0]).long()
+    return _Feet(
+        torch.stack(points, 1).take_along_dim(right[:, None, None, None], 1)[:, 0],
+        straight.take_along_dim(right[:, None], 1)[:, 0],
+        torch.stack(still, 1).take_along_dim(right[:, None], 1)[:, 0],
+    )
+
+
+def straight_legs(
+    bodies: Bodies, parts: Parts, up: Float[Tensor, "3"], config: FootContactConfig
+) -> Bool[Tensor, "bodies sides"]:
+    """Whether each leg, left and right, stands straight; `up` may be off by several degrees.
+
+    Of a mesh without landmarks: whether the body reaches about as high as its person usually does.
+    """
+    places = landmarks(bodies, parts)
+    if bool(places.isnan().any()):
+        return _tall(bodies, up)[:, None].expand(-1, 2)
+    legs: list[Tensor] = []
+    for side in SIDES:
+        hip, knee, ankle = (at(places, f"{side}_{joint}") for joint in ("hip", "knee", "ankle"))
+        trunk = at(places, "neck") - at(places, "hips")
+        lean = _angle(hip - ankle, up.expand_as(hip))
+        bent = _angle(hip - knee, ankle - knee) < config.knee
+        sits = _angle(knee - hip, trunk) < config.hip
+        legs.append(~bent & ~sits & (lean < config.upright))
+    return torch.stack(legs, 1)
+
+
+def _angle(a: Float[Tensor, "bodies 3"], b: Float[Tensor, "bodies 3"]) -> Float[Tensor, " bodies"]:
+    """Angle between vectors [degrees]."""
+    across = torch.linalg.cross(a, b).norm(dim=-1)
+    return torch.rad2deg(torch.atan2(across, (a * b).sum(-1)))
+
+
+def _tall(bodies: Bodies, up: Float[Tensor, "3"]) -> Bool[Tensor, " bodies"]:
+    """Whether a body reaches about as high as its person usually does."""
+    height = bodies.verts @ up
+    reach = height.amax(1) - height.amin(1)
+    tall = torch.zeros_like(reach, dtype=torch.bool)
+    for person in bodies.person.unique():
+        mine = bodies.person == person
+        tall[mine] = reach[mine] >= TALL * reach[mine].quantile(USUAL)
+    return tall
+
+
+def _still(
+    foot: Float[Tensor, "bodies 3"], bodies: Bodies, speed: float
+) -> Bool[Tensor, " bodies"]:
+    """Whether a foot rests, seen from the nearest useful frame before or after; unknown: yes."""
+    still = torch.ones(len(foot), dtype=torch.bool, device=foot.device)
+    if bodies.fps is None:
+        return still
+    for person in bodies.person.unique():
+        rows = (bodies.person == person).nonzero()[:, 0]
+        rows = rows[bodies.frame[rows].argsort()]
+        time = bodies.frame[rows].to(foot.dtype) / bodies.fps
+        still[rows] = _rests(foot[rows], time, speed)
+    return still
+
+
+def _rests(
+    foot: Float[Tensor, "frames 3"], time: Float[Tensor, " frames"], speed: float
+) -> Bool[Tensor, " frames"]:
+    """Whether a foot hardly moves to the frame before, or to the one after."""
+    last = len(time) - 1
+    after = torch.searchsorted(time, time + FAR_ENOUGH - 1e-4).clamp_max(last)
+    before = (torch.searchsorted(time, time - FAR_ENOUGH + 1e-4, right=True) - 1).clamp_min(0)
+    known, rests = (
+        torch.zeros_like(time, dtype=torch.bool),
+        torch.zeros_like(time, dtype=torch.bool),
+    )
+    for other in (before, after):
+        wait = (time - time[other]).abs()
+        told = (wait > 0) & (wait <= WITHIN)
+        known = known | told
+        rests = rests | told & ((foot - foot[other]).norm(dim=-1) < JITTER + speed * wait)
+    return rests | ~known

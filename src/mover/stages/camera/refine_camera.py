@@ -1,0 +1,165 @@
+"""Refine camera and ground together with the objects that stand on it.
+
+Ours, not the paper's, which freezes the camera after the feet: one degree of pitch or 2 cm of
+ground is 5-15 cm of depth at 5 m, because an object stands where the ray to its base meets the
+floor. Objects whose shape fits tell the camera more exactly than noisy feet do.
+
+    min over pitch, roll, ground and all objects on the floor:
+        sum_i E_i / (E_i(start) + 0.02)  +  w/2 d^T C^-1 d
+
+Each object's energy is divided by its own residual: exact shapes pull hard, wrong shapes softly.
+d is the change of pitch, roll and ground, C their covariance from the feet: a floor that was
+walked all around outweighs the objects, and what no foot told is left to them. The borders of the
+masks are held as they suit the objects at first (`fixed_borders`). An object is carried by the
+ray to the centre of its base, so a change of the camera leaves it where it is in the image.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.core.devices import constant
+from mover.core.observe import Energy, Observer, silent
+from mover.core.records import record
+from mover.core.types import Camera, Layout, Objects
+from mover.energy.config import SceneConfig, SceneWeights
+from mover.energy.fused.energy import never_asks
+from mover.energy.minimize import minimize
+from mover.energy.objective import HumanCues, ImageCues, best_borders, scene_energy
+from mover.geometry.camera import pitch_roll, tilted, to_camera
+from mover.geometry.placement import GROUND, LOWEST, hit_floor
+from mover.stages.config import RefineConfig
+
+# Masks whose border has been found: evidence without that freedom.
+
+
+def fixed_borders(
+    image: ImageCues, layout: Layout, objects: Objects, camera: Camera, weights: SceneWeights
+) -> ImageCues:
+    """The masks and boxes under the shift that suits a layout best (`terms.border`).
+
+    The layout has one place for each object.
+    """
+    borders = image.borders
+    if borders is None:
+        return image
+    with torch.no_grad():
+        number = best_borders(layout, objects, camera, image, weights)
+    shift = borders.shifts[number]
+    boxes = image.boxes + torch.stack([-shift, -shift, shift, shift], -1)
+    masks = borders.masks[number, torch.arange(len(number))]
+    return replace(image, masks=masks, boxes=boxes, borders=None)
+
+
+SOFT = 0.02  # [1], added to an object's own residual
+UNITS = (
+    0.01,
+    0.01,
+    0.02,
+    0.01,
+    0.05,
+    0.03,
+)  # pitch, roll [rad], ground [m], rays, yaw [rad], log scale
+
+
+@record
+class RefineInputs:
+    """Camera and ground from the feet, objects from the image alone."""
+
+    camera: Camera
+    ground: float
+    covariance: Float[Tensor, "3 3"]
+    """Of pitch [rad], roll [rad] and ground [m], from the feet."""
+    objects: Objects
+    image: ImageCues
+    layout: Layout
+
+
+@record
+class Refined:
+    """The better camera and ground."""
+
+    camera: Camera
+    ground: float
+    trace: Float[Tensor, " steps"]
+
+
+@record
+class _Joint:
+    tilt: Float[Tensor, "3"]
+    rays: Float[Tensor, "objects 2"]
+    yaw: Float[Tensor, " objects"]
+    log_scale: Float[Tensor, "objects 3"]
+
+
+def refine_camera(
+    inputs: RefineInputs, config: RefineConfig, observe: Observer = silent
+) -> Refined:
+    """Minimise over the camera, the ground and all standing objects at once."""
+    image = SceneConfig(config.weights, "robust", config.uniform_scale_weight)
+    fixed, certainty = _start(inputs), torch.linalg.inv(inputs.covariance)
+    cues = fixed_borders(inputs.image, inputs.layout, inputs.objects, inputs.camera, config.weights)
+    usable = _usable(inputs)
+    zero = _Joint(
+        *(torch.zeros_like(x) for x in (fixed.tilt, fixed.rays, fixed.yaw, fixed.log_scale))
+    )
+
+    def objects_energy(joint: _Joint) -> Float[Tensor, " objects"]:
+        camera, layout = _unpack(joint, inputs)
+        energy = scene_energy(layout, inputs.objects, camera, cues, HumanCues(), image)
+        return energy.per_item
+
+    with torch.no_grad():
+        own = objects_energy(fixed) + SOFT
+
+    def energy(free: _Joint) -> Energy:
+        joint = _shift(fixed, free)
+        terms = objects_energy(joint) / own
+        off = joint.tilt - fixed.tilt
+        feet = 0.5 * config.feet * (off @ certainty @ off)
+        return Energy({"objects": (terms * usable).sum(), "feet": feet})
+
+    if not bool(usable.any()):
+        return Refined(inputs.camera, inputs.ground, torch.zeros(0))
+    still = never_asks(inputs.objects)
+    found = minimize(energy, zero, config.method, observe, "refine_camera", still=still)
+    joint = _shift(fixed, found.at)
+    camera, _ = _unpack(joint, inputs)
+    return Refined(camera, float(joint.tilt[2]), found.trace)
+
+
+def _start(inputs: RefineInputs) -> _Joint:
+    base = to_camera(inputs.layout.t_world_object, inputs.camera.R_cam_world)
+    rays = base[:, :2] / base[:, 2:].clamp_min(0.1)
+    pitch, roll = pitch_roll(inputs.camera.R_cam_world)
+    tilt = torch.stack([pitch, roll, pitch.new_tensor(inputs.ground)])
+    return _Joint(tilt, rays, inputs.layout.yaw, inputs.layout.log_scale)
+
+
+def _usable(inputs: RefineInputs) -> Float[Tensor, " objects"]:
+    """Objects on the ground, in front of the camera, below the horizon, with a mask."""
+    t = inputs.layout.t_world_object
+    low = -t[:, 1] > 2 * LOWEST * t.norm(dim=-1)
+    ahead = to_camera(t, inputs.camera.R_cam_world)[:, 2] > 0.3
+    seen = inputs.image.keep.flatten(1).any(-1)
+    return ((inputs.objects.supports == GROUND) & low & ahead & seen).to(t)
+
+
+def _shift(fixed: _Joint, free: _Joint) -> _Joint:
+    units = constant(UNITS, fixed.tilt)
+    return _Joint(
+        fixed.tilt + free.tilt * units[:3],
+        fixed.rays + free.rays * units[3],
+        fixed.yaw + free.yaw * units[4],
+        fixed.log_scale + free.log_scale * units[5],
+    )
+
+
+def _unpack(joint: _Joint, inputs: RefineInputs) -> tuple[Camera, Layout]:
+    old = inputs.camera
+    R = tilted(joint.tilt[0], joint.tilt[1])
+    rays = torch.nn.functional.pad(joint.rays, (0, 1), value=1.0)
+    t = hit_floor(rays, R, joint.tilt[2])
+    return Camera(old.K, R, old.width, old.height), Layout(t, joint.yaw, joint.log_scale)

@@ -1,0 +1,180 @@
+"""Find what body parts touch: the chance of every vertex, and the objects that they are given to.
+
+A part goes to an object by the overlap of its projection with the objects' masks and by the
+distance in 3D: `contact_association` has the rules of the three presets (Sec. 3.1).
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.bodies.parts import Parts
+from mover.bodies.posture import headings, postures, touching
+from mover.bodies.skin import PARTS
+from mover.core.observe import Observer, silent
+from mover.core.records import record
+from mover.core.types import Bodies
+from mover.energy.terms.contact import ContactPoints
+from mover.geometry.mesh import vertex_normals
+from mover.stages.config import AssignConfig, ContactConfig
+from mover.stages.contacts.contact_association import AssignInputs, ContactRows, contact_rows
+
+
+@record
+class ContactInputs:
+    """Bodies in the world whose up is true, and what the user knows of their contacts."""
+
+    bodies: Bodies
+    parts: Parts
+    ground: float
+    given: Float[Tensor, "bodies verts"] | None
+
+
+@record
+class ContactProbability:
+    """Chance that each vertex touches something."""
+
+    probability: Float[Tensor, "bodies verts"]
+
+
+def find_contacts(
+    inputs: ContactInputs, config: ContactConfig, observe: Observer = silent
+) -> ContactProbability:
+    """Contacts by geometry and motion: seat and thighs, back, hands, soles."""
+    del observe
+    if config.given and inputs.given is not None:
+        return ContactProbability(inputs.given)
+    return ContactProbability(touching(inputs.bodies, inputs.parts, inputs.ground))
+
+
+# Thin clouds of points out to cells, so that their number does not grow with the video.
+
+
+GOLDEN = 0.6180339887498949  # its multiples, modulo 1, fill the unit interval evenly
+
+
+def thin(
+    points: Float[Tensor, "points 3"],
+    group: Int[Tensor, " points"],
+    groups: int,
+    limits: tuple[float, int],
+) -> tuple[Float[Tensor, "groups most 3"], Float[Tensor, "groups most"]]:
+    """One point, their mean, for all points of a group in one cell; and how many they were.
+
+    Args:
+        points: All points [m].
+        group: Group of each point.
+        groups: Number of groups.
+        limits: Edge of a cell [m], and the number of points of a group that are kept at most:
+            where there are more cells, evenly chosen ones stand for all.
+    """
+    cell, most = limits
+    key = torch.cat([group.unsqueeze(-1), (points / cell).floor().long()], -1)
+    cells, owner, count = key.unique(dim=0, return_inverse=True, return_counts=True)
+    means = torch.zeros(len(cells), 3, dtype=points.dtype).index_add(0, owner, points)
+    means = means / count.unsqueeze(-1)
+    rows: list[tuple[Tensor, Tensor]] = []
+    for g in range(groups):
+        mine = (cells[:, 0] == g).nonzero()[:, 0]
+        kept = evenly(mine, most)
+        total = count[mine].sum().to(points)
+        share = count[kept].to(points)
+        rows.append((means[kept], share * (total / share.sum().clamp_min(1))))
+    longest = max(1, max(len(p) for p, _ in rows))
+    padded = [torch.nn.functional.pad(p, (0, 0, 0, longest - len(p))) for p, _ in rows]
+    weight = [torch.nn.functional.pad(w, (0, longest - len(w))) for _, w in rows]
+    return torch.stack(padded), torch.stack(weight)
+
+
+def evenly(rows: Int[Tensor, " rows"], most: int) -> Int[Tensor, " some"]:
+    """At most so many of them, evenly spread, the first and the last among them."""
+    return rows[torch.linspace(0, len(rows) - 1, min(most, len(rows))).round().long()]
+
+
+def in_turns(count: int) -> Int[Tensor, " count"]:
+    """An order of so many rows whose beginnings are all spread evenly (golden ratio)."""
+    return (torch.arange(count, dtype=torch.float64) * GOLDEN % 1).argsort()
+
+
+LEVEL = 0.7071  # cosine of 45 degrees, the released code's split of the normals
+
+
+@record
+class ContactAssignment:
+    """Who touches what."""
+
+    points: ContactPoints | None
+    """Contact points of each object; None: nothing is touched."""
+    seated_on: Bool[Tensor, " bodies"]
+    """Bodies whose seat or back touches an object."""
+    bodies: tuple[int, ...]
+    """Number of bodies that touch each object."""
+    pairs: Int[Tensor, "pairs 3"]
+    """Who touches what: body, object, and part as in `ContactPoints.points`."""
+
+
+def assign_contacts(
+    inputs: AssignInputs, config: AssignConfig, observe: Observer = silent
+) -> ContactAssignment:
+    """Give each touching part of each body to the object that it touches."""
+    del observe
+    found = [c for c in contact_rows(inputs, config) if len(c.body)]
+    seated = torch.zeros(len(inputs.bodies.frame), dtype=torch.bool)
+    counts = [0] * len(inputs.objects.ids)
+    if not found:
+        return ContactAssignment(None, seated, tuple(counts), torch.zeros(0, 3, dtype=torch.long))
+    names = ("body", "vert", "object_of", "hand")
+    rows = ContactRows(*(torch.cat([getattr(c, n) for c in found]) for n in names))
+    seated[rows.body[~rows.hand]] = True
+    part = _parts(rows, inputs, config)
+    points = _pack(rows, part, inputs, config)
+    for i, bodies in zip(points.object_of.tolist(), points.bodies.tolist(), strict=True):
+        counts[i] = int(bodies)
+    pairs = torch.stack([rows.body, rows.object_of, part], -1).unique(dim=0)
+    return ContactAssignment(points, seated, tuple(counts), pairs)
+
+
+def _parts(rows: ContactRows, inputs: AssignInputs, config: AssignConfig) -> Int[Tensor, " rows"]:
+    """The part that each row touches: top, back, and the same for hands."""
+    normals = vertex_normals(inputs.bodies.verts, inputs.bodies.faces)[rows.body, rows.vert]
+    level = normals[:, 1].abs() >= LEVEL
+    if config.split == "parts":
+        level = level | (inputs.parts.part_of[rows.vert] != PARTS.index("back"))
+    return (~level).long() + 2 * rows.hand.long()
+
+
+def _pack(
+    rows: ContactRows, part: Int[Tensor, " rows"], inputs: AssignInputs, config: AssignConfig
+) -> ContactPoints:
+    points = inputs.bodies.verts[rows.body, rows.vert]
+    touched = rows.object_of.unique()
+    packed, weight = thin(
+        points,
+        torch.searchsorted(touched, rows.object_of) * 4 + part,
+        4 * len(touched),
+        (config.cell, config.most),
+    )
+    back = inputs.objects.has_back[touched].float()
+    usable = torch.stack([torch.ones_like(back), back, torch.ones_like(back), back], -1)
+    weight = weight.unflatten(0, (len(touched), 4)) * usable.unsqueeze(-1)
+    bodies = [len(rows.body[rows.object_of == o].unique()) for o in touched.tolist()]
+    return ContactPoints(
+        touched, packed.unflatten(0, (len(touched), 4)), weight,
+        torch.tensor(bodies, dtype=points.dtype), _headings(rows, touched, inputs),
+    )  # fmt: skip
+
+
+def _headings(rows: ContactRows, touched: Int[Tensor, " touched"], inputs: AssignInputs) -> Tensor:
+    """Mean horizontal direction of those who sit on each touched object; zero for none.
+
+    Only of objects with a back: one sits on the side of a bed, and round a stool.
+    """
+    facing = headings(inputs.bodies, inputs.parts)[:, [0, 2]]
+    sits = postures(inputs.bodies, inputs.parts).sitting
+    means: list[Tensor] = []
+    for o in touched.tolist():
+        seated = rows.body[(rows.object_of == o) & ~rows.hand].unique()
+        mean = facing[seated[sits[seated]]].sum(0)
+        told = bool(inputs.objects.has_back[o]) and float(mean.norm()) > 0.1
+        means.append(mean / mean.norm() if told else 0 * mean)
+    return torch.stack(means)

@@ -1,0 +1,114 @@
+"""Say where the result should be doubted (supplement, "Failure Cases").
+
+A person who sits on nothing (a missing object), a lower body that is hidden (a guessed pose), and a
+seat whose mesh has another height than its sitters (a wrong shape).
+"""
+
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mover.bodies.parts import Parts, members
+from mover.bodies.posture import postures
+from mover.core.records import record
+from mover.core.types import Bodies, Camera, Layout, Objects, People
+from mover.energy.terms.contact import ContactPoints
+from mover.geometry.camera import project, to_camera
+from mover.geometry.placement import place
+from mover.stages.masks import mask_table
+
+OFTEN = 3  # bodies from which on something is worth a warning
+SEEN = 0.25  # share of the lower body that must be seen
+HEIGHT = 0.08  # [m], between a seat and its sitters
+EVERY = 5  # of the bodies, checked for hidden legs
+LEGS = ("left_sole", "right_sole", "seat", "left_thigh", "right_thigh")
+
+
+@record
+class DiagnosticInputs:
+    """The finished room with its people."""
+
+    bodies: Bodies
+    parts: Parts
+    people: People | None
+    camera: Camera
+    objects: Objects
+    layout: Layout
+    contacts: ContactPoints | None
+    seated_on: Bool[Tensor, " bodies"]
+    """Bodies whose seat is assigned to an object."""
+
+
+def diagnostics(inputs: DiagnosticInputs) -> tuple[str, ...]:
+    """Warnings, each one sentence."""
+    return (*_nothing_below(inputs), *_hidden_legs(inputs), *_wrong_seats(inputs))
+
+
+def _often(found: Bool[Tensor, " bodies"], bodies: Bodies) -> Iterator[tuple[int, int, str]]:
+    """Each person of whom `OFTEN` bodies are found, how many they are, and in which frames."""
+    for person in bodies.person.unique().tolist():
+        frames = bodies.frame[found & (bodies.person == person)]
+        if len(frames) >= OFTEN:
+            yield person, len(frames), f"{int(frames.min())}-{int(frames.max())}"
+
+
+def _nothing_below(inputs: DiagnosticInputs) -> Iterator[str]:
+    floating = postures(inputs.bodies, inputs.parts).sitting & ~inputs.seated_on
+    for person, count, frames in _often(floating, inputs.bodies):
+        yield (
+            f"person {person} sits on nothing in {count} bodies (frames {frames}): an object may be"
+            " missing from the scene"
+        )
+
+
+def _hidden_legs(inputs: DiagnosticInputs) -> Iterator[str]:
+    legs, bodies, camera = members(inputs.parts, *LEGS), inputs.bodies, inputs.camera
+    if inputs.people is None or not bool(legs.any()):
+        return
+    table = mask_table(inputs.people, bodies)
+    hidden = torch.zeros(len(bodies.frame), dtype=torch.bool)
+    for row in range(0, len(bodies.frame), EVERY):
+        if table.own[row] is None:
+            continue
+        seen, _ = table.decode(row)
+        pixels = project(to_camera(bodies.verts[row, legs], camera.R_cam_world), camera.K).long()
+        x, y = pixels[:, 0].clamp(0, seen.shape[1] - 1), pixels[:, 1].clamp(0, seen.shape[0] - 1)
+        hidden[row] = seen[y, x].float().mean() < SEEN
+    for person, count, frames in _often(hidden, bodies):
+        yield (
+            f"the lower body of person {person} is hidden in about {EVERY * count} bodies (frames"
+            f" {frames}): its pose there is a guess"
+        )
+
+
+def _wrong_seats(inputs: DiagnosticInputs) -> Iterator[str]:
+    contacts = inputs.contacts
+    if contacts is None:
+        return
+    tops = place(inputs.objects.top, inputs.layout)
+    for k, i in enumerate(contacts.object_of.tolist()):
+        weight = contacts.weight[k, 0]
+        if not bool(inputs.objects.is_seat[i]) or int(contacts.bodies[k]) < OFTEN:
+            continue
+        gap = _gap(contacts.points[k, 0], weight, tops[i])
+        if abs(gap) > HEIGHT:
+            side = "above" if gap > 0 else "below"
+            yield (
+                f"{inputs.objects.ids[i]}: its sitters touch {100 * abs(gap):.0f} cm {side} its"
+                " seat: the mesh may have the wrong shape"
+            )
+
+
+def _gap(
+    points: Float[Tensor, "points 3"],
+    weight: Float[Tensor, " points"],
+    seat: Float[Tensor, "region 3"],
+) -> float:
+    """Median height of contact points over the seat below them [m]."""
+    real = points[weight > 0]
+    if len(real) == 0:
+        return 0.0
+    below = torch.cdist(real[:, [0, 2]], seat[:, [0, 2]]).argmin(-1)
+    return float((real[:, 1] - seat[below, 1]).median())

@@ -1,0 +1,241 @@
+"""Masks of people and of a smaller image: whose they are, what they tell of depth, how they fit."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import interpolate, max_pool2d
+
+from mover.core.types import Bodies, Camera, Masks, People
+from mover.energy.terms.bbox import WIDTH
+from mover.geometry.camera import project
+from mover.geometry.raster import Crops, layers
+from mover.geometry.rle import decode
+
+# Which mask belongs to which body, decoded only when it is drawn.
+
+
+@dataclass(frozen=True)
+class MaskTable:
+    """Rows of `people` for each body: its own mask, and those of the others in its frame."""
+
+    masks: Masks
+    own: tuple[int | None, ...]
+    """None: the track has no mask in that frame, so the body says nothing about depth."""
+    others: tuple[tuple[int, ...], ...]
+
+    def decode(self, body: int) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
+        """The visible mask of a body, and the union of the other people's."""
+        own = self.own[body]
+        blank = torch.zeros(self.masks.height, self.masks.width, dtype=torch.bool)
+        rest = blank
+        for row in self.others[body]:
+            rest = rest | decode(self.masks, row)
+        return (blank if own is None else decode(self.masks, own)), rest
+
+
+def mask_table(people: People, bodies: Bodies) -> MaskTable:
+    """Match masks with bodies by frame and track."""
+    row_of = {
+        key: row
+        for row, key in enumerate(zip(people.frame.tolist(), people.person.tolist(), strict=True))
+    }
+    in_frame: dict[int, list[int]] = {}
+    for row, frame in enumerate(people.frame.tolist()):
+        in_frame.setdefault(frame, []).append(row)
+    keys = list(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True))
+    own = tuple(row_of.get(key) for key in keys)
+    others = tuple(
+        tuple(row for row in in_frame.get(frame, []) if row != mine)
+        for (frame, _), mine in zip(keys, own, strict=True)
+    )
+    return MaskTable(people.masks, own, others)
+
+
+# How far away upright people are: their height in the image less the width of their head.
+#
+# Not in the paper. A mask that is too wide by a few pixels all round adds as much to the height as
+# to the width of everything in it: the difference of both does not know it. An error of the pose,
+# which lowers the overlap of body and mask and so makes smaller, farther bodies look better,
+# changes the height of somebody upright by its square only.
+#
+#     factor = median over frames of  (h_body - w_body) / (h_mask - w_mask)
+
+
+WHOLE = 0.01  # of the body's picture may be covered by objects or others, and no more
+UPRIGHT = 1.8  # times as high as wide
+HEAD = 0.125  # of the height
+HIGH = 100.0  # [px]; of smaller people a pixel is more than a percent
+GAUSS = 1.4826  # standard deviation over the median of absolute deviations
+
+
+@dataclass(frozen=True)
+class Extents:
+    """What the heights of one person say."""
+
+    factor: float
+    """True depth over the given one."""
+    spread: float
+    """Standard deviation of `factor`."""
+    frames: int
+    """How many showed the person wholly."""
+
+
+def compare_extents(
+    bodies: Bodies,
+    rows: Int[Tensor, " rows"],
+    camera: Camera,
+    table: MaskTable,
+    blocked: Bool[Tensor, "h w"],
+) -> Extents | None:
+    """Compare the heights of bodies that are wholly seen with those of their masks.
+
+    Args:
+        bodies: In camera axes.
+        rows: Bodies of one person.
+        camera: Its image has the size of the masks.
+        table: The person's masks.
+        blocked: Pixels of what may hide people.
+
+    Returns:
+        None if nobody is seen wholly, upright and high enough.
+    """
+    ratios: list[float] = []
+    for row in rows.tolist():
+        if not _inside(bodies.verts[row], camera):
+            continue
+        drawn = _drawn(bodies, row, camera)
+        high, wide = _extent(drawn)
+        if high <= UPRIGHT * wide:
+            continue
+        own, others = table.decode(row)
+        covered = drawn & (blocked | others) & ~own
+        if covered.sum() <= WHOLE * drawn.sum() and min(high, _extent(own)[0]) >= HIGH:
+            body, mask = high - _thick(drawn), _extent(own)[0] - _thick(own)
+            ratios.append(body / mask if mask > 0 else math.nan)
+    found = torch.tensor([r for r in ratios if math.isfinite(r)], dtype=torch.float64)
+    if not len(found):
+        return None
+    middle = found.median()
+    off = GAUSS * float((found - middle).abs().median())
+    return Extents(float(middle), 1.25 * off / len(found) ** 0.5, len(found))
+
+
+def pixels_of(masks: Masks) -> Bool[Tensor, "h w"]:
+    """The pixels that are in any of some masks."""
+    covered = torch.zeros(masks.height, masks.width, dtype=torch.bool)
+    for row in range(len(masks.counts)):
+        covered = covered | decode(masks, row)
+    return covered
+
+
+def _inside(verts: Float[Tensor, "verts 3"], camera: Camera) -> bool:
+    pixels = project(verts, camera.K.to(verts))
+    last = pixels.new_tensor([camera.width - 2, camera.height - 2])
+    ahead = bool((verts[:, 2] > 0).all())
+    return ahead and bool(((pixels > 2) & (pixels < last)).all())
+
+
+def _drawn(bodies: Bodies, row: int, camera: Camera) -> Bool[Tensor, "h w"]:
+    views = Crops(camera.K[None].float(), camera.height, camera.width)
+    return layers(bodies.verts[row : row + 1].float(), bodies.faces, views).front.isfinite()[0]
+
+
+def _extent(mask: Bool[Tensor, "h w"]) -> tuple[float, float]:
+    """Height and width of what is set [px]."""
+    ends = [torch.nonzero(mask.any(axis))[:, 0] for axis in (1, 0)]
+    high, wide = (float(e[-1] - e[0] + 1) if len(e) else 0.0 for e in ends)
+    return high, wide
+
+
+def _thick(mask: Bool[Tensor, "h w"]) -> float:
+    """Width of the head [px]: of the largest disc in the top of what is set."""
+    from scipy.ndimage import distance_transform_edt
+
+    rows = torch.nonzero(mask.any(1))[:, 0]
+    if not len(rows):
+        return 0.0
+    high = int(rows[-1] - rows[0]) + 1
+    top = mask[rows[0] : rows[0] + max(3, round(HEAD * high))]
+    padded = torch.nn.functional.pad(top, [1, 1, 1, 0])
+    return 2 * float(np.max(np.asarray(distance_transform_edt(padded.numpy())))) - 1
+
+
+# How well drawn bodies fill a mask whose border may be too wide or too narrow everywhere.
+
+
+COVERED = 0.05  # of a pixel of the smaller picture, from which it counts as covered
+MARGINS = 9  # borders from one pixel too narrow to one pixel too wide are tried
+
+
+def small(mask: Bool[Tensor, "h w"], width: int) -> Float[Tensor, "small_h small_w"]:
+    """Share of each pixel of a smaller picture that is set."""
+    height = max(1, round(mask.shape[0] * width / mask.shape[1]))
+    return interpolate(mask[None, None].float(), (height, width), mode="area")[0, 0]
+
+
+def uncovered(mask: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "small_h small_w"]:
+    """The pixels of a smaller picture in which next to nothing is set."""
+    return small(mask, width) < COVERED
+
+
+def overlaps(
+    drawn: Bool[Tensor, "items h w"], mask: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]
+) -> Float[Tensor, " items"]:
+    """Intersection over union with the mask, in the known pixels, at the best width of its border.
+
+    A mask that is two pixels too wide all around looks like a person who is 3 % nearer, were it
+    not that arms and legs grow by as much as the whole body.
+    """
+    image, inside = drawn.float(), mask[known]
+    wide, narrow = _grown(image)[:, known], 1 - _grown(1 - image)[:, known]
+    best, exact = torch.zeros(len(drawn)).to(mask), image[:, known]
+    for margin in torch.linspace(-1, 1, MARGINS).tolist():  # a few; all at once is much memory
+        part = exact + abs(margin) * ((wide if margin > 0 else narrow) - exact)
+        both, either = torch.minimum(part, inside).sum(1), torch.maximum(part, inside).sum(1)
+        best = torch.maximum(best, both / either.clamp_min(1))
+    return best
+
+
+def _grown(image: Float[Tensor, "items h w"]) -> Float[Tensor, "items h w"]:
+    """Each pixel or the largest of its four neighbours."""
+    columns = max_pool2d(image[:, None], (3, 1), 1, (1, 0))
+    rows = max_pool2d(image[:, None], (1, 3), 1, (0, 1))
+    return torch.maximum(columns, rows)[:, 0]
+
+
+# The image at the width at which the paper's weights have their meaning.
+
+
+def small_views(camera: Camera) -> Crops:
+    """The whole image as one window, at most 640 pixels wide."""
+    zoom = min(1.0, WIDTH / camera.width)
+    width, height = max(1, round(camera.width * zoom)), max(1, round(camera.height * zoom))
+    zooms = torch.tensor([width / camera.width, height / camera.height, 1.0]).to(camera.K)
+    return Crops((camera.K * zooms.unsqueeze(-1)).unsqueeze(0), height, width)
+
+
+def small_camera(camera: Camera) -> Camera:
+    """The camera of that image."""
+    views = small_views(camera)
+    return replace(camera, K=views.K[0], width=views.width, height=views.height)
+
+
+def small_masks(masks: Bool[Tensor, "rows h w"], camera: Camera) -> Bool[Tensor, "rows sh sw"]:
+    """Masks of that image, by their nearest pixel; those given, where they have its size."""
+    views, (height, width) = small_views(camera), masks.shape[-2:]
+    if (views.height, views.width) == (height, width):
+        return masks
+    rows = ((torch.arange(views.height) + 0.5) * height / views.height).long()
+    columns = ((torch.arange(views.width) + 0.5) * width / views.width).long()
+    return masks[:, rows][:, :, columns]
+
+
+def small_boxes(boxes: Float[Tensor, "rows 4"], camera: Camera) -> Float[Tensor, "rows 4"]:
+    """Boxes in that image [px]."""
+    views = small_views(camera)
+    zoom = [views.width / camera.width, views.height / camera.height]
+    return boxes * boxes.new_tensor(zoom * 2)

@@ -1,0 +1,1 @@
+"""Furniture: made fit, seen in the image, placed."""

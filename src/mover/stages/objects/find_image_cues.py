@@ -1,0 +1,172 @@
+"""What the clean image says about each object: its box, its mask, and what is unknown."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mover.core.observe import Observer, silent
+from mover.core.records import record
+from mover.core.types import Camera, Capture, Masks
+from mover.energy.objective import ImageCues
+from mover.energy.terms.bbox import LEAST, SEEN, UNKNOWN
+from mover.energy.terms.border import borders_of
+from mover.energy.terms.silhouette import outline_root
+from mover.geometry.crops import area_mean, crop_views
+from mover.geometry.rle import decode
+from mover.stages.config import ImageConfig
+from mover.stages.objects.prepare_objects import Prepared
+
+
+@record
+class Seen:
+    """The detections of the pieces, in the order of the scene."""
+
+    boxes: Float[Tensor, "objects 4"]
+    """x_min, y_min, x_max, y_max [px]; the whole image where there is no detection."""
+    detected: Bool[Tensor, " objects"]
+    masks: Bool[Tensor, "objects h w"]
+    """Empty where only the box is known."""
+    people: Bool[Tensor, "h w"]
+    """People in the reference image."""
+
+
+def image_evidence(capture: Capture) -> Seen:
+    """Line the detections up with the pieces of the scene."""
+    camera, pieces = capture.scene.camera, capture.scene.objects
+    by_id = {d.id: d for d in capture.detections}
+    found = [by_id.get(-1 if p.annotation is None else p.annotation) for p in pieces]
+    whole = torch.tensor([0.0, 0.0, camera.width, camera.height])
+    blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    masks = [blank if d is None or d.mask is None else decode(d.mask, 0) for d in found]
+    people = blank
+    if capture.reference_people is not None:
+        for row in range(len(capture.reference_people.counts)):
+            people = people | decode(capture.reference_people, row)
+    return Seen(
+        torch.stack([whole if d is None else d.box for d in found]) if found else torch.zeros(0, 4),
+        torch.tensor([d is not None for d in found], dtype=torch.bool),
+        torch.stack(masks) if masks else blank.expand(0, -1, -1),
+        people,
+    )
+
+
+def detected_masks(capture: Capture) -> Masks:
+    """All masks of the reference image."""
+    camera = capture.scene.camera
+    found = [d.mask.counts[0] for d in capture.detections if d.mask is not None]
+    return Masks(camera.height, camera.width, tuple(found))
+
+
+def ground_without_people(capture: Capture, prepared: Prepared) -> float:
+    """Height of the floor where no foot tells: given, or under the median object [m]."""
+    if capture.camera_height is not None:
+        return -capture.camera_height
+    if capture.scene.ground is not None:
+        return capture.scene.ground
+    return float(prepared.start.t_world_object[:, 1].median())
+
+
+BORDER = 1.5  # [px], a side this close to the image's border is cut by it
+STRIP = 0.06  # of the box's size: how far beyond a side one looks for what may hide it
+MARGIN = 0.3  # of the box's larger side: how much a window is larger than the box (PHOSA)
+
+
+@record
+class ImageInputs:
+    """The detections of the pieces, in their order."""
+
+    camera: Camera
+    boxes: Float[Tensor, "objects 4"]
+    """x_min, y_min, x_max, y_max [px]; the whole image where there is no detection."""
+    seen: Bool[Tensor, " objects"]
+    """False where a piece has no annotation."""
+    masks: Bool[Tensor, "objects h w"]
+    """Empty where only the box is known."""
+    people: Bool[Tensor, "h w"]
+    """People in the reference image."""
+    behind: Bool[Tensor, "objects objects"]
+    """[i, j]: object j is known to stand behind object i, so it cannot hide it."""
+    distance: Float[Tensor, " objects"] | None = None
+    """From the camera to the middle of each base in the initial scene [m]."""
+
+
+def find_image_cues(
+    inputs: ImageInputs, config: ImageConfig, observe: Observer = silent
+) -> ImageCues:
+    """Cut a square window around each box; mark what other objects, people or the border hide."""
+    del observe
+    views = crop_views(inputs.camera.K, inputs.boxes, MARGIN, config.size)
+    others = _others(inputs)
+    own = area_mean(inputs.masks.float(), views, inputs.camera.K)
+    hidden = area_mean(others.float(), views, inputs.camera.K)
+    inside = area_mean(torch.ones_like(inputs.masks).float(), views, inputs.camera.K) > 0.999
+    known = inputs.masks.any(-1).any(-1)[:, None, None]
+    if config.form == "release":
+        own, hidden, inside = (own - hidden > 0).float(), (own < hidden).float(), inside | True
+    keep = (hidden < 1e-6) & inside & known
+    sides = torch.where(inputs.seen, SEEN, UNKNOWN).unsqueeze(-1).expand(-1, 4)
+    if config.form == "robust":
+        unsure = (sides == SEEN) & ~_seen_sides(inputs, others, config.hidden)
+        sides = torch.where(unsure, LEAST, sides)
+    trust = torch.ones(len(own))
+    outline = outline_root(own) if config.form == "release" else None
+    borders = None
+    if config.borders:
+        zoom = views.K[:, 0, 0] / inputs.camera.K[0, 0]
+        borders = borders_of(own, zoom, config.borders)
+    return ImageCues(
+        inputs.boxes, sides, views, own, keep, trust, inputs.distance, outline, borders
+    )
+
+
+def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:
+    """Pixels where something else is seen that may hide this object."""
+    rows: list[Tensor] = []
+    for i in range(len(inputs.masks)):  # a loop keeps the memory at one image
+        rivals = ~inputs.behind[i]
+        rivals[i] = False
+        seen = inputs.masks[rivals].any(0) if rivals.any() else torch.zeros_like(inputs.people)
+        rows.append((seen | inputs.people) & ~inputs.masks[i])
+    return torch.stack(rows)
+
+
+def _seen_sides(
+    inputs: ImageInputs, others: Bool[Tensor, "objects h w"], hidden: float
+) -> Bool[Tensor, "objects 4"]:
+    """Sides of boxes that neither the image's border nor something in front may cut off.
+
+    A table's legs may be hidden where nothing is in front of most of its top's lower edge: a small
+    share is enough.
+    """
+    size = inputs.boxes.new_tensor([inputs.camera.width, inputs.camera.height])
+    low, high = inputs.boxes[:, :2] > BORDER, inputs.boxes[:, 2:] < size - BORDER
+    free = torch.cat([low, high], -1)
+    return free & torch.stack([
+        torch.stack([_share(others[i], _strip(box, side)) < hidden for side in range(4)])
+        for i, box in enumerate(inputs.boxes)
+    ])  # fmt: skip
+
+
+def _strip(box: Float[Tensor, "4"], side: int) -> Float[Tensor, "4"]:
+    """The thin box just beyond one side (0 left, 1 top, 2 right, 3 bottom)."""
+    depth = STRIP * (box[2:] - box[:2]).clamp_min(1).prod().sqrt().clamp_min(2)
+    axis, strip = side % 2, box.clone()
+    if side < 2:
+        strip[axis], strip[axis + 2] = box[axis] - depth, box[axis]
+    else:
+        strip[axis], strip[axis + 2] = box[axis + 2], box[axis + 2] + depth
+    return strip
+
+
+def _share(mask: Bool[Tensor, "h w"], box: Float[Tensor, "4"]) -> Float[Tensor, ""]:
+    height, width = mask.shape
+    x0, y0, x1, y1 = (round(v) for v in box.tolist())
+    part = mask[max(0, y0) : min(height, max(y1, y0 + 1)), max(0, x0) : min(width, max(x1, x0 + 1))]
+    return part.float().mean() if part.numel() else torch.tensor(0.0)
+
+
+def order_of(
+    nearest: Float[Tensor, " objects"], farthest: Float[Tensor, " objects"], slack: float = 0.1
+) -> Bool[Tensor, "objects objects"]:
+    """[i, j]: all of object j is farther than all of object i by more than `slack` [m]."""
+    return nearest.unsqueeze(0) > farthest.unsqueeze(1) + slack

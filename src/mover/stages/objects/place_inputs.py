@@ -1,0 +1,129 @@
+"""Objects that the user has placed for good: they price the evidence but do not move."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mover.core.records import record
+from mover.core.types import Camera, Layout, Objects
+from mover.energy.objective import HumanCues, ImageCues
+from mover.energy.terms.border import Borders
+from mover.energy.terms.depth import DepthRange
+from mover.energy.terms.silhouette import outline_root
+from mover.energy.terms.wall import Walls
+from mover.geometry.raster import Crops
+from mover.stages.objects.starts import merged
+
+
+@record
+class Pinned:
+    """Which objects are held, and where."""
+
+    fixed: Bool[torch.Tensor, " objects"]
+    layout: Layout
+    """Without an axis of starts; rows that are not fixed have no meaning."""
+
+
+def hold(layout: Layout, pinned: Pinned | None) -> Layout:
+    """The layout with the pinned objects at their places, in every start; no gradient there."""
+    if pinned is None:
+        return layout
+    return merged(pinned.fixed, pinned.layout, layout)
+
+
+# What placing the objects needs, how it is done, and what comes of it.
+
+
+@record
+class PlaceInputs:
+    """What placing the objects needs."""
+
+    objects: Objects
+    camera: Camera
+    ground: float
+    image: ImageCues
+    humans: HumanCues
+    starts: Layout
+    """Candidates on a leading axis."""
+    reference: Float[Tensor, " objects"]
+    """Yaw that breaks ties: of the sitters where there are any, else the initial one [rad]."""
+    pinned: Pinned | None = None
+    """Objects that stay where they are; None: all may move."""
+
+
+@record
+class Moment:
+    """The room in the middle of a descent, for those who watch."""
+
+    layout: Layout
+    """All starts."""
+    camera: Camera
+    ground: float
+
+
+@record
+class Placed:
+    """Where the objects ended."""
+
+    layout: Layout
+    """The chosen candidate of each object."""
+    candidates: Layout
+    """All that were left, best first."""
+    energy: Float[Tensor, "starts objects"]
+    """Of the candidates."""
+    trace: Float[Tensor, " steps"]
+    """Total energy before each step of the last descent, summed over the candidates."""
+    walls: Walls | None = None
+    """The lines that were priced; None: none."""
+
+
+def with_walls(inputs: PlaceInputs, walls: Walls | None) -> PlaceInputs:
+    """The inputs with the lines along which furniture stands."""
+    return replace(inputs, image=replace(inputs.image, walls=walls))
+
+
+# Windows of fewer pixels: what is far off is found there, at a fraction of the work.
+
+
+def coarser_image(image: ImageCues, factor: int) -> ImageCues:
+    """The same with `factor` times fewer pixels along each side.
+
+    Raises:
+        ValueError: If the windows are not a multiple of it.
+    """
+    views = image.views
+    if factor < 1 or views.height % factor or views.width % factor:
+        raise ValueError(
+            f"coarser_image: windows of {views.height} x {views.width}, which {factor} does not"
+            " divide"
+        )
+    if factor == 1:
+        return image
+    zoom = views.K.new_tensor([1 / factor, 1 / factor, 1.0])[:, None]
+    small = Crops(views.K * zoom, views.height // factor, views.width // factor)
+    masks = _tiles(image.masks, factor).mean((-3, -1))
+    keep = _tiles(image.keep, factor).all(-1).all(-2)
+    outline = None if image.outline is None else outline_root(masks)
+    borders = image.borders
+    if borders is not None:
+        borders = Borders(borders.shifts, _tiles(borders.masks, factor).mean((-3, -1)))
+    return replace(image, views=small, masks=masks, keep=keep, outline=outline, borders=borders)
+
+
+def coarser_humans(humans: HumanCues, factor: int) -> HumanCues:
+    """The same with the bounds of the depth at one pixel of each tile."""
+    if factor == 1 or humans.depth is None:
+        return humans
+    middle = factor // 2
+    near, far, free = (
+        getattr(humans.depth, k)[..., middle::factor, middle::factor]
+        for k in ("near", "far", "free")
+    )
+    depth = DepthRange(near, far, free, humans.depth.area * factor**2)
+    return replace(humans, depth=depth)
+
+
+def _tiles(image: Tensor, factor: int) -> Tensor:
+    return image.unflatten(-1, (-1, factor)).unflatten(-3, (-1, factor))

@@ -1,0 +1,239 @@
+"""Make any meshes fit for optimisation: closed, light, evenly sampled, with known parts."""
+
+import dataclasses
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.core.observe import Observer, Step, silent
+from mover.core.records import record
+from mover.core.types import Layout, Mesh, Objects, SceneObject
+from mover.furniture.library import BACKS, SEATS, canonical
+from mover.geometry.mesh import box, decimate, sample_surface, signed_volume, used
+from mover.geometry.placement import FREE, GROUND
+from mover.geometry.rotations import rot_y
+from mover.geometry.topology import edges_of
+from mover.geometry.watertight import close_mesh
+from mover.stages.config import PrepareConfig
+
+# Which parts of furniture people touch (supplement, "Contact Regions of Objects").
+#
+# Sofas and chairs are touched at the seat and the back, beds, tables and the rest on their top. The
+# parts follow from the normals of even surface points: up for seats and tops, forward for backs.
+
+UPRIGHT = 0.866  # cosine of 30 degrees: normals of a seat or a back in the `level` rule
+STEEP = 0.966  # cosine of 15 degrees: the same in the release
+LAYER = 0.05  # [m], thickness of the layer that is one seat
+
+
+@record
+class Regions:
+    """Surface points that can be touched, in the object's frame [m]."""
+
+    top: Float[Tensor, "tops 3"]
+    back: Float[Tensor, "backs 3"]
+    has_top: bool
+    has_back: bool
+
+
+def find_regions(
+    points: Float[Tensor, "points 3"],
+    normals: Float[Tensor, "points 3"],
+    category: str,
+    rule: Literal["level", "release"],
+) -> Regions:
+    """Seat or top, and back, of one object.
+
+    `level`: the seat is the largest level layer above a quarter of the height, so that neither
+    arms nor the back's rim count; a top is the highest layer with a quarter of the largest one's
+    area. `release`: normals within 15 degrees above a third of the height; of those, chairs, sofas
+    and beds keep the points below the mean height, others those above it.
+    """
+    if rule == "release":
+        top, back = _by_means(points, normals, category)
+    else:
+        top = _level(points, normals, category)
+        back = _behind(points, normals, points[top])
+    if category not in BACKS:
+        back = torch.zeros_like(back)
+    return Regions(points[top], points[back], bool(top.any()), bool(back.any()))
+
+
+def _level(
+    points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], category: str
+) -> Bool[Tensor, " points"]:
+    y = points[:, 1]
+    height = float(y.max())
+    facing = (normals[:, 1] > UPRIGHT) & (y > 0.25 * height)
+    layers = torch.arange(0.0, height + LAYER, LAYER / 2)
+    inside = facing & ((y - layers.unsqueeze(-1)).abs() <= LAYER)
+    area = inside.sum(-1)
+    if category in SEATS or category == "bed":
+        return inside[area.argmax()]
+    wide = (area >= 0.25 * area.max()) & (area > 0)
+    return inside[wide.nonzero()[-1, 0]] if wide.any() else facing
+
+
+def _behind(
+    points: Float[Tensor, "points 3"],
+    normals: Float[Tensor, "points 3"],
+    seat: Float[Tensor, "seat 3"],
+) -> Bool[Tensor, " points"]:
+    if len(seat) == 0:
+        return torch.zeros(len(points), dtype=torch.bool)
+    above = points[:, 1] > seat[:, 1].mean() + LAYER
+    return (normals[:, 2] > UPRIGHT) & above & (points[:, 2] < seat[:, 2].mean())
+
+
+def _by_means(
+    points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], category: str
+) -> tuple[Bool[Tensor, " points"], Bool[Tensor, " points"]]:
+    y, z = points[:, 1], points[:, 2]
+    high = y > y.max() / 3
+    top, back = high & (normals[:, 1] > STEEP), high & (normals[:, 2] > STEEP)
+    if top.any():
+        mean = y[top].mean()
+        below = category in ("chair", "sofa", "bed")
+        top = top & ((y <= mean) if below else (y >= mean))
+    if back.any():
+        back = back & (z <= z[back].mean())
+    return top, back
+
+
+@record
+class PrepareInputs:
+    """The furniture of the initial scene."""
+
+    objects: tuple[SceneObject, ...]
+
+
+@record
+class Prepared:
+    """Proxies, where they start, and how to come back to the user's meshes."""
+
+    objects: Objects
+    start: Layout
+    center: Float[Tensor, "objects 3"]
+    """Centre of the box's bottom in the mesh's own coordinates."""
+    scale: Float[Tensor, "objects 3"]
+    """Initial scale."""
+    warnings: tuple[str, ...]
+
+
+@record
+class _Proxy:
+    mesh: Mesh
+    edges: Int[Tensor, "edges 4"]
+    samples: Float[Tensor, "samples 3"]
+    regions: Regions
+    center: Float[Tensor, "3"]
+
+
+def prepare_objects(
+    inputs: PrepareInputs, config: PrepareConfig, observe: Observer = silent
+) -> Prepared:
+    """Close, decimate, sample and pack the furniture; read off where it starts."""
+    proxies: list[_Proxy] = []
+    for index, piece in enumerate(inputs.objects):
+        proxies.append(_proxy(piece, config))
+        observe(Step("prepare_objects", index, len(inputs.objects)))
+    pieces = inputs.objects
+    center = torch.stack([p.center for p in proxies])
+    scale = torch.stack([p.scale for p in pieces])
+    yaw = torch.stack([p.yaw for p in pieces])
+    origin = torch.stack([p.t_world_object for p in pieces])
+    moved = (rot_y(yaw) @ (scale * center).unsqueeze(-1)).squeeze(-1)
+    start = Layout(origin + moved, yaw, torch.zeros_like(scale))
+    return Prepared(_pack(pieces, proxies), start, center, scale, _warnings(pieces, proxies))
+
+
+def to_objects(
+    pieces: tuple[SceneObject, ...], prepared: Prepared, layout: Layout
+) -> tuple[SceneObject, ...]:
+    """Turn a layout of proxies back into placements of the user's own meshes."""
+    scale = prepared.scale * layout.log_scale.exp()
+    back = (rot_y(layout.yaw) @ (scale * prepared.center).unsqueeze(-1)).squeeze(-1)
+    origin = layout.t_world_object - back
+    return tuple(
+        dataclasses.replace(p, t_world_object=origin[i], yaw=layout.yaw[i], scale=scale[i])
+        for i, p in enumerate(pieces)
+    )
+
+
+def proxy_meshes(prepared: Prepared) -> tuple[Mesh, ...]:
+    """The closed proxies in the coordinates of the pieces' own meshes, for the same placements."""
+    objects, meshes = prepared.objects, []
+    for i in range(len(objects.ids)):
+        verts = objects.verts[i][objects.real_verts[i]] / prepared.scale[i] + prepared.center[i]
+        faces = objects.faces[i]
+        meshes.append(Mesh(verts, faces[(faces != 0).any(-1)]))
+    return tuple(meshes)
+
+
+def _proxy(piece: SceneObject, config: PrepareConfig) -> _Proxy:
+    mesh = used(piece.mesh)
+    low, high = box(mesh.verts)
+    center = torch.stack([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    mesh = Mesh((mesh.verts - center) * piece.scale, mesh.faces)
+    mesh = decimate(close_mesh(mesh, config.cells), config.faces)
+    points, normals = sample_surface(mesh, 4 * config.samples)
+    regions = find_regions(points, normals, canonical(piece.category), config.rule)
+    samples, _ = sample_surface(mesh, config.samples)
+    return _Proxy(mesh, edges_of(mesh.faces), samples, _thin(regions, config.region), center)
+
+
+def _thin(regions: Regions, count: int) -> Regions:
+    def some(points: Tensor) -> Tensor:
+        if len(points) == 0:
+            return points.new_zeros(count, 3)
+        return points[torch.linspace(0, len(points) - 1, count).round().long()]
+
+    return Regions(some(regions.top), some(regions.back), regions.has_top, regions.has_back)
+
+
+def _pack(pieces: tuple[SceneObject, ...], proxies: list[_Proxy]) -> Objects:
+    categories = tuple(canonical(p.category) for p in pieces)
+    size = torch.stack([high - low for low, high in (box(p.mesh.verts) for p in proxies)])
+    return Objects(
+        ids=tuple(p.id for p in pieces),
+        categories=categories,
+        verts=_pad([p.mesh.verts for p in proxies], repeat=True),
+        real_verts=_real([len(p.mesh.verts) for p in proxies]),
+        faces=_pad([p.mesh.faces for p in proxies]),
+        edges=_pad([p.edges for p in proxies]),
+        samples=torch.stack([p.samples for p in proxies]),
+        size=size,
+        top=torch.stack([p.regions.top for p in proxies]),
+        back=torch.stack([p.regions.back for p in proxies]),
+        has_top=torch.tensor([p.regions.has_top for p in proxies]),
+        has_back=torch.tensor([p.regions.has_back for p in proxies]),
+        is_seat=torch.tensor([c in SEATS for c in categories]),
+        supports=_supports(pieces),
+    )
+
+
+def _pad(rows: list[Tensor], repeat: bool = False) -> Tensor:
+    most = max(len(r) for r in rows)
+    fill = [r[:1] if repeat else torch.zeros_like(r[:1]) for r in rows]
+    return torch.stack(
+        [torch.cat([r, f.expand(most - len(r), -1)]) for r, f in zip(rows, fill, strict=True)]
+    )
+
+
+def _real(counts: list[int]) -> Bool[Tensor, "objects verts"]:
+    return torch.arange(max(counts)) < torch.tensor(counts).unsqueeze(-1)
+
+
+def _supports(pieces: tuple[SceneObject, ...]) -> Int[Tensor, " objects"]:
+    index = {p.id: i for i, p in enumerate(pieces)} | {"ground": GROUND, "free": FREE}
+    return torch.tensor([index[p.support] for p in pieces])
+
+
+def _warnings(pieces: tuple[SceneObject, ...], proxies: list[_Proxy]) -> tuple[str, ...]:
+    return tuple(
+        f"{piece.id}: its mesh encloses almost nothing, its silhouette may be wrong"
+        for piece, proxy in zip(pieces, proxies, strict=True)
+        if signed_volume(proxy.mesh) <= 0
+    )

@@ -1,0 +1,145 @@
+"""Find the lines along which furniture stands, from where it was placed, and place it again.
+
+Each object that usually stands with its back to a wall proposes the line of its rear; the rears of
+others that lie near it and along it belong to the line, which runs through the middle of them all.
+Objects whose base is seen count in full, all others little: their own distance is what is asked.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.core.types import Layout, Objects
+from mover.energy.terms.bbox import SEEN
+from mover.energy.terms.wall import ALONG, Walls, rears_of
+from mover.furniture.library import WALL_PIECES
+from mover.geometry.placement import GROUND
+from mover.geometry.rotations import wrap
+from mover.stages.objects.place_inputs import Placed, PlaceInputs, with_walls
+from mover.stages.objects.starts import alone, best_few, joined, merged
+
+NEAR = 0.3  # [m], root mean square distance of a rear from the line that it belongs to
+UNSEEN = 0.2  # how much an object whose base is not seen counts against one whose base is
+TURN = math.pi / 4  # rears that are turned farther than this do not belong to a line
+STRETCH = (0.7, 1.4)  # of its distance, within which an object is moved to a line
+BOTTOM = 3  # number of the side of a box on which the object stands
+KEPT = 3  # candidates of the search without lines from which a piece goes down again
+
+Lower = Callable[[PlaceInputs, Layout], Placed]
+"""Goes down from some starts."""
+
+
+def line_up(found: Placed, inputs: PlaceInputs, rounds: int, lower: Lower) -> Placed:
+    """Place the pieces along walls again, with the lines that others tell them.
+
+    Args:
+        found: Where a search ended that knew no lines.
+        inputs: What was placed.
+        rounds: How often; each time with the lines of where the pieces stand by then.
+        lower: Goes down from some starts.
+
+    Returns:
+        Objects of which no line is told are as they were found.
+    """
+    lined = found
+    for _ in range(rounds):
+        walls = find_walls(lined.layout, inputs.objects, inputs.image.sides)
+        if walls is None:
+            break
+        starts = starts_at(lined.layout, inputs.objects, walls)
+        few = best_few(found.candidates, found.energy, KEPT)
+        more = lower(with_walls(inputs, walls), joined(starts, few))
+        lined = _where_told(more, found, walls)
+    return lined
+
+
+def _where_told(lined: Placed, found: Placed, walls: Walls) -> Placed:
+    """What is lined up where a line is told, else what was found; both as many candidates."""
+    told = walls.trust.amax(-1) > 0
+    count = min(len(lined.energy), len(found.energy))
+    few = (_first(placed.candidates, count) for placed in (lined, found))
+    return Placed(
+        merged(told, lined.layout, found.layout),
+        merged(told, *few),
+        torch.where(told, lined.energy[:count], found.energy[:count]),
+        found.trace,
+        walls,
+    )
+
+
+def _first(layout: Layout, count: int) -> Layout:
+    return Layout(layout.t_world_object[:count], layout.yaw[:count], layout.log_scale[:count])
+
+
+def find_walls(layout: Layout, objects: Objects, sides: Int[Tensor, "objects 4"]) -> Walls | None:
+    """The lines that the rears of at least one object tell to another.
+
+    Args:
+        layout: One place for each object.
+        objects: The objects.
+        sides: What is known of each side of their boxes, see `terms.bbox`.
+
+    Returns:
+        None where fewer than two objects usually stand along a wall.
+    """
+    able = _able(objects)
+    if int(able.sum()) < 2:
+        return None
+    rears = rears_of(layout, objects.size)
+    middle = rears.ends.mean(-2)
+    sure = torch.where(sides[:, BOTTOM].to(able.device) == SEEN, 1.0, UNSEEN).to(middle) * able
+    lines = able.nonzero()[:, 0]
+    out, at = rears.out[lines], middle[lines]
+    off = torch.einsum("oed,ld->loe", rears.ends, out) - (at * out).sum(-1)[:, None, None]
+    near = (off.square().mean(-1).sqrt() < NEAR) & (out @ rears.out.mT > ALONG) & able
+    weight = near * sure
+    out = torch.nn.functional.normalize(weight @ rears.out, dim=-1)
+    offset = (weight * (out @ middle.mT)).sum(-1) / weight.sum(-1)
+    return Walls(out, offset, _trust(weight) * able[:, None])
+
+
+def _able(objects: Objects) -> Bool[Tensor, " objects"]:
+    """Which objects stand on the floor and usually along a wall."""
+    usual = [c in WALL_PIECES for c in objects.categories]
+    return torch.tensor(usual, dtype=torch.bool).to(objects.supports.device) & (
+        objects.supports == GROUND
+    )
+
+
+def _trust(weight: Float[Tensor, "lines objects"]) -> Float[Tensor, "objects lines"]:
+    """The largest weight of any other object in each line."""
+    others = weight[:, None] * ~torch.eye(weight.shape[1], dtype=torch.bool).to(weight.device)
+    return others.amax(-1).mT
+
+
+def starts_at(layout: Layout, objects: Objects, walls: Walls) -> Layout:
+    """The layout, and for each line one in which all objects that may stand along it do so.
+
+    They turn with the line and go along their rays, as large in the image as before.
+    """
+    found = alone(layout)
+    for number in range(len(walls.offset)):  # as many as there are pieces along walls
+        found = joined(found, alone(_moved(layout, objects, walls, number)))
+    return found
+
+
+def _moved(layout: Layout, objects: Objects, walls: Walls, number: int) -> Layout:
+    line = walls.out[number]
+    out = rears_of(layout, objects.size).out
+    turn = wrap(torch.atan2(line[0], line[1]) - torch.atan2(out[:, 0], out[:, 1]))
+    depth = objects.size[:, 2] * layout.log_scale[:, 2].exp()
+    ahead = layout.t_world_object[:, ::2] @ line
+    share = walls.offset[number] / (ahead + depth / 2).clamp_min(1e-6)
+    low, high = STRETCH
+    goes = (walls.trust[:, number] > 0) & (turn.abs() < TURN) & (share > low) & (share < high)
+    goes = goes & (ahead > 0)  # else its other side would look away from the camera
+    share = torch.where(goes, share, 1.0)
+    stretch = torch.stack([share, torch.ones_like(share), share], -1)
+    return Layout(
+        layout.t_world_object * stretch,
+        torch.where(goes, wrap(layout.yaw + turn), layout.yaw),
+        layout.log_scale + share.log().unsqueeze(-1),
+    )

@@ -1,0 +1,225 @@
+"""What the room, the masks and the feet say about bodies, gathered before they are refined."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.bodies.corrected import spread
+from mover.bodies.parts import Parts, members
+from mover.bodies.posture import postures, speeds
+from mover.bodies.skin import PARTS
+from mover.core.records import record
+from mover.core.types import Bodies, Camera, Capture, Mesh, People, Room
+from mover.energy.body_terms.contact import Surface
+from mover.energy.body_terms.order import Bounds, Sighting, bounds_of_skin
+from mover.geometry.camera import project, to_camera
+from mover.geometry.mesh import sample_surface
+from mover.geometry.placement import place_object
+from mover.geometry.raster import first_hit
+from mover.geometry.volume import Volume, grid_around
+from mover.geometry.volume_warp import union_bodies
+from mover.stages.masks import MaskTable, mask_table, small_camera, small_masks
+from mover.stages.objects.find_image_cues import image_evidence
+
+SOLES = ("left_sole", "right_sole")
+CELL = 0.025  # [m], of the furniture's volume
+MOST_CELLS = 320  # along its longest side
+SAMPLES = 1500  # points of each piece's surface
+SKIN_POINTS = 400  # even points of a body
+PART_POINTS = 40  # at most, of each part that touches
+LOW = (0.08, 0.03)  # [m] over the lowest point of a body: a sole hangs, surely carries
+STILL = (0.5, 0.2)  # [m/s] of a sole: moves, surely at rest; bodies fitted frame by frame tremble
+INNER = 2  # [px of an image 640 wide] by which masks shrink before they bound anything
+
+
+@record
+class Surroundings:
+    """The estimated room, as bodies meet it."""
+
+    camera: Camera
+    ground: float
+    furniture: Volume | None
+    """Signed distance to all pieces; None: there are none."""
+    surface: Surface
+    """Points of their surfaces."""
+    front: Float[Tensor, "h w"]
+    """Depth of the nearest piece in the image 640 wide [m]; inf: none."""
+    owned: Bool[Tensor, "h w"]
+    """The piece that is drawn there is also detected there."""
+
+
+@dataclass(frozen=True)
+class Picked:
+    """The vertices that stand for a body."""
+
+    index: Int[Tensor, " picked"]
+    even: Bool[Tensor, " picked"]
+    """Those that lie evenly over the body."""
+    part: Int[Tensor, " picked"]
+    """Index into `PARTS`; -1: none."""
+    group: Int[Tensor, " picked"]
+    """0: no part that is known, then each of `PARTS`."""
+
+
+def surroundings_of(room: Room, capture: Capture | None) -> Surroundings:
+    """The closed furniture of a room where it stands, its volume, surface and picture.
+
+    Raises:
+        ValueError: If the room has no floor.
+    """
+    if room.scene.ground is None:
+        raise ValueError("surroundings_of: the room has no floor")
+    camera = room.scene.camera
+    meshes = [
+        place_object(replace(piece, mesh=proxy))
+        for piece, proxy in zip(room.scene.objects, room.proxies, strict=True)
+    ]
+    small = small_camera(camera)
+    front, piece = _drawn(meshes, camera, small)
+    owned = torch.zeros_like(piece, dtype=torch.bool)
+    if capture is not None and meshes:
+        masks = small_masks(image_evidence(capture).masks, capture.scene.camera)
+        owned = (piece >= 0) & masks.gather(0, piece.clamp_min(0)[None])[0]
+    return Surroundings(camera, room.scene.ground, _volume(meshes), _surface(meshes), front, owned)
+
+
+def _drawn(meshes: list[Mesh], camera: Camera, small: Camera) -> tuple[Tensor, Tensor]:
+    """Depth of the nearest piece, and which it is; -1: none."""
+    size = (small.height, small.width)
+    if not meshes:
+        none = torch.full(size, torch.inf)
+        return none, torch.full(size, -1)
+    verts = to_camera(torch.cat([m.verts for m in meshes]), camera.R_cam_world)
+    starts = torch.tensor([0, *(len(m.verts) for m in meshes[:-1])]).cumsum(0)
+    faces = torch.cat([m.faces + s for m, s in zip(meshes, starts, strict=True)])
+    owner = torch.cat([torch.full((len(m.faces),), k) for k, m in enumerate(meshes)])
+    depth, face = first_hit(verts.contiguous(), faces, small.K, size)
+    return depth, torch.where(face >= 0, owner[face.clamp_min(0)], torch.full_like(face, -1).long())
+
+
+def _volume(meshes: list[Mesh]) -> Volume | None:
+    if not meshes:
+        return None
+    verts = torch.cat([m.verts for m in meshes]).float()
+    low, high = verts.amin(0), verts.amax(0)
+    cells = min(MOST_CELLS, max(8, int(float((high - low).max()) / CELL)))
+    volume = grid_around(low, high, cells, 0.1)
+    for mesh in meshes:  # each has its own triangles
+        volume = union_bodies(mesh.verts.float()[None], mesh.faces, volume, 1)
+    return volume
+
+
+def _surface(meshes: list[Mesh]) -> Surface:
+    found = [sample_surface(m, SAMPLES) for m in meshes]
+    none = torch.zeros(0, 3)
+    pieces = [torch.full((len(p),), k) for k, (p, _) in enumerate(found)]
+    return Surface(
+        torch.cat([none, *(p.float() for p, _ in found)]),
+        torch.cat([none, *(n.float() for _, n in found)]),
+        torch.cat([none[:, 0].long(), *pieces]),
+    )
+
+
+def pick(bodies: Bodies, parts: Parts) -> Picked:
+    """Even points of the whole skin, and more of the parts that touch."""
+    verts = bodies.verts[len(bodies.verts) // 2]
+    even = spread(verts, SKIN_POINTS)
+    chosen = [even]
+    for name in PARTS:
+        own = members(parts, name).nonzero()[:, 0]
+        if len(own):
+            chosen.append(own[spread(verts[own], PART_POINTS)])
+    index = torch.cat(chosen).unique()
+    part = parts.part_of[index]
+    return Picked(index, torch.isin(index, even), part, part + 1)
+
+
+def resting_soles(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies feet"]:
+    """Chance that each sole is at rest and carries its body, whatever its height over the floor."""
+    lying = postures(bodies, parts, ground).lying
+    low = bodies.verts[..., 1].amin(1)
+    found: list[Tensor] = []
+    for name in SOLES:
+        own = members(parts, name)
+        if not own.any():
+            found.append(torch.zeros_like(low))
+            continue
+        sole = bodies.verts[:, own]
+        still = _ramp(speeds(sole.mean(1, keepdim=True), bodies)[:, 0], *STILL)
+        found.append(still * _ramp(sole[..., 1].amin(1) - low, *LOW) * ~lying)
+    return torch.stack(found, 1)
+
+
+def _ramp(value: Tensor, zero: float, one: float) -> Tensor:
+    """0 up to `zero`, 1 from `one` on; `one` is the smaller."""
+    return ((value - zero) / (one - zero)).clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class Watched:
+    """People's masks, and the furniture that may hide them."""
+
+    room: Surroundings
+    table: MaskTable
+    camera: Camera
+    """Of the masks."""
+
+
+def watched_of(room: Surroundings, people: People | None, bodies: Bodies) -> Watched | None:
+    """The masks of these bodies; None where there are none."""
+    if people is None:
+        return None
+    return Watched(room, mask_table(people, bodies), room.camera)
+
+
+def order_bounds(
+    watched: Watched,
+    rows: Int[Tensor, " bodies"],
+    skin: Float[Tensor, "bodies points 3"],
+    normals: Float[Tensor, "bodies points 3"],
+) -> Bounds:
+    """Bounds of the depth of skin points where they are now.
+
+    Args:
+        watched: Masks and furniture.
+        rows: Which rows of the bodies these are.
+        skin: Points in the world [m].
+        normals: Their outward normals.
+    """
+    room = watched.room
+    small = small_camera(room.camera)
+    cam, facing = (
+        to_camera(skin, room.camera.R_cam_world),
+        to_camera(normals, room.camera.R_cam_world),
+    )
+    at = project(cam, small.K).floor().long()
+    inside = (at >= 0).all(-1) & (at[..., 0] < small.width) & (at[..., 1] < small.height)
+    x, y = at[..., 0].clamp(0, small.width - 1), at[..., 1].clamp(0, small.height - 1)
+    shown, away = (torch.stack(masks) for masks in zip(*_masks(watched, rows), strict=True))
+    body = torch.arange(len(rows))[:, None].expand_as(x)
+    seen = Sighting(
+        torch.where(inside, room.front[y, x], torch.full_like(cam[..., 2], torch.inf)),
+        shown[body, y, x],
+        away[body, y, x] & room.owned[y, x],
+        (cam * facing).sum(-1) < 0,
+    )
+    return bounds_of_skin(seen)
+
+
+def _masks(watched: Watched, rows: Int[Tensor, " bodies"]) -> list[tuple[Tensor, Tensor]]:
+    """Well inside the own mask, and well outside everybody's; nothing where a mask is missing."""
+    found: list[tuple[Tensor, Tensor]] = []
+    for row in rows.tolist():
+        own, others = watched.table.decode(row)
+        own, others = small_masks(torch.stack([own, others]), watched.camera)
+        known = watched.table.own[row] is not None
+        found.append((_shrunk(own) & known, _shrunk(~(own | others)) & known))
+    return found
+
+
+def _shrunk(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    inverse = (~mask).float()[None, None]
+    size = 2 * INNER + 1
+    return torch.nn.functional.max_pool2d(inverse, size, stride=1, padding=INNER)[0, 0] < 0.5

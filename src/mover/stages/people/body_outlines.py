@@ -1,0 +1,188 @@
+"""Compare the outlines of bodies, where they stand now, with their masks."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.core.types import Camera
+from mover.energy.body_terms.outline import POINTS, Outline
+from mover.geometry.camera import project
+from mover.geometry.raster import Crops, layers
+from mover.stages.contacts.assign_contacts import evenly
+from mover.stages.masks import MaskTable
+
+SIDE = 160  # [px] of a body's window
+AROUND = 1.3  # window over the longer side of the body's box
+REACH = 0.02  # [image widths], farther no outline is looked for
+ALONG = 0.6  # least cosine between the drawn outline's normal and the way to the mask's outline
+MOST = 48  # points of one body's outline
+LEAST = 12  # fewer say nothing
+BEHIND = 0.1  # [m] a piece has to be behind a body for certain not to hide it
+SPREAD = 2  # [px of the window] around what may end a mask
+WIDER = 3.0  # [px], usual error of a mask's border that is the same all around
+SHIFT = 8.0  # [px], usual shift of a body against its mask
+LARGER = 0.04  # usual error of the size that a body is seen with, as a share
+ERROR = 2.0  # [px], usual error of one place of an outline
+INDEPENDENT = 16.0  # places of an outline
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Bodies in camera axes, and what may hide them."""
+
+    verts: Float[Tensor, "bodies verts 3"]
+    faces: Int[Tensor, "faces 3"]
+    skin: Float[Tensor, "bodies points 3"]
+    """The skin points that carry the outline [m]."""
+    camera: Camera
+    front: Float[Tensor, "h w"]
+    """Depth of the nearest piece, in a picture of any size [m]; inf: none."""
+
+
+def gather_outlines(seen: Seen, table: MaskTable, rows: Int[Tensor, " bodies"]) -> Outline:
+    """How far each body's outline is from that of its mask.
+
+    Args:
+        seen: The bodies.
+        table: Masks of everybody.
+        rows: Which rows of the table these bodies are.
+    """
+    found: list[Outline] = []
+    for first in range(0, len(rows), 64):  # 64 windows at a time, for memory
+        part = slice(first, first + 64)
+        some = replace(seen, verts=seen.verts[part], skin=seen.skin[part])
+        views, corner = _windows(some)
+        drawn = layers(some.verts.float(), seen.faces, views).front
+        for k, row in enumerate(rows[part].tolist()):  # masks are decoded one by one
+            if table.own[row] is None:
+                continue
+            one = _compare(some, k, drawn[k], (views.K[k], corner[k]), table.decode(row))
+            if one is not None:
+                found.append(replace(one, body=one.body + first))
+    return _joined(found, seen.skin)
+
+
+def _windows(seen: Seen) -> tuple[Crops, Float[Tensor, "bodies 3"]]:
+    """A square window around each body; its corner [px] and its zoom."""
+    at = project(seen.verts, seen.camera.K.to(seen.verts))
+    low, high = at.amin(1), at.amax(1)
+    side = AROUND * (high - low).amax(-1).clamp_min(8)
+    zoom, corner = SIDE / side, (low + high) / 2 - side[:, None] / 2
+    K = seen.camera.K.to(at).expand(len(at), 3, 3).clone()
+    K[:, :2, 2] = K[:, :2, 2] - corner
+    K[:, :2] = K[:, :2] * zoom[:, None, None]
+    return Crops(K.float(), SIDE, SIDE), torch.cat([corner, zoom[:, None]], -1)
+
+
+def _compare(
+    seen: Seen,
+    k: int,
+    drawn: Float[Tensor, "side side"],
+    window: tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]],
+    masks: tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]],
+) -> Outline | None:
+    """The outline of one body; None where too little of it can be compared."""
+    body, zoom = drawn.isfinite(), float(window[1][2])
+    own, others = (_sampled(m, window[1], seen.camera) for m in masks)
+    if not bool(own.any()) or not bool(body.any()):
+        return None
+    depth = drawn[body].median()
+    front = _sampled(seen.front, window[1], seen.camera)
+    blocked = _grown(others | (front < depth + BEHIND) | _outside(window[1], seen.camera))
+    away = _signed(own)
+    normal, rises = _slope(_signed(body)), _slope(away)
+    agree = (normal * rises).sum(0) > ALONG
+    near = away.abs() < REACH * seen.camera.width * zoom
+    inner = torch.nn.functional.max_pool2d((~body).float()[None, None], 3, 1, 1)[0, 0] < 0.5
+    y, x = (body & ~inner & ~blocked & agree & near).nonzero(as_tuple=True)
+    if len(y) < LEAST:
+        return None
+    gap = (away[y, x] + 0.5) / zoom
+    gap = gap - _wider(gap, normal[:, y, x].mT, torch.stack([x, y], -1) / zoom)
+    some = evenly(torch.arange(len(y)), MOST)
+    y, x = y[some], x[some]
+    pixel = torch.stack([x, y], -1).float().add(0.5) / zoom + window[1][:2]
+    skin = project(seen.skin[k], seen.camera.K.to(seen.skin))
+    carrier = torch.cdist(pixel, skin.float()).argmin(-1)
+    weight = torch.full_like(gap[some], POINTS / len(some))
+    return Outline(
+        torch.full_like(carrier, k), carrier, skin[carrier].float(), normal[:, y, x].mT,
+        gap[some], weight,
+    )  # fmt: skip
+
+
+def _wider(
+    gap: Float[Tensor, " points"], normal: Float[Tensor, "points 2"], at: Float[Tensor, "points 2"]
+) -> Tensor:
+    """By how much the mask is narrower all around, told from a body that is off or too large [px].
+
+    Least squares with a usual size for each: the border, two shifts, and the share of the size.
+    """
+    middle = at - at.mean(0)
+    size = middle.norm(dim=-1).amax().clamp_min(1.0)
+    ways = torch.cat([torch.ones_like(gap)[:, None], normal], -1)
+    ways = torch.cat([ways, (normal * middle).sum(-1, keepdim=True) / size], -1)
+    usual = gap.new_tensor([WIDER, SHIFT, SHIFT, LARGER * float(size)])
+    design = (ways * usual).double()
+    ridge = torch.eye(4, dtype=torch.float64) * ERROR**2
+    inner = design.mT @ design + ridge * len(gap) / INDEPENDENT
+    share = torch.linalg.solve(inner, design.mT @ gap.double())
+    return share[0].to(gap) * WIDER
+
+
+def _sampled(image: Tensor, window: Float[Tensor, "3"], camera: Camera) -> Tensor:
+    """An image of any size at the pixel centres of the window; its border goes on."""
+    x, y = ((torch.arange(SIDE) + 0.5) / float(window[2]) + float(c) for c in window[:2])
+    height, width = image.shape
+    columns = (x * width / camera.width).long().clamp(0, width - 1)
+    rows = (y * height / camera.height).long().clamp(0, height - 1)
+    return image[rows][:, columns]
+
+
+def _outside(window: Float[Tensor, "3"], camera: Camera) -> Bool[Tensor, "side side"]:
+    """Beyond the border of the image, or right at it."""
+    x, y = ((torch.arange(SIDE) + 0.5) / float(window[2]) + float(c) for c in window[:2])
+    rows, columns = (y < 2) | (y > camera.height - 2), (x < 2) | (x > camera.width - 2)
+    return rows[:, None] | columns[None]
+
+
+def _grown(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    size = 2 * SPREAD + 1
+    return torch.nn.functional.max_pool2d(mask.float()[None, None], size, 1, SPREAD)[0, 0] > 0.5
+
+
+def _signed(mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Distance from the outline, negative inside [px]."""
+    from scipy.ndimage import distance_transform_edt
+
+    inside = mask.numpy()
+    outer = np.asarray(distance_transform_edt(~inside)) if not inside.all() else 0.0 * inside
+    inner = np.asarray(distance_transform_edt(inside)) if not inside.all() else inside + 0.0
+    return torch.from_numpy(np.where(inside, 0.5 - inner, outer - 0.5)).float()
+
+
+def _slope(image: Float[Tensor, "h w"]) -> Float[Tensor, "2 h w"]:
+    """Direction in which a distance grows, along x and y."""
+    smooth = torch.nn.functional.avg_pool2d(image[None, None], 5, 1, 2, count_include_pad=False)[
+        0, 0
+    ]
+    down, right = torch.gradient(smooth)
+    both = torch.stack([right, down])
+    return both / both.norm(dim=0).clamp_min(1e-6)
+
+
+def _joined(found: list[Outline], like: Tensor) -> Outline:
+    none = torch.zeros(0, dtype=torch.long)
+    empty = like.new_zeros(0).float()
+    pair = empty.reshape(0, 2)
+    return Outline(
+        torch.cat([none, *(o.body for o in found)]),
+        torch.cat([none, *(o.skin for o in found)]),
+        torch.cat([pair, *(o.pixel for o in found)]),
+        torch.cat([pair, *(o.normal for o in found)]),
+        torch.cat([empty, *(o.gap for o in found)]),
+        torch.cat([empty, *(o.weight for o in found)]),
+    )

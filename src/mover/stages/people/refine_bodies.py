@@ -1,0 +1,284 @@
+"""Refine the bodies with the room that they helped to find (Sec. "HPS estimation", after PROX).
+
+With the parameters of a body model the pose is refined, bare meshes are moved as a whole. Rows are
+taken a few hundred at a time, in the order of their tracks, with neighbours on both sides that are
+moved along and thrown away, so that memory does not grow with the video.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mover.bodies.corrected import (
+    Correction,
+    Moved,
+    Puppet,
+    corrected,
+    moved,
+    no_correction,
+    normals_after,
+    puppet_of,
+)
+from mover.bodies.parts import parts_of
+from mover.bodies.posture import touching
+from mover.bodies.skin import PARTS
+from mover.bodies.smpl_model import pose_rows
+from mover.core.errors import InputError
+from mover.core.observe import Observer, silent
+from mover.core.records import map_tensors, record
+from mover.core.types import Bodies, Capture, Room
+from mover.energy.body_terms.contact import Matches, Skin, gather_matches
+from mover.energy.body_terms.order import Bounds
+from mover.energy.body_terms.outline import Outline
+from mover.energy.body_terms.start import ANGLE
+from mover.energy.body_terms.time import gather_neighbours
+from mover.energy.config import BodyWeights, MatchConfig
+from mover.energy.minimize import minimize
+from mover.geometry.camera import to_camera
+from mover.stages.config import RefineBodiesConfig
+from mover.stages.people.body_energy import Evidence, Feet, body_energy
+from mover.stages.people.body_evidence import (
+    Picked,
+    Surroundings,
+    Watched,
+    order_bounds,
+    pick,
+    resting_soles,
+    surroundings_of,
+    watched_of,
+)
+from mover.stages.people.body_outlines import Seen, gather_outlines
+
+# Everybody who is refined, and what is found about them each time they have moved.
+
+SIDES = ("left", "right")
+
+
+@dataclass(frozen=True)
+class Cast:
+    """Everybody, and what is known before anything moves."""
+
+    bodies: Bodies
+    picked: Picked
+    room: Surroundings
+    chance: Float[Tensor, "bodies picked"]
+    rest: Float[Tensor, "bodies feet"]
+    watched: Watched | None
+
+
+@dataclass(frozen=True)
+class Acted:
+    """Some rows where they are now."""
+
+    rows: Int[Tensor, " rows"]
+    bodies: Bodies
+    """As they were given."""
+    puppet: Puppet
+    by: Correction
+
+
+def cast_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Cast:
+    """Everybody and the room, before anything moves.
+
+    Raises:
+        InputError: If the room has no bodies or no floor.
+    """
+    bodies, ground = room.bodies, room.scene.ground
+    if bodies is None or not len(bodies.frame) or ground is None:
+        lack = "bodies" if ground is not None else "floor"
+        raise InputError(f"the room has no {lack}: there is nothing to refine")
+    bodies = map_tensors(lambda x: x.float() if x.is_floating_point() else x, bodies)
+    parts = parts_of(bodies)
+    picked = pick(bodies, parts)
+    surroundings = surroundings_of(room, capture)
+    asked = weights.order or weights.outline
+    people = None if capture is None or not asked else capture.people
+    given = None if capture is None else capture.touch
+    if given is not None and given.shape != bodies.verts.shape[:2]:
+        given = None
+    chance = given if given is not None else touching(bodies, parts, ground)
+    rest = resting_soles(bodies, parts, ground)
+    return Cast(
+        bodies, picked, surroundings, _furniture_only(chance[:, picked.index].float(), picked),
+        rest, watched_of(surroundings, people, bodies),
+    )  # fmt: skip
+
+
+def _furniture_only(chance: Tensor, picked: Picked) -> Tensor:
+    """Without the soles, which the floor holds, and forearms, which seem to rest in the air."""
+    without = torch.tensor([PARTS.index(f"{s}_{p}") for s in SIDES for p in ("sole", "forearm")])
+    return torch.where(torch.isin(picked.part, without), torch.zeros_like(chance), chance)
+
+
+def known_of(cast: Cast, bodies: Bodies, rows: Int[Tensor, " rows"]) -> Evidence:
+    """What does not change while the bodies move."""
+    room = cast.room
+    soles = torch.stack([cast.picked.part == 0, cast.picked.part == 1])
+    return Evidence(
+        camera=room.camera, ground=room.ground, furniture=room.furniture,
+        near=gather_neighbours(bodies.frame, bodies.person, bodies.fps),
+        feet=Feet(soles, cast.rest[rows]), matches=None, bounds=None, rho=0.1,
+        even=cast.picked.even,
+    )  # fmt: skip
+
+
+def looked(
+    cast: Cast, acted: Acted, known: Evidence, weights: BodyWeights, match: MatchConfig
+) -> Evidence:
+    """Look anew for what the skin touches, what hides it, and where outlines should go."""
+    puppet, by, rows = acted.puppet, acted.by, acted.rows
+    with torch.no_grad():
+        now, normals = moved(puppet, by), normals_after(puppet, by)
+    matches: Matches | None = None
+    bounds: Bounds | None = None
+    if weights.touch:
+        skin = _skin(cast, acted, known, now, normals)
+        matches = gather_matches(skin, cast.room.surface, match, cast.room.furniture)
+    if weights.order and cast.watched is not None:
+        even = cast.picked.even
+        bounds = order_bounds(cast.watched, rows, now.skin[:, even], normals[:, even])
+    outline: Outline | None = None
+    if weights.outline and cast.watched is not None:
+        outline = _outlines(cast, acted)
+    return replace(known, matches=matches, bounds=bounds, outline=outline)
+
+
+def _skin(cast: Cast, acted: Acted, known: Evidence, now: Moved, normals: Tensor) -> Skin:
+    """The skin where it is now; errors of poses count where they are not corrected."""
+    return Skin(
+        points=now.skin, normals=normals, chance=cast.chance[acted.rows], group=cast.picked.group,
+        track=known.near.track, pivot=now.points[:, 0],
+        bent=ANGLE if acted.puppet.model is None else 0.0,
+    )  # fmt: skip
+
+
+def _outlines(cast: Cast, acted: Acted) -> Outline:
+    """The outlines of the bodies where they stand now, against their masks."""
+    assert cast.watched is not None
+    room, bodies, rows = cast.room, acted.bodies, acted.rows
+    rigid = acted.puppet.model is None
+    whole = corrected(replace(bodies, pose=None) if rigid else bodies, acted.by)
+    verts = to_camera(whole.verts, room.camera.R_cam_world)
+    skin = verts[:, cast.picked.index]
+    seen = Seen(verts, bodies.faces, skin, room.camera, room.front)
+    return gather_outlines(seen, cast.watched.table, rows)
+
+
+SMOOTHED = BodyWeights(under=0.0, stand=0.0, lock=0.0, sink=0.0, touch=0.0, order=0.0, outline=0.0)
+"""No room at all: smooth in time, near to what was given."""
+ABLATION = {
+    "baseline": SMOOTHED,
+    "+CamGP": replace(SMOOTHED, under=1.0, stand=1.0, lock=1.0),
+    "+CamGP+SDF": replace(BodyWeights(), touch=0.0, order=0.0, outline=0.0),
+    "+CamGP+Contact": replace(BodyWeights(), sink=0.0, order=0.0, outline=0.0),
+    "+CamGP+SDF+Contact": replace(BodyWeights(), order=0.0, outline=0.0),
+    "masks": replace(SMOOTHED, outline=1.0),
+    "masks+CamGP": replace(SMOOTHED, under=1.0, stand=1.0, lock=1.0, outline=1.0),
+    "masks+CamGP+SDF+Contact": replace(BodyWeights(), order=0.0),
+    "all": BodyWeights(),
+}
+"""Weights of the paper's table, the same with the outlines of masks, and with the depth order."""
+
+
+@record
+class RefinedBodies:
+    """People whose bodies agree with the room."""
+
+    bodies: Bodies
+    """All rows, in the world of the room."""
+    shift: Float[Tensor, "bodies 3"]
+    """How far each pelvis has moved [m]."""
+    energy: Float[Tensor, " bodies"]
+    """What is left of the price [nats]."""
+
+
+def refine_bodies(
+    room: Room,
+    capture: Capture | None,
+    config: RefineBodiesConfig,
+    observe: Observer = silent,
+) -> RefinedBodies:
+    """Move the people of a room so that they agree with its floor and furniture.
+
+    Args:
+        room: The estimated room; its bodies are in its world, with a pose where it may be refined.
+        capture: Gives masks and known contacts; without it there is no depth order.
+        config: Weights and settings.
+        observe: Called after each step.
+
+    Raises:
+        InputError: If the room has no bodies or no floor.
+    """
+    cast = cast_of(room, capture, config.weights)
+    order = sorted(
+        range(len(cast.bodies.frame)),
+        key=lambda k: (int(cast.bodies.person[k]), int(cast.bodies.frame[k])),
+    )
+    found: Correction | None = None
+    energy = torch.zeros(len(order))
+    for first in range(0, len(order), config.rows):
+        inner = order[first : first + config.rows]
+        start = max(0, first - config.overlap)
+        rows = torch.tensor(order[start : first + config.rows + config.overlap])
+        by, left = _refine(cast, rows, config, observe)
+        keep = slice(first - start, first - start + len(inner))
+        found = _put(found, by, torch.tensor(inner), keep, len(order))
+        energy[inner] = left[keep]
+    assert found is not None, "bodies have at least one row"
+    return RefinedBodies(corrected(cast.bodies, found), found.shift, energy)
+
+
+def _refine(
+    cast: Cast, rows: Int[Tensor, " rows"], config: RefineBodiesConfig, observe: Observer
+) -> tuple[Correction, Float[Tensor, " rows"]]:
+    """Some rows, in rounds: first moved as a whole, then with their pose."""
+    bodies = _take(cast.bodies, rows)
+    puppet = puppet_of(bodies, cast.picked.index)
+    stiff = replace(puppet, model=None, pose=None)
+    by, known = no_correction(stiff), known_of(cast, bodies, rows)
+    left = torch.zeros(len(rows))
+    total = config.places + config.rounds
+    for turn in range(total):
+        now, method = (stiff, config.place) if turn < config.places else (puppet, config.method)
+        by = _begun(now, by)
+        share = turn / max(1, total - 1)
+        rho = config.rhos[0] * (config.rhos[1] / config.rhos[0]) ** share
+        acted = Acted(rows, bodies, now, by)
+        known = replace(looked(cast, acted, known, config.weights, config.match), rho=rho)
+        energy = partial(body_energy, puppet=now, known=known, weights=config.weights)
+        found = minimize(energy, by, method, observe, "refine_bodies")
+        by, left = found.at, found.value
+    return _begun(puppet, by), left
+
+
+def _begun(puppet: Puppet, by: Correction) -> Correction:
+    """The same correction with the angles of this puppet, which were not free before."""
+    none = no_correction(puppet)
+    if none.angles.shape == by.angles.shape:
+        return by
+    return replace(none, shift=by.shift, turn=by.turn)
+
+
+def _take(bodies: Bodies, rows: Int[Tensor, " rows"]) -> Bodies:
+    pose = None if bodies.pose is None else pose_rows(bodies.pose, rows)
+    joints = None if bodies.joints is None else bodies.joints[rows]
+    return replace(
+        bodies, verts=bodies.verts[rows], joints=joints, frame=bodies.frame[rows],
+        person=bodies.person[rows], pose=pose,
+    )  # fmt: skip
+
+
+def _put(
+    whole: Correction | None, part: Correction, rows: Int[Tensor, " rows"], keep: slice, count: int
+) -> Correction:
+    """Write the kept rows of a part into the correction of everybody."""
+
+    def into(name: str) -> Tensor:
+        value = getattr(part, name)[keep]
+        before = value.new_zeros(count, value.shape[1]) if whole is None else getattr(whole, name)
+        return before.index_copy(0, rows, value)
+
+    return Correction(into("shift"), into("turn"), into("angles"))

@@ -1,0 +1,196 @@
+r"""Leave out frames whose body cannot be right (Sec. 3.2, "Initial Estimate of 3D Bodies").
+
+Paper:     {j : nu_j < tau_pelvis and alpha_j < tau_local}, nu and alpha the accelerations of the
+           pelvis and of the joints relative to it.
+Reading:   A body departs from constant velocity because it is pushed (metres per second squared)
+           and because it is estimated frame by frame (metres). So the limit on the second
+           difference is `jitter + acceleration * h^2`, h the time between frames: 0.21 m for the
+           pelvis at 30 frames a second (authors: 0.18 m at any rate) and 0.6 m at 5, where
+           an honest step down makes 0.31 m and a jump by half a metre 1 m. Local joints are
+           measured by the mean of their lengths; the mean vector of the authors' code (limit
+           0.09 m, less noise) does not see that left and right are swapped.
+Departure: A wrong frame also spoils the second differences of its neighbours. `chain` keeps the
+           longest sequence of frames that is consistent; `each` judges every frame by itself.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mover.core.observe import Observer, Step, silent
+from mover.core.records import record
+from mover.core.types import Bodies
+from mover.stages.config import SelectConfig
+
+LOCAL = (
+    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow",
+    "left_hip", "right_hip", "left_knee", "right_knee",
+)  # fmt: skip
+SPREAD_VERTS = 32  # vertices that stand for the joints of a body without any
+REACH = 13  # frames in a row that may be left out
+CUT = 6.0  # frames that one would rather leave out than believe that a track jumps
+
+Points = Float[np.ndarray, "frames points 3"]
+
+
+@record
+class SelectInputs:
+    """Who moves."""
+
+    bodies: Bodies
+
+
+@record
+class Selection:
+    """Which rows of the bodies give evidence."""
+
+    keep: Bool[Tensor, " bodies"]
+
+
+def select_frames(
+    inputs: SelectInputs, config: SelectConfig = SelectConfig(), observe: Observer = silent
+) -> Selection:
+    """Find the frames in which a person moves as a person can.
+
+    Each track is judged by itself, at its real times, so that gaps do no harm. Unordered images and
+    tracks of fewer than three frames are kept whole.
+    """
+    bodies = inputs.bodies
+    keep = np.ones(len(bodies.frame), dtype=bool)
+    tracks = bodies.person.unique().tolist()
+    if bodies.fps is None:
+        return Selection(torch.from_numpy(keep))
+    frame, points = bodies.frame.cpu().numpy(), _points(bodies)
+    for index, person in enumerate(tracks):
+        rows = np.flatnonzero(bodies.person.cpu().numpy() == person)
+        rows = rows[np.argsort(frame[rows], kind="stable")]
+        if len(rows) >= 3:
+            keep[rows] = _select(frame[rows] / bodies.fps, points[rows], config)
+        observe(Step("select_frames", index, len(tracks)))
+    return Selection(torch.from_numpy(keep).to(bodies.frame.device))
+
+
+def _points(bodies: Bodies) -> Points:
+    """The pelvis, and then the other points relative to it [m]; without joints from vertices."""
+    names = bodies.joint_names
+    if bodies.joints is not None and {"pelvis", *LOCAL} <= set(names):
+        points = bodies.joints[:, [names.index(n) for n in ("pelvis", *LOCAL)]]
+    else:
+        picked = torch.linspace(0, bodies.verts.shape[1] - 1, SPREAD_VERTS).round().long()
+        centre = bodies.verts.mean(1, keepdim=True)
+        points = torch.cat([centre, bodies.verts[:, picked.to(centre.device)]], 1)
+    points = torch.cat([points[:, :1], points[:, 1:] - points[:, :1]], 1)
+    return points.detach().cpu().double().numpy()
+
+
+def _select(time: Float[np.ndarray, " frames"], points: Points, config: SelectConfig) -> np.ndarray:
+    if config.rule == "each":
+        inner = np.arange(1, len(time) - 1)
+        strain = np.zeros(len(time))
+        strain[1:-1] = _strain(time, points, (inner - 1, inner, inner + 1), config)
+        keep = _eroded(strain < 1, config.erode)
+    else:
+        keep = _longest(time, points, config)
+        strain = np.zeros(len(time))
+        at = np.flatnonzero(keep)
+        if len(at) > 2:
+            strain[at[1:-1]] = _strain(time, points, (at[:-2], at[1:-1], at[2:]), config)
+    return _steadiest(time, keep, strain, config.window)
+
+
+def _strain(
+    time: Float[np.ndarray, " frames"],
+    points: Points,
+    triple: tuple[np.ndarray, np.ndarray, np.ndarray],
+    config: SelectConfig,
+) -> np.ndarray:
+    """Second difference over its limit at the middle of three frames; above 1 it is not honest."""
+    i, j, k = triple
+    h1, h2 = time[j] - time[i], time[k] - time[j]
+    to_i, to_k = h2 / (h1 + h2), h1 / (h1 + h2)
+    straight = points[i] * to_i[..., None, None] + points[k] * to_k[..., None, None]
+    second, area = 2 * (points[j] - straight), h1 * h2  # a h1 h2 [m]
+    pelvis, joints = np.linalg.norm(second[..., 0, :], axis=-1), second[..., 1:, :]
+    if config.local == "vector":
+        joints = joints.mean(-2, keepdims=True)
+    local = np.linalg.norm(joints, axis=-1).mean(-1)
+    return np.maximum(
+        pelvis / (config.pelvis_jitter + config.pelvis_acceleration * area),
+        local / (config.local_jitter + config.local_acceleration * area),
+    )
+
+
+def _eroded(keep: np.ndarray, by: int) -> np.ndarray:
+    wrong = np.convolve(~keep, np.ones(2 * by + 1), mode="same") > 0.5
+    return ~wrong
+
+
+def _steadiest(time: np.ndarray, keep: np.ndarray, strain: np.ndarray, window: float) -> np.ndarray:
+    """Keep one frame of every window: the one with the least strain."""
+    if window <= 0:
+        return keep
+    chosen = np.zeros_like(keep)
+    part = np.floor((time - time[0]) / window + 1e-6).astype(int)
+    for one in np.unique(part[keep]):  # a few frames each
+        at = np.flatnonzero(keep & (part == one))
+        chosen[at[strain[at].argmin()]] = True
+    return chosen
+
+
+def _longest(time: np.ndarray, points: Points, config: SelectConfig) -> np.ndarray:
+    """The sequence with the fewest frames left out whose every three neighbours are honest.
+
+    Shortest path: `pair[b, k]` is the least cost of a sequence that ends with frames k - 1 - b
+    and k. A frame left out costs 1, a jump of the track `CUT`.
+    """
+    n, back = len(time), np.arange(REACH)
+    pair = np.full((REACH, n), np.inf)  # cost of (k - 1 - b, k)
+    came = np.full(
+        (REACH, n), -1
+    )  # the b of the frame before k - 1 - b; -1: a sequence begins there
+    alone, before = np.zeros(n), np.full(n, -1)  # cost of beginning with k, and the frame before
+    for j in range(n):
+        ends = alone[:j] if j == 0 else np.minimum(alone[:j], pair[:, :j].min(0))
+        alone[j], before[j] = _begin(ends, j)
+        k = j + 1 + back[: max(0, min(REACH, n - 1 - j))]
+        if not len(k):
+            continue
+        i = j - 1 - back[: min(REACH, j)]
+        cost = np.full((len(i) + 1, len(k)), alone[j])
+        if len(i):
+            i2, k2 = np.broadcast_arrays(i[:, None], k[None, :])
+            strain = _strain(time, points, (i2, np.full_like(i2, j), k2), config)
+            cost[1:] = np.where(strain < 1, pair[: len(i), j][:, None] + 1e-3 * strain, np.inf)
+        best = cost.argmin(0)
+        pair[k - 1 - j, k] = cost[best, np.arange(len(k))] + (k - 1 - j)
+        came[k - 1 - j, k] = best - 1
+    return _trace(pair, came, alone, before)
+
+
+def _begin(ends: np.ndarray, j: int) -> tuple[float, int]:
+    """Least cost of a sequence that begins with frame j, and the frame where the last one ended."""
+    if j == 0:
+        return 0.0, -1
+    jump = ends + (j - 1 - np.arange(j)) + CUT
+    last = int(jump.argmin())
+    return (float(j), -1) if j <= jump[last] else (float(jump[last]), last)
+
+
+def _trace(pair: np.ndarray, came: np.ndarray, alone: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Walk back along the best path."""
+    n = len(alone)
+    keep = np.zeros(n, dtype=bool)
+    best = np.minimum(alone, pair.min(0)) + (n - 1 - np.arange(n))
+    k = int(best.argmin())
+    while k >= 0:
+        keep[k] = True
+        b = int(pair[:, k].argmin())
+        if alone[k] <= pair[b, k]:
+            k = int(before[k])
+            continue
+        while b >= 0:
+            k, b = k - 1 - b, int(came[b, k])
+            keep[k] = True
+        k = int(before[k])
+    return keep

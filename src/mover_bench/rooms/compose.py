@@ -1,0 +1,325 @@
+"""A furnished room before a camera.
+
+Pieces stand along a wall, around a table, in the middle of a room; how much of each others hide is
+counted in a small picture without people.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.core.records import record
+from mover.core.types import Camera
+from mover.furniture.library import make_piece
+from mover.geometry.camera import project, tilted, to_camera
+from mover.geometry.raster import first_hit
+from mover_bench.rooms.config import PlanConfig, Rule
+from mover_bench.rooms.placed import Placed, corners, verts_on_floor
+from mover_bench.rooms.turns import facing, heading_of, left_of
+
+Pose = tuple[float, float, float]
+Size = tuple[float, float, float]
+Others = list[Placed]
+
+
+def _wall(rng: np.random.Generator, size: Size, walls: np.ndarray, _: Others) -> Pose:
+    side = int(rng.integers(3))
+    off = size[2] / 2 + float(rng.uniform(0.02, 0.06))
+    half = size[0] / 2 + 0.02
+    if side == 0:
+        return float(rng.uniform(walls[0, 0] + half, walls[1, 0] - half)), walls[0, 1] + off, 0.0
+    z = float(rng.uniform(walls[0, 1] + half, max(walls[0, 1] + half + 0.1, -2.6 - half)))
+    turn = np.pi / 2 if side == 1 else -np.pi / 2
+    return (walls[0, 0] + off if side == 1 else walls[1, 0] - off), z, turn
+
+
+def _corner(rng: np.random.Generator, size: Size, walls: np.ndarray, _: Others) -> Pose:
+    off = max(size[0], size[2]) / 2 + float(rng.uniform(0.03, 0.5))
+    x = walls[0, 0] + off if rng.integers(2) else walls[1, 0] - off
+    return float(x), float(walls[0, 1] + off), float(rng.uniform(-np.pi, np.pi))
+
+
+def _middle(rng: np.random.Generator, _: Size, walls: np.ndarray, __: Others) -> Pose:
+    x = float(rng.uniform(-1.4, 1.4))
+    z = float(rng.uniform(walls[0, 1] + 1.6, -3.1))
+    return x, z, float(rng.choice([0.0, np.pi / 2]) + np.radians(rng.uniform(-8, 8)))
+
+
+def _facing(rng: np.random.Generator, _: Size, walls: np.ndarray, __: Others) -> Pose:
+    x = float(rng.uniform(walls[0, 0] + 0.6, walls[1, 0] - 0.6))
+    z = float(rng.uniform(walls[0, 1] + 0.6, -2.7))
+    centre = np.array([0.0, (walls[0, 1] - 2.8) / 2])
+    heading = float(heading_of(centre - np.array([x, z])) + np.radians(rng.uniform(-50, 50)))
+    return x, z, heading
+
+
+def _before(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
+    sofas = [p for p in others if p.furniture.category == "sofa"]
+    if not sofas:
+        return None
+    front = sofas[0].furniture.size[2] / 2 + size[2] / 2 + float(rng.uniform(0.8, 1.0))
+    place = sofas[0].place + front * facing(np.array(sofas[0].heading))
+    return float(place[0]), float(place[1]), sofas[0].heading
+
+
+def _around(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
+    tables = [p for p in others if p.furniture.category == "table"]
+    if not tables:
+        return None
+    side = int(rng.integers(4))
+    w, d = tables[0].furniture.size[0], tables[0].furniture.size[2]
+    away = (d if side % 2 == 0 else w) / 2 + size[2] / 2 + float(rng.uniform(0.06, 0.45))
+    out = tables[0].heading + side * np.pi / 2
+    place = tables[0].place + away * facing(np.array(out))
+    turn = float(rng.choice([np.pi, np.pi / 2, -np.pi / 2, 0.0])) + np.radians(rng.uniform(-20, 20))
+    return float(place[0]), float(place[1]), float(out + turn)
+
+
+def _beside(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
+    beds = [p for p in others if p.furniture.category == "bed"]
+    if not beds:
+        return None
+    bed = beds[0]
+    side = 1 if rng.integers(2) else -1
+    across = side * (bed.furniture.size[0] / 2 + size[0] / 2 + float(rng.uniform(0.06, 0.12)))
+    along = -bed.furniture.size[2] / 2 + size[2] / 2
+    place = (
+        bed.place + across * left_of(np.array(bed.heading)) + along * facing(np.array(bed.heading))
+    )
+    return float(place[0]), float(place[1]), bed.heading
+
+
+RULES: dict[Rule, Callable[[np.random.Generator, Size, np.ndarray, Others], Pose | None]] = {
+    "wall": _wall, "corner": _corner, "middle": _middle, "facing": _facing, "before": _before,
+    "around": _around, "beside": _beside,
+}  # fmt: skip
+"""Draws (x [m], z [m], heading [rad]) of a piece of a size among others; None: nowhere."""
+
+
+# How much of each piece of furniture other pieces hide, in a small picture without people.
+
+
+WIDTH = 240  # [px] of the small picture
+HIDDEN = 0.3  # a piece of which more is hidden counts as hidden
+
+
+def depth_of(piece: Placed, camera: Camera, height: float) -> Float[Tensor, "h w"]:
+    """Depth of a piece drawn alone by a camera above the floor [m], infinite where it is not."""
+    zoom = WIDTH / camera.width
+    size = (max(1, round(camera.height * zoom)), WIDTH)
+    K = camera.K * torch.tensor([[zoom], [size[0] / camera.height], [1.0]])
+    verts = torch.from_numpy(verts_on_floor(piece)).float() - torch.tensor([0, height, 0])
+    cam = to_camera(verts, camera.R_cam_world)
+    return first_hit(cam, piece.furniture.mesh.faces, K, size)[0]
+
+
+def worth(depths: list[Float[Tensor, "h w"]], least: float, most: float) -> float:
+    """How many pieces others hide well, plus a little; -1 where one can hardly be seen.
+
+    Args:
+        depths: Of each piece drawn alone [m].
+        least: Fewest pixels of the small picture that a piece must show.
+        most: No piece may be hidden more than this share.
+    """
+    alone = torch.stack(depths)
+    covered = alone.isfinite()
+    seen = (covered & (alone <= alone.amin(0))).sum((1, 2)).numpy()
+    hidden = 1 - seen / covered.sum((1, 2)).clamp_min(1).numpy()
+    if (hidden > most).any() or (seen < least).any():
+        return -1.0
+    return float((hidden >= HIDDEN).sum() + 0.1 * hidden.mean())
+
+
+# Furnish a room: what stands where, and from where the camera sees it.
+
+
+@record
+class Viewpoint:
+    """The camera over the floor: it stands at x = z = 0."""
+
+    camera: Camera
+    height: float
+    """Above the floor [m]."""
+
+
+@record
+class Plan:
+    """A furnished room."""
+
+    pieces: tuple[Placed, ...]
+    view: Viewpoint
+    low: tuple[float, float]
+    """Smallest x and z of the floor [m]."""
+    high: tuple[float, float]
+    """Largest x and z of the floor [m]."""
+
+    @property
+    def walls(self) -> Float[np.ndarray, "2 2"]:
+        """Smallest, then largest x and z of the floor [m]."""
+        return np.array([self.low, self.high])
+
+
+KINDS: dict[str, tuple[tuple[str, Rule], ...]] = {
+    "living room": (
+        ("sofa", "wall"), ("coffee table", "before"), ("table", "middle"), ("chair", "around"),
+        ("armchair", "facing"), ("shelf", "wall"), ("cabinet", "wall"), ("floor lamp", "corner"),
+        ("stool", "facing"),
+    ),
+    "bedroom": (
+        ("double bed", "wall"), ("nightstand", "beside"), ("wardrobe", "wall"), ("desk", "wall"),
+        ("chair", "facing"), ("cabinet", "wall"), ("armchair", "facing"), ("floor lamp", "corner"),
+    ),
+    "dining room": (
+        ("table", "middle"), ("chair", "around"), ("chair", "around"), ("sofa", "wall"),
+        ("cabinet", "wall"), ("shelf", "wall"), ("bench", "facing"), ("floor lamp", "corner"),
+    ),
+    "studio": (
+        ("single bed", "wall"), ("desk", "wall"), ("office chair", "facing"),
+        ("armchair", "facing"), ("shelf", "wall"), ("nightstand", "beside"), ("cabinet", "wall"),
+        ("floor lamp", "corner"),
+    ),
+}  # fmt: skip
+"""What stands in each kind of room, the most important first."""
+
+ROUNDS = 5  # rooms to choose from
+TRIES = 40
+CHOICES = 8  # places to choose from, the one that hides the most pieces
+SPARE = 1.15  # on the fewest pixels of a piece, which are counted in a small picture
+MARGIN: dict[Rule, float] = {
+    "wall": 0.06, "corner": 0.05, "middle": 0.5, "facing": 0.45, "before": 0.1, "around": 0.04,
+    "beside": 0.04,
+}  # fmt: skip
+"""Free floor around a piece, by where it stands [m]."""
+
+
+def make_view(size: tuple[int, int], numbers: tuple[float, float, float, float]) -> Viewpoint:
+    """A camera of a width and height [px] with (height [m], pitch, roll, field of view [rad])."""
+    width, height = size
+    above, pitch, roll, fov = numbers
+    focal = width / 2 / np.tan(fov / 2)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    turn = tilted(torch.tensor(pitch, dtype=torch.float64), torch.tensor(roll, dtype=torch.float64))
+    return Viewpoint(Camera(K.float(), turn.float(), width, height), above)
+
+
+def draw_view(rng: np.random.Generator, size: tuple[int, int], config: PlanConfig) -> Viewpoint:
+    """A camera as somebody would put it up: the higher, the more it looks down."""
+    height = float(rng.uniform(*config.camera_height))
+    pitch = -np.radians(rng.uniform(*config.look_down) + 4 * (height - 1.2))
+    roll = np.radians(rng.uniform(-2, 2))
+    fov = np.radians(rng.uniform(*config.field_of_view))
+    return make_view(size, (height, float(pitch), float(roll), float(fov)))
+
+
+def draw_plan(
+    rng: np.random.Generator,
+    size: tuple[int, int],
+    most: int,
+    least: int,
+    config: PlanConfig | None = None,
+) -> Plan:
+    """A room of a random kind, many of whose pieces are partly hidden.
+
+    Args:
+        rng: Source of randomness.
+        size: Width and height of the image [px].
+        most: Most pieces.
+        least: Fewest pixels that each piece shows.
+        config: How it is furnished and seen.
+    """
+    config = config or PlanConfig()
+    kind = sorted(KINDS)[int(rng.integers(len(KINDS)))]
+    best, most_hidden = None, -1.0
+    for _ in range(ROUNDS):
+        wanted = (*KINDS[kind], *config.more)[:most]
+        plan, value = _furnished(rng, size, wanted, least, config)
+        if best is None or value > most_hidden:
+            best, most_hidden = plan, value
+        if most_hidden >= config.crowded * len(best.pieces):
+            break
+    assert best is not None, "there is at least one round"
+    return best
+
+
+def _furnished(
+    rng: np.random.Generator,
+    size: tuple[int, int],
+    wanted: tuple[tuple[str, Rule], ...],
+    least: int,
+    config: PlanConfig,
+) -> tuple[Plan, float]:
+    """One room, and how many of its pieces are well hidden."""
+    view = draw_view(rng, size, config)
+    wide, deep = float(rng.uniform(*config.wide)), float(rng.uniform(*config.far))
+    low, high = (-wide / 2, -deep), (wide / 2, -1.9)
+    plan, value = Plan((), view, low, high), 0.0
+    few = SPARE * least * (WIDTH / size[0]) ** 2
+    drawn: list[Float[Tensor, "h w"]] = []
+    for what in wanted:
+        spots = _spots(plan, what, rng, config)
+        looks = [depth_of(spot, view.camera, view.height) for spot in spots]
+        values = [worth([*drawn, look], few, config.hidden) for look in looks]
+        best = int(np.argmax(values)) if values else -1
+        if best >= 0 and values[best] >= 0:
+            drawn, value = [*drawn, looks[best]], values[best]
+            plan = dataclasses.replace(plan, pieces=(*plan.pieces, spots[best]))
+    return plan, value
+
+
+def _spots(
+    plan: Plan, what: tuple[str, Rule], rng: np.random.Generator, config: PlanConfig
+) -> list[Placed]:
+    """Up to `CHOICES` places where a new piece stands free and in view."""
+    name, rule = what
+    furniture = make_piece(name, rng)
+    others = list(plan.pieces)
+    count = sum(p.furniture.category == furniture.category for p in others)
+    label = f"{furniture.category.replace(' ', '_')}_{count}"
+    found: list[Placed] = []
+    for _ in range(TRIES):
+        spot = RULES[rule](rng, furniture.size, plan.walls, others)
+        if spot is None or len(found) == CHOICES:
+            break
+        piece = Placed(label, furniture, (spot[0], spot[1]), spot[2])
+        free = _fits(piece, others, config.spacing * MARGIN[rule], plan.walls)
+        if free and in_view(piece, plan.view) >= config.visible:
+            found.append(piece)
+    return found
+
+
+def in_view(piece: Placed, view: Viewpoint) -> float:
+    """Share of the vertices that the image holds."""
+    verts = torch.from_numpy(verts_on_floor(piece)).float()
+    cam = to_camera(verts - torch.tensor([0, view.height, 0]), view.camera.R_cam_world)
+    pixel = project(cam, view.camera.K)
+    size = torch.tensor([view.camera.width, view.camera.height])
+    inside = ((pixel > 0) & (pixel < size)).all(-1) & (cam[:, 2] > 0.3)
+    return float(inside.double().mean())
+
+
+def _fits(piece: Placed, others: list[Placed], margin: float, walls: np.ndarray) -> bool:
+    own = corners(piece)
+    if (own < walls[0] + 0.01).any() or (own > walls[1] - 0.01).any():
+        return False
+    return not any(overlap(piece, other, margin) for other in others)
+
+
+def overlap(a: Placed, b: Placed, margin: float) -> bool:
+    """Whether footprints come nearer than `margin` (along some edge's normal) [m]."""
+    reach = (
+        np.hypot(a.furniture.size[0], a.furniture.size[2])
+        + np.hypot(b.furniture.size[0], b.furniture.size[2])
+    ) / 2 + 2 * margin
+    if np.hypot(*(a.place - b.place)) > reach:
+        return False
+    first, second = corners(a, margin / 2), corners(b, margin / 2)
+    for heading in (a.heading, b.heading):
+        for axis in (facing(np.array(heading)), left_of(np.array(heading))):
+            p, q = first @ axis, second @ axis
+            if p.max() < q.min() or q.max() < p.min():
+                return False
+    return True

@@ -1,0 +1,160 @@
+"""How a known room is made and used, and how wrong its input is, with a source for each number."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+Rule = Literal["wall", "corner", "middle", "facing", "before", "around", "beside"]
+"""Where a piece of furniture may stand."""
+
+
+@dataclass(frozen=True)
+class PlanConfig:
+    """How a room is furnished and seen."""
+
+    camera_height: tuple[float, float] = (1.2, 1.7)
+    """Lowest and highest camera above the floor [m]."""
+    look_down: tuple[float, float] = (8.0, 14.0)
+    """How far a camera 1.2 m high looks down; one that is higher by 1 m 4 more [degrees]."""
+    field_of_view: tuple[float, float] = (61.0, 69.0)
+    """Of the image's width [degrees]."""
+    wide: tuple[float, float] = (4.6, 5.4)
+    """Of the floor, from left to right [m]."""
+    far: tuple[float, float] = (5.6, 6.4)
+    """From the camera to the wall behind the furniture [m]."""
+    visible: float = 0.85
+    """Least share of a piece's vertices inside the image."""
+    hidden: float = 0.75
+    """No piece may be hidden by others more than this."""
+    crowded: float = 1 / 3
+    """Share of the pieces that others should hide; of five rooms the one nearest to it is taken."""
+    spacing: float = 1.0
+    """Factor on the free floor around each piece."""
+    more: tuple[tuple[str, Rule], ...] = ()
+    """What stands in the room after the pieces of its kind, and where."""
+
+
+@dataclass(frozen=True)
+class ActConfig:
+    """What people do."""
+
+    tasks: int = 5
+    """Most tasks with furniture for each person."""
+    walks: int = 2
+    """Walks to free places: the first comes before all tasks, the others after them."""
+    rounds: int = 1
+    """How often each piece is thought of; more make other uses of the same piece."""
+    apart: float = 0.0
+    """More than 0: people only walk, and keep their skin so far from all furniture [m]."""
+
+
+@dataclass(frozen=True)
+class RoomConfig:
+    """How a known room is made."""
+
+    width: int = 960
+    """Of the image [px]."""
+    height: int = 540
+    """Of the image [px]."""
+    fps: float = 5.0
+    """Frames a second."""
+    people: int = 1
+    """How many people use the room, 1 or 2."""
+    pieces: int = 9
+    """Most pieces of furniture."""
+    least_pieces: int = 6
+    """Fewest pieces of furniture that the camera sees."""
+    least_frames: int = 200
+    """Fewest frames."""
+    least_touches: int = 3
+    """Fewest tasks that touch furniture, over all people."""
+    least_pixels: int = 500
+    """A piece with fewer visible pixels is not annotated well enough: the room is refused."""
+    stay: float = 1.0
+    """Factor on how long people sit, lie and stand."""
+    most_frames: int = 0
+    """The video ends after so many; 0: when everybody is done."""
+    least_passing: float = 0.0
+    """Least share of the bodies that furniture hides in part."""
+    plan: PlanConfig = field(default_factory=PlanConfig)
+    """How the room is furnished and seen."""
+    acts: ActConfig = field(default_factory=ActConfig)
+    """What people do."""
+
+
+# How wrong the input of a known room is, with a source for each number.
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """How wrong the input is. Zero everywhere gives the truth back."""
+
+    along_ray: float = 0.3
+    """Objects: largest shift along the viewing ray, drawn evenly [m]; the size follows."""
+    sideways: float = 0.1
+    """Objects: largest shift along each world axis, drawn evenly [m]."""
+    yaw: float = 30.0
+    """Objects: largest turn, drawn evenly [degrees]."""
+    flips: float = 0.1
+    """Objects: share that is turned by a further 90, 180 or 270 degrees."""
+    scale: float = 0.15
+    """Objects: largest error of the size along each axis, drawn evenly [share]."""
+    other_shapes: float = 0.0
+    """Objects: share whose mesh is another piece of the same class, stretched to the same box."""
+    camera: float = 3.0
+    """Mean size of the error of pitch and of roll; between 2/3 and 4/3 of it [degrees]."""
+    focal: float = 0.0
+    """Largest error of the focal length, drawn evenly [share]."""
+    depth_bias: float = 0.03
+    """Bodies: largest error of a person's depth; the body keeps its size [share]."""
+    depth_drift: float = 0.01
+    """Bodies: standard deviation of a depth error that changes within a second [share]."""
+    pose: float = 4.0
+    """Bodies: standard deviation of each joint's rotation error [degrees]."""
+    pose_seconds: float = 0.6
+    """Bodies: how long a pose error lasts [s]."""
+    pose_hidden: float = 1.5
+    """Bodies: factor on the pose error where more than half of the body is hidden."""
+    jitter: float = 0.015
+    """Bodies: standard deviation of the place, independent in each frame and axis [m]."""
+    dropped: float = 0.02
+    """Bodies: share of rows that are missing."""
+    person_masks: int = 3
+    """People's masks: most pixels by which they grow or shrink (at least 1 unless 0) [px]."""
+    missed_masks: float = 0.03
+    """People's masks: share that is missing."""
+    object_masks: int = 1
+    """Objects' masks: most pixels by which they grow or shrink [px]."""
+    lost_feet: float = 0.0
+    """Bodies: share of rows whose lower legs and feet are lost, in runs of about a second.
+
+    Source: regressors guess the legs that furniture or the border of the image hides (PARE).
+    """
+    lost_angle: float = 35.0
+    """Bodies: standard deviation of the error of lost knees, ankles and toes [degrees]."""
+    leaks: float = 0.0
+    """Objects' masks: share that leaks over its border by a fifth of its own extent.
+
+    Source: instance masks of cluttered rooms run over into the floor and into neighbours of the
+    same colour, which finer outlines (PointRend) do not cure.
+    """
+    missed: float = 0.0
+    """Detections: share that is missing, and with it the object of the initial scene.
+
+    Source of this and of the next three: the paper's rows with PointRend in place of annotated
+    boxes. A score threshold of 0.55 misses hidden objects, and COCO has one class of tables, no
+    shelves and no cabinets.
+    """
+    false: float = 0.0
+    """Detections: objects that are not there, as a share of those that are found."""
+    merged: float = 0.0
+    """Detections: share that swallows a neighbour in the image, which is then missing."""
+    wrong_class: float = 0.0
+    """Detections: share with another class; the mesh is of that class and fills the same box."""
+    holes: float = 0.0
+    """Meshes: share with a hole of up to a tenth of the surface.
+
+    Source of this and of the next: meshes of Total3D are cut out of a deformed sphere, which
+    leaves open borders, and the paper makes them watertight; files of other origin are no better.
+    """
+    inverted: float = 0.0
+    """Meshes: share whose faces all wind the wrong way."""

@@ -1,0 +1,293 @@
+"""What is known of a room: the capture that a perfect upstream would give, and the truth."""
+
+from collections.abc import Generator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.bodies.skinning import open_body
+from mover.core.records import map_tensors, record
+from mover.core.types import Bodies, BodyPose, Capture, Detection, Masks, People, Scene, SceneObject
+from mover.furniture.pieces import Furniture
+from mover_bench.rooms.compose import Plan
+from mover_bench.rooms.config import RoomConfig
+from mover_bench.rooms.motion import Performance, Stage
+from mover_bench.rooms.poses import angles
+from mover_bench.rooms.render import Sight, box_of_mask, encode, look_at, see
+from mover_bench.rooms.truth import GAPE, NONE, nearness
+from mover_bench.rooms.turns import from_vector, to_vector
+
+
+@contextmanager
+def one_thread() -> Generator[None, None, None]:
+    """Let torch use one thread inside the block (or the decorated function)."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+# What is known of a room: the capture that a perfect upstream would give, and the truth.
+
+
+PASSING = 0.1  # a body of which furniture hides more passes behind it
+
+
+@record
+class KnownRoom:
+    """A capture without noise, and the truth behind it."""
+
+    capture: Capture
+    """What a perfect upstream would give: true scene, camera, bodies and masks."""
+    truth: Scene
+    bodies: Bodies
+    """In the camera frame, with pose parameters of the open body."""
+    touching: Bool[Tensor, "bodies verts"]
+    """Skin within 1 cm of a piece or of the floor."""
+    touched: Int[Tensor, "bodies verts"]
+    """What it touches: index of the piece, -1 the floor, -2 nothing."""
+    actions: tuple[str, ...]
+    """What each body does."""
+    furniture: tuple[Furniture, ...]
+    """The pieces in the order of `truth.objects`."""
+    plan: Plan
+    refused: tuple[str, ...]
+    """Rooms and tasks that were not true enough, with the reasons."""
+    whole: Int[Tensor, " bodies"]
+    """Pixels that each body would fill if nothing hid it."""
+    passing: Bool[Tensor, " bodies"]
+    """Furniture hides more than `PASSING` of what the image would show of the body."""
+
+
+class RefusedError(Exception):
+    """A draft of a room is not true enough or not rich enough."""
+
+
+@record
+class Acted:
+    """One person, frame by frame, in the frame of the floor."""
+
+    pose: BodyPose
+    """Of the open body, float64."""
+    pelvis: Float[np.ndarray, "frames 3"]
+    """[m]"""
+    origin: Float[np.ndarray, "3"]
+    """The pelvis of the rest shape: what `transl` leaves out [m]."""
+    labels: tuple[str, ...]
+    """What is done in each frame."""
+    touched: tuple[int, ...]
+    """Index of the piece in use in each frame, or -1."""
+
+
+@record
+class Actor:
+    """One person and what they do."""
+
+    stage: Stage
+    performance: Performance
+
+    @property
+    def acted(self) -> Acted:
+        """The person frame by frame."""
+        person, act = self.stage.person, self.performance
+        pose = angles(person, act.posture)
+        return Acted(pose, act.posture.pelvis, person.origin, act.labels, act.touched)
+
+
+def build(
+    plan: Plan,
+    actors: tuple[Actor | Acted, ...],
+    config: RoomConfig,
+    name: str,
+    refused: tuple[str, ...],
+) -> KnownRoom:
+    """Put people and furniture before the camera.
+
+    Raises:
+        RefusedError: If too little is seen or happens.
+    """
+    acts = tuple(a.acted if isinstance(a, Actor) else a for a in actors)
+    _check(acts, config)
+    sight = see(plan)
+    detections = _detections(plan, sight, config)
+    crowd = _crowd(plan, acts, config.fps)
+    scene = _scene(plan)
+    shown = _people(plan, sight, crowd.bodies)
+    passing = shown.free < (1 - PASSING) * shown.whole
+    share = float(passing.double().mean())
+    if share < config.least_passing:
+        raise RefusedError(f"furniture hides a part of only {share:.0%} of the bodies")
+    capture = _capture(name, scene, detections, sight, crowd.bodies, shown.people)
+    touching = crowd.distance < GAPE
+    touched = torch.where(touching, crowd.nearest, torch.full_like(crowd.nearest, NONE))
+    furniture = tuple(p.furniture for p in plan.pieces)
+    return KnownRoom(
+        capture=capture,
+        truth=scene,
+        bodies=crowd.bodies,
+        touching=touching,
+        touched=touched,
+        actions=crowd.actions,
+        furniture=furniture,
+        plan=plan,
+        refused=refused,
+        whole=shown.whole,
+        passing=passing,
+    )
+
+
+def _check(acts: tuple[Acted, ...], config: RoomConfig) -> None:
+    """Whether there is enough to see."""
+    frames = max(len(a.labels) for a in acts)
+    used = {(k, i) for k, a in enumerate(acts) for i in a.touched if i >= 0}
+    if frames < config.least_frames or len(used) < config.least_touches:
+        raise RefusedError(f"{frames} frames, {len(used)} pieces used")
+
+
+def _capture(
+    name: str,
+    scene: Scene,
+    detections: tuple[Detection, ...],
+    sight: Sight,
+    bodies: Bodies,
+    people: People,
+) -> Capture:
+    """What a perfect upstream would give."""
+    return Capture(
+        name=name,
+        scene=scene,
+        camera_height=None,
+        detections=detections,
+        reference=sight.picture,
+        reference_people=None,
+        bodies=bodies,
+        people=people,
+        touch=None,
+        warnings=(),
+    )
+
+
+def _scene(plan: Plan) -> Scene:
+    pieces = []
+    for index, piece in enumerate(plan.pieces):
+        x, z = piece.place.tolist()
+        place = torch.tensor([x, -plan.view.height, z])
+        pieces.append(
+            SceneObject(
+                piece.id, piece.furniture.category, piece.furniture.mesh, "", index + 1, "ground",
+                place, torch.tensor(float(piece.heading)), torch.ones(3),
+            )
+        )  # fmt: skip
+    return Scene(plan.view.camera, -plan.view.height, tuple(pieces))
+
+
+def _detections(plan: Plan, sight: Sight, config: RoomConfig) -> tuple[Detection, ...]:
+    found = []
+    for index, piece in enumerate(plan.pieces):
+        mask = (sight.piece == index).numpy()
+        if mask.sum() < config.least_pixels:
+            raise RefusedError(f"{piece.id} is hidden: {int(mask.sum())} pixels")
+        box = box_of_mask(mask)
+        found.append(Detection(index + 1, piece.furniture.category, box, encode([mask]), 1.0))
+    return tuple(found)
+
+
+@record
+class _Crowd:
+    """Everybody, row by row."""
+
+    bodies: Bodies
+    distance: Float[Tensor, "bodies verts"]
+    nearest: Int[Tensor, "bodies verts"]
+    actions: tuple[str, ...]
+
+
+def _crowd(plan: Plan, acts: tuple[Acted, ...], fps: float) -> _Crowd:
+    """Everybody in camera axes, how near they are to what, and what they do."""
+    model = open_body()
+    rows = [(f, k) for k, a in enumerate(acts) for f in range(len(a.labels))]
+    order = sorted(range(len(rows)), key=lambda k: rows[k])
+    index = torch.tensor(order)
+    nears = [nearness(model.posed(a.pose)[0].numpy(), plan.pieces) for a in acts]
+    distance = torch.cat([torch.from_numpy(n.distance).float() for n in nears])[index]
+    nearest = torch.cat([torch.from_numpy(n.nearest) for n in nears])[index]
+    labels = [name for a in acts for name in a.labels]
+    pose = _in_camera(plan, acts, index)
+    verts, joints = model.posed(pose)
+    bodies = Bodies(
+        verts=rounded(verts),
+        faces=model.faces,
+        joints=rounded(joints),
+        joint_names=model.joint_names,
+        frame=torch.tensor([rows[k][0] for k in order]),
+        person=torch.tensor([rows[k][1] for k in order]),
+        fps=fps,
+        space="camera",
+        pose=map_tensors(rounded, pose),
+    )
+    return _Crowd(bodies, distance, nearest, tuple(labels[k] for k in order))
+
+
+def rounded(value: Tensor) -> Tensor:
+    """To 10 micrometres, so that the last bits of other machines do not show."""
+    return value.mul(1e5).round().div(1e5).float()
+
+
+def _in_camera(plan: Plan, acts: tuple[Acted, ...], index: Tensor) -> BodyPose:
+    """Pose parameters in camera axes, float64; the root turns about the pelvis."""
+    R = plan.view.camera.R_cam_world.double().numpy()
+    eye = np.array([0.0, plan.view.height, 0.0])
+    fields: dict[str, list[Tensor]] = {
+        n: [] for n in ("betas", "global_orient", "body_pose", "transl")
+    }
+    for act in acts:
+        turn = R @ from_vector(act.pose.global_orient.numpy())
+        pelvis = (act.pelvis - eye) @ R.T
+        fields["betas"].append(act.pose.betas)
+        fields["body_pose"].append(act.pose.body_pose)
+        fields["global_orient"].append(torch.from_numpy(to_vector(turn)))
+        fields["transl"].append(torch.from_numpy(pelvis - act.origin))
+    rows = {n: torch.cat(parts)[index] for n, parts in fields.items()}
+    return BodyPose(model="makehuman", gender="neutral", extra={}, **rows)
+
+
+@record
+class _Shown:
+    """What is seen of everybody, row by row."""
+
+    people: People
+    whole: Int[Tensor, " bodies"]
+    """Pixels of the body alone."""
+    free: Int[Tensor, " bodies"]
+    """Pixels of it that no furniture hides."""
+
+
+def _people(plan: Plan, sight: Sight, bodies: Bodies) -> _Shown:
+    """Visible masks: what furniture or a nearer person hides is left out."""
+    masks, wholes, frees = list[bytes](), list[int](), list[int]()
+    rows: dict[int, list[Tensor]] = {}
+    for frame, verts in zip(bodies.frame.tolist(), bodies.verts, strict=True):
+        rows.setdefault(frame, []).append(verts)
+    for group in rows.values():  # rows are in the order of their frames
+        looks = [look_at(plan, verts, bodies.faces) for verts in group]
+        nearest = sight.depth
+        if len(looks) > 1:
+            nearest = nearest.clone()
+            for look in looks:
+                nearest[look.window] = torch.minimum(nearest[look.window], look.depth)
+        for look in looks:
+            whole = look.depth.isfinite()
+            wholes.append(int(whole.sum()))
+            frees.append(int((whole & (look.depth <= sight.depth[look.window])).sum()))
+            mask = torch.zeros_like(sight.piece, dtype=torch.bool)
+            mask[look.window] = whole & (look.depth <= nearest[look.window])
+            masks += encode([mask.numpy()]).counts
+    camera = plan.view.camera
+    coded = Masks(camera.height, camera.width, tuple(masks))
+    people = People(coded, bodies.frame, bodies.person, {})
+    return _Shown(people, torch.tensor(wholes), torch.tensor(frees))

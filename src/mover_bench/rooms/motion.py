@@ -1,0 +1,256 @@
+"""What people do in a room: a list of tasks becomes a performance, checked against the furniture.
+
+A task that would sink into furniture, or hang in the air where it should touch, is refused and
+left out; the reasons are kept.
+"""
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from mover.core.records import record
+from mover_bench.rooms.gait import Stations, duration, stations, walk
+from mover_bench.rooms.lying import LIE_TIME, berth, lie_down, on_side, roll_over, supine
+from mover_bench.rooms.placed import NoWayError, Placed, way
+from mover_bench.rooms.poses import Person, Posture, blend, chain, rows
+from mover_bench.rooms.seating import (
+    REACH_TIME,
+    SIT_TIME,
+    before,
+    hand_on,
+    leaning,
+    reach_out,
+    seat_spot,
+    seated,
+    settle_down,
+    sit_down,
+    standing,
+    table_stand,
+)
+from mover_bench.rooms.truth import faults
+from mover_bench.rooms.turns import facing, smooth
+
+ARM = 0.06  # [m], how far arms that swing reach out over the width of a way
+DOOR = 0.3  # [m], from a seat or table to where one turns round
+
+
+@record
+class Task:
+    """One thing to do."""
+
+    kind: Literal["walk", "sit", "lean", "lie", "table"]
+    piece: int = -1
+    """Index of the piece; -1 for a walk."""
+    goal: tuple[float, float] = (0.0, 0.0)
+    """Where to walk (x, z) [m]."""
+    seconds: float = 5.0
+    """How long to stay [s]."""
+    side: int = 1
+    """Lying: from which side; at a table: 0 front, 1 left, 2 back, 3 right."""
+    along: float = 0.0
+    """Offset along the edge [m]."""
+    roll: bool = False
+    """Lying: turn onto the side and back."""
+
+
+@record
+class Take:
+    """Frames of one kind of action."""
+
+    posture: Posture
+    label: str
+    piece: int
+
+
+@record
+class Stop:
+    """Where a task is done: in front of a seat, at a table, or anywhere."""
+
+    place: Float[np.ndarray, "2"]
+    heading: float
+    door: Float[np.ndarray, "2"]
+    """Where one turns before and after."""
+
+
+@record
+class Stage:
+    """Everything that a performance needs to know."""
+
+    person: Person
+    pieces: tuple[Placed, ...]
+    bounds: Float[np.ndarray, "2 2"]
+    """Smallest and largest x and z that one may walk [m]."""
+    fps: float
+    apart: float = 0.0
+    """More than 0: how far from all furniture the skin must stay [m]."""
+
+
+@record
+class Performance:
+    """One person's frames."""
+
+    posture: Posture
+    labels: tuple[str, ...]
+    touched: tuple[int, ...]
+    """Index of the piece in use in each frame, or -1."""
+    refused: tuple[str, ...]
+
+
+def perform(
+    stage: Stage, tasks: tuple[Task, ...], start: Stop, rng: np.random.Generator, enough: int = 0
+) -> Performance:
+    """Do the tasks one after the other; refuse those that the furniture does not allow.
+
+    After `enough` frames no further task is begun, unless that is 0.
+    """
+    takes: list[Take] = []
+    refused: list[str] = []
+    here = start
+    for task in tasks:
+        phase = float(rng.uniform(0, 2 * np.pi))
+        if enough and sum(len(take.posture.pelvis) for take in takes) >= enough:
+            break
+        try:
+            stop = _stop(stage, task, here)
+            new = _played(stage, task, (here, stop), phase)
+        except (NoWayError, RefusedTaskError, ValueError) as error:
+            refused.append(f"{task.kind} {_name(stage, task)}: {error}")
+        else:
+            takes, here = takes + new, stop
+    if not takes:
+        takes = [Take(standing(stage.person, start.place, start.heading), "walk", -1)]
+    count = [len(t.posture.pelvis) for t in takes]
+    labels = tuple(t.label for t, n in zip(takes, count, strict=True) for _ in range(n))
+    touched = tuple(t.piece for t, n in zip(takes, count, strict=True) for _ in range(n))
+    return Performance(chain([t.posture for t in takes]), labels, touched, tuple(refused))
+
+
+class RefusedTaskError(Exception):
+    """Bodies would sink into furniture, or hang in the air."""
+
+
+def _played(stage: Stage, task: Task, way: tuple[Stop, Stop], phase: float) -> list[Take]:
+    """Walk there and do it, checked against the furniture."""
+    takes = [_walk(stage, *way)]
+    _check(stage, takes)
+    acts = _ACTS[task.kind](stage, task, way[1], phase)
+    _check(stage, acts)
+    return takes + acts
+
+
+def _check(stage: Stage, takes: list[Take]) -> None:
+    for take in takes:
+        wrong = faults(
+            stage.person, take.posture, take.label, stage.pieces, take.piece, stage.apart
+        )
+        if wrong:
+            raise RefusedTaskError(wrong[0])
+
+
+def _name(stage: Stage, task: Task) -> str:
+    return stage.pieces[task.piece].id if task.piece >= 0 else "to a place"
+
+
+def _stop(stage: Stage, task: Task, here: Stop) -> Stop:
+    if task.kind == "walk":
+        goal = np.array(task.goal)
+        ahead = goal - here.place
+        return Stop(goal, float(np.arctan2(ahead[0], ahead[1])), goal)
+    if task.kind == "table":
+        place, heading = table_stand(stage.pieces, task.piece, task.side, task.along)
+        return Stop(place, heading, place - DOOR * facing(np.array(heading)))
+    spot = seat_spot(stage.pieces, task.piece, task.along)
+    if task.kind == "lie":
+        spot = berth(stage.person, stage.pieces, task.piece, task.side).spot
+    place = before(stage.person, spot)
+    return Stop(place, spot.heading, place + DOOR * facing(np.array(spot.heading)))
+
+
+def _walk(stage: Stage, here: Stop, stop: Stop) -> Take:
+    more = stage.apart + ARM if stage.apart > 0 else 0.0
+    path = way(here.door, stop.door, stage.pieces, stage.bounds, more)
+    outer = np.stack([here.place, stop.place])
+    route: Stations = stations(path, here.heading, stop.heading, outer)
+    return Take(walk(stage.person, route, _times(stage, duration(route))), "walk", -1)
+
+
+def _times(stage: Stage, seconds: float) -> Float[np.ndarray, " frames"]:
+    return np.arange(1, max(1, round(seconds * stage.fps)) + 1) / stage.fps
+
+
+def _shares(stage: Stage, seconds: float) -> Float[np.ndarray, " frames"]:
+    times = _times(stage, seconds)
+    return times / times[-1]
+
+
+def _still(stage: Stage, posture: Posture, seconds: float, phase: float, amount: float) -> Posture:
+    return settle_down(posture, _times(stage, seconds), phase, amount)
+
+
+def _nothing(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
+    del stage, task, stop, phase
+    return []
+
+
+def _sit(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
+    piece = stage.pieces[task.piece]
+    spot = seat_spot(stage.pieces, task.piece, task.along)
+    sitting = seated(stage.person, spot, piece)
+    down = sit_down(stage.person, sitting, stop.heading, _shares(stage, SIT_TIME))
+    takes = [Take(down, "sit down", task.piece)]
+    if task.kind == "lean":
+        back = leaning(stage.person, sitting, piece)
+        move = blend(sitting, back, smooth(_shares(stage, 1.0)))
+        rest = _still(stage, back, task.seconds, phase, 0.0)
+        takes.append(Take(_still(stage, sitting, 1.6, phase, 1.0), "sit", task.piece))
+        takes += [Take(move, "sit", task.piece), Take(rest, "lean", task.piece)]
+        takes.append(Take(_reversed(move), "sit", task.piece))
+    else:
+        takes.append(Take(_still(stage, sitting, task.seconds, phase, 1.0), "sit", task.piece))
+    return [*takes, Take(_reversed(down), "stand up", task.piece)]
+
+
+def _lie(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
+    person, piece = stage.person, stage.pieces[task.piece]
+    place = berth(person, stage.pieces, task.piece, task.side)
+    sitting = seated(person, place.spot, piece)
+    back = supine(person, place, piece)
+    down = sit_down(person, sitting, stop.heading, _shares(stage, SIT_TIME))
+    lay = lie_down(person, sitting, back, piece, _shares(stage, LIE_TIME))
+    takes = [
+        Take(down, "sit down", task.piece),
+        Take(_still(stage, sitting, 1.0, phase, 1.0), "sit", task.piece),
+    ]
+    takes += [
+        Take(lay, "lie down", task.piece),
+        Take(_still(stage, back, task.seconds, phase, 0.0), "lie", task.piece),
+    ]
+    if task.roll:
+        side = on_side(person, back, place, piece)
+        roll = roll_over(person, back, side, piece, _shares(stage, 2.0))
+        rest = _still(stage, rows(roll, slice(-1, None)), 0.6 * task.seconds, phase, 0.0)
+        takes += [Take(roll, "lie", task.piece), Take(rest, "lie", task.piece)]
+        takes += [Take(_reversed(roll), "lie", task.piece)]
+    takes.append(Take(_reversed(lay), "get up", task.piece))
+    return [*takes, Take(_reversed(down), "stand up", task.piece)]
+
+
+def _table(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
+    hand = int(phase > np.pi)
+    piece = stage.pieces[task.piece]
+    end = hand_on(stage.person, stop.place, stop.heading, piece, hand)
+    stand = standing(stage.person, stop.place, stop.heading)
+    out = reach_out(end, stand, _shares(stage, REACH_TIME))
+    label = ("left", "right")[hand] + " hand"
+    still = Take(_still(stage, end, task.seconds, phase, 0.3), label, task.piece)
+    return [Take(out, "reach", task.piece), still, Take(_reversed(out), "reach", task.piece)]
+
+
+def _reversed(posture: Posture) -> Posture:
+    """The same frames from the last to the first, without the last."""
+    order = np.maximum(np.arange(len(posture.pelvis)) - 1, 0)[::-1]
+    return rows(posture, order)
+
+
+_ACTS = {"walk": _nothing, "sit": _sit, "lean": _sit, "lie": _lie, "table": _table}

@@ -1,0 +1,238 @@
+"""Errors like those of real upstream tools, on a room in which everything is known.
+
+Sources: the paper's sensitivity table (uniform noise on the translation, orientation and scale of
+Total3D's objects: 0.3 m, 30 degrees, 15 %), and published errors of monocular body regression
+(a few degrees a joint and 2-3 % in depth, both slow in time); the other rows name their own
+sources in `NoiseConfig`. Every part has its own stream of
+random numbers, so that changing one leaves the others as they were.
+"""
+
+import dataclasses
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from mover.bodies.skinning import open_body
+from mover.core.records import map_tensors
+from mover.core.types import Bodies, BodyPose, Camera, Capture, Mesh, Scene, SceneObject
+from mover.furniture.library import another
+from mover.furniture.pieces import Furniture
+from mover.geometry.camera import pitch_roll, tilted
+from mover.geometry.rle import decode
+from mover.geometry.rotations import rot_y
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.known import KnownRoom, one_thread, rounded
+from mover_bench.rooms.noise_masks import leaking, noisy_detections, noisy_finds, noisy_people
+from mover_bench.rooms.poses import LEG
+from mover_bench.rooms.turns import from_vector, to_vector
+
+HOLE = 0.1  # share of the surface that is missing where a mesh has a hole
+
+
+def other_shapes(
+    pieces: tuple[SceneObject, ...],
+    furniture: tuple[Furniture, ...],
+    noise: NoiseConfig,
+    rng: np.random.Generator,
+) -> tuple[SceneObject, ...]:
+    """Some meshes replaced by other designs that fill the same box."""
+    out: list[SceneObject] = []
+    for piece, known in zip(pieces, furniture, strict=True):
+        swap = float(rng.uniform()) < noise.other_shapes
+        new = another(known, rng)
+        if not swap:
+            out.append(piece)
+            continue
+        ratio = torch.tensor(known.size) / torch.tensor(new.size)
+        out.append(dataclasses.replace(piece, mesh=Mesh(new.mesh.verts * ratio, new.mesh.faces)))
+    return tuple(out)
+
+
+def broken(
+    pieces: tuple[SceneObject, ...], noise: NoiseConfig, rng: np.random.Generator
+) -> tuple[SceneObject, ...]:
+    """Some meshes with a hole, some turned inside out."""
+    out: list[SceneObject] = []
+    for piece in pieces:
+        hole, invert = rng.uniform(size=2) < (noise.holes, noise.inverted)
+        start = int(rng.integers(len(piece.mesh.faces)))
+        mesh = _holed(piece.mesh, start) if hole else piece.mesh
+        faces = mesh.faces.flip(1) if invert else mesh.faces
+        out.append(dataclasses.replace(piece, mesh=Mesh(mesh.verts, faces)))
+    return tuple(out)
+
+
+def _holed(mesh: Mesh, start: int) -> Mesh:
+    """Without the faces nearest to one, at least that one and at most `HOLE` of the surface."""
+    corners = mesh.verts[mesh.faces].double()
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = area.norm(dim=-1) / 2
+    middle = corners.mean(1)
+    order = (middle - middle[start]).norm(dim=-1).argsort(stable=True)
+    gone = order[: max(1, int((area[order].cumsum(0) < HOLE * area.sum()).sum()))]
+    keep = torch.ones(len(mesh.faces), dtype=torch.bool)
+    keep[gone] = False
+    return Mesh(mesh.verts, mesh.faces[keep])
+
+
+# Errors of body regression: depth, pose and place, slow or fast in time; missing frames.
+
+
+LOST_SECONDS = 2.0  # memory of what loses them; a stretch lasts about a second
+
+
+def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) -> Bodies:
+    """Bodies as a network would see them, skinned anew from wrong pose parameters."""
+    bodies = room.bodies
+    assert bodies.pose is not None, "a known room has parameters"
+    pose = map_tensors(lambda x: x.double(), bodies.pose)
+    count = len(bodies.frame)
+    error = slow(rng, bodies, (22, 3), noise.pose_seconds) * np.radians(noise.pose)
+    hidden = hidden_rows(room) if noise.pose_hidden != 1 else np.zeros(count, dtype=bool)
+    error = error * np.where(hidden, noise.pose_hidden, 1.0)[:, None, None]
+    pose = _turned(pose, error)
+    people = bodies.person.numpy()
+    bias = 1 + noise.depth_bias * rng.uniform(-1, 1, int(people.max()) + 1)[people]
+    drift = noise.depth_drift * slow(rng, bodies, (1,), 1.0)[:, 0]
+    pelvis = open_body().posed(pose)[1][:, 0]
+    shift = pelvis * torch.from_numpy(bias + drift - 1)[:, None]
+    shift = shift + torch.from_numpy(noise.jitter * rng.normal(size=(count, 3)))
+    pose = dataclasses.replace(pose, transl=pose.transl + shift)
+    verts, joints = open_body().posed(pose)
+    keep = torch.from_numpy(np.flatnonzero(rng.uniform(size=count) >= noise.dropped))
+    return dataclasses.replace(
+        bodies,
+        verts=rounded(verts[keep]),
+        joints=rounded(joints[keep]),
+        frame=bodies.frame[keep],
+        person=bodies.person[keep],
+        pose=map_tensors(lambda x: rounded(x[keep]), pose),
+    )
+
+
+def lose_feet(bodies: Bodies, noise: NoiseConfig, rng: np.random.Generator) -> Bodies:
+    """Legs below the knees guessed wrongly in some stretches of time."""
+    if noise.lost_feet == 0:
+        return bodies
+    assert bodies.pose is not None, "bodies of known rooms have parameters"
+    mood = slow(rng, bodies, (1,), LOST_SECONDS)[:, 0]
+    lost = mood <= np.quantile(mood, noise.lost_feet)
+    wrong = slow(rng, bodies, (22, 3), noise.pose_seconds) * np.radians(noise.lost_angle)
+    below = np.isin(np.arange(22), [joint for leg in LEG for joint in leg[1:]])
+    pose = map_tensors(lambda x: x.double(), bodies.pose)
+    pose = _turned(pose, wrong * lost[:, None, None] * below[:, None])
+    verts, joints = open_body().posed(pose)
+    return dataclasses.replace(
+        bodies, verts=rounded(verts), joints=rounded(joints), pose=map_tensors(rounded, pose)
+    )
+
+
+def slow(
+    rng: np.random.Generator, bodies: Bodies, shape: tuple[int, ...], seconds: float
+) -> np.ndarray:
+    """Noise (bodies, *shape) of variance one that forgets within `seconds` (Ornstein-Uhlenbeck)."""
+    assert bodies.fps is not None, "a known room is a video"
+    fresh = rng.normal(size=(len(bodies.frame), *shape))
+    memory = np.exp(-1 / (bodies.fps * seconds))
+    frame, person = bodies.frame.numpy(), bodies.person.numpy()
+    last: dict[int, int] = {}
+    for row in range(len(fresh)):  # each row builds on the one before
+        before = last.get(int(person[row]))
+        if before is not None:
+            kept = memory ** float(frame[row] - frame[before])
+            fresh[row] = kept * fresh[before] + np.sqrt(1 - kept**2) * fresh[row]
+        last[int(person[row])] = row
+    return fresh
+
+
+def hidden_rows(room: KnownRoom) -> Bool[np.ndarray, " bodies"]:
+    """Bodies of which less than half is seen, behind furniture or outside the image."""
+    people = room.capture.people
+    assert people is not None, "a known room has masks"
+    seen = [int(decode(people.masks, row).sum()) for row in range(len(people.frame))]
+    return np.array(seen) < 0.5 * room.whole.clamp_min(1).numpy()
+
+
+def _turned(pose: BodyPose, error: Float[np.ndarray, "bodies 22 3"]) -> BodyPose:
+    """Each joint's rotation followed by an error, as an axis-angle vector [rad]."""
+    count = len(error)
+    root = pose.global_orient.reshape(count, 1, 3)
+    local = torch.cat([root, pose.body_pose.reshape(count, 21, 3)], 1).numpy()
+    wrong = torch.from_numpy(to_vector(from_vector(local) @ from_vector(error)))
+    return dataclasses.replace(
+        pose, global_orient=wrong[:, 0], body_pose=wrong[:, 1:].reshape(count, -1)
+    )
+
+
+# Errors like those of real upstream tools, on a room in which everything is known.
+#
+# Sources: the paper's sensitivity table (uniform noise on the translation, orientation and scale of
+# Total3D's objects: 0.3 m, 30 degrees, 15 %), and published errors of monocular body regression
+# (a few degrees a joint and 2-3 % in depth, both slow in time); the other rows name their own
+# sources in `NoiseConfig`. Every part has its own stream of
+# random numbers, so that changing one leaves the others as they were.
+
+
+@one_thread()
+def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
+    """What upstream tools would say about a room; the same for the same seed on every machine.
+
+    The guess of the camera is wrong, so the objects are given in a wrong world: they keep their
+    box centres in the camera frame, and their fronts are projected onto its horizontal plane.
+    """
+    streams = [np.random.default_rng([seed, k]) for k in range(9)]
+    camera = _noisy_camera(room.truth.camera, noise, streams[0])
+    pieces = tuple(
+        _noisy_piece((piece, furniture), (room.truth.camera, camera), noise, streams[1])
+        for piece, furniture in zip(room.truth.objects, room.furniture, strict=True)
+    )
+    pieces = broken(other_shapes(pieces, room.furniture, noise, streams[2]), noise, streams[6])
+    detections = noisy_detections(room.capture.detections, noise.object_masks, streams[3])
+    capture = dataclasses.replace(
+        room.capture,
+        scene=Scene(camera, None, pieces),
+        detections=leaking(detections, noise.leaks, streams[7]),
+        bodies=lose_feet(noisy_bodies(room, noise, streams[4]), noise, streams[8]),
+        people=noisy_people(
+            room.capture.people, noise.person_masks, noise.missed_masks, streams[5]
+        ),
+    )
+    assert room.truth.ground is not None, "a known room has a floor"
+    return noisy_finds(capture, room.truth.ground, noise, [seed, 9])
+
+
+def _noisy_camera(camera: Camera, noise: NoiseConfig, rng: np.random.Generator) -> Camera:
+    pitch, roll = pitch_roll(camera.R_cam_world.double())
+    error = np.radians(noise.camera) * rng.uniform(2 / 3, 4 / 3, 2) * rng.choice([-1.0, 1.0], 2)
+    zoom = 1 + noise.focal * float(rng.uniform(-1, 1))
+    K = camera.K * torch.tensor([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
+    R = tilted(pitch + float(error[0]), roll + float(error[1])).float()
+    return Camera(K, R, camera.width, camera.height)
+
+
+def _noisy_piece(
+    known: tuple[SceneObject, Furniture],
+    cameras: tuple[Camera, Camera],
+    noise: NoiseConfig,
+    rng: np.random.Generator,
+) -> SceneObject:
+    """The piece in the world of the wrong camera, moved, turned and stretched."""
+    piece, _ = known
+    turn = cameras[1].R_cam_world.double().mT @ cameras[0].R_cam_world.double()
+    low, high = piece.mesh.verts.amin(0).double(), piece.mesh.verts.amax(0).double()
+    middle = (low + high) / 2 * piece.scale.double()
+    yaw = piece.yaw.double()
+    centre = turn @ (rot_y(yaw) @ middle + piece.t_world_object.double())
+    front = turn @ torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()])
+    far = 1 + noise.along_ray * float(rng.uniform(-1, 1)) / float(centre.norm())
+    aside = torch.from_numpy(noise.sideways * rng.uniform(-1, 1, 3))
+    size = piece.scale.double() * far * torch.from_numpy(1 + noise.scale * rng.uniform(-1, 1, 3))
+    wrong = np.radians(noise.yaw) * float(rng.uniform(-1, 1))
+    quarter = float(rng.integers(1, 4)) if float(rng.uniform()) < noise.flips else 0.0
+    angle = torch.atan2(front[0], front[2]) + wrong + quarter * np.pi / 2
+    angle = torch.atan2(angle.sin(), angle.cos())
+    place = centre * far + aside - rot_y(angle) @ ((low + high) / 2 * size)
+    return dataclasses.replace(
+        piece, t_world_object=place.float(), yaw=angle.float(), scale=size.float()
+    )

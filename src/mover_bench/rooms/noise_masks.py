@@ -1,0 +1,212 @@
+"""Errors of masks and detections: outlines off by some pixels; objects missed, invented or merged.
+
+An initial scene has one object for each detection, so that the scene follows the detections.
+"""
+
+import dataclasses
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from mover.core.types import Capture, Detection, Masks, People, SceneObject
+from mover.furniture.library import PIECES, canonical, make_piece
+from mover.geometry.camera import project, to_camera
+from mover.geometry.mesh import fit_box
+from mover.geometry.placement import place_object
+from mover.geometry.rle import decode
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.render import box_of_mask, encode
+
+LEAK = 0.2  # radius of a leak as a share of the root of the mask's area
+
+
+def grown(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
+    """The mask with its outline moved out by so many pixels, in where negative."""
+    from scipy.ndimage import distance_transform_edt
+
+    if pixels == 0 or not mask.any() or mask.all():
+        return mask
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    pad = abs(pixels) + 1
+    window = np.s_[
+        max(0, rows[0] - pad) : rows[-1] + pad + 1, max(0, cols[0] - pad) : cols[-1] + pad + 1
+    ]
+    part = mask[window]
+    out = np.zeros_like(mask)
+    if pixels > 0:
+        out[window] = np.asarray(distance_transform_edt(~part)) <= pixels
+    else:
+        out[window] = np.asarray(distance_transform_edt(part)) > -pixels
+    return out if out.any() else mask
+
+
+def noisy_people(
+    people: People | None, most: int, missed: float, rng: np.random.Generator
+) -> People | None:
+    """Masks that grow or shrink by 1 to `most` pixels; some are missing."""
+    if people is None:
+        return None
+    count = len(people.frame)
+    off = rng.integers(1, max(1, most) + 1, count) * rng.choice([-1, 1], count) * (most > 0)
+    keep = np.flatnonzero(rng.uniform(size=count) >= missed)
+    masks = [grown(decode(people.masks, int(k)).numpy(), int(off[k])) for k in keep]
+    rows = torch.from_numpy(keep)
+    size = (people.masks.height, people.masks.width)
+    coded = encode(masks) if masks else Masks(*size, ())
+    return People(coded, people.frame[rows], people.person[rows], people.heights)
+
+
+def noisy_detections(
+    detections: tuple[Detection, ...], most: int, rng: np.random.Generator
+) -> tuple[Detection, ...]:
+    """Masks of objects with outlines that are off; the boxes follow."""
+    out: list[Detection] = []
+    for one in detections:
+        off = int(rng.integers(-most, most + 1))
+        if one.mask is None or off == 0:
+            out.append(one)
+            continue
+        mask = grown(decode(one.mask, 0).numpy(), off)
+        out.append(dataclasses.replace(one, mask=encode([mask]), box=box_of_mask(mask)))
+    return tuple(out)
+
+
+def leaking(
+    detections: tuple[Detection, ...], share: float, rng: np.random.Generator
+) -> tuple[Detection, ...]:
+    """Some masks of objects run over at one place of their border; the boxes follow."""
+    out: list[Detection] = []
+    for one in detections:
+        leaks, where = rng.uniform(size=2)
+        if one.mask is None or leaks >= share:
+            out.append(one)
+            continue
+        mask = leaked(decode(one.mask, 0).numpy(), float(where))
+        out.append(dataclasses.replace(one, mask=encode([mask]), box=box_of_mask(mask)))
+    return tuple(out)
+
+
+def leaked(mask: Bool[np.ndarray, "h w"], where: float) -> Bool[np.ndarray, "h w"]:
+    """The mask and a disc around a point of its border.
+
+    Args:
+        mask: Not empty.
+        where: In [0, 1), which point of the border.
+    """
+    rows, cols = np.nonzero(mask & ~grown(mask, -1))
+    if not len(rows):
+        return mask
+    centre = int(where * len(rows))
+    radius = LEAK * np.sqrt(mask.sum())
+    v, u = np.mgrid[: mask.shape[0], : mask.shape[1]]
+    return mask | ((v - rows[centre]) ** 2 + (u - cols[centre]) ** 2 <= radius**2)
+
+
+# Errors of an instance detector: objects missed, invented, run together, or called by wrong names.
+#
+# An initial scene has one object for each detection, so that the scene follows the detections.
+
+
+TOUCH = 2  # [px], masks that come nearer than this may run together
+
+
+def noisy_finds(capture: Capture, floor: float, noise: NoiseConfig, seed: list[int]) -> Capture:
+    """What a detector finds of a room whose floor is at a height [m], and what is rebuilt of it."""
+    rngs = [np.random.default_rng([*seed, k]) for k in range(4)]
+    capture = _merged(capture, noise.merged, rngs[0])
+    lost = [d.id for d in capture.detections if float(rngs[1].uniform()) < noise.missed]
+    capture = _without(capture, set(lost))
+    capture = _renamed(capture, noise.wrong_class, rngs[2])
+    count = int(rngs[3].binomial(len(capture.detections), noise.false))
+    for index in range(count):
+        capture = _with_false(capture, (index, floor), rngs[3])
+    return capture
+
+
+def _without(capture: Capture, lost: set[int]) -> Capture:
+    pieces = tuple(p for p in capture.scene.objects if p.annotation not in lost)
+    return dataclasses.replace(
+        capture,
+        scene=dataclasses.replace(capture.scene, objects=pieces),
+        detections=tuple(d for d in capture.detections if d.id not in lost),
+    )
+
+
+def _merged(capture: Capture, share: float, rng: np.random.Generator) -> Capture:
+    """Some objects swallow a neighbour in the image, whose own detection is then missing."""
+    gone: set[int] = set()
+    found = {d.id: d for d in capture.detections}
+    for one in capture.detections:
+        swallows = float(rng.uniform()) < share
+        if not swallows or one.id in gone:
+            continue
+        free = [d for d in found.values() if d.id not in gone | {one.id}]
+        near = [d.id for d in free if _touch(found[one.id], d)]
+        if not near:
+            continue
+        other = near[int(rng.integers(len(near)))]
+        mask = _mask(found[one.id]) | _mask(found[other])
+        found[one.id] = dataclasses.replace(one, mask=encode([mask]), box=box_of_mask(mask))
+        gone.add(other)
+    capture = dataclasses.replace(capture, detections=tuple(found.values()))
+    return _without(capture, gone)
+
+
+def _touch(a: Detection, b: Detection) -> bool:
+    """Whether two masks come nearer than `TOUCH`."""
+    from scipy.ndimage import binary_dilation
+
+    apart = (a.box[:2] > b.box[2:] + TOUCH) | (b.box[:2] > a.box[2:] + TOUCH)
+    if a.mask is None or b.mask is None or bool(apart.any()):
+        return False
+    return bool((binary_dilation(_mask(a), iterations=TOUCH) & _mask(b)).any())
+
+
+def _mask(detection: Detection) -> Bool[np.ndarray, "h w"]:
+    assert isinstance(detection.mask, Masks), "detections of known rooms have masks"
+    return decode(detection.mask, 0).numpy()
+
+
+def _renamed(capture: Capture, share: float, rng: np.random.Generator) -> Capture:
+    """Some objects get another class, and a piece of that class stretched to the same box."""
+    if share == 0:
+        return capture
+    names = {d.id: d.category for d in capture.detections}
+    pieces: list[SceneObject] = []
+    for piece in capture.scene.objects:
+        others = [n for n in PIECES if canonical(n) != canonical(piece.category)]
+        name = others[int(rng.integers(len(others)))]
+        new = make_piece(name, rng)
+        if float(rng.uniform()) < share and piece.annotation is not None:
+            verts = piece.mesh.verts
+            mesh = fit_box(new.mesh, verts.amin(0), verts.amax(0))
+            names[piece.annotation] = new.category
+            piece = dataclasses.replace(piece, category=new.category, mesh=mesh)
+        pieces.append(piece)
+    found = [dataclasses.replace(d, category=names[d.id]) for d in capture.detections]
+    scene = dataclasses.replace(capture.scene, objects=tuple(pieces))
+    return dataclasses.replace(capture, scene=scene, detections=tuple(found))
+
+
+def _with_false(capture: Capture, what: tuple[int, float], rng: np.random.Generator) -> Capture:
+    """One more object that is not there: a patch of the image, and a piece that it shows."""
+    index, floor = what
+    camera = capture.scene.camera
+    new = make_piece(list(PIECES)[int(rng.integers(len(PIECES)))], rng)
+    z = float(rng.uniform(-5.0, -2.8))
+    place = torch.tensor([float(rng.uniform(0.4 * z, -0.4 * z)), floor, z])
+    yaw = torch.tensor(float(rng.uniform(-np.pi, np.pi)))
+    number = 1 + max((d.id for d in capture.detections), default=0)
+    piece = SceneObject(f"false_{index}", new.category, new.mesh, "", number, "ground", place, yaw,
+                  torch.ones(3))  # fmt: skip
+    pixel = project(to_camera(place_object(piece).verts, camera.R_cam_world), camera.K)
+    centre = (pixel.amin(0) + pixel.amax(0)).numpy() / 2
+    half = (pixel.amax(0) - pixel.amin(0)).numpy() / 2
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    patch = ((u - centre[0]) / half[0]) ** 2 + ((v - centre[1]) / half[1]) ** 2 < 1
+    if not patch.any():
+        return capture
+    found = Detection(number, new.category, box_of_mask(patch), encode([patch]), 0.6)
+    scene = dataclasses.replace(capture.scene, objects=(*capture.scene.objects, piece))
+    return dataclasses.replace(capture, scene=scene, detections=(*capture.detections, found))

@@ -1,0 +1,299 @@
+"""Known rooms: drawn from a seed with what people are asked to do there, or composed by hand."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.core.types import Mesh
+from mover.furniture.library import canonical, make_piece
+from mover_bench.rooms.compose import Plan, draw_plan, make_view
+from mover_bench.rooms.config import ActConfig, RoomConfig
+from mover_bench.rooms.known import Actor, KnownRoom, RefusedError, build, one_thread
+from mover_bench.rooms.motion import DOOR, Performance, Stage, Stop, Task, perform
+from mover_bench.rooms.placed import ROOMY, Placed, free_of
+from mover_bench.rooms.poses import jointed, make_person, rows
+from mover_bench.rooms.render import draw_bodies, see
+from mover_bench.rooms.seating import table_stand
+from mover_bench.rooms.truth import faults
+from mover_bench.rooms.turns import facing
+
+SITS = frozenset({"chair", "armchair", "office chair", "sofa", "stool", "bench"})
+STANDS = frozenset({"table", "desk", "cabinet"})
+PLACES = 60  # to choose walks from
+GONE = 4  # so many last goals the next one keeps away from
+
+
+def draw_person(rng: np.random.Generator) -> list[float]:
+    """Shape coefficients of an adult."""
+    return [float(b) for b in np.clip(rng.normal(0, 0.7, 4), -1.4, 1.4)] + [0.0] * 6
+
+
+def free_place(plan: Plan, rng: np.random.Generator) -> np.ndarray:
+    """A place to stand with room around it, in view of the camera (x, z) [m].
+
+    Raises:
+        ValueError: If there is none.
+    """
+    low, high = plan.walls[0] + 0.45, np.array([plan.walls[1, 0] - 0.45, -2.9])
+    for _ in range(200):
+        place = rng.uniform(low, high)
+        if abs(place[0]) < 0.5 * -place[1] and free_of(place, plan.pieces, ROOMY):
+            return place
+    raise ValueError("the room has no free floor")
+
+
+def draw_start(plan: Plan, rng: np.random.Generator) -> Stop:
+    """Where a person is when the video begins."""
+    place = free_place(plan, rng)
+    return Stop(place, float(rng.uniform(-np.pi, np.pi)), place)
+
+
+def draw_tasks(
+    plan: Plan, rng: np.random.Generator, length: float, acts: ActConfig
+) -> tuple[Task, ...]:
+    """Sit, lean, lie and stand at tables in random order; walk before and after.
+
+    Args:
+        plan: The room.
+        rng: Source of randomness.
+        length: Factor on all times to stay.
+        acts: How much.
+    """
+    if acts.apart > 0:
+        return draw_walks(plan, rng, acts.walks)
+    tasks: list[Task] = []
+    for _ in range(acts.rounds):
+        uses = _uses(plan, rng, length)
+        tasks += [uses[k] for k in rng.permutation(len(uses))]
+    walks = [Task("walk", goal=_pair(free_place(plan, rng))) for _ in range(acts.walks)]
+    return (*walks[:1], *tasks[: acts.tasks], *walks[1:])
+
+
+def draw_walks(plan: Plan, rng: np.random.Generator, count: int) -> tuple[Task, ...]:
+    """Walks to free places far from one another, every other one behind furniture if there is one.
+
+    Args:
+        plan: The room.
+        rng: Source of randomness.
+        count: How many.
+    """
+    places = np.array([free_place(plan, rng) for _ in range(PLACES)])
+    behind = places[[_is_behind(place, plan) for place in places]]
+    goals = places[:1]
+    for k in range(count):
+        pool = places if k % 2 or not len(behind) else behind
+        apart = np.linalg.norm(pool[:, None] - goals[-GONE:], axis=-1).min(1)
+        goals = np.concatenate([goals, pool[[int(apart.argmax())]]])
+    return tuple(Task("walk", goal=_pair(goal)) for goal in goals[1:])
+
+
+def _is_behind(place: np.ndarray, plan: Plan) -> bool:
+    """Whether furniture stands between the camera and a place."""
+    line = np.linspace(0, 1, 60)[:, None] * place
+    return not bool(free_of(line, plan.pieces, 0.0).all())
+
+
+def _uses(plan: Plan, rng: np.random.Generator, length: float) -> list[Task]:
+    """What can be done with each piece, once."""
+    tasks: list[Task] = []
+    for index, piece in enumerate(plan.pieces):
+        name = canonical(piece.furniture.category)
+        stay = length * float(rng.uniform(4.5, 6.5))
+        if name in SITS:
+            lean = piece.furniture.back_height > 0 and rng.uniform() < 0.6
+            along = _along(piece, rng)
+            tasks.append(Task("lean" if lean else "sit", index, seconds=stay, along=along))
+        if name == "bed" or (
+            name == "sofa"
+            and piece.furniture.seat_right - piece.furniture.seat_left > 1.3
+            and rng.uniform() < 0.5
+        ):
+            side, roll = (1 if rng.integers(2) else -1), name == "bed"
+            tasks.append(Task("lie", index, seconds=stay, side=side, roll=roll))
+        if name in STANDS and 0.65 < piece.furniture.top_height < 1.0:
+            side = _open_side(plan, index, rng)
+            tasks.append(Task("table", index, seconds=0.7 * stay, side=side))
+    return tasks
+
+
+def _pair(place: np.ndarray) -> tuple[float, float]:
+    return float(place[0]), float(place[1])
+
+
+def _along(piece: Placed, rng: np.random.Generator) -> float:
+    room = (piece.furniture.seat_right - piece.furniture.seat_left) / 2 - 0.3
+    return float(rng.uniform(-room, room)) if room > 0 else 0.0
+
+
+def _open_side(plan: Plan, index: int, rng: np.random.Generator) -> int:
+    sides = [0, 1, 2, 3] if plan.pieces[index].furniture.category == "table" else [0]
+    others = tuple(p for k, p in enumerate(plan.pieces) if k != index)
+    good = []
+    for side in sides:
+        place, heading = table_stand(plan.pieces, index, side, 0.0)
+        door = place - DOOR * facing(np.array(heading))
+        inside = (door > plan.walls[0] + 0.3).all() and (door < plan.walls[1] - 0.3).all()
+        if inside and free_of(door, others, 0.3) and free_of(place, others, 0.25):
+            good.append(side)
+    return int(rng.choice(good)) if good else sides[0]
+
+
+# Known rooms: drawn from a seed, or composed by hand for the demo.
+
+
+CLEAR = 0.25  # [m], between the joints of two people
+MOST_WAIT = 24.0  # [s], before somebody begins
+
+
+@one_thread()
+def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
+    """A room in which everything is known; the same for the same seed and configuration.
+
+    Raises:
+        ValueError: If 60 drafts in a row had to be refused.
+    """
+    config = config or RoomConfig()
+    refused: list[str] = []
+    for draft in range(60):
+        rng = np.random.default_rng([seed, draft])
+        try:
+            size = (config.width, config.height)
+            plan = draw_plan(rng, size, config.pieces, config.least_pixels, config.plan)
+            room = build(
+                plan, _cast(plan, config, rng, refused), config, f"room_{seed}", tuple(refused)
+            )
+        except RefusedError as error:
+            refused.append(f"draft {draft}: {error}")
+        else:
+            return room
+    raise ValueError(f"seed {seed}: 60 drafts were refused: {refused[-3:]}")
+
+
+def _cast(
+    plan: Plan, config: RoomConfig, rng: np.random.Generator, refused: list[str]
+) -> tuple[Actor, ...]:
+    """Everybody's performance."""
+    if len(plan.pieces) < config.least_pieces:
+        raise RefusedError(f"only {len(plan.pieces)} pieces fit")
+    actors: list[Actor] = []
+    for _ in range(6 * config.people):
+        if len(actors) == config.people:
+            break
+        actor = _actor(plan, config, rng)
+        wait = patience(actor, actors)
+        if wait is not None:
+            refused += actor.performance.refused
+            whole = late(actor.performance, wait)
+            acted = cut(whole, config.most_frames) if config.most_frames else whole
+            actors.append(dataclasses.replace(actor, performance=acted))
+    if len(actors) < config.people:
+        raise RefusedError("people run into each other")
+    return tuple(actors)
+
+
+def _actor(plan: Plan, config: RoomConfig, rng: np.random.Generator) -> Actor:
+    """Somebody of a random shape who does random things."""
+    bounds = np.stack([plan.walls[0] + 0.25, plan.walls[1] - 0.25])
+    person, apart = make_person(draw_person(rng)), config.acts.apart
+    stage = Stage(person, plan.pieces, bounds, config.fps, apart)
+    try:
+        tasks, start = draw_tasks(plan, rng, config.stay, config.acts), draw_start(plan, rng)
+    except ValueError as error:
+        raise RefusedError(str(error)) from error
+    actor = Actor(stage, perform(stage, tasks, start, rng, config.most_frames))
+    if apart > 0:  # also between the tasks
+        near = faults(person, actor.performance.posture, "walk", plan.pieces, -1, apart)
+        if near:
+            raise RefusedError(near[0])
+    return actor
+
+
+def patience(newcomer: Actor, others: list[Actor]) -> int | None:
+    """Fewest frames to stand still first so that joints of two people keep `CLEAR`; None: never."""
+    if not others:
+        return 0
+    own = jointed(newcomer.stage.person, newcomer.performance.posture)
+    theirs = [jointed(o.stage.person, o.performance.posture) for o in others]
+    for wait in range(0, int(MOST_WAIT * newcomer.stage.fps) + 1, 2):
+        mine = np.concatenate([np.repeat(own[:1], wait, axis=0), own])
+        if all(_clear(mine, joints) for joints in theirs):
+            return wait
+    return None
+
+
+def _clear(a: np.ndarray, b: np.ndarray) -> bool:
+    frames = min(len(a), len(b))
+    middle = np.linalg.norm(a[:frames, 0] - b[:frames, 0], axis=-1)
+    near = np.flatnonzero(middle < 2.0)
+    gap = np.linalg.norm(a[near, :, None] - b[near, None], axis=-1)
+    return bool(gap.size == 0 or gap.min() > CLEAR)
+
+
+def cut(performance: Performance, frames: int) -> Performance:
+    """The first frames of it."""
+    first = slice(0, frames)
+    return Performance(
+        rows(performance.posture, first),
+        performance.labels[first],
+        performance.touched[first],
+        performance.refused,
+    )
+
+
+def late(performance: Performance, wait: int) -> Performance:
+    """The same, after standing still for so many frames."""
+    order = np.maximum(np.arange(-wait, len(performance.labels)), 0)
+    return Performance(
+        rows(performance.posture, order),
+        ("stand",) * wait + performance.labels,
+        (-1,) * wait + performance.touched,
+        performance.refused,
+    )
+
+
+_DEMO: tuple[tuple[str, str, int, int, tuple[float, float, float]], ...] = (
+    ("bed_0", "single bed", 0, 3, (-1.75, -5.08, 0.0)),
+    ("nightstand_0", "nightstand", 0, 3, (-0.9, -5.92, 0.0)),
+    ("shelf_0", "shelf", 2, 3, (-0.05, -5.98, 0.0)),
+    ("cabinet_0", "cabinet", 1, 3, (0.95, -5.9, 0.0)),
+    ("sofa_0", "sofa", 0, 6, (2.1, -4.72, -1.5708)),
+    ("floor_lamp_0", "floor lamp", 0, 3, (1.72, -6.02, 0.0)),
+    ("table_0", "table", 0, 3, (-0.98, -3.2, 0.05)),
+    ("chair_0", "chair", 1, 3, (0.45, -3.9, 0.35)),
+)
+"""Id, piece, style, seed of the sizes, and (x, z, heading) of the demo's furniture."""
+
+
+@one_thread()
+def demo_room() -> KnownRoom:
+    """A bed-sitting room whose tenant walks, sits, leans back, lies and stands at a table."""
+    pieces = tuple(
+        Placed(name, make_piece(kind, np.random.default_rng(sizes), style), spot[:2], spot[2])
+        for name, kind, style, sizes, spot in _DEMO
+    )
+    view = make_view((960, 540), (1.62, float(np.radians(-12.5)), float(np.radians(1.1)), 1.15))
+    plan = Plan(pieces, view, (-2.75, -6.25), (2.75, -1.9))
+    tasks = (
+        Task("walk", goal=(1.1, -4.9)),
+        Task("sit", 7, seconds=5.0),
+        Task("lean", 4, seconds=5.0, along=0.3),
+        Task("table", 6, seconds=4.0, side=2),
+        Task("lie", 0, seconds=6.0, side=1, roll=True),
+        Task("walk", goal=(0.9, -3.0)),
+    )
+    stage = Stage(make_person([0.0] * 10), pieces, np.array([[-2.5, -6.0], [2.5, -2.1]]), 5.0)
+    start = Stop(np.array([0.9, -2.95]), 3.0, np.array([0.9, -2.95]))
+    performance = perform(stage, tasks, start, np.random.default_rng(5))
+    actors = (Actor(stage, performance),)
+    return build(plan, actors, RoomConfig(), "demo", performance.refused)
+
+
+@one_thread()
+def draw_frame(room: KnownRoom, frame: int) -> Float[Tensor, "h w 3"]:
+    """A picture of the room with everybody in it, in [0, 1]."""
+    rows = torch.nonzero(room.bodies.frame == frame)[:, 0].tolist()
+    meshes = [Mesh(room.bodies.verts[k], room.bodies.faces) for k in rows]
+    return draw_bodies(room.plan, see(room.plan), meshes)

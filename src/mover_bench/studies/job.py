@@ -1,0 +1,217 @@
+"""One job of an experiment: make a known room with noise, or rebuild it and measure.
+
+Each job is a process of its own (`python -m mover_bench.studies.job SET SEED NAME FOLDER`) with one
+thread, so that its numbers depend on nothing but its inputs.
+"""
+
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mover import __version__
+from mover.app.batch.runner import write_tree
+from mover.core import records
+from mover.core.explanation import Facts
+from mover.core.observe import Observer, silent
+from mover.core.run import Run, sources
+from mover.core.types import Scene
+from mover.evaluate.evaluation import EvaluateConfig
+from mover.pipeline.reconstruct import reconstruct
+from mover.stages.config import RefineBodiesConfig
+from mover.stages.people.refine_bodies import refine_bodies
+from mover_bench.rooms.config import RoomConfig
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.room import make_room
+from mover_bench.studies.measures import (
+    Trial,
+    carry_all,
+    measure,
+    measure_people,
+    measure_true_room,
+    measure_truth,
+    timing,
+    traits_of,
+)
+from mover_bench.studies.sets import RoomSet, set_named
+from mover_bench.studies.variants import VARIANTS, Variant, frames_of, withheld
+
+ROOM = "room"  # the job that makes the room; all others have the name of their variant
+DONE = "metrics.json"  # a job that has it is finished
+TRUTHS = "truths"  # folder of rooms without noise, which sets share
+STAGES = {"initial": "Initial", "image": "Stage 1", "full": "Full"}
+"""Scenes that are measured, by their name in the files."""
+USES = {"sit": "sit", "lean": "sit", "lie": "lie", "left hand": "hand", "right hand": "hand"}
+"""Interactions that are told apart, by the action of a known room."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One process of an experiment."""
+
+    rooms: str
+    """Name of a set, see `changes.set_named`."""
+    seed: int
+    name: str
+    """A variant, or `ROOM`."""
+    out: Path
+    """Folder of the experiment."""
+
+    @property
+    def home(self) -> Path:
+        """Where the jobs of its room are, and the stages that they share."""
+        return self.out / self.rooms / str(self.seed)
+
+    @property
+    def folder(self) -> Path:
+        """Where its files are."""
+        return self.home / self.name
+
+    @property
+    def room(self) -> Path:
+        """What the room of its seed is stored as."""
+        return self.home / ROOM / ROOM
+
+    @property
+    def truths(self) -> Path:
+        """Where rooms of its seed without noise are kept, for all sets."""
+        return self.out / TRUTHS / str(self.seed)
+
+
+@records.record
+class Rebuilt:
+    """The scenes of a job that pictures are drawn from, and why the objects stand there."""
+
+    image: Scene
+    full: Scene
+    facts: tuple[Facts, ...] = ()
+
+
+@dataclass(frozen=True)
+class Seed:
+    """What a room is drawn from."""
+
+    seed: int
+
+
+def make_truth(inputs: Seed, config: RoomConfig, observe: Observer = silent) -> KnownRoom:
+    """A room without noise, as a stage: sets with the same rooms make it once."""
+    del observe
+    return make_room(inputs.seed, config)
+
+
+def noisy_room(seed: int, rooms: RoomSet, run: Run | None = None) -> Trial:
+    """A generated room of a set, with the noise of the set; `run` keeps the one without noise."""
+    recipe = Seed(seed)
+    room = (
+        make_truth(recipe, rooms.room) if run is None else run.stage(make_truth, recipe, rooms.room)
+    )
+    return spoilt(room, seed, rooms)
+
+
+def spoilt(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
+    """A known room with the noise of a set."""
+    capture = add_noise(room, rooms.noise, seed)
+    traits = traits_of(room, capture.scene)
+    return Trial(capture, room.truth, room.bodies, traits, doing_of(room))
+
+
+def doing_of(room: KnownRoom) -> tuple[str, ...]:
+    """For each body how it uses which piece, such as `sit chair_0`; empty: it uses none."""
+    names: list[str] = []
+    for action, touched in zip(room.actions, room.touched, strict=True):
+        pieces = Counter(touched[touched >= 0].tolist())
+        known = USES.get(action) if pieces else None
+        most = max(pieces, key=lambda k: (pieces[k], -k)) if pieces else -1
+        names.append(f"{known} {room.truth.objects[most].id}" if known else "")
+    return tuple(names)
+
+
+def key_of(job: Job) -> str:
+    """Digest of everything that a job's numbers depend on."""
+    settings = None if job.name == ROOM else VARIANTS[job.name]
+    rooms = set_named(job.rooms)
+    return records.fingerprint(
+        rooms.room, rooms.noise, rooms.version, job.seed, job.name, settings, sources("mover_bench")
+    )
+
+
+def do_job(job: Job) -> None:
+    """Do one job, from what is left of it on disk, and write its results."""
+    if job.name == ROOM:
+        store_room(job, noisy_room(job.seed, set_named(job.rooms), Run(job.truths)))
+    else:
+        rebuild(job, VARIANTS[job.name])
+
+
+def store_room(job: Job, trial: Trial, densities: EvaluateConfig | None = None) -> None:
+    """Keep a room for the jobs that rebuild it, and measure the truth itself."""
+    records.save(trial, job.room)
+    truth = measure_truth(trial, densities)
+    _finish(job, {"truth": truth})
+
+
+def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None) -> None:
+    """Rebuild a stored room as a variant does and measure it."""
+    if not job.room.with_name(DONE).exists():
+        raise FileNotFoundError(f"the room of seed {job.seed} could not be made")
+    trial = records.load(Trial, job.room)
+    capture = withheld(trial.capture, variant.hears, variant.cut)
+    run = Run(job.folder if variant.fresh else job.home)
+    room = reconstruct(capture, variant.config, run)
+    if room.bodies is None or variant.cut is not None:
+        room = carry_all(room, trial.capture)
+    if variant.refined:
+        room = replace(room, bodies=refine_bodies(room, capture, RefineBodiesConfig()).bodies)
+    stages = timing(run.stages)
+    if variant.bodies:
+        found = measure_people(trial, room, variant.bodies)
+    else:
+        facts = tuple(e.facts for e in room.explanations)
+        records.save(Rebuilt(room.image_only, room.scene, facts), job.folder / "scenes")
+        found = measure(trial, room, run, densities)
+        if variant.cut is None:  # no table shows it of parts of a video
+            found["true_room"] = measure_true_room(trial, room, run, densities)
+    _finish(job, found | {"stages": stages, **_length(trial, variant)})
+    shutil.rmtree(job.folder / "stages", ignore_errors=True)
+
+
+def _length(trial: Trial, variant: Variant) -> dict[str, float]:
+    """How many frames and seconds were given, and how many different interactions are in them."""
+    given, truth = trial.capture.bodies, trial.bodies
+    if given is None or truth is None or variant.hears == "nobody":
+        return {"frames": 0, "seconds": 0.0, "interactions": 0}
+    frames = given.frame.unique() if variant.cut is None else frames_of(given, variant.cut)
+    seen = torch.isin(truth.frame, frames).tolist()
+    uses = {name for name, there in zip(trial.doing, seen, strict=False) if there and name}
+    seconds = len(frames) / given.fps if given.fps else 0.0
+    return {"frames": len(frames), "seconds": seconds, "interactions": len(uses)}
+
+
+def _finish(job: Job, results: dict[str, Any]) -> None:
+    about = {
+        "set": job.rooms,
+        "seed": job.seed,
+        "name": job.name,
+        "key": key_of(job),
+        "version": __version__,
+        "sources": sources("mover_bench")[:16],
+    }
+    write_tree(job.folder / DONE, about | results)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Do the job that is named on the command line."""
+    rooms, seed, name, out = arguments
+    torch.set_num_threads(1)
+    do_job(Job(rooms, int(seed), name, Path(out)))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,93 @@
+"""The paper's first table on known rooms: initial, Stage 1 and full, preset by preset.
+
+Every seed and preset is a process of its own; finished ones are files and are not done again.
+"""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from mover.core.errors import InputError
+from mover.core.observe import Observer, Step, silent
+from mover_bench.studies.args import ExperimentArgs
+from mover_bench.studies.job import DONE, ROOM, Job
+from mover_bench.studies.pictures import draw_worst
+from mover_bench.studies.queue import Launch, failure_of, has_results, open_jobs, run_all, start
+from mover_bench.studies.sets import set_named
+from mover_bench.studies.tables import Experiment, need_bench, read_outcome, write_tables
+from mover_bench.studies.variants import VARIANTS, choices
+
+
+def run_experiment(
+    args: ExperimentArgs, observe: Observer = silent, launch: Launch | None = None
+) -> Path:
+    """Do all jobs that are not finished, then write tables and pictures.
+
+    Args:
+        args: What to do.
+        observe: Told of every job that ends.
+        launch: Starts a job; None: as a process of its own.
+
+    Returns:
+        The summary, OUT/SET/summary.md.
+
+    Raises:
+        InputError: If a seed, a preset or a set is none.
+    """
+    seeds = parse_seeds(args.seeds)
+    _check(args)
+    need_bench()
+    rooms = [Job(args.set, seed, ROOM, args.out) for seed in seeds]
+    presets = tuple(dict.fromkeys(args.presets))
+    rebuilt = [Job(args.set, s, name, args.out) for name in presets for s in seeds]
+    jobs, workers = rooms + rebuilt, args.workers or os.cpu_count() or 1
+    waiting = open_jobs(by_room(jobs), args.keep)
+    count, done = len(jobs), len(jobs) - len(waiting)
+    for job in run_all(waiting, workers, launch or start):
+        done += 1
+        observe(Step(f"{args.set} {job.seed}: {job.name}", done - 1, count))
+    outcomes = [read_outcome(job.folder / DONE) for job in rebuilt if has_results(job)]
+    failures = [failure_of(job) for job in jobs if not has_results(job)]
+    experiment = Experiment(
+        command_of(args), args.set, presets, seeds, tuple(outcomes), tuple(failures)
+    )
+    folder = args.out / args.set
+    pictures = draw_worst(experiment, args.set, args.out)
+    return write_tables(experiment, pictures, folder)
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Read `0-9` or `0,3,5-7`.
+
+    Raises:
+        InputError: If it is anything else.
+    """
+    seeds: set[int] = set()
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        ends = [first, last if dash else first]
+        if not all(end.isascii() and end.isdigit() for end in ends) or int(ends[1]) < int(ends[0]):
+            raise InputError(f"--seeds: {text!r}, expected numbers and ranges like 0,3,5-7")
+        seeds.update(range(int(ends[0]), int(ends[1]) + 1))
+    return tuple(sorted(seeds))
+
+
+def command_of(args: ExperimentArgs) -> str:
+    """The command that makes the same table."""
+    presets = " ".join(args.presets)
+    return f"mover experiment --set {args.set} --seeds {args.seeds} --presets {presets}"
+
+
+def by_room(jobs: Sequence[Job]) -> list[Job]:
+    """The jobs of a room one after the other, rooms in the order in which they first appear."""
+    rooms = {key: place for place, key in enumerate(dict.fromkeys((j.rooms, j.seed) for j in jobs))}
+    return sorted(jobs, key=lambda job: rooms[(job.rooms, job.seed)])
+
+
+def _check(args: ExperimentArgs) -> None:
+    set_named(args.set)
+    for name in args.presets:
+        if name not in VARIANTS:
+            raise InputError(f"--presets: {name!r} is none of {choices()}")
+    if args.workers < 0:
+        raise InputError(f"--workers: {args.workers}, expected 0 or more")

@@ -1,0 +1,202 @@
+"""Open HSI Rooms: versioned sets of known rooms, each made from its seeds alone.
+
+A set is a way to make rooms, a way to spoil what is known of them, and the seeds that results are
+reported on; settings are chosen on other seeds. Sets that differ in nothing but the noise have the
+same rooms for the same seeds. The figures of the noise have their sources in `NoiseConfig`.
+For the study of sensitivity one thing of the noise is changed: `rooms+scale=0.25` is the set
+`rooms` with errors of 25 % in the sizes of the objects; rooms, people and all else stay the same.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from mover.core.errors import InputError
+from mover_bench.rooms.config import ActConfig, NoiseConfig, PlanConfig, RoomConfig
+
+
+@dataclass(frozen=True)
+class RoomSet:
+    """Rooms of one kind, with one kind of noise."""
+
+    about: str
+    """What it holds, in a sentence."""
+    seeds: str
+    """Held-out rooms, for results: `1000-1029`."""
+    development: str
+    """Rooms to choose settings on; none is held out."""
+    room: RoomConfig = field(default_factory=RoomConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    version: int = 1
+    """Counts up whenever a room of the set changes."""
+
+
+_SMALL = RoomConfig(
+    width=320,
+    height=180,
+    pieces=5,
+    least_pieces=3,
+    least_frames=40,
+    most_frames=80,
+    least_touches=1,
+    least_pixels=60,
+    stay=0.25,
+    acts=ActConfig(tasks=2, walks=1),
+)
+_FREE = RoomConfig(
+    least_frames=150,
+    most_frames=250,
+    least_touches=0,
+    least_passing=0.25,
+    acts=ActConfig(walks=12, apart=0.05),
+)
+_CROWDED = RoomConfig(
+    pieces=14,
+    least_pieces=9,
+    least_frames=150,
+    plan=PlanConfig(
+        camera_height=(0.9, 1.25),
+        look_down=(5.0, 9.0),
+        field_of_view=(52.0, 58.0),
+        visible=0.4,
+        hidden=0.85,
+        crowded=0.7,
+        spacing=0.6,
+        more=(
+            ("chair", "around"), ("armchair", "facing"), ("stool", "facing"), ("bench", "facing"),
+            ("cabinet", "wall"), ("coffee table", "facing"), ("nightstand", "wall"),
+            ("office chair", "facing"),
+        ),
+    ),
+)  # fmt: skip
+_LONG = RoomConfig(
+    least_frames=300,
+    most_frames=300,
+    least_touches=4,
+    stay=0.4,
+    acts=ActConfig(tasks=16, rounds=3),
+)
+_DETECTED = NoiseConfig(
+    object_masks=3,
+    person_masks=4,
+    missed_masks=0.08,
+    leaks=0.25,
+    missed=0.1,
+    false=0.1,
+    merged=0.05,
+    wrong_class=0.08,
+)
+
+SETS: dict[str, RoomSet] = {
+    "mini": RoomSet(
+        "Small pictures of little rooms with a short visit: a test that takes seconds.",
+        "1000-1002", "100-101", _SMALL,
+    ),
+    "rooms": RoomSet(
+        "A person uses the furniture of a room: the standard set.",
+        "1000-1029", "100-129",
+    ),
+    "two": RoomSet(
+        "Two people use one room.",
+        "1000-1019", "100-129", RoomConfig(people=2),
+    ),
+    "free": RoomSet(
+        "A person walks between the pieces and behind them and touches nothing but the floor.",
+        "1000-1019", "100-129", _FREE,
+    ),
+    "wrong-shape": RoomSet(
+        "The rooms of `rooms`; every mesh that is given is another piece of the same class.",
+        "1000-1029", "100-129", noise=NoiseConfig(other_shapes=1.0),
+    ),
+    "clutter": RoomSet(
+        "More furniture, seen by a lower and narrower camera: pieces hide each other and are cut"
+        " by the border of the image.",
+        "1000-1029", "100-129", _CROWDED,
+    ),
+    "detected": RoomSet(
+        "The rooms of `rooms`; masks and boxes as a detector gives them, with objects missed,"
+        " invented, run together and called by wrong names.",
+        "1000-1029", "100-129", noise=_DETECTED,
+    ),
+    "long": RoomSet(
+        "A minute in which a person uses many pieces, some of them repeatedly, each for a short"
+        " time.",
+        "1000-1009", "100-103", _LONG,
+    ),
+}  # fmt: skip
+"""All sets by name."""
+
+
+# Sets whose noise is changed in one thing, for the study of sensitivity.
+#
+# `rooms+scale=0.25` is the set `rooms` with errors of 25 % in the sizes of the objects; its rooms,
+# people and all other errors stay the same.
+
+
+@dataclass(frozen=True)
+class Change:
+    """An error of the input in growing sizes."""
+
+    title: str
+    unit: str
+    fields: tuple[str, ...]
+    """Of `NoiseConfig`: set to the level."""
+    levels: tuple[float, ...]
+    """Studied sizes; the first is no error of this kind."""
+    without: tuple[str, ...] = ()
+    """Fields that are zero, so that this error is the only one of its kind."""
+    shown: float = 1.0
+    """Factor from a level to the unit."""
+
+
+CHANGES: dict[str, Change] = {
+    "scale": Change("size of objects", "± %", ("scale",), (0.0, 0.05, 0.15, 0.25), shown=100),
+    "place": Change(
+        "place of objects", "± cm", ("sideways",), (0.0, 0.1, 0.2, 0.3), ("along_ray",), shown=100
+    ),
+    "turn": Change("orientation of objects", "± °", ("yaw",), (0.0, 15.0, 30.0, 45.0), ("flips",)),
+    "focal": Change("focal length", "± %", ("focal",), (0.0, 0.025, 0.05), shown=100),
+    "masks": Change("objects' masks", "± px", ("object_masks",), (0, 1, 3, 6)),
+    "leaks": Change("objects' masks that leak", "%", ("leaks",), (0.0, 0.2, 0.4), shown=100),
+    "people": Change("people's masks", "± px", ("person_masks",), (0, 3, 6)),
+    "pose": Change("joints of bodies", "° (sd)", ("pose",), (0.0, 4.0, 8.0)),
+    "depth": Change("depth of bodies", "± %", ("depth_bias",), (0.0, 0.03, 0.06), shown=100),
+    "feet": Change("lost legs", "%", ("lost_feet",), (0.0, 0.2, 0.4), shown=100),
+    "missed": Change("missed objects", "%", ("missed",), (0.0, 0.1, 0.2), shown=100),
+}
+"""By the name that stands in the name of a set."""
+WHOLE = ("object_masks", "person_masks")  # fields that count pixels
+
+
+def set_named(name: str) -> RoomSet:
+    """A set of `SETS`, or one with a changed noise: `rooms+scale=0.25`.
+
+    Raises:
+        InputError: If there is none of this name.
+    """
+    base, plus, change = name.partition("+")
+    if base not in SETS:
+        raise InputError(f"--set: {base!r} is none of {', '.join(SETS)}")
+    if not plus:
+        return SETS[base]
+    kind, _, level = change.partition("=")
+    if kind not in CHANGES:
+        raise InputError(f"--set: {name!r} changes {kind!r}, expected one of {', '.join(CHANGES)}")
+    try:
+        size = float(level)
+    except ValueError:
+        raise InputError(f"--set: {name!r}, expected a number: {base}+{kind}=LEVEL") from None
+    return replace(SETS[base], noise=changed(SETS[base].noise, CHANGES[kind], size))
+
+
+def changed(noise: NoiseConfig, change: Change, level: float) -> NoiseConfig:
+    """The noise with one kind of error of a given size."""
+    values: dict[str, Any] = {
+        name: round(level) if name in WHOLE else level for name in change.fields
+    }
+    return replace(noise, **values, **dict.fromkeys(change.without, 0.0))
+
+
+def changed_set(base: str, kind: str, level: float) -> str:
+    """Name of a changed set; the base itself where its noise is that already."""
+    same = changed(SETS[base].noise, CHANGES[kind], level) == SETS[base].noise
+    return base if same else f"{base}+{kind}={level:g}"
