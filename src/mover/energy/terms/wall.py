@@ -69,8 +69,16 @@ def wall_term(
         walls: The lines; at least one.
     """
     rears = rears_of(layout, size)
-    off = rears.ends @ walls.out.mT - walls.offset
+    off = _across(rears.ends, walls.out) - walls.offset
     apart = off.square().mean(-2)
-    along = (rears.out.detach() @ walls.out.mT) > ALONG
+    along = _across(rears.out.detach(), walls.out) > ALONG
     near = walls.trust * along * RHO**2 / (apart + RHO**2)
     return walls.trust.amax(-1) - near.amax(-1)
+
+
+def _across(
+    points: Float[Tensor, "*batch 2"], out: Float[Tensor, "walls 2"]
+) -> Float[Tensor, "*batch walls"]:
+    """Coordinates along the normals; no matmul, whose bits change with the number of starts."""
+    x, z = out.unbind(-1)
+    return points[..., :1] * x + points[..., 1:] * z
