@@ -101,7 +101,7 @@ class Weighing(Run):
     def stage(self, fn, inputs, config):
         weights = getattr(config, "weights", None)
         if isinstance(weights, SceneWeights):
-            self.heard.append((fn.__name__, weights.scale, config.growth))
+            self.heard.append((fn.__name__, weights.scale, config.uniform_scale_weight))
         return super().stage(fn, inputs, config)
 
 

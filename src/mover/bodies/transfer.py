@@ -98,7 +98,7 @@ SHAPES = 10
 class TransferConfig:
     """How a body is laid into another model."""
 
-    steps: int = 60
+    steps: int = 120
     """Most iterations of L-BFGS, first of shape and place, then of everything."""
     sigma_vertex: float = 0.001
     """Expected distance of corresponding vertices [m]."""
