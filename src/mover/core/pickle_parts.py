@@ -1,33 +1,38 @@
 """What a pickle names: a short list of classes and functions whose data are understood.
 
-A name that is not in the list is refused as soon as it appears. A name that is in it is a word, not
-the thing: what a file would do with it is one of the makers below. What gets its content later (an
-array, a matrix) is a `Part` until then.
+A name that is in the list is a word, not the thing: what a file would do with it is a function of
+this module. What gets its content later (an array, a matrix) is a `Part` until then.
 """
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from mover.core.errors import InputError
 
-LARGEST = 2 << 30
-"""No file and no array is larger [bytes]."""
 REPEATED = 1 << 26
 """No tensor that repeats its numbers is larger [bytes]."""
 TORCH_BYTES = "torch.storage._load_from_bytes"
 JOBLIB = "joblib.numpy_pickle.NumpyArrayWrapper"
-NUMBERS = re.compile(r"[<>=|]?(\?|[biufcSU]\d{1,7}|[bBhHiIlLqQefdFDgG])")
-"""Names of types of numbers and of text; no objects, no fields."""
+TYPES = re.compile(r"[<>=|]?(\?|[biufcSU]\d{1,7}|[bBhHiIlLqQefdFDgG]|O8?|object)")
+"""Names of types of numbers, of text and of objects; no fields."""
 STORAGES = {
     "Float": "<f4", "Double": "<f8", "Half": "<f2", "BFloat16": "<u2", "Long": "<i8",
     "Int": "<i4", "Short": "<i2", "Char": "|i1", "Byte": "|u1", "Bool": "|b1",
 }  # fmt: skip
 """Type of the numbers in each of torch's storages."""
 SIMPLE = (int, float, complex, str, bytes, type(None), np.generic)
+RENAMED = {
+    "__builtin__": "builtins", "copy_reg": "copyreg", "pathlib._local": "pathlib",
+    "numpy._core.multiarray": "numpy.core.multiarray",
+    "numpy._core.numeric": "numpy.core.numeric",
+    **{f"scipy.sparse.{dash}{form}": "scipy.sparse" for dash in ("", "_")
+       for form in ("csc", "csr", "coo")},
+}  # fmt: skip
+"""Modules that are the same as others: of Python 2, of other versions."""
 
 
 class Name(str):
@@ -46,30 +51,30 @@ class Part:
         self.places: list[int] = []
 
 
+class Row(tuple[Any, ...]):
+    """A tuple that is a key only if its hash is quick: of numbers and text, not of more tuples."""
+
+    __slots__ = ()
+
+    def __hash__(self) -> int:
+        if not all(isinstance(v, SIMPLE) for v in self):
+            raise ValueError("a key that is no text, number or tuple of these")
+        return super().__hash__()
+
+
 def named(module: str, name: str) -> Name:
     """The word for a class or function whose data are understood.
 
     Raises:
         InputError: If they are not; nothing was imported or called.
     """
-    full = Name(f"{module}.{name}")
+    full = Name(f"{RENAMED.get(module, module)}.{name}")
     chumpy = module.split(".")[0] == "chumpy" and name.isidentifier()
-    if not chumpy and not any(full in words for words in (WORDS, MAKERS, CONTENT, BEHIND)):
-        shown = full if full.isprintable() and len(full) < 200 else "a class with an odd name"
+    if not chumpy and not any(full in words for words in (WORDS, MAKERS, CONTENT)):
+        shown = f"{module}.{name}"
+        shown = shown if shown.isprintable() and len(shown) < 200 else "a class with an odd name"
         raise InputError(f"the pickle holds {shown}, expected arrays, numbers, text and containers")
     return full
-
-
-def keyed(items: Iterable[Any]) -> Iterator[Any]:
-    """Things that are found by their value: text, numbers, or tuples of these, whose hash is quick.
-
-    Raises:
-        ValueError: If one is anything else.
-    """
-    for item in items:
-        if not all(isinstance(v, SIMPLE) for v in (item if type(item) is tuple else (item,))):
-            raise ValueError("a key that is no text, number or tuple of these")
-        yield item
 
 
 def made(name: Any, args: Any) -> Any:  # noqa: ANN401
@@ -94,85 +99,24 @@ def _rebuilt(kind: Any, base: Any, state: Any) -> Any:  # noqa: ANN401
     return made(kind, ())
 
 
-def _bytes(*args: Any) -> bytes:  # noqa: ANN401
+def _bytes(raw: Any = b"", coding: Any = "latin1") -> bytes:  # noqa: ANN401
     """Bytes from text or bytes, never from a size."""
-    match args:
-        case ():
-            return b""
-        case (bytes() as raw,):
-            return raw
-        case (str() as text,) | (str() as text, "latin1" | "latin-1"):
-            return text.encode("latin1")
-        case (list() as numbers,):
-            return bytes(numbers)
-        case _:
-            raise ValueError("bytes from something else than text")
+    if not isinstance(raw, str | bytes | list) or coding not in ("latin1", "latin-1"):
+        raise ValueError("bytes from something else than text")
+    return raw.encode("latin1") if isinstance(raw, str) else bytes(raw)
 
 
-def _dict(*args: Any) -> dict[Any, Any]:  # noqa: ANN401
-    """A dictionary of pairs."""
-    pairs = [(key, value) for key, value in (args[0] if args else ())]
-    return dict(zip(keyed(key for key, _ in pairs), (value for _, value in pairs), strict=True))
-
-
-def _of_list(kind: Callable[..., Any]) -> Callable[..., Any]:
-    """A container of the items of another one."""
-
-    def build(*args: Any) -> Any:  # noqa: ANN401
-        if any(not isinstance(a, list | tuple | set | frozenset) for a in args) or len(args) > 1:
-            raise ValueError("a container of something else than a list")
-        return kind(*args)
-
-    return build
-
-
-def _set(items: Iterable[Any] = ()) -> set[Any]:
-    return set(keyed(items))
-
-
-def _frozen(items: Iterable[Any] = ()) -> frozenset[Any]:
-    return frozenset(keyed(items))
-
-
-def _first(*args: Any) -> Any:  # noqa: ANN401
-    """A parameter's tensor, a device's name."""
-    return args[0]
-
-
-def _nothing(*_: Any) -> dict[Any, Any]:  # noqa: ANN401
-    """A dictionary whose maker of defaults is not kept."""
-    return {}
-
-
-def _new(kind: Any, *args: Any) -> Any:  # noqa: ANN401
-    """An object of a class, as a function makes it."""
-    return made(kind, args)
-
-
-def _scalar(dtype: Any, raw: Any) -> Any:  # noqa: ANN401
-    return filled(raw, dtype, (1,), "C")[0]
-
-
-def _path(*args: str) -> str:
-    return "/".join(args).replace("//", "/")
-
-
-def _complex(*args: Any) -> complex:  # noqa: ANN401
-    if not all(isinstance(a, float | int) for a in args):
-        raise ValueError("a complex number of something else than numbers")
-    return complex(*args)
+def _listed(items: Any = ()) -> Any:  # noqa: ANN401
+    """The items of another container."""
+    if not isinstance(items, list | tuple | set | frozenset):
+        raise ValueError("a container of something else than a list")
+    return items
 
 
 def _dtype(part: Part, state: Any) -> np.dtype[Any]:  # noqa: ANN401
-    """A type of numbers or text; an object's type is told by `O`."""
-    name = part.args[0]
-    if not isinstance(name, str):
-        raise ValueError("a type without a name")
-    if name in ("O", "O8", "object"):
-        return np.dtype("O")
-    if not NUMBERS.fullmatch(name):
+    if not isinstance(part.args[0], str) or not TYPES.fullmatch(part.args[0]):
         raise ValueError("a type of something else than numbers and text")
-    found = np.dtype(name)
+    found = np.dtype(part.args[0])
     if isinstance(state, tuple) and len(state) > 4:
         if any(x is not None for x in state[2:5]):
             raise ValueError("a type with fields")
@@ -195,10 +139,7 @@ def filled(raw: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:  # noqa:
     if dtype.hasobject:
         if not isinstance(raw, list) or len(raw) != count:
             raise ValueError("an array with the wrong number of objects")
-        array = np.empty(count, object)
-        for index, item in enumerate(raw):
-            array[index] = item
-        return array.reshape(shape, order=order)
+        return np.fromiter(raw, object, count).reshape(shape, order=order)
     data = raw.encode("latin1") if isinstance(raw, str) else raw
     if not isinstance(data, bytes) or len(data) != count * dtype.itemsize:
         raise ValueError("an array whose bytes do not fit its shape")
@@ -251,10 +192,9 @@ def _sparse(part: Part, state: Any) -> Any:  # noqa: ANN401
     from scipy import sparse
 
     form = part.name.rpartition(".")[2][:3]
-    shape = state.get("_shape", state.get("shape"))
     parts = ("row", "col") if form == "coo" else ("indices", "indptr")
-    index = state["coords"] if form == "coo" and "coords" in state else [state[p] for p in parts]
-    arrays = [state["data"], *index]
+    arrays = [state["data"], *(state.get("coords") or [state[part] for part in parts])]
+    shape = state.get("_shape", state.get("shape"))
     if not all(isinstance(a, np.ndarray) and a.ndim == 1 for a in arrays) or len(shape) != 2:
         raise ValueError("a sparse matrix without its arrays")
     if form == "coo":
@@ -282,50 +222,40 @@ def chumpy_array(part: Part, state: Any) -> np.ndarray:  # noqa: ANN401
             raise InputError(f"the pickle holds {part.name} without an array, expected its values")
 
 
-def _under(modules: str, names: str) -> list[str]:
-    """Full names: each of some modules with each of some names."""
-    return [f"{module}.{name}" for module in modules.split() for name in names.split()]
-
-
-PATHS = "PosixPath PurePosixPath WindowsPath PureWindowsPath"
-BUILTINS, COPYREG = "builtins __builtin__", "copyreg copy_reg"
-NUMPY = "numpy.core numpy._core"
-SCIPY = " ".join(
-    f"scipy.sparse.{dash}{form}" for dash in ("", "_") for form in ("csc", "csr", "coo")
-)
 WORDS = {
-    *_under(BUILTINS, "object int float str bool"),
-    *_under("numpy", "ndarray memmap float64 float32 float16 int64 int32 int16 int8 uint8"),
-    *_under("torch", "float64 float32 float16 int64 int32 int16 int8 uint8 bool bfloat16"),
+    *(f"builtins.{name}" for name in ("object", "int", "float", "str", "bool")),
+    *(f"{module}.{kind}{bits}" for module in ("numpy", "torch") for kind, sizes in
+      (("float", (16, 32, 64)), ("int", (8, 16, 32, 64)), ("uint", (8,))) for bits in sizes),
+    "numpy.ndarray", "numpy.memmap", "torch.bool", "torch.bfloat16",
     *(f"torch.{name}Storage" for name in STORAGES), "torch.storage.UntypedStorage",
 }  # fmt: skip
 """Classes that a pickle may name, but not call."""
-BEHIND = (JOBLIB, TORCH_BYTES)
-"""What only the reader itself understands: it lies behind its description in the file."""
 MAKERS: Mapping[str, Callable[..., Any]] = {
-    **dict.fromkeys(_under(BUILTINS, "set"), _of_list(_set)),
-    **dict.fromkeys(_under(BUILTINS, "frozenset"), _of_list(_frozen)),
-    **dict.fromkeys(_under(BUILTINS, "list"), _of_list(list)),
-    **dict.fromkeys([*_under(BUILTINS, "tuple"), "torch.Size"], _of_list(tuple)),
-    **dict.fromkeys([*_under(BUILTINS, "dict"), "collections.OrderedDict"], _dict),
-    **dict.fromkeys([*_under(BUILTINS, "bytes bytearray"), "_codecs.encode"], _bytes),
-    **dict.fromkeys(_under(BUILTINS, "complex"), _complex),
-    **dict.fromkeys(_under(COPYREG, "_reconstructor"), _rebuilt),
-    **dict.fromkeys(_under(COPYREG, "__newobj__"), _new),
-    **dict.fromkeys(_under("pathlib pathlib._local", PATHS), _path),
-    **dict.fromkeys(_under(NUMPY, "multiarray.scalar"), _scalar),
-    **dict.fromkeys(_under(NUMPY, "numeric._frombuffer"), filled),
-    "collections.defaultdict": _nothing,
-    "torch.device": _first,
-    "torch._utils._rebuild_tensor_v2": _tensor,
-    "torch._utils._rebuild_parameter": _first,
-}
-"""What is made at once, by functions that are all written here."""
-CONTENT: Mapping[str, Callable[[Part, Any], Any]] = {
-    "numpy.dtype": _dtype,
-    **dict.fromkeys(_under(NUMPY, "multiarray._reconstruct"), _array),
+    "builtins.set": lambda *items: set(_listed(*items)),
+    "builtins.frozenset": lambda *items: frozenset(_listed(*items)),
+    "builtins.list": lambda *items: list(_listed(*items)),
+    **dict.fromkeys(("builtins.tuple", "torch.Size"), lambda *items: Row(_listed(*items))),
+    **dict.fromkeys(("builtins.dict", "collections.OrderedDict"), lambda pairs=(): dict(pairs)),
+    "collections.defaultdict": lambda *_: {},  # its maker of defaults is not kept
+    **dict.fromkeys(("builtins.bytes", "builtins.bytearray", "_codecs.encode"), _bytes),
+    "builtins.complex": lambda *parts: complex(*parts),
+    "copyreg._reconstructor": _rebuilt,
+    "copyreg.__newobj__": lambda kind, *args: made(kind, args),
     **dict.fromkeys(
-        _under(SCIPY, "csc_matrix csc_array csr_matrix csr_array coo_matrix coo_array"), _sparse
+        (f"pathlib.{name}Path" for name in ("Posix", "PurePosix", "Windows", "PureWindows")),
+        lambda *args: "/".join(args).replace("//", "/"),
     ),
-}
+    "numpy.core.multiarray.scalar": lambda dtype, raw: filled(raw, dtype, (1,), "C")[0],
+    "numpy.core.numeric._frombuffer": filled,
+    **dict.fromkeys(("torch.device", "torch._utils._rebuild_parameter"), lambda first, *_: first),
+    "torch._utils._rebuild_tensor_v2": _tensor,
+}  # fmt: skip
+"""What is made at once, by functions that are all written here."""
+CONTENT: Mapping[str, Callable[[Part, Any], Any] | None] = {
+    "numpy.dtype": _dtype,
+    "numpy.core.multiarray._reconstruct": _array,
+    **{f"scipy.sparse.{form}_{kind}": _sparse for form in ("csc", "csr", "coo")
+       for kind in ("matrix", "array")},
+    JOBLIB: None, TORCH_BYTES: None,  # only the reader understands what lies behind them
+}  # fmt: skip
 """What becomes whole with its content."""

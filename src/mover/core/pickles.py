@@ -24,13 +24,12 @@ from mover.core.errors import InputError
 from mover.core.pickle_parts import (
     CONTENT,
     JOBLIB,
-    LARGEST,
     TORCH_BYTES,
     Name,
     Part,
+    Row,
     chumpy_array,
     filled,
-    keyed,
     made,
     named,
     storage_of,
@@ -38,6 +37,8 @@ from mover.core.pickle_parts import (
 )
 from mover.core.records import BROKEN
 
+LARGEST = 2 << 30
+"""No file and no array is larger [bytes]."""
 DEEPEST = 64
 """Levels of lists and mappings in a plain value."""
 ITEM = 64  # what Python takes for an item of a list, nearly [bytes]
@@ -49,10 +50,18 @@ REFUSED = (
     pickle.NEWOBJ_EX, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER,
 )  # fmt: skip
 """Opcodes that would make more than data."""
+TUPLES = (pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3)
 BROKEN_PICKLE = (
-    *BROKEN, TypeError, AttributeError, OverflowError, AssertionError, struct.error,
-    lzma.LZMAError, pickle.UnpicklingError,
+    *BROKEN, OverflowError, AssertionError, struct.error, lzma.LZMAError, pickle.UnpicklingError,
 )  # fmt: skip
+PACKED: Mapping[tuple[bytes, ...], Callable[[], Any]] = {
+    (b"\x1f\x8b", b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda"): (
+        lambda: zlib.decompressobj(wbits=47)
+    ),
+    (b"BZh",): bz2.BZ2Decompressor,
+    (b"\xfd7zXZ\x00", b"\x5d\x00"): lzma.LZMADecompressor,
+}
+"""How files with these first bytes are unpacked: gzip and zlib, bzip2, xz and lzma."""
 
 
 # Files: plain, compressed, joblib's, torch's, or inside an .npy file.
@@ -101,45 +110,32 @@ def _loaded(data: bytes) -> Any:  # noqa: ANN401
     """The content of a file in any of the forms."""
     if data[:4] == b"PK\x03\x04":
         return _archive(data)
-    plain = _unpacked(data)
-    stream = BytesIO(plain)
-    if plain[:6] == b"\x93NUMPY":
-        _skip_header(stream)
+    for heads, packed in PACKED.items():
+        if data.startswith(heads):
+            data = _unpacked(data, packed())
+            break
+    stream = BytesIO(data)
+    if data[:6] == b"\x93NUMPY":
+        version = npy.read_magic(stream)
+        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        if read(stream)[2] != np.dtype("O"):
+            raise ValueError("an .npy file of plain numbers, which is no pickle")
     value = Reader(stream).load()
     return _old_torch(stream) if type(value) is int and value == TORCH else value
 
 
-def _unpacked(data: bytes) -> bytes:
+def _unpacked(data: bytes, packed: Any) -> bytes:  # noqa: ANN401
     """The bytes without compression, never more than `LARGEST`.
 
     Raises:
         InputError: If they would be more.
     """
-    if data[:2] == b"\x1f\x8b":
-        packed: Any = zlib.decompressobj(wbits=31)
-    elif data[:1] == b"\x78" and len(data) > 1 and (data[0] * 256 + data[1]) % 31 == 0:
-        packed = zlib.decompressobj()
-    elif data[:3] == b"BZh":
-        packed = bz2.BZ2Decompressor()
-    elif data[:6] == b"\xfd7zXZ\x00" or data[:2] == b"\x5d\x00":
-        packed = lzma.LZMADecompressor()
-    else:
-        return data
     result = packed.decompress(data, LARGEST + 1)
     if len(result) > LARGEST:
         raise InputError(f"unpacks to more than {LARGEST} bytes, expected at most that")
     if not packed.eof:
         raise ValueError("it ends too early")
     return result
-
-
-def _skip_header(stream: BytesIO) -> None:
-    """Stand behind the header of an .npy file that holds an object."""
-    version = npy.read_magic(stream)
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    _, _, dtype = read(stream)
-    if dtype != np.dtype("O"):
-        raise ValueError("an .npy file of plain numbers, which is no pickle")
 
 
 def _archive(data: bytes) -> Any:  # noqa: ANN401
@@ -190,13 +186,22 @@ class Opcodes(dict[int, Callable[[Any], None]]):
         raise ValueError(f"opcode {code:#04x}")
 
 
+def _as_row(code: int) -> Callable[[Any], None]:
+    """What an opcode of a tuple does."""
+
+    def act(reader: Any) -> None:  # noqa: ANN401
+        READ[code](reader)
+        reader.append(Row(reader.stack.pop()))
+
+    return act
+
+
 class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAttributeAccessIssue]
     """Python's reader of a pickle, without any opcode that could import, call or set."""
 
     stack: list[Any]
     memo: dict[int, Any]
     append: Callable[[Any], None]
-    pop_mark: Callable[[], list[Any]]
 
     def __init__(self, stream: BytesIO, stored: Callable[[str], bytes] | None = None) -> None:
         """Args: stream: Of one pickle. stored: The bytes of torch's storages, if not behind it."""
@@ -229,16 +234,15 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
             case _:
                 raise ValueError("a reference to something outside")
         if key not in self.storages:
-            raw = self.stored(key) if self.stored else self._room(count, storage_type(kind))
-            self.storages[key] = kind, storage_of(kind, raw)
+            size = count * storage_type(kind).itemsize
+            self.left -= 0 if self.stored else size
+            if self.left < 0:
+                raise ValueError("it ends too early")
+            self.storages[key] = (
+                kind,
+                storage_of(kind, self.stored(key) if self.stored else bytes(size)),
+            )
         return self.storages[key][1]
-
-    def _room(self, count: int, dtype: np.dtype[Any]) -> bytes:
-        """Zeros where numbers will come, never more than the file has bytes."""
-        self.left -= count * dtype.itemsize
-        if self.left < 0:
-            raise ValueError("it ends too early")
-        return bytes(count * dtype.itemsize)
 
     def make(self) -> None:
         """REDUCE and NEWOBJ: what a call would make."""
@@ -255,7 +259,7 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
         if part.name == JOBLIB:
             value = self._array_behind(state)
         else:
-            value = CONTENT.get(part.name, chumpy_array)(part, state)
+            value = (CONTENT.get(part.name) or chumpy_array)(part, state)
         self.stack[-1] = value
         for place in part.places:
             self.memo[place] = value
@@ -275,41 +279,12 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
             stream.read(stream.read(1)[0])
         return filled(stream.read(math.prod(shape) * dtype.itemsize), dtype, shape, form["order"])
 
-    def set_items(self, items: list[Any]) -> None:
-        """Put keys and values into the dictionary on the stack."""
-        target = self.stack[-1]
-        if type(target) is not dict:
-            raise ValueError("items for something else than a dictionary")
-        target.update(zip(keyed(items[::2]), items[1::2], strict=True))
-
-    def set_item(self) -> None:
-        """SETITEM."""
-        value, key = self.stack.pop(), self.stack.pop()
-        self.set_items([key, value])
-
-    def make_dict(self) -> None:
-        """DICT."""
-        items = self.pop_mark()
-        self.append({})
-        self.set_items(items)
-
-    def make_frozen(self) -> None:
-        """FROZENSET."""
-        items = self.pop_mark()
-        self.append(frozenset(keyed(items)))
-
-    def add_items(self) -> None:
-        """ADDITEMS."""
-        items = self.pop_mark()
-        self.stack[-1].update(keyed(items))
-
     dispatch = Opcodes(
         {code: act for code, act in READ.items() if bytes([code]) not in REFUSED}
+        | {code[0]: _as_row(code[0]) for code in TUPLES}
         | {
             pickle.REDUCE[0]: make, pickle.NEWOBJ[0]: make, pickle.BUILD[0]: build,
-            pickle.SETITEM[0]: set_item, pickle.SETITEMS[0]: lambda r: r.set_items(r.pop_mark()),
-            pickle.DICT[0]: make_dict, pickle.FROZENSET[0]: make_frozen,
-            pickle.ADDITEMS[0]: add_items, pickle.BYTEARRAY8[0]: READ[pickle.BINBYTES8[0]],
+            pickle.BYTEARRAY8[0]: READ[pickle.BINBYTES8[0]],
         }
     )  # fmt: skip
 
@@ -343,36 +318,25 @@ def _unfolded(value: Any, done: dict[int, Any], depth: int) -> tuple[Any, int]: 
     Raises:
         InputError: If it holds itself, is too deep or too large.
     """
-    if isinstance(value, Mapping | list | tuple) or _holds_objects(value):
-        if id(value) not in done:
-            done[id(value)] = value, None
-            done[id(value)] = value, _unfolded_items(value, done, depth + 1)
-        found = done[id(value)][1]
-        if found is None:
-            raise InputError("holds a list that contains itself, expected a tree")
-        return found
     if isinstance(value, str | bytes):
         return value, ITEM + 4 * len(value)
-    return value, ITEM + int(getattr(value, "nbytes", 0))
-
-
-def _unfolded_items(value: Any, done: dict[int, Any], depth: int) -> tuple[Any, int]:  # noqa: ANN401
-    """The same for what holds others."""
-    if depth > DEEPEST:
-        raise InputError(f"holds lists in lists in more than {DEEPEST} levels, expected fewer")
-    if isinstance(value, np.ndarray):
-        inner = value.item() if value.ndim == 0 else value.tolist()
-        return _unfolded(inner, done, depth)
-    items = list(value.values() if isinstance(value, Mapping) else value)
-    found = [_unfolded(item, done, depth) for item in items]
-    size = ITEM + sum(size for _, size in found)
-    if size > LARGEST:
-        raise InputError(f"unfolds to more than {LARGEST} bytes, expected at most that")
-    plain = [item for item, _ in found]
-    if isinstance(value, Mapping):
-        return dict(zip(map(str, value), plain, strict=True)), size
-    return plain, size
-
-
-def _holds_objects(value: Any) -> bool:  # noqa: ANN401
-    return isinstance(value, np.ndarray) and value.dtype == object
+    objects = isinstance(value, np.ndarray) and value.dtype == object
+    if not objects and not isinstance(value, Mapping | list | tuple):
+        return value, ITEM + int(getattr(value, "nbytes", 0))
+    if id(value) not in done:
+        if depth >= DEEPEST:
+            raise InputError(f"holds lists in lists in more than {DEEPEST} levels, expected fewer")
+        done[id(value)] = value, None
+        items = value.values() if isinstance(value, Mapping) else value
+        inner = [value.tolist()] if isinstance(value, np.ndarray) else items
+        found = [_unfolded(item, done, depth + 1) for item in inner]
+        size = ITEM + sum(size for _, size in found)
+        if size > LARGEST:
+            raise InputError(f"unfolds to more than {LARGEST} bytes, expected at most that")
+        plain: Any = [item for item, _ in found]
+        if isinstance(value, Mapping):
+            plain = dict(zip(map(str, value), plain, strict=True))
+        done[id(value)] = value, (plain[0] if objects else plain, size)
+    if done[id(value)][1] is None:
+        raise InputError("holds a list that contains itself, expected a tree")
+    return done[id(value)][1]
