@@ -17,6 +17,7 @@ from mover.bodies.corrected import in_world
 from mover.core.files import replacing
 from mover.core.records import map_tensors, record
 from mover.core.types import Bodies, Mesh, Scene
+from mover.evaluate.aligned import SCENE_METRICS, Together
 from mover.evaluate.bodies import (
     GROUND_METRICS,
     MOTION_METRICS,
@@ -36,13 +37,16 @@ from mover.evaluate.contact import (
 )
 from mover.evaluate.scene import (
     CAMERA_METRICS,
+    HARM_METRICS,
     OBJECT_METRICS,
     SIDES,
     Metric,
+    Pair,
     Sight,
     means_of,
     measure,
     measure_objects,
+    pairs,
     unmatched,
 )
 from mover.io.capture.bodies_file import read_bodies
@@ -54,6 +58,8 @@ T = TypeVar("T")
 
 METRICS: dict[str, Metric[Any]] = {
     **OBJECT_METRICS,
+    **HARM_METRICS,
+    **SCENE_METRICS,
     **TOUCH_METRICS,
     **CAMERA_METRICS,
     **GROUND_METRICS,
@@ -133,10 +139,20 @@ def evaluate(
     touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)
     return {
         key: means_of(objects, key)
+        | _aligned(key, scenes, config.by_place)
         | measure(CAMERA_METRICS, Sight(judged.scene, true.scene))
         | _people(judged, true, touch, config)
         for key, judged in asked.items()
     } | {"objects": objects}
+
+
+def _aligned(side: str, scenes: tuple[Scene, Scene, Scene], by_place: bool) -> dict[str, float]:
+    """The objects of one of `SIDES` after one similarity of all of them."""
+    initial, result, truth = scenes
+    before, after = pairs(initial, result, truth, by_place)
+    found, camera = (before, initial.camera) if side == SIDES[0] else (after, result.camera)
+    there = [Pair(found[t.id], camera, t, truth.camera, 0) for t in truth.objects if t.id in found]
+    return measure(SCENE_METRICS, Together(tuple(there), len(truth.objects) - len(there)))
 
 
 def touch_in_truth(

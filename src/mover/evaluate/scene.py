@@ -63,7 +63,7 @@ class Sight:
 
 def iou3d(pair: Pair) -> float:
     """Overlap of the two upright oriented boxes: intersection over union of their volumes."""
-    return float(box_iou(_thick(box_of(pair.estimate)), _thick(box_of(pair.truth))))
+    return float(box_iou(thick(box_of(pair.estimate)), thick(box_of(pair.truth))))
 
 
 def iou2d(pair: Pair) -> float | None:
@@ -122,6 +122,12 @@ OBJECT_METRICS: dict[str, Metric[Pair]] = {
     "center_error": Metric("m", 0.0, center_error),
     "size_error": Metric("m", 0.0, size_error),
 }
+HARM_METRICS: dict[str, Metric[float]] = {
+    "worse_by_10cm": Metric("", 0.0, lambda farther: float(farther > 0.1)),
+    "worse_by_50cm": Metric("", 0.0, lambda farther: float(farther > 0.5)),
+}
+"""Of how much farther from the truth an object's centre is than it was given [m]; means of these
+are the shares of objects that were made worse."""
 CAMERA_METRICS: dict[str, Metric[Sight]] = {
     "pitch_error": Metric("rad", 0.0, pitch_error),
     "roll_error": Metric("rad", 0.0, roll_error),
@@ -228,7 +234,8 @@ def _assign(
     return {theirs[row].id: ours[column] for row, column in zip(rows, columns, strict=True)}
 
 
-def _thick(box: Box) -> Box:
+def thick(box: Box) -> Box:
+    """The box, at least as thick as flat objects count."""
     return Box(box.center, box.size.clamp_min(THINNEST), box.yaw)
 
 
@@ -292,12 +299,18 @@ def measure_objects(
         if piece is None:
             return measure_missing(true, truth.camera)
         pair = Pair(piece, there[side].camera, true, truth.camera, samples)
-        return measure(OBJECT_METRICS, pair)
+        given = found["initial"].get(true.id)
+        values = measure(OBJECT_METRICS, pair)
+        if given is None:
+            return values
+        before = center_error(Pair(given, initial.camera, true, truth.camera, samples))
+        return values | measure(HARM_METRICS, values["center_error"] - before)
 
     return [{"id": true.id} | {side: of(side, true) for side in sides} for true in truth.objects]
 
 
 def means_of(objects: Sequence[dict[str, Any]], side: str) -> dict[str, float]:
     """Means over those objects that have the metric."""
-    values = {n: [item[side][n] for item in objects if n in item[side]] for n in OBJECT_METRICS}
+    names = (*OBJECT_METRICS, *HARM_METRICS)
+    values = {n: [item[side][n] for item in objects if n in item[side]] for n in names}
     return {name: sum(found) / len(found) for name, found in values.items() if found}

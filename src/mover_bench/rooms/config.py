@@ -158,3 +158,42 @@ class NoiseConfig:
     """
     inverted: float = 0.0
     """Meshes: share whose faces all wind the wrong way."""
+    foreign: float = 0.0
+    """Meshes: share that is another piece of the class as another program would make it.
+
+    Source of this and of the next: `rooms.foreign`; networks from one image (Total3D, image-to-3D)
+    choose another design, smooth it, leave it open and are off by 2-5 % of its size.
+    """
+    warp: float = 0.0
+    """Foreign meshes: root mean square displacement by a smooth warp [share of the size]."""
+    mask_head: int = 0
+    """Objects' masks: cells a side of the mask head, 0: exact.
+
+    Source: Mask R-CNN predicts 28 x 28 cells in a box (He et al. 2017), others 56 x 56 or 112.
+    """
+    mask_box: float = 0.0
+    """Objects' boxes: standard deviation of each side [share of the box's width or height].
+
+    Source: a box AP at IoU .75 of about .6 (detectron2's model zoo) is sides off by a few per cent.
+    """
+    amodal: float = 0.0
+    """Objects' masks: share that holds what other furniture hides, too (amodal heads, SAM)."""
+    wobble: float = 0.0
+    """People's masks: standard deviation of their outlines, which changes along them [px]."""
+    mean_bodies: bool = False
+    """Bodies: all have the mean shape, as far away as their picture's size then says.
+
+    Source: regressors from crops hardly leave the mean shape; heights of adults differ by 6 %, so
+    that people and all that is measured by them are too large or too small by as much.
+    """
+    pose_bias: float = 0.0
+    """Bodies: standard deviation of an error of each joint's rotation that stays [degrees].
+
+    Source: errors of 40-50 mm after alignment (3DPW, EMDB) that do not average out in time.
+    """
+    lens: float = 0.0
+    """Mean size of the error of a guessed focal length, between 6/11 and 16/11 of it [share].
+
+    Bodies and first scene are made under the guess: they keep their widths and are off in depth.
+    Source: lenses guessed from one image (GeoCalib, WildCamera) are off by 3-8 %.
+    """

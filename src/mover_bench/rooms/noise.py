@@ -12,17 +12,21 @@ import dataclasses
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from mover.bodies.skinning import open_body
 from mover.core.records import map_tensors
 from mover.core.types import Bodies, BodyPose, Camera, Capture, Mesh, Scene, SceneObject
 from mover.furniture.library import another
 from mover.furniture.pieces import Furniture
+from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rle import decode
 from mover.geometry.rotations import rot_y
 from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.foreign import foreign_mesh
 from mover_bench.rooms.known import KnownRoom, one_thread, rounded
+from mover_bench.rooms.mask_heads import headed, wobbling
 from mover_bench.rooms.noise_masks import leaking, noisy_detections, noisy_finds, noisy_people
 from mover_bench.rooms.poses import LEG
 from mover_bench.rooms.turns import from_vector, to_vector
@@ -46,6 +50,22 @@ def other_shapes(
             continue
         ratio = torch.tensor(known.size) / torch.tensor(new.size)
         out.append(dataclasses.replace(piece, mesh=Mesh(new.mesh.verts * ratio, new.mesh.faces)))
+    return tuple(out)
+
+
+def foreign_shapes(
+    pieces: tuple[SceneObject, ...],
+    furniture: tuple[Furniture, ...],
+    noise: NoiseConfig,
+    seed: list[int],
+) -> tuple[SceneObject, ...]:
+    """Some meshes replaced by pieces of the class as other programs would make them."""
+    out: list[SceneObject] = []
+    for index, (piece, known) in enumerate(zip(pieces, furniture, strict=True)):
+        rng = np.random.default_rng([*seed, index])
+        swap = float(rng.uniform()) < noise.foreign
+        mesh = foreign_mesh(known, noise.warp, rng) if swap else piece.mesh
+        out.append(dataclasses.replace(piece, mesh=mesh))
     return tuple(out)
 
 
@@ -88,15 +108,20 @@ def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) 
     assert bodies.pose is not None, "a known room has parameters"
     pose = map_tensors(lambda x: x.double(), bodies.pose)
     count = len(bodies.frame)
+    people = bodies.person.numpy()
     error = slow(rng, bodies, (22, 3), noise.pose_seconds) * np.radians(noise.pose)
+    if noise.pose_bias:
+        stays = rng.normal(size=(int(people.max()) + 1, 22, 3)) * np.radians(noise.pose_bias)
+        error = error + stays[people]
     hidden = hidden_rows(room) if noise.pose_hidden != 1 else np.zeros(count, dtype=bool)
     error = error * np.where(hidden, noise.pose_hidden, 1.0)[:, None, None]
     pose = _turned(pose, error)
-    people = bodies.person.numpy()
     bias = 1 + noise.depth_bias * rng.uniform(-1, 1, int(people.max()) + 1)[people]
     drift = noise.depth_drift * slow(rng, bodies, (1,), 1.0)[:, 0]
     pelvis = open_body().posed(pose)[1][:, 0]
     shift = pelvis * torch.from_numpy(bias + drift - 1)[:, None]
+    if noise.mean_bodies:
+        pose, shift = _of_mean_shape(pose, pelvis, shift)
     shift = shift + torch.from_numpy(noise.jitter * rng.normal(size=(count, 3)))
     pose = dataclasses.replace(pose, transl=pose.transl + shift)
     verts, joints = open_body().posed(pose)
@@ -109,6 +134,24 @@ def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) 
         person=bodies.person[keep],
         pose=map_tensors(lambda x: rounded(x[keep]), pose),
     )
+
+
+def _of_mean_shape(pose: BodyPose, pelvis: Tensor, shift: Tensor) -> tuple[BodyPose, Tensor]:
+    """Bodies of the mean shape, as large in the picture as they are, and shifted as much."""
+    model = open_body()
+    mean = dataclasses.replace(pose, betas=torch.zeros_like(pose.betas))
+
+    def heights(some: BodyPose) -> Tensor:
+        still = dataclasses.replace(
+            some, body_pose=torch.zeros_like(some.body_pose), transl=torch.zeros_like(some.transl)
+        )
+        upright = dataclasses.replace(still, global_orient=torch.zeros_like(still.global_orient))
+        rest = model.posed(upright)[0][..., 1]
+        return rest.amax(-1) - rest.amin(-1)
+
+    share = (heights(mean) / heights(pose))[:, None]
+    there = pelvis - model.posed(mean)[1][:, 0]
+    return mean, there + pelvis * (share - 1) + shift * share
 
 
 def lose_feet(bodies: Bodies, noise: NoiseConfig, rng: np.random.Generator) -> Bodies:
@@ -188,7 +231,12 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
         for piece, furniture in zip(room.truth.objects, room.furniture, strict=True)
     )
     pieces = broken(other_shapes(pieces, room.furniture, noise, streams[2]), noise, streams[6])
-    detections = noisy_detections(room.capture.detections, noise.object_masks, streams[3])
+    if noise.foreign:
+        pieces = foreign_shapes(pieces, room.furniture, noise, [seed, 10])
+    detections = room.capture.detections
+    if noise.mask_head or noise.mask_box or noise.amodal:
+        detections = headed(detections, room.truth, noise, np.random.default_rng([seed, 11]))
+    detections = noisy_detections(detections, noise.object_masks, streams[3])
     capture = dataclasses.replace(
         room.capture,
         scene=Scene(camera, None, pieces),
@@ -198,8 +246,44 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
             room.capture.people, noise.person_masks, noise.missed_masks, streams[5]
         ),
     )
+    people = wobbling(capture.people, noise.wobble, np.random.default_rng([seed, 12]))
     assert room.truth.ground is not None, "a known room has a floor"
-    return noisy_finds(capture, room.truth.ground, noise, [seed, 9])
+    capture = noisy_finds(
+        dataclasses.replace(capture, people=people), room.truth.ground, noise, [seed, 9]
+    )
+    return wrong_lens(capture, noise.lens, np.random.default_rng([seed, 13]))
+
+
+def wrong_lens(capture: Capture, mean: float, rng: np.random.Generator) -> Capture:
+    """A capture made under another lens: widths are kept, depths are off, as the picture stays."""
+    zoom = 1 + mean * float(rng.uniform(6 / 11, 16 / 11) * rng.choice([-1.0, 1.0]))
+    if zoom == 1:
+        return capture
+    camera, bodies = capture.scene.camera, capture.bodies
+    R = camera.R_cam_world.double()
+
+    def moved(piece: SceneObject) -> SceneObject:
+        centre = R @ box_of(piece).center.double()
+        gap = R.mT @ torch.stack([torch.zeros(()), torch.zeros(()), (zoom - 1) * centre[2].float()]
+                                 ).double()  # fmt: skip
+        return dataclasses.replace(piece, t_world_object=piece.t_world_object + gap.float())
+
+    K = camera.K * torch.tensor([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
+    scene = dataclasses.replace(
+        capture.scene,
+        camera=dataclasses.replace(camera, K=K),
+        objects=tuple(moved(piece) for piece in capture.scene.objects),
+    )
+    if bodies is None or bodies.joints is None or bodies.pose is None:
+        return dataclasses.replace(capture, scene=scene)
+    gap = torch.zeros_like(bodies.joints[:, 0])
+    gap[:, 2] = (zoom - 1) * bodies.joints[:, 0, 2]
+    pose = dataclasses.replace(bodies.pose, transl=bodies.pose.transl + gap)
+    bodies = dataclasses.replace(
+        bodies, verts=rounded(bodies.verts + gap[:, None]),
+        joints=rounded(bodies.joints + gap[:, None]), pose=map_tensors(rounded, pose),
+    )  # fmt: skip
+    return dataclasses.replace(capture, scene=scene, bodies=bodies)
 
 
 def _noisy_camera(camera: Camera, noise: NoiseConfig, rng: np.random.Generator) -> Camera:

@@ -85,6 +85,14 @@ _DETECTED = NoiseConfig(
     merged=0.05,
     wrong_class=0.08,
 )
+_UPSTREAM = NoiseConfig(
+    foreign=1.0, warp=0.03,
+    mask_head=28, mask_box=0.03, amodal=0.15, leaks=0.15, object_masks=0,
+    mean_bodies=True, depth_bias=0.01, pose_bias=4.0, pose=4.0, pose_seconds=2.0,
+    lens=0.055,
+    wobble=2.5, person_masks=0, missed_masks=0.04,
+    missed=0.05, false=0.05,
+)  # fmt: skip
 
 SETS: dict[str, RoomSet] = {
     "mini": RoomSet(
@@ -117,6 +125,11 @@ SETS: dict[str, RoomSet] = {
         " invented, run together and called by wrong names.",
         "1000-1029", "100-129", noise=_DETECTED,
     ),
+    "upstream": RoomSet(
+        "The rooms of `rooms` as today's tools would give them, all errors at once: foreign meshes,"
+        " masks of a coarse head, mean bodies with biased poses, a guessed lens.",
+        "1000-1029", "100-129", noise=_UPSTREAM,
+    ),
     "long": RoomSet(
         "A minute in which a person uses many pieces, some of them repeatedly, each for a short"
         " time.",
@@ -124,6 +137,30 @@ SETS: dict[str, RoomSet] = {
     ),
 }  # fmt: skip
 """All sets by name."""
+
+
+# Sets without one kind of errors, for the study of what each costs: `upstream+no-shapes`.
+
+
+SWITCHES: dict[str, tuple[str, ...]] = {
+    "shapes": ("foreign", "warp"),
+    "places": ("along_ray", "sideways", "scale"),
+    "flips": ("flips",),
+    "masks": ("mask_head", "mask_box", "amodal", "leaks", "object_masks"),
+    "bodies": ("mean_bodies", "pose_bias", "pose"),
+    "height": ("mean_bodies",),
+    "lens": ("lens",),
+    "people": ("wobble", "missed_masks"),
+    "finds": ("missed", "false"),
+}
+"""Fields of `NoiseConfig` that are zero where an error is switched off, by its name."""
+OFF = "no-"
+
+
+def without(noise: NoiseConfig, error: str) -> NoiseConfig:
+    """The noise with one kind of errors switched off."""
+    off: dict[str, Any] = {name: type(getattr(noise, name))(0) for name in SWITCHES[error]}
+    return replace(noise, **off)
 
 
 # Sets whose noise is changed in one thing, for the study of sensitivity.
@@ -168,7 +205,7 @@ WHOLE = ("object_masks", "person_masks")  # fields that count pixels
 
 
 def set_named(name: str) -> RoomSet:
-    """A set of `SETS`, or one with a changed noise: `rooms+scale=0.25`.
+    """A set of `SETS`, or one with a changed noise: `rooms+scale=0.25`, `upstream+no-lens`.
 
     Raises:
         InputError: If there is none of this name.
@@ -178,6 +215,8 @@ def set_named(name: str) -> RoomSet:
         raise InputError(f"--set: {base!r} is none of {', '.join(SETS)}")
     if not plus:
         return SETS[base]
+    if change.startswith(OFF) and change.removeprefix(OFF) in SWITCHES:
+        return replace(SETS[base], noise=without(SETS[base].noise, change.removeprefix(OFF)))
     kind, _, level = change.partition("=")
     if kind not in CHANGES:
         raise InputError(f"--set: {name!r} changes {kind!r}, expected one of {', '.join(CHANGES)}")

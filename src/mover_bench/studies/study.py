@@ -9,7 +9,7 @@ from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
 from mover.pipeline.presets import PRESETS
-from mover_bench.studies import study_noise, study_rows, study_video
+from mover_bench.studies import study_noise, study_rows, study_upstream, study_video
 from mover_bench.studies.args import StudyArgs
 from mover_bench.studies.finished import Finished, read_finished
 from mover_bench.studies.job import ROOM, Job
@@ -66,6 +66,10 @@ STUDIES: dict[str, Study] = {
     "sensitivity": Study(
         "Accuracy against errors of the input.",
         "rooms", study_noise.plan, study_noise.page,
+    ),
+    "upstream": Study(
+        "What each error of today's tools costs: all at once, and each left out.",
+        "upstream", study_upstream.plan, study_upstream.page,
     ),
     "sets": Study(
         "All presets on all sets.",

@@ -19,9 +19,10 @@ from mover_bench.studies.study_page import difference_text
 from mover_bench.studies.variants import PARTS, PEOPLE, REFINED, SINGLE, TERMS
 from mover_bench.tables import published
 
-SCENE = ("iou3d", "p2s", "iou2d", "non_collision", "contact", "contact_f1")
-OBJECTS = ("iou3d", "p2s", "iou2d", "contact_f1", "non_collision", "iou3d_touched",
-           "iou3d_untouched")  # fmt: skip
+SCENE = ("iou3d", "p2s", "iou2d", "non_collision", "contact", "contact_f1", "worse_by_10cm",
+         "worse_by_50cm")  # fmt: skip
+OBJECTS = ("iou3d", "iou3d_aligned", "p2s", "iou2d", "worse_by_10cm", "worse_by_50cm", "contact_f1",
+           "non_collision", "iou3d_touched", "iou3d_untouched")  # fmt: skip
 PARTS_SHOWN = ("iou3d", "p2s", "iou2d", "contact_f1", "yaw_error", "tilt", "ground_error")
 
 SCENE_NOTE = (

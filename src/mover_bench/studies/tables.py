@@ -17,7 +17,7 @@ from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.records import plain
 from mover.core.run import sources
-from mover.evaluate.scene import OBJECT_METRICS
+from mover.evaluate.scene import HARM_METRICS, OBJECT_METRICS
 from mover_bench.studies.compare import COLUMNS, Column, head_of, markdown, shown
 from mover_bench.studies.job import STAGES
 from mover_bench.studies.sets import set_named
@@ -31,7 +31,20 @@ BAD = 0.25  # IoU3D below which an object is lost
 TRAITS = ("category", "touched", "hidden", "truncated", "flipped", "stays")
 ABOUT = ("seed", "preset", "stage", "object", *TRAITS)
 SHOWN: dict[str, Column] = {
-    **{n: COLUMNS[n] for n in ("iou3d", "p2s", "iou2d", "yaw_error", "center_error", "size_error")},
+    **{
+        n: COLUMNS[n]
+        for n in (
+            "iou3d",
+            "p2s",
+            "iou2d",
+            "yaw_error",
+            "center_error",
+            "size_error",
+            "worse_by_10cm",
+            "worse_by_50cm",
+            "iou3d_aligned",
+        )
+    },
     "contact_f1": COLUMNS["contact_f1"],
     "non_collision": Column("non-collision"),
     "contact": Column("contact"),
@@ -41,7 +54,7 @@ SHOWN: dict[str, Column] = {
     "ground_error": Column("ground", -1, "cm", 100, 1),
 }
 """Metrics of the tables, in their order."""
-FEW = tuple(SHOWN)[:6]
+FEW = tuple(SHOWN)[:8]
 """Metrics of objects."""
 COUNTED = {"turned": "turned > 45° ↓", "bad": "IoU3D < .25 ↓"}
 """How many objects are so."""
@@ -111,7 +124,7 @@ def write_tables(experiment: Experiment, pictures: Sequence[str], folder: Path) 
     """Write results.csv, summary.csv and summary.md; returns the latter."""
     objects, rooms = frames_of(experiment)
     lines = summarise(objects, rooms)
-    metrics = (name for name in SHOWN if name in OBJECT_METRICS)
+    metrics = (name for name in SHOWN if name in OBJECT_METRICS | HARM_METRICS)
     write_csv(objects, (*ABOUT, *metrics), folder / "results.csv")
     about = ("over", "preset", "stage", "count", *COUNTED)
     write_csv(lines, (*about, *SHOWN), folder / "summary.csv")

@@ -1,0 +1,164 @@
+"""The set `upstream`: what today's tools give, all errors at once; each can be left out."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from test_noise import SILENT, size
+from test_rooms import shared_room
+
+from mover.bodies.skinning import open_body
+from mover.core.records import fingerprint
+from mover.core.types import SceneObject
+from mover.furniture.library import PIECES, make_piece
+from mover.geometry.boxes import box_of
+from mover.geometry.camera import project, to_camera
+from mover.geometry.nearest import to_surface
+from mover.geometry.rle import decode
+from mover.geometry.topology import is_closed
+from mover_bench.rooms import foreign
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.foreign import MAKERS, foreign_mesh
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.mask_heads import coarse, wobbled
+from mover_bench.rooms.noise import add_noise
+from mover_bench.studies.sets import SETS, SWITCHES, set_named
+
+
+@pytest.fixture(scope="module")
+def room() -> KnownRoom:
+    return shared_room()
+
+
+def with_only(**errors: float) -> NoiseConfig:
+    return dataclasses.replace(SILENT, **errors)
+
+
+@pytest.mark.parametrize("maker", MAKERS, ids=lambda m: m.__name__.strip("_"))
+@pytest.mark.parametrize("name", ["chair", "shelf", "sofa"])
+def test_a_foreign_mesh_fills_the_box_and_is_another_shape(
+    name: str, maker: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(foreign, "MAKERS", (maker,))
+    known = make_piece(name, np.random.default_rng(1), 0)
+    mesh, again = (foreign_mesh(known, 0.03, np.random.default_rng(5)) for _ in range(2))
+    assert torch.equal(mesh.verts, again.verts)
+    found = (mesh.verts.amax(0) - mesh.verts.amin(0)).double()
+    assert torch.allclose(found, torch.tensor(known.size).double(), atol=1e-4)
+    away = to_surface(known.mesh.verts, mesh.verts, mesh.faces).mean()
+    assert 0.005 < float(away) < 0.3
+
+
+def test_every_piece_has_foreign_meshes_and_most_are_open_or_unclean() -> None:
+    meshes = [
+        foreign_mesh(make_piece(name, np.random.default_rng(k)), 0.03, np.random.default_rng(k))
+        for k, name in enumerate(PIECES)
+    ]
+    assert sum(is_closed(mesh.faces) for mesh in meshes) < len(meshes) / 2
+
+
+def test_a_mask_head_keeps_what_is_large_and_loses_what_is_thin() -> None:
+    mask = np.zeros((200, 300), dtype=bool)
+    mask[50:150, 60:240] = True
+    mask[20:50, 100:103] = True
+    drawn = coarse(mask, np.array([60.0, 20.0, 240.0, 150.0]), 28)
+    assert (drawn & mask).sum() / (drawn | mask).sum() > 0.9
+    assert drawn[20:45, 100:103].mean() < 0.5
+    assert not drawn[:, :55].any()
+
+
+def test_an_outline_wobbles_by_the_stated_pixels() -> None:
+    mask = np.zeros((200, 300), dtype=bool)
+    mask[40:160, 50:250] = True
+    off = [
+        wobbled(mask, 2.5, np.random.default_rng(seed))[60:140].argmax(1) - 50.0
+        for seed in range(40)
+    ]  # an island before the outline counts as the outline: a little more than 2.5
+    assert 2.0 < np.std(off) < 4.0
+    assert abs(np.mean(off)) < 1.0
+
+
+def test_amodal_masks_hold_what_is_hidden(room: KnownRoom) -> None:
+    capture = add_noise(room, with_only(amodal=1.0), 0)
+    pairs = list(zip(capture.detections, room.capture.detections, strict=True))
+    grown = [
+        int(decode(a.mask, 0).sum()) - int(decode(b.mask, 0).sum())
+        for a, b in pairs
+        if a.mask is not None and b.mask is not None
+    ]
+    assert min(grown) >= 0
+    assert max(grown) > 0
+
+
+def test_mean_bodies_have_one_shape_and_fill_their_pictures(room: KnownRoom) -> None:
+    given, true = add_noise(room, with_only(mean_bodies=True), 0).bodies, room.bodies
+    assert given is not None
+    assert given.pose is not None
+    assert float(given.pose.betas.abs().max()) == 0
+
+    def height(verts: torch.Tensor) -> torch.Tensor:
+        pixel = project(verts, room.truth.camera.K)[..., 1]
+        return pixel.amax(-1) - pixel.amin(-1)
+
+    share = height(given.verts) / height(true.verts)
+    assert 0.93 < float(share.median()) < 1.07
+    assert open_body().posed(given.pose)[0].sub(given.verts).abs().max() < 1e-4
+
+
+def test_a_biased_pose_stays_biased(room: KnownRoom) -> None:
+    given = add_noise(room, with_only(pose_bias=6.0), 0).bodies
+    assert given is not None
+    assert given.pose is not None
+    assert room.bodies.pose is not None
+    off = given.pose.body_pose - room.bodies.pose.body_pose
+    assert float(off.mean(0).abs().mean()) > 3 * float(off.std(0).median())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_wrong_lens_keeps_the_picture_and_the_widths(room: KnownRoom, seed: int) -> None:
+    capture = add_noise(room, with_only(lens=0.055), seed)
+    zoom = float(capture.scene.camera.K[0, 0] / room.truth.camera.K[0, 0])
+    assert 0.029 < abs(zoom - 1) < 0.081
+
+    def seen(piece: SceneObject, K: torch.Tensor) -> torch.Tensor:
+        return project(to_camera(box_of(piece).center, room.truth.camera.R_cam_world), K)
+
+    for given, true in zip(capture.scene.objects, room.truth.objects, strict=True):
+        assert torch.allclose(size(given), size(true), atol=1e-5)
+        pixels = seen(given, capture.scene.camera.K), seen(true, room.truth.camera.K)
+        assert torch.allclose(*pixels, atol=0.05)
+    assert capture.bodies is not None
+    assert capture.bodies.joints is not None
+    assert room.bodies.joints is not None
+    assert torch.allclose(
+        capture.bodies.joints[:, 0, 2], room.bodies.joints[:, 0, 2] * zoom, atol=1e-3
+    )
+    assert torch.allclose(capture.bodies.joints[..., :2], room.bodies.joints[..., :2], atol=1e-4)
+
+
+def test_each_error_of_the_set_can_be_switched_off_alone() -> None:
+    whole = SETS["upstream"].noise
+    assert set_named("upstream") is SETS["upstream"]
+    off = {name: set_named(f"upstream+no-{name}").noise for name in SWITCHES}
+    assert len({fingerprint(noise) for noise in off.values()}) == len(SWITCHES)
+    kind = NoiseConfig()
+    for name, noise in off.items():
+        assert all(not getattr(noise, field) for field in SWITCHES[name])
+        rest = [f.name for f in dataclasses.fields(noise) if f.name not in SWITCHES[name]]
+        assert all(getattr(noise, field) == getattr(whole, field) for field in rest)
+    touched = set(itertools.chain(*SWITCHES.values()))
+    changed = {
+        f.name for f in dataclasses.fields(whole) if getattr(whole, f.name) > getattr(kind, f.name)
+    }
+    assert changed - {"pose_seconds"} <= touched
+
+
+def test_the_other_sets_do_not_change(room: KnownRoom) -> None:
+    """New errors have streams of their own."""
+    plain, lens = add_noise(room, NoiseConfig(), 3), add_noise(room, NoiseConfig(lens=0.05), 3)
+    assert [p.yaw for p in plain.scene.objects] == [p.yaw for p in lens.scene.objects]
+    assert plain.detections == lens.detections or all(
+        torch.equal(a.box, b.box) for a, b in zip(plain.detections, lens.detections, strict=True)
+    )
