@@ -34,8 +34,7 @@ from mover.stages.objects.place_inputs import Pinned, hold
 
 
 def at(x=0.5, z=-2.0, yaw=1.0, scale=(1.0, 1.1, 0.9), pitch=-0.2, roll=0.0):
-    t = torch.tensor([x, GROUND, z])
-    return Placement(t, torch.tensor(yaw), torch.tensor(scale), pitch=pitch, roll=roll)
+    return Placement((x, GROUND, z), yaw, scale, pitch=pitch, roll=roll)
 
 
 def every_edit():
@@ -109,7 +108,7 @@ class TestEdits:
         pitch, roll = pitch_roll(scene.camera.R_cam_world)
         put = at(pitch=float(pitch), roll=float(roll))
         piece = by_id(edit_scene(scene, [Place("sofa_0", put)]))["sofa_0"]
-        assert (piece.t_world_object - put.t_world_object).abs().max() < 1e-6
+        assert (piece.t_world_object - torch.tensor(put.translation)).abs().max() < 1e-6
         assert float((piece.yaw - put.yaw).abs()) < 1e-6
 
     def test_what_a_deleted_object_carried_stands_where_it_stood(self):
@@ -143,6 +142,7 @@ class TestFile:
     def test_gives_back_what_was_written(self, tmp_path: Path):
         write_edits(every_edit(), tmp_path / "edits.json")
         back = read_edits(tmp_path / "edits.json")
+        assert back == every_edit()
         write_edits(back, tmp_path / "again.json")
         assert (tmp_path / "again.json").read_bytes() == (tmp_path / "edits.json").read_bytes()
         a, b = (edit_scene(room(), e) for e in (back, every_edit()))

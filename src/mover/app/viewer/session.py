@@ -1,6 +1,7 @@
 """The state behind the viewer: a result or a capture, the edits on top of it, what is selected."""
 
 import json
+import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -242,10 +243,9 @@ def start_session(shown: Shown, file: Path | None, capture: Capture | None) -> S
 def _on_floor(scene: Scene, place: tuple[float, float]) -> Placement:
     """On the floor, facing the camera."""
     ground = scene.ground if scene.ground is not None else -EYE_HEIGHT
-    t = torch.tensor([place[0], ground, place[1]])
     pitch, roll = pitch_roll(scene.camera.R_cam_world)
-    yaw = torch.atan2(-t[0], -t[2])
-    return Placement(t, yaw, torch.ones(3), pitch=float(pitch), roll=float(roll))
+    yaw = math.atan2(-place[0], -place[1])
+    return Placement((place[0], ground, place[1]), yaw, (1, 1, 1), float(pitch), float(roll))
 
 
 def _changed(old: SceneObject | None, new: SceneObject) -> bool:

@@ -11,79 +11,79 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from msgspec import Meta, Struct
-from torch import Tensor
+from msgspec import Meta, Struct, to_builtins
 
 from mover.core.errors import InputError
-from mover.core.records import record
 from mover.core.types import Capture, Scene, SceneObject
 from mover.furniture.library import PIECES, STYLES, make_piece
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted, to_camera, to_world
 from mover.io.capture.scene_file import check_id
-from mover.io.files.fields import At, choice, get, integer, items, plain, read_json, write_json
-from mover.io.files.schema import Id, Number, Sizes, Text, Vector, checked
+from mover.io.files.fields import (
+    At,
+    choice,
+    get,
+    integer,
+    items,
+    mapping,
+    plain,
+    read_json,
+    text,
+    write_json,
+)
+from mover.io.files.schema import Id, Number, Sizes, Vector, checked
 
 
-@record
-class Placement:
-    """Where an object stands: x_world = R_y(yaw) @ (scale * x_mesh) + t_world_object."""
+class Placement(Struct, frozen=True):
+    """Where an object stands: x_world = R_y(yaw) @ (scale * x_mesh) + translation."""
 
-    t_world_object: Float[Tensor, "3"]
+    translation: Vector
     """Place of the mesh origin [m]."""
-    yaw: Float[Tensor, ""]
+    yaw: Number
     """[rad]."""
-    scale: Float[Tensor, "3"]
+    scale: Sizes
     """Factor along each mesh axis."""
-    pitch: float
+    pitch: Annotated[float, Meta(ge=-1.6, le=1.6)]
     """Of the camera in whose world this is [rad]."""
-    roll: float
+    roll: Annotated[float, Meta(ge=-3.2, le=3.2)]
     """[rad]."""
 
 
-@record
-class Place:
+class _Edit(Struct, frozen=True, tag_field="do"):
+    id: str
+
+
+class Place(_Edit, frozen=True, tag="place"):
     """Put an object somewhere, turn it, resize it."""
 
-    id: str
     at: Placement
 
 
-@record
-class Relabel:
+class Relabel(_Edit, frozen=True, tag="relabel"):
     """Say what an object is."""
 
-    id: str
     category: str
 
 
-@record
-class Pin:
+class Pin(_Edit, frozen=True, tag="pin"):
     """Keep an object where it starts, or let it go again."""
 
-    id: str
     pinned: bool
 
 
-@record
-class Delete:
+class Delete(_Edit, frozen=True, tag="delete"):
     """Take an object out of the room; what it carried stands where it stood."""
 
-    id: str
 
-
-@record
-class Add:
+class Add(_Edit, frozen=True, tag="add"):
     """Put a piece of the library into the room."""
 
-    id: str
     piece: str
     """A name of `furniture.library.PIECES`."""
-    style: int
-    seed: int
+    style: Id
+    seed: Id
     """Draws its sizes."""
-    annotation: int | None
+    annotation: Id | None
     """The detection that shows it; None: only people tell where it stands."""
     at: Placement
 
@@ -138,9 +138,8 @@ def pinned_ids(scene: Scene, edits: Sequence[Edit]) -> tuple[str, ...]:
 def placement_of(piece: SceneObject, scene: Scene) -> Placement:
     """Where a piece of a scene stands, as an edit says it."""
     pitch, roll = pitch_roll(scene.camera.R_cam_world)
-    return Placement(
-        piece.t_world_object, piece.yaw, piece.scale, pitch=float(pitch), roll=float(roll)
-    )
+    t, yaw, scale = (plain(x) for x in (piece.t_world_object, piece.yaw, piece.scale))
+    return Placement(tuple(t), yaw, tuple(scale), float(pitch), float(roll))
 
 
 def joined(edits: Sequence[Edit], new: Edit) -> tuple[Edit, ...]:
@@ -171,11 +170,8 @@ def _new(edit: Add, index: int) -> SceneObject:
         made = make_piece(edit.piece, np.random.default_rng(edit.seed), edit.style)
     except ValueError as error:
         raise InputError(f"edits[{index}]: {error}") from error
-    at = edit.at
-    return SceneObject(
-        edit.id, edit.piece, made.mesh, "", edit.annotation, "ground", at.t_world_object, at.yaw,
-        at.scale,
-    )  # fmt: skip
+    place = torch.zeros(3), torch.tensor(0.0), torch.ones(3)
+    return SceneObject(edit.id, edit.piece, made.mesh, "", edit.annotation, "ground", *place)
 
 
 def _without(name: str, pieces: dict[str, SceneObject]) -> dict[str, SceneObject]:
@@ -193,10 +189,11 @@ def _placed(piece: SceneObject, at: Placement, scene: Scene) -> SceneObject:
     Its box keeps its centre in the camera frame. Its front is the level direction that `recast`
     turns back into the edit's: a pinned object comes home exactly when a run finds that camera.
     """
-    put = replace(piece, t_world_object=at.t_world_object, yaw=at.yaw, scale=at.scale)
+    t, yaw, scale = (torch.tensor(x).float() for x in (at.translation, at.yaw, at.scale))
+    put = replace(piece, t_world_object=t, yaw=yaw, scale=scale)
     old, new = tilted(torch.tensor(at.pitch), torch.tensor(at.roll)), scene.camera.R_cam_world
     center = to_world(to_camera(box_of(put).center, old), new)
-    front = old @ torch.stack([at.yaw.sin(), torch.zeros_like(at.yaw), at.yaw.cos()])
+    front = old @ torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()])
     up_old, up_new = old[:, 1], new[:, 1]
     level = to_world(front - up_old * (front @ up_new) / (up_old @ up_new), new)
     turned = replace(put, yaw=torch.atan2(level[0], level[2]))
@@ -209,54 +206,12 @@ def _placed(piece: SceneObject, at: Placement, scene: Scene) -> SceneObject:
 FORMAT, VERSION = "mover-edits", 1
 
 
-class _Edit(Struct, frozen=True, tag_field="do"):
-    id: Text
-
-
-class PlaceFields(_Edit, frozen=True, tag="place"):
-    """An object's place, and the camera of its world."""
-
-    translation: Vector
-    yaw: Number
-    scale: Sizes
-    pitch: Annotated[float, Meta(ge=-1.6, le=1.6)]
-    roll: Annotated[float, Meta(ge=-3.2, le=3.2)]
-
-
-class AddFields(PlaceFields, frozen=True, tag="add"):
-    """A piece of the library."""
-
-    piece: Text
-    style: Id
-    seed: Id
-    annotation: Id | None = None
-
-
-class RelabelFields(_Edit, frozen=True, tag="relabel"):
-    """What an object is."""
-
-    category: Text
-
-
-class PinFields(_Edit, frozen=True, tag="pin"):
-    """Whether it stays."""
-
-    pinned: bool
-
-
-class DeleteFields(_Edit, frozen=True, tag="delete"):
-    """Which one goes."""
-
-
-EditFields = PlaceFields | RelabelFields | PinFields | DeleteFields | AddFields
-
-
 class EditsFields(Struct, frozen=True):
     """edits.json."""
 
     format: Literal["mover-edits"]
     version: Literal[1]
-    edits: list[EditFields]
+    edits: list[Any]
 
 
 def read_edits(path: Path) -> tuple[Edit, ...]:
@@ -266,60 +221,34 @@ def read_edits(path: Path) -> tuple[Edit, ...]:
         InputError: If anything in it is wrong.
     """
     at = read_json(path)
-    rows = checked(at, EditsFields).edits
-    places = items(get(at, "edits"))
-    return tuple(_edit_of(place, row) for place, row in zip(places, rows, strict=True))
+    checked(at, EditsFields)
+    return tuple(_edit_of(item) for item in items(get(at, "edits")))
+
+
+def _edit_of(at: At) -> Edit:
+    """An edit; where it places something, its row has the fields of the placement."""
+    row = mapping(at)
+    if row.get("do") in ("place", "add"):
+        row = {"annotation": None, **row, "at": checked(at, Placement)}
+    edit: Edit = checked(At(row, at.file, at.field), Edit)
+    text(get(at, "id"))
+    match edit:
+        case Relabel():
+            text(get(at, "category"))
+        case Add():
+            check_id(get(at, "id"))
+            choice(get(at, "piece"), tuple(PIECES))
+            integer(get(at, "style"), 0, STYLES[edit.piece] - 1)
+        case _:
+            pass
+    return edit
 
 
 def write_edits(edits: tuple[Edit, ...], path: Path) -> None:
     """Write the list, all at once."""
-    tree = {"format": FORMAT, "version": VERSION, "edits": [_edit_to_json(e) for e in edits]}
-    write_json(tree, path)
-
-
-def _placement_of(row: PlaceFields) -> Placement:
-    return Placement(
-        torch.tensor(row.translation), torch.tensor(row.yaw), torch.tensor(row.scale),
-        pitch=row.pitch, roll=row.roll,
-    )  # fmt: skip
-
-
-def _edit_of(at: At, row: EditFields) -> Edit:
-    match row:
-        case RelabelFields():
-            return Relabel(row.id, row.category)
-        case PinFields():
-            return Pin(row.id, row.pinned)
-        case DeleteFields():
-            return Delete(row.id)
-        case AddFields():
-            check_id(get(at, "id"))
-            choice(get(at, "piece"), tuple(PIECES))
-            integer(get(at, "style"), 0, STYLES[row.piece] - 1)
-            place = _placement_of(row)
-            return Add(row.id, row.piece, row.style, row.seed, row.annotation, place)
-        case PlaceFields():
-            return Place(row.id, _placement_of(row))
-
-
-def _edit_to_json(edit: Edit) -> dict[str, Any]:
-    match edit:
-        case Place():
-            return {"do": "place", "id": edit.id, **_placement_to_json(edit.at)}
-        case Relabel():
-            return {"do": "relabel", "id": edit.id, "category": edit.category}
-        case Pin():
-            return {"do": "pin", "id": edit.id, "pinned": edit.pinned}
-        case Delete():
-            return {"do": "delete", "id": edit.id}
-        case Add():
-            shown = {} if edit.annotation is None else {"annotation": edit.annotation}
-            made = {"piece": edit.piece, "style": edit.style, "seed": edit.seed, **shown}
-            return {"do": "add", "id": edit.id, **made, **_placement_to_json(edit.at)}
-
-
-def _placement_to_json(at: Placement) -> dict[str, Any]:
-    return {
-        "translation": plain(at.t_world_object), "yaw": plain(at.yaw), "scale": plain(at.scale),
-        "pitch": at.pitch, "roll": at.roll,
-    }  # fmt: skip
+    rows: list[dict[str, Any]] = [to_builtins(edit) for edit in edits]
+    flat = [
+        {k: v for k, v in (row | row.get("at", {})).items() if k != "at" and v is not None}
+        for row in rows
+    ]
+    write_json({"format": FORMAT, "version": VERSION, "edits": flat}, path)
