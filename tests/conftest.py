@@ -6,11 +6,11 @@ torch.set_num_threads(1)  # threads that wait for one another are slower than on
 
 def pytest_sessionstart():
     """Tests draw in double precision, too, which the program never does."""
-    from reference import drawer
+    from reference import reference_of
 
     from mover.geometry import raster
 
-    raster._drawer = drawer
+    raster._reference_of = reference_of
 
 
 def pytest_collection_modifyitems(items):

@@ -17,7 +17,7 @@ from mover.core.types import Bodies, Camera, People
 from mover.energy.terms.depth import DepthMaps, Seen, bounds_of, merge
 from mover.geometry import volume_warp
 from mover.geometry.raster import Crops
-from mover.geometry.raster.warp import layers as layers_warp
+from mover.geometry.raster import layers as layers_warp
 from mover.geometry.volume import Volume, grid_around, sample, sample_torch
 from mover.geometry.volume_warp import face_tree
 from mover.stages.contacts.gather_cues import Sight, gather_depth

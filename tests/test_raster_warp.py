@@ -13,12 +13,9 @@ from sm90 import ptx_of
 from test_raster import PINHOLE, edges_of, packed, posed, poses, slab, window
 
 from mover.geometry import raster
+from mover.geometry import raster as raster_warp
 from mover.geometry.kernels.start import _cores, threads, use_threads
-from mover.geometry.raster import Crops, Topology
-from mover.geometry.raster import warp as raster_warp
-from mover.geometry.raster import warp_cpu as raster_warp_cpu
-from mover.geometry.raster import warp_cuda as raster_warp_cuda
-from mover.geometry.raster.engine import drawn_by, engine
+from mover.geometry.raster import Crops, Topology, draw, drawn_by, engine
 
 wp = pytest.importorskip("warp")
 NAMES = ["sphere", "torus", "chair", "table", "sofa"]
@@ -28,7 +25,7 @@ NAMES = ["sphere", "torus", "chair", "table", "sofa"]
 def driver(request, monkeypatch):
     """Both ways to launch the kernels; the second is that of a GPU, on the CPU."""
     if request.param == "a thread an element":
-        monkeypatch.setattr(raster_warp, "_driver", lambda _: raster_warp_cuda)
+        monkeypatch.setattr(draw, "_in_loops", lambda _: False)
     return request.param
 
 
@@ -134,7 +131,6 @@ class TestRepetition:
         inputs = [scene(NAMES[i:], size) for i, size in enumerate((64, 128, 31))]
         alone = []
         for args in inputs:
-            vars(raster_warp_cpu._own).clear()
             alone.append(pulled(raster_warp, *args))
         for args, expected in zip(inputs, alone, strict=True):
             for values, truth in zip(pulled(raster_warp, *args), expected, strict=True):
@@ -229,7 +225,8 @@ class TestEngine:
         with use_threads(5):
             assert threads() == 5
 
-    def test_double_precision_is_drawn_in_single_and_handed_back(self):
+    def test_double_precision_is_drawn_in_single_and_handed_back(self, monkeypatch):
+        monkeypatch.setattr(raster, "_reference_of", lambda _: None)
         verts_cam, shape, views = scene(["sphere"], 24)
         free, same = (v.clone().requires_grad_() for v in (verts_cam.double(), verts_cam))
         (image, seen), (single, _) = (raster_warp.look(v, shape, views) for v in (free, same))
@@ -259,5 +256,12 @@ class TestEngine:
     @pytest.mark.slow
     def test_kernels_compile_for_an_h100_without_a_driver(self, tmp_path):
         text = ptx_of("grid", tmp_path)
-        for name in ("draw_tall", "enter_cuts", "keep_cuts", "show", "pull_cuts", "pull_pixels"):
+        for name in (
+            "draw_rows",
+            "enter_edges",
+            "keep_edges",
+            "show_pixels",
+            "pull_cuts",
+            "pull_pixels",
+        ):
             assert f".entry {name}_" in text

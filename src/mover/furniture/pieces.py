@@ -4,6 +4,8 @@ Pieces are built standing on y = 0 with the front towards +z; a part is the conv
 points, so that shifting, tilting and mirroring a part is arithmetic on points.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -78,6 +80,26 @@ def block(x: Span, y: Span, z: Span, bevel: float = 0.0) -> Part:
 def post(x: float, z: float, y: Span, half: float) -> Part:
     """A square bar upright at (x, z), of the thickness 2 * `half` [m]."""
     return block((x - half, x + half), y, (z - half, z + half))
+
+
+def pair(x: float) -> Span:
+    """The same distance to both sides of the middle [m]."""
+    return -x, x
+
+
+def posts(xs: Iterable[float], zs: Iterable[float], y: Span, half: float) -> list[Part]:
+    """A `post` at each of the places [m]."""
+    return [post(x, z, y, half) for x in xs for z in zs]
+
+
+def upright(xs: Iterable[float], half: float, y: Span, z: Span) -> list[Part]:
+    """Boards across x, of the thickness 2 * `half`, at each of the places [m]."""
+    return [block((x - half, x + half), y, z) for x in xs]
+
+
+def crosswise(x: Span, y: Span, zs: Iterable[float], half: float) -> list[Part]:
+    """Boards across z, of the thickness 2 * `half`, at each of the places [m]."""
+    return [block(x, y, (z - half, z + half)) for z in zs]
 
 
 def rod(start: tuple[float, ...], end: tuple[float, ...], radii: Span, sides: int = 10) -> Part:

@@ -9,14 +9,17 @@ from mover.furniture.pieces import (
     Part,
     Seat,
     block,
+    crosswise,
     disc,
     draw,
     finish,
     legs,
-    post,
+    pair,
+    posts,
     rod,
     tilted,
     turned,
+    upright,
 )
 
 
@@ -39,13 +42,9 @@ def sofa(rng: np.random.Generator, style: int) -> Furniture:
         front = d + draw(rng, 0.5, 0.75)
         parts.append(block((x - each, x), (h - 0.17, h), (0.1, front), 0.03))
         parts.append(block((x - each + 0.01, x - 0.01), (foot, h - 0.14), (0.1, front - 0.03)))
-    feet = [
-        (left + 0.07, -0.18),
-        (left + 0.07, d - 0.1),
-        (right - 0.07, -0.18),
-        (right - 0.07, front - 0.1),
-    ]
-    parts += [rod((i, 0, k), (i, foot + 0.03, k), (0.022, 0.028), 8) for i, k in feet]
+    for i, ahead in ((left + 0.07, d), (right - 0.07, front)):
+        feet = ((i, -0.18), (i, ahead - 0.1))
+        parts += [rod((i, 0, k), (i, foot + 0.03, k), (0.022, 0.028), 8) for i, k in feet]
     usable = (-x, x - each if style == 3 else x)
     return finish("sofa", style, parts, Seat(h, usable, (0.0, d), back))
 
@@ -89,20 +88,15 @@ def _bed(
     frame = block((-x - edge, x + edge), (under, h - 0.14), (-z - edge, z + edge), 0.008)
     parts = [mattress, frame]
     if style > 0:
-        parts += [
-            post(i, k, (0, h - 0.15), 0.04)
-            for i in (-x + 0.04, x - 0.04)
-            for k in (-z + 0.04, z - 0.04)
-        ]
+        parts += posts(pair(x - 0.04), pair(z - 0.04), (0, h - 0.15), 0.04)
     board = draw(rng, 0.95, 1.15)
     behind = (-z - edge - 0.05, -z - edge + 0.03)
     if style == 0:
         parts.append(block((-x - edge, x + edge), (0, board), behind, 0.012))
     if style == 1:
         parts += _slats((-x - edge, x + edge), (h - 0.15, board), behind)
-        parts += _slats(
-            (-x - edge, x + edge), (h - 0.15, h + 0.14), (z + edge - 0.03, z + edge + 0.04)
-        )
+        ahead = (z + edge - 0.03, z + edge + 0.04)
+        parts += _slats((-x - edge, x + edge), (h - 0.15, h + 0.14), ahead)
     parts += _pillows(x, z, h, pillows)
     return finish(category, style, parts, Seat(h, (-x, x), (-z, z)), top=h)
 
@@ -120,12 +114,9 @@ def _pillows(x: float, z: float, h: float, count: int) -> list[Part]:
 
 def _slats(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> list[Part]:
     rail = block(x, (y[1] - 0.06, y[1]), z, 0.006)
-    bars = [
-        block((c - 0.03, c + 0.03), (y[0] - 0.1, y[1] - 0.02), (z[0] + 0.01, z[1] - 0.01))
-        for c in np.linspace(x[0] + 0.04, x[1] - 0.04, 6)
-    ]
-    posts = [block((s - 0.035, s + 0.035), (0, y[1]), z) for s in (x[0] + 0.035, x[1] - 0.035)]
-    return [rail, *bars, *posts]
+    at, inner = np.linspace(x[0] + 0.04, x[1] - 0.04, 6), (z[0] + 0.01, z[1] - 0.01)
+    bars = upright(at, 0.03, (y[0] - 0.1, y[1] - 0.02), inner)
+    return [rail, *bars, *upright((x[0] + 0.035, x[1] - 0.035), 0.035, (0, y[1]), z)]
 
 
 # Chairs, armchairs, office chairs, stools and benches.
@@ -148,33 +139,21 @@ def _panel_back(x: float, h: float, back: float, z: float) -> list[Part]:
 
 
 def _ladder_back(x: float, h: float, back: float, z: float) -> list[Part]:
-    posts = [
-        rod(
-            (s * (x - 0.02), h - 0.04, z - 0.018), (s * (x - 0.02), back, z - 0.018), (0.018, 0.018)
-        )
-        for s in (-1, 1)
-    ]
+    behind, inner = z - 0.018, pair(x - 0.02)
+    bars = [rod((s, h - 0.04, behind), (s, back, behind), (0.018, 0.018)) for s in inner]
     rungs = np.linspace(h + 0.16, back - 0.04, 3)
-    slats = [
-        block((-x + 0.02, x - 0.02), (y - 0.03, y + 0.03), (z - 0.026, z - 0.004)) for y in rungs
-    ]
-    return posts + slats
+    return bars + [block(inner, (y - 0.03, y + 0.03), (z - 0.026, z - 0.004)) for y in rungs]
 
 
 def _low_back(x: float, h: float, back: float, z: float) -> list[Part]:
     low = h + 0.12
-    posts = [
-        block((s * x - 0.02, s * x + 0.02), (h - 0.04, back - 0.02), (z - 0.03, z - 0.004))
-        for s in (-0.8, 0.8)
-    ]
-    return [*posts, block((-x, x), (low, back), (z - 0.04, z), 0.012)]
+    bars = upright(pair(0.8 * x), 0.02, (h - 0.04, back - 0.02), (z - 0.03, z - 0.004))
+    return [*bars, block((-x, x), (low, back), (z - 0.04, z), 0.012)]
 
 
 def _spindle_back(x: float, h: float, back: float, z: float) -> list[Part]:
-    xs = np.linspace(-x + 0.03, x - 0.03, 6)
-    spindles = [
-        rod((s, h - 0.03, z - 0.018), (s, back - 0.02, z - 0.018), (0.011, 0.009), 8) for s in xs
-    ]
+    xs, k = np.linspace(-x + 0.03, x - 0.03, 6), z - 0.018
+    spindles = [rod((s, h - 0.03, k), (s, back - 0.02, k), (0.011, 0.009), 8) for s in xs]
     return [*spindles, block((-x, x), (back - 0.07, back), (z - 0.034, z - 0.002), 0.008)]
 
 
@@ -183,10 +162,8 @@ def _square_legs(x: float, z: float, h: float) -> list[Part]:
 
 
 def _round_legs(x: float, z: float, h: float) -> list[Part]:
-    rungs = [
-        rod((-x + 0.03, 0.2, s * (z - 0.03)), (x - 0.03, 0.2, s * (z - 0.03)), (0.011, 0.011), 8)
-        for s in (-1, 1)
-    ]
+    left, right = pair(x - 0.03)
+    rungs = [rod((left, 0.2, k), (right, 0.2, k), (0.011, 0.011), 8) for k in pair(z - 0.03)]
     return [*legs(x - 0.035, z - 0.035, h - 0.02, 0.02, 0.004), *rungs]
 
 
@@ -195,9 +172,7 @@ def _side_frames(x: float, z: float, h: float) -> list[Part]:
     for s in (-1, 1):
         side = (s * (x - 0.02) - 0.018, s * (x - 0.02) + 0.018)
         parts.append(block(side, (0, 0.035), (-z + 0.01, z - 0.01)))
-        parts += [
-            block(side, (0.01, h - 0.02), (k - 0.018, k + 0.018)) for k in (-z + 0.03, z - 0.03)
-        ]
+        parts += crosswise(side, (0.01, h - 0.02), pair(z - 0.03), 0.018)
     return parts
 
 
@@ -227,16 +202,11 @@ def armchair(rng: np.random.Generator, style: int) -> Furniture:
     span = (-x - arm + 0.03, x + arm - 0.03)
     base = block(span, (foot, h - 0.1), (-0.17, d - 0.02), 0.01)
     thin = 0.03 if style == 0 else 0.022
-    feet = [
-        rod((i, 0, k), (i, foot + 0.03, k), (thin, thin), 8)
-        for i in (span[0] + 0.04, span[1] - 0.04)
-        for k in (-0.12, d - 0.07)
-    ]
-    parts += (
-        [base, *feet]
-        if style < 2
-        else [block((-x - 0.02, x + 0.02), (h - 0.17, h - 0.1), (-0.1, d - 0.02))]
-    )
+    feet = [(i, k) for i in (span[0] + 0.04, span[1] - 0.04) for k in (-0.12, d - 0.07)]
+    if style < 2:
+        parts += [base, *(rod((i, 0, k), (i, foot + 0.03, k), (thin, thin), 8) for i, k in feet)]
+    else:
+        parts.append(block((-x - 0.02, x + 0.02), (h - 0.17, h - 0.1), (-0.1, d - 0.02)))
     return finish("armchair", style, parts, Seat(h, (-x, x), (0.0, d), back))
 
 
@@ -249,8 +219,8 @@ def _arm_seats(
     if style < 2:
         return [block(span, (foot, h + 0.19), (-0.15, d - 0.02), 0.025)]
     top = block((span[0] - 0.015, span[1] + 0.015), (h + 0.17, h + 0.2), (-0.16, d + 0.03), 0.006)
-    posts = [block(span, (0, h + 0.18), (k - 0.025, k + 0.025)) for k in (-0.12, d - 0.05)]
-    return [top, *posts, block(span, (h - 0.17, h - 0.12), (-0.12, d - 0.05))]
+    bars = crosswise(span, (0, h + 0.18), (-0.12, d - 0.05), 0.025)
+    return [top, *bars, block(span, (h - 0.17, h - 0.12), (-0.12, d - 0.05))]
 
 
 def office_chair(rng: np.random.Generator, style: int) -> Furniture:
@@ -258,11 +228,8 @@ def office_chair(rng: np.random.Generator, style: int) -> Furniture:
     w, d, h = draw(rng, 0.46, 0.5), draw(rng, 0.44, 0.48), draw(rng, 0.44, 0.48)
     back = h + (0.48 if style == 0 else 0.66)
     x, z = w / 2, d / 2
-    parts = [
-        block((-x, x), (h - 0.07, h), (-z, z), 0.03),
-        disc((0, 0), (0.07, h - 0.03), 0.028, 12),
-    ]
-    parts.append(disc((0, 0), (0.06, 0.14), 0.05, 16))
+    column = [disc((0, 0), (0.07, h - 0.03), 0.028, 12), disc((0, 0), (0.06, 0.14), 0.05, 16)]
+    parts = [block((-x, x), (h - 0.07, h), (-z, z), 0.03), *column]
     for k in range(5):
         spoke = block((-0.022, 0.022), (0.06, 0.1), (0, 0.29))
         caster = rod((-0.025, 0.032, 0.27), (0.025, 0.032, 0.27), (0.032, 0.032), 12)
@@ -286,21 +253,13 @@ def stool(rng: np.random.Generator, style: int) -> Furniture:
     if style == 0:
         parts = [disc((0, 0), (h - 0.04, h), r), *legs(0.1, 0.1, h - 0.02, 0.02, 0.05)]
     elif style == 1:
-        parts = [
-            block((-r, r), (h - 0.05, h), (-r, r), 0.01),
-            *legs(r - 0.03, r - 0.03, h - 0.02, 0.025),
-        ]
-        parts += [
-            block((-r + 0.02, r - 0.02), (0.13, 0.16), (s - 0.012, s + 0.012))
-            for s in (-r + 0.03, r - 0.03)
-        ]
+        parts = [block((-r, r), (h - 0.05, h), (-r, r), 0.01)]
+        parts += legs(r - 0.03, r - 0.03, h - 0.02, 0.025)
+        parts += crosswise(pair(r - 0.02), (0.13, 0.16), pair(r - 0.03), 0.012)
     else:
         r += 0.04
-        rings = [
-            disc((0, 0), (y, y + 0.01), r - cut, 24)
-            for y, cut in ((0, 0.03), (0.03, 0), (h - 0.05, 0), (h - 0.01, 0.03))
-        ]
-        parts = [np.concatenate(rings)]
+        cuts = ((0, 0.03), (0.03, 0), (h - 0.05, 0), (h - 0.01, 0.03))
+        parts = [np.concatenate([disc((0, 0), (y, y + 0.01), r - cut, 24) for y, cut in cuts])]
     reach = 0.8 * r
     return finish("stool", style, parts, Seat(h, (-reach, reach), (-r, r)))
 
@@ -311,26 +270,14 @@ def bench(rng: np.random.Generator, style: int) -> Furniture:
     x, z = w / 2, d / 2
     if style == 0:
         parts = [block((-x, x), (h - 0.045, h), (-z, z), 0.006)]
-        parts += [
-            block((s - 0.02, s + 0.02), (0, h - 0.02), (-z + 0.02, z - 0.02))
-            for s in (-x + 0.1, x - 0.1)
-        ]
+        parts += upright(pair(x - 0.1), 0.02, (0, h - 0.02), pair(z - 0.02))
         parts.append(block((-x + 0.1, x - 0.1), (h - 0.14, h - 0.03), (-0.012, 0.012)))
     elif style == 1:
         edges = np.linspace(-z, z, 6)
         parts = [block((-x, x), (h - 0.03, h), (a, b - 0.008)) for a, b in pairwise(edges)]
-        parts += [
-            block((s - 0.03, s + 0.03), (h - 0.07, h - 0.02), (-z + 0.01, z - 0.02))
-            for s in (-x + 0.12, x - 0.12)
-        ]
-        parts += [
-            post(i, k, (0, h - 0.03), 0.025)
-            for i in (-x + 0.12, x - 0.12)
-            for k in (-z + 0.05, z - 0.06)
-        ]
+        parts += upright(pair(x - 0.12), 0.03, (h - 0.07, h - 0.02), (-z + 0.01, z - 0.02))
+        parts += posts(pair(x - 0.12), (-z + 0.05, z - 0.06), (0, h - 0.03), 0.025)
     else:
-        parts = [
-            block((-x, x), (h - 0.12, h), (-z, z), 0.025),
-            *legs(x - 0.08, z - 0.06, h - 0.1, 0.022, 0.03),
-        ]
+        parts = [block((-x, x), (h - 0.12, h), (-z, z), 0.025)]
+        parts += legs(x - 0.08, z - 0.06, h - 0.1, 0.022, 0.03)
     return finish("bench", style, parts, Seat(h, (-x, x), (-z, z)))

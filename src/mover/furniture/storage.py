@@ -8,13 +8,16 @@ from mover.furniture.pieces import (
     Furniture,
     Part,
     block,
+    crosswise,
     disc,
     draw,
     finish,
     legs,
-    post,
+    pair,
+    posts,
     rod,
     turned,
+    upright,
 )
 
 
@@ -23,28 +26,19 @@ def table(rng: np.random.Generator, style: int) -> Furniture:
     w, d, h = draw(rng, 1.1, 1.7), draw(rng, 0.75, 0.92), draw(rng, 0.72, 0.77)
     x, z, r = w / 2, d / 2, draw(rng, 0.45, 0.6)
     if style == 0:
-        parts = [
-            block((-x, x), (h - 0.035, h), (-z, z), 0.006),
-            *legs(x - 0.06, z - 0.06, h - 0.01, 0.045),
-        ]
+        parts = [block((-x, x), (h - 0.035, h), (-z, z), 0.006)]
+        parts += legs(x - 0.06, z - 0.06, h - 0.01, 0.045)
         parts.append(block((-x + 0.08, x - 0.08), (h - 0.11, h - 0.02), (-z + 0.06, z - 0.06)))
     elif style == 1:
-        parts = [
-            block((-x, x), (h - 0.04, h), (-z, z), 0.008),
-            block((-x + 0.25, x - 0.25), (0.3, 0.36), (-0.03, 0.03)),
-        ]
-        for s in (-x + 0.25, x - 0.25):
-            parts += [block((s - 0.035, s + 0.035), (0.03, h - 0.02), (-0.06, 0.06))]
-            parts += [
-                block((s - 0.04, s + 0.04), y, (-z + 0.1, z - 0.1))
-                for y in ((0, 0.06), (h - 0.09, h - 0.03))
-            ]
+        parts = [block((-x, x), (h - 0.04, h), (-z, z), 0.008)]
+        parts.append(block(pair(x - 0.25), (0.3, 0.36), (-0.03, 0.03)))
+        for s in pair(x - 0.25):
+            parts += upright([s], 0.035, (0.03, h - 0.02), (-0.06, 0.06))
+            parts += upright([s], 0.04, (0, 0.06), pair(z - 0.1))
+            parts += upright([s], 0.04, (h - 0.09, h - 0.03), pair(z - 0.1))
     elif style == 2:
-        parts = [
-            disc((0, 0), (h - 0.035, h), r, 40),
-            disc((0, 0), (0.03, h - 0.02), 0.05, 16),
-            disc((0, 0), (0, 0.04), 0.3, 32),
-        ]
+        foot = [disc((0, 0), (0.03, h - 0.02), 0.05, 16), disc((0, 0), (0, 0.04), 0.3, 32)]
+        parts = [disc((0, 0), (h - 0.035, h), r, 40), *foot]
     else:
         parts = [disc((0, 0), (h - 0.035, h), r, 40), *legs(0.5 * r, 0.5 * r, h - 0.02, 0.028, 0.1)]
     return finish("table", style, parts, top=h)
@@ -57,33 +51,17 @@ def desk(rng: np.random.Generator, style: int) -> Furniture:
     parts = [block((-x, x), (h - 0.03, h), (-z, z), 0.005)]
     if style == 0:
         parts += [block((x - 0.42, x - 0.02), (0.04, h - 0.01), (-z + 0.02, z - 0.03))]
-        parts += [
-            block((x - 0.4, x - 0.04), (y, y + 0.18), (z - 0.04, z - 0.02))
-            for y in (0.07, 0.28, 0.49)
-        ]
-        parts += [
-            block((x - 0.4, x - 0.36), (0, 0.06), (k - 0.02, k + 0.02))
-            for k in (-z + 0.06, z - 0.08)
-        ]
-        parts += [
-            block((x - 0.08, x - 0.04), (0, 0.06), (k - 0.02, k + 0.02))
-            for k in (-z + 0.06, z - 0.08)
-        ]
-        parts += [
-            block((-x + 0.02, -x + 0.07), (0, h - 0.01), (k - 0.025, k + 0.025))
-            for k in (-z + 0.05, z - 0.06)
-        ]
+        front, feet = (z - 0.04, z - 0.02), (-z + 0.06, z - 0.08)
+        parts += [block((x - 0.4, x - 0.04), (y, y + 0.18), front) for y in (0.07, 0.28, 0.49)]
+        parts += crosswise((x - 0.4, x - 0.36), (0, 0.06), feet, 0.02)
+        parts += crosswise((x - 0.08, x - 0.04), (0, 0.06), feet, 0.02)
+        parts += crosswise((-x + 0.02, -x + 0.07), (0, h - 0.01), (-z + 0.05, z - 0.06), 0.025)
     elif style == 1:
-        parts += [
-            block((s - 0.015, s + 0.015), (0, h - 0.01), (-z + 0.02, z - 0.02))
-            for s in (-x + 0.04, x - 0.04)
-        ]
+        parts += upright(pair(x - 0.04), 0.015, (0, h - 0.01), pair(z - 0.02))
         parts.append(block((-x + 0.04, x - 0.04), (0.35, h - 0.01), (-z + 0.05, -z + 0.07)))
     else:
-        parts += [
-            *legs(x - 0.08, z - 0.08, h - 0.01, 0.025, 0.05),
-            block((-x + 0.06, x - 0.06), (h - 0.12, h - 0.02), (-z + 0.06, z - 0.1)),
-        ]
+        parts += legs(x - 0.08, z - 0.08, h - 0.01, 0.025, 0.05)
+        parts.append(block(pair(x - 0.06), (h - 0.12, h - 0.02), (-z + 0.06, z - 0.1)))
     return finish("desk", style, parts, top=h)
 
 
@@ -92,22 +70,16 @@ def coffee_table(rng: np.random.Generator, style: int) -> Furniture:
     w, d, h = draw(rng, 0.85, 1.2), draw(rng, 0.5, 0.62), draw(rng, 0.36, 0.44)
     x, z, r = w / 2, d / 2, draw(rng, 0.36, 0.45)
     if style == 0:
-        parts = [
-            block((-x, x), (h - 0.04, h), (-z, z), 0.006),
-            *legs(x - 0.05, z - 0.05, h - 0.02, 0.035),
-        ]
+        parts = [block((-x, x), (h - 0.04, h), (-z, z), 0.006)]
+        parts += legs(x - 0.05, z - 0.05, h - 0.02, 0.035)
         parts.append(block((-x + 0.04, x - 0.04), (0.12, 0.15), (-z + 0.04, z - 0.04)))
     elif style == 1:
-        feet = [
-            turned(rod((0.24, 0, 0), (0.14, h - 0.02, 0), (0.015, 0.022)), 120 * k + 30)
-            for k in range(3)
-        ]
+        foot = rod((0.24, 0, 0), (0.14, h - 0.02, 0), (0.015, 0.022))
+        feet = [turned(foot, 120 * k + 30) for k in range(3)]
         parts = [disc((0, 0), (h - 0.03, h), r, 36), *feet]
     else:
-        parts = [
-            block((-x, x), (0.06, h), (-z, z), 0.01),
-            block((-x + 0.06, x - 0.06), (0, 0.08), (-z + 0.06, z - 0.06)),
-        ]
+        plinth = block(pair(x - 0.06), (0, 0.08), pair(z - 0.06))
+        parts = [block((-x, x), (0.06, h), (-z, z), 0.01), plinth]
     return finish("coffee table", style, parts, top=h)
 
 
@@ -120,14 +92,10 @@ def shelf(rng: np.random.Generator, style: int) -> Furniture:
     boards = np.linspace(0.05, h - 0.0125, max(3, round(h / 0.36) + 1))
     parts = [block((-x, x), (y - 0.0125, y + 0.0125), (-z, z)) for y in boards]
     if style == 1:
-        parts += [
-            post(i, k, (0, h), 0.018)
-            for i in (-x + 0.018, x - 0.018)
-            for k in (-z + 0.018, z - 0.018)
-        ]
+        parts += posts(pair(x - 0.018), pair(z - 0.018), (0, h), 0.018)
     else:
-        sides = [-x + 0.012, x - 0.012] + ([0.0] if style == 3 else [])
-        parts += [block((s - 0.012, s + 0.012), (0, h), (-z, z)) for s in sides]
+        sides = [*pair(x - 0.012), *([0.0] if style == 3 else [])]
+        parts += upright(sides, 0.012, (0, h), (-z, z))
         parts.append(block((-x, x), (0.03, h), (-z, -z + 0.012)))
     if style == 2:
         parts += _books(rng, x, z, boards)
@@ -181,26 +149,17 @@ def nightstand(rng: np.random.Generator, style: int) -> Furniture:
     w, d, h = draw(rng, 0.4, 0.5), draw(rng, 0.36, 0.42), draw(rng, 0.45, 0.56)
     x, z = w / 2, d / 2
     if style == 0:
-        parts = [
-            *_cupboard(w, d, (0.04, h), (1, 2)),
-            block((-x + 0.02, x - 0.02), (0, 0.05), (-z + 0.02, z - 0.04)),
-        ]
+        plinth = block(pair(x - 0.02), (0, 0.05), (-z + 0.02, z - 0.04))
+        parts = [*_cupboard(w, d, (0.04, h), (1, 2)), plinth]
     elif style == 1:
-        parts = [
-            block((-x, x), (h - 0.03, h), (-z, z)),
-            *legs(x - 0.025, z - 0.025, h - 0.01, 0.022),
-        ]
-        parts += [
-            block((-x + 0.01, x - 0.01), (h - 0.16, h - 0.02), (-z + 0.01, z - 0.01)),
-            block((-x + 0.01, x - 0.01), (0.12, 0.14), (-z + 0.01, z - 0.01)),
-        ]
+        parts = [block((-x, x), (h - 0.03, h), (-z, z))]
+        parts += legs(x - 0.025, z - 0.025, h - 0.01, 0.022)
+        shelves = ((h - 0.16, h - 0.02), (0.12, 0.14))
+        parts += [block(pair(x - 0.01), y, pair(z - 0.01)) for y in shelves]
     else:
         r = x - 0.02
-        parts = [
-            disc((0, 0), (h - 0.03, h), r),
-            disc((0, 0), (0.02, h - 0.02), 0.03, 12),
-            disc((0, 0), (0, 0.03), 0.8 * r),
-        ]
+        column = disc((0, 0), (0.02, h - 0.02), 0.03, 12)
+        parts = [disc((0, 0), (h - 0.03, h), r), column, disc((0, 0), (0, 0.03), 0.8 * r)]
     return finish("nightstand", style, parts, top=h)
 
 
@@ -229,22 +188,14 @@ def lamp(rng: np.random.Generator, style: int) -> Furniture:
     """A floor lamp: 0 cone shade, 1 tripod with a drum, 2 an uplight."""
     h, r = draw(rng, 1.45, 1.7), draw(rng, 0.17, 0.22)
     if style == 1:
-        feet = [
-            turned(rod((0.28, 0, 0), (0.02, h - 0.28, 0), (0.012, 0.014), 8), 120 * k)
-            for k in range(3)
-        ]
-        parts = [
-            *feet,
-            disc((0, 0), (h - 0.32, h - 0.2), 0.02, 8),
-            disc((0, 0), (h - 0.3, h), 1.15 * r, 28),
-        ]
+        foot = rod((0.28, 0, 0), (0.02, h - 0.28, 0), (0.012, 0.014), 8)
+        drum = disc((0, 0), (h - 0.3, h), 1.15 * r, 28)
+        feet = [turned(foot, 120 * k) for k in range(3)]
+        parts = [*feet, disc((0, 0), (h - 0.32, h - 0.2), 0.02, 8), drum]
     else:
         shade = rod((0, h - 0.26, 0), (0, h, 0), (r, 0.55 * r), 28)
         if style == 2:
             shade = rod((0, h - 0.14, 0), (0, h, 0), (0.06, r), 28)
-        parts = [
-            disc((0, 0), (0, 0.025), 0.14, 28),
-            disc((0, 0), (0.02, h - 0.1), 0.013, 10),
-            shade,
-        ]
+        stand = [disc((0, 0), (0, 0.025), 0.14, 28), disc((0, 0), (0.02, h - 0.1), 0.013, 10)]
+        parts = [*stand, shade]
     return finish("floor lamp", style, parts)

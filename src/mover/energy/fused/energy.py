@@ -22,7 +22,7 @@ from mover.energy.objective import (
 )
 from mover.energy.terms.contact import trees_of
 from mover.energy.terms.silhouette import outline_root
-from mover.geometry.raster.engine import engine
+from mover.geometry.raster import engine
 
 EnergyOf = Callable[[Layout], Energy]
 

@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mover.geometry.kernels.start import array, kernels, share, started, threads
-from mover.geometry.raster.warp_pack import desk_of
+from mover.geometry.kernels.start import array, filled, kernels, share, started, threads
+from mover.geometry.raster.draw import scratch_of
 
 KERNELS = "mover.energy.fused.kernels"
 BORDER = 1  # [px], as in the rasterisers
@@ -179,14 +179,11 @@ def _buffers_of(fused: FusedEnergy, items: int, count: int) -> _Buffers:
     parts, slope = torch.empty(items, TERMS), torch.empty(items, 7)
     slopes = torch.empty(items, TERMS, 7)
     order = torch.zeros(items, dtype=torch.int32)
-    fused.given.people.held = array(
-        torch.full((max(1, fused.asked * -(-items // n)),), -1, dtype=torch.int32), "int32"
+    held = torch.full((max(1, fused.asked * -(-items // n)),), -1, dtype=torch.int32)
+    fused.given.people.held = array(held, "int32")
+    answer = filled(
+        Answer, order=order, layout=layout, parts=parts, slopes=slopes, whole=whole, slope=slope
     )
-    answer = Answer()
-    answer.order = array(order, "int32")
-    answer.layout, answer.parts = (started().from_torch(x) for x in (layout, parts))
-    answer.slopes, answer.slope = (_slopes(x) for x in (slopes, slope))
-    answer.whole = array(whole, "float32")
     launches = tuple(
         launch(
             kernel,
@@ -198,12 +195,6 @@ def _buffers_of(fused: FusedEnergy, items: int, count: int) -> _Buffers:
         for _ in range(count)
     )
     return _Buffers([], order, layout, parts, slopes, whole, slope, launches)
-
-
-def _slopes(values: Tensor) -> Any:  # noqa: ANN401
-    from mover.energy.fused.kernels.given import Slope
-
-    return started().from_torch(values, dtype=Slope)
 
 
 def _workspace(room: Room) -> Any:  # noqa: ANN401
@@ -218,8 +209,8 @@ def _workspace(room: Room) -> Any:  # noqa: ANN401
     scene.views = scene.shapes = 1
     scene.n_verts, scene.n_faces, scene.n_edges = room.verts, room.faces, room.edges
     scene.height, scene.width, scene.border = room.height, room.width, BORDER
-    sizes = room.verts, room.faces, room.edges, grid
-    space.scene, space.scratch = scene, desk_of(sizes, 2 * grid, torch.device("cpu")).scratch
+    sizes = room.verts, room.faces, room.edges, grid, 2 * grid
+    space.scene, space.scratch = scene, scratch_of(sizes, torch.device("cpu"))
     _marks(space, room)
     space.pairs = array(torch.empty(2 * grid, dtype=torch.int32), "int32")
     space.keys = array(torch.empty(2 * grid, dtype=torch.int64), "uint64")

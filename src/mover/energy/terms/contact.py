@@ -25,7 +25,7 @@ from mover.core.types import Layout, Objects
 from mover.energy.config import Variant
 from mover.energy.minimize import geman_mcclure, safe_norm
 from mover.geometry.nearest_warp import Clouds, clouds, nearest
-from mover.geometry.raster.engine import engine
+from mover.geometry.raster import engine
 from mover.geometry.rotations import rot_y
 
 RHO = 0.3  # [m], docs/method.md: 0.15 gives up on pieces half a metre away

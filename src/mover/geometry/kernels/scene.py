@@ -57,8 +57,8 @@ class Scratch:
     cuts: wp.array(dtype=wp.vec4i)
     """Cuts that count: two vertices (over all items), line x 4 + flags, covered place."""
     targets: wp.array(dtype=wp.int32)
-    """Pixel of the window that each cut moves, over all items; where it overshoots -1 - pixel
-    (`grid`: -2 - pixel; -1 where there is none)."""
+    """Pixel of the window that each cut moves, over all items; where it overshoots -2 - pixel; -1
+    where there is none."""
     count: wp.array(dtype=wp.int32)
     """Number of entries of `queue`, of `cuts`."""
 
@@ -80,12 +80,12 @@ class Maps:
     """Face that won the pixel in `near`."""
     far_face: wp.array(dtype=wp.int32)
     """Face that won the pixel in `far`."""
-    box: wp.array(dtype=wp.vec4i)
-    """Where each item may be: first row, row after the last, the same of columns, in the grid."""
     silhouette: bool
     """Whether `image` is wanted."""
     depth: bool
-    """Whether the other maps are wanted."""
+    """Whether the other maps are wanted, where both surfaces are seen."""
+    hits: bool
+    """Whether `nearest` and `near_face` are wanted alone, wherever something is seen."""
 
 
 @wp.struct
@@ -97,8 +97,6 @@ class Pull:
     """As in `Scratch`."""
     targets: wp.array(dtype=wp.int32)
     """As in `Scratch`."""
-    starts: wp.array(dtype=wp.int32)
-    """First cut of each item, and the number of all."""
     image: wp.array(dtype=wp.float32)
     """Gradient of the covered share."""
     nearest: wp.array(dtype=wp.float32)

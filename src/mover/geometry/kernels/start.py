@@ -107,6 +107,16 @@ def array(tensor: Tensor, dtype: str) -> Any:  # noqa: ANN401
     return wp.from_torch(tensor.detach(), dtype=getattr(wp, dtype))
 
 
+def filled(kind: Any, **fields: Any) -> Any:  # noqa: ANN401
+    """A struct of the kernels; tensors become arrays of the declared kind without a copy."""
+    made = kind()
+    for name, value in fields.items():
+        if isinstance(value, Tensor):
+            value = started().from_torch(value.detach(), dtype=kind.vars[name].type.dtype)
+        setattr(made, name, value)
+    return made
+
+
 def threads() -> int:
     """Threads that draw on a CPU: of `use_threads`, else of OMP_NUM_THREADS, else one a core.
 

@@ -35,16 +35,6 @@ def inverse_depth(key: wp.uint64, farthest: bool) -> float:
 
 @wp.func
 @no_type_check
-def pixel_of(scene: Scene, item: int, row: int, column: int) -> int:
-    """Pixel of the windows, over all items, for a place of the grid."""
-    high = scene.height - 2 * scene.border
-    return (item * high + row - scene.border) * (scene.width - 2 * scene.border) + (
-        column - scene.border
-    )
-
-
-@wp.func
-@no_type_check
 def item_of(scene: Scene, pixel: int) -> int:
     """Item that a pixel of the windows belongs to."""
     border = 2 * scene.border
@@ -70,6 +60,9 @@ def show_pixel(maps: Maps, pixel: int, near: wp.uint64, far: wp.uint64) -> None:
     if near != wp.uint64(0):
         if maps.silhouette:
             maps.image[pixel] = 1.0
+        if maps.hits:
+            maps.nearest[pixel] = 1.0 / inverse_depth(near, False)
+            maps.near_face[pixel] = face_of(near)
         if maps.depth and far != wp.uint64(0):
             maps.covered[pixel] = True
             maps.nearest[pixel] = 1.0 / inverse_depth(near, False)

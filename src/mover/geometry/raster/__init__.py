@@ -1,18 +1,35 @@
-"""Exact-contour silhouettes and depth of many objects at once: the interface of the rasterisers.
+"""Exact-contour silhouettes and depth of many objects at once.
 
 The grid of a window has its first pixel centre at (0.5, 0.5). Triangles with a vertex nearer than
-`camera.NEAR` are not drawn. The work is done by compiled kernels (`raster.warp`), in single
-precision whatever that of the vertices, without a gradient of the intrinsics.
+`camera.NEAR` are not drawn. The work is done by kernels in NVIDIA Warp on a CPU or an NVIDIA GPU,
+in single precision whatever that of the vertices, with gradients in closed form but none of the
+intrinsics. On a CPU two runs give the same bits. Inside `drawn_by` a reference draws instead.
 """
 
+from collections.abc import Generator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import ModuleType
+from typing import Any, Literal
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from mover.geometry.raster import warp
-from mover.geometry.raster.engine import reference
-from mover.geometry.raster.records import Crops, Depths, Layers, Topology
+from mover.geometry.kernels.start import kernels, launch, name_of, started
+from mover.geometry.raster import draw
+from mover.geometry.raster.records import (
+    BORDER,
+    Asked,
+    Crops,
+    Depths,
+    Gradients,
+    Items,
+    Layers,
+    Maps,
+    Topology,
+)
 
 __all__ = [
     "Crops",
@@ -20,11 +37,36 @@ __all__ = [
     "Layers",
     "Topology",
     "depths",
+    "drawn_by",
+    "engine",
     "first_hit",
     "layers",
     "look",
     "silhouettes",
 ]
+
+MOST = 1 << 30  # pixels or vertices of one drawing: the kernels count them in 32 bits
+_reference: ContextVar[ModuleType | None] = ContextVar("reference", default=None)
+
+
+def engine() -> Literal["torch", "warp"]:
+    """Who draws and sums: "torch" inside `drawn_by`, else "warp"."""
+    return "torch" if _reference.get() else "warp"
+
+
+@contextmanager
+def drawn_by(module: ModuleType) -> Generator[None, None, None]:
+    """Let a module with `look`, `depths`, `layers` and `first_hit` draw inside the block."""
+    token = _reference.set(module)
+    try:
+        yield
+    finally:
+        _reference.reset(token)
+
+
+def _reference_of(_verts_cam: Tensor) -> ModuleType | None:
+    """Who draws such vertices in place of the kernels."""
+    return _reference.get()
 
 
 def silhouettes(
@@ -48,7 +90,9 @@ def depths(
     The outline's motion has no share in the gradient (`silhouettes` has it). A triangle seen at
     less than half a degree gives a depth but no gradient, which would be without bound.
     """
-    return _drawer(verts_cam).depths(verts_cam, shape, views)
+    if reference := _reference_of(verts_cam):
+        return reference.depths(verts_cam, shape, views)
+    return _depths(_maps(verts_cam, shape, views, Asked(False, True)), verts_cam)
 
 
 def look(
@@ -58,7 +102,10 @@ def look(
     depth: bool = True,
 ) -> tuple[Float[Tensor, "*starts items h w"], Depths | None]:
     """`silhouettes` and, where asked for, `depths`: both from one pass over the triangles."""
-    return _drawer(verts_cam).look(verts_cam, shape, views, depth)
+    if reference := _reference_of(verts_cam):
+        return reference.look(verts_cam, shape, views, depth)
+    maps = _maps(verts_cam, shape, views, Asked(True, depth))
+    return maps.image.to(verts_cam), _depths(maps, verts_cam) if depth else None
 
 
 def layers(
@@ -68,9 +115,26 @@ def layers(
 
     `exit` is the nearest back-facing surface. Where a body cuts into itself (a hand in the hip) the
     ray may still be inside another part there: the bound is conservative, never too deep.
-    Items are streamed, so memory does not grow with their number but for the result.
+    Items are streamed, so memory does not grow with their number but for the result. A call works
+    in one thread and leaves Python's lock to others.
     """
-    return _drawer(verts_cam).layers(verts_cam, faces, views)
+    if reference := _reference_of(verts_cam):
+        return reference.layers(verts_cam, faces, views)
+    wp = started()
+    items, n_verts, _ = verts_cam.shape
+    points = verts_cam.detach().float().contiguous()
+    front = points.new_zeros(items, views.height, views.width)
+    leave = torch.full_like(front, -0.0)  # whose inverse is what stands for no exit
+    if front.numel() * n_verts * len(faces) > 0:
+        window = wp.from_torch(_windows(views.K.to(points), 0), dtype=wp.vec4)
+        screen = wp.from_torch(torch.empty_like(points), dtype=wp.vec3)
+        table = wp.from_torch(faces.to(points.device).long().contiguous(), dtype=wp.vec3l)
+        maps = [wp.from_torch(front), wp.from_torch(leave)]
+        exits = kernels("exits", name_of(points.device))
+        verts = wp.from_torch(points, dtype=wp.vec3)
+        launch(exits.project, (items, n_verts), [verts, window, screen], points.device)
+        launch(exits.draw, (items, len(faces)), [screen, table, *maps], points.device)
+    return Layers(front.reciprocal_().to(verts_cam), leave.reciprocal_().to(verts_cam))
 
 
 def first_hit(
@@ -87,9 +151,75 @@ def first_hit(
         K: Intrinsics [px].
         size: Height and width [px].
     """
-    return _drawer(verts_cam).first_hit(verts_cam, faces, K, size)
+    if reference := _reference_of(verts_cam):
+        return reference.first_hit(verts_cam, faces, K, size)
+    depth = torch.full(size, torch.inf, device=verts_cam.device)
+    face = torch.full(size, -1, dtype=torch.int32, device=verts_cam.device)
+    if len(verts_cam):
+        shape = Topology(faces[None], faces.new_zeros(1, 0, 4))
+        draw.first_hit(
+            items_of(verts_cam.float()[None], shape, Crops(K[None], *size), border=0), depth, face
+        )
+    return depth.to(verts_cam), face.long()
 
 
-def _drawer(_verts_cam: Tensor) -> ModuleType:
-    """Who draws such vertices."""
-    return reference() or warp
+def _depths(maps: Maps, like: Tensor) -> Depths:
+    return Depths(maps.nearest.to(like), maps.farthest.to(like), maps.covered)
+
+
+def _maps(verts_cam: Tensor, shape: Topology, views: Crops, asked: Asked) -> Maps:
+    """Starts x items as one list, cut where it would be too long to count."""
+    *lead, n_verts, _ = verts_cam.shape
+    size = (*lead, views.height, views.width)
+    flat = verts_cam.float().reshape(-1, n_verts, 3)
+    if views.K.requires_grad:
+        raise ValueError("raster: the intrinsics have no gradient, found K that requires one")
+    if flat.numel() == 0:
+        nothing = flat.new_zeros(size)
+        return Maps(nothing, nothing, nothing, nothing.bool())
+    one = len(views.K)
+    most = MOST // max(views.height * views.width, n_verts)
+    parts = flat.split(max(one, most // one * one))
+    drawn = [_Look.apply(v, items_of(v, shape, views, BORDER), asked) for v in parts]
+    maps = (m[0] if len(m) == 1 else torch.cat(m) for m in zip(*drawn, strict=True))
+    return Maps(*(m.view(size) if m.numel() else m for m in maps))
+
+
+def items_of(verts: Tensor, shape: Topology, views: Crops, border: int) -> Items:
+    """The inputs as the kernels read them; `border` [px] lies around the windows."""
+    edges = shape.edges[:, : None if shape.faces.shape[1] else 0]
+    faces, edges = (t.to(verts.device, torch.int64).contiguous() for t in (shape.faces, edges))
+    windows = _windows(views.K.to(verts), border)
+    return Items(
+        verts.detach().contiguous(), windows, faces, edges, views.height, views.width, border
+    )
+
+
+def _windows(K: Tensor, border: int) -> Tensor:
+    """Focal lengths and principal points in windows with a border [px]."""
+    return torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2] + border, K[:, 1, 2] + border], -1)
+
+
+class _Look(torch.autograd.Function):
+    """Maps from vertices, and the gradient of the vertices from those of the maps."""
+
+    @staticmethod
+    def forward(ctx: Any, verts: Tensor, items: Items, asked: Asked) -> tuple[Tensor, ...]:  # noqa: ANN401
+        maps, ctx.trace = draw.look(items, asked)
+        ctx.items = items
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(maps.covered)
+        ctx.save_for_backward(verts, maps.nearest, maps.farthest, maps.covered)
+        return maps.image, maps.nearest, maps.farthest, maps.covered
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any,  # noqa: ANN401
+        *grads: Tensor | None,
+    ) -> tuple[Tensor | None, None, None]:
+        verts, nearest, farthest, covered = ctx.saved_tensors
+        given = Gradients(*(None if g is None else g.contiguous() for g in grads[:3]))
+        maps = Maps(nearest.new_zeros(0), nearest, farthest, covered)
+        pulled = draw.pull(ctx.items, maps, ctx.trace, given)
+        return pulled.view_as(verts), None, None

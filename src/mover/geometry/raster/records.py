@@ -98,6 +98,18 @@ class Maps:
 
 
 @dataclass(frozen=True)
+class Cuts:
+    """Where the outlines of some items are cut between pixel centres."""
+
+    group: range
+    """The items."""
+    table: Tensor
+    """4 numbers for each cut: see `kernels.scene`."""
+    targets: Tensor
+    """Pixel that each cut moves; negative where it has no gradient."""
+
+
+@dataclass(frozen=True)
 class Trace:
     """What the gradients need to know of a drawing."""
 
@@ -105,14 +117,7 @@ class Trace:
     """Face that is seen first (items, h, w); unset where not covered."""
     far_face: Tensor
     """Face that is seen last (items, h, w); unset where not covered."""
-    box: Tensor
-    """Rows and columns that each item may touch (items, 4); unset where nobody asks."""
-    cuts: Tensor
-    """Cuts of the outline, 4 numbers each: see `kernels.scene`."""
-    targets: Tensor
-    """Pixel that each cut moves; negative where it has no gradient."""
-    starts: Tensor
-    """First cut of each item, and the number of all."""
+    cuts: tuple[Cuts, ...]
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,12 @@ import warp as wp
 
 from mover.energy.fused.kernels.given import EDGES, FACES, VERTS, Given, Pose, Workspace
 from mover.geometry.camera import NEAR
-from mover.geometry.kernels.items import ROUNDING, SLACK
 from mover.geometry.kernels.spans import is_above, on_screen, side, signed_area
 
 FRONT, NEITHER, BACK = (wp.constant(wp.int8(k)) for k in (1, 0, -1))
 FAR = 1.0e30
+SLACK = 3.0  # [px] around an item that its outline may touch
+ROUNDING = 1e-6  # share of the largest column by which a cut can be off
 BYTE, ALL = wp.constant(wp.uint64(255)), wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 
 
@@ -26,7 +27,7 @@ class Extent:
     """Where an item is on the screen."""
 
     box: wp.vec4i
-    """Rows and columns that it may touch, as in `Maps.box`."""
+    """What it may touch: first row, row after the last, the same of columns, in the grid."""
     left: int
     """Its leftmost vertex, and so on; the first of equals."""
     top: int

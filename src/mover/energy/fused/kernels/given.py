@@ -57,7 +57,7 @@ class Windows:
     upper: wp.array(dtype=wp.float32)
     """Highest depth, with its slack [m]."""
     bounded: wp.array(dtype=wp.vec4i)
-    """Rows and columns in which depths are bounded, as in `Maps.box`."""
+    """Rows and columns in which depths are bounded, as in `cover.Extent`."""
     limit: float
     """Most that a depth can be out of its bounds [m]."""
     fewest: float
