@@ -179,51 +179,18 @@ def winding(verts: np.ndarray, faces: np.ndarray, shape: np.ndarray) -> np.ndarr
     Counts signed crossings along the y lines. Coordinates x and z are snapped to fixed point and
     the top-left rule decides ties, so that a line through a shared edge or vertex counts once.
     """
-    flat = np.rint(verts[:, [0, 2]] * SNAP).astype(np.int64)[faces]
-    area = _cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
-    flip = area < 0  # seen from below, a triangle that faces down winds counter-clockwise
-    flat[flip] = flat[flip][:, [0, 2, 1]]
-    heights = verts[:, 1][faces]
-    heights[flip] = heights[flip][:, [0, 2, 1]]
-    triangle, column = _pairs(flat, area != 0, shape)
-    covered, height = _crossings(flat[triangle], heights[triangle], column)
-    triangle, column = triangle[covered], column[covered]
-    first = np.clip(np.ceil(height), 0, shape[1]).astype(np.int64)
-    place = (column[:, 0] * (shape[1] + 1) + first) * shape[2] + column[:, 1]
-    steps = np.bincount(
-        place, np.sign(area[triangle]), minlength=int(shape[0] * (shape[1] + 1) * shape[2])
-    ).reshape(shape[0], shape[1] + 1, shape[2])
-    return np.cumsum(steps[:, :-1], axis=1).astype(np.int32)
+    from mover.geometry.kernels.bodies import Pair, Work
 
-
-def _pairs(flat: np.ndarray, keep: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles and the columns (x, z) that their boxes hold, as one ragged list of pairs."""
-    low = np.maximum(-(-flat.min(1) // SNAP), 0)
-    high = np.minimum(flat.max(1) // SNAP, shape[[0, 2]] - 1)
-    sides = np.where(keep[:, None], np.maximum(high - low + 1, 0), 0)
-    counts = sides.prod(-1)
-    triangle = np.repeat(np.arange(len(flat)), counts)
-    rank = np.arange(len(triangle)) - np.repeat(np.cumsum(counts) - counts, counts)
-    wide = sides[triangle, 1]
-    return triangle, low[triangle] + np.stack([rank // wide, rank % wide], -1)
-
-
-def _crossings(
-    corners: np.ndarray, heights: np.ndarray, column: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Whether each triangle holds its column, and at what height [cells] the ones that do."""
-    point = column * SNAP
-    covered = np.ones(len(column), dtype=bool)
-    weights = np.empty((len(column), 3), dtype=np.int64)
-    for k in range(3):
-        start = corners[:, (k + 1) % 3]
-        edge = corners[:, (k + 2) % 3] - start
-        weights[:, k] = _cross(edge, point - start)
-        owns = (edge[:, 1] < 0) | ((edge[:, 1] == 0) & (edge[:, 0] > 0))
-        covered &= (weights[:, k] > 0) | ((weights[:, k] == 0) & owns)
-    share = weights[covered] / weights[covered].sum(-1, keepdims=True)
-    return covered, (share * heights[covered]).sum(-1)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    wp, size, cross = started(), [int(n) for n in shape], kernels("bodies", "cpu").cross
+    steps = np.zeros((size[0], size[2], size[1] + 1), dtype=np.int32)
+    blocks = ((size[0] + 1) // 2) * ((size[2] + 1) // 2)
+    work = Work()
+    work.size = wp.vec3i(*size)
+    work.faces = wp.array(faces.astype(np.int32), dtype=wp.vec3i, device="cpu")
+    work.place = wp.array(verts, dtype=wp.vec3d, device="cpu")
+    lines = np.rint(verts[:, [0, 2]] * SNAP).astype(np.int64)
+    work.lines = wp.array(lines, dtype=Pair, device="cpu")
+    work.crossed = wp.zeros(blocks, dtype=wp.uint8, device="cpu")
+    work.steps = wp.array(steps.ravel(), dtype=wp.int32, device="cpu", copy=False)
+    wp.launch(cross, len(faces), [work], device="cpu")
+    return steps[..., :-1].cumsum(2, dtype=np.int32).swapaxes(1, 2)

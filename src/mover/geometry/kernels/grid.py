@@ -61,7 +61,7 @@ def triangle_of(scene: Scene, scratch: Scratch, at: wp.vec2i, face: wp.vec3l) ->
         scratch.screen[base + int(face[1])],
         scratch.screen[base + int(face[2])],
         face,
-        scene.height,
+        wp.vec4i(0, scene.height, 0, scene.width),
     )
 
 

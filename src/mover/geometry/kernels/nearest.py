@@ -69,15 +69,34 @@ def in_group(c: Cloud, q: Query, group: int, best: float, place: int) -> tuple[f
 
 @wp.func
 @no_type_check
+def nearest_group(c: Cloud, q: Query) -> int:
+    """The group whose box is nearest; the first of those equally near."""
+    first = int(0)
+    least = float(FAR)
+    for group in range(c.group_low.shape[1]):
+        d = to_box(q, c.group_low[q.item, group], c.group_high[q.item, group])
+        if d < least:
+            least = d
+            first = group
+    return first
+
+
+@wp.func
+@no_type_check
 def nearest_of(c: Cloud, q: Query, guess: int) -> int:
     """Where the nearest point is; the first of those equally near. Any guess gives the same."""
     best = FAR
     place = int(0)
+    first = int(-1)
     if guess >= 0:
         place = guess
         best = wp.length_sq(wp.cw_mul(c.points[q.item, guess], q.scale) - q.place)
+    else:
+        first = nearest_group(c, q)
+        best, place = in_group(c, q, first, FAR, 0)
     for group in range(c.group_low.shape[1]):
-        if to_box(q, c.group_low[q.item, group], c.group_high[q.item, group]) <= best * SLACK:
+        d = to_box(q, c.group_low[q.item, group], c.group_high[q.item, group])
+        if group != first and d <= best * SLACK:
             best, place = in_group(c, q, group, best, place)
     return place
 
@@ -98,16 +117,4 @@ def nearest(
     q.item = row % c.points.shape[0]
     q.place = query[row, column]
     q.scale = scale[row]
-    first = wp.int32(0)
-    least = wp.float32(FAR)
-    for group in range(c.group_low.shape[1]):
-        d = to_box(q, c.group_low[q.item, group], c.group_high[q.item, group])
-        if d < least:
-            least = d
-            first = group
-    best, place = in_group(c, q, first, FAR, 0)
-    for group in range(c.group_low.shape[1]):
-        d = to_box(q, c.group_low[q.item, group], c.group_high[q.item, group])
-        if group != first and d <= best * SLACK:
-            best, place = in_group(c, q, group, best, place)
-    found[row, column] = c.index[q.item, place]
+    found[row, column] = c.index[q.item, nearest_of(c, q, -1)]

@@ -47,7 +47,7 @@ class Triangle:
     first: int
     """First row."""
     last: int
-    """Last row; before the first where no row cuts the triangle."""
+    """Last row; before the first where nothing is drawn."""
 
 
 @wp.func
@@ -94,14 +94,24 @@ def is_above(a: wp.vec3, b: wp.vec3, i: wp.int64, j: wp.int64) -> bool:
 
 @wp.func
 @no_type_check
-def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, face: wp.vec3l, height: int) -> Triangle:
-    """Sort the vertices from the top and find the rows."""
+def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, face: wp.vec3l, box: wp.vec4i) -> Triangle:
+    """Sort the vertices from the top and find the rows.
+
+    Most triangles of a body are smaller than a pixel: these are left before anything is set up.
+
+    Args:
+        a: The first vertex on the screen.
+        b: The second.
+        c: The third.
+        face: Their numbers.
+        box: What is drawn: first row, row after the last, the same of columns.
+    """
     t = Triangle()
-    t.first = int(wp.max(wp.ceil(wp.min(a[1], wp.min(b[1], c[1])) - 0.5), 0.0))
-    t.last = int(wp.min(wp.floor(wp.max(a[1], wp.max(b[1], c[1])) - 0.5), float(height - 1)))
-    left = wp.min(a[0], wp.min(b[0], c[0])) - SLACK
-    right = wp.max(a[0], wp.max(b[0], c[0])) + SLACK
-    if t.first > t.last or wp.ceil(left - 0.5) > wp.floor(right - 0.5):
+    t.first = int(wp.max(wp.ceil(wp.min(a[1], wp.min(b[1], c[1])) - 0.5), float(box[0])))
+    t.last = int(wp.min(wp.floor(wp.max(a[1], wp.max(b[1], c[1])) - 0.5), float(box[1] - 1)))
+    left = wp.ceil(wp.min(a[0], wp.min(b[0], c[0])) - SLACK - 0.5)
+    right = wp.floor(wp.max(a[0], wp.max(b[0], c[0])) + SLACK - 0.5)
+    if t.first > t.last or wp.max(left, float(box[2])) > wp.min(right, float(box[3] - 1)):
         t.last = t.first - 1
         return t
     ab = is_above(a, b, face[0], face[1])
@@ -117,68 +127,67 @@ def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, face: wp.vec3l, height: int) ->
     return t
 
 
+@wp.struct
+@no_type_check
+class Run:
+    """What a row cuts out of a triangle."""
+
+    first: int
+    """First column."""
+    count: int
+    """Number of columns."""
+    q: float
+    """Inverse depth at the first pixel [1/m]."""
+    step: float
+    """Its change from one pixel to the next [1/m]."""
+
+
 @wp.func
 @no_type_check
-def fill(
-    keys: wp.array(dtype=wp.uint64), first: int, count: int, q: float, step: float, tag: int
-) -> None:
-    """Raise the keys of a run of pixels; `tag` as for `draw_row`.
+def run_of(t: Triangle, row: int, left: int, right: int) -> Run:
+    """The pixels of a row that cuts the triangle, from column `left` to before `right`."""
+    y = float(row) + 0.5
+    other = t.upper
+    if y >= t.kink:
+        other = t.lower
+    x = t.across.x + (y - t.across.y) * t.across.x_step
+    x2 = other.x + (y - other.y) * other.x_step
+    low = wp.where(x < x2, x, x2) - 0.5
+    high = wp.where(x < x2, x2, x) - 0.5
+    start = float(left)
+    end = float(right)
+    r = Run()
+    r.first = int(wp.ceil(wp.where(low > start, wp.where(low < end, low, end), start)))
+    last = wp.where(high > start - 1.0, wp.where(high < end, high, end - 1.0), start - 1.0)
+    r.count = int(wp.floor(last)) - r.first + 1
+    if r.count > 0:
+        q = t.across.q + (y - t.across.y) * t.across.q_step
+        q2 = other.q + (y - other.y) * other.q_step
+        span = x2 - x
+        r.step = (q2 - q) * span / wp.max(span * span, TINY)
+        r.q = q + (float(r.first) + 0.5 - x) * r.step
+    return r
+
+
+@wp.func
+@no_type_check
+def fill(keys: wp.array(dtype=wp.uint64), start: int, r: Run, tag: int) -> None:
+    """Raise the keys of a run: where its key is greater than the pixel's it wins.
 
     Args:
         keys: Winner of each pixel.
-        first: First pixel.
-        count: Number of pixels.
-        q: Inverse depth at the first pixel [1/m].
-        step: Its change from one pixel to the next [1/m].
-        tag: Face and order.
+        start: First pixel of the row in `keys`.
+        r: The run.
+        tag: Face + 1 where the nearest run wins, or less than zero where the farthest does.
     """
     flip = wp.where(tag > 0, wp.uint32(0), FULL)
     face = wp.uint64(wp.abs(tag))
     i = int(0)
-    while i < count:
-        at = q + float(i) * step
+    while i < r.count:
+        at = r.q + float(i) * r.step
         bits = wp.cast(wp.where(at > TINY, at, TINY), wp.uint32) ^ flip
-        wp.atomic_max(keys, first + i, (wp.uint64(bits) << HALF) | face)
+        wp.atomic_max(keys, start + r.first + i, (wp.uint64(bits) << HALF) | face)
         i += 1
-
-
-@wp.func
-@no_type_check
-def draw_row(
-    t: Triangle, row: int, start: int, width: int, keys: wp.array(dtype=wp.uint64), tag: int
-) -> None:
-    """Write the run of one row: where its key is greater than the pixel's it wins.
-
-    Args:
-        t: A triangle that the row cuts.
-        row: Row of the grid.
-        start: First pixel of the row in `keys`.
-        width: Columns of the grid.
-        keys: Winner of each pixel.
-        tag: Face + 1 where the nearest run wins, or less than zero where the farthest does.
-    """
-    y = float(row) + 0.5
-    down = y - t.across.y
-    other = y - t.upper.y
-    x = t.across.x + down * t.across.x_step
-    x2 = t.upper.x + other * t.upper.x_step
-    if y >= t.kink:
-        other = y - t.lower.y
-        x2 = t.lower.x + other * t.lower.x_step
-    low = wp.where(x < x2, x, x2) - 0.5
-    high = wp.where(x < x2, x2, x) - 0.5
-    wide = float(width)
-    first = int(wp.ceil(wp.where(low > 0.0, wp.where(low < wide, low, wide), 0.0)))
-    last = int(wp.floor(wp.where(high > -1.0, wp.where(high < wide, high, wide - 1.0), -1.0)))
-    if first <= last:
-        q = t.across.q + down * t.across.q_step
-        q2 = t.upper.q + other * t.upper.q_step
-        if y >= t.kink:
-            q2 = t.lower.q + other * t.lower.q_step
-        span = x2 - x
-        step = (q2 - q) * span / wp.max(span * span, TINY)
-        q = q + (float(first) + 0.5 - x) * step
-        fill(keys, start + first, last - first + 1, q, step, tag)
 
 
 @wp.func
@@ -194,7 +203,8 @@ def paint(scene: Scene, scratch: Scratch, t: Triangle, place: wp.vec3i, near: bo
         near: Draw to `near`, where the nearest wins, else to `far`, where the farthest does.
     """
     start = (place[0] * scene.height + place[1]) * scene.width
+    r = run_of(t, place[1], 0, scene.width)
     if near:
-        draw_row(t, place[1], start, scene.width, scratch.near, place[2] + 1)
+        fill(scratch.near, start, r, place[2] + 1)
     else:
-        draw_row(t, place[1], start, scene.width, scratch.far, -place[2] - 1)
+        fill(scratch.far, start, r, -place[2] - 1)

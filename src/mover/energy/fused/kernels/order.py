@@ -7,82 +7,10 @@ import warp as wp
 
 from mover.energy.fused.kernels.cover import FRONT, is_marked
 from mover.energy.fused.kernels.given import FACES, Given, Pose, Slope, Workspace, slope_of
-from mover.geometry.kernels.spans import HALF, SLACK, TINY, Side, is_above, side
+from mover.geometry.kernels.spans import fill, run_of, triangle
 from mover.geometry.kernels.surface import AGREE, GRAZING, face_of, inverse_depth
 
 UNKNOWN = 1.0e29  # [m], a lower bound above it stands for a pixel that has none
-
-
-@wp.struct
-@no_type_check
-class Run:
-    """What is drawn of a face: its front edge, where, and how."""
-
-    across: Side
-    """From the top to the bottom."""
-    box: wp.vec4i
-    """Rows and columns in which something is drawn."""
-    width: int
-    """Columns of the grid."""
-    face: int
-
-
-@wp.func
-@no_type_check
-def draw_row(r: Run, s: Side, row: int, keys: wp.array(dtype=wp.uint64)) -> None:
-    """Where the face is nearer than what was drawn, between two sides, it is seen."""
-    y = float(row) + 0.5
-    down = y - r.across.y
-    other = y - s.y
-    x = r.across.x + down * r.across.x_step
-    x2 = s.x + other * s.x_step
-    left = float(r.box[2])
-    right = float(r.box[3] - 1)
-    column = int(wp.ceil(wp.clamp(wp.min(x, x2) - 0.5, left, right + 1.0)))
-    last = int(wp.floor(wp.clamp(wp.max(x, x2) - 0.5, left - 1.0, right)))
-    if column <= last:
-        q = r.across.q + down * r.across.q_step
-        span = x2 - x
-        step = (s.q + other * s.q_step - q) * span / wp.max(span * span, TINY)
-        q = q + (float(column) + 0.5 - x) * step
-        at = row * r.width + column
-        for k in range(last - column + 1):
-            bits = wp.cast(wp.max(q + float(k) * step, TINY), wp.uint32)
-            code = (wp.uint64(bits) << HALF) | wp.uint64(r.face + 1)
-            if code > keys[at + k]:
-                keys[at + k] = code
-
-
-@wp.func
-@no_type_check
-def draw_face(work: Workspace, corner: wp.vec3i, r: Run) -> None:
-    """Draw the rows of a face that lie in the box."""
-    a = work.scratch.screen[corner[0]]
-    b = work.scratch.screen[corner[1]]
-    c = work.scratch.screen[corner[2]]
-    row = int(wp.max(wp.ceil(wp.min(a[1], wp.min(b[1], c[1])) - 0.5), float(r.box[0])))
-    last = int(wp.min(wp.floor(wp.max(a[1], wp.max(b[1], c[1])) - 0.5), float(r.box[1] - 1)))
-    left = wp.max(wp.ceil(wp.min(a[0], wp.min(b[0], c[0])) - SLACK - 0.5), float(r.box[2]))
-    right = wp.min(wp.floor(wp.max(a[0], wp.max(b[0], c[0])) + SLACK - 0.5), float(r.box[3] - 1))
-    if row > last or left > right:
-        return
-    ab = is_above(a, b, wp.int64(corner[0]), wp.int64(corner[1]))
-    bc = is_above(b, c, wp.int64(corner[1]), wp.int64(corner[2]))
-    ca = is_above(c, a, wp.int64(corner[2]), wp.int64(corner[0]))
-    top = wp.where(ab, wp.where(ca, c, a), wp.where(bc, b, c))
-    low = wp.where(ab, wp.where(bc, c, b), wp.where(ca, a, c))
-    mid = wp.where(ab == bc, b, wp.where(ab == ca, a, c))
-    r.across = side(top, low)
-    if float(row) + 0.5 < mid[1]:
-        upper = side(top, mid)
-        while row <= last and float(row) + 0.5 < mid[1]:
-            draw_row(r, upper, row, work.scratch.near)
-            row += 1
-    if row <= last:
-        lower = side(mid, low)
-        while row <= last:
-            draw_row(r, lower, row, work.scratch.near)
-            row += 1
 
 
 @wp.func
@@ -90,13 +18,17 @@ def draw_face(work: Workspace, corner: wp.vec3i, r: Run) -> None:
 def draw_fronts(given: Given, work: Workspace, p: Pose, box: wp.vec4i) -> None:
     """Draw the fronts in a box."""
     first = given.things.starts[p.thing, FACES]
-    r = Run()
-    r.box = box
-    r.width = work.scene.width
     for f in range(given.things.starts[p.thing + 1, FACES] - first):
         if work.scratch.front[f] == FRONT:
-            r.face = f
-            draw_face(work, given.things.faces[first + f], r)
+            face = given.things.faces[first + f]
+            a = work.scratch.screen[face[0]]
+            b = work.scratch.screen[face[1]]
+            c = work.scratch.screen[face[2]]
+            wide = wp.vec3l(wp.int64(face[0]), wp.int64(face[1]), wp.int64(face[2]))
+            t = triangle(a, b, c, wide, box)
+            for row in range(t.first, t.last + 1):
+                r = run_of(t, row, box[2], box[3])
+                fill(work.scratch.near, row * work.scene.width, r, f + 1)
 
 
 @wp.func
