@@ -14,6 +14,7 @@ from mover.core.errors import InputError
 from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle
 from mover.io.files.fields import At, array, choice, get, maybe, reason, refuse
+from mover.io.people.values import vectors
 
 NEEDED = ("betas", "global_orient", "body_pose", "transl")
 HANDS = ("left_hand_pose", "right_hand_pose", "flat_hand_mean")
@@ -24,6 +25,7 @@ ANGLES = (63, 69)  # of SMPL-X and SMPL-H, of SMPL
 SAME = 0.01  # [m], a model that comes so close gives the same meshes
 LOOKED_AT = 64  # so many rows are compared, spread over the video
 CHUNK = 128  # rows posed at once
+NO_TURN = 1e-6
 
 
 def pose_of(at: At, rows: int) -> BodyPose | None:
@@ -70,27 +72,6 @@ def _rows(at: At, rows: int) -> Float[Tensor, "bodies values"]:
     return _tensor(array(at, (rows, *("N" * axes)))).flatten(1)
 
 
-def _rows_of(pose: BodyPose, index: Int[Tensor, " rows"]) -> BodyPose:
-    """Some rows of a pose."""
-    names = ("betas", "global_orient", "body_pose", "transl")
-    extra = {key: value[index] for key, value in pose.extra.items()}
-    return dataclasses.replace(
-        pose, extra=extra, **{name: getattr(pose, name)[index] for name in names}
-    )
-
-
-def _run(
-    model: BodyModel, pose: BodyPose
-) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
-    """Pose a model row by row in chunks, to bound the memory."""
-    with torch.no_grad():
-        parts = [
-            model.posed(_rows_of(pose, index))
-            for index in torch.arange(len(pose.transl)).split(CHUNK)
-        ]
-    return torch.cat([verts for verts, _ in parts]), torch.cat([joints for _, joints in parts])
-
-
 def posed(
     pose: BodyPose, at: At
 ) -> tuple[
@@ -106,7 +87,7 @@ def posed(
     """
     try:
         model = load_model(pose.model, pose.gender)
-        verts, joints = _run(model, pose)
+        verts, joints = run_model(model, pose)
     except (InputError, ValueError, RuntimeError, KeyError, OSError) as error:
         message = f"{str(pose.model)!r}, which gives no meshes ({reason(error)})"
         refuse(
@@ -121,7 +102,7 @@ def reproduces(pose: BodyPose, verts: Float[Tensor, "bodies verts 3"], at: At) -
         model = load_model(pose.model, pose.gender)
         count = min(LOOKED_AT, len(verts))
         index = torch.linspace(0, len(verts) - 1, count).round().long()
-        found, _ = _run(model, _rows_of(pose, index))
+        found, _ = run_model(model, chosen_pose(pose, index))
     except (InputError, ValueError, RuntimeError, KeyError, OSError) as error:
         return f"the parameters of '{pose.model}' cannot be used ({reason(error)})"
     if found.shape[1] != verts.shape[1]:
@@ -138,23 +119,11 @@ def into_camera(bodies: Bodies, R_cam_world: Float[Tensor, "3 3"]) -> Bodies:
         return bodies
     R = R_cam_world.to(bodies.verts)
     joints = None if bodies.joints is None else bodies.joints @ R.mT
-    pose = None if bodies.pose is None else _turned(bodies.pose, R)
+    pose = bodies.pose
+    if pose is not None:
+        pose = moved(pose, R.expand(len(pose.transl), 3, 3), torch.zeros_like(pose.transl))
     return dataclasses.replace(
         bodies, verts=bodies.verts @ R.mT, joints=joints, pose=pose, space="camera"
-    )
-
-
-def _turned(pose: BodyPose, R: Float[Tensor, "3 3"]) -> BodyPose:
-    """The parameters of the turned body: its root turns about the pelvis, not about the origin."""
-    from scipy.spatial.transform import Rotation
-
-    _, joints = _run(load_model(pose.model, pose.gender), pose)
-    pelvis = joints[:, 0] - pose.transl
-    turned = (R @ axis_angle(pose.global_orient)).double().numpy()
-    vectors = torch.from_numpy(Rotation.from_matrix(turned).as_rotvec())
-    transl = joints[:, 0] @ R.mT - pelvis
-    return dataclasses.replace(
-        pose, global_orient=vectors.to(pose.global_orient), transl=transl.to(pose.transl)
     )
 
 
@@ -163,3 +132,47 @@ def pose_to_arrays(pose: BodyPose) -> dict[str, NDArray[Any]]:
     tensors = {key: getattr(pose, key) for key in NEEDED} | pose.extra
     words = {"model": np.array(pose.model), "gender": np.array(pose.gender)}
     return words | {key: value.detach().cpu().numpy() for key, value in tensors.items()}
+
+
+# Parameters of bodies: posed, and moved as rigid bodies, whose root turns about the pelvis.
+
+
+def chosen_pose(pose: BodyPose, index: Int[Tensor, " rows"]) -> BodyPose:
+    """Some rows of parameters."""
+    extra = {name: value[index] for name, value in pose.extra.items()}
+    return dataclasses.replace(
+        pose, extra=extra, **{name: getattr(pose, name)[index] for name in NEEDED}
+    )
+
+
+def run_model(
+    model: BodyModel, pose: BodyPose
+) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+    """Vertices and joints, some rows at a time to bound the memory [m]."""
+    with torch.no_grad():
+        parts = [
+            model.posed(chosen_pose(pose, index))
+            for index in torch.arange(len(pose.transl)).split(CHUNK)
+        ]
+    return torch.cat([verts for verts, _ in parts]), torch.cat([joints for _, joints in parts])
+
+
+def rest_pelvis(model: BodyModel, pose: BodyPose) -> Float[Tensor, "bodies 3"]:
+    """From `transl` to the pelvis, about which the root turns [m]."""
+    zero = torch.zeros_like(pose.transl)
+    return run_model(model, dataclasses.replace(pose, transl=zero, global_orient=zero))[1][:, 0]
+
+
+def moved(pose: BodyPose, R: Float[Tensor, "bodies 3 3"], t: Float[Tensor, "bodies 3"]) -> BodyPose:
+    """The parameters of the bodies x' = R x + t; NaN stays NaN.
+
+    Raises:
+        InputError: If the body turns and its model, which knows the pelvis, is not at hand.
+    """
+    if (R - torch.eye(3).to(R)).abs().nan_to_num(0).amax() < NO_TURN:
+        return dataclasses.replace(pose, transl=pose.transl + t)
+    offset = rest_pelvis(load_model(pose.model, pose.gender), pose)
+    place = (R @ (offset + pose.transl)[..., None])[..., 0] + t - offset
+    whole = (R.double() @ axis_angle(pose.global_orient.double())).numpy()
+    root = torch.from_numpy(vectors(whole, At(whole, "the camera"))).to(pose.global_orient)
+    return dataclasses.replace(pose, transl=place, global_orient=root)

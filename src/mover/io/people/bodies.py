@@ -13,11 +13,11 @@ from mover.core.errors import InputError
 from mover.core.records import record
 from mover.core.types import Bodies, BodyPose, Camera, Mesh
 from mover.geometry.camera import pitch_roll
-from mover.io.capture.pose_file import into_camera
+from mover.io.capture.pose_file import into_camera, rest_pelvis, run_model
 from mover.io.files.fields import LARGEST, At, listed
 from mover.io.files.meshes import read_mesh
 from mover.io.formats import chosen as format_of
-from mover.io.people.found import Found, Known, chosen, rest_pelvis, run_model
+from mover.io.people.found import Found, Known, chosen
 from mover.io.people.lens import TURNED, differs, level, mean_up, refocused
 
 SAME = 0.01  # [m], parameters that miss the tool's own vertices by more are left out

@@ -1,21 +1,20 @@
 """What the user knows, and what a tool found: rows of bodies before anything is settled."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.bodies import BodyModel, load_model
 from mover.core.errors import InputError
 from mover.core.records import record
 from mover.core.types import BodyPose, Camera
-from mover.geometry.rotations import axis_angle
-from mover.io.files.fields import At
-from mover.io.people.values import Numbers, tensor, vectors
+from mover.io.capture.pose_file import chosen_pose, moved
+from mover.io.people.values import Numbers, tensor
 
 
 @dataclass(frozen=True)
@@ -72,6 +71,37 @@ def pose_of(
     return BodyPose(model, gender or "neutral", shape, root, body, place, {})
 
 
+def people_rows(
+    known: Known,
+    model: str,
+    frame: Int[Tensor, " bodies"],
+    person: int | Int[Tensor, " bodies"],
+    told: tuple[Numbers, Numbers, Numbers | None],
+    extra: Mapping[str, Tensor] | None = None,
+    **more: Any,  # noqa: ANN401
+) -> Found:
+    """Rows of a body model.
+
+    Args:
+        known: What the user knows.
+        model: Whose parameters.
+        frame: Of each row.
+        person: Of each row, or of all.
+        told: Angles, shape and place as `pose_of` takes them.
+        extra: Hands, jaw, expression.
+        more: Further fields of the rows.
+    """
+    who = torch.full_like(frame, person) if isinstance(person, int) else person
+    pose = dataclasses.replace(pose_of(model, known.gender, *told), extra=dict(extra or {}))
+    return Found(model, frame, who, pose, **more)
+
+
+def shifted(found: Found, R: Float[Tensor, "bodies 3 3"], t: Float[Tensor, "bodies 3"]) -> Found:
+    """Rows whose parameters are those of the bodies R x + t."""
+    assert found.pose is not None
+    return dataclasses.replace(found, pose=moved(found.pose, R, t))
+
+
 def joined(parts: Sequence[Found]) -> Found:
     """Rows of several people or frames together; all are of one tool.
 
@@ -118,60 +148,5 @@ def chosen(found: Found, index: Int[Tensor, " rows"]) -> Found:
     return dataclasses.replace(found, **picked, pose=pose)
 
 
-def chosen_pose(pose: BodyPose, index: Int[Tensor, " rows"]) -> BodyPose:
-    """Some rows of parameters."""
-    extra = {name: value[index] for name, value in pose.extra.items()}
-    values = {name: getattr(pose, name)[index] for name in ("betas", *_POSE)}
-    return dataclasses.replace(pose, **values, extra=extra)
-
-
 _TENSORS = ("frame", "person", "verts", "joints", "pelvis", "K", "up")
 _POSE = ("global_orient", "body_pose", "transl")
-
-
-# Parameters of bodies: posed, and moved as rigid bodies, whose root turns about the pelvis.
-
-
-NO_TURN = 1e-6
-CHUNK = 128  # rows posed at once
-
-
-def run_model(
-    model: BodyModel, pose: BodyPose
-) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
-    """Vertices and joints, some rows at a time to bound the memory [m]."""
-    with torch.no_grad():
-        parts = [
-            model.posed(chosen_pose(pose, index))
-            for index in torch.arange(len(pose.transl)).split(CHUNK)
-        ]
-    return torch.cat([verts for verts, _ in parts]), torch.cat([joints for _, joints in parts])
-
-
-def rest_pelvis(model: BodyModel, pose: BodyPose) -> Float[Tensor, "bodies 3"]:
-    """From `transl` to the pelvis, about which the root turns [m]."""
-    straight = dataclasses.replace(
-        pose,
-        transl=torch.zeros_like(pose.transl),
-        global_orient=torch.zeros_like(pose.global_orient),
-    )
-    return run_model(model, straight)[1][:, 0]
-
-
-def moved(pose: BodyPose, R: Float[Tensor, "bodies 3 3"], t: Float[Tensor, "bodies 3"]) -> BodyPose:
-    """The parameters of the bodies x' = R x + t.
-
-    Raises:
-        InputError: If the body turns and its model, which knows the pelvis, is not at hand.
-    """
-    if (R - torch.eye(3).to(R)).abs().nan_to_num(0).amax() < NO_TURN:
-        return dataclasses.replace(pose, transl=pose.transl + t)
-    offset = rest_pelvis(load_model(pose.model, pose.gender), pose)
-    place = (R @ (offset + pose.transl)[..., None])[..., 0] + t - offset
-    return dataclasses.replace(pose, transl=place, global_orient=turned(pose.global_orient, R))
-
-
-def turned(root: Float[Tensor, "bodies 3"], R: Float[Tensor, "bodies 3 3"]) -> Tensor:
-    """Axis-angle vectors of roots that are turned by R; NaN stays NaN [rad]."""
-    whole = (R.double() @ axis_angle(root.double())).numpy()
-    return torch.from_numpy(vectors(whole, At(whole, "the camera"))).to(root)

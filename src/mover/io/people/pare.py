@@ -13,7 +13,7 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.types import Camera
 from mover.io.files.fields import At
-from mover.io.people.found import Found, Known, joined, pose_of
+from mover.io.people.found import Found, Known, joined, people_rows
 from mover.io.people.lens import from_crop, from_image, from_pixels
 from mover.io.people.tracks import people_of
 from mover.io.people.values import (
@@ -69,13 +69,8 @@ def _rows(at: At, frame: Tensor, person: Tensor, known: Known) -> Found:
     betas = rows(need(at, "betas", "pred_shape"), count, 10)
     place = _places(at, count, known.camera)
     verts = meshes(either(at, "verts", "smpl_vertices"), VERTS, count)
-    return Found(
-        model="smpl",
-        frame=frame,
-        person=person,
-        pose=pose_of("smpl", known.gender, whole, betas, place),
-        verts=None if verts is None else verts + place[:, None],
-    )
+    placed = None if verts is None else verts + place[:, None]
+    return people_rows(known, "smpl", frame, person, (whole, betas, place), verts=placed)
 
 
 def _places(at: At, count: int, camera: Camera) -> Float[Tensor, "bodies 3"]:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.types import BodyPose
 from mover.io.files.fields import At, items, mapping
-from mover.io.people.found import Found, Known, joined, pose_of
+from mover.io.people.found import Found, Known, joined, people_rows
 from mover.io.people.lens import assumed_lens, lens
 from mover.io.people.values import (
+    Numbers,
     angles,
     either,
     natural,
@@ -66,13 +66,7 @@ def _frame(at: At, index: int, known: Known) -> list[Found]:
     number = torch.tensor([frame if frame >= 0 else index])
     sizes = either(at, "size")
     return [
-        Found(
-            model="smpl",
-            frame=number,
-            person=torch.tensor([int(tid)]),
-            pose=_pose(body, camera, known),
-            K=_lens(sizes, k, known),
-        )
+        people_rows(known, "smpl", number, int(tid), _told(body, camera), K=_lens(sizes, k, known))
         for k, (tid, body, camera) in enumerate(zip(tids, bodies, cameras, strict=True))
         if seen[k]
     ]
@@ -94,13 +88,11 @@ def _list(at: At) -> At:
     return At(value, at.file, at.field)
 
 
-def _pose(body: At, camera: At, known: Known) -> BodyPose:
+def _told(body: At, camera: At) -> tuple[Numbers, Numbers, Numbers]:
+    """Angles, shape and place of one person."""
     root = angles(need(body, "global_orient"), 1, 1)
-    turns = angles(need(body, "body_pose"), 1, 23)
-    whole = np.concatenate([root, turns], 1)
-    return pose_of(
-        "smpl", known.gender, whole, rows(need(body, "betas"), 1, 10), rows(camera, 1, 3)
-    )
+    whole = np.concatenate([root, angles(need(body, "body_pose"), 1, 23)], 1)
+    return whole, rows(need(body, "betas"), 1, 10), rows(camera, 1, 3)
 
 
 def _lens(sizes: At | None, row: int, known: Known) -> Tensor | None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.io.files.fields import At, refuse
-from mover.io.people.found import Found, Known, chosen, joined, moved, pose_of
+from mover.io.people.found import Found, Known, chosen, joined, people_rows, shifted
 from mover.io.people.lens import movement
 from mover.io.people.tracks import people_of
 from mover.io.people.values import (
@@ -87,17 +87,13 @@ def _person(at: At, who: int, shape: tuple[int, int], known: Known) -> Found:
     betas = numbers(need(at, "betas"))
     shapes = betas.size if betas.ndim < 2 else betas.shape[-1]
     whole = torch.cat([told("root_orient", 3), told("pose_body", 63)], 1)
-    pose = pose_of("smplh", known.gender, whole, told("betas", shapes), told("trans", 3))
     R, t = told("cam_R", 9).reshape(-1, 3, 3), told("cam_t", 3)
-    return Found(
-        model="smplh",
-        frame=torch.arange(shape[1]),
-        person=torch.full((shape[1],), who),
-        pose=moved(pose, R, t),
-        K=_lens(at, shape[1]),
-        up=(R @ _up(at, who)[:, None])[..., 0],
-        warnings=movement(R, t),
-    )
+    rows = whole, told("betas", shapes), told("trans", 3)
+    found = people_rows(
+        known, "smplh", torch.arange(shape[1]), who, rows,
+        K=_lens(at, shape[1]), up=(R @ _up(at, who)[:, None])[..., 0], warnings=movement(R, t),
+    )  # fmt: skip
+    return shifted(found, R, t)
 
 
 def _up(at: At, who: int) -> Tensor:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mover.io.files.fields import At, refuse
-from mover.io.people.found import Found, Known, joined, moved, pose_of
+from mover.io.people.found import Found, Known, joined, people_rows, shifted
 from mover.io.people.lens import assumed_lens
 from mover.io.people.values import either, files_of, need, number_in, read_any, rows, tensor, wide
 
@@ -85,24 +85,18 @@ def _rows(at: At, frame: int, person: int, known: Known, assumed: bool) -> Found
     if place is None:
         shift = need(at, "camera_translation", "transl")
     zero = torch.zeros(count, 3)
-    pose = pose_of(
-        "smplx",
-        known.gender or _gender(at),
-        torch.cat([root, _body(need(at, "body_pose"), count)], 1),
-        wide(need(at, "betas"), count),
-        zero if place is None else rows(place, count, 3),
-    )
+    whole = torch.cat([root, _body(need(at, "body_pose"), count)], 1)
+    told = whole, wide(need(at, "betas"), count), zero if place is None else rows(place, count, 3)
     extra = {n: tensor(wide(v, count)) for n in EXTRA if (v := either(at, n)) is not None}
     flat = np.eye(3).reshape(1, 9).repeat(count, 0) if turn is None else rows(turn, count, 9)
     R = tensor(flat).reshape(-1, 3, 3)
     t = zero if shift is None else tensor(rows(shift, count, 3))
-    return Found(
-        model="smplx",
-        frame=torch.arange(frame, frame + count),
-        person=torch.full((count,), person),
-        pose=moved(dataclasses.replace(pose, extra=extra), R, t),
+    known = dataclasses.replace(known, gender=known.gender or _gender(at))
+    found = people_rows(
+        known, "smplx", torch.arange(frame, frame + count), person, told, extra,
         K=assumed_lens(known, FOCAL, count) if assumed else None,
-    )
+    )  # fmt: skip
+    return shifted(found, R, t)
 
 
 def _body(at: At, count: int) -> Tensor:
