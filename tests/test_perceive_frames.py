@@ -12,8 +12,8 @@ from PIL import Image
 
 from mover.core.errors import InputError
 from mover.core.run import Run
-from mover.perceive.capture import exif_focal, lens_of, perceive
-from mover.perceive.config import CleanConfig, FramesConfig, Lens, PerceiveConfig, SteadyConfig
+from mover.perceive.capture import Video, exif_focal, lens_of, perceive
+from mover.perceive.config import CleanConfig, FramesConfig, PerceiveConfig, SteadyConfig
 from mover.perceive.reference import clean_picture, spread_frames
 from mover.perceive.steady import (
     SteadyInputs,
@@ -151,7 +151,7 @@ def test_without_opencv_one_sentence_comes_before_any_work(
     monkeypatch.setitem(sys.modules, "cv2", None)
     run = Run(tmp_path / "out" / "perceived")
     with pytest.raises(InputError, match=r"needs OpenCV: pip install '\.\[perceive\]'"):
-        perceive(tmp_path, tmp_path / "out", Lens(), PerceiveConfig(), run, print)
+        perceive(Video(tmp_path), tmp_path / "out", PerceiveConfig(), run, print)
     assert not any(tmp_path.rglob("*.jpg"))
 
 

@@ -160,7 +160,7 @@ def test_numbers_of_people_go_on_from_segment_to_segment(models: ModelsConfig, t
     for segment in (2, 3, 50):
         track = type(config.track)(models, segment=segment, present=-1e9, least=0.0)
         run = Run(tmp_path / f"r{segment}")
-        tracks = people_of_clip(clip, loose, PerceiveConfig(models=models, track=track), run)
+        tracks = people_of_clip(clip, (loose, PerceiveConfig(models=models, track=track)), run)
         pairs = list(zip(tracks.frame.tolist(), tracks.person.tolist(), strict=True))
         assert len(set(pairs)) == len(pairs)
         assert sorted(set(tracks.frame.tolist())) == list(range(FRAMES))

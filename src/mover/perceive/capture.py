@@ -9,7 +9,7 @@ CAPTURE/reference.png, objects.json, people.json, keypoints.npz, camera.json, sc
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,10 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from mover.core.errors import InputError
+from mover.core.observe import Observer
 from mover.core.records import fingerprint
 from mover.core.run import Run
-from mover.core.types import Camera, People
+from mover.core.types import Camera, Keypoints, People
 from mover.geometry.rle import decode, joined
 from mover.io.capture.camera_file import camera_of, camera_to_json
 from mover.io.capture.folder import folder_parts
@@ -31,12 +32,26 @@ from mover.io.files.cameras import of_view, read_camera_file
 from mover.io.files.fields import At, maybe, number, write_json
 from mover.io.files.images import write_image
 from mover.io.people.keypoints import write_keypoints
-from mover.perceive.config import DetectConfig, JointsConfig, Lens, PerceiveConfig
+from mover.perceive.config import DetectConfig, JointsConfig, Lens, PerceiveConfig, TrackConfig
 from mover.perceive.depth_map import read_depth
-from mover.perceive.detect import DetectInputs, find_instances, joined_finds, people_in
+from mover.perceive.detect import DetectInputs, Finds, find_instances, joined_finds, people_in
 from mover.perceive.layout import FirstScene, Picture
-from mover.perceive.reference import Clean, detections_in, furniture_of, hidden_mask, reference_of
-from mover.perceive.steady import Drift, SteadyInputs, find_drift, opencv, steady_frames, warning_of
+from mover.perceive.reference import (
+    Clean,
+    clip_of_clean,
+    detections_in,
+    hidden_mask,
+    reference_of,
+)
+from mover.perceive.steady import (
+    Drift,
+    SteadyInputs,
+    cut_warning,
+    find_drift,
+    opencv,
+    steady_frames,
+    warning_of,
+)
 from mover.perceive.track import (
     JointsInputs,
     SegmentInputs,
@@ -56,8 +71,34 @@ EXIF_IFD, FOCAL_35 = 0x8769, 0xA405
 Say = Callable[[str], None]
 
 
+@dataclass(frozen=True)
+class Finders:
+    """Stages that look at pictures: the networks, or what stands for them."""
+
+    instances: Callable[[DetectInputs, DetectConfig, Observer], Finds] = find_instances
+    tracks: Callable[[SegmentInputs, TrackConfig, Observer], Tracks] = track_people
+    joints: Callable[[JointsInputs, JointsConfig, Observer], Keypoints] = find_joints
+
+
+NETWORKS = Finders()
+
+
+@dataclass(frozen=True)
+class Video:
+    """What is looked at."""
+
+    source: Path
+    """A video, or a folder of pictures."""
+    lens: Lens = field(default_factory=Lens)
+
+
 def perceive(
-    source: Path, out: Path, lens: Lens, config: PerceiveConfig, run: Run, say: Say
+    video: Video,
+    out: Path,
+    config: PerceiveConfig,
+    run: Run,
+    say: Say,
+    finders: Finders = NETWORKS,
 ) -> Camera:
     """Fill a capture folder with all that a video tells of its pictures; gives the camera.
 
@@ -65,17 +106,18 @@ def perceive(
         InputError: If the source, OpenCV or a network is missing.
     """
     opencv()
-    clip, drift = steady_clip(source, out, config, run, say)
-    size = clip.width, clip.height
+    clip, drift = steady_clip(video.source, out, config, run, say)
+    size, lens = (clip.width, clip.height), video.lens
     at, text = lens_of(size, file=lens.file, fov=lens.fov, photo=lens.photo)
     if text is not None:
         say(f"warning: {text}")
     camera = camera_of(at)
     detect = replace(config.detect, models=config.models)
-    tracks = people_of_clip(clip, detect, config, run)
+    tracks = people_of_clip(clip, (detect, config), run, finders)
     clean = reference_of(clip, drift, tracks, config.clean)
     say(_told(clean, tracks))
-    found = furniture_of(clean, out / "perceived" / "reference", detect, run)
+    clean_clip = clip_of_clean(clean, out / "perceived" / "reference")
+    found = run.stage(finders.instances, DetectInputs(clean_clip, (0,)), detect)
     write_image(clean.picture, out / "reference.png")
     objects = detections_to_json(detections_in(found), camera, "reference.png")
     write_json(objects, out / "objects.json")
@@ -84,7 +126,7 @@ def perceive(
     write_json({**camera_to_json(camera), **height}, out / "camera.json")
     if config.models.keypoints and len(tracks.frame):
         inputs, joints = JointsInputs(clip, tracks), JointsConfig(config.models)
-        write_keypoints(run.stage(find_joints, inputs, joints), out / "keypoints.npz")
+        write_keypoints(run.stage(finders.joints, inputs, joints), out / "keypoints.npz")
     return camera
 
 
@@ -112,9 +154,9 @@ def steady_clip(
     work = out / "perceived"
     raw = run.stage(take_frames, TakeInputs(source, stamp_of(source), work / "raw"), config.frames)
     drift = run.stage(find_drift, SteadyInputs(raw), config.steady)
-    text = warning_of(drift)
-    if text is not None:
-        say(f"warning: {text}")
+    for text in (cut_warning(drift, raw.time), warning_of(drift)):
+        if text is not None:
+            say(f"warning: {text}")
     done = out / "frames" / f"{len(raw.time) - 1:06d}.jpg"
     origin = fingerprint(raw.origin, drift)
     steady = replace(raw, folder=str(out / "frames"), origin=origin)
@@ -123,19 +165,25 @@ def steady_clip(
     return steady, drift
 
 
-def people_of_clip(clip: Clip, detect: DetectConfig, config: PerceiveConfig, run: Run) -> Tracks:
+def people_of_clip(
+    clip: Clip,
+    settings: tuple[DetectConfig, PerceiveConfig],
+    run: Run,
+    finders: Finders = NETWORKS,
+) -> Tracks:
     """Everybody in all frames, segment by segment."""
+    detect, config = settings
     count = len(clip.time)
     if not config.models.tracker:
         chunks = [tuple(range(k, min(k + CHUNK, count))) for k in range(0, count, CHUNK)]
-        found = [run.stage(find_instances, DetectInputs(clip, c), detect) for c in chunks]
+        found = [run.stage(finders.instances, DetectInputs(clip, c), detect) for c in chunks]
         return link_people(people_in(joined_finds(found)), config.track)
     track = replace(config.track, models=config.models)
     parts, carried = list[Tracks](), nobody(clip)
     for first in range(0, count, track.segment):
-        found = people_in(run.stage(find_instances, DetectInputs(clip, (first,)), detect))
+        found = people_in(run.stage(finders.instances, DetectInputs(clip, (first,)), detect))
         last = min(first + track.segment, count - 1)  # it is also the next one's first
-        part = run.stage(track_people, SegmentInputs(clip, first, last, found, carried), track)
+        part = run.stage(finders.tracks, SegmentInputs(clip, first, last, found, carried), track)
         carried = where(part, part.frame == last)
         parts.append(part if last == count - 1 else where(part, part.frame != last))
         if last == count - 1:

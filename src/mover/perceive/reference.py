@@ -10,11 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.core.records import fingerprint, record
-from mover.core.run import Run
 from mover.core.types import Detection, Masks
 from mover.geometry.rle import decode, encode, tight_box
-from mover.perceive.config import CleanConfig, DetectConfig
-from mover.perceive.detect import DetectInputs, Finds, find_instances, overlap
+from mover.perceive.config import CleanConfig
+from mover.perceive.detect import Finds, overlap
 from mover.perceive.steady import Drift, seen_share
 from mover.perceive.track import Tracks, stack_of
 from mover.perceive.video import Clip, load_frame, write_jpeg
@@ -122,15 +121,14 @@ def grown(mask: Bool[Tensor, "h w"], steps: int) -> Bool[Tensor, "h w"]:
     return torch.from_numpy(distance_transform_edt(~mask.numpy())) <= steps
 
 
-def furniture_of(clean: Clean, folder: Path, config: DetectConfig, run: Run) -> Finds:
-    """What the network finds in the clean picture."""
+def clip_of_clean(clean: Clean, folder: Path) -> Clip:
+    """The clean picture as a clip of one frame, in which furniture is looked for."""
     pixels = (clean.picture * 255).round().clamp(0, 255).to(torch.uint8).numpy()
     folder = folder / fingerprint(clean.picture)  # another picture is another input
     folder.mkdir(parents=True, exist_ok=True)
     write_jpeg(np.ascontiguousarray(pixels), folder / "000000.jpg")
     height, width = clean.hidden.shape
-    clip = Clip(str(folder), width, height, torch.zeros(1), None)
-    return run.stage(find_instances, DetectInputs(clip, (0,)), config)
+    return Clip(str(folder), width, height, torch.zeros(1), None)
 
 
 def detections_in(finds: Finds) -> tuple[Detection, ...]:

@@ -29,6 +29,7 @@ LEAST = 10  # points, fewer tell nothing
 ROUGH = 3.0  # [px], how far points may be off a shift of the picture
 NOISE = 0.3  # [px], of a point that was found again
 LIGHT = 19  # [px], what changes over more is light
+CUT, STAYS = 0.3, 5  # agreement that a cut takes at once, frames that it stays away at least
 SAME = 0.4  # [contrast], two pixels that show the same differ by less
 
 Grey = UInt8[np.ndarray, "h w"]
@@ -265,6 +266,33 @@ def _judged(
         verdict = "moves"
     total = float((places - points).norm(dim=-1).amax())
     return Drift(H, shift, agree, reference, total, verdict)
+
+
+def cuts_of(drift: Drift, config: SteadyConfig | None = None) -> list[int]:
+    """Frames at which the picture is another one all at once and stays so: the video was cut.
+
+    A camera that walks away loses its first picture little by little, and somebody who passes close
+    by gives it back.
+    """
+    least = (config or SteadyConfig()).agree
+    agree = drift.agree.tolist()
+    return [
+        k
+        for k in range(1, len(agree))
+        if agree[k - 1] - agree[k] > CUT and max(agree[k : k + STAYS]) < least
+    ]
+
+
+def cut_warning(drift: Drift, time: Float[Tensor, " frames"]) -> str | None:
+    """Where the video was cut, and what to do; None: nowhere."""
+    cuts = [float(time[k]) for k in cuts_of(drift)]
+    if not cuts:
+        return None
+    shown = ", ".join(f"{second:.1f} s" for second in cuts[:5])
+    return (
+        f"the video is cut at {shown}: the method needs one shot, so choose it with "
+        f"--frames.end {cuts[0]:.1f} or --frames.start {cuts[-1]:.1f}"
+    )
 
 
 def warning_of(drift: Drift) -> str | None:

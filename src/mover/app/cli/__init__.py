@@ -13,6 +13,14 @@ COMMANDS = {
         "mover_bench.cli:demo",
         "Make a known room, reconstruct it, compare it with the truth.",
     ),
+    "video": (
+        "mover.app.cli.video:video",
+        "From a video to a room: pictures, first scene, bodies, room, report.",
+    ),
+    "image": (
+        "mover.app.cli.video:image",
+        "The same from one picture.",
+    ),
     "import": (
         "mover.app.cli.imports:import_",
         "Turn what other tools wrote into a capture folder.",

@@ -51,7 +51,15 @@ class FitArgs:
 
 def fit(arguments: Sequence[str]) -> None:
     """`mover fit`."""
-    args = tyro.cli(FitArgs, prog="mover fit", args=list(arguments))
+    fit_into(tyro.cli(FitArgs, prog="mover fit", args=list(arguments)))
+
+
+def fit_into(args: FitArgs) -> None:
+    """Fit, and write the bodies.
+
+    Raises:
+        InputError: If what is given cannot be used.
+    """
     from mover.app.cli.progress import Bar
     from mover.bodies import load_model
     from mover.fitting.bodies import FitInputs, fit_bodies

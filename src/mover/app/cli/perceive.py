@@ -1,15 +1,16 @@
 """What `perceive` and `layout` do."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional, arg
 
 from mover.app.cli.console import say
-from mover.perceive.config import LayoutConfig, PerceiveConfig
+from mover.perceive.config import LayoutConfig, Lens, ModelsConfig, PerceiveConfig
+from mover.perceive.networks import check_networks, in_folder
 
 THREADS = 1  # of torch, as in `run`
 
@@ -54,36 +55,69 @@ class PerceiveArgs:
     """Folder with your own shapes, for the first scene."""
     layout: bool = True
     """Find the first scene, too."""
+    weights: Path | None = None
+    """Folder with the networks, for a machine without a network: one folder for each."""
     config: Annotated[PerceiveConfig, arg(name="")] = field(default_factory=PerceiveConfig)
 
 
 def perceive(arguments: Sequence[str]) -> None:
     """`mover perceive`."""
     args = tyro.cli(PerceiveArgs, prog="mover perceive", args=list(arguments))
-    import torch
-
-    from mover.app.cli.progress import Bar
-    from mover.core.run import Run
-    from mover.perceive.capture import perceive as fill
-    from mover.perceive.config import Lens
-
-    torch.set_num_threads(THREADS)
-    lens = Lens(args.camera, args.fov, args.photo)
-    with Bar() as bar:
-        run = Run(args.out / "perceived", bar)
-        fill(args.source, args.out, lens, args.config, run, say)
-    say(f"{args.out}: wrote frames/, reference.png, objects.json, people.json, camera.json")
+    perceive_into(args, ready_models(args.config.models, args.weights))
     if args.layout:
-        _layout(LayoutArgs(args.out, args.depth, args.meshes))
-    say("still missing: bodies.npz (mover import-bodies TOOL PATH --out CAPTURE/bodies.npz)")
+        layout_into(LayoutArgs(args.out, args.depth, args.meshes))
+    say("still missing: bodies.npz (mover fit, or mover import-bodies TOOL PATH)")
+    say(f"next: mover check {args.out}; mover run {args.out} --out OUT")
 
 
 def layout(arguments: Sequence[str]) -> None:
     """`mover layout`."""
-    _layout(tyro.cli(LayoutArgs, prog="mover layout", args=list(arguments)))
+    args = tyro.cli(LayoutArgs, prog="mover layout", args=list(arguments))
+    layout_into(args)
+    say(f"next: mover check {args.capture}; mover run {args.capture} --out OUT")
 
 
-def _layout(args: LayoutArgs) -> None:
+def ready_models(models: ModelsConfig, weights: Path | None) -> ModelsConfig:
+    """The networks, from the folder where one is given; all that is missing is said at once.
+
+    Raises:
+        InputError: If something is missing.
+    """
+    models = models if weights is None else in_folder(models, weights)
+    check_networks(models)
+    return models
+
+
+def perceive_into(
+    args: PerceiveArgs,
+    models: ModelsConfig,
+    finders: Any = None,  # noqa: ANN401
+) -> None:
+    """Fill the capture with all but the first scene.
+
+    Args:
+        args: What is asked.
+        models: The networks.
+        finders: What stands for them, `perceive.capture.Finders`; None: they themselves.
+    """
+    import torch
+
+    from mover.app.cli.progress import Bar
+    from mover.core.run import Run
+    from mover.perceive.capture import NETWORKS, Video
+    from mover.perceive.capture import perceive as fill
+
+    torch.set_num_threads(THREADS)
+    video = Video(args.source, Lens(args.camera, args.fov, args.photo))
+    config = replace(args.config, models=models)
+    with Bar() as bar:
+        run = Run(args.out / "perceived", bar)
+        fill(video, args.out, config, run, say, finders or NETWORKS)
+    say(f"{args.out}: wrote frames/, reference.png, objects.json, people.json, camera.json")
+
+
+def layout_into(args: LayoutArgs) -> None:
+    """Write the first scene into the capture."""
     import torch
 
     from mover.app.cli.progress import Bar
@@ -102,4 +136,3 @@ def _layout(args: LayoutArgs) -> None:
     say(f"{args.capture}: first scene of {len(first.scene.objects)} objects{height}")
     if first.skipped:
         say(f"note: not on the floor, left out: {', '.join(sorted(set(first.skipped)))}")
-    say(f"next: mover check {args.capture}; mover run {args.capture} --out OUT")

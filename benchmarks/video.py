@@ -1,0 +1,112 @@
+"""From a video to a room, on known rooms: what each step costs and what comes out.
+
+Each room is drawn as an MP4 and goes the whole way of `mover video`; for the networks stand the
+truth with the errors of detectors (`mover_bench.rooms.seen`), under COCO's classes. Furniture that
+COCO has no class for is not found and not counted.
+
+    python benchmarks/video.py --seeds 100-103 --out video
+"""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mover.app.cli.video import ChainArgs, video_to_room
+from mover.core.types import Scene
+from mover.evaluate.evaluation import EvaluatedBodies, evaluate
+from mover.geometry.rle import decode
+from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.folder import read_capture
+from mover.io.capture.scene_file import read_scene
+from mover_bench.rooms.config import NoiseConfig, RoomConfig
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.room import make_room
+from mover_bench.rooms.seen import Seen, write_video
+from mover_bench.studies.run import parse_seeds
+
+FPS = 5.0
+KEYS = ("iou3d", "p2s", "center_error", "contact_f1", "pje", "p_pje")
+
+
+def truth_of(room: KnownRoom, capture: Path) -> dict[str, int]:
+    """Which true object each object of the first scene stands for: the best overlap of masks."""
+    found = read_capture(capture)
+    true = [decode(d.mask, 0) if d.mask else None for d in room.capture.detections]
+    by = {d.id: d for d in found.detections}
+    names: dict[str, int] = {}
+    for piece in found.scene.objects:
+        mask = by[piece.annotation].mask
+        shared = [0 if t is None else int((decode(mask, 0) & t).sum()) for t in true]
+        names[piece.id] = int(np.argmax(shared))
+    return names
+
+
+def renamed(scene: Scene, room: KnownRoom, names: dict[str, int]) -> Scene:
+    """The scene under the truth's names; of two that stand for one object the first counts."""
+    true, taken = room.truth.objects, dict[int, str]()
+    for name, index in names.items():
+        taken.setdefault(index, name)
+    keep = {name: true[index].id for index, name in taken.items()}
+    return replace(
+        scene, objects=tuple(replace(p, id=keep[p.id]) for p in scene.objects if p.id in keep)
+    )
+
+
+def judged(out: Path, room: KnownRoom) -> dict[str, dict[str, float]]:
+    """Metrics of the first scene and of the result, over the objects that were found."""
+    names = truth_of(room, out / "capture")
+    found = out / "room"
+    scenes = [renamed(read_scene(found / n), room, names) for n in ("initial.json", "scene.json")]
+    kept = {p.id for p in scenes[0].objects}
+    truth = replace(room.truth, objects=tuple(p for p in room.truth.objects if p.id in kept))
+    people = [read_bodies(found / n) for n in ("initial_bodies.npz", "bodies.npz")]
+    bodies = EvaluatedBodies(people[0], people[1], room.bodies)
+    metrics = evaluate(scenes[0], scenes[1], truth, bodies)
+    return {side: metrics[side] for side in ("initial", "result")}
+
+
+def trial(seed: int, out: Path) -> dict[str, float]:
+    """One known room, from its video to its room."""
+    room = make_room(seed, RoomConfig(fps=FPS))
+    out.mkdir(parents=True, exist_ok=True)
+    if not (out / "video.mp4").is_file():
+        write_video(room, out / "video.mp4")
+    camera = room.truth.camera
+    lens = {"w": camera.width, "h": camera.height, "fl_x": float(camera.K[0, 0])}
+    lens |= {
+        "fl_y": float(camera.K[1, 1]),
+        "cx": float(camera.K[0, 2]),
+        "cy": float(camera.K[1, 2]),
+    }
+    (out / "lens.json").write_text(json.dumps(lens))
+    seen = Seen(room, add_noise(room, NoiseConfig(), seed), seed)
+    args = ChainArgs(out / "chain", camera=out / "lens.json")
+    video_to_room(out / "video.mp4", args, seen.finders())
+    metrics = judged(out / "chain", room)
+    steps = json.loads((out / "chain" / "steps.json").read_text())["steps"]
+    row = {f"{side} {k}": metrics[side][k] for side in metrics for k in KEYS if k in metrics[side]}
+    return row | {f"{name} [s]": step["seconds"] for name, step in steps.items()}
+
+
+def main() -> None:
+    """A table of means, and a line for each room."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", default="100-103")
+    parser.add_argument("--out", type=Path, default=Path("video"))
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = {seed: trial(seed, args.out / str(seed)) for seed in parse_seeds(args.seeds)}
+    names = list(dict.fromkeys(name for row in rows.values() for name in row))
+    for name in names:
+        values = [row[name] for row in rows.values() if name in row]
+        each = " ".join(f"{v:.3f}" for v in values)
+        print(f"{name:<24} {np.mean(values):8.3f}   {each}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,180 @@
+"""From a video to a room, step by step: what is finished stays, what you replace stays, too.
+
+OUT/capture      an ordinary capture: every file in it may be replaced by a better tool's
+OUT/room         the result, as `mover run` writes it
+OUT/steps.json   what each step was made from, and what it took
+
+A step is done anew only where what it was made from has changed; a file that was replaced in
+between is what the later steps read.
+"""
+
+import hashlib
+import json
+import shlex
+import subprocess
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mover.core.errors import InputError
+from mover.io.files.fields import write_json
+
+Say = Callable[[str], None]
+FIT = "fit"
+OUT = "{out}"  # by which a command is told from a file
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The steps of one folder."""
+
+    folder: Path
+    say: Say
+    names: tuple[str, ...]
+    """All steps in their order."""
+    log: dict[str, dict[str, Any]] = field(default_factory=lambda: {})
+    """What each took, and the hash of what it was made from."""
+
+    def do(
+        self, name: str, made_from: Iterable[Path | str], made: Path, work: Callable[[], None]
+    ) -> None:
+        """Do a step unless its result is there, made from the same.
+
+        Args:
+            name: Of the step.
+            made_from: Files, and words for settings.
+            made: The file that the step ends with.
+            work: Does it.
+        """
+        key, number = digest(made_from), f"{self.names.index(name) + 1}/{len(self.names)}"
+        if made.exists() and self.log.get(name, {}).get("made_from") == key:
+            self.say(f"{number} {name}: kept")
+            return
+        self.say(f"{number} {name} ...")
+        start = time.monotonic()
+        work()
+        seconds = round(time.monotonic() - start, 1)
+        self.log[name] = {"made_from": key, "seconds": seconds}
+        write_json({"steps": self.log}, self.folder / "steps.json")
+        self.say(f"{number} {name}: {seconds:.0f} s")
+
+
+def steps_in(folder: Path, say: Say, names: tuple[str, ...]) -> Steps:
+    """The steps of a folder, with what an earlier run has finished; a damaged log is dropped."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file, log = folder / "steps.json", dict[str, dict[str, Any]]()
+    if file.is_file():
+        try:
+            tree = json.loads(file.read_text())["steps"]
+            log = {str(name): dict(step) for name, step in tree.items()}
+        except (ValueError, KeyError, TypeError, AttributeError):
+            say(f"warning: {file.name} is damaged and is dropped: all steps are done anew")
+    return Steps(folder, say, names, log)
+
+
+def digest(made_from: Iterable[Path | str]) -> str:
+    """Hash of the content of files and of words; a file that is missing counts as such."""
+    found = hashlib.sha256()
+    for part in made_from:
+        if isinstance(part, str):
+            found.update(b"word" + part.encode())
+        elif part.is_file():
+            found.update(b"file" + hashlib.sha256(part.read_bytes()).digest())
+        else:
+            found.update(b"none")
+    return found.hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class BodiesFrom:
+    """Where bodies come from."""
+
+    source: str = FIT
+    """`fit`, a file or folder, or a command with {out} in it."""
+    tool: str = ""
+    """What wrote the file, a name of `mover import-bodies`; empty: bodies.npz."""
+
+    @property
+    def is_command(self) -> bool:
+        """Whether it is a command that makes them."""
+        return OUT in self.source
+
+    def check(self) -> None:
+        """Refuse what cannot work, before any other step.
+
+        Raises:
+            InputError: If there is no such file or tool.
+        """
+        from mover.io.formats import names
+
+        if self.tool and self.tool not in names("people"):
+            known = ", ".join(names("people"))
+            raise InputError(f"--bodies-tool: {self.tool!r} is none of {known}")
+        if self.source != FIT and not self.is_command and not Path(self.source).exists():
+            raise InputError(
+                f"--bodies: {self.source!r} is neither `fit`, nor a file or folder that is there, "
+                "nor a command with {out} in it"
+            )
+
+
+def make_bodies(bodies: BodiesFrom, video: Path, capture: Path, fit: Callable[[], None]) -> None:
+    """Write CAPTURE/bodies.npz.
+
+    Args:
+        bodies: Where they come from.
+        video: The user's file, {video} of a command.
+        capture: The capture; its frames and camera.json are {frames} and {camera} of a command.
+        fit: Fits them to the keypoints of the capture.
+
+    Raises:
+        InputError: If the command fails, or what was written cannot be read.
+    """
+    if bodies.source == FIT:
+        fit()
+        return
+    source = Path(bodies.source)
+    if bodies.is_command:
+        source = capture / "bodies-by-command"
+        source = source if bodies.tool else source.with_suffix(".npz")
+        places = {"video": video, "frames": capture / "frames", "camera": capture / "camera.json"}
+        run_command_line(bodies.source, {**places, "out": source})
+    import_bodies(source, bodies.tool, capture)
+
+
+def run_command_line(command: str, places: dict[str, Path]) -> None:
+    """Run a user's command without a shell; {video}, {frames}, {camera} and {out} are filled in.
+
+    Raises:
+        InputError: If it cannot be run, fails, or leaves nothing at {out}.
+    """
+    words = shlex.split(command)
+    for name, place in places.items():
+        words = [word.replace("{" + name + "}", str(place.resolve())) for word in words]
+    try:
+        code = subprocess.run(words, check=False).returncode
+    except OSError as error:
+        raise InputError(f"--bodies: {words[0]}: {error.strerror or error}") from error
+    if code:
+        raise InputError(f"--bodies: the command ended with code {code}: {shlex.join(words)}")
+    if not places["out"].exists():
+        raise InputError(
+            f"--bodies: the command wrote nothing to {places['out'].name}, which stands for "
+            f"{OUT}: {shlex.join(words)}"
+        )
+
+
+def import_bodies(source: Path, tool: str, capture: Path) -> None:
+    """bodies.npz of the capture from bodies.npz elsewhere, or from what a tool wrote."""
+    from mover.io.capture.bodies_file import read_bodies, write_bodies
+    from mover.io.capture.camera_file import camera_of
+    from mover.io.files.cameras import read_camera_file
+    from mover.io.people.bodies import bodies_from
+    from mover.io.people.found import Known
+
+    if not tool:
+        write_bodies(read_bodies(source), capture / "bodies.npz")
+        return
+    camera = camera_of(read_camera_file(capture / "camera.json", None))
+    write_bodies(bodies_from(tool, source, Known(camera)).bodies, capture / "bodies.npz")

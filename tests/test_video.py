@@ -1,0 +1,252 @@
+"""`mover video`: steps that are kept, bodies from anywhere, networks that are missing, the way."""
+
+import json
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mover.app import chain
+from mover.app.chain import BodiesFrom, digest, import_bodies, make_bodies, steps_in
+from mover.app.cli import run_command
+from mover.app.cli.video import ChainArgs, video_to_room
+from mover.core.errors import InputError
+from mover.io.capture.bodies_file import read_bodies, write_bodies
+from mover.perceive import networks
+from mover.perceive.config import ModelsConfig
+from mover.perceive.networks import FACTS, in_folder, missing
+from mover.perceive.steady import Drift, cut_warning, cuts_of
+
+NAMES = ("first", "second")
+
+
+def said() -> tuple[list[str], chain.Say]:
+    lines: list[str] = []
+    return lines, lines.append
+
+
+class TestSteps:
+    def test_a_step_is_done_again_only_where_what_it_is_made_from_changed(self, tmp_path: Path):
+        source, made = tmp_path / "in.txt", tmp_path / "made.txt"
+        source.write_text("a")
+        done: list[str] = []
+
+        def work() -> None:
+            done.append(source.read_text())
+            made.write_text("program's")
+
+        def go(word: str = "setting") -> None:
+            steps_in(tmp_path / "out", said()[1], NAMES).do("first", [source, word], made, work)
+
+        go()
+        go()
+        assert done == ["a"]
+        made.write_text("user's")
+        go()
+        assert (done, made.read_text()) == (["a"], "user's")
+        source.write_text("b")
+        go()
+        assert done == ["a", "b"]
+        go("another")
+        made.unlink()
+        go("another")
+        assert len(done) == 4
+
+    def test_a_step_that_dies_is_not_taken_for_finished(self, tmp_path: Path):
+        made = tmp_path / "made.txt"
+
+        def dies() -> None:
+            made.write_text("half")
+            raise InputError("no")
+
+        steps = steps_in(tmp_path, said()[1], NAMES)
+        with pytest.raises(InputError):
+            steps.do("first", [], made, dies)
+        done: list[int] = []
+        again = steps_in(tmp_path, said()[1], NAMES)
+        again.do("first", [], made, lambda: done.append(1))
+        assert done == [1]
+
+    @pytest.mark.parametrize("text", ["", "{", "[]", '{"steps": 3}', '{"steps": {"first": 5}}'])
+    def test_a_damaged_log_is_said_and_dropped(self, tmp_path: Path, text: str):
+        (tmp_path / "steps.json").write_text(text)
+        lines, say = said()
+        assert steps_in(tmp_path, say, NAMES).log == {}
+        assert "steps.json is damaged" in lines[0]
+
+    def test_files_count_by_their_content_and_words_are_no_files(self, tmp_path: Path):
+        a, b = tmp_path / "a", tmp_path / "b"
+        a.write_text("x")
+        b.write_text("x")
+        assert digest([a]) == digest([b]) != digest(["x"])
+        assert digest([tmp_path / "none"]) != digest([])
+
+
+class TestBodies:
+    @pytest.mark.parametrize(
+        ("source", "tool", "words"),
+        [("nowhere.npz", "", "neither `fit`"), ("fit", "nope", "'nope' is none of")],
+    )
+    def test_what_cannot_work_is_said_before(self, source: str, tool: str, words: str):
+        with pytest.raises(InputError, match=words):
+            BodiesFrom(source, tool).check()
+
+    def make(self, capture: Path, code: str) -> None:
+        command = f"{sys.executable} -c {json.dumps(code)} {{video}} {{frames}} {{camera}} {{out}}"
+        make_bodies(BodiesFrom(command), capture / "video.mp4", capture, lambda: None)
+
+    @pytest.mark.parametrize(
+        ("code", "words"),
+        [("import sys; sys.exit(3)", "ended with code 3"), ("pass", "wrote nothing to")],
+    )
+    def test_a_command_that_fails_is_one_sentence(self, tmp_path: Path, code: str, words: str):
+        with pytest.raises(InputError, match=words):
+            self.make(tmp_path, code)
+
+    def test_a_program_that_is_not_there_is_one_sentence(self, tmp_path: Path):
+        with pytest.raises(InputError, match=r"no-such-program: No such file"):
+            make_bodies(BodiesFrom("no-such-program {out}"), tmp_path, tmp_path, lambda: None)
+
+    def test_a_command_gets_the_video_the_frames_and_the_lens_and_its_bodies_are_read(
+        self, tmp_path: Path, small_room
+    ):
+        write_bodies(small_room.bodies, tmp_path / "theirs.npz")
+        code = (
+            "import shutil, sys; assert [a.rsplit('/', 1)[-1] for a in sys.argv[1:]] == "
+            "['video.mp4', 'frames', 'camera.json', 'bodies-by-command.npz'], sys.argv; "
+            f"shutil.copy('{tmp_path / 'theirs.npz'}', sys.argv[4])"
+        )
+        self.make(tmp_path, code)
+        found = read_bodies(tmp_path / "bodies.npz")
+        assert torch.equal(found.verts, read_bodies(tmp_path / "theirs.npz").verts)
+
+    def test_a_file_that_holds_no_bodies_is_refused_and_nothing_is_written(self, tmp_path: Path):
+        np.savez(tmp_path / "other.npz", a=np.zeros(3))
+        with pytest.raises(InputError, match=r"other\.npz"):
+            import_bodies(tmp_path / "other.npz", "", tmp_path)
+        assert not (tmp_path / "bodies.npz").exists()
+
+
+class TestNetworks:
+    def test_everything_that_is_missing_is_said_at_once_with_licence_size_and_what_to_do(
+        self, monkeypatch: pytest.MonkeyPatch
+    ):
+        monkeypatch.setattr(networks.importlib.util, "find_spec", lambda _: None)
+        found = "; ".join(missing(ModelsConfig()))
+        for name, facts in FACTS.items():
+            assert f"hf download {name}" in found
+            assert facts.licence in found
+            assert facts.size in found
+        assert all(f"the package {name}" in found for name in networks.PACKAGES)
+
+    def test_all_default_networks_have_their_facts(self):
+        models = ModelsConfig()
+        assert {models.masks, models.tracker, models.keypoints} == set(FACTS)
+
+    def test_the_command_says_so_before_any_work(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ):
+        monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+        monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "empty"))
+        (tmp_path / "a.mp4").write_bytes(b"no video")
+        for name in ("video", "image"):
+            file = tmp_path / ("a.mp4" if name == "video" else "a.png")
+            if name == "image":
+                from PIL import Image
+
+                Image.new("RGB", (8, 8)).save(file)
+            assert run_command(name, [str(file), "--out", str(tmp_path / "out")]) == 2
+            error = capsys.readouterr().err
+            assert error.startswith(f"mover {name}: not on this machine: ")
+            assert len(error.splitlines()) == 1
+        assert not (tmp_path / "out" / "capture").exists()
+
+    def test_a_folder_of_weights_gives_each_network_by_its_whole_or_its_last_name(
+        self, tmp_path: Path
+    ):
+        models = ModelsConfig()
+        (tmp_path / "sam2.1-hiera-large").mkdir()
+        (tmp_path / models.masks).mkdir(parents=True)
+        found = in_folder(models, tmp_path)
+        assert found.tracker == str(tmp_path / "sam2.1-hiera-large")
+        assert found.masks == str(tmp_path / models.masks)
+        assert found.keypoints == models.keypoints
+        with pytest.raises(
+            InputError, match=r"--weights: .* is no folder, expected one with mask2"
+        ):
+            in_folder(models, tmp_path / "nowhere")
+
+    @pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
+    def test_a_folder_without_weights_is_missing_and_one_with_them_is_not(self, tmp_path: Path):
+        models = ModelsConfig(str(tmp_path), "", "")
+        assert len([s for s in missing(models) if "holds no network" in s]) == 1
+        (tmp_path / "config.json").write_text("{}")
+        (tmp_path / "model.safetensors").write_bytes(b"")
+        assert not [s for s in missing(models) if "holds no network" in s]
+
+
+def drift(agree: list[float]) -> Drift:
+    n = len(agree)
+    eye = torch.eye(3).expand(n, 3, 3)
+    return Drift(eye, torch.zeros(n), torch.tensor(agree), 0, 0.0, "moves")
+
+
+class TestCuts:
+    def test_a_picture_that_changes_at_once_and_for_good_is_a_cut(self):
+        found = drift([1.0, 0.95, 0.9, *[0.05] * 7])
+        assert cuts_of(found) == [3]
+        text = cut_warning(found, torch.arange(10) / 5) or ""
+        assert "cut at 0.6 s" in text
+        assert "--frames.end 0.6" in text
+
+    @pytest.mark.parametrize(
+        "agree",
+        [
+            [1.0, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9],  # somebody passes close by
+            [1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.1],  # the camera walks away
+            [1.0] * 8,
+        ],
+    )
+    def test_somebody_who_passes_by_and_a_camera_that_walks_are_none(self, agree: list[float]):
+        assert cuts_of(drift(agree)) == []
+        assert cut_warning(drift(agree), torch.arange(8) / 5) is None
+
+
+@pytest.mark.long
+def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
+    tmp_path: Path, small_room, capsys: pytest.CaptureFixture[str]
+):
+    pytest.importorskip("cv2")
+    pytest.importorskip("av")
+    from mover_bench.rooms.config import NoiseConfig
+    from mover_bench.rooms.noise import add_noise
+    from mover_bench.rooms.seen import Seen, write_video
+
+    video, out = tmp_path / "room.mp4", tmp_path / "out"
+    write_video(small_room, video)
+    finders = Seen(small_room, add_noise(small_room, NoiseConfig(), 1), 1).finders()
+    K, camera = small_room.truth.camera.K, small_room.truth.camera
+    lens = {"w": camera.width, "h": camera.height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1])}
+    (tmp_path / "lens.json").write_text(
+        json.dumps({**lens, "cx": float(K[0, 2]), "cy": float(K[1, 2])})
+    )
+    args = ChainArgs(out, camera=tmp_path / "lens.json")
+    video_to_room(video, args, finders)
+    assert (out / "room" / "report.html").is_file()
+    found = read_bodies(out / "room" / "bodies.npz")
+    true = {k: i for i, k in enumerate(small_room.bodies.frame.tolist())}
+    rows = [true[k] for k in found.frame.tolist()]
+    heights = small_room.bodies.verts[rows].norm(dim=-1).mean()
+    assert (found.verts.norm(dim=-1).mean() / heights - 1).abs() < 0.15
+    capsys.readouterr()
+    write_bodies(small_room.bodies, out / "capture" / "bodies.npz")
+    video_to_room(video, args, finders)
+    told = capsys.readouterr().out
+    assert [line for line in told.splitlines() if line.endswith("kept")] == [
+        "1/4 pictures: kept", "2/4 first scene: kept", "3/4 bodies: kept",
+    ]  # fmt: skip
+    after = read_bodies(out / "capture" / "bodies.npz")
+    assert torch.equal(after.verts, small_room.bodies.verts)
