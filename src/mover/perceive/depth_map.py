@@ -39,9 +39,9 @@ def read_depth(path: Path, camera: Camera) -> Float[Tensor, "h w"]:
         case ".npz":
             values = _of_npz(path)
         case ".npy":
-            from mover.io.masks.instances_pixels import read_array
+            from mover.io.files.npz import read_npy
 
-            values = _two_axes(read_array(path))
+            values = _two_axes(read_npy(path))
         case ".png":
             values = _of_png(path)
         case _:

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.records import BROKEN
 from mover.core.types import Bodies
 from mover.io.capture.pose_file import pose_of, pose_to_arrays, posed, reproduces
 from mover.io.files.fields import LAST_INDEX, At, Warn, array, choice, get, maybe, refuse
-from mover.io.files.npz import check_array_header, read_npz, write_npz
+from mover.io.files.npz import read_npy, read_npz, write_npz
 
 log = logging.getLogger(__name__)
 
@@ -228,11 +227,7 @@ def _array(path: Path) -> np.ndarray:
         return np.asarray(at.value[key])
     if not path.is_file():
         raise InputError(f"{path}: there is no such file, expected an .npy or .npz file")
-    try:
-        check_array_header(path)
-        return np.asarray(np.load(path, allow_pickle=False))
-    except BROKEN as error:
-        raise InputError(f"{path.name}: cannot be read ({error})") from error
+    return np.asarray(read_npy(path).value)
 
 
 def _checked(value: np.ndarray, source: Path, bodies: Bodies) -> Float[Tensor, "bodies verts"]:

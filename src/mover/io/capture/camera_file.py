@@ -1,27 +1,23 @@
 """The camera of camera.json and scene.json."""
 
 import dataclasses
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-from msgspec import Meta, Struct
+from msgspec import Struct
 
 from mover.core.types import Camera
 from mover.geometry.camera import heading, pitch_roll
 from mover.geometry.rotations import rot_y
 from mover.io.files.fields import At, Warn, get, plain, refuse
-from mover.io.files.schema import Number, Positive, Rows, checked, rotation
+from mover.io.files.schema import Number, Positive, Rows, Side, checked, rotation
 
-LARGEST_SIDE = 32768  # [px]
 LARGEST_AREA = 1 << 28  # [px²]
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 STEEPEST = 1.4  # [rad], beyond it a camera has no heading to speak of
 NO_TURN = 1e-6  # [rad]
 LEVEL = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
-
-
-Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE)]
 
 
 class CameraFields(Struct, frozen=True):

@@ -144,9 +144,9 @@ def read_sdf(root: Path, scene: str) -> Volume:
 
 def _read_npy(path: Path) -> NDArray[np.float64]:
     """The numbers of an .npy file."""
-    from mover.io.masks.instances_pixels import read_array
+    from mover.io.files.npz import read_npy
 
-    at = read_array(path)
+    at = read_npy(path)
     if not isinstance(at.value, np.ndarray) or at.value.dtype.kind != "f":
         refuse(at, "floating-point numbers")
     return at.value

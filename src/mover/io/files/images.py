@@ -1,7 +1,10 @@
 """Pictures: read the reference image, write it without loss."""
 
 import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -13,6 +16,41 @@ from mover.core.files import replacing
 from mover.core.types import Camera
 from mover.io.files.fields import At, reason, refuse
 from mover.io.files.meshes import inside
+
+
+@contextmanager
+def opened(
+    path: Path,
+    at: At | None = None,
+    expected: str = "a picture",
+    bombs: Literal["error", "ignore"] = "ignore",
+) -> Generator[Any, None, None]:
+    """An open picture.
+
+    Args:
+        path: Its file.
+        at: How messages call it; None: by its file.
+        expected: What it should be.
+        bombs: Whether a picture is refused that is large enough to make Pillow warn.
+
+    Raises:
+        InputError: If it is missing or cannot be read.
+    """
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter(bombs, Image.DecompressionBombWarning)
+            with Image.open(path) as picture:
+                yield picture
+    except (
+        OSError, ValueError, SyntaxError, Image.DecompressionBombError,
+        Image.DecompressionBombWarning,
+    ) as error:  # fmt: skip
+        if at is not None:
+            refuse(at, expected, f"{str(at.value)!r}, which cannot be read ({reason(error)})")
+        said = f"cannot be read ({reason(error)}), expected {expected}"
+        raise InputError(f"{path.name}: {said}") from error
 
 
 def read_image(at: At, folder: Path, camera: Camera) -> Float[Tensor, "h w 3"]:
@@ -35,21 +73,15 @@ def read_image_file(at: At, path: Path, camera: Camera) -> Float[Tensor, "h w 3"
     Raises:
         InputError: If it cannot be read or has another size.
     """
-    from PIL import Image, ImageOps
+    from PIL import ImageOps
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as picture:
-                sides = sorted(picture.size)
-                if sides == sorted((camera.width, camera.height)):
-                    upright = ImageOps.exif_transpose(picture)
-                    picture = upright.convert("RGB")
-                size, pixels = picture.size, None
-                if size == (camera.width, camera.height):
-                    pixels = np.asarray(picture, dtype=np.float32)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        refuse(at, "a picture", f"{str(at.value)!r}, which cannot be read ({reason(error)})")
+    wanted, pixels = (camera.width, camera.height), None
+    with opened(path, at) as picture:
+        if sorted(picture.size) == sorted(wanted):
+            picture = ImageOps.exif_transpose(picture).convert("RGB")
+        size = picture.size
+        if size == wanted:
+            pixels = np.asarray(picture, dtype=np.float32)
     if pixels is None:
         expected = f"{camera.width} x {camera.height} pixels, as the camera has"
         refuse(at, expected, f"{str(at.value)!r} with {size[0]} x {size[1]} pixels")
@@ -62,17 +94,8 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         InputError: If it is missing or cannot be read.
     """
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as picture:
-                return picture.size
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"{path.name}: cannot be read ({reason(error)}), expected a picture"
-        ) from error
+    with opened(path) as picture:
+        return picture.size
 
 
 def write_image(image: Float[Tensor, "h w 3"], path: Path) -> None:
@@ -90,14 +113,9 @@ def mirrored_copy(path: Path, work: Path) -> Path:
     Raises:
         InputError: If it cannot be read.
     """
-    from PIL import Image, ImageOps
+    from PIL import ImageOps
 
     target = work / f"mirrored_{path.stem}.jpg"
-    try:
-        with Image.open(path) as picture:
-            ImageOps.mirror(picture.convert("RGB")).save(target, quality=95)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"{path.name}: cannot be read ({reason(error)}), expected a picture"
-        ) from error
+    with opened(path) as picture:
+        ImageOps.mirror(picture.convert("RGB")).save(target, quality=95)
     return target

@@ -1,5 +1,6 @@
 """Read and write .npz files that others made: no pickles, no bombs, the same bytes each time."""
 
+import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -53,19 +54,14 @@ def _check_headers(path: Path) -> None:
 
 def _header(stream: Any) -> tuple[np.dtype[Any], int]:  # noqa: ANN401
     """Type and bytes of an .npy file."""
-    match npy.read_magic(stream):
-        case (1, 0):
-            shape, _, dtype = npy.read_array_header_1_0(stream)
-        case (2, 0):
-            shape, _, dtype = npy.read_array_header_2_0(stream)
-        case version:
-            raise ValueError(f"version {version} of the .npy format")
+    read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+    version = npy.read_magic(stream)
+    if version not in read:
+        raise ValueError(f"version {version} of the .npy format")
+    shape, _, dtype = read[version](stream)
     if any(n < 0 for n in shape):
         raise ValueError(f"an array of shape {shape}")
-    size = dtype.itemsize
-    for n in shape:
-        size *= n
-    return dtype, size
+    return dtype, dtype.itemsize * math.prod(shape)
 
 
 def check_array_header(path: Path) -> None:
@@ -80,6 +76,21 @@ def check_array_header(path: Path) -> None:
         raise InputError(f"{path.name}: has {dtype}, expected plain numbers (no pickled objects)")
     if size > min(LARGEST_FILE, path.stat().st_size):
         raise InputError(f"{path.name}: promises {size} bytes, expected no more than it has")
+
+
+def read_npy(path: Path) -> At:
+    """The array of an .npy file.
+
+    Raises:
+        InputError: If it is missing, broken, or holds pickled objects.
+    """
+    try:
+        check_array_header(path)
+        return At(np.load(path, allow_pickle=False), path.name)
+    except BROKEN as error:
+        raise InputError(
+            f"{path.name}: cannot be read ({reason(error)}), expected an .npy file"
+        ) from error
 
 
 def write_npz(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:

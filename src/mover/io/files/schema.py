@@ -20,6 +20,9 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 Index = Annotated[int, Meta(ge=0, le=LAST_INDEX)]
 """Of a frame or a track."""
 Id = Annotated[int, Meta(ge=0, le=LAST_ID)]
+LARGEST_SIDE = 32768  # [px]
+Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE)]
+"""Of an image [px]."""
 Vector = tuple[Number, Number, Number]
 Sizes = tuple[Positive, Positive, Positive]
 Box = tuple[Number, Number, Number, Number]

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
@@ -18,9 +19,9 @@ from mover.io.files.fields import (
     items,
     maybe,
     refuse,
-    text,
     unique,
 )
+from mover.io.files.schema import Id, Text, checked
 
 CORNERS = 3  # a polygon has at least so many
 
@@ -122,15 +123,19 @@ def check_image(at: At, camera: Camera) -> int:
     return integer(get(at, "id"))
 
 
+class CategoryFields(Struct, frozen=True):
+    """One of `categories`."""
+
+    id: Id
+    name: Text
+
+
 def categories_of(at: At) -> dict[int, str]:
     """Names by id."""
-    names: dict[int, str] = {}
-    seen: set[object] = set()
-    for item in items(at):
-        key = integer(get(item, "id"), 0, LAST_ID)
-        unique(get(item, "id"), seen, key, "an id")
-        names[key] = text(get(item, "name"))
-    return names
+    rows, seen = checked(at, list[CategoryFields]), set[object]()
+    for item, row in zip(items(at), rows, strict=True):
+        unique(get(item, "id"), seen, row.id, "an id")
+    return {row.id: str(row.name) for row in rows}
 
 
 def category_of(at: At, names: dict[int, str]) -> str:

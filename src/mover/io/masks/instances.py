@@ -17,7 +17,6 @@ from mover.io.files.fields import At, read_json, refuse
 from mover.io.masks.coco import from_coco
 
 PERSON = frozenset({"person", "people", "human", "man", "woman", "child"})
-LARGEST_SIDE = 32768  # [px]
 SAME_SHAPE = 0.02  # masks of another size fit an image whose sides have this ratio, nearly
 
 

@@ -1,7 +1,6 @@
 """Masks as pixels: arrays (SAM 2, SAM 3, transformers) and pictures (labels, alpha channels)."""
 
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.records import BROKEN
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import (
     LAST_INDEX,
@@ -20,11 +18,11 @@ from mover.io.files.fields import (
     mapping,
     maybe,
     read_json,
-    reason,
     refuse,
     text,
 )
-from mover.io.files.npz import check_array_header, read_npz
+from mover.io.files.images import opened
+from mover.io.files.npz import read_npy, read_npz
 from mover.io.masks.instances import Instance, Instances, code_of
 
 MASKS = ("masks", "pred_masks", "mask", "segmentation", "arr_0")
@@ -65,22 +63,7 @@ def _load(path: Path) -> At:
     """The arrays of an .npz, or the one of an .npy as `masks`."""
     if path.suffix.lower() == ".npz":
         return read_npz(path)
-    return At({"masks": read_array(path).value}, path.name)
-
-
-def read_array(path: Path) -> At:
-    """The array of an .npy file.
-
-    Raises:
-        InputError: If it is missing, broken, or holds pickled objects.
-    """
-    try:
-        check_array_header(path)
-        return At(np.load(path, allow_pickle=False), path.name)
-    except BROKEN as error:
-        raise InputError(
-            f"{path.name}: cannot be read ({reason(error)}), expected an .npy file"
-        ) from error
+    return At({"masks": read_npy(path).value}, path.name)
 
 
 def _of_labels(labels: NDArray[Any], names: Mapping[str, str]) -> list[Instance]:
@@ -205,20 +188,8 @@ def read_labels(path: Path) -> NDArray[np.int64]:
     Raises:
         InputError: If it cannot be read.
     """
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(path) as picture:
-                return _numbers(picture)
-    except (
-        OSError, ValueError, SyntaxError, Image.DecompressionBombError,
-        Image.DecompressionBombWarning,
-    ) as error:  # fmt: skip
-        raise InputError(
-            f"{path.name}: cannot be read ({reason(error)}), expected a picture of masks"
-        ) from error
+    with opened(path, expected="a picture of masks", bombs="error") as picture:
+        return _numbers(picture)
 
 
 def _numbers(picture: Any) -> NDArray[np.int64]:  # noqa: ANN401

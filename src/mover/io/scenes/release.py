@@ -27,9 +27,9 @@ from mover.io.datasets.true_boxes import boxes_scene, read_bbox3d, vertical_of
 from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, get, items, maybe, read_json
 from mover.io.files.meshes import floor_of, read_scan
+from mover.io.files.npz import read_npy
 from mover.io.masks.instance_files import DETECTIONS, read_instances
 from mover.io.masks.instances import Instances, fitted, is_person, people_tree
-from mover.io.masks.instances_pixels import read_array
 from mover.io.scenes.placing import FLIP, Matrix, level_of, load_from, posed
 from mover.io.scenes.total3d import read_shape, total3d_parts
 
@@ -100,7 +100,7 @@ def contact_arrays(folder: Path, bodies: At | None, notes: list[str]) -> At | No
     if len(there) < rows:
         notes.append(f"contacts: only {len(there)} of {rows} bodies have a file, so none is used")
         return None
-    values = [read_array(path) for path in paths]
+    values = [read_npy(path) for path in paths]
     for at in values:
         if at.value.dtype.kind != "f" or at.value.size != count:
             raise InputError(f"{at.file}: has shape {at.value.shape}, expected ({count}, 1)")
