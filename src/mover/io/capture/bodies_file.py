@@ -107,7 +107,6 @@ def _places(at: At, shape: tuple[int | str, ...]) -> Float[Tensor, "bodies point
 
 
 def _faces(at: At, n_verts: int) -> Int[Tensor, "faces 3"]:
-    """Triangles of the bodies."""
     value = array(at, ("F", 3), "whole").astype(np.int64)
     if not len(value):
         refuse(at, "at least one face", "an empty mesh")
@@ -128,7 +127,6 @@ def _joints(at: At, rows: int) -> tuple[Float[Tensor, "bodies joints 3"] | None,
 
 
 def _fps(at: At) -> float | None:
-    """Frames a second."""
     given = maybe(at, "fps")
     if given is None:
         return None

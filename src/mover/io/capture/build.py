@@ -63,7 +63,6 @@ def build_capture(parts: Parts) -> Capture:
 
 
 def _image_of(parts: Parts, camera: Camera, warn: Warn) -> Float[Tensor, "h w 3"] | None:
-    """The reference image."""
     if parts.load_image is None:
         warn(f"{parts.no_image}: there is no picture to draw on")
         return None
@@ -112,7 +111,6 @@ def _bodies_of(
 def _touch_of(
     at: At | None, bodies: Bodies | None, warn: Warn
 ) -> Float[Tensor, "bodies verts"] | None:
-    """The user's own chances of contact."""
     if at is None:
         return None
     if bodies is None:

@@ -10,7 +10,7 @@ from msgspec import Struct
 from mover.core.types import Camera
 from mover.geometry.camera import heading, pitch_roll
 from mover.geometry.rotations import rot_y
-from mover.io.files.fields import At, Warn, get, plain, refuse
+from mover.io.files.fields import At, Warn, get, maybe, plain, refuse
 from mover.io.files.schema import Number, Positive, Rows, Side, checked, rotation
 
 LARGEST_AREA = 1 << 28  # [px²]
@@ -30,14 +30,6 @@ class CameraFields(Struct, frozen=True):
     cx: Number
     cy: Number
     R_cam_world: Rows | None = None
-    k1: Number | None = None
-    k2: Number | None = None
-    k3: Number | None = None
-    k4: Number | None = None
-    k5: Number | None = None
-    k6: Number | None = None
-    p1: Number | None = None
-    p2: Number | None = None
 
 
 def camera_of(at: At, other: Camera | None = None) -> Camera:
@@ -55,8 +47,9 @@ def camera_of(at: At, other: Camera | None = None) -> Camera:
         found = f"{lens.w} x {lens.h}"
         refuse(get(at, "w"), f"an image of at most {LARGEST_AREA} pixels", found)
     for key in DISTORTION:
-        if getattr(lens, key):
-            refuse(get(at, key), "an image without distortion (0): undistort the images first")
+        given = maybe(at, key)
+        if given is not None and checked(given, Number) != 0:
+            refuse(given, "an image without distortion (0): undistort the images first")
     K = torch.tensor([[lens.fl_x, 0.0, lens.cx], [0.0, lens.fl_y, lens.cy], [0.0, 0.0, 1.0]])
     if lens.R_cam_world is not None:
         turn = torch.from_numpy(rotation(get(at, "R_cam_world")).astype(np.float32))

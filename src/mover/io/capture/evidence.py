@@ -1,7 +1,7 @@
 """In how many frames somebody seems to touch each object: for `mover check`."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import torch
@@ -37,9 +37,7 @@ def contact_frames(capture: Capture) -> tuple[int, ...]:
         floor = float(world.verts[..., 1].amin(1).quantile(0.05))
         chance = touching(world, parts, floor)
     chance = chance * ~members(parts, "left_sole", "right_sole")
-    known = {d.id: d for d in capture.detections}
-    found = [known.get(-1 if p.annotation is None else p.annotation) for p in pieces]
-    masks = [None if d is None or d.mask is None else decode(d.mask, 0) for d in found]
+    masks = [None if mask is None else decode(mask, 0) for mask in _masks_of(capture)]
     frames = [set[int]() for _ in pieces]
     for row in range(len(bodies.frame)):
         skin = bodies.verts[row][chance[row] > UNSURE]
@@ -50,6 +48,11 @@ def contact_frames(capture: Capture) -> tuple[int, ...]:
             if mask is not None and _inside(mask, pixels) >= FEWEST:
                 frames[i].add(int(bodies.frame[row]))
     return tuple(len(f) for f in frames)
+
+
+def _masks_of(capture: Capture) -> list[Masks | None]:
+    known = {d.id: d.mask for d in capture.detections}
+    return [known.get(-1 if p.annotation is None else p.annotation) for p in capture.scene.objects]
 
 
 def _inside(mask: Bool[Tensor, "h w"], pixels: Tensor) -> int:
@@ -89,9 +92,7 @@ class ObjectEvidence:
 
 def gather_evidence(capture: Capture) -> tuple[ObjectEvidence, ...]:
     """The evidence of each object, counted on a coarse grid from projected body vertices."""
-    known = {d.id: d for d in capture.detections}
-    found = [known.get(-1 if p.annotation is None else p.annotation) for p in capture.scene.objects]
-    masks = [None if d is None else d.mask for d in found]
+    masks = _masks_of(capture)
     step = max(1, capture.scene.camera.width // CELLS)
     grids = _stack(masks, capture, step)
     near, far = np.zeros_like(grids), np.zeros_like(grids)
@@ -203,19 +204,8 @@ def evidence_table(capture: Capture, evidence: Sequence[ObjectEvidence]) -> str:
     head = (
         "object", "category", "mask px", "near px", "far px", "frames", "contacts", "missing",
     )  # fmt: skip
-    rows = [head] + [
-        (
-            e.id,
-            e.category,
-            str(e.mask_pixels),
-            str(e.near_pixels),
-            str(e.far_pixels),
-            str(e.frames),
-            str(e.contacts),
-            ", ".join(e.missing) or "-",
-        )
-        for e in evidence
-    ]
+    fields = [[*map(str, astuple(e)[:-1]), ", ".join(e.missing) or "-"] for e in evidence]
+    rows = [head, *fields]
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
     lines = ["  ".join(c.ljust(w) for c, w in zip(r, widths, strict=True)).rstrip() for r in rows]
     return "\n".join([*lines, *(f"warning: {text}" for text in capture.warnings)])

@@ -81,7 +81,6 @@ def _files(folder: Path, needed: Callable[[Path], At | None]) -> Parts:
 
 
 def _reference(folder: Path, objects: At | None) -> tuple[LoadImage | None, tuple[int, int] | None]:
-    """The picture of a folder."""
     names = ["reference.png", REFERENCE]
     named = None if objects is None else image_name(objects)
     if named is not None and isinstance(named.value, str):
@@ -94,7 +93,6 @@ def _reference(folder: Path, objects: At | None) -> tuple[LoadImage | None, tupl
 
 
 def _if_there(read: Callable[[Path], At], path: Path) -> At | None:
-    """The content of an optional file."""
     return read(path) if path.exists() else None
 
 

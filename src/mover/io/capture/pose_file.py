@@ -51,7 +51,6 @@ def pose_of(at: At, rows: int) -> BodyPose | None:
 
 
 def _word(at: At) -> At:
-    """A 0-d array of text as text."""
     return At(str(array(at, (), "text")), at.file, at.field)
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 import torch
 from msgspec import Meta, Struct
+from torch import Tensor
 
 from mover.core.types import Camera, Mesh, Scene, SceneObject
 from mover.geometry.rotations import rot_y, wrap
@@ -134,10 +135,14 @@ def check_id(at: At) -> None:
 
 
 def _piece_of(row: ObjectFields, mesh: Mesh, file: str) -> SceneObject:
-    """One object."""
-    place = torch.tensor(row.translation), torch.tensor(row.yaw), torch.tensor(row.scale)
     support = "ground" if row.support is None else str(row.support)
+    place = _place_of(row)
     return SceneObject(str(row.id), str(row.category), mesh, file, row.annotation, support, *place)
+
+
+def _place_of(row: PlaceFields) -> tuple[Tensor, Tensor, Tensor]:
+    """Translation, yaw and scale."""
+    return torch.tensor(row.translation), torch.tensor(row.yaw), torch.tensor(row.scale)
 
 
 def _check_supports(at: At, pieces: list[SceneObject]) -> None:
@@ -156,7 +161,6 @@ def _check_supports(at: At, pieces: list[SceneObject]) -> None:
 
 
 def _turn(piece: SceneObject, angle: float) -> SceneObject:
-    """The object in the world turned about +y."""
     if not angle:
         return piece
     turn = torch.tensor(angle, dtype=torch.float64)
@@ -206,7 +210,6 @@ def write_scene(
 
 
 def _object_to_json(piece: SceneObject, mesh: str) -> dict[str, Any]:
-    """The JSON object of a piece."""
     annotation = {} if piece.annotation is None else {"annotation": piece.annotation}
     return {
         "id": piece.id, "category": piece.category, "mesh": mesh, **annotation,
@@ -260,7 +263,11 @@ def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[Sce
             continue
         places = items(get(objects, name))
         pairs = zip(rows[1:], places[1:], strict=True)
-        found += [_moved(row, own[name], *load(get(at, "mesh"))) for row, at in pairs]
+        for row, place in pairs:
+            mesh, file = load(get(place, "mesh"))
+            t, yaw, scale = _place_of(row)
+            where = {"t_world_object": t, "yaw": yaw, "scale": scale}
+            found.append(replace(own[name], mesh=mesh, mesh_file=file, **where))
     if stale:
         warn(f"{at.file}: not of this scene, so not used: {listed('object', stale)}")
     return tuple(found)
@@ -268,21 +275,9 @@ def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[Sce
 
 def _is_at(row: PlaceFields, piece: SceneObject) -> bool:
     """Whether a row is where the scene has the object."""
-    turn = wrap(torch.tensor(row.yaw) - piece.yaw)
-    away = torch.tensor(row.translation) - piece.t_world_object
-    return float(away.norm()) < SAME and float(turn.abs()) < SAME
-
-
-def _moved(row: PlaceFields, piece: SceneObject, mesh: Mesh, file: str) -> SceneObject:
-    """The object in another place and shape."""
-    return replace(
-        piece,
-        mesh=mesh,
-        mesh_file=file,
-        t_world_object=torch.tensor(row.translation),
-        yaw=torch.tensor(row.yaw),
-        scale=torch.tensor(row.scale),
-    )
+    t, yaw, _ = _place_of(row)
+    away = (t - piece.t_world_object).norm()
+    return float(away) < SAME and float(wrap(yaw - piece.yaw).abs()) < SAME
 
 
 def write_hypotheses(

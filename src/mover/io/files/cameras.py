@@ -7,9 +7,11 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.geometry.camera import tilted
 from mover.io.files.fields import (
     At,
     array,
@@ -118,10 +120,7 @@ def read_intrinsics(path: Path) -> NDArray[np.float64]:
 
 def tilt_of(pitch: float, roll: float) -> list[list[float]]:
     """R_cam_world of angles [rad]: diag(1, -1, -1) R_z(roll) R_x(-pitch)."""
-    c, s, cr, sr = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
-    Rx = np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
-    Rz = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]])
-    return (np.diag([1.0, -1.0, -1.0]) @ Rz @ Rx).tolist()
+    return tilted(*torch.tensor([pitch, roll], dtype=torch.float64)).tolist()
 
 
 def _matrix(at: At) -> NDArray[np.float64]:
@@ -192,7 +191,6 @@ def _read_xml(path: Path) -> ElementTree.Element:
 def _of_node(
     tree: ElementTree.Element, path: Path, name: str, shape: tuple[int, int] | None
 ) -> NDArray[np.float64]:
-    """A matrix of OpenCV's XML."""
     at = At(None, path.name, name)
     node = tree.find(name)
     data = None if node is None else node.find("data")

@@ -169,7 +169,6 @@ def copy_mesh(source: Path, folder: Path, name: str) -> Path:
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy the bytes of a file in one step."""
     if target.exists() and target.samefile(source):
         return
     with replacing(target) as part:

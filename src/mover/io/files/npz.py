@@ -53,7 +53,6 @@ def _check_headers(path: Path) -> None:
 
 
 def _header(stream: Any) -> tuple[np.dtype[Any], int]:  # noqa: ANN401
-    """Type and bytes of an .npy file."""
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     version = npy.read_magic(stream)
     if version not in read:

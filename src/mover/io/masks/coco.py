@@ -74,7 +74,6 @@ def _runs(counts: Any, where: str) -> NDArray[np.int64]:  # noqa: ANN401
 
 
 def _compressed(runs: NDArray[np.int64], height: int, width: int) -> bytes:
-    """The compressed code of runs."""
     from pycocotools import mask as coco
 
     code: Any = {"size": [height, width], "counts": [int(n) for n in runs]}

@@ -94,7 +94,6 @@ def fitted(found: Instances, size: tuple[int, int] | None) -> Instances:
 
 
 def _resized(item: Instance, old: tuple[int, int], new: tuple[int, int]) -> Instance:
-    """An instance in an image of another size."""
     factor = new[0] / old[0], new[1] / old[1]
     box, mask = item.box, item.mask
     if box is not None:

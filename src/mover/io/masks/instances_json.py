@@ -138,7 +138,6 @@ def _size_of(at: At, row: RowFields) -> Size | None:
 def _instance(
     at: At, row: RowFields, size: Size | None, words: Mapping[int, str], frames: Mapping[int, int]
 ) -> Instance:
-    """One thing."""
     box, score = _corners(at, row)
     key = -1 if row.category_id is None else row.category_id
     return Instance(

@@ -55,7 +55,6 @@ def read_mask_arrays(path: Path, names: Mapping[str, str]) -> Instances:
 
 
 def _first(at: At, keys: Sequence[str]) -> At | None:
-    """The first of several arrays that is there."""
     return next((found for key in keys if (found := maybe(at, key)) is not None), None)
 
 
@@ -73,7 +72,6 @@ def _of_labels(labels: NDArray[Any], names: Mapping[str, str]) -> list[Instance]
 
 
 def _of_stack(at: At, given: At, stack: NDArray[Any], names: Mapping[str, str]) -> Instances:
-    """The things of a stack of masks."""
     many = stack.ndim == 4 and (stack.shape[1] != 1 or _is_one_track(at))
     if stack.ndim not in (2, 3, 4) or not stack.size:
         refuse(given, "an array of masks (n, h, w) or (frames, objects, h, w)")
@@ -125,7 +123,6 @@ def _tracks(at: At, stack: NDArray[Any], many: bool, rows: int) -> NDArray[np.in
 
 
 def _words(at: At, rows: int) -> list[str] | None:
-    """Names of the masks."""
     known = _first(at, CLASSES)
     if known is None or not isinstance(known.value, np.ndarray) or known.value.dtype.kind != "U":
         return None
@@ -193,7 +190,6 @@ def read_labels(path: Path) -> NDArray[np.int64]:
 
 
 def _numbers(picture: Any) -> NDArray[np.int64]:  # noqa: ANN401
-    """The labels of an open picture."""
     if picture.mode in ("RGBA", "LA", "PA"):
         alpha = np.asarray(picture.getchannel("A"))
         if (alpha < 255).any():
@@ -208,7 +204,6 @@ def _numbers(picture: Any) -> NDArray[np.int64]:  # noqa: ANN401
 def _of_picture(
     pixels: NDArray[np.int64], path: Path, table: Mapping[str, str], frame: int | None
 ) -> list[Instance]:
-    """The things of one picture."""
     values = [v for v in np.unique(pixels).tolist() if v != 0]
     if len(values) > MOST_LABELS:
         found = f"{len(values)} different values"

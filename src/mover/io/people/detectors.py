@@ -77,7 +77,6 @@ def _integer(at: At) -> int:
 
 
 def _instance(at: At, frame: int, count: int) -> Seen:
-    """One person of one image."""
     given = need(at, "keypoints")
     scores = either(at, "keypoint_scores", "scores")
     joints = _joints(given, None if scores is None else numbers(scores), count)
@@ -99,7 +98,6 @@ def _track(at: At) -> int:
 
 
 def _joints(at: At, scores: NDArray[np.float64] | None, count: int) -> NDArray[np.float64]:
-    """Points and confidences of one person."""
     value = numbers(at)
     width = value.size // count if value.size % count == 0 else 0
     if width not in (2, 3) or (value.ndim > 1 and value.shape[-1] != width):
@@ -112,7 +110,6 @@ def _joints(at: At, scores: NDArray[np.float64] | None, count: int) -> NDArray[n
 
 
 def _arrays(at: At, count: int) -> list[Seen]:
-    """Rows of arrays."""
     given, scores = need(at, "keypoints", "points"), either(at, "scores", "confidence")
     frames = whole(need(at, "frame", "frames"))
     person = either(at, "person", "track_id")

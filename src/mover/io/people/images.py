@@ -118,7 +118,6 @@ def _verts(at: At) -> NDArray[np.float64]:
 
 
 def _lens(at: At, known: Known) -> Tensor | None:
-    """The lens that was assumed."""
     joints, pixels = either(at, "pred_keypoints_3d"), either(at, "pred_keypoints_2d")
     if joints is not None and pixels is not None:
         points = stacked(joints, 3) + rows(need(at, "pred_cam_t"), 1, 3)

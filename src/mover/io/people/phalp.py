@@ -83,7 +83,6 @@ def _seen(at: At, tids: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _list(at: At) -> At:
-    """Rows of an array as a list."""
     value = list(at.value) if isinstance(at.value, np.ndarray) else at.value
     return At(value, at.file, at.field)
 

@@ -109,7 +109,6 @@ def _up(at: At, who: int) -> Tensor:
 
 
 def _lens(at: At, frames: int) -> Tensor | None:
-    """The lens of its video."""
     given = either(at, "intrins")
     if given is None:
         return None

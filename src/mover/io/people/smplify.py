@@ -55,7 +55,6 @@ def read_mover(path: Path, known: Known) -> Found:
 
 
 def _read(path: Path, known: Known, assumed: bool) -> Found:
-    """All fits of a file or folder."""
     files = files_of(path, "**/*.pkl", "fits")
     parts: list[Found] = []
     for index, file in enumerate(files):
@@ -112,7 +111,6 @@ def _body(at: At, count: int) -> Tensor:
 
 
 def _gender(at: At) -> str:
-    """What the file says, else neutral."""
     given = either(at, "gender")
     if given is None:
         return "neutral"

@@ -4,6 +4,7 @@ Schema: docs/data.md, "Boxes". A box is what a 3D detector or a person with a ru
 centre, full size, and yaw or a rotation.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from functools import partial
@@ -13,10 +14,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta, Struct
 
-from mover.core.types import Mesh
 from mover.furniture.library import choose_piece
 from mover.io.capture.parts import Hints, Parts
-from mover.io.capture.scene_file import scene_tree
 from mover.io.files.cameras import camera_of_tree
 from mover.io.files.fields import At, get, integer, items, maybe, read_json, refuse
 from mover.io.files.images import image_size
@@ -34,7 +33,7 @@ from mover.io.files.schema import (
 )
 from mover.io.masks.instances import Instance, Instances, objects_tree
 from mover.io.scenes.glb_scene import up_axes
-from mover.io.scenes.placing import LEVEL, Matrix, about_y, free_id, load_from
+from mover.io.scenes.placing import LEVEL, Matrix, Pieces, Placed, about_y
 
 
 class BoxFields(Struct, frozen=True):
@@ -74,18 +73,15 @@ def box_parts(path: Path, hints: Hints) -> Parts:
         size = None if hints.image is None else image_size(hints.image)
         camera = camera_of_tree(At(tree.camera, at.file, "camera"), size)
     turn = _world(tree, camera, hints.up)
-    rows: list[dict[str, Any]] = []
-    meshes: dict[str, tuple[Mesh, str]] = {}
-    for item, box in zip(items(get(at, "objects")), tree.objects, strict=True):
-        row, mesh = _piece(item, box, turn, meshes)
-        meshes[row["id"]] = mesh, ""
-        rows.append(row)
-    return Parts(
-        name=path.stem,
+    found = Pieces()
+    for i, (item, box) in enumerate(zip(items(get(at, "objects")), tree.objects, strict=True)):
+        kind = Id if isinstance(box.id, int) else Text
+        name = "" if box.id is None else str(checked(get(item, "id"), kind))
+        found.add(str(box.category), name, partial(_placed, item, box, turn, i))
+    return dataclasses.replace(
+        found.parts(path.stem, path.name, tree.ground),
         camera=camera,
-        scene=scene_tree(rows, path.name, tree.ground),
         objects=_annotations(tree.objects, camera, at.file),
-        load_mesh=partial(load_from, meshes),
     )
 
 
@@ -97,30 +93,22 @@ def _world(tree: BoxesFields, camera: At | None, up: str) -> Matrix:
     return (np.array(LEVEL) if tilt is None else rotation(tilt)).T
 
 
-def _piece(
-    at: At, box: BoxFields, turn: Matrix, used: dict[str, tuple[Mesh, str]]
-) -> tuple[dict[str, Any], Mesh]:
-    """The fields of an object, and the mesh of the library that fills its box."""
-    category, centre = str(box.category), turn @ np.array(box.center)
+def _placed(at: At, box: BoxFields, turn: Matrix, index: int, _key: str) -> Placed:
+    """The object of a box: the mesh of the library that fills it."""
     order, yaw = _upright(at, _axes(at, box, turn))
     size = np.array(box.size)[order]
-    mesh = choose_piece(category, (float(size[0]), float(size[1]), float(size[2])))
+    mesh = choose_piece(str(box.category), (float(size[0]), float(size[1]), float(size[2])))
     low, high = mesh.verts.double().numpy().min(0), mesh.verts.double().numpy().max(0)
+    centre = turn @ np.array(box.center)
     place = centre - np.array([0.0, size[1] / 2, 0.0])  # the library stands on its bottom
-    given = (
-        "" if box.id is None else checked(get(at, "id"), Id if isinstance(box.id, int) else Text)
-    )
-    name = free_id(category, str(given), used)
-    return {
-        "id": name,
-        "category": category,
-        "mesh": name,
-        "annotation": None if box.box2d is None else len(used),
+    fields = {
+        "annotation": None if box.box2d is None else index,
         "translation": place.tolist(),
         "yaw": yaw,
         "scale": (size / (high - low)).tolist(),
         "support": "ground" if box.support is None else str(box.support),
-    }, mesh
+    }
+    return fields, (mesh, ""), ""
 
 
 def _axes(at: At, box: BoxFields, turn: Matrix) -> Matrix:

@@ -5,27 +5,18 @@ holds. Meshes have no axes of their own: an object gets an upright box around it
 guessed (placing.py). Gravity is not known either: the camera is level unless --camera says more.
 """
 
+import dataclasses
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mover.core.errors import InputError
-from mover.core.types import Mesh
 from mover.io.capture.parts import Hints, Parts, image_parts
-from mover.io.capture.scene_file import scene_tree
 from mover.io.files.cameras import camera_of_tree
 from mover.io.files.fields import At, get, maybe, read_json
 from mover.io.files.schema import rigid, rotation
-from mover.io.scenes.placing import (
-    LEVEL,
-    Matrix,
-    category_of_name,
-    free_id,
-    load_from,
-    without_axes,
-)
+from mover.io.scenes.placing import LEVEL, Matrix, Pieces, category_of_name, without_axes
 
 WHOLE = ("full_scene", "background", "depth_scene")
 
@@ -47,21 +38,17 @@ def gen3dsr_parts(folder: Path, hints: Hints) -> Parts:
     paths = [p for p in (folder / "reconstruction").glob("*.glb") if p.stem not in WHOLE]
     if not paths:
         raise InputError(f"{folder}: has no reconstruction/<i>_<label>.glb, expected meshes")
-    rows: list[dict[str, Any]] = []
-    meshes: dict[str, tuple[Mesh, str]] = {}
+    found = Pieces()
     for path in sorted(paths, key=_number):
         category = hints.names.get(path.stem) or category_of_name(path.stem)
-        name = free_id(category, path.stem, meshes)
-        fields, meshes[name] = without_axes(path, world, category, hints.work / f"{name}.glb")
-        rows.append({"id": name, "category": category, "mesh": name, **fields})
+        copy = partial(without_axes, path, world, category)
+        found.add(category, path.stem, lambda key, copy=copy: copy(hints.work / f"{key}.glb"))
     image = folder / "input.png"
     load, size = image_parts(image) if image.is_file() else (None, None)
     how = "level" if tilt is None else "as given"
-    return Parts(
-        name=folder.resolve().name,
+    return dataclasses.replace(
+        found.parts(folder.resolve().name, folder.name),
         camera=camera,
-        scene=scene_tree(rows, folder.name),
-        load_mesh=partial(load_from, meshes),
         load_image=load if size == (given.value["w"], given.value["h"]) else None,
         image_size=size,
         notes=(f"the camera is {how}; the fronts of the objects are guesses",),

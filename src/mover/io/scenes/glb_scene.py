@@ -5,6 +5,7 @@ scene's origin is the camera, which looks along -z: glTF's axes are ours. Scenes
 that were written with y down or z up are turned by --up.
 """
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from functools import partial
@@ -15,19 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.types import Mesh
 from mover.io.capture.parts import Hints, Parts
-from mover.io.capture.scene_file import scene_tree
 from mover.io.files.fields import At, maybe, reason
 from mover.io.files.images import image_size
 from mover.io.files.meshes import gltf_tree
 from mover.io.scenes.placing import (
     FLIP,
     Matrix,
+    Pieces,
+    Placed,
     category_of_name,
     corners,
-    free_id,
-    load_from,
     load_parts,
     posed,
     write_parts,
@@ -62,16 +61,14 @@ def glb_parts(path: Path, hints: Hints) -> Parts:
         camera = At({**fields, "R_cam_world": R.tolist()}, path.name, "cameras")
     else:
         camera = hints.camera
-    rows, meshes, notes = _objects(scene, turn, hints)
-    if not rows:
+    found = Pieces()
+    for node in _nodes(scene):
+        category = hints.names.get(node) or category_of_name(node)
+        found.add(category, node, partial(_placed, scene, node, turn, hints.work))
+    if not found.rows:
         raise InputError(f"{path.name}: has no meshes, expected a glTF scene of furniture")
-    return Parts(
-        name=path.stem,
-        camera=camera,
-        scene=scene_tree(rows, path.name, _ground(scene, turn)),
-        load_mesh=partial(load_from, meshes),
-        notes=tuple(notes),
-    )
+    parts = found.parts(path.stem, path.name, _ground(scene, turn))
+    return dataclasses.replace(parts, camera=camera)
 
 
 def up_axes(up: str) -> Matrix:
@@ -85,29 +82,13 @@ def up_axes(up: str) -> Matrix:
     return UP[up or "y"]
 
 
-def _objects(
-    scene: Any,  # noqa: ANN401
-    turn: Matrix,
-    hints: Hints,
-) -> tuple[list[dict[str, Any]], dict[str, tuple[Mesh, str]], list[str]]:
-    """Objects of scene.json, their meshes, and what was lost."""
-    rows: list[dict[str, Any]] = []
-    meshes: dict[str, tuple[Mesh, str]] = {}
-    notes: list[str] = []
-    for node in _nodes(scene):
-        matrix, _ = scene.graph[node]
-        own = _below(scene, node)
-        category = hints.names.get(node) or category_of_name(node)
-        name = free_id(category, node, meshes)
-        file = hints.work / f"{name}.glb"
-        mesh, _ = found = write_parts(own, np.eye(4), file)
-        place = posed(turn @ np.asarray(matrix), *corners(mesh))
-        if place.bake is not None:
-            found = write_parts(own, place.bake, file)
-        meshes[name] = found
-        notes += [f"{name}: {place.note}"] if place.note else []
-        rows.append({"id": name, "category": category, "mesh": name, **place.fields})
-    return rows, meshes, notes
+def _placed(scene: Any, node: str, turn: Matrix, work: Path, key: str) -> Placed:  # noqa: ANN401
+    own, file = _below(scene, node), work / f"{key}.glb"
+    mesh, _ = found = write_parts(own, np.eye(4), file)
+    place = posed(turn @ np.asarray(scene.graph[node][0]), *corners(mesh))
+    if place.bake is not None:
+        found = write_parts(own, place.bake, file)
+    return place.fields, found, place.note
 
 
 def _nodes(scene: Any) -> list[str]:  # noqa: ANN401

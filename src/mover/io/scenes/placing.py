@@ -2,8 +2,9 @@
 
 import math
 import re
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.types import Mesh
 from mover.furniture.library import BACKS, BEDS, canonical
-from mover.io.capture.parts import UNKNOWN
+from mover.io.capture.parts import UNKNOWN, Parts
+from mover.io.capture.scene_file import scene_tree
 from mover.io.files.fields import At, reason
 from mover.io.files.meshes import check_gltf, mesh_of, read_mesh
 
@@ -24,6 +26,8 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 """x right, y down, z forward <-> x right, y up, z backward; its own inverse."""
 LEVEL = FLIP.tolist()
 Matrix = NDArray[np.float64]
+Placed = tuple[dict[str, Any], tuple[Mesh, str], str]
+"""Fields of an object of scene.json, its mesh and file, and what was lost."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ def posed(matrix: Matrix, low: Matrix, high: Matrix) -> Posed:
     A, t = matrix[:3, :3], matrix[:3, 3]
     size = float(np.abs(A).max())
     yaw = math.atan2(A[0, 2], A[2, 2]) if math.hypot(A[0, 2], A[2, 2]) > EXACT * size else 0.0
-    rest = _about_y(-yaw) @ A
+    rest = about_y(-yaw) @ A
     scale = np.diag(rest)
     if np.abs(rest - np.diag(scale)).max() <= EXACT * size and (scale > 0).all():
         return Posed(_fields(t, yaw, scale), None, "")
@@ -62,7 +66,7 @@ def posed(matrix: Matrix, low: Matrix, high: Matrix) -> Posed:
     skewed = np.abs(R.T @ R - np.eye(3)).max() > SHEAR or np.linalg.det(A) <= 0
     if not skewed and tilt <= MOST_TILT:
         centre = (low + high) / 2
-        place = A @ centre + t - _about_y(yaw) @ (lengths * centre)
+        place = A @ centre + t - about_y(yaw) @ (lengths * centre)
         return Posed(_fields(place, yaw, lengths), None, f"a tilt of {math.degrees(tilt):.1f}°")
     return _baked(A, t, low, high)
 
@@ -75,10 +79,10 @@ def _baked(A: Matrix, t: Matrix, low: Matrix, high: Matrix) -> Posed:
         front = A[:, 2]
     yaw = math.atan2(front[0], front[2])
     bake = np.eye(4)
-    bake[:3, :3] = _about_y(-yaw) @ A
+    bake[:3, :3] = about_y(-yaw) @ A
     centre = bake[:3, :3] @ ((low + high) / 2)
     bake[:3, 3] = -centre  # near its own origin, where single precision is finest
-    place = t + _about_y(yaw) @ centre
+    place = t + about_y(yaw) @ centre
     mirrored = " mirrored" if np.linalg.det(A) < 0 else ""
     note = f"it was{mirrored} about other axes, which went into a new mesh"
     return Posed(_fields(place, yaw, np.ones(3)), bake, note)
@@ -86,12 +90,36 @@ def _baked(A: Matrix, t: Matrix, low: Matrix, high: Matrix) -> Posed:
 
 def about_y(angle: float) -> Matrix:
     """The right-handed rotation about +y."""
-    return _about_y(angle)
-
-
-def _about_y(angle: float) -> Matrix:
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Objects of scene.json that a reader finds, and their meshes by their ids."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    meshes: dict[str, tuple[Mesh, str]] = field(default_factory=dict[str, tuple[Mesh, str]])
+    notes: list[str] = field(default_factory=list[str])
+
+    def add(self, category: str, name: str, place: Callable[[str], Placed]) -> None:
+        """Append the object that `place` makes for a free id.
+
+        Args:
+            category: Free text.
+            name: What the tool calls it.
+            place: Fields of scene.json, the mesh with its file, and what was lost.
+        """
+        key = free_id(category, name, self.meshes)
+        fields, self.meshes[key], note = place(key)
+        self.notes.extend([f"{key}: {note}"] if note else [])
+        self.rows.append({"id": key, "category": category, "mesh": key, **fields})
+
+    def parts(self, name: str, file: str, ground: float | None = None) -> Parts:
+        """Parts of a capture with these objects."""
+        tree = scene_tree(self.rows, file, ground)
+        load = partial(load_from, self.meshes)
+        return Parts(name=name, scene=tree, load_mesh=load, notes=tuple(self.notes))
 
 
 def _fields(t: Matrix, yaw: float, scale: Matrix) -> dict[str, Any]:
@@ -250,9 +278,7 @@ def guess_front(verts: NDArray[np.float64], category: str) -> float:
     return math.atan2(math.sin(yaw), math.cos(yaw))
 
 
-def without_axes(
-    path: Path, world: Matrix, category: str, file: Path
-) -> tuple[dict[str, Any], tuple[Mesh, str]]:
+def without_axes(path: Path, world: Matrix, category: str, file: Path, note: str = "") -> Placed:
     """The place of a mesh that lies where it is, and a copy about the middle of its box's bottom.
 
     Args:
@@ -260,6 +286,7 @@ def without_axes(
         world: Our world (+y up, the camera at the origin) from its vertices (4, 4).
         category: Free text.
         file: Where the copy goes.
+        note: What was lost.
 
     Raises:
         InputError: If the mesh cannot be read.
@@ -273,5 +300,4 @@ def without_axes(
     bake = np.eye(4)
     bake[:3, :3], bake[:3, 3] = about_y(-yaw), -origin
     found = write_parts(load_parts(path), bake @ world, file)
-    place = about_y(yaw) @ origin
-    return {"translation": place.tolist(), "yaw": yaw, "scale": [1.0, 1.0, 1.0]}, found
+    return _fields(about_y(yaw) @ origin, yaw, np.ones(3)), found, note

@@ -11,16 +11,15 @@ forward, with rows as vectors. Sizes are those of the tool's depth, which may no
 import dataclasses
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mover.core.errors import InputError
 from mover.core.types import Mesh
-from mover.io.capture.parts import UNKNOWN, Hints, Parts
-from mover.io.capture.scene_file import scene_tree
+from mover.io.capture.parts import Hints, Parts
 from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, array, get, mapping, maybe, number, read_json, refuse, text
+from mover.io.files.images import image_size
 from mover.io.files.meshes import KINDS, read_mesh
 from mover.io.files.npz import read_npz
 from mover.io.files.schema import rotation
@@ -28,12 +27,12 @@ from mover.io.scenes.placing import (
     FLIP,
     LEVEL,
     Matrix,
+    Pieces,
+    Placed,
     category_of_name,
     common_up,
     corners,
-    free_id,
     level_of,
-    load_from,
     load_parts,
     posed,
     without_axes,
@@ -108,16 +107,12 @@ def pose_matrix(at: At) -> Matrix:
     Raises:
         InputError: If a field is wrong.
     """
+    from scipy.spatial.transform import Rotation
+
     q = _numbers(get(at, "rotation"), 4)
-    length = float(np.linalg.norm(q))
-    if not 0.5 < length < 2:
+    if not 0.5 < float(np.linalg.norm(q)) < 2:
         refuse(get(at, "rotation"), "a unit quaternion (w, x, y, z)")
-    w, x, y, z = (q / length).tolist()
-    R = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    R = Rotation.from_quat(np.roll(q, -1)).as_matrix()
     given = get(at, "scale")
     scale = np.array([number(given)] * 3) if isinstance(given.value, int | float) else None
     scale = _numbers(given, 3) if scale is None else scale
@@ -193,29 +188,26 @@ def sam3d_parts(folder: Path, hints: Hints) -> Parts:
     lens = folder / "focal_length.json"
     camera = hints.camera
     if camera is None and lens.is_file():
-        camera = read_camera_file(lens, _size(hints))
+        size = None if hints.image is None else image_size(hints.image)
+        camera = read_camera_file(lens, size)
     things = _things(folder, hints)
     if not things:
         raise InputError(f"{folder}: has no meshes, expected <name>.glb with <name>.npz or .json")
     R, how = _attitude(camera, things)
-    rows, meshes, notes = _pieces(things, R, hints.work)
+    turn = np.eye(4)
+    turn[:3, :3] = R.T
+    found = Pieces()
+    for thing in things:
+        found.add(thing.category, thing.name, partial(_placed_piece, thing, turn, hints.work))
     if camera is not None:
         camera = At({**camera.value, "R_cam_world": R.tolist()}, camera.file)
     people = person_parts(folder)
     return dataclasses.replace(
-        people,
-        name=folder.resolve().name,
+        found.parts(folder.resolve().name, folder.name),
         camera=camera,
-        scene=scene_tree(rows, folder.name),
-        load_mesh=partial(load_from, meshes),
-        notes=(how, *notes, *people.notes),
+        bodies=people.bodies,
+        notes=(how, *found.notes, *people.notes),
     )
-
-
-def _size(hints: Hints) -> tuple[int, int] | None:
-    from mover.io.files.images import image_size
-
-    return None if hints.image is None else image_size(hints.image)
 
 
 def _things(folder: Path, hints: Hints) -> list[_Thing]:
@@ -259,24 +251,6 @@ def _attitude(camera: At | None, things: list[_Thing]) -> tuple[Matrix, str]:
     return level_of(up), "the camera's tilt is that at which most objects stand upright"
 
 
-def _pieces(
-    things: list[_Thing], R: Matrix, work: Path
-) -> tuple[list[dict[str, Any]], dict[str, tuple[Mesh, str]], list[str]]:
-    """Objects of scene.json, their meshes, and what was lost."""
-    rows: list[dict[str, Any]] = []
-    meshes: dict[str, tuple[Mesh, str]] = {}
-    notes: list[str] = []
-    turn = np.eye(4)
-    turn[:3, :3] = R.T
-    for thing in things:
-        name = free_id(thing.category, thing.name, meshes)
-        fields, meshes[name], note = _placed_piece(thing, turn, work / f"{name}.glb")
-        notes += [f"{name}: {note}"] if note else []
-        category = thing.category or UNKNOWN
-        rows.append({"id": name, "category": category, "mesh": name, **fields})
-    return rows, meshes, notes
-
-
 def _check_placed(thing: _Thing) -> None:
     """Refuse a mesh in its own frame: one that was placed lies before the camera."""
     ahead = -thing.mesh.verts[:, 2]
@@ -286,17 +260,14 @@ def _check_placed(thing: _Thing) -> None:
         raise InputError(f"{thing.file.name}: {where}, expected {expected}")
 
 
-def _placed_piece(
-    thing: _Thing, turn: Matrix, file: Path
-) -> tuple[dict[str, Any], tuple[Mesh, str], str]:
-    """The place of a mesh, the mesh, and what was lost."""
-    matrix = turn @ thing.cam_mesh
+def _placed_piece(thing: _Thing, turn: Matrix, work: Path, key: str) -> Placed:
+    matrix, copy = turn @ thing.cam_mesh, work / f"{key}.glb"
     if np.array_equal(thing.cam_mesh, placed_already()):
         _check_placed(thing)
-        fields, mesh = without_axes(thing.file, matrix, thing.category, file)
-        return fields, mesh, "it was placed already; its front is a guess"
+        note = "it was placed already; its front is a guess"
+        return without_axes(thing.file, matrix, thing.category, copy, note)
     found = posed(matrix, *corners(thing.mesh))
     mesh = thing.mesh, str(thing.file.resolve())
     if found.bake is not None:
-        mesh = write_parts(load_parts(thing.file), found.bake, file)
+        mesh = write_parts(load_parts(thing.file), found.bake, copy)
     return found.fields, mesh, found.note

@@ -40,6 +40,7 @@ from mover.io.files.fields import (
 from mover.io.files.images import image_size, read_image
 from mover.io.files.meshes import KINDS, mesh_of, read_mesh
 from mover.io.masks.instances import mask_code
+from mover.io.scenes.placing import about_y
 
 CLASSES = (
     "void", "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window",
@@ -144,8 +145,7 @@ def _box(at: At, name: str) -> Box:
     if (half <= 0).any():
         refuse(parts["coeffs"], "half sizes above 0", f"{half.tolist()}")
     yaw = math.atan2(basis[2, 0], basis[2, 2])
-    c, s = math.cos(yaw), math.sin(yaw)
-    if abs(basis - np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])).max() > 1e-3:
+    if abs(basis - about_y(-yaw)).max() > 1e-3:
         refuse(parts["basis"], "the axes of an upright box", f"{basis.round(3).tolist()}")
     return Box(array(parts["centroid"], (1, 3)).astype(np.float64)[0], half, yaw, name)
 
@@ -285,9 +285,7 @@ def _piece(
         refuse(At(None, file), "a solid mesh", "a flat mesh")
     scale = 2 * box.half / (high - low)
     yaw = box.yaw + math.pi / 2  # TO_OURS is R_y of a quarter turn
-    c, s = math.cos(yaw), math.sin(yaw)
-    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-    place = TO_OURS @ box.center - R @ (scale * (low + high) / 2)
+    place = TO_OURS @ box.center - about_y(yaw) @ (scale * (low + high) / 2)
     lifted = box.name in LIFTED and box.center[1] - box.half[1] > floor + ON_FLOOR
     return {
         "id": f"{box.name}_{index}",
