@@ -21,7 +21,7 @@ from furnished import (
 )
 from little_room import walkers
 
-import mover.io.export.usd
+import mover.io.export.usd_mesh
 from mover.app.cli import run_command
 from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
@@ -283,7 +283,7 @@ class TestUsd:
     def stage(self, tmp_path: Path):
         Usd = pytest.importorskip("pxr.Usd", reason="needs usd-core")
         self.home = finished(tmp_path, two_people())
-        return Usd.Stage.Open(str(export_usd(self.home, tmp_path).files[0]))
+        return Usd.Stage.Open(str(export_usd(self.home, tmp_path, "morph").files[0]))
 
     def test_objects_stand_where_they_stood_to_a_hundredth_of_a_millimetre(self, stage):
         from pxr import UsdGeom
@@ -291,7 +291,7 @@ class TestUsd:
         assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
         assert UsdGeom.GetStageUpAxis(stage) == "Y"
         for piece in self.home.scene.objects:
-            mesh = stage.GetPrimAtPath(f"/room/{piece.id}/mesh")
+            mesh = stage.GetPrimAtPath(f"/room/{piece.id}/visual/mesh")
             points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get(), float)
             matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh))
             found = np.concatenate([points, np.ones((len(points), 1))], 1) @ matrix
@@ -415,7 +415,7 @@ def test_a_folder_without_a_result_is_refused(tmp_path: Path, capsys):
 
 
 def test_without_usd_core_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(mover.io.export.usd, "find_spec", lambda _: None)
+    monkeypatch.setattr(mover.io.export.usd_mesh, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=r"\.\[usd\]"):
         export_usd(finished(tmp_path), tmp_path)
 

@@ -16,7 +16,7 @@ from mover.core.errors import InputError
 from mover.core.run import Run
 from mover.core.types import Scene
 from mover.io.capture.scene_file import read_scene
-from mover.io.export.mjcf import body_name, mjcf_of
+from mover.io.export.mjcf import body_name, mjcf_of, text_of
 from mover.io.export.solids import Solid, solids_of
 from mover.io.files.fields import write_json
 
@@ -78,8 +78,8 @@ def simulate(
     mujoco: Any = import_module("mujoco")
     config = config or SimulationConfig()
     solids = solids_of(scene, run)
-    text, meshes = mjcf_of(scene, solids, looks=False)
-    model = mujoco.MjModel.from_xml_string(text, meshes)
+    root, meshes = mjcf_of(scene, solids, looks=False)
+    model = mujoco.MjModel.from_xml_string(text_of(root), meshes)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     start = _states(data, solids)

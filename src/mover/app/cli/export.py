@@ -29,9 +29,10 @@ class ExportArgs:
     capture: Path | None = None
     """Folder of the capture: its bodies.npz tells the parameters of the bodies."""
     body: Literal["auto", "skin", "morph", "none"] = "auto"
-    """glb: how people move: on bones, by exact shapes of some frames, or not at all."""
+    """glb, usd: how people move: on bones, by exact shapes of some frames, or not at all (also
+    mjcf)."""
     up: Literal["y", "z"] = "y"
-    """bodies: y is the world of scene.json, z that of AMASS."""
+    """bodies, usd: y is the world of scene.json, z that of AMASS and of simulators."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ def export(arguments: Sequence[str]) -> None:
     writers = {target: chosen("--to", target, "export") for target in args.to}
     finished, folder = read_finished(args.out, args.capture), args.out / "export"
     options = {"glb": {"body": args.body}, "bodies": {"up": args.up}}
+    options |= {"usd": {"body": args.body, "up": args.up}, "mjcf": {"body": args.body}}
     for target, write in writers.items():
         found: Exported = write(finished, folder, **options.get(target, {}))
         shown = found.files if len(found.files) <= 3 else found.files[:1]

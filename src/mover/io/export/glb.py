@@ -1,6 +1,5 @@
 """scene.glb: objects as nodes, floor, camera, and people who move on bones or by shapes."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +12,6 @@ from torch import Tensor
 from mover.bodies.skinning import SkinnedBody
 from mover.core.colours import Colour, person_colour
 from mover.core.errors import InputError
-from mover.core.records import record
 from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals
 from mover.io.export.finished import Exported, Finished
@@ -27,8 +25,9 @@ from mover.io.export.gltf import (
     add_sampler,
 )
 from mover.io.export.people import FPS, Track, keyframes, tracks_of
-from mover.io.export.posed import Motion, all_angles, misses, motion_of, skin_of
+from mover.io.export.posed import all_angles
 from mover.io.export.scene_glb import write_glb
+from mover.io.export.skin import Skin, quaternions, rest_of, skin_for
 
 TOLERANCE = 0.005  # [m]
 MOST = 60  # shapes of one person
@@ -106,38 +105,12 @@ INFLUENCES = 4  # joints that move a vertex: what every viewer draws
 STILL = 1e-6  # [rad], [m]; what moves less is not animated
 
 
-@record
-class Skin:
-    """Bones of everybody, each person with one shape."""
-
-    motion: Motion
-    model: SkinnedBody
-    """With four weights a vertex."""
-    miss: float
-    """How far the skin is off the meshes of the result at most [m]."""
-
-
-def fit_skin(motion: Motion, model: SkinnedBody, bodies: Bodies) -> Skin:
-    """One shape for each person, four weights for each vertex, and what they cost."""
-    share, joint = model.weights.topk(INFLUENCES, dim=1)
-    weights = torch.zeros_like(model.weights).scatter(1, joint, share / share.sum(1, keepdim=True))
-    simple = dataclasses.replace(model, weights=weights)
-    betas = motion.pose.betas.clone()
-    for track in tracks_of(bodies):
-        betas[track.rows] = betas[track.rows].mean(0)
-    posed = Motion(dataclasses.replace(motion.pose, betas=betas), motion.size)
-    return Skin(posed, simple, misses(posed, simple, bodies))
-
-
 def add_skinned(
     document: Document, animation: int, skin: Skin, track: Track, tint: Colour
 ) -> list[Channel]:
     """Append a person: mesh, bones and their motion; what moves."""
-    pose, model, name = skin.motion.pose, skin.model, f"person_{track.person}"
-    betas = pose.betas[track.rows[0]]
-    count = len(betas)
-    rest = model.verts + model.shape_dirs[..., :count] @ betas
-    joints = model.joints + model.joint_dirs[..., :count] @ betas
+    model, name = skin.model, f"person_{track.person}"
+    rest, joints = rest_of(skin, int(track.rows[0]))
     bones = _add_bones(document, model, joints)
     top = document.add("nodes", {"name": name, "children": [bones[0]]})
     document.add_root(top)
@@ -225,22 +198,11 @@ def _move(
     return channels
 
 
-def quaternions(vectors: Float[Tensor, "frames joints 3"]) -> NDArray[np.float32]:
-    """Rotations (x, y, z, w) of axis-angle vectors; neighbours in time are on one side."""
-    angle = vectors.double().norm(dim=-1, keepdim=True)
-    half = torch.where(angle > 1e-9, (angle / 2).sin() / angle.clamp_min(1e-9), 0.5)
-    found = torch.cat([vectors.double() * half, (angle / 2).cos()], -1)
-    dots = (found[1:] * found[:-1]).sum(-1)
-    side = torch.where(dots < 0, -1.0, 1.0).cumprod(0)
-    return torch.cat([found[:1], found[1:] * side[..., None]]).float().numpy()
-
-
 # The file with everything in it.
 
 
 BodyForm = Literal["auto", "skin", "morph", "none"]
 FAR_OFF = 0.01  # [m]
-SKIN_MISS = 0.02  # [m], the most that a skinned body may miss the result's mesh
 
 
 def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exported:
@@ -260,7 +222,7 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
     bodies = finished.bodies
     if bodies is None or body == "none":
         return Exported((path,), ("no people",))
-    skin = _fit(finished) if body in ("auto", "skin") else "morph was asked for"
+    skin = skin_for(finished, INFLUENCES) if body in ("auto", "skin") else "morph was asked for"
     document = Document(path.read_bytes())
     first, step = int(bodies.frame.min()), 1 / (bodies.fps or FPS)
     notes = [f"frame {first} of the video is at 0 s, each next one {step:g} s later"]
@@ -291,21 +253,6 @@ def _add_people(document: Document, bodies: Bodies, skin: Skin | None) -> list[s
         channels += moved
     _connect(document, animation, channels)
     return notes
-
-
-def _fit(finished: Finished) -> Skin | str:
-    """The bones that move the result's bodies, or why there are none."""
-    motion = motion_of(finished)
-    if isinstance(motion, str):
-        return motion
-    assert finished.bodies is not None
-    model = skin_of(motion.pose, finished.bodies)
-    if model is None:
-        return f"the model {motion.pose.model!r} has no bones that are known here"
-    skin = fit_skin(motion, model, finished.bodies)
-    if not skin.miss <= SKIN_MISS:
-        return f"its bones miss the result's meshes by {skin.miss:.3f} m"
-    return skin
 
 
 def _connect(document: Document, animation: int, channels: list[Channel]) -> None:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import torch
@@ -12,36 +13,66 @@ from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.types import Camera, Scene
 from mover.io.export.finished import Exported, Finished
-from mover.io.export.solids import AXES, Solid, floor_height, mesh_bytes, numbers, solids_of
+from mover.io.export.mjcf_people import add_figures, figures_of
+from mover.io.export.solids import (
+    AXES,
+    FRICTION,
+    Solid,
+    floor_height,
+    mesh_bytes,
+    numbers,
+    solids_of,
+)
 
 STEP = 0.002  # [s]
-FRICTION = (0.8, 0.005, 0.0001)  # wood on wood or carpet; slip, spin, roll
+BodyForm = Literal["auto", "skin", "morph", "none"]
 RESERVED = "world"
 
 
-def export_mjcf(finished: Finished, folder: Path) -> Exported:
+def export_mjcf(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exported:
     """Write `mjcf/room.xml` and its meshes.
 
     Args:
         finished: The result.
         folder: Gets the folder `mjcf`.
+        body: none: without people; else they are mocap bodies where their joints are known.
     """
     solids = solids_of(finished.scene, Run(finished.out))
-    text, meshes = mjcf_of(finished.scene, solids)
+    root, meshes = mjcf_of(finished.scene, solids)
+    notes = ["+z is up and the floor is at 0", ", ".join(f"{s.id} {s.mass:.0f} kg" for s in solids)]
+    notes.append(_add_people(root, finished) if body != "none" else "no people")
     home = folder / "mjcf"
     for name, content in meshes.items():
         with replacing(home / name) as part:
             part.write_bytes(content)
     with replacing(home / "room.xml") as part:
-        part.write_text(text)
-    kilos = ", ".join(f"{s.id} {s.mass:.0f} kg" for s in solids)
-    return Exported((home / "room.xml",), ("+z is up and the floor is at 0", kilos))
+        part.write_text(text_of(root))
+    return Exported((home / "room.xml",), tuple(notes))
+
+
+def _add_people(root: Element, finished: Finished) -> str:
+    """Append the people's skeletons; what there is to say about them."""
+    figures = figures_of(finished)
+    if isinstance(figures, str):
+        return f"no people: {figures}"
+    assert finished.bodies is not None
+    add_figures(root, figures, finished.bodies)
+    count = len(finished.bodies.frame.unique())
+    return (
+        f"people are mocap bodies that touch nothing; {count} keyframes, frame_<number>, move them"
+    )
+
+
+def text_of(root: Element) -> str:
+    """The model as a file has it."""
+    indent(root)
+    return tostring(root, encoding="unicode") + "\n"
 
 
 def mjcf_of(
     scene: Scene, solids: Sequence[Solid], looks: bool = True
-) -> tuple[str, dict[str, bytes]]:
-    """The model as text, and its mesh files by name.
+) -> tuple[Element, dict[str, bytes]]:
+    """The model, and its mesh files by name.
 
     Args:
         scene: Gives the camera and the floor.
@@ -65,8 +96,7 @@ def mjcf_of(
     meshes: dict[str, bytes] = {}
     for index, solid in enumerate(solids):
         meshes |= _add_solid(asset, world, solid, (index, looks))
-    indent(root)
-    return tostring(root, encoding="unicode") + "\n", meshes
+    return root, meshes
 
 
 def _reach(solids: Sequence[Solid]) -> float:
@@ -79,6 +109,8 @@ def _add_defaults(root: Element) -> None:
     default = SubElement(root, "default")
     collide = SubElement(default, "default", {"class": "collide"})
     SubElement(collide, "geom", type="mesh", group="3", friction=numbers(FRICTION), condim="4")
+    person = SubElement(default, "default", {"class": "person"})
+    SubElement(person, "geom", type="capsule", group="1", contype="0", conaffinity="0", mass="0")
     look = SubElement(default, "default", {"class": "look"})
     SubElement(look, "geom", type="mesh", group="2", contype="0", conaffinity="0", mass="0")
 

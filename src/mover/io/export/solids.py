@@ -29,6 +29,7 @@ upholstered is mostly foam, and a cabinet's mesh is full where the piece is holl
 give usual weights (a sofa for two 45 kg, a wardrobe 80 kg)."""
 OTHER = 250.0
 LEAST = 0.05  # [kg]
+FRICTION = (0.8, 0.005, 0.0001)  # wood on wood or carpet; slip, spin, roll
 AXES = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 """From +y up to +z up."""
 

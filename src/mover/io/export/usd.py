@@ -1,160 +1,99 @@
-"""scene.usdc: metres, +y up, objects with their placement and looks, camera, people over time."""
+"""scene.usdc: metres, objects with looks and physics, floor, camera, people over time."""
 
-import hashlib
-from importlib import import_module
-from importlib.util import find_spec
-from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
-from mover.core.colours import Colour, colour, person_colour
+from mover.core.colours import Colour, colour
 from mover.core.errors import InputError
 from mover.core.files import replacing
-from mover.core.types import Bodies, Camera, Scene, SceneObject
+from mover.core.run import Run
+from mover.core.types import Camera, SceneObject
 from mover.geometry.camera import NEAR
 from mover.io.export.finished import Exported, Finished
-from mover.io.export.people import FPS, Track, keyframes, seen_from_to, tracks_of
+from mover.io.export.people import FPS, tracks_of
 from mover.io.export.scene_glb import floor_of, parts_of
-
-
-def add_look(stage: Any, mesh: Any, part: Any, folder: Path) -> None:  # noqa: ANN401
-    """Give a mesh the material of a trimesh part: its texture or colour, or colours of vertices."""
-    from trimesh.visual import ColorVisuals
-    from trimesh.visual.material import PBRMaterial
-
-    if isinstance(part.visual, ColorVisuals):
-        _add_vertex_colours(mesh, np.asarray(part.visual.vertex_colors))
-        return
-    material = part.visual.material
-    plain = material if isinstance(material, PBRMaterial) else material.to_pbr()
-    rgba = plain.baseColorFactor
-    colour = [1.0, 1.0, 1.0] if rgba is None else [float(c) / 255 for c in np.asarray(rgba)[:3]]
-    picture, uv = plain.baseColorTexture, part.visual.uv
-    textured = picture is not None and uv is not None and len(uv) == len(part.vertices)
-    shader = _bind_surface(stage, mesh, colour)
-    if textured:
-        _add_uv(mesh, np.asarray(uv))
-        _connect_picture(stage, shader, _save_picture(picture, folder))
-
-
-def _add_vertex_colours(mesh: Any, rgba: Any) -> None:  # noqa: ANN401
-    UsdGeom, Vt = pxr("UsdGeom"), pxr("Vt")
-
-    share = rgba[:, :3].astype(np.float32) / 255
-    light = np.where(share > 0.04045, ((share + 0.055) / 1.055) ** 2.4, share / 12.92)
-    primvar = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-    primvar.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(light, np.float32)))
-
-
-def _add_uv(mesh: Any, uv: Any) -> None:  # noqa: ANN401
-    """Texture coordinates from the lower left corner, as trimesh and USD both have them."""
-    Sdf, UsdGeom, Vt = pxr("Sdf"), pxr("UsdGeom"), pxr("Vt")
-
-    kind = Sdf.ValueTypeNames.TexCoord2fArray
-    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", kind, UsdGeom.Tokens.vertex)
-    primvar.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uv[:, :2], np.float32)))
-
-
-def _bind_surface(stage: Any, mesh: Any, colour: list[float]) -> Any:  # noqa: ANN401
-    """A rough surface of one colour; its shader."""
-    Gf, Sdf, UsdShade = pxr("Gf"), pxr("Sdf"), pxr("UsdShade")
-
-    place = mesh.GetPath().AppendChild("look")
-    look = UsdShade.Material.Define(stage, place)
-    shader = UsdShade.Shader.Define(stage, place.AppendChild("surface"))
-    shader.CreateIdAttr("UsdPreviewSurface")
-    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*colour))
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.9)
-    look.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(look)
-    return shader
-
-
-def _connect_picture(stage: Any, shader: Any, picture: str) -> None:  # noqa: ANN401
-    Sdf, UsdShade = pxr("Sdf"), pxr("UsdShade")
-
-    names, above = Sdf.ValueTypeNames, shader.GetPath().GetParentPath()
-    reader = UsdShade.Shader.Define(stage, above.AppendChild("uv"))
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", names.String).Set("st")
-    texture = UsdShade.Shader.Define(stage, above.AppendChild("picture"))
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", names.Asset).Set(Sdf.AssetPath(picture))
-    for wrap in ("wrapS", "wrapT"):
-        texture.CreateInput(wrap, names.Token).Set("repeat")
-    texture.CreateInput("st", names.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
-    texture.CreateOutput("rgb", names.Float3)
-    shader.GetInput("diffuseColor").ConnectToSource(texture.ConnectableAPI(), "rgb")
-
-
-def _save_picture(picture: Any, folder: Path) -> str:  # noqa: ANN401
-    """Write a texture beside the scene, once for each content; its relative path."""
-    stream = BytesIO()
-    picture.convert("RGBA" if "A" in picture.getbands() else "RGB").save(stream, "PNG")
-    name = f"textures/{hashlib.sha256(stream.getvalue()).hexdigest()[:16]}.png"
-    with replacing(folder / name) as part:
-        part.write_bytes(stream.getvalue())
-    return f"./{name}"
-
-
-# OpenUSD's Python modules, which fill themselves when they are imported.
-
-
-def pxr(name: str) -> Any:  # noqa: ANN401
-    """The module `pxr.<name>`.
-
-    Raises:
-        InputError: If usd-core is not installed.
-    """
-    if find_spec("pxr") is None:
-        raise InputError(
-            "--to usd: usd-core is not installed; pip install '.[usd]' in mover's folder"
-        )
-    return import_module(f"pxr.{name}")
-
-
-# The room and its people.
-
+from mover.io.export.skin import Skin, skin_for
+from mover.io.export.solids import floor_height, solids_of
+from mover.io.export.usd_mesh import add_look, add_mesh, free_path, pxr
+from mover.io.export.usd_people import INFLUENCES, add_moving_mesh, add_skeleton
+from mover.io.export.usd_physics import add_floor, add_laws, add_solid
 
 APERTURE = 20.955  # width of the film [tenths of a scene unit by USD's custom: mm]
-TOLERANCE = 0.002  # [m], of the straight lines between two samples of time
-MOST = 100_000
 FAR = 1000.0  # [m]
+BodyForm = Literal["auto", "skin", "morph", "none"]
+Up = Literal["y", "z"]
 
 
-def export_usd(finished: Finished, folder: Path) -> Exported:
+def export_usd(finished: Finished, folder: Path, body: BodyForm = "auto", up: Up = "y") -> Exported:
     """Write the room as one binary USD file.
 
-    Objects are transforms (translate, rotateY, scale) with the meshes of the user's file below
-    them; people are meshes with samples of time, in frames of the video.
+    Each object is a rigid body (place and turn) with two children: `visual`, the meshes of the
+    user's file at their size, and `collision`, convex pieces. People are skeletons with animation
+    where the parameters of their bodies are known, else meshes with samples of time.
+
+    Args:
+        finished: The result; its folder keeps the convex pieces.
+        folder: Where `scene.usdc` goes.
+        body: How people move: on bones (skin), as meshes (morph), not at all (none), or on bones
+            where the parameters are known (auto).
+        up: y: the world of scene.json; z: turned, with the floor at 0, as simulators have it.
 
     Raises:
-        InputError: If usd-core is not installed.
+        InputError: If usd-core is not installed, or bones are asked for and there are none.
     """
     Usd = pxr("Usd")
+    skin = _skin(finished, body)
     path = folder / "scene.usdc"
     with replacing(path) as part:
         part.unlink()
         stage = Usd.Stage.CreateNew(str(part))
-        _head(stage, finished)
-        _add_scene(stage, finished.scene, folder)
-        if finished.bodies is not None:
+        _head(stage, finished, up)
+        _add_scene(stage, finished, folder)
+        if finished.bodies is not None and body != "none":
             for track in tracks_of(finished.bodies):
-                _add_person(stage, finished.bodies, track)
+                if isinstance(skin, Skin):
+                    add_skeleton(stage, skin, finished.bodies, track)
+                else:
+                    add_moving_mesh(stage, finished.bodies, track)
         stage.GetRootLayer().Save()
-    return Exported((path,), ("people's meshes move in straight lines between samples, 2 mm off",))
+    return Exported((path,), _notes(finished, skin, body))
 
 
-def _head(stage: Any, finished: Finished) -> None:  # noqa: ANN401
-    UsdGeom = pxr("UsdGeom")
+def _skin(finished: Finished, body: BodyForm) -> Skin | str:
+    if finished.bodies is None or body in ("morph", "none"):
+        return "it was not asked for"
+    skin = skin_for(finished, INFLUENCES)
+    if isinstance(skin, str) and body == "skin":
+        raise InputError(f"--body skin: {skin}")
+    return skin
+
+
+def _notes(finished: Finished, skin: Skin | str, body: BodyForm) -> tuple[str, ...]:
+    if finished.bodies is None or body == "none":
+        return ("no people",)
+    if isinstance(skin, Skin):
+        return (f"people are skeletons, at most {1e3 * skin.miss:.0f} mm off the result",)
+    why = [] if body == "morph" else [f"people are moving meshes, not skeletons: {skin}"]
+    return (*why, "people's meshes move in straight lines between samples, 2 mm off")
+
+
+def _head(stage: Any, finished: Finished, up: Up) -> None:  # noqa: ANN401
+    """Units, axes, time, and the one root below which everything is."""
+    Gf, UsdGeom = pxr("Gf"), pxr("UsdGeom")
 
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/room").GetPrim())
+    pxr("UsdPhysics").SetStageKilogramsPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y if up == "y" else UsdGeom.Tokens.z)
+    room = UsdGeom.Xform.Define(stage, "/room")
+    pxr("Usd").ModelAPI(room.GetPrim()).SetKind("group")
+    stage.SetDefaultPrim(room.GetPrim())
+    if up == "z":
+        double = UsdGeom.XformOp.PrecisionDouble
+        room.AddTranslateOp(double).Set(Gf.Vec3d(0, 0, -floor_height(finished.scene)))
+        room.AddRotateXOp(double).Set(90.0)
     bodies = finished.bodies
     if bodies is not None:
         stage.SetTimeCodesPerSecond(bodies.fps or FPS)
@@ -163,100 +102,47 @@ def _head(stage: Any, finished: Finished) -> None:  # noqa: ANN401
         stage.SetEndTimeCode(int(bodies.frame.max()))
 
 
-def _add_scene(stage: Any, scene: Scene, folder: Path) -> None:  # noqa: ANN401
-    for index, piece in enumerate(scene.objects):
-        _add_object(stage, piece, colour(index), folder)
+def _add_scene(stage: Any, finished: Finished, folder: Path) -> None:  # noqa: ANN401
+    scene, wood = finished.scene, add_laws(stage)
+    solids = solids_of(scene, Run(finished.out))
+    for index, (piece, solid) in enumerate(zip(scene.objects, solids, strict=True)):
+        body = _add_object(stage, piece, colour(index), folder)
+        add_solid(stage, body, solid, wood)
     if scene.ground is not None:
         floor = floor_of(scene, scene.ground)
         verts, faces = floor.verts.double().numpy(), floor.faces.numpy()
-        _add_mesh(stage, "/room/ground", verts, faces, (0.86, 0.85, 0.83))
+        path = free_path(stage, "/room", "ground")
+        add_mesh(stage, path, verts, faces, (0.86, 0.85, 0.83))
+    add_floor(stage, floor_height(scene), wood)
     _add_camera(stage, scene.camera)
 
 
-def _free(stage: Any, parent: str, name: str) -> str:  # noqa: ANN401
-    """A path that USD allows and that nothing has yet."""
-    Tf = pxr("Tf")
-
-    path = f"{parent}/{Tf.MakeValidIdentifier(name)}"
-    while stage.GetPrimAtPath(path):
-        path += "_"
-    return path
-
-
-def _add_object(stage: Any, piece: SceneObject, tint: Colour, folder: Path) -> None:  # noqa: ANN401
-    """A transform in the format's own order: scale, then turn, then shift."""
+def _add_object(stage: Any, piece: SceneObject, tint: Colour, folder: Path) -> Any:  # noqa: ANN401
+    """A place and a turn, and below them the looks at their size; the transform."""
     Gf, UsdGeom = pxr("Gf"), pxr("UsdGeom")
 
-    node = UsdGeom.Xform.Define(stage, _free(stage, "/room", piece.id))
+    node = UsdGeom.Xform.Define(stage, free_path(stage, "/room", piece.id))
     prim, double = node.GetPrim(), UsdGeom.XformOp.PrecisionDouble
+    pxr("Usd").ModelAPI(prim).SetKind("component")
     prim.SetCustomDataByKey("mover:id", piece.id)
     prim.SetCustomDataByKey("mover:category", piece.category)
     node.AddTranslateOp(double).Set(Gf.Vec3d(*piece.t_world_object.tolist()))
     node.AddRotateYOp(double).Set(float(np.degrees(float(piece.yaw))))
-    node.AddScaleOp(double).Set(Gf.Vec3d(*piece.scale.tolist()))
+    looks = UsdGeom.Xform.Define(stage, node.GetPath().AppendChild("visual"))
+    looks.AddScaleOp(double).Set(Gf.Vec3d(*piece.scale.tolist()))
     for part, transform in parts_of(piece, tint):
-        path = _free(stage, str(node.GetPath()), "mesh")
-        mesh = _add_mesh(stage, path, np.asarray(part.vertices), np.asarray(part.faces), tint)
+        path = free_path(stage, str(looks.GetPath()), "mesh")
+        mesh = add_mesh(stage, path, np.asarray(part.vertices), np.asarray(part.faces), tint)
         mesh.AddTransformOp(double).Set(Gf.Matrix4d(transform.T.tolist()))
         add_look(stage, mesh, part, folder)
-
-
-def _add_mesh(
-    stage: Any,  # noqa: ANN401
-    path: str,
-    verts: NDArray[Any],
-    faces: NDArray[Any],
-    tint: Colour,
-) -> Any:  # noqa: ANN401
-    UsdGeom, Vt = pxr("UsdGeom"), pxr("Vt")
-
-    mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateDoubleSidedAttr(True)
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(
-        Vt.IntArray.FromNumpy(np.ascontiguousarray(faces, np.int32).reshape(-1))
-    )
-    _set_points(mesh, verts.astype(np.float32), None)
-    mesh.CreateDisplayColorAttr([tint])
-    return mesh
-
-
-def _set_points(mesh: Any, points: NDArray[np.float32], time: float | None) -> None:  # noqa: ANN401
-    """Places and extent, always or at one time."""
-    Usd, Vt = pxr("Usd"), pxr("Vt")
-
-    when = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
-    mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points)), when)
-    extent = np.stack([points.min(0), points.max(0)])
-    mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), when)
-
-
-def _add_person(stage: Any, bodies: Bodies, track: Track) -> None:  # noqa: ANN401
-    UsdGeom = pxr("UsdGeom")
-
-    verts = bodies.verts[track.rows].detach().cpu().float()
-    keys, _ = keyframes(verts, track.time, TOLERANCE, MOST)
-    path = _free(stage, "/room", f"person_{track.person}")
-    tint = person_colour(track.person)
-    mesh = _add_mesh(stage, path, verts[0].numpy(), bodies.faces.cpu().numpy(), tint)
-    for key in keys:
-        _set_points(mesh, verts[key].numpy(), float(track.frame[key]))
-    seen = mesh.CreateVisibilityAttr()
-    first, fps = int(bodies.frame.min()), bodies.fps or FPS
-    for start, end in seen_from_to(track):
-        if start > 0:
-            seen.Set(UsdGeom.Tokens.invisible, float(first))
-        seen.Set(UsdGeom.Tokens.inherited, first + round(start * fps))
-        if end < track.last:
-            seen.Set(UsdGeom.Tokens.invisible, first + round(end * fps) + 1)
+    return prim
 
 
 def _add_camera(stage: Any, camera: Camera) -> None:  # noqa: ANN401
     """USD's cameras look along -z with +y up; the film is moved for the principal point."""
     Gf, UsdGeom = pxr("Gf"), pxr("UsdGeom")
 
-    lens = UsdGeom.Camera.Define(stage, _free(stage, "/room", "camera"))
+    lens = UsdGeom.Camera.Define(stage, free_path(stage, "/room", "camera"))
     fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
     cx, cy = float(camera.K[0, 2]), float(camera.K[1, 2])
     focal = fx / camera.width * APERTURE

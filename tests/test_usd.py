@@ -1,0 +1,218 @@
+"""Physics and skeletons in USD, read back with usd-core's own schemas and validators."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from furnished import furnished, two_people, write_out
+from little_room import GROUND, walkers
+
+import mover.io.export.convex
+from mover.core.errors import InputError
+from mover.core.run import Run
+from mover.core.types import Bodies, Scene
+from mover.geometry.placement import place_object
+from mover.io.export.finished import Finished, read_finished
+from mover.io.export.solids import AXES, solids_of
+from mover.io.export.usd import export_usd
+
+Usd = pytest.importorskip("pxr.Usd", reason="needs the extra usd")
+
+
+def room() -> Scene:
+    """A stretched chair, a table that hangs, and a floor lamp."""
+    scene = furnished(("chair", "table", "floor lamp"))
+    chair, table, lamp = scene.objects
+    pieces = (
+        dataclasses.replace(chair, scale=torch.tensor([1.2, 0.9, 1.1])),
+        dataclasses.replace(table, support="free"),
+        lamp,
+    )
+    return dataclasses.replace(scene, objects=pieces)
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The convex pieces of the room, cut once, along the axes only (CoACD takes seconds)."""
+    folder = tmp_path_factory.mktemp("kept")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+        solids_of(room(), Run(folder))
+    return folder
+
+
+@pytest.fixture
+def out(kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+    shutil.copytree(kept / "stages", tmp_path / "out" / "stages")
+    return tmp_path / "out"
+
+
+def stage_of(out: Path, bodies: Bodies | None = None, **options: Any) -> tuple[Any, Finished]:
+    home = read_finished(write_out(out, room(), bodies))
+    return Usd.Stage.Open(str(export_usd(home, out / "export", **options).files[0])), home
+
+
+def complaints(stage: Any) -> list[str]:
+    """What all validators of usd-core say: geometry, shading, skeletons, physics, and the rest."""
+    from pxr import UsdValidation
+
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    names = {str(v.GetMetadata().name) for v in validators}
+    assert any("usdPhysics" in name for name in names), names
+    assert any("usdSkel" in name for name in names), names
+    found = UsdValidation.ValidationContext(validators).Validate(stage)
+    return [f"{error.GetName()}: {error.GetMessage()}" for error in found]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("body", "up"), [("skin", "y"), ("skin", "z"), ("morph", "y")])
+def test_the_validators_of_usd_find_nothing(out: Path, body: str, up: str):
+    stage, _ = stage_of(out, two_people(), body=body, up=up)
+    assert complaints(stage) == []
+
+
+@pytest.mark.slow
+def test_the_validators_would_find_a_body_that_has_no_place(out: Path):
+    from pxr import UsdPhysics
+
+    stage, _ = stage_of(out)
+    UsdPhysics.RigidBodyAPI.Apply(stage.GetPrimAtPath("/room/wood"))
+    assert any("RigidBody" in said for said in complaints(stage))
+
+
+def parsed(stage: Any) -> dict[Any, dict[str, Any]]:
+    """What a simulator gets from usd-core's own parser of physics, by kind and path."""
+    from pxr import UsdPhysics
+
+    found = UsdPhysics.UsdPhysicsLoadStageFromPrimRange(stage, ["/"])
+    return {
+        kind: {str(path): desc for path, desc in zip(*rows, strict=True)}
+        for kind, rows in found.items()
+    }
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_a_simulator_reads_bodies_pieces_masses_and_a_floor(out: Path, up: str):
+    from pxr import UsdGeom, UsdPhysics
+
+    stage, home = stage_of(out, up=up)
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert UsdPhysics.GetStageKilogramsPerUnit(stage) == 1.0
+    assert UsdGeom.GetStageUpAxis(stage) == up.upper()
+    kinds = parsed(stage)
+    bodies = kinds[UsdPhysics.ObjectType.RigidBody]
+    assert set(bodies) == {"/room/chair_0", "/room/floor_lamp_0"}  # the table hangs
+    meshes = kinds[UsdPhysics.ObjectType.MeshShape]
+    solids = solids_of(home.scene, Run(home.out))
+    assert len(meshes) == sum(len(solid.hulls) for solid in solids)
+    assert all(desc.approximation == "convexHull" for desc in meshes.values())
+    assert all("/collision/" in path for path in meshes)
+    for path, desc in bodies.items():
+        assert all(str(c).startswith(f"{path}/collision") for c in desc.collisions)
+    assert list(kinds[UsdPhysics.ObjectType.PlaneShape]) == ["/room/floor_collision"]
+    (laws,) = kinds[UsdPhysics.ObjectType.Scene].values()
+    assert list(laws.gravityDirection) == ([0, -1, 0] if up == "y" else [0, 0, -1])
+    assert laws.gravityMagnitude == pytest.approx(9.81)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_pieces_and_looks_fill_the_same_place_and_the_floor_is_below(out: Path, up: str):
+    from pxr import UsdGeom
+
+    stage, home = stage_of(out, up=up)
+    cache = UsdGeom.BBoxCache(0, [UsdGeom.Tokens.default_, UsdGeom.Tokens.guide])
+    for piece in home.scene.objects:
+        truth = place_object(piece).verts.double().numpy()
+        if up == "z":
+            truth = np.stack([truth[:, 0], -truth[:, 2], truth[:, 1] - GROUND], -1)
+        for part, off in (("visual", 1e-4), ("collision", 2e-3)):
+            found = points_of(stage, f"/room/{piece.id}/{part}")
+            assert found.min(0) == pytest.approx(truth.min(0), abs=off)
+            assert found.max(0) == pytest.approx(truth.max(0), abs=off)
+    floor = stage.GetPrimAtPath("/room/floor_collision")
+    place = cache.ComputeWorldBound(floor).ComputeAlignedRange().GetMidpoint()
+    assert place[1 if up == "y" else 2] == pytest.approx(GROUND if up == "y" else 0.0)
+
+
+def points_of(stage: Any, path: str) -> np.ndarray:
+    """All points below a prim, in the world."""
+    from pxr import UsdGeom
+
+    every: list[np.ndarray] = []
+    for prim in Usd.PrimRange(stage.GetPrimAtPath(path)):
+        if prim.IsA(UsdGeom.Mesh):
+            points = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(), float)
+            matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim))
+            every.append((np.c_[points, np.ones(len(points))] @ matrix)[:, :3])
+    return np.concatenate(every)
+
+
+def test_mass_centre_and_moments_are_those_of_the_solid(out: Path):
+    from pxr import Gf, UsdPhysics
+
+    stage, home = stage_of(out)
+    for solid in solids_of(home.scene, Run(home.out)):
+        prim = stage.GetPrimAtPath(f"/room/{solid.id}")
+        mass = UsdPhysics.MassAPI(prim)
+        assert prim.HasAPI(UsdPhysics.MassAPI) == solid.free
+        if not solid.free:
+            continue
+        assert mass.GetMassAttr().Get() == pytest.approx(solid.mass)
+        centre = AXES.mT @ solid.centre
+        assert list(mass.GetCenterOfMassAttr().Get()) == pytest.approx(centre.tolist(), abs=1e-6)
+        axes = np.array(Gf.Matrix3d(Gf.Quatd(mass.GetPrincipalAxesAttr().Get()))).T
+        moments = np.diag(list(mass.GetDiagonalInertiaAttr().Get()))
+        truth = (AXES.mT @ solid.inertia @ AXES).numpy()
+        assert axes @ moments @ axes.T == pytest.approx(truth, rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_skeletons_carry_the_skin_to_the_result_in_every_frame(out: Path, up: str):
+    from pxr import Gf, UsdGeom, UsdSkel
+
+    bodies = two_people(6)
+    stage, _ = stage_of(out, bodies, up=up)
+    cache = UsdSkel.Cache()
+    for person in (0, 1):
+        root = UsdSkel.Root(stage.GetPrimAtPath(f"/room/person_{person}"))
+        cache.Populate(root, Usd.PrimDefaultPredicate)
+        (binding,) = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
+        skeleton = cache.GetSkelQuery(binding.GetSkeleton())
+        (target,) = binding.GetSkinningTargets()
+        mesh = UsdGeom.Mesh(target.GetPrim())
+        for row in (bodies.person == person).nonzero()[:, 0].tolist():
+            frame = float(bodies.frame[row])
+            moves = skeleton.ComputeSkinningTransforms(frame)
+            points = mesh.GetPointsAttr().Get()
+            assert target.ComputeSkinnedPoints(moves, points, frame)
+            matrix = UsdGeom.XformCache(frame).GetLocalToWorldTransform(target.GetPrim())
+            found = np.array([matrix.Transform(Gf.Vec3d(p)) for p in points])
+            truth = bodies.verts[row].double().numpy()
+            if up == "z":
+                truth = np.stack([truth[:, 0], -truth[:, 2], truth[:, 1] - GROUND], -1)
+            assert np.linalg.norm(found - truth, axis=1).max() < 0.001
+            assert root.ComputeVisibility(frame) == "inherited"
+    assert root.ComputeVisibility(float(bodies.frame.min())) == "invisible"
+
+
+def test_bodies_without_parameters_move_as_meshes_and_it_is_said(out: Path):
+    home = read_finished(write_out(out, room(), walkers(5)))
+    found = export_usd(home, out)
+    assert "not skeletons" in " ".join(found.notes)
+    with pytest.raises(InputError, match="--body skin"):
+        export_usd(home, out, "skin")
+
+
+def test_ids_that_the_file_keeps_for_itself_stay_apart(out: Path):
+    scene = room()
+    names = ("ground", "physics", "wood")
+    pieces = [dataclasses.replace(p, id=n) for p, n in zip(scene.objects, names, strict=True)]
+    home = Finished(out, dataclasses.replace(scene, objects=tuple(pieces)), None, None)
+    stage = Usd.Stage.Open(str(export_usd(home, out).files[0]))
+    ids = [p.GetCustomDataByKey("mover:id") for p in stage.Traverse()]
+    assert set(names) <= set(ids)
