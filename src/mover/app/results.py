@@ -16,18 +16,23 @@ from mover import __version__
 from mover.app.report.content import ReportContent
 from mover.app.report.page import write_report
 from mover.bodies.corrected import in_world
+from mover.bodies.parts import parts_of
 from mover.core import records
+from mover.core.contact_labels import ContactLabels
 from mover.core.devices import CPU, named
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.types import Bodies, Capture, Mesh, Room, Scene
 from mover.evaluate.explanation import log_rows, scene_fields
+from mover.geometry.placement import place_object
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.edits import Edit, write_edits
 from mover.io.capture.scene_file import write_scene
+from mover.io.export.contacts import write_labels
 from mover.io.export.scene_glb import write_glb
 from mover.pipeline.presets import Config, with_present_keys
+from mover.stages.contacts.label_contacts import LabelConfig, LabelInputs, label_contacts
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +62,7 @@ def write_results(
     if room.bodies is not None:
         write_bodies(room.bodies, out / "bodies.npz")
         write_bodies(initial_bodies(capture), out / "initial_bodies.npz")
+        write_labels(labels_of(room, run), out / "contacts.npz")
     for piece, proxy in zip(room.scene.objects, room.proxies, strict=True):
         _write_mesh(proxy, out / "watertight" / f"{piece.id}.glb")
     write_glb(room.scene, room.bodies, out / "scene.glb")
@@ -65,6 +71,20 @@ def write_results(
     _write_log(room, config, run, origin)
     write_scene(room.scene, out / "scene.json", scene_fields(room.explanations))
     return write_report(out, report_of(capture, room, config, run))
+
+
+def labels_of(room: Room, run: Run) -> ContactLabels:
+    """Who touches what in a finished room with people."""
+    assert room.bodies is not None
+    solid = [
+        place_object(dataclasses.replace(piece, mesh=proxy))
+        for piece, proxy in zip(room.scene.objects, room.proxies, strict=True)
+    ]
+    ids = tuple(piece.id for piece in room.scene.objects)
+    inputs = LabelInputs(
+        room.bodies, parts_of(room.bodies), tuple(solid), ids, room.scene.ground
+    )  # fmt: skip
+    return run.stage(label_contacts, inputs, LabelConfig())
 
 
 def write_truth(scene: Scene, bodies: Bodies, folder: Path) -> None:

@@ -32,7 +32,7 @@ class ExportArgs:
     """glb, usd: how people move: on bones, by exact shapes of some frames, or not at all (also
     mjcf)."""
     up: Literal["y", "z"] = "y"
-    """bodies, usd: y is the world of scene.json, z that of AMASS and of simulators."""
+    """bodies, usd, contacts: y is the world of scene.json, z that of AMASS and of simulators."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def export(arguments: Sequence[str]) -> None:
 
     writers = {target: chosen("--to", target, "export") for target in args.to}
     finished, folder = read_finished(args.out, args.capture), args.out / "export"
-    options = {"glb": {"body": args.body}, "bodies": {"up": args.up}}
+    options = {"glb": {"body": args.body}, "bodies": {"up": args.up}, "contacts": {"up": args.up}}
     options |= {"usd": {"body": args.body, "up": args.up}, "mjcf": {"body": args.body}}
     for target, write in writers.items():
         found: Exported = write(finished, folder, **options.get(target, {}))

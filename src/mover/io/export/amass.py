@@ -65,6 +65,7 @@ def _arrays(motion: Motion, track: Track, bodies: Bodies) -> dict[str, NDArray[A
         "root_orient": pose.global_orient[rows].numpy(),
         "poses": poses,
         "betas": shape,
+        "num_betas": np.array(len(shape)),
         "gender": np.array(pose.gender),
         "mocap_framerate": rate,
         "mocap_frame_rate": rate,

@@ -1,0 +1,191 @@
+"""Label the contacts of a finished room: part of the body, object, place, normal, confidence.
+
+Two cues agree or not: how near the part comes to the surface (`closeness`), and whether the posture
+says that it bears on something (`chance`, as in `find_contacts`: sitting, leaning, hands and soles
+at rest). The label keeps the product, with a floor under the second, as no posture tells of a shin
+against a table.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mover.bodies.parts import Parts, members
+from mover.bodies.posture import touching
+from mover.bodies.skin import PARTS
+from mover.core.contact_labels import ContactLabels
+from mover.core.observe import Observer, silent
+from mover.core.records import record
+from mover.core.types import Bodies, Mesh
+from mover.geometry.nearest import as_float64, as_int64, closest
+from mover.geometry.volume import outward
+
+FLOOR = "ground"
+
+
+@dataclass(frozen=True)
+class LabelConfig:
+    """What counts as a touch."""
+
+    reach: float = 0.06
+    """From here on nothing touches [m]: what bodies of single frames float on average."""
+    near: float = 0.02
+    """Up to here the part surely touches [m]."""
+    unseen: float = 0.4
+    """Share of the confidence that nearness alone gives, where the posture says nothing."""
+    least: float = 0.2
+    """Labels below this confidence are left out."""
+    most: int = 40
+    """Vertices of a part that are looked at, evenly chosen."""
+
+
+@record
+class LabelInputs:
+    """A finished room."""
+
+    bodies: Bodies
+    """In the world."""
+    parts: Parts
+    meshes: tuple[Mesh, ...]
+    """Closed, of the objects where they stand."""
+    ids: tuple[str, ...]
+    ground: float | None
+
+
+@record
+class _Touches:
+    """Rows of bodies whose part is near one surface."""
+
+    row: Int[Tensor, " rows"]
+    gap: Float[Tensor, " rows"]
+    position: Float[Tensor, "rows 3"]
+    normal: Float[Tensor, "rows 3"]
+
+
+def label_contacts(
+    inputs: LabelInputs, config: LabelConfig, observe: Observer = silent
+) -> ContactLabels:
+    """The labels of all frames, in the order of parts, objects, rows."""
+    del observe
+    bodies, parts = inputs.bodies, inputs.parts
+    floor = bodies.verts[..., 1].amin() if inputs.ground is None else inputs.ground
+    chance = touching(bodies, parts, float(floor))
+    solids = [_Solid(mesh) for mesh in inputs.meshes]
+    found: list[tuple[int, int, _Touches, Tensor]] = []
+    for part, name in enumerate(PARTS):
+        chosen = _evenly(members(parts, name).nonzero()[:, 0], config.most)
+        if not len(chosen):
+            continue
+        points = bodies.verts[:, chosen]
+        sure = chance[:, members(parts, name)].amax(1)
+        surfaces = [_near_solid(points, solid, config) for solid in solids]
+        if inputs.ground is not None:
+            surfaces.append(_near_floor(points, inputs.ground, config))
+        for k, touch in enumerate(surfaces):
+            close = (touch.gap - config.reach) / (config.near - config.reach)
+            trust = config.unseen + (1 - config.unseen) * sure[touch.row]
+            found.append((part, k, touch, close.clamp(0, 1) * trust))
+    return _joined(found, inputs, config)
+
+
+def _evenly(verts: Int[Tensor, " verts"], most: int) -> Int[Tensor, " some"]:
+    return verts[torch.linspace(0, len(verts) - 1, min(most, len(verts))).round().long()]
+
+
+class _Solid:
+    """A mesh as libigl wants it, once for all parts."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.verts = as_float64(mesh.verts)
+        self.faces = outward(self.verts, as_int64(mesh.faces))
+        self.low = torch.from_numpy(self.verts.min(0))
+        self.high = torch.from_numpy(self.verts.max(0))
+        corners = self.verts[self.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        size = np.linalg.norm(normals, axis=1, keepdims=True)
+        self.normals = normals / np.maximum(size, 1e-12)
+
+
+def _near_solid(
+    points: Float[Tensor, "bodies points 3"], solid: _Solid, config: LabelConfig
+) -> _Touches:
+    """Bodies whose points come near an object."""
+    import igl
+
+    low, high = (solid.low - config.reach).to(points), (solid.high + config.reach).to(points)
+    inside = torch.minimum(points - low, high - points).amin(-1) > 0
+    row = inside.any(-1).nonzero()[:, 0]
+    if not len(row):
+        return _touches(points, row, [])
+    asked = inside[row].numpy()
+    query = as_float64(points[row][inside[row]])
+    squared, face, nearest = closest(query, solid.verts, solid.faces)
+    deep = np.asarray(igl.fast_winding_number(solid.verts, solid.faces, query)) > 0.5
+    signed = np.full(asked.shape, np.inf)
+    signed[asked] = np.where(deep, -1, 1) * np.sqrt(squared)
+    place, normal = np.zeros((*asked.shape, 3)), np.zeros((*asked.shape, 3))
+    place[asked], normal[asked] = nearest, solid.normals[face]
+    return _touches(points, row, [signed, place, normal], config)
+
+
+def _near_floor(
+    points: Float[Tensor, "bodies points 3"], ground: float, config: LabelConfig
+) -> _Touches:
+    """Bodies whose points come near the floor."""
+    height = points[..., 1] - ground
+    row = (height.amin(1) < config.reach).nonzero()[:, 0]
+    place = points[row].clone()
+    place[..., 1] = ground
+    up = torch.zeros_like(place)
+    up[..., 1] = 1.0
+    values = [height[row].double().numpy(), place.numpy(), up.numpy()]
+    return _touches(points, row, values, config)
+
+
+def _touches(
+    points: Float[Tensor, "bodies points 3"],
+    row: Int[Tensor, " rows"],
+    values: list[np.ndarray],
+    config: LabelConfig | None = None,
+) -> _Touches:
+    """The part's place on the surface: the mean over its points that are nearest."""
+    if not values or config is None:
+        nothing = points.new_zeros(0, 3)
+        return _Touches(row, points.new_zeros(0), nothing, nothing)
+    signed, place, normal = (torch.from_numpy(value).to(points) for value in values)
+    gap = signed.amin(1)
+    keep = gap < config.reach
+    layer = (signed <= gap[:, None].clamp_min(0) + config.near / 2)[keep].to(points)[..., None]
+    share = layer / layer.sum(1, keepdim=True)
+    mean = (share * normal[keep]).sum(1)
+    best = normal[keep][torch.arange(int(keep.sum())), signed[keep].argmin(1)]
+    unit = torch.where(mean.norm(dim=-1, keepdim=True) > 0.5, mean, best)
+    unit = unit / unit.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    return _Touches(row[keep], gap[keep], (share * place[keep]).sum(1), unit)
+
+
+def _joined(
+    found: list[tuple[int, int, _Touches, Tensor]], inputs: LabelInputs, config: LabelConfig
+) -> ContactLabels:
+    bodies = inputs.bodies
+    nothing = _Touches(
+        torch.zeros(0, dtype=torch.long), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0, 3)
+    )
+    rows = [*found, (0, 0, nothing, torch.zeros(0))]
+    keep = torch.cat([sure >= config.least for *_, sure in rows])
+    body = torch.cat([touch.row for _, _, touch, _ in rows])[keep]
+    return ContactLabels(
+        frame=bodies.frame[body],
+        person=bodies.person[body],
+        part=torch.cat([torch.full_like(t.row, part) for part, _, t, _ in rows])[keep],
+        object=torch.cat([torch.full_like(t.row, k) for _, k, t, _ in rows])[keep],
+        position=torch.cat([t.position for _, _, t, _ in rows])[keep],
+        normal=torch.cat([t.normal for _, _, t, _ in rows])[keep],
+        gap=torch.cat([t.gap for _, _, t, _ in rows])[keep],
+        confidence=torch.cat([sure for *_, sure in rows])[keep],
+        parts=PARTS,
+        objects=(*inputs.ids, FLOOR),
+    )
