@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Camera, Mesh, Scene, SceneObject
+from mover.evaluate import surfaces
 from mover.furniture.library import canonical
 from mover.geometry.boxes import Box, box_of
 from mover.geometry.boxes import iou2d as rectangle_iou
@@ -97,6 +98,27 @@ def size_error(pair: Pair) -> float:
     return float((box_of(pair.estimate).size - box_of(pair.truth).size).abs().mean())
 
 
+def add_s(pair: Pair) -> float:
+    """Mean distance between the two surfaces, both ways, as a share of the true diameter."""
+    return surfaces.add_s(*_points(pair))
+
+
+def add_s_01(pair: Pair) -> float:
+    """1 where that is less than a tenth; the mean is the share of such objects."""
+    return float(add_s(pair) < surfaces.CLOSE)
+
+
+def icp_rotation(pair: Pair) -> float:
+    """Angle by which ICP turns the object onto the true one [rad]."""
+    return surfaces.icp_turn(*_points(pair))
+
+
+def _points(pair: Pair) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"]]:
+    """Points of both surfaces where they stand."""
+    estimate, truth = (place_object(piece) for piece in (pair.estimate, pair.truth))
+    return area_samples(estimate, surfaces.POINTS), area_samples(truth, surfaces.POINTS)
+
+
 def pitch_error(sight: Sight) -> float:
     """Difference of the cameras' pitch [rad]."""
     return _tilt_errors(sight)[0]
@@ -121,6 +143,9 @@ OBJECT_METRICS: dict[str, Metric[Pair]] = {
     "yaw_error": Metric("rad", 0.0, yaw_error),
     "center_error": Metric("m", 0.0, center_error),
     "size_error": Metric("m", 0.0, size_error),
+    "add_s": Metric("", 0.0, add_s),
+    "add_s_01": Metric("", 1.0, add_s_01),
+    "icp_rotation": Metric("rad", 0.0, icp_rotation),
 }
 HARM_METRICS: dict[str, Metric[float]] = {
     "worse_by_10cm": Metric("", 0.0, lambda farther: float(farther > 0.1)),
@@ -142,9 +167,9 @@ def measure(table: Mapping[str, Metric[T]], subject: T) -> dict[str, float]:
 
 
 def measure_missing(truth: SceneObject, camera: Camera) -> dict[str, float]:
-    """A missing object scores 0 in both overlaps, if the truth has them, and nothing else."""
+    """A missing object scores 0 in overlaps, if the truth has them, and is not within a tenth."""
     seen = image_box(truth, camera) is not None
-    return {"iou3d": 0.0, "iou2d": 0.0} if seen else {"iou3d": 0.0}
+    return ({"iou3d": 0.0, "iou2d": 0.0} if seen else {"iou3d": 0.0}) | {"add_s_01": 0.0}
 
 
 def area_samples(mesh: Mesh, count: int) -> Float[Tensor, "count 3"]:
