@@ -1,8 +1,11 @@
-"""Let gravity act on a room: what stands well stays, what floats falls, what is stuck jumps."""
+"""Let gravity act on a room: what stands well stays, what floats falls, what is stuck jumps.
+
+A second simulation puts the weight of people on what they sit on, where they sat on it.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,22 +15,25 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mover.app.sitters import Load, hardest, loads_of
 from mover.core.errors import InputError
 from mover.core.run import Run
-from mover.core.types import Scene
+from mover.core.types import Scene, SceneObject
 from mover.io.capture.scene_file import read_scene
 from mover.io.export.mjcf import body_name, mjcf_of, text_of
-from mover.io.export.solids import Solid, solids_of
+from mover.io.export.solids import AXES, Solid, solids_of
 from mover.io.files.fields import write_json
+from mover.io.files.npz import read_npz
 
 TOPPLED = math.radians(45)  # [rad]
+STAYS = (0.01, math.radians(1))  # [m], [rad]; REST3D (2026) and others call less stable
 
 
 @dataclass(frozen=True)
 class SimulationConfig:
     """How long gravity acts."""
 
-    seconds: float = 3.0
+    seconds: float = 2.0
     """Time of the simulation."""
 
 
@@ -51,6 +57,18 @@ class SimulatedObject:
     """[kg]"""
     fixed: bool
     """True: it hangs or is built in (`support` is free), so it was held."""
+    load: float = 0.0
+    """What people put on it where they sat on it [kg]; 0: nobody sat on it."""
+    moved_loaded: float = 0.0
+    """How far it moves under that weight [m]."""
+    turned_loaded: float = 0.0
+    """... and turns [rad]."""
+
+    @property
+    def stays(self) -> bool:
+        """Whether it moves less than 1 cm and turns less than a degree, also under sitters."""
+        moved = max(self.moved, self.moved_loaded)
+        return moved < STAYS[0] and max(self.turned, self.turned_loaded) < STAYS[1]
 
     @property
     def toppled(self) -> bool:
@@ -59,7 +77,10 @@ class SimulatedObject:
 
 
 def simulate(
-    scene: Scene, run: Run, config: SimulationConfig | None = None
+    scene: Scene,
+    run: Run,
+    config: SimulationConfig | None = None,
+    loads: tuple[Load, ...] = (),
 ) -> tuple[SimulatedObject, ...]:
     """Simulate a scene in MuJoCo and compare where its pieces end with where they were.
 
@@ -67,6 +88,7 @@ def simulate(
         scene: Initial, result or truth; without a floor, its lowest point is on one.
         run: Its folder keeps the convex pieces.
         config: How long.
+        loads: Who sits where; each object gets the hardest of its loads, in a second simulation.
 
     Raises:
         InputError: If mujoco is not installed.
@@ -75,19 +97,66 @@ def simulate(
         raise InputError(
             "mover simulate: mujoco is not installed; pip install '.[physics]' in mover's folder"
         )
-    mujoco: Any = import_module("mujoco")
     config = config or SimulationConfig()
     solids = solids_of(scene, run)
+    start, end, stuck = _settled(scene, solids, config.seconds, {})
+    found = [_compare(*row) for row in zip(solids, start, end, stuck, strict=True)]
+    pressed = {p.id: load for p in scene.objects if (load := hardest(loads, p)) is not None}
+    if not pressed:
+        return tuple(found)
+    _, under, _ = _settled(scene, solids, config.seconds, pressed)
+    for k, solid in enumerate(solids):
+        if solid.id in pressed:
+            heavy = _compare(solid, start[k], under[k], stuck[k])
+            found[k] = replace(
+                found[k], load=pressed[solid.id].kilos, moved_loaded=heavy.moved,
+                turned_loaded=heavy.turned,
+            )  # fmt: skip
+    return tuple(found)
+
+
+def _settled(
+    scene: Scene, solids: tuple[Solid, ...], seconds: float, pressed: Mapping[str, Load]
+) -> tuple[list["State"], list["State"], list[float]]:
+    """Where the pieces are before and after, and how deep they were stuck."""
+    mujoco: Any = import_module("mujoco")
     root, meshes = mjcf_of(scene, solids, looks=False)
     model = mujoco.MjModel.from_xml_string(text_of(root), meshes)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     start = _states(data, solids)
     stuck = [_stuck(model, data, body_name(solid)) for solid in solids]
-    for _ in range(round(config.seconds / model.opt.timestep)):
+    weights = [
+        (model.body(body_name(solid)).id, pressed[solid.id].kilos, _seat(pressed[solid.id], piece))
+        for solid, piece in zip(solids, scene.objects, strict=True)
+        if solid.id in pressed
+    ]
+    for _ in range(round(seconds / model.opt.timestep)):
+        for body, kilos, place in weights:
+            _press(data, body, (kilos * abs(float(model.opt.gravity[2])), place))
         mujoco.mj_step(model, data)
-    end = _states(data, solids)
-    return tuple(_compare(*row) for row in zip(solids, start, end, stuck, strict=True))
+    return start, _states(data, solids), stuck
+
+
+def settled(scene: Scene, run: Run, seconds: float) -> list["State"]:
+    """Where gravity leaves each piece: its origin [m] and attitude in the simulator's axes."""
+    return _settled(scene, solids_of(scene, run), seconds, {})[1]
+
+
+def _seat(load: Load, piece: SceneObject) -> NDArray[np.float64]:
+    """Where the weight is, in the axes of the simulated body [m]."""
+    return (AXES @ (load.place * piece.scale).double()).numpy()
+
+
+def _press(data: Any, body: int, by: tuple[float, NDArray[np.float64]]) -> None:  # noqa: ANN401
+    """Push a body down with a force [N] at a point of its own."""
+    force, place = by
+    point = data.xmat[body].reshape(3, 3) @ place + data.xpos[body]
+    data.xfrc_applied[body] = 0
+    lever = point - data.xipos[body]
+    down = np.array([0.0, 0.0, -force])
+    data.xfrc_applied[body, :3] = down
+    data.xfrc_applied[body, 3:] = np.cross(lever, down)
 
 
 State = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -130,6 +199,11 @@ def _compare(solid: Solid, start: State, end: State, stuck: float) -> SimulatedO
     )
 
 
+def result_loads(out: Path, scene: Scene) -> tuple[Load, ...]:
+    """Who sits where in a result."""
+    return loads_of(out, scene, _rate(out))
+
+
 def simulate_folder(
     out: Path, truth: Path | None = None, config: SimulationConfig | None = None
 ) -> dict[str, tuple[SimulatedObject, ...]]:
@@ -148,24 +222,33 @@ def simulate_folder(
     files = {name: file for name, file in files.items() if name == "result" or file.is_file()}
     if truth is not None:
         files["truth"] = truth / "scene.json"
+    read = {name: read_scene(file) for name, file in files.items()}
+    loads = result_loads(out, read["result"])
     found: dict[str, tuple[SimulatedObject, ...]] = {}
-    for name, file in files.items():
+    for name, scene in read.items():
         home = run if name != "truth" else Run(out / "stages" / "truth")
-        found[name] = simulate(read_scene(file), home, config)
+        found[name] = simulate(scene, home, config, loads)
     tree: dict[str, Any] = {"format": "mover-settle", "version": 1, "seconds": config.seconds}
     scenes = {
-        name: [{**asdict(row), "toppled": row.toppled} for row in rows]
+        name: [{**asdict(row), "toppled": row.toppled, "stays": row.stays} for row in rows]
         for name, rows in found.items()
     }
     write_json({**tree, "scenes": scenes}, out / "settle.json")
     return found
 
 
+def _rate(out: Path) -> float | None:
+    """Frames a second of the result's people."""
+    file = out / "bodies.npz"
+    found = read_npz(file).value.get("fps") if file.is_file() else None
+    return None if found is None or not float(found) > 0 else float(found)
+
+
 # The settle test as text.
 
 
 HEADS = ("moved", "turned", "stuck", "")
-WIDTHS = (9, 9, 8, 10)
+WIDTHS = (9, 9, 8, 11)
 
 
 def simulation_table(found: Mapping[str, Sequence[SimulatedObject]]) -> str:
@@ -190,7 +273,13 @@ def _cell(row: SimulatedObject | None) -> str:
         return _row(("-" if row is None else "held", "", "", ""))
     moved, stuck = f"{1e3 * row.moved:.0f} mm", f"{1e3 * row.stuck:.0f} mm"
     turned = f"{math.degrees(row.turned):.0f} deg"
-    return _row((moved, turned, stuck, "fell over" if row.toppled else ""))
+    word = "stays" if row.stays else "fell over" if row.toppled else "sitter" if _only(row) else ""
+    return _row((moved, turned, stuck, word))
+
+
+def _only(row: SimulatedObject) -> bool:
+    """Whether only the weight of who sits on it moves it."""
+    return row.moved < STAYS[0] and row.turned < STAYS[1]
 
 
 def _summary(name: str, rows: Sequence[SimulatedObject]) -> str:
@@ -200,4 +289,9 @@ def _summary(name: str, rows: Sequence[SimulatedObject]) -> str:
     far = sorted(row.moved for row in loose)
     over = sum(row.toppled for row in loose)
     middle, most = 1e3 * far[len(far) // 2], 1e3 * far[-1]
-    return f"{name}: median {middle:.0f} mm, most {most:.0f} mm, {over} of {len(loose)} fell over"
+    stay, sat = sum(row.stays for row in loose), sum(row.load > 0 for row in loose)
+    under = f", {sat} of them under sitters" if sat else ""
+    return (
+        f"{name}: {stay} of {len(loose)} stay{under} (< 1 cm, < 1 deg), {over} fell over; "
+        f"median {middle:.0f} mm, most {most:.0f} mm"
+    )

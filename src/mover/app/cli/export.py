@@ -28,6 +28,8 @@ class ExportArgs:
     """What to write; several with spaces between them."""
     capture: Path | None = None
     """Folder of the capture: its bodies.npz tells the parameters of the bodies."""
+    stable: bool = False
+    """Take OUT/stable.json, which `mover simulate --nudge` writes, in place of scene.json."""
     body: Literal["auto", "skin", "morph", "none"] = "auto"
     """glb, usd: how people move: on bones, by exact shapes of some frames, or not at all (also
     mjcf)."""
@@ -43,8 +45,11 @@ class SimulateArgs:
     """Folder of the result."""
     truth: Path | None = None
     """Folder with the true scene.json, to settle it as well."""
-    seconds: float = 3.0
+    seconds: float = 2.0
     """Time of the simulation [s]."""
+    nudge: bool = False
+    """Move pieces that would fall to where they stand, as far as their uncertainty allows; writes
+    OUT/stable.json."""
 
 
 def export(arguments: Sequence[str]) -> None:
@@ -53,7 +58,7 @@ def export(arguments: Sequence[str]) -> None:
     from mover.io.export.finished import Exported, read_finished
 
     writers = {target: chosen("--to", target, "export") for target in args.to}
-    finished, folder = read_finished(args.out, args.capture), args.out / "export"
+    finished, folder = read_finished(args.out, args.capture, args.stable), args.out / "export"
     options = {"glb": {"body": args.body}, "bodies": {"up": args.up}, "contacts": {"up": args.up}}
     options |= {"usd": {"body": args.body, "up": args.up}, "mjcf": {"body": args.body}}
     for target, write in writers.items():
@@ -72,4 +77,9 @@ def simulate(arguments: Sequence[str]) -> None:
 
     if not 0 < args.seconds <= 60:
         raise InputError(f"--seconds: {args.seconds:g}, expected more than 0, at most 60")
-    say(simulation_table(simulate_folder(args.out, args.truth, SimulationConfig(args.seconds))))
+    config = SimulationConfig(args.seconds)
+    say(simulation_table(simulate_folder(args.out, args.truth, config)))
+    if args.nudge:
+        from mover.app.nudge import nudge_folder
+
+        say(f"\n{nudge_folder(args.out, config)}")

@@ -30,18 +30,25 @@ class Exported:
     """What the user should know about them."""
 
 
-def read_finished(out: Path, capture: Path | None = None) -> Finished:
+STABLE = "stable.json"
+"""The result's scene with pieces nudged to where they stand, from `mover simulate --nudge`."""
+
+
+def read_finished(out: Path, capture: Path | None = None, stable: bool = False) -> Finished:
     """Read a result.
 
     Args:
         out: Folder of the result.
         capture: Folder of the capture; its bodies.npz tells the parameters of the bodies where the
             result has none.
+        stable: Whether the scene is that of `STABLE`.
 
     Raises:
         InputError: If there is no result, or something in it is wrong.
     """
-    scene = read_scene(out / "scene.json")
+    if stable and not (out / STABLE).is_file():
+        raise InputError(f"{out / STABLE}: not found; `mover simulate OUT --nudge` writes it")
+    scene = read_scene(out / (STABLE if stable else "scene.json"))
     file = out / "bodies.npz"
     bodies = read_bodies(file) if file.is_file() else None
     if bodies is not None and bodies.space != "world":
