@@ -299,3 +299,5 @@ class RefineBodiesConfig:
     """Bodies that are moved at once."""
     overlap: int = 12
     """Rows on both sides that are moved along."""
+    plant: bool = True
+    """Whether soles at rest are put still at the end (where `weights.lock` is not 0)."""

@@ -51,6 +51,7 @@ from mover.stages.people.body_evidence import (
     watched_of,
 )
 from mover.stages.people.body_outlines import Seen, gather_outlines
+from mover.stages.people.plant_feet import plant_feet
 
 # Everybody who is refined, and what is found about them each time they have moved.
 
@@ -228,7 +229,12 @@ def refine_bodies(
         found = _put(found, by, torch.tensor(inner), keep, len(order))
         energy[inner] = left[keep]
     assert found is not None, "bodies have at least one row"
-    return RefinedBodies(corrected(cast.bodies, found), found.shift, energy)
+    bodies, shift = corrected(cast.bodies, found), found.shift
+    if config.plant and config.weights.lock:
+        planted = plant_feet(bodies, parts_of(bodies), cast.room.ground)
+        shift = shift + (planted.verts - bodies.verts).mean(1)
+        bodies = planted
+    return RefinedBodies(bodies, shift, energy)
 
 
 def _refine(

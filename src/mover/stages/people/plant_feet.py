@@ -1,0 +1,244 @@
+"""Feet that stand stand still: the last step of the refinement, by least squares in time.
+
+Energies make a sole slide less, and leave a rest, which goes here in three steps:
+
+1. Whole bodies are shifted so that soles at rest keep their place and lie on the floor, and who
+   sits or lies is still. Shifts along the ray from the camera (the world's origin) are cheap, as
+   pictures do not tell depth; those across it are dear.
+2. Each foot is to go where it rested on average; the way there fades in and out between steps.
+3. The leg is bent to reach it, as little as it can be, without a turn of the sole.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mover.bodies import load_model
+from mover.bodies.corrected import Correction, corrected
+from mover.bodies.parts import Parts, members
+from mover.bodies.posture import postures
+from mover.bodies.skeleton import BODY
+from mover.bodies.smpl_model import vertex_subset
+from mover.core.types import Bodies
+from mover.energy.body_terms.time import Neighbours, gather_neighbours
+from mover.stages.people.body_evidence import resting_soles
+
+ALONG, ACROSS = 0.05, 0.015  # [m], how far a body may be off along and across its ray
+STEADY = 0.1  # [m/√s], by which such errors change
+SWAY = 0.03  # [m], error of a resting sole beside its body's: angles of the leg are off
+SINK = 0.015  # [m], the same over the floor
+RIGID = 0.01  # [m], the same where no leg can be bent
+SLIP, RISE = 0.001, 0.003  # [m], of a sole at rest from frame to frame, and over the floor, at last
+STILL = 0.01  # [m], of somebody who sits or lies, from frame to frame
+ON_FLOOR = 0.12  # [m]; a sole at rest that is higher stands on something else
+FOOT = 0.03  # [m], how far a foot is off beside its body
+FADE = 0.06  # [m/√s], by which that changes
+BENT = 0.25  # [rad], usual error of an angle of the leg
+REACHED = 0.002  # [m], how near a foot is brought
+STEPS = 3  # of Gauss and Newton
+SPOTS = 4  # points of a sole
+LEG = ("hip", "knee", "ankle")
+SIDES = ("left", "right")
+NUDGE = 1e-3  # [rad], for differences
+
+
+def plant_feet(bodies: Bodies, parts: Parts, ground: float) -> Bodies:
+    """The bodies with their resting soles still and on the floor.
+
+    Args:
+        bodies: In the world; a video. Unordered images have no rest, and come back as they are.
+        parts: Parts of their mesh.
+        ground: Height of the floor [m].
+    """
+    near = gather_neighbours(bodies.frame, bodies.person, bodies.fps)
+    rest = resting_soles(bodies, parts, ground).double()
+    soles = [members(parts, f"{side}_sole").nonzero()[:, 0] for side in SIDES]
+    if not len(near.pairs) or not all(len(sole) for sole in soles):
+        return bodies
+    shift = _shifts(bodies, near, rest, (soles, ground), parts)
+    moved = corrected(bodies, _by(bodies, shift))
+    if bodies.pose is None:
+        return moved
+    rest = resting_soles(moved, parts, ground).double()
+    ways = torch.stack([
+        _way(moved.verts[:, sole], near, rest[:, k], ground) for k, sole in enumerate(soles)
+    ])  # fmt: skip
+    for k, side in enumerate(SIDES):
+        moved = _bend(moved, side, soles[k], ways[k])
+    return moved
+
+
+def _by(bodies: Bodies, shift: Float[Tensor, "bodies 3"]) -> Correction:
+    width = 0 if bodies.pose is None else bodies.pose.body_pose.shape[-1]
+    zero = torch.zeros_like(bodies.verts[:, 0])
+    return Correction(shift.to(zero), zero, zero.new_zeros(len(zero), width))
+
+
+def _foot(points: Float[Tensor, "bodies sole 3"]) -> Float[Tensor, "bodies 3"]:
+    """Middle of a sole at the height of its lowest point [m]."""
+    middle = points.double().mean(1)
+    low = points[..., 1].double().amin(1)
+    return torch.stack([middle[:, 0], low, middle[:, 2]], -1)
+
+
+class _Chain:
+    """Least squares for a vector in each row: unknowns, pairs of them, and their sum."""
+
+    def __init__(self, rows: int) -> None:
+        self.rows = rows
+        self.entries: list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]] = []
+        self.right = np.zeros((rows, 3))
+
+    def prior(self, at: Float[Tensor, "rows 3 3"], goal: Float[Tensor, "rows 3"]) -> None:
+        """Add (x - goal)ᵀ A (x - goal) of each row."""
+        blocks = at.numpy()
+        self._blocks(np.arange(self.rows), np.arange(self.rows), blocks)
+        self.right += np.einsum("rij,rj->ri", blocks, goal.numpy())
+
+    def pairs(
+        self,
+        pairs: Int[Tensor, "pairs 2"],
+        at: Float[Tensor, "pairs 3"],
+        goal: Float[Tensor, "pairs 3"],
+    ) -> None:
+        """Add (x_j - x_i - goal)ᵀ diag(a) (x_j - x_i - goal) of each pair."""
+        i, j = pairs.numpy().T
+        blocks = np.einsum("pi,ij->pij", at.numpy(), np.eye(3))
+        for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            self._blocks(a, b, sign * blocks)
+        pull = at.numpy() * goal.numpy()
+        np.add.at(self.right, j, pull)
+        np.add.at(self.right, i, -pull)
+
+    def _blocks(
+        self, i: NDArray[np.int64], j: NDArray[np.int64], values: NDArray[np.float64]
+    ) -> None:
+        axis = np.arange(3)
+        row = (3 * i[:, None, None] + axis[:, None]).repeat(3, 2)
+        column = (3 * j[:, None, None] + axis).repeat(3, 1)
+        self.entries.append((row.ravel(), column.ravel(), values.ravel()))
+
+    def solve(self) -> Float[Tensor, "rows 3"]:
+        """The rows with the least sum."""
+        from scipy.sparse import csc_matrix
+        from scipy.sparse.linalg import spsolve
+
+        row, column, value = (np.concatenate(part) for part in zip(*self.entries, strict=True))
+        size = 3 * self.rows
+        found = spsolve(csc_matrix((value, (row, column)), shape=(size, size)), self.right.ravel())
+        return torch.from_numpy(np.asarray(found).reshape(self.rows, 3))
+
+
+def _both(values: Float[Tensor, " rows"], pairs: Int[Tensor, "pairs 2"]) -> Float[Tensor, " pairs"]:
+    """What is true of both rows of a pair."""
+    return torch.minimum(values[pairs[:, 0]], values[pairs[:, 1]])
+
+
+def _level(weight: Tensor, up: float = 0.0) -> Tensor:
+    """A weight along the floor, and a share of it upwards."""
+    return torch.stack([weight, up * weight, weight], -1)
+
+
+def _shifts(
+    bodies: Bodies,
+    near: Neighbours,
+    rest: Float[Tensor, "bodies feet"],
+    feet: tuple[list[Tensor], float],
+    parts: Parts,
+) -> Float[Tensor, "bodies 3"]:
+    """How far each body is moved as a whole [m]."""
+    soles, ground = feet
+    chain, pairs = _Chain(len(bodies.frame)), near.pairs
+    sway = SWAY if bodies.pose is not None else RIGID
+    middle = bodies.verts.double().mean(1)
+    ray = middle / middle.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    along = ray[:, :, None] * ray[:, None]
+    eye = torch.eye(3, dtype=torch.float64)
+    prior = along / ALONG**2 + (eye - along) / ACROSS**2
+    none = torch.zeros_like(middle)
+    posture = postures(bodies, parts, ground)
+    gaps = near.gaps.double()
+    nothing = torch.zeros(len(pairs), 3, dtype=torch.float64)
+    chain.pairs(pairs, _level(1 / (STEADY**2 * gaps), 1.0), nothing)
+    chain.prior(prior, none)
+    for k, sole in enumerate(soles):
+        foot = _foot(bodies.verts[:, sole])
+        way = foot[pairs[:, 1]] - foot[pairs[:, 0]]
+        chain.pairs(pairs, _level(_both(rest[:, k], pairs) / sway**2), -way)
+        chain.prior(*_floor(foot, rest[:, k], ground, SINK))
+    calm = (posture.sitting | posture.lying).double()
+    way = middle[pairs[:, 1]] - middle[pairs[:, 0]]
+    chain.pairs(pairs, _level(_both(calm, pairs) / STILL**2, 1.0), -way)
+    return chain.solve()
+
+
+def _floor(
+    foot: Float[Tensor, "bodies 3"], rest: Float[Tensor, " bodies"], ground: float, rise: float
+) -> tuple[Float[Tensor, "bodies 3 3"], Float[Tensor, "bodies 3"]]:
+    """A sole at rest near the floor lies on it, and none is below it."""
+    height = foot[:, 1] - ground
+    share = torch.where(height < 0, torch.ones_like(rest), rest * (height < ON_FLOOR))
+    at = torch.zeros(len(foot), 3, 3, dtype=torch.float64)
+    at[:, 1, 1] = share / rise**2
+    goal = torch.zeros(len(foot), 3, dtype=torch.float64)
+    goal[:, 1] = -height
+    return at, goal
+
+
+def _way(
+    points: Float[Tensor, "bodies sole 3"],
+    near: Neighbours,
+    rest: Float[Tensor, " bodies"],
+    ground: float,
+) -> Float[Tensor, "bodies 3"]:
+    """How far a foot has to go beside its body [m]."""
+    foot, pairs = _foot(points), near.pairs
+    chain = _Chain(len(foot))
+    eye = torch.eye(3, dtype=torch.float64).expand(len(foot), 3, 3)
+    chain.prior(eye / FOOT**2, torch.zeros_like(foot))
+    nothing = torch.zeros(len(pairs), 3, dtype=torch.float64)
+    chain.pairs(pairs, _level(1 / (FADE**2 * near.gaps.double()), 1.0), nothing)
+    way = foot[pairs[:, 1]] - foot[pairs[:, 0]]
+    chain.pairs(pairs, _level(_both(rest, pairs) / SLIP**2), -way)
+    chain.prior(*_floor(foot, rest, ground, RISE))
+    return chain.solve()
+
+
+def _bend(
+    bodies: Bodies, side: str, sole: Int[Tensor, " sole"], way: Float[Tensor, "bodies 3"]
+) -> Bodies:
+    """Bend a leg so that its sole goes that way, without a turn of the sole (Gauss-Newton)."""
+    pose = bodies.pose
+    assert pose is not None
+    spots = sole[torch.linspace(0, len(sole) - 1, min(SPOTS, len(sole))).long()]
+    model = vertex_subset(load_model(pose.model, pose.gender), spots)
+    index = [BODY.index(f"{side}_{part}") - 1 for part in LEG]
+    columns = torch.tensor([3 * k + axis for k in index for axis in range(3)])
+    goal = bodies.verts[:, spots].double() + way[:, None]
+    angles = torch.zeros(len(way), len(columns), dtype=torch.float64)
+
+    def placed(change: Tensor) -> Tensor:
+        bent = pose.body_pose.clone()
+        bent[:, columns] += change.to(bent)
+        return model.posed(replace(pose, body_pose=bent))[0].double().flatten(1)
+
+    damp = torch.eye(len(columns), dtype=torch.float64) / BENT**2
+    with torch.no_grad():
+        for _ in range(STEPS):
+            here = placed(angles)
+            slope = torch.stack([
+                (placed(angles + NUDGE * step) - here) / NUDGE
+                for step in torch.eye(len(columns), dtype=torch.float64)
+            ], -1)  # fmt: skip
+            left = goal.flatten(1) - here
+            normal = slope.mT @ slope / REACHED**2 + damp
+            right = (slope.mT @ left[..., None])[..., 0] / REACHED**2 - angles / BENT**2
+            angles = angles + torch.linalg.solve(normal, right)
+    by = _by(bodies, torch.zeros_like(way))
+    whole = by.angles.clone()
+    whole[:, columns] = angles.to(whole)
+    return corrected(bodies, replace(by, angles=whole))
