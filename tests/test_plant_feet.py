@@ -126,7 +126,8 @@ def test_two_people_do_not_hold_each_other():
         for s, at in enumerate([(-1.0, -3.0), (1.0, -4.0)])
     )
     both = replace(
-        one, verts=torch.cat([one.verts, other.verts]), joints=torch.cat([one.joints, other.joints]),
+        one, verts=torch.cat([one.verts, other.verts]),
+        joints=torch.cat([one.joints, other.joints]),
         frame=torch.cat([one.frame, other.frame]),
         person=torch.cat([one.person, other.person + 1]),
         pose=replace(one.pose, **{

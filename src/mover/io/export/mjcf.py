@@ -14,6 +14,7 @@ from mover.core.run import Run
 from mover.core.types import Camera, Scene
 from mover.io.export.finished import Exported, Finished
 from mover.io.export.mjcf_people import add_figures, figures_of
+from mover.io.export.shell import HEIGHT, Wall, Walls, guess_walls, slab, wall_notes
 from mover.io.export.solids import (
     AXES,
     FRICTION,
@@ -29,18 +30,25 @@ BodyForm = Literal["auto", "skin", "morph", "none"]
 RESERVED = "world"
 
 
-def export_mjcf(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exported:
+def export_mjcf(
+    finished: Finished, folder: Path, body: BodyForm = "auto", walls: Walls = "none"
+) -> Exported:
     """Write `mjcf/room.xml` and its meshes.
 
     Args:
         finished: The result.
         folder: Gets the folder `mjcf`.
         body: none: without people; else they are mocap bodies where their joints are known.
+        walls: Whether walls are guessed from furniture and people.
     """
     solids = solids_of(finished.scene, Run(finished.out))
     root, meshes = mjcf_of(finished.scene, solids)
     notes = ["+z is up and the floor is at 0", ", ".join(f"{s.id} {s.mass:.0f} kg" for s in solids)]
     notes.append(_add_people(root, finished) if body != "none" else "no people")
+    if walls == "guess":
+        shell = guess_walls(finished.scene, finished.bodies)
+        _add_walls(root, shell)
+        notes += wall_notes(shell)
     home = folder / "mjcf"
     for name, content in meshes.items():
         with replacing(home / name) as part:
@@ -61,6 +69,18 @@ def _add_people(root: Element, finished: Finished) -> str:
     return (
         f"people are mocap bodies that touch nothing; {count} keyframes, frame_<number>, move them"
     )
+
+
+def _add_walls(root: Element, walls: Sequence[Wall]) -> None:
+    """Boxes that stand still, named as guessed."""
+    world = root.find("worldbody")
+    assert world is not None
+    for k, wall in enumerate(walls):
+        (x, z), (length, thick), yaw = slab(wall)
+        half = {"size": numbers((length / 2, thick / 2, HEIGHT / 2))}
+        place = {"pos": numbers((x, -z, HEIGHT / 2)), "euler": numbers((0, 0, yaw))}
+        look = {"type": "box", "rgba": "0.9 0.89 0.86 0.4", "friction": numbers(FRICTION)}
+        SubElement(world, "geom", {"name": f"guessed_wall_{k}", **half, **place, **look})
 
 
 def text_of(root: Element) -> str:

@@ -10,16 +10,17 @@ from mover.core.colours import Colour, colour
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.run import Run
-from mover.core.types import Camera, SceneObject
+from mover.core.types import Bodies, Camera, SceneObject
 from mover.geometry.camera import NEAR
 from mover.io.export.finished import Exported, Finished
 from mover.io.export.people import FPS, tracks_of
 from mover.io.export.scene_glb import floor_of, parts_of
+from mover.io.export.shell import Wall, Walls, guess_walls, wall_notes
 from mover.io.export.skin import Skin, skin_for
 from mover.io.export.solids import floor_height, solids_of
 from mover.io.export.usd_mesh import add_look, add_mesh, free_path, pxr
 from mover.io.export.usd_people import INFLUENCES, add_moving_mesh, add_skeleton
-from mover.io.export.usd_physics import add_floor, add_laws, add_solid
+from mover.io.export.usd_physics import add_floor, add_laws, add_solid, add_walls
 
 APERTURE = 20.955  # width of the film [tenths of a scene unit by USD's custom: mm]
 FAR = 1000.0  # [m]
@@ -27,7 +28,13 @@ BodyForm = Literal["auto", "skin", "morph", "none"]
 Up = Literal["y", "z"]
 
 
-def export_usd(finished: Finished, folder: Path, body: BodyForm = "auto", up: Up = "y") -> Exported:
+def export_usd(
+    finished: Finished,
+    folder: Path,
+    body: BodyForm = "auto",
+    up: Up = "y",
+    walls: Walls = "none",
+) -> Exported:
     """Write the room as one binary USD file.
 
     Each object is a rigid body (place and turn) with two children: `visual`, the meshes of the
@@ -40,26 +47,34 @@ def export_usd(finished: Finished, folder: Path, body: BodyForm = "auto", up: Up
         body: How people move: on bones (skin), as meshes (morph), not at all (none), or on bones
             where the parameters are known (auto).
         up: y: the world of scene.json; z: turned, with the floor at 0, as simulators have it.
+        walls: Whether walls are guessed from furniture and people.
 
     Raises:
         InputError: If usd-core is not installed, or bones are asked for and there are none.
     """
-    Usd = pxr("Usd")
-    skin = _skin(finished, body)
+    skin, shell = _skin(finished, body), ()
+    if walls == "guess":
+        shell = guess_walls(finished.scene, finished.bodies)
     path = folder / "scene.usdc"
     with replacing(path) as part:
         part.unlink()
-        stage = Usd.Stage.CreateNew(str(part))
+        stage = pxr("Usd").Stage.CreateNew(str(part))
         _head(stage, finished, up)
-        _add_scene(stage, finished, folder)
-        if finished.bodies is not None and body != "none":
-            for track in tracks_of(finished.bodies):
-                if isinstance(skin, Skin):
-                    add_skeleton(stage, skin, finished.bodies, track)
-                else:
-                    add_moving_mesh(stage, finished.bodies, track)
+        _add_scene(stage, finished, folder, shell)
+        if body != "none":
+            _add_people(stage, finished.bodies, skin)
         stage.GetRootLayer().Save()
-    return Exported((path,), _notes(finished, skin, body))
+    notes = _notes(finished, skin, body)
+    return Exported((path,), (*notes, *(wall_notes(shell) if walls == "guess" else ())))
+
+
+def _add_people(stage: Any, bodies: Bodies | None, skin: Skin | str) -> None:  # noqa: ANN401
+    for track in () if bodies is None else tracks_of(bodies):
+        assert bodies is not None
+        if isinstance(skin, Skin):
+            add_skeleton(stage, skin, bodies, track)
+        else:
+            add_moving_mesh(stage, bodies, track)
 
 
 def _skin(finished: Finished, body: BodyForm) -> Skin | str:
@@ -102,7 +117,12 @@ def _head(stage: Any, finished: Finished, up: Up) -> None:  # noqa: ANN401
         stage.SetEndTimeCode(int(bodies.frame.max()))
 
 
-def _add_scene(stage: Any, finished: Finished, folder: Path) -> None:  # noqa: ANN401
+def _add_scene(
+    stage: Any,  # noqa: ANN401
+    finished: Finished,
+    folder: Path,
+    shell: tuple[Wall, ...],
+) -> None:
     scene, wood = finished.scene, add_laws(stage)
     solids = solids_of(scene, Run(finished.out))
     for index, (piece, solid) in enumerate(zip(scene.objects, solids, strict=True)):
@@ -114,6 +134,7 @@ def _add_scene(stage: Any, finished: Finished, folder: Path) -> None:  # noqa: A
         path = free_path(stage, "/room", "ground")
         add_mesh(stage, path, verts, faces, (0.86, 0.85, 0.83))
     add_floor(stage, floor_height(scene), wood)
+    add_walls(stage, shell, floor_height(scene), wood)
     _add_camera(stage, scene.camera)
 
 

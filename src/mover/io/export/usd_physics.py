@@ -1,16 +1,19 @@
 """Physics of USD: rigid bodies of convex pieces with their mass, on a floor that stays."""
 
+import math
 from typing import Any
 
 import numpy as np
 import torch
 
+from mover.io.export.shell import HEIGHT, Wall, slab
 from mover.io.export.solids import AXES, FRICTION, Solid
 from mover.io.export.usd_mesh import add_mesh, free_path, pxr
 
 GRAVITY = 9.81  # [m/s²]
 PIECE = (0.55, 0.75, 0.9)
 """Colour of convex pieces, which are drawn only where guides are asked for."""
+WALL = (0.9, 0.89, 0.86)
 
 
 def add_laws(stage: Any) -> Any:  # noqa: ANN401
@@ -40,6 +43,25 @@ def add_floor(stage: Any, height: float, wood: Any) -> None:  # noqa: ANN401
     plane.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(0, height, 0))
     UsdPhysics.CollisionAPI.Apply(plane.GetPrim())
     _bind(plane.GetPrim(), wood)
+
+
+def add_walls(stage: Any, walls: tuple[Wall, ...], floor: float, wood: Any) -> None:  # noqa: ANN401
+    """Boxes that stand still, marked as guessed."""
+    Gf, UsdGeom, UsdPhysics = pxr("Gf"), pxr("UsdGeom"), pxr("UsdPhysics")
+
+    double = UsdGeom.XformOp.PrecisionDouble
+    for k, wall in enumerate(walls):
+        (x, z), (length, thick), yaw = slab(wall)
+        cube = UsdGeom.Cube.Define(stage, free_path(stage, "/room", f"guessed_wall_{k}"))
+        cube.CreateSizeAttr(1.0)
+        cube.CreateExtentAttr([(-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)])
+        cube.CreateDisplayColorAttr([WALL])
+        cube.AddTranslateOp(double).Set(Gf.Vec3d(x, floor + HEIGHT / 2, z))
+        cube.AddRotateYOp(double).Set(math.degrees(yaw))
+        cube.AddScaleOp(double).Set(Gf.Vec3d(length, HEIGHT, thick))
+        cube.GetPrim().SetCustomDataByKey("mover:guessed_from", ", ".join(wall.pieces))
+        UsdPhysics.CollisionAPI.Apply(cube.GetPrim())
+        _bind(cube.GetPrim(), wood)
 
 
 def add_solid(stage: Any, body: Any, solid: Solid, wood: Any) -> None:  # noqa: ANN401

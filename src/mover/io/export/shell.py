@@ -1,0 +1,120 @@
+"""Walls that nobody saw: guessed from furniture that stands along them and from where people went.
+
+Rooms are taken for rectangles. Their axes are those of most furniture; a side gets a wall where a
+piece that usually stands along walls turns its back to it, in line with the outermost. No wall may
+cut a piece, a person or the camera, so it lies outside of all of them. Sides without such a piece
+stay open. A guess is marked as one wherever it is written.
+"""
+
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.core.records import record
+from mover.core.types import Bodies, Scene, SceneObject
+from mover.furniture.library import WALL_PIECES, canonical
+from mover.geometry.boxes import box_of, corners
+from mover.geometry.rotations import wrap
+
+Walls = Literal["none", "guess"]
+TURNED = math.radians(12)  # [rad], of a back that faces a wall, at most
+SAME = math.radians(4)  # [rad], usual difference of pieces along walls of one room
+LINE = 0.25  # [m], of a back from the outermost thing of its side, at most
+HEIGHT, THICKNESS = 2.5, 0.1  # [m]
+CLEARANCE = 0.02  # [m], from furniture to the wall
+
+
+@record
+class Wall:
+    """A wall of a room, from the floor up."""
+
+    start: Float[Tensor, "2"]
+    """(x, z) of one end of its inner face [m]."""
+    end: Float[Tensor, "2"]
+    out: Float[Tensor, "2"]
+    """Unit normal, out of the room."""
+    pieces: tuple[str, ...]
+    """Ids of what stands along it: what the guess rests on."""
+
+
+def guess_walls(scene: Scene, bodies: Bodies | None) -> tuple[Wall, ...]:
+    """The walls of a scene, as far as its furniture tells them.
+
+    Args:
+        scene: A result; the camera is at its origin.
+        bodies: Its people, in the world: nobody walks through walls.
+    """
+    if not scene.objects:
+        return ()
+    yaw = _main_yaw(scene.objects)
+    c, s = math.cos(yaw), math.sin(yaw)
+    turn = torch.tensor([[c, -s], [s, c]], dtype=torch.float64)  # from the world to the room's axes
+    foot = [corners(box_of(p)).double()[:, ::2] @ turn.mT for p in scene.objects]
+    inside = [torch.cat(foot), torch.zeros(1, 2, dtype=torch.float64)]
+    if bodies is not None:
+        inside.append(bodies.verts[..., ::2].double().reshape(-1, 2) @ turn.mT)
+    low = torch.stack([points.amin(0) for points in inside]).amin(0) - CLEARANCE
+    high = torch.stack([points.amax(0) for points in inside]).amax(0) + CLEARANCE
+    found: list[Wall] = []
+    for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1)):
+        edge = float((low if sign < 0 else high)[axis])
+        along = _along(scene.objects, foot, (axis, sign, edge), yaw)
+        if along:
+            ends = torch.stack([low, high])
+            ends[:, axis] = edge
+            out = torch.zeros(2, dtype=torch.float64)
+            out[axis] = sign
+            start, end = (ends @ turn).unbind(0)
+            found.append(Wall(start, end, out @ turn, along))
+    return tuple(found)
+
+
+def _main_yaw(objects: tuple[SceneObject, ...]) -> float:
+    """The turn that most furniture shares, up to a quarter; what stands askew does not count."""
+    yaw = torch.stack([box_of(piece).yaw.double() for piece in objects])
+    size = torch.stack([box_of(piece).size.double() for piece in objects])
+    usual = torch.tensor([canonical(p.category) in WALL_PIECES for p in objects])
+    weight = size[:, [0, 2]].amax(1) * torch.where(usual, 2.0, 1.0)
+    apart = wrap(4 * (yaw[:, None] - yaw)) / 4
+    votes = (weight * (-(apart / SAME).square()).exp()).sum(1)
+    best = int(votes.argmax())
+    near = weight * (apart[best].abs() < 2 * SAME)
+    return float(yaw[best] - (near * apart[best]).sum() / near.sum())
+
+
+def _along(
+    objects: tuple[SceneObject, ...],
+    foot: list[Float[Tensor, "8 2"]],
+    side: tuple[int, int, float],
+    yaw: float,
+) -> tuple[str, ...]:
+    """Ids of the pieces that turn their backs to a side and stand at its edge."""
+    axis, sign, edge = side
+    found: list[str] = []
+    for piece, points in zip(objects, foot, strict=True):
+        if canonical(piece.category) not in WALL_PIECES or piece.support != "ground":
+            continue
+        turn = float(piece.yaw) - yaw
+        back = torch.tensor([-math.sin(turn), -math.cos(turn)])
+        beside = abs(edge - float(points[:, axis].max() if sign > 0 else points[:, axis].min()))
+        if float(sign * back[axis]) > math.cos(TURNED) and beside < LINE:
+            found.append(piece.id)
+    return tuple(found)
+
+
+def slab(wall: Wall) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Middle (x, z), length and thickness of a wall [m], and its turn about +y [rad]."""
+    way = wall.end - wall.start
+    middle = (wall.start + wall.end) / 2 + wall.out * THICKNESS / 2
+    x, z = middle.tolist()
+    return (x, z), (float(way.norm()), THICKNESS), math.atan2(-float(way[1]), float(way[0]))
+
+
+def wall_notes(walls: tuple[Wall, ...]) -> tuple[str, ...]:
+    """What a guess rests on."""
+    if not walls:
+        return ("no walls: nothing stands along any",)
+    return tuple(f"a wall is guessed from {', '.join(wall.pieces)}" for wall in walls)
