@@ -65,11 +65,11 @@ def test_a_larger_fault_never_scores_better(
         assert (values[-1] - values[0]) * worse > 0.02, name
 
 
-def test_a_missing_object_scores_zero_in_both_overlaps_and_nothing_else() -> None:
+def test_a_missing_object_scores_zero_in_overlaps_and_in_the_share_and_nothing_else() -> None:
     truth = room()
     fewer = replace(truth, objects=truth.objects[1:])
     metrics = evaluate(fewer, truth, truth, config=FAST)
-    assert metrics["objects"][0]["initial"] == {"iou3d": 0.0, "iou2d": 0.0}
+    assert metrics["objects"][0]["initial"] == {"iou3d": 0.0, "iou2d": 0.0, "add_s_01": 0.0}
     assert metrics["initial"]["iou3d"] == pytest.approx(2 / 3)
     assert metrics["initial"]["center_error"] == pytest.approx(0)
 
@@ -92,7 +92,7 @@ def test_missed_and_false_objects_are_named_and_a_missed_one_counts_as_nothing_f
     assert known == {"missed": names[:1], "false": ["ghost"]}
     config = replace(FAST, by_place=False)
     metrics = evaluate(given, given, truth, config=config)
-    assert metrics["objects"][0]["result"] == {"iou3d": 0.0, "iou2d": 0.0}
+    assert metrics["objects"][0]["result"] == {"iou3d": 0.0, "iou2d": 0.0, "add_s_01": 0.0}
     assert metrics["result"]["iou3d"] == pytest.approx((len(names) - 1) / len(names))
     text = table({**metrics, "unmatched": known})
     assert f"missed: {names[0]}\nfalse: ghost" in text

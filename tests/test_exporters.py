@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shutil
 import struct
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,12 @@ from furnished import (
 )
 from little_room import walkers
 
+import mover.io.export.convex
 import mover.io.export.usd_mesh
 from mover.app.cli import run_command
 from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
+from mover.core.run import Run
 from mover.core.types import Bodies, BodyPose, Scene, SceneObject
 from mover.geometry.placement import place_object
 from mover.io.export.amass import export_bodies
@@ -32,6 +35,7 @@ from mover.io.export.finished import Finished, read_finished
 from mover.io.export.glb import export_glb
 from mover.io.export.people import keyframes
 from mover.io.export.scene_glb import export_objects
+from mover.io.export.solids import solids_of
 from mover.io.export.usd import export_usd
 from mover.io.formats import chosen
 
@@ -278,10 +282,27 @@ def test_keys_stop_where_there_are_enough():
     assert miss > 0
 
 
+@pytest.fixture(autouse=True)
+def along_the_axes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CoACD takes seconds for pieces that nobody looks at here."""
+    monkeypatch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The convex pieces of the room, cut once."""
+    folder = tmp_path_factory.mktemp("cut")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+        solids_of(scaled(furnished()), Run(folder))
+    return folder / "stages"
+
+
 class TestUsd:
     @pytest.fixture
-    def stage(self, tmp_path: Path):
+    def stage(self, tmp_path: Path, cut: Path):
         Usd = pytest.importorskip("pxr.Usd", reason="needs usd-core")
+        shutil.copytree(cut, tmp_path / "out" / "stages")
         self.home = finished(tmp_path, two_people())
         return Usd.Stage.Open(str(export_usd(self.home, tmp_path, "morph").files[0]))
 
