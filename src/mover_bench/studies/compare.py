@@ -3,14 +3,15 @@
 A difference is told from none by a paired bootstrap over rooms, corrected by Holm.
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal, TypeVar
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from mover_bench.studies.finished import Finished, Source, by_room
+from mover_bench.studies.finished import Finished, Frame, Source, by_room
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def shown(
     sign: bool = False,
 ) -> str:
     """A value in the unit of its column; `-` where there is none."""
-    if value is None:
+    if value is None or math.isnan(value):
         return "-"
     column = columns[metric]
     rounded = round(column.factor * value, column.digits) + 0.0  # no negative zero
@@ -84,11 +85,14 @@ def markdown(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, rule, *rows))
 
 
-# Whether a row of a table differs from another: paired bootstrap over rooms, corrected by Holm.
+# Whether a row of a table differs from another.
 
 
 RESAMPLES = 10_000
 LEVEL = 0.95
+MARKS = ("better", "worse")
+Numbers = Any
+"""A number, or a `pandas.Series` of numbers."""
 FEWEST = 6
 """With fewer rooms no difference can be significant: even if all rooms agree, 2 / 2^5 > .05."""
 
@@ -120,7 +124,7 @@ def paired(
     Raises:
         ValueError: If the two are of different length or empty.
     """
-    if len(values) != len(reference) or not values:
+    if len(values) != len(reference) or not len(values):
         raise ValueError(f"{len(values)} and {len(reference)} rooms, expected as many, at least 1")
     return interval(np.subtract(values, reference), seed, resamples)
 
@@ -168,16 +172,12 @@ def holm(chances: Sequence[float]) -> list[float]:
     return adjusted
 
 
-def is_significant(found: Interval, adjusted: float) -> bool:
-    """Whether a difference is told from none: 5 % over the whole family, and enough rooms."""
-    return adjusted < 1 - LEVEL and found.rooms >= FEWEST
+def is_significant(rooms: Numbers, adjusted: Numbers) -> Any:  # noqa: ANN401
+    """Whether differences are told from none: 5 % over the whole family, and enough rooms."""
+    return (adjusted < 1 - LEVEL) & (rooms >= FEWEST)
 
 
-# Tables whose rows are compared with one of them, room by room.
-
-
-T = TypeVar("T")
-Mark = Literal["better", "worse", ""]
+# The tables themselves: what they ask for, and their numbers.
 
 
 @dataclass(frozen=True)
@@ -210,33 +210,19 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Cell:
-    """A number of a table."""
-
-    metric: str
-    value: Interval | None
-    """Over the rooms; None: missing, or quoted."""
-    difference: Interval | None = None
-    """From the row that it is compared with, over the rooms that both have."""
-    adjusted: float = 1.0
-    """p of the difference after Holm's correction over the study."""
-    quoted: float | None = None
-
-    @property
-    def mark(self) -> Mark:
-        """Whether the difference is told from none, and to which side."""
-        found, side = self.difference, COLUMNS[self.metric].better
-        if found is None or not side or not is_significant(found, self.adjusted):
-            return ""
-        return "better" if found.mean * side > 0 else "worse"
-
-
-@dataclass(frozen=True)
 class Filled:
-    """A table with its numbers: one list of cells for each row."""
+    """A table with its numbers."""
 
     table: Table
-    cells: tuple[tuple[Cell, ...], ...]
+    numbers: Frame
+    """A line for each row (`place`, its index) and metric: `NUMBERS`, empty where there is none."""
+
+
+NUMBERS = (
+    "place", "metric", "rooms", "mean", "low", "high", "shared", "difference", "difference_low",
+    "difference_high", "p", "p_holm", "mark",
+)  # fmt: skip
+"""Mean over the rooms [m], [rad], its interval; the same of the difference in `shared` rooms."""
 
 
 def fill_tables(
@@ -249,43 +235,38 @@ def fill_tables(
         finished: What the jobs have left.
         seeds: The rooms of each set.
     """
-    raw = [[_cells(table, row, finished, seeds) for row in table.rows] for table in tables]
-    tested = [
-        (t, r, c)
-        for t, rows in enumerate(raw)
-        for r, cells in enumerate(rows)
-        for c, cell in enumerate(cells)
-        if cell.difference is not None and COLUMNS[cell.metric].better
+    from pandas import DataFrame
+
+    lines = [
+        {"table": t, "place": r, "metric": metric} | _numbers(metric, table, row, finished, seeds)
+        for t, table in enumerate(tables)
+        for r, row in enumerate(table.rows)
+        for metric in table.columns
     ]
-    chances = holm([_known(raw[t][r][c].difference).p for t, r, c in tested])
-    for (t, r, c), adjusted in zip(tested, chances, strict=True):
-        raw[t][r][c] = replace(raw[t][r][c], adjusted=adjusted)
-    return [
-        Filled(table, tuple(tuple(cells) for cells in rows))
-        for table, rows in zip(tables, raw, strict=True)
-    ]
+    found = DataFrame(lines, columns=["table", *NUMBERS])
+    better = found.metric.map(lambda name: COLUMNS[name].better)
+    tested = found.p.notna() & (better != 0)
+    found["p_holm"] = found.p.where(found.p.isna(), 1.0)
+    found.loc[tested, "p_holm"] = holm(found.p[tested].tolist())
+    told = tested & is_significant(found.shared, found.p_holm)
+    found["mark"] = np.select([told & (found.difference * better > 0), told], MARKS, "")
+    return [Filled(table, found[found.table == t]) for t, table in enumerate(tables)]
 
 
-def _cells(
-    table: Table, row: Row, finished: Finished, seeds: Mapping[str, Sequence[int]]
-) -> list[Cell]:
-    if row.source is None:
-        return [Cell(name, None, quoted=row.quoted.get(name)) for name in table.columns]
-    return [_cell(name, table, row, finished, seeds) for name in table.columns]
-
-
-def _cell(
+def _numbers(
     metric: str, table: Table, row: Row, finished: Finished, seeds: Mapping[str, Sequence[int]]
-) -> Cell:
-    source, other = _known(row.source), table.against
-    values = by_room(finished, source, metric, seeds[source.rooms])
-    mean = interval(list(values.values())) if values else None
-    if other is None or not row.tested or other == source:
-        return Cell(metric, mean)
-    theirs = by_room(finished, other, metric, seeds[other.rooms])
-    return Cell(metric, mean, paired_rooms(values, theirs))
-
-
-def _known(value: T | None) -> T:
-    assert value is not None
-    return value
+) -> dict[str, float | None]:
+    if row.source is None:
+        return {"mean": row.quoted.get(metric)}
+    values, other = by_room(finished, row.source, metric, seeds[row.source.rooms]), table.against
+    line: dict[str, float | None] = {}
+    if values:
+        own = interval(list(values.values()))
+        line |= {"rooms": own.rooms, "mean": own.mean, "low": own.low, "high": own.high}
+    if other is None or not row.tested or other == row.source:
+        return line
+    gap = paired_rooms(values, by_room(finished, other, metric, seeds[other.rooms]))
+    if gap is not None:
+        line |= {"difference": gap.mean, "difference_low": gap.low, "difference_high": gap.high}
+        line |= {"shared": gap.rooms, "p": gap.p}
+    return line

@@ -1,16 +1,22 @@
-"""Finished jobs, and the numbers of a row of a table in each room."""
+"""What finished jobs have left, as tables: a row for each scene, and one for each object in it."""
 
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from mover_bench.studies.job import DONE, ROOM, Job
+from mover.app.batch.runner import read_tree
+from mover_bench.studies.job import DONE, ROOM, STAGES, Job
 
+Frame = Any
+"""A `pandas.DataFrame`."""
 TURNED = math.radians(45)  # [rad], a yaw error from which on an object is turned
 SEATS = ("chair", "armchair", "office chair", "sofa", "couch")  # pieces with a front and a back
+PLACING = ("place_objects", "find_image_cues", "refine_camera")  # stages that optimise
+TRAITS = ("category", "touched", "hidden", "truncated", "flipped", "stays")
+MEASURED = (*STAGES, "true_room", "truth")  # scenes of a job that have metrics
+SPENT = ("optimisation", "everything else")  # [s] of all stages
+LENGTH = ("frames", "seconds", "interactions")  # of what a job was given
 
 
 @dataclass(frozen=True)
@@ -22,89 +28,74 @@ class Source:
     names: tuple[str, ...]
     """Variants; `ROOM` for the truth itself."""
     stage: str = "full"
-    """initial, image, full; or truth."""
+    """One of `MEASURED`."""
 
 
 @dataclass(frozen=True)
 class Finished:
-    """All results that a study needs, as their files hold them."""
+    """All results that a study needs; both tables begin with set, seed and name of the job."""
 
-    found: Mapping[tuple[str, int, str], Mapping[str, Any]]
-    """By set, seed and variant."""
-
-    def of(self, rooms: str, seed: int, name: str) -> Mapping[str, Any] | None:
-        """Results of one job; None: it left none."""
-        return self.found.get((rooms, seed, name))
+    scenes: Frame
+    """Stage, version, `LENGTH`, `SPENT`, number of `false` objects, and all metrics."""
+    objects: Frame
+    """Stage, id (`object`), `TRAITS` and the object's metrics."""
 
 
 def read_finished(jobs: Iterable[Job]) -> Finished:
     """Read what the jobs have left."""
-    found: dict[tuple[str, int, str], Mapping[str, Any]] = {}
+    from pandas import DataFrame
+
+    scenes, objects = list[dict[str, Any]](), list[dict[str, Any]]()
     for job in jobs:
-        path = job.folder / DONE
-        if path.exists():
-            found[(job.rooms, job.seed, job.name)] = _read(path)
-    return Finished(found)
+        tree = read_tree(job.folder / DONE)
+        for stage in (name for name in MEASURED if name in tree):
+            about = {"set": job.rooms, "seed": job.seed, "name": job.name, "stage": stage}
+            scenes.append(about | _about(tree) | tree[stage])
+            objects += [
+                about | {"object": item["id"]} | {n: item.get(n) for n in TRAITS} | item[stage]
+                for item in tree.get("objects", ())
+                if stage in item
+            ]
+    keys = ["set", "seed", "name", "stage"]
+    empty = [*keys, "version", "false", *SPENT, *LENGTH, "iou3d"]
+    frame = DataFrame(scenes, columns=None if scenes else empty)
+    things = DataFrame(objects, columns=None if objects else [*keys, "object", *TRAITS, "iou3d"])
+    for name, used in (("iou3d_touched", True), ("iou3d_untouched", False)):
+        means = things[things.touched.astype(bool) == used].groupby(keys).iou3d.mean()
+        frame = frame.join(means.rename(name), on=keys)
+    if "pitch_error" in frame:  # the mean of both angles, as the paper's table has it
+        frame = frame.assign(tilt=(frame.pitch_error + frame.roll_error) / 2)
+    return Finished(frame, things)
 
 
-def _read(path: Path) -> Mapping[str, Any]:
-    tree: Mapping[str, Any] = json.loads(path.read_text())
-    return tree
+def _about(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """What is known of a job beside its metrics."""
+    spent = dict.fromkeys(SPENT, 0.0)
+    for stage in tree.get("stages", ()):
+        spent[SPENT[stage["name"] not in PLACING]] += stage["seconds"]
+    return {
+        "version": f"{tree['version']} ({tree['sources']})",
+        "false": len(tree.get("unmatched", {}).get("false", ())),
+        **spent,
+        **{name: tree.get(name) for name in LENGTH},
+    }
+
+
+def rows_of(frame: Frame, source: Source, seeds: Sequence[int]) -> Frame:
+    """The rows of one source in some rooms, by seed."""
+    mine = (frame.set == source.rooms) & (frame.stage == source.stage)
+    mine &= frame.name.isin(source.names) & frame.seed.isin(seeds)
+    return frame[mine].sort_values("seed", kind="stable")
 
 
 def by_room(
     finished: Finished, source: Source, metric: str, seeds: Sequence[int]
 ) -> dict[int, float]:
     """A metric in each room, the mean over the source's jobs; rooms that lack it are left out."""
-    values: dict[int, float] = {}
-    for seed in seeds:
-        found = [
-            value
-            for name in source.names
-            if (tree := finished.of(source.rooms, seed, name)) is not None
-            and (value := value_of(tree, source.stage, metric)) is not None
-        ]
-        if len(found) == len(source.names):
-            values[seed] = math.fsum(found) / len(found)
-    return values
-
-
-def value_of(tree: Mapping[str, Any], stage: str, metric: str) -> float | None:
-    """A metric of a scene of a job; None: it has none."""
-    if metric in DERIVED:
-        return DERIVED[metric](tree, stage)
-    value = tree.get(stage, {}).get(metric)
-    return None if value is None else float(value)
-
-
-def _tilt(tree: Mapping[str, Any], stage: str) -> float | None:
-    """Mean of the errors of pitch and roll, as the paper's table has it."""
-    scene = tree.get(stage, {})
-    if "pitch_error" not in scene:
-        return None
-    return (scene["pitch_error"] + scene["roll_error"]) / 2
-
-
-def _touched(tree: Mapping[str, Any], stage: str) -> float | None:
-    return _mean([o[stage]["iou3d"] for o in _objects(tree, stage) if o["touched"]])
-
-
-def _untouched(tree: Mapping[str, Any], stage: str) -> float | None:
-    return _mean([o[stage]["iou3d"] for o in _objects(tree, stage) if not o["touched"]])
-
-
-def _objects(tree: Mapping[str, Any], stage: str) -> Sequence[Mapping[str, Any]]:
-    """The objects of a scene of a job; the truth has none that could be wrong."""
-    found: Sequence[Mapping[str, Any]] = tree.get("objects", [])
-    return [item for item in found if stage in item]
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return math.fsum(values) / len(values) if values else None
-
-
-DERIVED = {"tilt": _tilt, "iou3d_touched": _touched, "iou3d_untouched": _untouched}
-"""Metrics that are made of those of the objects or of others."""
+    if metric not in finished.scenes:
+        return {}
+    rooms = rows_of(finished.scenes, source, seeds).groupby("seed")[metric]
+    return rooms.mean()[rooms.count() == len(source.names)].to_dict()
 
 
 def recovered(
@@ -121,15 +112,10 @@ def recovered(
     Returns:
         How many came within 45 degrees, and how many there were.
     """
-    good = count = 0
-    for seed in seeds:
-        for name in source.names:
-            tree = finished.of(source.rooms, seed, name) or {}
-            for item in _objects(tree, source.stage):
-                if item["flipped"] and item["category"] in SEATS and (item["touched"] or not used):
-                    count += 1
-                    good += item[source.stage].get("yaw_error", math.pi) < TURNED
-    return good, count
+    rows = rows_of(finished.objects, source, seeds)
+    rows = rows[rows.flipped.astype(bool) & rows.category.isin(SEATS)]
+    rows = rows[rows.touched.astype(bool)] if used else rows
+    return int((rows.yaw_error < TURNED).sum()) if len(rows) else 0, len(rows)
 
 
 def truth_source(rooms: str) -> Source:

@@ -72,7 +72,7 @@ def make_set(args: MakeArgs, observe: Observer = silent, launch: Launch | None =
         done += 1
         observe(Step(f"{args.set} {job.seed}", done - 1, len(jobs)))
     rows = {str(job.seed): _row(job) for job in jobs if has_results(job)}
-    failed = {str(job.seed): failure_of(job).reason for job in jobs if not has_results(job)}
+    failed = {str(job.seed): failure_of(job) for job in jobs if not has_results(job)}
     manifest = _write_manifests(args, rows, failed)
     known = known_hashes(args.set) if args.check else {}
     wrong = {seed: differences(rows[seed], known[seed]) for seed in rows if seed in known}

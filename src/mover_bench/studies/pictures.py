@@ -1,7 +1,6 @@
 """Pictures of the objects that came out worst: in the image and from above."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from mover.core.records import load, map_tensors
 from mover.core.types import Scene, SceneObject
 from mover.evaluate.scene import image_box
 from mover.geometry.boxes import box_of, corners
+from mover_bench.studies.finished import Frame
 from mover_bench.studies.job import Job, Rebuilt, noisy_room
 from mover_bench.studies.measures import Trial
 from mover_bench.studies.sets import set_named
@@ -29,25 +29,11 @@ COLOURS = {"before": "#7878be", "truth": "#1e783c", "after": "#c83c32"}
 BASE = (0, 4, 5, 1)  # corners of a box around its bottom, the last two at its front
 
 
-@dataclass(frozen=True)
-class Worst:
-    """An object that came out badly."""
-
-    seed: int
-    preset: str
-    item: Mapping[str, Any]
-    """Its row of metrics.json."""
-
-
-def worst_objects(experiment: Experiment, count: int = WORST) -> list[Worst]:
+def worst_objects(experiment: Experiment, count: int = WORST) -> Frame:
     """The objects of the last preset with the lowest IoU3D after the full method."""
-    rows = [
-        Worst(outcome.seed, outcome.preset, item)
-        for outcome in experiment.outcomes
-        if outcome.preset == experiment.presets[-1]
-        for item in outcome.objects
-    ]
-    return sorted(rows, key=lambda w: (w.item["full"]["iou3d"], w.seed, w.item["id"]))[:count]
+    found = experiment.finished.objects
+    rows = found[(found.name == experiment.presets[-1]) & (found.stage == "full")]
+    return rows.sort_values(["iou3d", "seed", "object"])[:count]
 
 
 def draw_worst(experiment: Experiment, rooms: str, out: Path) -> list[str]:
@@ -57,30 +43,34 @@ def draw_worst(experiment: Experiment, rooms: str, out: Path) -> list[str]:
     """
     names: list[str] = []
     trials: dict[Job, Trial] = {}
-    for place, worst in enumerate(worst_objects(experiment), 1):
-        job = Job(rooms, worst.seed, worst.preset, out)
+    for place, worst in enumerate(worst_objects(experiment).itertuples(), 1):
+        job = Job(rooms, worst.seed, worst.name, out)
         if job not in trials:
             trials[job] = map_tensors(_plain, _trial(job))
         rebuilt = map_tensors(_plain, load(Rebuilt, job.folder / "scenes"))
         names.append(f"worst_{place}.png")
         with replacing(out / rooms / names[-1]) as part:
-            figure = draw_object(worst, trials[job], rebuilt)
+            found = experiment.finished.objects
+            stages = found[(found.seed == worst.seed) & (found.object == worst.object)]
+            stages = stages[stages.name == worst.name].set_index("stage")
+            figure = draw_object(stages, trials[job], rebuilt)
             figure.savefig(part, format="png", metadata={"Software": None})
     return names
 
 
-def draw_object(worst: Worst, trial: Trial, rebuilt: Rebuilt) -> Any:  # noqa: ANN401
+def draw_object(stages: Frame, trial: Trial, rebuilt: Rebuilt) -> Any:  # noqa: ANN401
     """Overlays of the initial, the rebuilt and the true scene around an object, and a plan."""
     from matplotlib.figure import Figure
 
-    name, item = worst.item["id"], worst.item
+    before, after = stages.loc["initial"], stages.loc["full"]
+    name = after.object
     scenes = {"before": trial.capture.scene, "after": rebuilt.full, "truth": trial.truth}
     found = {key: _piece(scene, name) for key, scene in scenes.items()}
     region = _region([(scenes[k], p) for k, p in found.items() if p is not None and k != "before"])
     titles = {
-        "before": _numbers(item["initial"]),
-        "after": _numbers(item["full"]),
-        "truth": _traits(worst),
+        "before": _numbers(before),
+        "after": _numbers(after),
+        "truth": _traits(after),
     }
     figure = Figure((4 * SIDE, SIDE + 0.4), layout="constrained")
     *views, plan = figure.subplots(1, 4)
@@ -112,10 +102,9 @@ def _numbers(values: Mapping[str, float]) -> str:
     return f"IoU3D {cell_of('iou3d', values)}, centre {centre} cm, yaw {yaw}°"
 
 
-def _traits(worst: Worst) -> str:
-    item = worst.item
-    use = "touched" if item["touched"] else "untouched"
-    return f"{worst.preset}, seed {worst.seed}, {item['id']}, {use}, {item['hidden']:.0%} hidden"
+def _traits(item: Any) -> str:  # noqa: ANN401
+    use = "touched" if item.touched else "untouched"
+    return f"{item['name']}, seed {item.seed}, {item.object}, {use}, {item.hidden:.0%} hidden"
 
 
 def _piece(scene: Scene, name: str) -> SceneObject | None:

@@ -15,7 +15,6 @@ from mover.app.batch.runner import (
     start_main,
 )
 from mover_bench.studies.job import DONE, ROOM, Job, key_of
-from mover_bench.studies.tables import Failure
 
 log = logging.getLogger(__name__)
 FAILED = "failure.json"
@@ -134,7 +133,6 @@ def has_results(job: Job) -> bool:
     return (job.folder / DONE).exists()
 
 
-def failure_of(job: Job) -> Failure:
+def failure_of(job: Job) -> str:
     """Why a job left no results."""
-    reason = read_tree(job.folder / FAILED).get("reason", "it left no results")
-    return Failure(job.seed, job.name, str(reason))
+    return str(read_tree(job.folder / FAILED).get("reason", "it left no results"))

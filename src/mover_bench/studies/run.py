@@ -10,11 +10,12 @@ from pathlib import Path
 from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover_bench.studies.args import ExperimentArgs
-from mover_bench.studies.job import DONE, ROOM, Job
+from mover_bench.studies.finished import read_finished
+from mover_bench.studies.job import ROOM, Job
 from mover_bench.studies.pictures import draw_worst
 from mover_bench.studies.queue import Launch, failure_of, has_results, open_jobs, run_all, start
 from mover_bench.studies.sets import set_named
-from mover_bench.studies.tables import Experiment, need_bench, read_outcome, write_tables
+from mover_bench.studies.tables import Experiment, need_bench, write_tables
 from mover_bench.studies.variants import VARIANTS, choices
 
 
@@ -46,11 +47,9 @@ def run_experiment(
     for job in run_all(waiting, workers, launch or start):
         done += 1
         observe(Step(f"{args.set} {job.seed}: {job.name}", done - 1, count))
-    outcomes = [read_outcome(job.folder / DONE) for job in rebuilt if has_results(job)]
-    failures = [failure_of(job) for job in jobs if not has_results(job)]
-    experiment = Experiment(
-        command_of(args), args.set, presets, seeds, tuple(outcomes), tuple(failures)
-    )
+    failures = {job: failure_of(job) for job in jobs if not has_results(job)}
+    found = read_finished(rebuilt)
+    experiment = Experiment(command_of(args), args.set, presets, seeds, found, failures)
     folder = args.out / args.set
     pictures = draw_worst(experiment, args.set, args.out)
     return write_tables(experiment, pictures, folder)

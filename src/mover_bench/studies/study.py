@@ -145,12 +145,11 @@ def write_study(name: str, args: StudyArgs, ask: Ask, jobs: Sequence[Job]) -> Pa
     for title, plot in page.plots.items():
         with replacing(folder / f"{title}.svg") as part:
             part.write_text(plot)
-    versions = (f"{t['version']} ({t['sources']})" for t in finished.found.values())
     parts = [
         f"# {name.capitalize().replace('-', ' ')}",
         f"    {command_of(name, args)}",
         f"{study.about} {SCALE}",
-        f"{_rooms(ask)} {made_by(versions)}",
+        f"{_rooms(ask)} {made_by(finished.scenes.version)}",
         *missing_of(jobs),
         *(table_of(filled) for filled in page.tables),
         *page.sections,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from mover.core.errors import InputError
 from mover_bench.studies.compare import Interval, interval, markdown, paired
-from mover_bench.studies.finished import Finished, Source, by_room
+from mover_bench.studies.finished import Finished, Frame, Source, by_room
 from mover_bench.studies.plots import Line, Panel, draw_panels
 from mover_bench.studies.sets import CHANGES, Change, changed_set
 from mover_bench.studies.study_rows import Ask, Page, Plan
@@ -67,24 +67,19 @@ def page(ask: Ask, finished: Finished) -> Page:
 
 def levels_of(ask: Ask, finished: Finished, name: str, kind: str) -> list[Level]:
     """IoU3D under each size of an error, over the rooms that have all sizes."""
-    seeds, levels = ask.seeds[ask.rooms], CHANGES[kind].levels
-    rows = {
-        level: by_room(
-            finished, Source(changed_set(ask.rooms, kind, level), (name,)), "iou3d", seeds
-        )
-        for level in levels
-    }
-    whole = [seed for seed in seeds if all(seed in row for row in rows.values())]
-    if not whole:
+    from pandas import DataFrame
+
+    sources = {x: Source(changed_set(ask.rooms, kind, x), (name,)) for x in CHANGES[kind].levels}
+    rows = {x: by_room(finished, s, "iou3d", ask.seeds[ask.rooms]) for x, s in sources.items()}
+    whole: Frame = DataFrame(rows).dropna().sort_index()
+    if not len(whole):
         return []
-    first = [rows[levels[0]][seed] for seed in whole]
-    scale = len(first) / sum(first) if sum(first) else 0.0
-    out: list[Level] = []
-    for level in levels:
-        values = [rows[level][seed] for seed in whole]
-        cost = paired([scale * v for v in first], [scale * v for v in values])
-        out.append(Level(level, interval(values), cost))
-    return out
+    first = whole.iloc[:, 0]
+    scale = 1 / first.mean() if first.any() else 0.0
+    return [
+        Level(level, interval(values), paired(scale * first, scale * values))
+        for level, values in whole.items()
+    ]
 
 
 def _section(kind: str, change: Change, found: dict[str, list[Level]]) -> str:

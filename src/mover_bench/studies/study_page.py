@@ -2,20 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from mover_bench.studies.compare import (
     COLUMNS,
     FEWEST,
     RESAMPLES,
-    Cell,
     Filled,
-    Interval,
-    Row,
     head_of,
     markdown,
     shown,
 )
-from mover_bench.studies.finished import Source
+from mover_bench.studies.finished import Frame, Source
 from mover_bench.studies.job import ROOM, Job
 from mover_bench.studies.queue import FAILED, failure_of, has_results
 from mover_bench.studies.tables import write_csv
@@ -34,16 +32,23 @@ FIELDS: tuple[str, ...] = (
 
 def table_of(filled: Filled) -> str:
     """A table with its marks, and the differences below it."""
-    table = filled.table
+    table, heads = filled.table, [head_of(name) for name in filled.table.columns]
     parts = [f"## {table.title}"] + ([table.note] if table.note else [])
-    head = ["", *table.parts, *(head_of(name) for name in table.columns), "rooms"]
-    parts.append(markdown(head, [_row(filled, k) for k in range(len(table.rows))]))
-    against = _against(filled)
+    rows, differences = list[list[str]](), list[list[str]]()
+    for row, (_, cells) in zip(table.rows, filled.numbers.groupby("place"), strict=True):
+        ticks = ["✓" if on else "" for on in row.ticks] or [""] * len(table.parts)
+        label = f"*{row.label}* (paper)" if row.source is None else row.label
+        marked = [shown(c.metric, c.mean) + MARKS[c.mark] for c in cells.itertuples()]
+        rows.append([label, *ticks, *marked, _span(cells.rooms)])
+        if cells.difference.notna().any():
+            differences.append([row.label, *(_difference(c) for c in cells.itertuples())])
+    parts.append(markdown(["", *table.parts, *heads, "rooms"], rows))
+    against = [row.label for row in table.rows if table.against and row.source == table.against]
     if against:
         parts += [
-            LEGEND.format(against=f"*{against}*"),
-            f"Difference from *{against}* with its 95 % interval:",
-            _differences(filled),
+            LEGEND.format(against=f"*{against[0]}*"),
+            f"Difference from *{against[0]}* with its 95 % interval:",
+            markdown(["", *heads], differences),
         ]
     return "\n\n".join(parts)
 
@@ -52,58 +57,28 @@ def missing_of(jobs: Sequence[Job]) -> list[str]:
     """What failed or was not run, so that nothing is left out silently."""
     without = [job for job in jobs if not has_results(job)]
     failed = [job for job in without if (job.folder / FAILED).exists()]
-    lines = [
-        f"**Failed**: {job.rooms} {job.seed}, {job.name}: {failure_of(job).reason}"
-        for job in failed
-    ]
+    lines = [f"**Failed**: {job.rooms} {job.seed}, {job.name}: {failure_of(job)}" for job in failed]
     if len(without) > len(failed):
         count = f"{len(without) - len(failed):,} of {len(jobs):,}"
         lines.append(f"**Not run**: {count} jobs; the tables hold what is finished.")
     return lines
 
 
-def _row(filled: Filled, index: int) -> list[str]:
-    row, cells = filled.table.rows[index], filled.cells[index]
-    ticks = ["✓" if on else "" for on in row.ticks] or [""] * len(filled.table.parts)
-    label = f"*{row.label}* (paper)" if row.source is None else row.label
-    return [label, *ticks, *(_shown(cell) for cell in cells), _rooms(cells)]
-
-
-def _shown(cell: Cell) -> str:
-    if cell.value is None:
-        return shown(cell.metric, cell.quoted)
-    return shown(cell.metric, cell.value.mean) + MARKS[cell.mark]
-
-
-def _rooms(cells: Sequence[Cell]) -> str:
-    counts = sorted({cell.value.rooms for cell in cells if cell.value is not None})
+def _span(rooms: Frame) -> str:
+    """Fewest and most rooms of a row's numbers."""
+    counts = sorted({int(n) for n in rooms.dropna()})
     return "-".join(str(n) for n in dict.fromkeys((*counts[:1], *counts[-1:])))
 
 
-def _against(filled: Filled) -> str:
-    """Label of the row that the others are compared with."""
-    source = filled.table.against
-    labels = [row.label for row in filled.table.rows if row.source == source]
-    return labels[0] if source is not None and labels else ""
+def _difference(cell: Any) -> str:  # noqa: ANN401
+    """The difference of a line of `Filled.numbers`."""
+    return difference_text(cell.metric, cell.difference, cell.difference_low, cell.difference_high)
 
 
-def _differences(filled: Filled) -> str:
-    rows = [
-        [row.label, *(_interval(cell) for cell in cells)]
-        for row, cells in zip(filled.table.rows, filled.cells, strict=True)
-        if any(cell.difference is not None for cell in cells)
-    ]
-    return markdown(["", *(head_of(name) for name in filled.table.columns)], rows)
-
-
-def _interval(cell: Cell) -> str:
-    return "-" if cell.difference is None else difference_text(cell.metric, cell.difference)
-
-
-def difference_text(metric: str, found: Interval) -> str:
-    """A difference and its interval in the unit of the column."""
-    mean, low, high = (shown(metric, v, sign=True) for v in (found.mean, found.low, found.high))
-    return f"{mean} [{low}, {high}]"
+def difference_text(metric: str, mean: float, low: float, high: float) -> str:
+    """A difference and its interval in the unit of the column; `-` where there is none."""
+    middle, *ends = (shown(metric, value, sign=True) for value in (mean, low, high))
+    return middle if middle == "-" else f"{middle} [{', '.join(ends)}]"
 
 
 def command_of(source: Source, seeds: str) -> str:
@@ -120,40 +95,27 @@ def commands_of(tables: Sequence[Filled], seeds: Mapping[str, str]) -> list[str]
 
 def write_numbers(tables: Sequence[Filled], seeds: Mapping[str, str], path: Path) -> None:
     """A line for each number [m], [rad]: mean, interval, difference, p, and its command."""
-    from pandas import DataFrame
+    from pandas import concat
 
-    lines = [
-        _line(filled.table.title, row, cell, seeds)
-        for filled in tables
-        for row, cells in zip(filled.table.rows, filled.cells, strict=True)
-        for cell in cells
-    ]
-    write_csv(DataFrame(lines), FIELDS, path)
+    lines = concat([_lines(filled, seeds) for filled in tables])
+    chances = lines[["p", "p_holm"]].map("{:.4g}".format, na_action="ignore")
+    write_csv(lines.assign(unit=lines.metric.map(_unit), **chances), FIELDS, path)
 
 
-def _line(title: str, row: Row, cell: Cell, seeds: Mapping[str, str]) -> dict[str, str]:
-    value, difference = cell.value, cell.difference
-    line: dict[str, str] = {
-        "table": title,
-        "row": row.label,
-        "quoted": "yes" if row.source is None else "",
-        "metric": cell.metric,
-        "unit": "m" if COLUMNS[cell.metric].factor in (100, 1000) else "",
-        "mark": cell.mark,
-        "command": "" if row.source is None else command_of(row.source, seeds[row.source.rooms]),
+def _lines(filled: Filled, seeds: Mapping[str, str]) -> Frame:
+    """The numbers of a table with what names them."""
+    rows = filled.table.rows
+    about = {
+        "row": [row.label for row in rows],
+        "quoted": ["yes" if row.source is None else "" for row in rows],
+        "command": [command_of(r.source, seeds[r.source.rooms]) if r.source else "" for r in rows],
     }
-    if COLUMNS[cell.metric].unit == "°":
-        line["unit"] = "rad"
-    if cell.quoted is not None:
-        line["mean"] = f"{cell.quoted:.6g}"
-    if value is not None:
-        line |= {"rooms": str(value.rooms), **_three("mean", "low", "high", value)}
-    if difference is not None:
-        names = ("difference", "difference_low", "difference_high")
-        line |= _three(*names, difference)
-        line |= {"p": f"{difference.p:.4g}", "p_holm": f"{cell.adjusted:.4g}"}
-    return line
+    named = {
+        name: filled.numbers.place.map(dict(enumerate(words))) for name, words in about.items()
+    }
+    return filled.numbers.assign(table=filled.table.title, **named)
 
 
-def _three(mean: str, low: str, high: str, found: Interval) -> dict[str, str]:
-    return {mean: f"{found.mean:.6g}", low: f"{found.low:.6g}", high: f"{found.high:.6g}"}
+def _unit(metric: str) -> str:
+    column = COLUMNS[metric]
+    return "rad" if column.unit == "°" else "m" if column.factor in (100, 1000) else ""

@@ -223,7 +223,7 @@ def _images(rooms: str) -> dict[str, Source]:
 def _gain(metric: str, full: Mapping[int, float], image: Mapping[int, float]) -> str:
     """The first less the second, in the rooms that both have."""
     found = paired_rooms(full, image)
-    return "-" if found is None else difference_text(metric, found)
+    return "-" if found is None else difference_text(metric, found.mean, found.low, found.high)
 
 
 def _turned(ask: Ask, finished: Finished) -> str:

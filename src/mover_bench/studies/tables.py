@@ -1,7 +1,5 @@
 """The tables of an experiment: every object, the means, and a page that one can read."""
 
-import json
-import math
 import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,16 +17,13 @@ from mover.core.records import plain
 from mover.core.run import sources
 from mover.evaluate.scene import HARM_METRICS, OBJECT_METRICS
 from mover_bench.studies.compare import COLUMNS, Column, head_of, markdown, shown
-from mover_bench.studies.job import STAGES
+from mover_bench.studies.finished import TRAITS, TURNED, Finished, Frame
+from mover_bench.studies.job import STAGES, Job
 from mover_bench.studies.sets import set_named
 
-Frame = Any
-"""A `pandas.DataFrame`."""
 HIDDEN = 0.3  # share of an object that others hide, from which on it counts as hidden
 CUT = 0.1  # share of an object that the border of the image cuts off, likewise
-TURNED = math.radians(45)  # an object with a larger yaw error is turned
 BAD = 0.25  # IoU3D below which an object is lost
-TRAITS = ("category", "touched", "hidden", "truncated", "flipped", "stays")
 ABOUT = ("seed", "preset", "stage", "object", *TRAITS)
 SHOWN: dict[str, Column] = {
     **{
@@ -61,30 +56,6 @@ COUNTED = {"turned": "turned > 45° ↓", "bad": "IoU3D < .25 ↓"}
 
 
 @dataclass(frozen=True)
-class Failure:
-    """A job that ended without results."""
-
-    seed: int
-    name: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a finished job found."""
-
-    seed: int
-    preset: str
-    version: str
-    """Of the program, with a digest of its sources."""
-    scenes: Mapping[str, Mapping[str, float]]
-    """Metrics of each stage of `STAGES`."""
-    objects: tuple[Mapping[str, Any], ...]
-    false: int = 0
-    """Objects of the result that the truth does not have."""
-
-
-@dataclass(frozen=True)
 class Experiment:
     """All that is known when the jobs have ended."""
 
@@ -93,8 +64,9 @@ class Experiment:
     """Name of the set of rooms."""
     presets: tuple[str, ...]
     seeds: tuple[int, ...]
-    outcomes: tuple[Outcome, ...]
-    failures: tuple[Failure, ...]
+    finished: Finished
+    failures: Mapping[Job, str]
+    """Why the jobs that left no results failed."""
 
 
 def need_bench() -> None:
@@ -111,15 +83,6 @@ def need_bench() -> None:
             )
 
 
-def read_outcome(path: Path) -> Outcome:
-    """Read the results of a finished job."""
-    tree = json.loads(path.read_text())
-    version = f"{tree['version']} ({tree['sources']})"
-    scenes = {stage: tree[stage] for stage in STAGES}
-    false = len(tree.get("unmatched", {}).get("false", ()))
-    return Outcome(tree["seed"], tree["name"], version, scenes, tuple(tree["objects"]), false)
-
-
 def write_tables(experiment: Experiment, pictures: Sequence[str], folder: Path) -> Path:
     """Write results.csv, summary.csv and summary.md; returns the latter."""
     objects, rooms = frames_of(experiment)
@@ -128,7 +91,7 @@ def write_tables(experiment: Experiment, pictures: Sequence[str], folder: Path) 
     write_csv(objects, (*ABOUT, *metrics), folder / "results.csv")
     about = ("over", "preset", "stage", "count", *COUNTED)
     write_csv(lines, (*about, *SHOWN), folder / "summary.csv")
-    versions = made_by(x.version for x in experiment.outcomes)
+    versions = made_by(experiment.finished.scenes.version)
     page = fill_page(experiment.command, versions, lines, _notes(experiment, objects))
     with replacing(folder / "summary.md") as part:
         part.write_text(page + "".join(f"\n![{name}]({name})\n" for name in pictures))
@@ -144,28 +107,18 @@ def write_csv(frame: Frame, columns: Sequence[str], path: Path) -> None:
 
 def frames_of(experiment: Experiment) -> tuple[Frame, Frame]:
     """A row for each object and stage, and one for each room and stage."""
-    from pandas import DataFrame
-
-    objects, rooms = list[dict[str, Any]](), list[dict[str, Any]]()
-    for outcome, stage, preset in _scenes(experiment):
-        about = {"seed": outcome.seed, "preset": preset, "stage": stage}
-        rooms.append({**about, **outcome.scenes[stage]})
-        objects += [
-            {**about, "object": item["id"], **{n: item[n] for n in TRAITS}, **item[stage]}
-            for item in outcome.objects
-        ]
-    columns = None if objects else list(ABOUT)
-    return DataFrame(objects, columns=columns), DataFrame(rooms, columns=columns)
+    found = experiment.finished
+    return _by_stage(found.objects, ["seed", "object"]), _by_stage(found.scenes, ["seed"])
 
 
-def _scenes(experiment: Experiment) -> Iterable[tuple[Outcome, str, str]]:
-    """Outcome, stage and preset of every measured scene; the initial scene has no preset."""
-    first = {outcome.seed: outcome for outcome in reversed(experiment.outcomes)}
-    for seed in sorted(first):
-        yield first[seed], "initial", ""
-    for outcome in experiment.outcomes:
-        yield outcome, "image", outcome.preset
-        yield outcome, "full", outcome.preset
+def _by_stage(found: Frame, keys: list[str]) -> Frame:
+    """What is measured of the stages; the initial scene has no preset and comes once."""
+    from pandas import concat
+
+    rows = found.rename(columns={"name": "preset"})
+    first = rows[rows.stage == "initial"].assign(preset="").drop_duplicates(keys)
+    later = rows[rows.stage.isin(("image", "full"))]
+    return concat([first.sort_values("seed", kind="stable"), later], ignore_index=True)
 
 
 def summarise(objects: Frame, rooms: Frame) -> Frame:
@@ -225,18 +178,20 @@ def _notes(experiment: Experiment, objects: Frame) -> list[str]:
         f"Noise: {noise}.",
     ]
     missed = int(first.center_error.isna().sum())
-    false = sum({outcome.seed: outcome.false for outcome in experiment.outcomes}.values())
+    scenes = experiment.finished.scenes
+    full = scenes[scenes.stage == "full"]
+    false = int(full.drop_duplicates("seed", keep="last").false.sum())
     if missed or false:
         notes.append(
             f"**{missed} objects were not given: they count with IoU 0** and have no other metric."
             f" {false} were given that are not there: they are in no mean of objects."
         )
-    for failure in experiment.failures:
-        notes.append(f"**Failed**: seed {failure.seed}, {failure.name}: {failure.reason}")
+    for job, reason in experiment.failures.items():
+        notes.append(f"**Failed**: seed {job.seed}, {job.name}: {reason}")
     expected = len(experiment.seeds) * len(experiment.presets)
-    if len(experiment.outcomes) < expected:
+    if len(full) < expected:
         notes.append(
-            f"Only {len(experiment.outcomes)} of {expected} runs ended: rows of different presets"
+            f"Only {len(full)} of {expected} runs ended: rows of different presets"
             " may be means over different rooms (see `rooms`)."
         )
     return notes
@@ -291,8 +246,7 @@ def _by_room(lines: Frame, names: Sequence[str], stages: Sequence[str]) -> str:
 
 def cell_of(name: str, line: Mapping[str, Any]) -> str:
     """A metric of a row in the unit of its column."""
-    value = line.get(name)
-    return shown(name, None if value is None or math.isnan(value) else value, SHOWN)
+    return shown(name, line.get(name), SHOWN)
 
 
 def label_of(line: Mapping[str, Any]) -> str:
