@@ -25,19 +25,20 @@ from mover_bench.rooms.placed import BODY, free_of, way
 from mover_bench.rooms.room import make_room
 from mover_bench.studies import make
 from mover_bench.studies.args import MakeArgs
-from mover_bench.studies.job import DONE, Job, spoilt
-from mover_bench.studies.made import (
+from mover_bench.studies.job import DONE, Job, key_of, spoilt
+from mover_bench.studies.make import (
     CAPTURE,
     MADE,
     capture_hash,
     differences,
-    key_of,
+    known_hashes,
     make_one,
+    make_set,
     mask_pixels,
     row_of,
+    told,
     truth_hash,
 )
-from mover_bench.studies.make import known_hashes, make_set, told
 from mover_bench.studies.measures import (
     hidden_shares,
     is_flipped,

@@ -19,7 +19,7 @@ from mover.geometry.camera import project, tilted, to_camera
 from mover.geometry.raster import first_hit
 from mover_bench.rooms.config import PlanConfig, Rule
 from mover_bench.rooms.placed import Placed, corners, verts_on_floor
-from mover_bench.rooms.turns import facing, heading_of, left_of
+from mover_bench.rooms.turns import facing, heading_of
 
 Pose = tuple[float, float, float]
 Size = tuple[float, float, float]
@@ -61,8 +61,8 @@ def _before(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others)
     sofas = [p for p in others if p.furniture.category == "sofa"]
     if not sofas:
         return None
-    front = sofas[0].furniture.size[2] / 2 + size[2] / 2 + float(rng.uniform(0.8, 1.0))
-    place = sofas[0].place + front * facing(np.array(sofas[0].heading))
+    away = sofas[0].furniture.size[2] / 2 + size[2] / 2 + float(rng.uniform(0.8, 1.0))
+    place = sofas[0].place + away * sofas[0].axes[1]
     return float(place[0]), float(place[1]), sofas[0].heading
 
 
@@ -87,9 +87,8 @@ def _beside(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others)
     side = 1 if rng.integers(2) else -1
     across = side * (bed.furniture.size[0] / 2 + size[0] / 2 + float(rng.uniform(0.06, 0.12)))
     along = -bed.furniture.size[2] / 2 + size[2] / 2
-    place = (
-        bed.place + across * left_of(np.array(bed.heading)) + along * facing(np.array(bed.heading))
-    )
+    left, front = bed.axes
+    place = bed.place + across * left + along * front
     return float(place[0]), float(place[1]), bed.heading
 
 
@@ -107,14 +106,26 @@ WIDTH = 240  # [px] of the small picture
 HIDDEN = 0.3  # a piece of which more is hidden counts as hidden
 
 
-def depth_of(piece: Placed, camera: Camera, height: float) -> Float[Tensor, "h w"]:
+@record
+class Viewpoint:
+    """The camera over the floor: it stands at x = z = 0."""
+
+    camera: Camera
+    height: float
+    """Above the floor [m]."""
+
+    def seen(self, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
+        """Points in the frame of the floor in camera axes [m]."""
+        return to_camera(points - torch.tensor([0, self.height, 0]), self.camera.R_cam_world)
+
+
+def depth_of(piece: Placed, view: Viewpoint) -> Float[Tensor, "h w"]:
     """Depth of a piece drawn alone by a camera above the floor [m], infinite where it is not."""
+    camera = view.camera
     zoom = WIDTH / camera.width
     size = (max(1, round(camera.height * zoom)), WIDTH)
     K = camera.K * torch.tensor([[zoom], [size[0] / camera.height], [1.0]])
-    verts = torch.from_numpy(verts_on_floor(piece)).float() - torch.tensor([0, height, 0])
-    cam = to_camera(verts, camera.R_cam_world)
-    return first_hit(cam, piece.furniture.mesh.faces, K, size)[0]
+    return first_hit(view.seen(verts_on_floor(piece)), piece.furniture.mesh.faces, K, size)[0]
 
 
 def worth(depths: list[Float[Tensor, "h w"]], least: float, most: float) -> float:
@@ -135,15 +146,6 @@ def worth(depths: list[Float[Tensor, "h w"]], least: float, most: float) -> floa
 
 
 # Furnish a room: what stands where, and from where the camera sees it.
-
-
-@record
-class Viewpoint:
-    """The camera over the floor: it stands at x = z = 0."""
-
-    camera: Camera
-    height: float
-    """Above the floor [m]."""
 
 
 @record
@@ -261,7 +263,7 @@ def _furnished(
     drawn: list[Float[Tensor, "h w"]] = []
     for what in wanted:
         spots = _spots(plan, what, rng, config)
-        looks = [depth_of(spot, view.camera, view.height) for spot in spots]
+        looks = [depth_of(spot, view) for spot in spots]
         values = [worth([*drawn, look], few, config.hidden) for look in looks]
         best = int(np.argmax(values)) if values else -1
         if best >= 0 and values[best] >= 0:
@@ -293,8 +295,7 @@ def _spots(
 
 def in_view(piece: Placed, view: Viewpoint) -> float:
     """Share of the vertices that the image holds."""
-    verts = torch.from_numpy(verts_on_floor(piece)).float()
-    cam = to_camera(verts - torch.tensor([0, view.height, 0]), view.camera.R_cam_world)
+    cam = view.seen(verts_on_floor(piece))
     pixel = project(cam, view.camera.K)
     size = torch.tensor([view.camera.width, view.camera.height])
     inside = ((pixel > 0) & (pixel < size)).all(-1) & (cam[:, 2] > 0.3)
@@ -317,9 +318,8 @@ def overlap(a: Placed, b: Placed, margin: float) -> bool:
     if np.hypot(*(a.place - b.place)) > reach:
         return False
     first, second = corners(a, margin / 2), corners(b, margin / 2)
-    for heading in (a.heading, b.heading):
-        for axis in (facing(np.array(heading)), left_of(np.array(heading))):
-            p, q = first @ axis, second @ axis
-            if p.max() < q.min() or q.max() < p.min():
-                return False
+    for axis in (*a.axes, *b.axes):
+        p, q = first @ axis, second @ axis
+        if p.max() < q.min() or q.max() < p.min():
+            return False
     return True

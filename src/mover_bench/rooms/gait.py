@@ -1,4 +1,8 @@
-"""Walking: stations of the body along a path, footsteps that lead there, and the body on them."""
+"""Walking: stations of the body along a path, footsteps that lead there, and the body on them.
+
+A foot stays where it landed until it swings again; the heel rises about the ball of the foot when
+the body moves on. The pelvis runs through the middle between the feet.
+"""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -119,12 +123,6 @@ def steps_of(way: Stations) -> Steps:
 def duration(way: Stations) -> float:
     """Time of all steps [s]."""
     return STEP_TIME * len(way.place)
-
-
-# Walking: footsteps along a path, and the body that they carry.
-#
-# A foot stays where it landed until it swings again; the heel rises about the ball of the foot when
-# the body moves on. The pelvis runs through the middle between the feet.
 
 
 LIFT = 0.07  # [m], of the ankle in mid-swing

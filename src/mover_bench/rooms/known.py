@@ -32,9 +32,6 @@ def one_thread() -> Generator[None, None, None]:
         torch.set_num_threads(before)
 
 
-# What is known of a room: the capture that a perfect upstream would give, and the truth.
-
-
 PASSING = 0.1  # a body of which furniture hides more passes behind it
 
 

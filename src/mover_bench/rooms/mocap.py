@@ -198,11 +198,6 @@ def _refuse(path: Path, number: int, words: list[str], expected: str) -> NoRetur
     raise InputError(f"{path.name}: line {number} has {line!r}, expected {expected}")
 
 
-# Motion capture on the open body: bones point where the actor's bones point.
-#
-# Only files that the user has are read; none comes with this package.
-
-
 RATE = 120.0  # [1/s], frames of the library of Carnegie Mellon University
 FLOOR = 0.02  # share of frames whose lowest point may be under the floor
 

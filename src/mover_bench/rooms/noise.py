@@ -208,15 +208,6 @@ def _turned(pose: BodyPose, error: Float[np.ndarray, "bodies 22 3"]) -> BodyPose
     )
 
 
-# Errors like those of real upstream tools, on a room in which everything is known.
-#
-# Sources: the paper's sensitivity table (uniform noise on the translation, orientation and scale of
-# Total3D's objects: 0.3 m, 30 degrees, 15 %), and published errors of monocular body regression
-# (a few degrees a joint and 2-3 % in depth, both slow in time); the other rows name their own
-# sources in `NoiseConfig`. Every part has its own stream of
-# random numbers, so that changing one leaves the others as they were.
-
-
 @one_thread()
 def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     """What upstream tools would say about a room; the same for the same seed on every machine.

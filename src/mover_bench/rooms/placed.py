@@ -1,7 +1,9 @@
 """Furniture in a room: places on the floor, depth of bodies inside it, ways around it."""
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from mover.core.records import record
 from mover.furniture.pieces import Furniture
@@ -28,6 +30,11 @@ class Placed:
         """X and z of the centre of the base [m]."""
         return np.array(self.at)
 
+    @property
+    def axes(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+        """Directions on the floor (x, z) to the left of the piece and to its front."""
+        return left_of(np.array(self.heading)), facing(np.array(self.heading))
+
 
 @record
 class Spot:
@@ -50,26 +57,23 @@ class Spot:
 
 def on_floor(piece: Placed, x: float, z: float) -> Float[np.ndarray, "2"]:
     """Place on the floor (x, z) of a point in the axes of the piece [m]."""
-    return piece.place + x * left_of(np.array(piece.heading)) + z * facing(np.array(piece.heading))
+    left, front = piece.axes
+    return piece.place + x * left + z * front
 
 
 def corners(piece: Placed, margin: float = 0.0) -> Float[np.ndarray, "4 2"]:
     """Corners of the footprint of a piece, grown by `margin` [m]."""
     w, _, d = piece.furniture.size
     x, z = w / 2 + margin, d / 2 + margin
-    heading = np.array(piece.heading)
-    return piece.place + SIGNS[:, :1] * x * left_of(heading) + SIGNS[:, 1:] * z * facing(heading)
+    left, front = piece.axes
+    return piece.place + SIGNS[:, :1] * x * left + SIGNS[:, 1:] * z * front
 
 
-def verts_on_floor(piece: Placed) -> Float[np.ndarray, "verts 3"]:
+def verts_on_floor(piece: Placed) -> Float[Tensor, "verts 3"]:
     """Vertices in the frame of the floor [m]."""
-    verts = piece.furniture.mesh.verts.double().numpy()
-    flat = (
-        piece.place
-        + verts[:, :1] * left_of(np.array(piece.heading))
-        + verts[:, 2:] * facing(np.array(piece.heading))
-    )
-    return np.stack([flat[:, 0], verts[:, 1], flat[:, 1]], -1)
+    verts, (left, front) = piece.furniture.mesh.verts.double().numpy(), piece.axes
+    flat = piece.place + verts[:, :1] * left + verts[:, 2:] * front
+    return torch.from_numpy(np.stack([flat[:, 0], verts[:, 1], flat[:, 1]], -1)).float()
 
 
 def distances(
@@ -78,10 +82,8 @@ def distances(
     """Signed distance to a piece, negative inside, at most `far` [m]."""
     import igl
 
-    flat = points[:, [0, 2]] - piece.place
-    x = flat @ left_of(np.array(piece.heading))
-    z = flat @ facing(np.array(piece.heading))
-    local = np.stack([x, points[:, 1], z], -1)
+    flat, (left, front) = points[:, [0, 2]] - piece.place, piece.axes
+    local = np.stack([flat @ left, points[:, 1], flat @ front], -1)
     verts = piece.furniture.mesh.verts.double().numpy()
     low, high = verts.min(0) - far, verts.max(0) + far
     near = np.flatnonzero(((local > low) & (local < high)).all(-1))
@@ -101,9 +103,8 @@ def free_of(
     free = np.ones(point.shape[:-1], dtype=bool)
     for piece in pieces:
         w, _, d = piece.furniture.size
-        flat = point - piece.place
-        x = np.abs(flat @ left_of(np.array(piece.heading))) - w / 2
-        z = np.abs(flat @ facing(np.array(piece.heading))) - d / 2
+        flat, (left, front) = point - piece.place, piece.axes
+        x, z = np.abs(flat @ left) - w / 2, np.abs(flat @ front) - d / 2
         gap = np.hypot(np.maximum(x, 0), np.maximum(z, 0)) + np.minimum(np.maximum(x, z), 0)
         free &= gap > margin
     return free

@@ -78,12 +78,6 @@ def make_person(betas: Sequence[float]) -> Person:
     return Person(shape.numpy(), joints[0].numpy() - origin, verts[0].numpy() - origin, origin)
 
 
-# From what a person wants (pelvis here, feet there, hands on the table) to joint angles.
-#
-# A posture is given by places; the limbs follow by the law of cosines. All in float64 and in the
-# frame of the floor: +y up, the floor at y = 0.
-
-
 REACH = 0.995  # a limb is never quite straight
 
 

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Masks, Mesh
-from mover.geometry.camera import to_camera
 from mover.geometry.raster import first_hit
 from mover_bench.rooms.compose import Plan
 from mover_bench.rooms.placed import corners, verts_on_floor
@@ -68,7 +67,7 @@ def see(plan: Plan) -> Sight:
     """Draw the furniture, the floor and the walls."""
     camera = plan.view.camera
     verts, faces, owner = _scene(plan)
-    cam = _to_camera(plan, verts)
+    cam = plan.view.seen(verts)
     depth, face = first_hit(cam, faces, camera.K, (camera.height, camera.width))
     hit = face >= 0
     piece = torch.where(hit, owner[face.clamp_min(0)], torch.full_like(face, -1))
@@ -130,16 +129,12 @@ def _scene(plan: Plan) -> tuple[Tensor, Tensor, Tensor]:
     """Vertices on the floor, faces, and the piece of each face."""
     verts, faces, owner, start = [], [], [], 0
     for index, piece in enumerate(plan.pieces):
-        one = torch.from_numpy(verts_on_floor(piece)).float()
+        one = verts_on_floor(piece)
         verts.append(one)
         faces.append(piece.furniture.mesh.faces + start)
         owner.append(torch.full((len(piece.furniture.mesh.faces),), index))
         start += len(one)
     return torch.cat(verts), torch.cat(faces), torch.cat(owner)
-
-
-def _to_camera(plan: Plan, verts: Tensor) -> Tensor:
-    return to_camera(verts - torch.tensor([0, plan.view.height, 0]), plan.view.camera.R_cam_world)
 
 
 def _shades(verts: Tensor, faces: Tensor) -> Float[Tensor, " faces"]:

@@ -141,9 +141,6 @@ def _open_side(plan: Plan, index: int, rng: np.random.Generator) -> int:
     return int(rng.choice(good)) if good else sides[0]
 
 
-# Known rooms: drawn from a seed, or composed by hand for the demo.
-
-
 CLEAR = 0.25  # [m], between the joints of two people
 MOST_WAIT = 24.0  # [s], before somebody begins
 

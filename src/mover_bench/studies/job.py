@@ -135,7 +135,7 @@ def doing_of(room: KnownRoom) -> tuple[str, ...]:
 
 def key_of(job: Job) -> str:
     """Digest of everything that a job's numbers depend on."""
-    settings = None if job.name == ROOM else VARIANTS[job.name]
+    settings = VARIANTS.get(job.name)  # a room has none
     rooms = set_named(job.rooms)
     return records.fingerprint(
         rooms.room, rooms.noise, rooms.version, job.seed, job.name, settings, sources("mover_bench")

@@ -135,9 +135,6 @@ def _depth(
     return first_hit(verts, mesh.faces, K, size)[0]
 
 
-# Measure a rebuilt room against the truth: objects, interaction, camera, and the people.
-
-
 GIVEN, TRUE_GIVEN, TRUE_ROOM = "given", "true given", "true room"
 TRAITS = ("id", "category", "touched", "hidden", "truncated", "flipped", "stays")
 PROX = "+CamGP+SDF+Contact"  # what refines bodies in the true room

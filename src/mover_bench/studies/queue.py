@@ -1,6 +1,7 @@
 """The order of an experiment's jobs: room by room; finished ones are files."""
 
 import logging
+import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,22 +15,24 @@ from mover.app.batch.runner import (
     run_jobs,
     start_main,
 )
+from mover.core.errors import InputError
+from mover.core.observe import Observer, Step
 from mover_bench.studies.job import DONE, ROOM, Job, key_of
 
 log = logging.getLogger(__name__)
 FAILED = "failure.json"
 PRELOADED = (
-    "mover_bench.studies.job", "mover_bench.studies.made", "warp", "scipy.interpolate",
+    "mover_bench.studies.job", "mover_bench.studies.make", "warp", "scipy.interpolate",
     "scipy.ndimage", "scipy.sparse.csgraph",
 )  # fmt: skip
 """What jobs do, and what they import themselves when they first need it."""
 Launch = Callable[[Job], Running[int]]
 
 
-def start(job: Job) -> Running[int]:
-    """Start a job; what it says goes to its log."""
-    words = (job.rooms, str(job.seed), job.name, str(job.out))
-    return start_main("mover_bench.studies.job", words, job.folder / LOG, PRELOADED)
+def start(job: Job, module: str = "mover_bench.studies.job", *more: str) -> Running[int]:
+    """Start a job in the process of a module, with `more` words; what it says goes to its log."""
+    words = (job.rooms, str(job.seed), job.name, str(job.out), *more)
+    return start_main(module, words, job.folder / LOG, PRELOADED)
 
 
 def open_jobs(jobs: Sequence[Job], keep: bool) -> list[Job]:
@@ -50,6 +53,27 @@ def open_jobs(jobs: Sequence[Job], keep: bool) -> list[Job]:
         and not (is_finished(job, keep) and job.room.with_suffix(".json").exists())
     ]
     return [*rooms, *waiting]
+
+
+def finish(
+    jobs: Sequence[Job],
+    waiting: Sequence[Job],
+    workers: int,
+    work: tuple[Observer, Launch],
+    *,
+    store: bool = True,
+) -> None:
+    """Do those of the jobs that wait, and tell an observer of each that ends.
+
+    Raises:
+        InputError: If the number of workers is negative; 0: as many as there are cores.
+    """
+    if workers < 0:
+        raise InputError(f"--workers: {workers}, expected 0 or more")
+    observe, launch = work
+    ended = run_all(waiting, workers or os.cpu_count() or 1, launch, store=store)
+    for done, job in enumerate(ended, len(jobs) - len(waiting)):
+        observe(Step(f"{job.rooms} {job.seed}: {job.name}", done, len(jobs)))
 
 
 def run_all(

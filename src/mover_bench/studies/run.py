@@ -3,17 +3,16 @@
 Every seed and preset is a process of its own; finished ones are files and are not done again.
 """
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from mover.core.errors import InputError
-from mover.core.observe import Observer, Step, silent
+from mover.core.observe import Observer, silent
 from mover_bench.studies.args import ExperimentArgs
 from mover_bench.studies.finished import read_finished
 from mover_bench.studies.job import ROOM, Job
 from mover_bench.studies.pictures import draw_worst
-from mover_bench.studies.queue import Launch, failure_of, has_results, open_jobs, run_all, start
+from mover_bench.studies.queue import Launch, failure_of, finish, has_results, open_jobs, start
 from mover_bench.studies.sets import set_named
 from mover_bench.studies.tables import Experiment, need_bench, write_tables
 from mover_bench.studies.variants import VARIANTS, choices
@@ -41,12 +40,9 @@ def run_experiment(
     rooms = [Job(args.set, seed, ROOM, args.out) for seed in seeds]
     presets = tuple(dict.fromkeys(args.presets))
     rebuilt = [Job(args.set, s, name, args.out) for name in presets for s in seeds]
-    jobs, workers = rooms + rebuilt, args.workers or os.cpu_count() or 1
+    jobs = rooms + rebuilt
     waiting = open_jobs(by_room(jobs), args.keep)
-    count, done = len(jobs), len(jobs) - len(waiting)
-    for job in run_all(waiting, workers, launch or start):
-        done += 1
-        observe(Step(f"{args.set} {job.seed}: {job.name}", done - 1, count))
+    finish(jobs, waiting, args.workers, (observe, launch or start))
     failures = {job: failure_of(job) for job in jobs if not has_results(job)}
     found = read_finished(rebuilt)
     experiment = Experiment(command_of(args), args.set, presets, seeds, found, failures)
@@ -88,5 +84,3 @@ def _check(args: ExperimentArgs) -> None:
     for name in args.presets:
         if name not in VARIANTS:
             raise InputError(f"--presets: {name!r} is none of {choices()}")
-    if args.workers < 0:
-        raise InputError(f"--workers: {args.workers}, expected 0 or more")

@@ -163,12 +163,6 @@ def without(noise: NoiseConfig, error: str) -> NoiseConfig:
     return replace(noise, **off)
 
 
-# Sets whose noise is changed in one thing, for the study of sensitivity.
-#
-# `rooms+scale=0.25` is the set `rooms` with errors of 25 % in the sizes of the objects; its rooms,
-# people and all other errors stay the same.
-
-
 @dataclass(frozen=True)
 class Change:
     """An error of the input in growing sizes."""

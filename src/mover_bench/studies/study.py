@@ -1,19 +1,18 @@
 """Run the paper's experiments on known rooms, each a study of its own: jobs, then tables."""
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from mover.core.errors import InputError
 from mover.core.files import replacing
-from mover.core.observe import Observer, Step, silent
+from mover.core.observe import Observer, silent
 from mover.pipeline.presets import PRESETS
 from mover_bench.studies import study_noise, study_rows, study_upstream, study_video
 from mover_bench.studies.args import StudyArgs
 from mover_bench.studies.finished import Finished, read_finished
 from mover_bench.studies.job import ROOM, Job
-from mover_bench.studies.queue import Launch, open_jobs, run_all, start
+from mover_bench.studies.queue import Launch, finish, open_jobs, start
 from mover_bench.studies.run import parse_seeds
 from mover_bench.studies.sets import CHANGES, SETS, set_named
 from mover_bench.studies.study_page import commands_of, missing_of, table_of, write_numbers
@@ -102,11 +101,7 @@ def run_study(
     plans = {name: jobs_of(STUDIES[name].plan(ask), ask, args.out) for name, ask in asks.items()}
     jobs = in_order([job for plan in plans.values() for job in plan])
     waiting = [] if args.look else open_jobs(jobs, args.keep)
-    done, count = len(jobs) - len(waiting), len(jobs)
-    workers = args.workers or os.cpu_count() or 1
-    for job in run_all(waiting, workers, launch or start, store=False):
-        done += 1
-        observe(Step(f"{job.rooms} {job.seed}: {job.name}", done - 1, count))
+    finish(jobs, waiting, args.workers, (observe, launch or start), store=False)
     return [write_study(name, args, asks[name], plans[name]) for name in names]
 
 
@@ -216,5 +211,3 @@ def _check(args: StudyArgs) -> None:
     study_noise.check_errors(args.name, args.errors)
     if "robust" not in args.presets:
         raise InputError("--presets: robust is missing, with which the others are compared")
-    if args.workers < 0:
-        raise InputError(f"--workers: {args.workers}, expected 0 or more")
