@@ -9,7 +9,7 @@ from reference import use_engine
 
 from mover.core.types import Layout
 from mover.energy import objective
-from mover.energy.config import BodyWeights, SceneConfig, SceneWeights
+from mover.energy.config import BodyWeights, SceneConfig, SceneWeights, only
 from mover.energy.fused import energy
 from mover.energy.fused.energy import energy_function, energy_of_rows
 from mover.energy.minimize import Term
@@ -74,7 +74,9 @@ def test_the_evidence_of_each_term_exists_and_silences_it_where_it_is_missing():
                 for x in (inputs.image, inputs.humans)
             )
             less = objective.SceneEvidence(inputs.objects, inputs.camera, image, humans)
-            left = objective.active_config(SceneConfig(SceneWeights(*[1.0] * 12)), less).weights
+            left = objective.active_config(
+                SceneConfig(only(**dict.fromkeys(WEIGHTS, 1.0))), less
+            ).weights
             silent = {t.name for t in SCENE_TERMS if need in t.needs}
             assert {n for n in WEIGHTS if not getattr(left, n)} == silent
 
@@ -141,7 +143,7 @@ def test_evidence_by_rows_is_that_of_the_objects(preset):
     place = PRESETS[preset].place
     inputs, layout = evidence(torch.float64, place.form)
     rest = inputs.objects, inputs.camera, inputs.image, inputs.humans
-    config = SceneConfig(SceneWeights(*[0.5] * 12), place.form)
+    config = SceneConfig(only(**dict.fromkeys(WEIGHTS, 0.5)), place.form)
     rows = torch.tensor([5, 1, 3, 1])
     whole = scene_energy(layout, *rest, config)
     some = energy_of_rows(*rest, config)(rows)(some_of(layout, rows))
