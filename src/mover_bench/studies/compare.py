@@ -124,7 +124,7 @@ def paired(
     Raises:
         ValueError: If the two are of different length or empty.
     """
-    if len(values) != len(reference) or not len(values):
+    if len(values) != len(reference) or not values:
         raise ValueError(f"{len(values)} and {len(reference)} rooms, expected as many, at least 1")
     return interval(np.subtract(values, reference), seed, resamples)
 

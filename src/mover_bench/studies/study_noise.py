@@ -77,8 +77,8 @@ def levels_of(ask: Ask, finished: Finished, name: str, kind: str) -> list[Level]
     first = whole.iloc[:, 0]
     scale = 1 / first.mean() if first.any() else 0.0
     return [
-        Level(level, interval(values), paired(scale * first, scale * values))
-        for level, values in whole.items()
+        Level(level, interval(list(v)), paired(list(scale * first), list(scale * v)))
+        for level, v in whole.items()
     ]
 
 
