@@ -26,8 +26,6 @@ class Line:
     """(x, y), x ascending."""
     spans: tuple[tuple[float, float], ...] = ()
     """Lowest and highest y at each point; empty: not drawn."""
-    dashed: bool = False
-    """Quoted, not computed."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,6 @@ def _draw(panel: Panel, axes: Any) -> None:  # noqa: ANN401
             axes.errorbar(
                 x, y, list(zip(*ends, strict=True)) or None, label=line.label, marker="o",
                 markersize=4, color=css(PALETTE[index % len(PALETTE)]),
-                linestyle="--" if line.dashed else "-",
             )  # fmt: skip
     axes.set_title(panel.title, loc="left", fontweight="bold")
     axes.set_xlabel(panel.x)

@@ -9,11 +9,12 @@ from pathlib import Path
 from mover.core.errors import InputError
 from mover.core.observe import Observer, silent
 from mover_bench.studies.args import ExperimentArgs
-from mover_bench.studies.finished import read_finished
+from mover_bench.studies.finished import Source, read_finished
 from mover_bench.studies.job import ROOM, Job
 from mover_bench.studies.pictures import draw_worst
 from mover_bench.studies.queue import Launch, failure_of, finish, has_results, open_jobs, start
 from mover_bench.studies.sets import set_named
+from mover_bench.studies.study_page import command_of
 from mover_bench.studies.tables import Experiment, need_bench, write_tables
 from mover_bench.studies.variants import VARIANTS, choices
 
@@ -45,7 +46,8 @@ def run_experiment(
     finish(jobs, waiting, args.workers, (observe, launch or start))
     failures = {job: failure_of(job) for job in jobs if not has_results(job)}
     found = read_finished(rebuilt)
-    experiment = Experiment(command_of(args), args.set, presets, seeds, found, failures)
+    command = command_of(Source(args.set, args.presets), args.seeds)
+    experiment = Experiment(command, args.set, presets, seeds, found, failures)
     folder = args.out / args.set
     pictures = draw_worst(experiment, args.set, args.out)
     return write_tables(experiment, pictures, folder)
@@ -65,12 +67,6 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             raise InputError(f"--seeds: {text!r}, expected numbers and ranges like 0,3,5-7")
         seeds.update(range(int(ends[0]), int(ends[1]) + 1))
     return tuple(sorted(seeds))
-
-
-def command_of(args: ExperimentArgs) -> str:
-    """The command that makes the same table."""
-    presets = " ".join(args.presets)
-    return f"mover experiment --set {args.set} --seeds {args.seeds} --presets {presets}"
 
 
 def by_room(jobs: Sequence[Job]) -> list[Job]:

@@ -10,11 +10,12 @@ from mover.core.observe import Observer, silent
 from mover.pipeline.presets import PRESETS
 from mover_bench.studies import study_noise, study_rows, study_upstream, study_video
 from mover_bench.studies.args import StudyArgs
-from mover_bench.studies.finished import Finished, read_finished
+from mover_bench.studies.finished import Finished, Source, read_finished
 from mover_bench.studies.job import ROOM, Job
 from mover_bench.studies.queue import Launch, finish, open_jobs, start
 from mover_bench.studies.run import parse_seeds
 from mover_bench.studies.sets import CHANGES, SETS, set_named
+from mover_bench.studies.study_page import command_of as row_command
 from mover_bench.studies.study_page import commands_of, missing_of, table_of, write_numbers
 from mover_bench.studies.study_rows import Ask, Page, Plan
 from mover_bench.studies.tables import made_by, need_bench
@@ -188,10 +189,7 @@ def _commands(page: Page, jobs: Sequence[Job], seeds: Mapping[str, str]) -> list
         for job in jobs:
             if job.name != ROOM and job.name not in names.setdefault(job.rooms, []):
                 names[job.rooms].append(job.name)
-        lines = [
-            f"mover experiment --set {rooms} --seeds {seeds[rooms]} --presets {' '.join(found)}"
-            for rooms, found in names.items()
-        ]
+        lines = [row_command(Source(n, tuple(found)), seeds[n]) for n, found in names.items()]
     code = "\n".join(f"    {line}" for line in lines)
     return [f"## Commands\n\nThe jobs of each row by themselves:\n\n{code}"] if lines else []
 

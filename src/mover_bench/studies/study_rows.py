@@ -202,7 +202,11 @@ def _gains(ask: Ask, finished: Finished) -> str:
     rows: list[list[str]] = []
     for rooms, seeds in ask.seeds.items():
         full = Source(rooms, ("robust",))
-        for label, image in _images(rooms).items():
+        images = {  # as it is where there are no people, and with the camera they gave
+            "first camera": Source(rooms, ("nobody",)),
+            "camera of the people": Source(rooms, ("robust",), "image"),
+        }
+        for label, image in images.items():
             cells = [
                 _gain(metric, *(by_room(finished, s, metric, seeds) for s in (full, image)))
                 for metric in columns
@@ -210,14 +214,6 @@ def _gains(ask: Ask, finished: Finished) -> str:
             rows.append([f"{rooms}, {label}", *cells])
     table = markdown(["", *(head_of(name) for name in columns)], rows)
     return f"## What people add\n\n`robust` minus the image alone, 95 % interval.\n\n{table}"
-
-
-def _images(rooms: str) -> dict[str, Source]:
-    """The image alone: as it is where there are no people, and with the camera they gave."""
-    return {
-        "first camera": Source(rooms, ("nobody",)),
-        "camera of the people": Source(rooms, ("robust",), "image"),
-    }
 
 
 def _gain(metric: str, full: Mapping[int, float], image: Mapping[int, float]) -> str:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from mover.bodies.smpl_model import pose_rows
+from mover.bodies.corrected import rows_of
 from mover.core.types import Bodies, Capture, Masks, People
 from mover.pipeline.presets import PRESETS, Config, with_sizes
 from mover.stages.config import AlignConfig, AssignConfig, SpreadConfig
@@ -195,21 +195,6 @@ def shortened(capture: Capture, frames: Int[Tensor, " frames"]) -> Capture:
     if people is not None:
         people = _masks_of(people, torch.isin(people.frame, frames))
     return replace(capture, bodies=bodies, people=people, touch=touch)
-
-
-def rows_of(bodies: Bodies, keep: Bool[Tensor, " bodies"]) -> Bodies:
-    """Some of the bodies, parameters included."""
-    rows = keep.nonzero()[:, 0]
-    pose = None if bodies.pose is None else pose_rows(bodies.pose, rows)
-    joints = None if bodies.joints is None else bodies.joints[rows]
-    return replace(
-        bodies,
-        verts=bodies.verts[rows],
-        joints=joints,
-        frame=bodies.frame[rows],
-        person=bodies.person[rows],
-        pose=pose,
-    )
 
 
 def _masks_of(people: People, keep: Bool[Tensor, " rows"]) -> People:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from mover.core.devices import constant
 from mover.core.observe import Energy, Observer, silent
-from mover.core.records import record
+from mover.core.records import map_tensors, record
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.fused.energy import never_asks
@@ -102,9 +102,7 @@ def refine_camera(
     fixed, certainty = _start(inputs), torch.linalg.inv(inputs.covariance)
     cues = fixed_borders(inputs.image, inputs.layout, inputs.objects, inputs.camera, config.weights)
     usable = _usable(inputs)
-    zero = _Joint(
-        *(torch.zeros_like(x) for x in (fixed.tilt, fixed.rays, fixed.yaw, fixed.log_scale))
-    )
+    zero = map_tensors(torch.zeros_like, fixed)
 
     def objects_energy(joint: _Joint) -> Float[Tensor, " objects"]:
         camera, layout = _unpack(joint, inputs)
