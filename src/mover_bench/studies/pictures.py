@@ -62,8 +62,8 @@ def draw_object(stages: Frame, trial: Trial, rebuilt: Rebuilt) -> Any:  # noqa: 
     """Overlays of the initial, the rebuilt and the true scene around an object, and a plan."""
     from matplotlib.figure import Figure
 
-    before, after = stages.loc["initial"], stages.loc["full"]
-    name = after.object
+    before, after = (stages.loc[stage].to_dict() for stage in ("initial", "full"))
+    name = after["object"]
     scenes = {"before": trial.capture.scene, "after": rebuilt.full, "truth": trial.truth}
     found = {key: _piece(scene, name) for key, scene in scenes.items()}
     region = _region([(scenes[k], p) for k, p in found.items() if p is not None and k != "before"])
@@ -102,9 +102,10 @@ def _numbers(values: Mapping[str, float]) -> str:
     return f"IoU3D {cell_of('iou3d', values)}, centre {centre} cm, yaw {yaw}°"
 
 
-def _traits(item: Any) -> str:  # noqa: ANN401
-    use = "touched" if item.touched else "untouched"
-    return f"{item['name']}, seed {item.seed}, {item.object}, {use}, {item.hidden:.0%} hidden"
+def _traits(item: Mapping[str, Any]) -> str:
+    about = f"{item['name']}, seed {item['seed']}, {item['object']}"
+    use = "touched" if item["touched"] else "untouched"
+    return f"{about}, {use}, {item['hidden']:.0%} hidden"
 
 
 def _piece(scene: Scene, name: str) -> SceneObject | None:
