@@ -97,7 +97,7 @@ def _plain(tensor: Tensor) -> Tensor:
     return tensor.float() if tensor.is_floating_point() else tensor
 
 
-def _numbers(values: Mapping[str, float]) -> str:
+def _numbers(values: Mapping[str, Any]) -> str:
     centre, yaw = cell_of("center_error", values), cell_of("yaw_error", values)
     return f"IoU3D {cell_of('iou3d', values)}, centre {centre} cm, yaw {yaw}°"
 
