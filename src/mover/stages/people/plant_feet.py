@@ -3,8 +3,8 @@
 Energies make a sole slide less, and leave a rest, which goes here in three steps:
 
 1. Whole bodies are shifted so that soles at rest keep their place and lie on the floor, and who
-   sits or lies is still. Shifts along the ray from the camera (the world's origin) are cheap, as
-   pictures do not tell depth; those across it are dear.
+   sits or lies is still. Shifts in depth, seen from the camera at the world's origin, and in height
+   are cheap, as pictures and bodies of unknown size tell them least; those to the side are dear.
 2. Each foot is to go where it rested on average; the way there fades in and out between steps.
 3. The leg is bent to reach it, as little as it can be, without a turn of the sole.
 """
@@ -27,12 +27,12 @@ from mover.core.types import Bodies
 from mover.energy.body_terms.time import Neighbours, gather_neighbours
 from mover.stages.people.body_evidence import resting_soles
 
-ALONG, ACROSS = 0.05, 0.015  # [m], how far a body may be off along and across its ray
-STEADY = 0.1  # [m/√s], by which such errors change
+ALONG, ACROSS = 0.015, 0.005  # [m], how far a body may be off in depth or height, and to the side
+STEADY = 0.03  # [m/√s], by which such errors change
 SWAY = 0.03  # [m], error of a resting sole beside its body's: angles of the leg are off
-SINK = 0.015  # [m], the same over the floor
+SINK = 0.01  # [m], the same over the floor
 RIGID = 0.01  # [m], the same where no leg can be bent
-SLIP, RISE = 0.001, 0.003  # [m], of a sole at rest from frame to frame, and over the floor, at last
+SLIP, RISE = 0.003, 0.003  # [m], of a sole at rest from frame to frame, and over the floor, at last
 STILL = 0.01  # [m], of somebody who sits or lies, from frame to frame
 ON_FLOOR = 0.12  # [m]; a sole at rest that is higher stands on something else
 FOOT = 0.03  # [m], how far a foot is off beside its body
@@ -155,10 +155,11 @@ def _shifts(
     chain, pairs = _Chain(len(bodies.frame)), near.pairs
     sway = SWAY if bodies.pose is not None else RIGID
     middle = bodies.verts.double().mean(1)
-    ray = middle / middle.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-    along = ray[:, :, None] * ray[:, None]
-    eye = torch.eye(3, dtype=torch.float64)
-    prior = along / ALONG**2 + (eye - along) / ACROSS**2
+    x, _, z = middle.unbind(-1)
+    side = torch.stack([z, torch.zeros_like(z), -x], -1)
+    side = side / side.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    across = side[:, :, None] * side[:, None]
+    prior = (torch.eye(3, dtype=torch.float64) - across) / ALONG**2 + across / ACROSS**2
     none = torch.zeros_like(middle)
     posture = postures(bodies, parts, ground)
     gaps = near.gaps.double()
