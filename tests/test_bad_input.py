@@ -79,6 +79,8 @@ JSON = [
     ("scene.json", "objects.0.mesh", "a" * 5000, "cannot be found"),
     ("scene.json", "objects.0.mesh", "a\0b", "printable"),
     ("scene.json", "objects.0.category", "\ud800", "printable"),
+    ("scene.json", "objects.0.yaw", "\ud800", "'objects.0..yaw' has"),
+    ("camera.json", "R_cam_world", [[1, 0, 0], [0, 1, "\ud800"], [0, 0, 1]], r"\[1\]\[2\]' has"),
     ("scene.json", "objects.0.annotation", 12, "'objects.0..annotation' has 12"),
     ("scene.json", "objects.0.annotation", 5, "used twice"),
     ("scene.json", "objects.0.annotation", "11", "whole number"),
@@ -128,6 +130,34 @@ JSON = [
     ("people.json", "annotations.0.segmentation", SQUARE, r"\[48, 64\]"),
     ("people.json", "annotations.0.category_id", 9, "one of the categories"),
     ("people.json", "reference_people.0.segmentation.counts", [1], "sum to 1"),
+    ("people.json", "info.fps", 1e-8, "'info.fps' has 1e-08, expected a finite number from 0.001"),
+    ("camera.json", "height", 99, "'height' has 99"),
+    ("camera.json", "fl_x", 1e8, "'fl_x' has 1e.08, expected 3.2 to 6400 px for 64 px"),
+    ("camera.json", "fl_y", 1e-8, "'fl_y' has 1e-08, expected a number above 0|'fl_y' has 1e-08"),
+    ("camera.json", "cx", 1e8, "'cx' has 1e.08, expected -640 to 640 px"),
+    (
+        "scene.json",
+        "ground.height",
+        -80,
+        "'ground.height' has -80, expected a finite number from -30",
+    ),
+    ("scene.json", "objects.0.translation", [1e9, 0, 0], "translation' of chair_0 is 1e.09 m away"),
+    (
+        "scene.json",
+        "objects.1.translation",
+        [0, 0, -500],
+        r"objects\[1\].translation.* is 500 m away",
+    ),
+    ("scene.json", "objects.0.yaw", 1e8, "yaw' of chair_0 has 1e.08 rad, expected -1000 to 1000"),
+    (
+        "scene.json",
+        "objects.0.scale",
+        [1000] * 3,
+        "2e.03 m large, expected .*millimetres",
+    ),
+    ("scene.json", "objects.0.scale", [50, 100, 60], "100 m large.*centimetres. Multiply .* 0.01"),
+    ("scene.json", "objects.0.scale", [1e-8] * 3, "2e-08 m large, expected 0.01 to 30 m"),
+    ("scene.json", "objects.0.scale", [1e6] * 3, "2e.06 m large"),
 ]
 
 
@@ -318,6 +348,15 @@ def test_frames_behind_the_end_of_the_video_are_refused(folder: Path) -> None:
         ("people.json", "reference_people.0.segmentation", None, "1 people of the reference"),
         ("scene.json", "ground.height", 0.4, "the ground is not below the camera"),
         ("scene.json", "objects", [], "there are no objects"),
+        ("scene.json", "objects.0.translation", [0, -1.4, 5], "4.6 m behind the camera"),
+        ("scene.json", "objects.0.translation", [0, -1.4, -45], "is it in metres"),
+        ("scene.json", "objects.0.scale", [1e-8, 0.9, 0.6], "is it flat"),
+        ("camera.json", "fl_x", 6000.0, "fl_x 6000 and fl_y 58.5 differ much"),
+        ("camera.json", "cx", 0, "far from the middle"),
+        ("scene.json", "objects.0.yaw", 90, "yaw' of chair_0 has 90; is it in radians"),
+        ("scene.json", "objects.0.scale", [8.0, 8, 8], "16 m large, as its box"),
+        ("scene.json", "objects.0.category", "sofa", "is a sofa, its annotation 11 a chair"),
+        ("people.json", "info.heights", {"5": 1.7}, "the height of unknown track 5"),
         ("camera.json", "R_cam_world", [[-1, 0, 0], [0, 1, 0], [0, 0, -1]], "on its side or head"),
         ("camera.json", "R_cam_world", [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "straight up or down"),
     ],
@@ -334,9 +373,32 @@ def test_what_is_odd_but_not_wrong_is_told(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda a: {**a, "vertices": a["vertices"] * 1000}, "are they in metres"),
+        (lambda a: {**a, "vertices": a["vertices"] * 1000}, "millimetres.*are they in metres"),
+        (lambda a: {**a, "vertices": a["vertices"] * 100}, "centimetres.*are they in metres"),
+        (lambda a: {**a, "vertices": a["vertices"] / 1000}, "are they in metres"),
         (lambda a: {**a, "vertices": -a["vertices"]}, "behind the camera"),
+        (lambda a: {**a, "vertices": with_far(a["vertices"])}, "1e.08 m away in row 1"),
+        (lambda a: {**a, "fps": np.array(1e-8)}, "'fps' has 1e-08"),
+    ],
+)
+def test_bodies_that_cannot_be_people_here_are_refused(
+    folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]], words: str
+) -> None:
+    np.savez(folder / "bodies.npz", **change(tiny.bodies()))
+    refused(folder, "bodies.npz", words)
+
+
+def with_far(verts: np.ndarray) -> np.ndarray:
+    bad = verts.copy()
+    bad[1, 2] = 1e8
+    return bad
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
         (lambda a: {**a, "person": a["person"] + 1}, "3 of 3 bodies have no mask"),
+        (lambda a: {**a, "joints": a["joints"] + 5}, "'joints' is 8.5 m off the meshes"),
     ],
 )
 def test_bodies_that_are_odd_are_told(
@@ -344,3 +406,32 @@ def test_bodies_that_are_odd_are_told(
 ) -> None:
     np.savez(folder / "bodies.npz", **change(tiny.bodies()))
     assert words in "\n".join(read_capture(folder).warnings)
+
+
+def test_two_objects_with_one_mask_are_told(folder: Path) -> None:
+    tree = tiny.objects()
+    for key in ("segmentation", "bbox"):
+        tree["annotations"][1][key] = tree["annotations"][0][key]
+    (folder / "objects.json").write_text(json.dumps(tree))
+    assert "2 objects (chair_0, Lampe_ä.2) have one" in "\n".join(read_capture(folder).warnings)
+
+
+@pytest.mark.parametrize("name", ["camera.json", "scene.json", "objects.json", "people.json"])
+def test_a_name_that_is_told_twice_is_refused(folder: Path, name: str) -> None:
+    text = (folder / name).read_text()
+    (folder / name).write_text('{"info": 1, "info": 2, ' + text[1:])
+    refused(folder, name, 'the name "info" is there twice')
+
+
+@pytest.mark.parametrize("name", ["people.json", "bodies.npz", "contacts.npz", "hypotheses.json"])
+def test_a_link_to_nothing_is_no_missing_file(folder: Path, name: str) -> None:
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(folder / "gone")
+    refused(folder, name, "no such file")
+
+
+def test_an_energy_that_is_no_number_is_refused(folder: Path) -> None:
+    tree = tiny.hypotheses()
+    tree["objects"]["chair_0"][1]["energy"] = NAN
+    (folder / "hypotheses.json").write_text(json.dumps(tree))
+    refused(folder, "hypotheses.json", r"objects.chair_0\[1\].energy' has nan")

@@ -239,3 +239,15 @@ def test_each_sample_is_the_farthest_from_those_before(kind: str):
         nearest = torch.minimum(nearest, away[:, 0] + away[:, 1] + away[:, 2])
         expected.append(int((nearest == nearest.max()).nonzero()[0]))
     assert farthest_first(points, count).tolist() == expected
+
+
+def test_a_solid_with_a_hollow_inside_becomes_as_light_as_one_without():
+    shape = trimesh.creation.icosphere(subdivisions=5, radius=0.4)
+    hollow = trimesh.creation.icosphere(subdivisions=1, radius=0.01)
+    hollow.invert()
+    both = trimesh.util.concatenate([shape, hollow])
+    mesh = Mesh(torch.tensor(both.vertices).float(), torch.tensor(both.faces).long())
+    assert len(mesh.faces) > 20_000
+    light = m.decimate(mesh, 1000)
+    assert len(light.faces) <= 1000
+    assert m.signed_volume(light) == pytest.approx(m.signed_volume(mesh), rel=0.01)

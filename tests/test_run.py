@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from mover.core import records
 from mover.core.errors import InputError
+from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.run import Run
@@ -122,3 +124,14 @@ def test_a_damaged_record_is_one_sentence_with_its_file(tmp_path: Path) -> None:
     cut(tmp_path / "plane.npz")
     with pytest.raises(InputError, match="plane: is damaged"):
         records.load(Plane, tmp_path / "plane")
+
+
+def test_what_a_killed_write_left_goes_away_with_a_later_one(tmp_path: Path) -> None:
+    wanted, young = tmp_path / "a.json", tmp_path / ".a-new.json"
+    for name in (".a-x1.json", ".a-x2.json", ".b-x3.json"):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (0, 0))
+    young.touch()
+    with replacing(wanted) as part:
+        part.write_text("1")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".a-new.json", ".b-x3.json", "a.json"]

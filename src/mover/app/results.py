@@ -20,9 +20,9 @@ from mover.bodies.parts import parts_of
 from mover.core import records
 from mover.core.contact_labels import ContactLabels
 from mover.core.devices import CPU, named
-from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.run import Run
+from mover.core.settings import read_settings
 from mover.core.types import Bodies, Capture, Mesh, Room, Scene
 from mover.evaluate.explanation import log_rows, scene_fields
 from mover.geometry.placement import place_object
@@ -31,6 +31,7 @@ from mover.io.capture.edits import Edit, write_edits
 from mover.io.capture.scene_file import write_scene
 from mover.io.export.contacts import write_labels
 from mover.io.export.scene_glb import write_glb
+from mover.io.files.fields import get, read_json, refuse
 from mover.pipeline.presets import Config, with_present_keys
 from mover.stages.contacts.label_contacts import LabelConfig, LabelInputs, label_contacts
 
@@ -175,12 +176,15 @@ def _thinned(trace: Tensor, most: int = 500) -> list[float]:
 
 
 def read_config(path: Path) -> Config:
-    """The configuration of an earlier run, from its run.json."""
-    try:
-        tree: Mapping[str, Any] = json.loads(path.read_text())
-        config, renamed = with_present_keys(tree["config"])
-        for sentence in renamed:
-            log.warning("%s: %s", path, sentence)
-        return records.built(Config, config)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: no configuration of a run in it ({error})") from error
+    """The configuration of an earlier run, from its run.json.
+
+    Raises:
+        InputError: If there is none, or a setting in it is wrong.
+    """
+    at = get(read_json(path), "config")
+    if not isinstance(at.value, Mapping):
+        refuse(at, "the settings of a run {...}")
+    config, renamed = with_present_keys(at.value)
+    for sentence in renamed:
+        log.warning("%s: %s", path, sentence)
+    return read_settings(Config, config, f"{path}: config")

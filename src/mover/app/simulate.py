@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mover.app.sitters import Load, hardest, loads_of
 from mover.core.errors import InputError
 from mover.core.run import Run
+from mover.core.settings import float_in
 from mover.core.types import Scene, SceneObject
 from mover.io.capture.scene_file import read_scene
 from mover.io.export.mjcf import body_name, mjcf_of, text_of
@@ -33,7 +34,7 @@ STAYS = (0.01, math.radians(1))  # [m], [rad]; REST3D (2026) and others call les
 class SimulationConfig:
     """How long gravity acts."""
 
-    seconds: float = 2.0
+    seconds: Annotated[float, float_in(0.01, 3600)] = 2.0
     """Time of the simulation."""
 
 

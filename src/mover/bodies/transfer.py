@@ -31,6 +31,7 @@ from mover.bodies.smpl_model import (
 )
 from mover.bodies.transfer_matrix import TransferMatrix
 from mover.core.records import record
+from mover.core.settings import Sigma, Steps
 from mover.core.types import BodyPose
 
 SAMPLED = 1200
@@ -98,15 +99,15 @@ SHAPES = 10
 class TransferConfig:
     """How a body is laid into another model."""
 
-    steps: int = 120
+    steps: Steps = 120
     """Most iterations of L-BFGS, first of shape and place, then of everything."""
-    sigma_vertex: float = 0.001
+    sigma_vertex: Sigma = 0.001
     """Expected distance of corresponding vertices [m]."""
-    sigma_joint: float = 0.01
+    sigma_joint: Sigma = 0.01
     """Expected distance of joints and keypoints of the same name, which models place apart [m]."""
-    sigma_pose: float = 0.15
+    sigma_pose: Sigma = 0.15
     """Expected difference of an angle between the models [rad]."""
-    sigma_shape: float = 3.0
+    sigma_shape: Sigma = 3.0
     """Expected size of a number of the shape."""
     free_pose: bool = True
     """Turn the joints after the copy; else only shape and place are solved."""

@@ -1,16 +1,27 @@
 """Files that are whole or not there. Imports nothing heavy: commands answer at once."""
 
+import glob
 import os
 import tempfile
+import time
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+LEFT = 3600  # [s], no file is written for so long
 
 
 @contextmanager
 def replacing(path: Path) -> Generator[Path, None, None]:
-    """Give a temporary file beside `path` that takes its place when the block ends well."""
+    """Give a temporary file beside `path` that takes its place when the block ends well.
+
+    Those that a killed process left for the same file are removed an hour later.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
+    for left in path.parent.glob(f".{glob.escape(path.stem)}-*{glob.escape(path.suffix)}"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > LEFT:
+                left.unlink()
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
     os.close(handle)
     os.chmod(name, 0o644)

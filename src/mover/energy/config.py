@@ -1,7 +1,9 @@
 """Weights of Eq. 1 and the ways down it. Imports no torch: `--help` is quick."""
 
 from dataclasses import dataclass, field, fields
-from typing import Literal
+from typing import Annotated, Literal
+
+from mover.core.settings import Share, Steps, Weight, float_in, int_in
 
 Variant = Literal["paper", "release", "robust"]
 """How a term is priced: as printed, as in the authors' released code, or normalised and robust."""
@@ -14,29 +16,29 @@ GROWTH = 1.5  # price of another size as a whole, against that of another shape
 class SceneWeights:
     """Weights of Eq. 1 in its order; zero removes a term and the need for its evidence."""
 
-    bbox: float = 1000.0
+    bbox: Weight = 1000.0
     """lambda 1: objects fill their detected boxes."""
-    silhouette: float = 0.3
+    silhouette: Weight = 0.3
     """lambda 2: objects cover their masks."""
-    scale: float = 1000.0
+    scale: Weight = 1000.0
     """lambda 3: objects keep their initial size."""
-    depth: float = 8.0
+    depth: Weight = 8.0
     """lambda 4: who hides whom bounds the depth."""
-    collision: float = 1000.0
+    collision: Weight = 1000.0
     """lambda 5: people move through free space."""
-    contact: float = 1e5
+    contact: Weight = 1e5
     """lambda 6: touching surfaces share a place."""
-    edge: float = 0.0
+    edge: Weight = 0.0
     """Outlines follow the outlines of the masks (release only)."""
-    offscreen: float = 0.0
+    offscreen: Weight = 0.0
     """Objects stay inside the image (release only)."""
-    free_space: float = 0.0
+    free_space: Weight = 0.0
     """Nothing hides a person that is seen (release only)."""
-    distance: float = 0.0
+    distance: Weight = 0.0
     """Objects stay at the distance they were given, where nothing else tells it (robust only)."""
-    heading: float = 0.0
+    heading: Weight = 0.0
     """Seats face where their sitters face (robust only)."""
-    wall: float = 0.0
+    wall: Weight = 0.0
     """Furniture along a wall stands in one line (robust only)."""
 
 
@@ -52,7 +54,7 @@ class SceneConfig:
     weights: SceneWeights = field(default_factory=SceneWeights)
     form: Variant = "paper"
     """As printed, as the authors released it, or normalised and robust."""
-    growth: float = GROWTH
+    growth: Weight = GROWTH
     """Price of another size as a whole, against that of another shape (robust only)."""
 
 
@@ -60,13 +62,13 @@ class SceneConfig:
 class Adam:
     """Adam with a step that falls geometrically from `rate` to `last_rate`."""
 
-    steps: int = 3000
+    steps: Steps = 3000
     """Number of steps."""
-    rate: float = 0.002
+    rate: Annotated[float, float_in(1e-9, 100)] = 0.002
     """First step size (Sec. "Optimization" of the supplement)."""
-    last_rate: float = 0.002
+    last_rate: Annotated[float, float_in(1e-9, 100)] = 0.002
     """Last step size; equal to `rate`: constant."""
-    beta2: float = 0.999
+    beta2: Annotated[float, float_in(0, 0.999999)] = 0.999
     """Memory of the squared gradient."""
     keep_best: bool = False
     """Return the best state of each item instead of the last one."""
@@ -76,17 +78,17 @@ class Adam:
 class BatchedBFGS:
     """Second-order steps of each problem within its own radius, until each has converged."""
 
-    steps: int = 100
+    steps: Steps = 100
     """Most steps: a problem that still moves stops then."""
-    reach: float = 0.05
+    reach: Annotated[float, float_in(1e-6, 100)] = 0.05
     """First radius, in units of the unknowns [m, rad, log scale]."""
-    widest: float = 0.5
+    widest: Annotated[float, float_in(1e-6, 100)] = 0.5
     """Largest radius."""
-    least: float = 1e-4
+    least: Annotated[float, float_in(1e-9, 1)] = 1e-4
     """Radius below which a problem has converged."""
-    gain: float = 1e-5
+    gain: Share = 1e-5
     """Relative decrease below which a step counts as none."""
-    patience: int = 3
+    patience: Annotated[int, int_in(1, 1000)] = 3
     """Such steps in a row after which a problem has converged."""
 
 
@@ -94,9 +96,9 @@ class BatchedBFGS:
 class MatchConfig:
     """Which skin is believed to touch."""
 
-    least: float = 0.5
+    least: Share = 0.5
     """Chance above which a point of the skin touches (the paper's threshold)."""
-    reach: float = 0.25
+    reach: Annotated[float, float_in(1e-3, 100)] = 0.25
     """Farther no surface is touched [m]."""
 
 
@@ -104,27 +106,27 @@ class MatchConfig:
 class BodyWeights:
     """How much each term counts; 0: it is left out. All are in nats, so 1 is the natural weight."""
 
-    angles: float = 1.0
+    angles: Weight = 1.0
     """Distance of all angles from those that were given."""
-    image: float = 1.0
+    image: Weight = 1.0
     """Distance of the joints from where they were seen."""
-    range: float = 1.0
+    range: Weight = 1.0
     """Change of the depth."""
-    smooth: float = 1.0
+    smooth: Weight = 1.0
     """E_smooth: joints between their neighbours in time."""
-    steady: float = 0.5
+    steady: Weight = 0.5
     """Corrections that come and go."""
-    under: float = 1.0
+    under: Weight = 1.0
     """CamGP: skin below the floor."""
-    stand: float = 1.0
+    stand: Weight = 1.0
     """CamGP: soles at rest off the floor."""
-    lock: float = 1.0
+    lock: Weight = 1.0
     """CamGP: soles at rest that slide."""
-    sink: float = 1.0
+    sink: Weight = 1.0
     """SDF: skin inside furniture."""
-    touch: float = 1.0
+    touch: Weight = 1.0
     """Contact: skin that touches, off the furniture."""
-    order: float = 0.3
+    order: Weight = 0.3
     """Depth order: skin before what hides it, or behind what it hides."""
-    outline: float = 1.0
+    outline: Weight = 1.0
     """Masks: the outline of the body on the outline of its mask."""

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import torch
 from jaxtyping import Int
@@ -16,6 +16,7 @@ from torch import Tensor
 from mover.bodies.corrected import in_world
 from mover.core.files import replacing
 from mover.core.records import map_tensors, record
+from mover.core.settings import Count, Metres, int_in
 from mover.core.types import Bodies, Mesh, Scene
 from mover.evaluate.aligned import SCENE_METRICS, Together
 from mover.evaluate.bodies import (
@@ -72,13 +73,13 @@ METRICS: dict[str, Metric[Any]] = {
 class EvaluateConfig:
     """How densely the metrics are measured."""
 
-    samples: int = 10_000
+    samples: Annotated[int, int_in(100, 10_000_000)] = 10_000
     """Points on each true surface, of equal area, for the distance to the estimated one."""
-    bodies: int = 100
+    bodies: Count = 100
     """At most so many bodies, spread evenly over the rows, for contact and collision."""
-    reach: float = 0.05
+    reach: Metres = 0.05
     """A vertex touches furniture that is at most so far away [m]."""
-    ground_tolerance: float = 0.01
+    ground_tolerance: Metres = 0.01
     """How far a sole may be under the floor before it counts as penetration [m]."""
     by_place: bool = True
     """Objects that bear no true name are paired by place; False: they are false."""

@@ -12,12 +12,14 @@ a person with hanging arms, and half of the range that daily life uses.
 import math
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mover.bodies.skeleton import BODY
+from mover.core.settings import Seconds, Share, Sigma, Steps, Weight, float_in, int_in
 
 Range = tuple[float, float, float, float]
 """Lowest angle, highest angle, rest and spread [degrees]."""
@@ -88,21 +90,21 @@ def spreads(like: Tensor) -> Float[Tensor, "63"]:
 class Stage:
     """Weights of one stage; all are squared where SMPLify-X squares them."""
 
-    pose: float = 4.78
+    pose: Weight = 4.78
     """Prior of the body's pose; the bending prior follows it (times 3.17)."""
-    shape: float = 5.0
+    shape: Weight = 5.0
     """Numbers of the shape, and of the expression."""
-    hands: float = 4.78
+    hands: Weight = 4.78
     """Prior of the hands."""
-    jaw: float = 47.8
+    jaw: Weight = 47.8
     """Prior of the jaw's opening; its other turns cost ten times as much."""
-    hand_joints: float = 0.0
+    hand_joints: Weight = 0.0
     """Factor on the confidence of keypoints of the hands."""
-    face_joints: float = 0.0
+    face_joints: Weight = 0.0
     """Factor on the confidence of keypoints of the face."""
-    smooth: float = 5.0
+    smooth: Weight = 5.0
     """Constant-velocity terms."""
-    steps: int = 30
+    steps: Steps = 30
     """Most iterations of L-BFGS."""
 
 
@@ -126,49 +128,49 @@ STAGES = (
 class FitConfig:
     """How bodies are fitted to keypoints."""
 
-    rho: float = 100.0
+    rho: Sigma = 100.0
     """Residual at which the Geman-McClure price of a keypoint has halved [px], per 1,080 rows."""
-    loose: float = 0.3
+    loose: Weight = 0.3
     """Factor on the confidence of neck and hips, which detectors place elsewhere (SMPLify-X: 0)."""
-    least_confidence: float = 0.1
+    least_confidence: Share = 0.1
     """Keypoints below are missing."""
-    least_joints: int = 4
+    least_joints: Annotated[int, int_in(1, 133)] = 4
     """Rows with fewer keypoints of the body are left out."""
-    bending: float = 3.17
+    bending: Weight = 3.17
     """Multiple of the pose weight for elbows and knees bent the wrong way."""
-    limits: float = 4.78
+    limits: Weight = 4.78
     """Weight of the ranges of motion."""
-    sigma_joints: float = 0.1
+    sigma_joints: Sigma = 0.1
     """sigma_2 of the paper: Geman-McClure's constant for second differences of 3D joints [m]."""
-    sigma_pixels: float = 100.0
+    sigma_pixels: Sigma = 100.0
     """sigma_3 of the paper: the same for their projections [px]."""
-    smooth_joints: float = 1.0
+    smooth_joints: Weight = 1.0
     """Weight of the smoothness of 3D joints, over the acceleration that people have."""
-    smooth_pixels: float = 0.1
+    smooth_pixels: Weight = 0.1
     """Weight of the smoothness of projections; confidence of the middle frame counts."""
-    acceleration: float = 3.0
+    acceleration: Annotated[float, float_in(1e-3, 1e4)] = 3.0
     """What joints of people do all the time [m/s²]."""
-    jitter: float = 0.004
+    jitter: Sigma = 0.004
     """Second difference that is free of charge at any frame rate [m]."""
-    longest_gap: float = 1.0
+    longest_gap: Seconds = 1.0
     """Frames further apart do not smooth each other [s]."""
-    support: float = 0.05
+    support: Sigma = 0.05
     """Where the floor is known: how far a joint may be under it [m]."""
-    near: float = 15.0
+    near: Annotated[float, float_in(1e-3, 180)] = 15.0
     """With bodies to start from: how far each angle may be from theirs [degrees]."""
-    hands: int = 12
+    hands: Annotated[int, int_in(0, 45)] = 12
     """Principal components of each hand, where the model has them; else its angles are used."""
-    chunk: int = 1000
+    chunk: Annotated[int, int_in(1, 100_000)] = 1000
     """Frames that are solved at once."""
-    start_steps: int = 30
+    start_steps: Steps = 30
     """Iterations from each hypothesis of orientation and posture."""
-    jump: float = 0.25
+    jump: Sigma = 0.25
     """How far joints move about the pelvis between rows of a track that hypotheses explain [m]."""
-    reach: float = 0.3
+    reach: Sigma = 0.3
     """How far a pelvis is misplaced by a hypothesis [m]."""
-    speed: float = 1.5
+    speed: Sigma = 1.5
     """How fast a pelvis moves [m/s]."""
-    switch: float = 10.0
+    switch: Weight = 10.0
     """Price of such a move, in squared standard deviations of the pose."""
     stages: tuple[Stage, ...] = field(default=STAGES)
     """Weights of the stages."""

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mover.core.settings import Seconds, Sigma, Weight
 from mover.core.types import Bodies, Keypoints
 from mover.fitting.tracks import tracks_of
 
@@ -23,13 +24,13 @@ from mover.fitting.tracks import tracks_of
 class OneEuroConfig:
     """Cut-off frequencies."""
 
-    least: float = 1.0
+    least: Sigma = 1.0
     """Cut-off of things that stand still [Hz]."""
-    beta: float = 0.3
+    beta: Weight = 0.3
     """How much the cut-off grows with speed [Hz / (unit / s)]."""
-    derivative: float = 1.0
+    derivative: Sigma = 1.0
     """Cut-off of the speed [Hz]."""
-    longest_gap: float = 1.0
+    longest_gap: Seconds = 1.0
     """After such a time nothing is remembered [s]."""
 
 

@@ -118,14 +118,24 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
     Where the target would open the mesh or lose a part of it, a gentler one is taken, and the mesh
     itself where none is left.
     """
+    if faces >= len(mesh.faces):
+        return mesh
     target, closed = float(faces), is_closed(mesh.faces)
+    outer = _outer(mesh) if closed else used(mesh)
     while target < len(mesh.faces):
         small = _simplified(mesh, int(target))
         small = _resolidified(small, mesh) if closed else small
-        if small is not None and _strays(used(mesh), small) <= STRAY:
+        if small is not None and _strays(outer, small) <= STRAY:
             return fit_box(small, *box(used(mesh).verts))
         target *= GENTLER
     return mesh
+
+
+def _outer(mesh: Mesh) -> Mesh:
+    """A solid without the hollows in it, which no simplification keeps."""
+    part_of, parts = volumes(as_float64(mesh.verts), as_int64(mesh.faces))
+    keep = np.sign(signed_volume(mesh)) * parts > 0
+    return used(Mesh(mesh.verts, mesh.faces[torch.from_numpy(keep[part_of])]))
 
 
 def _strays(mesh: Mesh, small: Mesh) -> float:

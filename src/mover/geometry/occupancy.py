@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from mover.core.errors import InputError
+from mover.core.settings import float_in, int_in
 from mover.core.types import Mesh
 from mover.geometry.mesh import box, fit_box, sample_surface, used
 
@@ -190,15 +191,15 @@ Inside = Callable[[Float[Tensor, "points 3"]], Float[Tensor, " points"]]
 class ExtractConfig:
     """As MOVER runs it."""
 
-    coarse: int = 32
+    coarse: Annotated[int, int_in(2, 256)] = 32
     """Cells along a side at first."""
-    levels: int = 2
+    levels: Annotated[int, int_in(0, 4)] = 2
     """How often cells are halved near the surface."""
-    padding: float = 0.1
+    padding: Annotated[float, float_in(0, 10)] = 0.1
     """The box is larger than the unit cube by this."""
-    threshold: float = 0.2
+    threshold: Annotated[float, float_in(1e-6, 0.999999)] = 0.2
     """Probability of the surface."""
-    points: int = 2048
+    points: Annotated[int, int_in(1, 1_000_000)] = 2048
     """Points of the cloud that is encoded."""
 
 

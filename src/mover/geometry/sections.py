@@ -16,7 +16,8 @@ from mover.geometry.volume import Volume, outward, sample, winding
 
 WIDE = 96  # cells along the longest horizontal side, at most
 CELL = 0.01  # [m], the smallest cell
-RISE = 0.005  # [m] from section to section
+RISE = 0.005  # [m] from section to section, at least
+MOST = 2000  # sections of a solid
 AROUND = 2  # cells outside, on every side
 
 
@@ -41,11 +42,12 @@ def sections_of(verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]) 
     points, triangles = as_float64(verts), as_int64(faces)
     low, high = points.min(0), points.max(0)
     cell = max(float((high - low)[[0, 2]].max()) / WIDE, CELL)
-    edges = np.array([cell, RISE, cell])
+    rise = max(float(high[1] - low[1]) / MOST, RISE)
+    edges = np.array([cell, rise, cell])
     counts = np.ceil((high - low) / edges).astype(np.int64) + 2 * AROUND
     first = (low + high) / 2 - edges * (counts - 1) / 2
     inside = winding((points - first) / edges, outward(points, triangles), counts) > 0
-    stretch = cell / RISE
+    stretch = cell / rise
     return Sections(
         Volume(
             torch.from_numpy(_outlines(inside, cell)).to(verts),

@@ -3,7 +3,9 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
+from mover.core.settings import Count, Seconds, Share, Sigma, Weight, float_in, int_in
 from mover.energy.config import Adam, SceneWeights
 from mover.stages.config import ImageConfig, PlaceConfig, PrepareConfig
 
@@ -12,13 +14,13 @@ from mover.stages.config import ImageConfig, PlaceConfig, PrepareConfig
 class FramesConfig:
     """Which frames are taken."""
 
-    fps: float = 5.0
+    fps: Annotated[float, float_in(0, 1e4)] = 5.0
     """Frames a second; 0: all."""
-    start: float = 0.0
+    start: Seconds = 0.0
     """Where to begin [s]."""
-    end: float = 0.0
+    end: Seconds = 0.0
     """Where to stop [s]; 0: at the end."""
-    folder_fps: float = 0.0
+    folder_fps: Annotated[float, float_in(0, 1e4)] = 0.0
     """Frames a second of a folder of pictures; 0: unknown, all are taken."""
 
 
@@ -26,11 +28,11 @@ class FramesConfig:
 class SteadyConfig:
     """What counts as still."""
 
-    still: float = 0.002
+    still: Share = 0.002
     """Largest drift of a camera that stands still, as a share of the image's larger side."""
-    small: float = 0.15
+    small: Share = 0.15
     """Largest drift that is undone; beyond it the camera walks."""
-    agree: float = 0.35
+    agree: Share = 0.35
     """Least share of pixels that must agree with the homography of a frame."""
 
 
@@ -38,13 +40,13 @@ class SteadyConfig:
 class CleanConfig:
     """How the reference picture is made."""
 
-    frames: int = 40
+    frames: Annotated[int, int_in(1, 10_000)] = 40
     """Most frames that are looked at, evenly over the video."""
-    free: float = 0.0005
+    free: Share = 0.0005
     """Share of the picture that may be hidden in a frame that is taken as it is."""
-    least: int = 3
+    least: Count = 3
     """Fewest frames that must show a pixel; with fewer it is hidden."""
-    strips: int = 16
+    strips: Annotated[int, int_in(1, 10_000)] = 16
     """Parts in which the picture is put together, to save memory."""
 
 
@@ -70,11 +72,11 @@ class DetectConfig:
 
     models: ModelsConfig = field(default_factory=ModelsConfig)
     """Which network."""
-    score: float = 0.5
+    score: Share = 0.5
     """Least score."""
-    batch: int = 4
+    batch: Annotated[int, int_in(1, 1024)] = 4
     """Pictures that the network sees at once."""
-    least: float = 0.0004
+    least: Share = 0.0004
     """Smallest instance, as a share of the picture."""
 
 
@@ -84,15 +86,15 @@ class TrackConfig:
 
     models: ModelsConfig = field(default_factory=ModelsConfig)
     """Which network."""
-    segment: int = 50
+    segment: Annotated[int, int_in(1, 100_000)] = 50
     """Frames between two detections."""
-    same: float = 0.3
+    same: Share = 0.3
     """Overlap from which on a detection is somebody who is already followed."""
-    present: float = 0.0
+    present: Annotated[float, float_in(-100, 100)] = 0.0
     """Least score (logit) of SAM 2 that a person is in the picture."""
-    least: float = 0.0004
+    least: Share = 0.0004
     """Smallest mask, as a share of the picture."""
-    patience: int = 10
+    patience: Annotated[int, int_in(0, 100_000)] = 10
     """Frames for which somebody who is not detected is remembered (without a tracker)."""
 
 
@@ -102,7 +104,7 @@ class JointsConfig:
 
     models: ModelsConfig = field(default_factory=ModelsConfig)
     """Which network."""
-    batch: int = 16
+    batch: Annotated[int, int_in(1, 1024)] = 16
     """People that the network sees at once."""
 
 
@@ -129,7 +131,7 @@ class Lens:
     """What is known of the camera."""
 
     file: Path | None = None
-    fov: float | None = None
+    fov: Annotated[float, float_in(1, 179)] | None = None
     photo: Path | None = None
 
 
@@ -137,25 +139,35 @@ class Lens:
 class ScreenConfig:
     """How the quick look is done."""
 
-    heights: tuple[float, ...] = (0.8, 0.95, 1.1, 1.25, 1.4, 1.6, 1.8, 2.05, 2.35)
+    heights: tuple[Annotated[float, float_in(0.1, 20)], ...] = (
+        0.8,
+        0.95,
+        1.1,
+        1.25,
+        1.4,
+        1.6,
+        1.8,
+        2.05,
+        2.35,
+    )
     """Heights of the camera that are tried [m]."""
-    usual: float = 1.5
+    usual: Annotated[float, float_in(0.1, 20)] = 1.5
     """The usual one [m],"""
-    spread: float = 0.4
+    spread: Annotated[float, float_in(1e-3, 10)] = 0.4
     """and how much it varies (of its logarithm)."""
-    yaws: int = 8
+    yaws: Annotated[int, int_in(1, 360)] = 8
     """Turns that are tried."""
-    scale: float = 0.3
+    scale: Weight = 0.3
     """Weight of usual sizes against boxes."""
-    depth: float = 0.5
+    depth: Weight = 0.5
     """Weight of measured depth, where there is any."""
-    tilt: float = math.radians(3)
+    tilt: Annotated[float, float_in(0, 1.5)] = math.radians(3)
     """How wrong pitch and roll may be [rad]; 0: not at all."""
-    prior: float = 0.03
+    prior: Weight = 0.03
     """Weight of usual heights and tilts."""
-    cap: float = 0.3
+    cap: Weight = 0.3
     """Most that one object may say about the height."""
-    soft: float = 0.05
+    soft: Sigma = 0.05
     """Shapes that fit worse than the best by so much hardly count."""
     method: Adam = field(default_factory=lambda: Adam(100, 0.05, 0.005, beta2=0.98))
     """The descent."""
@@ -171,11 +183,11 @@ LONG = Adam(100, 0.02, 0.003, beta2=0.98, keep_best=True)
 class LayoutConfig:
     """How the first scene is found."""
 
-    shapes: int = 8
+    shapes: Annotated[int, int_in(1, 1000)] = 8
     """Shapes of each thing that the boxes judge."""
-    keep: int = 3
+    keep: Annotated[int, int_in(1, 1000)] = 3
     """Shapes of each thing that the silhouettes judge."""
-    turns: int = 6
+    turns: Annotated[int, int_in(1, 360)] = 6
     """Starts of each of them."""
     screen: ScreenConfig = field(default_factory=ScreenConfig)
     """The quick look by boxes."""

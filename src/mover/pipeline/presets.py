@@ -8,8 +8,9 @@
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
+from mover.core.settings import int_in
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
 from mover.stages.config import (
     AlignConfig,
@@ -68,7 +69,7 @@ class Config:
     """Stage 2: objects from the image and the people."""
     explain: ExplainConfig = field(default_factory=ExplainConfig)
     """What holds each object, and how well its place is known."""
-    outer_iterations: int = 0
+    outer_iterations: Annotated[int, int_in(0, 100)] = 0
     """Further passes of stage 2 with assignment and occlusion order renewed."""
     slide_to_floor: bool = False
     """Start on the floor along the rays with the size in the image kept; else dropped straight."""

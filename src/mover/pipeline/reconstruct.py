@@ -9,10 +9,13 @@ from torch import Tensor
 from mover.bodies.corrected import in_world, rows_of
 from mover.bodies.parts import parts_of
 from mover.core.run import Run as Run
+from mover.core.settings import check_settings
 from mover.core.types import Camera, Capture, Layout, Room
 from mover.energy.objective import HumanCues
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import GROUND, place, reproject, rest_on_support, slide_to_floor
+from mover.io.capture.plausible import check_plausible
+from mover.pipeline.believable import check_floor, check_room
 from mover.pipeline.outcome import (
     PeopleState,
     ReconstructionContext,
@@ -58,7 +61,20 @@ NOBODY = HumanCues()
 
 
 def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...] = ()) -> Room:
-    """From a capture to a consistent room (Sec. 3); `pinned` objects stay where they start."""
+    """From a capture to a consistent room (Sec. 3); `pinned` objects stay where they start.
+
+    Raises:
+        InputError: If a setting is out of its range, the capture cannot be true, or the result.
+    """
+    check_settings(config, "config")
+    told: list[str] = []
+    check_plausible(capture, told.append)
+    capture = replace(capture, warnings=tuple(dict.fromkeys((*capture.warnings, *told))))
+    return check_room(_reconstructed(capture, config, run, pinned))
+
+
+def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]) -> Room:
+    """The stages in their order."""
     people = people_of(capture, config, run)
     if not capture.scene.objects:
         return unfurnished(capture, people)
@@ -67,6 +83,7 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
     context = ReconstructionContext(capture, config, run, seen, prepared, pinned)
     if people is None:
         ground = ground_without_people(capture, prepared)
+        check_floor(ground, capture)
         return room_of(context, placed_by_image(context, capture.scene.camera, ground), None)
     state = placed_by_image(context, people.alignment.camera, people.alignment.ground)
     context = with_size_prior(context, state)
@@ -97,7 +114,8 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     feet = run.stage(find_foot_contacts, standing, config.foot_contacts)
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height)
     alignment = run.stage(align_camera, known, config.align)
-    warnings = (*warnings, *feet.warnings, *alignment.warnings)
+    odd = check_floor(alignment.ground, capture)
+    warnings = (*warnings, *feet.warnings, *alignment.warnings, *odd)
     return PeopleState(bodies, kept, parts, feet, alignment, warnings)
 
 

@@ -2,8 +2,19 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
+from mover.core.settings import (
+    Count,
+    Degrees,
+    Metres,
+    Seconds,
+    Share,
+    Sigma,
+    Weight,
+    float_in,
+    int_in,
+)
 from mover.energy.config import (
     GROWTH,
     Adam,
@@ -23,19 +34,19 @@ class SelectConfig:
 
     rule: Literal["chain", "each"] = "chain"
     """`chain`: the longest consistent sequence; `each`: the paper's test of every frame."""
-    pelvis_acceleration: float = 10.0
+    pelvis_acceleration: Annotated[float, float_in(0, 1e4)] = 10.0
     """What a pelvis does when one jumps off a step [m/s²]."""
-    pelvis_jitter: float = 0.2
+    pelvis_jitter: Metres = 0.2
     """Second difference of the pelvis that noise explains [m]."""
-    local_acceleration: float = 8.0
+    local_acceleration: Annotated[float, float_in(0, 1e4)] = 8.0
     """Mean acceleration of shoulders, elbows, hips and knees relative to the pelvis [m/s²]."""
-    local_jitter: float = 0.16
+    local_jitter: Metres = 0.16
     """Its second difference that noise explains [m]."""
     local: Literal["lengths", "vector"] = "lengths"
     """How the joints are averaged: their lengths, or their vectors as the authors' code does."""
-    erode: int = 0
+    erode: Annotated[int, int_in(0, 1000)] = 0
     """`each`: frames beside a wrong one that are left out as well."""
-    window: float = 0.0
+    window: Seconds = 0.0
     """Keep only the steadiest frame of every such stretch of time [s]; 0: all."""
 
 
@@ -43,15 +54,15 @@ class SelectConfig:
 class FocalConfig:
     """How the focal length is searched for."""
 
-    spread: float = 0.0
+    spread: Share = 0.0
     """Standard deviation of the logarithm of the focal length; 0: it is kept as given."""
-    most: int = 150
+    most: Count = 150
     """At most so many frames of a person, spread over the video."""
-    width: int = 240
+    width: Annotated[int, int_in(16, 4096)] = 240
     """Width of the pictures that are compared [px]."""
-    seen: float = 0.6
+    seen: Share = 0.6
     """Share of a body's picture that its mask has to fill, and least overlap with it."""
-    least: int = 5
+    least: Count = 5
     """Fewer sightings than that tell nothing."""
 
 
@@ -59,25 +70,25 @@ class FocalConfig:
 class DepthConfig:
     """How the depth of people is searched for."""
 
-    span: float = 0.09
+    span: Annotated[float, float_in(0, 0.9)] = 0.09
     """Factors from 1 - span to 1 + span are tried."""
-    factors: int = 13
+    factors: Annotated[int, int_in(3, 1000)] = 13
     """How many."""
-    every: int = 1
+    every: Count = 1
     """Use every so many of a person's frames ..."""
-    most: int = 40
+    most: Count = 40
     """... and at most so many in which it is seen well, spread over the video."""
-    whole: int = 150
+    whole: Count = 150
     """At most so many frames are searched for people who are seen well, or wholly."""
-    least: int = 3
+    least: Count = 3
     """Fewer frames than that tell nothing."""
-    width: int = 240
+    width: Annotated[int, int_in(16, 4096)] = 240
     """Width of the pictures that are compared [px]."""
-    seen: float = 0.6
+    seen: Share = 0.6
     """Share of a body's picture that its mask has to fill, and that no object may cover."""
-    inside: float = 0.6
+    inside: Share = 0.6
     """Share of the body that has to be inside the image."""
-    spread: float = 0.04
+    spread: Share = 0.04
     """A factor less certain than that is not used."""
 
 
@@ -85,15 +96,15 @@ class DepthConfig:
 class FootContactConfig:
     """When a foot carries a person."""
 
-    knee: float = 145.0
+    knee: Degrees = 145.0
     """A leg is straight if the angle at the knee is larger [degrees]."""
-    hip: float = 140.0
+    hip: Degrees = 140.0
     """... and the angle between thigh and trunk [degrees]."""
-    upright: float = 60.0
+    upright: Degrees = 60.0
     """... and the leg leans less than this [degrees]."""
-    speed: float = 0.2
+    speed: Annotated[float, float_in(0, 100)] = 0.2
     """A foot is still if it is slower [m/s]."""
-    points: int = 4
+    points: Annotated[int, int_in(1, 1000)] = 4
     """The lowest vertices of a sole that count."""
 
 
@@ -101,15 +112,15 @@ class FootContactConfig:
 class AlignConfig:
     """How feet make a floor; the paper has sigmas (0.1,), no priors, one vote a point."""
 
-    sigmas: tuple[float, ...] = (0.1, 0.06, 0.035, 0.02)
+    sigmas: tuple[Annotated[float, float_in(1e-4, 100)], ...] = (0.1, 0.06, 0.035, 0.02)
     """Scales of the Geman-McClure price, one descent after the other [m]."""
-    tilt_prior: float = math.radians(4.0)
+    tilt_prior: Annotated[float, float_in(1e-4, math.inf)] = math.radians(4.0)
     """How far off the first pitch and roll usually are [rad]; inf: no prior."""
-    offset_prior: float = 0.03
+    offset_prior: Metres = 0.03
     """How far a person usually floats because of a wrong depth [m]; 0: not at all."""
     votes: Literal["places", "points"] = "places"
     """What counts once: a place where a person stood, or a point."""
-    steps: int = 60
+    steps: Annotated[int, int_in(1, 10_000)] = 60
     """Most Gauss-Newton steps for each scale."""
 
 
@@ -125,13 +136,13 @@ class ContactConfig:
 class PrepareConfig:
     """How meshes are prepared."""
 
-    cells: int = 96
+    cells: Annotated[int, int_in(8, 512)] = 96
     """Cells along the longest side when a mesh must be closed."""
-    faces: int = 2000
+    faces: Annotated[int, int_in(20, 200_000)] = 2000
     """Faces of the proxies that are optimised."""
-    samples: int = 1500
+    samples: Annotated[int, int_in(20, 100_000)] = 1500
     """Even surface samples of each object."""
-    region: int = 400
+    region: Annotated[int, int_in(1, 100_000)] = 400
     """Points of each region that can be touched."""
     rule: Literal["level", "release"] = "level"
     """How seats and backs are found (`prepare_objects.find_regions`)."""
@@ -141,13 +152,13 @@ class PrepareConfig:
 class ImageConfig:
     """How the image is sampled."""
 
-    size: int = 256
+    size: Annotated[int, int_in(8, 2048)] = 256
     """Pixels along a side of each object's window."""
     form: Variant = "paper"
     """`release`: beyond the border is background; `robust`: hidden sides are lower bounds."""
-    hidden: float = 0.5
+    hidden: Share = 0.5
     """Share of the strip beyond a side from which on more may be hidden there (`robust`)."""
-    borders: tuple[float, ...] = ()
+    borders: tuple[Annotated[float, float_in(-100, 100)], ...] = ()
     """By how much outlines of masks may be off, with 0 among them [px of the image] (`robust`)."""
 
 
@@ -162,31 +173,31 @@ class PlaceConfig:
     """The descent from each start that is left."""
     first: Adam = field(default_factory=lambda: Adam(steps=0))
     """A descent of the box term over the places alone, before all others (release)."""
-    yaws: int = 1
+    yaws: Annotated[int, int_in(1, 360)] = 1
     """Starts that are turned evenly round each object."""
-    distances: tuple[float, ...] = ()
+    distances: tuple[Annotated[float, float_in(0.01, 100)], ...] = ()
     """Further starts at these shares of its distance, turned as often."""
     short: Adam | BatchedBFGS = field(default_factory=lambda: Adam(steps=0))
     """A short descent from each of them."""
-    num_hypotheses: int = 1
+    num_hypotheses: Annotated[int, int_in(1, 1000)] = 1
     """Starts of each object that are left after the short descents."""
-    coarse: int = 1
+    coarse: Annotated[int, int_in(1, 64)] = 1
     """Pixels of a window that are one, along each side, in the short descents."""
-    perturbations: int = 0
+    perturbations: Annotated[int, int_in(0, 1000)] = 0
     """Further descents from places around the best one of each object."""
-    perturbation_rounds: int = 1
+    perturbation_rounds: Annotated[int, int_in(1, 100)] = 1
     """How often that is done; each time around the best so far, and half as far from it."""
-    wall_alignment_steps: int = 0
+    wall_alignment_steps: Annotated[int, int_in(0, 100)] = 0
     """How often pieces along a wall are placed again with its line (robust)."""
-    yaw_prior_weight: float = 0.0
+    yaw_prior_weight: Weight = 0.0
     """How much a turn away from the reference yaw worsens a candidate: 1 doubles half a turn."""
-    apart: float = 0.0
+    apart: Weight = 0.0
     """Weight of the space that objects share, in a last descent of all together."""
-    span: float = 0.0
+    span: Annotated[float, float_in(0, 1.9)] = 0.0
     """Release: scales stay within 1 +- span/2 by a sigmoid; 0: free."""
-    chair_span: float = 0.0
+    chair_span: Annotated[float, float_in(0, 1.9)] = 0.0
     """The same for chairs."""
-    uniform_scale_weight: float = GROWTH
+    uniform_scale_weight: Weight = GROWTH
     """Price of another size as a whole, against that of another shape (robust)."""
 
 
@@ -194,13 +205,13 @@ class PlaceConfig:
 class RefineConfig:
     """How the camera is refined."""
 
-    rounds: int = 0
+    rounds: Annotated[int, int_in(0, 100)] = 0
     """How often; 0: never (the paper)."""
-    feet: float = 0.04
+    feet: Weight = 0.04
     """Weight w of what the feet say; each object counts about one."""
     weights: SceneWeights = IMAGE_ONLY
     """Of what the image says."""
-    uniform_scale_weight: float = GROWTH
+    uniform_scale_weight: Weight = GROWTH
     """Price of another size as a whole, against that of another shape."""
     method: Adam = field(default_factory=lambda: Adam(400, rate=0.3, last_rate=0.02, beta2=0.98))
 
@@ -209,13 +220,13 @@ class RefineConfig:
 class SpreadConfig:
     """How the price of sizes follows the room."""
 
-    usual: float = 0.0
+    usual: Share = 0.0
     """Usual standard deviation of the logarithm of a size; 0: nothing is learnt."""
-    common: float = 0.03
+    common: Share = 0.03
     """That of what the three sizes of a piece have in common."""
-    known: float = 2.0
+    known: Annotated[float, float_in(0, 1e6)] = 2.0
     """How many pieces of a usual room count as if they were seen."""
-    most: float = 4.0
+    most: Annotated[float, float_in(1, 1e3)] = 4.0
     """The largest spread that is believed, in usual ones; the smallest is 1."""
 
 
@@ -223,17 +234,17 @@ class SpreadConfig:
 class GatherConfig:
     """How the evidence is gathered."""
 
-    erode: int = 1
+    erode: Annotated[int, int_in(0, 100)] = 1
     """Pixels (of an image 640 wide) by which masks and silhouettes shrink."""
-    reach: float = 0.0
+    reach: Metres = 0.0
     """How far the outlines of bodies may be wrong: what is thinner is not hidden (robust) [m]."""
     vote: bool = True
     """Per body and object, keep only the larger of the hidden and the hiding region."""
-    cells: int = 256
+    cells: Annotated[int, int_in(8, 512)] = 256
     """Cells along the longest side of the volume of all bodies."""
-    padding: float = 0.2
+    padding: Annotated[float, float_in(0, 10)] = 0.2
     """Space around the bodies in the volume [m]."""
-    workers: int = 2
+    workers: Annotated[int, int_in(1, 256)] = 2
     """Threads that draw and measure; the result does not depend on it."""
 
 
@@ -245,17 +256,17 @@ class AssignConfig:
     """What is assigned as one."""
     split: Literal["normals", "parts"] = "normals"
     """Seat or back: by the normal of the vertex, or backs alone touch backs (unless they lie)."""
-    chance: float = 0.5
+    chance: Share = 0.5
     """A vertex touches from here on."""
-    overlap: float = 0.5
+    overlap: Share = 0.5
     """Share of a group that must project into an object's mask."""
-    farthest: float = 1.0
+    farthest: Metres = 1.0
     """Farther than this from the object's part, nothing is touched [m]."""
-    hand_reach: float = 1.0
+    hand_reach: Metres = 1.0
     """The same for hands, and for backs of bodies that sit on no object (`group`) [m]."""
-    cell: float = 0.01
+    cell: Annotated[float, float_in(1e-4, 10)] = 0.01
     """Contact points nearer than this become one with their count as weight [m]."""
-    most: int = 2000
+    most: Count = 2000
     """Points kept for each part of each object."""
 
 
@@ -265,9 +276,9 @@ class ReinitConfig:
 
     use: bool = False
     """True in `release`."""
-    span: float = 0.8
+    span: Annotated[float, float_in(0, 1.9)] = 0.8
     """Scales stay within 1 +- span/2."""
-    chair_span: float = 0.6
+    chair_span: Annotated[float, float_in(0, 1.9)] = 0.6
     """The same for chairs."""
 
 
@@ -287,17 +298,17 @@ class RefineBodiesConfig:
     match: MatchConfig = field(default_factory=MatchConfig)
     place: Adam = field(default_factory=lambda: Adam(60, 0.02, 0.004, beta2=0.98))
     """The descent of one round that moves bodies as a whole."""
-    places: int = 2
+    places: Annotated[int, int_in(0, 1000)] = 2
     """How many of these rounds come first."""
     method: Adam = field(default_factory=lambda: Adam(25, 0.01, 0.003, beta2=0.98))
     """The descent of one round that changes poses too."""
-    rounds: int = 3
+    rounds: Annotated[int, int_in(1, 1000)] = 3
     """How often contacts and depth order are looked for anew."""
-    rhos: tuple[float, float] = (0.15, 0.06)
+    rhos: tuple[Sigma, Sigma] = (0.15, 0.06)
     """Distances at which a contact pays half, in the first and in the last round [m]."""
-    rows: int = 512
+    rows: Annotated[int, int_in(1, 100_000)] = 512
     """Bodies that are moved at once."""
-    overlap: int = 12
+    overlap: Annotated[int, int_in(0, 10_000)] = 12
     """Rows on both sides that are moved along."""
     plant: bool = True
     """Whether soles at rest are put still at the end (where `weights.lock` is not 0)."""

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import Positional, arg
 
-from mover.app.cli.config import Device, preset_named
+from mover.app.cli.config import Device, parsed, preset_named
 from mover.app.cli.console import say
 from mover.app.cli.run import reconstruct_into
-from mover.core.errors import InputError
+from mover.core.settings import Seconds, Seed, float_in
 from mover_bench.studies.args import ExperimentArgs, MakeArgs, StudyArgs
 
 
@@ -21,7 +20,7 @@ class DemoArgs:
 
     out: Path = Path("demo")
     """Folder for the capture and the result."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the noise."""
     preset: str = "robust"
     """paper, release or robust."""
@@ -31,7 +30,7 @@ class DemoArgs:
 
 def demo(arguments: Sequence[str]) -> None:
     """`mover demo`."""
-    args = tyro.cli(DemoArgs, prog="mover demo", args=list(arguments))
+    args = parsed(DemoArgs, "mover demo", arguments)
     config = preset_named(args.preset)
     from mover.app.report.page import write_report
     from mover.app.results import Origin, report_of, write_truth
@@ -70,22 +69,17 @@ class RoomsArgs:
     """The clip of that actor."""
     out: Path = Path("rooms")
     """Folder for the capture; its `truth` holds the truth."""
-    seed: int = 0
+    seed: Seed = 0
     """Of the room and of the noise."""
-    fps: float = 5.0
+    fps: Annotated[float, float_in(1e-3, 120)] = 5.0
     """Frames a second, at most 120."""
-    seconds: float = 0.0
+    seconds: Seconds = 0.0
     """Length of the part that is shown, from the beginning [s]; 0: the whole clip."""
 
 
 def clip_rooms(arguments: Sequence[str]) -> None:
     """`mover rooms`."""
-    args = tyro.cli(RoomsArgs, prog="mover rooms", args=list(arguments))
-    if not 0 < args.fps <= 120 or args.seconds < 0:
-        raise InputError(
-            f"--fps: {args.fps:g}, --seconds: {args.seconds:g}, expected more than 0 and at most"
-            " 120 frames a second, and 0 or more seconds"
-        )
+    args = parsed(RoomsArgs, "mover rooms", arguments)
     from mover.app.results import write_truth
     from mover.io.capture.folder import write_capture
     from mover_bench.rooms.clip import clip_room
@@ -104,7 +98,7 @@ def run_presets(arguments: Sequence[str]) -> None:
     if arguments and arguments[0] in MORE:
         MORE[arguments[0]](arguments[1:])
         return
-    args = tyro.cli(ExperimentArgs, prog="mover experiment", args=list(arguments))
+    args = parsed(ExperimentArgs, "mover experiment", arguments)
     from mover.app.cli.progress import Bar
     from mover_bench.studies.run import run_experiment
 
@@ -115,7 +109,7 @@ def run_presets(arguments: Sequence[str]) -> None:
 
 def run_studies(arguments: Sequence[str]) -> None:
     """`mover experiment study`."""
-    args = tyro.cli(StudyArgs, prog="mover experiment study", args=list(arguments))
+    args = parsed(StudyArgs, "mover experiment study", arguments)
     from mover.app.cli.progress import Bar
     from mover_bench.studies.study import run_study
 
@@ -127,7 +121,7 @@ def run_studies(arguments: Sequence[str]) -> None:
 
 def make_rooms(arguments: Sequence[str]) -> None:
     """`mover experiment make`."""
-    args = tyro.cli(MakeArgs, prog="mover experiment make", args=list(arguments))
+    args = parsed(MakeArgs, "mover experiment make", arguments)
     from mover.app.cli.progress import Bar
     from mover_bench.studies.make import make_set, told
 
@@ -159,7 +153,7 @@ class PaperTableArgs:
 
 def show_paper_table(arguments: Sequence[str]) -> None:
     """`mover paper-table`."""
-    args = tyro.cli(PaperTableArgs, prog="mover paper-table", args=list(arguments))
+    args = parsed(PaperTableArgs, "mover paper-table", arguments)
     from mover_bench.tables.paper_table import paper_table
 
     say(paper_table(args.table, args.captures, args.results))

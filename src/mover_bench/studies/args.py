@@ -6,6 +6,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from mover.core.settings import int_in
+
 
 @dataclass(frozen=True)
 class ExperimentArgs:
@@ -17,7 +19,7 @@ class ExperimentArgs:
     """Which settings: presets, or `robust` without one of its parts (see docs/results.md)."""
     out: Path = Path("experiments")
     """Folder for the results."""
-    workers: int = 0
+    workers: Annotated[int, int_in(0, 10_000)] = 0
     """How many jobs run at once; 0: as many as there are cores."""
     set: str = "rooms"
     """Where the rooms come from."""
@@ -41,7 +43,7 @@ class StudyArgs:
     """Which errors of the input the study `sensitivity` tries: scale, place, ...; empty: all."""
     out: Path = Path("experiments")
     """Folder for the results."""
-    workers: int = 0
+    workers: Annotated[int, int_in(0, 10_000)] = 0
     """How many jobs run at once; 0: as many as there are cores."""
     keep: bool = False
     """Take finished jobs of other versions or settings of the program as they are."""
@@ -63,7 +65,7 @@ class MakeArgs:
     """Write each room as a capture folder with its truth, for `mover run` and other tools."""
     check: bool = False
     """Compare with the hashes that the package holds."""
-    workers: int = 0
+    workers: Annotated[int, int_in(0, 10_000)] = 0
     """How many rooms are made at once; 0: as many as there are cores."""
     keep: bool = False
     """Take rooms that another version of the program has made as they are."""

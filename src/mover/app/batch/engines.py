@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from mover.app.batch.job import Attempt, Job, Outcome, lost, run_job
 from mover.app.batch.runner import run_jobs
 from mover.core.errors import InputError
+from mover.core.settings import float_in, int_in
 
 ARRAY = 1000  # jobs in one SLURM array; many clusters allow no more
 WAIT = 1.0  # [s] between two looks at a cluster
@@ -25,11 +26,11 @@ class RayOptions:
 
     address: str = "local"
     """Of a running cluster (`auto`, `ray://...`); local: start one on this machine."""
-    cpus: float = 1.0
+    cpus: Annotated[float, float_in(0.01, 1024)] = 1.0
     """Cores for each capture; fractions share a core."""
-    gpus: float = 0.0
+    gpus: Annotated[float, float_in(0, 64)] = 0.0
     """GPUs for each capture; 0.25: four captures share one."""
-    retries: int = 2
+    retries: Annotated[int, int_in(0, 1000)] = 2
     """How often a capture is run again whose machine or worker was lost."""
 
 
@@ -41,13 +42,13 @@ class SlurmOptions:
     """slurm; local and debug are submitit's stand-ins for a test."""
     partition: str = ""
     """Empty: the cluster's default."""
-    cpus: int = 1
+    cpus: Annotated[int, int_in(1, 1024)] = 1
     """Cores for each capture."""
-    gpus: int = 0
+    gpus: Annotated[int, int_in(0, 64)] = 0
     """GPUs for each capture."""
-    memory: float = 0.0
+    memory: Annotated[float, float_in(0, 1e5)] = 0.0
     """[GB]; 0: the cluster's default."""
-    minutes: int = 0
+    minutes: Annotated[int, int_in(0, 100_000)] = 0
     """Time that is asked for each capture; 0: its limit and five minutes more, else two hours."""
 
 
@@ -57,7 +58,7 @@ class EngineOptions:
 
     engine: str = "local"
     """local, ray or slurm."""
-    workers: int = 1
+    workers: Annotated[int, int_in(1, 10_000)] = 1
     """Captures at a time."""
     ray: RayOptions = field(default_factory=RayOptions)
     slurm: SlurmOptions = field(default_factory=SlurmOptions)

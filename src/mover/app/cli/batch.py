@@ -2,18 +2,17 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import tyro
-from tyro.conf import AvoidSubcommands, Positional, arg
+from tyro.conf import AvoidSubcommands, Positional, Suppress, arg
 
 from mover.app.batch import CAPTURE, OUT, BatchPlan, captures_in, cores, counted, run_batch
 from mover.app.batch.engines import EngineOptions, RayOptions, SlurmOptions
-from mover.app.cli.config import chosen_config
+from mover.app.cli.config import chosen_config, parsed
 from mover.app.cli.console import say
-from mover.core.errors import InputError
+from mover.core.settings import Seconds, int_in
 from mover.pipeline.presets import Config
 
 
@@ -27,11 +26,11 @@ class BatchArgs:
     """Folder of all results, the failures and summary.csv."""
     engine: Literal["local", "ray", "slurm"] = "local"
     """Where captures run: on this machine, on a Ray cluster, or under SLURM."""
-    workers: int = 0
+    workers: Annotated[int, int_in(0, 10_000)] = 0
     """Captures at a time; 0: as many as this machine has cores."""
-    limit: float = 0.0
+    limit: Seconds = 0.0
     """Most seconds for one capture; 0: no limit."""
-    threads: int = 1
+    threads: Annotated[int, int_in(1, 1024)] = 1
     """Threads of each capture."""
     retry: bool = False
     """Run those again that failed before."""
@@ -45,7 +44,7 @@ class BatchArgs:
     """At the end of each run, refine the people with the room they helped to find."""
     ray: RayOptions = field(default_factory=RayOptions)
     slurm: SlurmOptions = field(default_factory=SlurmOptions)
-    config: Annotated[Config, arg(name="")] = field(default_factory=Config)
+    config: Annotated[Suppress[Config], arg(name="")] = field(default_factory=Config)
 
 
 def batch(arguments: Sequence[str]) -> None:
@@ -75,14 +74,14 @@ def batch(arguments: Sequence[str]) -> None:
 
 def _parse_batch(arguments: Sequence[str]) -> BatchArgs:
     config, rest = chosen_config(arguments)
-    missing: Any = tyro.MISSING
-    default = BatchArgs(missing, config=config)
-    args = tyro.cli(
-        BatchArgs, prog="mover batch", args=rest, default=default, config=(AvoidSubcommands,)
-    )
-    if args.workers < 0 or args.limit < 0 or args.threads < 1:
-        raise InputError("--workers, --limit and --threads: expected 0, 0 and 1 or more")
-    return args
+
+    def both(
+        args: Annotated[BatchArgs, arg(name="")], config: Annotated[Config, arg(name="")] = config
+    ) -> BatchArgs:
+        """Run thousands of captures; what is finished is not run again."""
+        return replace(args, config=config)
+
+    return parsed(both, "mover batch", rest, AvoidSubcommands)
 
 
 def _command(args: BatchArgs) -> tuple[str, ...]:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from tyro.conf import Positional, arg
 
+from mover.app.cli.config import parsed
 from mover.app.cli.console import say
 from mover.io.formats import chosen
 
@@ -36,20 +36,24 @@ class EvaluateArgs:
 
 def check(arguments: Sequence[str]) -> None:
     """`mover check`."""
-    args = tyro.cli(CheckArgs, prog="mover check", args=list(arguments))
+    args = parsed(CheckArgs, "mover check", arguments)
     read = chosen("--format", args.format, "capture")
     from mover.app.pictures.overlay import save_overlay
     from mover.io.capture.evidence import evidence_table, gather_evidence
+    from mover.pipeline.believable import warnings_of
 
     capture = read(args.source)
+    warnings = warnings_of(capture)
     say(evidence_table(capture, gather_evidence(capture)))
     save_overlay(capture, args.out)
+    for warning in warnings:
+        say(f"warning: {warning}")
     say(f"{args.source} is a valid capture; its initial scene is drawn in {args.out}")
 
 
 def evaluate(arguments: Sequence[str]) -> None:
     """`mover evaluate`."""
-    args = tyro.cli(EvaluateArgs, prog="mover evaluate", args=list(arguments))
+    args = parsed(EvaluateArgs, "mover evaluate", arguments)
     from mover.evaluate.evaluation import evaluate_folder, table
 
     say(table(evaluate_folder(args.out, args.truth)))

@@ -2,14 +2,18 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeVar
+
+import tyro
 
 from mover.app.cli.console import say
 from mover.core.errors import InputError
+from mover.core.settings import check_settings
 from mover.pipeline.presets import PRESETS, Config, with_methods, with_present_flags
 
+T = TypeVar("T")
 Device = Literal["auto", "cpu", "cuda"]
 """Where the heavy stages compute, see `core.devices.device_of`."""
 
@@ -28,6 +32,25 @@ def chosen_config(arguments: Sequence[str]) -> tuple[Config, list[str]]:
     from mover.app.results import read_config
 
     return with_methods(read_config(chosen.config), arguments)
+
+
+def parsed(kind: Callable[..., T], prog: str, arguments: Sequence[str], *markers: Any) -> T:  # noqa: ANN401
+    """The arguments of a command as its dataclass, checked before any work starts.
+
+    Args:
+        kind: The dataclass, or a function that returns dataclasses.
+        prog: The command's name.
+        arguments: What was typed after it.
+        markers: Of tyro.
+
+    Raises:
+        InputError: If a setting is out of its range.
+    """
+    found = tyro.cli(kind, prog=prog, args=list(arguments), config=markers)
+    parts: tuple[Any, ...] = found if isinstance(found, tuple) else (found,)
+    for part in parts:
+        check_settings(part, "--")
+    return found
 
 
 def preset_named(name: str) -> Config:

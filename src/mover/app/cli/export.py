@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
 from tyro.conf import Positional, arg
 
+from mover.app.cli.config import parsed
 from mover.app.cli.console import say
 from mover.core.errors import InputError
+from mover.core.settings import float_in
 from mover.io.formats import chosen, names
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class SimulateArgs:
     """Folder of the result."""
     truth: Path | None = None
     """Folder with the true scene.json, to settle it as well."""
-    seconds: float = 2.0
+    seconds: Annotated[float, float_in(0.01, 3600)] = 2.0
     """Time of the simulation [s]."""
     nudge: bool = False
     """Move pieces that would fall to where they stand, as far as their uncertainty allows; writes
@@ -56,7 +57,7 @@ class SimulateArgs:
 
 def export(arguments: Sequence[str]) -> None:
     """`mover export`."""
-    args = tyro.cli(ExportArgs, prog="mover export", args=list(arguments))
+    args = parsed(ExportArgs, "mover export", arguments)
     from mover.io.export.finished import Exported, read_finished
 
     writers = {target: chosen("--to", target, "export") for target in args.to}
@@ -75,7 +76,7 @@ def export(arguments: Sequence[str]) -> None:
 
 def simulate(arguments: Sequence[str]) -> None:
     """`mover simulate`."""
-    args = tyro.cli(SimulateArgs, prog="mover simulate", args=list(arguments))
+    args = parsed(SimulateArgs, "mover simulate", arguments)
     from mover.app.simulate import SimulationConfig, simulate_folder, simulation_table
 
     if not 0 < args.seconds <= 60:

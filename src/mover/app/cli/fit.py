@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
 from tyro.conf import Positional, arg
 
+from mover.app.cli.config import parsed
 from mover.app.cli.console import say
 from mover.core.errors import InputError
+from mover.core.settings import Index, Rate, float_in
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,11 @@ class FitArgs:
     """bodies.npz to start from: parameters of any model, or joints, in the camera frame."""
     vposer: Path | None = None
     """VPoser's weights (a checkpoint, its folder, or .npz) instead of the ranges of motion."""
-    ground: float | None = None
+    ground: Annotated[float, float_in(-100, 100)] | None = None
     """Height of the floor in the camera's world, where it is known: nobody sinks into it [m]."""
-    fps: float | None = None
+    fps: Rate | None = None
     """Frames a second, where the keypoints do not tell."""
-    first: int = 0
+    first: Index = 0
     """The number in the name of the first frame's file, 1 where they count from 1."""
     one_euro: bool = False
     """Filter the keypoints over time before the fit (One-Euro)."""
@@ -51,7 +52,7 @@ class FitArgs:
 
 def fit(arguments: Sequence[str]) -> None:
     """`mover fit`."""
-    fit_into(tyro.cli(FitArgs, prog="mover fit", args=list(arguments)))
+    fit_into(parsed(FitArgs, "mover fit", arguments))
 
 
 def fit_into(args: FitArgs) -> None:

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
 from tyro.conf import Positional, arg
 
+from mover.app.cli.config import parsed
 from mover.app.cli.console import say
 from mover.core.errors import InputError
+from mover.core.settings import Rate, float_in
 from mover.io.formats import IMPORTED, chosen, listing
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class ImportArgs:
     """The reference image."""
     camera: Path | None = None
     """A calibration: camera.json, transforms of nerfstudio, cam_K.txt, OpenCV's XML, fov.json."""
-    fov: float | None = None
+    fov: Annotated[float, float_in(1, 179)] | None = None
     """Horizontal field of view, where there is no calibration [degrees]."""
     objects_masks: Path | None = None
     """Masks of the furniture in the reference image."""
@@ -55,7 +56,7 @@ class ImportArgs:
     """The tool that found the bodies, as gvhmr, wham, tram or smplifyx; else bodies.npz."""
     gender: str | None = None
     """Of the bodies, where the tool does not tell: neutral, female or male."""
-    fps: float | None = None
+    fps: Rate | None = None
     """Frames a second of the people's masks and bodies."""
     up: str = ""
     """Which way is up in a glTF scene or in boxes: y, -y or z."""
@@ -69,7 +70,7 @@ class ImportArgs:
 
 def import_(arguments: Sequence[str]) -> None:
     """`mover import`."""
-    args = tyro.cli(ImportArgs, prog="mover import", args=list(arguments))
+    args = parsed(ImportArgs, "mover import", arguments)
     chosen("FORMAT", args.format, *IMPORTED)
     with tempfile.TemporaryDirectory(prefix="mover-import-") as work:
         run_import(args, Path(work))

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
 from tyro.conf import Positional, arg
 
+from mover.app.cli.config import parsed
 from mover.app.cli.console import say
 from mover.core.errors import InputError
+from mover.core.settings import Index, Rate, float_in
 from mover.io.formats import listing, names
 
 TOOLS = f"The tool that wrote the source; see docs/data.md.\n{listing('people', 'keypoints')}"
@@ -27,7 +28,7 @@ class BodiesArgs:
     """The file to write: bodies.npz, or keypoints.npz."""
     camera: Path | None = None
     """The true lens (camera.json or a calibration): bodies keep their pixels under it."""
-    focal: float | None = None
+    focal: Annotated[float, float_in(1, 1e6)] | None = None
     """The focal length that the tool assumed, where its files do not tell [px]."""
     model_folder: Path | None = None
     """Folder of the licensed body models; by default what MOVER_BODY_MODELS names."""
@@ -35,9 +36,9 @@ class BodiesArgs:
     """A mesh file with the triangles of the bodies, for meshes without a model."""
     gender: Literal["neutral", "female", "male"] | None = None
     """Of the body model; by default what the files say, else neutral."""
-    fps: float | None = None
+    fps: Rate | None = None
     """Frames a second."""
-    first: int = 0
+    first: Index = 0
     """The number in the name of the first frame's file, 1 where they count from 1."""
     space: Literal["camera", "world"] = "camera"
     """world: upright, +y up, by the gravity that the tool knows."""
@@ -47,7 +48,7 @@ class BodiesArgs:
 
 def bodies(arguments: Sequence[str]) -> None:
     """`mover import-bodies`."""
-    args = tyro.cli(BodiesArgs, prog="mover import-bodies", args=list(arguments))
+    args = parsed(BodiesArgs, "mover import-bodies", arguments)
     if args.fps is not None and not args.fps > 0:
         raise InputError(f"--fps: {args.fps:g}, expected more than 0")
     if args.model_folder is not None:

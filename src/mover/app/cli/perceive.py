@@ -5,10 +5,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
 from tyro.conf import Positional, arg
 
+from mover.app.cli.config import parsed
 from mover.app.cli.console import say
+from mover.core.settings import float_in
 from mover.perceive.config import LayoutConfig, Lens, ModelsConfig, PerceiveConfig
 from mover.perceive.networks import check_networks, in_folder
 
@@ -45,7 +46,7 @@ class PerceiveArgs:
     """The capture folder."""
     camera: Path | None = None
     """A calibration; GeoCalib's also tells pitch and roll."""
-    fov: float | None = None
+    fov: Annotated[float, float_in(1, 179)] | None = None
     """Horizontal field of view, where there is no calibration [degrees]."""
     photo: Path | None = None
     """A photo of the same camera, whose EXIF tells the focal length."""
@@ -62,7 +63,7 @@ class PerceiveArgs:
 
 def perceive(arguments: Sequence[str]) -> None:
     """`mover perceive`."""
-    args = tyro.cli(PerceiveArgs, prog="mover perceive", args=list(arguments))
+    args = parsed(PerceiveArgs, "mover perceive", arguments)
     perceive_into(args, ready_models(args.config.models, args.weights))
     if args.layout:
         layout_into(LayoutArgs(args.out, args.depth, args.meshes))
@@ -72,7 +73,7 @@ def perceive(arguments: Sequence[str]) -> None:
 
 def layout(arguments: Sequence[str]) -> None:
     """`mover layout`."""
-    args = tyro.cli(LayoutArgs, prog="mover layout", args=list(arguments))
+    args = parsed(LayoutArgs, "mover layout", arguments)
     layout_into(args)
     say(f"next: mover check {args.capture}; mover run {args.capture} --out OUT")
 

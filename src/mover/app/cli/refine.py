@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import Positional, arg
 
+from mover.app.cli.config import parsed
 from mover.app.cli.console import say
 from mover.core.errors import InputError
+from mover.core.settings import Index, int_in
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class RefineArgs:
     """Use who hides whom."""
     masks: bool = True
     """Use the outlines of people's masks."""
-    rounds: int = 3
+    rounds: Annotated[int, int_in(1, 1000)] = 3
     """How often contacts and outlines are looked for anew while poses change."""
 
 
@@ -47,7 +48,7 @@ class ContactsArgs:
     """bodies.npz."""
     source: Path | None = None
     """files: the .npy or .npz file, or the folder of them."""
-    first: int = 0
+    first: Index = 0
     """files: the number in the name of the first frame's file."""
     weights: Path | None = None
     """posa: contact.pt or contact_semantics.pt."""
@@ -55,7 +56,7 @@ class ContactsArgs:
     """posa: the folder mesh_ds."""
     camera: Path | None = None
     """posa: a camera.json with the true pitch and roll, for bodies in camera axes."""
-    samples: int = 0
+    samples: Annotated[int, int_in(0, 1000)] = 0
     """posa: mean of so many random answers; 0: the one of the mean code."""
     model_folder: Path | None = None
     """Folder of the licensed body models; by default what MOVER_BODY_MODELS names."""
@@ -65,7 +66,7 @@ class ContactsArgs:
 
 def refine(arguments: Sequence[str]) -> None:
     """`mover refine`."""
-    args = tyro.cli(RefineArgs, prog="mover refine", args=list(arguments))
+    args = parsed(RefineArgs, "mover refine", arguments)
     import torch
 
     from mover.app.cli.progress import Bar
@@ -92,7 +93,7 @@ def refine(arguments: Sequence[str]) -> None:
 
 def contacts(arguments: Sequence[str]) -> None:
     """`mover contacts`."""
-    args = tyro.cli(ContactsArgs, prog="mover contacts", args=list(arguments))
+    args = parsed(ContactsArgs, "mover contacts", arguments)
     from mover.io.capture.bodies_file import read_bodies
     from mover.pipeline.refinement import contacts_from, find_posa, write_contacts
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from tyro.conf import Positional, arg
 
+from mover.app.cli.config import parsed
 from mover.app.cli.console import say
 from mover.app.pictures.config import RenderConfig
 from mover.core.errors import InputError
@@ -30,7 +30,7 @@ class RenderArgs:
 
 def render(arguments: Sequence[str]) -> None:
     """`mover render`."""
-    args = tyro.cli(RenderArgs, prog="mover render", args=list(arguments))
+    args = parsed(RenderArgs, "mover render", arguments)
     import torch
 
     from mover.app.pictures.render import render_result

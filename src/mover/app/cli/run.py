@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
 from tyro.conf import AvoidSubcommands, Positional, arg
 
-from mover.app.cli.config import Device, chosen_config
+from mover.app.cli.config import Device, chosen_config, parsed
 from mover.app.cli.console import say
 from mover.io.formats import chosen
 from mover.pipeline.presets import Config
@@ -50,7 +49,7 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
         """Reconstruct a room from a capture folder."""
         return args, config
 
-    return tyro.cli(both, prog="mover run", args=rest, config=(AvoidSubcommands,))
+    return parsed(both, "mover run", rest, AvoidSubcommands)
 
 
 def run(arguments: Sequence[str]) -> None:

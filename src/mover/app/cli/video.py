@@ -5,11 +5,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
 from tyro.conf import Positional, arg
 
 from mover.app.chain import FIT, BodiesFrom, Steps, make_bodies, steps_in
-from mover.app.cli.config import Device, preset_named
+from mover.app.cli.config import Device, parsed, preset_named
 from mover.app.cli.console import say
 from mover.app.cli.fit import FitArgs, fit_into
 from mover.app.cli.perceive import (
@@ -20,6 +19,7 @@ from mover.app.cli.perceive import (
     ready_models,
 )
 from mover.core.errors import InputError
+from mover.core.settings import float_in
 from mover.perceive.config import PerceiveConfig
 
 STEPS = ("pictures", "first scene", "bodies", "room")
@@ -44,7 +44,7 @@ class ChainArgs:
     itself."""
     camera: Path | None = None
     """A calibration; GeoCalib's also tells pitch and roll."""
-    fov: float | None = None
+    fov: Annotated[float, float_in(1, 179)] | None = None
     """Horizontal field of view, where there is no calibration [degrees]."""
     photo: Path | None = None
     """A photo of the same camera, whose EXIF tells the focal length."""
@@ -83,7 +83,7 @@ class ImageArgs:
 
 def video(arguments: Sequence[str]) -> None:
     """`mover video`."""
-    args = tyro.cli(VideoArgs, prog="mover video", args=list(arguments))
+    args = parsed(VideoArgs, "mover video", arguments)
     if not args.source.exists():
         raise InputError(f"{args.source}: there is no such file, expected a video or a folder")
     video_to_room(args.source, args.chain)
@@ -91,7 +91,7 @@ def video(arguments: Sequence[str]) -> None:
 
 def image(arguments: Sequence[str]) -> None:
     """`mover image`."""
-    args = tyro.cli(ImageArgs, prog="mover image", args=list(arguments))
+    args = parsed(ImageArgs, "mover image", arguments)
     from mover.perceive.video import read_picture
 
     if not args.source.is_file():

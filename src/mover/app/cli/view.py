@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from tyro.conf import Positional, arg
 
+from mover.app.cli.config import parsed
 from mover.app.viewer.address import Address
 
 
@@ -28,7 +28,7 @@ class ViewArgs:
 
 def view(arguments: Sequence[str]) -> None:
     """`mover view`."""
-    args = tyro.cli(ViewArgs, prog="mover view", args=list(arguments))
+    args = parsed(ViewArgs, "mover view", arguments)
     from mover.app.viewer.show import view_result
 
     source = None if args.capture is None else (args.format, args.capture)

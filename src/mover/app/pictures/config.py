@@ -1,7 +1,9 @@
 """What a picture shows. Imports no torch: `--help` is quick."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from mover.core.settings import Index, float_in, int_in
 
 
 @dataclass(frozen=True)
@@ -12,15 +14,15 @@ class RenderConfig:
     """From the video's camera, from above, or from a place around the room."""
     scene: Literal["result", "initial", "both"] = "result"
     """The result, the scene as it was given, or both side by side."""
-    width: int = 960
+    width: Annotated[int, int_in(16, 8192)] = 960
     """Of one picture [px]."""
-    azimuth: float = 35.0
+    azimuth: Annotated[float, float_in(-3600, 3600)] = 35.0
     """orbit: 0 is the video's side, 90 the right of its image [degrees]."""
-    elevation: float = 25.0
+    elevation: Annotated[float, float_in(-90, 90)] = 25.0
     """orbit: above the floor [degrees]."""
-    turns: float = 0.0
+    turns: Annotated[float, float_in(-1000, 1000)] = 0.0
     """orbit: how often the eye goes around during a film."""
-    frame: int | None = None
+    frame: Index | None = None
     """A still: which frame of the video; by default the one in the middle."""
     people: bool = True
     """Draw people."""

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import math
+import socket
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch
 
 from mover.app.viewer.address import Address
 from mover.app.viewer.drawing import Drawing, People
+from mover.app.viewer.gate import gate_at, guarded
 from mover.app.viewer.panel_object import add_object_panel
 from mover.app.viewer.panel_room import add_room_panel
 from mover.app.viewer.panel_solve import Gauges, SolveJob, add_solve_panel
@@ -78,7 +80,8 @@ def open_viewer(
         raise InputError(
             "mover view needs viser: pip install '.[viewer]' in mover's folder"
         ) from error
-    with contextlib.redirect_stdout(io.StringIO()):
+    gate = gate_at(address.host)
+    with contextlib.redirect_stdout(io.StringIO()), guarded(gate):
         server = viser.ViserServer(
             host=address.host, port=address.port, label=session.shown.title, verbose=False
         )
@@ -98,7 +101,9 @@ def open_viewer(
         add_object_panel(window)
     with tabs.add_tab("Solve"):
         gauges = add_solve_panel(window, job, why_not)
-    return Opened(window, gauges, f"http://{server.get_host()}:{server.get_port()}")
+    host = socket.gethostname() if server.get_host() == "0.0.0.0" else server.get_host()
+    token = f"/?token={gate.token}" if gate.token else ""
+    return Opened(window, gauges, f"http://{host}:{server.get_port()}{token}")
 
 
 def _window_of(server: object, session: Session) -> Window:

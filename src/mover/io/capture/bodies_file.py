@@ -15,7 +15,19 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.types import Bodies
 from mover.io.capture.pose_file import pose_of, pose_to_arrays, posed, reproduces
-from mover.io.files.fields import LAST_INDEX, At, Warn, array, choice, get, maybe, refuse
+from mover.io.files.fields import (
+    FASTEST,
+    LAST_INDEX,
+    SLOWEST,
+    At,
+    Warn,
+    array,
+    choice,
+    get,
+    maybe,
+    number,
+    refuse,
+)
 from mover.io.files.npz import read_npy, read_npz, write_npz
 
 log = logging.getLogger(__name__)
@@ -130,10 +142,7 @@ def _fps(at: At) -> float | None:
     given = maybe(at, "fps")
     if given is None:
         return None
-    value = float(array(given, ())[()])
-    if not value > 0:
-        refuse(given, "a number above 0", f"{value:g}")
-    return value
+    return number(At(float(array(given, ())[()]), given.file, given.field), SLOWEST, FASTEST)
 
 
 def _space(at: At) -> Any:  # noqa: ANN401

@@ -14,11 +14,12 @@ from mover.io.capture.camera_file import camera_of
 from mover.io.capture.objects_file import detections_of
 from mover.io.capture.parts import Parts
 from mover.io.capture.people_file import PeopleFile, people_of
+from mover.io.capture.plausible import check_plausible
 from mover.io.capture.pose_file import into_camera
 from mover.io.capture.scene_file import hypotheses_of, scene_of
 from mover.io.files.fields import At, Warn, get, items, listed, maybe, number, refuse
 
-LEAST_HEIGHT, MOST_HEIGHT = 0.1, 100.0  # [m], of the camera above the floor
+LEAST_HEIGHT, MOST_HEIGHT = 0.1, 20.0  # [m], of the camera above the floor
 NOBODY = PeopleFile(None, None, None, frozenset())
 
 
@@ -47,7 +48,7 @@ def build_capture(parts: Parts) -> Capture:
     others: tuple[SceneObject, ...] = ()
     if parts.hypotheses is not None:
         others = hypotheses_of(parts.hypotheses, parts.load_mesh, scene, warn)
-    return Capture(
+    capture = Capture(
         name=parts.name,
         scene=scene,
         camera_height=_camera_height(parts.camera),
@@ -57,9 +58,11 @@ def build_capture(parts: Parts) -> Capture:
         bodies=bodies,
         people=found.people,
         touch=touch,
-        warnings=tuple(warnings),
+        warnings=(),
         hypotheses=others,
     )
+    check_plausible(capture, warn)
+    return dataclasses.replace(capture, warnings=tuple(warnings))
 
 
 def _image_of(parts: Parts, camera: Camera, warn: Warn) -> Float[Tensor, "h w 3"] | None:
@@ -102,9 +105,6 @@ def _bodies_of(
     if bodies.space == "world":
         # The file's world is that of scene.json, before its heading was taken out.
         bodies = into_camera(bodies, camera.R_cam_world @ rot_y(torch.tensor(turn)))
-    if float(bodies.verts[..., 2].median()) <= 0:
-        axes = "the camera frame is x right, y down, z forward"
-        warn(f"bodies.npz: most of the bodies are behind the camera; {axes}")
     return dataclasses.replace(bodies, fps=fps) if bodies.fps is None else bodies
 
 

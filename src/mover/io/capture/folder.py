@@ -93,7 +93,7 @@ def _reference(folder: Path, objects: At | None) -> tuple[LoadImage | None, tupl
 
 
 def _if_there(read: Callable[[Path], At], path: Path) -> At | None:
-    return read(path) if path.exists() else None
+    return read(path) if path.exists() or path.is_symlink() else None
 
 
 def _count_frames(folder: Path) -> int | None:

@@ -11,7 +11,7 @@ from msgspec import Meta, Struct
 from mover.core.types import Camera, Masks, People
 from mover.geometry.rle import area, joined
 from mover.io.files.fields import At, Warn, get, items, maybe, refuse, shown, unique
-from mover.io.files.schema import Box, Index, Positive, checked
+from mover.io.files.schema import Box, FrameRate, Index, checked
 from mover.io.masks.coco import categories_of, category_of, check_image, mask_of, segmentation
 
 
@@ -33,7 +33,7 @@ Height = Annotated[float, Meta(ge=0.3, le=3.0)]
 class InfoFields(Struct, frozen=True):
     """`info`: frames a second, and known heights by track."""
 
-    fps: Positive | None = None
+    fps: FrameRate | None = None
     heights: dict[str, Height] | None = None
 
 

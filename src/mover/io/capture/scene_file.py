@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 FORMAT, VERSION = "mover-scene", 1
 SAFE_ID = re.compile(r"\w[\w.-]{0,99}")
 WORDS = ("ground", "free")
+LOWEST = 30.0  # [m], of a floor below the camera
 LoadMesh = Callable[[At], tuple[Mesh, str]]
 """Gives the mesh that a field names, and its file."""
 
@@ -65,6 +66,7 @@ class PlaceFields(Struct, frozen=True):
     translation: Vector
     yaw: Number
     scale: Sizes
+    energy: Number | None = None
 
 
 class ObjectFields(PlaceFields, frozen=True, kw_only=True):
@@ -79,7 +81,7 @@ class ObjectFields(PlaceFields, frozen=True, kw_only=True):
 class Ground(Struct, frozen=True):
     """`ground`."""
 
-    height: Number
+    height: Annotated[float, Meta(ge=-LOWEST, le=LOWEST)]
 
 
 class SceneFields(Struct, frozen=True):

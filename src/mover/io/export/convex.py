@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.run import Run
+from mover.core.settings import float_in, int_in
 from mover.core.types import Mesh, SceneObject
 from mover.geometry.watertight import close_mesh
 from mover.io.files.fields import At
@@ -111,9 +112,9 @@ class ConvexConfig:
     method: Literal["best", "coacd", "slices"] = "best"
     """slices: cuts along the axes by manifold3d, exact for boards; coacd: any shape, slower; best:
     coacd where slices leave hollows."""
-    concavity: float = 0.04
+    concavity: Annotated[float, float_in(0.01, 1)] = 0.04
     """How hollow a piece may be, as a share of the object's size (coacd) or volume (slices)."""
-    most: int = 24
+    most: Annotated[int, int_in(1, 1000)] = 24
     """Pieces of one object."""
 
 

@@ -20,6 +20,7 @@ LARGEST_FILE = 4 << 30  # [bytes], of a JSON file or of all arrays of an .npz
 LARGEST = 1e9  # no number of the format is larger; keeps float32 finite
 LAST_INDEX = 10_000_000  # frames, tracks
 LAST_ID = 1 << 62
+SLOWEST, FASTEST = 1e-3, 1e4  # frames a second
 
 
 class Missing:
@@ -190,9 +191,20 @@ def read_json(path: Path) -> At:
         size = path.stat().st_size
         raise InputError(f"{name}: has {size} bytes, expected at most {LARGEST_FILE}")
     try:
-        return At(json.loads(path.read_text(encoding="utf-8-sig")), name)
+        text = path.read_text(encoding="utf-8-sig")
+        return At(json.loads(text, object_pairs_hook=_once), name)
     except (ValueError, RecursionError, OSError) as error:
         raise InputError(f"{name}: is not JSON ({reason(error)}), expected a JSON file") from error
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON whose names are told once each."""
+    tree = dict(pairs)
+    if len(tree) < len(pairs):
+        told: set[str] = set()
+        twice = next(key for key, _ in pairs if key in told or told.add(key))
+        raise ValueError(f"the name {shown(twice)} is there twice")
+    return tree
 
 
 def write_json(value: object, path: Path) -> None:

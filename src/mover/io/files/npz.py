@@ -85,7 +85,8 @@ def read_npy(path: Path) -> At:
     """
     try:
         check_array_header(path)
-        return At(np.load(path, allow_pickle=False), path.name)
+        with path.open("rb") as file:
+            return At(np.load(file, allow_pickle=False), path.name)
     except BROKEN as error:
         raise InputError(
             f"{path.name}: cannot be read ({reason(error)}), expected an .npy file"

@@ -12,11 +12,22 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from mover.io.files.fields import LARGEST, LAST_ID, LAST_INDEX, MISSING, At, refuse
+from mover.io.files.fields import (
+    FASTEST,
+    LARGEST,
+    LAST_ID,
+    LAST_INDEX,
+    MISSING,
+    SLOWEST,
+    At,
+    refuse,
+)
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="a finite number")]
 Positive = Annotated[float, Meta(ge=1 / LARGEST, le=LARGEST, description="a number above 0")]
 Share = Annotated[float, Meta(ge=0, le=1)]
+FrameRate = Annotated[float, Meta(ge=SLOWEST, le=FASTEST)]
+"""Of a video [1/s]."""
 Index = Annotated[int, Meta(ge=0, le=LAST_INDEX)]
 """Of a frame or a track."""
 Id = Annotated[int, Meta(ge=0, le=LAST_ID)]
@@ -57,15 +68,19 @@ def checked(at: At, kind: Any) -> Any:
     except msgspec.ValidationError as error:
         if "got `numpy." not in str(error):
             _refuse(at, kind, str(error))
+    except UnicodeEncodeError:  # half of a pair of surrogates, which no text has
+        pass
     return checked(At(_plain(at.value), at.file, at.field), kind)
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
-    """Numbers of numpy, which msgspec does not take, as those of Python."""
+    """Numbers of numpy and text that is none, which msgspec does not take, as those of Python."""
     if isinstance(value, dict):
         return {key: _plain(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(one) for one in value]
+    if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
+        return "\0"
     return value.item() if isinstance(value, np.generic) else value
 
 

@@ -58,7 +58,8 @@ def read_any(path: Path) -> At:
 def _read_npy(path: Path) -> object:
     """An array of plain numbers, or the pickled object in its place."""
     try:
-        return np.load(path, allow_pickle=False)
+        with path.open("rb") as file:
+            return np.load(file, allow_pickle=False)
     except ValueError:
         return load_plain(path)
     except BROKEN as error:

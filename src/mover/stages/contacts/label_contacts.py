@@ -19,6 +19,7 @@ from mover.bodies.skin import PARTS
 from mover.core.contact_labels import ContactLabels
 from mover.core.observe import Observer, silent
 from mover.core.records import record
+from mover.core.settings import Count, Metres, Share
 from mover.core.types import Bodies, Mesh
 from mover.geometry.nearest import as_float64, as_int64, closest
 from mover.geometry.volume import outward
@@ -30,15 +31,15 @@ FLOOR = "ground"
 class LabelConfig:
     """What counts as a touch."""
 
-    reach: float = 0.06
+    reach: Metres = 0.06
     """From here on nothing touches [m]: what bodies of single frames float on average."""
-    near: float = 0.02
+    near: Metres = 0.02
     """Up to here the part surely touches [m]."""
-    unseen: float = 0.4
+    unseen: Share = 0.4
     """Share of the confidence that nearness alone gives, where the posture says nothing."""
-    least: float = 0.2
+    least: Share = 0.2
     """Labels below this confidence are left out."""
-    most: int = 40
+    most: Count = 40
     """Vertices of a part that are looked at, evenly chosen."""
 
 

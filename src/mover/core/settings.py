@@ -1,0 +1,209 @@
+"""Settings: each number says its range where it is declared, for flags, files and `--help`.
+
+    yaws: Annotated[int, int_in(1, 360)] = 16
+
+Imports no torch: `--help` is quick.
+"""
+
+import dataclasses
+import functools
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+from tyro.constructors import PrimitiveConstructorSpec
+
+from mover.core.errors import InputError
+
+T = TypeVar("T")
+MOST_SHOWN = 60  # letters of a wrong value in a message
+
+
+@dataclass(frozen=True, kw_only=True)
+class Range(PrimitiveConstructorSpec[Any]):
+    """The numbers that a setting may be; both ends belong to it. Tyro shows it in `--help`."""
+
+    low: float
+    high: float
+    kind: type[int] | type[float]
+
+    def words(self) -> str:
+        """As messages say it."""
+        noun = "a whole number" if self.kind is int else "a number"
+        return f"{noun} from {_short(self.low)} to {_short(self.high)}"
+
+    def holds(self, value: object) -> bool:
+        """Whether a value is such a number; NaN is none."""
+        is_number = isinstance(value, self.kind) or (self.kind is float and isinstance(value, int))
+        if isinstance(value, bool) or not is_number:
+            return False
+        return self.low <= typing.cast(float, value) <= self.high
+
+
+def int_in(low: int, high: int) -> Range:
+    """The range of a whole number."""
+    return _range(int, low, high)
+
+
+def float_in(low: float, high: float) -> Range:
+    """The range of a number; it may end at infinity."""
+    return _range(float, low, high)
+
+
+def _range(kind: type[int] | type[float], low: float, high: float) -> Range:
+    return Range(
+        nargs=1,
+        metavar=f"{kind.__name__.upper()}:{_short(low)}..{_short(high)}",
+        instance_from_str=lambda words: kind(words[0]),
+        is_instance=lambda value: type(value) is kind or (kind is float and type(value) is int),
+        str_from_instance=lambda value: [str(value)],
+        low=low,
+        high=high,
+        kind=kind,
+    )
+
+
+def _short(number: float) -> str:
+    return f"{number:,.0f}" if 1e3 <= abs(number) < 1e7 else f"{number:g}"
+
+
+Share = Annotated[float, float_in(0, 1)]
+Weight = Annotated[float, float_in(0, 1e9)]
+"""Of a term of an energy; 0 leaves it out."""
+Sigma = Annotated[float, float_in(1e-6, 1e6)]
+"""What an expected error or a scale may be: it divides."""
+Metres = Annotated[float, float_in(0, 100)]
+Seconds = Annotated[float, float_in(0, 1e6)]
+Rate = Annotated[float, float_in(1e-3, 1e4)]
+"""Of frames a second."""
+Degrees = Annotated[float, float_in(0, 180)]
+Pixels = Annotated[int, int_in(1, 32768)]
+"""Along a side of a picture."""
+Count = Annotated[int, int_in(1, 1_000_000)]
+Steps = Annotated[int, int_in(0, 1_000_000)]
+"""Of a descent, or rounds of one; 0: none."""
+Seed = Annotated[int, int_in(0, 2**32 - 1)]
+Index = Annotated[int, int_in(0, 2**31 - 1)]
+"""Of a frame."""
+
+
+def check_settings(settings: object, name: str) -> None:
+    """Check every setting of a dataclass and of those inside.
+
+    Args:
+        settings: The dataclass.
+        name: How messages call it: `--` for flags.
+
+    Raises:
+        InputError: If one is of a wrong type, or out of its range.
+    """
+    for key, hint in settings_of(type(settings)).items():
+        flat = any(getattr(one, "name", None) == "" for one in getattr(hint, "__metadata__", ()))
+        _check(getattr(settings, key), hint, name if flat else _joined(name, key))
+
+
+def read_settings(kind: type[T], tree: object, name: str) -> T:
+    """Settings from plain JSON values, checked; what is not told keeps its default.
+
+    Args:
+        kind: The dataclass.
+        tree: Its fields.
+        name: How messages call it.
+
+    Raises:
+        InputError: If one is unknown, of a wrong type, or out of its range.
+    """
+    return typing.cast(T, _built(kind, tree, name))
+
+
+@functools.cache
+def settings_of(kind: type[Any]) -> dict[str, Any]:
+    """The types of a dataclass's fields, with their ranges."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+
+
+def _joined(name: str, key: str) -> str:
+    return f"{name}{key}" if name in ("--", "") else f"{name}.{key}"
+
+
+def _check(value: Any, hint: Any, name: str) -> None:  # noqa: ANN401
+    if expected := _wrong(value, hint, name):
+        raise InputError(f"{name}: has {_shown(value)}, expected {expected}")
+
+
+def _wrong(value: Any, hint: Any, name: str) -> str:  # noqa: ANN401
+    """What is expected in place of a value; empty: it fits."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        ranges = [one for one in args[1:] if isinstance(one, Range)]
+        wrong = [one.words() for one in ranges if not one.holds(value)]
+        return wrong[0] if wrong else "" if ranges else _wrong(value, args[0], name)
+    if origin in (Union, types.UnionType):
+        return _wrong_of_all(value, args, name)
+    if origin is tuple:
+        return _wrong_items(value, args, name)
+    if origin is Literal:
+        return "" if value in args else f"one of {', '.join(map(str, args))}"
+    if dataclasses.is_dataclass(hint):
+        if isinstance(value, typing.cast(type, hint)):
+            check_settings(value, name)
+            return ""
+        return "settings {...}"
+    words = {bool: "true or false", str: "text", Path: "a path", types.NoneType: "nothing"}
+    return "" if hint not in words or isinstance(value, hint) else words[hint]
+
+
+def _wrong_of_all(value: Any, kinds: Sequence[Any], name: str) -> str:  # noqa: ANN401
+    """What is expected where there is a choice of types."""
+    wrong = [_wrong(value, kind, name) for kind in kinds if kind is not types.NoneType]
+    if "" in wrong or (value is None and types.NoneType in kinds):
+        return ""
+    return wrong[0]
+
+
+def _wrong_items(value: Any, kinds: Sequence[Any], name: str) -> str:  # noqa: ANN401
+    """What is expected of a tuple; its items are checked, too."""
+    if not isinstance(value, tuple):
+        return "a list"
+    if Ellipsis not in kinds and len(value) != len(kinds):
+        return f"a list of {len(kinds)}"
+    for i, one in enumerate(value):
+        _check(one, kinds[0 if Ellipsis in kinds else i], f"{name}[{i}]")
+    return ""
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= MOST_SHOWN else text[:MOST_SHOWN] + "..."
+
+
+def _built(hint: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
+    """A value of plain JSON values, checked before a record is built of it."""
+    kinds = _dataclasses(hint)
+    if kinds and isinstance(tree, Mapping):
+        kind = next((k for k in kinds if set(settings_of(k)) == set(tree)), kinds[0])
+        for key in tree:
+            if key not in settings_of(kind):
+                known = ", ".join(settings_of(kind))
+                raise InputError(f"{_joined(name, key)}: is no setting, expected one of {known}")
+        fields = settings_of(kind)
+        return kind(**{k: _built(fields[k], v, _joined(name, k)) for k, v in tree.items()})
+    value = tree
+    if isinstance(tree, list):
+        args = get_args(hint)
+        items = args[:1] * len(tree) if Ellipsis in args else (*args, *[Any] * len(tree))
+        pairs = enumerate(zip(items, tree, strict=False))
+        value = tuple(_built(kind, one, f"{name}[{i}]") for i, (kind, one) in pairs)
+    _check(value, hint, name)
+    return value
+
+
+def _dataclasses(hint: Any) -> list[type[Any]]:  # noqa: ANN401
+    """The dataclasses among the types that a hint allows."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return [kind for one in get_args(hint) for kind in _dataclasses(one)]
+    return [hint] if isinstance(hint, type) and dataclasses.is_dataclass(hint) else []

@@ -1,0 +1,431 @@
+"""Whatever is damaged: a sentence or a result, and never a traceback, a hang or silent nonsense.
+
+All mutations are drawn from a seed. A share of them runs in `make test`, all in `make test-all`;
+`python -m pytest tests/test_fuzz.py -m "" -s` prints the counts.
+"""
+
+import json
+import logging
+import math
+import os
+import pickle
+import shutil
+import signal
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import make_people as made
+import numpy as np
+import pytest
+import tiny_capture as tiny
+import torch
+from test_fuzz_people import CAMERA, Toy
+from test_run import PLANE, Twice, doubled, files
+
+from mover.bodies import BODY_MODELS
+from mover.core.errors import InputError
+from mover.core.pickles import REFUSED
+from mover.core.run import Run
+from mover.core.settings import Range, settings_of
+from mover.core.types import Capture
+from mover.io.capture.folder import read_capture
+from mover.io.people.bodies import bodies_from
+from mover.io.people.found import Known
+from mover.io.people.keypoints import keypoints_from
+
+FEW, ALL = 60, 1500  # mutations of a capture
+LONGEST = 20  # [s], of one read
+JUNK = (
+    0, -1, 1, 1e-8, -1e-8, 1e8, -80, 500, 1000, 1e5, 10**30, math.nan, math.inf, -math.inf, True,
+    None, "", "x", "..", "ground", "\ud800", [], {}, [[]], [1, 2], {"a": 1}, ["x"] * 3,
+    [math.nan] * 3,
+)  # fmt: skip
+FACTORS = (0.001, 0.01, 0.3048, 3.28, 39.37, 100.0, 1000.0, 1e8, -1.0)
+
+
+@contextmanager
+def limited(seconds: int) -> Iterator[None]:
+    """A hang is a failure."""
+
+    def late(*_: object) -> None:
+        raise TimeoutError(f"not through after {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def said(error: InputError) -> str:
+    """The sentence of an error: one line, not too long, with what was expected."""
+    text = str(error)
+    assert "\n" not in text, text
+    assert 20 < len(text) < 700, text
+    return text
+
+
+# Captures.
+
+
+def places_of(tree: Any, way: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    keys = tree if isinstance(tree, dict) else range(len(tree)) if isinstance(tree, list) else ()
+    found = [way] if way else []
+    for key in keys:
+        found += places_of(tree[key], (*way, key))
+    return found
+
+
+def in_json(folder: Path, rng: np.random.Generator) -> str:
+    """One value of one file is another, is a multiple of itself, or is not there."""
+    path = folder / str(rng.choice(["camera", "scene", "objects", "people", "hypotheses"]))
+    path = path.with_suffix(".json")
+    tree = json.loads(path.read_text())
+    places = places_of(tree)
+    *way, last = places[rng.integers(len(places))]
+    node = tree
+    for key in way:
+        node = node[key]
+    old, kind = node[last], rng.integers(4)
+    if kind == 0 and isinstance(old, float | int) and not isinstance(old, bool):
+        node[last] = old * FACTORS[rng.integers(len(FACTORS))]
+    elif kind == 1:
+        del node[last]
+    else:
+        node[last] = JUNK[rng.integers(len(JUNK))]
+    path.write_text(json.dumps(tree))
+    return f"{path.name} {(*way, last)}, {old!r:.30}"
+
+
+def in_arrays(folder: Path, rng: np.random.Generator) -> str:
+    """One array of an archive has another unit, shape, kind or one bad number, or is not there."""
+    path = folder / str(rng.choice(["bodies.npz", "contacts.npz"]))
+    with np.load(path) as file:
+        arrays = dict(file)
+    name = str(rng.choice(list(arrays)))
+    array = arrays[name]
+    bad, far = array.copy(), 1e8 if array.dtype.kind == "f" else 7
+    if array.dtype.kind in "fiu" and array.size:
+        bad.flat[rng.integers(array.size)] = rng.choice([0, 99, far])
+    options: list[Callable[[], Any]] = [
+        lambda: bad, lambda: array[:-1] if array.ndim else np.zeros(3), lambda: array.ravel(),
+        lambda: np.array(["x"]), lambda: array.astype(str), lambda: np.zeros(0),
+    ]  # fmt: skip
+    if array.dtype.kind == "f":
+        options += [lambda f=f: array * np.float32(f) for f in FACTORS] + [lambda: array * math.nan]
+    which = int(rng.integers(len(options) + 1))
+    if which == len(options):
+        del arrays[name]
+    else:
+        arrays[name] = options[which]()
+    np.savez(path, **arrays)
+    return f"{path.name} {name} {which}"
+
+
+def in_bytes(folder: Path, rng: np.random.Generator) -> str:
+    """A file is cut, or some of its bytes are others."""
+    found = sorted(p for p in folder.rglob("*") if p.is_file())
+    path = found[rng.integers(len(found))]
+    content = bytearray(path.read_bytes())
+    where = int(rng.integers(len(content)))
+    if rng.integers(2):
+        del content[where:]
+    else:
+        content[where : where + 4] = rng.bytes(int(rng.integers(1, 9)))
+    path.write_bytes(bytes(content))
+    return f"{path.name} at {where}"
+
+
+def in_files(folder: Path, rng: np.random.Generator) -> str:
+    """A file is gone, a folder, a link to nothing or to itself, or another file."""
+    found = sorted(p for p in folder.rglob("*") if p.is_file())
+    path, other = found[rng.integers(len(found))], found[rng.integers(len(found))]
+    content = other.read_bytes()
+    path.unlink()
+    kind = int(rng.integers(5))
+    if kind == 1:
+        path.mkdir()
+    elif kind == 2:
+        path.symlink_to(folder / "gone")
+    elif kind == 3:
+        path.symlink_to(path)
+    elif kind == 4:
+        path.write_bytes(content)
+    return f"{path.name} {kind} {other.name}"
+
+
+KINDS = (in_json, in_json, in_json, in_arrays, in_arrays, in_bytes, in_files)
+
+
+def check_sane(capture: Capture) -> None:
+    """What is taken can be true, whatever the readers think of it."""
+    camera = capture.scene.camera
+    assert 0.05 <= float(camera.K[0, 0]) / camera.width <= 100
+    assert camera.width * camera.height <= 1 << 28
+    for piece in (*capture.scene.objects, *capture.hypotheses):
+        verts = piece.mesh.verts[piece.mesh.faces.unique()] * piece.scale
+        assert 0.01 <= float((verts.amax(0) - verts.amin(0)).max()) <= 30
+        assert float(piece.t_world_object.norm()) <= 100
+        assert abs(float(piece.yaw)) <= 1000
+    bodies = capture.bodies
+    if bodies is not None:
+        assert float(bodies.verts.abs().max()) <= 100
+        assert float(bodies.verts[..., 2].median()) > 0
+        extent = (bodies.verts.amax(1) - bodies.verts.amin(1)).norm(dim=-1).median()
+        assert 0.05 <= float(extent) <= 10
+        assert bodies.fps is None or 1e-3 <= bodies.fps <= 1e4
+    for detection in capture.detections:
+        assert bool(detection.box.isfinite().all())
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tiny.write_capture(tmp_path_factory.mktemp("fuzz") / "tiny")
+    (folder / "hypotheses.json").write_text(json.dumps(tiny.hypotheses()))
+    return folder
+
+
+def mutations(whole: Path, numbers: range) -> Counter[str]:
+    """What became of mutated captures."""
+    counts: Counter[str] = Counter()
+    copy = whole.parent / "copy"
+    for number in numbers:
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(whole, copy)
+        rng = np.random.default_rng(number)
+        what = KINDS[number % len(KINDS)](copy, rng)
+        try:
+            with limited(LONGEST):
+                capture = read_capture(copy)
+        except InputError as error:
+            said(error)
+            counts["refused"] += 1
+            continue
+        except Exception as error:
+            raise AssertionError(f"mutation {number} ({what}): {error!r}") from error
+        check_sane(capture)
+        counts["told" if capture.warnings else "taken"] += 1
+    return counts
+
+
+def test_some_mutated_captures_are_taken_told_or_refused(whole):
+    assert sum(mutations(whole, range(FEW)).values()) == FEW
+
+
+@pytest.mark.slow
+def test_a_thousand_mutated_captures_are_taken_told_or_refused(whole):
+    counts = mutations(whole, range(FEW, FEW + ALL))
+    print(f"{ALL} mutations of a capture: {dict(counts)}")  # noqa: T201
+    assert sum(counts.values()) == ALL
+
+
+# Pickles.
+
+
+class Runs:
+    """A pickle that calls something when it is loaded."""
+
+    def __init__(self, call: Callable[..., object], *arguments: object) -> None:
+        self.way = (call, arguments)
+
+    def __reduce__(self) -> Any:
+        return self.way
+
+
+def bad_pickles(mark: Path) -> dict[str, bytes]:
+    """Pickles that call, bombs, and broken ones, by their names."""
+    good = pickle.dumps({"betas": np.zeros((2, 10)), "frame": [1, 2], "x": [1.0, "a", None]})
+    found = {
+        f"calls {call.__name__}, protocol {p}": pickle.dumps(Runs(call, *arguments), protocol=p)
+        for p in (0, 2, 4)
+        for call, arguments in (
+            (os.system, (f"touch {mark}",)), (open, (str(mark), "w")),
+            (eval, (f"open({str(mark)!r},'w')",)), (os.mkdir, (str(mark),)),
+            (getattr, ("x", "upper")), (__import__, ("os",)),
+        )
+    }  # fmt: skip
+    found |= {f"opcode {op!r}": b"\x80\x04" + op + b"\x00" * 12 + b"." for op in REFUSED}
+    nested: Any = [1.0]
+    for _ in range(40):
+        nested = [nested, nested]
+    pairs: Any = (1.0,)
+    for _ in range(40):
+        pairs = (pairs, pairs)
+    loop: list[Any] = [1]
+    loop.append(loop)
+    ring: dict[str, Any] = {}
+    ring["betas"] = ring
+    found |= {
+        "shared lists": pickle.dumps(nested), "shared tuples": pickle.dumps(pairs),
+        "shared lists in a field": pickle.dumps({"betas": nested, "pose": nested}),
+        "a list that holds itself": pickle.dumps(loop),
+        "a mapping that holds itself": pickle.dumps(ring),
+        "deep lists": b"\x80\x02" + b"](" * 5000 + b"e" * 5000 + b".",
+        "deep tuples": b"\x80\x02)" + b"\x85" * 50_000 + b".",
+        "a deep key": b"\x80\x04})" + b"\x85" * 20_000 + b"K\x01s.",
+        "huge bytes": b"\x80\x04\x8e" + struct.pack("<Q", 1 << 60) + b".",
+        "huge text": b"\x80\x04\x8d" + struct.pack("<Q", 1 << 62) + b".",
+        "a huge number": b"\x80\x02\x8b" + struct.pack("<i", 1 << 30) + b".",
+        "a huge frame": b"\x80\x04\x95" + struct.pack("<Q", 1 << 62) + b".",
+        "a far memo": b"\x80\x02j\xff\xff\xff\x7f.", "nothing": b"", "no end": b"\x80\x04]",
+        "only an end": b".", "text": b"hello\n", "an archive": b"PK\x03\x04" + b"\0" * 60,
+        "gzip of nothing": b"\x1f\x8b\x08" + b"\0" * 7, "an unknown protocol": b"\x80\x63N.",
+        "a huge array": pickle.dumps(np.zeros(3)).replace(b"K\x03\x85", b"J\xff\xff\xff\x7f\x85"),
+    }  # fmt: skip
+    for number in range(12):
+        rng = np.random.default_rng(number)
+        broken = bytearray(good)
+        where = int(rng.integers(2, len(good)))
+        if number % 2:
+            del broken[where:]
+        else:
+            broken[where : where + 3] = rng.bytes(3)
+        found[f"broken {number}"] = bytes(broken)
+    return found
+
+
+def readers(home: Path) -> Iterator[tuple[str, Path, Callable[[], object]]]:
+    """Each reader of people and keypoints, its source, and how it is read."""
+    for tool, make in (made.BODIES | made.KEYPOINTS).items():
+        folder = home / tool.replace(":", "_")
+        folder.mkdir()
+        source, known = make(folder), Known(camera=CAMERA)
+        read = keypoints_from if tool in made.KEYPOINTS else bodies_from
+        yield tool, folder, lambda r=read, t=tool, s=source, k=known: r(t.split(":")[0], s, k)
+
+
+def read_pickles(home: Path, every: int, monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """What became of bad pickles in place of each file of each reader's source."""
+    for name in made.COUNTS:
+        monkeypatch.setitem(BODY_MODELS, name, lambda _, name=name: Toy(name))
+    counts: Counter[str] = Counter()
+    mark = home / "mark"
+    bad = bad_pickles(mark)
+    assert len(bad) >= 50
+    for number, (tool, folder, read) in enumerate(readers(home)):
+        path = sorted(p for p in folder.rglob("*") if p.is_file())[0]
+        for name, content in list(bad.items())[number % every :: every]:
+            path.write_bytes(content)
+            try:
+                with limited(LONGEST):
+                    read()
+            except InputError as error:
+                said(error)
+                counts["refused"] += 1
+            except Exception as error:
+                raise AssertionError(f"{tool}: {name}: {error!r}") from error
+            else:
+                counts["taken"] += 1
+            assert not mark.exists(), (tool, name)
+    return counts
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # the toy's sums
+def test_some_bad_pickles_are_refused_by_every_reader(tmp_path, monkeypatch):
+    assert read_pickles(tmp_path, 12, monkeypatch)["refused"] > 50
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")
+def test_all_bad_pickles_are_refused_by_every_reader(tmp_path, monkeypatch):
+    counts = read_pickles(tmp_path, 1, monkeypatch)
+    print(f"bad pickles x readers: {dict(counts)}")  # noqa: T201
+    assert sum(counts.values()) > 50 * 15
+
+
+# Stages.
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_a_stage_that_was_damaged_anywhere_is_said_and_computed_anew(tmp_path, caplog, seed):
+    rng = np.random.default_rng(seed)
+    wanted = Run(tmp_path).stage(doubled, PLANE, Twice())
+    path = files(tmp_path)[seed % 2]
+    content = bytearray(path.read_bytes())
+    where, kind = int(rng.integers(len(content))), seed // 2 % 3
+    if kind == 0:
+        del content[where:]
+    elif kind == 1:
+        content[where] ^= 1 << int(rng.integers(8))
+    else:
+        content[where:where] = rng.bytes(5)
+    path.write_bytes(bytes(content))
+    with caplog.at_level(logging.WARNING):
+        run = Run(tmp_path)
+        found = run.stage(doubled, PLANE, Twice())
+    assert torch.equal(found.points, wanted.points)
+    assert found.ground == wanted.ground
+    assert run.stages[0].kept or "computed anew" in caplog.text  # unused bytes of an archive
+
+
+# Settings: every number at -1, 0 and the ends of its range, where these are taken.
+
+
+def ways_of(settings: Any, way: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Range]]:
+    """The settings with a range of a tree, below the dataclasses that are in it now."""
+    for name, hint in settings_of(type(settings)).items():
+        value = getattr(settings, name)
+        ranges = [one for one in getattr(hint, "__metadata__", ()) if isinstance(one, Range)]
+        if is_dataclass(value):
+            yield from ways_of(value, (*way, name))
+        elif ranges:
+            yield (*way, name), ranges[0]
+
+
+def with_value(settings: Any, way: tuple[str, ...], value: float) -> Any:
+    name, *rest = way
+    inner = with_value(getattr(settings, name), tuple(rest), value) if rest else value
+    return replace(settings, **{name: inner})
+
+
+def part_of(capture: Capture, objects: int, rows: int) -> Capture:
+    """The first objects, and some of the frames."""
+    bodies = capture.bodies
+    keep = torch.linspace(0, len(bodies.frame) - 1, rows).long()
+    some = {
+        f.name: getattr(bodies, f.name)[keep]
+        for f in fields(bodies)
+        if f.name in ("verts", "joints", "frame", "person")
+    }
+    pieces = capture.scene.objects[:objects]
+    return replace(
+        capture,
+        scene=replace(capture.scene, objects=pieces),
+        bodies=replace(bodies, pose=None, **some),
+    )
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_every_setting_at_its_ends_runs_to_the_end(small_room, tmp_path):
+    from test_pipeline import light
+
+    from mover.pipeline.reconstruct import reconstruct
+    from mover_bench.rooms.config import NoiseConfig
+    from mover_bench.rooms.noise import add_noise
+
+    capture = part_of(add_noise(small_room, NoiseConfig(), 1), 2, 24)
+    config, counts = light("robust", steps=2), Counter[str]()
+    for way, span in ways_of(config):
+        for value in {span.kind(v) for v in (-1, 0, span.low) if span.holds(span.kind(v))}:
+            try:
+                with limited(60):
+                    room = reconstruct(capture, with_value(config, way, value), Run(tmp_path))
+            except InputError as error:
+                said(error)
+                counts["refused"] += 1
+                continue
+            except Exception as error:
+                raise AssertionError(f"{'.'.join(way)} {value}: {error!r}") from error
+            for piece in room.scene.objects:
+                assert bool(piece.t_world_object.isfinite().all()), (way, value)
+            counts["ran"] += 1
+    print(f"settings at their ends: {dict(counts)}")  # noqa: T201
+    assert counts["ran"] > 100

@@ -1,0 +1,180 @@
+"""Each setting of each command and stage has a range, which is checked before work starts."""
+
+import ast
+import dataclasses
+import importlib
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mover
+from mover.app.cli import COMMANDS, run_command
+from mover.app.results import read_config
+from mover.core.errors import InputError
+from mover.core.settings import Range, check_settings, read_settings, settings_of
+from mover.pipeline.presets import PRESETS, Config
+
+SOURCES = Path(mover.__file__).parents[1]
+ENDS = ("Args", "Config", "Options", "Weights", "Address", "Stage", "Adam", "BatchedBFGS")
+BAD = (-1, 0, math.nan, math.inf, -math.inf, 1e30, 10**30, None, "a", True, [], {"a": 1})
+
+
+def classes() -> Iterator[type[Any]]:
+    """Every dataclass of settings in the sources of `mover`, and of its commands in mover_bench."""
+    for path in sorted(SOURCES.rglob("*.py")):
+        name = ".".join(path.relative_to(SOURCES).with_suffix("").parts).removesuffix(".__init__")
+        found = [n for n in ast.parse(path.read_text()).body if isinstance(n, ast.ClassDef)]
+        for node in found:
+            made_by_users = name.startswith("mover.") or node.name.endswith("Args")
+            if made_by_users and node.name.endswith(ENDS):
+                kind = getattr(importlib.import_module(name), node.name)
+                if dataclasses.is_dataclass(kind):
+                    yield kind
+
+
+def numbers(kind: type[Any]) -> Iterator[tuple[str, Range | None]]:
+    """The fields with numbers of a dataclass, and their ranges."""
+    for name, hint in settings_of(kind).items():
+        ranges = [one for one in walk(hint) if isinstance(one, Range)]
+        if ranges or {int, float} & set(walk(hint)):
+            yield name, ranges[0] if ranges else None
+
+
+def walk(hint: Any) -> Iterator[Any]:
+    yield hint
+    for one in (*getattr(hint, "__args__", ()), *getattr(hint, "__metadata__", ())):
+        yield from walk(one)
+
+
+def test_every_number_that_a_user_may_set_has_a_range():
+    found = {f"{kind.__name__}.{name}": span for kind in classes() for name, span in numbers(kind)}
+    assert len(found) > 190
+    assert {name for name, span in found.items() if span is None} == set()
+
+
+def paths_of(kind: type[Any], way: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Every setting of a tree of dataclasses."""
+    for name, hint in settings_of(kind).items():
+        inner = [
+            one for one in walk(hint) if isinstance(one, type) and dataclasses.is_dataclass(one)
+        ]
+        for one in inner:
+            yield from paths_of(one, (*way, name))
+        if not inner:
+            yield (*way, name)
+
+
+def tree_with(way: tuple[str, ...], value: Any) -> dict[str, Any]:
+    *outer, last = way
+    tree = {last: value}
+    for name in reversed(outer):
+        tree = {name: tree}
+    return tree
+
+
+@pytest.mark.parametrize("way", list(paths_of(Config)), ids=".".join)
+def test_a_setting_is_taken_or_refused_with_its_name(way):
+    for value in BAD:
+        tree = json.loads(json.dumps(tree_with(way, value)))
+        try:
+            config = read_settings(Config, tree, "config")
+        except InputError as error:
+            said = str(error)
+            assert said.startswith(f"config.{'.'.join(way)}"), said
+            assert "expected" in said
+        else:
+            assert finite(config) or way[-1] == "tilt_prior"
+
+
+def finite(value: Any) -> bool:
+    """Whether all numbers in settings are finite, but for priors that are not there."""
+    if dataclasses.is_dataclass(value):
+        return all(finite(getattr(value, f.name)) for f in dataclasses.fields(value))
+    if isinstance(value, tuple):
+        return all(finite(one) for one in value)
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_presets_are_within_their_own_ranges(name):
+    check_settings(PRESETS[name], name)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--gather.cells", "0"), "--gather.cells: has 0, expected a whole number from 8 to 512"),
+        (("--layout.num-hypotheses", "0"), "--layout.num_hypotheses: has 0"),
+        (("--image.size", "0"), "--image.size: has 0"),
+        (("--place.weights.depth", "nan"), "--place.weights.depth: has nan"),
+        (("--place.weights.depth", "-5"), "--place.weights.depth: has -5"),
+        (("--outer-iterations", "-3"), "--outer_iterations: has -3"),
+        (("--layout.yaws", "0"), "--layout.yaws: has 0"),
+        (("--layout.method.steps", "-1"), "--layout.method.steps: has -1"),
+        (("--prepare.cells", "100000"), "--prepare.cells: has 100000"),
+        (("--prepare.faces", "0"), "--prepare.faces: has 0"),
+        (("--gather.erode", "-1"), "--gather.erode: has -1"),
+        (("--select.window", "nan"), "--select.window: has nan"),
+        (("--format", "nope"), "--format: 'nope' is none of"),
+        (("--preset", "nope"), "--preset: 'nope' is none of"),
+    ],
+)
+def test_run_refuses_a_setting_before_it_reads_anything(flags, words, capsys):
+    assert run_command("run", ("no/such/capture", *flags)) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "flags", "words"),
+    [
+        ("render", ("x", "--width", "0"), "--width: has 0, expected a whole number from 16 to"),
+        ("view", ("x", "--port", "-1"), "--port: has -1"),
+        ("batch", ("x", "--gather.cells", "0"), "--gather.cells: has 0"),
+        ("batch", ("x", "--workers", "-1"), "--workers: has -1"),
+        ("batch", ("x", "--ray.cpus", "nan"), "--ray.cpus: has nan"),
+        ("video", ("x", "--out", "y", "--fov", "0"), "--fov: has 0"),
+        ("rooms", ("x", "y", "--fps", "0"), "--fps: has 0.0, expected a number from 0.001 to 120"),
+        ("demo", ("--seed", "-1"), "--seed: has -1"),
+    ],
+)
+def test_every_command_checks_its_numbers(command, flags, words, capsys):
+    assert run_command(command, flags) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("tree", "words"),
+    [
+        ({"config": {"place": 5}}, "config.place: has 5, expected settings"),
+        ({"config": {"place": {"yaws": "many"}}}, "place.yaws: has 'many', expected a whole"),
+        ({"config": {"place": {"yaw": 1}}}, "config.place.yaw: is no setting, expected one of"),
+        ({"config": {"nonsense": 1}}, "config.nonsense: is no setting"),
+        ({"config": {"layout": {"distances": [1, math.nan]}}}, r"layout.distances\[1\]: has"),
+        ({"config": {"layout": {"distances": 3}}}, "layout.distances: has 3, expected a list"),
+        ({"config": {"layout": {"method": {"steps": -1}}}}, "config.layout.method.steps: has -1"),
+        ({"config": {"layout": {"form": "new"}}}, "config.layout.form: has 'new', expected one of"),
+        ({"config": {"slide_to_floor": 1}}, "config.slide_to_floor: has 1, expected true or false"),
+        ({"config": 3}, "field 'config' has 3"),
+        ([], "has \\[\\], expected an object"),
+        ({}, "field 'config' has nothing"),
+    ],
+)
+def test_a_file_of_settings_is_refused_with_the_field(tree, words, tmp_path):
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps(tree))
+    with pytest.raises(InputError, match=words) as caught:
+        read_config(path)
+    assert "run.json" in str(caught.value)
+
+
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_help_shows_the_range_of_each_number(command, capsys):
+    with pytest.raises(SystemExit):
+        run_command(command, ("--help",))
+    shown = capsys.readouterr().out
+    assert " INT " not in shown
+    assert " FLOAT " not in shown
