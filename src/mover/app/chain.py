@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from mover.core.errors import InputError
-from mover.io.files.fields import write_json
 
 Say = Callable[[str], None]
 FIT = "fit"
@@ -57,6 +56,8 @@ class Steps:
         work()
         seconds = round(time.monotonic() - start, 1)
         self.log[name] = {"made_from": key, "seconds": seconds}
+        from mover.io.files.fields import write_json
+
         write_json({"steps": self.log}, self.folder / "steps.json")
         self.say(f"{number} {name}: {seconds:.0f} s")
 
