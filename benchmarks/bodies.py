@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from mover.bodies.smpl_model import pose_rows
+from mover.core.records import rows_of
 from mover.core.run import Run
 from mover.core.types import Bodies, Capture, Room, Scene
 from mover.evaluate.bodies import gather_twins, p_pje, p_v2v, pje, v2v
@@ -79,13 +79,7 @@ def first_bodies(room: Room, most: int) -> Room:
     bodies = room.bodies
     assert bodies is not None
     rows = torch.arange(min(most, len(bodies.frame)))
-    pose = None if bodies.pose is None else pose_rows(bodies.pose, rows)
-    joints = None if bodies.joints is None else bodies.joints[rows]
-    some = dataclasses.replace(
-        bodies, verts=bodies.verts[rows], joints=joints, frame=bodies.frame[rows],
-        person=bodies.person[rows], pose=pose,
-    )  # fmt: skip
-    return dataclasses.replace(room, bodies=some)
+    return dataclasses.replace(room, bodies=rows_of(bodies, rows))
 
 
 def scores(bodies: Bodies, truth: Bodies) -> list[float]:

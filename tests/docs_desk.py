@@ -20,8 +20,8 @@ from tiny_models import tiny_mask2former, tiny_sam2, tiny_vitpose
 
 from mover.app.results import write_truth
 from mover.bodies import BodyModel
-from mover.bodies.corrected import rows_of
 from mover.bodies.smpl_files import load_smpl
+from mover.core.records import rows_of
 from mover.core.types import Bodies, BodyPose, Capture
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.camera_file import camera_to_json

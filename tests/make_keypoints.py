@@ -1,11 +1,14 @@
 """2D joints of people whose truth is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
-from mover.bodies.keypoints import LAYOUTS, has_keypoints, keypoints_of
+from mover.bodies.keypoints import LAYOUTS, keypoints_of, spots_of
 from mover.bodies.skeleton import BODY
-from mover.bodies.skinning import open_body, zero_pose
+from mover.bodies.skinning import SkinnedBody, open_body, zero_pose
+from mover.bodies.smpl_model import Model
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
 from mover.geometry.camera import project, tilted
 from mover.geometry.rotations import rot_y
@@ -64,7 +67,7 @@ def seen(bodies: Bodies, layout="openpose25", noise=0.0, missing=0.0, seed=0) ->
     pixels = project(points, CAMERA.K)
     pixels = pixels + torch.from_numpy(noise * rng.normal(size=pixels.shape)).float()
     there = torch.from_numpy(rng.uniform(size=pixels.shape[:2]) >= missing)
-    there = there & has_keypoints(open_body(), layout)
+    there = there & spots_of(open_body(), layout).there
     sure = there.float()
     return Keypoints(
         torch.where(there[..., None], pixels, torch.zeros_like(pixels)),
@@ -75,3 +78,11 @@ def seen(bodies: Bodies, layout="openpose25", noise=0.0, missing=0.0, seed=0) ->
 def leg_columns(layout="openpose25") -> list[int]:
     legs = ("knee", "ankle", "toe", "heel")
     return [k for k, n in enumerate(LAYOUTS[layout]) if any(part in n for part in legs)]
+
+
+def rest_pose(bodies: int, model: Model) -> BodyPose:
+    """So many people of the mean shape (ten numbers) in the zero pose, `transl` zero."""
+    if isinstance(model, SkinnedBody):
+        return zero_pose(bodies, model)
+    zero = zero_pose(bodies, model.skin)
+    return replace(zero, gender=model.gender, betas=zero.betas[:, :10].clone())

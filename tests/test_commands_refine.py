@@ -10,13 +10,13 @@ import torch
 from analytic import FACES, box_verts
 from figures import ARMS_DOWN, people, pose
 from little_room import camera
+from make_keypoints import rest_pose
 from make_smpl import make_model, write_npz
 from test_pipeline import light
 
 from mover.app import cli
 from mover.bodies.skinning import open_body
 from mover.bodies.smpl_files import load_smpl
-from mover.bodies.smpl_model import rest_pose
 from mover.core import records
 from mover.core.types import Bodies, Mesh, Scene, SceneObject
 from mover.io.capture.bodies_file import read_bodies, write_bodies

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 from figures import SEATED, pose, turned
+from make_keypoints import rest_pose
 from make_smpl import make_model, write_npz
 
-from mover.bodies.keypoints import LAYOUTS, has_keypoints, keypoints_of
+from mover.bodies.keypoints import LAYOUTS, keypoints_of, spots_of
 from mover.bodies.skinning import open_body, zero_pose
 from mover.bodies.smpl_files import load_smpl
-from mover.bodies.smpl_model import rest_pose
 from mover.geometry.mesh import vertex_normals
 
 BODIES = ("small", "full")
@@ -154,7 +154,7 @@ def test_what_a_model_does_not_have_is_nan_and_is_said():
     at = named(model, "wholebody133")
     missing = [n for n, p in at.items() if not p.isfinite().all()]
     assert missing == [f"face_{k:02d}" for k in range(68)]
-    has = has_keypoints(model, "wholebody133")
+    has = spots_of(model, "wholebody133").there
     assert has.sum() == 133 - 68
     with pytest.raises(ValueError, match=r"no layout 'mpii'.*coco17"):
         keypoints_of(model, torch.zeros(1, 5002, 3), torch.zeros(1, 55, 3), "mpii")
@@ -208,6 +208,6 @@ def test_points_of_the_synthetic_smplx_are_where_the_open_body_has_them(smplx_fi
 
 def test_only_the_contour_of_the_face_is_missing_of_smplx(smplx_file):
     model = load_smpl("smplx", place=smplx_file)
-    has = has_keypoints(model, "wholebody133")
+    has = spots_of(model, "wholebody133").there
     assert np.flatnonzero(~has.numpy()).tolist() == list(range(23, 40))
-    assert has_keypoints(model, "halpe26").all()
+    assert spots_of(model, "halpe26").there.all()

@@ -7,7 +7,7 @@ import pytest
 import torch
 from make_keypoints import as_bodies, seen, walker
 
-from mover.bodies.corrected import rows_of
+from mover.core.records import rows_of
 from mover.fitting.one_euro import OneEuroConfig, one_euro, smooth_bodies, smooth_keypoints
 from mover.stages.people.select_frames import SelectInputs, select_frames
 

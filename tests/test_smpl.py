@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from make_keypoints import rest_pose
 from make_smpl import make_model, write_npz, write_old_pickle
 
 from mover.bodies import BODY_MODELS, BodyModel, load_model
@@ -12,7 +13,7 @@ from mover.bodies.parts import members, parts_of
 from mover.bodies.skeleton import JOINTS, PARENTS
 from mover.bodies.skin import PARTS
 from mover.bodies.smpl_files import FOLDER, find_file, load_smpl
-from mover.bodies.smpl_model import FLAT, rest_pose
+from mover.bodies.smpl_model import FLAT
 from mover.core.errors import InputError
 from mover.core.records import map_tensors
 from mover.core.types import Bodies, BodyPose

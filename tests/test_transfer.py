@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import torch
 from figures import SEATED, pose
+from make_keypoints import rest_pose
 from make_smpl import make_model, write_npz
 from scipy import sparse
 
 from mover.bodies.skinning import open_body
 from mover.bodies.smpl_files import FOLDER, load_smpl
-from mover.bodies.smpl_model import FLAT, rest_pose
+from mover.bodies.smpl_model import FLAT
 from mover.bodies.transfer import TransferConfig, copy_pose, transfer
 from mover.bodies.transfer_matrix import find_matrix, read_matrix
 from mover.core.errors import InputError

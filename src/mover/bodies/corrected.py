@@ -9,8 +9,8 @@ from torch import Tensor
 
 from mover.bodies import BodyModel, load_model
 from mover.bodies.skeleton import BODY
-from mover.bodies.smpl_model import Rows, pose_rows, vertex_subset
-from mover.core.records import map_tensors, record
+from mover.bodies.smpl_model import vertex_subset
+from mover.core.records import map_tensors, record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera
 from mover.geometry.camera import to_world
 from mover.geometry.mesh import vertex_normals
@@ -118,7 +118,7 @@ def corrected(bodies: Bodies, by: Correction) -> Bodies:
     pose = _new_pose(bodies.pose, by)
     model = load_model(pose.model, pose.gender)
     with torch.no_grad():
-        parts = [model.posed(pose_rows(pose, r)) for r in torch.arange(len(by.shift)).split(CHUNK)]
+        parts = [model.posed(rows_of(pose, r)) for r in torch.arange(len(by.shift)).split(CHUNK)]
     verts, joints = (torch.cat([part[k] for part in parts]) for k in (0, 1))
     return dataclasses.replace(
         bodies, verts=verts.to(bodies.verts), joints=joints.to(bodies.verts),
@@ -160,16 +160,6 @@ def spread(verts: Float[Tensor, "verts 3"], count: int) -> Int[Tensor, " picked"
         nearest = torch.minimum(nearest, apart)
         chosen[k] = nearest.argmax()
     return chosen.sort().values
-
-
-def rows_of(bodies: Bodies, rows: Rows) -> Bodies:
-    """Some rows of the bodies."""
-    return dataclasses.replace(
-        bodies, verts=bodies.verts[rows],
-        joints=None if bodies.joints is None else bodies.joints[rows],
-        frame=bodies.frame[rows], person=bodies.person[rows],
-        pose=None if bodies.pose is None else pose_rows(bodies.pose, rows),
-    )  # fmt: skip
 
 
 def in_world(bodies: Bodies, camera: Camera) -> Bodies:

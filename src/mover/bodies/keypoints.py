@@ -200,15 +200,6 @@ def keypoints_of(
     return torch.where(there[:, None], inside, torch.nan)
 
 
-def has_keypoints(model: BodyModel, layout: str) -> Bool[Tensor, " keypoints"]:
-    """Which keypoints of a layout the model has.
-
-    Raises:
-        ValueError: If there is no such layout.
-    """
-    return spots_of(model, layout).there
-
-
 @lru_cache(maxsize=16)
 def spots_of(model: BodyModel, layout: str) -> Spots:
     """Where the keypoints of a layout are on this model.

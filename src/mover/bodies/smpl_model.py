@@ -10,12 +10,12 @@ The mathematics is written from the papers; no file of these models is shipped.
 import dataclasses
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.bodies.skinning import SkinnedBody, angles_of, shaped, skinned, zero_pose
+from mover.bodies.skinning import SkinnedBody, angles_of, shaped, skinned
 from mover.core.errors import InputError
-from mover.core.records import record
+from mover.core.records import record, rows_of
 from mover.core.types import BodyPose
 from mover.geometry.rotations import axis_angle
 
@@ -147,14 +147,6 @@ def skin_of_model(model: object) -> SkinnedBody | None:
             return None
 
 
-def rest_pose(bodies: int, model: Model) -> BodyPose:
-    """So many people of the mean shape (ten numbers) in the zero pose, `transl` zero."""
-    if isinstance(model, SkinnedBody):
-        return zero_pose(bodies, model)
-    zero = zero_pose(bodies, model.skin)
-    return dataclasses.replace(zero, gender=model.gender, betas=zero.betas[:, :10].clone())
-
-
 def vertex_subset(model: object, index: Int[Tensor, " picked"]) -> Model:
     """The model with these vertices only, and without faces; its joints and poses are the same.
 
@@ -163,33 +155,12 @@ def vertex_subset(model: object, index: Int[Tensor, " picked"]) -> Model:
     """
     match model:
         case SkinnedBody():
-            return _skin(model, index)
+            return dataclasses.replace(rows_of(model, index, "verts"), faces=model.faces[:0])
         case SmplBody():
-            return dataclasses.replace(
-                model, skin=_skin(model.skin, index), pose_dirs=model.pose_dirs[:, index],
-                expression_dirs=model.expression_dirs[index], face=None,
-            )  # fmt: skip
+            some = rows_of(model, index, "verts")
+            skin = dataclasses.replace(some.skin, faces=model.faces[:0])
+            return dataclasses.replace(some, skin=skin, face=None)
         case _:
             raise ValueError(
                 f"vertex_subset: {type(model).__name__} is none of the skinned body models"
             )
-
-
-def _skin(model: SkinnedBody, index: Int[Tensor, " picked"]) -> SkinnedBody:
-    return dataclasses.replace(
-        model, faces=model.faces[:0], verts=model.verts[index], weights=model.weights[index],
-        shape_dirs=model.shape_dirs[index],
-    )  # fmt: skip
-
-
-Rows = Int[Tensor, " rows"] | Bool[Tensor, " rows"]
-"""Numbers of rows, or which are kept."""
-
-
-def pose_rows(pose: BodyPose, rows: Rows) -> BodyPose:
-    """Some rows of parameters."""
-    return dataclasses.replace(
-        pose, betas=pose.betas[rows], global_orient=pose.global_orient[rows],
-        body_pose=pose.body_pose[rows], transl=pose.transl[rows],
-        extra={name: value[rows] for name, value in pose.extra.items()},
-    )  # fmt: skip

@@ -8,6 +8,7 @@ import typing
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any, TypeVar, dataclass_transform
@@ -60,6 +61,38 @@ def _map(fn: Callable[[Tensor], Tensor], value: Any) -> Any:  # noqa: ANN401
 def to_device(value: T, device: torch.device | str) -> T:
     """Return a copy of `value` on `device`."""
     return map_tensors(lambda x: x.to(device), value)
+
+
+def rows_of(value: T, rows: Tensor, *axes: str) -> T:
+    """Some rows of a record: of its tensors with an axis of such a name, and of its dicts.
+
+    Args:
+        value: The record; other fields stay as they are.
+        rows: Numbers of rows, or which are kept.
+        axes: Names in the annotations, by default `bodies` and `rows`.
+    """
+    index = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(typing.cast(Any, value)):
+        part, axis = getattr(value, field.name), axis_of(field.type, axes or ("bodies", "rows"))
+        if isinstance(part, Tensor) and axis is not None:
+            found[field.name] = part.index_select(axis, index)
+        elif isinstance(part, dict):
+            found[field.name] = {name: one[index] for name, one in part.items()}
+        elif dataclasses.is_dataclass(part):
+            found[field.name] = rows_of(part, index, *axes)
+    return dataclasses.replace(typing.cast(Any, value), **found)
+
+
+@cache
+def axis_of(kind: Any, axes: tuple[str, ...]) -> int | None:  # noqa: ANN401
+    """The axis of one of these names in a tensor's annotation, from the end, if there is one."""
+    for one in (kind, *typing.get_args(kind)):
+        names = getattr(one, "dim_str", "").split()
+        for place, name in enumerate(names):
+            if name in axes:
+                return place - len(names)
+    return None
 
 
 def save(value: Any, path: Path) -> None:  # noqa: ANN401

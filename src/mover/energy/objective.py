@@ -5,9 +5,9 @@ is a field of `ImageCues` or `HumanCues`, indexed by its axis `objects`.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import cache, cached_property
-from typing import Any, TypeVar, cast, get_args
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mover.core.devices import constant
 from mover.core.observe import Energy, PerItem
-from mover.core.records import record
+from mover.core.records import record, rows_of
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.minimize import Term, active_weights, sum_terms, there
@@ -302,25 +302,11 @@ def of_objects(evidence: E, index: Rows, count: int) -> E:
     """
     if isinstance(evidence, ContactPoints):
         return cast(E, some_touches(evidence, index, count))
-    found: dict[str, Any] = {}
-    for field in fields(cast(Any, evidence)):
-        value, axis = getattr(evidence, field.name), _axis_of_objects(field.type)
-        if isinstance(value, Tensor) and axis is not None:
-            found[field.name] = value.index_select(axis, index)
-        elif is_dataclass(value):
-            found[field.name] = of_objects(value, index, count)
-    return replace(cast(Any, evidence), **found)
-
-
-@cache
-def _axis_of_objects(kind: Any) -> int | None:  # noqa: ANN401
-    """The axis of a tensor that counts the objects, by its annotation; None: none does."""
-    for one in (kind, *get_args(kind)):
-        names = getattr(one, "dim_str", "").split()
-        for axis, name in enumerate(names):
-            if name in ("objects", "items"):
-                return axis - len(names)  # from the end: starts lead
-    return None
+    if isinstance(evidence, HumanCues) and evidence.touches is not None:
+        touches = some_touches(evidence.touches, index, count)
+        rest = rows_of(replace(evidence, touches=None), index, "objects", "items")
+        return cast(E, replace(rest, touches=touches))
+    return rows_of(evidence, index, "objects", "items")
 
 
 def some_objects(objects: Objects, rows: Rows) -> Objects:

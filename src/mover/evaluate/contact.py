@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.core.records import fingerprint, record
+from mover.core.records import fingerprint, record, rows_of
 from mover.core.types import Bodies, Mesh, SceneObject
 from mover.evaluate.bodies import shared_rows
 from mover.evaluate.scene import Metric
@@ -100,7 +100,7 @@ def gather_truth(
     rows = shared_rows(truth, judged)[0]
     if len(rows) == 0 or truth.verts.shape[1] != judged.verts.shape[1]:
         return None
-    bodies = _take(truth, rows[evenly(len(rows), count)])
+    bodies = rows_of(replace(truth, pose=None), rows[evenly(len(rows), count)])
     return TrueTouch(bodies, nearness(bodies.verts, furniture, reach))
 
 
@@ -157,12 +157,3 @@ def evenly(rows: int, count: int) -> Int[Tensor, " picked"]:
     if rows <= count:
         return torch.arange(rows)
     return torch.linspace(0, rows - 1, count, dtype=torch.float64).round().long()
-
-
-def _take(bodies: Bodies, rows: Int[Tensor, " rows"]) -> Bodies:
-    """Some rows of people without parameters."""
-    joints = bodies.joints
-    return replace(
-        bodies, verts=bodies.verts[rows], joints=None if joints is None else joints[rows],
-        frame=bodies.frame[rows], person=bodies.person[rows], pose=None,
-    )  # fmt: skip

@@ -10,9 +10,9 @@ from torch import Tensor
 from mover.bodies import BodyModel
 from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skinning import shaped, widths_of
-from mover.bodies.smpl_model import FLAT, Model, SmplBody, pose_rows, skin_of_model
+from mover.bodies.smpl_model import FLAT, Model, SmplBody, skin_of_model
 from mover.core.observe import Energy, Observer, Step, silent
-from mover.core.records import record
+from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
 from mover.fitting.config import FitConfig
 from mover.fitting.energy import Seen, Weighed, body_energy
@@ -24,7 +24,6 @@ from mover.fitting.tracks import (
     Window,
     at_stage,
     rows_at,
-    rows_of,
     seen_at_all,
     seen_of,
     usable_rows,
@@ -238,8 +237,7 @@ def bodies_of(pose: BodyPose, model: BodyModel, keypoints: Keypoints) -> Bodies:
     """Meshes and joints, in the camera frame."""
     with torch.no_grad():
         parts = [
-            model.posed(pose_rows(pose, rows))
-            for rows in torch.arange(len(pose.transl)).split(CHUNK)
+            model.posed(rows_of(pose, rows)) for rows in torch.arange(len(pose.transl)).split(CHUNK)
         ]
     return Bodies(
         verts=torch.cat([verts for verts, _ in parts]),

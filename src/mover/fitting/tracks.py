@@ -183,14 +183,6 @@ def usable_rows(
     return rows, (text,) if left else ()
 
 
-def rows_of(keypoints: Keypoints, rows: Int[Tensor, " some"]) -> Keypoints:
-    """Some rows."""
-    return dataclasses.replace(
-        keypoints, points=keypoints.points[rows], confidence=keypoints.confidence[rows],
-        frame=keypoints.frame[rows], person=keypoints.person[rows],
-    )  # fmt: skip
-
-
 def seen_at_all(keypoints: Keypoints, config: FitConfig) -> Bool[Tensor, " layout"]:
     """Keypoints that some row sees and some stage looks at."""
     stages = config.stages

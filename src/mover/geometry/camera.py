@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.devices import constant
-from mover.geometry.rotations import rot_x, rot_y, rot_z
+from mover.geometry.rotations import rot_x, rot_z
 
 NEAR = 0.05  # [m], nothing nearer than this is drawn
 
@@ -64,9 +64,3 @@ def heading(R_cam_world: Float[Tensor, "3 3"]) -> float:
     """Angle `a` [rad]: x_new = R_y(a) @ x_world turns the world so that the camera has none."""
     x, _, z = R_cam_world[2].tolist()
     return math.atan2(x, -z)
-
-
-def without_heading(R_cam_world: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """R_cam_new of the world turned by `heading`."""
-    turn = rot_y(R_cam_world.new_tensor(heading(R_cam_world)))
-    return R_cam_world @ turn.mT

@@ -4,9 +4,8 @@ A launch on the CPU is serial but leaves Python's lock, so bodies are measured i
 with a volume of its own; the least of these is the result, whoever measured what.
 """
 
-from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from queue import SimpleQueue
 from typing import Any
@@ -120,34 +119,6 @@ class Scratch:
     stacks: int = 0
 
 
-def _in_a_ring(every: list[Scratch]) -> "SimpleQueue[Scratch]":
-    """All that wait for a body; each may look into the next one's field."""
-    idle: SimpleQueue[Scratch] = SimpleQueue()
-    for scratch, other in zip(every, every[1:] + every[:1], strict=True):
-        scratch.work.other = other.work.field
-        idle.put(scratch)
-    return idle
-
-
-def _in_threads(
-    add: Callable[[int], None],
-    bodies: Iterable[int],
-    count: int,
-    observe: Callable[[int, int], None] | None,
-) -> None:
-    """Add all bodies; the first error ends the others."""
-    with ThreadPoolExecutor(count) as pool:
-        jobs = [pool.submit(add, body) for body in bodies]
-        try:
-            for done, job in enumerate(as_completed(jobs), 1):
-                job.result()
-                if observe is not None:
-                    observe(done, len(jobs))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
 def union_bodies(
     verts: Float[Tensor, "bodies verts 3"],
     faces: Int[Tensor, "faces 3"],
@@ -175,13 +146,22 @@ def union_bodies(
     tools = _tools(verts.detach().float().contiguous(), faces, grid)
     count = max(1, min(workers, len(verts))) if tools.device == "cpu" else 1
     every = [_scratch(tools) for _ in range(count)]
-    idle = _in_a_ring(every)
+    idle: SimpleQueue[Scratch] = SimpleQueue()
+    for scratch, other in zip(every, every[1:] + every[:1], strict=True):
+        scratch.work.other = other.work.field  # each may look into the next one's field
+        idle.put(scratch)
 
     def add(body: int) -> None:
-        with _borrowed(idle) as scratch:
+        scratch = idle.get()
+        try:
             add_body(tools, scratch, body)
+        finally:
+            idle.put(scratch)
 
-    _in_threads(add, _spread(len(verts)), count, observe)
+    with ThreadPoolExecutor(count) as pool:
+        for done, _ in enumerate(pool.map(add, _spread(len(verts))), 1):
+            if observe is not None:
+                observe(done, len(verts))
     values = every[0].field
     for scratch in every[1:]:
         torch.minimum(values, scratch.field, out=values)
@@ -193,15 +173,6 @@ def _spread(count: int) -> list[int]:
     return [body for first in (0, 8, 4, 12, 2, 10, 6, 14) for body in range(first, count, 16)] + [
         *range(1, count, 2)
     ]
-
-
-@contextmanager
-def _borrowed(idle: SimpleQueue[Scratch]) -> Generator[Scratch]:
-    scratch = idle.get()
-    try:
-        yield scratch
-    finally:
-        idle.put(scratch)
 
 
 def _tools(verts: Tensor, faces: Tensor, grid: Volume) -> Tools:

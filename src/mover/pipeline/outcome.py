@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 from jaxtyping import Bool
 from torch import Tensor
 
-from mover.bodies.corrected import in_world, rows_of
+from mover.bodies.corrected import in_world
 from mover.bodies.parts import Parts
 from mover.core.explanation import Explanation
+from mover.core.records import rows_of
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, Capture, Evidence, Layout, Room, Scene
 from mover.energy.terms.feet import FootContacts

@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mover.bodies.corrected import in_world, rows_of
+from mover.bodies.corrected import in_world
 from mover.bodies.parts import parts_of
+from mover.core.records import rows_of
 from mover.core.run import Run as Run
 from mover.core.settings import check_settings
 from mover.core.types import Camera, Capture, Layout, Room

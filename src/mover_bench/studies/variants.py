@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from mover.bodies.corrected import rows_of
+from mover.core.records import rows_of
 from mover.core.types import Bodies, Capture, Masks, People
 from mover.pipeline.presets import PRESETS, Config, with_sizes
 from mover.stages.config import AlignConfig, AssignConfig, SpreadConfig

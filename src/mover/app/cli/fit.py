@@ -122,7 +122,7 @@ def _keypoints(args: FitArgs) -> Any:  # noqa: ANN401
 
 def _without_outliers(bodies: Any) -> Any:  # noqa: ANN401
     """The rows that the frame filter keeps."""
-    from mover.bodies.corrected import rows_of
+    from mover.core.records import rows_of
     from mover.stages.people.select_frames import SelectInputs, select_frames
 
     keep = select_frames(SelectInputs(bodies)).keep

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mover.bodies import BodyModel, load_model
 from mover.core.errors import InputError
+from mover.core.records import rows_of
 from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle
 from mover.io.files.fields import At, array, choice, get, maybe, reason, refuse
@@ -101,7 +102,7 @@ def reproduces(pose: BodyPose, verts: Float[Tensor, "bodies verts 3"], at: At) -
         model = load_model(pose.model, pose.gender)
         count = min(LOOKED_AT, len(verts))
         index = torch.linspace(0, len(verts) - 1, count).round().long()
-        found, _ = run_model(model, chosen_pose(pose, index))
+        found, _ = run_model(model, rows_of(pose, index))
     except (InputError, ValueError, RuntimeError, KeyError, OSError) as error:
         return f"the parameters of '{pose.model}' cannot be used ({reason(error)})"
     if found.shape[1] != verts.shape[1]:
@@ -136,21 +137,13 @@ def pose_to_arrays(pose: BodyPose) -> dict[str, NDArray[Any]]:
 # Parameters of bodies: posed, and moved as rigid bodies, whose root turns about the pelvis.
 
 
-def chosen_pose(pose: BodyPose, index: Int[Tensor, " rows"]) -> BodyPose:
-    """Some rows of parameters."""
-    extra = {name: value[index] for name, value in pose.extra.items()}
-    return dataclasses.replace(
-        pose, extra=extra, **{name: getattr(pose, name)[index] for name in NEEDED}
-    )
-
-
 def run_model(
     model: BodyModel, pose: BodyPose
 ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
     """Vertices and joints, some rows at a time to bound the memory [m]."""
     with torch.no_grad():
         parts = [
-            model.posed(chosen_pose(pose, index))
+            model.posed(rows_of(pose, index))
             for index in torch.arange(len(pose.transl)).split(CHUNK)
         ]
     return torch.cat([verts for verts, _ in parts]), torch.cat([joints for _, joints in parts])

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mover.bodies import load_model
 from mover.bodies.skinning import SkinnedBody
-from mover.core.records import map_tensors, record
+from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle
 from mover.io.export.finished import Finished
@@ -138,10 +138,3 @@ def misses(motion: Motion, model: SkinnedBody, bodies: Bodies) -> float:
         sized = root + motion.size[rows, None, None] * (verts - root)
         worst = max(worst, float((sized - bodies.verts[rows]).norm(dim=-1).max()))
     return worst
-
-
-def rows_of(pose: BodyPose, rows: Tensor) -> BodyPose:
-    """The parameters of some rows."""
-    names = ("betas", "global_orient", "body_pose", "transl", "extra")
-    chosen = map_tensors(lambda x: x[rows], {name: getattr(pose, name) for name in names})
-    return dataclasses.replace(pose, **chosen)

@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.records import record
+from mover.core.records import record, rows_of
 from mover.core.types import BodyPose, Camera
-from mover.io.capture.pose_file import chosen_pose, moved
+from mover.io.capture.pose_file import moved
 from mover.io.people.values import Numbers, tensor
 
 
@@ -144,7 +144,7 @@ def chosen(found: Found, index: Int[Tensor, " rows"]) -> Found:
     """Some rows."""
     values = {name: getattr(found, name) for name in _TENSORS}
     picked = {name: None if v is None else v[index] for name, v in values.items()}
-    pose = None if found.pose is None else chosen_pose(found.pose, index)
+    pose = None if found.pose is None else rows_of(found.pose, index)
     return dataclasses.replace(found, **picked, pose=pose)
 
 

@@ -25,10 +25,9 @@ from mover.bodies.corrected import (
 from mover.bodies.parts import parts_of
 from mover.bodies.posture import touching
 from mover.bodies.skin import PARTS
-from mover.bodies.smpl_model import pose_rows
 from mover.core.errors import InputError
 from mover.core.observe import Observer, silent
-from mover.core.records import map_tensors, record
+from mover.core.records import map_tensors, record, rows_of
 from mover.core.types import Bodies, Capture, Room
 from mover.energy.body_terms.contact import Matches, Skin, gather_matches
 from mover.energy.body_terms.order import Bounds
@@ -241,7 +240,7 @@ def _refine(
     cast: Cast, rows: Int[Tensor, " rows"], config: RefineBodiesConfig, observe: Observer
 ) -> tuple[Correction, Float[Tensor, " rows"]]:
     """Some rows, in rounds: first moved as a whole, then with their pose."""
-    bodies = _take(cast.bodies, rows)
+    bodies = rows_of(cast.bodies, rows)
     puppet = puppet_of(bodies, cast.picked.index)
     stiff = replace(puppet, model=None, pose=None)
     by, known = no_correction(stiff), known_of(cast, bodies, rows)
@@ -266,15 +265,6 @@ def _begun(puppet: Puppet, by: Correction) -> Correction:
     if none.angles.shape == by.angles.shape:
         return by
     return replace(none, shift=by.shift, turn=by.turn)
-
-
-def _take(bodies: Bodies, rows: Int[Tensor, " rows"]) -> Bodies:
-    pose = None if bodies.pose is None else pose_rows(bodies.pose, rows)
-    joints = None if bodies.joints is None else bodies.joints[rows]
-    return replace(
-        bodies, verts=bodies.verts[rows], joints=joints, frame=bodies.frame[rows],
-        person=bodies.person[rows], pose=pose,
-    )  # fmt: skip
 
 
 def _put(
