@@ -19,17 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from mover.geometry.kernels.start import kernels, launch, name_of, started
 from mover.geometry.raster import draw
-from mover.geometry.raster.records import (
-    BORDER,
-    Asked,
-    Crops,
-    Depths,
-    Gradients,
-    Items,
-    Layers,
-    Maps,
-    Topology,
-)
+from mover.geometry.raster.records import Crops, Depths, Layers, Maps, Topology
 
 __all__ = [
     "Crops",
@@ -92,7 +82,7 @@ def depths(
     """
     if reference := _reference_of(verts_cam):
         return reference.depths(verts_cam, shape, views)
-    return _depths(_maps(verts_cam, shape, views, Asked(False, True)), verts_cam)
+    return _depths(_maps(verts_cam, shape, views, (False, True)), verts_cam)
 
 
 def look(
@@ -104,7 +94,7 @@ def look(
     """`silhouettes` and, where asked for, `depths`: both from one pass over the triangles."""
     if reference := _reference_of(verts_cam):
         return reference.look(verts_cam, shape, views, depth)
-    maps = _maps(verts_cam, shape, views, Asked(True, depth))
+    maps = _maps(verts_cam, shape, views, (True, depth))
     return maps.image.to(verts_cam), _depths(maps, verts_cam) if depth else None
 
 
@@ -126,7 +116,7 @@ def layers(
     front = points.new_zeros(items, views.height, views.width)
     leave = torch.full_like(front, -0.0)  # whose inverse is what stands for no exit
     if front.numel() * n_verts * len(faces) > 0:
-        window = wp.from_torch(_windows(views.K.to(points), 0), dtype=wp.vec4)
+        window = wp.from_torch(draw.windows(views.K.to(points), 0), dtype=wp.vec4)
         screen = wp.from_torch(torch.empty_like(points), dtype=wp.vec3)
         table = wp.from_torch(faces.to(points.device).long().contiguous(), dtype=wp.vec3l)
         maps = [wp.from_torch(front), wp.from_torch(leave)]
@@ -156,10 +146,8 @@ def first_hit(
     depth = torch.full(size, torch.inf, device=verts_cam.device)
     face = torch.full(size, -1, dtype=torch.int32, device=verts_cam.device)
     if len(verts_cam):
-        shape = Topology(faces[None], faces.new_zeros(1, 0, 4))
-        draw.first_hit(
-            items_of(verts_cam.float()[None], shape, Crops(K[None], *size), border=0), depth, face
-        )
+        shape, views = Topology(faces[None], faces.new_zeros(1, 0, 4)), Crops(K[None], *size)
+        draw.first_hit(verts_cam.float()[None], shape, views, depth, face)
     return depth.to(verts_cam), face.long()
 
 
@@ -167,8 +155,15 @@ def _depths(maps: Maps, like: Tensor) -> Depths:
     return Depths(maps.nearest.to(like), maps.farthest.to(like), maps.covered)
 
 
-def _maps(verts_cam: Tensor, shape: Topology, views: Crops, asked: Asked) -> Maps:
-    """Starts x items as one list, cut where it would be too long to count."""
+def _maps(verts_cam: Tensor, shape: Topology, views: Crops, asked: tuple[bool, bool]) -> Maps:
+    """Silhouettes and depths of starts x items, one list that is cut where it is too long to count.
+
+    Args:
+        verts_cam: Vertices in camera axes [m].
+        shape: Their triangles.
+        views: The windows.
+        asked: Whether silhouettes, and whether depths are asked for.
+    """
     *lead, n_verts, _ = verts_cam.shape
     size = (*lead, views.height, views.width)
     flat = verts_cam.float().reshape(-1, n_verts, 3)
@@ -180,36 +175,20 @@ def _maps(verts_cam: Tensor, shape: Topology, views: Crops, asked: Asked) -> Map
     one = len(views.K)
     most = MOST // max(views.height * views.width, n_verts)
     parts = flat.split(max(one, most // one * one))
-    drawn = [_Look.apply(v, items_of(v, shape, views, BORDER), asked) for v in parts]
+    drawn = [_Look.apply(v, shape, views, *asked) for v in parts]
     maps = (m[0] if len(m) == 1 else torch.cat(m) for m in zip(*drawn, strict=True))
     return Maps(*(m.view(size) if m.numel() else m for m in maps))
-
-
-def items_of(verts: Tensor, shape: Topology, views: Crops, border: int) -> Items:
-    """The inputs as the kernels read them; `border` [px] lies around the windows."""
-    edges = shape.edges[:, : None if shape.faces.shape[1] else 0]
-    faces, edges = (t.to(verts.device, torch.int64).contiguous() for t in (shape.faces, edges))
-    windows = _windows(views.K.to(verts), border)
-    return Items(
-        verts.detach().contiguous(), windows, faces, edges, views.height, views.width, border
-    )
-
-
-def _windows(K: Tensor, border: int) -> Tensor:
-    """Focal lengths and principal points in windows with a border [px]."""
-    return torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2] + border, K[:, 1, 2] + border], -1)
 
 
 class _Look(torch.autograd.Function):
     """Maps from vertices, and the gradient of the vertices from those of the maps."""
 
     @staticmethod
-    def forward(ctx: Any, verts: Tensor, items: Items, asked: Asked) -> tuple[Tensor, ...]:  # noqa: ANN401
-        maps, ctx.trace = draw.look(items, asked)
-        ctx.items = items
+    def forward(ctx: Any, *given: Any) -> tuple[Tensor, ...]:  # noqa: ANN401
+        maps, ctx.trace = draw.look(*given)
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(maps.covered)
-        ctx.save_for_backward(verts, maps.nearest, maps.farthest, maps.covered)
+        ctx.save_for_backward(given[0], maps.nearest, maps.farthest, maps.covered)
         return maps.image, maps.nearest, maps.farthest, maps.covered
 
     @staticmethod
@@ -217,9 +196,11 @@ class _Look(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any,  # noqa: ANN401
         *grads: Tensor | None,
-    ) -> tuple[Tensor | None, None, None]:
+    ) -> tuple[Tensor | None, ...]:
         verts, nearest, farthest, covered = ctx.saved_tensors
-        given = Gradients(*(None if g is None else g.contiguous() for g in grads[:3]))
-        maps = Maps(nearest.new_zeros(0), nearest, farthest, covered)
-        pulled = draw.pull(ctx.items, maps, ctx.trace, given)
-        return pulled.view_as(verts), None, None
+        maps = Maps(verts.new_zeros(0), nearest, farthest, covered)
+        pulled = verts.new_zeros(verts.shape)
+        named: dict[str, Tensor | None] = dict.fromkeys(("image", "nearest", "farthest"))
+        named.update(zip(named, grads, strict=False))
+        draw.pull(maps, ctx.trace, named, pulled)
+        return pulled, None, None, None, None

@@ -24,69 +24,71 @@ from mover.geometry.kernels.start import (
     started,
     threads,
 )
-from mover.geometry.raster.records import Asked, Cuts, Gradients, Items, Maps, Trace
+from mover.geometry.raster.records import Crops, Cuts, Maps, Topology, Trace
 
+BORDER = 1  # [px], so that an outline just outside the window still moves the window's pixels
 NOWHERE, FRONT, BEHIND = 0, 1, 2  # where backs are drawn, as in `kernels.grid`
 GROUPS = 3  # of items for each thread of a CPU, so that none waits long for the last
 KEPT = 1 << 22  # pixels up to which a thread of a CPU keeps its working memory (72 bytes each)
 _own = local()
 
 
-def look(items: Items, asked: Asked) -> tuple[Maps, Trace]:
-    """Silhouettes and depths of all items."""
-    like, size = items.verts, (len(items.verts), items.height, items.width)
+def look(
+    verts: Tensor, shape: Topology, views: Crops, silhouette: bool, depth: bool
+) -> tuple[Maps, Trace]:
+    """Silhouettes and depths, where they are asked for, of items in camera axes."""
+    size = (len(verts), views.height, views.width)
     image, nearest, farthest = (
-        like.new_zeros(size if wanted else 0)
-        for wanted in (asked.silhouette, asked.depth, asked.depth)
+        verts.new_zeros(size if wanted else 0) for wanted in (silhouette, depth, depth)
     )
     maps = Maps(image, nearest, farthest, torch.zeros_like(nearest, dtype=torch.bool))
     near, far = (torch.empty_like(nearest, dtype=torch.int32) for _ in range(2))
-    cuts = _draw(items, _maps(maps, near, far), BEHIND if asked.depth else NOWHERE)
-    return maps, Trace(near, far, cuts)
+    scene = _scene(verts, shape, views, BORDER)
+    cuts = _draw(scene, _maps(maps, near, far), BEHIND if depth else NOWHERE, verts.device)
+    return maps, Trace(scene, near, far, cuts)
 
 
-def first_hit(items: Items, depth: Tensor, face: Tensor) -> None:
+def first_hit(verts: Tensor, shape: Topology, views: Crops, depth: Tensor, face: Tensor) -> None:
     """Write the nearest surface and its face where there is one."""
-    none = items.verts.new_zeros(0)
-    _draw(items, _maps(Maps(none, depth, none, none.bool()), face, face), FRONT)
+    none = verts.new_zeros(0)
+    packed = _maps(Maps(none, depth, none, none.bool()), face, face)
+    _draw(_scene(verts, shape, views, 0), packed, FRONT, verts.device)
 
 
-def pull(items: Items, maps: Maps, trace: Trace, grads: Gradients) -> Tensor:
-    """Gradients of the vertices of all items."""
-    verts, scene = torch.zeros_like(items.verts), _scene(items)
-    packed = _maps(maps, trace.near_face, trace.far_face)
-    known = {name: value.view(-1) for name, value in vars(grads).items() if value is not None}
-    known |= {f"has_{name}": name in known for name in vars(grads)}
+def pull(maps: Maps, trace: Trace, grads: dict[str, Tensor | None], verts: Tensor) -> None:
+    """Add the gradients of `image`, `nearest` and `farthest` to those of the vertices."""
+    where, packed = verts.device, _maps(maps, trace.near_face, trace.far_face)
+    known = {name: g.contiguous().view(-1) for name, g in grads.items() if g is not None}
+    known |= {f"has_{name}": name in known for name in grads}
 
     def pull_group(k: int) -> None:
         cuts, flat = trace.cuts[k], verts.view(-1, 3)
         given = _packed("Pull", cuts=cuts.table, targets=cuts.targets, verts=flat, **known)
-        if _in_loops(items):
+        if _in_loops(where):
             ends = cuts.group.start, cuts.group.stop
-            _launch(items, "items.pull_items", 1, scene, packed, given, *ends)
+            _launch(where, "items.pull_items", 1, trace.scene, packed, given, *ends)
             return
         if given.has_image:
-            _launch(items, "grid.pull_cuts", len(cuts.targets), scene, given)
+            _launch(where, "grid.pull_cuts", len(cuts.targets), trace.scene, given)
         if given.has_nearest or given.has_farthest:
-            _launch(items, "grid.pull_pixels", maps.nearest.numel(), scene, packed, given)
+            _launch(where, "grid.pull_pixels", maps.nearest.numel(), trace.scene, packed, given)
 
     share(pull_group, len(trace.cuts))
-    return verts
 
 
-def _draw(items: Items, maps: Any, backs: int) -> tuple[Cuts, ...]:  # noqa: ANN401
+def _draw(scene: Any, maps: Any, backs: int, where: torch.device) -> tuple[Cuts, ...]:  # noqa: ANN401
     """Fill the maps; the cuts of the outlines, by groups of items."""
-    scene, count = _scene(items), len(items.verts)
-    if not _in_loops(items):
-        return (_draw_at_once(items, scene, maps, backs),)
+    count = len(scene.verts) // scene.n_verts
+    if not _in_loops(where):
+        return (_draw_at_once(scene, maps, backs, where),)
     size = max(1, count // (GROUPS * threads()))
     groups = [range(k, min(k + size, count)) for k in range(0, count, size)]
     found: dict[int, Cuts] = {}
 
     def draw_group(k: int) -> None:
-        scratch = _own_scratch(items, len(groups[k]) if maps.silhouette else 0)
+        scratch = _own_scratch(scene, len(groups[k]) if maps.silhouette else 0)
         ends = groups[k].start, groups[k].stop
-        _launch(items, "items.look_items", 1, scene, scratch, maps, backs, *ends)
+        _launch(where, "items.look_items", 1, scene, scratch, maps, backs, *ends)
         number = int(started().to_torch(scratch.count)[1])
         table, targets = (x[:number].clone() for x in _listed(scratch))
         found[k] = Cuts(groups[k], table, targets)
@@ -95,48 +97,49 @@ def _draw(items: Items, maps: Any, backs: int) -> tuple[Cuts, ...]:  # noqa: ANN
     return tuple(found[k] for k in range(len(groups)))
 
 
-def _draw_at_once(items: Items, scene: Any, maps: Any, backs: int) -> Cuts:  # noqa: ANN401
+def _draw_at_once(scene: Any, maps: Any, backs: int, where: torch.device) -> Cuts:  # noqa: ANN401
     """The same with a thread for each vertex, triangle, edge and pixel."""
     from mover.geometry.kernels.grid import LANES
 
-    n, (_, verts, _) = len(items.verts), items.verts.shape
-    scratch = scratch_of(_room(items, n, n if maps.silhouette else 0), items.verts.device)
+    n = len(scene.verts) // scene.n_verts
+    scratch = scratch_of(_room(scene, n, n if maps.silhouette else 0), where)
     table, targets = _listed(scratch)
-    edges = (n, items.edges.shape[1])
-    _launch(items, "grid.place_verts", (n, verts), scene, scratch)
-    _launch(items, "grid.draw_faces", (n, items.faces.shape[1]), scene, scratch, backs)
-    _launch(items, "grid.draw_rows", LANES, scene, scratch, backs)
+    edges = (n, scene.n_edges)
+    _launch(where, "grid.place_verts", (n, scene.n_verts), scene, scratch)
+    _launch(where, "grid.draw_faces", (n, scene.n_faces), scene, scratch, backs)
+    _launch(where, "grid.draw_rows", LANES, scene, scratch, backs)
     if maps.silhouette:
-        _launch(items, "grid.enter_edges", edges, scene, scratch)
-    _launch(items, "grid.show_pixels", (n, scene.height, scene.width), scene, scratch, maps)
+        _launch(where, "grid.enter_edges", edges, scene, scratch)
+    _launch(where, "grid.show_pixels", (n, scene.height, scene.width), scene, scratch, maps)
     if maps.silhouette:
-        _launch(items, "grid.keep_edges", edges, scene, scratch, maps)
-        _launch(items, "grid.mark_cuts", len(targets), scratch, maps)
-        _launch(items, "grid.bound_cuts", len(targets), scratch, maps)
+        _launch(where, "grid.keep_edges", edges, scene, scratch, maps)
+        _launch(where, "grid.mark_cuts", len(targets), scratch, maps)
+        _launch(where, "grid.bound_cuts", len(targets), scratch, maps)
     return Cuts(range(n), table, targets)
 
 
-def _in_loops(items: Items) -> bool:
+def _in_loops(where: torch.device) -> bool:
     """Whether a thread draws whole items."""
-    return items.verts.device.type == "cpu"
+    return where.type == "cpu"
 
 
-def _own_scratch(items: Items, listed: int) -> Any:  # noqa: ANN401
-    """The working memory of this thread, which kernels leave clean, for one item at a time."""
-    room = _room(items, 1, listed)
+def _own_scratch(scene: Any, listed: int) -> Any:  # noqa: ANN401
+    """The working memory of this thread of a CPU, which kernels leave clean, for one item."""
+    room = _room(scene, 1, listed)
     if any(have < need for have, need in zip(getattr(_own, "room", [0]), room, strict=False)):
-        _own.room, _own.scratch = room, scratch_of(room, items.verts.device)
+        _own.room, _own.scratch = room, scratch_of(room, torch.device("cpu"))
     scratch = _own.scratch
-    if items.grid > KEPT:
+    if scene.height * scene.width > KEPT:
         vars(_own).clear()
     started().to_torch(scratch.count).zero_()
     return scratch
 
 
-def _room(items: Items, count: int, listed: int) -> list[int]:
+def _room(scene: Any, count: int, listed: int) -> list[int]:  # noqa: ANN401
     """What `scratch_of` asks for some items at a time, and the cuts of some one after the other."""
-    verts, faces, edges = (x.shape[1] for x in (items.verts, items.faces, items.edges))
-    return [*(count * n for n in (verts, faces, edges, items.grid)), 2 * listed * items.grid]
+    grid = scene.height * scene.width
+    one = scene.n_verts, scene.n_faces, scene.n_edges, grid
+    return [*(count * n for n in one), 2 * listed * grid]
 
 
 def _listed(scratch: Any) -> tuple[Tensor, Tensor]:  # noqa: ANN401
@@ -169,23 +172,30 @@ def _zeros(size: int, device: torch.device) -> Tensor:
     return torch.zeros(size, dtype=torch.int64, device=device)
 
 
-def _scene(items: Items) -> Any:  # noqa: ANN401
-    """All items as the kernels read them."""
+def _scene(verts: Tensor, shape: Topology, views: Crops, border: int) -> Any:  # noqa: ANN401
+    """The items as the kernels read them; `border` [px] lies around the windows."""
+    edges = shape.edges[:, : None if shape.faces.shape[1] else 0]
+    faces, edges = (t.to(verts.device, torch.int64).contiguous() for t in (shape.faces, edges))
     return _packed(
         "Scene",
-        verts=items.verts.view(-1, 3),
-        window=items.window,
-        faces=items.faces.view(-1, 3),
-        edges=items.edges.view(-1, 4),
-        views=len(items.window),
-        shapes=len(items.faces),
-        n_verts=items.verts.shape[1],
-        n_faces=items.faces.shape[1],
-        n_edges=items.edges.shape[1],
-        height=items.height + 2 * items.border,
-        width=items.width + 2 * items.border,
-        border=items.border,
+        verts=verts.detach().contiguous().view(-1, 3),
+        window=windows(views.K.to(verts), border),
+        faces=faces.view(-1, 3),
+        edges=edges.view(-1, 4),
+        views=len(views.K),
+        shapes=len(faces),
+        n_verts=verts.shape[1],
+        n_faces=faces.shape[1],
+        n_edges=edges.shape[1],
+        height=views.height + 2 * border,
+        width=views.width + 2 * border,
+        border=border,
     )
+
+
+def windows(K: Tensor, border: int) -> Tensor:
+    """Focal lengths and principal points in windows with a border [px]."""
+    return torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2] + border, K[:, 1, 2] + border], -1)
 
 
 def _maps(maps: Maps, near_face: Tensor, far_face: Tensor) -> Any:  # noqa: ANN401
@@ -204,7 +214,7 @@ def _packed(name: str, **fields: Any) -> Any:  # noqa: ANN401
     return filled(getattr(scene, name), **fields)
 
 
-def _launch(items: Items, name: str, dim: int | tuple[int, ...], *inputs: Any) -> None:  # noqa: ANN401
-    """Launch a kernel, by its module and name, where the items are."""
-    where, (module, kernel) = items.verts.device, name.split(".")
+def _launch(where: torch.device, name: str, dim: int | tuple[int, ...], *inputs: Any) -> None:  # noqa: ANN401
+    """Launch a kernel, by its module and name."""
+    module, kernel = name.split(".")
     launch(getattr(kernels(module, name_of(where)), kernel), dim, list(inputs), where)

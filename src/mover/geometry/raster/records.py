@@ -1,13 +1,12 @@
-"""What is drawn and what comes of it: windows, padded triangles, maps; and what drivers hold."""
+"""What is drawn and what comes of it: windows, padded triangles, maps, traces."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.records import record
-
-BORDER = 1  # [px], so that an outline just outside the window still moves the window's pixels
 
 
 @record
@@ -55,39 +54,6 @@ class Layers:
 
 
 @dataclass(frozen=True)
-class Items:
-    """Items on their grids; item i has topology i % shapes and window i % views."""
-
-    verts: Tensor
-    """Vertices in camera axes (items, verts, 3), contiguous, without gradient [m]."""
-    window: Tensor
-    """Focal lengths and principal points of the windows (views, 4), with the border [px]."""
-    faces: Tensor
-    """Triangles (shapes, faces, 3), int64, contiguous."""
-    edges: Tensor
-    """Two vertices and two faces (shapes, edges, 4), int64, contiguous."""
-    height: int
-    """Rows of a window, without the border [px]."""
-    width: int
-    """Columns of a window, without the border [px]."""
-    border: int
-    """Rows and columns of the grid around the window [px]."""
-
-    @property
-    def grid(self) -> int:
-        """Pixels of one grid."""
-        return (self.height + 2 * self.border) * (self.width + 2 * self.border)
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What is to be drawn."""
-
-    silhouette: bool
-    depth: bool
-
-
-@dataclass(frozen=True)
 class Maps:
     """What was drawn (items, h, w); empty where it was not asked for."""
 
@@ -113,17 +79,10 @@ class Cuts:
 class Trace:
     """What the gradients need to know of a drawing."""
 
+    scene: Any
+    """The items as the kernels read them: `kernels.scene.Scene`."""
     near_face: Tensor
     """Face that is seen first (items, h, w); unset where not covered."""
     far_face: Tensor
     """Face that is seen last (items, h, w); unset where not covered."""
     cuts: tuple[Cuts, ...]
-
-
-@dataclass(frozen=True)
-class Gradients:
-    """Gradients of the maps, contiguous; None where there is none."""
-
-    image: Tensor | None
-    nearest: Tensor | None
-    farthest: Tensor | None
