@@ -67,15 +67,10 @@ def _field(
 
 def _outside(free: np.ndarray) -> np.ndarray:
     """The free cells that can be reached from the grid's first corner in steps along the axes."""
-    index = np.arange(free.size).reshape(free.shape)
-    links: list[tuple[np.ndarray, np.ndarray]] = []
-    for axis in range(3):
-        here, there = np.moveaxis(index, axis, 0)[:-1], np.moveaxis(index, axis, 0)[1:]
-        both = np.moveaxis(free, axis, 0)[:-1] & np.moveaxis(free, axis, 0)[1:]
-        links.append((here[both], there[both]))
-    a, b = (np.concatenate(ends) for ends in zip(*links, strict=True))
-    region = labels(a, b, free.size).reshape(free.shape)
-    return region == region[0, 0, 0]
+    from scipy.ndimage import label
+
+    region = np.asarray(label(free)[0])
+    return free & (region == region[0, 0, 0])
 
 
 def _distances(

@@ -154,26 +154,16 @@ class Flat:
 def flat(w: Work, t: wp.vec3i) -> Flat:
     """See `Flat`; the sign is 0 where the triangle is seen edge-on."""
     r = Flat()
+    u = w.lines[t[1]] - w.lines[t[0]]
+    v = w.lines[t[2]] - w.lines[t[0]]
+    area = u[0] * v[1] - u[1] * v[0]
+    r.sign = wp.where(area < wp.int64(0), -1, wp.where(area > wp.int64(0), 1, 0))
     for k in range(3):
-        v = w.lines[t[k]]
-        r.x[k] = v[0]
-        r.z[k] = v[1]
-        r.y[k] = w.place[t[k]][1]
-    area = (r.x[1] - r.x[0]) * (r.z[2] - r.z[0]) - (r.z[1] - r.z[0]) * (r.x[2] - r.x[0])
-    r.sign = 1
-    if area == wp.int64(0):
-        r.sign = 0
-    if area < wp.int64(0):
-        r.sign = -1
-        x = r.x[1]
-        z = r.z[1]
-        y = r.y[1]
-        r.x[1] = r.x[2]
-        r.z[1] = r.z[2]
-        r.y[1] = r.y[2]
-        r.x[2] = x
-        r.z[2] = z
-        r.y[2] = y
+        corner = t[wp.where(r.sign < 0, (3 - k) % 3, k)]
+        line = w.lines[corner]
+        r.x[k] = line[0]
+        r.z[k] = line[1]
+        r.y[k] = w.place[corner][1]
     return r
 
 

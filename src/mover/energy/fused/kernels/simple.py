@@ -1,3 +1,4 @@
+# pyright: basic, reportInvalidTypeForm=false
 """The costs of boxes, sizes, distances and headings (robust form) and their gradients."""
 
 from typing import no_type_check
@@ -23,8 +24,6 @@ from mover.energy.fused.kernels.given import (
 from mover.geometry.camera import NEAR
 from mover.geometry.kernels.lookup import interpolate
 from mover.geometry.kernels.nearest import Query, nearest_of
-
-# pyright: basic, reportInvalidTypeForm=false
 
 
 @wp.func
@@ -110,9 +109,6 @@ def heading_cost(given: Given, p: Pose) -> tuple[float, Slope]:
 
 
 # The costs of contact and of collision (robust form) and their gradients.
-
-
-# pyright: basic, reportInvalidTypeForm=false
 
 
 CALM = wp.constant(wp.uint8(2))  # a brick without bodies
