@@ -51,47 +51,25 @@ SOLE_HEIGHT = 0.025
 
 
 def model_parts(model: SkinnedBody) -> Int[Tensor, " verts"]:
-    """Index of each vertex of `model` into `PARTS`, -1 for none."""
-    verts, joints = (x[0] for x in model.posed(zero_pose(1, model)))
-    dominant = tuple(model.joint_names[j] for j in model.weights.argmax(1).tolist())
-    place = dict(zip(model.joint_names, joints, strict=True))
-    return skin_parts(dominant, verts, vertex_normals(verts, model.faces), place)
-
-
-def skin_parts(
-    dominant: tuple[str, ...],
-    verts: Float[Tensor, "verts 3"],
-    normals: Float[Tensor, "verts 3"],
-    place: dict[str, Float[Tensor, "3"]],
-) -> Int[Tensor, " verts"]:
-    """Index of each vertex into `PARTS`, -1 for none.
-
-    Args:
-        dominant: Name of the joint with the largest weight at each vertex.
-        verts: Vertices in the zero pose (T-pose, +y up, +z front) [m].
-        normals: Outward unit normals there.
-        place: Places of the joints by name there [m].
-    """
-    part = torch.full((len(verts),), -1, dtype=torch.long, device=verts.device)
-    for name, inside in _patches(dominant, verts, normals, place).items():
+    """Index of each vertex of `model` into `PARTS`, -1 for none; of parts that overlap the first."""
+    part = torch.full((len(model.verts),), -1, dtype=torch.long, device=model.verts.device)
+    for name, inside in _patches(model).items():
         part[inside & (part < 0)] = PARTS.index(name)
     return part
 
 
-def _patches(
-    dominant: tuple[str, ...],
-    verts: Float[Tensor, "verts 3"],
-    normals: Float[Tensor, "verts 3"],
-    place: dict[str, Float[Tensor, "3"]],
-) -> dict[str, Bool[Tensor, " verts"]]:
-    """Where each part is; where two overlap the first counts."""
+def _patches(model: SkinnedBody) -> dict[str, Bool[Tensor, " verts"]]:
+    """Where each part is in the zero pose (T-pose, +y up, +z front)."""
+    verts, joints = (x[0] for x in model.posed(zero_pose(1, model)))
+    dominant = [model.joint_names[j] for j in model.weights.argmax(1).tolist()]
+    place = dict(zip(model.joint_names, joints, strict=True))
+    _, ny, nz = vertex_normals(verts, model.faces).unbind(-1)
 
     def of(*joints: str) -> Bool[Tensor, " verts"]:
         known = frozenset(joints)
         return torch.tensor([name in known for name in dominant], device=verts.device)
 
-    height, nx, ny, nz = verts[:, 1], *normals.unbind(-1)
-    del nx
+    height = verts[:, 1]
     low, stature = height.min(), height.max() - height.min()
     hip = (place["left_hip"][1] + place["right_hip"][1]) / 2
     thigh = hip - (place["left_knee"][1] + place["right_knee"][1]) / 2
