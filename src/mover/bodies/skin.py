@@ -51,7 +51,7 @@ SOLE_HEIGHT = 0.025
 
 
 def model_parts(model: SkinnedBody) -> Int[Tensor, " verts"]:
-    """Index of each vertex of `model` into `PARTS`, -1 for none; of parts that overlap the first."""
+    """Index of each vertex of `model` into `PARTS`, -1 for none; the first of several."""
     part = torch.full((len(model.verts),), -1, dtype=torch.long, device=model.verts.device)
     for name, inside in _patches(model).items():
         part[inside & (part < 0)] = PARTS.index(name)

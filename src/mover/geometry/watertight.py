@@ -7,6 +7,8 @@ thickness around the triangles, is a closed surface; its vertices then fall back
 up to a small rest, so that neither thickness nor box change and sheets keep two sides.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -69,7 +71,8 @@ def _outside(free: np.ndarray) -> np.ndarray:
     """The free cells that can be reached from the grid's first corner in steps along the axes."""
     from scipy.ndimage import label
 
-    region = np.asarray(label(free)[0])
+    found: Any = label(free)
+    region = np.asarray(found[0])
     return free & (region == region[0, 0, 0])
 
 
