@@ -15,6 +15,7 @@ from mover.core.types import Bodies, BodyPose, Camera
 from mover.geometry.camera import to_world
 from mover.geometry.mesh import vertex_normals
 from mover.geometry.rotations import axis_angle
+from mover.geometry.thinning import farthest_first
 
 LOOSE_POINTS = 16  # vertices that stand for the joints of a body without any
 CHUNK = 64  # bodies posed at once
@@ -151,15 +152,8 @@ def _new_pose(pose: BodyPose, by: Correction) -> BodyPose:
 
 
 def spread(verts: Float[Tensor, "verts 3"], count: int) -> Int[Tensor, " picked"]:
-    """Vertices that lie evenly over a mesh: each next one is the farthest from those before."""
-    count = min(count, len(verts))
-    chosen = torch.zeros(count, dtype=torch.long, device=verts.device)
-    nearest = torch.full_like(verts[:, 0], torch.inf)
-    for k in range(1, count):  # each choice depends on those before it
-        apart = (verts - verts[chosen[k - 1]]).square().sum(-1)
-        nearest = torch.minimum(nearest, apart)
-        chosen[k] = nearest.argmax()
-    return chosen.sort().values
+    """Vertices that lie evenly over a mesh."""
+    return farthest_first(verts, min(count, len(verts))).sort().values
 
 
 def in_world(bodies: Bodies, camera: Camera) -> Bodies:
