@@ -75,13 +75,12 @@ def show_pixel(maps: Maps, pixel: int, near: wp.uint64, far: wp.uint64) -> None:
 @no_type_check
 def pull_pixel(scene: Scene, maps: Maps, pull: Pull, pixel: int) -> None:
     """Add the gradients of both depths of a pixel to the vertices."""
-    if pull.has_nearest:
-        g = pull.nearest[pixel]
-        if g != 0.0 and maps.covered[pixel]:
+    if maps.covered[pixel]:
+        if pull.has_nearest:
+            g = pull.nearest[pixel]
             pull_depth(scene, pixel, maps.near_face[pixel], maps.nearest[pixel], g, pull.verts)
-    if pull.has_farthest:
-        g = pull.farthest[pixel]
-        if g != 0.0 and maps.covered[pixel]:
+        if pull.has_farthest:
+            g = pull.farthest[pixel]
             pull_depth(scene, pixel, maps.far_face[pixel], maps.farthest[pixel], g, pull.verts)
 
 
@@ -104,6 +103,8 @@ def pull_depth(
         gradient: Of that depth.
         grads: Gradients of the vertices of all items.
     """
+    if gradient == 0.0:
+        return
     item = item_of(scene, pixel)
     ray = ray_of(scene, pixel)
     corner = scene.faces[item % scene.shapes * scene.n_faces + face]
