@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.records import record
-from mover.geometry.kernels.start import kernels, launch, name_of, share, started, threads
+from mover.geometry.kernels.start import filled, kernels, launch, name_of, share, started, threads
 
 FAN = 8  # points of a leaf, leaves of a group
 
@@ -69,14 +69,13 @@ def packed(held: Clouds) -> Any:  # noqa: ANN401
     """`kernels.nearest.Cloud` of the points."""
     from mover.geometry.kernels.nearest import Cloud
 
-    wp, cloud = started(), Cloud()
-    cloud.points = wp.from_torch(held.points.float().contiguous(), dtype=wp.vec3)
-    cloud.index = wp.from_torch(held.index.contiguous())
-    for name, boxes in (("leaf", held.leaves), ("group", held.groups)):
-        for side, corner in enumerate(("low", "high")):
-            array = wp.from_torch(boxes[:, side].float().contiguous(), dtype=wp.vec3)
-            setattr(cloud, f"{name}_{corner}", array)
-    return cloud
+    boxes: dict[str, Tensor] = {}
+    for name, both in (("leaf", held.leaves), ("group", held.groups)):
+        for corner, box in zip(("low", "high"), both.float().unbind(1), strict=True):
+            boxes[f"{name}_{corner}"] = box.contiguous()
+    return filled(
+        Cloud, points=held.points.float().contiguous(), index=held.index.contiguous(), **boxes
+    )
 
 
 def nearest(

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mover.core.records import record
-from mover.geometry.kernels.start import kernels, launch, name_of, started
+from mover.geometry.kernels.start import filled, kernels, launch, name_of, started
 from mover.geometry.nearest import as_float64, as_int64, closest
 
 SHELL = 2.0  # [cells], up to where it is exact outside: more than a cell's diagonal
@@ -66,29 +66,26 @@ def sample(volume: Volume, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "
     return sample_torch(volume, points)
 
 
+def field_of(volume: Volume, busy: Tensor) -> Any:  # noqa: ANN401
+    """The volume as kernels read it: `kernels.lookup.Field`, with what is known of its bricks."""
+    from mover.geometry.kernels.lookup import Field
+
+    origin = started().vec3(*volume.corner)
+    return filled(Field, values=volume.values, busy=busy, origin=origin, cell=volume.cell)
+
+
 class _Lookup(torch.autograd.Function):
     """The lookup as a kernel: value and gradient in one pass, skipping empty space."""
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, volume: Volume) -> Tensor:  # noqa: ANN401
-        wp = started()
-        kernels("lookup", name_of(points.device))
-        from mover.geometry.kernels.lookup import Field, lookup
-
+        wp, lookup = started(), kernels("lookup", name_of(points.device)).lookup
         flat = points.detach().reshape(-1, 3).contiguous()
         found, slope = flat.new_empty(len(flat)), torch.empty_like(flat)
         if len(flat):
-            field = Field()
-            field.values = wp.from_torch(volume.values.detach())
-            field.busy = wp.from_torch(volume.busy)
-            field.origin = wp.vec3(*volume.corner)
-            field.cell = volume.cell
-            arrays = [
-                wp.from_torch(flat, dtype=wp.vec3),
-                wp.from_torch(found),
-                wp.from_torch(slope, dtype=wp.vec3),
-            ]
-            launch(lookup, len(flat), [field, *arrays], flat.device)
+            at, slopes = (wp.from_torch(x, dtype=wp.vec3) for x in (flat, slope))
+            field = field_of(volume, volume.busy)
+            launch(lookup, len(flat), [field, at, wp.from_torch(found), slopes], flat.device)
         ctx.save_for_backward(slope)
         return found.reshape(points.shape[:-1])
 

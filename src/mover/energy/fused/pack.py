@@ -15,7 +15,7 @@ from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.factors import factors
 from mover.geometry.kernels.start import array, started
 from mover.geometry.nearest_warp import packed
-from mover.geometry.volume import Volume
+from mover.geometry.volume import Volume, field_of
 
 BRICK = 8  # [cells], as in `Volume.busy`
 CALM = 2  # a brick without bodies, as in `kernels.simple`
@@ -173,17 +173,11 @@ def _people(humans: HumanCues, weights: SceneWeights, asked: Tensor, share: Tens
 
 
 def _field(volume: Volume) -> Any:  # noqa: ANN401
-    """`kernels.lookup.Field` in which bricks without bodies are told apart."""
-    from mover.geometry.kernels.lookup import Field
-
-    wp, field = started(), Field()
+    """The volume, with bricks without bodies told apart."""
     some = volume.values[::BRICK, ::BRICK, ::BRICK]
     x, y, z = volume.busy.shape
     calm = (volume.busy == 0) & (some[:x, :y, :z] >= 0)
-    field.values = wp.from_torch(volume.values.detach())
-    field.busy = wp.from_torch(torch.where(calm, CALM, 1).to(torch.uint8))
-    field.origin, field.cell = wp.vec3(*volume.origin.tolist()), volume.cell
-    return field
+    return field_of(volume, torch.where(calm, CALM, 1).to(torch.uint8))
 
 
 def _facts(objects: Objects, image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Tensor:
