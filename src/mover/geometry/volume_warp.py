@@ -7,6 +7,7 @@ with a volume of its own; the least of these is the result, whoever measured wha
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
@@ -119,6 +120,15 @@ class Scratch:
     stacks: int = 0
 
 
+def _in_a_ring(every: list[Scratch]) -> "SimpleQueue[Scratch]":
+    """All that wait for a body; each may look into the next one's field."""
+    idle: SimpleQueue[Scratch] = SimpleQueue()
+    for scratch, other in zip(every, every[1:] + every[:1], strict=True):
+        scratch.work.other = other.work.field
+        idle.put(scratch)
+    return idle
+
+
 def union_bodies(
     verts: Float[Tensor, "bodies verts 3"],
     faces: Int[Tensor, "faces 3"],
@@ -146,18 +156,8 @@ def union_bodies(
     tools = _tools(verts.detach().float().contiguous(), faces, grid)
     count = max(1, min(workers, len(verts))) if tools.device == "cpu" else 1
     every = [_scratch(tools) for _ in range(count)]
-    idle: SimpleQueue[Scratch] = SimpleQueue()
-    for scratch, other in zip(every, every[1:] + every[:1], strict=True):
-        scratch.work.other = other.work.field  # each may look into the next one's field
-        idle.put(scratch)
-
-    def add(body: int) -> None:
-        scratch = idle.get()
-        try:
-            add_body(tools, scratch, body)
-        finally:
-            idle.put(scratch)
-
+    idle = _in_a_ring(every)
+    add = partial(_add, tools, idle)
     with ThreadPoolExecutor(count) as pool:
         for done, _ in enumerate(pool.map(add, _spread(len(verts))), 1):
             if observe is not None:
@@ -166,6 +166,14 @@ def union_bodies(
     for scratch in every[1:]:
         torch.minimum(values, scratch.field, out=values)
     return replace(grid, values=values.to(grid.values))
+
+
+def _add(tools: Tools, idle: "SimpleQueue[Scratch]", body: int) -> None:
+    scratch = idle.get()
+    try:
+        add_body(tools, scratch, body)
+    finally:
+        idle.put(scratch)
 
 
 def _spread(count: int) -> list[int]:
