@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skeleton import BODY
-from mover.core.records import record
+from mover.core.records import record, rows_of
 from mover.core.types import Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage, resting
 from mover.fitting.energy import Seen, Weighed, body_energy
@@ -170,11 +170,7 @@ def chosen(seen: Seen, rows: Int[Tensor, " rows"]) -> Seen:
         seen.triples, rows=seen.triples.rows[:0], share=seen.triples.share[:0],
         expected=seen.triples.expected[:0],
     )  # fmt: skip
-    joints = None if seen.joints is None else seen.joints[rows]
-    return dataclasses.replace(
-        seen, pixels=seen.pixels[rows], weight=seen.weight[rows], triples=triples,
-        centre=seen.centre[rows], joints=joints,
-    )  # fmt: skip
+    return dataclasses.replace(rows_of(seen, rows, "bodies"), triples=triples)
 
 
 def _tried(

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS
 from mover.core.errors import InputError
-from mover.core.records import record
+from mover.core.records import record, rows_of
 from mover.core.types import Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage, resting, spreads
 from mover.fitting.energy import Seen, Triples
@@ -59,14 +59,7 @@ def rows_at(
     rows = window.rows
     fields = {n: getattr(at, n)[rows] for n in ("turn", "code", "place", "hands", "face")}
     triples = triples_of(window.frame, window.person, window.fps, config)
-    part = dataclasses.replace(
-        seen,
-        pixels=seen.pixels[rows],
-        weight=seen.weight[rows],
-        triples=triples,
-        centre=seen.centre[rows],
-        joints=None if seen.joints is None else seen.joints[rows],
-    )
+    part = dataclasses.replace(rows_of(seen, rows, "bodies"), triples=triples)
     small = Frame(frame.rig, frame.root[rows], frame.person[rows])
     return dataclasses.replace(at, **fields), small, part
 
