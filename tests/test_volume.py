@@ -8,7 +8,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from mover.geometry.nearest import to_surface
+from mover.geometry.nearest import nearest_points, to_surface
 from mover.geometry.rotations import axis_angle
 from mover.geometry.topology import is_closed
 from mover.geometry.volume import Volume, grid_around, sample, signed_distance, winding
@@ -269,12 +269,19 @@ def test_outside_of_the_grid_nothing_is_inside_and_nothing_pulls():
     assert torch.equal(points.grad, torch.zeros(3, 3))
 
 
-def test_distances_from_a_sphere_are_those_from_its_middle():
-    query = torch.rand(40, 3, generator=torch.Generator().manual_seed(2))
+def test_nearest_points_and_distances_are_those_of_naive_loops():
+    generator = torch.Generator().manual_seed(2)
+    query, points = torch.rand(40, 3, generator=generator), torch.rand(60, 3, generator=generator)
+    distance, index = nearest_points(query, points)
+    naive = torch.cdist(query, points)
+    assert torch.equal(index, naive.argmin(1))
+    torch.testing.assert_close(distance, naive.amin(1), rtol=0, atol=1e-4)
     verts, faces = sphere([0.0, 0.0, 0.0], 1.0, level=5)
     found = to_surface(query * 3, verts, faces)
     torch.testing.assert_close(found, (query.norm(dim=-1) * 3 - 1).abs(), rtol=0, atol=2e-3)
     assert to_surface(query[:0], verts, faces).shape == (0,)
+    with pytest.raises(ValueError, match="empty"):
+        nearest_points(query, points[:0])
     with pytest.raises(ValueError, match="empty"):
         to_surface(query, verts, faces[:0])
 

@@ -1,9 +1,26 @@
-"""Distances to surfaces, without gradients."""
+"""Nearest points and distances to surfaces, without gradients."""
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+
+def nearest_points(
+    query: Float[Tensor, "q 3"], points: Float[Tensor, "p 3"]
+) -> tuple[Float[Tensor, " q"], Int[Tensor, " q"]]:
+    """Distance [m] to, and index of, the nearest of `points` for each query point.
+
+    Raises:
+        ValueError: If there are no points to find.
+    """
+    from scipy.spatial import KDTree
+
+    if len(points) == 0:
+        raise ValueError("nearest_points: 'points' is empty, expected at least one point")
+    tree = KDTree(as_float64(points))
+    distance, index = tree.query(as_float64(query))
+    return torch.from_numpy(distance).to(query), torch.from_numpy(index).to(query.device)
 
 
 def to_surface(
