@@ -142,8 +142,7 @@ def test_a_perfect_picture_gives_furniture_near_the_true_one(
     assert all(stage.kept for stage in run.stages[len(run.stages) // 2 :])
 
 
-@pytest.mark.slow
-def test_measured_depth_makes_it_better(pieces: list[SceneObject], tmp_path: Path):
+def test_a_depth_map_tells_the_floor_and_how_far_things_are(pieces: list[SceneObject]):
     view = camera()
     seen = picture(pieces, view, depth=True)
     assert seen.depth is not None
@@ -153,15 +152,25 @@ def test_measured_depth_makes_it_better(pieces: list[SceneObject], tmp_path: Pat
     medians = median_depths(seen.depth, seen.masks)
     for k, piece in enumerate(pieces):
         assert float(medians[k]) == pytest.approx(float(box_of(piece).center.norm()), rel=0.15)
-    config = replace(QUICK, screen=ScreenConfig(tilt=0.0))
-    plain = first_scene(replace(seen, depth=None), config, Run(tmp_path))
-    deep = first_scene(seen, config, Run(tmp_path))
 
-    def score(first) -> float:
-        pairs = zip(first.scene.objects, pieces, strict=True)
+
+@pytest.mark.slow
+def test_measured_depth_makes_it_better(tmp_path: Path):
+    """In the mean of five rooms: in a single one a picture alone may be lucky."""
+    config, view = replace(QUICK, screen=ScreenConfig(tilt=0.0)), camera()
+
+    def miss(seen: Picture, pieces: list[SceneObject]) -> float:
+        found = first_scene(seen, config, Run(tmp_path)).scene.objects
+        pairs = zip(found, pieces, strict=True)
         return sum(float((box_of(a).center - box_of(b).center).norm()) for a, b in pairs) / 4
 
-    assert score(deep) < min(0.3, score(plain))
+    plain, deep = 0.0, 0.0
+    for seed in range(50, 55):
+        pieces = furniture(ROOM, seed)
+        seen = picture(pieces, view, depth=True)
+        plain += miss(replace(seen, depth=None), pieces) / 5
+        deep += miss(seen, pieces) / 5
+    assert deep < min(0.3, plain)
 
 
 @pytest.mark.slow
