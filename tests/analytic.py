@@ -10,6 +10,7 @@ from mover.energy.terms.bbox import SEEN
 from mover.energy.terms.collision import BodySpace
 from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.depth import DepthRange
+from mover.energy.terms.given import Given
 from mover.energy.terms.wall import Walls, rears_of
 from mover.geometry.camera import project, tilted, to_camera
 from mover.geometry.crops import crop_views
@@ -96,7 +97,17 @@ def image_at(objects, layout, camera, size):
     keep = torch.ones(n, size, size, dtype=torch.bool)
     return ImageCues(
         boxes, torch.full((n, 4), SEEN), views, drawn, keep, torch.ones(n).to(boxes),
-        layout.t_world_object.norm(dim=-1),
+        layout.t_world_object.norm(dim=-1), given=given_at(layout),
+    )  # fmt: skip
+
+
+def given_at(layout):
+    """Objects are given where they stand, along axes of their own."""
+    n, one = len(layout.yaw), torch.ones_like(layout.yaw)
+    precision = 60 * torch.eye(3).to(one) - 10
+    return Given(
+        layout.t_world_object.norm(dim=-1), layout.yaw, 0.6 * one, 5 * one, layout.yaw,
+        torch.zeros_like(layout.log_scale), precision.expand(n, 3, 3).clone(), 1.5 * one,
     )  # fmt: skip
 
 

@@ -34,6 +34,7 @@ from mover.energy.terms.contact import (
 from mover.energy.terms.depth import DepthRange, depth_term, free_space_term
 from mover.energy.terms.distance import distance_term
 from mover.energy.terms.factors import Factors, factors
+from mover.energy.terms.given import Given, given_term
 from mover.energy.terms.offscreen import offscreen_term
 from mover.energy.terms.scale import scale_term
 from mover.energy.terms.silhouette import edge_term, silhouette_term
@@ -71,6 +72,8 @@ class ImageCues:
     """What the masks may be if their outlines are too wide or too narrow; None: they are not."""
     walls: Walls | None = None
     """Lines along which furniture stands; None: none are known."""
+    given: Given | None = None
+    """What is known of the objects before they are seen; None: nothing."""
 
 
 @record
@@ -253,6 +256,10 @@ SCENE_TERMS: tuple[Term[PlacedScene], ...] = (
     Term(
         "wall", lambda s: wall_term(s.layout, s.known.objects.size, there(s.known.image.walls)),
         "the line of the furniture beside it", ("walls",),
+    ),
+    Term(
+        "given", lambda s: given_term(s.layout, there(s.known.image.given)),
+        "how it was given", ("given",),
     ),
 )  # fmt: skip
 """All terms of Eq. 1; what is not in this list does not count, what is cannot be forgotten."""

@@ -96,6 +96,29 @@ SIZES: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, fl
 }
 """Smallest and largest width (x), height (y) and depth (z) of each class [m]."""
 
+Usual = tuple[float, float] | None
+STANDARD: dict[str, tuple[Usual, Usual, Usual]] = {
+    "chair": ((0.48, 0.15), (0.90, 0.10), (0.52, 0.15)),
+    "armchair": ((0.80, 0.18), (0.90, 0.15), (0.82, 0.12)),
+    "office chair": ((0.62, 0.12), (1.00, 0.12), (0.62, 0.12)),
+    "stool": (None, (0.46, 0.08), None),
+    "bench": (None, (0.45, 0.08), (0.40, 0.15)),
+    "sofa": (None, (0.82, 0.10), (0.90, 0.15)),
+    "bed": (None, None, (2.05, 0.06)),
+    "table": (None, (0.74, 0.04), None),
+    "desk": (None, (0.74, 0.04), (0.68, 0.12)),
+    "coffee table": (None, (0.42, 0.15), None),
+    "shelf": (None, None, (0.32, 0.18)),
+    "cabinet": (None, None, (0.45, 0.15)),
+    "wardrobe": (None, (2.00, 0.08), (0.60, 0.10)),
+    "nightstand": ((0.45, 0.18), (0.52, 0.15), (0.42, 0.18)),
+    "floor lamp": (None, (1.55, 0.12), None),
+}
+"""Width (x), height (y) and depth (z) as makers of furniture keep to them [m], with the standard
+deviation of the logarithm; None: there is no such standard. Tables and desks are .70-.78 m high,
+seats .40-.50 m for the sake of the body, beds as long as mattresses, wardrobes as deep as hangers.
+"""
+
 SYNONYMS: dict[str, str] = {
     "couch": "sofa", "loveseat": "sofa", "settee": "sofa", "sectional": "sofa",
     "corner sofa": "sofa",

@@ -1,5 +1,7 @@
 """Rays and the floor, and objects under a new camera."""
 
+import math
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -24,6 +26,11 @@ def hit_floor(
     reach = -ground / (-rays[..., 1]).clamp_min(LOWEST)
     floor = ground.expand(reach.shape)
     return torch.stack([rays[..., 0] * reach, floor, rays[..., 2] * reach], -1)
+
+
+def larger(layout: Layout, factor: float) -> Layout:
+    """The layout of a room that is larger by a factor about the camera; the image is the same."""
+    return Layout(layout.t_world_object * factor, layout.yaw, layout.log_scale + math.log(factor))
 
 
 def reproject(

@@ -73,6 +73,9 @@ class Config:
     """Further passes of stage 2 with assignment and occlusion order renewed."""
     slide_to_floor: bool = False
     """Start on the floor along the rays with the size in the image kept; else dropped straight."""
+    height_spread: float = 0.0
+    """Standard deviation of the logarithm of people's height, where all have the mean shape of
+    their model and no height is given: the furniture then tells the scale, too; 0: believed."""
     silhouette_confidence: bool = False
     """Believe the silhouette of an object less whose shape does not fit."""
 

@@ -1,5 +1,6 @@
 """The order of the stages, each kept on disk: from a capture to a consistent room."""
 
+import math
 from dataclasses import replace
 
 import torch
@@ -12,9 +13,18 @@ from mover.core.records import rows_of
 from mover.core.run import Run as Run
 from mover.core.settings import check_settings
 from mover.core.types import Camera, Capture, Layout, Room
-from mover.energy.objective import HumanCues
+from mover.energy.config import SceneConfig, only
+from mover.energy.fused.energy import energy_function
+from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.camera import to_camera
-from mover.geometry.placement import GROUND, place, reproject, rest_on_support, slide_to_floor
+from mover.geometry.placement import (
+    GROUND,
+    larger,
+    place,
+    reproject,
+    rest_on_support,
+    slide_to_floor,
+)
 from mover.io.capture.plausible import check_plausible
 from mover.pipeline.believable import check_floor, check_room
 from mover.pipeline.outcome import (
@@ -42,6 +52,7 @@ from mover.stages.objects.find_image_cues import (
     image_evidence,
     order_of,
 )
+from mover.stages.objects.gather_given import common_scale, drawn_in, gather_given
 from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
 from mover.stages.objects.place_objects import estimate_size_prior, inlier_weights, place_objects
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
@@ -55,7 +66,13 @@ from mover.stages.objects.starts import (
     other_starts,
     reference_yaw,
 )
-from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
+from mover.stages.people.find_depth import (
+    DepthInputs,
+    apply_depth,
+    are_shapeless,
+    find_depth,
+    nearer,
+)
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
 NOBODY = HumanCues()
@@ -90,6 +107,7 @@ def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str
     context = with_size_prior(context, state)
     for _ in range(config.refine.rounds):
         state = with_refined_camera(context, people, state)
+    people, state = with_common_scale(context, people, state)
     state = gathered(context, people, state)
     image_energy = state.placed.energy[0]
     state = placed_with_people(context, assigned(context, people, state), image_energy)
@@ -139,7 +157,12 @@ def with_size_prior(context: ReconstructionContext, state: SceneState) -> Recons
     return replace(context, config=with_sizes(context.config, *learnt))
 
 
-def placed_by_image(context: ReconstructionContext, camera: Camera, ground: float) -> SceneState:
+def placed_by_image(
+    context: ReconstructionContext,
+    camera: Camera,
+    ground: float,
+    before: SceneState | None = None,
+) -> SceneState:
     """Carry the initial scene into this world and place the objects by the image alone."""
     objects, seen = context.prepared.objects, context.seen
     old = context.capture.scene.camera.R_cam_world
@@ -162,12 +185,37 @@ def placed_by_image(context: ReconstructionContext, camera: Camera, ground: floa
         camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered, given
     )
     cues = context.run.stage(find_image_cues, image, context.config.image)
+    cues = with_given(cues, context, as_given(context, camera), before)
     inputs = PlaceInputs(
         objects, camera, ground, cues, NOBODY, starts, start.yaw, _pinned(context, start)
     )
     placed = context.run.stage(place_objects, inputs, context.config.layout)
     found = SceneState(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
     return replace(found, priced=(with_walls(inputs, placed.walls), context.config.layout))
+
+
+def as_given(context: ReconstructionContext, camera: Camera) -> Layout:
+    """The initial scene in the world of another camera; objects may hang in the air."""
+    objects, old = context.prepared.objects, context.capture.scene.camera.R_cam_world
+    return reproject(context.prepared.start, objects.size[:, 1], old, camera.R_cam_world)
+
+
+def with_given(
+    image: ImageCues, context: ReconstructionContext, given: Layout, before: SceneState | None
+) -> ImageCues:
+    """The image's cues with what is known of the objects before they are seen."""
+    objects = context.prepared.objects
+    if not context.config.place.weights.given:
+        return image
+    if before is None:
+        return replace(image, given=gather_given(objects, given))
+    misfit = only(bbox=1.0, silhouette=1.0)
+    energy = energy_function(objects, before.camera, image, NOBODY, SceneConfig(misfit, "robust"))(
+        alone(before.placed.layout)
+    )
+    left = energy.per_item[0].detach()
+    known = gather_given(objects, given, before.placed.layout, left)
+    return replace(image, given=known, boxes=drawn_in(image.boxes, known.doubt))
 
 
 def with_refined_camera(
@@ -178,8 +226,29 @@ def with_refined_camera(
     spread, objects = people.alignment.covariance, context.prepared.objects
     inputs = RefineInputs(state.camera, state.ground, spread, objects, cues, state.placed.layout)
     better = context.run.stage(refine_camera, inputs, context.config.refine)
-    found = placed_by_image(context, better.camera, better.ground)
+    found = placed_by_image(context, better.camera, better.ground, state)
     return replace(found, traces={**state.traces, "camera": better.trace, **found.traces})
+
+
+def with_common_scale(
+    context: ReconstructionContext, people: PeopleState, state: SceneState
+) -> tuple[PeopleState, SceneState]:
+    """The whole room larger or smaller where nothing but the furniture tells its scale."""
+    capture = context.capture
+    given = None if state.priced is None else state.priced[0].image.given
+    heights = {} if capture.people is None else capture.people.heights
+    told = bool(heights) or capture.camera_height is not None
+    if given is None or told or not are_shapeless(people.bodies):
+        return people, state
+    factor = math.exp(-common_scale(state.placed.layout, given, context.config.height_spread))
+    bodies = nearer(people.bodies, state.camera, state.ground, factor)
+    layouts = (state.start, state.alone, state.placed.layout, state.placed.candidates)
+    start, only_image, layout, candidates = (larger(x, factor) for x in layouts)
+    placed = replace(state.placed, layout=layout, candidates=candidates)
+    state = replace(
+        state, ground=factor * state.ground, start=start, alone=only_image, placed=placed
+    )
+    return replace(people, bodies=bodies), state
 
 
 def gathered(context: ReconstructionContext, people: PeopleState, state: SceneState) -> SceneState:
@@ -212,6 +281,7 @@ def placed_with_people(
     assert state.contacts is not None
     contacts = state.contacts.points
     image = run.stage(find_image_cues, state.image, config.image)
+    image = with_given(image, context, as_given(context, state.camera), state)
     humans = cues_in_windows(state.cues, contacts, image.views, state.camera)
     if config.silhouette_confidence:
         image = replace(image, trust=inlier_weights(image_energy))

@@ -146,6 +146,8 @@ class PrepareConfig:
     """Points of each region that can be touched."""
     rule: Literal["level", "release"] = "level"
     """How seats and backs are found (`prepare_objects.find_regions`)."""
+    level_feet: bool = False
+    """All feet of a proxy are put on the floor (`prepare_objects.levelled`)."""
 
 
 @dataclass(frozen=True)

@@ -171,6 +171,9 @@ def find_depth(
     return DepthFactors(person, factor, spread, size, tuple(warnings))
 
 
+SHAPELESS = 0.05  # coefficients below it are the mean shape
+
+
 def apply_depth(bodies: Bodies, factors: DepthFactors) -> Bodies:
     """Move people to their true depth: scaled about the camera, then along the pelvis' ray.
 
@@ -189,6 +192,36 @@ def apply_depth(bodies: Bodies, factors: DepthFactors) -> Bodies:
         moved = dataclasses.replace(pose, transl=pose.transl + shift.to(pose.transl))
         pose = None if resized else moved
     return dataclasses.replace(bodies, verts=verts, joints=joints, pose=pose)
+
+
+def are_shapeless(bodies: Bodies) -> bool:
+    """Whether all bodies have the mean shape of their model: then nothing tells their height."""
+    return bodies.pose is not None and float(bodies.pose.betas.abs().max()) < SHAPELESS
+
+
+def nearer(bodies: Bodies, camera: Camera, ground: float, factor: float) -> Bodies:
+    """People moved as if the whole room were larger by a factor: the floor below them is.
+
+    They keep their size and stand as high above the floor, whose height is the one before.
+
+    Args:
+        bodies: In camera axes.
+        camera: Which way is down.
+        ground: Height of the floor [m].
+        factor: Of the room about the camera.
+    """
+    R = camera.R_cam_world.to(bodies.verts)
+    below = pelvis(bodies) @ R
+    below = torch.stack([below[:, 0], torch.full_like(below[:, 1], ground), below[:, 2]], -1)
+    shift = (factor - 1) * (below @ R.mT)
+    joints, pose = bodies.joints, bodies.pose
+    if joints is not None:
+        joints = joints + shift[:, None]
+    if pose is not None:
+        pose = dataclasses.replace(pose, transl=pose.transl + shift.to(pose.transl))
+    return dataclasses.replace(
+        bodies, verts=bodies.verts + shift[:, None], joints=joints, pose=pose
+    )
 
 
 def pelvis(bodies: Bodies) -> Float[Tensor, "bodies 3"]:

@@ -1,0 +1,89 @@
+r"""Objects stay about as they were given, of usual sizes, along the room (not in the paper).
+
+Price:     L_given = \sum_i d_i (P_i^{place} + P_i^{yaw} + P_i^{axis} + P_i^{size}), each in nats
+Place:     2 \log(1 + \delta^2 / 3 \sigma^2), \delta = \log \|t_i\| / \|t_i^{init}\|, a Student t: a
+           guess of a distance is off by some per cent, seldom by more, never by metres.
+Yaw:       the guess is off by some 20 degrees, one in ten is turned by a quarter or a half.
+Axis:      most furniture stands along one of two directions of the room.
+Size:      r^T \Lambda r / 2 with r the logarithms of the three sizes less those expected: of the
+           given mesh and of the standard dimensions of its class, each with its spread.
+Doubt:     d_i grows with what is left of the image's energy where the object fits best: a shape or
+           a mask that does not fit tells by so much less where the object stands.
+
+Nothing here is hard: each price is bounded or grows slowly, so that a piece that was given metres
+away or turned round is found as before where its shape fits or people tell.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.core.records import record
+from mover.core.types import Layout
+
+AWAY = 0.07  # standard deviation of the logarithm of a given distance
+TURN = math.radians(20)  # of a given yaw [rad]
+FLIPPED = 0.1  # share of yaws that are off by a further quarter or half turn
+ANY = 0.01  # and of those that are off by anything
+
+
+@record
+class Given:
+    """What the initial scene, the room and standard dimensions say of each object."""
+
+    distance: Float[Tensor, " objects"]
+    """From the camera to the middle of the base [m]."""
+    yaw: Float[Tensor, " objects"]
+    """[rad]"""
+    along: Float[Tensor, " objects"]
+    """Chance that it stands along an axis of the room."""
+    sharpness: Float[Tensor, " objects"]
+    """How well those that do stand along it, and how well it is known: of a von Mises density."""
+    axis: Float[Tensor, " objects"]
+    """Direction of an axis of the room, up to quarter turns [rad]."""
+    log_scale: Float[Tensor, "objects 3"]
+    """Expected size, as a factor on that of the mesh."""
+    precision: Float[Tensor, "objects 3 3"]
+    """How well it is known: inverse covariance of the logarithms."""
+    doubt: Float[Tensor, " objects"]
+    """How little the image tells of it: 1 is usual, 0 leaves it to the image."""
+
+
+def given_term(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
+    """How far places, yaws and sizes are from what is expected [nats, times the doubt]."""
+    return given.doubt * (
+        _place(layout, given) + _yaw(layout, given) + _axis(layout, given) + _size(layout, given)
+    )
+
+
+def _place(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
+    away = layout.t_world_object.square().sum(-1).clamp_min(1e-6).log() / 2
+    off = (away - given.distance.clamp_min(1e-3).log()) / AWAY
+    return 2 * (1 + off.square() / 3).log()
+
+
+def _yaw(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
+    off, sharp = layout.yaw - given.yaw, 1 / TURN**2
+
+    def density(turned: Tensor) -> Tensor:
+        quarters = (-turned.sin(), turned.sin(), -turned.cos())
+        flipped = torch.stack([(sharp * (c - 1)).exp() for c in quarters]).sum(0)
+        right = (sharp * (turned.cos() - 1)).exp()
+        return (1 - FLIPPED) * right + FLIPPED / 3 * flipped + ANY
+
+    return density(torch.zeros_like(given.yaw)).log() - density(off).log()
+
+
+def _axis(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
+    """Densities over a quarter turn, against an even one."""
+    level = given.along / torch.special.i0e(given.sharpness)
+    free = 1 - given.along
+    turned = (4 * (layout.yaw - given.axis)).cos() - 1
+    return (free + level).log() - (free + level * (given.sharpness * turned).exp()).log()
+
+
+def _size(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
+    off = layout.log_scale - given.log_scale
+    return 0.5 * ((given.precision @ off.unsqueeze(-1)).squeeze(-1) * off).sum(-1)

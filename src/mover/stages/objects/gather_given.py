@@ -1,0 +1,127 @@
+"""What is known of the furniture before it is seen: as given, of standard sizes, along axes."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.core.types import Layout, Objects
+from mover.energy.terms.given import AWAY, TURN, Given
+from mover.furniture.library import STANDARD, WALL_PIECES
+
+SIZE = 0.1  # standard deviation of the logarithm of each given size
+COMMON = 0.06  # and of what the three have in common
+FIT = 0.1  # image energy (robust form) of a shape that fits
+DOUBTS = (0.05, 4.0)  # least and largest doubt
+UNSEEN = 0.2  # doubt before anything was placed
+SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
+OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
+INWARD = (0.03, 0.015, -0.03, 0.0)  # by which sides of boxes lie inside, of width and height
+FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
+DIRECTIONS = 90  # that are tried within a quarter turn
+
+
+def gather_given(
+    objects: Objects,
+    start: Layout,
+    layout: Layout | None = None,
+    energy: Float[Tensor, " objects"] | None = None,
+) -> Given:
+    """The evidence of `terms.given`.
+
+    Args:
+        objects: The furniture, as large as it was given.
+        start: As it was given, in the world as it is known now.
+        layout: Where it was placed since; None: nowhere yet.
+        energy: What is left of the image's energy there, per object; None: not known.
+    """
+    mean, precision = expected_sizes(objects)
+    along = torch.tensor([OFTEN if c in WALL_PIECES else SELDOM for c in objects.categories])
+    axis, spread = room_axis(start, layout, along)
+    sharp = 1 / (4 * math.hypot(SQUARE, spread)) ** 2
+    known = torch.ones_like(start.yaw)
+    doubt = UNSEEN * known if energy is None else (energy / FIT).clamp(*DOUBTS)
+    return Given(
+        distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=along.to(known),
+        sharpness=sharp * known, axis=axis * known, log_scale=mean, precision=precision,
+        doubt=doubt,
+    )  # fmt: skip
+
+
+def expected_sizes(
+    objects: Objects,
+) -> tuple[Float[Tensor, "objects 3"], Float[Tensor, "objects 3 3"]]:
+    """Mean and inverse covariance of the logarithms of the sizes, of the given ones."""
+    own = SIZE**2 * torch.eye(3) + COMMON**2
+    usual, sharp = torch.zeros_like(objects.size), torch.zeros_like(objects.size)
+    for i, category in enumerate(objects.categories):
+        for axis, known in enumerate(STANDARD.get(category, ())):
+            if known is not None:
+                usual[i, axis] = math.log(known[0]) - objects.size[i, axis].log()
+                sharp[i, axis] = 1 / known[1] ** 2
+    precision = torch.linalg.inv(own).to(usual) + torch.diag_embed(sharp)
+    mean = torch.linalg.solve(precision, (sharp * usual).unsqueeze(-1)).squeeze(-1)
+    return mean, precision
+
+
+def drawn_in(
+    boxes: Float[Tensor, "objects 4"], doubt: Float[Tensor, " objects"]
+) -> Float[Tensor, "objects 4"]:
+    """Detected boxes as meshes fill them that touch their own box with few points only [px].
+
+    A warped or rounded mesh of the true size fills less of the image than the true piece does;
+    to fill all of it, it would have to be too large and too near.
+    """
+    size = (boxes[:, 2:] - boxes[:, :2]).repeat(1, 2)
+    share = (doubt - 1).clamp(0, 1)[:, None] * boxes.new_tensor(INWARD)
+    return boxes + share * size
+
+
+def common_scale(layout: Layout, given: Given, spread: float) -> float:
+    """Logarithm of how much too large the whole room is, as its furniture tells.
+
+    People of unknown height make floor, places and sizes too large at once, which no image tells.
+    What was given, and standard sizes, say of each object how far it is off.
+
+    Args:
+        layout: Where the objects were placed under the people's scale.
+        given: What was expected of them.
+        spread: Standard deviation of the logarithm of the people's size; 0: it is known.
+    """
+    if spread <= 0:
+        return 0.0
+    tried = torch.linspace(-3 * spread, 3 * spread, 121, dtype=torch.float64)
+    away = (layout.t_world_object.norm(dim=-1) / given.distance).log().double()
+    off = (layout.log_scale - given.log_scale).double()
+    noise = FITTED**2 * torch.eye(3).to(off)
+    precision = torch.linalg.inv(torch.linalg.inv(given.precision.double()) + noise)
+    near = away[:, None] - tried
+    rest = off[:, None] - tried[:, None]
+    price = 2 * (1 + near.square() / (3 * (AWAY**2 + FITTED**2))).log()
+    price = price + 0.5 * torch.einsum("nri,nij,nrj->nr", rest, precision, rest)
+    total = price.sum(0) + 0.5 * (tried / spread).square()
+    weight = (total.min() - total).exp()
+    return float((weight * tried).sum() / weight.sum())
+
+
+def room_axis(
+    start: Layout, layout: Layout | None, along: Float[Tensor, " objects"]
+) -> tuple[float, float]:
+    """The direction along which most furniture stands, up to quarter turns, and its spread [rad].
+
+    Given yaws are rough and each says little; placed ones say more.
+    """
+    tried = torch.arange(DIRECTIONS) * (math.pi / 2 / DIRECTIONS)
+    chance = torch.zeros(DIRECTIONS)
+    said = [(start.yaw, TURN)] if layout is None else [(start.yaw, TURN), (layout.yaw, TURN / 2)]
+    for yaw, spread in said:
+        sharp = torch.tensor(1 / (4 * spread) ** 2)
+        off = (4 * (yaw.cpu().float()[:, None] - tried)).cos() - 1
+        density = (sharp * off).exp() / torch.special.i0e(sharp)
+        chance += (1 - along[:, None] + along[:, None] * density).log().sum(0)
+    weight = (chance - chance.max()).exp()
+    weight = weight / weight.sum()
+    x, y = float(weight @ (4 * tried).cos()), float(weight @ (4 * tried).sin())
+    length = min(max(math.hypot(x, y), 1e-3), 1 - 1e-9)
+    return math.atan2(y, x) / 4, math.sqrt(-2 * math.log(length)) / 4

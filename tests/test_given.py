@@ -1,0 +1,214 @@
+"""What is known before anything is seen: given places, usual sizes, axes, level feet."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from analytic import FACES, box_verts, boxes_of, given_at
+
+from mover.core.types import Bodies, Camera, Layout, Mesh
+from mover.energy.terms.given import Given, given_term
+from mover.furniture.library import PIECES, SIZES, STANDARD, STYLES, canonical, make_piece
+from mover.geometry.camera import tilted, to_camera, to_world
+from mover.geometry.mesh import box
+from mover.geometry.placement import larger
+from mover.geometry.topology import is_closed
+from mover.stages.objects.gather_given import (
+    DOUBTS,
+    INWARD,
+    common_scale,
+    drawn_in,
+    expected_sizes,
+    gather_given,
+    room_axis,
+)
+from mover.stages.objects.prepare_objects import levelled
+from mover.stages.people.find_depth import are_shapeless, nearer
+from mover_bench.rooms.foreign import foreign_mesh
+
+TURNS = torch.linspace(-math.pi, math.pi, 721)
+
+
+def somewhere(count: int = 1) -> Layout:
+    place = torch.tensor([0.3, -1.4, -4.0]).expand(count, 3)
+    return Layout(place.clone(), torch.zeros(count), torch.zeros(count, 3))
+
+
+def cost(given: Given, layout: Layout) -> float:
+    return float(given_term(layout, given).sum())
+
+
+def test_a_place_metres_away_costs_more_than_one_beside_it_but_not_without_bound() -> None:
+    layout = somewhere()
+    given = given_at(layout)
+    away = [
+        cost(given, replace(layout, t_world_object=layout.t_world_object * k))
+        for k in (1.0, 1.05, 1.1, 1.3, 1.6, 2.0)
+    ]
+    assert away[0] == pytest.approx(0, abs=1e-6)
+    assert all(b > a + 0.3 for a, b in itertools.pairwise(away))
+    slopes = np.diff(away[3:]) / np.diff([1.3, 1.6, 2.0])
+    assert slopes[1] < slopes[0]
+
+
+def test_a_given_yaw_may_be_off_by_a_quarter_or_half_turn_rather_than_by_an_eighth() -> None:
+    given = replace(given_at(somewhere()), along=torch.zeros(1), doubt=torch.ones(1))
+    layouts = Layout(
+        somewhere().t_world_object.expand(721, 1, 3),
+        TURNS[:, None],
+        torch.zeros(721, 1, 3),
+    )
+    costs = given_term(layouts, given)[:, 0]
+    eighth, quarter, half = (costs[360 + 2 * degrees] for degrees in (45, 90, 180))
+    assert float(costs.argmin()) == 360
+    assert float(quarter) < float(costs[360 + 2 * 60]) + 1
+    assert 2 < float(half) < 4
+    assert float(half) == pytest.approx(float(quarter), abs=0.3)
+    assert float(eighth) < float(half)
+    assert float(costs.max()) < 5
+
+
+def test_furniture_along_walls_turns_to_the_axes_and_may_stand_askew() -> None:
+    given = replace(
+        given_at(somewhere()), axis=torch.full((1,), 0.2), sharpness=torch.full((1,), 8.0)
+    )
+
+    def at(yaw: float, along: float) -> float:
+        some = replace(given, along=torch.full((1,), along), yaw=torch.full((1,), yaw))
+        return cost(some, replace(somewhere(), yaw=torch.full((1,), yaw)))
+
+    for k in range(4):
+        assert at(0.2 + k * math.pi / 2, 0.9) == pytest.approx(0, abs=1e-5)
+    assert at(0.2 + math.pi / 4, 0.9) > 2 * at(0.2 + math.pi / 4, 0.4) > 0
+    assert at(0.2 + math.pi / 4, 0.0) == pytest.approx(0, abs=1e-6)
+
+
+def test_the_axis_of_a_room_is_found_from_rough_yaws() -> None:
+    generator = torch.Generator().manual_seed(3)
+    true = 0.3
+    quarters = torch.randint(0, 4, (8,), generator=generator) * (math.pi / 2)
+    given = true + quarters + math.radians(15) * torch.randn(8, generator=generator)
+    placed = true + quarters + math.radians(4) * torch.randn(8, generator=generator)
+    layout = replace(somewhere(8), yaw=given)
+    along = torch.full((8,), 0.9)
+    rough, wide = room_axis(layout, None, along)
+    fine, narrow = room_axis(layout, replace(layout, yaw=placed), along)
+
+    def off(angle: float) -> float:
+        return abs(math.remainder(angle - true, math.pi / 2))
+
+    assert off(rough) < math.radians(12)
+    assert off(fine) < math.radians(4)
+    assert narrow < wide
+    nothing = room_axis(layout, None, torch.zeros(8))[1]
+    assert nothing > 3 * wide
+
+
+def test_standard_sizes_pull_what_they_know_and_leave_the_rest() -> None:
+    sizes = [(1.2, 0.60, 0.8), (0.45, 0.95, 0.5), (1.0, 1.0, 1.0)]
+    objects = boxes_of(("table", "chair", "aquarium"), sizes)
+    mean, precision = expected_sizes(objects)
+    assert 0.6 * math.log(0.74 / 0.60) < float(mean[0, 1]) < math.log(0.74 / 0.60)
+    assert float(mean[1].abs().max()) < 0.1
+    assert float(mean[2].abs().max()) == 0
+    assert bool((torch.linalg.eigvalsh(precision) > 0).all())
+
+
+def test_standards_are_those_of_the_classes_and_near_what_the_library_has() -> None:
+    for category, axes in STANDARD.items():
+        assert canonical(category) == category
+        for known, (low, high) in zip(axes, SIZES[category], strict=True):
+            assert known is None or low * 0.9 < known[0] < high * 1.1
+
+
+def test_doubt_follows_the_misfit_within_bounds() -> None:
+    objects = boxes_of(("table", "chair", "sofa"), [(1.0, 0.7, 1.0)] * 3)
+    given = gather_given(objects, somewhere(3), somewhere(3), torch.tensor([0.001, 0.25, 3.0]))
+    assert given.doubt.tolist() == pytest.approx([DOUBTS[0], 2.5, DOUBTS[1]])
+
+
+def test_boxes_are_drawn_in_only_where_the_shape_does_not_fit() -> None:
+    boxes = torch.tensor([[10.0, 20.0, 110.0, 70.0]] * 2)
+    found = drawn_in(boxes, torch.tensor([1.0, 3.0]))
+    assert torch.equal(found[0], boxes[0])
+    size = torch.tensor([100.0, 50.0, 100.0, 50.0])
+    assert torch.allclose(found[1], boxes[1] + torch.tensor(INWARD) * size)
+
+
+@pytest.mark.parametrize("name", PIECES)
+def test_feet_that_stand_level_stay_as_they_are(name: str) -> None:
+    for style in range(STYLES[name]):
+        mesh = make_piece(name, np.random.default_rng(style), style).mesh
+        assert levelled(mesh) is mesh
+
+
+def test_a_foot_that_hangs_comes_down_and_the_box_stays() -> None:
+    for seed in range(6):
+        mesh = foreign_mesh(
+            make_piece("table", np.random.default_rng(seed)), 0.03, np.random.default_rng(seed)
+        )
+        found = levelled(mesh)
+        for before, after in zip(box(mesh.verts), box(found.verts), strict=True):
+            assert torch.allclose(before, after, atol=1e-6)
+        assert float((found.verts - mesh.verts).abs().max()) < 0.15 * float(box(mesh.verts)[1][1])
+    tilted = box_verts((0.5, 0.8, 0.5)).float()
+    tilted[:, 1] += 0.04 * (tilted[:, 0] + 0.25) / 0.5 * (1 - tilted[:, 1] / 0.8)
+    level = levelled(Mesh(tilted, FACES))
+    assert float(level.verts[tilted[:, 1] < 0.1][:, 1].abs().max()) < 0.005
+    assert is_closed(level.faces)
+
+
+@pytest.mark.parametrize("large", [0.93, 1.0, 1.06])
+def test_furniture_tells_how_large_the_room_is(large: float) -> None:
+    """Sizes and places are given with errors; under people too large all is too large at once."""
+    generator = torch.Generator().manual_seed(1)
+    count = 9
+    objects = boxes_of(("aquarium",) * count, [(1.0, 0.8, 0.6)] * count)
+    true = replace(somewhere(count), t_world_object=somewhere(count).t_world_object * 1.2)
+    error = 0.04 * torch.randn(count, 1, generator=generator)
+    start = replace(true, t_world_object=true.t_world_object * error.exp())
+    off = error + 0.08 * torch.randn(count, 3, generator=generator)
+    found = Layout(true.t_world_object * large, true.yaw, math.log(large) - off)
+    given = gather_given(objects, start, found)
+    scale = common_scale(found, given, 0.055)
+    assert abs(scale - math.log(large)) < 0.03
+    assert common_scale(found, given, 0.0) == 0
+    assert abs(common_scale(found, given, 0.005)) < 0.006
+    metres = Layout(found.t_world_object.clone(), found.yaw, found.log_scale)
+    metres.t_world_object[0] *= 1.8
+    assert abs(common_scale(metres, given, 0.055) - scale) < 0.015
+
+
+def test_a_larger_room_moves_the_floor_below_people_and_keeps_them_on_it() -> None:
+    camera = Camera(torch.eye(3), tilted(torch.tensor(-0.2), torch.tensor(0.03)), 640, 360)
+    world = Bodies(
+        verts=torch.tensor([[[0.5, -1.4, -3.0], [0.5, 0.3, -3.0]]]),
+        faces=torch.zeros(1, 3, dtype=torch.long),
+        joints=torch.tensor([[[0.5, -0.5, -3.0]]]),
+        joint_names=("pelvis",),
+        frame=torch.zeros(1, dtype=torch.long),
+        person=torch.zeros(1, dtype=torch.long),
+        fps=5.0,
+        space="camera",
+        pose=None,
+    )
+    seen = replace(
+        world,
+        verts=to_camera(world.verts, camera.R_cam_world),
+        joints=to_camera(world.joints, camera.R_cam_world),
+    )
+    there = nearer(seen, camera, -1.4, 0.9)
+    moved = to_world(there.verts, camera.R_cam_world)[0]
+    assert torch.allclose(moved[0], torch.tensor([0.45, -1.26, -2.7]), atol=1e-5)
+    assert torch.allclose(moved[1], torch.tensor([0.45, 0.44, -2.7]), atol=1e-5)
+    assert not are_shapeless(seen)
+
+
+def test_a_larger_room_is_the_same_picture() -> None:
+    layout = somewhere(2)
+    found = larger(layout, 1.1)
+    assert torch.allclose(found.t_world_object, 1.1 * layout.t_world_object)
+    assert torch.allclose(found.log_scale.exp(), torch.full((2, 3), 1.1))
