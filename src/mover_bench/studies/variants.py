@@ -81,6 +81,13 @@ def _unlined(config: Config) -> Config:
     return replace(config, layout=layout, place=place)
 
 
+def as_given(config: Config) -> Config:
+    """With the term for how objects were given, level feet, and the scale from the furniture."""
+    layout = replace(config.layout, weights=replace(config.layout.weights, given=0.02))
+    prepare = replace(config.prepare, level_feet=True)
+    return weighed(replace(config, layout=layout, prepare=prepare, height_spread=0.055), given=0.02)
+
+
 _SILENT = {"contact": 0.0, "heading": 0.0}
 TERMS: dict[str, Variant] = {
     "again-alone": Variant(weighed(ROBUST, depth=0.0, collision=0.0, **_SILENT), "no contact"),
@@ -109,6 +116,12 @@ PARTS: dict[str, Variant] = {
     "no-groups": Variant(replace(ROBUST, assign=AssignConfig())),
 }
 """`robust` without one of the parts that it adds to the paper."""
+
+TOOLS: dict[str, Variant] = {
+    "with-given": Variant(as_given(ROBUST)),
+    "with-given-no-scale": Variant(replace(as_given(ROBUST), height_spread=0.0)),
+}
+"""`robust` with what is meant for the inputs of today's tools, and without one part of it."""
 
 NOBODY: dict[str, Variant] = {"nobody": Variant(ROBUST, "nobody")}
 SINGLE: dict[str, Variant] = {
@@ -143,7 +156,7 @@ REFINED: dict[str, Variant] = {"refined-people": Variant(ROBUST, refined=True)}
 
 VARIANTS: dict[str, Variant] = {
     **{name: Variant(config) for name, config in PRESETS.items()},
-    **TERMS, **PARTS, **NOBODY, **RELAXED, **LENS, **REFINED, **SINGLE, **SEGMENT, **TIMED,
+    **TERMS, **PARTS, **TOOLS, **NOBODY, **RELAXED, **LENS, **REFINED, **SINGLE, **SEGMENT, **TIMED,
     **PEOPLE,
 }  # fmt: skip
 """By the name of the job."""
