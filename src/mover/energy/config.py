@@ -40,7 +40,7 @@ class SceneWeights:
     """Seats face where their sitters face (robust only)."""
     wall: Weight = 0.0
     """Furniture along a wall stands in one line (robust only)."""
-    given: float = 0.0
+    given: Weight = 0.0
     """Objects stay about as they were given, of usual sizes and along the room (robust only)."""
 
 

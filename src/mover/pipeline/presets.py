@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, TypeVar
 
-from mover.core.settings import int_in
+from mover.core.settings import float_in, int_in
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
 from mover.stages.config import (
     AlignConfig,
@@ -73,7 +73,7 @@ class Config:
     """Further passes of stage 2 with assignment and occlusion order renewed."""
     slide_to_floor: bool = False
     """Start on the floor along the rays with the size in the image kept; else dropped straight."""
-    height_spread: float = 0.0
+    height_spread: Annotated[float, float_in(0, 0.3)] = 0.0
     """Standard deviation of the logarithm of people's height, where all have the mean shape of
     their model and no height is given: the furniture then tells the scale, too; 0: believed."""
     silhouette_confidence: bool = False
