@@ -15,11 +15,10 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from mover.app.pictures.board import set_up, show
 from mover.app.pictures.eye import orbit_eye
 from mover.app.pictures.film import pixels
-from mover.app.pictures.floor import ground_under
-from mover.app.pictures.paint import Surfaces, furniture, joined, people
+from mover.app.pictures.paint import Surfaces, furniture, ground_under, joined, people
+from mover.app.pictures.render import set_up, show
 from mover.bodies.skinning import open_body
 from mover.core.types import Bodies, Camera, Scene, SceneObject
 from mover.furniture.library import STYLES, make_piece

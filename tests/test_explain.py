@@ -13,7 +13,7 @@ import torch
 from analytic import make_inputs, moved
 from little_room import camera, room, walkers
 
-from mover.app.report.diagnostics import draw_uncertainty, explanations_list
+from mover.app.report.page import draw_uncertainty, explanations_list
 from mover.app.viewer.layers import place_ellipses
 from mover.core.explanation import Alternative, Bound, Facts, Pull, TouchingBody
 from mover.core.observe import Energy

@@ -27,10 +27,9 @@ from mover.fitting.config import (
 )
 from mover.fitting.energy import Weighed, bending_price, body_energy, geman_mcclure
 from mover.fitting.prior import ANGLES, same
-from mover.fitting.rig import move, rig_of
 from mover.fitting.start import placed
 from mover.fitting.tracks import best_path, seen_of, triples_of
-from mover.fitting.unknowns import Frame, Unknowns, points_of
+from mover.fitting.unknowns import Frame, Unknowns, move, points_of, rig_of
 from mover.geometry.camera import project
 from mover.geometry.rotations import axis_angle
 from mover.io.capture.scene_file import write_scene
@@ -380,8 +379,8 @@ def test_the_command_reads_openpose_and_writes_bodies(tmp_path, walk, capsys):
         (folder / f"{k:06d}_keypoints.json").write_text(json.dumps({"people": [person]}))
     (tmp_path / "camera.json").write_text(json.dumps(camera_to_json(CAMERA)))
     out = tmp_path / "bodies.npz"
-    fit([str(folder), "--camera", str(tmp_path / "camera.json"), "--out", str(out), "--fps", "5",
-         "--one-euro", "--drop"])  # fmt: skip
+    words = ["--out", str(out), "--fps", "5", "--one-euro", "--drop"]
+    fit([str(folder), "--camera", str(tmp_path / "camera.json"), *words])
     bodies = read_bodies(out)
     assert bodies.pose is not None
     assert bodies.fps == 5

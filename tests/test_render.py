@@ -10,7 +10,6 @@ import torch
 from little_room import GROUND, room, walkers
 from PIL import Image
 
-from mover.app.pictures.board import set_up, show
 from mover.app.pictures.config import RenderConfig
 from mover.app.pictures.eye import (
     above_eye,
@@ -21,9 +20,17 @@ from mover.app.pictures.eye import (
     video_eye,
 )
 from mover.app.pictures.film import save_film, video_pictures
-from mover.app.pictures.floor import ground_under, shadows
-from mover.app.pictures.paint import NOBODY, PERSON, draw, furniture, joined, people
-from mover.app.pictures.render import Moment, render_result, render_worlds, world_of
+from mover.app.pictures.paint import (
+    NOBODY,
+    PERSON,
+    draw,
+    furniture,
+    ground_under,
+    joined,
+    people,
+    shadows,
+)
+from mover.app.pictures.render import Moment, render_result, render_worlds, set_up, show, world_of
 from mover.core.errors import InputError
 from mover.geometry.camera import project, to_camera
 from mover.geometry.rle import thinned

@@ -18,9 +18,7 @@ from little_room import GROUND, box, camera, mesh_of, piece, room, walkers
 from PIL import Image, ImageColor
 
 from mover.app.pictures.overlay import draw_overlay, save_overlay
-from mover.app.report.content import ReportContent
-from mover.app.report.curves import draw_curve, draw_curves
-from mover.app.report.page import write_report
+from mover.app.report.page import ReportContent, draw_curve, draw_curves, write_report
 from mover.app.report.plan import draw_top, extent_of
 from mover.app.report.scene_view import pack_view
 from mover.app.report.tables import find_changes, metrics_table, objects_table

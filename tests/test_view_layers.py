@@ -11,7 +11,7 @@ from little_room import GROUND, camera, room, walkers
 
 from mover.app.viewer.drawing import cast_of
 from mover.app.viewer.layers import contact_points, depth_points, floor_ellipses, space_surface
-from mover.app.viewer.panel_object import numbers_of
+from mover.app.viewer.panels import numbers_of
 from mover.app.viewer.session import Shown, start_session
 from mover.app.viewer.solve import Stopped, Watch, seen_in
 from mover.core.observe import Energy, Step

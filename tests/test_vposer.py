@@ -12,9 +12,9 @@ from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig
-from mover.fitting.prior import encoded
-from mover.fitting.vposer import (
+from mover.fitting.prior import (
     decoded,
+    encoded,
     gram_schmidt,
     load_vposer,
     nearest_rotations,

@@ -5,16 +5,14 @@ import json
 import logging
 import platform
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from mover import __version__
-from mover.app.report.content import ReportContent
-from mover.app.report.page import write_report
+from mover.app.report.page import ReportContent, write_report
 from mover.bodies.corrected import in_world
 from mover.bodies.parts import parts_of
 from mover.core import records
@@ -36,6 +34,7 @@ from mover.pipeline.presets import Config, with_present_keys
 from mover.stages.contacts.label_contacts import LabelConfig, LabelInputs, label_contacts
 
 log = logging.getLogger(__name__)
+POINTS = 500  # of a trace, about, that run.json keeps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,19 +159,14 @@ def _write_log(room: Room, config: Config, run: Run, origin: Origin) -> None:
         "warnings": list(room.warnings),
         "evidence": [dataclasses.asdict(e) for e in room.evidence],
         "explanations": log_rows(room.explanations),
-        "camera_covariance": _rows(room.covariance),
-        "traces": {name: _thinned(trace) for name, trace in room.traces.items()},
+        "camera_covariance": None if room.covariance is None else room.covariance.tolist(),
+        "traces": {
+            name: trace[:: max(1, len(trace) // POINTS)].tolist()
+            for name, trace in room.traces.items()
+        },
     }
     with replacing(run.folder / "run.json") as part:
         part.write_text(json.dumps(log, indent=1))
-
-
-def _rows(matrix: Tensor | None) -> Sequence[Sequence[float]] | None:
-    return None if matrix is None else matrix.tolist()
-
-
-def _thinned(trace: Tensor, most: int = 500) -> list[float]:
-    return trace[:: max(1, len(trace) // most)].tolist()
 
 
 def read_config(path: Path) -> Config:

@@ -14,7 +14,7 @@ from mover.core.records import map_tensors, record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera
 from mover.geometry.camera import to_world
 from mover.geometry.mesh import vertex_normals
-from mover.geometry.rotations import axis_angle
+from mover.geometry.rotations import axis_angle, rotation_vectors
 from mover.geometry.thinning import farthest_first
 
 LOOSE_POINTS = 16  # vertices that stand for the joints of a body without any
@@ -140,10 +140,8 @@ def _moved_rigidly(bodies: Bodies, by: Correction) -> Bodies:
 
 def _new_pose(pose: BodyPose, by: Correction) -> BodyPose:
     """The parameters of the moved bodies: the root turns about the pelvis."""
-    from scipy.spatial.transform import Rotation
-
     turned = axis_angle(by.turn.double()) @ axis_angle(pose.global_orient.double())
-    orient = torch.from_numpy(Rotation.from_matrix(turned.cpu().numpy()).as_rotvec())
+    orient = rotation_vectors(turned)
     found = dataclasses.replace(
         pose, global_orient=orient.to(pose.global_orient), transl=pose.transl + by.shift,
         body_pose=pose.body_pose + by.angles,

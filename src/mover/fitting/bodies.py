@@ -18,29 +18,33 @@ from mover.fitting.config import FitConfig
 from mover.fitting.energy import Seen, Weighed, body_energy
 from mover.fitting.given import begin_from
 from mover.fitting.prior import ANGLES, PosePrior, encoded
-from mover.fitting.rig import Rig, rig_of
 from mover.fitting.start import Begun, begin
 from mover.fitting.tracks import (
     Window,
     at_stage,
-    rows_at,
+    chosen,
     seen_at_all,
     seen_of,
+    triples_of,
     usable_rows,
     windows_of,
 )
 from mover.fitting.unknowns import (
     EVERYTHING,
     HAND,
+    OF_ROWS,
     Frame,
+    Rig,
     Unknowns,
     hand_angles,
     pelvis_of,
     points_of,
+    rig_of,
     solve,
     turns_of,
 )
 from mover.geometry.camera import project
+from mover.geometry.rotations import rotation_vectors
 
 SHAPES = 10
 EXPRESSION = 10
@@ -130,12 +134,12 @@ def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
     if len(windows) > 1:
         some = windows[0]
         at = dataclasses.replace(at, betas=_stages(at, frame, seen, some, (job, free)).betas)
-        free, windows = tuple(n for n in EVERYTHING if n != "betas"), windows[1:]
+        free, windows = OF_ROWS, windows[1:]
     parts = [_stages(at, frame, seen, window, (job, free)) for window in windows]
     betas = parts[0].betas
     fields = {
         name: torch.cat([getattr(p, name)[w.keep] for p, w in zip(parts, windows, strict=True)])
-        for name in ("turn", "code", "place", "hands", "face")
+        for name in OF_ROWS
     }
     back = torch.argsort(torch.cat([w.rows[w.keep] for w in windows]))
     fields = {name: value[back] for name, value in fields.items()}
@@ -166,8 +170,12 @@ def _stages(
 ) -> Unknowns:
     """All stages over some of the rows."""
     job, free = what
-    at, frame, seen = rows_at(at, frame, seen, window, job.config)
-    stages = job.config.stages
+    rows, stages = window.rows, job.config.stages
+    some = rows_of(job.inputs.keypoints, rows)
+    seen = chosen(seen, rows, triples_of(some.frame, some.person, some.fps, job.config))
+    at = dataclasses.replace(at, **{name: getattr(at, name)[rows] for name in OF_ROWS})
+    frame = Frame(frame.rig, frame.root[rows], frame.person[rows])
+    extremities = any("index" in name or name.startswith("face_") for name in job.names)
     for index, stage in enumerate(stages):
         here = at_stage(seen, job.names, stage)
         by = Weighed(stage, job.config, job.inputs.prior.decode, job.inputs.prior.width > 0)
@@ -175,16 +183,11 @@ def _stages(
         def energy(u: Unknowns, here: Seen = here, by: Weighed = by) -> Energy:
             return body_energy(u, frame, here, by)
 
-        if len(stages) > 1 and index == len(stages) - 1 and not _extremities(job):
+        if len(stages) > 1 and index == len(stages) - 1 and not extremities:
             continue
         at = solve(energy, at, stage.steps, free)
         job.observe(Step("fit_bodies", index, len(stages)))
     return at
-
-
-def _extremities(job: _Job) -> bool:
-    """Whether hands or faces are seen."""
-    return any("index" in name or name.startswith("face_") for name in job.names)
 
 
 # What was solved, as bodies.
@@ -218,19 +221,11 @@ def pose_of(at: Unknowns, frame: Frame, model: Model, prior: PosePrior) -> BodyP
         model=model.name,
         gender=model.gender if isinstance(model, SmplBody) else "neutral",
         betas=betas,
-        global_orient=_vectors(turns_of(at, frame, angles)[:, 0]),
+        global_orient=rotation_vectors(turns_of(at, frame, angles)[:, 0]),
         body_pose=body,
         transl=pelvis_of(at) - rest,
         extra=extra,
     )
-
-
-def _vectors(turns: Float[Tensor, "bodies 3 3"]) -> Float[Tensor, "bodies 3"]:
-    """Axis-angle vectors of rotations [rad]."""
-    from scipy.spatial.transform import Rotation
-
-    vectors = Rotation.from_matrix(turns.detach().double().cpu().numpy()).as_rotvec()
-    return torch.from_numpy(vectors).to(turns)
 
 
 def bodies_of(pose: BodyPose, model: BodyModel, keypoints: Keypoints) -> Bodies:

@@ -22,8 +22,7 @@ from mover.core.observe import Energy
 from mover.core.records import record
 from mover.energy.minimize import weigh
 from mover.fitting.config import FitConfig, Stage, limit_price
-from mover.fitting.rig import Points
-from mover.fitting.unknowns import Decode, Frame, Unknowns, points_of
+from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, points_of
 from mover.geometry.camera import project
 
 LIFTED = 10.0  # weight of joints that are known in 3D

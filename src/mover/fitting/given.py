@@ -16,10 +16,10 @@ from mover.core.errors import InputError
 from mover.core.types import Bodies, Keypoints
 from mover.fitting.config import FitConfig, Stage, resting
 from mover.fitting.energy import Seen, Weighed, body_energy
-from mover.fitting.prior import same
-from mover.fitting.rig import Rig
-from mover.fitting.start import BEFORE, Begun, chosen, placed, torso_first, unknowns_at
-from mover.fitting.unknowns import Frame, place_of, points_of, solve
+from mover.fitting.prior import nearest_rotations, same
+from mover.fitting.start import Begun, before, unknowns_at, where_seen
+from mover.fitting.tracks import chosen
+from mover.fitting.unknowns import Frame, Rig, points_of, solve
 from mover.geometry.camera import project
 from mover.geometry.rotations import axis_angle
 
@@ -140,12 +140,8 @@ def _placed(
 ) -> Begun:
     """Bodies in these poses where the camera sees them."""
     names = [LAYOUTS[by[0].layout][k] for k in rig.keypoints.tolist()]
-    before = angles.new_tensor([[0, 0, BEFORE]]).expand(len(angles), -1)
-    at = unknowns_at(angles, before, (1, 1))
     frame = Frame(rig, root, torch.zeros(len(angles), dtype=torch.long))
-    found = points_of(at, frame, same).keypoints - before[:, None]
-    pelvis = placed(found, seen.pixels, torso_first(seen.weight, names), seen.K)
-    at = dataclasses.replace(at, place=place_of(pelvis))
+    at = where_seen(unknowns_at(angles, before(angles)), frame, seen, names)
     return Begun(at, root, angles, torch.full_like(seen.spread, math.radians(by[1].near)))
 
 
@@ -167,7 +163,7 @@ def _lifted(
     person = torch.zeros(len(rows), dtype=torch.long)
     eye = torch.eye(3).to(given).expand(len(rows), -1, -1)
     middle = given[:, 0]
-    at = unknowns_at(angles, middle, (1, 1))
+    at = unknowns_at(angles, middle)
     with torch.no_grad():
         own = points_of(at, Frame(rig, eye, person), same).joints[:, : len(BODY)]
     root = _trunk_turn(own, given)
@@ -188,7 +184,4 @@ def _trunk_turn(
     """The rotation that lays one trunk onto the other (Kabsch)."""
     index = [BODY.index(name) for name in TRUNK]
     a, b = own[:, index] - own[:, :1], given[:, index] - given[:, :1]
-    u, _, vt = torch.linalg.svd(b.mT @ a)
-    flip = torch.ones_like(u[:, 0])
-    flip = torch.cat([flip[:, :2], torch.linalg.det(u @ vt)[:, None]], -1)
-    return (u * flip[:, None]) @ vt
+    return nearest_rotations(b.mT @ a)

@@ -15,13 +15,13 @@ from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skeleton import BODY
-from mover.core.records import record, rows_of
+from mover.core.records import record
 from mover.core.types import Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage, resting
 from mover.fitting.energy import Seen, Weighed, body_energy
-from mover.fitting.rig import Rig
-from mover.fitting.tracks import best_path, every_so_often, tracks_of
-from mover.fitting.unknowns import Frame, Unknowns, place_of, points_of, solve
+from mover.fitting.prior import same
+from mover.fitting.tracks import best_path, chosen, every_so_often, tracks_of
+from mover.fitting.unknowns import OF_ROWS, Frame, Rig, Unknowns, place_of, points_of, solve
 from mover.geometry.rotations import rot_x, rot_y, rot_z
 
 YAWS = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)
@@ -73,14 +73,24 @@ def guesses(like: Tensor) -> list[Guess]:
     return upright + [Guess(stand, turn @ side, False) for side in sides for turn in turns]
 
 
-def unknowns_at(
-    pose: Float[Tensor, "bodies code"], pelvis: Float[Tensor, "bodies 3"], shapes: tuple[int, int]
-) -> Unknowns:
-    """Bodies at rest but for this pose and place; `shapes` is people, numbers of shape."""
+def before(pose: Float[Tensor, "bodies code"]) -> Float[Tensor, "bodies 3"]:
+    """A place in front of the camera for each body [m]."""
+    return pose.new_tensor([[0, 0, BEFORE]]).expand(len(pose), -1)
+
+
+def unknowns_at(pose: Float[Tensor, "bodies code"], pelvis: Float[Tensor, "bodies 3"]) -> Unknowns:
+    """Bodies at rest but for this pose and place, all of one person's usual shape."""
     none = pose.new_zeros(len(pose), 0)
     return Unknowns(
-        torch.zeros_like(pelvis), pose, place_of(pelvis), pose.new_zeros(shapes), none, none
+        torch.zeros_like(pelvis), pose, place_of(pelvis), pose.new_zeros(1, 1), none, none
     )
+
+
+def where_seen(at: Unknowns, frame: Frame, seen: Seen, names: list[str]) -> Unknowns:
+    """Bodies that are `before` the camera, put where it sees their keypoints."""
+    origin = points_of(at, frame, same).keypoints - before(at.code)[:, None]
+    pelvis = placed(origin, seen.pixels, torso_first(seen.weight, names), seen.K)
+    return dataclasses.replace(at, place=place_of(pelvis))
 
 
 def placed(
@@ -164,15 +174,6 @@ def begin(keypoints: Keypoints, seen: Seen, rig: Rig, camera: Camera, config: Fi
     return Begun(at, root, centre, seen.spread)
 
 
-def chosen(seen: Seen, rows: Int[Tensor, " rows"]) -> Seen:
-    """Some rows, without neighbours."""
-    triples = dataclasses.replace(
-        seen.triples, rows=seen.triples.rows[:0], share=seen.triples.share[:0],
-        expected=seen.triples.expected[:0],
-    )  # fmt: skip
-    return dataclasses.replace(rows_of(seen, rows, "bodies"), triples=triples)
-
-
 def _tried(
     guess: Guess,
     root: Float[Tensor, "3 3"],
@@ -184,28 +185,21 @@ def _tried(
     rows = len(seen.pixels)
     body = guess.pose.expand(rows, -1)
     person = torch.zeros(rows, dtype=torch.long)
-    at = unknowns_at(body, body.new_tensor([[0, 0, BEFORE]]).expand(rows, -1), (1, 1))
+    at = unknowns_at(body, before(body))
     seen = dataclasses.replace(seen, centre=guess.pose.expand(rows, -1))
     frame = Frame(rig, root.expand(rows, -1, -1), person)
     if guess.upright:
-        flat = points_of(at, frame, _same).keypoints
+        flat = points_of(at, frame, same).keypoints
         frame = Frame(rig, rot_z(tilt_of(flat, seen, names)) @ frame.root, person)
-    found = points_of(at, frame, _same).keypoints
-    origin = found - found.new_tensor([0, 0, BEFORE])
-    pelvis = placed(origin, seen.pixels, torso_first(seen.weight, names), seen.K)
-    at = dataclasses.replace(at, place=place_of(pelvis))
-    by = Weighed(START, config, _same, learned=False)
+    at = where_seen(at, frame, seen, names)
+    by = Weighed(START, config, same, learned=False)
     at = solve(
         lambda u: body_energy(u, frame, seen, by), at, config.start_steps, ("turn", "code", "place")
     )
     with torch.no_grad():
         cost = body_energy(at, frame, seen, by).per_item / START.pose**2
-        joints = points_of(at, frame, _same).joints[:, :22]
+        joints = points_of(at, frame, same).joints[:, :22]
     return at, frame.root, cost, joints
-
-
-def _same(code: Tensor) -> Tensor:
-    return code
 
 
 def _followed(
@@ -229,7 +223,6 @@ def _picked(
 ) -> Unknowns:
     """For each row, the unknowns of its hypothesis."""
     fields = {
-        name: torch.stack([getattr(at, name) for at in tries])[best, nearest]
-        for name in ("turn", "code", "place", "hands", "face")
+        name: torch.stack([getattr(at, name) for at in tries])[best, nearest] for name in OF_ROWS
     }
     return dataclasses.replace(tries[0], **fields)

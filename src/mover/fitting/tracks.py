@@ -12,10 +12,11 @@ from mover.core.records import record, rows_of
 from mover.core.types import Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage, resting, spreads
 from mover.fitting.energy import Seen, Triples
-from mover.fitting.rig import Rig
-from mover.fitting.unknowns import Frame, Unknowns
+from mover.fitting.unknowns import Rig
 
 MARGIN = 20  # rows of its neighbours that a stretch solves as well, at most
+ALONE = Triples(torch.zeros(0, 3, dtype=torch.long), torch.zeros(0), torch.zeros(0))
+"""Nobody has neighbours in time."""
 
 
 @record
@@ -25,9 +26,6 @@ class Window:
     rows: Int[Tensor, " rows"]
     keep: Bool[Tensor, " rows"]
     """Rows that are taken from this window; its neighbours have the others."""
-    frame: Int[Tensor, " rows"]
-    person: Int[Tensor, " rows"]
-    fps: float | None
 
 
 def windows_of(keypoints: Keypoints, config: FitConfig) -> list[Window]:
@@ -35,33 +33,22 @@ def windows_of(keypoints: Keypoints, config: FitConfig) -> list[Window]:
     count = len(keypoints.frame)
     order = torch.argsort(keypoints.frame, stable=True)
     if count <= config.chunk:
-        return [_window(order, torch.ones(count, dtype=torch.bool), keypoints)]
+        return [Window(order, torch.ones(count, dtype=torch.bool))]
     spread = torch.linspace(0, count - 1, config.chunk // 2).round().long().unique()
-    found = [_window(order[spread], torch.ones(len(spread), dtype=torch.bool), keypoints)]
+    found = [Window(order[spread], torch.ones(len(spread), dtype=torch.bool))]
     margin = min(MARGIN, config.chunk // 4)
     inner = max(1, config.chunk - 2 * margin)
     for first in range(0, count, inner):
         low, high = max(0, first - margin), min(count, first + inner + margin)
         place = torch.arange(low, high)
         keep = (place >= first) & (place < first + inner)
-        found.append(_window(order[low:high], keep, keypoints))
+        found.append(Window(order[low:high], keep))
     return found
 
 
-def _window(rows: Tensor, keep: Tensor, keypoints: Keypoints) -> Window:
-    return Window(rows, keep, keypoints.frame[rows], keypoints.person[rows], keypoints.fps)
-
-
-def rows_at(
-    at: Unknowns, frame: Frame, seen: Seen, window: Window, config: FitConfig
-) -> tuple[Unknowns, Frame, Seen]:
-    """The rows of a window."""
-    rows = window.rows
-    fields = {n: getattr(at, n)[rows] for n in ("turn", "code", "place", "hands", "face")}
-    triples = triples_of(window.frame, window.person, window.fps, config)
-    part = dataclasses.replace(rows_of(seen, rows, "bodies"), triples=triples)
-    small = Frame(frame.rig, frame.root[rows], frame.person[rows])
-    return dataclasses.replace(at, **fields), small, part
+def chosen(seen: Seen, rows: Int[Tensor, " rows"], triples: Triples = ALONE) -> Seen:
+    """Some rows, with these neighbours."""
+    return dataclasses.replace(rows_of(seen, rows, "bodies"), triples=triples)
 
 
 # Rows of the same person in the order of time.
@@ -85,10 +72,9 @@ def triples_of(
     config: FitConfig,
 ) -> Triples:
     """Neighbours in time of each person; none of unordered images and across long gaps."""
-    none = torch.zeros(0, 3, dtype=torch.long)
     if fps is None:
-        return Triples(none, torch.zeros(0), torch.zeros(0))
-    found = [none]
+        return ALONE
+    found = [ALONE.rows]
     for rows in tracks_of(frame, person):
         found.append(torch.stack([rows[:-2], rows[1:-1], rows[2:]], 1))
     triples = torch.cat(found)

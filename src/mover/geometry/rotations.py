@@ -37,6 +37,14 @@ def axis_angle(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]
     return eye + first * skew + second * (skew @ skew)
 
 
+def rotation_vectors(turns: Float[Tensor, "rows 3 3"]) -> Float[Tensor, "rows 3"]:
+    """Axis-angle vectors of rotation matrices [rad]; nothing is differentiated."""
+    from scipy.spatial.transform import Rotation
+
+    found = Rotation.from_matrix(turns.detach().cpu().double().numpy()).as_rotvec()
+    return torch.from_numpy(found).to(turns)
+
+
 def wrap(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The same angle in (-pi, pi] [rad]."""
     return torch.atan2(angle.sin(), angle.cos())

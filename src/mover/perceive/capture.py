@@ -227,7 +227,9 @@ def lens_of(
         return of_view(fov, size, "--fov"), None
     focal = None if photo is None else exif_focal(photo, size)
     if focal is not None:
-        return _centred(focal, size), None
+        w, h = size
+        fields = {"w": w, "h": h, "fl_x": focal, "fl_y": focal, "cx": w / 2, "cy": h / 2}
+        return At(fields, "EXIF"), None
     text = (
         f"the lens is not known: {USUAL:.0f} degrees across are assumed; give --camera FILE or "
         "--fov DEGREES (GeoCalib, MoGe and others tell both lens and tilt)"
@@ -248,12 +250,6 @@ def exif_focal(photo: Path, size: tuple[int, int]) -> float | None:
     if found is None or not 1 <= float(found) <= 2000:
         return None
     return float(found) / FULL_FRAME * math.hypot(*size)
-
-
-def _centred(focal: float, size: tuple[int, int]) -> At:
-    w, h = size
-    fields = {"w": w, "h": h, "fl_x": focal, "fl_y": focal, "cx": w / 2, "cy": h / 2}
-    return At(fields, "EXIF")
 
 
 def read_picture_of(folder: Path, depth: Path | None = None) -> Picture:

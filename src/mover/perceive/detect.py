@@ -192,9 +192,9 @@ def finds_of(
     codes: list[bytes] = []
     rows: list[tuple[int, str, float]] = []
     for frame, one in zip(frames, found, strict=True):
-        maps = one["segmentation"]
+        maps = one["segmentation"].cpu()
         for index, info in enumerate(one["segments_info"]):
-            mask = _binary(maps, index, int(info["id"]))
+            mask = maps[index] > 0 if maps.dim() == 3 else maps == int(info["id"])  # a map of ids
             if int(mask.sum()) < max(1, least * mask.numel()):
                 continue
             codes.append(encode(mask))
@@ -205,13 +205,6 @@ def finds_of(
         tuple(r[1] for r in rows),
         torch.tensor([r[2] for r in rows], dtype=torch.float32),
     )
-
-
-def _binary(maps: Any, index: int, name: int) -> Bool[Tensor, "h w"]:  # noqa: ANN401
-    """One mask of a stack of masks, or of a map of ids where the network gives no stack."""
-    if maps.dim() == 3:
-        return maps[index].cpu() > 0
-    return maps.cpu() == name
 
 
 def joined_finds(parts: Sequence[Finds]) -> Finds:

@@ -250,7 +250,8 @@ def _judged(
     from_first: Tensor, agree: Tensor, size: tuple[int, int], config: SteadyConfig
 ) -> Drift:
     """Choose the reference frame and say what the camera did."""
-    points = _points(size)
+    y, x = (torch.linspace(0, float(n), GRID) for n in size)
+    points = torch.cartesian_prod(x, y)
     places = moved(from_first, points)
     middle = places.median(0).values
     reference = int((places - middle).norm(dim=-1).amax(-1).argmin())
@@ -340,12 +341,6 @@ def seen_share(drift: Drift, frame: int, size: tuple[int, int]) -> Float[Tensor,
     if drift.verdict == "still":
         return torch.ones(size)
     return torch.from_numpy(_known(size, drift.H[frame]))
-
-
-def _points(size: tuple[int, int]) -> Float[Tensor, "points 2"]:
-    """An even grid over the image [px]."""
-    y, x = (torch.linspace(0, float(n), GRID) for n in size)
-    return torch.cartesian_prod(x, y)
 
 
 def _grey(path: Path, scale: float) -> Grey:

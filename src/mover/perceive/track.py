@@ -92,7 +92,8 @@ def track_people(inputs: SegmentInputs, config: TrackConfig, observe: Observer =
                     codes.append(encode(mask))
                     rows.append((inputs.first + int(output.frame_idx), int(name)))
             observe(Step("track_people", int(output.frame_idx) + 1, len(frames)))
-    return _tracks(codes, rows, size, used)
+    frame, person = (torch.tensor([r[k] for r in rows], dtype=torch.long) for k in (0, 1))
+    return Tracks(Masks(*size, tuple(codes)), frame, person, used)
 
 
 def seeded(inputs: SegmentInputs, same: float) -> tuple[Bool[Tensor, "people h w"], list[int], int]:
@@ -189,13 +190,6 @@ def full_masks(logits: Tensor, size: tuple[int, int]) -> Bool[Tensor, "people h 
         logits.reshape(-1, 1, *logits.shape[-2:]).float(), size, mode="bilinear"
     )
     return (wide[:, 0] > 0).cpu()
-
-
-def _tracks(
-    codes: list[bytes], rows: list[tuple[int, int]], size: tuple[int, int], used: int
-) -> Tracks:
-    frame, person = (torch.tensor([r[k] for r in rows], dtype=torch.long) for k in (0, 1))
-    return Tracks(Masks(*size, tuple(codes)), frame, person, used)
 
 
 @record

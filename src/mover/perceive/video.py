@@ -203,14 +203,11 @@ def load_frame(path: Path) -> Float[Tensor, "h w 3"]:
 
 def _rate(source: Path, config: FramesConfig) -> float | None:
     """Frames a second of what is taken."""
-    known = (config.folder_fps or None) if source.is_dir() else _video_rate(source)
+    known = config.folder_fps or None
+    if not source.is_dir():
+        with _opened(source) as container:
+            known = float(container.streams.video[0].average_rate or 30.0)
     return known if known is None or not config.fps else min(known, config.fps)
-
-
-def _video_rate(source: Path) -> float:
-    with _opened(source) as container:
-        rate = container.streams.video[0].average_rate
-    return float(rate) if rate else 30.0
 
 
 def _opened(source: Path) -> Any:  # noqa: ANN401

@@ -83,12 +83,11 @@ def on_ray(jobs: Sequence[Job], options: EngineOptions, out: Path) -> Iterator[O
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ray: Any = importlib.import_module("ray")
     asked = options.ray
-    local = (
-        {"num_cpus": options.workers * max(asked.cpus, 1e-3)} if asked.address == "local" else {}
-    )
+    cores = max(1, round(options.workers * max(asked.cpus, 1e-3)))
+    local: dict[str, Any] = {"num_cpus": cores} if asked.address == "local" else {}
     ray.init(
         address=asked.address, include_dashboard=False if local else None, log_to_driver=False,
-        logging_level=logging.ERROR, ignore_reinit_error=True, **_whole(local),
+        logging_level=logging.ERROR, ignore_reinit_error=True, **local,
     )  # fmt: skip
     share = {"num_cpus": asked.cpus, "num_gpus": asked.gpus, "max_retries": asked.retries}
     task = ray.remote(**share)(run_job)
@@ -106,10 +105,6 @@ def on_ray(jobs: Sequence[Job], options: EngineOptions, out: Path) -> Iterator[O
             yield _answer(waiting.pop(ready[0]), ray, ready[0])
     finally:
         ray.shutdown()
-
-
-def _whole(local: dict[str, float]) -> dict[str, int]:
-    return {key: max(1, round(value)) for key, value in local.items()}
 
 
 def _answer(job: Job, ray: Any, handle: Any) -> Outcome:  # noqa: ANN401

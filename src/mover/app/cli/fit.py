@@ -65,8 +65,7 @@ def fit_into(args: FitArgs) -> None:
     from mover.bodies import load_model
     from mover.fitting.bodies import FitInputs, fit_bodies
     from mover.fitting.one_euro import smooth_keypoints
-    from mover.fitting.prior import ANGLES
-    from mover.fitting.vposer import load_vposer, vposer_prior
+    from mover.fitting.prior import ANGLES, load_vposer, vposer_prior
     from mover.io.capture.bodies_file import read_bodies, write_bodies
 
     if args.fps is not None and not args.fps > 0:

@@ -99,13 +99,6 @@ def part_of(eye: RenderCamera, left: int, top: int, right: int, bottom: int) -> 
     return RenderCamera(eye.K - shift, eye.R_eye_world, eye.t_world_eye, *size)
 
 
-def finer(eye: RenderCamera, times: int) -> RenderCamera:
-    """The same eye with `times` as many pixels along each side."""
-    K = eye.K * torch.tensor([times, times, 1.0])[:, None]
-    size = (times * eye.width, times * eye.height)
-    return RenderCamera(K, eye.R_eye_world, eye.t_world_eye, *size)
-
-
 def floor_seen(eye: RenderCamera, height: float) -> Float[Tensor, "h w 3"]:
     """Where the ray of each pixel meets the plane y = `height` [m]; inf where it never does."""
     rows, columns = torch.arange(eye.height) + 0.5, torch.arange(eye.width) + 0.5

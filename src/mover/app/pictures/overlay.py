@@ -11,7 +11,6 @@ from torch.nn.functional import avg_pool2d
 
 from mover.app.pictures.eye import RenderCamera, camera_sized
 from mover.app.pictures.film import pixels, save_still, sized
-from mover.app.pictures.floor import ground_under, metre_lines
 from mover.app.pictures.paint import (
     FINE,
     NOBODY,
@@ -19,7 +18,9 @@ from mover.app.pictures.paint import (
     draw,
     fine_eye,
     furniture,
+    ground_under,
     joined,
+    metre_lines,
     over,
     paint,
     skin,

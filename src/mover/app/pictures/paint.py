@@ -1,15 +1,15 @@
-"""Surfaces become a sheet of shaded, outlined pixels that lies over any picture."""
+"""Surfaces become a sheet of shaded, outlined pixels over any picture; below them lies a floor."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d, normalize
+from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d, normalize
 
-from mover.app.pictures.eye import RenderCamera, finer, part_of, seen_from
+from mover.app.pictures.eye import RenderCamera, floor_seen, seen_from
 from mover.core.colours import colour, person_colour
-from mover.core.records import record
+from mover.core.records import map_tensors, record
 from mover.core.types import Bodies, Scene
-from mover.geometry.mesh import vertex_normals
+from mover.geometry.mesh import face_normals, vertex_normals
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 
@@ -71,7 +71,7 @@ def furniture(scene: Scene) -> Surfaces:
     for index, piece in enumerate(scene.objects):
         mesh = place_object(piece)
         verts, faces = mesh.verts.detach().float(), mesh.faces.long()
-        parts.append(_coloured(verts, faces, _face_normals(verts, faces), colour(index), index))
+        parts.append(_coloured(verts, faces, face_normals(verts, faces), colour(index), index))
     return joined(parts)
 
 
@@ -131,11 +131,7 @@ def nearer(a: Drawn, b: Drawn) -> Drawn:
 
 def cut(drawn: Drawn, left: int, top: int, right: int, bottom: int) -> Drawn:
     """A window of it [px]."""
-    rows, columns = slice(top, bottom), slice(left, right)
-    return Drawn(
-        drawn.depth[rows, columns], drawn.owner[rows, columns], drawn.normal[rows, columns],
-        drawn.tint[rows, columns],
-    )  # fmt: skip
+    return map_tensors(lambda pixels: pixels[top:bottom, left:right], drawn)
 
 
 def paint(drawn: Drawn, ink: Ink) -> Float[Tensor, "height width 4"]:
@@ -160,13 +156,9 @@ def paint(drawn: Drawn, ink: Ink) -> Float[Tensor, "height width 4"]:
 
 def fine_eye(eye: RenderCamera) -> RenderCamera:
     """The eye whose pictures `paint` shrinks."""
-    return finer(eye, FINE)
-
-
-def fine_part(eye: RenderCamera, window: tuple[int, int, int, int]) -> RenderCamera:
-    """The fine eye of a window (left, top, right, bottom) of the coarse picture [px]."""
-    left, top, right, bottom = (FINE * edge for edge in window)
-    return part_of(fine_eye(eye), left, top, right, bottom)
+    K = eye.K * torch.tensor([FINE, FINE, 1.0])[:, None]
+    size = (FINE * eye.width, FINE * eye.height)
+    return RenderCamera(K, eye.R_eye_world, eye.t_world_eye, *size)
 
 
 def over(
@@ -185,11 +177,6 @@ def _coloured(
     )
 
 
-def _face_normals(verts: Tensor, faces: Tensor) -> Float[Tensor, "faces 3"]:
-    a, b, c = verts[faces].unbind(1)
-    return normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-
-
 def _lines(drawn: Drawn, thickness: int) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
     """Pixels beside another owner, and those beside a crease of their own object."""
     outline, crease = torch.zeros_like(drawn.owner).bool(), torch.zeros_like(drawn.owner).bool()
@@ -204,3 +191,92 @@ def _lines(drawn: Drawn, thickness: int) -> tuple[Bool[Tensor, "h w"], Bool[Tens
         crease.narrow(axis, 0, n).logical_or_(bent & ~border & stiff)
     wide = max_pool2d(outline[None, None].float(), 2 * thickness - 1, 1, thickness - 1)[0, 0] > 0
     return wide & (drawn.owner != NOBODY), crease
+
+
+CELL = 0.03  # [m], of the map of shadows
+MOST = 600  # cells along a side of it at most
+BELOW = 60.0  # [m], from where the undersides are seen: nearly in parallel
+REACH = 0.35  # [m], height over the floor at which a shadow has faded to 1/e
+SOFT = (2, 7)  # cells that a shadow is blurred by: at the contact, around it
+DARK = 0.55  # of the darkest shadow
+METRE = 0.5  # opacity of the metre lines
+EDGE = 1.2  # [m], how far the floor reaches beyond what stands on it
+SKY, FLOOR = (0.955, 0.965, 0.98), (0.80, 0.785, 0.76)
+
+
+@record
+class Ground:
+    """The floor's height and what part of it is shown."""
+
+    height: float
+    """[m]"""
+    low: Float[Tensor, "2"]
+    """Smallest x and z [m]."""
+    high: Float[Tensor, "2"]
+    """Largest x and z [m]."""
+
+
+def ground_under(points: Float[Tensor, "points 3"], height: float) -> Ground:
+    """The floor under everything."""
+    flat = points[:, [0, 2]]
+    return Ground(height, flat.amin(0) - EDGE, flat.amax(0) + EDGE)
+
+
+def backdrop(eye: RenderCamera, ground: Ground) -> Float[Tensor, "h w 3"]:
+    """A plain room: a floor that ends softly, and light around it."""
+    spread = torch.linspace(1.0, 0.93, eye.height)[:, None, None]
+    sky = (torch.tensor(SKY) * spread).expand(eye.height, eye.width, 3)
+    points = floor_seen(eye, ground.height)[..., [0, 2]]
+    return sky.lerp(torch.tensor(FLOOR), 0.75 * _inside(points, ground)[..., None])
+
+
+def metre_lines(eye: RenderCamera, ground: Ground, brightness: float) -> Float[Tensor, "h w 4"]:
+    """A sheet with lines at whole metres of the world, of one brightness in [0, 1]."""
+    points = floor_seen(eye, ground.height)[..., [0, 2]]
+    points = torch.where(points.isfinite(), points, 1e6)
+    steps = [torch.gradient(points, dim=d)[0].abs() for d in (0, 1)]
+    spread = torch.maximum(*steps).clamp_min(1e-6)
+    near = ((points - points.round()).abs() / spread).amin(-1)
+    coarse = (1 - spread.amax(-1) * 4).clamp(0, 1)
+    alpha = METRE * (1.2 - near).clamp(0, 1) * coarse * _inside(points, ground)
+    return torch.cat([(brightness * alpha)[..., None].expand(-1, -1, 3), alpha[..., None]], -1)
+
+
+def shadows(eye: RenderCamera, ground: Ground, surfaces: Surfaces) -> Float[Tensor, "h w 4"]:
+    """A black sheet: dark where an underside is near the floor."""
+    sheet = torch.zeros(eye.height, eye.width, 4)
+    if not len(surfaces.faces):
+        return sheet
+    flat = surfaces.verts[:, [0, 2]]
+    low, high = flat.amin(0) - 0.4, flat.amax(0) + 0.4
+    darkness = _shadow_map(surfaces, ground.height, low, high)
+    points = floor_seen(eye, ground.height)[..., [0, 2]]
+    where = ((points - low) / (high - low) * 2 - 1).nan_to_num(9.0, 9.0, -9.0).clamp(-9, 9)
+    sheet[..., 3] = grid_sample(
+        darkness[None, None], where[None], align_corners=False, padding_mode="zeros"
+    )[0, 0]
+    return sheet
+
+
+def _shadow_map(
+    surfaces: Surfaces, floor: float, low: Tensor, high: Tensor
+) -> Float[Tensor, "rows columns"]:
+    """Darkness of the floor between two corners, x along the columns and z along the rows."""
+    cell = max(CELL, float((high - low).max()) / MOST)
+    columns, rows = ((high - low) / cell).ceil().int().tolist()
+    scale = torch.tensor([columns, rows]) / (high - low)
+    x, y, z = surfaces.verts.unbind(-1)
+    depth = BELOW + (y - floor).clamp_min(0)
+    middle = (low + high) / 2
+    straight = torch.stack([(x - middle[0]) * depth, (z - middle[1]) * depth, depth], -1)
+    K = torch.tensor([[scale[0], 0, columns / 2], [0, scale[1], rows / 2], [0, 0, 1]])
+    seen, face = first_hit(straight, surfaces.faces, K, (rows, columns))
+    dark = torch.where(face >= 0, (-(seen - BELOW) / REACH).exp(), 0.0)[None, None]
+    near, wide = (avg_pool2d(avg_pool2d(dark, 2 * r + 1, 1, r), 2 * r + 1, 1, r) for r in SOFT)
+    return (DARK * (0.6 * near + 0.4 * wide))[0, 0]
+
+
+def _inside(points: Float[Tensor, "h w 2"], ground: Ground) -> Float[Tensor, "h w"]:
+    """1 on the shown part of the floor, fading to 0 at its border."""
+    gap = torch.minimum(points - ground.low, ground.high - points).amin(-1)
+    return (gap.nan_to_num(-1.0, -1.0, -1.0) / EDGE).clamp(0, 1)

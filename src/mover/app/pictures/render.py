@@ -1,5 +1,6 @@
 """Draw a result without a screen: over the video, from above or from around, as PNG or MP4."""
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,9 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mover.app.pictures.board import Tiles, set_up, show, with_base
 from mover.app.pictures.config import RenderConfig
-from mover.app.pictures.eye import RenderCamera, above_eye, spinning_eyes, video_eye
+from mover.app.pictures.eye import (
+    RenderCamera,
+    above_eye,
+    part_of,
+    seen_from,
+    spinning_eyes,
+    video_eye,
+)
 from mover.app.pictures.film import (
     FILM,
     STILL,
@@ -23,9 +30,27 @@ from mover.app.pictures.film import (
     video_library,
     video_pictures,
 )
-from mover.app.pictures.floor import Ground, ground_under
-from mover.app.pictures.paint import Surfaces, furniture, people
+from mover.app.pictures.paint import (
+    FINE,
+    Drawn,
+    Ground,
+    Ink,
+    Surfaces,
+    backdrop,
+    cut,
+    draw,
+    fine_eye,
+    furniture,
+    ground_under,
+    metre_lines,
+    nearer,
+    over,
+    paint,
+    people,
+    shadows,
+)
 from mover.core.errors import InputError
+from mover.core.records import record
 from mover.core.types import Bodies, Scene
 from mover.geometry.placement import place_object
 from mover.io.capture.bodies_file import read_bodies
@@ -77,7 +102,8 @@ def render_result(out: Path, path: Path, config: RenderConfig, capture: Path | N
         raise InputError(f"--to: {path.name!r} ends in {ending!r}, expected .png, .jpg or .mp4")
     if ending in FILM:
         video_library(f"--to {path.name}")
-    worlds = [_world(out, name, config) for name in _names(config)]
+    names = ("initial", "result") if config.scene == "both" else (config.scene,)
+    worlds = [_world(out, name, config) for name in names]
     moments = _moments(worlds, config, still=ending in STILL)
     pictures = render_worlds(worlds, moments, config, capture)
     if ending in STILL:
@@ -94,10 +120,6 @@ def render_worlds(
     for row in zip(*panels, strict=True):
         named = [captioned(p, w.caption) for p, w in zip(row, worlds, strict=True)]
         yield torch.cat(named if len(row) > 1 else list(row), 1)
-
-
-def _names(config: RenderConfig) -> tuple[str, ...]:
-    return ("initial", "result") if config.scene == "both" else (config.scene,)
 
 
 def _world(out: Path, name: str, config: RenderConfig) -> World:
@@ -217,3 +239,107 @@ def _reference(capture: Path, size: tuple[int, int]) -> Float[Tensor, "h w 3"]:
     if image is None:
         return torch.full((size[1], size[0], 3), 0.9)
     return sized(Image.fromarray(pixels(image)), size)
+
+
+OPACITY = 0.72  # of surfaces over a picture
+THICK = 800  # [px] of width for each coarse pixel of an outline's thickness
+RIM = 3  # [px] around a window that are drawn but not used: lines need neighbours
+NEAR = 0.1  # [m], people nearer to the eye than this fill the whole picture
+SHADE = 0.5  # [m], how far the shadow of people reaches
+
+
+@record
+class Tiles:
+    """What does not move, drawn once."""
+
+    eye: RenderCamera
+    ground: Ground
+    ink: Ink
+    still: Drawn
+    """The furniture in fine pixels."""
+    floor: Float[Tensor, "h w 4"]
+    """Shadows of the furniture and metre lines."""
+    sheet: Float[Tensor, "h w 4"]
+    """The furniture."""
+    base: Float[Tensor, "h w 3"]
+    """What is behind."""
+
+
+def set_up(
+    eye: RenderCamera, ground: Ground, still: Surfaces, base: Float[Tensor, "h w 3"] | None = None
+) -> Tiles:
+    """Draw the furniture.
+
+    Args:
+        eye: From where.
+        ground: The floor.
+        still: The furniture.
+        base: A picture of the size of the eye's; None: a plain room.
+    """
+    over_picture = base is not None
+    ink = Ink(OPACITY if over_picture else 1.0, max(1, round(eye.width / THICK)))
+    drawn = draw(still, fine_eye(eye))
+    lines = metre_lines(eye, ground, 1.0 if over_picture else 0.58)
+    floor = lines if over_picture else over(shadows(eye, ground, still), lines)
+    picture = base if base is not None else backdrop(eye, ground)
+    return Tiles(eye, ground, ink, drawn, floor, paint(drawn, ink), picture)
+
+
+def with_base(board: Tiles, base: Float[Tensor, "h w 3"]) -> Tiles:
+    """The same world over another picture."""
+    return dataclasses.replace(board, base=base)  # type: ignore[type-var]
+
+
+def show(board: Tiles, moving: Surfaces | None = None) -> Float[Tensor, "h w 3"]:
+    """The picture, with people in it."""
+    picture = over(board.sheet, over(board.floor, board.base))
+    if moving is None or not len(moving.faces):
+        return picture.clamp(0, 1)
+    window = _window(board, moving)
+    left, top, right, bottom = window
+    if right <= left or bottom <= top:
+        return picture.clamp(0, 1)
+    patch = _patch(board, moving, window)
+    rim = [RIM if edge else 0 for edge in (left, top)]
+    end = [
+        RIM if e < size else 0 for e, size in ((right, board.eye.width), (bottom, board.eye.height))
+    ]
+    inner = patch[rim[1] : bottom - top - end[1], rim[0] : right - left - end[0]]
+    picture[top + rim[1] : bottom - end[1], left + rim[0] : right - end[0]] = inner
+    return picture.clamp(0, 1)
+
+
+def _patch(
+    board: Tiles, moving: Surfaces, window: tuple[int, int, int, int]
+) -> Float[Tensor, "height width 3"]:
+    """The window with people in it."""
+    left, top, right, bottom = window
+    here = (slice(top, bottom), slice(left, right))
+    fine = [FINE * edge for edge in window]
+    moved = draw(moving, part_of(fine_eye(board.eye), *fine))
+    drawn = nearer(cut(board.still, *fine), moved)
+    behind = over(board.floor[here], board.base[here])
+    if board.ink.opacity == 1:
+        behind = over(shadows(part_of(board.eye, *window), board.ground, moving), behind)
+    return over(paint(drawn, board.ink), behind)
+
+
+def _window(board: Tiles, moving: Surfaces) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of what people and their shadows fill [px]."""
+    eye = board.eye
+    flat = moving.verts.clone()
+    flat[:, 1] = board.ground.height
+    around = torch.tensor([[SHADE, 0, SHADE], [-SHADE, 0, SHADE], [SHADE, 0, -SHADE]])
+    around = torch.cat([around, -around[:1]])
+    corners = (flat[:, None] + around).reshape(-1, 3)
+    points = seen_from(eye, torch.cat([moving.verts, corners]))
+    whole = (0, 0, eye.width, eye.height)
+    if float(seen_from(eye, moving.verts)[:, 2].min()) < NEAR:
+        return whole
+    points = points[points[:, 2] > NEAR]
+    pixel = (points @ eye.K.mT)[:, :2] / points[:, 2:]
+    size = torch.tensor([eye.width, eye.height])
+    low = (pixel.amin(0).floor() - RIM).long().clamp_min(0).minimum(size)
+    high = (pixel.amax(0).ceil() + RIM).long().clamp_min(0).minimum(size)
+    (left, top), (right, bottom) = low.tolist(), high.tolist()
+    return left, top, right, bottom

@@ -6,33 +6,76 @@ The page is one file without any address outside it: it opens from disk, today a
 import base64
 import io
 import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import torch
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from mover import __version__
 from mover.app.pictures.film import pixels
 from mover.app.pictures.overlay import WIDEST, canvas, draw_overlay, on_cpu, shrink
-from mover.app.report.content import ReportContent
-from mover.app.report.curves import draw_curves
-from mover.app.report.diagnostics import draw_uncertainty, explanations_list
 from mover.app.report.plan import draw_top, extent_of
 from mover.app.report.scene_view import ReportScene, pack_view
 from mover.app.report.tables import (
     QUANTITIES,
+    Cell,
+    draw_table,
     find_changes,
     metrics_table,
     objects_table,
     settings_of,
-    stage_bars,
     write_quantity,
 )
 from mover.app.report.templates import asset, fill
+from mover.core.colours import colour, css
+from mover.core.explanation import UNKNOWNS, Explanation, Pull
 from mover.core.files import replacing
 from mover.core.records import map_tensors
-from mover.core.types import Scene
+from mover.core.types import Bodies, Scene
+from mover.evaluate.explanation import LEVEL
 from mover.geometry.camera import pitch_roll
+
+
+@dataclass(frozen=True)
+class ReportContent:
+    """Everything that a report can show; what is missing is left out of the page."""
+
+    title: str
+    image: Float[Tensor, "h w 3"] | None
+    """The reference image, in [0, 1]."""
+    initial: Scene
+    result: Scene
+    truth: Scene | None = None
+    initial_bodies: Bodies | None = None
+    """People in the world of `initial`."""
+    bodies: Bodies | None = None
+    """People in the world of `result`."""
+    traces: Mapping[str, Sequence[float]] = field(default_factory=lambda: {})
+    """Total energy before each step, by stage."""
+    metrics: Mapping[str, Any] | None = None
+    """What metrics.json holds."""
+    warnings: tuple[str, ...] = ()
+    stages: Sequence[Mapping[str, Any]] = ()
+    """`name`, `seconds`, `memory` or `peak_memory` [MB] and `kept` of each stage."""
+    config: Mapping[str, Any] = field(default_factory=lambda: {})
+    objects: Sequence[Mapping[str, Any]] = ()
+    """Rows of the table of objects, found by `id`; other keys become columns."""
+    explanations: Sequence[Explanation] = ()
+    """Why each object of `result` stands where it stands, in their order."""
+    command: str = ""
+    """What the user typed."""
+    version: str = __version__
+
+    @property
+    def peopled(self) -> bool:
+        """Whether there is anybody to show."""
+        return any(b is not None and len(b.verts) > 0 for b in (self.initial_bodies, self.bodies))
+
 
 QUALITY = 87  # of a JPEG
 TILES = ("iou3d", "center_error", "contact_f1", "pitch_error")
@@ -73,7 +116,7 @@ def _page(content: ReportContent) -> str:
             ("What holds them", explanations_list(content.explanations)),
         ),
         curves=draw_curves(content.traces),
-        stages=stage_bars(content.stages),
+        longest=max([float(s.get("seconds") or 0) for s in content.stages], default=0.0) or 1.0,
         settings=settings_of(content.config),
         photo="" if image is None else _data_url(shrink(image, WIDEST)),
         view=_view(content),
@@ -153,3 +196,177 @@ def _data_url(image: Float[Tensor, "h w 3"]) -> str:
     file = io.BytesIO()
     Image.fromarray(pixels(image)).save(file, "JPEG", quality=QUALITY, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+WIDTH, HEIGHT = 420.0, 200.0  # [px] of a plot
+LEFT, RIGHT, TOP, BOTTOM = 52.0, 12.0, 12.0, 28.0  # [px] around its frame
+POINTS = 320  # at most so many points are drawn
+DEEPEST = 1e-12  # a curve is drawn down to this share of its highest value
+DECADES = 2.2  # below this many decades, 2 and 5 are ticks too
+
+
+def draw_curves(traces: Mapping[str, Sequence[float]]) -> str:
+    """Plot the total energy of each stage over its iterations on a logarithmic scale."""
+    plots = [
+        {
+            "name": name,
+            "curve": draw_curve(trace),
+            "first": _short(_finite(trace)[0]),
+            "last": _short(_finite(trace)[-1]),
+            "steps": len(trace),
+        }
+        for name, trace in traces.items()
+        if _finite(trace)
+    ]
+    return fill("curves.html", plots=plots) if plots else ""
+
+
+def draw_curve(trace: Sequence[float]) -> str:
+    """One plot; values that have no logarithm are drawn at the lower edge."""
+    pairs = _thinned(trace)
+    low, high = _range([v for _, v in pairs])
+    last = max(1, len(trace) - 1)
+
+    def x(step: float) -> float:
+        return LEFT + (WIDTH - LEFT - RIGHT) * step / last
+
+    def y(value: float) -> float:
+        share = (math.log10(max(value, low)) - math.log10(low)) / math.log10(high / low)
+        return HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * share
+
+    return fill(
+        "curve.svg",
+        width=f"{WIDTH:.0f}",
+        height=f"{HEIGHT:.0f}",
+        left=LEFT,
+        right=WIDTH - RIGHT,
+        floor=HEIGHT - BOTTOM,
+        levels=[
+            {"at": f"{y(v):.1f}", "below": f"{y(v) + 4:.1f}", "text": _short(v)}
+            for v in _ticks(low, high)
+        ],
+        steps=[{"at": f"{x(s):.1f}", "text": s} for s in _steps(last)],
+        line="L".join(f"{x(s):.1f} {y(v):.1f}" for s, v in pairs),
+        start=f"{x(pairs[0][0]):.1f}",
+        end=f"{x(pairs[-1][0]):.1f}",
+    )
+
+
+def _finite(trace: Iterable[float]) -> list[float]:
+    return [v for v in trace if math.isfinite(v)]
+
+
+def _thinned(trace: Sequence[float]) -> list[tuple[int, float]]:
+    """(step, value) at an even stride, the last step always included."""
+    stride = max(1, math.ceil(len(trace) / POINTS))
+    steps = sorted({*range(0, len(trace), stride), len(trace) - 1})
+    return [(s, trace[s]) for s in steps if math.isfinite(trace[s])] or [(0, _finite(trace)[0])]
+
+
+def _range(values: Sequence[float]) -> tuple[float, float]:
+    positive = [v for v in values if v > 0] or [1.0]
+    high = max(positive)
+    low = max(min(positive), high * DEEPEST)
+    pad = max(1.05, (high / low) ** 0.06)
+    return low / pad, high * pad
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    span = math.log10(high / low)
+    marks = (1, 2, 5) if span < DECADES else (1,)
+    if span < 0.35:
+        marks = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    ticks = [m * 10.0**d for d in decades for m in marks if low <= m * 10.0**d <= high]
+    return ticks[:: max(1, math.ceil(len(ticks) / 5))]
+
+
+def _steps(last: int) -> list[int]:
+    raw = last / 4
+    base = 10 ** math.floor(math.log10(max(raw, 1)))
+    step = next((m * base for m in (1, 2, 5, 10) if m * base >= raw), 10 * base)
+    return list(range(0, last + 1, step))
+
+
+def _short(value: float) -> str:
+    """Three significant digits."""
+    if value == 0:
+        return "0"
+    if 1e-3 <= abs(value) < 1e5:
+        digits = max(0, 2 - math.floor(math.log10(abs(value))))
+        text = f"{value:,.{digits}f}"
+        return text.rstrip("0").rstrip(".") if "." in text else text
+    return f"{value:.2g}".replace("e-0", "e-").replace("e+0", "e")
+
+
+LIKELY = math.sqrt(-2 * math.log(1 - LEVEL))  # radius of the ellipse that holds 90 % in the plane
+
+
+def draw_uncertainty(explanations: Sequence[Explanation]) -> str:
+    """Ellipses on the plan: 90 % of where each object stands, dots where else it may stand."""
+    ellipses = [_ellipse(e, css(colour(i))) for i, e in enumerate(explanations)]
+    return fill("uncertainty.svg", ellipses=ellipses)
+
+
+def _ellipse(explanation: Explanation, tint: str) -> dict[str, str]:
+    flat = explanation.covariance[[0, 2]][:, [0, 2]].double()
+    values, axes = torch.linalg.eigh(flat)
+    small, large = (LIKELY * values.clamp_min(0).sqrt()).tolist()
+    turn = math.degrees(math.atan2(float(axes[1, 1]), float(axes[0, 1])))
+    x, z = explanation.facts.place[[0, 2]].tolist()
+    places = [other.place.tolist() for other in explanation.others]
+    numbers = {"x": x, "z": z, "large": large, "small": small}
+    return {
+        "tint": tint,
+        **{name: f"{value:.3f}" for name, value in numbers.items()},
+        "turn": f"{turn:.1f}",
+        "others": "".join(f"M{place[0]:.3f} {place[2]:.3f}h0" for place in places),
+    }
+
+
+def explanations_list(explanations: Sequence[Explanation]) -> str:
+    """Each object with its verdict, its evidence in sentences, and a table of what pulls at it."""
+    if not explanations:
+        return ""
+    rows = [
+        {
+            "tint": css(colour(index)),
+            "explanation": explanation,
+            "ranges": _ranges(explanation),
+            "pulls": _pulls(explanation.facts.pulls),
+        }
+        for index, explanation in enumerate(explanations)
+    ]
+    calibrated = all(e.calibrated for e in explanations)
+    return fill("explanations.html", rows=rows, calibrated=calibrated)
+
+
+def _ranges(explanation: Explanation) -> str:
+    """Half widths of the 90 % ranges in one line."""
+    half = [(r.high - r.low) / 2 for r in explanation.ranges]
+    parts = [f"{name} ±{100 * half[k]:.1f} cm" for k, name in ((0, "x"), (2, "z"))]
+    parts.append(f"yaw ±{math.degrees(half[3]):.1f}°")
+    parts += [f"{UNKNOWNS[k]} ±{100 * math.expm1(half[k]):.1f} %" for k in (4, 5, 6)]
+    return f"{LEVEL:.0%} of the probability: {', '.join(parts)}"
+
+
+def _pulls(pulls: Sequence[Pull]) -> str:
+    titles = ("Energy", "Share", "Tells distance", "Force x, z [1/m]", "Turn [1/rad]", "Without it")
+    rows = [_pull(p) for p in pulls if p.energy or bool(p.force.any())]
+    return draw_table([Cell("Term", "text"), *map(Cell, titles)], rows)
+
+
+def _pull(pull: Pull) -> list[Cell]:
+    force, move = pull.force.tolist(), pull.move.tolist()
+    away = 100 * math.hypot(move[0], move[2])
+    cells = (
+        f"{pull.energy:.4f}", f"{100 * pull.share:.0f} %", f"{100 * pull.constrains:.0f} %",
+        f"{_plain(force[0], 3)}, {_plain(force[2], 3)}", _plain(force[3], 3),
+        f"{away:.1f} cm, {_plain(math.degrees(move[3]), 1)}°",
+    )  # fmt: skip
+    return [Cell(pull.term.replace("_", " "), "text"), *map(Cell, cells)]
+
+
+def _plain(value: float, digits: int) -> str:
+    """Without a minus before zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"

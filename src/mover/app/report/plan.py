@@ -11,12 +11,13 @@ from torch import Tensor
 from mover.app.report.templates import fill
 from mover.core.colours import colour, css, person_colour
 from mover.core.types import Bodies, Camera, Scene, SceneObject
+from mover.geometry.boxes import box_of, corners
 from mover.geometry.placement import place_object
-from mover.geometry.rotations import rot_y
 
 MARGIN = 0.5  # [m] around everything that is drawn
 RANGE = 2.0  # how far beyond the furthest object the camera's cone is drawn
 FEW = 8  # bodies whose dots are drawn larger
+BASE = (1, 5, 4, 0)  # corners of a box around its bottom, the first two at its front
 DOTS = 400  # at most so many bodies are dotted for each person
 
 
@@ -122,11 +123,8 @@ def _cone(camera: Camera, extent: Extent) -> tuple[Shape, ...]:
 
 def _corners(piece: SceneObject) -> Float[Tensor, "5 2"]:
     """Corners of the box seen from above, front left first, and the middle of the front [m]."""
-    used = piece.mesh.verts[piece.mesh.faces.unique()] * piece.scale
-    (x0, _, z0), (x1, _, z1) = used.amin(0).tolist(), used.amax(0).tolist()
-    flat = [(x0, z1), (x1, z1), (x1, z0), (x0, z0), ((x0 + x1) / 2, z1)]
-    points = torch.tensor([(x, 0.0, z) for x, z in flat]).to(piece.scale)
-    return (points @ rot_y(piece.yaw).mT + piece.t_world_object)[:, [0, 2]]
+    base = corners(box_of(piece))[list(BASE)][:, [0, 2]]
+    return torch.cat([base, base[:2].mean(0, keepdim=True)])
 
 
 def _footprint(piece: SceneObject, tint: str) -> tuple[Shape, ...]:

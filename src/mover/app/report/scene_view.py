@@ -59,7 +59,7 @@ def pack_view(scenes: dict[str, Scene], bodies: dict[str, Bodies]) -> ReportScen
             _pack_object(p, i, _shared(p.mesh, meshes, packed, block))
             for i, p in enumerate(scene.objects)
         ]
-        floor = _floor(scene, bodies.get(name))
+        floor = floor_of(scene, bodies.get(name))
         tree["scenes"][name] = {
             "camera": _pack_camera(scene.camera),
             "floor": floor,
@@ -137,7 +137,7 @@ def _numbers(values: Tensor) -> list[float]:
     return [round(v, 6) for v in values.detach().tolist()]
 
 
-def _floor(scene: Scene, bodies: Bodies | None) -> float:
+def floor_of(scene: Scene, bodies: Bodies | None = None) -> float:
     """Height of the floor, or of the lowest thing where no floor is known [m]."""
     if scene.ground is not None:
         return scene.ground

@@ -215,25 +215,6 @@ def _score_cell(score: Mapping[str, Any] | None, key: str) -> str:
     return f"{write_quantity(key, before.get(key), False)} → {write_quantity(key, after.get(key))}"
 
 
-def stage_bars(stages: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Seconds, their share of the longest stage's [%], and peak memory of each stage."""
-    longest = max([float(s.get("seconds") or 0) for s in stages], default=0.0) or 1.0
-    bars: list[dict[str, Any]] = []
-    for stage in stages:
-        seconds = float(stage.get("seconds") or 0)
-        memory = float(stage.get("memory") or stage.get("peak_memory") or 0)
-        bars.append(
-            {
-                "name": str(stage.get("name", "")),
-                "kept": bool(stage.get("kept")),
-                "share": f"{100 * seconds / longest:.1f}",
-                "seconds": f"{seconds:,.1f}",
-                "memory": f"{memory:,.0f} MB" if memory else "",
-            }
-        )
-    return bars
-
-
 def settings_of(config: Mapping[str, Any], above: str = "") -> list[tuple[str, str]]:
     """Each setting under its full name, `place.weights.depth`."""
     leaves: list[tuple[str, str]] = []

@@ -9,12 +9,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mover.app.report.scene_view import EYE_HEIGHT
+from mover.app.report.scene_view import floor_of
 from mover.app.report.vertex_subset import Thinning, thin, thin_choice
 from mover.app.viewer.layers import Layers
 from mover.core.colours import Colour, colour, person_colour
 from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject
-from mover.geometry.boxes import box_of, corners
 
 FACES = 20_000  # of an object, at most
 WIDEST = 800  # pixels of the picture in the frustum
@@ -68,7 +67,7 @@ def draw_fixed(drawing: Drawing, scene: Scene, image: torch.Tensor | None) -> No
     for handle in drawing.fixed.values():
         handle.remove()
     server = drawing.server
-    ground = _floor_of(scene)
+    ground = floor_of(scene)
     drawing.fixed = {
         "ground": server.scene.add_grid(
             "/ground", 40.0, 40.0, plane="xz", cell_size=0.5, section_size=1.0,
@@ -77,14 +76,6 @@ def draw_fixed(drawing: Drawing, scene: Scene, image: torch.Tensor | None) -> No
         "camera": _frustum(server, scene.camera, image),
     }  # fmt: skip
     drawing.fixed["camera"].visible = drawing.camera_visible
-
-
-def _floor_of(scene: Scene) -> float:
-    """Height of the floor, or of the lowest object where nobody knows the floor [m]."""
-    if scene.ground is not None:
-        return scene.ground
-    lows = [float(corners(box_of(piece))[:, 1].amin()) for piece in scene.objects]
-    return min(lows, default=-EYE_HEIGHT)
 
 
 def _frustum(server: Any, camera: Camera, image: torch.Tensor | None) -> Any:  # noqa: ANN401

@@ -36,23 +36,18 @@ CORNERS = 48  # of an ellipse
 class Layers:
     """What is known of a run's evidence; None and empty: it is not there."""
 
-    near: Float[Tensor, "near 3"] | None
+    near: Float[Tensor, "near 3"] | None = None
     """Nothing of an object is nearer than these points [m]: people passed in front of it."""
-    far: Float[Tensor, "far 3"] | None
+    far: Float[Tensor, "far 3"] | None = None
     """An object is at least as near as these points [m]: it hid people."""
-    space: Mesh | None
+    space: Mesh | None = None
     """Surface of all that people's bodies have moved through [m]."""
-    contacts: dict[str, Float[Tensor, "points 3"]]
+    contacts: dict[str, Float[Tensor, "points 3"]] = field(default_factory=lambda: {})
     """Points of bodies that touch an object [m], by its id."""
-    ellipses: dict[str, Float[Tensor, "corners 3"]]
+    ellipses: dict[str, Float[Tensor, "corners 3"]] = field(default_factory=lambda: {})
     """95 % of where the floor and camera let an object stand [m], by its id."""
     places: dict[str, Float[Tensor, "corners 3"]] = field(default_factory=lambda: {})
     """90 % of where all evidence together lets the middle of an object stand [m], by its id."""
-
-
-def no_layers() -> Layers:
-    """Nothing is known."""
-    return Layers(None, None, None, {}, {})
 
 
 @record

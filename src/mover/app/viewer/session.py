@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mover.app.report.scene_view import EYE_HEIGHT
 from mover.app.results import initial_bodies
-from mover.app.viewer.layers import Layers, no_layers, read_layers
+from mover.app.viewer.layers import Layers, read_layers
 from mover.core.errors import InputError
 from mover.core.types import Bodies, Capture, Scene, SceneObject
 from mover.geometry.camera import pitch_roll
@@ -50,7 +50,7 @@ class Shown:
     """People in the world of `initial`."""
     image: Float[Tensor, "h w 3"] | None = None
     """The reference image, in [0, 1]."""
-    layers: Layers = field(default_factory=no_layers)
+    layers: Layers = field(default_factory=Layers)
     log: Mapping[str, Any] = field(default_factory=lambda: {})
     """What run.json holds."""
     metrics: Mapping[str, Any] = field(default_factory=lambda: {})
@@ -119,9 +119,6 @@ def _json(file: Path) -> dict[str, Any]:
 # The edits on top of it, and what is selected.
 
 
-Listener = Callable[[], None]
-
-
 @dataclass
 class Session:
     """What the user sees and has changed; every change is saved at once."""
@@ -134,9 +131,7 @@ class Session:
     done: int = 0
     """So many of the edits are inside of `shown.result`."""
     selected: str | None = None
-    on_room: list[Listener] = field(default_factory=lambda: [])
-    """Called when objects or their places change."""
-    on_select: list[Listener] = field(default_factory=lambda: [])
+    listeners: list[Callable[[], None]] = field(default_factory=lambda: [])
     lock: threading.RLock = field(default_factory=threading.RLock)
 
     @property
@@ -157,7 +152,7 @@ class Session:
         """Choose the object whose numbers are shown and which can be moved."""
         if name != self.selected:
             self.selected = name
-            _call(self.on_select)
+            self.changed()
 
     def put(self, moved: SceneObject) -> None:
         """Record where the user put an object."""
@@ -216,16 +211,24 @@ class Session:
         """Go on from a new result."""
         with self.lock:
             self.shown, self.done = shown, done
-            _call(self.on_room)
-            _call(self.on_select)
+            self.changed()
+
+    def listen(self, listener: Callable[[], None]) -> None:
+        """Call it now, and whenever the room, its edits or the choice have changed."""
+        self.listeners.append(listener)
+        listener()
+
+    def changed(self) -> None:
+        """Tell everybody who listens."""
+        for listener in self.listeners:
+            listener()
 
     def _save(self) -> None:
         if self.file is not None:
             write_edits(self.edits, self.file)
         if self.piece(self.selected) is None:
             self.selected = None
-        _call(self.on_room)
-        _call(self.on_select)
+        self.changed()
 
 
 def start_session(shown: Shown, file: Path | None, capture: Capture | None) -> Session:
@@ -255,8 +258,3 @@ def _changed(old: SceneObject | None, new: SceneObject) -> bool:
         torch.allclose(getattr(old, key), getattr(new, key), atol=1e-5)
         for key in ("t_world_object", "yaw", "scale")
     )
-
-
-def _call(listeners: list[Listener]) -> None:
-    for listener in listeners:
-        listener()

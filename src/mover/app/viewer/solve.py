@@ -19,7 +19,7 @@ from mover.core.run import Run
 from mover.core.types import Capture, Scene, SceneObject
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import rot_y
-from mover.io.capture.edits import Edit, apply_edits
+from mover.io.capture.edits import apply_edits
 from mover.pipeline.presets import Config
 from mover.pipeline.reconstruct import reconstruct
 from mover.pipeline.refinement import refined_room
@@ -133,11 +133,6 @@ def solve_again(
         torch.set_num_threads(threads)
     write_results(edited, room, config, run, origin)
     return folder
-
-
-def started_from(capture: Capture, edits: tuple[Edit, ...]) -> Capture:
-    """The capture that `solve_again` starts from."""
-    return apply_edits(capture, edits)[0]
 
 
 def share_stages(out: Path, folder: Path) -> None:

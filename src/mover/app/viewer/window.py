@@ -33,8 +33,8 @@ class Grips:
     session: Session
     drawing: Drawing
     gizmo: Any = None
-    by_hand: bool = False
-    """Whether the chosen object itself can be dragged, not only its gizmo."""
+    switch: Any = None
+    """Checkbox that lets the chosen object itself be dragged, not only its gizmo."""
     bound: dict[str, Any] = field(default_factory=lambda: {})
     """Handles that answer clicks, by object."""
     dragged: Any = None
@@ -42,6 +42,11 @@ class Grips:
     start: SceneObject | None = None
     """The object as it was when the mouse took it."""
     grabbed: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether the chosen object itself can be dragged."""
+        return self.switch is not None and self.switch.value
 
 
 def bind_clicks(grips: Grips) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.types import Bodies, BodyPose
-from mover.geometry.rotations import axis_angle, rot_x
+from mover.geometry.rotations import axis_angle, rot_x, rotation_vectors
 from mover.io.export.finished import Exported, Finished
 from mover.io.export.people import FPS, Track, tracks_of
 from mover.io.export.posed import (
@@ -19,7 +19,6 @@ from mover.io.export.posed import (
     motion_of,
     pelvis_of,
     skin_of,
-    vectors_of,
 )
 from mover.io.files.npz import write_npz
 
@@ -108,7 +107,7 @@ def upright(motion: Motion) -> Motion:
     turn = rot_x(torch.tensor(torch.pi / 2))
     offset = pelvis_of(pose)
     place = (pose.transl + offset) @ turn.mT - offset
-    root = vectors_of(turn @ axis_angle(pose.global_orient))
+    root = rotation_vectors(turn @ axis_angle(pose.global_orient))
     return Motion(dataclasses.replace(pose, transl=place, global_orient=root), motion.size)
 
 

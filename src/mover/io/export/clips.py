@@ -17,7 +17,7 @@ from mover.bodies.skeleton import BODY, JOINTS
 from mover.bodies.skinning import SkinnedBody, zero_pose
 from mover.core.records import record
 from mover.core.types import Bodies, BodyPose
-from mover.geometry.rotations import axis_angle
+from mover.geometry.rotations import axis_angle, rotation_vectors
 from mover.io.export.finished import Finished
 from mover.io.export.people import Track, seen_from_to, tracks_of
 from mover.io.export.posed import (
@@ -27,7 +27,6 @@ from mover.io.export.posed import (
     pelvis_of,
     rows_of,
     skin_of,
-    vectors_of,
 )
 from mover.io.export.solids import AXES, floor_height
 
@@ -157,7 +156,7 @@ def _standing(model: SkinnedBody, pose: BodyPose) -> float:
 def _posed(motion: Motion, track: Track, clip: Clip) -> PosedClip:
     pose = rows_of(motion.pose, track.rows)
     angles = _turned_between(all_angles(pose), track.time, clip.time)
-    turned = vectors_of(AXES @ axis_angle(angles[:, 0]))
+    turned = rotation_vectors(AXES @ axis_angle(angles[:, 0]))
     angles = torch.cat([turned[:, None], angles[:, 1:]], 1)
     exact = pose.model == "smplx"
     pelvis = clip.joints[:, 0]

@@ -10,7 +10,7 @@ from mover.bodies import load_model
 from mover.bodies.skinning import SkinnedBody
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose
-from mover.geometry.rotations import axis_angle
+from mover.geometry.rotations import axis_angle, rotation_vectors
 from mover.io.export.finished import Finished
 
 SAME = 0.01  # [m], a similarity that leaves more did not make the result's body
@@ -55,7 +55,7 @@ def _carried(given: Bodies, pose: BodyPose, bodies: Bodies) -> Motion | str:
     offset = pelvis_of(pose)
     pelvis = (pose.transl + offset).double()
     there = size[:, None] * (turn @ pelvis[..., None])[..., 0] + shift
-    root = vectors_of(turn @ axis_angle(pose.global_orient.double()))
+    root = rotation_vectors(turn @ axis_angle(pose.global_orient.double()))
     moved = dataclasses.replace(
         pose, global_orient=root.to(pose.transl), transl=there.to(pose.transl) - offset
     )
@@ -88,14 +88,6 @@ def similarity(
     shift = (b - size[:, None, None] * a @ turn.mT)[:, 0]
     miss = size[:, None, None] * start @ turn.mT + shift[:, None] - end
     return size, turn, shift, miss.norm(dim=-1).amax(-1)
-
-
-def vectors_of(turns: Float[Tensor, "rows 3 3"]) -> Float[Tensor, "rows 3"]:
-    """Axis-angle vectors of rotation matrices [rad]."""
-    from scipy.spatial.transform import Rotation
-
-    found = Rotation.from_matrix(turns.detach().cpu().double().numpy()).as_rotvec()
-    return torch.from_numpy(found).to(turns)
 
 
 def all_angles(pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
