@@ -119,11 +119,22 @@ def into_camera(bodies: Bodies, R_cam_world: Float[Tensor, "3 3"]) -> Bodies:
         return bodies
     R = R_cam_world.to(bodies.verts)
     joints = None if bodies.joints is None else bodies.joints @ R.mT
-    pose = bodies.pose
-    if pose is not None:
-        pose = moved(pose, R.expand(len(pose.transl), 3, 3), torch.zeros_like(pose.transl))
+    pose = None if bodies.pose is None else _turned(bodies.pose, R)
     return dataclasses.replace(
         bodies, verts=bodies.verts @ R.mT, joints=joints, pose=pose, space="camera"
+    )
+
+
+def _turned(pose: BodyPose, R: Float[Tensor, "3 3"]) -> BodyPose:
+    """The parameters of the turned body: its root turns about the pelvis, not about the origin."""
+    from scipy.spatial.transform import Rotation
+
+    joints = run_model(load_model(pose.model, pose.gender), pose)[1][:, 0]
+    turned = (R @ axis_angle(pose.global_orient)).double().numpy()
+    vectors = torch.from_numpy(Rotation.from_matrix(turned).as_rotvec())
+    transl = joints @ R.mT - (joints - pose.transl)
+    return dataclasses.replace(
+        pose, global_orient=vectors.to(pose.global_orient), transl=transl.to(pose.transl)
     )
 
 
