@@ -323,6 +323,29 @@ def _four(R: np.ndarray) -> np.ndarray:
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # our world -> the scan's, z up
 
 
+def prox_stem(recording: str, index: int) -> str:
+    """Name of a frame: stills of the quantitative part are each the first frame of their own shot.
+
+    As in public code that reads it: fittings/mosh/vicon_03301_01/results/
+    s001_frame_00001__00.00.00.023, and vicon_03301_03/results/s007_frame_00001__00.00.00.009
+    (YangYuan's pkl2smpl; see also prox/viz/viz_mosh.py of mohamedhassanmus/prox for the folders).
+    """
+    if recording.startswith("vicon"):
+        return f"s{index + 1:03d}_frame_00001__00.00.00.{(index * 37 + 23) % 60:03d}"
+    return f"s001_frame_{index + 1:05d}__00.00.{index // 30:02d}.{index % 30:03d}"
+
+
+def body_index(size: tuple[int, int], index: int) -> Image.Image:
+    """Kinect's body index of a mirrored picture: 255 where nobody is, else the body's number.
+
+    Read as grey and flipped, with 0 where the person is: data_parser.py of third-party readers of
+    PROX (img_fn + '.png' in BodyIndexColor), and BodyIndex by a threshold at 254.
+    """
+    pixels = np.full(size[::-1], 255, dtype=np.uint8)
+    pixels[200:700, 300 + 10 * index : 400 + 10 * index] = 0
+    return Image.fromarray(pixels)
+
+
 def write_prox(root: Path, room: Room, recording: str, frames: int, shift: np.ndarray) -> Path:
     """The camera stands at `shift` in the scan's frame; pictures are stored mirrored."""
     place = recording.split("_")[0]
@@ -338,10 +361,12 @@ def write_prox(root: Path, room: Room, recording: str, frames: int, shift: np.nd
     scan(room).apply_transform(matrix).export(root / "scenes" / f"{place}.ply")
     color = root / "recordings" / recording / "Color"
     keypoints = root / "keypoints" / recording
-    color.mkdir(parents=True)
-    keypoints.mkdir(parents=True)
+    index = root / "recordings" / recording / "BodyIndexColor"
+    for folder in (color, keypoints, index):
+        folder.mkdir(parents=True)
     for i in range(frames):
-        stem = f"s001_frame_{i + 1:05d}__00.00.{i // 30:02d}.{i % 30:03d}"
+        stem = prox_stem(recording, i)
+        body_index(room.size, i).save(index / f"{stem}.png")
         picture(room.size).transpose(Image.Transpose.FLIP_LEFT_RIGHT).save(color / f"{stem}.jpg")
         joints = np.zeros((25, 3))
         joints[4] = [100 + i, 200, 0.9]  # right wrist of the mirrored picture

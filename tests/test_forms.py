@@ -177,7 +177,8 @@ def naive_contact(inputs, layout, form):
                     points = touches.points[k, part, known].double()
                     gap = (points[:, None] - region[s, i][None]).norm(dim=-1)
                     if form == "paper":
-                        price = (gap.amin(1) * touches.weight[k, part, known]).sum()
+                        weight = touches.weight[k, part, known].double()
+                        price = (gap.amin(1) * weight).sum() / weight.sum()
                     else:
                         price = gap.amin(0).mean()
                     total = total.index_put((torch.tensor([s]), torch.tensor([i])), price, True)

@@ -15,16 +15,28 @@ from mover.core import records
 from mover.core.errors import InputError
 from mover.core.observe import Step
 from mover.core.types import Room
+from mover.energy.terms.feet import FootContacts
 from mover.geometry.camera import project, to_camera
 from mover.pipeline.outcome import to_world
 from mover.pipeline.presets import PRESETS
+from mover.stages.camera.align_camera import AlignInputs, align_camera
 from mover.stages.people.refine_bodies import RefinedBodies
+from mover_bench.rooms.known import KnownRoom
 from mover_bench.studies.args import StudyArgs
-from mover_bench.studies.job import DONE, ROOM, Job, key_of, rebuild, store_room
+from mover_bench.studies.job import (
+    DONE,
+    ROOM,
+    Job,
+    held_camera,
+    key_of,
+    rebuild,
+    spoilt,
+    store_room,
+)
 from mover_bench.studies.measures import seen_from
 from mover_bench.studies.queue import open_jobs, run_all
 from mover_bench.studies.run import by_room
-from mover_bench.studies.sets import CHANGES, SETS, changed_set, set_named
+from mover_bench.studies.sets import CHANGES, EXACT, SETS, changed_set, set_named
 from mover_bench.studies.study import STUDIES, ask_of, jobs_of, run_study
 from mover_bench.studies.variants import PARTS, TERMS, VARIANTS, Cut, Variant, frames_of, withheld
 
@@ -432,6 +444,8 @@ def test_people_seen_from_another_camera_stay_in_their_pixels() -> None:
         (["ablation", "--seeds", "x"], "--seeds: 'x'"),
         (["sets", "--presets", "paper"], "--presets: robust is missing"),
         (["sensitivity", "--set", "rooms+scale=0"], "is changed already"),
+        (["paper", "--set", "rooms+exact=camera"], "is changed already"),
+        (["ablation", "--set", "rooms+exact=light"], "'light' exact, expected some of camera"),
         (["sensitivity", "--errors", "size"], "--errors: 'size' is none of scale, place"),
         (["camera", "--errors", "scale"], "--errors: the study camera tries none"),
     ],
@@ -439,6 +453,49 @@ def test_people_seen_from_another_camera_stay_in_their_pixels() -> None:
 def test_the_command_names_what_it_does_not_know(flags, said, tmp_path, capsys) -> None:
     assert run_command("experiment", ["study", *flags, "--out", str(tmp_path)]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_what_is_exact_has_no_noise_and_all_else_stays() -> None:
+    for name, zero in EXACT.items():
+        noise, base = set_named(f"rooms+exact={name}").noise, SETS["rooms"].noise
+        for field in vars(base):
+            wanted = 0 if field in zero else getattr(base, field)
+            assert getattr(noise, field) == wanted, (name, field)
+
+
+def test_a_true_camera_is_held_and_true_contacts_are_given(small_room: KnownRoom) -> None:
+    rooms = set_named("rooms+exact=camera,contacts")
+    trial = spoilt(small_room, 3, rooms)
+    capture, given = trial.capture, trial.capture.bodies
+    true = small_room.truth.camera.R_cam_world
+    assert torch.allclose(capture.scene.camera.R_cam_world, true, atol=1e-5)
+    assert given is not None
+    assert capture.touch is not None
+    for row in (0, len(given.frame) - 1):
+        same = (small_room.bodies.frame == given.frame[row]) & (
+            small_room.bodies.person == given.person[row]
+        )
+        assert torch.equal(capture.touch[row], small_room.touching[same][0].float())
+    config = held_camera(PRESETS["paper"])
+    points = torch.tensor([[0.0, 2.0, 3.0], [1.0, 2.0, 4.0], [-1.0, 2.2, 5.0]]).double()
+    feet = FootContacts(points, torch.zeros(3).long(), torch.arange(3), ())
+    known = AlignInputs(feet, capture.scene.camera, None, capture.camera_height)
+    found = align_camera(known, config.align)
+    assert torch.allclose(found.camera.R_cam_world, true, atol=1e-5)
+    assert found.ground == pytest.approx(small_room.truth.ground, abs=1e-6)
+
+
+def test_people_of_the_paper_are_compared_with_its_first_stage(tmp_path: Path) -> None:
+    args = StudyArgs("paper", seeds="1000-1007", out=tmp_path)
+    page = run_study(args, launch=Table(paper=0.4, paper_contact=0.55, paper_depth=0.45))[0]
+    text = page.read_text()
+    gains = text.split("## What people add to IoU3D")[1]
+    line = next(x for x in gains.splitlines() if x.startswith("| paper, all errors |"))
+    assert [x.split()[0] for x in line.split("|")[2:6]] == ["+0.250", "+0.150", "+0.200", "+0.100"]
+    first = text.split("## paper, true camera\n")[0]
+    assert "*MOVER, camera, depth* (paper)" in first
+    assert "+exact=camera,bodies,contacts,masks" in text
+    assert "| 1000 chair_0 | ✓ |" in text.split("## Object by object")[1]
 
 
 def test_all_studies_share_one_queue(tmp_path: Path) -> None:

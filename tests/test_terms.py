@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from mover.core.types import Layout
 from mover.energy.config import SceneWeights
 from mover.energy.objective import HumanCues
+from mover.energy.terms.contact import contact_term
+from mover.energy.terms.depth import DepthRange, depth_term
 from mover.geometry.camera import project, to_camera
 from mover.geometry.placement import place, rest_on_support
-from mover.geometry.raster import Topology, look
+from mover.geometry.raster import Depths, Topology, look
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.place_inputs import with_walls
 from mover.stages.objects.place_objects import energy_of
@@ -92,6 +94,12 @@ class TestPaperAsPrinted:
     def value(self, term, layout):
         return energy(self.inputs, layout, term).per_item[0].numpy()
 
+    def samples(self, layout, i):
+        c, s = np.cos(float(layout.yaw[0, i])), np.sin(float(layout.yaw[0, i]))
+        points = self.inputs.objects.samples[i].numpy() * np.exp(layout.log_scale[0, i].numpy())
+        turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        return points @ turn.T + layout.t_world_object[0, i].numpy()
+
     def corners(self, layout, i):
         c, s = np.cos(float(layout.yaw[0, i])), np.sin(float(layout.yaw[0, i]))
         scale = np.exp(layout.log_scale[0, i].numpy())
@@ -147,6 +155,8 @@ class TestPaperAsPrinted:
                 for x in range(64):
                     if not seen.covered[0, i, y, x] or self.inputs.image.masks[i, y, x] <= 0.5:
                         continue
+                    if near[i, y, x] > far[i, y, x]:
+                        continue  # no range
                     d = float(seen.nearest[0, i, y, x])
                     want += max(d - float(far[i, y, x]), 0) + max(float(near[i, y, x]) - d, 0)
             assert found == pytest.approx(want * float(self.inputs.humans.depth.area[i]), rel=1e-9)
@@ -156,8 +166,8 @@ class TestPaperAsPrinted:
         volume = self.inputs.humans.space.volume
         total = 0.0
         for i, found in enumerate(self.value("collision", layout)):
-            want = 0.0
-            for p in self.corners(layout, i):
+            want, points = 0.0, self.samples(layout, i)
+            for p in points:
                 at = (p - volume.origin.numpy()) / volume.cell
                 low = np.floor(at).astype(int)
                 value = 0.0
@@ -165,7 +175,7 @@ class TestPaperAsPrinted:
                     step = np.array([k & 1, (k >> 1) & 1, k >> 2])
                     share = np.prod(np.where(step, at - low, 1 - (at - low)))
                     value += share * float(volume.values[tuple(low + step)])
-                want += min(value, 0.0) ** 2
+                want += 1000 / len(points) * min(value, 0.0) ** 2
             assert found == pytest.approx(want, rel=1e-9)
             total += want
         assert total > 0
@@ -176,9 +186,46 @@ class TestPaperAsPrinted:
         tops = place(self.inputs.objects.top, layout)[0].numpy()
         for k, i in enumerate(touches.object_of.tolist()):
             points = touches.points[k, 0].numpy()
-            want = sum(min(np.linalg.norm(p - q) for q in tops[i]) for p in points)
+            want = np.mean([min(np.linalg.norm(p - q) for q in tops[i]) for p in points])
             assert found[i] == pytest.approx(want, abs=1e-4)
         assert found[2] == 0
+
+
+class TestPrintedTerms:
+    """What the printed formulas leave open, see 'Readings of the paper' in docs/method.md."""
+
+    def test_contact_does_not_grow_with_the_number_of_points(self):
+        inputs = make_inputs(torch.float64, size=16)
+        touches = inputs.humans.touches
+        away = replace(inputs.starts, t_world_object=inputs.starts.t_world_object + 0.3)
+        twice = replace(
+            touches,
+            points=torch.cat([touches.points, touches.points], 2),
+            weight=torch.cat([touches.weight, touches.weight], 2),
+        )
+        one, other = (
+            contact_term(
+                (
+                    place(inputs.objects.top, away),
+                    place(inputs.objects.back, away),
+                ),
+                given,
+                "paper",
+            )
+            for given in (touches, twice)
+        )
+        torch.testing.assert_close(one, other)
+        assert one.max() > 0
+
+    def test_bounds_that_contradict_each_other_are_no_range(self):
+        covered, four = torch.ones(1, 1, 1, 4, dtype=torch.bool), torch.ones(1, 1, 4)
+        seen = Depths(4.0 * four[None], 4.0 * four[None], covered)
+        none = torch.full((1, 1, 4), float("-inf"))
+        near = torch.tensor([[[9.0, 9.0, 4.5, -torch.inf]]])
+        far = torch.tensor([[[1.0, torch.inf, 4.2, 3.0]]])
+        allowed = DepthRange(near, far, none, torch.ones(1))
+        found = float(depth_term(seen, four, allowed, "paper"))
+        assert found == pytest.approx(5 + 1)
 
 
 def test_a_term_without_its_evidence_is_not_computed():

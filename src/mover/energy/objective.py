@@ -193,12 +193,9 @@ def _depth(s: PlacedScene) -> PerItem:
 
 
 def _collision(s: PlacedScene) -> PerItem:
-    """Of the meshes' vertices (`paper`; the padding is sent far away) or of even samples."""
-    objects, form = s.known.objects, s.config.form
-    points = place(objects.verts if form == "paper" else objects.samples, s.layout)
-    if form == "paper":
-        points = torch.where(objects.real_verts.unsqueeze(-1), points, 1e3)
-    return s.factors.collision * collision_term(points, there(s.known.humans.space), form)
+    points = place(s.known.objects.samples, s.layout)
+    space = there(s.known.humans.space)
+    return s.factors.collision * collision_term(points, space, s.config.form)
 
 
 def _contact(s: PlacedScene) -> PerItem:

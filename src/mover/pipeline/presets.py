@@ -83,10 +83,16 @@ class Config:
 IMAGE_ONLY = SceneWeights(depth=0.0, collision=0.0, contact=0.0)
 """L_scene: Eq. 1 without people."""
 
+_PLANE = AlignConfig(sigmas=(0.1,), offset_prior=0.0, votes="points")
+_NAMED_FEET = FootContactConfig(given=True)
+
 PAPER = Config(
     select=SelectConfig("each"),
-    align=AlignConfig(sigmas=(0.1,), votes="points"),
+    foot_contacts=_NAMED_FEET,
+    align=_PLANE,
     layout=PlaceConfig(weights=IMAGE_ONLY, method=Adam(1000)),
+    gather=GatherConfig(erode=2),
+    assign=AssignConfig(by="release"),
     place=PlaceConfig(),
 )
 
@@ -97,7 +103,8 @@ _RELEASE_FULL = SceneWeights(
 
 RELEASE = Config(
     select=SelectConfig("each", 0.0, 0.18, 0.0, 0.09, "vector", 1, 0.2),
-    align=AlignConfig(sigmas=(0.1,), votes="points"),
+    foot_contacts=_NAMED_FEET,
+    align=_PLANE,
     prepare=PrepareConfig(rule="release"),
     image=ImageConfig(form="release"),
     layout=PlaceConfig(

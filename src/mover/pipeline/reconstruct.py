@@ -129,7 +129,8 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
         inputs = DepthInputs(bodies, parts, kept, capture.people, detected_masks(capture), camera)
         depth = run.stage(find_depth, inputs, config.depth)
         bodies, warnings = apply_depth(bodies, depth), (*warnings, *depth.warnings)
-    standing = FootContactInputs(bodies, parts, kept, camera)
+    touch = capture.touch if config.foot_contacts.given else None
+    standing = FootContactInputs(bodies, parts, kept, camera, touch)
     feet = run.stage(find_foot_contacts, standing, config.foot_contacts)
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height)
     alignment = run.stage(align_camera, known, config.align)

@@ -106,6 +106,8 @@ class FootContactConfig:
     """A foot is still if it is slower [m/s]."""
     points: Annotated[int, int_in(1, 1000)] = 4
     """The lowest vertices of a sole that count."""
+    given: bool = False
+    """Where the capture has contacts of its own (POSA), these say which soles stand (paper)."""
 
 
 @dataclass(frozen=True)

@@ -32,13 +32,13 @@ class StudyArgs:
     """Make one of the paper's experiments on known rooms, or all; goes on where it stopped."""
 
     name: Annotated[Positional[str], arg(metavar="STUDY")]
-    """ablation, camera, bodies, video-length, interactions, time, sensitivity, sets, or all."""
+    """ablation, camera, bodies, video-length, interactions, time, sensitivity, paper, sets, all."""
     set: str = ""
     """Which rooms; empty: those that the study is meant for."""
     seeds: str = ""
     """Which of them: 1000-1009, or 1000,1003; empty: all that are held out."""
     presets: tuple[str, ...] = ("paper", "release", "robust")
-    """Which presets the study `sets` compares."""
+    """Which presets the studies `sets` and `paper` try."""
     errors: tuple[str, ...] = ()
     """Which errors of the input the study `sensitivity` tries: scale, place, ...; empty: all."""
     out: Path = Path("experiments")

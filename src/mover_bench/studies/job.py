@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from mover import __version__
 from mover.app.batch.runner import write_tree
@@ -20,9 +22,9 @@ from mover.core import records
 from mover.core.explanation import Facts
 from mover.core.observe import Observer, silent
 from mover.core.run import Run, sources
-from mover.core.types import Scene
+from mover.core.types import Bodies, Scene
 from mover.evaluate.evaluation import EvaluateConfig
-from mover.pipeline.reconstruct import reconstruct
+from mover.pipeline.reconstruct import Config, reconstruct
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
 from mover_bench.rooms.config import RoomConfig
@@ -118,8 +120,33 @@ def noisy_room(seed: int, rooms: RoomSet, run: Run | None = None) -> Trial:
 def spoilt(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
     """A known room with the noise of a set."""
     capture = add_noise(room, rooms.noise, seed)
+    if "camera" in rooms.exact:
+        assert room.truth.ground is not None, "a known room has a floor"
+        capture = replace(capture, camera_height=-room.truth.ground)
+    if "contacts" in rooms.exact:
+        capture = replace(capture, touch=true_contacts(room, capture.bodies))
     traits = traits_of(room, capture.scene)
     return Trial(capture, room.truth, room.bodies, traits, doing_of(room))
+
+
+def true_contacts(room: KnownRoom, bodies: Bodies | None) -> Float[Tensor, "bodies verts"] | None:
+    """1 where the skin of each given body truly touches furniture or the floor, else 0."""
+    if bodies is None:
+        return None
+    true = {
+        key: row
+        for row, key in enumerate(
+            zip(room.bodies.frame.tolist(), room.bodies.person.tolist(), strict=True)
+        )
+    }
+    keys = zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True)
+    return room.touching[torch.tensor([true[key] for key in keys])].float()
+
+
+def held_camera(config: Config) -> Config:
+    """The camera stays as it is given, as its height is: nothing is looked for."""
+    align = replace(config.align, steps=0)
+    return replace(config, align=align, refine=replace(config.refine, rounds=0))
 
 
 def doing_of(room: KnownRoom) -> tuple[str, ...]:
@@ -138,8 +165,9 @@ def key_of(job: Job) -> str:
     settings = VARIANTS.get(job.name)  # a room has none
     rooms = set_named(job.rooms)
     return records.fingerprint(
-        rooms.room, rooms.noise, rooms.version, job.seed, job.name, settings, sources("mover_bench")
-    )
+        rooms.room, rooms.noise, rooms.exact, rooms.version, job.seed, job.name, settings,
+        sources("mover_bench"),
+    )  # fmt: skip
 
 
 def do_job(job: Job) -> None:
@@ -164,7 +192,9 @@ def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None)
     trial = records.load(Trial, job.room)
     capture = withheld(trial.capture, variant.hears, variant.cut)
     run = Run(job.folder if variant.fresh else job.home)
-    room = reconstruct(capture, variant.config, run)
+    exact = set_named(job.rooms).exact
+    config = held_camera(variant.config) if "camera" in exact else variant.config
+    room = reconstruct(capture, config, run)
     if room.bodies is None or variant.cut is not None:
         room = carry_all(room, trial.capture)
     if variant.refined:

@@ -28,6 +28,8 @@ class RoomSet:
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     version: int = 1
     """Counts up whenever a room of the set changes."""
+    exact: tuple[str, ...] = ()
+    """What is given as it truly is, of `EXACT`."""
 
 
 _SMALL = RoomConfig(
@@ -196,10 +198,23 @@ CHANGES: dict[str, Change] = {
 }
 """By the name that stands in the name of a set."""
 WHOLE = ("object_masks", "person_masks")  # fields that count pixels
+EXACT: dict[str, tuple[str, ...]] = {
+    "camera": ("camera", "focal"),
+    "bodies": ("depth_bias", "depth_drift", "pose", "jitter", "dropped", "lost_feet"),
+    "contacts": (),
+    "masks": ("object_masks", "person_masks", "missed_masks", "leaks"),
+}
+"""What can be true, and the fields of `NoiseConfig` that are zero then: `rooms+exact=camera,masks`.
+
+A true camera stays where it is, with the floor's height below it, and the true contacts of each
+body are given as its own (`job.spoilt`). Initial scene and the rest of the noise stay as they are.
+"""
 
 
 def set_named(name: str) -> RoomSet:
-    """A set of `SETS`, or one with a changed noise: `rooms+scale=0.25`, `upstream+no-lens`.
+    """A set of `SETS`, or one with another noise.
+
+    `rooms+scale=0.25`, `rooms+exact=bodies`, `upstream+no-lens`.
 
     Raises:
         InputError: If there is none of this name.
@@ -212,13 +227,26 @@ def set_named(name: str) -> RoomSet:
     if change.startswith(OFF) and change.removeprefix(OFF) in SWITCHES:
         return replace(SETS[base], noise=without(SETS[base].noise, change.removeprefix(OFF)))
     kind, _, level = change.partition("=")
+    if kind == "exact":
+        return _exactly(SETS[base], name, tuple(level.split(",")))
     if kind not in CHANGES:
-        raise InputError(f"--set: {name!r} changes {kind!r}, expected one of {', '.join(CHANGES)}")
+        known = f"{', '.join(CHANGES)}, exact"
+        raise InputError(f"--set: {name!r} changes {kind!r}, expected one of {known}")
     try:
         size = float(level)
     except ValueError:
         raise InputError(f"--set: {name!r}, expected a number: {base}+{kind}=LEVEL") from None
     return replace(SETS[base], noise=changed(SETS[base].noise, CHANGES[kind], size))
+
+
+def _exactly(base: RoomSet, name: str, exact: tuple[str, ...]) -> RoomSet:
+    """A set of which some things are known as they truly are."""
+    for word in exact:
+        if word not in EXACT:
+            known = ", ".join(EXACT)
+            raise InputError(f"--set: {name!r} has {word!r} exact, expected some of {known}")
+    zero: dict[str, Any] = {field: 0 for word in exact for field in EXACT[word]}
+    return replace(base, noise=replace(base.noise, **zero), exact=exact)
 
 
 def changed(noise: NoiseConfig, change: Change, level: float) -> NoiseConfig:

@@ -8,7 +8,13 @@ from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, silent
 from mover.pipeline.presets import PRESETS
-from mover_bench.studies import study_noise, study_rows, study_upstream, study_video
+from mover_bench.studies import (
+    study_noise,
+    study_paper,
+    study_rows,
+    study_upstream,
+    study_video,
+)
 from mover_bench.studies.args import StudyArgs
 from mover_bench.studies.finished import Finished, Source, read_finished
 from mover_bench.studies.job import ROOM, Job
@@ -70,6 +76,10 @@ STUDIES: dict[str, Study] = {
     "upstream": Study(
         "What each error of today's tools costs: all at once, and each left out.",
         "upstream", study_upstream.plan, study_upstream.page,
+    ),
+    "paper": Study(
+        "Which error of the input undoes which printed term.",
+        "rooms", study_paper.plan, study_paper.page,
     ),
     "sets": Study(
         "All presets on all sets.",
@@ -169,7 +179,7 @@ def command_of(name: str, args: StudyArgs) -> str:
     words = ["mover experiment study", name]
     words += ["--set", args.set] if args.set else []
     words += ["--seeds", args.seeds] if args.seeds else []
-    if name == "sets" and args.presets != StudyArgs.presets:
+    if name in ("sets", "paper") and args.presets != StudyArgs.presets:
         words += ["--presets", *args.presets]
     words += ["--errors", *args.errors] if args.errors else []
     return " ".join(words)
@@ -199,7 +209,7 @@ def _check(args: StudyArgs) -> None:
         raise InputError(f"study: {args.name!r} is none of {', '.join(STUDIES)}, {ALL}")
     if args.set:
         set_named(args.set)
-    if args.name in ("sensitivity", "sets", ALL) and args.set and args.set not in SETS:
+    if args.name in ("sensitivity", "sets", "paper", ALL) and args.set and args.set not in SETS:
         raise InputError(
             f"--set: {args.set!r} is changed already, expected one of {', '.join(SETS)}"
         )

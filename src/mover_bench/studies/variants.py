@@ -14,7 +14,7 @@ from torch import Tensor
 from mover.core.records import rows_of
 from mover.core.types import Bodies, Capture, Masks, People
 from mover.pipeline.presets import PRESETS, Config, with_sizes
-from mover.stages.config import AlignConfig, AssignConfig, SpreadConfig
+from mover.stages.config import AssignConfig, SpreadConfig
 
 Hears = Literal["all", "no contact", "nobody"]
 SEGMENTS = 10  # of each length, as in the paper
@@ -100,10 +100,31 @@ TERMS: dict[str, Variant] = {
 }
 """The paper's ablation: which terms of the people are on, under the same camera."""
 
+HUMAN = ("contact", "depth", "collision")
+"""The terms of the people as the paper has them."""
+
+
+def lone_term(preset: str, name: str) -> Variant:
+    """A preset whose second stage has one term of the people, or none."""
+    config = PRESETS[preset]
+    weights = config.place.weights
+    silent = {term: 0.0 for term in HUMAN if term != name}
+    silent |= {} if name == "depth" else {"free_space": 0.0}
+    silent |= {} if name == "contact" else {"heading": 0.0}
+    place = replace(config.place, weights=replace(weights, **silent))
+    plain = replace(config, place=place, explain=replace(config.explain, use=False))
+    return Variant(plain, "all" if name == "contact" else "no contact")
+
+
+ALONE: dict[str, Variant] = {
+    f"{preset}-{name}": lone_term(preset, name) for preset in ("paper", "release") for name in HUMAN
+}
+"""`paper` and `release` with one term of the people."""
+
 _FEET = replace(ROBUST, refine=replace(ROBUST.refine, rounds=0))
 PARTS: dict[str, Variant] = {
     "no-refined-camera": Variant(_FEET),
-    "paper-camera": Variant(replace(_FEET, align=AlignConfig(sigmas=(0.1,), votes="points"))),
+    "paper-camera": Variant(replace(_FEET, align=PRESETS["paper"].align)),
     "no-yaw-starts": Variant(replace(ROBUST, layout=replace(ROBUST.layout, yaws=1))),
     "no-second-pass": Variant(replace(ROBUST, outer_iterations=0)),
     "no-depth-factor": Variant(replace(ROBUST, correct_depth=False)),
@@ -156,7 +177,8 @@ REFINED: dict[str, Variant] = {"refined-people": Variant(ROBUST, refined=True)}
 
 VARIANTS: dict[str, Variant] = {
     **{name: Variant(config) for name, config in PRESETS.items()},
-    **TERMS, **PARTS, **TOOLS, **NOBODY, **RELAXED, **LENS, **REFINED, **SINGLE, **SEGMENT, **TIMED,
+    **TERMS, **ALONE, **PARTS, **TOOLS, **NOBODY, **RELAXED, **LENS, **REFINED, **SINGLE, **SEGMENT,
+    **TIMED,
     **PEOPLE,
 }  # fmt: skip
 """By the name of the job."""

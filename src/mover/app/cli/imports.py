@@ -64,6 +64,8 @@ class ImportArgs:
     """Categories of what has only a number or a file name, as 1=chair 2=sofa."""
     recording: str = ""
     """Which recording of a data set (PROX, PiGraphs)."""
+    recordings: tuple[str, ...] = ()
+    """Several recordings of one room of PROX in one capture; the room's name: all of its own."""
     boxes: Path | None = None
     """bbox3d.json of MOVER's authors: the true furniture of a room of PROX."""
 
@@ -111,7 +113,12 @@ def _hints(args: ImportArgs, work: Path) -> "Hints":
         camera = of_view(args.fov, size, "--fov")
     elif old is not None:
         camera = old.camera
-    return Hints(camera, args.image, args.up, _names(args.names), args.recording, args.boxes, work)
+    if args.recording and args.recordings:
+        raise InputError("--recording, --recordings: both are given, expected one of them")
+    return Hints(
+        camera, args.image, args.up, _names(args.names), args.recording, args.recordings,
+        args.boxes, work,
+    )  # fmt: skip
 
 
 def _names(given: Sequence[str]) -> dict[str, str]:

@@ -10,7 +10,7 @@ from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.fused.launch import BORDER, FusedEnergy, Room
 from mover.energy.objective import SCENE_TERMS, HumanCues, ImageCues
 from mover.energy.terms import bbox, border, contact, depth, distance, scale
-from mover.energy.terms.collision import ROBUST
+from mover.energy.terms.collision import SAMPLES
 from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.factors import factors
 from mover.geometry.kernels.start import array, started
@@ -187,7 +187,7 @@ def _facts(objects: Objects, image: ImageCues, humans: HumanCues, weights: Scene
     facts = torch.zeros(n, 7)
     facts[:, 0] = (boxes[:, 2:] - boxes[:, :2]).clamp_min(1).prod(-1).sqrt()
     facts[:, 1] = many.depth
-    facts[:, 2] = many.collision * ROBUST / max(1, objects.samples.shape[1])
+    facts[:, 2] = many.collision * SAMPLES / max(1, objects.samples.shape[1])
     if image.distance is not None:
         facts[:, 3] = image.distance.clamp_min(1e-3).log()
     touches: ContactPoints | None = humans.touches

@@ -27,7 +27,7 @@ from torch import Tensor
 from mover.core.devices import constant
 from mover.core.records import record
 from mover.core.types import Layout, Objects
-from mover.energy.terms.collision import ROBUST
+from mover.energy.terms.collision import SAMPLES
 from mover.geometry.placement import place
 from mover.geometry.rotations import rot_y
 from mover.geometry.sections import Sections, outline
@@ -86,6 +86,6 @@ def apart_term(layout: Layout, objects: Objects, solids: Solids) -> Float[Tensor
         inside = -outline(solids.sections[other], own) * scale[::2].mean().exp()
         deep = (inside - MARGIN).relu() * solids.upright[one]
         near = deep.clamp_max(FAR)
-        price = ROBUST * (near * (2 * deep - near)).mean()
+        price = SAMPLES * (near * (2 * deep - near)).mean()
         total = total.index_add(0, constant((one,), index), price[None])
     return total

@@ -2,10 +2,11 @@ r"""People move through free space (Sec. 3.1, "Collision constraint").
 
 Evidence:  V = min(V_1, ..., V_T), the signed distance to all bodies on one grid [m]
 Price:     L_collision = \sum_i \sum_u \| V(u_i) \|_2^2   where V(u_i) < 0
-Paper:     u runs over the vertices of the mesh.
-Release:   u runs over even surface samples, and the price is |V| (energy.py doubles sofas).
-Robust:    1000 times the mean of V^2 over even surface samples: neither the resolution of the mesh
-           nor the number of samples has a weight.
+Paper:     the vertices u of a mesh that marching cubes made lie evenly on it, and how many they are
+           is not printed: here even surface samples, whose sum counts as that of 1000, as many as
+           the release draws. So the resolution of a mesh has no weight.
+Release:   the same samples (twice as many of sofas, see `factors`), and the price is |V|.
+Robust:    as in the paper.
 """
 
 from jaxtyping import Float
@@ -15,8 +16,7 @@ from mover.core.records import record
 from mover.energy.config import Variant
 from mover.geometry.volume import Volume, sample
 
-SAMPLES = 1000  # surface samples of an object in the release
-ROBUST = 1000.0  # brings a depth of 3 cm on every sample to a price of one
+SAMPLES = 1000.0  # of an object in the release; 3 cm inside on each is a price of one
 
 
 @record
@@ -33,13 +33,11 @@ def collision_term(
     """Price of object points inside bodies.
 
     Args:
-        points: Vertices (`paper`) or even surface samples [m].
+        points: Even surface samples [m].
         space: The bodies of all frames.
-        form: `paper` [m²], `release` [m], `robust` [1].
+        form: `release` [m], else [m²].
     """
     depth = sample(space.volume, points).clamp_max(0)
     if form == "release":
         return -depth.mean(-1) * SAMPLES
-    if form == "robust":
-        return ROBUST * depth.square().mean(-1)
-    return depth.square().sum(-1)
+    return SAMPLES * depth.square().mean(-1)

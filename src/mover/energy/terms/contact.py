@@ -5,7 +5,8 @@ Evidence:  body points that touch, from all frames, each assigned to one object 
            the back (C(O)^{\perp y}); thinned to small cells whose weight counts the points inside.
 Price:     L_contact = \sum_i \sum_v I(v, O_i)
            [CD(v^y, C(O_i)^y) + CD(v^{\perp y}, C(O_i)^{\perp y})]
-Paper:     CD is the distance from a body point to the nearest point of the object's part.
+Paper:     CD is the mean over the body points of the distance to the nearest point of the object's
+           part: a Chamfer distance is a mean over its source points. Body and hands apart.
 Release:   from each point of the object's part to the nearest body point, its mean; body and hands
            apart.
 Robust:    the mean of a Geman-McClure price (rho 0.3 m) from body to object, in full only once four
@@ -98,7 +99,8 @@ def gap_term(
 
 def _price(near: Tensor, touches: ContactPoints, form: Variant) -> Float[Tensor, "*starts touched"]:
     if form == "paper":
-        return (near * touches.weight).sum((-2, -1))
+        mean = (near * touches.weight).sum(-1) / touches.weight.sum(-1).clamp_min(1e-9)
+        return mean.sum(-1)
     share = constant(SHARE, near)
     mean = (geman_mcclure(near, RHO) * touches.weight).sum(-1)
     mean = mean / touches.weight.sum(-1).clamp_min(1e-9)

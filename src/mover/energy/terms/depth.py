@@ -5,7 +5,8 @@ Evidence:  far(p) = min_t D_far^t(p),  near(p) = max_t D_near^t(p), gathered onc
            nearer than where the ray leaves the body; where object i hides the person (p in M_i and
            Sil_t, not in M_t), it is not farther than where the ray would enter the body.
 Price:     L_depth = \sum_i \sum_{q in Sil_i, M_i} ReLU(D_i(q) - far(q)) + ReLU(near(q) - D_i(q))
-Paper:     both bounds act on D_i, the front surface; pixels of an image that is 640 wide.
+Paper:     both bounds act on D_i, the front surface; pixels of an image that is 640 wide. Where
+           near(p) > far(p) there is no range to lie in, and the pixel says nothing.
 Release:   the far bound acts on the back surface, both are clamped at 2 m, the region is eroded
            by a pixel, and a third map keeps objects behind people outside their masks (`free`).
 Robust:    mean over the constrained pixels (at least 100), 2 cm margin, clamped at 2 m; pixels
@@ -117,8 +118,9 @@ def depth_term(
         out = _short(allowed.near - MARGIN, seen.nearest, CLAMP)
         out = out + _short(seen.nearest, allowed.far + MARGIN, CLAMP)
         return (out * bounded).sum((-2, -1)) / bounded.sum((-2, -1)).clamp_min(FEWEST)
+    ranged = inside & (allowed.near <= allowed.far)
     out = _short(allowed.near, seen.nearest) + _short(seen.nearest, allowed.far)
-    return (out * inside).sum((-2, -1)) * allowed.area
+    return (out * ranged).sum((-2, -1)) * allowed.area
 
 
 def free_space_term(

@@ -80,6 +80,8 @@ class Hints:
     """Categories by number, file name or index, where the source has none."""
     recording: str = ""
     """Which recording of a data set."""
+    recordings: tuple[str, ...] = ()
+    """Several recordings of one room of a data set."""
     boxes: Path | None = None
     """bbox3d.json: the true boxes of MOVER's authors."""
     work: Path = Path()

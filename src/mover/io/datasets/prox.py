@@ -1,240 +1,222 @@
-"""PROX: a recording as a capture, with the truth beside it.
+"""PROX: recordings of one room as a capture, with the truth beside it.
 
-The pictures are stored mirrored and are flipped here; the calibration and the fits belong to the
-flipped ones. The truth is the camera of cam2world, the floor of the scan and, where the user has
-them, the boxes of MOVER's authors (--boxes), and in the quantitative part the bodies of MoSh.
-The capture itself knows none of that: its camera is level, its furniture comes from elsewhere.
+The pictures are stored mirrored and are flipped here, and so are the masks of people; the
+calibration and the fits belong to the flipped ones. Several recordings of a room follow one
+another. The stills of the quantitative part are frames of their own without a frame rate. The truth
+is the camera of cam2world, the floor of the scan and, where the user has them, the boxes of MOVER's
+authors (--boxes), and in the quantitative part the bodies of MoSh. The capture itself knows none of
+that: its camera is level, its furniture comes from elsewhere. What is missing is told.
 """
 
 import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.types import Bodies, Camera, Scene
+from mover.core.types import Bodies, BodyPose, Camera, Scene
 from mover.io.capture.bodies_file import bodies_to_arrays
 from mover.io.capture.parts import Hints, Parts, image_parts
 from mover.io.datasets.prox_files import (
+    FITS,
+    FOLDERS,
     FPS,
     QUANTITATIVE,
     SIZE,
     Recording,
-    frames_of,
+    Timeline,
+    asked_for,
     lens_of,
-    number_of,
-    recordings_of,
     scene_camera,
+    timelines,
     world_of,
 )
+from mover.io.datasets.prox_keypoints import keypoint_trees
+from mover.io.datasets.prox_masks import people_masks
 from mover.io.datasets.true_boxes import TrueBox, boxes_scene, read_bbox3d
 from mover.io.files.cameras import tilt_of
-from mover.io.files.fields import At, get, items, mapping, maybe, number, read_json, refuse
+from mover.io.files.fields import At, read_json
 from mover.io.files.images import mirrored_copy
 from mover.io.files.meshes import floor_of, read_scan
 from mover.io.files.schema import rigid
 from mover.io.scenes.placing import Matrix
 
-PAIRS_25 = ((2, 5), (3, 6), (4, 7), (9, 12), (10, 13), (11, 14), (15, 16), (17, 18),
-            (19, 22), (20, 23), (21, 24))  # fmt: skip
-"""BODY_25: right and left."""
-FACE = (
-    *((i, 16 - i) for i in range(8)), *((17 + i, 26 - i) for i in range(5)), (31, 35), (32, 34),
-    (36, 45), (37, 44), (38, 43), (39, 42), (40, 47), (41, 46), (48, 54), (49, 53), (50, 52),
-    (55, 59), (56, 58), (60, 64), (61, 63), (65, 67), (68, 69),
-)  # fmt: skip
-"""The 70 points of a face: right and left."""
-BODY, LEFT, RIGHT, HEAD = (
-    "pose_keypoints_2d",
-    "hand_left_keypoints_2d",
-    "hand_right_keypoints_2d",
-    "face_keypoints_2d",
-)
-SURE = 0.3  # joints with less confidence do not vote
-LEAST = 20.0  # [px], the difference that decides
-
-
-def keypoint_trees(
-    recording: Recording, first: int, bodies: Bodies | None, camera: Camera, notes: list[str]
-) -> dict[str, Any]:
-    """OpenPose files by their place in the capture, in the flipped pictures.
-
-    Third-party code says that those of the qualitative part are of the mirrored pictures and those
-    of the quantitative part are not. Where the fitted bodies are known, they decide instead.
-
-    Args:
-        recording: Of PROX.
-        first: The number of frame 0.
-        bodies: Fits in the camera's frame.
-        camera: Of the flipped pictures.
-        notes: Takes what was decided.
-
-    Raises:
-        InputError: If a file is not OpenPose's.
-    """
-    folder = recording.root / "keypoints" / recording.name
-    paths = sorted(folder.glob("*.json")) if folder.is_dir() else []
-    if not paths:
-        return {}
-    trees = {number_of(path) - first: read_json(path) for path in paths}
-    stored = {frame: _middle(at) for frame, at in trees.items()}
-    mirrored, why = recording.scene != QUANTITATIVE, "as third-party code says"
-    vote = None if bodies is None else _vote(stored, bodies, camera)
-    if vote is not None:
-        mirrored, why = vote, "as the fitted bodies say"
-    notes.append(f"the keypoints were {'flipped' if mirrored else 'kept'}, {why}")
-    return {
-        f"keypoints/{frame:06d}_keypoints.json": _flipped(at) if mirrored else dict(mapping(at))
-        for frame, at in trees.items()
-        if frame >= 0
-    }
-
-
-def _triples(at: At) -> NDArray[np.float64]:
-    """x, y and confidence."""
-    values = [number(v) for v in items(at)]
-    if len(values) % 3:
-        refuse(at, "triples of x, y, confidence")
-    return np.array(values).reshape(-1, 3)
-
-
-def _middle(at: At) -> float | None:
-    """Mean x of what is seen of the first person."""
-    people = items(get(at, "people"))
-    if not people:
-        return None
-    joints = _triples(get(people[0], BODY))
-    seen = joints[joints[:, 2] > SURE]
-    return float(seen[:, 0].mean()) if len(seen) else None
-
-
-def _vote(stored: dict[int, float | None], bodies: Bodies, camera: Camera) -> bool | None:
-    """Whether the files are of mirrored pictures; None where the bodies do not tell."""
-    from mover.geometry.camera import project
-
-    gain = 0.0
-    for row, frame in enumerate(bodies.frame.tolist()):
-        x = stored.get(frame)
-        if x is not None:
-            true = float(project(bodies.verts[row], camera.K)[:, 0].mean())
-            gain += abs(x - true) - abs(SIZE[0] - x - true)
-    return None if abs(gain) < LEAST else gain > 0
-
-
-def _flipped(at: At) -> dict[str, Any]:
-    """A file of a mirrored picture as that of the true one: left is right."""
-    people: list[dict[str, Any]] = []
-    for person in items(get(at, "people")):
-        row = dict(mapping(person))
-        hands = {LEFT: maybe(person, RIGHT), RIGHT: maybe(person, LEFT)}
-        parts = {BODY: maybe(person, BODY), HEAD: maybe(person, HEAD), **hands}
-        for key, given in parts.items():
-            if given is not None:
-                pairs = PAIRS_25 if key == BODY else FACE if key == HEAD else ()
-                row[key] = _mirror(_triples(given), pairs).ravel().tolist()
-        people.append(row)
-    return {**mapping(at), "people": people}
-
-
-def _mirror(joints: NDArray[np.float64], pairs: tuple[tuple[int, int], ...]) -> NDArray[np.float64]:
-    """Joints of the flipped picture; those that are missing stay zeros."""
-    order = np.arange(len(joints))
-    for a, b in pairs:
-        if max(a, b) < len(joints):
-            order[a], order[b] = b, a
-    out = joints[order].copy()
-    out[:, 0] = np.where(out[:, 2] > 0, SIZE[0] - out[:, 0], 0.0)
-    return out
-
-
-FITS = ("PROXD", "PROX", "fittings/PROXD", "fittings/PROX", "fittings/RGB")
-MOSH = "fittings/mosh"
+COSTS = {
+    "Color": "no pictures: nothing to draw on, masks of furniture must come from elsewhere",
+    "BodyIndexColor": "no masks of people: no depth order",
+    "keypoints": "no keypoints: `mover fit` has nothing to fit",
+    "fits": "no bodies: only the image speaks, unless `mover fit` makes some of the keypoints",
+    "cam2world": "no truth of the camera, and so none at all",
+    "scenes": "no scan: the truth has no floor and no surfaces (P2S)",
+    "mosh": "no true bodies: no errors of people",
+}
+"""What each part of a user's copy is for."""
 
 
 def prox_parts(root: Path, hints: Hints) -> Parts:
-    """One recording of a user's copy of PROX.
+    """Recordings of one room of a user's copy of PROX.
 
     Raises:
         InputError: If there is no such recording, or a file is wrong.
     """
-    recording = _recording(root, hints.recording)
-    frames = frames_of(recording)
-    first = min(frames, default=_first_fit(recording))
-    lens = lens_of(root)
+    recordings = asked_for(
+        root, hints.recordings or ((hints.recording,) if hints.recording else ())
+    )
+    lines, lens = timelines(recordings), lens_of(root)
     camera = Camera(
         torch.tensor([[lens.value["fl_x"], 0, lens.value["cx"]],
                       [0, lens.value["fl_y"], lens.value["cy"]], [0, 0, 1]]).float(),
         torch.tensor(tilt_of(0.0, 0.0)).float(), *SIZE,
     )  # fmt: skip
-    notes: list[str] = [f"{recording.name}: frame 0 is number {first} of the recording"]
-    bodies = _fits(recording, FITS, first, notes)
+    notes = [_told(line) for line in lines]
+    fits = [_fits(line, FITS, notes) for line in lines]
+    bodies = _joined(zip(lines, fits, strict=True), _tracks(recordings), notes)
+    trees: dict[str, Any] = {}
+    for line, found in zip(lines, fits, strict=True):
+        trees |= keypoint_trees(line, found, camera, notes)
+    fps = None if lines[0].stills else FPS
+    name = recordings[0].name if len(recordings) == 1 else recordings[0].scene
     parts = Parts(
-        name=recording.name,
+        name=name,
         camera=lens,
-        bodies=None if bodies is None else At(bodies_to_arrays(bodies), recording.name),
-        trees=keypoint_trees(recording, first, bodies, camera, notes),
-        notes=tuple(notes),
+        bodies=None if bodies is None else At(bodies_to_arrays(bodies), name),
+        people=people_masks(lines, _tracks(recordings), fps),
+        trees=trees,
+        notes=(*notes, *_missing(lines)),
     )
-    if frames:
-        load, size = image_parts(frames[first], mirrored=True)
-        copies = {
-            f"frames/{number - first:06d}.jpg": mirrored_copy(path, hints.work)
-            for number, path in frames.items()
+    parts = _with_pictures(parts, lines, hints)
+    return _with_truth(parts, lines, lens, hints)
+
+
+def _told(line: Timeline) -> str:
+    """Which frames a recording has become."""
+    first, last = min(line.frames.values()), max(line.frames.values())
+    kind = "stills" if line.stills else "frames"
+    return f"{line.recording.name}: {len(line.frames)} {kind}, {first} to {last} of the capture"
+
+
+def _missing(lines: Sequence[Timeline]) -> list[str]:
+    """The parts that the recordings lack, with what each costs."""
+    notes: list[str] = []
+    for line in lines:
+        name, root = line.recording.name, line.recording.root
+        lacking = {
+            kind: FOLDERS[kind].format(name) for kind in ("Color", "BodyIndexColor", "keypoints")
         }
-        parts = dataclasses.replace(parts, load_image=load, image_size=size, copies=copies)
-    return _with_truth(parts, recording, first, lens, hints)
+        lacking = {kind: place for kind, place in lacking.items() if not line.files(kind)}
+        if not any(line.files(kind) for kind in FITS):
+            kind = "fittings/PROX" if line.stills else FITS[0]
+            lacking["fits"] = FOLDERS[kind].format(name)
+        if line.recording.scene == QUANTITATIVE and not line.files("mosh"):
+            lacking["mosh"] = FOLDERS["mosh"].format(name)
+        for kind, place in {"cam2world": "cam2world/{}.json", "scenes": "scenes/{}.ply"}.items():
+            if not (root / place.format(line.recording.scene)).is_file():
+                lacking[kind] = place.format(line.recording.scene)
+        notes += [f"{place}: missing, so {COSTS[kind]}" for kind, place in lacking.items()]
+    return list(dict.fromkeys(notes))
 
 
-def _recording(root: Path, name: str) -> Recording:
-    """The recording that is asked for."""
-    known = recordings_of(root)
-    if not name and len(known) == 1:
-        name = known[0]
-    if name not in known:
-        some = ", ".join(known[:4]) + (", ..." if len(known) > 4 else "")
-        raise InputError(f"--recording: {name!r} is none of {len(known)} in {root}: {some}")
-    return Recording(root, name)
+def _with_pictures(parts: Parts, lines: Sequence[Timeline], hints: Hints) -> Parts:
+    """The parts with all pictures, flipped; the first is the reference image."""
+    copies: dict[str, Path] = {}
+    first: Path | None = None
+    for line in lines:
+        for frame, path in line.files("Color").items():
+            first = first or path
+            copies[f"frames/{frame:06d}.jpg"] = mirrored_copy(
+                path, hints.work / line.recording.name
+            )
+    if first is None:
+        return parts
+    load, size = image_parts(first, mirrored=True)
+    return dataclasses.replace(parts, load_image=load, image_size=size, copies=copies)
 
 
-def _first_fit(recording: Recording) -> int:
-    """The number of the first frame where there are no pictures."""
-    for kind in (*FITS, MOSH):
-        folder = recording.root / kind / recording.name / "results"
-        numbers = [number_of(p) for p in folder.iterdir()] if folder.is_dir() else []
-        if numbers:
-            return min(numbers)
-    return 1
+def _tracks(recordings: Sequence[Recording]) -> dict[str, int]:
+    """A track for each subject: there is one person in a recording."""
+    subjects = dict.fromkeys(recording.subject for recording in recordings)
+    return {subject: track for track, subject in enumerate(subjects)}
 
 
-def _fits(
-    recording: Recording, kinds: tuple[str, ...], first: int, notes: list[str]
-) -> Bodies | None:
-    """Fitted bodies in the frame of their files; None where there are none or no body model."""
+def _fits(line: Timeline, kinds: Sequence[str], notes: list[str]) -> Bodies | None:
+    """Fitted bodies in the frame of their files; None where there are none or no body model.
+
+    Raises:
+        InputError: If fits are lost.
+    """
     from mover.io.people.bodies import bodies_from
     from mover.io.people.found import Known
 
-    for kind in kinds:
-        folder = recording.root / kind / recording.name / "results"
-        if folder.is_dir():
-            known = Known(fps=FPS, gender=recording.gender, first=first)
-            try:
-                found = bodies_from("prox", folder, known)
-            except InputError as error:
-                notes.append(f"{kind}: the bodies were not read: {error}")
-                return None
-            notes += [f"bodies are those of {kind}", *found.warnings]
-            return found.bodies
-    return None
+    recording = line.recording
+    kind = next((kind for kind in kinds if line.files(kind)), None)
+    if kind is None:
+        return None
+    folder = recording.root / FOLDERS[kind].format(recording.name)
+    known = Known(fps=None if line.stills else FPS, gender=recording.gender, frames=line.frames)
+    try:
+        found = bodies_from("prox", folder, known)
+    except InputError as error:
+        notes.append(f"{kind}: the bodies were not read: {error}")
+        return None
+    lost = len(line.files(kind)) - len(found.bodies.frame.unique())
+    if lost > 0 and not found.warnings:
+        raise InputError(f"{folder}: {lost} of {len(line.files(kind))} fits are lost")
+    notes += [f"{recording.name}: bodies are those of {kind}", *found.warnings]
+    return found.bodies
 
 
-def _with_truth(parts: Parts, recording: Recording, first: int, lens: At, hints: Hints) -> Parts:
+def _joined(
+    given: Iterable[tuple[Timeline, Bodies | None]], tracks: Mapping[str, int], notes: list[str]
+) -> Bodies | None:
+    """Bodies of all recordings together, each person under the own track."""
+    parts = [
+        dataclasses.replace(
+            found, person=torch.full_like(found.person, tracks[line.recording.subject])
+        )
+        for line, found in given
+        if found is not None
+    ]
+    if len(parts) < 2:
+        return parts[0] if parts else None
+    if len({tuple(part.faces.shape) + tuple(part.verts.shape[1:]) for part in parts}) > 1:
+        raise InputError("the recordings have bodies of different models, expected one")
+    pose = _joined_pose([part.pose for part in parts])
+    if pose is None:
+        notes.append("the bodies of several models are kept as meshes, without their parameters")
+    joints = [part.joints for part in parts if part.joints is not None]
+    whole = len(joints) == len(parts)
+    return dataclasses.replace(
+        parts[0],
+        verts=torch.cat([part.verts for part in parts]),
+        joints=torch.cat(joints) if whole else None,
+        joint_names=parts[0].joint_names if whole else (),
+        frame=torch.cat([part.frame for part in parts]),
+        person=torch.cat([part.person for part in parts]),
+        pose=pose,
+    )
+
+
+def _joined_pose(poses: Sequence[BodyPose | None]) -> BodyPose | None:
+    """Parameters of one model together; None where there are several, or none."""
+    known = [pose for pose in poses if pose is not None]
+    kinds = {(pose.model, pose.gender, pose.betas.shape[1], tuple(pose.extra)) for pose in known}
+    if len(known) < len(poses) or len(kinds) != 1:
+        return None
+    names = ("betas", "global_orient", "body_pose", "transl")
+    rows = {name: torch.cat([getattr(pose, name) for pose in known]) for name in names}
+    extra = {name: torch.cat([pose.extra[name] for pose in known]) for name in known[0].extra}
+    return dataclasses.replace(known[0], **rows, extra=extra)
+
+
+def _with_truth(parts: Parts, lines: Sequence[Timeline], lens: At, hints: Hints) -> Parts:
     """The parts with the folders truth/ and truth_scan/."""
+    recording = lines[0].recording
     root, notes = recording.root, list(parts.notes)
     if not (root / "cam2world" / f"{recording.scene}.json").is_file():
-        return dataclasses.replace(parts, notes=(*notes, "cam2world: missing, so no truth"))
+        return parts
     cam2world = scene_camera(root, recording.scene)
     world, R = world_of(cam2world)
     camera = {**lens.value, "R_cam_world": R.tolist()}
@@ -246,7 +228,8 @@ def _with_truth(parts: Parts, recording: Recording, first: int, lens: At, hints:
     scenes = _true_scenes(recording, boxes, (world, cam2world), camera)
     people: dict[str, Bodies] = {}
     if recording.scene == QUANTITATIVE:
-        mosh = _fits(recording, (MOSH,), first, notes)
+        true = [(line, _fits(line, ("mosh",), notes)) for line in lines]
+        mosh = _joined(true, _tracks([line.recording for line in lines]), notes)
         if mosh is not None:
             people["truth"] = _into_camera(mosh, root, cam2world)
     return dataclasses.replace(parts, scenes=scenes, people_of=people, notes=tuple(notes))

@@ -1,6 +1,7 @@
 """Files of PROX: calibration, cameras, scans, signed distances, names of frames and recordings."""
 
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from mover.geometry.volume import Volume
 from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, get, integer, read_json, refuse, vector
 from mover.io.files.schema import rigid
+from mover.io.people.values import frame_numbers
 from mover.io.scenes.placing import Matrix
 
 SIZE = (1920, 1080)  # [px], of the colour images
@@ -35,6 +37,11 @@ UNEVEN = 1e-3  # [share], cells that differ by no more are cubes
 MOST_CELLS = 512  # along an axis of a signed distance field
 
 
+PAUSE = 60.0  # [s] between two videos of one capture: nobody is followed across it
+FITS = ("PROXD", "PROX", "fittings/PROXD", "fittings/PROX", "fittings/RGB")
+"""Where fitted bodies may lie; the first that is there counts."""
+
+
 @dataclass(frozen=True)
 class Recording:
     """One video of PROX."""
@@ -48,10 +55,15 @@ class Recording:
         return self.name.split("_")[0]
 
     @property
+    def subject(self) -> str:
+        """Who is in it, by the number in the name; the name itself where it has none."""
+        parts = self.name.split("_")
+        return parts[1] if len(parts) > 1 else self.name
+
+    @property
     def gender(self) -> str:
         """Of the person, by the number in the name."""
-        parts = self.name.split("_")
-        return "female" if len(parts) > 1 and parts[1] in FEMALE else "male"
+        return "female" if self.subject in FEMALE else "male"
 
 
 def recordings_of(root: Path) -> list[str]:
@@ -68,25 +80,102 @@ def recordings_of(root: Path) -> list[str]:
     return kept
 
 
-def frames_of(recording: Recording) -> dict[int, Path]:
-    """Pictures by the number in their name, e.g. s001_frame_00001__00.00.00.023.jpg."""
-    folder = recording.root / "recordings" / recording.name / "Color"
-    if not folder.is_dir():
-        return {}
-    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
-    return {number_of(path): path for path in paths}
+FOLDERS = {
+    "Color": "recordings/{}/Color",
+    "BodyIndexColor": "recordings/{}/BodyIndexColor",
+    "keypoints": "keypoints/{}",
+    "mosh": "fittings/mosh/{}/results",
+    **{kind: f"{kind}/{{}}/results" for kind in FITS},
+}
+"""What a recording has for each of its frames, by the folder's pattern in the user's copy."""
+ENDINGS = ("_keypoints",)  # of names beside those of the pictures
 
 
-def number_of(path: Path) -> int:
-    """The frame's number in the name of a file or folder.
+@dataclass(frozen=True)
+class Timeline:
+    """Which frame of the capture each file of a recording is."""
+
+    recording: Recording
+    frames: Mapping[str, int]
+    """By the name of the picture, without its ending."""
+    stills: bool
+    """Each frame is a shot of its own, at a time of its own."""
+
+    def files(self, kind: str) -> dict[int, Path]:
+        """The files or folders of one kind of `FOLDERS` by frame, ascending."""
+        return {self.frames[name]: path for name, path in named_files(self.recording, kind)}
+
+
+def timelines(recordings: Sequence[Recording]) -> tuple[Timeline, ...]:
+    """The frames of recordings of one room, one after the other.
+
+    A video keeps its numbers, and a minute lies between two; stills are numbered in their order.
 
     Raises:
-        InputError: If it has none.
+        InputError: If two files of a recording would be one frame, or it has none.
     """
-    found = re.search(r"frame_?(\d{1,9})", path.name) or re.search(r"(\d{1,9})", path.name)
-    if found is None:
-        raise InputError(f"{path.name}: has no number of a frame, expected s001_frame_00001__...")
-    return int(found[1])
+    lines: list[Timeline] = []
+    start = 0
+    for recording in recordings:
+        names = [name for kind in FOLDERS for name, _ in named_files(recording, kind)]
+        if not names:
+            where = ", ".join(f.format(recording.name) for f in tuple(FOLDERS.values())[:3])
+            raise InputError(f"{recording.name}: has no frames, expected files in {where}, ...")
+        numbers = frame_numbers(names, recording.name)
+        first, last = min(numbers.values()), max(numbers.values())
+        frames = {name: start + number - first for name, number in numbers.items()}
+        stills = recording.scene == QUANTITATIVE
+        lines.append(Timeline(recording, frames, stills))
+        start += last - first + 1 + (0 if stills else round(PAUSE * FPS))
+    return tuple(lines)
+
+
+def named_files(recording: Recording, kind: str) -> list[tuple[str, Path]]:
+    """Names of frames with their files or folders, of one kind of `FOLDERS`.
+
+    Raises:
+        InputError: If two files have one name.
+    """
+    folder = recording.root / FOLDERS[kind].format(recording.name)
+    if not folder.is_dir():
+        return []
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        name = path.name if path.is_dir() else path.stem
+        if path.name.startswith(".") or not re.search(r"\d", name):
+            continue
+        for ending in ENDINGS:
+            name = name.removesuffix(ending)
+        if name in found:
+            raise InputError(f"{folder}: {found[name].name} and {path.name} are one frame")
+        found[name] = path
+    return list(found.items())
+
+
+def asked_for(root: Path, names: Sequence[str]) -> tuple[Recording, ...]:
+    """The recordings that a user names: whole names, or a room for all of its recordings.
+
+    Raises:
+        InputError: If there is no such recording, none is named, or they are of several rooms.
+    """
+    known = recordings_of(root)
+    if not names and len(known) == 1:
+        names = known
+    found: list[str] = []
+    for name in names or ("",):
+        same = [n for n in known if n == name or n.split("_")[0] == name]
+        if not same:
+            some = ", ".join(known[:4]) + (", ..." if len(known) > 4 else "")
+            raise InputError(f"--recording: {name!r} is none of {len(known)} in {root}: {some}")
+        found += same
+    chosen = tuple(Recording(root, name) for name in dict.fromkeys(found))
+    for other in chosen[1:]:
+        if other.scene != chosen[0].scene:
+            raise InputError(
+                f"--recordings: {chosen[0].name} is of {chosen[0].scene}, {other.name} of"
+                f" {other.scene}, expected recordings of one room"
+            )
+    return chosen
 
 
 def lens_of(root: Path) -> At:

@@ -115,6 +115,7 @@ def mirrored_copy(path: Path, work: Path) -> Path:
     """
     from PIL import ImageOps
 
+    work.mkdir(parents=True, exist_ok=True)
     target = work / f"mirrored_{path.stem}.jpg"
     with opened(path) as picture:
         ImageOps.mirror(picture.convert("RGB")).save(target, quality=95)

@@ -33,6 +33,8 @@ class Known:
     """neutral, female or male; None: what the files say, else neutral."""
     first: int = 0
     """The number in the name of the first frame's file."""
+    frames: Mapping[str, int] | None = None
+    """Frames by the names of files or folders; None: by the numbers in them, less `first`."""
 
 
 ROOT = 3  # angles of the root

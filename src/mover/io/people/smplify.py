@@ -14,10 +14,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mover.core.errors import InputError
 from mover.io.files.fields import At, refuse
 from mover.io.people.found import Found, Known, joined, people_rows, shifted
 from mover.io.people.lens import assumed_lens
-from mover.io.people.values import either, files_of, need, number_in, read_any, rows, tensor, wide
+from mover.io.people.values import (
+    either,
+    files_of,
+    frame_numbers,
+    need,
+    read_any,
+    rows,
+    tensor,
+    wide,
+)
 
 FOCAL = 5000.0  # [px], SMPLify-X's default
 CODE = 32  # numbers of a VPoser code
@@ -56,24 +66,26 @@ def read_mover(path: Path, known: Known) -> Found:
 
 def _read(path: Path, known: Known, assumed: bool) -> Found:
     files = files_of(path, "**/*.pkl", "fits")
+    if not path.is_dir():
+        return joined([_rows(read_any(files[0]), 0, 0, known, assumed)])
+    places = [_place_in(file) for file in files]
+    frames = known.frames
+    if frames is None:
+        numbers = frame_numbers((name for name, _ in places), path.name)
+        frames = {name: number - known.first for name, number in numbers.items()}
     parts: list[Found] = []
-    for index, file in enumerate(files):
-        at = read_any(file)
-        frame, person = _place_in(file, index) if path.is_dir() else (known.first, 0)
-        parts.append(_rows(at, frame - known.first, person, known, assumed))
+    for file, (name, person) in zip(files, places, strict=True):
+        if name not in frames:
+            raise InputError(f"{file}: {name!r} is no frame of the recording")
+        parts.append(_rows(read_any(file), frames[name], person, known, assumed))
     return joined(parts)
 
 
-def _place_in(file: Path, index: int) -> tuple[int, int]:
-    """Frame and person of `<frame>/<person>.pkl` or `<frame>.pkl`.
-
-    A name may hold other numbers: `frame_00012__00.00.00.401` is frame 12; else the last counts.
-    """
-    person, name = 0, file.stem
-    if re.fullmatch(r"\d{1,3}", name) and re.search(r"\d", file.parent.name):
-        person, name = int(name), file.parent.name
-    told = re.findall(r"frame_?(\d+)", name)
-    return number_in(told[-1] if told else name, index), person
+def _place_in(file: Path) -> tuple[str, int]:
+    """Name of the frame, and person, of `<frame>/<person>.pkl` or `<frame>.pkl`."""
+    if re.fullmatch(r"\d{1,3}", file.stem) and re.search(r"\d", file.parent.name):
+        return file.parent.name, int(file.stem)
+    return file.stem, 0
 
 
 def _rows(at: At, frame: int, person: int, known: Known, assumed: bool) -> Found:

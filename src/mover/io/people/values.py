@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,34 @@ def number_in(name: str, index: int) -> int:
     """The last number in a file's name, else its place among the files."""
     found = re.findall(r"\d+", name)
     return int(found[-1]) if found else index
+
+
+def frame_numbers(names: Iterable[str], place: str) -> dict[str, int]:
+    """Frames by the names of their files or folders, as `s001_frame_00012__00.00.00.401`.
+
+    The number after `frame` counts, else the last one. Where the names tell several shots (s001,
+    s002, ...) each is a still of its own, and they are numbered from 1 in their order.
+
+    Args:
+        names: Of one recording, without endings.
+        place: How messages call it.
+
+    Raises:
+        InputError: If two names would be one frame.
+    """
+    known = sorted(set(names), key=lambda name: natural(Path(name)))
+    shots = {found[1] for name in known if (found := re.match(r"s(\d+)_frame", name))}
+    if len(shots) > 1:
+        return {name: rank for rank, name in enumerate(known, 1)}
+    frames: dict[str, int] = {}
+    owners: dict[int, str] = {}
+    for rank, name in enumerate(known):
+        told = re.findall(r"frame_?(\d+)", name)
+        number = number_in(told[-1] if told else name, rank)
+        if number in owners:
+            raise InputError(f"{place}: {owners[number]} and {name} are both frame {number}")
+        frames[name], owners[number] = number, name
+    return frames
 
 
 def natural(path: Path) -> tuple[tuple[int, str], ...]:

@@ -19,6 +19,8 @@ from mover.energy.terms.feet import FootContacts
 from mover.stages.config import FootContactConfig
 
 SIDES = ("left", "right")
+SOLES = tuple(f"{side}_sole" for side in SIDES)
+TOUCHING = 0.5  # the paper's threshold
 WITHIN = 0.5  # [s] between two frames that still tell whether a foot moved
 FAR_ENOUGH = 0.15  # [s] between them, at least, where the video has them: jitter is no motion
 JITTER = 0.03  # [m] that a still foot seems to move
@@ -36,6 +38,8 @@ class FootContactInputs:
     """Which rows are sound, from `select_frames`."""
     camera: Camera
     """Its pitch and roll may be off by several degrees."""
+    touch: Float[Tensor, "bodies verts"] | None = None
+    """Chance that a vertex touches something, where the user knows it."""
 
 
 @record
@@ -65,6 +69,10 @@ def find_foot_contacts(
     if not len(bodies.frame):
         none = bodies.frame
         return FootContacts(bodies.verts.new_zeros(0, 3), none, none, ())
+    if config.given and inputs.touch is not None:
+        named = _named(inputs, inputs.touch)
+        if len(named.person):
+            return named
     feet = _lower_feet(inputs, config)
     use, warnings = _best_evidence(feet, sound)
     observe(Step("find_foot_contacts", 0, 1))
@@ -75,6 +83,14 @@ def find_foot_contacts(
         frame=bodies.frame[use].repeat_interleave(count),
         warnings=warnings,
     )
+
+
+def _named(inputs: FootContactInputs, touch: Float[Tensor, "bodies verts"]) -> FootContacts:
+    """The sole points that the user's contacts name."""
+    bodies = inputs.bodies
+    touching = (touch > TOUCHING) & members(inputs.parts, *SOLES) & inputs.keep[:, None]
+    row, vert = touching.nonzero().unbind(1)
+    return FootContacts(bodies.verts[row, vert], bodies.person[row], bodies.frame[row], ())
 
 
 def _best_evidence(
