@@ -402,3 +402,37 @@ def test_a_second_pass_takes_camera_and_floor_of_a_result(tmp_path):
     for both in ({}, {"room": tmp_path, "camera": tmp_path / "camera.json"}):
         with pytest.raises(InputError, match="--camera or --room"):
             _world(FitArgs(Path("k.npz"), **both))
+
+
+def test_the_preset_paper_prices_motion_as_printed():
+    """L_smooth of a track at even times, by a loop over Sec. 3.2, with the released weights."""
+    from mover.fitting.energy import Seen, smooth_joint_price, smooth_pixel_price
+    from mover.fitting.presets import PAPER
+
+    generator = torch.Generator().manual_seed(0)
+    frames = torch.arange(5)
+    joints = torch.rand(5, 22, 3, generator=generator)
+    pixels = 900 * torch.rand(5, 4, 2, generator=generator)
+    triples = triples_of(frames, torch.zeros(5).long(), 30.0, PAPER)
+    none = torch.zeros(5, 63)
+    seen = Seen(
+        pixels, torch.ones(5, 4), torch.eye(3), 1080, torch.tensor([0.0, -1, 0]), None, triples,
+        none, torch.ones(63), None,
+    )  # fmt: skip
+    by = Weighed(PAPER.stages[0], PAPER, same, False)
+    stage = PAPER.stages[0].smooth
+    solid = stage * PAPER.smooth_joints * smooth_joint_price(joints, seen, by).sum()
+    flat = stage * PAPER.smooth_pixels * smooth_pixel_price(pixels, seen, by).sum()
+
+    def rho(squared, sigma):
+        return sigma**2 * squared / (squared + sigma**2)
+
+    wanted = [0.0, 0.0]
+    for t in range(1, 4):
+        second = joints[t - 1] + joints[t + 1] - 2 * joints[t]
+        wanted[0] += 1e2 * float(sum(rho(float(j.square().sum()), 0.1) for j in second))
+        second = pixels[t - 1] + pixels[t + 1] - 2 * pixels[t]
+        wanted[1] += 1e-2 * float(sum(rho(float(c), 100.0) for c in second.square().flatten()))
+    assert float(solid) == pytest.approx(wanted[0], rel=1e-4)
+    assert float(flat) == pytest.approx(wanted[1], rel=1e-4)
+    assert [s.pose for s in PAPER.stages] == [4.78, 4.78]

@@ -170,31 +170,3 @@ def test_parts_of_an_object_become_one_box(plain: layouts.Room, tmp_path: Path) 
     for box, thing in zip(boxes, known, strict=True):
         size = thing.scale * np.ptp(thing.verts, axis=0)
         assert np.allclose(sorted(2 * box.half), sorted(size), atol=1e-6)
-
-
-def test_the_papers_table_of_a_perfect_copy_has_perfect_rows(
-    plain: layouts.Room, prox: Path, tmp_path: Path
-) -> None:
-    """A result that is the truth scores 1 in both overlaps; the published rows stand below."""
-    import shutil
-
-    from mover_bench.tables.paper_table import paper_table
-
-    room = prox_room(plain)
-    out = tmp_path / "captures" / RECORDING
-    boxes = prox / "boxes" / "bbox3d.json"
-    imported("prox", prox, out, tmp_path, recording=RECORDING, boxes=boxes)
-    results = tmp_path / "results" / RECORDING
-    shutil.copytree(out / "truth", results)
-    shutil.copy(results / "scene.json", results / "initial.json")
-    told = paper_table("prox", tmp_path / "captures", tmp_path / "results")
-    assert "here 1 of 51" in told
-    rows = {line[:20].strip(): line[20:].split() for line in told.splitlines()[2:6]}
-    ours = rows["your copy, mover"]
-    assert (ours[0], ours[2]) == ("1.000", "1.000")
-    assert float(ours[1]) < 0.2  # boxes are not the shapes in the scan
-    assert ours[5:8] == ["0.000", "0.000", "0.000"]
-    assert rows["Total3D"][0] == "0.196"
-    with pytest.raises(InputError, match="no capture"):
-        paper_table("pigraphs", tmp_path / "results", tmp_path / "captures")
-    assert len(room.things) > 2

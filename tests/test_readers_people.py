@@ -317,6 +317,19 @@ def test_codes_of_vposer_are_refused_with_the_way_out(tmp_path):
         bodies_from("smplifyx", path)
 
 
+def test_codes_of_vposer_are_decoded_with_its_weights(tmp_path):
+    """Code 0 .. 31 of the fixture's decoder: the angles are a linear map of the code."""
+    code = np.linspace(-1, 1, 32)[None]
+    path = smplify_file(tmp_path, lambda d: {**d, "body_pose": code})
+
+    def decode(given):
+        return torch.cat([given, given[:, :31]], 1) * 0.1
+
+    found = bodies_from("smplifyx", path, replace(KNOWN, decode=decode))
+    wanted = decode(torch.from_numpy(code).float())
+    torch.testing.assert_close(found.bodies.pose.body_pose, wanted)
+
+
 def test_frames_with_nan_are_left_out_and_told(tmp_path):
     data = made.wham_person()
     data["pose"][1, 5] = np.nan

@@ -189,3 +189,34 @@ def test_a_mask_beside_the_matrix_says_which_vertices_count(matrix_file):
             read_matrix(matrix_file, "smpl", "smplx")
     finally:
         mask.unlink()
+
+
+def test_imported_bodies_change_to_another_model_by_the_matrix(
+    models, matrix_file, monkeypatch, capsys
+):
+    """`mover import-bodies TOOL SOURCE --transfer smplx`, with and without the official file."""
+    from mover.app.cli.people import BodiesArgs, _transferred
+    from mover.bodies import smpl_files
+    from mover.core.types import Bodies
+
+    monkeypatch.setattr(smpl_files, "load_smpl", lambda name, _: models[name])
+    monkeypatch.setenv(FOLDER, str(matrix_file.parents[1]))
+    source = people(models["smpl"])
+    verts, joints = models["smpl"].posed(source)
+    zero = torch.zeros(3).long()
+    given = Bodies(
+        verts, models["smpl"].faces, joints, models["smpl"].joint_names, torch.arange(3), zero,
+        30.0, "camera", source,
+    )  # fmt: skip
+    args = BodiesArgs("pare", matrix_file, transfer="smplx")
+    found = _transferred(given, args)
+    assert found.verts.shape[1] == 10475
+    assert found.pose.model == "smplx"
+    assert "by smpl2smplx_deftrafo_setup.pkl" in capsys.readouterr().out
+    monkeypatch.delenv(FOLDER)
+    _transferred(given, args)
+    assert "by joints and matched skin" in capsys.readouterr().out
+    with pytest.raises(InputError, match="of smplx already"):
+        _transferred(found, args)
+    with pytest.raises(InputError, match="meshes only"):
+        _transferred(replace(given, pose=None), args)

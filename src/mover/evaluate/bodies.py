@@ -15,6 +15,8 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera
 from mover.energy.body_terms.time import Neighbours, gather_neighbours
 from mover.evaluate.scene import Metric
+from mover.io.capture.pose_file import into_camera
+from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 
 SOLES = ("left_sole", "right_sole")
 
@@ -88,6 +90,18 @@ def soles_of(bodies: Bodies, camera: Camera) -> Int[Tensor, " soles"]:
     up_cam = camera.R_cam_world[:, 1].to(bodies.verts)
     parts = parts_of(bodies, up_cam if bodies.space == "camera" else up_world)
     return members(parts, *SOLES).nonzero()[:, 0]
+
+
+def feet_heights(bodies: Bodies, camera: Camera) -> Float[Tensor, "points 1"]:
+    """Heights in the world of the foot contacts that bodies in it tell: still, straight legs [m].
+
+    The paper takes contacts of POSA; these are estimated as `find_foot_contacts` does.
+    """
+    R = camera.R_cam_world.to(bodies.verts)
+    seen = into_camera(bodies, R)
+    sound = torch.ones(len(bodies.frame), dtype=torch.bool)
+    feet = find_foot_contacts(FootContactInputs(seen, parts_of(seen, R[:, 1]), sound, camera))
+    return (feet.points_cam @ R)[:, 1:2]
 
 
 def gather_twins(bodies: Bodies, truth: Bodies) -> Twins | None:

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Int
@@ -24,6 +24,7 @@ from mover.evaluate.bodies import (
     MOTION_METRICS,
     POSE_METRICS,
     Standing,
+    feet_heights,
     gather_gait,
     gather_twins,
     soles_of,
@@ -83,6 +84,10 @@ class EvaluateConfig:
     """How far a sole may be under the floor before it counts as penetration [m]."""
     by_place: bool = True
     """Objects that bear no true name are paired by place; False: they are false."""
+    boxes: bool = False
+    """The true objects are boxes without meshes: 3D boxes are compared in the image (IoU2D)."""
+    feet: Literal["soles", "contacts"] = "soles"
+    """What may be under the floor: all soles, or the foot contacts that bodies tell (paper)."""
 
 
 @record
@@ -136,7 +141,7 @@ def evaluate(
         key: judged for key, judged in zip(SIDES, (before, after), strict=True) if key in sides
     }
     scenes = before.scene, after.scene, true.scene
-    objects = measure_objects(scenes, sides, config.samples, config.by_place)
+    objects = measure_objects(scenes, sides, config.samples, config.by_place, config.boxes)
     touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)
     return {
         key: means_of(objects, key)
@@ -253,6 +258,8 @@ def _people(
     values = measure(TOUCH_METRICS, near)
     if ground is not None and len(judged.soles):
         heights = bodies.verts[:, judged.soles, 1] - ground
+        if config.feet == "contacts":
+            heights = feet_heights(bodies, judged.scene.camera) - ground
         values |= measure(GROUND_METRICS, Standing(heights, config.ground_tolerance))
     values |= measure(MOTION_METRICS, gather_gait(bodies, truth.bodies, ground))
     twins = None if truth.bodies is None else gather_twins(bodies, truth.bodies)

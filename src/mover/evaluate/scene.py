@@ -16,7 +16,7 @@ from mover.core.records import record
 from mover.core.types import Camera, Mesh, Scene, SceneObject
 from mover.evaluate import surfaces
 from mover.furniture.library import canonical
-from mover.geometry.boxes import Box, box_of
+from mover.geometry.boxes import Box, box_of, corners
 from mover.geometry.boxes import iou2d as rectangle_iou
 from mover.geometry.boxes import iou3d as box_iou
 from mover.geometry.camera import NEAR, pitch_roll, project, to_camera
@@ -52,6 +52,8 @@ class Pair:
     truth_camera: Camera
     samples: int
     """Number of points on the true surface."""
+    boxes: bool = False
+    """The truth is a box: boxes are compared in the image, not what is drawn."""
 
 
 @record
@@ -68,9 +70,13 @@ def iou3d(pair: Pair) -> float:
 
 
 def iou2d(pair: Pair) -> float | None:
-    """Overlap in the image of the boxes around the two drawn meshes, both cut at its border."""
-    truth = image_box(pair.truth, pair.truth_camera)
-    estimate = image_box(pair.estimate, pair.estimate_camera)
+    """Overlap in the image of the boxes around the two drawn meshes, both cut at its border.
+
+    Where the truth is a box without a mesh (`Pair.boxes`) the two 3D boxes are drawn instead.
+    """
+    shape = _box_mesh if pair.boxes else place_object
+    truth = image_box(pair.truth, pair.truth_camera, shape)
+    estimate = image_box(pair.estimate, pair.estimate_camera, shape)
     if truth is None:
         return None
     return 0.0 if estimate is None else float(rectangle_iou(estimate, truth))
@@ -218,12 +224,19 @@ def match(
     return found
 
 
-def image_box(piece: SceneObject, camera: Camera) -> Float[Tensor, "4"] | None:
+def _box_mesh(piece: SceneObject) -> Mesh:
+    """The box of a piece, with triangles between all of its corners: only their edges are used."""
+    return Mesh(corners(box_of(piece)), torch.combinations(torch.arange(8), 3))
+
+
+def image_box(
+    piece: SceneObject, camera: Camera, shape: Callable[[SceneObject], Mesh] = place_object
+) -> Float[Tensor, "4"] | None:
     """Box around the drawn mesh, cut at the image border, as shares of its width and height.
 
     None: nothing of the mesh is on the image.
     """
-    mesh = place_object(piece)
+    mesh = shape(piece)
     visible = _in_front(to_camera(mesh.verts, camera.R_cam_world), mesh.faces)
     if len(visible) == 0:
         return None
@@ -303,7 +316,11 @@ def unmatched(
 
 
 def measure_objects(
-    scenes: tuple[Scene, Scene, Scene], sides: Sequence[str], samples: int, by_place: bool
+    scenes: tuple[Scene, Scene, Scene],
+    sides: Sequence[str],
+    samples: int,
+    by_place: bool,
+    boxes: bool = False,
 ) -> list[dict[str, Any]]:
     """Each true object in the initial scene and in the result, as far as they are asked for.
 
@@ -312,6 +329,7 @@ def measure_objects(
         sides: Some of `SIDES`.
         samples: Points on each true surface.
         by_place: Whether objects that bear no true name are paired by place.
+        boxes: Whether the truth is boxes without meshes.
     """
     initial, result, truth = scenes
     found: dict[str, dict[str, SceneObject]] = dict(
@@ -323,7 +341,7 @@ def measure_objects(
         piece = found[side].get(true.id)
         if piece is None:
             return measure_missing(true, truth.camera)
-        pair = Pair(piece, there[side].camera, true, truth.camera, samples)
+        pair = Pair(piece, there[side].camera, true, truth.camera, samples, boxes)
         given = found["initial"].get(true.id)
         values = measure(OBJECT_METRICS, pair)
         if given is None:

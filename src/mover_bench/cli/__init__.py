@@ -141,19 +141,40 @@ Table = Literal["prox", "prox-quantitative", "pigraphs"]
 
 @dataclass(frozen=True)
 class PaperTableArgs:
-    """Print the paper's table for your copy of a data set, beside the published rows."""
+    """Make all rows of the paper's table for your copy of a data set, beside the published ones.
+
+    Rows run beside each other and go on where they stopped; the page is RESULTS/TABLE-PRESET.md,
+    its numbers are the .csv beside it.
+    """
 
     table: Annotated[Positional[Table], arg(metavar="TABLE")]
     """prox, prox-quantitative or pigraphs."""
     captures: Annotated[Positional[Path], arg(metavar="CAPTURES")]
     """Folder of captures made by `mover import`, one for each recording, under its name."""
     results: Annotated[Positional[Path], arg(metavar="RESULTS")]
-    """Folder of results of `mover run` or `mover batch`, under the same names."""
+    """Folder for the rows' results and the page."""
+    preset: str = "robust"
+    """paper, release or robust."""
+    detected: Path | None = None
+    """The same captures with boxes and masks of a detector (PointRend), for rows of their own."""
+    only: tuple[str, ...] = ()
+    """Rows whose names begin so, as initial full; empty: all."""
+    workers: int = 0
+    """How many jobs run at once; 0: as many as there are cores."""
+    look: bool = False
+    """Run nothing: write the page from the jobs that are finished."""
 
 
 def show_paper_table(arguments: Sequence[str]) -> None:
     """`mover paper-table`."""
     args = parsed(PaperTableArgs, "mover paper-table", arguments)
-    from mover_bench.tables.paper_table import paper_table
+    from mover.app.cli.progress import Bar
+    from mover_bench.tables.paper_table import TableArgs, paper_table
 
-    say(paper_table(args.table, args.captures, args.results))
+    asked = TableArgs(
+        args.table, args.captures, args.results, args.detected, args.preset, args.workers,
+        args.look, args.only,
+    )  # fmt: skip
+    with Bar() as bar:
+        page = paper_table(asked, bar)
+    say(f"{page.read_text()}\ntable: {page}")

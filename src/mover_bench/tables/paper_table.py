@@ -1,121 +1,212 @@
-"""The paper's tables for a user's own copy of PROX and PiGraphs, beside the published rows."""
+"""The paper's tables for a user's own copy of PROX and PiGraphs, beside the published rows.
 
+All rows are made by one command: jobs run beside each other, finished ones are files and are not
+done again, and what is finished so far is written as Markdown and CSV at every call.
+"""
+
+import csv
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from mover.app.batch.runner import LOG, Running, last_lines, read_tree, run_jobs, start_main
 from mover.core.errors import InputError
-from mover.evaluate.evaluation import evaluate_folder
+from mover.core.files import replacing
+from mover.core.observe import Observer, Step, silent
 from mover.io.datasets import pigraphs, prox_files
-from mover_bench.tables import published
+from mover.pipeline.presets import PRESETS
+from mover_bench.tables import published, rows
+from mover_bench.tables.rows import TableRow
+from mover_bench.tables.table_job import DONE, TableJob, key_of
 
-Row = tuple[str, Sequence[float | None]]
+Quoted = tuple[str, Mapping[str, float]]
+Launch = Callable[[TableJob], Running[int]]
+MILLIMETRES = 1000.0
+
+
+@dataclass(frozen=True)
+class Part:
+    """One table of the paper: its columns, our rows and the published ones."""
+
+    title: str
+    columns: tuple[str, ...]
+    ours: tuple[TableRow, ...]
+    quoted: tuple[Quoted, ...] = ()
+    note: str = ""
 
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One table of the paper."""
+    """The tables of one data set."""
 
     title: str
     expected: str
     """On what the paper measures."""
     count: int
     """Recordings of it."""
-    columns: tuple[str, ...]
-    """Keys of metrics.json."""
-    factor: float
+    parts: tuple[Part, ...]
+    factor: float = 1.0
     """On the overlaps: the paper prints some in percent."""
-    published: tuple[Row, ...]
 
 
 SCENE = ("iou3d", "p2s", "iou2d", "non_collision", "contact")
 CAMERA = ("pitch_error", "roll_error", "mean_tilt",
           "ground_penetration_frequency", "ground_penetration_distance")  # fmt: skip
 BODY = ("pje", "v2v", "p_pje", "p_v2v")
-MILLIMETRES = 1000.0
-NOTHING: tuple[None, ...] = (None,) * 5
+BOX_NOTE = (
+    "IoU2D compares the 3D boxes in the image, as the truth is boxes; P2S is measured from what the"
+    " scan has inside them, without the floor."
+)
+FEET_NOTE = (
+    "Feet are those that bodies tell to stand (the paper: POSA's); more than 1 cm below the floor"
+    " counts. Angles in radians."
+)
+
+
+def _quoted(columns: Sequence[str], values: Mapping[str, published.Values]) -> tuple[Quoted, ...]:
+    return tuple(
+        (label, {c: v for c, v in zip(columns, row, strict=True) if v is not None})
+        for label, row in values.items()
+    )
+
+
+_PROX = {k: v for k, v in published.SCENE.items() if not k.endswith("PiGraphs")}
+_TILT = ("pitch_error", "roll_error", "mean_tilt", *published.CAMERA_COLUMNS[3:])
+_STILLS = {
+    "Total3D": (0.063, 0.409, 0.342, 0.940, 0.436),
+    "HolisticMesh": (0.239, 0.133, 0.533, 0.948, 0.951),
+    "MOVER": (0.390, 0.095, 0.862, 0.972, 0.934),
+}
+_PIGRAPHS = {k.partition(",")[0]: v for k, v in published.SCENE.items() if k.endswith("PiGraphs")}
+_LENGTH = {k: (v[0],) for k, v in published.LENGTH.items()}
+_NOISE = {
+    f"{kind} ± {level:g}": (value,)
+    for kind, levels in published.NOISE.items()
+    for level, value in levels.items()
+}
 
 TABLES: dict[str, PaperTable] = {
     "prox": PaperTable(
         "PROX qualitative",
         f"{prox_files.VIDEOS} videos of {len(prox_files.SCENES)} scenes, without the two booths",
         prox_files.VIDEOS,
-        (*SCENE, *CAMERA),
-        1.0,
         (
-            ("Total3D", (*published.SCENE["Total3D"], *published.CAMERA["Total3D"])),
-            ("HolisticMesh", (*published.SCENE["HolisticMesh"], *NOTHING)),
-            ("MOVER", (*published.SCENE["MOVER"], *published.CAMERA["MOVER"])),
+            Part("Scenes and interaction", SCENE, (*rows.ABLATION, *rows.DETECTED),
+                 _quoted(SCENE, _PROX), BOX_NOTE),
+            Part("Camera and ground", CAMERA, (rows.ABLATION[0], rows.ABLATION[-1]),
+                 _quoted(_TILT, published.CAMERA), FEET_NOTE),
+            Part("Length of the video", ("iou3d",), (*rows.LONGER, rows.ABLATION[-1]),
+                 _quoted(("iou3d",), _LENGTH)),
+            Part("Noise on the initial scene", ("iou3d",), (*rows.DISTURBED, rows.ABLATION[-1]),
+                 _quoted(("iou3d",), _NOISE)),
         ),
     ),
     "prox-quantitative": PaperTable(
         "PROX quantitative",
-        f"{prox_files.SHOTS} frames of one scene; errors of bodies in millimetres",
+        f"{prox_files.SHOTS} frames of one scene",
         1,
-        (*SCENE, *BODY),
-        1.0,
         (
-            ("Total3D", (0.063, 0.409, 0.342, 0.940, 0.436, None, None, None, None)),
-            ("HolisticMesh", (0.239, 0.133, 0.533, 0.948, 0.951, 190.78, 192.21, 72.72, 61.01)),
-            ("MOVER baseline", (*NOTHING, 219.62, 222.50, 75.92, 68.34)),
-            ("MOVER", (0.390, 0.095, 0.862, 0.972, 0.934, 174.37, 178.31, 73.60, 67.89)),
+            Part("Scenes and interaction", SCENE, rows.ABLATION, _quoted(SCENE, _STILLS), BOX_NOTE),
+            Part("People [mm]", BODY, rows.PEOPLE,
+                 _quoted(published.BODY_COLUMNS, published.BODIES)),
         ),
     ),
     "pigraphs": PaperTable(
         "PiGraphs",
         f"{pigraphs.VIDEOS} videos of {pigraphs.ROOMS} scenes; overlaps in percent",
         pigraphs.VIDEOS,
-        ("iou2d", "iou3d"),
+        (Part("Scenes", ("iou2d", "iou3d"), (rows.ABLATION[0], rows.ABLATION[1], rows.ABLATION[-1]),
+              _quoted(SCENE, _PIGRAPHS)),),
         100.0,
-        (
-            ("Cooperative", (68.6, 21.4)),
-            ("Holistic++", (75.1, 24.9)),
-            ("HolisticMesh", (75.6, 26.3)),
-            ("MOVER", (79.2, 27.8)),
-        ),
     ),
-}
+}  # fmt: skip
 """The tables by name."""
 
 
-def paper_table(name: str, captures: Path, results: Path) -> str:
-    """The table of the paper with the user's rows first.
+@dataclass(frozen=True)
+class TableArgs:
+    """What is made of which folders."""
 
-    Every folder of `captures` that has truth/ and a result of the same name in `results` counts
-    once. The distance to the surface is measured against what the scan has inside the boxes
-    (truth_scan/), everything else against the boxes, as the paper labels them.
+    name: str
+    captures: Path
+    """Captures that `mover import` made, with truth/."""
+    out: Path
+    """Folder of jobs and pages."""
+    detected: Path | None = None
+    """The same captures with boxes and masks of a detector."""
+    preset: str = "robust"
+    workers: int = 0
+    """0: as many as there are cores."""
+    look: bool = False
+    """Nothing is run."""
+    only: tuple[str, ...] = ()
+    """First words of the labels of rows; empty: all."""
+
+
+def paper_table(args: TableArgs, observe: Observer = silent, launch: Launch | None = None) -> Path:
+    """Do all jobs that are not finished, and write OUT/NAME-PRESET.md and .csv.
 
     Args:
-        name: A key of `TABLES`.
-        captures: Folder of captures that `mover import` made.
-        results: Folder of results of `mover run` or `mover batch`, by the captures' names.
+        args: What to do.
+        observe: Told of every job that ends.
+        launch: Starts a job; None: as a process of its own.
+
+    Returns:
+        The page.
 
     Raises:
         ValueError: If there is no such table.
-        InputError: If no capture has both a truth and a result, or a file is wrong.
+        InputError: If no capture has a truth, or the preset is none.
     """
-    if name not in TABLES:
-        raise ValueError(f"table is {name!r}, choose one of {', '.join(TABLES)}")
-    table = TABLES[name]
-    names = sorted(p.parent.parent.name for p in captures.glob("*/truth/scene.json"))
-    done = [n for n in names if (results / n / "scene.json").is_file() and _belongs(n, name)]
-    if not done:
-        where = f"{captures}/<name>/truth and {results}/<name>"
-        raise InputError(f"{captures}: has no capture with truth and result, expected {where}")
-    metrics = [_measured(captures / n, results / n) for n in done]
-    rows: list[Row] = [
-        (title, [_mean([m[key] for m in metrics], c, table.factor) for c in table.columns])
-        for title, key in (("your copy, initial", "initial"), ("your copy, mover", "result"))
+    if args.name not in TABLES:
+        raise ValueError(f"table is {args.name!r}, choose one of {', '.join(TABLES)}")
+    if args.preset not in PRESETS:
+        raise InputError(f"--preset: {args.preset!r} is none of {', '.join(PRESETS)}")
+    table = TABLES[args.name]
+    jobs = {row: jobs_of(row, args) for part in table.parts for row in asked(part, args)}
+    every = list(dict.fromkeys(job for found in jobs.values() for job in found))
+    if not every:
+        where = f"{args.captures}/<name>/truth/scene.json"
+        raise InputError(f"{args.captures}: has no capture of {table.title}, expected {where}")
+    waiting = [] if args.look else [job for job in every if not is_finished(job)]
+    done = len(every) - len(waiting)
+    for job, code in run_jobs(waiting, args.workers or os.cpu_count() or 1, launch or start):
+        done += 1
+        observe(Step(f"{job.capture.name}: {job.name}", done - 1, len(every)))
+        del code  # a job without metrics.json has failed, and the page says so
+    return _written(table, jobs, args)
+
+
+def asked(part: Part, args: TableArgs) -> list[TableRow]:
+    """Our rows of a table that are made."""
+    return [
+        row
+        for row in part.ours
+        if (args.detected is not None or not row.detected)
+        and (not args.only or row.label.startswith(args.only))
     ]
-    head = f"{table.title}: the paper has {table.expected}; here {len(done)} of {table.count}"
-    lacking = [n for n in names if n not in done and _belongs(n, name)]
-    tail = [f"without a result: {', '.join(lacking)}"] if lacking else []
-    return "\n".join([head, _laid_out(table, [*rows, *table.published]), *tail])
 
 
-def _belongs(name: str, table: str) -> bool:
+def jobs_of(row: TableRow, args: TableArgs) -> list[TableJob]:
+    """The jobs of a row, over all captures that belong to the table."""
+    names = [n for n in rows.variants(args.preset) if n == row.job or _is_part(n, row.job)]
+    captures = args.detected if row.detected and args.detected is not None else args.captures
+    out = args.out / "detected" if row.detected else args.out
+    return [
+        TableJob(path.parent.parent, out, args.preset, name)
+        for path in sorted(captures.glob("*/truth/scene.json"))
+        if belongs(path.parent.parent.name, args.name)
+        for name in names
+    ]
+
+
+def _is_part(name: str, job: str) -> bool:
+    return job.endswith("-") and name.startswith(job)
+
+
+def belongs(name: str, table: str) -> bool:
     """Whether a recording is one of those on which the paper measures."""
     scene = name.split("_")[0]
     if table == "prox":
@@ -123,31 +214,70 @@ def _belongs(name: str, table: str) -> bool:
     return (scene == prox_files.QUANTITATIVE) == (table == "prox-quantitative")
 
 
-def _measured(capture: Path, result: Path) -> Mapping[str, Any]:
-    """The metrics of one recording, before and after."""
-    surface = None
-    if (capture / "truth_scan" / "scene.json").is_file():
-        surface = evaluate_folder(result, capture / "truth_scan")
-    found = evaluate_folder(result, capture / "truth")
-    return {key: _whole(found[key], surface and surface[key]) for key in ("initial", "result")}
+def start(job: TableJob) -> Running[int]:
+    """Start a job; what it says goes to its log."""
+    (job.folder / DONE).unlink(missing_ok=True)
+    words = (str(job.capture), str(job.out), job.preset, job.name)
+    return start_main("mover_bench.tables.table_job", words, job.folder / LOG)
 
 
-def _whole(values: Mapping[str, float], surface: Mapping[str, float] | None) -> dict[str, float]:
-    """The metrics with the distance to the scan, the mean tilt, and bodies in millimetres."""
-    out = dict(values)
-    out.pop("p2s", None)  # of boxes: their walls are no furniture
-    if surface is not None and "p2s" in surface:
-        out["p2s"] = surface["p2s"]
-    if "pitch_error" in out and "roll_error" in out:
-        out["mean_tilt"] = (out["pitch_error"] + out["roll_error"]) / 2
-    return out | {key: out[key] * MILLIMETRES for key in BODY if key in out}
+def is_finished(job: TableJob) -> bool:
+    """Whether its results are there, of these inputs and this version."""
+    return read_tree(job.folder / DONE).get("key") == key_of(job)
 
 
-def _mean(rows: Sequence[Mapping[str, float]], key: str, factor: float) -> float | None:
-    """Over those recordings that have the metric."""
-    values = [row[key] for row in rows if key in row and math.isfinite(row[key])]
-    scale = factor if key.startswith("iou") else 1.0
-    return scale * sum(values) / len(values) if values else None
+def _written(
+    table: PaperTable, jobs: Mapping[TableRow, Sequence[TableJob]], args: TableArgs
+) -> Path:
+    """The page and the numbers of what is finished."""
+    count = len({job.capture for found in jobs.values() for job in found})
+    lines = [f"# {table.title}", f"The paper has {table.expected}; here {count} of {table.count}."]
+    numbers: list[dict[str, str]] = []
+    for part in table.parts:
+        filled = [(row, _values(row, jobs[row], part, table)) for row in asked(part, args)]
+        if not filled:
+            continue
+        lines += [f"## {part.title}", _laid_out(part, filled, table)]
+        lines += [part.note] if part.note else []
+        notes = [f"- *{row.label}*: {row.protocol}" for row, _ in filled if row.protocol]
+        lines += ["\n".join(notes)] if notes else []
+        numbers += [_line(part, row, values) for row, values in filled]
+    lines += _failures(jobs)
+    page = args.out / f"{args.name}-{args.preset}.md"
+    with replacing(page) as new:
+        new.write_text("\n\n".join(lines) + "\n")
+    names = dict.fromkeys(key for line in numbers for key in line)
+    with replacing(page.with_suffix(".csv")) as new, new.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(names))
+        writer.writeheader()
+        writer.writerows(numbers)
+    return page
+
+
+def _values(
+    row: TableRow, jobs: Sequence[TableJob], part: Part, table: PaperTable
+) -> dict[str, float]:
+    """Means over the recordings of what is finished, in the units of the table."""
+    found = [read_tree(job.folder / DONE).get(row.stage, {}) for job in jobs]
+    found = [tree for tree in found if tree]
+    values: dict[str, float] = {"recordings": len({j.capture for j in jobs if _there(j)})}
+    for column in part.columns:
+        known = [v for tree in found if math.isfinite(v := _value(tree, column))]
+        scale = table.factor if column.startswith("iou") else 1.0
+        scale *= MILLIMETRES if column in BODY else 1.0
+        if known:
+            values[column] = scale * math.fsum(known) / len(known)
+    return values
+
+
+def _there(job: TableJob) -> bool:
+    return bool(read_tree(job.folder / DONE))
+
+
+def _value(tree: Mapping[str, float], column: str) -> float:
+    if column == "mean_tilt" and "pitch_error" in tree:
+        return (tree["pitch_error"] + tree["roll_error"]) / 2
+    return float(tree.get(column, math.nan))
 
 
 SHORT = {
@@ -158,16 +288,47 @@ SHORT = {
 }  # fmt: skip
 
 
-def _laid_out(table: PaperTable, rows: Sequence[Row]) -> str:
-    """Rows as plain text."""
-    lines = [f"{'':20}" + "".join(f"{SHORT[c]:>9}" for c in table.columns)]
-    for title, values in rows:
-        cells = "".join(_cell(v) for v in values)
-        lines.append(f"{title:20}{cells}")
-    return "\n".join(lines)
+def _laid_out(
+    part: Part, filled: Sequence[tuple[TableRow, Mapping[str, float]]], table: PaperTable
+) -> str:
+    """Our rows, then the published ones in italics."""
+    head = ["", *(SHORT[c] for c in part.columns), "recordings"]
+    lines = [head, ["---", *["--:"] * (len(head) - 1)]]
+    for row, values in filled:
+        cells = [_cell(values.get(c)) for c in part.columns]
+        lines.append([row.label, *cells, str(int(values["recordings"]))])
+    for label, quoted in part.quoted:
+        cells = [_cell(_in_units(quoted.get(c), c, table)) for c in part.columns]
+        lines.append([f"*{label}* (paper)", *cells, ""])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _in_units(value: float | None, column: str, table: PaperTable) -> float | None:
+    if value is None:
+        return None
+    scale = table.factor if column.startswith("iou") else 1.0
+    return value * scale * (MILLIMETRES if column in BODY else 1.0)
 
 
 def _cell(value: float | None) -> str:
     if value is None:
-        return f"{'-':>9}"
-    return f"{value:9.3f}" if abs(value) < 10 else f"{value:9.1f}"
+        return "-"
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
+
+
+def _line(part: Part, row: TableRow, values: Mapping[str, float]) -> dict[str, str]:
+    cells = {name: f"{value:.6g}" for name, value in values.items()}
+    return {"table": part.title, "row": row.label, **cells}
+
+
+def _failures(jobs: Mapping[TableRow, Sequence[TableJob]]) -> list[str]:
+    """What is not there, so that nothing is left out silently."""
+    lacking = [j for j in dict.fromkeys(j for f in jobs.values() for j in f) if not _there(j)]
+    logs = {job: job.folder / LOG for job in lacking}
+    failed = {job: last_lines(path) for job, path in logs.items() if path.is_file()}
+    lines = [
+        f"**Failed**: {job.capture.name}, {job.name}: {said[-1] if said else 'it said nothing'}"
+        for job, said in failed.items()
+    ]
+    rest = len(lacking) - len(failed)
+    return lines + ([f"**Not run**: {rest} jobs."] if rest else [])

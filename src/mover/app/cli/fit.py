@@ -38,6 +38,8 @@ class FitArgs:
     """bodies.npz to start from: parameters of any model, or joints, in the camera frame."""
     vposer: Path | None = None
     """VPoser's weights (a checkpoint, its folder, or .npz) instead of the ranges of motion."""
+    preset: Literal["robust", "paper"] = "robust"
+    """How bodies are priced: ours, or E_Body as printed, with VPoser's weights (--vposer)."""
     ground: Annotated[float, float_in(-100, 100)] | None = None
     """Height of the floor in the camera's world, where it is known: nobody sinks into it [m]."""
     fps: Rate | None = None
@@ -65,6 +67,7 @@ def fit_into(args: FitArgs) -> None:
     from mover.bodies import load_model
     from mover.fitting.bodies import FitInputs, fit_bodies
     from mover.fitting.one_euro import smooth_keypoints
+    from mover.fitting.presets import FITS
     from mover.fitting.prior import ANGLES, load_vposer, vposer_prior
     from mover.io.capture.bodies_file import read_bodies, write_bodies
 
@@ -82,8 +85,10 @@ def fit_into(args: FitArgs) -> None:
         prior=ANGLES if args.vposer is None else vposer_prior(load_vposer(args.vposer)),
         ground=ground,
     )
+    if args.preset == "paper" and args.vposer is None:
+        say("note: the printed pose prior is VPoser's; without --vposer ours stands in for it")
     with Bar() as bar:
-        found = fit_bodies(inputs, observe=bar)
+        found = fit_bodies(inputs, FITS[args.preset], observe=bar)
     for warning in found.warnings:
         say(f"warning: {warning}")
     bodies = _without_outliers(found.bodies) if args.drop else found.bodies

@@ -1,5 +1,6 @@
 """True boxes of data sets, and what a scan has inside them: scenes for `mover evaluate`."""
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ FACES = np.array(
 """Triangles of a box whose corners are in the order of `SIGNS`, seen from outside."""
 MARGIN = 0.02  # [m], a scan's surface lies so far outside of its box
 LEAST = 12  # triangles, fewer are no object
+FLOOR = 0.03  # [m], a scan's floor lies so near to its height
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,8 @@ def boxes_scene(
         ground: Height of the floor in our world [m].
         scan: In the frame of the boxes; None: the boxes themselves.
     """
+    if scan is not None and ground is not None:
+        scan = without_floor(scan, world, ground)
     rows: list[dict[str, Any]] = []
     meshes: dict[str, tuple[Mesh, str]] = {}
     for box in boxes:
@@ -136,6 +140,20 @@ def boxes_scene(
         rows.append({**row, "translation": place.tolist(), "yaw": yaw, "support": "free"})
     lens = camera_of(At(dict(camera), "camera"))
     return scene_of(scene_tree(rows, "truth", ground), partial(load_from, meshes), lens, _silent)[0]
+
+
+def without_floor(scan: Mesh, world: Matrix, ground: float) -> Mesh:
+    """A scan without the triangles that lie on the floor.
+
+    Args:
+        scan: In any frame.
+        world: Our world (+y up) from that frame (4, 4).
+        ground: Height of the floor in our world [m].
+    """
+    heights = scan.verts.double().numpy() @ world[1, :3] + world[1, 3] - ground
+    low: NDArray[np.bool_] = np.abs(heights) < FLOOR
+    faces = scan.faces.numpy()
+    return dataclasses.replace(scan, faces=torch.from_numpy(faces[~low[faces].all(1)]))
 
 
 def _silent(text: str) -> None:

@@ -1,7 +1,7 @@
 """What the user knows, and what a tool found: rows of bodies before anything is settled."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,8 @@ class Known:
     """The number in the name of the first frame's file."""
     frames: Mapping[str, int] | None = None
     """Frames by the names of files or folders; None: by the numbers in them, less `first`."""
+    decode: Callable[[Tensor], Tensor] | None = None
+    """Angles of the 21 joints from VPoser's codes, where the user has its weights."""
 
 
 ROOT = 3  # angles of the root

@@ -96,7 +96,7 @@ def _rows(at: At, frame: int, person: int, known: Known, assumed: bool) -> Found
     if place is None:
         shift = need(at, "camera_translation", "transl")
     zero = torch.zeros(count, 3)
-    whole = torch.cat([root, _body(need(at, "body_pose"), count)], 1)
+    whole = torch.cat([root, _body(need(at, "body_pose"), count, known)], 1)
     told = whole, wide(need(at, "betas"), count), zero if place is None else rows(place, count, 3)
     extra = {n: tensor(wide(v, count)) for n in EXTRA if (v := either(at, n)) is not None}
     flat = np.eye(3).reshape(1, 9).repeat(count, 0) if turn is None else rows(turn, count, 9)
@@ -110,16 +110,21 @@ def _rows(at: At, frame: int, person: int, known: Known, assumed: bool) -> Found
     return shifted(found, R, t)
 
 
-def _body(at: At, count: int) -> Tensor:
-    """The 21 joints of the body."""
-    if wide(at, count).shape[1] == CODE:
+def _body(at: At, count: int, known: Known) -> Tensor:
+    """The 21 joints of the body; VPoser's codes are decoded where its weights are known."""
+    given = wide(at, count)
+    if given.shape[1] != CODE:
+        return tensor(rows(at, count, 63))
+    if known.decode is None:
         refuse(
             at,
             "63 angles: SMPLify-X stored VPoser's code, which its decoder turns into angles "
-            "(vposer.decode(body_pose, output_type='aa')); store these instead",
+            "(vposer.decode(body_pose, output_type='aa')); store these instead, or name VPoser's "
+            "weights (--vposer)",
             f"{CODE} numbers",
         )
-    return tensor(rows(at, count, 63))
+    with torch.no_grad():
+        return known.decode(tensor(given))
 
 
 def _gender(at: At) -> str:

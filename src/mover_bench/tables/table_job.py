@@ -1,0 +1,154 @@
+"""One job of a table: rebuild a capture of the user's as a row asks, and measure it.
+
+Each job is a process (`python -m mover_bench.tables.table_job CAPTURE OUT PRESET NAME`); jobs of a
+capture share its finished stages, and a finished job is a file under a digest of its inputs.
+"""
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mover.app.batch.runner import write_tree
+from mover.core.records import fingerprint
+from mover.core.run import Run, sources
+from mover.core.types import Bodies, Capture, Scene, SceneObject
+from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
+from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.camera_file import camera_of
+from mover.io.capture.folder import read_capture
+from mover.io.capture.scene_file import read_scene
+from mover.io.files.fields import read_json
+from mover.pipeline.outcome import to_world
+from mover.pipeline.reconstruct import reconstruct
+from mover.stages.config import RefineBodiesConfig
+from mover.stages.people.refine_bodies import ABLATION, refine_bodies
+from mover_bench.studies.measures import carry_all
+from mover_bench.studies.variants import withheld
+from mover_bench.tables.rows import Disturbance, disturbance_of, variants
+
+DONE, FAILED = "metrics.json", "failure.json"
+BOXES = EvaluateConfig(boxes=True, feet="contacts")
+"""The truth of both data sets is boxes; feet are those that touch the floor, as in the paper."""
+
+
+@dataclass(frozen=True)
+class TableJob:
+    """One process of a table."""
+
+    capture: Path
+    out: Path
+    """Folder of all results."""
+    preset: str
+    name: str
+    """A variant of `rows.variants`."""
+
+    @property
+    def home(self) -> Path:
+        """Where the jobs of its capture are, and the stages that they share."""
+        return self.out / self.preset / self.capture.name
+
+    @property
+    def folder(self) -> Path:
+        """Where its files are."""
+        return self.home / self.name
+
+
+def key_of(job: TableJob) -> str:
+    """Digest of everything that a job's numbers depend on."""
+    files = [
+        (path.relative_to(job.capture).as_posix(), path.stat().st_size, path.stat().st_mtime_ns)
+        for path in sorted(job.capture.rglob("*"))
+        if path.is_file() and path.parent.name != "frames"
+    ]
+    settings = variants(job.preset)[job.name]
+    return fingerprint(settings, job.name, json.dumps(files), sources("mover_bench"))
+
+
+def do_job(job: TableJob) -> None:
+    """Rebuild, measure, and write metrics.json."""
+    variant, disturbed = variants(job.preset)[job.name], disturbance_of(job.name)
+    given = read_capture(job.capture)
+    if disturbed is not None:
+        scene = disturb(given.scene, disturbed, torch.Generator().manual_seed(0))
+        given = replace(given, scene=scene)
+    capture = withheld(given, variant.hears, variant.cut)
+    room = reconstruct(capture, variant.config, Run(job.home))
+    if given.bodies is not None and (room.bodies is None or variant.cut is not None):
+        room = carry_all(room, given)
+    people = room.bodies
+    if variant.bodies and people is not None:
+        weights = RefineBodiesConfig(weights=ABLATION[variant.bodies])
+        people = refine_bodies(room, capture, weights).bodies
+    scenes = {
+        "initial": (given.scene, given.bodies),
+        "image": (room.image_only, people),
+        "full": (room.scene, people),
+    }
+    measured = {name: measure(job.capture, given, *scene) for name, scene in scenes.items()}
+    write_tree(job.folder / DONE, {"key": key_of(job), **measured})
+
+
+def measure(
+    folder: Path, capture: Capture, scene: Scene, people: Bodies | None
+) -> Mapping[str, Any]:
+    """The metrics of one scene against truth/, and P2S against truth_scan/ where there is one."""
+    if people is not None and people.space == "camera":
+        people = to_world(people, scene.camera)
+    found: dict[str, float] = {}
+    for name in ("truth", "truth_scan"):
+        path = folder / name
+        if not (path / "scene.json").is_file():
+            continue
+        own = path / "camera.json"
+        camera = camera_of(read_json(own)) if own.exists() else None
+        true = read_scene(path / "scene.json", camera)
+        there = path / "bodies.npz"
+        rows = EvaluatedBodies(None, people, read_bodies(there) if there.is_file() else None)
+        if name == "truth_scan":
+            rows = EvaluatedBodies(None, None, None)
+        values = evaluate(capture.scene, scene, true, rows, BOXES, ("result",))["result"]
+        if name == "truth":
+            values.pop("p2s", None)  # of boxes: their walls are no furniture
+            found |= values
+        elif "p2s" in values:
+            found["p2s"] = values["p2s"]
+    return found
+
+
+def disturb(scene: Scene, noise: Disturbance, generator: torch.Generator) -> Scene:
+    """The initial scene with uniform noise on every object.
+
+    Args:
+        scene: As it is given.
+        noise: Kind and largest size.
+        generator: Of the random numbers.
+    """
+
+    def drawn(count: int) -> torch.Tensor:
+        return noise.level * (2 * torch.rand(count, generator=generator) - 1)
+
+    def changed(piece: SceneObject) -> SceneObject:
+        if noise.kind == "scale":
+            return replace(piece, scale=piece.scale * (1 + drawn(3)).to(piece.scale))
+        if noise.kind == "place":
+            place = piece.t_world_object + drawn(3).to(piece.t_world_object)
+            return replace(piece, t_world_object=place)
+        return replace(piece, yaw=piece.yaw + drawn(1)[0].deg2rad().to(piece.yaw))
+
+    return replace(scene, objects=tuple(changed(piece) for piece in scene.objects))
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Do the job that is named on the command line."""
+    capture, out, preset, name = arguments
+    torch.set_num_threads(1)
+    do_job(TableJob(Path(capture), Path(out), preset, name))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

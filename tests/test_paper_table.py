@@ -1,0 +1,221 @@
+"""The paper's tables on a user's own copy: rows, jobs, pages, and what a perfect result scores."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import make_people as made
+import make_scenes as layouts
+import pytest
+import torch
+from test_experiments import Ended, quick
+from test_import_datasets import prox_room
+from test_import_scenes import imported
+from test_import_scenes import plain as plain  # the fixture
+from test_prox import FIRST, SECOND
+from test_prox import stills as stills  # the fixture
+from test_readers_people import models as models  # the fixture: the body that the fits are of
+
+from mover.app.cli import run_command
+from mover.app.results import write_truth
+from mover.core.errors import InputError
+from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.folder import read_capture, write_capture
+from mover.io.capture.scene_file import read_scene
+from mover.pipeline.presets import PRESETS
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.noise import add_noise
+from mover_bench.tables import rows
+from mover_bench.tables.paper_table import TABLES, TableArgs, is_finished, jobs_of, paper_table
+from mover_bench.tables.rows import Disturbance
+from mover_bench.tables.table_job import DONE, TableJob, disturb, do_job, key_of, measure
+
+
+@pytest.fixture(scope="module")
+def copy(plain: layouts.Room, stills: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Captures of a user's copy: the two recordings of the quantitative room as one capture."""
+    work = tmp_path_factory.mktemp("work")
+    out = tmp_path_factory.mktemp("captures") / "vicon_03301"
+    source = layouts.write_glb(work / "in.glb", prox_room(plain))
+    with pytest.MonkeyPatch.context() as patch:
+        for name in made.COUNTS:
+            from test_readers_people import Toy
+
+            from mover.bodies import BODY_MODELS
+
+            patch.setitem(BODY_MODELS, name, lambda _, name=name: Toy(name))
+        boxes = stills / "boxes" / "bbox3d.json"
+        imported("prox", stills, out, work, recordings=(FIRST, SECOND), boxes=boxes)
+        imported("glb", source, out, work)
+    return out
+
+
+def test_a_perfect_result_scores_one_and_zero_in_every_column(
+    copy: Path, plain: layouts.Room
+) -> None:
+    """The truth is boxes and a scan; the result is the furniture itself where it stands."""
+    capture = read_capture(copy)
+    truth = read_scene(copy / "truth" / "scene.json")
+    by_id = {piece.id: piece for piece in truth.objects}
+    pieces = []
+    for thing in prox_room(plain).things:
+        box = next(p for p in by_id.values() if p.id.endswith(thing.name) or thing.name in p.id)
+        verts = torch.from_numpy(thing.world).float()
+        mesh = replace(box.mesh, verts=verts, faces=torch.from_numpy(thing.faces))
+        zero = torch.zeros(3)
+        pieces.append(
+            replace(box, mesh=mesh, t_world_object=zero, yaw=torch.tensor(0.0), scale=zero + 1)
+        )
+    pieces = [_own_axes(piece, by_id[piece.id]) for piece in pieces]
+    perfect = replace(truth, objects=tuple(pieces))
+    people = read_bodies(copy / "truth" / "bodies.npz")
+    found = measure(copy, capture, perfect, people)
+    assert found["iou3d"] == pytest.approx(1, abs=2e-3)
+    assert found["iou2d"] == pytest.approx(1, abs=1e-3)
+    assert found["p2s"] == pytest.approx(0, abs=2e-3)
+    for name in ("pitch_error", "roll_error", "pje", "v2v", "p_pje", "p_v2v"):
+        assert found[name] == pytest.approx(0, abs=1e-5), name
+
+
+def _own_axes(piece, box):
+    """The same mesh with the yaw of its true box: a placed mesh keeps its vertices."""
+    from mover.geometry.rotations import rot_y
+
+    turn = rot_y(box.yaw)
+    verts = (piece.mesh.verts - box.t_world_object) @ turn
+    return replace(
+        piece, mesh=replace(piece.mesh, verts=verts), yaw=box.yaw,
+        t_world_object=box.t_world_object,
+    )  # fmt: skip
+
+
+class Answers:
+    """Answers every job with numbers that are known."""
+
+    def __init__(self, broken: str = "") -> None:
+        self.done: list[tuple[str, str]] = []
+        self.broken = broken
+
+    def __call__(self, job: TableJob) -> Ended:
+        self.done.append((job.capture.name, job.name))
+        job.folder.mkdir(parents=True, exist_ok=True)
+        if job.name == self.broken:
+            (job.folder / "log.txt").write_text("Traceback\nValueError: no floor\n")
+            return Ended(1)
+        scene = {"iou3d": 0.5, "p2s": 0.1, "iou2d": 0.8, "pitch_error": 0.02, "roll_error": 0.04,
+                 "pje": 0.17, "v2v": 0.18}  # fmt: skip
+        tree = {"key": key_of(job), "initial": {"iou3d": 0.25}, "image": scene, "full": scene}
+        (job.folder / DONE).write_text(json.dumps(tree))
+        return Ended(0)
+
+
+def named_captures(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name / "truth").mkdir(parents=True)
+        (folder / name / "truth" / "scene.json").write_text("{}")
+    return folder
+
+
+@pytest.mark.parametrize("name", list(TABLES))
+def test_every_table_makes_all_of_its_rows_once(name: str, tmp_path: Path) -> None:
+    there = named_captures(tmp_path / "c", "MPH8_00034_01", "vicon_03301", "room_kitchen_1")
+    args = TableArgs(name, there, tmp_path / "out", workers=2)
+    answers = Answers()
+    page = paper_table(args, launch=answers).read_text()
+    assert len(answers.done) == len(set(answers.done))
+    wanted = {"prox": "MPH8_00034_01", "prox-quantitative": "vicon_03301"}
+    assert {capture for capture, _ in answers.done} <= {
+        wanted.get(name, "room_kitchen_1"),
+        *(() if name != "pigraphs" else ("MPH8_00034_01",)),
+    }
+    for part in TABLES[name].parts:
+        lines = page.split(f"## {part.title}")[1].split("\n## ")[0].splitlines()
+        ours = [x for x in lines if x.startswith("| ") and "(paper)" not in x][2:]
+        assert [x.split("|")[1].strip() for x in ours] == [
+            row.label for row in part.ours if not row.detected
+        ]
+        assert sum("(paper)" in x for x in lines) == len(part.quoted)
+    numbers = list(csv.DictReader((args.out / f"{name}-robust.csv").open()))
+    full = next(x for x in numbers if x["row"] == "full")
+    assert float(full["iou3d"]) == (50 if name == "pigraphs" else 0.5)
+    again = Answers()
+    paper_table(args, launch=again)
+    assert again.done == []
+
+
+def test_people_are_in_millimetres_and_overlaps_as_the_paper_prints_them(tmp_path: Path) -> None:
+    there = named_captures(tmp_path / "c", "vicon_03301")
+    args = TableArgs("prox-quantitative", there, tmp_path / "out", only=("baseline", "initial"))
+    page = paper_table(args, launch=Answers()).read_text()
+    assert "| baseline | 170.0 | 180.0 |" in page
+    assert "| *MOVER, +CamGP+SDF+Contact* (paper) | 174.4 | 178.3 |" in page
+    assert "| initial | 0.250 |" in page
+    assert "+ depth" not in page
+
+
+def test_detected_captures_have_rows_of_their_own(tmp_path: Path) -> None:
+    there = named_captures(tmp_path / "c", "MPH8_00034_01")
+    other = named_captures(tmp_path / "d", "MPH8_00034_01")
+    args = TableArgs("prox", there, tmp_path / "out", other, only=("initial", "full"))
+    page = paper_table(args, launch=Answers()).read_text()
+    assert "| initial, detected | 0.250 |" in page
+    assert "| *Total3D, PointRend* (paper) | 0.246 |" in page
+
+
+def test_a_job_that_fails_is_named_and_done_again(tmp_path: Path) -> None:
+    there = named_captures(tmp_path / "c", "vicon_03301")
+    args = TableArgs("prox-quantitative", there, tmp_path / "out")
+    page = paper_table(args, launch=Answers(broken="people-sdf")).read_text()
+    assert "**Failed**: vicon_03301, people-sdf: ValueError: no floor" in page
+    assert "| + CamGP + SDF | - | - | - | - | 0 |" in page
+    again = Answers()
+    paper_table(args, launch=again)
+    assert again.done == [("vicon_03301", "people-sdf")]
+
+
+def test_what_is_asked_wrongly_is_one_sentence(tmp_path: Path, capsys) -> None:
+    there = named_captures(tmp_path / "c", "vicon_03301")
+    with pytest.raises(InputError, match="has no capture of PROX qualitative"):
+        paper_table(TableArgs("prox", there, tmp_path / "out"))
+    words = ["prox-quantitative", str(there), str(tmp_path / "out"), "--preset", "best"]
+    assert run_command("paper-table", words) == 2
+    assert "--preset: 'best' is none of paper, release, robust" in capsys.readouterr().err
+
+
+def test_noise_is_uniform_and_within_its_level(small_room: KnownRoom) -> None:
+    scene = small_room.truth
+    for kind, levels in rows.NOISES.items():
+        level = levels[0]
+        found = disturb(scene, Disturbance(kind, level), torch.Generator().manual_seed(3))
+        for a, b in zip(scene.objects, found.objects, strict=True):
+            change = {
+                "scale": b.scale / a.scale - 1,
+                "place": b.t_world_object - a.t_world_object,
+                "turn": (b.yaw - a.yaw).rad2deg()[None],
+            }
+            for name, value in change.items():
+                assert float(value.abs().max()) <= (level if name == kind else 0) + 1e-4
+            assert change[kind].abs().max() > 0
+
+
+def test_jobs_of_every_kind_run_on_a_capture(
+    small_room: KnownRoom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "c" / "flat_hall_1"
+    write_capture(add_noise(small_room, NoiseConfig(), 1), folder)
+    write_truth(small_room.truth, small_room.bodies, folder / "truth")
+    for name, preset in PRESETS.items():
+        monkeypatch.setitem(PRESETS, name, quick(preset))
+    names = ("full", "contact-depth", "length-10-3", "noise-turn-15")
+    for name in names:
+        job = TableJob(folder, tmp_path / "out", "paper", name)
+        do_job(job)
+        assert is_finished(job)
+        tree = json.loads((job.folder / DONE).read_text())
+        assert {"iou3d", "iou2d", "pitch_error", "v2v"} <= set(tree["full"])
+        assert "p2s" not in tree["full"]  # there is no scan
+    args = TableArgs("pigraphs", tmp_path / "c", tmp_path / "out", preset="paper", look=True)
+    assert "| full |" in paper_table(args).read_text()
+    assert len(jobs_of(TABLES["pigraphs"].parts[0].ours[0], args)) == 1
