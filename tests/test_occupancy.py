@@ -1,6 +1,7 @@
 """The Occupancy Network: names and shapes of the published checkpoint, and its surfaces."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -245,3 +246,36 @@ def test_a_network_of_this_size_runs_on_a_mesh():
     faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     closed = occupied_mesh(network.eval(), Mesh(verts, faces), SMALL)
     assert is_closed(closed.faces)
+
+
+def test_furniture_is_closed_by_the_checkpoint_that_the_user_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """`--prepare.watertight occnet --prepare.occnet FILE`, on files in the published layout."""
+    from test_prepare_objects import LIGHT, off_centre_box, piece_of
+
+    from mover.stages.objects import prepare_objects as stage
+
+    given = stage.PrepareInputs((piece_of(off_centre_box()),))
+    config = replace(LIGHT, watertight="occnet")
+    with pytest.raises(InputError, match="--prepare.occnet: names no file"):
+        stage.prepare_objects(given, config)
+    with pytest.raises(InputError, match="gone.pt"):
+        stage.prepare_objects(given, replace(config, occnet=str(tmp_path / "gone.pt")))
+    state = random_state(published(12, 10, 8))
+    state["decoder.fc_out.weight"].zero_()
+    state["decoder.fc_out.bias"].fill_(-5.0)  # nothing is inside
+    torch.save({"model": state}, tmp_path / "empty.pt")
+    config = replace(config, occnet=str(tmp_path / "empty.pt"))
+    found = stage.prepare_objects(given, config)
+    wrapped = stage.prepare_objects(given, LIGHT)
+    assert any("Occupancy Network gave none" in text for text in found.warnings)
+    assert torch.equal(found.objects.verts, wrapped.objects.verts)
+
+    def halved(network: OccupancyNetwork, mesh: Mesh) -> Mesh:
+        assert isinstance(network, OccupancyNetwork)
+        return Mesh(mesh.verts * torch.tensor([1.0, 0.5, 1.0]), mesh.faces)
+
+    monkeypatch.setattr(stage, "occupied_mesh", halved)
+    lower = stage.prepare_objects(given, config).objects
+    torch.testing.assert_close(lower.size, wrapped.objects.size * torch.tensor([1.0, 0.5, 1.0]))

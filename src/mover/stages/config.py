@@ -150,6 +150,10 @@ class PrepareConfig:
     """How seats and backs are found (`prepare_objects.find_regions`)."""
     level_feet: bool = False
     """All feet of a proxy are put on the floor (`prepare_objects.levelled`)."""
+    watertight: Literal["wrap", "occnet"] = "wrap"
+    """How meshes become closed: those that are not are wrapped, or all by Occupancy Networks."""
+    occnet: str = ""
+    """The checkpoint of the Occupancy Network for point clouds, for `occnet`."""
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,21 @@
 """Make any meshes fit for optimisation: closed, light, evenly sampled, with known parts."""
 
 import dataclasses
+from collections.abc import Callable
+from pathlib import Path
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Layout, Mesh, Objects, SceneObject
 from mover.furniture.library import BACKS, SEATS, canonical
 from mover.geometry.mesh import box, decimate, sample_surface, signed_volume, used
+from mover.geometry.occupancy import load_occupancy, occupied_mesh
 from mover.geometry.placement import FREE, GROUND
 from mover.geometry.rotations import rot_y
 from mover.geometry.topology import edges_of
@@ -136,10 +140,15 @@ class _Proxy:
 def prepare_objects(
     inputs: PrepareInputs, config: PrepareConfig, observe: Observer = silent
 ) -> Prepared:
-    """Close, decimate, sample and pack the furniture; read off where it starts."""
+    """Close, decimate, sample and pack the furniture; read off where it starts.
+
+    Raises:
+        InputError: If a network is asked for whose checkpoint is missing or is none.
+    """
+    close, notes = _closing(config)
     proxies: list[_Proxy] = []
     for index, piece in enumerate(inputs.objects):
-        proxies.append(_proxy(piece, config))
+        proxies.append(_proxy(piece, config, close))
         observe(Step("prepare_objects", index, len(inputs.objects)))
     pieces = inputs.objects
     center = torch.stack([p.center for p in proxies])
@@ -148,7 +157,8 @@ def prepare_objects(
     origin = torch.stack([p.t_world_object for p in pieces])
     moved = (rot_y(yaw) @ (scale * center).unsqueeze(-1)).squeeze(-1)
     start = Layout(origin + moved, yaw, torch.zeros_like(scale))
-    return Prepared(_pack(pieces, proxies), start, center, scale, _warnings(pieces, proxies))
+    warnings = (*_warnings(pieces, proxies), *notes)
+    return Prepared(_pack(pieces, proxies), start, center, scale, warnings)
 
 
 def to_objects(
@@ -174,12 +184,35 @@ def proxy_meshes(prepared: Prepared) -> tuple[Mesh, ...]:
     return tuple(meshes)
 
 
-def _proxy(piece: SceneObject, config: PrepareConfig) -> _Proxy:
+def _closing(config: PrepareConfig) -> tuple[Callable[[Mesh], Mesh], list[str]]:
+    """How meshes are closed, and what there is to tell of it afterwards."""
+    notes: list[str] = []
+
+    def wrapped(mesh: Mesh) -> Mesh:
+        return close_mesh(mesh, config.cells)
+
+    if config.watertight == "wrap":
+        return wrapped, notes
+    if not config.occnet:
+        raise InputError("--prepare.occnet: names no file, expected the network's checkpoint")
+    network = load_occupancy(Path(config.occnet))
+
+    def seen(mesh: Mesh) -> Mesh:
+        try:
+            return close_mesh(occupied_mesh(network, mesh), config.cells)
+        except ValueError as error:  # it finds nothing inside
+            notes.append(f"a mesh was wrapped, as the Occupancy Network gave none ({error})")
+            return wrapped(mesh)
+
+    return seen, notes
+
+
+def _proxy(piece: SceneObject, config: PrepareConfig, close: Callable[[Mesh], Mesh]) -> _Proxy:
     mesh = used(piece.mesh)
     low, high = box(mesh.verts)
     center = torch.stack([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
     mesh = Mesh((mesh.verts - center) * piece.scale, mesh.faces)
-    mesh = decimate(close_mesh(mesh, config.cells), config.faces)
+    mesh = decimate(close(mesh), config.faces)
     if config.level_feet:
         mesh = levelled(mesh)
     points, normals = sample_surface(mesh, 4 * config.samples)
