@@ -432,7 +432,7 @@ def test_the_preset_paper_prices_motion_as_printed():
         second = joints[t - 1] + joints[t + 1] - 2 * joints[t]
         wanted[0] += 1e2 * float(sum(rho(float(j.square().sum()), 0.1) for j in second))
         second = pixels[t - 1] + pixels[t + 1] - 2 * pixels[t]
-        wanted[1] += 1e-2 * float(sum(rho(float(c), 100.0) for c in second.square().flatten()))
+        wanted[1] += 1e-2 * float(sum(rho(float(j.square().sum()), 100.0) for j in second))
     assert float(solid) == pytest.approx(wanted[0], rel=1e-4)
     assert float(flat) == pytest.approx(wanted[1], rel=1e-4)
     assert [s.pose for s in PAPER.stages] == [4.78, 4.78]

@@ -258,9 +258,9 @@ def test_furniture_is_closed_by_the_checkpoint_that_the_user_names(
 
     given = stage.PrepareInputs((piece_of(off_centre_box()),))
     config = replace(LIGHT, watertight="occnet")
-    with pytest.raises(InputError, match="--prepare.occnet: names no file"):
+    with pytest.raises(InputError, match=r"--prepare\.occnet: names no file"):
         stage.prepare_objects(given, config)
-    with pytest.raises(InputError, match="gone.pt"):
+    with pytest.raises(InputError, match=r"gone\.pt"):
         stage.prepare_objects(given, replace(config, occnet=str(tmp_path / "gone.pt")))
     state = random_state(published(12, 10, 8))
     state["decoder.fc_out.weight"].zero_()

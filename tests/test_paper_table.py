@@ -137,7 +137,8 @@ def test_every_table_makes_all_of_its_rows_once(name: str, tmp_path: Path) -> No
             row.label for row in part.ours if not row.detected
         ]
         assert sum("(paper)" in x for x in lines) == len(part.quoted)
-    numbers = list(csv.DictReader((args.out / f"{name}-robust.csv").open()))
+    with (args.out / f"{name}-robust.csv").open(newline="") as file:
+        numbers = list(csv.DictReader(file))
     full = next(x for x in numbers if x["row"] == "full")
     assert float(full["iou3d"]) == (50 if name == "pigraphs" else 0.5)
     again = Answers()
