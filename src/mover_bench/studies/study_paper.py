@@ -6,10 +6,16 @@ tried alone beside the whole of Eq. 1, and objects that people touch are told fr
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
-from mover_bench.studies.compare import Filled, Row, Table, fill_tables, markdown, shown
-from mover_bench.studies.finished import Finished, Source
+from mover_bench.studies.compare import (
+    Row,
+    Table,
+    fill_tables,
+    markdown,
+    paired_rooms,
+    shown,
+)
+from mover_bench.studies.finished import Finished, Source, by_room
 from mover_bench.studies.sets import EXACT
 from mover_bench.studies.study_page import difference_text
 from mover_bench.studies.study_rows import Ask, Page, Plan, quoted_rows
@@ -57,7 +63,7 @@ def page(ask: Ask, finished: Finished) -> Page:
         for label, exact in TRUE.items()
     ]
     filled = fill_tables(tables, finished, asks)
-    return Page(filled, [_gains(filled), _pieces(ask, finished)])
+    return Page(filled, [_gains(ask, finished), _pieces(ask, finished)])
 
 
 def _presets(ask: Ask) -> list[str]:
@@ -77,16 +83,21 @@ def _table(preset: str, label: str, rooms: str) -> Table:
     return Table(f"{preset}, {label}", COLUMNS, rows, image, note=NOTE)
 
 
-def _gains(filled: Sequence[Filled]) -> str:
+def _gains(ask: Ask, finished: Finished) -> str:
     """What each term adds to Stage 1, one line for each choice of what is true."""
     rows: list[list[str]] = []
-    for part in filled:
-        cells = [
-            "-" if found[0].difference is None else difference_text("iou3d", found[0].difference)
-            for row, found in zip(part.table.rows, part.cells, strict=True)
-            if row.source is not None and row.label not in ("initial scene", "Stage 1")
-        ]
-        rows.append([part.table.title, *cells])
+    seeds = ask.seeds[ask.rooms]
+    for preset in _presets(ask):
+        for label, exact in TRUE.items():
+            rooms = set_of(ask.rooms, exact)
+            image = by_room(finished, Source(rooms, (preset,), "image"), "iou3d", seeds)
+            cells: list[str] = []
+            for name in (*(f"{preset}-{term}" for term in HUMAN), preset):
+                values = by_room(finished, Source(rooms, (name,)), "iou3d", seeds)
+                gain = paired_rooms(values, image)
+                told = gain and difference_text("iou3d", gain.mean, gain.low, gain.high)
+                cells.append(told or "-")
+            rows.append([f"{preset}, {label}", *cells])
     head = ["", *(f"+ {term}" for term in HUMAN), "full"]
     return f"## What people add to IoU3D\n\nDifference from Stage 1.\n\n{markdown(head, rows)}"
 
@@ -110,21 +121,21 @@ def _pieces(ask: Ask, finished: Finished) -> str:
 
 
 def _rows_of(finished: Finished, rooms: str, seed: int, names: Sequence[str]) -> list[list[str]]:
-    """A line for each object of a room."""
-    trees = [finished.of(rooms, seed, name) for name in names]
-    whole = trees[0]
-    if whole is None:
-        return []
-    rows: list[list[str]] = []
-    for place, item in enumerate(whole["objects"]):
-        alone = [
-            "-" if tree is None else _overlap(tree["objects"][place], "full") for tree in trees[1:]
+    """A line for each object of a room; the first of the names is the whole preset."""
+    every = finished.objects
+    here = every[(every["set"] == rooms) & (every["seed"] == seed)]
+    overlap = {
+        (str(row["name"]), str(row["stage"]), str(row["object"])): float(row["iou3d"])
+        for _, row in here.iterrows()
+    }
+    whole = here[(here["name"] == names[0]) & (here["stage"] == "full")]
+    columns = [(names[0], "initial"), (names[0], "image"), *((n, "full") for n in names[1:])]
+    columns.append((names[0], "full"))
+    return [
+        [
+            f"{seed} {row['object']}",
+            "✓" if row["touched"] else "",
+            *(shown("iou3d", overlap.get((*column, str(row["object"])))) for column in columns),
         ]
-        used = "✓" if item["touched"] else ""
-        first = (_overlap(item, stage) for stage in ("initial", "image"))
-        rows.append([f"{seed} {item['id']}", used, *first, *alone, _overlap(item, "full")])
-    return rows
-
-
-def _overlap(item: Mapping[str, Any], stage: str) -> str:
-    return shown("iou3d", item.get(stage, {}).get("iou3d"))
+        for _, row in whole.iterrows()
+    ]
