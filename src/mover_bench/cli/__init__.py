@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 from mover.app.cli.config import Device, parsed, preset_named
 from mover.app.cli.console import say
 from mover.app.cli.run import reconstruct_into
-from mover.core.settings import Seconds, Seed, float_in
+from mover.core.settings import Seconds, Seed, float_in, int_in
 from mover_bench.studies.args import ExperimentArgs, MakeArgs, StudyArgs
 
 
@@ -159,7 +159,7 @@ class PaperTableArgs:
     """The same captures with boxes and masks of a detector (PointRend), for rows of their own."""
     only: tuple[str, ...] = ()
     """Rows whose names begin so, as initial full; empty: all."""
-    workers: int = 0
+    workers: Annotated[int, int_in(0, 10_000)] = 0
     """How many jobs run at once; 0: as many as there are cores."""
     look: bool = False
     """Run nothing: write the page from the jobs that are finished."""

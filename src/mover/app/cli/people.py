@@ -126,7 +126,7 @@ def _known(args: BodiesArgs) -> Any:  # noqa: ANN401
     camera = None if args.camera is None else camera_of(read_camera_file(args.camera, None))
     decode = None
     if args.vposer is not None:
-        from mover.fitting.vposer import load_vposer, vposer_prior
+        from mover.fitting.prior import load_vposer, vposer_prior
 
         decode = vposer_prior(load_vposer(args.vposer)).decode
     known = Known(camera, args.focal, args.faces, args.fps, args.gender, args.first)
