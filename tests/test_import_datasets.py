@@ -19,6 +19,7 @@ from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.datasets.pigraphs import NAMES, capsule_people, read_segments
 from mover.io.datasets.prox_files import read_sdf, recordings_of
+from mover.io.datasets.true_boxes import FLOOR
 
 RECORDING = "MPH8_00034_01"
 
@@ -63,14 +64,19 @@ def test_prox_gives_flipped_frames_its_lens_and_the_truth(
 
 
 def check_scan(folder: Path, room: layouts.Room) -> None:
-    """What the scan has in the boxes are the objects themselves, with some floor at most."""
+    """What the scan has in the boxes are the objects themselves above the floor, and no floor."""
     truth = read_scene(folder / "scene.json")
     known = {t.name: t for t in room.things}
     assert len(truth.objects) == len(known)
     for piece, thing in zip(truth.objects, room.things, strict=True):
-        verts = place_object(piece).verts.numpy()
+        mesh = place_object(piece)
+        verts = mesh.verts.numpy()
         gap = np.linalg.norm(thing.world[:, None] - verts[None], axis=-1).min(1)
-        assert gap.max() < 1e-3, thing.name
+        assert truth.ground is not None
+        above = thing.world[:, 1] - truth.ground > FLOOR
+        assert above.any()
+        assert gap[above].max() < 1e-3, thing.name
+        assert (verts[mesh.faces.numpy()][..., 1].max(1) - truth.ground > 0.9 * FLOOR).all()
 
 
 def test_keypoints_of_mirrored_pictures_change_sides(

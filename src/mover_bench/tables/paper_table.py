@@ -10,11 +10,13 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from mover.app.batch.runner import LOG, Running, last_lines, read_tree, run_jobs, start_main
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
+from mover.core.settings import int_in
 from mover.io.datasets import pigraphs, prox_files
 from mover.pipeline.presets import PRESETS
 from mover_bench.tables import published, rows
@@ -137,7 +139,7 @@ class TableArgs:
     detected: Path | None = None
     """The same captures with boxes and masks of a detector."""
     preset: str = "robust"
-    workers: int = 0
+    workers: Annotated[int, int_in(0, 10_000)] = 0
     """0: as many as there are cores."""
     look: bool = False
     """Nothing is run."""
