@@ -38,7 +38,7 @@ from mover.io.people.bodies import bodies_from
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from
 
-FEW, ALL = 60, 1500  # mutations of a capture
+FEW, ALL = 60, 3000  # mutations of a capture
 LONGEST = 20  # [s], of one read
 JUNK = (
     0, -1, 1, 1e-8, -1e-8, 1e8, -80, 500, 1000, 1e5, 10**30, math.nan, math.inf, -math.inf, True,
