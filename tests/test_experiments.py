@@ -362,7 +362,7 @@ def test_a_job_is_a_process_whose_last_words_are_kept(copied, tmp_path, monkeypa
         (["--set", "flats"], "--set: 'flats' is none of mini, rooms"),
         (["--presets", "best"], "--presets: 'best' is none of paper, release, robust"),
         (["--seeds", "x"], "--seeds: 'x'"),
-        (["--workers", "-1"], "--workers: -1"),
+        (["--workers", "-1"], "--workers: has -1, expected a whole number from 0 to"),
     ],
 )
 def test_the_command_names_what_it_does_not_know(flags, said, tmp_path, capsys) -> None:
