@@ -212,7 +212,10 @@ def test_an_unknown_format_names_the_choices() -> None:
 
 
 def test_every_row_of_the_table_of_formats_has_a_function_and_a_name_of_its_own() -> None:
-    homes = [*((kind,) for kind in ("capture", "people", "keypoints", "export")), IMPORTED]
+    homes = [
+        *((kind,) for kind in ("capture", "people", "cameras", "keypoints", "export")),
+        IMPORTED,
+    ]
     for kinds in homes:
         known = names(*kinds)
         assert len(known) == len(set(known)) > 0

@@ -2,6 +2,7 @@
 
 from typing import Literal
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -140,6 +141,25 @@ class Keypoints:
 
 
 @record
+class CameraPath:
+    """Where the camera was in the frames, in the axes of the reference image's camera.
+
+    x_reference = R_reference_camera @ x_camera + t_reference_camera. A camera that stands still has
+    one pose, which is that of the reference image.
+    """
+
+    frame: Int[Tensor, " poses"]
+    """Rising."""
+    R_reference_camera: Float[Tensor, "poses 3 3"]
+    t_reference_camera: Float[Tensor, "poses 3"]
+    """In the units of the tool that found the poses until their scale is found, then [m]."""
+
+
+STILL = CameraPath(torch.zeros(1, dtype=torch.long), torch.eye(3)[None], torch.zeros(1, 3))
+"""The path of a camera that stands still."""
+
+
+@record
 class Capture:
     """Everything that is known before the method runs; it never holds the truth."""
 
@@ -160,6 +180,8 @@ class Capture:
     warnings: tuple[str, ...]
     hypotheses: tuple[SceneObject, ...] = ()
     """Other places and shapes of the scene's objects, under their ids: further starts."""
+    path: CameraPath = STILL
+    """Where the camera was when it saw the people."""
 
 
 @record

@@ -15,9 +15,10 @@ from mover.core.errors import InputError
 if TYPE_CHECKING:
     from mover.core.types import Capture
 
-Kind = Literal["capture", "scene", "dataset", "masks", "people", "keypoints", "export"]
+Kind = Literal["capture", "scene", "dataset", "masks", "people", "cameras", "keypoints", "export"]
 """What a function gives: a whole capture of a path; parts of one of a path and hints (scenes, data
-sets, masks); people or keypoints of a path and what is known; or files of a result and a folder."""
+sets, masks); people or keypoints of a path and what is known; a camera's path; or files of a result
+and a folder."""
 IMPORTED: tuple[Kind, ...] = ("scene", "dataset", "masks")
 """What `mover import` takes."""
 
@@ -90,6 +91,18 @@ FORMATS = (
     Format("people", "smplifyx", "results/ of SMPLify-X", "people.smplify:read_smplifyx"),
     Format("people", "tram", "a folder of TRAM", "people.video:read_tram"),
     Format("people", "wham", "wham_output.pkl of WHAM", "people.video:read_wham"),
+    Format("cameras", "da3", "results.npz of Depth Anything 3", "people.paths:read_da3"),
+    Format("cameras", "gvhmr", "slam_results.pt of GVHMR", "people.paths:read_slam"),
+    Format(
+        "cameras", "mapanything", "predictions.npz of MapAnything",
+        "people.paths:read_mapanything",
+    ),
+    Format("cameras", "megasam", "*_sgd_cvd_hr.npz of MegaSaM", "people.paths:read_megasam"),
+    Format("cameras", "prompthmr", "results.pkl of PromptHMR", "people.paths:read_prompthmr"),
+    Format("cameras", "tram", "camera.npy of TRAM", "people.paths:read_tram"),
+    Format("cameras", "vggt", "predictions.npz of VGGT", "people.paths:read_vggt"),
+    Format("cameras", "vipe", "a folder of ViPE", "people.paths:read_vipe"),
+    Format("cameras", "wham", "slam_results.pth of WHAM", "people.paths:read_slam"),
     Format(
         "keypoints", "coco17", "COCO's 17 joints: JSON or npz", "people.detectors:read_instances",
         {"layout": "coco17"},
@@ -114,7 +127,7 @@ FORMATS = (
     Format("export", "contacts", "labels of contact", "export.contacts:export_contacts"),
     Format("export", "bodies", "people's own frames, AMASS' names", "export.amass:export_bodies"),
 )  # fmt: skip
-"""Names are unique within `capture`, `people`, `keypoints`, `export`, and within `IMPORTED`."""
+"""Names are unique within `capture`, `people`, `cameras`, `keypoints`, `export`, and `IMPORTED`."""
 
 
 def names(*kinds: Kind) -> list[str]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mover.bodies.corrected import in_world
 from mover.bodies.parts import parts_of
+from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.run import Run as Run
 from mover.core.settings import check_settings
@@ -17,6 +18,7 @@ from mover.energy.config import SceneConfig, only
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.camera import to_camera
+from mover.geometry.path import is_still
 from mover.geometry.placement import (
     GROUND,
     larger,
@@ -93,6 +95,8 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
 
 def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]) -> Room:
     """The stages in their order."""
+    if not is_still(capture.path):
+        raise InputError("cameras.npz: the camera moves, expected one that stands still")
     people = people_of(capture, config, run)
     if not capture.scene.objects:
         return unfurnished(capture, people)

@@ -54,6 +54,12 @@ class ImportArgs:
     """bodies.npz, or what the tool of --bodies-from wrote."""
     bodies_from: str = ""
     """The tool that found the bodies, as gvhmr, wham, tram or smplifyx; else bodies.npz."""
+    cameras: Path | None = None
+    """Where a moving camera was: cameras.npz, or what the tool of --cameras-from wrote."""
+    cameras_from: str = ""
+    """The tool that found the poses, as vipe, megasam, tram or vggt; else cameras.npz."""
+    reference_frame: int | None = None
+    """The frame that the reference image shows, where the camera moves; else the first pose."""
     gender: str | None = None
     """Of the bodies, where the tool does not tell: neutral, female or male."""
     fps: Rate | None = None
@@ -146,7 +152,23 @@ def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
         bodies = read_body_arrays(args.bodies, args.fps) if not args.bodies_from else None
         bodies = bodies or _bodies_of_tool(args, [*found, extra], hints)
         extra = dataclasses.replace(extra, bodies=bodies)
+    if args.cameras is not None:
+        extra = dataclasses.replace(extra, cameras=_cameras(args, args.cameras))
     return [*found, extra, *_masks(args, [*found, extra], hints)]
+
+
+def _cameras(args: ImportArgs, source: Path) -> "At":
+    """Poses of a moving camera, as the arrays of cameras.npz."""
+    import numpy as np
+
+    from mover.io.files.fields import At
+    from mover.io.files.npz import read_npz
+
+    read = chosen("--cameras-from", args.cameras_from, "cameras") if args.cameras_from else read_npz
+    at: At = read(source)
+    if args.reference_frame is None:
+        return at
+    return At({**at.value, "reference": np.array(args.reference_frame)}, at.file)
 
 
 def _bodies_of_tool(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "At":

@@ -7,17 +7,29 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.types import Bodies, Camera, Capture, Detection, People, Scene, SceneObject
+from mover.core.types import (
+    STILL,
+    Bodies,
+    Camera,
+    CameraPath,
+    Capture,
+    Detection,
+    People,
+    Scene,
+    SceneObject,
+)
+from mover.geometry.path import is_still
 from mover.geometry.rotations import rot_y
 from mover.io.capture.bodies_file import bodies_of, read_touch
 from mover.io.capture.camera_file import camera_of
+from mover.io.capture.cameras_file import path_of
 from mover.io.capture.objects_file import detections_of
 from mover.io.capture.parts import Parts
 from mover.io.capture.people_file import PeopleFile, people_of
 from mover.io.capture.plausible import check_plausible
 from mover.io.capture.pose_file import into_camera
 from mover.io.capture.scene_file import hypotheses_of, scene_of
-from mover.io.files.fields import At, Warn, get, items, listed, maybe, number, refuse
+from mover.io.files.fields import At, Warn, array, get, items, listed, maybe, number, refuse
 
 LEAST_HEIGHT, MOST_HEIGHT = 0.1, 20.0  # [m], of the camera above the floor
 NOBODY = PeopleFile(None, None, None, frozenset())
@@ -42,6 +54,7 @@ def build_capture(parts: Parts) -> Capture:
     if parts.people is not None:
         found = people_of(parts.people, scene.camera, warn)
     bodies = _bodies_of(parts.bodies, scene.camera, turn, found.fps, warn)
+    path = _path_of(parts, scene.camera, bodies, warn)
     touch = _touch_of(parts.contacts, bodies, warn)
     _check_frames(parts, found, bodies)
     _check_people(found.people, bodies, warn)
@@ -60,6 +73,7 @@ def build_capture(parts: Parts) -> Capture:
         touch=touch,
         warnings=(),
         hypotheses=others,
+        path=path,
     )
     check_plausible(capture, warn)
     return dataclasses.replace(capture, warnings=tuple(warnings))
@@ -106,6 +120,18 @@ def _bodies_of(
         # The file's world is that of scene.json, before its heading was taken out.
         bodies = into_camera(bodies, camera.R_cam_world @ rot_y(torch.tensor(turn)))
     return dataclasses.replace(bodies, fps=fps) if bodies.fps is None else bodies
+
+
+def _path_of(parts: Parts, camera: Camera, bodies: Bodies | None, warn: Warn) -> CameraPath:
+    """Where the camera was; people of a moving one are in its own axes, frame by frame."""
+    if parts.cameras is None:
+        return STILL
+    path = path_of(parts.cameras, camera, bodies, warn)
+    if parts.bodies is not None and not is_still(path):
+        space = get(parts.bodies, "space")
+        if str(array(space, (), "text")) != "camera":
+            refuse(space, "'camera': cameras.npz carries people into the room's world", "'world'")
+    return path
 
 
 def _touch_of(

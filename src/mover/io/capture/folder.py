@@ -9,9 +9,11 @@ from typing import Any
 
 from mover.core.errors import InputError
 from mover.core.types import Capture
+from mover.geometry.path import is_still
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_to_json
+from mover.io.capture.cameras_file import path_to_arrays
 from mover.io.capture.objects_file import detections_to_json, image_name
 from mover.io.capture.parts import Hints, LoadImage, Parts, image_parts
 from mover.io.capture.people_file import people_to_json
@@ -74,6 +76,7 @@ def _files(folder: Path, needed: Callable[[Path], At | None]) -> Parts:
         people=_if_there(read_json, folder / "people.json"),
         bodies=_if_there(read_npz, folder / "bodies.npz"),
         contacts=_if_there(read_npz, folder / "contacts.npz"),
+        cameras=_if_there(read_npz, folder / "cameras.npz"),
         load_mesh=partial(read_mesh, folder=folder),
         n_frames=_count_frames(folder / "frames"),
         hypotheses=_if_there(read_json, folder / HYPOTHESES),
@@ -123,6 +126,8 @@ def write_capture(capture: Capture, folder: Path) -> None:
     if capture.touch is not None:
         touch = capture.touch.detach().cpu().numpy()
         write_npz({"probability": touch}, folder / "contacts.npz")
+    if not is_still(capture.path):
+        write_npz(path_to_arrays(capture.path), folder / "cameras.npz")
     write_trees(capture, folder, name)
     if capture.hypotheses:
         own = {piece.id: [piece] for piece in capture.scene.objects}
@@ -168,6 +173,7 @@ def _check_room_for(capture: Capture, folder: Path) -> None:
         "bodies.npz": capture.bodies is not None,
         "people.json": capture.people is not None or capture.reference_people is not None,
         "contacts.npz": capture.touch is not None,
+        "cameras.npz": not is_still(capture.path),
     }
     for name, is_written in wanted.items():
         if not is_written and (folder / name).exists():

@@ -273,6 +273,9 @@ def _write_whole(whole: Parts, old: Parts, capture: Capture | None, folder: Path
     if whole.contacts is not None and whole.contacts is not old.contacts:
         write_npz(whole.contacts.value, folder / "contacts.npz")
         done.append("contacts.npz")
+    if whole.cameras is not None and whole.cameras is not old.cameras:
+        write_npz(whole.cameras.value, folder / "cameras.npz")
+        done.append("cameras.npz")
     return done + _write_beside(whole, folder)
 
 

@@ -43,6 +43,8 @@ class Parts:
     """The arrays of bodies.npz."""
     contacts: At | None = None
     """The arrays of contacts.npz."""
+    cameras: At | None = None
+    """The arrays of cameras.npz."""
     load_mesh: LoadMesh = no_mesh
     """Gives the mesh that a field of `scene` names."""
     load_image: LoadImage | None = None

@@ -179,7 +179,7 @@ def movement(
     if angle < TURNED and way < TRAVELLED:
         return ()
     told = f"turns by up to {math.degrees(angle):.1f} degrees and travels {way:.2f} m"
-    return (f"the camera {told}; rooms are rebuilt from a camera that stands still",)
+    return (f"the camera {told}: give its poses, too (`mover import --cameras`)",)
 
 
 def cameras_of(

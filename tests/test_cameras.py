@@ -1,0 +1,269 @@
+"""A moving camera's poses come in from every tool's own layout, and wrong ones are refused."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import joblib
+import little_room
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mover.core.errors import InputError
+from mover.core.types import STILL, Capture
+from mover.geometry.path import from_reference, is_still, poses_at, scaled, to_reference
+from mover.io.capture.cameras_file import path_of, path_to_arrays
+from mover.io.capture.folder import read_capture, write_capture
+from mover.io.capture.merge import import_into
+from mover.io.capture.parts import Parts
+from mover.io.files.fields import At
+from mover.io.formats import chosen, names
+from mover.io.people.paths import read_slam
+
+COUNT, FOCAL = 6, 0.625
+WIDTH, HEIGHT = 640, 360
+
+
+def true_path() -> np.ndarray:
+    """Camera to world in OpenCV's axes, (T, 4, 4)."""
+    T = np.tile(np.eye(4), (COUNT, 1, 1))
+    way = np.linspace(0, 1, COUNT)[:, None]
+    T[:, :3, :3] = Rotation.from_rotvec(way * [0.1, -0.4, 0.05] + [0.2, 0, 0]).as_matrix()
+    T[:, :3, 3] = way * [0.7, -0.1, 0.3] + [3, 1, 2]
+    return T
+
+
+def lens(zoom: float = 1.0) -> np.ndarray:
+    K = np.array([[FOCAL * WIDTH, 0, WIDTH / 2], [0, FOCAL * WIDTH, HEIGHT / 2], [0, 0, 1]])
+    K[:2] *= zoom
+    return K
+
+
+def write_vipe(folder: Path) -> Path:
+    """nv-tlabs/vipe, vipe/utils/io.py: read_pose_artifacts, read_intrinsics_artifacts."""
+    for kind in ("pose", "intrinsics"):
+        (folder / kind).mkdir()
+    inds, K = np.arange(COUNT), lens()
+    four = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (COUNT, 1)).astype(np.float32)
+    np.savez(folder / "pose" / "clip.npz", data=true_path().astype(np.float32), inds=inds)
+    np.savez(folder / "intrinsics" / "clip.npz", data=four, inds=inds)
+    return folder
+
+
+def write_megasam(folder: Path) -> Path:
+    """mega-sam/mega-sam, cvd_opt/cvd_opt.py: np.savez at its end; images are smaller."""
+    file, small = folder / "clip_sgd_cvd_hr.npz", (COUNT, 18, 32)
+    np.savez(
+        file, images=np.zeros((*small, 3), np.uint8), depths=np.ones(small, np.float16),
+        intrinsic=lens(0.05).astype(np.float32), cam_c2w=true_path().astype(np.float32),
+    )  # fmt: skip
+    return file
+
+
+def write_tram(folder: Path) -> Path:
+    """yufu-wang/tram, scripts/estimate_camera.py: a pickled dict in camera.npy."""
+    T, K = true_path(), lens()
+    camera = {
+        "pred_cam_R": T[:, :3, :3].astype(np.float32), "pred_cam_T": T[:, :3, 3],
+        "img_focal": K[0, 0], "img_center": K[:2, 2],
+    }  # fmt: skip
+    np.save(folder / "camera.npy", camera, allow_pickle=True)  # pyright: ignore
+    return folder
+
+
+def write_prompthmr(folder: Path) -> Path:
+    """yufu-wang/PromptHMR, pipeline/world.py: `camera_world` of results.pkl."""
+    T, K = true_path(), lens()
+    back = np.linalg.inv(T)
+    world = {
+        "pred_cam_R": T[:, :3, :3], "pred_cam_T": T[:, :3, 3], "Rwc": T[:, :3, :3],
+        "Twc": T[:, :3, 3], "Rcw": back[:, :3, :3], "Tcw": back[:, :3, 3],
+        "img_focal": K[0, 0], "img_center": K[:2, 2],
+    }  # fmt: skip
+    joblib.dump({"people": {}, "camera_world": world}, folder / "results.pkl")
+    return folder
+
+
+def seven() -> np.ndarray:
+    """DPVO's terminate(): x y z, quaternion x y z w, camera to world."""
+    T = true_path()
+    return np.concatenate([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()], 1)
+
+
+def write_wham(folder: Path) -> Path:
+    """yohanshin/WHAM, demo.py: joblib.dump of DPVO's rows."""
+    joblib.dump(seven().astype(np.float32), folder / "slam_results.pth")
+    return folder
+
+
+def write_gvhmr(folder: Path) -> Path:
+    """zju3dv/GVHMR, tools/demo/demo.py: torch.save of DPVO's rows, which hold R_w2c.mT."""
+    (folder / "preprocess").mkdir()
+    torch.save(seven(), folder / "preprocess" / "slam_results.pt")
+    return folder
+
+
+def write_vggt(folder: Path) -> Path:
+    """facebookresearch/vggt, demo_gradio.py: predictions.npz, camera from world, (S, 3, 4)."""
+    pose = np.linalg.inv(true_path())[:, :3].astype(np.float32)
+    K = np.tile(lens(518 / WIDTH), (COUNT, 1, 1)).astype(np.float32)
+    depth = np.ones((COUNT, 29, 51, 1), np.float32)
+    np.savez(folder / "predictions.npz", extrinsic=pose, intrinsic=K, depth=depth)
+    return folder
+
+
+def write_da3(folder: Path) -> Path:
+    """ByteDance-Seed/Depth-Anything-3, src/depth_anything_3/utils/export/npz.py."""
+    inside = folder / "exports" / "npz"
+    inside.mkdir(parents=True)
+    pose = np.linalg.inv(true_path())[:, :3].astype(np.float32)
+    K = np.tile(lens(504 / WIDTH), (COUNT, 1, 1)).astype(np.float32)
+    depth, image = np.ones((COUNT, 9, 16), np.float32), np.zeros((COUNT, 9, 16, 3), np.uint8)
+    np.savez_compressed(
+        inside / "results.npz", image=image, depth=depth, extrinsics=pose, intrinsics=K
+    )
+    return folder
+
+
+def write_mapanything(folder: Path) -> Path:
+    """facebookresearch/map-anything, scripts/gradio_app.py: `camera_poses` under `extrinsic`."""
+    K = np.tile(lens(518 / WIDTH), (COUNT, 1, 1)).astype(np.float32)
+    pose = true_path().astype(np.float32)
+    np.savez(folder / "predictions.npz", extrinsic=pose, intrinsic=K, conf=np.ones((COUNT, 2, 2)))
+    return folder
+
+
+WRITERS: dict[str, Callable[[Path], Path]] = {
+    "vipe": write_vipe, "megasam": write_megasam, "tram": write_tram, "wham": write_wham,
+    "prompthmr": write_prompthmr, "gvhmr": write_gvhmr, "vggt": write_vggt, "da3": write_da3,
+    "mapanything": write_mapanything,
+}  # fmt: skip
+
+
+def test_every_tool_has_a_fixture() -> None:
+    assert set(WRITERS) == set(names("cameras"))
+
+
+@pytest.fixture
+def capture() -> Capture:
+    bodies = little_room.walkers(2)
+    bodies = dataclasses.replace(bodies, verts=bodies.verts * torch.tensor([1.0, -1, -1]))
+    return Capture(
+        "room", dataclasses.replace(little_room.room(), objects=()), None, (), None, None,
+        dataclasses.replace(bodies, space="camera"), None, None, (),
+    )  # fmt: skip
+
+
+def points_of(path, frames: list[int]) -> torch.Tensor:
+    """A few points that each frame's camera sees, in the axes of the reference camera."""
+    seen = torch.tensor([[0.3, 0.2, 3.0], [-1, 0.5, 4]]).expand(len(frames), 2, 3)
+    return to_reference(seen, poses_at(path, torch.tensor(frames)))
+
+
+@pytest.mark.parametrize("tool", WRITERS)
+def test_the_poses_of_every_tool_come_back_from_a_capture(
+    tool: str, capture: Capture, tmp_path: Path
+) -> None:
+    folder, source = tmp_path / "room", tmp_path / "source"
+    write_capture(capture, folder)
+    source.mkdir()
+    at = chosen("--cameras-from", tool, "cameras")(WRITERS[tool](source))
+    if "focal" in at.value:
+        assert np.allclose(at.value["focal"], FOCAL, rtol=1e-5)
+    at = At({**at.value, "reference": np.array(2)}, at.file)
+    import_into(folder, Parts("cameras", cameras=at))
+    path = read_capture(folder).path
+    true = np.linalg.inv(true_path()[2]) @ true_path()
+    seen = np.array([[0.3, 0.2, 3.0, 1], [-1, 0.5, 4, 1]])
+    expected = torch.tensor(np.einsum("tij,pj->tpi", true, seen)[..., :3]).float()
+    assert torch.allclose(points_of(path, list(range(COUNT))), expected, atol=1e-5)
+    again = path_of(
+        At(path_to_arrays(path), "cameras.npz"), capture.scene.camera, None, list[str]().append
+    )
+    assert torch.allclose(points_of(again, list(range(COUNT))), expected, atol=1e-5)
+
+
+def test_simple_vo_of_gvhmr_tells_world_to_camera(tmp_path: Path) -> None:
+    """zju3dv/GVHMR, hmr4d/utils/preproc/relpose/simple_vo.py: T_w2c, (L, 4, 4)."""
+    np.save(tmp_path / "slam_results.npy", np.linalg.inv(true_path()))
+    at = read_slam(tmp_path / "slam_results.npy")
+    assert np.allclose(at.value["T_world_camera"], true_path())
+
+
+def test_whams_sign_for_no_slam_is_refused(tmp_path: Path) -> None:
+    row = np.zeros((COUNT, 7))
+    row[:, 3] = 1
+    joblib.dump(row, tmp_path / "slam_results.pth")
+    with pytest.raises(InputError, match="camera that was followed"):
+        read_slam(tmp_path)
+
+
+def test_a_pose_between_two_is_half_way(capture: Capture) -> None:
+    at = {"frame": np.arange(COUNT) * 10, "T_world_camera": true_path()}
+    path = path_of(At(at, "cameras.npz"), capture.scene.camera, None, list[str]().append)
+    ends = poses_at(path, torch.tensor([0, 10, 20]))
+    middle = poses_at(path, torch.tensor([5, 15]))
+    t = ends.t_reference_camera
+    assert torch.allclose(middle.t_reference_camera, (t[1:] + t[:-1]) / 2)
+    R = ends.R_reference_camera
+    step = middle.R_reference_camera[0].mT @ R[1]
+    assert torch.allclose(step, R[0].mT @ middle.R_reference_camera[0], atol=1e-6)
+
+
+def test_points_go_there_and_back_and_a_larger_scale_moves_the_camera_alone() -> None:
+    at = {"frame": np.arange(COUNT), "T_world_camera": true_path()}
+    path = path_of(At(at, "cameras.npz"), little_room.camera(), None, list[str]().append)
+    poses = poses_at(path, torch.arange(COUNT))
+    points = torch.randn(COUNT, 5, 3, generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(from_reference(to_reference(points, poses), poses), points, atol=1e-5)
+    larger = poses_at(scaled(path, 2.0), torch.arange(COUNT))
+    moved = to_reference(points, larger) - to_reference(points, poses)
+    assert torch.allclose(moved, poses.t_reference_camera[:, None].expand(-1, 5, -1), atol=1e-5)
+
+
+def test_a_camera_that_never_moves_is_the_still_one(capture: Capture) -> None:
+    at = {"frame": np.arange(COUNT), "T_world_camera": np.tile(true_path()[:1], (COUNT, 1, 1))}
+    path = path_of(At(at, "cameras.npz"), capture.scene.camera, capture.bodies, list[str]().append)
+    assert path is STILL
+    assert is_still(path)
+    points = torch.randn(3, 4, 3)
+    assert torch.equal(to_reference(points, poses_at(path, torch.arange(3))), points)
+
+
+def test_wrong_cameras_are_refused_in_a_sentence(capture: Capture) -> None:
+    T, good = true_path(), np.arange(COUNT)
+    zoom = np.linspace(0.6, 0.8, COUNT)
+    mirrored = T @ np.diag([-1.0, 1, 1, 1])
+    cases = [
+        ({"frame": good[::-1], "T_world_camera": T}, "rising frames"),
+        ({"frame": good, "T_world_camera": T[:3]}, r"shape \(6, 4, 4\)"),
+        ({"frame": good, "T_world_camera": mirrored}, "rotation and translation"),
+        ({"frame": good, "T_world_camera": T * 2}, "rotation and translation"),
+        ({"frame": good, "T_world_camera": T, "focal": zoom}, "no zoom"),
+        ({"frame": good, "T_world_camera": T, "reference": np.array(9)}, "has a pose"),
+        ({"frame": good + 2, "T_world_camera": T}, "for all bodies, also for frame 0"),
+        ({"frame": good}, "T_world_camera"),
+    ]
+    for arrays, words in cases:
+        with pytest.raises(InputError, match=words):
+            path_of(
+                At(arrays, "cameras.npz"), capture.scene.camera, capture.bodies, list[str]().append
+            )
+
+
+def test_people_of_a_moving_camera_must_be_in_its_axes(capture: Capture, tmp_path: Path) -> None:
+    assert capture.bodies is not None
+    world = dataclasses.replace(capture.bodies, space="world")
+    write_capture(dataclasses.replace(capture, bodies=world), tmp_path / "room")
+    at = At({"frame": np.arange(COUNT), "T_world_camera": true_path()}, "cameras.npz")
+    with pytest.raises(InputError, match="'space' has 'world', expected 'camera'"):
+        import_into(tmp_path / "room", Parts("cameras", cameras=at))
+
+
+def test_another_lens_is_told(capture: Capture) -> None:
+    told: list[str] = []
+    at = {"frame": np.arange(COUNT), "T_world_camera": true_path(), "focal": np.full(COUNT, 0.9)}
+    path_of(At(at, "cameras.npz"), capture.scene.camera, None, told.append)
+    assert "focal length is 0.9 widths" in told[0]
