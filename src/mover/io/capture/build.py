@@ -54,13 +54,11 @@ def build_capture(parts: Parts) -> Capture:
     if parts.people is not None:
         found = people_of(parts.people, scene.camera, warn)
     bodies = _bodies_of(parts.bodies, scene.camera, turn, found.fps, warn)
-    path = _path_of(parts, scene.camera, bodies, warn)
     touch = _touch_of(parts.contacts, bodies, warn)
     _check_frames(parts, found, bodies)
     _check_people(found.people, bodies, warn)
-    others: tuple[SceneObject, ...] = ()
-    if parts.hypotheses is not None:
-        others = hypotheses_of(parts.hypotheses, parts.load_mesh, scene, warn)
+    given = parts.hypotheses
+    others = () if given is None else hypotheses_of(given, parts.load_mesh, scene, warn)
     capture = Capture(
         name=parts.name,
         scene=scene,
@@ -73,7 +71,7 @@ def build_capture(parts: Parts) -> Capture:
         touch=touch,
         warnings=(),
         hypotheses=others,
-        path=path,
+        path=_path_of(parts, scene.camera, bodies, warn),
     )
     check_plausible(capture, warn)
     return dataclasses.replace(capture, warnings=tuple(warnings))
