@@ -16,7 +16,6 @@ from mover.core.types import (
     Detection,
     People,
     Scene,
-    SceneObject,
 )
 from mover.geometry.path import is_still
 from mover.geometry.rotations import rot_y
