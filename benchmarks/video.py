@@ -2,9 +2,10 @@
 
 Each room is drawn as an MP4 and goes the whole way of `mover video`; for the networks stand the
 truth with the errors of detectors (`mover_bench.rooms.seen`), under COCO's classes. Furniture that
-COCO has no class for is not found and not counted.
+COCO has no class for is not found and not counted. With --other-designs no piece of the room's
+designs is among the shapes that the first scene is made of: no mesh is the true one.
 
-    python benchmarks/video.py --seeds 100-103 --out video
+    python benchmarks/video.py --seeds 100-103 --other-designs --out video
 """
 
 import argparse
@@ -18,19 +19,34 @@ import torch
 from mover.app.cli.video import ChainArgs, video_to_room
 from mover.core.types import Scene
 from mover.evaluate.evaluation import EvaluatedBodies, evaluate
+from mover.furniture.library import canonical, catalogue
 from mover.geometry.rle import decode
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
+from mover.io.files.meshes import write_mesh
+from mover.perceive.layout import WIDE_CLASSES
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise
 from mover_bench.rooms.room import make_room
-from mover_bench.rooms.seen import Seen, write_video
+from mover_bench.rooms.seen import COCO, Seen, write_video
 from mover_bench.studies.run import parse_seeds
 
 FPS = 5.0
 KEYS = ("iou3d", "p2s", "center_error", "contact_f1", "pje", "p_pje")
+
+
+def other_designs(room: KnownRoom, folder: Path) -> Path:
+    """Shapes of all that COCO calls furniture, without any design that stands in the room."""
+    used = {(canonical(piece.category), piece.style) for piece in room.furniture}
+    for name in sorted(set(COCO.values())):
+        kinds = sorted({canonical(kind) for kind in WIDE_CLASSES.get(name, (name,))})
+        every = [piece for kind in kinds for piece in catalogue(kind)]
+        shapes = [p for p in every if (canonical(p.category), p.style) not in used]
+        for index, shape in enumerate(shapes):
+            write_mesh(shape.mesh, folder / f"{canonical(name)}_{index}.glb")
+    return folder
 
 
 def truth_of(room: KnownRoom, capture: Path) -> dict[str, int]:
@@ -70,7 +86,7 @@ def judged(out: Path, room: KnownRoom) -> dict[str, dict[str, float]]:
     return {side: metrics[side] for side in ("initial", "result")}
 
 
-def trial(seed: int, out: Path) -> dict[str, float]:
+def trial(seed: int, out: Path, designs: bool) -> dict[str, float]:
     """One known room, from its video to its room."""
     room = make_room(seed, RoomConfig(fps=FPS))
     out.mkdir(parents=True, exist_ok=True)
@@ -85,7 +101,8 @@ def trial(seed: int, out: Path) -> dict[str, float]:
     }
     (out / "lens.json").write_text(json.dumps(lens))
     seen = Seen(room, add_noise(room, NoiseConfig(), seed), seed)
-    args = ChainArgs(out / "chain", camera=out / "lens.json")
+    meshes = other_designs(room, out / "meshes") if designs else None
+    args = ChainArgs(out / "chain", camera=out / "lens.json", meshes=meshes)
     video_to_room(out / "video.mp4", args, seen.finders())
     metrics = judged(out / "chain", room)
     steps = json.loads((out / "chain" / "steps.json").read_text())["steps"]
@@ -98,9 +115,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", default="100-103")
     parser.add_argument("--out", type=Path, default=Path("video"))
+    parser.add_argument("--other-designs", action="store_true", help="no mesh is the true one")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    rows = {seed: trial(seed, args.out / str(seed)) for seed in parse_seeds(args.seeds)}
+    rows = {
+        seed: trial(seed, args.out / str(seed), args.other_designs)
+        for seed in parse_seeds(args.seeds)
+    }
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     for name in names:
         values = [row[name] for row in rows.values() if name in row]

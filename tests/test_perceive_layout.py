@@ -11,6 +11,7 @@ import torch
 
 from mover.app.cli import run_command
 from mover.core.errors import InputError
+from mover.core.records import rows_of
 from mover.core.run import Run
 from mover.core.types import Camera, Detection, Masks, SceneObject
 from mover.energy.terms.bbox import SEEN
@@ -27,6 +28,7 @@ from mover.perceive.config import LayoutConfig, ScreenConfig
 from mover.perceive.depth_map import floor_height, median_depths, read_depth
 from mover.perceive.layout import Picture, first_scene, is_placed, shapes_of
 from mover.perceive.screen import ScreenInputs, outermost, screen
+from mover.perceive.standing import standing_on
 
 W, H, FOCAL = 480, 320, 420.0
 HEIGHT = 1.35
@@ -171,6 +173,23 @@ def test_measured_depth_makes_it_better(tmp_path: Path):
         plain += miss(replace(seen, depth=None), pieces) / 5
         deep += miss(seen, pieces) / 5
     assert deep < min(0.3, plain)
+
+
+def test_feet_tell_the_tilt_and_the_height_of_the_camera(
+    pieces: list[SceneObject], small_room, tmp_path: Path
+):
+    true = small_room.truth.camera
+    level = replace(true, R_cam_world=torch.diag(torch.tensor([1.0, -1.0, -1.0])))
+    seen = replace(picture(pieces, camera()), camera=level)
+    found = standing_on(seen, small_room.bodies, Run(tmp_path))
+    off = torch.rad2deg(torch.stack(pitch_roll(found.camera.R_cam_world)))
+    assert (off - torch.rad2deg(torch.stack(pitch_roll(true.R_cam_world)))).abs().max() < 1.5
+    assert found.height == pytest.approx(-small_room.truth.ground, abs=0.05)
+    # a height that is known stays, and feet of one frame tell neither
+    known = replace(seen, height=2.0)
+    assert standing_on(known, small_room.bodies, Run(tmp_path)) is known
+    once = rows_of(small_room.bodies, torch.tensor([0]))
+    assert standing_on(seen, once, Run(tmp_path)) is seen
 
 
 @pytest.mark.slow

@@ -37,7 +37,13 @@ class Steps:
     """What each took, and the hash of what it was made from."""
 
     def do(
-        self, name: str, made_from: Iterable[Path | str], made: Path, work: Callable[[], None]
+        self,
+        name: str,
+        made_from: Iterable[Path | str],
+        made: Path,
+        work: Callable[[], None],
+        *,
+        yours: bool = False,
     ) -> None:
         """Do a step unless its result is there, made from the same.
 
@@ -46,16 +52,21 @@ class Steps:
             made_from: Files, and words for settings.
             made: The file that the step ends with.
             work: Does it.
+            yours: Whether a result that was replaced stays, whatever it would be made from now.
         """
         key, number = digest(made_from), f"{self.names.index(name) + 1}/{len(self.names)}"
-        if made.exists() and self.log.get(name, {}).get("made_from") == key:
+        before = self.log.get(name, {})
+        if made.exists() and before.get("made_from") == key:
             self.say(f"{number} {name}: kept")
+            return
+        if yours and made.exists() and before.get("made") not in (None, digest([made])):
+            self.say(f"{number} {name}: {made.name} is yours and stays; without it, it is made")
             return
         self.say(f"{number} {name} ...")
         start = time.monotonic()
         work()
         seconds = round(time.monotonic() - start, 1)
-        self.log[name] = {"made_from": key, "seconds": seconds}
+        self.log[name] = {"made_from": key, "made": digest([made]), "seconds": seconds}
         from mover.io.files.fields import write_json
 
         write_json({"steps": self.log}, self.folder / "steps.json")

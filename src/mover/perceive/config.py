@@ -155,6 +155,8 @@ class ScreenConfig:
     """The usual one [m],"""
     spread: Annotated[float, float_in(1e-3, 10)] = 0.4
     """and how much it varies (of its logarithm)."""
+    known: Sigma = 0.05
+    """How far off a height is that people or depth tell (of its logarithm): people's heights."""
     yaws: Annotated[int, int_in(1, 360)] = 8
     """Turns that are tried."""
     scale: Weight = 0.3
@@ -163,6 +165,8 @@ class ScreenConfig:
     """Weight of measured depth, where there is any."""
     tilt: Annotated[float, float_in(0, 1.5)] = math.radians(3)
     """How wrong pitch and roll may be [rad]; 0: not at all."""
+    tilt_known: Annotated[float, float_in(0, 1.5)] = math.radians(1)
+    """The same where the height is known, too [rad]."""
     prior: Weight = 0.03
     """Weight of usual heights and tilts."""
     cap: Weight = 0.3
@@ -183,9 +187,9 @@ LONG = Adam(100, 0.02, 0.003, beta2=0.98, keep_best=True)
 class LayoutConfig:
     """How the first scene is found."""
 
-    shapes: Annotated[int, int_in(1, 1000)] = 8
+    shapes: Annotated[int, int_in(1, 1000)] = 16
     """Shapes of each thing that the boxes judge."""
-    keep: Annotated[int, int_in(1, 1000)] = 3
+    keep: Annotated[int, int_in(1, 1000)] = 5
     """Shapes of each thing that the silhouettes judge."""
     turns: Annotated[int, int_in(1, 360)] = 6
     """Starts of each of them."""

@@ -41,7 +41,11 @@ from mover.stages.objects.prepare_objects import (
     to_objects,
 )
 
-WIDE_CLASSES = {"dining table": ("table", "coffee table", "desk"), "couch": ("sofa", "armchair")}
+WIDE_CLASSES = {
+    "dining table": ("table", "coffee table", "desk"),
+    "couch": ("sofa", "armchair"),
+    "chair": ("chair", "armchair", "office chair", "stool"),
+}
 """COCO has one name for what the library tells apart."""
 
 OTHER_SIZES: dict[str, tuple[float, float, float]] = {

@@ -45,7 +45,7 @@ class ScreenInputs:
     points: Float[Tensor, "items points 3"]
     """Outermost points of each shape, from the centre of its bottom [m]."""
     height: float | None
-    """The camera's, where it is known [m]."""
+    """The camera's, where people's feet or a depth map tell it, and then its tilt [m]."""
 
 
 @record
@@ -142,12 +142,13 @@ def _share(
 
 
 def _world(guess: Guess, inputs: ScreenInputs, config: ScreenConfig) -> Float[Tensor, " heights"]:
-    """How unusual height and tilt are."""
-    prior = ((guess.log_height - math.log(config.usual)) / config.spread).square()
+    """How unusual height and tilt are, or how far from the known ones."""
+    usual, spread, tilt = config.usual, config.spread, config.tilt
     if inputs.height is not None:
-        prior = torch.zeros_like(prior)
-    tilt = (guess.tilt / max(config.tilt, 1e-3)).square().sum(-1)
-    return config.prior * (prior + tilt)
+        usual, spread, tilt = inputs.height, config.known, config.tilt_known
+    height = ((guess.log_height - math.log(usual)) / spread).square()
+    turned = (guess.tilt / max(tilt, 1e-3)).square().sum(-1)
+    return config.prior * (height + turned)
 
 
 def _standing(guess: Guess) -> Layout:

@@ -20,8 +20,8 @@ THREADS = 1  # of torch, as in `run`
 class LayoutArgs:
     """Find a first scene: furniture of the library (or yours) where the picture shows some.
 
-    Needs camera.json and objects.json in the capture; writes scene.json, meshes/ and
-    hypotheses.json.
+    Needs camera.json and objects.json in the capture, and is far better with bodies.npz, whose feet
+    tell where the floor is; writes scene.json, meshes/ and hypotheses.json.
     """
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -123,13 +123,17 @@ def layout_into(args: LayoutArgs) -> None:
 
     from mover.app.cli.progress import Bar
     from mover.core.run import Run
+    from mover.io.capture.bodies_file import read_bodies
     from mover.perceive.capture import read_picture_of, write_first_scene
     from mover.perceive.layout import first_scene
+    from mover.perceive.standing import standing_on
 
     torch.set_num_threads(THREADS)
-    picture = read_picture_of(args.capture, args.depth)
+    picture, people = read_picture_of(args.capture, args.depth), args.capture / "bodies.npz"
     with Bar() as bar:
         run = Run(args.capture / "perceived", bar)
+        if people.is_file():
+            picture = standing_on(picture, read_bodies(people), run)
         first = first_scene(picture, args.config, run, args.meshes)
     write_first_scene(first, args.capture)
     ground = first.scene.ground

@@ -22,7 +22,7 @@ from mover.core.errors import InputError
 from mover.core.settings import float_in
 from mover.perceive.config import PerceiveConfig
 
-STEPS = ("pictures", "first scene", "bodies", "room")
+STEPS = ("pictures", "bodies", "first scene", "room")
 ONE_IMAGE = (
     "note: one picture shows one moment: nobody passes behind furniture, nothing is touched twice, "
     "nobody's height is averaged; a video of ten seconds or more places furniture far better"
@@ -65,7 +65,7 @@ class ChainArgs:
 
 @dataclass(frozen=True)
 class VideoArgs:
-    """From a video to a room: pictures, first scene, bodies, room, report."""
+    """From a video to a room: pictures, bodies, first scene, room, report."""
 
     source: Annotated[Positional[Path], arg(metavar="VIDEO")]
     """A video, or a folder of pictures."""
@@ -136,10 +136,8 @@ def video_to_room(
         lambda: perceive_into(pictures, config.models, finders),
     )
     _tell_what_is_missing(capture)
-    found = [capture / "objects.json", capture / "people.json", str(args.depth), str(args.meshes)]
-    asked = LayoutArgs(capture, args.depth, args.meshes)
-    steps.do(STEPS[1], found, capture / "scene.json", lambda: layout_into(asked))
     _bodies(source, capture, args, steps)
+    _first_scene(capture, args, steps)
     _room(capture, args)
 
 
@@ -175,12 +173,31 @@ def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
         say("warning: no keypoints were found, so there are no bodies")
         return
     given = [] if args.bodies == FIT or bodies.is_command else [Path(args.bodies)]
-    made_from = [keypoints, capture / "camera.json", args.bodies, args.bodies_tool, *given]
+    made_from = [keypoints, lens_in(capture), args.bodies, args.bodies_tool, *given]
 
     def work() -> None:
         make_bodies(bodies, source, capture, lambda: _fit(capture))
 
-    steps.do(STEPS[2], made_from, capture / "bodies.npz", work)
+    steps.do(STEPS[1], made_from, capture / "bodies.npz", work, yours=args.bodies == FIT)
+
+
+def _first_scene(capture: Path, args: ChainArgs, steps: Steps) -> None:
+    """scene.json, under the camera that the bodies tell."""
+    names = ("objects.json", "people.json", "bodies.npz")
+    made_from = [*(capture / name for name in names), lens_in(capture)]
+    made_from += [str(args.meshes), *([] if args.depth is None else [args.depth])]
+    asked = LayoutArgs(capture, args.depth, args.meshes)
+    made = capture / "scene.json"
+    steps.do(STEPS[2], made_from, made, lambda: layout_into(asked), yours=True)
+
+
+def lens_in(capture: Path) -> str:
+    """What camera.json says of the lens: the tilt beside it is found with the first scene."""
+    from mover.io.capture.camera_file import camera_of
+    from mover.io.files.cameras import read_camera_file
+
+    camera = camera_of(read_camera_file(capture / "camera.json", None))
+    return f"{camera.width} {camera.height} " + " ".join(f"{v:.6g}" for v in camera.K.flatten())
 
 
 def _fit(capture: Path) -> None:
