@@ -247,6 +247,25 @@ class Evidence:
 
 
 @record
+class Proposal:
+    """A support that no detector saw: people rest on it."""
+
+    object: SceneObject
+    """Of the library, where they rest; without an annotation."""
+    piece: str
+    """Its name in the library."""
+    style: int
+    seed: int
+    """Which design, and what drew its sizes."""
+    certainty: float
+    """From 0 to 1; a rule of thumb, not a calibrated chance."""
+    bodies: int
+    """How many bodies rest on it..."""
+    seconds: float
+    """... and for how long [s]."""
+
+
+@record
 class Room:
     """What `reconstruct` returns."""
 
@@ -270,3 +289,5 @@ class Room:
     warnings: tuple[str, ...]
     explanations: tuple[Explanation, ...] = ()
     """Why each object stands where it stands; empty: nobody asked."""
+    proposals: tuple[Proposal, ...] = ()
+    """What people rest on that is not in the scene; nothing else depends on them."""

@@ -14,12 +14,18 @@ from mover.core.types import Bodies, Camera, Capture, Evidence, Layout, Room, Sc
 from mover.energy.terms.feet import FootContacts
 from mover.evaluate.calibration import calibration_of
 from mover.evaluate.explanation import explain
+from mover.geometry.placement import place
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import Alignment
 from mover.stages.config import PlaceConfig
-from mover.stages.contacts.assign_contacts import ContactAssignment
+from mover.stages.contacts.assign_contacts import ContactAssignment, ContactInputs, find_contacts
 from mover.stages.contacts.gather_cues import Cues
+from mover.stages.contacts.propose_supports import (
+    KnownTops,
+    ProposeInputs,
+    propose_supports,
+)
 from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.explain.placements import ExplainInputs, explain_placements
 from mover.stages.objects.find_image_cues import ImageInputs, Seen
@@ -136,6 +142,40 @@ def explanations_of(
     asked = ExplainInputs(inputs, config, state.placed, bodies, pairs, tilt)
     found = context.run.stage(explain_placements, asked, context.config.explain)
     return explain(found.facts, calibration_of(config.form))
+
+
+def with_proposals(
+    room: Room,
+    capture: Capture,
+    config: Config,
+    run: Run,
+    people: PeopleState | None,
+    known: KnownTops,
+) -> Room:
+    """The room with what people rest on that is not in it."""
+    camera, ground = room.scene.camera, room.scene.ground
+    if people is None or ground is None or not config.propose.use:
+        return room
+    bodies = in_world(rows_of(people.bodies, people.kept), camera)
+    given = None if capture.touch is None else capture.touch[people.kept]
+    contacts = ContactInputs(bodies, people.parts, ground, given)
+    chance = run.stage(find_contacts, contacts, config.contacts).probability
+    inputs = ProposeInputs(bodies, people.parts, chance, ground, camera, known)
+    found = run.stage(propose_supports, inputs, config.propose).found
+    sentences = (
+        f"{one.object.id}: people rest for {one.seconds:.0f} s on nothing that is known; a"
+        f" {one.object.category} is proposed there (certainty {one.certainty:.2f})"
+        for one in found
+    )
+    return replace(room, proposals=found, warnings=(*room.warnings, *sentences))
+
+
+def tops_of(context: ReconstructionContext, state: SceneState) -> KnownTops:
+    """What of the placed room can carry people."""
+    objects = context.prepared.objects
+    rows = objects.has_top.nonzero()[:, 0]
+    tops = place(objects.top, state.placed.layout)[rows]
+    return KnownTops(tops, context.seen.masks[rows], objects.is_seat[rows], objects.ids)
 
 
 def _evidence(context: ReconstructionContext, state: SceneState) -> tuple[Evidence, ...]:

@@ -24,6 +24,7 @@ from mover.stages.config import (
     ImageConfig,
     PlaceConfig,
     PrepareConfig,
+    ProposeConfig,
     RefineConfig,
     ReinitConfig,
     SelectConfig,
@@ -69,6 +70,8 @@ class Config:
     """Stage 2: objects from the image and the people."""
     explain: ExplainConfig = field(default_factory=ExplainConfig)
     """What holds each object, and how well its place is known."""
+    propose: ProposeConfig = field(default_factory=ProposeConfig)
+    """Supports that no detector saw, where people rest on nothing that is known."""
     outer_iterations: Annotated[int, int_in(0, 100)] = 0
     """Further passes of stage 2 with assignment and occlusion order renewed."""
     slide_to_floor: bool = False

@@ -34,7 +34,9 @@ from mover.pipeline.outcome import (
     ReconstructionContext,
     SceneState,
     room_of,
+    tops_of,
     unfurnished,
+    with_proposals,
 )
 from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
@@ -46,6 +48,7 @@ from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
 from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import GatherInputs, cues_in_windows, gather_cues
+from mover.stages.contacts.propose_supports import NOTHING
 from mover.stages.objects.find_image_cues import (
     ImageInputs,
     detected_masks,
@@ -99,7 +102,8 @@ def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str
         raise InputError("cameras.npz: the camera moves, expected one that stands still")
     people = people_of(capture, config, run)
     if not capture.scene.objects:
-        return unfurnished(capture, people)
+        room = unfurnished(capture, people)
+        return with_proposals(room, capture, config, run, people, NOTHING)
     seen = image_evidence(capture)
     prepared = run.stage(prepare_objects, PrepareInputs(capture.scene.objects), config.prepare)
     context = ReconstructionContext(capture, config, run, seen, prepared, pinned)
@@ -118,7 +122,8 @@ def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str
     for _ in range(config.outer_iterations):
         state = assigned(context, people, with_order(context, state))
         state = placed_with_people(context, state, image_energy)
-    return room_of(context, state, people)
+    room = room_of(context, state, people)
+    return with_proposals(room, capture, config, run, people, tops_of(context, state))
 
 
 def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:

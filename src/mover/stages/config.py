@@ -320,3 +320,28 @@ class RefineBodiesConfig:
     """Rows on both sides that are moved along."""
     plant: bool = True
     """Whether soles at rest are put still at the end (where `weights.lock` is not 0)."""
+
+
+@dataclass(frozen=True)
+class ProposeConfig:
+    """When people who rest on nothing that is known propose a support."""
+
+    use: bool = True
+    """Look for supports that no detector saw."""
+    chance: Share = 0.5
+    """A vertex touches from here on."""
+    lowest: Metres = 0.12
+    """Rests nearer to the floor than this need no support [m]."""
+    reach: Metres = 0.25
+    """A known top carries what rests within this distance aside of it [m]."""
+    overlap: Share = 0.3
+    """A known seat carries what is seen before its mask by more than this share of its points..."""
+    farthest: Metres = 0.8
+    """... where it stands within this distance [m]."""
+    covered: Share = 0.5
+    """Where a larger share of the rests at one place is carried by what is known, nothing is
+    missing."""
+    speed: Annotated[float, float_in(0, 10)] = 0.3
+    """Soles slower than this stand [m/s]."""
+    seconds: Annotated[float, float_in(0, 3600)] = 1.5
+    """Shorter rests propose nothing [s]; an image without time counts as one."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from mover.bodies.skinning import open_body
 from mover.core.records import map_tensors
 from mover.core.types import Bodies, BodyPose, Camera, Capture, Mesh, Scene, SceneObject
-from mover.furniture.library import another
+from mover.furniture.library import SEATS, another
 from mover.furniture.pieces import Furniture
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
@@ -27,10 +27,17 @@ from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.foreign import foreign_mesh
 from mover_bench.rooms.known import KnownRoom, one_thread, rounded
 from mover_bench.rooms.mask_heads import headed, wobbling
-from mover_bench.rooms.noise_masks import leaking, noisy_detections, noisy_finds, noisy_people
+from mover_bench.rooms.noise_masks import (
+    leaking,
+    noisy_detections,
+    noisy_finds,
+    noisy_people,
+    without,
+)
 from mover_bench.rooms.poses import LEG
 from mover_bench.rooms.turns import from_vector, to_vector
 
+SEATS_FOR_ONE = ("chair", "armchair", "office chair", "stool")
 HOLE = 0.1  # share of the surface that is missing where a mesh has a hole
 
 
@@ -243,6 +250,22 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
         dataclasses.replace(capture, people=people), room.truth.ground, noise, [seed, 9]
     )
     return wrong_lens(capture, noise.lens, np.random.default_rng([seed, 13]))
+
+
+def without_seat(capture: Capture, room: KnownRoom) -> Capture:
+    """The capture without the seat that is sat on most: no detector saw it.
+
+    A seat for one, whose middle its sitter tells, goes before sofas, benches and beds.
+    """
+    sitting = torch.tensor([action in ("sit", "lean", "lie") for action in room.actions])
+    touched = room.touched[sitting]
+    used = [int((touched == k).any(1).sum()) for k in range(len(room.furniture))]
+    seats = [k for k, n in enumerate(used) if n and room.furniture[k].category in SEATS]
+    if not seats:
+        return capture
+    single = [k for k in seats if room.furniture[k].category in SEATS_FOR_ONE]
+    lost = room.truth.objects[max(single or seats, key=lambda k: used[k])]
+    return without(capture, {lost.annotation})
 
 
 def wrong_lens(capture: Capture, mean: float, rng: np.random.Generator) -> Capture:

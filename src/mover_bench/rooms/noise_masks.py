@@ -4,6 +4,7 @@ An initial scene has one object for each detection, so that the scene follows th
 """
 
 import dataclasses
+from collections.abc import Collection
 
 import numpy as np
 import torch
@@ -108,6 +109,7 @@ def leaked(mask: Bool[np.ndarray, "h w"], where: float) -> Bool[np.ndarray, "h w
 # An initial scene has one object for each detection, so that the scene follows the detections.
 
 
+KINDS = tuple(name for name in PIECES if name != "step")  # what a detector has a class for
 TOUCH = 2  # [px], masks that come nearer than this may run together
 
 
@@ -116,7 +118,7 @@ def noisy_finds(capture: Capture, floor: float, noise: NoiseConfig, seed: list[i
     rngs = [np.random.default_rng([*seed, k]) for k in range(4)]
     capture = _merged(capture, noise.merged, rngs[0])
     lost = [d.id for d in capture.detections if float(rngs[1].uniform()) < noise.missed]
-    capture = _without(capture, set(lost))
+    capture = without(capture, set(lost))
     capture = _renamed(capture, noise.wrong_class, rngs[2])
     count = int(rngs[3].binomial(len(capture.detections), noise.false))
     for index in range(count):
@@ -124,7 +126,8 @@ def noisy_finds(capture: Capture, floor: float, noise: NoiseConfig, seed: list[i
     return capture
 
 
-def _without(capture: Capture, lost: set[int]) -> Capture:
+def without(capture: Capture, lost: Collection[int | None]) -> Capture:
+    """The capture without what some detections show: neither they nor their objects."""
     pieces = tuple(p for p in capture.scene.objects if p.annotation not in lost)
     return dataclasses.replace(
         capture,
@@ -150,7 +153,7 @@ def _merged(capture: Capture, share: float, rng: np.random.Generator) -> Capture
         found[one.id] = dataclasses.replace(one, mask=encode([mask]), box=box_of_mask(mask))
         gone.add(other)
     capture = dataclasses.replace(capture, detections=tuple(found.values()))
-    return _without(capture, gone)
+    return without(capture, gone)
 
 
 def _touch(a: Detection, b: Detection) -> bool:
@@ -175,7 +178,7 @@ def _renamed(capture: Capture, share: float, rng: np.random.Generator) -> Captur
     names = {d.id: d.category for d in capture.detections}
     pieces: list[SceneObject] = []
     for piece in capture.scene.objects:
-        others = [n for n in PIECES if canonical(n) != canonical(piece.category)]
+        others = [n for n in KINDS if canonical(n) != canonical(piece.category)]
         name = others[int(rng.integers(len(others)))]
         new = make_piece(name, rng)
         if float(rng.uniform()) < share and piece.annotation is not None:
@@ -193,7 +196,7 @@ def _with_false(capture: Capture, what: tuple[int, float], rng: np.random.Genera
     """One more object that is not there: a patch of the image, and a piece that it shows."""
     index, floor = what
     camera = capture.scene.camera
-    new = make_piece(list(PIECES)[int(rng.integers(len(PIECES)))], rng)
+    new = make_piece(KINDS[int(rng.integers(len(KINDS)))], rng)
     z = float(rng.uniform(-5.0, -2.8))
     place = torch.tensor([float(rng.uniform(0.4 * z, -0.4 * z)), floor, z])
     yaw = torch.tensor(float(rng.uniform(-np.pi, np.pi)))

@@ -29,7 +29,7 @@ from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.known import KnownRoom
-from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.noise import add_noise, without_seat
 from mover_bench.rooms.room import make_room
 from mover_bench.studies.measures import (
     Trial,
@@ -120,6 +120,8 @@ def noisy_room(seed: int, rooms: RoomSet, run: Run | None = None) -> Trial:
 def spoilt(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
     """A known room with the noise of a set."""
     capture = add_noise(room, rooms.noise, seed)
+    if rooms.withheld:
+        capture = without_seat(capture, room)
     if "camera" in rooms.exact:
         assert room.truth.ground is not None, "a known room has a floor"
         capture = replace(capture, camera_height=-room.truth.ground)
@@ -165,8 +167,8 @@ def key_of(job: Job) -> str:
     settings = VARIANTS.get(job.name)  # a room has none
     rooms = set_named(job.rooms)
     return records.fingerprint(
-        rooms.room, rooms.noise, rooms.exact, rooms.version, job.seed, job.name, settings,
-        sources("mover_bench"),
+        rooms.room, rooms.noise, rooms.exact, rooms.withheld, rooms.version, job.seed, job.name,
+        settings, sources("mover_bench"),
     )  # fmt: skip
 
 

@@ -18,7 +18,10 @@ from mover.evaluate.contact import TrueTouch
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate, touch_in_truth
 from mover.evaluate.scene import measure as measured
 from mover.evaluate.scene import unmatched
+from mover.furniture.library import SEATS, canonical
+from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera
+from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 from mover.geometry.rotations import wrap
@@ -26,6 +29,7 @@ from mover.geometry.watertight import close_mesh
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.outcome import to_world
 from mover.stages.config import RefineBodiesConfig
+from mover.stages.objects.prepare_objects import find_regions
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
 from mover_bench.rooms.known import KnownRoom
 
@@ -137,6 +141,8 @@ def _depth(
 
 GIVEN, TRUE_GIVEN, TRUE_ROOM = "given", "true given", "true room"
 TRAITS = ("id", "category", "touched", "hidden", "truncated", "flipped", "stays")
+NEAR = 0.6  # [m] from the middle of a seat, at most, of its proposal
+SURFACE = 4000  # points that tell the height of a seat
 PROX = "+CamGP+SDF+Contact"  # what refines bodies in the true room
 
 
@@ -219,8 +225,43 @@ def measure(
         **{name: verdict["result"] for name, verdict in found.items()},
         "objects": objects,
         "unmatched": unmatched(capture.scene, room.scene, trial.truth, by_place=False),
+        "proposed": measure_proposals(trial, room),
         "warnings": list(room.warnings),
     }
+
+
+def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:
+    """How the seats that were not given, and are used, are proposed, and what else is.
+
+    A proposal is that of the nearest such seat within `NEAR`; others are false.
+    """
+    given = {piece.id for piece in trial.capture.scene.objects}
+    turn = trial.truth.camera.R_cam_world.mT @ room.scene.camera.R_cam_world
+    places = [turn @ box_of(one.object).center for one in room.proposals]
+    claimed: set[int] = set()
+    rows: list[dict[str, Any]] = []
+    for seat, traits in zip(trial.truth.objects, trial.traits, strict=True):
+        if seat.id in given or not traits.touched or canonical(seat.category) not in SEATS:
+            continue
+        away = [float((at - box_of(seat).center)[[0, 2]].norm()) for at in places]
+        near = [k for k, gap in enumerate(away) if gap < NEAR]
+        row = {"id": seat.id, "category": seat.category, "found": bool(near)}
+        if near:
+            best = min(near, key=lambda k: away[k])
+            height = seat_height(room.proposals[best].object) - seat_height(seat)
+            row |= {"centre": away[best], "height": height}
+        claimed.update(near)
+        rows.append(row)
+    return {"withheld": rows, "false": len(places) - len(claimed)}
+
+
+def seat_height(piece: SceneObject) -> float:
+    """Of the surface that carries, over the piece's foot [m]."""
+    mesh = place_object(piece)
+    points, normals = sample_surface(mesh, SURFACE)
+    points = points - torch.tensor([0.0, float(mesh.verts[:, 1].min()), 0.0])
+    top = find_regions(points, normals, canonical(piece.category), "level").top
+    return float(top[:, 1].median())
 
 
 def measure_true_room(

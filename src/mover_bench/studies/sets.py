@@ -30,6 +30,8 @@ class RoomSet:
     """Counts up whenever a room of the set changes."""
     exact: tuple[str, ...] = ()
     """What is given as it truly is, of `EXACT`."""
+    withheld: bool = False
+    """No detector saw the seat that is used most: see `rooms.noise.without_seat`."""
 
 
 _SMALL = RoomConfig(
@@ -136,6 +138,10 @@ SETS: dict[str, RoomSet] = {
         "A minute in which a person uses many pieces, some of them repeatedly, each for a short"
         " time.",
         "1000-1009", "100-103", _LONG,
+    ),
+    "withheld-seat": RoomSet(
+        "The rooms of `rooms`; the seat that is used most is not in what is given.",
+        "1000-1029", "100-129", withheld=True,
     ),
 }  # fmt: skip
 """All sets by name."""

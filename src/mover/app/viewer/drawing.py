@@ -3,7 +3,7 @@
 import math
 import threading
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ class Drawing:
     """Furniture as it is, by id."""
     before: dict[str, Any] = field(default_factory=lambda: {})
     """Furniture as it was given."""
+    proposed: dict[str, Any] = field(default_factory=lambda: {})
+    """Supports that no detector saw."""
     fixed: dict[str, Any] = field(default_factory=lambda: {})
     """Floor and camera."""
     layers: dict[str, list[Any]] = field(default_factory=lambda: {})
@@ -41,9 +43,9 @@ class Drawing:
 LAYERS = ("near", "far", "free space", "contacts", "doubt", "place")
 
 
-def draw_room(drawing: Drawing, scene: Scene, kind: str) -> None:
-    """Draw the furniture of a scene as `after` or `before`; what is there already only moves."""
-    handles = drawing.after if kind == "after" else drawing.before
+def draw_room(drawing: Drawing, scene: Scene, kind: Literal["after", "before", "proposed"]) -> None:
+    """Draw furniture as `after`, `before` or, faintly, `proposed`; what is there only moves."""
+    handles: dict[str, Any] = getattr(drawing, kind)
     gone = set(handles) - {piece.id for piece in scene.objects}
     for name in gone:
         handles.pop(name).remove()
@@ -51,6 +53,8 @@ def draw_room(drawing: Drawing, scene: Scene, kind: str) -> None:
         tint = drawing.colours.setdefault(piece.id, colour(len(drawing.colours)))
         if piece.id not in handles:
             handles[piece.id] = _mesh(drawing.server, f"/{kind}/{piece.id}", piece.mesh, tint)
+            if kind == "proposed":
+                handles[piece.id].opacity = GHOST
         move_object(handles[piece.id], piece)
 
 

@@ -16,7 +16,7 @@ from mover.app.report.scene_view import EYE_HEIGHT
 from mover.app.results import initial_bodies
 from mover.app.viewer.layers import Layers, read_layers
 from mover.core.errors import InputError
-from mover.core.types import Bodies, Capture, Scene, SceneObject
+from mover.core.types import Bodies, Capture, Proposal, Scene, SceneObject
 from mover.geometry.camera import pitch_roll
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.edits import (
@@ -34,7 +34,7 @@ from mover.io.capture.edits import (
     read_edits,
     write_edits,
 )
-from mover.io.capture.scene_file import read_scene
+from mover.io.capture.scene_file import PROPOSED, read_proposals, read_scene
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,8 @@ class Shown:
     """What run.json holds."""
     metrics: Mapping[str, Any] = field(default_factory=lambda: {})
     """What metrics.json holds."""
+    proposals: tuple[Proposal, ...] = ()
+    """Supports that no detector saw."""
 
     @property
     def edits_inside(self) -> int:
@@ -81,6 +83,7 @@ def read_shown(out: Path, capture: Capture | None = None) -> Shown:
         layers=read_layers(out, log, result),
         log=log,
         metrics=_json(out / "metrics.json"),
+        proposals=read_proposals(out / PROPOSED),
     )
 
 
@@ -131,6 +134,8 @@ class Session:
     done: int = 0
     """So many of the edits are inside of `shown.result`."""
     selected: str | None = None
+    dismissed: frozenset[str] = frozenset()
+    """Ids of proposals that the user does not want to see again in this session."""
     listeners: list[Callable[[], None]] = field(default_factory=lambda: [])
     lock: threading.RLock = field(default_factory=threading.RLock)
 
@@ -143,6 +148,25 @@ class Session:
     def pinned(self) -> tuple[str, ...]:
         """The objects that will not move."""
         return pinned_ids(self.scene, self.edits)
+
+    @property
+    def proposals(self) -> tuple[Proposal, ...]:
+        """Supports that the user has neither accepted nor dismissed."""
+        gone = self.dismissed | {piece.id for piece in self.scene.objects}
+        return tuple(one for one in self.shown.proposals if one.object.id not in gone)
+
+    def accept(self, name: str) -> None:
+        """Make a proposed support an object of the room."""
+        for one in self.proposals:
+            if one.object.id == name:
+                at = placement_of(one.object, self.shown.result)
+                self.record(Add(name, one.piece, one.style, one.seed, None, at))
+                self.select(name)
+
+    def dismiss(self, name: str) -> None:
+        """Show a proposed support no longer."""
+        self.dismissed = self.dismissed | {name}
+        self.changed()
 
     def piece(self, name: str | None) -> SceneObject | None:
         """An object of the room by its id."""

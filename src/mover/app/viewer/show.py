@@ -21,6 +21,7 @@ from mover.app.viewer.address import Address
 from mover.app.viewer.drawing import Drawing, People, draw_room
 from mover.app.viewer.gate import gate_at, guarded
 from mover.app.viewer.panels import add_object_panel, add_room_panel
+from mover.app.viewer.proposals import add_proposals
 from mover.app.viewer.session import (
     Session,
     Shown,
@@ -255,6 +256,7 @@ def open_viewer(
         add_room_panel(window)
     with tabs.add_tab("Object"):
         add_object_panel(window)
+        add_proposals(window)
     with tabs.add_tab("Solve"):
         gauges = add_solve_panel(window, job, why_not)
     host = socket.gethostname() if server.get_host() == "0.0.0.0" else server.get_host()

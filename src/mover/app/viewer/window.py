@@ -172,6 +172,8 @@ def redraw(window: Window) -> None:
     """Draw the room as the session has it."""
     drawing, session = window.drawing, window.session
     draw_room(drawing, session.scene, "after")
+    proposed = tuple(one.object for one in session.proposals)
+    draw_room(drawing, replace(session.scene, objects=proposed), "proposed")
     bind_clicks(window.grips)
     if not window.watching:
         hold_selected(window.grips)

@@ -1,0 +1,196 @@
+"""Supports that no detector saw are found where people rest on nothing, and nowhere else."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from figures import ARMS_DOWN, SEATED, STRIDE, moving, people, pose, turned
+from little_room import GROUND, camera, room
+
+from mover.app.viewer.session import Shown, start_session
+from mover.bodies.parts import members, parts_of
+from mover.bodies.posture import touching
+from mover.core.errors import InputError
+from mover.core.types import Bodies, Proposal, Room
+from mover.furniture.library import make_piece
+from mover.geometry.boxes import box_of
+from mover.geometry.placement import place_object
+from mover.geometry.rotations import rot_y
+from mover.io.capture.scene_file import read_proposals, read_scene, write_proposals
+from mover.stages.config import ProposeConfig
+from mover.stages.contacts.propose_supports import (
+    NOTHING,
+    KnownTops,
+    ProposeInputs,
+    propose_supports,
+)
+
+COUNT = 12  # frames: 2.4 s
+LYING = turned(pose(ARMS_DOWN, COUNT), -torch.pi / 2, 0.0, 0.0)
+TURN = 0.7  # [rad]
+
+
+def somewhere(bodies: Bodies, yaw: float = TURN, lift: float = 0.0) -> Bodies:
+    """The same people, turned about up and 3 m before the camera, on a floor 1.5 m below it."""
+    there = torch.tensor([0.4, GROUND + lift, -3.0])
+    return replace(bodies, verts=bodies.verts @ rot_y(torch.tensor(yaw)).mT + there)
+
+
+def proposed(bodies: Bodies, known: KnownTops = NOTHING) -> tuple[Proposal, ...]:
+    parts = parts_of(bodies)
+    chance = touching(bodies, parts, GROUND)
+    inputs = ProposeInputs(bodies, parts, chance, GROUND, camera(), known)
+    return propose_supports(inputs, ProposeConfig()).found
+
+
+def sitters(count: int = COUNT) -> Bodies:
+    return somewhere(people(pose(SEATED, count), fps=5.0))
+
+
+def seat_of(bodies: Bodies) -> torch.Tensor:
+    """Middle and height of what the sitters touch [m]."""
+    parts = parts_of(bodies)
+    part = members(parts, "seat", "left_thigh", "right_thigh")
+    sure = (touching(bodies, parts, GROUND)[0] > 0.5) & part
+    points = bodies.verts[0, sure]
+    middle = points.mean(0)
+    middle[1] = points[:, 1].quantile(0.2)
+    return middle
+
+
+def top(x: float, y: float, z: float) -> torch.Tensor:
+    spots = torch.cartesian_prod(torch.linspace(-0.2, 0.2, 5), torch.linspace(-0.2, 0.2, 5))
+    return torch.stack([spots[:, 0] + x, torch.full((25,), y), spots[:, 1] + z], -1)[None]
+
+
+def tops_at(points: torch.Tensor, *, seat: bool = True, seen: bool = False) -> KnownTops:
+    masks = torch.full((1, 360, 640), seen)
+    return KnownTops(points, masks, torch.tensor([seat]), ("chair_0",))
+
+
+def test_a_sitter_on_nothing_proposes_a_seat_below_as_high_as_what_touches():
+    bodies = sitters()
+    (found,) = proposed(bodies)
+    piece = make_piece(found.piece, np.random.default_rng(found.seed), 0)
+    middle = seat_of(bodies)
+    assert found.object.category == "stool"
+    assert found.object.id == "proposed_stool_0"
+    height = piece.seat_height * float(found.object.scale[1])
+    assert height == pytest.approx(float(middle[1]) - GROUND, abs=0.01)
+    front = torch.stack([found.object.yaw.sin(), torch.zeros(()), found.object.yaw.cos()])
+    away = found.object.t_world_object - (middle - 0.1 * front)
+    assert away[[0, 2]].abs().max() < 0.01
+    assert float(place_object(found.object).verts[:, 1].min()) == pytest.approx(GROUND, abs=1e-5)
+    assert float(found.object.yaw) == pytest.approx(TURN, abs=0.05)
+    assert (found.bodies, found.seconds) == (COUNT, pytest.approx(COUNT / 5))
+    assert 0.6 < found.certainty < 1
+
+
+def test_who_leans_back_has_a_chair_and_who_lies_a_bed_with_the_feet_to_its_front():
+    back = {**SEATED, "left_hip": (-1.2, 0, 0), "right_hip": (-1.2, 0, 0)}
+    leaning = turned(pose(back, COUNT), -0.35, 0.0, 0.0)
+    (chair,) = proposed(somewhere(people(leaning, fps=5.0)))
+    assert chair.object.category == "chair"
+    lying = somewhere(people(LYING, fps=5.0, floor=0.45))
+    (bed,) = proposed(lying)
+    assert bed.object.category == "bed"
+    flat = (lying.verts[0] - bed.object.t_world_object) @ rot_y(bed.object.yaw)
+    soles = members(parts_of(lying), "left_sole", "right_sole")
+    assert flat[soles, 2].mean() > 0.5
+    assert flat[:, [0, 2]].abs().amax(0)[1] < box_of(bed.object).size[2] / 2 + 0.1
+
+
+def test_feet_that_stand_above_the_floor_propose_a_step_of_that_height():
+    (step,) = proposed(somewhere(people(pose(ARMS_DOWN, COUNT), fps=5.0), lift=0.25))
+    assert step.object.category == "step"
+    assert float(box_of(step.object).size[1]) == pytest.approx(0.25, abs=0.03)
+    soles = people(pose(ARMS_DOWN)).verts[0]
+    assert float(soles[:, 1].min()) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "bodies",
+    [
+        somewhere(people(pose(ARMS_DOWN, COUNT), fps=5.0)),
+        somewhere(moving(people(pose(STRIDE, COUNT), fps=5.0), 0.0, 0.0, 0.2)),
+        somewhere(people(LYING, fps=5.0)),
+        sitters(count=4),
+    ],
+    ids=["stands", "walks", "lies on the floor", "hardly sits"],
+)
+def test_nothing_is_proposed_for_who(bodies: Bodies):
+    assert proposed(bodies) == ()
+
+
+def test_a_known_seat_below_or_one_that_is_seen_there_and_near_needs_no_proposal():
+    bodies = sitters()
+    x, y, z = seat_of(bodies).tolist()
+    assert proposed(bodies, tops_at(top(x, y, z))) == ()
+    assert proposed(bodies, tops_at(top(x, y, z), seat=False)) == ()
+    assert proposed(bodies, tops_at(top(x, y, z - 0.8), seen=True)) == ()
+    assert len(proposed(bodies, tops_at(top(x, y, z - 0.8)))) == 1
+    assert len(proposed(bodies, tops_at(top(x, y, z - 0.8), seat=False, seen=True))) == 1
+    assert len(proposed(bodies, tops_at(top(x, y, z - 1.6), seen=True))) == 1
+    assert len(proposed(bodies, tops_at(top(x, y + 0.35, z), seat=False))) == 1
+
+
+def test_two_people_on_two_seats_propose_two_and_two_visits_one():
+    one = sitters()
+    aside = replace(one, verts=one.verts + torch.tensor([1.2, 0.0, 0.0]), person=one.person + 1)
+    both = replace(
+        one, verts=torch.cat([one.verts, aside.verts]), frame=torch.cat([one.frame, aside.frame]),
+        person=torch.cat([one.person, aside.person]), pose=None,
+    )  # fmt: skip
+    assert [p.object.id for p in proposed(both)] == ["proposed_stool_0", "proposed_stool_1"]
+    again = replace(both, verts=torch.cat([one.verts, one.verts]), frame=torch.arange(2 * COUNT))
+    (found,) = proposed(replace(again, person=torch.zeros(2 * COUNT, dtype=torch.long)))
+    assert found.bodies == 2 * COUNT
+
+
+def result(found: tuple[Proposal, ...]) -> Room:
+    scene = room()
+    return Room(
+        scene=scene, initial=scene, image_only=scene, bodies=None, kept=None, proxies=(),
+        evidence=(), covariance=None, traces={}, warnings=(), proposals=found,
+    )  # fmt: skip
+
+
+def test_proposals_are_a_file_of_their_own_that_is_read_again_and_goes_with_them(tmp_path: Path):
+    found, path = proposed(sitters()), tmp_path / "proposed.json"
+    write_proposals(result(found), path)
+    (same,) = read_proposals(path)
+    assert box_of(same.object).center.tolist() == pytest.approx(
+        box_of(found[0].object).center.tolist(), abs=1e-4
+    )
+    for key in ("piece", "style", "seed", "certainty", "bodies", "seconds"):
+        assert getattr(same, key) == pytest.approx(getattr(found[0], key))
+    assert [p.id for p in read_scene(path).objects] == ["proposed_stool_0"]
+    tree = json.loads(path.read_text())
+    tree["objects"][0]["certainty"] = 2
+    path.write_text(json.dumps(tree))
+    with pytest.raises(InputError, match=r"certainty.* has 2, expected"):
+        read_proposals(path)
+    write_proposals(result(()), path)
+    assert not path.exists()
+    assert read_proposals(path) == ()
+
+
+def test_an_accepted_proposal_is_an_object_where_it_was_proposed_and_a_dismissed_one_is_gone():
+    found = proposed(sitters())
+    session = start_session(Shown("x", room(), room(), None, None, proposals=found), None, None)
+    assert len(session.proposals) == 1
+    session.accept("proposed_stool_0")
+    assert session.proposals == ()
+    piece = session.piece("proposed_stool_0")
+    assert piece is not None
+    for key in ("center", "size"):
+        ours, theirs = (getattr(box_of(p), key) for p in (piece, found[0].object))
+        assert torch.allclose(ours, theirs, atol=1e-4)
+    session.undo()
+    assert len(session.proposals) == 1
+    session.dismiss("proposed_stool_0")
+    assert session.proposals == ()
+    assert len(session.scene.objects) == 3
