@@ -22,6 +22,7 @@ SELF_CONTAINED = {
     "contact",
     "foot_skate",
     "float_height",
+    "jerk",
 }  # they judge an estimate by itself
 
 

@@ -105,7 +105,8 @@ def test_what_lacks_its_truth_is_absent() -> None:
     metrics = evaluate(scene, scene, blind, EvaluatedBodies(None, bodies, None), FAST)
     assert set(metrics["initial"]) == {"pitch_error", "roll_error"}
     alone = {"non_collision", "contact", "penetration_depth"}
-    floor = {"ground_penetration_frequency", "ground_penetration_distance", "float_height"}
+    floor = {"ground_penetration_frequency", "ground_penetration_distance", "float_height",
+             "sink_depth"}  # fmt: skip
     assert set(metrics["result"]) == {"pitch_error", "roll_error", "foot_skate"} | alone | floor
     assert metrics["objects"] == []
     metrics = evaluate(blind, blind, blind, EvaluatedBodies(bare, bodies, bodies), FAST)

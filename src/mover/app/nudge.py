@@ -8,6 +8,7 @@ all that stood before stay there.
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -54,11 +55,16 @@ class Nudge:
 
 def ranges_of(file: Path) -> Ranges:
     """What scene.json states of its objects."""
+    return ranges_in({item["id"]: item for item in read_json(file).value["objects"]})
+
+
+def ranges_in(fields: Mapping[str, Mapping[str, Any]]) -> Ranges:
+    """What is stated of objects: their fields of scene.json by id."""
     found: Ranges = {}
-    for item in read_json(file).value["objects"]:
+    for name, item in fields.items():
         stated = item.get("uncertainty") or {}
         rows = stated.get("ranges") or {}
-        found[item["id"]] = {k: (float(rows[k][0]), float(rows[k][1])) for k in KEYS if k in rows}
+        found[name] = {k: (float(rows[k][0]), float(rows[k][1])) for k in KEYS if k in rows}
     return found
 
 

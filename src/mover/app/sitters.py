@@ -42,9 +42,11 @@ def loads_of(out: Path, scene: Scene, fps: float | None) -> tuple[Load, ...]:
         scene: Its scene, in which the contacts lie.
         fps: Frames a second.
     """
-    if not (out / FILE).is_file():
-        return ()
-    labels = read_labels(out / FILE)
+    return loads_in(read_labels(out / FILE), scene, fps) if (out / FILE).is_file() else ()
+
+
+def loads_in(labels: ContactLabels, scene: Scene, fps: float | None) -> tuple[Load, ...]:
+    """The weights of all bouts of sitting that the labels of a scene tell."""
     names = torch.tensor([name in BEARING for name in labels.parts])
     bears = names[labels.part] & (labels.confidence >= SURE)
     found: list[Load] = []

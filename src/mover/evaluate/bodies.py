@@ -172,6 +172,10 @@ class Gait:
 
     soles: Float[Tensor, "bodies feet 3"] | None
     """Lowest place of each sole [m]; None: no video or no soles."""
+    lowest: Float[Tensor, " bodies"]
+    """Height of each body's lowest vertex [m]."""
+    skeleton: Float[Tensor, "bodies own 3"] | None
+    """All joints of the bodies themselves [m]."""
     ground: float | None
     """Height of the floor [m]."""
     near: Neighbours
@@ -203,6 +207,26 @@ def float_height(gait: Gait) -> float | None:
     return float((gait.soles[..., 1].amin(1) - gait.ground).clamp_min(0).mean())
 
 
+def sink_depth(gait: Gait) -> float | None:
+    """Mean depth of the body's lowest vertex under the floor [m]; 0 where all of it is above."""
+    if gait.ground is None:
+        return None
+    return float((gait.ground - gait.lowest).clamp_min(0).mean())
+
+
+def jerk(gait: Gait) -> float | None:
+    """Mean change of the joints' accelerations [m/s³], from four frames that follow each other."""
+    if gait.skeleton is None or not len(gait.near.triples):
+        return None
+    triples, steps = gait.near.triples, gait.near.steps.to(gait.skeleton)
+    ahead = (triples[:-1, 1:] == triples[1:, :2]).all(-1)
+    if not bool(ahead.any()):
+        return None
+    change = _accelerations(gait.skeleton, gait.near).diff(dim=0)[ahead]
+    apart = (steps[:-1].sum(-1) + steps[1:, 1])[ahead] / 3  # of the two moments
+    return float((change / apart[:, None, None]).norm(dim=-1).mean())
+
+
 def acceleration_error(gait: Gait) -> float | None:
     """Mean difference of the joints' accelerations [m/s²]."""
     if gait.joints is None or gait.true_joints is None or not len(gait.twins.triples):
@@ -214,21 +238,23 @@ def acceleration_error(gait: Gait) -> float | None:
 MOTION_METRICS: dict[str, Metric[Gait]] = {
     "foot_skate": Metric("m/s", 0.0, foot_skate),
     "float_height": Metric("m", 0.0, float_height),
+    "sink_depth": Metric("m", 0.0, sink_depth),
+    "jerk": Metric("m/s³", 0.0, jerk),
     "acceleration_error": Metric("m/s²", 0.0, acceleration_error),
 }
 
 
 def gather_gait(bodies: Bodies, truth: Bodies | None, ground: float | None) -> Gait:
     """Feet and joints of bodies in the world, and of the true ones where they are known."""
-    soles = _soles(bodies)
+    soles, lowest = _soles(bodies), bodies.verts[..., 1].amin(1)
     near = gather_neighbours(bodies.frame, bodies.person, bodies.fps)
     none = gather_neighbours(bodies.frame[:0], bodies.person[:0], bodies.fps)
     twins = None if truth is None else gather_twins(bodies, truth)
     if truth is None or twins is None or twins.joints is None:
-        return Gait(soles, ground, near, None, None, none)
+        return Gait(soles, lowest, bodies.joints, ground, near, None, None, none)
     rows, _ = shared_rows(bodies, truth)
     both = gather_neighbours(bodies.frame[rows], bodies.person[rows], bodies.fps)
-    return Gait(soles, ground, near, twins.joints, twins.true_joints, both)
+    return Gait(soles, lowest, bodies.joints, ground, near, twins.joints, twins.true_joints, both)
 
 
 def _soles(bodies: Bodies) -> Tensor | None:

@@ -36,6 +36,7 @@ from mover.evaluate.contact import (
     furniture_of,
     gather_touch,
     gather_truth,
+    penetration_depth,
 )
 from mover.evaluate.scene import (
     CAMERA_METRICS,
@@ -210,6 +211,25 @@ def table(metrics: Mapping[str, Any]) -> str:
     for name, ids in metrics.get("unmatched", {}).items():
         lines += [f"{name}: {', '.join(ids)}"] if ids else []
     return "\n".join(lines)
+
+
+def evaluate_people(
+    bodies: Bodies, ground: float | None, furniture: Sequence[Mesh], truth: Bodies | None = None
+) -> dict[str, float]:
+    """How people move, how deep they are in floor and furniture, how far they are from the truth.
+
+    Args:
+        bodies: People in the world of their room.
+        ground: Height of its floor [m]; None: not known.
+        furniture: Its closed objects where they stand.
+        truth: The true people in the world of the true room; None: not known.
+    """
+    config = EvaluateConfig()
+    values = measure(MOTION_METRICS, gather_gait(bodies, truth, ground))
+    near = gather_touch(bodies, furniture, None, config.bodies, config.reach)
+    values["penetration_depth"] = penetration_depth(near)
+    twins = None if truth is None else gather_twins(bodies, truth)
+    return values | ({} if twins is None else measure(POSE_METRICS, twins))
 
 
 def _cell(values: Mapping[str, float], name: str) -> str:

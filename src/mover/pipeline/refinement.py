@@ -15,9 +15,9 @@ from mover.bodies.posa import load_posa, posa_contacts
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, silent
-from mover.core.types import Bodies, Capture, Mesh, Room, Scene
-from mover.evaluate.bodies import MOTION_METRICS, POSE_METRICS, gather_gait, gather_twins
-from mover.evaluate.scene import measure
+from mover.core.types import Bodies, Capture, Mesh, Room
+from mover.evaluate.evaluation import evaluate_people
+from mover.geometry.placement import place_object
 from mover.io.capture.bodies_file import read_bodies, read_contacts, write_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import read_scene
@@ -89,32 +89,36 @@ def refined_room(room: Room, capture: Capture, observe: Observer = silent) -> Ro
     return replace(room, bodies=found.bodies)
 
 
-def measure_people(out: Path, truth: Path) -> dict[str, dict[str, float]]:
-    """The people of a result before and after their refinement against the true ones.
+def measure_people(out: Path, truth: Path | None = None) -> dict[str, dict[str, float]]:
+    """How the people of a result move before and after their refinement.
 
     Writes OUT/refined/metrics.json.
+
+    Args:
+        out: Folder of the result.
+        truth: Folder of the true scene and people, to tell their errors as well.
 
     Raises:
         InputError: If a file is missing or wrong.
     """
-    own = truth / "camera.json"
-    camera = camera_of(read_json(own)) if own.exists() else None
-    scene = read_scene(truth / "scene.json", camera)
-    true = to_refined_world(read_bodies(truth / "bodies.npz"), scene)
-    ground = read_scene(out / "scene.json").ground
-    values: dict[str, dict[str, float]] = {}
-    for name, path in (("result", out / "bodies.npz"), ("refined", out / "refined" / "bodies.npz")):
-        bodies = read_bodies(path)
-        twins = gather_twins(bodies, true)
-        values[name] = {} if twins is None else measure(POSE_METRICS, twins)
-        values[name] |= measure(MOTION_METRICS, gather_gait(bodies, true, ground))
+    room, true = finished_room(out), None if truth is None else _true_people(truth)
+    pieces = zip(room.scene.objects, room.proxies, strict=True)
+    solid = [place_object(replace(piece, mesh=proxy)) for piece, proxy in pieces]
+    files = {"result": out / "bodies.npz", "refined": out / "refined" / "bodies.npz"}
+    values = {
+        name: evaluate_people(read_bodies(file), room.scene.ground, solid, true)
+        for name, file in files.items()
+    }
     with replacing(out / "refined" / "metrics.json") as part:
         part.write_text(json.dumps(values, indent=1, allow_nan=False))
     return values
 
 
-def to_refined_world(bodies: Bodies, scene: Scene) -> Bodies:
-    """Bodies in the world of a scene."""
+def _true_people(truth: Path) -> Bodies:
+    """The people of a truth, in its world."""
+    own = truth / "camera.json"
+    scene = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
+    bodies = read_bodies(truth / "bodies.npz")
     return bodies if bodies.space == "world" else to_world(bodies, scene.camera)
 
 

@@ -32,7 +32,8 @@ class StudyArgs:
     """Make one of the paper's experiments on known rooms, or all; goes on where it stopped."""
 
     name: Annotated[Positional[str], arg(metavar="STUDY")]
-    """ablation, camera, bodies, video-length, interactions, time, sensitivity, paper, sets, all."""
+    """ablation, camera, bodies, video-length, interactions, time, sensitivity, paper, sets,
+    stability, motion, upstream, all."""
     set: str = ""
     """Which rooms; empty: those that the study is meant for."""
     seeds: str = ""

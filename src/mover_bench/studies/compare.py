@@ -53,6 +53,16 @@ COLUMNS: dict[str, Column] = {
     "v2v": Column("V2V", -1, "mm", 1000, 1),
     "p_pje": Column("p.PJE", -1, "mm", 1000, 1),
     "p_v2v": Column("p.V2V", -1, "mm", 1000, 1),
+    "foot_skate": Column("skate", -1, "cm/s", 100, 1),
+    "float_height": Column("float", -1, "mm", 1000, 1),
+    "sink_depth": Column("sink", -1, "mm", 1000, 1),
+    "penetration_depth": Column("in furniture", -1, "mm", 1000, 1),
+    "jerk": Column("jerk", -1, "m/s³", 1, 1),
+    "acceleration_error": Column("acceleration", -1, "m/s²", 1, 2),
+    "stands": Column("stays", 1, "%", 100, 1),
+    "moved": Column("moved", -1, "mm", 1000, 1),
+    "turned": Column("turned", -1, "°", DEGREES, 2),
+    "toppled": Column("fell over", -1, "%", 100, 1),
 }
 ARROWS = {1: " ↑", -1: " ↓", 0: ""}
 

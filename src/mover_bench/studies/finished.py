@@ -14,7 +14,7 @@ TURNED = math.radians(45)  # [rad], a yaw error from which on an object is turne
 SEATS = ("chair", "armchair", "office chair", "sofa", "couch")  # pieces with a front and a back
 PLACING = ("place_objects", "find_image_cues", "refine_camera")  # stages that optimise
 TRAITS = ("category", "touched", "hidden", "truncated", "flipped", "stays")
-MEASURED = (*STAGES, "true_room", "truth")  # scenes of a job that have metrics
+MEASURED = (*STAGES, "nudged", "true_room", "truth")  # scenes of a job that have metrics
 SPENT = ("optimisation", "everything else")  # [s] of all stages
 LENGTH = ("frames", "seconds", "interactions")  # of what a job was given
 
@@ -60,7 +60,8 @@ def read_finished(jobs: Iterable[Job]) -> Finished:
     empty = [*keys, "version", "false", *SPENT, *LENGTH, "iou3d"]
     frame = DataFrame(scenes, columns=None if scenes else empty)
     things = DataFrame(objects, columns=None if objects else [*keys, "object", *TRAITS, "iou3d"])
-    for name, used in (("iou3d_touched", True), ("iou3d_untouched", False)):
+    halves = (("iou3d_touched", True), ("iou3d_untouched", False)) if "iou3d" in things else ()
+    for name, used in halves:
         means = things[things.touched.astype(bool) == used].groupby(keys).iou3d.mean()
         frame = frame.join(means.rename(name), on=keys)
     if "pitch_error" in frame:  # the mean of both angles, as the paper's table has it

@@ -42,6 +42,7 @@ from mover_bench.studies.measures import (
     traits_of,
 )
 from mover_bench.studies.sets import RoomSet, set_named
+from mover_bench.studies.stability import measure_stability
 from mover_bench.studies.variants import VARIANTS, Variant, frames_of, withheld
 
 ROOM = "room"  # the job that makes the room; all others have the name of their variant
@@ -202,7 +203,9 @@ def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None)
     if variant.refined:
         room = replace(room, bodies=refine_bodies(room, capture, RefineBodiesConfig()).bodies)
     stages = timing(run.stages)
-    if variant.bodies:
+    if variant.simulated:
+        found = measure_stability(trial.truth, room, run)
+    elif variant.bodies:
         found = measure_people(trial, room, variant.bodies)
     else:
         facts = tuple(e.facts for e in room.explanations)

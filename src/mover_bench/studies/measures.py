@@ -13,10 +13,14 @@ from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.run import Run, StageLog
 from mover.core.types import Bodies, Camera, Capture, Room, Scene, SceneObject
-from mover.evaluate.bodies import MOTION_METRICS, POSE_METRICS, gather_gait, gather_twins
-from mover.evaluate.contact import TrueTouch
-from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate, touch_in_truth
-from mover.evaluate.scene import measure as measured
+from mover.evaluate.contact import TrueTouch, close_meshes, furniture_of
+from mover.evaluate.evaluation import (
+    EvaluateConfig,
+    EvaluatedBodies,
+    evaluate,
+    evaluate_people,
+    touch_in_truth,
+)
 from mover.evaluate.scene import unmatched
 from mover.furniture.library import SEATS, canonical
 from mover.geometry.boxes import box_of
@@ -139,7 +143,7 @@ def _depth(
     return first_hit(verts, mesh.faces, K, size)[0]
 
 
-GIVEN, TRUE_GIVEN, TRUE_ROOM = "given", "true given", "true room"
+GIVEN, TRUE_GIVEN, TRUE_ROOM, TRUTH = "given", "true given", "true room", "true people"
 TRAITS = ("id", "category", "touched", "hidden", "truncated", "flipped", "stays")
 NEAR = 0.6  # [m] from the middle of a seat, at most, of its proposal
 SURFACE = 4000  # points that tell the height of a seat
@@ -313,10 +317,10 @@ def measure_people(trial: Trial, room: Room, row: str) -> dict[str, Any]:
         found = refine_bodies(room, trial.capture, RefineBodiesConfig(weights=weights)).bodies
     assert found is not None, "the people were carried into a room"
     truth = to_world(trial.bodies, trial.truth.camera)
-    twins = gather_twins(found, truth)
-    assert twins is not None, "known people are paired by frame"
-    gait = gather_gait(found, truth, scene.ground)
-    values = measured(POSE_METRICS, twins) | measured(MOTION_METRICS, gait)
+    if row == TRUTH:
+        found, scene = truth, trial.truth
+    solid = furniture_of(scene.objects, close_meshes(scene.objects))
+    values = evaluate_people(found, scene.ground, solid, truth)
     return {"initial": {}, "image": {}, "full": values, "objects": [], "warnings": []}
 
 

@@ -12,6 +12,7 @@ from mover_bench.studies import (
     study_noise,
     study_paper,
     study_rows,
+    study_simulation,
     study_upstream,
     study_video,
 )
@@ -76,6 +77,14 @@ STUDIES: dict[str, Study] = {
     "upstream": Study(
         "What each error of today's tools costs: all at once, and each left out.",
         "upstream", study_upstream.plan, study_upstream.page,
+    ),
+    "stability": Study(
+        "Which share of the furniture stays under gravity and sitters.",
+        "rooms", study_simulation.stability_plan, study_simulation.stability,
+    ),
+    "motion": Study(
+        "How people slide, float, sink and jerk, before and after their refinement.",
+        "rooms", study_simulation.motion_plan, study_simulation.motion,
     ),
     "paper": Study(
         "Which error of the input undoes which printed term.",

@@ -47,6 +47,8 @@ class Variant:
     """Part of the video; None: all of it."""
     bodies: str = ""
     """People refined afterwards: a row of the paper's table of bodies; empty: they are not."""
+    simulated: bool = False
+    """Gravity acts on the furniture: only whether it stays is measured."""
     refined: bool = False
     """The room refines the people before anything is measured."""
     fresh: bool = False
@@ -172,14 +174,21 @@ PEOPLE: dict[str, Variant] = {
     }.items()
 }  # fmt: skip
 """The people after the room is known; the last two in the true room."""
+UNREFINED: dict[str, Variant] = {
+    "people-in-room": Variant(ROBUST, bodies="in room"),
+    "people-true": Variant(ROBUST, bodies="true people"),
+}
+"""The people as they are in the room that was found, and the true ones."""
+
+STANDS: dict[str, Variant] = {"stands": Variant(ROBUST, simulated=True)}
+"""Whether what `robust` finds stays under gravity."""
 
 REFINED: dict[str, Variant] = {"refined-people": Variant(ROBUST, refined=True)}
 
 VARIANTS: dict[str, Variant] = {
     **{name: Variant(config) for name, config in PRESETS.items()},
     **TERMS, **ALONE, **PARTS, **TOOLS, **NOBODY, **RELAXED, **LENS, **REFINED, **SINGLE, **SEGMENT,
-    **TIMED,
-    **PEOPLE,
+    **TIMED, **STANDS, **PEOPLE, **UNREFINED,
 }  # fmt: skip
 """By the name of the job."""
 

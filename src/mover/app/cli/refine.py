@@ -16,14 +16,14 @@ from mover.core.settings import Index, int_in
 
 @dataclass(frozen=True)
 class RefineArgs:
-    """Refine the people of a result with its room; writes OUT/refined/bodies.npz."""
+    """Refine the people of a result with its room; writes OUT/refined: bodies.npz, metrics.json."""
 
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """Folder of a finished `mover run`."""
     capture: Path | None = None
     """Folder of its capture, for masks and contacts; by default where run.json says."""
     truth: Path | None = None
-    """Folder with the true people: their errors before and after go to OUT/refined/metrics.json."""
+    """Folder with the true people: their errors are told as well."""
     camgp: bool = True
     """Use the floor: nobody under it, soles at rest on it."""
     sdf: bool = True
@@ -85,10 +85,10 @@ def refine(arguments: Sequence[str]) -> None:
     how = "rigidly" if found.bodies.pose is None else "with their pose"
     say(f"{len(found.shift)} bodies refined {how}, moved by {1000 * float(way):.0f} mm (median): "
          f"{args.out / 'refined' / 'bodies.npz'}")  # fmt: skip
-    if args.truth is not None:
-        values = measure_people(args.out, args.truth)
-        for name in values["result"]:
-            say(f"{name:20}{values['result'][name]:10.4f}{values['refined'].get(name, 0):10.4f}")
+    values = measure_people(args.out, args.truth)
+    say(f"\n{'':20}{'result':>10}{'refined':>10}")
+    for name, before in values["result"].items():
+        say(f"{name:20}{before:10.4f}{values['refined'][name]:10.4f}")
 
 
 def contacts(arguments: Sequence[str]) -> None:

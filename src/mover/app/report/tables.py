@@ -60,6 +60,8 @@ QUANTITIES = {
     "p_v2v": Quantity("Error of the body's surface, aligned", *_CM),
     "foot_skate": Quantity("Speed of feet on the floor", "cm/s", 100.0, 1),
     "float_height": Quantity("Height of the lower foot over the floor", *_CM),
+    "sink_depth": Quantity("Depth of the body's lowest point under the floor", *_CM),
+    "jerk": Quantity("Jerk of the joints", "m/s³", 1.0, 1),
     "acceleration_error": Quantity("Error of the joints' acceleration", "m/s²", 1.0, 2),
 }
 
