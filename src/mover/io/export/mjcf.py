@@ -13,6 +13,7 @@ from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.types import Camera, Scene
 from mover.io.export.finished import Exported, Finished
+from mover.io.export.looks import Look, looks_of
 from mover.io.export.mjcf_people import add_figures, figures_of
 from mover.io.export.shell import HEIGHT, Wall, Walls, guess_walls, slab, wall_notes
 from mover.io.export.solids import (
@@ -26,6 +27,7 @@ from mover.io.export.solids import (
 )
 
 STEP = 0.002  # [s]
+VISUAL, COLLISION = "meshes/visual", "meshes/collision"
 BodyForm = Literal["auto", "skin", "morph", "none"]
 RESERVED = "world"
 
@@ -114,8 +116,11 @@ def mjcf_of(
     ground = {"name": "ground", "type": "plane", "size": f"{size:g} {size:g} 0.1"}
     SubElement(world, "geom", ground, rgba="0.86 0.85 0.83 1", friction=numbers(FRICTION))
     meshes: dict[str, bytes] = {}
-    for index, solid in enumerate(solids):
-        meshes |= _add_solid(asset, world, solid, (index, looks))
+    for index, (piece, solid) in enumerate(zip(scene.objects, solids, strict=True)):
+        body = _add_solid(world, solid)
+        meshes |= _add_pieces(asset, body, solid)
+        if looks:
+            meshes |= _add_looks(asset, body, looks_of(piece, colour(index), body_name(solid)))
     return root, meshes
 
 
@@ -149,11 +154,8 @@ def body_name(solid: Solid) -> str:
     return solid.id if solid.id != RESERVED else f"{solid.id}_"
 
 
-def _add_solid(
-    asset: Element, world: Element, solid: Solid, drawn: tuple[int, bool]
-) -> dict[str, bytes]:
-    """A body with its convex pieces; its mesh files."""
-    index, looks = drawn
+def _add_solid(world: Element, solid: Solid) -> Element:
+    """A body with its mass, and a joint where it is free."""
     name = body_name(solid)
     half = torch.tensor(solid.yaw / 2, dtype=torch.float64)
     quat = (float(half.cos()), 0.0, 0.0, float(half.sin()))
@@ -165,16 +167,35 @@ def _add_solid(
     full = (i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2])
     mass = {"pos": numbers(solid.centre.tolist()), "mass": f"{solid.mass:.8g}"}
     SubElement(body, "inertial", mass, fullinertia=numbers([float(v) for v in full]))
+    return body
+
+
+def _add_pieces(asset: Element, body: Element, solid: Solid) -> dict[str, bytes]:
+    """What collides; its mesh files."""
     files: dict[str, bytes] = {}
     for k, hull in enumerate(solid.hulls):
-        part = f"{name}_{k}"
-        files[f"meshes/{part}.obj"] = mesh_bytes(hull, "obj")
-        SubElement(asset, "mesh", name=part, file=f"meshes/{part}.obj", inertia="shell")
+        part = f"{body_name(solid)}_{k}"
+        file = f"{COLLISION}/{part}.obj"
+        files[file] = mesh_bytes(hull, "obj")
+        SubElement(asset, "mesh", name=part, file=file, inertia="shell")
         SubElement(body, "geom", {"class": "collide", "mesh": part})
-    if looks:
-        files[f"meshes/{name}_look.obj"] = mesh_bytes(solid.look, "obj")
-        mesh = {"name": f"{name}_look", "file": f"meshes/{name}_look.obj", "inertia": "shell"}
+    return files
+
+
+def _add_looks(asset: Element, body: Element, looks: Sequence[Look]) -> dict[str, bytes]:
+    """What is seen, with materials and pictures; its files."""
+    files: dict[str, bytes] = {}
+    for look in looks:
+        files |= look.files(VISUAL)
+        mesh = {"name": look.name, "file": f"{VISUAL}/{look.name}.obj", "inertia": "shell"}
         SubElement(asset, "mesh", mesh)
-        tint = numbers((*colour(index), 1.0))
-        SubElement(body, "geom", {"class": "look", "mesh": f"{name}_look", "rgba": tint})
+        material = {"name": look.name, "rgba": numbers(look.rgba)}
+        if look.picture:
+            if asset.find(f"texture[@name='{look.image}']") is None:
+                picture = {"name": look.image, "file": f"{VISUAL}/{look.image}.png"}
+                SubElement(asset, "texture", {"type": "2d", **picture})
+            material["texture"] = look.image
+        SubElement(asset, "material", material)
+        geom = {"class": "look", "mesh": look.name, "material": look.name}
+        SubElement(body, "geom", geom)
     return files

@@ -49,8 +49,6 @@ class Solid:
     """False: it hangs or is built in, so it does not move."""
     hulls: tuple[Mesh, ...]
     """Convex pieces in its own axes, at its size [m]."""
-    look: Mesh
-    """Its mesh in its own axes, at its size [m]."""
     mass: float
     """[kg]"""
     centre: Float[Tensor, "3"]
@@ -92,7 +90,6 @@ def _solid(piece: SceneObject, convex: Convex, floor: float) -> Solid:
         yaw=float(piece.yaw),
         free=piece.support != "free",
         hulls=tuple(_turned(hull, scale) for hull in convex.hulls),
-        look=_turned(piece.mesh, scale),
         mass=mass,
         centre=AXES @ (scale * convex.centre),
         inertia=_physical(inertia, mass),

@@ -8,6 +8,8 @@ from mover.core.colours import colour
 from mover.core.files import replacing
 from mover.core.run import Run
 from mover.io.export.finished import Exported, Finished
+from mover.io.export.looks import Look, looks_of
+from mover.io.export.mjcf import COLLISION, VISUAL
 from mover.io.export.solids import Solid, mesh_bytes, numbers, solids_of
 
 SLAB = 0.1  # [m], thickness of the floor
@@ -23,17 +25,21 @@ def export_urdf(finished: Finished, folder: Path) -> Exported:
         folder: Gets the folder `urdf`.
     """
     solids, home = solids_of(finished.scene, Run(finished.out)), folder / "urdf"
+    seen = [
+        looks_of(piece, colour(index), piece.id)
+        for index, piece in enumerate(finished.scene.objects)
+    ]
     files = [home / "room.urdf"]
-    for solid in solids:
+    for solid, looks in zip(solids, seen, strict=True):
         for k, hull in enumerate(solid.hulls):
-            _save(home / "meshes" / f"{solid.id}_{k}.stl", mesh_bytes(hull, "stl"))
-        _save(home / "meshes" / f"{solid.id}.obj", mesh_bytes(solid.look, "obj"))
-    for index, solid in enumerate(solids):
+            _save(home / COLLISION / f"{solid.id}_{k}.stl", mesh_bytes(hull, "stl"))
+        for name, content in (item for look in looks for item in look.files(VISUAL).items()):
+            _save(home / name, content)
         robot = _robot(solid.id)
-        _add_link(robot, solid, index)
+        _add_link(robot, solid, looks)
         files.append(home / f"{_apart(solid.id)}.urdf")
         _save(files[-1], _text(robot))
-    _save(files[0], _text(_room(solids)))
+    _save(files[0], _text(_room(solids, seen)))
     note = "+z is up and the floor is at 0; room.urdf holds every piece still"
     return Exported(tuple(files), (note,))
 
@@ -50,7 +56,7 @@ def _robot(name: str) -> Element:
     return robot
 
 
-def _room(solids: Sequence[Solid]) -> Element:
+def _room(solids: Sequence[Solid], seen: Sequence[Sequence[Look]]) -> Element:
     robot = _robot(BASE)
     link = SubElement(robot, "link", name="floor")
     for kind in ("visual", "collision"):
@@ -58,8 +64,8 @@ def _room(solids: Sequence[Solid]) -> Element:
         SubElement(shape, "origin", xyz=numbers((0, 0, -SLAB / 2)), rpy="0 0 0")
         box = SubElement(shape, "geometry")
         SubElement(box, "box", size=numbers((FLOOR, FLOOR, SLAB)))
-    for index, solid in enumerate(solids):
-        _add_link(robot, solid, index)
+    for solid, looks in zip(solids, seen, strict=True):
+        _add_link(robot, solid, looks)
         joint = SubElement(robot, "joint", name=f"{_link(solid)}_joint", type="fixed")
         SubElement(joint, "parent", link="floor")
         SubElement(joint, "child", link=_link(solid))
@@ -73,7 +79,7 @@ def _link(solid: Solid) -> str:
     return solid.id if solid.id not in ("floor", "world") else f"{solid.id}_"
 
 
-def _add_link(robot: Element, solid: Solid, index: int) -> None:
+def _add_link(robot: Element, solid: Solid, looks: Sequence[Look]) -> None:
     link = SubElement(robot, "link", name=_link(solid))
     inertial = SubElement(link, "inertial")
     SubElement(inertial, "origin", xyz=numbers(solid.centre.tolist()), rpy="0 0 0")
@@ -82,14 +88,17 @@ def _add_link(robot: Element, solid: Solid, index: int) -> None:
     moments = {"ixx": i[0][0], "iyy": i[1][1], "izz": i[2][2]}
     moments |= {"ixy": i[0][1], "ixz": i[0][2], "iyz": i[1][2]}
     SubElement(inertial, "inertia", {key: f"{value:.8g}" for key, value in moments.items()})
-    visual = SubElement(link, "visual")
-    mesh = SubElement(visual, "geometry")
-    SubElement(mesh, "mesh", filename=f"meshes/{solid.id}.obj")
-    material = SubElement(visual, "material", name=f"{solid.id}_colour")
-    SubElement(material, "color", rgba=numbers((*colour(index), 1.0)))
+    for look in looks:
+        visual = SubElement(link, "visual")
+        mesh = SubElement(visual, "geometry")
+        SubElement(mesh, "mesh", filename=f"{VISUAL}/{look.name}.obj")
+        material = SubElement(visual, "material", name=look.name)
+        SubElement(material, "color", rgba=numbers(look.rgba))
+        if look.picture:
+            SubElement(material, "texture", filename=f"{VISUAL}/{look.image}.png")
     for k in range(len(solid.hulls)):
         shape = SubElement(SubElement(link, "collision"), "geometry")
-        SubElement(shape, "mesh", filename=f"meshes/{solid.id}_{k}.stl")
+        SubElement(shape, "mesh", filename=f"{COLLISION}/{solid.id}_{k}.stl")
 
 
 def _text(robot: Element) -> bytes:
