@@ -4,6 +4,7 @@ import dataclasses
 import math
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from mover.app.cli import run_command
 from mover.core.types import Scene
 from mover.io.export.finished import Finished, read_finished
 from mover.io.export.mjcf import export_mjcf
-from mover.io.export.shell import HEIGHT, guess_walls, slab
+from mover.io.export.shell import HEIGHT, guess_walls, slab, wall_notes
+from mover.io.export.urdf import export_urdf
 from mover.io.export.usd import export_usd
+from mover.pipeline.outcome import layout_over
 
 BACK, LEFT = -5.0, -2.5  # [m], inner faces of the true walls before the room is turned
 
@@ -84,6 +87,32 @@ def test_a_shelf_that_faces_the_wall_tells_none():
     assert guess_walls(dataclasses.replace(scene, objects=tuple(turned)), None) == ()
 
 
+@pytest.mark.parametrize("yaw", [0.0, 0.4])
+def test_a_layout_that_was_given_tells_all_four_walls(yaw: float):
+    """Its left side would cut the cabinet, so that wall goes where the cabinet ends."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    corners = [(-2.3, -6.0), (3.0, -6.0), (3.0, 1.0), (-2.3, 1.0)]
+    layout = torch.tensor([(c * x + s * z, c * z - s * x) for x, z in corners])
+    walls = guess_walls(dataclasses.replace(room(yaw), layout=layout), None)
+    edges = {}
+    for wall in walls:
+        assert wall.pieces == ()
+        out = wall.out.numpy() @ np.array([[c, s], [-s, c]])  # in the room's own axes
+        edges[tuple(np.round(out).astype(int))] = float((wall.start * wall.out).sum())
+    left = {(-1, 0): pytest.approx(2.49, abs=1e-4)}  # the cabinet, and 2 cm of air
+    assert edges == {(1, 0): pytest.approx(3.0, abs=1e-4), (0, -1): pytest.approx(6.0, abs=1e-4),
+                     (0, 1): pytest.approx(1.0, abs=1e-4), **left}  # fmt: skip
+    assert "a wall is guessed from the layout that was given" in wall_notes(walls)
+
+
+def test_a_layout_grows_with_the_height_of_the_camera():
+    layout = torch.tensor([[-1.0, -4.0], [2.0, -4.0], [2.0, 1.0], [-1.0, 1.0]])
+    given = dataclasses.replace(room(), layout=layout)
+    assert torch.equal(layout_over(given, GROUND), layout)
+    assert torch.allclose(layout_over(given, 1.1 * GROUND), 1.1 * layout)
+    assert torch.equal(layout_over(given, None), layout)
+
+
 def finished(tmp_path: Path) -> Finished:
     out = write_out(tmp_path / "out", room(0.2), bodies_of(moving_pose(3, pace=0.1)))
     return read_finished(out)
@@ -140,6 +169,32 @@ def test_mujoco_has_them_and_the_furniture_stays(tmp_path: Path):
         mujoco.mj_step(model, data)
     for name, place in start.items():
         assert np.linalg.norm(data.body(name).xpos - place) < 0.01
+
+
+def test_urdf_has_them_as_fixed_boxes(tmp_path: Path):
+    mujoco = pytest.importorskip("mujoco", reason="needs the extra physics")
+    home = finished(tmp_path)
+    found = export_urdf(home, tmp_path, walls="guess")
+    assert "a wall is guessed from shelf_0, sofa_0" in found.notes
+    model = mujoco.MjModel.from_xml_path(str(found.files[0]))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    boxes = [g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX]
+    walls = guess_walls(home.scene, home.bodies)
+    assert len(boxes) == 2 * (1 + len(walls))  # seen and colliding: the floor, the walls
+    for wall in walls:
+        (x, z), _, _ = slab(wall)
+        away = [np.linalg.norm(data.geom_xpos[g] - [x, -z, HEIGHT / 2]) for g in boxes]
+        geom = boxes[int(np.argmin(away))]
+        turn, size = data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
+        points = [
+            data.geom_xpos[geom] + turn @ (size * [a, b, 0]) for a in (-1, 1) for b in (-1, 1)
+        ]
+        flat = np.array([[x, -y] for x, y, _ in points])
+        assert max(np.linalg.norm(flat - p, axis=1).min() for p in corners_of(wall)) < 1e-6
+    names = {link.attrib["name"] for link in ElementTree.parse(found.files[0]).iter("link")}
+    assert {"guessed_wall_0", "guessed_wall_1"} <= names
+    assert "guessed_wall" not in export_urdf(home, tmp_path).files[0].read_text()
 
 
 def test_the_command_says_what_a_guess_rests_on(tmp_path: Path, capsys):

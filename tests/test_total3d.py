@@ -41,6 +41,22 @@ def cell(angle: float, centre: list[float], half: list[float]) -> dict[str, Any]
     return {"basis": basis, "coeffs": np.array([half], "f4"), "centroid": np.array([centre], "f4")}
 
 
+LAYOUT = (0.3, [2.5, 0.525, -0.4], [3.5, 1.975, 2.2])
+
+
+def layout_box() -> np.ndarray:
+    """Corners as Total3D's `get_layout_bdb_sunrgbd` orders them: four above, the same four below.
+
+    Rows of the basis are the room's own axes (yinyunie/Total3DUnderstanding, net_utils/libs.py).
+    """
+    angle, centre, half = LAYOUT
+    c, s = math.cos(angle), math.sin(angle)
+    basis = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) * np.array(half)[:, None]
+    around = [(-1, -1), (-1, 1), (1, 1), (1, -1)]
+    signs = np.array([[a, up, b] for up in (1, -1) for a, b in around], float)
+    return (signs @ basis + centre).astype("f4")
+
+
 def write(folder: Path) -> Path:
     source, result = folder / "input", folder / "output"
     source.mkdir(parents=True)
@@ -55,7 +71,7 @@ def write(folder: Path) -> Path:
         cells[0, i] = cell(*box)
     savemat(result / "bdb_3d.mat", {"bdb": cells, "class_id": np.array([[b[0] for b in BOXES]])})
     savemat(result / "r_ex.mat", {"cam_R": attitude()})
-    savemat(result / "layout.mat", {"layout": np.array([[0.0, 2.5, 0]] * 4 + [[0, -1.45, 0]] * 4)})
+    savemat(result / "layout.mat", {"layout": layout_box()})
     for i, box in enumerate(BOXES):
         # One vertex that no face uses counts in the bounds that are stretched to the box.
         lines = ["v " + " ".join(map(str, v)) for v in [*tiny.STEP.tolist(), [0.0, -0.5, 0.0]]]
@@ -80,6 +96,21 @@ def test_a_vertex_lands_on_the_pixel_that_total3d_says(tmp_path: Path) -> None:
         seen = project(to_camera(place_object(piece).verts, camera.R_cam_world), camera.K)
         assert np.allclose(seen.numpy(), image[:, :2] / image[:, 2:], atol=1e-3)
         assert place_object(piece).faces.tolist() == tiny.STEP_FACES.tolist()
+
+
+def test_the_layout_becomes_corners_on_the_floor_and_goes_with_the_capture(tmp_path: Path) -> None:
+    found = read("total3d", write(tmp_path / "room"))
+    corners = found.scene.layout
+    assert corners is not None
+    floor = torch.stack([corners[:, 0], torch.full((4,), -1.45), corners[:, 1]], -1)
+    camera = found.scene.camera
+    seen = to_camera(floor, camera.R_cam_world)
+    image = layout_box()[4:] @ attitude() @ np.array([[0, 0, 1], [0, -1, 0], [1, 0, 0]]).T
+    assert np.allclose(seen.numpy(), image, atol=1e-5)  # right, down, forward
+    write_capture(found, tmp_path / "capture")
+    again = read_capture(tmp_path / "capture").scene.layout
+    assert again is not None
+    assert torch.allclose(again, corners, atol=1e-6)
 
 
 def test_the_camera_keeps_its_pitch_and_roll(tmp_path: Path) -> None:

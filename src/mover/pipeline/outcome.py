@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.bodies.corrected import in_world
@@ -88,7 +88,8 @@ def unfurnished(capture: Capture, people: PeopleState | None) -> Room:
     """A room without objects still has a camera, a floor and people."""
     found = None if people is None else people.alignment
     camera = capture.scene.camera if found is None else found.camera
-    scene = Scene(camera, capture.scene.ground if found is None else found.ground, ())
+    ground = capture.scene.ground if found is None else found.ground
+    scene = Scene(camera, ground, (), layout_over(capture.scene, ground))
     warnings = (*capture.warnings, *(() if people is None else people.warnings))
     return Room(
         scene=scene, initial=capture.scene, image_only=scene,
@@ -96,6 +97,13 @@ def unfurnished(capture: Capture, people: PeopleState | None) -> Room:
         kept=None if people is None else people.kept, proxies=(), evidence=(),
         covariance=None if found is None else found.covariance, traces={}, warnings=warnings,
     )  # fmt: skip
+
+
+def layout_over(given: Scene, ground: float | None) -> Float[Tensor, "4 2"] | None:
+    """The corners that were given; their distances are as much larger as the floor is lower."""
+    if given.layout is None or not given.ground or ground is None:
+        return given.layout
+    return given.layout * (ground / given.ground)
 
 
 def room_of(context: ReconstructionContext, state: SceneState, people: PeopleState | None) -> Room:
@@ -115,7 +123,7 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
             context.prepared.objects, placed.layout, contacts.points, contacts.seated_on,
         ))  # fmt: skip
     return Room(
-        scene=Scene(state.camera, state.ground, pieces),
+        scene=Scene(state.camera, state.ground, pieces, layout_over(capture.scene, state.ground)),
         initial=capture.scene,
         image_only=Scene(state.camera, state.ground, alone),
         bodies=bodies,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
+from jaxtyping import Float
 from msgspec import Meta, Struct
 from torch import Tensor
 
@@ -84,6 +85,10 @@ class Ground(Struct, frozen=True):
     height: Annotated[float, Meta(ge=-LOWEST, le=LOWEST)]
 
 
+Spot = tuple[Number, Number]
+"""(x, z) [m]"""
+
+
 class SceneFields(Struct, frozen=True):
     """scene.json."""
 
@@ -92,6 +97,7 @@ class SceneFields(Struct, frozen=True):
     objects: list[ObjectFields]
     camera: Any = None
     ground: Ground | None = None
+    layout: tuple[Spot, Spot, Spot, Spot] | None = None
 
 
 def scene_of(at: At, load: LoadMesh, camera: Camera | None, warn: Warn) -> tuple[Scene, float]:
@@ -111,7 +117,8 @@ def scene_of(at: At, load: LoadMesh, camera: Camera | None, warn: Warn) -> tuple
     pieces = _pieces_of(get(at, "objects"), fields.objects, load)
     camera, angle = turned(camera)
     check_attitude(camera, at.file, warn)
-    return Scene(camera, ground, tuple(_turn(piece, angle) for piece in pieces)), angle
+    layout = None if fields.layout is None else _turned_spots(fields.layout, angle)
+    return Scene(camera, ground, tuple(_turn(piece, angle) for piece in pieces), layout), angle
 
 
 def _pieces_of(at: At, rows: Sequence[ObjectFields], load: LoadMesh) -> list[SceneObject]:
@@ -162,6 +169,13 @@ def _check_supports(at: At, pieces: list[SceneObject]) -> None:
             below = under[below]
 
 
+def _turned_spots(spots: Sequence[Spot], angle: float) -> Float[Tensor, "spots 2"]:
+    """Places on the floor, turned about +y."""
+    flat = torch.tensor(spots, dtype=torch.float64)
+    turn = rot_y(torch.tensor(angle, dtype=torch.float64))[::2, ::2]
+    return (flat @ turn.mT).float()
+
+
 def _turn(piece: SceneObject, angle: float) -> SceneObject:
     if not angle:
         return piece
@@ -173,15 +187,22 @@ def _turn(piece: SceneObject, angle: float) -> SceneObject:
     )
 
 
-def scene_tree(objects: Sequence[Mapping[str, Any]], file: str, ground: float | None = None) -> At:
+def scene_tree(
+    objects: Sequence[Mapping[str, Any]],
+    file: str,
+    ground: float | None = None,
+    layout: list[list[float]] | None = None,
+) -> At:
     """scene.json of objects that a reader found.
 
     Args:
         objects: Their fields.
         file: How messages call it.
         ground: Its height [m].
+        layout: Four corners of the room on the floor, (x, z) [m].
     """
     below = {} if ground is None else {"ground": {"height": ground}}
+    below |= {} if layout is None else {"layout": layout}
     return At({"format": FORMAT, "version": VERSION, **below, "objects": list(objects)}, file)
 
 
@@ -206,7 +227,8 @@ def write_scene(
             write_mesh(piece.mesh, target)
         fields = _object_to_json(piece, target.relative_to(path.parent).as_posix())
         objects.append(fields | dict((more or {}).get(piece.id, {})))
-    tree: dict[str, Any] = scene_tree(objects, "scene.json", scene.ground).value
+    layout = None if scene.layout is None else [plain(spot) for spot in scene.layout]
+    tree: dict[str, Any] = scene_tree(objects, "scene.json", scene.ground, layout).value
     head = {key: tree.pop(key) for key in ("format", "version")}
     write_json({**head, "camera": camera_to_json(scene.camera), **tree}, path)
 

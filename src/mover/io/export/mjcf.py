@@ -15,7 +15,7 @@ from mover.core.types import Camera, Scene
 from mover.io.export.finished import Exported, Finished
 from mover.io.export.looks import Look, looks_of
 from mover.io.export.mjcf_people import add_figures, figures_of
-from mover.io.export.shell import HEIGHT, Wall, Walls, guess_walls, slab, wall_notes
+from mover.io.export.shell import GUESSED, HEIGHT, Wall, Walls, guess_walls, slab, wall_notes
 from mover.io.export.solids import (
     AXES,
     FRICTION,
@@ -82,7 +82,7 @@ def _add_walls(root: Element, walls: Sequence[Wall]) -> None:
         half = {"size": numbers((length / 2, thick / 2, HEIGHT / 2))}
         place = {"pos": numbers((x, -z, HEIGHT / 2)), "euler": numbers((0, 0, yaw))}
         look = {"type": "box", "rgba": "0.9 0.89 0.86 0.4", "friction": numbers(FRICTION)}
-        SubElement(world, "geom", {"name": f"guessed_wall_{k}", **half, **place, **look})
+        SubElement(world, "geom", {"name": f"{GUESSED}_{k}", **half, **place, **look})
 
 
 def text_of(root: Element) -> str:

@@ -1,9 +1,10 @@
-"""Walls that nobody saw: guessed from furniture that stands along them and from where people went.
+"""Walls that nobody saw: guessed from the layout that a tool gave, or from furniture along them.
 
-Rooms are taken for rectangles. Their axes are those of most furniture; a side gets a wall where a
-piece that usually stands along walls turns its back to it, in line with the outermost. No wall may
-cut a piece, a person or the camera, so it lies outside of all of them. Sides without such a piece
-stay open. A guess is marked as one wherever it is written.
+Rooms are taken for rectangles. Where the scene has a layout, its four sides are walls. Else the
+axes are those of most furniture, and a side gets a wall where a piece that usually stands along
+walls turns its back to it, in line with the outermost; sides without such a piece stay open. No
+wall may cut a piece, a person or the camera: it lies outside of all of them. A guess is marked as
+one wherever it is written.
 """
 
 import math
@@ -20,6 +21,7 @@ from mover.geometry.boxes import box_of, corners
 from mover.geometry.rotations import wrap
 
 Walls = Literal["none", "guess"]
+GUESSED = "guessed_wall"  # what the names of walls begin with
 TURNED = math.radians(12)  # [rad], of a back that faces a wall, at most
 SAME = math.radians(4)  # [rad], usual difference of pieces along walls of one room
 LINE = 0.25  # [m], of a back from the outermost thing of its side, at most
@@ -37,39 +39,54 @@ class Wall:
     out: Float[Tensor, "2"]
     """Unit normal, out of the room."""
     pieces: tuple[str, ...]
-    """Ids of what stands along it: what the guess rests on."""
+    """Ids of what stands along it; none where the layout tells it."""
+
+    @property
+    def source(self) -> str:
+        """What the guess rests on."""
+        return ", ".join(self.pieces) or "the layout that was given"
 
 
 def guess_walls(scene: Scene, bodies: Bodies | None) -> tuple[Wall, ...]:
-    """The walls of a scene, as far as its furniture tells them.
+    """The walls of a scene, as far as a layout or its furniture tells them.
 
     Args:
         scene: A result; the camera is at its origin.
         bodies: Its people, in the world: nobody walks through walls.
     """
-    if not scene.objects:
+    layout = None if scene.layout is None else scene.layout.double()
+    if not scene.objects and layout is None:
         return ()
-    yaw = _main_yaw(scene.objects)
+    yaw = _main_yaw(scene.objects) if layout is None else _yaw_of(layout)
     c, s = math.cos(yaw), math.sin(yaw)
     turn = torch.tensor([[c, -s], [s, c]], dtype=torch.float64)  # from the world to the room's axes
     foot = [corners(box_of(p)).double()[:, ::2] @ turn.mT for p in scene.objects]
-    inside = [torch.cat(foot), torch.zeros(1, 2, dtype=torch.float64)]
+    inside = [*foot, torch.zeros(1, 2, dtype=torch.float64)]
     if bodies is not None:
         inside.append(bodies.verts[..., ::2].double().reshape(-1, 2) @ turn.mT)
     low = torch.stack([points.amin(0) for points in inside]).amin(0) - CLEARANCE
     high = torch.stack([points.amax(0) for points in inside]).amax(0) + CLEARANCE
+    if layout is not None:
+        flat = layout @ turn.mT
+        low, high = torch.minimum(low, flat.amin(0)), torch.maximum(high, flat.amax(0))
     found: list[Wall] = []
     for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1)):
         edge = float((low if sign < 0 else high)[axis])
         along = _along(scene.objects, foot, (axis, sign, edge), yaw)
-        if along:
+        if along or layout is not None:
             ends = torch.stack([low, high])
             ends[:, axis] = edge
             out = torch.zeros(2, dtype=torch.float64)
             out[axis] = sign
             start, end = (ends @ turn).unbind(0)
-            found.append(Wall(start, end, out @ turn, along))
+            found.append(Wall(start, end, out @ turn, along if layout is None else ()))
     return tuple(found)
+
+
+def _yaw_of(layout: Float[Tensor, "4 2"]) -> float:
+    """The turn of a rectangle's first side."""
+    x, z = (layout[1] - layout[0]).tolist()
+    return math.atan2(-z, x)
 
 
 def _main_yaw(objects: tuple[SceneObject, ...]) -> float:
@@ -117,4 +134,4 @@ def wall_notes(walls: tuple[Wall, ...]) -> tuple[str, ...]:
     """What a guess rests on."""
     if not walls:
         return ("no walls: nothing stands along any",)
-    return tuple(f"a wall is guessed from {', '.join(wall.pieces)}" for wall in walls)
+    return tuple(f"a wall is guessed from {wall.source}" for wall in walls)

@@ -10,19 +10,29 @@ from mover.core.run import Run
 from mover.io.export.finished import Exported, Finished
 from mover.io.export.looks import Look, looks_of
 from mover.io.export.mjcf import COLLISION, VISUAL
+from mover.io.export.shell import (
+    GUESSED,
+    HEIGHT,
+    Wall,
+    Walls,
+    guess_walls,
+    slab,
+    wall_notes,
+)
 from mover.io.export.solids import Solid, mesh_bytes, numbers, solids_of
 
 SLAB = 0.1  # [m], thickness of the floor
 FLOOR = 20.0  # [m], its width
-BASE = "room"
+BASE, FLOOR_LINK = "room", "floor"
 
 
-def export_urdf(finished: Finished, folder: Path) -> Exported:
+def export_urdf(finished: Finished, folder: Path, walls: Walls = "none") -> Exported:
     """Write `urdf/<id>.urdf` (a loose body each) and `urdf/room.urdf` (everything fixed).
 
     Args:
         finished: The result.
         folder: Gets the folder `urdf`.
+        walls: Whether `room.urdf` has walls that are guessed.
     """
     solids, home = solids_of(finished.scene, Run(finished.out)), folder / "urdf"
     seen = [
@@ -39,9 +49,13 @@ def export_urdf(finished: Finished, folder: Path) -> Exported:
         _add_link(robot, solid, looks)
         files.append(home / f"{_apart(solid.id)}.urdf")
         _save(files[-1], _text(robot))
-    _save(files[0], _text(_room(solids, seen)))
-    note = "+z is up and the floor is at 0; room.urdf holds every piece still"
-    return Exported(tuple(files), (note,))
+    room, notes = _room(solids, seen), ("room.urdf holds every piece still",)
+    if walls == "guess":
+        shell = guess_walls(finished.scene, finished.bodies)
+        _add_walls(room, shell)
+        notes += wall_notes(shell)
+    _save(files[0], _text(room))
+    return Exported(tuple(files), ("+z is up and the floor is at 0", *notes))
 
 
 def _apart(name: str) -> str:
@@ -58,25 +72,42 @@ def _robot(name: str) -> Element:
 
 def _room(solids: Sequence[Solid], seen: Sequence[Sequence[Look]]) -> Element:
     robot = _robot(BASE)
-    link = SubElement(robot, "link", name="floor")
-    for kind in ("visual", "collision"):
-        shape = SubElement(link, kind)
-        SubElement(shape, "origin", xyz=numbers((0, 0, -SLAB / 2)), rpy="0 0 0")
-        box = SubElement(shape, "geometry")
-        SubElement(box, "box", size=numbers((FLOOR, FLOOR, SLAB)))
+    _add_box(robot, FLOOR_LINK, (0, 0, -SLAB / 2), (FLOOR, FLOOR, SLAB))
     for solid, looks in zip(solids, seen, strict=True):
         _add_link(robot, solid, looks)
-        joint = SubElement(robot, "joint", name=f"{_link(solid)}_joint", type="fixed")
-        SubElement(joint, "parent", link="floor")
-        SubElement(joint, "child", link=_link(solid))
-        place, turn = numbers(solid.place.tolist()), numbers((0, 0, solid.yaw))
-        SubElement(joint, "origin", xyz=place, rpy=turn)
+        _fix(robot, _link(solid), solid.place.tolist(), solid.yaw)
     return robot
 
 
+def _add_box(robot: Element, name: str, middle: Sequence[float], size: Sequence[float]) -> None:
+    """A link that is seen and collides as a box."""
+    link = SubElement(robot, "link", name=name)
+    for kind in ("visual", "collision"):
+        shape = SubElement(link, kind)
+        SubElement(shape, "origin", xyz=numbers(middle), rpy="0 0 0")
+        SubElement(SubElement(shape, "geometry"), "box", size=numbers(size))
+
+
+def _fix(robot: Element, link: str, place: Sequence[float], yaw: float) -> None:
+    """Hold a link still on the floor."""
+    joint = SubElement(robot, "joint", name=f"{link}_joint", type="fixed")
+    SubElement(joint, "parent", link=FLOOR_LINK)
+    SubElement(joint, "child", link=link)
+    SubElement(joint, "origin", xyz=numbers(place), rpy=numbers((0, 0, yaw)))
+
+
+def _add_walls(robot: Element, walls: Sequence[Wall]) -> None:
+    """Boxes that stand still, named as guessed."""
+    for k, wall in enumerate(walls):
+        (x, z), (length, thick), yaw = slab(wall)
+        _add_box(robot, f"{GUESSED}_{k}", (0, 0, HEIGHT / 2), (length, thick, HEIGHT))
+        _fix(robot, f"{GUESSED}_{k}", (x, -z, 0), yaw)
+
+
 def _link(solid: Solid) -> str:
-    """Name of its link; `floor` is taken, and MuJoCo keeps `world`."""
-    return solid.id if solid.id not in ("floor", "world") else f"{solid.id}_"
+    """Name of its link; `floor` and those of walls are taken, and MuJoCo keeps `world`."""
+    taken = solid.id in (FLOOR_LINK, "world") or solid.id.startswith(GUESSED)
+    return f"{solid.id}_" if taken else solid.id
 
 
 def _add_link(robot: Element, solid: Solid, looks: Sequence[Look]) -> None:

@@ -59,7 +59,7 @@ def add_walls(stage: Any, walls: tuple[Wall, ...], floor: float, wood: Any) -> N
         cube.AddTranslateOp(double).Set(Gf.Vec3d(x, floor + HEIGHT / 2, z))
         cube.AddRotateYOp(double).Set(math.degrees(yaw))
         cube.AddScaleOp(double).Set(Gf.Vec3d(length, HEIGHT, thick))
-        cube.GetPrim().SetCustomDataByKey("mover:guessed_from", ", ".join(wall.pieces))
+        cube.GetPrim().SetCustomDataByKey("mover:guessed_from", wall.source)
         UsdPhysics.CollisionAPI.Apply(cube.GetPrim())
         _bind(cube.GetPrim(), wood)
 
