@@ -1,0 +1,178 @@
+"""Every export of the demo's room, opened by the library that reads it."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import mover.io.export.convex
+from mover.app.cli import run_command
+from mover.app.results import labels_of, write_truth
+from mover.core.records import rows_of
+from mover.core.run import Run
+from mover.io.capture.scene_file import read_scene
+from mover.io.export.contacts import write_labels
+from mover.io.files.meshes import write_mesh
+from mover.io.formats import names
+from mover.pipeline.outcome import to_world
+from mover.pipeline.refinement import finished_room
+from mover_bench.rooms.known import KnownRoom
+
+pytestmark = pytest.mark.slow
+TEXTURED = "chair_0"
+FRAMES = 60
+PICTURE = np.arange(3 * 64, dtype=np.uint8).reshape(8, 8, 3)
+
+
+@pytest.fixture(scope="module")
+def out(demo_room: KnownRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The true room as a result, one of its meshes with a texture, with all of its exports."""
+    folder = tmp_path_factory.mktemp("demo")
+    bodies = rows_of(demo_room.bodies, demo_room.bodies.frame < FRAMES)
+    write_truth(demo_room.truth, to_world(bodies, demo_room.truth.camera), folder)
+    shape = trimesh.load_mesh(folder / "meshes" / f"{TEXTURED}.glb", process=False)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(PICTURE))
+    uv = np.asarray(shape.vertices)[:, :2] % 1
+    shape.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    shape.export(folder / "meshes" / f"{TEXTURED}.glb")
+    for piece in demo_room.truth.objects:
+        write_mesh(piece.mesh, folder / "watertight" / f"{piece.id}.glb")
+    write_labels(labels_of(finished_room(folder), Run(folder)), folder / "contacts.npz")
+    with pytest.MonkeyPatch.context() as patch:  # CoACD has a test of its own
+        patch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+        asked = [str(folder), "--to", *names("export"), "--walls", "guess", "--up", "z"]
+        assert run_command("export", asked) == 0
+    return folder
+
+
+def ids(out: Path) -> set[str]:
+    return {piece.id for piece in read_scene(out / "scene.json").objects}
+
+
+def opens_glb(out: Path) -> None:
+    scene = trimesh.load_scene(out / "export" / "scene.glb")
+    assert ids(out) <= set(scene.graph.nodes)
+    pictures = [
+        np.asarray(picture.convert("RGB"))
+        for part in scene.geometry.values()
+        if (picture := getattr(part.visual.material, "baseColorTexture", None)) is not None
+    ]
+    assert any(np.array_equal(picture, PICTURE) for picture in pictures)
+
+
+def opens_usd(out: Path) -> None:
+    Usd = pytest.importorskip("pxr.Usd", reason="needs the extra usd")
+    from pxr import UsdGeom, UsdPhysics, UsdSkel
+
+    stage = Usd.Stage.Open(str(out / "export" / "scene.usdc"))
+    assert (UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)) == (1.0, "Z")
+    prims = list(stage.Traverse())
+    bodies = [p for p in prims if p.HasAPI(UsdPhysics.RigidBodyAPI)]
+    assert {p.GetName() for p in bodies} == ids(out)
+    for body in bodies:
+        assert UsdPhysics.MassAPI(body).GetMassAttr().Get() > 0.5
+        hulls = [p for p in Usd.PrimRange(body) if p.HasAPI(UsdPhysics.MeshCollisionAPI)]
+        assert hulls
+    still = [p for p in prims if p.HasAPI(UsdPhysics.CollisionAPI) and p not in bodies]
+    assert any(p.GetTypeName() == "Plane" for p in still)
+    (motion,) = [p for p in prims if p.IsA(UsdSkel.Animation)]
+    assert len(UsdSkel.Animation(motion).GetRotationsAttr().GetTimeSamples()) > FRAMES / 2
+    files = [p.GetAttribute("inputs:file").Get() for p in prims if p.GetName() == "picture"]
+    (file,) = files
+    assert np.array_equal(np.asarray(Image.open(out / "export" / file.path)), PICTURE)
+
+
+def opens_mjcf(out: Path) -> None:
+    """And stands for two seconds, with the person posed by the keyframes."""
+    mujoco = pytest.importorskip("mujoco", reason="needs the extra physics")
+    model = mujoco.MjModel.from_xml_path(str(out / "export" / "mjcf" / "room.xml"))
+    data = mujoco.MjData(model)
+    assert model.nkey > FRAMES / 2
+    assert model.nmocap == 22
+    assert model.ntex == 1
+    mujoco.mj_resetDataKeyframe(model, data, model.nkey // 2)
+    mujoco.mj_forward(model, data)
+    start = {name: np.array(data.body(name).xpos) for name in ids(out)}
+    for _ in range(round(2 / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+    assert all(np.linalg.norm(data.body(n).xpos - place) < 0.01 for n, place in start.items())
+
+
+def opens_urdf(out: Path) -> None:
+    mujoco = pytest.importorskip("mujoco", reason="needs the extra physics")
+    home = out / "export" / "urdf"
+    assert {file.stem for file in home.glob("*.urdf")} == ids(out) | {"room"}
+    for file in home.glob("*.urdf"):
+        model = mujoco.MjModel.from_xml_path(str(file))
+        assert model.ngeom > 1
+
+
+def opens_ply(out: Path) -> None:
+    for name in ids(out):
+        home = out / "export" / "objects"
+        assert len(trimesh.load_mesh(home / f"{name}.ply").faces)
+        assert len(trimesh.load_scene(home / name / f"{name}.obj").geometry)
+
+
+def clip(out: Path, place: str, **shapes: tuple[int, ...]) -> dict[str, Any]:
+    """An npz whose arrays have these shapes behind their first axis."""
+    found = dict(np.load(out / "export" / place, allow_pickle=False))
+    rows = {len(found[name]) for name in shapes}
+    assert len(rows) == 1
+    assert rows.pop() > FRAMES / 2
+    assert {name: found[name].shape[1:] for name in shapes} == shapes
+    return found
+
+
+def opens_amass(out: Path) -> None:
+    """AMASS' SMPL-X files, as their readers index them: trans, root_orient, pose_body, betas."""
+    found = clip(
+        out, "amass/person_0_stageii.npz", trans=(3,), root_orient=(3,), pose_body=(63,),
+        pose_hand=(90,), poses=(165,),
+    )  # fmt: skip
+    assert int(found["num_betas"]) == len(found["betas"])
+    assert float(found["mocap_frame_rate"]) == 30
+
+
+def opens_gmr(out: Path) -> None:
+    found = clip(out, "gmr/person_0.npz", trans=(3,), root_orient=(3,), pose_body=(63,))
+    assert {"betas", "gender", "mocap_frame_rate"} <= set(found)
+
+
+def opens_holosoma(out: Path) -> None:
+    found = clip(out, "holosoma/person_0.npz", global_joint_positions=(22, 3))
+    assert 1.4 < float(found["height"]) < 2.1
+    home = out / "export" / "holosoma" / "person_0"
+    assets = re.findall(r'file="([^"]*)"', (home / "box_assets.xml").read_text())
+    assert assets
+    for name in assets:
+        shape = trimesh.load_mesh(next(home.rglob(Path(name).name)))
+        assert shape.volume == pytest.approx(shape.convex_hull.volume, rel=1e-6)
+
+
+def opens_contacts(out: Path) -> None:
+    found = dict(np.load(out / "export" / "contacts_0.npz", allow_pickle=False))
+    assert found["contact"].shape == found["position"].shape[:-1] == found["normal"].shape[:-1]
+    assert found["object_contact"].shape == (len(found["frame"]), found["contact"].shape[2])
+    assert found["object_contact"].any()
+
+
+def opens_bodies(out: Path) -> None:
+    clip(out, "bodies_0.npz", trans=(3,), root_orient=(3,), poses=(165,))
+
+
+OPENS: dict[str, Callable[[Path], None]] = {
+    "glb": opens_glb, "usd": opens_usd, "mjcf": opens_mjcf, "urdf": opens_urdf, "ply": opens_ply,
+    "amass": opens_amass, "gmr": opens_gmr, "holosoma": opens_holosoma,
+    "contacts": opens_contacts, "bodies": opens_bodies,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("target", names("export"))
+def test_every_export_of_the_demo_opens(out: Path, target: str):
+    OPENS[target](out)
