@@ -13,8 +13,9 @@ from furnished import bodies_of, furnished, write_out
 from little_room import GROUND, box, camera, mesh_of, piece
 
 import mover.app.simulate
+from mover.app.apart import Ranges, apart
 from mover.app.cli import run_command
-from mover.app.nudge import Ranges, nudged
+from mover.app.nudge import nudged
 from mover.app.simulate import SimulatedObject, simulate
 from mover.app.sitters import MASS, SEAT_SHARE, Load, hardest, loads_of
 from mover.bodies.skin import PARTS
@@ -146,6 +147,70 @@ def test_a_piece_that_falls_over_is_left(tmp_path: Path):
         dataclasses.replace(scene, objects=(leaning,)), Run(tmp_path), {"bench_0": wide}
     )
     assert nudge.reason == "it falls over"
+
+
+def wedged(sure: float, unsure: float) -> tuple[Scene, Ranges]:
+    """A tall box and a low one stand in each other by 6 cm, askew so that they are thrown over."""
+    tall = piece("tall_0", box(0.4, 1.2, 0.4), (0, -3), 0.0, GROUND)
+    low = piece("low_0", box(0.6, 0.5, 0.6), (0.44, -3.1), 0.2, GROUND)
+    scene = Scene(camera(), GROUND, (tall, low))
+    ranges: Ranges = {}
+    for given, wide in ((tall, sure), (low, unsure)):
+        x, y, z = given.t_world_object.tolist()
+        here = {"x": x, "y": y, "z": z, "yaw": float(given.yaw)}
+        ranges[given.id] = {k: (v - wide, v + wide) for k, v in here.items()}
+    return scene, ranges
+
+
+@needs_mujoco
+def test_what_stands_in_each_other_comes_apart_the_least_certain_first(tmp_path: Path):
+    scene, ranges = wedged(0.02, 0.2)
+    assert not any(row.stays for row in simulate(scene, Run(tmp_path)))
+    clear = apart(scene, Run(tmp_path), ranges, {"tall_0"})
+    (still, _), (before, after) = scene.objects, (scene.objects[1], clear.objects[1])
+    assert torch.equal(clear.objects[0].t_world_object, still.t_world_object)
+    step = after.t_world_object - before.t_world_object
+    assert 0.05 < float(step.norm()) < 0.12
+    assert float(step[1]) == 0
+    assert all(row.stays and row.stuck < 0.003 for row in simulate(clear, Run(tmp_path)))
+
+
+@needs_mujoco
+def test_each_makes_as_much_room_as_its_range_allows(tmp_path: Path):
+    scene, ranges = wedged(0.06, 0.061)
+    steady, rows, nudges = nudged(scene, Run(tmp_path), ranges)
+    assert all(row.stays for row in rows)
+    assert {nudge.id for nudge in nudges} == {"tall_0", "low_0"}
+    for given, found in zip(scene.objects, steady.objects, strict=True):
+        away = (found.t_world_object - given.t_world_object).abs()
+        assert float(away.max()) < 0.0611
+    narrow = {name: dict.fromkeys(("x", "y", "z", "yaw"), (-9.0, -8.9)) for name in ranges}
+    left, rows, nudges = nudged(scene, Run(tmp_path), narrow)
+    assert left is scene
+    assert not any(nudge.done for nudge in nudges)
+
+
+@needs_mujoco
+def test_what_carries_others_is_not_moved_from_under_them(tmp_path: Path):
+    scene, ranges = wedged(0.02, 0.2)
+    carried = piece("cup_0", box(0.1, 0.1, 0.1), (0.5, -3.1), 0.0, GROUND + 0.5)
+    cup = dataclasses.replace(carried, support="low_0")
+    both = dataclasses.replace(scene, objects=(*scene.objects, cup))
+    clear = apart(both, Run(tmp_path), ranges, {"tall_0"})
+    assert torch.equal(clear.objects[1].t_world_object, both.objects[1].t_world_object)
+
+
+@needs_mujoco
+def test_ranges_speak_of_the_underside_wherever_the_mesh_has_its_origin(tmp_path: Path):
+    scene, ranges = floating(0.02)
+    (given,) = scene.objects
+    shift = torch.tensor([0.5, -0.25, 0.1])
+    mesh = dataclasses.replace(given.mesh, verts=given.mesh.verts - shift)
+    place = given.t_world_object + shift
+    moved = dataclasses.replace(given, mesh=mesh, t_world_object=place)
+    _, rows, (nudge,) = nudged(dataclasses.replace(scene, objects=(moved,)), Run(tmp_path), ranges)
+    assert nudge.done, nudge.reason
+    assert rows[0].stays
 
 
 @needs_mujoco

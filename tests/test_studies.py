@@ -41,6 +41,7 @@ from mover_bench.studies.study import STUDIES, ask_of, jobs_of, run_study
 from mover_bench.studies.variants import PARTS, TERMS, VARIANTS, Cut, Variant, frames_of, withheld
 
 SEEDS = "1000-1019"
+SCENES = ("initial", "image", "full", "nudged")
 
 
 def scene(iou: float) -> dict[str, float]:
@@ -193,13 +194,55 @@ def test_every_study_has_a_page_with_its_command_and_plots(name: str, tmp_path: 
     page = run_study(args, launch=Table())[0]
     text = page.read_text()
     assert f"    mover experiment study {name} --seeds 1000,1001\n" in text
-    assert "(paper)" in text or name in ("interactions", "upstream")  # the paper has no such table
+    own = ("interactions", "upstream", "stability", "motion")  # the paper has no such table
+    assert "(paper)" in text or name in own
     for plot in re.findall(r"!\[[^]]*\]\(([^)]*)\)", text):
         assert page.with_name(plot).read_text().startswith("<svg")
     for line in text.splitlines():
         if line.startswith("    mover experiment --set"):
             named = line.split("--presets ")[1].split()
             assert set(named) <= set(VARIANTS)
+
+
+def test_stable_pieces_are_counted_and_those_that_fall_are_named(tmp_path: Path) -> None:
+    def stood(job: Job) -> Ended:
+        chair = {"stands": 1.0, "moved": 0.001, "stuck": 0.0}
+        table = {"stands": 0.0, "moved": 0.04, "stuck": 0.098, "nudge": "nudged"}
+        still = {**table, "stands": 1.0}
+        items = [
+            {"id": "chair_0", "category": "chair"} | dict.fromkeys(SCENES, chair),
+            {"id": "table_0", "category": "table", "initial": table, "image": table,
+             "full": table, "nudged": still},
+        ]  # fmt: skip
+        means = {name: {"stands": 0.5} for name in (*SCENES, "truth")}
+        ended = Table()(job)
+        if job.name == ROOM:
+            return ended
+        tree = json.loads((job.folder / DONE).read_text())
+        (job.folder / DONE).write_text(json.dumps(tree | means | {"objects": items}))
+        return ended
+
+    args = StudyArgs("stability", seeds="1000,1001", out=tmp_path)
+    text = run_study(args, launch=stood)[0].read_text()
+    assert "| robust | 2 / 4 | 50.0 |" in text
+    assert "| robust, nudged | 4 / 4 | 100.0 |" in text
+    assert "| 1001 table_0 | 40 | 98 | nudged |" in text
+    assert "chair_0" not in text
+
+
+def test_a_job_lets_gravity_act_on_what_it_rebuilt(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="needs the extra physics")
+    store_room(Job("rooms", 0, ROOM, tmp_path), trial(), FEW)
+    job = Job("rooms", 0, "stands", tmp_path)
+    rebuild(job, Variant(quick(PRESETS["robust"]), simulated=True), FEW)
+    tree = json.loads((job.folder / DONE).read_text())
+    assert tree["truth"]["stands"] == 1
+    for item in tree["objects"]:
+        assert set(SCENES) <= set(item)
+        for name in SCENES:
+            found = item[name]
+            expected = found["moved"] < 0.01 and found["turned"] < 0.0174533
+            assert found["stands"] == expected
 
 
 def test_the_study_of_all_sets_counts_turned_seats(tmp_path: Path) -> None:

@@ -1,20 +1,21 @@
 """Move pieces that would fall to where they stand, as far as their stated uncertainty allows.
 
 A piece that floats comes down to what carries it, one that is stuck goes where it is pushed, one
-that stands half beside its support goes on to it: gravity says where. A place counts only if it is
-within the range that the result states (scene.json, `uncertainty`), upright, and if the piece and
-all that stood before stay there.
+that stands half beside its support goes on to it: gravity says where. Pieces that stand in each
+other come apart first (apart.py). A place counts only if it is within the range that the result
+states (scene.json, `uncertainty`), upright, and if all that stood before still stay.
 """
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from mover.app.apart import KEYS, Ranges, apart, base_of
 from mover.app.simulate import (
     SimulatedObject,
     SimulationConfig,
@@ -34,18 +35,15 @@ from mover.io.files.fields import read_json
 
 ROUNDS = 3
 LEVEL = math.radians(2)  # [rad], a piece that ends more tilted has toppled on to something
-KEYS = ("x", "y", "z", "yaw")
-Ranges = dict[str, dict[str, tuple[float, float]]]
-"""Lowest and highest place [m] and yaw [rad] of objects by id, where they are stated."""
 
 
 @dataclass(frozen=True)
 class Nudge:
-    """What became of a piece that did not stay."""
+    """What became of a piece that did not stay, or that made room for one."""
 
     id: str
     moved: float
-    """How far it was moved, or would have to be [m]."""
+    """How far it was moved [m]."""
     turned: float
     """... and turned about the vertical [rad]."""
     done: bool
@@ -77,6 +75,8 @@ def nudged(
 ) -> tuple[Scene, tuple[SimulatedObject, ...], tuple[Nudge, ...]]:
     """The scene with pieces nudged, how it stands, and what was done to each that did not stay.
 
+    Pieces that stand in each other are first moved apart, where more of them stay for it.
+
     Args:
         scene: A result.
         run: Its folder keeps the convex pieces.
@@ -84,38 +84,73 @@ def nudged(
         config: How long gravity acts.
         loads: Who sits where.
     """
-    config = config or SimulationConfig()
-    rows = simulate(scene, run, config, loads)
-    told: dict[str, Nudge] = {}
+    trial = _Trial(scene, run, ranges, config or SimulationConfig(), loads)
+    rows = trial.simulated(scene)
+    if not _loose(rows):
+        return scene, rows, ()
+    steady, after, refused = _fallen(trial, scene, rows)
+    if _loose(after):
+        clear = apart(scene, run, ranges, _loose(rows))
+        if clear is not scene:
+            freed = _fallen(trial, clear, trial.simulated(clear))
+            if _stay(rows) <= _stay(freed[1]) and len(_stay(freed[1])) > len(_stay(after)):
+                steady, after, refused = freed
+    refused |= dict.fromkeys(_loose(rows) & _stay(after), "it stays since others made room")
+    return steady, after, _nudges(scene, steady, rows, refused)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """What is tried on a scene as it was given."""
+
+    given: Scene
+    run: Run
+    ranges: Ranges
+    config: SimulationConfig
+    loads: tuple[Load, ...]
+
+    def simulated(self, scene: Scene) -> tuple[SimulatedObject, ...]:
+        """How a scene stands."""
+        return simulate(scene, self.run, self.config, self.loads)
+
+
+_Fallen = tuple[Scene, tuple[SimulatedObject, ...], dict[str, str]]
+"""A scene, how it stands, and why pieces were not moved, by id."""
+
+
+def _stay(rows: Sequence[SimulatedObject]) -> set[str]:
+    return {row.id for row in rows if row.stays}
+
+
+def _loose(rows: Sequence[SimulatedObject]) -> set[str]:
+    return {row.id for row in rows if not row.stays and not row.fixed}
+
+
+def _fallen(trial: _Trial, scene: Scene, rows: tuple[SimulatedObject, ...]) -> _Fallen:
+    """The scene with loose pieces where gravity leaves them, as long as more stay for it."""
+    refused: dict[str, str] = {}
     for _ in range(ROUNDS):
-        loose = [row for row in rows if not row.stays and not row.fixed]
+        loose = _loose(rows)
         if not loose:
             break
-        tried, asked = _where_it_ends(scene, run, config, ranges, {row.id for row in loose})
-        told |= asked
+        tried, why = _where_it_ends(trial, scene, loose)
+        refused |= why
         if tried is scene:
             break
-        after = simulate(tried, run, config, loads)
-        stay = {row.id for row in after if row.stays}
-        if {row.id for row in rows if row.stays} - stay or not stay & {r.id for r in loose}:
-            told |= {
-                n: replace(a, done=False, reason="others would fall")
-                for n, a in asked.items()
-                if a.done
-            }
+        after = trial.simulated(tried)
+        if _stay(rows) - _stay(after) or not _stay(after) & loose:
+            refused |= dict.fromkeys(loose - set(why), "others would fall")
             break
         scene, rows = tried, after
-    return scene, rows, tuple(told.values())
+    return scene, rows, refused
 
 
-def _where_it_ends(
-    scene: Scene, run: Run, config: SimulationConfig, ranges: Ranges, loose: set[str]
-) -> tuple[Scene, dict[str, Nudge]]:
+def _where_it_ends(trial: _Trial, scene: Scene, loose: set[str]) -> tuple[Scene, dict[str, str]]:
     """The scene with each loose piece where gravity leaves it, if its range holds that place."""
-    ends = settled(scene, run, config.seconds)
+    ends = settled(scene, trial.run, trial.config.seconds)
     floor = torch.tensor([0.0, floor_height(scene), 0.0], dtype=torch.float64)
-    pieces, told = list(scene.objects), dict[str, Nudge]()
-    for k, piece in enumerate(scene.objects):
+    pieces, refused = list(scene.objects), dict[str, str]()
+    for k, (piece, given) in enumerate(zip(scene.objects, trial.given.objects, strict=True)):
         if piece.id not in loose:
             continue
         place, turn = ends[k]
@@ -126,32 +161,44 @@ def _where_it_ends(
             piece, t_world_object=there.to(piece.t_world_object),
             yaw=torch.tensor(yaw).to(piece.yaw),
         )  # fmt: skip
-        why = "it falls over" if tilt > LEVEL else _outside(piece, now, ranges.get(piece.id, {}))
-        if not why:
+        stated = trial.ranges.get(piece.id, {})
+        why = "it falls over" if tilt > LEVEL else _outside(given, now, stated)
+        if why:
+            refused[piece.id] = why
+        else:
             pieces[k] = now
-        moved = float((now.t_world_object - piece.t_world_object).norm())
-        turned = float(wrap(now.yaw - piece.yaw).abs())
-        told[piece.id] = Nudge(piece.id, moved, turned, not why, why)
     changed = any(a is not b for a, b in zip(pieces, scene.objects, strict=True))
-    return (replace(scene, objects=tuple(pieces)) if changed else scene), told
+    return (replace(scene, objects=tuple(pieces)) if changed else scene), refused
 
 
-def _outside(
-    before: SceneObject, after: SceneObject, ranges: dict[str, tuple[float, float]]
-) -> str:
+def _outside(given: SceneObject, now: SceneObject, ranges: dict[str, tuple[float, float]]) -> str:
     """Why a place is beyond what is stated of it; empty: it is not."""
     if not ranges:
         return "its uncertainty is not stated"
-    away = [*(after.t_world_object - before.t_world_object).tolist()]
-    away.append(float(wrap(after.yaw - before.yaw)))
-    here = [*before.t_world_object.tolist(), float(before.yaw)]
-    for key, step, place in zip(KEYS, away, here, strict=True):
-        low, high = ranges.get(key, (place, place))
-        if not low - place - 1e-6 <= step <= high - place + 1e-6:
+    here, there = base_of(given), base_of(now)
+    for key in KEYS:
+        step = there[key] - here[key]
+        step = math.remainder(step, 2 * math.pi) if key == "yaw" else step
+        low, high = (limit - here[key] for limit in ranges.get(key, (here[key],) * 2))
+        if not low - 1e-6 <= step <= high + 1e-6:
             unit = "rad" if key == "yaw" else "m"
-            stated = f"stated are {low - place:+.3f} to {high - place:+.3f}"
-            return f"{key} would change by {step:+.3f} {unit}, {stated}"
+            return f"{key} would change by {step:+.3f} {unit}, stated are {low:+.3f} to {high:+.3f}"
     return ""
+
+
+def _nudges(
+    given: Scene, steady: Scene, rows: Sequence[SimulatedObject], refused: dict[str, str]
+) -> tuple[Nudge, ...]:
+    """What was done to each piece that did not stay, or that made room."""
+    found: list[Nudge] = []
+    for before, after in zip(given.objects, steady.objects, strict=True):
+        moved = float((after.t_world_object - before.t_world_object).norm())
+        turned = float(wrap(after.yaw - before.yaw).abs())
+        done = moved > 0 or turned > 0
+        if done or before.id in _loose(rows):
+            why = "" if done else refused.get(before.id, "nothing better was found")
+            found.append(Nudge(before.id, moved, turned, done, why))
+    return tuple(found)
 
 
 def nudge_folder(out: Path, config: SimulationConfig) -> str:

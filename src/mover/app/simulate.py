@@ -116,15 +116,21 @@ def simulate(
     return tuple(found)
 
 
-def _settled(
-    scene: Scene, solids: tuple[Solid, ...], seconds: float, pressed: Mapping[str, Load]
-) -> tuple[list["State"], list["State"], list[float]]:
-    """Where the pieces are before and after, and how deep they were stuck."""
+def modelled(scene: Scene, solids: tuple[Solid, ...]) -> tuple[Any, Any, Any]:
+    """MuJoCo, its model of a scene without looks, and the data of that model at the start."""
     mujoco: Any = import_module("mujoco")
     root, meshes = mjcf_of(scene, solids, looks=False)
     model = mujoco.MjModel.from_xml_string(text_of(root), meshes)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    return mujoco, model, data
+
+
+def _settled(
+    scene: Scene, solids: tuple[Solid, ...], seconds: float, pressed: Mapping[str, Load]
+) -> tuple[list["State"], list["State"], list[float]]:
+    """Where the pieces are before and after, and how deep they were stuck."""
+    mujoco, model, data = modelled(scene, solids)
     start = _states(data, solids)
     stuck = [_stuck(model, data, body_name(solid)) for solid in solids]
     weights = [

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from mover_bench.studies.compare import Row, Table, fill_tables, markdown
-from mover_bench.studies.finished import Finished, Source
+from mover_bench.studies.finished import Finished, Frame, Source
 from mover_bench.studies.study_rows import Ask, Page, Plan
 from mover_bench.studies.variants import STANDS
 
@@ -32,12 +32,19 @@ def stability(ask: Ask, finished: Finished) -> Page:
     return Page(fill_tables([table], finished, ask.seeds), [_share(finished), _fallen(finished)])
 
 
+def _pieces(finished: Finished, stage: str) -> Frame:
+    """All pieces of a scene that were simulated."""
+    columns = ("seed", "object", "stands", "moved", "stuck", "nudge")
+    pieces = finished.objects[finished.objects.stage == stage].reindex(columns=columns)
+    return pieces[pieces.stands.notna()]
+
+
 def _share(finished: Finished) -> str:
     """How many of all pieces stay."""
     rows: list[Sequence[str]] = []
     for stage, label in STAGES.items():
-        pieces = finished.objects[finished.objects.stage == stage]
-        count, stay = len(pieces), int(pieces.stands.sum()) if len(pieces) else 0
+        pieces = _pieces(finished, stage)
+        count, stay = len(pieces), int(pieces.stands.sum())
         share = f"{100 * stay / count:.1f}" if count else "-"
         rows.append([label, f"{stay} / {count}", share])
     table = markdown(["", "stay", "%"], [list(row) for row in rows])
@@ -46,9 +53,9 @@ def _share(finished: Finished) -> str:
 
 def _fallen(finished: Finished) -> str:
     """Pieces of the result that do not stay, and what was done about them."""
-    pieces = finished.objects[finished.objects.stage == "full"]
+    pieces = _pieces(finished, "full")
     rows: list[list[str]] = []
-    for piece in pieces[pieces.stands < 1].itertuples() if len(pieces) else ():
+    for piece in pieces[pieces.stands < 1].itertuples():
         moved = f"{1000 * piece.moved:.0f}"
         stuck = f"{1000 * piece.stuck:.0f}"
         rows.append([f"{piece.seed} {piece.object}", moved, stuck, piece.nudge])

@@ -1,0 +1,138 @@
+"""Pieces that stand in each other come apart: the shortest level way out, within stated ranges.
+
+Gravity alone is no help there: it throws such pieces over. Instead places around each are tried,
+the nearest first, the least certain piece first, until nothing is inside it; if none is free, it
+goes where it is the least deep, and the other piece makes room.
+"""
+
+import math
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mover.app.simulate import modelled
+from mover.core.run import Run
+from mover.core.types import Scene, SceneObject
+from mover.geometry.boxes import box_of
+from mover.io.export.mjcf import body_name
+from mover.io.export.solids import solids_of
+
+TOUCH = 0.002  # [m], so deep is no more than a touch
+RINGS, STEP = 50, 0.01  # places that are tried: rings of so many metres, at most so many
+WAYS = 16  # places on a ring
+PASSES = 3
+KEYS = ("x", "y", "z", "yaw")
+Ranges = dict[str, dict[str, tuple[float, float]]]
+"""Lowest and highest place [m] of the middle of objects' undersides, and yaw [rad], by id."""
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A simulation whose bodies are moved by hand."""
+
+    mujoco: Any
+    model: Any
+    data: Any
+
+    def depths(self) -> dict[int, float]:
+        """How deep each body is in others, the floor left out [m]."""
+        self.mujoco.mj_kinematics(self.model, self.data)
+        self.mujoco.mj_collision(self.model, self.data)
+        found: dict[int, float] = {}
+        for contact in self.data.contact[: self.data.ncon]:
+            pair = [int(self.model.geom_bodyid[geom]) for geom in contact.geom]
+            for body in pair if 0 not in pair else ():
+                found[body] = max(found.get(body, 0.0), -float(contact.dist))
+        return found
+
+    def place(self, body: int) -> Any:  # noqa: ANN401
+        """(x, y) of a free body, to be changed [m]."""
+        start = self.model.jnt_qposadr[self.model.body_jntadr[body]]
+        return self.data.qpos[start : start + 2]
+
+
+def base_of(piece: SceneObject) -> dict[str, float]:
+    """Where the middle of its underside is [m], and its yaw [rad]: what ranges speak of."""
+    box = box_of(piece)
+    x, y, z = box.center.tolist()
+    return {"x": x, "y": y - float(box.size[1]) / 2, "z": z, "yaw": float(piece.yaw)}
+
+
+def apart(scene: Scene, run: Run, ranges: Ranges, loose: Collection[str]) -> Scene:
+    """The scene with pieces that stand in each other moved level, as far as ranges allow.
+
+    Args:
+        scene: A room; what carries others, hangs or has no range stays where it is.
+        run: Its folder keeps the convex pieces.
+        ranges: Where each piece may be.
+        loose: Ids of the pieces that do not stay; they and what they stand in are moved.
+    """
+    solids = solids_of(scene, run)
+    world = _Model(*modelled(scene, solids))
+    carriers = {piece.support for piece in scene.objects}
+    pieces = {
+        world.model.body(body_name(solid)).id: piece
+        for piece, solid in zip(scene.objects, solids, strict=True)
+        if solid.free and piece.id not in carriers and ranges.get(piece.id)
+    }
+    start = {body: np.array(world.place(body)) for body in pieces}
+    depths = world.depths()
+    if not any(depths.get(b, 0.0) > TOUCH for b, p in pieces.items() if p.id in loose):
+        return scene
+    least_certain = sorted(pieces, key=lambda b: -_width(ranges[pieces[b].id]))
+    for _ in range(PASSES):
+        for body in least_certain:
+            if world.depths().get(body, 0.0) > TOUCH:
+                world.place(body)[:] = _way_out(world, body, pieces[body], ranges, start[body])
+    return _moved(scene, {pieces[b].id: world.place(b) - start[b] for b in pieces})
+
+
+def _width(stated: dict[str, tuple[float, float]]) -> float:
+    return sum(high - low for key, (low, high) in stated.items() if key in ("x", "z"))
+
+
+def _way_out(
+    world: _Model, body: int, piece: SceneObject, ranges: Ranges, start: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The nearest place where nothing is inside a body, else where it is the least deep."""
+    base, stated = base_of(piece), ranges[piece.id]
+    x_range, z_range = (stated.get(key, (base[key], base[key])) for key in ("x", "z"))
+    least, best = world.depths().get(body, 0.0), np.array(world.place(body))
+    for ring in _rings():
+        for x, y in ring:
+            if not (_within(base["x"] + x, x_range) and _within(base["z"] - y, z_range)):
+                continue
+            there = start + np.array((x, y))
+            world.place(body)[:] = there
+            deep = world.depths().get(body, 0.0)
+            if deep < least - 1e-6:
+                least, best = deep, there
+        if least <= TOUCH:
+            break
+    return best
+
+
+def _rings() -> Iterator[list[tuple[float, float]]]:
+    """Steps in all directions, the shortest first [m]."""
+    yield [(0.0, 0.0)]
+    angles = [2 * math.pi * way / WAYS for way in range(WAYS)]
+    for ring in range(1, RINGS + 1):
+        yield [(ring * STEP * math.cos(a), ring * STEP * math.sin(a)) for a in angles]
+
+
+def _within(value: float, limits: tuple[float, float]) -> bool:
+    return limits[0] - 1e-6 <= value <= limits[1] + 1e-6
+
+
+def _moved(scene: Scene, steps: dict[str, NDArray[np.float64]]) -> Scene:
+    """The scene after level steps in the simulator's axes."""
+    pieces: list[SceneObject] = []
+    for piece in scene.objects:
+        x, y = steps.get(piece.id, np.zeros(2)).tolist()
+        step = torch.tensor([x, 0.0, -y]).to(piece.t_world_object)
+        pieces.append(replace(piece, t_world_object=piece.t_world_object + step))
+    return replace(scene, objects=tuple(pieces))
