@@ -10,6 +10,7 @@ import torch
 from analytic import FACES, box_verts, boxes_of, given_at
 
 from mover.core.types import Bodies, Camera, Layout, Mesh
+from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.given import Given, given_term
 from mover.furniture.library import PIECES, SIZES, STANDARD, STYLES, canonical, make_piece
 from mover.geometry.camera import tilted, to_camera, to_world
@@ -18,12 +19,12 @@ from mover.geometry.placement import larger
 from mover.geometry.topology import is_closed
 from mover.stages.objects.gather_given import (
     DOUBTS,
-    INWARD,
     common_scale,
-    drawn_in,
+    doubts,
     expected_sizes,
     gather_given,
     room_axis,
+    told_by_people,
 )
 from mover.stages.objects.prepare_objects import levelled
 from mover.stages.people.find_depth import are_shapeless, nearer
@@ -92,10 +93,10 @@ def test_the_axis_of_a_room_is_found_from_rough_yaws() -> None:
     quarters = torch.randint(0, 4, (8,), generator=generator) * (math.pi / 2)
     given = true + quarters + math.radians(15) * torch.randn(8, generator=generator)
     placed = true + quarters + math.radians(4) * torch.randn(8, generator=generator)
-    layout = replace(somewhere(8), yaw=given)
     along = torch.full((8,), 0.9)
-    rough, wide = room_axis(layout, None, along)
-    fine, narrow = room_axis(layout, replace(layout, yaw=placed), along)
+    guess = (given, torch.full((8,), math.radians(20)))
+    rough, wide = room_axis([guess], along)
+    fine, narrow = room_axis([guess, (placed, torch.full((8,), math.radians(8)))], along)
 
     def off(angle: float) -> float:
         return abs(math.remainder(angle - true, math.pi / 2))
@@ -103,7 +104,7 @@ def test_the_axis_of_a_room_is_found_from_rough_yaws() -> None:
     assert off(rough) < math.radians(12)
     assert off(fine) < math.radians(4)
     assert narrow < wide
-    nothing = room_axis(layout, None, torch.zeros(8))[1]
+    nothing = room_axis([guess], torch.zeros(8))[1]
     assert nothing > 3 * wide
 
 
@@ -126,16 +127,39 @@ def test_standards_are_those_of_the_classes_and_near_what_the_library_has() -> N
 
 def test_doubt_follows_the_misfit_within_bounds() -> None:
     objects = boxes_of(("table", "chair", "sofa"), [(1.0, 0.7, 1.0)] * 3)
-    given = gather_given(objects, somewhere(3), somewhere(3), torch.tensor([0.001, 0.25, 3.0]))
+    given = gather_given(objects, somewhere(3), somewhere(3), torch.tensor([1e-6, 0.25, 3.0]))
     assert given.doubt.tolist() == pytest.approx([DOUBTS[0], 2.5, DOUBTS[1]])
 
 
-def test_boxes_are_drawn_in_only_where_the_shape_does_not_fit() -> None:
-    boxes = torch.tensor([[10.0, 20.0, 110.0, 70.0]] * 2)
-    found = drawn_in(boxes, torch.tensor([1.0, 3.0]))
-    assert torch.equal(found[0], boxes[0])
-    size = torch.tensor([100.0, 50.0, 100.0, 50.0])
-    assert torch.allclose(found[1], boxes[1] + torch.tensor(INWARD) * size)
+def test_an_object_that_fits_among_shapes_that_do_not_is_doubted_more_than_alone() -> None:
+    energy = torch.tensor([0.01, 0.4, 0.4, 0.3, 0.9])
+    found = doubts(energy)
+    assert float(found[0]) == pytest.approx((0.01 * 0.4) ** 0.5 / 0.1)
+    assert found[[1, 2, 4]].tolist() == pytest.approx([4.0, 4.0, DOUBTS[1]])
+    assert torch.allclose(doubts(torch.full((3,), 0.01)), torch.full((3,), 0.1))
+
+
+def test_of_what_people_use_a_guess_says_less_beside_them() -> None:
+    given = replace(given_at(somewhere(3)), doubt=torch.tensor([4.0, 4.0, 4.0]))
+    touched = ContactPoints(
+        object_of=torch.tensor([1]), points=torch.zeros(1, 4, 2, 3),
+        weight=torch.ones(1, 4, 2), bodies=torch.ones(1), heading=torch.zeros(1, 2),
+    )  # fmt: skip
+    trust = torch.full((3,), 0.25)
+    assert told_by_people(given, trust, touched).doubt.tolist() == [4.0, 1.0, 4.0]
+    assert told_by_people(given, trust, None) is given
+
+
+def test_doubt_counts_for_places_and_sizes_but_not_beyond_one_for_yaws() -> None:
+    layout = somewhere()
+    given = given_at(layout)
+    turned = replace(layout, yaw=layout.yaw + 0.4)
+    larger_one = replace(layout, log_scale=layout.log_scale + 0.2)
+    for doubt, yaw, size in ((0.5, 0.5, 0.5), (1.0, 1.0, 1.0), (6.0, 1.0, 6.0)):
+        some = replace(given, doubt=torch.tensor([doubt]))
+        usual = replace(given, doubt=torch.ones(1))
+        assert cost(some, turned) == pytest.approx(yaw * cost(usual, turned))
+        assert cost(some, larger_one) == pytest.approx(size * cost(usual, larger_one))
 
 
 @pytest.mark.parametrize("name", PIECES)
@@ -172,7 +196,7 @@ def test_furniture_tells_how_large_the_room_is(large: float) -> None:
     start = replace(true, t_world_object=true.t_world_object * error.exp())
     off = error + 0.08 * torch.randn(count, 3, generator=generator)
     found = Layout(true.t_world_object * large, true.yaw, math.log(large) - off)
-    given = gather_given(objects, start, found)
+    given = gather_given(objects, start, found, torch.full((count,), 0.1))
     scale = common_scale(found, given, 0.055)
     assert abs(scale - math.log(large)) < 0.03
     assert common_scale(found, given, 0.0) == 0

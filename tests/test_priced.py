@@ -16,7 +16,7 @@ from mover.energy.config import Adam, SceneConfig, SceneWeights
 from mover.energy.fused.energy import energy_function, energy_of_rows
 from mover.energy.minimize import minimize
 from mover.energy.objective import scene_energy
-from mover.energy.terms.bbox import LEAST, UNKNOWN
+from mover.energy.terms.bbox import LEAST, LIKELY, UNKNOWN
 from mover.energy.terms.depth import DepthRange
 from mover.geometry.kernels.start import use_threads
 from mover.geometry.topology import edges_of
@@ -158,6 +158,7 @@ class TestAgreement:
         sides = image.sides.clone()
         sides[0, 1] = sides[1] = UNKNOWN
         sides[2, ::2] = sides[0, 2] = LEAST
+        sides[2, 1] = sides[0, 3] = LIKELY
         trust = torch.tensor([0.2, 1.0, 0.7])
         image = replace(image, keep=keep, masks=masks, sides=sides, trust=trust)
         inputs = replace(inputs, image=image)

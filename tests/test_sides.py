@@ -6,7 +6,7 @@ import pytest
 import torch
 from analytic import make_inputs
 
-from mover.energy.terms.bbox import LEAST, SEEN, SOFT, UNKNOWN, bbox_term
+from mover.energy.terms.bbox import HIDDEN, LEAST, LIKELY, SEEN, SOFT, UNKNOWN, bbox_term
 from mover.stages.config import ImageConfig
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
 
@@ -25,7 +25,7 @@ def box_of(mask):
     return torch.tensor([x.min(), y.min(), x.max() + 1, y.max() + 1]).float()
 
 
-def sides_of(first, *others, form="robust", people=None, behind=()):
+def sides_of(first, *others, form="robust", people=None, behind=(), bounded=False):
     """What is known of the first of some masks."""
     masks = torch.stack([first, *others])
     hidden_by = torch.zeros(len(masks), len(masks), dtype=torch.bool)
@@ -36,7 +36,7 @@ def sides_of(first, *others, form="robust", people=None, behind=()):
     boxes = torch.stack([box_of(m) for m in masks])
     nobody = torch.zeros_like(first) if people is None else people
     inputs = ImageInputs(camera, boxes, seen, masks, nobody, hidden_by)
-    return find_image_cues(inputs, ImageConfig(32, form, 0.1)).sides[0].tolist()
+    return find_image_cues(inputs, ImageConfig(32, form, 0.1, bounded)).sides[0].tolist()
 
 
 class TestWhatIsKnown:
@@ -46,6 +46,11 @@ class TestWhatIsKnown:
     def test_what_stands_in_front_makes_a_side_a_lower_bound(self):
         sofa = rectangle(90, 20, 150, 90)
         assert sides_of(rectangle(50, 30, 90, 80), sofa) == [SEEN, SEEN, LEAST, SEEN]
+
+    def test_where_reaching_beyond_is_bounded_the_border_of_the_image_still_bounds_nothing(self):
+        sofa = rectangle(90, 20, 150, 90)
+        found = sides_of(rectangle(0, 30, 90, 80), sofa, bounded=True)
+        assert found == [LEAST, SEEN, LIKELY, SEEN]
 
     def test_so_do_people_and_the_border_of_the_image(self):
         body = rectangle(50, 80, 90, 120)
@@ -84,13 +89,14 @@ class TestPrice:
         corners = torch.tensor([[drawn[:2], drawn[2:]]])
         return float(bbox_term(corners, self.detected, torch.tensor([sides]), 200.0, "robust"))
 
+    @pytest.mark.parametrize("known", [LEAST, LIKELY])
     @pytest.mark.parametrize("side", range(4))
-    def test_a_lower_bound_is_priced_as_a_seen_side_where_the_object_falls_short(self, side):
+    def test_a_lower_bound_is_priced_as_a_seen_side_where_the_object_falls_short(self, side, known):
         short = self.detected[0].clone()
         short[side] += 8.0 if side < 2 else -8.0
         sides = [SEEN] * 4
         expected = self.price(short.tolist(), sides)
-        sides[side] = LEAST
+        sides[side] = known
         assert self.price(short.tolist(), sides) == expected
         assert expected == pytest.approx((0.2**2 + SOFT**2) ** 0.5 - SOFT, rel=1e-5)
 
@@ -101,6 +107,18 @@ class TestPrice:
         sides = [SEEN] * 4
         sides[side] = LEAST
         assert self.price(wide.tolist(), sides) == 0
+
+    @pytest.mark.parametrize("side", range(4))
+    def test_beyond_a_side_that_may_be_hidden_it_costs_less_and_less(self, side):
+        def beyond(far, known):
+            wide = self.detected[0].clone()
+            wide[side] += -far if side < 2 else far
+            return self.price(wide.tolist(), [known if k == side else SEEN for k in range(4)])
+
+        costs = [beyond(far, LIKELY) for far in (0.5, 5.0, 50.0, 5000.0)]
+        assert costs[0] == pytest.approx(beyond(0.5, SEEN), rel=0.2)
+        assert costs == sorted(costs)
+        assert 0.9 * HIDDEN < costs[-1] < HIDDEN
 
     def test_an_unknown_side_never_costs(self):
         for off in (-20.0, 20.0):

@@ -121,14 +121,17 @@ RELEASE = Config(
 
 _GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300, hand_reach=0.25)
 _SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
-_ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0, distance=0.02, wall=0.01)
-_ROBUST_FULL = SceneWeights(1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.01)
+_ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0, distance=0.02, wall=0.01, given=0.02)
+_ROBUST_FULL = SceneWeights(
+    1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.01, given=0.02
+)
 
 ROBUST = Config(
     correct_depth=True,
     foot_contacts=FootContactConfig(speed=0.6),
+    prepare=PrepareConfig(level_feet=True),
     image=ImageConfig(
-        128, "robust", hidden=0.2, borders=(-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
+        128, "robust", hidden=0.2, bounded=True, borders=(-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
     ),
     layout=PlaceConfig(
         _ROBUST_IMAGE, "robust", BatchedBFGS(), yaws=16, distances=(0.9, 1.1), short=_SHORT,
@@ -145,6 +148,7 @@ ROBUST = Config(
     ),
     outer_iterations=1,
     slide_to_floor=True,
+    height_spread=0.055,
     silhouette_confidence=True,
 )  # fmt: skip
 

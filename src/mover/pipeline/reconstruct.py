@@ -57,7 +57,7 @@ from mover.stages.objects.find_image_cues import (
     image_evidence,
     order_of,
 )
-from mover.stages.objects.gather_given import common_scale, drawn_in, gather_given
+from mover.stages.objects.gather_given import common_scale, gather_given, told_by_people
 from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
 from mover.stages.objects.place_objects import estimate_size_prior, inlier_weights, place_objects
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
@@ -213,19 +213,19 @@ def as_given(context: ReconstructionContext, camera: Camera) -> Layout:
 def with_given(
     image: ImageCues, context: ReconstructionContext, given: Layout, before: SceneState | None
 ) -> ImageCues:
-    """The image's cues with what is known of the objects before they are seen."""
+    """The image's cues with what is known of the objects before they are seen.
+
+    The first descent goes without it: what the image leaves there tells how far it is believed.
+    """
     objects = context.prepared.objects
-    if not context.config.place.weights.given:
+    if before is None or not context.config.place.weights.given:
         return image
-    if before is None:
-        return replace(image, given=gather_given(objects, given))
     misfit = only(bbox=1.0, silhouette=1.0)
     energy = energy_function(objects, before.camera, image, NOBODY, SceneConfig(misfit, "robust"))(
         alone(before.placed.layout)
     )
     left = energy.per_item[0].detach()
-    known = gather_given(objects, given, before.placed.layout, left)
-    return replace(image, given=known, boxes=drawn_in(image.boxes, known.doubt))
+    return replace(image, given=gather_given(objects, given, before.placed.layout, left))
 
 
 def with_refined_camera(
@@ -295,6 +295,8 @@ def placed_with_people(
     humans = cues_in_windows(state.cues, contacts, image.views, state.camera)
     if config.silhouette_confidence:
         image = replace(image, trust=inlier_weights(image_energy))
+        if image.given is not None:
+            image = replace(image, given=told_by_people(image.given, image.trust, contacts))
     seats = ReinitInputs(objects, state.camera, humans, image.masks, state.placed.layout)
     starts = alone(run.stage(by_release, seats, config.reinit))
     if config.layout.num_hypotheses > 1:

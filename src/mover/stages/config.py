@@ -166,6 +166,8 @@ class ImageConfig:
     """`release`: beyond the border is background; `robust`: hidden sides are lower bounds."""
     hidden: Share = 0.5
     """Share of the strip beyond a side from which on more may be hidden there (`robust`)."""
+    bounded: bool = False
+    """Reaching beyond such a side costs, up to a bound; else it is free (`robust`)."""
     borders: tuple[Annotated[float, float_in(-100, 100)], ...] = ()
     """By how much outlines of masks may be off, with 0 among them [px of the image] (`robust`)."""
 

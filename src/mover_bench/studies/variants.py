@@ -83,11 +83,13 @@ def _unlined(config: Config) -> Config:
     return replace(config, layout=layout, place=place)
 
 
-def as_given(config: Config) -> Config:
-    """With the term for how objects were given, level feet, and the scale from the furniture."""
-    layout = replace(config.layout, weights=replace(config.layout.weights, given=0.02))
-    prepare = replace(config.prepare, level_feet=True)
-    return weighed(replace(config, layout=layout, prepare=prepare, height_spread=0.055), given=0.02)
+def kind_inputs(config: Config) -> Config:
+    """Without what is meant for the inputs of today's tools, as `robust` was before."""
+    layout = replace(config.layout, weights=replace(config.layout.weights, given=0.0))
+    prepare = replace(config.prepare, level_feet=False)
+    image = replace(config.image, bounded=False)
+    kind = replace(config, layout=layout, prepare=prepare, image=image, height_spread=0.0)
+    return weighed(kind, given=0.0)
 
 
 _SILENT = {"contact": 0.0, "heading": 0.0}
@@ -141,10 +143,12 @@ PARTS: dict[str, Variant] = {
 """`robust` without one of the parts that it adds to the paper."""
 
 TOOLS: dict[str, Variant] = {
-    "with-given": Variant(as_given(ROBUST)),
-    "with-given-no-scale": Variant(replace(as_given(ROBUST), height_spread=0.0)),
+    "no-given": Variant(kind_inputs(ROBUST)),
+    "no-scale": Variant(replace(ROBUST, height_spread=0.0)),
+    "no-level-feet": Variant(replace(ROBUST, prepare=replace(ROBUST.prepare, level_feet=False))),
+    "no-bounded-sides": Variant(replace(ROBUST, image=replace(ROBUST.image, bounded=False))),
 }
-"""`robust` with what is meant for the inputs of today's tools, and without one part of it."""
+"""`robust` without all that is meant for the inputs of today's tools, and without parts of it."""
 
 NOBODY: dict[str, Variant] = {"nobody": Variant(ROBUST, "nobody")}
 SINGLE: dict[str, Variant] = {

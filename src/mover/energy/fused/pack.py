@@ -38,7 +38,8 @@ def kernel_of(
     given.people = _people(humans, weights, asked, share)
     given.boxes = array(image.boxes.contiguous(), "vec4")
     given.within = array((image.sides != bbox.UNKNOWN).float(), "vec4")
-    given.beyond = array((image.sides == bbox.SEEN).float(), "vec4")
+    prices = torch.tensor([0.0, torch.inf, 0.0, bbox.HIDDEN])  # by what is known of a side
+    given.beyond = array(prices[image.sides], "vec4")
     given.facts = wp.from_torch(_facts(objects, image, humans, weights))
     given.turn = wp.mat33(*camera.R_cam_world.flatten().tolist())
     K = camera.K.tolist()

@@ -6,7 +6,9 @@ Paper:     Proj_i is the projected 3D box (its eight corners); an l1 norm, in pi
 Release:   Proj_i is the extent of the projected mesh; smooth l1 with a knee of one pixel.
 Robust:    extent of the mesh, all four sides, each divided by the box's size \sqrt{w h}, so that
            near and far objects count alike. Where the image's border or something in front may hide
-           more of the object, it reaches at least as far as it is seen, and may reach farther.
+           more of the object, it reaches at least as far as it is seen, and may reach farther:
+           beyond the border at no price, behind something at a bounded one, since beside many
+           sides something stands that hides nothing of it.
 """
 
 import torch
@@ -17,9 +19,11 @@ from mover.core.devices import constant
 from mover.energy.config import Variant
 
 WIDTH = 640.0  # [px], the image width at which the weights of the paper have their meaning
-UNKNOWN, SEEN, LEAST = 0, 1, 2
-"""What is known of a side: nothing, where it is, or how far the object reaches at least."""
+UNKNOWN, SEEN, LEAST, LIKELY = range(4)
+"""What is known of a side: nothing, where it is, how far the object reaches at least, or where it
+is unless something in front hides more."""
 SOFT = 0.01  # of a box's size: half width of the rounded tip of the robust price
+HIDDEN = 0.05  # the most that an object pays for reaching beyond a side that may be hidden
 
 
 def bbox_term(
@@ -35,7 +39,7 @@ def bbox_term(
     Args:
         pixels: Projected corners (`paper`) or vertices [px].
         detected: x_min, y_min, x_max, y_max [px].
-        sides: `UNKNOWN`, `SEEN` or `LEAST`; an object without a box knows none and costs nothing.
+        sides: `UNKNOWN`, `SEEN`, `LEAST` or `LIKELY`; an object without a box costs nothing.
         width: Width of the image [px].
         form: How it is priced; [px at 640] for `paper` and `release`, else box sizes.
         wider: How far the true sides lie outside the detected ones [px] (`robust` only).
@@ -45,8 +49,11 @@ def bbox_term(
         size = (detected[:, 2:] - detected[:, :2]).clamp_min(1).prod(-1, keepdim=True).sqrt()
         outward = constant((-1.0, -1.0, 1.0, 1.0), detected)
         off = (drawn - (detected + wider * outward)) / size
-        counts = (sides == SEEN) | ((sides == LEAST) & (off * outward <= 0))
-        return (((off.square() + SOFT**2).sqrt() - SOFT) * counts).sum(-1)
+        price = (off.square() + SOFT**2).sqrt() - SOFT
+        beyond = (sides == LIKELY) & (off * outward > 0)
+        price = torch.where(beyond, HIDDEN * price / (HIDDEN + price), price)
+        free = (sides == UNKNOWN) | ((sides == LEAST) & (off * outward > 0))
+        return (price * ~free).sum(-1)
     off = (_corner_and_width(drawn) - _corner_and_width(detected)).abs() * (WIDTH / width)
     if form == "release":
         off = torch.where(off < 1, 0.5 * off.square(), off - 0.5)

@@ -1,6 +1,7 @@
 r"""Objects stay about as they were given, of usual sizes, along the room (not in the paper).
 
-Price:     L_given = \sum_i d_i (P_i^{place} + P_i^{yaw} + P_i^{axis} + P_i^{size}), each in nats
+Price:     L_given = \sum_i d_i (P_i^{place} + P_i^{size}) + \min(d_i, 1) (P_i^{yaw} + P_i^{axis}),
+           each in nats
 Place:     2 \log(1 + \delta^2 / 3 \sigma^2), \delta = \log \|t_i\| / \|t_i^{init}\|, a Student t: a
            guess of a distance is off by some per cent, seldom by more, never by metres.
 Yaw:       the guess is off by some 20 degrees, one in ten is turned by a quarter or a half.
@@ -8,7 +9,8 @@ Axis:      most furniture stands along one of two directions of the room.
 Size:      r^T \Lambda r / 2 with r the logarithms of the three sizes less those expected: of the
            given mesh and of the standard dimensions of its class, each with its spread.
 Doubt:     d_i grows with what is left of the image's energy where the object fits best: a shape or
-           a mask that does not fit tells by so much less where the object stands.
+           a mask that does not fit tells by so much less where the object stands. Which way it
+           faces, the worst outline still tells better than a guess.
 
 Nothing here is hard: each price is bounded or grows slowly, so that a piece that was given metres
 away or turned round is found as before where its shape fits or people tell.
@@ -26,6 +28,7 @@ from mover.core.types import Layout
 AWAY = 0.07  # standard deviation of the logarithm of a given distance
 TURN = math.radians(20)  # of a given yaw [rad]
 FLIPPED = 0.1  # share of yaws that are off by a further quarter or half turn
+TURNS = 1.0  # largest doubt that counts for yaws
 ANY = 0.01  # and of those that are off by anything
 
 
@@ -53,9 +56,9 @@ class Given:
 
 def given_term(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
     """How far places, yaws and sizes are from what is expected [nats, times the doubt]."""
-    return given.doubt * (
-        _place(layout, given) + _yaw(layout, given) + _axis(layout, given) + _size(layout, given)
-    )
+    turned = _yaw(layout, given) + _axis(layout, given)
+    placed = _place(layout, given) + _size(layout, given)
+    return given.doubt.clamp_max(TURNS) * turned + given.doubt * placed
 
 
 def _place(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:

@@ -1,14 +1,14 @@
 """What the clean image says about each object: its box, its mask, and what is unknown."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.types import Camera, Capture, Masks
 from mover.energy.objective import ImageCues
-from mover.energy.terms.bbox import LEAST, SEEN, UNKNOWN
+from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.terms.border import borders_of
 from mover.energy.terms.silhouette import outline_root
 from mover.geometry.crops import area_mean, crop_views
@@ -106,8 +106,7 @@ def find_image_cues(
     keep = (hidden < 1e-6) & inside & known
     sides = torch.where(inputs.seen, SEEN, UNKNOWN).unsqueeze(-1).expand(-1, 4)
     if config.form == "robust":
-        unsure = (sides == SEEN) & ~_seen_sides(inputs, others, config.hidden)
-        sides = torch.where(unsure, LEAST, sides)
+        sides = torch.where(sides == SEEN, _sides(inputs, others, config), sides)
     trust = torch.ones(len(own))
     outline = outline_root(own) if config.form == "release" else None
     borders = None
@@ -130,21 +129,22 @@ def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:
     return torch.stack(rows)
 
 
-def _seen_sides(
-    inputs: ImageInputs, others: Bool[Tensor, "objects h w"], hidden: float
-) -> Bool[Tensor, "objects 4"]:
-    """Sides of boxes that neither the image's border nor something in front may cut off.
+def _sides(
+    inputs: ImageInputs, others: Bool[Tensor, "objects h w"], config: ImageConfig
+) -> Int[Tensor, "objects 4"]:
+    """What is known of the sides of boxes, which the image's border or something else may cut off.
 
     A table's legs may be hidden where nothing is in front of most of its top's lower edge: a small
     share is enough.
     """
     size = inputs.boxes.new_tensor([inputs.camera.width, inputs.camera.height])
     low, high = inputs.boxes[:, :2] > BORDER, inputs.boxes[:, 2:] < size - BORDER
-    free = torch.cat([low, high], -1)
-    return free & torch.stack([
-        torch.stack([_share(others[i], _strip(box, side)) < hidden for side in range(4)])
+    inside = torch.cat([low, high], -1)
+    free = torch.stack([
+        torch.stack([_share(others[i], _strip(box, side)) < config.hidden for side in range(4)])
         for i, box in enumerate(inputs.boxes)
     ])  # fmt: skip
+    return torch.where(inside, torch.where(free, SEEN, LIKELY if config.bounded else LEAST), LEAST)
 
 
 def _strip(box: Float[Tensor, "4"], side: int) -> Float[Tensor, "4"]:

@@ -1,52 +1,79 @@
 """What is known of the furniture before it is seen: as given, of standard sizes, along axes."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.types import Layout, Objects
+from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.given import AWAY, TURN, Given
 from mover.furniture.library import STANDARD, WALL_PIECES
 
 SIZE = 0.1  # standard deviation of the logarithm of each given size
 COMMON = 0.06  # and of what the three have in common
 FIT = 0.1  # image energy (robust form) of a shape that fits
-DOUBTS = (0.05, 4.0)  # least and largest doubt
-UNSEEN = 0.2  # doubt before anything was placed
+DOUBTS = (0.05, 8.0)  # least and largest doubt
+LOOSE = math.radians(8)  # how well the image alone turns objects of a doubt of 1 [rad]
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
-INWARD = (0.03, 0.015, -0.03, 0.0)  # by which sides of boxes lie inside, of width and height
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
 DIRECTIONS = 90  # that are tried within a quarter turn
 
 
 def gather_given(
-    objects: Objects,
-    start: Layout,
-    layout: Layout | None = None,
-    energy: Float[Tensor, " objects"] | None = None,
+    objects: Objects, start: Layout, layout: Layout, energy: Float[Tensor, " objects"]
 ) -> Given:
     """The evidence of `terms.given`.
 
     Args:
         objects: The furniture, as large as it was given.
         start: As it was given, in the world as it is known now.
-        layout: Where it was placed since; None: nowhere yet.
-        energy: What is left of the image's energy there, per object; None: not known.
+        layout: Where it was placed since, by the image.
+        energy: What is left of the image's energy there.
     """
     mean, precision = expected_sizes(objects)
     along = torch.tensor([OFTEN if c in WALL_PIECES else SELDOM for c in objects.categories])
-    axis, spread = room_axis(start, layout, along)
-    sharp = 1 / (4 * math.hypot(SQUARE, spread)) ** 2
     known = torch.ones_like(start.yaw)
-    doubt = UNSEEN * known if energy is None else (energy / FIT).clamp(*DOUBTS)
+    doubt = doubts(energy)
+    found = (LOOSE * (0.1 + doubt).sqrt()).clamp(SQUARE, TURN)
+    axis, spread = room_axis([(start.yaw, TURN * known), (layout.yaw, found)], along)
+    sharp = 1 / (4 * math.hypot(SQUARE, spread)) ** 2
     return Given(
         distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=along.to(known),
         sharpness=sharp * known, axis=axis * known, log_scale=mean, precision=precision,
         doubt=doubt,
     )  # fmt: skip
+
+
+def doubts(energy: Float[Tensor, " objects"]) -> Float[Tensor, " objects"]:
+    """How little the image tells of each object, see `terms.given`.
+
+    A wrong shape can fit well where something hides half of it. So an object that fits better than
+    the room's usual one is doubted as the geometric mean of both: shapes of one tool are alike.
+    """
+    usual = energy.median().clamp_min(1e-6)
+    return (torch.where(energy < usual, (energy * usual).sqrt(), energy) / FIT).clamp(*DOUBTS)
+
+
+def told_by_people(
+    given: Given, trust: Float[Tensor, " objects"], touches: ContactPoints | None
+) -> Given:
+    """The same, with less doubt of what people use: they tell where it stands, not its outline.
+
+    Args:
+        given: What is known before the people are heard.
+        trust: Weight of each silhouette beside them.
+        touches: What they touch.
+    """
+    if touches is None:
+        return given
+    index = touches.object_of
+    less = given.doubt[index] * trust[index]
+    return replace(given, doubt=given.doubt.index_copy(0, index, less))
 
 
 def expected_sizes(
@@ -63,19 +90,6 @@ def expected_sizes(
     precision = torch.linalg.inv(own).to(usual) + torch.diag_embed(sharp)
     mean = torch.linalg.solve(precision, (sharp * usual).unsqueeze(-1)).squeeze(-1)
     return mean, precision
-
-
-def drawn_in(
-    boxes: Float[Tensor, "objects 4"], doubt: Float[Tensor, " objects"]
-) -> Float[Tensor, "objects 4"]:
-    """Detected boxes as meshes fill them that touch their own box with few points only [px].
-
-    A warped or rounded mesh of the true size fills less of the image than the true piece does;
-    to fill all of it, it would have to be too large and too near.
-    """
-    size = (boxes[:, 2:] - boxes[:, :2]).repeat(1, 2)
-    share = (doubt - 1).clamp(0, 1)[:, None] * boxes.new_tensor(INWARD)
-    return boxes + share * size
 
 
 def common_scale(layout: Layout, given: Given, spread: float) -> float:
@@ -106,17 +120,19 @@ def common_scale(layout: Layout, given: Given, spread: float) -> float:
 
 
 def room_axis(
-    start: Layout, layout: Layout | None, along: Float[Tensor, " objects"]
+    said: Sequence[tuple[Float[Tensor, " objects"], Float[Tensor, " objects"]]],
+    along: Float[Tensor, " objects"],
 ) -> tuple[float, float]:
     """The direction along which most furniture stands, up to quarter turns, and its spread [rad].
 
-    Given yaws are rough and each says little; placed ones say more.
+    Args:
+        said: Yaws of all objects with their spreads, from sources of their own [rad].
+        along: Chance that each stands along it.
     """
     tried = torch.arange(DIRECTIONS) * (math.pi / 2 / DIRECTIONS)
     chance = torch.zeros(DIRECTIONS)
-    said = [(start.yaw, TURN)] if layout is None else [(start.yaw, TURN), (layout.yaw, TURN / 2)]
     for yaw, spread in said:
-        sharp = torch.tensor(1 / (4 * spread) ** 2)
+        sharp = (1 / (4 * spread.cpu().float()) ** 2)[:, None]
         off = (4 * (yaw.cpu().float()[:, None] - tried)).cos() - 1
         density = (sharp * off).exp() / torch.special.i0e(sharp)
         chance += (1 - along[:, None] + along[:, None] * density).log().sum(0)

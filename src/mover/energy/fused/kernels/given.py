@@ -93,9 +93,9 @@ class Given:
     boxes: wp.array(dtype=wp.vec4)
     """Detected boxes [px]."""
     within: wp.array(dtype=wp.vec4)
-    """Whether it costs that the object does not reach a side."""
+    """Whether a side is known, and costs."""
     beyond: wp.array(dtype=wp.vec4)
-    """Whether it costs that it sticks out."""
+    """The most that it costs to stick out of a side."""
     facts: wp.array2d(dtype=wp.float32)
     turn: wp.mat33
     """From the world to the camera."""

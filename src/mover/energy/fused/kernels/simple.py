@@ -42,13 +42,16 @@ def side_of_box(
     off = (at[axis] / z * focal + given.lens[axis + 2] - known) / size
     length = wp.sqrt(off * off + soft * soft)
     outside = off * wp.where(k < 2, -1.0, 1.0) > 0.0
-    counts = wp.where(outside, given.beyond[p.thing][k], given.within[p.thing][k])
+    most = wp.where(outside, given.beyond[p.thing][k], wp.inf)
+    cost = length - soft
+    share = wp.where(most < wp.inf, most / wp.max(most + cost, 1.0e-9), 1.0)
+    counts = given.within[p.thing][k] * share * share
     pull = counts * off / (length * size) * focal / z
     force = wp.vec3(0.0, 0.0, wp.where(at[2] >= NEAR, -at[axis] / z * pull, 0.0))
     force[axis] = pull
     arm = wp.cw_mul(given.things.verts[given.things.starts[p.thing, VERTS] + v], p.scale)
     slope = slope_of(wp.transpose(p.view) * force, arm)
-    return counts * (length - soft), slope
+    return given.within[p.thing][k] * share * cost, slope
 
 
 @wp.func
