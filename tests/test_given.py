@@ -10,6 +10,7 @@ import torch
 from analytic import FACES, box_verts, boxes_of, given_at
 
 from mover.core.types import Bodies, Camera, Layout, Mesh
+from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.given import Given, given_term
 from mover.furniture.library import PIECES, SIZES, STANDARD, STYLES, canonical, make_piece
@@ -19,6 +20,8 @@ from mover.geometry.placement import larger
 from mover.geometry.topology import is_closed
 from mover.stages.objects.gather_given import (
     DOUBTS,
+    UNFIT,
+    believed_sides,
     common_scale,
     doubts,
     expected_sizes,
@@ -137,6 +140,12 @@ def test_an_object_that_fits_among_shapes_that_do_not_is_doubted_more_than_alone
     assert float(found[0]) == pytest.approx((0.01 * 0.4) ** 0.5 / 0.1)
     assert found[[1, 2, 4]].tolist() == pytest.approx([4.0, 4.0, DOUBTS[1]])
     assert torch.allclose(doubts(torch.full((3,), 0.01)), torch.full((3,), 0.1))
+
+
+def test_a_side_that_may_be_hidden_bounds_nothing_of_a_shape_that_fits() -> None:
+    sides = torch.tensor([[SEEN, LEAST, LIKELY, UNKNOWN]] * 2)
+    found = believed_sides(sides, torch.tensor([UNFIT - 0.01, UNFIT + 0.01]))
+    assert found.tolist() == [[SEEN, LEAST, LEAST, UNKNOWN], sides[1].tolist()]
 
 
 def test_of_what_people_use_a_guess_says_less_beside_them() -> None:

@@ -57,7 +57,12 @@ from mover.stages.objects.find_image_cues import (
     image_evidence,
     order_of,
 )
-from mover.stages.objects.gather_given import common_scale, gather_given, told_by_people
+from mover.stages.objects.gather_given import (
+    believed_sides,
+    common_scale,
+    gather_given,
+    told_by_people,
+)
 from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
 from mover.stages.objects.place_objects import estimate_size_prior, inlier_weights, place_objects
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
@@ -118,10 +123,10 @@ def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str
     people, state = with_common_scale(context, people, state)
     state = gathered(context, people, state)
     image_energy = state.placed.energy[0]
-    state = placed_with_people(context, assigned(context, people, state), image_energy)
+    state = placed_with_people(context, people, assigned(context, people, state), image_energy)
     for _ in range(config.outer_iterations):
         state = assigned(context, people, with_order(context, state))
-        state = placed_with_people(context, state, image_energy)
+        state = placed_with_people(context, people, state, image_energy)
     room = room_of(context, state, people)
     return with_proposals(room, capture, config, run, people, tops_of(context, state))
 
@@ -218,14 +223,16 @@ def with_given(
     The first descent goes without it: what the image leaves there tells how far it is believed.
     """
     objects = context.prepared.objects
+    free = replace(image, sides=believed_sides(image.sides, torch.zeros_like(image.trust)))
     if before is None or not context.config.place.weights.given:
-        return image
+        return free
     misfit = only(bbox=1.0, silhouette=1.0)
-    energy = energy_function(objects, before.camera, image, NOBODY, SceneConfig(misfit, "robust"))(
+    energy = energy_function(objects, before.camera, free, NOBODY, SceneConfig(misfit, "robust"))(
         alone(before.placed.layout)
     )
     left = energy.per_item[0].detach()
-    return replace(image, given=gather_given(objects, given, before.placed.layout, left))
+    known = gather_given(objects, given, before.placed.layout, left)
+    return replace(image, given=known, sides=believed_sides(image.sides, known.doubt))
 
 
 def with_refined_camera(
@@ -283,7 +290,10 @@ def assigned(context: ReconstructionContext, people: PeopleState, state: SceneSt
 
 
 def placed_with_people(
-    context: ReconstructionContext, state: SceneState, image_energy: Float[Tensor, " objects"]
+    context: ReconstructionContext,
+    people: PeopleState,
+    state: SceneState,
+    image_energy: Float[Tensor, " objects"],
 ) -> SceneState:
     """One descent of the whole of Eq. 1."""
     objects, config, run = context.prepared.objects, context.config, context.run
@@ -295,7 +305,7 @@ def placed_with_people(
     humans = cues_in_windows(state.cues, contacts, image.views, state.camera)
     if config.silhouette_confidence:
         image = replace(image, trust=inlier_weights(image_energy))
-        if image.given is not None:
+        if image.given is not None and not are_shapeless(people.bodies):
             image = replace(image, given=told_by_people(image.given, image.trust, contacts))
     seats = ReinitInputs(objects, state.camera, humans, image.masks, state.placed.layout)
     starts = alone(run.stage(by_release, seats, config.reinit))

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.types import Layout, Objects
+from mover.energy.terms.bbox import LEAST, LIKELY
 from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.given import AWAY, TURN, Given
 from mover.furniture.library import STANDARD, WALL_PIECES
@@ -16,6 +17,7 @@ from mover.furniture.library import STANDARD, WALL_PIECES
 SIZE = 0.1  # standard deviation of the logarithm of each given size
 COMMON = 0.06  # and of what the three have in common
 FIT = 0.1  # image energy (robust form) of a shape that fits
+UNFIT = 0.5  # doubt from which on a shape may fit because something hides what does not
 DOUBTS = (0.05, 8.0)  # least and largest doubt
 LOOSE = math.radians(8)  # how well the image alone turns objects of a doubt of 1 [rad]
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
@@ -74,6 +76,14 @@ def told_by_people(
     index = touches.object_of
     less = given.doubt[index] * trust[index]
     return replace(given, doubt=given.doubt.index_copy(0, index, less))
+
+
+def believed_sides(
+    sides: Int[Tensor, "objects 4"], doubt: Float[Tensor, " objects"]
+) -> Int[Tensor, "objects 4"]:
+    """What is known of the sides of boxes, where a shape that fits needs no bound (`LIKELY`)."""
+    fits = (doubt < UNFIT).unsqueeze(-1)
+    return torch.where(fits & (sides == LIKELY), LEAST, sides)
 
 
 def expected_sizes(
