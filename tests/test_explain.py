@@ -370,6 +370,15 @@ class TestWords:
             seen, 1e-4 * seen.covariance
         )
 
+    def test_of_an_object_for_which_nothing_speaks_it_is_said_that_it_stayed(self):
+        for word in ("given", "distance"):
+            stayed = facts(pulls=(pull("scale", 0.5), pull(word, 0.4), pull("bbox", 0.05)))
+            said = verdict_of(stayed, stayed.covariance)
+            assert said.endswith("nothing that is seen tells it, it stays about where it was given")
+        seen = facts(pulls=(pull("given", 0.4), pull("contact", 0.3)))
+        said = verdict_of(seen, seen.covariance)
+        assert said.endswith("told by how it was given (40 %) and touch (30 %)")
+
     def test_calibration_scales_spreads_by_kind_and_the_camera_by_itself(self):
         factors = {
             "distance": 2.0,

@@ -28,7 +28,8 @@ NORMAL = 1.6448536269514722  # half width of the range that holds 90 % of a norm
 LEVELS = ((0.03, "well known"), (0.08, "known"), (0.15, "uncertain"))
 WORST = "very uncertain"
 TERMS = {term.name: term.word for term in SCENE_TERMS}
-PRIORS = ("scale", "distance")  # terms that are no evidence of this room
+GUESSES = ("distance", "given")  # terms of what the initial scene says
+PRIORS = ("scale", *GUESSES)  # terms that are no evidence of this room
 LITTLE = 0.1  # share of a term in what tells a distance, below which it is not named
 FELT = (0.02, math.radians(2))  # moves [m] and turns [rad] from which on an absence is told
 LOOSE = 0.5  # [m], a bound with more room than that holds nothing
@@ -44,6 +45,8 @@ def verdict_of(facts: Facts, covariance: Float[Tensor, "7 7"]) -> str:
     about = f"distance {word} (±{_length(half)}, 90 %)"
     told = sorted((p for p in facts.pulls if p.constrains >= LITTLE), key=lambda p: -p.constrains)
     evidence = [p for p in told if p.term not in PRIORS]
+    if not evidence and any(p.term in GUESSES for p in told):
+        return f"{about}: nothing that is seen tells it, it stays about where it was given"
     if not evidence:
         return f"{about}: nothing but its size tells it"
     named = [f"{_name(p.term)} ({100 * p.constrains:.0f} %)" for p in told]
