@@ -5,8 +5,8 @@
 Each capture is an empty command (Python without its imports, which writes the two files of a
 result), so that what is left is the engine: processes, locks, records, the summary. Printed per
 engine: seconds of the whole batch, seconds per capture beyond the command itself, and seconds to
-find that all is finished when the same batch is started again. SLURM is submitit's executor on this
-machine. Ray's time holds its start; --repeat tells it apart.
+find that all is finished when the same batch is started again. Ray's time holds its start; --repeat
+tells it apart. `slurm` needs a machine with SLURM's commands.
 """
 
 import argparse
@@ -46,7 +46,7 @@ def bare(command: tuple[str, ...], folder: Path) -> float:
 
 def measure(engine: str, plan: BatchPlan, workers: int) -> tuple[float, float]:
     """Seconds of a batch, and of the same batch when all is finished."""
-    options = EngineOptions(engine, workers, slurm=SlurmOptions("local", minutes=5))
+    options = EngineOptions(engine, workers, slurm=SlurmOptions(minutes=5))
     begin = time.perf_counter()
     states = {outcome.state for outcome in run_batch(plan, options, quiet=True)}
     middle = time.perf_counter()

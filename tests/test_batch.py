@@ -43,6 +43,36 @@ if task != "silent":
     (out / "scene.json").write_text(json.dumps({"name": capture.name, "length": len(task)}))
 """
 
+SLURM = """#!{python} -SE
+import os, subprocess, sys
+from pathlib import Path
+home, name = Path(__file__).parent, Path(__file__).name
+options = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
+if name == "sbatch":
+    if options.get("--partition") == "none":
+        sys.exit("sbatch: error: invalid partition specified: none")
+    for place in range(int(options["--array"].split("-")[1].split("%")[0]) + 1):
+        process = subprocess.Popen(
+            ["bash", "-c", options["--wrap"]], stdin=-3, stdout=-3, stderr=-3,
+            env=dict(os.environ, SLURM_ARRAY_TASK_ID=str(place)), start_new_session=True,
+        )
+        (home / f"{place}.pid").write_text(str(process.pid))
+    print("7;here")
+if name == "squeue":
+    for file in home.glob("*.pid"):
+        if Path("/proc", file.read_text()).is_dir():
+            print(file.stem)
+"""  # of SLURM's commands what a batch uses, as their manual pages tell it
+
+
+def pretend_slurm(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder.mkdir()
+    for name in ("sbatch", "squeue", "scancel"):
+        (folder / name).write_text(SLURM.replace("{python}", sys.executable))
+        (folder / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setattr("mover.app.batch.engines.WAIT", 0.05)
+
 
 def fakes(folder: Path, count: int, special: dict[int, str]) -> tuple[Path, ...]:
     (folder / "fake.py").write_text(FAKE)
@@ -283,16 +313,17 @@ def test_an_empty_summary_still_has_its_head(tmp_path: Path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["ray", "slurm"])
-def test_other_engines_give_what_the_local_one_gives(tmp_path: Path, engine: str):
-    package = {"ray": "ray", "slurm": "submitit"}[engine]
-    if importlib.util.find_spec(package) is None:
+def test_other_engines_give_what_the_local_one_gives(tmp_path: Path, engine: str, monkeypatch):
+    if engine == "slurm":
+        pretend_slurm(tmp_path / "commands", monkeypatch)
+    elif importlib.util.find_spec(engine) is None:
         pytest.skip(f"needs the extra {engine}")
     count = {"ray": 40, "slurm": 6}[engine]
     captures = fakes(tmp_path, count, {1: "refuse", 2: "crash", 3: "slow"})
     here = plan_of(tmp_path, captures, 3.0)
     there = BatchPlan(captures, tmp_path / "there", here.command, "settings", 3.0)
     local = run_here(here)
-    options = EngineOptions(engine, 2, RayOptions(cpus=0.5), SlurmOptions("local", minutes=5))
+    options = EngineOptions(engine, 2, RayOptions(cpus=0.5), SlurmOptions(minutes=5))
     found = run_batch(there, options, quiet=True)
     assert [outcome.state for outcome in found] == local
     for job in jobs_of(there):
@@ -301,6 +332,28 @@ def test_other_engines_give_what_the_local_one_gives(tmp_path: Path, engine: str
         assert not mine.exists() or mine.read_bytes() == theirs.read_bytes()
     kinds = [json.loads(f.read_text())["kind"] for f in sorted((there.out / "failures").iterdir())]
     assert kinds == [r["kind"] for r in failures(tmp_path).values()]
+
+
+def test_a_job_that_slurm_has_ended_without_a_word_is_a_failure(tmp_path: Path, monkeypatch):
+    pretend_slurm(tmp_path / "commands", monkeypatch)
+    monkeypatch.setattr("mover.app.batch.engines.LATE", 0.2)
+    monkeypatch.setattr("mover.app.batch.engines.sys.executable", "/bin/false")  # a node's own
+    plan = plan_of(tmp_path, fakes(tmp_path, 2, {}))
+    found = run_batch(plan, EngineOptions("slurm", 2), quiet=True)
+    assert [outcome.state for outcome in found] == ["failed", "failed"]
+    assert "SLURM has ended it, see" in found[0].reason
+    assert failures(tmp_path)["capture_01"]["kind"] == "worker"
+
+
+def test_what_slurm_says_when_it_refuses_is_passed_on(tmp_path: Path, monkeypatch):
+    pretend_slurm(tmp_path / "commands", monkeypatch)
+    plan = plan_of(tmp_path, fakes(tmp_path, 1, {}))
+    options = EngineOptions("slurm", 2, slurm=SlurmOptions("none"))
+    with pytest.raises(InputError, match=r"sbatch refuses the jobs: .* partition specified: none"):
+        run_batch(plan, options, quiet=True)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match="no sbatch, expected a machine with SLURM's commands"):
+        run_batch(plan, options, quiet=True)
 
 
 @pytest.mark.slow

@@ -4,20 +4,28 @@ import importlib
 import logging
 import math
 import os
+import shlex
+import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Annotated, Any
 
-from mover.app.batch.job import Attempt, Job, Outcome, lost, run_job
+import msgspec
+
+from mover.app.batch.job import Attempt, Job, Outcome, earlier, lost, run_job
 from mover.app.batch.runner import run_jobs
 from mover.core.errors import InputError
 from mover.core.settings import float_in, int_in
 
 ARRAY = 1000  # jobs in one SLURM array; many clusters allow no more
-WAIT = 1.0  # [s] between two looks at a cluster
+WAIT = 2.0  # [s] between two looks at SLURM's queue
+LATE = 30.0  # [s] after which the files of a job that has ended must be seen here
 
 
 @dataclass(frozen=True)
@@ -38,8 +46,6 @@ class RayOptions:
 class SlurmOptions:
     """What each capture asks of SLURM."""
 
-    cluster: str = "slurm"
-    """slurm; local and debug are submitit's stand-ins for a test."""
     partition: str = ""
     """Empty: the cluster's default."""
     cpus: Annotated[int, int_in(1, 1024)] = 1
@@ -79,7 +85,10 @@ def on_ray(jobs: Sequence[Job], options: EngineOptions, out: Path) -> Iterator[O
     del out
     if not jobs:
         return
-    _need("ray", "ray")
+    if find_spec("ray") is None:
+        raise InputError(
+            "--engine ray: ray is not installed; pip install '.[ray]' in mover's folder"
+        )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ray: Any = importlib.import_module("ray")
     asked = options.ray
@@ -115,58 +124,80 @@ def _answer(job: Job, ray: Any, handle: Any) -> Outcome:  # noqa: ANN401
 
 
 def on_slurm(jobs: Sequence[Job], options: EngineOptions, out: Path) -> Iterator[Outcome]:
-    """Arrays of SLURM jobs, one a capture."""
+    """Arrays of SLURM jobs, one a capture.
+
+    Asked is `squeue` only, which knows no more than what waits and runs, so that no cluster needs
+    accounting: how a job ended stands in its folder. SLURM itself runs those again whose node died.
+    """
     if not jobs:
         return
-    _need("submitit", "slurm")
-    submitit: Any = importlib.import_module("submitit")
-    executor = submitit.AutoExecutor(folder=out / "slurm", cluster=options.slurm.cluster)
-    executor.update_parameters(**_parameters(options, jobs[0].limit))
-    for start in range(0, len(jobs), ARRAY):
-        part = jobs[start : start + ARRAY]
-        waiting = dict(zip(executor.map_array(run_job, part), part, strict=True))
-        try:
-            while waiting:
-                ready = [handle for handle in waiting if handle.done()]
-                for handle in ready:
-                    yield _result(waiting.pop(handle), handle)
-                if not ready:
-                    time.sleep(WAIT)
-        finally:
-            for handle in waiting:
-                handle.cancel()
-
-
-def _parameters(options: EngineOptions, limit: float) -> dict[str, Any]:
-    """The options as submitit calls them."""
-    asked = options.slurm
-    needed = math.ceil(limit / 60) + 5 if limit > 0 else 120
-    found: dict[str, Any] = {
-        "timeout_min": asked.minutes or needed, "cpus_per_task": asked.cpus, "name": "mover",
-        "slurm_array_parallelism": options.workers,
-    }  # fmt: skip
-    if asked.gpus:
-        found["gpus_per_node"] = asked.gpus
-    if asked.memory:
-        found["mem_gb"] = asked.memory
-    if asked.partition:
-        found["slurm_partition"] = asked.partition
-    return found
-
-
-def _result(job: Job, handle: Any) -> Outcome:  # noqa: ANN401
-    try:
-        return handle.result()
-    except Exception as error:  # submitit raises what the worker raised, or that it vanished
-        return lost(job, error)
-
-
-def _need(package: str, extra: str) -> None:
-    if find_spec(package) is None:
+    missing = [name for name in ("sbatch", "squeue", "scancel") if shutil.which(name) is None]
+    if missing:
         raise InputError(
-            f"--engine {extra}: {package} is not installed; "
-            f"pip install '.[{extra}]' in mover's folder"
+            f"--engine slurm: there is no {missing[0]}, expected a machine with SLURM's commands"
         )
+    folder = out / "slurm"
+    folder.mkdir(parents=True, exist_ok=True)
+    for start in range(0, len(jobs), ARRAY):
+        yield from _array(jobs[start : start + ARRAY], options, folder)
+
+
+def _array(jobs: Sequence[Job], options: EngineOptions, folder: Path) -> Iterator[Outcome]:
+    with NamedTemporaryFile(dir=folder, prefix="jobs-", suffix=".json", delete=False) as file:
+        file.write(msgspec.json.encode(jobs))
+    number = _asked(_sbatch(options, len(jobs), jobs[0].limit, Path(file.name))).split(";")[0]
+    waiting, gone = dict(enumerate(jobs)), dict[int, float]()
+    try:
+        while waiting:
+            time.sleep(WAIT)
+            queued = _queued(number)
+            for place in [p for p in waiting if queued is not None and p not in queued]:
+                since = gone.setdefault(place, time.monotonic())
+                found = earlier(waiting[place])
+                if found is None and time.monotonic() - since > LATE:
+                    log = folder / f"{number}_{place}.log"
+                    found = lost(waiting[place], RuntimeError(f"SLURM has ended it, see {log}"))
+                if found is not None:
+                    del waiting[place]
+                    yield replace(found, state="done") if found.state == "kept" else found
+    finally:
+        if waiting:
+            subprocess.run(["scancel", number], check=False, capture_output=True)
+
+
+def _queued(number: str) -> set[int] | None:
+    """Places in an array that wait or run; None: SLURM does not answer now."""
+    asked = subprocess.run(
+        ["squeue", "--noheader", "--array", "--format=%K", f"--jobs={number}"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if asked.returncode:  # it forgets an array some minutes after its end
+        return set() if "Invalid job id" in asked.stderr else None
+    return {int(word) for word in asked.stdout.split()}
+
+
+def _sbatch(options: EngineOptions, count: int, limit: float, jobs: Path) -> list[str]:
+    """The command that queues an array."""
+    asked = options.slurm
+    minutes = asked.minutes or (math.ceil(limit / 60) + 5 if limit > 0 else 120)
+    work = f"from mover.app.batch.job import run_numbered; run_numbered({str(jobs)!r})"
+    return [
+        "sbatch", "--parsable", "--requeue", "--open-mode=append", "--job-name=mover",
+        f"--array=0-{count - 1}%{options.workers}", f"--output={jobs.parent}/%A_%a.log",
+        f"--time={minutes}", f"--cpus-per-task={asked.cpus}",
+        *([f"--gpus-per-node={asked.gpus}"] if asked.gpus else []),
+        *([f"--mem={math.ceil(1024 * asked.memory)}M"] if asked.memory else []),
+        *([f"--partition={asked.partition}"] if asked.partition else []),
+        f"--wrap={shlex.join(['exec', sys.executable, '-c', work])}",
+    ]  # fmt: skip
+
+
+def _asked(command: Sequence[str]) -> str:
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except subprocess.CalledProcessError as error:
+        said = " ".join(str(error.stderr).split())
+        raise InputError(f"--engine slurm: {command[0]} refuses the jobs: {said}") from None
 
 
 ENGINES: dict[str, Engine] = {"local": on_this_machine, "ray": on_ray, "slurm": on_slurm}

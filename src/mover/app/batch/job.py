@@ -17,6 +17,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Literal
 
+import msgspec
+
 from mover.app.batch.runner import (
     LOG,
     POLL,
@@ -131,6 +133,12 @@ def run_job(job: Job, stop: threading.Event = NEVER) -> Outcome:
     return outcome
 
 
+def run_numbered(jobs: str) -> None:
+    """Of a file of jobs, run the one whose place SLURM names."""
+    rows = msgspec.json.decode(Path(jobs).read_bytes(), type=list[Job])
+    run_job(rows[int(os.environ["SLURM_ARRAY_TASK_ID"])])
+
+
 def _steps(job: Job) -> Generator[None, None, Outcome]:
     """Yields while another batch runs this capture, and while it runs itself."""
     Path(job.out).mkdir(parents=True, exist_ok=True)
@@ -151,6 +159,7 @@ def _locked(lock: IO[str]) -> bool:
 
 def _run(job: Job) -> Generator[None, None, Outcome]:
     (Path(job.out) / MARK).unlink(missing_ok=True)
+    Path(job.record).unlink(missing_ok=True)
     begin = time.monotonic()
     try:
         process = _start(job)
@@ -171,7 +180,6 @@ def _run(job: Job) -> Generator[None, None, Outcome]:
     if code == 0 and not missing:
         done = {"fingerprint": job.fingerprint, "seconds": seconds}
         write_tree(Path(job.out) / MARK, done)
-        Path(job.record).unlink(missing_ok=True)
         return Outcome(job.name, "done", seconds, "")
     return _failed(job, *_why(job, code, missing), seconds, code)
 

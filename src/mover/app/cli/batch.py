@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import AvoidSubcommands, Positional, Suppress, arg
 
 from mover.app.batch import CAPTURE, OUT, BatchPlan, captures_in, cores, counted, run_batch
-from mover.app.batch.engines import EngineOptions, RayOptions, SlurmOptions
+from mover.app.batch.engines import ARRAY, EngineOptions, RayOptions, SlurmOptions
 from mover.app.cli.config import chosen_config, parsed
 from mover.app.cli.console import say
 from mover.core.settings import Seconds, int_in
@@ -27,7 +27,7 @@ class BatchArgs:
     engine: Literal["local", "ray", "slurm"] = "local"
     """Where captures run: on this machine, on a Ray cluster, or under SLURM."""
     workers: Annotated[int, int_in(0, 10_000)] = 0
-    """Captures at a time; 0: as many as this machine has cores."""
+    """Captures at a time; 0: as many as this machine has cores, on a cluster as it has room for."""
     limit: Seconds = 0.0
     """Most seconds for one capture; 0: no limit."""
     threads: Annotated[int, int_in(1, 1024)] = 1
@@ -61,7 +61,9 @@ def batch(arguments: Sequence[str]) -> None:
         limit=args.limit,
         threads=args.threads,
     )
-    options = EngineOptions(args.engine, args.workers or cores(), args.ray, args.slurm)
+    alone = args.engine == "local" or (args.engine == "ray" and args.ray.address == "local")
+    workers = args.workers or (cores() if alone else ARRAY)  # a cluster itself keeps them waiting
+    options = EngineOptions(args.engine, workers, args.ray, args.slurm)
     outcomes = run_batch(plan, options, retry=args.retry)
     say(f"{counted(outcomes)}: {args.out / 'summary.csv'}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
