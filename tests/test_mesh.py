@@ -1,5 +1,6 @@
 """Meshes: topology, normals, even samples, fewer faces."""
 
+import manifold3d
 import numpy as np
 import pytest
 import torch
@@ -251,3 +252,22 @@ def test_a_solid_with_a_hollow_inside_becomes_as_light_as_one_without():
     light = m.decimate(mesh, 1000)
     assert len(light.faces) <= 1000
     assert m.signed_volume(light) == pytest.approx(m.signed_volume(mesh), rel=0.01)
+
+
+def test_a_hollow_whose_way_out_becomes_too_narrow_does_not_keep_a_mesh_heavy():
+    solid = manifold3d.Manifold.cube((1.0, 1.0, 1.0), True)
+    solid -= manifold3d.Manifold.cube((0.6, 0.6, 0.6), True)
+    for size, place in (
+        ((1.0, 0.02, 0.02), (0.0, 0.07, 0.09)),
+        ((0.02, 1.0, 0.02), (0.11, 0.07, 0.09)),
+        ((0.02, 0.02, 1.0), (0.11, 0.07, 0.09)),
+    ):
+        solid -= manifold3d.Manifold.cube(size, True).translate(place)
+    made = solid.refine_to_length(0.04).to_mesh64()
+    verts = torch.from_numpy(np.array(made.vert_properties)[:, :3])
+    mesh = Mesh(verts, torch.from_numpy(np.array(made.tri_verts).astype(np.int64)))
+    light = m.decimate(mesh, 60)
+    assert len(light.faces) <= 60
+    assert m.is_closed(light.faces)
+    outside = mesh.verts.abs().amax(1) > 0.499
+    assert to_surface(mesh.verts[outside], light.verts, light.faces).max() < 0.03

@@ -12,7 +12,7 @@ from mover.core.types import Mesh
 from mover.geometry import mesh as m
 from mover.geometry.nearest import to_surface
 from mover.geometry.volume import signed_distance
-from mover.geometry.watertight import close_mesh
+from mover.geometry.watertight import LARGE, close_mesh
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 REAL = [
@@ -201,6 +201,16 @@ def test_a_solid_with_missing_faces_is_filled_again():
     check(shape, closed)
     assert m.signed_volume(closed) == pytest.approx(m.signed_volume(shape), rel=0.02)
     assert max(distances(shape, closed)) < 0.005
+
+
+def test_a_large_open_mesh_is_closed_as_well_as_a_small_one():
+    full = as_mesh(trimesh.creation.icosphere(6))
+    source = Mesh(full.verts, full.faces[torch.arange(len(full.faces)) % 50 != 0])
+    assert len(source.faces) > LARGE
+    closed = close_mesh(source)
+    check(source, closed)
+    assert max(distances(source, closed)) < 0.005
+    assert m.signed_volume(closed) == pytest.approx(m.signed_volume(full), rel=0.02)
 
 
 def test_a_soup_of_crossing_triangles_is_closed():

@@ -123,9 +123,9 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
     target, closed = float(faces), is_closed(mesh.faces)
     outer = _outer(mesh) if closed else used(mesh)
     while target < len(mesh.faces):
-        small = _simplified(mesh, int(target))
-        small = _resolidified(small, mesh) if closed else small
-        if small is not None and _strays(outer, small) <= STRAY:
+        whole = _simplified(mesh, int(target))
+        small = _resolidified(whole, mesh) if closed else whole
+        if small is not None and _strays(outer, whole, small) <= STRAY:
             return fit_box(small, *box(used(mesh).verts))
         target *= GENTLER
     return mesh
@@ -138,9 +138,22 @@ def _outer(mesh: Mesh) -> Mesh:
     return used(Mesh(mesh.verts, mesh.faces[torch.from_numpy(keep[part_of])]))
 
 
-def _strays(mesh: Mesh, small: Mesh) -> float:
-    """Farthest vertex of a mesh from its simplification, over the longest side of its box."""
-    squared, _, _ = closest(as_float64(mesh.verts), as_float64(small.verts), as_int64(small.faces))
+def _strays(mesh: Mesh, whole: Mesh, small: Mesh) -> float:
+    """Farthest vertex of a mesh from its simplification, over the longest side of its box.
+
+    What was left out of the whole simplification may lie inside the rest only: a hollow whose way
+    out became too narrow is no part of the shape, a leg that was turned inside out is.
+    """
+    import igl
+
+    verts = as_float64(mesh.verts)
+    squared, _, _ = closest(verts, as_float64(whole.verts), as_int64(whole.faces))
+    if small is not whole:
+        solid = as_float64(small.verts), as_int64(small.faces)
+        kept = closest(verts, *solid)[0]
+        far = np.flatnonzero(kept > squared)
+        outside = far[np.asarray(igl.fast_winding_number(*solid, verts[far])) < 0.5]
+        squared[outside] = kept[outside]
     low, high = box(mesh.verts)
     return float(squared.max() ** 0.5 / (high - low).max())
 

@@ -13,14 +13,15 @@ import numpy as np
 import torch
 
 from mover.core.types import Mesh
-from mover.geometry.mesh import fit_box, used
+from mover.geometry.mesh import decimate, fit_box, used
 from mover.geometry.nearest import as_float64, as_int64, closest
-from mover.geometry.topology import Triangles, areas, labels, manifold, solid, volumes
+from mover.geometry.topology import Triangles, areas, is_closed, labels, manifold, solid, volumes
 
 WALL = 0.75  # [cells], more than the half diagonal of a step, or the flood would leak through
 REST = 0.3  # of the thickness of the wall that stays: sheets need two sides that are apart
 REACH = 3.0  # [walls], vertices further from the triangles stay where they are: lids over holes
 INSIDE = 0.85  # winding number from which a place that the flood reached still counts as matter
+AROUND, SMOOTH = 0.4, 0.05  # winding number, and its change, from which on every cell is looked at
 LID = 4.0  # [cells] over which a winding number that is larger by 1 would lower the field
 COARSE = 4  # [cells], step of the first look at the distances
 MARGIN = 2  # [cells] of air around the box
@@ -57,14 +58,33 @@ def _field(
     field = np.where(air, distance, np.minimum(distance, wall / 2))
     shell = ~air & (distance <= wall)
     field[shell] = distance[shell]
-    reached = np.argwhere(air)
-    places = start + cell * reached
-    within = ((places > verts.min(0)) & (places < verts.max(0))).all(-1)
-    reached, places = reached[within], places[within]
-    winding = np.abs(igl.fast_winding_number(verts, faces, places))
+    least, most = _windings(verts, faces, start, cell, counts)
+    winding = (least + most) / 2
+    reached = np.argwhere(air & (most > AROUND) & (most - least > SMOOTH))
+    exact = igl.fast_winding_number(verts, faces, start + cell * reached)
+    winding[tuple(reached.T)] = np.abs(exact)
     lid = wall + (INSIDE - winding) * LID * cell
-    field[tuple(reached.T)] = np.minimum(field[tuple(reached.T)], lid)
-    return field
+    return np.where(air, np.minimum(field, lid), field)
+
+
+def _windings(
+    verts: np.ndarray, faces: np.ndarray, start: np.ndarray, cell: float, counts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest winding number around each cell, of every other cell along the axes."""
+    import igl
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    rows = [np.arange(0, count, 2) for count in counts.tolist()]
+    places = start + cell * np.stack(np.meshgrid(*rows, indexing="ij"), -1)
+    within = ((places > verts.min(0)) & (places < verts.max(0))).all(-1)
+    winding = np.zeros(within.shape)
+    winding[within] = np.abs(igl.fast_winding_number(verts, faces, places[within]))
+    found: list[np.ndarray] = []
+    for around in (minimum_filter(winding, 3), maximum_filter(winding, 3)):
+        for axis in range(3):
+            around = around.take(np.arange(int(counts[axis])) // 2, axis)
+        found.append(around)
+    return found[0], found[1]
 
 
 def _outside(free: np.ndarray) -> np.ndarray:
@@ -81,17 +101,19 @@ def _distances(
 ) -> np.ndarray:
     """Distance to the triangles at the grid's places [m]: exact near them, else too small.
 
-    The distance changes by no more than the way one goes: a coarse grid tells where to look.
+    The distance changes by no more than the way one goes: that to the middle of a block of cells
+    tells whether to look at its parts.
     """
-    blocks = (-(-counts // COARSE)).tolist()
-    coarse = np.indices(blocks).reshape(3, -1).T * COARSE + (COARSE - 1) / 2
-    far = np.sqrt(closest(start + cell * coarse, verts, faces)[0]).reshape(blocks)
-    for axis in range(3):
-        far = far.repeat(COARSE, axis).take(np.arange(int(counts[axis])), axis)
-    distance = far - cell * np.sqrt(3) * (COARSE - 1) / 2
-    near = np.argwhere(distance < 2 * cell)
-    distance[tuple(near.T)] = np.sqrt(closest(start + cell * near, verts, faces)[0])
-    return distance
+    bound = np.zeros(-(-counts // COARSE))
+    for step in (COARSE, COARSE // 2, 1):
+        near = np.argwhere(bound < (WALL + 1) * cell)  # the level's cells and their neighbours
+        middles = start + cell * (near * step + (step - 1) / 2)
+        distance = np.sqrt(closest(middles, verts, faces)[0])
+        bound[tuple(near.T)] = distance - cell * np.sqrt(3) * (step - 1) / 2
+        for axis in range(3 if step > 1 else 0):
+            finer = np.arange(-(-int(counts[axis]) * 2 // step))
+            bound = bound.take(finer // 2, axis)
+    return bound
 
 
 def _bodies(points: np.ndarray, shell: np.ndarray) -> Triangles:
@@ -122,6 +144,7 @@ def _drawn_tight(
 # there are several, so that no walls stand inside walls. Everything else is wrapped (wrap.py).
 
 
+LARGE, LIGHT = 20_000, 10_000  # faces of an open mesh that is made lighter, and what is left
 WELD = 1e-6  # [longest side], vertices this near are one
 
 
@@ -130,7 +153,8 @@ def close_mesh(mesh: Mesh, cells: int = 96) -> Mesh:
 
     A closed, consistently wound mesh passes through: turned over if it is inside out, with
     duplicate vertices merged. Several closed parts are united. Everything else (holes,
-    double-sided faces, soups) is wrapped at a resolution of 1/cells of the longest side.
+    double-sided faces, soups) is wrapped at a resolution of 1/cells of the longest side, which has
+    no use for more than `LIGHT` triangles.
 
     Args:
         mesh: Triangles of any kind; degenerate ones and unused vertices do not count.
@@ -146,6 +170,9 @@ def close_mesh(mesh: Mesh, cells: int = 96) -> Mesh:
         raise ValueError("close_mesh: the mesh has no triangle with an area")
     low, high = verts[faces].min((0, 1)), verts[faces].max((0, 1))
     verts, faces = _cleaned(verts, faces)
+    if len(faces) > LARGE and not is_closed(torch.from_numpy(faces)):
+        light = decimate(Mesh(torch.from_numpy(verts), torch.from_numpy(faces)), LIGHT)
+        verts, faces = as_float64(light.verts), as_int64(light.faces)
     found = solid(verts, faces)
     if found is None:
         found = wrap(verts, faces, cells)

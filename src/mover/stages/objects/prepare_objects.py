@@ -10,8 +10,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.errors import InputError
+from mover.core.kept import kept
 from mover.core.observe import Observer, Step, silent
-from mover.core.records import record
+from mover.core.records import fingerprint, record
+from mover.core.run import sources
 from mover.core.types import Layout, Mesh, Objects, SceneObject
 from mover.furniture.library import BACKS, SEATS, canonical
 from mover.geometry.mesh import box, decimate, sample_surface, signed_volume, used
@@ -185,11 +187,12 @@ def proxy_meshes(prepared: Prepared) -> tuple[Mesh, ...]:
 
 
 def _closing(config: PrepareConfig) -> tuple[Callable[[Mesh], Mesh], list[str]]:
-    """How meshes are closed, and what there is to tell of it afterwards."""
+    """How meshes become closed and light, and what there is to tell of it afterwards."""
     notes: list[str] = []
 
     def wrapped(mesh: Mesh) -> Mesh:
-        return close_mesh(mesh, config.cells)
+        key = fingerprint(mesh, config.cells, config.faces, sources())
+        return kept(Mesh, key, lambda: decimate(close_mesh(mesh, config.cells), config.faces))
 
     if config.watertight == "wrap":
         return wrapped, notes
@@ -199,7 +202,8 @@ def _closing(config: PrepareConfig) -> tuple[Callable[[Mesh], Mesh], list[str]]:
 
     def seen(mesh: Mesh) -> Mesh:
         try:
-            return close_mesh(occupied_mesh(network, mesh), config.cells)
+            found = close_mesh(occupied_mesh(network, mesh), config.cells)
+            return decimate(found, config.faces)
         except ValueError as error:  # it finds nothing inside
             notes.append(f"a mesh was wrapped, as the Occupancy Network gave none ({error})")
             return wrapped(mesh)
@@ -212,7 +216,7 @@ def _proxy(piece: SceneObject, config: PrepareConfig, close: Callable[[Mesh], Me
     low, high = box(mesh.verts)
     center = torch.stack([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
     mesh = Mesh((mesh.verts - center) * piece.scale, mesh.faces)
-    mesh = decimate(close(mesh), config.faces)
+    mesh = close(mesh)
     if config.level_feet:
         mesh = levelled(mesh)
     points, normals = sample_surface(mesh, 4 * config.samples)
