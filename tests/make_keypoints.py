@@ -86,3 +86,11 @@ def rest_pose(bodies: int, model: Model) -> BodyPose:
         return zero_pose(bodies, model)
     zero = zero_pose(bodies, model.skin)
     return replace(zero, gender=model.gender, betas=zero.betas[:, :10].clone())
+
+
+def keypoints_at(frame, fps, points=None):
+    """Keypoints of one person at some moments."""
+    count = len(frame)
+    points = torch.zeros(count, 17, 2) if points is None else points
+    person = torch.zeros(count, dtype=torch.long)
+    return Keypoints(points, torch.ones(count, 17), "coco17", frame, person, fps)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from make_keypoints import CAMERA, as_bodies, leg_columns, seen, walker
+from make_keypoints import CAMERA, as_bodies, keypoints_at, leg_columns, seen, walker
 from make_smpl import make_model, write_npz
 
 from mover.bodies.keypoints import keypoints_of
@@ -274,14 +274,17 @@ def test_the_best_path_is_that_of_all_paths():
 
 
 def test_constant_velocity_costs_nothing_over_gaps_and_long_gaps_join_nothing():
-    frame, person = torch.tensor([0, 1, 3, 4, 40, 41, 42]), torch.zeros(7, dtype=torch.long)
-    triples = triples_of(frame, person, 10.0, FitConfig())
+    frame = torch.tensor([0, 1, 3, 4, 40, 41, 42])
+    triples = triples_of(keypoints_at(frame, 10.0), None, FitConfig())
     assert triples.rows.tolist() == [[0, 1, 2], [1, 2, 3], [4, 5, 6]]
     from mover.fitting.energy import second_difference
 
     line = (0.3 * frame.float())[:, None, None].expand(-1, 2, 3)
     assert second_difference(line, triples).abs().max() < 1e-5
-    assert len(triples_of(frame, person, None, FitConfig()).rows) == 0
+    assert len(triples_of(keypoints_at(frame, None), None, FitConfig()).rows) == 0
+    calm = triples_of(keypoints_at(frame, 10.0), torch.tensor([0, 0, 5, 5, 5, 0, 5.0]), FitConfig())
+    assert (calm.whole < 0.2 * calm.expected).tolist() == [True, False, True]
+    torch.testing.assert_close(calm.whole[1], triples.whole[1])
 
 
 def test_prices_are_those_of_the_publication():
@@ -413,7 +416,7 @@ def test_the_preset_paper_prices_motion_as_printed():
     frames = torch.arange(5)
     joints = torch.rand(5, 22, 3, generator=generator)
     pixels = 900 * torch.rand(5, 4, 2, generator=generator)
-    triples = triples_of(frames, torch.zeros(5).long(), 30.0, PAPER)
+    triples = triples_of(keypoints_at(frames, 30.0), None, PAPER)
     none = torch.zeros(5, 63)
     seen = Seen(
         pixels, torch.ones(5, 4), torch.eye(3), 1080, torch.tensor([0.0, -1, 0]), None, triples,

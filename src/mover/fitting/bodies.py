@@ -23,6 +23,8 @@ from mover.fitting.tracks import (
     Window,
     at_stage,
     chosen,
+    confidence_of,
+    image_speed,
     seen_at_all,
     seen_of,
     triples_of,
@@ -172,8 +174,8 @@ def _stages(
     job, free = what
     rows, stages = window.rows, job.config.stages
     some = rows_of(job.inputs.keypoints, rows)
-    seen = chosen(seen, rows, triples_of(some.frame, some.person, some.fps, job.config))
     at = dataclasses.replace(at, **{name: getattr(at, name)[rows] for name in OF_ROWS})
+    seen = chosen(seen, rows, triples_of(some, _speed(at, some, job), job.config))
     frame = Frame(frame.rig, frame.root[rows], frame.person[rows])
     extremities = any("index" in name or name.startswith("face_") for name in job.names)
     for index, stage in enumerate(stages):
@@ -188,6 +190,15 @@ def _stages(
         at = solve(energy, at, stage.steps, free)
         job.observe(Step("fit_bodies", index, len(stages)))
     return at
+
+
+def _speed(at: Unknowns, keypoints: Keypoints, job: _Job) -> Float[Tensor, " rows"] | None:
+    """How fast bodies seem to move across the view [m/s]; None without a frame rate."""
+    if keypoints.fps is None:
+        return None
+    there = confidence_of(keypoints, job.config) > 0
+    pixels = image_speed(keypoints, there).to(at.place)
+    return pixels * pelvis_of(at)[:, 2] / job.seen.K[0, 0]
 
 
 # What was solved, as bodies.

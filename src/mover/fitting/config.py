@@ -29,7 +29,7 @@ _NECK = ((-30, 30, 5, 14), (-40, 40, 0, 16), (-23, 23, 0, 8))
 LEFT: dict[str, tuple[Range, Range, Range]] = {
     "hip": ((-125, 30, -25, 38), (-45, 50, 5, 14), (-30, 48, 2, 13)),
     "knee": ((-5, 150, 30, 42), (-12, 12, 0, 6), (-8, 8, 0, 4)),
-    "ankle": ((-25, 50, 0, 14), (-22, 22, 0, 9), (-22, 22, 0, 8)),
+    "ankle": ((-25, 50, -5, 14), (-22, 22, 0, 9), (-22, 22, 0, 8)),
     "foot": ((-45, 25, 0, 10), (-6, 6, 0, 3), (-6, 6, 0, 3)),
     "collar": ((-8, 8, 0, 4), (-16, 16, 0, 7), (-12, 32, 0, 8)),
     "shoulder": ((-95, 80, 5, 28), (-130, 45, -15, 32), (-100, 80, -62, 28)),
@@ -150,6 +150,12 @@ class FitConfig:
     """Weight of the smoothness of projections; confidence of the middle frame counts."""
     acceleration: Annotated[float, float_in(1e-3, 1e4)] = 3.0
     """What joints of people do all the time [m/s²]."""
+    still: Weight = 4.0
+    """Weight of the smoothness of the pelvis, which does not move where its picture does not."""
+    calm: Sigma = 0.05
+    """Acceleration of a body whose picture stands still [m/s²],"""
+    agility: Weight = 2.0
+    """and what each m/s, across the view, adds to it [1/s]."""
     jitter: Sigma = 0.004
     """Second difference that is free of charge at any frame rate [m]."""
     longest_gap: Seconds = 1.0

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mover.bodies.skeleton import BODY
 from mover.core.observe import Energy
 from mover.core.records import record
 from mover.energy.minimize import weigh
@@ -29,6 +30,10 @@ LIFTED = 10.0  # weight of joints that are known in 3D
 HEIGHT = 1000.0  # [px], the image height at which the published weights were chosen
 BENT = ((17, 1, 1.0), (18, 1, -1.0), (3, 0, -1.0), (4, 0, -1.0))
 """Elbows and knees: joint of the body, axis, and the sign that is the wrong way."""
+HIPS, KNEES, ANKLES = (
+    [3 * (BODY.index(f"{side}_{joint}") - 1) for side in ("left", "right")]
+    for joint in ("hip", "knee", "ankle")
+)  # their bending among the angles of the body
 
 
 @record
@@ -40,6 +45,8 @@ class Triples:
     """Weight of the first in the straight line through first and last."""
     expected: Float[Tensor, " triples"]
     """Second difference that people make in that time [m]."""
+    whole: Float[Tensor, " triples"]
+    """That of the pelvis, which is less where the picture of the body stands still [m]."""
 
 
 @record
@@ -91,6 +98,7 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
         ("joints", lifted**2, lambda: joint_price(points, seen)),
         ("smooth_joints", smooth * solid, lambda: smooth_joint_price(points.joints, seen, by)),
         ("smooth_pixels", smooth * flat, lambda: smooth_pixel_price(pixels, seen, by)),
+        ("still", smooth * by.config.still, lambda: still_price(points.joints, seen)),
     )
     return Energy({**space.parts, **_prior_energy(at, frame, seen, by).parts})
 
@@ -138,8 +146,15 @@ def bending_price(angles: Float[Tensor, "bodies angles"]) -> Float[Tensor, " bod
 
 
 def pose_price(angles: Float[Tensor, "bodies angles"], seen: Seen) -> Float[Tensor, " bodies"]:
-    """Squared distance from the pose that is expected, in spreads."""
-    return ((angles[:, :63] - seen.centre) / seen.spread).square().sum(-1)
+    """Squared distance from the pose that is expected, in spreads; ankles keep the feet level.
+
+    Few detectors see toes. An ankle that is expected to turn back what hip and knee turn forth
+    keeps the foot as level as the trunk is upright; one at rest would stand people on their toes.
+    """
+    away = angles[:, :63] - seen.centre
+    level = away.index_add(1, away.new_tensor(ANKLES, dtype=torch.long), away[:, HIPS])
+    level = level.index_add(1, away.new_tensor(ANKLES, dtype=torch.long), away[:, KNEES])
+    return (level / seen.spread).square().sum(-1)
 
 
 def jaw_price(face: Float[Tensor, "bodies face"]) -> Float[Tensor, " bodies"]:
@@ -180,6 +195,18 @@ def smooth_joint_price(
     triples = seen.triples
     second = second_difference(joints[:, :22], triples).square().sum(-1)
     price = geman_mcclure(second, by.config.sigma_joints).sum(-1) / triples.expected.square()
+    return joints.new_zeros(len(joints)).index_add(0, triples.rows[:, 1], price)
+
+
+def still_price(joints: Float[Tensor, "bodies joints 3"], seen: Seen) -> Float[Tensor, " bodies"]:
+    """Squared second differences of the pelvis, over what a body does that looks so still.
+
+    The keypoints of a body along the view, of one that lies, hardly tell how far it is: frames that
+    show the same say it together. Not robust, since each of them alone is off by a metre.
+    """
+    triples = seen.triples
+    second = second_difference(joints[:, :1], triples).square().sum((-1, -2))
+    price = second / triples.whole.square()
     return joints.new_zeros(len(joints)).index_add(0, triples.rows[:, 1], price)
 
 

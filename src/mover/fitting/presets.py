@@ -12,6 +12,7 @@ PAPER = FitConfig(
     limits=0.0,
     smooth_joints=1e2,
     smooth_pixels=1e-2,
+    still=0.0,
     acceleration=0.0,
     jitter=1.0,
     stages=tuple(replace(stage, smooth=1.0, steps=300) for stage in PUBLISHED[3:]),

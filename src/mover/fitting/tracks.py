@@ -14,8 +14,9 @@ from mover.fitting.config import FitConfig, Stage, resting, spreads
 from mover.fitting.energy import Seen, Triples
 from mover.fitting.unknowns import Rig
 
+HALF = 0.5  # [s], over which motion in the image is measured, on either side
 MARGIN = 20  # rows of its neighbours that a stretch solves as well, at most
-ALONE = Triples(torch.zeros(0, 3, dtype=torch.long), torch.zeros(0), torch.zeros(0))
+ALONE = Triples(torch.zeros(0, 3, dtype=torch.long), torch.zeros(0), torch.zeros(0), torch.zeros(0))
 """Nobody has neighbours in time."""
 
 
@@ -66,25 +67,70 @@ def tracks_of(
 
 
 def triples_of(
-    frame: Int[Tensor, " rows"],
-    person: Int[Tensor, " rows"],
-    fps: float | None,
-    config: FitConfig,
+    keypoints: Keypoints, speed: Float[Tensor, " rows"] | None, config: FitConfig
 ) -> Triples:
-    """Neighbours in time of each person; none of unordered images and across long gaps."""
-    if fps is None:
+    """Neighbours in time of each person; none of unordered images and across long gaps.
+
+    Args:
+        keypoints: Their rows.
+        speed: How fast each body seems to move [m/s]; None: not known.
+        config: How much people accelerate.
+    """
+    if keypoints.fps is None:
         return ALONE
     found = [ALONE.rows]
-    for rows in tracks_of(frame, person):
+    for rows in tracks_of(keypoints.frame, keypoints.person):
         found.append(torch.stack([rows[:-2], rows[1:-1], rows[2:]], 1))
     triples = torch.cat(found)
-    time = frame[triples].double() / fps
+    time = keypoints.frame[triples].double() / keypoints.fps
     before, after = time[:, 1] - time[:, 0], time[:, 2] - time[:, 1]
     near = torch.maximum(before, after) <= config.longest_gap
     triples, before, after = triples[near], before[near], after[near]
     share = (after / (before + after)).float()
     expected = config.jitter + config.acceleration * before * after
-    return Triples(triples, share, expected.float())
+    whole = expected
+    if speed is not None:
+        most = (config.calm + config.agility * speed.double()).clamp_max(config.acceleration)
+        whole = config.jitter + most[triples[:, 1]] * before * after
+    return Triples(triples, share, expected.float(), whole.float())
+
+
+def image_speed(keypoints: Keypoints, there: Bool[Tensor, "rows layout"]) -> Float[Tensor, " rows"]:
+    """How fast the keypoints of each row move in the image, the median of them [px/s].
+
+    Between the means of half a second before and after; infinite at the ends of a track.
+
+    Args:
+        keypoints: With a frame rate.
+        there: Which of them count.
+    """
+    assert keypoints.fps is not None
+    speed = torch.full((len(keypoints.frame),), torch.inf)
+    ones = there[..., None].to(keypoints.points)
+    known = torch.where(there[..., None], keypoints.points, torch.zeros_like(keypoints.points))
+    for rows in tracks_of(keypoints.frame, keypoints.person):
+        time = keypoints.frame[rows].to(known) / keypoints.fps
+        clock = time[:, None, None].expand_as(known[rows]) * ones[rows]
+        values = torch.cat([known[rows], clock[..., :1], ones[rows]], -1)
+        past, coming = (_half(values, time, side) for side in (1, -1))
+        gone = coming[..., :3] / coming[..., 3:] - past[..., :3] / past[..., 3:]
+        speeds = gone[..., :2].norm(dim=-1) / gone[..., 2]
+        speed[rows] = speeds.nanmedian(1).values.nan_to_num(torch.inf)
+    return speed
+
+
+def _half(
+    values: Float[Tensor, "track keypoints sums"], time: Float[Tensor, " track"], side: int
+) -> Float[Tensor, "track keypoints sums"]:
+    """Sums over the rows of half a second before (side 1) or after (-1) each row."""
+    total = torch.zeros_like(values)
+    for step in range(1, len(time)):  # as many as half a second has frames
+        near = (time[step:] - time[:-step]) <= HALF
+        if not bool(near.any()):
+            break
+        later, sooner = (slice(step, None), slice(None, -step))[:: 1 if side > 0 else -1]
+        total[later] = total[later] + values[sooner] * near[:, None, None]
+    return total
 
 
 def every_so_often(
@@ -185,7 +231,7 @@ def seen_of(keypoints: Keypoints, rig: Rig, camera: Camera, config: FitConfig) -
         height=camera.height,
         up=camera.R_cam_world[:, 1].to(pixels),
         floor=None,
-        triples=triples_of(keypoints.frame, keypoints.person, keypoints.fps, config),
+        triples=triples_of(keypoints, None, config),
         centre=resting(len(weight), pixels),
         spread=spreads(pixels),
         joints=None,

@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,6 +21,7 @@ from mover.core.records import record
 from mover.core.types import Masks
 from mover.geometry.rle import encode, joined
 from mover.perceive.config import DetectConfig, ModelsConfig
+from mover.perceive.networks import absent
 from mover.perceive.video import Clip, read_picture
 
 log = logging.getLogger(__name__)
@@ -33,8 +33,6 @@ KINDS = {
 """Classes of transformers for each task: of the network, and of what prepares its input."""
 OWN_PROCESSOR = {"oneformer": "OneFormerProcessor"}
 """Networks that are told their task in words, too."""
-CLASSES = "shi-labs/oneformer_demo"
-"""Where OneFormer's processor looks for the names of its classes, if they are not in its folder."""
 PERSON = "person"
 TASK = "instance"  # what OneFormer is asked for
 
@@ -109,23 +107,8 @@ def _loaded(kind: str, name: str, device: str, download: bool) -> Network:
                 processor = getattr(library, processor_class).from_pretrained(name, **own)
     except (OSError, ValueError, KeyError, ImportError) as error:
         log.debug("loading %s: %s", name, error)
-        raise InputError(missing_text(kind, name)) from error
+        raise InputError(absent(kind, replace(ModelsConfig(), **{kind: name}))) from error
     return Network(model.to(device).eval(), processor, device)
-
-
-def missing_text(kind: str, name: str) -> str:
-    """The one sentence that says what to do about a network that cannot be loaded."""
-    if Path(name).is_dir():
-        return (
-            f"--models.{kind}: the folder {name} holds no network for this task, expected "
-            "config.json and model.safetensors as transformers save them"
-        )
-    more = f" and `hf download {CLASSES}`" if "oneformer" in name.lower() else ""
-    return (
-        f"--models.{kind}: {name!r} is not on this machine; where there is a network, run "
-        f"`hf download {name}`{more} once (or add --models.download), or name a folder that holds "
-        "it"
-    )
 
 
 @record

@@ -45,6 +45,8 @@ FACTS = {
     "usyd-community/vitpose-base-simple": NetworkFacts("joints of people", "Apache-2.0", "0.34 GB"),
 }
 """Of the networks of `ModelsConfig`, by their names on Hugging Face."""
+CLASSES = "shi-labs/oneformer_demo"
+"""Where OneFormer's processor looks for the names of its classes, if they are not in its folder."""
 KINDS = ("masks", "tracker", "keypoints")
 
 
@@ -81,9 +83,9 @@ def missing(models: ModelsConfig) -> list[str]:
         for name in lacking
     ]
     if "transformers" in lacking:
-        return found + [_sentence(kind, models) for kind in KINDS if getattr(models, kind)]
+        return found + [absent(kind, models) for kind in KINDS if getattr(models, kind)]
     kinds = [f.name for f in fields(models) if f.name in KINDS]
-    return found + [_sentence(kind, models) for kind in kinds if not _is_here(kind, models)]
+    return found + [absent(kind, models) for kind in kinds if not _is_here(kind, models)]
 
 
 def _is_here(kind: str, models: ModelsConfig) -> bool:
@@ -102,19 +104,21 @@ def _is_here(kind: str, models: ModelsConfig) -> bool:
     return cached("config.json") and any(cached(file) for file in WEIGHTS)
 
 
-def _sentence(kind: str, models: ModelsConfig) -> str:
-    """What a network is, and how it gets here."""
+def absent(kind: str, models: ModelsConfig) -> str:
+    """What a network is that is not there or cannot be loaded, and how it gets here."""
     name = str(getattr(models, kind))
     if Path(name).is_dir():
         return (
-            f"--models.{kind}: the folder {name} holds no network, expected config.json and "
-            "model.safetensors as transformers save them"
+            f"--models.{kind}: the folder {name} holds no network for this task, expected "
+            "config.json and model.safetensors as transformers save them"
         )
     facts = FACTS.get(name)
     told = "" if facts is None else f" ({facts.task}; {facts.licence}; {facts.size})"
+    more = f" and `hf download {CLASSES}`" if "oneformer" in name.lower() else ""
     return (
-        f"--models.{kind}: {name}{told}: `hf download {name}` once where there is a network, "
-        f"--models.download, or --weights DIR with the folder {name.rsplit('/', 1)[-1]}/ in it"
+        f"--models.{kind}: {name}{told}: run `hf download {name}`{more} once where there is a "
+        f"network, or --models.download, or --weights DIR with the folder "
+        f"{name.rsplit('/', 1)[-1]}/ in it"
     )
 
 

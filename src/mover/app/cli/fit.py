@@ -71,8 +71,6 @@ def fit_into(args: FitArgs) -> None:
     from mover.fitting.prior import ANGLES, load_vposer, vposer_prior
     from mover.io.capture.bodies_file import read_bodies, write_bodies
 
-    if args.fps is not None and not args.fps > 0:
-        raise InputError(f"--fps: {args.fps:g}, expected more than 0")
     if args.model_folder is not None:
         os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
     keypoints = _keypoints(args)

@@ -1,0 +1,75 @@
+"""What the fit knows beyond keypoints: bodies that stand still, and feet that are level."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from make_keypoints import CAMERA, as_bodies, keypoints_at, seen, walker
+
+from mover.bodies.skeleton import BODY
+from mover.bodies.skinning import open_body
+from mover.fitting.bodies import FitInputs, fit_bodies
+from mover.fitting.config import STAGES, FitConfig, resting, spreads
+from mover.fitting.energy import Seen, pose_price
+from mover.fitting.tracks import ALONE, image_speed
+from mover.geometry.rotations import axis_angle, rotation_vectors
+
+QUICK = FitConfig(
+    start_steps=20,
+    stages=(dataclasses.replace(STAGES[0], steps=25), dataclasses.replace(STAGES[1], steps=50)),
+)
+
+
+@pytest.mark.parametrize("fps", [5.0, 30.0])
+def test_the_speed_in_the_image_is_that_of_most_joints_whatever_the_frame_rate(fps):
+    generator = torch.Generator().manual_seed(0)
+    frame = torch.arange(0, int(4 * fps))
+    time = frame / fps
+    points = 100 * torch.rand(17, 2, generator=generator).expand(len(frame), 17, 2).clone()
+    points[..., 0] += 60 * (time - 2).clamp_min(0)[:, None]  # stands for two seconds, then walks
+    points[:, :4, 1] += 50 * (9 * time).sin()[:, None]  # an arm that waves is not the body
+    noisy = points + 2 * torch.randn(points.shape, generator=generator)
+    there = torch.ones(len(frame), 17, dtype=torch.bool)
+    there[:, 9] = False
+    speed = image_speed(keypoints_at(frame, fps, noisy), there)
+    assert torch.isinf(speed[[0, -1]]).all()
+    assert speed[(time > 0) & (time < 1.4)].max() < 12
+    walks = speed[(time > 2.6) & (time < 3.7)]
+    assert (walks - 60).abs().max() < 12
+
+
+@pytest.mark.slow
+def test_a_body_along_the_view_is_as_far_in_all_frames_that_look_alike():
+    pose, frame = walker(12)
+    lying = axis_angle(torch.tensor([[-1.35, 0.0, 0.0]])) @ axis_angle(pose.global_orient[:1])
+    still = dataclasses.replace(
+        pose,
+        global_orient=rotation_vectors(lying).expand(12, 3).clone(),
+        body_pose=pose.body_pose[:1].expand(12, -1).clone(),
+        transl=pose.transl[:1].expand(12, 3).clone(),
+    )
+    keypoints = seen(as_bodies(still, frame), noise=4.0)
+    spread = [
+        fit_bodies(FitInputs(keypoints, CAMERA, open_body()), dataclasses.replace(QUICK, still=w))
+        .bodies.joints[:, 0, 2].std() for w in (QUICK.still, 0.0)
+    ]  # fmt: skip
+    assert spread[0] < 0.5 * spread[1]
+
+
+def test_an_ankle_that_levels_the_foot_costs_no_more_than_one_at_rest():
+    rest = resting(1, torch.zeros(1))
+    none = torch.zeros(1, 1)
+    looked = Seen(
+        none[..., None].expand(1, 1, 2), none, torch.eye(3), 540, torch.tensor([0.0, -1, 0]), None,
+        ALONE, rest, spreads(rest), None,
+    )  # fmt: skip
+    bent, level = rest.clone(), rest.clone()
+    for joint, turn in (("left_hip", -0.7), ("left_knee", 1.0)):
+        column = 3 * (BODY.index(joint) - 1)
+        bent[0, column] += turn
+        level[0, column] += turn
+    level[0, 3 * (BODY.index("left_ankle") - 1)] -= 0.3
+    assert float(pose_price(rest, looked)) == 0
+    ankle = (0.3 / math.radians(14)) ** 2
+    assert float(pose_price(bent, looked) - pose_price(level, looked)) == pytest.approx(ankle)
