@@ -33,6 +33,7 @@ from mover.io.export.solids import AXES, floor_height
 
 WIDTH = 560  # [px] of one picture
 GREY = (0.62, 0.66, 0.72)
+FINE = 24  # pieces along the edge of a triangle with a picture
 SKIN = (0.85, 0.6, 0.45)
 Picture = Float[Tensor, "h w 3"]
 
@@ -100,11 +101,30 @@ def of_glb(file: Path) -> Iterator[Shape]:
         if "person" in node or node == "ground":
             continue
         verts = np.asarray(part.vertices) @ matrix[:3, :3].T + matrix[:3, 3]
-        colours = part.visual.to_color().vertex_colors
-        faces = np.asarray(part.faces)
-        tint = np.broadcast_to(colours[..., :3] / 255, (len(verts), 3))[faces].mean(1)
-        light = getattr(part.visual.material, "baseColorTexture", None) is None
-        yield Shape(verts, faces, 1.055 * tint ** (1 / 2.4) - 0.055 if light else tint)
+        faces, material = np.asarray(part.faces), part.visual.material
+        if material.baseColorTexture is not None:
+            yield painted(
+                verts[faces], np.asarray(part.visual.uv)[faces], material.baseColorTexture
+            )
+            continue
+        light = np.asarray(material.baseColorFactor)[:3] / 255
+        yield Shape(verts, faces, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def painted(corners: NDArray[Any], uv: NDArray[Any], picture: Image.Image) -> Shape:
+    """Triangles with a picture on them: each cut into many of one colour."""
+    rows = np.arange(FINE)
+    grid = [(i, j, k) for i in rows for j in rows for k in (0, 1) if i + j + k < FINE]
+    first = [[(i + k, j + k), (i + 1, j), (i, j + 1)] for i, j, k in grid]
+    second = np.array(first, float) / FINE
+    shares = np.concatenate([1 - second.sum(-1, keepdims=True), second], -1)
+    verts = np.einsum("csk,fkx->fcsx", shares, corners)
+    middle = np.einsum("csk,fkx->fcsx", shares, uv).mean(2).reshape(-1, 2)
+    pixels = np.asarray(picture.convert("RGB"))
+    height, width = pixels.shape[:2]
+    x, y = (middle[:, 0] % 1 * width).astype(int), ((1 - middle[:, 1]) % 1 * height).astype(int)
+    tint = pixels[y.clip(0, height - 1), x.clip(0, width - 1)] / 255
+    return Shape(verts.reshape(-1, 3), np.arange(verts.size // 3).reshape(-1, 3), tint)
 
 
 def of_usd(file: Path, frame: int, purpose: str = "default") -> Iterator[Shape]:
@@ -123,7 +143,13 @@ def of_usd(file: Path, frame: int, purpose: str = "default") -> Iterator[Shape]:
         verts = points @ matrix[:3, :3] + matrix[3, :3]
         tint = mesh.GetDisplayColorAttr().Get() or [GREY]
         faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
-        yield Shape(verts, faces, np.array(tint[0], float))
+        picture = stage.GetPrimAtPath(prim.GetPath().AppendPath("look/picture"))
+        if not picture:
+            yield Shape(verts, faces, np.array(tint[0], float))
+            continue
+        name = picture.GetAttribute("inputs:file").Get().path
+        uv = np.array(UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get(), float)
+        yield painted(verts[faces], uv[faces], Image.open(file.parent / name))
 
 
 def of_holosoma(home: Path, scene: Scene) -> Iterator[Shape]:
@@ -146,6 +172,7 @@ def to_world(points: NDArray[Any], floor: float) -> NDArray[Any]:
 def by_mujoco(file: Path, scene: Scene, frame: int) -> Picture:
     """A model from where the video was taken, people in the pose of a keyframe."""
     model = mujoco.MjModel.from_xml_path(str(file))
+    model.vis.headlight.ambient[:] = 0.4  # URDF has no lamps
     data = mujoco.MjData(model)
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, f"frame_{frame}")
     if key >= 0:

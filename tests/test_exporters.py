@@ -356,7 +356,9 @@ def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path: Path):
     box = trimesh.creation.box(extents=(0.5, 0.9, 0.5))
     picture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
     uv = np.random.default_rng(0).random((len(box.vertices), 2))
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=picture, baseColorFactor=[51, 255, 102, 255]
+    )
     box.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     box.export(tmp_path / "box.glb")
     scene = furnished(("chair",))
@@ -372,6 +374,9 @@ def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path: Path):
         p.GetAttribute("inputs:file").Get() for p in stage.Traverse() if p.GetName() == "picture"
     ]
     assert len(files) == 2
+    pictures = [p for p in stage.Traverse() if p.GetName() == "picture"]
+    scale = pictures[0].GetAttribute("inputs:scale").Get()
+    assert list(scale) == pytest.approx([0.2, 1.0, 0.4, 1.0])  # glTF multiplies them, too
     found = Image.open(tmp_path / "usd" / files[0].path)
     assert np.array_equal(np.asarray(found).ravel(), np.arange(48))
 

@@ -89,7 +89,7 @@ def add_look(stage: Any, mesh: Any, part: Any, folder: Path) -> None:  # noqa: A
     shader = _bind_surface(stage, mesh, colour)
     if textured:
         _add_uv(mesh, np.asarray(uv))
-        _connect_picture(stage, shader, _save_picture(picture, folder))
+        _connect_picture(stage, shader, _save_picture(picture, folder), colour)
 
 
 def _add_vertex_colours(mesh: Any, rgba: Any) -> None:  # noqa: ANN401
@@ -125,8 +125,14 @@ def _bind_surface(stage: Any, mesh: Any, colour: list[float]) -> Any:  # noqa: A
     return shader
 
 
-def _connect_picture(stage: Any, shader: Any, picture: str) -> None:  # noqa: ANN401
-    Sdf, UsdShade = pxr("Sdf"), pxr("UsdShade")
+def _connect_picture(
+    stage: Any,  # noqa: ANN401
+    shader: Any,  # noqa: ANN401
+    picture: str,
+    colour: list[float],
+) -> None:
+    """Let a picture, multiplied with a colour, be that of a surface."""
+    Gf, Sdf, UsdShade = pxr("Gf"), pxr("Sdf"), pxr("UsdShade")
 
     names, above = Sdf.ValueTypeNames, shader.GetPath().GetParentPath()
     reader = UsdShade.Shader.Define(stage, above.AppendChild("uv"))
@@ -135,6 +141,7 @@ def _connect_picture(stage: Any, shader: Any, picture: str) -> None:  # noqa: AN
     texture = UsdShade.Shader.Define(stage, above.AppendChild("picture"))
     texture.CreateIdAttr("UsdUVTexture")
     texture.CreateInput("file", names.Asset).Set(Sdf.AssetPath(picture))
+    texture.CreateInput("scale", names.Float4).Set(Gf.Vec4f(*colour, 1.0))
     for wrap in ("wrapS", "wrapT"):
         texture.CreateInput(wrap, names.Token).Set("repeat")
     texture.CreateInput("st", names.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
