@@ -17,8 +17,8 @@ import torch
 
 from mover.core.run import Run
 from mover.geometry.camera import pitch_roll
+from mover.pipeline.people import people_of
 from mover.pipeline.presets import ROBUST, Config
-from mover.pipeline.reconstruct import people_of
 from mover.stages.camera.find_focal import Focal, zoomed
 from mover_bench.studies.job import noisy_room
 from mover_bench.studies.measures import Trial

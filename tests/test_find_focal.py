@@ -11,8 +11,8 @@ from torch.nn.functional import pad
 from mover.core import records
 from mover.core.observe import Step
 from mover.core.run import Run
+from mover.pipeline.people import people_of
 from mover.pipeline.presets import PRESETS, ROBUST, Config
-from mover.pipeline.reconstruct import people_of
 from mover.stages.camera.find_focal import (
     OFFSET,
     Focal,

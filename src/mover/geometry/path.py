@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.types import CameraPath
+from mover.geometry.camera import project
 from mover.geometry.rotations import axis_angle, rotation_vectors
 
 
@@ -52,3 +53,31 @@ def from_reference(
     """The way back: points in the axes of the camera that saw each row."""
     R, t = (x.to(points) for x in (poses.R_reference_camera, poses.t_reference_camera))
     return (points - t[:, None]) @ R
+
+
+def resampled(
+    image: Bool[Tensor, "images h w"],
+    depth: Float[Tensor, "wh ww"],
+    views: tuple[Float[Tensor, "3 3"], tuple[slice, slice]],
+    pose: CameraPath,
+) -> Bool[Tensor, "images wh ww"]:
+    """Images of another camera where it sees the surface that this one sees at each pixel.
+
+    Args:
+        image: Of the other camera, with the same intrinsics.
+        depth: Of the surface in a window of this camera [m].
+        views: Intrinsics, and rows and columns of the window.
+        pose: One, of the other camera in the axes of this one.
+    """
+    K, (rows, columns) = views
+    y, x = (
+        torch.arange(rows.start, rows.stop) + 0.5,
+        torch.arange(columns.start, columns.stop) + 0.5,
+    )
+    pixel = torch.stack(torch.broadcast_tensors(x, y[:, None], torch.ones(())), -1)
+    points = (pixel @ torch.linalg.inv(K).mT) * depth[..., None]
+    there = project(from_reference(points.flatten(0, 1)[None], pose)[0], K).floor().long()
+    height, width = image.shape[-2:]
+    inside = ((there >= 0) & (there < torch.tensor([width, height]))).all(-1)
+    column, row = there[:, 0].clamp(0, width - 1), there[:, 1].clamp(0, height - 1)
+    return (image[:, row, column] & inside).unflatten(-1, depth.shape)

@@ -63,8 +63,8 @@ def warnings_of(capture: Capture) -> tuple[str, ...]:
     Raises:
         InputError: What it would refuse.
     """
+    from mover.pipeline.people import people_of
     from mover.pipeline.presets import ROBUST
-    from mover.pipeline.reconstruct import people_of
 
     with tempfile.TemporaryDirectory() as folder:
         people = people_of(capture, ROBUST, Run(Path(folder)))

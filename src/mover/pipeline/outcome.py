@@ -10,7 +10,7 @@ from mover.bodies.parts import Parts
 from mover.core.explanation import Explanation
 from mover.core.records import rows_of
 from mover.core.run import Run
-from mover.core.types import Bodies, Camera, Capture, Evidence, Layout, Room, Scene
+from mover.core.types import Bodies, Camera, CameraPath, Capture, Evidence, Layout, Room, Scene
 from mover.energy.terms.feet import FootContacts
 from mover.evaluate.calibration import calibration_of
 from mover.evaluate.explanation import explain
@@ -51,7 +51,9 @@ class PeopleState:
     """The people as the stages see them."""
 
     bodies: Bodies
-    """All rows, in camera axes, at their corrected depth."""
+    """All rows, in the axes of the reference image's camera, at their corrected depth."""
+    path: CameraPath
+    """Where the cameras of their frames were [m]."""
     kept: Bool[Tensor, " bodies"]
     parts: Parts
     foot_contacts: FootContacts
@@ -121,6 +123,7 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
         warnings += diagnostics(DiagnosticInputs(
             rows_of(bodies, people.kept), people.parts, capture.people, state.camera,
             context.prepared.objects, placed.layout, contacts.points, contacts.seated_on,
+            people.path,
         ))  # fmt: skip
     return Room(
         scene=Scene(state.camera, state.ground, pieces, layout_over(capture.scene, state.ground)),

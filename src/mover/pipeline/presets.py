@@ -17,6 +17,7 @@ from mover.stages.config import (
     AssignConfig,
     ContactConfig,
     DepthConfig,
+    DriftConfig,
     ExplainConfig,
     FocalConfig,
     FootContactConfig,
@@ -27,6 +28,7 @@ from mover.stages.config import (
     ProposeConfig,
     RefineConfig,
     ReinitConfig,
+    ScaleConfig,
     SelectConfig,
     SpreadConfig,
 )
@@ -44,8 +46,12 @@ class Config:
     """One depth factor a person."""
     correct_depth: bool = False
     """Whether it is looked for and applied."""
+    scale: ScaleConfig = field(default_factory=ScaleConfig)
+    """The scale of a moving camera's path."""
     foot_contacts: FootContactConfig = field(default_factory=FootContactConfig)
     """Feet at rest."""
+    drift: DriftConfig = field(default_factory=DriftConfig)
+    """The slow error of a moving camera's path."""
     align: AlignConfig = field(default_factory=AlignConfig)
     """Camera pitch, roll and ground from the feet."""
     contacts: ContactConfig = field(default_factory=ContactConfig)

@@ -8,8 +8,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.bodies.corrected import in_world
-from mover.bodies.parts import parts_of
-from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.run import Run as Run
 from mover.core.settings import check_settings
@@ -18,7 +16,7 @@ from mover.energy.config import SceneConfig, only
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.camera import to_camera
-from mover.geometry.path import is_still
+from mover.geometry.path import scaled
 from mover.geometry.placement import (
     GROUND,
     larger,
@@ -38,12 +36,10 @@ from mover.pipeline.outcome import (
     unfurnished,
     with_proposals,
 )
+from mover.pipeline.people import people_of
 from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
 from mover.pipeline.presets import with_sizes
-from mover.stages.camera.align_camera import AlignInputs, align_camera
-from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
-from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
 from mover.stages.contacts.contact_association import AssignInputs
@@ -51,7 +47,6 @@ from mover.stages.contacts.gather_cues import GatherInputs, cues_in_windows, gat
 from mover.stages.contacts.propose_supports import NOTHING
 from mover.stages.objects.find_image_cues import (
     ImageInputs,
-    detected_masks,
     find_image_cues,
     ground_without_people,
     image_evidence,
@@ -77,13 +72,9 @@ from mover.stages.objects.starts import (
     reference_yaw,
 )
 from mover.stages.people.find_depth import (
-    DepthInputs,
-    apply_depth,
     are_shapeless,
-    find_depth,
     nearer,
 )
-from mover.stages.people.select_frames import SelectInputs, select_frames
 
 NOBODY = HumanCues()
 
@@ -103,8 +94,6 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
 
 def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]) -> Room:
     """The stages in their order."""
-    if not is_still(capture.path):
-        raise InputError("cameras.npz: the camera moves, expected one that stands still")
     people = people_of(capture, config, run)
     if not capture.scene.objects:
         room = unfurnished(capture, people)
@@ -129,40 +118,6 @@ def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str
         state = placed_with_people(context, people, state, image_energy)
     room = room_of(context, state, people)
     return with_proposals(room, capture, config, run, people, tops_of(context, state))
-
-
-def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
-    """Choose frames, find the people's depth and their feet, and from these camera and ground."""
-    bodies, scene = capture.bodies, capture.scene
-    if bodies is None:
-        return None
-    parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
-    kept = run.stage(select_frames, SelectInputs(bodies), config.select).keep
-    camera, warnings = _with_lens(capture, kept, config, run)
-    if config.correct_depth and capture.people is not None:
-        inputs = DepthInputs(bodies, parts, kept, capture.people, detected_masks(capture), camera)
-        depth = run.stage(find_depth, inputs, config.depth)
-        bodies, warnings = apply_depth(bodies, depth), (*warnings, *depth.warnings)
-    touch = capture.touch if config.foot_contacts.given else None
-    standing = FootContactInputs(bodies, parts, kept, camera, touch)
-    feet = run.stage(find_foot_contacts, standing, config.foot_contacts)
-    known = AlignInputs(feet, camera, scene.ground, capture.camera_height)
-    alignment = run.stage(align_camera, known, config.align)
-    odd = check_floor(alignment.ground, capture)
-    warnings = (*warnings, *feet.warnings, *alignment.warnings, *odd)
-    return PeopleState(bodies, kept, parts, feet, alignment, warnings)
-
-
-def _with_lens(
-    capture: Capture, kept: Bool[Tensor, " bodies"], config: Config, run: Run
-) -> tuple[Camera, tuple[str, ...]]:
-    """The given camera, with the focal length that the people tell where one is looked for."""
-    camera, bodies, people = capture.scene.camera, capture.bodies, capture.people
-    if config.focal.spread <= 0 or bodies is None or people is None:
-        return camera, ()
-    inputs = FocalInputs(bodies, kept, people, detected_masks(capture), camera)
-    lens = run.stage(find_focal, inputs, config.focal)
-    return zoomed(camera, lens), lens.warnings
 
 
 def with_size_prior(context: ReconstructionContext, state: SceneState) -> ReconstructionContext:
@@ -265,13 +220,15 @@ def with_common_scale(
     state = replace(
         state, ground=factor * state.ground, start=start, alone=only_image, placed=placed
     )
-    return replace(people, bodies=bodies), state
+    return replace(people, bodies=bodies, path=scaled(people.path, factor)), state
 
 
 def gathered(context: ReconstructionContext, people: PeopleState, state: SceneState) -> SceneState:
     """The state with depth maps and free space from all frames."""
     bodies = in_world(rows_of(people.bodies, people.kept), state.camera)
-    inputs = GatherInputs(bodies, context.capture.people, context.seen.masks, state.camera)
+    inputs = GatherInputs(
+        bodies, context.capture.people, context.seen.masks, state.camera, people.path
+    )
     return replace(state, cues=context.run.stage(gather_cues, inputs, context.config.gather))
 
 

@@ -111,6 +111,34 @@ class FootContactConfig:
 
 
 @dataclass(frozen=True)
+class ScaleConfig:
+    """How feet at rest tell the scale of a moving camera's path."""
+
+    waits: tuple[Annotated[float, float_in(1e-3, 100)], ...] = (0.2, 0.4, 0.8, 1.6, 3.2)
+    """Times between two sights of a foot that are compared [s]."""
+    noise: Annotated[float, float_in(1e-4, 10)] = 0.04
+    """By how much the place of a foot at rest usually differs between two frames [m]."""
+    loose: Metres = 0.1
+    """An error of the farthest camera's place that deserves a warning [m]."""
+
+
+@dataclass(frozen=True)
+class DriftConfig:
+    """How standing feet tell the drift of a moving camera's path."""
+
+    share: Annotated[float, float_in(1e-5, 1)] = 0.01
+    """Usual error of the place at the end, as a share of the way."""
+    every: Annotated[float, float_in(0.1, 600)] = 4.0
+    """Time between two knots [s]."""
+    sigmas: tuple[Annotated[float, float_in(1e-4, 100)], ...] = (0.1, 0.06, 0.035)
+    """Scales of the Geman-McClure price, one descent after the other [m]."""
+    tilt_prior: Annotated[float, float_in(1e-4, math.inf)] = math.radians(4.0)
+    """How far off the first pitch and roll usually are [rad]."""
+    loose: Metres = 0.02
+    """A correction that is told [m]."""
+
+
+@dataclass(frozen=True)
 class AlignConfig:
     """How feet make a floor; the paper has sigmas (0.1,), no priors, one vote a point."""
 
@@ -254,6 +282,9 @@ class GatherConfig:
     """Cells along the longest side of the volume of all bodies."""
     padding: Annotated[float, float_in(0, 10)] = 0.2
     """Space around the bodies in the volume [m]."""
+    beside: Metres = 0.25
+    """Farthest a moving camera may be from that of the image for which its frame tells who hides
+    whom: from farther away another object may be in between [m]."""
     workers: Annotated[int, int_in(1, 256)] = 2
     """Threads that draw and measure; the result does not depend on it."""
 

@@ -81,6 +81,29 @@ class RoomConfig:
     """What people do."""
 
 
+@dataclass(frozen=True)
+class PathConfig:
+    """How a camera moves, and how wrong its path is given; zero everywhere: it stands still."""
+
+    travel: float = 0.0
+    """Farthest from where it began, about [m]."""
+    turn: float = 0.0
+    """Farthest from where it looked, about [degrees]."""
+    hand: float = 0.0
+    """Standard deviation of a hand along each axis [m]."""
+    shake: float = 0.0
+    """Standard deviation of its direction about each axis [degrees]."""
+    units: float = 0.0
+    """Largest logarithm of the scale in which it is given."""
+    drift: float = 0.0
+    """Error of the place at the end [share of the way].
+
+    Source: SLAM on indoor sequences ends off by .5 to 1 % of the way (DROID-SLAM, DPVO on TUM).
+    """
+    drift_turn: float = 0.0
+    """Error of the direction at the end [degrees]."""
+
+
 # How wrong the input of a known room is, with a source for each number.
 
 

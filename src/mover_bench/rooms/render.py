@@ -66,7 +66,7 @@ def box_of_mask(mask: Bool[np.ndarray, "h w"]) -> torch.Tensor:
 def see(plan: Plan) -> Sight:
     """Draw the furniture, the floor and the walls."""
     camera = plan.view.camera
-    verts, faces, owner = _scene(plan)
+    verts, faces, owner = furniture(plan)
     cam = plan.view.seen(verts)
     depth, face = first_hit(cam, faces, camera.K, (camera.height, camera.width))
     hit = face >= 0
@@ -125,7 +125,7 @@ def draw_bodies(plan: Plan, sight: Sight, bodies: list[Mesh]) -> Float[Tensor, "
     return picture.clamp(0, 1)
 
 
-def _scene(plan: Plan) -> tuple[Tensor, Tensor, Tensor]:
+def furniture(plan: Plan) -> tuple[Tensor, Tensor, Tensor]:
     """Vertices on the floor, faces, and the piece of each face."""
     verts, faces, owner, start = [], [], [], 0
     for index, piece in enumerate(plan.pieces):

@@ -12,12 +12,12 @@ from functools import cached_property
 from threading import Lock
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record, to_device
-from mover.core.types import Bodies, Camera, People
+from mover.core.types import STILL, Bodies, Camera, CameraPath, People
 from mover.energy.objective import HumanCues
 from mover.energy.terms.bbox import WIDTH
 from mover.energy.terms.collision import BodySpace
@@ -25,6 +25,7 @@ from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.depth import DepthMaps, DepthRange, Seen, bounds_of, merge
 from mover.geometry.camera import to_camera
 from mover.geometry.crops import sample_nearest
+from mover.geometry.path import is_still, poses_at, resampled
 from mover.geometry.raster import Crops, layers
 from mover.geometry.volume import grid_around
 from mover.geometry.volume_warp import union_bodies
@@ -52,6 +53,30 @@ class Sight:
     """See `terms.depth.bounds_of`."""
     reach: float = 0.0
     """How far the outline of a body may be wrong [m]."""
+    path: CameraPath = STILL
+    """Of the cameras that saw the people, in the axes of this one."""
+    beside: float = 0.0
+    """A camera that is farther away tells nothing [m]."""
+
+    @cached_property
+    def telling(self) -> list[int]:
+        """Bodies that have a mask and were seen from here."""
+        away = poses_at(self.path, self.bodies.frame).t_reference_camera.norm(dim=-1)
+        near = (away <= self.beside).tolist()
+        return [row for row, own in enumerate(self.table.own) if own is not None and near[row]]
+
+    def seen(
+        self, row: int, window: Window, front: Float[Tensor, "h w"]
+    ) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
+        """The visible mask of a body and those of others, as if this camera had seen them."""
+        whole = [small_masks(mask[None], self.camera)[0] for mask in self.table.decode(row)]
+        if is_still(self.path):
+            return whole[0][window], whole[1][window]
+        pose = poses_at(self.path, self.bodies.frame[row : row + 1])
+        depth = torch.where(front.isfinite(), front, front[front.isfinite()].median())
+        K = small_camera(self.camera).K
+        own, others = resampled(torch.stack(whole), depth[window], (K, window), pose)
+        return own, others
 
     @cached_property
     def spans(self) -> tuple[tuple[int, int, int, int], ...]:
@@ -86,7 +111,7 @@ def gather_depth(
     views = small_views(sight.camera)
     blank, lock = torch.full((views.height, views.width), float("inf")), Lock()
     maps = DepthMaps(-blank, blank, -blank)
-    rows = [row for row in range(len(sight.bodies.frame)) if sight.table.own[row] is not None]
+    rows = sight.telling
 
     def add(block: list[int]) -> int:
         for window, found in _bounds(sight, block):
@@ -119,9 +144,7 @@ def _bounds(sight: Sight, block: list[int]) -> Iterator[tuple[Window, DepthMaps]
     drawn = to_device(layers(verts, sight.bodies.faces, many), "cpu")  # where the masks are
     for k, row in enumerate(block):
         window = _window(drawn.front[k] < float("inf"), sight.erode)
-        visible, others = (
-            small_masks(mask[None], sight.camera)[0][window] for mask in sight.table.decode(row)
-        )
+        visible, others = sight.seen(row, window, drawn.front[k])
         reach = sight.reach
         if reach > 0:
             reach *= float(views.K[0, 0, 0] / verts[k, :, 2].median().clamp_min(NEAREST))
@@ -154,6 +177,8 @@ class GatherInputs:
     masks: Bool[Tensor, "objects h w"]
     """Of the objects in the clean image; empty where only the box is known."""
     camera: Camera
+    path: CameraPath = STILL
+    """Of the cameras that saw the people, in the axes of this one [m]."""
 
 
 @record
@@ -203,7 +228,17 @@ def _depth_maps(inputs: GatherInputs, config: GatherConfig, observe: Observer) -
     masks = small_masks(inputs.masks, inputs.camera).cpu()
     table = mask_table(inputs.people, inputs.bodies)
     return gather_depth(
-        Sight(inputs.bodies, table, masks, inputs.camera, config.erode, config.vote, config.reach),
+        Sight(
+            inputs.bodies,
+            table,
+            masks,
+            inputs.camera,
+            config.erode,
+            config.vote,
+            config.reach,
+            inputs.path,
+            config.beside,
+        ),
         config.workers,
         lambda done, of: observe(Step("gather_cues: depth", done, of)),
     )

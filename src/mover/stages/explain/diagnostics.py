@@ -12,10 +12,11 @@ from torch import Tensor
 
 from mover.bodies.parts import Parts, members
 from mover.bodies.posture import postures
-from mover.core.records import record
-from mover.core.types import Bodies, Camera, Layout, Objects, People
+from mover.core.records import record, rows_of
+from mover.core.types import STILL, Bodies, Camera, CameraPath, Layout, Objects, People
 from mover.energy.terms.contact import ContactPoints
 from mover.geometry.camera import project, to_camera
+from mover.geometry.path import from_reference, poses_at
 from mover.geometry.placement import place
 from mover.stages.masks import mask_table
 
@@ -39,6 +40,8 @@ class DiagnosticInputs:
     contacts: ContactPoints | None
     seated_on: Bool[Tensor, " bodies"]
     """Bodies whose seat is assigned to an object."""
+    path: CameraPath = STILL
+    """Of the cameras that saw the people, in the axes of `camera` [m]."""
 
 
 def diagnostics(inputs: DiagnosticInputs) -> tuple[str, ...]:
@@ -69,11 +72,14 @@ def _hidden_legs(inputs: DiagnosticInputs) -> Iterator[str]:
         return
     table = mask_table(inputs.people, bodies)
     hidden = torch.zeros(len(bodies.frame), dtype=torch.bool)
+    poses = poses_at(inputs.path, bodies.frame)
     for row in range(0, len(bodies.frame), EVERY):
         if table.own[row] is None:
             continue
         seen, _ = table.decode(row)
-        pixels = project(to_camera(bodies.verts[row, legs], camera.R_cam_world), camera.K).long()
+        pose = rows_of(poses, torch.tensor([row]), "poses")
+        there = to_camera(bodies.verts[row, legs], camera.R_cam_world)
+        pixels = project(from_reference(there[None], pose)[0], camera.K).long()
         x, y = pixels[:, 0].clamp(0, seen.shape[1] - 1), pixels[:, 1].clamp(0, seen.shape[0] - 1)
         hidden[row] = seen[y, x].float().mean() < SEEN
     for person, count, frames in _often(hidden, bodies):

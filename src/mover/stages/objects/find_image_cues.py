@@ -12,6 +12,7 @@ from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.terms.border import borders_of
 from mover.energy.terms.silhouette import outline_root
 from mover.geometry.crops import area_mean, crop_views
+from mover.geometry.path import is_still
 from mover.geometry.rle import decode
 from mover.stages.config import ImageConfig
 from mover.stages.objects.prepare_objects import Prepared
@@ -50,10 +51,11 @@ def image_evidence(capture: Capture) -> Seen:
     )
 
 
-def detected_masks(capture: Capture) -> Masks:
-    """All masks of the reference image."""
+def hiding(capture: Capture) -> Masks:
+    """Masks of the furniture that may hide people in the frames; a moving camera tells none."""
     camera = capture.scene.camera
-    found = [d.mask.counts[0] for d in capture.detections if d.mask is not None]
+    seen = capture.detections if is_still(capture.path) else ()
+    found = [d.mask.counts[0] for d in seen if d.mask is not None]
     return Masks(camera.height, camera.width, tuple(found))
 
 

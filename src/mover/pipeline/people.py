@@ -1,0 +1,93 @@
+"""The people of a run: where they are about the reference camera, and the floor they tell."""
+
+from dataclasses import replace
+
+from jaxtyping import Bool
+from torch import Tensor
+
+from mover.bodies.parts import Parts, parts_of
+from mover.core.run import Run
+from mover.core.types import Bodies, Camera, CameraPath, Capture
+from mover.energy.terms.feet import FootContacts
+from mover.geometry.path import is_still, poses_at, scaled, to_reference
+from mover.io.capture.pose_file import moved
+from mover.pipeline.believable import check_floor
+from mover.pipeline.outcome import PeopleState
+from mover.pipeline.presets import Config
+from mover.stages.camera.align_camera import AlignInputs, align_camera
+from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
+from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
+from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
+from mover.stages.camera.find_scale import ScaleInputs, find_scale
+from mover.stages.objects.find_image_cues import hiding
+from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
+from mover.stages.people.select_frames import SelectInputs, select_frames
+
+
+def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
+    """Choose frames, find the people's depth and their feet, and from these camera and ground."""
+    bodies, scene = capture.bodies, capture.scene
+    if bodies is None:
+        return None
+    parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
+    path, told = _in_metres(bodies, parts, capture, config, run)
+    kept = run.stage(select_frames, SelectInputs(carried(bodies, path)), config.select).keep
+    camera, warnings = _with_lens(capture, kept, config, run)
+    if config.correct_depth and capture.people is not None:
+        inputs = DepthInputs(bodies, parts, kept, capture.people, hiding(capture), camera)
+        depth = run.stage(find_depth, inputs, config.depth)
+        bodies, warnings = apply_depth(bodies, depth), (*warnings, *depth.warnings)
+        path, told = _in_metres(bodies, parts, capture, config, run)
+    touch = capture.touch if config.foot_contacts.given else None
+
+    def feet_on(path: CameraPath) -> FootContacts:
+        standing = FootContactInputs(carried(bodies, path), parts, kept, camera, touch)
+        return run.stage(find_foot_contacts, standing, config.foot_contacts)
+
+    feet = feet_on(path)
+    if not is_still(path):
+        inputs = DriftInputs(feet, camera, path, bodies.fps or 1.0)
+        drift = run.stage(find_drift, inputs, config.drift)
+        path, told = undrifted(path, drift), (*told, *drift.warnings)
+        feet = feet_on(path)
+    known = AlignInputs(feet, camera, scene.ground, capture.camera_height)
+    alignment = run.stage(align_camera, known, config.align)
+    odd = check_floor(alignment.ground, capture)
+    warnings = (*warnings, *told, *feet.warnings, *alignment.warnings, *odd)
+    return PeopleState(carried(bodies, path), path, kept, parts, feet, alignment, warnings)
+
+
+def _in_metres(
+    bodies: Bodies, parts: Parts, capture: Capture, config: Config, run: Run
+) -> tuple[CameraPath, tuple[str, ...]]:
+    """The camera's path in the people's scale, and what is odd about it."""
+    if is_still(capture.path):
+        return capture.path, ()
+    scale = run.stage(find_scale, ScaleInputs(bodies, parts, capture.path), config.scale)
+    return scaled(capture.path, scale.scale), scale.warnings
+
+
+def carried(bodies: Bodies, path: CameraPath) -> Bodies:
+    """Bodies from the axes of their frames' cameras into those of the reference image's camera."""
+    if is_still(path):
+        return bodies
+    poses = poses_at(path, bodies.frame)
+    joints, pose = bodies.joints, bodies.pose
+    if pose is not None:
+        pose = moved(pose, poses.R_reference_camera, poses.t_reference_camera)
+    return replace(
+        bodies, verts=to_reference(bodies.verts, poses), pose=pose,
+        joints=None if joints is None else to_reference(joints, poses),
+    )  # fmt: skip
+
+
+def _with_lens(
+    capture: Capture, kept: Bool[Tensor, " bodies"], config: Config, run: Run
+) -> tuple[Camera, tuple[str, ...]]:
+    """The given camera, with the focal length that the people tell where one is looked for."""
+    camera, bodies, people = capture.scene.camera, capture.bodies, capture.people
+    if config.focal.spread <= 0 or bodies is None or people is None:
+        return camera, ()
+    inputs = FocalInputs(bodies, kept, people, hiding(capture), camera)
+    lens = run.stage(find_focal, inputs, config.focal)
+    return zoomed(camera, lens), lens.warnings
