@@ -1,18 +1,22 @@
-r"""Find the scale of a moving camera's path: people's feet tell it, since people have their size.
+r"""Find the scale of a moving camera's path: people tell it, since they have their size.
 
 Not in the paper, whose camera stands still. Poses from images alone have a scale of their own; the
-bodies are in metres. A foot at rest is where it was: with x its place in the axes of the camera of
-its frame, and R, t the camera's pose,
+bodies are in metres. What rests is where it was: with x its place in the axes of the camera of its
+frame, and R, t the camera's pose,
 
     (R_j x_j - R_i x_i)  +  s (t_j - t_i)  =  0
 
-for all pairs of frames i, j in which it rests. Which do is not known, so all pairs of both feet
-over several waits are told to a robust price (Geman-McClure): feet that swing have no say. Gravity
-and floor are found afterwards as for a camera that stands still (`align_camera`).
+for all pairs of frames i, j in which it rests. Which do is not known, so all pairs over several
+waits are told to a robust price (Geman-McClure): feet that swing and people who walk have no say.
+Feet and pelvis choose among many scales (the pelvis of a walker whom a camera follows rests at
+scale 0, the feet do not); the pelvis alone, which errors of the pose do not move, then says it
+exactly. Gravity and floor are found afterwards as for a camera that stands still (`align_camera`).
 
 What this cannot tell: people who are all too far by a factor make the path longer by it, as they
 do the room.
 """
+
+from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float, Int
@@ -24,11 +28,13 @@ from mover.core.records import record
 from mover.core.types import Bodies, CameraPath
 from mover.geometry.path import poses_at
 from mover.stages.config import ScaleConfig
+from mover.stages.people.find_depth import pelvis
 
 RANGE = (-5.0, 3.0)  # logarithms of the scales that are tried, about the usual ratio
 TRIED = 321
 STEPS = 20  # of reweighted least squares
 BLOCKS = 8  # parts of the video, each left out once for the spread
+DEEP = 3.0  # depths of bodies are so many times as uncertain as their pixels
 FEWEST = 20  # pairs
 EVERYBODY = 1.0  # spread of a scale that nothing tells, as a share of it
 
@@ -61,12 +67,12 @@ UNMOVED = PathScale(1.0, 0.0, 0.0, ())
 
 @record
 class _Pairs:
-    """Two sights of one foot."""
+    """Two sights of one point of a body, in units of its noise."""
 
     moved: Float[Tensor, "pairs 3"]
-    """From the first to the second, were the camera turning on the spot [m]."""
+    """From the first to the second, were the camera turning on the spot; see `_told`."""
     camera: Float[Tensor, "pairs 3"]
-    """What the camera moved meanwhile, in units of the path."""
+    """What the camera moved meanwhile, per unit of the path; see `_told`."""
     block: Int[Tensor, " pairs"]
     """Part of the video."""
 
@@ -75,14 +81,15 @@ def find_scale(
     inputs: ScaleInputs, config: ScaleConfig = ScaleConfig(), observe: Observer = silent
 ) -> PathScale:
     """The scale at which most feet rest most of the time."""
-    pairs = _pairs(inputs, config)
+    parts = [_pairs(inputs, config, *point) for point in _resting(inputs, config)]
+    pairs = parts[0]
     reach = float(inputs.path.t_reference_camera.norm(dim=-1).max())
     if len(pairs.moved) < FEWEST or not float(pairs.camera.norm(dim=-1).max()) > 0:
         why = "too few frames with people tell the scale of the camera's path: taken as metres"
         return PathScale(1.0, EVERYBODY, reach, (why,))
-    scale = _descended(pairs, _first(pairs, config), config)
+    scale = _descended(pairs, _first(parts))
     observe(Step("find_scale", 0, 1))
-    spread = _spread(pairs, scale, config)
+    spread = _spread(pairs, scale)
     warnings = ()
     if spread * scale * reach > config.loose:
         off = 100 * spread
@@ -92,26 +99,43 @@ def find_scale(
     return PathScale(scale, min(spread, EVERYBODY), scale * reach, warnings)
 
 
-def _pairs(inputs: ScaleInputs, config: ScaleConfig) -> _Pairs:
-    """Both feet of everybody, over all waits."""
+def _pairs(
+    inputs: ScaleInputs, config: ScaleConfig, point: Float[Tensor, "bodies 3"], noise: float
+) -> _Pairs:
+    """Two sights of a point of everybody, over all waits."""
     bodies, poses = inputs.bodies, poses_at(inputs.path, inputs.bodies.frame)
     R, t = poses.R_reference_camera.double(), poses.t_reference_camera.double()
     fps = bodies.fps or 1.0
-    part = bodies.frame * BLOCKS // (int(bodies.frame.max()) + 1)
+    block = bodies.frame * BLOCKS // (int(bodies.frame.max()) + 1)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
-    for side in ("left_sole", "right_sole"):
-        sole = members(inputs.parts, side)
-        verts = bodies.verts[:, sole] if bool(sole.any()) else bodies.verts
-        place = (R @ verts.mean(1).double()[..., None])[..., 0]
-        for person in bodies.person.unique():
-            rows = (bodies.person == person).nonzero()[:, 0]
-            rows = rows[bodies.frame[rows].argsort()]
-            for wait in config.waits:
-                i, j = _apart(bodies.frame[rows], max(1, round(wait * fps)))
-                i, j = rows[i], rows[j]
-                found.append((place[j] - place[i], t[j] - t[i], part[i]))
+    place = (R @ point.double()[..., None])[..., 0]
+    for person in bodies.person.unique():
+        rows = (bodies.person == person).nonzero()[:, 0]
+        rows = rows[bodies.frame[rows].argsort()]
+        for wait in config.waits:
+            i, j = _apart(bodies.frame[rows], max(1, round(wait * fps)))
+            i, j = rows[i], rows[j]
+            ray = torch.nn.functional.normalize(place[i] + place[j], dim=-1)
+            moved, camera = place[j] - place[i], t[j] - t[i]
+            found.append((_told(moved, ray) / noise, _told(camera, ray) / noise, block[i]))
     moved, camera, block = (torch.cat(column) for column in zip(*found, strict=True))
     return _Pairs(moved, camera, block)
+
+
+def _resting(
+    inputs: ScaleInputs, config: ScaleConfig
+) -> Iterator[tuple[Float[Tensor, "bodies 3"], float]]:
+    """Points of everybody that rest at times, the pelvis first, and the noise of their places."""
+    yield pelvis(inputs.bodies), config.pelvis
+    for side in ("left_sole", "right_sole"):
+        sole = members(inputs.parts, side)
+        if bool(sole.any()):
+            yield inputs.bodies.verts[:, sole].mean(1), config.foot
+
+
+def _told(way: Float[Tensor, "pairs 3"], ray: Float[Tensor, "pairs 3"]) -> Float[Tensor, "pairs 3"]:
+    """Ways of which the part along the ray counts by what depths are less certain (`DEEP`)."""
+    return way - (1 - 1 / DEEP) * (way * ray).sum(-1, keepdim=True) * ray
 
 
 def _apart(frame: Int[Tensor, " rows"], wait: int) -> tuple[Tensor, Tensor]:
@@ -121,27 +145,30 @@ def _apart(frame: Int[Tensor, " rows"], wait: int) -> tuple[Tensor, Tensor]:
     return there.nonzero()[:, 0], later[there]
 
 
-def _cost(pairs: _Pairs, scale: Float[Tensor, " tried"], noise: float) -> Float[Tensor, " tried"]:
-    """Share of the pairs in which the foot seems to move."""
-    each = [
-        ((pairs.moved + s * pairs.camera).square().sum(-1) / noise**2).double() for s in scale
-    ]  # one at a time: memory stays that of one
+def _cost(pairs: _Pairs, scale: Float[Tensor, " tried"]) -> Float[Tensor, " tried"]:
+    """Share of the pairs in which the point seems to move; at twice the noise, to be wide."""
+    each = [_squared(pairs, float(s)) / 4 for s in scale]  # one at a time: memory of one
     return torch.stack([(e / (1 + e)).mean() for e in each])
 
 
-def _first(pairs: _Pairs, config: ScaleConfig) -> float:
-    """The best of many scales; ties go to the smaller one, which moves nobody."""
-    usual = pairs.moved.norm(dim=-1).median() / pairs.camera.norm(dim=-1).median().clamp_min(1e-9)
-    tried = usual * torch.linspace(*RANGE, TRIED).double().exp()
-    return float(tried[_cost(pairs, tried, 2 * config.noise).argmin()])
+def _squared(pairs: _Pairs, scale: float) -> Float[Tensor, " pairs"]:
+    """How far the point seems to move, in units of its noise, squared."""
+    return (pairs.moved + scale * pairs.camera).square().sum(-1)
 
 
-def _descended(pairs: _Pairs, scale: float, config: ScaleConfig) -> float:
+def _first(parts: list[_Pairs]) -> float:
+    """The best of many scales, by what all points say."""
+    moved = torch.cat([p.moved.norm(dim=-1) for p in parts]).median()
+    camera = torch.cat([p.camera.norm(dim=-1) for p in parts]).median()
+    tried = moved / camera.clamp_min(1e-9) * torch.linspace(*RANGE, TRIED).double().exp()
+    costs = torch.stack([_cost(pairs, tried) for pairs in parts])
+    return float(tried[costs.sum(0).argmin()])
+
+
+def _descended(pairs: _Pairs, scale: float) -> float:
     """Reweighted least squares from there."""
     for _ in range(STEPS):
-        off = (pairs.moved + scale * pairs.camera).square().sum(-1) / config.noise**2
-        weight = (1 + off).square().reciprocal()
-        scale = _solved(pairs, weight)
+        scale = _solved(pairs, (1 + _squared(pairs, scale)).square().reciprocal())
     return scale
 
 
@@ -151,10 +178,9 @@ def _solved(pairs: _Pairs, weight: Float[Tensor, " pairs"]) -> float:
     return max(-float(along / length.clamp_min(1e-12)), 0.0)
 
 
-def _spread(pairs: _Pairs, scale: float, config: ScaleConfig) -> float:
+def _spread(pairs: _Pairs, scale: float) -> float:
     """Jackknife over the parts of the video, as a share of the scale."""
-    off = (pairs.moved + scale * pairs.camera).square().sum(-1) / config.noise**2
-    weight = (1 + off).square().reciprocal()
+    weight = (1 + _squared(pairs, scale)).square().reciprocal()
     parts = pairs.block.unique()
     left = torch.tensor([_solved(pairs, weight * (pairs.block != part)) for part in parts])
     count = len(parts)
