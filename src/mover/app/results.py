@@ -30,6 +30,7 @@ from mover.io.capture.scene_file import PROPOSED, write_proposals, write_scene
 from mover.io.export.contacts import write_labels
 from mover.io.export.scene_glb import write_glb
 from mover.io.files.fields import get, read_json, refuse
+from mover.pipeline.people import as_given
 from mover.pipeline.presets import Config, with_present_keys
 from mover.stages.contacts.label_contacts import LabelConfig, LabelInputs, label_contacts
 
@@ -96,8 +97,7 @@ def write_truth(scene: Scene, bodies: Bodies, folder: Path) -> None:
 
 def initial_bodies(capture: Capture) -> Bodies:
     """The bodies in the world of the initial camera."""
-    assert capture.bodies is not None
-    return in_world(capture.bodies, capture.scene.camera)
+    return in_world(as_given(capture), capture.scene.camera)
 
 
 def report_of(

@@ -67,6 +67,16 @@ def _in_metres(
     return scaled(capture.path, scale.scale), scale.warnings
 
 
+def as_given(capture: Capture) -> Bodies:
+    """The people as they were given, about the reference camera, in whatever scale they tell."""
+    assert capture.bodies is not None
+    if is_still(capture.path):
+        return capture.bodies
+    parts = parts_of(capture.bodies, capture.scene.camera.R_cam_world[:, 1])
+    scale = find_scale(ScaleInputs(capture.bodies, parts, capture.path)).scale
+    return carried(capture.bodies, scaled(capture.path, scale))
+
+
 def carried(bodies: Bodies, path: CameraPath) -> Bodies:
     """Bodies from the axes of their frames' cameras into those of the reference image's camera."""
     if is_still(path):

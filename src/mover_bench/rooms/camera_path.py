@@ -13,18 +13,31 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.records import map_tensors
-from mover.core.types import Bodies, CameraPath, People
+from mover.core.types import Bodies, CameraPath, Capture, People
 from mover.geometry.path import from_reference, is_still, poses_at, scaled
 from mover.geometry.raster import first_hit
 from mover.geometry.rotations import axis_angle
 from mover.io.capture.pose_file import moved
-from mover_bench.rooms.config import PathConfig
+from mover_bench.rooms.config import NoiseConfig, PathConfig
 from mover_bench.rooms.known import KnownRoom, one_thread, rounded
+from mover_bench.rooms.noise import add_noise
 from mover_bench.rooms.render import encode, furniture, look_at
 
 TARGET = 4.0  # [m] ahead, at which a camera that travels looks
 SHAKE = 0.7  # [s], how long a hand keeps its error
-LEAST = 200  # pixels of an object that are annotated in a further view
+PATHS = 20  # number of the stream of random numbers
+
+
+def filmed(room: KnownRoom, noise: NoiseConfig, seed: int, config: PathConfig) -> Capture:
+    """What upstream tools would say about a room that a moving camera, or a still one, has seen."""
+    if config == PathConfig():
+        return add_noise(room, noise, seed)
+    rng = np.random.default_rng([seed, PATHS])
+    frames, fps = int(room.bodies.frame.max()) + 1, room.bodies.fps
+    assert fps is not None, "a known room is a video"
+    true = draw_path(frames, fps, config, rng)
+    capture = add_noise(on_the_way(room, true), noise, seed)
+    return dataclasses.replace(capture, path=slam_path(true, config, rng))
 
 
 def draw_path(frames: int, fps: float, config: PathConfig, rng: np.random.Generator) -> CameraPath:

@@ -27,9 +27,10 @@ from mover.evaluate.evaluation import EvaluateConfig
 from mover.pipeline.reconstruct import Config, reconstruct
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
+from mover_bench.rooms.camera_path import filmed
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.known import KnownRoom
-from mover_bench.rooms.noise import add_noise, without_seat
+from mover_bench.rooms.noise import without_seat
 from mover_bench.rooms.room import make_room
 from mover_bench.studies.measures import (
     Trial,
@@ -120,7 +121,7 @@ def noisy_room(seed: int, rooms: RoomSet, run: Run | None = None) -> Trial:
 
 def spoilt(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
     """A known room with the noise of a set."""
-    capture = add_noise(room, rooms.noise, seed)
+    capture = filmed(room, rooms.noise, seed, rooms.paths[seed % len(rooms.paths)])
     if rooms.withheld:
         capture = without_seat(capture, room)
     if "camera" in rooms.exact:
@@ -168,8 +169,8 @@ def key_of(job: Job) -> str:
     settings = VARIANTS.get(job.name)  # a room has none
     rooms = set_named(job.rooms)
     return records.fingerprint(
-        rooms.room, rooms.noise, rooms.exact, rooms.withheld, rooms.version, job.seed, job.name,
-        settings, sources("mover_bench"),
+        rooms.room, rooms.noise, rooms.exact, rooms.withheld, rooms.paths, rooms.version, job.seed,
+        job.name, settings, sources("mover_bench"),
     )  # fmt: skip
 
 

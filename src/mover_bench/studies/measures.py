@@ -32,6 +32,7 @@ from mover.geometry.rotations import wrap
 from mover.geometry.watertight import close_mesh
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.outcome import to_world
+from mover.pipeline.people import as_given
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.objects.prepare_objects import find_regions
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
@@ -212,7 +213,7 @@ def measure(
     """
     capture = trial.capture
     asked = {
-        "initial": (capture.scene, capture.bodies),
+        "initial": (capture.scene, None if capture.bodies is None else as_given(capture)),
         "image": (room.image_only, room.bodies),
         "full": (room.scene, room.bodies),
     }
@@ -337,9 +338,8 @@ def carry_all(room: Room, capture: Capture) -> Room:
 
 def _under(room: Room, capture: Capture, camera: Camera) -> Room:
     """The same room seen by another camera, with the people as they were given."""
-    assert capture.bodies is not None, "a known room has people"
     scene = replace(room.scene, camera=camera)
-    return replace(room, scene=scene, bodies=to_world(capture.bodies, camera), kept=None)
+    return replace(room, scene=scene, bodies=to_world(as_given(capture), camera), kept=None)
 
 
 def _true_room(trial: Trial, room: Room) -> Room:

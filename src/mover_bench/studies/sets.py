@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from mover.core.errors import InputError
-from mover_bench.rooms.config import ActConfig, NoiseConfig, PlanConfig, RoomConfig
+from mover_bench.rooms.config import ActConfig, NoiseConfig, PathConfig, PlanConfig, RoomConfig
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,8 @@ class RoomSet:
     """What is given as it truly is, of `EXACT`."""
     withheld: bool = False
     """No detector saw the seat that is used most: see `rooms.noise.without_seat`."""
+    paths: tuple[PathConfig, ...] = (PathConfig(),)
+    """How the camera moves, one room after the other."""
 
 
 _SMALL = RoomConfig(
@@ -97,6 +99,12 @@ _UPSTREAM = NoiseConfig(
     wobble=2.5, person_masks=0, missed_masks=0.04,
     missed=0.05, false=0.05,
 )  # fmt: skip
+_SLAM = PathConfig(shake=0.7, units=1.6, drift=0.01, drift_turn=0.5)
+_MOVING = (
+    replace(_SLAM, travel=0.8, turn=5.0, hand=0.01),
+    replace(_SLAM, travel=0.1, turn=12.0, hand=0.01),
+    replace(_SLAM, travel=0.05, turn=1.0, hand=0.015),
+)
 
 SETS: dict[str, RoomSet] = {
     "mini": RoomSet(
@@ -142,6 +150,11 @@ SETS: dict[str, RoomSet] = {
     "withheld-seat": RoomSet(
         "The rooms of `rooms`; the seat that is used most is not in what is given.",
         "1000-1029", "100-129", withheld=True,
+    ),
+    "moving-camera": RoomSet(
+        "The rooms of `rooms` seen by a camera that is walked with, panned or held by hand; its"
+        " path is as SLAM gives it, in a scale of its own and with a drift of 1 % of the way.",
+        "1000-1029", "100-129", paths=_MOVING,
     ),
 }  # fmt: skip
 """All sets by name."""

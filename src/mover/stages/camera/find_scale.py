@@ -56,13 +56,7 @@ class PathScale:
     """[m]"""
     spread: float
     """Standard deviation, as a share of the scale."""
-    travelled: float
-    """Farthest from the reference image's camera [m]."""
     warnings: tuple[str, ...]
-
-
-UNMOVED = PathScale(1.0, 0.0, 0.0, ())
-"""Of a camera that stands still."""
 
 
 @record
@@ -80,23 +74,21 @@ class _Pairs:
 def find_scale(
     inputs: ScaleInputs, config: ScaleConfig = ScaleConfig(), observe: Observer = silent
 ) -> PathScale:
-    """The scale at which most feet rest most of the time."""
+    """The scale at which people rest most of the time."""
     parts = [_pairs(inputs, config, *point) for point in _resting(inputs, config)]
     pairs = parts[0]
     reach = float(inputs.path.t_reference_camera.norm(dim=-1).max())
     if len(pairs.moved) < FEWEST or not float(pairs.camera.norm(dim=-1).max()) > 0:
         why = "too few frames with people tell the scale of the camera's path: taken as metres"
-        return PathScale(1.0, EVERYBODY, reach, (why,))
+        return PathScale(1.0, EVERYBODY, (why,))
     scale = _descended(pairs, _first(parts))
     observe(Step("find_scale", 0, 1))
     spread = _spread(pairs, scale)
-    warnings = ()
-    if spread * scale * reach > config.loose:
-        off = 100 * spread
-        warnings = (
-            f"the scale of the camera's path is uncertain by {off:.0f} %: feet hardly rest",
-        )
-    return PathScale(scale, min(spread, EVERYBODY), scale * reach, warnings)
+    told = (
+        f"the scale of the camera's path is uncertain by {100 * spread:.0f} %: people hardly rest"
+    )
+    warnings = (told,) if spread * scale * reach > config.loose else ()
+    return PathScale(scale, min(spread, EVERYBODY), warnings)
 
 
 def _pairs(

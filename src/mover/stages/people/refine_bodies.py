@@ -37,6 +37,7 @@ from mover.energy.body_terms.time import gather_neighbours
 from mover.energy.config import BodyWeights, MatchConfig
 from mover.energy.minimize import minimize
 from mover.geometry.camera import to_camera
+from mover.geometry.path import is_still
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.body_energy import Evidence, Feet, body_energy
 from mover.stages.people.body_evidence import (
@@ -95,7 +96,8 @@ def cast_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Cast:
     picked = pick(bodies, parts)
     surroundings = surroundings_of(room, capture)
     asked = weights.order or weights.outline
-    people = None if capture is None or not asked else capture.people
+    moves = capture is not None and not is_still(capture.path)  # masks are seen from elsewhere
+    people = None if capture is None or not asked or moves else capture.people
     given = None if capture is None else capture.touch
     if given is not None and given.shape != bodies.verts.shape[:2]:
         given = None

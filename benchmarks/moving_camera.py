@@ -1,0 +1,95 @@
+"""A camera that moves against one that stands still: the same known rooms under both.
+
+    PYTHONPATH=src python benchmarks/moving_camera.py --seeds 100-111 --out moving
+
+Rebuilds each room with `robust` from both captures (`rooms` and `moving-camera`; finished rooms are
+kept in `--out`) and prints IoU3D, the angle of gravity [degrees], the error of the floor [cm] and,
+for the moving camera, the error of the path's scale [%] and how far it went [m].
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mover.core.run import Run
+from mover.core.types import CameraPath
+from mover.geometry.path import is_still
+from mover.pipeline.people import people_of
+from mover.pipeline.presets import ROBUST
+from mover.pipeline.reconstruct import reconstruct
+from mover_bench.rooms.camera_path import PATHS, draw_path, slam_path
+from mover_bench.studies.job import noisy_room
+from mover_bench.studies.measures import Trial, measure
+from mover_bench.studies.run import parse_seeds
+from mover_bench.studies.sets import SETS
+
+KINDS = ("walked", "panned", "held")
+
+
+def paths_of(trial: Trial, seed: int) -> tuple[CameraPath, CameraPath]:
+    """The true path [m], and the one that was given without its drift."""
+    assert trial.bodies is not None
+    assert trial.bodies.fps is not None
+    kinds = SETS["moving-camera"].paths
+    config, rng = kinds[seed % len(kinds)], np.random.default_rng([seed, PATHS])
+    true = draw_path(int(trial.bodies.frame.max()) + 1, trial.bodies.fps, config, rng)
+    return true, slam_path(true, replace(config, drift=0.0, drift_turn=0.0), rng)
+
+
+def scale_error(trial: Trial, path: CameraPath, seed: int) -> tuple[float, float]:
+    """Of the path that was found: its scale [%], and how far the camera truly went [m]."""
+    true, given = paths_of(trial, seed)
+    found = path.t_reference_camera.norm() / trial.capture.path.t_reference_camera.norm()
+    wanted = true.t_reference_camera.norm() / given.t_reference_camera.norm()
+    reach = float(true.t_reference_camera.norm(dim=-1).max())
+    return 100 * (float(found / wanted) - 1), reach
+
+
+def row(name: str, seed: int, out: Path) -> list[float]:
+    """IoU3D of stage 1 and of the whole, gravity, floor, scale, reach, seconds."""
+    trial = noisy_room(seed, SETS[name], Run(out / str(seed)))
+    begin = time.process_time()
+    run = Run(out / name / str(seed))
+    room, people = reconstruct(trial.capture, ROBUST, run), people_of(trial.capture, ROBUST, run)
+    seconds = time.process_time() - begin
+    found, true = (s.camera.R_cam_world[:, 1].double() for s in (room.scene, trial.truth))
+    angle = float(torch.linalg.cross(found, true).norm().asin().rad2deg())
+    assert people is not None
+    assert room.scene.ground is not None
+    assert trial.truth.ground is not None
+    scale = (0.0, 0.0)
+    if not is_still(people.path):  # the part of the scale that drift does not move
+        scale = scale_error(trial, people.path, seed)
+    told = measure(trial, room, run)
+    values = [told[stage]["iou3d"] for stage in ("image", "full")]
+    floor = 100 * abs(room.scene.ground - trial.truth.ground)
+    return [*values, angle, floor, *scale, seconds]
+
+
+def main() -> None:
+    """Print a line for each room and camera, and the means."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", default="100-111")
+    parser.add_argument("--out", type=Path, default=Path("moving"))
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    rows: dict[str, list[list[float]]] = {"rooms": [], "moving-camera": []}
+    print("seed camera | IoU3D stage 1, full | gravity, floor | scale, reach | seconds")
+    for seed in parse_seeds(args.seeds):
+        for name, found in rows.items():
+            found.append(row(name, seed, args.out))
+            kind = "still" if name == "rooms" else KINDS[seed % len(KINDS)]
+            told = ("{:.3f}", "{:.3f}", "{:.2f}", "{:.1f}", "{:+.1f}", "{:.2f}", "{:.0f}")
+            line = " ".join(t.format(v) for t, v in zip(told, found[-1], strict=True))
+            print(f"{seed} {kind}: {line}", flush=True)
+    for name, found in rows.items():
+        means = np.abs(np.array(found)).mean(0)
+        print(f"mean {name}:", " ".join(f"{v:.3f}" for v in means))
+
+
+if __name__ == "__main__":
+    main()

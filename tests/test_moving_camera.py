@@ -1,0 +1,162 @@
+"""A moving camera: its scale from people at rest, its drift from feet, masks seen from beside."""
+
+import dataclasses
+import math
+
+import little_room
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mover.bodies.parts import parts_of
+from mover.core.types import STILL, Bodies, CameraPath
+from mover.energy.terms.feet import FootContacts
+from mover.geometry.camera import to_camera
+from mover.geometry.path import from_reference, poses_at, resampled, scaled, to_reference
+from mover.pipeline.people import carried
+from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
+from mover.stages.camera.find_scale import ScaleInputs, find_scale
+
+FRAMES, FPS = 200, 5.0
+CAMERA = little_room.camera()
+SPOTS = torch.tensor([[-1.0, -3.0], [0.8, -4.0], [1.2, -2.8], [-0.4, -4.6]])
+
+
+def swaying(amount: float = 0.6) -> CameraPath:
+    """A camera that sways sideways and looks at the same place [m]."""
+    way = np.arange(FRAMES) / FPS
+    x = amount * np.sin(way / 3)
+    turn = Rotation.from_rotvec(np.stack([0 * x, -x / 4, 0.02 * np.sin(way)], 1)).as_matrix()
+    t = np.stack([x, 0.1 * x**2, 0.2 * x], 1)
+    return CameraPath(
+        torch.arange(FRAMES), torch.from_numpy(turn).float(), torch.from_numpy(t).float()
+    )
+
+
+def staying(noise: float = 0.0) -> Bodies:
+    """Somebody who stays at one spot after the other and walks between, about the reference."""
+    walker = little_room.walkers(1)
+    stay = torch.arange(FRAMES) / FRAMES * len(SPOTS)
+    spot, share = stay.floor().long(), ((stay - stay.floor()) * 4 - 3).clamp_min(0)[:, None]
+    place = torch.lerp(SPOTS[spot], SPOTS[(spot + 1) % len(SPOTS)], share)
+    feet = torch.stack([place[:, 0], torch.full((FRAMES,), little_room.GROUND), place[:, 1]], -1)
+    verts = walker.verts - walker.verts[0].mean(0) * torch.tensor([1.0, 0, 1]) * 1.0
+    verts = verts - verts[..., 1].min() * torch.tensor([0.0, 1, 0]) + feet[:, None]
+    random = torch.Generator().manual_seed(1)
+    verts = verts + noise * torch.randn(FRAMES, 1, 3, generator=random)
+    frame, person = torch.arange(FRAMES), torch.zeros(FRAMES, dtype=torch.long)
+    return Bodies(
+        to_camera(verts, CAMERA.R_cam_world), walker.faces, None, (), frame, person, FPS,
+        "camera", None,
+    )  # fmt: skip
+
+
+def seen_by(path: CameraPath, bodies: Bodies) -> Bodies:
+    """The same people in the axes of the moving camera."""
+    return dataclasses.replace(
+        bodies, verts=from_reference(bodies.verts, poses_at(path, bodies.frame))
+    )
+
+
+@pytest.mark.parametrize(("noise", "within"), [(0.0, 1e-3), (0.01, 0.02)])
+@pytest.mark.parametrize("units", [0.1, 1.0, 7.0])
+def test_people_at_rest_tell_the_scale_in_any_units(noise, within, units) -> None:
+    path = swaying()
+    bodies = seen_by(path, staying(noise))
+    parts = parts_of(bodies, CAMERA.R_cam_world[:, 1])
+    found = find_scale(ScaleInputs(bodies, parts, scaled(path, units)))
+    assert found.scale * units == pytest.approx(1, abs=within)
+    assert abs(found.scale * units - 1) < 4 * found.spread + 1e-3
+    assert found.warnings == ()
+
+
+def test_people_who_are_all_too_far_make_the_path_longer_by_as_much() -> None:
+    path = swaying()
+    bodies = seen_by(path, staying())
+    farther = dataclasses.replace(bodies, verts=1.1 * bodies.verts)
+    parts = parts_of(bodies, CAMERA.R_cam_world[:, 1])
+    found = find_scale(ScaleInputs(farther, parts, path))
+    assert found.scale == pytest.approx(1.1, rel=1e-3)
+
+
+def test_too_few_frames_are_told() -> None:
+    path = swaying()
+    bodies = seen_by(path, staying())
+    few = dataclasses.replace(
+        bodies, verts=bodies.verts[:3], frame=bodies.frame[:3], person=bodies.person[:3]
+    )
+    found = find_scale(ScaleInputs(few, parts_of(few, CAMERA.R_cam_world[:, 1]), path))
+    assert "too few frames" in found.warnings[0]
+
+
+def test_people_are_carried_back_to_where_they_stood() -> None:
+    path, bodies = swaying(), staying()
+    assert torch.allclose(carried(seen_by(path, bodies), path).verts, bodies.verts, atol=1e-5)
+    assert carried(bodies, STILL) is bodies
+
+
+def soles(lift: torch.Tensor, spread: float = 2.0) -> FootContacts:
+    """Feet all over a floor, put too high by a lift that changes in time [m]."""
+    rng = np.random.default_rng(0)
+    xz = torch.from_numpy(rng.uniform(-spread, spread, (FRAMES, 2))).float() / 2
+    xz = xz + torch.tensor([0, -3.5])
+    world = torch.stack([xz[:, 0], little_room.GROUND + lift, xz[:, 1]], -1)
+    frame = torch.arange(FRAMES)
+    return FootContacts(to_camera(world, CAMERA.R_cam_world), torch.zeros_like(frame), frame, ())
+
+
+def test_feet_tell_a_slow_drift_and_not_that_of_the_reference_image() -> None:
+    time = torch.arange(FRAMES) / FRAMES
+    lift = 0.08 * (1.5 * math.pi * time).sin()
+    path = scaled(swaying(2.0), 1.0)
+    found = find_drift(DriftInputs(soles(lift), CAMERA, path, FPS))
+    better = undrifted(path, found)
+    up = CAMERA.R_cam_world[:, 1]
+    height = (better.t_reference_camera - path.t_reference_camera) @ up
+    assert (height + lift).abs().max() < 0.02
+    assert height[0].abs() < 1e-3
+    assert "corrected by up to" in found.warnings[0]
+
+
+def test_a_wrong_gravity_is_not_taken_for_drift() -> None:
+    off = little_room.camera(pitch=-0.2 + math.radians(3), roll=math.radians(-2))
+    found = find_drift(DriftInputs(soles(torch.zeros(FRAMES)), off, swaying(2.0), FPS))
+    assert found.height.abs().max() < 0.01
+    assert math.degrees(float((found.up @ CAMERA.R_cam_world[:, 1]).clamp(max=1).acos())) < 0.5
+    assert found.warnings == ()
+
+
+def test_nobody_on_foot_leaves_the_path_alone() -> None:
+    none = FootContacts(torch.zeros(0, 3), *[torch.zeros(0, dtype=torch.long)] * 2, ())
+    path = swaying()
+    found = find_drift(DriftInputs(none, CAMERA, path, FPS))
+    assert torch.equal(undrifted(path, found).t_reference_camera, path.t_reference_camera)
+
+
+def test_a_mask_is_looked_up_where_the_other_camera_sees_the_surface() -> None:
+    """A naive loop over pixels."""
+    K = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]])
+    random = torch.Generator().manual_seed(2)
+    image = torch.rand(2, 32, 48, generator=random) > 0.5
+    depth = 2 + torch.rand(32, 48, generator=random)
+    window = (slice(4, 28), slice(10, 44))
+    pose = poses_at(swaying(), torch.tensor([20]))
+    found = resampled(image, depth[window], (K, window), pose)
+    for y in range(4, 28, 5):
+        for x in range(10, 44, 7):
+            ray = torch.linalg.inv(K) @ torch.tensor([x + 0.5, y + 0.5, 1.0])
+            there = from_reference((ray * depth[y, x])[None, None], pose)[0, 0]
+            u, v = ((K @ there)[:2] / there[2]).floor().long().tolist()
+            inside = 0 <= u < 48 and 0 <= v < 32
+            expected = image[:, v, u] if inside else torch.zeros(2, dtype=torch.bool)
+            assert torch.equal(found[:, y - 4, x - 10], expected)
+
+
+def test_a_still_camera_looks_up_its_own_pixels() -> None:
+    K = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]])
+    image = torch.rand(1, 32, 48, generator=torch.Generator().manual_seed(3)) > 0.5
+    window = (slice(0, 32), slice(0, 48))
+    assert torch.equal(resampled(image, torch.full((32, 48), 3.0), (K, window), STILL), image)
+    points = torch.randn(3, 4, 3, generator=torch.Generator().manual_seed(3))
+    assert torch.equal(to_reference(points, poses_at(STILL, torch.arange(3))), points)
