@@ -19,15 +19,15 @@ from mover.geometry.mesh import box
 from mover.geometry.placement import larger
 from mover.geometry.topology import is_closed
 from mover.stages.objects.gather_given import (
-    DOUBTS,
+    WEIGHTS,
     UNFIT,
     believed_sides,
     common_scale,
-    doubts,
+    prior_weights,
     expected_sizes,
     gather_given,
     room_axis,
-    told_by_people,
+    lighter_where_used,
 )
 from mover.stages.objects.prepare_objects import levelled
 from mover.stages.people.find_depth import are_shapeless, nearer
@@ -59,7 +59,7 @@ def test_a_place_metres_away_costs_more_than_one_beside_it_but_not_without_bound
 
 
 def test_a_given_yaw_may_be_off_by_a_quarter_or_half_turn_rather_than_by_an_eighth() -> None:
-    given = replace(given_at(somewhere()), along=torch.zeros(1), doubt=torch.ones(1))
+    given = replace(given_at(somewhere()), along=torch.zeros(1), weight=torch.ones(1))
     layouts = Layout(
         somewhere().t_world_object.expand(721, 1, 3),
         TURNS[:, None],
@@ -131,15 +131,15 @@ def test_standards_are_those_of_the_classes_and_near_what_the_library_has() -> N
 def test_doubt_follows_the_misfit_within_bounds() -> None:
     objects = boxes_of(("table", "chair", "sofa"), [(1.0, 0.7, 1.0)] * 3)
     given = gather_given(objects, somewhere(3), somewhere(3), torch.tensor([1e-6, 0.25, 3.0]))
-    assert given.doubt.tolist() == pytest.approx([DOUBTS[0], 2.5, DOUBTS[1]])
+    assert given.weight.tolist() == pytest.approx([WEIGHTS[0], 2.5, WEIGHTS[1]])
 
 
 def test_an_object_that_fits_among_shapes_that_do_not_is_doubted_more_than_alone() -> None:
     energy = torch.tensor([0.01, 0.4, 0.4, 0.3, 0.9])
-    found = doubts(energy)
+    found = prior_weights(energy)
     assert float(found[0]) == pytest.approx((0.01 * 0.4) ** 0.5 / 0.1)
-    assert found[[1, 2, 4]].tolist() == pytest.approx([4.0, 4.0, DOUBTS[1]])
-    assert torch.allclose(doubts(torch.full((3,), 0.01)), torch.full((3,), 0.1))
+    assert found[[1, 2, 4]].tolist() == pytest.approx([4.0, 4.0, WEIGHTS[1]])
+    assert torch.allclose(prior_weights(torch.full((3,), 0.01)), torch.full((3,), 0.1))
 
 
 def test_a_side_that_may_be_hidden_bounds_nothing_of_a_shape_that_fits() -> None:
@@ -149,14 +149,14 @@ def test_a_side_that_may_be_hidden_bounds_nothing_of_a_shape_that_fits() -> None
 
 
 def test_of_what_people_use_a_guess_says_less_beside_them() -> None:
-    given = replace(given_at(somewhere(3)), doubt=torch.tensor([4.0, 4.0, 4.0]))
+    given = replace(given_at(somewhere(3)), weight=torch.tensor([4.0, 4.0, 4.0]))
     touched = ContactPoints(
         object_of=torch.tensor([1]), points=torch.zeros(1, 4, 2, 3),
         weight=torch.ones(1, 4, 2), bodies=torch.ones(1), heading=torch.zeros(1, 2),
     )  # fmt: skip
     trust = torch.full((3,), 0.25)
-    assert told_by_people(given, trust, touched).doubt.tolist() == [4.0, 1.0, 4.0]
-    assert told_by_people(given, trust, None) is given
+    assert lighter_where_used(given, trust, touched).weight.tolist() == [4.0, 1.0, 4.0]
+    assert lighter_where_used(given, trust, None) is given
 
 
 def test_doubt_counts_for_places_and_sizes_but_not_beyond_one_for_yaws() -> None:
@@ -164,9 +164,9 @@ def test_doubt_counts_for_places_and_sizes_but_not_beyond_one_for_yaws() -> None
     given = given_at(layout)
     turned = replace(layout, yaw=layout.yaw + 0.4)
     larger_one = replace(layout, log_scale=layout.log_scale + 0.2)
-    for doubt, yaw, size in ((0.5, 0.5, 0.5), (1.0, 1.0, 1.0), (6.0, 1.0, 6.0)):
-        some = replace(given, doubt=torch.tensor([doubt]))
-        usual = replace(given, doubt=torch.ones(1))
+    for weight, yaw, size in ((0.5, 0.5, 0.5), (1.0, 1.0, 1.0), (6.0, 1.0, 6.0)):
+        some = replace(given, weight=torch.tensor([weight]))
+        usual = replace(given, weight=torch.ones(1))
         assert cost(some, turned) == pytest.approx(yaw * cost(usual, turned))
         assert cost(some, larger_one) == pytest.approx(size * cost(usual, larger_one))
 

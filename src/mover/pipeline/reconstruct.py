@@ -56,7 +56,7 @@ from mover.stages.objects.gather_given import (
     believed_sides,
     common_scale,
     gather_given,
-    told_by_people,
+    lighter_where_used,
 )
 from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
 from mover.stages.objects.place_objects import estimate_size_prior, inlier_weights, place_objects
@@ -187,7 +187,7 @@ def with_given(
     )
     left = energy.per_item[0].detach()
     known = gather_given(objects, given, before.placed.layout, left)
-    return replace(image, given=known, sides=believed_sides(image.sides, known.doubt))
+    return replace(image, given=known, sides=believed_sides(image.sides, known.weight))
 
 
 def with_refined_camera(
@@ -263,7 +263,7 @@ def placed_with_people(
     if config.silhouette_confidence:
         image = replace(image, trust=inlier_weights(image_energy))
         if image.given is not None and not are_shapeless(people.bodies):
-            image = replace(image, given=told_by_people(image.given, image.trust, contacts))
+            image = replace(image, given=lighter_where_used(image.given, image.trust, contacts))
     seats = ReinitInputs(objects, state.camera, humans, image.masks, state.placed.layout)
     starts = alone(run.stage(by_release, seats, config.reinit))
     if config.layout.num_hypotheses > 1:

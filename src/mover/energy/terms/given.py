@@ -8,9 +8,9 @@ Yaw:       the guess is off by some 20 degrees, one in ten is turned by a quarte
 Axis:      most furniture stands along one of two directions of the room.
 Size:      r^T \Lambda r / 2 with r the logarithms of the three sizes less those expected: of the
            given mesh and of the standard dimensions of its class, each with its spread.
-Doubt:     d_i grows with what is left of the image's energy where the object fits best: a shape or
-           a mask that does not fit tells by so much less where the object stands. Which way it
-           faces, the worst outline still tells better than a guess.
+Weight:    d_i grows with what is left of the image's energy where the object fits best: a shape or
+           a mask that does not fit says by so much less where the object stands. Which way it
+           faces, the worst outline still says better than a guess.
 
 Nothing here is hard: each price is bounded or grows slowly, so that a piece that was given metres
 away or turned round is found as before where its shape fits or people tell.
@@ -28,7 +28,7 @@ from mover.core.types import Layout
 AWAY = 0.07  # standard deviation of the logarithm of a given distance
 TURN = math.radians(20)  # of a given yaw [rad]
 FLIPPED = 0.1  # share of yaws that are off by a further quarter or half turn
-TURNS = 1.0  # largest doubt that counts for yaws
+TURNS = 1.0  # largest weight that counts for yaws
 ANY = 0.01  # and of those that are off by anything
 
 
@@ -50,15 +50,15 @@ class Given:
     """Expected size, as a factor on that of the mesh."""
     precision: Float[Tensor, "objects 3 3"]
     """How well it is known: inverse covariance of the logarithms."""
-    doubt: Float[Tensor, " objects"]
+    weight: Float[Tensor, " objects"]
     """How little the image tells of it: 1 is usual, 0 leaves it to the image."""
 
 
 def given_term(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
-    """How far places, yaws and sizes are from what is expected [nats, times the doubt]."""
+    """How far places, yaws and sizes are from what is expected [nats, times the weight]."""
     turned = _yaw(layout, given) + _axis(layout, given)
     placed = _place(layout, given) + _size(layout, given)
-    return given.doubt.clamp_max(TURNS) * turned + given.doubt * placed
+    return given.weight.clamp_max(TURNS) * turned + given.weight * placed
 
 
 def _place(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:

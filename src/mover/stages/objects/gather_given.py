@@ -17,9 +17,9 @@ from mover.furniture.library import STANDARD, WALL_PIECES
 SIZE = 0.1  # standard deviation of the logarithm of each given size
 COMMON = 0.06  # and of what the three have in common
 FIT = 0.1  # image energy (robust form) of a shape that fits
-UNFIT = 0.5  # doubt from which on a shape may fit because something hides what does not
-DOUBTS = (0.05, 8.0)  # least and largest doubt
-LOOSE = math.radians(8)  # how well the image alone turns objects of a doubt of 1 [rad]
+UNFIT = 0.5  # weight from which on a shape does not fit, or only as something hides it
+WEIGHTS = (0.05, 8.0)  # least and largest weight
+LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of 1 [rad]
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
@@ -40,49 +40,49 @@ def gather_given(
     mean, precision = expected_sizes(objects)
     along = torch.tensor([OFTEN if c in WALL_PIECES else SELDOM for c in objects.categories])
     known = torch.ones_like(start.yaw)
-    doubt = doubts(energy)
-    found = (LOOSE * (0.1 + doubt).sqrt()).clamp(SQUARE, TURN)
+    weight = prior_weights(energy)
+    found = (LOOSE * (0.1 + weight).sqrt()).clamp(SQUARE, TURN)
     axis, spread = room_axis([(start.yaw, TURN * known), (layout.yaw, found)], along)
     sharp = 1 / (4 * math.hypot(SQUARE, spread)) ** 2
     return Given(
         distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=along.to(known),
         sharpness=sharp * known, axis=axis * known, log_scale=mean, precision=precision,
-        doubt=doubt,
+        weight=weight,
     )  # fmt: skip
 
 
-def doubts(energy: Float[Tensor, " objects"]) -> Float[Tensor, " objects"]:
-    """How little the image tells of each object, see `terms.given`.
+def prior_weights(energy: Float[Tensor, " objects"]) -> Float[Tensor, " objects"]:
+    """Weight of the guess of each object, by what the image leaves of it (`terms.given`).
 
-    A wrong shape can fit well where something hides half of it. So an object that fits better than
-    the room's usual one is doubted as the geometric mean of both: shapes of one tool are alike.
+    A wrong shape can fit well where something hides half of it. So of an object that fits better
+    than the room's usual one the geometric mean of both counts: shapes of one tool are alike.
     """
     usual = energy.median().clamp_min(1e-6)
-    return (torch.where(energy < usual, (energy * usual).sqrt(), energy) / FIT).clamp(*DOUBTS)
+    return (torch.where(energy < usual, (energy * usual).sqrt(), energy) / FIT).clamp(*WEIGHTS)
 
 
-def told_by_people(
+def lighter_where_used(
     given: Given, trust: Float[Tensor, " objects"], touches: ContactPoints | None
 ) -> Given:
-    """The same, with less doubt of what people use: they tell where it stands, not its outline.
+    """The same, lighter for what people use: they say where it stands, whatever its outline.
 
     Args:
-        given: What is known before the people are heard.
+        given: What is known without the people.
         trust: Weight of each silhouette beside them.
         touches: What they touch.
     """
     if touches is None:
         return given
     index = touches.object_of
-    less = given.doubt[index] * trust[index]
-    return replace(given, doubt=given.doubt.index_copy(0, index, less))
+    less = given.weight[index] * trust[index]
+    return replace(given, weight=given.weight.index_copy(0, index, less))
 
 
 def believed_sides(
-    sides: Int[Tensor, "objects 4"], doubt: Float[Tensor, " objects"]
+    sides: Int[Tensor, "objects 4"], weight: Float[Tensor, " objects"]
 ) -> Int[Tensor, "objects 4"]:
-    """What is known of the sides of boxes, where a shape that fits needs no bound (`LIKELY`)."""
-    fits = (doubt < UNFIT).unsqueeze(-1)
+    """What is known of the sides of boxes, with no bound (`LIKELY`) for shapes that fit."""
+    fits = (weight < UNFIT).unsqueeze(-1)
     return torch.where(fits & (sides == LIKELY), LEAST, sides)
 
 
@@ -122,9 +122,9 @@ def common_scale(layout: Layout, given: Given, spread: float) -> float:
     precision = torch.linalg.inv(torch.linalg.inv(given.precision.double()) + noise)
     near = away[:, None] - tried
     rest = off[:, None] - tried[:, None]
-    price = 2 * (1 + near.square() / (3 * (AWAY**2 + FITTED**2))).log()
-    price = price + 0.5 * torch.einsum("nri,nij,nrj->nr", rest, precision, rest)
-    total = price.sum(0) + 0.5 * (tried / spread).square()
+    cost = 2 * (1 + near.square() / (3 * (AWAY**2 + FITTED**2))).log()
+    cost = cost + 0.5 * torch.einsum("nri,nij,nrj->nr", rest, precision, rest)
+    total = cost.sum(0) + 0.5 * (tried / spread).square()
     weight = (total.min() - total).exp()
     return float((weight * tried).sum() / weight.sum())
 
