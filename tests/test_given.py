@@ -19,15 +19,15 @@ from mover.geometry.mesh import box
 from mover.geometry.placement import larger
 from mover.geometry.topology import is_closed
 from mover.stages.objects.gather_given import (
-    WEIGHTS,
     UNFIT,
+    WEIGHTS,
     believed_sides,
     common_scale,
-    prior_weights,
     expected_sizes,
     gather_given,
-    room_axis,
     lighter_where_used,
+    prior_weights,
+    room_axis,
 )
 from mover.stages.objects.prepare_objects import levelled
 from mover.stages.people.find_depth import are_shapeless, nearer
