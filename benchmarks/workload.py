@@ -8,7 +8,7 @@ from mover.core.types import Camera, Layout, Objects
 from mover.energy.objective import HumanCues, ImageCues
 from mover.energy.terms.bbox import SEEN
 from mover.energy.terms.collision import BodySpace
-from mover.energy.terms.contact import ContactPoints
+from mover.energy.terms.contact import ContactPoints, shares_of
 from mover.energy.terms.depth import DepthRange
 from mover.geometry.camera import project, tilted, to_camera
 from mover.geometry.crops import crop_views
@@ -89,7 +89,8 @@ def people(objects: Objects, layout: Layout, depths: Depths, rng: torch.Generato
     points = place(objects.top, layout)[:, torch.randint(400, (1200,), generator=rng)]
     points = points.view(n, 4, 300, 3) + 0.05 * torch.randn(n, 4, 300, 3, generator=rng)
     facing = torch.stack([layout.yaw.sin(), layout.yaw.cos()], -1)
-    touches = ContactPoints(torch.arange(n), points, weight, torch.full((n,), 8.0), facing)
+    bodies, shares = torch.full((n,), 8.0), shares_of(weight)
+    touches = ContactPoints(torch.arange(n), points, weight, bodies, shares, facing)
     return HumanCues(DepthRange(near, far, near, torch.ones(n)), BodySpace(volume), touches)
 
 

@@ -8,7 +8,7 @@ from mover.core.types import Camera, Layout, Objects
 from mover.energy.objective import HumanCues, ImageCues
 from mover.energy.terms.bbox import SEEN
 from mover.energy.terms.collision import BodySpace
-from mover.energy.terms.contact import ContactPoints
+from mover.energy.terms.contact import ContactPoints, shares_of
 from mover.energy.terms.depth import DepthRange
 from mover.energy.terms.given import Given
 from mover.energy.terms.wall import Walls, rears_of
@@ -138,6 +138,7 @@ def humans_at(objects, layout, camera, image):
         points.contiguous(),
         weight,
         torch.tensor([6.0, 6.0]).to(near),
+        shares_of(weight),
         heading,
     )
     return HumanCues(DepthRange(near, far, lowest, area), BodySpace(volume), touches)

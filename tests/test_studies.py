@@ -14,7 +14,9 @@ from mover.app.cli import run_command
 from mover.core import records
 from mover.core.errors import InputError
 from mover.core.observe import Step
+from mover.core.settings import check_settings
 from mover.core.types import Room
+from mover.energy.config import Adam
 from mover.energy.terms.feet import FootContacts
 from mover.geometry.camera import project, to_camera
 from mover.pipeline.outcome import to_world
@@ -38,7 +40,18 @@ from mover_bench.studies.queue import open_jobs, run_all
 from mover_bench.studies.run import by_room
 from mover_bench.studies.sets import CHANGES, EXACT, SETS, changed_set, set_named
 from mover_bench.studies.study import STUDIES, ask_of, jobs_of, run_study
-from mover_bench.studies.variants import PARTS, TERMS, VARIANTS, Cut, Variant, frames_of, withheld
+from mover_bench.studies.variants import (
+    HUMAN,
+    PARTS,
+    TERMS,
+    VARIANTS,
+    Cut,
+    Variant,
+    frames_of,
+    is_variant,
+    variant_named,
+    withheld,
+)
 
 SEEDS = "1000-1019"
 SCENES = ("initial", "image", "full", "nudged")
@@ -491,6 +504,8 @@ def test_people_seen_from_another_camera_stay_in_their_pixels() -> None:
         (["ablation", "--set", "rooms+exact=light"], "'light' exact, expected some of camera"),
         (["sensitivity", "--errors", "size"], "--errors: 'size' is none of scale, place"),
         (["camera", "--errors", "scale"], "--errors: the study camera tries none"),
+        (["paper", "--errors", "scale"], "--errors: 'scale' is none of camera, bodies"),
+        (["camera", "--steps", "5"], "--steps: the study camera keeps"),
     ],
 )
 def test_the_command_names_what_it_does_not_know(flags, said, tmp_path, capsys) -> None:
@@ -520,6 +535,7 @@ def test_a_true_camera_is_held_and_true_contacts_are_given(small_room: KnownRoom
         )
         assert torch.equal(capture.touch[row], small_room.touching[same][0].float())
     config = held_camera(PRESETS["paper"])
+    check_settings(config, "config")
     points = torch.tensor([[0.0, 2.0, 3.0], [1.0, 2.0, 4.0], [-1.0, 2.2, 5.0]]).double()
     feet = FootContacts(points, torch.zeros(3).long(), torch.arange(3), ())
     known = AlignInputs(feet, capture.scene.camera, None, capture.camera_height)
@@ -534,11 +550,28 @@ def test_people_of_the_paper_are_compared_with_its_first_stage(tmp_path: Path) -
     text = page.read_text()
     gains = text.split("## What people add to IoU3D")[1]
     line = next(x for x in gains.splitlines() if x.startswith("| paper, all errors |"))
-    assert [x.split()[0] for x in line.split("|")[2:6]] == ["+0.250", "+0.150", "+0.200", "+0.100"]
+    assert [x.split()[0] for x in line.split("|")[2:7]] == [
+        "+0.200", "+0.250", "+0.150", "+0.200", "+0.100",
+    ]  # fmt: skip
     first = text.split("## paper, true camera\n")[0]
     assert "*MOVER, camera, depth* (paper)" in first
     assert "+exact=camera,bodies,contacts,masks" in text
     assert "| 1000 chair_0 | ✓ |" in text.split("## Object by object")[1]
+
+
+def test_the_paper_is_asked_with_few_steps_about_some_errors(tmp_path: Path) -> None:
+    table = Table()
+    args = StudyArgs(
+        "paper", seeds="5", presets=("paper",), errors=("camera", "bodies"), steps=7, out=tmp_path
+    )
+    page = run_study(args, launch=table)[0].read_text()
+    sets = {rooms for rooms, _, _ in table.done}
+    assert sets == {"rooms", *(f"rooms+exact={x}" for x in ("camera", "bodies", "camera,bodies"))}
+    names = {name for _, _, name in table.done} - {ROOM}
+    assert names == {"paper@7", *(f"paper-{x}@7" for x in ("nothing", *HUMAN))}
+    assert all(variant_named(name).config.place.method == Adam(7) for name in names)
+    assert "study paper --seeds 5 --presets paper --errors camera bodies --steps 7\n" in page
+    assert [is_variant(n) for n in ("paper@7", "paper@x", "papers@7")] == [True, False, False]
 
 
 def test_all_studies_share_one_queue(tmp_path: Path) -> None:

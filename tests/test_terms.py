@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mover.core.types import Layout
 from mover.energy.config import SceneWeights
 from mover.energy.objective import HumanCues
-from mover.energy.terms.contact import contact_term
+from mover.energy.terms.contact import contact_term, shares_of
 from mover.energy.terms.depth import DepthRange, depth_term
 from mover.geometry.camera import project, to_camera
 from mover.geometry.placement import place, rest_on_support
@@ -184,9 +184,10 @@ class TestPaperAsPrinted:
         layout, touches = self.at(), self.inputs.humans.touches
         found = self.value("contact", layout)
         tops = place(self.inputs.objects.top, layout)[0].numpy()
+        everybody = touches.points[:, 0].flatten(0, 1)
         for k, i in enumerate(touches.object_of.tolist()):
             points = touches.points[k, 0].numpy()
-            want = np.mean([min(np.linalg.norm(p - q) for q in tops[i]) for p in points])
+            want = sum(min(np.linalg.norm(p - q) for q in tops[i]) for p in points) / len(everybody)
             assert found[i] == pytest.approx(want, abs=1e-4)
         assert found[2] == 0
 
@@ -203,6 +204,7 @@ class TestPrintedTerms:
             points=torch.cat([touches.points, touches.points], 2),
             weight=torch.cat([touches.weight, touches.weight], 2),
         )
+        assert torch.equal(shares_of(twice.weight), touches.share)
         one, other = (
             contact_term(
                 (
@@ -216,6 +218,18 @@ class TestPrintedTerms:
         )
         torch.testing.assert_close(one, other)
         assert one.max() > 0
+
+    def test_what_few_vertices_touch_weighs_little_beside_what_many_touch(self):
+        inputs = make_inputs(torch.float64, size=16)
+        touches = inputs.humans.touches
+        weight = touches.weight.clone()
+        weight[1] *= 0.01
+        away = replace(inputs.starts, t_world_object=inputs.starts.t_world_object + 0.3)
+        regions = tuple(place(x, away) for x in (inputs.objects.top, inputs.objects.back))
+        few = replace(touches, weight=weight, share=shares_of(weight))
+        both, one = (contact_term(regions, t, "paper")[0] for t in (touches, few))
+        assert float(one[1]) == pytest.approx(2 / 101 * float(both[1]))
+        assert float(one[0]) == pytest.approx(200 / 101 * float(both[0]))
 
     def test_bounds_that_contradict_each_other_are_no_range(self):
         covered, four = torch.ones(1, 1, 1, 4, dtype=torch.bool), torch.ones(1, 1, 4)

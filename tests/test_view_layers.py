@@ -16,7 +16,7 @@ from mover.app.viewer.session import Shown, start_session
 from mover.app.viewer.solve import Stopped, Watch, seen_in
 from mover.core.observe import Energy, Step
 from mover.core.types import Layout
-from mover.energy.terms.contact import ContactPoints
+from mover.energy.terms.contact import ContactPoints, shares_of
 from mover.energy.terms.depth import DepthMaps
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, project, tilted, to_camera
@@ -74,7 +74,12 @@ class TestLayers:
         weight = torch.zeros(2, 4, 3)
         weight[0, 1, 2], weight[1, 0, 0], weight[1, 3, 1] = 5.0, 1.0, 2.0
         touches = ContactPoints(
-            torch.tensor([2, 0]), points, weight, torch.ones(2), torch.zeros(2, 2)
+            torch.tensor([2, 0]),
+            points,
+            weight,
+            torch.ones(2),
+            shares_of(weight),
+            torch.zeros(2, 2),
         )
         found = contact_points(touches, ("a", "b", "c"))
         assert set(found) == {"a", "c"}

@@ -152,8 +152,8 @@ class AlignConfig:
     """How far a person usually floats because of a wrong depth [m]; 0: not at all."""
     votes: Literal["places", "points"] = "places"
     """What counts once: a place where a person stood, or a point."""
-    steps: Annotated[int, int_in(1, 10_000)] = 60
-    """Most Gauss-Newton steps for each scale."""
+    steps: Annotated[int, int_in(0, 10_000)] = 60
+    """Most Gauss-Newton steps for each scale; 0: the camera stays as it is given."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from mover.core.settings import int_in
+from mover.core.settings import Steps, int_in
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,10 @@ class StudyArgs:
     presets: tuple[str, ...] = ("paper", "release", "robust")
     """Which presets the studies `sets` and `paper` try."""
     errors: tuple[str, ...] = ()
-    """Which errors of the input the study `sensitivity` tries: scale, place, ...; empty: all."""
+    """Which errors the study `sensitivity` tries: scale, place, ..., or `paper` switches off:
+    camera, bodies, contacts, masks; empty: all."""
+    steps: Steps = 0
+    """Steps of the last descent in the study `paper`; 0: the presets' own."""
     out: Path = Path("experiments")
     """Folder for the results."""
     workers: Annotated[int, int_in(0, 10_000)] = 0

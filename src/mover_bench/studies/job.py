@@ -44,7 +44,7 @@ from mover_bench.studies.measures import (
 )
 from mover_bench.studies.sets import RoomSet, set_named
 from mover_bench.studies.stability import measure_stability
-from mover_bench.studies.variants import VARIANTS, Variant, frames_of, withheld
+from mover_bench.studies.variants import Variant, frames_of, is_variant, variant_named, withheld
 
 ROOM = "room"  # the job that makes the room; all others have the name of their variant
 DONE = "metrics.json"  # a job that has it is finished
@@ -166,7 +166,7 @@ def doing_of(room: KnownRoom) -> tuple[str, ...]:
 
 def key_of(job: Job) -> str:
     """Digest of everything that a job's numbers depend on."""
-    settings = VARIANTS.get(job.name)  # a room has none
+    settings = variant_named(job.name) if is_variant(job.name) else None  # a room has none
     rooms = set_named(job.rooms)
     return records.fingerprint(
         rooms.room, rooms.noise, rooms.exact, rooms.withheld, rooms.paths, rooms.version, job.seed,
@@ -179,7 +179,7 @@ def do_job(job: Job) -> None:
     if job.name == ROOM:
         store_room(job, noisy_room(job.seed, set_named(job.rooms), Run(job.truths)))
     else:
-        rebuild(job, VARIANTS[job.name])
+        rebuild(job, variant_named(job.name))
 
 
 def store_room(job: Job, trial: Trial, densities: EvaluateConfig | None = None) -> None:

@@ -16,7 +16,7 @@ from mover_bench.studies.queue import Launch, failure_of, finish, has_results, o
 from mover_bench.studies.sets import set_named
 from mover_bench.studies.study_page import command_of
 from mover_bench.studies.tables import Experiment, need_bench, write_tables
-from mover_bench.studies.variants import VARIANTS, choices
+from mover_bench.studies.variants import choices, is_variant
 
 
 def run_experiment(
@@ -78,5 +78,5 @@ def by_room(jobs: Sequence[Job]) -> list[Job]:
 def _check(args: ExperimentArgs) -> None:
     set_named(args.set)
     for name in args.presets:
-        if name not in VARIANTS:
+        if not is_variant(name):
             raise InputError(f"--presets: {name!r} is none of {choices()}")

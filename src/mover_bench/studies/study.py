@@ -130,7 +130,8 @@ def ask_of(args: StudyArgs, study: Study) -> Ask:
     rooms = args.set or study.rooms
     names = [rooms] if rooms else list(SETS)
     seeds = {name: parse_seeds(args.seeds or set_named(name).seeds) for name in names}
-    return Ask(names[0], seeds, args.presets, args.errors or tuple(CHANGES))
+    errors = args.errors or tuple(study_noise.ERRORS.get(args.name, CHANGES))
+    return Ask(names[0], seeds, args.presets, errors, args.steps)
 
 
 def jobs_of(plan: Plan, ask: Ask, out: Path) -> list[Job]:
@@ -191,6 +192,7 @@ def command_of(name: str, args: StudyArgs) -> str:
     if name in ("sets", "paper") and args.presets != StudyArgs.presets:
         words += ["--presets", *args.presets]
     words += ["--errors", *args.errors] if args.errors else []
+    words += ["--steps", str(args.steps)] if args.steps else []
     return " ".join(words)
 
 
@@ -226,5 +228,7 @@ def _check(args: StudyArgs) -> None:
         if name not in PRESETS:
             raise InputError(f"--presets: {name!r} is none of {', '.join(PRESETS)}")
     study_noise.check_errors(args.name, args.errors)
-    if "robust" not in args.presets:
+    if args.steps and args.name != "paper":
+        raise InputError(f"--steps: the study {args.name} keeps the presets' own")
+    if "robust" not in args.presets and args.name != "paper":
         raise InputError("--presets: robust is missing, with which the others are compared")

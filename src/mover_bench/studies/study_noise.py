@@ -1,13 +1,13 @@
 """How much wrong input costs: one kind of error after the other, in growing sizes."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from mover.core.errors import InputError
 from mover_bench.studies.compare import Interval, interval, markdown, paired
 from mover_bench.studies.finished import Finished, Frame, Source, by_room
 from mover_bench.studies.plots import Line, Panel, draw_panels
-from mover_bench.studies.sets import CHANGES, Change, changed_set
+from mover_bench.studies.sets import CHANGES, EXACT, Change, changed_set
 from mover_bench.studies.study_rows import Ask, Page, Plan
 from mover_bench.tables import published
 
@@ -29,13 +29,17 @@ class Level:
     """Share of IoU3D that is lost against no error of this kind."""
 
 
+ERRORS: Mapping[str, Collection[str]] = {"sensitivity": CHANGES, "paper": EXACT}
+"""The errors of the input that a study tries, by its name."""
+
+
 def check_errors(study: str, kinds: Sequence[str]) -> None:
-    """They must be kinds that are known, and asked of the study that tries them."""
-    if kinds and study != "sensitivity":
-        raise InputError(f"--errors: the study {study} tries none, expected sensitivity")
+    """They must be kinds that are known, and asked of a study that tries them."""
+    if kinds and study not in ERRORS:
+        raise InputError(f"--errors: the study {study} tries none, expected {' or '.join(ERRORS)}")
     for kind in kinds:
-        if kind not in CHANGES:
-            raise InputError(f"--errors: {kind!r} is none of {', '.join(CHANGES)}")
+        if kind not in ERRORS[study]:
+            raise InputError(f"--errors: {kind!r} is none of {', '.join(ERRORS[study])}")
 
 
 def plan(ask: Ask) -> Plan:

@@ -44,7 +44,9 @@ class Ask:
     presets: tuple[str, ...] = ("paper", "release", "robust")
     """Which of them the study `sets` compares."""
     errors: tuple[str, ...] = tuple(CHANGES)
-    """Which of them the study `sensitivity` tries."""
+    """Which of them the study `sensitivity` tries, or `paper` switches off."""
+    steps: int = 0
+    """Of the last descent in the study `paper`; 0: the presets' own."""
 
 
 @dataclass(frozen=True)

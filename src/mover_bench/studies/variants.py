@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mover.core.records import rows_of
 from mover.core.types import Bodies, Capture, Masks, People
+from mover.energy.config import Adam
 from mover.pipeline.presets import PRESETS, Config, with_sizes
 from mover.stages.config import AssignConfig, SpreadConfig
 
@@ -106,6 +107,8 @@ TERMS: dict[str, Variant] = {
 
 HUMAN = ("contact", "depth", "collision")
 """The terms of the people as the paper has them."""
+NO_TERM = "nothing"
+"""Stands for none of them: the image alone for as many steps more."""
 
 
 def lone_term(preset: str, name: str) -> Variant:
@@ -121,9 +124,11 @@ def lone_term(preset: str, name: str) -> Variant:
 
 
 ALONE: dict[str, Variant] = {
-    f"{preset}-{name}": lone_term(preset, name) for preset in ("paper", "release") for name in HUMAN
+    f"{preset}-{name}": lone_term(preset, name)
+    for preset in ("paper", "release")
+    for name in (*HUMAN, NO_TERM)
 }
-"""`paper` and `release` with one term of the people."""
+"""`paper` and `release` with one term of the people, or none."""
 
 _FEET = replace(ROBUST, refine=replace(ROBUST.refine, rounds=0))
 PARTS: dict[str, Variant] = {
@@ -195,6 +200,23 @@ VARIANTS: dict[str, Variant] = {
     **TIMED, **STANDS, **PEOPLE, **UNREFINED,
 }  # fmt: skip
 """By the name of the job."""
+
+
+def is_variant(name: str) -> bool:
+    """Whether `variant_named` knows it."""
+    base, at, steps = name.partition("@")
+    return base in VARIANTS and (not at or (steps.isascii() and steps.isdigit()))
+
+
+def variant_named(name: str) -> Variant:
+    """A variant; `paper-depth@600` is `paper-depth` with 600 steps of the last descent."""
+    base, _, steps = name.partition("@")
+    variant = VARIANTS[base]
+    method = variant.config.place.method
+    if not steps or not isinstance(method, Adam):
+        return variant
+    place = replace(variant.config.place, method=replace(method, steps=int(steps)))
+    return replace(variant, config=replace(variant.config, place=place))
 
 
 def choices() -> str:

@@ -5,8 +5,9 @@ Evidence:  body points that touch, from all frames, each assigned to one object 
            the back (C(O)^{\perp y}); thinned to small cells whose weight counts the points inside.
 Price:     L_contact = \sum_i \sum_v I(v, O_i)
            [CD(v^y, C(O_i)^y) + CD(v^{\perp y}, C(O_i)^{\perp y})]
-Paper:     CD is the mean over the body points of the distance to the nearest point of the object's
-           part: a Chamfer distance is a mean over its source points. Body and hands apart.
+Paper:     CD is a mean over its source points, which the sum prints: all touching skin of the
+           people, of which I(v, O_i) picks what touches this object. So what many bodies touch
+           weighs more than what a few stray vertices touch. Body and hands together.
 Release:   from each point of the object's part to the nearest body point, its mean; body and hands
            apart.
 Robust:    the mean of a Geman-McClure price (rho 0.3 m) from body to object, in full only once four
@@ -46,8 +47,17 @@ class ContactPoints:
     """Body vertices that a point stands for; 0 pads."""
     bodies: Float[Tensor, " touched"]
     """Number of bodies that touch the object."""
+    share: Float[Tensor, "touched 4"]
+    """Of all body vertices that touch seats and tops, or backs, those that touch this part [1]."""
     heading: Float[Tensor, "touched 2"]
     """Mean direction (x, z) that its sitters face, a unit vector; zero where nobody sits."""
+
+
+def shares_of(weight: Float[Tensor, "touched 4 points"]) -> Float[Tensor, "touched 4"]:
+    """Of all vertices that touch seats and tops, or backs, those that touch each part."""
+    counts = weight.sum(-1)
+    of_region = counts.unflatten(-1, (2, 2)).sum((0, 1))
+    return counts / of_region.clamp_min(1e-9).repeat(2)
 
 
 def some_touches(touches: ContactPoints, index: Int[Tensor, " few"], count: int) -> ContactPoints:
@@ -56,7 +66,7 @@ def some_touches(touches: ContactPoints, index: Int[Tensor, " few"], count: int)
     row[touches.object_of] = torch.arange(len(touches.object_of)).to(index)
     touched = torch.nonzero(row[index] >= 0)[:, 0]
     few = row[index[touched]]
-    rest = {k: getattr(touches, k)[few] for k in ("points", "weight", "bodies", "heading")}
+    rest = {k: getattr(touches, k)[few] for k in ("points", "weight", "bodies", "share", "heading")}
     return ContactPoints(touched, **rest)
 
 
@@ -100,7 +110,7 @@ def gap_term(
 def _price(near: Tensor, touches: ContactPoints, form: Variant) -> Float[Tensor, "*starts touched"]:
     if form == "paper":
         mean = (near * touches.weight).sum(-1) / touches.weight.sum(-1).clamp_min(1e-9)
-        return mean.sum(-1)
+        return (mean * touches.share).sum(-1)
     share = constant(SHARE, near)
     mean = (geman_mcclure(near, RHO) * touches.weight).sum(-1)
     mean = mean / touches.weight.sum(-1).clamp_min(1e-9)

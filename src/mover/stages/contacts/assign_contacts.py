@@ -14,7 +14,7 @@ from mover.bodies.skin import PARTS
 from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.types import Bodies
-from mover.energy.terms.contact import ContactPoints
+from mover.energy.terms.contact import ContactPoints, shares_of
 from mover.geometry.mesh import vertex_normals
 from mover.stages.config import AssignConfig, ContactConfig
 from mover.stages.contacts.contact_association import AssignInputs, ContactRows, contact_rows
@@ -160,7 +160,8 @@ def _pack(
     bodies = [len(rows.body[rows.object_of == o].unique()) for o in touched.tolist()]
     return ContactPoints(
         touched, packed.unflatten(0, (len(touched), 4)), weight,
-        torch.tensor(bodies, dtype=points.dtype), _headings(rows, touched, inputs),
+        torch.tensor(bodies, dtype=points.dtype), shares_of(weight),
+        _headings(rows, touched, inputs),
     )  # fmt: skip
 
 
