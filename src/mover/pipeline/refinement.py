@@ -137,6 +137,18 @@ def find_posa(
     return posa_contacts(load_posa(weights, meshes), bodies, samples)
 
 
+def with_posa(capture: Capture, weights: Path, meshes: Path) -> Capture:
+    """The capture with contacts by POSA in place of its own, upright by its camera (Sec. 3).
+
+    Raises:
+        InputError: If a file is missing or wrong, or the capture has nobody.
+    """
+    if capture.bodies is None:
+        raise InputError(f"--posa: {capture.name} has no bodies.npz, so nobody touches anything")
+    people = to_refined_world(capture.bodies, capture.scene)
+    return replace(capture, touch=posa_contacts(load_posa(weights, meshes), people, 0))
+
+
 def write_contacts(chance: Float[Tensor, "bodies verts"], out: Path) -> None:
     """Write contacts.npz of a capture."""
     write_npz({"probability": chance.to(torch.float32).numpy()}, out)

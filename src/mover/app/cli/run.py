@@ -9,6 +9,7 @@ from tyro.conf import AvoidSubcommands, Positional, arg
 
 from mover.app.cli.config import Device, chosen_config, parsed
 from mover.app.cli.console import say
+from mover.core.errors import InputError
 from mover.io.formats import chosen
 from mover.pipeline.presets import Config
 
@@ -35,6 +36,10 @@ class RunArgs:
     """Watch the furniture move in the browser (extra `viewer`)."""
     device: Device = "cpu"
     """Where the heavy stages compute: cpu, cuda (an NVIDIA GPU; see docs/engine.md) or auto."""
+    posa: Path | None = None
+    """POSA's contact.pt: its network says what touches, in place of contacts.npz and geometry."""
+    posa_meshes: Path | None = None
+    """The folder mesh_ds that comes with it."""
     refine: bool = False
     """At the end, refine the people with the room they helped to find: bodies.npz holds them."""
 
@@ -61,7 +66,7 @@ def run(arguments: Sequence[str]) -> None:
     from mover.io.capture.edits import read_edits
 
     device = device_of(args.device)
-    capture = read(args.source)
+    capture = _with_contacts(read(args.source), args)
     edits = () if args.edits is None else read_edits(args.edits)
     origin = Origin(str(args.source.resolve()), args.format, edits, args.refine, device)
     if args.view:
@@ -71,6 +76,17 @@ def run(arguments: Sequence[str]) -> None:
         return
     reconstruct_into(args.out, capture, config, origin)
     say(f"report: {args.out / 'report.html'}")
+
+
+def _with_contacts(capture: Any, args: RunArgs) -> Any:  # noqa: ANN401
+    """The capture with POSA's contacts where these are asked for."""
+    if args.posa is None and args.posa_meshes is None:
+        return capture
+    if args.posa is None or args.posa_meshes is None:
+        raise InputError("--posa, --posa-meshes: one is missing, expected contact.pt and mesh_ds")
+    from mover.pipeline.refinement import with_posa
+
+    return with_posa(capture, args.posa, args.posa_meshes)
 
 
 def reconstruct_into(
