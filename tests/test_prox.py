@@ -45,9 +45,13 @@ def write_fits(root: Path, recording: str, frames: int, kinds: tuple[str, ...]) 
 @pytest.fixture(scope="module")
 def stills(plain: layouts.Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two recordings of the quantitative room: three and two stills, with fits and MoSh."""
-    root = tmp_path_factory.mktemp("quantitative")
+    return write_stills(tmp_path_factory.mktemp("quantitative"), prox_room(plain))
+
+
+def write_stills(root: Path, room: layouts.Room) -> Path:
+    """PROX's quantitative part of a room, people in the camera's axes whatever its tilt."""
     for name, frames in ((FIRST, 3), (SECOND, 2)):
-        layouts.write_prox(root, prox_room(plain), name, frames, SHIFT)
+        layouts.write_prox(root, room, name, frames, SHIFT)
         write_fits(root, name, frames, ("fittings/PROX", "fittings/mosh"))
     world = np.eye(4).tolist()
     (root / "vicon2scene.json").write_text(json.dumps(world))

@@ -276,10 +276,10 @@ def _people(
         return {}
     near = gather_touch(bodies, judged.furniture, touch, config.bodies, config.reach)
     values = measure(TOUCH_METRICS, near)
-    if ground is not None and len(judged.soles):
-        heights = bodies.verts[:, judged.soles, 1] - ground
-        if config.feet == "contacts":
-            heights = feet_heights(bodies, judged.scene.camera) - ground
+    told = config.feet == "contacts"
+    if ground is not None and (told or len(judged.soles)):
+        soles = bodies.verts[:, judged.soles, 1]
+        heights = (feet_heights(bodies, judged.scene.camera) if told else soles) - ground
         values |= measure(GROUND_METRICS, Standing(heights, config.ground_tolerance))
     values |= measure(MOTION_METRICS, gather_gait(bodies, truth.bodies, ground))
     twins = None if truth.bodies is None else gather_twins(bodies, truth.bodies)
