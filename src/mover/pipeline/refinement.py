@@ -143,9 +143,11 @@ def with_posa(capture: Capture, weights: Path, meshes: Path) -> Capture:
     Raises:
         InputError: If a file is missing or wrong, or the capture has nobody.
     """
-    if capture.bodies is None:
+    people = capture.bodies
+    if people is None:
         raise InputError(f"--posa: {capture.name} has no bodies.npz, so nobody touches anything")
-    people = to_refined_world(capture.bodies, capture.scene)
+    if people.space == "camera":
+        people = to_world(people, capture.scene.camera)
     return replace(capture, touch=posa_contacts(load_posa(weights, meshes), people, 0))
 
 
