@@ -29,7 +29,7 @@ from mover.io.capture.scene_file import write_scene
 
 
 def test_the_truth_scores_best_in_every_metric() -> None:
-    scene, bodies = room(), people()
+    scene, bodies = room(), people(4)
     metrics = evaluate(scene, scene, scene, EvaluatedBodies(bodies, bodies, bodies), FAST)
     assert list(metrics) == ["initial", "result", "objects"]
     for key in ("initial", "result"):
@@ -195,7 +195,7 @@ def test_a_folder_without_truth_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_table_tells_every_metric_before_and_after() -> None:
-    scene, bodies = room(), people()
+    scene, bodies = room(), people(4)
     metrics = evaluate(scene, scene, scene, EvaluatedBodies(None, bodies, bodies), FAST)
     lines = table(metrics).splitlines()
     for name in METRICS:
