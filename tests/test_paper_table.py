@@ -177,31 +177,6 @@ def test_every_table_makes_all_of_its_rows_once(name: str, tmp_path: Path) -> No
     assert again.done == []
 
 
-@pytest.mark.slow
-def test_every_row_of_scenes_is_made_of_a_copy_in_the_true_layout(
-    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two recordings of the quantitative room with BodyIndexColor, from import to page.
-
-    The people's rows need a body model that the toy of the fits is not.
-    """
-    for name, preset in PRESETS.items():
-        monkeypatch.setitem(PRESETS, name, quick(preset))
-
-    def at_once(job: TableJob) -> Ended:
-        do_job(job)
-        return Ended(0)
-
-    scenes = TABLES["prox-quantitative"].parts[0].ours
-    only = tuple(row.label for row in scenes)
-    args = TableArgs("prox-quantitative", copy.parent, tmp_path / "out", preset="paper", only=only)
-    page = paper_table(args, launch=at_once).read_text().split("## People")[0]
-    assert "**Failed**" not in page
-    ours = [x for x in page.splitlines() if x.startswith("| ") and x.endswith(" 1 |")]
-    assert [x.split("|")[1].strip() for x in ours] == list(only)
-    assert not [x for x in ours if " - |" in x]
-
-
 def test_people_are_in_millimetres_and_overlaps_as_the_paper_prints_them(tmp_path: Path) -> None:
     there = named_captures(tmp_path / "c", "vicon_03301")
     args = TableArgs("prox-quantitative", there, tmp_path / "out", only=("baseline", "initial"))
