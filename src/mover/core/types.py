@@ -31,6 +31,17 @@ class Mesh:
 
 
 @record
+class Segment:
+    """Where an object stands from a frame on, until its next segment begins."""
+
+    frame: int
+    t_world_object: Float[Tensor, "3"]
+    """Place of the mesh origin in the world [m]."""
+    yaw: Float[Tensor, ""]
+    """[rad]"""
+
+
+@record
 class SceneObject:
     """One object of a scene: x_world = R_y(yaw) @ (scale * x_mesh) + t_world_object."""
 
@@ -49,6 +60,9 @@ class SceneObject:
     """Right-handed rotation about +y [rad]."""
     scale: Float[Tensor, "3"]
     """Factor along each mesh axis."""
+    segments: tuple[Segment, ...] = ()
+    """Where it stands when, of an object that is moved; its own place is that of the reference
+    image. Empty: it never moves."""
 
 
 @record
@@ -180,6 +194,8 @@ class Capture:
     touch: Float[Tensor, "bodies verts"] | None
     """Chance that a body's vertex touches something, where the user has it (POSA, DECO)."""
     warnings: tuple[str, ...]
+    furniture: People | None = None
+    """Visible masks of the objects in some frames, `person` being the number of an annotation."""
     hypotheses: tuple[SceneObject, ...] = ()
     """Other places and shapes of the scene's objects, under their ids: further starts."""
     path: CameraPath = STILL

@@ -1,5 +1,6 @@
 """Rays and the floor, and objects under a new camera."""
 
+import dataclasses
 import math
 
 import torch
@@ -122,3 +123,12 @@ def place_object(piece: SceneObject) -> Mesh:
     """The piece's mesh in the world: x_world = R_y(yaw) @ (scale * x_mesh) + t_world_object."""
     verts = (piece.mesh.verts * piece.scale) @ rot_y(piece.yaw).mT + piece.t_world_object
     return Mesh(verts, piece.mesh.faces)
+
+
+def placed_at(piece: SceneObject, frame: int) -> SceneObject:
+    """An object where it stands in a frame: in its last segment that has begun."""
+    begun = [segment for segment in piece.segments if segment.frame <= frame]
+    if not begun:
+        return piece
+    now = max(begun, key=lambda segment: segment.frame)
+    return dataclasses.replace(piece, t_world_object=now.t_world_object, yaw=now.yaw)

@@ -23,6 +23,7 @@ from mover.stages.config import (
     FootContactConfig,
     GatherConfig,
     ImageConfig,
+    MoveConfig,
     PlaceConfig,
     PrepareConfig,
     ProposeConfig,
@@ -76,6 +77,8 @@ class Config:
     """Stage 2: objects from the image and the people."""
     explain: ExplainConfig = field(default_factory=ExplainConfig)
     """What holds each object, and how well its place is known."""
+    moves: MoveConfig = field(default_factory=MoveConfig)
+    """When an object counts as moved."""
     propose: ProposeConfig = field(default_factory=ProposeConfig)
     """Supports that no detector saw, where people rest on nothing that is known."""
     outer_iterations: Annotated[int, int_in(0, 100)] = 0

@@ -27,6 +27,7 @@ from mover.geometry.placement import (
 )
 from mover.io.capture.plausible import check_plausible
 from mover.pipeline.believable import check_floor, check_room
+from mover.pipeline.moves import with_moves
 from mover.pipeline.outcome import (
     PeopleState,
     ReconstructionContext,
@@ -89,7 +90,8 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
     told: list[str] = []
     check_plausible(capture, told.append)
     capture = replace(capture, warnings=tuple(dict.fromkeys((*capture.warnings, *told))))
-    return check_room(_reconstructed(capture, config, run, pinned))
+    room = _reconstructed(capture, config, run, pinned)
+    return check_room(with_moves(room, capture, config, run, _reconstructed))
 
 
 def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]) -> Room:

@@ -358,6 +358,18 @@ class RefineBodiesConfig:
 
 
 @dataclass(frozen=True)
+class MoveConfig:
+    """When an object counts as moved: it looks different in the frames."""
+
+    alike: Share = 0.7
+    """Common pixels of two masks of what stands still, as a share of the smaller."""
+    visible: Share = 0.3
+    """Where less of an object can be seen, nothing is said."""
+    seconds: Annotated[float, float_in(0, 3600)] = 1.5
+    """An object that stands for a shorter time is being moved [s]."""
+
+
+@dataclass(frozen=True)
 class ProposeConfig:
     """When people who rest on nothing that is known propose a support."""
 

@@ -287,7 +287,7 @@ def _spots(
         if spot is None or len(found) == CHOICES:
             break
         piece = Placed(label, furniture, (spot[0], spot[1]), spot[2])
-        free = _fits(piece, others, config.spacing * MARGIN[rule], plan.walls)
+        free = fits(piece, others, config.spacing * MARGIN[rule], plan.walls)
         if free and in_view(piece, plan.view) >= config.visible:
             found.append(piece)
     return found
@@ -302,7 +302,8 @@ def in_view(piece: Placed, view: Viewpoint) -> float:
     return float(inside.double().mean())
 
 
-def _fits(piece: Placed, others: list[Placed], margin: float, walls: np.ndarray) -> bool:
+def fits(piece: Placed, others: list[Placed], margin: float, walls: np.ndarray) -> bool:
+    """Whether a piece stands inside the walls and keeps a margin from others [m]."""
     own = corners(piece)
     if (own < walls[0] + 0.01).any() or (own > walls[1] - 0.01).any():
         return False

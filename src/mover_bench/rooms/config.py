@@ -73,6 +73,8 @@ class RoomConfig:
     """Factor on how long people sit, lie and stand."""
     most_frames: int = 0
     """The video ends after so many; 0: when everybody is done."""
+    moved: bool = False
+    """A piece is moved in the middle of the video, before another person comes in."""
     least_passing: float = 0.0
     """Least share of the bodies that furniture hides in part."""
     plan: PlanConfig = field(default_factory=PlanConfig)

@@ -244,6 +244,10 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
             room.capture.people, noise.person_masks, noise.missed_masks, streams[5]
         ),
     )
+    furniture = noisy_people(
+        room.capture.furniture, noise.object_masks, 0.0, np.random.default_rng([seed, 14])
+    )
+    capture = dataclasses.replace(capture, furniture=furniture)
     people = wobbling(capture.people, noise.wobble, np.random.default_rng([seed, 12]))
     assert room.truth.ground is not None, "a known room has a floor"
     capture = noisy_finds(

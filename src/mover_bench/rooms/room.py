@@ -160,7 +160,7 @@ def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
             size = (config.width, config.height)
             plan = draw_plan(rng, size, config.pieces, config.least_pixels, config.plan)
             room = build(
-                plan, _cast(plan, config, rng, refused), config, f"room_{seed}", tuple(refused)
+                plan, cast(plan, config, rng, refused), config, f"room_{seed}", tuple(refused)
             )
         except RefusedError as error:
             refused.append(f"draft {draft}: {error}")
@@ -169,7 +169,7 @@ def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
     raise ValueError(f"seed {seed}: 60 drafts were refused: {refused[-3:]}")
 
 
-def _cast(
+def cast(
     plan: Plan, config: RoomConfig, rng: np.random.Generator, refused: list[str]
 ) -> tuple[Actor, ...]:
     """Everybody's performance."""

@@ -30,6 +30,7 @@ from mover.stages.people.refine_bodies import refine_bodies
 from mover_bench.rooms.camera_path import filmed
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.moved import make_moved_room
 from mover_bench.rooms.noise import without_seat
 from mover_bench.rooms.room import make_room
 from mover_bench.studies.measures import (
@@ -107,7 +108,7 @@ class Seed:
 def make_truth(inputs: Seed, config: RoomConfig, observe: Observer = silent) -> KnownRoom:
     """A room without noise, as a stage: sets with the same rooms make it once."""
     del observe
-    return make_room(inputs.seed, config)
+    return (make_moved_room if config.moved else make_room)(inputs.seed, config)
 
 
 def noisy_room(seed: int, rooms: RoomSet, run: Run | None = None) -> Trial:

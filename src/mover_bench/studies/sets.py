@@ -74,6 +74,14 @@ _CROWDED = RoomConfig(
         ),
     ),
 )  # fmt: skip
+_MOVED = RoomConfig(
+    least_frames=80,
+    most_frames=130,
+    least_touches=1,
+    stay=0.6,
+    moved=True,
+    acts=ActConfig(tasks=3, walks=1),
+)
 _LONG = RoomConfig(
     least_frames=300,
     most_frames=300,
@@ -146,6 +154,10 @@ SETS: dict[str, RoomSet] = {
         "A minute in which a person uses many pieces, some of them repeatedly, each for a short"
         " time.",
         "1000-1009", "100-103", _LONG,
+    ),
+    "moved": RoomSet(
+        "Two people use a room one after the other; between them a chair or a table is moved.",
+        "1000-1029", "100-129", _MOVED,
     ),
     "withheld-seat": RoomSet(
         "The rooms of `rooms`; the seat that is used most is not in what is given.",

@@ -1,0 +1,154 @@
+"""Known rooms in which a piece of furniture is moved while nobody is in the room.
+
+Two rooms that differ in the place of one piece, each with a visitor of its own, become one video:
+the second visitor comes after the piece was moved. How the objects look in the frames is known, as
+a segmenter that tracks them would give it.
+"""
+
+import dataclasses
+import math
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mover.core.records import axis_of
+from mover.core.types import Bodies, BodyPose, Masks, People, Scene, Segment
+from mover.geometry.rle import decode, joined
+from mover_bench.rooms.compose import Plan, fits, in_view
+from mover_bench.rooms.config import RoomConfig
+from mover_bench.rooms.known import KnownRoom, RefusedError, build, one_thread
+from mover_bench.rooms.placed import Placed
+from mover_bench.rooms.render import encode, see
+from mover_bench.rooms.room import cast, make_room
+
+MOVABLE = ("chair", "office chair", "stool", "armchair", "table", "coffee table")
+GAP = 10  # frames in which nobody is in the room, and in the middle of which the piece is moved
+EVERY = 2  # frames from one in which the objects are segmented to the next
+FAR = (0.5, 1.6)  # [m] by which a piece is moved
+TURN = 60.0  # [degrees] by which it is turned, at most
+TRIES = 60
+Rows = TypeVar("Rows")
+
+
+@one_thread()
+def make_moved_room(seed: int, config: RoomConfig) -> KnownRoom:
+    """A room in which the piece that is used most, of those that can be moved, is moved.
+
+    Raises:
+        ValueError: If no piece of the room can be moved.
+    """
+    first = make_room(seed, config)
+    rng = np.random.default_rng([seed, 77])
+    refused: list[str] = []
+    for index in _candidates(first):
+        for _ in range(TRIES // 10):
+            try:
+                plan = _moved(first.plan, index, rng)
+                acts = cast(plan, config, rng, refused)
+                second = build(plan, acts, config, first.capture.name, ())
+                return _joined(first, second, index)
+            except RefusedError as error:
+                refused.append(str(error))
+    raise ValueError(f"seed {seed}: nothing can be moved: {refused[-3:]}")
+
+
+def _candidates(room: KnownRoom) -> list[int]:
+    """Pieces that can be moved, those that are used most first."""
+    used = [int((room.touched == k).any(1).sum()) for k in range(len(room.furniture))]
+    can = [k for k, piece in enumerate(room.furniture) if piece.category in MOVABLE]
+    return sorted(can, key=lambda k: -used[k])
+
+
+def _moved(plan: Plan, index: int, rng: np.random.Generator) -> Plan:
+    """The plan with one piece elsewhere, free and in view."""
+    piece = plan.pieces[index]
+    others = [p for k, p in enumerate(plan.pieces) if k != index]
+    for _ in range(TRIES):
+        way, far = rng.uniform(-np.pi, np.pi), rng.uniform(*FAR)
+        x, z = piece.place + far * np.array([math.sin(way), math.cos(way)])
+        turn = math.radians(float(rng.uniform(-TURN, TURN)))
+        there = Placed(piece.id, piece.furniture, (float(x), float(z)), piece.heading + turn)
+        if fits(there, others, 0.3, plan.walls) and in_view(there, plan.view) >= 0.95:
+            pieces = tuple(there if k == index else p for k, p in enumerate(plan.pieces))
+            return dataclasses.replace(plan, pieces=pieces)
+    raise RefusedError(f"{piece.id} has nowhere to go")
+
+
+def _joined(first: KnownRoom, second: KnownRoom, index: int) -> KnownRoom:
+    """One video of both."""
+    later = int(first.bodies.frame.max()) + 1 + GAP
+    change, people = later - GAP // 2, 1 + int(first.bodies.person.max())
+    second = dataclasses.replace(
+        second,
+        bodies=_shifted(second.bodies, later, people),
+        capture=dataclasses.replace(
+            second.capture, people=_shifted(second.capture.people, later, people)
+        ),
+    )
+    end = int(second.bodies.frame.max()) + 1
+    before, after = range(0, change, EVERY), range(change + change % EVERY, end, EVERY)
+    truth = _scene(first.truth, second.truth, index, change)
+    both = _both(first, second)
+    capture = dataclasses.replace(
+        first.capture,
+        scene=truth,
+        bodies=both.bodies,
+        people=_both(first.capture.people, second.capture.people),
+        furniture=_both(_seen(first, before), _seen(second, after)),
+    )
+    actions = (*first.actions, *second.actions)
+    return dataclasses.replace(both, capture=capture, truth=truth, actions=actions)
+
+
+def _shifted(rows: Rows, frames: int, people: int) -> Rows:
+    """The same later, and other people."""
+    moved: Any = rows
+    return dataclasses.replace(moved, frame=moved.frame + frames, person=moved.person + people)
+
+
+def _both(first: Rows, second: Rows) -> Rows:
+    """The rows of one record after those of the other; what has no rows is the first's."""
+    some: Any = first
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(some):
+        a, b = getattr(first, field.name), getattr(second, field.name)
+        axis = axis_of(field.type, ("bodies", "rows"))
+        if isinstance(a, Tensor) and axis is not None:
+            found[field.name] = torch.cat([a, b], axis)
+        elif isinstance(a, Masks):
+            found[field.name] = joined([a, b])
+        elif isinstance(a, Bodies | BodyPose):
+            found[field.name] = _both(a, b)
+    return dataclasses.replace(some, **found)
+
+
+def _seen(room: KnownRoom, frames: range) -> People:
+    """What of each piece is seen in some frames; `person` is the number of its annotation."""
+    sight, people = see(room.plan).piece, room.capture.people
+    assert people is not None, "a known room has masks"
+    rows: list[tuple[int, int]] = []
+    masks: list[np.ndarray] = []
+    for frame in frames:
+        hidden = torch.zeros_like(sight, dtype=torch.bool)
+        for row in (people.frame == frame).nonzero()[:, 0].tolist():
+            hidden = hidden | decode(people.masks, row)
+        for index in range(len(room.furniture)):
+            mask = (sight == index) & ~hidden
+            if mask.any():
+                rows.append((frame, index + 1))
+                masks.append(mask.numpy())
+    frame, number = torch.tensor(rows).unbind(1)
+    return People(encode(masks), frame, number, {})
+
+
+def _scene(first: Scene, second: Scene, index: int, change: int) -> Scene:
+    """The first scene; one piece of it stands elsewhere from a frame on."""
+    segments = tuple(
+        Segment(frame, scene.objects[index].t_world_object, scene.objects[index].yaw)
+        for frame, scene in ((0, first), (change, second))
+    )
+    pieces = list(first.objects)
+    pieces[index] = dataclasses.replace(pieces[index], segments=segments)
+    return dataclasses.replace(first, objects=tuple(pieces))
