@@ -19,7 +19,8 @@ from mover.furniture.library import make_piece
 from mover.geometry.boxes import box_of
 from mover.geometry.placement import place_object
 from mover.geometry.rotations import rot_y
-from mover.io.capture.scene_file import read_proposals, read_scene, write_proposals
+from mover.io.capture.proposals_file import read_proposals, write_proposals
+from mover.io.capture.scene_file import read_scene
 from mover.stages.config import ProposeConfig
 from mover.stages.contacts.propose_supports import (
     NOTHING,

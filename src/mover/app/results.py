@@ -26,7 +26,8 @@ from mover.evaluate.explanation import log_rows, scene_fields
 from mover.geometry.placement import place_object
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.edits import Edit, write_edits
-from mover.io.capture.scene_file import PROPOSED, write_proposals, write_scene
+from mover.io.capture.proposals_file import PROPOSED, write_proposals
+from mover.io.capture.scene_file import write_scene
 from mover.io.export.contacts import write_labels
 from mover.io.export.scene_glb import write_glb
 from mover.io.files.fields import get, read_json, refuse

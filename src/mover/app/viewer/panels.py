@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from mover.app.report.tables import QUANTITIES, find_changes, write_quantity
-from mover.app.viewer.drawing import GHOST, LAYERS, camera_wxyz, show_people
+from mover.app.viewer.drawing import GHOST, LAYERS, camera_wxyz
 from mover.app.viewer.session import Session, Shown
-from mover.app.viewer.window import Window, hold_selected, set_world
+from mover.app.viewer.window import Window, hold_selected, set_world, show_moment
 from mover.core.types import Camera, Scene, SceneObject
 from mover.furniture.library import PIECES, STYLES
 from mover.geometry.boxes import box_of
@@ -49,8 +49,8 @@ def _add_time_line(window: Window) -> None:
     running = threading.Event()
 
     def show(_event: Any) -> None:  # noqa: ANN401
-        window.moment, window.people.visible = int(slider.value), people.value
-        show_people(window.people, window.moment)
+        window.people.visible = people.value
+        show_moment(window, int(slider.value))
 
     slider.on_update(show)
     people.on_update(show)

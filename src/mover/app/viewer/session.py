@@ -34,7 +34,8 @@ from mover.io.capture.edits import (
     read_edits,
     write_edits,
 )
-from mover.io.capture.scene_file import PROPOSED, read_proposals, read_scene
+from mover.io.capture.proposals_file import PROPOSED, read_proposals
+from mover.io.capture.scene_file import read_scene
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from mover.app.viewer.drawing import (
 )
 from mover.app.viewer.session import Session
 from mover.app.viewer.solve import Watch
-from mover.core.types import SceneObject
+from mover.core.types import Scene, SceneObject
+from mover.geometry.placement import placed_at
 
 FARTHEST = 30.0  # [m] from the camera of the view that a drag may carry
 
@@ -163,6 +164,12 @@ class Window:
     """Held by the run."""
 
     @property
+    def frame(self) -> int:
+        """The frame of the video where the time line stands."""
+        cast = self.people.cast
+        return 0 if cast is None else cast.frames[min(self.moment, len(cast.frames) - 1)]
+
+    @property
     def watching(self) -> bool:
         """Whether a run moves the furniture."""
         return self.watch is not None
@@ -171,12 +178,27 @@ class Window:
 def redraw(window: Window) -> None:
     """Draw the room as the session has it."""
     drawing, session = window.drawing, window.session
-    draw_room(drawing, session.scene, "after")
+    draw_room(drawing, _at_moment(window), "after")
     proposed = tuple(one.object for one in session.proposals)
     draw_room(drawing, replace(session.scene, objects=proposed), "proposed")
     bind_clicks(window.grips)
     if not window.watching:
         hold_selected(window.grips)
+
+
+def _at_moment(window: Window) -> Scene:
+    """The room with each object where it stands in the frame that is shown."""
+    scene = window.session.scene
+    pieces = tuple(placed_at(piece, window.frame) for piece in scene.objects)
+    return replace(scene, objects=pieces)
+
+
+def show_moment(window: Window, moment: int) -> None:
+    """Show people, and objects that are moved, at a moment of the time line."""
+    window.moment = moment
+    show_people(window.people, moment)
+    if not window.watching and any(piece.segments for piece in window.session.scene.objects):
+        draw_room(window.drawing, _at_moment(window), "after")
 
 
 def redraw_result(window: Window) -> None:

@@ -24,7 +24,7 @@ from mover.io.capture.camera_file import camera_of
 from mover.io.capture.cameras_file import path_of
 from mover.io.capture.objects_file import detections_of
 from mover.io.capture.parts import Parts
-from mover.io.capture.people_file import PeopleFile, people_of
+from mover.io.capture.people_file import PeopleFile, furniture_of, people_of
 from mover.io.capture.plausible import check_plausible
 from mover.io.capture.pose_file import into_camera
 from mover.io.capture.scene_file import hypotheses_of, scene_of
@@ -70,6 +70,11 @@ def build_capture(parts: Parts) -> Capture:
         touch=touch,
         warnings=(),
         hypotheses=others,
+        furniture=(
+            None
+            if parts.furniture is None
+            else furniture_of(parts.furniture, scene.camera, detections, warn)
+        ),
         path=_path_of(parts, scene.camera, bodies, warn),
     )
     check_plausible(capture, warn)

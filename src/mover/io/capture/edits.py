@@ -190,7 +190,7 @@ def _placed(piece: SceneObject, at: Placement, scene: Scene) -> SceneObject:
     turns back into the edit's: a pinned object comes home exactly when a run finds that camera.
     """
     t, yaw, scale = (torch.tensor(x).float() for x in (at.translation, at.yaw, at.scale))
-    put = replace(piece, t_world_object=t, yaw=yaw, scale=scale)
+    put = replace(piece, t_world_object=t, yaw=yaw, scale=scale, segments=())
     old, new = tilted(torch.tensor(at.pitch), torch.tensor(at.roll)), scene.camera.R_cam_world
     center = to_world(to_camera(box_of(put).center, old), new)
     front = old @ torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()])

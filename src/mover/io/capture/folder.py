@@ -16,14 +16,14 @@ from mover.io.capture.camera_file import camera_to_json
 from mover.io.capture.cameras_file import path_to_arrays
 from mover.io.capture.objects_file import detections_to_json, image_name
 from mover.io.capture.parts import Hints, LoadImage, Parts, image_parts
-from mover.io.capture.people_file import people_to_json
+from mover.io.capture.people_file import furniture_to_json, people_to_json
 from mover.io.capture.scene_file import HYPOTHESES, write_hypotheses, write_scene
 from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.images import read_image, write_image
 from mover.io.files.meshes import read_mesh
 from mover.io.files.npz import read_npz, write_npz
 
-REFERENCE = "reference.jpg"
+REFERENCE, FURNITURE = "reference.jpg", "furniture.json"
 
 
 def read_capture(folder: Path) -> Capture:
@@ -62,7 +62,7 @@ def folder_parts(folder: Path, hints: Hints | None = None) -> Parts:
     load, size = _reference(folder, parts.objects)
     return dataclasses.replace(
         parts, camera=camera, scene=scene, load_image=load, image_size=size,
-        n_frames=None, hypotheses=None,  # both may be of what is replaced
+        n_frames=None, hypotheses=None, furniture=None,  # they may be of what is replaced
     )  # fmt: skip
 
 
@@ -74,6 +74,7 @@ def _files(folder: Path, needed: Callable[[Path], At | None]) -> Parts:
         scene=needed(folder / "scene.json"),
         objects=needed(folder / "objects.json"),
         people=_if_there(read_json, folder / "people.json"),
+        furniture=_if_there(read_json, folder / FURNITURE),
         bodies=_if_there(read_npz, folder / "bodies.npz"),
         contacts=_if_there(read_npz, folder / "contacts.npz"),
         cameras=_if_there(read_npz, folder / "cameras.npz"),
@@ -128,6 +129,8 @@ def write_capture(capture: Capture, folder: Path) -> None:
         write_npz({"probability": touch}, folder / "contacts.npz")
     if not is_still(capture.path):
         write_npz(path_to_arrays(capture.path), folder / "cameras.npz")
+    if capture.furniture is not None:
+        write_json(furniture_to_json(capture.furniture), folder / FURNITURE)
     write_trees(capture, folder, name)
     if capture.hypotheses:
         own = {piece.id: [piece] for piece in capture.scene.objects}
@@ -173,6 +176,7 @@ def _check_room_for(capture: Capture, folder: Path) -> None:
         "bodies.npz": capture.bodies is not None,
         "people.json": capture.people is not None or capture.reference_people is not None,
         "contacts.npz": capture.touch is not None,
+        FURNITURE: capture.furniture is not None,
         "cameras.npz": not is_still(capture.path),
     }
     for name, is_written in wanted.items():

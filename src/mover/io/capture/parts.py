@@ -39,6 +39,8 @@ class Parts:
     """The fields of objects.json."""
     people: At | None = None
     """The fields of people.json."""
+    furniture: At | None = None
+    """The fields of furniture.json."""
     bodies: At | None = None
     """The arrays of bodies.npz."""
     contacts: At | None = None

@@ -1,4 +1,4 @@
-"""people.json: people's visible masks in the frames."""
+"""people.json and furniture.json: visible masks of people, and of objects, in the frames."""
 
 import re
 from collections.abc import Container, Iterable
@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import torch
 from msgspec import Meta, Struct
 
-from mover.core.types import Camera, Masks, People
+from mover.core.types import Camera, Detection, Masks, People
 from mover.geometry.rle import area, joined
 from mover.io.files.fields import At, Warn, get, items, maybe, refuse, shown, unique
 from mover.io.files.schema import Box, FrameRate, Index, checked
@@ -115,6 +115,29 @@ def _reference(at: At, camera: Camera, names: dict[int, str] | None, warn: Warn)
     if len(masks) < len(found):
         warn(f"{at.file}: {len(found) - len(masks)} people of the reference image without mask")
     return joined(masks) if masks else None
+
+
+def furniture_of(
+    at: At, camera: Camera, detections: tuple[Detection, ...], warn: Warn
+) -> People | None:
+    """The objects' visible masks in some frames; tracks are numbers of annotations.
+
+    Raises:
+        InputError: If a field is wrong, or a track is no annotation of objects.json.
+    """
+    found = people_of(at, camera, warn).people
+    known = {detection.id for detection in detections}
+    for index, item in enumerate(items(get(at, "annotations"))):
+        if get(item, "track_id").value not in known:
+            field = At(get(item, "track_id").value, at.file, f"annotations[{index}].track_id")
+            refuse(field, "the id of an annotation in objects.json")
+    return found
+
+
+def furniture_to_json(furniture: People) -> dict[str, Any]:
+    """The content of furniture.json."""
+    tree = people_to_json(furniture, None, None, ())
+    return {**tree, "categories": [{"id": 1, "name": "object"}]}
 
 
 def people_to_json(

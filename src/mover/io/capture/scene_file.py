@@ -6,15 +6,16 @@ import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Float
 from msgspec import Meta, Struct
 from torch import Tensor
 
-from mover.core.types import Camera, Mesh, Proposal, Room, Scene, SceneObject
+from mover.core.types import Camera, Mesh, Scene, SceneObject, Segment
 from mover.geometry.rotations import rot_y, wrap
 from mover.io.capture.camera_file import camera_of, camera_to_json, check_attitude, turned
 from mover.io.files.fields import (
@@ -30,7 +31,7 @@ from mover.io.files.fields import (
     write_json,
 )
 from mover.io.files.meshes import copy_mesh, read_mesh, write_mesh
-from mover.io.files.schema import Id, Number, Sizes, Text, Vector, checked
+from mover.io.files.schema import Id, Index, Number, Sizes, Text, Vector, checked
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +39,7 @@ FORMAT, VERSION = "mover-scene", 1
 SAFE_ID = re.compile(r"\w[\w.-]{0,99}")
 WORDS = ("ground", "free")
 LOWEST = 30.0  # [m], of a floor below the camera
+P = TypeVar("P", SceneObject, Segment)
 LoadMesh = Callable[[At], tuple[Mesh, str]]
 """Gives the mesh that a field names, and its file."""
 
@@ -70,6 +72,14 @@ class PlaceFields(Struct, frozen=True):
     energy: Number | None = None
 
 
+class SegmentFields(Struct, frozen=True):
+    """Where an object stands from a frame on."""
+
+    frame: Index
+    translation: Vector
+    yaw: Number
+
+
 class ObjectFields(PlaceFields, frozen=True, kw_only=True):
     """One of `objects`."""
 
@@ -77,6 +87,7 @@ class ObjectFields(PlaceFields, frozen=True, kw_only=True):
     category: Text
     annotation: Id | None = None
     support: Text | None = None
+    segments: list[SegmentFields] | None = None
 
 
 class Ground(Struct, frozen=True):
@@ -131,6 +142,7 @@ def _pieces_of(at: At, rows: Sequence[ObjectFields], load: LoadMesh) -> list[Sce
         unique(get(item, "id"), ids, row.id.casefold(), "an id (in any case)")
         if row.annotation is not None:
             unique(get(item, "annotation"), annotations, row.annotation, "an annotation")
+        _check_segments(item, row)
         pieces.append(_piece_of(row, *load(get(item, "mesh"))))
     _check_supports(at, pieces)
     return pieces
@@ -146,7 +158,21 @@ def check_id(at: At) -> None:
 def _piece_of(row: ObjectFields, mesh: Mesh, file: str) -> SceneObject:
     support = "ground" if row.support is None else str(row.support)
     place = _place_of(row)
-    return SceneObject(str(row.id), str(row.category), mesh, file, row.annotation, support, *place)
+    segments = tuple(
+        Segment(part.frame, torch.tensor(part.translation), torch.tensor(part.yaw))
+        for part in row.segments or ()
+    )
+    name, category = str(row.id), str(row.category)
+    return SceneObject(name, category, mesh, file, row.annotation, support, *place, segments)
+
+
+def _check_segments(at: At, row: ObjectFields) -> None:
+    """Segments begin one after the other."""
+    frames = [part.frame for part in row.segments or ()]
+    for k, (before, after) in enumerate(pairwise(frames), 1):
+        if after <= before:
+            field = At(after, at.file, f"{at.field}.segments[{k}].frame")
+            refuse(field, f"a frame after {before}, in which the segment before begins")
 
 
 def _place_of(row: PlaceFields) -> tuple[Tensor, Tensor, Tensor]:
@@ -180,11 +206,14 @@ def _turn(piece: SceneObject, angle: float) -> SceneObject:
     if not angle:
         return piece
     turn = torch.tensor(angle, dtype=torch.float64)
-    place = rot_y(turn) @ piece.t_world_object.double()
-    yaw = wrap(piece.yaw.double() + turn)
-    return dataclasses.replace(
-        piece, t_world_object=place.to(piece.t_world_object), yaw=yaw.to(piece.yaw)
-    )
+
+    def turned_by(place: P) -> P:
+        t = (rot_y(turn) @ place.t_world_object.double()).to(place.t_world_object)
+        yaw = wrap(place.yaw.double() + turn).to(place.yaw)
+        return dataclasses.replace(place, t_world_object=t, yaw=yaw)
+
+    segments = tuple(turned_by(segment) for segment in piece.segments)
+    return dataclasses.replace(turned_by(piece), segments=segments)
 
 
 def scene_tree(
@@ -235,10 +264,15 @@ def write_scene(
 
 def _object_to_json(piece: SceneObject, mesh: str) -> dict[str, Any]:
     annotation = {} if piece.annotation is None else {"annotation": piece.annotation}
+    segments = [
+        {"frame": s.frame, "translation": plain(s.t_world_object), "yaw": plain(s.yaw)}
+        for s in piece.segments
+    ]
     return {
         "id": piece.id, "category": piece.category, "mesh": mesh, **annotation,
         "translation": plain(piece.t_world_object), "yaw": plain(piece.yaw),
         "scale": plain(piece.scale), "support": piece.support,
+        **({"segments": segments} if segments else {}),
     }  # fmt: skip
 
 
@@ -334,59 +368,4 @@ def write_hypotheses(
     write_json(
         {"format": "mover-hypotheses", "version": VERSION, "objects": rows},
         folder / HYPOTHESES,
-    )
-
-
-# proposed.json: supports that no detector saw, as a scene of their own beside the result.
-
-
-PROPOSED = "proposed.json"
-
-
-class ProposalFields(Struct, frozen=True):
-    """What a row of proposed.json has beside the fields of an object."""
-
-    id: Text
-    piece: Text
-    style: Id
-    seed: Id
-    certainty: Annotated[float, Meta(ge=0, le=1)]
-    bodies: Id
-    seconds: Number
-
-
-class ProposedFields(Struct, frozen=True):
-    """proposed.json."""
-
-    objects: list[ProposalFields]
-
-
-def write_proposals(room: Room, path: Path) -> None:
-    """Write proposed.json; where nothing is proposed, one that is there goes."""
-    if not room.proposals:
-        path.unlink(missing_ok=True)
-        return
-    pieces = tuple(one.object for one in room.proposals)
-    more = {
-        one.object.id: {
-            key: getattr(one, key)
-            for key in ("piece", "style", "seed", "certainty", "bodies", "seconds")
-        }
-        for one in room.proposals
-    }
-    write_scene(dataclasses.replace(room.scene, objects=pieces), path, more)
-
-
-def read_proposals(path: Path) -> tuple[Proposal, ...]:
-    """What a result proposes; nothing where there is no such file.
-
-    Raises:
-        InputError: If anything in it is wrong.
-    """
-    if not path.is_file():
-        return ()
-    rows = checked(read_json(path), ProposedFields).objects
-    return tuple(
-        Proposal(piece, row.piece, row.style, row.seed, row.certainty, row.bodies, row.seconds)
-        for piece, row in zip(read_scene(path).objects, rows, strict=True)
     )
