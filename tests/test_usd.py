@@ -14,7 +14,7 @@ from little_room import GROUND, walkers
 import mover.io.export.convex
 from mover.core.errors import InputError
 from mover.core.run import Run
-from mover.core.types import Bodies, Scene
+from mover.core.types import Bodies, Scene, Segment
 from mover.geometry.placement import place_object
 from mover.io.export.finished import Finished, read_finished
 from mover.io.export.solids import AXES, solids_of
@@ -216,3 +216,19 @@ def test_ids_that_the_file_keeps_for_itself_stay_apart(out: Path):
     stage = Usd.Stage.Open(str(export_usd(home, out).files[0]))
     ids = [p.GetCustomDataByKey("mover:id") for p in stage.Traverse()]
     assert set(names) <= set(ids)
+
+
+def test_an_object_that_is_moved_stands_still_until_it_stands_elsewhere(out: Path):
+    scene = room()
+    chair, *others = scene.objects
+    later = Segment(12, chair.t_world_object + torch.tensor([0.0, 0.0, 1.0]), chair.yaw + 1)
+    segments = (Segment(0, chair.t_world_object, chair.yaw), later)
+    moved = dataclasses.replace(chair, segments=segments)
+    home = Finished(out, dataclasses.replace(scene, objects=(moved, *others)), None, None)
+    stage = Usd.Stage.Open(str(export_usd(home, out).files[0]))
+    prim = next(p for p in stage.Traverse() if p.GetCustomDataByKey("mover:id") == chair.id)
+    move = prim.GetAttribute("xformOp:translate")
+    z = [round(move.Get(time)[2] - move.Get(0)[2], 6) for time in (5, 11, 12, 40)]
+    assert z == [0, 0, 1, 1]
+    turn = prim.GetAttribute("xformOp:rotateY")
+    assert turn.Get(30) - turn.Get(11) == pytest.approx(np.degrees(1), abs=1e-3)

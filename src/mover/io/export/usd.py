@@ -1,5 +1,7 @@
 """scene.usdc: metres, objects with looks and physics, floor, camera, people over time."""
 
+from collections.abc import Iterator
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,7 +12,7 @@ from mover.core.colours import Colour, colour
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.run import Run
-from mover.core.types import Bodies, Camera, SceneObject
+from mover.core.types import Bodies, Camera, SceneObject, Segment
 from mover.geometry.camera import NEAR
 from mover.io.export.finished import Exported, Finished
 from mover.io.export.people import FPS, tracks_of
@@ -147,8 +149,12 @@ def _add_object(stage: Any, piece: SceneObject, tint: Colour, folder: Path) -> A
     pxr("Usd").ModelAPI(prim).SetKind("component")
     prim.SetCustomDataByKey("mover:id", piece.id)
     prim.SetCustomDataByKey("mover:category", piece.category)
-    node.AddTranslateOp(double).Set(Gf.Vec3d(*piece.t_world_object.tolist()))
-    node.AddRotateYOp(double).Set(float(np.degrees(float(piece.yaw))))
+    move, turn = node.AddTranslateOp(double), node.AddRotateYOp(double)
+    move.Set(Gf.Vec3d(*piece.t_world_object.tolist()))
+    turn.Set(float(np.degrees(float(piece.yaw))))
+    for moment, place in _held(piece):
+        move.Set(Gf.Vec3d(*place.t_world_object.tolist()), moment)
+        turn.Set(float(np.degrees(float(place.yaw))), moment)
     looks = UsdGeom.Xform.Define(stage, node.GetPath().AppendChild("visual"))
     looks.AddScaleOp(double).Set(Gf.Vec3d(*piece.scale.tolist()))
     for part, transform in parts_of(piece, tint):
@@ -157,6 +163,14 @@ def _add_object(stage: Any, piece: SceneObject, tint: Colour, folder: Path) -> A
         mesh.AddTransformOp(double).Set(Gf.Matrix4d(transform.T.tolist()))
         add_look(stage, mesh, part, folder)
     return prim
+
+
+def _held(piece: SceneObject) -> Iterator[tuple[int, Segment]]:
+    """The first and the last frame of each segment: between samples, USD would let it glide."""
+    for segment, after in zip_longest(piece.segments, piece.segments[1:]):
+        yield segment.frame, segment
+        if after is not None and after.frame > segment.frame + 1:
+            yield after.frame - 1, segment
 
 
 def _add_camera(stage: Any, camera: Camera) -> None:  # noqa: ANN401
