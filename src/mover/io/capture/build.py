@@ -70,11 +70,7 @@ def build_capture(parts: Parts) -> Capture:
         touch=touch,
         warnings=(),
         hypotheses=others,
-        furniture=(
-            None
-            if parts.furniture is None
-            else furniture_of(parts.furniture, scene.camera, detections, warn)
-        ),
+        furniture=_furniture_of(parts, scene.camera, detections, warn),
         path=_path_of(parts, scene.camera, bodies, warn),
     )
     check_plausible(capture, warn)
@@ -122,6 +118,14 @@ def _bodies_of(
         # The file's world is that of scene.json, before its heading was taken out.
         bodies = into_camera(bodies, camera.R_cam_world @ rot_y(torch.tensor(turn)))
     return dataclasses.replace(bodies, fps=fps) if bodies.fps is None else bodies
+
+
+def _furniture_of(
+    parts: Parts, camera: Camera, detections: tuple[Detection, ...], warn: Warn
+) -> People | None:
+    """The objects' masks in the frames."""
+    given = parts.furniture
+    return None if given is None else furniture_of(given, camera, detections, warn)
 
 
 def _path_of(parts: Parts, camera: Camera, bodies: Bodies | None, warn: Warn) -> CameraPath:
