@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -44,14 +45,15 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
         standing = FootContactInputs(carried(bodies, path), parts, kept, camera, touch)
         return run.stage(find_foot_contacts, standing, config.foot_contacts)
 
-    feet = feet_on(path)
+    feet, loose = feet_on(path), torch.zeros(3, 3)
     if not is_still(path):
         inputs = DriftInputs(feet, camera, path, bodies.fps or 1.0)
         drift = run.stage(find_drift, inputs, config.drift)
         path, told = undrifted(path, drift), (*told, *drift.warnings)
-        feet = feet_on(path)
+        feet, loose = feet_on(path), drift.covariance
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height)
     alignment = run.stage(align_camera, known, config.align)
+    alignment = replace(alignment, covariance=alignment.covariance + loose)
     odd = check_floor(alignment.ground, capture)
     warnings = (*warnings, *told, *feet.warnings, *alignment.warnings, *odd)
     return PeopleState(carried(bodies, path), path, kept, parts, feet, alignment, warnings)

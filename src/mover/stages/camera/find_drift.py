@@ -30,6 +30,7 @@ from mover.stages.config import DriftConfig
 
 STEPS = 12  # for each scale of the robust price
 FIXED = 1e-4  # [m], how well the height at the reference image is known
+UNKNOWN = 0.5  # [rad], [m], spread where no foot tells anything
 LEAST_WAY = 1e-3  # [m] between two knots
 
 
@@ -53,6 +54,8 @@ class Drift:
     """To be added along the world's up [m]."""
     up: Float[Tensor, "3"]
     """That up, in the axes of the reference image's camera."""
+    covariance: Float[Tensor, "3 3"]
+    """Of pitch [rad], roll [rad] and ground [m], as far as the drift is not known."""
     warnings: tuple[str, ...]
 
 
@@ -68,16 +71,19 @@ def find_drift(
         ground = (votes.foot_contacts.points_cam @ tilted(first[0], first[1])[:, 1]).median()
         at = torch.cat([first, ground[None], torch.zeros(len(knots)).double()])
         trust = _trust(inputs.path, knots, config)
+        bend = torch.eye(len(at)).double()
         for sigma in config.sigmas:
             for _ in range(STEPS):
-                at = _step(at, votes, shares, (first, sigma, trust, config.tilt_prior))
+                at, bend = _step(at, votes, shares, (first, sigma, trust, config.tilt_prior))
     else:
         at = torch.cat([first, torch.zeros(1 + len(knots)).double()])
+        bend = torch.eye(len(at)).double() / UNKNOWN**2
     observe(Step("find_drift", 0, 1))
     up, height = up_cam(at[0], at[1]).float(), at[3:].float()
     most = float(height.abs().max())
     told = f"the camera's path is corrected by up to {100 * most:.0f} cm of height: it drifts"
-    return Drift(knots, height, up, (told,) if most > config.loose else ())
+    spread = torch.linalg.inv(bend)[:3, :3].float()
+    return Drift(knots, height, up, spread, (told,) if most > config.loose else ())
 
 
 def undrifted(path: CameraPath, drift: Drift) -> CameraPath:
@@ -124,8 +130,8 @@ def _step(
     votes: Votes,
     shares: Float[Tensor, "soles knots"],
     belief: tuple[Tensor, float, Tensor, float],
-) -> Float[Tensor, " unknowns"]:
-    """One step of Gauss-Newton with the weights of Geman-McClure."""
+) -> tuple[Float[Tensor, " unknowns"], Float[Tensor, "unknowns unknowns"]]:
+    """One step of Gauss-Newton with the weights of Geman-McClure, and the curvature there."""
     first, sigma, trust, tilt = belief
     pitch, roll = at[:2]
     points = votes.foot_contacts.points_cam
@@ -141,4 +147,4 @@ def _step(
     centre = torch.cat([first, at[2:3], torch.zeros_like(at[3:])])
     hessian = slope.mT @ (pull[:, None] * slope) + prior
     gradient = slope.mT @ (pull * residual) + prior @ (at - centre)
-    return at - torch.linalg.solve(hessian + 1e-6 * hessian.diag().diag(), gradient)
+    return at - torch.linalg.solve(hessian + 1e-6 * hessian.diag().diag(), gradient), hessian
