@@ -13,7 +13,7 @@ from mover.core.types import Layout
 from mover.energy.config import Adam, SceneConfig, SceneWeights, only
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, scene_energy
-from mover.energy.terms.contact import contact_term
+from mover.energy.terms.contact import contact_term, shares_of
 from mover.energy.terms.silhouette import edge_term, outline_root
 from mover.geometry.kernels.start import use_threads
 from mover.geometry.placement import place
@@ -48,7 +48,7 @@ def disturbed(seed=0, size=64):
     points = touches.points + 0.2 * torch.rand(touches.points.shape, generator=g)
     weight = torch.rand(touches.weight.shape, generator=g) * chance(touches.weight, 0.4)
     weight[1, 1:3] = 0.0
-    touches = replace(touches, points=points, weight=weight)
+    touches = replace(touches, points=points, weight=weight, share=shares_of(weight))
     humans = replace(inputs.humans, depth=depth, touches=touches)
     return replace(inputs, image=image, humans=humans)
 
@@ -169,6 +169,7 @@ def naive_contact(inputs, layout, form):
     wide = map_tensors(lambda x: x.double(), layout)
     tops, backs = (place(x.double(), wide) for x in (inputs.objects.top, inputs.objects.back))
     touches, total = inputs.humans.touches, torch.zeros(wide.yaw.shape, dtype=torch.float64)
+    skin = [touches.weight[:, [k, k + 2]].double().sum() for k in (0, 1)]  # of seats, of backs
     for s in range(len(total)):
         for k, i in enumerate(touches.object_of.tolist()):
             for part, region in enumerate((tops, backs, tops, backs)):
@@ -178,7 +179,7 @@ def naive_contact(inputs, layout, form):
                     gap = (points[:, None] - region[s, i][None]).norm(dim=-1)
                     if form == "paper":
                         weight = touches.weight[k, part, known].double()
-                        price = (gap.amin(1) * weight).sum() / weight.sum()
+                        price = (gap.amin(1) * weight).sum() / skin[part % 2]
                     else:
                         price = gap.amin(0).mean()
                     total = total.index_put((torch.tensor([s]), torch.tensor([i])), price, True)

@@ -152,7 +152,8 @@ def test_of_what_people_use_a_guess_says_less_beside_them() -> None:
     given = replace(given_at(somewhere(3)), weight=torch.tensor([4.0, 4.0, 4.0]))
     touched = ContactPoints(
         object_of=torch.tensor([1]), points=torch.zeros(1, 4, 2, 3),
-        weight=torch.ones(1, 4, 2), bodies=torch.ones(1), heading=torch.zeros(1, 2),
+        weight=torch.ones(1, 4, 2), bodies=torch.ones(1), share=torch.ones(1, 4),
+        heading=torch.zeros(1, 2),
     )  # fmt: skip
     trust = torch.full((3,), 0.25)
     assert lighter_where_used(given, trust, touched).weight.tolist() == [4.0, 1.0, 4.0]

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from mover.app.cli.config import parsed
 from mover.app.cli.console import say
 from mover.core.errors import InputError
-from mover.core.settings import Rate, float_in
+from mover.core.settings import Index, Rate, float_in
 from mover.io.formats import IMPORTED, chosen, listing
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class ImportArgs:
     """Where a moving camera was: cameras.npz, or what the tool of --cameras-from wrote."""
     cameras_from: str = ""
     """The tool that found the poses, as vipe, megasam, tram or vggt; else cameras.npz."""
-    reference_frame: int | None = None
+    reference_frame: Index | None = None
     """The frame that the reference image shows, where the camera moves; else the first pose."""
     gender: str | None = None
     """Of the bodies, where the tool does not tell: neutral, female or male."""

@@ -67,7 +67,7 @@ class Sight:
 
     def seen(
         self, row: int, window: Window, front: Float[Tensor, "h w"]
-    ) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    ) -> tuple[Bool[Tensor, "rows columns"], Bool[Tensor, "rows columns"]]:
         """The visible mask of a body and those of others, as if this camera had seen them."""
         whole = [small_masks(mask[None], self.camera)[0] for mask in self.table.decode(row)]
         if is_still(self.path):
