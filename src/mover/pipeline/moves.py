@@ -26,11 +26,11 @@ from mover.core.types import (
 )
 from mover.geometry.path import is_still
 from mover.geometry.placement import hit_floor
-from mover.geometry.rle import decode, encode, tight_box
+from mover.geometry.rle import encode, tight_box
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.presets import Config, with_sizes
 from mover.stages.config import ExplainConfig, ProposeConfig, SpreadConfig
-from mover.stages.objects.find_moves import STEP, MoveInputs, Stay, find_moves
+from mover.stages.objects.find_moves import STEP, MoveInputs, Stay, find_moves, thin
 
 Solve = Callable[[Capture, Config, Run, tuple[str, ...]], Room]
 RIGID = 1e3  # factor on the price of another size in all segments but the first
@@ -100,13 +100,9 @@ def _shown_in(stays: list[Stay], capture: Capture) -> int:
     mask = next(d.mask for d in capture.detections if d.id == stays[0].annotation)
     if mask is None:
         return 0
-    there = _thinned(decode(mask, 0))
+    there = thin(mask, 0)
     common = [int((there & stay.mask).sum()) / int((there | stay.mask).sum()) for stay in stays]
     return max(range(len(stays)), key=lambda k: common[k])
-
-
-def _thinned(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "small_h small_w"]:
-    return mask[STEP // 2 :: STEP, STEP // 2 :: STEP]
 
 
 def _shift(stays: list[Stay], index: int, shown: int, room: Room) -> Float[Tensor, "3"]:

@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mover.core.errors import InputError
 from mover.io.files.fields import At, refuse
 from mover.io.people.values import (
     either,
-    files_of,
     need,
     numbers,
     one_number,
+    only_file,
     read_any,
     rows,
     stacked,
@@ -36,7 +35,7 @@ def read_vipe(path: Path) -> At:
         InputError: If a key is missing or has the wrong shape.
     """
     folder = path / "pose" if (path / "pose").is_dir() else path
-    at = read_any(_only(folder, "*.npz", "ViPE's poses"))
+    at = read_any(only_file(folder, "*.npz", "ViPE's poses"))
     T = stacked(need(at, "data"), 4, 4)
     frame = whole(need(at, "inds"), len(T))
     lens = folder.parent / "intrinsics" / at.file if folder.is_dir() else path.parent.parent
@@ -57,7 +56,7 @@ def read_megasam(path: Path) -> At:
     Raises:
         InputError: If a key is missing or has the wrong shape.
     """
-    at = read_any(_only(path, "*_sgd_cvd_hr.npz", "MegaSaM's result"))
+    at = read_any(only_file(path, "*_sgd_cvd_hr.npz", "MegaSaM's result"))
     T = stacked(need(at, "cam_c2w"), 4, 4)
     K = rows(need(at, "intrinsic"), None, 9, 3).reshape(-1, 9)
     return _arrays(at, T, None, _in_widths(K[:, 0], K[:, 2]))
@@ -95,7 +94,9 @@ def read_slam(path: Path) -> At:
     Raises:
         InputError: If it has another shape, or no camera was followed.
     """
-    at = read_any(_only(path, "**/slam_results.p*t*", "slam_results.pth of WHAM or .pt of GVHMR"))
+    at = read_any(
+        only_file(path, "**/slam_results.p*t*", "slam_results.pth of WHAM or .pt of GVHMR")
+    )
     value = numbers(at)
     if value.ndim == 3:
         return _arrays(at, np.linalg.inv(stacked(at, 4, 4)), None, None)
@@ -134,25 +135,13 @@ def read_mapanything(path: Path) -> At:
 
 def _of_network(path: Path, pattern: str, pose: str, lens: str, *, inverse: bool) -> At:
     """A network that sees all frames at once: matrices of three or four rows, and lenses."""
-    at = read_any(_only(path, pattern, f"a file with '{pose}'"))
+    at = read_any(only_file(path, pattern, f"a file with '{pose}'"))
     given = need(at, pose)
     upper = rows(given, None, 12, 16)[:, :12]
     last = np.tile([0.0, 0, 0, 1], (len(upper), 1))
     T = np.concatenate([upper, last], 1).reshape(-1, 4, 4)
     K = rows(need(at, lens), len(T), 9)
     return _arrays(at, np.linalg.inv(T) if inverse else T, None, _in_widths(K[:, 0], K[:, 2]))
-
-
-def _only(path: Path, pattern: str, what: str) -> Path:
-    """The file itself, or the only one of a folder.
-
-    Raises:
-        InputError: If there are none or several.
-    """
-    files = files_of(path, pattern, what)
-    if len(files) > 1:
-        raise InputError(f"{path}: has {len(files)} files {pattern}, expected one: name it")
-    return files[0]
 
 
 def _joined(turn: At, place: At) -> Array:

@@ -23,6 +23,7 @@ from mover.io.people.values import (
     need,
     numbers,
     one_number,
+    only_file,
     read_any,
     rows,
     stacked,
@@ -38,12 +39,7 @@ def read_phalp(path: Path, known: Known) -> Found:
     Raises:
         InputError: If a key is missing or has the wrong shape.
     """
-    if path.is_dir():
-        files = sorted(path.rglob("*.pkl"), key=natural)
-        if len(files) != 1:
-            raise InputError(f"{path}: has {len(files)} .pkl files, expected one: name the file")
-        path = files[0]
-    at = read_any(path)
+    at = read_any(only_file(path, "**/*.pkl", "the results of PHALP"))
     frames = mapping(at)
     found: list[Found] = []
     for index, name in enumerate(sorted(frames, key=lambda key: natural(Path(str(key))))):

@@ -79,6 +79,18 @@ def files_of(path: Path, pattern: str, what: str) -> list[Path]:
     return files
 
 
+def only_file(path: Path, pattern: str, what: str) -> Path:
+    """The file itself, or the only one of a folder.
+
+    Raises:
+        InputError: If there are none or several.
+    """
+    files = files_of(path, pattern, what)
+    if len(files) > 1:
+        raise InputError(f"{path}: has {len(files)} files {pattern}, expected one: name it")
+    return files[0]
+
+
 def number_in(name: str, index: int) -> int:
     """The last number in a file's name, else its place among the files."""
     found = re.findall(r"\d+", name)

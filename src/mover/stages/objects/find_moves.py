@@ -17,7 +17,7 @@ from torch.nn.functional import max_pool2d
 
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
-from mover.core.types import People
+from mover.core.types import Masks, People
 from mover.geometry.rle import thinned
 from mover.stages.config import MoveConfig
 
@@ -88,8 +88,9 @@ def _least_alike(stays: "list[_Run]", config: MoveConfig) -> float:
     return min((_likeness(a, b, config) for a, b in pairwise(stays)), default=1.0)
 
 
-def _thin(masks: People, row: int) -> Bool[Tensor, "h w"]:
-    return torch.from_numpy(thinned(masks.masks, row, STEP).copy())
+def thin(masks: Masks, row: int) -> Bool[Tensor, "h w"]:
+    """One of the masks, at the resolution of the stays."""
+    return torch.from_numpy(thinned(masks, row, STEP).copy())
 
 
 def _hidden(people: People | None, frame: int, like: Tensor) -> Bool[Tensor, "h w"]:
@@ -98,7 +99,7 @@ def _hidden(people: People | None, frame: int, like: Tensor) -> Bool[Tensor, "h 
     if people is None:
         return hidden
     for row in (people.frame == frame).nonzero()[:, 0].tolist():
-        hidden = hidden | _thin(people, row)
+        hidden = hidden | thin(people.masks, row)
     return max_pool2d(hidden[None].float(), 3, 1, 1)[0] > 0
 
 
@@ -129,7 +130,7 @@ def _stays(
     """The stretches in which an object stands; each begins between its frames and those before."""
     runs: list[_Run] = []
     for row in rows:  # what is usual grows with each frame
-        seen, frame = _thin(inputs.furniture, row), int(inputs.furniture.frame[row])
+        seen, frame = thin(inputs.furniture.masks, row), int(inputs.furniture.frame[row])
         free = ~_hidden(inputs.people, frame, seen)
         free = free if blocked is None else free & ~blocked
         run = _Run(frame, frame, (seen & free).long(), free.long())
