@@ -191,9 +191,11 @@ class TestTables:
     def test_every_metric_has_a_name_and_the_same_way_to_be_better(self):
         from mover.app.report.tables import QUANTITIES
         from mover.evaluate.evaluation import METRICS
+        from mover.evaluate.stability import PHYSICS_METRICS
 
-        ways = {key: QUANTITIES[key].more_is_better for key in METRICS}
-        assert ways == {key: metric.best > 0 for key, metric in METRICS.items()}
+        metrics = METRICS | PHYSICS_METRICS
+        ways = {key: QUANTITIES[key].more_is_better for key in metrics}
+        assert ways == {key: metric.best > 0 for key, metric in metrics.items()}
 
     def test_shows_a_missing_metric_as_missing(self):
         drawn = metrics_table({"initial": {}, "result": {"iou3d": 0.5, "contact": math.nan}})

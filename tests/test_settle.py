@@ -14,13 +14,14 @@ import trimesh
 from furnished import furnished, write_out
 from little_room import GROUND, box, camera, mesh_of, piece
 
-import mover.app.simulate
+import mover.evaluate.stability
 import mover.io.export.convex
 from mover.app.cli import run_command
-from mover.app.simulate import SimulatedObject, SimulationConfig, simulate, simulation_table
+from mover.app.simulate import simulation_table
 from mover.core.errors import InputError
 from mover.core.run import Run
 from mover.core.types import Mesh, Scene
+from mover.evaluate.stability import SimulatedObject, SimulationConfig, simulate
 from mover.furniture.library import PIECES, canonical, make_piece
 from mover.geometry.placement import place_object
 from mover.geometry.topology import is_closed
@@ -35,7 +36,7 @@ from mover.io.files.meshes import write_mesh
 
 BOXES = ("chair", "table")
 needs_mujoco = pytest.mark.skipif(
-    not mover.app.simulate.find_spec("mujoco"), reason="needs the extra physics"
+    not mover.evaluate.stability.find_spec("mujoco"), reason="needs the extra physics"
 )
 
 
@@ -287,7 +288,7 @@ def test_in_the_table_the_longest_words_stay_apart():
 
 
 def test_without_mujoco_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(mover.app.simulate, "find_spec", lambda _: None)
+    monkeypatch.setattr(mover.evaluate.stability, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=r"\.\[physics\]"):
         simulate(furnished(BOXES), Run(tmp_path))
 

@@ -12,23 +12,23 @@ import trimesh
 from furnished import bodies_of, furnished, write_out
 from little_room import GROUND, box, camera, mesh_of, piece
 
-import mover.app.simulate
+import mover.evaluate.stability
 from mover.app.apart import Ranges, apart
 from mover.app.cli import run_command
 from mover.app.nudge import nudged
-from mover.app.simulate import SimulatedObject, simulate
-from mover.app.sitters import MASS, SEAT_SHARE, Load, hardest, loads_of
 from mover.bodies.skin import PARTS
 from mover.bodies.skinning import open_body, zero_pose
 from mover.core.contact_labels import ContactLabels
 from mover.core.run import Run
 from mover.core.types import Scene
-from mover.io.capture.scene_file import read_scene
+from mover.evaluate.sitters import MASS, SEAT_SHARE, Load, hardest, loads_of
+from mover.evaluate.stability import SimulatedObject, simulate
+from mover.io.capture.scene_file import read_scene, write_scene
 from mover.io.export.contacts import write_labels
 from mover.io.export.finished import read_finished
 
 needs_mujoco = pytest.mark.skipif(
-    not mover.app.simulate.find_spec("mujoco"), reason="needs the extra physics"
+    not mover.evaluate.stability.find_spec("mujoco"), reason="needs the extra physics"
 )
 
 
@@ -235,3 +235,28 @@ def test_an_export_of_a_scene_that_nobody_made_is_refused(tmp_path: Path, capsys
     out = write_out(tmp_path / "out", furnished(("table",)))
     assert run_command("export", [str(out), "--to", "ply", "--stable"]) == 2
     assert "mover simulate OUT --nudge" in capsys.readouterr().err
+
+
+@needs_mujoco
+def test_evaluate_tells_the_share_that_stays_before_and_after(tmp_path: Path, capsys, monkeypatch):
+    """Of two boxes one floats as it was given; a third hangs, and counts in neither."""
+    boxes = [piece(f"box_{k}", box(0.6, 0.5, 0.6), (2.0 * k, -3), 0.0, GROUND) for k in range(3)]
+    boxes = [dataclasses.replace(p, annotation=None) for p in boxes]
+    boxes[2] = dataclasses.replace(boxes[2], support="free")
+    truth = Scene(camera(), GROUND, tuple(boxes))
+    boxes[1] = dataclasses.replace(
+        boxes[1], t_world_object=boxes[1].t_world_object + torch.tensor([0, 0.1, 0])
+    )
+    out, asked = write_out(tmp_path / "out", truth), ["--truth", str(tmp_path / "truth")]
+    write_out(tmp_path / "truth", truth)
+    write_scene(Scene(camera(), GROUND, tuple(boxes)), out / "initial.json")
+    assert run_command("evaluate", [str(out), *asked]) == 0
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("stable")]
+    assert line.split() == ["stable", "0.500", "1.000", "1"]
+    assert run_command("evaluate", [str(out), *asked, "--no-stable"]) == 0
+    assert "stable" not in capsys.readouterr().out
+    monkeypatch.setattr(mover.evaluate.stability, "find_spec", lambda _: None)
+    assert run_command("evaluate", [str(out), *asked]) == 0
+    assert "stable is not measured: mujoco is not installed; pip" in capsys.readouterr().out
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert "stable" not in metrics["result"]

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mover.app.simulate import modelled
 from mover.core.run import Run
 from mover.core.types import Scene, SceneObject
+from mover.evaluate.stability import modelled
 from mover.geometry.boxes import box_of
 from mover.io.export.mjcf import body_name
 from mover.io.export.solids import solids_of

@@ -16,17 +16,17 @@ from typing import Any
 import torch
 
 from mover.app.apart import KEYS, Ranges, apart, base_of
-from mover.app.simulate import (
+from mover.core.files import replacing
+from mover.core.run import Run
+from mover.core.types import Scene, SceneObject
+from mover.evaluate.sitters import Load
+from mover.evaluate.stability import (
     SimulatedObject,
     SimulationConfig,
     result_loads,
     settled,
     simulate,
 )
-from mover.app.sitters import Load
-from mover.core.files import replacing
-from mover.core.run import Run
-from mover.core.types import Scene, SceneObject
 from mover.geometry.rotations import wrap
 from mover.io.capture.scene_file import read_scene
 from mover.io.export.finished import STABLE

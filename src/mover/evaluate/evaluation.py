@@ -16,6 +16,7 @@ from torch import Tensor
 from mover.bodies.corrected import in_world
 from mover.core.files import replacing
 from mover.core.records import map_tensors, record
+from mover.core.run import Run
 from mover.core.settings import Count, Metres, int_in
 from mover.core.types import Bodies, Mesh, Scene
 from mover.evaluate.aligned import SCENE_METRICS, Together
@@ -52,6 +53,7 @@ from mover.evaluate.scene import (
     pairs,
     unmatched,
 )
+from mover.evaluate.stability import PHYSICS_METRICS, lacking, result_loads, simulate
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import read_scene
@@ -170,8 +172,16 @@ def touch_in_truth(
     return _true_touch(true, bodies.result or bodies.initial, config)
 
 
-def evaluate_folder(out: Path, truth: Path, config: EvaluateConfig | None = None) -> dict[str, Any]:
+def evaluate_folder(
+    out: Path, truth: Path, config: EvaluateConfig | None = None, physics: bool = True
+) -> dict[str, Any]:
     """Measure the result folder `out` against the folder `truth` and write out/metrics.json.
+
+    Args:
+        out: The result; its convex pieces are kept in out/stages.
+        truth: The true scene.
+        config: Densities and thresholds.
+        physics: Whether both scenes are simulated as well, for the share that is stable.
 
     Raises:
         InputError: If a scene or a bodies file is missing or wrong.
@@ -186,16 +196,28 @@ def evaluate_folder(out: Path, truth: Path, config: EvaluateConfig | None = None
     true = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
     metrics = evaluate(initial, result, true, bodies, config)
     metrics["unmatched"] = unmatched(initial, result, true)
+    if physics:
+        _add_stable(metrics, out, dict(zip(SIDES, (initial, result), strict=True)))
     with replacing(out / "metrics.json") as part:
         part.write_text(json.dumps(metrics, indent=1, allow_nan=False))
     return metrics
+
+
+def _add_stable(metrics: dict[str, Any], out: Path, scenes: Mapping[str, Scene]) -> None:
+    """Add the shares of pieces that stay under gravity, or why they are not known."""
+    if (missing := lacking()) is not None:
+        metrics["not_measured"] = dict.fromkeys(PHYSICS_METRICS, missing)
+        return
+    loads = result_loads(out, scenes["result"])
+    for side, scene in scenes.items():
+        metrics[side] |= measure(PHYSICS_METRICS, simulate(scene, Run(out), None, loads))
 
 
 def table(metrics: Mapping[str, Any]) -> str:
     """The metrics before and after as plain text, then the place of each object."""
     initial, result = metrics["initial"], metrics["result"]
     lines = [f"{'metric':34}{'before':>10}{'after':>10}{'best':>8}"]
-    for name, metric in METRICS.items():
+    for name, metric in (METRICS | PHYSICS_METRICS).items():
         if name in initial or name in result:
             title = f"{name} [{metric.unit}]" if metric.unit else name
             values = _cell(initial, name) + _cell(result, name)
@@ -210,6 +232,7 @@ def table(metrics: Mapping[str, Any]) -> str:
         lines.append(f"{item['id']:34.34}{cells}")
     for name, ids in metrics.get("unmatched", {}).items():
         lines += [f"{name}: {', '.join(ids)}"] if ids else []
+    lines += [f"{n} is not measured: {why}" for n, why in metrics.get("not_measured", {}).items()]
     return "\n".join(lines)
 
 

@@ -52,7 +52,7 @@ def demo(arguments: Sequence[str]) -> None:
     capture = read("folder", folder)
     origin = Origin(str(folder.resolve()), device=device)
     found, run = reconstruct_into(args.out / "room", capture, config, origin)
-    metrics = evaluate_folder(args.out / "room", folder / "truth")
+    metrics = evaluate_folder(args.out / "room", folder / "truth", physics=False)
     truth = read_scene(folder / "truth" / "scene.json", None)
     content = report_of(capture, found, config, run, truth=truth, metrics=metrics)
     report = write_report(args.out / "room", content)

@@ -32,6 +32,8 @@ class EvaluateArgs:
     """Folder of the result."""
     truth: Path
     """Folder with the true scene.json, meshes, and bodies.npz if there are any."""
+    stable: bool = True
+    """Simulate both scenes in MuJoCo (the extra physics) for the share of pieces that stay."""
 
 
 def check(arguments: Sequence[str]) -> None:
@@ -56,4 +58,4 @@ def evaluate(arguments: Sequence[str]) -> None:
     args = parsed(EvaluateArgs, "mover evaluate", arguments)
     from mover.evaluate.evaluation import evaluate_folder, table
 
-    say(table(evaluate_folder(args.out, args.truth)))
+    say(table(evaluate_folder(args.out, args.truth, physics=args.stable)))

@@ -78,7 +78,8 @@ def export(arguments: Sequence[str]) -> None:
 def simulate(arguments: Sequence[str]) -> None:
     """`mover simulate`."""
     args = parsed(SimulateArgs, "mover simulate", arguments)
-    from mover.app.simulate import SimulationConfig, simulate_folder, simulation_table
+    from mover.app.simulate import simulate_folder, simulation_table
+    from mover.evaluate.stability import SimulationConfig
 
     if not 0 < args.seconds <= 60:
         raise InputError(f"--seconds: {args.seconds:g}, expected more than 0, at most 60")

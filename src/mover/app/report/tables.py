@@ -45,6 +45,7 @@ QUANTITIES = {
     "worse_by_10cm": Quantity("Objects more than 10 cm worse than given", *_PERCENT),
     "worse_by_50cm": Quantity("Objects more than 50 cm worse than given", *_PERCENT),
     "iou3d_aligned": Quantity("3D overlap after one similarity of all", more_is_better=True),
+    "stable": Quantity("Pieces that stay under gravity", *_PERCENT, True),
     "contact": Quantity("Contacts that touch furniture", *_PERCENT, True),
     "contact_f1": Quantity("Contact F1", more_is_better=True),
     "non_collision": Quantity("Body outside furniture", *_PERCENT, True),
