@@ -19,6 +19,7 @@ from mover.core.types import Scene, SceneObject
 from mover.evaluate.stability import modelled
 from mover.geometry.boxes import box_of
 from mover.io.export.mjcf import body_name
+from mover.io.export.shell import Wall
 from mover.io.export.solids import solids_of
 
 TOUCH = 0.002  # [m], so deep is no more than a touch
@@ -31,7 +32,7 @@ Ranges = dict[str, dict[str, tuple[float, float]]]
 
 
 @dataclass(frozen=True)
-class _Model:
+class Hands:
     """A simulation whose bodies are moved by hand."""
 
     mujoco: Any
@@ -39,20 +40,27 @@ class _Model:
     data: Any
 
     def depths(self) -> dict[int, float]:
-        """How deep each body is in others, the floor left out [m]."""
+        """How deep each body is in others and in walls, the floor left out [m]."""
         self.mujoco.mj_kinematics(self.model, self.data)
         self.mujoco.mj_collision(self.model, self.data)
-        found: dict[int, float] = {}
+        found, floor = dict[int, float](), self.model.geom("ground").id
         for contact in self.data.contact[: self.data.ncon]:
             pair = [int(self.model.geom_bodyid[geom]) for geom in contact.geom]
-            for body in pair if 0 not in pair else ():
+            for body in pair if floor not in contact.geom else ():
                 found[body] = max(found.get(body, 0.0), -float(contact.dist))
         return found
 
     def place(self, body: int) -> Any:  # noqa: ANN401
         """(x, y) of a free body, to be changed [m]."""
+        return self._free(body)[:2]
+
+    def height(self, body: int) -> Any:  # noqa: ANN401
+        """(z,) of a free body, to be changed [m]."""
+        return self._free(body)[2:]
+
+    def _free(self, body: int) -> Any:  # noqa: ANN401
         start = self.model.jnt_qposadr[self.model.body_jntadr[body]]
-        return self.data.qpos[start : start + 2]
+        return self.data.qpos[start : start + 3]
 
 
 def base_of(piece: SceneObject) -> dict[str, float]:
@@ -62,7 +70,13 @@ def base_of(piece: SceneObject) -> dict[str, float]:
     return {"x": x, "y": y - float(box.size[1]) / 2, "z": z, "yaw": float(piece.yaw)}
 
 
-def apart(scene: Scene, run: Run, ranges: Ranges, loose: Collection[str]) -> Scene:
+def apart(
+    scene: Scene,
+    run: Run,
+    ranges: Ranges,
+    loose: Collection[str],
+    walls: tuple[Wall, ...] = (),
+) -> Scene:
     """The scene with pieces that stand in each other moved level, as far as ranges allow.
 
     Args:
@@ -70,9 +84,10 @@ def apart(scene: Scene, run: Run, ranges: Ranges, loose: Collection[str]) -> Sce
         run: Its folder keeps the convex pieces.
         ranges: Where each piece may be.
         loose: Ids of the pieces that do not stay; they and what they stand in are moved.
+        walls: Still walls.
     """
     solids = solids_of(scene, run)
-    world = _Model(*modelled(scene, solids))
+    world = Hands(*modelled(scene, solids, walls))
     carriers = {piece.support for piece in scene.objects}
     pieces = {
         world.model.body(body_name(solid)).id: piece
@@ -96,7 +111,7 @@ def _width(stated: dict[str, tuple[float, float]]) -> float:
 
 
 def _way_out(
-    world: _Model, body: int, piece: SceneObject, ranges: Ranges, start: NDArray[np.float64]
+    world: Hands, body: int, piece: SceneObject, ranges: Ranges, start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """The nearest place where nothing is inside a body, else where it is the least deep."""
     base, stated = base_of(piece), ranges[piece.id]
@@ -126,6 +141,21 @@ def _rings() -> Iterator[list[tuple[float, float]]]:
 
 def _within(value: float, limits: tuple[float, float]) -> bool:
     return limits[0] - 1e-6 <= value <= limits[1] + 1e-6
+
+
+def outside(given: SceneObject, now: SceneObject, ranges: dict[str, tuple[float, float]]) -> str:
+    """Why a place is beyond what is stated of it; empty: it is not."""
+    if not ranges:
+        return "its uncertainty is not stated"
+    here, there = base_of(given), base_of(now)
+    for key in KEYS:
+        step = there[key] - here[key]
+        step = math.remainder(step, 2 * math.pi) if key == "yaw" else step
+        low, high = (limit - here[key] for limit in ranges.get(key, (here[key],) * 2))
+        if not low - 1e-6 <= step <= high + 1e-6:
+            unit = "rad" if key == "yaw" else "m"
+            return f"{key} would change by {step:+.3f} {unit}, stated are {low:+.3f} to {high:+.3f}"
+    return ""
 
 
 def _moved(scene: Scene, steps: dict[str, NDArray[np.float64]]) -> Scene:

@@ -1,24 +1,26 @@
 """Move pieces that would fall to where they stand, as far as their stated uncertainty allows.
 
-A piece that floats comes down to what carries it, one that is stuck goes where it is pushed, one
-that stands half beside its support goes on to it: gravity says where. Pieces that stand in each
-other come apart first (apart.py). A place counts only if it is within the range that the result
-states (scene.json, `uncertainty`), upright, and if all that stood before still stay.
+A piece that floats comes down to what carries it, one that is stuck goes where it is pushed:
+gravity says where. Pieces that stand in each other come apart (apart.py). What still falls is
+brought to its floor, over its support or to a wall behind it (held.py). A place counts only if it
+is within the range that the result states (scene.json, `uncertainty`), upright, and if all that
+stood before still stay.
 """
 
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from mover.app.apart import KEYS, Ranges, apart, base_of
+from mover.app.apart import KEYS, Ranges, apart, outside
+from mover.app.held import held_places
 from mover.core.files import replacing
 from mover.core.run import Run
-from mover.core.types import Scene, SceneObject
+from mover.core.types import Scene
 from mover.evaluate.sitters import Load
 from mover.evaluate.stability import (
     SimulatedObject,
@@ -30,6 +32,7 @@ from mover.evaluate.stability import (
 from mover.geometry.rotations import wrap
 from mover.io.capture.scene_file import read_scene
 from mover.io.export.finished import STABLE
+from mover.io.export.shell import WALLS, Wall, wall_rows
 from mover.io.export.solids import AXES, floor_height
 from mover.io.files.fields import read_json
 
@@ -49,6 +52,9 @@ class Nudge:
     done: bool
     reason: str
     """Why not, or empty."""
+    to: str = ""
+    """What it was brought to: the floor, the id of its support, a wall; empty: where gravity or
+    the way out of others took it."""
 
 
 def ranges_of(file: Path) -> Ranges:
@@ -72,10 +78,9 @@ def nudged(
     ranges: Ranges,
     config: SimulationConfig | None = None,
     loads: tuple[Load, ...] = (),
+    walls: tuple[Wall, ...] = (),
 ) -> tuple[Scene, tuple[SimulatedObject, ...], tuple[Nudge, ...]]:
     """The scene with pieces nudged, how it stands, and what was done to each that did not stay.
-
-    Pieces that stand in each other are first moved apart, where more of them stay for it.
 
     Args:
         scene: A result.
@@ -83,20 +88,24 @@ def nudged(
         ranges: What is stated of each place; a piece without stays where it is.
         config: How long gravity acts.
         loads: Who sits where.
+        walls: Still walls.
     """
-    trial = _Trial(scene, run, ranges, config or SimulationConfig(), loads)
+    trial = _Trial(scene, run, ranges, config or SimulationConfig(), loads, walls)
     rows = trial.simulated(scene)
     if not _loose(rows):
         return scene, rows, ()
-    steady, after, refused = _fallen(trial, scene, rows)
-    if _loose(after):
-        clear = apart(scene, run, ranges, _loose(rows))
+    best = _fallen(trial, scene, rows)
+    if _loose(best.rows):
+        clear = apart(scene, run, ranges, _loose(rows), walls)
         if clear is not scene:
             freed = _fallen(trial, clear, trial.simulated(clear))
-            if _stay(rows) <= _stay(freed[1]) and len(_stay(freed[1])) > len(_stay(after)):
-                steady, after, refused = freed
-    refused |= dict.fromkeys(_loose(rows) & _stay(after), "it stays since others made room")
-    return steady, after, _nudges(scene, steady, rows, refused)
+            if _stay(rows) <= _stay(freed.rows) and len(_stay(freed.rows)) > len(_stay(best.rows)):
+                best = freed
+    for name in sorted(_loose(best.rows)):
+        best = _held(trial, best, name)
+    made_room = dict.fromkeys(_loose(rows) & _stay(best.rows), "it stays since others made room")
+    best = replace(best, refused=best.refused | made_room)
+    return best.scene, best.rows, _nudges(scene, best, rows)
 
 
 @dataclass(frozen=True)
@@ -108,14 +117,23 @@ class _Trial:
     ranges: Ranges
     config: SimulationConfig
     loads: tuple[Load, ...]
+    walls: tuple[Wall, ...]
 
     def simulated(self, scene: Scene) -> tuple[SimulatedObject, ...]:
         """How a scene stands."""
-        return simulate(scene, self.run, self.config, self.loads)
+        return simulate(scene, self.run, self.config, self.loads, self.walls)
 
 
-_Fallen = tuple[Scene, tuple[SimulatedObject, ...], dict[str, str]]
-"""A scene, how it stands, and why pieces were not moved, by id."""
+@dataclass(frozen=True)
+class _Fallen:
+    """A scene and how it stands."""
+
+    scene: Scene
+    rows: tuple[SimulatedObject, ...]
+    refused: dict[str, str]
+    """Why pieces were not moved, by id."""
+    to: dict[str, str] = field(default_factory=lambda: {})
+    """What pieces were brought to, by id."""
 
 
 def _stay(rows: Sequence[SimulatedObject]) -> set[str]:
@@ -142,12 +160,30 @@ def _fallen(trial: _Trial, scene: Scene, rows: tuple[SimulatedObject, ...]) -> _
             refused |= dict.fromkeys(loose - set(why), "others would fall")
             break
         scene, rows = tried, after
-    return scene, rows, refused
+    return _Fallen(scene, rows, refused)
+
+
+def _held(trial: _Trial, best: _Fallen, name: str) -> _Fallen:
+    """The scene with a piece where something holds it, if it stays there and nothing falls."""
+    k = next(k for k, piece in enumerate(best.scene.objects) if piece.id == name)
+    pieces, refused = best.scene.objects, dict[str, str]()
+    if name not in _loose(best.rows):
+        return best
+    for to, place in held_places(best.scene, trial.run, trial.walls, pieces[k]):
+        why = outside(trial.given.objects[k], place, trial.ranges.get(name, {}))
+        if why:
+            refused.setdefault(name, why)
+            continue
+        there = replace(best.scene, objects=(*pieces[:k], place, *pieces[k + 1 :]))
+        tried = _fallen(trial, there, trial.simulated(there))
+        if _stay(best.rows) | {name} <= _stay(tried.rows):
+            return replace(tried, refused=best.refused | tried.refused, to={**best.to, name: to})
+    return replace(best, refused=refused | best.refused)
 
 
 def _where_it_ends(trial: _Trial, scene: Scene, loose: set[str]) -> tuple[Scene, dict[str, str]]:
     """The scene with each loose piece where gravity leaves it, if its range holds that place."""
-    ends = settled(scene, trial.run, trial.config.seconds)
+    ends = settled(scene, trial.run, trial.config.seconds, trial.walls)
     floor = torch.tensor([0.0, floor_height(scene), 0.0], dtype=torch.float64)
     pieces, refused = list(scene.objects), dict[str, str]()
     for k, (piece, given) in enumerate(zip(scene.objects, trial.given.objects, strict=True)):
@@ -162,7 +198,7 @@ def _where_it_ends(trial: _Trial, scene: Scene, loose: set[str]) -> tuple[Scene,
             yaw=torch.tensor(yaw).to(piece.yaw),
         )  # fmt: skip
         stated = trial.ranges.get(piece.id, {})
-        why = "it falls over" if tilt > LEVEL else _outside(given, now, stated)
+        why = "it falls over" if tilt > LEVEL else outside(given, now, stated)
         if why:
             refused[piece.id] = why
         else:
@@ -171,49 +207,35 @@ def _where_it_ends(trial: _Trial, scene: Scene, loose: set[str]) -> tuple[Scene,
     return (replace(scene, objects=tuple(pieces)) if changed else scene), refused
 
 
-def _outside(given: SceneObject, now: SceneObject, ranges: dict[str, tuple[float, float]]) -> str:
-    """Why a place is beyond what is stated of it; empty: it is not."""
-    if not ranges:
-        return "its uncertainty is not stated"
-    here, there = base_of(given), base_of(now)
-    for key in KEYS:
-        step = there[key] - here[key]
-        step = math.remainder(step, 2 * math.pi) if key == "yaw" else step
-        low, high = (limit - here[key] for limit in ranges.get(key, (here[key],) * 2))
-        if not low - 1e-6 <= step <= high + 1e-6:
-            unit = "rad" if key == "yaw" else "m"
-            return f"{key} would change by {step:+.3f} {unit}, stated are {low:+.3f} to {high:+.3f}"
-    return ""
-
-
-def _nudges(
-    given: Scene, steady: Scene, rows: Sequence[SimulatedObject], refused: dict[str, str]
-) -> tuple[Nudge, ...]:
+def _nudges(given: Scene, best: _Fallen, rows: Sequence[SimulatedObject]) -> tuple[Nudge, ...]:
     """What was done to each piece that did not stay, or that made room."""
     found: list[Nudge] = []
-    for before, after in zip(given.objects, steady.objects, strict=True):
+    for before, after in zip(given.objects, best.scene.objects, strict=True):
         moved = float((after.t_world_object - before.t_world_object).norm())
         turned = float(wrap(after.yaw - before.yaw).abs())
         done = moved > 0 or turned > 0
         if done or before.id in _loose(rows):
-            why = "" if done else refused.get(before.id, "nothing better was found")
-            found.append(Nudge(before.id, moved, turned, done, why))
+            why = "" if done else best.refused.get(before.id, "nothing better was found")
+            to = best.to.get(before.id, "")
+            found.append(Nudge(before.id, moved, turned, done, why, to))
     return tuple(found)
 
 
-def nudge_folder(out: Path, config: SimulationConfig) -> str:
+def nudge_folder(out: Path, config: SimulationConfig, walls: tuple[Wall, ...] = ()) -> str:
     """Nudge the pieces of a result and write OUT/stable.json; what was done, in words."""
     file = out / "scene.json"
     scene = read_scene(file)
     loads = result_loads(out, scene)
-    steady, rows, nudges = nudged(scene, Run(out), ranges_of(file), config, loads)
-    write_nudged(out, steady, nudges)
+    steady, rows, nudges = nudged(scene, Run(out), ranges_of(file), config, loads, walls)
+    write_nudged(out, steady, nudges, walls)
     loose = [row for row in rows if not row.fixed]
     stay = f"stable: {sum(row.stays for row in loose)} of {len(loose)} stay; {out / STABLE}"
     return "\n".join([*filter(None, [nudge_lines(nudges)]), stay])
 
 
-def write_nudged(out: Path, scene: Scene, nudges: tuple[Nudge, ...]) -> None:
+def write_nudged(
+    out: Path, scene: Scene, nudges: tuple[Nudge, ...], walls: tuple[Wall, ...] = ()
+) -> None:
     """Write OUT/stable.json: scene.json with the pieces that were nudged where they stand now."""
     tree: dict[str, Any] = json.loads((out / "scene.json").read_text())
     places = {piece.id: piece for piece in scene.objects}
@@ -227,6 +249,8 @@ def write_nudged(out: Path, scene: Scene, nudges: tuple[Nudge, ...]) -> None:
             piece = places[item["id"]]
             item["translation"] = [round(v, 7) for v in piece.t_world_object.tolist()]
             item["yaw"] = round(float(piece.yaw), 7)
+    if walls:
+        tree[WALLS] = wall_rows(walls)
     with replacing(out / STABLE) as part:
         part.write_text(json.dumps(tree, indent=1))
 
@@ -236,6 +260,7 @@ def nudge_lines(nudges: tuple[Nudge, ...]) -> str:
     lines: list[str] = []
     for nudge in nudges:
         way = f"{1e3 * nudge.moved:.0f} mm, {math.degrees(nudge.turned):.1f} deg"
+        way += f" to {nudge.to}" if nudge.to else ""
         lines.append(
             f"{nudge.id}: " + (f"nudged by {way}" if nudge.done else f"left: {nudge.reason}")
         )

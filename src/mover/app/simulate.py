@@ -15,11 +15,21 @@ from mover.evaluate.stability import (
     simulate,
 )
 from mover.io.capture.scene_file import read_scene
+from mover.io.export.finished import read_finished
+from mover.io.export.shell import Wall, guess_walls
 from mover.io.files.fields import write_json
 
 
+def result_walls(out: Path) -> tuple[Wall, ...]:
+    """The walls that are guessed of a result."""
+    return read_finished(out).shell()
+
+
 def simulate_folder(
-    out: Path, truth: Path | None = None, config: SimulationConfig | None = None
+    out: Path,
+    truth: Path | None = None,
+    config: SimulationConfig | None = None,
+    walls: tuple[Wall, ...] | None = None,
 ) -> dict[str, tuple[SimulatedObject, ...]]:
     """Simulate the initial scene, the result and, where given, the truth; writes `settle.json`.
 
@@ -27,6 +37,7 @@ def simulate_folder(
         out: Folder of a result.
         truth: Folder with the true scene.json.
         config: How long.
+        walls: Those of the result; the other scenes get a guess of their own. None: no walls.
 
     Raises:
         InputError: If there is no result, or mujoco is not installed.
@@ -41,7 +52,8 @@ def simulate_folder(
     found: dict[str, tuple[SimulatedObject, ...]] = {}
     for name, scene in read.items():
         home = run if name != "truth" else Run(out / "stages" / "truth")
-        found[name] = simulate(scene, home, config, loads)
+        shell = walls if walls is None or name == "result" else guess_walls(scene, None)
+        found[name] = simulate(scene, home, config, loads, shell or ())
     tree: dict[str, Any] = {"format": "mover-settle", "version": 1, "seconds": config.seconds}
     scenes = {
         name: [{**asdict(row), "toppled": row.toppled, "stays": row.stays} for row in rows]

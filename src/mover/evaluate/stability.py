@@ -23,7 +23,8 @@ from mover.core.settings import float_in
 from mover.core.types import Scene, SceneObject
 from mover.evaluate.scene import Metric
 from mover.evaluate.sitters import Load, hardest, loads_of
-from mover.io.export.mjcf import body_name, mjcf_of, text_of
+from mover.io.export.mjcf import add_walls, body_name, mjcf_of, text_of
+from mover.io.export.shell import Wall
 from mover.io.export.solids import AXES, Solid, solids_of
 from mover.io.files.npz import read_npz
 
@@ -90,6 +91,7 @@ def simulate(
     run: Run,
     config: SimulationConfig | None = None,
     loads: tuple[Load, ...] = (),
+    walls: tuple[Wall, ...] = (),
 ) -> tuple[SimulatedObject, ...]:
     """Simulate a scene in MuJoCo and compare where its pieces end with where they were.
 
@@ -98,6 +100,7 @@ def simulate(
         run: Its folder keeps the convex pieces.
         config: How long.
         loads: Who sits where; each object gets the hardest of its loads, in a second simulation.
+        walls: Still walls that pieces may lean on.
 
     Raises:
         InputError: If mujoco is not installed.
@@ -106,12 +109,13 @@ def simulate(
         raise InputError(f"mover simulate: {missing}")
     config = config or SimulationConfig()
     solids = solids_of(scene, run)
-    start, end, stuck = _settled(scene, solids, config.seconds, {})
+    room = _Standing(scene, solids, walls)
+    start, end, stuck = _settled(room, config.seconds, {})
     found = [_compare(*row) for row in zip(solids, start, end, stuck, strict=True)]
     pressed = {p.id: load for p in scene.objects if (load := hardest(loads, p)) is not None}
     if not pressed:
         return tuple(found)
-    _, under, _ = _settled(scene, solids, config.seconds, pressed)
+    _, under, _ = _settled(room, config.seconds, pressed)
     for k, solid in enumerate(solids):
         if solid.id in pressed:
             heavy = _compare(solid, start[k], under[k], stuck[k])
@@ -122,10 +126,22 @@ def simulate(
     return tuple(found)
 
 
-def modelled(scene: Scene, solids: tuple[Solid, ...]) -> tuple[Any, Any, Any]:
+@dataclass(frozen=True)
+class _Standing:
+    """What is simulated."""
+
+    scene: Scene
+    solids: tuple[Solid, ...]
+    walls: tuple[Wall, ...]
+
+
+def modelled(
+    scene: Scene, solids: tuple[Solid, ...], walls: tuple[Wall, ...] = ()
+) -> tuple[Any, Any, Any]:
     """MuJoCo, its model of a scene without looks, and the data of that model at the start."""
     mujoco: Any = import_module("mujoco")
     root, meshes = mjcf_of(scene, solids, looks=False)
+    add_walls(root, walls)
     model = mujoco.MjModel.from_xml_string(text_of(root), meshes)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -133,10 +149,11 @@ def modelled(scene: Scene, solids: tuple[Solid, ...]) -> tuple[Any, Any, Any]:
 
 
 def _settled(
-    scene: Scene, solids: tuple[Solid, ...], seconds: float, pressed: Mapping[str, Load]
+    room: _Standing, seconds: float, pressed: Mapping[str, Load]
 ) -> tuple[list["State"], list["State"], list[float]]:
     """Where the pieces are before and after, and how deep they were stuck."""
-    mujoco, model, data = modelled(scene, solids)
+    scene, solids = room.scene, room.solids
+    mujoco, model, data = modelled(scene, solids, room.walls)
     start = _states(data, solids)
     stuck = [_stuck(model, data, body_name(solid)) for solid in solids]
     weights = [
@@ -151,9 +168,9 @@ def _settled(
     return start, _states(data, solids), stuck
 
 
-def settled(scene: Scene, run: Run, seconds: float) -> list["State"]:
+def settled(scene: Scene, run: Run, seconds: float, walls: tuple[Wall, ...] = ()) -> list["State"]:
     """Where gravity leaves each piece: its origin [m] and attitude in the simulator's axes."""
-    return _settled(scene, solids_of(scene, run), seconds, {})[1]
+    return _settled(_Standing(scene, solids_of(scene, run), walls), seconds, {})[1]
 
 
 def _seat(load: Load, piece: SceneObject) -> NDArray[np.float64]:

@@ -51,6 +51,8 @@ class SimulateArgs:
     """Folder with the true scene.json, to settle it as well."""
     seconds: Annotated[float, float_in(0.01, 3600)] = 2.0
     """Time of the simulation [s]."""
+    walls: Literal["none", "guess"] = "none"
+    """Guess walls as `mover export` does; pieces may lean on them."""
     nudge: bool = False
     """Move pieces that would fall to where they stand, as far as their uncertainty allows; writes
     OUT/stable.json."""
@@ -63,6 +65,8 @@ def export(arguments: Sequence[str]) -> None:
 
     writers = {target: chosen("--to", target, "export") for target in args.to}
     finished, folder = read_finished(args.out, args.capture, args.stable), args.out / "export"
+    if finished.walls is not None and args.walls == "none":
+        say("pieces were nudged along guessed walls; --walls guess writes these")
     options = {"glb": {"body": args.body}, "bodies": {"up": args.up}, "contacts": {"up": args.up}}
     room = {"body": args.body, "walls": args.walls}
     options |= {"usd": {**room, "up": args.up}, "mjcf": room, "urdf": {"walls": args.walls}}
@@ -78,14 +82,18 @@ def export(arguments: Sequence[str]) -> None:
 def simulate(arguments: Sequence[str]) -> None:
     """`mover simulate`."""
     args = parsed(SimulateArgs, "mover simulate", arguments)
-    from mover.app.simulate import simulate_folder, simulation_table
+    from mover.app.simulate import result_walls, simulate_folder, simulation_table
     from mover.evaluate.stability import SimulationConfig
+    from mover.io.export.shell import wall_notes
 
     if not 0 < args.seconds <= 60:
         raise InputError(f"--seconds: {args.seconds:g}, expected more than 0, at most 60")
     config = SimulationConfig(args.seconds)
-    say(simulation_table(simulate_folder(args.out, args.truth, config)))
+    walls = result_walls(args.out) if args.walls == "guess" else None
+    say(simulation_table(simulate_folder(args.out, args.truth, config, walls)))
+    for note in () if walls is None else wall_notes(walls):
+        say(note)
     if args.nudge:
         from mover.app.nudge import nudge_folder
 
-        say(f"\n{nudge_folder(args.out, config)}")
+        say(f"\n{nudge_folder(args.out, config, walls or ())}")

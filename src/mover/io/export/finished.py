@@ -7,6 +7,8 @@ from mover.core.errors import InputError
 from mover.core.types import Bodies, Scene
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
+from mover.io.export.shell import WALLS, Wall, guess_walls, walls_in
+from mover.io.files.fields import maybe, read_json
 
 
 @dataclass(frozen=True)
@@ -19,6 +21,12 @@ class Finished:
     """People in the world of `scene`."""
     given: Bodies | None
     """People as the capture had them, with the parameters of their model."""
+    walls: tuple[Wall, ...] | None = None
+    """The guess that the scene's pieces were nudged along; None: none was made."""
+
+    def shell(self) -> tuple[Wall, ...]:
+        """The walls, guessed where they were not."""
+        return guess_walls(self.scene, self.bodies) if self.walls is None else self.walls
 
 
 @dataclass(frozen=True)
@@ -54,4 +62,5 @@ def read_finished(out: Path, capture: Path | None = None, stable: bool = False) 
     if bodies is not None and bodies.space != "world":
         raise InputError("bodies.npz: field 'space' has 'camera', expected 'world' in a result")
     given = None if capture is None else read_bodies(capture / "bodies.npz")
-    return Finished(out, scene, bodies, given)
+    along = maybe(read_json(out / STABLE), WALLS) if stable else None
+    return Finished(out, scene, bodies, given, None if along is None else walls_in(along))

@@ -15,7 +15,7 @@ from mover.core.types import Camera, Scene
 from mover.io.export.finished import Exported, Finished
 from mover.io.export.looks import Look, looks_of
 from mover.io.export.mjcf_people import add_figures, figures_of
-from mover.io.export.shell import GUESSED, HEIGHT, Wall, Walls, guess_walls, slab, wall_notes
+from mover.io.export.shell import GUESSED, HEIGHT, Wall, Walls, slab, wall_notes
 from mover.io.export.solids import (
     AXES,
     FRICTION,
@@ -48,8 +48,8 @@ def export_mjcf(
     notes = ["+z is up and the floor is at 0", ", ".join(f"{s.id} {s.mass:.0f} kg" for s in solids)]
     notes.append(_add_people(root, finished) if body != "none" else "no people")
     if walls == "guess":
-        shell = guess_walls(finished.scene, finished.bodies)
-        _add_walls(root, shell)
+        shell = finished.shell()
+        add_walls(root, shell)
         notes += wall_notes(shell)
     home = folder / "mjcf"
     for name, content in meshes.items():
@@ -73,7 +73,7 @@ def _add_people(root: Element, finished: Finished) -> str:
     )
 
 
-def _add_walls(root: Element, walls: Sequence[Wall]) -> None:
+def add_walls(root: Element, walls: Sequence[Wall]) -> None:
     """Boxes that stand still, named as guessed."""
     world = root.find("worldbody")
     assert world is not None

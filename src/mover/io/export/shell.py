@@ -8,10 +8,12 @@ one wherever it is written.
 """
 
 import math
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
+from msgspec import Struct
 from torch import Tensor
 
 from mover.core.records import record
@@ -19,8 +21,12 @@ from mover.core.types import Bodies, Scene, SceneObject
 from mover.furniture.library import WALL_PIECES, canonical
 from mover.geometry.boxes import box_of, corners
 from mover.geometry.rotations import wrap
+from mover.io.files.fields import At, plain
+from mover.io.files.schema import Number, checked
 
 Walls = Literal["none", "guess"]
+WALLS = "guessed_walls"
+"""Field of stable.json: the walls that pieces were nudged along."""
 GUESSED = "guessed_wall"  # what the names of walls begin with
 TURNED = math.radians(12)  # [rad], of a back that faces a wall, at most
 SAME = math.radians(4)  # [rad], usual difference of pieces along walls of one room
@@ -135,3 +141,34 @@ def wall_notes(walls: tuple[Wall, ...]) -> tuple[str, ...]:
     if not walls:
         return ("no walls: nothing stands along any",)
     return tuple(f"a wall is guessed from {wall.source}" for wall in walls)
+
+
+class WallFields(Struct, frozen=True):
+    """A wall in a file."""
+
+    start: tuple[Number, Number]
+    end: tuple[Number, Number]
+    out: tuple[Number, Number]
+    pieces: list[str]
+
+
+def wall_rows(walls: Sequence[Wall]) -> list[dict[str, Any]]:
+    """Walls as a file has them."""
+    return [
+        {"start": plain(w.start), "end": plain(w.end), "out": plain(w.out), "pieces": [*w.pieces]}
+        for w in walls
+    ]
+
+
+def walls_in(at: At) -> tuple[Wall, ...]:
+    """Walls of a file.
+
+    Raises:
+        InputError: If a field is missing or wrong.
+    """
+    rows = checked(at, list[WallFields])
+
+    def spot(place: tuple[float, float]) -> Float[Tensor, "2"]:
+        return torch.tensor(place, dtype=torch.float64)
+
+    return tuple(Wall(spot(r.start), spot(r.end), spot(r.out), tuple(r.pieces)) for r in rows)

@@ -15,7 +15,6 @@ from mover.io.export.shell import (
     HEIGHT,
     Wall,
     Walls,
-    guess_walls,
     slab,
     wall_notes,
 )
@@ -51,7 +50,7 @@ def export_urdf(finished: Finished, folder: Path, walls: Walls = "none") -> Expo
         _save(files[-1], _text(robot))
     room, notes = _room(solids, seen), ("room.urdf holds every piece still",)
     if walls == "guess":
-        shell = guess_walls(finished.scene, finished.bodies)
+        shell = finished.shell()
         _add_walls(room, shell)
         notes += wall_notes(shell)
     _save(files[0], _text(room))

@@ -17,7 +17,7 @@ from mover.geometry.camera import NEAR
 from mover.io.export.finished import Exported, Finished
 from mover.io.export.people import FPS, tracks_of
 from mover.io.export.scene_glb import floor_of, parts_of
-from mover.io.export.shell import Wall, Walls, guess_walls, wall_notes
+from mover.io.export.shell import Wall, Walls, wall_notes
 from mover.io.export.skin import Skin, skin_for
 from mover.io.export.solids import floor_height, solids_of
 from mover.io.export.usd_mesh import add_look, add_mesh, free_path, pxr
@@ -56,7 +56,7 @@ def export_usd(
     """
     skin, shell = _skin(finished, body), ()
     if walls == "guess":
-        shell = guess_walls(finished.scene, finished.bodies)
+        shell = finished.shell()
     path = folder / "scene.usdc"
     with replacing(path) as part:
         part.unlink()
