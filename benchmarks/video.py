@@ -12,6 +12,7 @@ import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ import torch
 from mover.app.cli.video import ChainArgs, video_to_room
 from mover.core.types import Scene
 from mover.evaluate.evaluation import EvaluatedBodies, evaluate
+from mover.evaluate.scene import SIDES
 from mover.furniture.library import canonical, catalogue
 from mover.geometry.rle import decode
 from mover.io.capture.bodies_file import read_bodies
@@ -73,7 +75,7 @@ def renamed(scene: Scene, room: KnownRoom, names: dict[str, int]) -> Scene:
     )
 
 
-def judged(out: Path, room: KnownRoom) -> dict[str, dict[str, float]]:
+def judged(out: Path, room: KnownRoom) -> dict[str, Any]:
     """Metrics of the first scene and of the result, over the objects that were found."""
     names = truth_of(room, out / "capture")
     found = out / "room"
@@ -82,8 +84,19 @@ def judged(out: Path, room: KnownRoom) -> dict[str, dict[str, float]]:
     truth = replace(room.truth, objects=tuple(p for p in room.truth.objects if p.id in kept))
     people = [read_bodies(found / n) for n in ("initial_bodies.npz", "bodies.npz")]
     bodies = EvaluatedBodies(people[0], people[1], room.bodies)
-    metrics = evaluate(scenes[0], scenes[1], truth, bodies)
-    return {side: metrics[side] for side in ("initial", "result")}
+    return evaluate(scenes[0], scenes[1], truth, bodies)
+
+
+def told_of_objects(metrics: dict[str, Any]) -> str:
+    """IoU3D and error of the centre of each object, first scene -> room."""
+    lines: list[str] = []
+    for piece in metrics["objects"]:
+        pairs = [
+            " -> ".join(f"{piece[side].get(key, float('nan')):.3f}" for side in SIDES)
+            for key in ("iou3d", "center_error")
+        ]
+        lines.append(f"  {piece['id']:<18} IoU3D {pairs[0]}   centre {pairs[1]} m")
+    return "\n".join(lines)
 
 
 def trial(seed: int, out: Path, designs: bool) -> dict[str, float]:
@@ -105,8 +118,9 @@ def trial(seed: int, out: Path, designs: bool) -> dict[str, float]:
     args = ChainArgs(out / "chain", camera=out / "lens.json", meshes=meshes)
     video_to_room(out / "video.mp4", args, seen.finders())
     metrics = judged(out / "chain", room)
+    print(f"room {seed}", told_of_objects(metrics), sep="\n", flush=True)
     steps = json.loads((out / "chain" / "steps.json").read_text())["steps"]
-    row = {f"{side} {k}": metrics[side][k] for side in metrics for k in KEYS if k in metrics[side]}
+    row = {f"{side} {k}": metrics[side][k] for side in SIDES for k in KEYS if k in metrics[side]}
     return row | {f"{name} [s]": step["seconds"] for name, step in steps.items()}
 
 

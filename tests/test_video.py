@@ -218,9 +218,10 @@ class TestCuts:
     def test_a_picture_that_changes_at_once_and_for_good_is_a_cut(self):
         found = drift([1.0, 0.95, 0.9, *[0.05] * 7])
         assert cuts_of(found) == [3]
-        text = cut_warning(found, torch.arange(10) / 5) or ""
+        text = cut_warning(torch.arange(10) / 5, cuts_of(found), (3, 10)) or ""
         assert "cut at 0.6 s" in text
         assert "--frames.end 0.6" in text
+        assert "the longest is used, 0.6 to 1.8 s" in text
 
     @pytest.mark.parametrize(
         "agree",
@@ -232,7 +233,7 @@ class TestCuts:
     )
     def test_somebody_who_passes_by_and_a_camera_that_walks_are_none(self, agree: list[float]):
         assert cuts_of(drift(agree)) == []
-        assert cut_warning(drift(agree), torch.arange(8) / 5) is None
+        assert cut_warning(torch.arange(8) / 5, cuts_of(drift(agree)), (0, 8)) is None
 
 
 @pytest.mark.long

@@ -10,6 +10,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,17 @@ from mover.io.capture.objects_file import detections_of, detections_to_json
 from mover.io.capture.people_file import people_of, people_to_json
 from mover.io.capture.scene_file import write_hypotheses, write_scene
 from mover.io.files.cameras import of_view, read_camera_file
-from mover.io.files.fields import At, maybe, number, write_json
+from mover.io.files.fields import At, get, maybe, number, write_json
 from mover.io.files.images import write_image
 from mover.io.people.keypoints import write_keypoints
-from mover.perceive.config import DetectConfig, JointsConfig, Lens, PerceiveConfig, TrackConfig
+from mover.perceive.config import (
+    DetectConfig,
+    JointsConfig,
+    Lens,
+    PerceiveConfig,
+    SteadyConfig,
+    TrackConfig,
+)
 from mover.perceive.depth_map import read_depth
 from mover.perceive.detect import DetectInputs, Finds, find_instances, joined_finds, people_in
 from mover.perceive.layout import FirstScene, Picture
@@ -47,6 +55,7 @@ from mover.perceive.steady import (
     Drift,
     SteadyInputs,
     cut_warning,
+    cuts_of,
     find_drift,
     opencv,
     steady_frames,
@@ -64,8 +73,10 @@ from mover.perceive.track import (
 from mover.perceive.video import Clip, TakeInputs, opened_picture, stamp_of, take_frames
 
 log = logging.getLogger(__name__)
+MOST_SHOTS = 20  # that are told apart: what comes after them counts as one
 CHUNK = 50  # frames whose detections are kept together
 FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal lengths refer
+SAME_FORMAT = 0.01  # difference of two ratios of width and height
 USUAL = 60.0  # [degrees], horizontal field of view of phones held level, where nothing is known
 EXIF_IFD, FOCAL_35 = 0x8769, 0xA405
 Say = Callable[[str], None]
@@ -126,7 +137,11 @@ def perceive(
     write_json({**camera_to_json(camera), **height}, out / "camera.json")
     if config.models.keypoints and len(tracks.frame):
         inputs, joints = JointsInputs(clip, tracks), JointsConfig(config.models)
-        write_keypoints(run.stage(finders.joints, inputs, joints), out / "keypoints.npz")
+        found = run.stage(finders.joints, inputs, joints)
+        found = replace(found, frame=clip.numbers[found.frame])
+        write_keypoints(found, out / "keypoints.npz")
+    else:
+        (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
     return camera
 
 
@@ -142,9 +157,8 @@ def _told(clean: Clean, tracks: Tracks) -> str:
 def _people_tree(clip: Clip, tracks: Tracks, clean: Clean) -> dict[str, object]:
     people = None
     if tracks.masks.counts:
-        people = People(tracks.masks, tracks.frame, tracks.person, {})
-    frames = range(len(clip.time))
-    return people_to_json(people, hidden_mask(clean), clip.fps, frames)
+        people = People(tracks.masks, clip.numbers[tracks.frame], tracks.person, {})
+    return people_to_json(people, hidden_mask(clean), clip.fps, clip.numbers.tolist())
 
 
 def steady_clip(
@@ -152,17 +166,34 @@ def steady_clip(
 ) -> tuple[Clip, Drift]:
     """Frames of a camera that stands still, in CAPTURE/frames."""
     work = out / "perceived"
-    raw = run.stage(take_frames, TakeInputs(source, stamp_of(source), work / "raw"), config.frames)
-    drift = run.stage(find_drift, SteadyInputs(raw), config.steady)
-    for text in (cut_warning(drift, raw.time), warning_of(drift)):
-        if text is not None:
-            say(f"warning: {text}")
-    done = out / "frames" / f"{len(raw.time) - 1:06d}.jpg"
-    origin = fingerprint(raw.origin, drift)
-    steady = replace(raw, folder=str(out / "frames"), origin=origin)
-    if not done.is_file() or not run.stages[-1].kept:
+    whole = run.stage(
+        take_frames, TakeInputs(source, stamp_of(source), work / "raw"), config.frames
+    )
+    raw, drift = one_shot(whole, config.steady, run, say)
+    text = warning_of(drift)
+    if text is not None:
+        say(f"warning: {text}")
+    steady = replace(raw, folder=str(out / "frames"), origin=fingerprint(raw.origin, drift))
+    if not steady.path(len(raw.time) - 1).is_file() or not run.stages[-1].kept:
         steady_frames(raw, drift, out / "frames", run.observe)
     return steady, drift
+
+
+def one_shot(whole: Clip, config: SteadyConfig, run: Run, say: Say) -> tuple[Clip, Drift]:
+    """The longest part of a video that is not cut, and how its camera moved."""
+    drift = run.stage(find_drift, SteadyInputs(whole), config)
+    starts, count, cuts = [0], len(whole.time), cuts_of(drift, config)
+    while cuts and len(starts) < MOST_SHOTS:
+        starts.append(starts[-1] + cuts[0])
+        rest = whole.part(starts[-1], count)
+        cuts = cuts_of(run.stage(find_drift, SteadyInputs(rest), config), config)
+    if len(starts) == 1:
+        return whole, drift
+    shots = list(pairwise([*starts, count]))
+    taken = max(shots, key=lambda shot: shot[1] - shot[0])
+    say(f"warning: {cut_warning(whole.time, starts[1:], taken)}")
+    clip = whole.part(*taken)
+    return clip, run.stage(find_drift, SteadyInputs(clip), config)
 
 
 def people_of_clip(
@@ -222,7 +253,7 @@ def lens_of(
         InputError: If what is given cannot be used.
     """
     if file is not None:
-        return read_camera_file(file, size), None
+        return _in_pixels_of(size, read_camera_file(file, size)), None
     if fov is not None:
         return of_view(fov, size, "--fov"), None
     focal = None if photo is None else exif_focal(photo, size)
@@ -235,6 +266,24 @@ def lens_of(
         "--fov DEGREES (GeoCalib, MoGe and others tell both lens and tilt)"
     )
     return of_view(USUAL, size, "assumed"), text
+
+
+def _in_pixels_of(size: tuple[int, int], at: At) -> At:
+    """The fields of camera.json in the pixels of these frames; a calibration may be of larger ones.
+
+    Raises:
+        InputError: If the calibration is of pictures of another format.
+    """
+    own = tuple(int(number(get(at, name), 1, 1e5)) for name in ("w", "h"))
+    if abs(own[0] * size[1] - own[1] * size[0]) > SAME_FORMAT * own[0] * size[1]:
+        raise InputError(
+            f"{at.file}: is of pictures of {own[0]} x {own[1]} pixels, expected the format of the "
+            f"frames, {size[0]} x {size[1]}"
+        )
+    zoom = {"fl_x": size[0] / own[0], "cx": size[0] / own[0]}
+    zoom |= {"fl_y": size[1] / own[1], "cy": size[1] / own[1]}
+    scaled = {k: v if k not in zoom else zoom[k] * float(v) for k, v in at.value.items()}
+    return At({**scaled, "w": size[0], "h": size[1]}, at.file, at.field)
 
 
 def exif_focal(photo: Path, size: tuple[int, int]) -> float | None:

@@ -4,6 +4,8 @@ The method assumes one camera for all frames. A camera that turns a little about
 a loose tripod) is undone exactly by a homography; one that walks is not, and is told.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -284,15 +286,25 @@ def cuts_of(drift: Drift, config: SteadyConfig | None = None) -> list[int]:
     ]
 
 
-def cut_warning(drift: Drift, time: Float[Tensor, " frames"]) -> str | None:
-    """Where the video was cut, and what to do; None: nowhere."""
-    cuts = [float(time[k]) for k in cuts_of(drift)]
+def cut_warning(
+    time: Float[Tensor, " frames"], cuts: Sequence[int], taken: tuple[int, int]
+) -> str | None:
+    """Where the video was cut, which part is used, and what to do; None: it was not cut.
+
+    Args:
+        time: Of each frame of the whole video [s].
+        cuts: Frames that begin another shot.
+        taken: First frame of the shot that is used, and the one after its last.
+    """
     if not cuts:
         return None
-    shown = ", ".join(f"{second:.1f} s" for second in cuts[:5])
+    seconds = [float(time[k]) for k in cuts]
+    shown = ", ".join(f"{second:.1f} s" for second in seconds[:5])
+    first, last = float(time[taken[0]]), float(time[taken[1] - 1])
     return (
-        f"the video is cut at {shown}: the method needs one shot, so choose it with "
-        f"--frames.end {cuts[0]:.1f} or --frames.start {cuts[-1]:.1f}"
+        f"the video is cut at {shown}: the method needs one shot, and the longest is used, "
+        f"{first:.1f} to {last:.1f} s; another is chosen with --frames.end {seconds[0]:.1f} or "
+        f"--frames.start {seconds[-1]:.1f}"
     )
 
 
@@ -311,15 +323,20 @@ def warning_of(drift: Drift) -> str | None:
             lost = int((drift.agree < SteadyConfig().agree).sum())
             return (
                 f"the camera moves ({far}; {lost} frames do not fit a homography): the method "
-                "assumes one that stands still, so choose a part of the video where it does"
+                "assumes one that stands still, so choose a part of the video where it does "
+                "(--frames.start, --frames.end), or give its poses to `mover run` (cameras.npz)"
             )
 
 
 def steady_frames(clip: Clip, drift: Drift, folder: Path, observe: Observer = silent) -> Clip:
     """The frames as the reference frame's camera saw them; unchanged where the camera is still."""
     folder.mkdir(parents=True, exist_ok=True)
+    steady = replace(clip, folder=str(folder))
+    kept = {steady.path(frame) for frame in range(len(clip.time))}
+    for old in {*folder.glob("[0-9]*.jpg")} - kept:  # of another video
+        old.unlink()
     for frame in range(len(clip.time)):
-        path = folder / f"{frame:06d}.jpg"
+        path = steady.path(frame)
         if drift.verdict == "still":
             path.unlink(missing_ok=True)
             path.write_bytes(clip.path(frame).read_bytes())
@@ -327,7 +344,7 @@ def steady_frames(clip: Clip, drift: Drift, folder: Path, observe: Observer = si
             size = clip.height, clip.width
             write_jpeg(warp(read_picture(clip.path(frame)), drift.H[frame], size), path)
         observe(Step("steady_frames", frame, len(clip.time)))
-    return Clip(str(folder), clip.width, clip.height, clip.time, clip.fps)
+    return steady
 
 
 def seen_share(drift: Drift, frame: int, size: tuple[int, int]) -> Float[Tensor, "h w"]:

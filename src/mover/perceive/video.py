@@ -1,15 +1,20 @@
-"""Frames of a video or of a folder of pictures, at an even rate, as files."""
+"""Frames of a video or of a folder of pictures as files, numbered by the clock.
+
+A frame of number k was taken about k/fps after the chosen start. Phones' videos are uneven: where
+one has no picture for a while, numbers are missing.
+"""
 
 import warnings
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from mover.core.errors import InputError
@@ -23,14 +28,17 @@ from mover.perceive.config import FramesConfig
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 LARGEST_AREA = 1 << 26  # [px²], of a frame
 QUALITY = 95  # of JPEG
-EARLY = 0.05  # of the time between two frames: how early one may be taken
+USUAL_RATE = 30.0  # frames a second, where a video does not tell
+EARLY = 0.05  # of the time between two frames: how early the first may be taken
 
 Picture = UInt8[np.ndarray, "h w 3"]
+Timed = tuple[float, Callable[[], Picture]]
+"""When a frame was taken [s], and its pixels, upright: made when they are asked for."""
 
 
 @record
 class Clip:
-    """Frames on disk, in order: 000000.jpg ..."""
+    """Frames on disk, in order, named by their numbers: 000000.jpg ..."""
 
     folder: str
     width: int
@@ -41,10 +49,22 @@ class Clip:
     """Frames a second; None: unordered pictures."""
     origin: str = ""
     """What the pictures were made from: another source is another clip."""
+    number: Int[Tensor, " frames"] | None = None
+    """Number of each by the clock; None: they are counted."""
+
+    @property
+    def numbers(self) -> Int[Tensor, " frames"]:
+        """Number of each frame."""
+        return torch.arange(len(self.time)) if self.number is None else self.number
 
     def path(self, frame: int) -> Path:
-        """The file of a frame."""
-        return Path(self.folder) / f"{frame:06d}.jpg"
+        """The file of a frame, which is counted from 0 without gaps."""
+        number = frame if self.number is None else int(self.number[frame])
+        return Path(self.folder) / f"{number:06d}.jpg"
+
+    def part(self, first: int, end: int) -> "Clip":
+        """The frames from the first to before the end."""
+        return replace(self, time=self.time[first:end], number=self.numbers[first:end])
 
 
 @dataclass(frozen=True)
@@ -80,10 +100,13 @@ def take_frames(inputs: TakeInputs, config: FramesConfig, observe: Observer = si
         InputError: If the source cannot be read, or its pictures differ in size.
     """
     inputs.folder.mkdir(parents=True, exist_ok=True)
-    times: list[float] = []
+    for old in inputs.folder.glob("*.jpg"):  # of another source
+        old.unlink()
+    times, numbers = list[float](), list[int]()
     size: tuple[int, int] | None = None
     fps = _rate(inputs.source, config)
-    for time, picture in chosen(read_frames(inputs.source, config), config, fps):
+    for number, (time, pixels) in chosen(read_frames(inputs.source, config), config, fps):
+        picture = pixels()
         found = picture.shape[1], picture.shape[0]
         if size is not None and found != size:
             raise InputError(
@@ -91,16 +114,18 @@ def take_frames(inputs: TakeInputs, config: FramesConfig, observe: Observer = si
                 f"expected {size[0]} x {size[1]} as the first"
             )
         size = found
-        write_jpeg(picture, inputs.folder / f"{len(times):06d}.jpg")
+        write_jpeg(picture, inputs.folder / f"{number:06d}.jpg")
         observe(Step("take_frames", len(times), len(times) + 1))
         times.append(time)
+        numbers.append(number)
     if size is None:
         raise InputError(f"{inputs.source.name}: has no frames, expected some in the chosen time")
     origin = fingerprint(inputs.stamp, str(inputs.source.resolve()), config)
-    return Clip(str(inputs.folder), *size, torch.tensor(times), fps, origin)
+    clock = torch.tensor(numbers)
+    return Clip(str(inputs.folder), *size, torch.tensor(times), fps, origin, clock)
 
 
-def read_frames(source: Path, config: FramesConfig) -> Iterator[tuple[float, Picture]]:
+def read_frames(source: Path, config: FramesConfig) -> Iterator[Timed]:
     """Time [s] and pixels of each frame, upright.
 
     Raises:
@@ -109,7 +134,7 @@ def read_frames(source: Path, config: FramesConfig) -> Iterator[tuple[float, Pic
     if source.is_dir():
         rate = config.folder_fps or 1.0
         for index, path in enumerate(pictures_of(source)):
-            yield index / rate, read_picture(path)
+            yield index / rate, partial(read_picture, path)
         return
     try:
         yield from _decoded(source, config.start)
@@ -120,21 +145,28 @@ def read_frames(source: Path, config: FramesConfig) -> Iterator[tuple[float, Pic
 
 
 def chosen(
-    frames: Iterator[tuple[float, Picture]], config: FramesConfig, fps: float | None
-) -> Iterator[tuple[float, Picture]]:
-    """The first frame of each interval of 1/fps between start and end.
+    frames: Iterator[Timed], config: FramesConfig, fps: float | None
+) -> Iterator[tuple[int, Timed]]:
+    """The frame nearest to each tick of the clock, with the tick's number; without a rate, all.
 
-    Times of phones' videos are uneven, so the clock decides and not the count.
+    A tick to which no frame is nearer than to the next has none: nothing was seen then.
     """
-    step = 0.0 if fps is None or not config.fps else 1 / fps
-    due = config.start
-    for time, picture in frames:
-        if config.end and time > config.end:
-            return
-        if time < due - EARLY * step:
+    best: tuple[int, float, Timed] | None = None
+    for index, frame in enumerate(frames):
+        since = frame[0] - config.start
+        if config.end and frame[0] > config.end:
+            break
+        tick = index if fps is None else round(since * fps)
+        off = 0.0 if fps is None else abs(since * fps - tick)
+        if since < -EARLY / (fps or 1.0) or (best is not None and tick < best[0]):
             continue
-        yield time, picture
-        due = max(due + step, time + step / 2)
+        if best is not None and tick > best[0]:
+            yield best[0], best[2]
+            best = None
+        if best is None or off < best[1]:
+            best = tick, off, frame
+    if best is not None:
+        yield best[0], best[2]
 
 
 def pictures_of(folder: Path) -> list[Path]:
@@ -206,7 +238,7 @@ def _rate(source: Path, config: FramesConfig) -> float | None:
     known = config.folder_fps or None
     if not source.is_dir():
         with _opened(source) as container:
-            known = float(container.streams.video[0].average_rate or 30.0)
+            known = float(container.streams.video[0].average_rate or USUAL_RATE)
     return known if known is None or not config.fps else min(known, config.fps)
 
 
@@ -229,7 +261,7 @@ def _opened(source: Path) -> Any:  # noqa: ANN401
     return container
 
 
-def _decoded(source: Path, start: float) -> Iterator[tuple[float, Picture]]:
+def _decoded(source: Path, start: float) -> Iterator[Timed]:
     with _opened(source) as container:
         stream = container.streams.video[0]
         context = stream.codec_context
@@ -238,7 +270,14 @@ def _decoded(source: Path, start: float) -> Iterator[tuple[float, Picture]]:
         first = float((stream.start_time or 0) * stream.time_base)
         if start > 0:
             container.seek(int((start + first) / stream.time_base), stream=stream)
-        for frame in container.decode(stream):
-            time = float((frame.pts or 0) * frame.time_base) - first
-            turns = round(frame.rotation / 90) % 4
-            yield time, np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), turns))
+        rate = float(stream.average_rate or USUAL_RATE)
+        for index, frame in enumerate(container.decode(stream)):
+            stamped = frame.pts is not None  # the frames of a bare stream are not
+            time = float(frame.pts * frame.time_base) - first if stamped else index / rate
+            yield time, partial(_upright, frame)
+
+
+def _upright(frame: Any) -> Picture:  # noqa: ANN401
+    """A decoded frame's pixels, turned as its file says that it is shown."""
+    turns = round(frame.rotation / 90) % 4
+    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), turns))

@@ -1,0 +1,214 @@
+"""Videos as people film them: turned, uneven, short, long, cut, without people or furniture."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from filmed import FINDERS, Shot, filmed, held, turned, walk, write_film
+from PIL import Image
+
+from mover.app.cli.perceive import PerceiveArgs, perceive_into
+from mover.app.cli.video import ChainArgs, video_to_room
+from mover.core.errors import InputError
+from mover.core.types import Scene
+from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.scene_file import read_scene
+from mover.io.people.keypoints import read_keypoints
+from mover.perceive.config import FramesConfig, PerceiveConfig
+
+pytest.importorskip("cv2")
+SECOND = 30
+
+
+def perceived(source: Path, out: Path, fps: float = 5.0, lens: Path | None = None) -> Path:
+    config = PerceiveConfig(FramesConfig(fps=fps))
+    fov = 60.0 if lens is None else None
+    perceive_into(PerceiveArgs(source, out, lens, fov, config=config), config.models, FINDERS)
+    return out
+
+
+def rows(capture: Path, name: str) -> list[dict]:
+    return json.loads((capture / name).read_text())["annotations"]
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+@pytest.mark.parametrize("tall", [False, True])
+def test_a_phone_that_was_turned_gives_what_an_upright_one_gives(
+    tmp_path: Path, turns: int, tall: bool
+):
+    shot, times = Shot(tall=tall), range(0, SECOND, 3)
+    upright = perceived(filmed(tmp_path / "a.mp4", shot, times), tmp_path / "upright")
+    turned = perceived(held(tmp_path / "b.mp4", shot, times, turns), tmp_path / "turned")
+    cameras = [json.loads((c / "camera.json").read_text()) for c in (upright, turned)]
+    assert cameras[0] == cameras[1]
+    assert (cameras[1]["h"], cameras[1]["w"]) == shot.size
+    (chair,), (found,) = rows(upright, "objects.json"), rows(turned, "objects.json")
+    assert found["bbox"] == pytest.approx(chair["bbox"], abs=2)
+    assert len(rows(upright, "people.json")) == len(rows(turned, "people.json")) == len(times) // 2
+    one, other = (read_keypoints(c / "keypoints.npz") for c in (upright, turned))
+    assert torch.equal(one.frame, other.frame)
+    assert (one.points - other.points).abs().max() < 2
+
+
+def test_what_moves_evenly_moves_evenly_in_an_uneven_video(tmp_path: Path):
+    dim = range(SECOND, 3 * SECOND, 5)  # phones take fewer frames where it is dark
+    times = [*range(SECOND), *dim, *range(4 * SECOND, 5 * SECOND)]  # and none for a second
+    capture = perceived(filmed(tmp_path / "v.mp4", Shot(), times), tmp_path / "c", fps=10)
+    found = read_keypoints(capture / "keypoints.npz")
+    assert found.fps is not None
+    true = torch.tensor([walk(float(t)) for t in found.frame / found.fps])
+    middle = found.points[..., 0].mean(-1) - 10
+    assert (middle - true).abs().max() < 12 * 0.5 / 10 + 1  # half a step of the clock, and a pixel
+    assert int(found.frame.max()) == 10 * 5
+    shown = json.loads((capture / "people.json").read_text())["images"]
+    assert [image["id"] for image in shown] == found.frame.tolist()
+    assert len(found.frame) < 40
+    names = sorted(path.name for path in (capture / "frames").iterdir())
+    assert names == [f"{frame:06d}.jpg" for frame in found.frame.tolist()]
+
+
+def test_another_video_in_the_same_folder_leaves_nothing_of_the_first(tmp_path: Path):
+    filmed(tmp_path / "v.mp4", Shot(), range(0, 2 * SECOND, 3))
+    perceived(tmp_path / "v.mp4", tmp_path / "c")
+    assert (tmp_path / "c" / "keypoints.npz").is_file()
+    filmed(tmp_path / "w.mp4", Shot(person=False), range(0, SECOND, 3))
+    perceived(tmp_path / "w.mp4", tmp_path / "c")
+    assert len(list((tmp_path / "c" / "frames").iterdir())) == 5
+    assert not (tmp_path / "c" / "keypoints.npz").exists()
+
+
+def test_of_a_video_that_is_cut_the_longest_shot_is_used_and_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    shots = (Shot(1), Shot(2), Shot(1))
+    ends = (1.0, 3.4, 5.0)
+    times = range(0, 5 * SECOND, 6)
+    pictures = [shots[sum(t / SECOND >= end for end in ends)].at(t / SECOND) for t in times]
+    write_film(tmp_path / "v.mp4", pictures, times)
+    capture = perceived(tmp_path / "v.mp4", tmp_path / "c")
+    told = capsys.readouterr().out
+    assert "the video is cut at 1.0 s, 3.4 s" in told
+    assert "the longest is used, 1.0 to 3.2 s" in told
+    assert "moves" not in told
+    frames = [row["image_id"] for row in rows(capture, "people.json")]
+    assert frames == list(range(5, 17))
+    clean = np.asarray(Image.open(capture / "reference.png").convert("L")).astype(float)
+    empty = Shot(2, person=False).at(0).mean(-1)
+    assert np.abs(clean - empty)[:, 70:90].mean() < 12
+
+
+def test_a_camera_that_moves_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    times = range(0, 3 * SECOND, 6)
+    pictures = [Shot(look=(4 * k, 2 * k), chair=False).at(0) for k in range(len(times))]
+    write_film(tmp_path / "v.mp4", pictures, times)
+    perceived(tmp_path / "v.mp4", tmp_path / "c")
+    told = capsys.readouterr().out
+    assert "warning: the camera moves" in told
+    assert "one that stands still" in told
+
+
+def test_a_video_without_furniture_ends_with_one_sentence(tmp_path: Path):
+    filmed(tmp_path / "v.mp4", Shot(chair=False), range(0, SECOND, 3))
+    with pytest.raises(InputError, match=r"finds no furniture in it.*--detect\.score 0\.3"):
+        video_to_room(tmp_path / "v.mp4", ChainArgs(tmp_path / "out", fov=60), FINDERS)
+    assert not (tmp_path / "out" / "room").exists()
+
+
+def test_a_calibration_of_the_other_format_is_one_sentence(tmp_path: Path):
+    filmed(tmp_path / "v.mp4", Shot(tall=True), range(0, SECOND, 3))
+    lens = {"w": 128, "h": 96, "fl_x": 110, "fl_y": 110, "cx": 64, "cy": 48}
+    (tmp_path / "lens.json").write_text(json.dumps(lens))
+    with pytest.raises(InputError, match=r"lens\.json: .*128 x 96.*96 x 128"):
+        perceived(tmp_path / "v.mp4", tmp_path / "c", lens=tmp_path / "lens.json")
+
+
+def test_a_calibration_of_another_resolution_is_scaled(tmp_path: Path):
+    filmed(tmp_path / "v.mp4", Shot(), range(0, SECOND, 3))
+    lens = {"w": 640, "h": 480, "fl_x": 550, "fl_y": 560, "cx": 330, "cy": 235, "height": 1.4}
+    (tmp_path / "lens.json").write_text(json.dumps(lens))
+    capture = perceived(tmp_path / "v.mp4", tmp_path / "c", lens=tmp_path / "lens.json")
+    found = json.loads((capture / "camera.json").read_text())
+    expected = {"w": 128, "h": 96, "fl_x": 110, "fl_y": 112, "cx": 66, "cy": 47, "height": 1.4}
+    assert {name: found[name] for name in expected} == pytest.approx(expected)
+
+
+def test_frames_without_time_stamps_are_counted(tmp_path: Path):
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / "v.h264"), "w", format="h264") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        for k in range(25):
+            picture = np.ascontiguousarray(Shot().at(k / 25))
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    capture = perceived(tmp_path / "v.h264", tmp_path / "c")
+    found = read_keypoints(capture / "keypoints.npz")
+    assert found.frame.tolist() == list(range(6))
+    true = torch.tensor([walk(min(k / 5, 0.96)) for k in range(6)])
+    assert (found.points[..., 0].mean(-1) - 10 - true).abs().max() < 1.5
+
+
+def room_of(source: Path, out: Path, args: ChainArgs, finders=FINDERS) -> Scene:
+    video_to_room(source, args, finders)
+    assert (out / "room" / "report.html").is_file()
+    return read_scene(out / "room" / "scene.json")
+
+
+@pytest.mark.slow
+def test_without_people_the_picture_alone_places_the_furniture_and_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    filmed(tmp_path / "v.mp4", Shot(person=False), range(0, SECOND, 3))
+    out = tmp_path / "out"
+    scene = room_of(tmp_path / "v.mp4", out, ChainArgs(out, fov=60.0))
+    told = capsys.readouterr().out
+    assert "nobody is seen in the video: only the image places the furniture" in told
+    assert [piece.id for piece in scene.objects] == ["chair_0"]
+    assert not (out / "room" / "bodies.npz").exists()
+
+
+@pytest.mark.long
+def test_ten_minutes_become_a_room(tmp_path: Path):
+    times = range(0, 600 * SECOND, 3 * SECOND)  # the picture changes every three seconds
+    filmed(tmp_path / "v.mp4", Shot(), times)
+    out = tmp_path / "out"
+    scene = room_of(tmp_path / "v.mp4", out, ChainArgs(out, fov=60.0))
+    assert [piece.id for piece in scene.objects] == ["chair_0"]
+    found = read_keypoints(out / "capture" / "keypoints.npz")
+    assert found.frame.tolist() == list(range(0, 5 * 600, 15))
+    bodies = read_bodies(out / "room" / "bodies.npz")
+    assert bodies.fps == 5
+    assert int(bodies.frame.max()) > 2900
+
+
+@pytest.mark.long
+def test_three_seconds_of_a_phone_held_upright_become_a_room(tmp_path: Path):
+    from kept_rooms import drawn, kept
+
+    from mover_bench.rooms.config import NoiseConfig, RoomConfig
+    from mover_bench.rooms.noise import add_noise
+    from mover_bench.rooms.room import draw_frame
+    from mover_bench.rooms.seen import Seen
+
+    config = RoomConfig(width=270, height=480, stay=0.3, least_frames=60)
+    room = kept(drawn, 4, config)
+    first = int(room.bodies.frame.min())
+    pictures = [(draw_frame(room, first + k).numpy() * 255).astype(np.uint8) for k in range(15)]
+    turned(tmp_path / "v.mp4", pictures, [6 * k for k in range(15)], 1)
+    out, camera = tmp_path / "out", room.truth.camera
+    K = camera.K.tolist()
+    lens = {"w": 270, "h": 480, "fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}
+    (tmp_path / "lens.json").write_text(json.dumps(lens))
+    args = ChainArgs(out, camera=tmp_path / "lens.json")
+    finders = Seen(room, add_noise(room, NoiseConfig(), 4), 4).finders()
+    scene = room_of(tmp_path / "v.mp4", out, args, finders)
+    assert (scene.camera.width, scene.camera.height) == (270, 480)
+    found = read_bodies(out / "room" / "bodies.npz")
+    assert 0 < len(found.frame.unique()) <= 15
+    near = [float(piece.t_world_object.norm()) for piece in scene.objects]
+    true = [float(piece.t_world_object.norm()) for piece in room.truth.objects]
+    assert len(near) == 4
+    assert all(min(true) / 2 < distance < 2 * max(true) for distance in near)
