@@ -17,6 +17,7 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.people.keypoints import read_keypoints
 from mover.perceive.config import FramesConfig, PerceiveConfig
+from mover.perceive.video import TakeInputs, stamp_of, take_frames
 
 pytest.importorskip("cv2")
 SECOND = 30
@@ -67,6 +68,20 @@ def test_what_moves_evenly_moves_evenly_in_an_uneven_video(tmp_path: Path):
     assert len(found.frame) < 40
     names = sorted(path.name for path in (capture / "frames").iterdir())
     assert names == [f"{frame:06d}.jpg" for frame in found.frame.tolist()]
+
+
+@pytest.mark.parametrize(("gap", "fps"), [(15, 5.0), (15, 0.0), (1, 0.0)])
+def test_of_a_slow_video_or_at_its_own_rate_all_frames_are_taken_at_their_times(
+    tmp_path: Path, gap: int, fps: float
+):
+    times = [*range(0, 20 * gap, gap), *range(60 * gap, 70 * gap, gap)]  # a pause between
+    filmed(tmp_path / "v.mp4", Shot(), times)
+    config = FramesConfig(fps=fps)
+    source = tmp_path / "v.mp4"
+    clip = take_frames(TakeInputs(source, stamp_of(source), tmp_path / "f"), config)
+    assert clip.fps == pytest.approx(SECOND / gap)
+    assert clip.numbers.tolist() == [*range(20), *range(60, 70)]
+    assert clip.time.tolist() == pytest.approx([t / SECOND for t in times], abs=1e-3)
 
 
 def test_another_video_in_the_same_folder_leaves_nothing_of_the_first(tmp_path: Path):

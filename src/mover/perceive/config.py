@@ -15,7 +15,7 @@ class FramesConfig:
     """Which frames are taken."""
 
     fps: Annotated[float, float_in(0, 1e4)] = 5.0
-    """Frames a second; 0: all."""
+    """Frames a second; 0: all, at the rate of the video."""
     start: Seconds = 0.0
     """Where to begin [s]."""
     end: Seconds = 0.0

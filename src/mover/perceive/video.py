@@ -29,6 +29,7 @@ PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 LARGEST_AREA = 1 << 26  # [px²], of a frame
 QUALITY = 95  # of JPEG
 USUAL_RATE = 30.0  # frames a second, where a video does not tell
+SAME_GAP = 0.2  # difference of two gaps between frames that are meant to be one
 EARLY = 0.05  # of the time between two frames: how early the first may be taken
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -239,7 +240,21 @@ def _rate(source: Path, config: FramesConfig) -> float | None:
     if not source.is_dir():
         with _opened(source) as container:
             known = float(container.streams.video[0].average_rate or USUAL_RATE)
+            if not config.fps or known < config.fps:  # a pause or a late end spoils the average
+                known = _usual_rate(container) or known
     return known if known is None or not config.fps else min(known, config.fps)
+
+
+def _usual_rate(container: Any) -> float | None:  # noqa: ANN401
+    """Frames a second where a video is even; None: nothing tells."""
+    try:
+        packets = container.demux(container.streams.video[0])
+        times = sorted(float(p.pts * p.time_base) for p in packets if p.pts is not None)
+    except (OSError, ValueError):  # decoding will say so
+        return None
+    gaps = np.diff(np.unique(times))
+    usual = gaps[np.abs(gaps - np.median(gaps)) < SAME_GAP * np.median(gaps)] if len(gaps) else gaps
+    return 1 / float(usual.mean()) if len(usual) else None
 
 
 def _opened(source: Path) -> Any:  # noqa: ANN401
