@@ -21,12 +21,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mover.bodies.keypoints import LAYOUTS, keypoints_of
 from mover.bodies.parts import parts_of
 from mover.bodies.skinning import open_body
 from mover.core.types import Bodies, Camera, Keypoints
 from mover.fitting.bodies import FitInputs, Fitted, fit_bodies
-from mover.geometry.camera import pitch_roll, project
+from mover.geometry.camera import pitch_roll
 from mover.geometry.rle import decode
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from
@@ -34,29 +33,20 @@ from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camer
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.people.select_frames import SelectInputs, select_frames
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
+from mover_bench.rooms.keypoints import joints_seen
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise
 from mover_bench.rooms.render import see, see_body
 from mover_bench.rooms.room import make_room
 
-LEGS = ("knee", "ankle", "toe", "heel")
 SEATED, LYING = ("sit", "lean"), ("lie", "lie down", "get up")
-NOISE, MISSING = 3.0, 0.1
 
 
-def joints_seen(room: KnownRoom, rng: np.random.Generator) -> np.ndarray:
+def triples_seen(room: KnownRoom, rng: np.random.Generator) -> np.ndarray:
     """Triples x, y, confidence of each body; zeros for what is not seen."""
-    camera, names = room.truth.camera, LAYOUTS["openpose25"]
-    points = keypoints_of(open_body(), room.bodies.verts, room.bodies.joints, "openpose25")
-    pixels = project(points, camera.K).double().numpy()
-    seen = rng.uniform(size=pixels.shape[:2]) >= MISSING
-    pixels = pixels + NOISE * rng.normal(size=pixels.shape)
-    seen &= ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(-1)
-    legs = np.array([any(part in name for part in LEGS) for name in names])
-    seated = np.array([action in SEATED for action in room.actions])
-    seen &= ~(legs & seated[:, None])
-    sure = np.where(seen, rng.uniform(0.5, 1.0, seen.shape), 0.0)
-    return np.concatenate([pixels * seen[..., None], sure[..., None]], -1)
+    seated = torch.tensor([action in SEATED for action in room.actions])
+    found = joints_seen(room.bodies, room.truth.camera, seated, rng)
+    return torch.cat([found.points, found.confidence[..., None]], -1).double().numpy()
 
 
 def write_openpose(room: KnownRoom, triples: np.ndarray, folder: Path) -> None:
@@ -105,7 +95,7 @@ def draw(room: KnownRoom, found: Fitted, path: Path) -> None:
 def keypoints_seen(room: KnownRoom, seed: int, fps: float) -> Keypoints:
     """The joints that a detector sees, read from its files."""
     with tempfile.TemporaryDirectory() as folder:
-        write_openpose(room, joints_seen(room, np.random.default_rng(seed)), Path(folder))
+        write_openpose(room, triples_seen(room, np.random.default_rng(seed)), Path(folder))
         return keypoints_from("openpose", Path(folder), Known(fps=fps))
 
 

@@ -171,6 +171,28 @@ def write_gen3dsr(folder: Path, room: Room, c2w: np.ndarray | None = None) -> Pa
     return folder
 
 
+# --- HolisticMesh (ZZWENG/holistic_mesh, code/main.py, scene_model.py `inference` and
+# `get_scene_mesh`, utils.py `render_image`): one mesh of all pieces, each with the vertices of a
+# sphere of 2562, right, down, forward of the flipped picture; boxes of the picture as stored ---
+def write_holisticmesh(folder: Path, room: Room) -> Path:
+    (folder / "models").mkdir(parents=True)
+    size = max(2562, *(len(t.verts) for t in room.things))
+    verts, faces = [], []
+    for i, t in enumerate(room.things):
+        own = t.world @ room.R.T
+        verts.append(np.concatenate([own, np.repeat(own[-1:], size - len(own), 0)]))
+        faces.append(t.faces + i * size)
+    whole = mesh(np.concatenate(verts), np.concatenate(faces))
+    whole.export(folder / "models" / "scene.ply")
+    rows = []
+    for t in room.things:
+        left, top, right, bottom = room.box2d(t)
+        box = [room.size[0] - right, top, room.size[0] - left, bottom]
+        rows.append({"bbox": box, "class": t.category})
+    (folder / "detections.json").write_text(json.dumps(rows))
+    return folder
+
+
 # --- glTF: nodes with translation, rotation, scale; a camera node that looks along -z ---
 def write_glb(path: Path, room: Room, world: np.ndarray | None = None, camera: bool = True) -> Path:
     """`world` is a transform of everything (4, 4), camera included."""

@@ -57,6 +57,7 @@ SWAPS = {
         "FOLDER": "sam3d", "C": "NEW", "MASKS": "MASKS.json",
     },
     "mover import gen3dsr FOLDER --out C": {"FOLDER": "gen3dsr", "C": "NEW"},
+    "mover import holisticmesh FOLDER --out C": {"FOLDER": "holisticmesh", "C": "NEW"},
     "mover import glb SCENE.glb --out C [--camera K] [--up z]": {
         "C": "NEW", "[--camera": "--camera", "K]": "CAPTURE/camera.json", "[--up": "", "z]": "",
     },

@@ -16,16 +16,9 @@ from mover.bodies.smpl_files import load_smpl
 from mover.core.errors import InputError
 from mover.core.types import Scene
 from mover.fitting.bodies import FitInputs, fit_bodies
-from mover.fitting.config import (
-    PUBLISHED,
-    STAGES,
-    FitConfig,
-    Stage,
-    limit_price,
-    limit_table,
-    resting,
-)
+from mover.fitting.config import PUBLISHED, STAGES, FitConfig, Stage
 from mover.fitting.energy import Weighed, bending_price, body_energy, geman_mcclure
+from mover.fitting.limits import limit_price, limit_table, resting
 from mover.fitting.prior import ANGLES, same
 from mover.fitting.start import placed
 from mover.fitting.tracks import best_path, seen_of, triples_of

@@ -10,8 +10,9 @@ from make_keypoints import CAMERA, as_bodies, keypoints_at, seen, walker
 from mover.bodies.skeleton import BODY
 from mover.bodies.skinning import open_body
 from mover.fitting.bodies import FitInputs, fit_bodies
-from mover.fitting.config import STAGES, FitConfig, resting, spreads
+from mover.fitting.config import STAGES, FitConfig
 from mover.fitting.energy import Seen, pose_price
+from mover.fitting.limits import resting, spreads
 from mover.fitting.tracks import ALONE, image_speed
 from mover.geometry.rotations import axis_angle, rotation_vectors
 

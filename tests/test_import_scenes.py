@@ -1,6 +1,7 @@
 """A known room in the layout of every tool comes back as the same room."""
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 
@@ -155,6 +156,43 @@ def test_gen3dsr_boxes_are_as_tight_as_the_true_ones_and_seats_face_forward(
         if thing.name.startswith(("chair", "sofa")):
             turn = float(piece.yaw) - thing.yaw
             assert abs(math.atan2(math.sin(turn), math.cos(turn))) < 0.05, thing.name
+
+
+def test_holisticmesh_gives_the_room_back_in_the_flipped_picture(
+    plain: layouts.Room, tmp_path: Path
+) -> None:
+    source = layouts.write_holisticmesh(tmp_path / "in", plain)
+    found = capture_of("holisticmesh", source, tmp_path, camera=camera_at(plain))
+    assert [p.category for p in found.scene.objects] == [t.category for t in plain.things]
+    assert worst(found, plain) < FINE
+    assert tilt_error(found, plain) < FINE
+    for detection, thing in zip(found.detections, plain.things, strict=True):
+        assert detection.box.tolist() == pytest.approx(plain.box2d(thing), abs=1e-3)
+
+
+def test_holisticmesh_without_a_camera_is_level_under_the_lens_of_prox(
+    plain: layouts.Room, tmp_path: Path
+) -> None:
+    source = layouts.write_holisticmesh(tmp_path / "in", plain)
+    found = imported("holisticmesh", source, tmp_path / "out", tmp_path / "work")
+    assert any("the camera is level" in note for note in found.notes)
+    camera = read_capture(tmp_path / "out").scene.camera
+    assert float(camera.K[0, 0]) == pytest.approx(1060.5317)
+    assert (camera.width, camera.height) == (1920, 1080)
+
+
+def test_what_holisticmesh_lacks_is_said(plain: layouts.Room, tmp_path: Path) -> None:
+    source = layouts.write_holisticmesh(tmp_path / "in", plain)
+    rows = json.loads((source / "detections.json").read_text())
+    (source / "detections.json").write_text(json.dumps(rows[:-1]))
+    with pytest.raises(InputError, match=f"expected as many vertices for each of {len(rows) - 1}"):
+        imported("holisticmesh", source, tmp_path / "out", tmp_path)
+    (source / "detections.json").unlink()
+    with pytest.raises(InputError, match=r"detections\.json: there is no such file"):
+        imported("holisticmesh", source, tmp_path / "out", tmp_path)
+    (source / "models" / "scene.ply").unlink()
+    with pytest.raises(InputError, match=r"models/scene\.ply: there is no such file"):
+        imported("holisticmesh", source, tmp_path / "out", tmp_path)
 
 
 @pytest.mark.parametrize("up", ["y", "-y", "z"])

@@ -14,10 +14,11 @@ from mover.bodies.smpl_model import FLAT, Model, SmplBody, skin_of_model
 from mover.core.observe import Energy, Observer, Step, silent
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
-from mover.fitting.config import FitConfig
+from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, Weighed, body_energy
-from mover.fitting.given import begin_from
+from mover.fitting.given import begin_at, begin_from, start_rows
 from mover.fitting.prior import ANGLES, PosePrior, encoded
+from mover.fitting.room import FitRoom
 from mover.fitting.start import Begun, begin
 from mover.fitting.tracks import (
     Window,
@@ -34,6 +35,7 @@ from mover.fitting.tracks import (
 from mover.fitting.unknowns import (
     EVERYTHING,
     HAND,
+    NO_SKIN,
     OF_ROWS,
     Frame,
     Rig,
@@ -65,6 +67,8 @@ class FitInputs:
     prior: PosePrior = ANGLES
     ground: float | None = None
     """Height of the floor in the camera's world [m], where it is known: nobody goes below it."""
+    room: FitRoom | None = None
+    """The room around `start`, one row for each of its bodies: these are fitted where they are."""
 
 
 @record
@@ -103,10 +107,11 @@ def fit_bodies(
     rows, warnings = usable_rows(inputs.keypoints, config)
     some = rows_of(inputs.keypoints, rows)
     inputs = dataclasses.replace(inputs, keypoints=some)
-    rig = rig_of(inputs.model, some.layout, seen_at_all(some, config))
+    picked = NO_SKIN if inputs.room is None else inputs.room.picked
+    rig = rig_of(inputs.model, some.layout, seen_at_all(some, config), picked)
     names = [LAYOUTS[some.layout][k] for k in rig.keypoints.tolist()]
     seen = seen_of(some, rig, inputs.camera, config)
-    seen = dataclasses.replace(seen, floor=inputs.ground)
+    seen = dataclasses.replace(seen, floor=inputs.ground, room=_around(inputs))
     job = _Job(inputs, config, rig, names, seen, observe)
     at, frame, seen = _solved(_begun(job), job)
     pose = pose_of(at, frame, inputs.model, inputs.prior)
@@ -114,10 +119,20 @@ def fit_bodies(
     return Fitted(bodies_of(pose, inputs.model, some), rows, miss, warnings)
 
 
+def _around(inputs: FitInputs) -> FitRoom | None:
+    """The room around the bodies of each row of the keypoints."""
+    if inputs.room is None or inputs.start is None:
+        return None
+    return rows_of(inputs.room, start_rows(inputs.start, inputs.keypoints, inputs.camera.K))
+
+
 def _begun(job: _Job) -> Begun:
     """From given bodies, or from keypoints alone; the code is that of the prior."""
     inputs = job.inputs
-    if inputs.start is None:
+    if inputs.start is not None and inputs.room is not None:
+        rows = start_rows(inputs.start, inputs.keypoints, job.seen.K)
+        begun = begin_at(inputs.start, rows, job.seen, job.rig, job.config)
+    elif inputs.start is None:
         begun = begin(inputs.keypoints, job.seen, job.rig, inputs.camera, job.config)
     else:
         begun = begin_from(inputs.start, inputs.keypoints, job.seen, job.rig, job.config)
@@ -161,10 +176,27 @@ def _widened(at: Unknowns, people: int, job: _Job) -> dict[str, Tensor]:
     if len(skin.parents) == 55 and any(n.startswith("face_") for n in job.names):
         face = 3 + min(EXPRESSION, getattr(model, "expression_dirs").shape[-1])  # noqa: B009
     return {
-        "betas": at.place.new_zeros(people, shapes),
+        "betas": _shapes(people, shapes, job).to(at.place),
         "hands": at.place.new_zeros(rows, 2 * hands),
         "face": at.place.new_zeros(rows, face),
     }
+
+
+def _shapes(people: int, width: int, job: _Job) -> Tensor:
+    """The mean shape; people who are fitted where they are keep theirs to begin with."""
+    inputs, found = job.inputs, torch.zeros(people, width)
+    start = inputs.start
+    if inputs.room is None or start is None or start.pose is None:
+        return found
+    if start.pose.model != inputs.model.name:
+        return found
+    rows = start_rows(start, inputs.keypoints, job.seen.K)
+    person = inputs.keypoints.person.unique(return_inverse=True)[1]
+    count = min(width, start.pose.betas.shape[1])
+    own = start.pose.betas[rows, :count].float()
+    total = torch.zeros(people, count).index_add(0, person, own)
+    mean = total / torch.bincount(person, minlength=people)[:, None]
+    return torch.cat([mean, found[:, count:]], -1)
 
 
 def _stages(
@@ -185,11 +217,18 @@ def _stages(
         def energy(u: Unknowns, here: Seen = here, by: Weighed = by) -> Energy:
             return body_energy(u, frame, here, by)
 
-        if len(stages) > 1 and index == len(stages) - 1 and not extremities:
+        last = index > 0 and index == len(stages) - 1
+        if last and not extremities and _alike(stage, stages[index - 1]):
             continue
         at = solve(energy, at, stage.steps, free)
         job.observe(Step("fit_bodies", index, len(stages)))
     return at
+
+
+def _alike(stage: Stage, before: Stage) -> bool:
+    """Two stages differ in nothing but hands and faces."""
+    own = {"steps": before.steps, "hand_joints": before.hand_joints}
+    return dataclasses.replace(stage, face_joints=before.face_joints, **own) == before
 
 
 def _speed(at: Unknowns, keypoints: Keypoints, job: _Job) -> Float[Tensor, " rows"] | None:

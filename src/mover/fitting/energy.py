@@ -22,7 +22,9 @@ from mover.bodies.skeleton import BODY
 from mover.core.observe import Energy
 from mover.core.records import record
 from mover.energy.minimize import weigh
-from mover.fitting.config import FitConfig, Stage, limit_price
+from mover.fitting.config import FitConfig, Stage
+from mover.fitting.limits import limit_price
+from mover.fitting.room import FitRoom, room_terms
 from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, points_of
 from mover.geometry.camera import project
 
@@ -70,6 +72,8 @@ class Seen:
     """How far from it each angle may be [rad]."""
     joints: Float[Tensor, "bodies joints 3"] | None
     """Joints of the body that are known in 3D [m]; NaN: not known."""
+    room: FitRoom | None = None
+    """The room in which they are fitted; None: not known."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,8 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
         ("smooth_pixels", smooth * flat, lambda: smooth_pixel_price(pixels, seen, by)),
         ("still", smooth * by.config.still, lambda: still_price(points.joints, seen)),
     )
-    return Energy({**space.parts, **_prior_energy(at, frame, seen, by).parts})
+    room = room_terms(points, seen.room, by.stage)
+    return Energy({**space.parts, **room, **_prior_energy(at, frame, seen, by).parts})
 
 
 def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:

@@ -14,8 +14,9 @@ from mover.bodies.smpl_model import skin_of_model
 from mover.bodies.transfer import copy_pose
 from mover.core.errors import InputError
 from mover.core.types import Bodies, Keypoints
-from mover.fitting.config import FitConfig, Stage, resting
+from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, Weighed, body_energy
+from mover.fitting.limits import resting
 from mover.fitting.prior import nearest_rotations, same
 from mover.fitting.start import Begun, before, unknowns_at, where_seen
 from mover.fitting.tracks import chosen
@@ -115,6 +116,29 @@ def begin_from(
             f"or 'joints' with {', '.join(TRUNK)}"
         )
     return _lifted(start, rows, keypoints, seen, rig, config)
+
+
+def begin_at(
+    start: Bodies, rows: Int[Tensor, " rows"], seen: Seen, rig: Rig, config: FitConfig
+) -> Begun:
+    """Start from bodies with parameters where they are.
+
+    Args:
+        start: In the camera frame.
+        rows: The body of each row that is fitted.
+        seen: What is seen of them.
+        rig: Of the model that is fitted.
+        config: How near to them the fit stays.
+
+    Raises:
+        InputError: If they have no parameters or no joints.
+    """
+    if start.pose is None or start.joints is None:
+        raise InputError("bodies: have no parameters of a body model, which are fitted anew")
+    angles, root = _angles_of(start, rows, rig)
+    at = unknowns_at(angles, start.joints[rows, 0].float())
+    near = torch.full_like(seen.spread, math.radians(config.near))
+    return Begun(at, root, angles, near)
 
 
 def _angles_of(

@@ -1,5 +1,6 @@
-"""How `mover fit` prices bodies: ours, and E_Body as the paper prints it."""
+"""How `fit` and `refine` weigh bodies: ours, and as the paper and PROX have it."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -26,3 +27,33 @@ released code's 10^2 and 0.1^2. The printed pose prior is VPoser's: give its wei
 
 FITS: dict[Preset, FitConfig] = {"robust": FitConfig(), "paper": PAPER}
 """By name."""
+
+PAPER_ROOM = replace(
+    PAPER,
+    stages=(
+        replace(PAPER.stages[-1], under=1e4, feet=1e2, sdf=1e2, contact=0.0),
+        replace(PAPER.stages[-1], under=1e2, feet=1.0, sdf=1.0, contact=1e4),
+    ),
+)
+"""The refinement with the estimated room: `PAPER` with the last two stages of PROX.
+
+Weights of SDF and contact are PROX's, those of floor and soles (CamGP) the authors' second fit's.
+"""
+ROOM_TERMS: Mapping[str, tuple[str, ...]] = {
+    "camgp": ("under", "feet"), "sdf": ("sdf",), "contact": ("contact",),
+}  # fmt: skip
+"""The weights of a stage by the rows of the paper's table of bodies."""
+
+
+def without(config: FitConfig, *rows: str) -> FitConfig:
+    """The settings without some of the room's terms, see `ROOM_TERMS`."""
+    zero = {name: 0.0 for row in rows for name in ROOM_TERMS[row]}
+    return replace(config, stages=tuple(replace(stage, **zero) for stage in config.stages))
+
+
+def at_most(config: FitConfig, steps: int) -> FitConfig:
+    """The settings with so many iterations a stage at most; 0: as they are."""
+    if not steps:
+        return config
+    stages = tuple(replace(stage, steps=min(stage.steps, steps)) for stage in config.stages)
+    return replace(config, stages=stages)

@@ -215,3 +215,12 @@ def vposer_prior(network: Vposer) -> PosePrior:
         return vectors_of(decoded(network, code)).flatten(1)
 
     return PosePrior(decode, width)
+
+
+def prior_of(weights: Path | None) -> PosePrior:
+    """VPoser's prior from its weights; None: no learned prior.
+
+    Raises:
+        InputError: If they cannot be used.
+    """
+    return ANGLES if weights is None else vposer_prior(load_vposer(weights))

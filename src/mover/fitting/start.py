@@ -17,8 +17,9 @@ from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skeleton import BODY
 from mover.core.records import record
 from mover.core.types import Camera, Keypoints
-from mover.fitting.config import FitConfig, Stage, resting
+from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, Weighed, body_energy
+from mover.fitting.limits import resting
 from mover.fitting.prior import same
 from mover.fitting.tracks import best_path, chosen, every_so_often, tracks_of
 from mover.fitting.unknowns import OF_ROWS, Frame, Rig, Unknowns, place_of, points_of, solve

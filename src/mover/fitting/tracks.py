@@ -10,8 +10,9 @@ from mover.bodies.keypoints import LAYOUTS
 from mover.core.errors import InputError
 from mover.core.records import record, rows_of
 from mover.core.types import Camera, Keypoints
-from mover.fitting.config import FitConfig, Stage, resting, spreads
+from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, Triples
+from mover.fitting.limits import resting, spreads
 from mover.fitting.unknowns import Rig
 
 HALF = 0.5  # [s], over which motion in the image is measured, on either side

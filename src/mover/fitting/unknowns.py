@@ -17,6 +17,7 @@ from mover.bodies.skinning import SkinnedBody, shaped, widths_of
 from mover.bodies.smpl_model import Model, SmplBody, skin_of_model, vertex_subset
 from mover.core.observe import Energy
 from mover.core.records import record
+from mover.geometry.mesh import vertex_normals
 from mover.geometry.rotations import axis_angle
 
 
@@ -34,6 +35,10 @@ class Rig:
     """Share of each joint, then of each vertex, in each keypoint."""
     keypoints: Int[Tensor, " keypoints"]
     """Index of the keypoints in their layout: those that are used and that the model has."""
+    picked: Int[Tensor, " picked"]
+    """Which of its vertices stand for the skin, where a room is looked at."""
+    normals: Float[Tensor, "picked 3"]
+    """Their outward normals at rest."""
 
     @property
     def skin(self) -> SkinnedBody:
@@ -47,10 +52,23 @@ class Points:
 
     keypoints: Float[Tensor, "bodies keypoints 3"]
     joints: Float[Tensor, "bodies joints 3"]
+    skin: Float[Tensor, "bodies picked 3"]
+    facing: Float[Tensor, "bodies picked 3"]
+    """Normals of the skin, as far as joints turn them; no gradients."""
 
 
-def rig_of(model: Model, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
-    """The rig of the keypoints of a layout that are `used`.
+NO_SKIN = torch.zeros(0, dtype=torch.long)
+FAR = ("index", "middle", "ring", "pinky", "thumb", "jaw")
+"""Keypoints that no part of the 22 joints moves."""
+
+
+def rig_of(
+    model: Model,
+    layout: str,
+    used: Bool[Tensor, " layout"],
+    picked: Int[Tensor, " picked"] = NO_SKIN,
+) -> Rig:
+    """The rig of the keypoints of a layout that are `used`, and of `picked` vertices of the skin.
 
     Raises:
         ValueError: If there is no such layout.
@@ -58,19 +76,11 @@ def rig_of(model: Model, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
     spots = spots_of(model, layout)
     index = torch.nonzero(used.cpu() & spots.there)[:, 0]
     vertex, share, joint = spots.vertex[index], spots.share[index], spots.joint[index]
-    needed = torch.unique(vertex[joint < 0])
+    needed = torch.unique(torch.cat([vertex[joint < 0].flatten(), picked]))
     small = vertex_subset(model, needed)
     names = [LAYOUTS[layout][k] for k in index.tolist()]
-    far = (
-        "index",
-        "middle",
-        "ring",
-        "pinky",
-        "thumb",
-        "jaw",
-    )  # no part of the 22 joints moves them
-    on_body = all(n in BODY or not any(part in n for part in far) for n in names)
-    if isinstance(small, SkinnedBody) and on_body:
+    on_body = all(n in BODY or not any(part in n for part in FAR) for n in names)
+    if isinstance(small, SkinnedBody) and on_body and not len(picked):
         small = _cut(small, len(BODY))
     skin = skin_of_model(small)
     assert skin is not None
@@ -82,7 +92,10 @@ def rig_of(model: Model, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
     rows = torch.nonzero(~is_joint)[:, 0]
     mix[rows] = mix[rows].scatter_add(1, column[rows], share[rows])
     levels, above = _levels(skin.parents)
-    return Rig(small, levels, above, mix, index)
+    whole = skin_of_model(model)
+    assert whole is not None
+    normals = vertex_normals(whole.verts, model.faces)[picked]
+    return Rig(small, levels, above, mix, index, torch.searchsorted(needed, picked), normals)
 
 
 def _cut(skin: SkinnedBody, joints: int) -> SkinnedBody:
@@ -131,7 +144,10 @@ def move(
     moved = (skin[..., :3] @ verts[..., None])[..., 0] + skin[..., 3]
     shift = (pelvis - places[:, 0])[:, None]
     both = torch.cat([places, moved], 1)
-    return Points(rig.mix.to(both) @ both + shift, places + shift)
+    turned = skin[:, rig.picked, :, :3].detach() @ rig.normals.to(skin)[..., None]
+    facing = torch.nn.functional.normalize(turned[..., 0], dim=-1)
+    keypoints = rig.mix.to(both) @ both + shift
+    return Points(keypoints, places + shift, moved[:, rig.picked] + shift, facing)
 
 
 def _corrected(

@@ -59,6 +59,10 @@ FORMATS = (
         "scene", "gen3dsr", "a folder of Gen3DSR: reconstruction/ and cam_params.json",
         "scenes.gen3dsr:gen3dsr_parts",
     ),
+    Format(
+        "scene", "holisticmesh", "a folder of HolisticMesh: models/scene.ply and detections.json",
+        "scenes.holisticmesh:holisticmesh_parts",
+    ),
     Format("scene", "glb", "a glTF scene: each node an object", "scenes.glb_scene:glb_parts"),
     Format(
         "scene", "boxes", "3D boxes (JSON); meshes come from the furniture library",

@@ -32,7 +32,7 @@ class StudyArgs:
     """Make one of the paper's experiments on known rooms, or all; goes on where it stopped."""
 
     name: Annotated[Positional[str], arg(metavar="STUDY")]
-    """ablation, camera, bodies, video-length, interactions, time, sensitivity, paper, sets,
+    """ablation, camera, bodies, refit, video-length, interactions, time, sensitivity, paper, sets,
     stability, motion, upstream, all."""
     set: str = ""
     """Which rooms; empty: those that the study is meant for."""
@@ -44,7 +44,7 @@ class StudyArgs:
     """Which errors the study `sensitivity` tries: scale, place, ..., or `paper` switches off:
     camera, bodies, contacts, masks; empty: all."""
     steps: Steps = 0
-    """Steps of the last descent in the study `paper`; 0: the presets' own."""
+    """Steps of the last descent in the studies `paper` and `refit`; 0: the presets' own."""
     out: Path = Path("experiments")
     """Folder for the results."""
     workers: Annotated[int, int_in(0, 10_000)] = 0

@@ -33,6 +33,7 @@ from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.moved import make_moved_room
 from mover_bench.rooms.noise import without_seat
 from mover_bench.rooms.room import make_room
+from mover_bench.studies.fitted import fitted_trial, measure_fitted
 from mover_bench.studies.measures import (
     Trial,
     carry_all,
@@ -192,11 +193,9 @@ def store_room(job: Job, trial: Trial, densities: EvaluateConfig | None = None) 
 
 def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None) -> None:
     """Rebuild a stored room as a variant does and measure it."""
-    if not job.room.with_name(DONE).exists():
-        raise FileNotFoundError(f"the room of seed {job.seed} could not be made")
-    trial = records.load(Trial, job.room)
-    capture = withheld(trial.capture, variant.hears, variant.cut)
     run = Run(job.folder if variant.fresh else job.home)
+    trial = _given(job, variant, run)
+    capture = withheld(trial.capture, variant.hears, variant.cut)
     exact = set_named(job.rooms).exact
     config = held_camera(variant.config) if "camera" in exact else variant.config
     room = reconstruct(capture, config, run)
@@ -207,6 +206,8 @@ def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None)
     stages = timing(run.stages)
     if variant.simulated:
         found = measure_stability(trial.truth, room, run)
+    elif variant.fitted:
+        found = measure_fitted(trial, room, variant.fitted, job.seed)
     elif variant.bodies:
         found = measure_people(trial, room, variant.bodies)
     else:
@@ -217,6 +218,14 @@ def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None)
             found["true_room"] = measure_true_room(trial, room, run, densities)
     _finish(job, found | {"stages": stages, **_length(trial, variant)})
     shutil.rmtree(job.folder / "stages", ignore_errors=True)
+
+
+def _given(job: Job, variant: Variant, run: Run) -> Trial:
+    """The stored room, with the people that a variant begins with."""
+    if not job.room.with_name(DONE).exists():
+        raise FileNotFoundError(f"the room of seed {job.seed} could not be made")
+    trial = records.load(Trial, job.room)
+    return fitted_trial(trial, job.seed, run) if variant.fitted else trial
 
 
 def _length(trial: Trial, variant: Variant) -> dict[str, float]:

@@ -338,9 +338,9 @@ def measure_people(trial: Trial, room: Room, row: str) -> dict[str, Any]:
     assert trial.bodies is not None, "a known room has true people"
     scene = room.scene
     if row in (GIVEN, "baseline"):  # nothing of the room is known, not even where down is
-        room = _under(room, trial.capture, trial.capture.scene.camera)
+        room = under_camera(room, trial.capture, trial.capture.scene.camera)
     elif row in (TRUE_GIVEN, TRUE_ROOM):
-        room = _true_room(trial, room)
+        room = in_true_room(trial, room)
     weights = ABLATION.get(PROX if row == TRUE_ROOM else row)
     found = room.bodies
     if weights is not None:
@@ -362,16 +362,17 @@ def timing(stages: list[StageLog]) -> list[dict[str, Any]]:
 
 def carry_all(room: Room, capture: Capture) -> Room:
     """The room with all people of the capture in its world, whatever part was given."""
-    return _under(room, capture, room.scene.camera)
+    return under_camera(room, capture, room.scene.camera)
 
 
-def _under(room: Room, capture: Capture, camera: Camera) -> Room:
+def under_camera(room: Room, capture: Capture, camera: Camera) -> Room:
     """The same room seen by another camera, with the people as they were given."""
     scene = replace(room.scene, camera=camera)
     return replace(room, scene=scene, bodies=to_world(as_given(capture), camera), kept=None)
 
 
-def _true_room(trial: Trial, room: Room) -> Room:
+def in_true_room(trial: Trial, room: Room) -> Room:
+    """The true room, with the people as they were given."""
     proxies = tuple(close_mesh(piece.mesh) for piece in trial.truth.objects)
     room = replace(room, proxies=proxies, scene=trial.truth)
-    return _under(room, trial.capture, trial.truth.camera)
+    return under_camera(room, trial.capture, trial.truth.camera)

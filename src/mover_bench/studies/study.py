@@ -58,6 +58,10 @@ STUDIES: dict[str, Study] = {
         "What the room gives back to the people.",
         "rooms", study_rows.bodies_plan, study_rows.bodies,
     ),
+    "refit": Study(
+        "What the room gives back to people who are fitted to keypoints, as the paper does it.",
+        "rooms", study_rows.refit_plan, study_rows.refit,
+    ),
     "video-length": Study(
         "Accuracy against the length of the video.",
         "long", study_video.length_plan, study_video.length,
@@ -228,7 +232,7 @@ def _check(args: StudyArgs) -> None:
         if name not in PRESETS:
             raise InputError(f"--presets: {name!r} is none of {', '.join(PRESETS)}")
     study_noise.check_errors(args.name, args.errors)
-    if args.steps and args.name != "paper":
+    if args.steps and args.name not in ("paper", "refit"):
         raise InputError(f"--steps: the study {args.name} keeps the presets' own")
     if "robust" not in args.presets and args.name != "paper":
         raise InputError("--presets: robust is missing, with which the others are compared")

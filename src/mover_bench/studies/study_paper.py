@@ -18,7 +18,7 @@ from mover_bench.studies.compare import (
 from mover_bench.studies.finished import Finished, Source, by_room
 from mover_bench.studies.sets import EXACT
 from mover_bench.studies.study_page import difference_text
-from mover_bench.studies.study_rows import Ask, Page, Plan, quoted_rows
+from mover_bench.studies.study_rows import Ask, Page, Plan, few_steps, quoted_rows
 from mover_bench.studies.variants import HUMAN, NO_TERM
 from mover_bench.tables import published
 
@@ -72,7 +72,7 @@ def _presets(ask: Ask) -> list[str]:
 
 def _names(ask: Ask, preset: str) -> dict[str, str]:
     """The jobs of a preset by what they add to Stage 1; `full`, all of it, is the last."""
-    few = f"@{ask.steps}" if ask.steps else ""
+    few = few_steps(ask)
     added = {f"+ {head}": f"{preset}-{name}{few}" for head, name in ADDED.items()}
     return {**added, "full": f"{preset}{few}"}
 

@@ -22,7 +22,13 @@ SEGMENTS = 10  # of each length, as in the paper
 LENGTHS = (10, 20, 30)  # [s]
 FRAMES = 5  # single frames whose results are averaged
 SHARES = (0.125, 0.25, 0.5, 1.0)  # of the video, for the time
-HIDDEN = ("frame-", "s-", "time-", "people-")  # names of variants that tables put together
+HIDDEN = (
+    "frame-",
+    "s-",
+    "time-",
+    "people-",
+    "fitted-",
+)  # names of variants that tables put together
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,8 @@ class Variant:
     """Part of the video; None: all of it."""
     bodies: str = ""
     """People refined afterwards: a row of the paper's table of bodies; empty: they are not."""
+    fitted: str = ""
+    """People fitted to keypoints, and again in the room: a row of that table; empty: no."""
     simulated: bool = False
     """Gravity acts on the furniture: only whether it stays is measured."""
     refined: bool = False
@@ -192,12 +200,17 @@ UNREFINED: dict[str, Variant] = {
 STANDS: dict[str, Variant] = {"stands": Variant(ROBUST, simulated=True)}
 """Whether what `robust` finds stays under gravity."""
 
+FITTED: dict[str, Variant] = {
+    f"fitted-{row.replace(' ', '-')}": Variant(PRESETS["paper"], fitted=row)
+    for row in ("baseline", "camgp", "sdf", "contact", "robust", "true room")
+}
+"""The paper's chain: keypoints, fit, room, refinement (`studies.fitted`)."""
 REFINED: dict[str, Variant] = {"refined-people": Variant(ROBUST, refined=True)}
 
 VARIANTS: dict[str, Variant] = {
     **{name: Variant(config) for name, config in PRESETS.items()},
     **TERMS, **ALONE, **PARTS, **TOOLS, **NOBODY, **RELAXED, **LENS, **REFINED, **SINGLE, **SEGMENT,
-    **TIMED, **STANDS, **PEOPLE, **UNREFINED,
+    **TIMED, **STANDS, **PEOPLE, **UNREFINED, **FITTED,
 }  # fmt: skip
 """By the name of the job."""
 

@@ -98,9 +98,12 @@ DETECTED = (
 PEOPLE = (
     TableRow(
         "baseline", "people-baseline", "full",
-        "the paper: batch SMPLify-X; here: the capture's bodies, smoothed in time",
+        "the paper: batch SMPLify-X; here: the capture's bodies, which `robust` smooths in time",
     ),
-    TableRow("+ CamGP", "people-camgp", "full", "refined in the room that `full` has found"),
+    TableRow(
+        "+ CamGP", "people-camgp", "full",
+        "in the room that `full` has found; under `paper` fitted to the keypoints again, if any",
+    ),
     TableRow("+ CamGP + SDF", "people-sdf"),
     TableRow("+ CamGP + SDF + Contact", "people-contact"),
 )  # fmt: skip

@@ -53,6 +53,20 @@ def parsed(kind: Callable[..., T], prog: str, arguments: Sequence[str], *markers
     return found
 
 
+def preset_of(arguments: Sequence[str], names: Sequence[T]) -> T:
+    """The preset that a command line names, whose settings the other flags change.
+
+    Raises:
+        InputError: If there is none of that name.
+    """
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--preset", default=names[0])
+    name = early.parse_known_args(arguments)[0].preset
+    if name not in names:
+        raise InputError(f"--preset: {name!r} is none of {', '.join(map(str, names))}")
+    return name
+
+
 def preset_named(name: str) -> Config:
     """A preset by its name.
 

@@ -8,10 +8,15 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from mover.app.cli.config import parsed
+from mover.app.cli.config import parsed, preset_of
 from mover.app.cli.console import say
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, float_in
+from mover.fitting.config import FitConfig
+from mover.fitting.presets import FITS
+
+NO_VPOSER = "note: the printed pose prior is VPoser's; without --vposer ours stands in for it"
+Detector = Literal["openpose", "coco17", "halpe26", "wholebody"]
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,7 @@ class FitArgs:
     """The result of `mover run`, for a second pass: its camera and its floor count (Sec. 3.2)."""
     out: Path = Path("bodies.npz")
     """The file to write."""
-    tool: Literal["openpose", "coco17", "halpe26", "wholebody"] = "openpose"
+    tool: Detector = "openpose"
     """The detector, where the source is not keypoints.npz."""
     model: Literal["makehuman", "smpl", "smplh", "smplx"] = "makehuman"
     """The body model; all but the open body need the user's files."""
@@ -54,11 +59,24 @@ class FitArgs:
 
 def fit(arguments: Sequence[str]) -> None:
     """`mover fit`."""
-    fit_into(parsed(FitArgs, "mover fit", arguments))
+    preset = preset_of(arguments, tuple(FITS))
+
+    def both(
+        args: Annotated[FitArgs, arg(name="")],
+        config: Annotated[FitConfig, arg(name="")] = FITS[preset],
+    ) -> tuple[FitArgs, FitConfig]:
+        """Fit bodies to the 2D joints of a video: keypoints.npz, or what a detector wrote."""
+        return args, config
+
+    fit_into(*parsed(both, "mover fit", arguments))
 
 
-def fit_into(args: FitArgs) -> None:
+def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
     """Fit, and write the bodies.
+
+    Args:
+        args: What to fit.
+        config: Weights and settings; None: the preset's.
 
     Raises:
         InputError: If what is given cannot be used.
@@ -67,26 +85,25 @@ def fit_into(args: FitArgs) -> None:
     from mover.bodies import load_model
     from mover.fitting.bodies import FitInputs, fit_bodies
     from mover.fitting.one_euro import smooth_keypoints
-    from mover.fitting.presets import FITS
-    from mover.fitting.prior import ANGLES, load_vposer, vposer_prior
+    from mover.fitting.prior import prior_of
     from mover.io.capture.bodies_file import read_bodies, write_bodies
 
     if args.model_folder is not None:
         os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
-    keypoints = _keypoints(args)
+    keypoints = keypoints_at(args.source, args.tool, args.fps, args.first)
     camera, ground = _world(args)
     inputs = FitInputs(
         keypoints=smooth_keypoints(keypoints) if args.one_euro else keypoints,
         camera=camera,
         model=load_model(args.model, args.gender),  # pyright: ignore[reportArgumentType]
         start=None if args.start is None else read_bodies(args.start),
-        prior=ANGLES if args.vposer is None else vposer_prior(load_vposer(args.vposer)),
+        prior=prior_of(args.vposer),
         ground=ground,
     )
     if args.preset == "paper" and args.vposer is None:
-        say("note: the printed pose prior is VPoser's; without --vposer ours stands in for it")
+        say(NO_VPOSER)
     with Bar() as bar:
-        found = fit_bodies(inputs, FITS[args.preset], observe=bar)
+        found = fit_bodies(inputs, config or FITS[args.preset], observe=bar)
     for warning in found.warnings:
         say(f"warning: {warning}")
     bodies = _without_outliers(found.bodies) if args.drop else found.bodies
@@ -111,15 +128,19 @@ def _world(args: FitArgs) -> tuple[Any, float | None]:
     return scene.camera, scene.ground if args.ground is None else args.ground
 
 
-def _keypoints(args: FitArgs) -> Any:  # noqa: ANN401
-    """The 2D joints."""
+def keypoints_at(source: Path, tool: str, fps: float | None, first: int) -> Any:  # noqa: ANN401
+    """The 2D joints of keypoints.npz, or of a detector's file or folder.
+
+    Raises:
+        InputError: If they cannot be read.
+    """
     from mover.io.people.found import Known
     from mover.io.people.keypoints import keypoints_from, read_keypoints
 
-    if args.source.suffix != ".npz":
-        return keypoints_from(args.tool, args.source, Known(fps=args.fps, first=args.first))
-    found = read_keypoints(args.source)
-    return found if args.fps is None else replace(found, fps=args.fps)
+    if source.suffix != ".npz":
+        return keypoints_from(tool, source, Known(fps=fps, first=first))
+    found = read_keypoints(source)
+    return found if fps is None else replace(found, fps=fps)
 
 
 def _without_outliers(bodies: Any) -> Any:  # noqa: ANN401

@@ -4,14 +4,18 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import AvoidSubcommands, Positional, arg
 
-from mover.app.cli.config import parsed
+from mover.app.cli.config import parsed, preset_of
 from mover.app.cli.console import say
+from mover.app.cli.fit import NO_VPOSER, Detector, keypoints_at
 from mover.core.errors import InputError
-from mover.core.settings import Index, int_in
+from mover.core.settings import Index, Rate, int_in
+from mover.fitting.config import FitConfig
+from mover.fitting.presets import PAPER_ROOM, without
+from mover.stages.config import RefineBodiesConfig
 
 
 @dataclass(frozen=True)
@@ -34,8 +38,18 @@ class RefineArgs:
     """Use who hides whom."""
     masks: bool = True
     """Use the outlines of people's masks."""
-    rounds: Annotated[int, int_in(1, 1000)] = 3
-    """How often contacts and outlines are looked for anew while poses change."""
+    preset: Literal["robust", "paper"] = "robust"
+    """robust: the bodies that are there, moved; paper: SMPLify-X again, with PROX's terms."""
+    keypoints: Path | None = None
+    """paper: the 2D joints of the video, keypoints.npz, or a file or folder of a detector."""
+    tool: Detector = "openpose"
+    """paper: the detector, where --keypoints is not keypoints.npz."""
+    fps: Rate | None = None
+    """paper: frames a second, where the keypoints do not tell."""
+    first: Index = 0
+    """paper: the number in the name of the first frame's file of the detector."""
+    vposer: Path | None = None
+    """paper: VPoser's weights (a checkpoint, its folder, or .npz), the printed prior of poses."""
 
 
 @dataclass(frozen=True)
@@ -64,31 +78,71 @@ class ContactsArgs:
     """The file to write."""
 
 
+def _robust(
+    args: Annotated[RefineArgs, arg(name="")],
+    config: Annotated[RefineBodiesConfig, arg(name="")] = RefineBodiesConfig(),  # noqa: B008
+) -> tuple[RefineArgs, RefineBodiesConfig | FitConfig]:
+    """Refine the people of a result with its room; writes OUT/refined: bodies.npz, metrics.json."""
+    return args, config
+
+
+def _paper(
+    args: Annotated[RefineArgs, arg(name="")],
+    config: Annotated[FitConfig, arg(name="")] = PAPER_ROOM,
+) -> tuple[RefineArgs, RefineBodiesConfig | FitConfig]:
+    """Refine the people of a result with its room; writes OUT/refined: bodies.npz, metrics.json."""
+    return args, config
+
+
+PRESETS = {"robust": _robust, "paper": _paper}
+"""What the flags of a preset are."""
+
+
 def refine(arguments: Sequence[str]) -> None:
     """`mover refine`."""
-    args = parsed(RefineArgs, "mover refine", arguments)
+    kind = PRESETS[preset_of(arguments, tuple(PRESETS))]
+    args, config = parsed(kind, "mover refine", arguments, AvoidSubcommands)
     import torch
 
     from mover.app.cli.progress import Bar
-    from mover.pipeline.refinement import measure_people, refine_result, switched
-    from mover.stages.config import RefineBodiesConfig
+    from mover.pipeline.refinement import measure_people
 
     torch.set_num_threads(1)
-    off = {
-        "camgp": not args.camgp, "sdf": not args.sdf, "contact": not args.contact,
-        "order": not args.order, "masks": not args.masks,
-    }  # fmt: skip
-    config = switched(RefineBodiesConfig(rounds=args.rounds), off)
     with Bar() as bar:
-        found = refine_result(args.out, config, args.capture, bar)
-    way = found.shift.norm(dim=-1).median()
-    how = "rigidly" if found.bodies.pose is None else "with their pose"
-    say(f"{len(found.shift)} bodies refined {how}, moved by {1000 * float(way):.0f} mm (median): "
-         f"{args.out / 'refined' / 'bodies.npz'}")  # fmt: skip
+        say(_refined(args, config, bar))
     values = measure_people(args.out, args.truth)
     say(f"\n{'':20}{'result':>10}{'refined':>10}")
     for name, before in values["result"].items():
         say(f"{name:20}{before:10.4f}{values['refined'][name]:10.4f}")
+
+
+def _refined(args: RefineArgs, config: RefineBodiesConfig | FitConfig, observe: Any) -> str:  # noqa: ANN401
+    """Refine as the settings say; returns what was done.
+
+    Raises:
+        InputError: If something is asked for that a preset has not, or a file is wrong.
+    """
+    from mover.pipeline.refinement import refine_as_paper, refine_result, switched
+
+    off = {"camgp": not args.camgp, "sdf": not args.sdf, "contact": not args.contact}
+    path = args.out / "refined" / "bodies.npz"
+    if isinstance(config, RefineBodiesConfig):
+        if args.keypoints is not None or args.vposer is not None:
+            raise InputError("--keypoints, --vposer: of --preset paper only")
+        more = {"order": not args.order, "masks": not args.masks}
+        found = refine_result(args.out, switched(config, off | more), args.capture, observe)
+        how = "rigidly" if found.bodies.pose is None else "with their pose"
+        way = f"moved by {1000 * float(found.shift.norm(dim=-1).median()):.0f} mm (median)"
+        return f"{len(found.shift)} bodies refined {how}, {way}: {path}"
+    source = _needed(args.keypoints, "--keypoints")
+    seen = keypoints_at(source, args.tool, args.fps, args.first)
+    if args.vposer is None:
+        say(NO_VPOSER)
+    config = without(config, *(name for name, is_off in off.items() if is_off))
+    found = refine_as_paper(args.out, (seen, args.vposer), config, args.capture, observe)
+    for warning in found.warnings:
+        say(f"warning: {warning}")
+    return f"{len(found.rows)} bodies fitted again in their room: {path}"
 
 
 def contacts(arguments: Sequence[str]) -> None:

@@ -50,12 +50,16 @@ def read_mesh(at: At, folder: Path) -> tuple[Mesh, str]:
         refuse(at, f"a file of kind {', '.join(KINDS)}")
     if path.stat().st_size > LARGEST_FILE:
         refuse(at, f"at most {LARGEST_FILE} bytes", f"a file of {path.stat().st_size}")
-    verts, faces = _load(at, path)
+    verts, faces = load_arrays(at, path)
     return mesh_of(verts, faces, at), str(path)
 
 
-def _load(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Vertices and faces of all parts of a file."""
+def load_arrays(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
+    """All vertices, used or not, and the faces of all parts of a file.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
     import trimesh
 
     with warnings.catch_warnings():

@@ -1,0 +1,98 @@
+"""HolisticMesh: models/scene.ply, all furniture of one picture, and detections.json.
+
+Its main.py writes scene.ply where `verts, faces, lo_bdb3D_cam_coord` are given to `render_image`,
+as its commented line does. The pieces follow one another in the order of the detections, each with
+as many vertices (a sphere of 2562), in the axes of the mirrored picture's camera (x right, y down,
+z forward), as PROX's pictures are stored mirrored and its bodies are fitted to the flipped ones.
+Neither gravity nor the boxes' axes are written: the tilt comes from --camera, the fronts are
+guessed (placing.py).
+"""
+
+import dataclasses
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mover.core.errors import InputError
+from mover.io.capture.parts import Hints, Parts
+from mover.io.files.fields import At, choice, get, items, maybe, read_json, refuse, vector
+from mover.io.files.meshes import load_arrays, mesh_of, write_mesh
+from mover.io.files.schema import rotation
+from mover.io.scenes.placing import LEVEL, Pieces, without_axes
+from mover.io.scenes.total3d import CLASSES, FURNITURE
+
+SCENE = Path("models") / "scene.ply"
+LENS = {"w": 1920, "h": 1080, "fl_x": 1060.5317, "fl_y": 1060.3856, "cx": 951.2999, "cy": 536.7704}
+"""Of PROX's colour camera, which its code takes for every picture."""
+
+
+def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
+    """What HolisticMesh made of one picture.
+
+    Raises:
+        InputError: If a file is missing or wrong.
+    """
+    if not (folder / SCENE).is_file():
+        why = "that main.py writes where the scene is given to render_image"
+        raise InputError(f"{SCENE}: there is no such file in {folder}, expected the mesh {why}")
+    if not (folder / "detections.json").is_file():
+        why = "the one of its --data_path, whose order names the pieces"
+        raise InputError(f"detections.json: there is no such file in {folder}, expected {why}")
+    rows = items(read_json(folder / "detections.json"))
+    names = [choice(get(row, "class"), CLASSES) for row in rows]
+    given = {} if hints.camera is None else dict(hints.camera.value)
+    tilt = None if hints.camera is None else maybe(hints.camera, "R_cam_world")
+    R = np.array(LEVEL) if tilt is None else rotation(tilt)
+    camera = {**LENS, **given, "R_cam_world": R.tolist()}
+    found, world = Pieces(), np.eye(4)
+    world[:3, :3] = R.T
+    for index, path in _pieces(folder, len(rows), hints.work).items():
+        if names[index] in FURNITURE:
+            copy = partial(without_axes, path, world, names[index])
+            name = f"{names[index]}_{index}"
+            found.add(names[index], name, lambda key, copy=copy: copy(hints.work / f"{key}.glb"))
+            found.rows[-1]["annotation"] = index
+    how = "level, as --camera has no R_cam_world" if tilt is None else "as given"
+    return dataclasses.replace(
+        found.parts(folder.resolve().name, str(SCENE)),
+        camera=At(camera, "camera.json"),
+        objects=At(_annotations(rows, names, float(camera["w"])), "detections.json"),
+        notes=(f"the camera is {how}; the fronts of the objects are guesses",),
+    )
+
+
+def _pieces(folder: Path, count: int, work: Path) -> dict[int, Path]:
+    """The mesh of each detection, as a file of its own."""
+    at = At(str(SCENE), str(SCENE))
+    verts, faces = load_arrays(at, folder / SCENE)
+    if not count or len(verts) % count:
+        refuse(at, f"as many vertices for each of {count} detections", f"{len(verts)} vertices")
+    size = len(verts) // count
+    owner = faces // size
+    if (owner != owner[:, :1]).any():
+        refuse(at, "faces of one piece each", "faces that join two pieces")
+    found: dict[int, Path] = {}
+    for index in range(count):
+        own = verts[index * size : (index + 1) * size]
+        mesh = mesh_of(own, faces[owner[:, 0] == index] - index * size, at)
+        found[index] = work / f"holisticmesh_{index}.glb"
+        write_mesh(mesh, found[index])
+    return found
+
+
+def _annotations(rows: list[At], names: list[str], width: float) -> dict[str, Any]:
+    """The content of objects.json: boxes of the flipped picture."""
+    annotations: list[dict[str, Any]] = []
+    for i, (row, name) in enumerate(zip(rows, names, strict=True)):
+        if name not in FURNITURE:
+            continue
+        box = get(row, "bbox")
+        long = isinstance(box.value, list) and len(box.value) == 5
+        left, top, right, bottom = vector(box, 5 if long else 4)[:4]
+        place = [width - right, top, right - left, bottom - top]
+        at = {"id": i, "image_id": 0, "category_id": CLASSES.index(name), "bbox": place}
+        annotations.append(at)
+    categories = [{"id": i, "name": name} for i, name in enumerate(CLASSES)]
+    return {"images": [{"id": 0}], "categories": categories, "annotations": annotations}

@@ -1,0 +1,155 @@
+"""`refine --preset paper`: SMPLify-X again in the estimated room, with the terms of PROX."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import FACES, box_verts
+from test_commands_refine import FAR, finished, lowest, standing
+
+from mover.app import cli
+from mover.bodies.keypoints import keypoints_of
+from mover.bodies.skinning import open_body
+from mover.core.types import Bodies, Keypoints, Mesh
+from mover.fitting.config import Stage
+from mover.fitting.presets import PAPER_ROOM, ROOM_TERMS, without
+from mover.fitting.room import RHO, FitRoom, room_terms
+from mover.fitting.unknowns import Points
+from mover.geometry.camera import project
+from mover.geometry.volume import grid_around
+from mover.geometry.volume_warp import union_bodies
+from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.scene_file import read_scene
+from mover.io.people.keypoints import write_keypoints
+
+QUICK = ["--stages.0.steps", "15", "--stages.1.steps", "15"]
+
+
+def keypoints_in(out, bodies: Bodies) -> Keypoints:
+    """What a detector sees of people in the world of a result."""
+    camera = read_scene(out / "scene.json").camera
+    points = keypoints_of(open_body(), bodies.verts, bodies.joints, "openpose25")
+    pixels = project(points @ camera.R_cam_world.mT, camera.K)
+    sure = torch.ones(pixels.shape[:2])
+    return Keypoints(pixels, sure, "openpose25", bodies.frame, bodies.person, 5.0)
+
+
+@pytest.fixture
+def result(tmp_path):
+    """Somebody too far away, seen where the truth is; a truth, and the keypoints."""
+    out = finished(tmp_path / "out", standing(FAR))
+    truth = finished(tmp_path / "truth", standing(0.0))
+    write_keypoints(keypoints_in(truth, standing(0.0)), tmp_path / "keypoints.npz")
+    return out, truth, tmp_path / "keypoints.npz"
+
+
+def test_people_are_fitted_again_on_the_floor_of_their_room(result, capsys):
+    out, truth, seen = result
+    words = [str(out), "--preset", "paper", "--keypoints", str(seen), "--truth", str(truth)]
+    assert cli.run_command("refine", [*words, *QUICK]) == 0
+    assert "3 bodies fitted again in their room" in capsys.readouterr().out
+    before, after = read_bodies(out / "bodies.npz"), read_bodies(out / "refined" / "bodies.npz")
+    assert (
+        lowest(after).abs().max() < 0.5 * lowest(before).abs().min()
+    )  # the last stage holds loosely
+    values = json.loads((out / "refined" / "metrics.json").read_text())
+    assert values["refined"]["pje"] < 0.5 * values["result"]["pje"]
+    assert after.pose.betas.unique(dim=0).shape[0] == 1
+
+
+def test_the_floor_does_it_and_may_be_left_out(result):
+    out, _, seen = result
+    words = [str(out), "--preset", "paper", "--keypoints", str(seen), *QUICK]
+    assert cli.run_command("refine", [*words, "--no-camgp"]) == 0
+    without_floor = lowest(read_bodies(out / "refined" / "bodies.npz")).abs().max()
+    assert cli.run_command("refine", words) == 0
+    assert lowest(read_bodies(out / "refined" / "bodies.npz")).abs().max() < 0.5 * without_floor
+
+
+def test_bodies_without_keypoints_are_left_out_and_said(result, capsys):
+    out, truth, seen = result
+    every = keypoints_in(truth, standing(0.0))
+    some = replace(
+        every, points=every.points[:2], confidence=every.confidence[:2], frame=every.frame[:2],
+        person=every.person[:2],
+    )  # fmt: skip
+    write_keypoints(some, seen)
+    words = [str(out), "--preset", "paper", "--keypoints", str(seen), "--stages.0.steps", "2"]
+    assert cli.run_command("refine", [*words, "--stages.1.steps", "2"]) == 0
+    assert "1 of 3 bodies have no keypoints: left out" in capsys.readouterr().out
+    assert len(read_bodies(out / "refined" / "bodies.npz").frame) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--preset", "paper"], "--keypoints: is missing, expected a path"),
+        (["--keypoints", "k.npz"], "--keypoints, --vposer: of --preset paper only"),
+        (["--preset", "release"], "--preset: 'release' is none of robust, paper"),
+    ],
+)
+def test_what_is_asked_wrongly_is_one_sentence(tmp_path, capsys, words, said):
+    out = finished(tmp_path / "out", standing(FAR))
+    assert cli.run_command("refine", [str(out), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_bare_meshes_and_other_frames_are_refused(result, tmp_path, capsys):
+    out, truth, seen = result
+    words = ["--preset", "paper", "--keypoints", str(seen)]
+    late = keypoints_in(truth, standing(0.0))
+    write_keypoints(replace(late, frame=late.frame + 100), seen)
+    assert cli.run_command("refine", [str(out), *words]) == 2
+    assert "none is of a frame of bodies.npz" in capsys.readouterr().err
+    bare = finished(tmp_path / "bare", replace(standing(FAR), pose=None))
+    assert cli.run_command("refine", [str(bare), *words]) == 2
+    assert "has no parameters of a body model" in capsys.readouterr().err
+
+
+def box_room(stands=(False, False)) -> FitRoom:
+    """A box of half a metre on a floor at -1, two points of the skin that both may touch."""
+    mesh = Mesh(box_verts((0.5, 0.5, 0.5)).float() - torch.tensor([0.0, 1.0, 0.0]), FACES)
+    low, high = mesh.verts.amin(0), mesh.verts.amax(0)
+    volume = union_bodies(mesh.verts[None], mesh.faces, grid_around(low, high, 64, 0.2), 1)
+    top = torch.tensor([[0.0, -0.5, 0.0]])
+    return FitRoom(
+        torch.eye(3), -1.0, volume, top, torch.tensor([[0.0, 1.0, 0.0]]),
+        torch.arange(2), torch.tensor([True, True]), 10.0, torch.tensor([True, True]),
+        torch.tensor([stands]),
+    )  # fmt: skip
+
+
+def at(*places, facing=(0.0, -1.0, 0.0)) -> Points:
+    skin = torch.tensor([places]).requires_grad_()
+    none = torch.zeros(1, 0, 3)
+    return Points(none, none, skin, torch.tensor([[facing] * len(places)]))
+
+
+def test_each_term_is_what_prox_writes():
+    deep = at((0.0, -0.6, 0.0), (2.0, -1.03, 0.0))  # 10 cm in the box; 3 cm below the floor
+    found = room_terms(deep, box_room(), Stage(under=100, sdf=2.0, contact=7.0))
+    assert found["under"].item() == pytest.approx(3.0, abs=1e-4)
+    assert found["sdf"].item() == pytest.approx(2 * 10 * 0.1, rel=0.1)
+    far = 4.0 + 0.53**2
+    each = [0.1**2 / (0.1**2 + RHO**2), far / (far + RHO**2)]
+    assert found["contact"].item() == pytest.approx(7 * sum(each) / 2, rel=1e-4)
+    stands = room_terms(deep, box_room((False, True)), Stage(feet=1.0))
+    assert stands["feet"].item() == pytest.approx(0.03**2 / (0.03**2 + RHO**2), rel=1e-3)
+
+
+def test_a_surface_of_another_direction_is_not_touched_and_nothing_is_nothing():
+    aside = at((0.0, -0.45, 0.0), (0.1, -0.45, 0.0), facing=(1.0, 0.0, 0.0))
+    found = room_terms(aside, box_room(), Stage(contact=7.0, feet=1.0, sdf=1.0, under=1.0))
+    assert {name: value.item() for name, value in found.items()} == dict.fromkeys(found, 0.0)
+    assert room_terms(aside, None, Stage(contact=7.0)) == {}
+    assert room_terms(aside, box_room(), Stage()) == {}
+
+
+def test_every_row_of_the_table_leaves_its_terms_out():
+    for row, names in ROOM_TERMS.items():
+        stages = without(PAPER_ROOM, row).stages
+        assert all(getattr(stage, name) == 0 for stage in stages for name in names)
+        assert any(getattr(stage, name) for stage in PAPER_ROOM.stages for name in names)
+        others = [n for r, ns in ROOM_TERMS.items() if r != row for n in ns]
+        assert all(any(getattr(stage, n) for stage in stages) for n in others)
