@@ -27,6 +27,7 @@ def joints_seen(
         seated: Whose legs furniture hides.
         rng: Of the noise.
     """
+    assert bodies.joints is not None, "the open body has joints"
     points = keypoints_of(open_body(), bodies.verts, bodies.joints, LAYOUT)
     pixels = project(points, camera.K).double().numpy()
     seen = rng.uniform(size=pixels.shape[:2]) >= MISSING
