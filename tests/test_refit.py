@@ -22,6 +22,7 @@ from mover.geometry.volume_warp import union_bodies
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.people.keypoints import write_keypoints
+from mover.pipeline.refit import pairs_of
 
 QUICK = ["--stages.0.steps", "15", "--stages.1.steps", "15"]
 
@@ -65,6 +66,26 @@ def test_the_floor_does_it_and_may_be_left_out(result):
     without_floor = lowest(read_bodies(out / "refined" / "bodies.npz")).abs().max()
     assert cli.run_command("refine", words) == 0
     assert lowest(read_bodies(out / "refined" / "bodies.npz")).abs().max() < 0.5 * without_floor
+
+
+def test_people_are_paired_in_each_frame_whatever_their_numbers():
+    near, far = standing(0.0, 2), standing(0.0, 2)
+    far = replace(far, verts=far.verts + 1, joints=far.joints + 1, person=torch.tensor([1, 1]))
+    both = replace(
+        near, verts=torch.cat([near.verts, far.verts]), joints=torch.cat([near.joints, far.joints]),
+        frame=torch.tensor([0, 1, 0, 1]), person=torch.tensor([0, 0, 1, 1]), pose=None,
+        space="camera",
+    )  # fmt: skip
+    flip = torch.tensor([1.0, -1, -1])  # into a camera's axes
+    both = replace(both, verts=both.verts * flip, joints=both.joints * flip)
+    K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    pixels = project(both.joints[:, :17], K)[[2, 0, 3, 1, 1]]
+    pixels[4] += 900  # nobody
+    seen = Keypoints(
+        pixels, torch.ones(5, 17), "coco17", torch.tensor([0, 0, 1, 1, 1]),
+        torch.tensor([0, 1, 7, 8, 9]), 5.0,
+    )  # fmt: skip
+    assert pairs_of(both, seen, K).tolist() == [[0, 2], [1, 0], [2, 3], [3, 1]]
 
 
 def test_bodies_without_keypoints_are_left_out_and_said(result, capsys):

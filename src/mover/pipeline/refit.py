@@ -23,10 +23,10 @@ from mover.core.records import map_tensors, rows_of
 from mover.core.types import Bodies, Keypoints, Room
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import FitConfig
-from mover.fitting.given import start_rows
 from mover.fitting.presets import PAPER_ROOM
 from mover.fitting.prior import ANGLES, PosePrior
 from mover.fitting.room import FitRoom
+from mover.geometry.camera import project
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.outcome import to_world
 from mover.stages.people.body_evidence import Picked, pick, surroundings_of
@@ -69,20 +69,41 @@ def refit_bodies(
     bodies, model = _people(room)
     camera, (config, prior) = room.scene.camera, settings
     given = replace(into_camera(bodies, camera.R_cam_world), space="camera")
-    there = torch.isin(keypoints.frame, bodies.frame)
-    if not there.any():
+    pairs = pairs_of(given, keypoints, camera.K)
+    if not len(pairs):
         raise InputError("keypoints: none is of a frame of bodies.npz, expected the same numbers")
-    seen = rows_of(keypoints, there)
-    rows = start_rows(given, seen, camera.K)
-    same = given.frame[rows] == seen.frame  # somebody is seen whom the result has not there
-    seen, rows = rows_of(seen, same), rows[same]
-    around = room_around(room, bodies, touch)
-    found = fit_bodies(FitInputs(seen, camera, model, given, prior, room=around), config, observe)
-    rows = rows[found.rows]
-    refitted = replace(to_world(found.bodies, camera), person=bodies.person[rows])
+    rows = pairs[:, 1]
+    seen = replace(rows_of(keypoints, pairs[:, 0]), person=bodies.person[rows])
+    start = rows_of(given, rows)
+    around = rows_of(room_around(room, bodies, touch), rows)
+    found = fit_bodies(FitInputs(seen, camera, model, start, prior, room=around), config, observe)
+    rows, refitted = rows[found.rows], to_world(found.bodies, camera)
     lost = len(bodies.frame) - len(rows.unique())
     left = (f"{lost} of {len(bodies.frame)} bodies have no keypoints: left out",) if lost else ()
     return Refit(refitted, rows, (*found.warnings, *left))
+
+
+def pairs_of(
+    bodies: Bodies, keypoints: Keypoints, K: Float[Tensor, "3 3"]
+) -> Int[Tensor, "pairs 2"]:
+    """Rows of keypoints and of bodies that are one person, by where they are in their frame.
+
+    Detectors lose people and find them again under another number: numbers count for nothing.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    points = bodies.joints if bodies.joints is not None else bodies.verts[:, ::50]
+    theirs = project(points, K.to(points)).mean(1)
+    known = (keypoints.confidence > 0) & keypoints.points.isfinite().all(-1)
+    ours = keypoints.points.where(known[..., None], torch.nan).nanmean(1)
+    found: list[tuple[int, int]] = []
+    for frame in keypoints.frame[known.any(1)].unique().tolist():  # some people each
+        mine = ((keypoints.frame == frame) & known.any(1)).nonzero()[:, 0]
+        there = (bodies.frame == frame).nonzero()[:, 0]
+        cost = torch.cdist(ours[mine].double(), theirs[there].double())
+        rows, columns = linear_sum_assignment(cost.nan_to_num(1e6).numpy())
+        found += zip(mine[rows].tolist(), there[columns].tolist(), strict=True)
+    return torch.tensor(sorted(found)).reshape(-1, 2).long()
 
 
 def _people(room: Room) -> tuple[Bodies, SkinnedBody | SmplBody]:

@@ -18,7 +18,7 @@ from mover.core.records import fingerprint
 from mover.core.run import Run, sources
 from mover.core.types import Bodies, Capture, Room, Scene, SceneObject
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
-from mover.fitting.presets import PAPER_ROOM, without
+from mover.fitting.presets import PAPER_ROOM, at_most, without
 from mover.fitting.prior import ANGLES
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.camera_file import camera_of
@@ -38,6 +38,7 @@ from mover_bench.studies.variants import withheld
 from mover_bench.tables.rows import Disturbance, disturbance_of, variants
 
 DONE, FAILED = "metrics.json", "failure.json"
+STEPS = 0  # iterations of a stage of the people's fit at most; 0: the preset's
 KEYPOINTS = "keypoints"
 """Folder of a capture with OpenPose's files, as the importer of PROX makes it."""
 LACKS: Mapping[str, tuple[str, ...]] = {
@@ -119,7 +120,7 @@ def _refined(job: TableJob, room: Room, capture: Capture, row: str) -> Bodies:
         given = as_given(capture)
         return to_world(given, capture.scene.camera)
     keypoints = keypoints_from("openpose", seen, Known(fps=people.fps))
-    config = without(PAPER_ROOM, *LACKS[row])
+    config = at_most(without(PAPER_ROOM, *LACKS[row]), STEPS)
     return refit_bodies(room, keypoints, capture.touch, (config, ANGLES)).bodies
 
 

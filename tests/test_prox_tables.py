@@ -1,0 +1,110 @@
+"""`mover paper-table` end to end: every row of both parts of PROX, from files in its layout."""
+
+import csv
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+
+import make_prox
+import make_scenes as layouts
+import pytest
+from test_experiments import Ended, quick
+from test_import_datasets import prox_room
+from test_import_scenes import imported
+from test_import_scenes import plain as plain  # the fixture
+
+from mover.io.capture.bodies_file import read_bodies
+from mover.pipeline.presets import PRESETS
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.tables import table_job
+from mover_bench.tables.paper_table import TABLES, TableArgs, asked, paper_table
+from mover_bench.tables.table_job import TableJob, do_job
+
+STILLS = ("vicon_03301_01", "vicon_03301_02")
+VIDEOS = ("MPH8_00034_01", "MPH8_00035_02")
+pytestmark = pytest.mark.long
+
+
+def chosen_rows(room: KnownRoom, action: str, count: int) -> list[int]:
+    """Rows that do something, spread over the video."""
+    wanted = [k for k, name in enumerate(room.actions) if name == action]
+    return wanted[:: max(1, len(wanted) // count)][:count]
+
+
+@pytest.fixture(scope="module")
+def captures(
+    plain: layouts.Room, small_room: KnownRoom, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Path]:
+    """Captures of a user's copy: two recordings of the quantitative room, two of another one."""
+    room, root = prox_room(plain), tmp_path_factory.mktemp("prox")
+    models = make_prox.write_body_model(tmp_path_factory.mktemp("models"))
+    walks, sits = (chosen_rows(small_room, action, 3) for action in ("walk", "sit"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MOVER_BODY_MODELS", str(models))
+        for name in STILLS:
+            fits = ["fittings/PROX", "fittings/mosh"]
+            make_prox.write_recording(root, room, name, small_room, [*walks, *sits], fits)
+        for name in VIDEOS:
+            make_prox.write_recording(root, room, name, small_room, sits, ["PROXD"])
+        world = (root / "cam2world" / "vicon.json").read_text()
+        (root / "vicon2scene.json").write_text(world)  # MoSh's bodies are where the fits are
+        furniture = make_prox.write_furniture(root / "total3d", room)
+        masks = make_prox.write_object_masks(root / "masks.json", room, small_room)
+        out = tmp_path_factory.mktemp("captures")
+        boxes = root / "boxes" / "bbox3d.json"
+        for name, recordings in (("vicon_03301", STILLS), (VIDEOS[0], VIDEOS)):
+            work = tmp_path_factory.mktemp("work")
+            imported("prox", root, out / name, work, recordings=recordings, boxes=boxes)
+            imported("total3d", furniture, out / name, work)
+            imported("masks", masks, out / name, work)
+        yield out
+
+
+def at_once(job: TableJob) -> Ended:
+    """Do a job here; a traceback is its log."""
+    job.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        do_job(job)
+    except Exception:
+        (job.folder / "log.txt").write_text(traceback.format_exc())
+        return Ended(1)
+    return Ended(0)
+
+
+@pytest.mark.parametrize("name", ["prox", "prox-quantitative"])
+def test_every_row_is_made_from_the_files_of_prox(
+    name: str, captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for preset, config in PRESETS.items():
+        monkeypatch.setitem(PRESETS, preset, quick(config))
+    monkeypatch.setattr(table_job, "STEPS", 5)
+    args = TableArgs(name, captures, tmp_path, captures, preset="paper")
+    page = paper_table(args, launch=at_once).read_text()
+    assert "Failed" not in page
+    assert "Not run" not in page
+    with (tmp_path / f"{name}-paper.csv").open(newline="") as file:
+        numbers = {(line["table"], line["row"]): line for line in csv.DictReader(file)}
+    for part in TABLES[name].parts:
+        for row in asked(part, args):
+            line = numbers[part.title, row.label]
+            assert line["recordings"] == "1"
+            assert [c for c in part.columns if not line[c]] == [], (part.title, row.label)
+
+
+def test_the_fits_that_are_the_truth_are_wrong_by_the_camera_alone(
+    captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Under a level camera they lean; in the room that was found they stand."""
+    bodies = read_bodies(captures / "vicon_03301" / "bodies.npz")
+    assert bodies.pose is not None
+    assert bodies.pose.model == "smplx"
+    assert len(bodies.frame) == 12
+    monkeypatch.setitem(PRESETS, "paper", quick(PRESETS["paper"]))
+    monkeypatch.setattr(table_job, "STEPS", 5)
+    rows = ("baseline", "+ CamGP")
+    args = TableArgs("prox-quantitative", captures, tmp_path, preset="paper", only=rows)
+    paper_table(args, launch=at_once)
+    with (tmp_path / "prox-quantitative-paper.csv").open(newline="") as file:
+        found = {line["row"]: line for line in csv.DictReader(file)}
+    assert float(found["baseline"]["p_pje"]) < 1
+    assert float(found["+ CamGP"]["pje"]) < 0.7 * float(found["baseline"]["pje"])
