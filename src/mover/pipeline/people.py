@@ -10,12 +10,14 @@ from mover.bodies.parts import Parts, parts_of
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, CameraPath, Capture
 from mover.energy.terms.feet import FootContacts
+from mover.geometry.boxes import box_of
 from mover.geometry.path import is_still, poses_at, scaled, to_reference
 from mover.io.capture.pose_file import moved
 from mover.pipeline.believable import check_floor
 from mover.pipeline.outcome import PeopleState
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import AlignInputs, align_camera
+from mover.stages.camera.align_views import ViewInputs, align_views, aligned
 from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
 from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
@@ -23,6 +25,8 @@ from mover.stages.camera.find_scale import ScaleInputs, find_scale
 from mover.stages.objects.find_image_cues import hiding
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
 from mover.stages.people.select_frames import SelectInputs, select_frames
+
+NEAREST = 0.3  # [m], no object is nearer to the reference image's camera
 
 
 def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
@@ -45,6 +49,8 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
         standing = FootContactInputs(carried(bodies, path), parts, kept, camera, touch)
         return run.stage(find_foot_contacts, standing, config.foot_contacts)
 
+    path, views = _with_views(path, capture, config, run)
+    told = (*told, *views)
     feet, loose = feet_on(path), torch.zeros(3, 3)
     if not is_still(path):
         inputs = DriftInputs(feet, camera, path, bodies.fps or 1.0)
@@ -67,6 +73,26 @@ def _in_metres(
         return capture.path, ()
     scale = run.stage(find_scale, ScaleInputs(bodies, parts, capture.path), config.scale)
     return scaled(capture.path, scale.scale), scale.warnings
+
+
+def _with_views(
+    path: CameraPath, capture: Capture, config: Config, run: Run
+) -> tuple[CameraPath, tuple[str, ...]]:
+    """The path [m] as furniture in further frames corrects it, and what is odd about that."""
+    if is_still(path) or capture.furniture is None:
+        return path, ()
+    found = {one.id: one for one in capture.detections}
+    camera = capture.scene.camera
+    known = [p for p in capture.scene.objects if p.annotation in found]
+    middle = [camera.R_cam_world @ box_of(p).center for p in known]
+    if not known:
+        return path, ()
+    inputs = ViewInputs(
+        camera, tuple(found[p.annotation] for p in known if p.annotation is not None),
+        torch.stack(middle)[:, 2].clamp_min(NEAREST), capture.furniture, capture.people, path,
+    )  # fmt: skip
+    views = run.stage(align_views, inputs, config.views)
+    return aligned(path, views), views.warnings
 
 
 def as_given(capture: Capture) -> Bodies:

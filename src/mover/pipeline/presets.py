@@ -32,6 +32,7 @@ from mover.stages.config import (
     ScaleConfig,
     SelectConfig,
     SpreadConfig,
+    ViewConfig,
 )
 
 
@@ -51,6 +52,8 @@ class Config:
     """The scale of a moving camera's path."""
     foot_contacts: FootContactConfig = field(default_factory=FootContactConfig)
     """Feet at rest."""
+    views: ViewConfig = field(default_factory=ViewConfig)
+    """What furniture in further frames tells of a moving camera's path."""
     drift: DriftConfig = field(default_factory=DriftConfig)
     """The slow error of a moving camera's path."""
     align: AlignConfig = field(default_factory=AlignConfig)

@@ -16,6 +16,7 @@ from mover.core.records import map_tensors
 from mover.core.types import Bodies, CameraPath, Capture, People
 from mover.geometry.path import from_reference, is_still, poses_at, scaled
 from mover.geometry.raster import first_hit
+from mover.geometry.rle import decode
 from mover.geometry.rotations import axis_angle
 from mover.io.capture.pose_file import moved
 from mover_bench.rooms.config import NoiseConfig, PathConfig
@@ -25,6 +26,7 @@ from mover_bench.rooms.render import encode, furniture, look_at
 
 TARGET = 4.0  # [m] ahead, at which a camera that travels looks
 SHAKE = 0.7  # [s], how long a hand keeps its error
+LEAST_PIXELS = 100  # [px] of a piece; what is seen of less is not segmented
 PATHS = 20  # number of the stream of random numbers
 
 
@@ -36,7 +38,13 @@ def filmed(room: KnownRoom, noise: NoiseConfig, seed: int, config: PathConfig) -
     frames, fps = int(room.bodies.frame.max()) + 1, room.bodies.fps
     assert fps is not None, "a known room is a video"
     true = draw_path(frames, fps, config, rng)
-    capture = add_noise(on_the_way(room, true), noise, seed)
+    known = on_the_way(room, true)
+    if config.views:
+        seen = furniture_seen(known, true, max(1, round(config.views * fps)))
+        known = dataclasses.replace(
+            known, capture=dataclasses.replace(known.capture, furniture=seen)
+        )
+    capture = add_noise(known, noise, seed)
     return dataclasses.replace(capture, path=slam_path(true, config, rng))
 
 
@@ -110,6 +118,30 @@ def on_the_way(room: KnownRoom, path: CameraPath) -> KnownRoom:
     passing = free < 0.9 * whole
     capture = dataclasses.replace(room.capture, bodies=seen, people=people)
     return dataclasses.replace(room, bodies=seen, capture=capture, whole=whole, passing=passing)
+
+
+@one_thread()
+def furniture_seen(room: KnownRoom, path: CameraPath, every: int) -> People:
+    """What the moving camera sees of the furniture in some frames, as `furniture.json` has it."""
+    camera, (verts, faces, owner) = room.truth.camera, furniture(room.plan)
+    still, people = room.plan.view.seen(verts), room.capture.people
+    assert people is not None, "a known room has masks"
+    rows: list[tuple[int, int]] = []
+    masks: list[np.ndarray] = []
+    for frame in range(every, int(path.frame[-1]) + 1, every):
+        pose = poses_at(path, torch.tensor([frame]))
+        points = from_reference(still[None], pose)[0]
+        _, face = first_hit(points, faces, camera.K, (camera.height, camera.width))
+        piece = torch.where(face >= 0, owner[face.clamp_min(0)], -1)
+        for row in (people.frame == frame).nonzero()[:, 0].tolist():
+            piece[decode(people.masks, row)] = -1
+        for index in piece.unique().tolist():
+            mask = piece == index
+            if index >= 0 and int(mask.sum()) >= LEAST_PIXELS:
+                rows.append((frame, index + 1))
+                masks.append(mask.numpy())
+    frame, number = torch.tensor(rows).unbind(1)
+    return People(encode(masks), frame, number, {})
 
 
 def _people(room: KnownRoom, bodies: Bodies, path: CameraPath) -> tuple[People, Tensor, Tensor]:

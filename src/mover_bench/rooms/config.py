@@ -104,6 +104,8 @@ class PathConfig:
     """
     drift_turn: float = 0.0
     """Error of the direction at the end [degrees]."""
+    views: float = 0.0
+    """Time between two frames in which the furniture is segmented [s]; 0: the reference alone."""
 
 
 # How wrong the input of a known room is, with a source for each number.

@@ -168,6 +168,10 @@ SETS: dict[str, RoomSet] = {
         " path is as SLAM gives it, in a scale of its own and with a drift of 1 % of the way.",
         "1000-1029", "100-129", paths=_MOVING,
     ),
+    "moving-views": RoomSet(
+        "The rooms of `moving-camera`; the furniture is segmented in a frame every 4 s, too.",
+        "1000-1029", "100-129", paths=tuple(replace(path, views=4.0) for path in _MOVING),
+    ),
 }  # fmt: skip
 """All sets by name."""
 

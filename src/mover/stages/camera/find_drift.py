@@ -67,7 +67,7 @@ def find_drift(
     first = torch.stack(pitch_roll(inputs.camera.R_cam_world.double()))
     if len(inputs.foot_contacts.person):
         votes = vote(inputs.foot_contacts, "places")
-        shares = _shares(votes.foot_contacts.frame, knots)
+        shares = shares_of(votes.foot_contacts.frame, knots)
         ground = (votes.foot_contacts.points_cam @ tilted(first[0], first[1])[:, 1]).median()
         at = torch.cat([first, ground[None], torch.zeros(len(knots)).double()])
         trust = _trust(inputs.path, knots, config)
@@ -88,7 +88,7 @@ def find_drift(
 
 def undrifted(path: CameraPath, drift: Drift) -> CameraPath:
     """The path without it."""
-    lift = _shares(path.frame, drift.frame).to(drift.height) @ drift.height
+    lift = shares_of(path.frame, drift.frame).to(drift.height) @ drift.height
     at = path.t_reference_camera + lift[:, None] * drift.up
     return dataclasses.replace(path, t_reference_camera=at)
 
@@ -99,7 +99,12 @@ def _knots(path: CameraPath, every: int) -> Int[Tensor, " knots"]:
     return torch.linspace(first, last, count).round().long()
 
 
-def _shares(
+def home_of(path: CameraPath) -> Int[Tensor, ""]:
+    """The frame whose camera is most like that of the reference image."""
+    return path.frame[(path.R_reference_camera - torch.eye(3)).abs().amax((1, 2)).argmin()]
+
+
+def shares_of(
     frame: Int[Tensor, " rows"], knots: Int[Tensor, " knots"]
 ) -> Float[Tensor, "rows knots"]:
     """How much each knot has of a time between two; float64."""
@@ -120,8 +125,7 @@ def _trust(
     between = step[index].diff().clamp_min(LEAST_WAY)
     change = torch.eye(len(knots)).double().diff(dim=0)
     walk = 3 / (config.share**2 * between * between.sum())
-    home = path.frame[(path.R_reference_camera - torch.eye(3)).abs().amax((1, 2)).argmin()]
-    still = _shares(home[None], knots)
+    still = shares_of(home_of(path)[None], knots)
     return change.mT @ (walk[:, None] * change) + still.mT @ still / FIXED**2
 
 

@@ -120,6 +120,11 @@ def find_image_cues(
     )
 
 
+def free_sides(inputs: ImageInputs, config: ImageConfig) -> Bool[Tensor, "objects 4"]:
+    """Which sides of the boxes are seen: neither the image's border nor something cuts them off."""
+    return _sides(inputs, _others(inputs), config) == SEEN
+
+
 def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:
     """Pixels where something else is seen that may hide this object."""
     rows: list[Tensor] = []
