@@ -2,9 +2,10 @@
 
     PYTHONPATH=src python benchmarks/moving_camera.py --seeds 100-111 --out moving
 
-Rebuilds each room with `robust` from both captures (`rooms` and `moving-camera`; finished rooms are
-kept in `--out`) and prints IoU3D, the angle of gravity [degrees], the error of the floor [cm] and,
-for the moving camera, the error of the path's scale [%] and how far it went [m].
+Rebuilds each room with `robust` from the captures of `--sets` (the first: of the still camera;
+`moving-camera` has furniture in the reference image alone, `moving-views` in further frames, too;
+finished rooms are kept in `--out`) and prints IoU3D, the angle of gravity [degrees], the error of the
+floor [cm] and, for the moving camera, the error of the path's scale [%] and how far it went [m].
 """
 
 import argparse
@@ -34,7 +35,7 @@ def paths_of(trial: Trial, seed: int) -> tuple[CameraPath, CameraPath]:
     """The true path [m], and the one that was given without its drift."""
     assert trial.bodies is not None
     assert trial.bodies.fps is not None
-    kinds = SETS["moving-camera"].paths
+    kinds = SETS["moving-views"].paths
     config, rng = kinds[seed % len(kinds)], np.random.default_rng([seed, PATHS])
     true = draw_path(int(trial.bodies.frame.max()) + 1, trial.bodies.fps, config, rng)
     return true, slam_path(true, replace(config, drift=0.0, drift_turn=0.0), rng)
@@ -75,9 +76,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", default="100-111")
     parser.add_argument("--out", type=Path, default=Path("moving"))
+    parser.add_argument("--sets", nargs="+", default=["rooms", "moving-views"])
     args = parser.parse_args()
     torch.set_num_threads(1)
-    rows: dict[str, list[list[float]]] = {"rooms": [], "moving-camera": []}
+    rows: dict[str, list[list[float]]] = {name: [] for name in args.sets}
     print("seed camera | IoU3D stage 1, full | gravity, floor | scale, reach | seconds")
     for seed in parse_seeds(args.seeds):
         for name, found in rows.items():

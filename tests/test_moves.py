@@ -168,3 +168,11 @@ def test_a_capture_may_have_the_objects_masks_in_its_frames(tmp_path: Path):
     (folder / "furniture.json").write_text(json.dumps(furniture(999)))
     with pytest.raises(InputError, match=r"furniture.json.*track_id' has 999, expected the id"):
         read_capture(folder)
+
+
+def test_furniture_without_masks_is_told(tmp_path: Path):
+    folder = tiny.write_capture(tmp_path / "tiny")
+    (folder / "furniture.json").write_text('{"images": [], "annotations": []}')
+    capture = read_capture(folder)
+    assert capture.furniture is None
+    assert any("furniture.json: there are no masks of objects" in w for w in capture.warnings)

@@ -12,12 +12,12 @@ from typing import Annotated, Any, TypeVar
 
 from mover.core.settings import float_in, int_in
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
+from mover.stages.camera.config import DriftConfig, ScaleConfig, ViewConfig
 from mover.stages.config import (
     AlignConfig,
     AssignConfig,
     ContactConfig,
     DepthConfig,
-    DriftConfig,
     ExplainConfig,
     FocalConfig,
     FootContactConfig,
@@ -29,10 +29,8 @@ from mover.stages.config import (
     ProposeConfig,
     RefineConfig,
     ReinitConfig,
-    ScaleConfig,
     SelectConfig,
     SpreadConfig,
-    ViewConfig,
 )
 
 

@@ -131,6 +131,8 @@ def furniture_of(
         if get(item, "track_id").value not in known:
             field = At(get(item, "track_id").value, at.file, f"annotations[{index}].track_id")
             refuse(field, "the id of an annotation in objects.json")
+    if found is None:
+        warn(f"{at.file}: there are no masks of objects, expected some in its annotations")
     return found
 
 

@@ -8,17 +8,21 @@ image, z its depth, and R, t the pose of the view that was given,
         +  \sum_k |w_k - w_{k-1}|^2 / a_k  +  |d_k - d_{k-1}|^2 / b_k
 
 over turns w and shifts d of the views, and all z, by reweighted least squares; only the coordinate
-across a side is compared, and only where nothing hides the side. Turns and shifts are zero at the
-reference image and walk away from it (variances a, b grow with the way). People and views in
-between are corrected evenly. How long the path's unit is, people tell (`find_scale`).
+across a side is compared, and only where neither people nor the image's border cut the side (edges
+of other furniture do, but they stand as still). A mask whose outline is too wide or too narrow all
+around has an unknown of its own. Turns and shifts are zero at the reference image and walk away
+from it (variances a, b grow with the way); frames in between are corrected evenly. How long the
+path's unit is, people tell (`find_scale`).
 """
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
@@ -27,13 +31,16 @@ from mover.geometry.camera import project
 from mover.geometry.path import poses_at
 from mover.geometry.rle import decode, tight_box
 from mover.geometry.rotations import axis_angle
+from mover.stages.camera.config import ViewConfig
 from mover.stages.camera.find_drift import home_of, shares_of
-from mover.stages.config import ImageConfig, ViewConfig
+from mover.stages.config import ImageConfig
 from mover.stages.objects.find_image_cues import ImageInputs, free_sides
 
 STEPS = 8  # for each scale of the robust price
-MOST = 0.3
+STRIDE = 0.3  # [1], most that the logarithm of a depth changes in a step
 FEWEST = 6  # sides of a view, below which it says nothing
+HIDDEN = 0.1  # share of the strip beyond a side that people may fill
+FIXED = 1e-5  # [rad], [m], error of the reference image's own pose
 LEAST_WAY = 1e-3  # [m] between two views
 ACROSS = (0, 1, 0, 1)  # coordinate that is told by the left, upper, right and lower side
 
@@ -67,61 +74,69 @@ class Views:
 
 
 @record
+class _Boxes:
+    """Boxes of all objects in one picture."""
+
+    sides: Float[Tensor, "objects 4"]
+    """x_min, y_min, x_max, y_max [px]."""
+    free: Bool[Tensor, "objects 4"]
+    """Sides that neither people nor the border of the image cut off."""
+
+
+@record
 class _Sights:
     """Sides of objects in the reference image and in a view; one row each."""
 
-    point: Float[Tensor, "rows 2"]
-    """Where the reference image sees it [px]."""
+    ray: Float[Tensor, "rows 3"]
+    """Through the point that the reference image sees, of depth one."""
     at: Float[Tensor, " rows"]
-    """Where the view does, across the side [px]."""
+    """Where the view sees it, across the side [px]."""
     axis: Int[Tensor, " rows"]
-    depth: Int[Tensor, " rows"]
-    """Index of its depth."""
-    view: Int[Tensor, " rows"]
-    mask: Int[Tensor, " rows"]
-    """Index of its mask, whose outline may be off by some pixels all around."""
     outward: Float[Tensor, " rows"]
-    """1 where such an error is added to the coordinate, -1 where it is taken away."""
+    """Sign of the coordinate's change where the mask's outline is too wide."""
+    knot: Int[Tensor, " rows"]
+    point: Int[Tensor, " rows"]
+    """Whose depth is one unknown."""
+    mask: Int[Tensor, " rows"]
+    """Whose outline's error is one unknown."""
+    depth: Float[Tensor, " points"]
+    """First guess of the depth of each point [m]."""
+    piece: Int[Tensor, " points"]
+    """The object of each point."""
 
 
 def align_views(
     inputs: ViewInputs, config: ViewConfig = ViewConfig(), observe: Observer = silent
 ) -> Views:
     """The turns and shifts with which the views see the objects where the reference image does."""
-    frames = _frames(inputs.furniture, config)
-    boxes, free = zip(*(_seen(inputs, f) for f in (None, *frames.tolist())), strict=True)
-    observe(Step("align_views", 0, 1))
-    both = torch.stack(free)[1:] & free[0]
-    both = both & (both.flatten(1).sum(1) >= FEWEST)[:, None, None]
-    told = both.flatten(1).any(1)
-    frames, both, boxes = frames[told], both[told], torch.stack(boxes)[1:][told]
-    home = home_of(inputs.path)
-    knots = torch.cat([home[None], frames]).unique()
-    if not len(frames):
+    reference = _in_reference(inputs)
+    frames = _frames(inputs.furniture, config).tolist()
+    views: dict[int, _Boxes] = {}
+    for index, frame in enumerate(frames):  # a loop keeps the memory at one image
+        observe(Step("align_views", index, len(frames)))
+        view = _in_view(inputs, frame)
+        view = dataclasses.replace(view, free=view.free & reference.free)
+        if int(view.free.sum()) >= FEWEST:
+            views[frame] = view
+    knots = torch.cat([home_of(inputs.path)[None], torch.tensor(list(views)).long()]).unique()
+    if not views:
         return Views(knots, torch.zeros(len(knots), 3), torch.zeros(len(knots), 3), ())
-    view, piece, side = both.nonzero().unbind(1)
-    points = _extremes(inputs)
-    across = torch.tensor(ACROSS)
-    number, depth = (4 * piece + side).unique(return_inverse=True)
-    sights = _Sights(
-        points[piece, side].double(), boxes[view, piece, side].double(), across[side], depth,
-        torch.searchsorted(knots, frames)[view],
-        (view * len(points) + piece).unique(return_inverse=True)[1],
-        torch.where(side < 2, -1.0, 1.0).double(),
-    )  # fmt: skip
-    far = inputs.depth.double()[number // 4]
-    turn, shift = _solved(sights, (far, number // 4), knots, (inputs, config))
-    most = float(shift.norm(dim=-1).max()), math.degrees(float(turn.norm(dim=-1).max()))
-    said = (
-        f"the camera's path is corrected by up to {100 * most[0]:.0f} cm and {most[1]:.1f} degrees: "
-        "furniture is seen elsewhere than it says"
+    sights = _sights(inputs, views, knots)
+    moved = _solved(sights, knots, inputs, config).float()
+    turn, shift = moved[:, :3], moved[:, 3:]
+    far, wide = float(shift.norm(dim=-1).max()), math.degrees(float(turn.norm(dim=-1).max()))
+    told = (
+        f"the camera's path is corrected by up to {100 * far:.0f} cm and {wide:.1f} degrees: "
+        "it drifts from the furniture in the frames"
     )
-    loose = most[0] > config.loose or most[1] > config.loose_turn
-    return Views(knots, turn.float(), shift.float(), (said,) if loose else ())
+    loose = far > config.loose or wide > config.loose_turn
+    return Views(knots, turn, shift, (told,) if loose else ())
 
 
 def aligned(path: CameraPath, views: Views) -> CameraPath:
     """The path without what the views found to be wrong."""
+    if len(views.frame) == 1:
+        return path
     share = shares_of(path.frame, views.frame).to(views.turn)
     R = path.R_reference_camera @ axis_angle(share @ views.turn)
     t = path.t_reference_camera + share @ views.shift
@@ -129,113 +144,157 @@ def aligned(path: CameraPath, views: Views) -> CameraPath:
 
 
 def _frames(furniture: People, config: ViewConfig) -> Int[Tensor, " frames"]:
-    """The views: evenly chosen frames in which objects are segmented."""
+    """Evenly chosen frames in which objects are segmented."""
     frames = furniture.frame.unique()
     if len(frames) <= config.most:
         return frames
     return frames[torch.linspace(0, len(frames) - 1, config.most).round().long()]
 
 
-def _seen(
-    inputs: ViewInputs, frame: int | None
-) -> tuple[Float[Tensor, "objects 4"], Bool[Tensor, "objects 4"]]:
-    """Boxes of all objects in a view (None: the reference image), and which sides are free."""
-    camera = inputs.camera
-    masks = torch.zeros(len(inputs.detections), camera.height, camera.width, dtype=torch.bool)
-    people = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    if frame is None:
-        for k, found in enumerate(inputs.detections):
-            masks[k] = masks[k] if found.mask is None else decode(found.mask, 0)
-    else:
-        number = {found.id: k for k, found in enumerate(inputs.detections)}
-        for row in (inputs.furniture.frame == frame).nonzero()[:, 0].tolist():
-            index = number.get(int(inputs.furniture.person[row]))
-            if index is not None:
-                masks[index] = decode(inputs.furniture.masks, row)
-        seen = inputs.people
-        rows = [] if seen is None else (seen.frame == frame).nonzero()[:, 0].tolist()
-        for row in rows:
-            assert seen is not None
-            people = people | decode(seen.masks, row)
+def _in_reference(inputs: ViewInputs) -> _Boxes:
+    """The objects in the reference image."""
+    found = [None if d.mask is None else decode(d.mask, 0) for d in inputs.detections]
+    return _boxes(inputs, dict(enumerate(found)), None)
+
+
+def _in_view(inputs: ViewInputs, frame: int) -> _Boxes:
+    """The objects in a further frame."""
+    number = {found.id: k for k, found in enumerate(inputs.detections)}
+    furniture, people = inputs.furniture, inputs.people
+    rows = (furniture.frame == frame).nonzero()[:, 0].tolist()
+    masks = {
+        number[track]: decode(furniture.masks, row)
+        for row, track in zip(rows, furniture.person[rows].tolist(), strict=True)
+        if track in number
+    }
+    hidden = None
+    if people is not None and bool((people.frame == frame).any()):
+        seen = (people.frame == frame).nonzero()[:, 0].tolist()
+        hidden = torch.stack([decode(people.masks, row) for row in seen]).any(0)
+    return _boxes(inputs, masks, hidden)
+
+
+def _boxes(
+    inputs: ViewInputs,
+    found: Mapping[int, Bool[Tensor, "h w"] | None],
+    people: Bool[Tensor, "h w"] | None,
+) -> _Boxes:
+    """Boxes around the masks of some objects, and which of their sides are free."""
+    camera, count = inputs.camera, len(inputs.detections)
+    blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    given = [found.get(k) for k in range(count)]
+    masks = torch.stack([blank if m is None else m for m in given])
     there = masks.flatten(1).any(1)
-    boxes = torch.stack([tight_box(m) if bool(m.any()) else torch.zeros(4) for m in masks])
-    behind = torch.ones(len(masks), len(masks), dtype=torch.bool)  # edges that cut others move along
-    image = ImageInputs(camera, boxes, there, masks, people, behind)
-    return boxes, free_sides(image, ImageConfig(hidden=0.1)) & there[:, None]
+    sides = torch.stack([tight_box(m) if bool(m.any()) else torch.zeros(4) for m in masks])
+    alone = torch.ones(count, count, dtype=torch.bool)  # edges of what stands still may cut sides
+    people = blank if people is None else people
+    image = ImageInputs(camera, sides, there, masks, people, alone)
+    free = free_sides(image, ImageConfig(hidden=HIDDEN))
+    return _Boxes(sides, free & there[:, None])
 
 
 def _extremes(inputs: ViewInputs) -> Float[Tensor, "objects 4 2"]:
     """Where the reference image sees the outermost points of each mask [px]."""
-    points: list[Tensor] = []
-    for found in inputs.detections:
-        if found.mask is None:
-            points.append(torch.zeros(4, 2))
+    points = torch.zeros(len(inputs.detections), 4, 2)
+    for index, found in enumerate(inputs.detections):
+        mask = None if found.mask is None else decode(found.mask, 0)
+        if mask is None or not bool(mask.any()):
             continue
-        mask = decode(found.mask, 0)
-        x0, y0, x1, y1 = box = tight_box(mask)
+        box = tight_box(mask)
         left, top, right, low = (int(v) for v in box.tolist())
-        row, column = torch.arange(mask.shape[0]) + 0.5, torch.arange(mask.shape[1]) + 0.5
-        ends = [row[mask[:, left]], column[mask[top]], row[mask[:, right - 1]], column[mask[low - 1]]]
-        a, b, c, d = (end.mean() for end in ends)
-        points.append(torch.stack([x0, a, b, y0, x1, c, d, y1]).reshape(4, 2))
-    return torch.stack(points)
+        ends = (mask[:, left], mask[top], mask[:, right - 1], mask[low - 1])
+        middle = torch.stack([(end.nonzero() + 0.5).mean() for end in ends])
+        across = torch.stack([box, middle], -1)
+        points[index] = torch.where(torch.tensor(ACROSS)[:, None] == 0, across, across.flip(-1))
+    return points
+
+
+def _sights(
+    inputs: ViewInputs, views: Mapping[int, _Boxes], knots: Int[Tensor, " knots"]
+) -> _Sights:
+    """All sides that are free in the reference image and in a view."""
+    free = torch.stack([view.free for view in views.values()])
+    sides = torch.stack([view.sides for view in views.values()])
+    view, piece, side = free.nonzero().unbind(1)
+    pixel = torch.nn.functional.pad(_extremes(inputs)[piece, side], (0, 1), value=1.0).double()
+    number, point = (4 * piece + side).unique(return_inverse=True)
+    return _Sights(
+        ray=pixel @ torch.linalg.inv(inputs.camera.K.double()).mT,
+        at=sides[view, piece, side].double(),
+        axis=torch.tensor(ACROSS)[side],
+        outward=torch.where(side < 2, -1.0, 1.0).double(),
+        knot=torch.searchsorted(knots, torch.tensor(list(views)))[view],
+        point=point,
+        mask=(view * len(inputs.detections) + piece).unique(return_inverse=True)[1],
+        depth=inputs.depth.double()[number // 4],
+        piece=number // 4,
+    )
 
 
 def _solved(
-    sights: _Sights,
-    first: tuple[Tensor, Tensor],
-    knots: Int[Tensor, " knots"],
-    known: tuple[ViewInputs, ViewConfig],
-) -> tuple[Float[Tensor, "knots 3"], Float[Tensor, "knots 3"]]:
+    sights: _Sights, knots: Int[Tensor, " knots"], inputs: ViewInputs, config: ViewConfig
+) -> Float[Tensor, "knots 6"]:
     """Turns and shifts of all knots by Gauss-Newton with the weights of Geman-McClure."""
-    (inputs, config), (far, sights_owner) = known, first
-    trust = _trust(inputs.path, knots, config)
-    count, depths, masks = 6 * len(knots), len(far), int(sights.mask.max()) + 1
-    poses = poses_at(inputs.path, knots[sights.view])
-    R, t = poses.R_reference_camera.double(), poses.t_reference_camera.double()
-    K = inputs.camera.K.double()
-    rays = torch.nn.functional.pad(sights.point, (0, 1), value=1.0) @ torch.linalg.inv(K).mT
-
-    def residual(at: Tensor) -> Tensor:
-        moved = at[:count].unflatten(0, (len(knots), 6))[sights.view]
-        deep = far * at[count : count + depths].exp()
-        there = rays * deep[sights.depth, None] - t - moved[:, 3:]
-        there = (axis_angle(-moved[:, :3]) @ (R.mT @ there[..., None]))[..., 0]
-        pixel = project(there, K)
-        seen = sights.at - sights.outward * at[count + depths :][sights.mask]
-        return pixel.gather(1, sights.axis[:, None])[:, 0] - seen
-
-    at = torch.zeros(count + depths + masks).double()
-    alike = (sights_owner[:, None] == sights_owner).double() * config.depth**2
-    alike = torch.linalg.inv(alike + config.relief**2 * torch.eye(depths).double())
-    prior = torch.block_diag(trust, alike, torch.eye(masks).double() / config.border**2)
+    poses, K = poses_at(inputs.path, knots[sights.knot]), inputs.camera.K.double()
+    trust = _drift_trust(inputs.path, knots, config)
+    same = (sights.piece[:, None] == sights.piece).double() * config.depth**2
+    depths = torch.linalg.inv(same + config.relief**2 * torch.eye(len(same)).double())
+    outlines = torch.eye(int(sights.mask.max()) + 1).double() / config.border**2
+    prior = torch.block_diag(trust, depths, outlines)
+    at = prior.new_zeros(len(prior))
     for sigma in config.sigmas:
         for _ in range(STEPS):
-            off, slope = residual(at), torch.func.jacfwd(residual)(at)
+            off, slope = _linear(at, sights, poses, K)
             pull = 1 / (1 + (off / sigma).square()).square() / config.pixel**2
             hessian = slope.mT @ (pull[:, None] * slope) + prior
             gradient = slope.mT @ (pull * off) + prior @ at
-            at = at - torch.linalg.solve(hessian, gradient).clamp(-MOST, MOST)
-    import os
-    if os.environ.get('DBG'):
-        r=residual(at); print('rms med', float(r.abs().median()), 'p90', float(r.abs().quantile(.9)), 'by side', [round(float(r[s].abs().median()),2) for s in [(sights.axis==0),(sights.axis==1)]], 'logz', float((at[count:count+depths]).abs().mean()), float(at[count+depths:].abs().mean()))
-    moved = at[:count].unflatten(0, (len(knots), 6))
-    return moved[:, :3], moved[:, 3:]
+            at = at - torch.linalg.solve(hessian, gradient).clamp(-STRIDE, STRIDE)
+    return at[: len(trust)].unflatten(0, (len(knots), 6))
 
 
-def _trust(
+def _linear(
+    at: Float[Tensor, " unknowns"], sights: _Sights, poses: CameraPath, K: Float[Tensor, "3 3"]
+) -> tuple[Float[Tensor, " rows"], Float[Tensor, "rows unknowns"]]:
+    """By how much sides are seen elsewhere [px], and the derivatives; turns are small.
+
+    Args:
+        at: Turns and shifts of all knots, logarithms of depths, errors of outlines.
+        sights: Where the sides are seen.
+        poses: That were given of the view of each row.
+        K: Intrinsics.
+    """
+    depths, masks = len(sights.depth), int(sights.mask.max()) + 1
+    knots = (len(at) - depths - masks) // 6
+    moved = at[: 6 * knots].unflatten(0, (knots, 6))[sights.knot]
+    depth, outline = at[6 * knots :].split([depths, masks])
+    R, t = poses.R_reference_camera.double(), poses.t_reference_camera.double()
+    back = axis_angle(-moved[:, :3]) @ R.mT
+    point = sights.ray * (sights.depth * depth.exp())[sights.point, None]
+    there = (back @ (point - t - moved[:, 3:])[..., None])[..., 0]
+    pixel = project(there, K).gather(1, sights.axis[:, None])
+    off = pixel[:, 0] + sights.outward * outline[sights.mask] - sights.at
+    slope = (K[sights.axis] - pixel * K[2]) / there[:, 2:]
+    carried = (slope[:, None] @ back)[:, 0]
+    pose = torch.cat([torch.linalg.cross(slope, there), -carried], -1)
+    poses_of = (one_hot(sights.knot, knots)[..., None] * pose[:, None]).flatten(1)
+    depths_of = one_hot(sights.point, depths) * (carried * point).sum(-1, keepdim=True)
+    outlines_of = one_hot(sights.mask, masks) * sights.outward[:, None]
+    return off, torch.cat([poses_of, depths_of, outlines_of], -1)
+
+
+def _drift_trust(
     path: CameraPath, knots: Int[Tensor, " knots"], config: ViewConfig
 ) -> Float[Tensor, "unknowns unknowns"]:
-    """One over the covariance of turns and shifts before anything is seen."""
+    """What is believed of turns and shifts before anything is seen: one over their covariance."""
     step = path.t_reference_camera.double().diff(dim=0).norm(dim=-1)
     way = torch.nn.functional.pad(step, (1, 0)).cumsum(0)
     index = torch.searchsorted(path.frame, knots).clamp_max(len(way) - 1)
     between = way[index].diff().clamp_min(LEAST_WAY)
-    whole = between.sum()
     change = torch.eye(len(knots)).double().diff(dim=0)
     home = (knots == home_of(path)).double()
-    fixed = torch.outer(home, home) * 1e10
-    turns = change.mT @ ((whole / (config.turn**2 / 3 * between))[:, None] * change) + fixed
-    shifts = change.mT @ ((3 / (config.share**2 * whole * between))[:, None] * change) + fixed
-    of_turns = torch.tensor([1.0, 1, 1, 0, 0, 0]).double().diag()
-    return torch.kron(turns, of_turns) + torch.kron(shifts, torch.eye(6).double() - of_turns)
+    walks = change.mT @ ((3 / (between * between.sum()))[:, None] * change)
+    fixed = torch.outer(home, home) / FIXED**2
+    turns = walks * (between.sum() / math.radians(config.turn)) ** 2 + fixed
+    shifts = walks / config.share**2 + fixed
+    first = torch.tensor([1.0, 1, 1, 0, 0, 0]).double().diag()
+    return torch.kron(turns, first) + torch.kron(shifts, torch.eye(6).double() - first)

@@ -27,7 +27,7 @@ from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Bodies, CameraPath
 from mover.geometry.path import poses_at
-from mover.stages.config import ScaleConfig
+from mover.stages.camera.config import ScaleConfig
 from mover.stages.people.find_depth import pelvis
 
 RANGE = (-5.0, 3.0)  # logarithms of the scales that are tried, about the usual ratio
