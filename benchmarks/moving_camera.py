@@ -5,7 +5,8 @@
 Rebuilds each room with `robust` from the captures of `--sets` (the first: of the still camera;
 `moving-camera` has furniture in the reference image alone, `moving-views` in further frames, too;
 finished rooms are kept in `--out`) and prints IoU3D, the angle of gravity [degrees], the error of
-the floor [cm] and, for the moving camera, the error of the path's scale [%] and how far it went [m].
+the floor [cm] and, for the moving camera, the error of the path's scale [%] and how
+far it went [m].
 """
 
 import argparse
