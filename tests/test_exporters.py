@@ -28,13 +28,13 @@ from mover.app.cli import run_command
 from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
 from mover.core.run import Run
-from mover.core.types import Bodies, BodyPose, Scene, SceneObject
-from mover.geometry.placement import place_object
+from mover.core.types import Bodies, BodyPose, Scene, SceneObject, Segment
+from mover.geometry.placement import place_object, placed_at
 from mover.io.export.amass import export_bodies
 from mover.io.export.finished import Finished, read_finished
 from mover.io.export.glb import export_glb
 from mover.io.export.people import keyframes
-from mover.io.export.scene_glb import export_objects
+from mover.io.export.scene_glb import export_objects, placement_of
 from mover.io.export.solids import solids_of
 from mover.io.export.usd import export_usd
 from mover.io.formats import chosen
@@ -255,6 +255,26 @@ def test_trimesh_opens_the_file_with_the_objects_in_place(tmp_path: Path):
         transform, name = scene.graph[node]
         part = scene.geometry[name].copy().apply_transform(transform)
         assert part.bounds == pytest.approx(world(piece), abs=1e-5)
+
+
+@pytest.mark.parametrize("people", [False, True])
+def test_an_object_that_is_moved_jumps_to_its_next_place(tmp_path: Path, people: bool):
+    home = finished(tmp_path, two_people(4) if people else None)
+    piece, *others = home.scene.objects
+    later = Segment(8, piece.t_world_object + torch.tensor([0.0, 0.0, 1.0]), piece.yaw + 1)
+    moved = dataclasses.replace(
+        piece, segments=(Segment(0, piece.t_world_object, piece.yaw), later)
+    )
+    scene = dataclasses.replace(home.scene, objects=(moved, *others))
+    glb = Glb(export_glb(dataclasses.replace(home, scene=scene), tmp_path).files[0])
+    first, step = 0, 0.2
+    if home.bodies is not None and home.bodies.fps is not None:
+        first, step = int(home.bodies.frame.min()), 1 / home.bodies.fps
+    assert first < 7
+    for frame in (first, 7, 8, 20):
+        for one in scene.objects:
+            found = glb.matrix(glb.named(one.id), (frame - first) * step + 1e-4)
+            assert found == pytest.approx(placement_of(placed_at(one, frame)), abs=1e-5)
 
 
 def test_no_frame_between_keys_is_farther_off_than_is_said():

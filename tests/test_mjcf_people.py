@@ -1,5 +1,6 @@
 """People in MuJoCo: mocap skeletons, moved by keyframes, beside furniture that stays."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,8 @@ import torch
 from furnished import bodies_of, furnished, moving_pose, similar, two_people, write_out
 from little_room import GROUND, walkers
 
-from mover.core.types import Bodies
+from mover.core.types import Bodies, Segment
+from mover.geometry.placement import placed_at
 from mover.io.export.finished import Finished, read_finished
 from mover.io.export.mjcf import export_mjcf
 
@@ -101,3 +103,30 @@ def test_bodies_without_joints_are_left_out_and_it_is_said(tmp_path: Path):
     assert "no people" in " ".join(found.notes)
     assert mujoco.MjModel.from_xml_path(str(found.files[0])).nmocap == 0
     assert model_of(tmp_path / "b", two_people(3), body="none").nmocap == 0
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_keyframes_put_furniture_where_it_then_stands(tmp_path: Path, count: int):
+    home = read_finished(write_out(tmp_path / "out", furnished(("table", "chair")), None))
+    chair = home.scene.objects[1]
+    later = Segment(8, chair.t_world_object + torch.tensor([0.3, 0.0, 1.0]), chair.yaw + 1)
+    moved = dataclasses.replace(
+        chair, segments=(Segment(0, chair.t_world_object, chair.yaw), later)
+    )
+    scene = dataclasses.replace(home.scene, objects=(home.scene.objects[0], moved))
+    bodies = two_people(count) if count else None
+    file = export_mjcf(dataclasses.replace(home, scene=scene, bodies=bodies), tmp_path).files[0]
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(model)
+    frames = [int(model.key(k).name.removeprefix("frame_")) for k in range(model.nkey)]
+    assert 8 in frames
+    assert min(frames) < 8
+    for key, frame in enumerate(frames):
+        mujoco.mj_resetDataKeyframe(model, data, key)
+        mujoco.mj_forward(model, data)
+        for piece in scene.objects:
+            there = placed_at(piece, frame)
+            assert data.body(piece.id).xpos == pytest.approx(upright(there.t_world_object))
+            front = data.body(piece.id).xmat.reshape(3, 3) @ [0, -1, 0]
+            yaw = float(there.yaw)
+            assert front == pytest.approx([np.sin(yaw), -np.cos(yaw), 0], abs=1e-6)

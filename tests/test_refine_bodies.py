@@ -12,7 +12,8 @@ from figures import ARMS_DOWN, SEATED, STRIDE, people, pose
 from mover.bodies.corrected import Correction, corrected, in_world, moved, no_correction, puppet_of
 from mover.bodies.parts import members, parts_of
 from mover.core.errors import InputError
-from mover.core.types import Camera, Mesh, Room, Scene, SceneObject
+from mover.core.records import rows_of
+from mover.core.types import Camera, Mesh, Room, Scene, SceneObject, Segment
 from mover.energy.body_terms.contact import (
     Matches,
     Skin,
@@ -343,6 +344,28 @@ def test_chunks_do_not_show():
     torch.testing.assert_close(parts.bodies.verts, whole.bodies.verts, atol=2e-3, rtol=0)
     again = refine_bodies(room_with(bodies), None, config)
     assert torch.equal(again.bodies.verts, whole.bodies.verts)
+
+
+@pytest.mark.slow
+def test_people_meet_moved_furniture_where_it_stands_while_they_are_there():
+    """As two videos, one of each time, and nobody knows of the other time."""
+    bodies = replace(still_people(SEATED, 4), frame=torch.tensor([9, 0, 8, 1]))
+    height = float(seat_gap(bodies, 0.0)[0]) + 0.05
+    room = room_with(bodies, ((0.6, height, 0.6), (2.0, GROUND, -3.1)))
+    stool = room.scene.objects[0]
+    here = replace(stool, t_world_object=torch.tensor([0.0, GROUND, -3.1]))
+    stays = tuple(Segment(f, p.t_world_object, p.yaw) for f, p in ((0, stool), (5, here)))
+    config = replace(QUICK, rounds=1, method=Adam(5), place=Adam(5))
+    moved_stool = replace(stool, segments=stays)
+    moving = replace(room, scene=replace(room.scene, objects=(moved_stool,)))
+    found = refine_bodies(moving, None, config)
+    for piece, rows in ((stool, [1, 3]), (here, [0, 2])):
+        scene = replace(room.scene, objects=(piece,))
+        alone = replace(room, scene=scene, bodies=rows_of(bodies, torch.tensor(rows)))
+        expected = refine_bodies(alone, None, config)
+        assert torch.equal(found.bodies.verts[rows], expected.bodies.verts)
+        assert torch.equal(found.shift[rows], expected.shift)
+    assert (found.bodies.verts - refine_bodies(room, None, config).bodies.verts).abs().max() > 1e-3
 
 
 def test_rows_keep_their_order():

@@ -84,6 +84,30 @@ def rows_of(value: T, rows: Tensor, *axes: str) -> T:
     return dataclasses.replace(typing.cast(Any, value), **found)
 
 
+def with_rows(value: T, rows: Tensor, part: T, *axes: str) -> T:
+    """The record with the rows of another in place of some of its own, as `rows_of` takes them.
+
+    Args:
+        value: The record.
+        rows: Numbers of rows.
+        part: Has these rows alone.
+        axes: Names in the annotations, by default `bodies` and `rows`.
+    """
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(typing.cast(Any, value)):
+        old, new = getattr(value, field.name), getattr(part, field.name)
+        axis = axis_of(field.type, axes or ("bodies", "rows"))
+        if isinstance(old, Tensor) and axis is not None:
+            found[field.name] = old.index_copy(axis, rows, new.to(old))
+        elif isinstance(old, dict):
+            found[field.name] = {
+                n: one.index_copy(0, rows, new[n].to(one)) for n, one in old.items()
+            }
+        elif dataclasses.is_dataclass(old):
+            found[field.name] = with_rows(old, rows, new, *axes)
+    return dataclasses.replace(typing.cast(Any, value), **found)
+
+
 @cache
 def axis_of(kind: Any, axes: tuple[str, ...]) -> int | None:  # noqa: ANN401
     """The axis of one of these names in a tensor's annotation, from the end, if there is one."""

@@ -23,6 +23,7 @@ from mover.io.export.gltf import (
     add_material,
     add_presence,
     add_sampler,
+    add_stays,
 )
 from mover.io.export.people import FPS, Track, keyframes, tracks_of
 from mover.io.export.posed import all_angles
@@ -219,40 +220,57 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
         InputError: If bones are asked for and there are none.
     """
     path = write_glb(finished.scene, None, folder / "scene.glb")
-    bodies = finished.bodies
-    if bodies is None or body == "none":
+    bodies = None if body == "none" else finished.bodies
+    moved = [piece for piece in finished.scene.objects if piece.segments]
+    if bodies is None and not moved:
         return Exported((path,), ("no people",))
-    skin = skin_for(finished, INFLUENCES) if body in ("auto", "skin") else "morph was asked for"
     document = Document(path.read_bytes())
-    first, step = int(bodies.frame.min()), 1 / (bodies.fps or FPS)
+    animation = document.add("animations", {"name": "motion", "channels": [], "samplers": []})
+    first, step = 0, 1 / FPS
+    if finished.bodies is not None and len(finished.bodies.frame):
+        first, step = int(finished.bodies.frame.min()), 1 / (finished.bodies.fps or FPS)
     notes = [f"frame {first} of the video is at 0 s, each next one {step:g} s later"]
-    if isinstance(skin, str) and body == "skin":
-        raise InputError(f"--body skin: {skin}")
-    if isinstance(skin, str):
-        notes += [] if body == "morph" else [f"people move by shapes, not on bones: {skin}"]
+    channels = [c for p in moved for c in add_stays(document, animation, p, first, step)]
+    notes += [f"{piece.id} jumps where it is moved" for piece in moved]
+    if bodies is None:
+        notes.append("no people")
     else:
-        notes.append(f"people move on bones, at most {1e3 * skin.miss:.0f} mm off the result")
-    notes += _add_people(document, bodies, None if isinstance(skin, str) else skin)
+        added, said = _add_people(document, animation, finished, body)
+        channels, notes = channels + added, notes + said
+    _connect(document, animation, channels)
     document.write(path)
     return Exported((path,), tuple(notes))
 
 
-def _add_people(document: Document, bodies: Bodies, skin: Skin | None) -> list[str]:
-    """Append everybody and the one animation; what there is to say about it."""
+def _add_people(
+    document: Document, animation: int, finished: Finished, body: BodyForm
+) -> tuple[list[Channel], list[str]]:
+    """Append everybody; what moves, and what there is to say about it.
+
+    Raises:
+        InputError: If bones are asked for and there are none.
+    """
+    bodies = finished.bodies
+    assert bodies is not None
+    skin = skin_for(finished, INFLUENCES) if body in ("auto", "skin") else "morph was asked for"
+    if isinstance(skin, str) and body == "skin":
+        raise InputError(f"--body skin: {skin}")
     channels: list[Channel] = []
     notes: list[str] = []
-    animation = document.add("animations", {"name": "motion", "channels": [], "samplers": []})
+    if isinstance(skin, str):
+        notes += [] if body == "morph" else [f"people move by shapes, not on bones: {skin}"]
+    else:
+        notes.append(f"people move on bones, at most {1e3 * skin.miss:.0f} mm off the result")
     for track in tracks_of(bodies):
         tint = person_colour(track.person)
-        if skin is None:
+        if isinstance(skin, str):
             moved, miss = add_morphing(document, animation, bodies, track, tint)
             if miss > FAR_OFF:
                 notes.append(f"person {track.person}: up to {100 * miss:.1f} cm off between shapes")
         else:
             moved = add_skinned(document, animation, skin, track, tint)
         channels += moved
-    _connect(document, animation, channels)
-    return notes
+    return channels, notes
 
 
 def _connect(document: Document, animation: int, channels: list[Channel]) -> None:

@@ -1,6 +1,7 @@
 """Binary glTF files: what trimesh writes, read again to append bones, shapes and their motion."""
 
 import json
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,9 @@ from numpy.typing import NDArray
 
 from mover.core.colours import Colour
 from mover.core.files import replacing
+from mover.core.types import SceneObject
 from mover.io.export.people import Track, seen_from_to
-from mover.io.export.scene_glb import linear
+from mover.io.export.scene_glb import linear, placement_of
 
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 KINDS = {
@@ -123,6 +125,41 @@ def add_presence(document: Document, animation: int, node: int, track: Track) ->
     times = document.add_array(np.array(when, np.float32), bounds=True)
     sizes = np.array([[events[t]] * 3 for t in when], np.float32)
     return [(add_sampler(document, animation, times, sizes, "STEP"), node, "scale")]
+
+
+def add_stays(
+    document: Document, animation: int, piece: SceneObject, first: int, step: float
+) -> list[Channel]:
+    """Put an object where it stands in each of its segments; it jumps between them.
+
+    Args:
+        document: Has the object as a node of its placement.
+        animation: The one that is added to.
+        piece: An object with segments.
+        first: The frame at 0 s.
+        step: From one frame to the next [s].
+    """
+    wanted = placement_of(piece).T.reshape(-1)
+    node = next(
+        index for index, item in enumerate(document.tree["nodes"])
+        if item.get("name", "").rstrip("_") == piece.id.rstrip("_")
+        and np.allclose(item.pop("matrix", np.eye(4).reshape(-1)), wanted, atol=1e-6)
+    )  # fmt: skip
+    stays = {max(0.0, (s.frame - first) * step): s for s in piece.segments}
+    times = document.add_array(np.array(list(stays), np.float32), bounds=True)
+    at = np.array([s.t_world_object.tolist() for s in stays.values()], np.float32)
+    half = np.array([float(s.yaw) / 2 for s in stays.values()])
+    zero = np.zeros_like(half)
+    turns = np.stack([zero, np.sin(half), zero, np.cos(half)], 1).astype(np.float32)
+    own = float(piece.yaw) / 2
+    document.tree["nodes"][node] |= {
+        "translation": piece.t_world_object.tolist(), "scale": piece.scale.tolist(),
+        "rotation": [0.0, math.sin(own), 0.0, math.cos(own)],
+    }  # fmt: skip
+    return [
+        (add_sampler(document, animation, times, values, "STEP"), node, path)
+        for values, path in ((at, "translation"), (turns, "rotation"))
+    ]
 
 
 def add_material(document: Document, tint: Colour, name: str) -> int:

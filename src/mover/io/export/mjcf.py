@@ -15,6 +15,7 @@ from mover.core.types import Camera, Scene
 from mover.io.export.finished import Exported, Finished
 from mover.io.export.looks import Look, looks_of
 from mover.io.export.mjcf_people import add_figures, figures_of
+from mover.io.export.people import FPS
 from mover.io.export.shell import GUESSED, HEIGHT, Wall, Walls, slab, wall_notes
 from mover.io.export.solids import (
     AXES,
@@ -22,6 +23,7 @@ from mover.io.export.solids import (
     Solid,
     floor_height,
     mesh_bytes,
+    moved_to,
     numbers,
     solids_of,
 )
@@ -47,6 +49,9 @@ def export_mjcf(
     root, meshes = mjcf_of(finished.scene, solids)
     notes = ["+z is up and the floor is at 0", ", ".join(f"{s.id} {s.mass:.0f} kg" for s in solids)]
     notes.append(_add_people(root, finished) if body != "none" else "no people")
+    if any(piece.segments for piece in finished.scene.objects):
+        add_stays(root, finished, solids)
+        notes.append("qpos of each keyframe puts the furniture where it then stands")
     if walls == "guess":
         shell = finished.shell()
         add_walls(root, shell)
@@ -71,6 +76,31 @@ def _add_people(root: Element, finished: Finished) -> str:
     return (
         f"people are mocap bodies that touch nothing; {count} keyframes, frame_<number>, move them"
     )
+
+
+def add_stays(root: Element, finished: Finished, solids: Sequence[Solid]) -> None:
+    """Furniture where it stands, in the keyframes of people, else in one for each change."""
+    scene, bodies = finished.scene, finished.bodies
+    keys = root.find("keyframe")
+    if keys is None:
+        keys = SubElement(root, "keyframe")
+        first, fps = 0, FPS
+        if bodies is not None:
+            first, fps = int(bodies.frame.min()), bodies.fps or FPS
+        for frame in sorted({s.frame for piece in scene.objects for s in piece.segments}):
+            time = f"{max(0.0, (frame - first) / fps):.6g}"
+            SubElement(keys, "key", name=f"frame_{frame}", time=time)
+    pairs = list(zip(scene.objects, solids, strict=True))
+    for key in keys:
+        frame = int(key.attrib["name"].removeprefix("frame_"))
+        stands = [moved_to(solid, piece, frame) for piece, solid in pairs if solid.free]
+        key.set("qpos", numbers(value for solid in stands for value in pose_of(solid)))
+
+
+def pose_of(solid: Solid) -> tuple[float, ...]:
+    """Place [m] and quaternion (w, x, y, z), as a free joint has them."""
+    half = torch.tensor(solid.yaw / 2, dtype=torch.float64)
+    return (*solid.place.tolist(), float(half.cos()), 0.0, 0.0, float(half.sin()))
 
 
 def add_walls(root: Element, walls: Sequence[Wall]) -> None:
@@ -157,9 +187,8 @@ def body_name(solid: Solid) -> str:
 def _add_solid(world: Element, solid: Solid) -> Element:
     """A body with its mass, and a joint where it is free."""
     name = body_name(solid)
-    half = torch.tensor(solid.yaw / 2, dtype=torch.float64)
-    quat = (float(half.cos()), 0.0, 0.0, float(half.sin()))
-    place = {"name": name, "pos": numbers(solid.place.tolist()), "quat": numbers(quat)}
+    pose = pose_of(solid)
+    place = {"name": name, "pos": numbers(pose[:3]), "quat": numbers(pose[3:])}
     body = SubElement(world, "body", place)
     if solid.free:
         SubElement(body, "freejoint", name=name)

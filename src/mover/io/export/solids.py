@@ -5,6 +5,7 @@ Simulators and robots have +z up and a floor at zero: (x, y, z) of scene.json be
 its mesh, becomes -y.
 """
 
+import dataclasses
 from collections.abc import Iterable
 from typing import Literal
 
@@ -16,7 +17,7 @@ from mover.core.records import record
 from mover.core.run import Run
 from mover.core.types import Mesh, Scene, SceneObject
 from mover.furniture.library import canonical
-from mover.geometry.placement import place_object
+from mover.geometry.placement import place_object, placed_at
 from mover.io.export.convex import Convex, convex_of
 
 DENSITY = {
@@ -94,6 +95,13 @@ def _solid(piece: SceneObject, convex: Convex, floor: float) -> Solid:
         centre=AXES @ (scale * convex.centre),
         inertia=_physical(inertia, mass),
     )
+
+
+def moved_to(solid: Solid, piece: SceneObject, frame: int) -> Solid:
+    """The solid of a piece where that stands in a frame."""
+    there = placed_at(piece, frame)
+    way = AXES @ (there.t_world_object - piece.t_world_object).detach().cpu().double()
+    return dataclasses.replace(solid, place=solid.place + way, yaw=float(there.yaw))
 
 
 def _turned(mesh: Mesh, scale: Float[Tensor, "3"]) -> Mesh:

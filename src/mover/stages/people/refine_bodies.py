@@ -27,7 +27,7 @@ from mover.bodies.posture import touching
 from mover.bodies.skin import PARTS
 from mover.core.errors import InputError
 from mover.core.observe import Observer, silent
-from mover.core.records import map_tensors, record, rows_of
+from mover.core.records import map_tensors, record, rows_of, with_rows
 from mover.core.types import Bodies, Capture, Room
 from mover.energy.body_terms.contact import Matches, Skin, gather_matches
 from mover.energy.body_terms.order import Bounds
@@ -38,6 +38,7 @@ from mover.energy.config import BodyWeights, MatchConfig
 from mover.energy.minimize import minimize
 from mover.geometry.camera import to_camera
 from mover.geometry.path import is_still
+from mover.geometry.placement import placed_at
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.body_energy import Evidence, Feet, body_energy
 from mover.stages.people.body_evidence import (
@@ -205,6 +206,9 @@ def refine_bodies(
 ) -> RefinedBodies:
     """Move the people of a room so that they agree with its floor and furniture.
 
+    Furniture that is moved stands, for the people of each time between two moves, where it stood
+    then; nobody's motion is smoothed over a move.
+
     Args:
         room: The estimated room; its bodies are in its world, with a pose where it may be refined.
         capture: Gives masks and known contacts; without it there is no depth order.
@@ -214,6 +218,36 @@ def refine_bodies(
     Raises:
         InputError: If the room has no bodies or no floor.
     """
+    changes = sorted({s.frame for piece in room.scene.objects for s in piece.segments})[1:]
+    if room.bodies is None or not changes:
+        return _refined(room, capture, config, observe)
+    time = torch.bucketize(room.bodies.frame, torch.tensor(changes), right=True)
+    bodies = map_tensors(lambda x: x.float() if x.is_floating_point() else x, room.bodies)
+    found = RefinedBodies(bodies, torch.zeros(len(time), 3), torch.zeros(len(time)))
+    for now in time.unique():
+        rows = (time == now).nonzero()[:, 0]
+        part, given = _at_one_time(room, capture, rows)
+        found = with_rows(found, rows, _refined(part, given, config, observe))
+    return found
+
+
+def _at_one_time(
+    room: Room, capture: Capture | None, rows: Int[Tensor, " rows"]
+) -> tuple[Room, Capture | None]:
+    """The room with some of its people, and its furniture where it stands while they are there."""
+    assert room.bodies is not None
+    bodies = rows_of(room.bodies, rows)
+    pieces = tuple(placed_at(piece, int(bodies.frame.min())) for piece in room.scene.objects)
+    scene = replace(room.scene, objects=pieces)
+    if capture is not None and capture.touch is not None:
+        capture = replace(capture, touch=capture.touch[rows])
+    return replace(room, scene=scene, bodies=bodies, kept=None), capture
+
+
+def _refined(
+    room: Room, capture: Capture | None, config: RefineBodiesConfig, observe: Observer
+) -> RefinedBodies:
+    """The people of a room whose furniture stays where it is."""
     cast = cast_of(room, capture, config.weights)
     order = sorted(
         range(len(cast.bodies.frame)),
