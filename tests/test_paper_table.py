@@ -31,7 +31,15 @@ from mover_bench.rooms.noise import add_noise
 from mover_bench.tables import rows
 from mover_bench.tables.paper_table import TABLES, TableArgs, is_finished, jobs_of, paper_table
 from mover_bench.tables.rows import Disturbance
-from mover_bench.tables.table_job import DONE, TableJob, disturb, do_job, key_of, measure
+from mover_bench.tables.table_job import (
+    DONE,
+    TableJob,
+    beside_scan,
+    disturb,
+    do_job,
+    key_of,
+    measure,
+)
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +109,8 @@ def test_a_perfect_result_scores_one_and_zero_in_every_column(
     assert found["iou2d"] == pytest.approx(1, abs=1e-3)
     assert found["p2s"] == pytest.approx(0, abs=2e-3)
     assert found["contact"] == 1
+    assert found["scan_non_collision"] == 1  # that scan is a ball above the camera
+    assert found["scan_contact"] == 0
     assert found["non_collision"] == pytest.approx(1, abs=5e-3)
     ground = ("ground_penetration_frequency", "ground_penetration_distance")
     for name in ("pitch_error", "roll_error", "pje", "v2v", "p_pje", "p_v2v", *ground):
@@ -108,6 +118,17 @@ def test_a_perfect_result_scores_one_and_zero_in_every_column(
     shown = {column for part in TABLES["prox-quantitative"].parts for column in part.columns}
     shown |= {column for part in TABLES["prox"].parts for column in part.columns} - {"mean_tilt"}
     assert shown <= set(found)
+
+
+def test_people_are_measured_where_the_scan_is(copy: Path) -> None:
+    """The scan's ball is half a metre about (1, 2, 3), the camera stands 1.5 m below its middle."""
+    truth = read_scene(copy / "truth" / "scene.json")
+    scan = torch.tensor([[[1.0, 2.0, 3.0], [1.0, 2.45, 3.0], [1.0, 2.55, 3.0], [3.0, 2.0, 0.0]]])
+    from_camera = scan - torch.tensor([1.0, 2.0, 1.5])
+    z_up = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    verts = from_camera @ z_up.mT @ truth.camera.R_cam_world.mT
+    found = beside_scan(copy, torch.cat([verts, verts + 3.0]), truth)
+    assert found == {"scan_non_collision": pytest.approx(6 / 8), "scan_contact": 0.5}
 
 
 def _own_axes(piece, box):
@@ -201,7 +222,7 @@ def test_a_job_that_fails_is_named_and_done_again(tmp_path: Path) -> None:
     args = TableArgs("prox-quantitative", there, tmp_path / "out")
     page = paper_table(args, launch=Answers(broken="people-sdf")).read_text()
     assert "**Failed**: vicon_03301, people-sdf: ValueError: no floor" in page
-    assert "| + CamGP + SDF | - | - | - | - | 0 |" in page
+    assert "| + CamGP + SDF | - | - | - | - | - | - | 0 |" in page
     again = Answers()
     paper_table(args, launch=again)
     assert again.done == [("vicon_03301", "people-sdf")]

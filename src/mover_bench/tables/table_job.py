@@ -11,7 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from mover.app.batch.runner import write_tree
 from mover.core.records import fingerprint
@@ -20,10 +23,14 @@ from mover.core.types import Bodies, Capture, Room, Scene, SceneObject
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
 from mover.fitting.presets import PAPER_ROOM, at_most, without
 from mover.fitting.prior import ANGLES
+from mover.geometry.camera import to_camera
+from mover.geometry.camera import to_world as to_world_axes
+from mover.geometry.volume import sample
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
+from mover.io.datasets.prox_files import scan_of
 from mover.io.files.fields import read_json
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from
@@ -148,7 +155,35 @@ def measure(
             found |= values
         elif "p2s" in values:
             found["p2s"] = values["p2s"]
+        if name == "truth" and people is not None:
+            found |= beside_scan(folder, to_camera(people.verts, scene.camera.R_cam_world), true)
     return found
+
+
+def beside_scan(
+    capture: Path, verts_cam: Float[Tensor, "bodies verts 3"], truth: Scene
+) -> dict[str, float]:
+    """How people fit the scanned room (its `sdf`), wherever the estimated one is.
+
+    Args:
+        capture: Folder that may name the scan's signed distance.
+        verts_cam: People in the axes of the camera [m].
+        truth: Its camera is the scan's.
+
+    Returns:
+        The paper's non-collision and contact against the scan; nothing where there is none.
+    """
+    scan = scan_of(capture)
+    if scan is None:
+        return {}
+    volume, world_scan = scan
+    turn = torch.from_numpy(np.linalg.inv(world_scan)).float()
+    world = to_world_axes(verts_cam.float(), truth.camera.R_cam_world.float())
+    inside = sample(volume, world @ turn[:3, :3].mT + turn[:3, 3]) < 0
+    return {
+        "scan_non_collision": 1 - float(inside.double().mean()),
+        "scan_contact": float(inside.any(-1).double().mean()),
+    }
 
 
 def disturb(scene: Scene, noise: Disturbance, generator: torch.Generator) -> Scene:

@@ -25,6 +25,7 @@ from mover.io.datasets.prox_files import (
     FOLDERS,
     FPS,
     QUANTITATIVE,
+    SCAN_SDF,
     SIZE,
     Recording,
     Timeline,
@@ -52,8 +53,11 @@ COSTS = {
     "cam2world": "no truth of the camera, and so none at all",
     "scenes": "no scan: the truth has no floor and no surfaces (P2S)",
     "mosh": "no true bodies: no errors of people",
+    "sdf": "people are not measured against the scan",
 }
 """What each part of a user's copy is for."""
+OF_SCENES = {"cam2world": "cam2world/{}.json", "scenes": "scenes/{}.ply", "sdf": "sdf/{}.json"}
+"""The parts that belong to a scene, by their files."""
 
 
 def prox_parts(root: Path, hints: Hints) -> Parts:
@@ -112,7 +116,7 @@ def _missing(lines: Sequence[Timeline]) -> list[str]:
             lacking["fits"] = FOLDERS[kind].format(name)
         if line.recording.scene == QUANTITATIVE and not line.files("mosh"):
             lacking["mosh"] = FOLDERS["mosh"].format(name)
-        for kind, place in {"cam2world": "cam2world/{}.json", "scenes": "scenes/{}.ply"}.items():
+        for kind, place in OF_SCENES.items():
             if not (root / place.format(line.recording.scene)).is_file():
                 lacking[kind] = place.format(line.recording.scene)
         notes += [f"{place}: missing, so {COSTS[kind]}" for kind, place in lacking.items()]
@@ -232,7 +236,13 @@ def _with_truth(parts: Parts, lines: Sequence[Timeline], lens: At, hints: Hints)
         mosh = _joined(true, _tracks([line.recording for line in lines]), notes)
         if mosh is not None:
             people["truth"] = _into_camera(mosh, root, cam2world)
-    return dataclasses.replace(parts, scenes=scenes, people_of=people, notes=tuple(notes))
+    trees = dict(parts.trees)
+    if (root / "sdf" / f"{recording.scene}.json").is_file():
+        place = {"root": str(root.resolve()), "scene": recording.scene}
+        trees[SCAN_SDF] = {**place, "world_scan": world.tolist()}
+    return dataclasses.replace(
+        parts, scenes=scenes, people_of=people, notes=tuple(notes), trees=trees
+    )
 
 
 def _true_scenes(

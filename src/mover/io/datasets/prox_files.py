@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.geometry.volume import Volume
 from mover.io.files.cameras import read_camera_file
-from mover.io.files.fields import At, get, integer, read_json, refuse, vector
+from mover.io.files.fields import At, get, integer, read_json, refuse, text, vector
 from mover.io.files.schema import rigid
 from mover.io.people.values import frame_numbers
 from mover.io.scenes.placing import Matrix
@@ -203,6 +203,24 @@ def world_of(cam2world: Matrix) -> tuple[Matrix, Matrix]:
     world[:3, :3] = Z_UP
     world[:3, 3] = -Z_UP @ cam2world[:3, 3]
     return world, turn.T
+
+
+SCAN_SDF = "truth/scan_sdf.json"
+"""Where a capture says which signed distance is that of its scan: it is too large for a copy."""
+
+
+def scan_of(capture: Path) -> tuple[Volume, Matrix] | None:
+    """The signed distance of the scan of a capture, and the true world from its frame (4, 4).
+
+    Raises:
+        InputError: If what the capture names is not there, or is wrong.
+    """
+    path = capture / SCAN_SDF
+    if not path.is_file():
+        return None
+    at = read_json(path)
+    root, scene = text(get(at, "root")), text(get(at, "scene"))
+    return read_sdf(Path(root), scene), rigid(get(at, "world_scan"))
 
 
 def read_sdf(root: Path, scene: str) -> Volume:
