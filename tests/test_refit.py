@@ -7,10 +7,12 @@ import pytest
 import torch
 from analytic import FACES, box_verts
 from test_commands_refine import FAR, finished, lowest, standing
+from test_experiments import quick
 
 from mover.app import cli
 from mover.bodies.keypoints import keypoints_of
 from mover.bodies.skinning import open_body
+from mover.core.run import Run
 from mover.core.types import Bodies, Keypoints, Mesh
 from mover.fitting.config import Stage
 from mover.fitting.presets import PAPER_ROOM, ROOM_TERMS, without
@@ -22,7 +24,12 @@ from mover.geometry.volume_warp import union_bodies
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.people.keypoints import write_keypoints
+from mover.pipeline.presets import PRESETS
+from mover.pipeline.reconstruct import reconstruct
 from mover.pipeline.refit import pairs_of
+from mover_bench.studies import fitted
+from mover_bench.studies.job import spoilt
+from mover_bench.studies.sets import SETS
 
 QUICK = ["--stages.0.steps", "15", "--stages.1.steps", "15"]
 
@@ -174,3 +181,18 @@ def test_every_row_of_the_table_leaves_its_terms_out():
         assert any(getattr(stage, name) for stage in PAPER_ROOM.stages for name in names)
         others = [n for r, ns in ROOM_TERMS.items() if r != row for n in ns]
         assert all(any(getattr(stage, n) for stage in stages) for n in others)
+
+
+@pytest.mark.slow
+def test_the_chain_from_keypoints_gives_people_a_place_in_the_room(
+    small_room, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(fitted, "STEPS", 10)
+    run = Run(tmp_path)
+    trial = fitted.fitted_trial(spoilt(small_room, 3, SETS["rooms"]), 3, run)
+    room = reconstruct(trial.capture, quick(PRESETS["paper"]), run)
+    rows = ("baseline", "camgp", "contact", "true room")
+    found = {r: fitted.measure_fitted(trial, room, r, 3)["full"] for r in rows}
+    assert found["camgp"]["pje"] < 0.7 * found["baseline"]["pje"]
+    assert found["contact"]["sink_depth"] < 0.5 * found["baseline"]["sink_depth"]
+    assert found["true room"]["pje"] < found["baseline"]["pje"]
