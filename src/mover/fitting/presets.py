@@ -31,13 +31,15 @@ FITS: dict[Preset, FitConfig] = {"robust": FitConfig(), "paper": PAPER}
 PAPER_ROOM = replace(
     PAPER,
     stages=(
-        replace(PAPER.stages[-1], under=1e4, feet=1e2, sdf=1e2, contact=0.0),
-        replace(PAPER.stages[-1], under=1e2, feet=1.0, sdf=1.0, contact=1e4),
+        replace(PAPER.stages[-1], under=1e4, feet=1e2),
+        replace(PAPER.stages[-1], under=1e2, feet=1.0, sdf=40.0),
+        replace(PAPER.stages[-1], under=1e2, feet=1.0, sdf=40.0, contact=1e3),
     ),
 )
-"""The refinement with the estimated room: `PAPER` with the last two stages of PROX.
+"""The refinement with the estimated room: `PAPER`, and the terms of `fitting.room` one by one.
 
-Weights of SDF and contact are PROX's, those of floor and soles (CamGP) the authors' second fit's.
+The weights are printed nowhere: these are those of the authors' released configuration (its last
+three stages; the feet's are those of its configuration for videos).
 """
 ROOM_TERMS: Mapping[str, tuple[str, ...]] = {
     "camgp": ("under", "feet"), "sdf": ("sdf",), "contact": ("contact",),
