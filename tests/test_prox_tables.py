@@ -16,7 +16,7 @@ from test_import_scenes import plain as plain  # the fixture
 from mover.io.capture.bodies_file import read_bodies
 from mover.pipeline.presets import PRESETS
 from mover_bench.rooms.known import KnownRoom
-from mover_bench.tables import table_job
+from mover_bench.tables import rows, table_job
 from mover_bench.tables.paper_table import TABLES, TableArgs, asked, paper_table
 from mover_bench.tables.table_job import TableJob, do_job
 
@@ -78,6 +78,7 @@ def test_every_row_is_made_from_the_files_of_prox(
     for preset, config in PRESETS.items():
         monkeypatch.setitem(PRESETS, preset, quick(config))
     monkeypatch.setattr(table_job, "STEPS", 5)
+    monkeypatch.setattr(rows, "SEGMENTS", 3)  # the middle one lies between the two videos
     args = TableArgs(name, captures, tmp_path, captures, preset="paper")
     page = paper_table(args, launch=at_once).read_text()
     assert "Failed" not in page
@@ -101,8 +102,8 @@ def test_the_fits_that_are_the_truth_are_wrong_by_the_camera_alone(
     assert len(bodies.frame) == 12
     monkeypatch.setitem(PRESETS, "paper", quick(PRESETS["paper"]))
     monkeypatch.setattr(table_job, "STEPS", 5)
-    rows = ("baseline", "+ CamGP")
-    args = TableArgs("prox-quantitative", captures, tmp_path, preset="paper", only=rows)
+    only = ("baseline", "+ CamGP")
+    args = TableArgs("prox-quantitative", captures, tmp_path, preset="paper", only=only)
     paper_table(args, launch=at_once)
     with (tmp_path / "prox-quantitative-paper.csv").open(newline="") as file:
         found = {line["row"]: line for line in csv.DictReader(file)}

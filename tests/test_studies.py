@@ -392,6 +392,14 @@ class TestWithheld:
         assert part.bodies.frame.unique().tolist() == frames.tolist()
         assert (part.bodies.verts == bodies.verts[torch_rows(bodies, frames)]).all()
 
+    def test_a_segment_in_which_nobody_is_there_is_an_image_alone(self) -> None:
+        capture = trial().capture
+        last = int(capture.bodies.frame.max())
+        gap = replace(capture.bodies, fps=1.0, frame=3 * capture.bodies.frame)
+        late = withheld(replace(capture, bodies=gap), "all", Cut(seconds=1.0, place=1 / (3 * last)))
+        assert late.bodies is None
+        assert late.people is None
+
     def test_a_part_longer_than_the_video_is_all_of_it(self) -> None:
         bodies = trial().capture.bodies
         whole = bodies.frame.unique().tolist()

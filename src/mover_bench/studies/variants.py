@@ -270,10 +270,12 @@ def frames_of(bodies: Bodies, cut: Cut) -> Int[Tensor, " frames"]:
 
 
 def shortened(capture: Capture, frames: Int[Tensor, " frames"]) -> Capture:
-    """Only what is known of these frames; the still image stays."""
+    """Only what is known of these frames, where there may be nobody; the still image stays."""
     bodies, people, touch = capture.bodies, capture.people, capture.touch
     if bodies is not None:
         keep = torch.isin(bodies.frame, frames)
+        if not keep.any():
+            return replace(capture, bodies=None, people=None, touch=None)
         bodies, touch = rows_of(bodies, keep), None if touch is None else touch[keep]
     if people is not None:
         people = _masks_of(people, torch.isin(people.frame, frames))
