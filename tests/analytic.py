@@ -11,6 +11,7 @@ from mover.energy.terms.collision import BodySpace
 from mover.energy.terms.contact import ContactPoints, shares_of
 from mover.energy.terms.depth import DepthRange
 from mover.energy.terms.given import Given
+from mover.energy.terms.measured import Measured
 from mover.energy.terms.wall import Walls, rears_of
 from mover.geometry.camera import project, tilted, to_camera
 from mover.geometry.crops import crop_views
@@ -98,7 +99,14 @@ def image_at(objects, layout, camera, size):
     return ImageCues(
         boxes, torch.full((n, 4), SEEN), views, drawn, keep, torch.ones(n).to(boxes),
         layout.t_world_object.norm(dim=-1), given=given_at(layout),
+        measured=measured_at(verts, objects, views),
     )  # fmt: skip
+
+
+def measured_at(verts, objects, views):
+    """A network that sees the objects where they are."""
+    _, seen = look(verts, Topology(objects.faces, objects.edges), views, depth=True)
+    return Measured(seen.nearest, torch.full((len(verts),), 0.06).to(verts))
 
 
 def given_at(layout):

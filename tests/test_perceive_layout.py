@@ -22,10 +22,11 @@ from mover.geometry.placement import place_object
 from mover.geometry.raster import Crops, Topology, look
 from mover.geometry.rle import encode, tight_box
 from mover.geometry.topology import edges_of
+from mover.io.files.depth import read_depth
 from mover.io.files.meshes import write_mesh
 from mover.io.formats import read
 from mover.perceive.config import LayoutConfig, ScreenConfig
-from mover.perceive.depth_map import floor_height, median_depths, read_depth
+from mover.perceive.depth_map import floor_height, median_depths
 from mover.perceive.layout import Picture, first_scene, is_placed, shapes_of
 from mover.perceive.screen import ScreenInputs, outermost, screen
 from mover.perceive.standing import standing_on

@@ -176,6 +176,15 @@ STILL = CameraPath(torch.zeros(1, dtype=torch.long), torch.eye(3)[None], torch.z
 
 
 @record
+class DepthImage:
+    """What a depth network says of the reference picture."""
+
+    values: Float[Tensor, "h w"]
+    """Distance along the view [m], or inverse depth up to a factor and a shift; NaN: unknown."""
+    metric: bool
+
+
+@record
 class Capture:
     """Everything that is known before the method runs; it never holds the truth."""
 
@@ -200,6 +209,8 @@ class Capture:
     """Other places and shapes of the scene's objects, under their ids: further starts."""
     path: CameraPath = STILL
     """Where the camera was when it saw the people."""
+    depth: DepthImage | None = None
+    """Measured depth of the reference picture."""
 
 
 @record

@@ -42,6 +42,8 @@ class SceneWeights:
     """Furniture along a wall stands in one line (robust only)."""
     given: Weight = 0.0
     """Objects stay about as they were given, of usual sizes and along the room (robust only)."""
+    measured: Weight = 0.0
+    """Surfaces lie where a depth network sees them (robust only)."""
 
 
 def only(**weights: float) -> SceneWeights:

@@ -35,6 +35,7 @@ from mover.energy.terms.depth import DepthRange, depth_term, free_space_term
 from mover.energy.terms.distance import distance_term
 from mover.energy.terms.factors import Factors, factors
 from mover.energy.terms.given import Given, given_term
+from mover.energy.terms.measured import Measured, measured_term
 from mover.energy.terms.offscreen import offscreen_term
 from mover.energy.terms.scale import scale_term
 from mover.energy.terms.silhouette import edge_term, silhouette_term
@@ -45,6 +46,7 @@ from mover.geometry.raster import Crops, Depths, Topology, look
 
 E = TypeVar("E")
 Rows = Int[Tensor, " rows"]
+DEEP = {"depth", "measured"}  # evidence that is compared with drawn depths
 UNIT = tuple((x, y, z) for x in (-0.5, 0.5) for y in (0.0, 1.0) for z in (-0.5, 0.5))
 
 
@@ -74,6 +76,8 @@ class ImageCues:
     """Lines along which furniture stands; None: none are known."""
     given: Given | None = None
     """What is known of the objects before they are seen; None: nothing."""
+    measured: Measured | None = None
+    """What a depth network sees; None: there is none."""
 
 
 @record
@@ -137,7 +141,7 @@ class PlacedScene:
     def _drawn(self) -> tuple[Tensor, Depths | None]:
         """Silhouettes and, where a term has bounds for them, depths."""
         weights, objects = self.config.weights, self.known.objects
-        bounded = any(getattr(weights, t.name) for t in SCENE_TERMS if "depth" in t.needs)
+        bounded = any(getattr(weights, t.name) for t in SCENE_TERMS if DEEP & {*t.needs})
         shape = Topology(objects.faces, objects.edges)
         return look(self.verts_cam, shape, self.known.image.views, depth=bounded)
 
@@ -148,7 +152,7 @@ class PlacedScene:
 
     @property
     def depths(self) -> Depths:
-        """First and last surfaces, for terms that need the evidence `depth`."""
+        """First and last surfaces, for terms that need some evidence of `DEEP`."""
         return there(self._drawn[1])
 
     @cached_property
@@ -257,6 +261,11 @@ SCENE_TERMS: tuple[Term[PlacedScene], ...] = (
     Term(
         "given", lambda s: given_term(s.layout, there(s.known.image.given)),
         "how it was given", ("given",),
+    ),
+    Term(
+        "measured", lambda s: measured_term(
+            s.depths, s.known.image.masks, there(s.known.image.measured)),
+        "the measured depth", ("measured",),
     ),
 )  # fmt: skip
 """All terms of Eq. 1; what is not in this list does not count, what is cannot be forgotten."""

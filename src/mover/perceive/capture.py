@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.core.errors import InputError
@@ -30,6 +30,7 @@ from mover.io.capture.objects_file import detections_of, detections_to_json
 from mover.io.capture.people_file import people_of, people_to_json
 from mover.io.capture.scene_file import write_hypotheses, write_scene
 from mover.io.files.cameras import of_view, read_camera_file
+from mover.io.files.depth import find_depth_file, read_depth
 from mover.io.files.fields import At, get, maybe, number, write_json
 from mover.io.files.images import write_image
 from mover.io.people.keypoints import write_keypoints
@@ -41,7 +42,6 @@ from mover.perceive.config import (
     SteadyConfig,
     TrackConfig,
 )
-from mover.perceive.depth_map import read_depth
 from mover.perceive.detect import DetectInputs, Finds, find_instances, joined_finds, people_in
 from mover.perceive.layout import FirstScene, Picture
 from mover.perceive.reference import (
@@ -301,7 +301,7 @@ def exif_focal(photo: Path, size: tuple[int, int]) -> float | None:
     return float(found) / FULL_FRAME * math.hypot(*size)
 
 
-def read_picture_of(folder: Path, depth: Path | None = None) -> Picture:
+def read_picture_of(folder: Path) -> Picture:
     """Camera, annotations and hidden pixels of a capture that needs no scene yet.
 
     Raises:
@@ -329,8 +329,14 @@ def read_picture_of(folder: Path, depth: Path | None = None) -> Picture:
         masks=torch.stack(masks) if masks else blank[None][:0],
         people=hidden,
         height=None if known is None else number(known, 0.1, 100.0),
-        depth=None if depth is None else read_depth(depth, camera),
+        depth=_metric_depth(folder, camera),
     )
+
+
+def _metric_depth(folder: Path, camera: Camera) -> Float[Tensor, "h w"] | None:
+    """The capture's depth, where it is in metres."""
+    own = find_depth_file(folder)
+    return read_depth(own[0], camera) if own is not None and own[1] else None
 
 
 def write_first_scene(first: FirstScene, folder: Path) -> None:

@@ -1,93 +1,18 @@
-"""Metric depth of the picture, as Depth Anything, MoGe, UniDepth or Depth Pro give it."""
+"""What metric depth of the picture says of objects and the floor."""
 
-from pathlib import Path
-
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 from torch import Tensor
 
-from mover.core.errors import InputError
 from mover.core.types import Camera
 from mover.energy.objective import ImageCues
 from mover.energy.terms.depth import DepthRange
 from mover.geometry.camera import to_world
 from mover.geometry.crops import sample_nearest
-from mover.io.files.fields import At, array, maybe, refuse
-from mover.io.files.npz import read_npz
-from mover.perceive.video import opened_picture
 
-NAMES = ("depth", "depth_metric", "metric_depth", "predicted_depth", "depths", "arr_0")
-FARTHEST = 100.0  # [m], what is farther is sky or nonsense
-MILLIMETRES = 1000.0
 LEVEL = 0.92  # cosine of the largest tilt of a surface that counts as floor
 CELL = 0.04  # [m], height of a slice in which floor is counted
 ENOUGH = 0.25  # of the fullest slice: the lowest slice with so much is the floor
-
-
-def read_depth(path: Path, camera: Camera) -> Float[Tensor, "h w"]:
-    """Distance along the view of each pixel [m]; NaN where it is unknown.
-
-    `.npz` and `.npy` hold metres (`depth`, or MoGe's `points`, whose z counts); `.png` with 16
-    bits holds millimetres. Another resolution of the same shape is stretched.
-
-    Raises:
-        InputError: If the file is something else.
-    """
-    match path.suffix.lower():
-        case ".npz":
-            values = _of_npz(path)
-        case ".npy":
-            from mover.io.files.npz import read_npy
-
-            values = _two_axes(read_npy(path))
-        case ".png":
-            values = _of_png(path)
-        case _:
-            raise InputError(f"{path.name}: is no depth map, expected .npz, .npy or .png")
-    known = np.isfinite(values) & (values > 0) & (values < FARTHEST)
-    depth = torch.from_numpy(np.where(known, values, np.nan).astype(np.float32))
-    h, w = depth.shape
-    if abs(w * camera.height - h * camera.width) > 0.02 * w * camera.height:
-        raise InputError(
-            f"{path.name}: has {w} x {h} values, expected the shape of {camera.width} x "
-            f"{camera.height} pixels"
-        )
-    rows = ((torch.arange(camera.height) + 0.5) * h / camera.height).long()
-    columns = ((torch.arange(camera.width) + 0.5) * w / camera.width).long()
-    return depth[rows][:, columns]
-
-
-def _of_npz(path: Path) -> NDArray[np.float64]:
-    at = read_npz(path)
-    points = maybe(at, "points")
-    found = next((v for n in NAMES if (v := maybe(at, n)) is not None), None)
-    if found is None and points is not None and np.ndim(points.value) == 3:
-        return np.asarray(points.value, dtype=np.float64)[..., 2]
-    if found is None:
-        refuse(at, f"one of the arrays {', '.join(NAMES)} or points", f"{', '.join(at.value)}")
-    return _two_axes(found)
-
-
-def _two_axes(at: At) -> NDArray[np.float64]:
-    value = np.asarray(at.value)
-    while value.ndim > 2 and 1 in (value.shape[0], value.shape[-1]):
-        value = value[0] if value.shape[0] == 1 else value[..., 0]
-    if value.dtype.kind == "f":  # unknown pixels may be NaN or infinite
-        value = np.where(np.isfinite(value), value, 0)
-    return array(At(value, at.file, at.field), ("h", "w")).astype(np.float64)
-
-
-def _of_png(path: Path) -> NDArray[np.float64]:
-    with opened_picture(path, "a depth map") as picture:
-        mode, values = picture.mode, np.asarray(picture)
-    if not mode.startswith("I"):
-        raise InputError(
-            f"{path.name}: has {mode} pixels, expected 16 bits of millimetres (8 bits or colours "
-            "have no unit)"
-        )
-    return values.astype(np.float64) / MILLIMETRES
 
 
 def median_depths(

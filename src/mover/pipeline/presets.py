@@ -131,9 +131,11 @@ RELEASE = Config(
 
 _GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300, hand_reach=0.25)
 _SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
-_ROBUST_IMAGE = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0, distance=0.02, wall=0.01, given=0.02)
+_ROBUST_IMAGE = SceneWeights(
+    1.0, 1.0, 0.3, 0.0, 0.0, 0.0, distance=0.02, wall=0.01, given=0.02, measured=0.05
+)
 _ROBUST_FULL = SceneWeights(
-    1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.01, given=0.02
+    1.0, 1.0, 0.3, 0.2, 0.1, 0.2, distance=0.02, heading=0.1, wall=0.01, given=0.02, measured=0.05
 )
 
 ROBUST = Config(

@@ -53,6 +53,7 @@ from mover.stages.objects.find_image_cues import (
     image_evidence,
     order_of,
 )
+from mover.stages.objects.gather_depth import DepthInputs, gather_depth
 from mover.stages.objects.gather_given import (
     believed_sides,
     common_scale,
@@ -158,6 +159,9 @@ def placed_by_image(
     )
     cues = context.run.stage(find_image_cues, image, context.config.image)
     cues = with_given(cues, context, as_given(context, camera), before)
+    if before is not None or context.capture.bodies is None:
+        now = start if before is None else before.placed.layout
+        cues = with_measured(cues, context, (camera, ground), now)
     inputs = PlaceInputs(
         objects, camera, ground, cues, NOBODY, starts, start.yaw, _pinned(context, start)
     )
@@ -190,6 +194,19 @@ def with_given(
     left = energy.per_item[0].detach()
     known = gather_given(objects, given, before.placed.layout, left)
     return replace(image, given=known, sides=believed_sides(image.sides, known.weight))
+
+
+def with_measured(
+    image: ImageCues, context: ReconstructionContext, view: tuple[Camera, float], now: Layout
+) -> ImageCues:
+    """The image's cues with the measured depth at the scale of the room as it stands now."""
+    depth, (camera, ground) = context.capture.depth, view
+    if depth is None:
+        return image
+    hidden = context.seen.masks.any(0) | context.seen.people
+    objects = context.prepared.objects
+    inputs = DepthInputs(depth, image, objects, camera, ground, now, hidden)
+    return replace(image, measured=gather_depth(inputs))
 
 
 def with_refined_camera(
@@ -261,6 +278,8 @@ def placed_with_people(
     contacts = state.contacts.points
     image = run.stage(find_image_cues, state.image, config.image)
     image = with_given(image, context, as_given(context, state.camera), state)
+    view = state.camera, state.ground
+    image = with_measured(image, context, view, state.placed.layout)
     humans = cues_in_windows(state.cues, contacts, image.views, state.camera)
     if config.silhouette_confidence:
         image = replace(image, trust=inlier_weights(image_energy))

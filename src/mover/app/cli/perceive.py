@@ -9,6 +9,7 @@ from tyro.conf import Positional, arg
 
 from mover.app.cli.config import parsed
 from mover.app.cli.console import say
+from mover.core.errors import InputError
 from mover.core.settings import float_in
 from mover.perceive.config import LayoutConfig, Lens, ModelsConfig, PerceiveConfig
 from mover.perceive.networks import check_networks, in_folder
@@ -27,7 +28,8 @@ class LayoutArgs:
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
     """The capture folder."""
     depth: Path | None = None
-    """Metric depth of the reference picture (.npz, .npy [m], 16-bit .png [mm])."""
+    """Metric depth of the reference picture (.npz, .npy [m], 16-bit .png [mm]): a copy goes into
+    the capture, for `mover run`, too."""
     meshes: Path | None = None
     """Folder with your own shapes, named after their class: chair_0.obj."""
     config: Annotated[LayoutConfig, arg(name="")] = field(default_factory=LayoutConfig)
@@ -51,7 +53,7 @@ class PerceiveArgs:
     photo: Path | None = None
     """A photo of the same camera, whose EXIF tells the focal length."""
     depth: Path | None = None
-    """Metric depth of the reference picture, for the first scene."""
+    """Metric depth of the reference picture, for the first scene and `mover run`."""
     meshes: Path | None = None
     """Folder with your own shapes, for the first scene."""
     layout: bool = True
@@ -117,6 +119,30 @@ def perceive_into(
     say(f"{args.out}: wrote frames/, reference.png, objects.json, people.json, camera.json")
 
 
+def take_depth(depth: Path, capture: Path) -> None:
+    """A copy of a measured depth becomes the capture's own, for `mover run`, too.
+
+    Raises:
+        InputError: If there is no such file, or the capture has an inverse depth.
+    """
+    from shutil import copyfile
+
+    from mover.core.files import replacing
+    from mover.io.files.depth import DEPTH, find_depth_file
+
+    if not depth.is_file():
+        raise InputError(f"{depth}: there is no such file, expected a depth map")
+    if not capture.is_dir():
+        raise InputError(f"{capture}: there is no such folder, expected a capture")
+    place = capture / DEPTH / f"000000{depth.suffix.lower()}"
+    if depth.resolve() != place.resolve():
+        for old in (capture / DEPTH).glob("000000.*"):
+            old.unlink()
+        with replacing(place) as part:
+            copyfile(depth, part)
+    find_depth_file(capture)
+
+
 def layout_into(args: LayoutArgs) -> None:
     """Write the first scene into the capture."""
     import torch
@@ -129,7 +155,9 @@ def layout_into(args: LayoutArgs) -> None:
     from mover.perceive.standing import standing_on
 
     torch.set_num_threads(THREADS)
-    picture, people = read_picture_of(args.capture, args.depth), args.capture / "bodies.npz"
+    if args.depth is not None:
+        take_depth(args.depth, args.capture)
+    picture, people = read_picture_of(args.capture), args.capture / "bodies.npz"
     with Bar() as bar:
         run = Run(args.capture / "perceived", bar)
         if people.is_file():

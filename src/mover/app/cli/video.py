@@ -49,7 +49,7 @@ class ChainArgs:
     photo: Path | None = None
     """A photo of the same camera, whose EXIF tells the focal length."""
     depth: Path | None = None
-    """Metric depth of the reference picture, for the first scene."""
+    """Metric depth of the reference picture, for the first scene and the room."""
     meshes: Path | None = None
     """Folder with your own shapes, named after their class: chair_0.obj."""
     weights: Path | None = None
@@ -183,9 +183,12 @@ def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
 
 def _first_scene(capture: Path, args: ChainArgs, steps: Steps) -> None:
     """scene.json, under the camera that the bodies tell."""
+    from mover.io.files.depth import find_depth_file
+
     names = ("objects.json", "people.json", "bodies.npz")
     made_from = [*(capture / name for name in names), lens_in(capture)]
-    made_from += [str(args.meshes), *([] if args.depth is None else [args.depth])]
+    own = find_depth_file(capture) if args.depth is None else (args.depth, True)
+    made_from += [str(args.meshes), *([] if own is None else [own[0]])]
     asked = LayoutArgs(capture, args.depth, args.meshes)
     made = capture / "scene.json"
     steps.do(STEPS[2], made_from, made, lambda: layout_into(asked), yours=True)

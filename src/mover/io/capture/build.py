@@ -71,6 +71,7 @@ def build_capture(parts: Parts) -> Capture:
         hypotheses=others,
         furniture=_furniture_of(parts, scene.camera, detections, warn),
         path=_path_of(parts, scene.camera, bodies, warn),
+        depth=parts.load_depth(scene.camera),
     )
     check_plausible(capture, warn)
     return dataclasses.replace(capture, warnings=tuple(warnings))

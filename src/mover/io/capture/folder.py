@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mover.core.errors import InputError
-from mover.core.types import Capture
+from mover.core.types import Camera, Capture, DepthImage
 from mover.geometry.path import is_still
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.build import build_capture
@@ -18,6 +18,13 @@ from mover.io.capture.objects_file import detections_to_json, image_name
 from mover.io.capture.parts import Hints, LoadImage, Parts, image_parts
 from mover.io.capture.people_file import furniture_to_json, people_to_json
 from mover.io.capture.scene_file import HYPOTHESES, write_hypotheses, write_scene
+from mover.io.files.depth import (
+    DEPTH,
+    DISPARITY,
+    find_depth_file,
+    read_depth_image,
+    write_depth_image,
+)
 from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.images import read_image, write_image
 from mover.io.files.meshes import read_mesh
@@ -79,9 +86,15 @@ def _files(folder: Path, needed: Callable[[Path], At | None]) -> Parts:
         contacts=_if_there(read_npz, folder / "contacts.npz"),
         cameras=_if_there(read_npz, folder / "cameras.npz"),
         load_mesh=partial(read_mesh, folder=folder),
+        load_depth=partial(_depth_in, folder),
         n_frames=_count_frames(folder / "frames"),
         hypotheses=_if_there(read_json, folder / HYPOTHESES),
     )
+
+
+def _depth_in(folder: Path, camera: Camera) -> DepthImage | None:
+    found = find_depth_file(folder)
+    return None if found is None else read_depth_image(found[0], camera, metric=found[1])
 
 
 def _reference(folder: Path, objects: At | None) -> tuple[LoadImage | None, tuple[int, int] | None]:
@@ -124,19 +137,26 @@ def write_capture(capture: Capture, folder: Path) -> None:
         write_image(capture.reference, folder / name)
     if capture.bodies is not None:
         write_bodies(capture.bodies, folder / "bodies.npz")
-    if capture.touch is not None:
-        touch = capture.touch.detach().cpu().numpy()
-        write_npz({"probability": touch}, folder / "contacts.npz")
-    if not is_still(capture.path):
-        write_npz(path_to_arrays(capture.path), folder / "cameras.npz")
-    if capture.furniture is not None:
-        write_json(furniture_to_json(capture.furniture), folder / FURNITURE)
+    _write_evidence(capture, folder)
     write_trees(capture, folder, name)
     if capture.hypotheses:
         own = {piece.id: [piece] for piece in capture.scene.objects}
         for piece in capture.hypotheses:
             own[piece.id].append(piece)
         write_hypotheses(folder, {k: v for k, v in own.items() if len(v) > 1}, {})
+
+
+def _write_evidence(capture: Capture, folder: Path) -> None:
+    """Files that a capture may lack."""
+    if capture.touch is not None:
+        touch = capture.touch.detach().cpu().numpy()
+        write_npz({"probability": touch}, folder / "contacts.npz")
+    if not is_still(capture.path):
+        write_npz(path_to_arrays(capture.path), folder / "cameras.npz")
+    if capture.depth is not None:
+        write_depth_image(capture.depth, folder)
+    if capture.furniture is not None:
+        write_json(furniture_to_json(capture.furniture), folder / FURNITURE)
 
 
 def write_trees(
@@ -178,6 +198,8 @@ def _check_room_for(capture: Capture, folder: Path) -> None:
         "contacts.npz": capture.touch is not None,
         FURNITURE: capture.furniture is not None,
         "cameras.npz": not is_still(capture.path),
+        DEPTH: capture.depth is not None and capture.depth.metric,
+        DISPARITY: capture.depth is not None and not capture.depth.metric,
     }
     for name, is_written in wanted.items():
         if not is_written and (folder / name).exists():

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.types import Bodies, Camera, Mesh, Scene
+from mover.core.types import Bodies, Camera, DepthImage, Mesh, Scene
 from mover.io.files.fields import At
 from mover.io.files.images import image_size, read_image_file
 
@@ -22,6 +22,11 @@ UNKNOWN = "object"
 def no_mesh(at: At) -> NoReturn:
     """There are no meshes."""
     raise InputError(f"{at.place} names a mesh, expected none here")
+
+
+def no_depth(camera: Camera) -> None:
+    """Nothing was measured."""
+    del camera
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,8 @@ class Parts:
     """What the warning names where there is no picture."""
     image_size: tuple[int, int] | None = None
     """Width and height of the image, where it is known [px]."""
+    load_depth: Callable[[Camera], DepthImage | None] = no_depth
+    """Gives the measured depth of the reference picture."""
     n_frames: int | None = None
     """How many frames the video has, where that is known."""
     hypotheses: At | None = None

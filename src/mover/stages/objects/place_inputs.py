@@ -109,20 +109,28 @@ def coarser_image(image: ImageCues, factor: int) -> ImageCues:
     borders = image.borders
     if borders is not None:
         borders = Borders(borders.shifts, _tiles(borders.masks, factor).mean((-3, -1)))
-    return replace(image, views=small, masks=masks, keep=keep, outline=outline, borders=borders)
+    measured = image.measured
+    if measured is not None:
+        measured = replace(measured, depth=_middles(measured.depth, factor))
+    return replace(
+        image, views=small, masks=masks, keep=keep, outline=outline, borders=borders,
+        measured=measured,
+    )  # fmt: skip
 
 
 def coarser_humans(humans: HumanCues, factor: int) -> HumanCues:
     """The same with the bounds of the depth at one pixel of each tile."""
     if factor == 1 or humans.depth is None:
         return humans
-    middle = factor // 2
-    near, far, free = (
-        getattr(humans.depth, k)[..., middle::factor, middle::factor]
-        for k in ("near", "far", "free")
-    )
+    near, far, free = (_middles(getattr(humans.depth, k), factor) for k in ("near", "far", "free"))
     depth = DepthRange(near, far, free, humans.depth.area * factor**2)
     return replace(humans, depth=depth)
+
+
+def _middles(image: Tensor, factor: int) -> Tensor:
+    """One pixel of each tile: bounds and depths have no mean."""
+    middle = factor // 2
+    return image[..., middle::factor, middle::factor]
 
 
 def _tiles(image: Tensor, factor: int) -> Tensor:

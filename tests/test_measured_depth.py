@@ -1,0 +1,145 @@
+"""Measured depth: files, its scale against the room, and what it does in a run."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from analytic import GROUND, make_inputs
+from PIL import Image
+
+from mover.core.errors import InputError
+from mover.core.types import DepthImage, Layout
+from mover.energy.config import only
+from mover.energy.terms.measured import Measured
+from mover.geometry.camera import to_world
+from mover.geometry.placement import place_in
+from mover.geometry.raster import Crops, Topology, look
+from mover.io.capture.folder import read_capture, write_capture
+from mover.io.files.depth import find_depth_file, read_depth_image
+from mover.stages.config import PlaceConfig
+from mover.stages.objects.gather_depth import DepthInputs, gather_depth
+from mover.stages.objects.place_inputs import coarser_image
+from mover.stages.objects.place_objects import energy_of
+
+
+def true_inputs(metric: bool = True) -> DepthInputs:
+    """The boxes of the analytic room on its floor, and a network that sees them truly."""
+    known = make_inputs(size=64)
+    camera, objects = known.camera, known.objects
+    layout = Layout(*(getattr(known.starts, n)[0] for n in ("t_world_object", "yaw", "log_scale")))
+    y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in (360, 640)), indexing="ij")
+    rays = torch.stack([x, y, torch.ones_like(x)], -1) @ torch.linalg.inv(camera.K).mT
+    down = to_world(rays, camera.R_cam_world)[..., 1]
+    depth = torch.where(down < -0.01, GROUND / down.clamp_max(-0.01), torch.inf)
+    verts = place_in(objects.verts, layout, camera.R_cam_world)
+    whole = Crops(camera.K[None].expand(len(verts), 3, 3), 360, 640)
+    seen = look(verts, Topology(objects.faces, objects.edges), whole, depth=True)[1]
+    assert seen is not None
+    drawn = torch.where(seen.covered, seen.nearest, torch.inf)
+    depth = torch.minimum(depth, drawn.amin(0))
+    depth = torch.where(depth < 50, depth, torch.nan)
+    image = DepthImage(depth, metric)
+    hidden = seen.covered.any(0)
+    return DepthInputs(image, known.image, objects, camera, GROUND, layout, hidden)
+
+
+def errors(found: Measured | None, inputs: DepthInputs) -> torch.Tensor:
+    """Logarithm of found over true depth within the masks."""
+    assert found is not None
+    true = inputs.image.measured
+    assert true is not None
+    inside = (inputs.image.masks > 0.99) & (true.depth > 0) & (found.depth > 0)
+    return (found.depth / true.depth)[inside].log()
+
+
+def with_values(inputs: DepthInputs, values: torch.Tensor, metric: bool) -> DepthInputs:
+    return replace(inputs, depth=DepthImage(values, metric))
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.15, 0.85])
+def test_the_factor_of_a_metric_network_is_found(factor: float):
+    inputs = true_inputs()
+    scaled = with_values(inputs, factor * inputs.depth.values, True)
+    assert float(errors(gather_depth(scaled), inputs).abs().median()) < 0.02
+
+
+def test_factor_and_shift_of_an_inverse_depth_are_found():
+    inputs = true_inputs()
+    values = 300 / inputs.depth.values + 40
+    found = gather_depth(with_values(inputs, values, False))
+    assert float(errors(found, inputs).abs().median()) < 0.01
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_an_object_that_stands_wrong_does_not_pull_the_others(metric: bool):
+    inputs = true_inputs()
+    far = inputs.layout.t_world_object.clone()
+    far[1] *= 1.4
+    values = inputs.depth.values if metric else 7 / inputs.depth.values + 1
+    layout = replace(inputs.layout, t_world_object=far)
+    moved = replace(with_values(inputs, values, metric), layout=layout)
+    assert float(errors(gather_depth(moved), inputs).abs().median()) < 0.03
+
+
+def test_nothing_is_said_where_nothing_tells_the_scale():
+    inputs = true_inputs()
+    empty = torch.full_like(inputs.depth.values, torch.nan)
+    assert gather_depth(with_values(inputs, empty, True)) is None
+    assert gather_depth(with_values(inputs, torch.full_like(empty, 5.0), False)) is None
+
+
+def test_a_wrong_distance_costs_the_same_in_windows_of_fewer_pixels():
+    known = make_inputs(size=96)
+    config = PlaceConfig(only(measured=1.0), "robust")
+    far = replace(known.starts, t_world_object=1.1 * known.starts.t_world_object)
+    images = [coarser_image(known.image, factor) for factor in (1, 2)]
+    prices = [energy_of(replace(known, image=image), config)(far).per_item for image in images]
+    assert (prices[0] > 1).all()
+    assert torch.allclose(prices[0], prices[1], rtol=0.1)
+
+
+def test_a_capture_keeps_its_depth(tmp_path: Path, small_room):
+    shape = small_room.capture.scene.camera.height, small_room.capture.scene.camera.width
+    for metric in (True, False):
+        values = torch.rand(shape, generator=torch.Generator().manual_seed(1)) + 1
+        values[:5] = torch.nan
+        capture = replace(small_room.capture, depth=DepthImage(values, metric))
+        write_capture(capture, tmp_path / str(metric))
+        found = read_capture(tmp_path / str(metric)).depth
+        assert found is not None
+        assert found.metric == metric
+        assert torch.equal(found.values.nan_to_num(0), values.nan_to_num(0))
+    with pytest.raises(ValueError, match="has depth, which the capture lacks"):
+        write_capture(small_room.capture, tmp_path / "True")
+
+
+def test_inverse_depth_may_be_an_array_or_a_grey_picture(tmp_path: Path, small_room):
+    camera = small_room.capture.scene.camera
+    folder = tmp_path / "disparity"
+    folder.mkdir()
+    values = np.random.default_rng(0).integers(1, 255, (camera.height, camera.width))
+    Image.fromarray(values.astype(np.uint8)).save(folder / "000000.png")
+    np.savez(folder / "000001.npz", disparity=values.astype(np.float32))
+    for name in ("000000.png", "000001.npz"):
+        found = read_depth_image(folder / name, camera, metric=False)
+        assert torch.equal(found.values, torch.from_numpy(values).float())
+    assert find_depth_file(tmp_path) == (folder / "000000.png", False)
+
+
+def test_what_is_wrong_with_measured_depth_is_one_sentence(tmp_path: Path, small_room):
+    camera = small_room.capture.scene.camera
+    assert find_depth_file(tmp_path) is None
+    (tmp_path / "depth").mkdir()
+    with pytest.raises(InputError, match=r"depth/: has no depth map, expected 000000\.npy or"):
+        find_depth_file(tmp_path)
+    (tmp_path / "disparity").mkdir()
+    with pytest.raises(InputError, match=r"has depth/ and disparity/, expected one of the two"):
+        find_depth_file(tmp_path)
+    Image.new("RGB", (camera.width, camera.height)).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"a\.png: has RGB pixels, expected one grey value"):
+        read_depth_image(tmp_path / "a.png", camera, metric=False)
+    np.save(tmp_path / "a.npy", np.ones((5, 5)))
+    with pytest.raises(InputError, match=r"a\.npy: has 5 x 5 values"):
+        read_depth_image(tmp_path / "a.npy", camera, metric=False)
