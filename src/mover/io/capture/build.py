@@ -49,8 +49,7 @@ def build_capture(parts: Parts) -> Capture:
     scene, turn = scene_of(parts.scene, parts.load_mesh, other, warn)
     detections = detections_of(parts.objects, scene.camera, warn)
     _check_annotations(parts.scene, parts.objects.file, scene, detections, warn)
-    seen = parts.people
-    found = NOBODY if seen is None else people_of(seen, scene.camera, warn)
+    found = people_of(parts.people, scene.camera, warn) if parts.people else NOBODY
     bodies = _bodies_of(parts.bodies, scene.camera, turn, found.fps, warn)
     touch = _touch_of(parts.contacts, bodies, warn)
     _check_frames(parts, found, bodies)
