@@ -41,6 +41,7 @@ from mover.pipeline.people import people_of
 from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
 from mover.pipeline.presets import with_sizes
+from mover.pipeline.views import further_views
 from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
 from mover.stages.contacts.contact_association import AssignInputs
@@ -215,7 +216,10 @@ def with_refined_camera(
     """Camera and ground refined with the objects, and the objects placed anew under them."""
     cues = context.run.stage(find_image_cues, state.image, context.config.image)
     spread, objects = people.alignment.covariance, context.prepared.objects
-    inputs = RefineInputs(state.camera, state.ground, spread, objects, cues, state.placed.layout)
+    views = further_views(context, people, state.camera)
+    inputs = RefineInputs(
+        state.camera, state.ground, spread, objects, cues, state.placed.layout, views
+    )
     better = context.run.stage(refine_camera, inputs, context.config.refine)
     found = placed_by_image(context, better.camera, better.ground, state)
     return replace(found, traces={**state.traces, "camera": better.trace, **found.traces})

@@ -24,7 +24,7 @@ from mover.core.devices import constant
 from mover.core.observe import Energy, Observer, silent
 from mover.core.records import map_tensors, record
 from mover.core.types import Camera, Layout, Objects
-from mover.energy.config import SceneConfig, SceneWeights
+from mover.energy.config import SceneConfig, SceneWeights, only
 from mover.energy.fused.energy import never_asks
 from mover.energy.minimize import minimize
 from mover.energy.objective import HumanCues, ImageCues, best_borders, scene_energy
@@ -65,6 +65,16 @@ UNITS = (
 
 
 @record
+class FurtherView:
+    """Objects as the moving camera saw them in another frame."""
+
+    R_reference_camera: Float[Tensor, "3 3"]
+    t_reference_camera: Float[Tensor, "3"]
+    """[m]"""
+    image: ImageCues
+
+
+@record
 class RefineInputs:
     """Camera and ground from the feet, objects from the image alone."""
 
@@ -75,6 +85,8 @@ class RefineInputs:
     objects: Objects
     image: ImageCues
     layout: Layout
+    views: tuple[FurtherView, ...] = ()
+    """Their image terms count as much, all together, as those of the reference image."""
 
 
 @record
@@ -99,22 +111,31 @@ def refine_camera(
 ) -> Refined:
     """Minimise over the camera, the ground and all standing objects at once."""
     image = SceneConfig(config.weights, "robust", config.uniform_scale_weight)
-    fixed, certainty = _start(inputs), torch.linalg.inv(inputs.covariance)
-    cues = fixed_borders(inputs.image, inputs.layout, inputs.objects, inputs.camera, config.weights)
-    usable = _usable(inputs)
+    fixed, objects = _start(inputs), inputs.objects
+    certainty = torch.linalg.inv(inputs.covariance)
+    cues = fixed_borders(inputs.image, inputs.layout, objects, inputs.camera, config.weights)
+    usable, seen = _usable(inputs), _seen_terms(config)
+    views = _fixed_views(inputs, config.weights)
     zero = map_tensors(torch.zeros_like, fixed)
 
     def objects_energy(joint: _Joint) -> Float[Tensor, " objects"]:
         camera, layout = _unpack(joint, inputs)
-        energy = scene_energy(layout, inputs.objects, camera, cues, HumanCues(), image)
-        return energy.per_item
+        return scene_energy(layout, objects, camera, cues, HumanCues(), image).per_item
+
+    def views_energy(joint: _Joint) -> Float[Tensor, " objects"]:
+        whole = torch.zeros_like(usable)
+        for view in views:  # few, and each has windows of its own
+            camera, layout = _from_view(*_unpack(joint, inputs), view)
+            there = scene_energy(layout, objects, camera, view.image, HumanCues(), seen)
+            whole = whole + there.per_item / len(views)
+        return whole
 
     with torch.no_grad():
         own = objects_energy(fixed) + SOFT
 
     def energy(free: _Joint) -> Energy:
         joint = _shift(fixed, free)
-        terms = objects_energy(joint) / own
+        terms = (objects_energy(joint) + views_energy(joint)) / own
         off = joint.tilt - fixed.tilt
         feet = 0.5 * config.feet * (off @ certainty @ off)
         return Energy({"objects": (terms * usable).sum(), "feet": feet})
@@ -126,6 +147,30 @@ def refine_camera(
     joint = _shift(fixed, found.at)
     camera, _ = _unpack(joint, inputs)
     return Refined(camera, float(joint.tilt[2]), found.trace)
+
+
+def _seen_terms(config: RefineConfig) -> SceneConfig:
+    """Of further views only what is seen counts: sizes are believed once."""
+    weights = only(bbox=config.weights.bbox, silhouette=config.weights.silhouette)
+    return SceneConfig(weights, "robust", config.uniform_scale_weight)
+
+
+def _from_view(camera: Camera, layout: Layout, view: FurtherView) -> tuple[Camera, Layout]:
+    """The camera of a view and the objects in a world about it, with the reference's axes."""
+    R = view.R_reference_camera.mT @ camera.R_cam_world
+    centre = camera.R_cam_world.mT @ view.t_reference_camera
+    there = replace(layout, t_world_object=layout.t_world_object - centre)
+    return Camera(camera.K, R, camera.width, camera.height), there
+
+
+def _fixed_views(inputs: RefineInputs, weights: SceneWeights) -> list[FurtherView]:
+    """The further views with masks whose borders suit the objects as they stand."""
+    found: list[FurtherView] = []
+    for view in inputs.views:
+        camera, layout = _from_view(inputs.camera, inputs.layout, view)
+        image = fixed_borders(view.image, layout, inputs.objects, camera, weights)
+        found.append(replace(view, image=image))
+    return found
 
 
 def _start(inputs: RefineInputs) -> _Joint:

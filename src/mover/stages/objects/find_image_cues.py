@@ -13,7 +13,7 @@ from mover.energy.terms.border import borders_of
 from mover.energy.terms.silhouette import outline_root
 from mover.geometry.crops import area_mean, crop_views
 from mover.geometry.path import is_still
-from mover.geometry.rle import decode
+from mover.geometry.rle import decode, tight_box
 from mover.stages.config import ImageConfig
 from mover.stages.objects.prepare_objects import Prepared
 
@@ -49,6 +49,29 @@ def image_evidence(capture: Capture) -> Seen:
         torch.stack(masks) if masks else blank.expand(0, -1, -1),
         people,
     )
+
+
+def evidence_at(capture: Capture, frame: int) -> Seen:
+    """The same of a frame in which furniture is segmented (`furniture.json`)."""
+    camera, pieces = capture.scene.camera, capture.scene.objects
+    furniture, people = capture.furniture, capture.people
+    blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    masks = torch.zeros(len(pieces), camera.height, camera.width, dtype=torch.bool)
+    assert furniture is not None, "furniture is segmented in this frame"
+    index = {piece.annotation: k for k, piece in enumerate(pieces)}
+    for row in (furniture.frame == frame).nonzero()[:, 0].tolist():
+        number = int(furniture.person[row])
+        if number in index:
+            masks[index[number]] = decode(furniture.masks, row)
+    rows = [] if people is None else (people.frame == frame).nonzero()[:, 0].tolist()
+    hidden = [decode(people.masks, row) for row in rows] if people is not None else []
+    there = masks.flatten(1).any(1)
+    whole = torch.tensor([0.0, 0.0, camera.width, camera.height])
+    boxes = [tight_box(mask) if bool(mask.any()) else whole for mask in masks]
+    return Seen(
+        torch.stack(boxes) if boxes else torch.zeros(0, 4), there, masks,
+        torch.stack([blank, *hidden]).any(0),
+    )  # fmt: skip
 
 
 def hiding(capture: Capture) -> Masks:
