@@ -114,28 +114,22 @@ def refine_camera(
     fixed, objects = _start(inputs), inputs.objects
     certainty = torch.linalg.inv(inputs.covariance)
     cues = fixed_borders(inputs.image, inputs.layout, objects, inputs.camera, config.weights)
-    usable, seen = _usable(inputs), _seen_terms(config)
+    usable, known = _usable(inputs), (objects, _seen_terms(config))
     views = _fixed_views(inputs, config.weights)
     zero = map_tensors(torch.zeros_like, fixed)
 
-    def objects_energy(joint: _Joint) -> Float[Tensor, " objects"]:
+    def energies(joint: _Joint) -> tuple[Tensor, Tensor]:
         camera, layout = _unpack(joint, inputs)
-        return scene_energy(layout, objects, camera, cues, HumanCues(), image).per_item
-
-    def views_energy(joint: _Joint) -> Float[Tensor, " objects"]:
-        whole = torch.zeros_like(usable)
-        for view in views:  # few, and each has windows of its own
-            camera, layout = _from_view(*_unpack(joint, inputs), view)
-            there = scene_energy(layout, objects, camera, view.image, HumanCues(), seen)
-            whole = whole + there.per_item / len(views)
-        return whole
+        here = scene_energy(layout, objects, camera, cues, HumanCues(), image).per_item
+        return here, _in_views((camera, layout), views, known)
 
     with torch.no_grad():
-        own = objects_energy(fixed) + SOFT
+        own = energies(fixed)[0] + SOFT
 
     def energy(free: _Joint) -> Energy:
         joint = _shift(fixed, free)
-        terms = (objects_energy(joint) + views_energy(joint)) / own
+        here, elsewhere = energies(joint)
+        terms = (here + elsewhere) / own
         off = joint.tilt - fixed.tilt
         feet = 0.5 * config.feet * (off @ certainty @ off)
         return Energy({"objects": (terms * usable).sum(), "feet": feet})
@@ -161,6 +155,19 @@ def _from_view(camera: Camera, layout: Layout, view: FurtherView) -> tuple[Camer
     centre = camera.R_cam_world.mT @ view.t_reference_camera
     there = replace(layout, t_world_object=layout.t_world_object - centre)
     return Camera(camera.K, R, camera.width, camera.height), there
+
+
+def _in_views(
+    room: tuple[Camera, Layout], views: list[FurtherView], known: tuple[Objects, SceneConfig]
+) -> Float[Tensor, " objects"]:
+    """The mean energy of each object in the further views; zero where there are none."""
+    objects, config = known
+    whole = torch.zeros_like(room[1].yaw)
+    for view in views:  # few, and each has windows of its own
+        camera, layout = _from_view(*room, view)
+        there = scene_energy(layout, objects, camera, view.image, HumanCues(), config)
+        whole = whole + there.per_item / len(views)
+    return whole
 
 
 def _fixed_views(inputs: RefineInputs, weights: SceneWeights) -> list[FurtherView]:
