@@ -19,7 +19,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from mover.app.cli.config import preset_named
+from mover.app.cli.run import reconstruct_into
 from mover.app.cli.video import ChainArgs, video_to_room
+from mover.app.results import Origin
 from mover.core.types import Scene
 from mover.evaluate.evaluation import EvaluatedBodies, evaluate
 from mover.evaluate.scene import SIDES
@@ -99,9 +102,7 @@ def measured(room: KnownRoom, seed: int, kind: str, capture: Path) -> None:
     depth = np.minimum(near.min(0), floor) * np.exp(off)
     depth = np.where(depth < 20, depth, np.nan).astype(np.float32)
     values = depth if kind == "depth" else 200 / depth + rng.uniform(5, 30)
-    for other in KINDS:
-        shutil.rmtree(capture / other, ignore_errors=True)
-    (capture / kind).mkdir(parents=True)
+    (capture / kind).mkdir(parents=True, exist_ok=True)
     np.save(capture / kind / "000000.npy", values)
 
 
@@ -123,10 +124,9 @@ def surfaces(room: KnownRoom) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(near), np.where(down < -0.01, ground / np.minimum(down, -0.01), np.inf)
 
 
-def judged(out: Path, room: KnownRoom) -> dict[str, Any]:
+def judged(capture: Path, found: Path, room: KnownRoom) -> dict[str, Any]:
     """Metrics of the first scene and of the result, over the objects that were found."""
-    names = truth_of(room, out / "capture")
-    found = out / "room"
+    names = truth_of(room, capture)
     scenes = [renamed(read_scene(found / n), room, names) for n in ("initial.json", "scene.json")]
     kept = {p.id for p in scenes[0].objects}
     truth = replace(room.truth, objects=tuple(p for p in room.truth.objects if p.id in kept))
@@ -148,7 +148,7 @@ def told_of_objects(metrics: dict[str, Any]) -> str:
 
 
 def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, float]:
-    """One known room, from its video to its room; with measured depth after that."""
+    """One known room, from its video to its room; the room again with measured depth."""
     room = make_room(seed, RoomConfig(fps=FPS))
     out.mkdir(parents=True, exist_ok=True)
     if not (out / "video.mp4").is_file():
@@ -156,12 +156,16 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, float]:
     seen = Seen(room, add_noise(room, NoiseConfig(), seed), seed)
     meshes = other_designs(room, out / "meshes") if args.other_designs else None
     chain = ChainArgs(out / "chain", camera=lens_file(room, out), meshes=meshes)
-    row: dict[str, float] = {}
+    video_to_room(out / "video.mp4", chain, seen.finders())
+    capture, row = out / "chain" / "capture", dict[str, float]()
     for kind in ("", *args.depth):
+        place = out / "chain" / f"room {kind}".rstrip()
         if kind:
-            measured(room, seed, kind, out / "chain" / "capture")
-        video_to_room(out / "video.mp4", chain, seen.finders())
-        metrics, word = judged(out / "chain", room), f"{kind} ".lstrip()
+            measured(room, seed, kind, capture)
+            origin = Origin(str(capture), refine=True, device=torch.device("cpu"))
+            reconstruct_into(place, read_capture(capture), preset_named("robust"), origin)
+            shutil.rmtree(capture / kind)
+        metrics, word = judged(capture, place, room), f"{kind} ".lstrip()
         print(f"room {seed} {kind}", told_of_objects(metrics), sep="\n", flush=True)
         row |= {f"{word}{s} {k}": metrics[s][k] for s in SIDES for k in KEYS if k in metrics[s]}
     steps = json.loads((out / "chain" / "steps.json").read_text())["steps"]

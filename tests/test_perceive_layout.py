@@ -27,7 +27,7 @@ from mover.io.files.meshes import write_mesh
 from mover.io.formats import read
 from mover.perceive.config import LayoutConfig, ScreenConfig
 from mover.perceive.depth_map import floor_height, median_depths
-from mover.perceive.layout import Picture, first_scene, is_placed, shapes_of
+from mover.perceive.layout import Picture, at_scale, first_scene, is_placed, shapes_of
 from mover.perceive.screen import ScreenInputs, outermost, screen
 from mover.perceive.standing import standing_on
 
@@ -155,6 +155,19 @@ def test_a_depth_map_tells_the_floor_and_how_far_things_are(pieces: list[SceneOb
     medians = median_depths(seen.depth, seen.masks)
     for k, piece in enumerate(pieces):
         assert float(medians[k]) == pytest.approx(float(box_of(piece).center.norm()), rel=0.15)
+
+
+@pytest.mark.parametrize("factor", [0.85, 1.0, 1.2])
+def test_a_known_height_tells_the_scale_of_a_depth_map(pieces: list[SceneObject], factor: float):
+    seen = picture(pieces, camera(), depth=True)
+    assert seen.depth is not None
+    off = replace(seen, depth=factor * seen.depth, height=HEIGHT)
+    found = at_scale(off).depth
+    assert found is not None
+    known = seen.depth.isfinite()
+    assert torch.allclose(found[known], seen.depth[known], rtol=0.03)
+    assert at_scale(replace(off, height=None)).depth is off.depth
+    assert at_scale(replace(off, height=5 * HEIGHT)).depth is off.depth
 
 
 @pytest.mark.slow

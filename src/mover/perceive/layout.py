@@ -64,6 +64,7 @@ NOT_ON_FLOOR = frozenset({
 
 UNKNOWN_SIZE = (0.60, 0.80, 0.60)
 SLACK = 0.05  # error of measured depth [share]
+MOST_OFF = 1.5  # factor of a network's depth; what is farther off is no floor
 TURNED_APART = 0.6  # [rad], turns that are nearer count as one start
 
 
@@ -252,6 +253,7 @@ def first_scene(
         detections=tuple(picture.detections[k] for k in placed),
         masks=picture.masks[placed],
     )
+    picture = at_scale(picture)
     shapes = [shapes_of(d.category, config.shapes, meshes) for d in picture.detections]
     cues = run.stage(find_image_cues, _image(picture), config.image)
     pairs = [(thing, shape) for thing, known in enumerate(shapes) for shape in known]
@@ -267,6 +269,19 @@ def first_scene(
     placed = run.stage(place_objects, inputs, config.place)
     found = to_objects(pieces, prepared, placed.layout)
     return _scene(picture, (found, things, placed.energy[0]), screened.height, skipped)
+
+
+def at_scale(picture: Picture) -> Picture:
+    """The picture with its depth at the scale that the known height of the camera tells.
+
+    A network's depth is off by a factor for the whole picture, which its floor shows.
+    """
+    if picture.depth is None or picture.height is None:
+        return picture
+    seen = floor_height(picture.depth, picture.camera, picture.masks.any(0) | picture.people)
+    if seen is None or not 1 / MOST_OFF < picture.height / seen < MOST_OFF:
+        return picture
+    return replace(picture, depth=picture.depth * (picture.height / seen))
 
 
 def _image(picture: Picture) -> ImageInputs:
