@@ -31,7 +31,7 @@ from mover.io.export.solids import floor_height
 STEPS = (0.0, 0.45, 0.9)  # moments that are drawn, as shares of the span around the frame
 SPAN = 8.0  # [s]
 SURE = 0.5  # confidence of contacts that are drawn
-BALL, STICK = 0.02, 0.12  # [m]
+BALL, STICK = 0.025, 0.09  # [m]
 Arrays = dict[str, NDArray[Any]]
 
 
