@@ -32,6 +32,7 @@ from mover.app.pictures.paint import (
 )
 from mover.app.pictures.render import Moment, render_result, render_worlds, set_up, show, world_of
 from mover.core.errors import InputError
+from mover.core.types import Segment
 from mover.geometry.camera import project, to_camera
 from mover.geometry.rle import thinned
 from mover_bench.rooms.render import see
@@ -236,6 +237,25 @@ def test_a_room_without_people_turns():
     a, b = render_worlds([world], [Moment(0, 0.0), Moment(0, 0.5)], config, None)
     assert a.shape == b.shape == (36, 64, 3)
     assert (a - b).abs().max() > 0.2
+
+
+def test_moved_furniture_is_drawn_where_it_stands_in_the_frame():
+    scene = room()
+    chair, *others = scene.objects
+    there = dataclasses.replace(
+        chair, t_world_object=chair.t_world_object + torch.tensor([-0.6, 0.0, 0.4])
+    )
+    stays = tuple(Segment(f, p.t_world_object, p.yaw) for f, p in ((0, chair), (5, there)))
+    moved = dataclasses.replace(chair, segments=stays)
+    world = world_of("after", dataclasses.replace(scene, objects=(moved, *others)), None)
+    config, moments = RenderConfig(width=64), [Moment(4, 0.0), Moment(5, 0.5), Moment(4, 0.9)]
+    found = list(render_worlds([world], moments, config, None))
+    for picture, piece in zip(found, (chair, there, chair), strict=True):
+        alone = world_of("after", dataclasses.replace(scene, objects=(piece, *others)), None)
+        alone = dataclasses.replace(alone, ground=world.ground)
+        expected = next(render_worlds([alone], [Moment(0, 0.0)], config, None))
+        assert torch.equal(picture, expected)
+    assert (found[0] - found[1]).abs().max() > 0.2
 
 
 def test_the_command_says_what_it_drew(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +53,7 @@ from mover.app.pictures.paint import (
 from mover.core.errors import InputError
 from mover.core.records import record
 from mover.core.types import Bodies, Scene
-from mover.geometry.placement import place_object
+from mover.geometry.placement import place_object, placed_at
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.formats import read
@@ -180,16 +181,26 @@ def _panels(
     eyes = _eyes(world, worlds, moments, config)
     over_video = capture is not None and config.view == "camera"
     backs = _backs(capture, moments, eyes[0]) if over_video and capture is not None else None
-    board: Tiles | None = None
+    changes = sorted({s.frame for piece in world.scene.objects for s in piece.segments})
+    board, still, time = None, world.still, -1
     for moment, eye in zip(moments, eyes, strict=True):
-        base = None if backs is None else next(backs)
-        if board is None or board.eye is not eye:
-            board = set_up(eye, world.ground, world.still, base)
+        base, before = None if backs is None else next(backs), time
+        time = bisect_right(changes, moment.frame)
+        if time != before and changes:
+            still = furniture(_scene_at(world.scene, moment.frame))
+        if board is None or board.eye is not eye or time != before:
+            board = set_up(eye, world.ground, still, base)
         elif base is not None:
             board = with_base(board, base)
         present = rows.get(moment.frame, [])
         moving = people(world.bodies, present) if world.bodies is not None and present else None
         yield show(board, moving)
+
+
+def _scene_at(scene: Scene, frame: int) -> Scene:
+    """The furniture where it stands in a frame."""
+    pieces = tuple(placed_at(piece, frame) for piece in scene.objects)
+    return dataclasses.replace(scene, objects=pieces)
 
 
 def _rows_at(bodies: Bodies | None) -> dict[int, list[int]]:
