@@ -160,9 +160,8 @@ def placed_by_image(
     )
     cues = context.run.stage(find_image_cues, image, context.config.image)
     cues = with_given(cues, context, as_given(context, camera), before)
-    if before is not None or context.capture.bodies is None:
-        now = start if before is None else before.placed.layout
-        cues = with_measured(cues, context, (camera, ground), now)
+    if before is not None:  # the room as it was given does not tell the scale of a depth
+        cues = with_measured(cues, context, (camera, ground), before.placed.layout)
     inputs = PlaceInputs(
         objects, camera, ground, cues, NOBODY, starts, start.yaw, _pinned(context, start)
     )
