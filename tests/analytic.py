@@ -111,11 +111,10 @@ def measured_at(verts, objects, views):
 
 def given_at(layout):
     """Objects are given where they stand, along axes of their own."""
-    n, one = len(layout.yaw), torch.ones_like(layout.yaw)
-    precision = 60 * torch.eye(3).to(one) - 10
+    one = torch.ones_like(layout.yaw)
     return Given(
         layout.t_world_object.norm(dim=-1), layout.yaw, 0.6 * one, 5 * one, layout.yaw,
-        torch.zeros_like(layout.log_scale), precision.expand(n, 3, 3).clone(), 1.5 * one,
+        torch.zeros_like(layout.log_scale), 60 * torch.ones_like(layout.log_scale), 1.5 * one,
     )  # fmt: skip
 
 

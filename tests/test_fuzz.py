@@ -4,6 +4,7 @@ All mutations are drawn from a seed. A share of them runs in `make test`, all in
 `python -m pytest tests/test_fuzz.py -m "" -s` prints the counts.
 """
 
+import itertools
 import json
 import logging
 import math
@@ -404,7 +405,8 @@ def part_of(capture: Capture, objects: int, rows: int) -> Capture:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_every_setting_at_its_ends_runs_to_the_end(small_room, tmp_path):
+@pytest.mark.parametrize("part", range(4))
+def test_every_setting_at_its_ends_runs_to_the_end(small_room, tmp_path, part):
     from test_pipeline import light
 
     from mover.pipeline.reconstruct import reconstruct
@@ -413,7 +415,7 @@ def test_every_setting_at_its_ends_runs_to_the_end(small_room, tmp_path):
 
     capture = part_of(add_noise(small_room, NoiseConfig(), 1), 2, 24)
     config, counts = light("robust", steps=2), Counter[str]()
-    for way, span in ways_of(config):
+    for way, span in itertools.islice(ways_of(config), part, None, 4):
         for value in {span.kind(v) for v in (-1, 0, span.low) if span.holds(span.kind(v))}:
             try:
                 with limited(60):
@@ -428,4 +430,4 @@ def test_every_setting_at_its_ends_runs_to_the_end(small_room, tmp_path):
                 assert bool(piece.t_world_object.isfinite().all()), (way, value)
             counts["ran"] += 1
     print(f"settings at their ends: {dict(counts)}")  # noqa: T201
-    assert counts["ran"] > 100
+    assert counts["ran"] > 25

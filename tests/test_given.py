@@ -2,17 +2,19 @@
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from analytic import FACES, box_verts, boxes_of, given_at
+from torch import Tensor
 
 from mover.core.types import Bodies, Camera, Layout, Mesh
 from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.terms.contact import ContactPoints
-from mover.energy.terms.given import Given, given_term
+from mover.energy.terms.given import AWAY, Given, given_term
 from mover.furniture.library import PIECES, SIZES, STANDARD, STYLES, canonical, make_piece
 from mover.geometry.camera import tilted, to_camera, to_world
 from mover.geometry.mesh import box
@@ -23,11 +25,11 @@ from mover.stages.objects.gather_given import (
     WEIGHTS,
     believed_sides,
     common_scale,
-    expected_sizes,
     gather_given,
     lighter_where_used,
     prior_weights,
     room_axis,
+    standard_sizes,
 )
 from mover.stages.objects.prepare_objects import levelled
 from mover.stages.people.find_depth import are_shapeless, nearer
@@ -114,11 +116,45 @@ def test_the_axis_of_a_room_is_found_from_rough_yaws() -> None:
 def test_standard_sizes_pull_what_they_know_and_leave_the_rest() -> None:
     sizes = [(1.2, 0.60, 0.8), (0.45, 0.95, 0.5), (1.0, 1.0, 1.0)]
     objects = boxes_of(("table", "chair", "aquarium"), sizes)
-    mean, precision = expected_sizes(objects)
-    assert 0.6 * math.log(0.74 / 0.60) < float(mean[0, 1]) < math.log(0.74 / 0.60)
-    assert float(mean[1].abs().max()) < 0.1
-    assert float(mean[2].abs().max()) == 0
-    assert bool((torch.linalg.eigvalsh(precision) > 0).all())
+    standard, precision = standard_sizes(objects)
+    assert float(standard[0, 1]) == pytest.approx(math.log(0.74 / 0.60), abs=1e-5)
+    assert float(standard[1].abs().max()) < 0.1
+    assert float(precision[2].max()) == 0 < float(precision[0, 1])
+    given = gather_given(objects, somewhere(3), somewhere(3), torch.full((3,), 0.1))
+    best = minimum(lambda s: replace(somewhere(3), log_scale=s), given)
+    assert 0.6 * math.log(0.74 / 0.60) < float(best[0, 1]) < math.log(0.74 / 0.60)
+    assert float(best[2].abs().max()) < 1e-4
+
+
+def minimum(layout_of: Callable[[Tensor], Layout], given: Given) -> Tensor:
+    """Logarithms of sizes of least cost, by a naive descent."""
+    sizes = torch.zeros(len(given.yaw), 3, requires_grad=True)
+    descent = torch.optim.LBFGS([sizes], max_iter=100, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        descent.zero_grad()
+        cost = given_term(layout_of(sizes), given).sum()
+        cost.backward()
+        return cost
+
+    descent.step(closure)
+    return sizes.detach()
+
+
+def test_what_was_guessed_too_far_was_guessed_too_large() -> None:
+    """A guess looks right in its picture: the same picture nearer costs only its distance."""
+    layout = somewhere()
+    given = replace(given_at(layout), precision=torch.zeros(1, 3))
+    nearer_one = larger(layout, 0.85)
+    smaller = replace(layout, log_scale=nearer_one.log_scale)
+    kept = replace(nearer_one, log_scale=layout.log_scale)
+    place = 2 * math.log1p((math.log(0.85) / AWAY) ** 2 / 3) * float(given.weight)
+    for other in (nearer_one, kept):
+        assert place < cost(given, other) < place + math.log(2) * float(given.weight)
+    assert cost(given, smaller) > 3 * float(given.weight)
+    usual = replace(given, standard=torch.full((1, 3), math.log(0.85)),
+                    precision=torch.full((1, 3), 1 / 0.05**2))  # fmt: skip
+    assert cost(usual, nearer_one) < cost(usual, layout)
 
 
 def test_standards_are_those_of_the_classes_and_near_what_the_library_has() -> None:
@@ -130,15 +166,15 @@ def test_standards_are_those_of_the_classes_and_near_what_the_library_has() -> N
 
 def test_doubt_follows_the_misfit_within_bounds() -> None:
     objects = boxes_of(("table", "chair", "sofa"), [(1.0, 0.7, 1.0)] * 3)
-    given = gather_given(objects, somewhere(3), somewhere(3), torch.tensor([1e-6, 0.25, 3.0]))
-    assert given.weight.tolist() == pytest.approx([WEIGHTS[0], 2.5, WEIGHTS[1]])
+    given = gather_given(objects, somewhere(3), somewhere(3), torch.tensor([1e-6, 0.15, 3.0]))
+    assert given.weight.tolist() == pytest.approx([WEIGHTS[0], 1.5, WEIGHTS[1]])
 
 
 def test_an_object_that_fits_among_shapes_that_do_not_is_doubted_more_than_alone() -> None:
-    energy = torch.tensor([0.01, 0.4, 0.4, 0.3, 0.9])
+    energy = torch.tensor([0.01, 0.16, 0.16, 0.12, 0.9])
     found = prior_weights(energy)
-    assert float(found[0]) == pytest.approx((0.01 * 0.4) ** 0.5 / 0.1)
-    assert found[[1, 2, 4]].tolist() == pytest.approx([4.0, 4.0, WEIGHTS[1]])
+    assert float(found[0]) == pytest.approx((0.01 * 0.16) ** 0.5 / 0.1)
+    assert found[[1, 2, 4]].tolist() == pytest.approx([1.6, 1.6, WEIGHTS[1]])
     assert torch.allclose(prior_weights(torch.full((3,), 0.01)), torch.full((3,), 0.1))
 
 

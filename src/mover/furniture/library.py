@@ -105,7 +105,6 @@ STANDARD: dict[str, tuple[Usual, Usual, Usual]] = {
     "armchair": ((0.80, 0.18), (0.90, 0.15), (0.82, 0.12)),
     "office chair": ((0.62, 0.12), (1.00, 0.12), (0.62, 0.12)),
     "stool": (None, (0.46, 0.08), None),
-    "bench": (None, (0.45, 0.08), (0.40, 0.15)),
     "sofa": (None, (0.82, 0.10), (0.90, 0.15)),
     "bed": (None, None, (2.05, 0.06)),
     "table": (None, (0.74, 0.04), None),

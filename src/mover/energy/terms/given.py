@@ -6,8 +6,9 @@ Place:     2 \log(1 + \delta^2 / 3 \sigma^2), \delta = \log \|t_i\| / \|t_i^{ini
            guess of a distance is off by some per cent, seldom by more, never by metres.
 Yaw:       the guess is off by some 20 degrees, one in ten is turned by a quarter or a half.
 Axis:      most furniture stands along one of two directions of the room.
-Size:      r^T \Lambda r / 2 with r the logarithms of the three sizes less those expected: of the
-           given mesh and of the standard dimensions of its class, each with its spread.
+Size:      each of the three is about as large as given, or all are larger by as much as the object
+           is farther (its picture was right): -\log of the mean of both chances, normal in the
+           logarithms. And about as large as the standard dimensions of its class.
 Weight:    d_i grows with what is left of the image's energy where the object fits best: a shape or
            a mask that does not fit says by so much less where the object stands. Which way it
            faces, the worst outline still says better than a guess.
@@ -25,11 +26,12 @@ from torch import Tensor
 from mover.core.records import record
 from mover.core.types import Layout
 
-AWAY = 0.07  # standard deviation of the logarithm of a given distance
+AWAY = 0.1  # standard deviation of the logarithm of a distance: some decimetres in a room
 TURN = math.radians(20)  # of a given yaw [rad]
 FLIPPED = 0.1  # share of yaws that are off by a further quarter or half turn
 TURNS = 1.0  # largest weight that counts for yaws
 ANY = 0.01  # and of those that are off by anything
+SIZE = 0.1  # of the logarithm of each given size
 
 
 @record
@@ -37,7 +39,7 @@ class Given:
     """What the initial scene, the room and standard dimensions say of each object."""
 
     distance: Float[Tensor, " objects"]
-    """From the camera to the middle of the base [m]."""
+    """From the camera to the middle of the base, as given [m]."""
     yaw: Float[Tensor, " objects"]
     """[rad]"""
     along: Float[Tensor, " objects"]
@@ -46,10 +48,10 @@ class Given:
     """How well those that do stand along it, and how well it is known: of a von Mises density."""
     axis: Float[Tensor, " objects"]
     """Direction of an axis of the room, up to quarter turns [rad]."""
-    log_scale: Float[Tensor, "objects 3"]
-    """Expected size, as a factor on that of the mesh."""
-    precision: Float[Tensor, "objects 3 3"]
-    """How well it is known: inverse covariance of the logarithms."""
+    standard: Float[Tensor, "objects 3"]
+    """Standard sizes, as logarithms of factors on those of the mesh."""
+    precision: Float[Tensor, "objects 3"]
+    """How well they are known: one over the variance; 0 where there is no standard."""
     weight: Float[Tensor, " objects"]
     """How little the image tells of it: 1 is usual, 0 leaves it to the image."""
 
@@ -61,10 +63,14 @@ def given_term(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]
     return given.weight.clamp_max(TURNS) * turned + given.weight * placed
 
 
-def _place(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
+def _away(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
+    """Logarithm of how much farther than given."""
     away = layout.t_world_object.square().sum(-1).clamp_min(1e-6).log() / 2
-    off = (away - given.distance.clamp_min(1e-3).log()) / AWAY
-    return 2 * (1 + off.square() / 3).log()
+    return away - given.distance.clamp_min(1e-3).log()
+
+
+def _place(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
+    return 2 * (1 + (_away(layout, given) / AWAY).square() / 3).log()
 
 
 def _yaw(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
@@ -88,5 +94,8 @@ def _axis(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
 
 
 def _size(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
-    off = layout.log_scale - given.log_scale
-    return 0.5 * ((given.precision @ off.unsqueeze(-1)).squeeze(-1) * off).sum(-1)
+    farther = _away(layout, given).unsqueeze(-1)
+    kept = layout.log_scale.square().sum(-1) / SIZE**2
+    seen = (layout.log_scale - farther).square().sum(-1) / SIZE**2
+    usual = (given.precision * (layout.log_scale - given.standard).square()).sum(-1)
+    return usual / 2 + math.log(2) - torch.logaddexp(-kept / 2, -seen / 2)

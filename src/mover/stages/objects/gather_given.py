@@ -14,11 +14,9 @@ from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.given import AWAY, TURN, Given
 from mover.furniture.library import STANDARD, WALL_PIECES
 
-SIZE = 0.1  # standard deviation of the logarithm of each given size
-COMMON = 0.06  # and of what the three have in common
 FIT = 0.1  # image energy (robust form) of a shape that fits
 UNFIT = 0.5  # weight from which on a shape does not fit, or only as something hides it
-WEIGHTS = (0.05, 8.0)  # least and largest weight
+WEIGHTS = (0.05, 2.0)  # least and largest weight
 LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of 1 [rad]
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
@@ -37,7 +35,7 @@ def gather_given(
         layout: Where it was placed since, by the image.
         energy: What is left of the image's energy there.
     """
-    mean, precision = expected_sizes(objects)
+    standard, precision = standard_sizes(objects)
     along = torch.tensor([OFTEN if c in WALL_PIECES else SELDOM for c in objects.categories])
     known = torch.ones_like(start.yaw)
     weight = prior_weights(energy)
@@ -46,7 +44,7 @@ def gather_given(
     sharp = 1 / (4 * math.hypot(SQUARE, spread)) ** 2
     return Given(
         distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=along.to(known),
-        sharpness=sharp * known, axis=axis * known, log_scale=mean, precision=precision,
+        sharpness=sharp * known, axis=axis * known, standard=standard, precision=precision,
         weight=weight,
     )  # fmt: skip
 
@@ -86,20 +84,17 @@ def believed_sides(
     return torch.where(fits & (sides == LIKELY), LEAST, sides)
 
 
-def expected_sizes(
+def standard_sizes(
     objects: Objects,
-) -> tuple[Float[Tensor, "objects 3"], Float[Tensor, "objects 3 3"]]:
-    """Mean and inverse covariance of the logarithms of the sizes, of the given ones."""
-    own = SIZE**2 * torch.eye(3) + COMMON**2
+) -> tuple[Float[Tensor, "objects 3"], Float[Tensor, "objects 3"]]:
+    """Logarithms of the standard sizes over those of the meshes, and how well they are known."""
     usual, sharp = torch.zeros_like(objects.size), torch.zeros_like(objects.size)
     for i, category in enumerate(objects.categories):
         for axis, known in enumerate(STANDARD.get(category, ())):
             if known is not None:
                 usual[i, axis] = math.log(known[0]) - objects.size[i, axis].log()
                 sharp[i, axis] = 1 / known[1] ** 2
-    precision = torch.linalg.inv(own).to(usual) + torch.diag_embed(sharp)
-    mean = torch.linalg.solve(precision, (sharp * usual).unsqueeze(-1)).squeeze(-1)
-    return mean, precision
+    return usual, sharp
 
 
 def common_scale(layout: Layout, given: Given, spread: float) -> float:
@@ -117,13 +112,12 @@ def common_scale(layout: Layout, given: Given, spread: float) -> float:
         return 0.0
     tried = torch.linspace(-3 * spread, 3 * spread, 121, dtype=torch.float64)
     away = (layout.t_world_object.norm(dim=-1) / given.distance).log().double()
-    off = (layout.log_scale - given.log_scale).double()
-    noise = FITTED**2 * torch.eye(3).to(off)
-    precision = torch.linalg.inv(torch.linalg.inv(given.precision.double()) + noise)
+    off = (layout.log_scale - given.standard).double()
+    precision = given.precision.double() / (1 + FITTED**2 * given.precision.double())
     near = away[:, None] - tried
     rest = off[:, None] - tried[:, None]
     cost = 2 * (1 + near.square() / (3 * (AWAY**2 + FITTED**2))).log()
-    cost = cost + 0.5 * torch.einsum("nri,nij,nrj->nr", rest, precision, rest)
+    cost = cost + 0.5 * (precision[:, None] * rest.square()).sum(-1)
     total = cost.sum(0) + 0.5 * (tried / spread).square()
     weight = (total.min() - total).exp()
     return float((weight * tried).sum() / weight.sum())
