@@ -533,6 +533,7 @@ class TestStage:
         blind = replace(
             priced.image, keep=torch.zeros_like(priced.image.keep),
             sides=torch.zeros_like(priced.image.sides), distance=None, given=None,
+            measured=None,
         )  # fmt: skip
         nobody = replace(priced.humans, depth=None, space=None, touches=None)
         seen = explain_placements(self.inputs(priced), ExplainConfig()).facts
