@@ -75,6 +75,19 @@ class TestSteps:
         go("c")
         assert made.read_text() == "c"
 
+    def test_what_a_step_made_of_another_video_goes_and_what_replaced_it_stays(
+        self, tmp_path: Path
+    ):
+        made = tmp_path / "bodies.npz"
+        steps = steps_in(tmp_path, said()[1], NAMES)
+        steps.do("first", [], made, lambda: made.write_text("made") and None)
+        steps_in(tmp_path, said()[1], NAMES).undo("first", made)
+        assert not made.exists()
+        steps.do("first", [], made, lambda: made.write_text("made") and None)
+        made.write_text("user's")
+        steps_in(tmp_path, said()[1], NAMES).undo("first", made)
+        assert made.read_text() == "user's"
+
     def test_a_step_that_dies_is_not_taken_for_finished(self, tmp_path: Path):
         made = tmp_path / "made.txt"
 

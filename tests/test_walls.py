@@ -364,7 +364,7 @@ def a_hidden_shelf(given_at, size=48):
 
 CONFIG = replace(
     ROBUST.place, method=BatchedBFGS(), perturbations=2, perturbation_rounds=1,
-    weights=replace(ROBUST.place.weights, given=0.0),  # the guess is another test's
+    weights=replace(ROBUST.place.weights, given=0.0, measured=0.0),  # in tests of their own
 )  # fmt: skip
 UNLINED = replace(CONFIG, wall_alignment_steps=0)
 

@@ -72,6 +72,11 @@ class Steps:
         write_json({"steps": self.log}, self.folder / "steps.json")
         self.say(f"{number} {name}: {seconds:.0f} s")
 
+    def undo(self, name: str, made: Path) -> None:
+        """Remove what the step made, of another video; what was put in its place stays."""
+        if made.exists() and self.log.get(name, {}).get("made") == digest([made]):
+            made.unlink()
+
 
 def steps_in(folder: Path, say: Say, names: tuple[str, ...]) -> Steps:
     """The steps of a folder, with what an earlier run has finished; a damaged log is dropped."""

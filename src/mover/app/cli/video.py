@@ -171,6 +171,7 @@ def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
     bodies, keypoints = BodiesFrom(args.bodies, args.bodies_tool), capture / "keypoints.npz"
     if args.bodies == FIT and not keypoints.is_file():
         say("warning: no keypoints were found, so there are no bodies")
+        steps.undo(STEPS[1], capture / "bodies.npz")
         return
     given = [] if args.bodies == FIT or bodies.is_command else [Path(args.bodies)]
     made_from = [keypoints, lens_in(capture), args.bodies, args.bodies_tool, *given]
