@@ -28,6 +28,7 @@ from mover.geometry.rle import encode, tight_box
 from mover.pipeline.presets import PRESETS, Config
 from mover_bench.studies import pictures, tables
 from mover_bench.studies.args import ExperimentArgs
+from mover_bench.studies.finished import Finished
 from mover_bench.studies.job import DONE, ROOM, Job, rebuild, store_room
 from mover_bench.studies.measures import Traits, Trial, hidden_shares
 from mover_bench.studies.queue import start
@@ -224,6 +225,20 @@ def test_the_initial_row_is_the_truth_moved_by_the_noise(finished) -> None:
             shift = 0.1 * (int(row["seed"]) + 1) * math.sqrt(2)
             assert float(row["center_error"]) == pytest.approx(shift, abs=1e-4)
             assert float(row["size_error"]) == pytest.approx(0, abs=1e-5)
+
+
+def test_presets_that_measure_something_else_have_rows_without_places() -> None:
+    """`--presets stands` measures what gravity does."""
+    rows = DataFrame(
+        {"preset": ["stands"] * 2, "stage": ["full"] * 2, "object": ["a", "b"], "moved": [0.1, 0.2]}
+    )
+    found = means("objects", rows)
+    assert found["count"].tolist() == [2]
+    assert found[["turned", "bad"]].sum().tolist() == [0, 0]
+    assert found[["iou3d", "yaw_error"]].isna().all(axis=None)
+    done = Finished(rows, rows.assign(name="stands"))
+    experiment = tables.Experiment("mover", "rooms", ("stands",), (0,), done, {})
+    assert len(pictures.worst_objects(experiment)) == 0
 
 
 def test_stage_1_and_full_share_camera_and_ground(finished) -> None:

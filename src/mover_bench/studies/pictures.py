@@ -30,8 +30,13 @@ BASE = (0, 4, 5, 1)  # corners of a box around its bottom, the last two at its f
 
 
 def worst_objects(experiment: Experiment, count: int = WORST) -> Frame:
-    """The objects of the last preset with the lowest IoU3D after the full method."""
+    """The objects of the last preset with the lowest IoU3D after the full method.
+
+    None where the preset is one that measures something else of them.
+    """
     found = experiment.finished.objects
+    if "iou3d" not in found:
+        return found[:0]
     rows = found[(found.name == experiment.presets[-1]) & (found.stage == "full")]
     return rows.sort_values(["iou3d", "seed", "object"])[:count]
 

@@ -144,6 +144,8 @@ def means(over: str, rows: Frame) -> Frame:
 
     Objects that are turned or bad are counted.
     """
+    if "iou3d" not in rows:  # of presets that measure something else
+        rows = rows.reindex(columns=[*rows.columns, "iou3d", "yaw_error"])
     named = rows.assign(turned=rows.yaw_error > TURNED, bad=rows.iou3d < BAD) if len(rows) else rows
     groups = named.groupby(["preset", "stage"], sort=False)
     found = groups[[name for name in SHOWN if name in rows]].mean()
