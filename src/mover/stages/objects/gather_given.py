@@ -11,7 +11,7 @@ from torch import Tensor
 from mover.core.types import Layout, Objects
 from mover.energy.terms.bbox import LEAST, LIKELY
 from mover.energy.terms.contact import ContactPoints
-from mover.energy.terms.given import AWAY, TURN, Given
+from mover.energy.terms.given import AWAY, SIZE, TURN, Given
 from mover.furniture.library import STANDARD, WALL_PIECES
 
 FIT = 0.1  # image energy (robust form) of a shape that fits
@@ -20,6 +20,7 @@ WEIGHTS = (0.05, 2.0)  # least and largest weight
 LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of 1 [rad]
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
+COMMON = 0.06  # error that the three given sizes of an object have in common, as a logarithm
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
 DIRECTIONS = 90  # that are tried within a quarter turn
 
@@ -112,12 +113,17 @@ def common_scale(layout: Layout, given: Given, spread: float) -> float:
         return 0.0
     tried = torch.linspace(-3 * spread, 3 * spread, 121, dtype=torch.float64)
     away = (layout.t_world_object.norm(dim=-1) / given.distance).log().double()
-    off = (layout.log_scale - given.standard).double()
-    precision = given.precision.double() / (1 + FITTED**2 * given.precision.double())
     near = away[:, None] - tried
-    rest = off[:, None] - tried[:, None]
     cost = 2 * (1 + near.square() / (3 * (AWAY**2 + FITTED**2))).log()
-    cost = cost + 0.5 * (precision[:, None] * rest.square()).sum(-1)
+    own = SIZE**2 * torch.eye(3).to(away) + COMMON**2
+    sharp = torch.diag_embed(given.precision.double())
+    precision = torch.linalg.inv(own) + sharp
+    mean = torch.linalg.solve(precision, (sharp @ given.standard.double().unsqueeze(-1))).squeeze(
+        -1
+    )
+    precision = torch.linalg.inv(torch.linalg.inv(precision) + FITTED**2 * torch.eye(3).to(away))
+    rest = (layout.log_scale.double() - mean)[:, None] - tried[:, None]
+    cost = cost + 0.5 * torch.einsum("nri,nij,nrj->nr", rest, precision, rest)
     total = cost.sum(0) + 0.5 * (tried / spread).square()
     weight = (total.min() - total).exp()
     return float((weight * tried).sum() / weight.sum())
