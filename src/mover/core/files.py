@@ -2,6 +2,7 @@
 
 import glob
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Generator
@@ -30,3 +31,11 @@ def replacing(path: Path) -> Generator[Path, None, None]:
         os.replace(name, path)
     finally:
         Path(name).unlink(missing_ok=True)
+
+
+def copy_whole(source: Path, target: Path) -> None:
+    """Copy a file so that the copy is whole or not there; a file onto itself is left alone."""
+    if target.exists() and target.samefile(source):
+        return
+    with replacing(target) as part:
+        shutil.copyfile(source, part)

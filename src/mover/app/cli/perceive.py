@@ -125,9 +125,7 @@ def take_depth(depth: Path, capture: Path) -> None:
     Raises:
         InputError: If there is no such file, or the capture has an inverse depth.
     """
-    from shutil import copyfile
-
-    from mover.core.files import replacing
+    from mover.core.files import copy_whole
     from mover.io.files.depth import DEPTH, find_depth_file
 
     if not depth.is_file():
@@ -138,8 +136,7 @@ def take_depth(depth: Path, capture: Path) -> None:
     if depth.resolve() != place.resolve():
         for old in (capture / DEPTH).glob("000000.*"):
             old.unlink()
-        with replacing(place) as part:
-            copyfile(depth, part)
+        copy_whole(depth, place)
     find_depth_file(capture)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from mover.core.errors import InputError
-from mover.core.files import replacing
+from mover.core.files import copy_whole
 from mover.core.types import Camera, Capture, Scene
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera, to_world
@@ -282,8 +282,7 @@ def _write_whole(whole: Parts, old: Parts, capture: Capture | None, folder: Path
 def _write_beside(whole: Parts, folder: Path) -> list[str]:
     """Frames, keypoints, truth: what stands beside the capture's own files."""
     for place, source in whole.copies.items():
-        with replacing(folder / place) as part:
-            shutil.copyfile(source, part)
+        copy_whole(source, folder / place)
     for place, tree in whole.trees.items():
         write_json(tree, folder / place)
     for place, scene in whole.scenes.items():

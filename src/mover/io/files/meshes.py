@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.files import replacing
+from mover.core.files import copy_whole, replacing
 from mover.core.types import Mesh
 from mover.io.files.fields import LARGEST, LARGEST_FILE, At, reason, refuse, shown, text
 
@@ -166,17 +165,10 @@ def copy_mesh(source: Path, folder: Path, name: str) -> Path:
     beside = companions(source)
     home = folder / name if beside else folder
     target = home / (name + source.suffix)
-    _copy(source, target)
+    copy_whole(source, target)
     for file in beside:
-        _copy(source.parent / file, home / file)
+        copy_whole(source.parent / file, home / file)
     return target
-
-
-def _copy(source: Path, target: Path) -> None:
-    if target.exists() and target.samefile(source):
-        return
-    with replacing(target) as part:
-        shutil.copyfile(source, part)
 
 
 def companions(path: Path) -> tuple[Path, ...]:

@@ -118,9 +118,8 @@ def common_scale(layout: Layout, given: Given, spread: float) -> float:
     own = SIZE**2 * torch.eye(3).to(away) + COMMON**2
     sharp = torch.diag_embed(given.precision.double())
     precision = torch.linalg.inv(own) + sharp
-    mean = torch.linalg.solve(precision, (sharp @ given.standard.double().unsqueeze(-1))).squeeze(
-        -1
-    )
+    usual = sharp @ given.standard.double().unsqueeze(-1)
+    mean = torch.linalg.solve(precision, usual).squeeze(-1)
     precision = torch.linalg.inv(torch.linalg.inv(precision) + FITTED**2 * torch.eye(3).to(away))
     rest = (layout.log_scale.double() - mean)[:, None] - tried[:, None]
     cost = cost + 0.5 * torch.einsum("nri,nij,nrj->nr", rest, precision, rest)
