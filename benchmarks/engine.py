@@ -23,10 +23,10 @@ from mover.core.devices import Choice, device_of, finish, named
 from mover.core.records import to_device
 from mover.geometry import crops, raster
 from mover.geometry.camera import tilted
-from mover.geometry.kernels.start import use_threads
 from mover.geometry.raster import Crops, Topology
 from mover.geometry.rotations import rot_y
 from mover.geometry.topology import edges_of
+from mover.geometry.warp_start import use_threads
 
 K = torch.tensor([[353.5, 0, 317.1], [0, 353.5, 178.9], [0, 0, 1]])  # an image of 640 x 360 pixels
 ROUND, CELLS = 0.02, 96

@@ -31,7 +31,7 @@ from reference import use_engine
 
 from mover.core.observe import Step
 from mover.core.types import Bodies
-from mover.geometry.kernels.start import use_threads
+from mover.geometry.warp_start import use_threads
 from mover.stages.config import GatherConfig
 from mover.stages.contacts.gather_cues import GatherInputs, gather_cues
 

@@ -25,7 +25,6 @@ from mover.energy.config import Adam, SceneConfig
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import scene_energy
 from mover.geometry import raster
-from mover.geometry.kernels.start import use_threads
 from mover.geometry.nearest_warp import clouds, nearest
 from mover.geometry.raster import Crops
 from mover.geometry.volume import (
@@ -38,6 +37,7 @@ from mover.geometry.volume import (
     signed_distance,
 )
 from mover.geometry.volume_warp import union_bodies
+from mover.geometry.warp_start import use_threads
 from mover.pipeline.presets import ROBUST
 from mover.stages.config import GatherConfig
 from mover.stages.contacts.gather_cues import gather_cues

@@ -38,7 +38,7 @@ from mover.core.types import Layout
 from mover.energy.config import Adam, BatchedBFGS, SceneConfig
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import scene_energy
-from mover.geometry.kernels.start import use_threads
+from mover.geometry.warp_start import use_threads
 from mover.pipeline.presets import ROBUST
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.config import PlaceConfig

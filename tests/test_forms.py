@@ -15,8 +15,8 @@ from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, scene_energy
 from mover.energy.terms.contact import contact_term, shares_of
 from mover.energy.terms.silhouette import edge_term, outline_root
-from mover.geometry.kernels.start import use_threads
 from mover.geometry.placement import place
+from mover.geometry.warp_start import use_threads
 from mover.stages.config import ImageConfig, PlaceConfig
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
 from mover.stages.objects.place_objects import place_objects, with_trees

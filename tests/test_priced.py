@@ -18,8 +18,8 @@ from mover.energy.minimize import minimize
 from mover.energy.objective import scene_energy
 from mover.energy.terms.bbox import LEAST, LIKELY, UNKNOWN
 from mover.energy.terms.depth import DepthRange
-from mover.geometry.kernels.start import use_threads
 from mover.geometry.topology import edges_of
+from mover.geometry.warp_start import use_threads
 from mover.stages.objects.place_objects import with_trees
 
 pytest.importorskip("warp")

@@ -14,8 +14,8 @@ from test_raster import PINHOLE, edges_of, packed, posed, poses, slab, window
 
 from mover.geometry import raster
 from mover.geometry import raster as raster_warp
-from mover.geometry.kernels.start import _cores, threads, use_threads
 from mover.geometry.raster import Crops, Topology, draw, drawn_by, engine
+from mover.geometry.warp_start import _cores, threads, use_threads
 
 wp = pytest.importorskip("warp")
 NAMES = ["sphere", "torus", "chair", "table", "sofa"]

@@ -9,7 +9,7 @@ import pytest
 
 from mover.app.cli.progress import Bar
 from mover.core.observe import Step
-from mover.geometry.kernels import start
+from mover.geometry import warp_start
 
 pytest.importorskip("warp")
 
@@ -19,7 +19,7 @@ begun, init = [], warp.init
 def slow():
     begun.append(1); time.sleep(0.2); init()
 warp.init = slow
-from mover.geometry.kernels.start import started
+from mover.geometry.warp_start import started
 folder = []
 ask = lambda: folder.append(started().config.kernel_cache_dir)
 threads = [threading.Thread(target=ask) for _ in range(4)]
@@ -29,7 +29,7 @@ assert begun == [1], begun
 assert len(set(folder)) == 1, folder
 """
 COMPILE = """
-from mover.geometry.kernels.start import kernels
+from mover.geometry.warp_start import kernels
 from mover.energy.minimize import Step
 from mover.app.cli.progress import Bar
 with Bar() as bar:
@@ -58,16 +58,16 @@ def test_the_progress_tells_that_kernels_are_compiled_and_only_the_first_time(tm
 
 
 def test_kernels_in_the_cache_are_loaded_without_a_word(caplog):
-    start.kernels("lookup", "cpu")  # the first on this machine may tell
-    start._loaded.cache_clear()
+    warp_start.kernels("lookup", "cpu")  # the first on this machine may tell
+    warp_start._loaded.cache_clear()
     caplog.clear()
     with caplog.at_level(logging.INFO):
-        start.kernels("lookup", "cpu")
+        warp_start.kernels("lookup", "cpu")
     assert caplog.records == []
 
 
 def test_a_bar_shows_what_is_compiled_and_leaves_the_log_as_it_was(capsys):
-    log = logging.getLogger("mover.geometry.kernels.start")
+    log = logging.getLogger("mover.geometry.kernels")
     with Bar() as bar:
         bar(Step("place_objects", 0, 2))
         log.info("compiling kernels, once on this machine: %s for %s ...", "grid", "cpu")

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.records import record
-from mover.geometry.kernels.start import filled, kernels, launch, name_of, share, started, threads
+from mover.geometry.warp_start import filled, kernels, launch, name_of, share, started, threads
 
 FAN = 8  # points of a leaf, leaves of a group
 

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.geometry.kernels.start import kernels, started
+from mover.geometry.warp_start import kernels, started
 
 BITS = 10  # of a place along each axis, where neighbours are put together
 

@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mover.core.records import record
-from mover.geometry.kernels.start import filled, kernels, launch, name_of, started
 from mover.geometry.nearest import as_float64, as_int64, closest
+from mover.geometry.warp_start import filled, kernels, launch, name_of, started
 
 SHELL = 2.0  # [cells], up to where it is exact outside: more than a cell's diagonal
 BAND = 4.0  # [cells], what stands for any larger distance

@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.geometry.kernels.start import kernels, started
 from mover.geometry.nearest import as_float64, as_int64
 from mover.geometry.volume import Volume
+from mover.geometry.warp_start import kernels, started
 
 REACH = 2  # [cells], that the shell reaches out of the body
 EIGHT = 8  # children of a node, and faces of a leaf: one instruction serves all of them

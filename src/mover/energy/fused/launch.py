@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mover.geometry.kernels.start import array, filled, kernels, share, started, threads
 from mover.geometry.raster.draw import scratch_of
+from mover.geometry.warp_start import array, filled, kernels, share, started, threads
 
 KERNELS = "mover.energy.fused.kernels"
 BORDER = 1  # [px], as in the rasterisers

@@ -13,9 +13,9 @@ from mover.energy.terms import bbox, border, contact, depth, distance, scale
 from mover.energy.terms.collision import SAMPLES
 from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.factors import factors
-from mover.geometry.kernels.start import array, started
 from mover.geometry.nearest_warp import packed
 from mover.geometry.volume import Volume, field_of
+from mover.geometry.warp_start import array, started
 
 BRICK = 8  # [cells], as in `Volume.busy`
 CALM = 2  # a brick without bodies, as in `kernels.simple`

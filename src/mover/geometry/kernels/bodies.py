@@ -1,11 +1,8 @@
-# pyright: basic, reportInvalidTypeForm=false, reportGeneralTypeIssues=false
 """Warp kernels that lower a volume to the signed distance of one closed body.
 
 Positions are in cells: the centres of the grid's cells have integer coordinates. Scratch arrays
 are laid out by column, (x, z, y), with one place more than the body's box has along y.
 """
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -24,7 +21,6 @@ SLACK = wp.constant(1.0001)  # of squared limits; rounding is a thousand times s
 
 
 @wp.struct
-@no_type_check
 class Tree:
     """The triangles of a body and the boxes around them in packs of eight; see `FaceTree`.
 
@@ -43,7 +39,6 @@ class Tree:
 
 
 @wp.struct
-@no_type_check
 class Work:
     """One body on its way into a volume; one of these for each worker.
 
@@ -73,7 +68,6 @@ class Work:
 
 
 @wp.kernel
-@no_type_check
 def place(w: Work) -> None:
     """Vertices in cells, and where they are among the columns (x, z) of the box, in fixed point."""
     i = wp.tid()
@@ -88,14 +82,12 @@ def place(w: Work) -> None:
 
 
 @wp.func
-@no_type_check
 def block_of(w: Work, x: int, y: int, z: int) -> int:
     """Index of the block of two by two by two that holds a place of the box."""
     return ((x >> 1) * ((w.size[2] + 1) >> 1) + (z >> 1)) * ((w.size[1] + 1) >> 1) + (y >> 1)
 
 
 @wp.func
-@no_type_check
 def mark(w: Work, slot: int) -> None:
     """Mark the blocks within the shell of a box of the surface."""
     a = wp.vec3i()
@@ -114,7 +106,6 @@ def mark(w: Work, slot: int) -> None:
 
 
 @wp.kernel
-@no_type_check
 def leaves(w: Work) -> None:
     """The tree's leaves, the blocks near them, and the enclosed volume."""
     leaf = wp.tid()
@@ -125,7 +116,6 @@ def leaves(w: Work) -> None:
 
 
 @wp.kernel
-@no_type_check
 def inner(w: Work, pack: int, first: int) -> None:
     """Boxes of the tree's nodes on one level, from those on the next.
 
@@ -139,7 +129,6 @@ def inner(w: Work, pack: int, first: int) -> None:
 
 
 @wp.struct
-@no_type_check
 class Flat:
     """A triangle seen along y, in fixed point, counter-clockwise."""
 
@@ -150,7 +139,6 @@ class Flat:
 
 
 @wp.func
-@no_type_check
 def flat(w: Work, t: wp.vec3i) -> Flat:
     """See `Flat`; the sign is 0 where the triangle is seen edge-on."""
     r = Flat()
@@ -168,7 +156,6 @@ def flat(w: Work, t: wp.vec3i) -> Flat:
 
 
 @wp.func
-@no_type_check
 def weight(r: Flat, k: int, px: wp.int64, pz: wp.int64) -> wp.int64:
     """Twice the area of a column and the edge opposite of a corner; -1 if it is outside."""
     i = (k + 1) % 3
@@ -183,7 +170,6 @@ def weight(r: Flat, k: int, px: wp.int64, pz: wp.int64) -> wp.int64:
 
 
 @wp.kernel
-@no_type_check
 def cross(w: Work) -> None:
     """Signed crossings of the columns with each triangle, one step where they pass it."""
     t = w.faces[wp.tid()]

@@ -1,7 +1,4 @@
-# pyright: basic, reportInvalidTypeForm=false
 """Where the outline of an item passes between pixel centres."""
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -14,7 +11,6 @@ STEEP, OUTWARD = 2, 1  # flags of a cut
 
 
 @wp.struct
-@no_type_check
 class Contour:
     """An edge of the outline and the lines of pixel centres that cut it."""
 
@@ -36,7 +32,6 @@ class Contour:
 
 
 @wp.struct
-@no_type_check
 class Gap:
     """A covered and an uncovered centre with a cut in between."""
 
@@ -52,7 +47,6 @@ class Gap:
 
 
 @wp.func
-@no_type_check
 def contour(scene: Scene, scratch: Scratch, item: int, edge: wp.vec4l, face: wp.vec3l) -> Contour:
     """An edge between `face`, which is drawn and faces the camera, and one that does not.
 
@@ -94,14 +88,12 @@ def contour(scene: Scene, scratch: Scratch, item: int, edge: wp.vec4l, face: wp.
 
 
 @wp.func
-@no_type_check
 def sign(x: float) -> int:
     """1, 0 or -1."""
     return wp.where(x > 0.0, 1, wp.where(x < 0.0, -1, 0))
 
 
 @wp.func
-@no_type_check
 def gap(scene: Scene, c: Contour, line: int) -> Gap:
     """The two centres between which a line is cut, whatever they cover."""
     g = Gap()
@@ -122,14 +114,12 @@ def gap(scene: Scene, c: Contour, line: int) -> Gap:
 
 
 @wp.func
-@no_type_check
 def key(g: Gap, edge: int) -> wp.uint64:
     """Orders the cuts of one pair: the outermost wins, then the later edge."""
     return (wp.uint64(wp.cast(g.distance, wp.uint32)) << HALF) | wp.uint64(edge + 1)
 
 
 @wp.func
-@no_type_check
 def cut_of(scene: Scene, item: int, c: Contour, g: Gap, line: int) -> wp.vec4i:
     """What is kept of a cut."""
     flags = wp.where(c.steep, STEEP, 0) + wp.where(c.outward > 0, OUTWARD, 0)
@@ -138,7 +128,6 @@ def cut_of(scene: Scene, item: int, c: Contour, g: Gap, line: int) -> wp.vec4i:
 
 
 @wp.struct
-@no_type_check
 class Crossing:
     """A cut, computed again from the vertices."""
 
@@ -155,7 +144,6 @@ class Crossing:
 
 
 @wp.func
-@no_type_check
 def crossing(scene: Scene, cut: wp.vec4i) -> Crossing:
     """Where a cut is, and which pixel it moves."""
     x = Crossing()
@@ -191,7 +179,6 @@ def crossing(scene: Scene, cut: wp.vec4i) -> Crossing:
 
 
 @wp.func
-@no_type_check
 def pull_cut(scene: Scene, cut: wp.vec4i, gradient: float, grads: wp.array(dtype=wp.vec3)) -> None:
     """Add the gradient of a cut's pixel to the two vertices of its edge."""
     x = crossing(scene, cut)
@@ -205,7 +192,6 @@ def pull_cut(scene: Scene, cut: wp.vec4i, gradient: float, grads: wp.array(dtype
 
 
 @wp.func
-@no_type_check
 def pulled(p: wp.vec3, du: float, dv: float) -> wp.vec3:
     """Gradient of a point from that of its image, in focal lengths."""
     return wp.vec3(du, dv, -(du * p[0] + dv * p[1]) / p[2]) / p[2]

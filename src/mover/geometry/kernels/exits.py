@@ -1,7 +1,4 @@
-# pyright: basic, reportInvalidTypeForm=false
 """Where rays enter closed bodies and first leave them: one thread for each body and triangle."""
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -11,7 +8,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.kernel
-@no_type_check
 def project(
     verts: wp.array2d(dtype=wp.vec3),
     window: wp.array(dtype=wp.vec4),
@@ -23,7 +19,6 @@ def project(
 
 
 @wp.func
-@no_type_check
 def fill(t: Triangle, row: int, item: int, out: wp.array3d(dtype=wp.float32)) -> None:
     """Raise the inverse depth of the run of one row."""
     r = run_of(t, row, 0, out.shape[2])
@@ -33,7 +28,6 @@ def fill(t: Triangle, row: int, item: int, out: wp.array3d(dtype=wp.float32)) ->
 
 
 @wp.kernel
-@no_type_check
 def draw(
     screen: wp.array2d(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3l),

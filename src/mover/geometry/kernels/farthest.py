@@ -1,7 +1,4 @@
-# pyright: basic, reportInvalidTypeForm=false
 """Warp kernel that thins out points: each next one is the farthest from those before."""
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -13,7 +10,6 @@ BLOCK = wp.constant(32)  # neighbours that share a box
 
 
 @wp.struct
-@no_type_check
 class Crowd:
     """Points in an order in which neighbours are together, and what is known of each block."""
 
@@ -31,14 +27,12 @@ class Crowd:
 
 
 @wp.func
-@no_type_check
 def is_better(c: Crowd, d: float, place: int, most: float, best: int) -> bool:
     """Farther, or as far and earlier in the list that was given."""
     return d > most or (d == most and c.index[place] < c.index[best])
 
 
 @wp.func
-@no_type_check
 def visit(c: Crowd, block: int, last: wp.vec3) -> None:
     """Bring a block up to date."""
     out = wp.max(wp.max(c.low[block] - last, last - c.high[block]), wp.vec3(0.0, 0.0, 0.0))
@@ -57,7 +51,6 @@ def visit(c: Crowd, block: int, last: wp.vec3) -> None:
 
 
 @wp.kernel
-@no_type_check
 def farthest(c: Crowd, first: int, chosen: wp.array(dtype=wp.int64)) -> None:
     """Indices of the points in the order of their choice, in one thread."""
     at = first

@@ -1,12 +1,9 @@
-# pyright: basic, reportInvalidTypeForm=false
 """What is done for each vertex, triangle, edge, pixel or cut, and a thread for each: for GPUs.
 
 Winners are chosen by atomic maxima of whole keys, whatever the order of the threads; sums of
 gradients, and of cuts that move one pixel, are made in any order. Triangles of many rows get many
 threads. An item is told by two numbers, `at`: its own, and that of its place in `Scratch`.
 """
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -23,7 +20,6 @@ LANES = 1 << 16  # threads that share the triangles of many rows
 
 
 @wp.func
-@no_type_check
 def place_vert(scene: Scene, scratch: Scratch, at: wp.vec2i, v: int) -> wp.vec3:
     """Put a vertex on the screen."""
     p = scene.verts[at[0] * scene.n_verts + v]
@@ -33,14 +29,12 @@ def place_vert(scene: Scene, scratch: Scratch, at: wp.vec2i, v: int) -> wp.vec3:
 
 
 @wp.func
-@no_type_check
 def face_at(scene: Scene, at: wp.vec2i, f: int) -> wp.vec3l:
     """A triangle of an item."""
     return scene.faces[at[0] % scene.shapes * scene.n_faces + f]
 
 
 @wp.func
-@no_type_check
 def area_of(scene: Scene, scratch: Scratch, at: wp.vec2i, face: wp.vec3l) -> float:
     """Twice the signed area of a triangle [px²]."""
     base = at[1] * scene.n_verts
@@ -52,7 +46,6 @@ def area_of(scene: Scene, scratch: Scratch, at: wp.vec2i, face: wp.vec3l) -> flo
 
 
 @wp.func
-@no_type_check
 def triangle_of(scene: Scene, scratch: Scratch, at: wp.vec2i, face: wp.vec3l) -> Triangle:
     """A triangle and its rows."""
     base = at[1] * scene.n_verts
@@ -66,7 +59,6 @@ def triangle_of(scene: Scene, scratch: Scratch, at: wp.vec2i, face: wp.vec3l) ->
 
 
 @wp.func
-@no_type_check
 def draw_face(scene: Scene, scratch: Scratch, at: wp.vec2i, f: int, backs: int, most: int) -> bool:
     """Draw a triangle unless it has more rows than `most`; whether that is done."""
     face = face_at(scene, at, f)
@@ -85,7 +77,6 @@ def draw_face(scene: Scene, scratch: Scratch, at: wp.vec2i, f: int, backs: int, 
 
 
 @wp.func
-@no_type_check
 def outline_face(scene: Scene, scratch: Scratch, at: wp.vec2i, edge: wp.vec4l) -> int:
     """The face of an edge that is drawn as a front where the other is not, else -1."""
     base = at[1] * scene.n_faces
@@ -96,7 +87,6 @@ def outline_face(scene: Scene, scratch: Scratch, at: wp.vec2i, edge: wp.vec4l) -
 
 
 @wp.func
-@no_type_check
 def enter_cuts(scene: Scene, scratch: Scratch, at: wp.vec2i, e: int) -> None:
     """Find, for each pair of centres that an edge parts, the outermost cut."""
     edge = scene.edges[at[0] % scene.shapes * scene.n_edges + e]
@@ -114,7 +104,6 @@ def enter_cuts(scene: Scene, scratch: Scratch, at: wp.vec2i, e: int) -> None:
 
 
 @wp.func
-@no_type_check
 def keep_cuts(scene: Scene, scratch: Scratch, maps: Maps, at: wp.vec2i, e: int) -> None:
     """List the cuts of an edge that won, take them out, and move the image by them."""
     edge = scene.edges[at[0] % scene.shapes * scene.n_edges + e]
@@ -137,7 +126,6 @@ def keep_cuts(scene: Scene, scratch: Scratch, maps: Maps, at: wp.vec2i, e: int) 
 
 
 @wp.func
-@no_type_check
 def mark_cut(scratch: Scratch, maps: Maps, i: int) -> None:
     """Mark a cut whose pixel is outside [0, 1], before any is bounded."""
     target = scratch.targets[i]
@@ -147,7 +135,6 @@ def mark_cut(scratch: Scratch, maps: Maps, i: int) -> None:
 
 
 @wp.func
-@no_type_check
 def bound_cut(scratch: Scratch, maps: Maps, i: int) -> None:
     """Bound the pixel of a marked cut to [0, 1]."""
     target = -2 - scratch.targets[i]
@@ -156,7 +143,6 @@ def bound_cut(scratch: Scratch, maps: Maps, i: int) -> None:
 
 
 @wp.func
-@no_type_check
 def show(scene: Scene, scratch: Scratch, maps: Maps, at: wp.vec2i, row: int, column: int) -> None:
     """Write the maps of a pixel of the grid, and forget who won it."""
     grid = (at[1] * scene.height + row) * scene.width + column
@@ -173,7 +159,6 @@ def show(scene: Scene, scratch: Scratch, maps: Maps, at: wp.vec2i, row: int, col
 
 
 @wp.kernel
-@no_type_check
 def place_verts(scene: Scene, scratch: Scratch) -> None:
     """A thread for each vertex."""
     item, v = wp.tid()
@@ -181,7 +166,6 @@ def place_verts(scene: Scene, scratch: Scratch) -> None:
 
 
 @wp.kernel
-@no_type_check
 def draw_faces(scene: Scene, scratch: Scratch, backs: int) -> None:
     """A thread for each triangle, which is queued where it has many rows."""
     item, f = wp.tid()
@@ -190,7 +174,6 @@ def draw_faces(scene: Scene, scratch: Scratch, backs: int) -> None:
 
 
 @wp.kernel
-@no_type_check
 def draw_rows(scene: Scene, scratch: Scratch, backs: int) -> None:
     """Draw rows of the queued triangles, each thread every so many."""
     work = wp.tid()
@@ -209,7 +192,6 @@ def draw_rows(scene: Scene, scratch: Scratch, backs: int) -> None:
 
 
 @wp.kernel
-@no_type_check
 def enter_edges(scene: Scene, scratch: Scratch) -> None:
     """A thread for each edge."""
     item, e = wp.tid()
@@ -217,7 +199,6 @@ def enter_edges(scene: Scene, scratch: Scratch) -> None:
 
 
 @wp.kernel
-@no_type_check
 def show_pixels(scene: Scene, scratch: Scratch, maps: Maps) -> None:
     """A thread for each pixel of the grids."""
     item, row, column = wp.tid()
@@ -225,7 +206,6 @@ def show_pixels(scene: Scene, scratch: Scratch, maps: Maps) -> None:
 
 
 @wp.kernel
-@no_type_check
 def keep_edges(scene: Scene, scratch: Scratch, maps: Maps) -> None:
     """A thread for each edge."""
     item, e = wp.tid()
@@ -233,21 +213,18 @@ def keep_edges(scene: Scene, scratch: Scratch, maps: Maps) -> None:
 
 
 @wp.kernel
-@no_type_check
 def mark_cuts(scratch: Scratch, maps: Maps) -> None:
     """A thread for each cut."""
     mark_cut(scratch, maps, wp.tid())
 
 
 @wp.kernel
-@no_type_check
 def bound_cuts(scratch: Scratch, maps: Maps) -> None:
     """A thread for each cut."""
     bound_cut(scratch, maps, wp.tid())
 
 
 @wp.kernel
-@no_type_check
 def pull_cuts(scene: Scene, pull: Pull) -> None:
     """Gradient of one cut."""
     i = wp.tid()
@@ -256,7 +233,6 @@ def pull_cuts(scene: Scene, pull: Pull) -> None:
 
 
 @wp.kernel
-@no_type_check
 def pull_pixels(scene: Scene, maps: Maps, pull: Pull) -> None:
     """Gradient of the depths of one pixel."""
     pull_pixel(scene, maps, pull, wp.tid())

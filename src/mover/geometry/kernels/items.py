@@ -1,10 +1,7 @@
-# pyright: basic, reportInvalidTypeForm=false
 """All stages in a row for a few items, in working memory of one that stays in the cache: for CPUs.
 
 Threads share nothing, so that results do not depend on their number.
 """
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -25,7 +22,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-@no_type_check
 def draw_item(scene: Scene, scratch: Scratch, maps: Maps, backs: int, at: wp.vec2i) -> wp.vec2i:
     """Put the triangles of one item into the z-buffers, and find the cuts of its outline.
 
@@ -48,7 +44,6 @@ def draw_item(scene: Scene, scratch: Scratch, maps: Maps, backs: int, at: wp.vec
 
 
 @wp.func
-@no_type_check
 def bound_item(scene: Scene, scratch: Scratch, maps: Maps, at: wp.vec2i) -> None:
     """Move the silhouette of one item by its outline."""
     first = scratch.count[1]
@@ -61,7 +56,6 @@ def bound_item(scene: Scene, scratch: Scratch, maps: Maps, at: wp.vec2i) -> None
 
 
 @wp.kernel
-@no_type_check
 def look_items(
     scene: Scene, scratch: Scratch, maps: Maps, backs: int, first: int, stop: int
 ) -> None:
@@ -77,7 +71,6 @@ def look_items(
 
 
 @wp.kernel
-@no_type_check
 def pull_items(scene: Scene, maps: Maps, pull: Pull, first: int, stop: int) -> None:
     """Gradients of the vertices of some items."""
     if pull.has_image:

@@ -1,7 +1,4 @@
-# pyright: basic, reportInvalidTypeForm=false
 """Warp kernel of the trilinear lookup in a volume, with its gradient."""
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -11,7 +8,6 @@ BRICK = wp.constant(3)  # bits: side of the bricks that are known to be constant
 
 
 @wp.struct
-@no_type_check
 class Field:
     """A volume and the bricks in which it changes."""
 
@@ -22,7 +18,6 @@ class Field:
 
 
 @wp.func
-@no_type_check
 def interpolate(f: Field, at: wp.vec3i, t: wp.vec3) -> wp.vec4:
     """Change with x, y and z [per cell], and the value, at the fraction `t` of a cell."""
     x = at[0]
@@ -50,7 +45,6 @@ def interpolate(f: Field, at: wp.vec3i, t: wp.vec3) -> wp.vec4:
 
 
 @wp.kernel
-@no_type_check
 def lookup(
     f: Field,
     points: wp.array(dtype=wp.vec3),

@@ -1,4 +1,3 @@
-# pyright: basic, reportInvalidTypeForm=false
 """Warp kernels that lower a volume where a body is deeper or nearer; see `bodies`.
 
 Places are measured in blocks of two along each axis. Which of a block's places can gain is known
@@ -6,8 +5,6 @@ from a leaf that is near (that of a block beside); for these the tree is searche
 the eight places know together. Nothing is left out that the rounding of distances might hide: the
 least distance is the same bits whatever the tree, the order of the search or what was known.
 """
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -22,21 +19,18 @@ MORES = wp.constant(Eight(*[0.0021] * 8))  # 0.002 cells more; rounding is ten t
 
 
 @wp.func
-@no_type_check
 def corner(k: int) -> wp.vec3i:
     """Place in a block."""
     return wp.vec3i(k >> 2, (k >> 1) & 1, k & 1)
 
 
 @wp.func
-@no_type_check
 def place_of(w: Work, at: wp.vec3i) -> int:
     """Index of a place of the box in `steps`."""
     return (at[0] * w.size[2] + at[2]) * (w.size[1] + 1) + at[1]
 
 
 @wp.func
-@no_type_check
 def add_up(w: Work, x: int, z: int, block: int) -> None:
     """Turn the steps along a column into winding numbers, positive inside, and mark its blocks."""
     if x >= w.size[0] or z >= w.size[2]:
@@ -52,7 +46,6 @@ def add_up(w: Work, x: int, z: int, block: int) -> None:
 
 
 @wp.func
-@no_type_check
 def open_to(w: Work, at: wp.vec3i, near: bool, guess: int) -> float:
     """Squared distance below which a face lowers the field at a place; negative for none.
 
@@ -82,7 +75,6 @@ def open_to(w: Work, at: wp.vec3i, near: bool, guess: int) -> float:
 
 
 @wp.func
-@no_type_check
 def put(w: Work, at: wp.vec3i, known: float) -> None:
     """Lower the field at one place."""
     g = w.low + at
@@ -95,14 +87,12 @@ def put(w: Work, at: wp.vec3i, known: float) -> None:
 
 
 @wp.func
-@no_type_check
 def center(at: wp.vec3i) -> wp.vec3:
     """A place in single precision."""
     return wp.vec3(float(at[0]), float(at[1]), float(at[2]))
 
 
 @wp.func
-@no_type_check
 def nearest_of(w: Work, p: wp.vec3, guess: int, block: int) -> int:
     """Of the leaves near the block before and those beside, the one that is nearest to a point."""
     if w.beside == 0:
@@ -125,7 +115,6 @@ def nearest_of(w: Work, p: wp.vec3, guess: int, block: int) -> int:
 
 
 @wp.func
-@no_type_check
 def farthest(known: Eight) -> float:
     """The largest of eight numbers."""
     most = known[0]
@@ -135,7 +124,6 @@ def farthest(known: Eight) -> float:
 
 
 @wp.func
-@no_type_check
 def search(w: Work, low: wp.vec3, best: Eight, guess: int, first: int) -> tuple[Eight, int]:
     """Least squared distances at the places of a block, and a leaf that is near its last place.
 
@@ -171,7 +159,6 @@ def search(w: Work, low: wp.vec3, best: Eight, guess: int, first: int) -> tuple[
 
 
 @wp.func
-@no_type_check
 def measure(w: Work, at: wp.vec3i, near: bool, guess: int, first: int) -> int:
     """Lower the field in one block; gives a leaf that is near."""
     known = Eight()
@@ -187,7 +174,6 @@ def measure(w: Work, at: wp.vec3i, near: bool, guess: int, first: int) -> int:
 
 
 @wp.kernel
-@no_type_check
 def blocks(w: Work) -> None:
     """Lower the field along two by two columns of the body's box."""
     column = wp.tid()

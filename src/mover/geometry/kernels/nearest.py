@@ -1,7 +1,4 @@
-# pyright: basic, reportInvalidTypeForm=false
 """Warp kernel of the nearest points of scaled clouds."""
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -13,7 +10,6 @@ SLACK = wp.constant(1.0001)  # of squared distances, so that rounding skips no b
 
 
 @wp.struct
-@no_type_check
 class Cloud:
     """Points of each object in the order of their boxes, and the boxes of leaves and groups."""
 
@@ -26,7 +22,6 @@ class Cloud:
 
 
 @wp.struct
-@no_type_check
 class Query:
     """A place in the axes of an object, and the object's size."""
 
@@ -36,7 +31,6 @@ class Query:
 
 
 @wp.func
-@no_type_check
 def to_box(q: Query, low: wp.vec3, high: wp.vec3) -> float:
     """Squared distance to a scaled box."""
     a = wp.cw_mul(low, q.scale) - q.place
@@ -46,7 +40,6 @@ def to_box(q: Query, low: wp.vec3, high: wp.vec3) -> float:
 
 
 @wp.func
-@no_type_check
 def in_leaf(c: Cloud, q: Query, leaf: int, best: float, place: int) -> tuple[float, int]:
     """The nearest point of a leaf, if nearer than the best: squared distance and place."""
     for k in range(leaf * FAN, wp.min(leaf * FAN + FAN, c.points.shape[1])):
@@ -58,7 +51,6 @@ def in_leaf(c: Cloud, q: Query, leaf: int, best: float, place: int) -> tuple[flo
 
 
 @wp.func
-@no_type_check
 def in_group(c: Cloud, q: Query, group: int, best: float, place: int) -> tuple[float, int]:
     """The same for a group of leaves."""
     for leaf in range(group * FAN, wp.min(group * FAN + FAN, c.leaf_low.shape[1])):
@@ -68,7 +60,6 @@ def in_group(c: Cloud, q: Query, group: int, best: float, place: int) -> tuple[f
 
 
 @wp.func
-@no_type_check
 def nearest_group(c: Cloud, q: Query) -> int:
     """The group whose box is nearest; the first of those equally near."""
     first = int(0)
@@ -82,7 +73,6 @@ def nearest_group(c: Cloud, q: Query) -> int:
 
 
 @wp.func
-@no_type_check
 def nearest_of(c: Cloud, q: Query, guess: int) -> int:
     """Where the nearest point is; the first of those equally near. Any guess gives the same."""
     best = FAR
@@ -102,7 +92,6 @@ def nearest_of(c: Cloud, q: Query, guess: int) -> int:
 
 
 @wp.kernel
-@no_type_check
 def nearest(
     c: Cloud,
     query: wp.array2d(dtype=wp.vec3),

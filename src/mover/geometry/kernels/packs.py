@@ -1,4 +1,3 @@
-# pyright: basic, reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportReturnType=false
 """Squared distances to eight boxes or eight triangles at once, in the C++ that kernels become.
 
 A compiler turns loops over eight into single instructions of a CPU; written in Warp, the same takes
@@ -13,8 +12,6 @@ the other edges. Slabs: leaf i is at 8 i + j, j = 0..2 the normal of a leaf, 3 w
 plane is, 4 half its thickness. The functions are in a class, because Warp allows them no second
 decorator.
 """
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -277,7 +274,6 @@ ENTER = """
 """
 
 
-@no_type_check
 class Native:
     """What is written in C++."""
 

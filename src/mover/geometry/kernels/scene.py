@@ -1,13 +1,9 @@
-# pyright: basic, reportInvalidTypeForm=false
 """What the kernels read, their working memory and what they write."""
-
-from typing import no_type_check
 
 import warp as wp
 
 
 @wp.struct
-@no_type_check
 class Scene:
     """Items with their topologies and windows; item i has topology and window i % views."""
 
@@ -38,7 +34,6 @@ class Scene:
 
 
 @wp.struct
-@no_type_check
 class Scratch:
     """Working memory; `near`, `far` and `pairs` are zero before and after."""
 
@@ -64,7 +59,6 @@ class Scratch:
 
 
 @wp.struct
-@no_type_check
 class Maps:
     """What is drawn, without the border; a pixel that nothing covers is left as it is."""
 
@@ -89,7 +83,6 @@ class Maps:
 
 
 @wp.struct
-@no_type_check
 class Pull:
     """Gradients of the maps, on their way to the vertices."""
 

@@ -1,11 +1,8 @@
-# pyright: basic, reportInvalidTypeForm=false, reportGeneralTypeIssues=false
 """A triangle's runs of pixel centres, row by row.
 
 The order of the operations is that of the reference in torch, and products are not fused with sums,
 so that both decide alike for centres on an edge.
 """
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -20,7 +17,6 @@ HALF = wp.constant(wp.uint64(32))
 
 
 @wp.struct
-@no_type_check
 class Side:
     """An edge of a triangle from its upper to its lower vertex."""
 
@@ -32,7 +28,6 @@ class Side:
 
 
 @wp.struct
-@no_type_check
 class Triangle:
     """A triangle cut by rows of pixel centres."""
 
@@ -51,7 +46,6 @@ class Triangle:
 
 
 @wp.func
-@no_type_check
 def on_screen(p: wp.vec3, k: wp.vec4) -> wp.vec3:
     """Column, row [px] and inverse depth [1/m] of a point; zeros where it is not drawn."""
     q = 1.0 / wp.max(p[2], NEAR)
@@ -63,7 +57,6 @@ def on_screen(p: wp.vec3, k: wp.vec4) -> wp.vec3:
 
 
 @wp.func
-@no_type_check
 def signed_area(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
     """Twice the area [px²]: negative for fronts, positive for backs, 0 if not drawn."""
     if wp.min(a[2], wp.min(b[2], c[2])) == 0.0:
@@ -72,7 +65,6 @@ def signed_area(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
 
 
 @wp.func
-@no_type_check
 def side(a: wp.vec3, b: wp.vec3) -> Side:
     """The edge from `a` down to `b`."""
     drop = wp.max(b[1] - a[1], TINY)
@@ -86,14 +78,12 @@ def side(a: wp.vec3, b: wp.vec3) -> Side:
 
 
 @wp.func
-@no_type_check
 def is_above(a: wp.vec3, b: wp.vec3, i: wp.int64, j: wp.int64) -> bool:
     """Whether vertex i at `a` comes before vertex j at `b` from the top; ties by index."""
     return a[1] < b[1] or (a[1] == b[1] and i < j)
 
 
 @wp.func
-@no_type_check
 def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, face: wp.vec3l, box: wp.vec4i) -> Triangle:
     """Sort the vertices from the top and find the rows.
 
@@ -128,7 +118,6 @@ def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, face: wp.vec3l, box: wp.vec4i) 
 
 
 @wp.struct
-@no_type_check
 class Run:
     """What a row cuts out of a triangle."""
 
@@ -143,7 +132,6 @@ class Run:
 
 
 @wp.func
-@no_type_check
 def run_of(t: Triangle, row: int, left: int, right: int) -> Run:
     """The pixels of a row that cuts the triangle, from column `left` to before `right`."""
     y = float(row) + 0.5
@@ -170,7 +158,6 @@ def run_of(t: Triangle, row: int, left: int, right: int) -> Run:
 
 
 @wp.func
-@no_type_check
 def fill(keys: wp.array(dtype=wp.uint64), start: int, r: Run, tag: int) -> None:
     """Raise the keys of a run: where its key is greater than the pixel's it wins.
 
@@ -191,7 +178,6 @@ def fill(keys: wp.array(dtype=wp.uint64), start: int, r: Run, tag: int) -> None:
 
 
 @wp.func
-@no_type_check
 def paint(scene: Scene, scratch: Scratch, t: Triangle, place: wp.vec3i, near: bool) -> None:
     """Draw one row of a triangle.
 

@@ -1,11 +1,8 @@
-# pyright: basic, reportInvalidTypeForm=false
 """Depth of the surface that a pixel sees, and its gradient.
 
 The depth itself is that of the run of pixels: in single precision it is nearer to the exact value
 than the plane through the vertices, from which the gradient comes.
 """
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -19,14 +16,12 @@ HALF = wp.constant(wp.uint64(32))
 
 
 @wp.func
-@no_type_check
 def face_of(key: wp.uint64) -> int:
     """Face that won a pixel."""
     return int(key & LOW) - 1
 
 
 @wp.func
-@no_type_check
 def inverse_depth(key: wp.uint64, farthest: bool) -> float:
     """Inverse depth [1/m] of the run that won a pixel."""
     flip = wp.where(farthest, FULL, wp.uint32(0))
@@ -34,7 +29,6 @@ def inverse_depth(key: wp.uint64, farthest: bool) -> float:
 
 
 @wp.func
-@no_type_check
 def item_of(scene: Scene, pixel: int) -> int:
     """Item that a pixel of the windows belongs to."""
     border = 2 * scene.border
@@ -42,7 +36,6 @@ def item_of(scene: Scene, pixel: int) -> int:
 
 
 @wp.func
-@no_type_check
 def ray_of(scene: Scene, pixel: int) -> wp.vec3:
     """Ray through the centre of a pixel of the windows, with a depth of 1."""
     wide = scene.width - 2 * scene.border
@@ -54,7 +47,6 @@ def ray_of(scene: Scene, pixel: int) -> wp.vec3:
 
 
 @wp.func
-@no_type_check
 def show_pixel(maps: Maps, pixel: int, near: wp.uint64, far: wp.uint64) -> None:
     """Write the maps of one pixel from its winners."""
     if near != wp.uint64(0):
@@ -72,7 +64,6 @@ def show_pixel(maps: Maps, pixel: int, near: wp.uint64, far: wp.uint64) -> None:
 
 
 @wp.func
-@no_type_check
 def pull_pixel(scene: Scene, maps: Maps, pull: Pull, pixel: int) -> None:
     """Add the gradients of both depths of a pixel to the vertices."""
     if maps.covered[pixel]:
@@ -85,7 +76,6 @@ def pull_pixel(scene: Scene, maps: Maps, pull: Pull, pixel: int) -> None:
 
 
 @wp.func
-@no_type_check
 def pull_depth(
     scene: Scene, pixel: int, face: int, z: float, gradient: float, grads: wp.array(dtype=wp.vec3)
 ) -> None:

@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mover.geometry.kernels.start import kernels, launch, name_of, started
 from mover.geometry.raster import draw
 from mover.geometry.raster.records import Crops, Depths, Layers, Maps, Topology
+from mover.geometry.warp_start import kernels, launch, name_of, started
 
 __all__ = [
     "Crops",

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mover.geometry.kernels.start import (
+from mover.geometry.raster.records import Crops, Cuts, Maps, Topology, Trace
+from mover.geometry.warp_start import (
     filled,
     kernels,
     launch,
@@ -24,7 +25,6 @@ from mover.geometry.kernels.start import (
     started,
     threads,
 )
-from mover.geometry.raster.records import Crops, Cuts, Maps, Topology, Trace
 
 BORDER = 1  # [px], so that an outline just outside the window still moves the window's pixels
 NOWHERE, FRONT, BEHIND = 0, 1, 2  # where backs are drawn, as in `kernels.grid`

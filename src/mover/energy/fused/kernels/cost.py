@@ -1,11 +1,8 @@
-# pyright: basic, reportInvalidTypeForm=false
 """Eq. 1 in its robust form, with its gradient, for one item after the other: for CPUs.
 
 All terms and the change of each with the pose are found in one go, in memory that stays in the
 cache; no image is kept. Items share nothing, so that results do not depend on who has them.
 """
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -54,7 +51,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False, "optimization
 
 
 @wp.func
-@no_type_check
 def draw_outline(given: Given, work: Workspace, p: Pose, box: wp.vec4i) -> int:
     """The sum of the squares under each shift, in `squares`; the number of cuts that count."""
     things = given.things.starts.shape[0] - 1
@@ -69,7 +65,6 @@ def draw_outline(given: Given, work: Workspace, p: Pose, box: wp.vec4i) -> int:
 
 
 @wp.func
-@no_type_check
 def outline_cost(given: Given, work: Workspace, p: Pose, number: int) -> float:
     """The silhouette term under a shift, by its number."""
     things = given.things.starts.shape[0] - 1
@@ -79,7 +74,6 @@ def outline_cost(given: Given, work: Workspace, p: Pose, number: int) -> float:
 
 
 @wp.func
-@no_type_check
 def choose(given: Given, work: Workspace, p: Pose, e: Extent) -> int:
     """The number of the shift at which box and silhouette cost least."""
     best = int(0)
@@ -96,7 +90,6 @@ def choose(given: Given, work: Workspace, p: Pose, e: Extent) -> int:
 
 
 @wp.func
-@no_type_check
 def look_depth(
     given: Given, work: Workspace, p: Pose, box: wp.vec4i, neither: int
 ) -> tuple[float, Slope]:
@@ -120,7 +113,6 @@ def look_depth(
 
 
 @wp.func
-@no_type_check
 def look(given: Given, work: Workspace, answer: Answer, p: Pose) -> None:
     """The terms of the image, and that of the depth order."""
     w = given.weights
@@ -149,7 +141,6 @@ def look(given: Given, work: Workspace, answer: Answer, p: Pose) -> None:
 
 
 @wp.func
-@no_type_check
 def feel(given: Given, answer: Answer, p: Pose) -> None:
     """The terms of the people, but for the depth order."""
     w = given.weights
@@ -166,7 +157,6 @@ def feel(given: Given, answer: Answer, p: Pose) -> None:
 
 
 @wp.func
-@no_type_check
 def cost_one(given: Given, work: Workspace, answer: Answer, item: int) -> None:
     """All terms of one item."""
     p = pose_of(given, answer.layout, item)
@@ -188,7 +178,6 @@ def cost_one(given: Given, work: Workspace, answer: Answer, item: int) -> None:
 
 
 @wp.kernel
-@no_type_check
 def cost_items(given: Given, work: Workspace, answer: Answer, first: int, stop: int) -> None:
     """All terms of some items, in their order."""
     for i in range(first, stop):

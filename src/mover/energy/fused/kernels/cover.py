@@ -1,12 +1,9 @@
-# pyright: basic, reportInvalidTypeForm=false
 """Which pixels an item covers, from its outline alone.
 
 The number of fronts on a pixel's ray is the number of times that the outline, the edges between a
 front and what is not, is entered on the way from the left. So no triangle is drawn. The edges are
 cut by rows as in `spans`.
 """
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -22,7 +19,6 @@ BYTE, ALL = wp.constant(wp.uint64(255)), wp.constant(wp.uint64(0xFFFFFFFFFFFFFFF
 
 
 @wp.struct
-@no_type_check
 class Extent:
     """Where an item is on the screen."""
 
@@ -36,7 +32,6 @@ class Extent:
 
 
 @wp.func
-@no_type_check
 def put(given: Given, work: Workspace, p: Pose) -> Extent:
     """Put the vertices before the camera and on the screen."""
     low = wp.vec2(FAR, FAR)
@@ -76,7 +71,6 @@ def put(given: Given, work: Workspace, p: Pose) -> Extent:
 
 
 @wp.func
-@no_type_check
 def face_all(given: Given, work: Workspace, p: Pose) -> int:
     """Tell fronts from backs; the number of faces that are neither."""
     neither = int(0)
@@ -94,7 +88,6 @@ def face_all(given: Given, work: Workspace, p: Pose) -> int:
 
 
 @wp.func
-@no_type_check
 def wall(work: Workspace, i: int, j: int) -> None:
     """Let the layers change where rows cross the edge of a front that runs from i to j.
 
@@ -121,7 +114,6 @@ def wall(work: Workspace, i: int, j: int) -> None:
 
 
 @wp.func
-@no_type_check
 def walls(given: Given, work: Workspace, p: Pose, side: wp.int8) -> int:
     """Enter the outline of the fronts, or of the backs; the number of its edges, in `queue`."""
     n = int(0)
@@ -140,7 +132,6 @@ def walls(given: Given, work: Workspace, p: Pose, side: wp.int8) -> int:
 
 
 @wp.func
-@no_type_check
 def flood(
     given: Given, work: Workspace, p: Pose, box: wp.vec4i, bits: wp.array(dtype=wp.uint64)
 ) -> None:
@@ -179,7 +170,6 @@ def flood(
 
 
 @wp.func
-@no_type_check
 def add(given: Given, work: Workspace, begin: int, end: int) -> None:
     """Add what covering a run of pixels changes, under each shift."""
     things = given.things.starts.shape[0] - 1
@@ -190,7 +180,6 @@ def add(given: Given, work: Workspace, begin: int, end: int) -> None:
 
 
 @wp.func
-@no_type_check
 def mark(bits: wp.array(dtype=wp.uint64), start: int, begin: int, end: int) -> None:
     """Set the bits from `begin` to before `end` in the words of a row."""
     for k in range(begin >> 6, ((end - 1) >> 6) + 1):
@@ -201,7 +190,6 @@ def mark(bits: wp.array(dtype=wp.uint64), start: int, begin: int, end: int) -> N
 
 
 @wp.func
-@no_type_check
 def is_marked(work: Workspace, bits: wp.array(dtype=wp.uint64), row: int, column: int) -> bool:
     """Whether the bit of a pixel is set."""
     word = bits[row * work.across + (column >> 6)]
@@ -209,7 +197,6 @@ def is_marked(work: Workspace, bits: wp.array(dtype=wp.uint64), row: int, column
 
 
 @wp.func
-@no_type_check
 def clear(work: Workspace, bits: wp.array(dtype=wp.uint64), box: wp.vec4i) -> None:
     """Leave no marks."""
     for row in range(box[0], box[1]):

@@ -1,7 +1,4 @@
-# pyright: basic, reportInvalidTypeForm=false, reportGeneralTypeIssues=false
 """What the kernel of Eq. 1 knows of the objects, its working memory, and what it answers."""
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -19,7 +16,6 @@ Weights = wp.types.vector(length=8, dtype=wp.float32)
 
 
 @wp.struct
-@no_type_check
 class Things:
     """The objects one after the other, without padding; numbers count within an object."""
 
@@ -33,7 +29,6 @@ class Things:
 
 
 @wp.struct
-@no_type_check
 class Windows:
     """What the image says, on grids with a border, in which nothing is known."""
 
@@ -65,7 +60,6 @@ class Windows:
 
 
 @wp.struct
-@no_type_check
 class People:
     """What the people say."""
 
@@ -83,7 +77,6 @@ class People:
 
 
 @wp.struct
-@no_type_check
 class Given:
     """Everything that stays as it is while the objects move."""
 
@@ -113,7 +106,6 @@ class Given:
 
 
 @wp.struct
-@no_type_check
 class Workspace:
     """Working memory of a thread, for one item at a time; all but the lists is zero in between."""
 
@@ -147,7 +139,6 @@ class Workspace:
 
 
 @wp.struct
-@no_type_check
 class Answer:
     """Prices of the items, with their weights, and how they change."""
 
@@ -164,7 +155,6 @@ class Answer:
 
 
 @wp.struct
-@no_type_check
 class Pose:
     """Where an item stands; vectors in its own axes have its size but not its place."""
 
@@ -183,7 +173,6 @@ class Pose:
 
 
 @wp.func
-@no_type_check
 def pose_of(given: Given, layout: wp.array2d(dtype=wp.float32), item: int) -> Pose:
     """The pose of a row of the layout."""
     p = Pose()
@@ -200,7 +189,6 @@ def pose_of(given: Given, layout: wp.array2d(dtype=wp.float32), item: int) -> Po
 
 
 @wp.func
-@no_type_check
 def slope_of(force: wp.vec3, arm: wp.vec3) -> Slope:
     """How a cost changes with the pose, from its change with a point, all in the item's axes."""
     turn = arm[2] * force[0] - arm[0] * force[2]
@@ -209,7 +197,6 @@ def slope_of(force: wp.vec3, arm: wp.vec3) -> Slope:
 
 
 @wp.func
-@no_type_check
 def say(answer: Answer, p: Pose, term: int, cost: float, slope: Slope) -> None:
     """Enter a term, with its weight; the slope of the place is in the item's axes."""
     t = p.turn * wp.vec3(slope[0], slope[1], slope[2])

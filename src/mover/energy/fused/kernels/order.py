@@ -1,7 +1,4 @@
-# pyright: basic, reportInvalidTypeForm=false, reportGeneralTypeIssues=false
 """The cost of depths out of their bounds (`terms.depth`, robust form) and its gradient."""
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -14,7 +11,6 @@ UNKNOWN = 1.0e29  # [m], a lower bound above it stands for a pixel that has none
 
 
 @wp.func
-@no_type_check
 def draw_fronts(given: Given, work: Workspace, p: Pose, box: wp.vec4i) -> None:
     """Draw the fronts in a box."""
     first = given.things.starts[p.thing, FACES]
@@ -32,7 +28,6 @@ def draw_fronts(given: Given, work: Workspace, p: Pose, box: wp.vec4i) -> None:
 
 
 @wp.func
-@no_type_check
 def pull_depth(work: Workspace, p: Pose, corner: wp.vec3i, ray: wp.vec3, z: float) -> Slope:
     """Change of the depth of a ray with the pose, as in `surface.pull_depth`."""
     a = work.scene.verts[corner[0]]
@@ -47,7 +42,6 @@ def pull_depth(work: Workspace, p: Pose, corner: wp.vec3i, ray: wp.vec3, z: floa
 
 
 @wp.func
-@no_type_check
 def pixel_cost(
     given: Given, work: Workspace, p: Pose, at: wp.vec2i, code: wp.uint64
 ) -> tuple[float, Slope]:
@@ -70,7 +64,6 @@ def pixel_cost(
 
 
 @wp.func
-@no_type_check
 def depth_cost(
     given: Given, work: Workspace, p: Pose, box: wp.vec4i, closed: bool
 ) -> tuple[wp.float64, Slope]:

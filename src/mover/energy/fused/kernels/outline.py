@@ -1,10 +1,7 @@
-# pyright: basic, reportInvalidTypeForm=false
 """The cost of a silhouette (`terms.silhouette`) and its gradient, from the outline alone.
 
 The pixels that the outline moves are counted anew; of the others only those that are covered.
 """
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -24,7 +21,6 @@ from mover.geometry.kernels.contour import (
 
 
 @wp.func
-@no_type_check
 def edge_of_outline(given: Given, work: Workspace, p: Pose, e: int) -> Contour:
     """An edge between a front and what is none."""
     edge = given.things.edges[e]
@@ -36,7 +32,6 @@ def edge_of_outline(given: Given, work: Workspace, p: Pose, e: int) -> Contour:
 
 
 @wp.func
-@no_type_check
 def enter(given: Given, work: Workspace, p: Pose, edges: int) -> int:
     """List the cuts of pairs of a covered and an uncovered centre; their number.
 
@@ -60,7 +55,6 @@ def enter(given: Given, work: Workspace, p: Pose, edges: int) -> int:
 
 
 @wp.func
-@no_type_check
 def parts(work: Workspace, c: Contour, g: Gap, line: int) -> bool:
     """Whether the inner centre is covered and the outer one is not."""
     beyond = g.place + c.outward
@@ -72,7 +66,6 @@ def parts(work: Workspace, c: Contour, g: Gap, line: int) -> bool:
 
 
 @wp.func
-@no_type_check
 def list_cuts(work: Workspace, found: int) -> int:
     """Keep the cuts that count, and add up what they change; their number."""
     n = int(0)
@@ -94,7 +87,6 @@ def list_cuts(work: Workspace, found: int) -> int:
 
 
 @wp.func
-@no_type_check
 def on_grid(work: Workspace, pixel: int) -> int:
     """The pixel of the grid for one of the window."""
     border = work.scene.border
@@ -103,7 +95,6 @@ def on_grid(work: Workspace, pixel: int) -> int:
 
 
 @wp.func
-@no_type_check
 def pull_cuts(given: Given, work: Workspace, p: Pose, cuts: int, number: int) -> Slope:
     """Change of the sum of squares under a shift, by its number, with the pose."""
     total = Slope()
@@ -134,7 +125,6 @@ def pull_cuts(given: Given, work: Workspace, p: Pose, cuts: int, number: int) ->
 
 
 @wp.func
-@no_type_check
 def pane_of(given: Given, work: Workspace, p: Pose, number: int) -> int:
     """Where the masks under a shift, by its number, begin."""
     things = given.things.starts.shape[0] - 1
@@ -142,7 +132,6 @@ def pane_of(given: Given, work: Workspace, p: Pose, number: int) -> int:
 
 
 @wp.func
-@no_type_check
 def add_cuts(given: Given, work: Workspace, p: Pose, cuts: int) -> None:
     """Add what the outline changes to `squares`; what it adds to pixels is kept by cuts only."""
     for i in range(cuts):

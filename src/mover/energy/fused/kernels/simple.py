@@ -1,7 +1,4 @@
-# pyright: basic, reportInvalidTypeForm=false
 """The costs of boxes, sizes, distances and headings (robust form) and their gradients."""
-
-from typing import no_type_check
 
 import warp as wp
 
@@ -27,7 +24,6 @@ from mover.geometry.kernels.nearest import Query, nearest_of
 
 
 @wp.func
-@no_type_check
 def side_of_box(
     given: Given, work: Workspace, p: Pose, v: int, k: int, wider: float
 ) -> tuple[float, Slope]:
@@ -55,7 +51,6 @@ def side_of_box(
 
 
 @wp.func
-@no_type_check
 def box_cost(
     given: Given, work: Workspace, p: Pose, e: Extent, wider: float
 ) -> tuple[float, Slope]:
@@ -68,7 +63,6 @@ def box_cost(
 
 
 @wp.func
-@no_type_check
 def scale_cost(given: Given, logs: wp.vec3) -> tuple[float, Slope]:
     """How far the size is from the initial one, see `terms.scale`."""
     mean = (logs[0] + logs[1] + logs[2]) / 3.0
@@ -86,7 +80,6 @@ def scale_cost(given: Given, logs: wp.vec3) -> tuple[float, Slope]:
 
 
 @wp.func
-@no_type_check
 def distance_cost(given: Given, p: Pose) -> tuple[float, Slope]:
     """Price of another distance from the camera than the given one."""
     squared = wp.length_sq(p.place)
@@ -99,7 +92,6 @@ def distance_cost(given: Given, p: Pose) -> tuple[float, Slope]:
 
 
 @wp.func
-@no_type_check
 def heading_cost(given: Given, p: Pose) -> tuple[float, Slope]:
     """One less the cosine between a seat and its sitters."""
     x = given.facts[p.thing, FACE_X]
@@ -120,7 +112,6 @@ EPS = wp.constant(1.0e-12)  # [m²], as in `minimize.safe_norm`
 
 
 @wp.func
-@no_type_check
 def contact_cost(given: Given, p: Pose) -> tuple[float, Slope]:
     """Robust cost of the distance of the skin that touches, and its change."""
     total = wp.float64(0.0)
@@ -156,7 +147,6 @@ def contact_cost(given: Given, p: Pose) -> tuple[float, Slope]:
 
 
 @wp.func
-@no_type_check
 def collision_cost(given: Given, p: Pose) -> tuple[float, Slope]:
     """Sum of the squared depths of the surface inside bodies [m²], and its change."""
     total = wp.float64(0.0)

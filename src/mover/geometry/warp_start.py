@@ -16,7 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-log = logging.getLogger(__name__)
+KERNELS = "mover.geometry.kernels"
+log = logging.getLogger(KERNELS)
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
 _lock = RLock()  # of all that is done once; `cache` alone lets two threads do it
 
@@ -36,7 +37,7 @@ def _started() -> ModuleType:
     return wp
 
 
-def kernels(name: str, device: str, package: str = __package__ or "") -> ModuleType:
+def kernels(name: str, device: str, package: str = KERNELS) -> ModuleType:
     """The module of that name in a package of kernels, compiled for the device.
 
     The first call on a machine compiles (seconds, told before by a line of the log, which the
