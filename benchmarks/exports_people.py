@@ -24,8 +24,7 @@ from mover.bodies.skinning import open_body, zero_pose
 from mover.core.colours import colour
 from mover.core.types import BodyPose, Scene
 from mover.io.capture.scene_file import read_scene
-from mover.io.export.clips import HEIGHT_STEP, MEAN_HEIGHT, PELVIS, RATE
-from mover.io.export.humanoid import MOCAP_STEPS
+from mover.io.export.humanoid import HEIGHT_STEP, MEAN_HEIGHT, MOCAP_STEPS, PELVIS, RATE
 from mover.io.export.solids import floor_height
 
 STEPS = (0.0, 0.45, 0.9)  # moments that are drawn, as shares of the span around the frame

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mover.core.errors import InputError
 from mover.core.types import STILL, Capture
 from mover.geometry.path import from_reference, is_still, poses_at, scaled, to_reference
-from mover.io.capture.cameras_file import path_of, path_to_arrays
+from mover.io.capture.camera_file import path_of, path_to_arrays
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.merge import import_into
 from mover.io.capture.parts import Parts

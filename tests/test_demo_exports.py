@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-import mover.io.export.convex
+import mover.io.export.solids
 from mover.app.cli import run_command
 from mover.app.results import labels_of, write_truth
 from mover.core.records import rows_of
@@ -44,7 +44,7 @@ def out(demo_room: KnownRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_mesh(piece.mesh, folder / "watertight" / f"{piece.id}.glb")
     write_labels(labels_of(finished_room(folder), Run(folder)), folder / "contacts.npz")
     with pytest.MonkeyPatch.context() as patch:  # CoACD has a test of its own
-        patch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+        patch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
         asked = [str(folder), "--to", *names("export"), "--walls", "guess", "--up", "z"]
         assert run_command("export", asked) == 0
     return folder

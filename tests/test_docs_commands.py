@@ -93,11 +93,11 @@ def test_a_command_in_a_block_is_understood(line: str):
 ELSEWHERE = """
 import json, sys, tyro
 from mover.app import results
-from mover.app.cli import batch
+from mover.app.cli import run
 from mover.pipeline.presets import PRESETS
 results.read_config = lambda path: PRESETS["robust"]
 for words in json.loads(sys.argv[1]):
-    batch._parse_batch(words)
+    run._parse_batch(words)
 """
 
 

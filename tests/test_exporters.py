@@ -22,7 +22,7 @@ from furnished import (
 )
 from little_room import walkers
 
-import mover.io.export.convex
+import mover.io.export.solids
 import mover.io.export.usd_mesh
 from mover.app.cli import run_command
 from mover.bodies.skinning import open_body
@@ -305,7 +305,7 @@ def test_keys_stop_where_there_are_enough():
 @pytest.fixture(autouse=True)
 def along_the_axes(monkeypatch: pytest.MonkeyPatch) -> None:
     """CoACD takes seconds for pieces that nobody looks at here."""
-    monkeypatch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+    monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
 
 
 @pytest.fixture(scope="module")
@@ -313,7 +313,7 @@ def cut(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The convex pieces of the room, cut once."""
     folder = tmp_path_factory.mktemp("cut")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+        patch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
         solids_of(scaled(furnished()), Run(folder))
     return folder / "stages"
 

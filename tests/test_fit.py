@@ -362,7 +362,7 @@ def test_models_of_the_users_files_are_fitted_with_hands_and_face(name, tmp_path
 
 @pytest.mark.slow
 def test_the_command_reads_openpose_and_writes_bodies(tmp_path, walk, capsys):
-    from mover.app.cli.fit import fit
+    from mover.app.cli.people import fit
     from mover.io.capture.bodies_file import read_bodies
     from mover.io.capture.camera_file import camera_to_json
 
@@ -387,7 +387,7 @@ def test_the_command_reads_openpose_and_writes_bodies(tmp_path, walk, capsys):
 
 def test_a_second_pass_takes_camera_and_floor_of_a_result(tmp_path):
     """One of camera and result, not both; a floor that is given counts before the result's."""
-    from mover.app.cli.fit import FitArgs, _world
+    from mover.app.cli.people import FitArgs, _world
 
     write_scene(Scene(CAMERA, -1.25, ()), tmp_path / "scene.json")
     camera, ground = _world(FitArgs(Path("k.npz"), room=tmp_path))

@@ -12,10 +12,9 @@ from furnished import write_out
 from little_room import GROUND, box, camera, mesh_of, piece
 
 import mover.evaluate.stability
-from mover.app.apart import Ranges, base_of
 from mover.app.cli import run_command
-from mover.app.held import held_places
-from mover.app.nudge import nudged
+from mover.app.free_places import Ranges, base_of, held_places
+from mover.app.simulate import nudged
 from mover.core.run import Run
 from mover.core.types import Scene, SceneObject
 from mover.evaluate.stability import simulate

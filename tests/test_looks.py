@@ -11,7 +11,7 @@ import trimesh
 from furnished import furnished
 from PIL import Image
 
-import mover.io.export.convex
+import mover.io.export.solids
 from mover.core.types import SceneObject
 from mover.io.export.finished import Finished
 from mover.io.export.looks import looks_of
@@ -27,7 +27,7 @@ Corner = tuple[tuple[float, ...], tuple[int, ...]]
 
 @pytest.fixture(autouse=True)
 def along_the_axes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+    monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
 
 
 def textured(kind: str, mode: str = "RGB") -> trimesh.Trimesh:

@@ -286,8 +286,8 @@ def test_depth_maps_without_a_unit_or_of_another_shape_are_refused(tmp_path: Pat
 
 
 def write_capture_without_scene(folder: Path, seen: Picture) -> None:
+    from mover.io.capture.annotations_file import detections_to_json
     from mover.io.capture.camera_file import camera_to_json
-    from mover.io.capture.objects_file import detections_to_json
     from mover.io.files.fields import write_json
 
     folder.mkdir()

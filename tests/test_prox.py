@@ -23,7 +23,7 @@ from mover.core.errors import InputError
 from mover.core.types import Masks
 from mover.geometry.rle import decode
 from mover.io.capture.bodies_file import read_bodies
-from mover.io.datasets.prox_masks import read_body_index
+from mover.io.datasets.prox_people import read_body_index
 from mover.io.people.values import frame_numbers
 
 FIRST, SECOND = "vicon_03301_01", "vicon_03301_02"

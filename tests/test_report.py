@@ -20,9 +20,8 @@ from PIL import Image, ImageColor
 from mover.app.pictures.overlay import draw_overlay, save_overlay
 from mover.app.report.page import ReportContent, draw_curve, draw_curves, write_report
 from mover.app.report.plan import draw_top, extent_of
-from mover.app.report.scene_view import pack_view
+from mover.app.report.scene_view import pack_view, thin, thin_choice
 from mover.app.report.tables import find_changes, metrics_table, objects_table
-from mover.app.report.vertex_subset import thin, thin_choice
 from mover.core.colours import colour, css
 from mover.core.types import Bodies, Capture, Scene
 from mover.geometry.camera import to_camera, to_world

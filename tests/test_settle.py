@@ -15,7 +15,7 @@ from furnished import furnished, write_out
 from little_room import GROUND, box, camera, mesh_of, piece
 
 import mover.evaluate.stability
-import mover.io.export.convex
+import mover.io.export.solids
 from mover.app.cli import run_command
 from mover.app.simulate import simulation_table
 from mover.core.errors import InputError
@@ -27,10 +27,9 @@ from mover.geometry.placement import place_object
 from mover.geometry.topology import is_closed
 from mover.geometry.watertight import close_mesh
 from mover.io.capture.scene_file import write_scene
-from mover.io.export.convex import ConvexConfig, ConvexInputs, cut_into_convex
 from mover.io.export.finished import read_finished
 from mover.io.export.mjcf import export_mjcf
-from mover.io.export.solids import DENSITY, solids_of
+from mover.io.export.solids import DENSITY, ConvexConfig, ConvexInputs, cut_into_convex, solids_of
 from mover.io.export.urdf import export_urdf
 from mover.io.files.meshes import write_mesh
 
@@ -43,7 +42,7 @@ needs_mujoco = pytest.mark.skipif(
 @pytest.fixture(autouse=True)
 def along_the_axes(monkeypatch: pytest.MonkeyPatch) -> None:
     """CoACD takes seconds where the cuts along the axes leave hollows: it has a test of its own."""
-    monkeypatch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+    monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
 
 
 def manifold(mesh: Mesh) -> Any:

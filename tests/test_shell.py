@@ -12,7 +12,7 @@ import torch
 from furnished import bodies_of, furnished, moving_pose, write_out
 from little_room import GROUND, box, camera, piece, walkers
 
-import mover.io.export.convex
+import mover.io.export.solids
 from mover.app.cli import run_command
 from mover.core.types import Scene
 from mover.io.export.finished import Finished, read_finished
@@ -27,7 +27,7 @@ BACK, LEFT = -5.0, -2.5  # [m], inner faces of the true walls before the room is
 
 @pytest.fixture(autouse=True)
 def along_the_axes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+    monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
 
 
 def room(yaw: float = 0.0, gap: float = 0.03) -> Scene:

@@ -13,16 +13,23 @@ from furnished import bodies_of, furnished, write_out
 from little_room import GROUND, box, camera, mesh_of, piece
 
 import mover.evaluate.stability
-from mover.app.apart import Ranges, apart
 from mover.app.cli import run_command
-from mover.app.nudge import nudged
+from mover.app.free_places import Ranges, apart
+from mover.app.simulate import nudged
 from mover.bodies.skin import PARTS
 from mover.bodies.skinning import open_body, zero_pose
 from mover.core.contact_labels import ContactLabels
 from mover.core.run import Run
 from mover.core.types import Scene
-from mover.evaluate.sitters import MASS, SEAT_SHARE, Load, hardest, loads_of
-from mover.evaluate.stability import SimulatedObject, simulate
+from mover.evaluate.stability import (
+    MASS,
+    SEAT_SHARE,
+    Load,
+    SimulatedObject,
+    hardest,
+    loads_of,
+    simulate,
+)
 from mover.io.capture.scene_file import read_scene, write_scene
 from mover.io.export.contacts import write_labels
 from mover.io.export.finished import read_finished

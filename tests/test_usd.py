@@ -11,7 +11,7 @@ import torch
 from furnished import furnished, two_people, write_out
 from little_room import GROUND, walkers
 
-import mover.io.export.convex
+import mover.io.export.solids
 from mover.core.errors import InputError
 from mover.core.run import Run
 from mover.core.types import Bodies, Scene, Segment
@@ -40,14 +40,14 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The convex pieces of the room, cut once, along the axes only (CoACD takes seconds)."""
     folder = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+        patch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
         solids_of(room(), Run(folder))
     return folder
 
 
 @pytest.fixture
 def out(kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(mover.io.export.convex, "find_spec", lambda _: None)
+    monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
     shutil.copytree(kept / "stages", tmp_path / "out" / "stages")
     return tmp_path / "out"
 

@@ -9,8 +9,7 @@ import torch
 from filmed import FINDERS, Shot, filmed, held, turned, walk, write_film
 from PIL import Image
 
-from mover.app.cli.perceive import PerceiveArgs, perceive_into
-from mover.app.cli.video import ChainArgs, video_to_room
+from mover.app.cli.video import ChainArgs, PerceiveArgs, perceive_into, video_to_room
 from mover.core.errors import InputError
 from mover.core.types import Scene
 from mover.io.capture.bodies_file import read_bodies

@@ -24,10 +24,14 @@ from mover.core.records import fingerprint
 from mover.core.run import Run
 from mover.core.types import Camera, Keypoints, People
 from mover.geometry.rle import decode, joined
+from mover.io.capture.annotations_file import (
+    detections_of,
+    detections_to_json,
+    people_of,
+    people_to_json,
+)
 from mover.io.capture.camera_file import camera_of, camera_to_json
 from mover.io.capture.folder import folder_parts
-from mover.io.capture.objects_file import detections_of, detections_to_json
-from mover.io.capture.people_file import people_of, people_to_json
 from mover.io.capture.scene_file import write_hypotheses, write_scene
 from mover.io.files.cameras import of_view, read_camera_file
 from mover.io.files.depth import find_depth_file, read_depth

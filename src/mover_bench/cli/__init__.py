@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from mover.app.cli import say
 from mover.app.cli.config import Device, parsed, preset_named
-from mover.app.cli.console import say
 from mover.app.cli.run import reconstruct_into
 from mover.core.settings import Seconds, Seed, float_in, int_in
 from mover_bench.studies.args import ExperimentArgs, MakeArgs, StudyArgs

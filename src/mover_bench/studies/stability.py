@@ -4,13 +4,12 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
-from mover.app.nudge import nudged, ranges_in
 from mover.app.results import labels_of
+from mover.app.simulate import nudged, ranges_in
 from mover.core.run import Run
 from mover.core.types import Room, Scene
 from mover.evaluate.explanation import scene_fields
-from mover.evaluate.sitters import loads_in
-from mover.evaluate.stability import SimulatedObject, simulate
+from mover.evaluate.stability import SimulatedObject, loads_in, simulate
 
 
 def measure_stability(truth: Scene, room: Room, run: Run) -> dict[str, Any]:

@@ -4,8 +4,8 @@ import importlib
 import logging
 import sys
 from collections.abc import Callable, Sequence
+from typing import Any
 
-from mover.app.cli.console import say
 from mover.core.errors import InputError
 
 COMMANDS = {
@@ -26,11 +26,11 @@ COMMANDS = {
         "Turn what other tools wrote into a capture folder.",
     ),
     "perceive": (
-        "mover.app.cli.perceive:perceive",
+        "mover.app.cli.video:perceive",
         "From a video to a capture: frames, masks, joints, a first scene.",
     ),
     "layout": (
-        "mover.app.cli.perceive:layout",
+        "mover.app.cli.video:layout",
         "Find a first scene of library furniture in one picture's masks or boxes.",
     ),
     "import-bodies": (
@@ -38,11 +38,11 @@ COMMANDS = {
         "Turn what another tool found of people into bodies.npz or keypoints.npz.",
     ),
     "fit": (
-        "mover.app.cli.fit:fit",
+        "mover.app.cli.people:fit",
         "Fit bodies to the 2D joints of a video.",
     ),
     "check": (
-        "mover.app.cli.check:check",
+        "mover.app.cli.results:check",
         "Validate a capture, list the evidence of each object, draw the initial overlay.",
     ),
     "run": (
@@ -58,7 +58,7 @@ COMMANDS = {
         "Which vertices touch something, by POSA's network or from files.",
     ),
     "evaluate": (
-        "mover.app.cli.check:evaluate",
+        "mover.app.cli.results:evaluate",
         "Compare a result with the truth.",
     ),
     "paper-table": (
@@ -74,23 +74,23 @@ COMMANDS = {
         "Rebuild known rooms with each preset and compare them with the truth.",
     ),
     "export": (
-        "mover.app.cli.export:export",
+        "mover.app.cli.results:export",
         "Write a result for other programs: GLB, USD, MJCF, URDF, PLY, bodies.",
     ),
     "render": (
-        "mover.app.cli.render:render",
+        "mover.app.cli.results:render",
         "Draw a result without a screen: a picture or a film.",
     ),
     "view": (
-        "mover.app.cli.view:view",
+        "mover.app.cli.results:view",
         "Look at a result in the browser, correct it, solve it again.",
     ),
     "simulate": (
-        "mover.app.cli.export:simulate",
+        "mover.app.cli.results:simulate",
         "Let gravity act on a result: how far does each piece move?",
     ),
     "batch": (
-        "mover.app.cli.batch:batch",
+        "mover.app.cli.run:batch",
         "Run thousands of captures; what is finished is not run again.",
     ),
 }
@@ -146,3 +146,10 @@ def command_of(name: str) -> Callable[[Sequence[str]], None]:
     """The function of a command; its module is imported now."""
     module, _, function = COMMANDS[name][0].partition(":")
     return getattr(importlib.import_module(module), function)
+
+
+def say(text: str, stream: Any = None) -> None:  # noqa: ANN401
+    """Write a line to standard output, or to `stream`."""
+    where = stream or sys.stdout
+    where.write(text + "\n")
+    where.flush()

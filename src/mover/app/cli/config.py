@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeVar
 
 import tyro
 
-from mover.app.cli.console import say
+from mover.app.cli import say
 from mover.core.errors import InputError
 from mover.core.settings import check_settings
 from mover.pipeline.presets import PRESETS, Config, with_methods, with_present_flags

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from mover.app.cli import say
 from mover.app.cli.config import parsed
-from mover.app.cli.console import say
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, float_in
 from mover.io.formats import IMPORTED, chosen, listing

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import AvoidSubcommands, Positional, arg
 
+from mover.app.cli import say
 from mover.app.cli.config import parsed, preset_of
-from mover.app.cli.console import say
-from mover.app.cli.fit import NO_VPOSER, Detector, keypoints_at
+from mover.app.cli.people import NO_VPOSER, Detector, keypoints_at
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, int_in
 from mover.fitting.config import FitConfig

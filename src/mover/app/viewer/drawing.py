@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mover.app.report.scene_view import floor_of
-from mover.app.report.vertex_subset import Thinning, thin, thin_choice
+from mover.app.report.scene_view import Thinning, floor_of, thin, thin_choice
 from mover.app.viewer.layers import Layers
 from mover.core.colours import Colour, colour, person_colour
 from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject

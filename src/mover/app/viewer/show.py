@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mover.app.cli.console import say
+from mover.app.cli import say
 from mover.app.cli.run import reconstruct_into
 from mover.app.results import Origin, read_config
 from mover.app.viewer.address import Address

@@ -19,12 +19,10 @@ from mover.core.types import (
 )
 from mover.geometry.path import is_still
 from mover.geometry.rotations import rot_y
+from mover.io.capture.annotations_file import PeopleFile, detections_of, furniture_of, people_of
 from mover.io.capture.bodies_file import bodies_of, read_touch
-from mover.io.capture.camera_file import camera_of
-from mover.io.capture.cameras_file import path_of
-from mover.io.capture.objects_file import detections_of
+from mover.io.capture.camera_file import camera_of, path_of
 from mover.io.capture.parts import Parts
-from mover.io.capture.people_file import PeopleFile, furniture_of, people_of
 from mover.io.capture.plausible import check_plausible
 from mover.io.capture.pose_file import into_camera
 from mover.io.capture.scene_file import hypotheses_of, scene_of

@@ -1,4 +1,4 @@
-"""The camera of camera.json and scene.json."""
+"""The camera of camera.json and scene.json, and where a moving one was (cameras.npz)."""
 
 import dataclasses
 from typing import Any
@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import torch
 from msgspec import Struct
+from numpy.typing import NDArray
 
-from mover.core.types import Camera
+from mover.core.types import STILL, Bodies, Camera, CameraPath
 from mover.geometry.camera import heading, pitch_roll
 from mover.geometry.rotations import rot_y
-from mover.io.files.fields import At, Warn, get, maybe, plain, refuse
+from mover.io.files.fields import LAST_INDEX, At, Warn, array, get, maybe, plain, refuse
 from mover.io.files.schema import Number, Positive, Rows, Side, checked, rotation
 
 LARGEST_AREA = 1 << 28  # [px²]
@@ -86,3 +87,102 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
         "fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2],
         "R_cam_world": plain(camera.R_cam_world),
     }  # fmt: skip
+
+
+# cameras.npz: where a moving camera was in the frames, in any world and any scale.
+
+
+RIGID = 1e-2  # a matrix that is off by more is no rotation
+ZOOM = 0.05  # of the focal length: more is another lens
+STILL_POSES = 1e-9  # poses that differ by less are one
+
+
+def path_of(at: At, camera: Camera, bodies: Bodies | None, warn: Warn) -> CameraPath:
+    """The path of named arrays, in the axes of the reference image's camera.
+
+    Args:
+        at: `frame`, `T_world_camera`; optional `reference` (the frame that the reference image
+            shows, else the first) and `focal` (focal lengths in widths of the image).
+        camera: Of the reference image.
+        bodies: People whose frames must have a pose.
+        warn: Takes what is odd.
+
+    Raises:
+        InputError: If a field is wrong, a body's frame lies outside, or the lens zooms.
+    """
+    frame = array(get(at, "frame"), ("N",), "whole")
+    if not len(frame) or (np.diff(frame) <= 0).any() or frame[0] < 0 or frame[-1] > LAST_INDEX:
+        refuse(get(at, "frame"), f"rising frames from 0 to {LAST_INDEX}")
+    T = _poses(get(at, "T_world_camera"), len(frame))
+    _check_lens(at, len(frame), camera, warn)
+    reference = _reference(at, frame)
+    if bodies is not None:
+        _check_reach(at, frame, bodies)
+    relative = np.linalg.inv(T[reference]) @ T
+    if np.abs(relative - np.eye(4)).max() < STILL_POSES:
+        return STILL
+    R, t = (
+        torch.from_numpy(x.astype(np.float32)) for x in (relative[:, :3, :3], relative[:, :3, 3])
+    )
+    return CameraPath(torch.from_numpy(frame.astype(np.int64)), R, t)
+
+
+def _poses(at: At, count: int) -> NDArray[np.float64]:
+    """Rigid poses, exactly so."""
+    T = array(at, (count, 4, 4)).astype(np.float64)
+    u, size, v = np.linalg.svd(T[:, :3, :3])
+    bad = (np.abs(size - 1) > RIGID).any(1) | (np.linalg.det(T[:, :3, :3]) < 0)
+    bad |= np.abs(T[:, 3] - [0, 0, 0, 1]).max(1) > RIGID
+    if bad.any():
+        which = int(np.argmax(bad))
+        refuse(at, "poses of rotation and translation, last row 0 0 0 1", f"another at [{which}]")
+    T[:, :3, :3], T[:, 3] = u @ v, [0, 0, 0, 1]
+    return T
+
+
+def _reference(at: At, frame: NDArray[Any]) -> int:
+    """Row of the reference image's pose."""
+    given = maybe(at, "reference")
+    if given is None:
+        return 0
+    number = int(array(given, (), "whole"))
+    rows = np.flatnonzero(frame == number)
+    if not len(rows):
+        refuse(given, "a frame that has a pose", f"{number}")
+    return int(rows[0])
+
+
+def _check_lens(at: At, count: int, camera: Camera, warn: Warn) -> None:
+    """One lens sees all frames and the reference image."""
+    given = maybe(at, "focal")
+    if given is None:
+        return
+    focal = array(given, (count,)).astype(np.float64)
+    if focal.min() <= 0 or focal.max() / focal.min() > 1 + ZOOM:
+        found = f"{focal.min():.3g} to {focal.max():.3g}"
+        refuse(given, "one focal length above 0 for all frames (no zoom)", found)
+    own = float(camera.K[0, 0]) / camera.width
+    told = float(np.median(focal))
+    if abs(told / own - 1) > ZOOM:
+        warn(
+            f"{at.file}: its focal length is {told:.3g} widths of the image, that of camera.json"
+            f" {own:.3g}: people's depths fit camera.json"
+        )
+
+
+def _check_reach(at: At, frame: NDArray[Any], bodies: Bodies) -> None:
+    """Each body's frame has a pose, or lies between two."""
+    for number in (int(bodies.frame.min()), int(bodies.frame.max())):
+        if not frame[0] <= number <= frame[-1]:
+            reach = f"frames {frame[0]} to {frame[-1]}"
+            refuse(get(at, "frame"), f"poses for all bodies, also for frame {number}", reach)
+
+
+def path_to_arrays(path: CameraPath) -> dict[str, NDArray[Any]]:
+    """The arrays of a file; its world is that of the reference image's camera."""
+    T = np.tile(np.eye(4), (len(path.frame), 1, 1))
+    T[:, :3, :3] = path.R_reference_camera.numpy()
+    T[:, :3, 3] = path.t_reference_camera.numpy()
+    at_home = np.abs(T - np.eye(4)).max((1, 2))
+    reference = path.frame.numpy()[int(at_home.argmin())]
+    return {"frame": path.frame.numpy(), "T_world_camera": T, "reference": np.array(reference)}

@@ -10,13 +10,16 @@ from typing import Any
 from mover.core.errors import InputError
 from mover.core.types import Camera, Capture, DepthImage
 from mover.geometry.path import is_still
+from mover.io.capture.annotations_file import (
+    detections_to_json,
+    furniture_to_json,
+    image_name,
+    people_to_json,
+)
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.build import build_capture
-from mover.io.capture.camera_file import camera_to_json
-from mover.io.capture.cameras_file import path_to_arrays
-from mover.io.capture.objects_file import detections_to_json, image_name
+from mover.io.capture.camera_file import camera_to_json, path_to_arrays
 from mover.io.capture.parts import Hints, LoadImage, Parts, image_parts
-from mover.io.capture.people_file import furniture_to_json, people_to_json
 from mover.io.capture.scene_file import HYPOTHESES, write_hypotheses, write_scene
 from mover.io.files.depth import (
     DEPTH,

@@ -16,14 +16,13 @@ from mover.core.types import Camera, Capture, Scene
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera, to_world
 from mover.geometry.rotations import rot_y
+from mover.io.capture.annotations_file import detections_of, people_of
 from mover.io.capture.bodies_file import bodies_of, write_bodies
 from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_of, turned
 from mover.io.capture.folder import folder_parts, read_capture, write_trees
-from mover.io.capture.objects_file import detections_of
 from mover.io.capture.pairing import linked, merged, with_links
 from mover.io.capture.parts import Parts
-from mover.io.capture.people_file import people_of
 from mover.io.capture.scene_file import write_scene
 from mover.io.files.fields import At, get, items, maybe, write_json
 from mover.io.files.images import write_image

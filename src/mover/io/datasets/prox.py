@@ -35,8 +35,7 @@ from mover.io.datasets.prox_files import (
     timelines,
     world_of,
 )
-from mover.io.datasets.prox_keypoints import keypoint_trees
-from mover.io.datasets.prox_masks import people_masks
+from mover.io.datasets.prox_people import keypoint_trees, people_masks
 from mover.io.datasets.true_boxes import TrueBox, boxes_scene, read_bbox3d
 from mover.io.files.cameras import tilt_of
 from mover.io.files.fields import At, read_json

@@ -26,9 +26,8 @@ from mover.io.export.gltf import (
     add_stays,
 )
 from mover.io.export.people import FPS, Track, keyframes, tracks_of
-from mover.io.export.posed import all_angles
+from mover.io.export.posed import Skin, all_angles, quaternions, rest_of, skin_for
 from mover.io.export.scene_glb import write_glb
-from mover.io.export.skin import Skin, quaternions, rest_of, skin_for
 
 TOLERANCE = 0.005  # [m]
 MOST = 60  # shapes of one person

@@ -11,8 +11,7 @@ from mover.core.colours import person_colour
 from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals
 from mover.io.export.people import FPS, Track, keyframes, seen_from_to
-from mover.io.export.posed import all_angles
-from mover.io.export.skin import Skin, quaternions, rest_of
+from mover.io.export.posed import Skin, all_angles, quaternions, rest_of
 from mover.io.export.usd_mesh import add_mesh, free_path, pxr, set_points
 
 TOLERANCE = 0.002  # [m], of the straight lines between two samples of time

@@ -28,9 +28,8 @@ from torch import Tensor
 from mover.bodies.smpl_model import FLAT
 from mover.core.errors import InputError
 from mover.io.files.fields import At, refuse
-from mover.io.people.found import Found, Known, joined, people_rows
+from mover.io.people.found import Found, Known, followed, joined, people_rows
 from mover.io.people.lens import assumed_lens
-from mover.io.people.tracks import followed
 from mover.io.people.values import (
     KINDS,
     either,

@@ -16,8 +16,7 @@ from mover.core.types import Keypoints
 from mover.io.files.fields import LARGEST, At, array, choice, get, maybe, refuse
 from mover.io.files.npz import read_npz, write_npz
 from mover.io.formats import chosen
-from mover.io.people.found import Known
-from mover.io.people.tracks import followed
+from mover.io.people.found import Known, followed
 
 LAYOUTS = {name: len(JOINTS[name]) for name in
            ("openpose25", "openpose137", "coco17", "halpe26", "wholebody133")}  # fmt: skip

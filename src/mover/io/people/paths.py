@@ -1,6 +1,6 @@
 """Where a moving camera was, as tools tell it: SLAM, networks that see all frames, body trackers.
 
-Each reader gives the arrays of cameras.npz (`io.capture.cameras_file`): poses from camera to world,
+Each reader gives the arrays of cameras.npz (`io.capture.camera_file`): poses from camera to world,
 in OpenCV's axes, in whatever world and scale; and, where it is told, the focal length in widths of
 the image, which does not change when a tool looks at smaller images. Tools put the principal point
 in the middle, so the image is twice as wide as it. DPVO's rows are x y z and a quaternion x y z w.

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from mover.bodies.smpl_model import FLAT
 from mover.io.files.fields import At
-from mover.io.people.found import Found, Known, joined, people_rows
+from mover.io.people.found import Found, Known, joined, people_of, people_rows
 from mover.io.people.lens import assumed_lens, cameras_of, movement, told_lens, up_of_roots
-from mover.io.people.tracks import people_of
 from mover.io.people.values import (
     angles,
     either,

@@ -1,0 +1,218 @@
+"""`check` before a run; `evaluate`, `export`, `simulate`, `render` and `view` after it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from mover.app.cli import say
+from mover.app.cli.config import parsed
+from mover.app.pictures.config import RenderConfig
+from mover.app.viewer.address import Address
+from mover.core.errors import InputError
+from mover.core.settings import float_in
+from mover.io.formats import chosen, names
+
+
+@dataclass(frozen=True)
+class CheckArgs:
+    """Validate a capture, list the evidence of each object, draw the initial overlay."""
+
+    source: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """The capture folder (or whatever --format reads)."""
+    out: Path = Path("check.png")
+    """The picture of the initial scene over the reference image."""
+    format: str = "folder"
+    """How the capture is written."""
+
+
+@dataclass(frozen=True)
+class EvaluateArgs:
+    """Compare a result with the truth; writes OUT/metrics.json."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder of the result."""
+    truth: Path
+    """Folder with the true scene.json, meshes, and bodies.npz if there are any."""
+    stable: bool = True
+    """Simulate both scenes in MuJoCo (the extra physics) for the share of pieces that stay."""
+
+
+def check(arguments: Sequence[str]) -> None:
+    """`mover check`."""
+    args = parsed(CheckArgs, "mover check", arguments)
+    read = chosen("--format", args.format, "capture")
+    from mover.app.pictures.overlay import save_overlay
+    from mover.io.capture.evidence import evidence_table, gather_evidence
+    from mover.pipeline.believable import warnings_of
+
+    capture = read(args.source)
+    warnings = warnings_of(capture)
+    say(evidence_table(capture, gather_evidence(capture)))
+    save_overlay(capture, args.out)
+    for warning in warnings:
+        say(f"warning: {warning}")
+    say(f"{args.source} is a valid capture; its initial scene is drawn in {args.out}")
+
+
+def evaluate(arguments: Sequence[str]) -> None:
+    """`mover evaluate`."""
+    args = parsed(EvaluateArgs, "mover evaluate", arguments)
+    from mover.evaluate.evaluation import evaluate_folder, table
+
+    say(table(evaluate_folder(args.out, args.truth, physics=args.stable)))
+
+
+# `export` and `simulate`.
+
+
+if TYPE_CHECKING:
+    Target = str
+else:
+    Target = Literal[tuple(names("export"))]  # the table's names are refused or shown by the parser
+
+
+@dataclass(frozen=True)
+class ExportArgs:
+    """Write a result for other programs, into OUT/export."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder of the result."""
+    to: tuple[Target, ...] = ("glb",)
+    """What to write; several with spaces between them."""
+    capture: Path | None = None
+    """Folder of the capture: its bodies.npz tells the parameters of the bodies."""
+    stable: bool = False
+    """Take OUT/stable.json, which `mover simulate --nudge` writes, in place of scene.json."""
+    body: Literal["auto", "skin", "morph", "none"] = "auto"
+    """glb, usd: how people move: on bones, by exact shapes of some frames, or not at all (also
+    mjcf)."""
+    walls: Literal["none", "guess"] = "none"
+    """usd, mjcf, urdf: guess walls from a layout that was given (Total3D), else from what stands
+    along them; they are marked as guessed."""
+    up: Literal["y", "z"] = "y"
+    """bodies, usd, contacts: y is the world of scene.json, z that of AMASS and of simulators."""
+
+
+@dataclass(frozen=True)
+class SimulateArgs:
+    """Let gravity act on a result; writes OUT/settle.json."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder of the result."""
+    truth: Path | None = None
+    """Folder with the true scene.json, to settle it as well."""
+    seconds: Annotated[float, float_in(0.01, 3600)] = 2.0
+    """Time of the simulation [s]."""
+    walls: Literal["none", "guess"] = "none"
+    """Guess walls as `mover export` does; pieces may lean on them."""
+    nudge: bool = False
+    """Move pieces that would fall to where they stand, as far as their uncertainty allows; writes
+    OUT/stable.json."""
+
+
+def export(arguments: Sequence[str]) -> None:
+    """`mover export`."""
+    args = parsed(ExportArgs, "mover export", arguments)
+    from mover.io.export.finished import Exported, read_finished
+
+    writers = {target: chosen("--to", target, "export") for target in args.to}
+    finished, folder = read_finished(args.out, args.capture, args.stable), args.out / "export"
+    if finished.walls is not None and args.walls == "none":
+        say("pieces were nudged along guessed walls; --walls guess writes these")
+    options = {"glb": {"body": args.body}, "bodies": {"up": args.up}, "contacts": {"up": args.up}}
+    room = {"body": args.body, "walls": args.walls}
+    options |= {"usd": {**room, "up": args.up}, "mjcf": room, "urdf": {"walls": args.walls}}
+    for target, write in writers.items():
+        found: Exported = write(finished, folder, **options.get(target, {}))
+        shown = found.files if len(found.files) <= 3 else found.files[:1]
+        more = f" and {len(found.files) - 1} more" if len(found.files) > 3 else ""
+        say(f"{target}: {', '.join(str(file) for file in shown)}{more}")
+        for note in found.notes:
+            say(f"  {note}")
+
+
+def simulate(arguments: Sequence[str]) -> None:
+    """`mover simulate`."""
+    args = parsed(SimulateArgs, "mover simulate", arguments)
+    from mover.app.simulate import result_walls, simulate_folder, simulation_table
+    from mover.evaluate.stability import SimulationConfig
+    from mover.io.export.shell import wall_notes
+
+    if not 0 < args.seconds <= 60:
+        raise InputError(f"--seconds: {args.seconds:g}, expected more than 0, at most 60")
+    config = SimulationConfig(args.seconds)
+    walls = result_walls(args.out) if args.walls == "guess" else None
+    say(simulation_table(simulate_folder(args.out, args.truth, config, walls)))
+    for note in () if walls is None else wall_notes(walls):
+        say(note)
+    if args.nudge:
+        from mover.app.simulate import nudge_folder
+
+        say(f"\n{nudge_folder(args.out, config, walls or ())}")
+
+
+# `render`.
+
+
+WIDTHS = (16, 8192)  # [px]
+
+
+@dataclass(frozen=True)
+class RenderArgs:
+    """Draw a result without a screen, as a picture or a film."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder of the result."""
+    to: Path = Path("room.png")
+    """The file: .png or .jpg for one picture, .mp4 for a film."""
+    capture: Path | None = None
+    """Folder of the capture: its video, or else its reference image, is behind the furniture."""
+    config: Annotated[RenderConfig, arg(name="")] = field(default_factory=RenderConfig)
+
+
+def render(arguments: Sequence[str]) -> None:
+    """`mover render`."""
+    args = parsed(RenderArgs, "mover render", arguments)
+    import torch
+
+    from mover.app.pictures.render import render_result
+
+    low, high = WIDTHS
+    if not low <= args.config.width <= high:
+        raise InputError(f"--width: {args.config.width}, expected {low} to {high}")
+    if not -89 <= args.config.elevation <= 89:
+        raise InputError(f"--elevation: {args.config.elevation:g}, expected -89 to 89")
+    torch.set_num_threads(1)
+    count = render_result(args.out, args.to, args.config, args.capture)
+    what = "one picture" if count == 1 else f"{count} pictures"
+    say(f"{args.to}: {what}")
+
+
+# `view`.
+
+
+@dataclass(frozen=True)
+class ViewArgs:
+    """Look at a result in the browser, correct it, and solve it again."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Folder of the result."""
+    capture: Path | None = None
+    """The capture it was made from; by default the one that run.json names."""
+    format: str = "folder"
+    """How that capture is written."""
+    edits: Path | None = None
+    """The list of edits; by default OUT/edits.json."""
+    address: Annotated[Address, arg(name="")] = field(default_factory=Address)
+
+
+def view(arguments: Sequence[str]) -> None:
+    """`mover view`."""
+    args = parsed(ViewArgs, "mover view", arguments)
+    from mover.app.viewer.show import view_result
+
+    source = None if args.capture is None else (args.format, args.capture)
+    view_result(args.out, source, args.edits, args.address)
