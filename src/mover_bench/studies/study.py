@@ -8,15 +8,9 @@ from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, silent
 from mover.pipeline.presets import PRESETS
-from mover_bench.studies import (
-    study_noise,
-    study_paper,
-    study_rows,
-    study_simulation,
-    study_upstream,
-    study_video,
-)
+from mover_bench.studies import study_noise, study_paper, study_rows, study_video
 from mover_bench.studies.args import StudyArgs
+from mover_bench.studies.compare import Table, fill_tables
 from mover_bench.studies.finished import Finished, Source, read_finished
 from mover_bench.studies.job import ROOM, Job
 from mover_bench.studies.queue import Launch, finish, open_jobs, start
@@ -24,7 +18,7 @@ from mover_bench.studies.run import parse_seeds
 from mover_bench.studies.sets import CHANGES, SETS, set_named
 from mover_bench.studies.study_page import command_of as row_command
 from mover_bench.studies.study_page import commands_of, missing_of, table_of, write_numbers
-from mover_bench.studies.study_rows import Ask, Page, Plan
+from mover_bench.studies.study_rows import Ask, Page, Plan, jobs_in
 from mover_bench.studies.tables import made_by, need_bench
 
 ALL = "all"
@@ -45,22 +39,43 @@ class Study:
     page: Callable[[Ask, Finished], Page]
 
 
+def _nothing(_: Ask, __: Finished) -> Sequence[str]:
+    return ()
+
+
+def tabled(
+    about: str,
+    rooms: str,
+    tables: Callable[[Ask], Sequence[Table]],
+    more: Callable[[Ask, Finished], Sequence[str]] = _nothing,
+) -> Study:
+    """A study that is tables: its jobs are those of their rows; `more` writes further sections."""
+
+    def page(ask: Ask, finished: Finished) -> Page:
+        asked = tables(ask)
+        seeds = {row.source.rooms: ask.seeds_of(row.source.rooms)
+                 for table in asked for row in table.rows if row.source}  # fmt: skip
+        return Page(fill_tables(asked, finished, seeds), more(ask, finished))
+
+    return Study(about, rooms, lambda ask: jobs_in(tables(ask)), page)
+
+
 STUDIES: dict[str, Study] = {
-    "ablation": Study(
+    "ablation": tabled(
         "Which evidence and which part of the method places the furniture.",
-        "rooms", study_rows.ablation_plan, study_rows.ablation,
+        "rooms", study_rows.ablation,
     ),
-    "camera": Study(
+    "camera": tabled(
         "Orientation of the camera and feet below the floor.",
-        "rooms", study_rows.camera_plan, study_rows.camera,
+        "rooms", study_rows.camera,
     ),
-    "bodies": Study(
+    "bodies": tabled(
         "What the room gives back to the people.",
-        "rooms", study_rows.bodies_plan, study_rows.bodies,
+        "rooms", study_rows.bodies,
     ),
-    "refit": Study(
+    "refit": tabled(
         "What the room gives back to people who are fitted to keypoints, as the paper does it.",
-        "rooms", study_rows.refit_plan, study_rows.refit,
+        "rooms", study_rows.refit,
     ),
     "video-length": Study(
         "Accuracy against the length of the video.",
@@ -78,25 +93,25 @@ STUDIES: dict[str, Study] = {
         "Accuracy against errors of the input.",
         "rooms", study_noise.plan, study_noise.page,
     ),
-    "upstream": Study(
+    "upstream": tabled(
         "What each error of today's tools costs: all at once, and each left out.",
-        "upstream", study_upstream.plan, study_upstream.page,
+        "upstream", study_rows.upstream,
     ),
-    "stability": Study(
+    "stability": tabled(
         "Which share of the furniture stays under gravity and sitters.",
-        "rooms", study_simulation.stability_plan, study_simulation.stability,
+        "rooms", study_rows.stability, study_rows.fallen,
     ),
-    "motion": Study(
+    "motion": tabled(
         "How people slide, float, sink and jerk, before and after their refinement.",
-        "rooms", study_simulation.motion_plan, study_simulation.motion,
+        "rooms", study_rows.motion,
     ),
-    "paper": Study(
+    "paper": tabled(
         "Which error of the input undoes which printed term.",
-        "rooms", study_paper.plan, study_paper.page,
+        "rooms", study_paper.tables, study_paper.gains,
     ),
-    "sets": Study(
+    "sets": tabled(
         "All presets on all sets.",
-        "", study_rows.sets_plan, study_rows.sets,
+        "", study_rows.sets, study_rows.set_gains,
     ),
 }  # fmt: skip
 """By name."""
@@ -142,8 +157,7 @@ def jobs_of(plan: Plan, ask: Ask, out: Path) -> list[Job]:
     """The jobs of a plan with the rooms that they need; changed sets have the base's seeds."""
     jobs: list[Job] = []
     for rooms, name in plan:
-        seeds = ask.seeds.get(rooms) or ask.seeds[rooms.partition("+")[0]]
-        jobs += [Job(rooms, seed, job, out) for seed in seeds for job in (ROOM, name)]
+        jobs += [Job(rooms, s, job, out) for s in ask.seeds_of(rooms) for job in (ROOM, name)]
     return list(dict.fromkeys(jobs))
 
 

@@ -11,6 +11,7 @@ from mover_bench.studies.compare import (
     Filled,
     head_of,
     markdown,
+    paired_rooms,
     shown,
 )
 from mover_bench.studies.finished import Frame, Source
@@ -79,6 +80,12 @@ def difference_text(metric: str, mean: float, low: float, high: float) -> str:
     """A difference and its interval in the unit of the column; `-` where there is none."""
     middle, *ends = (shown(metric, value, sign=True) for value in (mean, low, high))
     return middle if middle == "-" else f"{middle} [{', '.join(ends)}]"
+
+
+def gain_text(metric: str, values: Mapping[int, float], reference: Mapping[int, float]) -> str:
+    """The first less the second, in the rooms that both have; `-` where there are none."""
+    gain = paired_rooms(values, reference)
+    return "-" if gain is None else difference_text(metric, gain.mean, gain.low, gain.high)
 
 
 def command_of(source: Source, seeds: str) -> str:

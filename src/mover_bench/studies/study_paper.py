@@ -7,18 +7,11 @@ tried alone beside the whole of Eq. 1, and objects that people touch are told fr
 
 from collections.abc import Sequence
 
-from mover_bench.studies.compare import (
-    Row,
-    Table,
-    fill_tables,
-    markdown,
-    paired_rooms,
-    shown,
-)
+from mover_bench.studies.compare import Row, Table, markdown, shown
 from mover_bench.studies.finished import Finished, Source, by_room
 from mover_bench.studies.sets import EXACT
-from mover_bench.studies.study_page import difference_text
-from mover_bench.studies.study_rows import Ask, Page, Plan, few_steps, quoted_rows
+from mover_bench.studies.study_page import gain_text
+from mover_bench.studies.study_rows import Ask, labelled, quoted_rows
 from mover_bench.studies.variants import HUMAN, NO_TERM
 from mover_bench.tables import published
 
@@ -52,18 +45,14 @@ def set_of(rooms: str, exact: Sequence[str]) -> str:
     return f"{rooms}+exact={','.join(exact)}" if exact else rooms
 
 
-def plan(ask: Ask) -> Plan:
+def tables(ask: Ask) -> Sequence[Table]:
     """Each preset, and each of its terms alone, under each choice of what is true."""
-    names = [name for preset in _presets(ask) for name in _names(ask, preset).values()]
-    return [(set_of(ask.rooms, exact), name) for exact in truths(ask).values() for name in names]
+    return [_table(ask, preset, label) for preset in _presets(ask) for label in truths(ask)]
 
 
-def page(ask: Ask, finished: Finished) -> Page:
-    """A table for each choice of what is true, and what people add under each."""
-    asks = {set_of(ask.rooms, exact): ask.seeds[ask.rooms] for exact in truths(ask).values()}
-    tables = [_table(ask, preset, label) for preset in _presets(ask) for label in truths(ask)]
-    filled = fill_tables(tables, finished, asks)
-    return Page(filled, [_gains(ask, finished), _pieces(ask, finished)])
+def gains(ask: Ask, finished: Finished) -> Sequence[str]:
+    """What people add under each choice, in the mean and object by object."""
+    return [_gains(ask, finished), _pieces(ask, finished)]
 
 
 def _presets(ask: Ask) -> list[str]:
@@ -72,7 +61,7 @@ def _presets(ask: Ask) -> list[str]:
 
 def _names(ask: Ask, preset: str) -> dict[str, str]:
     """The jobs of a preset by what they add to Stage 1; `full`, all of it, is the last."""
-    few = few_steps(ask)
+    few = ask.few_steps
     added = {f"+ {head}": f"{preset}-{name}{few}" for head, name in ADDED.items()}
     return {**added, "full": f"{preset}{few}"}
 
@@ -84,7 +73,7 @@ def _table(ask: Ask, preset: str, label: str) -> Table:
     rows = (
         Row("initial scene", Source(rooms, (names["full"],), "initial"), tested=False),
         Row("Stage 1", image),
-        *(Row(head, Source(rooms, (name,))) for head, name in names.items()),
+        *labelled(rooms, names),
         *quoted,
     )
     return Table(f"{preset}, {label}", COLUMNS, rows, image, note=NOTE)
@@ -101,12 +90,8 @@ def _gains(ask: Ask, finished: Finished) -> str:
         for label, exact in truths(ask).items():
             rooms = set_of(ask.rooms, exact)
             image = by_room(finished, Source(rooms, (names["full"],), "image"), "iou3d", seeds)
-            cells: list[str] = []
-            for name in names.values():
-                values = by_room(finished, Source(rooms, (name,)), "iou3d", seeds)
-                gain = paired_rooms(values, image)
-                told = gain and difference_text("iou3d", gain.mean, gain.low, gain.high)
-                cells.append(told or "-")
+            found = [by_room(finished, Source(rooms, (n,)), "iou3d", seeds) for n in names.values()]
+            cells = [gain_text("iou3d", values, image) for values in found]
             rows.append([f"{preset}, {label}", *cells])
     table = markdown(["", *heads], rows)
     return f"## What people add to IoU3D\n\nDifference from Stage 1.\n\n{table}"

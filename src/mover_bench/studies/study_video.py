@@ -1,8 +1,9 @@
 """What a longer video gives, in accuracy and in time, and whether it is the interactions."""
 
-from mover_bench.studies.compare import Interval, interval, markdown, paired_rooms
+from mover_bench.studies.compare import Interval, interval, markdown
 from mover_bench.studies.finished import SPENT, Finished, Frame, Source, by_room, rows_of
 from mover_bench.studies.plots import Line, Panel, draw_panels
+from mover_bench.studies.study_page import gain_text
 from mover_bench.studies.study_rows import Ask, Page, Plan
 from mover_bench.studies.variants import LENGTHS, SEGMENTS, SHARES
 from mover_bench.tables import published
@@ -54,11 +55,8 @@ def _length_cells(
     if not values:
         return ["-", "-", "-", "0"]
     spreads = segments_of(ask, finished, seconds).groupby("seed").iou3d.std()[list(values)]
-    difference, found = "-", paired_rooms(values, whole)
-    if found is not None:
-        difference = f"{found.mean:+.3f} [{found.low:+.3f}, {found.high:+.3f}]"
-    mean = sum(values.values()) / len(values)
-    return [f"{mean:.3f}", f"{spreads.mean():.3f}", difference, str(len(values))]
+    mean, gain = sum(values.values()) / len(values), gain_text("iou3d", values, whole)
+    return [f"{mean:.3f}", f"{spreads.mean():.3f}", gain, str(len(values))]
 
 
 def segments_of(ask: Ask, finished: Finished, seconds: int) -> Frame:
