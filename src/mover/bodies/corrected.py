@@ -108,12 +108,7 @@ def normals_after(puppet: Puppet, by: Correction) -> Float[Tensor, "bodies picke
 
 
 def corrected(bodies: Bodies, by: Correction) -> Bodies:
-    """All vertices, joints and parameters of the bodies after a correction.
-
-    Args:
-        bodies: In the world; those with parameters are posed anew.
-        by: One row for each body.
-    """
+    """Bodies of the world after a correction (a row for each); those with parameters posed anew."""
     if bodies.pose is None:
         return _moved_rigidly(bodies, by)
     pose = _new_pose(bodies.pose, by)

@@ -182,12 +182,6 @@ def keypoints_of(
     Hips, knees, shoulders and so on are the model's joints; nose, eyes, ears, toes, heels and tips
     of fingers are vertices; the face's inner points lie on SMPL-X's triangles.
 
-    Args:
-        model: The body model that was posed.
-        verts: Its vertices, as `model.posed` gives them [m].
-        joints: Its joints [m].
-        layout: One of `LAYOUTS`.
-
     Raises:
         ValueError: If there is no such layout.
     """

@@ -202,10 +202,7 @@ def canonical(
 ) -> Float[Tensor, "bodies verts 3"]:
     """Vertices about the pelvis without heading and roll: x to the person's left, y down, z back.
 
-    Args:
-        verts: In the world (+y up) [m].
-        pelvis: Places of the pelvis [m].
-        turn: Rotation of the body's root in the world.
+    They are given in the world (+y up), with the pelvis and the rotation of the root [m].
     """
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0])).to(verts)
     root = flip @ turn.to(verts)

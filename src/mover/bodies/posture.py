@@ -184,12 +184,7 @@ UNDERSIDE = 0.1  # [m] over the lowest point: where a body that lies on its fron
 
 
 def touching(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies verts"]:
-    """Chance that each vertex touches something.
-
-    Args:
-        bodies: People in the world (+y up).
-        parts: Parts of their mesh.
-        ground: Height of the floor [m].
+    """Chance that each vertex of people in the world (+y up) touches something.
 
     Raises:
         ValueError: If the bodies are not in the world.

@@ -50,10 +50,6 @@ def constant(values: Any, like: Tensor) -> Tensor:  # noqa: ANN401
 
     What an energy needs at every step is made by this: a step that is recorded on a GPU
     (`replay.Replay`) may take nothing from the host.
-
-    Args:
-        values: A number or nested tuples of numbers.
-        like: Gives type and device.
     """
     return _held(values, like.dtype, like.device)
 

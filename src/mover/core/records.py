@@ -85,14 +85,7 @@ def rows_of(value: T, rows: Tensor, *axes: str) -> T:
 
 
 def with_rows(value: T, rows: Tensor, part: T, *axes: str) -> T:
-    """The record with the rows of another in place of some of its own, as `rows_of` takes them.
-
-    Args:
-        value: The record.
-        rows: Numbers of rows.
-        part: Has these rows alone.
-        axes: Names in the annotations, by default `bodies` and `rows`.
-    """
+    """The record with the rows of another in place of some of its own, as `rows_of` takes them."""
     found: dict[str, Any] = {}
     for field in dataclasses.fields(typing.cast(Any, value)):
         old, new = getattr(value, field.name), getattr(part, field.name)

@@ -108,11 +108,6 @@ def check_settings(settings: object, name: str) -> None:
 def read_settings(kind: type[T], tree: object, name: str) -> T:
     """Settings from plain JSON values, checked; what is not told keeps its default.
 
-    Args:
-        kind: The dataclass.
-        tree: Its fields.
-        name: How messages call it.
-
     Raises:
         InputError: If one is unknown, of a wrong type, or out of its range.
     """

@@ -32,10 +32,6 @@ def choose_piece(category: str, size: Size) -> Mesh:
 
     Nearest is the smallest sum of squared logarithms of the ratios of width, height and depth,
     so that the mesh is stretched as little as possible when it fills the box.
-
-    Args:
-        category: Free text.
-        size: Width (x), height (y) and depth (z) of the box [m].
     """
     pieces = catalogue(canonical(category))
     if not pieces:
@@ -164,12 +160,7 @@ def canonical(category: str) -> str:
 
 
 def make_piece(name: str, rng: np.random.Generator, style: int | None = None) -> Furniture:
-    """A piece of a new size.
-
-    Args:
-        name: A key of `PIECES`.
-        rng: Draws the sizes, and the style where none is given.
-        style: Which design; None: any.
+    """A piece of `PIECES` of a new size, in some style where none is given.
 
     Raises:
         ValueError: If there is no such piece or style.

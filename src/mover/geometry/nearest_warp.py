@@ -85,10 +85,7 @@ def nearest(
 ) -> Int[Tensor, "*starts objects queries"]:
     """Index of the point of each object that is nearest to each query; no gradient.
 
-    Args:
-        held: Points of the objects.
-        query: In the axes of each object, from its origin, not scaled [m].
-        scale: Size of each object, above 0.
+    Queries are in the axes of each object, from its origin, not scaled [m].
     """
     wp = started()
     kernels("nearest", name_of(query.device))

@@ -204,11 +204,7 @@ class ExtractConfig:
 
 
 def extract(inside: Inside, config: ExtractConfig) -> Mesh:
-    """The surface of a field, found cell by cell where it changes sign.
-
-    Args:
-        inside: Logits of points in the unit cube about the origin.
-        config: How fine.
+    """The surface of logits in the unit cube, found cell by cell where they change sign.
 
     Raises:
         ValueError: If nothing is inside.

@@ -22,12 +22,7 @@ def scaled(path: CameraPath, factor: float) -> CameraPath:
 
 
 def poses_at(path: CameraPath, frame: Int[Tensor, " rows"]) -> CameraPath:
-    """The poses of some frames, in their order; between two known ones evenly on the way.
-
-    Args:
-        path: The known poses.
-        frame: Beyond the last known pose it is that of the end.
-    """
+    """The poses of some frames; evenly between two known ones, at the ends' beyond them."""
     R, t = path.R_reference_camera, path.t_reference_camera
     if is_still(path):
         return CameraPath(frame, R.expand(len(frame), 3, 3), t.expand(len(frame), 3))

@@ -44,12 +44,6 @@ def reproject(
 
     Each object keeps its box centre in the camera frame; its front is projected onto the new
     horizontal plane.
-
-    Args:
-        layout: Places in the old world.
-        heights: Height of each box [m].
-        old: R_cam_world of the old world.
-        new: R_cam_world of the new world.
     """
     half = torch.zeros_like(layout.t_world_object)
     half[..., 1] = heights * layout.log_scale[..., 1].exp() / 2

@@ -33,12 +33,7 @@ class Sections:
 
 
 def sections_of(verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]) -> Sections:
-    """The sections of a closed mesh; half a cell is how well their outlines are known.
-
-    Args:
-        verts: Of the mesh [m].
-        faces: Its triangles, one orientation, outward or inward.
-    """
+    """The sections of a closed mesh of one orientation; half a cell is how well they are known."""
     points, triangles = as_float64(verts), as_int64(faces)
     low, high = points.min(0), points.max(0)
     cell = max(float((high - low)[[0, 2]].max()) / WIDE, CELL)

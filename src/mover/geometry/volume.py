@@ -120,11 +120,7 @@ def grid_around(
 ) -> Volume:
     """Empty space around the box from `low` to `high` [m], nothing inside yet.
 
-    Args:
-        low: Corner of the box.
-        high: Opposite corner.
-        cells: Number of cells along the longest side.
-        padding: Room on every side of the box [m].
+    It has `cells` along the longest side, and room on every side of the box (`padding`).
 
     Raises:
         ValueError: If the box is turned inside out, not finite, or there are too few cells.

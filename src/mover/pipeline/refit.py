@@ -123,12 +123,9 @@ def _people(room: Room) -> tuple[Bodies, SkinnedBody | SmplBody]:
 
 
 def room_around(room: Room, bodies: Bodies, touch: Float[Tensor, "bodies verts"] | None) -> FitRoom:
-    """The room as the fit meets it, with one row for each body.
+    """The room (its closed furniture) as the fit meets it, with one row for each body.
 
-    Args:
-        room: Its closed furniture counts.
-        bodies: In its world.
-        touch: Chance that each vertex touches something; None: from their posture.
+    Contacts that are not given follow from the postures.
     """
     parts = parts_of(bodies)
     picked = pick(bodies, parts)

@@ -91,14 +91,9 @@ def compare_extents(
     table: MaskTable,
     blocked: Bool[Tensor, "h w"],
 ) -> Extents | None:
-    """Compare the heights of bodies that are wholly seen with those of their masks.
+    """Compare the heights of a person's wholly seen bodies with those of their masks.
 
-    Args:
-        bodies: In camera axes.
-        rows: Bodies of one person.
-        camera: Its image has the size of the masks.
-        table: The person's masks.
-        blocked: Pixels of what may hide people.
+    Blocked pixels are of what may hide people.
 
     Returns:
         None if nobody is seen wholly, upright and high enough.

@@ -226,12 +226,7 @@ def draw_plan(
 ) -> Plan:
     """A room of a random kind, many of whose pieces are partly hidden.
 
-    Args:
-        rng: Source of randomness.
-        size: Width and height of the image [px].
-        most: Most pieces.
-        least: Fewest pixels that each piece shows.
-        config: How it is furnished and seen.
+    At most `most` pieces stand in it, each of which shows at least `least` pixels of the image.
     """
     config = config or PlanConfig()
     kind = sorted(KINDS)[int(rng.integers(len(KINDS)))]

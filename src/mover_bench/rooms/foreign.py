@@ -35,10 +35,7 @@ BRIDGE = 0.06  # of the size: faces of the sphere farther from the surface are c
 def foreign_mesh(known: Furniture, warp: float, rng: np.random.Generator) -> Mesh:
     """Another piece of the class as another program would give it, in the box of a known piece.
 
-    Args:
-        known: The true piece.
-        warp: Root mean square displacement, as a share of the size.
-        rng: Draws the design, its proportions and the maker.
+    `warp` is its root mean square displacement, as a share of the size.
     """
     mesh = another(known, rng).mesh
     verts = mesh.verts.double().numpy()

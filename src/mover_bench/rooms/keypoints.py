@@ -21,11 +21,7 @@ def joints_seen(
 ) -> Keypoints:
     """Joints with noise, some missing, none outside of the image, and no legs of who sits.
 
-    Args:
-        bodies: The true people, of the open body, in the camera's axes.
-        camera: The true one.
-        seated: Whose legs furniture hides.
-        rng: Of the noise.
+    The true people are in the axes of the true camera.
     """
     assert bodies.joints is not None, "the open body has joints"
     points = keypoints_of(open_body(), bodies.verts, bodies.joints, LAYOUT)

@@ -86,13 +86,7 @@ def coarse(
 
 
 def wobbling(people: People | None, pixels: float, rng: np.random.Generator) -> People | None:
-    """Masks of people whose outlines are off by a few pixels, here out and there in.
-
-    Args:
-        people: Their masks.
-        pixels: Standard deviation of the error along an outline [px].
-        rng: Another error in each frame.
-    """
+    """Masks of people whose outlines are off by some pixels (standard deviation), out and in."""
     if people is None or pixels == 0:
         return people
     masks = [

@@ -130,14 +130,9 @@ def way(
     bounds: Float[np.ndarray, "2 2"],
     apart: float = 0.0,
 ) -> Floor:
-    """Points (x, z) from start to goal, both included [m].
+    """Points (x, z) from start to goal, both included, inside of `bounds` [m].
 
-    Args:
-        start: Where the walk begins.
-        goal: Where it ends.
-        pieces: Furniture to walk around.
-        bounds: Smallest and largest x and z that one may walk.
-        apart: How much farther from furniture than usual [m].
+    They keep `apart` farther from furniture than usual.
 
     Raises:
         NoWayError: If furniture closes the way.

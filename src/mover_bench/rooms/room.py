@@ -56,11 +56,7 @@ def draw_tasks(
 ) -> tuple[Task, ...]:
     """Sit, lean, lie and stand at tables in random order; walk before and after.
 
-    Args:
-        plan: The room.
-        rng: Source of randomness.
-        length: Factor on all times to stay.
-        acts: How much.
+    `length` is a factor on all times to stay.
     """
     if acts.apart > 0:
         return draw_walks(plan, rng, acts.walks)
@@ -73,13 +69,7 @@ def draw_tasks(
 
 
 def draw_walks(plan: Plan, rng: np.random.Generator, count: int) -> tuple[Task, ...]:
-    """Walks to free places far from one another, every other one behind furniture if there is one.
-
-    Args:
-        plan: The room.
-        rng: Source of randomness.
-        count: How many.
-    """
+    """Walks to free places far from one another, every other one behind furniture if any is."""
     places = np.array([free_place(plan, rng) for _ in range(PLACES)])
     behind = places[[_is_behind(place, plan) for place in places]]
     goals = places[:1]

@@ -148,13 +148,7 @@ def faults(
 ) -> list[str]:
     """Why these frames are not true: what sinks in, what hangs in the air, what comes too near.
 
-    Args:
-        person: Whose skin.
-        posture: The frames.
-        label: What is done in them.
-        pieces: All furniture.
-        index: The piece that is used.
-        apart: More than 0: how far the skin must stay from furniture [m].
+    `index` is the piece that is used. Above 0, `apart` is what the skin keeps from furniture [m].
     """
     skin = skinned(person, posture)
     flat = skin.reshape(-1, 3)

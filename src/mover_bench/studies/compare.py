@@ -125,11 +125,7 @@ def paired(
 ) -> Interval:
     """Mean of `values - reference` over the same rooms.
 
-    Args:
-        values: One for each room.
-        reference: The same metric of the row that is compared with, room by room.
-        seed: Of the resampling; equal seeds and room counts draw the same rooms.
-        resamples: How often rooms are drawn anew, with replacement.
+    Equal seeds and room counts draw the same rooms.
 
     Raises:
         ValueError: If the two are of different length or empty.
@@ -238,13 +234,7 @@ NUMBERS = (
 def fill_tables(
     tables: Sequence[Table], finished: Finished, seeds: Mapping[str, Sequence[int]]
 ) -> list[Filled]:
-    """Fill in all tables of a study; its comparisons are one family for Holm's correction.
-
-    Args:
-        tables: What is asked for.
-        finished: What the jobs have left.
-        seeds: The rooms of each set.
-    """
+    """Fill in all tables of a study; its comparisons are one family for Holm's correction."""
     from pandas import DataFrame
 
     lines = [

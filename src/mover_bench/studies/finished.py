@@ -102,13 +102,7 @@ def by_room(
 def recovered(
     finished: Finished, source: Source, seeds: Sequence[int], *, used: bool
 ) -> tuple[int, int]:
-    """Of the chairs and sofas whose guess is turned round, how many were turned back.
-
-    Args:
-        finished: The results.
-        source: Which jobs and which scene.
-        seeds: Which rooms.
-        used: Only those that people use.
+    """Of the seats whose guess is turned round (`used`: by people), how many were turned back.
 
     Returns:
         How many came within 45 degrees, and how many there were.

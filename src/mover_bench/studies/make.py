@@ -66,11 +66,6 @@ class Made:
 def make_set(args: MakeArgs, observe: Observer = silent, launch: Launch | None = None) -> Made:
     """Make all rooms that are not there, then write OUT/SET/manifest.json and hashes.json.
 
-    Args:
-        args: What to make.
-        observe: Told of every room that is made.
-        launch: Starts a job; None: as a process of its own.
-
     Raises:
         InputError: If the set or a seed is none.
     """

@@ -27,6 +27,7 @@ PRELOADED = (
 )  # fmt: skip
 """What jobs do, and what they import themselves when they first need it."""
 Launch = Callable[[Job], Running[int]]
+"""Starts a job; where none is given, as a process of its own."""
 
 
 def start(job: Job, module: str = "mover_bench.studies.job", *more: str) -> Running[int]:
@@ -38,9 +39,7 @@ def start(job: Job, module: str = "mover_bench.studies.job", *more: str) -> Runn
 def open_jobs(jobs: Sequence[Job], keep: bool) -> list[Job]:
     """Those that are not finished; a room only if a job of it is open and the room is not there.
 
-    Args:
-        jobs: The rooms among them.
-        keep: Take what other versions or settings of the program have finished.
+    With `keep` what other versions or settings of the program have finished counts.
     """
     waiting = [job for job in jobs if job.name != ROOM and not is_finished(job, keep)]
     needed = {(job.rooms, job.seed) for job in waiting}
@@ -82,13 +81,8 @@ def run_all(
     """Yield each job when it has ended.
 
     A job waits for its room. A worker prefers a room that nobody works on, because the first job
-    of a room leaves stages that the others take; what is left of them goes with the last job.
-
-    Args:
-        jobs: In the order in which they should be done.
-        workers: How many run at once.
-        launch: Starts one.
-        store: Keep the rooms themselves when their last job has ended.
+    of a room leaves stages that the others take; what is left of them goes with the last job. So
+    does the room itself, unless it is stored.
     """
     left = list(jobs)
 

@@ -24,11 +24,6 @@ def run_experiment(
 ) -> Path:
     """Do all jobs that are not finished, then write tables and pictures.
 
-    Args:
-        args: What to do.
-        observe: Told of every job that ends.
-        launch: Starts a job; None: as a process of its own.
-
     Returns:
         The summary, OUT/SET/summary.md.
 

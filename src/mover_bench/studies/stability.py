@@ -16,11 +16,6 @@ def measure_stability(truth: Scene, room: Room, run: Run) -> dict[str, Any]:
     """Let gravity act on the initial scene, the result, the result nudged, and the truth.
 
     Who sits in the result sits on the same place of each piece in all of them.
-
-    Args:
-        truth: The true scene.
-        room: What a job rebuilt.
-        run: Its folder keeps the convex pieces.
     """
     people = room.bodies
     loads = () if people is None else loads_in(labels_of(room, run), room.scene, people.fps)

@@ -122,11 +122,6 @@ def run_study(
 ) -> list[Path]:
     """Do all jobs that are not finished, room by room, then write the tables of each study.
 
-    Args:
-        args: What to do.
-        observe: Told of every job that ends.
-        launch: Starts a job; None: as a process of its own.
-
     Returns:
         The pages, OUT/studies/NAME/summary.md.
 

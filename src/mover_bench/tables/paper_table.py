@@ -25,6 +25,7 @@ from mover_bench.tables.table_job import DONE, TableJob, key_of
 
 Quoted = tuple[str, Mapping[str, float]]
 Launch = Callable[[TableJob], Running[int]]
+"""Starts a job; where none is given, as a process of its own."""
 MILLIMETRES = 1000.0
 
 
@@ -154,11 +155,6 @@ class TableArgs:
 
 def paper_table(args: TableArgs, observe: Observer = silent, launch: Launch | None = None) -> Path:
     """Do all jobs that are not finished, and write OUT/NAME-PRESET.md and .csv.
-
-    Args:
-        args: What to do.
-        observe: Told of every job that ends.
-        launch: Starts a job; None: as a process of its own.
 
     Returns:
         The page.

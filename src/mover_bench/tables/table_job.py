@@ -187,13 +187,7 @@ def beside_scan(
 
 
 def disturb(scene: Scene, noise: Disturbance, generator: torch.Generator) -> Scene:
-    """The initial scene with uniform noise on every object.
-
-    Args:
-        scene: As it is given.
-        noise: Kind and largest size.
-        generator: Of the random numbers.
-    """
+    """The initial scene with uniform noise on every object."""
 
     def drawn(count: int) -> torch.Tensor:
         return noise.level * (2 * torch.rand(count, generator=generator) - 1)

@@ -204,13 +204,7 @@ def _foremost(off: Float[Tensor, " matches"], group: Int[Tensor, " matches"]) ->
 def touch_term(
     skin: Float[Tensor, "bodies points 3"], matches: Matches, rho: float
 ) -> Float[Tensor, " bodies"]:
-    """Price of the distance between skin and what it touches [nats].
-
-    Args:
-        skin: The skin points [m].
-        matches: What they touch.
-        rho: Distance at which half of the most is paid [m].
-    """
+    """Price of the distance between skin and what it touches, half of the most at `rho` [nats]."""
     moved = skin[matches.body, matches.point] - matches.place
     off = (moved * matches.normal).sum(-1)
     robust = (rho**2 / (off.square() + rho**2)).square()

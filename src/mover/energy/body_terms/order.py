@@ -55,12 +55,7 @@ def bounds_of_skin(seen: Sighting) -> Bounds:
 
 
 def order_term(depth: Float[Tensor, "bodies points"], bounds: Bounds) -> Float[Tensor, " bodies"]:
-    """Price of skin before what hides it or behind what it hides [nats].
-
-    Args:
-        depth: Of the skin points [m].
-        bounds: Of their depth.
-    """
+    """Price of skin before what hides it or behind what it hides [nats]."""
     known = bounds.near.isfinite() | bounds.far.isfinite()
     near = torch.where(
         bounds.near.isfinite(), bounds.near - MARGIN - depth, torch.zeros_like(depth)

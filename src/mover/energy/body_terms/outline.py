@@ -44,14 +44,7 @@ def outline_term(
     K: Float[Tensor, "3 3"],
     width: int,
 ) -> Float[Tensor, " bodies"]:
-    """Price of outlines that leave the outlines of the masks [nats].
-
-    Args:
-        skin_cam: The skin points in camera axes [m].
-        outline: Where the outlines should go.
-        K: Intrinsics [px].
-        width: Of the image [px].
-    """
+    """Price of outlines (of skin in camera axes) that leave the outlines of the masks [nats]."""
     here = project(skin_cam[outline.body, outline.skin], K)
     off = ((here - outline.pixel) * outline.normal).sum(-1) + outline.gap
     price = 0.5 * TAIL**2 * outline.weight * geman_mcclure(off / (BORDER * width), TAIL)

@@ -40,13 +40,7 @@ def under_term(skin: Float[Tensor, "bodies points 3"], ground: float) -> Float[T
 def stand_term(
     soles: Float[Tensor, "bodies feet 3"], rest: Float[Tensor, "bodies feet"], ground: float
 ) -> Float[Tensor, " bodies"]:
-    """Price of soles at rest that are not on the floor [nats].
-
-    Args:
-        soles: Lowest place of each foot [m].
-        rest: Chance that it stands.
-        ground: Height of the floor [m].
-    """
+    """Price of the lowest places of feet at rest (a chance) that are not on the floor [nats]."""
     off = geman_mcclure((soles[..., 1] - ground) / SOFT, TAIL)
     return 0.5 * FEET * TAIL**2 * (rest * off).sum(-1)
 

@@ -101,13 +101,7 @@ def steady_term(
 def lock_term(
     soles: Float[Tensor, "bodies feet 3"], rest: Float[Tensor, "bodies feet"], near: Neighbours
 ) -> Float[Tensor, " bodies"]:
-    """Price of soles at rest that slide [nats].
-
-    Args:
-        soles: Middle of each sole [m].
-        rest: Chance that it is at rest.
-        near: Which rows follow each other.
-    """
+    """Price of soles at rest (a chance) that slide between rows that follow each other [nats]."""
     i, j = near.pairs.unbind(-1)
     slip = geman_mcclure(safe_norm(soles[j] - soles[i]) / SLIP, TAIL)
     both = rest[i] * rest[j]

@@ -52,13 +52,7 @@ class Solids:
 def gather_solids(
     objects: Objects, sections: Mapping[int, Sections], pairs: Int[Tensor, "pairs 2"]
 ) -> Solids:
-    """Find the samples that count.
-
-    Args:
-        objects: Their samples.
-        sections: Of each object of a pair.
-        pairs: Whose samples may lie in whom; on the CPU.
-    """
+    """Find the samples that count, of pairs of which one may lie in the other; on the CPU."""
     upright = torch.zeros_like(objects.samples[..., 0], dtype=torch.bool)
     for index, own in sections.items():
         above = objects.samples.new_tensor([0.0, UPRIGHT, 0.0])
@@ -68,13 +62,7 @@ def gather_solids(
 
 
 def apart_term(layout: Layout, objects: Objects, solids: Solids) -> Float[Tensor, " objects"]:
-    """Price of the samples of each object that lie inside others [1].
-
-    Args:
-        layout: One place for each object.
-        objects: Their samples.
-        solids: What they fill.
-    """
+    """Price of the samples of each object that lie inside others [1]; one place for each object."""
     layout = replace(layout, yaw=layout.yaw.detach(), log_scale=layout.log_scale.detach())
     points = place(objects.samples, layout)
     total = torch.zeros_like(layout.yaw)

@@ -30,13 +30,7 @@ class BodySpace:
 def collision_term(
     points: Float[Tensor, "*starts objects points 3"], space: BodySpace, form: Variant
 ) -> Float[Tensor, "*starts objects"]:
-    """Price of object points inside bodies.
-
-    Args:
-        points: Even surface samples [m].
-        space: The bodies of all frames.
-        form: `release` [m], else [m²].
-    """
+    """Price of even surface samples inside the bodies of all frames; `release` [m], else [m²]."""
     depth = sample(space.volume, points).clamp_max(0)
     if form == "release":
         return -depth.mean(-1) * SAMPLES

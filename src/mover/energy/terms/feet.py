@@ -56,14 +56,9 @@ def feet_term(
     offset: Float[Tensor, " soles"],
     rho: float,
 ) -> Float[Tensor, "*starts soles"]:
-    """Price of each sole point that is not on the ground, in [0, 1).
+    """Price of each sole point that is not on the ground, in [0, 1); one half at `rho` [m].
 
-    Args:
-        soles: The evidence.
-        R_cam_world: World to camera.
-        ground: Height of the floor [m].
-        offset: How far each point's person floats above the floor [m].
-        rho: Height at which the price is one half [m].
+    The offset is how far each point's person floats above the floor [m].
     """
     return geman_mcclure(heights(soles.points_cam, R_cam_world, ground) - offset, rho)
 

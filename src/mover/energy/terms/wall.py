@@ -61,13 +61,7 @@ def rears_of(layout: Layout, size: Float[Tensor, "objects 3"]) -> Rears:
 def wall_term(
     layout: Layout, size: Float[Tensor, "objects 3"], walls: Walls
 ) -> Float[Tensor, "*starts objects"]:
-    """Price of standing off the lines along which other furniture stands [1].
-
-    Args:
-        layout: Places.
-        size: Of the objects' meshes [m].
-        walls: The lines; at least one.
-    """
+    """Price of standing off the lines along which other furniture stands [1]."""
     rears = rears_of(layout, size)
     off = _across(rears.ends, walls.out) - walls.offset
     apart = off.square().mean(-2)

@@ -117,13 +117,7 @@ def leaves(w: Work) -> None:
 
 @wp.kernel
 def inner(w: Work, pack: int, first: int) -> None:
-    """Boxes of the tree's nodes on one level, from those on the next.
-
-    Args:
-        w: The body.
-        pack: First pack of the next level.
-        first: Slot of the first node.
-    """
+    """Boxes of the nodes from slot `first` on, one level, from those from `pack` on, the next."""
     node = wp.tid()
     unite(w.tree.boxes, pack + node, first + node)
 

@@ -48,15 +48,7 @@ class Gap:
 
 @wp.func
 def contour(scene: Scene, scratch: Scratch, item: int, edge: wp.vec4l, face: wp.vec3l) -> Contour:
-    """An edge between `face`, which is drawn and faces the camera, and one that does not.
-
-    Args:
-        scene: Items.
-        scratch: Vertices on the screen, of this item alone or of all.
-        item: Place of the item in `scratch`.
-        edge: Two vertices, two faces.
-        face: That face.
-    """
+    """An edge between `face`, which is drawn and faces the camera, and one that does not."""
     c = Contour()
     i = int(edge[0])
     j = int(edge[1])

@@ -88,13 +88,7 @@ def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, face: wp.vec3l, box: wp.vec4i) 
     """Sort the vertices from the top and find the rows.
 
     Most triangles of a body are smaller than a pixel: these are left before anything is set up.
-
-    Args:
-        a: The first vertex on the screen.
-        b: The second.
-        c: The third.
-        face: Their numbers.
-        box: What is drawn: first row, row after the last, the same of columns.
+    The box is what is drawn: first row, row after the last, the same of columns.
     """
     t = Triangle()
     t.first = int(wp.max(wp.ceil(wp.min(a[1], wp.min(b[1], c[1])) - 0.5), float(box[0])))
@@ -161,11 +155,7 @@ def run_of(t: Triangle, row: int, left: int, right: int) -> Run:
 def fill(keys: wp.array(dtype=wp.uint64), start: int, r: Run, tag: int) -> None:
     """Raise the keys of a run: where its key is greater than the pixel's it wins.
 
-    Args:
-        keys: Winner of each pixel.
-        start: First pixel of the row in `keys`.
-        r: The run.
-        tag: Face + 1 where the nearest run wins, or less than zero where the farthest does.
+    The tag is face + 1 where the nearest run wins, less than zero where the farthest does.
     """
     flip = wp.where(tag > 0, wp.uint32(0), FULL)
     face = wp.uint64(wp.abs(tag))
@@ -179,14 +169,9 @@ def fill(keys: wp.array(dtype=wp.uint64), start: int, r: Run, tag: int) -> None:
 
 @wp.func
 def paint(scene: Scene, scratch: Scratch, t: Triangle, place: wp.vec3i, near: bool) -> None:
-    """Draw one row of a triangle.
+    """Draw one row of a triangle to `near`, where the nearest wins, else to `far`.
 
-    Args:
-        scene: Items.
-        scratch: Working memory.
-        t: The triangle.
-        place: Item within `scratch`, row and face.
-        near: Draw to `near`, where the nearest wins, else to `far`, where the farthest does.
+    Its place is the item within `scratch`, the row and the face.
     """
     start = (place[0] * scene.height + place[1]) * scene.width
     r = run_of(t, place[1], 0, scene.width)

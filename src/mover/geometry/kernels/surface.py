@@ -84,14 +84,6 @@ def pull_depth(
     The depth z = (n . a) / (n . ray) moves by n / (n . ray) times the motion of the point that is
     hit, which is the mean of the motions of the vertices with its barycentric weights. Faces that
     are seen edge-on, and slivers whose plane is noise, have no gradient.
-
-    Args:
-        scene: Items.
-        pixel: Pixel of the windows, over all items.
-        face: Face that won the pixel.
-        z: Its depth there [m].
-        gradient: Of that depth.
-        grads: Gradients of the vertices of all items.
     """
     if gradient == 0.0:
         return

@@ -135,11 +135,7 @@ def first_hit(
 ) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
     """Depth [m] (inf: none) and face (-1: none) that each pixel sees, whatever the winding.
 
-    Args:
-        verts_cam: Vertices in camera axes [m].
-        faces: Triangles, not necessarily closed or consistent.
-        K: Intrinsics [px].
-        size: Height and width [px].
+    The size is height and width [px]; triangles need not be closed or consistent.
     """
     if reference := _reference_of(verts_cam):
         return reference.first_hit(verts_cam, faces, K, size)
@@ -156,14 +152,7 @@ def _depths(maps: Maps, like: Tensor) -> Depths:
 
 
 def _maps(verts_cam: Tensor, shape: Topology, views: Crops, asked: tuple[bool, bool]) -> Maps:
-    """Silhouettes and depths of starts x items, one list that is cut where it is too long to count.
-
-    Args:
-        verts_cam: Vertices in camera axes [m].
-        shape: Their triangles.
-        views: The windows.
-        asked: Whether silhouettes, and whether depths are asked for.
-    """
+    """Silhouettes and depths of starts x items, a list that is cut where it is too long."""
     *lead, n_verts, _ = verts_cam.shape
     size = (*lead, views.height, views.width)
     flat = verts_cam.float().reshape(-1, n_verts, 3)

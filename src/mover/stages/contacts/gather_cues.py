@@ -102,11 +102,6 @@ def gather_depth(
     Memory is that of a few frames for each worker, however many frames there are. Bodies whose
     track has no mask say nothing. Bodies are drawn where their vertices are; the maps are on the
     CPU.
-
-    Args:
-        sight: What is seen.
-        workers: Threads that draw.
-        observe: Called with (bodies done, bodies) after each block.
     """
     views = small_views(sight.camera)
     blank, lock = torch.full((views.height, views.width), float("inf")), Lock()

@@ -55,15 +55,7 @@ def bounds_of_objects(
     views: Crops,
     who: tuple[Bodies, Camera],
 ) -> tuple[tuple[Bound, ...], ...]:
-    """The near and the far bound of each object, where it has any.
-
-    Args:
-        seen: Depth of the objects at their places, in their windows.
-        masks: Their masks there.
-        depth: The bounds there.
-        views: The windows.
-        who: The bodies whose frames were gathered, in the world, and the camera.
-    """
+    """The near and the far bound of each object, where it has any."""
     bodies, camera = who
     sane = seen.covered & (masks > 0.5) & (depth.near < depth.far)
     x, y = grid_in_image(views, small_camera(camera).K)
@@ -217,15 +209,7 @@ def touching_of(
     pairs: Int[Tensor, "pairs 3"],
     bodies: Bodies,
 ) -> tuple[tuple[TouchingBody, ...], ...]:
-    """For each object and part the people who touch it, those who do it longest first.
-
-    Args:
-        objects: The furniture.
-        layout: Where it stands.
-        contacts: The contact points of all people together.
-        pairs: Body, object and part of every touch.
-        bodies: The people whose rows `pairs` counts.
-    """
+    """For each object and part the people who touch it, those who do it longest first."""
     found: list[list[TouchingBody]] = [[] for _ in objects.ids]
     if contacts is None:
         return tuple(() for _ in found)

@@ -38,10 +38,6 @@ def bend_at(energy: Callable[[Layout], Energy], layout: Layout) -> Bend:
 
     All objects take their steps at once. No term couples two objects but for the height of a
     carrier, which lifts its load: the load's price then belongs to the carrier as well.
-
-    Args:
-        energy: Of layouts with a leading axis of starts, one value for each object.
-        layout: The result.
     """
     steps = torch.tensor(STEPS, dtype=torch.float64)
     moves = torch.cat([torch.zeros(1, 7), torch.diag(steps), -torch.diag(steps)]).to(steps)
@@ -165,13 +161,9 @@ def moves_without(
 def by_tilt(
     layout: Layout, camera: Camera, ground: float, tilt: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "objects 7 7"]:
-    """What the doubt about pitch, roll and floor adds: objects move along their rays on the floor.
+    """What the doubt about pitch, roll [rad] and floor [m] (their covariance) adds.
 
-    Args:
-        layout: The result.
-        camera: Its camera.
-        ground: Its floor [m].
-        tilt: Covariance of pitch, roll [rad] and ground [m].
+    Objects move along their rays on the floor.
     """
     base = layout.t_world_object.double()
     matrix = camera.R_cam_world.double()

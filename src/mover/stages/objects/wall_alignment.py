@@ -77,11 +77,6 @@ def _first(layout: Layout, count: int) -> Layout:
 def find_walls(layout: Layout, objects: Objects, sides: Int[Tensor, "objects 4"]) -> Walls | None:
     """The lines that the rears of at least one object tell to another.
 
-    Args:
-        layout: One place for each object.
-        objects: The objects.
-        sides: What is known of each side of their boxes, see `terms.bbox`.
-
     Returns:
         None where fewer than two objects usually stand along a wall.
     """

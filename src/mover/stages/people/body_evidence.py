@@ -180,14 +180,7 @@ def order_bounds(
     skin: Float[Tensor, "bodies points 3"],
     normals: Float[Tensor, "bodies points 3"],
 ) -> Bounds:
-    """Bounds of the depth of skin points where they are now.
-
-    Args:
-        watched: Masks and furniture.
-        rows: Which rows of the bodies these are.
-        skin: Points in the world [m].
-        normals: Their outward normals.
-    """
+    """Bounds of the depth of skin points where they are now."""
     room = watched.room
     small = small_camera(room.camera)
     cam, facing = (

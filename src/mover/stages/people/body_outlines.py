@@ -43,13 +43,7 @@ class Seen:
 
 
 def gather_outlines(seen: Seen, table: MaskTable, rows: Int[Tensor, " bodies"]) -> Outline:
-    """How far each body's outline is from that of its mask.
-
-    Args:
-        seen: The bodies.
-        table: Masks of everybody.
-        rows: Which rows of the table these bodies are.
-    """
+    """How far each body's outline is from that of its mask."""
     found: list[Outline] = []
     for first in range(0, len(rows), 64):  # 64 windows at a time, for memory
         part = slice(first, first + 64)

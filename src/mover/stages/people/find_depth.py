@@ -203,12 +203,6 @@ def nearer(bodies: Bodies, camera: Camera, ground: float, factor: float) -> Bodi
     """People moved as if the whole room were larger by a factor: the floor below them is.
 
     They keep their size and stand as high above the floor, whose height is the one before.
-
-    Args:
-        bodies: In camera axes.
-        camera: Which way is down.
-        ground: Height of the floor [m].
-        factor: Of the room about the camera.
     """
     R = camera.R_cam_world.to(bodies.verts)
     below = pelvis(bodies) @ R

@@ -207,13 +207,8 @@ def refine_bodies(
     """Move the people of a room so that they agree with its floor and furniture.
 
     Furniture that is moved stands, for the people of each time between two moves, where it stood
-    then; nobody's motion is smoothed over a move.
-
-    Args:
-        room: The estimated room; its bodies are in its world, with a pose where it may be refined.
-        capture: Gives masks and known contacts; without it there is no depth order.
-        config: Weights and settings.
-        observe: Called after each step.
+    then; nobody's motion is smoothed over a move. The capture gives masks and known contacts;
+    without it there is no depth order.
 
     Raises:
         InputError: If the room has no bodies or no floor.

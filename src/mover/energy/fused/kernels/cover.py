@@ -137,14 +137,7 @@ def flood(
 ) -> None:
     """Mark what the outline encloses, and take it down; add what that changes to `squares`.
 
-    Layers are counted modulo 256, so that a step needs one byte.
-
-    Args:
-        given: The evidence.
-        work: Working memory.
-        p: The item.
-        box: Where it is.
-        bits: One for each pixel, which are set.
+    Layers are counted modulo 256, so that a step needs one byte. Bits, one for each pixel, are set.
     """
     pane = work.scene.height * (work.scene.width + 1)
     for row in range(box[0], box[1]):

@@ -69,12 +69,8 @@ def depth_cost(
 ) -> tuple[wp.float64, Slope]:
     """How far the depths in a box are out of their bounds, for each that has any, and the change.
 
-    Args:
-        given: The evidence.
-        work: Working memory; what is drawn is taken away.
-        p: The item.
-        box: Where it is drawn.
-        closed: Whether there is a back wherever there is a front; else it is looked up.
+    What is drawn is taken away. Where all is closed there is a back wherever there is a front;
+    else it is looked up.
     """
     total = wp.float64(0.0)
     slope = Slope()
