@@ -22,7 +22,16 @@ from mover.furniture.library import make_piece
 from mover.stages.config import PrepareConfig
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
 
-NAMES = ("armchair", "desk", "shelf", "wardrobe", "coffee table", "office chair", "sofa", "bed")
+NAMES = (
+    "armchair",
+    "desk",
+    "shelf",
+    "wardrobe",
+    "coffee table",
+    "office chair",
+    "sofa",
+    "double bed",
+)
 ROUGH = 0.002  # [m]
 MISSING, TURNED, LOOSE = 0.03, 0.05, 0.1  # share of the faces
 

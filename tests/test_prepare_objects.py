@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 import torch
+import trimesh
 from analytic import FACES, box_verts
 
 from mover.core.types import Layout, Mesh, SceneObject
 from mover.furniture.library import BACKS, PIECES, SEATS, make_piece
+from mover.geometry.kernels.start import use_threads
 from mover.geometry.mesh import box, signed_volume
 from mover.geometry.placement import place, place_object
 from mover.geometry.topology import is_closed
@@ -93,6 +95,24 @@ def test_open_and_inverted_meshes_become_closed_proxies():
     proxy = proxy_meshes(prepared)[0]
     assert is_closed(proxy.faces)
     assert signed_volume(proxy) > 0
+
+
+def test_objects_prepared_beside_each_other_are_those_prepared_one_by_one(tmp_path, monkeypatch):
+    sphere = trimesh.creation.icosphere(4)
+    shapes = []
+    for k in range(4):
+        bumps = 0.4 + 0.02 * np.sin((3 + k) * sphere.vertices)
+        faces = torch.from_numpy(sphere.faces[300 * k :].copy())  # open
+        shapes.append(Mesh(torch.from_numpy(sphere.vertices * bumps).float(), faces))
+    inputs = PrepareInputs(tuple(piece_of(m, name=str(k)) for k, m in enumerate(shapes)))
+    config = PrepareConfig(cells=16, faces=400, samples=100)
+    made = []
+    for count in (4, 1):
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / str(count)))  # nothing is kept
+        with use_threads(count):
+            made.append(prepare_objects(inputs, config).objects)
+    assert torch.equal(made[0].verts, made[1].verts)
+    assert torch.equal(made[0].faces, made[1].faces)
 
 
 def test_supports_name_the_carrying_object():

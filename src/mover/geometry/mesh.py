@@ -1,5 +1,7 @@
 """Triangle meshes: boxes, normals, even samples, fewer faces."""
 
+from threading import Lock
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -17,6 +19,7 @@ STRAY = 0.03  # of the longest side; no vertex may be further from the decimated
 FOLD = 1e-9  # of the cube of the longest side; closed pieces of less volume are folded faces
 CAUTION = 5  # of fast_simplification: 7 is its default, less is slower and better
 GENTLER = 1.5  # a target of faces that spoils a mesh is raised by this factor
+_simplifying = Lock()
 
 
 def box(verts: Float[Tensor, "verts 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
@@ -162,7 +165,8 @@ def _simplified(mesh: Mesh, faces: int) -> Mesh:
     import fast_simplification
 
     corners, rows = as_float64(mesh.verts), as_int64(mesh.faces).astype(np.int32)
-    found = fast_simplification.simplify(corners, rows, target_count=faces, agg=CAUTION)
+    with _simplifying:  # it works on global variables, without Python's lock
+        found = fast_simplification.simplify(corners, rows, target_count=faces, agg=CAUTION)
     verts, triangles = (torch.from_numpy(np.ascontiguousarray(part)) for part in found[:2])
     return used(Mesh(verts.to(mesh.verts), triangles.to(mesh.faces)))
 

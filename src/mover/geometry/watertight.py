@@ -16,14 +16,15 @@ from mover.core.types import Mesh
 from mover.geometry.mesh import decimate, fit_box, used
 from mover.geometry.nearest import as_float64, as_int64, closest
 from mover.geometry.topology import Triangles, areas, is_closed, labels, manifold, solid, volumes
+from mover.geometry.volume import BAND, SHELL, Volume
+from mover.geometry.volume_warp import union_bodies
 
 WALL = 0.75  # [cells], more than the half diagonal of a step, or the flood would leak through
 REST = 0.3  # of the thickness of the wall that stays: sheets need two sides that are apart
 REACH = 3.0  # [walls], vertices further from the triangles stay where they are: lids over holes
 INSIDE = 0.85  # winding number from which a place that the flood reached still counts as matter
-AROUND, SMOOTH = 0.4, 0.05  # winding number, and its change, from which on every cell is looked at
 LID = 4.0  # [cells] over which a winding number that is larger by 1 would lower the field
-COARSE = 4  # [cells], step of the first look at the distances
+FAR = 4  # [cells], step of the first look at the winding numbers
 MARGIN = 2  # [cells] of air around the box
 SPECK = 1e-3  # of the largest component's volume: what is smaller is no part of the furniture
 
@@ -50,41 +51,74 @@ def _field(
     verts: np.ndarray, faces: np.ndarray, start: np.ndarray, cell: float, counts: np.ndarray
 ) -> np.ndarray:
     """Distance to the triangles [m] where air is; at most that, and below the wall, in matter."""
-    import igl
-
     wall = WALL * cell
     distance = _distances(verts, faces, start, cell, counts)
     air = _outside(distance > wall)
     field = np.where(air, distance, np.minimum(distance, wall / 2))
     shell = ~air & (distance <= wall)
     field[shell] = distance[shell]
-    least, most = _windings(verts, faces, start, cell, counts)
-    winding = (least + most) / 2
-    reached = np.argwhere(air & (most > AROUND) & (most - least > SMOOTH))
-    exact = igl.fast_winding_number(verts, faces, start + cell * reached)
-    winding[tuple(reached.T)] = np.abs(exact)
+    winding = _windings(verts, faces, start, cell, distance < SHELL * cell, air)
     lid = wall + (INSIDE - winding) * LID * cell
     return np.where(air, np.minimum(field, lid), field)
 
 
 def _windings(
-    verts: np.ndarray, faces: np.ndarray, start: np.ndarray, cell: float, counts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest winding number around each cell, of every other cell along the axes."""
-    import igl
-    from scipy.ndimage import maximum_filter, minimum_filter
+    verts: np.ndarray,
+    faces: np.ndarray,
+    start: np.ndarray,
+    cell: float,
+    near: np.ndarray,
+    air: np.ndarray,
+) -> np.ndarray:
+    """Winding number, of either sign, of the air's places; zero elsewhere.
 
-    rows = [np.arange(0, count, 2) for count in counts.tolist()]
-    places = start + cell * np.stack(np.meshgrid(*rows, indexing="ij"), -1)
-    within = ((places > verts.min(0)) & (places < verts.max(0))).all(-1)
-    winding = np.zeros(within.shape)
-    winding[within] = np.abs(igl.fast_winding_number(verts, faces, places[within]))
-    found: list[np.ndarray] = []
-    for around in (minimum_filter(winding, 3), maximum_filter(winding, 3)):
-        for axis in range(3):
-            around = around.take(np.arange(int(counts[axis])) // 2, axis)
-        found.append(around)
-    return found[0], found[1]
+    It changes little from one place to the next but across triangles, between which and the air
+    stands a wall. So it is measured at every fourth place along the axes, and what lies between
+    places of known winding numbers takes their mean: far from the triangles at once, near them
+    (within `SHELL` cells) in the last step, which is shorter than a wall is thick.
+    """
+    import igl
+
+    winding, known = np.zeros(air.shape), _beyond(verts, start, cell, air.shape)
+    for step in (FAR, FAR // 2, 1):
+        some = np.s_[::step, ::step, ::step]
+        if step < FAR:
+            _draw_between(winding[some], known[some], (air if step == 1 else air & ~near)[some])
+        left = air[some] & ~known[some]
+        at = np.argwhere(left)
+        found = igl.fast_winding_number(verts, faces, start + cell * step * at)
+        winding[some][left], known[some][left] = np.abs(found), True
+    return winding
+
+
+def _beyond(
+    verts: np.ndarray, start: np.ndarray, cell: float, shape: tuple[int, ...]
+) -> np.ndarray:
+    """The places outside of the box of the triangles, where nothing is inside."""
+    low, high = (verts.min(0) - start) / cell, (verts.max(0) - start) / cell
+    beyond = np.ones(shape, dtype=bool)
+    first, last = np.floor(low).astype(int) + 1, np.ceil(high).astype(int)
+    beyond[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] = False
+    return beyond
+
+
+def _draw_between(winding: np.ndarray, known: np.ndarray, allowed: np.ndarray) -> None:
+    """Means of known neighbours where every second place along the axes was measured, in place."""
+    for axis in range(3):
+        row = [slice(None)] * axis + [slice(None)] + [slice(None, None, 2)] * (2 - axis)
+
+        def at(along: slice, row: list[slice] = row, axis: int = axis) -> tuple[slice, ...]:
+            return (*row[:axis], along, *row[axis + 1 :])
+
+        odd, behind = at(slice(1, None, 2)), at(slice(2, None, 2))
+        before = at(slice(0, winding.shape[axis] // 2 * 2, 2))
+        weight = known[before].astype(np.float64)
+        total = winding[before] * weight
+        inner = tuple(slice(n) for n in known[behind].shape)  # the last may have none behind it
+        weight[inner] += known[behind]
+        total[inner] += winding[behind] * known[behind]
+        fresh = allowed[odd] & ~known[odd] & (weight > 0)
+        winding[odd][fresh], known[odd][fresh] = total[fresh] / weight[fresh], True
 
 
 def _outside(free: np.ndarray) -> np.ndarray:
@@ -99,21 +133,14 @@ def _outside(free: np.ndarray) -> np.ndarray:
 def _distances(
     verts: np.ndarray, faces: np.ndarray, start: np.ndarray, cell: float, counts: np.ndarray
 ) -> np.ndarray:
-    """Distance to the triangles at the grid's places [m]: exact near them, else too small.
+    """Distance to the triangles at the grid's places [m]: exact up to two cells from them.
 
-    The distance changes by no more than the way one goes: that to the middle of a block of cells
-    tells whether to look at its parts.
+    Measured from the grid's corner: the kernels count in single precision.
     """
-    bound = np.zeros(-(-counts // COARSE))
-    for step in (COARSE, COARSE // 2, 1):
-        near = np.argwhere(bound < (WALL + 1) * cell)  # the level's cells and their neighbours
-        middles = start + cell * (near * step + (step - 1) / 2)
-        distance = np.sqrt(closest(middles, verts, faces)[0])
-        bound[tuple(near.T)] = distance - cell * np.sqrt(3) * (step - 1) / 2
-        for axis in range(3 if step > 1 else 0):
-            finer = np.arange(-(-int(counts[axis]) * 2 // step))
-            bound = bound.take(finer // 2, axis)
-    return bound
+    empty = torch.full(counts.tolist(), BAND * cell, dtype=torch.float32)
+    corners = torch.from_numpy(verts - start).float()[None]
+    grid = Volume(empty, torch.zeros(3), cell)
+    return union_bodies(corners, torch.from_numpy(faces), grid).values.abs().double().numpy()
 
 
 def _bodies(points: np.ndarray, shell: np.ndarray) -> Triangles:

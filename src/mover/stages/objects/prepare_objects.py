@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +17,7 @@ from mover.core.records import fingerprint, record
 from mover.core.run import sources
 from mover.core.types import Layout, Mesh, Objects, SceneObject
 from mover.furniture.library import BACKS, SEATS, canonical
+from mover.geometry.kernels.start import threads
 from mover.geometry.mesh import box, decimate, sample_surface, signed_volume, used
 from mover.geometry.occupancy import load_occupancy, occupied_mesh
 from mover.geometry.placement import FREE, GROUND
@@ -149,9 +151,11 @@ def prepare_objects(
     """
     close, notes = _closing(config)
     proxies: list[_Proxy] = []
-    for index, piece in enumerate(inputs.objects):
-        proxies.append(_proxy(piece, config, close))
-        observe(Step("prepare_objects", index, len(inputs.objects)))
+    with ThreadPoolExecutor(threads()) as pool:
+        made = pool.map(lambda piece: _proxy(piece, config, close), inputs.objects)
+        for index, proxy in enumerate(made):
+            proxies.append(proxy)
+            observe(Step("prepare_objects", index, len(inputs.objects)))
     pieces = inputs.objects
     center = torch.stack([p.center for p in proxies])
     scale = torch.stack([p.scale for p in pieces])
@@ -159,7 +163,7 @@ def prepare_objects(
     origin = torch.stack([p.t_world_object for p in pieces])
     moved = (rot_y(yaw) @ (scale * center).unsqueeze(-1)).squeeze(-1)
     start = Layout(origin + moved, yaw, torch.zeros_like(scale))
-    warnings = (*_warnings(pieces, proxies), *notes)
+    warnings = (*_warnings(pieces, proxies), *sorted(notes))
     return Prepared(_pack(pieces, proxies), start, center, scale, warnings)
 
 
