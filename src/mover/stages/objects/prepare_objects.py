@@ -17,12 +17,12 @@ from mover.core.records import fingerprint, record
 from mover.core.run import sources
 from mover.core.types import Layout, Mesh, Objects, SceneObject
 from mover.furniture.library import BACKS, SEATS, canonical
-from mover.geometry.kernels.start import threads
 from mover.geometry.mesh import box, decimate, sample_surface, signed_volume, used
 from mover.geometry.occupancy import load_occupancy, occupied_mesh
 from mover.geometry.placement import FREE, GROUND
 from mover.geometry.rotations import rot_y
 from mover.geometry.topology import edges_of
+from mover.geometry.warp_start import threads
 from mover.geometry.watertight import close_mesh
 from mover.stages.config import PrepareConfig
 
