@@ -182,9 +182,6 @@ def evaluate_folder(
         truth: The true scene.
         config: Densities and thresholds.
         physics: Whether both scenes are simulated as well, for the share that is stable.
-
-    Raises:
-        InputError: If a scene or a bodies file is missing or wrong.
     """
     initial_people, people, true_people = (
         read_bodies(path) if path.exists() else None

@@ -54,13 +54,7 @@ class Load:
 
 
 def loads_of(out: Path, scene: Scene, fps: float | None) -> tuple[Load, ...]:
-    """The weights of all bouts of sitting in a result; none without contacts.npz.
-
-    Args:
-        out: Folder of the result.
-        scene: Its scene, in which the contacts lie.
-        fps: Frames a second.
-    """
+    """The weights of all bouts of sitting in a result; none without contacts.npz."""
     return loads_in(read_labels(out / FILE), scene, fps) if (out / FILE).is_file() else ()
 
 

@@ -151,9 +151,6 @@ def chosen(asked: str, name: str, *kinds: Kind) -> Callable[..., Any]:
         asked: How a message calls the option, as `--format`.
         name: What was given.
         kinds: Among which it is looked for.
-
-    Raises:
-        InputError: If there is no such format.
     """
     row = next((row for row in FORMATS if row.name == name and row.kind in kinds), None)
     if row is None:
@@ -163,10 +160,6 @@ def chosen(asked: str, name: str, *kinds: Kind) -> Callable[..., Any]:
 
 def read(format: str, path: Path) -> "Capture":
     """Read a whole capture.
-
-    Args:
-        format: A name of the kind `capture`.
-        path: The file or folder.
 
     Raises:
         ValueError: If there is no such format.

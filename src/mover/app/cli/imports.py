@@ -85,12 +85,7 @@ def import_(arguments: Sequence[str]) -> None:
 
 
 def run_import(args: ImportArgs, work: Path) -> None:
-    """Import one source.
-
-    Args:
-        args: What was typed.
-        work: A folder for meshes on the way.
-    """
+    """Import one source; `work` is a folder for meshes on the way."""
     from mover.io.capture.merge import import_into
 
     hints = _hints(args, work)

@@ -232,11 +232,7 @@ def fit(arguments: Sequence[str]) -> None:
 
 
 def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
-    """Fit, and write the bodies.
-
-    Args:
-        args: What to fit.
-        config: Weights and settings; None: the preset's.
+    """Fit, with the preset's settings where none are given, and write the bodies.
 
     Raises:
         InputError: If what is given cannot be used.
@@ -289,11 +285,7 @@ def _world(args: FitArgs) -> tuple[Any, float | None]:
 
 
 def keypoints_at(source: Path, tool: str, fps: float | None, first: int) -> Any:  # noqa: ANN401
-    """The 2D joints of keypoints.npz, or of a detector's file or folder.
-
-    Raises:
-        InputError: If they cannot be read.
-    """
+    """The 2D joints of keypoints.npz, or of a detector's file or folder."""
     from mover.io.people.found import Known
     from mover.io.people.keypoints import keypoints_from, read_keypoints
 

@@ -165,13 +165,7 @@ Out = TypeVar("Out")
 
 
 def read_layers(out: Path, run: Mapping[str, Any], scene: Scene) -> Layers:
-    """The evidence of a result; what a run did not leave, or not in today's form, is left out.
-
-    Args:
-        out: Folder of the result.
-        run: What its run.json holds.
-        scene: The result.
-    """
+    """The evidence of a result; what a run did not leave, or not in today's form, is left out."""
     cues = _last(Cues, "gather_cues", out, run)
     contacts = _last(ContactAssignment, "assign_contacts", out, run)
     points = None

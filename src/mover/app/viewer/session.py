@@ -66,11 +66,7 @@ class Shown:
 
 
 def read_shown(out: Path, capture: Capture | None = None) -> Shown:
-    """Read what `mover run` left in its folder.
-
-    Raises:
-        InputError: If there is no result, or something in it is wrong.
-    """
+    """Read what `mover run` left in its folder."""
     result = read_scene(out / "scene.json")
     log = _json(out / "run.json")
     first = out / "initial.json"

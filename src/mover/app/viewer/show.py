@@ -194,9 +194,6 @@ def quiet_presses(server: Any) -> None:  # noqa: ANN401
     listener that was registered as passive. There the request does nothing, and Chromium writes an
     error about it. The script, which every browser that connects runs, takes the request off such
     presses: what they do stays the same. A viser without such messages stays as it is.
-
-    Args:
-        server: The viser server.
     """
     from viser import _messages  # pyright: ignore[reportMissingImports]
 

@@ -29,11 +29,7 @@ class AnnotationFields(Struct, frozen=True):
 
 
 def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
-    """The instances of objects.json.
-
-    Raises:
-        InputError: If a field is wrong.
-    """
+    """The instances of objects.json."""
     image = check_image(items(get(at, "images"), 1)[0], camera)
     names = categories_of(get(at, "categories"))
     seen: set[object] = set()
@@ -151,11 +147,7 @@ class PersonFields(Struct, frozen=True):
 
 
 def people_of(at: At, camera: Camera, warn: Warn) -> PeopleFile:
-    """The people's visible masks in the frames, and in the reference image.
-
-    Raises:
-        InputError: If a field is wrong.
-    """
+    """The people's visible masks in the frames, and in the reference image."""
     info = maybe(at, "info")
     known = InfoFields() if info is None else checked(info, InfoFields)
     heights: dict[str, float] = {}

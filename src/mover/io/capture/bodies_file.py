@@ -36,20 +36,12 @@ TALLEST, SMALLEST = 3.5, 0.2  # [m], of a body that is in metres
 
 
 def read_bodies(path: Path, warn: Warn = log.warning) -> Bodies:
-    """Read and check bodies, in the space that the file says.
-
-    Raises:
-        InputError: If anything in it is wrong.
-    """
+    """Read and check bodies, in the space that the file says."""
     return bodies_of(read_npz(path), warn)
 
 
 def read_body_arrays(path: Path, fps: float | None = None) -> At:
-    """The arrays of bodies.npz as they are, with a frame rate where one is given.
-
-    Raises:
-        InputError: If the file cannot be read.
-    """
+    """The arrays of bodies.npz as they are, with a frame rate where one is given."""
     at = read_npz(path)
     return at if fps is None else At({**at.value, "fps": np.array(fps)}, at.file)
 

@@ -39,9 +39,6 @@ def camera_of(at: At, other: Camera | None = None) -> Camera:
     Args:
         at: The object.
         other: Its rotation is taken where `at` has none; without it the camera is level.
-
-    Raises:
-        InputError: If a field is wrong.
     """
     lens = checked(at, CameraFields)
     if lens.w * lens.h > LARGEST_AREA:

@@ -215,11 +215,7 @@ class EditsFields(Struct, frozen=True):
 
 
 def read_edits(path: Path) -> tuple[Edit, ...]:
-    """Read and check a list of edits; whether their objects exist shows when they are applied.
-
-    Raises:
-        InputError: If anything in it is wrong.
-    """
+    """Read and check a list of edits; whether their objects exist shows when they are applied."""
     at = read_json(path)
     checked(at, EditsFields)
     return tuple(_edit_of(item) for item in items(get(at, "edits")))

@@ -37,11 +37,7 @@ REFERENCE, FURNITURE = "reference.jpg", "furniture.json"
 
 
 def read_capture(folder: Path) -> Capture:
-    """Read and check a capture folder; its truth is not looked at.
-
-    Raises:
-        InputError: If any field of any file is wrong.
-    """
+    """Read and check a capture folder; its truth is not looked at."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder, expected a capture")
     parts = _files(folder, read_json)
@@ -55,11 +51,7 @@ def read_capture(folder: Path) -> Capture:
 
 
 def folder_parts(folder: Path, hints: Hints | None = None) -> Parts:
-    """What is already in a capture's folder; the camera of scene.json is taken out of it.
-
-    Raises:
-        InputError: If a file is no JSON or no .npz.
-    """
+    """What is already in a capture's folder; the camera of scene.json is taken out of it."""
     del hints
     parts = _files(folder, partial(_if_there, read_json))
     camera, scene = parts.camera, parts.scene

@@ -249,12 +249,6 @@ def _stand_in(whole: Parts) -> Camera | None:
 def _write_whole(whole: Parts, old: Parts, capture: Capture | None, folder: Path) -> list[str]:
     """Write what is new.
 
-    Args:
-        whole: All parts.
-        old: Those that were there before.
-        capture: The same, checked; None while camera or scene are missing.
-        folder: Where to.
-
     Returns:
         The names of the files.
     """

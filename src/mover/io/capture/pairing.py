@@ -125,10 +125,6 @@ def _tree(like: At, rows: Sequence[Mapping[str, Any]]) -> At:
 def linked(scene: Scene, at: At) -> dict[str, int]:
     """Annotation of each object that has none yet, by the objects' outlines in the image.
 
-    Args:
-        scene: With its camera.
-        at: objects.json.
-
     Returns:
         Annotation id by object id, for those that find one.
     """
@@ -192,12 +188,7 @@ def overlap(scene: Scene, detections: tuple[Detection, ...]) -> float | None:
 
 
 def odd_world(scene: Scene, detections: tuple[Detection, ...]) -> str | None:
-    """What is wrong with the axes of a scene whose objects miss their detections; None: nothing.
-
-    Args:
-        scene: The initial scene.
-        detections: What the image shows.
-    """
+    """What is wrong with the axes of a scene whose objects miss their detections; None: nothing."""
     own = overlap(scene, detections)
     if own is None or own >= POOR:
         return None

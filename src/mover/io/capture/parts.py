@@ -105,9 +105,6 @@ def image_parts(path: Path, *, mirrored: bool = False) -> tuple[LoadImage, tuple
     Args:
         path: Of the picture.
         mirrored: It is stored mirrored and must be flipped left to right.
-
-    Raises:
-        InputError: If it cannot be read.
     """
     size = image_size(path)
 

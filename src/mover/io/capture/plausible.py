@@ -40,10 +40,6 @@ SCENE, BODIES = "scene.json", "bodies.npz"
 def check_plausible(capture: Capture, warn: Warn) -> None:
     """Look at everything that a capture says.
 
-    Args:
-        capture: The capture.
-        warn: Takes what is odd but may be.
-
     Raises:
         InputError: If something cannot be: file, field, found, expected.
     """

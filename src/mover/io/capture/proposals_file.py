@@ -49,11 +49,7 @@ def write_proposals(room: Room, path: Path) -> None:
 
 
 def read_proposals(path: Path) -> tuple[Proposal, ...]:
-    """What a result proposes; nothing where there is no such file.
-
-    Raises:
-        InputError: If anything in it is wrong.
-    """
+    """What a result proposes; nothing where there is no such file."""
     if not path.is_file():
         return ()
     rows = checked(read_json(path), ProposedFields).objects

@@ -51,9 +51,6 @@ def read_scene(path: Path, camera: Camera | None = None, warn: Warn = log.warnin
         path: Of scene.json; meshes are relative to its folder.
         camera: Used where the file has none.
         warn: Takes what is odd but not wrong.
-
-    Raises:
-        InputError: If anything in it is wrong.
     """
 
     def load(at: At) -> tuple[Mesh, str]:
@@ -308,9 +305,6 @@ def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[Sce
         load: Gives the mesh that a field names.
         scene: The scene beside the file.
         warn: Takes what is odd but not wrong.
-
-    Raises:
-        InputError: If a field is wrong.
     """
     objects, own = get(at, "objects"), {piece.id: piece for piece in scene.objects}
     found: list[SceneObject] = []

@@ -231,11 +231,7 @@ def _with_truth(parts: Parts, root: Path, room: str, scan_cam: Matrix, hints: Hi
 
 
 def read_segments(path: Path) -> list[TrueBox]:
-    """The furniture of segs.json: groups that are parts of one object are one box.
-
-    Raises:
-        InputError: If a field is wrong.
-    """
+    """The furniture of segs.json: groups that are parts of one object are one box."""
     groups: dict[str, list[TrueBox]] = {}
     for item in items(get(read_json(path), "segGroups")):
         label = text(get(item, "label")).lower()

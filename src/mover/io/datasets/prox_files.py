@@ -179,11 +179,7 @@ def asked_for(root: Path, names: Sequence[str]) -> tuple[Recording, ...]:
 
 
 def lens_of(root: Path) -> At:
-    """The colour camera; images are mirrored before it holds, and cx is not.
-
-    Raises:
-        InputError: If the calibration is missing or wrong.
-    """
+    """The colour camera; images are mirrored before it holds, and cx is not."""
     return read_camera_file(root / "calibration" / "Color.json", SIZE)
 
 

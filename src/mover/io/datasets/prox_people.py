@@ -27,16 +27,7 @@ MOST = 0.7  # of the picture that a person may fill
 def people_masks(
     lines: Sequence[Timeline], tracks: Mapping[str, int], fps: float | None
 ) -> At | None:
-    """The fields of people.json; None where no recording has masks.
-
-    Args:
-        lines: The frames of the recordings.
-        tracks: Track of each subject.
-        fps: Frames a second; None: stills.
-
-    Raises:
-        InputError: If a picture is no body index.
-    """
+    """The fields of people.json; None where no recording has masks; stills have no `fps`."""
     items: list[Instance] = []
     for line in lines:
         for frame, path in line.files("BodyIndexColor").items():
@@ -113,9 +104,6 @@ def keypoint_trees(
         bodies: Fits in the camera's frame.
         camera: Of the flipped pictures.
         notes: Takes what was decided.
-
-    Raises:
-        InputError: If a file is not OpenPose's.
     """
     trees = {frame: read_json(path) for frame, path in line.files("keypoints").items()}
     if not trees:

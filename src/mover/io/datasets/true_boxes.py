@@ -52,9 +52,6 @@ def read_bbox3d(path: Path, names: Mapping[str, str], file: At) -> list[TrueBox]
         path: For messages.
         names: Categories by id, where the id does not tell.
         file: The content of bbox3d.json.
-
-    Raises:
-        InputError: If a field is wrong.
     """
     rows = {key: get(file, key) for key in mapping(file)}
     if not rows:

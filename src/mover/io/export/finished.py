@@ -50,9 +50,6 @@ def read_finished(out: Path, capture: Path | None = None, stable: bool = False) 
         capture: Folder of the capture; its bodies.npz tells the parameters of the bodies where the
             result has none.
         stable: Whether the scene is that of `STABLE`.
-
-    Raises:
-        InputError: If there is no result, or something in it is wrong.
     """
     if stable and not (out / STABLE).is_file():
         raise InputError(f"{out / STABLE}: not found; `mover simulate OUT --nudge` writes it")

@@ -153,12 +153,7 @@ class Skin:
 
 
 def skin_for(finished: Finished, influences: int) -> Skin | str:
-    """The bones that move the result's bodies, or why there are none.
-
-    Args:
-        finished: The result.
-        influences: Joints that may move a vertex.
-    """
+    """The bones that move the bodies, `influences` joints a vertex, or why there are none."""
     motion = motion_of(finished)
     if isinstance(motion, str):
         return motion

@@ -161,11 +161,7 @@ def wall_rows(walls: Sequence[Wall]) -> list[dict[str, Any]]:
 
 
 def walls_in(at: At) -> tuple[Wall, ...]:
-    """Walls of a file.
-
-    Raises:
-        InputError: If a field is missing or wrong.
-    """
+    """Walls of a file."""
     rows = checked(at, list[WallFields])
 
     def spot(place: tuple[float, float]) -> Float[Tensor, "2"]:

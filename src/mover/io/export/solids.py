@@ -298,12 +298,7 @@ def floor_height(scene: Scene) -> float:
 
 
 def solids_of(scene: Scene, run: Run) -> tuple[Solid, ...]:
-    """All pieces of a scene.
-
-    Args:
-        scene: Initial, result or truth.
-        run: Its folder keeps the convex pieces.
-    """
+    """All pieces of a scene; the folder of `run` keeps their convex pieces."""
     floor = floor_height(scene)
     return tuple(_solid(piece, convex_of(piece, run), floor) for piece in scene.objects)
 

@@ -100,11 +100,7 @@ def of_view(degrees: float, size: tuple[int, int], file: str) -> At:
 
 
 def read_intrinsics(path: Path) -> NDArray[np.float64]:
-    """The 3 x 3 numbers of a text file [fx 0 cx; 0 fy cy; 0 0 1].
-
-    Raises:
-        InputError: If it is missing or something else.
-    """
+    """The 3 x 3 numbers of a text file [fx 0 cx; 0 fy cy; 0 0 1]."""
     try:
         if path.stat().st_size > LARGEST_TEXT:
             raise ValueError("the file is too large")

@@ -43,11 +43,7 @@ def find_depth_file(folder: Path) -> tuple[Path, bool] | None:
 
 
 def read_depth_image(path: Path, camera: Camera, *, metric: bool) -> DepthImage:
-    """The measured depth of the reference picture.
-
-    Raises:
-        InputError: If the file is something else.
-    """
+    """The measured depth of the reference picture."""
     return DepthImage(read_depth(path, camera) if metric else read_disparity(path, camera), metric)
 
 
@@ -60,11 +56,7 @@ def write_depth_image(depth: DepthImage, folder: Path) -> None:
 
 
 def read_disparity(path: Path, camera: Camera) -> Float[Tensor, "h w"]:
-    """Inverse depth up to a factor and a shift; NaN where it is not positive.
-
-    Raises:
-        InputError: If the file is something else.
-    """
+    """Inverse depth up to a factor and a shift; NaN where it is not positive."""
     if path.suffix.lower() == ".png":
         with opened(path, expected="a map of inverse depth", bombs="error") as picture:
             mode, values = picture.mode, np.asarray(picture, dtype=np.float64)
@@ -82,9 +74,6 @@ def read_depth(path: Path, camera: Camera) -> Float[Tensor, "h w"]:
 
     `.npz` and `.npy` hold metres (`depth`, or MoGe's `points`, whose z counts); `.png` with 16
     bits holds millimetres. Another resolution of the same shape is stretched.
-
-    Raises:
-        InputError: If the file is something else.
     """
     values = _of_png(path) if path.suffix.lower() == ".png" else _values_of(path, NAMES)
     known = np.isfinite(values) & (values > 0) & (values < FARTHEST)

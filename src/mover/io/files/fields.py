@@ -179,11 +179,7 @@ _KINDS = {"real": "fiu", "whole": "iu", "text": "U"}
 
 
 def read_json(path: Path) -> At:
-    """The content of a JSON file.
-
-    Raises:
-        InputError: If the file is missing or is not JSON.
-    """
+    """The content of a JSON file."""
     name = path.name
     if not path.is_file():
         raise InputError(f"{name}: there is no such file in {path.parent}, expected a JSON file")

@@ -32,9 +32,6 @@ def opened(
         at: How messages call it; None: by its file.
         expected: What it should be.
         bombs: Whether a picture is refused that is large enough to make Pillow warn.
-
-    Raises:
-        InputError: If it is missing or cannot be read.
     """
     from PIL import Image
 
@@ -65,11 +62,6 @@ def read_image(at: At, folder: Path, camera: Camera) -> Float[Tensor, "h w 3"]:
 def read_image_file(at: At, path: Path, camera: Camera) -> Float[Tensor, "h w 3"]:
     """A picture wherever it lies, upright, in [0, 1]; its size must be the camera's.
 
-    Args:
-        at: How messages call it.
-        path: Its file.
-        camera: Of the size that it must have.
-
     Raises:
         InputError: If it cannot be read or has another size.
     """
@@ -89,11 +81,7 @@ def read_image_file(at: At, path: Path, camera: Camera) -> Float[Tensor, "h w 3"
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of a picture as it is stored [px].
-
-    Raises:
-        InputError: If it is missing or cannot be read.
-    """
+    """Width and height of a picture as it is stored [px]."""
     with opened(path) as picture:
         return picture.size
 
@@ -108,11 +96,7 @@ def write_image(image: Float[Tensor, "h w 3"], path: Path) -> None:
 
 
 def mirrored_copy(path: Path, work: Path) -> Path:
-    """A picture flipped left to right, as a new file in `work`.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """A picture flipped left to right, as a new file in `work`."""
     from PIL import ImageOps
 
     work.mkdir(parents=True, exist_ok=True)

@@ -54,11 +54,7 @@ def read_mesh(at: At, folder: Path) -> tuple[Mesh, str]:
 
 
 def load_arrays(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-    """All vertices, used or not, and the faces of all parts of a file.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """All vertices, used or not, and the faces of all parts of a file."""
     import trimesh
 
     with warnings.catch_warnings():
@@ -213,20 +209,12 @@ OUTLIERS = 0.002  # share of the lowest points that may be anything
 
 
 def read_scan(path: Path) -> Mesh:
-    """A scan in the frame of its file.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """A scan in the frame of its file."""
     return read_mesh(At(path.name, path.name), path.parent)[0]
 
 
 def floor_of(heights: NDArray[np.float64]) -> float:
-    """The height at which a scan has its lowest large level part [m].
-
-    Args:
-        heights: Of its vertices, upwards [m].
-    """
+    """The height at which a scan has its lowest large level part, of its vertices' heights [m]."""
     lowest = float(np.quantile(heights, OUTLIERS))
     near = heights[(heights >= lowest - BIN) & (heights <= lowest + REACH)]
     edges = np.arange(lowest - BIN, lowest + REACH + BIN, BIN)

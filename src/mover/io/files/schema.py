@@ -56,10 +56,6 @@ def checked(at: At, kind: Any) -> Any: ...  # noqa: ANN401
 def checked(at: At, kind: Any) -> Any:
     """The value as its schema has it.
 
-    Args:
-        at: The value and its place.
-        kind: A `Struct`, or any type of its fields.
-
     Raises:
         InputError: If a field is missing or wrong: file, field, found, expected.
     """

@@ -29,11 +29,7 @@ CORNERS = 3  # a polygon has at least so many
 def from_coco(segmentation: Any, height: int, width: int, where: str) -> bytes:  # noqa: ANN401
     """The compressed run-length code of COCO's polygons or of either of its run-length codes.
 
-    Args:
-        segmentation: The value of an annotation's field.
-        height: Of the image [px].
-        width: Of the image [px].
-        where: File and field, for messages.
+    Height and width are those of the image [px]; `where` is file and field, for messages.
 
     Raises:
         InputError: If it is malformed or does not fit the image. It may be empty.

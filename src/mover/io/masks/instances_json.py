@@ -54,11 +54,7 @@ class RowFields(Struct, frozen=True):
 
 
 def coco_instances(at: At, names: Mapping[str, str], size: Size | None) -> Instances:
-    """The annotations of a COCO file; frames are its images in the order of their ids.
-
-    Raises:
-        InputError: If a field is wrong.
-    """
+    """The annotations of a COCO file; frames are its images in the order of their ids."""
     sizes = dict(_size_of_image(item, size) for item in items(get(at, "images")))
     words = {**_categories(at), **_numbered(names)}
     rows = [(item, checked(item, RowFields)) for item in items(get(at, "annotations"))]
@@ -106,9 +102,6 @@ def list_instances(at: At, names: Mapping[str, str], size: Size | None) -> Insta
 
     An item has `class` (a name) or `category_id`; `bbox` and `segmentation` or `mask`. COCO's ids
     have gaps; a file whose ids only make sense counted from 0 (detectron2) is read so.
-
-    Raises:
-        InputError: If a field is wrong.
     """
     rows = [(item, checked(item, RowFields)) for item in items(at)]
     keys = {row.category_id for _, row in rows if row.category_id is not None}
@@ -186,11 +179,7 @@ class MaskletFields(Struct, frozen=True):
 
 
 def masklets(at: At, names: Mapping[str, str]) -> Instances:
-    """SA-V's masklet[frame][object]; the objects have no names.
-
-    Raises:
-        InputError: If a field is wrong.
-    """
+    """SA-V's masklet[frame][object]; the objects have no names."""
     tree = checked(at, MaskletFields)
     size, tracks = (round(tree.video_width), round(tree.video_height)), tree.masklet_id or []
     found: list[Instance] = []
@@ -214,11 +203,7 @@ class Sam3Fields(Struct, frozen=True):
 
 
 def sam3_instances(at: At, names: Mapping[str, str]) -> Instances:
-    """SAM 3's answers: codes without sizes, boxes as shares of the image.
-
-    Raises:
-        InputError: If a field is wrong.
-    """
+    """SAM 3's answers: codes without sizes, boxes as shares of the image."""
     tree = checked(at, Sam3Fields)
     size, codes, scores = (tree.orig_img_w, tree.orig_img_h), tree.pred_masks, tree.pred_scores
     if scores is not None:

@@ -37,9 +37,6 @@ def read_mask_arrays(path: Path, names: Mapping[str, str]) -> Instances:
     (above 0 is inside); or (h, w), a label map. Beside it may stand `scores`, `labels` (names),
     `object_ids` and `frame`. With a single object id (n, 1, h, w) is one thing in n frames. Boxes
     are those of the masks.
-
-    Raises:
-        InputError: If the arrays are wrong.
     """
     at = _load(path)
     given = _first(at, MASKS)
@@ -180,11 +177,7 @@ def _labels(source: Path) -> dict[str, str]:
 
 
 def read_labels(path: Path) -> NDArray[np.int64]:
-    """The numbers of a picture of labels (h, w): palette or grey values, or alpha above 0.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """The numbers of a picture of labels (h, w): palette or grey values, or alpha above 0."""
     with opened(path, expected="a picture of masks", bombs="error") as picture:
         return _numbers(picture)
 

@@ -233,11 +233,7 @@ def _faces(found: Found, model: BodyModel | None, known: Known) -> Int[Tensor, "
 
 
 def mesh_file(path: Path) -> Mesh:
-    """The mesh that gives the triangles.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """The mesh that gives the triangles."""
     if not path.is_file():
         raise InputError(f"--faces: there is no file {path}")
     return read_mesh(At(path.name, str(path)), path.parent)[0]

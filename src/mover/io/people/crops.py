@@ -111,11 +111,7 @@ FOCAL, CROP = 5000.0, 256.0  # [px]
 
 
 def read_phalp(path: Path, known: Known) -> Found:
-    """Bodies of 4D-Humans (PHALP): the one .pkl of a folder, or the file itself.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Bodies of 4D-Humans (PHALP): the one .pkl of a folder, or the file itself."""
     at = read_any(only_file(path, "**/*.pkl", "the results of PHALP"))
     frames = mapping(at)
     found: list[Found] = []

@@ -41,29 +41,17 @@ GENDERS = ("neutral", "female", "male")
 
 
 def read_smplifyx(path: Path, known: Known) -> Found:
-    """Fits of SMPLify-X: results/<frame>/<person>.pkl, or one such file.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Fits of SMPLify-X: results/<frame>/<person>.pkl, or one such file."""
     return _read(path, known, assumed=True)
 
 
 def read_prox(path: Path, known: Known) -> Found:
-    """Fits of PROX: results/<frame>/000.pkl, under the true lens.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Fits of PROX: results/<frame>/000.pkl, under the true lens."""
     return _read(path, known, assumed=False)
 
 
 def read_mover(path: Path, known: Known) -> Found:
-    """Fits of the authors' MOVER: 001_all.pkl of a video, or a file a frame.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Fits of the authors' MOVER: 001_all.pkl of a video, or a file a frame."""
     if path.is_dir() and (path / "001_all.pkl").is_file():
         path = path / "001_all.pkl"
     return _read(path, known, assumed=False)
@@ -156,11 +144,7 @@ UP = (0.0, -1.0, 0.0)
 
 
 def read_slahmr(path: Path, known: Known) -> Found:
-    """Bodies of SLAHMR, in the cameras of their frames; of a folder the last result.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Bodies of SLAHMR, in the cameras of their frames; of a folder the last result."""
     path = files_of(path, "**/*_world_results.npz", "SLAHMR's results")[-1]
     at = read_any(path)
     place = numbers(need(at, "trans"))

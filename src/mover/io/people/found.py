@@ -165,17 +165,7 @@ def people_rows(
     extra: Mapping[str, Tensor] | None = None,
     **more: Any,  # noqa: ANN401
 ) -> Found:
-    """Rows of a body model.
-
-    Args:
-        known: What the user knows.
-        model: Whose parameters.
-        frame: Of each row.
-        person: Of each row, or of all.
-        told: Angles, shape and place as `pose_of` takes them.
-        extra: Hands, jaw, expression.
-        more: Further fields of the rows.
-    """
+    """Rows of a body model: `told` are angles, shape and place as `pose_of` takes them."""
     who = torch.full_like(frame, person) if isinstance(person, int) else person
     pose = dataclasses.replace(pose_of(model, known.gender, *told), extra=dict(extra or {}))
     return Found(model, frame, who, pose, **more)

@@ -54,11 +54,7 @@ EXTRA = {"left_hand_pose": (66, 111), "right_hand_pose": (111, 156), "jaw_pose":
 
 
 def read_multihmr(path: Path, known: Known) -> Found:
-    """Bodies of Multi-HMR; people are followed from image to image.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Bodies of Multi-HMR; people are followed from image to image."""
     return tracked(
         path,
         known,
@@ -84,11 +80,7 @@ def _of_multihmr(seen: "Sighting", person: int, known: Known) -> Found:
 
 
 def read_sam3d(path: Path, known: Known) -> Found:
-    """Bodies of SAM 3D Body, meshes only; people are followed from image to image.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Bodies of SAM 3D Body, meshes only; people are followed from image to image."""
     return tracked(
         path, known, lambda at: _verts(at).mean(0), lambda seen, who: _of_sam3d(seen, who, known)
     )

@@ -150,11 +150,7 @@ def write_keypoints(keypoints: Keypoints, path: Path) -> None:
 
 
 def read_keypoints(path: Path) -> Keypoints:
-    """Read and check keypoints.npz.
-
-    Raises:
-        InputError: If anything in it is wrong.
-    """
+    """Read and check keypoints.npz."""
     at = read_npz(path)
     word = get(at, "layout")
     layout = choice(At(str(array(word, (), "text")), at.file, "layout"), tuple(LAYOUTS))

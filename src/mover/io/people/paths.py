@@ -29,11 +29,7 @@ Array = NDArray[Any]
 
 
 def read_vipe(path: Path) -> At:
-    """ViPE: pose/NAME.npz (`data`, `inds`), and intrinsics/NAME.npz beside it.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """ViPE: pose/NAME.npz (`data`, `inds`), and intrinsics/NAME.npz beside it."""
     folder = path / "pose" if (path / "pose").is_dir() else path
     at = read_any(only_file(folder, "*.npz", "ViPE's poses"))
     T = stacked(need(at, "data"), 4, 4)
@@ -51,11 +47,7 @@ def read_vipe(path: Path) -> At:
 
 
 def read_megasam(path: Path) -> At:
-    """MegaSaM: NAME_sgd_cvd_hr.npz, or NAME_droid.npz of its first stage.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """MegaSaM: NAME_sgd_cvd_hr.npz, or NAME_droid.npz of its first stage."""
     at = read_any(only_file(path, "*_sgd_cvd_hr.npz", "MegaSaM's result"))
     T = stacked(need(at, "cam_c2w"), 4, 4)
     K = rows(need(at, "intrinsic"), None, 9, 3).reshape(-1, 9)
@@ -63,22 +55,14 @@ def read_megasam(path: Path) -> At:
 
 
 def read_tram(path: Path) -> At:
-    """TRAM: camera.npy (`pred_cam_R`, `pred_cam_T`: camera to world).
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """TRAM: camera.npy (`pred_cam_R`, `pred_cam_T`: camera to world)."""
     at = read_any(path / "camera.npy" if path.is_dir() else path)
     T = _joined(need(at, "pred_cam_R"), need(at, "pred_cam_T"))
     return _arrays(at, T, None, _told_focal(at))
 
 
 def read_prompthmr(path: Path) -> At:
-    """PromptHMR: `camera_world` of results.pkl (`Rwc`, `Twc`, or the way back).
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """PromptHMR: `camera_world` of results.pkl (`Rwc`, `Twc`, or the way back)."""
     at = read_any(path / "results.pkl" if path.is_dir() else path)
     world = need(at, "camera_world")
     turn = either(world, "Rwc")
@@ -107,29 +91,17 @@ def read_slam(path: Path) -> At:
 
 
 def read_vggt(path: Path) -> At:
-    """VGGT: predictions.npz (`extrinsic`: world to camera, `intrinsic`).
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """VGGT: predictions.npz (`extrinsic`: world to camera, `intrinsic`)."""
     return _of_network(path, "predictions.npz", "extrinsic", "intrinsic", inverse=True)
 
 
 def read_da3(path: Path) -> At:
-    """Depth Anything 3: exports/npz/results.npz (`extrinsics`: world to camera, `intrinsics`).
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Depth Anything 3: exports/npz/results.npz (`extrinsics`: world to camera, `intrinsics`)."""
     return _of_network(path, "**/results.npz", "extrinsics", "intrinsics", inverse=True)
 
 
 def read_mapanything(path: Path) -> At:
-    """MapAnything: predictions.npz (`extrinsic`: camera to world, `intrinsic`).
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """MapAnything: predictions.npz (`extrinsic`: camera to world, `intrinsic`)."""
     return _of_network(path, "predictions.npz", "extrinsic", "intrinsic", inverse=False)
 
 

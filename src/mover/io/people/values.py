@@ -170,11 +170,7 @@ def keys_of(at: At) -> str:
 
 
 def numbers(at: At) -> NDArray[np.float64]:
-    """An array of real numbers of any shape; NaN and infinity are let through.
-
-    Raises:
-        InputError: If it is no array of numbers.
-    """
+    """An array of real numbers of any shape; NaN and infinity are let through."""
     try:
         value = np.asarray(at.value)
     except ValueError:  # lists of different lengths

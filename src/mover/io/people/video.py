@@ -45,11 +45,7 @@ EXTRA = {
 
 
 def read_gvhmr(path: Path, known: Known) -> Found:
-    """Bodies of GVHMR or GEM: one person, a row for each frame of the video.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Bodies of GVHMR or GEM: one person, a row for each frame of the video."""
     inside = [path / name for name in FILES if (path / name).is_file()]
     at = read_any(path if path.is_file() or not inside else inside[0])
     body = need(at, *INCAM)
@@ -72,11 +68,7 @@ def _root_and_body(at: At) -> Tensor:
 
 
 def read_prompthmr(path: Path, known: Known) -> Found:
-    """Bodies of PromptHMR.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Bodies of PromptHMR."""
     at = read_any(path / "results.pkl" if path.is_dir() else path)
     people = people_of(need(at, "people"))
     return joined([_of_prompthmr(one, person, at, known) for person, one in people])
@@ -133,11 +125,7 @@ def _of_tram(at: At, person: int, camera: At | None, known: Known) -> Found:
 
 
 def read_wham(path: Path, known: Known) -> Found:
-    """Bodies of WHAM.
-
-    Raises:
-        InputError: If a key is missing or has the wrong shape.
-    """
+    """Bodies of WHAM."""
     at = read_any(path / "wham_output.pkl" if path.is_dir() else path)
     return joined([_of_wham(track, person, known) for person, track in people_of(at)])
 

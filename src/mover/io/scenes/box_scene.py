@@ -61,11 +61,7 @@ class BoxesFields(Struct, frozen=True):
 
 
 def box_parts(path: Path, hints: Hints) -> Parts:
-    """Furniture in boxes.
-
-    Raises:
-        InputError: If a field is wrong.
-    """
+    """Furniture in boxes."""
     at = read_json(path)
     tree = checked(at, BoxesFields)
     camera = hints.camera

@@ -22,11 +22,7 @@ WHOLE = ("full_scene", "background", "depth_scene")
 
 
 def gen3dsr_parts(folder: Path, hints: Hints) -> Parts:
-    """What Gen3DSR made of one picture.
-
-    Raises:
-        InputError: If a file is missing or wrong.
-    """
+    """What Gen3DSR made of one picture."""
     lens = read_json(folder / "cam_params.json")
     given = camera_of_tree(lens, None)
     tilt = None if hints.camera is None else maybe(hints.camera, "R_cam_world")

@@ -29,11 +29,7 @@ LENS = {"w": 1920, "h": 1080, "fl_x": 1060.5317, "fl_y": 1060.3856, "cx": 951.29
 
 
 def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
-    """What HolisticMesh made of one picture.
-
-    Raises:
-        InputError: If a file is missing or wrong.
-    """
+    """What HolisticMesh made of one picture."""
     if not (folder / SCENE).is_file():
         why = "that main.py writes where the scene is given to render_image"
         raise InputError(f"{SCENE}: there is no such file in {folder}, expected the mesh {why}")

@@ -287,9 +287,6 @@ def without_axes(path: Path, world: Matrix, category: str, file: Path, note: str
         category: Free text.
         file: Where the copy goes.
         note: What was lost.
-
-    Raises:
-        InputError: If the mesh cannot be read.
     """
     mesh, _ = read_mesh(At(path.name, path.name), path.parent)
     verts = mesh.verts.double().numpy() @ world[:3, :3].T + world[:3, 3]

@@ -84,11 +84,7 @@ def _meshes(folder: Path) -> list[Path]:
 
 
 def contact_arrays(folder: Path, bodies: At | None, notes: list[str]) -> At | None:
-    """The arrays of contacts.npz, where there is one file for each body.
-
-    Raises:
-        InputError: If a file cannot be read.
-    """
+    """The arrays of contacts.npz, where there is one file for each body."""
     if bodies is None:
         return None
     rows, count = bodies.value["vertices"].shape[:2]

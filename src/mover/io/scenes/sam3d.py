@@ -47,11 +47,7 @@ TOGETHER = ("rotation", "translation", "scale")
 
 
 def pose_beside(path: Path) -> At | None:
-    """The pose beside a mesh, None where there is none.
-
-    Raises:
-        InputError: If the file cannot be read.
-    """
+    """The pose beside a mesh, None where there is none."""
     for kind in (".npz", ".json"):
         own = path.with_suffix(kind)
         if own.is_file():
@@ -60,11 +56,7 @@ def pose_beside(path: Path) -> At | None:
 
 
 def poses_of(path: Path) -> dict[str, At]:
-    """Poses by name; a list is in the order of the masks, and so are the rows of arrays.
-
-    Raises:
-        InputError: If the file cannot be read.
-    """
+    """Poses by name; a list is in the order of the masks, and so are the rows of arrays."""
     if path.suffix == ".npz":
         at = read_npz(path)
         count = len(np.atleast_2d(get(at, "rotation").value)) if "rotation" in at.value else 0
@@ -102,11 +94,7 @@ def _numbers(at: At, count: int) -> Matrix:
 
 
 def pose_matrix(at: At) -> Matrix:
-    """Camera from mesh (4, 4): rows v, ((v @ L.T) * scale) @ R(q) + t, then x and y turned.
-
-    Raises:
-        InputError: If a field is wrong.
-    """
+    """Camera from mesh (4, 4): rows v, ((v @ L.T) * scale) @ R(q) + t, then x and y turned."""
     from scipy.spatial.transform import Rotation
 
     q = _numbers(get(at, "rotation"), 4)
@@ -142,9 +130,6 @@ def person_parts(folder: Path) -> Parts:
 
     The notebook of the human alignment scales the person to the depth in which the objects were
     made and shifts it to its mask; such a mesh (human_aligned) comes first.
-
-    Raises:
-        InputError: If the mesh is wrong.
     """
     for name in NAMES:
         for path in sorted(p for kind in KINDS for p in folder.glob(f"{name}*{kind}")):

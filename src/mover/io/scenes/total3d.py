@@ -78,11 +78,7 @@ sys.stdout.buffer.write(pickle.dumps(said))
 
 
 def load_mat(path: Path) -> At:
-    """The arrays of a MATLAB file.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """The arrays of a MATLAB file."""
     if not path.is_file():
         raise InputError(f"{path.name}: there is no such file in {path.parent}")
     call = [sys.executable, "-P", "-c", READ, str(path.resolve())]
@@ -164,11 +160,7 @@ def find_mesh(folder: Path, index: int, name: str) -> Path:
 
 
 def read_shape(path: Path) -> Shape:
-    """All vertices and triangles of a mesh; of an .obj also those vertices that are not used.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """All vertices and triangles of a mesh; of an .obj also those vertices that are not used."""
     if path.suffix != ".obj":
         mesh, _ = read_mesh(At(path.name, path.name), path.parent)
         return mesh.verts.double().numpy(), mesh.faces.numpy()
@@ -193,20 +185,12 @@ TO_IMAGE = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])
 
 
 def read_total3d(folder: Path) -> Capture:
-    """Read the input and the output of Total3D or Im3D for one picture.
-
-    Raises:
-        InputError: If a file is missing or wrong.
-    """
+    """Read the input and the output of Total3D or Im3D for one picture."""
     return build_capture(total3d_parts(folder, Hints()))
 
 
 def total3d_parts(folder: Path, hints: Hints) -> Parts:
-    """What Total3D or Im3D knows of one picture.
-
-    Raises:
-        InputError: If a file is missing or wrong.
-    """
+    """What Total3D or Im3D knows of one picture."""
     del hints
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder, expected one of Total3D")
