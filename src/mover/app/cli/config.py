@@ -4,9 +4,10 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
+from tyro.conf import arg
 
 from mover.app.cli import say
 from mover.core.errors import InputError
@@ -14,6 +15,7 @@ from mover.core.settings import check_settings
 from mover.pipeline.presets import PRESETS, Config, with_methods, with_present_flags
 
 T = TypeVar("T")
+C = TypeVar("C")
 Device = Literal["auto", "cpu", "cuda"]
 """Where the heavy stages compute, see `core.devices.device_of`."""
 
@@ -51,6 +53,26 @@ def parsed(kind: Callable[..., T], prog: str, arguments: Sequence[str], *markers
     for part in parts:
         check_settings(part, "--")
     return found
+
+
+def parsed_with(
+    kind: type[T],
+    config: C,
+    prog: str,
+    arguments: Sequence[str],
+    *markers: Any,  # noqa: ANN401
+) -> tuple[T, C]:
+    """The same, and the settings of `config` that other flags of the command change."""
+
+    def both(args: Any, config: Any = config) -> tuple[Any, Any]:  # noqa: ANN401
+        return args, config
+
+    both.__doc__ = kind.__doc__
+    both.__annotations__ = {
+        "args": Annotated[kind, arg(name="")], "config": Annotated[type(config), arg(name="")],
+        "return": tuple[kind, type(config)],
+    }  # fmt: skip
+    return parsed(both, prog, arguments, *markers)
 
 
 def preset_of(arguments: Sequence[str], names: Sequence[T]) -> T:

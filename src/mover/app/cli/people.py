@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from mover.app.cli import say
-from mover.app.cli.config import parsed, preset_of
+from mover.app.cli.config import parsed, parsed_with, preset_of
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, float_in
 from mover.fitting.config import FitConfig
@@ -220,15 +220,7 @@ class FitArgs:
 def fit(arguments: Sequence[str]) -> None:
     """`mover fit`."""
     preset = preset_of(arguments, tuple(FITS))
-
-    def both(
-        args: Annotated[FitArgs, arg(name="")],
-        config: Annotated[FitConfig, arg(name="")] = FITS[preset],
-    ) -> tuple[FitArgs, FitConfig]:
-        """Fit bodies to the 2D joints of a video: keypoints.npz, or what a detector wrote."""
-        return args, config
-
-    fit_into(*parsed(both, "mover fit", arguments))
+    fit_into(*parsed_with(FitArgs, FITS[preset], "mover fit", arguments))
 
 
 def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:

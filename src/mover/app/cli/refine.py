@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import AvoidSubcommands, Positional, arg
 
 from mover.app.cli import say
-from mover.app.cli.config import parsed, preset_of
+from mover.app.cli.config import parsed, parsed_with, preset_of
 from mover.app.cli.people import NO_VPOSER, Detector, keypoints_at
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, int_in
@@ -78,30 +78,14 @@ class ContactsArgs:
     """The file to write."""
 
 
-def _robust(
-    args: Annotated[RefineArgs, arg(name="")],
-    config: Annotated[RefineBodiesConfig, arg(name="")] = RefineBodiesConfig(),  # noqa: B008
-) -> tuple[RefineArgs, RefineBodiesConfig | FitConfig]:
-    """Refine the people of a result with its room; writes OUT/refined: bodies.npz, metrics.json."""
-    return args, config
-
-
-def _paper(
-    args: Annotated[RefineArgs, arg(name="")],
-    config: Annotated[FitConfig, arg(name="")] = PAPER_ROOM,
-) -> tuple[RefineArgs, RefineBodiesConfig | FitConfig]:
-    """Refine the people of a result with its room; writes OUT/refined: bodies.npz, metrics.json."""
-    return args, config
-
-
-PRESETS = {"robust": _robust, "paper": _paper}
-"""What the flags of a preset are."""
+PRESETS = {"robust": RefineBodiesConfig(), "paper": PAPER_ROOM}
+"""What the flags of a preset change."""
 
 
 def refine(arguments: Sequence[str]) -> None:
     """`mover refine`."""
-    kind = PRESETS[preset_of(arguments, tuple(PRESETS))]
-    args, config = parsed(kind, "mover refine", arguments, AvoidSubcommands)
+    preset = PRESETS[preset_of(arguments, tuple(PRESETS))]
+    args, config = parsed_with(RefineArgs, preset, "mover refine", arguments, AvoidSubcommands)
     import torch
 
     from mover.app.cli.progress import Bar

@@ -2,16 +2,16 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import AvoidSubcommands, Positional, Suppress, arg
+from tyro.conf import AvoidSubcommands, Positional, arg
 
 from mover.app.batch import CAPTURE, OUT, BatchPlan, captures_in, cores, counted, run_batch
 from mover.app.batch.engines import ARRAY, EngineOptions, RayOptions, SlurmOptions
 from mover.app.cli import say
-from mover.app.cli.config import Device, chosen_config, parsed
+from mover.app.cli.config import Device, chosen_config, parsed_with
 from mover.core.errors import InputError
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
@@ -51,14 +51,7 @@ class RunArgs:
 def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
     """What `mover run` is asked for, and the settings."""
     config, rest = chosen_config(arguments)
-
-    def both(
-        args: Annotated[RunArgs, arg(name="")], config: Annotated[Config, arg(name="")] = config
-    ) -> tuple[RunArgs, Config]:
-        """Reconstruct a room from a capture folder."""
-        return args, config
-
-    return parsed(both, "mover run", rest, AvoidSubcommands)
+    return parsed_with(RunArgs, config, "mover run", rest, AvoidSubcommands)
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -156,20 +149,20 @@ class BatchArgs:
     """At the end of each run, refine the people with the room they helped to find."""
     ray: RayOptions = field(default_factory=RayOptions)
     slurm: SlurmOptions = field(default_factory=SlurmOptions)
-    config: Annotated[Suppress[Config], arg(name="")] = field(default_factory=Config)
 
 
 def batch(arguments: Sequence[str]) -> None:
     """`mover batch`; the exit code is 1 if a capture failed."""
-    args = _parse_batch(arguments)
+    args, config = _parse_batch(arguments)
+    from mover import __version__
     from mover.core import records
 
     captures = captures_in(args.source, args.out)
     plan = BatchPlan(
         captures=captures,
         out=args.out,
-        command=_command(args),
-        fingerprint=records.fingerprint(args.config, args.format, _version(), args.refine),
+        command=_command(args, config),
+        fingerprint=records.fingerprint(config, args.format, __version__, args.refine),
         limit=args.limit,
         threads=args.threads,
     )
@@ -186,32 +179,19 @@ def batch(arguments: Sequence[str]) -> None:
         raise SystemExit(1)
 
 
-def _parse_batch(arguments: Sequence[str]) -> BatchArgs:
+def _parse_batch(arguments: Sequence[str]) -> tuple[BatchArgs, Config]:
     config, rest = chosen_config(arguments)
-
-    def both(
-        args: Annotated[BatchArgs, arg(name="")], config: Annotated[Config, arg(name="")] = config
-    ) -> BatchArgs:
-        """Run thousands of captures; what is finished is not run again."""
-        return replace(args, config=config)
-
-    return parsed(both, "mover batch", rest, AvoidSubcommands)
+    return parsed_with(BatchArgs, config, "mover batch", rest, AvoidSubcommands)
 
 
-def _command(args: BatchArgs) -> tuple[str, ...]:
+def _command(args: BatchArgs, config: Config) -> tuple[str, ...]:
     """The command of one capture; the settings are handed over in one file for all."""
     file = args.out.resolve() / "config.json"
     from mover.core import records
     from mover.io.files.fields import write_json
 
-    tree = {"format": "mover-config", "config": records.plain(args.config)}
+    tree = {"format": "mover-config", "config": records.plain(config)}
     write_json(tree, file)
     start = (sys.executable, "-m", "mover", "run", CAPTURE, "--out", OUT)
     refine = ("--refine",) if args.refine else ()
     return (*start, "--format", args.format, "--config", str(file), *refine)
-
-
-def _version() -> str:
-    from mover import __version__
-
-    return __version__
