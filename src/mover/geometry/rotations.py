@@ -1,5 +1,6 @@
 """Rotations: about the axes of the world, from axis-angle vectors, and between directions."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -43,6 +44,15 @@ def rotation_vectors(turns: Float[Tensor, "rows 3 3"]) -> Float[Tensor, "rows 3"
 
     found = Rotation.from_matrix(turns.detach().cpu().double().numpy()).as_rotvec()
     return torch.from_numpy(found).to(turns)
+
+
+def affine(
+    A: Float[np.ndarray, "*batch 3 3"], t: Float[np.ndarray, "*batch 3"] | float = 0.0
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """The matrices of A x + t, in double precision."""
+    out = np.tile(np.eye(4), (*A.shape[:-2], 1, 1))
+    out[..., :3, :3], out[..., :3, 3] = A, t
+    return out
 
 
 def wrap(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mover.core.types import STILL, Bodies, Camera, CameraPath
 from mover.geometry.camera import heading, pitch_roll
-from mover.geometry.rotations import rot_y
+from mover.geometry.rotations import affine, rot_y
 from mover.io.files.fields import LAST_INDEX, At, Warn, array, get, maybe, plain, refuse
 from mover.io.files.schema import Number, Positive, Rows, Side, checked, rotation
 
@@ -177,9 +177,7 @@ def _check_reach(at: At, frame: NDArray[Any], bodies: Bodies) -> None:
 
 def path_to_arrays(path: CameraPath) -> dict[str, NDArray[Any]]:
     """The arrays of a file; its world is that of the reference image's camera."""
-    T = np.tile(np.eye(4), (len(path.frame), 1, 1))
-    T[:, :3, :3] = path.R_reference_camera.numpy()
-    T[:, :3, 3] = path.t_reference_camera.numpy()
+    T = affine(path.R_reference_camera.numpy(), path.t_reference_camera.numpy())
     at_home = np.abs(T - np.eye(4)).max((1, 2))
     reference = path.frame.numpy()[int(at_home.argmin())]
     return {"frame": path.frame.numpy(), "T_world_camera": T, "reference": np.array(reference)}

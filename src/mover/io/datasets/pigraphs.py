@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts, image_parts
-from mover.io.datasets.prox_files import Z_UP
-from mover.io.datasets.true_boxes import TrueBox, boxes_scene
+from mover.io.datasets.prox_files import world_of
+from mover.io.datasets.true_boxes import SIGNS, TrueBox, boxes_scene, floor_in
 from mover.io.files.fields import At, get, items, mapping, maybe, read_json, refuse, text, vector
-from mover.io.files.meshes import floor_of, read_scan
+from mover.io.files.meshes import read_scan
 from mover.io.scenes.placing import Matrix
 
 JOINTS = 25
@@ -140,9 +141,8 @@ def pigraphs_parts(root: Path, hints: Hints) -> Parts:
     if hints.image is not None:
         load, size = image_parts(hints.image, mirrored=not mirror)
         parts = dataclasses.replace(parts, load_image=load, image_size=size)
-    from_camera = np.eye(4)
-    from_camera[:3, :3] = to_camera  # its own inverse
-    return _with_truth(parts, root, path.stem.split("_")[0], matrix @ from_camera, hints)
+    from_camera = affine(to_camera)  # its own inverse
+    return _with_truth(parts, root, path.stem.split("_")[0], matrix @ from_camera)
 
 
 def recordings_of(root: Path) -> list[Path]:
@@ -208,7 +208,7 @@ def _time(at: At) -> float:
     return value if np.isfinite(value) else refuse(at, "a time")
 
 
-def _with_truth(parts: Parts, root: Path, room: str, scan_cam: Matrix, hints: Hints) -> Parts:
+def _with_truth(parts: Parts, root: Path, room: str, scan_cam: Matrix) -> Parts:
     """The parts with truth/: the furniture among the segments of the scan."""
     home = root.parent if root.is_file() else root
     files = sorted(p for p in home.rglob(f"{room}*segs.json"))
@@ -216,17 +216,13 @@ def _with_truth(parts: Parts, root: Path, room: str, scan_cam: Matrix, hints: Hi
         note = f"{room}d.segs.json: missing, so no truth"
         return dataclasses.replace(parts, notes=(*parts.notes, note))
     boxes = read_segments(files[0])
-    world = np.eye(4)
-    world[:3, :3], world[:3, 3] = Z_UP, -Z_UP @ scan_cam[:3, 3]
-    R = (Z_UP @ scan_cam[:3, :3]).T
+    world, R = world_of(scan_cam)
     assert parts.camera is not None
     camera: dict[str, Any] = {**parts.camera.value, "R_cam_world": R.tolist()}
     ground = None
     scans = sorted(home.rglob(f"{room}.ply"))
     if scans:
-        heights = read_scan(scans[0]).verts.double().numpy() @ world[1, :3] + world[1, 3]
-        ground = floor_of(heights)
-    del hints
+        ground = floor_in(read_scan(scans[0]), world)
     return dataclasses.replace(parts, scenes={"truth": boxes_scene(boxes, world, camera, ground)})
 
 
@@ -261,8 +257,6 @@ def _obb(at: At, name: str, category: str, item: At) -> TrueBox:
 
 def _union(boxes: list[TrueBox]) -> TrueBox:
     """The box around parts, along the axes of the largest one."""
-    from mover.io.datasets.true_boxes import SIGNS
-
     main = max(boxes, key=lambda box: float(box.half.prod()))
     points = np.concatenate([box.center + (SIGNS * box.half) @ box.axes for box in boxes])
     local = (points - main.center) @ main.axes.T

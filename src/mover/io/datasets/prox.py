@@ -17,8 +17,9 @@ import numpy as np
 import torch
 
 from mover.core.errors import InputError
-from mover.core.types import Bodies, BodyPose, Camera, Scene
+from mover.core.types import Bodies, BodyPose, Scene
 from mover.io.capture.bodies_file import bodies_to_arrays
+from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts, image_parts
 from mover.io.datasets.prox_files import (
     FITS,
@@ -26,7 +27,6 @@ from mover.io.datasets.prox_files import (
     FPS,
     QUANTITATIVE,
     SCAN_SDF,
-    SIZE,
     Recording,
     Timeline,
     asked_for,
@@ -36,11 +36,10 @@ from mover.io.datasets.prox_files import (
     world_of,
 )
 from mover.io.datasets.prox_people import keypoint_trees, people_masks
-from mover.io.datasets.true_boxes import TrueBox, boxes_scene, read_bbox3d
-from mover.io.files.cameras import tilt_of
+from mover.io.datasets.true_boxes import TrueBox, boxes_scene, floor_in, read_bbox3d
 from mover.io.files.fields import At, read_json
 from mover.io.files.images import mirrored_copy
-from mover.io.files.meshes import floor_of, read_scan
+from mover.io.files.meshes import read_scan
 from mover.io.files.schema import rigid
 from mover.io.scenes.placing import Matrix
 
@@ -69,11 +68,7 @@ def prox_parts(root: Path, hints: Hints) -> Parts:
         root, hints.recordings or ((hints.recording,) if hints.recording else ())
     )
     lines, lens = timelines(recordings), lens_of(root)
-    camera = Camera(
-        torch.tensor([[lens.value["fl_x"], 0, lens.value["cx"]],
-                      [0, lens.value["fl_y"], lens.value["cy"]], [0, 0, 1]]).float(),
-        torch.tensor(tilt_of(0.0, 0.0)).float(), *SIZE,
-    )  # fmt: skip
+    camera = camera_of(lens)
     notes = [_told(line) for line in lines]
     fits = [_fits(line, FITS, notes) for line in lines]
     bodies = _joined(zip(lines, fits, strict=True), _tracks(recordings), notes)
@@ -254,10 +249,7 @@ def _true_scenes(
     world, cam2world = frames
     path = recording.root / "scenes" / f"{recording.scene}.ply"
     scan = read_scan(path) if path.is_file() else None
-    ground = None
-    if scan is not None:
-        heights = scan.verts.double().numpy() @ world[1, :3] + world[1, 3]
-        ground = floor_of(heights)
+    ground = None if scan is None else floor_in(scan, world)
     from_camera = world @ cam2world
     scenes = {"truth": boxes_scene(boxes, from_camera, camera, ground)}
     if scan is not None and boxes:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.geometry.rotations import affine
 from mover.geometry.volume import Volume
 from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, get, integer, read_json, refuse, text, vector
@@ -195,10 +196,7 @@ def scene_camera(root: Path, scene: str) -> Matrix:
 def world_of(cam2world: Matrix) -> tuple[Matrix, Matrix]:
     """Our world (+y up, origin at the camera) from the scan's frame (4, 4), and R_cam_world."""
     turn = Z_UP @ cam2world[:3, :3]
-    world = np.eye(4)
-    world[:3, :3] = Z_UP
-    world[:3, 3] = -Z_UP @ cam2world[:3, 3]
-    return world, turn.T
+    return affine(Z_UP, -Z_UP @ cam2world[:3, 3]), turn.T
 
 
 SCAN_SDF = "truth/scan_sdf.json"

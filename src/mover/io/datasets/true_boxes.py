@@ -17,6 +17,7 @@ from mover.core.types import Mesh, Scene
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import scene_of, scene_tree
 from mover.io.files.fields import At, get, mapping, refuse, vector
+from mover.io.files.meshes import floor_of
 from mover.io.scenes.placing import Matrix, category_of_name, free_id, load_from
 
 SIGNS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=float)
@@ -137,6 +138,11 @@ def boxes_scene(
         rows.append({**row, "translation": place.tolist(), "yaw": yaw, "support": "free"})
     lens = camera_of(At(dict(camera), "camera"))
     return scene_of(scene_tree(rows, "truth", ground), partial(load_from, meshes), lens, _silent)[0]
+
+
+def floor_in(scan: Mesh, world: Matrix) -> float:
+    """Height of a scan's floor in our world, of which `world` is the matrix from its frame [m]."""
+    return floor_of(scan.verts.double().numpy() @ world[1, :3] + world[1, 3])
 
 
 def without_floor(scan: Mesh, world: Matrix, ground: float) -> Mesh:

@@ -13,7 +13,7 @@ from mover.core.files import replacing
 from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject
 from mover.geometry.camera import NEAR
 from mover.geometry.placement import place_object
-from mover.geometry.rotations import rot_y
+from mover.geometry.rotations import affine, rot_y
 from mover.io.export.finished import Exported, Finished
 
 GHOSTS = 12  # at most so many bodies
@@ -74,11 +74,9 @@ def _add_object(out: Any, piece: SceneObject, tint: Colour) -> None:  # noqa: AN
 
 def placement_of(piece: SceneObject) -> np.ndarray:
     """Matrix of scale, then rotation about +y, then translation: glTF's order."""
-    matrix = np.eye(4)
     turn = rot_y(piece.yaw.detach().cpu().double()).numpy()
-    matrix[:3, :3] = turn * piece.scale.detach().cpu().double().numpy()
-    matrix[:3, 3] = piece.t_world_object.detach().cpu().numpy()
-    return matrix
+    stretched = turn * piece.scale.detach().cpu().double().numpy()
+    return affine(stretched, piece.t_world_object.detach().cpu().numpy())
 
 
 def parts_of(piece: SceneObject, tint: Colour) -> list[tuple[Any, np.ndarray]]:
@@ -185,9 +183,12 @@ def _add_camera(out: Any, camera: Camera) -> None:  # noqa: ANN401
 
     sizes = (camera.width, camera.height)
     out.camera = View(name=_free(out, "camera"), resolution=sizes, fov=_field_of_view(camera))
-    placement = np.eye(4)
-    placement[:3, :3] = camera.R_cam_world.detach().cpu().double().numpy().T @ np.diag([1, -1, -1])
-    out.camera_transform = placement
+    out.camera_transform = view_matrix(camera)
+
+
+def view_matrix(camera: Camera) -> Float[np.ndarray, "4 4"]:
+    """From the axes of a camera that looks along -z, with +y up, to the world."""
+    return affine(camera.R_cam_world.detach().cpu().double().numpy().T @ np.diag([1.0, -1.0, -1.0]))
 
 
 def _field_of_view(camera: Camera) -> list[float]:

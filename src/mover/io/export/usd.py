@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from mover.core.colours import Colour, colour
 from mover.core.errors import InputError
@@ -19,7 +18,7 @@ from mover.geometry.camera import NEAR
 from mover.io.export.finished import Exported, Finished
 from mover.io.export.people import FPS, tracks_of
 from mover.io.export.posed import Skin, skin_for
-from mover.io.export.scene_glb import floor_of, parts_of
+from mover.io.export.scene_glb import floor_of, parts_of, view_matrix
 from mover.io.export.shell import HEIGHT, Wall, Walls, slab, wall_notes
 from mover.io.export.solids import AXES, FRICTION, Solid, floor_height, solids_of
 from mover.io.export.usd_mesh import add_look, add_mesh, free_path, pxr
@@ -294,12 +293,6 @@ def _add_camera(stage: Any, camera: Camera) -> None:  # noqa: ANN401
     lens.CreateHorizontalApertureOffsetAttr(APERTURE * (0.5 - cx / camera.width))
     lens.CreateVerticalApertureOffsetAttr(height * (cy / camera.height - 0.5))
     lens.CreateClippingRangeAttr(Gf.Vec2f(NEAR, FAR))
-    lens.AddTransformOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Matrix4d(_to_world(camera)))
-
-
-def _to_world(camera: Camera) -> list[list[float]]:
-    """Rows of the matrix from the camera's axes (+y up) to the world; USD's points are rows."""
-    matrix: Float[np.ndarray, "4 4"] = np.eye(4)
-    R = camera.R_cam_world.detach().cpu().double().numpy()
-    matrix[:3, :3] = (R.T @ np.diag([1.0, -1.0, -1.0])).T
-    return matrix.tolist()
+    lens.AddTransformOp(UsdGeom.XformOp.PrecisionDouble).Set(
+        Gf.Matrix4d(view_matrix(camera).T.tolist())
+    )

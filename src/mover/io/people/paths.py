@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mover.geometry.rotations import affine
 from mover.io.files.fields import At, refuse
 from mover.io.people.values import (
     either,
@@ -118,18 +119,13 @@ def _of_network(path: Path, pattern: str, pose: str, lens: str, *, inverse: bool
 
 def _joined(turn: At, place: At) -> Array:
     R = stacked(turn, 3, 3)
-    T = np.tile(np.eye(4), (len(R), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = R, rows(place, len(R), 3)
-    return T
+    return affine(R, rows(place, len(R), 3))
 
 
 def _of_quaternions(row: Array) -> Array:
     from scipy.spatial.transform import Rotation
 
-    T = np.tile(np.eye(4), (len(row), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(row[:, 3:]).as_matrix()
-    T[:, :3, 3] = row[:, :3]
-    return T
+    return affine(Rotation.from_quat(row[:, 3:]).as_matrix(), row[:, :3])
 
 
 def _told_focal(at: At) -> Array:

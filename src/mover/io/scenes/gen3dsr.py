@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from mover.core.errors import InputError
+from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts, image_parts
 from mover.io.files.cameras import camera_of_tree
-from mover.io.files.fields import At, get, maybe, read_json
-from mover.io.files.schema import rigid, rotation
-from mover.io.scenes.placing import LEVEL, Matrix, Pieces, category_of_name, without_axes
+from mover.io.files.fields import At, get, read_json
+from mover.io.files.schema import rigid
+from mover.io.scenes.placing import LEVEL, Pieces, category_of_name, tilt_of, without_axes
 
 WHOLE = ("full_scene", "background", "depth_scene")
 
@@ -25,12 +26,10 @@ def gen3dsr_parts(folder: Path, hints: Hints) -> Parts:
     """What Gen3DSR made of one picture."""
     lens = read_json(folder / "cam_params.json")
     given = camera_of_tree(lens, None)
-    tilt = None if hints.camera is None else maybe(hints.camera, "R_cam_world")
-    R = np.array(LEVEL) if tilt is None else rotation(tilt)
+    tilt = tilt_of(hints)
+    R = np.array(LEVEL) if tilt is None else tilt
     camera = At({**given.value, "R_cam_world": R.tolist()}, given.file)
-    turn = np.eye(4)
-    turn[:3, :3] = R.T
-    world: Matrix = turn @ np.linalg.inv(rigid(get(lens, "c2w")))
+    world = np.asarray(affine(R.T) @ np.linalg.inv(rigid(get(lens, "c2w"))), dtype=np.float64)
     paths = [p for p in (folder / "reconstruction").glob("*.glb") if p.stem not in WHOLE]
     if not paths:
         raise InputError(f"{folder}: has no reconstruction/<i>_<label>.glb, expected meshes")

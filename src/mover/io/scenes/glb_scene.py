@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.fields import At, maybe, reason
 from mover.io.files.images import image_size
@@ -51,8 +51,7 @@ def glb_parts(path: Path, hints: Hints) -> Parts:
     if not path.is_file() or path.suffix.lower() not in (".glb", ".gltf"):
         raise InputError(f"{path}: is no .glb or .gltf file, expected a glTF scene")
     scene = load_parts(path)
-    turn = np.eye(4)
-    turn[:3, :3] = up_axes(hints.up)
+    turn = affine(up_axes(hints.up))
     view = None if hints.camera is not None else _view(path, hints)
     if view is not None:
         fields, pose = view
@@ -218,8 +217,6 @@ def _local(node: Any) -> Matrix:  # noqa: ANN401
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     from scipy.spatial.transform import Rotation
 
-    out: NDArray[np.float64] = np.eye(4)
     turn = Rotation.from_quat(node.get("rotation", [0.0, 0.0, 0.0, 1.0])).as_matrix()
-    out[:3, :3] = turn @ np.diag(node.get("scale", [1.0, 1.0, 1.0]))
-    out[:3, 3] = node.get("translation", [0.0, 0.0, 0.0])
-    return out
+    place = np.array(node.get("translation", [0.0, 0.0, 0.0]), dtype=np.float64)
+    return affine(turn @ np.diag(node.get("scale", [1.0, 1.0, 1.0])), place)

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from mover.core.errors import InputError
+from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
-from mover.io.files.fields import At, choice, get, items, maybe, read_json, refuse, vector
+from mover.io.files.fields import At, choice, get, items, read_json, refuse, vector
 from mover.io.files.meshes import load_arrays, mesh_of, write_mesh
-from mover.io.files.schema import rotation
-from mover.io.scenes.placing import LEVEL, Pieces, without_axes
+from mover.io.scenes.placing import LEVEL, Pieces, tilt_of, without_axes
 from mover.io.scenes.total3d import CLASSES, FURNITURE
 
 SCENE = Path("models") / "scene.ply"
@@ -39,11 +39,10 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
     rows = items(read_json(folder / "detections.json"))
     names = [choice(get(row, "class"), CLASSES) for row in rows]
     given = {} if hints.camera is None else dict(hints.camera.value)
-    tilt = None if hints.camera is None else maybe(hints.camera, "R_cam_world")
-    R = np.array(LEVEL) if tilt is None else rotation(tilt)
+    tilt = tilt_of(hints)
+    R = np.array(LEVEL) if tilt is None else tilt
     camera = {**LENS, **given, "R_cam_world": R.tolist()}
-    found, world = Pieces(), np.eye(4)
-    world[:3, :3] = R.T
+    found, world = Pieces(), affine(R.T)
     for index, path in _pieces(folder, len(rows), hints.work).items():
         if names[index] in FURNITURE:
             copy = partial(without_axes, path, world, names[index])

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.types import Mesh
 from mover.furniture.library import BACKS, BEDS, canonical
-from mover.io.capture.parts import UNKNOWN, Parts
+from mover.geometry.rotations import affine
+from mover.io.capture.parts import UNKNOWN, Hints, Parts
 from mover.io.capture.scene_file import scene_tree
-from mover.io.files.fields import At, reason
+from mover.io.files.fields import At, maybe, reason
 from mover.io.files.meshes import check_gltf, mesh_of, read_mesh
+from mover.io.files.schema import rotation
 
 EXACT = 1e-4  # [share], below it a matrix is a yaw and a scale
 MOST_TILT = math.radians(30)  # a tool's error of an upright thing; beyond, the axes are others
@@ -78,14 +80,19 @@ def _baked(A: Matrix, t: Matrix, low: Matrix, high: Matrix) -> Posed:
     if math.hypot(A[0, 2], A[2, 2]) > 0.5 * float(np.linalg.norm(A[:, 2])):
         front = A[:, 2]
     yaw = math.atan2(front[0], front[2])
-    bake = np.eye(4)
-    bake[:3, :3] = about_y(-yaw) @ A
-    centre = bake[:3, :3] @ ((low + high) / 2)
-    bake[:3, 3] = -centre  # near its own origin, where single precision is finest
+    turn = about_y(-yaw) @ A
+    centre = turn @ ((low + high) / 2)
+    bake = affine(turn, -centre)  # near its own origin, where single precision is finest
     place = t + about_y(yaw) @ centre
     mirrored = " mirrored" if np.linalg.det(A) < 0 else ""
     note = f"it was{mirrored} about other axes, which went into a new mesh"
     return Posed(_fields(place, yaw, np.ones(3)), bake, note)
+
+
+def tilt_of(hints: Hints) -> Matrix | None:
+    """R_cam_world as the user gave it; None: nobody told it."""
+    given = None if hints.camera is None else maybe(hints.camera, "R_cam_world")
+    return None if given is None else rotation(given)
 
 
 def about_y(angle: float) -> Matrix:
@@ -294,7 +301,5 @@ def without_axes(path: Path, world: Matrix, category: str, file: Path, note: str
     local = verts @ about_y(yaw)  # rows: R_y(-yaw) v
     low, high = local.min(0), local.max(0)
     origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    bake = np.eye(4)
-    bake[:3, :3], bake[:3, 3] = about_y(-yaw), -origin
-    found = write_parts(load_parts(path), bake @ world, file)
+    found = write_parts(load_parts(path), affine(about_y(-yaw), -origin) @ world, file)
     return _fields(about_y(yaw) @ origin, yaw, np.ones(3)), found, note

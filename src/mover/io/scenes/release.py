@@ -20,6 +20,7 @@ import numpy as np
 
 from mover.core.errors import InputError
 from mover.core.types import Scene
+from mover.geometry.rotations import affine
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts
 from mover.io.capture.scene_file import scene_of, scene_tree
@@ -249,8 +250,7 @@ def _truth(folder: Path, camera: dict[str, Any], hints: Hints) -> dict[str, Scen
     guess = maybe(At(camera, "camera"), "R_cam_world")
     first = FLIP if guess is None else np.array(guess.value)
     R = level_of(vertical_of(boxes, first[:, 1]))
-    world = np.eye(4)
-    world[:3, :3] = R.T
+    world = affine(R.T)
     lens = {**camera, "R_cam_world": R.tolist()}
     scans = [found(folder, n) for n in ("scan_cam_cooridnates.ply", "scan_cam_coordinates.ply")]
     file = next((p for p in scans if p is not None), None)

@@ -16,6 +16,7 @@ import numpy as np
 
 from mover.core.errors import InputError
 from mover.core.types import Mesh
+from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, array, get, mapping, maybe, number, read_json, refuse, text
@@ -106,17 +107,12 @@ def pose_matrix(at: At) -> Matrix:
     scale = _numbers(given, 3) if scale is None else scale
     if (scale <= 0).any():
         refuse(given, "scales above 0")
-    matrix = np.eye(4)
-    matrix[:3, :3] = TO_OPENCV @ R.T @ np.diag(scale) @ TO_LOCAL
-    matrix[:3, 3] = TO_OPENCV @ _numbers(get(at, "translation"), 3)
-    return matrix
+    turn = TO_OPENCV @ R.T @ np.diag(scale) @ TO_LOCAL
+    return affine(turn, TO_OPENCV @ _numbers(get(at, "translation"), 3))
 
 
-def placed_already() -> Matrix:
-    """Camera from mesh (4, 4) of what is already in an OpenGL camera's axes."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = FLIP
-    return matrix
+PLACED = affine(FLIP)
+"""Camera from mesh of what is already in an OpenGL camera's axes."""
 
 
 # People whom SAM 3D's notebooks leave beside the objects: human.ply in an OpenGL camera's axes.
@@ -179,8 +175,7 @@ def sam3d_parts(folder: Path, hints: Hints) -> Parts:
     if not things:
         raise InputError(f"{folder}: has no meshes, expected <name>.glb with <name>.npz or .json")
     R, how = _attitude(camera, things)
-    turn = np.eye(4)
-    turn[:3, :3] = R.T
+    turn = affine(R.T)
     found = Pieces()
     for thing in things:
         found.add(thing.category, thing.name, partial(_placed_piece, thing, turn, hints.work))
@@ -205,7 +200,7 @@ def _things(folder: Path, hints: Hints) -> list[_Thing]:
                        (0, p.stem)):  # fmt: skip
         mesh, _ = read_mesh(At(path.name, path.name), folder)
         pose = poses.get(path.stem) or pose_beside(path)
-        matrix = placed_already() if pose is None else pose_matrix(pose)
+        matrix = PLACED if pose is None else pose_matrix(pose)
         name = hints.names.get(path.stem) or _category(pose) or category_of_name(path.stem)
         found.append(_Thing(path.stem, name, mesh, path, matrix))
     return found
@@ -228,8 +223,7 @@ def _attitude(camera: At | None, things: list[_Thing]) -> tuple[Matrix, str]:
     given = None if camera is None else maybe(camera, "R_cam_world")
     if given is not None:
         return rotation(given), "the camera's tilt is the one that was given"
-    placed = placed_already()
-    ups = [t.cam_mesh[:3, 1] for t in things if not np.array_equal(t.cam_mesh, placed)]
+    ups = [t.cam_mesh[:3, 1] for t in things if not np.array_equal(t.cam_mesh, PLACED)]
     up = common_up(ups)
     if up is None:
         return np.array(LEVEL), "the camera's tilt is not known: taken as level"
@@ -247,7 +241,7 @@ def _check_placed(thing: _Thing) -> None:
 
 def _placed_piece(thing: _Thing, turn: Matrix, work: Path, key: str) -> Placed:
     matrix, copy = turn @ thing.cam_mesh, work / f"{key}.glb"
-    if np.array_equal(thing.cam_mesh, placed_already()):
+    if np.array_equal(thing.cam_mesh, PLACED):
         _check_placed(thing)
         note = "it was placed already; its front is a guess"
         return without_axes(thing.file, matrix, thing.category, copy, note)
