@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import AvoidSubcommands, Positional, arg
 
@@ -16,6 +16,12 @@ from mover.core.errors import InputError
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
 from mover.pipeline.presets import Config
+
+if TYPE_CHECKING:
+    from mover.app.results import Origin
+    from mover.core.observe import Observer
+    from mover.core.run import Run
+    from mover.core.types import Capture, Room
 
 THREADS = 1  # of torch: its operations here are small, and threads that wait for others cost more
 
@@ -75,7 +81,7 @@ def run(arguments: Sequence[str]) -> None:
     say(f"report: {args.out / 'report.html'}")
 
 
-def _with_contacts(capture: Any, args: RunArgs) -> Any:  # noqa: ANN401
+def _with_contacts(capture: "Capture", args: RunArgs) -> "Capture":
     """The capture with POSA's contacts where these are asked for."""
     if args.posa is None and args.posa_meshes is None:
         return capture
@@ -87,12 +93,8 @@ def _with_contacts(capture: Any, args: RunArgs) -> Any:  # noqa: ANN401
 
 
 def reconstruct_into(
-    out: Path,
-    capture: Any,  # noqa: ANN401
-    config: Config,
-    origin: Any,  # noqa: ANN401
-    watch: Any = None,  # noqa: ANN401
-) -> Any:  # noqa: ANN401
+    out: Path, capture: "Capture", config: Config, origin: "Origin", watch: "Observer | None" = None
+) -> "tuple[Room, Run]":
     """Run the main job on the edited capture and write its result; `watch` sees every step."""
     import torch
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -15,6 +15,9 @@ from mover.core.errors import InputError
 from mover.core.settings import float_in
 from mover.perceive.config import LayoutConfig, Lens, ModelsConfig, PerceiveConfig
 from mover.perceive.networks import check_networks, in_folder
+
+if TYPE_CHECKING:
+    from mover.perceive.capture import Finders
 
 THREADS = 1  # of torch, as in `run`
 
@@ -94,16 +97,14 @@ def ready_models(models: ModelsConfig, weights: Path | None) -> ModelsConfig:
 
 
 def perceive_into(
-    args: PerceiveArgs,
-    models: ModelsConfig,
-    finders: Any = None,  # noqa: ANN401
+    args: PerceiveArgs, models: ModelsConfig, finders: "Finders | None" = None
 ) -> None:
     """Fill the capture with all but the first scene.
 
     Args:
         args: What is asked.
         models: The networks.
-        finders: What stands for them, `perceive.capture.Finders`; None: they themselves.
+        finders: What stands for them; None: they themselves.
     """
     import torch
 
@@ -257,17 +258,13 @@ def image(arguments: Sequence[str]) -> None:
     video_to_room(folder, args.chain)
 
 
-def video_to_room(
-    source: Path,
-    args: ChainArgs,
-    finders: Any = None,  # noqa: ANN401
-) -> None:
+def video_to_room(source: Path, args: ChainArgs, finders: "Finders | None" = None) -> None:
     """All steps; what cannot work is said before the first.
 
     Args:
         source: A video, or a folder of pictures.
         args: What is asked.
-        finders: What stands for the networks, `perceive.capture.Finders`; None: they themselves.
+        finders: What stands for the networks; None: they themselves.
 
     Raises:
         InputError: If something is missing, or there is no furniture.
@@ -368,7 +365,7 @@ def _room(capture: Path, args: ChainArgs) -> None:
     from mover.io.formats import read
 
     say(f"{len(STEPS)}/{len(STEPS)} {STEPS[-1]} ...")
-    people: Any = (capture / "bodies.npz").is_file() and args.refine
+    people = (capture / "bodies.npz").is_file() and args.refine
     origin = Origin(str(capture.resolve()), refine=people, device=device_of(args.device))
     reconstruct_into(args.out / "room", read("folder", capture), preset_named(args.preset), origin)
     say(f"report: {args.out / 'room' / 'report.html'}")

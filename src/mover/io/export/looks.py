@@ -98,9 +98,14 @@ def _material(
         return None, b"", (red, green, blue, alpha)
     if not is_linear:  # Kd of an OBJ is often 0.4 or 0.8 beside a picture that is meant as it is
         red = green = blue = 1.0
+    return np.asarray(uv, np.float64)[:, :2], png_of(image), (red, green, blue, alpha)
+
+
+def png_of(image: Any) -> bytes:  # noqa: ANN401
+    """A picture of Pillow as PNG, with its cover where it has any."""
     stream = BytesIO()
     image.convert("RGBA" if "A" in image.getbands() else "RGB").save(stream, "PNG")
-    return np.asarray(uv, np.float64)[:, :2], stream.getvalue(), (red, green, blue, alpha)
+    return stream.getvalue()
 
 
 def _rgba(values: Any) -> Rgba:  # noqa: ANN401

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from mover.io.export.posed import Skin, skin_for
 from mover.io.export.scene_glb import floor_of, parts_of, view_matrix
 from mover.io.export.shell import HEIGHT, Wall, Walls, slab, wall_notes
 from mover.io.export.solids import AXES, FRICTION, Solid, floor_height, solids_of
-from mover.io.export.usd_mesh import add_look, add_mesh, free_path, pxr
+from mover.io.export.usd_mesh import Prim, Stage, add_look, add_mesh, free_path, pxr
 from mover.io.export.usd_people import INFLUENCES, add_moving_mesh, add_skeleton
 
 GRAVITY = 9.81  # [m/s²]
@@ -30,7 +30,7 @@ PIECE = (0.55, 0.75, 0.9)
 WALL = (0.9, 0.89, 0.86)
 
 
-def add_laws(stage: Any) -> Any:  # noqa: ANN401
+def add_laws(stage: Stage) -> Prim:
     """Gravity and the friction of wood; the material that all pieces take."""
     Gf, UsdPhysics, UsdShade = pxr("Gf"), pxr("UsdPhysics"), pxr("UsdShade")
 
@@ -46,7 +46,7 @@ def add_laws(stage: Any) -> Any:  # noqa: ANN401
     return wood
 
 
-def add_floor(stage: Any, height: float, wood: Any) -> None:  # noqa: ANN401
+def add_floor(stage: Stage, height: float, wood: Prim) -> None:
     """A plane without end that nothing falls through; it is not drawn."""
     Gf, UsdGeom, UsdPhysics = pxr("Gf"), pxr("UsdGeom"), pxr("UsdPhysics")
 
@@ -59,7 +59,7 @@ def add_floor(stage: Any, height: float, wood: Any) -> None:  # noqa: ANN401
     _bind(plane.GetPrim(), wood)
 
 
-def add_walls(stage: Any, walls: tuple[Wall, ...], floor: float, wood: Any) -> None:  # noqa: ANN401
+def add_walls(stage: Stage, walls: tuple[Wall, ...], floor: float, wood: Prim) -> None:
     """Boxes that stand still, marked as guessed."""
     Gf, UsdGeom, UsdPhysics = pxr("Gf"), pxr("UsdGeom"), pxr("UsdPhysics")
 
@@ -78,7 +78,7 @@ def add_walls(stage: Any, walls: tuple[Wall, ...], floor: float, wood: Any) -> N
         _bind(cube.GetPrim(), wood)
 
 
-def add_solid(stage: Any, body: Any, solid: Solid, wood: Any) -> None:  # noqa: ANN401
+def add_solid(stage: Stage, body: Prim, solid: Solid, wood: Prim) -> None:
     """Make a transform a rigid body and give it convex pieces, apart from what is drawn.
 
     Args:
@@ -104,7 +104,7 @@ def add_solid(stage: Any, body: Any, solid: Solid, wood: Any) -> None:  # noqa: 
         _bind(piece, wood)
 
 
-def _weigh(body: Any, solid: Solid) -> None:  # noqa: ANN401
+def _weigh(body: Prim, solid: Solid) -> None:
     """Mass, its centre, and the moments about the axes of inertia."""
     Gf, UsdPhysics = pxr("Gf"), pxr("UsdPhysics")
 
@@ -118,7 +118,7 @@ def _weigh(body: Any, solid: Solid) -> None:  # noqa: ANN401
     mass.CreatePrincipalAxesAttr(Gf.Quatf(turn.ExtractRotation().GetQuat()))
 
 
-def _bind(prim: Any, wood: Any) -> None:  # noqa: ANN401
+def _bind(prim: Prim, wood: Prim) -> None:
     UsdShade = pxr("UsdShade")
 
     UsdShade.MaterialBindingAPI.Apply(prim).Bind(
@@ -175,7 +175,7 @@ def export_usd(
     return Exported((path,), (*notes, *(wall_notes(shell) if walls == "guess" else ())))
 
 
-def _add_people(stage: Any, bodies: Bodies | None, skin: Skin | str) -> None:  # noqa: ANN401
+def _add_people(stage: Stage, bodies: Bodies | None, skin: Skin | str) -> None:
     for track in () if bodies is None else tracks_of(bodies):
         assert bodies is not None
         if isinstance(skin, Skin):
@@ -202,7 +202,7 @@ def _notes(finished: Finished, skin: Skin | str, body: BodyForm) -> tuple[str, .
     return (*why, "people's meshes move in straight lines between samples, 2 mm off")
 
 
-def _head(stage: Any, finished: Finished, up: Up) -> None:  # noqa: ANN401
+def _head(stage: Stage, finished: Finished, up: Up) -> None:
     """Units, axes, time, and the one root below which everything is."""
     Gf, UsdGeom = pxr("Gf"), pxr("UsdGeom")
 
@@ -224,12 +224,7 @@ def _head(stage: Any, finished: Finished, up: Up) -> None:  # noqa: ANN401
         stage.SetEndTimeCode(int(bodies.frame.max()))
 
 
-def _add_scene(
-    stage: Any,  # noqa: ANN401
-    finished: Finished,
-    folder: Path,
-    shell: tuple[Wall, ...],
-) -> None:
+def _add_scene(stage: Stage, finished: Finished, folder: Path, shell: tuple[Wall, ...]) -> None:
     scene, wood = finished.scene, add_laws(stage)
     solids = solids_of(scene, Run(finished.out))
     for index, (piece, solid) in enumerate(zip(scene.objects, solids, strict=True)):
@@ -245,7 +240,7 @@ def _add_scene(
     _add_camera(stage, scene.camera)
 
 
-def _add_object(stage: Any, piece: SceneObject, tint: Colour, folder: Path) -> Any:  # noqa: ANN401
+def _add_object(stage: Stage, piece: SceneObject, tint: Colour, folder: Path) -> Prim:
     """A place and a turn, and below them the looks at their size; the transform."""
     Gf, UsdGeom = pxr("Gf"), pxr("UsdGeom")
 
@@ -278,7 +273,7 @@ def _held(piece: SceneObject) -> Iterator[tuple[int, Segment]]:
             yield after.frame - 1, segment
 
 
-def _add_camera(stage: Any, camera: Camera) -> None:  # noqa: ANN401
+def _add_camera(stage: Stage, camera: Camera) -> None:
     """USD's cameras look along -z with +y up; the film is moved for the principal point."""
     Gf, UsdGeom = pxr("Gf"), pxr("UsdGeom")
 

@@ -3,7 +3,6 @@
 import hashlib
 from importlib import import_module
 from importlib.util import find_spec
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,12 @@ from numpy.typing import NDArray
 from mover.core.colours import Colour
 from mover.core.errors import InputError
 from mover.core.files import replacing
+from mover.io.export.looks import png_of
 
-# OpenUSD's Python modules fill themselves when they are imported.
+Stage = Any
+"""A file of OpenUSD, whose Python modules have no types and fill themselves when imported."""
+Prim = Any
+"""A thing in it, or the schema that defines it."""
 
 
 def pxr(name: str) -> Any:  # noqa: ANN401
@@ -30,7 +33,7 @@ def pxr(name: str) -> Any:  # noqa: ANN401
     return import_module(f"pxr.{name}")
 
 
-def free_path(stage: Any, parent: str, name: str) -> str:  # noqa: ANN401
+def free_path(stage: Stage, parent: str, name: str) -> str:
     """A path that USD allows and that nothing has yet."""
     Tf = pxr("Tf")
 
@@ -41,12 +44,8 @@ def free_path(stage: Any, parent: str, name: str) -> str:  # noqa: ANN401
 
 
 def add_mesh(
-    stage: Any,  # noqa: ANN401
-    path: str,
-    verts: NDArray[Any],
-    faces: NDArray[Any],
-    tint: Colour,
-) -> Any:  # noqa: ANN401
+    stage: Stage, path: str, verts: NDArray[Any], faces: NDArray[Any], tint: Colour
+) -> Prim:
     """Triangles of one colour, without a subdivision."""
     UsdGeom, Vt = pxr("UsdGeom"), pxr("Vt")
 
@@ -62,7 +61,7 @@ def add_mesh(
     return mesh
 
 
-def set_points(mesh: Any, points: NDArray[np.float32], time: float | None) -> None:  # noqa: ANN401
+def set_points(mesh: Prim, points: NDArray[np.float32], time: float | None) -> None:
     """Places and extent, always or at one time."""
     Usd, Vt = pxr("Usd"), pxr("Vt")
 
@@ -72,7 +71,7 @@ def set_points(mesh: Any, points: NDArray[np.float32], time: float | None) -> No
     mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), when)
 
 
-def add_look(stage: Any, mesh: Any, part: Any, folder: Path) -> None:  # noqa: ANN401
+def add_look(stage: Stage, mesh: Prim, part: Any, folder: Path) -> None:  # noqa: ANN401
     """Give a mesh the material of a trimesh part: its texture or colour, or colours of vertices."""
     from trimesh.visual import ColorVisuals
     from trimesh.visual.material import PBRMaterial
@@ -92,7 +91,7 @@ def add_look(stage: Any, mesh: Any, part: Any, folder: Path) -> None:  # noqa: A
         _connect_picture(stage, shader, _save_picture(picture, folder), colour)
 
 
-def _add_vertex_colours(mesh: Any, rgba: Any) -> None:  # noqa: ANN401
+def _add_vertex_colours(mesh: Prim, rgba: Any) -> None:  # noqa: ANN401
     UsdGeom, Vt = pxr("UsdGeom"), pxr("Vt")
 
     share = rgba[:, :3].astype(np.float32) / 255
@@ -101,7 +100,7 @@ def _add_vertex_colours(mesh: Any, rgba: Any) -> None:  # noqa: ANN401
     primvar.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(light, np.float32)))
 
 
-def _add_uv(mesh: Any, uv: Any) -> None:  # noqa: ANN401
+def _add_uv(mesh: Prim, uv: Any) -> None:  # noqa: ANN401
     """Texture coordinates from the lower left corner, as trimesh and USD both have them."""
     Sdf, UsdGeom, Vt = pxr("Sdf"), pxr("UsdGeom"), pxr("Vt")
 
@@ -110,7 +109,7 @@ def _add_uv(mesh: Any, uv: Any) -> None:  # noqa: ANN401
     primvar.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uv[:, :2], np.float32)))
 
 
-def _bind_surface(stage: Any, mesh: Any, colour: list[float]) -> Any:  # noqa: ANN401
+def _bind_surface(stage: Stage, mesh: Prim, colour: list[float]) -> Prim:
     """A rough surface of one colour; its shader."""
     Gf, Sdf, UsdShade = pxr("Gf"), pxr("Sdf"), pxr("UsdShade")
 
@@ -125,12 +124,7 @@ def _bind_surface(stage: Any, mesh: Any, colour: list[float]) -> Any:  # noqa: A
     return shader
 
 
-def _connect_picture(
-    stage: Any,  # noqa: ANN401
-    shader: Any,  # noqa: ANN401
-    picture: str,
-    colour: list[float],
-) -> None:
+def _connect_picture(stage: Stage, shader: Prim, picture: str, colour: list[float]) -> None:
     """Let a picture, multiplied with a colour, be that of a surface."""
     Gf, Sdf, UsdShade = pxr("Gf"), pxr("Sdf"), pxr("UsdShade")
 
@@ -151,9 +145,8 @@ def _connect_picture(
 
 def _save_picture(picture: Any, folder: Path) -> str:  # noqa: ANN401
     """Write a texture beside the scene, once for each content; its relative path."""
-    stream = BytesIO()
-    picture.convert("RGBA" if "A" in picture.getbands() else "RGB").save(stream, "PNG")
-    name = f"textures/{hashlib.sha256(stream.getvalue()).hexdigest()[:16]}.png"
+    content = png_of(picture)
+    name = f"textures/{hashlib.sha256(content).hexdigest()[:16]}.png"
     with replacing(folder / name) as part:
-        part.write_bytes(stream.getvalue())
+        part.write_bytes(content)
     return f"./{name}"

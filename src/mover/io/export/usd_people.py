@@ -1,7 +1,5 @@
 """People of USD: skeletons with animation where the parameters are known, else moving meshes."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -12,14 +10,14 @@ from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals
 from mover.io.export.people import FPS, Track, keyframes, seen_from_to
 from mover.io.export.posed import Skin, all_angles, quaternions, rest_of
-from mover.io.export.usd_mesh import add_mesh, free_path, pxr, set_points
+from mover.io.export.usd_mesh import Prim, Stage, add_mesh, free_path, pxr, set_points
 
 TOLERANCE = 0.002  # [m], of the straight lines between two samples of time
 MOST = 100_000
 INFLUENCES = 8  # joints that may move a vertex
 
 
-def add_moving_mesh(stage: Any, bodies: Bodies, track: Track) -> None:  # noqa: ANN401
+def add_moving_mesh(stage: Stage, bodies: Bodies, track: Track) -> None:
     """One person as a mesh with samples of time; they are straight lines between, 2 mm off."""
     verts = bodies.verts[track.rows].detach().cpu().float()
     keys, _ = keyframes(verts, track.time, TOLERANCE, MOST)
@@ -31,7 +29,7 @@ def add_moving_mesh(stage: Any, bodies: Bodies, track: Track) -> None:  # noqa: 
     _show(mesh, bodies, track)
 
 
-def _show(what: Any, bodies: Bodies, track: Track) -> None:  # noqa: ANN401
+def _show(what: Prim, bodies: Bodies, track: Track) -> None:
     """Hide a person while nobody sees them."""
     UsdGeom = pxr("UsdGeom")
 
@@ -45,7 +43,7 @@ def _show(what: Any, bodies: Bodies, track: Track) -> None:  # noqa: ANN401
             seen.Set(UsdGeom.Tokens.invisible, first + round(end * fps) + 1)
 
 
-def add_skeleton(stage: Any, skin: Skin, bodies: Bodies, track: Track) -> None:  # noqa: ANN401
+def add_skeleton(stage: Stage, skin: Skin, bodies: Bodies, track: Track) -> None:
     """One person as a skinned mesh on a skeleton, with one sample a frame."""
     UsdGeom, UsdSkel = pxr("UsdGeom"), pxr("UsdSkel")
 
@@ -102,19 +100,14 @@ def _local(skin: Skin, bind: Float[Tensor, "joints 4 4"]) -> Float[Tensor, "join
     return torch.stack(found)
 
 
-def _matrices(values: Float[Tensor, "joints 4 4"]) -> Any:  # noqa: ANN401
+def _matrices(values: Float[Tensor, "joints 4 4"]) -> Prim:
     """As USD has them, for rows."""
     Gf, Vt = pxr("Gf"), pxr("Vt")
 
     return Vt.Matrix4dArray([Gf.Matrix4d(value.T.tolist()) for value in values])
 
 
-def _move(
-    motion: Any,  # noqa: ANN401
-    skin: Skin,
-    track: Track,
-    joints: Float[Tensor, "joints 3"],
-) -> None:
+def _move(motion: Prim, skin: Skin, track: Track, joints: Float[Tensor, "joints 3"]) -> None:
     """Place, turn and size of every joint in its parent, frame by frame."""
     Gf, Vt = pxr("Gf"), pxr("Vt")
 
@@ -140,7 +133,7 @@ def _move(
             attr.Set(value, float(track.frame[k]))
 
 
-def _add_skin(stage: Any, skin: Skin, track: Track, path: str) -> Any:  # noqa: ANN401
+def _add_skin(stage: Stage, skin: Skin, track: Track, path: str) -> Prim:
     """The rest shape with the share of each joint in its vertices."""
     Gf, UsdGeom, UsdSkel, Vt = pxr("Gf"), pxr("UsdGeom"), pxr("UsdSkel"), pxr("Vt")
 
