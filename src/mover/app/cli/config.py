@@ -64,14 +64,13 @@ def parsed_with(
 ) -> tuple[T, C]:
     """The same, and the settings of `config` that other flags of the command change."""
 
-    def both(args: Any, config: Any = config) -> tuple[Any, Any]:  # noqa: ANN401
+    def both(
+        args: Annotated[kind, arg(name="")],  # pyright: ignore[reportInvalidTypeForm]
+        config: Annotated[type(config), arg(name="")] = config,  # pyright: ignore
+    ) -> Any:  # noqa: ANN401
         return args, config
 
     both.__doc__ = kind.__doc__
-    both.__annotations__ = {
-        "args": Annotated[kind, arg(name="")], "config": Annotated[type(config), arg(name="")],
-        "return": tuple[kind, type(config)],
-    }  # fmt: skip
     return parsed(both, prog, arguments, *markers)
 
 
