@@ -6,6 +6,7 @@ Objects are compared in the gravity-aligned world of their own scene (docs/metri
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -54,6 +55,17 @@ class Pair:
     """Number of points on the true surface."""
     boxes: bool = False
     """The truth is a box: boxes are compared in the image, not what is drawn."""
+
+    @cached_property
+    def points(self) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"]]:
+        """Points of both surfaces where they stand [m]."""
+        estimate, truth = (place_object(piece) for piece in (self.estimate, self.truth))
+        return area_samples(estimate, surfaces.POINTS), area_samples(truth, surfaces.POINTS)
+
+    @cached_property
+    def apart(self) -> float:
+        """ADD-S of the two surfaces, as a share of the true diameter."""
+        return surfaces.add_s(*self.points)
 
 
 @record
@@ -106,23 +118,17 @@ def size_error(pair: Pair) -> float:
 
 def add_s(pair: Pair) -> float:
     """Mean distance between the two surfaces, both ways, as a share of the true diameter."""
-    return surfaces.add_s(*_points(pair))
+    return pair.apart
 
 
 def add_s_01(pair: Pair) -> float:
     """1 where that is less than a tenth; the mean is the share of such objects."""
-    return float(add_s(pair) < surfaces.CLOSE)
+    return float(pair.apart < surfaces.CLOSE)
 
 
 def icp_rotation(pair: Pair) -> float:
     """Angle by which ICP turns the object onto the true one [rad]."""
-    return surfaces.icp_turn(*_points(pair))
-
-
-def _points(pair: Pair) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"]]:
-    """Points of both surfaces where they stand."""
-    estimate, truth = (place_object(piece) for piece in (pair.estimate, pair.truth))
-    return area_samples(estimate, surfaces.POINTS), area_samples(truth, surfaces.POINTS)
+    return surfaces.icp_turn(*pair.points)
 
 
 def pitch_error(sight: Sight) -> float:

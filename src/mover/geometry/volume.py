@@ -148,8 +148,11 @@ def signed_distance(
     query, corners = as_float64(points), as_float64(verts)
     triangles = outward(corners, as_int64(faces))
     distance = np.sqrt(closest(query, corners, triangles)[0])
-    inside = np.asarray(igl.fast_winding_number(corners, triangles, query)) > 0.5
-    return torch.from_numpy(np.where(inside, -distance, distance)).to(points)
+    within = ((query > corners.min(0)) & (query < corners.max(0))).all(-1)
+    if within.any():  # outside of the box nothing is inside
+        winding = np.asarray(igl.fast_winding_number(corners, triangles, query[within]))
+        distance[within] *= np.where(winding > 0.5, -1, 1)
+    return torch.from_numpy(distance).to(points)
 
 
 # Closed triangle meshes on a grid: winding numbers of places.

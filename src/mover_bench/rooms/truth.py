@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from mover.bodies.skinning import open_body
 from mover.core.records import record
-from mover_bench.rooms.placed import FAR, Placed, distances
+from mover_bench.rooms.placed import FAR, Placed, corners, distances
 from mover_bench.rooms.poses import AT, Person, Posture, moved, skinned
 
 PRESS = 0.006  # [m], how deep skin gives way
@@ -101,6 +101,7 @@ def laid(person: Person, posture: Posture, piece: Placed, group: str) -> Posture
 
 SINK = 0.02  # [m], deeper no body may be inside a piece
 GAPE = 0.01  # [m], farther no touch may be off
+SLACK = 1e-3  # [m], more than rounding
 NONE, GROUND = -2, -1
 
 RESTS = {
@@ -130,12 +131,29 @@ def nearness(skin: Float[np.ndarray, "frames verts 3"], pieces: tuple[Placed, ..
     """Distances of bodies on the floor (y = 0) to everything."""
     distance = skin[..., 1].copy()
     nearest = np.full(distance.shape, GROUND)
-    flat = skin.reshape(-1, 3)
+    boxes = skin.min(1), skin.max(1)
     for index, piece in enumerate(pieces):
-        one = distances(piece, flat).reshape(distance.shape)
+        one = around(piece, skin, boxes, FAR)
         nearest[one < distance] = index
         distance = np.minimum(distance, one)
     return Nearness(distance, nearest)
+
+
+def around(
+    piece: Placed,
+    skin: Float[np.ndarray, "frames verts 3"],
+    boxes: tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 3"]],
+    far: float,
+) -> Float[np.ndarray, "frames verts"]:
+    """Signed distance of bodies to a piece, at most `far` [m]; bodies beside it are skipped."""
+    floor, height = corners(piece, far + SLACK), piece.furniture.size[1]
+    low, high = floor.min(0), floor.max(0)
+    low, high = np.array([low[0], -far, low[1]]), np.array([high[0], height + far, high[1]])
+    close = ((boxes[1] > low - SLACK) & (boxes[0] < high + SLACK)).all(-1)
+    found = np.full(skin.shape[:2], far)
+    if close.any():
+        found[close] = distances(piece, skin[close].reshape(-1, 3), far).reshape(-1, skin.shape[1])
+    return found
 
 
 def faults(
@@ -151,10 +169,10 @@ def faults(
     `index` is the piece that is used. Above 0, `apart` is what the skin keeps from furniture [m].
     """
     skin = skinned(person, posture)
-    flat = skin.reshape(-1, 3)
+    boxes = skin.min(1), skin.max(1)
     found: list[str] = []
     for piece in pieces:
-        near = distances(piece, flat, max(FAR, apart))
+        near = around(piece, skin, boxes, apart)
         if apart > 0 and near.min() < apart:
             found.append(f"{label}: {100 * near.min():.1f} cm from {piece.id}")
         deep = -float(near.min())
