@@ -1,5 +1,6 @@
 """Starting: Warp is initialised once, kernels are compiled once, and both are told."""
 
+import io
 import logging
 import os
 import subprocess
@@ -7,7 +8,9 @@ import sys
 
 import pytest
 
+from mover.app.cli import say
 from mover.app.cli.progress import Bar
+from mover.app.cli.waiting import WAITING
 from mover.core.observe import Step
 from mover.geometry import warp_start
 
@@ -31,7 +34,9 @@ assert len(set(folder)) == 1, folder
 COMPILE = """
 from mover.geometry.warp_start import kernels
 from mover.energy.minimize import Step
+from mover.app.cli import say
 from mover.app.cli.progress import Bar
+from mover.app.cli.waiting import WAITING
 with Bar() as bar:
     bar(Step("gather", 0, 1))
     kernels("lookup", "cpu")
@@ -78,3 +83,47 @@ def test_a_bar_shows_what_is_compiled_and_leaves_the_log_as_it_was(capsys):
     assert "after" not in capsys.readouterr().out
     ours = logging.getLogger("mover.geometry.kernels")
     assert (ours.handlers, ours.level, ours.propagate) == ([], logging.NOTSET, True)
+
+
+class Screen(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_shows_a_moving_line_before_anything_heavy_is_imported():
+    code = """
+import io, sys
+class Screen(io.StringIO):
+    def isatty(self):
+        return True
+sys.stderr = Screen()
+from mover.app.cli.run import parse_run
+from mover.app.cli.waiting import WAITING
+parse_run(["capture"])
+import time
+time.sleep(0.3)
+WAITING.hide()
+lines = sys.stderr.getvalue().split("\\r")
+assert "torch" not in sys.modules
+assert lines[1] != lines[2], lines
+print([line for line in lines if "mover run" in line][0][:13].encode(), lines[-1].encode())
+"""
+    assert said(code).strip() == r"b'\x1b[2Kmover run' b'\x1b[2K'"
+
+
+def test_the_moving_line_makes_room_for_lines_of_text_and_for_a_bar(monkeypatch):
+    screen = Screen()
+    monkeypatch.setattr(sys, "stderr", screen)
+    for write in (
+        lambda: say("text", screen),
+        lambda: Bar().__enter__().__exit__(None, None, None),
+    ):
+        WAITING.show("reading")
+        write()
+        assert WAITING._thread is None
+
+
+def test_the_moving_line_is_silent_where_there_is_no_terminal(capsys):
+    WAITING.show("reading")
+    WAITING.hide()
+    assert capsys.readouterr().err == ""

@@ -55,9 +55,15 @@ class Origin:
 
 
 def write_results(
-    capture: Capture, room: Room, config: Config, run: Run, origin: Origin | None = None
-) -> Path:
-    """Write everything but metrics.json; returns the report's path."""
+    capture: Capture,
+    room: Room,
+    config: Config,
+    run: Run,
+    origin: Origin | None = None,
+    *,
+    report: bool = True,
+) -> None:
+    """Write everything but metrics.json; the page last, unless there is more to tell in it."""
     origin = origin or Origin()
     out = run.folder
     write_scene(room.initial, out / "initial.json")
@@ -73,7 +79,8 @@ def write_results(
     _write_log(room, config, run, origin)
     write_proposals(room, out / PROPOSED)
     write_scene(room.scene, out / "scene.json", scene_fields(room.explanations))
-    return write_report(out, report_of(capture, room, config, run))
+    if report:
+        write_report(out, report_of(capture, room, config, run))
 
 
 def labels_of(room: Room, run: Run) -> ContactLabels:

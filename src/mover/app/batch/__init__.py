@@ -19,6 +19,7 @@ from typing import Any
 from mover.app.batch.engines import ENGINES, EngineOptions
 from mover.app.batch.job import Job, Outcome, earlier
 from mover.app.batch.runner import read_tree
+from mover.app.cli.waiting import WAITING
 from mover.core.errors import InputError
 from mover.core.files import replacing
 
@@ -244,6 +245,7 @@ class Tally:
         self._task = self._progress.add_task("", total=total, failed=self._failed)
 
     def __enter__(self) -> "Tally":
+        WAITING.hide()
         if self._live:
             self._progress.update(self._task, completed=self._done)
             self._progress.start()

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from mover.app.cli.waiting import WAITING, Lines
 from mover.core.errors import InputError
 
 COMMANDS = {
@@ -115,7 +116,7 @@ def main() -> None:
     if arguments[0] not in COMMANDS and arguments[0] not in ALIASES:
         say(f"mover: no command {arguments[0]!r}; there are {', '.join(COMMANDS)}\n{USAGE}")
         raise SystemExit(2)
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[Lines()])
     logging.getLogger("mover.geometry.kernels").setLevel(logging.INFO)  # what is compiled, once
     raise SystemExit(run_command(arguments[0], arguments[1:]))
 
@@ -139,6 +140,8 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         say(f"\nmover {name}: stopped; the same command goes on from here", sys.stderr)
         return 130
+    finally:
+        WAITING.hide()
     return 0
 
 
@@ -150,6 +153,7 @@ def command_of(name: str) -> Callable[[Sequence[str]], None]:
 
 def say(text: str, stream: Any = None) -> None:  # noqa: ANN401
     """Write a line to standard output, or to `stream`."""
+    WAITING.hide()
     where = stream or sys.stdout
     where.write(text + "\n")
     where.flush()

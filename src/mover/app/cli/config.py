@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import arg
 
 from mover.app.cli import say
+from mover.app.cli.waiting import WAITING
 from mover.core.errors import InputError
 from mover.core.settings import check_settings
 from mover.pipeline.presets import PRESETS, Config, with_methods, with_present_flags
@@ -52,6 +53,7 @@ def parsed(kind: Callable[..., T], prog: str, arguments: Sequence[str], *markers
     parts: tuple[Any, ...] = found if isinstance(found, tuple) else (found,)
     for part in parts:
         check_settings(part, "--")
+    WAITING.show(prog)
     return found
 
 

@@ -5,6 +5,7 @@ import sys
 from types import TracebackType
 from typing import Any
 
+from mover.app.cli.waiting import WAITING
 from mover.core.observe import Observer, Step
 
 log = logging.getLogger("mover.geometry.kernels")  # tells what is compiled
@@ -16,7 +17,13 @@ class Bar:
     def __init__(self) -> None:
         from rich.console import Console
         from rich.logging import RichHandler
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+        )
 
         self._stage, self._task = "", None
         self._level = log.level
@@ -27,7 +34,7 @@ class Bar:
         columns = (
             TextColumn("{task.description:<28}"),
             BarColumn(),
-            TextColumn("{task.completed:>5}/{task.total}"),
+            MofNCompleteColumn(),
         )
         self._progress = Progress(
             *columns, TimeElapsedColumn(), console=self._console, transient=True
@@ -38,7 +45,9 @@ class Bar:
         self._level = log.level
         log.setLevel(logging.INFO)
         log.propagate = False
+        WAITING.hide()
         if self._console.is_terminal:
+            self._task = self._progress.add_task("...", total=None)
             self._progress.start()
         return self
 

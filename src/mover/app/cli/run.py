@@ -12,6 +12,7 @@ from mover.app.batch import CAPTURE, OUT, BatchPlan, captures_in, cores, counted
 from mover.app.batch.engines import ARRAY, EngineOptions, RayOptions, SlurmOptions
 from mover.app.cli import say
 from mover.app.cli.config import Device, chosen_config, parsed_with
+from mover.app.cli.waiting import WAITING
 from mover.core.errors import InputError
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
@@ -93,7 +94,12 @@ def _with_contacts(capture: "Capture", args: RunArgs) -> "Capture":
 
 
 def reconstruct_into(
-    out: Path, capture: "Capture", config: Config, origin: "Origin", watch: "Observer | None" = None
+    out: Path,
+    capture: "Capture",
+    config: Config,
+    origin: "Origin",
+    watch: "Observer | None" = None,
+    report: bool = True,
 ) -> "tuple[Room, Run]":
     """Run the main job on the edited capture and write its result; `watch` sees every step."""
     import torch
@@ -114,7 +120,8 @@ def reconstruct_into(
             from mover.pipeline.refinement import refined_room
 
             room = refined_room(room, capture, bar)
-    write_results(capture, room, config, run, origin)
+    WAITING.show("writing the result")
+    write_results(capture, room, config, run, origin, report=report)
     for warning in room.warnings:
         say(f"warning: {warning}")
     return room, run
