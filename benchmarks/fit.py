@@ -5,6 +5,10 @@ a tenth of the joints missing, none outside the image, and no legs while people 
 written as OpenPose's JSON, read as a user's would be, and fitted. PJE is the mean distance of the
 22 joints of the body from the truth: absolute, and with both pelvises laid on each other.
 
+`--detected` takes the joints of `benchmarks/video.py` instead: COCO's 17 with 3 to 6 px of noise,
+missed and swapped ones, guesses of hidden ones, and a camera whose tilt is 3 degrees off; the table
+tells postures apart. `--height` tells the fit how tall everybody is.
+
 `--second` measures the second pass: the first has a camera whose tilt is guessed (3 degrees off),
 camera and floor are found from its feet, and everybody is fitted again under them.
 """
@@ -22,22 +26,27 @@ import torch
 from torch import Tensor
 
 from mover.bodies.parts import parts_of
-from mover.bodies.skinning import open_body
+from mover.bodies.skinning import open_body, shaped
 from mover.core.types import Bodies, Camera, Keypoints
+from mover.evaluate.bodies import procrustes
 from mover.fitting.bodies import FitInputs, Fitted, fit_bodies
-from mover.geometry.camera import pitch_roll
+from mover.geometry.camera import pitch_roll, project
 from mover.geometry.rle import decode
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from
+from mover.perceive.config import JointsConfig
+from mover.perceive.track import JointsInputs, Tracks
+from mover.perceive.video import Clip
 from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camera
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.people.select_frames import SelectInputs, select_frames
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
 from mover_bench.rooms.keypoints import joints_seen
 from mover_bench.rooms.known import KnownRoom
-from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.noise import add_noise, hidden_rows
 from mover_bench.rooms.render import see, see_body
 from mover_bench.rooms.room import make_room
+from mover_bench.rooms.seen import Seen
 
 SEATED, LYING = ("sit", "lean"), ("lie", "lie down", "get up")
 
@@ -169,15 +178,95 @@ def measure(seed: int, fps: float, ground: bool, picture: Path | None) -> str:
     )
 
 
+def detected(room: KnownRoom, seed: int, fps: float) -> tuple[Keypoints, Camera]:
+    """COCO's joints as `mover video` gets them in the benchmark, and the camera that it guesses."""
+    noisy = add_noise(room, NoiseConfig(), seed)
+    people, camera = noisy.people, noisy.scene.camera
+    assert people is not None, "a known room has masks"
+    count = int(people.frame.max()) + 1
+    clip = Clip("", camera.width, camera.height, torch.arange(count) / fps, fps)
+    seen = Seen(room, noisy, seed)
+    tracks = Tracks(people.masks, people.frame, people.person, seen.people)
+    return seen.joints(JointsInputs(clip, tracks), JointsConfig()), camera
+
+
+def postures(room: KnownRoom, rows: list[int]) -> dict[str, list[int]]:
+    """Which of some bodies do what, and of which less is seen."""
+    camera, bodies = room.truth.camera, room.bodies
+    assert bodies.joints is not None
+    flat = project(bodies.joints[:, :22], camera.K)
+    size = torch.tensor([camera.width, camera.height])
+    cut = ((flat < 0) | (flat > size)).any(-1).any(-1)
+    actions = [room.actions[k] for k in rows]
+    hidden = hidden_rows(room)
+    still = (*SEATED, *LYING)
+    return {
+        "all": list(range(len(rows))),
+        "upright": [k for k, a in enumerate(actions) if a not in still],
+        "seated": [k for k, a in enumerate(actions) if a in SEATED],
+        "lying": [k for k, a in enumerate(actions) if a in LYING],
+        "half hidden": [k for k, row in enumerate(rows) if hidden[row]],
+        "cut": [k for k, row in enumerate(rows) if cut[row]],
+    }
+
+
+def stature(room: KnownRoom) -> tuple[float, ...]:
+    """How tall the people are [m]."""
+    assert room.bodies.pose is not None
+    people = room.bodies.person.unique()
+    first = [int((room.bodies.person == one).nonzero()[0, 0]) for one in people]
+    y = shaped(open_body(), room.bodies.pose.betas[first].float())[0][..., 1]
+    return tuple((y.amax(-1) - y.amin(-1)).tolist())
+
+
+def by_posture(seed: int, fps: float, tall: bool) -> dict[str, Tensor]:
+    """Of each posture: absolute and Procrustes-aligned PJE of each body [mm]."""
+    room = make_room(seed, RoomConfig(fps=fps))
+    keypoints, camera = detected(room, seed, fps)
+    heights = stature(room) if tall else ()
+    found = fit_bodies(FitInputs(keypoints, camera, open_body(), heights=heights))
+    where = {int(f): k for k, f in enumerate(room.bodies.frame.tolist())}
+    rows = [where[f] for f in found.bodies.frame.tolist()]
+    assert found.bodies.joints is not None
+    assert room.bodies.joints is not None
+    joints, truth = found.bodies.joints[:, :22].double(), room.bodies.joints[rows, :22].double()
+    pairs = torch.stack(
+        [(some - truth).norm(dim=-1).mean(1) for some in (joints, procrustes(joints, truth))], -1
+    )
+    told = {name: 1e3 * pairs[which] for name, which in postures(room, rows).items() if which}
+    means = ", ".join(
+        f"{n} {len(v)}: {v[:, 0].mean():.0f} / {v[:, 1].mean():.0f}" for n, v in told.items()
+    )
+    print(f"room {seed}: {means}", flush=True)
+    return told
+
+
+def table(seeds: list[int], fps: float, tall: bool) -> None:
+    """Postures over rooms: means of the bodies, and of the rooms."""
+    rooms = [by_posture(seed, fps, tall) for seed in seeds]
+    for name in rooms[0]:
+        each = [room[name] for room in rooms if name in room]
+        mean, mid = torch.cat(each).mean(0).tolist(), torch.cat(each).median(0).values.tolist()
+        print(
+            f"{name}: {sum(map(len, each))} bodies of {len(each)} rooms, absolute {mean[0]:.0f} mm "
+            f"(median {mid[0]:.0f}), Procrustes {mean[1]:.0f} mm (median {mid[1]:.0f})"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rooms", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--fps", type=float, default=5.0)
     parser.add_argument("--ground", action="store_true", help="tell the fit the true floor")
     parser.add_argument("--second", action="store_true", help="measure the second pass")
+    parser.add_argument("--detected", action="store_true", help="a detector's joints, by posture")
+    parser.add_argument("--height", action="store_true", help="tell the fit how tall people are")
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the fits")
     args = parser.parse_args()
     torch.set_num_threads(1)
+    if args.detected:
+        table(args.rooms, args.fps, args.height)
+        return
     for seed in args.rooms:
         if args.second:
             second(seed, args.fps)

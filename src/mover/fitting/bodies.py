@@ -20,6 +20,7 @@ from mover.fitting.given import begin_at, begin_from, start_rows
 from mover.fitting.prior import ANGLES, PosePrior, encoded
 from mover.fitting.room import FitRoom
 from mover.fitting.start import Begun, begin
+from mover.fitting.stature import stature_of
 from mover.fitting.tracks import (
     Window,
     at_stage,
@@ -67,6 +68,8 @@ class FitInputs:
     prior: PosePrior = ANGLES
     ground: float | None = None
     """Height of the floor in the camera's world [m], where it is known: nobody goes below it."""
+    heights: tuple[float, ...] = ()
+    """How tall each person is, in the order of their numbers, or one for everybody [m]."""
     room: FitRoom | None = None
     """The room around `start`, one row for each of its bodies: these are fitted where they are."""
 
@@ -105,6 +108,7 @@ def fit_bodies(
     """
     config = config or FitConfig()
     rows, warnings = usable_rows(inputs.keypoints, config)
+    stature = stature_of(inputs.model, inputs.heights, inputs.keypoints.person, rows)
     some = rows_of(inputs.keypoints, rows)
     inputs = dataclasses.replace(inputs, keypoints=some)
     picked = NO_SKIN if inputs.room is None else inputs.room.picked
@@ -113,7 +117,9 @@ def fit_bodies(
     seen = seen_of(some, rig, inputs.camera, config)
     seen = dataclasses.replace(seen, floor=inputs.ground, room=_around(inputs))
     job = _Job(inputs, config, rig, names, seen, observe)
-    at, frame, seen = _solved(_begun(job), job)
+    begun = _begun(job)
+    job = dataclasses.replace(job, seen=dataclasses.replace(seen, stature=stature))
+    at, frame, seen = _solved(begun, job)
     pose = pose_of(at, frame, inputs.model, inputs.prior)
     miss = miss_of(at, frame, seen, inputs.prior)
     return Fitted(bodies_of(pose, inputs.model, some), rows, miss, warnings)

@@ -86,6 +86,12 @@ class FitConfig:
     """and what each m/s, across the view, adds to it [1/s]."""
     jitter: Sigma = 0.004
     """Second difference that is free of charge at any frame rate [m]."""
+    by_size: bool = True
+    """Price second differences of joints in sizes of the body: people are not near to be smooth."""
+    alike: Annotated[int, int_in(1, 1_000_000)] = 20
+    """Frames whose keypoints tell of a person's shape as much as all of a long track do."""
+    height: Weight = 1e4
+    """Weight of a height that is told, off the body's [1/m]."""
     longest_gap: Seconds = 1.0
     """Frames further apart do not smooth each other [s]."""
     support: Sigma = 0.05

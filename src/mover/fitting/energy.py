@@ -8,8 +8,10 @@ r"""E_Body: what keypoints say of bodies, and what is known of bodies and of mot
 after Pavlakos et al. 2019 (SMPLify-X, Sec. 3.2 and its published configuration) and the paper;
 ρ(r; σ) = σ² r² / (r² + σ²), for keypoints on each coordinate.
 Departure: Second differences are taken over real time, so that gaps and frame rates make no
-acceleration, and are divided by what people do in that time. σ2 and σ3 stay the lengths beyond
-which a jump is believed. Self-collision is left out, as in the authors' video configuration.
+acceleration, and are divided by what people do in that time and, in 3D, by the size of the body:
+most of them is noise of the keypoints, which is longer in metres the larger and the farther the
+body is held to be. σ2 and σ3 stay the lengths beyond which a jump is believed. Self-collision is
+left out, as in the authors' video configuration.
 """
 
 from dataclasses import dataclass
@@ -25,6 +27,7 @@ from mover.energy.minimize import weigh
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.limits import limit_price
 from mover.fitting.room import FitRoom, room_terms
+from mover.fitting.stature import Stature, height_price, size_of
 from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, points_of
 from mover.geometry.camera import project
 
@@ -74,6 +77,8 @@ class Seen:
     """Joints of the body that are known in 3D [m]; NaN: not known."""
     room: FitRoom | None = None
     """The room in which they are fitted; None: not known."""
+    stature: Stature | None = None
+    """How tall they are; None: nobody told."""
 
 
 @dataclass(frozen=True)
@@ -95,14 +100,17 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
     floor = by.stage.pose / by.config.support if seen.floor is not None else 0.0
     lifted = LIFTED if seen.joints is not None else 0.0
     smooth = by.stage.smooth if len(seen.triples.rows) else 0.0
+    joints = points.joints
+    if by.config.by_size:
+        joints = joints / size_of(joints)[:, None, None]
     solid, flat = by.config.smooth_joints, by.config.smooth_pixels
     space = weigh(
         ("keypoints", image, lambda: keypoint_price(pixels, seen, rho)),
         ("support", floor**2, lambda: support_price(points, seen)),
         ("joints", lifted**2, lambda: joint_price(points, seen)),
-        ("smooth_joints", smooth * solid, lambda: smooth_joint_price(points.joints, seen, by)),
+        ("smooth_joints", smooth * solid, lambda: smooth_joint_price(joints, seen, by)),
         ("smooth_pixels", smooth * flat, lambda: smooth_pixel_price(pixels, seen, by)),
-        ("still", smooth * by.config.still, lambda: still_price(points.joints, seen)),
+        ("still", smooth * by.config.still, lambda: still_price(joints, seen)),
     )
     room = room_terms(points, seen.room, by.stage)
     return Energy({**space.parts, **room, **_prior_energy(at, frame, seen, by).parts})
@@ -113,17 +121,24 @@ def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy
     stage, config = by.stage, by.config
     angles = by.decode(at.code)
     count = torch.bincount(frame.person, minlength=len(at.betas)).to(at.betas)[frame.person]
+    news = count.clamp_max(config.alike)
+    told = config.height if seen.stature is not None else 0.0
     hands, face = min(1, at.hands.shape[1]), min(1, at.face.shape[1])
     expression = at.face[:, 3:]
 
     def pose() -> Tensor:
         return at.code.square().sum(-1) if by.learned else pose_price(angles, seen)
 
+    def height() -> Tensor:
+        assert seen.stature is not None
+        return height_price(seen.stature, at.betas)[frame.person] / count
+
     return weigh(
         ("pose", stage.pose**2, pose),
         ("limits", config.limits**2, lambda: limit_price(angles)),
         ("bending", config.bending * stage.pose, lambda: bending_price(angles)),
-        ("shape", stage.shape**2, lambda: at.betas.square().sum(-1)[frame.person] / count),
+        ("shape", stage.shape**2, lambda: at.betas.square().sum(-1)[frame.person] / news),
+        ("height", told**2, height),
         ("hands", stage.hands**2 * hands, lambda: at.hands.square().sum(-1)),
         ("jaw", stage.jaw**2 * face, lambda: jaw_price(at.face)),
         ("expression", stage.shape**2 * face, lambda: expression.square().sum(-1)),

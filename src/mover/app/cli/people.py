@@ -207,6 +207,8 @@ class FitArgs:
     """How bodies are priced: ours, or E_Body as printed, with VPoser's weights (--vposer)."""
     ground: Annotated[float, float_in(-100, 100)] | None = None
     """Height of the floor in the camera's world, where it is known: nobody sinks into it [m]."""
+    height: tuple[Annotated[float, float_in(0.4, 2.6)], ...] = ()
+    """How tall people are, one for everybody or for each in the order of their numbers [m]."""
     fps: Rate | None = None
     """Frames a second, where the keypoints do not tell."""
     first: Index = 0
@@ -247,6 +249,7 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
         start=None if args.start is None else read_bodies(args.start),
         prior=prior_of(args.vposer),
         ground=ground,
+        heights=args.height,
     )
     if args.preset == "paper" and args.vposer is None:
         say(NO_VPOSER)

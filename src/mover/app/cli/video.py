@@ -194,6 +194,9 @@ class ChainArgs:
     bodies_tool: str = ""
     """What wrote FILE, or what COMMAND writes: a TOOL of `mover import-bodies`; empty: bodies.npz
     itself."""
+    height: tuple[Annotated[float, float_in(0.4, 2.6)], ...] = ()
+    """How tall people are, one for everybody or for each in the order of their numbers [m]: tells
+    `--bodies fit` how far they are."""
     camera: Path | None = None
     """A calibration; GeoCalib's also tells pitch and roll."""
     fov: Annotated[float, float_in(1, 179)] | None = None
@@ -323,9 +326,10 @@ def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
         return
     given = [] if args.bodies == FIT or bodies.is_command else [Path(args.bodies)]
     made_from = [keypoints, lens_in(capture), args.bodies, args.bodies_tool, *given]
+    made_from += map(str, args.height)  # without any, results of before stay
 
     def work() -> None:
-        make_bodies(bodies, source, capture, lambda: _fit(capture))
+        make_bodies(bodies, source, capture, lambda: _fit(capture, args.height))
 
     steps.do(STEPS[1], made_from, capture / "bodies.npz", work, yours=args.bodies == FIT)
 
@@ -352,9 +356,9 @@ def lens_in(capture: Path) -> str:
     return f"{camera.width} {camera.height} " + " ".join(f"{v:.6g}" for v in camera.K.flatten())
 
 
-def _fit(capture: Path) -> None:
-    made = capture / "bodies.npz"
-    fit_into(FitArgs(capture / "keypoints.npz", capture / "camera.json", out=made, drop=True))
+def _fit(capture: Path, height: tuple[float, ...]) -> None:
+    camera, made = capture / "camera.json", capture / "bodies.npz"
+    fit_into(FitArgs(capture / "keypoints.npz", camera, out=made, drop=True, height=height))
 
 
 def _room(capture: Path, args: ChainArgs) -> None:
