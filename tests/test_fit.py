@@ -11,7 +11,7 @@ from make_keypoints import CAMERA, as_bodies, keypoints_at, leg_columns, seen, w
 from make_smpl import make_model, write_npz
 
 from mover.bodies.keypoints import keypoints_of
-from mover.bodies.skinning import open_body, zero_pose
+from mover.bodies.skinning import open_body, shaped, zero_pose
 from mover.bodies.smpl_files import load_smpl
 from mover.core.errors import InputError
 from mover.core.types import Scene
@@ -21,6 +21,7 @@ from mover.fitting.energy import Weighed, bending_price, body_energy, geman_mccl
 from mover.fitting.limits import limit_price, limit_table, resting
 from mover.fitting.prior import ANGLES, same
 from mover.fitting.start import placed
+from mover.fitting.stature import height_price, size_of, stature_of
 from mover.fitting.tracks import best_path, seen_of, triples_of
 from mover.fitting.unknowns import Frame, Unknowns, move, points_of, rig_of
 from mover.geometry.camera import project
@@ -432,3 +433,46 @@ def test_the_preset_paper_prices_motion_as_printed():
     assert float(solid) == pytest.approx(wanted[0], rel=1e-4)
     assert float(flat) == pytest.approx(wanted[1], rel=1e-4)
     assert [s.pose for s in PAPER.stages] == [4.78, 4.78]
+
+
+def test_how_tall_people_are_is_told_one_by_one_or_for_all():
+    everybody = torch.tensor([4, 7, 4, 9])
+    one = stature_of(open_body(), (1.7,), everybody, torch.arange(4))
+    assert one.given.tolist() == pytest.approx([1.7, 1.7, 1.7])
+    some = stature_of(open_body(), (1.6, 1.7, 1.8), everybody, torch.tensor([0, 2, 3]))
+    assert some.given.tolist() == pytest.approx([1.6, 1.8])  # nothing is seen of number 7
+    assert stature_of(open_body(), (), everybody, torch.arange(4)) is None
+    with pytest.raises(InputError, match="height: 2 are given, expected 1, or 3: one a person"):
+        stature_of(open_body(), (1.7, 1.8), everybody, torch.arange(4))
+
+
+def test_the_height_of_numbers_of_the_shape_is_that_of_the_body():
+    betas = torch.tensor([[1.5, -1.0, 0.5], [0.0, 2.0, 0.0]])
+    y = shaped(open_body(), betas)[0][..., 1]
+    tall = y.amax(-1) - y.amin(-1)
+    told = stature_of(open_body(), tuple((tall + 0.02).tolist()), torch.arange(2), torch.arange(2))
+    torch.testing.assert_close(
+        height_price(told, betas), torch.full((2,), 4e-4), atol=1e-4, rtol=0.2
+    )
+
+
+@pytest.mark.slow
+def test_people_whose_height_is_told_are_where_they_are(walk):
+    tall = float(np.ptp(shaped(open_body(), walk.pose.betas[:1])[0][0, :, 1].numpy()))
+    told = FitInputs(seen(walk, noise=3.0), CAMERA, open_body(), heights=(tall,))
+    far = dataclasses.replace(told, heights=(1.1 * tall,))
+    (_, near), (_, wrong) = (off(fit_bodies(one, QUICK), walk) for one in (told, far))
+    assert near < 0.1
+    assert wrong > 0.3  # a tenth taller is a tenth farther away
+
+
+def test_larger_bodies_do_not_move_less_smoothly(walk):
+    keypoints = seen(walk, noise=3.0)
+    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
+    looked = seen_of(keypoints, rig, CAMERA, FitConfig())
+    by = Weighed(Stage(), FitConfig(), ANGLES.decode, learned=False)
+    torch.testing.assert_close(size_of(1.1 * walk.joints), 1.1 * size_of(walk.joints))
+    sized = [j / size_of(j)[:, None, None] for j in (walk.joints, 1.1 * walk.joints)]
+    prices = [smooth_joint_price(j, looked, by).sum() for j in sized]
+    torch.testing.assert_close(*prices)
+    assert smooth_joint_price(walk.joints, looked, by).sum() > 0
