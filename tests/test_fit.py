@@ -17,7 +17,13 @@ from mover.core.errors import InputError
 from mover.core.types import Scene
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import PUBLISHED, STAGES, FitConfig, Stage
-from mover.fitting.energy import Weighed, bending_price, body_energy, geman_mcclure
+from mover.fitting.energy import (
+    Weighed,
+    bending_price,
+    body_energy,
+    geman_mcclure,
+    smooth_joint_price,
+)
 from mover.fitting.limits import limit_price, limit_table, resting
 from mover.fitting.prior import ANGLES, same
 from mover.fitting.start import placed
@@ -403,7 +409,7 @@ def test_a_second_pass_takes_camera_and_floor_of_a_result(tmp_path):
 
 def test_the_preset_paper_prices_motion_as_printed():
     """L_smooth of a track at even times, by a loop over Sec. 3.2, with the released weights."""
-    from mover.fitting.energy import Seen, smooth_joint_price, smooth_pixel_price
+    from mover.fitting.energy import Seen, smooth_pixel_price
     from mover.fitting.presets import PAPER
 
     generator = torch.Generator().manual_seed(0)
