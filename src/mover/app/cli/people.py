@@ -259,9 +259,8 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
         say(f"warning: {warning}")
     bodies = _without_outliers(found.bodies) if args.drop else found.bodies
     write_bodies(bodies, args.out)
-    people, frames = len(bodies.person.unique()), len(bodies.frame.unique())
-    miss = float(found.miss.mean())
-    say(f"{people} people in {frames} frames, keypoints missed by {miss:.1f} px: {args.out}")
+    counts = f"{len(bodies.person.unique())} people in {len(bodies.frame.unique())} frames"
+    say(f"{counts}, keypoints missed by {float(found.miss.mean()):.1f} px: {args.out}")
 
 
 def _world(args: FitArgs) -> tuple[Any, float | None]:
