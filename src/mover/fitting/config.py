@@ -90,7 +90,7 @@ class FitConfig:
     """Price second differences of joints in sizes of the body: people are not near to be smooth."""
     alike: Annotated[int, int_in(1, 1_000_000)] = 20
     """Frames whose keypoints tell of a person's shape as much as all of a long track do."""
-    height: Weight = 1e4
+    told: Weight = 1e4
     """Weight of a height that is told, off the body's [1/m]."""
     longest_gap: Seconds = 1.0
     """Frames further apart do not smooth each other [s]."""

@@ -122,7 +122,7 @@ def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy
     angles = by.decode(at.code)
     count = torch.bincount(frame.person, minlength=len(at.betas)).to(at.betas)[frame.person]
     news = count.clamp_max(config.alike)
-    told = config.height if seen.stature is not None else 0.0
+    told = config.told if seen.stature is not None else 0.0
     hands, face = min(1, at.hands.shape[1]), min(1, at.face.shape[1])
     expression = at.face[:, 3:]
 
