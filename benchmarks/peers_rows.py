@@ -146,14 +146,15 @@ def outlines() -> Figures:
     }
     if not absent("deodr"):
         fine = torch.nn.functional.avg_pool2d(deodr(room, 1e-3, 8)[0][:, None], 8)[:, 0]
-        hard, soft = deodr(room, 1e-3)[0], deodr(room)[0]
+        hard, (soft, pulls) = deodr(room, 1e-3)[0], deodr(room)
         figures |= {
             "silhouette Warp - DEODR eight times finer, mean": float((ours - fine).mean().abs()),
             "silhouette Warp - DEODR, centres differing": differing(ours, hard),
         }
         print(
             f"not the same image: at its usual width, DEODR's band lies outside of the outline;"
-            f" it covers {float((soft - ours).sum() / ours.sum()):.1%} more than we do"
+            f" it covers {float((soft - ours).sum() / ours.sum()):.1%} more than we do, and its"
+            f" gradient has a cosine of {alike(pulls, room):.2f} with ours"
         )
     if not absent("pytorch3d"):
         soft, first = pytorch3d(room)
@@ -162,6 +163,17 @@ def outlines() -> Figures:
         figures |= compared("Warp - PyTorch3D", near, first)
         print(f"PyTorch3D's soft silhouettes differ by {float((soft - ours).abs().mean()):.1e}")
     return figures
+
+
+def alike(pulls: list[Tensor], room: Room) -> float:
+    """Cosine between another gradient of all vertices and ours, of silhouettes alone."""
+    free = room.verts.clone().requires_grad_()
+    with use_engine("warp"):
+        image = raster.silhouettes(free, room.shape, room.views)
+    torch.autograd.backward((image - room.masks).square().sum())
+    assert free.grad is not None
+    own, other = free.grad.flatten(), torch.stack(pulls).flatten()
+    return float(torch.nn.functional.cosine_similarity(own, other, dim=0))
 
 
 def differing(one: Tensor, two: Tensor) -> float:

@@ -22,8 +22,8 @@ def absent(name: str) -> bool:
     return gone
 
 
-def deodr(room: Room, sigma: float = 1.0, finer: int = 1) -> tuple[Tensor, list[np.ndarray]]:
-    """Silhouettes by DEODR, and the gradient of their squared difference from the masks.
+def deodr(room: Room, sigma: float = 1.0, finer: int = 1) -> tuple[Tensor, list[Tensor]]:
+    """Silhouettes by DEODR, and how the vertices change their squared difference from the masks.
 
     Args:
         room: The objects.
@@ -37,8 +37,10 @@ def deodr(room: Room, sigma: float = 1.0, finer: int = 1) -> tuple[Tensor, list[
     for item, verts in enumerate(room.verts):
         faces = room.shape.faces[item]
         faces = faces[(faces != 0).any(1)].numpy()
-        flat = verts @ views.K[item].T
-        ij = (flat[:, :2] / flat[:, 2:]).double().numpy() * finer
+        free = verts.clone().requires_grad_()
+        flat = free @ views.K[item].T
+        place = flat[:, :2] / flat[:, 2:]
+        ij = place.detach().double().numpy() * finer
         count, many = len(verts), len(faces)
         flags = outline(faces, facing(ij, faces))
         drawn = Scene2D(
@@ -51,7 +53,9 @@ def deodr(room: Room, sigma: float = 1.0, finer: int = 1) -> tuple[Tensor, list[
         image, _ = drawn.render(sigma)
         if finer == 1:
             drawn.render_backward(2 * (image - room.masks[item].double().numpy()[..., None]))
-            slopes.append(drawn.ij_b)
+            torch.autograd.backward(place, torch.from_numpy(drawn.ij_b).float())
+            assert free.grad is not None
+            slopes.append(free.grad)
         images.append(torch.from_numpy(image[..., 0]).float())
     return torch.stack(images), slopes
 
