@@ -1,5 +1,6 @@
 """Linear blend skinning: from shape and pose to vertices and joints, batched, differentiable."""
 
+import dataclasses
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -50,6 +51,13 @@ class SkinnedBody:
         turns = axis_angle(angles_of(self, pose))
         verts, joints = shaped(self, pose.betas)
         return skinned(self, turns, verts, joints, pose.transl)
+
+    def joints_in(self, pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
+        """The joints that `posed` finds, without the skin [m]."""
+        bones = dataclasses.replace(
+            self, verts=self.verts[:1], weights=self.weights[:1], shape_dirs=self.shape_dirs[:1]
+        )
+        return bones.posed(pose)[1]
 
 
 def skinned(

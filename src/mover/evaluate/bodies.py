@@ -150,8 +150,14 @@ def _common_joints(names: Sequence[str], true_names: Sequence[str]) -> tuple[lis
     return [names.index(name) for name in body], [true_names.index(name) for name in body]
 
 
+AT_ONCE = 16  # bodies that are aligned together: what fits a processor's cache
+
+
 def _aligned(points: Tensor | None, target: Tensor | None) -> Tensor | None:
-    return points if points is None or target is None else procrustes(points, target)
+    if points is None or target is None or not len(points):
+        return points
+    pairs = zip(points.split(AT_ONCE), target.split(AT_ONCE), strict=True)
+    return torch.cat([procrustes(some, there) for some, there in pairs])
 
 
 def _distance(points: Tensor | None, target: Tensor | None) -> float | None:

@@ -125,7 +125,7 @@ def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) 
     pose = _turned(pose, error)
     bias = 1 + noise.depth_bias * rng.uniform(-1, 1, int(people.max()) + 1)[people]
     drift = noise.depth_drift * slow(rng, bodies, (1,), 1.0)[:, 0]
-    pelvis = open_body().posed(pose)[1][:, 0]
+    pelvis = open_body().joints_in(pose)[:, 0]
     shift = pelvis * torch.from_numpy(bias + drift - 1)[:, None]
     if noise.mean_bodies:
         pose, shift = _of_mean_shape(pose, pelvis, shift)
