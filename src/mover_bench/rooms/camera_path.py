@@ -6,6 +6,7 @@ the path in another scale, with a drift that grows with the way.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -13,16 +14,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.records import map_tensors
-from mover.core.types import Bodies, CameraPath, Capture, People
+from mover.core.types import CameraPath, Capture, People
 from mover.geometry.path import from_reference, is_still, poses_at, scaled
 from mover.geometry.raster import first_hit
-from mover.geometry.rle import decode
 from mover.geometry.rotations import axis_angle
 from mover.io.capture.pose_file import moved
 from mover_bench.rooms.config import NoiseConfig, PathConfig
-from mover_bench.rooms.known import KnownRoom, one_thread, rounded
-from mover_bench.rooms.noise import add_noise
-from mover_bench.rooms.render import encode, furniture, look_at
+from mover_bench.rooms.known import KnownRoom, one_thread, pieces_seen, rounded, visible
+from mover_bench.rooms.noise import add_noise, slow
+from mover_bench.rooms.render import furniture
 
 TARGET = 4.0  # [m] ahead, at which a camera that travels looks
 SHAKE = 0.7  # [s], how long a hand keeps its error
@@ -56,7 +56,8 @@ def draw_path(frames: int, fps: float, config: PathConfig, rng: np.random.Genera
     turn = np.radians(config.turn) * aim * [0.2, 1.0]
     look = np.stack([place[:, 1] / TARGET, -place[:, 0] / TARGET, 0 * time], 1)
     look[:, :2] += turn
-    hand = _slow(rng, frames, fps), _slow(rng, frames, fps)
+    every = np.arange(frames)
+    hand = [slow(rng, (every, 0 * every), (3,), fps * SHAKE) for _ in range(2)]
     place = place + config.hand * (hand[0] - hand[0][0])
     look = look + np.radians(config.shake) * (hand[1] - hand[1][0])
     R = axis_angle(torch.from_numpy(look))
@@ -70,14 +71,6 @@ def _swing(time: Float[np.ndarray, " frames"], rng: np.random.Generator, axes: i
     period, phase = rng.uniform(14, 26, axes), rng.uniform(-np.pi, np.pi, axes)
     whole = np.sin(2 * np.pi * time[:, None] / period + phase) - np.sin(phase)
     return whole / np.abs(whole).max(0).clip(0.3)
-
-
-def _slow(rng: np.random.Generator, frames: int, fps: float) -> Float[np.ndarray, "frames 3"]:
-    """Noise of variance one that forgets within `SHAKE`."""
-    fresh, memory = rng.normal(size=(frames, 3)), np.exp(-1 / (fps * SHAKE))
-    for k in range(1, frames):  # each frame builds on the one before
-        fresh[k] = memory * fresh[k - 1] + np.sqrt(1 - memory**2) * fresh[k]
-    return fresh
 
 
 def slam_path(true: CameraPath, config: PathConfig, rng: np.random.Generator) -> CameraPath:
@@ -114,60 +107,34 @@ def on_the_way(room: KnownRoom, path: CameraPath) -> KnownRoom:
         joints=rounded(from_reference(bodies.joints, poses)),
         pose=map_tensors(rounded, moved(bodies.pose, back[0], shift)),
     )
-    people, whole, free = _people(room, seen, path)
-    passing = free < 0.9 * whole
-    capture = dataclasses.replace(room.capture, bodies=seen, people=people)
-    return dataclasses.replace(room, bodies=seen, capture=capture, whole=whole, passing=passing)
+    drawn = _from(room, path)
+    shown = visible(room.plan, seen, lambda frame: drawn(frame)[0])
+    capture = dataclasses.replace(room.capture, bodies=seen, people=shown.people)
+    return dataclasses.replace(
+        room, bodies=seen, capture=capture, whole=shown.whole, passing=shown.passing
+    )
 
 
 @one_thread()
 def furniture_seen(room: KnownRoom, path: CameraPath, every: int) -> People:
     """What the moving camera sees of the furniture in some frames, as `furniture.json` has it."""
-    camera, (verts, faces, owner) = room.truth.camera, furniture(room.plan)
-    still, people = room.plan.view.seen(verts), room.capture.people
-    assert people is not None, "a known room has masks"
-    rows: list[tuple[int, int]] = []
-    masks: list[np.ndarray] = []
-    for frame in range(every, int(path.frame[-1]) + 1, every):
-        pose = poses_at(path, torch.tensor([frame]))
-        points = from_reference(still[None], pose)[0]
-        _, face = first_hit(points, faces, camera.K, (camera.height, camera.width))
-        piece = torch.where(face >= 0, owner[face.clamp_min(0)], -1)
-        for row in (people.frame == frame).nonzero()[:, 0].tolist():
-            piece[decode(people.masks, row)] = -1
-        for index in piece.unique().tolist():
-            mask = piece == index
-            if index >= 0 and int(mask.sum()) >= LEAST_PIXELS:
-                rows.append((frame, index + 1))
-                masks.append(mask.numpy())
-    frame, number = torch.tensor(rows).unbind(1)
-    return People(encode(masks), frame, number, {})
+    drawn, owner = _from(room, path), furniture(room.plan)[2]
+
+    def piece(frame: int) -> Tensor:
+        face = drawn(frame)[1]
+        return torch.where(face >= 0, owner[face.clamp_min(0)], -1)
+
+    frames = range(every, int(path.frame[-1]) + 1, every)
+    return pieces_seen(room.capture.people, frames, piece, LEAST_PIXELS)
 
 
-def _people(room: KnownRoom, bodies: Bodies, path: CameraPath) -> tuple[People, Tensor, Tensor]:
-    """Visible masks, and how many pixels each body fills alone and without furniture."""
+def _from(room: KnownRoom, path: CameraPath) -> Callable[[int], tuple[Tensor, Tensor]]:
+    """Depth [m] and face of the furniture at each pixel of a frame."""
     camera, (verts, faces, _) = room.truth.camera, furniture(room.plan)
-    seen = room.plan.view.seen(verts)
-    masks, counts = list[bytes](), list[tuple[int, int]]()
-    for frame in bodies.frame.unique().tolist():
-        rows = (bodies.frame == frame).nonzero()[:, 0].tolist()
-        pose = poses_at(path, torch.tensor([frame]))
-        depth, _ = first_hit(
-            from_reference(seen[None], pose)[0], faces, camera.K, (camera.height, camera.width)
-        )
-        looks = [look_at(room.plan, bodies.verts[row], bodies.faces) for row in rows]
-        nearest = depth.clone()
-        for look in looks:
-            nearest[look.window] = torch.minimum(nearest[look.window], look.depth)
-        for look in looks:
-            alone = look.depth.isfinite()
-            mask = torch.zeros_like(depth, dtype=torch.bool)
-            mask[look.window] = alone & (look.depth <= nearest[look.window])
-            counts.append(
-                (int(alone.sum()), int((alone & (look.depth <= depth[look.window])).sum()))
-            )
-            masks += encode([mask.numpy()]).counts
-    assert room.capture.people is not None, "a known room has masks"
-    coded = dataclasses.replace(room.capture.people.masks, counts=tuple(masks))
-    whole, free = torch.tensor(counts).unbind(1)
-    return People(coded, bodies.frame, bodies.person, {}), whole, free
+    still, size = room.plan.view.seen(verts)[None], (camera.height, camera.width)
+
+    def drawn(frame: int) -> tuple[Tensor, Tensor]:
+        points = from_reference(still, poses_at(path, torch.tensor([frame])))[0]
+        return first_hit(points, faces, camera.K, size)
+
+    return drawn

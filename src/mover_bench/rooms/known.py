@@ -1,6 +1,6 @@
 """What is known of a room: the capture that a perfect upstream would give, and the truth."""
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 
 import numpy as np
@@ -12,6 +12,7 @@ from mover.bodies.skinning import open_body
 from mover.core.records import map_tensors, record
 from mover.core.types import Bodies, BodyPose, Capture, Detection, Masks, People, Scene, SceneObject
 from mover.furniture.pieces import Furniture
+from mover.geometry.rle import decode
 from mover_bench.rooms.compose import Plan
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.motion import Performance, Stage
@@ -114,12 +115,22 @@ def build(
     detections = _detections(plan, sight, config)
     crowd = _crowd(plan, acts, config.fps)
     scene = _scene(plan)
-    shown = _people(plan, sight, crowd.bodies)
-    passing = shown.free < (1 - PASSING) * shown.whole
-    share = float(passing.double().mean())
+    shown = visible(plan, crowd.bodies, lambda _: sight.depth)
+    share = float(shown.passing.double().mean())
     if share < config.least_passing:
         raise RefusedError(f"furniture hides a part of only {share:.0%} of the bodies")
-    capture = _capture(name, scene, detections, sight, crowd.bodies, shown.people)
+    capture = Capture(
+        name=name,
+        scene=scene,
+        camera_height=None,
+        detections=detections,
+        reference=sight.picture,
+        reference_people=None,
+        bodies=crowd.bodies,
+        people=shown.people,
+        touch=None,
+        warnings=(),
+    )
     touching = crowd.distance < GAPE
     touched = torch.where(touching, crowd.nearest, torch.full_like(crowd.nearest, NONE))
     furniture = tuple(p.furniture for p in plan.pieces)
@@ -134,7 +145,7 @@ def build(
         plan=plan,
         refused=refused,
         whole=shown.whole,
-        passing=passing,
+        passing=shown.passing,
     )
 
 
@@ -144,29 +155,6 @@ def _check(acts: tuple[Acted, ...], config: RoomConfig) -> None:
     used = {(k, i) for k, a in enumerate(acts) for i in a.touched if i >= 0}
     if frames < config.least_frames or len(used) < config.least_touches:
         raise RefusedError(f"{frames} frames, {len(used)} pieces used")
-
-
-def _capture(
-    name: str,
-    scene: Scene,
-    detections: tuple[Detection, ...],
-    sight: Sight,
-    bodies: Bodies,
-    people: People,
-) -> Capture:
-    """What a perfect upstream would give."""
-    return Capture(
-        name=name,
-        scene=scene,
-        camera_height=None,
-        detections=detections,
-        reference=sight.picture,
-        reference_people=None,
-        bodies=bodies,
-        people=people,
-        touch=None,
-        warnings=(),
-    )
 
 
 def _scene(plan: Plan) -> Scene:
@@ -254,37 +242,60 @@ def _in_camera(plan: Plan, acts: tuple[Acted, ...], index: Tensor) -> BodyPose:
 
 
 @record
-class _Shown:
+class Shown:
     """What is seen of everybody, row by row."""
 
     people: People
+    """Masks without what furniture or a nearer person hides."""
     whole: Int[Tensor, " bodies"]
     """Pixels of the body alone."""
-    free: Int[Tensor, " bodies"]
-    """Pixels of it that no furniture hides."""
+    passing: Bool[Tensor, " bodies"]
+    """Furniture hides more than `PASSING` of them."""
 
 
-def _people(plan: Plan, sight: Sight, bodies: Bodies) -> _Shown:
-    """Visible masks: what furniture or a nearer person hides is left out."""
-    masks, wholes, frees = list[bytes](), list[int](), list[int]()
-    rows: dict[int, list[Tensor]] = {}
-    for frame, verts in zip(bodies.frame.tolist(), bodies.verts, strict=True):
-        rows.setdefault(frame, []).append(verts)
-    for group in rows.values():  # rows are in the order of their frames
+def visible(plan: Plan, bodies: Bodies, furniture: Callable[[int], Tensor]) -> Shown:
+    """What the camera sees of bodies in its axes; `furniture` is its depth in a frame [m]."""
+    masks, counts = list[bytes](), list[tuple[int, int]]()
+    for frame in bodies.frame.unique().tolist():  # rows are in the order of their frames
+        depth = furniture(frame)
+        group = bodies.verts[bodies.frame == frame]
         looks = [look_at(plan, verts, bodies.faces) for verts in group]
-        nearest = sight.depth
-        if len(looks) > 1:
-            nearest = nearest.clone()
-            for look in looks:
-                nearest[look.window] = torch.minimum(nearest[look.window], look.depth)
+        nearest = depth.clone()
+        for look in looks:
+            nearest[look.window] = torch.minimum(nearest[look.window], look.depth)
         for look in looks:
             whole = look.depth.isfinite()
-            wholes.append(int(whole.sum()))
-            frees.append(int((whole & (look.depth <= sight.depth[look.window])).sum()))
-            mask = torch.zeros_like(sight.piece, dtype=torch.bool)
+            free = whole & (look.depth <= depth[look.window])
+            counts.append((int(whole.sum()), int(free.sum())))
+            mask = torch.zeros_like(depth, dtype=torch.bool)
             mask[look.window] = whole & (look.depth <= nearest[look.window])
             masks += encode([mask.numpy()]).counts
     camera = plan.view.camera
     coded = Masks(camera.height, camera.width, tuple(masks))
+    whole, free = torch.tensor(counts).unbind(1)
     people = People(coded, bodies.frame, bodies.person, {})
-    return _Shown(people, torch.tensor(wholes), torch.tensor(frees))
+    return Shown(people, whole, free < (1 - PASSING) * whole)
+
+
+def pieces_seen(
+    people: People | None, frames: Iterable[int], piece: Callable[[int], Tensor], least: int = 1
+) -> People:
+    """Masks of at least so many pixels of the furniture in some frames, as `furniture.json` has it.
+
+    `piece` is the index of the piece at each pixel of a frame, -1 for none, without people; the
+    rows' `person` is the number of an annotation.
+    """
+    assert people is not None, "a known room has masks"
+    rows: list[tuple[int, int]] = []
+    masks: list[np.ndarray] = []
+    for frame in frames:
+        seen = piece(frame).clone()
+        for row in (people.frame == frame).nonzero()[:, 0].tolist():
+            seen[decode(people.masks, row)] = -1
+        for index in seen.unique().tolist():
+            mask = seen == index
+            if index >= 0 and int(mask.sum()) >= least:
+                rows.append((frame, index + 1))
+                masks.append(mask.numpy())
+    frame, number = torch.tensor(rows).unbind(1)
+    return People(encode(masks), frame, number, {})

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from mover.core.records import axis_of
 from mover.core.types import Bodies, BodyPose, Masks, People, Scene, Segment
-from mover.geometry.rle import decode, joined
+from mover.geometry.rle import joined
 from mover_bench.rooms.compose import Plan, fits, in_view
 from mover_bench.rooms.config import RoomConfig
-from mover_bench.rooms.known import KnownRoom, RefusedError, build, one_thread
+from mover_bench.rooms.known import KnownRoom, RefusedError, build, one_thread, pieces_seen
 from mover_bench.rooms.placed import Placed
-from mover_bench.rooms.render import encode, see
+from mover_bench.rooms.render import see
 from mover_bench.rooms.room import cast, make_room
 
 MOVABLE = ("chair", "office chair", "stool", "armchair", "table", "coffee table")
@@ -126,21 +126,8 @@ def _both(first: Rows, second: Rows) -> Rows:
 
 def _seen(room: KnownRoom, frames: range) -> People:
     """What of each piece is seen in some frames; `person` is the number of its annotation."""
-    sight, people = see(room.plan).piece, room.capture.people
-    assert people is not None, "a known room has masks"
-    rows: list[tuple[int, int]] = []
-    masks: list[np.ndarray] = []
-    for frame in frames:
-        hidden = torch.zeros_like(sight, dtype=torch.bool)
-        for row in (people.frame == frame).nonzero()[:, 0].tolist():
-            hidden = hidden | decode(people.masks, row)
-        for index in range(len(room.furniture)):
-            mask = (sight == index) & ~hidden
-            if mask.any():
-                rows.append((frame, index + 1))
-                masks.append(mask.numpy())
-    frame, number = torch.tensor(rows).unbind(1)
-    return People(encode(masks), frame, number, {})
+    piece = see(room.plan).piece
+    return pieces_seen(room.capture.people, frames, lambda _: piece)
 
 
 def _scene(first: Scene, second: Scene, index: int, change: int) -> Scene:

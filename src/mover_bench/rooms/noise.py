@@ -116,7 +116,9 @@ def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) 
     pose = map_tensors(lambda x: x.double(), bodies.pose)
     count = len(bodies.frame)
     people = bodies.person.numpy()
-    error = slow(rng, bodies, (22, 3), noise.pose_seconds) * np.radians(noise.pose)
+    assert bodies.fps is not None, "a known room is a video"
+    when = bodies.frame.numpy(), people
+    error = slow(rng, when, (22, 3), bodies.fps * noise.pose_seconds) * np.radians(noise.pose)
     if noise.pose_bias:
         stays = rng.normal(size=(int(people.max()) + 1, 22, 3)) * np.radians(noise.pose_bias)
         error = error + stays[people]
@@ -124,7 +126,7 @@ def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) 
     error = error * np.where(hidden, noise.pose_hidden, 1.0)[:, None, None]
     pose = _turned(pose, error)
     bias = 1 + noise.depth_bias * rng.uniform(-1, 1, int(people.max()) + 1)[people]
-    drift = noise.depth_drift * slow(rng, bodies, (1,), 1.0)[:, 0]
+    drift = noise.depth_drift * slow(rng, when, (1,), bodies.fps)[:, 0]
     pelvis = open_body().joints_in(pose)[:, 0]
     shift = pelvis * torch.from_numpy(bias + drift - 1)[:, None]
     if noise.mean_bodies:
@@ -166,9 +168,11 @@ def lose_feet(bodies: Bodies, noise: NoiseConfig, rng: np.random.Generator) -> B
     if noise.lost_feet == 0:
         return bodies
     assert bodies.pose is not None, "bodies of known rooms have parameters"
-    mood = slow(rng, bodies, (1,), LOST_SECONDS)[:, 0]
+    assert bodies.fps is not None, "a known room is a video"
+    when = bodies.frame.numpy(), bodies.person.numpy()
+    mood = slow(rng, when, (1,), bodies.fps * LOST_SECONDS)[:, 0]
     lost = mood <= np.quantile(mood, noise.lost_feet)
-    wrong = slow(rng, bodies, (22, 3), noise.pose_seconds) * np.radians(noise.lost_angle)
+    wrong = slow(rng, when, (22, 3), bodies.fps * noise.pose_seconds) * np.radians(noise.lost_angle)
     below = np.isin(np.arange(22), [joint for leg in LEG for joint in leg[1:]])
     pose = map_tensors(lambda x: x.double(), bodies.pose)
     pose = _turned(pose, wrong * lost[:, None, None] * below[:, None])
@@ -179,20 +183,23 @@ def lose_feet(bodies: Bodies, noise: NoiseConfig, rng: np.random.Generator) -> B
 
 
 def slow(
-    rng: np.random.Generator, bodies: Bodies, shape: tuple[int, ...], seconds: float
+    rng: np.random.Generator,
+    when: tuple[np.ndarray, np.ndarray],
+    shape: tuple[int, ...],
+    memory: float,
 ) -> np.ndarray:
-    """Noise (bodies, *shape) of variance one that forgets within `seconds` (Ornstein-Uhlenbeck)."""
-    assert bodies.fps is not None, "a known room is a video"
-    fresh = rng.normal(size=(len(bodies.frame), *shape))
-    memory = np.exp(-1 / (bodies.fps * seconds))
-    frame, person = bodies.frame.numpy(), bodies.person.numpy()
+    """Noise (rows, *shape) of variance one that forgets (Ornstein-Uhlenbeck).
+
+    `when` is the frame and the person of each row, `memory` in frames.
+    """
+    fresh, each = rng.normal(size=(len(when[0]), *shape)), np.exp(-1 / memory)
     last: dict[int, int] = {}
-    for row in range(len(fresh)):  # each row builds on the one before
-        before = last.get(int(person[row]))
+    for row, (frame, person) in enumerate(zip(*when, strict=True)):  # builds on the one before
+        before = last.get(int(person))
         if before is not None:
-            kept = memory ** float(frame[row] - frame[before])
+            kept = each ** float(frame - when[0][before])
             fresh[row] = kept * fresh[before] + np.sqrt(1 - kept**2) * fresh[row]
-        last[int(person[row])] = row
+        last[int(person)] = row
     return fresh
 
 

@@ -62,30 +62,27 @@ def noisy_detections(
     detections: tuple[Detection, ...], most: int, rng: np.random.Generator
 ) -> tuple[Detection, ...]:
     """Masks of objects with outlines that are off; the boxes follow."""
-    out: list[Detection] = []
-    for one in detections:
-        off = int(rng.integers(-most, most + 1))
-        if one.mask is None or off == 0:
-            out.append(one)
-            continue
-        mask = grown(decode(one.mask, 0).numpy(), off)
-        out.append(dataclasses.replace(one, mask=encode([mask]), box=box_of_mask(mask)))
-    return tuple(out)
+    off = [int(rng.integers(-most, most + 1)) for _ in detections]
+    return tuple(
+        redrawn(one, grown(_mask(one), pixels)) if one.mask is not None and pixels else one
+        for one, pixels in zip(detections, off, strict=True)
+    )
 
 
 def leaking(
     detections: tuple[Detection, ...], share: float, rng: np.random.Generator
 ) -> tuple[Detection, ...]:
     """Some masks of objects run over at one place of their border; the boxes follow."""
-    out: list[Detection] = []
-    for one in detections:
-        leaks, where = rng.uniform(size=2)
-        if one.mask is None or leaks >= share:
-            out.append(one)
-            continue
-        mask = leaked(decode(one.mask, 0).numpy(), float(where))
-        out.append(dataclasses.replace(one, mask=encode([mask]), box=box_of_mask(mask)))
-    return tuple(out)
+    draws = [rng.uniform(size=2) for _ in detections]
+    return tuple(
+        redrawn(one, leaked(_mask(one), float(where))) if one.mask and leaks < share else one
+        for one, (leaks, where) in zip(detections, draws, strict=True)
+    )
+
+
+def redrawn(detection: Detection, mask: Bool[np.ndarray, "h w"]) -> Detection:
+    """The detection with another mask and its box."""
+    return dataclasses.replace(detection, mask=encode([mask]), box=box_of_mask(mask))
 
 
 def leaked(mask: Bool[np.ndarray, "h w"], where: float) -> Bool[np.ndarray, "h w"]:
@@ -150,7 +147,7 @@ def _merged(capture: Capture, share: float, rng: np.random.Generator) -> Capture
             continue
         other = near[int(rng.integers(len(near)))]
         mask = _mask(found[one.id]) | _mask(found[other])
-        found[one.id] = dataclasses.replace(one, mask=encode([mask]), box=box_of_mask(mask))
+        found[one.id] = redrawn(one, mask)
         gone.add(other)
     capture = dataclasses.replace(capture, detections=tuple(found.values()))
     return without(capture, gone)
