@@ -1,6 +1,6 @@
 """What the camera sees of a known room: instance masks with all occlusions, shaded pictures."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Masks, Mesh
+from mover.geometry import rle
 from mover.geometry.raster import first_hit
 from mover_bench.rooms.compose import Plan
 from mover_bench.rooms.placed import corners, verts_on_floor
@@ -48,19 +49,15 @@ class Look:
     """-1: none."""
 
 
-def encode(masks: list[np.ndarray]) -> Masks:
+def encode(masks: Sequence[np.ndarray]) -> Masks:
     """Binary images (h, w), run-length encoded."""
-    from pycocotools import mask as coco
-
     height, width = masks[0].shape
-    rows: list[Any] = [coco.encode(np.asfortranarray(m.astype(np.uint8))) for m in masks]
-    return Masks(height, width, tuple(bytes(r["counts"]) for r in rows))
+    return Masks(height, width, tuple(rle.encode(torch.from_numpy(mask)) for mask in masks))
 
 
-def box_of_mask(mask: Bool[np.ndarray, "h w"]) -> torch.Tensor:
+def box_of_mask(mask: Bool[np.ndarray, "h w"]) -> Float[Tensor, "4"]:
     """x_min, y_min, x_max, y_max [px] of a mask that is not empty."""
-    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    return torch.tensor([cols[0], rows[0], cols[-1] + 1, rows[-1] + 1]).float()
+    return rle.tight_box(torch.from_numpy(mask))
 
 
 def see(plan: Plan) -> Sight:
