@@ -41,12 +41,11 @@ from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camer
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.people.select_frames import SelectInputs, select_frames
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
-from mover_bench.rooms.keypoints import joints_seen
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise, hidden_rows
 from mover_bench.rooms.render import see, see_body
 from mover_bench.rooms.room import make_room
-from mover_bench.rooms.seen import Seen
+from mover_bench.rooms.seen import Seen, joints_seen
 
 SEATED, LYING = ("sit", "lean"), ("lie", "lie down", "get up")
 

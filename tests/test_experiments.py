@@ -26,13 +26,13 @@ from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 from mover.geometry.rle import encode, tight_box
 from mover.pipeline.presets import PRESETS, Config
-from mover_bench.studies import pictures, tables
+from mover_bench.studies import run, tables
 from mover_bench.studies.args import ExperimentArgs
 from mover_bench.studies.finished import Finished
 from mover_bench.studies.job import DONE, ROOM, Job, rebuild, store_room
 from mover_bench.studies.measures import Traits, Trial, hidden_shares
 from mover_bench.studies.queue import start
-from mover_bench.studies.run import parse_seeds, run_experiment
+from mover_bench.studies.run import parse_seeds, run_experiment, worst_objects
 from mover_bench.studies.tables import fill_page, means
 from mover_bench.studies.variants import Variant
 
@@ -238,7 +238,7 @@ def test_presets_that_measure_something_else_have_rows_without_places() -> None:
     assert found[["iou3d", "yaw_error"]].isna().all(axis=None)
     done = Finished(rows, rows.assign(name="stands"))
     experiment = tables.Experiment("mover", "rooms", ("stands",), (0,), done, {})
-    assert len(pictures.worst_objects(experiment)) == 0
+    assert len(worst_objects(experiment)) == 0
 
 
 def test_stage_1_and_full_share_camera_and_ground(finished) -> None:
@@ -270,7 +270,7 @@ def test_pictures_of_rooms_that_a_study_did_not_keep_are_the_same(finished, tmp_
     for job in jobs.values():
         for path in job.folder.glob("room.*"):
             path.unlink()
-    monkeypatch.setattr(pictures, "noisy_room", lambda seed, _rooms: trials[seed])
+    monkeypatch.setattr(run, "noisy_room", lambda seed, _rooms: trials[seed])
     idle = Bench()
     run_experiment(args, launch=idle)
     assert idle.done == []

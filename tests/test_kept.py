@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from mover.core.kept import kept
+from mover.core.run import kept
 from mover.core.types import Mesh
 from mover.furniture.library import make_piece
 from mover.stages.config import PrepareConfig
@@ -52,7 +52,7 @@ def test_where_nothing_can_be_written_nothing_is_kept(cache: Path):
 
 
 def test_the_half_that_was_not_used_for_longest_goes(cache: Path, monkeypatch):
-    monkeypatch.setattr("mover.core.kept.MOST", 4)
+    monkeypatch.setattr("mover.core.run.MOST", 4)
     for place, name in enumerate("abcd"):
         kept(Mesh, name, lambda: MESH)
         for file in cache.glob(f"Mesh-{name}.*"):

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from mover.bodies.smpl_files import load_smpl
-from mover.bodies.transfer_matrix import read_matrix
+from mover.bodies.transfer import read_matrix
 from mover.core import pickle_parts, pickles
 from mover.core.errors import InputError
 from mover.core.pickles import load_pickle, load_plain

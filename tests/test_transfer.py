@@ -12,8 +12,7 @@ from scipy import sparse
 from mover.bodies.skinning import open_body
 from mover.bodies.smpl_files import FOLDER, load_smpl
 from mover.bodies.smpl_model import FLAT
-from mover.bodies.transfer import TransferConfig, copy_pose, transfer
-from mover.bodies.transfer_matrix import find_matrix, read_matrix
+from mover.bodies.transfer import TransferConfig, copy_pose, find_matrix, read_matrix, transfer
 from mover.core.errors import InputError
 
 COMMON = 22

@@ -22,8 +22,8 @@ from mover_bench.rooms import foreign
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.foreign import MAKERS, foreign_mesh
 from mover_bench.rooms.known import KnownRoom
-from mover_bench.rooms.mask_heads import coarse, wobbled
 from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.noise_masks import coarse, wobbled
 from mover_bench.studies.sets import SETS, SWITCHES, set_named
 
 

@@ -15,15 +15,7 @@ from torch import Tensor
 
 from mover.core.records import rows_of
 from mover.core.run import Run
-from mover.core.types import (
-    Camera,
-    Capture,
-    Detection,
-    Masks,
-    Room,
-    SceneObject,
-    Segment,
-)
+from mover.core.types import Camera, Capture, Detection, Masks, Room, SceneObject, Segment
 from mover.geometry.path import is_still
 from mover.geometry.placement import hit_floor
 from mover.geometry.rle import encode, tight_box

@@ -13,8 +13,7 @@ from mover.energy.terms.feet import FootContacts
 from mover.geometry.boxes import box_of
 from mover.geometry.path import is_still, poses_at, scaled, to_reference
 from mover.io.capture.pose_file import moved
-from mover.pipeline.believable import check_floor
-from mover.pipeline.outcome import PeopleState
+from mover.pipeline.outcome import PeopleState, check_floor
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import AlignInputs, align_camera
 from mover.stages.camera.align_views import ViewInputs, align_views, aligned

@@ -16,7 +16,7 @@ from mover.energy.config import SceneConfig, only
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.camera import to_camera
-from mover.geometry.path import scaled
+from mover.geometry.path import is_still, poses_at, scaled
 from mover.geometry.placement import (
     GROUND,
     larger,
@@ -26,12 +26,13 @@ from mover.geometry.placement import (
     slide_to_floor,
 )
 from mover.io.capture.plausible import check_plausible
-from mover.pipeline.believable import check_floor, check_room
 from mover.pipeline.moves import with_moves
 from mover.pipeline.outcome import (
     PeopleState,
     ReconstructionContext,
     SceneState,
+    check_floor,
+    check_room,
     room_of,
     tops_of,
     unfurnished,
@@ -41,14 +42,14 @@ from mover.pipeline.people import people_of
 from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
 from mover.pipeline.presets import with_sizes
-from mover.pipeline.views import further_views
-from mover.stages.camera.refine_camera import RefineInputs, refine_camera
+from mover.stages.camera.refine_camera import FurtherView, RefineInputs, refine_camera
 from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
 from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import GatherInputs, cues_in_windows, gather_cues
 from mover.stages.contacts.propose_supports import NOTHING
 from mover.stages.objects.find_image_cues import (
     ImageInputs,
+    evidence_at,
     find_image_cues,
     ground_without_people,
     image_evidence,
@@ -74,10 +75,7 @@ from mover.stages.objects.starts import (
     other_starts,
     reference_yaw,
 )
-from mover.stages.people.find_depth import (
-    are_shapeless,
-    nearer,
-)
+from mover.stages.people.find_depth import are_shapeless, nearer
 
 NOBODY = HumanCues()
 
@@ -321,3 +319,28 @@ def with_order(context: ReconstructionContext, state: SceneState) -> SceneState:
     z = to_camera(verts, state.camera.R_cam_world)[..., 2]
     behind = order_of(z.amin(-1), z.amax(-1))
     return replace(state, image=replace(state.image, behind=behind))
+
+
+def further_views(
+    context: ReconstructionContext, people: PeopleState, camera: Camera
+) -> tuple[FurtherView, ...]:
+    """The frames from which the camera saw the objects from elsewhere, the farthest first."""
+    capture, config = context.capture, context.config
+    if is_still(people.path) or capture.furniture is None:
+        return ()
+    poses = poses_at(people.path, capture.furniture.frame.unique())
+    chosen = [torch.zeros(3)]
+    found: list[FurtherView] = []
+    for _ in range(config.refine.views):
+        away = torch.cdist(poses.t_reference_camera, torch.stack(chosen)).amin(1)
+        best = int(away.argmax())
+        if float(away[best]) < config.refine.apart:
+            break
+        chosen.append(poses.t_reference_camera[best])
+        seen = evidence_at(capture, int(poses.frame[best]))
+        unordered = torch.zeros(len(seen.boxes), len(seen.boxes), dtype=torch.bool)
+        image = ImageInputs(camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered)
+        cues = context.run.stage(find_image_cues, image, config.image)
+        R, t = poses.R_reference_camera[best], poses.t_reference_camera[best]
+        found.append(FurtherView(R, t, cues))
+    return tuple(found)

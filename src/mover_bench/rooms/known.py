@@ -120,17 +120,10 @@ def build(
     if share < config.least_passing:
         raise RefusedError(f"furniture hides a part of only {share:.0%} of the bodies")
     capture = Capture(
-        name=name,
-        scene=scene,
-        camera_height=None,
-        detections=detections,
-        reference=sight.picture,
-        reference_people=None,
-        bodies=crowd.bodies,
-        people=shown.people,
-        touch=None,
-        warnings=(),
-    )
+        name=name, scene=scene, camera_height=None, detections=detections,
+        reference=sight.picture, reference_people=None, bodies=crowd.bodies,
+        people=shown.people, touch=None, warnings=(),
+    )  # fmt: skip
     touching = crowd.distance < GAPE
     touched = torch.where(touching, crowd.nearest, torch.full_like(crowd.nearest, NONE))
     furniture = tuple(p.furniture for p in plan.pieces)

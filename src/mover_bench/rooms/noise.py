@@ -26,13 +26,14 @@ from mover.geometry.rotations import rot_y
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.foreign import foreign_mesh
 from mover_bench.rooms.known import KnownRoom, one_thread, rounded
-from mover_bench.rooms.mask_heads import headed, wobbling
 from mover_bench.rooms.noise_masks import (
+    headed,
     leaking,
     noisy_detections,
     noisy_finds,
     noisy_people,
     without,
+    wobbling,
 )
 from mover_bench.rooms.poses import LEG
 from mover_bench.rooms.turns import from_vector, to_vector

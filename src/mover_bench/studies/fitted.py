@@ -26,7 +26,7 @@ from mover.pipeline.outcome import to_world
 from mover.pipeline.refit import refit_bodies
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
-from mover_bench.rooms.keypoints import joints_seen
+from mover_bench.rooms.seen import joints_seen
 from mover_bench.studies.measures import Trial, in_true_room, under_camera
 
 STEPS = 100  # iterations of a stage of the fit at most, a third of the preset's

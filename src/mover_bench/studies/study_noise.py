@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from mover.core.errors import InputError
 from mover_bench.studies.compare import Interval, interval, markdown, paired
 from mover_bench.studies.finished import Finished, Frame, Source, by_room
-from mover_bench.studies.plots import Line, Panel, draw_panels
 from mover_bench.studies.sets import CHANGES, EXACT, Change, changed_set
+from mover_bench.studies.study_page import Line, Panel, draw_panels
 from mover_bench.studies.study_rows import Ask, Page, Plan
 from mover_bench.tables import published
 

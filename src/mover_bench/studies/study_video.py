@@ -2,8 +2,7 @@
 
 from mover_bench.studies.compare import Interval, interval, markdown
 from mover_bench.studies.finished import SPENT, Finished, Frame, Source, by_room, rows_of
-from mover_bench.studies.plots import Line, Panel, draw_panels
-from mover_bench.studies.study_page import gain_text
+from mover_bench.studies.study_page import Line, Panel, draw_panels, gain_text
 from mover_bench.studies.study_rows import Ask, Page, Plan
 from mover_bench.studies.variants import LENGTHS, SEGMENTS, SHARES
 from mover_bench.tables import published

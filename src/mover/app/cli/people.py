@@ -142,8 +142,7 @@ def _transferred(people: Any, args: BodiesArgs) -> Any:  # noqa: ANN401
         InputError: If they have no parameters, or the matrix is none.
     """
     from mover.bodies.smpl_files import KINDS, load_smpl
-    from mover.bodies.transfer import transfer
-    from mover.bodies.transfer_matrix import find_matrix, read_matrix
+    from mover.bodies.transfer import find_matrix, read_matrix, transfer
 
     pose = people.pose
     if pose is None:

@@ -16,15 +16,7 @@ import torch
 from torch import Tensor
 
 from mover.geometry.raster.records import Crops, Cuts, Maps, Topology, Trace
-from mover.geometry.warp_start import (
-    filled,
-    kernels,
-    launch,
-    name_of,
-    share,
-    started,
-    threads,
-)
+from mover.geometry.warp_start import filled, kernels, launch, name_of, share, started, threads
 
 BORDER = 1  # [px], so that an outline just outside the window still moves the window's pixels
 NOWHERE, FRONT, BEHIND = 0, 1, 2  # where backs are drawn, as in `kernels.grid`

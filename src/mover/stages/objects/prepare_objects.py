@@ -11,10 +11,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.kept import kept
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import fingerprint, record
-from mover.core.run import sources
+from mover.core.run import kept, sources
 from mover.core.types import Layout, Mesh, Objects, SceneObject
 from mover.furniture.library import BACKS, SEATS, canonical
 from mover.geometry.mesh import box, decimate, sample_surface, signed_volume, used
