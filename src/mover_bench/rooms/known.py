@@ -124,17 +124,14 @@ def build(
         reference=sight.picture, reference_people=None, bodies=crowd.bodies,
         people=shown.people, touch=None, warnings=(),
     )  # fmt: skip
-    touching = crowd.distance < GAPE
-    touched = torch.where(touching, crowd.nearest, torch.full_like(crowd.nearest, NONE))
-    furniture = tuple(p.furniture for p in plan.pieces)
     return KnownRoom(
         capture=capture,
         truth=scene,
         bodies=crowd.bodies,
-        touching=touching,
-        touched=touched,
+        touching=crowd.touching,
+        touched=crowd.touched,
         actions=crowd.actions,
-        furniture=furniture,
+        furniture=tuple(p.furniture for p in plan.pieces),
         plan=plan,
         refused=refused,
         whole=shown.whole,
@@ -180,8 +177,8 @@ class _Crowd:
     """Everybody, row by row."""
 
     bodies: Bodies
-    distance: Float[Tensor, "bodies verts"]
-    nearest: Int[Tensor, "bodies verts"]
+    touching: Bool[Tensor, "bodies verts"]
+    touched: Int[Tensor, "bodies verts"]
     actions: tuple[str, ...]
 
 
@@ -208,7 +205,9 @@ def _crowd(plan: Plan, acts: tuple[Acted, ...], fps: float) -> _Crowd:
         space="camera",
         pose=map_tensors(rounded, pose),
     )
-    return _Crowd(bodies, distance, nearest, tuple(labels[k] for k in order))
+    touching = distance < GAPE
+    touched = torch.where(touching, nearest, torch.full_like(nearest, NONE))
+    return _Crowd(bodies, touching, touched, tuple(labels[k] for k in order))
 
 
 def rounded(value: Tensor) -> Tensor:
