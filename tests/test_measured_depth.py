@@ -16,7 +16,8 @@ from mover.energy.terms.measured import Measured
 from mover.geometry.camera import to_world
 from mover.geometry.placement import place_in
 from mover.geometry.raster import Crops, Topology, look
-from mover.io.capture.folder import read_capture, write_capture
+from mover.io.capture.folder import folder_parts, read_capture, write_capture
+from mover.io.capture.merge import import_into
 from mover.io.files.depth import find_depth_file, read_depth_image
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.gather_depth import DepthInputs, gather_depth
@@ -113,6 +114,24 @@ def test_a_capture_keeps_its_depth(tmp_path: Path, small_room):
         assert torch.equal(found.values.nan_to_num(0), values.nan_to_num(0))
     with pytest.raises(ValueError, match="has depth, which the capture lacks"):
         write_capture(small_room.capture, tmp_path / "True")
+
+
+def test_an_import_takes_measured_depth_along_and_the_newer_one_counts(tmp_path: Path, small_room):
+    shape = small_room.capture.scene.camera.height, small_room.capture.scene.camera.width
+    values = torch.rand(shape, generator=torch.Generator().manual_seed(1)) + 1
+    for name, metric in (("metres", True), ("inverse", False)):
+        capture = replace(small_room.capture, depth=DepthImage(values, metric))
+        write_capture(capture, tmp_path / name)
+        made = import_into(tmp_path / "own", folder_parts(tmp_path / name))
+        found = read_capture(tmp_path / "own").depth
+        assert found is not None
+        assert found.metric == metric
+        assert torch.equal(found.values, values)
+        assert f"{'depth' if metric else 'disparity'}/" in made.written
+    write_capture(small_room.capture, tmp_path / "none")
+    made = import_into(tmp_path / "own", folder_parts(tmp_path / "none"))
+    assert read_capture(tmp_path / "own").depth is not None
+    assert "disparity/" not in made.written
 
 
 def test_inverse_depth_may_be_an_array_or_a_grey_picture(tmp_path: Path, small_room):

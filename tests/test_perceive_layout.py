@@ -13,7 +13,7 @@ from mover.app.cli import run_command
 from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.run import Run
-from mover.core.types import Camera, Detection, Masks, SceneObject
+from mover.core.types import Camera, Detection, Masks, Scene, SceneObject
 from mover.energy.terms.bbox import SEEN
 from mover.furniture.library import make_piece
 from mover.geometry.boxes import box_of, iou3d
@@ -22,12 +22,23 @@ from mover.geometry.placement import place_object
 from mover.geometry.raster import Crops, Topology, look
 from mover.geometry.rle import encode, tight_box
 from mover.geometry.topology import edges_of
+from mover.io.capture.annotations_file import detections_to_json
+from mover.io.capture.camera_file import camera_to_json
 from mover.io.files.depth import read_depth
+from mover.io.files.fields import write_json
 from mover.io.files.meshes import write_mesh
 from mover.io.formats import read
+from mover.perceive.capture import read_picture_of, write_first_scene
 from mover.perceive.config import LayoutConfig, ScreenConfig
 from mover.perceive.depth_map import floor_height, median_depths
-from mover.perceive.layout import Picture, at_scale, first_scene, is_placed, shapes_of
+from mover.perceive.layout import (
+    FirstScene,
+    Picture,
+    at_scale,
+    first_scene,
+    is_placed,
+    shapes_of,
+)
 from mover.perceive.screen import ScreenInputs, outermost, screen
 from mover.perceive.standing import standing_on
 
@@ -286,13 +297,28 @@ def test_depth_maps_without_a_unit_or_of_another_shape_are_refused(tmp_path: Pat
 
 
 def write_capture_without_scene(folder: Path, seen: Picture) -> None:
-    from mover.io.capture.annotations_file import detections_to_json
-    from mover.io.capture.camera_file import camera_to_json
-    from mover.io.files.fields import write_json
-
     folder.mkdir()
     write_json(camera_to_json(seen.camera), folder / "camera.json")
     write_json(detections_to_json(seen.detections, seen.camera, None), folder / "objects.json")
+
+
+def test_a_first_scene_that_is_made_again_begins_where_the_first_did(
+    pieces: list[SceneObject], tmp_path: Path
+):
+    level, found, own = (camera(pitch, 0.0) for pitch in (-0.1, -0.2, -0.3))
+    folder = tmp_path / "c"
+    write_capture_without_scene(folder, picture(pieces[:1], level))
+    first = FirstScene(Scene(found, -1.4, ()), (), ())
+    write_first_scene(first, folder, read_picture_of(folder).camera)
+    told = json.loads((folder / "camera.json").read_text())["R_cam_world"]
+    torch.testing.assert_close(torch.tensor(told), found.R_cam_world)
+    again = read_picture_of(folder).camera
+    torch.testing.assert_close(again.R_cam_world, level.R_cam_world, rtol=0, atol=1e-6)
+    write_json(camera_to_json(own), folder / "camera.json")
+    torch.testing.assert_close(read_picture_of(folder).camera.R_cam_world, own.R_cam_world)
+    write_json(camera_to_json(found), folder / "camera.json")
+    (folder / "perceived" / "guess.json").write_text("{")
+    torch.testing.assert_close(read_picture_of(folder).camera.R_cam_world, found.R_cam_world)
 
 
 @pytest.mark.slow
@@ -306,6 +332,9 @@ def test_the_command_turns_masks_into_a_capture(
     assert "first scene of 2 objects" in capsys.readouterr().out
     capture = read("folder", folder)
     assert [p.id for p in capture.scene.objects] == ["sofa_0", "chair_0"]
+    made = [(folder / name).read_bytes() for name in ("scene.json", "camera.json")]
+    assert run_command("layout", [str(folder), *quick, "--screen.method.steps", "20"]) == 0
+    assert [(folder / name).read_bytes() for name in ("scene.json", "camera.json")] == made
     others = json.loads((folder / "hypotheses.json").read_text())["objects"]
     for name, rows in others.items():
         assert len(rows) == 2

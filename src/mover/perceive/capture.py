@@ -35,7 +35,7 @@ from mover.io.capture.folder import folder_parts
 from mover.io.capture.scene_file import write_hypotheses, write_scene
 from mover.io.files.cameras import of_view, read_camera_file
 from mover.io.files.depth import find_depth_file, read_depth
-from mover.io.files.fields import At, get, maybe, number, write_json
+from mover.io.files.fields import At, get, maybe, number, read_json, write_json
 from mover.io.files.images import write_image
 from mover.io.people.keypoints import write_keypoints
 from mover.perceive.config import (
@@ -81,6 +81,8 @@ MOST_SHOTS = 20  # that are told apart: what comes after them counts as one
 CHUNK = 50  # frames whose detections are kept together
 FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal lengths refer
 SAME_FORMAT = 0.01  # difference of two ratios of width and height
+GUESS = "perceived/guess.json"  # the camera before a first scene, and as it left it
+SAME_TILT = 1e-6  # elements of a rotation that was read back
 USUAL = 60.0  # [degrees], horizontal field of view of phones held level, where nothing is known
 EXIF_IFD, FOCAL_35 = 0x8769, 0xA405
 Say = Callable[[str], None]
@@ -314,9 +316,11 @@ def read_picture_of(folder: Path) -> Picture:
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder, expected a capture")
     parts = folder_parts(folder)
-    if parts.camera is None or parts.objects is None:
+    file = folder / "camera.json"
+    if not file.exists() or parts.objects is None:
         raise InputError(f"{folder}: a first scene needs camera.json and objects.json in it")
-    camera = camera_of(parts.camera)
+    told = read_json(file)  # not the camera of a scene that is made anew
+    camera = _guessed(folder, camera_of(told))
     detections = detections_of(parts.objects, camera, log.warning)
     blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     masks = [blank if d.mask is None else decode(d.mask, 0) for d in detections]
@@ -326,7 +330,7 @@ def read_picture_of(folder: Path) -> Picture:
         for row in range(0 if reference is None else len(reference.counts)):
             assert reference is not None
             hidden = hidden | decode(reference, row)
-    known = maybe(parts.camera, "height")
+    known = maybe(told, "height")
     return Picture(
         camera=camera,
         detections=detections,
@@ -343,13 +347,38 @@ def _metric_depth(folder: Path, camera: Camera) -> Float[Tensor, "h w"] | None:
     return read_depth(own[0], camera) if own is not None and own[1] else None
 
 
-def write_first_scene(first: FirstScene, folder: Path) -> None:
-    """Write scene.json with its meshes, the tilt into camera.json, and what else is possible."""
+def _guessed(folder: Path, camera: Camera) -> Camera:
+    """The camera with the tilt that it had before a first scene found another one.
+
+    So a first scene that is made again begins where the first did; another tilt in camera.json, of
+    the user, counts as it is.
+    """
+    file = folder / GUESS
+    if not file.is_file():
+        return camera
+    try:
+        before, found = (camera_of(get(read_json(file), name)) for name in ("before", "found"))
+    except InputError:  # a cache: what is damaged is no news
+        return camera
+    same = torch.allclose(found.R_cam_world, camera.R_cam_world, rtol=0, atol=SAME_TILT)
+    return replace(camera, R_cam_world=before.R_cam_world) if same else camera
+
+
+def write_first_scene(first: FirstScene, folder: Path, guess: Camera) -> None:
+    """Write scene.json with its meshes, the tilt into camera.json, and what else is possible.
+
+    Args:
+        first: What was found.
+        folder: The capture.
+        guess: The camera with which it began.
+    """
     write_scene(first.scene, folder / "scene.json")
     parts = folder_parts(folder)
     assert parts.camera is not None
     given = {k: v for k, v in parts.camera.value.items() if k == "height"}
-    write_json({**camera_to_json(first.scene.camera), **given}, folder / "camera.json")
+    found = camera_to_json(first.scene.camera)
+    write_json({**found, **given}, folder / "camera.json")
+    write_json({"before": camera_to_json(guess), "found": found}, folder / GUESS)
     groups = {group[0].piece.id: [h.piece for h in group] for group in first.others}
     energies = {group[0].piece.id: [h.energy for h in group] for group in first.others}
     write_hypotheses(folder, groups, energies)

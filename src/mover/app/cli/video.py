@@ -158,12 +158,13 @@ def layout_into(args: LayoutArgs) -> None:
     if args.depth is not None:
         take_depth(args.depth, args.capture)
     picture, people = read_picture_of(args.capture), args.capture / "bodies.npz"
+    guess = picture.camera
     with Bar() as bar:
         run = Run(args.capture / "perceived", bar)
         if people.is_file():
             picture = standing_on(picture, read_bodies(people), run)
         first = first_scene(picture, args.config, run, args.meshes)
-    write_first_scene(first, args.capture)
+    write_first_scene(first, args.capture, guess)
     ground = first.scene.ground
     height = "" if ground is None else f", camera {-ground:.2f} m above the floor"
     say(f"{args.capture}: first scene of {len(first.scene.objects)} objects{height}")

@@ -65,6 +65,7 @@ def folder_parts(folder: Path, hints: Hints | None = None) -> Parts:
     return dataclasses.replace(
         parts, camera=camera, scene=scene, load_image=load, image_size=size,
         n_frames=None, hypotheses=None, furniture=None,  # they may be of what is replaced
+        copies=_measured(folder),
     )  # fmt: skip
 
 
@@ -85,6 +86,14 @@ def _files(folder: Path, needed: Callable[[Path], At | None]) -> Parts:
         n_frames=_count_frames(folder / "frames"),
         hypotheses=_if_there(read_json, folder / HYPOTHESES),
     )
+
+
+def _measured(folder: Path) -> dict[str, Path]:
+    """The measured depth of a folder, by its place in a capture."""
+    found = find_depth_file(folder)
+    if found is None:
+        return {}
+    return {f"{DEPTH if found[1] else DISPARITY}/000000{found[0].suffix.lower()}": found[0]}
 
 
 def _depth_in(folder: Path, camera: Camera) -> DepthImage | None:

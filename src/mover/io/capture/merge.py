@@ -24,6 +24,7 @@ from mover.io.capture.folder import folder_parts, read_capture, write_trees
 from mover.io.capture.pairing import linked, merged, with_links
 from mover.io.capture.parts import Parts
 from mover.io.capture.scene_file import write_scene
+from mover.io.files.depth import DEPTH, DISPARITY
 from mover.io.files.fields import At, get, items, maybe, write_json
 from mover.io.files.images import write_image
 from mover.io.files.npz import write_npz
@@ -71,7 +72,9 @@ def import_into(folder: Path, *given: Parts) -> Imported:
         InputError: If a part is wrong or does not fit the others.
     """
     new = not folder.exists()
-    old = Parts(name=folder.resolve().name) if new else folder_parts(folder)
+    old = Parts(name=folder.resolve().name)
+    if not new:
+        old = dataclasses.replace(folder_parts(folder), copies={})
     if not new and not folder.is_dir():
         raise InputError(f"{folder}: is a file, expected a folder for the capture")
     whole, notes = old, list[str]()
@@ -274,6 +277,10 @@ def _write_whole(whole: Parts, old: Parts, capture: Capture | None, folder: Path
 
 def _write_beside(whole: Parts, folder: Path) -> list[str]:
     """Frames, keypoints, truth: what stands beside the capture's own files."""
+    measured = [place for place in whole.copies if place.split("/")[0] in (DEPTH, DISPARITY)]
+    if measured and not whole.copies[measured[0]].is_relative_to(folder):
+        for name in (DEPTH, DISPARITY):  # a picture has one depth
+            shutil.rmtree(folder / name, ignore_errors=True)
     for place, source in whole.copies.items():
         copy_whole(source, folder / place)
     for place, tree in whole.trees.items():
