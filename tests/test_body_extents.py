@@ -10,7 +10,8 @@ from test_find_depth import CAMERA, SIZE, masks_of, moved
 
 from mover.core.types import Masks
 from mover.geometry.rle import decode, encode
-from mover.stages.masks import compare_extents, mask_table, pixels_of
+from mover.stages.cover import Cover, covered, pixels_of
+from mover.stages.masks import compare_extents, mask_table
 
 NOBODY = Masks(*SIZE, ())
 UPRIGHT = {"left_shoulder": (0.0, 0.0, -1.45), "right_shoulder": (0.0, 0.0, 1.45)}
@@ -49,7 +50,7 @@ def wider(seen, pixels):
 
 def compared(bodies, seen, objects=NOBODY):
     rows, table = torch.arange(len(bodies.frame)), mask_table(seen, bodies)
-    return compare_extents(bodies, rows, CAMERA, table, pixels_of(objects))
+    return compare_extents(bodies, rows, CAMERA, table, covered(Cover(objects)))
 
 
 @pytest.mark.parametrize("pixels", [-2, -1, 0, 1, 2])

@@ -14,6 +14,7 @@ from mover.geometry.camera import tilted
 from mover.geometry.raster import Crops, layers
 from mover.geometry.rle import encode
 from mover.stages.config import DepthConfig
+from mover.stages.cover import Cover
 from mover.stages.masks import Extents
 from mover.stages.people.find_depth import (
     BENT,
@@ -79,7 +80,7 @@ def moved(bodies, factor):
 def inputs_of(bodies, seen, objects=()):
     keep = torch.ones(len(bodies.frame), dtype=torch.bool)
     objects = Masks(*SIZE, tuple(encode(m) for m in objects))
-    return DepthInputs(bodies, parts_of(bodies), keep, seen, objects, CAMERA)
+    return DepthInputs(bodies, parts_of(bodies), keep, seen, Cover(objects), CAMERA)
 
 
 def table():

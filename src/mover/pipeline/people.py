@@ -21,7 +21,7 @@ from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
 from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_scale import ScaleInputs, find_scale
-from mover.stages.objects.find_image_cues import hiding
+from mover.stages.cover import hiding
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
@@ -36,9 +36,9 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
     path, told = _in_metres(bodies, parts, capture, config, run)
     kept = run.stage(select_frames, SelectInputs(carried(bodies, path)), config.select).keep
-    camera, warnings = _with_lens(capture, kept, config, run)
+    camera, warnings = _with_lens(capture, path, kept, config, run)
     if config.correct_depth and capture.people is not None:
-        inputs = DepthInputs(bodies, parts, kept, capture.people, hiding(capture), camera)
+        inputs = DepthInputs(bodies, parts, kept, capture.people, hiding(capture, path), camera)
         depth = run.stage(find_depth, inputs, config.depth)
         bodies, warnings = apply_depth(bodies, depth), (*warnings, *depth.warnings)
         path, told = _in_metres(bodies, parts, capture, config, run)
@@ -119,12 +119,12 @@ def carried(bodies: Bodies, path: CameraPath) -> Bodies:
 
 
 def _with_lens(
-    capture: Capture, kept: Bool[Tensor, " bodies"], config: Config, run: Run
+    capture: Capture, path: CameraPath, kept: Bool[Tensor, " bodies"], config: Config, run: Run
 ) -> tuple[Camera, tuple[str, ...]]:
     """The given camera, with the focal length that the people tell where one is looked for."""
     camera, bodies, people = capture.scene.camera, capture.bodies, capture.people
     if config.focal.spread <= 0 or bodies is None or people is None:
         return camera, ()
-    inputs = FocalInputs(bodies, kept, people, hiding(capture), camera)
+    inputs = FocalInputs(bodies, kept, people, hiding(capture, path), camera)
     lens = run.stage(find_focal, inputs, config.focal)
     return zoomed(camera, lens), lens.warnings

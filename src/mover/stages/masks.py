@@ -1,6 +1,7 @@
 """Masks of people and of a smaller image: whose they are, what they tell of depth, how they fit."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,11 +90,11 @@ def compare_extents(
     rows: Int[Tensor, " rows"],
     camera: Camera,
     table: MaskTable,
-    blocked: Bool[Tensor, "h w"],
+    blocked: Callable[[int], Bool[Tensor, "h w"]],
 ) -> Extents | None:
     """Compare the heights of a person's wholly seen bodies with those of their masks.
 
-    Blocked pixels are of what may hide people.
+    Blocked pixels are of what may hide people in a frame.
 
     Returns:
         None if nobody is seen wholly, upright and high enough.
@@ -107,7 +108,7 @@ def compare_extents(
         if high <= UPRIGHT * wide:
             continue
         own, others = table.decode(row)
-        covered = drawn & (blocked | others) & ~own
+        covered = drawn & (blocked(int(bodies.frame[row])) | others) & ~own
         if covered.sum() <= WHOLE * drawn.sum() and min(high, _extent(own)[0]) >= HIGH:
             body, mask = high - _thick(drawn), _extent(own)[0] - _thick(own)
             ratios.append(body / mask if mask > 0 else math.nan)
@@ -117,14 +118,6 @@ def compare_extents(
     middle = found.median()
     off = GAUSS * float((found - middle).abs().median())
     return Extents(float(middle), 1.25 * off / len(found) ** 0.5, len(found))
-
-
-def pixels_of(masks: Masks) -> Bool[Tensor, "h w"]:
-    """The pixels that are in any of some masks."""
-    covered = torch.zeros(masks.height, masks.width, dtype=torch.bool)
-    for row in range(len(masks.counts)):
-        covered = covered | decode(masks, row)
-    return covered
 
 
 def _inside(verts: Float[Tensor, "verts 3"], camera: Camera) -> bool:

@@ -11,6 +11,7 @@ seen where they are. Then the factor is 1, and the people's depth is wrong with 
 """
 
 import dataclasses
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,11 +20,12 @@ from torch.nn.functional import pad
 
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
-from mover.core.types import Bodies, Camera, Masks, People
+from mover.core.types import Bodies, Camera, People
 from mover.geometry.raster import Crops, layers
 from mover.stages.config import FocalConfig
 from mover.stages.contacts.assign_contacts import evenly
-from mover.stages.masks import MaskTable, mask_table, pixels_of, small, uncovered
+from mover.stages.cover import Cover, covered
+from mover.stages.masks import MaskTable, mask_table, small, uncovered
 
 # How much longer the lens is than it was said to be: a robust line through where people are seen.
 #
@@ -120,8 +122,8 @@ class FocalInputs:
     keep: Bool[Tensor, " bodies"]
     """Which rows are sound, from `select_frames`."""
     people: People
-    objects: Masks
-    """Masks of all objects in the reference image: what they cover may hide a person."""
+    objects: Cover
+    """All objects: what they cover may hide a person."""
     camera: Camera
 
 
@@ -147,10 +149,12 @@ def find_focal(inputs: FocalInputs, config: FocalConfig, observe: Observer = sil
     if config.spread <= 0:
         raise ValueError(f"find_focal: spread {config.spread}, expected above 0")
     table = mask_table(inputs.people, inputs.bodies)
-    free = uncovered(pixels_of(inputs.objects), config.width)
+    blocked = covered(inputs.objects)
+    free = cache(lambda frame: uncovered(blocked(frame), config.width))
     found: list[tuple[int, Tensor]] = []
     for row in _rows(inputs, config, table):
-        places = _sighting(inputs, config, row, table, free)
+        clear = free(int(inputs.bodies.frame[row]))
+        places = _sighting(inputs, config, row, table, clear)
         if places is not None:
             found.append((row, places))
     observe(Step("find_focal", 0, 1))

@@ -6,13 +6,12 @@ from torch import Tensor
 
 from mover.core.observe import Observer, silent
 from mover.core.records import record
-from mover.core.types import Camera, Capture, Masks
+from mover.core.types import Camera, Capture
 from mover.energy.objective import ImageCues
 from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.terms.border import borders_of
 from mover.energy.terms.silhouette import outline_root
 from mover.geometry.crops import area_mean, crop_views
-from mover.geometry.path import is_still
 from mover.geometry.rle import decode, tight_box
 from mover.stages.config import ImageConfig
 from mover.stages.objects.prepare_objects import Prepared
@@ -72,14 +71,6 @@ def evidence_at(capture: Capture, frame: int) -> Seen:
         torch.stack(boxes) if boxes else torch.zeros(0, 4), there, masks,
         torch.stack([blank, *hidden]).any(0),
     )  # fmt: skip
-
-
-def hiding(capture: Capture) -> Masks:
-    """Masks of the furniture that may hide people in the frames; a moving camera tells none."""
-    camera = capture.scene.camera
-    seen = capture.detections if is_still(capture.path) else ()
-    found = [d.mask.counts[0] for d in seen if d.mask is not None]
-    return Masks(camera.height, camera.width, tuple(found))
 
 
 def ground_without_people(capture: Capture, prepared: Prepared) -> float:

@@ -13,7 +13,9 @@ scaled about the camera, which no picture sees.
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -22,19 +24,19 @@ from torch import Tensor
 from mover.bodies.parts import Parts
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
-from mover.core.types import Bodies, Camera, Masks, People
+from mover.core.types import Bodies, Camera, People
 from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
 from mover.stages.camera.find_foot_contacts import straight_legs
 from mover.stages.config import DepthConfig, FootContactConfig
 from mover.stages.contacts.assign_contacts import evenly, in_turns
+from mover.stages.cover import Cover, covered
 from mover.stages.masks import (
     Extents,
     MaskTable,
     compare_extents,
     mask_table,
     overlaps,
-    pixels_of,
     small,
     uncovered,
 )
@@ -125,8 +127,8 @@ class DepthInputs:
     keep: Bool[Tensor, " bodies"]
     """Which rows are sound, from `select_frames`."""
     people: People
-    objects: Masks
-    """Masks of all objects in the reference image: what they cover may hide a person."""
+    objects: Cover
+    """All objects: what they cover may hide a person."""
     camera: Camera
 
 
@@ -153,8 +155,8 @@ def find_depth(
     tracks = bodies.person.unique().tolist()
     found = torch.ones(3, len(tracks)) * torch.tensor([[1.0], [torch.inf], [1.0]])
     table = mask_table(inputs.people, bodies)
-    blocked = pixels_of(inputs.objects)
-    free = uncovered(blocked, config.width)
+    blocked = covered(inputs.objects)
+    free = cache(lambda frame: uncovered(blocked(frame), config.width))
     for index, person in enumerate(tracks):  # each has its own frames
         rows = ((bodies.person == person) & inputs.keep).nonzero()[:, 0]
         size, note = _size(inputs, rows, str(person))
@@ -258,7 +260,7 @@ def _curves(
     config: DepthConfig,
     rows: Int[Tensor, " rows"],
     table: MaskTable,
-    free: Bool[Tensor, "h w"],
+    clear: Callable[[int], Bool[Tensor, "h w"]],
 ) -> Float[Tensor, "used factors"]:
     """Overlap of silhouette and mask over the factors, for each body that is seen well."""
     factors = torch.linspace(1 - config.span, 1 + config.span, config.factors)
@@ -267,6 +269,7 @@ def _curves(
         if len(curves) == config.most:
             break
         own, others = table.decode(row)
+        free = clear(int(inputs.bodies.frame[row]))
         known = free & uncovered(others, config.width)
         mask = small(own, config.width)
         middle = _drawn(inputs, row, free, torch.ones(1))[0]
