@@ -1,0 +1,133 @@
+"""What furniture may hide of people, in each frame.
+
+Where the camera stands still, that is what the masks of the reference image cover. A moving camera
+has masks in the reference image and in the frames of furniture.json. Each piece is carried from the
+two of them whose cameras were most like that of the frame, as if it were flat and as far away as
+the initial scene says, and is widened by what that depth may be wrong.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from functools import cache
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from mover.core.records import record
+from mover.core.types import STILL, CameraPath, Capture, Masks, People
+from mover.geometry.boxes import box_of
+from mover.geometry.path import is_still, poses_at
+from mover.geometry.rle import decode, joined, thinned
+
+STEP = 4  # [px] from one pixel of a carried mask to the next
+LIKE = 2  # so many masks of each piece are carried: a person may stand before one of them
+WRONG = 0.15
+WIDEST = 6  # [STEP px] by which a carried mask grows at most
+NEAREST = 0.3  # [m], no piece is nearer to a camera
+
+
+@record
+class Cover:
+    """Masks of what may hide people; one row for each piece and picture."""
+
+    masks: Masks
+    piece: Int[Tensor, " rows"] = torch.zeros(0, dtype=torch.long)
+    """Only of a moving camera, as is all that follows."""
+    depth: Float[Tensor, " rows"] = torch.zeros(0)
+    """Of the piece, from the camera that saw it [m]."""
+    seen: CameraPath = STILL
+    """That camera."""
+    path: CameraPath = STILL
+    """Of the frames' cameras [m]."""
+    K: Float[Tensor, "3 3"] = torch.eye(3)
+
+
+def hiding(capture: Capture, path: CameraPath) -> Cover:
+    """The furniture of a capture, as a path sees it [m]."""
+    camera = capture.scene.camera
+    still = Masks(camera.height, camera.width, ())
+    shown = [(0, d.id, d.mask, STILL) for d in capture.detections if d.mask is not None]
+    if is_still(path):
+        return Cover(joined([still, *(mask for _, _, mask, _ in shown)]))
+    centre = {p.annotation: camera.R_cam_world @ box_of(p).center for p in capture.scene.objects}
+    rows = [row for row in (*shown, *_in_frames(capture.furniture, path)) if row[1] in centre]
+    frames, pieces, masks, poses = zip(*rows, strict=True) if rows else ((), (), (), ())
+    seen = CameraPath(
+        torch.tensor(frames, dtype=torch.long),
+        torch.cat([torch.zeros(0, 3, 3), *(p.R_reference_camera for p in poses)]),
+        torch.cat([torch.zeros(0, 3), *(p.t_reference_camera for p in poses)]),
+    )
+    middle = torch.stack([torch.zeros(3), *(centre[piece] for piece in pieces)])[1:]
+    ahead = ((middle - seen.t_reference_camera)[:, None] @ seen.R_reference_camera)[:, 0, 2]
+    number = torch.tensor(pieces, dtype=torch.long)
+    return Cover(joined([still, *masks]), number, ahead.clamp_min(NEAREST), seen, path, camera.K)
+
+
+def _in_frames(
+    furniture: People | None, path: CameraPath
+) -> Iterator[tuple[int, int, Masks, CameraPath]]:
+    """Frame, piece and mask of what is segmented in further frames, and the frame's camera."""
+    if furniture is None:
+        return
+    keys = zip(furniture.frame.tolist(), furniture.person.tolist(), strict=True)
+    for code, (frame, piece) in zip(furniture.masks.counts, keys, strict=True):
+        mask = dataclasses.replace(furniture.masks, counts=(code,))
+        yield frame, piece, mask, poses_at(path, torch.tensor([frame]))
+
+
+def covered(cover: Cover) -> Callable[[int], Bool[Tensor, "h w"]]:
+    """The pixels that may be hidden in a frame; each is found once."""
+    if is_still(cover.path):
+        same = pixels_of(cover.masks)
+        return lambda _: same
+    return cache(lambda frame: _carried(cover, frame))
+
+
+def pixels_of(masks: Masks) -> Bool[Tensor, "h w"]:
+    """The pixels that are in any of some masks."""
+    found = torch.zeros(masks.height, masks.width, dtype=torch.bool)
+    for row in range(len(masks.counts)):
+        found = found | decode(masks, row)
+    return found
+
+
+def _carried(cover: Cover, frame: int) -> Bool[Tensor, "h w"]:
+    """The furniture as the camera of a frame sees it."""
+    pose = poses_at(cover.path, torch.tensor([frame]))
+    away = (cover.seen.t_reference_camera - pose.t_reference_camera).norm(dim=-1) / cover.depth
+    turned = (cover.seen.R_reference_camera - pose.R_reference_camera).flatten(1).norm(dim=-1)
+    height, width = cover.masks.height, cover.masks.width
+    found = torch.zeros(-(-height // STEP), -(-width // STEP), dtype=torch.bool)
+    for piece in cover.piece.unique():
+        mine = (cover.piece == piece).nonzero()[:, 0]
+        for row in mine[(away + turned)[mine].argsort()[:LIKE]].tolist():
+            wide = math.ceil(float(away[row] * cover.K[0, 0]) * WRONG / STEP)
+            found = found | _grown(_warped(cover, row, pose, found.shape), min(wide, WIDEST))
+    return found.repeat_interleave(STEP, 0).repeat_interleave(STEP, 1)[:height, :width]
+
+
+def _warped(cover: Cover, row: int, pose: CameraPath, shape: torch.Size) -> Bool[Tensor, "h w"]:
+    """A mask as another camera sees it, were the piece flat."""
+    source = torch.from_numpy(thinned(cover.masks, row, STEP).copy())
+    back = pose.R_reference_camera[0].mT
+    turn = back @ cover.seen.R_reference_camera[row]
+    shift = back @ (cover.seen.t_reference_camera[row] - pose.t_reference_camera[0])
+    plane = turn.clone()
+    plane[:, 2] += shift / cover.depth[row]
+    there = cover.K @ torch.linalg.inv(plane) @ torch.linalg.inv(cover.K)
+    y, x = (STEP * (torch.arange(n) + 0.5) for n in shape)
+    pixel = torch.stack(torch.broadcast_tensors(x, y[:, None], torch.ones(())), -1) @ there.mT
+    at = (pixel[..., :2] / pixel[..., 2:].clamp_min(1e-6) / STEP).floor().long()
+    height, width = source.shape
+    inside = (at >= 0).all(-1) & (at[..., 0] < width) & (at[..., 1] < height)
+    column, line = at[..., 0].clamp(0, width - 1), at[..., 1].clamp(0, height - 1)
+    return source[line, column] & inside & (pixel[..., 2] > 0)
+
+
+def _grown(mask: Bool[Tensor, "h w"], wide: int) -> Bool[Tensor, "h w"]:
+    image = mask[None, None].float()
+    rows = max_pool2d(image, (2 * wide + 1, 1), 1, (wide, 0))
+    return max_pool2d(rows, (1, 2 * wide + 1), 1, (0, wide))[0, 0] > 0
