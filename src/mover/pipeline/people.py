@@ -16,7 +16,7 @@ from mover.io.capture.pose_file import moved
 from mover.pipeline.outcome import PeopleState, check_floor
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import AlignInputs, align_camera
-from mover.stages.camera.align_views import ViewInputs, align_views, aligned
+from mover.stages.camera.align_views import ViewInputs, Views, align_views, aligned
 from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
 from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
@@ -34,24 +34,24 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     if bodies is None:
         return None
     parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
-    path, told = _in_metres(bodies, parts, capture, config, run)
+    path, told = _in_metres(bodies, parts, capture.path, config, run)
     kept = run.stage(select_frames, SelectInputs(carried(bodies, path)), config.select).keep
     camera, warnings = _with_lens(capture, path, kept, config, run)
     if config.correct_depth and capture.people is not None:
         inputs = DepthInputs(bodies, parts, kept, capture.people, hiding(capture, path), camera)
         depth = run.stage(find_depth, inputs, config.depth)
         bodies, warnings = apply_depth(bodies, depth), (*warnings, *depth.warnings)
-        path, told = _in_metres(bodies, parts, capture, config, run)
+        path, told = _in_metres(bodies, parts, capture.path, config, run)
     touch = capture.touch if config.foot_contacts.given else None
 
     def feet_on(path: CameraPath) -> FootContacts:
         standing = FootContactInputs(carried(bodies, path), parts, kept, camera, touch)
         return run.stage(find_foot_contacts, standing, config.foot_contacts)
 
-    path, views = _with_views(path, capture, config, run)
-    told = (*told, *views)
+    seen = _along_views((bodies, parts), path, capture, config, run)
+    path, told = seen or (path, told)
     feet, loose = feet_on(path), torch.zeros(3, 3)
-    if not is_still(path):
+    if not is_still(path) and seen is None:  # furniture in further frames tells more
         inputs = DriftInputs(feet, camera, path, bodies.fps or 1.0)
         drift = run.stage(find_drift, inputs, config.drift)
         path, told = undrifted(path, drift), (*told, *drift.warnings)
@@ -65,33 +65,47 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
 
 
 def _in_metres(
-    bodies: Bodies, parts: Parts, capture: Capture, config: Config, run: Run
+    bodies: Bodies, parts: Parts, path: CameraPath, config: Config, run: Run
 ) -> tuple[CameraPath, tuple[str, ...]]:
-    """The camera's path in the people's scale, and what is odd about it."""
-    if is_still(capture.path):
-        return capture.path, ()
-    scale = run.stage(find_scale, ScaleInputs(bodies, parts, capture.path), config.scale)
-    return scaled(capture.path, scale.scale), scale.warnings
-
-
-def _with_views(
-    path: CameraPath, capture: Capture, config: Config, run: Run
-) -> tuple[CameraPath, tuple[str, ...]]:
-    """The path [m] as furniture in further frames corrects it, and what is odd about that."""
-    if is_still(path) or capture.furniture is None:
+    """A path in the people's scale, and what is odd about it."""
+    if is_still(path):
         return path, ()
+    scale = run.stage(find_scale, ScaleInputs(bodies, parts, path), config.scale)
+    return scaled(path, scale.scale), scale.warnings
+
+
+def _along_views(
+    people: tuple[Bodies, Parts], path: CameraPath, capture: Capture, config: Config, run: Run
+) -> tuple[CameraPath, tuple[str, ...]] | None:
+    """The path [m] without what furniture in further frames finds wrong; None: there is none.
+
+    What drifts is of another length, so that its scale is found again without.
+    """
+    views = _views(path, capture, config, run)
+    if views is None:
+        return None
+    scale = run.stage(find_scale, ScaleInputs(*people, aligned(path, views)), config.scale)
+    path = scaled(path, scale.scale)
+    views = _views(path, capture, config, run) or views
+    return aligned(path, views), (*scale.warnings, *views.warnings)
+
+
+def _views(path: CameraPath, capture: Capture, config: Config, run: Run) -> Views | None:
+    """What furniture in further frames says of a path [m]."""
+    if is_still(path) or capture.furniture is None:
+        return None
     found = {one.id: one for one in capture.detections}
     camera = capture.scene.camera
     known = [p for p in capture.scene.objects if p.annotation in found]
     middle = [camera.R_cam_world @ box_of(p).center for p in known]
     if not known:
-        return path, ()
+        return None
     inputs = ViewInputs(
         camera, tuple(found[p.annotation] for p in known if p.annotation is not None),
         torch.stack(middle)[:, 2].clamp_min(NEAREST), capture.furniture, capture.people, path,
     )  # fmt: skip
     views = run.stage(align_views, inputs, config.views)
-    return aligned(path, views), views.warnings
+    return views if len(views.frame) > 1 else None
 
 
 def as_given(capture: Capture) -> Bodies:
