@@ -24,8 +24,8 @@ from mover.geometry.rle import encode, tight_box
 from mover.geometry.topology import edges_of
 from mover.io.capture.annotations_file import detections_to_json
 from mover.io.capture.camera_file import camera_to_json
-from mover.io.files.depth import read_depth
 from mover.io.files.fields import write_json
+from mover.io.files.images import read_depth
 from mover.io.files.meshes import write_mesh
 from mover.io.formats import read
 from mover.perceive.capture import read_picture_of, write_first_scene

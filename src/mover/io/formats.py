@@ -57,11 +57,11 @@ FORMATS = (
     ),
     Format(
         "scene", "gen3dsr", "a folder of Gen3DSR: reconstruction/ and cam_params.json",
-        "scenes.gen3dsr:gen3dsr_parts",
+        "scenes.without_axes:gen3dsr_parts",
     ),
     Format(
         "scene", "holisticmesh", "a folder of HolisticMesh: models/scene.ply and detections.json",
-        "scenes.holisticmesh:holisticmesh_parts",
+        "scenes.without_axes:holisticmesh_parts",
     ),
     Format("scene", "glb", "a glTF scene: each node an object", "scenes.glb_scene:glb_parts"),
     Format(

@@ -34,9 +34,8 @@ from mover.io.capture.camera_file import camera_of, camera_to_json
 from mover.io.capture.folder import folder_parts
 from mover.io.capture.scene_file import write_hypotheses, write_scene
 from mover.io.files.cameras import of_view, read_camera_file
-from mover.io.files.depth import find_depth_file, read_depth
 from mover.io.files.fields import At, get, maybe, number, read_json, write_json
-from mover.io.files.images import write_image
+from mover.io.files.images import find_depth_file, read_depth, write_image
 from mover.io.people.keypoints import write_keypoints
 from mover.perceive.config import (
     DetectConfig,

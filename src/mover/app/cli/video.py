@@ -129,7 +129,7 @@ def take_depth(depth: Path, capture: Path) -> None:
         InputError: If there is no such file, or the capture has an inverse depth.
     """
     from mover.core.files import copy_whole
-    from mover.io.files.depth import DEPTH, find_depth_file
+    from mover.io.files.images import DEPTH, find_depth_file
 
     if not depth.is_file():
         raise InputError(f"{depth}: there is no such file, expected a depth map")
@@ -337,7 +337,7 @@ def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
 
 def _first_scene(capture: Path, args: ChainArgs, steps: Steps) -> None:
     """scene.json, under the camera that the bodies tell."""
-    from mover.io.files.depth import find_depth_file
+    from mover.io.files.images import find_depth_file
 
     names = ("objects.json", "people.json", "bodies.npz")
     made_from = [*(capture / name for name in names), lens_in(capture)]

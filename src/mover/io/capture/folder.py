@@ -21,15 +21,16 @@ from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_to_json, path_to_arrays
 from mover.io.capture.parts import Hints, LoadImage, Parts, image_parts
 from mover.io.capture.scene_file import HYPOTHESES, write_hypotheses, write_scene
-from mover.io.files.depth import (
+from mover.io.files.fields import At, read_json, write_json
+from mover.io.files.images import (
     DEPTH,
     DISPARITY,
     find_depth_file,
     read_depth_image,
+    read_image,
     write_depth_image,
+    write_image,
 )
-from mover.io.files.fields import At, read_json, write_json
-from mover.io.files.images import read_image, write_image
 from mover.io.files.meshes import read_mesh
 from mover.io.files.npz import read_npz, write_npz
 

@@ -24,9 +24,8 @@ from mover.io.capture.folder import folder_parts, read_capture, write_trees
 from mover.io.capture.pairing import linked, merged, with_links
 from mover.io.capture.parts import Parts
 from mover.io.capture.scene_file import write_scene
-from mover.io.files.depth import DEPTH, DISPARITY
 from mover.io.files.fields import At, get, items, maybe, write_json
-from mover.io.files.images import write_image
+from mover.io.files.images import DEPTH, DISPARITY, write_image
 from mover.io.files.npz import write_npz
 
 log = logging.getLogger(__name__)

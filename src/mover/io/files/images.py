@@ -1,4 +1,4 @@
-"""Pictures: read the reference image, write it without loss."""
+"""Pictures: the reference image, and its depth as networks give it."""
 
 import warnings
 from collections.abc import Generator
@@ -9,13 +9,15 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.files import replacing
-from mover.core.types import Camera
-from mover.io.files.fields import At, reason, refuse
+from mover.core.types import Camera, DepthImage
+from mover.io.files.fields import At, array, maybe, reason, refuse
 from mover.io.files.meshes import inside
+from mover.io.files.npz import read_npy, read_npz
 
 
 @contextmanager
@@ -104,3 +106,127 @@ def mirrored_copy(path: Path, work: Path) -> Path:
     with opened(path) as picture:
         ImageOps.mirror(picture.convert("RGB")).save(target, quality=95)
     return target
+
+
+# Depth of the picture, as Depth Anything, MoGe, UniDepth, Depth Pro or MiDaS give it.
+
+
+DEPTH, DISPARITY = "depth", "disparity"
+NAMES = ("depth", "depth_metric", "metric_depth", "predicted_depth", "depths", "arr_0")
+FARTHEST = 100.0  # [m], what is farther is sky or nonsense
+MILLIMETRES = 1000.0
+ENDINGS = (".npy", ".npz", ".png")
+
+
+def find_depth_file(folder: Path) -> tuple[Path, bool] | None:
+    """The measured depth in a capture's folder, and whether it is metric; None: there is none.
+
+    `depth/` holds metres (millimetres in a PNG), `disparity/` the inverse depth of a relative
+    network; the file is of the reference picture, the first by name.
+
+    Raises:
+        InputError: If both are there, or a folder holds no depth map.
+    """
+    there = [name for name in (DEPTH, DISPARITY) if (folder / name).is_dir()]
+    if not there:
+        return None
+    if len(there) == 2:
+        raise InputError(f"{folder.name}: has {DEPTH}/ and {DISPARITY}/, expected one of the two")
+    files = sorted(p for p in (folder / there[0]).iterdir() if p.suffix.lower() in ENDINGS)
+    if not files:
+        raise InputError(f"{there[0]}/: has no depth map, expected 000000{' or '.join(ENDINGS)}")
+    return files[0], there[0] == DEPTH
+
+
+def read_depth_image(path: Path, camera: Camera, *, metric: bool) -> DepthImage:
+    """The measured depth of the reference picture."""
+    return DepthImage(read_depth(path, camera) if metric else read_disparity(path, camera), metric)
+
+
+def write_depth_image(depth: DepthImage, folder: Path) -> None:
+    """Write it into a capture's folder."""
+    values = depth.values.detach().cpu().numpy()
+    place = folder / (DEPTH if depth.metric else DISPARITY) / "000000.npy"
+    with replacing(place) as part, part.open("wb") as file:
+        np.save(file, values, allow_pickle=False)
+
+
+def read_disparity(path: Path, camera: Camera) -> Float[Tensor, "h w"]:
+    """Inverse depth up to a factor and a shift; NaN where it is not positive."""
+    if path.suffix.lower() == ".png":
+        with opened(path, expected="a map of inverse depth", bombs="error") as picture:
+            mode, values = picture.mode, np.asarray(picture, dtype=np.float64)
+        if values.ndim != 2:
+            raise InputError(
+                f"{path.name}: has {mode} pixels, expected one grey value, larger where nearer"
+            )
+    else:
+        values = _values_of(path, (DISPARITY, *NAMES))
+    return _on_pixels(np.where(np.isfinite(values) & (values > 0), values, np.nan), path, camera)
+
+
+def read_depth(path: Path, camera: Camera) -> Float[Tensor, "h w"]:
+    """Distance along the view of each pixel [m]; NaN where it is unknown.
+
+    `.npz` and `.npy` hold metres (`depth`, or MoGe's `points`, whose z counts); `.png` with 16
+    bits holds millimetres. Another resolution of the same shape is stretched.
+    """
+    values = _of_png(path) if path.suffix.lower() == ".png" else _values_of(path, NAMES)
+    known = np.isfinite(values) & (values > 0) & (values < FARTHEST)
+    return _on_pixels(np.where(known, values, np.nan), path, camera)
+
+
+def _values_of(path: Path, names: tuple[str, ...]) -> NDArray[np.float64]:
+    match path.suffix.lower():
+        case ".npz":
+            return _of_npz(path, names)
+        case ".npy":
+            return _two_axes(read_npy(path))
+        case _:
+            raise InputError(f"{path.name}: is no depth map, expected .npz, .npy or .png")
+
+
+def _on_pixels(values: NDArray[np.float64], path: Path, camera: Camera) -> Float[Tensor, "h w"]:
+    """The values at the pixels of the camera."""
+    depth = torch.from_numpy(values.astype(np.float32))
+    h, w = depth.shape
+    if abs(w * camera.height - h * camera.width) > 0.02 * w * camera.height:
+        raise InputError(
+            f"{path.name}: has {w} x {h} values, expected the shape of {camera.width} x "
+            f"{camera.height} pixels"
+        )
+    rows = ((torch.arange(camera.height) + 0.5) * h / camera.height).long()
+    columns = ((torch.arange(camera.width) + 0.5) * w / camera.width).long()
+    return depth[rows][:, columns]
+
+
+def _of_npz(path: Path, names: tuple[str, ...]) -> NDArray[np.float64]:
+    at = read_npz(path)
+    points = maybe(at, "points")
+    found = next((v for n in names if (v := maybe(at, n)) is not None), None)
+    metric = DISPARITY not in names
+    if found is None and metric and points is not None and np.ndim(points.value) == 3:
+        return np.asarray(points.value, dtype=np.float64)[..., 2]
+    if found is None:
+        refuse(at, f"one of the arrays {', '.join(names)} or points", f"{', '.join(at.value)}")
+    return _two_axes(found)
+
+
+def _two_axes(at: At) -> NDArray[np.float64]:
+    value = np.asarray(at.value)
+    while value.ndim > 2 and 1 in (value.shape[0], value.shape[-1]):
+        value = value[0] if value.shape[0] == 1 else value[..., 0]
+    if value.dtype.kind == "f":  # unknown pixels may be NaN or infinite
+        value = np.where(np.isfinite(value), value, 0)
+    return array(At(value, at.file, at.field), ("h", "w")).astype(np.float64)
+
+
+def _of_png(path: Path) -> NDArray[np.float64]:
+    with opened(path, expected="a depth map", bombs="error") as picture:
+        mode, values = picture.mode, np.asarray(picture)
+    if not mode.startswith("I"):
+        raise InputError(
+            f"{path.name}: has {mode} pixels, expected 16 bits of millimetres (8 bits or colours "
+            "have no unit)"
+        )
+    return values.astype(np.float64) / MILLIMETRES
