@@ -163,12 +163,8 @@ def outside(given: SceneObject, now: SceneObject, ranges: dict[str, tuple[float,
 
 def _moved(scene: Scene, steps: dict[str, NDArray[np.float64]]) -> Scene:
     """The scene after level steps in the simulator's axes."""
-    pieces: list[SceneObject] = []
-    for piece in scene.objects:
-        x, y = steps.get(piece.id, np.zeros(2)).tolist()
-        step = torch.tensor([x, 0.0, -y]).to(piece.t_world_object)
-        pieces.append(replace(piece, t_world_object=piece.t_world_object + step))
-    return replace(scene, objects=tuple(pieces))
+    ways = [(piece, steps.get(piece.id, np.zeros(2)).tolist()) for piece in scene.objects]
+    return replace(scene, objects=tuple(_stepped(piece, (x, 0.0, -y)) for piece, (x, y) in ways))
 
 
 # Where something would hold a piece that falls: on its floor or support, along a wall behind it.
@@ -194,18 +190,14 @@ def held_places(
         piece: One of the scene's.
     """
     ground = piece.support == "ground"
-    there = _on_floor(scene, piece) if ground else _on_support(scene, run, piece)
+    rise = floor_height(scene) - base_of(piece)["y"]
+    there = _stepped(piece, (0.0, rise, 0.0)) if ground else _on_support(scene, run, piece)
     if float((there.t_world_object - piece.t_world_object).norm()) > STILL:
         yield ("the floor" if ground else piece.support), there
     for wall in walls if ground else ():
         beside = _along(wall, there)
         if beside is not None:
             yield f"the wall guessed from {wall.source}", beside
-
-
-def _on_floor(scene: Scene, piece: SceneObject) -> SceneObject:
-    """Its underside at the height of the floor."""
-    return _stepped(piece, (0.0, floor_height(scene) - base_of(piece)["y"], 0.0))
 
 
 def _stepped(piece: SceneObject, by: tuple[float, float, float]) -> SceneObject:

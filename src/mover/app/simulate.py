@@ -157,11 +157,6 @@ class Nudge:
     the way out of others took it."""
 
 
-def ranges_of(file: Path) -> Ranges:
-    """What scene.json states of its objects."""
-    return ranges_in({item["id"]: item for item in read_json(file).value["objects"]})
-
-
 def ranges_in(fields: Mapping[str, Mapping[str, Any]]) -> Ranges:
     """What is stated of objects: their fields of scene.json by id."""
     found: Ranges = {}
@@ -324,9 +319,10 @@ def _nudges(given: Scene, best: _Fallen, rows: Sequence[SimulatedObject]) -> tup
 def nudge_folder(out: Path, config: SimulationConfig, walls: tuple[Wall, ...] = ()) -> str:
     """Nudge the pieces of a result and write OUT/stable.json; what was done, in words."""
     file = out / "scene.json"
-    scene = read_scene(file)
+    scene, rows = read_scene(file), read_json(file).value["objects"]
+    stated = {item["id"]: item for item in rows}
     loads = result_loads(out, scene)
-    steady, rows, nudges = nudged(scene, Run(out), ranges_of(file), config, loads, walls)
+    steady, rows, nudges = nudged(scene, Run(out), ranges_in(stated), config, loads, walls)
     write_nudged(out, steady, nudges, walls)
     loose = [row for row in rows if not row.fixed]
     stay = f"stable: {sum(row.stays for row in loose)} of {len(loose)} stay; {out / STABLE}"

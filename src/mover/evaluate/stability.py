@@ -237,11 +237,11 @@ def _settled(
     mujoco, model, data = modelled(scene, solids, room.walls)
     start = _states(data, solids)
     stuck = [_stuck(model, data, body_name(solid)) for solid in solids]
-    weights = [
-        (model.body(body_name(solid)).id, pressed[solid.id].kilos, _seat(pressed[solid.id], piece))
-        for solid, piece in zip(solids, scene.objects, strict=True)
-        if solid.id in pressed
-    ]
+    weights: list[tuple[int, float, NDArray[np.float64]]] = []  # places in the bodies' axes [m]
+    for solid, piece in zip(solids, scene.objects, strict=True):
+        if (load := pressed.get(solid.id)) is not None:
+            place = (AXES @ (load.place * piece.scale).double()).numpy()
+            weights.append((model.body(body_name(solid)).id, load.kilos, place))
     for _ in range(round(seconds / model.opt.timestep)):
         for body, kilos, place in weights:
             _press(data, body, (kilos * abs(float(model.opt.gravity[2])), place))
@@ -252,11 +252,6 @@ def _settled(
 def settled(scene: Scene, run: Run, seconds: float, walls: tuple[Wall, ...] = ()) -> list["State"]:
     """Where gravity leaves each piece: its origin [m] and attitude in the simulator's axes."""
     return _settled(_Standing(scene, solids_of(scene, run), walls), seconds, {})[1]
-
-
-def _seat(load: Load, piece: SceneObject) -> NDArray[np.float64]:
-    """Where the weight is, in the axes of the simulated body [m]."""
-    return (AXES @ (load.place * piece.scale).double()).numpy()
 
 
 def _press(data: Any, body: int, by: tuple[float, NDArray[np.float64]]) -> None:  # noqa: ANN401

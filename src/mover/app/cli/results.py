@@ -10,9 +10,8 @@ from tyro.conf import Positional, arg
 from mover.app.cli import say
 from mover.app.cli.config import parsed
 from mover.app.pictures.config import RenderConfig
-from mover.app.viewer.address import Address
 from mover.core.errors import InputError
-from mover.core.settings import float_in
+from mover.core.settings import float_in, int_in
 from mover.io.formats import chosen, names
 
 
@@ -192,6 +191,16 @@ def render(arguments: Sequence[str]) -> None:
 
 
 # `view`.
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the viewer listens."""
+
+    host: str = "127.0.0.1"
+    """This machine only; 0.0.0.0 lets the network in, with the token of the URL."""
+    port: Annotated[int, int_in(1, 65535)] = 8080
+    """The next free one is taken where it is in use."""
 
 
 @dataclass(frozen=True)

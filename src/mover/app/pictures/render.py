@@ -191,7 +191,7 @@ def _panels(
         if board is None or board.eye is not eye or time != before:
             board = set_up(eye, world.ground, still, base)
         elif base is not None:
-            board = with_base(board, base)
+            board = dataclasses.replace(board, base=base)  # type: ignore[type-var]
         present = rows.get(moment.frame, [])
         moving = people(world.bodies, present) if world.bodies is not None and present else None
         yield show(board, moving)
@@ -294,11 +294,6 @@ def set_up(
     floor = lines if over_picture else over(shadows(eye, ground, still), lines)
     picture = base if base is not None else backdrop(eye, ground)
     return Tiles(eye, ground, ink, drawn, floor, paint(drawn, ink), picture)
-
-
-def with_base(board: Tiles, base: Float[Tensor, "h w 3"]) -> Tiles:
-    """The same world over another picture."""
-    return dataclasses.replace(board, base=base)  # type: ignore[type-var]
 
 
 def show(board: Tiles, moving: Surfaces | None = None) -> Float[Tensor, "h w 3"]:

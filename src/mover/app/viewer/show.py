@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from mover.app.cli import say
+from mover.app.cli.results import Address
 from mover.app.cli.run import reconstruct_into
 from mover.app.results import Origin, read_config
-from mover.app.viewer.address import Address
 from mover.app.viewer.drawing import Drawing, People, draw_room
 from mover.app.viewer.gate import gate_at, guarded
 from mover.app.viewer.panels import add_object_panel, add_room_panel

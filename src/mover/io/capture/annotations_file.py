@@ -14,7 +14,14 @@ from mover.core.types import Camera, Detection, Masks, People
 from mover.geometry.rle import area, decode, joined, tight_box
 from mover.io.files.fields import At, Warn, get, items, listed, maybe, plain, refuse, shown, unique
 from mover.io.files.schema import Box, FrameRate, Id, Index, Share, checked
-from mover.io.masks.coco import categories_of, category_of, check_image, mask_of, segmentation
+from mover.io.masks.coco import (
+    annotations_tree,
+    categories_of,
+    category_of,
+    check_image,
+    mask_of,
+    segmentation,
+)
 
 LEAST_OVERLAP = 0.3  # of a box and the box of its mask; below, they are not of one thing
 
@@ -99,19 +106,15 @@ def detections_to_json(
     detections: tuple[Detection, ...], camera: Camera, file_name: str | None
 ) -> dict[str, Any]:
     """The content of objects.json."""
-    names = list(dict.fromkeys(d.category for d in detections))
     image: dict[str, Any] = {"id": 0, "width": camera.width, "height": camera.height}
     annotations: list[dict[str, Any]] = []
     for d in detections:
         mask = {} if d.mask is None else {"segmentation": segmentation(d.mask, 0)}
-        place = {"id": d.id, "image_id": 0, "category_id": names.index(d.category) + 1}
+        place = {"id": d.id, "image_id": 0, "category_id": d.category}
         score = {"bbox": _corners_to_json(d.box), "score": d.score}
         annotations.append({**place, **score, **mask})
-    return {
-        "images": [image if file_name is None else {**image, "file_name": file_name}],
-        "categories": [{"id": i + 1, "name": name} for i, name in enumerate(names)],
-        "annotations": annotations,
-    }
+    image |= {} if file_name is None else {"file_name": file_name}
+    return annotations_tree(annotations, image, first=1)
 
 
 # people.json and furniture.json: visible masks of people, and of objects, in the frames.

@@ -18,6 +18,7 @@ from mover.io.capture.parts import Parts
 from mover.io.capture.scene_file import scene_tree
 from mover.io.files.fields import At, array, mapping, refuse
 from mover.io.files.meshes import mesh_of
+from mover.io.masks.coco import annotations_tree
 
 Numbers = Tensor | NDArray[Any] | np.generic | Sequence[Any] | float
 """One number or many, of any library."""
@@ -140,12 +141,11 @@ def _list(value: Numbers) -> Any:  # noqa: ANN401
 
 def _annotations(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
     """The content of objects.json."""
-    names = list(dict.fromkeys(o.category for o in objects))
     rows: list[dict[str, Any]] = []
     for i, o in enumerate(objects):
         if o.mask is None and o.box is None:
             continue
-        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": names.index(o.category)}
+        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": o.category}
         box = o.box
         if o.mask is not None:
             mask = _mask(At(o.mask, FILE, f"objects[{i}].mask"))
@@ -153,8 +153,7 @@ def _annotations(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
             row["segmentation"] = _code(mask)
         x, y, right, bottom = array(At(np.asarray(box), FILE, f"objects[{i}].box"), (4,)).tolist()
         rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": _list(o.score)})
-    categories = [{"id": i, "name": name} for i, name in enumerate(names)]
-    return {"images": [{"id": 0}], "categories": categories, "annotations": rows}
+    return annotations_tree(rows, {})
 
 
 def _mask(at: At) -> Tensor:

@@ -136,7 +136,7 @@ def _objects(old: Parts, new: Parts) -> At | None:
     """The annotations of both, under the ids that the scene uses."""
     if new.objects is None or old.objects is None:
         return new.objects or old.objects
-    if new.scene is not None and _names_annotations(new.scene):
+    if new.scene is not None and _annotations(new.scene):
         return merged(new.objects, old.objects, newer=False, keep=None)
     used = frozenset(_annotations(old.scene) if new.scene is None else ())
     return merged(old.objects, new.objects, newer=True, keep=used)
@@ -145,10 +145,6 @@ def _objects(old: Parts, new: Parts) -> At | None:
 def _annotations(scene: At | None) -> list[int]:
     rows = [] if scene is None else items(get(scene, "objects"))
     return [key.value for row in rows if (key := maybe(row, "annotation")) is not None]
-
-
-def _names_annotations(scene: At) -> bool:
-    return bool(_annotations(scene))
 
 
 def _with_size(parts: Parts) -> Parts:

@@ -17,6 +17,7 @@ from mover.geometry.camera import NEAR, project, to_camera
 from mover.geometry.placement import place_object
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import At, get, items
+from mover.io.masks.coco import annotations_tree
 
 LEAST = 0.1  # boxes of one class that share less are not of one thing
 OTHER_CLASS = 0.5  # the same, of different classes
@@ -110,16 +111,7 @@ def _joined(row: dict[str, Any], other: dict[str, Any], newer: bool) -> dict[str
 
 def _tree(like: At, rows: Sequence[Mapping[str, Any]]) -> At:
     """objects.json of named rows."""
-    names = list(dict.fromkeys(row["category_id"] for row in rows))
-    image = {**items(get(like, "images"))[0].value, "id": 0}
-    tree = {
-        "images": [image],
-        "categories": [{"id": i, "name": name} for i, name in enumerate(names)],
-        "annotations": [
-            {**row, "image_id": 0, "category_id": names.index(row["category_id"])} for row in rows
-        ],
-    }
-    return At(tree, like.file)
+    return At(annotations_tree(rows, items(get(like, "images"))[0].value), like.file)
 
 
 def linked(scene: Scene, at: At) -> dict[str, int]:

@@ -13,7 +13,7 @@ from mover.bodies import BodyModel, load_model
 from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.types import Bodies, BodyPose
-from mover.geometry.rotations import axis_angle
+from mover.geometry.rotations import axis_angle, rotation_vectors
 from mover.io.files.fields import At, array, choice, get, maybe, reason, refuse
 from mover.io.people.values import vectors
 
@@ -127,15 +127,10 @@ def into_camera(bodies: Bodies, R_cam_world: Float[Tensor, "3 3"]) -> Bodies:
 
 def _turned(pose: BodyPose, R: Float[Tensor, "3 3"]) -> BodyPose:
     """The parameters of the turned body: its root turns about the pelvis, not about the origin."""
-    from scipy.spatial.transform import Rotation
-
     joints = run_model(load_model(pose.model, pose.gender), pose)[1][:, 0]
-    turned = (R @ axis_angle(pose.global_orient)).double().numpy()
-    vectors = torch.from_numpy(Rotation.from_matrix(turned).as_rotvec())
+    root = rotation_vectors(R @ axis_angle(pose.global_orient))
     transl = joints @ R.mT - (joints - pose.transl)
-    return dataclasses.replace(
-        pose, global_orient=vectors.to(pose.global_orient), transl=transl.to(pose.transl)
-    )
+    return dataclasses.replace(pose, global_orient=root, transl=transl.to(pose.transl))
 
 
 def pose_to_arrays(pose: BodyPose) -> dict[str, NDArray[Any]]:

@@ -1,7 +1,7 @@
 """Bodies as AMASS and the tools around SMPL-X keep them: one npz a person."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle, rot_x, rotation_vectors
-from mover.io.export.finished import Exported, Finished
+from mover.io.export.finished import Exported, Finished, Up
 from mover.io.export.people import FPS, Track, tracks_of
 from mover.io.export.posed import (
     Motion,
@@ -22,7 +22,6 @@ from mover.io.export.posed import (
 )
 from mover.io.files.npz import write_npz
 
-Up = Literal["y", "z"]
 WIDTHS = {"smpl": 72, "smplh": 156, "smplx": 165, "makehuman": 165}
 """Angles of `poses` for each model."""
 

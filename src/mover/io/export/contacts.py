@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mover.core.contact_labels import ContactLabels
 from mover.core.errors import InputError
 from mover.core.types import Bodies
-from mover.io.export.finished import Exported, Finished
+from mover.io.export.finished import Exported, Finished, Up
 from mover.io.export.people import FPS, tracks_of
 from mover.io.export.solids import AXES, floor_height
 from mover.io.files.npz import read_npz, write_npz
@@ -20,7 +20,6 @@ FORMAT, FILE = "mover-contact-labels", "contacts.npz"
 SURE = 0.5  # confidence from which `object_contact` says yes
 WIDTHS = {"position": (3,), "normal": (3,), "gap": (), "confidence": ()}
 INDICES = ("frame", "person", "part", "object")
-Up = Literal["y", "z"]
 
 
 def write_labels(labels: ContactLabels, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from mover.core.errors import InputError
 from mover.core.types import Bodies, Scene
@@ -9,6 +10,11 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.export.shell import WALLS, Wall, guess_walls, walls_in
 from mover.io.files.fields import maybe, read_json
+
+BodyForm = Literal["auto", "skin", "morph", "none"]
+"""How people move: on bones, by exact shapes, not at all; auto: on bones where these are known."""
+Up = Literal["y", "z"]
+"""y: the world of scene.json; z: that of simulators and of AMASS."""
 
 
 @dataclass(frozen=True)

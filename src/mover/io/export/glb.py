@@ -1,7 +1,7 @@
 """scene.glb: objects as nodes, floor, camera, and people who move on bones or by shapes."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,10 +11,9 @@ from torch import Tensor
 
 from mover.bodies.skinning import SkinnedBody
 from mover.core.colours import Colour, person_colour
-from mover.core.errors import InputError
 from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals
-from mover.io.export.finished import Exported, Finished
+from mover.io.export.finished import BodyForm, Exported, Finished
 from mover.io.export.gltf import (
     INDICES,
     VERTICES,
@@ -26,7 +25,7 @@ from mover.io.export.gltf import (
     add_stays,
 )
 from mover.io.export.people import FPS, Track, keyframes, tracks_of
-from mover.io.export.posed import Skin, all_angles, quaternions, rest_of, skin_for
+from mover.io.export.posed import Skin, all_angles, bones_for, quaternions, rest_of
 from mover.io.export.scene_glb import write_glb
 
 TOLERANCE = 0.005  # [m]
@@ -201,7 +200,6 @@ def _move(
 # The file with everything in it.
 
 
-BodyForm = Literal["auto", "skin", "morph", "none"]
 FAR_OFF = 0.01  # [m]
 
 
@@ -251,9 +249,7 @@ def _add_people(
     """
     bodies = finished.bodies
     assert bodies is not None
-    skin = skin_for(finished, INFLUENCES) if body in ("auto", "skin") else "morph was asked for"
-    if isinstance(skin, str) and body == "skin":
-        raise InputError(f"--body skin: {skin}")
+    skin = bones_for(finished, body, INFLUENCES)
     channels: list[Channel] = []
     notes: list[str] = []
     if isinstance(skin, str):

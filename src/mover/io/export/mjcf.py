@@ -6,7 +6,6 @@ People are a mocap body for each joint, with a keyframe for each frame of the vi
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import torch
@@ -19,7 +18,7 @@ from mover.core.records import record
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, Scene
 from mover.geometry.rotations import axis_angle
-from mover.io.export.finished import Exported, Finished
+from mover.io.export.finished import BodyForm, Exported, Finished
 from mover.io.export.looks import Look, looks_of
 from mover.io.export.people import FPS, tracks_of
 from mover.io.export.posed import Skin, all_angles, rest_of, rows_of, skin_for
@@ -175,7 +174,6 @@ def _few(values: Tensor) -> str:
 
 STEP = 0.002  # [s]
 VISUAL, COLLISION = "meshes/visual", "meshes/collision"
-BodyForm = Literal["auto", "skin", "morph", "none"]
 RESERVED = "world"
 
 

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from mover.bodies import load_model
 from mover.bodies.skinning import SkinnedBody
+from mover.core.errors import InputError
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle, rotation_vectors
-from mover.io.export.finished import Finished
+from mover.io.export.finished import BodyForm, Finished
 from mover.io.export.people import tracks_of
 
 SAME = 0.01  # [m], a similarity that leaves more did not make the result's body
@@ -164,6 +165,20 @@ def skin_for(finished: Finished, influences: int) -> Skin | str:
     skin = _fit(motion, model, finished.bodies, influences)
     if not skin.miss <= SKIN_MISS:
         return f"its bones miss the result's meshes by {skin.miss:.3f} m"
+    return skin
+
+
+def bones_for(finished: Finished, body: BodyForm, influences: int) -> Skin | str:
+    """The bones on which people move as was asked, or why they move by shapes.
+
+    Raises:
+        InputError: If bones are asked for and there are none.
+    """
+    if finished.bodies is None or body in ("morph", "none"):
+        return "it was not asked for"
+    skin = skin_for(finished, influences)
+    if isinstance(skin, str) and body == "skin":
+        raise InputError(f"--body skin: {skin}")
     return skin
 
 

@@ -4,20 +4,18 @@ import math
 from collections.abc import Iterator
 from itertools import zip_longest
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 
 from mover.core.colours import Colour, colour
-from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, SceneObject, Segment
 from mover.geometry.camera import NEAR
-from mover.io.export.finished import Exported, Finished
+from mover.io.export.finished import BodyForm, Exported, Finished, Up
 from mover.io.export.people import FPS, tracks_of
-from mover.io.export.posed import Skin, skin_for
+from mover.io.export.posed import Skin, bones_for
 from mover.io.export.scene_glb import floor_of, parts_of, view_matrix
 from mover.io.export.shell import HEIGHT, Wall, Walls, slab, wall_notes
 from mover.io.export.solids import AXES, FRICTION, Solid, floor_height, solids_of
@@ -131,8 +129,6 @@ def _bind(prim: Prim, wood: Prim) -> None:
 
 APERTURE = 20.955  # width of the film [tenths of a scene unit by USD's custom: mm]
 FAR = 1000.0  # [m]
-BodyForm = Literal["auto", "skin", "morph", "none"]
-Up = Literal["y", "z"]
 
 
 def export_usd(
@@ -159,7 +155,7 @@ def export_usd(
     Raises:
         InputError: If usd-core is not installed, or bones are asked for and there are none.
     """
-    skin, shell = _skin(finished, body), ()
+    skin, shell = bones_for(finished, body, INFLUENCES), ()
     if walls == "guess":
         shell = finished.shell()
     path = folder / "scene.usdc"
@@ -182,15 +178,6 @@ def _add_people(stage: Stage, bodies: Bodies | None, skin: Skin | str) -> None:
             add_skeleton(stage, skin, bodies, track)
         else:
             add_moving_mesh(stage, bodies, track)
-
-
-def _skin(finished: Finished, body: BodyForm) -> Skin | str:
-    if finished.bodies is None or body in ("morph", "none"):
-        return "it was not asked for"
-    skin = skin_for(finished, INFLUENCES)
-    if isinstance(skin, str) and body == "skin":
-        raise InputError(f"--body skin: {skin}")
-    return skin
 
 
 def _notes(finished: Finished, skin: Skin | str, body: BodyForm) -> tuple[str, ...]:

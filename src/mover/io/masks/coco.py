@@ -1,6 +1,6 @@
 """What every COCO file has: images, categories, masks as polygons or run-length codes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -151,6 +151,31 @@ def mask_of(at: At, camera: Camera, warn: Warn) -> Masks | None:
     if leaves_image(given.value, *size):
         warn(f"{given.place} leaves the image and was clipped")
     return Masks(*size, (code,))
+
+
+def annotations_tree(
+    rows: Sequence[Mapping[str, Any]],
+    image: Mapping[str, Any],
+    names: Sequence[str] | None = None,
+    first: int = 0,
+) -> dict[str, Any]:
+    """The content of objects.json of rows that have the names of their categories as ids.
+
+    Args:
+        rows: Annotations of the one image.
+        image: Its fields but the id, 0.
+        names: All categories; None: those of the rows.
+        first: The id of the first.
+    """
+    names = list(dict.fromkeys(row["category_id"] for row in rows)) if names is None else names
+    known = {name: first + i for i, name in enumerate(names)}
+    return {
+        "images": [{**image, "id": 0}],
+        "categories": [{"id": key, "name": name} for name, key in known.items()],
+        "annotations": [
+            {**row, "image_id": 0, "category_id": known[row["category_id"]]} for row in rows
+        ],
+    }
 
 
 def segmentation(masks: Masks, index: int) -> dict[str, Any]:

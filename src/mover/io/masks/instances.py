@@ -14,7 +14,7 @@ from mover.core.errors import InputError
 from mover.core.types import Masks
 from mover.geometry.rle import area, decode, encode, tight_box
 from mover.io.files.fields import At, read_json, refuse
-from mover.io.masks.coco import from_coco
+from mover.io.masks.coco import annotations_tree, from_coco
 
 PERSON = frozenset({"person", "people", "human", "man", "woman", "child"})
 SAME_SHAPE = 0.02  # masks of another size fit an image whose sides have this ratio, nearly
@@ -122,7 +122,7 @@ def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
     names = list(dict.fromkeys(item.category for item in items))
     rows: list[dict[str, Any]] = []
     for i, item in enumerate(items):
-        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": names.index(item.category)}
+        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": item.category}
         box = item.box
         if item.mask is not None:
             row["segmentation"] = _segmentation(item.mask, found.size)
@@ -132,12 +132,8 @@ def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
         x, y, right, bottom = box
         rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": item.score})
     width, height = found.size
-    tree = {
-        "images": [{"id": 0, "width": width, "height": height}],
-        "categories": [{"id": i, "name": name} for i, name in enumerate(names)],
-        "annotations": rows,
-    }
-    return At(tree, found.file)
+    image = {"id": 0, "width": width, "height": height}
+    return At(annotations_tree(rows, image, names), found.file)
 
 
 def people_tree(found: Instances, fps: float | None = None) -> At:

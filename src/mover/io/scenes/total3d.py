@@ -39,6 +39,7 @@ from mover.io.files.fields import (
 )
 from mover.io.files.images import image_size, read_image
 from mover.io.files.meshes import KINDS, mesh_of, read_mesh
+from mover.io.masks.coco import annotations_tree
 from mover.io.masks.instances import mask_code
 from mover.io.scenes.placing import about_y
 
@@ -247,14 +248,13 @@ def _annotations(rows: Sequence[At], kept: Sequence[int]) -> dict[str, Any]:
         name, box = choice(get(rows[i], "class"), CLASSES), get(rows[i], "bbox")
         scored = isinstance(box.value, list) and len(box.value) == 5
         left, top, right, bottom, *score = vector(box, 5 if scored else 4)
-        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": CLASSES.index(name)}
+        row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": name}
         row |= {"bbox": [left, top, right - left, bottom - top]}
         if score:
             row["score"] = number(At(score[0], box.file, f"{box.field}[4]"), 0, 1)
         mask = maybe(rows[i], "mask")
         annotations.append(row if mask is None else {**row, "segmentation": mask_code(mask)})
-    categories = [{"id": i, "name": name} for i, name in enumerate(CLASSES)]
-    return {"images": [{"id": 0}], "categories": categories, "annotations": annotations}
+    return annotations_tree(annotations, {}, CLASSES)
 
 
 def _piece(

@@ -28,6 +28,7 @@ from mover.io.files.cameras import camera_of_tree
 from mover.io.files.fields import At, choice, get, items, read_json, refuse, vector
 from mover.io.files.meshes import load_arrays, mesh_of, write_mesh
 from mover.io.files.schema import rigid
+from mover.io.masks.coco import annotations_tree
 from mover.io.scenes.placing import LEVEL, Pieces, category_of_name, tilt_of, without_axes
 from mover.io.scenes.total3d import CLASSES, FURNITURE
 
@@ -134,7 +135,6 @@ def _annotations(rows: list[At], names: list[str], width: float) -> dict[str, An
         long = isinstance(box.value, list) and len(box.value) == 5
         left, top, right, bottom = vector(box, 5 if long else 4)[:4]
         place = [width - right, top, right - left, bottom - top]
-        at = {"id": i, "image_id": 0, "category_id": CLASSES.index(name), "bbox": place}
+        at = {"id": i, "image_id": 0, "category_id": name, "bbox": place}
         annotations.append(at)
-    categories = [{"id": i, "name": name} for i, name in enumerate(CLASSES)]
-    return {"images": [{"id": 0}], "categories": categories, "annotations": annotations}
+    return annotations_tree(annotations, {}, CLASSES)
