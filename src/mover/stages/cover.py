@@ -21,6 +21,7 @@ from mover.core.types import STILL, CameraPath, Capture, Masks, People
 from mover.geometry.boxes import box_of
 from mover.geometry.path import is_still, poses_at
 from mover.geometry.rle import decode, joined, thinned
+from mover.stages.masks import uncovered
 
 STEP = 4  # [px] from one pixel of a carried mask to the next
 LIKE = 2  # so many masks of each piece are carried: a person may stand before one of them
@@ -84,6 +85,15 @@ def covered(cover: Cover) -> Callable[[int], Bool[Tensor, "h w"]]:
         same = pixels_of(cover.masks)
         return lambda _: same
     return cache(lambda frame: _carried(cover, frame))
+
+
+def clear(cover: Cover, width: int) -> Callable[[int], Bool[Tensor, "small_h small_w"]]:
+    """The pixels of a smaller picture in which nothing hides anybody, in a frame."""
+    blocked = covered(cover)
+    if is_still(cover.path):
+        same = uncovered(blocked(0), width)
+        return lambda _: same
+    return cache(lambda frame: uncovered(blocked(frame), width))
 
 
 def pixels_of(masks: Masks) -> Bool[Tensor, "h w"]:

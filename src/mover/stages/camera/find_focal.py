@@ -11,7 +11,6 @@ seen where they are. Then the factor is 1, and the people's depth is wrong with 
 """
 
 import dataclasses
-from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,7 +23,7 @@ from mover.core.types import Bodies, Camera, People
 from mover.geometry.raster import Crops, layers
 from mover.stages.config import FocalConfig
 from mover.stages.contacts.assign_contacts import evenly
-from mover.stages.cover import Cover, covered
+from mover.stages.cover import Cover, clear
 from mover.stages.masks import MaskTable, mask_table, small, uncovered
 
 # How much longer the lens is than it was said to be: a robust line through where people are seen.
@@ -149,12 +148,11 @@ def find_focal(inputs: FocalInputs, config: FocalConfig, observe: Observer = sil
     if config.spread <= 0:
         raise ValueError(f"find_focal: spread {config.spread}, expected above 0")
     table = mask_table(inputs.people, inputs.bodies)
-    blocked = covered(inputs.objects)
-    free = cache(lambda frame: uncovered(blocked(frame), config.width))
+    free = clear(inputs.objects, config.width)
     found: list[tuple[int, Tensor]] = []
     for row in _rows(inputs, config, table):
-        clear = free(int(inputs.bodies.frame[row]))
-        places = _sighting(inputs, config, row, table, clear)
+        there = free(int(inputs.bodies.frame[row]))
+        places = _sighting(inputs, config, row, table, there)
         if places is not None:
             found.append((row, places))
     observe(Step("find_focal", 0, 1))

@@ -15,7 +15,6 @@ scaled about the camera, which no picture sees.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -30,7 +29,7 @@ from mover.geometry.raster import Crops, layers
 from mover.stages.camera.find_foot_contacts import straight_legs
 from mover.stages.config import DepthConfig, FootContactConfig
 from mover.stages.contacts.assign_contacts import evenly, in_turns
-from mover.stages.cover import Cover, covered
+from mover.stages.cover import Cover, clear, covered
 from mover.stages.masks import (
     Extents,
     MaskTable,
@@ -156,7 +155,7 @@ def find_depth(
     found = torch.ones(3, len(tracks)) * torch.tensor([[1.0], [torch.inf], [1.0]])
     table = mask_table(inputs.people, bodies)
     blocked = covered(inputs.objects)
-    free = cache(lambda frame: uncovered(blocked(frame), config.width))
+    free = clear(inputs.objects, config.width)
     for index, person in enumerate(tracks):  # each has its own frames
         rows = ((bodies.person == person) & inputs.keep).nonzero()[:, 0]
         size, note = _size(inputs, rows, str(person))
@@ -260,7 +259,7 @@ def _curves(
     config: DepthConfig,
     rows: Int[Tensor, " rows"],
     table: MaskTable,
-    clear: Callable[[int], Bool[Tensor, "h w"]],
+    free_in: Callable[[int], Bool[Tensor, "h w"]],
 ) -> Float[Tensor, "used factors"]:
     """Overlap of silhouette and mask over the factors, for each body that is seen well."""
     factors = torch.linspace(1 - config.span, 1 + config.span, config.factors)
@@ -269,7 +268,7 @@ def _curves(
         if len(curves) == config.most:
             break
         own, others = table.decode(row)
-        free = clear(int(inputs.bodies.frame[row]))
+        free = free_in(int(inputs.bodies.frame[row]))
         known = free & uncovered(others, config.width)
         mask = small(own, config.width)
         middle = _drawn(inputs, row, free, torch.ones(1))[0]
