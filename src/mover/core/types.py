@@ -42,6 +42,18 @@ class Segment:
 
 
 @record
+class Cage:
+    """A box of 3 x 3 x 3 control points by which a mesh is bent (`geometry.cage`)."""
+
+    low: Float[Tensor, "*items 3"]
+    """Lowest corner, in the mesh's coordinates."""
+    high: Float[Tensor, "*items 3"]
+    """Highest corner."""
+    offset: Float[Tensor, "*items 3 3 3 3"]
+    """How far each control point is moved; the first three axes are x, y, z."""
+
+
+@record
 class SceneObject:
     """One object of a scene: x_world = R_y(yaw) @ (scale * x_mesh) + t_world_object."""
 
@@ -49,7 +61,7 @@ class SceneObject:
     category: str
     mesh: Mesh
     mesh_file: str
-    """Where the mesh came from; it is copied, never rewritten."""
+    """Where the mesh came from; it is copied, and rewritten only where it was bent (`cage`)."""
     annotation: int | None
     """Id of its annotation in the reference image; None: no image evidence."""
     support: str
@@ -63,6 +75,8 @@ class SceneObject:
     segments: tuple[Segment, ...] = ()
     """Where it stands when, of an object that is moved; its own place is that of the reference
     image. Empty: it never moves."""
+    cage: Cage | None = None
+    """How `mesh` was bent from what its file holds; None: it is as in the file."""
 
 
 @record

@@ -78,6 +78,8 @@ class ImageCues:
     """What is known of the objects before they are seen; None: nothing."""
     measured: Measured | None = None
     """What a depth network sees; None: there is none."""
+    beside: Float[Tensor, "objects 4 2"] | None = None
+    """Shares of each side that something touches, and that something is near to; None: unknown."""
 
 
 @record

@@ -150,6 +150,7 @@ def _held(config: Config) -> Config:
     return replace(
         config,
         correct_depth=False,
+        shape="keep",
         height_spread=0.0,
         focal=replace(config.focal, spread=0.0),
         align=replace(config.align, steps=0),

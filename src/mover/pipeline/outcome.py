@@ -28,6 +28,7 @@ from mover.stages.contacts.gather_cues import Cues
 from mover.stages.contacts.propose_supports import KnownTops, ProposeInputs, propose_supports
 from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.explain.placements import ExplainInputs, explain_placements
+from mover.stages.objects.bend_shapes import told_of_shapes
 from mover.stages.objects.find_image_cues import ImageInputs, Seen
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
@@ -44,6 +45,8 @@ class ReconstructionContext:
     prepared: Prepared
     pinned: tuple[str, ...] = ()
     """Ids of the objects that stay where the capture has them."""
+    misfit: Float[Tensor, " objects"] | None = None
+    """What box and silhouette left of shapes before they were bent: doubt of them stays."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
     capture, placed = context.capture, state.placed
     pieces = to_objects(capture.scene.objects, context.prepared, placed.layout)
     alone = to_objects(capture.scene.objects, context.prepared, state.alone)
-    warnings = [*capture.warnings, *context.prepared.warnings]
+    warnings = [*capture.warnings, *context.prepared.warnings, *told_of_shapes(pieces)]
     bodies = None
     if people is not None:
         bodies = to_world(people.bodies, state.camera)

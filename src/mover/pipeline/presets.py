@@ -8,7 +8,7 @@
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from mover.core.settings import float_in, int_in
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
@@ -16,6 +16,7 @@ from mover.stages.camera.config import DriftConfig, ScaleConfig, ViewConfig
 from mover.stages.config import (
     AlignConfig,
     AssignConfig,
+    BendConfig,
     ContactConfig,
     DepthConfig,
     ExplainConfig,
@@ -68,6 +69,10 @@ class Config:
     """Camera and ground refined with the objects."""
     sizes: SpreadConfig = field(default_factory=SpreadConfig)
     """How far the given sizes are believed in this room."""
+    shape: Literal["keep", "bend"] = "keep"
+    """Meshes whose shapes do not fit the image are bent a little towards it, or kept."""
+    bend: BendConfig = field(default_factory=BendConfig)
+    """How far they are bent."""
     gather: GatherConfig = field(default_factory=GatherConfig)
     """Evidence from all people."""
     assign: AssignConfig = field(default_factory=AssignConfig)
@@ -152,6 +157,7 @@ ROBUST = Config(
     ),
     refine=RefineConfig(rounds=1),
     sizes=SpreadConfig(0.05),
+    shape="bend",
     gather=GatherConfig(erode=1, reach=0.1),
     assign=_GROUPS,
     place=PlaceConfig(

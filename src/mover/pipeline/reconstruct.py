@@ -47,6 +47,7 @@ from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts
 from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import GatherInputs, cues_in_windows, gather_cues
 from mover.stages.contacts.propose_supports import NOTHING
+from mover.stages.objects.bend_shapes import BendInputs, bend_shapes, with_shapes
 from mover.stages.objects.find_image_cues import (
     ImageInputs,
     evidence_at,
@@ -57,13 +58,19 @@ from mover.stages.objects.find_image_cues import (
 )
 from mover.stages.objects.gather_depth import DepthInputs, gather_depth
 from mover.stages.objects.gather_given import (
+    UNFIT,
     believed_sides,
     common_scale,
     gather_given,
     lighter_where_used,
 )
 from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
-from mover.stages.objects.place_objects import estimate_size_prior, inlier_weights, place_objects
+from mover.stages.objects.place_objects import (
+    estimate_size_prior,
+    inlier_weights,
+    place_objects,
+    priced,
+)
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
 from mover.stages.objects.starts import (
     ReinitInputs,
@@ -111,9 +118,11 @@ def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str
     context = with_size_prior(context, state)
     for _ in range(config.refine.rounds):
         state = with_refined_camera(context, people, state)
+    image_energy = state.placed.energy[0]
+    context, state = with_shapes_bent(context, state)
+    image_energy = torch.maximum(image_energy, state.placed.energy[0])
     people, state = with_common_scale(context, people, state)
     state = gathered(context, people, state)
-    image_energy = state.placed.energy[0]
     state = placed_with_people(context, people, assigned(context, people, state), image_energy)
     for _ in range(config.outer_iterations):
         state = assigned(context, people, with_order(context, state))
@@ -185,13 +194,44 @@ def with_given(
     free = replace(image, sides=believed_sides(image.sides, torch.zeros_like(image.trust)))
     if before is None or not context.config.place.weights.given:
         return free
-    misfit = only(bbox=1.0, silhouette=1.0)
-    energy = energy_function(objects, before.camera, free, NOBODY, SceneConfig(misfit, "robust"))(
-        alone(before.placed.layout)
-    )
-    left = energy.per_item[0].detach()
+    left = misfit_of(context, free, before)
+    if context.misfit is not None:
+        left = torch.maximum(left, context.misfit)
     known = gather_given(objects, given, before.placed.layout, left)
-    return replace(image, given=known, sides=believed_sides(image.sides, known.weight))
+    return replace(
+        image, given=known, sides=believed_sides(image.sides, known.weight, image.beside)
+    )
+
+
+def misfit_of(
+    context: ReconstructionContext, image: ImageCues, state: SceneState
+) -> Float[Tensor, " objects"]:
+    """What box and silhouette leave of each object where it stands."""
+    config = SceneConfig(only(bbox=1.0, silhouette=1.0), "robust")
+    energy = energy_function(context.prepared.objects, state.camera, image, NOBODY, config)
+    return energy(alone(state.placed.layout)).per_item[0].detach()
+
+
+def with_shapes_bent(
+    context: ReconstructionContext, state: SceneState
+) -> tuple[ReconstructionContext, SceneState]:
+    """Meshes whose shapes do not fit the image bent towards it, and all placed anew."""
+    if context.config.shape == "keep" or state.priced is None:
+        return context, state
+    inputs, config = state.priced
+    given = inputs.image.given
+    if given is None or not bool((given.weight >= UNFIT).any()):
+        return context, state
+    free = replace(inputs.image, sides=believed_sides(inputs.image.sides, 0 * given.weight))
+    misfit = misfit_of(context, free, state)
+    loose = (given.weight >= UNFIT) & ~_is_pinned(context)
+    bend = BendInputs(inputs, priced(config), state.placed.layout, loose)
+    bending = context.run.stage(bend_shapes, bend, context.config.bend)
+    prepared, layout = with_shapes(context.prepared, bending)
+    context = replace(context, prepared=prepared, misfit=misfit)
+    state = replace(state, placed=replace(state.placed, layout=layout))
+    found = placed_by_image(context, state.camera, state.ground, state)
+    return context, replace(found, traces={**state.traces, **found.traces})
 
 
 def with_measured(

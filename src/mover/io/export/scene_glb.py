@@ -15,6 +15,7 @@ from mover.geometry.camera import NEAR
 from mover.geometry.placement import place_object
 from mover.geometry.rotations import affine, rot_y
 from mover.io.export.finished import Exported, Finished
+from mover.io.files.meshes import bent_part
 
 GHOSTS = 12  # at most so many bodies
 FLOOR_MARGIN = 1.0  # [m] beyond the furniture
@@ -91,6 +92,8 @@ def parts_of(piece: SceneObject, tint: Colour) -> list[tuple[Any, np.ndarray]]:
     for node in loaded.graph.nodes_geometry:
         transform, name = loaded.graph[node]
         part = loaded.geometry[name]
+        if piece.cage is not None:
+            part, transform = bent_part(part, transform, piece.cage), np.eye(4)
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
             found.append((_finished(part, tint, piece.id), np.asarray(transform)))
     return found or [(_solid(piece.mesh, (*tint, 1.0), piece.id), np.eye(4))]

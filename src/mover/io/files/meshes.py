@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.files import copy_whole, replacing
-from mover.core.types import Mesh
+from mover.core.types import Cage, Mesh
+from mover.geometry.cage import bent
 from mover.io.files.fields import LARGEST, LARGEST_FILE, At, reason, refuse, shown, text
 
 KINDS = (".glb", ".gltf", ".obj", ".ply", ".off", ".stl")
@@ -165,6 +166,40 @@ def copy_mesh(source: Path, folder: Path, name: str) -> Path:
     for file in beside:
         copy_whole(source.parent / file, home / file)
     return target
+
+
+def bend_file(path: Path, cage: Cage) -> Path:
+    """A mesh file bent where it lies: parts, materials and textures stay; it becomes a .glb.
+
+    Args:
+        path: A copy, which goes if it has another ending.
+        cage: In the coordinates of the whole, with the transforms of the nodes applied.
+    """
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of parsers, as in `load_arrays`
+        whole = trimesh.load_scene(str(path), process=False)
+    out = trimesh.Scene()
+    for node in whole.graph.nodes_geometry:
+        matrix, name = whole.graph[node]
+        out.add_geometry(bent_part(whole.geometry[name], matrix, cage), node_name=node)
+    target = path.with_suffix(".glb")
+    with replacing(target) as file:
+        file.write_bytes(export_glb(out))
+    if target != path:
+        path.unlink()
+    return target
+
+
+def bent_part(part: Any, matrix: NDArray[Any], cage: Cage) -> Any:  # noqa: ANN401
+    """A part of a scene of trimesh, put where its node has it, and bent there."""
+    part = part.copy()
+    part.apply_transform(matrix)
+    verts = torch.from_numpy(np.array(part.vertices, dtype=np.float32))
+    part.vertices = bent(verts, cage).numpy()
+    return part
 
 
 def companions(path: Path) -> tuple[Path, ...]:

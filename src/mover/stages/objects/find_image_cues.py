@@ -84,6 +84,7 @@ def ground_without_people(capture: Capture, prepared: Prepared) -> float:
 
 BORDER = 1.5  # [px], a side this close to the image's border is cut by it
 STRIP = 0.06  # of the box's size: how far beyond a side one looks for what may hide it
+GAP = 0.02  # of the image's width: two cells of a coarse mask, by which masks of neighbours part
 MARGIN = 0.3  # of the box's larger side: how much a window is larger than the box (PHOSA)
 
 
@@ -129,9 +130,11 @@ def find_image_cues(
     if config.borders:
         zoom = views.K[:, 0, 0] / inputs.camera.K[0, 0]
         borders = borders_of(own, zoom, config.borders)
+    beside = _beside(inputs, others) if config.bounded else None
     return ImageCues(
-        inputs.boxes, sides, views, own, keep, trust, inputs.distance, outline, borders
-    )
+        inputs.boxes, sides, views, own, keep, trust, inputs.distance, outline, borders,
+        beside=beside,
+    )  # fmt: skip
 
 
 def free_sides(inputs: ImageInputs, config: ImageConfig) -> Bool[Tensor, "objects 4"]:
@@ -168,9 +171,23 @@ def _sides(
     return torch.where(inside, torch.where(free, SEEN, LIKELY if config.bounded else LEAST), LEAST)
 
 
-def _strip(box: Float[Tensor, "4"], side: int) -> Float[Tensor, "4"]:
+def _beside(
+    inputs: ImageInputs, others: Bool[Tensor, "objects h w"]
+) -> Float[Tensor, "objects 4 2"]:
+    """Shares of each side of the boxes that something touches, and that something is near to."""
+    rows: list[Tensor] = []
+    for own, box in zip(others, inputs.boxes, strict=True):
+        for side in range(4):
+            part = _part(own, _strip(box, side, GAP * inputs.camera.width))
+            near = part.any(1 - side % 2).float().mean() if part.numel() else torch.zeros(())
+            rows += [_share(own, _strip(box, side)), near]
+    return torch.stack(rows).reshape(len(inputs.boxes), 4, 2)
+
+
+def _strip(box: Float[Tensor, "4"], side: int, least: float = 0.0) -> Float[Tensor, "4"]:
     """The thin box just beyond one side (0 left, 1 top, 2 right, 3 bottom)."""
     depth = STRIP * (box[2:] - box[:2]).clamp_min(1).prod().sqrt().clamp_min(2)
+    depth = depth.clamp_min(least)
     axis, strip = side % 2, box.clone()
     if side < 2:
         strip[axis], strip[axis + 2] = box[axis] - depth, box[axis]
@@ -180,10 +197,14 @@ def _strip(box: Float[Tensor, "4"], side: int) -> Float[Tensor, "4"]:
 
 
 def _share(mask: Bool[Tensor, "h w"], box: Float[Tensor, "4"]) -> Float[Tensor, ""]:
+    part = _part(mask, box)
+    return part.float().mean() if part.numel() else torch.tensor(0.0)
+
+
+def _part(mask: Bool[Tensor, "h w"], box: Float[Tensor, "4"]) -> Bool[Tensor, "rows columns"]:
     height, width = mask.shape
     x0, y0, x1, y1 = (round(v) for v in box.tolist())
-    part = mask[max(0, y0) : min(height, max(y1, y0 + 1)), max(0, x0) : min(width, max(x1, x0 + 1))]
-    return part.float().mean() if part.numel() else torch.tensor(0.0)
+    return mask[max(0, y0) : min(height, max(y1, y0 + 1)), max(0, x0) : min(width, max(x1, x0 + 1))]
 
 
 def order_of(

@@ -9,12 +9,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.types import Layout, Objects
-from mover.energy.terms.bbox import LEAST, LIKELY
+from mover.energy.terms.bbox import LEAST, LIKELY, SEEN
 from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.given import AWAY, SIZE, TURN, Given
 from mover.furniture.library import STANDARD, WALL_PIECES
 
 FIT = 0.1  # image energy (robust form) of a shape that fits
+PART, WHOLE = 0.2, 0.9  # shares of a side that something is near to, or touches
 UNFIT = 0.5  # weight from which on a shape does not fit, or only as something hides it
 WEIGHTS = (0.05, 2.0)  # least and largest weight
 LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of 1 [rad]
@@ -78,10 +79,20 @@ def lighter_where_used(
 
 
 def believed_sides(
-    sides: Int[Tensor, "objects 4"], weight: Float[Tensor, " objects"]
+    sides: Int[Tensor, "objects 4"],
+    weight: Float[Tensor, " objects"],
+    beside: Float[Tensor, "objects 4 2"] | None = None,
 ) -> Int[Tensor, "objects 4"]:
-    """What is known of the sides of boxes, with no bound (`LIKELY`) for shapes that fit."""
+    """What is known of the sides of boxes, with no bound (`LIKELY`) for shapes that fit.
+
+    Where shapes do not fit, masks are coarse, too: what is near to a side may hide more behind it,
+    and what touches all of it does so about as often as not (`ImageCues.beside`).
+    """
     fits = (weight < UNFIT).unsqueeze(-1)
+    if beside is not None:
+        near = (sides == SEEN) & (beside[..., 1] > PART)
+        covered = (sides == LIKELY) & (beside[..., 0] > WHOLE)
+        sides = torch.where(~fits & near, LIKELY, torch.where(~fits & covered, LEAST, sides))
     return torch.where(fits & (sides == LIKELY), LEAST, sides)
 
 

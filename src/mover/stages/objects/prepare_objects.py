@@ -14,8 +14,9 @@ from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import fingerprint, record
 from mover.core.run import kept, sources
-from mover.core.types import Layout, Mesh, Objects, SceneObject
+from mover.core.types import Cage, Layout, Mesh, Objects, SceneObject
 from mover.furniture.library import BACKS, SEATS, canonical
+from mover.geometry.cage import bent
 from mover.geometry.mesh import box, decimate, sample_surface, signed_volume, used
 from mover.geometry.occupancy import load_occupancy, occupied_mesh
 from mover.geometry.placement import FREE, GROUND
@@ -129,6 +130,8 @@ class Prepared:
     scale: Float[Tensor, "objects 3"]
     """Initial scale."""
     warnings: tuple[str, ...]
+    cages: Cage | None = None
+    """How each mesh is bent, in its own coordinates (`bend_shapes`); None: none is."""
 
 
 @record
@@ -175,8 +178,22 @@ def to_objects(
     origin = layout.t_world_object - back
     return tuple(
         dataclasses.replace(p, t_world_object=origin[i], yaw=layout.yaw[i], scale=scale[i])
-        for i, p in enumerate(pieces)
+        for i, p in enumerate(bent_pieces(pieces, prepared.cages))
     )
+
+
+def bent_pieces(pieces: tuple[SceneObject, ...], cages: Cage | None) -> tuple[SceneObject, ...]:
+    """The pieces with their meshes bent; those whose cage moves nothing stay as they are."""
+    if cages is None:
+        return pieces
+    out: list[SceneObject] = []
+    for i, piece in enumerate(pieces):
+        cage = Cage(cages.low[i], cages.high[i], cages.offset[i])
+        if bool(cage.offset.any()):
+            mesh = Mesh(bent(piece.mesh.verts, cage), piece.mesh.faces)
+            piece = dataclasses.replace(piece, mesh=mesh, cage=cage)
+        out.append(piece)
+    return tuple(out)
 
 
 def proxy_meshes(prepared: Prepared) -> tuple[Mesh, ...]:

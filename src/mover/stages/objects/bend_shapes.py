@@ -1,0 +1,150 @@
+r"""Bend meshes whose shapes do not fit the image (not in the paper, whose shapes are given).
+
+A tool that makes a mesh from one picture chooses another design, rounds it and is off by some per
+cent of its size; placed truly, its silhouette is smaller than the mask, and the piece comes nearer
+until it fills it. So place, turn, size and shape are found together:
+
+    min  L_scene(layout, mesh bent by d) + w \sum |d|^2 / 2 \sigma^2
+
+with d the moves of 27 control points as shares of the box (`geometry.cage`), without what a
+placement could do and the same left and right. Only pieces whose shapes do not fit are bent: the
+others stay as they are, to the bit.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mover.core.observe import Energy, Observer, silent
+from mover.core.records import record
+from mover.core.types import Cage, Layout, Objects, SceneObject
+from mover.energy.config import SceneConfig
+from mover.energy.minimize import minimize
+from mover.energy.objective import scene_energy
+from mover.geometry.cage import bent, even
+from mover.geometry.mesh import box
+from mover.geometry.placement import rest_on_support
+from mover.geometry.rotations import rot_y
+from mover.stages.config import BendConfig
+from mover.stages.objects.place_inputs import PlaceInputs, hold
+from mover.stages.objects.prepare_objects import Prepared
+
+
+@record
+class BendInputs:
+    """Furniture where it was placed, and which of it may be bent."""
+
+    inputs: PlaceInputs
+    """What it was placed by."""
+    scene: SceneConfig
+    """How that is priced."""
+    layout: Layout
+    loose: Bool[Tensor, " objects"]
+    """Whose shapes do not fit."""
+
+
+@record
+class Bending:
+    """Shapes, and where they stand."""
+
+    offset: Float[Tensor, "objects 3 3 3 3"]
+    """Moves of the control points as shares of the box; 0 where a mesh is kept."""
+    layout: Layout
+    """Of the unbent boxes."""
+
+
+@record
+class _Free:
+    t_world_object: Float[Tensor, "objects 3"]
+    yaw: Float[Tensor, " objects"]
+    log_scale: Float[Tensor, "objects 3"]
+    offset: Float[Tensor, "objects 3 3 3 3"]
+
+
+def bend_shapes(inputs: BendInputs, config: BendConfig, observe: Observer = silent) -> Bending:
+    """Find shapes and places together."""
+    known, start = inputs.inputs, inputs.layout
+    objects, loose = known.objects, inputs.loose.to(start.yaw)
+
+    def layout_of(free: _Free) -> Layout:
+        there = Layout(free.t_world_object, free.yaw, free.log_scale)
+        there = hold(there, known.pinned)
+        return rest_on_support(there, objects.supports, objects.size[:, 1], known.ground)
+
+    def shape_of(free: _Free) -> Tensor:
+        return even(free.offset) * loose.view(-1, 1, 1, 1, 1)
+
+    def energy(free: _Free) -> Energy:
+        offset = shape_of(free)
+        verts = bent(objects.verts, _cages(objects, offset))
+        found = scene_energy(
+            layout_of(free), replace(objects, verts=verts), known.camera, known.image,
+            known.humans, inputs.scene,
+        )  # fmt: skip
+        bend = config.weight * (offset / config.sigma).square().flatten(1).sum(-1) / 2
+        return Energy({"placed": found.per_item, "bend": bend})
+
+    none = torch.zeros(len(objects.ids), 3, 3, 3, 3).to(start.yaw)
+    begin = _Free(start.t_world_object, start.yaw, start.log_scale, none)
+    found = minimize(energy, begin, config.method, observe, "bend_shapes").at
+    moved = layout_of(found)
+    keep = inputs.loose
+    layout = Layout(
+        torch.where(keep[:, None], moved.t_world_object, start.t_world_object),
+        torch.where(keep, moved.yaw, start.yaw),
+        torch.where(keep[:, None], moved.log_scale, start.log_scale),
+    )
+    return Bending(shape_of(found), layout)
+
+
+def _cages(objects: Objects, offset: Float[Tensor, "objects 3 3 3 3"]) -> Cage:
+    """Cages about the boxes, in the objects' frames [m]."""
+    half = objects.size * torch.tensor([0.5, 0.0, 0.5]).to(objects.size)
+    return Cage(-half, objects.size - half, offset * objects.size[:, None, None, None])
+
+
+def with_shapes(prepared: Prepared, bending: Bending) -> tuple[Prepared, Layout]:
+    """The furniture bent, each frame again at the middle of its box's bottom, and its layout."""
+    objects, layout = prepared.objects, bending.layout
+    cages = _cages(objects, bending.offset)
+    verts = bent(objects.verts, cages)
+    low, high = (torch.stack(ends) for ends in zip(*(box(v) for v in verts), strict=True))
+    base = torch.stack([(low[:, 0] + high[:, 0]) / 2, low[:, 1], (low[:, 2] + high[:, 2]) / 2], -1)
+    some = bending.offset.flatten(1).any(-1)
+    base = torch.where(some[:, None], base, 0)
+    size = torch.where(some[:, None], high - low, objects.size)
+
+    def shaped(points: Tensor) -> Tensor:
+        return torch.where(some[:, None, None], bent(points, cages) - base[:, None], points)
+
+    new = replace(
+        objects, verts=shaped(objects.verts), samples=shaped(objects.samples),
+        top=shaped(objects.top), back=shaped(objects.back), size=size,
+    )  # fmt: skip
+    away = (layout.log_scale.exp() * base).unsqueeze(-1)
+    moved = layout.t_world_object + (rot_y(layout.yaw) @ away).squeeze(-1)
+    unit, center = prepared.scale, prepared.center
+    own = Cage(
+        cages.low / unit + center, cages.high / unit + center,
+        (cages.offset - base[:, None, None, None]) / unit[:, None, None, None],
+    )  # fmt: skip
+    there = replace(layout, t_world_object=torch.where(some[:, None], moved, layout.t_world_object))
+    return replace(prepared, objects=new, cages=own), there
+
+
+def told_of_shapes(pieces: tuple[SceneObject, ...]) -> tuple[str, ...]:
+    """A sentence for each piece that was bent."""
+    return tuple(
+        f"{piece.id}: its mesh does not fit the image and is bent, by up to"
+        f" {100 * _farthest(piece, piece.cage):.0f} cm (`--shape keep` leaves it)"
+        for piece in pieces
+        if piece.cage is not None
+    )
+
+
+def _farthest(piece: SceneObject, cage: Cage) -> float:
+    """How far a control point is moved at most, about their middle move [m]."""
+    moved = cage.offset.reshape(-1, 3)
+    return float(((moved - moved.mean(0)) * piece.scale).norm(dim=-1).max())
