@@ -15,6 +15,7 @@ from mover.geometry.topology import is_closed as is_closed
 from mover.geometry.topology import manifold, volumes
 
 OVERSAMPLING = 5  # candidates for each even sample
+TRIED = 8000  # vertices, at least, of a heavy mesh that are looked at
 STRAY = 0.03  # of the longest side; no vertex may be further from the decimated surface
 FOLD = 1e-9  # of the cube of the longest side; closed pieces of less volume are folded faces
 CAUTION = 5  # of fast_simplification: 7 is its default, less is slower and better
@@ -155,12 +156,14 @@ def _outer(mesh: Mesh) -> Mesh:
 def _strays(mesh: Mesh, whole: Mesh, small: Mesh) -> float:
     """Farthest vertex of a mesh from its simplification, over the longest side of its box.
 
+    Of a mesh of many vertices, which stand closer than that matters, every second, third, ... one.
+
     What was left out of the whole simplification may lie inside the rest only: a hollow whose way
     out became too narrow is no part of the shape, a leg that was turned inside out is.
     """
     import igl
 
-    verts = as_float64(mesh.verts)
+    verts = as_float64(mesh.verts)[:: max(1, len(mesh.verts) // TRIED)]
     squared, _, _ = closest(verts, as_float64(whole.verts), as_int64(whole.faces))
     if small is not whole:
         solid = as_float64(small.verts), as_int64(small.faces)
