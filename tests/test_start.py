@@ -62,6 +62,25 @@ def test_the_progress_tells_that_kernels_are_compiled_and_only_the_first_time(tm
     assert second.strip() == "gather ..."
 
 
+@pytest.mark.slow
+def test_what_is_not_compiled_yet_is_compiled_by_a_process_beside(tmp_path):
+    code = """
+from mover.app.cli import warm
+from mover.geometry.warp_start import is_compiled
+warm.cores = lambda: 2
+warm.KERNELS = warm.KERNELS[-1:]
+warm.compile_beside()
+warm.compile_beside()
+assert len(warm._beside) == 1
+assert warm._beside[0].wait() == 0
+assert is_compiled("farthest", "cpu")
+warm._beside.clear()
+warm.compile_beside()
+assert not warm._beside
+"""
+    assert said(code, WARP_CACHE_PATH=str(tmp_path)) == ""
+
+
 def test_kernels_in_the_cache_are_loaded_without_a_word(caplog):
     warp_start.kernels("lookup", "cpu")  # the first on this machine may tell
     warp_start._loaded.cache_clear()

@@ -11,6 +11,7 @@ from mover.app.cli import say
 from mover.app.cli.config import Device, parsed, preset_named
 from mover.app.cli.run import reconstruct_into
 from mover.app.cli.waiting import WAITING
+from mover.app.cli.warm import compile_beside
 from mover.core.settings import Seconds, Seed, float_in, int_in
 from mover_bench.studies.args import ExperimentArgs, MakeArgs, StudyArgs
 
@@ -48,6 +49,7 @@ def demo(arguments: Sequence[str]) -> None:
     if not (folder / "truth" / "scene.json").exists():
         say("making a known room: furniture, a person, masks ...")
         WAITING.show("making a known room")
+        compile_beside()
         room = demo_room()
         write_capture(add_noise(room, NoiseConfig(), args.seed), folder)
         write_truth(room.truth, room.bodies, folder / "truth")

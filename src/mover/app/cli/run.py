@@ -13,6 +13,7 @@ from mover.app.batch.engines import ARRAY, EngineOptions, RayOptions, SlurmOptio
 from mover.app.cli import say
 from mover.app.cli.config import Device, chosen_config, parsed_with
 from mover.app.cli.waiting import WAITING
+from mover.app.cli.warm import compile_beside
 from mover.core.errors import InputError
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
@@ -111,6 +112,7 @@ def reconstruct_into(
     from mover.pipeline.reconstruct import reconstruct
 
     torch.set_num_threads(THREADS)
+    compile_beside()
     capture, pinned = apply_edits(capture, origin.edits)
     with Bar() as bar:
         observe = bar if watch is None else both(bar, watch)
