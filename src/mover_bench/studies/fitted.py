@@ -16,18 +16,15 @@ from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, Keypoints, Room
-from mover.evaluate.contact import close_meshes, furniture_of
-from mover.evaluate.evaluation import evaluate_people
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import FitConfig
 from mover.fitting.presets import FITS, PAPER_ROOM, at_most, without
 from mover.fitting.prior import ANGLES
-from mover.pipeline.outcome import to_world
 from mover.pipeline.refit import refit_bodies
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
 from mover_bench.rooms.seen import joints_seen
-from mover_bench.studies.measures import Trial, in_true_room, under_camera
+from mover_bench.studies.measures import Trial, in_true_room, judge_people, under_camera
 
 STEPS = 100  # iterations of a stage of the fit at most, a third of the preset's
 BASELINE, ROBUST, TRUE_ROOM = "baseline", "robust", "true room"
@@ -73,7 +70,6 @@ def fitted_trial(trial: Trial, seed: int, run: Run) -> Trial:
 
 def measure_fitted(trial: Trial, room: Room, row: str, seed: int) -> dict[str, Any]:
     """The people against the true ones, fitted again as a row of the paper's table says."""
-    assert trial.bodies is not None, "a known room has true people"
     if row == BASELINE:  # under the camera that was guessed
         room = under_camera(room, trial.capture, trial.capture.scene.camera)
     elif row == TRUE_ROOM:
@@ -84,9 +80,4 @@ def measure_fitted(trial: Trial, room: Room, row: str, seed: int) -> dict[str, A
     elif row in LACKS:
         config = at_most(without(PAPER_ROOM, *LACKS[row]), STEPS)
         found = refit_bodies(room, sighted(trial, seed), None, (config, ANGLES)).bodies
-    assert found is not None, "the people were carried into a room"
-    truth = to_world(trial.bodies, trial.truth.camera)
-    scene = room.scene
-    solid = furniture_of(scene.objects, close_meshes(scene.objects))
-    values = evaluate_people(found, scene.ground, solid, truth)
-    return {"initial": {}, "image": {}, "full": values, "objects": [], "warnings": []}
+    return judge_people(trial, room.scene, found)

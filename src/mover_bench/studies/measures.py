@@ -345,10 +345,16 @@ def measure_people(trial: Trial, room: Room, row: str) -> dict[str, Any]:
     found = room.bodies
     if weights is not None:
         found = refine_bodies(room, trial.capture, RefineBodiesConfig(weights=weights)).bodies
-    assert found is not None, "the people were carried into a room"
-    truth = to_world(trial.bodies, trial.truth.camera)
     if row == TRUTH:
-        found, scene = truth, trial.truth
+        found, scene = to_world(trial.bodies, trial.truth.camera), trial.truth
+    return judge_people(trial, scene, found)
+
+
+def judge_people(trial: Trial, scene: Scene, found: Bodies | None) -> dict[str, Any]:
+    """The metrics of people in a room against the true ones."""
+    assert found is not None, "the people were carried into a room"
+    assert trial.bodies is not None, "a known room has true people"
+    truth = to_world(trial.bodies, trial.truth.camera)
     solid = furniture_of(scene.objects, close_meshes(scene.objects))
     values = evaluate_people(found, scene.ground, solid, truth)
     return {"initial": {}, "image": {}, "full": values, "objects": [], "warnings": []}

@@ -79,10 +79,7 @@ def labelled(rooms: str, names: Mapping[str, str]) -> list[Row]:
 
 def quoted_rows(names: Sequence[str], rows: Mapping[str, published.Values]) -> list[Row]:
     """Rows of the paper."""
-    return [
-        Row(label, quoted={n: v for n, v in zip(names, values, strict=True) if v is not None})
-        for label, values in rows.items()
-    ]
+    return [Row(label, quoted=values) for label, values in published.quoted(names, rows)]
 
 
 def ablation(ask: Ask) -> Sequence[Table]:

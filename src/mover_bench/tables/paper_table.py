@@ -19,11 +19,11 @@ from mover.core.observe import Observer, Step, silent
 from mover.core.settings import int_in
 from mover.io.datasets import pigraphs, prox_files
 from mover.pipeline.presets import PRESETS
+from mover_bench.studies.compare import markdown
 from mover_bench.tables import published, rows
 from mover_bench.tables.rows import TableRow
 from mover_bench.tables.table_job import DONE, TableJob, key_of
 
-Quoted = tuple[str, Mapping[str, float]]
 Launch = Callable[[TableJob], Running[int]]
 """Starts a job; where none is given, as a process of its own."""
 MILLIMETRES = 1000.0
@@ -36,7 +36,7 @@ class Part:
     title: str
     columns: tuple[str, ...]
     ours: tuple[TableRow, ...]
-    quoted: tuple[Quoted, ...] = ()
+    quoted: published.Quoted = ()
     note: str = ""
 
 
@@ -54,10 +54,9 @@ class PaperTable:
     """On the overlaps: the paper prints some in percent."""
 
 
-SCENE = ("iou3d", "p2s", "iou2d", "non_collision", "contact")
+SCENE, BODY = published.SCENE_COLUMNS, published.BODY_COLUMNS
 CAMERA = ("pitch_error", "roll_error", "mean_tilt",
           "ground_penetration_frequency", "ground_penetration_distance")  # fmt: skip
-BODY = ("pje", "v2v", "p_pje", "p_v2v")
 SCAN = ("scan_non_collision", "scan_contact")
 SCAN_NOTE = (
     "Scan: the same people in the scanned room, by PROX's `sdf`: non-collision and contact,"
@@ -71,13 +70,6 @@ FEET_NOTE = (
     "Feet are those that bodies tell to stand (the paper: POSA's); more than 1 cm below the floor"
     " counts. Angles in radians."
 )
-
-
-def _quoted(columns: Sequence[str], values: Mapping[str, published.Values]) -> tuple[Quoted, ...]:
-    return tuple(
-        (label, {c: v for c, v in zip(columns, row, strict=True) if v is not None})
-        for label, row in values.items()
-    )
 
 
 _PROX = {k: v for k, v in published.SCENE.items() if not k.endswith("PiGraphs")}
@@ -102,13 +94,13 @@ TABLES: dict[str, PaperTable] = {
         prox_files.VIDEOS,
         (
             Part("Scenes and interaction", SCENE, (*rows.ABLATION, *rows.DETECTED),
-                 _quoted(SCENE, _PROX), BOX_NOTE),
+                 published.quoted(SCENE, _PROX), BOX_NOTE),
             Part("Camera and ground", CAMERA, (rows.ABLATION[0], rows.ABLATION[-1]),
-                 _quoted(_TILT, published.CAMERA), FEET_NOTE),
+                 published.quoted(_TILT, published.CAMERA), FEET_NOTE),
             Part("Length of the video", ("iou3d",), (*rows.LONGER, rows.ABLATION[-1]),
-                 _quoted(("iou3d",), _LENGTH)),
+                 published.quoted(("iou3d",), _LENGTH)),
             Part("Noise on the initial scene", ("iou3d",), (*rows.DISTURBED, rows.ABLATION[-1]),
-                 _quoted(("iou3d",), _NOISE)),
+                 published.quoted(("iou3d",), _NOISE)),
         ),
     ),
     "prox-quantitative": PaperTable(
@@ -116,9 +108,10 @@ TABLES: dict[str, PaperTable] = {
         f"{prox_files.SHOTS} frames of one scene",
         1,
         (
-            Part("Scenes and interaction", SCENE, rows.ABLATION, _quoted(SCENE, _STILLS), BOX_NOTE),
+            Part("Scenes and interaction", SCENE, rows.ABLATION,
+                 published.quoted(SCENE, _STILLS), BOX_NOTE),
             Part("People [mm]", (*BODY, *SCAN), rows.PEOPLE,
-                 _quoted(published.BODY_COLUMNS, published.BODIES), SCAN_NOTE),
+                 published.quoted(published.BODY_COLUMNS, published.BODIES), SCAN_NOTE),
         ),
     ),
     "pigraphs": PaperTable(
@@ -126,7 +119,7 @@ TABLES: dict[str, PaperTable] = {
         f"{pigraphs.VIDEOS} videos of {pigraphs.ROOMS} scenes; overlaps in percent",
         pigraphs.VIDEOS,
         (Part("Scenes", ("iou2d", "iou3d"), (rows.ABLATION[0], rows.ABLATION[1], rows.ABLATION[-1]),
-              _quoted(SCENE, _PIGRAPHS)),),
+              published.quoted(SCENE, _PIGRAPHS)),),
         100.0,
     ),
 }  # fmt: skip
@@ -297,14 +290,14 @@ def _laid_out(
 ) -> str:
     """Our rows, then the published ones in italics."""
     head = ["", *(SHORT[c] for c in part.columns), "recordings"]
-    lines = [head, ["---", *["--:"] * (len(head) - 1)]]
+    lines: list[list[str]] = []
     for row, values in filled:
         cells = [_cell(values.get(c)) for c in part.columns]
         lines.append([row.label, *cells, str(int(values["recordings"]))])
     for label, quoted in part.quoted:
         cells = [_cell(_in_units(quoted.get(c), c, table)) for c in part.columns]
         lines.append([f"*{label}* (paper)", *cells, ""])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown(head, lines)
 
 
 def _in_units(value: float | None, column: str, table: PaperTable) -> float | None:

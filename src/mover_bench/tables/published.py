@@ -5,9 +5,11 @@ CVPR 2022, its tables and its supplement. Measured on PROX and PiGraphs, which c
 that they are not comparable with numbers on known rooms. None: not printed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 Values = tuple[float | None, ...]
+Quoted = tuple[tuple[str, Mapping[str, float]], ...]
+"""Labels of rows, and their numbers by column."""
 
 SCENE_COLUMNS = ("iou3d", "p2s", "iou2d", "non_collision", "contact")
 SCENE: Mapping[str, Values] = {
@@ -67,3 +69,11 @@ NOISE: Mapping[str, Mapping[float, float]] = {
 
 MINUTES: Mapping[str, float] = {"MOVER, a video": 30.0, "HolisticMesh, one image": 45.0}
 """Optimisation of a room on the authors' machine [min]."""
+
+
+def quoted(columns: Sequence[str], values: Mapping[str, Values]) -> Quoted:
+    """What is printed of some rows."""
+    return tuple(
+        (label, {c: v for c, v in zip(columns, row, strict=True) if v is not None})
+        for label, row in values.items()
+    )
