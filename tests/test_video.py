@@ -249,6 +249,19 @@ class TestCuts:
         assert cut_warning(torch.arange(8) / 5, cuts_of(drift(agree)), (0, 8)) is None
 
 
+def test_heights_are_told_to_the_room_by_track(tmp_path: Path):
+    rows = [{"track_id": 7}, {"track_id": 3}, {"track_id": 7}]
+    (tmp_path / "people.json").write_text(json.dumps({"info": {"fps": 5}, "annotations": rows}))
+    chain.tell_heights(tmp_path, (1.6, 1.8))
+    info = json.loads((tmp_path / "people.json").read_text())["info"]
+    assert info == {"fps": 5, "heights": {"3": 1.6, "7": 1.8}}
+    chain.tell_heights(tmp_path, (1.7,))
+    assert json.loads((tmp_path / "people.json").read_text())["info"]["heights"]["7"] == 1.7
+    with pytest.raises(InputError, match="height: 3 are given, expected 1, or 2: one a person"):
+        chain.tell_heights(tmp_path, (1.6, 1.7, 1.8))
+    chain.tell_heights(tmp_path / "none", (1.7,))  # nobody is seen: nothing to tell
+
+
 @pytest.mark.long
 def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
     tmp_path: Path, small_room, capsys: pytest.CaptureFixture[str]

@@ -195,3 +195,28 @@ def import_bodies(source: Path, tool: str, capture: Path) -> None:
         return
     camera = camera_of(read_camera_file(capture / "camera.json", None))
     write_bodies(bodies_from(tool, source, Known(camera)).bodies, capture / "bodies.npz")
+
+
+def tell_heights(capture: Path, heights: tuple[float, ...]) -> None:
+    """Write how tall people are into people.json, for the room; nothing where nothing is told.
+
+    Args:
+        capture: With people.json in it.
+        heights: Of each track in the order of their numbers, or one for everybody [m].
+
+    Raises:
+        InputError: If there are others than there are people.
+    """
+    from mover.io.files.fields import read_json, write_json
+
+    file = capture / "people.json"
+    if not heights or not file.is_file():
+        return
+    tree: dict[str, Any] = read_json(file).value
+    tracks = sorted({int(row["track_id"]) for row in tree["annotations"]})
+    if len(heights) not in (1, len(tracks)):
+        found = f"height: {len(heights)} are given, expected 1, or {len(tracks)}: one a person"
+        raise InputError(found)
+    each = heights * len(tracks) if len(heights) == 1 else heights
+    told = {str(track): height for track, height in zip(tracks, each, strict=True)}
+    write_json({**tree, "info": {**tree.get("info", {}), "heights": told}}, file)

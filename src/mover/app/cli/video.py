@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from mover.app.chain import FIT, BodiesFrom, Steps, make_bodies, steps_in
+from mover.app.chain import FIT, BodiesFrom, Steps, make_bodies, steps_in, tell_heights
 from mover.app.cli import say
 from mover.app.cli.config import Device, parsed, preset_named
 from mover.app.cli.people import FitArgs, fit_into
@@ -197,7 +197,7 @@ class ChainArgs:
     itself."""
     height: tuple[Annotated[float, float_in(0.4, 2.6)], ...] = ()
     """How tall people are, one for everybody or for each in the order of their numbers [m]: tells
-    `--bodies fit` how far they are."""
+    `--bodies fit` and the room how far they are."""
     camera: Path | None = None
     """A calibration; GeoCalib's also tells pitch and roll."""
     fov: Annotated[float, float_in(1, 179)] | None = None
@@ -325,9 +325,10 @@ def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
         say("warning: no keypoints were found, so there are no bodies")
         steps.undo(STEPS[1], capture / "bodies.npz")
         return
+    tell_heights(capture, args.height)
     given = [] if args.bodies == FIT or bodies.is_command else [Path(args.bodies)]
     made_from = [keypoints, lens_in(capture), args.bodies, args.bodies_tool, *given]
-    made_from += map(str, args.height)  # without any, results of before stay
+    made_from += map(str, args.height)
 
     def work() -> None:
         make_bodies(bodies, source, capture, lambda: _fit(capture, args.height))
