@@ -27,7 +27,6 @@ import torch
 from mover.core.types import (
     Bodies,
     BodyPose,
-    Camera,
     Capture,
     Detection,
     Masks,
@@ -64,7 +63,7 @@ def large_pictures(capture: Capture) -> Capture:
 
     assert capture.reference is not None
     assert capture.people is not None
-    lens = Camera(K, camera.R_cam_world, HEIGHT, WIDTH)
+    lens = replace(camera, K=K, height=HEIGHT, width=WIDTH)
     return replace(
         capture,
         scene=replace(capture.scene, camera=lens),
