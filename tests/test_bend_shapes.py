@@ -94,8 +94,10 @@ def given_narrow(share: float = 0.08):
     cage = Cage(-half, size[1] - half, narrow(share) * size[1])
     verts = known.objects.verts.clone()
     verts[1] = bent(verts[1], cage)
+    size = size.clone()
+    size[1] = verts[1].amax(0) - verts[1].amin(0)
     image = replace(known.image, given=None, measured=None)
-    return replace(known, objects=replace(known.objects, verts=verts), image=image,
+    return replace(known, objects=replace(known.objects, verts=verts, size=size), image=image,
                    humans=HumanCues())  # fmt: skip
 
 
@@ -159,6 +161,8 @@ def test_the_users_mesh_and_the_proxy_are_bent_alike_and_told_of():
     own = (out[1].mesh.verts - center[1]) * scale[1]
     assert torch.allclose(own, prepared.objects.verts[1], atol=1e-5)
     low, high = own.amin(0), own.amax(0)
+    assert torch.allclose(high - low, known.objects.size[1], atol=1e-5)
+    assert torch.equal(prepared.objects.size, known.objects.size)
     assert torch.allclose((low + high)[[0, 2]], torch.zeros(2), atol=1e-5)
     assert float(low[1]) == pytest.approx(0, abs=1e-6)
     assert out[0] is not pieces[0]

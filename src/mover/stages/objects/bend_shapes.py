@@ -106,7 +106,11 @@ def _cages(objects: Objects, offset: Float[Tensor, "objects 3 3 3 3"]) -> Cage:
 
 
 def with_shapes(prepared: Prepared, bending: Bending) -> tuple[Prepared, Layout]:
-    """The furniture bent, each frame again at the middle of its box's bottom, and its layout."""
+    """The furniture bent, and its layout.
+
+    Each frame is again at the middle of its box's bottom, and each box as large as before: what
+    bending added to a size is in the layout, where what is known of sizes has its say.
+    """
     objects, layout = prepared.objects, bending.layout
     cages = _cages(objects, bending.offset)
     verts = bent(objects.verts, cages)
@@ -114,24 +118,39 @@ def with_shapes(prepared: Prepared, bending: Bending) -> tuple[Prepared, Layout]
     base = torch.stack([(low[:, 0] + high[:, 0]) / 2, low[:, 1], (low[:, 2] + high[:, 2]) / 2], -1)
     some = bending.offset.flatten(1).any(-1)
     base = torch.where(some[:, None], base, 0)
-    size = torch.where(some[:, None], high - low, objects.size)
+    grown = torch.where(some[:, None], (high - low) / objects.size.clamp_min(1e-9), 1)
+    grid = grown[:, None, None, None]
+    points = _control_points(cages)
+    offset = (points + cages.offset - base[:, None, None, None]) / grid - points
+    cages = replace(cages, offset=offset * some[:, None, None, None, None])
 
     def shaped(points: Tensor) -> Tensor:
-        return torch.where(some[:, None, None], bent(points, cages) - base[:, None], points)
+        return torch.where(some[:, None, None], bent(points, cages), points)
 
     new = replace(
         objects, verts=shaped(objects.verts), samples=shaped(objects.samples),
-        top=shaped(objects.top), back=shaped(objects.back), size=size,
+        top=shaped(objects.top), back=shaped(objects.back),
     )  # fmt: skip
     away = (layout.log_scale.exp() * base).unsqueeze(-1)
     moved = layout.t_world_object + (rot_y(layout.yaw) @ away).squeeze(-1)
     unit, center = prepared.scale, prepared.center
     own = Cage(
         cages.low / unit + center, cages.high / unit + center,
-        (cages.offset - base[:, None, None, None]) / unit[:, None, None, None],
+        cages.offset / unit[:, None, None, None],
     )  # fmt: skip
-    there = replace(layout, t_world_object=torch.where(some[:, None], moved, layout.t_world_object))
+    there = replace(
+        layout, t_world_object=torch.where(some[:, None], moved, layout.t_world_object),
+        log_scale=layout.log_scale + grown.log(),
+    )  # fmt: skip
     return replace(prepared, objects=new, cages=own), there
+
+
+def _control_points(cages: Cage) -> Float[Tensor, "objects 3 3 3 3"]:
+    """Where they are before they are moved: a map of them that is affine is that of all points."""
+    share = torch.linspace(0, 1, 3).to(cages.low)
+    grid = torch.stack(torch.meshgrid(share, share, share, indexing="ij"), -1)
+    low, size = (x[:, None, None, None] for x in (cages.low, cages.high - cages.low))
+    return low + grid * size
 
 
 def told_of_shapes(pieces: tuple[SceneObject, ...]) -> tuple[str, ...]:
@@ -146,5 +165,5 @@ def told_of_shapes(pieces: tuple[SceneObject, ...]) -> tuple[str, ...]:
 
 def _farthest(piece: SceneObject, cage: Cage) -> float:
     """How far a control point is moved at most, about their middle move [m]."""
-    moved = cage.offset.reshape(-1, 3)
-    return float(((moved - moved.mean(0)) * piece.scale).norm(dim=-1).max())
+    moved = even(cage.offset[None])[0].reshape(-1, 3)
+    return float((moved * piece.scale).norm(dim=-1).max())
