@@ -72,8 +72,9 @@ class Adam:
     """First step size (Sec. "Optimization" of the supplement)."""
     last_rate: Annotated[float, float_in(1e-9, 100)] = 0.002
     """Last step size; equal to `rate`: constant."""
-    beta2: Annotated[float, float_in(0, 0.999999)] = 0.999
-    """Memory of the squared gradient."""
+    beta2: Annotated[float, float_in(0.81, 0.999999)] = 0.999
+    """Memory of the squared gradient; below the square of that of the gradient (.9) a step has no
+    bound."""
     keep_best: bool = False
     """Return the best state of each item instead of the last one."""
 
