@@ -35,6 +35,14 @@ def box(verts: Float[Tensor, "verts 3"]) -> tuple[Float[Tensor, "3"], Float[Tens
     return verts.amin(0), verts.amax(0)
 
 
+def bottom_center(
+    low: Float[Tensor, "*items 3"], high: Float[Tensor, "*items 3"]
+) -> Float[Tensor, "*items 3"]:
+    """Centre of the bottom of boxes from their lowest and highest corners: the origin of frames."""
+    middle = (low + high) / 2
+    return torch.stack([middle[..., 0], low[..., 1], middle[..., 2]], -1)
+
+
 def used(mesh: Mesh) -> Mesh:
     """The mesh without the vertices that no face refers to."""
     keep, faces = torch.unique(mesh.faces, return_inverse=True)

@@ -24,12 +24,13 @@ from mover.energy.config import SceneConfig
 from mover.energy.minimize import minimize
 from mover.energy.objective import scene_energy
 from mover.geometry.cage import bent, even
-from mover.geometry.mesh import box
-from mover.geometry.placement import rest_on_support
+from mover.geometry.mesh import bottom_center, box
 from mover.geometry.rotations import rot_y
 from mover.stages.config import BendConfig
-from mover.stages.objects.place_inputs import PlaceInputs, hold
+from mover.stages.objects.place_inputs import PlaceInputs
+from mover.stages.objects.place_objects import standing
 from mover.stages.objects.prepare_objects import Prepared
+from mover.stages.objects.starts import merged
 
 
 @record
@@ -69,9 +70,7 @@ def bend_shapes(inputs: BendInputs, config: BendConfig, observe: Observer = sile
     objects, loose = known.objects, inputs.loose.to(start.yaw)
 
     def layout_of(free: _Free) -> Layout:
-        there = Layout(free.t_world_object, free.yaw, free.log_scale)
-        there = hold(there, known.pinned)
-        return rest_on_support(there, objects.supports, objects.size[:, 1], known.ground)
+        return standing(known, Layout(free.t_world_object, free.yaw, free.log_scale))
 
     def shape_of(free: _Free) -> Tensor:
         return even(free.offset) * loose.view(-1, 1, 1, 1, 1)
@@ -89,14 +88,7 @@ def bend_shapes(inputs: BendInputs, config: BendConfig, observe: Observer = sile
     none = torch.zeros(len(objects.ids), 3, 3, 3, 3).to(start.yaw)
     begin = _Free(start.t_world_object, start.yaw, start.log_scale, none)
     found = minimize(energy, begin, config.method, observe, "bend_shapes").at
-    moved = layout_of(found)
-    keep = inputs.loose
-    layout = Layout(
-        torch.where(keep[:, None], moved.t_world_object, start.t_world_object),
-        torch.where(keep, moved.yaw, start.yaw),
-        torch.where(keep[:, None], moved.log_scale, start.log_scale),
-    )
-    return Bending(shape_of(found), layout)
+    return Bending(shape_of(found), merged(inputs.loose, layout_of(found), start))
 
 
 def _cages(objects: Objects, offset: Float[Tensor, "objects 3 3 3 3"]) -> Cage:
@@ -115,7 +107,7 @@ def with_shapes(prepared: Prepared, bending: Bending) -> tuple[Prepared, Layout]
     cages = _cages(objects, bending.offset)
     verts = bent(objects.verts, cages)
     low, high = (torch.stack(ends) for ends in zip(*(box(v) for v in verts), strict=True))
-    base = torch.stack([(low[:, 0] + high[:, 0]) / 2, low[:, 1], (low[:, 2] + high[:, 2]) / 2], -1)
+    base = bottom_center(low, high)
     some = bending.offset.flatten(1).any(-1)
     base = torch.where(some[:, None], base, 0)
     grown = torch.where(some[:, None], (high - low) / objects.size.clamp_min(1e-9), 1)
@@ -138,11 +130,8 @@ def with_shapes(prepared: Prepared, bending: Bending) -> tuple[Prepared, Layout]
         cages.low / unit + center, cages.high / unit + center,
         cages.offset / unit[:, None, None, None],
     )  # fmt: skip
-    there = replace(
-        layout, t_world_object=torch.where(some[:, None], moved, layout.t_world_object),
-        log_scale=layout.log_scale + grown.log(),
-    )  # fmt: skip
-    return replace(prepared, objects=new, cages=own), there
+    there = replace(layout, t_world_object=moved, log_scale=layout.log_scale + grown.log())
+    return replace(prepared, objects=new, cages=own), merged(some, there, layout)
 
 
 def _control_points(cages: Cage) -> Float[Tensor, "objects 3 3 3 3"]:
@@ -164,6 +153,6 @@ def told_of_shapes(pieces: tuple[SceneObject, ...]) -> tuple[str, ...]:
 
 
 def _farthest(piece: SceneObject, cage: Cage) -> float:
-    """How far a control point is moved at most, about their middle move [m]."""
+    """How far a control point is moved at most, without what a placement could do [m]."""
     moved = even(cage.offset[None])[0].reshape(-1, 3)
     return float((moved * piece.scale).norm(dim=-1).max())

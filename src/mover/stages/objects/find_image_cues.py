@@ -122,15 +122,18 @@ def find_image_cues(
         own, hidden, inside = (own - hidden > 0).float(), (own < hidden).float(), inside | True
     keep = (hidden < 1e-6) & inside & known
     sides = torch.where(inputs.seen, SEEN, UNKNOWN).unsqueeze(-1).expand(-1, 4)
+    beside = None
     if config.form == "robust":
-        sides = torch.where(sides == SEEN, _sides(inputs, others, config), sides)
+        touched = _touched(inputs, others)
+        sides = torch.where(sides == SEEN, _sides(inputs, touched, config), sides)
+        if config.bounded:
+            beside = torch.stack([touched, _near(inputs, others)], -1)
     trust = torch.ones(len(own))
     outline = outline_root(own) if config.form == "release" else None
     borders = None
     if config.borders:
         zoom = views.K[:, 0, 0] / inputs.camera.K[0, 0]
         borders = borders_of(own, zoom, config.borders)
-    beside = _beside(inputs, others) if config.bounded else None
     return ImageCues(
         inputs.boxes, sides, views, own, keep, trust, inputs.distance, outline, borders,
         beside=beside,
@@ -139,7 +142,7 @@ def find_image_cues(
 
 def free_sides(inputs: ImageInputs, config: ImageConfig) -> Bool[Tensor, "objects 4"]:
     """Which sides of the boxes are seen: neither the image's border nor something cuts them off."""
-    return _sides(inputs, _others(inputs), config) == SEEN
+    return _sides(inputs, _touched(inputs, _others(inputs)), config) == SEEN
 
 
 def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:
@@ -154,7 +157,7 @@ def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:
 
 
 def _sides(
-    inputs: ImageInputs, others: Bool[Tensor, "objects h w"], config: ImageConfig
+    inputs: ImageInputs, touched: Float[Tensor, "objects 4"], config: ImageConfig
 ) -> Int[Tensor, "objects 4"]:
     """What is known of the sides of boxes, which the image's border or something else may cut off.
 
@@ -163,25 +166,29 @@ def _sides(
     """
     size = inputs.boxes.new_tensor([inputs.camera.width, inputs.camera.height])
     low, high = inputs.boxes[:, :2] > BORDER, inputs.boxes[:, 2:] < size - BORDER
-    inside = torch.cat([low, high], -1)
-    free = torch.stack([
-        torch.stack([_share(others[i], _strip(box, side)) < config.hidden for side in range(4)])
-        for i, box in enumerate(inputs.boxes)
-    ])  # fmt: skip
+    inside, free = torch.cat([low, high], -1), touched < config.hidden
     return torch.where(inside, torch.where(free, SEEN, LIKELY if config.bounded else LEAST), LEAST)
 
 
-def _beside(
+def _touched(
     inputs: ImageInputs, others: Bool[Tensor, "objects h w"]
-) -> Float[Tensor, "objects 4 2"]:
-    """Shares of each side of the boxes that something touches, and that something is near to."""
+) -> Float[Tensor, "objects 4"]:
+    """Share of the strip beyond each side of the boxes in which something else is seen."""
+    return torch.stack([
+        torch.stack([_share(others[i], _strip(box, side)) for side in range(4)])
+        for i, box in enumerate(inputs.boxes)
+    ])  # fmt: skip
+
+
+def _near(inputs: ImageInputs, others: Bool[Tensor, "objects h w"]) -> Float[Tensor, "objects 4"]:
+    """Share of each side of the boxes that something else is near to."""
     rows: list[Tensor] = []
     for own, box in zip(others, inputs.boxes, strict=True):
         for side in range(4):
             part = _part(own, _strip(box, side, GAP * inputs.camera.width))
             near = part.any(1 - side % 2).float().mean() if part.numel() else torch.zeros(())
-            rows += [_share(own, _strip(box, side)), near]
-    return torch.stack(rows).reshape(len(inputs.boxes), 4, 2)
+            rows.append(near)
+    return torch.stack(rows).reshape(len(inputs.boxes), 4)
 
 
 def _strip(box: Float[Tensor, "4"], side: int, least: float = 0.0) -> Float[Tensor, "4"]:

@@ -219,7 +219,7 @@ def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = 
         return placed
     energies = energy_of(with_walls(inputs, placed.walls), config)
     at = part_objects(energies, inputs.objects, placed.layout, config.apart, observe)
-    return replace(placed, layout=_standing(inputs, at))
+    return replace(placed, layout=standing(inputs, at))
 
 
 def _best_first(found: Minimum[Layout], inputs: PlaceInputs, config: PlaceConfig) -> Placed:
@@ -252,7 +252,7 @@ def starts_left(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = si
 def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
     """The energy as a function of layouts whose heights are still to be eliminated."""
     price = energy_function(*_evidence(inputs), priced(config))
-    return lambda layout: price(_standing(inputs, layout))
+    return lambda layout: price(standing(inputs, layout))
 
 
 def priced(config: PlaceConfig) -> SceneConfig:
@@ -264,7 +264,7 @@ def _evidence(inputs: PlaceInputs) -> tuple[Objects, Camera, ImageCues, HumanCue
     return inputs.objects, inputs.camera, inputs.image, inputs.humans
 
 
-def _standing(inputs: PlaceInputs, layout: Layout) -> Layout:
+def standing(inputs: PlaceInputs, layout: Layout) -> Layout:
     """The layout with what is pinned at its place, and the rest on its supports."""
     objects, held = inputs.objects, hold(layout, inputs.pinned)
     return rest_on_support(held, objects.supports, objects.size[:, 1], inputs.ground)
@@ -281,7 +281,7 @@ def descend(
     span = spans_of(inputs.objects, config.span, config.chair_span)
 
     def at(free: Layout) -> Layout:
-        return _standing(inputs, bounded(free, span))
+        return standing(inputs, bounded(free, span))
 
     def watched(step: Step) -> None:
         free = step.at
@@ -331,7 +331,7 @@ def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Proble
             reference=inputs.reference[index],
             pinned=inputs.pinned and of_objects(inputs.pinned, index, n),
         )
-        return lambda free: energy(_standing(few, bounded(free, span[index])))
+        return lambda free: energy(standing(few, bounded(free, span[index])))
 
     carrier = inputs.objects.supports
     if not bool((carrier >= 0).any()):

@@ -17,7 +17,7 @@ from mover.core.run import kept, sources
 from mover.core.types import Cage, Layout, Mesh, Objects, SceneObject
 from mover.furniture.library import BACKS, SEATS, canonical
 from mover.geometry.cage import bent
-from mover.geometry.mesh import box, decimate, sample_surface, signed_volume, used
+from mover.geometry.mesh import bottom_center, box, decimate, sample_surface, signed_volume, used
 from mover.geometry.occupancy import load_occupancy, occupied_mesh
 from mover.geometry.placement import FREE, GROUND
 from mover.geometry.rotations import rot_y
@@ -234,7 +234,7 @@ def _closing(config: PrepareConfig) -> tuple[Callable[[Mesh], Mesh], list[str]]:
 def _proxy(piece: SceneObject, config: PrepareConfig, close: Callable[[Mesh], Mesh]) -> _Proxy:
     mesh = used(piece.mesh)
     low, high = box(mesh.verts)
-    center = torch.stack([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    center = bottom_center(low, high)
     mesh = Mesh((mesh.verts - center) * piece.scale, mesh.faces)
     mesh = close(mesh)
     if config.level_feet:
