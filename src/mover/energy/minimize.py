@@ -46,6 +46,8 @@ class Term(Generic[S]):
     """Names of the evidence without which it says nothing."""
     fused: bool = False
     """Whether the fused kernel has it (`robust`)."""
+    bare: bool = False
+    """Whether it looks at nothing but the layout, the boxes and its own evidence of the image."""
 
 
 def active_weights(weights: W, terms: Iterable[Term[S]], has: Callable[[str], bool]) -> W:

@@ -113,6 +113,11 @@ class SceneEvidence:
         humans = of_objects(self.humans, rows % n, n)
         return SceneEvidence(some_objects(self.objects, rows), self.camera, image, humans)
 
+    def bare(self) -> "SceneEvidence":
+        """That without meshes, maps and people, which `Term.bare` terms do not look at."""
+        image = rows_of(self.image, torch.zeros(0).to(self.image.sides), "h")
+        return SceneEvidence(without_meshes(self.objects), self.camera, image, HumanCues())
+
 
 @dataclass(frozen=True)
 class PlacedScene:
@@ -258,11 +263,11 @@ SCENE_TERMS: tuple[Term[PlacedScene], ...] = (
     ),
     Term(
         "wall", lambda s: wall_term(s.layout, s.known.objects.size, there(s.known.image.walls)),
-        "the line of the furniture beside it", ("walls",),
+        "the line of the furniture beside it", ("walls",), bare=True,
     ),
     Term(
         "given", lambda s: given_term(s.layout, there(s.known.image.given)),
-        "how it was given", ("given",),
+        "how it was given", ("given",), bare=True,
     ),
     Term(
         "measured", lambda s: measured_term(
@@ -322,6 +327,12 @@ def of_objects(evidence: E, index: Rows, count: int) -> E:
         rest = rows_of(replace(evidence, touches=None), index, "objects", "items")
         return cast(E, replace(rest, touches=touches))
     return rows_of(evidence, index, "objects", "items")
+
+
+def without_meshes(objects: Objects) -> Objects:
+    """The objects as boxes alone: what a layout is priced by where nothing is drawn or touched."""
+    none = torch.zeros(0).to(objects.supports)
+    return rows_of(objects, none, "verts", "faces", "edges", "samples", "region")
 
 
 def some_objects(objects: Objects, rows: Rows) -> Objects:

@@ -48,9 +48,10 @@ def energy_of_rows(
     kernel = fused_energy(known, config)
     left = [t for t in SCENE_TERMS if kernel is None or not t.fused]
     rest = [t for t in left if getattr(config.weights, t.name)]
+    seen = known.bare() if all(t.bare for t in rest) else known
 
     def of(rows: Rows | None) -> EnergyOf:
-        few = known if rows is None or not rest else known.some(rows)
+        few = seen if rows is None or not rest else seen.some(rows)
 
         def energy(layout: Layout) -> Energy:
             if kernel is None:

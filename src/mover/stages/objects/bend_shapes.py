@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.core.observe import Energy, Observer, silent
-from mover.core.records import record
+from mover.core.records import record, rows_of, with_rows
 from mover.core.types import Cage, Layout, Objects, SceneObject
 from mover.energy.config import SceneConfig
 from mover.energy.minimize import minimize
@@ -28,7 +28,7 @@ from mover.geometry.mesh import bottom_center, box
 from mover.geometry.rotations import rot_y
 from mover.stages.config import BendConfig
 from mover.stages.objects.place_inputs import PlaceInputs
-from mover.stages.objects.place_objects import standing
+from mover.stages.objects.place_objects import piles_of, some_inputs, standing
 from mover.stages.objects.prepare_objects import Prepared
 from mover.stages.objects.starts import merged
 
@@ -65,9 +65,11 @@ class _Free:
 
 
 def bend_shapes(inputs: BendInputs, config: BendConfig, observe: Observer = silent) -> Bending:
-    """Find shapes and places together."""
-    known, start = inputs.inputs, inputs.layout
-    objects, loose = known.objects, inputs.loose.to(start.yaw)
+    """Find shapes and places together, of what is loose and of what stands with it."""
+    start, pile = inputs.layout, piles_of(inputs.inputs.objects)
+    rows = torch.isin(pile, pile[inputs.loose]).nonzero()[:, 0]
+    known, few = some_inputs(inputs.inputs, rows), rows_of(start, rows, "objects")
+    objects, loose = known.objects, inputs.loose[rows].to(start.yaw)
 
     def layout_of(free: _Free) -> Layout:
         return standing(known, Layout(free.t_world_object, free.yaw, free.log_scale))
@@ -85,10 +87,12 @@ def bend_shapes(inputs: BendInputs, config: BendConfig, observe: Observer = sile
         bend = config.weight * (offset / config.sigma).square().flatten(1).sum(-1) / 2
         return Energy({"placed": found.per_item, "bend": bend})
 
-    none = torch.zeros(len(objects.ids), 3, 3, 3, 3).to(start.yaw)
-    begin = _Free(start.t_world_object, start.yaw, start.log_scale, none)
+    none = torch.zeros(len(pile), 3, 3, 3, 3).to(start.yaw)
+    begin = _Free(few.t_world_object, few.yaw, few.log_scale, none[rows])
     found = minimize(energy, begin, config.method, observe, "bend_shapes").at
-    return Bending(shape_of(found), merged(inputs.loose, layout_of(found), start))
+    offset = even(none.index_copy(0, rows, found.offset)) * inputs.loose.view(-1, 1, 1, 1, 1)
+    ends = with_rows(start, rows, layout_of(found), "objects")
+    return Bending(offset, merged(inputs.loose, ends, start))
 
 
 def _cages(objects: Objects, offset: Float[Tensor, "objects 3 3 3 3"]) -> Cage:

@@ -14,7 +14,13 @@ from mover.energy.config import Adam, BatchedBFGS, SceneConfig, Variant, only
 from mover.energy.fused.energy import energy_function, energy_of_rows, never_asks
 from mover.energy.minimize import Minimum, minimize
 from mover.energy.newton import Problems, settle
-from mover.energy.objective import HumanCues, ImageCues, of_objects, some_objects
+from mover.energy.objective import (
+    HumanCues,
+    ImageCues,
+    of_objects,
+    some_objects,
+    without_meshes,
+)
 from mover.energy.terms.apart import apart_term, gather_solids
 from mover.energy.terms.contact import trees_of
 from mover.geometry.boxes import Box, corners
@@ -322,25 +328,40 @@ def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Proble
     starts, n = begin.yaw.shape
     some_energy = energy_of_rows(*_evidence(inputs), priced(config))
     span = spans_of(inputs.objects, config.span, config.chair_span)
+    boxes = without_meshes(inputs.objects)
 
     def of(rows: Tensor) -> Callable[[Layout], Energy]:
         index, energy = rows % n, some_energy(rows)
         few = replace(
             inputs,
-            objects=some_objects(inputs.objects, rows),
+            objects=some_objects(boxes, rows),
             reference=inputs.reference[index],
             pinned=inputs.pinned and of_objects(inputs.pinned, index, n),
         )
         return lambda free: energy(standing(few, bounded(free, span[index])))
 
-    carrier = inputs.objects.supports
-    if not bool((carrier >= 0).any()):
+    if not bool((inputs.objects.supports >= 0).any()):
         return Problems(of, begin, (starts, n))
+    pile = piles_of(inputs.objects)
+    group = pile + n * torch.arange(starts).to(pile)[:, None]
+    return Problems(of, begin, (starts, n), group.flatten())
+
+
+def piles_of(objects: Objects) -> Int[Tensor, " objects"]:
+    """The lowest of those that stand on one another, for each object."""
+    carrier, n = objects.supports, len(objects.ids)
     root = torch.where(carrier >= 0, carrier, torch.arange(n).to(carrier))
     for _ in range(n):
         root = root[root]
-    group = root + n * torch.arange(starts).to(root)[:, None]
-    return Problems(of, begin, (starts, n), group.flatten())
+    return root
+
+
+def some_inputs(inputs: PlaceInputs, rows: Int[Tensor, " rows"]) -> PlaceInputs:
+    """What placing whole piles needs, by the numbers of their objects."""
+    n = len(inputs.objects.ids)
+    few = of_objects(replace(inputs, humans=HumanCues()), rows, n)
+    humans = of_objects(inputs.humans, rows, n)
+    return replace(few, objects=some_objects(inputs.objects, rows), humans=humans)
 
 
 def _by_boxes(
