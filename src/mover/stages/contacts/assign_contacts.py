@@ -130,13 +130,21 @@ def assign_contacts(
     points = _pack(rows, part, inputs, config)
     for i, bodies in zip(points.object_of.tolist(), points.bodies.tolist(), strict=True):
         counts[i] = int(bodies)
-    pairs = torch.stack([rows.body, rows.object_of, part], -1).unique(dim=0)
+    pairs = _unique(torch.stack([rows.body, rows.object_of, part], -1))
     return ContactAssignment(points, seated, tuple(counts), pairs)
+
+
+def _unique(rows: Int[Tensor, "rows 3"]) -> Int[Tensor, "pairs 3"]:
+    """Rows of numbers from 0 on, each once and sorted; as numbers, which sort far faster."""
+    sizes = rows.amax(0) + 1
+    place = torch.stack([sizes[1] * sizes[2], sizes[2], torch.ones_like(sizes[2])])
+    return (rows @ place).unique()[:, None] // place % sizes
 
 
 def _parts(rows: ContactRows, inputs: AssignInputs, config: AssignConfig) -> Int[Tensor, " rows"]:
     """The part that each row touches: top, back, and the same for hands."""
-    normals = vertex_normals(inputs.bodies.verts, inputs.bodies.faces)[rows.body, rows.vert]
+    some, row = rows.body.unique(return_inverse=True)
+    normals = vertex_normals(inputs.bodies.verts[some], inputs.bodies.faces)[row, rows.vert]
     level = normals[:, 1].abs() >= LEVEL
     if config.split == "parts":
         level = level | (inputs.parts.part_of[rows.vert] != PARTS.index("back"))

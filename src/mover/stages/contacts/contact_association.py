@@ -266,8 +266,7 @@ def _decide(
         one = decide_by_release(part.points, part.pixels, part.mask, rivals.plain, arms=part.hands)
         return torch.full_like(part.pixels[:, 0], one)
     over = _inside(rivals.grown, part.pixels)
-    ways = [_distances(part.points, r) for r in (rivals.tops, rivals.backs)]
-    away, may = torch.stack(ways).amin(0), _may(objects, hands=part.hands)
+    away, may = _distances(part.points, rivals), _may(objects, hands=part.hands)
     if config.by == "vertex":
         price = torch.where(over & may.unsqueeze(-1), away, torch.full_like(away, torch.inf))
         lowest, best = price.min(0)
@@ -305,10 +304,10 @@ def _filled(masks: Bool[Tensor, "objects h w"], boxes: Float[Tensor, "objects 4"
 
 
 def _distances(
-    points: Float[Tensor, "verts 3"], region: Float[Tensor, "objects region 3"]
-) -> Tensor:
-    """Distance of each vertex from each object's part, through at most 40 of the vertices [m]."""
+    points: Float[Tensor, "verts 3"], rivals: _Rivals
+) -> Float[Tensor, "objects verts"]:
+    """Distance of each vertex from each object's parts, through at most 40 of the vertices [m]."""
     some = points[:: max(1, len(points) // 40)]
-    away = torch.cdist(some, region).amin(-1)  # objects some
+    ways = [torch.cdist(some, region).amin(-1) for region in (rivals.tops, rivals.backs)]
     nearest = torch.cdist(points, some).argmin(-1)
-    return away[:, nearest]
+    return torch.minimum(*ways)[:, nearest]
