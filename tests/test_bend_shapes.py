@@ -142,6 +142,14 @@ def test_what_is_not_loose_stays_to_the_bit():
         assert not bool(found.offset[i].any())
 
 
+def test_a_shape_is_bent_alike_alone_and_among_others():
+    (_, _, alone), (_, _, among) = found_with([False, True, False]), found_with([True] * 3)
+    assert torch.allclose(alone.offset[1], among.offset[1], atol=1e-6)
+    for a, b in zip(vars(alone.layout).values(), vars(among.layout).values(), strict=True):
+        assert torch.allclose(a[1], b[1], atol=1e-6)
+    assert bool(among.offset[0].any())
+
+
 def piece_of(mesh: Mesh, file: str) -> SceneObject:
     zero = torch.zeros(())
     return SceneObject(

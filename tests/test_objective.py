@@ -13,7 +13,13 @@ from mover.energy.config import BodyWeights, SceneConfig, SceneWeights, only
 from mover.energy.fused import energy
 from mover.energy.fused.energy import energy_function, energy_of_rows
 from mover.energy.minimize import Term
-from mover.energy.objective import SCENE_TERMS, of_objects, scene_energy
+from mover.energy.objective import (
+    SCENE_TERMS,
+    SceneEvidence,
+    energy_of_terms,
+    of_objects,
+    scene_energy,
+)
 from mover.pipeline.presets import PRESETS
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.place_inputs import with_walls
@@ -79,6 +85,22 @@ def test_the_evidence_of_each_term_exists_and_silences_it_where_it_is_missing():
             ).weights
             silent = {t.name for t in SCENE_TERMS if need in t.needs}
             assert {n for n in WEIGHTS if not getattr(left, n)} == silent
+
+
+@pytest.mark.parametrize("term", [t for t in SCENE_TERMS if t.bare], ids=lambda t: t.name)
+def test_a_bare_term_sees_no_meshes_no_maps_and_no_people(term):
+    inputs, layout = evidence(torch.float32, "robust")
+    known = SceneEvidence(inputs.objects, inputs.camera, inputs.image, inputs.humans)
+    config = SceneConfig(only(**{term.name: 0.7}), "robust")
+    rows = torch.tensor([5, 1, 3])
+    for some, at in ((known, layout), (known.some(rows), some_of(layout, rows))):
+        wanted = energy_of_terms([term], at, some, config).per_item
+        bare = energy_of_terms([term], at, some.bare(), config).per_item
+        assert torch.equal(bare, wanted)
+        assert bool(wanted.any())
+    parts = known.bare().objects, known.bare().image
+    sizes = {x.numel() for x in (parts[0].verts, parts[0].faces, parts[1].masks, parts[1].keep)}
+    assert sizes == {0}
 
 
 def test_terms_of_the_kernel_are_in_the_order_of_its_constants():

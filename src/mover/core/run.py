@@ -9,10 +9,12 @@ import sys
 import time
 import typing
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from contextvars import copy_context
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -20,7 +22,7 @@ from mover import __version__
 from mover.core import records
 from mover.core.devices import CPU, named
 from mover.core.errors import InputError
-from mover.core.observe import Observer, silent
+from mover.core.observe import Observer, Step, silent
 
 log = logging.getLogger(__name__)
 In = TypeVar("In")
@@ -52,6 +54,8 @@ class Run:
     stages: list[StageLog] = field(default_factory=lambda: [])
     device: torch.device = CPU
     """Where the stages in `ON_DEVICE` compute; all others do on the processor."""
+    begun: dict[Path, "Future[tuple[Any, float]]"] = field(default_factory=lambda: {})
+    """Stages that are computed beside others, and how many seconds they took."""
 
     def stage(self, fn: Callable[[In, Conf, Observer], Out], inputs: In, config: Conf) -> Out:
         """Return the stored output of `fn`, or compute and store it.
@@ -60,16 +64,18 @@ class Run:
         and its sources: a stale result cannot be read, and a killed run goes on where it stopped.
         Inputs and output lie on the processor; what another device computed has another name.
         """
-        name = getattr(fn, "__name__", "stage")
-        device = self.device if name in ON_DEVICE else CPU
-        where = () if device == CPU else (named(device),)
-        key = records.fingerprint(inputs, config, sources(_package(fn)), *where)
-        path = self.folder / "stages" / name / key
-        begin = time.perf_counter()
-        output: Out | None = _stored(typing.get_type_hints(fn)["return"], path)
+        name, device, path = self._named(fn, inputs, config)
+        begin, beside = time.perf_counter(), self.begun.pop(path, None)
+        kind = typing.get_type_hints(fn)["return"]
+        output: Out | None = _stored(kind, path) if beside is None else None
         kept = output is not None
+        if beside is not None:
+            self.observe(Step(name, 0, 1))
+            output, took = beside.result()
+            begin = time.perf_counter() - took
         if output is None:
             output = _computed(fn, inputs, config, self.observe, device)
+        if not kept:
             records.save(output, path)
         seconds = time.perf_counter() - begin
         self.stages.append(StageLog(name, seconds, _peak_memory(), kept, path.name))
@@ -81,6 +87,37 @@ class Run:
             self.stages[-1].seconds,
         )
         return output
+
+    def begin(self, fn: Callable[[In, Conf, Observer], Out], inputs: In, config: Conf) -> None:
+        """Begin to compute what `stage` is asked for later, beside the stages in between.
+
+        The output is the same. Nothing is done where it is on disk, or where a GPU computes it.
+        """
+        _, device, path = self._named(fn, inputs, config)
+        if device != CPU or path in self.begun or path.with_suffix(".json").exists():
+            return
+
+        def work() -> tuple[Out, float]:
+            begin = time.perf_counter()
+            return fn(inputs, config, silent), time.perf_counter() - begin
+
+        self.begun[path] = _beside().submit(copy_context().run, work)
+
+    def _named(
+        self, fn: Callable[[In, Conf, Observer], Out], inputs: In, config: Conf
+    ) -> tuple[str, torch.device, Path]:
+        """A stage's name, where it computes, and its files, by all that it is made from."""
+        name = getattr(fn, "__name__", "stage")
+        device = self.device if name in ON_DEVICE else CPU
+        where = () if device == CPU else (named(device),)
+        key = records.fingerprint(inputs, config, sources(_package(fn)), *where)
+        return name, device, self.folder / "stages" / name / key
+
+
+@functools.cache
+def _beside() -> ThreadPoolExecutor:
+    """One thread: what is begun is computed one after the other."""
+    return ThreadPoolExecutor(1, thread_name_prefix="mover-beside")
 
 
 def _stored(kind: type[Out], path: Path) -> Out | None:

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -11,11 +11,13 @@ from importlib import import_module
 from pathlib import Path
 from threading import RLock
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+A = TypeVar("A")
+B = TypeVar("B")
 KERNELS = "mover.geometry.kernels"
 log = logging.getLogger(KERNELS)
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
@@ -163,6 +165,17 @@ def share(work: Callable[[int], object], n: int) -> None:
     for other in others:
         if not other.cancel():
             other.result()
+
+
+def mapped(work: Callable[[A], B], items: Sequence[A]) -> list[B]:
+    """What the work gives for each item, in their order, on as many threads as are wanted."""
+    found: dict[int, B] = {}
+
+    def one(k: int) -> None:
+        found[k] = work(items[k])
+
+    share(one, len(items))
+    return [found[k] for k in range(len(items))]
 
 
 @cache

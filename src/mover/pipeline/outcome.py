@@ -24,7 +24,7 @@ from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import Alignment
 from mover.stages.config import PlaceConfig
 from mover.stages.contacts.assign_contacts import ContactAssignment, ContactInputs, find_contacts
-from mover.stages.contacts.gather_cues import Cues
+from mover.stages.contacts.gather_cues import Cues, GatherInputs
 from mover.stages.contacts.propose_supports import KnownTops, ProposeInputs, propose_supports
 from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.explain.placements import ExplainInputs, explain_placements
@@ -32,6 +32,7 @@ from mover.stages.objects.bend_shapes import told_of_shapes
 from mover.stages.objects.find_image_cues import ImageInputs, Seen
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
+from mover.stages.people.find_depth import are_shapeless
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,23 @@ class SceneState:
     contacts: ContactAssignment | None = None
     priced: tuple[PlaceInputs, PlaceConfig] | None = None
     """What the last descent minimised; None: nothing is explained."""
+
+
+def is_scale_known(capture: Capture, people: PeopleState) -> bool:
+    """Whether anything but the furniture tells how large the room is."""
+    heights = {} if capture.people is None else capture.people.heights
+    told = bool(heights) or capture.camera_height is not None
+    return told or not are_shapeless(people.bodies)
+
+
+def gather_inputs(
+    context: ReconstructionContext, people: PeopleState, state: SceneState
+) -> GatherInputs:
+    """The people in the world, and the masks."""
+    bodies = in_world(rows_of(people.bodies, people.kept), state.camera)
+    return GatherInputs(
+        bodies, context.capture.people, context.seen.masks, state.camera, people.path
+    )
 
 
 def to_world(bodies: Bodies, camera: Camera) -> Bodies:

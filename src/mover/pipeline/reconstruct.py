@@ -1,6 +1,7 @@
 """The order of the stages, each kept on disk: from a capture to a consistent room."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -8,7 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.bodies.corrected import in_world
+from mover.core.observe import Observer
 from mover.core.records import rows_of
+from mover.core.run import Conf, In
 from mover.core.run import Run as Run
 from mover.core.settings import check_settings
 from mover.core.types import Camera, Capture, Layout, Room
@@ -25,6 +28,7 @@ from mover.geometry.placement import (
     rest_on_support,
     slide_to_floor,
 )
+from mover.geometry.warp_start import threads
 from mover.io.capture.plausible import check_plausible
 from mover.pipeline.moves import with_moves
 from mover.pipeline.outcome import (
@@ -33,6 +37,8 @@ from mover.pipeline.outcome import (
     SceneState,
     check_floor,
     check_room,
+    gather_inputs,
+    is_scale_known,
     room_of,
     tops_of,
     unfurnished,
@@ -45,7 +51,7 @@ from mover.pipeline.presets import with_sizes
 from mover.stages.camera.refine_camera import FurtherView, RefineInputs, refine_camera
 from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
 from mover.stages.contacts.contact_association import AssignInputs
-from mover.stages.contacts.gather_cues import GatherInputs, cues_in_windows, gather_cues
+from mover.stages.contacts.gather_cues import cues_in_windows, gather_cues
 from mover.stages.contacts.propose_supports import NOTHING
 from mover.stages.objects.bend_shapes import BendInputs, bend_shapes, with_shapes
 from mover.stages.objects.find_image_cues import (
@@ -103,12 +109,15 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
 
 def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]) -> Room:
     """The stages in their order."""
+    furniture = PrepareInputs(capture.scene.objects)
+    if capture.scene.objects:
+        _begin(run, prepare_objects, furniture, config.prepare)
     people = people_of(capture, config, run)
     if not capture.scene.objects:
         room = unfurnished(capture, people)
         return with_proposals(room, capture, config, run, people, NOTHING)
     seen = image_evidence(capture)
-    prepared = run.stage(prepare_objects, PrepareInputs(capture.scene.objects), config.prepare)
+    prepared = run.stage(prepare_objects, furniture, config.prepare)
     context = ReconstructionContext(capture, config, run, seen, prepared, pinned)
     if people is None:
         ground = ground_without_people(capture, prepared)
@@ -118,12 +127,15 @@ def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str
     context = with_size_prior(context, state)
     for _ in range(config.refine.rounds):
         state = with_refined_camera(context, people, state)
+    if is_scale_known(capture, people):
+        _begin(run, gather_cues, gather_inputs(context, people, state), config.gather)
     image_energy = state.placed.energy[0]
     context, state = with_shapes_bent(context, state)
     image_energy = torch.maximum(image_energy, state.placed.energy[0])
     people, state = with_common_scale(context, people, state)
-    state = gathered(context, people, state)
-    state = placed_with_people(context, people, assigned(context, people, state), image_energy)
+    _begin(run, gather_cues, gather_inputs(context, people, state), config.gather)
+    state = gathered(context, people, assigned(context, people, state))
+    state = placed_with_people(context, people, state, image_energy)
     for _ in range(config.outer_iterations):
         state = assigned(context, people, with_order(context, state))
         state = placed_with_people(context, people, state, image_energy)
@@ -266,11 +278,8 @@ def with_common_scale(
     context: ReconstructionContext, people: PeopleState, state: SceneState
 ) -> tuple[PeopleState, SceneState]:
     """The whole room larger or smaller where nothing but the furniture tells its scale."""
-    capture = context.capture
     given = None if state.priced is None else state.priced[0].image.given
-    heights = {} if capture.people is None else capture.people.heights
-    told = bool(heights) or capture.camera_height is not None
-    if given is None or told or not are_shapeless(people.bodies):
+    if given is None or is_scale_known(context.capture, people):
         return people, state
     factor = math.exp(-common_scale(state.placed.layout, given, context.config.height_spread))
     bodies = nearer(people.bodies, state.camera, state.ground, factor)
@@ -283,12 +292,15 @@ def with_common_scale(
     return replace(people, bodies=bodies, path=scaled(people.path, factor)), state
 
 
+def _begin(run: Run, fn: Callable[[In, Conf, Observer], object], inputs: In, config: Conf) -> None:
+    """Begin a stage beside the next ones where there is a second thread for it."""
+    if threads() > 1:
+        run.begin(fn, inputs, config)
+
+
 def gathered(context: ReconstructionContext, people: PeopleState, state: SceneState) -> SceneState:
     """The state with depth maps and free space from all frames."""
-    bodies = in_world(rows_of(people.bodies, people.kept), state.camera)
-    inputs = GatherInputs(
-        bodies, context.capture.people, context.seen.masks, state.camera, people.path
-    )
+    inputs = gather_inputs(context, people, state)
     return replace(state, cues=context.run.stage(gather_cues, inputs, context.config.gather))
 
 

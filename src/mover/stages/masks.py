@@ -8,13 +8,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import interpolate, max_pool2d
+from torch.nn.functional import interpolate
 
 from mover.core.types import Bodies, Camera, Masks, People
 from mover.energy.terms.bbox import WIDTH
 from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
 from mover.geometry.rle import decode
+from mover.geometry.warp_start import mapped
 
 # Which mask belongs to which body, decoded only when it is drawn.
 
@@ -99,19 +100,23 @@ def compare_extents(
     Returns:
         None if nobody is seen wholly, upright and high enough.
     """
-    ratios: list[float] = []
-    for row in rows.tolist():
+
+    def ratio(row: int) -> float:
+        """Height of the body over that of its mask; NaN where they tell nothing."""
         if not _inside(bodies.verts[row], camera):
-            continue
+            return math.nan
         drawn = _drawn(bodies, row, camera)
         high, wide = _extent(drawn)
         if high <= UPRIGHT * wide:
-            continue
+            return math.nan
         own, others = table.decode(row)
         covered = drawn & (blocked(int(bodies.frame[row])) | others) & ~own
-        if covered.sum() <= WHOLE * drawn.sum() and min(high, _extent(own)[0]) >= HIGH:
-            body, mask = high - _thick(drawn), _extent(own)[0] - _thick(own)
-            ratios.append(body / mask if mask > 0 else math.nan)
+        if covered.sum() > WHOLE * drawn.sum() or min(high, _extent(own)[0]) < HIGH:
+            return math.nan
+        body, mask = high - _thick(drawn), _extent(own)[0] - _thick(own)
+        return body / mask if mask > 0 else math.nan
+
+    ratios = mapped(ratio, rows.tolist())
     found = torch.tensor([r for r in ratios if math.isfinite(r)], dtype=torch.float64)
     if not len(found):
         return None
@@ -178,9 +183,13 @@ def overlaps(
     A mask that is two pixels too wide all around looks like a person who is 3 % nearer, were it
     not that arms and legs grow by as much as the whole body.
     """
-    image, inside = drawn.float(), mask[known]
-    wide, narrow = _grown(image)[:, known], 1 - _grown(1 - image)[:, known]
-    best, exact = torch.zeros(len(drawn)).to(mask), image[:, known]
+    where = known.flatten().nonzero()[:, 0]
+    inside = mask.flatten()[where]
+    exact, wide, narrow = (
+        image.flatten(1).index_select(1, where).float()
+        for image in (drawn, _grown(drawn), ~_grown(~drawn))
+    )
+    best = torch.zeros(len(drawn)).to(mask)
     for margin in torch.linspace(-1, 1, MARGINS).tolist():  # a few; all at once is much memory
         part = exact + abs(margin) * ((wide if margin > 0 else narrow) - exact)
         both, either = torch.minimum(part, inside).sum(1), torch.maximum(part, inside).sum(1)
@@ -188,11 +197,14 @@ def overlaps(
     return best
 
 
-def _grown(image: Float[Tensor, "items h w"]) -> Float[Tensor, "items h w"]:
-    """Each pixel or the largest of its four neighbours."""
-    columns = max_pool2d(image[:, None], (3, 1), 1, (1, 0))
-    rows = max_pool2d(image[:, None], (1, 3), 1, (0, 1))
-    return torch.maximum(columns, rows)[:, 0]
+def _grown(image: Bool[Tensor, "items h w"]) -> Bool[Tensor, "items h w"]:
+    """Each pixel or any of its four neighbours."""
+    grown = image.clone()
+    grown[:, 1:] |= image[:, :-1]
+    grown[:, :-1] |= image[:, 1:]
+    grown[:, :, 1:] |= image[:, :, :-1]
+    grown[:, :, :-1] |= image[:, :, 1:]
+    return grown
 
 
 # The image at the width at which the paper's weights have their meaning.

@@ -73,7 +73,7 @@ def _draw(scene: Any, maps: Any, backs: int, where: torch.device) -> tuple[Cuts,
     count = len(scene.verts) // scene.n_verts
     if not _in_loops(where):
         return (_draw_at_once(scene, maps, backs, where),)
-    size = max(1, count // (GROUPS * threads()))
+    size = max(4, count // (GROUPS * threads()))
     groups = [range(k, min(k + size, count)) for k in range(0, count, size)]
     found: dict[int, Cuts] = {}
 

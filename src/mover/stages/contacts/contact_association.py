@@ -303,9 +303,7 @@ def _filled(masks: Bool[Tensor, "objects h w"], boxes: Float[Tensor, "objects 4"
     return torch.where(known, masks, inside)
 
 
-def _distances(
-    points: Float[Tensor, "verts 3"], rivals: _Rivals
-) -> Float[Tensor, "objects verts"]:
+def _distances(points: Float[Tensor, "verts 3"], rivals: _Rivals) -> Float[Tensor, "objects verts"]:
     """Distance of each vertex from each object's parts, through at most 40 of the vertices [m]."""
     some = points[:: max(1, len(points) // 40)]
     ways = [torch.cdist(some, region).amin(-1) for region in (rivals.tops, rivals.backs)]

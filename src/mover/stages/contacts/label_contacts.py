@@ -74,18 +74,17 @@ def label_contacts(
     bodies, parts = inputs.bodies, inputs.parts
     floor = bodies.verts[..., 1].amin() if inputs.ground is None else inputs.ground
     chance = touching(bodies, parts, float(floor))
-    solids = [_Solid(mesh) for mesh in inputs.meshes]
+    known = [members(parts, name) for name in PARTS]
+    named = [part for part, mine in enumerate(known) if bool(mine.any())]
+    chosen = [_evenly(known[part].nonzero()[:, 0], config.most) for part in named]
+    points = [bodies.verts[:, verts] for verts in chosen]
+    surfaces = [_near_solid(points, mesh, config) for mesh in inputs.meshes]
+    if inputs.ground is not None:
+        surfaces.append([_near_floor(some, inputs.ground, config) for some in points])
     found: list[tuple[int, int, _Touches, Tensor]] = []
-    for part, name in enumerate(PARTS):
-        chosen = _evenly(members(parts, name).nonzero()[:, 0], config.most)
-        if not len(chosen):
-            continue
-        points = bodies.verts[:, chosen]
-        sure = chance[:, members(parts, name)].amax(1)
-        surfaces = [_near_solid(points, solid, config) for solid in solids]
-        if inputs.ground is not None:
-            surfaces.append(_near_floor(points, inputs.ground, config))
-        for k, touch in enumerate(surfaces):
+    for number, part in enumerate(named):
+        sure = chance[:, known[part]].amax(1)
+        for k, touch in enumerate(touches[number] for touches in surfaces):
             close = (touch.gap - config.reach) / (config.near - config.reach)
             trust = config.unseen + (1 - config.unseen) * sure[touch.row]
             found.append((part, k, touch, close.clamp(0, 1) * trust))
@@ -96,40 +95,42 @@ def _evenly(verts: Int[Tensor, " verts"], most: int) -> Int[Tensor, " some"]:
     return verts[torch.linspace(0, len(verts) - 1, min(most, len(verts))).round().long()]
 
 
-class _Solid:
-    """A mesh as libigl wants it, once for all parts."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self.verts = as_float64(mesh.verts)
-        self.faces = outward(self.verts, as_int64(mesh.faces))
-        self.low = torch.from_numpy(self.verts.min(0))
-        self.high = torch.from_numpy(self.verts.max(0))
-        corners = self.verts[self.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        size = np.linalg.norm(normals, axis=1, keepdims=True)
-        self.normals = normals / np.maximum(size, 1e-12)
-
-
 def _near_solid(
-    points: Float[Tensor, "bodies points 3"], solid: _Solid, config: LabelConfig
-) -> _Touches:
-    """Bodies whose points come near an object."""
+    parts: list[Float[Tensor, "bodies points 3"]], mesh: Mesh, config: LabelConfig
+) -> list[_Touches]:
+    """Bodies whose points come near an object, for each part: all are asked for at once."""
     import igl
 
-    low, high = (solid.low - config.reach).to(points), (solid.high + config.reach).to(points)
-    inside = torch.minimum(points - low, high - points).amin(-1) > 0
-    row = inside.any(-1).nonzero()[:, 0]
-    if not len(row):
-        return _touches(points, row, [])
-    asked = inside[row].numpy()
-    query = as_float64(points[row][inside[row]])
-    squared, face, nearest = closest(query, solid.verts, solid.faces)
-    deep = np.asarray(igl.fast_winding_number(solid.verts, solid.faces, query)) > 0.5
-    signed = np.full(asked.shape, np.inf)
-    signed[asked] = np.where(deep, -1, 1) * np.sqrt(squared)
-    place, normal = np.zeros((*asked.shape, 3)), np.zeros((*asked.shape, 3))
-    place[asked], normal[asked] = nearest, solid.normals[face]
-    return _touches(points, row, [signed, place, normal], config)
+    verts = as_float64(mesh.verts)
+    faces = outward(verts, as_int64(mesh.faces))
+    low, high = (torch.from_numpy(end) for end in (verts.min(0), verts.max(0)))
+    low, high = (end.to(mesh.verts) for end in (low - config.reach, high + config.reach))
+    inside = [torch.minimum(points - low, high - points).amin(-1) > 0 for points in parts]
+    counts = [int(some.sum()) for some in inside]
+    if not any(counts):
+        return [_touches(points, torch.zeros(0).long(), []) for points in parts]
+    query = as_float64(torch.cat([p[some] for p, some in zip(parts, inside, strict=True)]))
+    squared, face, nearest = closest(query, verts, faces)
+    deep = np.asarray(igl.fast_winding_number(verts, faces, query)) > 0.5
+    gaps = np.where(deep, -1, 1) * np.sqrt(squared)
+    ends = np.cumsum(counts)[:-1]
+    values = [np.split(x, ends) for x in (gaps, nearest, _normals(verts, faces)[face])]
+    found: list[_Touches] = []
+    for points, some, *mine in zip(parts, inside, *values, strict=True):
+        row = some.any(-1).nonzero()[:, 0]
+        asked = some[row].numpy()
+        empty = np.full(asked.shape, np.inf), *(np.zeros((*asked.shape, 3)) for _ in range(2))
+        for whole, few in zip(empty, mine, strict=True):
+            whole[asked] = few
+        found.append(_touches(points, row, list(empty), config))
+    return found
+
+
+def _normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals of faces."""
+    corners = verts[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def _near_floor(

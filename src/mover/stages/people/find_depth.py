@@ -26,6 +26,7 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera, People
 from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
+from mover.geometry.warp_start import mapped
 from mover.stages.camera.find_foot_contacts import straight_legs
 from mover.stages.config import DepthConfig, FootContactConfig
 from mover.stages.contacts.assign_contacts import evenly, in_turns
@@ -263,10 +264,8 @@ def _curves(
 ) -> Float[Tensor, "used factors"]:
     """Overlap of silhouette and mask over the factors, for each body that is seen well."""
     factors = torch.linspace(1 - config.span, 1 + config.span, config.factors)
-    curves: list[Tensor] = []
-    for row in _spread_out(rows[:: config.every], inputs, config):  # masks are decoded one by one
-        if len(curves) == config.most:
-            break
+
+    def curve(row: int) -> Tensor | None:
         own, others = table.decode(row)
         free = free_in(int(inputs.bodies.frame[row]))
         known = free & uncovered(others, config.width)
@@ -275,8 +274,15 @@ def _curves(
         seen = mask[middle & known].sum() / (middle & known).sum().clamp_min(1)
         open_share = (middle & known).sum() / middle.sum().clamp_min(1)
         if min(float(seen), float(open_share)) < config.seen:
-            continue
-        curves.append(overlaps(_drawn(inputs, row, free, factors), mask, known))
+            return None
+        return overlaps(_drawn(inputs, row, free, factors), mask, known)
+
+    curves: list[Tensor] = []
+    asked = _spread_out(rows[:: config.every], inputs, config)
+    while asked and len(curves) < config.most:  # no more than may be needed
+        left = config.most - len(curves)
+        curves += [found for found in mapped(curve, asked[:left]) if found is not None]
+        asked = asked[left:]
     return torch.stack(curves) if curves else torch.zeros(0, config.factors)
 
 
