@@ -14,7 +14,7 @@ from mover.app.viewer.session import Shown, start_session
 from mover.bodies.parts import members, parts_of
 from mover.bodies.posture import touching
 from mover.core.errors import InputError
-from mover.core.types import Bodies, Proposal, Room
+from mover.core.types import Bodies, Proposal, Room, SceneObject
 from mover.furniture.library import make_piece
 from mover.geometry.boxes import box_of
 from mover.geometry.placement import place_object
@@ -102,6 +102,32 @@ def test_who_leans_back_has_a_chair_and_who_lies_a_bed_with_the_feet_to_its_fron
     soles = members(parts_of(lying), "left_sole", "right_sole")
     assert flat[soles, 2].mean() > 0.5
     assert flat[:, [0, 2]].abs().amax(0)[1] < box_of(bed.object).size[2] / 2 + 0.1
+
+
+def on_a_sofa(yaw: float = TURN) -> Bodies:
+    """Somebody lies, and another sits across at the feet, on a seat .45 m high."""
+    lying = somewhere(people(LYING, fps=5.0, floor=0.45), yaw)
+    middle = lying.verts[0].mean(0)
+    feet = torch.stack([torch.tensor(yaw).sin(), torch.zeros(()), torch.tensor(yaw).cos()])
+    sitting = somewhere(people(pose(SEATED, COUNT), fps=5.0), yaw + torch.pi / 2)
+    there = middle + 0.7 * feet - sitting.verts[0, members(parts_of(sitting), "seat")].mean(0)
+    sitting = sitting.verts + there * torch.tensor([1.0, 0.0, 1.0])
+    return replace(
+        lying, verts=torch.cat([lying.verts, sitting]), frame=torch.arange(2 * COUNT),
+        person=torch.zeros(2 * COUNT, dtype=torch.long), pose=None, joints=None,
+    )  # fmt: skip
+
+
+def test_who_sits_across_to_who_lies_sits_on_a_sofa_as_long_as_both():
+    bodies = on_a_sofa()
+    (sofa,) = proposed(bodies)
+    assert sofa.object.category == "sofa"
+    assert sofa.bodies > 1.5 * COUNT
+    assert float(sofa.object.yaw) == pytest.approx(TURN + torch.pi / 2, abs=0.1)
+    flat = (bodies.verts - sofa.object.t_world_object) @ rot_y(sofa.object.yaw)
+    lying, half = flat[:COUNT, :, 0], box_of(sofa.object).size[0] / 2
+    assert lying.abs().max() < half
+    assert lying.abs().max() > half - 0.45
 
 
 def test_feet_that_stand_above_the_floor_propose_a_step_of_that_height():
@@ -192,6 +218,39 @@ def test_an_accepted_proposal_is_an_object_where_it_was_proposed_and_a_dismissed
         assert torch.allclose(ours, theirs, atol=1e-4)
     session.undo()
     assert len(session.proposals) == 1
+
+
+def test_a_dismissed_proposal_is_gone_for_good_and_neither_answer_changes_another_object(
+    tmp_path: Path,
+):
+    found, file = proposed(sitters()), tmp_path / "edits.json"
+    shown = Shown("x", room(), room(), None, None, proposals=found)
+    session = start_session(shown, file, None)
+    session.accept("proposed_stool_0")
+    assert same_objects(session.scene.objects[:3], room().objects)
+    session.undo()
     session.dismiss("proposed_stool_0")
     assert session.proposals == ()
-    assert len(session.scene.objects) == 3
+    assert same_objects(session.scene.objects, room().objects)
+    assert start_session(shown, file, None).proposals == ()
+    near, far = (somewhere_else(found[0], gap) for gap in (0.2, 0.5))
+    later = start_session(replace(shown, proposals=(near, far)), file, None)
+    assert [one.object.id for one in later.proposals] == [far.object.id]
+    session.undo()
+    assert len(session.proposals) == 1
+
+
+def somewhere_else(one: Proposal, gap: float) -> Proposal:
+    """A proposal of the next run, under another name."""
+    piece = one.object
+    there = piece.t_world_object + gap * torch.tensor([1.0, 0.0, 0.0])
+    return replace(one, object=replace(piece, id=f"proposed_{gap}", t_world_object=there))
+
+
+def same_objects(ours: tuple[SceneObject, ...], theirs: tuple[SceneObject, ...]) -> bool:
+    """Whether all stand where they stood, to the bit."""
+    return all(
+        a.id == b.id and torch.equal(a.t_world_object, b.t_world_object)
+        and torch.equal(a.yaw, b.yaw) and torch.equal(a.scale, b.scale)
+        for a, b in zip(ours, theirs, strict=True)
+    )  # fmt: skip

@@ -137,6 +137,7 @@ SYNONYMS: dict[str, str] = {
 }  # fmt: skip
 """Other names of the classes."""
 
+STEP = "step"
 SEATS = frozenset({"chair", "armchair", "office chair", "sofa", "stool", "bench", "bed"})
 """Classes that may take a sitter."""
 

@@ -75,6 +75,8 @@ class RoomConfig:
     """The video ends after so many; 0: when everybody is done."""
     moved: bool = False
     """A piece is moved in the middle of the video, before another person comes in."""
+    step: bool = False
+    """There is a step, on which somebody stands first."""
     least_passing: float = 0.0
     """Least share of the bodies that furniture hides in part."""
     plan: PlanConfig = field(default_factory=PlanConfig)

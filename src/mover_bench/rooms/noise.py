@@ -17,7 +17,7 @@ from torch import Tensor
 from mover.bodies.skinning import open_body
 from mover.core.records import map_tensors
 from mover.core.types import Bodies, BodyPose, Camera, Capture, Mesh, Scene, SceneObject
-from mover.furniture.library import SEATS, another
+from mover.furniture.library import SEATS, STEP, another
 from mover.furniture.pieces import Furniture
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
@@ -264,19 +264,20 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     return wrong_lens(capture, noise.lens, np.random.default_rng([seed, 13]))
 
 
-def without_seat(capture: Capture, room: KnownRoom) -> Capture:
-    """The capture without the seat that is sat on most: no detector saw it.
+def without_support(capture: Capture, room: KnownRoom) -> Capture:
+    """The capture without the step that somebody stands on, else the seat that is sat on most.
 
     A seat for one, whose middle its sitter tells, goes before sofas, benches and beds.
     """
-    sitting = torch.tensor([action in ("sit", "lean", "lie") for action in room.actions])
-    touched = room.touched[sitting]
+    steps = [k for k, piece in enumerate(room.furniture) if piece.category == STEP]
+    resting = torch.tensor([action in ("sit", "lean", "lie") for action in room.actions])
+    touched = room.touched[resting]
     used = [int((touched == k).any(1).sum()) for k in range(len(room.furniture))]
     seats = [k for k, n in enumerate(used) if n and room.furniture[k].category in SEATS]
-    if not seats:
-        return capture
     single = [k for k in seats if room.furniture[k].category in SEATS_FOR_ONE]
-    lost = room.truth.objects[max(single or seats, key=lambda k: used[k])]
+    if not steps + seats:
+        return capture
+    lost = room.truth.objects[max(steps or single or seats, key=lambda k: used[k])]
     return without(capture, {lost.annotation})
 
 

@@ -36,8 +36,9 @@ from mover_bench.rooms.camera_path import filmed
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.moved import make_moved_room
-from mover_bench.rooms.noise import without_seat
+from mover_bench.rooms.noise import without_support
 from mover_bench.rooms.room import make_room
+from mover_bench.rooms.stepped import make_stepped_room
 from mover_bench.studies.fitted import fitted_trial, measure_fitted
 from mover_bench.studies.measures import (
     Trial,
@@ -113,7 +114,8 @@ class Seed:
 def make_truth(inputs: Seed, config: RoomConfig, observe: Observer = silent) -> KnownRoom:
     """A room without noise, as a stage: sets with the same rooms make it once."""
     del observe
-    return (make_moved_room if config.moved else make_room)(inputs.seed, config)
+    make = make_stepped_room if config.step else make_room
+    return (make_moved_room if config.moved else make)(inputs.seed, config)
 
 
 def noisy_room(seed: int, rooms: RoomSet, run: Run | None = None) -> Trial:
@@ -129,7 +131,7 @@ def spoilt(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
     """A known room with the noise of a set."""
     capture = filmed(room, rooms.noise, seed, rooms.paths[seed % len(rooms.paths)])
     if rooms.withheld:
-        capture = without_seat(capture, room)
+        capture = without_support(capture, room)
     if "camera" in rooms.exact:
         assert room.truth.ground is not None, "a known room has a floor"
         capture = replace(capture, camera_height=-room.truth.ground)

@@ -22,7 +22,7 @@ from mover.evaluate.evaluation import (
     touch_in_truth,
 )
 from mover.evaluate.scene import Pair, iou3d, unmatched
-from mover.furniture.library import SEATS, canonical
+from mover.furniture.library import SEATS, STEP, canonical
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera
 from mover.geometry.mesh import sample_surface
@@ -238,9 +238,9 @@ def measure(
 
 
 def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:
-    """How the seats that were not given, and are used, are proposed, and what else is.
+    """How the seats and steps that were not given, and are used, are proposed, and what else is.
 
-    A proposal is that of the nearest such seat within `NEAR`; others are false.
+    A proposal is that of the nearest of them within `NEAR`; others are false.
     """
     given = {piece.id for piece in trial.capture.scene.objects}
     turn = trial.truth.camera.R_cam_world.mT @ room.scene.camera.R_cam_world
@@ -248,7 +248,7 @@ def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:
     claimed: set[int] = set()
     rows: list[dict[str, Any]] = []
     for seat, traits in zip(trial.truth.objects, trial.traits, strict=True):
-        if seat.id in given or not traits.touched or canonical(seat.category) not in SEATS:
+        if seat.id in given or not traits.touched or canonical(seat.category) not in {*SEATS, STEP}:
             continue
         away = [float((at - box_of(seat).center)[[0, 2]].norm()) for at in places]
         near = [k for k, gap in enumerate(away) if gap < NEAR]

@@ -31,7 +31,7 @@ class RoomSet:
     exact: tuple[str, ...] = ()
     """What is given as it truly is, of `EXACT`."""
     withheld: bool = False
-    """No detector saw the seat that is used most: see `rooms.noise.without_seat`."""
+    """No detector saw the seat that is used most, or the step: `rooms.noise.without_support`."""
     paths: tuple[PathConfig, ...] = (PathConfig(),)
     """How the camera moves, one room after the other."""
 
@@ -162,6 +162,10 @@ SETS: dict[str, RoomSet] = {
     "withheld-seat": RoomSet(
         "The rooms of `rooms`; the seat that is used most is not in what is given.",
         "1000-1029", "100-129", withheld=True,
+    ),
+    "withheld-step": RoomSet(
+        "The rooms of `rooms` with a step on which somebody stands; it is not in what is given.",
+        "1000-1029", "100-129", RoomConfig(step=True), withheld=True,
     ),
     "moving-camera": RoomSet(
         "The rooms of `rooms` seen by a camera that is walked with, panned or held by hand; its"

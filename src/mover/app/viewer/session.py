@@ -22,12 +22,14 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.edits import (
     Add,
     Delete,
+    Dismiss,
     Edit,
     Pin,
     Place,
     Placement,
     Relabel,
     edit_scene,
+    is_dismissed,
     joined,
     pinned_ids,
     placement_of,
@@ -131,8 +133,6 @@ class Session:
     done: int = 0
     """So many of the edits are inside of `shown.result`."""
     selected: str | None = None
-    dismissed: frozenset[str] = frozenset()
-    """Ids of proposals that the user does not want to see again in this session."""
     listeners: list[Callable[[], None]] = field(default_factory=lambda: [])
     lock: threading.RLock = field(default_factory=threading.RLock)
 
@@ -149,8 +149,12 @@ class Session:
     @property
     def proposals(self) -> tuple[Proposal, ...]:
         """Supports that the user has neither accepted nor dismissed."""
-        gone = self.dismissed | {piece.id for piece in self.scene.objects}
-        return tuple(one for one in self.shown.proposals if one.object.id not in gone)
+        there = {piece.id for piece in self.scene.objects}
+        return tuple(
+            one for one in self.shown.proposals
+            if one.object.id not in there
+            and not is_dismissed(one.object, self.shown.result, self.edits)
+        )  # fmt: skip
 
     def accept(self, name: str) -> None:
         """Make a proposed support an object of the room."""
@@ -161,9 +165,10 @@ class Session:
                 self.select(name)
 
     def dismiss(self, name: str) -> None:
-        """Show a proposed support no longer."""
-        self.dismissed = self.dismissed | {name}
-        self.changed()
+        """Say that there is no such support: it is not shown again, whatever runs propose."""
+        for one in self.proposals:
+            if one.object.id == name:
+                self.record(Dismiss(name, placement_of(one.object, self.shown.result)))
 
     def piece(self, name: str | None) -> SceneObject | None:
         """An object of the room by its id."""

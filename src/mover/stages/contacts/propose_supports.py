@@ -5,7 +5,9 @@ known object is within reach, or where it is seen before the mask of a known sea
 Rests at one place make a group, over all people and the whole video. A group that is not covered
 and lasts is a support: the class follows from posture, the place from the middle of what touches,
 the height from its lowest layer, the front from where people look, the size from the class and from
-how wide the place is that they touch.
+how wide the place is that they touch. Who sits across to those who lie, near the edge, sits on a
+sofa: it reaches from one end of all of them to the other. What rests on a piece for several belongs
+to it.
 
 A proposal is no object: nothing else of the room depends on it until somebody accepts it.
 """
@@ -42,9 +44,13 @@ UNORDERED = 1.0  # [s] that an image without time stands for
 LEANS = 0.2  # [rad] of a trunk behind upright: its seat has a back
 UPRIGHT = 0.1  # [m] before the middle of its seat sits who does not lean (rooms 100-115)
 LIES = 0.2  # share of the rests that make a seat a bed
+ACROSS = 0.7  # sine of the angle between who sits and who lies, on a seat that is lain on along
+REACH = 0.12  # [m] beyond the front edge of what touches of a sitter
+NARROW = 0.36  # [m] from the middle of those who lie to the front edge: less is no bed
+LONG = frozenset({"single bed", "sofa", "bench"})
 WIDE = 0.8  # [m] of what touches, from side to side: more than one seat
 EDGE = 0.05  # [m] around what touches that at least belongs to what carries it
-ENDS = 0.02  # share of the points beyond each end
+ENDS = 0.02  # share of the points, and of the rests, beyond each end
 STEADY = 0.04  # [m] by which the heights of rests on one support differ
 
 Kind = Literal["sit", "lie", "step"]
@@ -111,14 +117,20 @@ def propose_supports(
         return Proposals(())
     groups = [Group(rests, inputs) for rests in grouped(resting_bodies(inputs, config))]
     held = [g for g in groups if g.covered < config.covered and g.seconds >= config.seconds]
-    held.sort(key=lambda group: -group.seconds)
+    held.sort(key=lambda group: (_kind_of(group) not in LONG, -group.seconds))
     taken = set(inputs.known.taken)
     found: list[Proposal] = []
-    for group in held:
-        if not any(_stands_under(proposal.object, group.middle) for proposal in found):
-            found.append(_proposal(group, taken))
-            taken.add(found[-1].object.id)
-    return Proposals(tuple(found))
+    while held:
+        group, *held = held
+        proposal = _proposal(group, taken)
+        under = [other for other in held if _stands_under(proposal.object, other.middle)]
+        if under and proposal.piece in LONG:
+            rests = [rest for part in (group, *under) for rest in part.rests]
+            proposal = _proposal(Group(rests, inputs), taken)
+        held = [other for other in held if not _stands_under(proposal.object, other.middle)]
+        found.append(proposal)
+        taken.add(proposal.object.id)
+    return Proposals(tuple(sorted(found, key=lambda proposal: -proposal.seconds)))
 
 
 def resting_bodies(inputs: ProposeInputs, config: ProposeConfig) -> list[Resting]:
@@ -223,8 +235,12 @@ class Group:
     def middle(self) -> Float[Tensor, "3"]:
         """Of what touches; of the whole body where people lie [m]."""
         if self.lies:
-            return self.inputs.bodies.verts[self.rows].mean(1).median(0).values
+            return self.inputs.bodies.verts[self.rows_of("lie")].mean(1).median(0).values
         return torch.stack([rest.points.mean(0) for rest in self.rests]).median(0).values
+
+    def rows_of(self, kind: Kind) -> Int[Tensor, " rests"]:
+        """The bodies that rest in one way."""
+        return torch.tensor([r.row for r in self.rests if r.kind == kind], dtype=torch.long)
 
     @property
     def lies(self) -> bool:
@@ -233,13 +249,19 @@ class Group:
 
     @property
     def leans(self) -> bool:
-        """People lean back here."""
+        """Most who sit here lean back."""
         pose = postures(self.inputs.bodies, self.inputs.parts, self.inputs.ground)
-        return bool(pose.recline[self.rows].median() > LEANS)
+        return bool(pose.recline[self.rows_of("sit")].median() > LEANS)
 
     @property
     def yaw(self) -> Float[Tensor, ""]:
-        """Where the front is: sitters look there, feet of liers are there [rad]."""
+        """Where the front is: sitters look there, on a bed feet of liers are there [rad]."""
+        if not self.lies:
+            return _angle(self.way(self.rests[0].kind))
+        return self.sofa if self.sofa is not None else _angle(self.way("lie"))
+
+    def way(self, kind: Kind) -> Float[Tensor, "3"]:
+        """Sum of where they look, or of where the feet of liers are."""
         bodies, parts = self.inputs.bodies, self.inputs.parts
         places = landmarks(bodies, parts)
         ways = {
@@ -247,32 +269,64 @@ class Group:
             "lie": at(places, "hips") - at(places, "neck"),
             "step": facing(places),
         }
-        kind = "lie" if self.lies else self.rests[0].kind
-        rows = torch.tensor([rest.row for rest in self.rests if rest.kind == kind])
-        way = torch.nan_to_num(ways[kind][rows]).sum(0)
-        return torch.atan2(way[0], way[2])
+        return torch.nan_to_num(ways[kind][self.rows_of(kind)]).sum(0)
+
+    @property
+    def sofa(self) -> Float[Tensor, ""] | None:
+        """Front of a seat on which people lie along and sit across [rad]; None: it is none."""
+        sits = self.rows_of("sit")
+        if not self.lies or not len(sits):
+            return None
+        lie, sit = _angle(self.way("lie")), self.way("sit")
+        across = torch.stack([lie.cos(), torch.zeros_like(lie), -lie.sin()])
+        side = torch.dot(across, sit)
+        if float(side.abs()) < ACROSS * float(sit.norm()):
+            return None
+        front = across * side.sign()
+        points = torch.cat([rest.points for rest in self.rests if rest.kind == "sit"])
+        edge = float(torch.quantile(points @ front, 1 - ENDS)) - REACH
+        return _angle(front) if edge - float(self.middle @ front) < NARROW else None
+
+    @property
+    def span(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+        """Least and largest x and z of all that rests, in axes whose z is the front [m].
+
+        Of people who lie on a sofa the whole body counts.
+        """
+        points = [torch.cat([rest.points for rest in self.rests])]
+        if self.sofa is not None:  # few who sit at one end count as much as many who lie
+            lying = self.inputs.bodies.verts[self.rows_of("lie")]
+            points = [*(rest.points for rest in self.rests), *lying]
+        turn, some = rot_y(self.yaw), torch.tensor([ENDS, 1 - ENDS])
+        ends = [torch.quantile((each @ turn)[:, [0, 2]], some, dim=0) for each in points]
+        low, high = torch.stack(ends).unbind(1)
+        return low.quantile(ENDS, dim=0), high.quantile(1 - ENDS, dim=0)
 
     @property
     def extent(self) -> Float[Tensor, "2"]:
-        """Width and depth of all that touches, seen from the front [m]."""
-        points = torch.cat([rest.points for rest in self.rests]) @ rot_y(self.yaw)
-        ends = torch.quantile(points[:, [0, 2]], torch.tensor([ENDS, 1 - ENDS]), dim=0)
-        return ends[1] - ends[0]
+        """Width and depth of all that rests, seen from the front [m]."""
+        low, high = self.span
+        return high - low
+
+
+def _angle(way: Float[Tensor, "3"]) -> Float[Tensor, ""]:
+    """About +y, from +z to a direction [rad]."""
+    return torch.atan2(way[0], way[2])
 
 
 def _proposal(group: Group, taken: set[str]) -> Proposal:
     """A piece of the library under a group."""
     kind, height, yaw = _kind_of(group), float(group.heights.median()), group.yaw
     seed, piece = _of_height(kind, height)
-    size = torch.tensor(piece.size)
-    scale = torch.ones(3)
-    scale[1] = height / (piece.seat_height or piece.top_height)
-    scale[[0, 2]] = ((group.extent + 2 * EDGE) / size[[0, 2]]).clamp_min(1.0)
-    if kind in ("chair", "stool"):  # thighs reach beyond its front edge
-        scale[2] = 1.0
-    forward = 0.0 if group.leans or group.rests[0].kind != "sit" else UPRIGHT
+    scale = _scale(group, kind, piece, height)
     front = torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()])
+    forward = 0.0 if group.leans or group.rests[0].kind != "sit" else UPRIGHT
     place = group.middle - forward * front
+    if group.sofa is not None:  # between both ends; who lies is in the middle of its seat
+        side = torch.stack([yaw.cos(), torch.zeros_like(yaw), -yaw.sin()])
+        seat = (piece.seat_back + piece.seat_front) / 2 * float(scale[2])
+        place = group.middle - seat * front
+        place = place + (sum(group.span)[0] / 2 - place @ side) * side
     place[1] = group.inputs.ground
     stem = f"proposed_{kind.replace(' ', '_')}"
     name = next(n for n in (f"{stem}_{k}" for k in range(len(taken) + 1)) if n not in taken)
@@ -281,6 +335,20 @@ def _proposal(group: Group, taken: set[str]) -> Proposal:
         SceneObject(name, piece.category, piece.mesh, "", None, "ground", *where),
         kind, 0, seed, _certainty(group), len(group.rests), group.seconds,
     )  # fmt: skip
+
+
+def _scale(group: Group, kind: str, piece: Furniture, height: float) -> Float[Tensor, "3"]:
+    """Of a piece, so that it is as high as what rests on it, and as wide where that tells."""
+    size, scale = torch.tensor(piece.size), torch.ones(3)
+    scale[1] = height / (piece.seat_height or piece.top_height)
+    wanted = group.extent + 2 * EDGE
+    if group.sofa is not None:
+        scale[0] = wanted[0] / (piece.seat_right - piece.seat_left)
+        return scale
+    scale[[0, 2]] = (wanted / size[[0, 2]]).clamp_min(1.0)
+    if kind in ("chair", "stool"):  # thighs reach beyond its front edge
+        scale[2] = 1.0
+    return scale
 
 
 def _stands_under(piece: SceneObject, point: Float[Tensor, "3"]) -> bool:
@@ -295,7 +363,7 @@ def _kind_of(group: Group) -> str:
     if group.rests[0].kind == "step":
         return "step"
     if group.lies:
-        return "single bed"
+        return "single bed" if group.sofa is None else "sofa"
     wide = bool(group.extent[0] > WIDE)
     if group.leans:
         return "sofa" if wide else "chair"
