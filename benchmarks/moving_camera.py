@@ -5,11 +5,13 @@
 Rebuilds each room with `robust` from the captures of `--sets` (the first: of the still camera;
 `moving-camera` has furniture in the reference image alone, `moving-views` in further frames, too;
 finished rooms are kept in `--out`) and prints IoU3D, the angle of gravity [degrees], the error of
-the floor [cm] and, for the moving camera, the error of the path's scale [%] and how
-far it went [m].
+the floor [cm], the scale of the room [%] as its furniture and as its people tell it (how far apart
+pieces stand, and how far people went, against the truth) and, for the moving camera, the error of
+the path's scale [%] and how far it went [m].
 """
 
 import argparse
+import math
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,17 +20,20 @@ import numpy as np
 import torch
 
 from mover.core.run import Run
-from mover.core.types import CameraPath
+from mover.core.types import Bodies, CameraPath, Room
+from mover.geometry.boxes import box_of
 from mover.geometry.path import is_still
 from mover.pipeline.people import people_of
 from mover.pipeline.presets import ROBUST
 from mover.pipeline.reconstruct import reconstruct
+from mover.stages.people.find_depth import pelvis
 from mover_bench.rooms.camera_path import PATHS, draw_path, slam_path
 from mover_bench.studies.job import noisy_room
 from mover_bench.studies.measures import Trial, measure
 from mover_bench.studies.run import parse_seeds
 from mover_bench.studies.sets import SETS
 
+APART = 1.0  # [m] between two pieces that tell the room's scale
 KINDS = ("walked", "panned", "held")
 
 
@@ -56,8 +61,31 @@ def _way(path: CameraPath) -> float:
     return float(path.t_reference_camera.diff(dim=0).norm(dim=-1).sum())
 
 
+def room_scale(trial: Trial, room: Room) -> tuple[float, float]:
+    """How much too large the room is [%]: by ways between pieces, and by those of people."""
+    true = {piece.id: box_of(piece).center for piece in trial.truth.objects}
+    found = {piece.id: box_of(piece).center for piece in room.scene.objects}
+    known = [name for name in true if name in found]
+    ways = [torch.pdist(torch.stack([centres[n] for n in known])) for centres in (found, true)]
+    assert room.bodies is not None
+    assert room.kept is not None
+    assert trial.bodies is not None
+    rows = {key: row for row, key in enumerate(_keys(trial.bodies))}
+    ours = pelvis(room.bodies)[room.kept]
+    index = torch.tensor([rows[key] for key in _keys(room.bodies)])[room.kept]
+    theirs = pelvis(trial.bodies)[index]
+    spreads = [(place - place.mean(0)).square().sum().sqrt() for place in (ours, theirs)]
+    far = ways[1] > APART
+    pieces = float((ways[0][far] / ways[1][far]).log().median())
+    return 100 * math.expm1(pieces), 100 * (float(spreads[0] / spreads[1]) - 1)
+
+
+def _keys(bodies: Bodies) -> list[tuple[int, int]]:
+    return list(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True))
+
+
 def row(name: str, seed: int, out: Path) -> list[float]:
-    """IoU3D of stage 1 and of the whole, gravity, floor, scale, reach, seconds."""
+    """IoU3D of stage 1 and of the whole, gravity, floor, room, path, reach, seconds."""
     trial = noisy_room(seed, SETS[name], Run(out / str(seed)))
     begin = time.process_time()
     run = Run(out / name / str(seed))
@@ -74,7 +102,7 @@ def row(name: str, seed: int, out: Path) -> list[float]:
     told = measure(trial, room, run)
     values = [told[stage]["iou3d"] for stage in ("image", "full")]
     floor = 100 * abs(room.scene.ground - trial.truth.ground)
-    return [*values, angle, floor, *scale, seconds]
+    return [*values, angle, floor, *room_scale(trial, room), *scale, seconds]
 
 
 def main() -> None:
@@ -86,12 +114,15 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     rows: dict[str, list[list[float]]] = {name: [] for name in args.sets}
-    print("seed camera | IoU3D stage 1, full | gravity, floor | scale, reach | seconds")
+    print(
+        "seed camera | IoU3D stage 1, full | gravity, floor | room, people | path, reach | seconds"
+    )
     for seed in parse_seeds(args.seeds):
         for name, found in rows.items():
             found.append(row(name, seed, args.out))
             kind = "still" if name == "rooms" else KINDS[seed % len(KINDS)]
-            told = ("{:.3f}", "{:.3f}", "{:.2f}", "{:.1f}", "{:+.1f}", "{:.2f}", "{:.0f}")
+            told = ("{:.3f}", "{:.3f}", "{:.2f}", "{:.1f}", "{:+.1f}", "{:+.1f}")
+            told += ("{:+.1f}", "{:.2f}", "{:.0f}")
             line = " ".join(t.format(v) for t, v in zip(told, found[-1], strict=True))
             print(f"{seed} {kind}: {line}", flush=True)
     for name, found in rows.items():

@@ -14,6 +14,8 @@ from mover.app.viewer.session import Shown, start_session
 from mover.bodies.parts import members, parts_of
 from mover.bodies.posture import touching
 from mover.core.errors import InputError
+from mover.core.records import fingerprint
+from mover.core.run import Run
 from mover.core.types import Bodies, Proposal, Room, SceneObject
 from mover.furniture.library import make_piece
 from mover.geometry.boxes import box_of
@@ -21,6 +23,8 @@ from mover.geometry.placement import place_object
 from mover.geometry.rotations import rot_y
 from mover.io.capture.proposals_file import read_proposals, write_proposals
 from mover.io.capture.scene_file import read_scene
+from mover.pipeline.presets import ROBUST
+from mover.pipeline.reconstruct import reconstruct
 from mover.stages.config import ProposeConfig
 from mover.stages.contacts.propose_supports import (
     NOTHING,
@@ -28,6 +32,8 @@ from mover.stages.contacts.propose_supports import (
     ProposeInputs,
     propose_supports,
 )
+from mover_bench.studies.job import noisy_room
+from mover_bench.studies.sets import SETS
 
 COUNT = 12  # frames: 2.4 s
 LYING = turned(pose(ARMS_DOWN, COUNT), -torch.pi / 2, 0.0, 0.0)
@@ -238,6 +244,17 @@ def test_a_dismissed_proposal_is_gone_for_good_and_neither_answer_changes_anothe
     assert [one.object.id for one in later.proposals] == [far.object.id]
     session.undo()
     assert len(session.proposals) == 1
+
+
+@pytest.mark.slow
+def test_what_a_run_proposes_changes_nothing_else_of_its_room(tmp_path: Path):
+    capture = noisy_room(103, replace(SETS["mini"], withheld=True)).capture
+    run, without = Run(tmp_path), replace(ROBUST, propose=ProposeConfig(use=False))
+    with_it, bare = (reconstruct(capture, config, run) for config in (ROBUST, without))
+    assert [one.piece for one in with_it.proposals] != []
+    assert bare.proposals == ()
+    told = tuple(line for line in with_it.warnings if "is proposed there" not in line)
+    assert fingerprint(replace(with_it, proposals=(), warnings=told)) == fingerprint(bare)
 
 
 def somewhere_else(one: Proposal, gap: float) -> Proposal:

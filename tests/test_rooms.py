@@ -22,12 +22,15 @@ from mover_bench.rooms.gait import duration, stations, walk
 from mover_bench.rooms.known import Actor, KnownRoom, build
 from mover_bench.rooms.lying import berth, on_side, supine
 from mover_bench.rooms.motion import Stage, Stop, Task, perform
+from mover_bench.rooms.noise import without_support
 from mover_bench.rooms.placed import NoWayError, Placed, free_of, way
 from mover_bench.rooms.poses import Person, Posture, make_person, skinned
 from mover_bench.rooms.render import see
 from mover_bench.rooms.room import demo_room, make_room
 from mover_bench.rooms.seating import hand_on, leaning, seat_spot, seated, table_stand
+from mover_bench.rooms.stepped import make_stepped_room
 from mover_bench.rooms.truth import part
+from mover_bench.studies.sets import SETS
 
 SHAPES = ([0.0] * 10, [1.3, -1.0, 0.5] + [0.0] * 7)
 
@@ -295,6 +298,22 @@ def test_tasks_that_the_furniture_does_not_allow_are_refused_with_a_reason() -> 
 
 @pytest.mark.slow
 class TestWholeRooms:
+    def test_a_video_begins_on_a_step_that_is_withheld_and_ends_on_the_floor(self) -> None:
+        config = dataclasses.replace(SETS["mini"].room, step=True)
+        room = make_stepped_room(101, config)
+        step, count = room.truth.objects[-1], room.actions.count("step")
+        assert step.category == "step"
+        assert count >= 15
+        world = to_world(room.bodies.verts, room.truth.camera.R_cam_world)
+        assert room.truth.ground is not None
+        low = world[..., 1].amin(1) - room.truth.ground
+        assert (low[:count] - room.furniture[-1].top_height).abs().max() < 0.01
+        assert low[count + 10 :].abs().max() < 0.02
+        assert bool((room.touched[:count] == len(room.furniture) - 1).any(1).all())
+        given = without_support(room.capture, room)
+        assert [p.id for p in given.scene.objects] == [p.id for p in room.truth.objects[:-1]]
+        assert len(given.detections) == len(room.capture.detections) - 1
+
     def test_a_third_of_the_pieces_of_drawn_rooms_is_partly_hidden_and_all_are_seen(self) -> None:
         hidden, pixels = [], []
         for seed in range(6):

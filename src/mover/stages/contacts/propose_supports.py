@@ -326,7 +326,8 @@ def _proposal(group: Group, taken: set[str]) -> Proposal:
         side = torch.stack([yaw.cos(), torch.zeros_like(yaw), -yaw.sin()])
         seat = (piece.seat_back + piece.seat_front) / 2 * float(scale[2])
         place = group.middle - seat * front
-        place = place + (sum(group.span)[0] / 2 - place @ side) * side
+        low, high = group.span
+        place = place + ((low + high)[0] / 2 - place @ side) * side
     place[1] = group.inputs.ground
     stem = f"proposed_{kind.replace(' ', '_')}"
     name = next(n for n in (f"{stem}_{k}" for k in range(len(taken) + 1)) if n not in taken)
