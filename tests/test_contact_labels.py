@@ -17,6 +17,7 @@ from mover.core.contact_labels import ContactLabels
 from mover.core.errors import InputError
 from mover.core.types import Bodies, Mesh
 from mover.geometry.nearest import to_surface
+from mover.geometry.placement import StandingMesh
 from mover.io.export.contacts import export_contacts, read_labels, write_labels
 from mover.io.export.finished import read_finished
 from mover.stages.contacts.label_contacts import LabelConfig, LabelInputs, label_contacts
@@ -35,7 +36,8 @@ def standing(frames: int = 6) -> Bodies:
 
 def labelled(bodies: Bodies, *meshes: Mesh, ground: float | None = GROUND) -> ContactLabels:
     ids = tuple(f"box_{k}" for k in range(len(meshes)))
-    return label_contacts(LabelInputs(bodies, parts_of(bodies), meshes, ids, ground), LabelConfig())
+    stands = tuple((StandingMesh(mesh),) for mesh in meshes)
+    return label_contacts(LabelInputs(bodies, parts_of(bodies), stands, ids, ground), LabelConfig())
 
 
 def shelf_beside(bodies: Bodies, side: str, gap: float) -> Mesh:

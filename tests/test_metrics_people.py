@@ -26,6 +26,7 @@ from mover.evaluate.bodies import (
 )
 from mover.evaluate.contact import (
     Nearness,
+    StandingMesh,
     Touch,
     contact,
     contact_f1,
@@ -39,7 +40,7 @@ from mover.evaluate.contact import (
 
 
 def test_a_body_that_sinks_into_a_box_collides_by_its_share_and_depth() -> None:
-    box = [cuboid(1, 1, 1)]  # its top is at 1
+    box = [StandingMesh(cuboid(1, 1, 1))]  # its top is at 1
     touch = gather_touch(some_people(grid_body(0.92, 1.32)), box, None, 10, 0.05)
     assert non_collision(touch) == pytest.approx(4 / 5)  # rows at .92, 1.02, 1.12, 1.22, 1.32
     assert contact(touch) == 1
@@ -48,7 +49,7 @@ def test_a_body_that_sinks_into_a_box_collides_by_its_share_and_depth() -> None:
 
 
 def test_a_body_just_above_a_box_touches_it_without_colliding() -> None:
-    box = [cuboid(1, 1, 1)]
+    box = [StandingMesh(cuboid(1, 1, 1))]
     above = some_people(grid_body(1.04, 1.44))
     touch = gather_touch(above, box, None, 10, 0.05)
     assert (non_collision(touch), contact(touch), penetration_depth(touch)) == (1, 0, 0)
@@ -56,7 +57,7 @@ def test_a_body_just_above_a_box_touches_it_without_colliding() -> None:
 
 
 def test_contact_scores_are_means_over_bodies() -> None:
-    box = [cuboid(1, 1, 1)]
+    box = [StandingMesh(cuboid(1, 1, 1))]
     both = some_people(torch.cat([grid_body(0.92, 1.32), grid_body(1.04, 1.44)]))
     touch = gather_touch(both, box, None, 10, 0.05)
     assert non_collision(touch) == pytest.approx(0.9)
@@ -65,7 +66,7 @@ def test_contact_scores_are_means_over_bodies() -> None:
 
 
 def test_contact_f1_compares_the_touching_vertices_with_the_true_ones() -> None:
-    box = [cuboid(1, 1, 1)]
+    box = [StandingMesh(cuboid(1, 1, 1))]
     true = some_people(grid_body(1.0, 1.4, 9))  # heights 1, 1.05, 1.1, ...: two rows touch
     high = some_people(grid_body(1.04, 1.44, 9))  # one row touches
     for judged, expected in ((true, 1.0), (high, 2 * 9 / (9 + 18))):
@@ -76,7 +77,7 @@ def test_contact_f1_compares_the_touching_vertices_with_the_true_ones() -> None:
 
 
 def test_contact_f1_is_paired_by_frame_and_person_not_by_row() -> None:
-    box = [cuboid(1, 1, 1)]
+    box = [StandingMesh(cuboid(1, 1, 1))]
     bodies = some_people(torch.cat([grid_body(1.0, 1.4), grid_body(1.04, 1.44), grid_body(2, 3)]))
     order = torch.tensor([2, 0, 1])
     shuffled = replace(bodies, verts=bodies.verts[order], frame=bodies.frame[order])
@@ -93,8 +94,10 @@ def test_distances_within_reach_are_those_to_all_objects_without_culling() -> No
     rng = torch.Generator().manual_seed(0)
     verts = torch.rand(3, 400, 3, generator=rng, dtype=F64) * 3 - 1.5
     sphere = mesh_of(trimesh.creation.icosphere(3, 0.8))
-    found = nearness(verts, [sphere, cuboid(1, 1, 1)], 0.05)
-    whole = nearness(verts, [sphere, cuboid(1, 1, 1)], 10.0)
+    frame = torch.arange(3)
+    solid = [StandingMesh(sphere), StandingMesh(cuboid(1, 1, 1))]
+    found = nearness(verts, frame, solid, 0.05)
+    whole = nearness(verts, frame, solid, 10.0)
     near = whole.surface <= 0.05
     assert near.sum() > 50
     assert torch.equal(near, found.surface <= 0.05)

@@ -10,6 +10,7 @@ import torch
 from little_room import room
 
 from mover.core.errors import InputError
+from mover.core.records import rows_of
 from mover.core.types import Masks, People, Segment
 from mover.geometry.placement import placed_at
 from mover.geometry.rle import decode, encode
@@ -45,6 +46,24 @@ def stays(seen: list[tuple[int, int, torch.Tensor]], people: People | None = Non
 
 
 FRAMES = range(0, 60, 2)
+
+
+def test_some_rows_of_people_keep_their_own_masks_and_known_heights():
+    people = rows([(f, f % 3, patch(f, f)) for f in range(6)])
+    some = rows_of(replace(people, heights={"1": 1.8}), people.frame >= 3)
+    assert some.frame.tolist() == [3, 4, 5]
+    assert some.heights == {"1": 1.8}
+    for row, frame in enumerate((3, 4, 5)):
+        assert torch.equal(decode(some.masks, row), patch(frame, frame))
+
+
+def test_a_stay_lasts_only_while_it_is_seen_and_not_while_it_may_be_hidden():
+    body = patch(0, 0, 160, 90)
+    seen = [(f, 3, patch(20, 30) if f < 20 else patch(90, 40)) for f in FRAMES]
+    seen = [(f, n, m & ~body if 14 < f < 30 else m) for f, n, m in seen]
+    people = rows([(f, 0, body) for f in FRAMES if 14 < f < 30])
+    found = find_moves(MoveInputs(rows(seen), people, (3,), FPS), MoveConfig()).stays
+    assert [stay.sure for stay in found] == [(0, 14), (30, 58)]
 
 
 def test_an_object_that_stands_elsewhere_from_a_frame_on_has_two_stays():
@@ -96,7 +115,7 @@ def test_a_glance_of_a_wrong_mask_is_no_move():
 def moved_room():
     scene = room()
     chair = scene.objects[0]
-    later = Segment(12, torch.tensor([0.0, -1.5, -2.5]), torch.tensor(1.0))
+    later = Segment(12, torch.tensor([0.0, -1.5, -2.5]), torch.tensor(1.0), 4)
     segments = (Segment(0, chair.t_world_object, chair.yaw), later)
     pieces = (replace(chair, segments=segments), *scene.objects[1:])
     return replace(scene, objects=tuple(replace(piece, annotation=None) for piece in pieces))
@@ -115,6 +134,7 @@ def test_scenes_keep_segments_and_those_without_are_written_as_ever(tmp_path: Pa
     again = read_scene(tmp_path / "scene.json")
     assert [len(piece.segments) for piece in again.objects] == [2, 0, 0]
     assert placed_at(again.objects[0], 12).t_world_object.tolist() == [0.0, -1.5, -2.5]
+    assert [segment.mover for segment in again.objects[0].segments] == [None, 4]
     tree = json.loads((tmp_path / "scene.json").read_text())
     assert ["segments" in row for row in tree["objects"]] == [True, False, False]
     tree["objects"][0]["segments"][1]["frame"] = 0

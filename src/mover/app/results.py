@@ -23,7 +23,7 @@ from mover.core.run import Run
 from mover.core.settings import read_settings
 from mover.core.types import Bodies, Capture, Mesh, Room, Scene
 from mover.evaluate.explanation import log_rows, scene_fields
-from mover.geometry.placement import place_object
+from mover.geometry.placement import standing_meshes
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.edits import Edit, write_edits
 from mover.io.capture.proposals_file import PROPOSED, write_proposals
@@ -87,7 +87,7 @@ def labels_of(room: Room, run: Run) -> ContactLabels:
     """Who touches what in a finished room with people."""
     assert room.bodies is not None
     solid = [
-        place_object(dataclasses.replace(piece, mesh=proxy))
+        standing_meshes(dataclasses.replace(piece, mesh=proxy))
         for piece, proxy in zip(room.scene.objects, room.proxies, strict=True)
     ]
     ids = tuple(piece.id for piece in room.scene.objects)

@@ -64,7 +64,7 @@ def to_device(value: T, device: torch.device | str) -> T:
 
 
 def rows_of(value: T, rows: Tensor, *axes: str) -> T:
-    """Some rows of a record: of its tensors with an axis of such a name, and of its dicts.
+    """Some rows of a record: of its tensors with an axis of such a name, its dicts and its masks.
 
     Args:
         value: The record; other fields stay as they are.
@@ -78,7 +78,11 @@ def rows_of(value: T, rows: Tensor, *axes: str) -> T:
         if isinstance(part, Tensor) and axis is not None:
             found[field.name] = part.index_select(axis, index)
         elif isinstance(part, dict):
-            found[field.name] = {name: one[index] for name, one in part.items()}
+            found[field.name] = {
+                name: one[index] if isinstance(one, Tensor) else one for name, one in part.items()
+            }
+        elif isinstance(part, tuple) and all(isinstance(one, bytes) for one in part) and part:
+            found[field.name] = tuple(part[row] for row in index.tolist())
         elif dataclasses.is_dataclass(part):
             found[field.name] = rows_of(part, index, *axes)
     return dataclasses.replace(typing.cast(Any, value), **found)

@@ -39,6 +39,8 @@ class Segment:
     """Place of the mesh origin in the world [m]."""
     yaw: Float[Tensor, ""]
     """[rad]"""
+    mover: int | None = None
+    """The person with whom it moves, held by hand or sat on; None: it stands."""
 
 
 @record

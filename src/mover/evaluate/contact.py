@@ -14,9 +14,11 @@ from mover.core.records import fingerprint, record, rows_of
 from mover.core.types import Bodies, Mesh, SceneObject
 from mover.evaluate.bodies import shared_rows
 from mover.evaluate.scene import Metric
-from mover.geometry.placement import place_object
+from mover.geometry.placement import StandingMesh, standing_meshes
 from mover.geometry.volume import signed_distance
 from mover.geometry.watertight import close_mesh
+
+Furniture = Sequence[StandingMesh]
 
 
 @record
@@ -88,24 +90,29 @@ def close_meshes(pieces: Iterable[SceneObject]) -> dict[str, Mesh]:
     return {key: close_mesh(mesh) for key, mesh in meshes.items()}
 
 
-def furniture_of(pieces: Iterable[SceneObject], closed: Mapping[str, Mesh]) -> list[Mesh]:
-    """The closed proxies of the pieces where they stand in the world."""
-    return [place_object(replace(p, mesh=closed[fingerprint(p.mesh)])) for p in pieces]
+def furniture_of(pieces: Iterable[SceneObject], closed: Mapping[str, Mesh]) -> list[StandingMesh]:
+    """The closed proxies of the pieces where they stand in the world, and when."""
+    solid = (replace(piece, mesh=closed[fingerprint(piece.mesh)]) for piece in pieces)
+    return [there for piece in solid for there in standing_meshes(piece)]
 
 
 def gather_truth(
-    truth: Bodies, furniture: Sequence[Mesh], judged: Bodies, count: int, reach: float
+    truth: Bodies, furniture: Furniture, judged: Bodies, count: int, reach: float
 ) -> TrueTouch | None:
     """True bodies beside the true furniture: at most `count` of those that are to be judged."""
     rows = shared_rows(truth, judged)[0]
     if len(rows) == 0 or truth.verts.shape[1] != judged.verts.shape[1]:
         return None
     bodies = rows_of(replace(truth, pose=None), rows[evenly(len(rows), count)])
-    return TrueTouch(bodies, nearness(bodies.verts, furniture, reach))
+    return TrueTouch(bodies, nearness(bodies.verts, bodies.frame, furniture, reach))
 
 
 def gather_touch(
-    bodies: Bodies, furniture: Sequence[Mesh], truth: TrueTouch | None, count: int, reach: float
+    bodies: Bodies,
+    furniture: Furniture,
+    truth: TrueTouch | None,
+    count: int,
+    reach: float,
 ) -> Touch:
     """Bodies beside the furniture of their scene: `count` of them, and those the truth knows.
 
@@ -117,34 +124,40 @@ def gather_touch(
         reach: A vertex touches what is at most so far away [m].
     """
     picked = evenly(len(bodies.frame), count)
-    near = nearness(bodies.verts[picked], furniture, reach)
+    near = nearness(bodies.verts[picked], bodies.frame[picked], furniture, reach)
     if truth is None or bodies.verts.shape[1] != truth.bodies.verts.shape[1]:
         return Touch(near, None, None, reach)
     rows, true_rows = shared_rows(bodies, truth.bodies)
     if len(rows) == 0:
         return Touch(near, None, None, reach)
     same = torch.equal(rows, picked)
-    shared = near if same else nearness(bodies.verts[rows], furniture, reach)
+    shared = near if same else nearness(bodies.verts[rows], bodies.frame[rows], furniture, reach)
     true = Nearness(truth.near.signed[true_rows], truth.near.surface[true_rows])
     return Touch(near, shared, true, reach)
 
 
 def nearness(
-    verts: Float[Tensor, "bodies verts 3"], furniture: Sequence[Mesh], reach: float
+    verts: Float[Tensor, "bodies verts 3"],
+    frame: Int[Tensor, " bodies"],
+    furniture: Furniture,
+    reach: float,
 ) -> Nearness:
     """Distances of body vertices to closed meshes in the same world, exact up to `reach` [m].
 
     Args:
         verts: Body vertices [m].
+        frame: Of each body: furniture that is moved is measured where it then stands.
         furniture: Closed meshes, wound outwards.
         reach: Vertices farther than this from an object's box are not measured against it [m].
     """
-    points = verts.reshape(-1, 3)
+    points, per = verts.reshape(-1, 3), verts.shape[1]
     signed = torch.full_like(points[:, 0], torch.inf)
     surface = signed.clone()
-    for mesh in furniture:  # one tree for each mesh: there is no batched exact distance
+    for there in furniture:  # one tree for each mesh: there is no batched exact distance
+        mesh, now = there.mesh, there.when(frame)
         low, high = mesh.verts.amin(0) - reach, mesh.verts.amax(0) + reach
-        close = ((points >= low) & (points <= high)).all(-1).nonzero()[:, 0]
+        inside = ((points >= low) & (points <= high)).all(-1)
+        close = (inside & now.repeat_interleave(per)).nonzero()[:, 0]
         if len(close):
             distance = signed_distance(points[close], mesh.verts, mesh.faces).to(signed)
             signed[close] = torch.minimum(signed[close], distance)

@@ -32,6 +32,7 @@ from mover.evaluate.bodies import (
 )
 from mover.evaluate.contact import (
     TOUCH_METRICS,
+    Furniture,
     TrueTouch,
     close_meshes,
     furniture_of,
@@ -54,6 +55,7 @@ from mover.evaluate.scene import (
     unmatched,
 )
 from mover.evaluate.stability import PHYSICS_METRICS, lacking, result_loads, simulate
+from mover.geometry.placement import StandingMesh
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import read_scene
@@ -112,7 +114,7 @@ class _Populated:
     bodies: Bodies | None
     soles: Int[Tensor, " soles"]
     """The vertices under their feet."""
-    furniture: tuple[Mesh, ...]
+    furniture: tuple[StandingMesh, ...]
     """The closed objects where they stand; none where there are no people."""
 
 
@@ -234,14 +236,17 @@ def table(metrics: Mapping[str, Any]) -> str:
 
 
 def evaluate_people(
-    bodies: Bodies, ground: float | None, furniture: Sequence[Mesh], truth: Bodies | None = None
+    bodies: Bodies,
+    ground: float | None,
+    furniture: Furniture,
+    truth: Bodies | None = None,
 ) -> dict[str, float]:
     """How people move, how deep they are in floor and furniture, how far they are from the truth.
 
     Args:
         bodies: People in the world of their room.
         ground: Height of its floor [m]; None: not known.
-        furniture: Its closed objects where they stand.
+        furniture: Its closed objects where they stand, and when.
         truth: The true people in the world of the true room; None: not known.
     """
     config = EvaluateConfig()

@@ -1,16 +1,19 @@
 """Rays and the floor, and objects under a new camera."""
 
 import dataclasses
+import itertools
 import math
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mover.core.records import record
 from mover.core.types import Layout, Mesh, SceneObject
 from mover.geometry.camera import to_camera, to_world
 from mover.geometry.rotations import rot_y
 
+ENDLESS = 2**40  # [frames], later than every other
 LOWEST = 0.02  # how much a ray of unit depth must go down at least to meet the floor
 
 
@@ -117,6 +120,44 @@ def place_object(piece: SceneObject) -> Mesh:
     """The piece's mesh in the world: x_world = R_y(yaw) @ (scale * x_mesh) + t_world_object."""
     verts = (piece.mesh.verts * piece.scale) @ rot_y(piece.yaw).mT + piece.t_world_object
     return Mesh(verts, piece.mesh.faces)
+
+
+@record
+class StandingMesh:
+    """A mesh in the world from a frame until another."""
+
+    mesh: Mesh
+    first: int = -ENDLESS
+    end: int = ENDLESS
+    """The first frame in which it is elsewhere."""
+
+    def when(self, frame: Int[Tensor, " rows"]) -> Bool[Tensor, " rows"]:
+        """Whether it stands there in each of some frames."""
+        return (frame >= self.first) & (frame < self.end)
+
+
+def standing_meshes(piece: SceneObject) -> tuple[StandingMesh, ...]:
+    """An object wherever it stands, one after the other; one place for what is never moved."""
+    if not piece.segments:
+        return (StandingMesh(place_object(piece)),)
+    firsts = [-ENDLESS, *(segment.frame for segment in piece.segments[1:])]
+    ends = [*firsts[1:], ENDLESS]
+    return tuple(
+        StandingMesh(place_object(placed_at(piece, segment.frame)), first, end)
+        for segment, first, end in zip(piece.segments, firsts, ends, strict=True)
+    )
+
+
+def changes(piece: SceneObject) -> list[int]:
+    """Frames in which an object begins to move, and in which it begins to stand elsewhere."""
+    pairs = itertools.pairwise(piece.segments)
+    return [b.frame for a, b in pairs if b.mover is None or b.mover != a.mover]
+
+
+def mover_at(piece: SceneObject, frame: int) -> int | None:
+    """Who moves an object in a frame; None: it stands."""
+    begun = [segment for segment in piece.segments if segment.frame <= frame]
+    return begun[-1].mover if begun else None
 
 
 def placed_at(piece: SceneObject, frame: int) -> SceneObject:

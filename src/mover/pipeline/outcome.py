@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.corrected import in_world
@@ -34,6 +34,9 @@ from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
 from mover.stages.people.find_depth import are_shapeless
 
+Spans = tuple[tuple[int, int], ...]
+"""Frames, from the first of each to the first that is no longer in it."""
+
 
 @dataclass(frozen=True)
 class ReconstructionContext:
@@ -46,6 +49,8 @@ class ReconstructionContext:
     prepared: Prepared
     pinned: tuple[str, ...] = ()
     """Ids of the objects that stay where the capture has them."""
+    elsewhere: Spans = ()
+    """In which an object is not where the reference image shows it."""
     misfit: Float[Tensor, " objects"] | None = None
     """What box and silhouette left of shapes before they were bent: doubt of them stays."""
 
@@ -140,11 +145,11 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
         bodies = to_world(people.bodies, state.camera)
         warnings += people.warnings
     if people is not None and bodies is not None and state.contacts is not None:
-        contacts = state.contacts
+        contacts, now = state.contacts, people.kept & ~within(bodies.frame, context.elsewhere)
         warnings += diagnostics(DiagnosticInputs(
-            rows_of(bodies, people.kept), people.parts, capture.people, state.camera,
-            context.prepared.objects, placed.layout, contacts.points, contacts.seated_on,
-            people.path,
+            rows_of(bodies, now), people.parts, capture.people, state.camera,
+            context.prepared.objects, placed.layout, contacts.points,
+            contacts.seated_on[now[people.kept]], people.path,
         ))  # fmt: skip
     return Room(
         scene=Scene(state.camera, state.ground, pieces, layout_over(capture.scene, state.ground)),
@@ -159,6 +164,14 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
         warnings=tuple(dict.fromkeys(warnings)),
         explanations=explanations_of(context, state, people),
     )
+
+
+def within(frames: Int[Tensor, " rows"], spans: Spans) -> Bool[Tensor, " rows"]:
+    """Whether frames lie in one of some spans."""
+    found = torch.zeros(len(frames), dtype=torch.bool)
+    for begin, end in spans:
+        found = found | ((frames >= begin) & (frames < end))
+    return found
 
 
 def explanations_of(
@@ -193,13 +206,17 @@ def with_proposals(
     contacts = ContactInputs(bodies, people.parts, ground, given)
     chance = run.stage(find_contacts, contacts, config.contacts).probability
     inputs = ProposeInputs(bodies, people.parts, chance, ground, camera, known)
-    found = run.stage(propose_supports, inputs, config.propose).found
+    return replace(room, proposals=run.stage(propose_supports, inputs, config.propose).found)
+
+
+def told_of_proposals(room: Room) -> Room:
+    """The room with a sentence for each proposal."""
     sentences = (
         f"{one.object.id}: people rest for {one.seconds:.0f} s on nothing that is known; a"
         f" {one.object.category} is proposed there (certainty {one.certainty:.2f})"
-        for one in found
+        for one in room.proposals
     )
-    return replace(room, proposals=found, warnings=(*room.warnings, *sentences))
+    return replace(room, warnings=(*room.warnings, *sentences))
 
 
 def tops_of(context: ReconstructionContext, state: SceneState) -> KnownTops:

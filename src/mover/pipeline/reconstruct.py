@@ -30,11 +30,12 @@ from mover.geometry.placement import (
 )
 from mover.geometry.warp_start import threads
 from mover.io.capture.plausible import check_plausible
-from mover.pipeline.moves import with_moves
+from mover.pipeline.moves import Solving, with_moves
 from mover.pipeline.outcome import (
     PeopleState,
     ReconstructionContext,
     SceneState,
+    Spans,
     check_floor,
     check_room,
     gather_inputs,
@@ -103,11 +104,12 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
     told: list[str] = []
     check_plausible(capture, told.append)
     capture = replace(capture, warnings=tuple(dict.fromkeys((*capture.warnings, *told))))
-    room = _reconstructed(capture, config, run, pinned)
-    return check_room(with_moves(room, capture, config, run, _reconstructed))
+    return check_room(with_moves(Solving(capture, config, run, _reconstructed), pinned))
 
 
-def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]) -> Room:
+def _reconstructed(
+    capture: Capture, config: Config, run: Run, pinned: tuple[str, ...], elsewhere: Spans = ()
+) -> Room:
     """The stages in their order."""
     furniture = PrepareInputs(capture.scene.objects)
     if capture.scene.objects:
@@ -118,7 +120,7 @@ def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str
         return with_proposals(room, capture, config, run, people, NOTHING)
     seen = image_evidence(capture)
     prepared = run.stage(prepare_objects, furniture, config.prepare)
-    context = ReconstructionContext(capture, config, run, seen, prepared, pinned)
+    context = ReconstructionContext(capture, config, run, seen, prepared, pinned, elsewhere)
     if people is None:
         ground = ground_without_people(capture, prepared)
         check_floor(ground, capture)

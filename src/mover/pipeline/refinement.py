@@ -19,7 +19,7 @@ from mover.core.types import Bodies, Capture, Keypoints, Mesh, Room
 from mover.evaluate.evaluation import evaluate_people
 from mover.fitting.config import FitConfig
 from mover.fitting.prior import prior_of
-from mover.geometry.placement import place_object
+from mover.geometry.placement import standing_meshes
 from mover.io.capture.bodies_file import read_bodies, read_contacts, write_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import read_scene
@@ -133,7 +133,7 @@ def measure_people(out: Path, truth: Path | None = None) -> dict[str, dict[str, 
     """
     room, true = finished_room(out), None if truth is None else _true_people(truth)
     pieces = zip(room.scene.objects, room.proxies, strict=True)
-    solid = [place_object(replace(piece, mesh=proxy)) for piece, proxy in pieces]
+    solid = [s for piece, proxy in pieces for s in standing_meshes(replace(piece, mesh=proxy))]
     files = {"result": out / "bodies.npz", "refined": out / "refined" / "bodies.npz"}
     values = {
         name: evaluate_people(read_bodies(file), room.scene.ground, solid, true)

@@ -353,6 +353,14 @@ class MoveConfig:
     """Where less of an object can be seen, nothing is said."""
     seconds: Annotated[float, float_in(0, 3600)] = 1.5
     """An object that stands for a shorter time is being moved [s]."""
+    margin: Annotated[float, float_in(0, 60)] = 0.8
+    """So long before and after it is seen elsewhere somebody may have moved it [s]."""
+    reach: Metres = 0.25
+    """From the wrists of who moves an object to its footprint, at most [m]."""
+    loose: Metres = 0.1
+    """Who moves an object brings it this near to where it then stands [m]..."""
+    share: Share = 0.25
+    """... and nearer than this share of the way besides."""
 
 
 @dataclass(frozen=True)

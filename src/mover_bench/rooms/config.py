@@ -73,8 +73,9 @@ class RoomConfig:
     """Factor on how long people sit, lie and stand."""
     most_frames: int = 0
     """The video ends after so many; 0: when everybody is done."""
-    moved: bool = False
-    """A piece is moved in the middle of the video, before another person comes in."""
+    moved: Literal["no", "put", "stays", "pushed", "rolled"] = "no"
+    """How a piece is moved in the middle of the video: put elsewhere between two visits (stays: two
+    visits, and nothing is moved), pushed by hand, or rolled under who sits on it."""
     step: bool = False
     """There is a step, on which somebody stands first."""
     least_passing: float = 0.0

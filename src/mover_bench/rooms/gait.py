@@ -4,12 +4,17 @@ A foot stays where it landed until it swings again; the heel rises about the bal
 the body moves on. The pelvis runs through the middle between the feet.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from jaxtyping import Float, Int
 
 from mover.core.records import record
 from mover_bench.rooms.poses import LEG, STANCE, Person, Posture
 from mover_bench.rooms.turns import X, Y, about, apply, facing, heading_of, left_of, smooth
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 STEP = 0.5  # [m], length of an indoor step
 STEP_TIME = 0.5  # [s]
@@ -133,21 +138,25 @@ ARM_SWING = np.radians(20)
 
 def walk(person: Person, way: Stations, times: Float[np.ndarray, " frames"]) -> Posture:
     """The body at `times` [s] after the start of the walk."""
-    from scipy.interpolate import CubicSpline
-
-    steps = steps_of(way)
-    clock = STEP_TIME * np.arange(len(way.place) + 1)
-    middle = np.concatenate([way.place[:1], (way.place[1:] + way.place[:-1]) / 2, way.place[-1:]])
-    mean = np.concatenate(
-        [way.heading[:1], (way.heading[1:] + way.heading[:-1]) / 2, way.heading[-1:]]
-    )
-    route = CubicSpline(clock, np.column_stack([middle, mean]), bc_type="clamped")
-    now = np.clip(times, 0, clock[-1])
+    steps, route = steps_of(way), route_of(way)
+    now = np.clip(times, 0, STEP_TIME * len(way.place))
     x, z, heading = route(now).T
     speed = np.linalg.norm(route(now, 1)[:, :2], axis=1)
     stride = np.clip(speed / (STEP / STEP_TIME), 0, 1)
     pelvis = _carried(person, (x, z, heading), steps, now, stride)
     return _stepping(person, (pelvis, heading, stride), steps, now)
+
+
+def route_of(way: Stations) -> "CubicSpline":
+    """Where the body is (x, z) and looks [m, rad] at a time of the walk [s], without sway."""
+    from scipy.interpolate import CubicSpline
+
+    clock = STEP_TIME * np.arange(len(way.place) + 1)
+    middle = np.concatenate([way.place[:1], (way.place[1:] + way.place[:-1]) / 2, way.place[-1:]])
+    mean = np.concatenate(
+        [way.heading[:1], (way.heading[1:] + way.heading[:-1]) / 2, way.heading[-1:]]
+    )
+    return CubicSpline(clock, np.column_stack([middle, mean]), bc_type="clamped")
 
 
 def _carried(

@@ -1,7 +1,9 @@
 """What is known of a room: the capture that a perfect upstream would give, and the truth."""
 
-from collections.abc import Callable, Generator, Iterable
+import dataclasses
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
+from itertools import groupby
 
 import numpy as np
 import torch
@@ -16,9 +18,10 @@ from mover.geometry.rle import decode
 from mover_bench.rooms.compose import Plan
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.motion import Performance, Stage
+from mover_bench.rooms.placed import Placed
 from mover_bench.rooms.poses import angles
-from mover_bench.rooms.render import Sight, box_of_mask, encode, look_at, see
-from mover_bench.rooms.truth import GAPE, NONE, nearness
+from mover_bench.rooms.render import Sight, box_of_mask, encode, look_at, outlines, see
+from mover_bench.rooms.truth import GAPE, NONE, Nearness, nearness
 from mover_bench.rooms.turns import from_vector, to_vector
 
 
@@ -97,12 +100,44 @@ class Actor:
         return Acted(pose, act.posture.pelvis, person.origin, act.labels, act.touched)
 
 
+Moving = Mapping[int, Placed]
+"""A piece of the plan in the frames in which it stands elsewhere."""
+NOWHERE: Moving = {}
+
+
+def plan_at(plan: Plan, moving: Moving, frame: int) -> Plan:
+    """The room in a frame."""
+    there = moving.get(frame)
+    if there is None:
+        return plan
+    pieces = tuple(there if piece.id == there.id else piece for piece in plan.pieces)
+    return dataclasses.replace(plan, pieces=pieces)
+
+
+def looks(
+    plan: Plan, moving: Moving, sight: Sight
+) -> Callable[[int], tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]]:
+    """Depth of the furniture [m] and the piece of each pixel, in a frame, without people."""
+    last: list[tuple[Placed, tuple[Tensor, Tensor]]] = []
+
+    def at(frame: int) -> tuple[Tensor, Tensor]:
+        there = moving.get(frame)
+        if there is None:
+            return sight.depth, sight.piece
+        if not last or last[0][0] is not there:
+            last[:] = [(there, outlines(plan_at(plan, moving, frame))[:2])]
+        return last[0][1]
+
+    return at
+
+
 def build(
     plan: Plan,
     actors: tuple[Actor | Acted, ...],
     config: RoomConfig,
     name: str,
     refused: tuple[str, ...],
+    moving: Moving = NOWHERE,
 ) -> KnownRoom:
     """Put people and furniture before the camera.
 
@@ -112,10 +147,11 @@ def build(
     acts = tuple(a.acted if isinstance(a, Actor) else a for a in actors)
     _check(acts, config)
     sight = see(plan)
+    furniture_at = looks(plan, moving, sight)
     detections = _detections(plan, sight, config)
-    crowd = _crowd(plan, acts, config.fps)
+    crowd = _crowd(plan, acts, config.fps, moving)
     scene = _scene(plan)
-    shown = visible(plan, crowd.bodies, lambda _: sight.depth)
+    shown = visible(plan, crowd.bodies, lambda frame: furniture_at(frame)[0])
     share = float(shown.passing.double().mean())
     if share < config.least_passing:
         raise RefusedError(f"furniture hides a part of only {share:.0%} of the bodies")
@@ -124,19 +160,12 @@ def build(
         reference=sight.picture, reference_people=None, bodies=crowd.bodies,
         people=shown.people, touch=None, warnings=(),
     )  # fmt: skip
+    furniture = tuple(piece.furniture for piece in plan.pieces)
     return KnownRoom(
-        capture=capture,
-        truth=scene,
-        bodies=crowd.bodies,
-        touching=crowd.touching,
-        touched=crowd.touched,
-        actions=crowd.actions,
-        furniture=tuple(p.furniture for p in plan.pieces),
-        plan=plan,
-        refused=refused,
-        whole=shown.whole,
-        passing=shown.passing,
-    )
+        capture=capture, truth=scene, bodies=crowd.bodies, touching=crowd.touching,
+        touched=crowd.touched, actions=crowd.actions, furniture=furniture, plan=plan,
+        refused=refused, whole=shown.whole, passing=shown.passing,
+    )  # fmt: skip
 
 
 def _check(acts: tuple[Acted, ...], config: RoomConfig) -> None:
@@ -182,13 +211,24 @@ class _Crowd:
     actions: tuple[str, ...]
 
 
-def _crowd(plan: Plan, acts: tuple[Acted, ...], fps: float) -> _Crowd:
+def _nearness(skin: np.ndarray, plan: Plan, moving: Moving) -> Nearness:
+    """How near somebody is to what, while a piece moves."""
+    groups = groupby(range(len(skin)), key=lambda frame: id(moving.get(frame)))
+    parts = [list(frames) for _, frames in groups]
+    found = [nearness(skin[part], plan_at(plan, moving, part[0]).pieces) for part in parts]
+    distance, nearest = (
+        np.concatenate([getattr(near, name) for near in found]) for name in ("distance", "nearest")
+    )
+    return Nearness(distance, nearest)
+
+
+def _crowd(plan: Plan, acts: tuple[Acted, ...], fps: float, moving: Moving) -> _Crowd:
     """Everybody in camera axes, how near they are to what, and what they do."""
     model = open_body()
     rows = [(f, k) for k, a in enumerate(acts) for f in range(len(a.labels))]
     order = sorted(range(len(rows)), key=lambda k: rows[k])
     index = torch.tensor(order)
-    nears = [nearness(model.posed(a.pose)[0].numpy(), plan.pieces) for a in acts]
+    nears = [_nearness(model.posed(a.pose)[0].numpy(), plan, moving) for a in acts]
     distance = torch.cat([torch.from_numpy(n.distance).float() for n in nears])[index]
     nearest = torch.cat([torch.from_numpy(n.nearest) for n in nears])[index]
     labels = [name for a in acts for name in a.labels]

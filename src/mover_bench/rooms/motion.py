@@ -95,6 +95,8 @@ class Performance:
     touched: tuple[int, ...]
     """Index of the piece in use in each frame, or -1."""
     refused: tuple[str, ...]
+    stop: Stop | None = None
+    """Where it ends."""
 
 
 def perform(
@@ -112,7 +114,7 @@ def perform(
         if enough and sum(len(take.posture.pelvis) for take in takes) >= enough:
             break
         try:
-            stop = _stop(stage, task, here)
+            stop = stop_for(stage, task, here)
             new = _played(stage, task, (here, stop), phase)
         except (NoWayError, RefusedTaskError, ValueError) as error:
             refused.append(f"{task.kind} {_name(stage, task)}: {error}")
@@ -123,7 +125,7 @@ def perform(
     count = [len(t.posture.pelvis) for t in takes]
     labels = tuple(t.label for t, n in zip(takes, count, strict=True) for _ in range(n))
     touched = tuple(t.piece for t, n in zip(takes, count, strict=True) for _ in range(n))
-    return Performance(chain([t.posture for t in takes]), labels, touched, tuple(refused))
+    return Performance(chain([t.posture for t in takes]), labels, touched, tuple(refused), here)
 
 
 class RefusedTaskError(Exception):
@@ -132,11 +134,21 @@ class RefusedTaskError(Exception):
 
 def _played(stage: Stage, task: Task, way: tuple[Stop, Stop], phase: float) -> list[Take]:
     """Walk there and do it, checked against the furniture."""
-    takes = [_walk(stage, *way)]
-    _check(stage, takes)
-    acts = _ACTS[task.kind](stage, task, way[1], phase)
+    return [walk_to(stage, *way), *done_there(stage, task, way[1], phase)]
+
+
+def walk_to(stage: Stage, here: Stop, stop: Stop) -> Take:
+    """Walk from one place to another, checked against the furniture."""
+    take = _walk(stage, here, stop)
+    _check(stage, [take])
+    return take
+
+
+def done_there(stage: Stage, task: Task, stop: Stop, phase: float = 0.0) -> list[Take]:
+    """Do a task where one stands, checked against the furniture."""
+    acts = _ACTS[task.kind](stage, task, stop, phase)
     _check(stage, acts)
-    return takes + acts
+    return acts
 
 
 def _check(stage: Stage, takes: list[Take]) -> None:
@@ -152,7 +164,8 @@ def _name(stage: Stage, task: Task) -> str:
     return stage.pieces[task.piece].id if task.piece >= 0 else "to a place"
 
 
-def _stop(stage: Stage, task: Task, here: Stop) -> Stop:
+def stop_for(stage: Stage, task: Task, here: Stop) -> Stop:
+    """Where a task is done."""
     if task.kind == "walk":
         goal = np.array(task.goal)
         ahead = goal - here.place

@@ -36,16 +36,19 @@ Rows = TypeVar("Rows")
 def make_moved_room(seed: int, config: RoomConfig) -> KnownRoom:
     """A room in which the piece that is used most, of those that can be moved, is moved.
 
+    Where `config.moved` is `stays`, the second visitor finds everything where it was.
+
     Raises:
         ValueError: If no piece of the room can be moved.
     """
     first = make_room(seed, config)
     rng = np.random.default_rng([seed, 77])
     refused: list[str] = []
-    for index in _candidates(first):
+    for index in candidates(first, MOVABLE):
         for _ in range(TRIES // 10):
             try:
-                plan = _moved(first.plan, index, rng)
+                stays = config.moved == "stays"
+                plan = first.plan if stays else _moved(first.plan, index, rng)
                 acts = cast(plan, config, rng, refused)
                 second = build(plan, acts, config, first.capture.name, ())
                 return _joined(first, second, index)
@@ -54,10 +57,10 @@ def make_moved_room(seed: int, config: RoomConfig) -> KnownRoom:
     raise ValueError(f"seed {seed}: nothing can be moved: {refused[-3:]}")
 
 
-def _candidates(room: KnownRoom) -> list[int]:
-    """Pieces that can be moved, those that are used most first."""
+def candidates(room: KnownRoom, kinds: tuple[str, ...]) -> list[int]:
+    """Pieces of some kinds, those that are used most first."""
     used = [int((room.touched == k).any(1).sum()) for k in range(len(room.furniture))]
-    can = [k for k, piece in enumerate(room.furniture) if piece.category in MOVABLE]
+    can = [k for k, piece in enumerate(room.furniture) if piece.category in kinds]
     return sorted(can, key=lambda k: -used[k])
 
 
@@ -89,7 +92,8 @@ def _joined(first: KnownRoom, second: KnownRoom, index: int) -> KnownRoom:
     )
     end = int(second.bodies.frame.max()) + 1
     before, after = range(0, change, EVERY), range(change + change % EVERY, end, EVERY)
-    truth = _scene(first.truth, second.truth, index, change)
+    stays = first.plan is second.plan
+    truth = first.truth if stays else _scene(first.truth, second.truth, index, change)
     both = _both(first, second)
     capture = dataclasses.replace(
         first.capture,

@@ -60,14 +60,20 @@ def box_of_mask(mask: Bool[np.ndarray, "h w"]) -> Float[Tensor, "4"]:
     return rle.tight_box(torch.from_numpy(mask))
 
 
-def see(plan: Plan) -> Sight:
-    """Draw the furniture, the floor and the walls."""
+def outlines(plan: Plan) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"], Int[Tensor, "h w"]]:
+    """Depth of the furniture [m], and which piece and which face each pixel shows (-1: none)."""
     camera = plan.view.camera
     verts, faces, owner = furniture(plan)
     cam = plan.view.seen(verts)
     depth, face = first_hit(cam, faces, camera.K, (camera.height, camera.width))
+    return depth, torch.where(face >= 0, owner[face.clamp_min(0)], torch.full_like(face, -1)), face
+
+
+def see(plan: Plan) -> Sight:
+    """Draw the furniture, the floor and the walls."""
+    depth, piece, face = outlines(plan)
+    verts, faces, owner = furniture(plan)
     hit = face >= 0
-    piece = torch.where(hit, owner[face.clamp_min(0)], torch.full_like(face, -1))
     colours = torch.tensor(
         [COLOURS.get(p.furniture.category, (0.6, 0.6, 0.6)) for p in plan.pieces]
     )

@@ -190,7 +190,7 @@ def hand_on(person: Person, place: np.ndarray, heading: float, piece: Placed, ha
         )
 
     angle = 0.0
-    while angle < 1.0 and _span(person, bent(angle), hand, goal) > 0.975 * person.arm:
+    while angle < 1.0 and span(person, bent(angle), hand, goal) > 0.975 * person.arm:
         angle += 0.02
     palms, resting = np.zeros((1, 2, 3)), np.zeros((1, 2))
     resting[0, hand] = 1.0
@@ -209,7 +209,8 @@ def palm_height(person: Person) -> float:
     return float(wrist[1] - person.skin[part(HANDS[0]), 1].min())
 
 
-def _span(person: Person, posture: Posture, hand: int, goal: np.ndarray) -> float:
+def span(person: Person, posture: Posture, hand: int, goal: np.ndarray) -> float:
+    """From a shoulder to a place [m]."""
     return float(np.linalg.norm(goal - chest_of(person, posture)[1][0, hand]))
 
 

@@ -8,7 +8,7 @@ import shutil
 import statistics
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
 from mover_bench.rooms.camera_path import filmed
 from mover_bench.rooms.config import RoomConfig
+from mover_bench.rooms.handled import make_handled_room
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.moved import make_moved_room
 from mover_bench.rooms.noise import without_support
@@ -111,11 +112,18 @@ class Seed:
     seed: int
 
 
+MAKERS: dict[str, Callable[[int, RoomConfig], KnownRoom]] = {
+    "no": make_room, "put": make_moved_room, "stays": make_moved_room,
+    "pushed": make_handled_room, "rolled": make_handled_room,
+}  # fmt: skip
+"""By `RoomConfig.moved`."""
+
+
 def make_truth(inputs: Seed, config: RoomConfig, observe: Observer = silent) -> KnownRoom:
     """A room without noise, as a stage: sets with the same rooms make it once."""
     del observe
-    make = make_stepped_room if config.step else make_room
-    return (make_moved_room if config.moved else make)(inputs.seed, config)
+    make = make_stepped_room if config.step else MAKERS[config.moved]
+    return make(inputs.seed, config)
 
 
 def noisy_room(seed: int, rooms: RoomSet, run: Run | None = None) -> Trial:

@@ -21,12 +21,13 @@ from mover.evaluate.evaluation import (
     evaluate_people,
     touch_in_truth,
 )
-from mover.evaluate.scene import Pair, iou3d, unmatched
+from mover.evaluate.moves import measure_moves
+from mover.evaluate.scene import unmatched
 from mover.furniture.library import SEATS, STEP, canonical
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera
 from mover.geometry.mesh import sample_surface
-from mover.geometry.placement import place_object, placed_at
+from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 from mover.geometry.rotations import wrap
 from mover.geometry.watertight import close_mesh
@@ -146,7 +147,6 @@ def _depth(
 
 GIVEN, TRUE_GIVEN, TRUE_ROOM, TRUTH = "given", "true given", "true room", "true people"
 TRAITS = ("id", "category", "touched", "hidden", "truncated", "flipped", "stays")
-SOON = 5  # frames after a true change
 NEAR = 0.6  # [m] from the middle of a seat, at most, of its proposal
 SURFACE = 4000  # points that tell the height of a seat
 PROX = "+CamGP+SDF+Contact"  # what refines bodies in the true room
@@ -232,9 +232,13 @@ def measure(
         "objects": objects,
         "unmatched": unmatched(capture.scene, room.scene, trial.truth, by_place=False),
         "proposed": measure_proposals(trial, room),
-        "moved": measure_moves(trial, room),
+        "moved": measure_moves(trial.truth, room.scene, _fps(trial)),
         "warnings": list(room.warnings),
     }
+
+
+def _fps(trial: Trial) -> float | None:
+    return None if trial.bodies is None else trial.bodies.fps
 
 
 def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:
@@ -269,33 +273,6 @@ def seat_height(piece: SceneObject) -> float:
     points = points - torch.tensor([0.0, float(mesh.verts[:, 1].min()), 0.0])
     top = find_regions(points, normals, canonical(piece.category), "level").top
     return float(top[:, 1].median())
-
-
-def measure_moves(trial: Trial, room: Room) -> dict[str, Any]:
-    """Of each moved object IoU3D in each true segment and errors of its change points [s]."""
-    fps = 1.0 if trial.bodies is None or trial.bodies.fps is None else trial.bodies.fps
-    found = {piece.id: piece for piece in room.scene.objects}
-    rows: list[dict[str, Any]] = []
-    for truth in trial.truth.objects:
-        piece = found.get(truth.id)
-        if not truth.segments or piece is None:
-            continue
-        pairs = [
-            Pair(
-                placed_at(piece, true.frame + SOON), room.scene.camera,
-                placed_at(truth, true.frame + SOON), trial.truth.camera, 1,
-            )
-            for true in truth.segments
-        ]  # fmt: skip
-        changes = [segment.frame for segment in piece.segments[1:]]
-        late = [
-            min((abs(change - true.frame) / fps for change in changes), default=None)
-            for true in truth.segments[1:]
-        ]
-        rows.append({"id": truth.id, "iou3d": [iou3d(pair) for pair in pairs], "late": late})
-    still = {truth.id for truth in trial.truth.objects if not truth.segments}
-    false = sum(bool(piece.segments) for name, piece in found.items() if name in still)
-    return {"objects": rows, "false": false}
 
 
 def measure_true_room(

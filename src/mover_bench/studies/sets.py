@@ -79,9 +79,10 @@ _MOVED = RoomConfig(
     most_frames=130,
     least_touches=1,
     stay=0.6,
-    moved=True,
+    moved="put",
     acts=ActConfig(tasks=3, walks=1),
 )
+_HANDLED = replace(_MOVED, stay=0.4, acts=ActConfig(tasks=2, walks=1))
 _LONG = RoomConfig(
     least_frames=300,
     most_frames=300,
@@ -158,6 +159,18 @@ SETS: dict[str, RoomSet] = {
     "moved": RoomSet(
         "Two people use a room one after the other; between them a chair or a table is moved.",
         "1000-1029", "100-129", _MOVED,
+    ),
+    "unmoved": RoomSet(
+        "The rooms of `moved`; the second visitor finds everything where it was.",
+        "1000-1029", "100-129", replace(_MOVED, moved="stays"),
+    ),
+    "pushed": RoomSet(
+        "A person pushes a chair or a table elsewhere with both hands.",
+        "1000-1029", "100-129", replace(_HANDLED, moved="pushed"),
+    ),
+    "rolled": RoomSet(
+        "A person sits on a chair, rolls elsewhere on it, and stands up there.",
+        "1000-1029", "100-129", replace(_HANDLED, moved="rolled"),
     ),
     "withheld-seat": RoomSet(
         "The rooms of `rooms`; the seat that is used most is not in what is given.",

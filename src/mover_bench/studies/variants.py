@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from mover.core.records import rows_of
-from mover.core.types import Bodies, Capture, Masks, People
+from mover.core.types import Bodies, Capture
 from mover.energy.config import Adam
 from mover.pipeline.presets import PRESETS, Config, with_sizes
 from mover.stages.config import AssignConfig, SpreadConfig
@@ -278,12 +278,5 @@ def shortened(capture: Capture, frames: Int[Tensor, " frames"]) -> Capture:
             return replace(capture, bodies=None, people=None, touch=None)
         bodies, touch = rows_of(bodies, keep), None if touch is None else touch[keep]
     if people is not None:
-        people = _masks_of(people, torch.isin(people.frame, frames))
+        people = rows_of(people, torch.isin(people.frame, frames))
     return replace(capture, bodies=bodies, people=people, touch=touch)
-
-
-def _masks_of(people: People, keep: Bool[Tensor, " rows"]) -> People:
-    masks = people.masks
-    counts = tuple(c for c, kept in zip(masks.counts, keep.tolist(), strict=True) if kept)
-    some = Masks(masks.height, masks.width, counts)
-    return People(some, people.frame[keep], people.person[keep], people.heights)

@@ -75,6 +75,7 @@ class SegmentFields(Struct, frozen=True):
     frame: Index
     translation: Vector
     yaw: Number
+    mover: Index | None = None
 
 
 class ObjectFields(PlaceFields, frozen=True, kw_only=True):
@@ -156,7 +157,7 @@ def _piece_of(row: ObjectFields, mesh: Mesh, file: str) -> SceneObject:
     support = "ground" if row.support is None else str(row.support)
     place = _place_of(row)
     segments = tuple(
-        Segment(part.frame, torch.tensor(part.translation), torch.tensor(part.yaw))
+        Segment(part.frame, torch.tensor(part.translation), torch.tensor(part.yaw), part.mover)
         for part in row.segments or ()
     )
     name, category = str(row.id), str(row.category)
@@ -267,6 +268,7 @@ def _object_to_json(piece: SceneObject, mesh: str) -> dict[str, Any]:
     annotation = {} if piece.annotation is None else {"annotation": piece.annotation}
     segments = [
         {"frame": s.frame, "translation": plain(s.t_world_object), "yaw": plain(s.yaw)}
+        | ({} if s.mover is None else {"mover": s.mover})
         for s in piece.segments
     ]
     return {

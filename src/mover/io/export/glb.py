@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mover.bodies.skinning import SkinnedBody
 from mover.core.colours import Colour, person_colour
-from mover.core.types import Bodies
+from mover.core.types import Bodies, SceneObject
 from mover.geometry.mesh import vertex_normals
 from mover.io.export.finished import BodyForm, Exported, Finished
 from mover.io.export.gltf import (
@@ -228,7 +228,7 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
         first, step = int(finished.bodies.frame.min()), 1 / (finished.bodies.fps or FPS)
     notes = [f"frame {first} of the video is at 0 s, each next one {step:g} s later"]
     channels = [c for p in moved for c in add_stays(document, animation, p, first, step)]
-    notes += [f"{piece.id} jumps where it is moved" for piece in moved]
+    notes += [f"{piece.id} {_way(piece)}" for piece in moved]
     if bodies is None:
         notes.append("no people")
     else:
@@ -237,6 +237,12 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
     _connect(document, animation, channels)
     document.write(path)
     return Exported((path,), tuple(notes))
+
+
+def _way(piece: SceneObject) -> str:
+    """How an object comes from one place to the next."""
+    held = any(segment.mover is not None for segment in piece.segments)
+    return "moves with who moves it, a step a frame" if held else "jumps where it is moved"
 
 
 def _add_people(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.parts import Parts, members
@@ -22,6 +22,7 @@ from mover.core.records import record
 from mover.core.settings import Count, Metres, Share
 from mover.core.types import Bodies, Mesh
 from mover.geometry.nearest import as_float64, as_int64, closest
+from mover.geometry.placement import StandingMesh
 from mover.geometry.volume import outward
 
 FLOOR = "ground"
@@ -50,8 +51,8 @@ class LabelInputs:
     bodies: Bodies
     """In the world."""
     parts: Parts
-    meshes: tuple[Mesh, ...]
-    """Closed, of the objects where they stand."""
+    meshes: tuple[tuple[StandingMesh, ...], ...]
+    """Closed, of each object where it stands when."""
     ids: tuple[str, ...]
     ground: float | None
 
@@ -78,13 +79,18 @@ def label_contacts(
     named = [part for part, mine in enumerate(known) if bool(mine.any())]
     chosen = [_evenly(known[part].nonzero()[:, 0], config.most) for part in named]
     points = [bodies.verts[:, verts] for verts in chosen]
-    surfaces = [_near_solid(points, mesh, config) for mesh in inputs.meshes]
+    surfaces = [
+        (k, _near_solid(points, there.mesh, there.when(bodies.frame), config))
+        for k, stands in enumerate(inputs.meshes)
+        for there in stands
+    ]
     if inputs.ground is not None:
-        surfaces.append([_near_floor(some, inputs.ground, config) for some in points])
+        floors = [_near_floor(some, inputs.ground, config) for some in points]
+        surfaces.append((len(inputs.meshes), floors))
     found: list[tuple[int, int, _Touches, Tensor]] = []
     for number, part in enumerate(named):
         sure = chance[:, known[part]].amax(1)
-        for k, touch in enumerate(touches[number] for touches in surfaces):
+        for k, touch in ((k, touches[number]) for k, touches in surfaces):
             close = (touch.gap - config.reach) / (config.near - config.reach)
             trust = config.unseen + (1 - config.unseen) * sure[touch.row]
             found.append((part, k, touch, close.clamp(0, 1) * trust))
@@ -96,16 +102,20 @@ def _evenly(verts: Int[Tensor, " verts"], most: int) -> Int[Tensor, " some"]:
 
 
 def _near_solid(
-    parts: list[Float[Tensor, "bodies points 3"]], mesh: Mesh, config: LabelConfig
+    parts: list[Float[Tensor, "bodies points 3"]],
+    mesh: Mesh,
+    now: Bool[Tensor, " bodies"],
+    config: LabelConfig,
 ) -> list[_Touches]:
-    """Bodies whose points come near an object, for each part: all are asked for at once."""
+    """Bodies of now whose points come near an object, for each part: all are asked for at once."""
     import igl
 
     verts = as_float64(mesh.verts)
     faces = outward(verts, as_int64(mesh.faces))
     low, high = (torch.from_numpy(end) for end in (verts.min(0), verts.max(0)))
     low, high = (end.to(mesh.verts) for end in (low - config.reach, high + config.reach))
-    inside = [torch.minimum(points - low, high - points).amin(-1) > 0 for points in parts]
+    near = (torch.minimum(points - low, high - points).amin(-1) > 0 for points in parts)
+    inside = [some & now[:, None] for some in near]
     counts = [int(some.sum()) for some in inside]
     if not any(counts):
         return [_touches(points, torch.zeros(0).long(), []) for points in parts]

@@ -38,7 +38,7 @@ from mover.energy.config import BodyWeights, MatchConfig
 from mover.energy.minimize import minimize
 from mover.geometry.camera import to_camera
 from mover.geometry.path import is_still
-from mover.geometry.placement import placed_at
+from mover.geometry.placement import changes, mover_at, placed_at
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.body_energy import Evidence, Feet, body_energy
 from mover.stages.people.body_evidence import (
@@ -213,10 +213,10 @@ def refine_bodies(
     Raises:
         InputError: If the room has no bodies or no floor.
     """
-    changes = sorted({s.frame for piece in room.scene.objects for s in piece.segments})[1:]
-    if room.bodies is None or not changes:
+    times = sorted({frame for piece in room.scene.objects for frame in changes(piece)})
+    if room.bodies is None or not times:
         return _refined(room, capture, config, observe)
-    time = torch.bucketize(room.bodies.frame, torch.tensor(changes), right=True)
+    time = torch.bucketize(room.bodies.frame, torch.tensor(times), right=True)
     bodies = map_tensors(lambda x: x.float() if x.is_floating_point() else x, room.bodies)
     found = RefinedBodies(bodies, torch.zeros(len(time), 3), torch.zeros(len(time)))
     for now in time.unique():
@@ -229,11 +229,21 @@ def refine_bodies(
 def _at_one_time(
     room: Room, capture: Capture | None, rows: Int[Tensor, " rows"]
 ) -> tuple[Room, Capture | None]:
-    """The room with some of its people, and its furniture where it stands while they are there."""
+    """The room with some of its people, and its furniture where it stands while they are there.
+
+    What somebody moves in that time is left out: it goes with their hands or their seat.
+    """
     assert room.bodies is not None
     bodies = rows_of(room.bodies, rows)
-    pieces = tuple(placed_at(piece, int(bodies.frame.min())) for piece in room.scene.objects)
-    scene = replace(room.scene, objects=pieces)
+    now = int(bodies.frame.min())
+    pairs = zip(room.scene.objects, room.proxies, strict=True)
+    still = [(placed_at(p, now), proxy) for p, proxy in pairs if mover_at(p, now) is None]
+    scene = replace(room.scene, objects=tuple(piece for piece, _ in still))
+    room = replace(room, proxies=tuple(proxy for _, proxy in still))
+    if capture is not None:
+        ids = {piece.id for piece, _ in still}
+        given = tuple(piece for piece in capture.scene.objects if piece.id in ids)
+        capture = replace(capture, scene=replace(capture.scene, objects=given))
     if capture is not None and capture.touch is not None:
         capture = replace(capture, touch=capture.touch[rows])
     return replace(room, scene=scene, bodies=bodies, kept=None), capture
