@@ -4,6 +4,8 @@
         --to docs/images/moving.jpg
     PYTHONPATH=src python benchmarks/strips.py --set withheld-seat --seed 104 --out withheld \
         --to docs/images/withheld.jpg
+    PYTHONPATH=src python benchmarks/strips.py --set pushed --seed 100 --frames 50 63 66 300 \
+        --out moved --to docs/images/moved.jpg
 
 Rebuilds the room with `robust` (what `moving_camera.py` and `withheld.py` left in `--out` is used)
 and draws `--count` frames. Supports that are proposed are drawn like other pieces. A camera that
@@ -26,6 +28,7 @@ from mover.app.pictures.render import set_up, show, world_of
 from mover.core.run import Run
 from mover.core.types import STILL, Bodies, CameraPath, Scene
 from mover.geometry.path import is_still, poses_at
+from mover.geometry.placement import placed_at
 from mover.pipeline.outcome import to_world
 from mover.pipeline.people import people_of
 from mover.pipeline.presets import ROBUST
@@ -41,9 +44,11 @@ def pictures(
     scene: Scene, bodies: Bodies, path: CameraPath, frames: list[int], width: int
 ) -> Float[Tensor, "h w 3"]:
     """A row of pictures; bodies are in the world."""
-    world, found = world_of("", scene, bodies), list[Tensor]()
+    found = list[Tensor]()
     height = round(width * scene.camera.height / scene.camera.width)
     for frame in frames:
+        pieces = tuple(placed_at(piece, frame) for piece in scene.objects)
+        world = world_of("", replace(scene, objects=pieces), bodies)
         eye = _eye(camera_sized(scene.camera, width, height), path, frame)
         board = set_up(eye, world.ground, world.still, None)
         rows = (bodies.frame == frame).nonzero()[:, 0].tolist()
@@ -61,8 +66,10 @@ def _eye(eye: RenderCamera, path: CameraPath, frame: int) -> RenderCamera:
                    t_world_eye=place)  # fmt: skip
 
 
-def strip(name: str, seed: int, out: Path, count: int, width: int) -> Float[Tensor, "h w 3"]:
-    """Truth and result, one above the other."""
+def strip(
+    name: str, seed: int, out: Path, frames: list[int] | int, width: int
+) -> Float[Tensor, "h w 3"]:
+    """Truth and result, one above the other, in some frames or in so many."""
     trial = noisy_room(seed, SETS[name], Run(out / "rooms" / str(seed)))
     run = Run(out / name / str(seed))
     room, given = reconstruct(trial.capture, ROBUST, run), people_of(trial.capture, ROBUST, run)
@@ -76,7 +83,8 @@ def strip(name: str, seed: int, out: Path, count: int, width: int) -> Float[Tens
         true = draw_path(last + 1, fps, kinds[seed % len(kinds)], rng)
     found = (*room.scene.objects, *(one.object for one in room.proposals))
     seen = room.bodies.frame.unique()
-    frames = seen[torch.linspace(0, len(seen) - 1, count + 2).round().long()[1:-1]].tolist()
+    if isinstance(frames, int):
+        frames = seen[torch.linspace(0, len(seen) - 1, frames + 2).round().long()[1:-1]].tolist()
     above = pictures(trial.truth, to_world(trial.bodies, trial.truth.camera), true, frames, width)
     below = pictures(replace(room.scene, objects=found), room.bodies, given.path, frames, width)
     return torch.cat([above, torch.ones(GAP, above.shape[1], 3), below])
@@ -89,11 +97,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=108)
     parser.add_argument("--out", type=Path, default=Path("moving"))
     parser.add_argument("--count", type=int, default=4)
+    parser.add_argument("--frames", type=int, nargs="*", default=[])
     parser.add_argument("--width", type=int, default=480)
     parser.add_argument("--to", type=Path, default=Path("strip.jpg"))
     args = parser.parse_args()
     torch.set_num_threads(1)
-    save_still(strip(args.set, args.seed, args.out, args.count, args.width), args.to)
+    frames = args.frames or args.count
+    save_still(strip(args.set, args.seed, args.out, frames, args.width), args.to)
 
 
 if __name__ == "__main__":
