@@ -40,6 +40,8 @@ class Problems(Generic[P]):
     """Lengths of those first axes."""
     group: Int[Tensor, " items"] | None = None
     """Problems with one number share a decision, because one's unknowns enter another's energy."""
+    like: Int[Tensor, " items"] | None = None
+    """The problem that each is the same as, maybe itself: that one alone is solved."""
 
 
 @dataclass(frozen=True)
@@ -94,14 +96,22 @@ def settle(
         ValueError: If an energy is not finite at the start.
     """
     start, axes, price = problems.start, problems.axes, _pricing(problems)
-    live = _begin(price, _flat(start, len(axes)), method)
-    ends, values, trace = live.at.clone(), live.value.clone(), [live.value.sum()]
-    if not bool(values.isfinite().all() and live.slope.isfinite().all()):
+    rows = _flat(start, len(axes))
+    like = torch.arange(len(rows)).to(rows.device) if problems.like is None else problems.like
+    index = like.unique()
+    live = _begin(price, index, rows[index], method)
+    ends, values = rows.clone(), torch.zeros_like(rows[:, 0])
+    values[index] = live.value
+    trace = [values[like].sum()]
+    if not bool(live.value.isfinite().all() and live.slope.isfinite().all()):
         raise ValueError(f"{stage}: the energy is not finite")
 
+    def reached() -> P:
+        return _shaped(ends[like], start, axes, len(axes))
+
     def told(index: int) -> Step:
-        seen = Energy({"energy": values.reshape(axes)})
-        return Step(stage, index, method.steps, seen, lambda: _shaped(ends, start, axes, len(axes)))
+        seen = Energy({"energy": values[like].reshape(axes)})
+        return Step(stage, index, method.steps, seen, reached)
 
     live = live.only(_pooled(problems, live, live.slope.norm(dim=-1)) > 0)
     for index in range(method.steps):
@@ -109,20 +119,18 @@ def settle(
             break
         live = _advance(problems, price, live, method)
         ends[live.index], values[live.index] = live.at, live.value
-        trace.append(values.sum())
+        trace.append(values[like].sum())
         observe(told(index))
         moves = (live.idle < method.patience) & (live.radius > method.least)
         live = live.only(_pooled(problems, live, moves.double()) > 0)
     if method.steps:
         observe(told(method.steps - 1))
-    value = values.to(_first(start).dtype).reshape(axes)
-    end = _shaped(ends, start, axes, len(axes))
-    return Minimum(end, value, torch.stack(trace).to(value.dtype))
+    value = values[like].to(_first(start).dtype).reshape(axes)
+    return Minimum(reached(), value, torch.stack(trace).to(value.dtype))
 
 
-def _begin(price: Price, at: Tensor, method: BatchedBFGS) -> _Live:
+def _begin(price: Price, index: Rows, at: Tensor, method: BatchedBFGS) -> _Live:
     """A round model whose minimum lies at the first radius."""
-    index = torch.arange(len(at)).to(at.device)
     value, slope = price(index, at)
     radius = torch.full_like(value, method.reach)
     model = _round(slope, radius)

@@ -28,9 +28,9 @@ from mover.geometry.mesh import bottom_center, box
 from mover.geometry.rotations import rot_y
 from mover.stages.config import BendConfig
 from mover.stages.objects.place_inputs import PlaceInputs
-from mover.stages.objects.place_objects import piles_of, some_inputs, standing
+from mover.stages.objects.place_objects import some_inputs, standing
 from mover.stages.objects.prepare_objects import Prepared
-from mover.stages.objects.starts import merged
+from mover.stages.objects.starts import merged, piles_of
 
 
 @record
@@ -66,7 +66,7 @@ class _Free:
 
 def bend_shapes(inputs: BendInputs, config: BendConfig, observe: Observer = silent) -> Bending:
     """Find shapes and places together, of what is loose and of what stands with it."""
-    start, pile = inputs.layout, piles_of(inputs.inputs.objects)
+    start, pile = inputs.layout, piles_of(inputs.inputs.objects.supports)
     rows = torch.isin(pile, pile[inputs.loose]).nonzero()[:, 0]
     known, few = some_inputs(inputs.inputs, rows), rows_of(start, rows, "objects")
     objects, loose = known.objects, inputs.loose[rows].to(start.yaw)

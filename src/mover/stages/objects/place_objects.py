@@ -33,11 +33,13 @@ from mover.stages.objects.place_inputs import Placed as Placed
 from mover.stages.objects.place_inputs import PlaceInputs as PlaceInputs
 from mover.stages.objects.place_inputs import coarser_humans, coarser_image, hold, with_walls
 from mover.stages.objects.starts import (
+    alike,
     alone,
     best_few,
     choose,
     joined,
     merged,
+    piles_of,
     shaken,
     spread,
     spread_distance,
@@ -340,20 +342,12 @@ def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Proble
         )
         return lambda free: energy(standing(few, bounded(free, span[index])))
 
+    pile = piles_of(inputs.objects.supports)
+    like = alike(begin, pile) * n + torch.arange(n).to(pile)
     if not bool((inputs.objects.supports >= 0).any()):
-        return Problems(of, begin, (starts, n))
-    pile = piles_of(inputs.objects)
+        return Problems(of, begin, (starts, n), None, like.flatten())
     group = pile + n * torch.arange(starts).to(pile)[:, None]
-    return Problems(of, begin, (starts, n), group.flatten())
-
-
-def piles_of(objects: Objects) -> Int[Tensor, " objects"]:
-    """The lowest of those that stand on one another, for each object."""
-    carrier, n = objects.supports, len(objects.ids)
-    root = torch.where(carrier >= 0, carrier, torch.arange(n).to(carrier))
-    for _ in range(n):
-        root = root[root]
-    return root
+    return Problems(of, begin, (starts, n), group.flatten(), like.flatten())
 
 
 def some_inputs(inputs: PlaceInputs, rows: Int[Tensor, " rows"]) -> PlaceInputs:

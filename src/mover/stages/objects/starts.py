@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.observe import Observer, silent
@@ -157,6 +157,27 @@ def reference_yaw(
         seated = (x.abs() + z.abs()) > 0
         yaw[touches.object_of[seated]] = torch.atan2(x, z)[seated]
     return yaw
+
+
+def piles_of(supports: Int[Tensor, " objects"]) -> Int[Tensor, " objects"]:
+    """The lowest of those that stand on one another, for each object."""
+    n = len(supports)
+    root = torch.where(supports >= 0, supports, torch.arange(n).to(supports))
+    for _ in range(n):
+        root = root[root]
+    return root
+
+
+def alike(layout: Layout, pile: Int[Tensor, " objects"]) -> Int[Tensor, "starts objects"]:
+    """For each start of each object the first one that begins where it does, with its pile."""
+    starts, n = layout.yaw.shape
+    first = torch.zeros(starts, n).to(pile)
+    known = torch.cat([layout.t_world_object, layout.yaw[..., None], layout.log_scale], -1)
+    for number in range(starts):  # memory stays that of one
+        other = (known[: number + 1] != known[number]).any(-1)
+        among = torch.zeros_like(other, dtype=torch.int64).index_add(1, pile, other.long())
+        first[number] = (among[:, pile] == 0).int().argmax(0)
+    return first
 
 
 # Further starts of the descent: other ways in which a first scene's objects may stand.

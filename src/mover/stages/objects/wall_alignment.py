@@ -19,7 +19,7 @@ from mover.furniture.library import WALL_PIECES
 from mover.geometry.placement import GROUND
 from mover.geometry.rotations import wrap
 from mover.stages.objects.place_inputs import Placed, PlaceInputs, with_walls
-from mover.stages.objects.starts import alone, best_few, joined, merged
+from mover.stages.objects.starts import alone, best_few, joined, merged, piles_of
 
 NEAR = 0.3  # [m], root mean square distance of a rear from the line that it belongs to
 UNSEEN = 0.2  # how much an object whose base is not seen counts against one whose base is
@@ -51,9 +51,17 @@ def line_up(found: Placed, inputs: PlaceInputs, rounds: int, lower: Lower) -> Pl
             break
         starts = starts_at(lined.layout, inputs.objects, walls)
         few = best_few(found.candidates, found.energy, KEPT)
-        more = lower(with_walls(inputs, walls), joined(starts, few))
+        begin = _held(joined(starts, few), lined.layout, inputs.objects, walls)
+        more = lower(with_walls(inputs, walls), begin)
         lined = _where_told(more, found, walls)
     return lined
+
+
+def _held(begin: Layout, layout: Layout, objects: Objects, walls: Walls) -> Layout:
+    """Starts of what stands with nothing that is told a line all alike, as one is enough there."""
+    pile = piles_of(objects.supports)
+    moves = torch.isin(pile, pile[walls.trust.amax(-1) > 0])
+    return merged(moves, begin, alone(layout))
 
 
 def _where_told(lined: Placed, found: Placed, walls: Walls) -> Placed:
