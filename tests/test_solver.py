@@ -75,6 +75,25 @@ def only(problems, k):
     return Problems(lambda rows: problems.of(rows + k), start, (1,))
 
 
+def test_problems_that_are_alike_are_solved_once():
+    some, like = valleys(4), torch.tensor([0, 1, 0, 3, 1, 3])
+    start = Point(some.start.x[like], some.start.y[like])
+    asked: list[int] = []
+
+    def of(rows):
+        asked.extend(rows.tolist())
+        return some.of(like[rows])
+
+    apart = settle(Problems(of, start, (6,)), BatchedBFGS())
+    assert {*asked} == {*range(6)}
+    asked.clear()
+    found = settle(Problems(of, start, (6,), None, torch.tensor([0, 1, 0, 3, 1, 3])), BatchedBFGS())
+    assert {*asked} == {0, 1, 3}
+    for a, b in ((found.at.x, apart.at.x), (found.at.y, apart.at.y), (found.value, apart.value)):
+        assert torch.equal(a, b)
+    assert torch.equal(found.trace, apart.trace)
+
+
 def test_bottoms_of_bowls_are_found():
     problems, bottom = bowls(20)
     found = settle(problems, EXACT)

@@ -1,10 +1,19 @@
 import torch
 from analytic import box_verts
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mover.core.types import Layout
 from mover.geometry.camera import project, to_camera
 from mover.geometry.placement import place
-from mover.stages.objects.starts import best_few, choose, spread, spread_distance
+from mover.stages.objects.starts import (
+    alike,
+    best_few,
+    choose,
+    piles_of,
+    spread,
+    spread_distance,
+)
 
 
 def layout_of(yaws, x=None):
@@ -96,3 +105,20 @@ class TestDistance:
             torch.testing.assert_close(corners[part], corners[:2], rtol=0, atol=1e-2)
             torch.testing.assert_close(tall[part], tall[:2], rtol=0, atol=1e-2)
             assert (ends[part, :, 0, 1] - ends[:2, :, 0, 1]).abs().min() > 5
+
+
+@given(st.integers(0, 1000))
+def test_starts_are_alike_where_a_whole_pile_begins_alike(seed: int):
+    g = torch.Generator().manual_seed(seed)
+    supports = torch.tensor([-1, 0, -1, 1])
+    number = torch.randint(0, 2, (5, 4), generator=g)
+    value = number[..., None].expand(-1, -1, 3).float()
+    layout = Layout(value, value[..., 0], value)
+    pile = piles_of(supports)
+    assert pile.tolist() == [0, 0, 2, 0]
+    found = alike(layout, pile)
+    for start in range(5):
+        for index in range(4):
+            mine = [k for k in range(4) if pile[k] == pile[index]]
+            same = [s for s in range(5) if torch.equal(number[s, mine], number[start, mine])]
+            assert int(found[start, index]) == same[0]
