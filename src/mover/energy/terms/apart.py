@@ -28,6 +28,7 @@ from mover.core.devices import constant
 from mover.core.records import record
 from mover.core.types import Layout, Objects
 from mover.energy.terms.collision import SAMPLES
+from mover.geometry.boxes import Box, corners
 from mover.geometry.placement import place
 from mover.geometry.rotations import rot_y
 from mover.geometry.sections import Sections, outline
@@ -64,16 +65,31 @@ def gather_solids(
 def apart_term(layout: Layout, objects: Objects, solids: Solids) -> Float[Tensor, " objects"]:
     """Price of the samples of each object that lie inside others [1]; one place for each object."""
     layout = replace(layout, yaw=layout.yaw.detach(), log_scale=layout.log_scale.detach())
-    points = place(objects.samples, layout)
+    points, pairs = place(objects.samples, layout), solids.pairs
+    here = points.device.type == "cpu"
+    if here:
+        pairs = pairs[_meet(layout, objects, pairs)]
     total = torch.zeros_like(layout.yaw)
     index = total.new_zeros(0, dtype=torch.long)
-    for one, other in solids.pairs.tolist():
+    for other in pairs[:, 1].unique().tolist():  # each with a volume of its own
+        ones = pairs[pairs[:, 1] == other, 0]
+        ones = ones if here else constant(tuple(ones.tolist()), index)
         scale = layout.log_scale[other]
-        away = points[one] - layout.t_world_object[other]
+        away = points[ones] - layout.t_world_object[other]
         own = away @ rot_y(layout.yaw[other]) / scale.exp()
         inside = -outline(solids.sections[other], own) * scale[::2].mean().exp()
-        deep = (inside - MARGIN).relu() * solids.upright[one]
+        deep = (inside - MARGIN).relu() * solids.upright[ones]
         near = deep.clamp_max(FAR)
-        price = SAMPLES * (near * (2 * deep - near)).mean()
-        total = total.index_add(0, constant((one,), index), price[None])
+        total = total.index_add(0, ones, SAMPLES * (near * (2 * deep - near)).mean(-1))
     return total
+
+
+def _meet(
+    layout: Layout, objects: Objects, pairs: Int[Tensor, "pairs 2"]
+) -> Bool[Tensor, " pairs"]:
+    """Whether upright boxes about both boxes meet; else neither has a sample in the other."""
+    size = objects.size * layout.log_scale.exp()
+    middle = layout.t_world_object + size * size.new_tensor([0.0, 0.5, 0.0])
+    ends = corners(Box(middle, size, layout.yaw)).detach()
+    low, high = (end[pairs] for end in (ends.amin(-2), ends.amax(-2)))
+    return ((low[:, 0] <= high[:, 1]) & (low[:, 1] <= high[:, 0])).all(-1)

@@ -136,7 +136,7 @@ def _short(
 ) -> Float[Tensor, "*most h w"]:
     """How much `lower` exceeds `upper`; unbounded pixels (infinite) cost nothing."""
     gap = lower - upper
-    return torch.where(gap.isfinite(), gap, torch.zeros_like(gap)).clamp(0, limit)
+    return gap.nan_to_num(0.0, 0.0, 0.0).clamp(0, limit)
 
 
 def _erode(mask: Bool[Tensor, "*batch h w"]) -> Bool[Tensor, "*batch h w"]:
