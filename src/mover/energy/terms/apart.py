@@ -69,7 +69,7 @@ def apart_term(layout: Layout, objects: Objects, solids: Solids) -> Float[Tensor
     here = points.device.type == "cpu"
     if here:
         pairs = pairs[_meet(layout, objects, pairs)]
-    total = torch.zeros_like(layout.yaw)
+    total = torch.zeros_like(layout.yaw) + 0 * layout.t_world_object.sum(-1)  # of all places
     index = total.new_zeros(0, dtype=torch.long)
     for other in pairs[:, 1].unique().tolist():  # each with a volume of its own
         ones = pairs[pairs[:, 1] == other, 0]
