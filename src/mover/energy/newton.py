@@ -96,12 +96,9 @@ def settle(
         ValueError: If an energy is not finite at the start.
     """
     start, axes, price = problems.start, problems.axes, _pricing(problems)
-    rows = _flat(start, len(axes))
-    like = torch.arange(len(rows)).to(rows.device) if problems.like is None else problems.like
-    index = like.unique()
-    live = _begin(price, index, rows[index], method)
-    ends, values = rows.clone(), torch.zeros_like(rows[:, 0])
-    values[index] = live.value
+    ends, like = _flat(start, len(axes)), _likes(problems)
+    live, values = _begin(price, like.unique(), ends, method), torch.zeros_like(ends[:, 0])
+    values[live.index] = live.value
     trace = [values[like].sum()]
     if not bool(live.value.isfinite().all() and live.slope.isfinite().all()):
         raise ValueError(f"{stage}: the energy is not finite")
@@ -129,8 +126,16 @@ def settle(
     return Minimum(reached(), value, torch.stack(trace).to(value.dtype))
 
 
-def _begin(price: Price, index: Rows, at: Tensor, method: BatchedBFGS) -> _Live:
-    """A round model whose minimum lies at the first radius."""
+def _likes(problems: Problems[P]) -> Tensor:
+    """The problem that is solved for each."""
+    if problems.like is not None:
+        return problems.like
+    return torch.arange(prod(problems.axes)).to(_first(problems.start).device)
+
+
+def _begin(price: Price, index: Rows, rows: Tensor, method: BatchedBFGS) -> _Live:
+    """A round model of some rows whose minimum lies at the first radius."""
+    at = rows[index]
     value, slope = price(index, at)
     radius = torch.full_like(value, method.reach)
     model = _round(slope, radius)
