@@ -68,6 +68,7 @@ def test_a_piece_that_is_moved_goes_smoothly_and_is_drawn_where_it_is(kind: str)
     assert float((place[-1] - place[0]).norm()) > 0.3
     furniture = room.capture.furniture
     assert furniture is not None
+    assert not any(given.segments for given in room.capture.scene.objects)
     for frame in (0, end + end % 2):
         mine = (furniture.frame == frame) & (furniture.person == piece.annotation)
         mask = decode(furniture.masks, int(mine.nonzero()[0])).nonzero().double().mean(0)

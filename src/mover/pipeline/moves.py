@@ -69,8 +69,11 @@ def away(stays: Stays, capture: Capture) -> Spans:
 
 
 def with_moves(solving: Solving, pinned: tuple[str, ...]) -> Room:
-    """The room, with its moved objects where they stand when."""
-    capture, config, run = solving.capture, solving.config, solving.run
+    """The room, with its moved objects where they stand when; what was given of that is left."""
+    given, config, run = solving.capture, solving.config, solving.run
+    pieces = tuple(replace(piece, segments=()) for piece in given.scene.objects)
+    capture = replace(given, scene=replace(given.scene, objects=pieces))
+    solving = replace(solving, capture=capture)
     stays = stays_of(capture, config, run)
     room = solving.solve(capture, config, run, pinned, away(stays, capture))
     for piece in room.scene.objects if room.scene.ground is not None else ():

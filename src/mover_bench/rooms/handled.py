@@ -116,7 +116,7 @@ def _acted(plan: Plan, index: int, config: RoomConfig, rng: np.random.Generator)
     seen = looks(plan, moving, see(plan))
     frames = range(0, len(whole.labels), EVERY)
     furniture = pieces_seen(room.capture.people, frames, lambda frame: seen(frame)[1])
-    capture = dataclasses.replace(room.capture, scene=truth, furniture=furniture)
+    capture = dataclasses.replace(room.capture, furniture=furniture)
     return dataclasses.replace(room, capture=capture, truth=truth)
 
 

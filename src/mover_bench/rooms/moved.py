@@ -97,7 +97,6 @@ def _joined(first: KnownRoom, second: KnownRoom, index: int) -> KnownRoom:
     both = _both(first, second)
     capture = dataclasses.replace(
         first.capture,
-        scene=truth,
         bodies=both.bodies,
         people=_both(first.capture.people, second.capture.people),
         furniture=_both(_seen(first, before), _seen(second, after)),
