@@ -135,6 +135,26 @@ def judged(capture: Path, found: Path, room: KnownRoom) -> dict[str, Any]:
     return evaluate(scenes[0], scenes[1], truth, bodies)
 
 
+def farther(metrics: dict[str, Any]) -> list[str]:
+    """Pieces that end farther from their true place than they began."""
+    return [
+        f"{piece['id']} {100 * before:.0f} to {100 * after:.0f} cm"
+        for piece in metrics["objects"]
+        for before, after in [[piece[side].get("center_error", np.nan) for side in SIDES]]
+        if after > before
+    ]
+
+
+def scale_of(found: Path, room: KnownRoom) -> dict[str, float]:
+    """Height of the camera over the true one, of the first scene and of the room."""
+    assert room.truth.ground is not None
+    scenes = {
+        side: read_scene(found / f"{n}.json")
+        for side, n in zip(SIDES, ("initial", "scene"), strict=True)
+    }
+    return {f"{side} scale": (s.ground or np.nan) / room.truth.ground for side, s in scenes.items()}
+
+
 def told_of_objects(metrics: dict[str, Any]) -> str:
     """IoU3D and error of the centre of each object, first scene -> room."""
     lines: list[str] = []
@@ -147,8 +167,11 @@ def told_of_objects(metrics: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, float]:
+def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
     """One known room, from its video to its room; the room again with measured depth."""
+    kept = out / "row.json"
+    if kept.is_file():
+        return json.loads(kept.read_text())
     room = make_room(seed, RoomConfig(fps=FPS))
     out.mkdir(parents=True, exist_ok=True)
     if not (out / "video.mp4").is_file():
@@ -157,7 +180,7 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, float]:
     meshes = other_designs(room, out / "meshes") if args.other_designs else None
     chain = ChainArgs(out / "chain", camera=lens_file(room, out), meshes=meshes)
     video_to_room(out / "video.mp4", chain, seen.finders())
-    capture, row = out / "chain" / "capture", dict[str, float]()
+    capture, row = out / "chain" / "capture", dict[str, Any]()
     for kind in ("", *args.depth):
         place = out / "chain" / f"room {kind}".rstrip()
         if kind:
@@ -168,8 +191,12 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, float]:
         metrics, word = judged(capture, place, room), f"{kind} ".lstrip()
         print(f"room {seed} {kind}", told_of_objects(metrics), sep="\n", flush=True)
         row |= {f"{word}{s} {k}": metrics[s][k] for s in SIDES for k in KEYS if k in metrics[s]}
+        row |= {f"{word}{name}": value for name, value in scale_of(place, room).items()}
+        row |= {f"{word}farther": farther(metrics), f"{word}objects": len(metrics["objects"])}
     steps = json.loads((out / "chain" / "steps.json").read_text())["steps"]
-    return row | {f"{name} [s]": step["seconds"] for name, step in steps.items()}
+    row |= {f"{name} [s]": step["seconds"] for name, step in steps.items()}
+    kept.write_text(json.dumps(row))
+    return row
 
 
 def lens_file(room: KnownRoom, out: Path) -> Path:
@@ -195,6 +222,9 @@ def main() -> None:
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     for name in names:
         values = [row[name] for row in rows.values() if name in row]
+        if isinstance(values[0], list):
+            print(f"{name}: {'; '.join(f'{s}: {v}' for s, row in rows.items() for v in row[name])}")
+            continue
         each = " ".join(f"{v:.3f}" for v in values)
         print(f"{name:<24} {np.mean(values):8.3f}   {each}")
 

@@ -110,6 +110,7 @@ def test_meshes_of_another_topology_with_parameters_are_refined_rigidly(tmp_path
         ({"transl": np.full((ROWS, 3), np.nan)}, "'transl' has nan at"),
         ({"global_orient": np.zeros((ROWS, 4))}, "'global_orient' has shape"),
         ({"left_hand_pose": np.zeros(45)}, "'left_hand_pose' has shape"),
+        ({"size_spread": np.array(-0.1)}, "'size_spread' has -0.1, expected .* from 0 to 1"),
     ],
 )
 def test_wrong_parameters_are_named(tmp_path: Path, change: dict[str, Any], words: str) -> None:
@@ -120,7 +121,9 @@ def test_wrong_parameters_are_named(tmp_path: Path, change: dict[str, Any], word
 
 
 def test_bodies_survive_writing(tmp_path: Path) -> None:
-    first, _ = told(save(tmp_path, **rows(), **parameters(), fps=np.array(12.5)))
+    first, _ = told(
+        save(tmp_path, **rows(), **parameters(), fps=np.array(12.5), size_spread=np.array(0.03))
+    )
     write_bodies(first, tmp_path / "copy.npz")
     second, words = told(tmp_path / "copy.npz")
     assert not words
@@ -130,7 +133,7 @@ def test_bodies_survive_writing(tmp_path: Path) -> None:
     for name in ("betas", "global_orient", "body_pose", "transl"):
         assert torch.equal(getattr(first.pose, name), getattr(second.pose, name))
     assert torch.equal(first.pose.extra["left_hand_pose"], second.pose.extra["left_hand_pose"])
-    assert (second.fps, second.space) == (12.5, "camera")
+    assert (second.fps, second.space, second.size_spread) == (12.5, "camera", 0.03)
     write_bodies(second, tmp_path / "again.npz")
     assert (tmp_path / "copy.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
 

@@ -12,6 +12,7 @@ from mover.bodies.skinning import open_body
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig
 from mover.fitting.energy import Seen, pose_price
+from mover.fitting.ground import distances_of_who_lies, plane_of, sole_heights, soles_of
 from mover.fitting.limits import resting, spreads
 from mover.fitting.tracks import ALONE, image_speed
 from mover.geometry.rotations import axis_angle, rotation_vectors
@@ -75,3 +76,51 @@ def test_an_ankle_that_levels_the_foot_costs_no_more_than_one_at_rest():
     assert float(pose_price(rest, looked)) == 0
     ankle = (0.3 / math.radians(14)) ** 2
     assert float(pose_price(bent, looked) - pose_price(level, looked)) == pytest.approx(ankle)
+
+
+def lying_down(depths, rises):
+    """Joints of a track whose trunk rises so [rad] along the view, at these distances [m]."""
+    rises = torch.as_tensor(rises)
+    joints = torch.zeros(len(rises), 22, 3)
+    joints[..., 2] = torch.as_tensor(depths)[:, None]
+    joints[:, BODY.index("neck"), 1] -= 0.5 * rises.sin()
+    joints[:, BODY.index("neck"), 2] += 0.5 * rises.cos()
+    return joints
+
+
+def test_who_lies_along_the_view_is_expected_where_they_sat_before_and_after():
+    upright = [1.5] * 4
+    joints = lying_down([4.0] * 4 + [4.9] * 5 + [4.4] * 4, upright + [0.0] * 5 + upright)
+    time = torch.arange(13) / 5
+    track = [torch.arange(13)]
+    found = distances_of_who_lies(joints, torch.tensor([0.0, -1, 0]), track, time)
+    assert found[:4].isnan().all()
+    assert found[9:].isnan().all()
+    between = torch.linspace(math.log(4.0), math.log(4.4), 7)[1:-1]
+    torch.testing.assert_close(found[4:9], between)
+    alone = distances_of_who_lies(
+        joints[4:9], torch.tensor([0.0, -1, 0]), [torch.arange(5)], time[4:9]
+    )
+    assert alone.isnan().all()  # nobody knows where they came from
+
+
+def test_a_body_across_the_view_tells_its_distance_itself():
+    joints = lying_down([4.0, 4.9, 4.0], [1.5, 0.0, 1.5])
+    joints[1, BODY.index("neck")] = torch.tensor([0.5, 0.0, 4.9])
+    track = [torch.arange(3)]
+    found = distances_of_who_lies(joints, torch.tensor([0.0, -1, 0]), track, torch.arange(3) / 5)
+    assert found.isnan().all()
+
+
+def test_a_leaning_floor_lies_where_its_soles_are():
+    up = torch.nn.functional.normalize(torch.tensor([0.1, -1.0, 0.2]), dim=0)
+    leaned, height = plane_of(torch.tensor([0.05, -0.03, -1.4]), up, None)
+    assert float(leaned.norm()) == pytest.approx(1)
+    assert float(leaned @ up) == pytest.approx(1 / math.sqrt(1 + 0.05**2 + 0.03**2))
+    assert float(height) == pytest.approx(-1.4)
+    joints = torch.zeros(1, 22, 3)
+    soles = soles_of(open_body())
+    for side, more in (("left", 0.2), ("right", 0.0)):  # the left foot is lifted
+        for joint, over in zip(("ankle", "foot"), soles, strict=True):
+            joints[0, BODY.index(f"{side}_{joint}")] = (height + over + more) * leaned
+    assert float(sole_heights(joints, soles, leaned)) == pytest.approx(-1.4, abs=1e-5)

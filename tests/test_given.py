@@ -32,7 +32,7 @@ from mover.stages.objects.gather_given import (
     standard_sizes,
 )
 from mover.stages.objects.prepare_objects import levelled
-from mover.stages.people.find_depth import are_shapeless, nearer
+from mover.stages.people.find_depth import are_shapeless, nearer, size_spread
 from mover_bench.rooms.foreign import foreign_mesh
 
 TURNS = torch.linspace(-math.pi, math.pi, 721)
@@ -275,6 +275,9 @@ def test_a_larger_room_moves_the_floor_below_people_and_keeps_them_on_it() -> No
     assert torch.allclose(moved[0], torch.tensor([0.45, -1.26, -2.7]), atol=1e-5)
     assert torch.allclose(moved[1], torch.tensor([0.45, 0.44, -2.7]), atol=1e-5)
     assert not are_shapeless(seen)
+    fitted = replace(seen, size_spread=0.025)
+    assert [size_spread(b, 0.055) for b in (seen, fitted)] == [0.0, 0.025]
+    assert size_spread(fitted, 0.0) == 0  # everybody is believed
 
 
 def test_a_larger_room_is_the_same_picture() -> None:

@@ -156,6 +156,9 @@ class Bodies:
     space: Literal["camera", "world"]
     """Frame of vertices and joints."""
     pose: BodyPose | None
+    size_spread: float | None = None
+    """Standard deviation of the logarithm of all sizes, as far as they are wrong together: bodies
+    from keypoints of which no height is told. None: nobody says."""
 
 
 @record

@@ -11,16 +11,17 @@ from mover.bodies import BodyModel
 from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skinning import shaped, widths_of
 from mover.bodies.smpl_model import FLAT, Model, SmplBody, skin_of_model
-from mover.core.observe import Energy, Observer, Step, silent
+from mover.core.observe import Observer, Step, silent
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, Weighed, body_energy
 from mover.fitting.given import begin_at, begin_from, start_rows
+from mover.fitting.ground import distances_of_who_lies, sole_heights, soles_of
 from mover.fitting.prior import ANGLES, PosePrior, encoded
 from mover.fitting.room import FitRoom
 from mover.fitting.start import Begun, begin
-from mover.fitting.stature import stature_of
+from mover.fitting.stature import UNTOLD, stature_of
 from mover.fitting.tracks import (
     Window,
     at_stage,
@@ -29,6 +30,7 @@ from mover.fitting.tracks import (
     image_speed,
     seen_at_all,
     seen_of,
+    tracks_of,
     triples_of,
     usable_rows,
     windows_of,
@@ -122,7 +124,10 @@ def fit_bodies(
     at, frame, seen = _solved(begun, job)
     pose = pose_of(at, frame, inputs.model, inputs.prior)
     miss = miss_of(at, frame, seen, inputs.prior)
-    return Fitted(bodies_of(pose, inputs.model, some), rows, miss, warnings)
+    told = stature is not None or inputs.room is not None
+    bodies = bodies_of(pose, inputs.model, some)
+    bodies = dataclasses.replace(bodies, size_spread=None if told else UNTOLD)
+    return Fitted(bodies, rows, miss, warnings)
 
 
 def _around(inputs: FitInputs) -> FitRoom | None:
@@ -152,11 +157,13 @@ def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
     people, person = job.inputs.keypoints.person.unique(return_inverse=True)
     at = dataclasses.replace(begun.at, **_widened(begun.at, len(people), job))
     frame = Frame(job.rig, begun.root, person)
+    seen, at = _on_a_floor(seen, at, frame, job)
     windows = windows_of(job.inputs.keypoints, job.config)
     free = EVERYTHING
     if len(windows) > 1:
         some = windows[0]
-        at = dataclasses.replace(at, betas=_stages(at, frame, seen, some, (job, free)).betas)
+        first = _stages(at, frame, seen, some, (job, free))
+        at = dataclasses.replace(at, betas=first.betas, floor=first.floor)
         free, windows = OF_ROWS, windows[1:]
     parts = [_stages(at, frame, seen, window, (job, free)) for window in windows]
     betas = parts[0].betas
@@ -166,7 +173,19 @@ def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
     }
     back = torch.argsort(torch.cat([w.rows[w.keep] for w in windows]))
     fields = {name: value[back] for name, value in fields.items()}
-    return Unknowns(betas=betas, **fields), frame, seen
+    return Unknowns(betas=betas, floor=parts[0].floor, **fields), frame, seen
+
+
+def _on_a_floor(seen: Seen, at: Unknowns, frame: Frame, job: _Job) -> tuple[Seen, Unknowns]:
+    """With a floor that is sought, first level and below the feet; not in a room that is known."""
+    if job.inputs.room is not None or not job.config.stands:
+        return seen, at
+    soles, decode = soles_of(job.inputs.model), job.inputs.prior.decode
+    with torch.no_grad():
+        low = sole_heights(points_of(at, frame, decode).joints, soles, seen.up)
+    level = low.median() if seen.floor is None else low.new_tensor(seen.floor)
+    floor = torch.stack([torch.zeros_like(level), torch.zeros_like(level), level])
+    return dataclasses.replace(seen, soles=soles), dataclasses.replace(at, floor=floor)
 
 
 def _widened(at: Unknowns, people: int, job: _Job) -> dict[str, Tensor]:
@@ -216,19 +235,40 @@ def _stages(
     seen = chosen(seen, rows, triples_of(some, _speed(at, some, job), job.config))
     frame = Frame(frame.rig, frame.root[rows], frame.person[rows])
     extremities = any("index" in name or name.startswith("face_") for name in job.names)
+    by = Weighed(stages[0], job.config, job.inputs.prior.decode, job.inputs.prior.width > 0)
+
+    def lowered_by(stage: Stage, free: tuple[str, ...]) -> Unknowns:
+        here, how = at_stage(seen, job.names, stage), dataclasses.replace(by, stage=stage)
+        return solve(lambda u: body_energy(u, frame, here, how), at, stage.steps, free)
+
     for index, stage in enumerate(stages):
-        here = at_stage(seen, job.names, stage)
-        by = Weighed(stage, job.config, job.inputs.prior.decode, job.inputs.prior.width > 0)
-
-        def energy(u: Unknowns, here: Seen = here, by: Weighed = by) -> Energy:
-            return body_energy(u, frame, here, by)
-
         last = index > 0 and index == len(stages) - 1
         if last and not extremities and _alike(stage, stages[index - 1]):
             continue
-        at = solve(energy, at, stage.steps, free)
+        at = lowered_by(stage, free)
+        at, seen = _laid(at, frame, some, seen, job)
+        if seen.about is not None:  # before, who lies moved those by whom they are placed
+            at = lowered_by(stage, OF_ROWS)
         job.observe(Step("fit_bodies", index, len(stages)))
     return at
+
+
+def _laid(
+    at: Unknowns, frame: Frame, keypoints: Keypoints, seen: Seen, job: _Job
+) -> tuple[Unknowns, Seen]:
+    """Who lies along the view put where they are expected."""
+    if keypoints.fps is None or job.inputs.room is not None or not job.config.lies:
+        return at, seen
+    with torch.no_grad():
+        joints = points_of(at, frame, job.inputs.prior.decode).joints
+    tracks = tracks_of(keypoints.frame, keypoints.person)
+    about = distances_of_who_lies(joints, seen.up, tracks, keypoints.frame / keypoints.fps)
+    free = about.isnan()
+    if bool(free.all()):
+        return at, seen
+    depth = torch.where(free, at.place[:, 2], about)
+    place = torch.cat([at.place[:, :2], depth[:, None]], -1)
+    return dataclasses.replace(at, place=place), dataclasses.replace(seen, about=about)
 
 
 def _alike(stage: Stage, before: Stage) -> bool:

@@ -95,7 +95,11 @@ class FitConfig:
     longest_gap: Seconds = 1.0
     """Frames further apart do not smooth each other [s]."""
     support: Sigma = 0.05
-    """Where the floor is known: how far a joint may be under it [m]."""
+    """How far a joint may be under the floor [m]."""
+    stands: Weight = 20.0
+    """Weight of one floor below the lower soles of all bodies, found with them [1/m]; 0: none."""
+    lies: Weight = 50.0
+    """Weight of the distance before and after lying, of who lies along the view; 0: none."""
     near: Annotated[float, float_in(1e-3, 180)] = 15.0
     """With bodies to start from: how far each angle may be from theirs [degrees]."""
     hands: Annotated[int, int_in(0, 45)] = 12

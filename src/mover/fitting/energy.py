@@ -25,6 +25,16 @@ from mover.core.observe import Energy
 from mover.core.records import record
 from mover.energy.minimize import weigh
 from mover.fitting.config import FitConfig, Stage
+from mover.fitting.ground import (
+    FRAMES,
+    STEP,
+    Plane,
+    laid_price,
+    level_price,
+    plane_of,
+    sole_heights,
+    support_price,
+)
 from mover.fitting.limits import limit_price
 from mover.fitting.room import FitRoom, room_terms
 from mover.fitting.stature import Stature, height_price, size_of
@@ -32,6 +42,7 @@ from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, points_of
 from mover.geometry.camera import project
 
 LIFTED = 10.0  # weight of joints that are known in 3D
+OF_SHAPES = 0.1  # what a body that lies along the view tells of shapes beside others
 HEIGHT = 1000.0  # [px], the image height at which the published weights were chosen
 BENT = ((17, 1, 1.0), (18, 1, -1.0), (3, 0, -1.0), (4, 0, -1.0))
 """Elbows and knees: joint of the body, axis, and the sign that is the wrong way."""
@@ -79,6 +90,10 @@ class Seen:
     """The room in which they are fitted; None: not known."""
     stature: Stature | None = None
     """How tall they are; None: nobody told."""
+    soles: Float[Tensor, "2"] | None = None
+    """Heights of ankles and balls of the feet over the soles [m]; None: no floor is sought."""
+    about: Float[Tensor, " bodies"] | None = None
+    """Logarithm of the distance at which who lies is expected; NaN, None: nothing is."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +112,6 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
     points = points_of(at, frame, by.decode)
     pixels = project(points.keypoints, seen.K)
     image, rho = (HEIGHT / seen.height) ** 2, by.config.rho
-    floor = by.stage.pose / by.config.support if seen.floor is not None else 0.0
     lifted = LIFTED if seen.joints is not None else 0.0
     smooth = by.stage.smooth if len(seen.triples.rows) else 0.0
     joints = points.joints
@@ -106,14 +120,50 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
     solid, flat = by.config.smooth_joints, by.config.smooth_pixels
     space = weigh(
         ("keypoints", image, lambda: keypoint_price(pixels, seen, rho)),
-        ("support", floor**2, lambda: support_price(points, seen)),
         ("joints", lifted**2, lambda: joint_price(points, seen)),
         ("smooth_joints", smooth * solid, lambda: smooth_joint_price(joints, seen, by)),
         ("smooth_pixels", smooth * flat, lambda: smooth_pixel_price(pixels, seen, by)),
         ("still", smooth * by.config.still, lambda: still_price(joints, seen)),
     )
     room = room_terms(points, seen.room, by.stage)
-    return Energy({**space.parts, **room, **_prior_energy(at, frame, seen, by).parts})
+    ground, prior = _ground_energy(points, at, seen, by), _prior_energy(at, frame, seen, by)
+    parts = {**space.parts, **ground.parts, **room, **prior.parts}
+    if seen.about is None:
+        return Energy(parts)
+    share = torch.where(seen.about.isnan(), 1.0, OF_SHAPES)
+    return Energy({name: share * part for name, part in parts.items()})
+
+
+def _ground_energy(points: Points, at: Unknowns, seen: Seen, by: Weighed) -> Energy:
+    """What the floor, and how people lie down, tell of how far they are."""
+    sought, pose, rows = bool(at.floor.numel()), by.stage.pose, len(at.place)
+    under = pose / by.config.support if sought or seen.floor is not None else 0.0
+    stands = pose * by.config.stands if sought else 0.0
+    lies = pose * by.config.lies if seen.about is not None else 0.0
+
+    def plane() -> Plane:
+        return plane_of(at.floor, seen.up, seen.floor)
+
+    def stand() -> Tensor:
+        assert seen.soles is not None
+        up, level = plane()
+        height = sole_heights(points.joints, seen.soles, up) - level
+        return geman_mcclure(height.square(), STEP)
+
+    def lie() -> Tensor:
+        assert seen.about is not None
+        return laid_price(at.place[:, 2], seen.about)
+
+    def level() -> Tensor:
+        return level_price(at.floor, seen.floor).expand(rows)
+
+    every = torch.cat([points.joints, points.keypoints], 1)
+    return weigh(
+        ("support", under**2, lambda: support_price(every, plane())),
+        ("stands", stands**2, stand),
+        ("level", pose**2 * FRAMES / rows if sought else 0.0, level),
+        ("lies", lies**2, lie),
+    )
 
 
 def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
@@ -180,13 +230,6 @@ def pose_price(angles: Float[Tensor, "bodies angles"], seen: Seen) -> Float[Tens
 def jaw_price(face: Float[Tensor, "bodies face"]) -> Float[Tensor, " bodies"]:
     """Squared turns of the jaw; about y and z a hundred times as much as opening."""
     return face[:, 0].square() + 100 * face[:, 1:3].square().sum(-1)
-
-
-def support_price(points: Points, seen: Seen) -> Float[Tensor, " bodies"]:
-    """Squared depth of joints and keypoints under the floor [m²]."""
-    assert seen.floor is not None
-    every = torch.cat([points.joints, points.keypoints], 1)
-    return (seen.floor - every @ seen.up).clamp_min(0).square().sum(-1)
 
 
 def joint_price(points: Points, seen: Seen) -> Float[Tensor, " bodies"]:

@@ -13,6 +13,7 @@ from mover.bodies.smpl_model import Model, skin_of_model
 from mover.core.errors import InputError
 from mover.core.records import record
 
+UNTOLD = 0.025  # of the logarithm of a height, found without one told (rooms 100 to 109)
 BONES = 4.6  # [m], the 21 bones of a usual person end to end
 
 

@@ -192,6 +192,7 @@ def _down_the_tree(
 
 
 HAND = 45
+NO_FLOOR = torch.zeros(0)
 
 
 @record
@@ -209,10 +210,12 @@ class Unknowns:
     """Left, then right; zero columns where no hands are fitted."""
     face: Float[Tensor, "bodies face"]
     """Jaw [rad], then expression; zero columns where no face is fitted."""
+    floor: Float[Tensor, " floor"] = NO_FLOOR
+    """Two slopes of the floor, and its height along upright from the camera [m]; or none."""
 
 
 SCALES = {"turn": 0.2, "code": 0.3, "place": (0.01, 0.01, 0.05), "betas": 1.0, "hands": 0.5,
-          "face": 0.3}  # fmt: skip
+          "face": 0.3, "floor": 0.03}  # fmt: skip
 """How far each usually moves: the solver works in these units."""
 
 Decode = Callable[[Float[Tensor, "bodies code"]], Float[Tensor, "bodies angles"]]
@@ -300,8 +303,8 @@ def _scale(name: str, value: Tensor) -> Tensor:
     return torch.tensor(SCALES[name], dtype=value.dtype, device=value.device)
 
 
-EVERYTHING = ("turn", "code", "place", "betas", "hands", "face")
-OF_ROWS = tuple(name for name in EVERYTHING if name != "betas")
+EVERYTHING = ("turn", "code", "place", "betas", "hands", "face", "floor")
+OF_ROWS = tuple(name for name in EVERYTHING if name not in ("betas", "floor"))
 
 
 def solve(

@@ -32,7 +32,7 @@ from mover.stages.objects.bend_shapes import told_of_shapes
 from mover.stages.objects.find_image_cues import ImageInputs, Seen
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
-from mover.stages.people.find_depth import are_shapeless
+from mover.stages.people.find_depth import size_spread
 
 Spans = tuple[tuple[int, int], ...]
 """Frames, from the first of each to the first that is no longer in it."""
@@ -93,7 +93,7 @@ def is_scale_known(capture: Capture, people: PeopleState) -> bool:
     """Whether anything but the furniture tells how large the room is."""
     heights = {} if capture.people is None else capture.people.heights
     told = bool(heights) or capture.camera_height is not None
-    return told or not are_shapeless(people.bodies)
+    return told or not size_spread(people.bodies, 1.0)
 
 
 def gather_inputs(

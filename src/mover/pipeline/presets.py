@@ -93,7 +93,8 @@ class Config:
     """Start on the floor along the rays with the size in the image kept; else dropped straight."""
     height_spread: Annotated[float, float_in(0, 0.3)] = 0.0
     """Standard deviation of the logarithm of people's height, where all have the mean shape of
-    their model and no height is given: the furniture then tells the scale, too; 0: believed."""
+    their model and no height is given: the furniture then tells the scale, too (and where bodies
+    say how far their sizes may be off, as those of `mover fit` do); 0: believed."""
     silhouette_confidence: bool = False
     """Believe the silhouette of an object less whose shape does not fit."""
 

@@ -89,7 +89,7 @@ from mover.stages.objects.starts import (
     other_starts,
     reference_yaw,
 )
-from mover.stages.people.find_depth import are_shapeless, nearer
+from mover.stages.people.find_depth import are_shapeless, nearer, size_spread
 
 NOBODY = HumanCues()
 
@@ -281,9 +281,10 @@ def with_common_scale(
 ) -> tuple[PeopleState, SceneState]:
     """The whole room larger or smaller where nothing but the furniture tells its scale."""
     given = None if state.priced is None else state.priced[0].image.given
-    if given is None or is_scale_known(context.capture, people):
+    spread = size_spread(people.bodies, context.config.height_spread)
+    if given is None or not spread or is_scale_known(context.capture, people):
         return people, state
-    factor = math.exp(-common_scale(state.placed.layout, given, context.config.height_spread))
+    factor = math.exp(-common_scale(state.placed.layout, given, spread))
     bodies = nearer(people.bodies, state.camera, state.ground, factor)
     layouts = (state.start, state.alone, state.placed.layout, state.placed.candidates)
     start, only_image, layout, candidates = (larger(x, factor) for x in layouts)

@@ -62,9 +62,11 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
         verts = _places(given, (len(frame), "V", 3))
         faces = _faces(get(at, "faces"), verts.shape[1])
         joints, names = _joints(at, len(frame))
+    spread = _scalar(at, "size_spread", 0.0, 1.0)
     bodies = Bodies(
-        verts, faces, joints, names, frame, person, _fps(at), _space(get(at, "space")), pose
-    )
+        verts, faces, joints, names, frame, person, _scalar(at, "fps", SLOWEST, FASTEST),
+        _space(get(at, "space")), pose, spread,
+    )  # fmt: skip
     extent = (bodies.verts.amax(1) - bodies.verts.amin(1)).norm(dim=-1).median()
     if not SMALLEST < extent < TALLEST:
         warn(f"{at.file}: the bodies measure {float(extent):.3g} across; are they in metres?")
@@ -130,11 +132,12 @@ def _joints(at: At, rows: int) -> tuple[Float[Tensor, "bodies joints 3"] | None,
     return joints, tuple(str(word) for word in words)
 
 
-def _fps(at: At) -> float | None:
-    given = maybe(at, "fps")
+def _scalar(at: At, name: str, least: float, most: float) -> float | None:
+    """A number that may be missing."""
+    given = maybe(at, name)
     if given is None:
         return None
-    return number(At(float(array(given, ())[()]), given.file, given.field), SLOWEST, FASTEST)
+    return number(At(float(array(given, ())[()]), given.file, given.field), least, most)
 
 
 def _space(at: At) -> Any:  # noqa: ANN401
@@ -156,8 +159,9 @@ def bodies_to_arrays(bodies: Bodies) -> dict[str, NDArray[Any]]:
         "vertices": bodies.verts.detach().cpu().numpy(),
         "faces": bodies.faces.cpu().numpy(),
     }
-    if bodies.fps is not None:
-        arrays["fps"] = np.array(bodies.fps)
+    for name in ("fps", "size_spread"):
+        if getattr(bodies, name) is not None:
+            arrays[name] = np.array(getattr(bodies, name))
     if bodies.joints is not None:
         arrays["joints"] = bodies.joints.detach().cpu().numpy()
         arrays["joint_names"] = np.array(bodies.joint_names, dtype=np.str_)

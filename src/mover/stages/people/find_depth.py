@@ -201,6 +201,18 @@ def are_shapeless(bodies: Bodies) -> bool:
     return bodies.pose is not None and float(bodies.pose.betas.abs().max()) < SHAPELESS
 
 
+def size_spread(bodies: Bodies, shapeless: float) -> float:
+    """How far off all sizes may be together (of the logarithm); 0: they are believed.
+
+    Args:
+        bodies: With what their maker says of it.
+        shapeless: The same of bodies of the mean shape; 0: all are believed.
+    """
+    if shapeless and bodies.size_spread is not None:
+        return bodies.size_spread
+    return shapeless if are_shapeless(bodies) else 0.0
+
+
 def nearer(bodies: Bodies, camera: Camera, ground: float, factor: float) -> Bodies:
     """People moved as if the whole room were larger by a factor: the floor below them is.
 

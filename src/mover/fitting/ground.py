@@ -1,0 +1,132 @@
+r"""What tells how far people are, beside their keypoints: the floor, and that who lies stays.
+
+    E = Σ_t w_s² ρ(h_t; 10 cm) + Σ_t (|slope|² / σ² + ...) + Σ_{t lies} w_l² (log z_t - log z_0)²
+
+h is the height of the lower sole above one floor for everybody, whose slopes and height are found
+with the bodies: it tells of each body how far it is beside the others, not how tall they are.
+
+Seen along the body, from the feet or the head, who lies looks the same from afar: between 5.6 and
+6.4 m keypoints differ by nothing, and the pose prior, which says the same in each frame, moved a
+body by a metre (room 108). But nobody lies down far from where they sat: z_0 is the distance before
+and after.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.bodies.skeleton import BODY
+from mover.bodies.smpl_model import Model, skin_of_model
+
+Plane = tuple[Float[Tensor, "3"], Float[Tensor, ""] | float]
+"""Away from the floor, in camera axes, and its height along that from the camera [m]."""
+
+STEP = 0.1  # [m], feet that are higher are not on the floor
+TILT = math.radians(4)  # how far off the first guess of upright is, where nothing tells the floor
+KNOWN_TILT, KNOWN_HEIGHT = math.radians(0.3), 0.01  # [rad], [m], the same where the floor is told
+FRAMES = 20  # that tell of the floor as much as what is known before
+FEET = tuple([BODY.index(f"{side}_{joint}") for side in ("left", "right")]
+             for joint in ("ankle", "foot"))  # fmt: skip
+NECK = BODY.index("neck")
+LIES = math.sin(math.radians(35))  # most that the trunk of who lies rises
+SITS = math.sin(math.radians(50))  # least that the trunk of who sits or stands does
+ALONG = 0.7  # cosine of trunk and view from which distance is hardly seen
+NEIGHBOURS = 1.0  # [s] before and after lying that tell where it is
+
+
+def soles_of(model: Model) -> Float[Tensor, "2"]:
+    """Heights of ankle and ball of the foot over the sole of the mean shape [m]."""
+    skin = skin_of_model(model)
+    assert skin is not None
+    return skin.joints[[side[0] for side in FEET], 1] - skin.verts[:, 1].min()
+
+
+def plane_of(floor: Float[Tensor, " floor"], up: Float[Tensor, "3"], known: float | None) -> Plane:
+    """The floor that is sought, or where it is not, the one that is known."""
+    if not floor.numel():
+        assert known is not None
+        return up, known
+    across = up.new_tensor([1.0, 0.0, 0.0])
+    across = torch.nn.functional.normalize(across - (across @ up) * up, dim=0)
+    leaned = up + floor[0] * across + floor[1] * torch.linalg.cross(across, up)
+    return leaned / leaned.norm(), floor[2]
+
+
+def sole_heights(
+    joints: Float[Tensor, "bodies joints 3"], soles: Float[Tensor, "2"], up: Float[Tensor, "3"]
+) -> Float[Tensor, " bodies"]:
+    """Height of the lower sole along `up` from the camera [m]."""
+    low = torch.stack([(joints[:, both] @ up).amin(-1) for both in FEET], -1)
+    return (low - soles.to(low)).amin(-1)
+
+
+def support_price(
+    points: Float[Tensor, "bodies points 3"], plane: Plane
+) -> Float[Tensor, " bodies"]:
+    """Squared depth of points under the floor [m²]."""
+    return (plane[1] - points @ plane[0]).clamp_min(0).square().sum(-1)
+
+
+def level_price(floor: Float[Tensor, " floor"], known: float | None) -> Float[Tensor, ""]:
+    """Squared slopes of the floor, and where it is known its height, in what may be."""
+    tilt = TILT if known is None else KNOWN_TILT
+    price = floor[:2].square().sum() / tilt**2
+    return price if known is None else price + ((floor[2] - known) / KNOWN_HEIGHT).square()
+
+
+def laid_price(
+    depth: Float[Tensor, " bodies"], about: Float[Tensor, " bodies"]
+) -> Float[Tensor, " bodies"]:
+    """Squared logarithm of the distance over the one that is expected; NaN: none is."""
+    off = torch.where(about.isnan(), torch.zeros_like(depth), depth - about.nan_to_num())
+    return off.square()
+
+
+def distances_of_who_lies(
+    joints: Float[Tensor, "bodies joints 3"],
+    up: Float[Tensor, "3"],
+    tracks: Sequence[Int[Tensor, " track"]],
+    time: Float[Tensor, " bodies"],
+) -> Float[Tensor, " bodies"]:
+    """Logarithm of the distance along the view before and after lying, by time; NaN: free [m].
+
+    Args:
+        joints: Of the body, in camera axes [m].
+        up: About upright.
+        tracks: Rows of each person, in the order of time.
+        time: Of each row [s].
+    """
+    trunk = torch.nn.functional.normalize(joints[:, NECK] - joints[:, 0], dim=-1)
+    view = torch.nn.functional.normalize(joints[:, 0], dim=-1)
+    rise = trunk @ up
+    lies = (rise.abs() < LIES) & ((trunk * view).sum(-1).abs() > ALONG)
+    found = torch.full_like(rise, torch.nan)
+    depth = joints[:, 0, 2].clamp_min(1e-3).log()
+    for rows in tracks:
+        clock = time[rows].double()
+        tells = _beside(lies[rows], rise[rows] > SITS, clock)
+        if not bool(tells.any()):
+            continue
+        near = ((clock[tells][:, None] - clock[tells]).abs() <= NEIGHBOURS).double()
+        known = (near @ depth[rows][tells].double()) / near.sum(1)
+        expected = np.interp(clock[lies[rows]].numpy(), clock[tells].numpy(), known.numpy())
+        found[rows[lies[rows]]] = torch.from_numpy(expected).to(found)
+    return found
+
+
+def _beside(
+    lies: Bool[Tensor, " track"], sits: Bool[Tensor, " track"], time: Float[Tensor, " track"]
+) -> Bool[Tensor, " track"]:
+    """The upright rows before and after each stretch of lying, for a while."""
+    upright = time[sits]
+    if not len(upright) or not bool(lies.any()):
+        return torch.zeros_like(lies)
+    after = torch.searchsorted(upright, time[lies].contiguous())
+    ends = torch.cat(
+        [upright[(after - 1).clamp_min(0)], upright[after.clamp_max(len(upright) - 1)]]
+    )
+    return sits & ((time[:, None] - ends.unique()).abs() <= NEIGHBOURS).any(1)
