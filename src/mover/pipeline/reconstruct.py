@@ -287,11 +287,9 @@ def with_common_scale(
     factor = math.exp(-common_scale(state.placed.layout, given, spread))
     bodies = nearer(people.bodies, state.camera, state.ground, factor)
     layouts = (state.start, state.alone, state.placed.layout, state.placed.candidates)
-    start, only_image, layout, candidates = (larger(x, factor) for x in layouts)
+    start, single, layout, candidates = (larger(x, factor) for x in layouts)
     placed = replace(state.placed, layout=layout, candidates=candidates)
-    state = replace(
-        state, ground=factor * state.ground, start=start, alone=only_image, placed=placed
-    )
+    state = replace(state, ground=factor * state.ground, start=start, alone=single, placed=placed)
     return replace(people, bodies=bodies, path=scaled(people.path, factor)), state
 
 
