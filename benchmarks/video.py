@@ -195,6 +195,8 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
         row |= {f"{word}farther": farther(metrics), f"{word}objects": len(metrics["objects"])}
     steps = json.loads((out / "chain" / "steps.json").read_text())["steps"]
     row |= {f"{name} [s]": step["seconds"] for name, step in steps.items()}
+    stages = json.loads((out / "chain" / "room" / "run.json").read_text())["stages"]
+    row["room [s]"] = sum(stage["seconds"] for stage in stages)
     kept.write_text(json.dumps(row))
     return row
 

@@ -275,8 +275,8 @@ def test_a_larger_room_moves_the_floor_below_people_and_keeps_them_on_it() -> No
     assert torch.allclose(moved[0], torch.tensor([0.45, -1.26, -2.7]), atol=1e-5)
     assert torch.allclose(moved[1], torch.tensor([0.45, 0.44, -2.7]), atol=1e-5)
     assert not are_shapeless(seen)
-    fitted = replace(seen, size_spread=0.025)
-    assert [size_spread(b, 0.055) for b in (seen, fitted)] == [0.0, 0.025]
+    fitted = replace(seen, size_spread=0.02)
+    assert [size_spread(b, 0.055) for b in (seen, fitted)] == [0.0, 0.02]
     assert size_spread(fitted, 0.0) == 0  # everybody is believed
 
 

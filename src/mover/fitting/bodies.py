@@ -21,7 +21,7 @@ from mover.fitting.ground import distances_of_who_lies, sole_heights, soles_of
 from mover.fitting.prior import ANGLES, PosePrior, encoded
 from mover.fitting.room import FitRoom
 from mover.fitting.start import Begun, begin
-from mover.fitting.stature import UNTOLD, stature_of
+from mover.fitting.stature import UNTOLD, growth_of, stature_of
 from mover.fitting.tracks import (
     Window,
     at_stage,
@@ -44,6 +44,7 @@ from mover.fitting.unknowns import (
     Rig,
     Unknowns,
     hand_angles,
+    log_depth,
     pelvis_of,
     points_of,
     rig_of,
@@ -156,7 +157,8 @@ def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
     seen = dataclasses.replace(job.seen, centre=begun.centre, spread=begun.spread)
     people, person = job.inputs.keypoints.person.unique(return_inverse=True)
     at = dataclasses.replace(begun.at, **_widened(begun.at, len(people), job))
-    frame = Frame(job.rig, begun.root, person)
+    growth = growth_of(job.inputs.model) if job.inputs.room is None else None
+    frame = Frame(job.rig, begun.root, person, growth)
     seen, at = _on_a_floor(seen, at, frame, job)
     windows = windows_of(job.inputs.keypoints, job.config)
     free = EVERYTHING
@@ -232,8 +234,8 @@ def _stages(
     rows, stages = window.rows, job.config.stages
     some = rows_of(job.inputs.keypoints, rows)
     at = dataclasses.replace(at, **{name: getattr(at, name)[rows] for name in OF_ROWS})
-    seen = chosen(seen, rows, triples_of(some, _speed(at, some, job), job.config))
-    frame = Frame(frame.rig, frame.root[rows], frame.person[rows])
+    frame = dataclasses.replace(frame, root=frame.root[rows], person=frame.person[rows])
+    seen = chosen(seen, rows, triples_of(some, _speed(at, frame, some, job), job.config))
     extremities = any("index" in name or name.startswith("face_") for name in job.names)
     by = Weighed(stages[0], job.config, job.inputs.prior.decode, job.inputs.prior.width > 0)
 
@@ -266,7 +268,7 @@ def _laid(
     free = about.isnan()
     if bool(free.all()):
         return at, seen
-    depth = torch.where(free, at.place[:, 2], about)
+    depth = at.place[:, 2] + torch.where(free, 0, about - log_depth(at, frame))
     place = torch.cat([at.place[:, :2], depth[:, None]], -1)
     return dataclasses.replace(at, place=place), dataclasses.replace(seen, about=about)
 
@@ -277,13 +279,15 @@ def _alike(stage: Stage, before: Stage) -> bool:
     return dataclasses.replace(stage, face_joints=before.face_joints, **own) == before
 
 
-def _speed(at: Unknowns, keypoints: Keypoints, job: _Job) -> Float[Tensor, " rows"] | None:
+def _speed(
+    at: Unknowns, frame: Frame, keypoints: Keypoints, job: _Job
+) -> Float[Tensor, " rows"] | None:
     """How fast bodies seem to move across the view [m/s]; None without a frame rate."""
     if keypoints.fps is None:
         return None
     there = confidence_of(keypoints, job.config) > 0
     pixels = image_speed(keypoints, there).to(at.place)
-    return pixels * pelvis_of(at)[:, 2] / job.seen.K[0, 0]
+    return pixels * log_depth(at, frame).exp() / job.seen.K[0, 0]
 
 
 # What was solved, as bodies.
@@ -319,7 +323,7 @@ def pose_of(at: Unknowns, frame: Frame, model: Model, prior: PosePrior) -> BodyP
         betas=betas,
         global_orient=rotation_vectors(turns_of(at, frame, angles)[:, 0]),
         body_pose=body,
-        transl=pelvis_of(at) - rest,
+        transl=pelvis_of(at, frame) - rest,
         extra=extra,
     )
 

@@ -88,7 +88,7 @@ class FitConfig:
     """Second difference that is free of charge at any frame rate [m]."""
     by_size: bool = True
     """Price second differences of joints in sizes of the body: people are not near to be smooth."""
-    alike: Annotated[int, int_in(1, 1_000_000)] = 20
+    alike: Annotated[int, int_in(1, 1_000_000)] = 100
     """Frames whose keypoints tell of a person's shape as much as all of a long track do."""
     told: Weight = 1e4
     """Weight of a height that is told, off the body's [1/m]."""

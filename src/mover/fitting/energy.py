@@ -38,7 +38,7 @@ from mover.fitting.ground import (
 from mover.fitting.limits import limit_price
 from mover.fitting.room import FitRoom, room_terms
 from mover.fitting.stature import Stature, height_price, size_of
-from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, points_of
+from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, log_depth, points_of
 from mover.geometry.camera import project
 
 LIFTED = 10.0  # weight of joints that are known in 3D
@@ -126,7 +126,7 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
         ("still", smooth * by.config.still, lambda: still_price(joints, seen)),
     )
     room = room_terms(points, seen.room, by.stage)
-    ground, prior = _ground_energy(points, at, seen, by), _prior_energy(at, frame, seen, by)
+    ground, prior = _ground_energy(points, at, frame, seen, by), _prior_energy(at, frame, seen, by)
     parts = {**space.parts, **ground.parts, **room, **prior.parts}
     if seen.about is None:
         return Energy(parts)
@@ -134,7 +134,7 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
     return Energy({name: share * part for name, part in parts.items()})
 
 
-def _ground_energy(points: Points, at: Unknowns, seen: Seen, by: Weighed) -> Energy:
+def _ground_energy(points: Points, at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
     """What the floor, and how people lie down, tell of how far they are."""
     sought, pose, rows = bool(at.floor.numel()), by.stage.pose, len(at.place)
     under = pose / by.config.support if sought or seen.floor is not None else 0.0
@@ -152,7 +152,7 @@ def _ground_energy(points: Points, at: Unknowns, seen: Seen, by: Weighed) -> Ene
 
     def lie() -> Tensor:
         assert seen.about is not None
-        return laid_price(at.place[:, 2], seen.about)
+        return laid_price(log_depth(at, frame), seen.about)
 
     def level() -> Tensor:
         return level_price(at.floor, seen.floor).expand(rows)

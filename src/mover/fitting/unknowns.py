@@ -204,7 +204,7 @@ class Unknowns:
     code: Float[Tensor, "bodies code"]
     """The pose of the body: its angles [rad], or the code of a learned prior."""
     place: Float[Tensor, "bodies 3"]
-    """The pelvis: x / z, y / z, and the logarithm of its depth."""
+    """The pelvis: x / z, y / z, and the logarithm of its depth for a person of the usual size."""
     betas: Float[Tensor, "people shape"]
     hands: Float[Tensor, "bodies hands"]
     """Left, then right; zero columns where no hands are fitted."""
@@ -230,11 +230,21 @@ class Frame:
     """First guess of the root's rotation, in camera axes."""
     person: Int[Tensor, " bodies"]
     """Row of `betas`."""
+    growth: Float[Tensor, " shape"] | None = None
+    """What each number of the shape adds to the logarithm of the depth: who is taller and farther
+    looks the same, so that shapes alone would hardly move. None: nothing."""
 
 
-def pelvis_of(at: Unknowns) -> Float[Tensor, "bodies 3"]:
+def log_depth(at: Unknowns, frame: Frame) -> Float[Tensor, " bodies"]:
+    """Logarithm of the depth of the pelvis [m]."""
+    if frame.growth is None:
+        return at.place[:, 2]
+    return at.place[:, 2] + (at.betas @ frame.growth[: at.betas.shape[1]])[frame.person]
+
+
+def pelvis_of(at: Unknowns, frame: Frame) -> Float[Tensor, "bodies 3"]:
     """Place of the pelvis in camera axes [m]."""
-    depth = at.place[:, 2:].exp()
+    depth = log_depth(at, frame).exp()[:, None]
     return torch.cat([at.place[:, :2] * depth, depth], -1)
 
 
@@ -248,7 +258,7 @@ def points_of(at: Unknowns, frame: Frame, decode: Decode) -> Points:
     """Keypoints and joints of the bodies, in camera axes [m]."""
     expression = at.face[:, 3:] if at.face.shape[1] > 3 else None
     turns = turns_of(at, frame, decode(at.code))
-    return move(frame.rig, turns, at.betas[frame.person], pelvis_of(at), expression)
+    return move(frame.rig, turns, at.betas[frame.person], pelvis_of(at, frame), expression)
 
 
 def turns_of(
