@@ -78,7 +78,7 @@ class FitConfig:
     """Weight of the smoothness of projections; confidence of the middle frame counts."""
     acceleration: Annotated[float, float_in(0, 1e4)] = 3.0
     """What joints of people do all the time [m/s²]."""
-    still: Weight = 4.0
+    still: Weight = 6.0
     """Weight of the smoothness of the pelvis, which does not move where its picture does not."""
     calm: Sigma = 0.05
     """Acceleration of a body whose picture stands still [m/s²],"""
