@@ -19,8 +19,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mover.core.records import rows_of
 from mover.core.run import Run
-from mover.core.types import Bodies, CameraPath, Room
+from mover.core.types import CameraPath, Room
+from mover.evaluate.bodies import shared_rows
 from mover.geometry.boxes import box_of
 from mover.geometry.path import is_still
 from mover.pipeline.people import people_of
@@ -70,18 +72,12 @@ def room_scale(trial: Trial, room: Room) -> tuple[float, float]:
     assert room.bodies is not None
     assert room.kept is not None
     assert trial.bodies is not None
-    rows = {key: row for row, key in enumerate(_keys(trial.bodies))}
-    ours = pelvis(room.bodies)[room.kept]
-    index = torch.tensor([rows[key] for key in _keys(room.bodies)])[room.kept]
-    theirs = pelvis(trial.bodies)[index]
+    rows, same = shared_rows(rows_of(room.bodies, room.kept), trial.bodies)
+    ours, theirs = pelvis(room.bodies)[room.kept][rows], pelvis(trial.bodies)[same]
     spreads = [(place - place.mean(0)).square().sum().sqrt() for place in (ours, theirs)]
     far = ways[1] > APART
     pieces = float((ways[0][far] / ways[1][far]).log().median())
     return 100 * math.expm1(pieces), 100 * (float(spreads[0] / spreads[1]) - 1)
-
-
-def _keys(bodies: Bodies) -> list[tuple[int, int]]:
-    return list(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True))
 
 
 def row(name: str, seed: int, out: Path) -> list[float]:

@@ -36,6 +36,14 @@ def corners(of: Box) -> Float[Tensor, "*b 8 3"]:
     return local @ rot_y(of.yaw).mT + of.center.unsqueeze(-2)
 
 
+def beyond(of: Box, points: Float[Tensor, "*p 3"]) -> Float[Tensor, "*p 2"]:
+    """How far points of the world are outside of a box's footprint, along its own x and z [m].
+
+    Negative: between the two edges of that axis.
+    """
+    return ((points - of.center) @ rot_y(of.yaw)).abs()[..., [0, 2]] - of.size[[0, 2]] / 2
+
+
 def iou3d(a: Box, b: Box) -> Float[Tensor, "*b"]:
     """Shared volume over joint volume of upright boxes; 0 where both are empty."""
     overlap = torch.minimum(_top(a), _top(b)) - torch.maximum(_bottom(a), _bottom(b))

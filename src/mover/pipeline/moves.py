@@ -18,11 +18,10 @@ from mover.bodies.parts import parts_of
 from mover.core.records import rows_of
 from mover.core.run import Run
 from mover.core.types import Camera, Capture, Detection, Masks, Proposal, Room, SceneObject, Segment
-from mover.geometry.boxes import box_of
+from mover.geometry.boxes import beyond, box_of
 from mover.geometry.path import is_still
 from mover.geometry.placement import ENDLESS, hit_floor, placed_at
 from mover.geometry.rle import encode, tight_box
-from mover.geometry.rotations import rot_y
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.outcome import Spans, told_of_proposals
 from mover.pipeline.presets import Config, with_sizes
@@ -126,12 +125,8 @@ def _moves(
 
 def _stands_in(proposal: Proposal, places: list[SceneObject]) -> bool:
     """Whether a proposal is where an object stands in one of its stays."""
-    for piece in places:
-        box = box_of(piece)
-        off = (rot_y(box.yaw).mT @ (box_of(proposal.object).center - box.center)).abs()
-        if bool((off < box.size / 2)[[0, 2]].all()):
-            return True
-    return False
+    middle = box_of(proposal.object).center
+    return any(bool((beyond(box_of(piece), middle) < 0).all()) for piece in places)
 
 
 def _places(
@@ -187,22 +182,21 @@ def _segment(
 ) -> Capture:
     """A capture of one stay: its people and its mask before the room as it was found."""
     capture, (stays, index) = solving.capture, stay
+    this = stays[index]
     camera, ground = room.scene.camera, room.scene.ground
     assert ground is not None
     bodies, people = room.bodies, capture.people
     margin = 0.0 if bodies is None else solving.config.moves.margin * (bodies.fps or 0.0)
-    begin = stays[index].sure[0] + margin if index else -ENDLESS
-    end = stays[index].sure[1] - margin if index + 1 < len(stays) else ENDLESS
+    begin = this.sure[0] + margin if index else -ENDLESS
+    end = this.sure[1] - margin if index + 1 < len(stays) else ENDLESS
     if bodies is not None:
         bodies = into_camera(bodies, camera.R_cam_world)
         inside = (bodies.frame >= begin) & (bodies.frame <= end)
         bodies = rows_of(bodies, inside) if bool(inside.any()) else None
     if people is not None:
         people = rows_of(people, (people.frame >= begin) & (people.frame <= end))
-    now = stays[index].sure[0]
-    others = (replace(placed_at(p, now), segments=()) for p in room.scene.objects)
+    others = (replace(placed_at(p, this.sure[0]), segments=()) for p in room.scene.objects)
     objects = tuple(piece if p.id == piece.id else p for p in others)
-    this = stays[index]
     seen = tuple(_as_in(d, this) if d.id == this.annotation else d for d in capture.detections)
     return replace(
         capture, scene=replace(room.scene, objects=objects), camera_height=-ground,

@@ -89,11 +89,13 @@ class SceneState:
     """What the last descent minimised; None: nothing is explained."""
 
 
-def is_scale_known(capture: Capture, people: PeopleState) -> bool:
-    """Whether anything but the furniture tells how large the room is."""
+def scale_spread(context: ReconstructionContext, people: PeopleState) -> float:
+    """How far off the room's scale may be (of the logarithm); 0: not only the furniture tells."""
+    capture = context.capture
     heights = {} if capture.people is None else capture.people.heights
-    told = bool(heights) or capture.camera_height is not None
-    return told or not size_spread(people.bodies, 1.0)
+    if heights or capture.camera_height is not None:
+        return 0.0
+    return size_spread(people.bodies, context.config.height_spread)
 
 
 def gather_inputs(

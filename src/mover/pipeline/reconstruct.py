@@ -39,8 +39,8 @@ from mover.pipeline.outcome import (
     check_floor,
     check_room,
     gather_inputs,
-    is_scale_known,
     room_of,
+    scale_spread,
     tops_of,
     unfurnished,
     with_proposals,
@@ -89,7 +89,7 @@ from mover.stages.objects.starts import (
     other_starts,
     reference_yaw,
 )
-from mover.stages.people.find_depth import are_shapeless, nearer, size_spread
+from mover.stages.people.find_depth import are_shapeless, nearer
 
 NOBODY = HumanCues()
 
@@ -129,7 +129,7 @@ def _reconstructed(
     context = with_size_prior(context, state)
     for _ in range(config.refine.rounds):
         state = with_refined_camera(context, people, state)
-    if is_scale_known(capture, people):
+    if not scale_spread(context, people):
         _begin(run, gather_cues, gather_inputs(context, people, state), config.gather)
     image_energy = state.placed.energy[0]
     context, state = with_shapes_bent(context, state)
@@ -281,8 +281,8 @@ def with_common_scale(
 ) -> tuple[PeopleState, SceneState]:
     """The whole room larger or smaller where nothing but the furniture tells its scale."""
     given = None if state.priced is None else state.priced[0].image.given
-    spread = size_spread(people.bodies, context.config.height_spread)
-    if given is None or not spread or is_scale_known(context.capture, people):
+    spread = scale_spread(context, people)
+    if given is None or not spread:
         return people, state
     factor = math.exp(-common_scale(state.placed.layout, given, spread))
     bodies = nearer(people.bodies, state.camera, state.ground, factor)

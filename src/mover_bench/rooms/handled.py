@@ -212,16 +212,11 @@ def _between(start: Placed, end: Placed, share: float) -> Placed:
 
 def _rigid(posture: Posture, start: Placed, places: tuple[Placed, ...]) -> Posture:
     """A body that keeps its place on a piece, which is at another one in each frame."""
-    turn = about(Y, np.array([place.heading - start.heading for place in places]))
-    old = np.array([start.at[0], 0.0, start.at[1]])
-    new = np.array([[place.at[0], 0.0, place.at[1]] for place in places])
-
-    def carried(points: np.ndarray) -> np.ndarray:
-        return apply(turn, points - old) + new
-
-    ankles = np.stack([carried(posture.ankles[:, k]) for k in (0, 1)], 1)
+    turn = _turns(start, places)
+    pelvis = _carried(posture.pelvis[:, None], start, places)[:, 0]
     return dataclasses.replace(
-        posture, pelvis=carried(posture.pelvis), turn=turn @ posture.turn, ankles=ankles,
+        posture, pelvis=pelvis, turn=turn @ posture.turn,
+        ankles=_carried(posture.ankles, start, places),
         feet=turn[:, None] @ posture.feet, knees=apply(turn[:, None], posture.knees),
     )  # fmt: skip
 
@@ -304,16 +299,16 @@ def _before(piece: Placed, start: np.ndarray, now: np.ndarray) -> Placed:
     return dataclasses.replace(piece, at=(float(x), float(z)), heading=piece.heading + turn)
 
 
+def _turns(start: Placed, places: tuple[Placed, ...]) -> np.ndarray:
+    """How far a piece is turned in each frame."""
+    return about(Y, np.array([place.heading - start.heading for place in places]))
+
+
 def _carried(points: np.ndarray, start: Placed, places: tuple[Placed, ...]) -> np.ndarray:
-    """Points of a piece in each frame [m]."""
+    """Points, of each frame or of all alike, that keep their places on a piece [m]."""
     old = np.array([start.at[0], 0.0, start.at[1]])
-    return np.stack(
-        [
-            apply(about(Y, np.array(place.heading - start.heading)), points - old)
-            + np.array([place.at[0], 0.0, place.at[1]])
-            for place in places
-        ]
-    )
+    new = np.array([[place.at[0], 0.0, place.at[1]] for place in places])
+    return apply(_turns(start, places)[:, None], points - old) + new[:, None]
 
 
 def _holding(posture: Posture, bend: float, palms: np.ndarray) -> Posture:

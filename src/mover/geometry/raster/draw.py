@@ -16,7 +16,16 @@ import torch
 from torch import Tensor
 
 from mover.geometry.raster.records import Crops, Cuts, Maps, Topology, Trace
-from mover.geometry.warp_start import filled, kernels, launch, name_of, share, started, threads
+from mover.geometry.warp_start import (
+    filled,
+    kernels,
+    launch,
+    mapped,
+    name_of,
+    share,
+    started,
+    threads,
+)
 
 BORDER = 1  # [px], so that an outline just outside the window still moves the window's pixels
 NOWHERE, FRONT, BEHIND = 0, 1, 2  # where backs are drawn, as in `kernels.grid`
@@ -75,18 +84,16 @@ def _draw(scene: Any, maps: Any, backs: int, where: torch.device) -> tuple[Cuts,
         return (_draw_at_once(scene, maps, backs, where),)
     size = max(4, count // (GROUPS * threads()))
     groups = [range(k, min(k + size, count)) for k in range(0, count, size)]
-    found: dict[int, Cuts] = {}
 
-    def draw_group(k: int) -> None:
-        scratch = _own_scratch(scene, len(groups[k]) if maps.silhouette else 0)
-        ends = groups[k].start, groups[k].stop
+    def draw_group(group: range) -> Cuts:
+        scratch = _own_scratch(scene, len(group) if maps.silhouette else 0)
+        ends = group.start, group.stop
         _launch(where, "items.look_items", 1, scene, scratch, maps, backs, *ends)
         number = int(started().to_torch(scratch.count)[1])
         table, targets = (x[:number].clone() for x in _listed(scratch))
-        found[k] = Cuts(groups[k], table, targets)
+        return Cuts(group, table, targets)
 
-    share(draw_group, len(groups))
-    return tuple(found[k] for k in range(len(groups)))
+    return tuple(mapped(draw_group, groups))
 
 
 def _draw_at_once(scene: Any, maps: Any, backs: int, where: torch.device) -> Cuts:  # noqa: ANN401

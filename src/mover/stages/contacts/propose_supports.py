@@ -14,6 +14,7 @@ A proposal is no object: nothing else of the room depends on it until somebody a
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -28,7 +29,7 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera, Proposal, SceneObject
 from mover.furniture.library import SEEDS, make_piece
 from mover.furniture.pieces import Furniture
-from mover.geometry.boxes import box_of
+from mover.geometry.boxes import beyond, box_of
 from mover.geometry.camera import project, to_camera
 from mover.geometry.rotations import rot_y
 from mover.stages.config import ProposeConfig
@@ -210,12 +211,12 @@ class Group:
         """Their bodies."""
         return torch.tensor([rest.row for rest in self.rests])
 
-    @property
+    @cached_property
     def covered(self) -> float:
         """Share that something known carries."""
         return sum(rest.covered for rest in self.rests) / len(self.rests)
 
-    @property
+    @cached_property
     def seconds(self) -> float:
         """How long people rest here [s]."""
         bodies = self.inputs.bodies
@@ -225,13 +226,13 @@ class Group:
         gaps = bodies.frame.unique().diff()
         return moments * float(gaps.double().median() if len(gaps) else 1.0) / bodies.fps
 
-    @property
+    @cached_property
     def heights(self) -> Float[Tensor, " rests"]:
         """Of what touches, over the floor [m]."""
         low = torch.stack([rest.points[:, 1].quantile(LOWEST) for rest in self.rests])
         return low - self.inputs.ground
 
-    @property
+    @cached_property
     def middle(self) -> Float[Tensor, "3"]:
         """Of what touches; of the whole body where people lie [m]."""
         if self.lies:
@@ -242,18 +243,18 @@ class Group:
         """The bodies that rest in one way."""
         return torch.tensor([r.row for r in self.rests if r.kind == kind], dtype=torch.long)
 
-    @property
+    @cached_property
     def lies(self) -> bool:
         """People lie here."""
         return sum(rest.kind == "lie" for rest in self.rests) > LIES * len(self.rests)
 
-    @property
+    @cached_property
     def leans(self) -> bool:
         """Most who sit here lean back."""
         pose = postures(self.inputs.bodies, self.inputs.parts, self.inputs.ground)
         return bool(pose.recline[self.rows_of("sit")].median() > LEANS)
 
-    @property
+    @cached_property
     def yaw(self) -> Float[Tensor, ""]:
         """Where the front is: sitters look there, on a bed feet of liers are there [rad]."""
         if not self.lies:
@@ -262,16 +263,19 @@ class Group:
 
     def way(self, kind: Kind) -> Float[Tensor, "3"]:
         """Sum of where they look, or of where the feet of liers are."""
+        return torch.nan_to_num(self._ways[kind][self.rows_of(kind)]).sum(0)
+
+    @cached_property
+    def _ways(self) -> dict[Kind, Float[Tensor, "bodies 3"]]:
         bodies, parts = self.inputs.bodies, self.inputs.parts
         places = landmarks(bodies, parts)
-        ways = {
+        return {
             "sit": headings(bodies, parts, self.inputs.ground),
             "lie": at(places, "hips") - at(places, "neck"),
             "step": facing(places),
         }
-        return torch.nan_to_num(ways[kind][self.rows_of(kind)]).sum(0)
 
-    @property
+    @cached_property
     def sofa(self) -> Float[Tensor, ""] | None:
         """Front of a seat on which people lie along and sit across [rad]; None: it is none."""
         sits = self.rows_of("sit")
@@ -287,7 +291,7 @@ class Group:
         edge = float(torch.quantile(points @ front, 1 - ENDS)) - REACH
         return _angle(front) if edge - float(self.middle @ front) < NARROW else None
 
-    @property
+    @cached_property
     def span(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
         """Least and largest x and z of all that rests, in axes whose z is the front [m].
 
@@ -354,9 +358,7 @@ def _scale(group: Group, kind: str, piece: Furniture, height: float) -> Float[Te
 
 def _stands_under(piece: SceneObject, point: Float[Tensor, "3"]) -> bool:
     """Whether a piece's footprint, and half of `SAME` around it, holds a point."""
-    box = box_of(piece)
-    inside = ((point - box.center) @ rot_y(piece.yaw)).abs() < box.size / 2 + SAME / 2
-    return bool(inside[[0, 2]].all())
+    return bool((beyond(box_of(piece), point) < SAME / 2).all())
 
 
 def _kind_of(group: Group) -> str:

@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.parts import Parts
 from mover.bodies.posture import at, facing, landmarks, postures
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, SceneObject, Segment
-from mover.geometry.boxes import box_of
+from mover.geometry.boxes import beyond, box_of
 from mover.geometry.placement import placed_at
 from mover.geometry.rotations import rot_y, wrap
 from mover.stages.config import MoveConfig
@@ -60,7 +60,7 @@ class Followed:
 class _Holds:
     """Where a person could hold something, frame by frame."""
 
-    frame: Tensor
+    frame: Int[Tensor, " frames"]
     place: Float[Tensor, "frames 2"]
     """(x, z) [m]"""
     heading: Float[Tensor, " frames"]
@@ -158,10 +158,9 @@ def _fitted(
 
 def _touches(piece: SceneObject, held: _Holds, reach: float) -> Bool[Tensor, " frames"]:
     """Rows in which the hold is over the footprint of an object, or within reach of it [m]."""
-    box = box_of(piece)
-    off = torch.stack([_level(place) for place in held.place]) - box.center
-    local = (off @ rot_y(box.yaw)).abs()[:, [0, 2]] - box.size[[0, 2]] / 2
-    return (local.clamp_min(0).norm(dim=-1) <= reach) & _nearly(held.able)
+    places = torch.stack([_level(place) for place in held.place])
+    off = beyond(box_of(piece), places).clamp_min(0).norm(dim=-1)
+    return (off <= reach) & _nearly(held.able)
 
 
 def _nearly(able: Bool[Tensor, " frames"]) -> Bool[Tensor, " frames"]:
