@@ -6,13 +6,14 @@ import os
 import shutil
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, TypeCheckError
 from torch import Tensor
 
 from mover.core import records
@@ -167,3 +168,22 @@ def test_what_a_killed_write_left_goes_away_with_a_later_one(tmp_path: Path) -> 
     with replacing(wanted) as part:
         part.write_text("1")
     assert sorted(p.name for p in tmp_path.iterdir()) == [".a-new.json", ".b-x3.json", "a.json"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"points": torch.zeros(4, 2)},
+        {"points": torch.zeros(4, 3, dtype=torch.int64)},
+        {"points": None},
+        {"ground": "low"},
+        {"ground": torch.zeros(())},
+        {"names": (1, 2)},
+        {"names": ["a", "b"]},
+    ],
+)
+def test_what_is_wrong_is_refused_however_often_the_like_was_built(wrong: dict[str, Any]) -> None:
+    for _ in range(3):
+        replace(PLANE, points=torch.zeros(5, 3))
+        with pytest.raises(TypeCheckError):
+            replace(PLANE, **wrong)

@@ -8,7 +8,7 @@ import typing
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any, TypeVar, dataclass_transform
@@ -34,8 +34,48 @@ _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 @dataclass_transform(frozen_default=True)
 def record(cls: type[T]) -> type[T]:
-    """Make a frozen dataclass whose dtypes and shapes are checked when it is built."""
-    return jaxtyped(typechecker=_check)(dataclasses.dataclass(frozen=True, eq=False)(cls))
+    """Make a frozen dataclass whose dtypes and shapes are checked when it is built.
+
+    What a check looks at (see `_looks`) is looked at once: descents build the same record, with
+    other numbers in it, thousands of times.
+    """
+    made: Any = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    plain = made.__init__
+    checked = jaxtyped(typechecker=_check)(plain)
+    passed: set[Any] = set()
+
+    @wraps(plain)
+    def init(self: Any, *args: Any, **fields: Any) -> None:  # noqa: ANN401
+        looks = _looks((tuple(fields), *args, *fields.values()))
+        (plain if looks in passed else checked)(self, *args, **fields)
+        if looks is not None and len(passed) < MOST_LOOKS:
+            passed.add(looks)
+
+    made.__init__ = init
+    return made
+
+
+MOST_LOOKS = 10_000  # of one kind of record, so that no process grows with its rooms
+
+
+def _looks(values: tuple[Any, ...]) -> tuple[Any, ...] | None:
+    """Kinds, dtypes and shapes of values; None where a check looks at more than these."""
+    found: list[Any] = []
+    for value in values:
+        if isinstance(value, Tensor):
+            found.append((type(value), value.dtype, value.shape))
+        elif value is None or isinstance(value, (str, bytes)):
+            found.append(value)
+        elif isinstance(value, (int, float)) or dataclasses.is_dataclass(value):
+            found.append(type(value))
+        elif isinstance(value, tuple) and len(value) < 100:
+            inner = _looks(value)
+            if inner is None:
+                return None
+            found.append(inner)
+        else:
+            return None
+    return tuple(found)
 
 
 def map_tensors(fn: Callable[[Tensor], Tensor], value: T) -> T:
