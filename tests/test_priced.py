@@ -18,6 +18,7 @@ from mover.energy.minimize import minimize
 from mover.energy.objective import scene_energy
 from mover.energy.terms.bbox import LEAST, LIKELY, UNKNOWN
 from mover.energy.terms.depth import DepthRange
+from mover.geometry.rotations import axis_angle
 from mover.geometry.topology import edges_of
 from mover.geometry.warp_start import use_threads
 from mover.stages.objects.place_objects import with_trees
@@ -114,6 +115,33 @@ class TestAgreement:
         layout = starts_of(inputs)
         assert set(fast(layout).parts) == set(slow(layout).parts) == set(TERMS) - {"wall"}
         agree(fast, slow, layout)
+
+    @pytest.mark.parametrize("parts", [False, True])
+    def test_so_is_what_another_rotation_of_the_camera_costs_and_its_gradient(self, parts):
+        inputs = room(130)
+        weights = replace(WEIGHTS, collision=0.0, contact=0.0, wall=0.0, heading=0.0)
+        fast, _ = both(inputs, weights)
+        rest, layout = (inputs.image, inputs.humans), starts_of(inputs)
+        before = fast(layout).per_item
+        tilt = torch.tensor([0.02, -0.03, 0.01])
+        found = []
+        for way in (
+            fast,
+            lambda layout, turn: scene_energy(
+                layout, inputs.objects, replace(inputs.camera, R_cam_world=turn), *rest,
+                SceneConfig(weights, "robust", GROWTH),
+            ),
+        ):  # fmt: skip
+            free = tilt.clone().requires_grad_()
+            energy = way(layout, axis_angle(free) @ inputs.camera.R_cam_world)
+            each = energy.per_item
+            told = torch.stack(list(energy.parts.values())).sum(0) if parts else each
+            (slope,) = torch.autograd.grad(told.sum(), free)
+            found.append((each.detach(), slope))
+        torch.testing.assert_close(found[0][0], found[1][0], rtol=1e-5, atol=1e-5)
+        assert (found[0][1] - found[1][1]).norm() <= 1e-3 * found[1][1].norm()
+        assert not torch.allclose(found[0][0], before)
+        assert torch.equal(fast(layout).per_item, before)
 
     def test_some_rows_of_the_starts_cost_what_they_cost_among_all(self):
         inputs = room()

@@ -2,8 +2,10 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.observe import Energy
@@ -24,7 +26,16 @@ from mover.energy.terms.contact import trees_of
 from mover.energy.terms.silhouette import outline_root
 from mover.geometry.raster import engine
 
-EnergyOf = Callable[[Layout], Energy]
+
+@runtime_checkable
+class EnergyOf(Protocol):
+    """Eq. 1 of a layout, and of the camera's rotation if it is another than was told."""
+
+    def __call__(
+        self, layout: Layout, R_cam_world: Float[Tensor, "3 3"] | None = None, /
+    ) -> Energy:
+        """The terms of each start of each object."""
+        ...
 
 
 def energy_function(
@@ -53,13 +64,16 @@ def energy_of_rows(
     def of(rows: Rows | None) -> EnergyOf:
         few = seen if rows is None or not rest else seen.some(rows)
 
-        def energy(layout: Layout) -> Energy:
+        def energy(layout: Layout, R_cam_world: Tensor | None = None) -> Energy:
+            here = few
+            if R_cam_world is not None:
+                here = replace(few, camera=replace(camera, R_cam_world=R_cam_world))
             if kernel is None:
-                return energy_of_terms(rest, layout, few, config)
-            found = _by_kernel(kernel, config.weights, layout, rows)
+                return energy_of_terms(rest, layout, here, config)
+            found = _by_kernel((kernel, config.weights), layout, rows, R_cam_world)
             if not rest:
                 return found
-            others = energy_of_terms(rest, layout, few, config)
+            others = energy_of_terms(rest, layout, here, config)
             return Energy({**found.parts, **others.parts}, found.per_item + others.per_item)
 
         return energy
@@ -68,9 +82,14 @@ def energy_of_rows(
 
 
 def _by_kernel(
-    kernel: FusedEnergy, weights: SceneWeights, layout: Layout, rows: Rows | None
+    priced: tuple[FusedEnergy, SceneWeights],
+    layout: Layout,
+    rows: Rows | None,
+    turn: Tensor | None,
 ) -> Energy:
-    whole, parts = fused_cost(kernel, layout.t_world_object, layout.yaw, layout.log_scale, rows)
+    kernel, weights = priced
+    at = layout.t_world_object, layout.yaw, layout.log_scale
+    whole, parts = fused_cost(kernel, *at, rows, turn)
     each = zip(FUSED, parts.unbind(-1), strict=True)
     return Energy({name: part for name, part in each if getattr(weights, name)}, whole)
 

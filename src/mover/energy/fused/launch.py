@@ -19,6 +19,7 @@ from mover.geometry.warp_start import array, filled, kernels, share, started, th
 KERNELS = "mover.energy.fused.kernels"
 BORDER = 1  # [px], as in the rasterisers
 TERMS = 8
+IMAGE = [0, 1, 3]  # box, silhouette and depth order: what changes with the camera
 FIRST = 3  # place of the first item among the arguments of the kernel
 
 
@@ -48,6 +49,10 @@ class FusedEnergy:
     """How much work each object is, roughly."""
     asked: int
     """Number of skin points that ask what they touch."""
+    camera: Tensor
+    """From the world to the camera, where nothing else is asked for."""
+    turn: Tensor
+    """The same as it is now; memory of the kernel."""
     buffers: list["_Buffers"] = field(default_factory=list)
     """Memory for the most items so far."""
     lock: Any = field(default_factory=Lock)
@@ -74,6 +79,7 @@ def fused_cost(
     yaw: Float[Tensor, "*starts objects"],
     log_scale: Float[Tensor, "*starts objects 3"],
     rows: Int[Tensor, " objects"] | None = None,
+    turn: Float[Tensor, "3 3"] | None = None,
 ) -> tuple[Float[Tensor, "*starts objects"], Float[Tensor, "*starts objects terms"]]:
     """The sum of the terms and the terms, with their weights; differentiable once.
 
@@ -84,9 +90,10 @@ def fused_cost(
         log_scale: Logarithms of the scales.
         rows: Which these are among the starts of all objects, counted through, each at most once;
             None: all, in their order.
+        turn: From the world to the camera, a rotation, if it is another than the kernel's.
     """
     layout = torch.cat([t_world_object, yaw.unsqueeze(-1), log_scale], -1)
-    whole, parts = _Cost.apply(layout, fused, rows)
+    whole, parts = _Cost.apply(layout, fused, rows, turn)
     return whole, parts
 
 
@@ -99,13 +106,15 @@ class _Cost(torch.autograd.Function):
         layout: Tensor,
         fused: FusedEnergy,
         rows: Tensor | None,
+        turn: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         axes = layout.shape[:-1]
         flat = layout.reshape(-1, layout.shape[-1])
         rows = torch.arange(len(flat)) if rows is None else rows
         with fused.lock:
+            fused.turn.copy_(fused.camera if turn is None else turn)
             held = _run(fused, flat, rows)
-            ctx.save_for_backward(held.slope[rows], held.slopes[rows])
+            ctx.save_for_backward(held.slope[rows], held.slopes[rows], flat[:, :3], turn)
             whole, parts = held.whole[rows], held.parts[rows]
         ctx.set_materialize_grads(False)
         return whole.view(axes), parts.view(*axes, -1)
@@ -115,16 +124,35 @@ class _Cost(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any,  # noqa: ANN401
         *grads: Tensor | None,
-    ) -> tuple[Tensor | None, None, None]:
-        slope, slopes = ctx.saved_tensors
+    ) -> tuple[Tensor | None, None, None, Tensor | None]:
+        slope, slopes, place, turn = ctx.saved_tensors
         whole, parts = grads
         found = None
         if whole is not None:
-            found = whole.unsqueeze(-1) * slope.view(*whole.shape, -1)
+            found = whole.unsqueeze(-1) * slope[:, :7].view(*whole.shape, -1)
         if parts is not None:
-            more = (parts.unsqueeze(-1) * slopes.view(*parts.shape, -1)).sum(-2)
+            more = (parts.unsqueeze(-1) * slopes[..., :7].view(*parts.shape, -1)).sum(-2)
             found = more if found is None else found + more
-        return found, None, None
+        if turn is None:
+            return found, None, None, None
+        each = slopes.new_zeros(slopes.shape[:2])
+        for grad, last in ((whole, 1), (parts, TERMS)):
+            each = each if grad is None else each + grad.reshape(-1, last)
+        return found, None, None, _of_camera(each[:, IMAGE, None] * slopes[:, IMAGE], place, turn)
+
+
+def _of_camera(slopes: Tensor, place: Tensor, turn: Tensor) -> Tensor:
+    """Change with the camera's rotation R of what the image says.
+
+    Under dR = R [w], points X of the world move by w x X before the camera, so that with forces F
+    dE = w . sum X x F = < R [sum X x F] / 2, dR >.
+    """
+    pull = slopes.sum(1)
+    arm = torch.cross(place, pull[:, :3], dim=-1) + pull[:, [7, 3, 8]]
+    x, y, z = arm.sum(0).unbind()
+    none = torch.zeros_like(x)
+    skew = torch.stack([none, -z, y, z, none, -x, -y, x, none]).view(3, 3)
+    return 0.5 * turn @ skew
 
 
 def _run(fused: FusedEnergy, layout: Tensor, rows: Tensor) -> _Buffers:
@@ -176,8 +204,8 @@ def _buffers_of(fused: FusedEnergy, items: int, count: int) -> _Buffers:
     kernel, launch = kernels("cost", "cpu", KERNELS).cost_items, started().launch
     n = max(1, len(fused.effort))
     layout, whole = torch.empty(items, 7), torch.empty(items)
-    parts, slope = torch.empty(items, TERMS), torch.empty(items, 7)
-    slopes = torch.empty(items, TERMS, 7)
+    parts, slope = torch.empty(items, TERMS), torch.empty(items, 9)
+    slopes = torch.empty(items, TERMS, 9)
     order = torch.zeros(items, dtype=torch.int32)
     held = torch.full((max(1, fused.asked * -(-items // n)),), -1, dtype=torch.int32)
     fused.given.people.held = array(held, "int32")

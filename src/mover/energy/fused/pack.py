@@ -41,7 +41,8 @@ def kernel_of(
     prices = torch.tensor([0.0, torch.inf, 0.0, bbox.HIDDEN])  # by what is known of a side
     given.beyond = array(prices[image.sides], "vec4")
     given.facts = wp.from_torch(_facts(objects, image, humans, weights))
-    given.turn = wp.mat33(*camera.R_cam_world.flatten().tolist())
+    turn = camera.R_cam_world.detach().clone()
+    given.turn = array(turn[None], "mat33")
     K = camera.K.tolist()
     given.lens = wp.vec4(K[0][0], K[1][1], K[0][2], K[1][2])
     given.weights = tuple(getattr(weights, name) for name in FUSED)
@@ -51,7 +52,7 @@ def kernel_of(
     verts, faces, edges = (int(c.max()) for c in counts)
     shifts = 1 if image.borders is None else len(image.borders.shifts)
     room = Room(verts, faces, edges, views.height + 2 * BORDER, views.width + 2 * BORDER, shifts)
-    return FusedEnergy(given, room, counts[1], len(asked))
+    return FusedEnergy(given, room, counts[1], len(asked), camera.R_cam_world, turn)
 
 
 def _things(objects: Objects, asked: Tensor) -> tuple[Any, list[Tensor]]:

@@ -25,9 +25,9 @@ from mover.core.observe import Energy, Observer, silent
 from mover.core.records import map_tensors, record
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights, only
-from mover.energy.fused.energy import never_asks
+from mover.energy.fused.energy import EnergyOf, energy_function, never_asks
 from mover.energy.minimize import minimize
-from mover.energy.objective import HumanCues, ImageCues, best_borders, scene_energy
+from mover.energy.objective import HumanCues, ImageCues, best_borders
 from mover.geometry.camera import pitch_roll, tilted, to_camera
 from mover.geometry.placement import GROUND, LOWEST, hit_floor
 from mover.stages.config import RefineConfig
@@ -110,18 +110,17 @@ def refine_camera(
     inputs: RefineInputs, config: RefineConfig, observe: Observer = silent
 ) -> Refined:
     """Minimise over the camera, the ground and all standing objects at once."""
-    image = SceneConfig(config.weights, "robust", config.uniform_scale_weight)
     fixed, objects = _start(inputs), inputs.objects
     certainty = torch.linalg.inv(inputs.covariance)
     cues = fixed_borders(inputs.image, inputs.layout, objects, inputs.camera, config.weights)
-    usable, known = _usable(inputs), (objects, _seen_terms(config))
-    views = _fixed_views(inputs, config.weights)
+    priced = SceneConfig(config.weights, "robust", config.uniform_scale_weight)
+    seen = energy_function(objects, inputs.camera, cues, HumanCues(), priced)
+    usable, views = _usable(inputs), _views(inputs, config)
     zero = map_tensors(torch.zeros_like, fixed)
 
     def energies(joint: _Joint) -> tuple[Tensor, Tensor]:
         camera, layout = _unpack(joint, inputs)
-        here = scene_energy(layout, objects, camera, cues, HumanCues(), image).per_item
-        return here, _in_views((camera, layout), views, known)
+        return seen(layout, camera.R_cam_world).per_item, _in_views(camera, layout, views)
 
     with torch.no_grad():
         own = energies(fixed)[0] + SOFT
@@ -158,25 +157,24 @@ def _from_view(camera: Camera, layout: Layout, view: FurtherView) -> tuple[Camer
 
 
 def _in_views(
-    room: tuple[Camera, Layout], views: list[FurtherView], known: tuple[Objects, SceneConfig]
+    camera: Camera, layout: Layout, views: list[tuple[FurtherView, EnergyOf]]
 ) -> Float[Tensor, " objects"]:
     """The mean energy of each object in the further views; zero where there are none."""
-    objects, config = known
-    whole = torch.zeros_like(room[1].yaw)
-    for view in views:  # few, and each has windows of its own
-        camera, layout = _from_view(*room, view)
-        there = scene_energy(layout, objects, camera, view.image, HumanCues(), config)
-        whole = whole + there.per_item / len(views)
+    whole = torch.zeros_like(layout.yaw)
+    for view, seen in views:  # few, and each has windows of its own
+        there, moved = _from_view(camera, layout, view)
+        whole = whole + seen(moved, there.R_cam_world).per_item / len(views)
     return whole
 
 
-def _fixed_views(inputs: RefineInputs, weights: SceneWeights) -> list[FurtherView]:
-    """The further views with masks whose borders suit the objects as they stand."""
-    found: list[FurtherView] = []
+def _views(inputs: RefineInputs, config: RefineConfig) -> list[tuple[FurtherView, EnergyOf]]:
+    """The further views, by masks whose borders suit the objects as they stand."""
+    found: list[tuple[FurtherView, EnergyOf]] = []
     for view in inputs.views:
         camera, layout = _from_view(inputs.camera, inputs.layout, view)
-        image = fixed_borders(view.image, layout, inputs.objects, camera, weights)
-        found.append(replace(view, image=image))
+        image = fixed_borders(view.image, layout, inputs.objects, camera, config.weights)
+        known = inputs.objects, camera, image, HumanCues()
+        found.append((view, energy_function(*known, _seen_terms(config))))
     return found
 
 

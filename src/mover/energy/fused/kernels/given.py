@@ -10,8 +10,8 @@ BBOX, SILHOUETTE, SCALE, DEPTH, COLLISION, CONTACT, DISTANCE, HEADING = range(8)
 VERTS, FACES, EDGES, SAMPLES, ASKED = range(5)  # columns of `Things.starts`
 SIZE, ORDER, BUMP, AWAY, FACE_X, FACE_Z, SEATED = range(7)  # columns of `Given.facts`
 
-Slope = wp.types.vector(length=7, dtype=wp.float32)
-"""Gradient of a place (3), of the yaw and of the logarithms of the scale (3)."""
+Slope = wp.types.vector(length=9, dtype=wp.float32)
+"""Gradient of a place (3), of the yaw, of the logarithms of the scale (3), of turns about x, z."""
 Weights = wp.types.vector(length=8, dtype=wp.float32)
 
 
@@ -90,8 +90,8 @@ class Given:
     beyond: wp.array(dtype=wp.vec4)
     """The most that it costs to stick out of a side."""
     facts: wp.array2d(dtype=wp.float32)
-    turn: wp.mat33
-    """From the world to the camera."""
+    turn: wp.array(dtype=wp.mat33)
+    """From the world to the camera; one."""
     lens: wp.vec4
     """Focal lengths and principal point of the image [px]."""
     weights: Weights
@@ -183,24 +183,25 @@ def pose_of(given: Given, layout: wp.array2d(dtype=wp.float32), item: int) -> Po
     p.turn = wp.mat33(c, 0.0, s, 0.0, 1.0, 0.0, -s, 0.0, c)
     p.place = wp.vec3(layout[item, 0], layout[item, 1], layout[item, 2])
     p.scale = wp.vec3(wp.exp(layout[item, 4]), wp.exp(layout[item, 5]), wp.exp(layout[item, 6]))
-    p.view = given.turn * p.turn
-    p.origin = given.turn * p.place
+    p.view = given.turn[0] * p.turn
+    p.origin = given.turn[0] * p.place
     return p
 
 
 @wp.func
 def slope_of(force: wp.vec3, arm: wp.vec3) -> Slope:
     """How a cost changes with the pose, from its change with a point, all in the item's axes."""
-    turn = arm[2] * force[0] - arm[0] * force[2]
+    turn = wp.cross(arm, force)
     size = wp.cw_mul(force, arm)
-    return Slope(force[0], force[1], force[2], turn, size[0], size[1], size[2])
+    return Slope(force[0], force[1], force[2], turn[1], size[0], size[1], size[2], turn[0], turn[2])
 
 
 @wp.func
 def say(answer: Answer, p: Pose, term: int, cost: float, slope: Slope) -> None:
-    """Enter a term, with its weight; the slope of the place is in the item's axes."""
+    """Enter a term, with its weight; the slopes of place and turns are in the item's axes."""
     t = p.turn * wp.vec3(slope[0], slope[1], slope[2])
-    s = Slope(t[0], t[1], t[2], slope[3], slope[4], slope[5], slope[6])
+    r = p.turn * wp.vec3(slope[7], 0.0, slope[8])
+    s = Slope(t[0], t[1], t[2], slope[3], slope[4], slope[5], slope[6], r[0], r[2])
     answer.parts[p.item, term] = cost
     answer.slopes[p.item, term] = s
     answer.whole[p.item] = answer.whole[p.item] + cost

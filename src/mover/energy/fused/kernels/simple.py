@@ -76,7 +76,7 @@ def scale_cost(given: Given, logs: wp.vec3) -> tuple[float, Slope]:
         )
         cost += (logs[k] - mean) * (logs[k] - mean) + 10.0 * out * out
         slope[k] += 2.0 * (logs[k] - mean) + sign * out
-    return cost, Slope(0.0, 0.0, 0.0, 0.0, slope[0], slope[1], slope[2])
+    return cost, Slope(0.0, 0.0, 0.0, 0.0, slope[0], slope[1], slope[2], 0.0, 0.0)
 
 
 @wp.func
@@ -88,7 +88,7 @@ def distance_cost(given: Given, p: Pose) -> tuple[float, Slope]:
     whole = off * off + rho2
     pull = wp.where(squared >= 1.0e-6, 2.0 * off * rho2 / (whole * whole * squared), 0.0)
     force = wp.transpose(p.turn) * (pull * p.place)
-    return off * off / whole, Slope(force[0], force[1], force[2], 0.0, 0.0, 0.0, 0.0)
+    return off * off / whole, Slope(force[0], force[1], force[2], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @wp.func
@@ -100,7 +100,7 @@ def heading_cost(given: Given, p: Pose) -> tuple[float, Slope]:
     c = p.turn[0, 0]
     seated = given.facts[p.thing, SEATED]
     turn = seated * (s * z - c * x)
-    return seated * (1.0 - s * x - c * z), Slope(0.0, 0.0, 0.0, turn, 0.0, 0.0, 0.0)
+    return seated * (1.0 - s * x - c * z), Slope(0.0, 0.0, 0.0, turn, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 # The costs of contact and of collision (robust form) and their gradients.
