@@ -210,6 +210,9 @@ def _grown(image: Bool[Tensor, "items h w"]) -> Bool[Tensor, "items h w"]:
 # The image at the width at which the paper's weights have their meaning.
 
 
+ALL = slice(None)
+
+
 def small_views(camera: Camera) -> Crops:
     """The whole image as one window, at most 640 pixels wide."""
     zoom = min(1.0, WIDTH / camera.width)
@@ -224,14 +227,16 @@ def small_camera(camera: Camera) -> Camera:
     return replace(camera, K=views.K[0], width=views.width, height=views.height)
 
 
-def small_masks(masks: Bool[Tensor, "rows h w"], camera: Camera) -> Bool[Tensor, "rows sh sw"]:
-    """Masks of that image, by their nearest pixel; those given, where they have its size."""
+def small_masks(
+    masks: Bool[Tensor, "rows h w"], camera: Camera, window: tuple[slice, slice] = (ALL, ALL)
+) -> Bool[Tensor, "rows sh sw"]:
+    """A window of masks of that image, by their nearest pixel; as given, if they have its size."""
     views, (height, width) = small_views(camera), masks.shape[-2:]
     if (views.height, views.width) == (height, width):
-        return masks
+        return masks[:, *window]
     rows = ((torch.arange(views.height) + 0.5) * height / views.height).long()
     columns = ((torch.arange(views.width) + 0.5) * width / views.width).long()
-    return masks[:, rows][:, :, columns]
+    return masks[:, rows[window[0]]][:, :, columns[window[1]]]
 
 
 def small_boxes(boxes: Float[Tensor, "rows 4"], camera: Camera) -> Float[Tensor, "rows 4"]:

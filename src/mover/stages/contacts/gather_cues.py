@@ -69,9 +69,11 @@ class Sight:
         self, row: int, window: Window, front: Float[Tensor, "h w"]
     ) -> tuple[Bool[Tensor, "rows columns"], Bool[Tensor, "rows columns"]]:
         """The visible mask of a body and those of others, as if this camera had seen them."""
-        whole = [small_masks(mask[None], self.camera)[0] for mask in self.table.decode(row)]
+        masks = self.table.decode(row)
         if is_still(self.path):
-            return whole[0][window], whole[1][window]
+            own, others = (small_masks(mask[None], self.camera, window)[0] for mask in masks)
+            return own, others
+        whole = [small_masks(mask[None], self.camera)[0] for mask in masks]
         pose = poses_at(self.path, self.bodies.frame[row : row + 1])
         depth = torch.where(front.isfinite(), front, front[front.isfinite()].median())
         K = small_camera(self.camera).K
