@@ -72,11 +72,11 @@ def skinned(
     offset = places - torch.einsum("bjik,bjk->bji", world, joints)
     bodies, count = offset.shape[:2]
     moves = torch.cat([world, offset[..., None]], -1)
-    flat = moves.transpose(0, 1).reshape(count, bodies * 12)
-    skin = (model.weights.to(flat) @ flat).reshape(-1, bodies, 3, 4)
-    moved = torch.einsum("vbik,bvk->bvi", skin[..., :3], verts) + skin[..., 3].transpose(0, 1)
-    shift = transl[:, None]
-    return moved + shift, places + shift
+    flat = moves.permute(1, 3, 0, 2).reshape(count, bodies * 12)
+    x, y, z, put = (model.weights.to(flat) @ flat).view(-1, 4, bodies, 3).unbind(1)
+    at = verts.transpose(0, 1).unsqueeze(-1)
+    moved = x * at[:, :, 0] + y * at[:, :, 1] + z * at[:, :, 2] + put + transl
+    return moved.transpose(0, 1).contiguous(), places + transl[:, None]
 
 
 ANGLES = {

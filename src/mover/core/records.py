@@ -41,13 +41,14 @@ def record(cls: type[T]) -> type[T]:
     """
     made: Any = dataclasses.dataclass(frozen=True, eq=False)(cls)
     plain = made.__init__
-    checked = jaxtyped(typechecker=_check)(plain)
+    plain.__annotations__.pop("return")  # else all is looked at once more, after the call
+    checked = cache(lambda: jaxtyped(typechecker=_check)(plain))  # made where it is built first
     passed: set[Any] = set()
 
     @wraps(plain)
     def init(self: Any, *args: Any, **fields: Any) -> None:  # noqa: ANN401
         looks = _looks((tuple(fields), *args, *fields.values()))
-        (plain if looks in passed else checked)(self, *args, **fields)
+        (plain if looks in passed else checked())(self, *args, **fields)
         if looks is not None and len(passed) < MOST_LOOKS:
             passed.add(looks)
 
