@@ -1,5 +1,6 @@
 """The command line. This file imports nothing heavy: `mover --help` answers at once."""
 
+import gc
 import importlib
 import logging
 import sys
@@ -116,6 +117,7 @@ def main() -> None:
     if arguments[0] not in COMMANDS and arguments[0] not in ALIASES:
         say(f"mover: no command {arguments[0]!r}; there are {', '.join(COMMANDS)}\n{USAGE}")
         raise SystemExit(2)
+    gc.set_threshold(10_000)  # imports alone make millions of objects, hardly any in circles
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[Lines()])
     logging.getLogger("mover.geometry.kernels").setLevel(logging.INFO)  # what is compiled, once
     raise SystemExit(run_command(arguments[0], arguments[1:]))
