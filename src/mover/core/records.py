@@ -65,9 +65,9 @@ def _looks(values: tuple[Any, ...]) -> tuple[Any, ...] | None:
     for value in values:
         if isinstance(value, Tensor):
             found.append((type(value), value.dtype, value.shape))
-        elif value is None or isinstance(value, (str, bytes)):
+        elif value is None or isinstance(value, str):
             found.append(value)
-        elif isinstance(value, (int, float)) or dataclasses.is_dataclass(value):
+        elif isinstance(value, (int, float, bytes)) or dataclasses.is_dataclass(value):
             found.append(type(value))
         elif isinstance(value, tuple) and len(value) < 100:
             inner = _looks(value)
