@@ -7,10 +7,12 @@ import pytest
 import torch
 from figures import ARMS_DOWN, AT_TABLE, SEATED, STRIDE, people, pose
 
+from mover.bodies.corrected import larger
 from mover.bodies.parts import parts_of
+from mover.bodies.skeleton import JOINTS
 from mover.bodies.skinning import open_body
 from mover.core.types import Bodies, Camera, Masks, People
-from mover.geometry.camera import tilted
+from mover.geometry.camera import project, tilted
 from mover.geometry.raster import Crops, layers
 from mover.geometry.rle import encode
 from mover.stages.config import DepthConfig
@@ -199,6 +201,37 @@ def test_pose_and_mesh_move_together():
     assert torch.allclose(again[1], result.joints, atol=1e-5)
     expected = joints[:, 0] * torch.tensor([1.05, 1.05, 0.97, 1.0])[:, None]
     assert torch.allclose(result.joints[:, 0], expected, atol=1e-5)
+
+
+def test_people_who_are_larger_look_the_same_and_keep_their_parameters():
+    """Heights and places grow; meshes, and parameters that no model poses, are scaled."""
+    walker = dataclasses.replace(
+        pose(STRIDE, 2), transl=torch.tensor([[0.3, -0.2, 4.0], [-0.4, 0.1, 3.0]])
+    )
+    verts, joints = open_body().posed(walker)
+    seen = dataclasses.replace(people(walker), verts=verts, joints=joints, joint_names=JOINTS)
+    K = torch.tensor([[700.0, 0, 480], [0, 700, 270], [0, 0, 1]])
+    for factor in (0.94, 1.05):
+        found = larger(seen, torch.tensor([factor, 1.0]))
+        assert found.pose is not None
+        assert found.joints is not None
+        assert torch.allclose(found.joints[0, 0], factor * joints[0, 0], atol=1e-5)
+        tall = [float(b.verts[0, :, 1].amax() - b.verts[0, :, 1].amin()) for b in (seen, found)]
+        assert tall[1] / tall[0] == pytest.approx(factor, abs=0.004)
+        off = (project(found.joints[0], K) - project(joints[0], K)).norm(dim=-1)
+        assert float(off[:22].max()) < 4.0  # px, at 3 m: who is taller has longer legs
+        again = open_body().posed(found.pose)
+        assert torch.allclose(again[0], found.verts, atol=1e-5)
+        assert torch.allclose(again[1], found.joints, atol=1e-5)
+        assert torch.allclose(found.verts[1], seen.verts[1], atol=1e-5)
+        for bare in (
+            dataclasses.replace(seen, pose=None),
+            dataclasses.replace(seen, pose=dataclasses.replace(walker, model="mine")),
+        ):
+            mesh = larger(bare, torch.tensor([factor, 1.0]))
+            assert mesh.pose is None
+            assert torch.equal(mesh.verts[0], factor * seen.verts[0])
+            assert torch.equal(mesh.verts[1], seen.verts[1])
 
 
 class TestOverlapAndHeight:

@@ -247,6 +247,10 @@ def test_furniture_tells_how_large_the_room_is(large: float) -> None:
     assert abs(scale - math.log(large)) < 0.03
     assert common_scale(found, given, 0.0) == 0
     assert abs(common_scale(found, given, 0.005)) < 0.006
+    same, less, none = (common_scale(found, given, 0.055, off) for off in (0.01, 0.04, 5.0))
+    assert same == pytest.approx(scale, abs=0.005)
+    assert abs(none) < 1e-3
+    assert min(0.0, scale) <= less <= max(0.0, scale)  # what was given may be off together
     metres = Layout(found.t_world_object.clone(), found.yaw, found.log_scale)
     metres.t_world_object[0] *= 1.8
     assert abs(common_scale(metres, given, 0.055) - scale) < 0.015

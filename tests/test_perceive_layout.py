@@ -134,6 +134,8 @@ def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[SceneObject]):
     )
     assert twice.height / found.height == pytest.approx(2, rel=0.05)
     known = screen(replace(inputs, height=1.2), ScreenConfig(tilt=0.0))
+    sure = screen(replace(inputs, height=1.2, height_spread=0.01), ScreenConfig(tilt=0.0))
+    assert abs(sure.height - 1.2) < 0.5 * abs(known.height - 1.2)
     assert torch.equal(known.R_cam_world, camera().R_cam_world)
 
 
@@ -213,6 +215,9 @@ def test_feet_tell_the_tilt_and_the_height_of_the_camera(
     # a height that is known stays, and feet of one frame tell neither
     known = replace(seen, height=2.0)
     assert standing_on(known, small_room.bodies, Run(tmp_path)) is known
+    assert found.height_spread is None
+    fitted = replace(small_room.bodies, size_spread=0.02)
+    assert standing_on(seen, fitted, Run(tmp_path)).height_spread == 0.02
     once = rows_of(small_room.bodies, torch.tensor([0]))
     assert standing_on(seen, once, Run(tmp_path)) is seen
 

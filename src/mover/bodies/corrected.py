@@ -9,7 +9,9 @@ from torch import Tensor
 
 from mover.bodies import BodyModel, load_model
 from mover.bodies.skeleton import BODY
-from mover.bodies.smpl_model import vertex_subset
+from mover.bodies.skinning import shaped
+from mover.bodies.smpl_model import growth_of, skin_of_model, vertex_subset
+from mover.core.errors import InputError
 from mover.core.records import map_tensors, record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera
 from mover.geometry.camera import to_world
@@ -120,6 +122,36 @@ def corrected(bodies: Bodies, by: Correction) -> Bodies:
         bodies, verts=verts.to(bodies.verts), joints=joints.to(bodies.verts),
         joint_names=model.joint_names, pose=pose,
     )  # fmt: skip
+
+
+def larger(bodies: Bodies, factor: Float[Tensor, " bodies"]) -> Bodies:
+    """Bodies as if the whole room were larger: all that the camera sees of it is the same.
+
+    With parameters their shapes grow, as people of that height are; where these cannot, since the
+    model is not there or has no shapes, bodies become meshes.
+
+    Args:
+        bodies: In camera axes.
+        factor: Of heights and of the pelvis' place.
+    """
+    wide = factor.to(bodies.verts)[:, None, None]
+    joints = None if bodies.joints is None else wide * bodies.joints
+    meshes = dataclasses.replace(bodies, verts=wide * bodies.verts, joints=joints, pose=None)
+    pose = bodies.pose
+    if pose is None or not pose.betas.shape[1]:
+        return meshes
+    try:
+        model = load_model(pose.model, pose.gender)
+    except InputError:
+        return meshes
+    skin, betas, wide = skin_of_model(model), pose.betas, factor.to(pose.betas)[:, None]
+    assert skin is not None
+    growth = growth_of(model)[: betas.shape[1]].to(betas)
+    grown = betas + wide.log() * growth / growth.square().sum()
+    before, after = (shaped(skin, some)[1][:, 0].to(pose.transl) for some in (betas, grown))
+    pose = dataclasses.replace(pose, betas=grown, transl=wide * (pose.transl + before) - after)
+    none = (torch.zeros_like(x) for x in (pose.transl, pose.transl, pose.body_pose))
+    return corrected(dataclasses.replace(bodies, pose=pose), Correction(*none))
 
 
 def _moved_rigidly(bodies: Bodies, by: Correction) -> Bodies:

@@ -147,6 +147,22 @@ def skin_of_model(model: object) -> SkinnedBody | None:
             return None
 
 
+def heights_of(model: object) -> tuple[float, Float[Tensor, " shape"]]:
+    """Height of the mean shape, and what each number of the shape adds to it [m]."""
+    skin = skin_of_model(model)
+    assert skin is not None
+    y = skin.verts[:, 1]
+    top, sole = int(y.argmax()), int(y.argmin())
+    dirs = skin.shape_dirs[top, 1] - skin.shape_dirs[sole, 1]
+    return float(y[top] - y[sole]), dirs.float()
+
+
+def growth_of(model: object) -> Float[Tensor, " shape"]:
+    """What each number of the shape adds to the logarithm of a body's height."""
+    usual, dirs = heights_of(model)
+    return dirs / usual
+
+
 def vertex_subset(model: object, index: Int[Tensor, " picked"]) -> Model:
     """The model with these vertices only, and without faces; its joints and poses are the same.
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from mover.bodies import BodyModel
 from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skinning import shaped, widths_of
-from mover.bodies.smpl_model import FLAT, Model, SmplBody, skin_of_model
+from mover.bodies.smpl_model import FLAT, Model, SmplBody, growth_of, skin_of_model
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
@@ -21,7 +21,7 @@ from mover.fitting.ground import distances_of_who_lies, sole_heights, soles_of
 from mover.fitting.prior import ANGLES, PosePrior, encoded
 from mover.fitting.room import FitRoom
 from mover.fitting.start import Begun, begin
-from mover.fitting.stature import UNTOLD, growth_of, stature_of
+from mover.fitting.stature import UNTOLD, stature_of
 from mover.fitting.tracks import (
     Window,
     at_stage,

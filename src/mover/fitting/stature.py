@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.bodies.skeleton import BODY, PARENTS
-from mover.bodies.smpl_model import Model, skin_of_model
+from mover.bodies.smpl_model import Model, heights_of
 from mover.core.errors import InputError
 from mover.core.records import record
 
@@ -53,26 +53,10 @@ def stature_of(
         raise InputError(
             f"height: {len(heights)} are given, expected 1, or {len(everybody)}: one a person"
         )
-    usual, dirs = _heights(model)
+    usual, dirs = heights_of(model)
     given = torch.tensor(heights).expand(len(everybody))
     fitted = torch.isin(everybody, person[rows])
     return Stature(usual, dirs, given[fitted])
-
-
-def growth_of(model: Model) -> Float[Tensor, " shape"]:
-    """What each number of the shape adds to the logarithm of a body's height."""
-    usual, dirs = _heights(model)
-    return dirs / usual
-
-
-def _heights(model: Model) -> tuple[float, Float[Tensor, " shape"]]:
-    """Height of the mean shape, and what each number of the shape adds to it [m]."""
-    skin = skin_of_model(model)
-    assert skin is not None
-    y = skin.verts[:, 1]
-    top, sole = int(y.argmax()), int(y.argmin())
-    dirs = skin.shape_dirs[top, 1] - skin.shape_dirs[sole, 1]
-    return float(y[top] - y[sole]), dirs.float()
 
 
 def height_price(

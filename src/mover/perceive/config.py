@@ -156,7 +156,8 @@ class ScreenConfig:
     spread: Annotated[float, float_in(1e-3, 10)] = 0.4
     """and how much it varies (of its logarithm)."""
     known: Sigma = 0.05
-    """How far off a height is that people or depth tell (of its logarithm): people's heights."""
+    """How far off a height is that people or depth tell (of its logarithm), where bodies.npz does
+    not say it: people's heights."""
     yaws: Annotated[int, int_in(1, 360)] = 8
     """Turns that are tried."""
     scale: Weight = 0.3

@@ -211,6 +211,8 @@ class Picture:
     """Of the camera above the floor, where it is known [m]."""
     depth: Float[Tensor, "h w"] | None
     """Measured distance along the view [m]; NaN: unknown. None: nothing was measured."""
+    height_spread: float | None = None
+    """Standard deviation of the logarithm of `height`; None: as people's heights differ."""
 
 
 @record
@@ -307,6 +309,7 @@ def _screen_inputs(
         thing=torch.tensor([thing for thing, _ in pairs]),
         points=torch.stack([outer_points(shape) for _, shape in pairs]),
         height=height,
+        height_spread=picture.height_spread,
     )
 
 

@@ -46,6 +46,8 @@ class ScreenInputs:
     """Outermost points of each shape, from the centre of its bottom [m]."""
     height: float | None
     """The camera's, where people's feet or a depth map tell it, and then its tilt [m]."""
+    height_spread: float | None = None
+    """Standard deviation of its logarithm; None: `ScreenConfig.known`."""
 
 
 @record
@@ -145,7 +147,8 @@ def _world(guess: Guess, inputs: ScreenInputs, config: ScreenConfig) -> Float[Te
     """How unusual height and tilt are, or how far from the known ones."""
     usual, spread, tilt = config.usual, config.spread, config.tilt
     if inputs.height is not None:
-        usual, spread, tilt = inputs.height, config.known, config.tilt_known
+        usual, spread, tilt = inputs.height, inputs.height_spread, config.tilt_known
+        spread = config.known if spread is None else spread
     height = ((guess.log_height - math.log(usual)) / spread).square()
     turned = (guess.tilt / max(tilt, 1e-3)).square().sum(-1)
     return config.prior * (height + turned)

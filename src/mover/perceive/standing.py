@@ -38,7 +38,8 @@ def standing_on(picture: Picture, bodies: Bodies, run: Run) -> Picture:
     found = run.stage(align_camera, AlignInputs(feet, camera, None, None), GUESSED)
     if not _certain(found):
         return picture
-    return replace(picture, camera=found.camera, height=-found.ground)
+    spread = bodies.size_spread or None
+    return replace(picture, camera=found.camera, height=-found.ground, height_spread=spread)
 
 
 def _certain(found: Alignment) -> bool:

@@ -273,9 +273,9 @@ def video_to_room(source: Path, args: ChainArgs, finders: "Finders | None" = Non
     Raises:
         InputError: If something is missing, or there is no furniture.
     """
+    config = _checked(args, finders is None)  # in the first second: nothing heavy is loaded yet
     from mover.perceive.video import stamp_of
 
-    config = _checked(args, finders is None)
     capture, steps = args.out / "capture", steps_in(args.out, say, STEPS)
     stamp = str((str(source.resolve()), *stamp_of(source)))
     lens = args.camera, args.fov, args.photo

@@ -22,6 +22,9 @@ LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
 COMMON = 0.06  # error that the three given sizes of an object have in common, as a logarithm
+SOUGHT = (
+    0.04  # error of the scale of a first scene of `mover layout` (rooms 100 to 104), as a logarithm
+)
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
 DIRECTIONS = 90  # that are tried within a quarter turn
 
@@ -109,7 +112,7 @@ def standard_sizes(
     return usual, sharp
 
 
-def common_scale(layout: Layout, given: Given, spread: float) -> float:
+def common_scale(layout: Layout, given: Given, spread: float, shared: float = 0.0) -> float:
     """Logarithm of how much too large the whole room is, as its furniture tells.
 
     People of unknown height make floor, places and sizes too large at once, which no image tells.
@@ -119,10 +122,26 @@ def common_scale(layout: Layout, given: Given, spread: float) -> float:
         layout: Where the objects were placed under the people's scale.
         given: What was expected of them.
         spread: Standard deviation of the logarithm of the people's size; 0: it is known.
+        shared: The same of all that was given, together: of a scene that sought its own floor.
     """
     if spread <= 0:
         return 0.0
     tried = torch.linspace(-3 * spread, 3 * spread, 121, dtype=torch.float64)
+    cost = _cost_of_scales(layout, given, tried)
+    if shared:
+        wide = torch.linspace(-3, 3, 121, dtype=torch.float64) * (spread + shared)
+        cost = _cost_of_scales(layout, given, wide)
+        near = -0.5 * ((tried[:, None] - wide) / shared).square()
+        cost = -torch.logsumexp(near - cost, 1)
+    total = cost + 0.5 * (tried / spread).square()
+    weight = (total.min() - total).exp()
+    return float((weight * tried).sum() / weight.sum())
+
+
+def _cost_of_scales(
+    layout: Layout, given: Given, tried: Float[Tensor, " scales"]
+) -> Float[Tensor, " scales"]:
+    """What places and sizes cost in rooms too large by the exponential of each [nats]."""
     away = (layout.t_world_object.norm(dim=-1) / given.distance).log().double()
     near = away[:, None] - tried
     cost = 2 * (1 + near.square() / (3 * (AWAY**2 + FITTED**2))).log()
@@ -134,9 +153,7 @@ def common_scale(layout: Layout, given: Given, spread: float) -> float:
     precision = torch.linalg.inv(torch.linalg.inv(precision) + FITTED**2 * torch.eye(3).to(away))
     rest = (layout.log_scale.double() - mean)[:, None] - tried[:, None]
     cost = cost + 0.5 * torch.einsum("nri,nij,nrj->nr", rest, precision, rest)
-    total = cost.sum(0) + 0.5 * (tried / spread).square()
-    weight = (total.min() - total).exp()
-    return float((weight * tried).sum() / weight.sum())
+    return cost.sum(0)
 
 
 def room_axis(

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mover.bodies.corrected import larger
 from mover.bodies.parts import Parts
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
@@ -177,23 +178,20 @@ SHAPELESS = 0.05  # coefficients below it are the mean shape
 
 
 def apply_depth(bodies: Bodies, factors: DepthFactors) -> Bodies:
-    """Move people to their true depth: scaled about the camera, then along the pelvis' ray.
-
-    A changed size is beyond the pose's parameters, so they are dropped: the bodies stay meshes.
-    """
+    """Move people to their true depth: scaled about the camera, then along the pelvis' ray."""
     same = (bodies.person[:, None] == factors.person.to(bodies.person)).to(bodies.verts)
     both = factors.factor, factors.size  # people without a factor keep their place
     factor, size = (1 + same @ (x.to(bodies.verts) - 1) for x in both)
-    shift = (factor - 1)[:, None] * pelvis(bodies) * size[:, None]
-    verts = bodies.verts * size[:, None, None] + shift[:, None]
+    bodies = larger(bodies, size) if bool((size != 1).any()) else bodies
+    shift = (factor - 1)[:, None] * pelvis(bodies)
     joints, pose = bodies.joints, bodies.pose
     if joints is not None:
-        joints = joints * size[:, None, None] + shift[:, None]
+        joints = joints + shift[:, None]
     if pose is not None:
-        resized = bool((factors.size != 1).any())
-        moved = dataclasses.replace(pose, transl=pose.transl + shift.to(pose.transl))
-        pose = None if resized else moved
-    return dataclasses.replace(bodies, verts=verts, joints=joints, pose=pose)
+        pose = dataclasses.replace(pose, transl=pose.transl + shift.to(pose.transl))
+    return dataclasses.replace(
+        bodies, verts=bodies.verts + shift[:, None], joints=joints, pose=pose
+    )
 
 
 def are_shapeless(bodies: Bodies) -> bool:
