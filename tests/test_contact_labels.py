@@ -16,6 +16,7 @@ from mover.bodies.skinning import open_body, zero_pose
 from mover.core.contact_labels import ContactLabels
 from mover.core.errors import InputError
 from mover.core.types import Bodies, Mesh
+from mover.furniture.floor import Floor
 from mover.geometry.nearest import to_surface
 from mover.geometry.placement import StandingMesh
 from mover.io.export.contacts import export_contacts, read_labels, write_labels
@@ -34,10 +35,13 @@ def standing(frames: int = 6) -> Bodies:
     )
 
 
-def labelled(bodies: Bodies, *meshes: Mesh, ground: float | None = GROUND) -> ContactLabels:
+LEVEL = Floor(GROUND)
+
+
+def labelled(bodies: Bodies, *meshes: Mesh, floor: Floor | None = LEVEL) -> ContactLabels:
     ids = tuple(f"box_{k}" for k in range(len(meshes)))
     stands = tuple((StandingMesh(mesh),) for mesh in meshes)
-    return label_contacts(LabelInputs(bodies, parts_of(bodies), stands, ids, ground), LabelConfig())
+    return label_contacts(LabelInputs(bodies, parts_of(bodies), stands, ids, floor), LabelConfig())
 
 
 def shelf_beside(bodies: Bodies, side: str, gap: float) -> Mesh:
@@ -95,8 +99,8 @@ def test_the_nearer_the_surer_and_what_is_far_is_no_touch():
 def test_an_inverted_mesh_is_no_different_and_an_unknown_floor_is_not_touched():
     bodies = standing(2)
     shelf = shelf_beside(bodies, "left", -0.03)
-    straight = labelled(bodies, shelf, ground=None)
-    turned = labelled(bodies, Mesh(shelf.verts, shelf.faces.flip(-1)), ground=None)
+    straight = labelled(bodies, shelf, floor=None)
+    turned = labelled(bodies, Mesh(shelf.verts, shelf.faces.flip(-1)), floor=None)
     assert torch.equal(straight.gap, turned.gap)
     assert torch.equal(straight.normal, turned.normal)
     assert len(straight.gap)

@@ -18,6 +18,7 @@ from mover.fitting.config import Stage
 from mover.fitting.presets import PAPER_ROOM, ROOM_TERMS, without
 from mover.fitting.room import RHO, FitRoom, room_terms
 from mover.fitting.unknowns import Points
+from mover.furniture.floor import Floor
 from mover.geometry.camera import project
 from mover.geometry.volume import grid_around
 from mover.geometry.volume_warp import union_bodies
@@ -143,7 +144,7 @@ def box_room(stands=(False, False)) -> FitRoom:
     volume = union_bodies(mesh.verts[None], mesh.faces, grid_around(low, high, 64, 0.2), 1)
     top = torch.tensor([[0.0, -0.5, 0.0]])
     return FitRoom(
-        torch.eye(3), -1.0, volume, top, torch.tensor([[0.0, 1.0, 0.0]]),
+        torch.eye(3), Floor(-1.0), volume, top, torch.tensor([[0.0, 1.0, 0.0]]),
         torch.arange(2), torch.tensor([True, True]), 10.0, torch.tensor([True, True]),
         torch.tensor([stands]),
     )  # fmt: skip

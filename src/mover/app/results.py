@@ -23,6 +23,7 @@ from mover.core.run import Run
 from mover.core.settings import read_settings
 from mover.core.types import Bodies, Capture, Mesh, Room, Scene
 from mover.evaluate.explanation import log_rows, scene_fields
+from mover.furniture.floor import floor_of
 from mover.geometry.placement import standing_meshes
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.edits import Edit, write_edits
@@ -92,7 +93,8 @@ def labels_of(room: Room, run: Run) -> ContactLabels:
     ]
     ids = tuple(piece.id for piece in room.scene.objects)
     inputs = LabelInputs(
-        room.bodies, parts_of(room.bodies), tuple(solid), ids, room.scene.ground
+        room.bodies, parts_of(room.bodies), tuple(solid), ids,
+        floor_of(room.scene),
     )  # fmt: skip
     return run.stage(label_contacts, inputs, LabelConfig())
 

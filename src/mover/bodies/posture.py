@@ -97,7 +97,11 @@ def elevation(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     return torch.rad2deg(torch.atan2(vector[..., 1], vector[..., [0, 2]].norm(dim=-1)))
 
 
-def postures(bodies: Bodies, parts: Parts, ground: float | None = None) -> Postures:
+Height = float | Float[Tensor, " bodies"]
+"""Of the floor, everywhere or under each body [m]."""
+
+
+def postures(bodies: Bodies, parts: Parts, ground: Height | None = None) -> Postures:
     """Posture of each body in the world.
 
     `ground` is the height of the floor [m]; where it is not known, each body's lowest point counts.
@@ -153,7 +157,7 @@ def _level(vector: Float[Tensor, "bodies 3"]) -> Float[Tensor, "bodies 3"]:
 
 
 def headings(
-    bodies: Bodies, parts: Parts, ground: float | None = None
+    bodies: Bodies, parts: Parts, ground: Height | None = None
 ) -> Float[Tensor, "bodies 3"]:
     """Level unit vector to where each sitter faces: the pelvis' front and the thighs' way.
 
@@ -183,7 +187,7 @@ FLOATS = (0.08, 0.16)  # [m] of that point from the ground: on the floor, surely
 UNDERSIDE = 0.1  # [m] over the lowest point: where a body that lies on its front or side touches
 
 
-def touching(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies verts"]:
+def touching(bodies: Bodies, parts: Parts, ground: Height) -> Float[Tensor, "bodies verts"]:
     """Chance that each vertex of people in the world (+y up) touches something.
 
     Raises:
@@ -270,7 +274,7 @@ def _rest_arms(
     parts: Parts,
     places: Float[Tensor, "bodies landmarks 3"],
     down: Float[Tensor, "bodies verts"],
-    ground: float,
+    ground: Height,
 ) -> Float[Tensor, "bodies verts"]:
     """Hands and forearms at rest on a surface, not on the own lap: what faces down of them."""
     chance = torch.zeros_like(down)
@@ -306,7 +310,7 @@ def _from_lap(
     return torch.minimum(*ways)
 
 
-def _stand(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies verts"]:
+def _stand(bodies: Bodies, parts: Parts, ground: Height) -> Float[Tensor, "bodies verts"]:
     """Soles: hardly moving, and as low as the body reaches, which is about the ground.
 
     A body whose depth is wrong floats or sinks by some centimetres: its own lowest point tells
@@ -314,7 +318,7 @@ def _stand(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies
     """
     height = bodies.verts[..., 1]
     lowest = height.amin(1, keepdim=True)
-    floor = _ramp((lowest - ground).abs(), FLOATS[1], FLOATS[0])
+    floor = _ramp((lowest[:, 0] - ground).abs(), FLOATS[1], FLOATS[0])[:, None]
     near = _ramp(height - lowest, SOLE[1], SOLE[0]) * floor
     chance = torch.zeros_like(near)
     for name in PARTS[:2]:

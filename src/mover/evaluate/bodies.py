@@ -15,6 +15,7 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera
 from mover.energy.body_terms.time import Neighbours, gather_neighbours
 from mover.evaluate.scene import Metric
+from mover.furniture.floor import Floor, height_under, height_under_bodies
 from mover.io.capture.pose_file import into_camera
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 
@@ -92,8 +93,8 @@ def soles_of(bodies: Bodies, camera: Camera) -> Int[Tensor, " soles"]:
     return members(parts, *SOLES).nonzero()[:, 0]
 
 
-def feet_heights(bodies: Bodies, camera: Camera) -> Float[Tensor, "points 1"]:
-    """Heights in the world of the foot contacts that bodies in it tell: still, straight legs [m].
+def feet_places(bodies: Bodies, camera: Camera) -> Float[Tensor, "points 1 3"]:
+    """Places in the world of the foot contacts that bodies in it tell: still, straight legs [m].
 
     The paper takes contacts of POSA; these are estimated as `find_foot_contacts` does.
     """
@@ -101,7 +102,7 @@ def feet_heights(bodies: Bodies, camera: Camera) -> Float[Tensor, "points 1"]:
     seen = into_camera(bodies, R)
     sound = torch.ones(len(bodies.frame), dtype=torch.bool)
     feet = find_foot_contacts(FootContactInputs(seen, parts_of(seen, R[:, 1]), sound, camera))
-    return (feet.points_cam @ R)[:, 1:2]
+    return (feet.points_cam @ R)[:, None]
 
 
 def gather_twins(bodies: Bodies, truth: Bodies) -> Twins | None:
@@ -178,12 +179,12 @@ class Gait:
 
     soles: Float[Tensor, "bodies feet 3"] | None
     """Lowest place of each sole [m]; None: no video or no soles."""
-    lowest: Float[Tensor, " bodies"]
-    """Height of each body's lowest vertex [m]."""
+    over: Float[Tensor, "bodies feet"] | None
+    """Height of each sole over the floor under it [m]; None: neither, or no floor is known."""
+    lowest: Float[Tensor, " bodies"] | None
+    """Height of each body's lowest vertex over the floor under it [m]; None: no floor."""
     skeleton: Float[Tensor, "bodies own 3"] | None
     """All joints of the bodies themselves [m]."""
-    ground: float | None
-    """Height of the floor [m]."""
     near: Neighbours
     joints: Float[Tensor, "twins joints 3"] | None
     """Joints that the truth knows as well [m]."""
@@ -194,10 +195,10 @@ class Gait:
 
 def foot_skate(gait: Gait) -> float | None:
     """Mean speed of soles near the floor along it [m/s], the nearer the more it counts (HuMoR)."""
-    if gait.soles is None or gait.ground is None or not len(gait.near.pairs):
+    if gait.soles is None or gait.over is None or not len(gait.near.pairs):
         return None
     i, j = gait.near.pairs.unbind(-1)
-    height = ((gait.soles[i, :, 1] + gait.soles[j, :, 1]) / 2 - gait.ground).clamp_min(0)
+    height = ((gait.over[i] + gait.over[j]) / 2).clamp_min(0)
     share = 2 - 2 ** (height / STEP).clamp(0, 1)
     way = (gait.soles[j] - gait.soles[i])[..., [0, 2]].norm(dim=-1)
     speed = way / gait.near.gaps.to(way)[:, None]
@@ -208,16 +209,16 @@ def foot_skate(gait: Gait) -> float | None:
 
 def float_height(gait: Gait) -> float | None:
     """Mean height of the lower sole over the floor [m]; 0 where it is below."""
-    if gait.soles is None or gait.ground is None:
+    if gait.over is None:
         return None
-    return float((gait.soles[..., 1].amin(1) - gait.ground).clamp_min(0).mean())
+    return float(gait.over.amin(1).clamp_min(0).mean())
 
 
 def sink_depth(gait: Gait) -> float | None:
     """Mean depth of the body's lowest vertex under the floor [m]; 0 where all of it is above."""
-    if gait.ground is None:
+    if gait.lowest is None:
         return None
-    return float((gait.ground - gait.lowest).clamp_min(0).mean())
+    return float((-gait.lowest).clamp_min(0).mean())
 
 
 def jerk(gait: Gait) -> float | None:
@@ -250,17 +251,21 @@ MOTION_METRICS: dict[str, Metric[Gait]] = {
 }
 
 
-def gather_gait(bodies: Bodies, truth: Bodies | None, ground: float | None) -> Gait:
+def gather_gait(bodies: Bodies, truth: Bodies | None, floor: Floor | None) -> Gait:
     """Feet and joints of bodies in the world, and of the true ones where they are known."""
-    soles, lowest = _soles(bodies), bodies.verts[..., 1].amin(1)
+    soles, over, lowest = _soles(bodies), None, None
+    if floor is not None:
+        over = None if soles is None else soles[..., 1] - height_under(floor, soles)
+        lowest = bodies.verts[..., 1].amin(1) - height_under_bodies(floor, bodies)
     near = gather_neighbours(bodies.frame, bodies.person, bodies.fps)
     none = gather_neighbours(bodies.frame[:0], bodies.person[:0], bodies.fps)
     twins = None if truth is None else gather_twins(bodies, truth)
+    feet = soles, over, lowest, bodies.joints, near
     if truth is None or twins is None or twins.joints is None:
-        return Gait(soles, lowest, bodies.joints, ground, near, None, None, none)
+        return Gait(*feet, None, None, none)
     rows, _ = shared_rows(bodies, truth)
     both = gather_neighbours(bodies.frame[rows], bodies.person[rows], bodies.fps)
-    return Gait(soles, lowest, bodies.joints, ground, near, twins.joints, twins.true_joints, both)
+    return Gait(*feet, twins.joints, twins.true_joints, both)
 
 
 def _soles(bodies: Bodies) -> Tensor | None:

@@ -5,7 +5,7 @@ Definitions, matching rules and sampling densities: docs/metrics.md.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -25,7 +25,7 @@ from mover.evaluate.bodies import (
     MOTION_METRICS,
     POSE_METRICS,
     Standing,
-    feet_heights,
+    feet_places,
     gather_gait,
     gather_twins,
     soles_of,
@@ -40,6 +40,7 @@ from mover.evaluate.contact import (
     gather_truth,
     penetration_depth,
 )
+from mover.evaluate.moves import measure_moves, moved_lines
 from mover.evaluate.scene import (
     CAMERA_METRICS,
     HARM_METRICS,
@@ -55,6 +56,7 @@ from mover.evaluate.scene import (
     unmatched,
 )
 from mover.evaluate.stability import PHYSICS_METRICS, lacking, result_loads, simulate
+from mover.furniture.floor import Floor, floor_of, height_under
 from mover.geometry.placement import StandingMesh
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.camera_file import camera_of
@@ -195,6 +197,12 @@ def evaluate_folder(
     true = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
     metrics = evaluate(initial, result, true, bodies, config)
     metrics["unmatched"] = unmatched(initial, result, true)
+    _, after = pairs(initial, result, true, (config or EvaluateConfig()).by_place)
+    named = tuple(replace(piece, id=name) for name, piece in after.items())
+    fps = None if true_people is None else true_people.fps
+    moves = measure_moves(true, replace(result, objects=named), fps)
+    if any(moves.values()):
+        metrics["moved"] = moves
     if physics:
         _add_stable(metrics, out, dict(zip(SIDES, (initial, result), strict=True)))
     with replacing(out / "metrics.json") as part:
@@ -229,6 +237,7 @@ def table(metrics: Mapping[str, Any]) -> str:
             for key in ("initial", "result")
         )
         lines.append(f"{item['id']:34.34}{cells}")
+    lines += moved_lines(metrics.get("moved", {}))
     for name, ids in metrics.get("unmatched", {}).items():
         lines += [f"{name}: {', '.join(ids)}"] if ids else []
     lines += [f"{n} is not measured: {why}" for n, why in metrics.get("not_measured", {}).items()]
@@ -237,7 +246,7 @@ def table(metrics: Mapping[str, Any]) -> str:
 
 def evaluate_people(
     bodies: Bodies,
-    ground: float | None,
+    floor: Floor | None,
     furniture: Furniture,
     truth: Bodies | None = None,
 ) -> dict[str, float]:
@@ -245,12 +254,12 @@ def evaluate_people(
 
     Args:
         bodies: People in the world of their room.
-        ground: Height of its floor [m]; None: not known.
+        floor: Of that room; None: not known.
         furniture: Its closed objects where they stand, and when.
         truth: The true people in the world of the true room; None: not known.
     """
     config = EvaluateConfig()
-    values = measure(MOTION_METRICS, gather_gait(bodies, truth, ground))
+    values = measure(MOTION_METRICS, gather_gait(bodies, truth, floor))
     near = gather_touch(bodies, furniture, None, config.bodies, config.reach)
     values["penetration_depth"] = penetration_depth(near)
     twins = None if truth is None else gather_twins(bodies, truth)
@@ -296,16 +305,17 @@ def _people(
     judged: _Populated, truth: _Populated, touch: TrueTouch | None, config: EvaluateConfig
 ) -> dict[str, float]:
     """The metrics of a scene's people; what they or the truth do not tell is left out."""
-    bodies, ground = judged.bodies, judged.scene.ground
+    bodies, floor = judged.bodies, floor_of(judged.scene)
     if bodies is None:
         return {}
     near = gather_touch(bodies, judged.furniture, touch, config.bodies, config.reach)
     values = measure(TOUCH_METRICS, near)
     told = config.feet == "contacts"
-    if ground is not None and (told or len(judged.soles)):
-        soles = bodies.verts[:, judged.soles, 1]
-        heights = (feet_heights(bodies, judged.scene.camera) if told else soles) - ground
+    if floor is not None and (told or len(judged.soles)):
+        soles = bodies.verts[:, judged.soles]
+        places = feet_places(bodies, judged.scene.camera) if told else soles
+        heights = places[..., 1] - height_under(floor, places)
         values |= measure(GROUND_METRICS, Standing(heights, config.ground_tolerance))
-    values |= measure(MOTION_METRICS, gather_gait(bodies, truth.bodies, ground))
+    values |= measure(MOTION_METRICS, gather_gait(bodies, truth.bodies, floor))
     twins = None if truth.bodies is None else gather_twins(bodies, truth.bodies)
     return values | (measure(POSE_METRICS, twins) if twins is not None else {})

@@ -18,6 +18,7 @@ from torch import Tensor
 from mover.core.records import record
 from mover.fitting.config import Stage
 from mover.fitting.unknowns import Points
+from mover.furniture.floor import Floor, height_under
 from mover.geometry.camera import to_world
 from mover.geometry.nearest import nearest_points
 from mover.geometry.volume import Volume, sample
@@ -31,7 +32,7 @@ class FitRoom:
     """The estimated room, and which skin meets it."""
 
     R_cam_world: Float[Tensor, "3 3"]
-    ground: float
+    floor: Floor
     """Height of the floor in the world [m]."""
     furniture: Volume | None
     """Signed distance to all pieces; None: there are none."""
@@ -59,9 +60,9 @@ def room_terms(
     skin, facing = (to_world(x, room.R_cam_world.to(x)) for x in (points.skin, points.facing))
     found: dict[str, Tensor] = {}
     if stage.under:
-        found["under"] = stage.under * under_term(skin, room.ground)
+        found["under"] = stage.under * under_term(skin, height_under(room.floor, skin))
     if stage.feet:
-        found["feet"] = stage.feet * feet_term(skin, room.stands, room.ground)
+        found["feet"] = stage.feet * feet_term(skin, room.stands, height_under(room.floor, skin))
     if stage.sdf and room.furniture is not None:
         found["sdf"] = stage.sdf * room.share * sdf_term(skin[:, room.even], room.furniture)
     if stage.contact and len(room.surface):
@@ -70,16 +71,20 @@ def room_terms(
     return found
 
 
-def under_term(skin: Float[Tensor, "bodies points 3"], ground: float) -> Float[Tensor, " bodies"]:
+def under_term(
+    skin: Float[Tensor, "bodies points 3"], floor: Float[Tensor, "bodies points"]
+) -> Float[Tensor, " bodies"]:
     """Depth of the lowest point below the floor [m]."""
-    return (ground - skin[..., 1]).clamp_min(0).amax(-1)
+    return (floor - skin[..., 1]).clamp_min(0).amax(-1)
 
 
 def feet_term(
-    skin: Float[Tensor, "bodies points 3"], stands: Bool[Tensor, "bodies points"], ground: float
+    skin: Float[Tensor, "bodies points 3"],
+    stands: Bool[Tensor, "bodies points"],
+    floor: Float[Tensor, "bodies points"],
 ) -> Float[Tensor, " bodies"]:
     """Mean distance of soles that carry the body from the floor, robust; 0 without any."""
-    return _mean_where((skin[..., 1] - ground).square(), stands)
+    return _mean_where((skin[..., 1] - floor).square(), stands)
 
 
 def sdf_term(skin: Float[Tensor, "bodies points 3"], furniture: Volume) -> Float[Tensor, " bodies"]:

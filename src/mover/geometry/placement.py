@@ -58,10 +58,14 @@ def reproject(
 
 
 def slide_to_floor(
-    layout: Layout, ground: float, standing: Bool[Tensor, " objects"], limit: float = 2.0
+    layout: Layout,
+    ground: float | Float[Tensor, "*starts objects"],
+    standing: Bool[Tensor, " objects"],
+    limit: float = 2.0,
 ) -> Layout:
     """Move standing objects along their rays to the floor, keeping their size in the image.
 
+    The floor has one height [m] for all or one for each.
     Objects whose base is not below the camera are left alone; sizes change at most by `limit`.
     """
     t = layout.t_world_object

@@ -14,11 +14,22 @@ from mover.core.errors import InputError
 from mover.core.explanation import Explanation
 from mover.core.records import rows_of
 from mover.core.run import Run
-from mover.core.types import Bodies, Camera, CameraPath, Capture, Evidence, Layout, Room, Scene
+from mover.core.types import (
+    Bodies,
+    Camera,
+    CameraPath,
+    Capture,
+    Evidence,
+    Layout,
+    Room,
+    Scene,
+    SceneObject,
+)
 from mover.energy.terms.feet import FootContacts
 from mover.evaluate.calibration import calibration_of
 from mover.evaluate.explanation import explain
-from mover.geometry.placement import place
+from mover.furniture.floor import Floor, floor_of
+from mover.geometry.placement import place, reproject
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import Alignment
@@ -30,6 +41,7 @@ from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.explain.placements import ExplainInputs, explain_placements
 from mover.stages.objects.bend_shapes import told_of_shapes
 from mover.stages.objects.find_image_cues import ImageInputs, Seen
+from mover.stages.objects.on_platforms import platforms_of, supports_with_platforms
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
 from mover.stages.people.find_depth import size_spread
@@ -87,6 +99,41 @@ class SceneState:
     contacts: ContactAssignment | None = None
     priced: tuple[PlaceInputs, PlaceConfig] | None = None
     """What the last descent minimised; None: nothing is explained."""
+
+
+def as_given(context: ReconstructionContext, camera: Camera) -> Layout:
+    """The initial scene in the world of another camera; objects may hang in the air."""
+    objects, old = context.prepared.objects, context.capture.scene.camera.R_cam_world
+    return reproject(context.prepared.start, objects.size[:, 1], old, camera.R_cam_world)
+
+
+def is_pinned(context: ReconstructionContext) -> Bool[Tensor, " objects"]:
+    """The objects that stay where the capture has them."""
+    ids = context.prepared.objects.ids
+    return torch.tensor([name in context.pinned for name in ids], dtype=torch.bool)
+
+
+def with_platforms(context: ReconstructionContext, state: SceneState) -> ReconstructionContext:
+    """What stands on a platform, carried by it."""
+    objects = context.prepared.objects
+    if not bool(platforms_of(objects).any()):
+        return context
+    given = as_given(context, state.camera)
+    found = supports_with_platforms(objects, state.placed.layout, given, state.ground)
+    found = torch.where(is_pinned(context), objects.supports, found)
+    prepared = replace(context.prepared, objects=replace(objects, supports=found))
+    return replace(context, prepared=prepared)
+
+
+def floor_now(context: ReconstructionContext, state: SceneState) -> Floor:
+    """The floor with its platforms as they are placed now."""
+    pieces: tuple[SceneObject, ...] = ()
+    if bool(platforms_of(context.prepared.objects).any()):
+        given = context.capture.scene.objects
+        pieces = to_objects(given, context.prepared, state.placed.layout)
+    floor = floor_of(Scene(state.camera, state.ground, pieces))
+    assert floor is not None, "a placed room has a floor"
+    return floor
 
 
 def scale_spread(context: ReconstructionContext, people: PeopleState) -> float:
@@ -200,14 +247,14 @@ def with_proposals(
     known: KnownTops,
 ) -> Room:
     """The room with what people rest on that is not in it."""
-    camera, ground = room.scene.camera, room.scene.ground
-    if people is None or ground is None or not config.propose.use:
+    camera, floor = room.scene.camera, floor_of(room.scene)
+    if people is None or floor is None or not config.propose.use:
         return room
     bodies = in_world(rows_of(people.bodies, people.kept), camera)
     given = None if capture.touch is None else capture.touch[people.kept]
-    contacts = ContactInputs(bodies, people.parts, ground, given)
+    contacts = ContactInputs(bodies, people.parts, floor, given)
     chance = run.stage(find_contacts, contacts, config.contacts).probability
-    inputs = ProposeInputs(bodies, people.parts, chance, ground, camera, known)
+    inputs = ProposeInputs(bodies, people.parts, chance, floor, camera, known)
     return replace(room, proposals=run.stage(propose_supports, inputs, config.propose).found)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from mover.bodies.corrected import in_world
@@ -21,12 +21,10 @@ from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.camera import to_camera
 from mover.geometry.path import is_still, poses_at, scaled
 from mover.geometry.placement import (
-    GROUND,
     larger,
     place,
     reproject,
     rest_on_support,
-    slide_to_floor,
 )
 from mover.geometry.warp_start import threads
 from mover.io.capture.plausible import check_plausible
@@ -36,13 +34,17 @@ from mover.pipeline.outcome import (
     ReconstructionContext,
     SceneState,
     Spans,
+    as_given,
     check_floor,
     check_room,
+    floor_now,
     gather_inputs,
+    is_pinned,
     room_of,
     scale_spread,
     tops_of,
     unfurnished,
+    with_platforms,
     with_proposals,
 )
 from mover.pipeline.people import people_of
@@ -72,6 +74,7 @@ from mover.stages.objects.gather_given import (
     gather_given,
     lighter_where_used,
 )
+from mover.stages.objects.on_platforms import stood
 from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
 from mover.stages.objects.place_objects import (
     estimate_size_prior,
@@ -127,7 +130,7 @@ def _reconstructed(
         check_floor(ground, capture)
         return room_of(context, placed_by_image(context, capture.scene.camera, ground), None)
     state = placed_by_image(context, people.alignment.camera, people.alignment.ground)
-    context = with_size_prior(context, state)
+    context = with_size_prior(with_platforms(context, state), state)
     for _ in range(config.refine.rounds):
         state = with_refined_camera(context, people, state)
     if not scale_spread(context, people):
@@ -166,8 +169,7 @@ def placed_by_image(
     def carried(layout: Layout) -> Layout:
         there = reproject(layout, objects.size[:, 1], old, camera.R_cam_world)
         if context.config.slide_to_floor:
-            slides = (objects.supports == GROUND) & ~_is_pinned(context)
-            there = slide_to_floor(there, ground, slides)
+            there = stood(there, objects, ground, is_pinned(context))
         return rest_on_support(there, objects.supports, objects.size[:, 1], ground)
 
     start = carried(context.prepared.start)
@@ -190,12 +192,6 @@ def placed_by_image(
     placed = context.run.stage(place_objects, inputs, context.config.layout)
     found = SceneState(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
     return replace(found, priced=(with_walls(inputs, placed.walls), context.config.layout))
-
-
-def as_given(context: ReconstructionContext, camera: Camera) -> Layout:
-    """The initial scene in the world of another camera; objects may hang in the air."""
-    objects, old = context.prepared.objects, context.capture.scene.camera.R_cam_world
-    return reproject(context.prepared.start, objects.size[:, 1], old, camera.R_cam_world)
 
 
 def with_given(
@@ -239,7 +235,7 @@ def with_shapes_bent(
         return context, state
     free = replace(inputs.image, sides=believed_sides(inputs.image.sides, 0 * given.weight))
     misfit = misfit_of(context, free, state)
-    loose = (given.weight >= UNFIT) & ~_is_pinned(context)
+    loose = (given.weight >= UNFIT) & ~is_pinned(context)
     bend = BendInputs(inputs, priced(config), state.placed.layout, loose)
     bending = context.run.stage(bend_shapes, bend, context.config.bend)
     prepared, layout = with_shapes(context.prepared, bending)
@@ -311,7 +307,7 @@ def assigned(context: ReconstructionContext, people: PeopleState, state: SceneSt
     bodies = in_world(rows_of(people.bodies, people.kept), state.camera)
     capture, config, seen, run = context.capture, context.config, context.seen, context.run
     given = None if capture.touch is None else capture.touch[people.kept]
-    inputs = ContactInputs(bodies, people.parts, state.ground, given)
+    inputs = ContactInputs(bodies, people.parts, floor_now(context, state), given)
     chance = run.stage(find_contacts, inputs, config.contacts).probability
     contacts = AssignInputs(
         bodies, chance, people.parts, seen.masks, seen.boxes, state.camera,
@@ -358,13 +354,8 @@ def placed_with_people(
     return replace(state, placed=placed, traces=traces, priced=priced)
 
 
-def _is_pinned(context: ReconstructionContext) -> Bool[Tensor, " objects"]:
-    ids = context.prepared.objects.ids
-    return torch.tensor([name in context.pinned for name in ids], dtype=torch.bool)
-
-
 def _pinned(context: ReconstructionContext, start: Layout) -> Pinned | None:
-    return Pinned(_is_pinned(context), start) if context.pinned else None
+    return Pinned(is_pinned(context), start) if context.pinned else None
 
 
 def with_order(context: ReconstructionContext, state: SceneState) -> SceneState:

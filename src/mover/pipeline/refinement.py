@@ -19,9 +19,11 @@ from mover.core.types import Bodies, Capture, Keypoints, Mesh, Room
 from mover.evaluate.evaluation import evaluate_people
 from mover.fitting.config import FitConfig
 from mover.fitting.prior import prior_of
+from mover.furniture.floor import floor_of
 from mover.geometry.placement import standing_meshes
 from mover.io.capture.bodies_file import read_bodies, read_contacts, write_bodies
 from mover.io.capture.camera_file import camera_of
+from mover.io.capture.proposals_file import PROPOSED, read_proposals
 from mover.io.capture.scene_file import read_scene
 from mover.io.export.finished import read_finished
 from mover.io.files.fields import At, read_json
@@ -48,6 +50,7 @@ def finished_room(out: Path) -> Room:
     return Room(
         scene=done.scene, initial=done.scene, image_only=done.scene, bodies=done.bodies, kept=None,
         proxies=proxies, evidence=(), covariance=None, traces={}, warnings=(),
+        proposals=read_proposals(out / PROPOSED),
     )  # fmt: skip
 
 
@@ -134,10 +137,10 @@ def measure_people(out: Path, truth: Path | None = None) -> dict[str, dict[str, 
     room, true = finished_room(out), None if truth is None else _true_people(truth)
     pieces = zip(room.scene.objects, room.proxies, strict=True)
     solid = [s for piece, proxy in pieces for s in standing_meshes(replace(piece, mesh=proxy))]
+    floor = floor_of(room.scene, room.proposals)
     files = {"result": out / "bodies.npz", "refined": out / "refined" / "bodies.npz"}
     values = {
-        name: evaluate_people(read_bodies(file), room.scene.ground, solid, true)
-        for name, file in files.items()
+        name: evaluate_people(read_bodies(file), floor, solid, true) for name, file in files.items()
     }
     with replacing(out / "refined" / "metrics.json") as part:
         part.write_text(json.dumps(values, indent=1, allow_nan=False))

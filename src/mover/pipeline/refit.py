@@ -26,6 +26,7 @@ from mover.fitting.config import FitConfig
 from mover.fitting.presets import PAPER_ROOM
 from mover.fitting.prior import ANGLES, PosePrior
 from mover.fitting.room import FitRoom
+from mover.furniture.floor import height_under_bodies
 from mover.geometry.camera import project
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.outcome import to_world
@@ -131,10 +132,10 @@ def room_around(room: Room, bodies: Bodies, touch: Float[Tensor, "bodies verts"]
     picked = pick(bodies, parts)
     around = surroundings_of(room, None)
     if touch is None or touch.shape != bodies.verts.shape[:2]:
-        touch = touching(bodies, parts, around.ground)
+        touch = touching(bodies, parts, height_under_bodies(around.floor, bodies))
     sole = _of(picked, ("left_sole", "right_sole"))
     return FitRoom(
-        R_cam_world=around.camera.R_cam_world.float(), ground=around.ground,
+        R_cam_world=around.camera.R_cam_world.float(), floor=around.floor,
         furniture=around.furniture, surface=around.surface.points, normals=around.surface.normals,
         picked=picked.index, even=picked.even,
         share=bodies.verts.shape[1] / float(picked.even.sum()),

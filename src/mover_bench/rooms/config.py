@@ -76,8 +76,8 @@ class RoomConfig:
     moved: Literal["no", "put", "stays", "pushed", "rolled"] = "no"
     """How a piece is moved in the middle of the video: put elsewhere between two visits (stays: two
     visits, and nothing is moved), pushed by hand, or rolled under who sits on it."""
-    step: bool = False
-    """There is a step, on which somebody stands first."""
+    step: Literal["no", "step", "platform"] = "no"
+    """There is a step, on which somebody stands first, or a platform under a seat."""
     least_passing: float = 0.0
     """Least share of the bodies that furniture hides in part."""
     plan: PlanConfig = field(default_factory=PlanConfig)

@@ -180,11 +180,11 @@ def _scene(plan: Plan) -> Scene:
     pieces = []
     for index, piece in enumerate(plan.pieces):
         x, z = piece.place.tolist()
-        place = torch.tensor([x, -plan.view.height, z])
+        place = torch.tensor([x, piece.height - plan.view.height, z])
         pieces.append(
             SceneObject(
-                piece.id, piece.furniture.category, piece.furniture.mesh, "", index + 1, "ground",
-                place, torch.tensor(float(piece.heading)), torch.ones(3),
+                piece.id, piece.furniture.category, piece.furniture.mesh, "", index + 1,
+                piece.support, place, torch.tensor(float(piece.heading)), torch.ones(3),
             )
         )  # fmt: skip
     return Scene(plan.view.camera, -plan.view.height, tuple(pieces))

@@ -16,7 +16,7 @@ FAR = 0.03  # [m], signed distances beyond this are not told apart
 
 @record
 class Placed:
-    """A piece on the floor of a room (+y up, the floor at y = 0)."""
+    """A piece in a room (+y up, the floor at y = 0)."""
 
     id: str
     furniture: Furniture
@@ -24,6 +24,10 @@ class Placed:
     """x and z of the centre of the base [m]."""
     heading: float
     """Rotation about +y; 0 faces +z, towards the camera [rad]."""
+    height: float = 0.0
+    """Of what it stands on [m]."""
+    support: str = "ground"
+    """Id of what it stands on."""
 
     @property
     def place(self) -> Float[np.ndarray, "2"]:
@@ -73,7 +77,9 @@ def verts_on_floor(piece: Placed) -> Float[Tensor, "verts 3"]:
     """Vertices in the frame of the floor [m]."""
     verts, (left, front) = piece.furniture.mesh.verts.double().numpy(), piece.axes
     flat = piece.place + verts[:, :1] * left + verts[:, 2:] * front
-    return torch.from_numpy(np.stack([flat[:, 0], verts[:, 1], flat[:, 1]], -1)).float()
+    return torch.from_numpy(
+        np.stack([flat[:, 0], verts[:, 1] + piece.height, flat[:, 1]], -1)
+    ).float()
 
 
 def distances(
@@ -83,7 +89,7 @@ def distances(
     import igl
 
     flat, (left, front) = points[:, [0, 2]] - piece.place, piece.axes
-    local = np.stack([flat @ left, points[:, 1], flat @ front], -1)
+    local = np.stack([flat @ left, points[:, 1] - piece.height, flat @ front], -1)
     verts = piece.furniture.mesh.verts.double().numpy()
     low, high = verts.min(0) - far, verts.max(0) + far
     near = np.flatnonzero(((local > low) & (local < high)).all(-1))

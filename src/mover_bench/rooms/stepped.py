@@ -1,21 +1,26 @@
-"""Known rooms with a step: somebody stands on it, comes down, and uses the room.
+"""Known rooms with a step, on which somebody stands, or with a platform under a seat.
 
-The step is a piece of the room like others. Who comes down sinks evenly while the first paces are
-walked, without the bend of a knee: what a step tells is where soles rest, not how they got there.
+Both are pieces of the room like others. Who goes up rises and who comes down sinks evenly over some
+paces, without the bend of a knee: what a step tells is where soles rest, not how they got there.
 """
 
 import dataclasses
+from itertools import compress
 
 import numpy as np
 
 from mover.furniture.library import make_piece
-from mover_bench.rooms.compose import Plan, fits, in_view
+from mover.furniture.pieces import block, draw, finish, pair
+from mover_bench.rooms.compose import Plan, fits, in_view, overlap
 from mover_bench.rooms.config import RoomConfig
+from mover_bench.rooms.handled import OTHER, ROOMS
 from mover_bench.rooms.known import Acted, Actor, KnownRoom, RefusedError, build, one_thread
 from mover_bench.rooms.motion import Performance, Stage, Stop, Task, perform
+from mover_bench.rooms.moved import candidates
+from mover_bench.rooms.noise import SEATS_FOR_ONE
 from mover_bench.rooms.placed import NoWayError, Placed, corners, on_floor, way
-from mover_bench.rooms.poses import chain, make_person
-from mover_bench.rooms.room import draw_person, draw_tasks, free_place, make_room
+from mover_bench.rooms.poses import chain, make_person, moved
+from mover_bench.rooms.room import draw_person, draw_start, draw_tasks, free_place, make_room
 from mover_bench.rooms.seating import settle_down, standing
 from mover_bench.rooms.turns import heading_of, smooth
 
@@ -25,6 +30,11 @@ WAY = (0.9, 2.5)  # [m] to where one walks from there
 DOWN = 0.3  # [m] beyond the step's farthest corner, where both feet are on the floor
 FREE = 0.45  # [m] around it
 TRIES = 60
+HIGH = (0.15, 0.30)  # [m] of a platform
+BESIDE, BEHIND, BEFORE = (0.25, 0.45), (0.05, 0.2), (0.75, 0.95)  # [m] of it around its seat
+EDGE = 0.35  # [m] from a platform, where people begin to rise
+GAP = 0.1  # [m] from a platform to all furniture that is not on it
+SHARE = 0.05  # least share of the frames on a platform
 
 
 @one_thread()
@@ -106,3 +116,77 @@ def _lift(step: Placed, pelvis: np.ndarray, count: int) -> np.ndarray:
     share = smooth(np.clip((away - edge / 2) / (edge / 2 + DOWN), 0, 1))
     share[:count] = 0
     return step.furniture.top_height * (1 - np.maximum.accumulate(share))
+
+
+@one_thread()
+def make_platform_room(seed: int, config: RoomConfig) -> KnownRoom:
+    """The room of a seed with a platform under the seat for one that is used most.
+
+    What is given has everything on the ground: no tool tells what furniture stands on.
+
+    Raises:
+        ValueError: If no seat of the room has space for a platform.
+    """
+    refused, rng = list[str](), np.random.default_rng([seed, 79])
+    for other in range(ROOMS):
+        room = make_room(seed + other * OTHER, config)
+        for index in candidates(room, SEATS_FOR_ONE):
+            for _ in range(TRIES // 4):
+                try:
+                    return _on_platform(room.plan, index, config, rng)
+                except (RefusedError, ValueError) as error:
+                    refused.append(str(error))
+    raise ValueError(f"seed {seed}: no platform: {refused[-3:]}")
+
+
+def _on_platform(plan: Plan, index: int, config: RoomConfig, rng: np.random.Generator) -> KnownRoom:
+    """One draft of the room: acted on a flat floor, then lifted where the platform is.
+
+    What stands in the way of the platform is not in the room.
+    """
+    platform = _under(plan.pieces[index], rng)
+    if not fits(platform, [], GAP, plan.walls) or in_view(platform, plan.view) < 0.7:
+        raise RefusedError("the platform has no space")
+    keep = [k == index or not overlap(platform, p, GAP) for k, p in enumerate(plan.pieces)]
+    index = sum(keep[:index])
+    plan = dataclasses.replace(plan, pieces=tuple(compress(plan.pieces, keep)))
+    if len(plan.pieces) < config.least_pieces:
+        raise RefusedError("too much stands in the way of the platform")
+    bounds = np.stack([plan.walls[0] + 0.25, plan.walls[1] - 0.25])
+    stage = Stage(make_person(draw_person(rng)), plan.pieces, bounds, config.fps)
+    tasks = (*draw_tasks(plan, rng, config.stay, config.acts), Task("sit", index))
+    act = perform(stage, tasks, draw_start(plan, rng), rng)
+    lift = _rise(platform, act.posture.pelvis)
+    elsewhere = np.array([k not in (-1, index) for k in act.touched])
+    if (lift[elsewhere] > 0).any() or (lift == lift.max()).mean() < SHARE or lift.max() == 0:
+        raise RefusedError("people use other furniture from the platform, or nobody the seat on it")
+    posture = moved(act.posture, lift[:, None] * np.array([0.0, 1.0, 0.0]))
+    high = platform.furniture.top_height
+    seat = dataclasses.replace(plan.pieces[index], height=high, support=platform.id)
+    pieces = tuple(seat if k == index else piece for k, piece in enumerate(plan.pieces))
+    whole = dataclasses.replace(plan, pieces=(*pieces, platform))
+    actor = Actor(stage, dataclasses.replace(act, posture=posture))
+    room = build(whole, (actor,), config, "platform", act.refused)
+    flat = tuple(dataclasses.replace(p, support="ground") for p in room.truth.objects)
+    given = dataclasses.replace(room.capture.scene, objects=flat)
+    return dataclasses.replace(room, capture=dataclasses.replace(room.capture, scene=given))
+
+
+def _under(seat: Placed, rng: np.random.Generator) -> Placed:
+    """A platform under a seat, with space to stand before it."""
+    width, _, depth = seat.furniture.size
+    before, behind = draw(rng, *BEFORE), draw(rng, *BEHIND)
+    x, z = pair(width / 2 + draw(rng, *BESIDE)), pair((depth + before + behind) / 2)
+    top = draw(rng, *HIGH)
+    shape = finish("step", 0, [block(x, (0, top), z)], top=top)
+    middle = on_floor(seat, 0.0, (before - behind) / 2)
+    return Placed("platform_0", shape, (float(middle[0]), float(middle[1])), seat.heading)
+
+
+def _rise(platform: Placed, pelvis: np.ndarray) -> np.ndarray:
+    """How far each frame is above the floor [m]."""
+    width, high, depth = platform.furniture.size
+    flat, (left, front) = pelvis[:, [0, 2]] - platform.place, platform.axes
+    beside = np.abs(np.stack([flat @ left, flat @ front])) - np.array([[width], [depth]]) / 2
+    away = np.linalg.norm(np.maximum(beside, 0), axis=0)
+    return high * (1 - smooth(np.clip(away / EDGE, 0, 1)))

@@ -39,7 +39,7 @@ from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.moved import make_moved_room
 from mover_bench.rooms.noise import without_support
 from mover_bench.rooms.room import make_room
-from mover_bench.rooms.stepped import make_stepped_room
+from mover_bench.rooms.stepped import make_platform_room, make_stepped_room
 from mover_bench.studies.fitted import fitted_trial, measure_fitted
 from mover_bench.studies.measures import (
     Trial,
@@ -115,15 +115,16 @@ class Seed:
 MAKERS: dict[str, Callable[[int, RoomConfig], KnownRoom]] = {
     "no": make_room, "put": make_moved_room, "stays": make_moved_room,
     "pushed": make_handled_room, "rolled": make_handled_room,
+    "step": make_stepped_room, "platform": make_platform_room,
 }  # fmt: skip
-"""By `RoomConfig.moved`."""
+"""By `RoomConfig.moved` and `RoomConfig.step`."""
 
 
 def make_truth(inputs: Seed, config: RoomConfig, observe: Observer = silent) -> KnownRoom:
     """A room without noise, as a stage: sets with the same rooms make it once."""
     del observe
-    make = make_stepped_room if config.step else MAKERS[config.moved]
-    return make(inputs.seed, config)
+    kind = config.moved if config.step == "no" else config.step
+    return MAKERS[kind](inputs.seed, config)
 
 
 def noisy_room(seed: int, rooms: RoomSet, run: Run | None = None) -> Trial:

@@ -23,6 +23,7 @@ from mover.evaluate.evaluation import (
 )
 from mover.evaluate.moves import measure_moves
 from mover.evaluate.scene import unmatched
+from mover.furniture.floor import floor_of
 from mover.furniture.library import SEATS, STEP, canonical
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera
@@ -333,7 +334,7 @@ def judge_people(trial: Trial, scene: Scene, found: Bodies | None) -> dict[str, 
     assert trial.bodies is not None, "a known room has true people"
     truth = to_world(trial.bodies, trial.truth.camera)
     solid = furniture_of(scene.objects, close_meshes(scene.objects))
-    values = evaluate_people(found, scene.ground, solid, truth)
+    values = evaluate_people(found, floor_of(scene), solid, truth)
     return {"initial": {}, "image": {}, "full": values, "objects": [], "warnings": []}
 
 

@@ -178,7 +178,12 @@ SETS: dict[str, RoomSet] = {
     ),
     "withheld-step": RoomSet(
         "The rooms of `rooms` with a step on which somebody stands; it is not in what is given.",
-        "1000-1029", "100-129", RoomConfig(step=True), withheld=True,
+        "1000-1029", "100-129", RoomConfig(step="step"), withheld=True,
+    ),
+    "platform": RoomSet(
+        "The rooms of `rooms`; a seat stands on a platform that people walk onto; what is given"
+        " says that all stands on the ground.",
+        "1000-1029", "100-129", RoomConfig(step="platform"),
     ),
     "moving-camera": RoomSet(
         "The rooms of `rooms` seen by a camera that is walked with, panned or held by hand; its"

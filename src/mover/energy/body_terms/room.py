@@ -1,6 +1,6 @@
 r"""Bodies do not sink into the room, and feet stand on its floor (after PROX, SDF term).
 
-Evidence:  the signed distance to all furniture on one grid, and the floor, y = ground.
+Evidence:  the signed distance to all furniture on one grid, and the floor's height.
 Price:     sink:  rho(depth of the skin inside furniture), summed over even points of the skin
            under: the same below the floor, of the deepest points
            stand: Geman-McClure of the height of soles at rest over the floor
@@ -31,17 +31,21 @@ def sink_term(
     return _dent((-sample(furniture, skin)).clamp_min(0))
 
 
-def under_term(skin: Float[Tensor, "bodies points 3"], ground: float) -> Float[Tensor, " bodies"]:
-    """Price of the skin's depth below the floor [nats]."""
-    depth = (ground - skin[..., 1]).clamp_min(0)
+def under_term(
+    skin: Float[Tensor, "bodies points 3"], floor: Float[Tensor, "bodies points"]
+) -> Float[Tensor, " bodies"]:
+    """Price of the skin's depth below the floor, whose height under each point is given [nats]."""
+    depth = (floor - skin[..., 1]).clamp_min(0)
     return DEEPEST * _dent(depth.topk(min(FEW, depth.shape[-1]), -1).values) / POINTS
 
 
 def stand_term(
-    soles: Float[Tensor, "bodies feet 3"], rest: Float[Tensor, "bodies feet"], ground: float
+    soles: Float[Tensor, "bodies feet 3"],
+    rest: Float[Tensor, "bodies feet"],
+    floor: Float[Tensor, "bodies feet"],
 ) -> Float[Tensor, " bodies"]:
     """Price of the lowest places of feet at rest (a chance) that are not on the floor [nats]."""
-    off = geman_mcclure((soles[..., 1] - ground) / SOFT, TAIL)
+    off = geman_mcclure((soles[..., 1] - floor) / SOFT, TAIL)
     return 0.5 * FEET * TAIL**2 * (rest * off).sum(-1)
 
 

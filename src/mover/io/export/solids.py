@@ -26,6 +26,7 @@ from mover.core.records import record
 from mover.core.run import Run
 from mover.core.settings import float_in, int_in
 from mover.core.types import Mesh, Scene, SceneObject
+from mover.furniture.floor import is_platform
 from mover.furniture.library import canonical
 from mover.geometry.placement import place_object, placed_at
 from mover.geometry.watertight import close_mesh
@@ -315,7 +316,7 @@ def _solid(piece: SceneObject, convex: Convex, floor: float) -> Solid:
         category=piece.category,
         place=place,
         yaw=float(piece.yaw),
-        free=piece.support != "free",
+        free=piece.support != "free" and not is_platform(piece.category),
         hulls=tuple(_turned(hull, scale) for hull in convex.hulls),
         mass=mass,
         centre=AXES @ (scale * convex.centre),

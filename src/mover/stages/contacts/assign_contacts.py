@@ -15,6 +15,7 @@ from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.types import Bodies
 from mover.energy.terms.contact import ContactPoints, shares_of
+from mover.furniture.floor import Floor, height_under_bodies
 from mover.geometry.mesh import vertex_normals
 from mover.stages.config import AssignConfig, ContactConfig
 from mover.stages.contacts.contact_association import AssignInputs, ContactRows, contact_rows
@@ -26,7 +27,7 @@ class ContactInputs:
 
     bodies: Bodies
     parts: Parts
-    ground: float
+    floor: Floor
     given: Float[Tensor, "bodies verts"] | None
 
 
@@ -44,7 +45,8 @@ def find_contacts(
     del observe
     if config.given and inputs.given is not None:
         return ContactProbability(inputs.given)
-    return ContactProbability(touching(inputs.bodies, inputs.parts, inputs.ground))
+    under = height_under_bodies(inputs.floor, inputs.bodies)
+    return ContactProbability(touching(inputs.bodies, inputs.parts, under))
 
 
 # Thin clouds of points out to cells, so that their number does not grow with the video.

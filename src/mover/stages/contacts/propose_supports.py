@@ -27,6 +27,7 @@ from mover.bodies.posture import Postures, at, facing, headings, landmarks, post
 from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Proposal, SceneObject
+from mover.furniture.floor import Floor, height_under_bodies
 from mover.furniture.library import SEEDS, make_piece
 from mover.furniture.pieces import Furniture
 from mover.geometry.boxes import beyond, box_of
@@ -85,9 +86,14 @@ class ProposeInputs:
     parts: Parts
     chance: Float[Tensor, "bodies verts"]
     """That a vertex touches something."""
-    ground: float
+    floor: Floor
     camera: Camera
     known: KnownTops
+
+    @cached_property
+    def under(self) -> Float[Tensor, " bodies"]:
+        """Height of the floor under each body [m]."""
+        return height_under_bodies(self.floor, self.bodies)
 
 
 @dataclass(frozen=True)
@@ -136,7 +142,7 @@ def propose_supports(
 
 def resting_bodies(inputs: ProposeInputs, config: ProposeConfig) -> list[Resting]:
     """All bodies that sit, lie or stand above the floor."""
-    pose = postures(inputs.bodies, inputs.parts, inputs.ground)
+    pose = postures(inputs.bodies, inputs.parts, inputs.under)
     seats = (inputs.chance > config.chance) & members(inputs.parts, *RESTS)
     kinds: tuple[tuple[Kind, Tensor], ...] = (
         ("sit", seats & pose.sitting[:, None]),
@@ -147,7 +153,7 @@ def resting_bodies(inputs: ProposeInputs, config: ProposeConfig) -> list[Resting
     for kind, rests in kinds:  # each body touches with another number of vertices
         for row in (rests.sum(1) >= FEWEST).nonzero()[:, 0].tolist():
             points = inputs.bodies.verts[row, rests[row]]
-            if float(points[:, 1].median()) - inputs.ground > config.lowest:
+            if float(points[:, 1].median() - inputs.under[row]) > config.lowest:
                 found.append(Resting(row, kind, points, _covered(points, inputs, config)))
     return found
 
@@ -230,7 +236,7 @@ class Group:
     def heights(self) -> Float[Tensor, " rests"]:
         """Of what touches, over the floor [m]."""
         low = torch.stack([rest.points[:, 1].quantile(LOWEST) for rest in self.rests])
-        return low - self.inputs.ground
+        return low - self.inputs.under[self.rows]
 
     @cached_property
     def middle(self) -> Float[Tensor, "3"]:
@@ -251,7 +257,7 @@ class Group:
     @cached_property
     def leans(self) -> bool:
         """Most who sit here lean back."""
-        pose = postures(self.inputs.bodies, self.inputs.parts, self.inputs.ground)
+        pose = postures(self.inputs.bodies, self.inputs.parts, self.inputs.under)
         return bool(pose.recline[self.rows_of("sit")].median() > LEANS)
 
     @cached_property
@@ -270,7 +276,7 @@ class Group:
         bodies, parts = self.inputs.bodies, self.inputs.parts
         places = landmarks(bodies, parts)
         return {
-            "sit": headings(bodies, parts, self.inputs.ground),
+            "sit": headings(bodies, parts, self.inputs.under),
             "lie": at(places, "hips") - at(places, "neck"),
             "step": facing(places),
         }
@@ -332,7 +338,7 @@ def _proposal(group: Group, taken: set[str]) -> Proposal:
         place = group.middle - seat * front
         low, high = group.span
         place = place + ((low + high)[0] / 2 - place @ side) * side
-    place[1] = group.inputs.ground
+    place[1] = group.inputs.under[group.rows].median()
     stem = f"proposed_{kind.replace(' ', '_')}"
     name = next(n for n in (f"{stem}_{k}" for k in range(len(taken) + 1)) if n not in taken)
     where = place, yaw, scale

@@ -14,9 +14,9 @@ from torch import Tensor
 from mover.core.explanation import Alternative, Facts, Pull
 from mover.core.observe import Energy, Observer, Step, silent
 from mover.core.records import record
-from mover.core.types import Bodies, Layout, Objects
+from mover.core.types import Bodies, Layout
 from mover.energy.terms.bbox import SEEN
-from mover.geometry.placement import FREE, GROUND, place_in
+from mover.geometry.placement import FREE, place_in
 from mover.geometry.raster import Depths, Topology, look
 from mover.geometry.rotations import wrap
 from mover.stages.config import ExplainConfig, PlaceConfig
@@ -34,6 +34,7 @@ from mover.stages.explain.spread import (
 )
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.place_objects import energy_of, with_trees
+from mover.stages.objects.prepare_objects import support_names
 from mover.stages.objects.starts import MOVED, TURNED
 
 # Other places that the evidence allows nearly as well as the chosen one.
@@ -132,7 +133,7 @@ def explain_placements(
         "tilt": _tilted(inputs, free),
         "pulls": _pulls(bend, free, covariance, placed.layout),
         "alternatives": others_of(placed, priced.reference, weight, energy),
-        "support": [_support(objects, below) for below in objects.supports.tolist()],
+        "support": list(support_names(objects)),
         "pinned": [False] * len(value) if pinned is None else pinned.fixed.tolist(),
     }
     observe(Step("explain_placements", 1, 2))
@@ -196,10 +197,6 @@ def _overlaps(
     both = (ours & theirs).sum((-2, -1)) / (ours | theirs).sum((-2, -1)).clamp_min(1)
     known = theirs.any(-1).any(-1)
     return tuple(float(b) if k else None for b, k in zip(both, known.tolist(), strict=True))
-
-
-def _support(objects: Objects, below: int) -> str:
-    return {GROUND: "ground", FREE: "free"}.get(below) or objects.ids[below]
 
 
 def _pulls(

@@ -176,10 +176,19 @@ def to_objects(
     scale = prepared.scale * layout.log_scale.exp()
     back = (rot_y(layout.yaw) @ (scale * prepared.center).unsqueeze(-1)).squeeze(-1)
     origin = layout.t_world_object - back
+    below = support_names(prepared.objects)
     return tuple(
-        dataclasses.replace(p, t_world_object=origin[i], yaw=layout.yaw[i], scale=scale[i])
+        dataclasses.replace(
+            p, support=below[i], t_world_object=origin[i], yaw=layout.yaw[i], scale=scale[i]
+        )
         for i, p in enumerate(bent_pieces(pieces, prepared.cages))
     )
+
+
+def support_names(objects: Objects) -> tuple[str, ...]:
+    """`ground`, `free`, or the id of what carries it, of each object."""
+    words = {GROUND: "ground", FREE: "free"}
+    return tuple(words.get(below) or objects.ids[below] for below in objects.supports.tolist())
 
 
 def bent_pieces(pieces: tuple[SceneObject, ...], cages: Cage | None) -> tuple[SceneObject, ...]:

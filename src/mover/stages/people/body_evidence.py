@@ -14,6 +14,7 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera, Capture, Mesh, People, Room
 from mover.energy.body_terms.contact import Surface
 from mover.energy.body_terms.order import Bounds, Sighting, bounds_of_skin
+from mover.furniture.floor import Floor, floor_of, height_under_bodies
 from mover.geometry.camera import project, to_camera
 from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place_object
@@ -39,7 +40,7 @@ class Surroundings:
     """The estimated room, as bodies meet it."""
 
     camera: Camera
-    ground: float
+    floor: Floor
     furniture: Volume | None
     """Signed distance to all pieces; None: there are none."""
     surface: Surface
@@ -69,7 +70,8 @@ def surroundings_of(room: Room, capture: Capture | None) -> Surroundings:
     Raises:
         ValueError: If the room has no floor.
     """
-    if room.scene.ground is None:
+    floor = floor_of(room.scene, room.proposals)
+    if floor is None:
         raise ValueError("surroundings_of: the room has no floor")
     camera = room.scene.camera
     meshes = [
@@ -82,7 +84,7 @@ def surroundings_of(room: Room, capture: Capture | None) -> Surroundings:
     if capture is not None and meshes:
         masks = small_masks(image_evidence(capture).masks, capture.scene.camera)
         owned = (piece >= 0) & masks.gather(0, piece.clamp_min(0)[None])[0]
-    return Surroundings(camera, room.scene.ground, _volume(meshes), _surface(meshes), front, owned)
+    return Surroundings(camera, floor, _volume(meshes), _surface(meshes), front, owned)
 
 
 def _drawn(meshes: list[Mesh], camera: Camera, small: Camera) -> tuple[Tensor, Tensor]:
@@ -136,9 +138,9 @@ def pick(bodies: Bodies, parts: Parts) -> Picked:
     return Picked(index, torch.isin(index, even), part, part + 1)
 
 
-def resting_soles(bodies: Bodies, parts: Parts, ground: float) -> Float[Tensor, "bodies feet"]:
+def resting_soles(bodies: Bodies, parts: Parts, floor: Floor) -> Float[Tensor, "bodies feet"]:
     """Chance that each sole is at rest and carries its body, whatever its height over the floor."""
-    lying = postures(bodies, parts, ground).lying
+    lying = postures(bodies, parts, height_under_bodies(floor, bodies)).lying
     low = bodies.verts[..., 1].amin(1)
     found: list[Tensor] = []
     for name in SOLES:

@@ -25,6 +25,7 @@ from mover.bodies.skeleton import BODY
 from mover.bodies.smpl_model import vertex_subset
 from mover.core.types import Bodies
 from mover.energy.body_terms.time import Neighbours, gather_neighbours
+from mover.furniture.floor import Floor, height_under, height_under_bodies
 from mover.stages.people.body_evidence import resting_soles
 
 ALONG, ACROSS = 0.015, 0.005  # [m], how far a body may be off in depth or height, and to the side
@@ -46,26 +47,26 @@ SIDES = ("left", "right")
 NUDGE = 1e-3  # [rad], for differences
 
 
-def plant_feet(bodies: Bodies, parts: Parts, ground: float) -> Bodies:
+def plant_feet(bodies: Bodies, parts: Parts, floor: Floor) -> Bodies:
     """The bodies with their resting soles still and on the floor.
 
     Args:
         bodies: In the world; a video. Unordered images have no rest, and come back as they are.
         parts: Parts of their mesh.
-        ground: Height of the floor [m].
+        floor: Of their room, with its platforms.
     """
     near = gather_neighbours(bodies.frame, bodies.person, bodies.fps)
-    rest = resting_soles(bodies, parts, ground).double()
+    rest = resting_soles(bodies, parts, floor).double()
     soles = [members(parts, f"{side}_sole").nonzero()[:, 0] for side in SIDES]
     if not len(near.pairs) or not all(len(sole) for sole in soles):
         return bodies
-    shift = _shifts(bodies, near, rest, (soles, ground), parts)
+    shift = _shifts(bodies, near, rest, (soles, floor), parts)
     moved = corrected(bodies, _by(bodies, shift))
     if bodies.pose is None:
         return moved
-    rest = resting_soles(moved, parts, ground).double()
+    rest = resting_soles(moved, parts, floor).double()
     ways = torch.stack([
-        _way(moved.verts[:, sole], near, rest[:, k], ground) for k, sole in enumerate(soles)
+        _way(moved.verts[:, sole], near, rest[:, k], floor) for k, sole in enumerate(soles)
     ])  # fmt: skip
     for k, side in enumerate(SIDES):
         moved = _bend(moved, side, soles[k], ways[k])
@@ -147,11 +148,11 @@ def _shifts(
     bodies: Bodies,
     near: Neighbours,
     rest: Float[Tensor, "bodies feet"],
-    feet: tuple[list[Tensor], float],
+    feet: tuple[list[Tensor], Floor],
     parts: Parts,
 ) -> Float[Tensor, "bodies 3"]:
     """How far each body is moved as a whole [m]."""
-    soles, ground = feet
+    soles, floor = feet
     chain, pairs = _Chain(len(bodies.frame)), near.pairs
     sway = SWAY if bodies.pose is not None else RIGID
     middle = bodies.verts.double().mean(1)
@@ -161,7 +162,7 @@ def _shifts(
     across = side[:, :, None] * side[:, None]
     prior = (torch.eye(3, dtype=torch.float64) - across) / ALONG**2 + across / ACROSS**2
     none = torch.zeros_like(middle)
-    posture = postures(bodies, parts, ground)
+    posture = postures(bodies, parts, height_under_bodies(floor, bodies))
     gaps = near.gaps.double()
     nothing = torch.zeros(len(pairs), 3, dtype=torch.float64)
     chain.pairs(pairs, _level(1 / (STEADY**2 * gaps), 1.0), nothing)
@@ -170,7 +171,7 @@ def _shifts(
         foot = _foot(bodies.verts[:, sole])
         way = foot[pairs[:, 1]] - foot[pairs[:, 0]]
         chain.pairs(pairs, _level(_both(rest[:, k], pairs) / sway**2), -way)
-        chain.prior(*_floor(foot, rest[:, k], ground, SINK))
+        chain.prior(*_floor(foot, rest[:, k], floor, SINK))
     calm = (posture.sitting | posture.lying).double()
     way = middle[pairs[:, 1]] - middle[pairs[:, 0]]
     chain.pairs(pairs, _level(_both(calm, pairs) / STILL**2, 1.0), -way)
@@ -178,10 +179,10 @@ def _shifts(
 
 
 def _floor(
-    foot: Float[Tensor, "bodies 3"], rest: Float[Tensor, " bodies"], ground: float, rise: float
+    foot: Float[Tensor, "bodies 3"], rest: Float[Tensor, " bodies"], floor: Floor, rise: float
 ) -> tuple[Float[Tensor, "bodies 3 3"], Float[Tensor, "bodies 3"]]:
     """A sole at rest near the floor lies on it, and none is below it."""
-    height = foot[:, 1] - ground
+    height = foot[:, 1] - height_under(floor, foot)
     share = torch.where(height < 0, torch.ones_like(rest), rest * (height < ON_FLOOR))
     at = torch.zeros(len(foot), 3, 3, dtype=torch.float64)
     at[:, 1, 1] = share / rise**2
@@ -194,7 +195,7 @@ def _way(
     points: Float[Tensor, "bodies sole 3"],
     near: Neighbours,
     rest: Float[Tensor, " bodies"],
-    ground: float,
+    floor: Floor,
 ) -> Float[Tensor, "bodies 3"]:
     """How far a foot has to go beside its body [m]."""
     foot, pairs = _foot(points), near.pairs
@@ -205,7 +206,7 @@ def _way(
     chain.pairs(pairs, _level(1 / (FADE**2 * near.gaps.double()), 1.0), nothing)
     way = foot[pairs[:, 1]] - foot[pairs[:, 0]]
     chain.pairs(pairs, _level(_both(rest, pairs) / SLIP**2), -way)
-    chain.prior(*_floor(foot, rest, ground, RISE))
+    chain.prior(*_floor(foot, rest, floor, RISE))
     return chain.solve()
 
 

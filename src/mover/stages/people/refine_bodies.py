@@ -36,6 +36,7 @@ from mover.energy.body_terms.start import ANGLE
 from mover.energy.body_terms.time import gather_neighbours
 from mover.energy.config import BodyWeights, MatchConfig
 from mover.energy.minimize import minimize
+from mover.furniture.floor import height_under_bodies
 from mover.geometry.camera import to_camera
 from mover.geometry.path import is_still
 from mover.geometry.placement import changes, mover_at, placed_at
@@ -102,8 +103,10 @@ def cast_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Cast:
     given = None if capture is None else capture.touch
     if given is not None and given.shape != bodies.verts.shape[:2]:
         given = None
-    chance = given if given is not None else touching(bodies, parts, ground)
-    rest = resting_soles(bodies, parts, ground)
+    floor = surroundings.floor
+    under = height_under_bodies(floor, bodies)
+    chance = given if given is not None else touching(bodies, parts, under)
+    rest = resting_soles(bodies, parts, floor)
     return Cast(
         bodies, picked, surroundings, _furniture_only(chance[:, picked.index].float(), picked),
         rest, watched_of(surroundings, people, bodies),
@@ -121,7 +124,7 @@ def known_of(cast: Cast, bodies: Bodies, rows: Int[Tensor, " rows"]) -> Evidence
     room = cast.room
     soles = torch.stack([cast.picked.part == 0, cast.picked.part == 1])
     return Evidence(
-        camera=room.camera, ground=room.ground, furniture=room.furniture,
+        camera=room.camera, floor=room.floor, furniture=room.furniture,
         near=gather_neighbours(bodies.frame, bodies.person, bodies.fps),
         feet=Feet(soles, cast.rest[rows]), matches=None, bounds=None, rho=0.1,
         even=cast.picked.even,
@@ -271,7 +274,7 @@ def _refined(
     assert found is not None, "bodies have at least one row"
     bodies, shift = corrected(cast.bodies, found), found.shift
     if config.plant and config.weights.lock:
-        planted = plant_feet(bodies, parts_of(bodies), cast.room.ground)
+        planted = plant_feet(bodies, parts_of(bodies), cast.room.floor)
         shift = shift + (planted.verts - bodies.verts).mean(1)
         bodies = planted
     return RefinedBodies(bodies, shift, energy)
