@@ -16,6 +16,7 @@ from mover.bodies.parts import members, parts_of
 from mover.bodies.posture import touching
 from mover.core.run import Run
 from mover.core.types import Bodies, Layout, Mesh, Proposal, Scene, SceneObject
+from mover.energy.terms.feet import FootContacts
 from mover.evaluate.bodies import float_height, gather_gait, sink_depth
 from mover.evaluate.evaluation import evaluate_people
 from mover.furniture.floor import (
@@ -28,8 +29,10 @@ from mover.furniture.floor import (
 )
 from mover.furniture.library import make_piece
 from mover.geometry.boxes import box_of
+from mover.geometry.camera import pitch_roll, tilted, to_camera
 from mover.geometry.rotations import rot_y
 from mover.io.export.solids import solids_of
+from mover.stages.camera.align_camera import AlignInputs, align_camera
 from mover.stages.config import ProposeConfig
 from mover.stages.contacts.propose_supports import NOTHING, ProposeInputs, propose_supports
 from mover.stages.objects.on_platforms import stood, supports_with_platforms
@@ -155,6 +158,25 @@ def test_a_seat_that_is_proposed_on_a_platform_stands_on_it():
     torch.testing.assert_close(above.size, below.size, atol=2e-3, rtol=0)
     rise = torch.tensor([0.0, HIGH, 0.0])
     torch.testing.assert_close(above.center, below.center + rise, atol=2e-3, rtol=0)
+
+
+def test_soles_on_a_platform_that_is_seen_do_not_tilt_the_floor():
+    rng = torch.Generator().manual_seed(3)
+    world = torch.rand(60, 3, generator=rng) * torch.tensor([3.0, 0.0, 2.0])
+    world = world + torch.tensor([-1.5, GROUND, -4.5])
+    high = world[:, 2] > -4.0  # three quarters of them
+    world[:, 1] += HIGH * high
+    R = tilted(torch.tensor(-0.25), torch.tensor(0.03))
+    frame = torch.arange(60)
+    feet = FootContacts(to_camera(world, R), torch.zeros_like(frame), frame, ())
+    camera = replace(CAMERA, R_cam_world=tilted(torch.tensor(-0.22), torch.tensor(0.0)))
+    lift = torch.where(high | (frame % 5 == 0), HIGH, 0.0)  # some of the box is floor
+    flat, known = (
+        align_camera(AlignInputs(replace(feet, lift=it), camera, None, None)) for it in (None, lift)
+    )
+    assert abs(known.ground - GROUND) < 0.005
+    assert abs(float(pitch_roll(known.camera.R_cam_world)[0]) + 0.25) < 0.005
+    assert abs(flat.ground - GROUND) > 0.1
 
 
 @pytest.mark.slow

@@ -3,14 +3,16 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.bodies.parts import Parts, parts_of
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, CameraPath, Capture
 from mover.energy.terms.feet import FootContacts
+from mover.furniture.floor import is_platform
 from mover.geometry.boxes import box_of
+from mover.geometry.camera import project
 from mover.geometry.path import is_still, poses_at, scaled, to_reference
 from mover.io.capture.pose_file import moved
 from mover.pipeline.outcome import PeopleState, check_floor
@@ -22,6 +24,7 @@ from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_scale import ScaleInputs, find_scale
 from mover.stages.cover import hiding
+from mover.stages.objects.find_image_cues import image_evidence
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
@@ -56,12 +59,28 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
         drift = run.stage(find_drift, inputs, config.drift)
         path, told = undrifted(path, drift), (*told, *drift.warnings)
         feet, loose = feet_on(path), drift.covariance
+    feet = replace(feet, lift=_lifts(feet, capture))
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height)
     alignment = run.stage(align_camera, known, config.align)
     alignment = replace(alignment, covariance=alignment.covariance + loose)
     odd = check_floor(alignment.ground, capture)
     warnings = (*warnings, *told, *feet.warnings, *alignment.warnings, *odd)
     return PeopleState(carried(bodies, path), path, kept, parts, feet, alignment, warnings)
+
+
+def _lifts(feet: FootContacts, capture: Capture) -> Float[Tensor, " soles"] | None:
+    """How much higher than the plane soles may be, as a platform is seen there [m]."""
+    pieces = capture.scene.objects
+    rows = [k for k, piece in enumerate(pieces) if is_platform(piece.category)]
+    if not rows:
+        return None
+    boxes = image_evidence(capture).boxes
+    pixels = project(feet.points_cam, capture.scene.camera.K)
+    found = torch.zeros_like(feet.points_cam[:, 0])
+    for k in rows:
+        there = ((pixels >= boxes[k, :2]) & (pixels <= boxes[k, 2:])).all(-1)
+        found = torch.where(there, box_of(pieces[k]).size[1].to(found), found)
+    return found
 
 
 def _in_metres(

@@ -1,7 +1,8 @@
 """Known rooms with a step, on which somebody stands, or with a platform under a seat.
 
-Both are pieces of the room like others. Who goes up rises and who comes down sinks evenly over some
-paces, without the bend of a knee: what a step tells is where soles rest, not how they got there.
+Both are pieces of the room like others. Who comes down from a step sinks evenly over some paces,
+who walks onto a platform rises at its edge, without the bend of a knee: what a step tells is where
+soles rest, not how they got there.
 """
 
 import dataclasses
@@ -32,9 +33,9 @@ FREE = 0.45  # [m] around it
 TRIES = 60
 HIGH = (0.15, 0.30)  # [m] of a platform
 BESIDE, BEHIND, BEFORE = (0.25, 0.45), (0.05, 0.2), (0.75, 0.95)  # [m] of it around its seat
-EDGE = 0.35  # [m] from a platform, where people begin to rise
+EDGE = 0.12  # [m] from a platform, where people rise: in a frame or two, as feet are up or down
 GAP = 0.1  # [m] from a platform to all furniture that is not on it
-SHARE = 0.05  # least share of the frames on a platform
+SHARE = 0.05  # least share of the frames on a platform, most of those in between
 
 
 @one_thread()
@@ -158,8 +159,10 @@ def _on_platform(plan: Plan, index: int, config: RoomConfig, rng: np.random.Gene
     act = perform(stage, tasks, draw_start(plan, rng), rng)
     lift = _rise(platform, act.posture.pelvis)
     elsewhere = np.array([k not in (-1, index) for k in act.touched])
-    if (lift[elsewhere] > 0).any() or (lift == lift.max()).mean() < SHARE or lift.max() == 0:
-        raise RefusedError("people use other furniture from the platform, or nobody the seat on it")
+    top = lift.max()
+    on, between = (lift == top).mean(), ((lift > 0) & (lift < top)).mean()
+    if (lift[elsewhere] > 0).any() or top == 0 or on < SHARE or between > SHARE:
+        raise RefusedError("people stay at the edge of the platform, or nobody uses it")
     posture = moved(act.posture, lift[:, None] * np.array([0.0, 1.0, 0.0]))
     high = platform.furniture.top_height
     seat = dataclasses.replace(plan.pieces[index], height=high, support=platform.id)

@@ -22,7 +22,7 @@ from torch import Tensor
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Camera
-from mover.energy.terms.feet import TAIL, FootContacts, feet_term, heights, tilt_prior, up_cam
+from mover.energy.terms.feet import TAIL, FootContacts, feet_term, over_floor, tilt_prior, up_cam
 from mover.geometry.camera import pitch_roll, tilted, to_world
 from mover.stages.config import AlignConfig
 
@@ -97,7 +97,7 @@ def vote(foot_contacts: FootContacts, by: Literal["places", "points"]) -> Votes:
         place_of_row = torch.zeros_like(per_row).scatter(0, row_of, place_of)
         stay = place_of_row.bincount()[place_of].double()
         weight = 1 / (STEP_NOISE**2 + stay * PLACE_NOISE**2) / per_row[row_of]
-    contacts = FootContacts(points, person, frame, foot_contacts.warnings)
+    contacts = dataclasses.replace(foot_contacts, points_cam=points, person=person, frame=frame)
     return Votes(contacts, people, person_of, row_of, place_of, weight)
 
 
@@ -183,7 +183,7 @@ def _linear(
     """Heights above the floor [m] and their derivatives."""
     (pitch, roll), points = at[:2], votes.foot_contacts.points_cam
     offset = at[3:][votes.person_of]
-    residual = heights(points, tilted(pitch, roll), at[2]) - offset
+    residual = over_floor(votes.foot_contacts, tilted(pitch, roll), at[2], offset)
     up = up_cam(pitch, roll)
     by_pitch = up_cam(pitch + math.pi / 2, roll)
     by_roll = torch.stack([up[1], -up[0], torch.zeros_like(pitch)])
@@ -323,6 +323,7 @@ def _best_fit(
     offset = config.offset_prior
     prior = Prior(first, config.tilt_prior, offset if known is None else SIZE_PRIOR, known)
     height = votes.foot_contacts.points_cam @ tilted(first[0], first[1])[:, 1]
+    height = height if (lift := votes.foot_contacts.lift) is None else height - lift
     guesses = [g for g in (known, inputs.ground) if g is not None] or [float(height.median())]
     start = torch.cat([first, first.new_tensor(guesses[:1]), first.new_zeros(len(votes.people))])
     away = torch.cat([first, height.median()[None], torch.zeros_like(start[3:])])
