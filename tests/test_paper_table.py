@@ -253,6 +253,7 @@ def test_noise_is_uniform_and_within_its_level(small_room: KnownRoom) -> None:
             assert change[kind].abs().max() > 0
 
 
+@pytest.mark.slow
 def test_jobs_of_every_kind_run_on_a_capture(
     small_room: KnownRoom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
