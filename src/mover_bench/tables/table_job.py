@@ -42,7 +42,7 @@ from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
 from mover_bench.studies.measures import carry_all
 from mover_bench.studies.variants import withheld
-from mover_bench.tables.rows import Disturbance, disturbance_of, variants
+from mover_bench.tables.rows import PLAIN, Disturbance, disturbance_of, variants
 
 DONE, FAILED = "metrics.json", "failure.json"
 STEPS = 0  # iterations of a stage of the people's fit at most; 0: the preset's
@@ -103,11 +103,9 @@ def do_job(job: TableJob) -> None:
     people = room.bodies
     if variant.bodies and people is not None:
         people = _refined(job, room, capture, variant.bodies)
-    scenes = {
-        "initial": (given.scene, given.bodies),
-        "image": (room.image_only, people),
-        "full": (room.scene, people),
-    }
+    scenes = {"full": (room.scene, people)}
+    if job.name == PLAIN:  # other jobs have no rows of these
+        scenes |= {"initial": (given.scene, given.bodies), "image": (room.image_only, people)}
     measured = {name: measure(job.capture, given, *scene) for name, scene in scenes.items()}
     write_tree(job.folder / DONE, {"key": key_of(job), **measured})
 
