@@ -2,13 +2,14 @@
 
     PYTHONPATH=src python benchmarks/moved.py --seeds 100-109 --out moved
     PYTHONPATH=src python benchmarks/moved.py --sets pushed rolled --seeds 100-104 --out moved
+    PYTHONPATH=src python benchmarks/moved.py --sets moving-moved --seeds 100-102 --out moved
 
 Rebuilds each room of `--sets` with `robust` (finished rooms are kept in `--out`) and prints of each
 moved piece IoU3D in each true stay and, where somebody moves it, in the mean of the frames on the
 way; how far the nearest found beginning or end of a move is from each true one [s]; how many other
-pieces are said to move; and IoU3D of the pieces that never move, as a mean. In the set `unmoved`
-the second visitor of the same room finds everything where it was: the last column of `moved` has
-the difference to it over the same pieces.
+pieces are said to move; and IoU3D of the pieces that never move, as a mean. Beside it that of the
+same pieces of the same room in another set: in `unmoved`, whose second visitor finds everything
+where it was, for `moved`; under a camera that stands still for `moving-moved` and its like.
 """
 
 import argparse
@@ -30,6 +31,12 @@ from mover.pipeline.reconstruct import reconstruct
 from mover_bench.studies.job import noisy_room
 from mover_bench.studies.run import parse_seeds
 from mover_bench.studies.sets import SETS
+
+
+BESIDE = {
+    "moved": "unmoved", "moving-moved": "moved", "moving-pushed": "pushed",
+    "moving-rolled": "rolled",
+}  # fmt: skip
 
 
 def measured(name: str, seed: int, out: Path) -> dict[str, Any]:
@@ -88,7 +95,7 @@ def main() -> None:
         print(f"{name}: piece, IoU3D of each stay | on the way | late | false | the others | time")
         means: list[list[float]] = []
         for seed in parse_seeds(args.seeds):
-            beside = measured("unmoved", seed, args.out) if name == "moved" else None
+            beside = measured(BESIDE[name], seed, args.out) if name in BESIDE else None
             told, mean = line_of(measured(name, seed, args.out), beside)
             means.append(mean)
             print(f"{seed}: {told}", flush=True)

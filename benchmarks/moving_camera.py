@@ -25,7 +25,6 @@ from mover.core.types import CameraPath, Room
 from mover.evaluate.bodies import shared_rows
 from mover.geometry.boxes import box_of
 from mover.geometry.path import is_still
-from mover.pipeline.people import people_of
 from mover.pipeline.presets import ROBUST
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.people.find_depth import pelvis
@@ -85,16 +84,15 @@ def row(name: str, seed: int, out: Path) -> list[float]:
     trial = noisy_room(seed, SETS[name], Run(out / str(seed)))
     begin = time.process_time()
     run = Run(out / name / str(seed))
-    room, people = reconstruct(trial.capture, ROBUST, run), people_of(trial.capture, ROBUST, run)
+    room = reconstruct(trial.capture, ROBUST, run)
     seconds = time.process_time() - begin
     found, true = (s.camera.R_cam_world[:, 1].double() for s in (room.scene, trial.truth))
     angle = float(torch.linalg.cross(found, true).norm().asin().rad2deg())
-    assert people is not None
     assert room.scene.ground is not None
     assert trial.truth.ground is not None
     scale = (0.0, 0.0)
-    if not is_still(people.path):  # the part of the scale that drift does not move
-        scale = scale_error(trial, people.path, seed)
+    if not is_still(room.path):  # the part of the scale that drift does not move
+        scale = scale_error(trial, room.path, seed)
     told = measure(trial, room, run)
     values = [told[stage]["iou3d"] for stage in ("image", "full")]
     floor = 100 * abs(room.scene.ground - trial.truth.ground)

@@ -30,7 +30,6 @@ from mover.core.types import STILL, Bodies, CameraPath, Scene
 from mover.geometry.path import is_still, poses_at
 from mover.geometry.placement import placed_at
 from mover.pipeline.outcome import to_world
-from mover.pipeline.people import people_of
 from mover.pipeline.presets import ROBUST
 from mover.pipeline.reconstruct import reconstruct
 from mover_bench.rooms.camera_path import PATHS, draw_path
@@ -71,13 +70,11 @@ def strip(
 ) -> Float[Tensor, "h w 3"]:
     """Truth and result, one above the other, in some frames or in so many."""
     trial = noisy_room(seed, SETS[name], Run(out / "rooms" / str(seed)))
-    run = Run(out / name / str(seed))
-    room, given = reconstruct(trial.capture, ROBUST, run), people_of(trial.capture, ROBUST, run)
+    room = reconstruct(trial.capture, ROBUST, Run(out / name / str(seed)))
     assert trial.bodies is not None
     assert room.bodies is not None
-    assert given is not None
     true = STILL
-    if not is_still(given.path):
+    if not is_still(room.path):
         rng, kinds = np.random.default_rng([seed, PATHS]), SETS[name].paths
         last, fps = int(trial.bodies.frame.max()), trial.bodies.fps or 1.0
         true = draw_path(last + 1, fps, kinds[seed % len(kinds)], rng)
@@ -86,7 +83,7 @@ def strip(
     if isinstance(frames, int):
         frames = seen[torch.linspace(0, len(seen) - 1, frames + 2).round().long()[1:-1]].tolist()
     above = pictures(trial.truth, to_world(trial.bodies, trial.truth.camera), true, frames, width)
-    below = pictures(replace(room.scene, objects=found), room.bodies, given.path, frames, width)
+    below = pictures(replace(room.scene, objects=found), room.bodies, room.path, frames, width)
     return torch.cat([above, torch.ones(GAP, above.shape[1], 3), below])
 
 

@@ -337,5 +337,7 @@ class Room:
     warnings: tuple[str, ...]
     explanations: tuple[Explanation, ...] = ()
     """Why each object stands where it stands; empty: nobody asked."""
+    path: CameraPath = STILL
+    """Where the cameras of the frames were, in the axes of that of `scene` [m]."""
     proposals: tuple[Proposal, ...] = ()
     """What people rest on that is not in the scene; nothing else depends on them."""

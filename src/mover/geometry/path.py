@@ -21,6 +21,18 @@ def scaled(path: CameraPath, factor: float) -> CameraPath:
     return replace(path, t_reference_camera=path.t_reference_camera * factor)
 
 
+def about(path: CameraPath, view: CameraPath) -> CameraPath:
+    """The path in the axes of another camera, whose one pose is given."""
+    R, t = view.R_reference_camera[0], view.t_reference_camera[0]
+    return CameraPath(path.frame, R.mT @ path.R_reference_camera, (path.t_reference_camera - t) @ R)
+
+
+def reversed_poses(path: CameraPath) -> CameraPath:
+    """From the axes of the reference image's camera into those of each frame's."""
+    back = path.R_reference_camera.mT
+    return CameraPath(path.frame, back, -(back @ path.t_reference_camera[..., None])[..., 0])
+
+
 def poses_at(path: CameraPath, frame: Int[Tensor, " rows"]) -> CameraPath:
     """The poses of some frames; evenly between two known ones, at the ends' beyond them."""
     R, t = path.R_reference_camera, path.t_reference_camera
@@ -52,10 +64,10 @@ def from_reference(
 
 def resampled(
     image: Bool[Tensor, "images h w"],
-    depth: Float[Tensor, "wh ww"],
+    depth: Float[Tensor, "*depths wh ww"],
     views: tuple[Float[Tensor, "3 3"], tuple[slice, slice]],
     pose: CameraPath,
-) -> Bool[Tensor, "images wh ww"]:
+) -> Bool[Tensor, "images *depths wh ww"]:
     """Images of another camera where it sees the surface that this one sees at each pixel.
 
     Args:
@@ -71,7 +83,7 @@ def resampled(
     )
     pixel = torch.stack(torch.broadcast_tensors(x, y[:, None], torch.ones(())), -1)
     points = (pixel @ torch.linalg.inv(K).mT) * depth[..., None]
-    there = project(from_reference(points.flatten(0, 1)[None], pose)[0], K).floor().long()
+    there = project(from_reference(points.flatten(0, -2)[None], pose)[0], K).floor().long()
     height, width = image.shape[-2:]
     inside = ((there >= 0) & (there < torch.tensor([width, height]))).all(-1)
     column, row = there[:, 0].clamp(0, width - 1), there[:, 1].clamp(0, height - 1)

@@ -4,6 +4,10 @@ The whole room is rebuilt first, as if nothing moved. Then each segment of each 
 small reconstruction of its own: camera, floor, people and all other objects stay as they were
 found, the object's mask is that of the segment, and only the people of the segment speak. The
 segment of the reference image comes first and tells the size, which the others keep.
+
+Under a moving camera the other segments have a reference image of their own: the frame that shows
+most of the object, with the masks that were given of it. The reconstruction then stands about the
+camera of that frame, and its place is carried back into the room.
 """
 
 from collections.abc import Callable
@@ -11,21 +15,39 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from mover.bodies.parts import parts_of
 from mover.core.records import rows_of
 from mover.core.run import Run
-from mover.core.types import Camera, Capture, Detection, Masks, Proposal, Room, SceneObject, Segment
+from mover.core.types import (
+    STILL,
+    Bodies,
+    Camera,
+    CameraPath,
+    Capture,
+    DepthImage,
+    Detection,
+    Masks,
+    People,
+    Proposal,
+    Room,
+    SceneObject,
+    Segment,
+)
 from mover.geometry.boxes import beyond, box_of
-from mover.geometry.path import is_still
+from mover.geometry.camera import heading
+from mover.geometry.path import about, is_still, poses_at, reversed_poses
 from mover.geometry.placement import ENDLESS, hit_floor, placed_at
 from mover.geometry.rle import encode, tight_box
+from mover.geometry.rotations import rot_y
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.outcome import Spans, told_of_proposals
+from mover.pipeline.people import carried, depths_of, found_path
 from mover.pipeline.presets import Config, with_sizes
 from mover.stages.config import ExplainConfig, ProposeConfig, SpreadConfig
+from mover.stages.objects.find_image_cues import evidence_at
 from mover.stages.objects.find_moves import STEP, MoveInputs, Stay, find_moves, thin
 from mover.stages.objects.follow_movers import Between, Followed, follow_mover
 
@@ -45,16 +67,47 @@ class Solving:
 
 
 def stays_of(capture: Capture, config: Config, run: Run) -> Stays:
-    """When each object that is moved stands where; nothing without masks of it in the frames."""
-    if capture.furniture is None or not is_still(capture.path):
+    """When each object that is moved stands where; nothing without masks of it in the frames.
+
+    What is moved before a moving camera bends the path that is found with it. So moves are looked
+    for along the path as it was given first, then along the one that the others correct.
+    """
+    if is_still(capture.path) or capture.bodies is None or capture.furniture is None:
+        return _stays_along(capture.path, capture, config, run)
+    people = capture.bodies, parts_of(capture.bodies, capture.scene.camera.R_cam_world[:, 1])
+    bare = replace(capture, furniture=None)
+    first = _stays_along(found_path(people, bare, config, run)[0], capture, config, run)
+    if 2 * len(first) > len(capture.scene.objects):  # then it is the path that moves
+        first = {}
+    steady = replace(capture, furniture=_where_shown(first, capture))
+    return _stays_along(found_path(people, steady, config, run)[0], capture, config, run)
+
+
+def _stays_along(path: CameraPath, capture: Capture, config: Config, run: Run) -> Stays:
+    """The same along a path [m]."""
+    camera = capture.scene.camera
+    known = {p.annotation: p for p in capture.scene.objects if p.annotation is not None}
+    if capture.furniture is None or not known:
         return {}
-    numbers = tuple(p.annotation for p in capture.scene.objects if p.annotation is not None)
     fps = None if capture.bodies is None else capture.bodies.fps
-    inputs = MoveInputs(capture.furniture, capture.people, numbers, fps)
+    depth = depths_of(tuple(known.values()), camera)
+    inputs = MoveInputs(capture.furniture, capture.people, tuple(known), fps, depth, path, camera.K)
     found: Stays = {}
     for stay in run.stage(find_moves, inputs, config.moves).stays:
         found.setdefault(stay.annotation, []).append(stay)
     return found
+
+
+def _where_shown(stays: Stays, capture: Capture) -> People | None:
+    """The objects' masks of the frames in which they are where the reference image shows them."""
+    if capture.furniture is None:
+        return None
+    frame, number = capture.furniture.frame, capture.furniture.person
+    gone = torch.zeros_like(frame, dtype=torch.bool)
+    for annotation, mine in stays.items():
+        first, last = mine[_shown_in(mine, capture)].sure
+        gone = gone | ((number == annotation) & ((frame < first) | (frame > last)))
+    return rows_of(capture.furniture, ~gone)
 
 
 def away(stays: Stays, capture: Capture) -> Spans:
@@ -74,7 +127,8 @@ def with_moves(solving: Solving, pinned: tuple[str, ...]) -> Room:
     capture = replace(given, scene=replace(given.scene, objects=pieces))
     solving = replace(solving, capture=capture)
     stays = stays_of(capture, config, run)
-    room = solving.solve(capture, config, run, pinned, away(stays, capture))
+    steady = replace(capture, furniture=_where_shown(stays, capture))
+    room = solving.solve(steady, config, run, pinned, away(stays, capture))
     for piece in room.scene.objects if room.scene.ground is not None else ():
         mine = stays.get(-1 if piece.annotation is None else piece.annotation)
         if mine:
@@ -138,16 +192,17 @@ def _places(
     shown = _shown_in(stays, capture)
     given = next(p for p in capture.scene.objects if p.id == piece.id)
     piece = replace(piece, scale=given.scale)
+    views = [_view(stays, k, room, capture) for k in range(len(stays))]
+    feet = [_foot(view, stays[0].annotation, room) for view in views]
     held, found = _held(config), dict[int, SceneObject]()
     told: tuple[str, ...] = ()
     for index in sorted(range(len(stays)), key=lambda k: k != shown):
-        begins = replace(
-            piece, t_world_object=piece.t_world_object + _shift(stays, index, shown, room)
-        )
-        part = _segment(room, begins, (stays, index), solving)
+        begins = replace(piece, t_world_object=piece.t_world_object + feet[index] - feet[shown])
+        part = _segment(room, begins, (stays, index), views[index], solving)
         solved = solving.solve(part, held, solving.run, others, ())
         told = told if index == shown else (*told, *solved.warnings)
-        found[index] = next(p for p in solved.scene.objects if p.id == piece.id)
+        there = next(p for p in solved.scene.objects if p.id == piece.id)
+        found[index] = _seen_from(there, views[index], back=True)
         piece, held = found[shown], with_sizes(_held(config), RIGID, RIGID)
     return [found[k] for k in range(len(stays))], told
 
@@ -162,53 +217,117 @@ def _shown_in(stays: list[Stay], capture: Capture) -> int:
     return max(range(len(stays)), key=lambda k: common[k])
 
 
-def _shift(stays: list[Stay], index: int, shown: int, room: Room) -> Float[Tensor, "3"]:
-    """How far the foot of an object went over the floor from the reference to a stay [m]."""
-    ground = torch.tensor(room.scene.ground)
-    feet = torch.stack([_foot(stays[k].mask, room.scene.camera) for k in (index, shown)])
-    there, here = hit_floor(feet, room.scene.camera.R_cam_world, ground)
-    return there - here
+@dataclass(frozen=True)
+class _View:
+    """Where a stay is seen from, and what is seen there."""
+
+    pose: CameraPath
+    """One, in the axes of the reference image's camera."""
+    camera: Camera
+    """In a world about it."""
+    place: Float[Tensor, "3"]
+    """Of that camera in the room [m]."""
+    turn: float
+    """From the room's axes to that world's about +y [rad]."""
+    detections: tuple[Detection, ...]
+    people: Masks | None
+    """Who hides something there."""
+    depth: DepthImage | None
+    """Measured there."""
 
 
-def _foot(mask: Bool[Tensor, "h w"], camera: Camera) -> Float[Tensor, "3"]:
-    """The ray through the middle of a mask's lower edge, in camera axes."""
-    left, _, right, low = (STEP * tight_box(mask)).tolist()
+def _view(stays: list[Stay], index: int, room: Room, capture: Capture) -> _View:
+    """The reference image, where it shows the stay or the camera stands still; else a frame."""
+    stay, camera, people = stays[index], room.scene.camera, capture.reference_people
+    here = STILL, camera, torch.zeros(3), 0.0
+    if is_still(room.path):
+        seen = (_as_in(d, stay) if d.id == stay.annotation else d for d in capture.detections)
+        return _View(*here, tuple(seen), people, capture.depth)
+    if index == _shown_in(stays, capture):
+        return _View(*here, capture.detections, people, capture.depth)
+    pose = poses_at(room.path, torch.tensor([stay.best]))
+    R = pose.R_reference_camera[0].mT @ camera.R_cam_world
+    turn = heading(R)
+    about_it = replace(camera, R_cam_world=R @ rot_y(torch.tensor(turn)).mT)
+    place = camera.R_cam_world.mT @ pose.t_reference_camera[0]
+    return _View(pose, about_it, place, turn, *_shown_at(stay.best, capture), None)
+
+
+def _shown_at(frame: int, capture: Capture) -> tuple[tuple[Detection, ...], Masks]:
+    """What a frame shows of the objects, and the people before them."""
+    seen, pieces = evidence_at(capture, frame), capture.scene.objects
+    height, width = seen.people.shape
+    found = tuple(
+        Detection(piece.annotation, piece.category, box, Masks(height, width, (encode(mask),)), 1.0)
+        for piece, there, box, mask in zip(
+            pieces, seen.detected.tolist(), seen.boxes, seen.masks, strict=True
+        )
+        if there and piece.annotation is not None
+    )
+    return found, Masks(height, width, (encode(seen.people),))
+
+
+def _seen_from(piece: SceneObject, view: _View, back: bool = False) -> SceneObject:
+    """An object of the room in the world about a view, or the way back."""
+    if back:
+        t = rot_y(torch.tensor(-view.turn)) @ piece.t_world_object + view.place
+        return replace(piece, t_world_object=t, yaw=piece.yaw - view.turn)
+    t = rot_y(torch.tensor(view.turn)) @ (piece.t_world_object - view.place)
+    return replace(piece, t_world_object=t, yaw=piece.yaw + view.turn)
+
+
+def _foot(view: _View, annotation: int, room: Room) -> Float[Tensor, "3"]:
+    """Where the ray through the middle of an object's lower edge meets the floor [m]."""
+    left, _, right, low = next(d.box for d in view.detections if d.id == annotation).tolist()
     pixel = torch.tensor([(left + right) / 2, low, 1.0])
-    return torch.linalg.solve(camera.K, pixel)
+    ray = torch.linalg.solve(view.camera.K, pixel)
+    foot = hit_floor(ray, view.camera.R_cam_world, torch.tensor(room.scene.ground) - view.place[1])
+    return rot_y(torch.tensor(-view.turn)) @ foot + view.place
 
 
 def _segment(
-    room: Room, piece: SceneObject, stay: tuple[list[Stay], int], solving: Solving
+    room: Room, piece: SceneObject, stay: tuple[list[Stay], int], view: _View, solving: Solving
 ) -> Capture:
     """A capture of one stay: its people and its mask before the room as it was found."""
     capture, (stays, index) = solving.capture, stay
     this = stays[index]
-    camera, ground = room.scene.camera, room.scene.ground
-    assert ground is not None
-    bodies, people = room.bodies, capture.people
+    bodies, people = _in_frames(room), capture.people
     margin = 0.0 if bodies is None else solving.config.moves.margin * (bodies.fps or 0.0)
     begin = this.sure[0] + margin if index else -ENDLESS
     end = this.sure[1] - margin if index + 1 < len(stays) else ENDLESS
     if bodies is not None:
-        bodies = into_camera(bodies, camera.R_cam_world)
         inside = (bodies.frame >= begin) & (bodies.frame <= end)
         bodies = rows_of(bodies, inside) if bool(inside.any()) else None
     if people is not None:
         people = rows_of(people, (people.frame >= begin) & (people.frame <= end))
     others = (replace(placed_at(p, this.sure[0]), segments=()) for p in room.scene.objects)
-    objects = tuple(piece if p.id == piece.id else p for p in others)
-    seen = tuple(_as_in(d, this) if d.id == this.annotation else d for d in capture.detections)
+    objects = tuple(_seen_from(piece if p.id == piece.id else p, view) for p in others)
+    assert room.scene.ground is not None
+    ground = room.scene.ground - float(view.place[1])
+    scene = replace(room.scene, camera=view.camera, ground=ground, objects=objects)
     return replace(
-        capture, scene=replace(room.scene, objects=objects), camera_height=-ground,
-        detections=seen, bodies=bodies, people=people, touch=None, hypotheses=(), furniture=None,
-        warnings=(),
+        capture, scene=scene, camera_height=-ground, detections=view.detections,
+        reference_people=view.people, bodies=bodies, people=people, touch=None, hypotheses=(),
+        furniture=None, warnings=(), path=about(room.path, view.pose),
+        depth=view.depth,
     )  # fmt: skip
+
+
+def _in_frames(room: Room) -> Bodies | None:
+    """The people of a room in the axes of the cameras of their frames."""
+    if room.bodies is None:
+        return None
+    bodies = into_camera(room.bodies, room.scene.camera.R_cam_world)
+    if is_still(room.path):
+        return bodies
+    frames = torch.cat([room.path.frame, bodies.frame]).unique()
+    return carried(bodies, reversed_poses(poses_at(room.path, frames)))
 
 
 def _as_in(found: Detection, stay: Stay) -> Detection:
     """A detection as it is in a stay."""
     if found.mask is None:
-        return found
+        return replace(found, box=STEP * tight_box(stay.mask))
     big = stay.mask.repeat_interleave(STEP, 0).repeat_interleave(STEP, 1)
     mask = torch.zeros(found.mask.height, found.mask.width, dtype=torch.bool)
     height, width = (min(a, b) for a, b in zip(big.shape, mask.shape, strict=True))
@@ -222,6 +341,7 @@ def _held(config: Config) -> Config:
     return replace(
         config,
         correct_depth=False,
+        path="keep",
         shape="keep",
         height_spread=0.0,
         focal=replace(config.focal, spread=0.0),

@@ -173,6 +173,7 @@ def unfurnished(capture: Capture, people: PeopleState | None) -> Room:
         bodies=None if people is None else to_world(people.bodies, camera),
         kept=None if people is None else people.kept, proxies=(), evidence=(),
         covariance=None if found is None else found.covariance, traces={}, warnings=warnings,
+        path=capture.path if people is None else people.path,
     )  # fmt: skip
 
 
@@ -212,6 +213,7 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
         traces=state.traces,
         warnings=tuple(dict.fromkeys(warnings)),
         explanations=explanations_of(context, state, people),
+        path=capture.path if people is None else people.path,
     )
 
 

@@ -1,5 +1,6 @@
 """The people of a run: where they are about the reference camera, and the floor they tell."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from mover.bodies.parts import Parts, parts_of
 from mover.core.run import Run
-from mover.core.types import Bodies, Camera, CameraPath, Capture
+from mover.core.types import Bodies, Camera, CameraPath, Capture, SceneObject
 from mover.energy.terms.feet import FootContacts
 from mover.furniture.floor import is_platform
 from mover.geometry.boxes import box_of
@@ -37,24 +38,22 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     if bodies is None:
         return None
     parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
-    path, told = _in_metres(bodies, parts, capture.path, config, run)
+    path, told, along_views = found_path((bodies, parts), capture, config, run)
     kept = run.stage(select_frames, SelectInputs(carried(bodies, path)), config.select).keep
     camera, warnings = _with_lens(capture, path, kept, config, run)
     if config.correct_depth and capture.people is not None:
         inputs = DepthInputs(bodies, parts, kept, capture.people, hiding(capture, path), camera)
         depth = run.stage(find_depth, inputs, config.depth)
         bodies, warnings = apply_depth(bodies, depth), (*warnings, *depth.warnings)
-        path, told = _in_metres(bodies, parts, capture.path, config, run)
+        path, told, along_views = found_path((bodies, parts), capture, config, run)
     touch = capture.touch if config.foot_contacts.given else None
 
     def feet_on(path: CameraPath) -> FootContacts:
         standing = FootContactInputs(carried(bodies, path), parts, kept, camera, touch)
         return run.stage(find_foot_contacts, standing, config.foot_contacts)
 
-    seen = _along_views((bodies, parts), path, capture, config, run)
-    path, told = seen or (path, told)
     feet, loose = feet_on(path), torch.zeros(3, 3)
-    if not is_still(path) and seen is None:  # furniture in further frames tells more
+    if not _is_known(path, config) and not along_views:  # furniture in further frames tells more
         inputs = DriftInputs(feet, camera, path, bodies.fps or 1.0)
         drift = run.stage(find_drift, inputs, config.drift)
         path, told = undrifted(path, drift), (*told, *drift.warnings)
@@ -83,48 +82,51 @@ def _lifts(feet: FootContacts, capture: Capture) -> Float[Tensor, " soles"] | No
     return found
 
 
-def _in_metres(
-    bodies: Bodies, parts: Parts, path: CameraPath, config: Config, run: Run
-) -> tuple[CameraPath, tuple[str, ...]]:
-    """A path in the people's scale, and what is odd about it."""
-    if is_still(path):
-        return path, ()
-    scale = run.stage(find_scale, ScaleInputs(bodies, parts, path), config.scale)
-    return scaled(path, scale.scale), scale.warnings
+def _is_known(path: CameraPath, config: Config) -> bool:
+    return is_still(path) or config.path == "keep"
 
 
-def _along_views(
-    people: tuple[Bodies, Parts], path: CameraPath, capture: Capture, config: Config, run: Run
-) -> tuple[CameraPath, tuple[str, ...]] | None:
-    """The path [m] without what furniture in further frames finds wrong; None: there is none.
+def found_path(
+    people: tuple[Bodies, Parts], capture: Capture, config: Config, run: Run
+) -> tuple[CameraPath, tuple[str, ...], bool]:
+    """The path in the people's scale, what is odd about it, and whether furniture told its errors.
 
     What drifts is of another length, so that its scale is found again without.
     """
+    if _is_known(capture.path, config):
+        return capture.path, (), False
+    scale = run.stage(find_scale, ScaleInputs(*people, capture.path), config.scale)
+    path = scaled(capture.path, scale.scale)
     views = _views(path, capture, config, run)
     if views is None:
-        return None
+        return path, scale.warnings, False
     scale = run.stage(find_scale, ScaleInputs(*people, aligned(path, views)), config.scale)
     path = scaled(path, scale.scale)
     views = _views(path, capture, config, run) or views
-    return aligned(path, views), (*scale.warnings, *views.warnings)
+    return aligned(path, views), (*scale.warnings, *views.warnings), True
 
 
 def _views(path: CameraPath, capture: Capture, config: Config, run: Run) -> Views | None:
     """What furniture in further frames says of a path [m]."""
-    if is_still(path) or capture.furniture is None:
+    if capture.furniture is None:
         return None
     found = {one.id: one for one in capture.detections}
     camera = capture.scene.camera
     known = [p for p in capture.scene.objects if p.annotation in found]
-    middle = [camera.R_cam_world @ box_of(p).center for p in known]
     if not known:
         return None
     inputs = ViewInputs(
         camera, tuple(found[p.annotation] for p in known if p.annotation is not None),
-        torch.stack(middle)[:, 2].clamp_min(NEAREST), capture.furniture, capture.people, path,
+        depths_of(known, camera), capture.furniture, capture.people, path,
     )  # fmt: skip
     views = run.stage(align_views, inputs, config.views)
     return views if len(views.frame) > 1 else None
+
+
+def depths_of(pieces: Sequence[SceneObject], camera: Camera) -> Float[Tensor, " objects"]:
+    """How far the middle of each object is from the reference image's camera [m]."""
+    middle = [camera.R_cam_world @ box_of(piece).center for piece in pieces]
+    return torch.stack(middle)[:, 2].clamp_min(NEAREST)
 
 
 def as_given(capture: Capture) -> Bodies:

@@ -55,6 +55,8 @@ class Config:
     """What furniture in further frames tells of a moving camera's path."""
     drift: DriftConfig = field(default_factory=DriftConfig)
     """The slow error of a moving camera's path."""
+    path: Literal["find", "keep"] = "find"
+    """Scale and errors of a moving camera's path are found, or it is true as it is, in metres."""
     align: AlignConfig = field(default_factory=AlignConfig)
     """Camera pitch, roll and ground from the feet."""
     contacts: ContactConfig = field(default_factory=ContactConfig)

@@ -16,9 +16,11 @@ from torch import Tensor
 from mover.core.records import map_tensors
 from mover.core.types import CameraPath, Capture, People
 from mover.geometry.path import from_reference, is_still, poses_at, scaled
+from mover.geometry.placement import placed_at
 from mover.geometry.raster import first_hit
 from mover.geometry.rotations import axis_angle
 from mover.io.capture.pose_file import moved
+from mover_bench.rooms.compose import Plan
 from mover_bench.rooms.config import NoiseConfig, PathConfig
 from mover_bench.rooms.known import KnownRoom, one_thread, pieces_seen, rounded, visible
 from mover_bench.rooms.noise import add_noise, slow
@@ -130,11 +132,24 @@ def furniture_seen(room: KnownRoom, path: CameraPath, every: int) -> People:
 
 def _from(room: KnownRoom, path: CameraPath) -> Callable[[int], tuple[Tensor, Tensor]]:
     """Depth [m] and face of the furniture at each pixel of a frame."""
-    camera, (verts, faces, _) = room.truth.camera, furniture(room.plan)
-    still, size = room.plan.view.seen(verts)[None], (camera.height, camera.width)
+    camera = room.truth.camera
+    size = (camera.height, camera.width)
 
     def drawn(frame: int) -> tuple[Tensor, Tensor]:
+        verts, faces, _ = furniture(_plan_in(room, frame))
+        still = room.plan.view.seen(verts)[None]
         points = from_reference(still, poses_at(path, torch.tensor([frame])))[0]
         return first_hit(points, faces, camera.K, size)
 
     return drawn
+
+
+def _plan_in(room: KnownRoom, frame: int) -> Plan:
+    """The room with its moved pieces where they stand in a frame."""
+    pieces = list(room.plan.pieces)
+    for index, true in enumerate(room.truth.objects):
+        if true.segments:
+            now = placed_at(true, frame)
+            x, _, z = now.t_world_object.tolist()
+            pieces[index] = dataclasses.replace(pieces[index], at=(x, z), heading=float(now.yaw))
+    return dataclasses.replace(room.plan, pieces=tuple(pieces))

@@ -114,6 +114,7 @@ _MOVING = (
     replace(_SLAM, travel=0.1, turn=12.0, hand=0.01),
     replace(_SLAM, travel=0.05, turn=1.0, hand=0.015),
 )
+_MOVING_OFTEN = tuple(replace(path, views=0.4) for path in _MOVING)
 
 SETS: dict[str, RoomSet] = {
     "mini": RoomSet(
@@ -193,6 +194,19 @@ SETS: dict[str, RoomSet] = {
     "moving-views": RoomSet(
         "The rooms of `moving-camera`; the furniture is segmented in a frame every 4 s, too.",
         "1000-1029", "100-129", paths=tuple(replace(path, views=4.0) for path in _MOVING),
+    ),
+    "moving-moved": RoomSet(
+        "The rooms of `moved` seen by the cameras of `moving-camera`; the furniture is segmented in"
+        " every second frame.",
+        "1000-1029", "100-129", _MOVED, paths=_MOVING_OFTEN,
+    ),
+    "moving-pushed": RoomSet(
+        "The rooms of `pushed` seen by the cameras of `moving-moved`.",
+        "1000-1029", "100-129", replace(_HANDLED, moved="pushed"), paths=_MOVING_OFTEN,
+    ),
+    "moving-rolled": RoomSet(
+        "The rooms of `rolled` seen by the cameras of `moving-moved`.",
+        "1000-1029", "100-129", replace(_HANDLED, moved="rolled"), paths=_MOVING_OFTEN,
     ),
 }  # fmt: skip
 """All sets by name."""

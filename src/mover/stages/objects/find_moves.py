@@ -5,26 +5,37 @@ stood still: by the common pixels' share of the smaller of both, for what is hid
 other furniture only grows or shrinks, and what is moved does both. Each stretch between two moves
 is a stay, in which the object stands; its mask is what most of its frames show where nobody is
 before it. Stretches that are too short are moves themselves: the object is carried or pushed.
+
+The masks of a moving camera are compared in the image of the reference camera, to which they are
+carried as if the object were flat, at several depths: what stands still is alike at one of them. A
+camera that stands still has one depth, and nothing to carry.
 """
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from mover.core.observe import Observer, Step, silent
-from mover.core.records import record
-from mover.core.types import Masks, People
-from mover.geometry.rle import thinned
+from mover.core.records import record, rows_of
+from mover.core.types import STILL, CameraPath, Masks, People
+from mover.geometry.camera import project
+from mover.geometry.path import is_still, poses_at, resampled
+from mover.geometry.rle import area, decode, thinned, tight_box
 from mover.stages.config import MoveConfig
 
 STEP = 3  # [px] from one pixel that is compared to the next
+WIDE = 480  # [px]; masks of a wider image are carried by so many times longer steps
 UNSEEN = 2.0  # more alike than any two masks can be: nothing is said against it
+NEAREST, FARTHEST = 0.7, 1.5  # times its first depth: what is moved goes so near or so far
+SWEEP = 2.0  # [steps] by which a mask is carried from one depth to the next, at most
+RELIEF = 0.07  # of its depth: what stands still is not flat, so that carried outlines differ
 
 
 @record
@@ -37,6 +48,12 @@ class MoveInputs:
     annotations: tuple[int, ...]
     """Of the objects."""
     fps: float | None
+    depth: Float[Tensor, " objects"] = torch.zeros(0)
+    """Only of a moving camera, as is all that follows: of the middle of each object from the
+    reference image's camera, as first guessed [m]."""
+    path: CameraPath = STILL
+    """[m]"""
+    K: Float[Tensor, "3 3"] = torch.eye(3)
 
 
 @record
@@ -47,9 +64,11 @@ class Stay:
     first: int
     """Its first frame; the time ends where that of the next begins."""
     mask: Bool[Tensor, "h w"]
-    """What is seen of it, at a third of the image's resolution."""
+    """What the reference image's camera sees of it, at a third of the image's resolution."""
     sure: tuple[int, int]
     """First and last frame that show it there."""
+    best: int
+    """The frame that shows most of it."""
 
 
 @record
@@ -63,53 +82,126 @@ class Moves:
 def find_moves(inputs: MoveInputs, config: MoveConfig, observe: Observer = silent) -> Moves:
     """The change points of each object.
 
-    The object that changes most is taken first; where it is seen in one of its stays, it may hide
-    or uncover others, which are looked at again without these pixels.
+    The object that changes most is taken first; where it is seen, it may hide or uncover others,
+    which are looked at again without these pixels.
     """
-    rows = {n: _rows_of(inputs.furniture, n) for n in inputs.annotations}
-    hidden = cache(lambda frame: _hidden(inputs.people, frame))
-    changed: dict[int, float] = {}
-    for index, (number, mine) in enumerate(rows.items()):
-        observe(Step("find_moves", index, len(rows)))
-        changed[number] = _least_alike(_stays(inputs, mine, hidden, config), config)
+    seen = _sights(inputs)
+    alone: dict[int, list[_Run]] = {}
+    for index, (number, sight) in enumerate(seen.items()):
+        observe(Step("find_moves", index, len(seen)))
+        alone[number] = _stays(sight, config)
+    changed = {n: _least_alike(stays, seen[n], config) for n, stays in alone.items()}
     found: list[Stay] = []
-    blocked: Bool[Tensor, "h w"] | None = None
+    moved: tuple[_Sight, ...] = ()
     for number in sorted((n for n, alike in changed.items() if alike < 1), key=changed.__getitem__):
-        stays = _stays(inputs, rows[number], hidden, config, blocked)
+        sight = seen[number]
+        stays = _stays(sight, config, moved) if moved else alone[number]
         if len(stays) > 1:
             starts = [0, *((a.sure + b.first + 1) // 2 for a, b in pairwise(stays))]
-            found += [
-                Stay(number, start, stay.usual, (stay.first, stay.sure))
-                for start, stay in zip(starts, stays, strict=True)
-            ]
-            seen = torch.stack([stay.usual for stay in stays]).any(0)
-            blocked = seen if blocked is None else blocked | seen
+            found += [_told(number, *pair, sight) for pair in zip(starts, stays, strict=True)]
+            moved = (*moved, sight)
     return Moves(tuple(found))
 
 
-def _rows_of(furniture: People, number: int) -> list[int]:
-    """Rows of one object in the order of their frames."""
-    rows = (furniture.person == number).nonzero()[:, 0]
-    return rows[furniture.frame[rows].argsort()].tolist()
-
-
-def _least_alike(stays: "list[_Run]", config: MoveConfig) -> float:
+def _least_alike(stays: "list[_Run]", sight: "_Sight", config: MoveConfig) -> float:
     """How alike the two stays are that differ most; 1 where there is but one."""
-    return min((_likeness(a, b, config) for a, b in pairwise(stays)), default=UNSEEN)
+    return min((_likeness(a, b, sight, config) for a, b in pairwise(stays)), default=UNSEEN)
 
 
-def thin(masks: Masks, row: int) -> Bool[Tensor, "h w"]:
+def thin(masks: Masks, row: int, step: int = STEP) -> Bool[Tensor, "h w"]:
     """One of the masks, at the resolution of the stays."""
-    return torch.from_numpy(thinned(masks, row, STEP).copy())
+    return torch.from_numpy(thinned(masks, row, step).copy())
 
 
-def _hidden(people: People | None, frame: int) -> Bool[Tensor, "h w"] | None:
-    """Pixels of people in a frame, and those beside them; None: there are none."""
+def _hidden(people: People | None, frame: int, step: int) -> Bool[Tensor, "h w"] | None:
+    """Pixels of some rows of a frame, and those beside them; None: there are none."""
     present = [] if people is None else (people.frame == frame).nonzero()[:, 0].tolist()
     if people is None or not present:
         return None
-    hidden = torch.stack([thin(people.masks, row) for row in present]).any(0)
+    hidden = torch.stack([thin(people.masks, row, step) for row in present]).any(0)
     return max_pool2d(hidden[None].float(), 3, 1, 1)[0] > 0
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """How one object is looked at."""
+
+    furniture: People
+    """Its masks, in the order of their frames."""
+    hidden: Callable[[int], Bool[Tensor, "h w"] | None]
+    """What people hide in a frame."""
+    fps: float | None
+    path: CameraPath
+    step: int
+    """From one pixel that is compared to the next [px]."""
+    K: Float[Tensor, "3 3"]
+    """Of the thinner image."""
+    depth: Float[Tensor, " depths"]
+    """At which it is compared [m]."""
+    window: tuple[slice, slice]
+    """Rows and columns of the thinner image of the reference camera in which a moving camera sees
+    it."""
+    loose: int
+    """By how much carried outlines of it differ while it stands still [steps]."""
+
+
+def _sights(inputs: MoveInputs) -> dict[int, _Sight]:
+    """Each object, by its annotation."""
+    still = is_still(inputs.path)
+    step = STEP if still else STEP * max(1, round(inputs.furniture.masks.width / WIDE))
+    hidden = cache(lambda frame: _hidden(inputs.people, frame, step))
+    K = inputs.K / torch.tensor([[step], [step], [1.0]])
+    found: dict[int, _Sight] = {}
+    for index, number in enumerate(inputs.annotations):
+        rows = (inputs.furniture.person == number).nonzero()[:, 0]
+        mine = rows_of(inputs.furniture, rows[inputs.furniture.frame[rows].argsort()])
+        here = torch.ones(1), (slice(0, 0), slice(0, 0)), 0
+        sight = _Sight(mine, hidden, inputs.fps, inputs.path, step, K, *here)
+        if len(rows) and not still:
+            sight = _swept(sight, float(inputs.depth[index]))
+        found[number] = sight
+    return found
+
+
+def _swept(sight: _Sight, depth: float) -> _Sight:
+    """The depths at which what a moving camera sees is compared, and where it is seen then."""
+    poses = poses_at(sight.path, sight.furniture.frame)
+    near, far = 1 / (NEAREST * depth), 1 / (FARTHEST * depth)
+    at = torch.cat([torch.zeros(1, 3), poses.t_reference_camera])
+    moves = float((at.amax(0) - at.amin(0)).norm() * sight.K[0, 0])  # of what is 1 m away
+    depths = 1 / torch.linspace(near, far, 1 + math.ceil(moves * (near - far) / SWEEP))
+    masks = (decode(sight.furniture.masks, row) for row in range(len(poses.frame)))
+    boxes = torch.stack([tight_box(mask) for mask in masks]) / sight.step
+    corner = torch.stack([boxes[:, [0, 2, 0, 2]], boxes[:, [1, 1, 3, 3]]], -1)
+    ray = torch.nn.functional.pad(corner, (0, 1), value=1.0) @ torch.linalg.inv(sight.K).mT
+    ray = ray @ poses.R_reference_camera.mT
+    reach = (depths[:, None, None] - poses.t_reference_camera[:, None, 2]) / ray[..., 2]
+    point = poses.t_reference_camera[:, None] + reach[..., None] * ray
+    low, high = (
+        end(project(point, sight.K).flatten(0, -2), 0)[0] for end in (torch.min, torch.max)
+    )
+    (left, top), (right, bottom) = low.floor().long().tolist(), high.ceil().long().tolist()
+    window = slice(top, bottom), slice(left, right)
+    return replace(sight, depth=depths, window=window, loose=round(moves * RELIEF / depth))
+
+
+def _seen(
+    sight: _Sight, row: int, moved: tuple[_Sight, ...]
+) -> tuple[Bool[Tensor, "depths h w"], Bool[Tensor, "depths h w"]]:
+    """Where an object is seen in one of its frames, and where it could be seen, at each depth."""
+    seen, frame = thin(sight.furniture.masks, row, sight.step), sight.furniture.frame[row]
+    others = (_hidden(one.furniture, int(frame), sight.step) for one in moved)
+    before = [sight.hidden(int(frame)), *others]
+    hidden = [mask for mask in before if mask is not None]
+    free = ~torch.stack(hidden).any(0) if hidden else torch.ones_like(seen)
+    if is_still(sight.path):
+        return (seen & free)[None], free[None]
+    pose, (rows, columns) = poses_at(sight.path, frame[None]), sight.window
+    size = rows.stop - rows.start, columns.stop - columns.start
+    both = torch.stack([seen & free, free])
+    depth = sight.depth[:, None, None].expand(-1, *size)
+    there, could = resampled(both, depth, (sight.K, sight.window), pose).unbind(0)
+    return there, could
 
 
 @dataclass(frozen=True)
@@ -120,13 +212,13 @@ class _Run:
     last: int
     sure: int
     """The last that shows enough of it."""
-    hits: Int[Tensor, "h w"]
+    hits: Int[Tensor, "depths h w"]
     """In how many frames it is seen."""
-    times: Int[Tensor, "h w"]
+    times: Int[Tensor, "depths h w"]
     """In how many it could be seen."""
 
     @property
-    def usual(self) -> Bool[Tensor, "h w"]:
+    def usual(self) -> Bool[Tensor, "depths h w"]:
         """What most frames show."""
         return 2 * self.hits > self.times
 
@@ -137,41 +229,73 @@ class _Run:
         return _Run(other.first, self.last, last, hits, times)
 
 
-def _stays(
-    inputs: MoveInputs,
-    rows: list[int],
-    hidden: Callable[[int], Bool[Tensor, "h w"] | None],
-    config: MoveConfig,
-    blocked: Bool[Tensor, "h w"] | None = None,
-) -> list[_Run]:
+def _stays(sight: _Sight, config: MoveConfig, moved: tuple[_Sight, ...] = ()) -> list[_Run]:
     """The stretches in which an object stands."""
     runs: list[_Run] = []
-    for row in rows:  # what is usual grows with each frame
-        seen, frame = thin(inputs.furniture.masks, row), int(inputs.furniture.frame[row])
-        before = hidden(frame)
-        free = torch.ones_like(seen) if before is None else ~before
-        free = free if blocked is None else free & ~blocked
-        run = _Run(frame, frame, frame, (seen & free).long(), free.long())
-        alike = _likeness(run, runs[-1], config) if runs else 0.0
+    for row, frame in enumerate(sight.furniture.frame.tolist()):  # what is usual grows
+        seen, free = _seen(sight, row, moved)
+        run = _Run(frame, frame, frame, seen.long(), free.long())
+        alike = _likeness(run, runs[-1], sight, config) if runs else 0.0
         if alike > config.alike:
             runs[-1] = run.after(runs[-1], alike <= 1)
         else:
             runs.append(run)
-    least = config.seconds * (inputs.fps or 1.0)
+    least = config.seconds * (sight.fps or 1.0)
     stays: list[_Run] = []
     for run in (run for run in runs if run.last - run.first >= least):
-        if stays and _likeness(run, stays[-1], config) > config.alike:
+        if stays and _likeness(run, stays[-1], sight, config) > config.alike:
             stays[-1] = run.after(stays[-1], True)
         else:
             stays.append(run)
     return stays
 
 
-def _likeness(a: _Run, b: _Run, config: MoveConfig) -> float:
-    """Common pixels of an object in two runs, of those of the smaller; `UNSEEN`: too few are."""
+def _likeness(a: _Run, b: _Run, sight: _Sight, config: MoveConfig) -> float:
+    """Common pixels of an object in two runs, of those of the smaller; `UNSEEN`: too few are.
+
+    Of the depths that one counts which suits both best.
+    """
     known = (a.times > 0) & (b.times > 0)
+    whole = torch.maximum(_count(a.usual), _count(b.usual))
     one, other = a.usual & known, b.usual & known
-    fewest = float(torch.minimum(one.sum(), other.sum()))
-    if fewest < config.visible * float(torch.maximum(a.usual.sum(), b.usual.sum())):
+    fewest = torch.minimum(_count(one), _count(other))
+    enough = fewest >= config.visible * whole
+    if not bool(enough.any()):
         return UNSEEN
-    return float((one & other).sum()) / max(fewest, 1.0)
+    wide = sight.loose
+    common = torch.minimum(_count(one & _grown(other, wide)), _count(other & _grown(one, wide)))
+    share = common / fewest.clamp_min(1.0)
+    return float(share[enough].max())
+
+
+def _count(masks: Bool[Tensor, "depths h w"]) -> Float[Tensor, " depths"]:
+    return masks.flatten(1).sum(1).double()
+
+
+def _grown(masks: Bool[Tensor, "depths h w"], wide: int) -> Bool[Tensor, "depths h w"]:
+    if not wide:
+        return masks
+    rows = max_pool2d(masks.float(), (2 * wide + 1, 1), 1, (wide, 0))
+    return max_pool2d(rows, (1, 2 * wide + 1), 1, (0, wide)) > 0
+
+
+def _told(number: int, start: int, run: _Run, sight: _Sight) -> Stay:
+    """What is told of a stay."""
+    masks, frame = sight.furniture.masks, sight.furniture.frame
+    agreed = _count(run.usual & (run.hits > 0)) / _count(run.hits > 0).clamp_min(1.0)
+    usual = run.usual[int(agreed.argmax())]
+    within = ((frame >= run.first) & (frame <= run.sure)).nonzero()[:, 0].tolist()
+    best = int(frame[max(within, key=lambda row: area(masks, row))])
+    mask = usual if is_still(sight.path) else _in_image(usual, sight)
+    return Stay(number, start, mask, (run.first, run.sure), best)
+
+
+def _in_image(usual: Bool[Tensor, "h w"], sight: _Sight) -> Bool[Tensor, "height width"]:
+    """What is seen in a window, in the image of the reference camera at the resolution of stays."""
+    image = torch.zeros_like(thin(sight.furniture.masks, 0))
+    (rows, columns), (height, width), times = sight.window, image.shape, sight.step // STEP
+    big = usual.repeat_interleave(times, 0).repeat_interleave(times, 1)
+    y, x = (big.nonzero() + times * torch.tensor([rows.start, columns.start])).unbind(1)
+    inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+    image[y[inside], x[inside]] = True
+    return image
