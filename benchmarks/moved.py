@@ -32,7 +32,6 @@ from mover_bench.studies.job import noisy_room
 from mover_bench.studies.run import parse_seeds
 from mover_bench.studies.sets import SETS
 
-
 BESIDE = {
     "moved": "unmoved", "moving-moved": "moved", "moving-pushed": "pushed",
     "moving-rolled": "rolled",
