@@ -1,58 +1,72 @@
-"""A strip of pictures from the camera of a known room: the truth above, what is rebuilt below.
+"""Known rooms through their cameras, the truth beside what is rebuilt: pictures and short films.
 
-    PYTHONPATH=src python benchmarks/strips.py --set moving-views --seed 108 --out moving \
-        --to docs/images/moving.jpg
+    PYTHONPATH=src python benchmarks/strips.py --set moving-views --seed 102 --out moving \
+        --frames 0 80 --width 320 --to docs/images/moving.webp
     PYTHONPATH=src python benchmarks/strips.py --set withheld-seat --seed 104 --out withheld \
-        --to docs/images/withheld.jpg
-    PYTHONPATH=src python benchmarks/strips.py --set pushed --seed 100 --frames 50 63 66 300 \
-        --out moved --to docs/images/moved.jpg
+        --frames 60 140 --width 320 --to docs/images/withheld.webp
+    PYTHONPATH=src python benchmarks/strips.py --set pushed --seed 100 --out moved \
+        --frames 45 125 --width 320 --to docs/images/moved.webp
 
-Rebuilds the room with `robust` (what `moving_camera.py` and `withheld.py` left in `--out` is used)
-and draws `--count` frames. Supports that are proposed are drawn like other pieces. A camera that
-moves is the true one above, and the one that was found below.
+Rebuilds the room with `robust` (what `moving_camera.py`, `withheld.py` and `moved.py` left in
+`--out` is used). A .webp is a film of all frames from the first to the last of `--frames`, the
+truth on the left; a .jpg has the truth above, in just these frames. Supports that are proposed are
+drawn like other pieces. A camera that moves is the true one, and the one that was found.
 """
 
 import argparse
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 from torch import Tensor
 
 from mover.app.pictures.eye import RenderCamera, camera_sized
-from mover.app.pictures.film import save_still
+from mover.app.pictures.film import captioned, pixels, save_still
 from mover.app.pictures.paint import people
-from mover.app.pictures.render import set_up, show, world_of
+from mover.app.pictures.render import Tiles, set_up, show, world_of
+from mover.core.files import replacing
 from mover.core.run import Run
-from mover.core.types import STILL, Bodies, CameraPath, Scene
+from mover.core.types import STILL, Bodies, CameraPath, Room, Scene, SceneObject
 from mover.geometry.path import is_still, poses_at
 from mover.geometry.placement import placed_at
 from mover.pipeline.outcome import to_world
 from mover.pipeline.presets import ROBUST
 from mover.pipeline.reconstruct import reconstruct
 from mover_bench.rooms.camera_path import PATHS, draw_path
-from mover_bench.studies.job import noisy_room
+from mover_bench.studies.job import Trial, noisy_room
 from mover_bench.studies.sets import SETS
 
 GAP = 6  # [px] of white between two pictures
+QUALITY = 55  # of a film's pictures
 
 
-def pictures(
-    scene: Scene, bodies: Bodies, path: CameraPath, frames: list[int], width: int
-) -> Float[Tensor, "h w 3"]:
-    """A row of pictures; bodies are in the world."""
-    found = list[Tensor]()
-    height = round(width * scene.camera.height / scene.camera.width)
-    for frame in frames:
-        pieces = tuple(placed_at(piece, frame) for piece in scene.objects)
-        world = world_of("", replace(scene, objects=pieces), bodies)
-        eye = _eye(camera_sized(scene.camera, width, height), path, frame)
-        board = set_up(eye, world.ground, world.still, None)
-        rows = (bodies.frame == frame).nonzero()[:, 0].tolist()
-        found += [show(board, people(bodies, rows)), torch.ones(height, GAP, 3)]
-    return torch.cat(found[:-1], 1)
+@dataclass(frozen=True)
+class Filmed:
+    """A room, its people in the world, and the camera that sees them."""
+
+    scene: Scene
+    bodies: Bodies
+    path: CameraPath
+    name: str
+    boards: dict[int, Tiles] = field(default_factory=dict)
+
+    def picture(self, frame: int, width: int) -> Float[Tensor, "h w 3"]:
+        """One frame; what does not move is drawn once."""
+        rows = (self.bodies.frame == frame).nonzero()[:, 0].tolist()
+        moves = not is_still(self.path) or any(piece.segments for piece in self.scene.objects)
+        key = frame if moves else 0
+        if key not in self.boards:
+            pieces = tuple(placed_at(piece, frame) for piece in self.scene.objects)
+            world = world_of("", replace(self.scene, objects=pieces), self.bodies)
+            camera = self.scene.camera
+            height = round(width * camera.height / camera.width)
+            eye = _eye(camera_sized(camera, width, height), self.path, frame)
+            self.boards.clear()
+            self.boards[key] = set_up(eye, world.ground, world.still, None)
+        return captioned(show(self.boards[key], people(self.bodies, rows)), self.name)
 
 
 def _eye(eye: RenderCamera, path: CameraPath, frame: int) -> RenderCamera:
@@ -65,10 +79,8 @@ def _eye(eye: RenderCamera, path: CameraPath, frame: int) -> RenderCamera:
                    t_world_eye=place)  # fmt: skip
 
 
-def strip(
-    name: str, seed: int, out: Path, frames: list[int] | int, width: int
-) -> Float[Tensor, "h w 3"]:
-    """Truth and result, one above the other, in some frames or in so many."""
+def filmed(name: str, seed: int, out: Path) -> tuple[Filmed, Filmed]:
+    """A room of a set as it is, and as it is rebuilt."""
     trial = noisy_room(seed, SETS[name], Run(out / "rooms" / str(seed)))
     room = reconstruct(trial.capture, ROBUST, Run(out / name / str(seed)))
     assert trial.bodies is not None
@@ -78,29 +90,67 @@ def strip(
         rng, kinds = np.random.default_rng([seed, PATHS]), SETS[name].paths
         last, fps = int(trial.bodies.frame.max()), trial.bodies.fps or 1.0
         true = draw_path(last + 1, fps, kinds[seed % len(kinds)], rng)
-    found = (*room.scene.objects, *(one.object for one in room.proposals))
-    seen = room.bodies.frame.unique()
-    if isinstance(frames, int):
-        frames = seen[torch.linspace(0, len(seen) - 1, frames + 2).round().long()[1:-1]].tolist()
-    above = pictures(trial.truth, to_world(trial.bodies, trial.truth.camera), true, frames, width)
-    below = pictures(replace(room.scene, objects=found), room.bodies, room.path, frames, width)
-    return torch.cat([above, torch.ones(GAP, above.shape[1], 3), below])
+    truth = Filmed(trial.truth, to_world(trial.bodies, trial.truth.camera), true, "truth")
+    found = replace(room.scene, objects=_in_order(trial, room))
+    return truth, Filmed(found, room.bodies, room.path, "rebuilt")
+
+
+def _in_order(trial: Trial, room: Room) -> tuple[SceneObject, ...]:
+    """The pieces in the order, and so the colours, of the true ones; proposals fill the gaps."""
+    found = {piece.id: piece for piece in room.scene.objects}
+    proposed = [one.object for one in room.proposals]
+    pieces: list[SceneObject] = []
+    for true in trial.truth.objects:
+        if true.id in found:
+            pieces.append(found.pop(true.id))
+        elif proposed:
+            pieces.append(proposed.pop(0))
+    return (*pieces, *found.values(), *proposed)
+
+
+def strip(sides: tuple[Filmed, Filmed], frames: list[int], width: int) -> Float[Tensor, "h w 3"]:
+    """Truth and result, one above the other, in some frames."""
+    rows = [_joined([side.picture(frame, width) for frame in frames], 1) for side in sides]
+    return _joined(rows, 0)
+
+
+def _joined(pictures: list[Tensor], axis: int) -> Float[Tensor, "h w 3"]:
+    """Pictures beside (1) or above (0) each other, with white between them."""
+    shape = list(pictures[0].shape)
+    shape[axis] = GAP
+    parts = [part for picture in pictures for part in (torch.ones(shape), picture)]
+    return torch.cat(parts[1:], axis)
+
+
+def save_webp(pictures: list[Float[Tensor, "h w 3"]], rate: float, path: Path) -> None:
+    """A film that browsers show like a picture, over and over."""
+    first, *rest = (Image.fromarray(pixels(picture)) for picture in pictures)
+    with replacing(path) as part:
+        first.save(
+            part, format="webp", save_all=True, append_images=rest, duration=round(1000 / rate),
+            loop=0, quality=QUALITY, method=6,
+        )  # fmt: skip
 
 
 def main() -> None:
-    """Draw the strip that is asked for."""
+    """Draw what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--set", default="moving-views", choices=tuple(SETS))
     parser.add_argument("--seed", type=int, default=108)
     parser.add_argument("--out", type=Path, default=Path("moving"))
-    parser.add_argument("--count", type=int, default=4)
-    parser.add_argument("--frames", type=int, nargs="*", default=[])
-    parser.add_argument("--width", type=int, default=480)
+    parser.add_argument("--frames", type=int, nargs="+", default=[0, 40])
+    parser.add_argument("--width", type=int, default=400)
     parser.add_argument("--to", type=Path, default=Path("strip.jpg"))
     args = parser.parse_args()
     torch.set_num_threads(1)
-    frames = args.frames or args.count
-    save_still(strip(args.set, args.seed, args.out, frames, args.width), args.to)
+    sides = filmed(args.set, args.seed, args.out)
+    if args.to.suffix != ".webp":
+        save_still(strip(sides, args.frames, args.width), args.to)
+        return
+    seen = sides[0].bodies.frame.unique().tolist()
+    frames = [frame for frame in seen if args.frames[0] <= frame <= args.frames[-1]]
+    shown = [_joined([side.picture(frame, args.width) for side in sides], 1) for frame in frames]
+    save_webp(shown, sides[0].bodies.fps or 5.0, args.to)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """The docs site: built without warnings, links that resolve, nothing loaded from elsewhere."""
 
+import importlib
+import pkgutil
 import re
 import subprocess
 import sys
@@ -105,3 +107,11 @@ def test_the_weights_in_the_table_are_those_of_the_presets():
         w = PRESETS[name].place.weights
         told = [float(word.strip().replace("10⁵", "1e5")) for word in text.split(",")]
         assert told == [w.bbox, w.silhouette, w.scale, w.depth, w.collision, w.contact]
+
+
+def test_every_name_of_the_api_is_one_object_and_told_once():
+    named = re.findall(r"\.\. auto(\w+):: ([\w.]+)", (DOCS / "api.md").read_text())
+    assert len(named) == len(set(named)) > 50
+    for kind, name in named:
+        assert kind == "module" or pkgutil.resolve_name(name) is not None
+        assert kind != "module" or importlib.import_module(name)
