@@ -33,7 +33,7 @@ class FitRoom:
 
     R_cam_world: Float[Tensor, "3 3"]
     floor: Floor
-    """Height of the floor in the world [m]."""
+    """In the world."""
     furniture: Volume | None
     """Signed distance to all pieces; None: there are none."""
     surface: Float[Tensor, "points 3"]
@@ -58,11 +58,11 @@ def room_terms(
     if room is None:
         return {}
     skin, facing = (to_world(x, room.R_cam_world.to(x)) for x in (points.skin, points.facing))
-    found: dict[str, Tensor] = {}
+    floor, found = height_under(room.floor, skin), dict[str, Tensor]()
     if stage.under:
-        found["under"] = stage.under * under_term(skin, height_under(room.floor, skin))
+        found["under"] = stage.under * under_term(skin, floor)
     if stage.feet:
-        found["feet"] = stage.feet * feet_term(skin, room.stands, height_under(room.floor, skin))
+        found["feet"] = stage.feet * feet_term(skin, room.stands, floor)
     if stage.sdf and room.furniture is not None:
         found["sdf"] = stage.sdf * room.share * sdf_term(skin[:, room.even], room.furniture)
     if stage.contact and len(room.surface):

@@ -47,8 +47,9 @@ from mover.pipeline.outcome import Spans, told_of_proposals
 from mover.pipeline.people import carried, depths_of, found_path
 from mover.pipeline.presets import Config, with_sizes
 from mover.stages.config import ExplainConfig, ProposeConfig, SpreadConfig
+from mover.stages.masks import enlarged, thin
 from mover.stages.objects.find_image_cues import evidence_at
-from mover.stages.objects.find_moves import STEP, MoveInputs, Stay, find_moves, thin
+from mover.stages.objects.find_moves import STEP, MoveInputs, Stay, find_moves
 from mover.stages.objects.follow_movers import Between, Followed, follow_mover
 
 RIGID = 1e3  # factor on the price of another size in all segments but the first
@@ -212,7 +213,7 @@ def _shown_in(stays: list[Stay], capture: Capture) -> int:
     mask = next(d.mask for d in capture.detections if d.id == stays[0].annotation)
     if mask is None:
         return 0
-    there = thin(mask, 0)
+    there = thin(mask, 0, STEP)
     common = [int((there & stay.mask).sum()) / int((there | stay.mask).sum()) for stay in stays]
     return max(range(len(stays)), key=lambda k: common[k])
 
@@ -328,7 +329,7 @@ def _as_in(found: Detection, stay: Stay) -> Detection:
     """A detection as it is in a stay."""
     if found.mask is None:
         return replace(found, box=STEP * tight_box(stay.mask))
-    big = stay.mask.repeat_interleave(STEP, 0).repeat_interleave(STEP, 1)
+    big = enlarged(stay.mask, STEP)
     mask = torch.zeros(found.mask.height, found.mask.width, dtype=torch.bool)
     height, width = (min(a, b) for a, b in zip(big.shape, mask.shape, strict=True))
     mask[:height, :width] = big[:height, :width]

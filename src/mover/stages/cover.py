@@ -14,14 +14,13 @@ from functools import cache
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from mover.core.records import record
 from mover.core.types import STILL, CameraPath, Capture, Masks, People
 from mover.geometry.boxes import box_of
 from mover.geometry.path import is_still, poses_at
-from mover.geometry.rle import decode, joined, thinned
-from mover.stages.masks import uncovered
+from mover.geometry.rle import decode, joined
+from mover.stages.masks import enlarged, thin, uncovered, widened
 
 STEP = 4  # [px] from one pixel of a carried mask to the next
 LIKE = 2  # so many masks of each piece are carried: a person may stand before one of them
@@ -115,13 +114,14 @@ def _carried(cover: Cover, frame: int) -> Bool[Tensor, "h w"]:
         mine = (cover.piece == piece).nonzero()[:, 0]
         for row in mine[(away + turned)[mine].argsort()[:LIKE]].tolist():
             wide = math.ceil(float(away[row] * cover.K[0, 0]) * WRONG / STEP)
-            found = found | _grown(_warped(cover, row, pose, found.shape), min(wide, WIDEST))
-    return found.repeat_interleave(STEP, 0).repeat_interleave(STEP, 1)[:height, :width]
+            there = _warped(cover, row, pose, found.shape)
+            found = found | widened(there[None], min(wide, WIDEST))[0]
+    return enlarged(found, STEP)[:height, :width]
 
 
 def _warped(cover: Cover, row: int, pose: CameraPath, shape: torch.Size) -> Bool[Tensor, "h w"]:
     """A mask as another camera sees it, were the piece flat."""
-    source = torch.from_numpy(thinned(cover.masks, row, STEP).copy())
+    source = thin(cover.masks, row, STEP)
     back = pose.R_reference_camera[0].mT
     turn = back @ cover.seen.R_reference_camera[row]
     shift = back @ (cover.seen.t_reference_camera[row] - pose.t_reference_camera[0])
@@ -135,9 +135,3 @@ def _warped(cover: Cover, row: int, pose: CameraPath, shape: torch.Size) -> Bool
     inside = (at >= 0).all(-1) & (at[..., 0] < width) & (at[..., 1] < height)
     column, line = at[..., 0].clamp(0, width - 1), at[..., 1].clamp(0, height - 1)
     return source[line, column] & inside & (pixel[..., 2] > 0)
-
-
-def _grown(mask: Bool[Tensor, "h w"], wide: int) -> Bool[Tensor, "h w"]:
-    image = mask[None, None].float()
-    rows = max_pool2d(image, (2 * wide + 1, 1), 1, (wide, 0))
-    return max_pool2d(rows, (1, 2 * wide + 1), 1, (0, wide))[0, 0] > 0

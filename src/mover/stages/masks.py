@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, max_pool2d
 
 from mover.core.types import Bodies, Camera, Masks, People
 from mover.energy.terms.bbox import WIDTH
 from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
-from mover.geometry.rle import decode
+from mover.geometry.rle import decode, thinned
 from mover.geometry.warp_start import mapped
 
 # Which mask belongs to which body, decoded only when it is drawn.
@@ -205,6 +205,27 @@ def _grown(image: Bool[Tensor, "items h w"]) -> Bool[Tensor, "items h w"]:
     grown[:, :, 1:] |= image[:, :, :-1]
     grown[:, :, :-1] |= image[:, :, 1:]
     return grown
+
+
+# Masks of every few pixels, and back.
+
+
+def thin(masks: Masks, row: int, step: int) -> Bool[Tensor, "h w"]:
+    """Every `step`-th pixel of one of the masks."""
+    return torch.from_numpy(thinned(masks, row, step).copy())
+
+
+def enlarged(mask: Bool[Tensor, "h w"], times: int) -> Bool[Tensor, "big_h big_w"]:
+    """Each pixel as a square of so many."""
+    return mask.repeat_interleave(times, 0).repeat_interleave(times, 1)
+
+
+def widened(masks: Bool[Tensor, "masks h w"], wide: int) -> Bool[Tensor, "masks h w"]:
+    """Masks that reach so many pixels farther along both axes."""
+    if not wide:
+        return masks
+    rows = max_pool2d(masks.float(), (2 * wide + 1, 1), 1, (wide, 0))
+    return max_pool2d(rows, (1, 2 * wide + 1), 1, (0, wide)) > 0
 
 
 # The image at the width at which the paper's weights have their meaning.

@@ -20,15 +20,15 @@ from itertools import pairwise
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record, rows_of
-from mover.core.types import STILL, CameraPath, Masks, People
+from mover.core.types import STILL, CameraPath, People
 from mover.geometry.camera import project
 from mover.geometry.path import is_still, poses_at, resampled
-from mover.geometry.rle import area, decode, thinned, tight_box
+from mover.geometry.rle import area, decode, tight_box
 from mover.stages.config import MoveConfig
+from mover.stages.masks import enlarged, thin, widened
 
 STEP = 3  # [px] from one pixel that is compared to the next
 WIDE = 480  # [px]; masks of a wider image are carried by so many times longer steps
@@ -108,18 +108,13 @@ def _least_alike(stays: "list[_Run]", sight: "_Sight", config: MoveConfig) -> fl
     return min((_likeness(a, b, sight, config) for a, b in pairwise(stays)), default=UNSEEN)
 
 
-def thin(masks: Masks, row: int, step: int = STEP) -> Bool[Tensor, "h w"]:
-    """One of the masks, at the resolution of the stays."""
-    return torch.from_numpy(thinned(masks, row, step).copy())
-
-
 def _hidden(people: People | None, frame: int, step: int) -> Bool[Tensor, "h w"] | None:
     """Pixels of some rows of a frame, and those beside them; None: there are none."""
     present = [] if people is None else (people.frame == frame).nonzero()[:, 0].tolist()
     if people is None or not present:
         return None
     hidden = torch.stack([thin(people.masks, row, step) for row in present]).any(0)
-    return max_pool2d(hidden[None].float(), 3, 1, 1)[0] > 0
+    return widened(hidden[None], 1)[0]
 
 
 @dataclass(frozen=True)
@@ -263,20 +258,13 @@ def _likeness(a: _Run, b: _Run, sight: _Sight, config: MoveConfig) -> float:
     if not bool(enough.any()):
         return UNSEEN
     wide = sight.loose
-    common = torch.minimum(_count(one & _grown(other, wide)), _count(other & _grown(one, wide)))
+    common = torch.minimum(_count(one & widened(other, wide)), _count(other & widened(one, wide)))
     share = common / fewest.clamp_min(1.0)
     return float(share[enough].max())
 
 
 def _count(masks: Bool[Tensor, "depths h w"]) -> Float[Tensor, " depths"]:
     return masks.flatten(1).sum(1).double()
-
-
-def _grown(masks: Bool[Tensor, "depths h w"], wide: int) -> Bool[Tensor, "depths h w"]:
-    if not wide:
-        return masks
-    rows = max_pool2d(masks.float(), (2 * wide + 1, 1), 1, (wide, 0))
-    return max_pool2d(rows, (1, 2 * wide + 1), 1, (0, wide)) > 0
 
 
 def _told(number: int, start: int, run: _Run, sight: _Sight) -> Stay:
@@ -292,10 +280,11 @@ def _told(number: int, start: int, run: _Run, sight: _Sight) -> Stay:
 
 def _in_image(usual: Bool[Tensor, "h w"], sight: _Sight) -> Bool[Tensor, "height width"]:
     """What is seen in a window, in the image of the reference camera at the resolution of stays."""
-    image = torch.zeros_like(thin(sight.furniture.masks, 0))
+    image = torch.zeros_like(thin(sight.furniture.masks, 0, STEP))
     (rows, columns), (height, width), times = sight.window, image.shape, sight.step // STEP
-    big = usual.repeat_interleave(times, 0).repeat_interleave(times, 1)
-    y, x = (big.nonzero() + times * torch.tensor([rows.start, columns.start])).unbind(1)
+    y, x = (
+        enlarged(usual, times).nonzero() + times * torch.tensor([rows.start, columns.start])
+    ).unbind(1)
     inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
     image[y[inside], x[inside]] = True
     return image

@@ -22,9 +22,8 @@ LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
 COMMON = 0.06  # error that the three given sizes of an object have in common, as a logarithm
-SOUGHT = (
-    0.04  # error of the scale of a first scene of `mover layout` (rooms 100 to 104), as a logarithm
-)
+SOUGHT = 0.04
+"""Error of the scale of a first scene of `mover layout` (rooms 100 to 104), as a logarithm."""
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
 DIRECTIONS = 90  # that are tried within a quarter turn
 
@@ -127,12 +126,12 @@ def common_scale(layout: Layout, given: Given, spread: float, shared: float = 0.
     if spread <= 0:
         return 0.0
     tried = torch.linspace(-3 * spread, 3 * spread, 121, dtype=torch.float64)
-    cost = _cost_of_scales(layout, given, tried)
     if shared:
         wide = torch.linspace(-3, 3, 121, dtype=torch.float64) * (spread + shared)
-        cost = _cost_of_scales(layout, given, wide)
         near = -0.5 * ((tried[:, None] - wide) / shared).square()
-        cost = -torch.logsumexp(near - cost, 1)
+        cost = -torch.logsumexp(near - _cost_of_scales(layout, given, wide), 1)
+    else:
+        cost = _cost_of_scales(layout, given, tried)
     total = cost + 0.5 * (tried / spread).square()
     weight = (total.min() - total).exp()
     return float((weight * tried).sum() / weight.sum())
