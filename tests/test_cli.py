@@ -105,6 +105,18 @@ def test_check_draws_a_picture_and_lists_every_object(folder, capsys):
     assert (folder.parent / "check.png").stat().st_size > 1000
 
 
+@pytest.mark.parametrize("name", ["c3", "c3.gif"])
+def test_a_picture_that_cannot_be_written_is_refused_before_the_capture_is_read(
+    tmp_path, name, capsys
+):
+    assert cli.run_command("check", [str(tmp_path), "--out", str(tmp_path / name)]) == 2
+    message = capsys.readouterr().err.strip()
+    assert len(message.splitlines()) == 1
+    assert "--out: " in message
+    assert repr(name) in message
+    assert ".png or .jpg or .jpeg" in message
+
+
 def test_wrong_input_gives_one_sentence_that_names_file_and_field(folder, capsys):
     camera = json.loads((folder / "camera.json").read_text())
     (folder / "camera.json").write_text(json.dumps(camera | {"fl_x": -1.0}))

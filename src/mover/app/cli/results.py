@@ -9,7 +9,7 @@ from tyro.conf import Positional, arg
 
 from mover.app.cli import say
 from mover.app.cli.config import parsed
-from mover.app.pictures.config import RenderConfig
+from mover.app.pictures.config import STILL, RenderConfig, check_ending
 from mover.core.errors import InputError
 from mover.core.settings import float_in, int_in
 from mover.io.formats import chosen, names
@@ -42,6 +42,7 @@ class EvaluateArgs:
 def check(arguments: Sequence[str]) -> None:
     """`mover check`."""
     args = parsed(CheckArgs, "mover check", arguments)
+    check_ending("--out", args.out, STILL)
     read = chosen("--format", args.format, "capture")
     from mover.app.pictures.overlay import save_overlay
     from mover.io.capture.evidence import evidence_table, gather_evidence

@@ -1,8 +1,10 @@
-"""What a picture shows. Imports no torch: `--help` is quick."""
+"""What a picture shows, and into which files. Imports no torch: `--help` is quick."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
+from mover.core.errors import InputError
 from mover.core.settings import Index, float_in, int_in
 
 
@@ -26,3 +28,18 @@ class RenderConfig:
     """A still: which frame of the video; by default the one in the middle."""
     people: bool = True
     """Draw people."""
+
+
+STILL, FILM = (".png", ".jpg", ".jpeg"), (".mp4",)
+
+
+def check_ending(argument: str, path: Path, endings: tuple[str, ...]) -> None:
+    """Refuse a file that cannot be written, before anything is drawn for it.
+
+    Raises:
+        InputError: If the ending is none of these.
+    """
+    ending = path.suffix.lower()
+    if ending not in endings:
+        found = f"ends in {ending!r}" if ending else "has no ending"
+        raise InputError(f"{argument}: {path.name!r} {found}, expected {' or '.join(endings)}")

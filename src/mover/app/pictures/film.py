@@ -15,7 +15,6 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.files import replacing
 
-STILL, FILM = (".png", ".jpg", ".jpeg"), (".mp4",)
 FRAMES, VIDEO = "frames", "video.mp4"
 QUALITY = {"crf": "18", "preset": "veryfast"}  # of H.264: nearly without visible loss
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mover.app.pictures.config import RenderConfig
+from mover.app.pictures.config import FILM, STILL, RenderConfig, check_ending
 from mover.app.pictures.eye import (
     RenderCamera,
     above_eye,
@@ -21,8 +21,6 @@ from mover.app.pictures.eye import (
     video_eye,
 )
 from mover.app.pictures.film import (
-    FILM,
-    STILL,
     captioned,
     has_video,
     save_film,
@@ -91,23 +89,22 @@ def render_result(out: Path, path: Path, config: RenderConfig, capture: Path | N
 
     Args:
         out: Folder of the result.
-        path: .png, .jpg or .mp4.
+        path: .png, .jpg, .jpeg or .mp4.
         config: What is drawn.
         capture: Folder of the capture, whose video (or reference image) is behind the furniture.
 
     Raises:
         InputError: If something is missing or the ending of `path` is none of these.
     """
-    ending = path.suffix.lower()
-    if ending not in STILL + FILM:
-        raise InputError(f"--to: {path.name!r} ends in {ending!r}, expected .png, .jpg or .mp4")
-    if ending in FILM:
+    check_ending("--to", path, STILL + FILM)
+    still = path.suffix.lower() in STILL
+    if not still:
         video_library(f"--to {path.name}")
     names = ("initial", "result") if config.scene == "both" else (config.scene,)
     worlds = [_world(out, name, config) for name in names]
-    moments = _moments(worlds, config, still=ending in STILL)
+    moments = _moments(worlds, config, still)
     pictures = render_worlds(worlds, moments, config, capture)
-    if ending in STILL:
+    if still:
         save_still(next(pictures), path)
         return 1
     return save_film(pictures, _rate(worlds, moments), path)
