@@ -335,6 +335,23 @@ def without_meshes(objects: Objects) -> Objects:
     return rows_of(objects, none, "verts", "faces", "edges", "samples", "region")
 
 
+def some_supports(supports: Int[Tensor, " objects"], rows: Rows) -> Int[Tensor, " rows"]:
+    """What carries rows of (starts x objects), counted through, by its number among them.
+
+    Raises:
+        ValueError: If an object is asked for without what carries it.
+    """
+    n = len(supports)
+    index = rows % n
+    place = torch.full((int(rows.max()) // n * n + n if len(rows) else n,), -1).to(rows)
+    place[rows] = torch.arange(len(rows)).to(rows)
+    below = supports[index]
+    carrier = place[(rows - index + below).clamp_min(0)]
+    if bool(((below >= 0) & (carrier < 0)).any()):
+        raise ValueError("some_supports: an object without the one that carries it")
+    return torch.where(below >= 0, carrier, below)
+
+
 def some_objects(objects: Objects, rows: Rows) -> Objects:
     """The objects of rows of (starts x objects), counted through; carriers come with their loads.
 
@@ -343,16 +360,10 @@ def some_objects(objects: Objects, rows: Rows) -> Objects:
     """
     n = len(objects.ids)
     index = rows % n
-    place = torch.full((int(rows.max()) // n * n + n if len(rows) else n,), -1).to(rows)
-    place[rows] = torch.arange(len(rows)).to(rows)
-    below = objects.supports[index]
-    carrier = place[(rows - index + below).clamp_min(0)]
-    if bool(((below >= 0) & (carrier < 0)).any()):
-        raise ValueError("some_objects: an object without the one that carries it")
-    names = index.tolist()
+    supports, names = some_supports(objects.supports, rows), index.tolist()
     return replace(
         of_objects(objects, index, n),
-        supports=torch.where(below >= 0, carrier, below),
+        supports=supports,
         ids=tuple(objects.ids[i] for i in names),
         categories=tuple(objects.categories[i] for i in names),
     )

@@ -29,7 +29,7 @@ from mover.energy.terms.feet import FootContacts
 from mover.evaluate.calibration import calibration_of
 from mover.evaluate.explanation import explain
 from mover.furniture.floor import Floor, floor_of
-from mover.geometry.placement import place, reproject
+from mover.geometry.placement import place, reproject, rest_on_support
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import Alignment
@@ -41,7 +41,7 @@ from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.explain.placements import ExplainInputs, explain_placements
 from mover.stages.objects.bend_shapes import told_of_shapes
 from mover.stages.objects.find_image_cues import ImageInputs, Seen
-from mover.stages.objects.on_platforms import platforms_of, supports_with_platforms
+from mover.stages.objects.on_platforms import platforms_of, stood, supports_with_platforms
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
 from mover.stages.people.find_depth import size_spread
@@ -105,6 +105,17 @@ def as_given(context: ReconstructionContext, camera: Camera) -> Layout:
     """The initial scene in the world of another camera; objects may hang in the air."""
     objects, old = context.prepared.objects, context.capture.scene.camera.R_cam_world
     return reproject(context.prepared.start, objects.size[:, 1], old, camera.R_cam_world)
+
+
+def carried(
+    context: ReconstructionContext, layout: Layout, old: Camera, here: tuple[Camera, float]
+) -> Layout:
+    """A layout of another camera's world in that of this camera, standing on this ground."""
+    objects, (camera, ground) = context.prepared.objects, here
+    there = reproject(layout, objects.size[:, 1], old.R_cam_world, camera.R_cam_world)
+    if context.config.slide_to_floor:
+        there = stood(there, objects, ground, is_pinned(context))
+    return rest_on_support(there, objects.supports, objects.size[:, 1], ground)
 
 
 def is_pinned(context: ReconstructionContext) -> Bool[Tensor, " objects"]:

@@ -20,12 +20,7 @@ from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.camera import to_camera
 from mover.geometry.path import is_still, poses_at, scaled
-from mover.geometry.placement import (
-    larger,
-    place,
-    reproject,
-    rest_on_support,
-)
+from mover.geometry.placement import larger, place
 from mover.geometry.warp_start import threads
 from mover.io.capture.plausible import check_plausible
 from mover.pipeline.moves import Solving, with_moves
@@ -35,6 +30,7 @@ from mover.pipeline.outcome import (
     SceneState,
     Spans,
     as_given,
+    carried,
     check_floor,
     check_room,
     floor_now,
@@ -74,13 +70,13 @@ from mover.stages.objects.gather_given import (
     gather_given,
     lighter_where_used,
 )
-from mover.stages.objects.on_platforms import stood
 from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
 from mover.stages.objects.place_objects import (
     estimate_size_prior,
     inlier_weights,
     place_objects,
     priced,
+    without_search,
 )
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
 from mover.stages.objects.starts import (
@@ -163,20 +159,19 @@ def placed_by_image(
     before: SceneState | None = None,
 ) -> SceneState:
     """Carry the initial scene into this world and place the objects by the image alone."""
-    objects, seen = context.prepared.objects, context.seen
-    old = context.capture.scene.camera.R_cam_world
-
-    def carried(layout: Layout) -> Layout:
-        there = reproject(layout, objects.size[:, 1], old, camera.R_cam_world)
-        if context.config.slide_to_floor:
-            there = stood(there, objects, ground, is_pinned(context))
-        return rest_on_support(there, objects.supports, objects.size[:, 1], ground)
-
-    start = carried(context.prepared.start)
+    objects, seen, capture = context.prepared.objects, context.seen, context.capture
+    here, searching = (camera, ground), context.config.layout
+    start = carried(context, context.prepared.start, capture.scene.camera, here)
     starts = alone(start)
-    if context.config.layout.num_hypotheses > 1 and context.capture.hypotheses:
-        others = other_starts(context.capture.hypotheses, objects, context.prepared.start)
-        starts = joined(starts, carried(others))
+    if searching.num_hypotheses > 1 and before is not None:
+        # Where the image has each object was searched: only the ends of that go down again.
+        ends = best_few(before.placed.candidates, before.placed.energy, searching.num_hypotheses)
+        ends = joined(alone(before.placed.layout), ends)
+        starts = joined(starts, carried(context, ends, before.camera, here))
+        searching = without_search(searching)
+    elif searching.num_hypotheses > 1 and capture.hypotheses:
+        others = other_starts(capture.hypotheses, objects, context.prepared.start)
+        starts = joined(starts, carried(context, others, capture.scene.camera, here))
     unordered = torch.zeros(len(objects.ids), len(objects.ids), dtype=torch.bool)
     given = context.prepared.start.t_world_object.norm(dim=-1)
     image = ImageInputs(
@@ -185,13 +180,13 @@ def placed_by_image(
     cues = context.run.stage(find_image_cues, image, context.config.image)
     cues = with_given(cues, context, as_given(context, camera), before)
     if before is not None:  # the room as it was given does not tell the scale of a depth
-        cues = with_measured(cues, context, (camera, ground), before.placed.layout)
+        cues = with_measured(cues, context, here, before.placed.layout)
     inputs = PlaceInputs(
         objects, camera, ground, cues, NOBODY, starts, start.yaw, _pinned(context, start)
     )
-    placed = context.run.stage(place_objects, inputs, context.config.layout)
+    placed = context.run.stage(place_objects, inputs, searching)
     found = SceneState(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
-    return replace(found, priced=(with_walls(inputs, placed.walls), context.config.layout))
+    return replace(found, priced=(with_walls(inputs, placed.walls), searching))
 
 
 def with_given(

@@ -19,7 +19,7 @@ from mover.energy.objective import (
     ImageCues,
     of_objects,
     some_objects,
-    without_meshes,
+    some_supports,
 )
 from mover.energy.terms.apart import apart_term, gather_solids
 from mover.energy.terms.contact import trees_of
@@ -257,6 +257,11 @@ def starts_left(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = si
     return best_few(found.at, found.value, config.num_hypotheses)
 
 
+def without_search(config: PlaceConfig) -> PlaceConfig:
+    """The same from the starts as they are."""
+    return replace(config, first=Adam(0), yaws=1, distances=(), short=Adam(0))
+
+
 def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
     """The energy as a function of layouts whose heights are still to be eliminated."""
     price = energy_function(*_evidence(inputs), priced(config))
@@ -330,17 +335,18 @@ def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Proble
     starts, n = begin.yaw.shape
     some_energy = energy_of_rows(*_evidence(inputs), priced(config))
     span = spans_of(inputs.objects, config.span, config.chair_span)
-    boxes = without_meshes(inputs.objects)
+    boxes, ranged = inputs.objects, bool(span.any())
 
     def of(rows: Tensor) -> Callable[[Layout], Energy]:
         index, energy = rows % n, some_energy(rows)
-        few = replace(
-            inputs,
-            objects=some_objects(boxes, rows),
-            reference=inputs.reference[index],
-            pinned=inputs.pinned and of_objects(inputs.pinned, index, n),
-        )
-        return lambda free: energy(standing(few, bounded(free, span[index])))
+        supports, heights = some_supports(boxes.supports, rows), boxes.size[index, 1]
+        pinned = inputs.pinned and of_objects(inputs.pinned, index, n)
+
+        def price(free: Layout) -> Energy:
+            held = hold(bounded(free, span[index]) if ranged else free, pinned)
+            return energy(rest_on_support(held, supports, heights, inputs.ground))
+
+        return price
 
     pile = piles_of(inputs.objects.supports)
     like = alike(begin, pile) * n + torch.arange(n).to(pile)
