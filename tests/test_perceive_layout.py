@@ -32,6 +32,7 @@ from mover.perceive.capture import read_picture_of, write_first_scene
 from mover.perceive.config import LayoutConfig, ScreenConfig
 from mover.perceive.depth_map import floor_height, median_depths
 from mover.perceive.layout import (
+    SOUGHT,
     FirstScene,
     Picture,
     at_scale,
@@ -337,6 +338,7 @@ def test_the_command_turns_masks_into_a_capture(
     assert "first scene of 2 objects" in capsys.readouterr().out
     capture = read("folder", folder)
     assert [p.id for p in capture.scene.objects] == ["sofa_0", "chair_0"]
+    assert capture.scene.size_spread == SOUGHT
     made = [(folder / name).read_bytes() for name in ("scene.json", "camera.json")]
     assert run_command("layout", [str(folder), *quick, "--screen.method.steps", "20"]) == 0
     assert [(folder / name).read_bytes() for name in ("scene.json", "camera.json")] == made

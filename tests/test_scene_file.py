@@ -34,6 +34,17 @@ def test_a_mesh_without_a_file_becomes_glb_with_the_same_triangles(tmp_path: Pat
     assert found.objects[0].mesh.faces.tolist() == tiny.STEP_FACES.tolist()
 
 
+def test_how_far_off_all_sizes_are_together_is_kept_and_by_itself_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "scene.json"
+    for spread in (0.0, 0.04):
+        write_scene(Scene(CAMERA, None, (piece(),), size_spread=spread), file)
+        assert read_scene(file).size_spread == spread
+        assert ("size_spread" in json.loads(file.read_text())) == bool(spread)
+    file.write_text(file.read_text().replace("0.04", "-0.04"))
+    with pytest.raises(InputError, match="size_spread"):
+        read_scene(file)
+
+
 def test_a_users_mesh_is_copied_byte_by_byte(tmp_path: Path) -> None:
     source = tmp_path / "user" / "thing.obj"
     source.parent.mkdir()

@@ -91,6 +91,8 @@ class Scene:
     objects: tuple[SceneObject, ...]
     layout: Float[Tensor, "4 2"] | None = None
     """Corners (x, z) of a rectangular room in order around it, as a tool guessed it [m]."""
+    size_spread: float = 0.0
+    """How far off all places and sizes may be together, the standard deviation of a logarithm."""
 
 
 @record

@@ -65,6 +65,8 @@ NOT_ON_FLOOR = frozenset({
 UNKNOWN_SIZE = (0.60, 0.80, 0.60)
 SLACK = 0.05  # error of measured depth [share]
 MOST_OFF = 1.5  # factor of a network's depth; what is farther off is no floor
+SOUGHT = 0.04
+"""Error of the scale of a first scene (rooms 100 to 104), as a logarithm."""
 TURNED_APART = 0.6  # [rad], turns that are nearer count as one start
 
 
@@ -350,5 +352,6 @@ def _scene(
         count[word] += 1
         own = sorted((things == thing).nonzero()[:, 0].tolist(), key=lambda k: float(energy[k]))
         groups.append(tuple(Hypothesis(replace(pieces[k], id=name), float(energy[k])) for k in own))
-    scene = Scene(picture.camera, -height, tuple(group[0].piece for group in groups))
+    pieces = tuple(group[0].piece for group in groups)
+    scene = Scene(picture.camera, -height, pieces, size_spread=SOUGHT)
     return FirstScene(scene, tuple(groups), skipped)

@@ -20,6 +20,7 @@ from mover.pipeline.outcome import PeopleState, check_floor
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import AlignInputs, align_camera
 from mover.stages.camera.align_views import ViewInputs, Views, align_views, aligned
+from mover.stages.camera.doubt_floor import doubt_floor
 from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
 from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
@@ -62,9 +63,16 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height)
     alignment = run.stage(align_camera, known, config.align)
     alignment = replace(alignment, covariance=alignment.covariance + loose)
-    odd = check_floor(alignment.ground, capture)
+    odd = (*_doubts(feet, capture, camera), *check_floor(alignment.ground, capture))
     warnings = (*warnings, *told, *feet.warnings, *alignment.warnings, *odd)
     return PeopleState(carried(bodies, path), path, kept, parts, feet, alignment, warnings)
+
+
+def _doubts(feet: FootContacts, capture: Capture, camera: Camera) -> tuple[str, ...]:
+    """What makes the floor doubtful that the feet tell, where nothing else tells it."""
+    if capture.camera_height is not None or not is_still(capture.path):
+        return ()
+    return doubt_floor(feet, capture.detections, capture.people, camera)
 
 
 def _lifts(feet: FootContacts, capture: Capture) -> Float[Tensor, " soles"] | None:

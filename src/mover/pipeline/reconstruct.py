@@ -63,7 +63,6 @@ from mover.stages.objects.find_image_cues import (
 )
 from mover.stages.objects.gather_depth import DepthInputs, gather_depth
 from mover.stages.objects.gather_given import (
-    SOUGHT,
     UNFIT,
     believed_sides,
     common_scale,
@@ -273,7 +272,7 @@ def with_common_scale(
 ) -> tuple[PeopleState, SceneState]:
     """The whole room larger or smaller where nothing but the furniture tells its scale."""
     given = None if state.priced is None else state.priced[0].image.given
-    spread, shared = scale_spread(context, people), SOUGHT if context.capture.hypotheses else 0.0
+    spread, shared = scale_spread(context, people), context.capture.scene.size_spread
     if given is None or not spread:
         return people, state
     factor = math.exp(-common_scale(state.placed.layout, given, spread, shared))

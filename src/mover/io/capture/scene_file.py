@@ -107,6 +107,7 @@ class SceneFields(Struct, frozen=True):
     camera: Any = None
     ground: Ground | None = None
     layout: tuple[Spot, Spot, Spot, Spot] | None = None
+    size_spread: Annotated[float, Meta(ge=0, le=1)] = 0.0
 
 
 def scene_of(at: At, load: LoadMesh, camera: Camera | None, warn: Warn) -> tuple[Scene, float]:
@@ -127,7 +128,8 @@ def scene_of(at: At, load: LoadMesh, camera: Camera | None, warn: Warn) -> tuple
     camera, angle = turned(camera)
     check_attitude(camera, at.file, warn)
     layout = None if fields.layout is None else _turned_spots(fields.layout, angle)
-    return Scene(camera, ground, tuple(_turn(piece, angle) for piece in pieces), layout), angle
+    pieces = tuple(_turn(piece, angle) for piece in pieces)
+    return Scene(camera, ground, pieces, layout, fields.size_spread), angle
 
 
 def _pieces_of(at: At, rows: Sequence[ObjectFields], load: LoadMesh) -> list[SceneObject]:
@@ -261,7 +263,8 @@ def write_scene(
     layout = None if scene.layout is None else [plain(spot) for spot in scene.layout]
     tree: dict[str, Any] = scene_tree(objects, "scene.json", scene.ground, layout).value
     head = {key: tree.pop(key) for key in ("format", "version")}
-    write_json({**head, "camera": camera_to_json(scene.camera), **tree}, path)
+    spread = {"size_spread": scene.size_spread} if scene.size_spread else {}
+    write_json({**head, "camera": camera_to_json(scene.camera), **spread, **tree}, path)
 
 
 def _object_to_json(piece: SceneObject, mesh: str) -> dict[str, Any]:

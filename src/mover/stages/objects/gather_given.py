@@ -22,8 +22,6 @@ LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
 COMMON = 0.06  # error that the three given sizes of an object have in common, as a logarithm
-SOUGHT = 0.04
-"""Error of the scale of a first scene of `mover layout` (rooms 100 to 104), as a logarithm."""
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
 DIRECTIONS = 90  # that are tried within a quarter turn
 
@@ -121,7 +119,7 @@ def common_scale(layout: Layout, given: Given, spread: float, shared: float = 0.
         layout: Where the objects were placed under the people's scale.
         given: What was expected of them.
         spread: Standard deviation of the logarithm of the people's size; 0: it is known.
-        shared: The same of all that was given, together: of a scene that sought its own floor.
+        shared: The same of all that was given, together (`Scene.size_spread`).
     """
     if spread <= 0:
         return 0.0
