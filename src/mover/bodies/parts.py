@@ -33,7 +33,7 @@ from mover.bodies.skinning import SkinnedBody, open_body, zero_pose
 from mover.bodies.smpl_files import KINDS, load_smpl
 from mover.bodies.smpl_model import skin_of_model
 from mover.core.errors import InputError
-from mover.core.records import record
+from mover.core.records import fingerprint, record
 from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals
 
@@ -313,13 +313,29 @@ def _find(bodies: Bodies, up_cam: Float[Tensor, "3"] | None) -> Parts:
     rows = torch.linspace(0, bodies.verts.shape[0] - 1, POSES).round().long().unique()
     meshes = bodies.verts[rows].detach().cpu().double()
     faces = bodies.faces.detach().cpu()
-    found = match(meshes.numpy(), faces.numpy())
+    found = _matched(meshes, faces)
     if found is not None:
         return Parts(torch.from_numpy(found.part), torch.from_numpy(found.rings))
     log.warning("the bodies' mesh does not look like a whole person: only its soles are looked for")
     default = (0.0, -1.0, 0.0) if bodies.space == "camera" else (0.0, 1.0, 0.0)
     up = torch.tensor(default) if up_cam is None else up_cam.detach().cpu()
     return _unmatched(lowest_soles(meshes, faces, up.to(meshes)))
+
+
+def _matched(
+    meshes: Float[Tensor, "meshes verts 3"], faces: Int[Tensor, "faces 3"]
+) -> Matched | None:
+    """`match`, once for the same poses: many ask, of the people of one capture."""
+    key = fingerprint(meshes, faces)
+    if key not in _matches:
+        while len(_matches) >= MOST_MATCHES:
+            _matches.pop(next(iter(_matches)), None)
+        _matches[key] = match(meshes.numpy(), faces.numpy())
+    return _matches[key]
+
+
+MOST_MATCHES = 16
+_matches: dict[str, Matched | None] = {}
 
 
 def known_model(faces: Int[Tensor, "faces 3"], verts: int) -> SkinnedBody | None:
