@@ -264,16 +264,24 @@ def test_heights_are_told_to_the_room_by_track(tmp_path: Path):
 
 @pytest.mark.long
 def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
-    tmp_path: Path, small_room, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, small_room, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     pytest.importorskip("cv2")
     pytest.importorskip("av")
+    from test_pipeline import light
+
+    from mover.app.pictures.film import save_film
+    from mover.core.records import rows_of
+    from mover.pipeline.presets import PRESETS
     from mover_bench.rooms.config import NoiseConfig
     from mover_bench.rooms.noise import add_noise
-    from mover_bench.rooms.seen import Seen, write_video
+    from mover_bench.rooms.room import draw_frame
+    from mover_bench.rooms.seen import Seen
 
-    video, out = tmp_path / "room.mp4", tmp_path / "out"
-    write_video(small_room, video)
+    monkeypatch.setitem(PRESETS, "robust", light("robust"))
+    video, out, frames = tmp_path / "room.mp4", tmp_path / "out", 120
+    save_film((draw_frame(small_room, k) for k in range(frames)), small_room.bodies.fps, video)
+    bodies = rows_of(small_room.bodies, small_room.bodies.frame < frames)
     finders = Seen(small_room, add_noise(small_room, NoiseConfig(), 1), 1).finders()
     K, camera = small_room.truth.camera.K, small_room.truth.camera
     lens = {"w": camera.width, "h": camera.height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1])}
@@ -289,7 +297,8 @@ def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
     heights = small_room.bodies.verts[rows].norm(dim=-1).mean()
     assert (found.verts.norm(dim=-1).mean() / heights - 1).abs() < 0.15
     capsys.readouterr()
-    write_bodies(small_room.bodies, out / "capture" / "bodies.npz")
+    write_bodies(bodies, out / "capture" / "bodies.npz")
+    args = ChainArgs(out, camera=args.camera, refine=False)
     video_to_room(video, args, finders)
     told = capsys.readouterr().out
     assert [line for line in told.splitlines() if line.endswith("kept")] == [
@@ -300,4 +309,4 @@ def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
     kept = [line for line in capsys.readouterr().out.splitlines() if line.endswith("kept")]
     assert kept == ["1/4 pictures: kept", "2/4 bodies: kept", "3/4 first scene: kept"]
     after = read_bodies(out / "capture" / "bodies.npz")
-    assert torch.equal(after.verts, small_room.bodies.verts)
+    assert torch.equal(after.verts, bodies.verts)

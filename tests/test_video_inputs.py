@@ -8,6 +8,7 @@ import pytest
 import torch
 from filmed import FINDERS, Shot, filmed, held, turned, walk, write_film
 from PIL import Image
+from test_pipeline import light
 
 from mover.app.cli.video import ChainArgs, PerceiveArgs, perceive_into, video_to_room
 from mover.core.errors import InputError
@@ -17,6 +18,7 @@ from mover.io.capture.scene_file import read_scene
 from mover.io.people.keypoints import read_keypoints
 from mover.perceive.config import FramesConfig, PerceiveConfig
 from mover.perceive.video import TakeInputs, stamp_of, take_frames
+from mover.pipeline.presets import PRESETS
 
 pytest.importorskip("cv2")
 SECOND = 30
@@ -165,6 +167,12 @@ def test_frames_without_time_stamps_are_counted(tmp_path: Path):
     assert (found.points[..., 0].mean(-1) - 10 - true).abs().max() < 1.5
 
 
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rooms with few steps: they are asked whether they are there, not how well they are placed."""
+    monkeypatch.setitem(PRESETS, "robust", light("robust"))
+
+
 def room_of(source: Path, out: Path, args: ChainArgs, finders=FINDERS) -> Scene:
     video_to_room(source, args, finders)
     assert (out / "room" / "report.html").is_file()
@@ -185,6 +193,7 @@ def test_without_people_the_picture_alone_places_the_furniture_and_that_is_said(
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("quick")
 def test_ten_minutes_become_a_room(tmp_path: Path):
     times = range(0, 600 * SECOND, 3 * SECOND)  # the picture changes every three seconds
     filmed(tmp_path / "v.mp4", Shot(), times)
@@ -202,6 +211,7 @@ def test_ten_minutes_become_a_room(tmp_path: Path):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("quick")
 def test_three_seconds_of_a_phone_held_upright_become_a_room(tmp_path: Path):
     from kept_rooms import drawn, kept
 
