@@ -206,6 +206,16 @@ class DepthImage:
 
 
 @record
+class Tilt:
+    """Pitch and roll as the lines of the reference picture tell them [rad]."""
+
+    pitch: float
+    roll: float
+    spread: float
+    """Standard deviation of both."""
+
+
+@record
 class Capture:
     """Everything that is known before the method runs; it never holds the truth."""
 
@@ -232,6 +242,11 @@ class Capture:
     """Where the camera was when it saw the people."""
     depth: DepthImage | None = None
     """Measured depth of the reference picture."""
+    focal_spread: float | None = None
+    """Standard deviation of the logarithm of the focal length; 0: it was measured. None: nobody
+    says."""
+    tilt: Tilt | None = None
+    """Of the camera, where it was looked for in the picture."""
 
 
 @record

@@ -78,6 +78,10 @@ from mover.perceive.video import Clip, TakeInputs, opened_picture, stamp_of, tak
 log = logging.getLogger(__name__)
 MOST_SHOTS = 20  # that are told apart: what comes after them counts as one
 CHUNK = 50  # frames whose detections are kept together
+# How far off a focal length may be, of its logarithm; what a file tells stays as it says.
+GUESSED = 0.055  # by a network from one image: 3 to 8 % (GeoCalib, WildCamera)
+BY_EXIF = 0.05  # of a photo, while a video is cut by what steadies it
+ASSUMED = 0.15  # cameras of phones and rooms are 50 to 75 degrees wide
 FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal lengths refer
 SAME_FORMAT = 0.01  # difference of two ratios of width and height
 GUESS = "perceived/guess.json"  # the camera before a first scene, and as it left it
@@ -138,8 +142,8 @@ def perceive(
     objects = detections_to_json(detections_in(found), camera, "reference.png")
     write_json(objects, out / "objects.json")
     write_json(_people_tree(clip, tracks, clean), out / "people.json")
-    height = {"height": at.value["height"]} if "height" in at.value else {}
-    write_json({**camera_to_json(camera), **height}, out / "camera.json")
+    known = {k: at.value[k] for k in ("height", "focal_spread") if k in at.value}
+    write_json({**camera_to_json(camera), **known}, out / "camera.json")
     if config.models.keypoints and len(tracks.frame):
         inputs, joints = JointsInputs(clip, tracks), JointsConfig(config.models)
         found = run.stage(finders.joints, inputs, joints)
@@ -260,17 +264,22 @@ def lens_of(
     if file is not None:
         return _in_pixels_of(size, read_camera_file(file, size)), None
     if fov is not None:
-        return of_view(fov, size, "--fov"), None
+        return _spread(of_view(fov, size, "--fov"), GUESSED), None
     focal = None if photo is None else exif_focal(photo, size)
     if focal is not None:
         w, h = size
         fields = {"w": w, "h": h, "fl_x": focal, "fl_y": focal, "cx": w / 2, "cy": h / 2}
-        return At(fields, "EXIF"), None
+        return _spread(At(fields, "EXIF"), BY_EXIF), None
     text = (
         f"the lens is not known: {USUAL:.0f} degrees across are assumed; give --camera FILE or "
         "--fov DEGREES (GeoCalib, MoGe and others tell both lens and tilt)"
     )
-    return of_view(USUAL, size, "assumed"), text
+    return _spread(of_view(USUAL, size, "assumed"), ASSUMED), text
+
+
+def _spread(at: At, spread: float) -> At:
+    """The lens with how far off it may be."""
+    return At({**at.value, "focal_spread": spread}, at.file, at.field)
 
 
 def _in_pixels_of(size: tuple[int, int], at: At) -> At:
@@ -374,7 +383,7 @@ def write_first_scene(first: FirstScene, folder: Path, guess: Camera) -> None:
     write_scene(first.scene, folder / "scene.json")
     parts = folder_parts(folder)
     assert parts.camera is not None
-    given = {k: v for k, v in parts.camera.value.items() if k == "height"}
+    given = {k: v for k, v in parts.camera.value.items() if k in ("height", "focal_spread")}
     found = camera_to_json(first.scene.camera)
     write_json({**found, **given}, folder / "camera.json")
     write_json({"before": camera_to_json(guess), "found": found}, folder / GUESS)

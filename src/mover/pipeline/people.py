@@ -13,7 +13,7 @@ from mover.core.types import Bodies, Camera, CameraPath, Capture, SceneObject
 from mover.energy.terms.feet import FootContacts
 from mover.furniture.floor import is_platform
 from mover.geometry.boxes import box_of
-from mover.geometry.camera import project
+from mover.geometry.camera import project, tilted
 from mover.geometry.path import is_still, poses_at, scaled, to_reference
 from mover.io.capture.pose_file import moved
 from mover.pipeline.outcome import PeopleState, check_floor
@@ -24,13 +24,29 @@ from mover.stages.camera.doubt_floor import doubt_floor
 from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
 from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
+from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens
 from mover.stages.camera.find_scale import ScaleInputs, find_scale
+from mover.stages.camera.room_lines import find_segments
 from mover.stages.cover import hiding
-from mover.stages.objects.find_image_cues import image_evidence
+from mover.stages.objects.find_image_cues import image_evidence, people_in_reference
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
 NEAREST = 0.3  # [m], no object is nearer to the reference image's camera
+
+
+def through_its_lens(
+    capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]
+) -> Capture:
+    """The capture under focal length and tilt as the lines of its picture tell them."""
+    picture, camera = capture.reference, capture.scene.camera
+    if not config.lens.use or picture is None or not is_still(capture.path):
+        return capture
+    segments = find_segments(picture, people_in_reference(capture), camera.K[:2, 2])
+    inputs = LensInputs(segments, camera, capture.focal_spread)
+    lens = run.stage(find_lens, inputs, config.lens)
+    told = replace(capture, warnings=(*capture.warnings, *lens.warnings), tilt=lens.tilt)
+    return through_lens(told, lens.zoom, pinned)
 
 
 def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
@@ -60,7 +76,8 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
         path, told = undrifted(path, drift), (*told, *drift.warnings)
         feet, loose = feet_on(path), drift.covariance
     feet = replace(feet, lift=_lifts(feet, capture))
-    known = AlignInputs(feet, camera, scene.ground, capture.camera_height)
+    camera, tilt_spread = _tilted(camera, capture)
+    known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread)
     alignment = run.stage(align_camera, known, config.align)
     alignment = replace(alignment, covariance=alignment.covariance + loose)
     odd = (*_doubts(feet, capture, camera), *check_floor(alignment.ground, capture))
@@ -73,6 +90,15 @@ def _doubts(feet: FootContacts, capture: Capture, camera: Camera) -> tuple[str, 
     if capture.camera_height is not None or not is_still(capture.path):
         return ()
     return doubt_floor(feet, capture.detections, capture.people, camera)
+
+
+def _tilted(camera: Camera, capture: Capture) -> tuple[Camera, float | None]:
+    """The camera with the tilt that the lines of the picture tell, and how far off that is."""
+    tilt = capture.tilt
+    if tilt is None:
+        return camera, None
+    R = tilted(torch.tensor(tilt.pitch), torch.tensor(tilt.roll)).to(camera.R_cam_world)
+    return replace(camera, R_cam_world=R), tilt.spread
 
 
 def _lifts(feet: FootContacts, capture: Capture) -> Float[Tensor, " soles"] | None:

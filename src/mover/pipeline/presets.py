@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from mover.core.settings import float_in, int_in
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
-from mover.stages.camera.config import DriftConfig, ScaleConfig, ViewConfig
+from mover.stages.camera.config import DriftConfig, LensConfig, ScaleConfig, ViewConfig
 from mover.stages.config import (
     AlignConfig,
     AssignConfig,
@@ -39,6 +39,8 @@ from mover.stages.config import (
 class Config:
     """Settings of all stages, in their order."""
 
+    lens: LensConfig = field(default_factory=LensConfig)
+    """The focal length from the lines of the picture."""
     select: SelectConfig = field(default_factory=SelectConfig)
     """Which frames are believed."""
     focal: FocalConfig = field(default_factory=FocalConfig)
@@ -147,6 +149,7 @@ _ROBUST_FULL = SceneWeights(
 )
 
 ROBUST = Config(
+    lens=LensConfig(use=True),
     correct_depth=True,
     foot_contacts=FootContactConfig(speed=0.6),
     prepare=PrepareConfig(level_feet=True),

@@ -43,7 +43,7 @@ from mover.pipeline.outcome import (
     with_platforms,
     with_proposals,
 )
-from mover.pipeline.people import people_of
+from mover.pipeline.people import people_of, through_its_lens
 from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
 from mover.pipeline.presets import with_sizes
@@ -103,7 +103,9 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
     told: list[str] = []
     check_plausible(capture, told.append)
     capture = replace(capture, warnings=tuple(dict.fromkeys((*capture.warnings, *told))))
-    return check_room(with_moves(Solving(capture, config, run, _reconstructed), pinned))
+    seen = through_its_lens(capture, config, run, pinned)
+    room = check_room(with_moves(Solving(seen, config, run, _reconstructed), pinned))
+    return replace(room, initial=capture.scene)
 
 
 def _reconstructed(

@@ -225,5 +225,15 @@ class NoiseConfig:
     """Mean size of the error of a guessed focal length, between 6/11 and 16/11 of it [share].
 
     Bodies and first scene are made under the guess: they keep their widths and are off in depth.
-    Source: lenses guessed from one image (GeoCalib, WildCamera) are off by 3-8 %.
+    Source: lenses guessed from one image (GeoCalib, WildCamera) are off by 3-8 %. camera.json says
+    that it is a guess (`focal_spread`).
     """
+    distortion: float = 0.0
+    """Reference picture: standard deviation of the radial distortion k1 that is left in it.
+
+    Source: .04 to .05 are what one corrects in a Kinect's colour camera (Lachat et al. 2015).
+    """
+    things: int = 0
+    """Reference picture: things that lie about in it, as large as cushions, books and bags."""
+    grain: float = 0.0
+    """Reference picture: noise of the sensor [share of white], with blur and a JPEG's traces."""

@@ -19,10 +19,10 @@ from mover.core.records import map_tensors
 from mover.core.types import Bodies, BodyPose, Camera, Capture, Mesh, Scene, SceneObject
 from mover.furniture.library import SEATS, STEP, another
 from mover.furniture.pieces import Furniture
-from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rle import decode
 from mover.geometry.rotations import rot_y
+from mover.stages.camera.find_lens import through_lens
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.foreign import foreign_mesh
 from mover_bench.rooms.known import KnownRoom, one_thread, rounded
@@ -35,6 +35,7 @@ from mover_bench.rooms.noise_masks import (
     without,
     wobbling,
 )
+from mover_bench.rooms.noise_picture import worn_picture
 from mover_bench.rooms.poses import LEG
 from mover_bench.rooms.turns import from_vector, to_vector
 
@@ -261,6 +262,7 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     capture = noisy_finds(
         dataclasses.replace(capture, people=people), room.truth.ground, noise, [seed, 9]
     )
+    capture = worn_picture(capture, noise, np.random.default_rng([seed, 15]))
     return wrong_lens(capture, noise.lens, np.random.default_rng([seed, 13]))
 
 
@@ -286,31 +288,15 @@ def wrong_lens(capture: Capture, mean: float, rng: np.random.Generator) -> Captu
     zoom = 1 + mean * float(rng.uniform(6 / 11, 16 / 11) * rng.choice([-1.0, 1.0]))
     if zoom == 1:
         return capture
-    camera, bodies = capture.scene.camera, capture.bodies
-    R = camera.R_cam_world.double()
-
-    def moved(piece: SceneObject) -> SceneObject:
-        centre = R @ box_of(piece).center.double()
-        gap = R.mT @ torch.stack([torch.zeros(()), torch.zeros(()), (zoom - 1) * centre[2].float()]
-                                 ).double()  # fmt: skip
-        return dataclasses.replace(piece, t_world_object=piece.t_world_object + gap.float())
-
-    K = camera.K * torch.tensor([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
-    scene = dataclasses.replace(
-        capture.scene,
-        camera=dataclasses.replace(camera, K=K),
-        objects=tuple(moved(piece) for piece in capture.scene.objects),
-    )
+    capture = dataclasses.replace(through_lens(capture, zoom), focal_spread=mean)
+    bodies = capture.bodies
     if bodies is None or bodies.joints is None or bodies.pose is None:
-        return dataclasses.replace(capture, scene=scene)
-    gap = torch.zeros_like(bodies.joints[:, 0])
-    gap[:, 2] = (zoom - 1) * bodies.joints[:, 0, 2]
-    pose = dataclasses.replace(bodies.pose, transl=bodies.pose.transl + gap)
+        return capture
     bodies = dataclasses.replace(
-        bodies, verts=rounded(bodies.verts + gap[:, None]),
-        joints=rounded(bodies.joints + gap[:, None]), pose=map_tensors(rounded, pose),
+        bodies, verts=rounded(bodies.verts), joints=rounded(bodies.joints),
+        pose=map_tensors(rounded, bodies.pose),
     )  # fmt: skip
-    return dataclasses.replace(capture, scene=scene, bodies=bodies)
+    return dataclasses.replace(capture, bodies=bodies)
 
 
 def _noisy_camera(camera: Camera, noise: NoiseConfig, rng: np.random.Generator) -> Camera:

@@ -104,7 +104,7 @@ _UPSTREAM = NoiseConfig(
     foreign=1.0, warp=0.03,
     mask_head=28, mask_box=0.03, amodal=0.15, leaks=0.15, object_masks=0,
     mean_bodies=True, depth_bias=0.01, pose_bias=4.0, pose=4.0, pose_seconds=2.0,
-    lens=0.055,
+    lens=0.055, distortion=0.02, things=8, grain=0.02,
     wobble=2.5, person_masks=0, missed_masks=0.04,
     missed=0.05, false=0.05,
 )  # fmt: skip
@@ -223,6 +223,7 @@ SWITCHES: dict[str, tuple[str, ...]] = {
     "bodies": ("mean_bodies", "pose_bias", "pose"),
     "height": ("mean_bodies",),
     "lens": ("lens",),
+    "picture": ("distortion", "things", "grain"),
     "people": ("wobble", "missed_masks"),
     "finds": ("missed", "false"),
 }

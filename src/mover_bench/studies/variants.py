@@ -15,6 +15,7 @@ from mover.core.records import rows_of
 from mover.core.types import Bodies, Capture
 from mover.energy.config import Adam
 from mover.pipeline.presets import PRESETS, Config, with_sizes
+from mover.stages.camera.config import LensConfig
 from mover.stages.config import AssignConfig, SpreadConfig
 
 Hears = Literal["all", "no contact", "nobody"]
@@ -98,7 +99,7 @@ def kind_inputs(config: Config) -> Config:
     prepare = replace(config.prepare, level_feet=False)
     image = replace(config.image, bounded=False)
     kind = replace(config, layout=layout, prepare=prepare, image=image, height_spread=0.0)
-    return weighed(kind, given=0.0)
+    return weighed(replace(kind, lens=LensConfig()), given=0.0)
 
 
 _SILENT = {"contact": 0.0, "heading": 0.0}
@@ -157,6 +158,7 @@ PARTS: dict[str, Variant] = {
 
 TOOLS: dict[str, Variant] = {
     "no-given": Variant(kind_inputs(ROBUST)),
+    "no-lens": Variant(replace(ROBUST, lens=LensConfig())),
     "no-scale": Variant(replace(ROBUST, height_spread=0.0)),
     "no-level-feet": Variant(replace(ROBUST, prepare=replace(ROBUST.prepare, level_feet=False))),
     "no-bounded-sides": Variant(replace(ROBUST, image=replace(ROBUST.image, bounded=False))),

@@ -43,8 +43,7 @@ def build_capture(parts: Parts) -> Capture:
         raise InputError(f"{parts.name}: has no {lacking[0]}, expected one (see `mover import`)")
     warnings: list[str] = []
     warn = warnings.append
-    other = camera_of(parts.camera)
-    scene, turn = scene_of(parts.scene, parts.load_mesh, other, warn)
+    scene, turn = scene_of(parts.scene, parts.load_mesh, camera_of(parts.camera), warn)
     detections = detections_of(parts.objects, scene.camera, warn)
     _check_annotations(parts.scene, parts.objects.file, scene, detections, warn)
     found = people_of(parts.people, scene.camera, warn) if parts.people else NOBODY
@@ -69,6 +68,7 @@ def build_capture(parts: Parts) -> Capture:
         furniture=_furniture_of(parts, scene.camera, detections, warn),
         path=_path_of(parts, scene.camera, bodies, warn),
         depth=parts.load_depth(scene.camera),
+        focal_spread=_focal_spread(parts.camera),
     )
     check_plausible(capture, warn)
     return dataclasses.replace(capture, warnings=tuple(warnings))
@@ -85,6 +85,12 @@ def _camera_height(at: At) -> float | None:
     """Known height of the camera above the floor [m]."""
     given = maybe(at, "height")
     return None if given is None else number(given, LEAST_HEIGHT, MOST_HEIGHT)
+
+
+def _focal_spread(at: At) -> float | None:
+    """How far off the focal length may be, of its logarithm."""
+    given = maybe(at, "focal_spread")
+    return None if given is None else number(given, 0.0, 1.0)
 
 
 def _check_annotations(

@@ -181,6 +181,8 @@ def write_trees(
     camera = camera_to_json(capture.scene.camera)
     if capture.camera_height is not None:
         camera["height"] = capture.camera_height
+    if capture.focal_spread is not None:
+        camera["focal_spread"] = capture.focal_spread
     write_scene(capture.scene, folder / "scene.json")
     objects = detections_to_json(capture.detections, capture.scene.camera, image)
     write_json(objects, folder / "objects.json")

@@ -40,6 +40,7 @@ from mover.io.scenes.placing import (
     write_parts,
 )
 
+BY_MOGE = 0.055  # how far off the focal length is that it guesses from the image, of its logarithm
 TO_LOCAL = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """The stored mesh (+y up) -> the frame of the pose (+z up)."""
 TO_OPENCV = np.diag([-1.0, -1.0, 1.0])
@@ -171,6 +172,7 @@ def sam3d_parts(folder: Path, hints: Hints) -> Parts:
     if camera is None and lens.is_file():
         size = None if hints.image is None else image_size(hints.image)
         camera = read_camera_file(lens, size)
+        camera = At({**camera.value, "focal_spread": BY_MOGE}, camera.file, camera.field)
     things = _things(folder, hints)
     if not things:
         raise InputError(f"{folder}: has no meshes, expected <name>.glb with <name>.npz or .json")

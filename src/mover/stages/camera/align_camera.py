@@ -270,6 +270,8 @@ class AlignInputs:
     """First guess of the floor's height [m]."""
     camera_height: float | None
     """Known height of the camera above the floor [m]."""
+    tilt_spread: float | None = None
+    """How far off that pitch and roll are [rad]; None: as `AlignConfig` has it."""
 
 
 @record
@@ -297,16 +299,14 @@ def align_camera(
     feet, camera = inputs.foot_contacts, inputs.camera
     if not len(feet.person):
         return _without_feet(inputs, config)
-    first = torch.stack(pitch_roll(camera.R_cam_world.double()))
-    votes = vote(feet, config.votes)
+    votes, first = vote(feet, config.votes), torch.stack(pitch_roll(camera.R_cam_world.double()))
     fit = _best_fit(inputs, config, votes, first)
     observe(Step("align_camera", 0, 1))
     spread = covariance_of(fit, votes)
     people = [str(p) for p in votes.people.tolist()]
-    ground = float(fit.at[2]) if inputs.camera_height is None else -inputs.camera_height
     found = Alignment(
         camera=_turned(camera, fit.at),
-        ground=ground,
+        ground=float(fit.at[2]) if inputs.camera_height is None else -inputs.camera_height,
         covariance=spread.to(camera.K),
         offsets=dict(zip(people, fit.at[3:].tolist(), strict=True)),
         warnings=(),
@@ -321,7 +321,8 @@ def _best_fit(
     """The better of two descents: from the first guess, and from the plane through most feet."""
     known = None if inputs.camera_height is None else -inputs.camera_height
     offset = config.offset_prior
-    prior = Prior(first, config.tilt_prior, offset if known is None else SIZE_PRIOR, known)
+    tilt = inputs.tilt_spread or config.tilt_prior
+    prior = Prior(first, tilt, offset if known is None else SIZE_PRIOR, known)
     height = votes.foot_contacts.points_cam @ tilted(first[0], first[1])[:, 1]
     height = height if (lift := votes.foot_contacts.lift) is None else height - lift
     guesses = [g for g in (known, inputs.ground) if g is not None] or [float(height.median())]
@@ -340,7 +341,7 @@ def _turned(camera: Camera, at: Float[Tensor, " unknowns"]) -> Camera:
 
 def _without_feet(inputs: AlignInputs, config: AlignConfig) -> Alignment:
     """The first guess, unchanged."""
-    camera, tilt = inputs.camera, min(config.tilt_prior, math.radians(10))
+    camera, tilt = inputs.camera, min(inputs.tilt_spread or config.tilt_prior, math.radians(10))
     warning = "no feet were found: pitch and roll stay at their first guess"
     if inputs.camera_height is not None:
         ground, spread = -inputs.camera_height, 0.01
@@ -364,8 +365,8 @@ def _weak(found: Alignment, votes: Votes) -> tuple[str, ...]:
     ]
     if ground > LOOSE_GROUND:
         loose.append(f"the ground is uncertain by {100 * ground:.0f} cm")
-    warnings = votes.foot_contacts.warnings
-    return (*warnings, f"{_cause(found, votes)}: {', '.join(loose)}") if loose else warnings
+    odd = (f"{_cause(found, votes)}: {', '.join(loose)}",) if loose else ()
+    return (*votes.foot_contacts.warnings, *odd)
 
 
 def _cause(found: Alignment, votes: Votes) -> str:
@@ -386,8 +387,7 @@ def _surprising(
 ) -> tuple[str, ...]:
     """Warnings about what contradicts what was believed."""
     warnings: list[str] = []
-    pitch, roll = pitch_roll(found.camera.R_cam_world.double())
-    turned = float(torch.stack([pitch, roll]).sub(first).norm())
+    turned = float(torch.stack(pitch_roll(found.camera.R_cam_world.double())).sub(first).norm())
     if turned > 2.5 * config.tilt_prior:
         warnings.append(f"the feet turn the camera by {math.degrees(turned):.0f} degrees")
     for person, offset in found.offsets.items():

@@ -1,10 +1,10 @@
-"""Settings of a moving camera's path. Imports no torch: `--help` is quick."""
+"""Settings of the lens and of a moving camera's path. Imports no torch: `--help` is quick."""
 
 import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from mover.core.settings import Metres, float_in, int_in
+from mover.core.settings import Metres, Share, float_in, int_in
 
 
 @dataclass(frozen=True)
@@ -61,3 +61,19 @@ class ViewConfig:
     """A shift that is told [m]..."""
     loose_turn: Annotated[float, float_in(0, 180)] = 0.3
     """... and a turn [degrees]."""
+
+
+@dataclass(frozen=True)
+class LensConfig:
+    """How far the focal length that is given is believed where the lines of the picture tell it."""
+
+    use: bool = False
+    """Whether they are asked."""
+    spread: Annotated[float, float_in(1e-3, 1)] = 0.055
+    """Standard deviation of the logarithm of a focal length that was guessed."""
+    measured: Share = 0.5
+    """Chance that a lens was measured and not guessed where camera.json has no `focal_spread`."""
+    least: Share = 0.6
+    """So probably it has to be a guess before anything is changed."""
+    tilt: Annotated[float, float_in(1e-3, 1)] = 0.07
+    """Standard deviation of the pitch and roll that are given [rad]."""

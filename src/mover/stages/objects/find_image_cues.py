@@ -38,16 +38,22 @@ def image_evidence(capture: Capture) -> Seen:
     whole = torch.tensor([0.0, 0.0, camera.width, camera.height])
     blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     masks = [blank if d is None or d.mask is None else decode(d.mask, 0) for d in found]
-    people = blank
-    if capture.reference_people is not None:
-        for row in range(len(capture.reference_people.counts)):
-            people = people | decode(capture.reference_people, row)
     return Seen(
         torch.stack([whole if d is None else d.box for d in found]) if found else torch.zeros(0, 4),
         torch.tensor([d is not None for d in found], dtype=torch.bool),
         torch.stack(masks) if masks else blank.expand(0, -1, -1),
-        people,
+        people_in_reference(capture),
     )
+
+
+def people_in_reference(capture: Capture) -> Bool[Tensor, "h w"]:
+    """Where people are in the reference image."""
+    camera, people = capture.scene.camera, capture.reference_people
+    found = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    if people is not None:
+        for row in range(len(people.counts)):
+            found = found | decode(people, row)
+    return found
 
 
 def evidence_at(capture: Capture, frame: int) -> Seen:

@@ -184,6 +184,11 @@ def apply_depth(bodies: Bodies, factors: DepthFactors) -> Bodies:
     factor, size = (1 + same @ (x.to(bodies.verts) - 1) for x in both)
     bodies = larger(bodies, size) if bool((size != 1).any()) else bodies
     shift = (factor - 1)[:, None] * pelvis(bodies)
+    return shifted(bodies, shift)
+
+
+def shifted(bodies: Bodies, shift: Float[Tensor, "bodies 3"]) -> Bodies:
+    """Each body moved by its own vector [m]."""
     joints, pose = bodies.joints, bodies.pose
     if joints is not None:
         joints = joints + shift[:, None]
@@ -219,15 +224,7 @@ def nearer(bodies: Bodies, camera: Camera, ground: float, factor: float) -> Bodi
     R = camera.R_cam_world.to(bodies.verts)
     below = pelvis(bodies) @ R
     below = torch.stack([below[:, 0], torch.full_like(below[:, 1], ground), below[:, 2]], -1)
-    shift = (factor - 1) * (below @ R.mT)
-    joints, pose = bodies.joints, bodies.pose
-    if joints is not None:
-        joints = joints + shift[:, None]
-    if pose is not None:
-        pose = dataclasses.replace(pose, transl=pose.transl + shift.to(pose.transl))
-    return dataclasses.replace(
-        bodies, verts=bodies.verts + shift[:, None], joints=joints, pose=pose
-    )
+    return shifted(bodies, (factor - 1) * (below @ R.mT))
 
 
 def pelvis(bodies: Bodies) -> Float[Tensor, "bodies 3"]:

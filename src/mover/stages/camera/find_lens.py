@@ -1,0 +1,155 @@
+"""Find the focal length that a tool guessed, from the lines of the reference picture.
+
+Not in the paper, which takes the lens as given. Bodies and scene that were made under a wrong lens
+contradict nothing: all is seen where it is, and only depths are off, by the same factor as the
+lens. The picture's own lines (`room_lines`) tell it. Three rules keep what is right:
+
+- camera.json may say how its focal length was found (`focal_spread`): 0 is kept;
+- where it does not, a measured lens is as probable as a guess, and only lines that contradict it
+  clearly change it;
+- lines that fit several cameras, or none, tell little, and what they tell is weighed with the
+  guess.
+"""
+
+import dataclasses
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.core.observe import Observer, Step, silent
+from mover.core.records import record
+from mover.core.types import Bodies, Camera, Capture, SceneObject, Tilt
+from mover.geometry.boxes import box_of
+from mover.geometry.camera import pitch_roll
+from mover.stages.camera.config import LensConfig
+from mover.stages.camera.room_lines import Ends, Prior, Segments, fit_room
+from mover.stages.people.find_depth import pelvis, shifted
+
+MEASURED = 0.003  # error of the logarithm of a measured focal length
+SYSTEMATIC = 0.01  # error of the logarithm that more lines do not make smaller
+SYSTEMATIC_TILT = 0.003  # [rad]
+SAYS_LITTLE = 0.95  # of the spread before any line: lines that leave more of it tell nothing
+
+
+@record
+class LensInputs:
+    """Lines of the reference picture, and the camera under which all else was made."""
+
+    segments: Segments
+    camera: Camera
+    focal_spread: float | None
+    """What is said of the focal length; None: nothing."""
+
+
+@record
+class Lens:
+    """The lens, as the lines of the picture tell it."""
+
+    zoom: float
+    """Focal length to take over the given one; 1 where it is kept."""
+    spread: float
+    """Standard deviation of its logarithm if the given one was a guess."""
+    guessed: float
+    """Chance that it was."""
+    tilt: Tilt | None
+    """None: the lines do not tell it."""
+    warnings: tuple[str, ...] = ()
+
+
+def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent) -> Lens:
+    """How much longer the lens is than it was said to be."""
+    declared, camera = inputs.focal_spread, inputs.camera
+    spread = config.spread if declared is None else max(declared, MEASURED)
+    up = camera.R_cam_world[:, 1].double().cpu()
+    focal = float(camera.K[0, 0].double().log())
+    ends = fit_room(inputs.segments, Prior(focal, spread, up, config.tilt), camera.R_cam_world)
+    observe(Step("find_lens", 0, 1))
+    told, tilt = _told(ends, focal, spread), _tilt(ends, config)
+    if told is None or declared == 0:
+        return Lens(1.0, spread, float(bool(declared)), tilt)
+    off, error = told
+    wide = math.hypot(error, spread)
+    guess = 1 - config.measured if declared is None else 1.0
+    fits = [share * math.exp(-0.5 * (off / s) ** 2) / s
+            for share, s in ((guess, wide), (1 - guess, error))]  # fmt: skip
+    guessed = fits[0] / sum(fits) if sum(fits) else 1.0
+    left = error * spread / wide
+    if guessed < config.least:
+        return Lens(1.0, left, guessed, tilt)
+    zoom = math.exp(off * (spread / wide) ** 2)
+    warnings = (_sentence(zoom, left),) if abs(math.log(zoom)) > left else ()
+    return Lens(zoom, left, guessed, tilt, warnings)
+
+
+def _tilt(ends: Ends, config: LensConfig) -> Tilt | None:
+    """Pitch and roll over all ends; None where that is no better than what was given."""
+    weight = (ends.cost.min() - ends.cost).exp()
+    weight = (weight / weight.sum())[:, None]
+    both = torch.stack(pitch_roll(ends.pose.R_cam_room), -1)
+    mean = (weight * both).sum(0)
+    own = torch.linalg.inv(ends.precision).diagonal(0, 1, 2)[:, [1, 3]]  # about x and z
+    square = (weight * (own + (both - mean).square())).sum(0)
+    spread = math.hypot(float(square.amax()) ** 0.5, SYSTEMATIC_TILT)
+    return Tilt(float(mean[0]), float(mean[1]), spread) if spread < config.tilt / 2 else None
+
+
+def _told(ends: Ends, focal: float, spread: float) -> tuple[float, float] | None:
+    """What the lines alone say of the logarithm of the zoom, and its error; None: nothing."""
+    weight = (ends.cost.min() - ends.cost).exp()
+    weight = weight / weight.sum()
+    off = ends.pose.log_focal - focal
+    mean = float((weight * off).sum())
+    own = torch.linalg.inv(ends.precision)[:, 0, 0]
+    left = float((weight * (own + (off - mean).square())).sum()) ** 0.5
+    if not left < SAYS_LITTLE * spread:
+        return None
+    error = (left**-2 - spread**-2) ** -0.5
+    return mean * (error / left) ** 2, math.hypot(error, SYSTEMATIC)
+
+
+def _sentence(zoom: float, spread: float) -> str:
+    change = f"{100 * abs(zoom - 1):.1f} ± {100 * spread:.1f} %"
+    which = "longer" if zoom > 1 else "shorter"
+    return (
+        f"camera.json: the lines of the picture tell a focal length {change} {which} than the"
+        ' given one, which is taken for a guess; "focal_spread": 0 in it keeps a measured one'
+    )
+
+
+def through_lens(capture: Capture, zoom: float, pinned: tuple[str, ...] = ()) -> Capture:
+    """The capture as it is seen through another lens: all depths longer, as the picture stays.
+
+    `pinned` objects are where the user says.
+    """
+    if zoom == 1:
+        return capture
+    camera = capture.scene.camera
+    K = camera.K.clone()
+    K[0, 0], K[1, 1] = K[0, 0] * zoom, K[1, 1] * zoom
+    scene = dataclasses.replace(
+        capture.scene,
+        camera=dataclasses.replace(camera, K=K),
+        objects=tuple(
+            piece if piece.id in pinned else _deeper(piece, camera, zoom)
+            for piece in capture.scene.objects
+        ),
+    )
+    others = tuple(_deeper(piece, camera, zoom) for piece in capture.hypotheses)
+    bodies = None if capture.bodies is None else _people_deeper(capture.bodies, zoom)
+    return dataclasses.replace(capture, scene=scene, hypotheses=others, bodies=bodies)
+
+
+def _deeper(piece: SceneObject, camera: Camera, zoom: float) -> SceneObject:
+    R = camera.R_cam_world.double()
+    away = R[2] @ box_of(piece).center.double()
+    t = piece.t_world_object.double() + (zoom - 1) * away * R[2]
+    return dataclasses.replace(piece, t_world_object=t.to(piece.t_world_object))
+
+
+def _people_deeper(bodies: Bodies, zoom: float) -> Bodies:
+    away: Float[Tensor, " bodies"] = pelvis(bodies)[:, 2]
+    gap = torch.zeros_like(bodies.verts[:, 0])
+    gap[:, 2] = (zoom - 1) * away
+    return shifted(bodies, gap)

@@ -1,0 +1,223 @@
+"""The focal length from the straight lines of a picture (`find_lens`, `room_lines`)."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mover.core.run import Run
+from mover.core.types import Camera
+from mover.geometry.boxes import box_of
+from mover.geometry.camera import project, tilted
+from mover.geometry.rotations import rot_y
+from mover.io.capture.folder import read_capture, write_capture
+from mover.pipeline.presets import PAPER, RELEASE, ROBUST
+from mover.pipeline.reconstruct import reconstruct
+from mover.stages.camera.config import LensConfig
+from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens
+from mover.stages.camera.room_lines import (
+    Prior,
+    RoomPose,
+    Segments,
+    _angles,
+    find_segments,
+    fit_room,
+)
+from mover.stages.people.find_depth import pelvis
+from mover_bench.rooms.noise import wrong_lens
+
+W, H, FOCAL = 960, 540, 760.0
+ON = LensConfig(use=True)
+REAL = Path(__file__).parents[2] / "shared" / "data" / "total3d_1" / "input" / "img.jpg"
+KINECT = 529.5
+"""Focal length of its calibrated camera [px] (SUN RGB-D)."""
+
+
+def camera_of(focal: float, pitch: float = -0.2, roll: float = 0.02) -> Camera:
+    K = torch.tensor([[focal, 0, W / 2], [0, focal, H / 2], [0, 0, 1.0]])
+    return Camera(K, tilted(torch.tensor(pitch), torch.tensor(roll)), W, H)
+
+
+def drawn(heading: float, seed: int, boxes: int = 9, askew: int = 0, only: int | None = None):
+    """A picture of boxes' edges by OpenCV's pencil: a maker that shares nothing with the method."""
+    rng, camera = np.random.default_rng(seed), camera_of(FOCAL)
+    picture = np.full((H, W, 3), 235, np.uint8)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
+    pairs = [(a, b) for a in range(8) for b in range(a) if abs(corners[a] - corners[b]).sum() == 1]
+    turn = rot_y(torch.tensor(heading, dtype=torch.float64)).numpy()
+    R = camera.R_cam_world.double().numpy()
+    for k in range(boxes + askew):
+        own = turn if k < boxes else rot_y(torch.tensor(rng.uniform(0, np.pi))).double().numpy()
+        size = rng.uniform(0.4, 1.4, 3)
+        middle = np.array([rng.uniform(-2, 2), rng.uniform(-1.4, 0), rng.uniform(-5, -3)])
+        world = (corners * size) @ own.T + middle
+        seen = world @ R.T
+        pixel = seen[:, :2] / seen[:, 2:] * FOCAL + [W / 2, H / 2]
+        for a, b in pairs:
+            if only is None or abs(corners[a] - corners[b])[only]:
+                ends = [tuple(round(16 * v) for v in pixel[i]) for i in (a, b)]
+                cv2.line(picture, *ends, (60, 70, 80), 2, cv2.LINE_AA, 4)
+    noisy = picture + rng.normal(0, 4, picture.shape)
+    return torch.from_numpy(noisy.clip(0, 255) / 255).float()
+
+
+def lens_of(picture: torch.Tensor, focal: float, spread: float | None):
+    camera = camera_of(focal, -0.17, 0.0)  # tilt is known to some degrees
+    segments = find_segments(picture, None, camera.K[:2, 2])
+    return find_lens(LensInputs(segments, camera, spread), ON)
+
+
+@pytest.mark.parametrize("off", [0.93, 1.0, 1.07])
+@pytest.mark.parametrize("heading", [0.0, 0.3, 0.7])
+def test_a_guessed_lens_is_found_from_boxes_that_stand_along_a_room(off: float, heading: float):
+    found = lens_of(drawn(heading, seed=3, askew=2), off * FOCAL, 0.055)
+    assert found.spread < 0.03
+    assert abs(math.log(found.zoom * off)) < max(2.5 * found.spread, 0.015)
+    assert abs(math.log(found.zoom * off)) < 0.025
+
+
+def test_the_stated_error_holds():
+    off = [
+        math.log(lens_of(drawn(0.1 * k, seed=k, askew=3), 1.06 * FOCAL, 0.055).zoom * 1.06) / s
+        for k in range(10)
+        if (s := lens_of(drawn(0.1 * k, seed=k, askew=3), 1.06 * FOCAL, 0.055).spread)
+    ]
+    assert math.sqrt(np.mean(np.square(off))) < 1.5
+
+
+def test_a_lens_of_which_nothing_is_said_changes_only_where_lines_contradict_it():
+    picture = drawn(0.5, seed=1)
+    right, wrong = lens_of(picture, FOCAL, None), lens_of(picture, 1.09 * FOCAL, None)
+    assert right.zoom == 1
+    assert right.warnings == ()
+    assert wrong.zoom == pytest.approx(1 / 1.09, rel=0.025)
+    assert "focal length" in wrong.warnings[0]
+    assert "shorter" in wrong.warnings[0]
+
+
+@pytest.mark.parametrize("picture", ["blank", "verticals", "noise"])
+def test_a_picture_that_does_not_tell_leaves_the_lens(picture: str):
+    rng = torch.Generator().manual_seed(0)
+    made = {
+        "blank": torch.full((H, W, 3), 0.5),
+        "verticals": drawn(0.4, seed=2, only=1),
+        "noise": torch.rand(H, W, 3, generator=rng),
+    }[picture]
+    assert lens_of(made, 1.08 * FOCAL, None).zoom == 1
+    declared = lens_of(made, 1.08 * FOCAL, 0.055)
+    assert declared.spread > 0.04
+    assert abs(math.log(declared.zoom)) < 0.03
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="the shared data are not here")
+@pytest.mark.parametrize(("off", "most"), [(0.93, 0.045), (1.0, 0.015), (1.07, 0.02)])
+def test_a_photo_of_a_calibrated_camera_tells_its_lens(off: float, most: float):
+    picture = torch.from_numpy(cv2.imread(str(REAL))[..., ::-1] / 255.0).float()
+    K = torch.tensor([[off * KINECT, 0, 365], [0, off * KINECT, 265], [0, 0, 1.0]])
+    camera = Camera(K, tilted(torch.tensor(-0.28), torch.tensor(0.05)), 730, 530)
+    segments = find_segments(picture, None, K[:2, 2])
+    guess = find_lens(LensInputs(segments, camera, 0.055), ON)
+    assert abs(math.log(off * guess.zoom)) < most
+    if off == 1:
+        assert find_lens(LensInputs(segments, camera, None), ON).zoom == 1
+
+
+def test_slopes_are_those_of_the_angles():
+    rng = torch.Generator().manual_seed(1)
+    middle = 200 * torch.randn(7, 2, generator=rng).double()
+    along = torch.nn.functional.normalize(torch.randn(7, 2, generator=rng).double(), dim=-1)
+    segments = Segments(middle, along, torch.ones(7).double(), torch.ones(7).double())
+    R = (
+        tilted(torch.tensor(-0.2), torch.tensor(0.1)).double() @ rot_y(torch.tensor(0.4).double())
+    )[None]
+
+    def angles(x: torch.Tensor):
+        from mover.geometry.rotations import axis_angle
+
+        pose = RoomPose(math.log(700) + x[:1], axis_angle(x[1:])[None] @ R)
+        return _angles(segments, pose)[0]
+
+    at = torch.zeros(4, dtype=torch.float64)
+    wanted = torch.autograd.functional.jacobian(angles, at)
+    _, slope = _angles(segments, RoomPose(torch.tensor([math.log(700)]).double(), R))
+    assert torch.allclose(slope, wanted, atol=1e-6)
+
+
+def test_the_whole_camera_is_found_in_exact_lines():
+    camera, rng = camera_of(FOCAL), np.random.default_rng(0)
+    R = camera.R_cam_world.double() @ rot_y(torch.tensor(0.35).double())
+    start = torch.from_numpy(rng.uniform([-2, -1, -6], [2, 1, -3], (60, 3)))
+    axis = torch.eye(3).double()[torch.arange(60) % 3] * 0.5
+    ends = torch.stack([project((start + k * axis) @ R.mT, camera.K.double()) for k in (0, 1)], 1)
+    gap = ends[:, 1] - ends[:, 0]
+    length = gap.norm(dim=-1)
+    segments = Segments(
+        ends.mean(1) - torch.tensor([W / 2, H / 2]),
+        gap / length[:, None],
+        1 / length,
+        torch.ones(60).double(),
+    )
+    up = camera_of(FOCAL, -0.15, 0.0).R_cam_world[:, 1].double()
+    prior = Prior(math.log(1.08 * FOCAL), 0.2, up, 0.1)
+    found = fit_room(segments, prior, camera_of(FOCAL, -0.15, 0.0).R_cam_world)
+    assert float(found.pose.log_focal[0]) == pytest.approx(math.log(FOCAL), abs=2e-3)
+    lean = found.pose.R_cam_room[0, :, 1] @ camera.R_cam_world[:, 1].double()
+    assert float(lean) > math.cos(2e-3)
+    between = (found.pose.R_cam_room[0].mT @ R).abs()
+    assert float(between.amax(1).amin()) > math.cos(3e-3)
+
+
+def test_the_picture_stays_under_another_lens(small_room):
+    capture = small_room.capture
+    zoomed = through_lens(capture, 1.07, pinned=(capture.scene.objects[0].id,))
+    old, new = capture.scene, zoomed.scene
+    for k, (a, b) in enumerate(zip(old.objects, new.objects, strict=True)):
+        x, y = (s.camera.R_cam_world @ box_of(p).center for s, p in ((old, a), (new, b)))
+        if k == 0:
+            assert torch.equal(a.t_world_object, b.t_world_object)
+        else:
+            pixels = project(x[None], old.camera.K), project(y[None], new.camera.K)
+            assert torch.allclose(*pixels, atol=1e-2)
+            assert float(y[2] / x[2]) == pytest.approx(1.07, rel=1e-4)
+            assert torch.equal(a.yaw, b.yaw)
+    assert capture.bodies is not None
+    assert zoomed.bodies is not None
+    before, after = pelvis(capture.bodies), pelvis(zoomed.bodies)
+    pixels = project(before, old.camera.K), project(after, new.camera.K)
+    assert torch.allclose(*pixels, atol=1e-2)
+    back = through_lens(zoomed, 1 / 1.07, pinned=(capture.scene.objects[0].id,))
+    assert back.bodies is not None
+    assert torch.allclose(back.bodies.verts, capture.bodies.verts, atol=1e-5)
+
+
+def test_only_robust_asks_the_lines():
+    assert ROBUST.lens.use
+    assert not PAPER.lens.use
+    assert not RELEASE.lens.use
+
+
+def test_a_capture_keeps_what_it_says_of_its_lens(small_room, tmp_path):
+    guessed = dataclasses.replace(small_room.capture, focal_spread=0.055)
+    write_capture(guessed, tmp_path / "guessed")
+    assert read_capture(tmp_path / "guessed").focal_spread == 0.055
+    write_capture(small_room.capture, tmp_path / "silent")
+    assert read_capture(tmp_path / "silent").focal_spread is None
+
+
+@pytest.mark.slow
+def test_a_room_under_a_guessed_lens_is_rebuilt_under_a_better_one(small_room, tmp_path):
+    guessed = wrong_lens(small_room.capture, 0.055, np.random.default_rng(2))
+    given, true = guessed.scene.camera.K[0, 0], small_room.truth.camera.K[0, 0]
+    room = reconstruct(guessed, ROBUST, Run(tmp_path / "asked"))
+    found = room.scene.camera.K[0, 0]
+    assert abs(float((found / true).log())) < 0.6 * abs(float((given / true).log()))
+    assert torch.equal(room.initial.camera.K, guessed.scene.camera.K)
+    for piece, own in zip(room.initial.objects, guessed.scene.objects, strict=True):
+        assert torch.equal(piece.t_world_object, own.t_world_object)
+    told = dataclasses.replace(guessed, focal_spread=0.0)
+    kept = reconstruct(told, ROBUST, Run(tmp_path / "kept"))
+    assert torch.equal(kept.scene.camera.K, guessed.scene.camera.K)
