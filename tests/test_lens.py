@@ -68,7 +68,7 @@ def drawn(heading: float, seed: int, boxes: int = 9, askew: int = 0, only: int |
 def lens_of(picture: torch.Tensor, focal: float, spread: float | None):
     camera = camera_of(focal, -0.17, 0.0)  # tilt is known to some degrees
     segments = find_segments(picture, None, camera.K[:2, 2])
-    return find_lens(LensInputs(segments, camera, spread), ON)
+    return find_lens(LensInputs(segments, camera, spread, ON.tilt), ON)
 
 
 @pytest.mark.parametrize("off", [0.93, 1.0, 1.07])
@@ -120,10 +120,10 @@ def test_a_photo_of_a_calibrated_camera_tells_its_lens(off: float, most: float):
     K = torch.tensor([[off * KINECT, 0, 365], [0, off * KINECT, 265], [0, 0, 1.0]])
     camera = Camera(K, tilted(torch.tensor(-0.28), torch.tensor(0.05)), 730, 530)
     segments = find_segments(picture, None, K[:2, 2])
-    guess = find_lens(LensInputs(segments, camera, 0.055), ON)
+    guess = find_lens(LensInputs(segments, camera, 0.055, ON.tilt), ON)
     assert abs(math.log(off * guess.zoom)) < most
     if off == 1:
-        assert find_lens(LensInputs(segments, camera, None), ON).zoom == 1
+        assert find_lens(LensInputs(segments, camera, None, ON.tilt), ON).zoom == 1
 
 
 def test_slopes_are_those_of_the_angles():

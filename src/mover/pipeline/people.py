@@ -1,5 +1,6 @@
 """The people of a run: where they are about the reference camera, and the floor they tell."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -42,8 +43,13 @@ def through_its_lens(
     picture, camera = capture.reference, capture.scene.camera
     if not config.lens.use or picture is None or not is_still(capture.path):
         return capture
+    people, tilt = people_of(capture, config, run), config.lens.tilt
+    if people is not None:
+        camera = replace(camera, R_cam_world=people.alignment.camera.R_cam_world)
+        spread = people.alignment.covariance.diag()[:2].amax()
+        tilt = min(tilt, math.hypot(config.lens.feet, float(spread) ** 0.5))
     segments = find_segments(picture, people_in_reference(capture), camera.K[:2, 2])
-    inputs = LensInputs(segments, camera, capture.focal_spread)
+    inputs = LensInputs(segments, camera, capture.focal_spread, tilt)
     lens = run.stage(find_lens, inputs, config.lens)
     told = replace(capture, warnings=(*capture.warnings, *lens.warnings), tilt=lens.tilt)
     return through_lens(told, lens.zoom, pinned)

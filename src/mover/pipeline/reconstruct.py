@@ -103,6 +103,8 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
     told: list[str] = []
     check_plausible(capture, told.append)
     capture = replace(capture, warnings=tuple(dict.fromkeys((*capture.warnings, *told))))
+    if capture.scene.objects:
+        _begin(run, prepare_objects, PrepareInputs(capture.scene.objects), config.prepare)
     seen = through_its_lens(capture, config, run, pinned)
     room = check_room(with_moves(Solving(seen, config, run, _reconstructed), pinned))
     return replace(room, initial=capture.scene)

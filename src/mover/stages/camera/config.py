@@ -76,4 +76,6 @@ class LensConfig:
     least: Share = 0.6
     """So probably it has to be a guess before anything is changed."""
     tilt: Annotated[float, float_in(1e-3, 1)] = 0.07
-    """Standard deviation of the pitch and roll that are given [rad]."""
+    """Standard deviation of the pitch and roll that are given [rad] ..."""
+    feet: Annotated[float, float_in(1e-3, 1)] = 0.0175
+    """... and of those that feet tell, beside what they say themselves: poses are biased."""

@@ -39,8 +39,11 @@ class LensInputs:
 
     segments: Segments
     camera: Camera
+    """Pitch and roll as the feet tell them, or as they are given."""
     focal_spread: float | None
     """What is said of the focal length; None: nothing."""
+    tilt_spread: float
+    """How far off pitch and roll are [rad]."""
 
 
 @record
@@ -64,9 +67,10 @@ def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent
     spread = config.spread if declared is None else max(declared, MEASURED)
     up = camera.R_cam_world[:, 1].double().cpu()
     focal = float(camera.K[0, 0].double().log())
-    ends = fit_room(inputs.segments, Prior(focal, spread, up, config.tilt), camera.R_cam_world)
+    prior = Prior(focal, spread, up, inputs.tilt_spread)
+    ends = fit_room(inputs.segments, prior, camera.R_cam_world)
     observe(Step("find_lens", 0, 1))
-    told, tilt = _told(ends, focal, spread), _tilt(ends, config)
+    told, tilt = _told(ends, focal, spread), _tilt(ends, inputs.tilt_spread)
     if told is None or declared == 0:
         return Lens(1.0, spread, float(bool(declared)), tilt)
     off, error = told
@@ -83,8 +87,8 @@ def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent
     return Lens(zoom, left, guessed, tilt, warnings)
 
 
-def _tilt(ends: Ends, config: LensConfig) -> Tilt | None:
-    """Pitch and roll over all ends; None where that is no better than what was given."""
+def _tilt(ends: Ends, before: float) -> Tilt | None:
+    """Pitch and roll over all ends; None where that is no better than what was known."""
     weight = (ends.cost.min() - ends.cost).exp()
     weight = (weight / weight.sum())[:, None]
     both = torch.stack(pitch_roll(ends.pose.R_cam_room), -1)
@@ -92,7 +96,7 @@ def _tilt(ends: Ends, config: LensConfig) -> Tilt | None:
     own = torch.linalg.inv(ends.precision).diagonal(0, 1, 2)[:, [1, 3]]  # about x and z
     square = (weight * (own + (both - mean).square())).sum(0)
     spread = math.hypot(float(square.amax()) ** 0.5, SYSTEMATIC_TILT)
-    return Tilt(float(mean[0]), float(mean[1]), spread) if spread < config.tilt / 2 else None
+    return Tilt(float(mean[0]), float(mean[1]), spread) if spread < before / 2 else None
 
 
 def _told(ends: Ends, focal: float, spread: float) -> tuple[float, float] | None:

@@ -23,7 +23,6 @@ MOST = 400  # the longest segments
 END = 0.5  # [px] by which the end of a segment is off
 BENT = 0.001  # [rad] edges are not straighter and not more parallel than that
 FREE = 0.5  # share of segments that belong to no direction
-VOTE = 0.5  # of a segment: neighbours err together
 ALONG, ASIDE = 0.05, 0.02  # [rad], of the width: segments that are one edge, or its two sides
 COARSE = (5.0, 2.0, 1.0)  # times the errors, one descent after the other
 STEPS = 12
@@ -106,7 +105,7 @@ def find_segments(
     middle = lines.mean(1)
     along = (lines[:, 1] - lines[:, 0]) / length[:, None]
     error = ((2 * END / length).square() + BENT**2).sqrt()
-    vote = VOTE / _sides(middle, along, length, ASIDE * grey.shape[1])
+    vote = 1 / _sides(middle, along, length, ASIDE * grey.shape[1])
     return Segments(middle - centre.double().cpu(), along, error, vote)
 
 
