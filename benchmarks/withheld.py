@@ -5,7 +5,8 @@
 Rebuilds the rooms of `--sets` with `robust` (`withheld-seat` lacks the seat that is used most,
 `withheld-step` a step, `rooms` nothing, so that all proposals there are false; finished stages are
 kept in `--out`) and prints for each what is missing, how far the proposal's middle is from it and
-how much too high its seat is [cm], its certainty, and the number of false proposals.
+how much too high its seat is [cm], its certainty, and the number of false proposals. Seeds without
+such a room (no step fits) are told and left out.
 """
 
 import argparse
@@ -17,6 +18,7 @@ import torch
 from mover.core.run import Run
 from mover.pipeline.presets import ROBUST
 from mover.pipeline.reconstruct import reconstruct
+from mover_bench.rooms.known import NoRoomError
 from mover_bench.studies.job import noisy_room
 from mover_bench.studies.measures import measure_proposals
 from mover_bench.studies.run import parse_seeds
@@ -25,9 +27,13 @@ from mover_bench.studies.sets import SETS
 Row = tuple[float, float]  # centre and height [cm]; nan where nothing was found
 
 
-def rows(name: str, seed: int, out: Path) -> tuple[list[Row], int]:
+def rows(name: str, seed: int, out: Path) -> tuple[list[Row], int] | None:
     """What became of each support that is missing in a room, and the false proposals."""
-    trial = noisy_room(seed, SETS[name], Run(out / "rooms" / str(seed)))
+    try:
+        trial = noisy_room(seed, SETS[name], Run(out / "rooms" / str(seed)))
+    except NoRoomError as error:
+        print(f"{name} {seed}: left out, there is no such room: {error}", flush=True)
+        return None
     room = reconstruct(trial.capture, ROBUST, Run(out / name / str(seed)))
     told = measure_proposals(trial, room)
     found: list[Row] = []
@@ -49,7 +55,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     for name in args.sets:
-        all_rows = [rows(name, seed, args.out) for seed in parse_seeds(args.seeds)]
+        tried = [rows(name, seed, args.out) for seed in parse_seeds(args.seeds)]
+        all_rows = [row for row in tried if row is not None]
         told = np.array([row for found, _ in all_rows for row in found]).reshape(-1, 2)
         there = told[np.isfinite(told[:, 0])]
         false = sum(count for _, count in all_rows)

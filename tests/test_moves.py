@@ -46,6 +46,8 @@ def stays(seen: list[tuple[int, int, torch.Tensor]], people: People | None = Non
 
 
 FRAMES = range(0, 60, 2)
+ASIDE = rows([(f, 0, patch(0, 0, 10, 20)) for f in FRAMES])
+"""Somebody who hides nothing."""
 
 
 def test_some_rows_of_people_keep_their_own_masks_and_known_heights():
@@ -90,6 +92,7 @@ def test_what_stands_still_never_moves_however_its_outline_trembles(amount: int)
     seen = [(f, 1, patch(40 + int(shift[f, 0]), 30 + int(shift[f, 1]))) for f in FRAMES]
     seen = [(f, n, torch.zeros_like(m) if f == 20 else m) for f, n, m in seen]
     assert stays(seen) == []
+    assert stays(seen, ASIDE) == []
 
 
 def test_people_before_an_object_do_not_move_it():
@@ -105,6 +108,33 @@ def test_what_a_moved_object_hides_and_uncovers_stands_still():
     seen = [(f, 1, bed & ~chair[f < 30]) for f in FRAMES]
     seen += [(f, 2, chair[f < 30]) for f in FRAMES]
     assert stays(seen) == [(2, 0), (2, 29)]
+    assert stays(seen, ASIDE) == [(2, 0), (2, 29)]
+
+
+def pushed(share: float) -> torch.Tensor:
+    """What goes straight away from the camera: what is seen of it later lies inside of it."""
+    return patch(40 + round(6 * share), 30 + round(2 * share), 48 - round(16 * share),
+                 42 - round(14 * share))  # fmt: skip
+
+
+@pytest.mark.parametrize("frames", [1, 8])
+def test_what_is_pushed_straight_away_or_towards_the_camera_moves(frames: int):
+    share = {f: min(max(f - 24, 0) / frames, 1.0) for f in FRAMES}
+    away = [(f, 3, pushed(share[f])) for f in FRAMES]
+    towards = [(f, 3, pushed(1 - share[f])) for f in FRAMES]
+    for seen in (away, towards):
+        (_, first), (_, second) = stays(seen, ASIDE)
+        assert first == 0
+        assert 24 <= second <= 24 + frames
+        assert stays(seen) == []  # somebody whom no mask tells may be before it
+
+
+def test_what_comes_before_an_object_does_not_move_it_though_it_looks_smaller():
+    chair = {True: patch(118, 40, 36, 48), False: patch(60, 20, 36, 68)}
+    bed = patch(15, 25, 80, 45)
+    seen = [(f, 1, bed & ~chair[f < 30]) for f in FRAMES]
+    seen += [(f, 2, chair[f < 30]) for f in FRAMES]
+    assert stays(seen, ASIDE) == [(2, 0), (2, 29)]
 
 
 def test_a_glance_of_a_wrong_mask_is_no_move():

@@ -17,6 +17,7 @@ from mover_bench.rooms.gait import Stations, duration, route_of, stations, walk
 from mover_bench.rooms.known import (
     Actor,
     KnownRoom,
+    NoRoomError,
     RefusedError,
     build,
     looks,
@@ -76,7 +77,7 @@ def make_handled_room(seed: int, config: RoomConfig) -> KnownRoom:
     """A room whose visitor pushes the piece that is used most, or rolls on it.
 
     Raises:
-        ValueError: If no piece of the room can be moved so.
+        NoRoomError: If no piece of the room can be moved so.
     """
     rng = np.random.default_rng([seed, 78])
     refused: list[str] = []
@@ -88,7 +89,7 @@ def make_handled_room(seed: int, config: RoomConfig) -> KnownRoom:
                     return _acted(first.plan, index, config, rng)
                 except (RefusedError, RefusedTaskError, NoWayError, ValueError) as error:
                     refused.append(str(error))
-    raise ValueError(f"seed {seed}: nothing can be moved: {refused[-3:]}")
+    raise NoRoomError(f"seed {seed}: nothing can be moved: {refused[-3:]}")
 
 
 def _acted(plan: Plan, index: int, config: RoomConfig, rng: np.random.Generator) -> KnownRoom:

@@ -69,6 +69,10 @@ class RefusedError(Exception):
     """A draft of a room is not true enough or not rich enough."""
 
 
+class NoRoomError(ValueError):
+    """A seed of a set has no room."""
+
+
 @record
 class Acted:
     """One person, frame by frame, in the frame of the floor."""

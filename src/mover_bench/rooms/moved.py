@@ -18,7 +18,14 @@ from mover.core.types import Bodies, BodyPose, Masks, People, Scene, Segment
 from mover.geometry.rle import joined
 from mover_bench.rooms.compose import Plan, fits, in_view
 from mover_bench.rooms.config import RoomConfig
-from mover_bench.rooms.known import KnownRoom, RefusedError, build, one_thread, pieces_seen
+from mover_bench.rooms.known import (
+    KnownRoom,
+    NoRoomError,
+    RefusedError,
+    build,
+    one_thread,
+    pieces_seen,
+)
 from mover_bench.rooms.placed import Placed
 from mover_bench.rooms.render import see
 from mover_bench.rooms.room import cast, make_room
@@ -39,7 +46,7 @@ def make_moved_room(seed: int, config: RoomConfig) -> KnownRoom:
     Where `config.moved` is `stays`, the second visitor finds everything where it was.
 
     Raises:
-        ValueError: If no piece of the room can be moved.
+        NoRoomError: If no piece of the room can be moved.
     """
     first = make_room(seed, config)
     rng = np.random.default_rng([seed, 77])
@@ -54,7 +61,7 @@ def make_moved_room(seed: int, config: RoomConfig) -> KnownRoom:
                 return _joined(first, second, index)
             except RefusedError as error:
                 refused.append(str(error))
-    raise ValueError(f"seed {seed}: nothing can be moved: {refused[-3:]}")
+    raise NoRoomError(f"seed {seed}: nothing can be moved: {refused[-3:]}")
 
 
 def candidates(room: KnownRoom, kinds: tuple[str, ...]) -> list[int]:

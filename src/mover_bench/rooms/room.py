@@ -11,7 +11,7 @@ from mover.core.types import Mesh
 from mover.furniture.library import canonical, make_piece
 from mover_bench.rooms.compose import Plan, draw_plan, make_view
 from mover_bench.rooms.config import ActConfig, RoomConfig
-from mover_bench.rooms.known import Actor, KnownRoom, RefusedError, build, one_thread
+from mover_bench.rooms.known import Actor, KnownRoom, NoRoomError, RefusedError, build, one_thread
 from mover_bench.rooms.motion import DOOR, Performance, Stage, Stop, Task, perform
 from mover_bench.rooms.placed import ROOMY, Placed, free_of
 from mover_bench.rooms.poses import jointed, make_person, rows
@@ -140,7 +140,7 @@ def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
     """A room in which everything is known; the same for the same seed and configuration.
 
     Raises:
-        ValueError: If 60 drafts in a row had to be refused.
+        NoRoomError: If 60 drafts in a row had to be refused.
     """
     config = config or RoomConfig()
     refused: list[str] = []
@@ -156,7 +156,7 @@ def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
             refused.append(f"draft {draft}: {error}")
         else:
             return room
-    raise ValueError(f"seed {seed}: 60 drafts were refused: {refused[-3:]}")
+    raise NoRoomError(f"seed {seed}: 60 drafts were refused: {refused[-3:]}")
 
 
 def cast(

@@ -15,7 +15,15 @@ from mover.furniture.pieces import block, draw, finish, pair
 from mover_bench.rooms.compose import Plan, fits, in_view, overlap
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.handled import OTHER, ROOMS
-from mover_bench.rooms.known import Acted, Actor, KnownRoom, RefusedError, build, one_thread
+from mover_bench.rooms.known import (
+    Acted,
+    Actor,
+    KnownRoom,
+    NoRoomError,
+    RefusedError,
+    build,
+    one_thread,
+)
 from mover_bench.rooms.motion import Performance, Stage, Stop, Task, perform
 from mover_bench.rooms.moved import candidates
 from mover_bench.rooms.noise import SEATS_FOR_ONE
@@ -43,7 +51,7 @@ def make_stepped_room(seed: int, config: RoomConfig) -> KnownRoom:
     """The room of a seed with a step on its free floor, on which its video begins.
 
     Raises:
-        ValueError: If no step fits, or nobody can use the room then.
+        NoRoomError: If no step fits, or nobody can use the room then.
     """
     room, refused = make_room(seed, config), list[str]()
     rng = np.random.default_rng([seed, 78])
@@ -53,7 +61,7 @@ def make_stepped_room(seed: int, config: RoomConfig) -> KnownRoom:
             return build(plan, (_climber(plan, config, rng),), config, room.capture.name, ())
         except (RefusedError, NoWayError, ValueError) as error:
             refused.append(str(error))
-    raise ValueError(f"seed {seed}: no step: {refused[-3:]}")
+    raise NoRoomError(f"seed {seed}: no step: {refused[-3:]}")
 
 
 def with_step(plan: Plan, rng: np.random.Generator) -> Plan:
@@ -126,7 +134,7 @@ def make_platform_room(seed: int, config: RoomConfig) -> KnownRoom:
     What is given has everything on the ground: no tool tells what furniture stands on.
 
     Raises:
-        ValueError: If no seat of the room has space for a platform.
+        NoRoomError: If no seat of the room has space for a platform.
     """
     refused, rng = list[str](), np.random.default_rng([seed, 79])
     for other in range(ROOMS):
@@ -137,7 +145,7 @@ def make_platform_room(seed: int, config: RoomConfig) -> KnownRoom:
                     return _on_platform(room.plan, index, config, rng)
                 except (RefusedError, ValueError) as error:
                     refused.append(str(error))
-    raise ValueError(f"seed {seed}: no platform: {refused[-3:]}")
+    raise NoRoomError(f"seed {seed}: no platform: {refused[-3:]}")
 
 
 def _on_platform(plan: Plan, index: int, config: RoomConfig, rng: np.random.Generator) -> KnownRoom:

@@ -2,7 +2,9 @@
 
 What is seen of an object where nobody hides it is compared with what was seen of it since it last
 stood still: by the common pixels' share of the smaller of both, for what is hidden or uncovered by
-other furniture only grows or shrinks, and what is moved does both. Each stretch between two moves
+other furniture only grows or shrinks, and what is moved does both. What is pushed straight away
+only shrinks, too: so where neither people nor other furniture are seen, and nothing can hide it,
+the share of the larger counts. Each stretch between two moves
 is a stay, in which the object stands; its mask is what most of its frames show where nobody is
 before it. Stretches that are too short are moves themselves: the object is carried or pushed.
 
@@ -20,6 +22,7 @@ from itertools import pairwise
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record, rows_of
@@ -117,6 +120,15 @@ def _hidden(people: People | None, frame: int, step: int) -> Bool[Tensor, "h w"]
     return widened(hidden[None], 1)[0]
 
 
+def _covered(furniture: People, frame: int, step: int) -> Bool[Tensor, "h w"]:
+    """Steps with any pixel of furniture in a frame, and those beside them: what is thin is seen."""
+    rows = (furniture.frame == frame).nonzero()[:, 0].tolist()
+    whole = torch.stack([decode(furniture.masks, row) for row in rows]).any(0)
+    height, width = thin(furniture.masks, rows[0], step).shape
+    steps = max_pool2d(whole[None].float(), step, ceil_mode=True)[:, :height, :width]
+    return widened(steps > 0, 1)[0]
+
+
 @dataclass(frozen=True)
 class _Sight:
     """How one object is looked at."""
@@ -125,6 +137,8 @@ class _Sight:
     """Its masks, in the order of their frames."""
     hidden: Callable[[int], Bool[Tensor, "h w"] | None]
     """What people hide in a frame."""
+    covered: Callable[[int], Bool[Tensor, "h w"]]
+    """Where a frame may show furniture."""
     fps: float | None
     path: CameraPath
     step: int
@@ -145,13 +159,14 @@ def _sights(inputs: MoveInputs) -> dict[int, _Sight]:
     still = is_still(inputs.path)
     step = STEP if still else STEP * max(1, round(inputs.furniture.masks.width / WIDE))
     hidden = cache(lambda frame: _hidden(inputs.people, frame, step))
+    covered = cache(lambda frame: _covered(inputs.furniture, frame, step))
     K = inputs.K / torch.tensor([[step], [step], [1.0]])
     found: dict[int, _Sight] = {}
     for index, number in enumerate(inputs.annotations):
         rows = (inputs.furniture.person == number).nonzero()[:, 0]
         mine = rows_of(inputs.furniture, rows[inputs.furniture.frame[rows].argsort()])
         here = torch.ones(1), (slice(0, 0), slice(0, 0)), 0
-        sight = _Sight(mine, hidden, inputs.fps, inputs.path, step, K, *here)
+        sight = _Sight(mine, hidden, covered, inputs.fps, inputs.path, step, K, *here)
         if len(rows) and not still:
             sight = _swept(sight, float(inputs.depth[index]))
         found[number] = sight
@@ -180,23 +195,23 @@ def _swept(sight: _Sight, depth: float) -> _Sight:
     return replace(sight, depth=depths, window=window, loose=round(moves * RELIEF / depth))
 
 
-def _seen(
-    sight: _Sight, row: int, moved: tuple[_Sight, ...]
-) -> tuple[Bool[Tensor, "depths h w"], Bool[Tensor, "depths h w"]]:
-    """Where an object is seen in one of its frames, and where it could be seen, at each depth."""
-    seen, frame = thin(sight.furniture.masks, row, sight.step), sight.furniture.frame[row]
-    others = (_hidden(one.furniture, int(frame), sight.step) for one in moved)
-    before = [sight.hidden(int(frame)), *others]
-    hidden = [mask for mask in before if mask is not None]
+def _seen(sight: _Sight, row: int, moved: tuple[_Sight, ...]) -> "_Run":
+    """One of an object's frames as a run."""
+    seen, frame = thin(sight.furniture.masks, row, sight.step), int(sight.furniture.frame[row])
+    people = sight.hidden(frame)
+    others = (_hidden(one.furniture, frame, sight.step) for one in moved)
+    hidden = [mask for mask in (people, *others) if mask is not None]
     free = ~torch.stack(hidden).any(0) if hidden else torch.ones_like(seen)
+    seen, bare = seen & free, torch.zeros_like(seen)
+    if people is not None:  # else people may hide what no mask tells
+        bare = seen | (free & ~sight.covered(frame))
     if is_still(sight.path):
-        return (seen & free)[None], free[None]
-    pose, (rows, columns) = poses_at(sight.path, frame[None]), sight.window
+        return _Run(frame, frame, frame, *(mask[None].long() for mask in (seen, free, bare)))
+    pose, (rows, columns) = poses_at(sight.path, torch.tensor([frame])), sight.window
     size = rows.stop - rows.start, columns.stop - columns.start
-    both = torch.stack([seen & free, free])
     depth = sight.depth[:, None, None].expand(-1, *size)
-    there, could = resampled(both, depth, (sight.K, sight.window), pose).unbind(0)
-    return there, could
+    carried = resampled(torch.stack([seen, free, bare]), depth, (sight.K, sight.window), pose)
+    return _Run(frame, frame, frame, *carried.long().unbind(0))
 
 
 @dataclass(frozen=True)
@@ -211,6 +226,8 @@ class _Run:
     """In how many frames it is seen."""
     times: Int[Tensor, "depths h w"]
     """In how many it could be seen."""
+    bare: Int[Tensor, "depths h w"]
+    """In how many it is seen, or nothing else that could hide it."""
 
     @property
     def usual(self) -> Bool[Tensor, "depths h w"]:
@@ -221,15 +238,14 @@ class _Run:
         """Both as one."""
         last = self.sure if sure else other.sure
         hits, times = self.hits + other.hits, self.times + other.times
-        return _Run(other.first, self.last, last, hits, times)
+        return _Run(other.first, self.last, last, hits, times, self.bare + other.bare)
 
 
 def _stays(sight: _Sight, config: MoveConfig, moved: tuple[_Sight, ...] = ()) -> list[_Run]:
     """The stretches in which an object stands."""
     runs: list[_Run] = []
-    for row, frame in enumerate(sight.furniture.frame.tolist()):  # what is usual grows
-        seen, free = _seen(sight, row, moved)
-        run = _Run(frame, frame, frame, seen.long(), free.long())
+    for row in range(len(sight.furniture.frame)):  # what is usual grows
+        run = _seen(sight, row, moved)
         alike = _likeness(run, runs[-1], sight, config) if runs else 0.0
         if alike > config.alike:
             runs[-1] = run.after(runs[-1], alike <= 1)
@@ -246,21 +262,28 @@ def _stays(sight: _Sight, config: MoveConfig, moved: tuple[_Sight, ...] = ()) ->
 
 
 def _likeness(a: _Run, b: _Run, sight: _Sight, config: MoveConfig) -> float:
-    """Common pixels of an object in two runs, of those of the smaller; `UNSEEN`: too few are.
+    """Common pixels of an object in two runs, as a share; `UNSEEN`: too few are seen.
 
-    Of the depths that one counts which suits both best.
+    Of those of the smaller, since the rest may be hidden; where no mask could hide it, of those of
+    the larger. The less counts, at the depth that suits both best.
     """
-    known = (a.times > 0) & (b.times > 0)
-    whole = torch.maximum(_count(a.usual), _count(b.usual))
-    one, other = a.usual & known, b.usual & known
-    fewest = torch.minimum(_count(one), _count(other))
-    enough = fewest >= config.visible * whole
-    if not bool(enough.any()):
-        return UNSEEN
-    wide = sight.loose
-    common = torch.minimum(_count(one & widened(other, wide)), _count(other & widened(one, wide)))
-    share = common / fewest.clamp_min(1.0)
-    return float(share[enough].max())
+    enough = config.visible * torch.maximum(_count(a.usual), _count(b.usual))
+    alike = torch.full_like(enough, UNSEEN)
+    for bare in (False, True):
+        times = (a.bare, b.bare) if bare else (a.times, b.times)
+        known = (times[0] > 0) & (times[1] > 0)
+        one, other = (known & (2 * run.hits > n) for run, n in zip((a, b), times, strict=True))
+        pairs = (one, other), (other, one)
+        common = torch.stack([_count(x & widened(y, sight.loose)) for x, y in pairs])
+        size = torch.stack([_count(one), _count(other)])
+        if bare:
+            whole, share = size.amax(0), (common / size.clamp_min(1.0)).amin(0)
+        else:
+            whole = size.amin(0)
+            share = common.amin(0) / whole.clamp_min(1.0)
+        alike = torch.minimum(alike, torch.where(whole >= enough, share, UNSEEN))
+    told = alike[alike <= 1]
+    return float(told.max()) if len(told) else UNSEEN
 
 
 def _count(masks: Bool[Tensor, "depths h w"]) -> Float[Tensor, " depths"]:
