@@ -19,7 +19,7 @@ from mover.core.run import Run
 from mover.geometry.camera import pitch_roll
 from mover.pipeline.people import people_of
 from mover.pipeline.presets import ROBUST, Config
-from mover.stages.camera.find_focal import Focal, zoomed
+from mover.stages.camera.find_focal import zoomed
 from mover_bench.studies.job import noisy_room
 from mover_bench.studies.measures import Trial
 from mover_bench.studies.run import parse_seeds
@@ -43,7 +43,7 @@ def tilt(trial: Trial, config: Config, run: Run) -> list[float]:
 def lens(trial: Trial, longer: float, run: Run) -> float:
     """Error of the focal length that was found [%]."""
     scene = trial.capture.scene
-    camera = zoomed(scene.camera, Focal(longer, 0.0, 0, ()))
+    camera = zoomed(scene.camera, longer)
     capture = replace(trial.capture, scene=replace(scene, camera=camera))
     crew = people_of(capture, GUESSED, run)
     assert crew is not None

@@ -36,7 +36,7 @@ LOOSE = FocalConfig(spread=0.05)
 
 def asked(bodies, seen, zoom=1.0, objects=()):
     given = inputs_of(bodies, seen, objects)
-    camera = zoomed(CAMERA, Focal(zoom, 0.0, 0, ()))
+    camera = zoomed(CAMERA, zoom)
     return FocalInputs(given.bodies, given.keep, given.people, given.objects, camera)
 
 
@@ -105,7 +105,7 @@ def test_without_a_spread_no_preset_looks_for_it_and_the_stage_refuses():
 
 
 def test_only_the_focal_length_of_the_camera_changes():
-    camera = zoomed(CAMERA, Focal(1.1, 0.01, 9, ()))
+    camera = zoomed(CAMERA, 1.1)
     expected = CAMERA.K * torch.tensor([[1.1, 1, 1], [1, 1.1, 1], [1, 1, 1]])
     assert torch.equal(camera.K, expected)
     assert torch.equal(camera.R_cam_world, CAMERA.R_cam_world)
@@ -204,7 +204,7 @@ def test_the_whole_job_looks_for_it_only_when_told_to(small_room, tmp_path):
 
 def test_the_whole_job_goes_on_with_the_lens_that_was_found(small_room, tmp_path):
     capture = add_noise(small_room, NoiseConfig(), 1)
-    wrong = zoomed(capture.scene.camera, Focal(1.05, 0.0, 0, ()))
+    wrong = zoomed(capture.scene.camera, 1.05)
     capture = dataclasses.replace(capture, scene=dataclasses.replace(capture.scene, camera=wrong))
     run = Run(tmp_path)
     crew = people_of(capture, VARIANTS["refined-focal"].config, run)

@@ -33,7 +33,7 @@ from mover.io.capture.annotations_file import (
 from mover.io.capture.camera_file import camera_of, camera_to_json
 from mover.io.capture.folder import folder_parts
 from mover.io.capture.scene_file import write_hypotheses, write_scene
-from mover.io.files.cameras import of_view, read_camera_file
+from mover.io.files.cameras import GUESSED, of_view, read_camera_file, with_spread
 from mover.io.files.fields import At, get, maybe, number, read_json, write_json
 from mover.io.files.images import find_depth_file, read_depth, write_image
 from mover.io.people.keypoints import write_keypoints
@@ -79,7 +79,6 @@ log = logging.getLogger(__name__)
 MOST_SHOTS = 20  # that are told apart: what comes after them counts as one
 CHUNK = 50  # frames whose detections are kept together
 # How far off a focal length may be, of its logarithm; what a file tells stays as it says.
-GUESSED = 0.055  # by a network from one image: 3 to 8 % (GeoCalib, WildCamera)
 BY_EXIF = 0.05  # of a photo, while a video is cut by what steadies it
 ASSUMED = 0.15  # cameras of phones and rooms are 50 to 75 degrees wide
 FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal lengths refer
@@ -264,22 +263,17 @@ def lens_of(
     if file is not None:
         return _in_pixels_of(size, read_camera_file(file, size)), None
     if fov is not None:
-        return _spread(of_view(fov, size, "--fov"), GUESSED), None
+        return with_spread(of_view(fov, size, "--fov"), GUESSED), None
     focal = None if photo is None else exif_focal(photo, size)
     if focal is not None:
         w, h = size
         fields = {"w": w, "h": h, "fl_x": focal, "fl_y": focal, "cx": w / 2, "cy": h / 2}
-        return _spread(At(fields, "EXIF"), BY_EXIF), None
+        return with_spread(At(fields, "EXIF"), BY_EXIF), None
     text = (
         f"the lens is not known: {USUAL:.0f} degrees across are assumed; give --camera FILE or "
         "--fov DEGREES (GeoCalib, MoGe and others tell both lens and tilt)"
     )
-    return _spread(of_view(USUAL, size, "assumed"), ASSUMED), text
-
-
-def _spread(at: At, spread: float) -> At:
-    """The lens with how far off it may be."""
-    return At({**at.value, "focal_spread": spread}, at.file, at.field)
+    return with_spread(of_view(USUAL, size, "assumed"), ASSUMED), text
 
 
 def _in_pixels_of(size: tuple[int, int], at: At) -> At:

@@ -202,4 +202,4 @@ def _with_lens(
         return camera, ()
     inputs = FocalInputs(bodies, kept, people, hiding(capture, path), camera)
     lens = run.stage(find_focal, inputs, config.focal)
-    return zoomed(camera, lens), lens.warnings
+    return zoomed(camera, lens.zoom), lens.warnings

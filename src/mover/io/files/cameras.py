@@ -27,6 +27,7 @@ from mover.io.files.fields import (
 
 LARGEST_TEXT = 1 << 20  # [bytes], of a calibration
 HALF = 0.5  # [px], calibrations count from the centre of the first pixel
+GUESSED = 0.055  # error of a focal length's logarithm by a network: 3-8 % (GeoCalib, WildCamera)
 WIDEST = 175.0  # [degrees], of a pinhole camera
 
 
@@ -97,6 +98,11 @@ def of_view(degrees: float, size: tuple[int, int], file: str) -> At:
     angle = number(At(degrees, file), 1, WIDEST)
     focal = size[0] / 2 / math.tan(math.radians(angle) / 2)
     return _centred(focal, focal, size, file)
+
+
+def with_spread(at: At, spread: float) -> At:
+    """The fields of camera.json with how far off the focal length may be, of its logarithm."""
+    return At({**at.value, "focal_spread": spread}, at.file, at.field)
 
 
 def read_intrinsics(path: Path) -> NDArray[np.float64]:

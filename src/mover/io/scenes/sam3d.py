@@ -18,7 +18,7 @@ from mover.core.errors import InputError
 from mover.core.types import Mesh
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
-from mover.io.files.cameras import read_camera_file
+from mover.io.files.cameras import GUESSED, read_camera_file, with_spread
 from mover.io.files.fields import At, array, get, mapping, maybe, number, read_json, refuse, text
 from mover.io.files.images import image_size
 from mover.io.files.meshes import KINDS, read_mesh
@@ -40,7 +40,6 @@ from mover.io.scenes.placing import (
     write_parts,
 )
 
-BY_MOGE = 0.055  # how far off the focal length is that it guesses from the image, of its logarithm
 TO_LOCAL = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """The stored mesh (+y up) -> the frame of the pose (+z up)."""
 TO_OPENCV = np.diag([-1.0, -1.0, 1.0])
@@ -171,8 +170,7 @@ def sam3d_parts(folder: Path, hints: Hints) -> Parts:
     camera = hints.camera
     if camera is None and lens.is_file():
         size = None if hints.image is None else image_size(hints.image)
-        camera = read_camera_file(lens, size)
-        camera = At({**camera.value, "focal_spread": BY_MOGE}, camera.file, camera.field)
+        camera = with_spread(read_camera_file(lens, size), GUESSED)
     things = _things(folder, hints)
     if not things:
         raise InputError(f"{folder}: has no meshes, expected <name>.glb with <name>.npz or .json")

@@ -167,10 +167,10 @@ def find_focal(inputs: FocalInputs, config: FocalConfig, observe: Observer = sil
     return Focal(zoom, spread, len(found), (told,) if abs(zoom - 1) > 2 * spread else ())
 
 
-def zoomed(camera: Camera, focal: Focal) -> Camera:
-    """The camera with the lens that was found."""
+def zoomed(camera: Camera, zoom: float) -> Camera:
+    """The camera with a longer lens."""
     K = camera.K.clone()
-    K[0, 0], K[1, 1] = K[0, 0] * focal.zoom, K[1, 1] * focal.zoom
+    K[0, 0], K[1, 1] = K[0, 0] * zoom, K[1, 1] * zoom
     return dataclasses.replace(camera, K=K)
 
 

@@ -24,6 +24,7 @@ from mover.core.types import Bodies, Camera, Capture, SceneObject, Tilt
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll
 from mover.stages.camera.config import LensConfig
+from mover.stages.camera.find_focal import zoomed
 from mover.stages.camera.room_lines import Ends, Prior, Segments, fit_room
 from mover.stages.people.find_depth import pelvis, shifted
 
@@ -89,28 +90,31 @@ def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent
 
 def _tilt(ends: Ends, before: float) -> Tilt | None:
     """Pitch and roll over all ends; None where that is no better than what was known."""
-    weight = (ends.cost.min() - ends.cost).exp()
-    weight = (weight / weight.sum())[:, None]
     both = torch.stack(pitch_roll(ends.pose.R_cam_room), -1)
-    mean = (weight * both).sum(0)
-    own = torch.linalg.inv(ends.precision).diagonal(0, 1, 2)[:, [1, 3]]  # about x and z
-    square = (weight * (own + (both - mean).square())).sum(0)
+    mean, square = _over(ends, both, [1, 3])  # about x and z
     spread = math.hypot(float(square.amax()) ** 0.5, SYSTEMATIC_TILT)
     return Tilt(float(mean[0]), float(mean[1]), spread) if spread < before / 2 else None
 
 
 def _told(ends: Ends, focal: float, spread: float) -> tuple[float, float] | None:
     """What the lines alone say of the logarithm of the zoom, and its error; None: nothing."""
-    weight = (ends.cost.min() - ends.cost).exp()
-    weight = weight / weight.sum()
-    off = ends.pose.log_focal - focal
-    mean = float((weight * off).sum())
-    own = torch.linalg.inv(ends.precision)[:, 0, 0]
-    left = float((weight * (own + (off - mean).square())).sum()) ** 0.5
+    off, square = _over(ends, (ends.pose.log_focal - focal)[:, None], [0])
+    mean, left = float(off), float(square) ** 0.5
     if not left < SAYS_LITTLE * spread:
         return None
     error = (left**-2 - spread**-2) ** -0.5
     return mean * (error / left) ** 2, math.hypot(error, SYSTEMATIC)
+
+
+def _over(
+    ends: Ends, values: Float[Tensor, "starts values"], unknowns: list[int]
+) -> tuple[Float[Tensor, " values"], Float[Tensor, " values"]]:
+    """Mean and variance over all ends by their probability; `unknowns` are those of each end."""
+    weight = (ends.cost.min() - ends.cost).exp()
+    weight = (weight / weight.sum())[:, None]
+    mean = (weight * values).sum(0)
+    own = torch.linalg.inv(ends.precision).diagonal(0, 1, 2)[:, unknowns]
+    return mean, (weight * (own + (values - mean).square())).sum(0)
 
 
 def _sentence(zoom: float, spread: float) -> str:
@@ -130,11 +134,9 @@ def through_lens(capture: Capture, zoom: float, pinned: tuple[str, ...] = ()) ->
     if zoom == 1:
         return capture
     camera = capture.scene.camera
-    K = camera.K.clone()
-    K[0, 0], K[1, 1] = K[0, 0] * zoom, K[1, 1] * zoom
     scene = dataclasses.replace(
         capture.scene,
-        camera=dataclasses.replace(camera, K=K),
+        camera=zoomed(camera, zoom),
         objects=tuple(
             piece if piece.id in pinned else _deeper(piece, camera, zoom)
             for piece in capture.scene.objects

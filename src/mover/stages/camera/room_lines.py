@@ -46,7 +46,7 @@ class Segments:
 
 @record
 class RoomPose:
-    """A camera in the axes of a room, and how far it is believed beforehand."""
+    """Cameras in the axes of a room."""
 
     log_focal: Float[Tensor, " starts"]
     R_cam_room: Float[Tensor, "starts 3 3"]

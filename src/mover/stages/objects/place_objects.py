@@ -335,11 +335,11 @@ def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Proble
     starts, n = begin.yaw.shape
     some_energy = energy_of_rows(*_evidence(inputs), priced(config))
     span = spans_of(inputs.objects, config.span, config.chair_span)
-    boxes, ranged = inputs.objects, bool(span.any())
+    objects, ranged = inputs.objects, bool(span.any())
 
     def of(rows: Tensor) -> Callable[[Layout], Energy]:
         index, energy = rows % n, some_energy(rows)
-        supports, heights = some_supports(boxes.supports, rows), boxes.size[index, 1]
+        supports, heights = some_supports(objects.supports, rows), objects.size[index, 1]
         pinned = inputs.pinned and of_objects(inputs.pinned, index, n)
 
         def price(free: Layout) -> Energy:
