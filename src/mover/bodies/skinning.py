@@ -16,6 +16,7 @@ from mover.core.types import BodyPose
 from mover.geometry.rotations import axis_angle
 
 ASSETS = Path(__file__).parent / "assets"
+AT_ONCE = 8  # bodies that are skinned together: what fits a processor's cache
 
 
 @record
@@ -70,13 +71,26 @@ def skinned(
     """Vertices and joints in a pose, from rest shapes and the rotation of each joint [m]."""
     world, places = _pose_joints(model, turns, joints)
     offset = places - torch.einsum("bjik,bjk->bji", world, joints)
-    bodies, count = offset.shape[:2]
     moves = torch.cat([world, offset[..., None]], -1)
+    some = (x.split(AT_ONCE) for x in (moves, verts, transl))
+    weights = model.weights.to(moves)
+    skin = [_blended(weights, *few) for few in zip(*some, strict=True)]
+    return torch.cat(skin), places + transl[:, None]
+
+
+def _blended(
+    weights: Float[Tensor, "verts joints"],
+    moves: Float[Tensor, "bodies joints 3 4"],
+    verts: Float[Tensor, "bodies verts 3"],
+    transl: Float[Tensor, "bodies 3"],
+) -> Float[Tensor, "bodies verts 3"]:
+    """The rest shape of a few bodies, moved with the joints [m]."""
+    bodies, count = moves.shape[:2]
     flat = moves.permute(1, 3, 0, 2).reshape(count, bodies * 12)
-    x, y, z, put = (model.weights.to(flat) @ flat).view(-1, 4, bodies, 3).unbind(1)
+    x, y, z, put = (weights @ flat).view(-1, 4, bodies, 3).unbind(1)
     at = verts.transpose(0, 1).unsqueeze(-1)
     moved = x * at[:, :, 0] + y * at[:, :, 1] + z * at[:, :, 2] + put + transl
-    return moved.transpose(0, 1).contiguous(), places + transl[:, None]
+    return moved.transpose(0, 1).contiguous()
 
 
 ANGLES = {

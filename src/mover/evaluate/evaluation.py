@@ -58,6 +58,7 @@ from mover.evaluate.scene import (
 from mover.evaluate.stability import PHYSICS_METRICS, lacking, result_loads, simulate
 from mover.furniture.floor import Floor, floor_of, height_under
 from mover.geometry.placement import StandingMesh
+from mover.geometry.warp_start import mapped
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import read_scene
@@ -150,13 +151,17 @@ def evaluate(
     scenes = before.scene, after.scene, true.scene
     objects = measure_objects(scenes, sides, config.samples, config.by_place, config.boxes)
     touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)
-    return {
-        key: means_of(objects, key)
-        | _aligned(key, scenes, config.by_place)
-        | measure(CAMERA_METRICS, Sight(judged.scene, true.scene))
-        | _people(judged, true, touch, config)
-        for key, judged in asked.items()
-    } | {"objects": objects}
+
+    def of(key: str) -> dict[str, float]:
+        judged = asked[key]
+        return (
+            means_of(objects, key)
+            | _aligned(key, scenes, config.by_place)
+            | measure(CAMERA_METRICS, Sight(judged.scene, true.scene))
+            | _people(judged, true, touch, config)
+        )
+
+    return dict(zip(asked, mapped(of, list(asked)), strict=True)) | {"objects": objects}
 
 
 def _aligned(side: str, scenes: tuple[Scene, Scene, Scene], by_place: bool) -> dict[str, float]:
@@ -187,9 +192,9 @@ def evaluate_folder(
         config: Densities and thresholds.
         physics: Whether both scenes are simulated as well, for the share that is stable.
     """
-    initial_people, people, true_people = (
-        read_bodies(path) if path.exists() else None
-        for path in (out / "initial_bodies.npz", out / "bodies.npz", truth / "bodies.npz")
+    initial_people, people, true_people = mapped(
+        lambda path: read_bodies(path) if path.exists() else None,
+        [out / "initial_bodies.npz", out / "bodies.npz", truth / "bodies.npz"],
     )
     bodies = EvaluatedBodies(initial_people, people, true_people)
     initial, result = read_scene(out / "initial.json"), read_scene(out / "scene.json")

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mover.core.records import record
-from mover.geometry.nearest import as_float64, as_int64, closest
+from mover.geometry.nearest import as_float64, as_int64, closest, enclosed
 from mover.geometry.warp_start import filled, kernels, launch, name_of, started
 
 SHELL = 2.0  # [cells], up to where it is exact outside: more than a cell's diagonal
@@ -143,15 +143,13 @@ def signed_distance(
     faces: Int[Tensor, "faces 3"],
 ) -> Float[Tensor, " points"]:
     """Exact signed distance to a closed surface at any points [m]; the sign by winding number."""
-    import igl
-
     query, corners = as_float64(points), as_float64(verts)
     triangles = outward(corners, as_int64(faces))
     distance = np.sqrt(closest(query, corners, triangles)[0])
     within = ((query > corners.min(0)) & (query < corners.max(0))).all(-1)
     if within.any():  # outside of the box nothing is inside
-        winding = np.asarray(igl.fast_winding_number(corners, triangles, query[within]))
-        distance[within] *= np.where(winding > 0.5, -1, 1)
+        deep = enclosed(query[within], corners, triangles, distance[within])
+        distance[within] *= np.where(deep, -1, 1)
     return torch.from_numpy(distance).to(points)
 
 

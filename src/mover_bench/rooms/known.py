@@ -15,6 +15,7 @@ from mover.core.records import map_tensors, record
 from mover.core.types import Bodies, BodyPose, Capture, Detection, Masks, People, Scene, SceneObject
 from mover.furniture.pieces import Furniture
 from mover.geometry.rle import decode
+from mover.geometry.warp_start import beside, mapped
 from mover_bench.rooms.compose import Plan
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.motion import Performance, Stage
@@ -128,9 +129,11 @@ def looks(
         there = moving.get(frame)
         if there is None:
             return sight.depth, sight.piece
-        if not last or last[0][0] is not there:
-            last[:] = [(there, outlines(plan_at(plan, moving, frame))[:2])]
-        return last[0][1]
+        held = last[0] if last else None
+        if held is None or held[0] is not there:
+            held = there, outlines(plan_at(plan, moving, frame))[:2]
+            last[:] = [held]
+        return held[1]
 
     return at
 
@@ -232,12 +235,15 @@ def _crowd(plan: Plan, acts: tuple[Acted, ...], fps: float, moving: Moving) -> _
     rows = [(f, k) for k, a in enumerate(acts) for f in range(len(a.labels))]
     order = sorted(range(len(rows)), key=lambda k: rows[k])
     index = torch.tensor(order)
-    nears = [_nearness(model.posed(a.pose)[0].numpy(), plan, moving) for a in acts]
+    pose = _in_camera(plan, acts, index)
+
+    def near() -> list[Nearness]:
+        return [_nearness(model.posed(a.pose)[0].numpy(), plan, moving) for a in acts]
+
+    nears, (verts, joints) = beside(near, lambda: model.posed(pose))
     distance = torch.cat([torch.from_numpy(n.distance).float() for n in nears])[index]
     nearest = torch.cat([torch.from_numpy(n.nearest) for n in nears])[index]
     labels = [name for a in acts for name in a.labels]
-    pose = _in_camera(plan, acts, index)
-    verts, joints = model.posed(pose)
     bodies = Bodies(
         verts=rounded(verts),
         faces=model.faces,
@@ -291,24 +297,28 @@ class Shown:
 
 def visible(plan: Plan, bodies: Bodies, furniture: Callable[[int], Tensor]) -> Shown:
     """What the camera sees of bodies in its axes; `furniture` is its depth in a frame [m]."""
-    masks, counts = list[bytes](), list[tuple[int, int]]()
-    for frame in bodies.frame.unique().tolist():  # rows are in the order of their frames
+
+    def at(frame: int) -> list[tuple[bytes, int, int]]:
         depth = furniture(frame)
         group = bodies.verts[bodies.frame == frame]
         looks = [look_at(plan, verts, bodies.faces) for verts in group]
         nearest = depth.clone()
         for look in looks:
             nearest[look.window] = torch.minimum(nearest[look.window], look.depth)
+        found: list[tuple[bytes, int, int]] = []
         for look in looks:
             whole = look.depth.isfinite()
             free = whole & (look.depth <= depth[look.window])
-            counts.append((int(whole.sum()), int(free.sum())))
             mask = torch.zeros_like(depth, dtype=torch.bool)
             mask[look.window] = whole & (look.depth <= nearest[look.window])
-            masks += encode([mask.numpy()]).counts
+            found.append((encode([mask.numpy()]).counts[0], int(whole.sum()), int(free.sum())))
+        return found
+
+    # Rows are in the order of their frames.
+    rows = [row for found in mapped(at, bodies.frame.unique().tolist()) for row in found]
     camera = plan.view.camera
-    coded = Masks(camera.height, camera.width, tuple(masks))
-    whole, free = torch.tensor(counts).unbind(1)
+    coded = Masks(camera.height, camera.width, tuple(mask for mask, _, _ in rows))
+    whole, free = torch.tensor([counts for _, *counts in rows]).unbind(1)
     people = People(coded, bodies.frame, bodies.person, {})
     return Shown(people, whole, free < (1 - PASSING) * whole)
 

@@ -22,6 +22,7 @@ from mover.furniture.pieces import Furniture
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rle import decode
 from mover.geometry.rotations import rot_y
+from mover.geometry.warp_start import beside
 from mover.stages.camera.find_lens import through_lens
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.foreign import foreign_mesh
@@ -244,15 +245,16 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     if noise.mask_head or noise.mask_box or noise.amodal:
         detections = headed(detections, room.truth, noise, np.random.default_rng([seed, 11]))
     detections = noisy_detections(detections, noise.object_masks, streams[3])
-    capture = dataclasses.replace(
-        room.capture,
-        scene=Scene(camera, None, pieces),
-        detections=leaking(detections, noise.leaks, streams[7]),
-        bodies=lose_feet(noisy_bodies(room, noise, streams[4]), noise, streams[8]),
-        people=noisy_people(
+    bodies, people = beside(
+        lambda: lose_feet(noisy_bodies(room, noise, streams[4]), noise, streams[8]),
+        lambda: noisy_people(
             room.capture.people, noise.person_masks, noise.missed_masks, streams[5]
         ),
     )
+    capture = dataclasses.replace(
+        room.capture, scene=Scene(camera, None, pieces), bodies=bodies, people=people,
+        detections=leaking(detections, noise.leaks, streams[7]),
+    )  # fmt: skip
     furniture = noisy_people(
         room.capture.furniture, noise.object_masks, 0.0, np.random.default_rng([seed, 14])
     )

@@ -17,6 +17,7 @@ from mover.geometry.mesh import fit_box
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 from mover.geometry.rle import decode
+from mover.geometry.warp_start import mapped
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.render import box_of_mask, encode
 
@@ -52,10 +53,13 @@ def noisy_people(
     count = len(people.frame)
     off = rng.integers(1, max(1, most) + 1, count) * rng.choice([-1, 1], count) * (most > 0)
     keep = np.flatnonzero(rng.uniform(size=count) >= missed)
-    masks = [grown(decode(people.masks, int(k)).numpy(), int(off[k])) for k in keep]
+    masks = people.masks
+
+    def off_by(row: int) -> bytes:
+        return encode([grown(decode(masks, row).numpy(), int(off[row]))]).counts[0]
+
     rows = torch.from_numpy(keep)
-    size = (people.masks.height, people.masks.width)
-    coded = encode(masks) if masks else Masks(*size, ())
+    coded = Masks(masks.height, masks.width, tuple(mapped(off_by, keep.tolist())))
     return People(coded, people.frame[rows], people.person[rows], people.heights)
 
 

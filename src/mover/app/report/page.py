@@ -39,6 +39,7 @@ from mover.core.records import map_tensors
 from mover.core.types import Bodies, Scene
 from mover.evaluate.explanation import LEVEL
 from mover.geometry.camera import pitch_roll
+from mover.geometry.warp_start import mapped
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def write_report(out: Path, content: ReportContent) -> Path:
 def _page(content: ReportContent) -> str:
     """The whole text."""
     image, scenes = content.image, (content.initial, content.result)
-    before, after = (_data_url(draw_overlay(canvas(image, s, WIDEST), s)) for s in scenes)
+    before, after = mapped(lambda s: _data_url(draw_overlay(canvas(image, s, WIDEST), s)), scenes)
     objects = objects_table(content.initial, content.result, content.objects, content.metrics)
     return fill(
         "page.html",

@@ -22,7 +22,7 @@ from mover.core.records import record
 from mover.core.settings import Count, Metres, Share
 from mover.core.types import Bodies, Mesh
 from mover.furniture.floor import Floor, height_under_bodies
-from mover.geometry.nearest import as_float64, as_int64, closest
+from mover.geometry.nearest import as_float64, as_int64, closest, enclosed
 from mover.geometry.placement import StandingMesh
 from mover.geometry.volume import outward
 
@@ -109,8 +109,6 @@ def _near_solid(
     config: LabelConfig,
 ) -> list[_Touches]:
     """Bodies of now whose points come near an object, for each part: all are asked for at once."""
-    import igl
-
     verts = as_float64(mesh.verts)
     faces = outward(verts, as_int64(mesh.faces))
     low, high = (torch.from_numpy(end) for end in (verts.min(0), verts.max(0)))
@@ -122,8 +120,8 @@ def _near_solid(
         return [_touches(points, torch.zeros(0).long(), []) for points in parts]
     query = as_float64(torch.cat([p[some] for p, some in zip(parts, inside, strict=True)]))
     squared, face, nearest = closest(query, verts, faces)
-    deep = np.asarray(igl.fast_winding_number(verts, faces, query)) > 0.5
-    gaps = np.where(deep, -1, 1) * np.sqrt(squared)
+    away = np.sqrt(squared)
+    gaps = np.where(enclosed(query, verts, faces, away), -1, 1) * away
     ends = np.cumsum(counts)[:-1]
     values = [np.split(x, ends) for x in (gaps, nearest, _normals(verts, faces)[face])]
     found: list[_Touches] = []
