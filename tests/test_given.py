@@ -24,7 +24,6 @@ from mover.stages.objects.gather_given import (
     UNFIT,
     WEIGHTS,
     believed_sides,
-    common_scale,
     gather_given,
     lighter_where_used,
     prior_weights,
@@ -229,31 +228,6 @@ def test_a_foot_that_hangs_comes_down_and_the_box_stays() -> None:
     level = levelled(Mesh(tilted, FACES))
     assert float(level.verts[tilted[:, 1] < 0.1][:, 1].abs().max()) < 0.005
     assert is_closed(level.faces)
-
-
-@pytest.mark.parametrize("large", [0.93, 1.0, 1.06])
-def test_furniture_tells_how_large_the_room_is(large: float) -> None:
-    """Sizes and places are given with errors; under people too large all is too large at once."""
-    generator = torch.Generator().manual_seed(1)
-    count = 9
-    objects = boxes_of(("aquarium",) * count, [(1.0, 0.8, 0.6)] * count)
-    true = replace(somewhere(count), t_world_object=somewhere(count).t_world_object * 1.2)
-    error = 0.04 * torch.randn(count, 1, generator=generator)
-    start = replace(true, t_world_object=true.t_world_object * error.exp())
-    off = error + 0.08 * torch.randn(count, 3, generator=generator)
-    found = Layout(true.t_world_object * large, true.yaw, math.log(large) - off)
-    given = gather_given(objects, start, found, torch.full((count,), 0.1))
-    scale = common_scale(found, given, 0.055)
-    assert abs(scale - math.log(large)) < 0.03
-    assert common_scale(found, given, 0.0) == 0
-    assert abs(common_scale(found, given, 0.005)) < 0.006
-    same, less, none = (common_scale(found, given, 0.055, off) for off in (0.01, 0.04, 5.0))
-    assert same == pytest.approx(scale, abs=0.005)
-    assert abs(none) < 1e-3
-    assert min(0.0, scale) <= less <= max(0.0, scale)  # what was given may be off together
-    metres = Layout(found.t_world_object.clone(), found.yaw, found.log_scale)
-    metres.t_world_object[0] *= 1.8
-    assert abs(common_scale(metres, given, 0.055) - scale) < 0.015
 
 
 def test_a_larger_room_moves_the_floor_below_people_and_keeps_them_on_it() -> None:

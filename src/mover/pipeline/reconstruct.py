@@ -65,7 +65,6 @@ from mover.stages.objects.gather_depth import DepthInputs, gather_depth
 from mover.stages.objects.gather_given import (
     UNFIT,
     believed_sides,
-    common_scale,
     gather_given,
     lighter_where_used,
 )
@@ -78,6 +77,7 @@ from mover.stages.objects.place_objects import (
     without_search,
 )
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
+from mover.stages.objects.room_scale import ScaleKnown, common_scale, seats_tell
 from mover.stages.objects.starts import (
     ReinitInputs,
     alone,
@@ -279,7 +279,10 @@ def with_common_scale(
     spread, shared = scale_spread(context, people), context.capture.scene.size_spread
     if given is None or not spread:
         return people, state
-    factor = math.exp(-common_scale(state.placed.layout, given, spread, shared))
+    kept = in_world(rows_of(people.bodies, people.kept), state.camera)
+    seats = seats_tell(kept, people.parts, floor_now(context, state))
+    known = ScaleKnown(spread, shared, seats)
+    factor = math.exp(-common_scale(state.placed.layout, given, known))
     bodies = nearer(people.bodies, state.camera, state.ground, factor)
     layouts = (state.start, state.alone, state.placed.layout, state.placed.candidates)
     start, single, layout, candidates = (larger(x, factor) for x in layouts)

@@ -11,7 +11,7 @@ from torch import Tensor
 from mover.core.types import Layout, Objects
 from mover.energy.terms.bbox import LEAST, LIKELY, SEEN
 from mover.energy.terms.contact import ContactPoints
-from mover.energy.terms.given import AWAY, SIZE, TURN, Given
+from mover.energy.terms.given import TURN, Given
 from mover.furniture.library import STANDARD, WALL_PIECES
 
 FIT = 0.1  # image energy (robust form) of a shape that fits
@@ -21,8 +21,6 @@ WEIGHTS = (0.05, 2.0)  # least and largest weight
 LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of 1 [rad]
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
-COMMON = 0.06  # error that the three given sizes of an object have in common, as a logarithm
-FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
 DIRECTIONS = 90  # that are tried within a quarter turn
 
 
@@ -107,50 +105,6 @@ def standard_sizes(
                 usual[i, axis] = math.log(known[0]) - objects.size[i, axis].log()
                 sharp[i, axis] = 1 / known[1] ** 2
     return usual, sharp
-
-
-def common_scale(layout: Layout, given: Given, spread: float, shared: float = 0.0) -> float:
-    """Logarithm of how much too large the whole room is, as its furniture tells.
-
-    People of unknown height make floor, places and sizes too large at once, which no image tells.
-    What was given, and standard sizes, say of each object how far it is off.
-
-    Args:
-        layout: Where the objects were placed under the people's scale.
-        given: What was expected of them.
-        spread: Standard deviation of the logarithm of the people's size; 0: it is known.
-        shared: The same of all that was given, together (`Scene.size_spread`).
-    """
-    if spread <= 0:
-        return 0.0
-    tried = torch.linspace(-3 * spread, 3 * spread, 121, dtype=torch.float64)
-    if shared:
-        wide = torch.linspace(-3, 3, 121, dtype=torch.float64) * (spread + shared)
-        near = -0.5 * ((tried[:, None] - wide) / shared).square()
-        cost = -torch.logsumexp(near - _cost_of_scales(layout, given, wide), 1)
-    else:
-        cost = _cost_of_scales(layout, given, tried)
-    total = cost + 0.5 * (tried / spread).square()
-    weight = (total.min() - total).exp()
-    return float((weight * tried).sum() / weight.sum())
-
-
-def _cost_of_scales(
-    layout: Layout, given: Given, tried: Float[Tensor, " scales"]
-) -> Float[Tensor, " scales"]:
-    """What places and sizes cost in rooms too large by the exponential of each [nats]."""
-    away = (layout.t_world_object.norm(dim=-1) / given.distance).log().double()
-    near = away[:, None] - tried
-    cost = 2 * (1 + near.square() / (3 * (AWAY**2 + FITTED**2))).log()
-    own = SIZE**2 * torch.eye(3).to(away) + COMMON**2
-    sharp = torch.diag_embed(given.precision.double())
-    precision = torch.linalg.inv(own) + sharp
-    usual = sharp @ given.standard.double().unsqueeze(-1)
-    mean = torch.linalg.solve(precision, usual).squeeze(-1)
-    precision = torch.linalg.inv(torch.linalg.inv(precision) + FITTED**2 * torch.eye(3).to(away))
-    rest = (layout.log_scale.double() - mean)[:, None] - tried[:, None]
-    cost = cost + 0.5 * torch.einsum("nri,nij,nrj->nr", rest, precision, rest)
-    return cost.sum(0)
 
 
 def room_axis(
