@@ -14,7 +14,6 @@ import torch
 from mover import __version__
 from mover.app.report.page import ReportContent, write_report
 from mover.bodies.corrected import in_world
-from mover.bodies.parts import parts_of
 from mover.core import records
 from mover.core.contact_labels import ContactLabels
 from mover.core.devices import CPU, named
@@ -23,8 +22,6 @@ from mover.core.run import Run
 from mover.core.settings import read_settings
 from mover.core.types import Bodies, Capture, Mesh, Room, Scene
 from mover.evaluate.explanation import log_rows, scene_fields
-from mover.furniture.floor import floor_of
-from mover.geometry.placement import standing_meshes
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.edits import Edit, write_edits
 from mover.io.capture.proposals_file import PROPOSED, write_proposals
@@ -32,9 +29,10 @@ from mover.io.capture.scene_file import write_scene
 from mover.io.export.contacts import write_labels
 from mover.io.export.scene_glb import write_glb
 from mover.io.files.fields import get, read_json, refuse
+from mover.pipeline.outcome import label_inputs
 from mover.pipeline.people import as_given
 from mover.pipeline.presets import Config, with_present_keys
-from mover.stages.contacts.label_contacts import LabelConfig, LabelInputs, label_contacts
+from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
 
 log = logging.getLogger(__name__)
 POINTS = 500  # of a trace, about, that run.json keeps
@@ -86,17 +84,7 @@ def write_results(
 
 def labels_of(room: Room, run: Run) -> ContactLabels:
     """Who touches what in a finished room with people."""
-    assert room.bodies is not None
-    solid = [
-        standing_meshes(dataclasses.replace(piece, mesh=proxy))
-        for piece, proxy in zip(room.scene.objects, room.proxies, strict=True)
-    ]
-    ids = tuple(piece.id for piece in room.scene.objects)
-    inputs = LabelInputs(
-        room.bodies, parts_of(room.bodies), tuple(solid), ids,
-        floor_of(room.scene),
-    )  # fmt: skip
-    return run.stage(label_contacts, inputs, LabelConfig())
+    return run.stage(label_contacts, label_inputs(room), LabelConfig())
 
 
 def write_truth(scene: Scene, bodies: Bodies, folder: Path) -> None:

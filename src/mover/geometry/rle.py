@@ -14,10 +14,13 @@ from mover.core.types import Masks
 
 def decode(masks: Masks, index: int) -> Bool[Tensor, "h w"]:
     """One of the masks as an image."""
-    runs = run_lengths(masks.counts[index])
-    flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
-    image = flat.reshape(masks.width, masks.height).T
-    return torch.from_numpy(np.ascontiguousarray(image))
+    runs, height, width = run_lengths(masks.counts[index]), masks.height, masks.width
+    flat = np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height)
+    first = int(runs[0]) // height  # only what is not background is turned
+    end = width - int(runs[-1]) // height if len(runs) % 2 else width
+    image = np.zeros((height, width), dtype=bool)
+    image[:, first:end] = flat[first:end].T
+    return torch.from_numpy(image)
 
 
 def run_lengths(counts: bytes) -> NDArray[np.int64]:

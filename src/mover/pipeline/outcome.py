@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.corrected import in_world
-from mover.bodies.parts import Parts
+from mover.bodies.parts import Parts, parts_of
 from mover.core.errors import InputError
 from mover.core.explanation import Explanation
 from mover.core.records import rows_of
@@ -29,18 +29,20 @@ from mover.energy.terms.feet import FootContacts
 from mover.evaluate.calibration import calibration_of
 from mover.evaluate.explanation import explain
 from mover.furniture.floor import Floor, floor_of
-from mover.geometry.placement import place, reproject, rest_on_support
+from mover.geometry.camera import to_camera
+from mover.geometry.placement import place, reproject, rest_on_support, standing_meshes
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import Alignment
 from mover.stages.config import PlaceConfig
 from mover.stages.contacts.assign_contacts import ContactAssignment, ContactInputs, find_contacts
 from mover.stages.contacts.gather_cues import Cues, GatherInputs
+from mover.stages.contacts.label_contacts import LabelInputs
 from mover.stages.contacts.propose_supports import KnownTops, ProposeInputs, propose_supports
 from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.explain.placements import ExplainInputs, explain_placements
 from mover.stages.objects.bend_shapes import told_of_shapes
-from mover.stages.objects.find_image_cues import ImageInputs, Seen
+from mover.stages.objects.find_image_cues import ImageInputs, Seen, order_of
 from mover.stages.objects.on_platforms import platforms_of, stood, supports_with_platforms
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
@@ -136,6 +138,14 @@ def with_platforms(context: ReconstructionContext, state: SceneState) -> Reconst
     return replace(context, prepared=prepared)
 
 
+def with_order(context: ReconstructionContext, state: SceneState) -> SceneState:
+    """The state with what stands behind what, as the objects are placed now."""
+    verts = place(context.prepared.objects.verts, state.placed.layout)
+    z = to_camera(verts, state.camera.R_cam_world)[..., 2]
+    behind = order_of(z.amin(-1), z.amax(-1))
+    return replace(state, image=replace(state.image, behind=behind))
+
+
 def floor_now(context: ReconstructionContext, state: SceneState) -> Floor:
     """The floor with its platforms as they are placed now."""
     pieces: tuple[SceneObject, ...] = ()
@@ -223,9 +233,19 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
         covariance=None if people is None else people.alignment.covariance,
         traces=state.traces,
         warnings=tuple(dict.fromkeys(warnings)),
-        explanations=explanations_of(context, state, people),
         path=capture.path if people is None else people.path,
     )
+
+
+def label_inputs(room: Room) -> LabelInputs:
+    """The people and the closed furniture of a finished room."""
+    assert room.bodies is not None
+    solid = tuple(
+        standing_meshes(replace(piece, mesh=proxy))
+        for piece, proxy in zip(room.scene.objects, room.proxies, strict=True)
+    )
+    ids = tuple(piece.id for piece in room.scene.objects)
+    return LabelInputs(room.bodies, parts_of(room.bodies), solid, ids, floor_of(room.scene))
 
 
 def within(frames: Int[Tensor, " rows"], spans: Spans) -> Bool[Tensor, " rows"]:

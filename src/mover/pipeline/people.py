@@ -43,7 +43,7 @@ def through_its_lens(
     picture, camera = capture.reference, capture.scene.camera
     if not config.lens.use or picture is None or not is_still(capture.path):
         return capture
-    people, tilt = people_of(capture, config, run), config.lens.tilt
+    people, tilt = located(capture, config, run), config.lens.tilt
     if people is not None:
         camera = replace(camera, R_cam_world=people.alignment.camera.R_cam_world)
         spread = people.alignment.covariance.diag()[:2].amax()
@@ -56,6 +56,20 @@ def through_its_lens(
 
 
 def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
+    """The people of a run, with what makes the floor doubtful that their feet tell.
+
+    Raises:
+        InputError: If no camera stands above such a floor.
+    """
+    found = located(capture, config, run)
+    if found is None:
+        return None
+    feet, there = found.foot_contacts, found.alignment
+    odd = (*_doubts(feet, capture, there.camera), *check_floor(there.ground, capture))
+    return replace(found, warnings=(*found.warnings, *odd))
+
+
+def located(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     """Choose frames, find the people's depth and their feet, and from these camera and ground."""
     bodies, scene = capture.bodies, capture.scene
     if bodies is None:
@@ -86,8 +100,7 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread)
     alignment = run.stage(align_camera, known, config.align)
     alignment = replace(alignment, covariance=alignment.covariance + loose)
-    odd = (*_doubts(feet, capture, camera), *check_floor(alignment.ground, capture))
-    warnings = (*warnings, *told, *feet.warnings, *alignment.warnings, *odd)
+    warnings = (*warnings, *told, *feet.warnings, *alignment.warnings)
     return PeopleState(carried(bodies, path), path, kept, parts, feet, alignment, warnings)
 
 

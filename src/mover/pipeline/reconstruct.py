@@ -18,9 +18,8 @@ from mover.core.types import Camera, Capture, Layout, Room
 from mover.energy.config import SceneConfig, only
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, ImageCues
-from mover.geometry.camera import to_camera
 from mover.geometry.path import is_still, poses_at, scaled
-from mover.geometry.placement import larger, place
+from mover.geometry.placement import larger
 from mover.geometry.warp_start import threads
 from mover.io.capture.plausible import check_plausible
 from mover.pipeline.moves import Solving, with_moves
@@ -33,13 +32,16 @@ from mover.pipeline.outcome import (
     carried,
     check_floor,
     check_room,
+    explanations_of,
     floor_now,
     gather_inputs,
     is_pinned,
+    label_inputs,
     room_of,
     scale_spread,
     tops_of,
     unfurnished,
+    with_order,
     with_platforms,
     with_proposals,
 )
@@ -51,6 +53,7 @@ from mover.stages.camera.refine_camera import FurtherView, RefineInputs, refine_
 from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
 from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import cues_in_windows, gather_cues
+from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
 from mover.stages.contacts.propose_supports import NOTHING
 from mover.stages.objects.bend_shapes import BendInputs, bend_shapes, with_shapes
 from mover.stages.objects.find_image_cues import (
@@ -59,7 +62,6 @@ from mover.stages.objects.find_image_cues import (
     find_image_cues,
     ground_without_people,
     image_evidence,
-    order_of,
 )
 from mover.stages.objects.gather_depth import DepthInputs, gather_depth
 from mover.stages.objects.gather_given import (
@@ -127,7 +129,8 @@ def _reconstructed(
     if people is None:
         ground = ground_without_people(capture, prepared)
         check_floor(ground, capture)
-        return room_of(context, placed_by_image(context, capture.scene.camera, ground), None)
+        state = placed_by_image(context, capture.scene.camera, ground)
+        return explained(room_of(context, state, None), context, state, None)
     state = placed_by_image(context, people.alignment.camera, people.alignment.ground)
     context = with_size_prior(with_platforms(context, state), state)
     for _ in range(config.refine.rounds):
@@ -144,8 +147,17 @@ def _reconstructed(
     for _ in range(config.outer_iterations):
         state = assigned(context, people, with_order(context, state))
         state = placed_with_people(context, people, state, image_energy)
-    room = room_of(context, state, people)
+    room = explained(room_of(context, state, people), context, state, people)
     return with_proposals(room, capture, config, run, people, tops_of(context, state))
+
+
+def explained(
+    room: Room, context: ReconstructionContext, state: SceneState, people: PeopleState | None
+) -> Room:
+    """The room with what holds each object; the labels of its contacts are begun beside."""
+    if room.bodies is not None and context.capture.furniture is None:  # nothing of it will move
+        _begin(context.run, label_contacts, label_inputs(room), LabelConfig())
+    return replace(room, explanations=explanations_of(context, state, people))
 
 
 def with_size_prior(context: ReconstructionContext, state: SceneState) -> ReconstructionContext:
@@ -357,14 +369,6 @@ def placed_with_people(
 
 def _pinned(context: ReconstructionContext, start: Layout) -> Pinned | None:
     return Pinned(is_pinned(context), start) if context.pinned else None
-
-
-def with_order(context: ReconstructionContext, state: SceneState) -> SceneState:
-    """The state with what stands behind what, as the objects are placed now."""
-    verts = place(context.prepared.objects.verts, state.placed.layout)
-    z = to_camera(verts, state.camera.R_cam_world)[..., 2]
-    behind = order_of(z.amin(-1), z.amax(-1))
-    return replace(state, image=replace(state.image, behind=behind))
 
 
 def further_views(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mover.core.records import record
+from mover.geometry.warp_start import mapped
 from mover_bench.rooms.gait import Stations, duration, stations, walk
 from mover_bench.rooms.lying import LIE_TIME, berth, lie_down, on_side, roll_over, supine
 from mover_bench.rooms.placed import NoWayError, Placed, way
@@ -152,12 +153,12 @@ def done_there(stage: Stage, task: Task, stop: Stop, phase: float = 0.0) -> list
 
 
 def _check(stage: Stage, takes: list[Take]) -> None:
-    for take in takes:
-        wrong = faults(
-            stage.person, take.posture, take.label, stage.pieces, take.piece, stage.apart
-        )
-        if wrong:
-            raise RefusedTaskError(wrong[0])
+    def wrong(take: Take) -> list[str]:
+        return faults(stage.person, take.posture, take.label, stage.pieces, take.piece, stage.apart)
+
+    found = [fault for faulty in mapped(wrong, takes) for fault in faulty]
+    if found:
+        raise RefusedTaskError(found[0])
 
 
 def _name(stage: Stage, task: Task) -> str:

@@ -7,7 +7,7 @@ touches. Hands that rest in the air and backs that lean on nothing are the commo
 of bodies with a few degrees of pose error: they touch only what is within reach.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -212,13 +212,13 @@ def contact_rows(inputs: AssignInputs, config: AssignConfig) -> Iterator[Contact
         torch.isin(inputs.parts.part_of, torch.tensor([PARTS.index(n) for n in names]))
         for names in groups
     ]
-    for body in _bodies(inputs, config):
+    touching = inputs.probability > config.chance
+    asking = torch.stack([(touching & mine).sum(1) >= FEWEST for mine in members], 1)
+    for body in _bodies(inputs, config, asking.any(1).nonzero()[:, 0].tolist()):
         seat = -1
-        for group, names in enumerate(groups):
-            touching = inputs.probability[body.index] > config.chance
-            verts = (members[group] & touching).nonzero()[:, 0]
-            if len(verts) < FEWEST:
-                continue
+        for group in asking[body.index].nonzero()[:, 0].tolist():
+            names = groups[group]
+            verts = (members[group] & touching[body.index]).nonzero()[:, 0]
             hands, back = names[0].endswith("palm"), names == ("back",)
             part = _Group(
                 body.points[verts], body.pixels[verts], hands, back and seat < 0,
@@ -233,12 +233,13 @@ def contact_rows(inputs: AssignInputs, config: AssignConfig) -> Iterator[Contact
             yield ContactRows(rows[found], verts[found], object_of[found], hand[found])
 
 
-def _bodies(inputs: AssignInputs, config: AssignConfig) -> Iterator[_Body]:
+def _bodies(inputs: AssignInputs, config: AssignConfig, asked: Sequence[int]) -> Iterator[_Body]:
     camera, bodies = small_camera(inputs.camera), inputs.bodies
     table = None
     if config.by == "release" and inputs.people is not None:
         table = mask_table(inputs.people, bodies)
-    for index, points in enumerate(bodies.verts):  # one at a time: memory stays that of one
+    for index in asked:  # one at a time: memory stays that of one
+        points = bodies.verts[index]
         pixels = project(to_camera(points, camera.R_cam_world), camera.K).long()
         mask = None
         if table is not None and table.own[index] is not None:
@@ -250,7 +251,8 @@ def _rivals(inputs: AssignInputs) -> _Rivals:
     objects, layout = inputs.objects, inputs.layout
     boxes = small_boxes(inputs.boxes, inputs.camera)
     masks = _filled(small_masks(inputs.masks, inputs.camera), boxes)
-    grown = torch.nn.functional.max_pool2d(masks.float().unsqueeze(1), 7, 1, 3).squeeze(1) > 0
+    down = torch.nn.functional.max_pool2d(masks.float().unsqueeze(1), (7, 1), 1, (3, 0))
+    grown = torch.nn.functional.max_pool2d(down, (1, 7), 1, (0, 3)).squeeze(1) > 0
     verts = place(objects.verts, layout)
     far_away = torch.full_like(verts, FAR_AWAY)
     verts = torch.where(objects.real_verts.unsqueeze(-1), verts, far_away)

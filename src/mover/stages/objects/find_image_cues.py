@@ -13,6 +13,7 @@ from mover.energy.terms.border import borders_of
 from mover.energy.terms.silhouette import outline_root
 from mover.geometry.crops import area_mean, crop_views
 from mover.geometry.rle import decode, tight_box
+from mover.geometry.warp_start import mapped
 from mover.stages.config import ImageConfig
 from mover.stages.objects.prepare_objects import Prepared
 
@@ -120,9 +121,11 @@ def find_image_cues(
     del observe
     views = crop_views(inputs.camera.K, inputs.boxes, MARGIN, config.size)
     others = _others(inputs)
-    own = area_mean(inputs.masks.float(), views, inputs.camera.K)
-    hidden = area_mean(others.float(), views, inputs.camera.K)
-    inside = area_mean(torch.ones_like(inputs.masks).float(), views, inputs.camera.K) > 0.999
+    own, hidden, inside = mapped(
+        lambda masks: area_mean(masks.float(), views, inputs.camera.K),
+        [inputs.masks, others, torch.ones_like(inputs.masks)],
+    )
+    inside = inside > 0.999
     known = inputs.masks.any(-1).any(-1)[:, None, None]
     if config.form == "release":
         own, hidden, inside = (own - hidden > 0).float(), (own < hidden).float(), inside | True
