@@ -145,9 +145,8 @@ def evaluate(
     config = config or EvaluateConfig()
     bodies = bodies or EvaluatedBodies(None, None, None)
     before, after, true = _populate((initial, result, truth), bodies)
-    asked = {
-        key: judged for key, judged in zip(SIDES, (before, after), strict=True) if key in sides
-    }
+    both = dict(zip(SIDES, (before, after), strict=True))
+    asked = {key: both[key] for key in SIDES if key in sides}
     scenes = before.scene, after.scene, true.scene
     objects = measure_objects(scenes, sides, config.samples, config.by_place, config.boxes)
     touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)

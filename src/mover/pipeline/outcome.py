@@ -43,10 +43,11 @@ from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.explain.placements import ExplainInputs, explain_placements
 from mover.stages.objects.bend_shapes import told_of_shapes
 from mover.stages.objects.find_image_cues import ImageInputs, Seen, order_of
+from mover.stages.objects.fronts import turned_to_people
 from mover.stages.objects.on_platforms import platforms_of, stood, supports_with_platforms
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
-from mover.stages.people.find_depth import size_spread
+from mover.stages.people.find_depth import pelvis, size_spread
 
 Spans = tuple[tuple[int, int], ...]
 """Frames, from the first of each to the first that is no longer in it."""
@@ -124,6 +125,17 @@ def is_pinned(context: ReconstructionContext) -> Bool[Tensor, " objects"]:
     """The objects that stay where the capture has them."""
     ids = context.prepared.objects.ids
     return torch.tensor([name in context.pinned for name in ids], dtype=torch.bool)
+
+
+def with_fronts(context: ReconstructionContext, people: PeopleState) -> ReconstructionContext:
+    """What was given with its back to the people turned round, where guesses are weighed."""
+    if not context.config.place.weights.given:
+        return context
+    prepared = context.prepared
+    places = pelvis(people.bodies)[people.kept] @ context.capture.scene.camera.R_cam_world
+    start = turned_to_people(prepared.start, prepared.objects.categories, places)
+    yaw = torch.where(is_pinned(context), prepared.start.yaw, start.yaw)
+    return replace(context, prepared=replace(prepared, start=replace(start, yaw=yaw)))
 
 
 def with_platforms(context: ReconstructionContext, state: SceneState) -> ReconstructionContext:

@@ -41,6 +41,7 @@ from mover.pipeline.outcome import (
     scale_spread,
     tops_of,
     unfurnished,
+    with_fronts,
     with_order,
     with_platforms,
     with_proposals,
@@ -131,6 +132,7 @@ def _reconstructed(
         check_floor(ground, capture)
         state = placed_by_image(context, capture.scene.camera, ground)
         return explained(room_of(context, state, None), context, state, None)
+    context = with_fronts(context, people)
     state = placed_by_image(context, people.alignment.camera, people.alignment.ground)
     context = with_size_prior(with_platforms(context, state), state)
     for _ in range(config.refine.rounds):
