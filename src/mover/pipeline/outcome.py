@@ -129,7 +129,7 @@ def is_pinned(context: ReconstructionContext) -> Bool[Tensor, " objects"]:
 
 def with_fronts(context: ReconstructionContext, people: PeopleState) -> ReconstructionContext:
     """What was given with its back to the people turned round, where guesses are weighed."""
-    if not context.config.place.weights.given:
+    if not context.config.turn_to_people or not context.config.place.weights.given:
         return context
     prepared = context.prepared
     places = pelvis(people.bodies)[people.kept] @ context.capture.scene.camera.R_cam_world

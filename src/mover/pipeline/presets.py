@@ -99,6 +99,10 @@ class Config:
     """Standard deviation of the logarithm of people's height, where all have the mean shape of
     their model and no height is given: the furniture then tells the scale, too (and where bodies
     say how far their sizes may be off, as those of `mover fit` do); 0: believed."""
+    seat_heights: bool = False
+    """How high people sit tells the scale of such a room, too."""
+    turn_to_people: bool = False
+    """Furniture along walls that was given with its back to the people begins turned to them."""
     silhouette_confidence: bool = False
     """Believe the silhouette of an object less whose shape does not fit."""
 
@@ -173,6 +177,8 @@ ROBUST = Config(
     outer_iterations=1,
     slide_to_floor=True,
     height_spread=0.055,
+    seat_heights=True,
+    turn_to_people=True,
     silhouette_confidence=True,
 )  # fmt: skip
 

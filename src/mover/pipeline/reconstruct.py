@@ -294,7 +294,8 @@ def with_common_scale(
     if given is None or not spread:
         return people, state
     kept = in_world(rows_of(people.bodies, people.kept), state.camera)
-    seats = seats_tell(kept, people.parts, floor_now(context, state))
+    floor = floor_now(context, state)
+    seats = seats_tell(kept, people.parts, floor) if context.config.seat_heights else None
     known = ScaleKnown(spread, shared, seats)
     factor = math.exp(-common_scale(state.placed.layout, given, known))
     bodies = nearer(people.bodies, state.camera, state.ground, factor)

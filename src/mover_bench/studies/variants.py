@@ -160,6 +160,9 @@ TOOLS: dict[str, Variant] = {
     "no-given": Variant(kind_inputs(ROBUST)),
     "no-lens": Variant(replace(ROBUST, lens=LensConfig())),
     "no-scale": Variant(replace(ROBUST, height_spread=0.0)),
+    "no-seats": Variant(replace(ROBUST, seat_heights=False)),
+    "no-turns": Variant(replace(ROBUST, turn_to_people=False)),
+    "no-bending": Variant(replace(ROBUST, shape="keep")),
     "no-level-feet": Variant(replace(ROBUST, prepare=replace(ROBUST.prepare, level_feet=False))),
     "no-bounded-sides": Variant(replace(ROBUST, image=replace(ROBUST.image, bounded=False))),
 }
