@@ -1,4 +1,4 @@
-"""`mover paper-table` end to end: every row of both parts of PROX, from files in its layout."""
+"""`mover paper-table` end to end: every row, from files in the layout of PROX and of PiGraphs."""
 
 import csv
 import traceback
@@ -7,12 +7,14 @@ from pathlib import Path
 
 import make_prox
 import make_scenes as layouts
+import numpy as np
 import pytest
 from test_experiments import Ended, quick
 from test_import_datasets import prox_room
 from test_import_scenes import imported
 from test_import_scenes import plain as plain  # the fixture
 
+from mover.io.datasets.pigraphs import NAMES
 from mover.pipeline.presets import PRESETS
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.tables import rows, table_job
@@ -98,3 +100,52 @@ def test_every_row_is_made_from_the_files_of_prox(
         baseline, camgp = (numbers["People [mm]", row] for row in ("baseline", "+ CamGP"))
         assert float(baseline["p_pje"]) < 1
         assert float(camgp["pje"]) < 0.7 * float(baseline["pje"])
+
+
+def kinect_joints(room: KnownRoom, wanted: list[int]) -> np.ndarray:
+    """Joints (frames, 25, 3) of some rows under Kinect's names; tips of hands are at the wrists."""
+    bodies = room.bodies
+    assert bodies.joints is not None
+    known = list(bodies.joint_names)
+    places = [
+        known.index(name if name in known else f"{name.partition('_')[0]}_wrist") for name in NAMES
+    ]
+    return bodies.joints[wanted][:, places].double().numpy()
+
+
+@pytest.fixture(scope="module")
+def graphs(
+    plain: layouts.Room, small_room: KnownRoom, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Captures of two recordings of PiGraphs, one of them mirrored as Kinect's pictures are."""
+    room, root = prox_room(plain), tmp_path_factory.mktemp("pigraphs")
+    rows_ = [k for act in ("walk", "sit") for k in chosen_rows(small_room, act, 3)]
+    joints = kinect_joints(small_room, rows_)
+    furniture = make_prox.write_furniture(root / "total3d", room)
+    masks = make_prox.write_object_masks(root / "masks.json", room, small_room)
+    out = tmp_path_factory.mktemp("captures")
+    for name, mirror in (("roomA_anna_1", False), ("roomB_bert_1", True)):
+        copy, work = root / name, tmp_path_factory.mktemp("work")
+        layouts.write_pigraphs(copy, room, name, joints, mirror=mirror)
+        imported("pigraphs", copy, out / name, work, recording=name)
+        imported("total3d", furniture, out / name, work)
+        imported("masks", masks, out / name, work)
+    return out
+
+
+def test_every_row_is_made_from_the_files_of_pigraphs(
+    graphs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for preset, config in PRESETS.items():
+        monkeypatch.setitem(PRESETS, preset, quick(config))
+    args = TableArgs("pigraphs", graphs, tmp_path, graphs, preset="paper")
+    page = paper_table(args, launch=at_once).read_text()
+    assert "Failed" not in page
+    assert "Not run" not in page
+    with (tmp_path / "pigraphs-paper.csv").open(newline="") as file:
+        numbers = {line["row"]: line for line in csv.DictReader(file)}
+    (part,) = TABLES["pigraphs"].parts
+    for row in asked(part, args):
+        line = numbers[row.label]
+        assert line["recordings"] == "2"
+        assert [c for c in part.columns if not line.get(c)] == [], row.label
