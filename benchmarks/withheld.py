@@ -3,10 +3,10 @@
     PYTHONPATH=src python benchmarks/withheld.py --seeds 100-109 --out withheld
 
 Rebuilds the rooms of `--sets` with `robust` (`withheld-seat` lacks the seat that is used most,
-`withheld-step` a step, `rooms` nothing, so that all proposals there are false; finished stages are
-kept in `--out`) and prints for each what is missing, how far the proposal's middle is from it and
-how much too high its seat is [cm], its certainty, and the number of false proposals. Seeds without
-such a room (no step fits) are told and left out.
+`withheld-step` a step, `withheld-table` a table, `rooms` nothing, so that all proposals there are
+false; finished stages are kept in `--out`) and prints for each what is missing, how far the
+proposal's middle is from it and how much too high its seat or top is [cm], its certainty, and the
+number of false proposals. Seeds without such a room (no step fits) are told and left out.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from mover_bench.studies.measures import measure_proposals
 from mover_bench.studies.run import parse_seeds
 from mover_bench.studies.sets import SETS
 
+DEFAULT = ["withheld-seat", "withheld-step", "withheld-table", "rooms"]
 Row = tuple[float, float]  # centre and height [cm]; nan where nothing was found
 
 
@@ -51,7 +52,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", default="100-109")
     parser.add_argument("--out", type=Path, default=Path("withheld"))
-    parser.add_argument("--sets", nargs="+", default=["withheld-seat", "withheld-step", "rooms"])
+    parser.add_argument("--sets", nargs="+", default=DEFAULT)
     args = parser.parse_args()
     torch.set_num_threads(1)
     for name in args.sets:

@@ -23,6 +23,12 @@ STRIDE = {
 ARMS_UP = {"left_shoulder": (0.0, 0.0, 1.3), "right_shoulder": (0.0, 0.0, -1.3)}
 AT_TABLE = {**ARMS_DOWN, "left_elbow": (0.0, -1.5, 0.0), "right_elbow": (0.0, 1.5, 0.0)}
 
+LEANING = {
+    "left_shoulder": (0.702, -1.454, -0.702), "right_shoulder": (0.702, 1.454, 0.702),
+    "left_elbow": (0.0, 0.0, 0.9), "right_elbow": (0.0, 0.0, -0.9),
+}  # fmt: skip
+"""Upper arms forwards and 52 degrees down, forearms level, palms down."""
+
 
 def pose(turns: dict[str, tuple[float, float, float]], count: int = 1) -> BodyPose:
     """So many people with these joints turned from the T-pose [rad]."""

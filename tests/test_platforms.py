@@ -34,7 +34,8 @@ from mover.geometry.rotations import rot_y
 from mover.io.export.solids import solids_of
 from mover.stages.camera.align_camera import AlignInputs, align_camera
 from mover.stages.config import ProposeConfig
-from mover.stages.contacts.propose_supports import NOTHING, ProposeInputs, propose_supports
+from mover.stages.contacts.propose_supports import propose_supports
+from mover.stages.contacts.resting import NOTHING, ProposeInputs
 from mover.stages.objects.on_platforms import stood, supports_with_platforms
 from mover.stages.objects.prepare_objects import (
     Prepared,

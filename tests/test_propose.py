@@ -27,12 +27,8 @@ from mover.io.capture.scene_file import read_scene
 from mover.pipeline.presets import ROBUST
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.config import ProposeConfig
-from mover.stages.contacts.propose_supports import (
-    NOTHING,
-    KnownTops,
-    ProposeInputs,
-    propose_supports,
-)
+from mover.stages.contacts.propose_supports import propose_supports
+from mover.stages.contacts.resting import NOTHING, KnownTops, ProposeInputs
 from mover_bench.studies.job import noisy_room
 from mover_bench.studies.sets import SETS
 
@@ -249,7 +245,7 @@ def test_a_dismissed_proposal_is_gone_for_good_and_neither_answer_changes_anothe
 
 @pytest.mark.slow
 def test_what_a_run_proposes_changes_nothing_else_of_its_room(tmp_path: Path):
-    capture = noisy_room(103, replace(SETS["mini"], withheld=True)).capture
+    capture = noisy_room(103, replace(SETS["mini"], withheld="seat")).capture
     run, without = Run(tmp_path), replace(ROBUST, propose=ProposeConfig(use=False))
     with_it, bare = (reconstruct(capture, config, run) for config in (ROBUST, without))
     assert [one.piece for one in with_it.proposals] != []

@@ -31,6 +31,7 @@ from mover_bench.rooms.room import demo_room, make_room
 from mover_bench.rooms.seating import hand_on, leaning, seat_spot, seated, table_stand
 from mover_bench.rooms.stepped import make_platform_room, make_stepped_room
 from mover_bench.rooms.truth import part
+from mover_bench.rooms.worked import make_worked_room
 from mover_bench.studies.sets import SETS
 
 SHAPES = ([0.0] * 10, [1.3, -1.0, 0.5] + [0.0] * 7)
@@ -300,7 +301,7 @@ def test_tasks_that_the_furniture_does_not_allow_are_refused_with_a_reason() -> 
 @pytest.mark.slow
 class TestWholeRooms:
     def test_a_video_begins_on_a_step_that_is_withheld_and_ends_on_the_floor(self) -> None:
-        config = dataclasses.replace(SETS["mini"].room, step="step")
+        config = dataclasses.replace(SETS["mini"].room, support="step")
         room = make_stepped_room(101, config)
         step, count = room.truth.objects[-1], room.actions.count("step")
         assert step.category == "step"
@@ -311,12 +312,28 @@ class TestWholeRooms:
         assert (low[:count] - room.furniture[-1].top_height).abs().max() < 0.01
         assert low[count + 10 :].abs().max() < 0.02
         assert bool((room.touched[:count] == len(room.furniture) - 1).any(1).all())
-        given = without_support(room.capture, room)
+        given = without_support(room.capture, room, "step")
         assert [p.id for p in given.scene.objects] == [p.id for p in room.truth.objects[:-1]]
         assert len(given.detections) == len(room.capture.detections) - 1
 
+    def test_both_palms_lie_on_a_table_that_is_withheld_of_who_sits_and_of_who_stands(self) -> None:
+        config = dataclasses.replace(SETS["mini"].room, support="table")
+        room = make_worked_room(100, config)
+        given = without_support(room.capture, room, "table")
+        (lost,) = {p.id for p in room.truth.objects} - {p.id for p in given.scene.objects}
+        table = next(k for k, p in enumerate(room.truth.objects) if p.id == lost)
+        works = torch.tensor([action == "both hands" for action in room.actions])
+        assert int(works.sum()) > 15
+        hands = torch.from_numpy(np.stack([part("left_hand"), part("right_hand")]))
+        for hand in hands:
+            assert bool((room.touched[works][:, hand] == table).any(1).all())
+        world = to_world(room.bodies.verts, room.truth.camera.R_cam_world)
+        assert room.truth.ground is not None
+        top = room.truth.ground + room.furniture[table].top_height
+        assert (world[works][:, hands.any(0), 1].amin(1) - top).abs().max() < 0.02
+
     def test_people_walk_onto_a_platform_and_sit_on_it_and_all_else_is_on_the_floor(self) -> None:
-        room = make_platform_room(100, dataclasses.replace(SETS["mini"].room, step="platform"))
+        room = make_platform_room(100, dataclasses.replace(SETS["mini"].room, support="platform"))
         seat = next(k for k, p in enumerate(room.truth.objects) if p.support == "platform_0")
         high, floor = room.furniture[-1].top_height, floor_of(room.truth)
         assert floor is not None

@@ -286,7 +286,7 @@ def _rest_arms(
         middle = bodies.verts[:, part].mean(1)
         rest = _ramp(speeds(middle[:, None], bodies)[:, 0], STILL[1], STILL[0])
         height = middle[:, 1] - ground
-        free = (_from_lap(middle, places) > LAP) & (height > SURFACE[0]) & (height < SURFACE[1])
+        free = (from_lap(middle, places) > LAP) & (height > SURFACE[0]) & (height < SURFACE[1])
         if kind == "forearm":
             arm = at(places, f"{side}_wrist") - at(places, f"{side}_elbow")
             free = free & (elevation(arm).abs() < LEVEL_ARM)
@@ -296,7 +296,7 @@ def _rest_arms(
     return chance
 
 
-def _from_lap(
+def from_lap(
     point: Float[Tensor, "bodies 3"], places: Float[Tensor, "bodies landmarks 3"]
 ) -> Float[Tensor, " bodies"]:
     """Distance to the nearer of the own thighs' middle lines [m]."""

@@ -43,9 +43,10 @@ from mover.geometry.placement import ENDLESS, hit_floor, placed_at
 from mover.geometry.rle import encode, tight_box
 from mover.geometry.rotations import rot_y
 from mover.io.capture.pose_file import into_camera
-from mover.pipeline.outcome import Spans, told_of_proposals
+from mover.pipeline.outcome import Spans
 from mover.pipeline.people import carried, depths_of, found_path
 from mover.pipeline.presets import Config, with_sizes
+from mover.pipeline.proposals import told_of_proposals
 from mover.stages.config import ExplainConfig, ProposeConfig, SpreadConfig
 from mover.stages.masks import enlarged, thin
 from mover.stages.objects.find_image_cues import evidence_at

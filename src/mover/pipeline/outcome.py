@@ -35,10 +35,9 @@ from mover.io.capture.pose_file import into_camera
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import Alignment
 from mover.stages.config import PlaceConfig
-from mover.stages.contacts.assign_contacts import ContactAssignment, ContactInputs, find_contacts
+from mover.stages.contacts.assign_contacts import ContactAssignment
 from mover.stages.contacts.gather_cues import Cues, GatherInputs
 from mover.stages.contacts.label_contacts import LabelInputs
-from mover.stages.contacts.propose_supports import KnownTops, ProposeInputs, propose_supports
 from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.explain.placements import ExplainInputs, explain_placements
 from mover.stages.objects.bend_shapes import told_of_shapes
@@ -281,44 +280,6 @@ def explanations_of(
     asked = ExplainInputs(inputs, config, state.placed, bodies, pairs, tilt)
     found = context.run.stage(explain_placements, asked, context.config.explain)
     return explain(found.facts, calibration_of(config.form))
-
-
-def with_proposals(
-    room: Room,
-    capture: Capture,
-    config: Config,
-    run: Run,
-    people: PeopleState | None,
-    known: KnownTops,
-) -> Room:
-    """The room with what people rest on that is not in it."""
-    camera, floor = room.scene.camera, floor_of(room.scene)
-    if people is None or floor is None or not config.propose.use:
-        return room
-    bodies = in_world(rows_of(people.bodies, people.kept), camera)
-    given = None if capture.touch is None else capture.touch[people.kept]
-    contacts = ContactInputs(bodies, people.parts, floor, given)
-    chance = run.stage(find_contacts, contacts, config.contacts).probability
-    inputs = ProposeInputs(bodies, people.parts, chance, floor, camera, known)
-    return replace(room, proposals=run.stage(propose_supports, inputs, config.propose).found)
-
-
-def told_of_proposals(room: Room) -> Room:
-    """The room with a sentence for each proposal."""
-    sentences = (
-        f"{one.object.id}: people rest for {one.seconds:.0f} s on nothing that is known; a"
-        f" {one.object.category} is proposed there (certainty {one.certainty:.2f})"
-        for one in room.proposals
-    )
-    return replace(room, warnings=(*room.warnings, *sentences))
-
-
-def tops_of(context: ReconstructionContext, state: SceneState) -> KnownTops:
-    """What of the placed room can carry people."""
-    objects = context.prepared.objects
-    rows = objects.has_top.nonzero()[:, 0]
-    tops = place(objects.top, state.placed.layout)[rows]
-    return KnownTops(tops, context.seen.masks[rows], objects.is_seat[rows], objects.ids)
 
 
 def _evidence(context: ReconstructionContext, state: SceneState) -> tuple[Evidence, ...]:

@@ -39,23 +39,22 @@ from mover.pipeline.outcome import (
     label_inputs,
     room_of,
     scale_spread,
-    tops_of,
     unfurnished,
     with_fronts,
     with_order,
     with_platforms,
-    with_proposals,
 )
 from mover.pipeline.people import people_of, through_its_lens
 from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
 from mover.pipeline.presets import with_sizes
+from mover.pipeline.proposals import tops_of, with_proposals
 from mover.stages.camera.refine_camera import FurtherView, RefineInputs, refine_camera
 from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
 from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import cues_in_windows, gather_cues
 from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
-from mover.stages.contacts.propose_supports import NOTHING
+from mover.stages.contacts.resting import NOTHING
 from mover.stages.objects.bend_shapes import BendInputs, bend_shapes, with_shapes
 from mover.stages.objects.find_image_cues import (
     ImageInputs,

@@ -386,3 +386,7 @@ class ProposeConfig:
     """Soles slower than this stand [m/s]."""
     seconds: Annotated[float, float_in(0, 3600)] = 1.5
     """Shorter rests propose nothing [s]; an image without time counts as one."""
+    lowest_hand: Metres = 0.55
+    """Lower hands lean on nothing [m over the floor]..."""
+    highest_hand: Metres = 1.15
+    """... nor do higher ones [m]."""

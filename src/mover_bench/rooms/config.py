@@ -5,6 +5,8 @@ from typing import Literal
 
 Rule = Literal["wall", "corner", "middle", "facing", "before", "around", "beside"]
 """Where a piece of furniture may stand."""
+Withheld = Literal["seat", "step", "table"]
+"""What people rest on and no detector saw."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,9 @@ class RoomConfig:
     moved: Literal["no", "put", "stays", "pushed", "rolled"] = "no"
     """How a piece is moved in the middle of the video: put elsewhere between two visits (stays: two
     visits, and nothing is moved), pushed by hand, or rolled under who sits on it."""
-    step: Literal["no", "step", "platform"] = "no"
-    """There is a step, on which somebody stands first, or a platform under a seat."""
+    support: Literal["no", "step", "platform", "table"] = "no"
+    """There is a step, on which somebody stands first, or a platform under a seat, or a table at
+    which people work with both hands."""
     least_passing: float = 0.0
     """Least share of the bodies that furniture hides in part."""
     plan: PlanConfig = field(default_factory=PlanConfig)

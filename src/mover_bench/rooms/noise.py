@@ -17,14 +17,14 @@ from torch import Tensor
 from mover.bodies.skinning import open_body
 from mover.core.records import map_tensors
 from mover.core.types import Bodies, BodyPose, Camera, Capture, Mesh, Scene, SceneObject
-from mover.furniture.library import SEATS, STEP, another
+from mover.furniture.library import SEATS, STEP, TOPS, another
 from mover.furniture.pieces import Furniture
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rle import decode
 from mover.geometry.rotations import rot_y
 from mover.geometry.warp_start import beside
 from mover.stages.camera.find_lens import through_lens
-from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.config import NoiseConfig, Withheld
 from mover_bench.rooms.foreign import foreign_mesh
 from mover_bench.rooms.known import KnownRoom, one_thread, rounded
 from mover_bench.rooms.noise_masks import (
@@ -41,6 +41,8 @@ from mover_bench.rooms.poses import LEG
 from mover_bench.rooms.turns import from_vector, to_vector
 
 SEATS_FOR_ONE = ("chair", "armchair", "office chair", "stool")
+LOST = {"seat": ("sit", "lean", "lie"), "step": ("step",), "table": ("both hands",)}
+"""Actions that tell which piece of each kind is used most."""
 HOLE = 0.1  # share of the surface that is missing where a mesh has a hole
 
 
@@ -268,20 +270,19 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     return wrong_lens(capture, noise.lens, np.random.default_rng([seed, 13]))
 
 
-def without_support(capture: Capture, room: KnownRoom) -> Capture:
-    """The capture without the step that somebody stands on, else the seat that is sat on most.
+def without_support(capture: Capture, room: KnownRoom, kind: Withheld) -> Capture:
+    """The capture without the piece of a kind on which people rest most.
 
     A seat for one, whose middle its sitter tells, goes before sofas, benches and beds.
     """
-    steps = [k for k, piece in enumerate(room.furniture) if piece.category == STEP]
-    resting = torch.tensor([action in ("sit", "lean", "lie") for action in room.actions])
-    touched = room.touched[resting]
-    used = [int((touched == k).any(1).sum()) for k in range(len(room.furniture))]
-    seats = [k for k, n in enumerate(used) if n and room.furniture[k].category in SEATS]
-    single = [k for k in seats if room.furniture[k].category in SEATS_FOR_ONE]
-    if not steps + seats:
+    actions = torch.tensor([action in LOST[kind] for action in room.actions])
+    used = [int((room.touched[actions] == k).any(1).sum()) for k in range(len(room.furniture))]
+    of_kind = {"step": {STEP}, "seat": SEATS, "table": TOPS - SEATS}[kind]
+    could = [k for k, n in enumerate(used) if n and room.furniture[k].category in of_kind]
+    single = [k for k in could if room.furniture[k].category in SEATS_FOR_ONE]
+    if not could:
         return capture
-    lost = room.truth.objects[max(steps or single or seats, key=lambda k: used[k])]
+    lost = room.truth.objects[max(single or could, key=lambda k: used[k])]
     return without(capture, {lost.annotation})
 
 

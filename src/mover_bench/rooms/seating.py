@@ -215,11 +215,11 @@ def span(person: Person, posture: Posture, hand: int, goal: np.ndarray) -> float
 
 
 def reach_out(end: Posture, stand: Posture, share: np.ndarray) -> Posture:
-    """From standing (share 0) over a raised hand to the hand on the top (share 1)."""
-    hand = int(end.resting[0].argmax())
+    """From standing (share 0) over raised hands to the hands on the top (share 1)."""
     half = blend(stand, end, np.array([0.5]))
     wrists = half.wrists.copy()
-    wrists[0, hand] = np.array([0.05 if hand == 0 else -0.05, -0.2, 0.13])
+    for hand in np.flatnonzero(end.resting[0]):
+        wrists[0, hand] = np.array([0.05 if hand == 0 else -0.05, -0.2, 0.13])
     palms = np.where(end.resting[..., None] > 0, end.palms, half.palms)
     raised = dataclasses.replace(half, wrists=wrists, palms=palms, resting=np.zeros((1, 2)))
     start = dataclasses.replace(stand, palms=palms)

@@ -110,10 +110,19 @@ RESTS = {
     "lie": ("torso",),
     "left hand": ("left_hand",),
     "right hand": ("right_hand",),
+    "both hands": ("left_hand", "right_hand"),
 }
 """Parts of the body that must touch the piece in use, by the name of the action."""
 ON_FEET = frozenset(
-    {"walk", "sit down", "sit", "lean", "stand up", "reach", "left hand", "right hand"}
+    {
+        "walk",
+        "sit down",
+        "sit",
+        "lean",
+        "stand up",
+        "reach",
+        *(name for name in RESTS if "hand" in name),
+    }
 )
 
 

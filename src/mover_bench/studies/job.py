@@ -29,6 +29,7 @@ from mover.core.types import Bodies, Room, Scene
 from mover.evaluate.evaluation import EvaluateConfig
 from mover.evaluate.explanation import scene_fields
 from mover.evaluate.stability import SimulatedObject, loads_in, simulate
+from mover.furniture.library import SEATS
 from mover.pipeline.reconstruct import Config, reconstruct
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
@@ -40,6 +41,7 @@ from mover_bench.rooms.moved import make_moved_room
 from mover_bench.rooms.noise import without_support
 from mover_bench.rooms.room import make_room
 from mover_bench.rooms.stepped import make_platform_room, make_stepped_room
+from mover_bench.rooms.worked import make_worked_room
 from mover_bench.studies.fitted import fitted_trial, measure_fitted
 from mover_bench.studies.measures import (
     Trial,
@@ -59,7 +61,10 @@ DONE = "metrics.json"  # a job that has it is finished
 TRUTHS = "truths"  # folder of rooms without noise, which sets share
 STAGES = {"initial": "Initial", "image": "Stage 1", "full": "Full"}
 """Scenes that are measured, by their name in the files."""
-USES = {"sit": "sit", "lean": "sit", "lie": "lie", "left hand": "hand", "right hand": "hand"}
+USES = {
+    "sit": "sit", "lean": "sit", "lie": "lie",
+    "left hand": "hand", "right hand": "hand", "both hands": "hand",
+}  # fmt: skip
 """Interactions that are told apart, by the action of a known room."""
 
 
@@ -115,15 +120,15 @@ class Seed:
 MAKERS: dict[str, Callable[[int, RoomConfig], KnownRoom]] = {
     "no": make_room, "put": make_moved_room, "stays": make_moved_room,
     "pushed": make_handled_room, "rolled": make_handled_room,
-    "step": make_stepped_room, "platform": make_platform_room,
+    "step": make_stepped_room, "platform": make_platform_room, "table": make_worked_room,
 }  # fmt: skip
-"""By `RoomConfig.moved` and `RoomConfig.step`."""
+"""By `RoomConfig.moved` and `RoomConfig.support`."""
 
 
 def make_truth(inputs: Seed, config: RoomConfig, observe: Observer = silent) -> KnownRoom:
     """A room without noise, as a stage: sets with the same rooms make it once."""
     del observe
-    kind = config.moved if config.step == "no" else config.step
+    kind = config.moved if config.support == "no" else config.support
     return MAKERS[kind](inputs.seed, config)
 
 
@@ -139,8 +144,8 @@ def noisy_room(seed: int, rooms: RoomSet, run: Run | None = None) -> Trial:
 def spoilt(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
     """A known room with the noise of a set."""
     capture = filmed(room, rooms.noise, seed, rooms.paths[seed % len(rooms.paths)])
-    if rooms.withheld:
-        capture = without_support(capture, room)
+    if rooms.withheld is not None:
+        capture = without_support(capture, room, rooms.withheld)
     if "camera" in rooms.exact:
         assert room.truth.ground is not None, "a known room has a floor"
         capture = replace(capture, camera_height=-room.truth.ground)
@@ -173,9 +178,13 @@ def held_camera(config: Config) -> Config:
 def doing_of(room: KnownRoom) -> tuple[str, ...]:
     """For each body how it uses which piece, such as `sit chair_0`; empty: it uses none."""
     names: list[str] = []
+    seats = {k for k, piece in enumerate(room.furniture) if piece.category in SEATS}
     for action, touched in zip(room.actions, room.touched, strict=True):
+        known = USES.get(action)
         pieces = Counter(touched[touched >= 0].tolist())
-        known = USES.get(action) if pieces else None
+        if known == "hand":  # of who sits at a table the seat is touched most
+            pieces = Counter({k: n for k, n in pieces.items() if k not in seats})
+        known = known if pieces else None
         most = max(pieces, key=lambda k: (pieces[k], -k)) if pieces else -1
         names.append(f"{known} {room.truth.objects[most].id}" if known else "")
     return tuple(names)

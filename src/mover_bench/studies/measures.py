@@ -3,7 +3,7 @@
 import json
 import math
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -24,7 +24,7 @@ from mover.evaluate.evaluation import (
 from mover.evaluate.moves import measure_moves
 from mover.evaluate.scene import unmatched
 from mover.furniture.floor import floor_of
-from mover.furniture.library import SEATS, STEP, canonical
+from mover.furniture.library import SEATS, STEP, TOPS, canonical
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera
 from mover.geometry.mesh import sample_surface
@@ -243,20 +243,24 @@ def _fps(trial: Trial) -> float | None:
 
 
 def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:
-    """How the seats and steps that were not given, and are used, are proposed, and what else is.
+    """How what was not given, and is used, is proposed, and what else is.
 
-    A proposal is that of the nearest of them within `NEAR`; others are false.
+    A proposal is that of the nearest piece of its sort (seats and steps, or tables) within `NEAR`;
+    others are false.
     """
     given = {piece.id for piece in trial.capture.scene.objects}
     turn = trial.truth.camera.R_cam_world.mT @ room.scene.camera.R_cam_world
     places = [turn @ box_of(one.object).center for one in room.proposals]
+    sorts = [_sort(one.object) for one in room.proposals]
     claimed: set[int] = set()
     rows: list[dict[str, Any]] = []
     for seat, traits in zip(trial.truth.objects, trial.traits, strict=True):
-        if seat.id in given or not traits.touched or canonical(seat.category) not in {*SEATS, STEP}:
+        sort = _sort(seat)
+        used = traits.touched if sort == "rest" else f"hand {seat.id}" in trial.doing
+        if seat.id in given or not used or sort is None:
             continue
         away = [float((at - box_of(seat).center)[[0, 2]].norm()) for at in places]
-        near = [k for k, gap in enumerate(away) if gap < NEAR]
+        near = [k for k, gap in enumerate(away) if gap < NEAR and sorts[k] == sort]
         row = {"id": seat.id, "category": seat.category, "found": bool(near)}
         if near:
             best = min(near, key=lambda k: away[k])
@@ -265,6 +269,12 @@ def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:
         claimed.update(near)
         rows.append(row)
     return {"withheld": rows, "false": len(places) - len(claimed)}
+
+
+def _sort(piece: SceneObject) -> Literal["rest", "hands"] | None:
+    """What a piece carries: people at rest, or hands; None: nothing."""
+    kind = canonical(piece.category)
+    return "rest" if kind in {*SEATS, STEP} else "hands" if kind in TOPS else None
 
 
 def seat_height(piece: SceneObject) -> float:

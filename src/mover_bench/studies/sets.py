@@ -11,7 +11,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from mover.core.errors import InputError
-from mover_bench.rooms.config import ActConfig, NoiseConfig, PathConfig, PlanConfig, RoomConfig
+from mover_bench.rooms.config import (
+    ActConfig,
+    NoiseConfig,
+    PathConfig,
+    PlanConfig,
+    RoomConfig,
+    Withheld,
+)
 
 
 @dataclass(frozen=True)
@@ -30,8 +37,8 @@ class RoomSet:
     """Counts up whenever a room of the set changes."""
     exact: tuple[str, ...] = ()
     """What is given as it truly is, of `EXACT`."""
-    withheld: bool = False
-    """No detector saw the seat that is used most, or the step: `rooms.noise.without_support`."""
+    withheld: Withheld | None = None
+    """What no detector saw: `rooms.noise.without_support`."""
     paths: tuple[PathConfig, ...] = (PathConfig(),)
     """How the camera moves, one room after the other."""
 
@@ -175,16 +182,21 @@ SETS: dict[str, RoomSet] = {
     ),
     "withheld-seat": RoomSet(
         "The rooms of `rooms`; the seat that is used most is not in what is given.",
-        "1000-1029", "100-129", withheld=True,
+        "1000-1029", "100-129", withheld="seat",
     ),
     "withheld-step": RoomSet(
         "The rooms of `rooms` with a step on which somebody stands; it is not in what is given.",
-        "1000-1029", "100-129", RoomConfig(step="step"), withheld=True,
+        "1000-1029", "100-129", RoomConfig(support="step"), withheld="step",
+    ),
+    "withheld-table": RoomSet(
+        "The rooms of `rooms` with people who work at a table with both hands; it is not in what is"
+        " given.",
+        "1000-1029", "100-129", RoomConfig(support="table"), withheld="table",
     ),
     "platform": RoomSet(
         "The rooms of `rooms`; a seat stands on a platform that people walk onto; what is given"
         " says that all stands on the ground.",
-        "1000-1029", "100-129", RoomConfig(step="platform"),
+        "1000-1029", "100-129", RoomConfig(support="platform"),
     ),
     "moving-camera": RoomSet(
         "The rooms of `rooms` seen by a camera that is walked with, panned or held by hand; its"

@@ -30,9 +30,17 @@ from mover.geometry.raster import Crops, layers
 from mover.geometry.volume import grid_around
 from mover.geometry.volume_warp import union_bodies
 from mover.stages.config import GatherConfig
-from mover.stages.masks import MaskTable, mask_table, small_camera, small_masks, small_views
+from mover.stages.masks import (
+    MaskTable,
+    mask_table,
+    small_camera,
+    small_masks,
+    small_views,
+    widened,
+)
 
 NEAREST = 0.3  # [m], bodies are taken to be at least that far when pixels become metres
+ASIDE = 3  # [px] around known objects in which what hides people may be one of them
 BLOCK = 4  # bodies that a thread draws at once
 
 Window = tuple[slice, slice]
@@ -219,26 +227,38 @@ def cues_in_windows(
     return HumanCues(depth, cues.space, touches)
 
 
+def hidden_by_unknown(inputs: GatherInputs, config: GatherConfig) -> Float[Tensor, "fh fw"]:
+    """How near bodies are of which something hides a pixel that is no known object [m].
+
+    In the image 640 wide; infinite where nothing is hidden, or where a farther body was seen.
+    """
+    camera = small_camera(inputs.camera)
+    if inputs.people is None:
+        return torch.full((camera.height, camera.width), float("inf"))
+    known = widened(small_masks(inputs.masks, inputs.camera).cpu().any(0)[None], ASIDE)
+    maps = gather_depth(_sight(inputs, ~known, replace(config, vote=False)), config.workers)
+    return torch.where(maps.near < maps.far, maps.far, float("inf"))
+
+
 def _depth_maps(inputs: GatherInputs, config: GatherConfig, observe: Observer) -> DepthMaps | None:
     if inputs.people is None:
         return None
     masks = small_masks(inputs.masks, inputs.camera).cpu()
-    table = mask_table(inputs.people, inputs.bodies)
     return gather_depth(
-        Sight(
-            inputs.bodies,
-            table,
-            masks,
-            inputs.camera,
-            config.erode,
-            config.vote,
-            config.reach,
-            inputs.path,
-            config.beside,
-        ),
+        _sight(inputs, masks, config),
         config.workers,
         lambda done, of: observe(Step("gather_cues: depth", done, of)),
     )
+
+
+def _sight(inputs: GatherInputs, masks: Bool[Tensor, "objects h w"], config: GatherConfig) -> Sight:
+    """What is drawn of the people, against some masks of the image 640 wide."""
+    assert inputs.people is not None, "people have masks"
+    table = mask_table(inputs.people, inputs.bodies)
+    return Sight(
+        inputs.bodies, table, masks, inputs.camera, config.erode, config.vote, config.reach,
+        inputs.path, config.beside,
+    )  # fmt: skip
 
 
 def _space(inputs: GatherInputs, config: GatherConfig, observe: Observer) -> BodySpace:

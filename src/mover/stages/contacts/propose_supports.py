@@ -1,13 +1,11 @@
 """Supports that no detector saw: where people rest, again and again, on nothing that is known.
 
-A resting body part (a seat, a back that lies, soles above the floor) is covered where the top of a
-known object is within reach, or where it is seen before the mask of a known seat that is not far.
-Rests at one place make a group, over all people and the whole video. A group that is not covered
-and lasts is a support: the class follows from posture, the place from the middle of what touches,
-the height from its lowest layer, the front from where people look, the size from the class and from
-how wide the place is that they touch. Who sits across to those who lie, near the edge, sits on a
-sofa: it reaches from one end of all of them to the other. What rests on a piece for several belongs
-to it.
+Rests (`resting`) at one place make a group, over all people and the whole video. A group that
+nothing known covers and that lasts is a support. Hands tell a table (`propose_tables`). Else the
+class follows from posture, the place from the middle of what touches, the height from its lowest
+layer, the front from where people look, the size from the class and from how wide the place is that
+they touch. Who sits across to those who lie, near the edge, sits on a sofa: it reaches from one end
+of all of them to the other. What rests on a piece for several belongs to it.
 
 A proposal is no object: nothing else of the room depends on it until somebody accepts it.
 """
@@ -15,33 +13,33 @@ A proposal is no object: nothing else of the room depends on it until somebody a
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.bodies.parts import Parts, members
-from mover.bodies.posture import Postures, at, facing, headings, landmarks, postures, speeds
+from mover.bodies.posture import at, facing, headings, landmarks
 from mover.core.observe import Observer, silent
 from mover.core.records import record
-from mover.core.types import Bodies, Camera, Proposal, SceneObject
-from mover.furniture.floor import Floor, height_under_bodies
+from mover.core.types import Proposal, SceneObject
 from mover.furniture.library import SEEDS, make_piece
 from mover.furniture.pieces import Furniture
 from mover.geometry.boxes import beyond, box_of
-from mover.geometry.camera import project, to_camera
 from mover.geometry.rotations import rot_y
 from mover.stages.config import ProposeConfig
-from mover.stages.masks import small_camera, small_masks
+from mover.stages.contacts.propose_tables import HandPlace, likeliest_top
+from mover.stages.contacts.resting import (
+    LEVEL,
+    LOWEST,
+    SAME,
+    Kind,
+    ProposeInputs,
+    Resting,
+    grouped,
+    resting_bodies,
+)
 
-RESTS = ("seat", "left_thigh", "right_thigh", "back")  # parts that a seat or a bed carries
-SOLES = ("left_sole", "right_sole")
-FEWEST = 10  # vertices of a part that rests
-LEVEL = 0.2  # [m] from a top, up or down, at most, of what rests on it
-LOWEST = 0.2  # share of the points that touch below the height of what carries them
-SAME = 0.3  # [m] between the middles of two rests on one support
 UNORDERED = 1.0  # [s] that an image without time stands for
 LEANS = 0.2  # [rad] of a trunk behind upright: its seat has a back
 UPRIGHT = 0.1  # [m] before the middle of its seat sits who does not lean (rooms 100-115)
@@ -55,64 +53,23 @@ EDGE = 0.05  # [m] around what touches that at least belongs to what carries it
 ENDS = 0.02  # share of the points, and of the rests, beyond each end
 STEADY = 0.04  # [m] by which the heights of rests on one support differ
 
-Kind = Literal["sit", "lie", "step"]
-
-
-@record
-class KnownTops:
-    """What can carry somebody in the room as it is placed."""
-
-    tops: Float[Tensor, "objects region 3"]
-    """Points of seats, mattresses and table tops in the world [m]."""
-    masks: Bool[Tensor, "objects h w"]
-    """Pixels of the objects in the clean image."""
-    is_seat: Bool[Tensor, " objects"]
-    taken: tuple[str, ...]
-    """Ids of all objects of the room."""
-
-
-NOTHING = KnownTops(
-    torch.zeros(0, 1, 3), torch.zeros(0, 1, 1, dtype=torch.bool), torch.zeros(0, dtype=torch.bool),
-    (),
-)  # fmt: skip
-"""Of an empty room."""
-
-
-@record
-class ProposeInputs:
-    """The selected bodies in the world, what touches, and what is there to be touched."""
-
-    bodies: Bodies
-    parts: Parts
-    chance: Float[Tensor, "bodies verts"]
-    """That a vertex touches something."""
-    floor: Floor
-    camera: Camera
-    known: KnownTops
-
-    @cached_property
-    def under(self) -> Float[Tensor, " bodies"]:
-        """Height of the floor under each body [m]."""
-        return height_under_bodies(self.floor, self.bodies)
-
-
-@dataclass(frozen=True)
-class Resting:
-    """One body at rest on something."""
-
-    row: int
-    kind: Kind
-    points: Float[Tensor, "verts 3"]
-    """What touches [m]."""
-    covered: bool
-    """Something known carries it."""
-
 
 @record
 class Proposals:
     """Supports that no detector saw."""
 
     found: tuple[Proposal, ...]
+
+
+def leans_on_nothing(inputs: ProposeInputs, config: ProposeConfig) -> bool:
+    """Whether a table will be looked for."""
+    return any(group.is_table for group in _uncovered(inputs, config))
+
+
+def _uncovered(inputs: ProposeInputs, config: ProposeConfig) -> list["Group"]:
+    """Places where people rest for long on nothing known."""
+    groups = [Group(rests, inputs) for rests in grouped(resting_bodies(inputs, config))]
+    return [g for g in groups if g.covered < config.covered and g.seconds >= config.seconds]
 
 
 def propose_supports(
@@ -122,95 +79,35 @@ def propose_supports(
     del observe
     if not config.use:
         return Proposals(())
-    groups = [Group(rests, inputs) for rests in grouped(resting_bodies(inputs, config))]
-    held = [g for g in groups if g.covered < config.covered and g.seconds >= config.seconds]
-    held.sort(key=lambda group: (_kind_of(group) not in LONG, -group.seconds))
-    taken = set(inputs.known.taken)
-    found: list[Proposal] = []
-    while held:
-        group, *held = held
-        proposal = _proposal(group, taken)
-        under = [other for other in held if _stands_under(proposal.object, other.middle)]
-        if under and proposal.piece in LONG:
-            rests = [rest for part in (group, *under) for rest in part.rests]
-            proposal = _proposal(Group(rests, inputs), taken)
-        held = [other for other in held if not _stands_under(proposal.object, other.middle)]
+    held = _uncovered(inputs, config)
+    found = _seats([group for group in held if not group.is_table], inputs)
+    tables = [group for group in held if group.is_table]
+    taken = {*inputs.known.taken, *(one.object.id for one in found)}
+    boxes = [box_of(one.object) for one in found]
+    tables = [g for g in tables if all(bool((beyond(b, g.middle) > 0).any()) for b in boxes)]
+    while tables:
+        group, *tables = tables
+        proposal = _table(group, taken)
+        if same := [other for other in tables if _at_table(proposal.object, group, other)]:
+            rests = [rest for part in (group, *same) for rest in part.rests]
+            tables = [Group(rests, inputs), *(one for one in tables if one not in same)]
+            continue
         found.append(proposal)
         taken.add(proposal.object.id)
     return Proposals(tuple(sorted(found, key=lambda proposal: -proposal.seconds)))
 
 
-def resting_bodies(inputs: ProposeInputs, config: ProposeConfig) -> list[Resting]:
-    """All bodies that sit, lie or stand above the floor."""
-    pose = postures(inputs.bodies, inputs.parts, inputs.under)
-    seats = (inputs.chance > config.chance) & members(inputs.parts, *RESTS)
-    kinds: tuple[tuple[Kind, Tensor], ...] = (
-        ("sit", seats & pose.sitting[:, None]),
-        ("lie", seats & pose.lying[:, None]),
-        ("step", _raised(inputs, pose, config)),
-    )
-    found: list[Resting] = []
-    for kind, rests in kinds:  # each body touches with another number of vertices
-        for row in (rests.sum(1) >= FEWEST).nonzero()[:, 0].tolist():
-            points = inputs.bodies.verts[row, rests[row]]
-            if float(points[:, 1].median() - inputs.under[row]) > config.lowest:
-                found.append(Resting(row, kind, points, _covered(points, inputs, config)))
-    return found
-
-
-def _raised(
-    inputs: ProposeInputs, pose: Postures, config: ProposeConfig
-) -> Bool[Tensor, "bodies verts"]:
-    """Soles, still and as low as the body reaches, of those who stand."""
-    bodies, part = inputs.bodies, members(inputs.parts, *SOLES)
-    if not bool(part.any()):
-        return torch.zeros_like(inputs.chance, dtype=torch.bool)
-    height = bodies.verts[..., 1]
-    lowest = height.amin(1, keepdim=True)
-    still = speeds(bodies.verts[:, part].mean(1, keepdim=True), bodies)[:, 0] < config.speed
-    return (height < lowest + 0.03) & part & (pose.standing & still)[:, None]
-
-
-def _covered(
-    points: Float[Tensor, "verts 3"], inputs: ProposeInputs, config: ProposeConfig
-) -> bool:
-    """Whether something known carries these points."""
-    known, middle = inputs.known, points.mean(0)
-    if len(known.tops) == 0:
-        return False
-    height = points[:, 1].quantile(LOWEST)
-    aside = (known.tops - middle)[..., [0, 2]].norm(dim=-1)
-    level = (known.tops[..., 1] - height).abs() < LEVEL
-    if bool((level & (aside < config.reach)).any()):
-        return True
-    camera = small_camera(inputs.camera)
-    x, y = project(to_camera(points, camera.R_cam_world), camera.K).long().unbind(-1)
-    shown = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    masks = small_masks(known.masks, inputs.camera)
-    over = masks[:, y.clamp(0, camera.height - 1), x.clamp(0, camera.width - 1)] & shown
-    before = over.float().mean(-1) > config.overlap
-    return bool((before & known.is_seat & (aside.amin(-1) < config.farthest)).any())
-
-
-def grouped(rests: list[Resting]) -> list[list[Resting]]:
-    """Rests of one kind whose middles are near one another, directly or through others."""
-    from scipy.sparse.csgraph import connected_components
-
-    if not rests:
-        return []
-    middle = torch.stack([rest.points.mean(0) for rest in rests])
-    step = torch.tensor([rest.kind == "step" for rest in rests])
-    near = (torch.cdist(middle[:, [0, 2]], middle[:, [0, 2]]) < SAME) & (step[:, None] == step)
-    count, label = connected_components(near.numpy(), directed=False)
-    return [[r for r, mine in zip(rests, label, strict=True) if mine == k] for k in range(count)]
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Group:
     """All rests at one place."""
 
     rests: Sequence[Resting]
     inputs: ProposeInputs
+
+    @property
+    def is_table(self) -> bool:
+        """Hands rest here."""
+        return self.rests[0].kind == "hand"
 
     @property
     def rows(self) -> Int[Tensor, " rests"]:
@@ -257,8 +154,7 @@ class Group:
     @cached_property
     def leans(self) -> bool:
         """Most who sit here lean back."""
-        pose = postures(self.inputs.bodies, self.inputs.parts, self.inputs.under)
-        return bool(pose.recline[self.rows_of("sit")].median() > LEANS)
+        return bool(self.inputs.pose.recline[self.rows_of("sit")].median() > LEANS)
 
     @cached_property
     def yaw(self) -> Float[Tensor, ""]:
@@ -338,12 +234,34 @@ def _proposal(group: Group, taken: set[str]) -> Proposal:
         place = group.middle - seat * front
         low, high = group.span
         place = place + ((low + high)[0] / 2 - place @ side) * side
+    return _named(group, (kind, seed, piece), (place, yaw, scale), taken)
+
+
+Where = tuple[Float[Tensor, "3"], Float[Tensor, ""], Float[Tensor, "3"]]
+
+
+def _table(group: Group, taken: set[str]) -> Proposal:
+    """A piece of the library under the hands of a group."""
+    place = HandPlace(list(group.rests), group.inputs)
+    top = likeliest_top(place)
+    seed, piece = _of_height(place.kind, place.height)
+    wide, _, deep = piece.size
+    size = top.size[0] / wide, place.height / piece.top_height, top.size[1] / deep
+    where = top.middle, place.yaw, torch.tensor(size)
+    return _named(group, (place.kind, seed, piece), where, taken)
+
+
+def _named(
+    group: Group, chosen: tuple[str, int, Furniture], where: Where, taken: set[str]
+) -> Proposal:
+    """A piece on the floor at a place, under a name of its own."""
+    kind, seed, piece = chosen
+    place = where[0].clone()
     place[1] = group.inputs.under[group.rows].median()
     stem = f"proposed_{kind.replace(' ', '_')}"
     name = next(n for n in (f"{stem}_{k}" for k in range(len(taken) + 1)) if n not in taken)
-    where = place, yaw, scale
     return Proposal(
-        SceneObject(name, piece.category, piece.mesh, "", None, "ground", *where),
+        SceneObject(name, piece.category, piece.mesh, "", None, "ground", place, *where[1:]),
         kind, 0, seed, _certainty(group), len(group.rests), group.seconds,
     )  # fmt: skip
 
@@ -360,6 +278,30 @@ def _scale(group: Group, kind: str, piece: Furniture, height: float) -> Float[Te
     if kind in ("chair", "stool"):  # thighs reach beyond its front edge
         scale[2] = 1.0
     return scale
+
+
+def _seats(held: list[Group], inputs: ProposeInputs) -> list[Proposal]:
+    """Seats, beds and steps; what rests on a piece for several belongs to it."""
+    held.sort(key=lambda group: (_kind_of(group) not in LONG, -group.seconds))
+    taken = set(inputs.known.taken)
+    found: list[Proposal] = []
+    while held:
+        group, *held = held
+        proposal = _proposal(group, taken)
+        under = [other for other in held if _stands_under(proposal.object, other.middle)]
+        if under and proposal.piece in LONG:
+            rests = [rest for part in (group, *under) for rest in part.rests]
+            proposal = _proposal(Group(rests, inputs), taken)
+        held = [other for other in held if not _stands_under(proposal.object, other.middle)]
+        found.append(proposal)
+        taken.add(proposal.object.id)
+    return found
+
+
+def _at_table(table: SceneObject, group: Group, other: Group) -> bool:
+    """Whether hands elsewhere lean on the same table."""
+    level = float((group.heights.median() - other.heights.median()).abs()) < LEVEL / 2
+    return level and bool((beyond(box_of(table), other.middle) < SAME).all())
 
 
 def _stands_under(piece: SceneObject, point: Float[Tensor, "3"]) -> bool:
