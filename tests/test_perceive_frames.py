@@ -12,6 +12,7 @@ from PIL import Image
 
 from mover.core.errors import InputError
 from mover.core.run import Run
+from mover.io.files.cameras import GUESSED
 from mover.perceive.capture import Video, exif_focal, lens_of, perceive
 from mover.perceive.config import CleanConfig, FramesConfig, PerceiveConfig, SteadyConfig
 from mover.perceive.reference import clean_picture, spread_frames
@@ -243,6 +244,7 @@ def test_the_lens_comes_from_the_file_the_angle_or_the_photo(tmp_path: Path):
     assert math.asin(up[2]) == pytest.approx(-0.2)
     at, _ = lens_of((640, 480), file=None, fov=90.0, photo=None)
     assert at.value["fl_x"] == pytest.approx(320)
+    assert at.value["focal_spread"] == GUESSED
     picture = Image.new("RGB", (36, 24))
     exif = picture.getexif()
     exif.get_ifd(0x8769)[0xA405] = 28

@@ -33,7 +33,7 @@ from mover.io.capture.annotations_file import (
 from mover.io.capture.camera_file import camera_of, camera_to_json
 from mover.io.capture.folder import folder_parts
 from mover.io.capture.scene_file import write_hypotheses, write_scene
-from mover.io.files.cameras import GUESSED, of_view, read_camera_file, with_spread
+from mover.io.files.cameras import guessed_view, of_view, read_camera_file, with_spread
 from mover.io.files.fields import At, get, maybe, number, read_json, write_json
 from mover.io.files.images import find_depth_file, read_depth, write_image
 from mover.io.people.keypoints import write_keypoints
@@ -263,7 +263,7 @@ def lens_of(
     if file is not None:
         return _in_pixels_of(size, read_camera_file(file, size)), None
     if fov is not None:
-        return with_spread(of_view(fov, size, "--fov"), GUESSED), None
+        return guessed_view(fov, size), None
     focal = None if photo is None else exif_focal(photo, size)
     if focal is not None:
         w, h = size

@@ -106,7 +106,7 @@ def main() -> None:
     """Run the command that is named first."""
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help"):
-        lines = [f"  {name:<12} {text}" for name, (_, text) in COMMANDS.items()]
+        lines = [f"  {name:<14} {text}" for name, (_, text) in COMMANDS.items()]
         say("\n".join([USAGE, "", "Rooms from the people who move in them.", "", *lines]))
         return
     if arguments[0] == "--version":

@@ -43,7 +43,8 @@ class ImportArgs:
     camera: Path | None = None
     """A calibration: camera.json, transforms of nerfstudio, cam_K.txt, OpenCV's XML, fov.json."""
     fov: Annotated[float, float_in(1, 179)] | None = None
-    """Horizontal field of view, where there is no calibration [degrees]."""
+    """Horizontal field of view, where there is no calibration: a guess, which `run` may mend
+    [degrees]."""
     objects_masks: Path | None = None
     """Masks of the furniture in the reference image."""
     people_masks: Path | None = None
@@ -98,7 +99,7 @@ def _hints(args: ImportArgs, work: Path) -> "Hints":
     """What the options say; a camera of the folder counts where none is given."""
     from mover.io.capture.folder import folder_parts
     from mover.io.capture.parts import Hints
-    from mover.io.files.cameras import of_view, read_camera_file
+    from mover.io.files.cameras import guessed_view, read_camera_file
     from mover.io.files.images import image_size
 
     size = None if args.image is None else image_size(args.image)
@@ -111,7 +112,7 @@ def _hints(args: ImportArgs, work: Path) -> "Hints":
     elif args.fov is not None:
         if size is None:
             raise InputError("--fov: needs the size of the image, expected --image too")
-        camera = of_view(args.fov, size, "--fov")
+        camera = guessed_view(args.fov, size)
     elif old is not None:
         camera = old.camera
     if args.recording and args.recordings:

@@ -105,6 +105,15 @@ def with_spread(at: At, spread: float) -> At:
     return At({**at.value, "focal_spread": spread}, at.file, at.field)
 
 
+def guessed_view(degrees: float, size: tuple[int, int]) -> At:
+    """The camera of `--fov`: somebody's guess of the angle across, which says so.
+
+    Raises:
+        InputError: If the angle is not that of a pinhole camera.
+    """
+    return with_spread(of_view(degrees, size, "--fov"), GUESSED)
+
+
 def read_intrinsics(path: Path) -> NDArray[np.float64]:
     """The 3 x 3 numbers of a text file [fx 0 cx; 0 fy cy; 0 0 1]."""
     try:
