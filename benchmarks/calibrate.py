@@ -7,7 +7,8 @@ rebuilds the rooms with true meshes and with wrong ones (jobs of `mover experime
 the 90 % ranges hold, how wide they are and whether their widths rank with the errors, in each room
 learnt on with what the others teach and in those to check, and with `--write` replaces
 `src/mover/evaluate/calibration.json`. Rooms 0-9 and from 1000 on are for results: nothing is learnt
-on them. `--learn "" --check 1000-1029` tests what the package holds on the held-out rooms.
+on them. `--learn "" --check 1000-1029` tests what the package holds on the held-out rooms, and
+`--sets upstream` on the inputs of today's tools.
 """
 
 import argparse
@@ -48,7 +49,7 @@ from mover_bench.studies.queue import open_jobs, run_all, start
 from mover_bench.studies.run import parse_seeds
 from mover_bench.studies.sets import set_named
 
-USED = ("rooms", "wrong-shape")  # true meshes, and meshes of other pieces
+USED = ("rooms", "wrong-shape")  # true meshes, and meshes of other pieces; all have one truth
 HEAD = (
     "| | values | held by 90 % ranges | median width | best constant width | Spearman |",
     "| --- | --: | --: | --: | --: | --: |",
@@ -59,8 +60,9 @@ ASSET = Path(__file__).parents[1] / "src" / "mover" / "evaluate" / "calibration.
 def judged(facts: tuple[Facts, ...], result: Scene, truth: Scene) -> Judged:
     """The true unknowns beside the stated ones: each scene in its own upright world."""
     true = {piece.id: piece for piece in truth.objects}
-    rows = [_row(f, p, true[p.id]) for f, p in zip(facts, result.objects, strict=True)]
-    return Judged(facts, torch.stack(rows))
+    pairs = [(f, p) for f, p in zip(facts, result.objects, strict=True) if p.id in true]
+    rows = [_row(f, p, true[p.id]) for f, p in pairs]  # others were invented
+    return Judged(tuple(f for f, _ in pairs), torch.stack(rows))
 
 
 def _row(facts: Facts, ours: SceneObject, true: SceneObject) -> Float[Tensor, "7"]:
@@ -95,17 +97,19 @@ def _line(kind: str, told: tuple[Explanation, ...], truth: Float[Tensor, "object
     return "| " + " | ".join(map(str, cells)) + f" | {rank:.2f} |"
 
 
-def finished(seeds: tuple[int, ...], asked: ExperimentArgs) -> list[list[Judged]]:
+def finished(
+    seeds: tuple[int, ...], asked: ExperimentArgs, sets: Sequence[str]
+) -> list[list[Judged]]:
     """The judged rooms of each set, seed by seed; jobs that are not finished are done first."""
     (preset,) = asked.presets
     workers = asked.workers or os.cpu_count() or 1
-    jobs = [Job(n, s, job, asked.out) for s in seeds for n in USED for job in (ROOM, preset)]
+    jobs = [Job(n, s, job, asked.out) for s in seeds for n in sets for job in (ROOM, preset)]
     for job in run_all(open_jobs(jobs, asked.keep), workers, start, store=False):
         print(f"{job.rooms} {job.seed}: {job.name}", file=sys.stderr)
     with ProcessPoolExecutor(workers) as pool:
         truths = list(pool.map(truth_of, seeds))
     pairs = list(zip(seeds, truths, strict=True))
-    return [[of_job(Job(n, s, preset, asked.out), truth) for n in USED] for s, truth in pairs]
+    return [[of_job(Job(n, s, preset, asked.out), truth) for n in sets] for s, truth in pairs]
 
 
 def truth_of(seed: int) -> Scene:
@@ -120,13 +124,15 @@ def of_job(job: Job, truth: Scene) -> Judged:
     return judged(rebuilt.facts, rebuilt.full, truth)
 
 
-def tables(groups: list[list[Judged]], calibrations: Sequence[Calibration]) -> str:
+def tables(
+    groups: list[list[Judged]], calibrations: Sequence[Calibration], sets: Sequence[str]
+) -> str:
     """A table for each set, and one for all; each seed with a calibration."""
     parts: list[str] = []
-    for k, name in enumerate(USED):
+    for k, name in enumerate(sets):
         parts += [f"## {name}", table([group[k] for group in groups], calibrations)]
     flat = [room for group in groups for room in group]
-    parts += ["## Both", table(flat, [c for c in calibrations for _ in USED])]
+    parts += ["## All", table(flat, [c for c in calibrations for _ in sets])]
     return "\n\n".join(parts)
 
 
@@ -144,6 +150,7 @@ def main() -> None:
     parser.add_argument("--learn", default="100-117", help="rooms to learn on; '' takes the asset")
     parser.add_argument("--check", default="", help="rooms to test on")
     parser.add_argument("--preset", default="robust")
+    parser.add_argument("--sets", nargs="+", default=list(USED), help="of the same rooms")
     parser.add_argument("--out", type=Path, default=Path("experiments"))
     parser.add_argument("--workers", type=int, default=0)
     parser.add_argument("--keep", action="store_true", help="take what other versions finished")
@@ -153,16 +160,16 @@ def main() -> None:
     form = PRESETS[args.preset].place.form
     calibration = calibration_of(form)
     if args.learn:
-        groups = finished(learnable(args.learn), asked)
+        groups = finished(learnable(args.learn), asked, args.sets)
         calibration = learn([room for group in groups for room in group])
         print(f"learnt on {args.learn}: {calibration}")
         if len(groups) > 2:
             print(f"each of {args.learn} tested with what the others teach")
-            print(tables(groups, in_turn(groups)))
+            print(tables(groups, in_turn(groups), args.sets))
     if args.check:
         print(f"\ntested on {args.check}")
-        groups = finished(parse_seeds(args.check), asked)
-        print(tables(groups, [calibration] * len(groups)))
+        groups = finished(parse_seeds(args.check), asked, args.sets)
+        print(tables(groups, [calibration] * len(groups), args.sets))
     if args.write:
         write(form, calibration, args.learn)
 

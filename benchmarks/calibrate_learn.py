@@ -43,6 +43,8 @@ class Cases:
     """Variances that the kind's factor multiplies; above zero."""
     rest: Float[Tensor, " cases"]
     """Variances by the camera."""
+    whole: Float[Tensor, " cases"]
+    """Variances by scale and lens of the room, which have no factor."""
     errors: Float[Tensor, " cases"]
     """To the nearest of the result and its likely alternatives."""
     growth: Float[Tensor, " cases"]
@@ -76,12 +78,13 @@ def learn(rooms: list[Judged]) -> Calibration:
 
 
 def _unlikely(cases: Cases, camera: float, power: float) -> float:
-    return surprise(cases.grown(power).own, camera**2 * cases.rest, cases.errors)
+    rest = camera**2 * cases.rest + cases.whole
+    return surprise(cases.grown(power).own, rest, cases.errors)
 
 
 def _factor(cases: Cases, camera: float) -> float:
     """The factor with which the ranges of these cases hold; that of the camera is settled."""
-    square = (cases.errors / NORMAL).square() - camera**2 * cases.rest
+    square = (cases.errors / NORMAL).square() - camera**2 * cases.rest - cases.whole
     return learn_factor((square.clamp_min(0) / cases.own).sqrt().tolist(), LEVEL)
 
 
@@ -90,15 +93,18 @@ def cases_of(told: list[tuple[Explanation, Float[Tensor, "7"]]], kind: str) -> C
 
     The doubt of a height is all the camera's, and counts as its own.
     """
-    rows: list[tuple[float, float, float, float]] = []
+    rows: list[tuple[float, ...]] = []
     for e, truth in told:
         for way in ways_of(e.facts.place)[[k == kind for k in KIND_OF]]:
-            own, tilt = (float(way @ c @ way) for c in (e.facts.covariance, e.facts.tilt))
+            whole = torch.zeros_like(e.facts.tilt) if e.facts.whole is None else e.facts.whole
+            parts = (e.facts.covariance, e.facts.tilt, whole)
+            own, tilt, both = (float(way @ c @ way) for c in parts)
             if kind == "height":
                 own, tilt = own + tilt, 0.0
             if own > 0:
-                rows.append((own, tilt, min(offs(e, way, truth)), growth(e.facts.overlap)))
-    return Cases(*torch.tensor(rows, dtype=torch.float64).reshape(-1, 4).unbind(-1))
+                error = min(offs(e, way, truth))
+                rows.append((own, tilt, both, error, growth(e.facts.overlap)))
+    return Cases(*torch.tensor(rows, dtype=torch.float64).reshape(-1, 5).unbind(-1))
 
 
 def _nearest(facts: Facts, truth: Float[Tensor, "7"]) -> int:

@@ -55,6 +55,7 @@ from mover.stages.explain.spread import (
     UNKNOWN,
     bend_at,
     by_tilt,
+    by_whole,
     heat_of,
     measured,
     moves_without,
@@ -173,6 +174,20 @@ class TestCurvature:
             slope = (ends[0] - ends[1]) / 2e-5
             expected += variance * slope[:, :, None] * slope[:, None, :]
         close(found[:, :3, :3], expected, rtol=1e-5)
+
+    def test_the_doubt_of_scale_and_lens_moves_the_whole_room(self):
+        base = torch.tensor([[0.4, -1.4, -3.0], [-1.0, -1.4, -4.5]], dtype=torch.float64)
+        rows = torch.cat([base, torch.zeros(2, 4, dtype=torch.float64)], -1)
+        here = replace(camera(), R_cam_world=tilted(*torch.tensor([0.0, 0.0]).double()))
+        larger = by_whole(unvector(rows), here, 0.02, 0.0)
+        grown = torch.cat([base, torch.zeros(2, 1), torch.ones(2, 3)], -1)
+        close(larger, 0.02**2 * grown[:, :, None] * grown[:, None, :], rtol=1e-6)
+        longer = by_whole(unvector(rows), here, 0.0, 0.03)
+        away = torch.zeros(2, 7, dtype=torch.float64)
+        away[:, 2] = base[:, 2]  # a level camera looks along -z: the picture stays, depths grow
+        close(longer, 0.03**2 * away[:, :, None] * away[:, None, :], rtol=1e-6)
+        both = by_whole(unvector(rows), here, 0.02, 0.03)
+        close(both, larger + longer, rtol=1e-6)
 
 
 class TestOthers:

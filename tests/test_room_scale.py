@@ -38,19 +38,21 @@ def test_furniture_tells_how_large_the_room_is(large: float) -> None:
     off = error + 0.08 * torch.randn(count, 3, generator=generator)
     found = Layout(true.t_world_object * large, true.yaw, math.log(large) - off)
     given = gather_given(objects, start, found, torch.full((count,), 0.1))
-    scale = common_scale(found, given, ScaleKnown(0.055))
+    scale, spread = common_scale(found, given, ScaleKnown(0.055))
     assert abs(scale - math.log(large)) < 0.03
-    assert common_scale(found, given, ScaleKnown(0.0)) == 0
-    assert abs(common_scale(found, given, ScaleKnown(0.005))) < 0.006
-    same, less, none = (
+    assert 0.01 < spread < 0.03
+    assert common_scale(found, given, ScaleKnown(0.0)) == (0, 0)
+    assert abs(common_scale(found, given, ScaleKnown(0.005))[0]) < 0.006
+    (same, near), (less, far), (none, nothing) = (
         common_scale(found, given, ScaleKnown(0.055, off)) for off in (0.01, 0.04, 5.0)
     )
+    assert spread < near < far < nothing == pytest.approx(0.055, rel=0.02)
     assert same == pytest.approx(scale, abs=0.005)
     assert abs(none) < 1e-3
     assert min(0.0, scale) <= less <= max(0.0, scale)  # what was given may be off together
     metres = Layout(found.t_world_object.clone(), found.yaw, found.log_scale)
     metres.t_world_object[0] *= 1.8
-    assert abs(common_scale(metres, given, ScaleKnown(0.055)) - scale) < 0.015
+    assert abs(common_scale(metres, given, ScaleKnown(0.055))[0] - scale) < 0.015
 
 
 def test_what_sizes_cost_is_the_least_squares_of_all_that_is_said_of_them() -> None:
@@ -98,7 +100,7 @@ def test_who_sits_as_high_as_people_do_tells_their_size(large: float) -> None:
     layout = somewhere(1)
     given = gather_given(boxes_of(("aquarium",), [(1.0, 1.0, 1.0)]), layout, layout, torch.ones(1))
     told = [
-        common_scale(layout, given, ScaleKnown(0.055, seats=seats))
+        common_scale(layout, given, ScaleKnown(0.055, seats=seats))[0]
         for seats in (None, (0.05, 0.06), (0.05, 0.001))
     ]
     assert told[0] == pytest.approx(0, abs=1e-3)

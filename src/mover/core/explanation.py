@@ -110,6 +110,8 @@ class Facts:
     support: str
     """`ground`, `free`, or the id of the object that carries it."""
     pinned: bool
+    whole: Float[Tensor, "7 7"] | None = None
+    """What the doubt about the scale of the room and about its lens adds; None: both are known."""
 
 
 @record

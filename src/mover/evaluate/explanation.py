@@ -209,13 +209,15 @@ def ways_of(place: Float[Tensor, "7"]) -> Float[Tensor, "7 7"]:
 def calibrated(facts: Facts, calibration: Calibration) -> Float[Tensor, "7 7"]:
     """The covariance with one factor on the spread of each kind, and the camera's with its own.
 
-    Spreads grow with a power of the misfit of an object's silhouette.
+    Spreads grow with a power of the misfit of an object's silhouette. What is not known of scale
+    and lens is stated where it is found, and counts as it is.
     """
     known, ways, grown = calibration.factors, ways_of(facts.place), growth(facts.overlap)
     own = {kind: known[kind] * grown ** calibration.powers.get(kind, 0.0) for kind in KIND_OF}
     factor = _along(ways, [own[kind] for kind in KIND_OF])
     tilt = _along(ways, [known["roll" if k == "sideways" else "height"] for k in KIND_OF])
-    return factor @ facts.covariance @ factor.mT + tilt @ facts.tilt @ tilt.mT
+    found = factor @ facts.covariance @ factor.mT + tilt @ facts.tilt @ tilt.mT
+    return found if facts.whole is None else found + facts.whole
 
 
 def _along(ways: Float[Tensor, "7 7"], factors: list[float]) -> Float[Tensor, "7 7"]:

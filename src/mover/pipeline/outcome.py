@@ -101,6 +101,8 @@ class SceneState:
     contacts: ContactAssignment | None = None
     priced: tuple[PlaceInputs, PlaceConfig] | None = None
     """What the last descent minimised; None: nothing is explained."""
+    scale_spread: float = 0.0
+    """Standard deviation of the logarithm of the room's scale; 0: it is known."""
 
 
 def as_given(context: ReconstructionContext, camera: Camera) -> Layout:
@@ -277,7 +279,8 @@ def explanations_of(
     bodies = None if people is None else in_world(rows_of(people.bodies, people.kept), state.camera)
     pairs = None if state.contacts is None else state.contacts.pairs
     tilt = None if people is None else people.alignment.covariance
-    asked = ExplainInputs(inputs, config, state.placed, bodies, pairs, tilt)
+    whole = state.scale_spread, context.capture.focal_spread or 0.0
+    asked = ExplainInputs(inputs, config, state.placed, bodies, pairs, tilt, *whole)
     found = context.run.stage(explain_placements, asked, context.config.explain)
     return explain(found.facts, calibration_of(config.form))
 

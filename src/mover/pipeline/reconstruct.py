@@ -296,12 +296,14 @@ def with_common_scale(
     floor = floor_now(context, state)
     seats = seats_tell(kept, people.parts, floor) if context.config.seat_heights else None
     known = ScaleKnown(spread, shared, seats)
-    factor = math.exp(-common_scale(state.placed.layout, given, known))
+    scale, left = common_scale(state.placed.layout, given, known)
+    factor = math.exp(-scale)
     bodies = nearer(people.bodies, state.camera, state.ground, factor)
     layouts = (state.start, state.alone, state.placed.layout, state.placed.candidates)
     start, single, layout, candidates = (larger(x, factor) for x in layouts)
     placed = replace(state.placed, layout=layout, candidates=candidates)
     state = replace(state, ground=factor * state.ground, start=start, alone=single, placed=placed)
+    state = replace(state, scale_spread=left)
     return replace(people, bodies=bodies, path=scaled(people.path, factor)), state
 
 

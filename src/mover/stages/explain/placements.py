@@ -26,6 +26,7 @@ from mover.stages.explain.spread import (
     Bend,
     bend_at,
     by_tilt,
+    by_whole,
     heat_of,
     measured,
     moves_without,
@@ -102,6 +103,10 @@ class ExplainInputs:
     """Body, object and part of every touch."""
     tilt: Float[Tensor, "3 3"] | None
     """Covariance of the camera's pitch and roll [rad] and of the floor [m]."""
+    scale: float = 0.0
+    """Standard deviation of the logarithm of the room's scale; 0: it is known."""
+    focal: float = 0.0
+    """The same of the focal length."""
 
 
 @record
@@ -131,6 +136,7 @@ def explain_placements(
         "place": vector(placed.layout).double(),
         "covariance": covariance,
         "tilt": _tilted(inputs, free),
+        "whole": _whole(inputs, free),
         "pulls": _pulls(bend, free, covariance, placed.layout),
         "alternatives": others_of(placed, priced.reference, weight, energy),
         "support": list(support_names(objects)),
@@ -156,6 +162,15 @@ def _tilted(inputs: ExplainInputs, free: Tensor) -> Float[Tensor, "objects 7 7"]
     tilt = torch.zeros(3, 3) if inputs.tilt is None else inputs.tilt
     standing = (priced.objects.supports != FREE) & free[:, 0]
     return by_tilt(layout, priced.camera, priced.ground, tilt) * standing[:, None, None]
+
+
+def _whole(inputs: ExplainInputs, free: Tensor) -> Sequence[Tensor | None]:
+    """What the doubt about scale and lens does to all that is not pinned."""
+    if not (inputs.scale or inputs.focal):
+        return [None] * len(free)
+    camera, layout = inputs.priced.camera, inputs.placed.layout
+    added = by_whole(layout, camera, inputs.scale, inputs.focal)
+    return list(added * free[:, 0, None, None])
 
 
 def _evidence(inputs: ExplainInputs) -> dict[str, Sequence[Any]]:

@@ -180,3 +180,26 @@ def by_tilt(
     added = torch.zeros(len(base), 7, 7, dtype=torch.float64)
     added[:, :3, :3] = slope @ tilt.double() @ slope.mT
     return added
+
+
+def by_whole(
+    layout: Layout, camera: Camera, scale: float, focal: float
+) -> Float[Tensor, "objects 7 7"]:
+    """What the doubt about the scale of the whole room and about its lens adds.
+
+    With the scale all places and sizes grow. With the lens all depths do, and nothing else, since
+    the picture stays; pitch and floor are found anew, so that what stands stays on the floor.
+
+    Args:
+        layout: Where the objects stand.
+        camera: That sees them.
+        scale: Standard deviation of the logarithm of the scale.
+        focal: The same of the focal length.
+    """
+    base, axis = layout.t_world_object.double(), camera.R_cam_world.double()[2]
+    larger, deeper = (torch.zeros(len(base), 7, dtype=torch.float64) for _ in range(2))
+    larger[:, :3], larger[:, 4:] = base, 1
+    deeper[:, :3] = (base @ axis)[:, None] * axis
+    deeper[:, 1] = 0
+    slopes = torch.stack([scale * larger, focal * deeper], -1)
+    return slopes @ slopes.mT

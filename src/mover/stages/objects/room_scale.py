@@ -42,8 +42,8 @@ class ScaleKnown:
     """Logarithm of how much too high people sit, and its standard deviation."""
 
 
-def common_scale(layout: Layout, given: Given, known: ScaleKnown) -> float:
-    """Logarithm of how much too large the whole room is.
+def common_scale(layout: Layout, given: Given, known: ScaleKnown) -> tuple[float, float]:
+    """Logarithm of how much too large the whole room is, and its standard deviation.
 
     Args:
         layout: Where the objects were placed under the people's scale.
@@ -52,7 +52,7 @@ def common_scale(layout: Layout, given: Given, known: ScaleKnown) -> float:
     """
     spread, shared = known.spread, known.shared
     if spread <= 0:
-        return 0.0
+        return 0.0, 0.0
     tried = torch.linspace(-3 * spread, 3 * spread, TRIED, dtype=torch.float64)
     if shared:
         wide = torch.linspace(-3, 3, TRIED, dtype=torch.float64) * (spread + shared)
@@ -64,7 +64,8 @@ def common_scale(layout: Layout, given: Given, known: ScaleKnown) -> float:
     if known.seats is not None:
         total = total + 0.5 * ((tried - known.seats[0]) / known.seats[1]).square()
     weight = (total.min() - total).exp()
-    return float((weight * tried).sum() / weight.sum())
+    mean = float((weight * tried).sum() / weight.sum())
+    return mean, float((weight * (tried - mean).square()).sum() / weight.sum()) ** 0.5
 
 
 def _cost_of_scales(
