@@ -124,6 +124,8 @@ def rows_of(value: T, rows: Tensor, *axes: str) -> T:
             }
         elif isinstance(part, tuple) and all(isinstance(one, bytes) for one in part) and part:
             found[field.name] = tuple(part[row] for row in index.tolist())
+        elif isinstance(part, tuple) and all(dataclasses.is_dataclass(one) for one in part):
+            found[field.name] = tuple(rows_of(one, index, *axes) for one in part)
         elif dataclasses.is_dataclass(part):
             found[field.name] = rows_of(part, index, *axes)
     return dataclasses.replace(typing.cast(Any, value), **found)

@@ -25,6 +25,7 @@ from mover.core.types import (
     Scene,
     SceneObject,
 )
+from mover.energy.objective import FurtherView
 from mover.energy.terms.feet import FootContacts
 from mover.evaluate.calibration import calibration_of
 from mover.evaluate.explanation import explain
@@ -99,6 +100,8 @@ class SceneState:
     """Where the image alone places the objects."""
     cues: Cues | None = None
     contacts: ContactAssignment | None = None
+    views: tuple[FurtherView, ...] = ()
+    """Further frames of a moving camera."""
     priced: tuple[PlaceInputs, PlaceConfig] | None = None
     """What the last descent minimised; None: nothing is explained."""
     scale_spread: float = 0.0

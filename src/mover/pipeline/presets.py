@@ -165,7 +165,7 @@ ROBUST = Config(
         num_hypotheses=6, coarse=2, perturbations=4, perturbation_rounds=2, wall_alignment_steps=2,
         yaw_prior_weight=1.0,
     ),
-    refine=RefineConfig(rounds=1),
+    refine=RefineConfig(rounds=1, views=4, apart=0.15),
     sizes=SpreadConfig(0.05),
     shape="bend",
     gather=GatherConfig(erode=1, reach=0.1),

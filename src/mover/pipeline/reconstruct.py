@@ -18,10 +18,11 @@ from mover.core.types import Camera, Capture, Layout, Room
 from mover.energy.config import SceneConfig, only
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, ImageCues
-from mover.geometry.path import is_still, poses_at, scaled
+from mover.geometry.path import scaled
 from mover.geometry.placement import larger
 from mover.geometry.warp_start import threads
 from mover.io.capture.plausible import check_plausible
+from mover.pipeline.further_views import further_views, larger_views, with_views
 from mover.pipeline.moves import Solving, with_moves
 from mover.pipeline.outcome import (
     PeopleState,
@@ -49,7 +50,7 @@ from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
 from mover.pipeline.presets import with_sizes
 from mover.pipeline.proposals import tops_of, with_proposals
-from mover.stages.camera.refine_camera import FurtherView, RefineInputs, refine_camera
+from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
 from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import cues_in_windows, gather_cues
@@ -58,7 +59,6 @@ from mover.stages.contacts.resting import NOTHING
 from mover.stages.objects.bend_shapes import BendInputs, bend_shapes, with_shapes
 from mover.stages.objects.find_image_cues import (
     ImageInputs,
-    evidence_at,
     find_image_cues,
     ground_without_people,
     image_evidence,
@@ -202,7 +202,8 @@ def placed_by_image(
     )
     placed = context.run.stage(place_objects, inputs, searching)
     found = SceneState(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
-    return replace(found, priced=(with_walls(inputs, placed.walls), searching))
+    views = () if before is None else before.views
+    return replace(found, priced=(with_walls(inputs, placed.walls), searching), views=views)
 
 
 def with_given(
@@ -275,13 +276,14 @@ def with_refined_camera(
     """Camera and ground refined with the objects, and the objects placed anew under them."""
     cues = context.run.stage(find_image_cues, state.image, context.config.image)
     spread, objects = people.alignment.covariance, context.prepared.objects
-    views = further_views(context, people, state.camera)
+    views = state.views or further_views(context, people, state.camera)
     inputs = RefineInputs(
         state.camera, state.ground, spread, objects, cues, state.placed.layout, views
     )
     better = context.run.stage(refine_camera, inputs, context.config.refine)
     found = placed_by_image(context, better.camera, better.ground, state)
-    return replace(found, traces={**state.traces, "camera": better.trace, **found.traces})
+    traces = {**state.traces, "camera": better.trace, **found.traces}
+    return replace(found, traces=traces, views=better.views)
 
 
 def with_common_scale(
@@ -302,7 +304,10 @@ def with_common_scale(
     layouts = (state.start, state.alone, state.placed.layout, state.placed.candidates)
     start, single, layout, candidates = (larger(x, factor) for x in layouts)
     placed = replace(state.placed, layout=layout, candidates=candidates)
-    state = replace(state, ground=factor * state.ground, start=start, alone=single, placed=placed)
+    state = replace(
+        state, ground=factor * state.ground, start=start, alone=single, placed=placed,
+        views=larger_views(state.views, factor),
+    )  # fmt: skip
     state = replace(state, scale_spread=left)
     return replace(people, bodies=bodies, path=scaled(people.path, factor)), state
 
@@ -353,6 +358,7 @@ def placed_with_people(
         image = replace(image, trust=inlier_weights(image_energy))
         if image.given is not None and not are_shapeless(people.bodies):
             image = replace(image, given=lighter_where_used(image.given, image.trust, contacts))
+    image = with_views(image, state.views)
     seats = ReinitInputs(objects, state.camera, humans, image.masks, state.placed.layout)
     starts = alone(run.stage(by_release, seats, config.reinit))
     if config.layout.num_hypotheses > 1:
@@ -373,28 +379,3 @@ def placed_with_people(
 
 def _pinned(context: ReconstructionContext, start: Layout) -> Pinned | None:
     return Pinned(is_pinned(context), start) if context.pinned else None
-
-
-def further_views(
-    context: ReconstructionContext, people: PeopleState, camera: Camera
-) -> tuple[FurtherView, ...]:
-    """The frames from which the camera saw the objects from elsewhere, the farthest first."""
-    capture, config = context.capture, context.config
-    if is_still(people.path) or capture.furniture is None:
-        return ()
-    poses = poses_at(people.path, capture.furniture.frame.unique())
-    chosen = [torch.zeros(3)]
-    found: list[FurtherView] = []
-    for _ in range(config.refine.views):
-        away = torch.cdist(poses.t_reference_camera, torch.stack(chosen)).amin(1)
-        best = int(away.argmax())
-        if float(away[best]) < config.refine.apart:
-            break
-        chosen.append(poses.t_reference_camera[best])
-        seen = evidence_at(capture, int(poses.frame[best]))
-        unordered = torch.zeros(len(seen.boxes), len(seen.boxes), dtype=torch.bool)
-        image = ImageInputs(camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered)
-        cues = context.run.stage(find_image_cues, image, config.image)
-        R, t = poses.R_reference_camera[best], poses.t_reference_camera[best]
-        found.append(FurtherView(R, t, cues))
-    return tuple(found)

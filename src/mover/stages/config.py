@@ -240,6 +240,12 @@ class RefineConfig:
     """Of a moving camera, so many further frames with masks of the furniture count at most..."""
     apart: Metres = 0.2
     """... each seen from so far from all others."""
+    turn: Annotated[float, float_in(0, 90)] = 0.15
+    """How far their directions may be off [degrees]..."""
+    shift: Metres = 0.015
+    """... and their places [m]."""
+    path: Weight = 0.3
+    """Weight w_p of such errors."""
 
 
 @dataclass(frozen=True)

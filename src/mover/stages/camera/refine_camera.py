@@ -1,4 +1,4 @@
-"""Refine camera and ground together with the objects that stand on it.
+r"""Refine camera and ground together with the objects that stand on it.
 
 Ours, not the paper's, which freezes the camera after the feet: one degree of pitch or 2 cm of
 ground is 5-15 cm of depth at 5 m, because an object stands where the ray to its base meets the
@@ -12,8 +12,14 @@ d is the change of pitch, roll and ground, C their covariance from the feet: a f
 walked all around outweighs the objects, and what no foot told is left to them. The borders of the
 masks are held as they suit the objects at first (`fixed_borders`). An object is carried by the
 ray to the centre of its base, so a change of the camera leaves it where it is in the image.
+
+Of a moving camera further frames with masks of the furniture (views) count, too, all together as
+much as the reference image. Where they were seen from is known to a tenth of a degree and some
+millimetres only, which furniture would otherwise take for its own place: small turns and shifts of
+theirs are found together with all else, at the price  w_p/2 \sum |pose / sigma|^2.
 """
 
+import math
 from dataclasses import replace
 
 import torch
@@ -27,9 +33,17 @@ from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights, only
 from mover.energy.fused.energy import EnergyOf, energy_function, never_asks
 from mover.energy.minimize import minimize
-from mover.energy.objective import HumanCues, ImageCues, best_borders
+from mover.energy.objective import (
+    FurtherView,
+    HumanCues,
+    ImageCues,
+    best_borders,
+    from_view,
+    shares_of,
+)
 from mover.geometry.camera import pitch_roll, tilted, to_camera
 from mover.geometry.placement import GROUND, LOWEST, hit_floor
+from mover.geometry.rotations import axis_angle
 from mover.stages.config import RefineConfig
 
 # Masks whose border has been found: evidence without that freedom.
@@ -65,16 +79,6 @@ UNITS = (
 
 
 @record
-class FurtherView:
-    """Objects as the moving camera saw them in another frame."""
-
-    R_reference_camera: Float[Tensor, "3 3"]
-    t_reference_camera: Float[Tensor, "3"]
-    """[m]"""
-    image: ImageCues
-
-
-@record
 class RefineInputs:
     """Camera and ground from the feet, objects from the image alone."""
 
@@ -96,6 +100,8 @@ class Refined:
     camera: Camera
     ground: float
     trace: Float[Tensor, " steps"]
+    views: tuple[FurtherView, ...] = ()
+    """From where the furniture says that they were seen."""
 
 
 @record
@@ -104,6 +110,8 @@ class _Joint:
     rays: Float[Tensor, "objects 2"]
     yaw: Float[Tensor, " objects"]
     log_scale: Float[Tensor, "objects 3"]
+    poses: Float[Tensor, "views 6"]
+    """Turns [rad] and shifts [m] of the further views."""
 
 
 def refine_camera(
@@ -120,26 +128,29 @@ def refine_camera(
 
     def energies(joint: _Joint) -> tuple[Tensor, Tensor]:
         camera, layout = _unpack(joint, inputs)
-        return seen(layout, camera.R_cam_world).per_item, _in_views(camera, layout, views)
+        elsewhere = _in_views(camera, layout, views, joint.poses)
+        return seen(layout, camera.R_cam_world).per_item, elsewhere
 
     with torch.no_grad():
         own = energies(fixed)[0] + SOFT
 
     def energy(free: _Joint) -> Energy:
-        joint = _shift(fixed, free)
+        joint = _shift(fixed, free, config)
         here, elsewhere = energies(joint)
         terms = (here + elsewhere) / own
         off = joint.tilt - fixed.tilt
         feet = 0.5 * config.feet * (off @ certainty @ off)
-        return Energy({"objects": (terms * usable).sum(), "feet": feet})
+        path = 0.5 * config.path * free.poses.square().sum()
+        return Energy({"objects": (terms * usable).sum(), "feet": feet, "path": path})
 
     if not bool(usable.any()):
-        return Refined(inputs.camera, inputs.ground, torch.zeros(0))
+        return Refined(inputs.camera, inputs.ground, torch.zeros(0), inputs.views)
     still = never_asks(inputs.objects)
     found = minimize(energy, zero, config.method, observe, "refine_camera", still=still)
-    joint = _shift(fixed, found.at)
+    joint = _shift(fixed, found.at, config)
     camera, _ = _unpack(joint, inputs)
-    return Refined(camera, float(joint.tilt[2]), found.trace)
+    aligned = (moved_view(*one) for one in zip(inputs.views, joint.poses, strict=True))
+    return Refined(camera, float(joint.tilt[2]), found.trace, tuple(aligned))
 
 
 def _seen_terms(config: RefineConfig) -> SceneConfig:
@@ -148,22 +159,27 @@ def _seen_terms(config: RefineConfig) -> SceneConfig:
     return SceneConfig(weights, "robust", config.uniform_scale_weight)
 
 
-def _from_view(camera: Camera, layout: Layout, view: FurtherView) -> tuple[Camera, Layout]:
-    """The camera of a view and the objects in a world about it, with the reference's axes."""
-    R = view.R_reference_camera.mT @ camera.R_cam_world
-    centre = camera.R_cam_world.mT @ view.t_reference_camera
-    there = replace(layout, t_world_object=layout.t_world_object - centre)
-    return Camera(camera.K, R, camera.width, camera.height), there
+def moved_view(view: FurtherView, pose: Float[Tensor, "6"]) -> FurtherView:
+    """The view from a camera turned about its own axes [rad] and shifted [m]."""
+    return replace(
+        view,
+        R_reference_camera=view.R_reference_camera @ axis_angle(pose[:3]),
+        t_reference_camera=view.t_reference_camera + pose[3:],
+    )
 
 
 def _in_views(
-    camera: Camera, layout: Layout, views: list[tuple[FurtherView, EnergyOf]]
+    camera: Camera,
+    layout: Layout,
+    views: list[tuple[FurtherView, EnergyOf]],
+    poses: Float[Tensor, "views 6"],
 ) -> Float[Tensor, " objects"]:
     """The mean energy of each object in the further views; zero where there are none."""
     whole = torch.zeros_like(layout.yaw)
-    for view, seen in views:  # few, and each has windows of its own
-        there, moved = _from_view(camera, layout, view)
-        whole = whole + seen(moved, there.R_cam_world).per_item / len(views)
+    shares = shares_of(tuple(view for view, _ in views)) if views else poses
+    for (view, seen), share, pose in zip(views, shares, poses, strict=True):  # few
+        there, moved = from_view(camera, layout, moved_view(view, pose))
+        whole = whole + share * seen(moved, there.R_cam_world).per_item
     return whole
 
 
@@ -171,7 +187,7 @@ def _views(inputs: RefineInputs, config: RefineConfig) -> list[tuple[FurtherView
     """The further views, by masks whose borders suit the objects as they stand."""
     found: list[tuple[FurtherView, EnergyOf]] = []
     for view in inputs.views:
-        camera, layout = _from_view(inputs.camera, inputs.layout, view)
+        camera, layout = from_view(inputs.camera, inputs.layout, view)
         image = fixed_borders(view.image, layout, inputs.objects, camera, config.weights)
         known = inputs.objects, camera, image, HumanCues()
         found.append((view, energy_function(*known, _seen_terms(config))))
@@ -183,7 +199,8 @@ def _start(inputs: RefineInputs) -> _Joint:
     rays = base[:, :2] / base[:, 2:].clamp_min(0.1)
     pitch, roll = pitch_roll(inputs.camera.R_cam_world)
     tilt = torch.stack([pitch, roll, pitch.new_tensor(inputs.ground)])
-    return _Joint(tilt, rays, inputs.layout.yaw, inputs.layout.log_scale)
+    poses = tilt.new_zeros(len(inputs.views), 6)
+    return _Joint(tilt, rays, inputs.layout.yaw, inputs.layout.log_scale, poses)
 
 
 def _usable(inputs: RefineInputs) -> Float[Tensor, " objects"]:
@@ -195,13 +212,16 @@ def _usable(inputs: RefineInputs) -> Float[Tensor, " objects"]:
     return ((inputs.objects.supports == GROUND) & low & ahead & seen).to(t)
 
 
-def _shift(fixed: _Joint, free: _Joint) -> _Joint:
+def _shift(fixed: _Joint, free: _Joint, config: RefineConfig) -> _Joint:
     units = constant(UNITS, fixed.tilt)
+    turn, shift = math.radians(config.turn), config.shift
+    steps = constant((turn,) * 3 + (shift,) * 3, fixed.tilt)
     return _Joint(
         fixed.tilt + free.tilt * units[:3],
         fixed.rays + free.rays * units[3],
         fixed.yaw + free.yaw * units[4],
         fixed.log_scale + free.log_scale * units[5],
+        fixed.poses + free.poses * steps,
     )
 
 
