@@ -238,7 +238,7 @@ def test_presets_that_measure_something_else_have_rows_without_places() -> None:
     assert found[["iou3d", "yaw_error"]].isna().all(axis=None)
     done = Finished(rows, rows.assign(name="stands"))
     experiment = tables.Experiment("mover", "rooms", ("stands",), (0,), done, {})
-    assert len(worst_objects(experiment)) == 0
+    assert len(worst_objects(experiment, 3)) == 0
 
 
 def test_stage_1_and_full_share_camera_and_ground(finished) -> None:

@@ -25,6 +25,8 @@ class ExperimentArgs:
     """Where the rooms come from."""
     keep: bool = False
     """Take finished jobs of other versions or settings of the program as they are."""
+    worst: Annotated[int, int_in(0, 1000)] = 3
+    """How many of the worst objects are drawn."""
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def run_experiment(
     command = command_of(Source(args.set, args.presets), args.seeds)
     experiment = Experiment(command, args.set, presets, seeds, found, failures)
     folder = args.out / args.set
-    pictures = draw_worst(experiment, args.set, args.out)
+    pictures = draw_worst(experiment, args.set, args.out, args.worst)
     return write_tables(experiment, pictures, folder)
 
 
@@ -91,7 +91,6 @@ def _check(args: ExperimentArgs) -> None:
 # Pictures of the objects that came out worst: in the image and from above.
 
 
-WORST = 3  # so many pictures
 SIDE = 4.2  # [inch] of a panel
 WIDEST = 1600  # [px] of a whole overlay
 MARGIN = 0.3  # around an object, as a share of its size in the image
@@ -100,7 +99,7 @@ COLOURS = {"before": "#7878be", "truth": "#1e783c", "after": "#c83c32"}
 BASE = (0, 4, 5, 1)  # corners of a box around its bottom, the last two at its front
 
 
-def worst_objects(experiment: Experiment, count: int = WORST) -> Frame:
+def worst_objects(experiment: Experiment, count: int) -> Frame:
     """The objects of the last preset with the lowest IoU3D after the full method.
 
     None where the preset is one that measures something else of them.
@@ -112,14 +111,14 @@ def worst_objects(experiment: Experiment, count: int = WORST) -> Frame:
     return rows.sort_values(["iou3d", "seed", "object"])[:count]
 
 
-def draw_worst(experiment: Experiment, rooms: str, out: Path) -> list[str]:
+def draw_worst(experiment: Experiment, rooms: str, out: Path, count: int) -> list[str]:
     """Draw worst_1.png, ... into OUT/ROOMS; returns their names.
 
     Each shows the object before, after and in truth in the image, and all three from above.
     """
     names: list[str] = []
     trials: dict[Job, Trial] = {}
-    for place, worst in enumerate(worst_objects(experiment).itertuples(), 1):
+    for place, worst in enumerate(worst_objects(experiment, count).itertuples(), 1):
         job = Job(rooms, worst.seed, worst.name, out)
         if job not in trials:
             trials[job] = map_tensors(_plain, _trial(job))
