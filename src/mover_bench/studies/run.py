@@ -100,7 +100,7 @@ BASE = (0, 4, 5, 1)  # corners of a box around its bottom, the last two at its f
 
 
 def worst_objects(experiment: Experiment, count: int) -> Frame:
-    """The objects of the last preset with the lowest IoU3D after the full method.
+    """The given objects of the last preset with the lowest IoU3D after the full method.
 
     None where the preset is one that measures something else of them.
     """
@@ -108,6 +108,7 @@ def worst_objects(experiment: Experiment, count: int) -> Frame:
     if "iou3d" not in found:
         return found[:0]
     rows = found[(found.name == experiment.presets[-1]) & (found.stage == "full")]
+    rows = rows.dropna(subset=["center_error"])  # what was not given cannot be drawn
     return rows.sort_values(["iou3d", "seed", "object"])[:count]
 
 
