@@ -105,7 +105,7 @@ def worst_objects(experiment: Experiment, count: int) -> Frame:
     None where the preset is one that measures something else of them.
     """
     found = experiment.finished.objects
-    if "iou3d" not in found:
+    if not {"iou3d", "center_error"} <= set(found):
         return found[:0]
     rows = found[(found.name == experiment.presets[-1]) & (found.stage == "full")]
     rows = rows.dropna(subset=["center_error"])  # what was not given cannot be drawn
