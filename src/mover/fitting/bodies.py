@@ -1,6 +1,7 @@
 """From keypoints to bodies: the batch fit of a whole video."""
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -11,13 +12,14 @@ from mover.bodies import BodyModel
 from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skinning import shaped, widths_of
 from mover.bodies.smpl_model import FLAT, Model, SmplBody, growth_of, skin_of_model
-from mover.core.observe import Observer, Step, silent
+from mover.core.observe import Energy, Observer, Step, silent
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, Weighed, body_energy
 from mover.fitting.given import begin_at, begin_from, start_rows
 from mover.fitting.ground import distances_of_who_lies, sole_heights, soles_of
+from mover.fitting.noise import Bias, at_most, bias_of, noise_of, noisy, without
 from mover.fitting.prior import ANGLES, PosePrior, encoded
 from mover.fitting.room import FitRoom
 from mover.fitting.start import Begun, begin
@@ -30,6 +32,7 @@ from mover.fitting.tracks import (
     image_speed,
     seen_at_all,
     seen_of,
+    stages_of,
     tracks_of,
     triples_of,
     usable_rows,
@@ -43,6 +46,7 @@ from mover.fitting.unknowns import (
     Frame,
     Rig,
     Unknowns,
+    grown,
     hand_angles,
     log_depth,
     pelvis_of,
@@ -161,13 +165,12 @@ def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
     frame = Frame(job.rig, begun.root, person, growth)
     seen, at = _on_a_floor(seen, at, frame, job)
     windows = windows_of(job.inputs.keypoints, job.config)
-    free = EVERYTHING
+    first = _stages(at, frame, seen, windows[0], (job, EVERYTHING))
+    bias, parts = _bias(first, job), [first.at]
     if len(windows) > 1:
-        some = windows[0]
-        first = _stages(at, frame, seen, some, (job, free))
-        at = dataclasses.replace(at, betas=first.betas, floor=first.floor)
-        free, windows = OF_ROWS, windows[1:]
-    parts = [_stages(at, frame, seen, window, (job, free)) for window in windows]
+        at = dataclasses.replace(at, betas=first.at.betas, floor=first.at.floor)
+        windows = windows[1:]
+        parts = [_stages(at, frame, seen, window, (job, OF_ROWS)).at for window in windows]
     betas = parts[0].betas
     fields = {
         name: torch.cat([getattr(p, name)[w.keep] for p, w in zip(parts, windows, strict=True)])
@@ -175,7 +178,9 @@ def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
     }
     back = torch.argsort(torch.cat([w.rows[w.keep] for w in windows]))
     fields = {name: value[back] for name, value in fields.items()}
-    return Unknowns(betas=betas, floor=parts[0].floor, **fields), frame, seen
+    at = Unknowns(betas=betas, floor=parts[0].floor, **fields)
+    at = at if bias is None else without(at, bias, frame.person)
+    return at, frame, seen
 
 
 def _on_a_floor(seen: Seen, at: Unknowns, frame: Frame, job: _Job) -> tuple[Seen, Unknowns]:
@@ -226,33 +231,73 @@ def _shapes(people: int, width: int, job: _Job) -> Tensor:
     return torch.cat([mean, found[:, count:]], -1)
 
 
+@dataclass(frozen=True)
+class _Lowered:
+    """What all stages make of some rows."""
+
+    at: Unknowns
+    seen: Seen
+    """What they were fitted to at last."""
+    frame: Frame
+    noise: Float[Tensor, " bodies"] | None
+    """Of the keypoints [px]; None: as assumed."""
+
+
 def _stages(
     at: Unknowns, frame: Frame, seen: Seen, window: Window, what: tuple[_Job, tuple[str, ...]]
-) -> Unknowns:
+) -> _Lowered:
     """All stages over some of the rows."""
     job, free = what
-    rows, stages = window.rows, job.config.stages
+    rows, stages = window.rows, stages_of(job.config, job.names)
     some = rows_of(job.inputs.keypoints, rows)
     at = dataclasses.replace(at, **{name: getattr(at, name)[rows] for name in OF_ROWS})
     frame = dataclasses.replace(frame, root=frame.root[rows], person=frame.person[rows])
     seen = chosen(seen, rows, triples_of(some, _speed(at, frame, some, job), job.config))
-    extremities = any("index" in name or name.startswith("face_") for name in job.names)
-    by = Weighed(stages[0], job.config, job.inputs.prior.decode, job.inputs.prior.width > 0)
-
-    def lowered_by(stage: Stage, free: tuple[str, ...]) -> Unknowns:
-        here, how = at_stage(seen, job.names, stage), dataclasses.replace(by, stage=stage)
-        return solve(lambda u: body_energy(u, frame, here, how), at, stage.steps, free)
-
+    noise = None
     for index, stage in enumerate(stages):
-        last = index > 0 and index == len(stages) - 1
-        if last and not extremities and _alike(stage, stages[index - 1]):
-            continue
-        at = lowered_by(stage, free)
+        if index == 1 and job.config.left and job.inputs.room is None:
+            quick = dataclasses.replace(stage, steps=job.config.noise_steps)
+            at = _lowered(at, frame, seen, (job, quick, free))
+            off = _seen_at(at, frame, seen, job) - seen.pixels
+            noise = noise_of(off, seen, frame.person, job.config.left)
+            seen = at_most(seen, noise, stage.pose)
+        at = _lowered(at, frame, seen, (job, stage, free))
         at, seen = _laid(at, frame, some, seen, job)
         if seen.about is not None:  # before, who lies moved those by whom they are placed
-            at = lowered_by(stage, OF_ROWS)
+            at = _lowered(at, frame, seen, (job, stage, OF_ROWS))
         job.observe(Step("fit_bodies", index, len(stages)))
-    return at
+    return _Lowered(at, seen, frame, noise)
+
+
+def _lowered(
+    at: Unknowns, frame: Frame, seen: Seen, what: tuple[_Job, Stage, tuple[str, ...]]
+) -> Unknowns:
+    """The energy of one stage lowered."""
+    job, stage, free = what
+    return solve(_energy(frame, seen, stage, job), at, stage.steps, free)
+
+
+def _energy(frame: Frame, seen: Seen, stage: Stage, job: _Job) -> Callable[[Unknowns], Energy]:
+    """E_Body of one stage."""
+    by = Weighed(stage, job.config, job.inputs.prior.decode, job.inputs.prior.width > 0)
+    here = at_stage(seen, job.names, stage)
+    return lambda u: body_energy(u, frame, here, by)
+
+
+def _seen_at(at: Unknowns, frame: Frame, seen: Seen, job: _Job) -> Tensor:
+    """Where the keypoints of bodies are in the image [px]."""
+    with torch.no_grad():
+        return project(points_of(at, frame, job.inputs.prior.decode).keypoints, seen.K)
+
+
+def _bias(found: _Lowered, job: _Job) -> Bias | None:
+    """What noise did to shapes and distances; None: not known."""
+    if found.noise is None:
+        return None
+    pixels = noisy(_seen_at(found.at, found.frame, found.seen, job), found.noise)
+    again = dataclasses.replace(found.seen, pixels=pixels)
+    energy = _energy(found.frame, again, stages_of(job.config, job.names)[-1], job)
+    return bias_of(energy, found.at, found.frame.person, job.config.noise_steps)
 
 
 def _laid(
@@ -268,15 +313,10 @@ def _laid(
     free = about.isnan()
     if bool(free.all()):
         return at, seen
-    depth = at.place[:, 2] + torch.where(free, 0, about - log_depth(at, frame))
+    about = about - grown(at, frame)[frame.person]
+    depth = torch.where(free, at.place[:, 2], about)
     place = torch.cat([at.place[:, :2], depth[:, None]], -1)
     return dataclasses.replace(at, place=place), dataclasses.replace(seen, about=about)
-
-
-def _alike(stage: Stage, before: Stage) -> bool:
-    """Two stages differ in nothing but hands and faces."""
-    own = {"steps": before.steps, "hand_joints": before.hand_joints}
-    return dataclasses.replace(stage, face_joints=before.face_joints, **own) == before
 
 
 def _speed(

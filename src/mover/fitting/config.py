@@ -60,6 +60,10 @@ class FitConfig:
     """Residual at which the Geman-McClure price of a keypoint has halved [px], per 1,080 rows."""
     loose: Weight = 0.3
     """Factor on the confidence of neck and hips, which detectors place elsewhere (SMPLify-X: 0)."""
+    left: Share = 0.45
+    """Share of the variance of keypoints' noise that a fit leaves; 0: noise is as assumed."""
+    noise_steps: Steps = 100
+    """Iterations of the fit that tells how large noise is, and of the one that tells its bias."""
     least_confidence: Share = 0.1
     """Keypoints below are missing."""
     least_joints: Annotated[int, int_in(1, 133)] = 4

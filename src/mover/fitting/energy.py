@@ -38,7 +38,7 @@ from mover.fitting.ground import (
 from mover.fitting.limits import limit_price
 from mover.fitting.room import FitRoom, room_terms
 from mover.fitting.stature import Stature, height_price, size_of
-from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, log_depth, points_of
+from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, floor_of, points_of
 from mover.geometry.camera import project
 
 LIFTED = 10.0  # weight of joints that are known in 3D
@@ -93,7 +93,7 @@ class Seen:
     soles: Float[Tensor, "2"] | None = None
     """Heights of ankles and balls of the feet over the soles [m]; None: no floor is sought."""
     about: Float[Tensor, " bodies"] | None = None
-    """Logarithm of the distance at which who lies is expected; NaN, None: nothing is."""
+    """Where `place` has the depth at which who lies is expected; NaN, None: nothing is."""
 
 
 @dataclass(frozen=True)
@@ -137,12 +137,13 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
 def _ground_energy(points: Points, at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
     """What the floor, and how people lie down, tell of how far they are."""
     sought, pose, rows = bool(at.floor.numel()), by.stage.pose, len(at.place)
+    floor = floor_of(at, frame)
     under = pose / by.config.support if sought or seen.floor is not None else 0.0
     stands = pose * by.config.stands if sought else 0.0
     lies = pose * by.config.lies if seen.about is not None else 0.0
 
     def plane() -> Plane:
-        return plane_of(at.floor, seen.up, seen.floor)
+        return plane_of(floor, seen.up, seen.floor)
 
     def stand() -> Tensor:
         assert seen.soles is not None
@@ -152,10 +153,10 @@ def _ground_energy(points: Points, at: Unknowns, frame: Frame, seen: Seen, by: W
 
     def lie() -> Tensor:
         assert seen.about is not None
-        return laid_price(log_depth(at, frame), seen.about)
+        return laid_price(at.place[:, 2], seen.about)
 
     def level() -> Tensor:
-        return level_price(at.floor, seen.floor).expand(rows)
+        return level_price(floor, seen.floor).expand(rows)
 
     every = torch.cat([points.joints, points.keypoints], 1)
     return weigh(

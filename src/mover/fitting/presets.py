@@ -10,6 +10,7 @@ Preset = Literal["robust", "paper"]
 
 PAPER = FitConfig(
     loose=0.0,
+    left=0.0,
     limits=0.0,
     smooth_joints=1e2,
     smooth_pixels=1e-2,

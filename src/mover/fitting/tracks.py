@@ -245,3 +245,12 @@ def at_stage(seen: Seen, names: list[str], stage: Stage) -> Seen:
     return dataclasses.replace(
         seen, weight=seen.weight * seen.weight.new_tensor([factor[kind_of(n)] for n in names])
     )
+
+
+def stages_of(config: FitConfig, names: list[str]) -> tuple[Stage, ...]:
+    """The stages, without a last one that differs in hands and faces that no keypoint shows."""
+    *_, before, last = (Stage(), *config.stages)
+    own = {"steps": before.steps, "hand_joints": before.hand_joints}
+    alike = dataclasses.replace(last, face_joints=before.face_joints, **own) == before
+    shown = any(kind_of(name) != "body" for name in names)
+    return config.stages if shown or not alike or len(config.stages) < 2 else config.stages[:-1]

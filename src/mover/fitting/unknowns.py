@@ -5,6 +5,7 @@ vertices that are keypoints are moved, so that hundreds of frames cost a few mil
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import torch
@@ -17,8 +18,12 @@ from mover.bodies.skinning import SkinnedBody, shaped, widths_of
 from mover.bodies.smpl_model import Model, SmplBody, skin_of_model, vertex_subset
 from mover.core.observe import Energy
 from mover.core.records import record
+from mover.fitting.limits import spreads
 from mover.geometry.mesh import vertex_normals
 from mover.geometry.rotations import axis_angle
+
+HISTORY = 100
+"""Steps that L-BFGS remembers: how tall people are is told by all poses together, slowly."""
 
 
 @record
@@ -211,12 +216,16 @@ class Unknowns:
     face: Float[Tensor, "bodies face"]
     """Jaw [rad], then expression; zero columns where no face is fitted."""
     floor: Float[Tensor, " floor"] = NO_FLOOR
-    """Two slopes of the floor, and its height along upright from the camera [m]; or none."""
+    """Two slopes of the floor, and its height along upright from the camera under people of the
+    usual size [m]; or none."""
 
 
-SCALES = {"turn": 0.2, "code": 0.3, "place": (0.01, 0.01, 0.05), "betas": 1.0, "hands": 0.5,
+BEND = 0.3  # [rad]
+SCALES = {"turn": 0.2, "code": BEND, "place": (0.01, 0.01, 0.05), "betas": 1.0, "hands": 0.5,
           "face": 0.3, "floor": 0.03}  # fmt: skip
 """How far each usually moves: the solver works in these units."""
+BENDS = tuple(1 / math.hypot(1 / s, 1 / BEND) for s in spreads(torch.zeros(1)).tolist())
+"""The same for angles, most of which people turn less than keypoints could tell."""
 
 Decode = Callable[[Float[Tensor, "bodies code"]], Float[Tensor, "bodies angles"]]
 
@@ -237,9 +246,19 @@ class Frame:
 
 def log_depth(at: Unknowns, frame: Frame) -> Float[Tensor, " bodies"]:
     """Logarithm of the depth of the pelvis [m]."""
+    return at.place[:, 2] + grown(at, frame)[frame.person]
+
+
+def grown(at: Unknowns, frame: Frame) -> Float[Tensor, " people"]:
+    """Logarithm of how much taller than usual people are, whose depths are counted so."""
     if frame.growth is None:
-        return at.place[:, 2]
-    return at.place[:, 2] + (at.betas @ frame.growth[: at.betas.shape[1]])[frame.person]
+        return at.betas.new_zeros(len(at.betas))
+    return at.betas @ frame.growth[: at.betas.shape[1]]
+
+
+def floor_of(at: Unknowns, frame: Frame) -> Float[Tensor, " floor"]:
+    """Slopes of the floor, and its height along upright from the camera [m]."""
+    return torch.cat([at.floor[:2], at.floor[2:] * grown(at, frame).mean().exp()])
 
 
 def pelvis_of(at: Unknowns, frame: Frame) -> Float[Tensor, "bodies 3"]:
@@ -310,6 +329,8 @@ def to_values(at: Unknowns, free: tuple[str, ...]) -> dict[str, Tensor]:
 
 
 def _scale(name: str, value: Tensor) -> Tensor:
+    if name == "code" and value.shape[-1] == len(BENDS):
+        return torch.tensor(BENDS, dtype=value.dtype, device=value.device)
     return torch.tensor(SCALES[name], dtype=value.dtype, device=value.device)
 
 

@@ -1,0 +1,97 @@
+"""How large the noise of keypoints is, and what a fit makes of it.
+
+A limb that looks too short is bent, one that looks too long cannot be: noise makes people look
+larger, so that they are put too near. How much depends on how noisy their keypoints are, how large
+they are seen and what they do. So the bodies that were found are seen once more with as much noise
+and fitted again (a parametric bootstrap): what changes is what noise had changed before.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from mover.core.observe import Energy
+from mover.core.records import record
+from mover.fitting.energy import HEIGHT, Seen
+from mover.fitting.unknowns import Unknowns, solve
+
+NORMAL = 0.6745  # median of the absolute value of a normal number
+FEW = 20  # rows of a person that tell half of what noise does
+
+
+@record
+class Bias:
+    """What noise does to people."""
+
+    betas: Float[Tensor, "people shape"]
+    depth: Float[Tensor, " people"]
+    """Logarithm of how much farther they are, beside what the shape says."""
+
+
+def noise_of(
+    off: Float[Tensor, "bodies keypoints 2"],
+    seen: Seen,
+    person: Int[Tensor, " bodies"],
+    left: float,
+) -> Float[Tensor, " bodies"]:
+    """Noise of the keypoints of each body's person along each axis [px]; 0: not known.
+
+    From the median, so that joints which are swapped or guessed at the wrong place do not count.
+
+    Args:
+        off: Keypoints from their projections by a fit [px].
+        seen: Which of them there are.
+        person: Whose body it is.
+        left: Share of the variance of the noise that a fit leaves.
+    """
+    noise, there = off.new_zeros(len(off)), seen.weight > 0
+    for one in person.unique():
+        mine = person == one
+        size = off[mine][there[mine]].abs().flatten()
+        if len(size):
+            noise[mine] = size.median() / (NORMAL * left**0.5)
+    return noise
+
+
+def at_most(seen: Seen, noise: Float[Tensor, " bodies"], pose: float) -> Seen:
+    """No keypoint surer than its noise [px] lets it be, beside a pose prior of this weight."""
+    most = pose * seen.height / HEIGHT / noise.clamp_min(1e-6)
+    return dataclasses.replace(seen, weight=torch.minimum(seen.weight, most[:, None]))
+
+
+def noisy(pixels: Float[Tensor, "bodies keypoints 2"], noise: Float[Tensor, " bodies"]) -> Tensor:
+    """Keypoints with noise [px], always the same."""
+    draw = torch.Generator().manual_seed(0)
+    drawn = torch.randn(pixels.shape, generator=draw).to(pixels)
+    return pixels + noise[:, None, None] * drawn
+
+
+def bias_of(
+    energy: Callable[[Unknowns], Energy],
+    found: Unknowns,
+    person: Int[Tensor, " bodies"],
+    steps: int,
+) -> Bias:
+    """What a fit changes of bodies that are seen once more, with noise.
+
+    Args:
+        energy: Of bodies under `noisy` keypoints.
+        found: The bodies that are seen.
+        person: Row of the shapes of each.
+        steps: Iterations of the fit.
+    """
+    again = solve(energy, found, steps)
+    count = torch.bincount(person, minlength=len(found.betas)).to(found.place)
+    moved = again.place[:, 2] - found.place[:, 2]
+    known = count / (count + FEW)
+    depth = torch.stack([moved[person == k].median() for k in range(len(count))])
+    return Bias(known[:, None] * (again.betas - found.betas), known * depth)
+
+
+def without(at: Unknowns, bias: Bias, person: Int[Tensor, " bodies"]) -> Unknowns:
+    """The bodies without what noise did to them; their poses stay."""
+    place = torch.cat([at.place[:, :2], (at.place[:, 2] - bias.depth[person])[:, None]], -1)
+    return dataclasses.replace(at, place=place, betas=at.betas - bias.betas)
