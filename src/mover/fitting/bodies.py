@@ -294,10 +294,14 @@ def _bias(found: _Lowered, job: _Job) -> Bias | None:
     """What noise did to shapes and distances; None: not known."""
     if found.noise is None:
         return None
+    person, stage = found.frame.person, stages_of(job.config, job.names)[-1]
     pixels = noisy(_seen_at(found.at, found.frame, found.seen, job), found.noise)
-    again = dataclasses.replace(found.seen, pixels=pixels)
-    energy = _energy(found.frame, again, stages_of(job.config, job.names)[-1], job)
-    return bias_of(energy, found.at, found.frame.person, job.config.noise_steps)
+    seen = dataclasses.replace(found.seen, pixels=pixels)
+    quick = dataclasses.replace(stage, steps=job.config.noise_steps)
+    again = _lowered(found.at, found.frame, seen, (job, quick, EVERYTHING))
+    left = noise_of(_seen_at(again, found.frame, seen, job) - pixels, seen, person, job.config.left)
+    share = (found.noise / left.clamp_min(1e-6)).square().clamp_max(1)
+    return bias_of(found.at, again, person, share)
 
 
 def _laid(

@@ -3,20 +3,19 @@
 A limb that looks too short is bent, one that looks too long cannot be: noise makes people look
 larger, so that they are put too near. How much depends on how noisy their keypoints are, how large
 they are seen and what they do. So the bodies that were found are seen once more with as much noise
-and fitted again (a parametric bootstrap): what changes is what noise had changed before.
+and fitted again (a parametric bootstrap): what changes is what noise had changed before. How much
+of the known noise that fit leaves tells how large the unknown one was.
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.core.observe import Energy
 from mover.core.records import record
 from mover.fitting.energy import HEIGHT, Seen
-from mover.fitting.unknowns import Unknowns, solve
+from mover.fitting.unknowns import Unknowns
 
 NORMAL = 0.6745  # median of the absolute value of a normal number
 FEW = 20  # rows of a person that tell half of what noise does
@@ -70,24 +69,24 @@ def noisy(pixels: Float[Tensor, "bodies keypoints 2"], noise: Float[Tensor, " bo
 
 
 def bias_of(
-    energy: Callable[[Unknowns], Energy],
     found: Unknowns,
+    again: Unknowns,
     person: Int[Tensor, " bodies"],
-    steps: int,
+    share: Float[Tensor, " bodies"],
 ) -> Bias:
-    """What a fit changes of bodies that are seen once more, with noise.
+    """What changed in bodies that were seen and fitted again, with noise.
 
     Args:
-        energy: Of bodies under `noisy` keypoints.
-        found: The bodies that are seen.
+        found: The bodies that were seen.
+        again: What was fitted to them.
         person: Row of the shapes of each.
-        steps: Iterations of the fit.
+        share: Of the variance of that noise, what is really in keypoints.
     """
-    again = solve(energy, found, steps)
     count = torch.bincount(person, minlength=len(found.betas)).to(found.place)
     moved = again.place[:, 2] - found.place[:, 2]
-    known = count / (count + FEW)
-    depth = torch.stack([moved[person == k].median() for k in range(len(count))])
+    each = [person == k for k in range(len(count))]
+    depth = torch.stack([moved[mine].median() for mine in each])
+    known = count / (count + FEW) * torch.stack([share[mine].median() for mine in each])
     return Bias(known[:, None] * (again.betas - found.betas), known * depth)
 
 
