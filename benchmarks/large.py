@@ -1,8 +1,10 @@
 """What captures far larger than the demo's cost: `mover run` to the end, stage by stage.
 
-    PYTHONPATH=src python benchmarks/large.py --cases demo 4k objects people frames
+    PYTHONPATH=src python benchmarks/large.py --cases demo foreign fine 4k objects people frames
 
-The demo's capture grown in one direction: its pictures and masks at 3840 x 2160, five copies of its
+The demo's capture with other meshes (`foreign`: eight of 50,000 faces, open and unclean as in
+`prepare.py`, never the same ones, so that no cache knows them; `fine`: one of 500,000), or grown in
+one direction: its pictures and masks at 3840 x 2160, five copies of its
 objects (40), twelve copies of its person, each a step aside, its frames again and again up to
 5,000. Copies are moved by centimetres, and their masks by pixels. Printed for each case: the
 seconds of every stage that took one or more, seconds and processor time of the whole run with
@@ -23,6 +25,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from prepare import unclean
 
 from mover.core.types import (
     Bodies,
@@ -30,9 +33,12 @@ from mover.core.types import (
     Capture,
     Detection,
     Masks,
+    Mesh,
     People,
     SceneObject,
 )
+from mover.furniture.library import PIECES
+from mover.geometry.mesh import box
 from mover.geometry.rle import decode, encode
 from mover.io.capture.folder import write_capture
 from mover_bench.rooms.config import NoiseConfig
@@ -161,8 +167,28 @@ def many_frames(capture: Capture) -> Capture:
     return copied(capture, -(-FRAMES // len(capture.bodies.frame)), FRAMES, aside=False)
 
 
+def other_meshes(capture: Capture, faces: int, most: int) -> Capture:
+    """The first objects with pieces of their class as tools leave them, as large as their own."""
+    seed = int.from_bytes(os.urandom(4))
+    given = capture.scene.objects
+    names = [p.category if p.category in PIECES else f"double {p.category}" for p in given[:most]]
+    pieces = [
+        replace(piece, mesh=_as_large(unclean(name, faces, seed), piece.mesh))
+        for piece, name in zip(given, names, strict=False)
+    ]
+    scene = replace(capture.scene, objects=(*pieces, *given[most:]))
+    return replace(capture, scene=scene)
+
+
+def _as_large(mesh: Mesh, own: Mesh) -> Mesh:
+    (low, high), (start, end) = box(mesh.verts), box(own.verts)
+    return Mesh(start + (mesh.verts - low) * ((end - start) / (high - low)), mesh.faces)
+
+
 CASES: dict[str, Callable[[Capture], Capture]] = {
     "demo": lambda capture: capture,
+    "foreign": lambda capture: other_meshes(capture, 50_000, len(capture.scene.objects)),
+    "fine": lambda capture: other_meshes(capture, 500_000, 1),
     "4k": large_pictures,
     "objects": many_objects,
     "people": many_people,
