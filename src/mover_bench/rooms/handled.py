@@ -17,7 +17,6 @@ from mover_bench.rooms.gait import Stations, duration, route_of, stations, walk
 from mover_bench.rooms.known import (
     Actor,
     KnownRoom,
-    NoRoomError,
     RefusedError,
     build,
     looks,
@@ -27,7 +26,6 @@ from mover_bench.rooms.known import (
 from mover_bench.rooms.motion import (
     DOOR,
     Performance,
-    RefusedTaskError,
     Stage,
     Stop,
     Take,
@@ -37,19 +35,18 @@ from mover_bench.rooms.motion import (
     stop_for,
     walk_to,
 )
-from mover_bench.rooms.moved import EVERY, candidates
-from mover_bench.rooms.placed import BODY, NoWayError, Placed, free_of
+from mover_bench.rooms.moved import EVERY, candidates, first_draft
+from mover_bench.rooms.placed import BODY, Placed, free_of
 from mover_bench.rooms.poses import Person, Posture, blend, chain, make_person, rows
 from mover_bench.rooms.render import see
-from mover_bench.rooms.room import draw_person, draw_start, draw_tasks, make_room
+from mover_bench.rooms.room import draw_person, draw_start, draw_tasks
 from mover_bench.rooms.seating import palm_height, span, standing
 from mover_bench.rooms.truth import PRESS
 from mover_bench.rooms.turns import Y, about, apply, facing, left_of, smooth
 
 PUSHED = ("chair", "office chair", "armchair", "table")
 ROLLED = ("office chair", "chair", "stool")
-ROOMS, TRIES = 4, 12  # that are drawn, and drafts with each of their pieces
-OTHER = 1_000_000  # from the seed of one room to that of the next
+TRIES = 12  # drafts with each piece of a room
 GRASP = 0.4  # [m], from the edge that is held to the middle of the body
 HOLD = (0.6, 1.15)  # [m], heights at which an edge is held
 PALM = 0.07  # [m], from the wrist to the middle of the hand
@@ -80,16 +77,14 @@ def make_handled_room(seed: int, config: RoomConfig) -> KnownRoom:
         NoRoomError: If no piece of the room can be moved so.
     """
     rng = np.random.default_rng([seed, 78])
-    refused: list[str] = []
-    for room in range(ROOMS):
-        first = make_room(seed + room * OTHER, config)
-        for index in candidates(first, ROLLED if config.moved == "rolled" else PUSHED):
-            for _ in range(TRIES):
-                try:
-                    return _acted(first.plan, index, config, rng)
-                except (RefusedError, RefusedTaskError, NoWayError, ValueError) as error:
-                    refused.append(str(error))
-    raise NoRoomError(f"seed {seed}: nothing can be moved: {refused[-3:]}")
+    kinds = ROLLED if config.moved == "rolled" else PUSHED
+
+    def draft(plan: Plan, index: int) -> KnownRoom:
+        return _acted(plan, index, config, rng)
+
+    return first_draft(
+        seed, config, lambda room: candidates(room, kinds), draft, TRIES, "nothing can be moved"
+    )
 
 
 def _acted(plan: Plan, index: int, config: RoomConfig, rng: np.random.Generator) -> KnownRoom:

@@ -14,7 +14,6 @@ from mover.furniture.library import make_piece
 from mover.furniture.pieces import block, draw, finish, pair
 from mover_bench.rooms.compose import Plan, fits, in_view, overlap
 from mover_bench.rooms.config import RoomConfig
-from mover_bench.rooms.handled import OTHER, ROOMS
 from mover_bench.rooms.known import (
     Acted,
     Actor,
@@ -25,7 +24,7 @@ from mover_bench.rooms.known import (
     one_thread,
 )
 from mover_bench.rooms.motion import Performance, Stage, Stop, Task, perform
-from mover_bench.rooms.moved import candidates
+from mover_bench.rooms.moved import candidates, first_draft
 from mover_bench.rooms.noise import SEATS_FOR_ONE
 from mover_bench.rooms.placed import NoWayError, Placed, corners, on_floor, way
 from mover_bench.rooms.poses import chain, make_person, moved
@@ -136,16 +135,14 @@ def make_platform_room(seed: int, config: RoomConfig) -> KnownRoom:
     Raises:
         NoRoomError: If no seat of the room has space for a platform.
     """
-    refused, rng = list[str](), np.random.default_rng([seed, 79])
-    for other in range(ROOMS):
-        room = make_room(seed + other * OTHER, config)
-        for index in candidates(room, SEATS_FOR_ONE):
-            for _ in range(TRIES // 4):
-                try:
-                    return _on_platform(room.plan, index, config, rng)
-                except (RefusedError, ValueError) as error:
-                    refused.append(str(error))
-    raise NoRoomError(f"seed {seed}: no platform: {refused[-3:]}")
+    rng = np.random.default_rng([seed, 79])
+
+    def draft(plan: Plan, index: int) -> KnownRoom:
+        return _on_platform(plan, index, config, rng)
+
+    return first_draft(
+        seed, config, lambda room: candidates(room, SEATS_FOR_ONE), draft, TRIES // 4, "no platform"
+    )
 
 
 def _on_platform(plan: Plan, index: int, config: RoomConfig, rng: np.random.Generator) -> KnownRoom:

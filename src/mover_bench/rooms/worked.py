@@ -12,8 +12,7 @@ import numpy as np
 from mover.furniture.library import make_piece
 from mover_bench.rooms.compose import Plan, fits, in_view
 from mover_bench.rooms.config import RoomConfig
-from mover_bench.rooms.handled import OTHER, ROOMS
-from mover_bench.rooms.known import Actor, KnownRoom, NoRoomError, RefusedError, build, one_thread
+from mover_bench.rooms.known import Actor, KnownRoom, build, one_thread
 from mover_bench.rooms.motion import (
     DOOR,
     Performance,
@@ -24,10 +23,10 @@ from mover_bench.rooms.motion import (
     perform,
     walk_to,
 )
-from mover_bench.rooms.moved import candidates
-from mover_bench.rooms.placed import NoWayError, Placed
+from mover_bench.rooms.moved import candidates, first_draft
+from mover_bench.rooms.placed import Placed
 from mover_bench.rooms.poses import Person, Posture, chain, make_person, rows
-from mover_bench.rooms.room import draw_person, draw_start, draw_tasks, late, make_room
+from mover_bench.rooms.room import draw_person, draw_start, draw_tasks, late
 from mover_bench.rooms.seating import (
     AWAY,
     HANDS,
@@ -63,18 +62,16 @@ def make_worked_room(seed: int, config: RoomConfig) -> KnownRoom:
     Raises:
         NoRoomError: If nobody can work at any table of it.
     """
-    refused, rng = list[str](), np.random.default_rng([seed, 80])
-    for other in range(ROOMS):
-        plan = make_room(seed + other * OTHER, config)
-        for index in candidates(plan, TABLES):
-            if not HIGH[0] < plan.furniture[index].top_height < HIGH[1]:
-                continue
-            for _ in range(TRIES):
-                try:
-                    return _worked(plan.plan, index, config, rng)
-                except (RefusedError, RefusedTaskError, NoWayError, ValueError) as error:
-                    refused.append(str(error))
-    raise NoRoomError(f"seed {seed}: nobody can work: {refused[-3:]}")
+    rng = np.random.default_rng([seed, 80])
+
+    def tables(room: KnownRoom) -> list[int]:
+        found = candidates(room, TABLES)
+        return [k for k in found if HIGH[0] < room.furniture[k].top_height < HIGH[1]]
+
+    def draft(plan: Plan, index: int) -> KnownRoom:
+        return _worked(plan, index, config, rng)
+
+    return first_draft(seed, config, tables, draft, TRIES, "nobody can work")
 
 
 def _worked(plan: Plan, index: int, config: RoomConfig, rng: np.random.Generator) -> KnownRoom:
