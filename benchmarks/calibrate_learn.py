@@ -96,14 +96,13 @@ def cases_of(told: list[tuple[Explanation, Float[Tensor, "7"]]], kind: str) -> C
     rows: list[tuple[float, ...]] = []
     for e, truth in told:
         for way in ways_of(e.facts.place)[[k == kind for k in KIND_OF]]:
-            whole = torch.zeros_like(e.facts.tilt) if e.facts.whole is None else e.facts.whole
-            parts = (e.facts.covariance, e.facts.tilt, whole)
-            own, tilt, both = (float(way @ c @ way) for c in parts)
+            parts = (e.facts.covariance, e.facts.tilt, e.facts.whole)
+            own, tilt, whole = (float(way @ c @ way) for c in parts)
             if kind == "height":
                 own, tilt = own + tilt, 0.0
             if own > 0:
                 error = min(offs(e, way, truth))
-                rows.append((own, tilt, both, error, growth(e.facts.overlap)))
+                rows.append((own, tilt, whole, error, growth(e.facts.overlap)))
     return Cases(*torch.tensor(rows, dtype=torch.float64).reshape(-1, 5).unbind(-1))
 
 

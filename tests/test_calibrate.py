@@ -29,8 +29,8 @@ def drawn(seed: int, objects: int = 150) -> Judged:
         tilt = torch.zeros(7, 7, dtype=torch.float64)
         tilt[1, 1] = 1e-6
         facts.append(
-            Facts(str(k), 0.1, place, torch.diag(spread**2), tilt, (), (), (), None, (), overlap,
-                  (), "ground", False)
+            Facts(str(k), 0.1, place, torch.diag(spread**2), tilt, torch.zeros_like(tilt), (), (),
+                  (), None, (), overlap, (), "ground", False)
         )  # fmt: skip
         error = 1e-3 * torch.randn(7, generator=g, dtype=torch.float64)
         for kind, columns in WAYS.items():

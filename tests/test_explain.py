@@ -343,6 +343,7 @@ def facts(**kwargs):
         place,
         torch.diag(SIGMA**2),
         torch.zeros(7, 7, dtype=torch.float64),
+        torch.zeros(7, 7, dtype=torch.float64),
         (),
         (),
         (),

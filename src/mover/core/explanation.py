@@ -96,6 +96,8 @@ class Facts:
     """Before calibration, if the camera is right; zero for what its support or the user decides."""
     tilt: Float[Tensor, "7 7"]
     """What the doubt about pitch, roll and floor adds, before calibration."""
+    whole: Float[Tensor, "7 7"]
+    """What the doubt about the scale of the room and about its lens adds; it counts as it is."""
     pulls: tuple[Pull, ...]
     """In the order of Eq. 1."""
     alternatives: tuple[Alternative, ...]
@@ -110,8 +112,6 @@ class Facts:
     support: str
     """`ground`, `free`, or the id of the object that carries it."""
     pinned: bool
-    whole: Float[Tensor, "7 7"] | None = None
-    """What the doubt about the scale of the room and about its lens adds; None: both are known."""
 
 
 @record

@@ -216,8 +216,7 @@ def calibrated(facts: Facts, calibration: Calibration) -> Float[Tensor, "7 7"]:
     own = {kind: known[kind] * grown ** calibration.powers.get(kind, 0.0) for kind in KIND_OF}
     factor = _along(ways, [own[kind] for kind in KIND_OF])
     tilt = _along(ways, [known["roll" if k == "sideways" else "height"] for k in KIND_OF])
-    found = factor @ facts.covariance @ factor.mT + tilt @ facts.tilt @ tilt.mT
-    return found if facts.whole is None else found + facts.whole
+    return factor @ facts.covariance @ factor.mT + tilt @ facts.tilt @ tilt.mT + facts.whole
 
 
 def _along(ways: Float[Tensor, "7 7"], factors: list[float]) -> Float[Tensor, "7 7"]:

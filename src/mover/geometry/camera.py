@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from mover.core.devices import constant
@@ -64,3 +64,13 @@ def heading(R_cam_world: Float[Tensor, "3 3"]) -> float:
     """Angle `a` [rad]: x_new = R_y(a) @ x_world turns the world so that the camera has none."""
     x, _, z = R_cam_world[2].tolist()
     return math.atan2(x, -z)
+
+
+def at_pixels(
+    images: Shaped[Tensor, "*images h w"], pixels: Int[Tensor, "*points 2"]
+) -> tuple[Shaped[Tensor, "..."], Bool[Tensor, "*points"]]:
+    """What images hold at pixels (x, y), and which of these lie in them; others mean nothing."""
+    height, width = images.shape[-2:]
+    x, y = pixels.unbind(-1)
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    return images[..., y.clamp(0, height - 1), x.clamp(0, width - 1)], inside

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.types import CameraPath
-from mover.geometry.camera import project
+from mover.geometry.camera import at_pixels, project
 from mover.geometry.rotations import axis_angle, rotation_vectors
 
 
@@ -84,7 +84,5 @@ def resampled(
     pixel = torch.stack(torch.broadcast_tensors(x, y[:, None], torch.ones(())), -1)
     points = (pixel @ torch.linalg.inv(K).mT) * depth[..., None]
     there = project(from_reference(points.flatten(0, -2)[None], pose)[0], K).floor().long()
-    height, width = image.shape[-2:]
-    inside = ((there >= 0) & (there < torch.tensor([width, height]))).all(-1)
-    column, row = there[:, 0].clamp(0, width - 1), there[:, 1].clamp(0, height - 1)
-    return (image[:, row, column] & inside).unflatten(-1, depth.shape)
+    found, inside = at_pixels(image, there)
+    return (found & inside).unflatten(-1, depth.shape)

@@ -306,9 +306,8 @@ def with_common_scale(
     placed = replace(state.placed, layout=layout, candidates=candidates)
     state = replace(
         state, ground=factor * state.ground, start=start, alone=single, placed=placed,
-        views=larger_views(state.views, factor),
+        views=larger_views(state.views, factor), scale_spread=left,
     )  # fmt: skip
-    state = replace(state, scale_spread=left)
     return replace(people, bodies=bodies, path=scaled(people.path, factor)), state
 
 

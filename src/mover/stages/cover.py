@@ -18,6 +18,7 @@ from torch import Tensor
 from mover.core.records import record
 from mover.core.types import STILL, CameraPath, Capture, Masks, People
 from mover.geometry.boxes import box_of
+from mover.geometry.camera import at_pixels
 from mover.geometry.path import is_still, poses_at
 from mover.geometry.rle import decode, joined
 from mover.stages.masks import enlarged, thin, uncovered, widened
@@ -131,7 +132,5 @@ def _warped(cover: Cover, row: int, pose: CameraPath, shape: torch.Size) -> Bool
     y, x = (STEP * (torch.arange(n) + 0.5) for n in shape)
     pixel = torch.stack(torch.broadcast_tensors(x, y[:, None], torch.ones(())), -1) @ there.mT
     at = (pixel[..., :2] / pixel[..., 2:].clamp_min(1e-6) / STEP).floor().long()
-    height, width = source.shape
-    inside = (at >= 0).all(-1) & (at[..., 0] < width) & (at[..., 1] < height)
-    column, line = at[..., 0].clamp(0, width - 1), at[..., 1].clamp(0, height - 1)
-    return source[line, column] & inside & (pixel[..., 2] > 0)
+    covered, inside = at_pixels(source, at)
+    return covered & inside & (pixel[..., 2] > 0)

@@ -25,19 +25,19 @@ from mover_bench.rooms.known import (
 )
 from mover_bench.rooms.motion import (
     DOOR,
-    Performance,
     Stage,
     Stop,
     Take,
     Task,
     done_there,
+    in_turn,
     perform,
     stop_for,
     walk_to,
 )
 from mover_bench.rooms.moved import EVERY, candidates, first_draft
 from mover_bench.rooms.placed import BODY, Placed, free_of
-from mover_bench.rooms.poses import Person, Posture, blend, chain, make_person, rows
+from mover_bench.rooms.poses import Person, Posture, blend, make_person, rows
 from mover_bench.rooms.render import see
 from mover_bench.rooms.room import draw_person, draw_start, draw_tasks
 from mover_bench.rooms.seating import palm_height, span, standing
@@ -106,7 +106,7 @@ def _acted(plan: Plan, index: int, config: RoomConfig, rng: np.random.Generator)
     start, held = len(before.labels), len(handled.places)
     moving = {start + k: place for k, place in enumerate(handled.places)}
     moving |= {start + held + k: end for k in range(len(after.labels))}
-    whole = _whole(before, handled, after)
+    whole = in_turn(before, handled.takes, after)
     room = build(plan, (Actor(stage, whole),), config, f"{config.moved}", whole.refused, moving)
     truth = _scene(room, index, moving)
     seen = looks(plan, moving, see(plan))
@@ -127,20 +127,6 @@ def _check(plan: Plan, places: tuple[Placed, ...]) -> None:
         raise RefusedError(f"{places[0].id}: something stands in the way")
     if in_view(places[-1], plan.view) < 0.95:
         raise RefusedError(f"{places[0].id} leaves the view")
-
-
-def _whole(before: Performance, handled: Handled, after: Performance) -> Performance:
-    """All of it, one after the other."""
-    count = [len(take.posture.pelvis) for take in handled.takes]
-    labels = [take.label for take, n in zip(handled.takes, count, strict=True) for _ in range(n)]
-    touched = [take.piece for take, n in zip(handled.takes, count, strict=True) for _ in range(n)]
-    postures = [before.posture, *(take.posture for take in handled.takes), after.posture]
-    return Performance(
-        chain(postures),
-        (*before.labels, *labels, *after.labels),
-        (*before.touched, *touched, *after.touched),
-        (*before.refused, *after.refused),
-    )
 
 
 def _scene(room: KnownRoom, index: int, moving: dict[int, Placed]) -> Scene:

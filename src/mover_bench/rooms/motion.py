@@ -4,6 +4,7 @@ A task that would sink into furniture, or hang in the air where it should touch,
 left out; the reasons are kept.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -98,6 +99,20 @@ class Performance:
     refused: tuple[str, ...]
     stop: Stop | None = None
     """Where it ends."""
+
+
+def in_turn(start: Performance, takes: Sequence[Take], end: Performance) -> Performance:
+    """A performance, some takes and another performance, one after the other."""
+    frames = [(take, len(take.posture.pelvis)) for take in takes]
+    labels = [take.label for take, count in frames for _ in range(count)]
+    touched = [take.piece for take, count in frames for _ in range(count)]
+    return Performance(
+        chain([start.posture, *(take.posture for take in takes), end.posture]),
+        (*start.labels, *labels, *end.labels),
+        (*start.touched, *touched, *end.touched),
+        (*start.refused, *end.refused),
+        end.stop,
+    )
 
 
 def perform(
@@ -254,11 +269,16 @@ def _table(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
     hand = int(phase > np.pi)
     piece = stage.pieces[task.piece]
     end = hand_on(stage.person, stop.place, stop.heading, piece, hand)
-    stand = standing(stage.person, stop.place, stop.heading)
-    out = reach_out(end, stand, _shares(stage, REACH_TIME))
     label = ("left", "right")[hand] + " hand"
     still = Take(_still(stage, end, task.seconds, phase, 0.3), label, task.piece)
-    return [Take(out, "reach", task.piece), still, Take(_reversed(out), "reach", task.piece)]
+    return there_and_back(stage, stop, end, still)
+
+
+def there_and_back(stage: Stage, stop: Stop, end: Posture, still: Take) -> list[Take]:
+    """From standing to hands on a top, what is done there, and back."""
+    stand = standing(stage.person, stop.place, stop.heading)
+    out = reach_out(end, stand, _shares(stage, REACH_TIME))
+    return [Take(out, "reach", still.piece), still, Take(_reversed(out), "reach", still.piece)]
 
 
 def _reversed(posture: Posture) -> Posture:

@@ -170,6 +170,19 @@ def table_stand(
     return on_floor(piece, x, z), piece.heading + [np.pi, -np.pi / 2, 0.0, np.pi / 2][side]
 
 
+def bent_over(stand: Posture, heading: float, angle: float, lean: float = 0.0) -> Posture:
+    """One frame of standing, bent forward over a table, and to a side [rad]."""
+    ahead = facing(np.array(heading))
+    back = -np.sin(angle) * np.array([0.25 * ahead[0], 0.05, 0.25 * ahead[1]])
+    return dataclasses.replace(
+        stand,
+        pelvis=stand.pelvis + back[None],
+        turn=stand.turn @ about(X, np.array([0.45 * angle])),
+        spine=stand.spine + angle * np.array([[0.55, 0, lean]]),
+        head=np.array([[-0.3 * angle, 0.0]]),
+    )
+
+
 def hand_on(person: Person, place: np.ndarray, heading: float, piece: Placed, hand: int) -> Posture:
     """One frame of standing, bent as far as needed, one palm (0 left, 1 right) on the top."""
     stand = standing(person, place, heading)
@@ -179,15 +192,7 @@ def hand_on(person: Person, place: np.ndarray, heading: float, piece: Placed, ha
     goal = np.array([flat[0], piece.furniture.top_height + palm_height(person), flat[1]])
 
     def bent(angle: float) -> Posture:
-        move = np.array([0.25 * ahead[0], -0.05, 0.25 * ahead[1]]) * [-1, 1, -1]
-        lean = -0.4 if hand == 0 else 0.4
-        return dataclasses.replace(
-            stand,
-            pelvis=stand.pelvis + np.sin(angle) * move[None],
-            turn=stand.turn @ about(X, np.array([0.45 * angle])),
-            spine=stand.spine + angle * np.array([[0.55, 0, lean]]),
-            head=np.array([[-0.3 * angle, 0.0]]),
-        )
+        return bent_over(stand, heading, angle, -0.4 if hand == 0 else 0.4)
 
     angle = 0.0
     while angle < 1.0 and span(person, bent(angle), hand, goal) > 0.975 * person.arm:

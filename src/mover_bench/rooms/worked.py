@@ -20,19 +20,20 @@ from mover_bench.rooms.motion import (
     Stage,
     Stop,
     Take,
+    in_turn,
     perform,
+    there_and_back,
     walk_to,
 )
 from mover_bench.rooms.moved import candidates, first_draft
 from mover_bench.rooms.placed import Placed
-from mover_bench.rooms.poses import Person, Posture, chain, make_person, rows
+from mover_bench.rooms.poses import Person, Posture, make_person
 from mover_bench.rooms.room import draw_person, draw_start, draw_tasks, late
 from mover_bench.rooms.seating import (
     AWAY,
     HANDS,
-    REACH_TIME,
+    bent_over,
     palm_height,
-    reach_out,
     seat_spot,
     seated,
     settle_down,
@@ -41,7 +42,7 @@ from mover_bench.rooms.seating import (
     table_stand,
 )
 from mover_bench.rooms.truth import approach, faults, gap
-from mover_bench.rooms.turns import X, about, facing, left_of
+from mover_bench.rooms.turns import facing, left_of
 
 TABLES, KNEES = ("table", "desk", "cabinet"), ("table", "desk")  # those with room for knees
 CHAIRS = ("chair", "office chair", "stool")
@@ -102,18 +103,7 @@ def _visit(
     place, heading = table_stand(plan.pieces, index, *_spot(plan.pieces[index], rng))
     stop = Stop(place, heading, place - DOOR * facing(np.array(heading)))
     takes = [walk_to(stage, before.stop, stop), *_leans(stage, index, stop, rng)]
-    after = perform(stage, tasks[half:], stop, rng)
-    count = [len(take.posture.pelvis) for take in takes]
-    told = zip(takes, count, strict=True)
-    labels = tuple(take.label for take, n in told for _ in range(n))
-    touched = tuple(take.piece for take, n in zip(takes, count, strict=True) for _ in range(n))
-    return Performance(
-        chain([before.posture, *(take.posture for take in takes), after.posture]),
-        before.labels + labels + after.labels,
-        before.touched + touched + after.touched,
-        before.refused + after.refused,
-        after.stop,
-    )
+    return in_turn(before, takes, perform(stage, tasks[half:], stop, rng))
 
 
 def _spot(piece: Placed, rng: np.random.Generator) -> tuple[int, float]:
@@ -126,28 +116,14 @@ def _spot(piece: Placed, rng: np.random.Generator) -> tuple[int, float]:
 
 def _leans(stage: Stage, index: int, stop: Stop, rng: np.random.Generator) -> list[Take]:
     """Standing, both palms on a top, and back."""
-    piece, stand = stage.pieces[index], standing(stage.person, stop.place, stop.heading)
-    ahead = facing(np.array(stop.heading))
+    stand = standing(stage.person, stop.place, stop.heading)
 
     def bent(angle: float) -> Posture:
-        back = -np.sin(angle) * np.array([0.25 * ahead[0], 0.05, 0.25 * ahead[1]])
-        return dataclasses.replace(
-            stand,
-            pelvis=stand.pelvis + back[None],
-            turn=stand.turn @ about(X, np.array([0.45 * angle])),
-            spine=stand.spine + angle * np.array([[0.55, 0, 0]]),
-            head=np.array([[-0.3 * angle, 0.0]]),
-        )
+        return bent_over(stand, stop.heading, angle)
 
-    flat = _palms(stop.place + AWAY * ahead, stop.heading, rng)
-    end = both_on(stage.person, bent, flat, piece)
-    share = np.arange(1, round(REACH_TIME * stage.fps) + 1) / round(REACH_TIME * stage.fps)
-    out = reach_out(end, stand, share)
-    takes = [
-        Take(out, "reach", index),
-        Take(_still(end, stage.fps, rng), LABEL, index),
-        Take(rows(out, np.maximum(np.arange(len(share)) - 1, 0)[::-1]), "reach", index),
-    ]
+    flat = _palms(stop.place + AWAY * facing(np.array(stop.heading)), stop.heading, rng)
+    end = both_on(stage.person, bent, flat, stage.pieces[index])
+    takes = there_and_back(stage, stop, end, Take(_still(end, stage.fps, rng), LABEL, index))
     _check(stage, takes)
     return takes
 

@@ -19,7 +19,7 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera, Layout, Objects, People
 from mover.energy.terms.factors import CHAIRS
 from mover.geometry.boxes import iou2d
-from mover.geometry.camera import project, to_camera
+from mover.geometry.camera import at_pixels, project, to_camera
 from mover.geometry.placement import place
 from mover.stages.config import AssignConfig
 from mover.stages.masks import mask_table, small_boxes, small_camera, small_masks
@@ -267,7 +267,8 @@ def _decide(
     if config.by == "release":
         one = decide_by_release(part.points, part.pixels, part.mask, rivals.plain, arms=part.hands)
         return torch.full_like(part.pixels[:, 0], one)
-    over = _inside(rivals.grown, part.pixels)
+    grown, shown = at_pixels(rivals.grown, part.pixels)
+    over = grown & shown
     away, may = _distances(part.points, rivals), _may(objects, hands=part.hands)
     if config.by == "vertex":
         price = torch.where(over & may.unsqueeze(-1), away, torch.full_like(away, torch.inf))
@@ -286,13 +287,6 @@ def _decide(
 def _may(objects: Objects, *, hands: bool) -> Bool[Tensor, " objects"]:
     """Seats take sitters and backs, other tops take hands."""
     return objects.has_top & ~objects.is_seat if hands else objects.is_seat
-
-
-def _inside(masks: Bool[Tensor, "objects h w"], pixels: Int[Tensor, "verts 2"]) -> Tensor:
-    height, width = masks.shape[-2:]
-    x, y = pixels.unbind(-1)
-    shown = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    return masks[:, y.clamp(0, height - 1), x.clamp(0, width - 1)] & shown
 
 
 def _filled(masks: Bool[Tensor, "objects h w"], boxes: Float[Tensor, "objects 4"]) -> Tensor:

@@ -10,7 +10,6 @@ of all of them to the other. What rests on a piece for several belongs to it.
 A proposal is no object: nothing else of the room depends on it until somebody accepts it.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,11 +30,10 @@ from mover.stages.config import ProposeConfig
 from mover.stages.contacts.propose_tables import HandPlace, likeliest_top
 from mover.stages.contacts.resting import (
     LEVEL,
-    LOWEST,
     SAME,
     Kind,
+    Place,
     ProposeInputs,
-    Resting,
     grouped,
     resting_bodies,
 )
@@ -98,21 +96,13 @@ def propose_supports(
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
-    """All rests at one place."""
-
-    rests: Sequence[Resting]
-    inputs: ProposeInputs
+class Group(Place):
+    """All rests at one place that one piece may carry."""
 
     @property
     def is_table(self) -> bool:
         """Hands rest here."""
         return self.rests[0].kind == "hand"
-
-    @property
-    def rows(self) -> Int[Tensor, " rests"]:
-        """Their bodies."""
-        return torch.tensor([rest.row for rest in self.rests])
 
     @cached_property
     def covered(self) -> float:
@@ -130,17 +120,11 @@ class Group:
         return moments * float(gaps.double().median() if len(gaps) else 1.0) / bodies.fps
 
     @cached_property
-    def heights(self) -> Float[Tensor, " rests"]:
-        """Of what touches, over the floor [m]."""
-        low = torch.stack([rest.points[:, 1].quantile(LOWEST) for rest in self.rests])
-        return low - self.inputs.under[self.rows]
-
-    @cached_property
     def middle(self) -> Float[Tensor, "3"]:
         """Of what touches; of the whole body where people lie [m]."""
         if self.lies:
             return self.inputs.bodies.verts[self.rows_of("lie")].mean(1).median(0).values
-        return torch.stack([rest.points.mean(0) for rest in self.rests]).median(0).values
+        return super().middle
 
     def rows_of(self, kind: Kind) -> Int[Tensor, " rests"]:
         """The bodies that rest in one way."""
@@ -242,7 +226,7 @@ Where = tuple[Float[Tensor, "3"], Float[Tensor, ""], Float[Tensor, "3"]]
 
 def _table(group: Group, taken: set[str]) -> Proposal:
     """A piece of the library under the hands of a group."""
-    place = HandPlace(list(group.rests), group.inputs)
+    place = HandPlace(group.rests, group.inputs)
     top = likeliest_top(place)
     seed, piece = _of_height(place.kind, place.height)
     wide, _, deep = piece.size

@@ -13,16 +13,16 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from mover.bodies.posture import at, facing, landmarks
 from mover.furniture.library import SEEDS, STANDARD, make_piece
 from mover.geometry.boxes import beyond
-from mover.geometry.camera import project, to_camera
+from mover.geometry.camera import at_pixels, project, to_camera
 from mover.geometry.rotations import rot_y
-from mover.stages.contacts.resting import LOWEST, ProposeInputs, Resting
+from mover.stages.contacts.resting import Place
 from mover.stages.masks import small_camera
 
 HIGH = 0.84  # [m]: what standing people lean on from here on is a sideboard, not a table
@@ -45,28 +45,14 @@ ENDS = 0.02  # share of the points beyond each end
 Ranges = tuple[Float[Tensor, " n"], Float[Tensor, " n"]]
 
 
-@dataclass(frozen=True)
-class HandPlace:
+@dataclass(frozen=True, eq=False)
+class HandPlace(Place):
     """All hands that rest at one place."""
-
-    rests: list[Resting]
-    inputs: ProposeInputs
-
-    @cached_property
-    def rows(self) -> Int[Tensor, " rests"]:
-        """Their bodies."""
-        return torch.tensor([rest.row for rest in self.rests])
 
     @cached_property
     def seated(self) -> bool:
         """People sit here."""
         return float(self.inputs.pose.sitting[self.rows].float().mean()) > SITS
-
-    @cached_property
-    def heights(self) -> Float[Tensor, " rests"]:
-        """Of the palms, over the floor [m]."""
-        low = torch.stack([rest.points[:, 1].quantile(LOWEST) for rest in self.rests])
-        return low - self.inputs.under[self.rows]
 
     @cached_property
     def kind(self) -> str:
@@ -109,11 +95,6 @@ class HandPlace:
         quarter = ((self._ways - self._axis) / (torch.pi / 2)).round().long() % 4
         most = int(torch.bincount(quarter, minlength=4).argmax())
         return self._axis + most * torch.pi / 2 + torch.pi
-
-    @cached_property
-    def middle(self) -> Float[Tensor, "3"]:
-        """Of all palms [m]."""
-        return torch.stack([rest.points.mean(0) for rest in self.rests]).median(0).values
 
     @cached_property
     def palms(self) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
@@ -259,11 +240,9 @@ def _seen_through(cells: Float[Tensor, "x z 3"], place: HandPlace) -> Bool[Tenso
         return torch.zeros(cells.shape[:2], dtype=torch.bool)
     camera = small_camera(place.inputs.camera)
     points = to_camera(cells, camera.R_cam_world)
-    x, y = project(points, camera.K).long().unbind(-1)
     depth = points[..., 2]
-    shown = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    far = free[y.clamp(0, camera.height - 1), x.clamp(0, camera.width - 1)]
-    return shown & (depth < far * (1 - SLACK[1]) - SLACK[0])
+    far, shown = at_pixels(free, project(points, camera.K).long())
+    return shown & (depth > 0) & (depth < far * (1 - SLACK[1]) - SLACK[0])
 
 
 def _filled(cells: Float[Tensor, "x z 3"], place: HandPlace) -> Bool[Tensor, "x z"]:

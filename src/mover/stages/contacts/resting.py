@@ -4,12 +4,13 @@ A resting body part (a seat, a back that lies, soles above the floor, palms) is 
 top of a known object is within reach, or where it is seen before the mask of one that is not far.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.parts import Parts, members
@@ -27,7 +28,7 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera, Layout, Objects
 from mover.furniture.floor import Floor, height_under_bodies
 from mover.geometry.boxes import Box
-from mover.geometry.camera import project, to_camera
+from mover.geometry.camera import at_pixels, project, to_camera
 from mover.geometry.mesh import vertex_normals
 from mover.geometry.placement import place
 from mover.geometry.rotations import rot_y
@@ -139,6 +140,30 @@ class Resting:
     """What touches [m]."""
     covered: bool
     """Something known carries it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """All rests at one place."""
+
+    rests: Sequence[Resting]
+    inputs: ProposeInputs
+
+    @cached_property
+    def rows(self) -> Int[Tensor, " rests"]:
+        """Their bodies."""
+        return torch.tensor([rest.row for rest in self.rests])
+
+    @cached_property
+    def heights(self) -> Float[Tensor, " rests"]:
+        """Of what touches, over the floor [m]."""
+        low = torch.stack([rest.points[:, 1].quantile(LOWEST) for rest in self.rests])
+        return low - self.inputs.under[self.rows]
+
+    @cached_property
+    def middle(self) -> Float[Tensor, "3"]:
+        """Of what touches [m]."""
+        return torch.stack([rest.points.mean(0) for rest in self.rests]).median(0).values
 
 
 def resting_bodies(inputs: ProposeInputs, config: ProposeConfig) -> list[Resting]:
@@ -288,11 +313,9 @@ def _before(
 ) -> Bool[Tensor, " objects"]:
     """The known objects before whose masks these points are seen."""
     camera = small_camera(inputs.camera)
-    x, y = project(to_camera(points, camera.R_cam_world), camera.K).long().unbind(-1)
-    shown = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    masks = small_masks(inputs.known.masks, inputs.camera)
-    over = masks[:, y.clamp(0, camera.height - 1), x.clamp(0, camera.width - 1)] & shown
-    return over.float().mean(-1) > config.overlap
+    pixels = project(to_camera(points, camera.R_cam_world), camera.K).long()
+    over, shown = at_pixels(small_masks(inputs.known.masks, inputs.camera), pixels)
+    return (over & shown).float().mean(-1) > config.overlap
 
 
 def grouped(rests: list[Resting]) -> list[list[Resting]]:

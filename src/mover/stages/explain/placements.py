@@ -164,13 +164,10 @@ def _tilted(inputs: ExplainInputs, free: Tensor) -> Float[Tensor, "objects 7 7"]
     return by_tilt(layout, priced.camera, priced.ground, tilt) * standing[:, None, None]
 
 
-def _whole(inputs: ExplainInputs, free: Tensor) -> Sequence[Tensor | None]:
+def _whole(inputs: ExplainInputs, free: Tensor) -> Float[Tensor, "objects 7 7"]:
     """What the doubt about scale and lens does to all that is not pinned."""
-    if not (inputs.scale or inputs.focal):
-        return [None] * len(free)
     camera, layout = inputs.priced.camera, inputs.placed.layout
-    added = by_whole(layout, camera, inputs.scale, inputs.focal)
-    return list(added * free[:, 0, None, None])
+    return by_whole(layout, camera, inputs.scale, inputs.focal) * free[:, 0, None, None]
 
 
 def _evidence(inputs: ExplainInputs) -> dict[str, Sequence[Any]]:

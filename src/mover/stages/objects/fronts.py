@@ -45,8 +45,8 @@ def turned_to_people(
     along = torch.tensor([name in WALL_PIECES for name in categories], device=layout.yaw.device)
     if not len(people) or not bool(along.any()):
         return layout
-    turned = [replace(layout, yaw=wrap(layout.yaw + k * math.pi / 2)) for k in range(4)]
-    faces = torch.stack([facing(one, people) for one in turned])
+    quarters = torch.arange(4, device=layout.yaw.device)[:, None] * (math.pi / 2)
+    yaws = wrap(layout.yaw + quarters)
+    faces = torch.stack([facing(replace(layout, yaw=yaw), people) for yaw in yaws])
     best = torch.where(along & (faces[0] < BEHIND), faces.argmax(0), 0)
-    yaws = torch.stack([one.yaw for one in turned])
     return replace(layout, yaw=yaws.gather(0, best[None])[0])
