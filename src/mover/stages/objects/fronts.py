@@ -45,8 +45,7 @@ def turned_to_people(
     along = torch.tensor([name in WALL_PIECES for name in categories], device=layout.yaw.device)
     if not len(people) or not bool(along.any()):
         return layout
-    quarters = torch.arange(4, device=layout.yaw.device)[:, None] * (math.pi / 2)
-    yaws = wrap(layout.yaw + quarters)
+    yaws = torch.stack([wrap(layout.yaw + k * math.pi / 2) for k in range(4)])
     faces = torch.stack([facing(replace(layout, yaw=yaw), people) for yaw in yaws])
     best = torch.where(along & (faces[0] < BEHIND), faces.argmax(0), 0)
     return replace(layout, yaw=yaws.gather(0, best[None])[0])
