@@ -6,12 +6,20 @@ import math
 import numpy as np
 import pytest
 import torch
+import trimesh
 from furnished import furnished
 from little_room import camera
 
-from mover.core.types import SceneObject
+from mover.core.types import Mesh, SceneObject
 from mover.evaluate.evaluation import evaluate
-from mover.evaluate.scene import Pair, add_s, add_s_01, icp_rotation, yaw_error
+from mover.evaluate.scene import (
+    Pair,
+    add_s,
+    add_s_01,
+    icp_rotation,
+    yaw_error,
+    yaw_error_symmetric,
+)
 from mover.evaluate.surfaces import add_s as share_of
 from mover.evaluate.surfaces import diameter, icp_turn
 
@@ -68,6 +76,52 @@ def test_a_round_thing_needs_no_turn_whatever_its_front_is_called():
     assert icp_turn(turned, disc) < 0.1
     (chair,) = furnished(("chair",)).objects
     assert yaw_error(pair(moved(chair, yaw=0.6), chair)) == pytest.approx(0.6)
+
+
+def shaped(category: str, mesh: Mesh) -> SceneObject:
+    (like,) = furnished(("table",)).objects
+    return dataclasses.replace(like, category=category, mesh=mesh)
+
+
+def box_mesh(width: float, depth: float, turn: float = 0.0) -> Mesh:
+    """A box by trimesh, turned in its own frame."""
+    made = trimesh.creation.box((width, 0.7, depth))
+    made.apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 1, 0]))
+    return Mesh(torch.from_numpy(made.vertices).float(), torch.from_numpy(made.faces).long())
+
+
+def test_sides_that_look_alike_are_no_error():
+    round_top = trimesh.creation.cylinder(0.5, 0.7, sections=72)
+    round_top.apply_transform(trimesh.transformations.rotation_matrix(math.pi / 2, [1, 0, 0]))
+    disc = Mesh(
+        torch.from_numpy(np.array(round_top.vertices)).float(),
+        torch.from_numpy(np.array(round_top.faces)).long(),
+    )
+    long, square = box_mesh(1.6, 0.8), box_mesh(0.9, 0.9)
+    for turn in (0.1, math.pi / 2 + 0.1, math.pi - 0.1, -math.pi / 2):
+        error = {
+            name: yaw_error_symmetric(pair(moved(p, yaw=turn), p))
+            for name, p in {
+                "disc": shaped("table", disc),
+                "square": shaped("side table", square),
+                "long": shaped("table", long),
+                "cabinet": shaped("cabinet", long),
+            }.items()
+        }
+        assert error["disc"] == 0
+        assert error["square"] == pytest.approx(0.1 if abs(turn) != math.pi / 2 else 0, abs=1e-5)
+        half = min(abs(turn), math.pi - abs(turn))
+        assert error["long"] == pytest.approx(half, abs=1e-5)
+        assert error["cabinet"] == pytest.approx(abs(turn), abs=1e-5)  # it has a front
+
+
+def test_a_table_with_one_shelf_is_turned_by_half_a_circle():
+    top, side = trimesh.creation.box((1.6, 0.05, 0.8)), trimesh.creation.box((0.05, 0.7, 0.8))
+    side.apply_translation([0.7, -0.35, 0])
+    both = trimesh.util.concatenate([top, side])
+    mesh = Mesh(torch.from_numpy(both.vertices).float(), torch.from_numpy(both.faces).long())
+    piece = shaped("table", mesh)
+    assert yaw_error_symmetric(pair(moved(piece, yaw=3.0), piece)) == pytest.approx(3.0)
 
 
 def test_a_missing_object_counts_in_the_share():

@@ -3,6 +3,7 @@
 Objects are compared in the gravity-aligned world of their own scene (docs/metrics.md).
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from torch import Tensor
 from mover.core.records import record
 from mover.core.types import Camera, Mesh, Scene, SceneObject
 from mover.evaluate import surfaces
-from mover.furniture.library import canonical
+from mover.furniture.library import FRONTLESS, canonical
 from mover.geometry.boxes import Box, box_of, corners
 from mover.geometry.boxes import iou2d as rectangle_iou
 from mover.geometry.boxes import iou3d as box_iou
@@ -106,6 +107,20 @@ def yaw_error(pair: Pair) -> float:
     return float(wrap(pair.estimate.yaw - pair.truth.yaw).abs())
 
 
+def yaw_error_symmetric(pair: Pair) -> float:
+    """`yaw_error`, after those turns under which a true piece without a front looks the same."""
+    if canonical(pair.truth.category) not in FRONTLESS:
+        return yaw_error(pair)
+    own = dataclasses.replace(pair.truth, yaw=torch.zeros_like(pair.truth.yaw))
+    mesh = place_object(own)
+    fold = surfaces.folds(area_samples(mesh, surfaces.ICP_POINTS), mesh)
+    if fold == surfaces.FOLDS[0]:
+        return 0.0
+    step = 2 * math.pi / fold
+    off = yaw_error(pair)
+    return abs(off - step * round(off / step))
+
+
 def center_error(pair: Pair) -> float:
     """Distance between the centres of the two boxes [m]."""
     return float((box_of(pair.estimate).center - box_of(pair.truth).center).norm())
@@ -153,6 +168,7 @@ OBJECT_METRICS: dict[str, Metric[Pair]] = {
     "iou2d": Metric("", 1.0, iou2d),
     "p2s": Metric("m", 0.0, p2s),
     "yaw_error": Metric("rad", 0.0, yaw_error),
+    "yaw_error_symmetric": Metric("rad", 0.0, yaw_error_symmetric),
     "center_error": Metric("m", 0.0, center_error),
     "size_error": Metric("m", 0.0, size_error),
     "add_s": Metric("", 0.0, add_s),

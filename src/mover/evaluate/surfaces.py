@@ -4,16 +4,23 @@ Sources: ADD-S is that of PoseCNN (Xiang et al. 2018), taken in both directions 
 the diameter, with the share of objects below 0.1 (SAM 3D, 2025, whose ICP-Rot is `icp_turn`).
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mover.geometry.nearest import nearest_points
+from mover.core.types import Mesh
+from mover.geometry.nearest import nearest_points, to_surface
+from mover.geometry.rotations import rot_y
 
 POINTS = 1000  # of each surface
 ICP_POINTS, STEPS = 400, 25
 SETTLED = 1e-5  # [rad], a step of ICP that turns less is the last
 CLOSE = 0.1  # of the diameter
+ALIKE = 0.02  # of the diameter, by which a turned surface may be off and still look the same ...
+MOST = 0.98  # ... at so many of its points
+FOLDS = (16, 4, 2)  # turns by a whole circle over these are tried; the first counts as round
 
 
 def add_s(estimate: Float[Tensor, "points 3"], truth: Float[Tensor, "true 3"]) -> float:
@@ -21,6 +28,27 @@ def add_s(estimate: Float[Tensor, "points 3"], truth: Float[Tensor, "true 3"]) -
     away, _ = nearest_points(estimate, truth)
     back, _ = nearest_points(truth, estimate)
     return float((away.mean() + back.mean()) / 2) / max(diameter(truth), 1e-9)
+
+
+def folds(points: Float[Tensor, "points 3"], mesh: Mesh) -> int:
+    """How many turns about the vertical through the box's middle leave a surface as it is.
+
+    Args:
+        points: On the surface [m].
+        mesh: The surface.
+
+    Returns:
+        One of `FOLDS`, or 1: it looks the same after a whole circle only.
+    """
+    used = mesh.verts[mesh.faces.unique()]
+    middle = (used.amin(0) + used.amax(0)) / 2
+    limit = ALIKE * diameter(points)
+    for fold in FOLDS:
+        turn = rot_y(torch.tensor(2 * math.pi / fold)).to(points)
+        turned = (points - middle) @ turn.mT + middle
+        if float(to_surface(turned, mesh.verts, mesh.faces).quantile(MOST)) < limit:
+            return fold
+    return 1
 
 
 def diameter(points: Float[Tensor, "points 3"]) -> float:

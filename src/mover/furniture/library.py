@@ -153,6 +153,9 @@ BEDS = frozenset({"bed", "sofa"})
 WALL_PIECES = frozenset({"sofa", "bed", "desk", "shelf", "cabinet", "wardrobe", "nightstand"})
 """Classes that usually stand with their back to a wall."""
 
+FRONTLESS = frozenset({"table", "coffee table", "stool", "bench", "floor lamp"})
+"""Classes of which no side is the front, so that their shapes alone tell turns apart."""
+
 
 def canonical(category: str) -> str:
     """The class that `category` names, without case; unknown names are kept in lower case."""

@@ -36,6 +36,7 @@ COLUMNS: dict[str, Column] = {
     "contact": Column("Cont.", 0),
     "contact_f1": Column("contact F1"),
     "yaw_error": Column("yaw", -1, "°", DEGREES, 1),
+    "yaw_error_symmetric": Column("yaw, alike sides aside", -1, "°", DEGREES, 1),
     "center_error": Column("centre", -1, "cm", 100, 1),
     "size_error": Column("size", -1, "cm", 100, 1),
     "worse_by_10cm": Column("worse by > 10 cm", -1, "%", 100, 1),

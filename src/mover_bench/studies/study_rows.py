@@ -327,8 +327,9 @@ def motion(ask: Ask) -> Sequence[Table]:
     return [Table("How people move", MOVES, tuple(rows), against, note=note)]
 
 
-UPSTREAM = ("iou3d", "iou3d_aligned", "p2s", "iou2d", "center_error", "yaw_error", "size_error",
-           "worse_by_10cm", "worse_by_50cm", "contact_f1", "tilt")  # fmt: skip
+UPSTREAM = ("iou3d", "iou3d_aligned", "p2s", "iou2d", "center_error", "yaw_error",
+           "yaw_error_symmetric", "size_error", "worse_by_10cm", "worse_by_50cm", "contact_f1",
+           "tilt")  # fmt: skip
 
 
 def upstream(ask: Ask) -> Sequence[Table]:

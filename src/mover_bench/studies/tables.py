@@ -33,6 +33,7 @@ SHOWN: dict[str, Column] = {
             "p2s",
             "iou2d",
             "yaw_error",
+            "yaw_error_symmetric",
             "center_error",
             "size_error",
             "worse_by_10cm",
@@ -49,7 +50,7 @@ SHOWN: dict[str, Column] = {
     "ground_error": Column("ground", -1, "cm", 100, 1),
 }
 """Metrics of the tables, in their order."""
-FEW = tuple(SHOWN)[:8]
+FEW = tuple(SHOWN)[:9]
 """Metrics of objects."""
 COUNTED = {"turned": "turned > 45° ↓", "bad": "IoU3D < .25 ↓"}
 """How many objects are so."""

@@ -38,6 +38,7 @@ QUANTITIES = {
     "p2s": Quantity("True surface to estimated surface", *_CM),
     "center_error": Quantity("Error of the centre", *_CM, short="Centre error"),
     "yaw_error": Quantity("Error of the orientation", *_DEG),
+    "yaw_error_symmetric": Quantity("Error of the orientation, alike sides aside", *_DEG),
     "size_error": Quantity("Error of the size", *_CM),
     "add_s": Quantity("Distance of the surfaces, of the diameter (ADD-S)", *_PERCENT),
     "add_s_01": Quantity("Objects within a tenth of their diameter", *_PERCENT, True),
