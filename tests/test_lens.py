@@ -24,6 +24,7 @@ from mover.stages.camera.room_lines import (
     RoomPose,
     Segments,
     _angles,
+    _lean,
     find_segments,
     fit_room,
 )
@@ -145,6 +146,42 @@ def test_slopes_are_those_of_the_angles():
     wanted = torch.autograd.functional.jacobian(angles, at)
     _, slope = _angles(segments, RoomPose(torch.tensor([math.log(700)]).double(), R))
     assert torch.allclose(slope, wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("plane", [False, True])
+def test_slopes_are_those_of_the_way_up(plane: bool):
+    from mover.geometry.rotations import axis_angle
+
+    R = tilted(torch.tensor(-0.2), torch.tensor(0.1)).double()[None]
+    up = tilted(torch.tensor(-0.25), torch.tensor(0.05)).double()[:, 1]
+    prior = Prior(math.log(700), 0.05, up, 0.1, plane)
+
+    def lean(x: torch.Tensor):
+        pose = RoomPose(math.log(730) + x[:1], axis_angle(x[1:])[None] @ R)
+        return _lean(prior, pose)[0]
+
+    at = torch.zeros(4, dtype=torch.float64)
+    wanted = torch.autograd.functional.jacobian(lean, at)[0]
+    _, slope = _lean(prior, RoomPose(torch.tensor([math.log(730)]).double(), R))
+    assert torch.allclose(slope[0].mT, wanted, atol=1e-8)
+
+
+@pytest.mark.parametrize("zoom", [0.93, 1.08])
+def test_a_floor_under_feet_is_as_steep_as_the_lens_makes_it(zoom: float):
+    """People are as many times too far as the lens is too long, and so their floor leans."""
+    true = camera_of(FOCAL)
+    rng = np.random.default_rng(0)
+    R = true.R_cam_world.double()
+    soles = torch.from_numpy(rng.uniform([-2, -1.5, -6], [2, -1.5, -2], (40, 3))) @ R.mT
+    soles = soles * torch.tensor([1, 1, zoom])  # as a tool sees them under the wrong lens
+    middle = soles - soles.mean(0)
+    normal = torch.linalg.svd(middle).Vh[2]
+    normal = normal * (normal @ R[:, 1]).sign()
+    pose = RoomPose(torch.tensor([math.log(FOCAL)]).double(), R[None])
+    seen = Prior(math.log(zoom * FOCAL), 0.05, normal, 0.01, up_is_plane=True)
+    assert float(_lean(seen, pose)[0].norm()) < 1e-6
+    fixed = dataclasses.replace(seen, up_is_plane=False)
+    assert float(_lean(fixed, pose)[0].norm()) > 0.01
 
 
 def test_the_whole_camera_is_found_in_exact_lines():

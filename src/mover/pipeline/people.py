@@ -49,7 +49,8 @@ def through_its_lens(
         spread = people.alignment.covariance.diag()[:2].amax()
         tilt = min(tilt, math.hypot(config.lens.feet, float(spread) ** 0.5))
     segments = find_segments(picture, people_in_reference(capture), camera.K[:2, 2])
-    inputs = LensInputs(segments, camera, capture.focal_spread, tilt)
+    by_feet = people is not None
+    inputs = LensInputs(segments, camera, capture.focal_spread, tilt, by_feet)
     lens = run.stage(find_lens, inputs, config.lens)
     told = replace(capture, warnings=(*capture.warnings, *lens.warnings), tilt=lens.tilt)
     if capture.focal_spread or lens.zoom != 1:

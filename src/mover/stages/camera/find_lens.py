@@ -45,6 +45,8 @@ class LensInputs:
     """What is said of the focal length; None: nothing."""
     tilt_spread: float
     """How far off pitch and roll are [rad]."""
+    by_feet: bool = False
+    """Whether they are those of a floor on which feet rest, at depths under this focal length."""
 
 
 @record
@@ -68,7 +70,7 @@ def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent
     spread = config.spread if declared is None else max(declared, MEASURED)
     up = camera.R_cam_world[:, 1].double().cpu()
     focal = float(camera.K[0, 0].double().log())
-    prior = Prior(focal, spread, up, inputs.tilt_spread)
+    prior = Prior(focal, spread, up, inputs.tilt_spread, inputs.by_feet)
     ends = fit_room(inputs.segments, prior, camera.R_cam_world)
     observe(Step("find_lens", 0, 1))
     told, tilt = _told(ends, focal, spread), _tilt(ends, inputs.tilt_spread)

@@ -18,9 +18,9 @@ from torch import Tensor
 from mover.core.records import record
 from mover.geometry.rotations import axis_angle, rot_y
 
-SHORTEST = 0.04  # of the picture's diagonal: shorter segments are no edges of a room
+SHORTEST = 0.02  # of the picture's diagonal: shorter segments are no edges of a room
 MOST = 400  # the longest segments
-END = 0.5  # [px] by which the end of a segment is off
+END = 0.3  # [px] by which the end of a segment is off
 BENT = 0.001  # [rad] edges are not straighter and not more parallel than that
 FREE = 0.5  # share of segments that belong to no direction
 ALONG, ASIDE = 0.05, 0.02  # [rad], of the width: segments that are one edge, or its two sides
@@ -60,9 +60,12 @@ class Prior:
     log_focal: float
     focal_spread: float
     up: Float[Tensor, "3"]
-    """In camera axes."""
+    """In camera axes, under this focal length."""
     up_spread: float
     """[rad]"""
+    up_is_plane: bool = False
+    """Whether `up` is the normal of a floor under people: as many times longer the lens is, as many
+    times farther are they, and so less steep is the floor."""
 
 
 @record
@@ -190,16 +193,30 @@ def _quadratic(
     gradient = torch.einsum("skn,skn,sknp->sp", weight, angle, slope)
     hessian = torch.einsum("skn,sknp,sknq->spq", weight, slope, slope)
     off = pose.log_focal - prior.log_focal
-    up = pose.R_cam_room[:, :, 1]
-    lean = up - prior.up.to(up)
-    turn = torch.linalg.cross(torch.eye(3, dtype=up.dtype).expand(len(up), 3, 3), up[:, None])
+    lean, change = _lean(prior, pose)
     tight = prior.up_spread**-2
     cost = cost + 0.5 * (off / prior.focal_spread).square() + 0.5 * tight * lean.square().sum(-1)
     gradient[:, 0] += off / prior.focal_spread**2
-    gradient[:, 1:] += tight * torch.einsum("spi,si->sp", turn, lean)
+    gradient += tight * torch.einsum("spi,si->sp", change, lean)
     hessian[:, 0, 0] += prior.focal_spread**-2
-    hessian[:, 1:, 1:] += tight * turn @ turn.mT + 1e-9 * torch.eye(3, dtype=up.dtype)
+    hessian += tight * change @ change.mT + 1e-9 * torch.eye(4, dtype=off.dtype)
     return cost, gradient, hessian
+
+
+def _lean(
+    prior: Prior, pose: RoomPose
+) -> tuple[Float[Tensor, "starts 3"], Float[Tensor, "starts 4 3"]]:
+    """How far up is from where it was said to be, and its slope in the four unknowns."""
+    up = pose.R_cam_room[:, :, 1]
+    said, change = prior.up.to(up).expand(len(up), 3).clone(), torch.zeros_like(up)
+    if prior.up_is_plane:
+        said[:, 2] *= (prior.log_focal - pose.log_focal).exp()
+        change[:, 2] = -said[:, 2]
+    length = said.norm(dim=-1, keepdim=True)
+    said = said / length
+    steeper = (change - (change * said).sum(-1, keepdim=True) * said) / length
+    turn = torch.linalg.cross(torch.eye(3, dtype=up.dtype).expand(len(up), 3, 3), up[:, None])
+    return up - said, torch.cat([-steeper[:, None], turn], 1)
 
 
 def _angles(
