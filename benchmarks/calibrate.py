@@ -1,14 +1,14 @@
 """Are stated doubts true? Learns their factors on some known rooms, and tests them on others.
 
-    python benchmarks/calibrate.py --learn 100-117 --check 118-129 --write
+    python benchmarks/calibrate.py --learn 100-107 --check 108-111 --write
 
-rebuilds the rooms with true meshes and with wrong ones (jobs of `mover experiment` on the sets
-`rooms` and `wrong-shape`; what is finished in `--out` is not done again), prints how many values
+rebuilds the rooms with true meshes, with wrong ones and with inputs of today's tools (jobs of
+`mover experiment` on `rooms`, `wrong-shape` and `upstream`, or `--sets`; what is finished in
+`--out` is not done again), prints how many values
 the 90 % ranges hold, how wide they are and whether their widths rank with the errors, in each room
 learnt on with what the others teach and in those to check, and with `--write` replaces
 `src/mover/evaluate/calibration.json`. Rooms 0-9 and from 1000 on are for results: nothing is learnt
-on them. `--learn "" --check 1000-1029` tests what the package holds on the held-out rooms, and
-`--sets upstream` on the inputs of today's tools.
+on them. `--learn "" --check 1000-1029` tests what the package holds on the held-out rooms.
 """
 
 import argparse
@@ -49,7 +49,8 @@ from mover_bench.studies.queue import open_jobs, run_all, start
 from mover_bench.studies.run import parse_seeds
 from mover_bench.studies.sets import set_named
 
-USED = ("rooms", "wrong-shape")  # true meshes, and meshes of other pieces; all have one truth
+USED = ("rooms", "wrong-shape", "upstream")
+"""True meshes, meshes of other pieces, and all as today's tools give it; all have one truth."""
 HEAD = (
     "| | values | held by 90 % ranges | median width | best constant width | Spearman |",
     "| --- | --: | --: | --: | --: | --: |",
@@ -171,17 +172,17 @@ def main() -> None:
         groups = finished(parse_seeds(args.check), asked, args.sets)
         print(tables(groups, [calibration] * len(groups), args.sets))
     if args.write:
-        write(form, calibration, args.learn)
+        write(form, calibration, f"{args.learn} --sets {' '.join(args.sets)}")
 
 
-def write(form: str, calibration: Calibration, seeds: str) -> None:
+def write(form: str, calibration: Calibration, learnt_on: str) -> None:
     """Put the factors of one form of the prices into the package."""
     tree = json.loads(ASSET.read_text()) | {"format": FORMAT, "version": VERSION}
     tree["forms"][form] = {
         "factors": {kind: round(f, 4) for kind, f in calibration.factors.items()},
         "powers": dict(calibration.powers),
         "share": round(calibration.share, 4),
-        "command": f"python benchmarks/calibrate.py --learn {seeds} --write",
+        "command": f"python benchmarks/calibrate.py --learn {learnt_on} --write",
     }
     with replacing(ASSET) as part:
         part.write_text(json.dumps(tree, indent=1) + "\n")
