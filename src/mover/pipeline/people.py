@@ -27,7 +27,7 @@ from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens
 from mover.stages.camera.find_scale import ScaleInputs, find_scale
-from mover.stages.camera.room_lines import find_segments
+from mover.stages.camera.room_lines import FINE, SURE, find_segments
 from mover.stages.cover import hiding
 from mover.stages.objects.find_image_cues import image_evidence, people_in_reference
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
@@ -48,8 +48,9 @@ def through_its_lens(
         camera = replace(camera, R_cam_world=people.alignment.camera.R_cam_world)
         spread = people.alignment.covariance.diag()[:2].amax()
         tilt = min(tilt, math.hypot(config.lens.feet, float(spread) ** 0.5))
-    segments = find_segments(picture, people_in_reference(capture), camera.K[:2, 2])
-    by_feet = people is not None
+    guessed, hidden = bool(capture.focal_spread), people_in_reference(capture)
+    segments = find_segments(picture, hidden, camera.K[:2, 2], FINE if guessed else SURE)
+    by_feet = guessed and people is not None
     inputs = LensInputs(segments, camera, capture.focal_spread, tilt, by_feet)
     lens = run.stage(find_lens, inputs, config.lens)
     told = replace(capture, warnings=(*capture.warnings, *lens.warnings), tilt=lens.tilt)

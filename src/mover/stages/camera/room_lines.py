@@ -18,9 +18,10 @@ from torch import Tensor
 from mover.core.records import record
 from mover.geometry.rotations import axis_angle, rot_y
 
-SHORTEST = 0.02  # of the picture's diagonal: shorter segments are no edges of a room
 MOST = 400  # the longest segments
-END = 0.3  # [px] by which the end of a segment is off
+FINE, SURE = (0.02, 0.3), (0.04, 0.5)
+"""Of the picture's diagonal, shorter segments are left out; [px], by which their ends are off: what
+is best where a lens was guessed, and what may contradict a lens of which nothing is said."""
 BENT = 0.001  # [rad] edges are not straighter and not more parallel than that
 FREE = 0.5  # share of segments that belong to no direction
 ALONG, ASIDE = 0.05, 0.02  # [rad], of the width: segments that are one edge, or its two sides
@@ -83,6 +84,7 @@ def find_segments(
     picture: Float[Tensor, "h w 3"],
     hidden: Bool[Tensor, "h w"] | None,
     centre: Float[Tensor, "2"],
+    fineness: tuple[float, float] = FINE,
 ) -> Segments:
     """The longest straight edges of a picture.
 
@@ -90,15 +92,17 @@ def find_segments(
         picture: In [0, 1].
         hidden: What is no room: segments with their middle there are left out.
         centre: The principal point [px].
+        fineness: `FINE` or `SURE`.
     """
     import cv2  # here: it takes a tenth of a second, and only this needs it
 
+    shortest, end = fineness
     grey = (picture.mean(-1) * 255).round().to(torch.uint8).cpu().numpy()
     found: Any = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
     ends = np.zeros((0, 4)) if found is None else np.asarray(found, np.float64)
     lines = torch.from_numpy(ends).reshape(-1, 2, 2) + 0.5  # pixel centres are at halves
     length = (lines[:, 1] - lines[:, 0]).norm(dim=-1)
-    keep = length > SHORTEST * float(np.hypot(*grey.shape))
+    keep = length > shortest * float(np.hypot(*grey.shape))
     if hidden is not None:
         x, y = lines.mean(1).long().unbind(-1)
         keep &= ~hidden[y.clamp(0, grey.shape[0] - 1), x.clamp(0, grey.shape[1] - 1)].cpu()
@@ -107,7 +111,7 @@ def find_segments(
     lines, length = lines[rows], length[rows]
     middle = lines.mean(1)
     along = (lines[:, 1] - lines[:, 0]) / length[:, None]
-    error = ((2 * END / length).square() + BENT**2).sqrt()
+    error = ((2 * end / length).square() + BENT**2).sqrt()
     vote = 1 / _sides(middle, along, length, ASIDE * grey.shape[1])
     return Segments(middle - centre.double().cpu(), along, error, vote)
 
