@@ -4,11 +4,11 @@
 
 rebuilds the rooms with true meshes, with wrong ones and with inputs of today's tools (jobs of
 `mover experiment` on `rooms`, `wrong-shape` and `upstream`, or `--sets`; what is finished in
-`--out` is not done again), prints how many values
-the 90 % ranges hold, how wide they are and whether their widths rank with the errors, in each room
-learnt on with what the others teach and in those to check, and with `--write` replaces
-`src/mover/evaluate/calibration.json`. Rooms 0-9 and from 1000 on are for results: nothing is learnt
-on them. `--learn "" --check 1000-1029` tests what the package holds on the held-out rooms.
+`--out` is not done again), prints how many values the 90 % ranges hold, how wide they are and
+whether their widths rank with the errors, in each room learnt on with what the others teach and in
+those to check, and with `--write` replaces `src/mover/evaluate/calibration.json`. Rooms 0-9 and
+from 1000 on are for results: nothing is learnt on them. `--learn "" --check 1000-1029` tests what
+the package holds on the held-out rooms.
 """
 
 import argparse

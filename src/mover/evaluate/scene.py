@@ -3,7 +3,6 @@
 Objects are compared in the gravity-aligned world of their own scene (docs/metrics.md).
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -109,15 +108,13 @@ def yaw_error(pair: Pair) -> float:
 
 def yaw_error_symmetric(pair: Pair) -> float:
     """`yaw_error`, after those turns under which a true piece without a front looks the same."""
-    if canonical(pair.truth.category) not in FRONTLESS:
-        return yaw_error(pair)
-    own = dataclasses.replace(pair.truth, yaw=torch.zeros_like(pair.truth.yaw))
-    mesh = place_object(own)
-    fold = surfaces.folds(area_samples(mesh, surfaces.ICP_POINTS), mesh)
+    off, truth = yaw_error(pair), pair.truth
+    if canonical(truth.category) not in FRONTLESS:
+        return off
+    fold = surfaces.folds(pair.points[1], place_object(truth), box_of(truth).center)
     if fold == surfaces.FOLDS[0]:
         return 0.0
     step = 2 * math.pi / fold
-    off = yaw_error(pair)
     return abs(off - step * round(off / step))
 
 

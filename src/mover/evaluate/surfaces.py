@@ -30,18 +30,17 @@ def add_s(estimate: Float[Tensor, "points 3"], truth: Float[Tensor, "true 3"]) -
     return float((away.mean() + back.mean()) / 2) / max(diameter(truth), 1e-9)
 
 
-def folds(points: Float[Tensor, "points 3"], mesh: Mesh) -> int:
-    """How many turns about the vertical through the box's middle leave a surface as it is.
+def folds(points: Float[Tensor, "points 3"], mesh: Mesh, middle: Float[Tensor, "3"]) -> int:
+    """How many turns about the vertical through its middle leave a surface as it is.
 
     Args:
         points: On the surface [m].
         mesh: The surface.
+        middle: Of its box [m].
 
     Returns:
         One of `FOLDS`, or 1: it looks the same after a whole circle only.
     """
-    used = mesh.verts[mesh.faces.unique()]
-    middle = (used.amin(0) + used.amax(0)) / 2
     limit = ALIKE * diameter(points)
     for fold in FOLDS:
         turn = rot_y(torch.tensor(2 * math.pi / fold)).to(points)
