@@ -26,7 +26,7 @@ from mover.app.results import Origin
 from mover.core.types import Scene
 from mover.evaluate.evaluation import EvaluatedBodies, evaluate
 from mover.evaluate.scene import SIDES
-from mover.furniture.library import canonical, catalogue
+from mover.furniture.library import WIDE_CLASSES, canonical, catalogue
 from mover.geometry.camera import to_camera, to_world
 from mover.geometry.placement import place_object
 from mover.geometry.raster import Crops, Topology, look
@@ -36,7 +36,6 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.meshes import write_mesh
-from mover.perceive.layout import WIDE_CLASSES
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise

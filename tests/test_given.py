@@ -125,6 +125,27 @@ def test_standard_sizes_pull_what_they_know_and_leave_the_rest() -> None:
     assert float(best[2].abs().max()) < 1e-4
 
 
+@pytest.mark.parametrize(
+    ("category", "size", "expected"),
+    [
+        ("table", (1.1, 0.43, 0.6), 0.42),  # a coffee table, which detectors call a dining table
+        ("table", (1.1, 0.65, 0.6), 0.74),
+        ("table", (1.1, 0.20, 0.6), None),  # neither
+        ("sofa", (1.7, 1.40, 0.9), None),
+        ("cabinet", (1.1, 0.8, 0.6), None),  # has no other name, and no standard height
+    ],
+)
+def test_the_standard_of_another_class_of_the_same_name_counts_where_its_own_is_contradicted(
+    category: str, size: tuple[float, float, float], expected: float | None
+) -> None:
+    standard, precision = standard_sizes(boxes_of((category,), [size]))
+    if expected is None:
+        assert float(precision[0, 1]) == 0
+    else:
+        assert float(standard[0, 1]) == pytest.approx(math.log(expected / size[1]), abs=1e-5)
+        assert float(precision[0, 1]) > 0
+
+
 def minimum(layout_of: Callable[[Tensor], Layout], given: Given) -> Tensor:
     """Logarithms of sizes of least cost, by a naive descent."""
     sizes = torch.zeros(len(given.yaw), 3, requires_grad=True)

@@ -11,11 +11,10 @@ from test_given import somewhere
 
 from mover.bodies.parts import parts_of
 from mover.core.types import Layout
-from mover.energy.terms.given import SIZE
+from mover.energy.terms.given import COMMON, SIZE
 from mover.furniture.floor import Floor
 from mover.stages.objects.gather_given import gather_given
 from mover.stages.objects.room_scale import (
-    COMMON,
     FITTED,
     ScaleKnown,
     _cost_of_sizes,

@@ -137,6 +137,13 @@ SYNONYMS: dict[str, str] = {
 }  # fmt: skip
 """Other names of the classes."""
 
+WIDE_CLASSES: dict[str, tuple[str, ...]] = {
+    "dining table": ("table", "coffee table", "desk"),
+    "couch": ("sofa", "armchair"),
+    "chair": ("chair", "armchair", "office chair", "stool"),
+}
+"""What detectors have one name for (COCO's), the likeliest first."""
+
 STEP = "step"
 SEATS = frozenset({"chair", "armchair", "office chair", "sofa", "stool", "bench", "bed"})
 """Classes that may take a sitter."""

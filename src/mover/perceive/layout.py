@@ -23,7 +23,7 @@ from mover.core.records import record
 from mover.core.run import Run
 from mover.core.types import Camera, Detection, Layout, Mesh, Scene, SceneObject
 from mover.energy.objective import HumanCues, ImageCues
-from mover.furniture.library import canonical, catalogue, choose_piece
+from mover.furniture.library import WIDE_CLASSES, canonical, catalogue, choose_piece
 from mover.geometry.mesh import box, used
 from mover.geometry.raster import Crops
 from mover.io.files.fields import At
@@ -40,13 +40,6 @@ from mover.stages.objects.prepare_objects import (
     prepare_objects,
     to_objects,
 )
-
-WIDE_CLASSES = {
-    "dining table": ("table", "coffee table", "desk"),
-    "couch": ("sofa", "armchair"),
-    "chair": ("chair", "armchair", "office chair", "stool"),
-}
-"""COCO has one name for what the library tells apart."""
 
 OTHER_SIZES: dict[str, tuple[float, float, float]] = {
     "refrigerator": (0.70, 1.70, 0.70), "oven": (0.60, 0.90, 0.60), "toilet": (0.40, 0.78, 0.66),

@@ -32,6 +32,7 @@ FLIPPED = 0.1  # share of yaws that are off by a further quarter or half turn
 TURNS = 1.0  # largest weight that counts for yaws
 ANY = 0.01  # and of those that are off by anything
 SIZE = 0.1  # of the logarithm of each given size
+COMMON = 0.06  # error that the three given sizes of an object have in common, as a logarithm
 
 
 @record

@@ -11,8 +11,8 @@ from torch import Tensor
 from mover.core.types import Layout, Objects
 from mover.energy.terms.bbox import LEAST, LIKELY, SEEN
 from mover.energy.terms.contact import ContactPoints
-from mover.energy.terms.given import TURN, Given
-from mover.furniture.library import STANDARD, WALL_PIECES
+from mover.energy.terms.given import COMMON, SIZE, TURN, Given
+from mover.furniture.library import STANDARD, WALL_PIECES, WIDE_CLASSES, canonical
 
 FIT = 0.1  # image energy (robust form) of a shape that fits
 PART, WHOLE = 0.2, 0.9  # shares of a side that something is near to, or touches
@@ -21,6 +21,7 @@ WEIGHTS = (0.05, 2.0)  # least and largest weight
 LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of 1 [rad]
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
+CONTRADICTED = 3.0  # standard deviations between a given and a standard size, of another class
 DIRECTIONS = 90  # that are tried within a quarter turn
 
 
@@ -97,13 +98,22 @@ def believed_sides(
 def standard_sizes(
     objects: Objects,
 ) -> tuple[Float[Tensor, "objects 3"], Float[Tensor, "objects 3"]]:
-    """Logarithms of the standard sizes over those of the meshes, and how well they are known."""
+    """Logarithms of the standard sizes over those of the meshes, and how well they are known.
+
+    Detectors call a coffee table a dining table. So of the classes that have one name the first
+    counts whose standard the given size does not contradict, and none where all are contradicted.
+    """
     usual, sharp = torch.zeros_like(objects.size), torch.zeros_like(objects.size)
+    others = {canonical(name): kinds for name, kinds in WIDE_CLASSES.items()}
     for i, category in enumerate(objects.categories):
-        for axis, known in enumerate(STANDARD.get(category, ())):
-            if known is not None:
-                usual[i, axis] = math.log(known[0]) - objects.size[i, axis].log()
-                sharp[i, axis] = 1 / known[1] ** 2
+        for name in dict.fromkeys((category, *others.get(category, ()))):
+            known = [(axis, *k) for axis, k in enumerate(STANDARD.get(name, ())) if k is not None]
+            off = [math.log(value) - objects.size[i, axis].log() for axis, value, _ in known]
+            limits = [CONTRADICTED * math.hypot(sigma, SIZE, COMMON) for *_, sigma in known]
+            if all(abs(x) < limit for x, limit in zip(off, limits, strict=True)):
+                for (axis, _, sigma), x in zip(known, off, strict=True):
+                    usual[i, axis], sharp[i, axis] = x, 1 / sigma**2
+                break
     return usual, sharp
 
 

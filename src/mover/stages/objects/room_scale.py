@@ -14,10 +14,9 @@ from mover.bodies.parts import Parts, members
 from mover.bodies.posture import at, landmarks, postures
 from mover.core.records import record
 from mover.core.types import Bodies, Layout
-from mover.energy.terms.given import AWAY, SIZE, Given
+from mover.energy.terms.given import AWAY, COMMON, SIZE, Given
 from mover.furniture.floor import Floor, height_under_bodies
 
-COMMON = 0.06  # error that the three given sizes of an object have in common, as a logarithm
 TOOL = 0.04  # ... and all given sizes of a room: shapes of one tool fill their boxes alike
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
 TRIED = 121  # scales
