@@ -35,6 +35,28 @@ def test_help_names_every_command_and_imports_nothing_heavy():
         assert f"  {name} " in found.stdout
 
 
+@pytest.mark.parametrize(
+    ("body", "code"),
+    [("return", 0), ("raise SystemExit(3)", 3), ("raise SystemExit('a sentence')", 1),
+     ("raise KeyError('lost')", 1)],
+)  # fmt: skip
+def test_a_program_ends_with_its_code_and_all_that_it_had_to_say(body, code):
+    """`program` leaves at once, but what waits to be written or done at the end comes first."""
+    lines = (
+        "import atexit, sys; import mover.app.cli as cli",
+        "def main():",
+        "    atexit.register(lambda: sys.stdout.write('at the end'))",
+        "    sys.stdout.write('waits ')",
+        f"    {body}",
+        "cli.main = main; cli.program()",
+    )
+    found = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True)
+    assert found.returncode == code
+    assert found.stdout == "waits at the end"
+    assert ("a sentence" in found.stderr) == ("sentence" in body)
+    assert ("lost" in found.stderr) == ("lost" in body)
+
+
 def test_an_unknown_command_is_answered_with_the_known_ones():
     found = call("reconstruct")
     assert found.returncode == 2

@@ -1,6 +1,6 @@
 """`python -m mover` is the command line, wherever the package is found."""
 
-from mover.app.cli import main
+from mover.app.cli import program
 
 if __name__ == "__main__":
-    main()
+    program()

@@ -21,7 +21,8 @@ FOLD = 1e-9  # of the cube of the longest side; closed pieces of less volume are
 CAUTION = 5  # of fast_simplification: 7 is its default, less is slower and better
 AT_ONCE = 16  # meshes whose normals are found together: what fits a processor's cache
 GENTLER = 1.5  # a target of faces that spoils a mesh is raised by this factor
-_simplifying = Lock()
+simplifying = Lock()
+"""Held while fast_simplification works: on global variables, without Python's lock."""
 
 
 def box(verts: Float[Tensor, "verts 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
@@ -187,7 +188,7 @@ def _simplified(mesh: Mesh, faces: int) -> Mesh:
     import fast_simplification
 
     corners, rows = as_float64(mesh.verts), as_int64(mesh.faces).astype(np.int32)
-    with _simplifying:  # it works on global variables, without Python's lock
+    with simplifying:
         found = fast_simplification.simplify(corners, rows, target_count=faces, agg=CAUTION)
     verts, triangles = (torch.from_numpy(np.ascontiguousarray(part)) for part in found[:2])
     return used(Mesh(verts.to(mesh.verts), triangles.to(mesh.faces)))

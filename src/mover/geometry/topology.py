@@ -34,6 +34,24 @@ def solid(verts: np.ndarray, faces: np.ndarray) -> Triangles | None:
     return whole if whole is not None and is_closed(torch.from_numpy(whole[1])) else None
 
 
+def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where each distinct row of whole numbers stands first, in order of the rows, and which it is.
+
+    The same as NumPy's `unique` along the first axis has, by numbers in place of bytes.
+    """
+    key, spans = np.zeros(len(rows), dtype=np.int64), 1
+    for column in rows.T:
+        low, high = (int(end) for end in (column.min(initial=0), column.max(initial=0)))
+        spans *= high - low + 1
+        if spans > np.iinfo(np.int64).max:
+            key, column = (np.unique(x, return_inverse=True)[1] for x in (key, column))
+            low, high = 0, len(rows)
+            spans = len(rows) * (high + 1)
+        key = key * (high - low + 1) + (column - low)
+    _, first, same = np.unique(key, return_index=True, return_inverse=True)
+    return first, same
+
+
 def areas(corners: np.ndarray) -> np.ndarray:
     """Areas of triangles given by their corners [m²]."""
     a, b, c = np.moveaxis(corners, -2, 0)

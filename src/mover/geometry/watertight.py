@@ -15,7 +15,16 @@ import torch
 from mover.core.types import Mesh
 from mover.geometry.mesh import decimate, fit_box, used
 from mover.geometry.nearest import as_float64, as_int64, closest
-from mover.geometry.topology import Triangles, areas, is_closed, labels, manifold, solid, volumes
+from mover.geometry.topology import (
+    Triangles,
+    areas,
+    distinct_rows,
+    is_closed,
+    labels,
+    manifold,
+    solid,
+    volumes,
+)
 from mover.geometry.volume import BAND, SHELL, Volume
 from mover.geometry.volume_warp import union_bodies
 
@@ -220,4 +229,4 @@ def _cleaned(verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     turned = np.take_along_axis(faces, (faces.argmin(1)[:, None] + np.arange(3)) % 3, 1)
-    return verts, faces[np.sort(np.unique(turned, axis=0, return_index=True)[1])]
+    return verts, faces[np.sort(distinct_rows(turned)[0])]

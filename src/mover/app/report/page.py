@@ -39,7 +39,7 @@ from mover.core.records import map_tensors
 from mover.core.types import Bodies, Scene
 from mover.evaluate.explanation import LEVEL
 from mover.geometry.camera import pitch_roll
-from mover.geometry.warp_start import mapped
+from mover.geometry.warp_start import beside, mapped
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,10 @@ def write_report(out: Path, content: ReportContent) -> Path:
 
 def _page(content: ReportContent) -> str:
     """The whole text."""
-    image, scenes = content.image, (content.initial, content.result)
-    before, after = mapped(lambda s: _data_url(draw_overlay(canvas(image, s, WIDEST), s)), scenes)
+    scenes = (content.initial, content.result)
+    view, (before, after) = beside(
+        lambda: _view(content), lambda: mapped(lambda s: _overlay(content, s), scenes)
+    )
     objects = objects_table(content.initial, content.result, content.objects, content.metrics)
     return fill(
         "page.html",
@@ -119,8 +121,8 @@ def _page(content: ReportContent) -> str:
         curves=draw_curves(content.traces),
         longest=max([float(s.get("seconds") or 0) for s in content.stages], default=0.0) or 1.0,
         settings=settings_of(content.config),
-        photo="" if image is None else _data_url(shrink(image, WIDEST)),
-        view=_view(content),
+        photo="" if content.image is None else _data_url(shrink(content.image, WIDEST)),
+        view=view,
     )
 
 
@@ -190,6 +192,11 @@ def _view(content: ReportContent) -> ReportScene:
         {name: scene for name, scene in scenes.items() if scene is not None},
         {name: bodies for name, bodies in people.items() if bodies is not None},
     )
+
+
+def _overlay(content: ReportContent, scene: Scene) -> str:
+    """The image with the furniture drawn over it."""
+    return _data_url(draw_overlay(canvas(content.image, scene, WIDEST), scene))
 
 
 def _data_url(image: Float[Tensor, "h w 3"]) -> str:

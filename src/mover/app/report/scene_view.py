@@ -13,7 +13,9 @@ from torch import Tensor
 
 from mover.core.colours import colour, css, person_colour
 from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject
+from mover.geometry.mesh import simplifying
 from mover.geometry.placement import place_object
+from mover.geometry.topology import distinct_rows
 
 GRAIN = 1e-4  # share of the longest side within which vertices are the same
 
@@ -34,7 +36,8 @@ def thin(mesh: Mesh, count: int) -> Mesh:
 
     verts, faces = _welded(mesh)
     if len(faces) > count:
-        verts, faces, *_ = simplify(verts, faces.astype(np.int32), target_count=count)
+        with simplifying:
+            verts, faces, *_ = simplify(verts, faces.astype(np.int32), target_count=count)
     if not len(faces):
         return mesh
     return Mesh(torch.from_numpy(verts).float(), torch.from_numpy(faces.astype(np.int64)))
@@ -54,8 +57,9 @@ def thin_choice(
         return Thinning(used, ends.reshape(-1, 3))
     points = verts.detach().cpu().double().numpy()
     triangles = faces.cpu().int().numpy()
-    *_, collapses = simplify(points, triangles, target_count=count, return_collapses=True)
-    fewer, kept_faces, heir = replay_simplification(points, triangles, collapses)
+    with simplifying:
+        *_, collapses = simplify(points, triangles, target_count=count, return_collapses=True)
+        fewer, kept_faces, heir = replay_simplification(points, triangles, collapses)
     used = np.unique(triangles)
     heirs = np.asarray(heir)[used]
     far = np.linalg.norm(points[used] - np.asarray(fewer)[heirs], axis=1)
@@ -73,12 +77,10 @@ def _welded(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     used, faces = np.unique(faces, return_inverse=True)
     verts, faces = verts[used], faces.reshape(-1, 3)
     grain = GRAIN * max(float(np.ptp(verts, axis=0).max()), 1e-9)
-    _, first, same = np.unique(
-        np.round(verts / grain).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-    faces = same.reshape(-1)[faces]
+    first, same = distinct_rows(np.round(verts / grain).astype(np.int64))
+    faces = same[faces]
     kept = (faces != np.roll(faces, 1, axis=1)).all(1)
-    _, once = np.unique(np.sort(faces[kept], axis=1), axis=0, return_index=True)
+    once, _ = distinct_rows(np.sort(faces[kept], axis=1))
     return verts[first], faces[kept][np.sort(once)]
 
 

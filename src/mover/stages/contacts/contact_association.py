@@ -269,18 +269,22 @@ def _decide(
         return torch.full_like(part.pixels[:, 0], one)
     grown, shown = at_pixels(rivals.grown, part.pixels)
     over = grown & shown
-    away, may = _distances(part.points, rivals), _may(objects, hands=part.hands)
+    may = _may(objects, hands=part.hands)
     if config.by == "vertex":
+        away = _distances(part.points, rivals.tops, rivals.backs)
         price = torch.where(over & may.unsqueeze(-1), away, torch.full_like(away, torch.inf))
         lowest, best = price.min(0)
         return torch.where(lowest < config.farthest, best, torch.full_like(best, -1))
     if part.seat >= 0:
         may = may & (torch.arange(len(may)) == part.seat)
     near = config.hand_reach if part.hands or part.lone_back else config.farthest
-    share, distance = over.float().mean(-1), away.mean(-1)
-    fits = may & (share >= config.overlap) & (distance < near)
-    score = torch.where(fits, share - distance, torch.full_like(share, -torch.inf))
-    best = score.argmax() if fits.any() else torch.tensor(-1)
+    share = over.float().mean(-1)
+    able = (may & (share >= config.overlap)).nonzero()[:, 0]
+    if not len(able):
+        return torch.full_like(part.pixels[:, 0], -1)
+    distance = _distances(part.points, rivals.tops[able], rivals.backs[able]).mean(-1)
+    score = torch.where(distance < near, share[able] - distance, -torch.inf)
+    best = able[score.argmax()] if bool(score.isfinite().any()) else torch.tensor(-1)
     return best.expand(over.shape[1])
 
 
@@ -299,9 +303,13 @@ def _filled(masks: Bool[Tensor, "objects h w"], boxes: Float[Tensor, "objects 4"
     return torch.where(known, masks, inside)
 
 
-def _distances(points: Float[Tensor, "verts 3"], rivals: _Rivals) -> Float[Tensor, "objects verts"]:
+def _distances(
+    points: Float[Tensor, "verts 3"],
+    tops: Float[Tensor, "objects region 3"],
+    backs: Float[Tensor, "objects region 3"],
+) -> Float[Tensor, "objects verts"]:
     """Distance of each vertex from each object's parts, through at most 40 of the vertices [m]."""
     some = points[:: max(1, len(points) // 40)]
-    ways = [torch.cdist(some, region).amin(-1) for region in (rivals.tops, rivals.backs)]
+    ways = [torch.cdist(some, region).amin(-1) for region in (tops, backs)]
     nearest = torch.cdist(points, some).argmin(-1)
     return torch.minimum(*ways)[:, nearest]
