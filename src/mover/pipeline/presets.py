@@ -162,7 +162,7 @@ ROBUST = Config(
     ),
     layout=PlaceConfig(
         _ROBUST_IMAGE, "robust", BatchedBFGS(), yaws=16, distances=(0.9, 1.1), short=_SHORT,
-        num_hypotheses=6, coarse=2, perturbations=4, perturbation_rounds=2, wall_alignment_steps=2,
+        num_hypotheses=6, coarse=2, perturbations=8, wall_alignment_steps=2,
         yaw_prior_weight=1.0,
     ),
     refine=RefineConfig(rounds=1, views=4, apart=0.15),
@@ -171,8 +171,8 @@ ROBUST = Config(
     gather=GatherConfig(erode=1, reach=0.1),
     assign=_GROUPS,
     place=PlaceConfig(
-        _ROBUST_FULL, "robust", BatchedBFGS(), perturbations=4, perturbation_rounds=2,
-        wall_alignment_steps=2, yaw_prior_weight=1.0, apart=0.3,
+        _ROBUST_FULL, "robust", BatchedBFGS(), perturbations=8, wall_alignment_steps=2,
+        yaw_prior_weight=1.0, apart=0.3,
     ),
     outer_iterations=1,
     slide_to_floor=True,
