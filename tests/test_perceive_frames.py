@@ -236,6 +236,28 @@ def test_the_clean_picture_is_the_room_that_people_never_hide_for_long():
     assert spread_frames(100, 3) == [0, 50, 99]
 
 
+@pytest.mark.parametrize("missed", [(0,), (0, 2), (0, 2, 5)])
+def test_a_frame_in_which_somebody_has_no_mask_is_no_clean_picture(missed: tuple[int, ...]):
+    """Detectors miss people; the frame without a mask would be the one with a person in it."""
+    room = texture(7, (60, 80))
+    noise = torch.Generator().manual_seed(0)
+
+    def load(frame: int):
+        picture = (room + 0.01 * torch.randn(room.shape, generator=noise)).clamp(0, 1)
+        body = torch.zeros(60, 80, dtype=torch.bool)
+        body[15:50, 8 * frame : 8 * frame + 14] = frame != 7  # nobody is in the seventh
+        picture[body] = 0.9
+        return picture, torch.ones_like(body) if frame in missed else ~body
+
+    found = clean_picture(range(9), load, CleanConfig())
+    assert found.frame == (7 if len(missed) < CleanConfig().least else -1)
+    assert not found.hidden.any()
+    assert float((found.picture - room).abs().max()) < 0.06
+    alone = clean_picture(range(7), load, CleanConfig())
+    assert alone.frame == -1
+    assert float((alone.picture - room).abs().max()) < 0.06
+
+
 def test_the_lens_comes_from_the_file_the_angle_or_the_photo(tmp_path: Path):
     (tmp_path / "geo.json").write_text('{"f": 700, "pitch": -0.2, "roll": 0.05}')
     at, text = lens_of((640, 480), file=tmp_path / "geo.json", fov=None, photo=None)

@@ -18,6 +18,9 @@ from mover.perceive.steady import Drift, seen_share
 from mover.perceive.track import Tracks, stack_of
 from mover.perceive.video import Clip, load_frame, write_jpeg
 
+DIFFERENT = 0.1  # of the range of brightness; noise and light change less
+PATCH = 5  # [px], edges that are off by a pixel differ in thinner lines
+
 Load = Callable[[int], tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]]
 """Picture of a frame, and where it shows the empty room."""
 
@@ -40,7 +43,10 @@ def spread_frames(count: int, most: int) -> list[int]:
 
 
 def clean_picture(frames: Sequence[int], load: Load, config: CleanConfig) -> Clean:
-    """The frame that shows most of the room, or the median of what all frames show.
+    """A frame that shows the room alone, or the median of what all frames show.
+
+    Who stands in a frame without a mask is seen in no median: a frame is taken only if it agrees
+    with that.
 
     Args:
         frames: Which may be used.
@@ -48,11 +54,23 @@ def clean_picture(frames: Sequence[int], load: Load, config: CleanConfig) -> Cle
         config: How.
     """
     empty = [float(load(frame)[1].float().mean()) for frame in frames]
-    best = int(np.argmax(empty))
-    picture, shown = load(frames[best])
-    if 1 - empty[best] <= config.free or len(frames) < config.least:
-        return Clean(picture, ~shown, frames[best])
-    return _median(frames, load, picture, config)
+    order = np.argsort(-np.array(empty), kind="stable").tolist()
+    picture, shown = load(frames[order[0]])
+    if len(frames) < config.least:
+        return Clean(picture, ~shown, frames[order[0]])
+    median = _median(frames, load, picture, config)
+    for k in order[: config.least]:
+        picture, shown = load(frames[k])
+        if 1 - empty[k] <= config.free and _apart(picture, median) <= config.free:
+            return Clean(picture, ~shown, frames[k])
+    return median
+
+
+def _apart(picture: Float[Tensor, "h w 3"], median: Clean) -> float:
+    """Share of the picture that lies within patches that are not as in the median."""
+    off = ((picture - median.picture).abs().amax(-1) > DIFFERENT) & ~median.hidden
+    whole = -torch.nn.functional.max_pool2d(-off[None].float(), PATCH, 1, PATCH // 2)
+    return float(whole.mean())
 
 
 def _median(
