@@ -15,6 +15,7 @@ from mover.core.observe import Step, silent
 from mover.core.run import Run
 from mover.energy.config import Adam
 from mover.geometry.rle import decode
+from mover.geometry.warp_start import use_threads
 from mover.io.capture.scene_file import read_scene
 from mover.io.formats import read
 from mover.pipeline.presets import PRESETS
@@ -90,16 +91,16 @@ class TestRun:
 
         def die(step: Step):
             seen.append(step.stage)
-            if step.stage == "explain_placements":  # not one that may be computed beside, unheard
+            if step.stage == "gather_cues: free space":
                 raise Killed
 
-        with pytest.raises(Killed):
+        with pytest.raises(Killed), use_threads(1):  # what is computed beside has no steps
             run_in(tmp_path / "cut", capture, config, die)
         finished = {p.parent.name for p in (tmp_path / "cut" / "stages").rglob("*.json")}
-        assert {"align_camera", "gather_cues", "place_objects"} <= finished
+        assert "align_camera" in finished
         second = []
         run_in(tmp_path / "cut", capture, config, lambda step: second.append(step.stage))
-        assert not {"prepare_objects", "place_objects", "gather_cues: free space"} & set(second)
+        assert "prepare_objects" not in second
         for name in ("scene.json", "bodies.npz"):
             a, b = (tmp_path / f / name for f in ("whole", "cut"))
             assert a.read_bytes() == b.read_bytes()

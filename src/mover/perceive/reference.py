@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.records import fingerprint, record
@@ -53,12 +53,12 @@ def clean_picture(frames: Sequence[int], load: Load, config: CleanConfig) -> Cle
         load: Gives a frame and where nobody is in it.
         config: How.
     """
-    empty = [float(load(frame)[1].float().mean()) for frame in frames]
+    empty, strips = _seen(frames, load, config.strips)
     order = np.argsort(-np.array(empty), kind="stable").tolist()
     picture, shown = load(frames[order[0]])
     if len(frames) < config.least:
         return Clean(picture, ~shown, frames[order[0]])
-    median = _median(frames, load, picture, config)
+    median = _median(strips, picture, config.least)
     for k in order[: config.least]:
         picture, shown = load(frames[k])
         if 1 - empty[k] <= config.free and _apart(picture, median) <= config.free:
@@ -73,21 +73,29 @@ def _apart(picture: Float[Tensor, "h w 3"], median: Clean) -> float:
     return float(whole.mean())
 
 
-def _median(
-    frames: Sequence[int], load: Load, best: Float[Tensor, "h w 3"], config: CleanConfig
-) -> Clean:
-    """The median of the frames that show a pixel; the best frame where too few do."""
-    rows = torch.arange(best.shape[0]).chunk(config.strips)
-    stacks: list[list[Tensor]] = [[] for _ in rows]
+def _seen(
+    frames: Sequence[int], load: Load, count: int
+) -> tuple[list[float], list[list[Int[Tensor, "_ w 3"]]]]:
+    """How much of the room each frame shows, and that in bytes, strip by strip; -1: hidden."""
+    empty: list[float] = []
+    strips: list[list[Tensor]] = [[] for _ in range(count)]
     for frame in frames:
         picture, shown = load(frame)
+        empty.append(float(shown.float().mean()))
         bytes_ = (picture * 255).round().to(torch.int16)
         seen = torch.where(shown[..., None], bytes_, torch.full_like(bytes_, -1))
-        for strip, part in zip(stacks, rows, strict=True):
-            strip.append(seen[part])
-    parts = [_of_strip(torch.stack(strip)) for strip in stacks]
+        for strip, part in zip(strips, seen.tensor_split(count), strict=True):
+            strip.append(part)
+    return empty, strips
+
+
+def _median(
+    strips: Sequence[Sequence[Int[Tensor, "_ w 3"]]], best: Float[Tensor, "h w 3"], least: int
+) -> Clean:
+    """The median of the frames that show a pixel; the best frame where too few do."""
+    parts = [_of_strip(torch.stack(list(strip))) for strip in strips]
     picture, times = torch.cat([p for p, _ in parts]), torch.cat([n for _, n in parts])
-    hidden = times < config.least
+    hidden = times < least
     return Clean(torch.where(hidden[..., None], best, picture), hidden, -1)
 
 

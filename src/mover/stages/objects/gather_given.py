@@ -106,15 +106,25 @@ def standard_sizes(
     usual, sharp = torch.zeros_like(objects.size), torch.zeros_like(objects.size)
     others = {canonical(name): kinds for name, kinds in WIDE_CLASSES.items()}
     for i, category in enumerate(objects.categories):
-        for name in dict.fromkeys((category, *others.get(category, ()))):
-            known = [(axis, *k) for axis, k in enumerate(STANDARD.get(name, ())) if k is not None]
-            off = [math.log(value) - objects.size[i, axis].log() for axis, value, _ in known]
-            limits = [CONTRADICTED * math.hypot(sigma, SIZE, COMMON) for *_, sigma in known]
-            if all(abs(x) < limit for x, limit in zip(off, limits, strict=True)):
-                for (axis, _, sigma), x in zip(known, off, strict=True):
-                    usual[i, axis], sharp[i, axis] = x, 1 / sigma**2
-                break
+        names = dict.fromkeys((category, *others.get(category, ())))
+        for axis, off, sigma in _standard_of(tuple(names), objects.size[i]):
+            usual[i, axis], sharp[i, axis] = off, 1 / sigma**2
     return usual, sharp
+
+
+def _standard_of(
+    names: Sequence[str], size: Float[Tensor, "3"]
+) -> list[tuple[int, Float[Tensor, ""], float]]:
+    """Axis, logarithm over the given size and its spread, of the first class that fits the size."""
+    for name in names:
+        known = [
+            (axis, math.log(usual[0]) - size[axis].log(), usual[1])
+            for axis, usual in enumerate(STANDARD.get(name, ()))
+            if usual is not None
+        ]
+        if all(abs(x) < CONTRADICTED * math.hypot(s, SIZE, COMMON) for _, x, s in known):
+            return known
+    return []
 
 
 def room_axis(
