@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -55,6 +56,26 @@ def test_a_program_ends_with_its_code_and_all_that_it_had_to_say(body, code):
     assert found.stdout == "waits at the end"
     assert ("a sentence" in found.stderr) == ("sentence" in body)
     assert ("lost" in found.stderr) == ("lost" in body)
+
+
+def test_memory_is_kept_where_the_c_library_can_and_nothing_happens_elsewhere(monkeypatch):
+    asked: list[tuple[int, int]] = []
+
+    def mallopt(name: int, value: int) -> int:
+        """As glibc before 2.35: no more than 32 MB before the system is asked."""
+        asked.append((name, value))
+        return int(name != -3 or value <= 32 << 20)
+
+    monkeypatch.setattr(cli.sys, "platform", "linux")
+    monkeypatch.setattr(cli.ctypes, "CDLL", lambda _: SimpleNamespace(mallopt=mallopt))
+    cli.keep_memory()
+    assert asked == list(cli.KEEP)
+    asked.clear()
+    monkeypatch.setattr(cli.ctypes, "CDLL", lambda _: SimpleNamespace())
+    cli.keep_memory()
+    monkeypatch.setattr(cli.sys, "platform", "win32")
+    cli.keep_memory()
+    assert not asked
 
 
 def test_an_unknown_command_is_answered_with_the_known_ones():

@@ -18,6 +18,7 @@ away or turned round is found as before where its shape fits or people tell.
 """
 
 import math
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -56,6 +57,28 @@ class Given:
     weight: Float[Tensor, " objects"]
     """How little the image tells of it: 1 is usual, 0 leaves it to the image."""
 
+    # What no layout changes is computed once: descents ask hundreds of times.
+
+    @cached_property
+    def log_distance(self) -> Float[Tensor, " objects"]:
+        """Its logarithm."""
+        return self.distance.clamp_min(1e-3).log()
+
+    @cached_property
+    def unturned(self) -> Float[Tensor, " objects"]:
+        """Logarithm of the density of a yaw as given."""
+        return _density(torch.zeros_like(self.yaw)).log()
+
+    @cached_property
+    def level(self) -> Float[Tensor, " objects"]:
+        """Density along an axis, against that of an even one."""
+        return self.along / torch.special.i0e(self.sharpness)
+
+    @cached_property
+    def aligned(self) -> Float[Tensor, " objects"]:
+        """Logarithm of the density of what stands along an axis, or as it likes."""
+        return (1 - self.along + self.level).log()
+
 
 def given_term(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
     """How far places, yaws and sizes are from what is expected [nats, times the weight]."""
@@ -67,7 +90,7 @@ def given_term(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]
 def _away(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
     """Logarithm of how much farther than given."""
     away = layout.t_world_object.square().sum(-1).clamp_min(1e-6).log() / 2
-    return away - given.distance.clamp_min(1e-3).log()
+    return away - given.log_distance
 
 
 def _place(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
@@ -75,23 +98,23 @@ def _place(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
 
 
 def _yaw(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
-    off, sharp = layout.yaw - given.yaw, 1 / TURN**2
+    return given.unturned - _density(layout.yaw - given.yaw).log()
 
-    def density(turned: Tensor) -> Tensor:
-        quarters = (-turned.sin(), turned.sin(), -turned.cos())
-        flipped = torch.stack([(sharp * (c - 1)).exp() for c in quarters]).sum(0)
-        right = (sharp * (turned.cos() - 1)).exp()
-        return (1 - FLIPPED) * right + FLIPPED / 3 * flipped + ANY
 
-    return density(torch.zeros_like(given.yaw)).log() - density(off).log()
+def _density(turned: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """Of being turned so far from what was given, but for a factor."""
+    sharp = 1 / TURN**2
+    quarters = (-turned.sin(), turned.sin(), -turned.cos())
+    flipped = torch.stack([(sharp * (c - 1)).exp() for c in quarters]).sum(0)
+    right = (sharp * (turned.cos() - 1)).exp()
+    return (1 - FLIPPED) * right + FLIPPED / 3 * flipped + ANY
 
 
 def _axis(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
     """Densities over a quarter turn, against an even one."""
-    level = given.along / torch.special.i0e(given.sharpness)
     free = 1 - given.along
     turned = (4 * (layout.yaw - given.axis)).cos() - 1
-    return (free + level).log() - (free + level * (given.sharpness * turned).exp()).log()
+    return given.aligned - (free + given.level * (given.sharpness * turned).exp()).log()
 
 
 def _size(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
