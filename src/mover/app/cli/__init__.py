@@ -127,26 +127,24 @@ def main() -> None:
     raise SystemExit(run_command(arguments[0], arguments[1:]))
 
 
-KEEP = ((-3, 256 << 20), (-3, 32 << 20), (-1, 512 << 20), (-8, 1))
-"""Of glibc's malloc.h: from which size the system is asked for memory of its own (the second where
-the first is too large for an old one), how much that is free is kept, and how many heaps there are.
-"""
+TRIM, MMAP, HEAPS = -1, -3, -8  # names of options in glibc's malloc.h
+MEGABYTE = 1 << 20
 
 
 def keep_memory() -> None:
     """Keep what was freed for what comes next: the system clears each page that it gives.
 
-    A run asks again and again for tens of megabytes; without this it gets and returns them each
-    time, a tenth of its time. Where the C library is another, nothing is done.
+    Long videos and large pictures ask again and again for tens of megabytes; without this each
+    block is got and returned. Where the C library is another, nothing is done.
     """
     library = ctypes.CDLL(None) if sys.platform == "linux" else None
     mallopt = getattr(library, "mallopt", None)
-    done: set[int] = set()
     if mallopt is None:
         return
-    for name, value in KEEP:
-        if name not in done and mallopt(name, value):
-            done.add(name)
+    if not mallopt(MMAP, 256 * MEGABYTE):
+        mallopt(MMAP, 32 * MEGABYTE)  # older versions take no more
+    mallopt(TRIM, 512 * MEGABYTE)
+    mallopt(HEAPS, 1)
 
 
 def program() -> None:
