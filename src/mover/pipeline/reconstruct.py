@@ -65,7 +65,7 @@ from mover.stages.objects.find_image_cues import (
 )
 from mover.stages.objects.gather_depth import DepthInputs, gather_depth
 from mover.stages.objects.gather_given import (
-    UNFIT,
+    BENT,
     believed_sides,
     gather_given,
     lighter_where_used,
@@ -243,11 +243,13 @@ def with_shapes_bent(
         return context, state
     inputs, config = state.priced
     given = inputs.image.given
-    if given is None or not bool((given.weight >= UNFIT).any()):
+    if given is None:
+        return context, state
+    loose = (given.weight >= BENT) & ~is_pinned(context)
+    if not bool(loose.any()):
         return context, state
     free = replace(inputs.image, sides=believed_sides(inputs.image.sides, 0 * given.weight))
     misfit = misfit_of(context, free, state)
-    loose = (given.weight >= UNFIT) & ~is_pinned(context)
     bend = BendInputs(inputs, priced(config), state.placed.layout, loose)
     bending = context.run.stage(bend_shapes, bend, context.config.bend)
     prepared, layout = with_shapes(context.prepared, bending)

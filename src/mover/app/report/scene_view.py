@@ -3,7 +3,7 @@
 import base64
 import json
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mover.core.colours import colour, css, person_colour
 from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject
+from mover.geometry.cage import bent
 from mover.geometry.mesh import simplifying
 from mover.geometry.placement import place_object
 from mover.geometry.topology import distinct_rows
@@ -124,12 +125,12 @@ class Block:
 def pack_view(scenes: dict[str, Scene], bodies: dict[str, Bodies]) -> ReportScene:
     """Pack the scenes (`initial`, `result`, `truth`) and the bodies in the world of each."""
     block = Block()
-    meshes: list[tuple[Mesh, int]] = []
+    meshes: list[_Packed] = []
     packed: list[dict[str, Any]] = []
     tree: dict[str, Any] = {"scenes": {}}
     for name, scene in scenes.items():
         pieces = [
-            _pack_object(p, i, _shared(p.mesh, meshes, packed, block))
+            _pack_object(p, i, _shared(p, meshes, packed, block))
             for i, p in enumerate(scene.objects)
         ]
         floor = floor_of(scene, bodies.get(name))
@@ -144,19 +145,23 @@ def pack_view(scenes: dict[str, Scene], bodies: dict[str, Bodies]) -> ReportScen
     return ReportScene(text, base64.b64encode(b"".join(block.parts)).decode())
 
 
+class _Packed(NamedTuple):
+    """A mesh that is in the block."""
+
+    mesh: Mesh
+    thinned: Mesh
+    index: int
+
+
 def _shared(
-    mesh: Mesh, seen: list[tuple[Mesh, int]], packed: list[dict[str, Any]], block: Block
+    piece: SceneObject, seen: list[_Packed], packed: list[dict[str, Any]], block: Block
 ) -> int:
     """Index of the packed mesh; a mesh that several scenes hold is packed once."""
-    for other, index in seen:
-        same = other is mesh or (
-            other.verts.shape == mesh.verts.shape
-            and other.faces.shape == mesh.faces.shape
-            and bool((other.verts == mesh.verts).all() and (other.faces == mesh.faces).all())
-        )
-        if same:
-            return index
-    fewer = thin(mesh, FACES_OBJECT)
+    mesh = piece.mesh
+    for other in seen:
+        if other.mesh is mesh or _alike(other.mesh, mesh):
+            return other.index
+    fewer = _bent_alike(piece, seen) or thin(mesh, FACES_OBJECT)
     low, step, coarse = _coarse(fewer.verts)
     packed.append(
         {
@@ -171,8 +176,25 @@ def _shared(
             "step": step,
         }
     )
-    seen.append((mesh, len(packed) - 1))
+    seen.append(_Packed(mesh, fewer, len(packed) - 1))
     return len(packed) - 1
+
+
+def _alike(one: Mesh, other: Mesh) -> bool:
+    """Whether two meshes are the same, to the bit."""
+    return one.faces.equal(other.faces) and one.verts.equal(other.verts)
+
+
+def _bent_alike(piece: SceneObject, seen: list[_Packed]) -> Mesh | None:
+    """The thinned mesh of what the piece was bent from, bent in the same way; None: not seen."""
+    if piece.cage is None:
+        return None
+    for other in seen:
+        if other.mesh.faces.equal(piece.mesh.faces) and piece.mesh.verts.equal(
+            bent(other.mesh.verts, piece.cage)
+        ):
+            return Mesh(bent(other.thinned.verts, piece.cage), other.thinned.faces)
+    return None
 
 
 def _coarse(points: Float[Tensor, "*any 3"]) -> tuple[list[float], float, Tensor]:
