@@ -150,7 +150,7 @@ class _Packed(NamedTuple):
 
     mesh: Mesh
     thinned: Mesh
-    index: int
+    place: int
 
 
 def _shared(
@@ -160,7 +160,7 @@ def _shared(
     mesh = piece.mesh
     for other in seen:
         if other.mesh is mesh or _alike(other.mesh, mesh):
-            return other.index
+            return other.place
     fewer = _bent_alike(piece, seen) or thin(mesh, FACES_OBJECT)
     low, step, coarse = _coarse(fewer.verts)
     packed.append(
