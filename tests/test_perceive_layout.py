@@ -140,6 +140,25 @@ def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[SceneObject]):
     assert torch.equal(known.R_cam_world, camera().R_cam_world)
 
 
+def test_a_thing_of_which_many_shapes_are_known_says_no_more_than_another(
+    pieces: list[SceneObject],
+):
+    seen = picture(pieces, camera())
+    shapes = [shapes_of(p.category, 1)[0].mesh.verts for p in pieces]
+    points = torch.stack(
+        [outermost(v - torch.tensor([0, float(v[:, 1].min()), 0])) for v in shapes]
+    )
+    points = points * torch.tensor([1.3, 1, 1, 1])[:, None, None]  # one is not of the usual size
+    once = ScreenInputs(
+        camera(), torch.stack([d.box for d in seen.detections]),
+        torch.full((4, 4), SEEN), torch.full((4,), torch.nan), torch.arange(4), points, 1.2,
+    )  # fmt: skip
+    rows = torch.tensor([0] * 8 + [1, 2, 3])
+    often = replace(once, thing=rows, points=points[rows])
+    config = ScreenConfig(tilt=0.0, tilt_known=0.0)
+    assert screen(often, config).height == pytest.approx(screen(once, config).height, abs=5e-4)
+
+
 @pytest.mark.slow
 def test_a_perfect_picture_gives_furniture_near_the_true_one(
     pieces: list[SceneObject], tmp_path: Path

@@ -133,14 +133,17 @@ def _best_of_things(
 def _share(
     each: Float[Tensor, "heights yaws items"], inputs: ScreenInputs, config: ScreenConfig
 ) -> Float[Tensor, "heights yaws items"]:
-    """How much an item in a turn moves camera and floor: the best of its thing, if it fits at all.
+    """How much an item in a turn moves camera and floor.
 
-    The others keep a little, so that they go on (Adam's steps do not shrink with it).
+    All of a thing have one voice together, and less where none fits; the best of them has most of
+    it. The others keep a little, so that they go on (Adam's steps do not shrink with it).
     """
     with torch.no_grad():
-        best = _best_of_things(inputs, each.amin(1))[:, None, inputs.thing]
-        share = ((best - each) / config.soft).exp() * (1 + best / config.cap) ** -2
-        return share.clamp_min(LITTLE)
+        best = _best_of_things(inputs, each.amin(1))
+        share = ((best[:, None, inputs.thing] - each) / config.soft).exp().clamp_min(LITTLE)
+        voices = torch.zeros_like(best).index_add(1, inputs.thing, share.sum(1))
+        voice = (1 + best / config.cap) ** -2 / voices
+        return share * voice[:, None, inputs.thing]
 
 
 def _world(guess: Guess, inputs: ScreenInputs, config: ScreenConfig) -> Float[Tensor, " heights"]:
