@@ -86,6 +86,11 @@ def laid_price(
     return off.square()
 
 
+def trunk_of(joints: Float[Tensor, "*bodies joints 3"]) -> Float[Tensor, "*bodies 3"]:
+    """Direction from pelvis to neck."""
+    return torch.nn.functional.normalize(joints[..., NECK, :] - joints[..., 0, :], dim=-1)
+
+
 def distances_of_who_lies(
     joints: Float[Tensor, "bodies joints 3"],
     up: Float[Tensor, "3"],
@@ -100,7 +105,7 @@ def distances_of_who_lies(
         tracks: Rows of each person, in the order of time.
         time: Of each row [s].
     """
-    trunk = torch.nn.functional.normalize(joints[:, NECK] - joints[:, 0], dim=-1)
+    trunk = trunk_of(joints)
     view = torch.nn.functional.normalize(joints[:, 0], dim=-1)
     rise = trunk @ up
     lies = (rise.abs() < LIES) & ((trunk * view).sum(-1).abs() > ALONG)

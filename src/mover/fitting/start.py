@@ -1,16 +1,22 @@
 """Where a fit begins: orientation, posture and place of each body from its keypoints alone.
 
 Each row is tried upright and facing the camera, turned left, right and away, standing and sitting;
-the picture of the trunk tells how far the body is tilted in the image. The place follows from the
-torso by linear least squares under the true camera. All are fitted without shape for a few steps,
-and along a track the cheapest sequence is kept whose bodies move as bodies can.
+the picture of the trunk tells how far the body is tilted in the image; and lying on its back. The
+place follows from the torso by linear least squares under the true camera. All are fitted without
+shape for a few steps, and along a track the cheapest sequence is kept whose bodies move as bodies
+can. Rows that are not upright then are tried lying on either side and on the belly, too.
+
+Seen along the body, who lies looks nearly the same from the feet as from the head (depths reversed
+about the pelvis), so that single frames lay a body the wrong way round. But nobody who lies turns
+end for end: of each stretch of lying the way of the most counts, and hypotheses against it are out.
 """
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS
@@ -18,7 +24,8 @@ from mover.bodies.skeleton import BODY
 from mover.core.records import record
 from mover.core.types import Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage
-from mover.fitting.energy import Seen, Weighed, body_energy
+from mover.fitting.energy import Seen, Weighed, body_energy, geman_mcclure
+from mover.fitting.ground import LIES, NEIGHBOURS, SITS, trunk_of
 from mover.fitting.limits import resting
 from mover.fitting.prior import same
 from mover.fitting.tracks import best_path, chosen, every_so_often, tracks_of
@@ -26,7 +33,8 @@ from mover.fitting.unknowns import OF_ROWS, Frame, Rig, Unknowns, place_of, poin
 from mover.geometry.rotations import rot_x, rot_y, rot_z
 
 YAWS = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)
-ROLLS = (0.0,)
+BACK, OTHERS = (0.0,), (0.5 * math.pi, -0.5 * math.pi, math.pi)
+"""How far who lies has rolled: on the back, on either side and on the belly [rad]."""
 SEATED = {"hip": -80.0, "knee": 85.0}  # [degrees] about x
 TORSO = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 START = Stage(pose=12.0, shape=5.0, smooth=0.0)
@@ -34,6 +42,12 @@ BEFORE = 3.5  # [m], where a body is put whose keypoints do not tell
 NEAREST, FARTHEST = 0.4, 40.0  # [m]
 START_FPS = 6.0  # hypotheses are tried so many times a second
 STRAIN = 4.0  # most that a jump costs, so that a track may begin anew
+NEVER = 1e4  # what a hypothesis costs that cannot be
+LEVEL, SLOPE = math.radians(5), math.radians(15)
+"""How far from level who lies is, and where that has cost half of its most [rad]."""
+
+Track = tuple[Int[Tensor, " track"], Float[Tensor, " track"] | None]
+"""Rows of a person in the order of time, and when they are [s]; None: nobody knows."""
 
 
 @record
@@ -60,18 +74,37 @@ class Guess:
     """Tilted in the image as the trunk is seen there."""
 
 
-def guesses(like: Tensor) -> list[Guess]:
-    """Standing and sitting people who face four ways, and people who lie with the head in four."""
+@record
+class Tried:
+    """A hypothesis that was fitted to rows."""
+
+    at: Unknowns
+    root: Float[Tensor, "bodies 3 3"]
+    centre: Float[Tensor, "bodies 63"]
+    """The pose that it expects [rad]."""
+    cost: Float[Tensor, " bodies"]
+    joints: Float[Tensor, "bodies joints 3"]
+    """Of the body, in camera axes [m]."""
+
+
+def upright_guesses(like: Tensor) -> list[Guess]:
+    """Standing and sitting people who face four ways."""
     stand = resting(1, like)[0]
     sit = stand.clone()
     for name, angle in SEATED.items():
         for side in ("left", "right"):
             sit[3 * (BODY.index(f"{side}_{name}") - 1)] = math.radians(angle)
     turns = rot_y(torch.tensor(YAWS).to(like)).unbind(0)
+    return [Guess(pose, turn, True) for pose in (stand, sit) for turn in turns]
+
+
+def lying_guesses(like: Tensor, rolls: tuple[float, ...]) -> list[Guess]:
+    """People who lie with the head in four directions, rolled as far."""
+    stand = resting(1, like)[0]
+    turns = rot_y(torch.tensor(YAWS).to(like)).unbind(0)
     back = rot_x(torch.tensor(-0.5 * math.pi).to(like))
-    upright = [Guess(pose, turn, True) for pose in (stand, sit) for turn in turns]
-    sides = [rot_z(torch.tensor(angle).to(like)) @ back for angle in ROLLS]
-    return upright + [Guess(stand, turn @ side, False) for side in sides for turn in turns]
+    sides = [rot_z(torch.tensor(angle).to(like)) @ back for angle in rolls]
+    return [Guess(stand, turn @ side, False) for side in sides for turn in turns]
 
 
 def before(pose: Float[Tensor, "bodies code"]) -> Float[Tensor, "bodies 3"]:
@@ -158,37 +191,39 @@ def begin(keypoints: Keypoints, seen: Seen, rig: Rig, camera: Camera, config: Fi
     step = 1 if fps is None else max(1, round(fps / START_FPS))
     rows, nearest = every_so_often(keypoints.frame, keypoints.person, step)
     names = [LAYOUTS[keypoints.layout][k] for k in rig.keypoints.tolist()]
-    R = camera.R_cam_world.to(seen.pixels)
-    every = guesses(seen.pixels)
-    tries = [
-        _tried(guess, R @ guess.root, chosen(seen, rows), (rig, names, config)) for guess in every
+    what = (camera.R_cam_world.to(seen.pixels), rig, names, config)
+    tracks = [
+        (track, None if fps is None else keypoints.frame[rows][track] / fps)
+        for track in tracks_of(keypoints.frame[rows], keypoints.person[rows])
     ]
-    cost = torch.stack([cost for _, _, cost, _ in tries], 1)
-    joints = torch.stack([joints for _, _, _, joints in tries], 1)
-    best = torch.zeros(len(rows), dtype=torch.long)
-    for track in tracks_of(keypoints.frame[rows], keypoints.person[rows]):
-        time = None if fps is None else keypoints.frame[rows][track] / fps
-        best[track] = _followed(cost[track], joints[track], time, config)
-    at = _picked([at for at, _, _, _ in tries], best[nearest], nearest)
-    root = torch.stack([root for _, root, _, _ in tries])[best[nearest], nearest]
-    centre = torch.stack([guess.pose for guess in every])[best[nearest]]
+    like = seen.pixels
+    first = [*upright_guesses(like), *lying_guesses(like, BACK)]
+    tries = [_tried(guess, chosen(seen, rows), what) for guess in first]
+    best = _followed(tries, tracks, seen.up, config)
+    trunks = torch.stack([trunk_of(one.joints) for one in tries])
+    down = _down(trunks[best, torch.arange(len(best))], seen.up, tracks)
+    if len(down):
+        for guess in lying_guesses(like, OTHERS):
+            some = _tried(guess, chosen(seen, rows[down]), what)
+            tries.append(_among(some, down, tries[-1]))
+        best = _followed(tries, tracks, seen.up, config)
+    best = best[nearest]
+    at = _picked([one.at for one in tries], best, nearest)
+    root = torch.stack([one.root for one in tries])[best, nearest]
+    centre = torch.stack([one.centre for one in tries])[best, nearest]
     return Begun(at, root, centre, seen.spread)
 
 
 def _tried(
-    guess: Guess,
-    root: Float[Tensor, "3 3"],
-    seen: Seen,
-    what: tuple[Rig, list[str], FitConfig],
-) -> tuple[Unknowns, Tensor, Tensor, Tensor]:
-    """Unknowns, root rotations, cost and joints of one hypothesis for all rows."""
-    rig, names, config = what
-    rows = len(seen.pixels)
-    body = guess.pose.expand(rows, -1)
-    person = torch.zeros(rows, dtype=torch.long)
+    guess: Guess, seen: Seen, what: tuple[Float[Tensor, "3 3"], Rig, list[str], FitConfig]
+) -> Tried:
+    """One hypothesis fitted to all rows."""
+    R, rig, names, config = what
+    body = guess.pose.expand(len(seen.pixels), -1)
+    person = torch.zeros(len(body), dtype=torch.long)
     at = unknowns_at(body, before(body))
-    seen = dataclasses.replace(seen, centre=guess.pose.expand(rows, -1))
-    frame = Frame(rig, root.expand(rows, -1, -1), person)
+    seen = dataclasses.replace(seen, centre=body)
+    frame = Frame(rig, (R @ guess.root).expand(len(body), -1, -1), person)
     if guess.upright:
         flat = points_of(at, frame, same).keypoints
         frame = Frame(rig, rot_z(tilt_of(flat, seen, names)) @ frame.root, person)
@@ -200,10 +235,78 @@ def _tried(
     with torch.no_grad():
         cost = body_energy(at, frame, seen, by).per_item / START.pose**2
         joints = points_of(at, frame, same).joints[:, :22]
-    return at, frame.root, cost, joints
+    if not guess.upright:
+        slope = (trunk_of(joints) @ seen.up).clamp(-1, 1).asin()
+        cost = cost + geman_mcclure(slope.square(), SLOPE) / LEVEL**2
+    return Tried(at, frame.root, body, cost, joints)
+
+
+def _among(some: Tried, rows: Int[Tensor, " some"], like: Tried) -> Tried:
+    """A hypothesis of some rows as one of all, which the others take at no price."""
+
+    def put(part: Tensor, whole: Tensor) -> Tensor:
+        return whole.index_copy(0, rows, part)
+
+    fields = {name: put(getattr(some.at, name), getattr(like.at, name)) for name in OF_ROWS}
+    return Tried(
+        dataclasses.replace(like.at, **fields),
+        put(some.root, like.root),
+        put(some.centre, like.centre),
+        put(some.cost, torch.full_like(like.cost, torch.inf)),
+        put(some.joints, like.joints),
+    )
+
+
+def _down(
+    trunk: Float[Tensor, "bodies 3"], up: Float[Tensor, "3"], tracks: Sequence[Track]
+) -> Int[Tensor, " some"]:
+    """Rows of who is not upright, and those shortly before and after."""
+    found = trunk @ up <= SITS
+    for track, time in tracks:
+        if time is not None:
+            near = (time[:, None] - time).abs() <= NEIGHBOURS
+            found[track] = (near & found[track]).any(1)
+    return found.nonzero()[:, 0]
 
 
 def _followed(
+    tries: list[Tried], tracks: Sequence[Track], up: Float[Tensor, "3"], config: FitConfig
+) -> Int[Tensor, " bodies"]:
+    """The hypothesis of each row, along each track; who lies keeps the head where it is."""
+    cost = torch.stack([one.cost for one in tries], 1)
+    joints = torch.stack([one.joints for one in tries], 1)
+    best = torch.zeros(len(cost), dtype=torch.long)
+    for track, time in tracks:
+        best[track] = _path(cost[track], joints[track], time, config)
+        if time is not None:
+            against = turned_round(trunk_of(joints[track]), best[track], up)
+            best[track] = _path(cost[track] + NEVER * against, joints[track], time, config)
+    return best
+
+
+def turned_round(
+    trunks: Float[Tensor, "rows tries 3"], best: Int[Tensor, " rows"], up: Float[Tensor, "3"]
+) -> Bool[Tensor, "rows tries"]:
+    """Hypotheses that lie against the way of most of the stretch of lying that a row is in.
+
+    Args:
+        trunks: Directions from pelvis to neck of all hypotheses.
+        best: The hypothesis that each row has, in the order of time.
+        up: About upright.
+    """
+    lies = (trunks @ up).abs() < LIES
+    own = trunks[torch.arange(len(best)), best]
+    rise = own @ up
+    against = torch.zeros_like(lies)
+    stretch = (rise > SITS).long().cumsum(0)
+    for one in stretch.unique():
+        rows = (stretch == one) & (rise <= SITS)
+        head = own[rows & (rise.abs() < LIES)].sum(0)
+        against[rows] = lies[rows] & (trunks[rows] @ head < 0)
+    return against
+
+
+def _path(
     cost: Float[Tensor, "rows tries"],
     joints: Float[Tensor, "rows tries joints 3"],
     time: Float[Tensor, " rows"] | None,
