@@ -18,12 +18,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from fit import postures
 
 from mover.app.cli.config import preset_named
 from mover.app.cli.run import reconstruct_into
 from mover.app.cli.video import ChainArgs, video_to_room
 from mover.app.results import Origin
+from mover.bodies.corrected import in_world
 from mover.core.types import Scene
+from mover.evaluate.bodies import procrustes, shared_rows
 from mover.evaluate.evaluation import EvaluatedBodies, evaluate
 from mover.evaluate.scene import SIDES
 from mover.furniture.library import WIDE_CLASSES, canonical, catalogue
@@ -154,6 +157,36 @@ def scale_of(found: Path, room: KnownRoom) -> dict[str, float]:
     return {f"{side} scale": (s.ground or np.nan) / room.truth.ground for side, s in scenes.items()}
 
 
+def errors_by_posture(found: Path, room: KnownRoom) -> dict[str, tuple[int, float, float]]:
+    """Bodies, and PJE of the refined ones in the room, absolute and after Procrustes [m]."""
+    bodies, camera = read_bodies(found / "bodies.npz"), read_scene(found / "scene.json").camera
+    there, true = in_world(bodies, camera), in_world(room.bodies, room.truth.camera)
+    rows, true_rows = shared_rows(there, true)
+    assert there.joints is not None
+    assert true.joints is not None
+    joints, truth = there.joints[rows, :22].double(), true.joints[true_rows, :22].double()
+    off, aligned = (
+        (some - truth).norm(dim=-1).mean(1) for some in (joints, procrustes(joints, truth))
+    )
+    return {
+        name: (len(which), float(off[which].mean()), float(aligned[which].mean()))
+        for name, which in postures(room, true_rows.tolist()).items()
+        if which
+    }
+
+
+def told_of_postures(rows: list[dict[str, tuple[int, float, float]]]) -> str:
+    """Means over the bodies of all rooms, and over rooms."""
+    lines: list[str] = []
+    for name in dict.fromkeys(name for row in rows for name in row):
+        each = np.array([row[name] for row in rows if name in row])
+        body, alike = np.average(each[:, 1:], 0, each[:, 0]), each[:, 1:].mean(0)
+        count = f"{int(each[:, 0].sum())} bodies of {len(each)} rooms"
+        means = [f"{1e3 * a:.0f} / {1e3 * p:.0f} mm" for a, p in (body, alike)]
+        lines.append(f"refined, {name}: {count}, {means[0]}; rooms alike {means[1]}")
+    return "\n".join(lines)
+
+
 def told_of_objects(metrics: dict[str, Any]) -> str:
     """IoU3D and error of the centre of each object, first scene -> room."""
     lines: list[str] = []
@@ -191,6 +224,7 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
         print(f"room {seed} {kind}", told_of_objects(metrics), sep="\n", flush=True)
         row |= {f"{word}{s} {k}": metrics[s][k] for s in SIDES for k in KEYS if k in metrics[s]}
         row |= {f"{word}{name}": value for name, value in scale_of(place, room).items()}
+        row |= {f"{word}postures": errors_by_posture(place, room)}
         row |= {f"{word}farther": farther(metrics), f"{word}objects": len(metrics["objects"])}
     steps = json.loads((out / "chain" / "steps.json").read_text())["steps"]
     row |= {f"{name} [s]": step["seconds"] for name, step in steps.items()}
@@ -223,6 +257,9 @@ def main() -> None:
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     for name in names:
         values = [row[name] for row in rows.values() if name in row]
+        if isinstance(values[0], dict):
+            print(told_of_postures(values))
+            continue
         if isinstance(values[0], list):
             print(f"{name}: {'; '.join(f'{s}: {v}' for s, row in rows.items() for v in row[name])}")
             continue

@@ -11,7 +11,7 @@ import torch
 from analytic import FACES, box_verts, boxes_of, given_at
 from torch import Tensor
 
-from mover.core.types import Bodies, Camera, Layout, Mesh
+from mover.core.types import Bodies, Camera, Heading, Layout, Mesh
 from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.given import AWAY, Given, given_term
@@ -25,6 +25,7 @@ from mover.stages.objects.gather_given import (
     WEIGHTS,
     believed_sides,
     gather_given,
+    given_axis,
     lighter_where_used,
     prior_weights,
     room_axis,
@@ -98,9 +99,9 @@ def test_the_axis_of_a_room_is_found_from_rough_yaws() -> None:
     given = true + quarters + math.radians(15) * torch.randn(8, generator=generator)
     placed = true + quarters + math.radians(4) * torch.randn(8, generator=generator)
     along = torch.full((8,), 0.9)
-    guess = (given, torch.full((8,), math.radians(20)))
-    rough, wide = room_axis([guess], along)
-    fine, narrow = room_axis([guess, (placed, torch.full((8,), math.radians(8)))], along)
+    guess = (given, torch.full((8,), math.radians(20)), along)
+    rough, wide = room_axis([guess])
+    fine, narrow = room_axis([guess, (placed, torch.full((8,), math.radians(8)), along)])
 
     def off(angle: float) -> float:
         return abs(math.remainder(angle - true, math.pi / 2))
@@ -108,8 +109,37 @@ def test_the_axis_of_a_room_is_found_from_rough_yaws() -> None:
     assert off(rough) < math.radians(12)
     assert off(fine) < math.radians(4)
     assert narrow < wide
-    nothing = room_axis([guess], torch.zeros(8))[1]
+    nothing = room_axis([(*guess[:2], torch.zeros(8))])[1]
     assert nothing > 3 * wide
+
+
+def test_walls_that_are_seen_tell_the_axis_better_than_rough_yaws():
+    rough = replace(somewhere(3), yaw=torch.tensor([0.45, 0.30, -0.05]))
+    objects, left = boxes_of(("bed",) * 3, [(1.4, 0.5, 2.0)] * 3), torch.full((3,), 0.1)
+    walls = Heading(0.1 + math.pi / 2, math.radians(0.5))
+    alone = gather_given(objects, rough, rough, left)
+    seen = gather_given(objects, rough, rough, left, walls)
+    assert abs(math.remainder(float(alone.axis[0]) - 0.1, math.pi / 2)) > 0.1
+    assert math.remainder(float(seen.axis[0]) - 0.1, math.pi / 2) == pytest.approx(0, abs=0.03)
+    assert float(seen.sharpness[0]) > float(alone.sharpness[0])
+    said = [(yaw, math.radians(2), 0.9) for yaw in (0.6, 0.61, 0.59, 0.6, 0.6)]  # all disagree
+    many, wall = (torch.tensor(x).unbind(-1) for x in (said, [(0.1, math.radians(0.5), 0.95)]))
+    assert room_axis([many, wall])[0] == pytest.approx(0.6, abs=0.02)
+
+
+def test_of_a_room_without_a_guess_the_axis_alone_is_priced():
+    objects = boxes_of(("bed", "chair"), [(1.4, 0.5, 2.0), (0.5, 0.9, 0.5)])
+    given = given_axis(objects, Heading(0.3, math.radians(0.5)))
+    straight = replace(somewhere(2), yaw=torch.full((2,), 0.3 - math.pi))
+    skew = replace(straight, yaw=straight.yaw + 0.7)
+    far = replace(
+        straight, t_world_object=3 * straight.t_world_object, log_scale=0.4 + 0 * straight.log_scale
+    )
+    price = given_term(straight, given)
+    torch.testing.assert_close(price, torch.zeros(2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(given_term(far, given), price)
+    bed, chair = given_term(skew, given).tolist()
+    assert bed > 3 > chair > 1
 
 
 def test_standard_sizes_pull_what_they_know_and_leave_the_rest() -> None:

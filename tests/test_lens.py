@@ -81,6 +81,16 @@ def test_a_guessed_lens_is_found_from_boxes_that_stand_along_a_room(off: float, 
     assert abs(math.log(found.zoom * off)) < 0.025
 
 
+@pytest.mark.parametrize("heading", [0.0, 0.3, 0.7, 1.4])
+def test_the_heading_of_a_room_is_found_from_what_stands_along_it(heading: float):
+    found = lens_of(drawn(heading, seed=3, askew=2), FOCAL, 0.0)
+    assert found.tilt is not None
+    assert found.heading is not None
+    off = math.remainder(found.heading.yaw - heading, math.pi / 2)
+    assert abs(off) < min(math.radians(0.5), 3 * found.heading.spread)
+    assert abs(found.tilt.pitch + 0.2) < math.radians(0.5)
+
+
 def test_the_stated_error_holds():
     off = [
         math.log(lens_of(drawn(0.1 * k, seed=k, askew=3), 1.06 * FOCAL, 0.055).zoom * 1.06) / s
@@ -111,6 +121,7 @@ def test_a_picture_that_does_not_tell_leaves_the_lens(picture: str):
     assert lens_of(made, 1.08 * FOCAL, None).zoom == 1
     declared = lens_of(made, 1.08 * FOCAL, 0.055)
     assert declared.spread > 0.04
+    assert declared.heading is None
     assert abs(math.log(declared.zoom)) < 0.03
 
 

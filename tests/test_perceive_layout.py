@@ -41,7 +41,7 @@ from mover.perceive.layout import (
     shapes_of,
 )
 from mover.perceive.screen import ScreenInputs, outermost, screen
-from mover.perceive.standing import standing_on
+from mover.perceive.standing import seen_from, standing_on
 
 W, H, FOCAL = 480, 320, 420.0
 HEIGHT = 1.35
@@ -240,6 +240,28 @@ def test_feet_tell_the_tilt_and_the_height_of_the_camera(
     assert standing_on(seen, fitted, Run(tmp_path)).height_spread == 0.02
     once = rows_of(small_room.bodies, torch.tensor([0]))
     assert standing_on(seen, once, Run(tmp_path)) is seen
+
+
+@pytest.mark.parametrize("people", [True, False])
+def test_edges_of_the_picture_tell_tilt_and_heading(people: bool, small_room, tmp_path: Path):
+    capture, true = small_room.capture, small_room.truth.camera
+    guess = tilted(*(a + math.radians(2) for a in pitch_roll(true.R_cam_world)))
+    seen = Picture(
+        replace(true, R_cam_world=guess), (), torch.zeros(0, true.height, true.width).bool(),
+        torch.zeros(true.height, true.width).bool(), None, None, reference=capture.reference,
+    )  # fmt: skip
+    found = seen_from(seen, small_room.bodies if people else None, Run(tmp_path))
+    pairs = zip(pitch_roll(found.camera.R_cam_world), pitch_roll(true.R_cam_world), strict=True)
+    assert max(abs(float(a - b)) for a, b in pairs) < math.radians(0.3)
+    assert found.tilt_spread < math.radians(0.5)
+    turned = abs(math.remainder(found.heading.yaw, math.pi / 2))
+    assert turned < min(math.radians(1), 3 * found.heading.spread)
+    if people:
+        assert found.height == pytest.approx(-small_room.truth.ground, abs=0.03)
+    blank = replace(seen, reference=torch.full_like(capture.reference, 0.5))
+    nothing = seen_from(blank, None, Run(tmp_path))
+    assert (nothing.tilt_spread, nothing.heading) == (None, None)
+    assert torch.equal(nothing.camera.R_cam_world, guess)
 
 
 @pytest.mark.slow

@@ -206,6 +206,16 @@ class DepthImage:
 
 
 @record
+class Heading:
+    """Along which two directions, at right angles, a room runs: its walls and most furniture."""
+
+    yaw: float
+    """Of one of them about up, seen from the camera [rad]."""
+    spread: float
+    """Standard deviation [rad]."""
+
+
+@record
 class Tilt:
     """Pitch and roll as the lines of the reference picture tell them [rad]."""
 
@@ -247,6 +257,8 @@ class Capture:
     says."""
     tilt: Tilt | None = None
     """Of the camera, where it was looked for in the picture."""
+    heading: Heading | None = None
+    """Of the room's walls, where it was."""
 
 
 @record

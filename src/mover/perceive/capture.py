@@ -340,6 +340,7 @@ def read_picture_of(folder: Path) -> Picture:
         people=hidden,
         height=None if known is None else number(known, 0.1, 100.0),
         depth=_metric_depth(folder, camera),
+        reference=None if parts.load_image is None else parts.load_image(camera),
     )
 
 

@@ -204,7 +204,7 @@ class LayoutConfig:
     """How shapes are made fit."""
     place: PlaceConfig = field(
         default_factory=lambda: PlaceConfig(
-            SceneWeights(1.0, 1.0, 0.3, 1.0, 0.0, 0.0),
+            SceneWeights(1.0, 1.0, 0.3, 1.0, 0.0, 0.0, given=0.02),
             "robust",
             LONG,
             short=SHORT,

@@ -21,7 +21,7 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.records import record
 from mover.core.run import Run
-from mover.core.types import Camera, Detection, Layout, Mesh, Scene, SceneObject
+from mover.core.types import Camera, Detection, Heading, Layout, Mesh, Scene, SceneObject
 from mover.energy.objective import HumanCues, ImageCues
 from mover.furniture.library import WIDE_CLASSES, canonical, catalogue, choose_piece
 from mover.geometry.mesh import box, used
@@ -32,6 +32,7 @@ from mover.perceive.config import LayoutConfig
 from mover.perceive.depth_map import floor_height, median_depths, range_in
 from mover.perceive.screen import Screened, ScreenInputs, outermost, screen
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
+from mover.stages.objects.gather_given import given_axis
 from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import place_objects
 from mover.stages.objects.prepare_objects import (
@@ -208,6 +209,12 @@ class Picture:
     """Measured distance along the view [m]; NaN: unknown. None: nothing was measured."""
     height_spread: float | None = None
     """Standard deviation of the logarithm of `height`; None: as people's heights differ."""
+    reference: Float[Tensor, "h w 3"] | None = None
+    """The picture itself, in [0, 1]."""
+    tilt_spread: float | None = None
+    """How far off pitch and roll are where its lines tell them [rad]."""
+    heading: Heading | None = None
+    """Of the room, where they tell it."""
 
 
 @record
@@ -305,6 +312,8 @@ def _screen_inputs(
         points=torch.stack([outer_points(shape) for _, shape in pairs]),
         height=height,
         height_spread=picture.height_spread,
+        tilt_spread=picture.tilt_spread,
+        heading=0.0 if picture.heading is None else picture.heading.yaw,
     )
 
 
@@ -323,6 +332,8 @@ def _place_inputs(
     depth = None
     if picture.depth is not None:
         depth = range_in(picture.depth, cues, picture.camera, SLACK)
+    if picture.heading is not None:
+        cues = replace(cues, given=given_axis(prepared.objects, picture.heading))
     return PlaceInputs(
         prepared.objects, picture.camera, -height, cues, HumanCues(depth=depth), starts,
         starts.yaw[0],

@@ -48,6 +48,10 @@ class ScreenInputs:
     """The camera's, where people's feet or a depth map tell it, and then its tilt [m]."""
     height_spread: float | None = None
     """Standard deviation of its logarithm; None: `ScreenConfig.known`."""
+    tilt_spread: float | None = None
+    """How far off pitch and roll are, where the picture tells them [rad]."""
+    heading: float = 0.0
+    """Yaw from which turns are tried [rad]."""
 
 
 @record
@@ -152,6 +156,7 @@ def _world(guess: Guess, inputs: ScreenInputs, config: ScreenConfig) -> Float[Te
     if inputs.height is not None:
         usual, spread, tilt = inputs.height, inputs.height_spread, config.tilt_known
         spread = config.known if spread is None else spread
+    tilt = tilt if inputs.tilt_spread is None else inputs.tilt_spread
     height = ((guess.log_height - math.log(usual)) / spread).square()
     turned = (guess.tilt / max(tilt, 1e-3)).square().sum(-1)
     return config.prior * (height + turned)
@@ -207,7 +212,7 @@ def _starts(inputs: ScreenInputs, config: ScreenConfig, heights: Tensor) -> Gues
     usable = (rays[0][:, 1] < -0.02) & (inputs.sides[inputs.thing][:, 3] == SEEN) & (far < FARTHEST)
     distance = torch.where(usable, far, by_size.expand_as(far)).clamp(NEAREST, FARTHEST)
     t = distance[..., None] * torch.where(usable[..., None], rays[0], rays[1])
-    yaw = torch.arange(config.yaws) * (2 * math.pi / config.yaws)
+    yaw = inputs.heading + torch.arange(config.yaws) * (2 * math.pi / config.yaws)
     shape = (len(heights), config.yaws, len(boxes))
     return Guess(
         t_world_object=t[:, None].expand(*shape, 3).clone(),

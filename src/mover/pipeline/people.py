@@ -54,6 +54,7 @@ def through_its_lens(
     inputs = LensInputs(segments, camera, capture.focal_spread, tilt, by_feet)
     lens = run.stage(find_lens, inputs, config.lens)
     told = replace(capture, warnings=(*capture.warnings, *lens.warnings), tilt=lens.tilt)
+    told = replace(told, heading=lens.heading)
     if capture.focal_spread or lens.zoom != 1:
         told = replace(told, focal_spread=lens.spread)
     return through_lens(told, lens.zoom, pinned)

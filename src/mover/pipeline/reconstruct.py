@@ -220,7 +220,8 @@ def with_given(
     left = misfit_of(context, free, before)
     if context.misfit is not None:
         left = torch.maximum(left, context.misfit)
-    known = gather_given(objects, given, before.placed.layout, left)
+    heading = context.capture.heading
+    known = gather_given(objects, given, before.placed.layout, left, heading)
     return replace(
         image, given=known, sides=believed_sides(image.sides, known.weight, image.beside)
     )

@@ -152,7 +152,7 @@ def layout_into(args: LayoutArgs) -> None:
     from mover.io.capture.bodies_file import read_bodies
     from mover.perceive.capture import read_picture_of, write_first_scene
     from mover.perceive.layout import first_scene
-    from mover.perceive.standing import standing_on
+    from mover.perceive.standing import seen_from
 
     torch.set_num_threads(THREADS)
     if args.depth is not None:
@@ -161,8 +161,7 @@ def layout_into(args: LayoutArgs) -> None:
     guess = picture.camera
     with Bar() as bar:
         run = Run(args.capture / "perceived", bar)
-        if people.is_file():
-            picture = standing_on(picture, read_bodies(people), run)
+        picture = seen_from(picture, read_bodies(people) if people.is_file() else None, run)
         first = first_scene(picture, args.config, run, args.meshes)
     write_first_scene(first, args.capture, guess)
     ground = first.scene.ground

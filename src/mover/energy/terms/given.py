@@ -56,6 +56,8 @@ class Given:
     """How well they are known: one over the variance; 0 where there is no standard."""
     weight: Float[Tensor, " objects"]
     """How little the image tells of it: 1 is usual, 0 leaves it to the image."""
+    told: bool = True
+    """Whether places, yaws and sizes were given; else the axis alone is known."""
 
     # What no layout changes is computed once: descents ask hundreds of times.
 
@@ -82,6 +84,8 @@ class Given:
 
 def given_term(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
     """How far places, yaws and sizes are from what is expected [nats, times the weight]."""
+    if not given.told:
+        return given.weight.clamp_max(TURNS) * _axis(layout, given)
     turned = _yaw(layout, given) + _axis(layout, given)
     placed = _place(layout, given) + _size(layout, given)
     return given.weight.clamp_max(TURNS) * turned + given.weight * placed

@@ -20,9 +20,9 @@ from torch import Tensor
 
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
-from mover.core.types import Bodies, Camera, Capture, SceneObject, Tilt
+from mover.core.types import Bodies, Camera, Capture, Heading, SceneObject, Tilt
 from mover.geometry.boxes import box_of
-from mover.geometry.camera import pitch_roll
+from mover.geometry.camera import pitch_roll, tilted
 from mover.stages.camera.config import LensConfig
 from mover.stages.camera.find_focal import zoomed
 from mover.stages.camera.room_lines import Ends, Prior, Segments, fit_room
@@ -31,6 +31,7 @@ from mover.stages.people.find_depth import pelvis, shifted
 MEASURED = 0.003  # error of the logarithm of a measured focal length
 SYSTEMATIC = 0.01  # error of the logarithm that more lines do not make smaller
 SYSTEMATIC_TILT = 0.003  # [rad]
+VAGUE = math.radians(5)  # spread of a heading that says nothing
 SAYS_LITTLE = 0.95  # of the spread before any line: lines that leave more of it tell nothing
 
 
@@ -61,6 +62,8 @@ class Lens:
     """Chance that it was."""
     tilt: Tilt | None
     """None: the lines do not tell it."""
+    heading: Heading | None
+    """The same of the room."""
     warnings: tuple[str, ...] = ()
 
 
@@ -73,9 +76,13 @@ def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent
     prior = Prior(focal, spread, up, inputs.tilt_spread, inputs.by_feet)
     ends = fit_room(inputs.segments, prior, camera.R_cam_world)
     observe(Step("find_lens", 0, 1))
-    told, tilt = _told(ends, focal, spread), _tilt(ends, inputs.tilt_spread)
+    told, tilt, heading = (
+        _told(ends, focal, spread),
+        tilt_of(ends, inputs.tilt_spread),
+        heading_of(ends),
+    )
     if told is None or declared == 0:
-        return Lens(1.0, spread, float(bool(declared)), tilt)
+        return Lens(1.0, spread, float(bool(declared)), tilt, heading)
     off, error = told
     wide = math.hypot(error, spread)
     guess = 1 - config.measured if declared is None else 1.0
@@ -84,18 +91,30 @@ def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent
     guessed = fits[0] / sum(fits) if sum(fits) else 1.0
     left = error * spread / wide
     if guessed < config.least:
-        return Lens(1.0, left, guessed, tilt)
+        return Lens(1.0, left, guessed, tilt, heading)
     zoom = math.exp(off * (spread / wide) ** 2)
     warnings = (_sentence(zoom, left),) if abs(math.log(zoom)) > left else ()
-    return Lens(zoom, left, guessed, tilt, warnings)
+    return Lens(zoom, left, guessed, tilt, heading, warnings)
 
 
-def _tilt(ends: Ends, before: float) -> Tilt | None:
+def tilt_of(ends: Ends, before: float) -> Tilt | None:
     """Pitch and roll over all ends; None where that is no better than what was known."""
     both = torch.stack(pitch_roll(ends.pose.R_cam_room), -1)
     mean, square = _over(ends, both, [1, 3])  # about x and z
     spread = math.hypot(float(square.amax()) ** 0.5, SYSTEMATIC_TILT)
     return Tilt(float(mean[0]), float(mean[1]), spread) if spread < before / 2 else None
+
+
+def heading_of(ends: Ends) -> Heading | None:
+    """The heading over all ends; None where they hardly agree."""
+    R = ends.pose.R_cam_room
+    level = tilted(*pitch_roll(R)).mT @ R
+    yaw = torch.atan2(level[:, 0, 2], level[:, 2, 2])
+    quarter = torch.pi / 2
+    off = torch.remainder(yaw - yaw[0] + quarter / 2, quarter) - quarter / 2
+    mean, square = _over(ends, off[:, None], [2])  # about y
+    spread = math.hypot(float(square) ** 0.5, SYSTEMATIC_TILT)
+    return Heading(float(yaw[0] + mean), spread) if spread < VAGUE else None
 
 
 def _told(ends: Ends, focal: float, spread: float) -> tuple[float, float] | None:

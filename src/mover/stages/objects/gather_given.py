@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.core.types import Layout, Objects
+from mover.core.types import Heading, Layout, Objects
 from mover.energy.terms.bbox import LEAST, LIKELY, SEEN
 from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.given import COMMON, SIZE, TURN, Given
@@ -21,13 +21,18 @@ BENT = 1.0  # weight from which on a mesh is bent: a shape that fits would leave
 WEIGHTS = (0.05, 2.0)  # least and largest weight
 LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of 1 [rad]
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]
+WALLS = 0.95  # chance that furniture runs along the edges that a picture shows
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
 CONTRADICTED = 3.0  # standard deviations between a given and a standard size, of another class
 DIRECTIONS = 90  # that are tried within a quarter turn
 
 
 def gather_given(
-    objects: Objects, start: Layout, layout: Layout, energy: Float[Tensor, " objects"]
+    objects: Objects,
+    start: Layout,
+    layout: Layout,
+    energy: Float[Tensor, " objects"],
+    heading: Heading | None = None,
 ) -> Given:
     """The evidence of `terms.given`.
 
@@ -36,18 +41,39 @@ def gather_given(
         start: As it was given, in the world as it is known now.
         layout: Where it was placed since, by the image.
         energy: What is left of the image's energy there.
+        heading: Of the room's walls, where they are seen.
     """
     standard, precision = standard_sizes(objects)
-    along = torch.tensor([OFTEN if c in WALL_PIECES else SELDOM for c in objects.categories])
+    along = chance_along(objects)
     known = torch.ones_like(start.yaw)
     weight = prior_weights(energy)
     found = (LOOSE * (0.1 + weight).sqrt()).clamp(SQUARE, TURN)
-    axis, spread = room_axis([(start.yaw, TURN * known), (layout.yaw, found)], along)
+    said = [(start.yaw, TURN * known, along), (layout.yaw, found, along)]
+    if heading is not None:
+        yaw, off, sure = along.new_tensor([[heading.yaw], [heading.spread], [WALLS]])
+        said.append((yaw, off, sure))
+    axis, spread = room_axis(said)
     sharp = 1 / (4 * math.hypot(SQUARE, spread)) ** 2
     return Given(
         distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=along.to(known),
         sharpness=sharp * known, axis=axis * known, standard=standard, precision=precision,
         weight=weight,
+    )  # fmt: skip
+
+
+def chance_along(objects: Objects) -> Float[Tensor, " objects"]:
+    """How probably each object stands along an axis of the room."""
+    return torch.tensor([OFTEN if c in WALL_PIECES else SELDOM for c in objects.categories])
+
+
+def given_axis(objects: Objects, heading: Heading) -> Given:
+    """The same where nothing was given: of a room whose walls are seen, the axis alone."""
+    known, none = torch.ones_like(objects.size[:, 0]), torch.zeros_like(objects.size)
+    sharp = 1 / (4 * math.hypot(SQUARE, heading.spread)) ** 2
+    return Given(
+        distance=known, yaw=0 * known, along=chance_along(objects).to(known),
+        sharpness=sharp * known, axis=heading.yaw * known, standard=none, precision=none,
+        weight=known, told=False,
     )  # fmt: skip
 
 
@@ -129,18 +155,17 @@ def _standard_of(
 
 
 def room_axis(
-    said: Sequence[tuple[Float[Tensor, " objects"], Float[Tensor, " objects"]]],
-    along: Float[Tensor, " objects"],
+    said: Sequence[tuple[Float[Tensor, " _"], Float[Tensor, " _"], Float[Tensor, " _"]]],
 ) -> tuple[float, float]:
     """The direction along which most furniture stands, up to quarter turns, and its spread [rad].
 
     Args:
-        said: Yaws of all objects with their spreads, from sources of their own [rad].
-        along: Chance that each stands along it.
+        said: Yaws of objects or walls with their spreads [rad] and the chance that each runs along
+            it, from sources of their own.
     """
     tried = torch.arange(DIRECTIONS) * (math.pi / 2 / DIRECTIONS)
     chance = torch.zeros(DIRECTIONS)
-    for yaw, spread in said:
+    for yaw, spread, along in said:
         sharp = (1 / (4 * spread.cpu().float()) ** 2)[:, None]
         off = (4 * (yaw.cpu().float()[:, None] - tried)).cos() - 1
         density = (sharp * off).exp() / torch.special.i0e(sharp)
