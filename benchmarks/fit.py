@@ -230,6 +230,13 @@ def too_tall(found: Fitted, heights: tuple[float, ...]) -> Tensor:
     return 100 * ((y.amax(-1) - y.amin(-1)) / torch.tensor(heights) - 1)
 
 
+def misses(joints: Tensor, truth: Tensor) -> Tensor:
+    """PJE of each body, absolute and after Procrustes [m]."""
+    joints, truth = joints[:, :22].double(), truth[:, :22].double()
+    pairs = [(some - truth).norm(dim=-1).mean(1) for some in (joints, procrustes(joints, truth))]
+    return torch.stack(pairs, -1)
+
+
 def by_posture(seed: int, fps: float, tall: bool) -> tuple[dict[str, Tensor], Tensor]:
     """Absolute and Procrustes-aligned PJE of bodies by posture [mm], and errors of heights [%]."""
     room = make_room(seed, RoomConfig(fps=fps))
@@ -241,10 +248,7 @@ def by_posture(seed: int, fps: float, tall: bool) -> tuple[dict[str, Tensor], Te
     rows = [where[f] for f in found.bodies.frame.tolist()]
     assert found.bodies.joints is not None
     assert room.bodies.joints is not None
-    joints, truth = found.bodies.joints[:, :22].double(), room.bodies.joints[rows, :22].double()
-    pairs = torch.stack(
-        [(some - truth).norm(dim=-1).mean(1) for some in (joints, procrustes(joints, truth))], -1
-    )
+    pairs = misses(found.bodies.joints, room.bodies.joints[rows])
     told = {name: 1e3 * pairs[which] for name, which in postures(room, rows).items() if which}
     means = ", ".join(
         f"{n} {len(v)}: {v[:, 0].mean():.0f} / {v[:, 1].mean():.0f}" for n, v in told.items()

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from fit import postures
+from fit import misses, postures
 
 from mover.app.cli.config import preset_named
 from mover.app.cli.run import reconstruct_into
@@ -26,7 +26,7 @@ from mover.app.cli.video import ChainArgs, video_to_room
 from mover.app.results import Origin
 from mover.bodies.corrected import in_world
 from mover.core.types import Scene
-from mover.evaluate.bodies import procrustes, shared_rows
+from mover.evaluate.bodies import shared_rows
 from mover.evaluate.evaluation import EvaluatedBodies, evaluate
 from mover.evaluate.scene import SIDES
 from mover.furniture.library import WIDE_CLASSES, canonical, catalogue
@@ -164,10 +164,7 @@ def errors_by_posture(found: Path, room: KnownRoom) -> dict[str, tuple[int, floa
     rows, true_rows = shared_rows(there, true)
     assert there.joints is not None
     assert true.joints is not None
-    joints, truth = there.joints[rows, :22].double(), true.joints[true_rows, :22].double()
-    off, aligned = (
-        (some - truth).norm(dim=-1).mean(1) for some in (joints, procrustes(joints, truth))
-    )
+    off, aligned = misses(there.joints[rows], true.joints[true_rows]).unbind(-1)
     return {
         name: (len(which), float(off[which].mean()), float(aligned[which].mean()))
         for name, which in postures(room, true_rows.tolist()).items()

@@ -242,7 +242,7 @@ def _tried(
 
 
 def _among(some: Tried, rows: Int[Tensor, " some"], like: Tried) -> Tried:
-    """A hypothesis of some rows as one of all, which the others take at no price."""
+    """A hypothesis of some rows as one of all, which none of the others may take."""
 
     def put(part: Tensor, whole: Tensor) -> Tensor:
         return whole.index_copy(0, rows, part)

@@ -9,17 +9,14 @@ along which directions furniture stands. Then the feet tell the height under tha
 import math
 from dataclasses import replace
 
-import torch
-
 from mover.bodies.parts import parts_of
 from mover.core.run import Run
 from mover.core.types import Bodies
-from mover.geometry.camera import tilted
 from mover.perceive.layout import Picture
 from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camera
 from mover.stages.camera.config import LensConfig
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
-from mover.stages.camera.find_lens import MEASURED, heading_of, tilt_of
+from mover.stages.camera.find_lens import MEASURED, heading_of, tilt_of, tilted_by
 from mover.stages.camera.room_lines import SURE, Prior, find_segments, fit_room
 from mover.stages.config import AlignConfig, FootContactConfig, SelectConfig
 from mover.stages.people.select_frames import SelectInputs, select_frames
@@ -61,9 +58,7 @@ def along_edges(picture: Picture, by_feet: bool) -> Picture:
     ends = fit_room(segments, prior, camera.R_cam_world)
     tilt, heading = tilt_of(ends, spread), heading_of(ends)
     if tilt is not None:
-        R = tilted(torch.tensor(tilt.pitch), torch.tensor(tilt.roll)).to(camera.R_cam_world)
-        camera = replace(camera, R_cam_world=R)
-        picture = replace(picture, camera=camera, tilt_spread=tilt.spread)
+        picture = replace(picture, camera=tilted_by(camera, tilt), tilt_spread=tilt.spread)
     return replace(picture, heading=heading)
 
 

@@ -14,7 +14,7 @@ from mover.core.types import Bodies, Camera, CameraPath, Capture, SceneObject
 from mover.energy.terms.feet import FootContacts
 from mover.furniture.floor import is_platform
 from mover.geometry.boxes import box_of
-from mover.geometry.camera import project, tilted
+from mover.geometry.camera import project
 from mover.geometry.path import is_still, poses_at, scaled, to_reference
 from mover.io.capture.pose_file import moved
 from mover.pipeline.outcome import PeopleState, check_floor
@@ -25,7 +25,7 @@ from mover.stages.camera.doubt_floor import doubt_floor
 from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
 from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
-from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens
+from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens, tilted_by
 from mover.stages.camera.find_scale import ScaleInputs, find_scale
 from mover.stages.camera.room_lines import FINE, SURE, find_segments
 from mover.stages.cover import hiding
@@ -53,8 +53,8 @@ def through_its_lens(
     by_feet = guessed and people is not None
     inputs = LensInputs(segments, camera, capture.focal_spread, tilt, by_feet)
     lens = run.stage(find_lens, inputs, config.lens)
-    told = replace(capture, warnings=(*capture.warnings, *lens.warnings), tilt=lens.tilt)
-    told = replace(told, heading=lens.heading)
+    warnings = (*capture.warnings, *lens.warnings)
+    told = replace(capture, warnings=warnings, tilt=lens.tilt, heading=lens.heading)
     if capture.focal_spread or lens.zoom != 1:
         told = replace(told, focal_spread=lens.spread)
     return through_lens(told, lens.zoom, pinned)
@@ -121,8 +121,7 @@ def _tilted(camera: Camera, capture: Capture) -> tuple[Camera, float | None]:
     tilt = capture.tilt
     if tilt is None:
         return camera, None
-    R = tilted(torch.tensor(tilt.pitch), torch.tensor(tilt.roll)).to(camera.R_cam_world)
-    return replace(camera, R_cam_world=R), tilt.spread
+    return tilted_by(camera, tilt), tilt.spread
 
 
 def _lifts(feet: FootContacts, capture: Capture) -> Float[Tensor, " soles"] | None:

@@ -76,11 +76,8 @@ def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent
     prior = Prior(focal, spread, up, inputs.tilt_spread, inputs.by_feet)
     ends = fit_room(inputs.segments, prior, camera.R_cam_world)
     observe(Step("find_lens", 0, 1))
-    told, tilt, heading = (
-        _told(ends, focal, spread),
-        tilt_of(ends, inputs.tilt_spread),
-        heading_of(ends),
-    )
+    told, tilt = _told(ends, focal, spread), tilt_of(ends, inputs.tilt_spread)
+    heading = heading_of(ends)
     if told is None or declared == 0:
         return Lens(1.0, spread, float(bool(declared)), tilt, heading)
     off, error = told
@@ -103,6 +100,12 @@ def tilt_of(ends: Ends, before: float) -> Tilt | None:
     mean, square = _over(ends, both, [1, 3])  # about x and z
     spread = math.hypot(float(square.amax()) ** 0.5, SYSTEMATIC_TILT)
     return Tilt(float(mean[0]), float(mean[1]), spread) if spread < before / 2 else None
+
+
+def tilted_by(camera: Camera, tilt: Tilt) -> Camera:
+    """The camera with the tilt that lines told."""
+    R = tilted(torch.tensor(tilt.pitch), torch.tensor(tilt.roll)).to(camera.R_cam_world)
+    return dataclasses.replace(camera, R_cam_world=R)
 
 
 def heading_of(ends: Ends) -> Heading | None:

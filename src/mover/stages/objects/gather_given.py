@@ -53,12 +53,16 @@ def gather_given(
         yaw, off, sure = along.new_tensor([[heading.yaw], [heading.spread], [WALLS]])
         said.append((yaw, off, sure))
     axis, spread = room_axis(said)
-    sharp = 1 / (4 * math.hypot(SQUARE, spread)) ** 2
     return Given(
         distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=along.to(known),
-        sharpness=sharp * known, axis=axis * known, standard=standard, precision=precision,
-        weight=weight,
+        sharpness=_sharpness(spread) * known, axis=axis * known,
+        standard=standard, precision=precision, weight=weight,
     )  # fmt: skip
+
+
+def _sharpness(spread: float) -> float:
+    """Of the density of yaws along an axis that is so far off [rad]."""
+    return 1 / (4 * math.hypot(SQUARE, spread)) ** 2
 
 
 def chance_along(objects: Objects) -> Float[Tensor, " objects"]:
@@ -69,11 +73,10 @@ def chance_along(objects: Objects) -> Float[Tensor, " objects"]:
 def given_axis(objects: Objects, heading: Heading) -> Given:
     """The same where nothing was given: of a room whose walls are seen, the axis alone."""
     known, none = torch.ones_like(objects.size[:, 0]), torch.zeros_like(objects.size)
-    sharp = 1 / (4 * math.hypot(SQUARE, heading.spread)) ** 2
     return Given(
         distance=known, yaw=0 * known, along=chance_along(objects).to(known),
-        sharpness=sharp * known, axis=heading.yaw * known, standard=none, precision=none,
-        weight=known, told=False,
+        sharpness=_sharpness(heading.spread) * known, axis=heading.yaw * known,
+        standard=none, precision=none, weight=known, told=False,
     )  # fmt: skip
 
 
