@@ -129,7 +129,7 @@ def test_walls_that_are_seen_tell_the_axis_better_than_rough_yaws():
 
 def test_of_a_room_without_a_guess_the_axis_alone_is_priced():
     objects = boxes_of(("bed", "chair"), [(1.4, 0.5, 2.0), (0.5, 0.9, 0.5)])
-    given = given_axis(objects, Heading(0.3, math.radians(0.5)))
+    given = given_axis(objects.categories, Heading(0.3, math.radians(0.5)))
     straight = replace(somewhere(2), yaw=torch.full((2,), 0.3 - math.pi))
     skew = replace(straight, yaw=straight.yaw + 0.7)
     far = replace(

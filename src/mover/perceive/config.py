@@ -168,6 +168,8 @@ class ScreenConfig:
     """How wrong pitch and roll may be [rad]; 0: not at all."""
     tilt_known: Annotated[float, float_in(0, 1.5)] = math.radians(1)
     """The same where the height is known, too [rad]."""
+    axis: Weight = 0.15
+    """Weight of the room's axis, where the picture shows it."""
     prior: Weight = 0.03
     """Weight of usual heights and tilts."""
     cap: Weight = 0.3
@@ -204,7 +206,7 @@ class LayoutConfig:
     """How shapes are made fit."""
     place: PlaceConfig = field(
         default_factory=lambda: PlaceConfig(
-            SceneWeights(1.0, 1.0, 0.3, 1.0, 0.0, 0.0, given=0.02),
+            SceneWeights(1.0, 1.0, 0.3, 1.0, 0.0, 0.0, given=0.1),
             "robust",
             LONG,
             short=SHORT,

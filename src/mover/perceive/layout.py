@@ -19,10 +19,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.records import record
+from mover.core.records import record, rows_of
 from mover.core.run import Run
 from mover.core.types import Camera, Detection, Heading, Layout, Mesh, Scene, SceneObject
 from mover.energy.objective import HumanCues, ImageCues
+from mover.energy.terms.given import Given
 from mover.furniture.library import WIDE_CLASSES, canonical, catalogue, choose_piece
 from mover.geometry.mesh import box, used
 from mover.geometry.raster import Crops
@@ -31,8 +32,10 @@ from mover.io.files.meshes import KINDS, read_mesh
 from mover.perceive.config import LayoutConfig
 from mover.perceive.depth_map import floor_height, median_depths, range_in
 from mover.perceive.screen import Screened, ScreenInputs, outermost, screen
+from mover.stages.camera.room_lines import Segments
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
 from mover.stages.objects.gather_given import given_axis
+from mover.stages.objects.own_edges import own_edges
 from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import place_objects
 from mover.stages.objects.prepare_objects import (
@@ -215,6 +218,8 @@ class Picture:
     """How far off pitch and roll are where its lines tell them [rad]."""
     heading: Heading | None = None
     """Of the room, where they tell it."""
+    segments: Segments | None = None
+    """These lines."""
 
 
 @record
@@ -269,7 +274,8 @@ def first_scene(
     pieces = _pieces(picture, [pairs[k] for k in items])
     prepared = run.stage(prepare_objects, PrepareInputs(pieces), config.prepare)
     starts = starts_of(screened, items, config.turns)
-    inputs = _place_inputs(picture, repeated(cues, things), prepared, starts, screened.height)
+    cues = replace(repeated(cues, things), given=axes_of(picture, things))
+    inputs = _place_inputs(picture, cues, prepared, starts, screened.height)
     placed = run.stage(place_objects, inputs, config.place)
     found = to_objects(pieces, prepared, placed.layout)
     return _scene(picture, (found, things, placed.energy[0]), screened.height, skipped)
@@ -301,19 +307,20 @@ def _screen_inputs(
 ) -> ScreenInputs:
     height = picture.height
     if height is None and picture.depth is not None:
-        things = picture.masks.any(0) | picture.people
-        height = floor_height(picture.depth, picture.camera, things)
+        hidden = picture.masks.any(0) | picture.people
+        height = floor_height(picture.depth, picture.camera, hidden)
+    things = torch.tensor([thing for thing, _ in pairs])
     return ScreenInputs(
         camera=picture.camera,
         boxes=cues.boxes,
         sides=cues.sides,
         depth=median_depths(picture.depth, picture.masks),
-        thing=torch.tensor([thing for thing, _ in pairs]),
+        thing=things,
         points=torch.stack([outer_points(shape) for _, shape in pairs]),
         height=height,
         height_spread=picture.height_spread,
         tilt_spread=picture.tilt_spread,
-        heading=0.0 if picture.heading is None else picture.heading.yaw,
+        given=axes_of(picture, things),
     )
 
 
@@ -326,14 +333,21 @@ def _pieces(picture: Picture, pairs: list[tuple[int, Shape]]) -> tuple[SceneObje
     return tuple(found)
 
 
+def axes_of(picture: Picture, things: Int[Tensor, " items"]) -> Given | None:
+    """Along what each item may run, as the room's edges and those of its thing tell."""
+    if picture.heading is None or picture.segments is None:
+        return None
+    edges = own_edges(picture.segments, picture.masks, picture.people, picture.camera)
+    kinds = [canonical(found.category) for found in picture.detections]
+    return rows_of(given_axis(kinds, picture.heading, edges), things, "objects")
+
+
 def _place_inputs(
     picture: Picture, cues: ImageCues, prepared: Prepared, starts: Layout, height: float
 ) -> PlaceInputs:
     depth = None
     if picture.depth is not None:
         depth = range_in(picture.depth, cues, picture.camera, SLACK)
-    if picture.heading is not None:
-        cues = replace(cues, given=given_axis(prepared.objects, picture.heading))
     return PlaceInputs(
         prepared.objects, picture.camera, -height, cues, HumanCues(depth=depth), starts,
         starts.yaw[0],

@@ -19,6 +19,7 @@ from mover.core.records import record
 from mover.core.types import Camera, Layout
 from mover.energy.minimize import minimize
 from mover.energy.terms.bbox import SEEN, bbox_term
+from mover.energy.terms.given import Given, given_term
 from mover.energy.terms.scale import scale_term
 from mover.geometry.camera import pitch_roll, project, tilted, to_world
 from mover.geometry.placement import place
@@ -50,8 +51,8 @@ class ScreenInputs:
     """Standard deviation of its logarithm; None: `ScreenConfig.known`."""
     tilt_spread: float | None = None
     """How far off pitch and roll are, where the picture tells them [rad]."""
-    heading: float = 0.0
-    """Yaw from which turns are tried [rad]."""
+    given: Given | None = None
+    """Along which axis each item may stand; None: no room's is seen."""
 
 
 @record
@@ -180,7 +181,10 @@ def _each(
     boxes, sides = inputs.boxes[thing], inputs.sides[thing]
     box = bbox_term(project(verts, camera.K), boxes, sides, float(camera.width), "robust")
     size = config.scale * scale_term(guess.log_scale, "robust")
-    return box + size + config.depth * _off_depth(verts, inputs.depth[thing])
+    energy = box + size + config.depth * _off_depth(verts, inputs.depth[thing])
+    if inputs.given is None:
+        return energy
+    return energy + config.axis * given_term(_standing(guess), inputs.given)
 
 
 def _off_depth(
@@ -212,11 +216,13 @@ def _starts(inputs: ScreenInputs, config: ScreenConfig, heights: Tensor) -> Gues
     usable = (rays[0][:, 1] < -0.02) & (inputs.sides[inputs.thing][:, 3] == SEEN) & (far < FARTHEST)
     distance = torch.where(usable, far, by_size.expand_as(far)).clamp(NEAREST, FARTHEST)
     t = distance[..., None] * torch.where(usable[..., None], rays[0], rays[1])
-    yaw = inputs.heading + torch.arange(config.yaws) * (2 * math.pi / config.yaws)
+    yaw = torch.arange(config.yaws)[:, None] * (2 * math.pi / config.yaws)
+    if inputs.given is not None:
+        yaw = yaw + inputs.given.axis
     shape = (len(heights), config.yaws, len(boxes))
     return Guess(
         t_world_object=t[:, None].expand(*shape, 3).clone(),
-        yaw=yaw[None, :, None].expand(shape).clone(),
+        yaw=yaw.expand(shape).clone(),
         log_scale=torch.zeros(*shape, 3),
         log_height=heights.log(),
         tilt=torch.zeros(len(heights), 2),

@@ -59,7 +59,7 @@ def along_edges(picture: Picture, by_feet: bool) -> Picture:
     tilt, heading = tilt_of(ends, spread), heading_of(ends)
     if tilt is not None:
         picture = replace(picture, camera=tilted_by(camera, tilt), tilt_spread=tilt.spread)
-    return replace(picture, heading=heading)
+    return replace(picture, heading=heading, segments=segments)
 
 
 def standing_on(picture: Picture, bodies: Bodies, run: Run) -> Picture:

@@ -35,6 +35,7 @@ from mover.geometry.placement import place, reproject, rest_on_support, standing
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import Alignment
+from mover.stages.camera.room_lines import Segments
 from mover.stages.config import PlaceConfig
 from mover.stages.contacts.assign_contacts import ContactAssignment
 from mover.stages.contacts.gather_cues import Cues, GatherInputs
@@ -68,6 +69,8 @@ class ReconstructionContext:
     """In which an object is not where the reference image shows it."""
     misfit: Float[Tensor, " objects"] | None = None
     """What box and silhouette left of shapes before they were bent: doubt of them stays."""
+    segments: Segments | None = None
+    """Straight edges of the reference image; None: nobody looks for them."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens, tilted_by
 from mover.stages.camera.find_scale import ScaleInputs, find_scale
-from mover.stages.camera.room_lines import FINE, SURE, find_segments
+from mover.stages.camera.room_lines import FINE, SURE, Segments, find_segments
 from mover.stages.cover import hiding
 from mover.stages.objects.find_image_cues import image_evidence, people_in_reference
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
@@ -58,6 +58,14 @@ def through_its_lens(
     if capture.focal_spread or lens.zoom != 1:
         told = replace(told, focal_spread=lens.spread)
     return through_lens(told, lens.zoom, pinned)
+
+
+def lines_of(capture: Capture, config: Config) -> Segments | None:
+    """Straight edges of the reference image of a still camera, where a preset looks for them."""
+    picture = capture.reference
+    if not config.lens.use or picture is None or not is_still(capture.path):
+        return None
+    return find_segments(picture, people_in_reference(capture), capture.scene.camera.K[:2, 2], SURE)
 
 
 def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:

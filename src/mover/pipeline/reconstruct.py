@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mover.bodies.corrected import in_world
 from mover.core.observe import Observer
-from mover.core.records import rows_of
+from mover.core.records import rows_of, to_device
 from mover.core.run import Conf, In
 from mover.core.run import Run as Run
 from mover.core.settings import check_settings
@@ -45,7 +45,7 @@ from mover.pipeline.outcome import (
     with_order,
     with_platforms,
 )
-from mover.pipeline.people import people_of, through_its_lens
+from mover.pipeline.people import lines_of, people_of, through_its_lens
 from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
 from mover.pipeline.presets import with_sizes
@@ -68,8 +68,10 @@ from mover.stages.objects.gather_given import (
     BENT,
     believed_sides,
     gather_given,
+    given_axis,
     lighter_where_used,
 )
+from mover.stages.objects.own_edges import OwnEdges, own_edges
 from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
 from mover.stages.objects.place_objects import (
     estimate_size_prior,
@@ -125,7 +127,9 @@ def _reconstructed(
         return with_proposals(room, capture, config, run, people, NOTHING)
     seen = image_evidence(capture)
     prepared = run.stage(prepare_objects, furniture, config.prepare)
-    context = ReconstructionContext(capture, config, run, seen, prepared, pinned, elsewhere)
+    context = ReconstructionContext(
+        capture, config, run, seen, prepared, pinned, elsewhere, segments=lines_of(capture, config)
+    )
     if people is None:
         ground = ground_without_people(capture, prepared)
         check_floor(ground, capture)
@@ -194,7 +198,7 @@ def placed_by_image(
         camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered, given
     )
     cues = context.run.stage(find_image_cues, image, context.config.image)
-    cues = with_given(cues, context, as_given(context, camera), before)
+    cues = with_given(cues, context, camera, before)
     if before is not None:  # the room as it was given does not tell the scale of a depth
         cues = with_measured(cues, context, here, before.placed.layout)
     inputs = PlaceInputs(
@@ -207,24 +211,36 @@ def placed_by_image(
 
 
 def with_given(
-    image: ImageCues, context: ReconstructionContext, given: Layout, before: SceneState | None
+    image: ImageCues, context: ReconstructionContext, camera: Camera, before: SceneState | None
 ) -> ImageCues:
     """The image's cues with what is known of the objects before they are seen.
 
-    The first descent goes without it: what the image leaves there tells how far it is believed.
+    The first descent knows axes alone: what the image leaves there tells how far the rest is
+    believed.
     """
-    objects = context.prepared.objects
+    objects, heading = context.prepared.objects, context.capture.heading
     free = replace(image, sides=believed_sides(image.sides, torch.zeros_like(image.trust)))
-    if before is None or not context.config.place.weights.given:
+    if not context.config.place.weights.given:
         return free
+    edges = edges_under(context, camera)
+    if before is None:
+        axes = None if heading is None else given_axis(objects.categories, heading, edges)
+        return replace(free, given=to_device(axes, image.trust.device))
     left = misfit_of(context, free, before)
     if context.misfit is not None:
         left = torch.maximum(left, context.misfit)
-    heading = context.capture.heading
-    known = gather_given(objects, given, before.placed.layout, left, heading)
+    given, layout = as_given(context, camera), before.placed.layout
+    known = gather_given(objects, given, layout, left, heading, edges)
     return replace(
         image, given=known, sides=believed_sides(image.sides, known.weight, image.beside)
     )
+
+
+def edges_under(context: ReconstructionContext, camera: Camera) -> OwnEdges | None:
+    """The furniture's own edges, under a camera."""
+    if context.segments is None:
+        return None
+    return own_edges(context.segments, context.seen.masks, context.seen.people, camera)
 
 
 def misfit_of(
@@ -352,7 +368,7 @@ def placed_with_people(
     assert state.contacts is not None
     contacts = state.contacts.points
     image = run.stage(find_image_cues, state.image, config.image)
-    image = with_given(image, context, as_given(context, state.camera), state)
+    image = with_given(image, context, state.camera, state)
     view = state.camera, state.ground
     image = with_measured(image, context, view, state.placed.layout)
     humans = cues_in_windows(state.cues, contacts, image.views, state.camera)

@@ -8,11 +8,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from mover.core.records import record
 from mover.core.types import Heading, Layout, Objects
 from mover.energy.terms.bbox import LEAST, LIKELY, SEEN
 from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.given import COMMON, SIZE, TURN, Given
 from mover.furniture.library import STANDARD, WALL_PIECES, WIDE_CLASSES, canonical
+from mover.stages.objects.own_edges import OwnEdges
 
 FIT = 0.1  # image energy (robust form) of a shape that fits
 PART, WHOLE = 0.2, 0.9  # shares of a side that something is near to, or touches
@@ -24,6 +26,9 @@ SQUARE = math.radians(5)  # how well furniture that stands along an axis does so
 WALLS = 0.95  # chance that furniture runs along the edges that a picture shows
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
 CONTRADICTED = 3.0  # standard deviations between a given and a standard size, of another class
+STRAIGHT = math.radians(2)  # how well edges run along the sides of what they belong to [rad]
+LEVEL, TOLD = 0.5, 0.95  # chances that an edge is level, and that what edges agree on is so
+AGREED = math.radians(4)  # [rad], how well they must
 DIRECTIONS = 90  # that are tried within a quarter turn
 
 
@@ -33,6 +38,7 @@ def gather_given(
     layout: Layout,
     energy: Float[Tensor, " objects"],
     heading: Heading | None = None,
+    edges: OwnEdges | None = None,
 ) -> Given:
     """The evidence of `terms.given`.
 
@@ -42,9 +48,10 @@ def gather_given(
         layout: Where it was placed since, by the image.
         energy: What is left of the image's energy there.
         heading: Of the room's walls, where they are seen.
+        edges: Of the objects, where they are seen.
     """
     standard, precision = standard_sizes(objects)
-    along = chance_along(objects)
+    along = chance_along(objects.categories)
     known = torch.ones_like(start.yaw)
     weight = prior_weights(energy)
     found = (LOOSE * (0.1 + weight).sqrt()).clamp(SQUARE, TURN)
@@ -52,12 +59,45 @@ def gather_given(
     if heading is not None:
         yaw, off, sure = along.new_tensor([[heading.yaw], [heading.spread], [WALLS]])
         said.append((yaw, off, sure))
-    axis, spread = room_axis(said)
+    axes = _own_axes(along, room_axis(said), edges)
     return Given(
-        distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=along.to(known),
-        sharpness=_sharpness(spread) * known, axis=axis * known,
+        distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=axes.along.to(known),
+        sharpness=axes.sharpness.to(known), axis=axes.yaw.to(known),
         standard=standard, precision=precision, weight=weight,
     )  # fmt: skip
+
+
+@record
+class _Axes:
+    """Along what each object runs."""
+
+    along: Float[Tensor, " objects"]
+    """The chance that it does."""
+    yaw: Float[Tensor, " objects"]
+    """Up to quarter turns [rad]."""
+    sharpness: Float[Tensor, " objects"]
+    """Of the density of yaws along it."""
+
+
+def _own_axes(
+    along: Float[Tensor, " objects"], room: tuple[float, float], edges: OwnEdges | None
+) -> _Axes:
+    """The room's axis, and of objects whose own edges agree their own."""
+    one = torch.ones_like(along)
+    axes = _Axes(along.clone(), room[0] * one, _sharpness(room[1]) * one)
+    if edges is None:
+        return axes
+    near = math.hypot(SQUARE, room[1]) * one
+    spread = torch.hypot(edges.spread, torch.full_like(edges.spread, STRAIGHT))
+    level = torch.full_like(edges.yaw, LEVEL)
+    for k in edges.of.unique():
+        mine, own = k.view(1), edges.of == k
+        beside = (axes.yaw[mine], near[mine], along[mine])
+        yaw, off = room_axis([beside, (edges.yaw[own], spread[own], level[own])])
+        if off < AGREED:
+            axes.along[k], axes.yaw[k] = TOLD, yaw
+            axes.sharpness[k] = 1 / (4 * math.hypot(STRAIGHT, off)) ** 2
+    return axes
 
 
 def _sharpness(spread: float) -> float:
@@ -65,17 +105,17 @@ def _sharpness(spread: float) -> float:
     return 1 / (4 * math.hypot(SQUARE, spread)) ** 2
 
 
-def chance_along(objects: Objects) -> Float[Tensor, " objects"]:
+def chance_along(categories: Sequence[str]) -> Float[Tensor, " objects"]:
     """How probably each object stands along an axis of the room."""
-    return torch.tensor([OFTEN if c in WALL_PIECES else SELDOM for c in objects.categories])
+    return torch.tensor([OFTEN if c in WALL_PIECES else SELDOM for c in categories])
 
 
-def given_axis(objects: Objects, heading: Heading) -> Given:
+def given_axis(categories: Sequence[str], heading: Heading, edges: OwnEdges | None = None) -> Given:
     """The same where nothing was given: of a room whose walls are seen, the axis alone."""
-    known, none = torch.ones_like(objects.size[:, 0]), torch.zeros_like(objects.size)
+    axes = _own_axes(chance_along(categories), (heading.yaw, heading.spread), edges)
+    known, none = torch.ones_like(axes.yaw), axes.yaw.new_zeros(len(axes.yaw), 3)
     return Given(
-        distance=known, yaw=0 * known, along=chance_along(objects).to(known),
-        sharpness=_sharpness(heading.spread) * known, axis=heading.yaw * known,
+        distance=known, yaw=0 * known, along=axes.along, sharpness=axes.sharpness, axis=axes.yaw,
         standard=none, precision=none, weight=known, told=False,
     )  # fmt: skip
 

@@ -1,0 +1,85 @@
+"""Which way each piece of furniture runs, by its own straight edges in the picture.
+
+Not in the paper. Beds, tables and shelves are square, and most of their edges level or upright: a
+level one tells the yaw of its piece up to quarter turns, whatever the shape of its mesh. The edge
+lies in the plane through the camera and its picture, and runs where that meets a level plane.
+Upright edges tell nothing, and slanted ones tell wrong, each in its own way: as for the axis of
+the room, each edge may be one of those, and edges that agree are believed.
+"""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import max_pool2d, normalize
+
+from mover.core.records import record
+from mover.core.types import Camera
+from mover.stages.camera.room_lines import Segments
+
+BORDER = 3  # [px], how far off a mask edges are its own, too: outlines
+UPRIGHT = math.radians(10)  # how far from upright the planes of edges must be that may be level
+
+
+@record
+class OwnEdges:
+    """Edges of furniture that may be level."""
+
+    of: Int[Tensor, " edges"]
+    """The object of each."""
+    yaw: Float[Tensor, " edges"]
+    """Where it runs if it is level, up to half turns [rad]."""
+    spread: Float[Tensor, " edges"]
+    """Standard deviation [rad]."""
+
+
+def own_edges(
+    segments: Segments,
+    masks: Bool[Tensor, "objects h w"],
+    people: Bool[Tensor, "h w"],
+    camera: Camera,
+) -> OwnEdges:
+    """The straight edges of each object, and where they run.
+
+    Args:
+        segments: Of the picture.
+        masks: What is seen of the objects.
+        people: Where people are.
+        camera: With the lens and tilt as they are known now.
+    """
+    of = _owners(segments, torch.cat([masks, people[None]]).cpu(), camera)
+    yaw, upright = _level(segments, camera, 0.0)
+    turned = torch.stack([_level(segments, camera, errors)[0] for errors in (-1.0, 1.0)])
+    half = torch.pi
+    spread = (torch.remainder(turned - yaw + half / 2, half) - half / 2).abs().amax(0)
+    told = (of >= 0) & ~upright
+    return OwnEdges(of[told], yaw[told].float(), spread[told].float())
+
+
+def _owners(
+    segments: Segments, masks: Bool[Tensor, "masks h w"], camera: Camera
+) -> Int[Tensor, " edges"]:
+    """Whose edge each is; -1: nobody's, of several, or of people, whose mask is the last."""
+    x, y = (segments.middle + camera.K[:2, 2].double().cpu()).long().unbind(-1)
+    x, y = x.clamp(0, camera.width - 1), y.clamp(0, camera.height - 1)
+    wide = max_pool2d(masks.float()[:, None], 2 * BORDER + 1, 1, BORDER)[:, 0, y, x] > 0
+    alone = (wide.sum(0) == 1) & ~wide[-1]
+    return torch.where(alone, wide.int().argmax(0), -1)
+
+
+def _level(
+    segments: Segments, camera: Camera, errors: float
+) -> tuple[Float[Tensor, " edges"], Bool[Tensor, " edges"]]:
+    """Yaw of each edge if it is level, turned in the picture by so many errors of its angle.
+
+    And whether it may as well be upright.
+    """
+    angle, focal = errors * segments.error, camera.K[0, 0].double().cpu()
+    x, y = segments.along.unbind(-1)
+    x, y = angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y
+    along = torch.stack([x, y, torch.zeros_like(x)], -1)
+    ray = torch.cat([segments.middle, focal.expand(len(x), 1)], -1)
+    normal = torch.linalg.cross(ray, along) @ camera.R_cam_world.double().cpu()
+    normal = normalize(normal, dim=-1)
+    return torch.atan2(normal[:, 2], -normal[:, 0]), normal[:, 1].abs() < math.sin(UPRIGHT)
