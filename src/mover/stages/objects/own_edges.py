@@ -12,7 +12,7 @@ import math
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize
+from torch.nn.functional import normalize
 
 from mover.core.records import record
 from mover.core.types import Camera
@@ -62,8 +62,10 @@ def _owners(
 ) -> Int[Tensor, " edges"]:
     """Whose edge each is; -1: nobody's, of several, or of people, whose mask is the last."""
     x, y = (segments.middle + camera.K[:2, 2].double().cpu()).long().unbind(-1)
-    x, y = x.clamp(0, camera.width - 1), y.clamp(0, camera.height - 1)
-    wide = max_pool2d(masks.float()[:, None], 2 * BORDER + 1, 1, BORDER)[:, 0, y, x] > 0
+    beside = torch.arange(-BORDER, BORDER + 1)
+    x = (x[:, None, None] + beside).clamp(0, camera.width - 1)
+    y = (y[:, None, None] + beside[:, None]).clamp(0, camera.height - 1)
+    wide = masks[:, y, x].flatten(2).any(-1)
     alone = (wide.sum(0) == 1) & ~wide[-1]
     return torch.where(alone, wide.int().argmax(0), -1)
 
