@@ -169,7 +169,7 @@ class ScreenConfig:
     tilt_known: Annotated[float, float_in(0, 1.5)] = math.radians(1)
     """The same where the height is known, too [rad]."""
     axis: Weight = 0.15
-    """Weight of the room's axis, where the picture shows it."""
+    """Weight of the axis along which a thing may stand, where the picture shows it."""
     prior: Weight = 0.03
     """Weight of usual heights and tilts."""
     cap: Weight = 0.3

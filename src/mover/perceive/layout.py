@@ -27,6 +27,7 @@ from mover.energy.terms.given import Given
 from mover.furniture.library import WIDE_CLASSES, canonical, catalogue, choose_piece
 from mover.geometry.mesh import box, used
 from mover.geometry.raster import Crops
+from mover.geometry.rotations import wrap
 from mover.io.files.fields import At
 from mover.io.files.meshes import KINDS, read_mesh
 from mover.perceive.config import LayoutConfig
@@ -172,8 +173,7 @@ def _apart(yaw: Float[Tensor, " yaws"], energy: Tensor, turns: int) -> Int[Tenso
     kept: list[int] = []
     rest: list[int] = []
     for k in energy.argsort().tolist():
-        near = [abs(float(torch.remainder(yaw[k] - yaw[j] + torch.pi, 2 * torch.pi)) - torch.pi)
-                for j in kept]  # fmt: skip
+        near = [abs(float(wrap(yaw[k] - yaw[j]))) for j in kept]
         (kept if all(d > TURNED_APART for d in near) else rest).append(k)
     return torch.tensor((kept + rest)[:turns])
 

@@ -52,7 +52,7 @@ class ScreenInputs:
     tilt_spread: float | None = None
     """How far off pitch and roll are, where the picture tells them [rad]."""
     given: Given | None = None
-    """Along which axis each item may stand; None: no room's is seen."""
+    """Along which axis each item may stand; None: nothing is seen of it."""
 
 
 @record

@@ -40,16 +40,15 @@ def through_its_lens(
     capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]
 ) -> Capture:
     """The capture under focal length and tilt as the lines of its picture tell them."""
-    picture, camera = capture.reference, capture.scene.camera
-    if not config.lens.use or picture is None or not is_still(capture.path):
+    camera, guessed = capture.scene.camera, bool(capture.focal_spread)
+    segments = lines_of(capture, config, FINE if guessed else SURE)
+    if segments is None:
         return capture
     people, tilt = located(capture, config, run), config.lens.tilt
     if people is not None:
         camera = replace(camera, R_cam_world=people.alignment.camera.R_cam_world)
         spread = people.alignment.covariance.diag()[:2].amax()
         tilt = min(tilt, math.hypot(config.lens.feet, float(spread) ** 0.5))
-    guessed, hidden = bool(capture.focal_spread), people_in_reference(capture)
-    segments = find_segments(picture, hidden, camera.K[:2, 2], FINE if guessed else SURE)
     by_feet = guessed and people is not None
     inputs = LensInputs(segments, camera, capture.focal_spread, tilt, by_feet)
     lens = run.stage(find_lens, inputs, config.lens)
@@ -60,12 +59,14 @@ def through_its_lens(
     return through_lens(told, lens.zoom, pinned)
 
 
-def lines_of(capture: Capture, config: Config) -> Segments | None:
+def lines_of(
+    capture: Capture, config: Config, fineness: tuple[float, float] = SURE
+) -> Segments | None:
     """Straight edges of the reference image of a still camera, where a preset looks for them."""
-    picture = capture.reference
+    picture, centre = capture.reference, capture.scene.camera.K[:2, 2]
     if not config.lens.use or picture is None or not is_still(capture.path):
         return None
-    return find_segments(picture, people_in_reference(capture), capture.scene.camera.K[:2, 2], SURE)
+    return find_segments(picture, people_in_reference(capture), centre, fineness)
 
 
 def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:

@@ -23,6 +23,7 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera, Capture, Heading, SceneObject, Tilt
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
+from mover.geometry.rotations import wrap
 from mover.stages.camera.config import LensConfig
 from mover.stages.camera.find_focal import zoomed
 from mover.stages.camera.room_lines import Ends, Prior, Segments, fit_room
@@ -113,8 +114,7 @@ def heading_of(ends: Ends) -> Heading | None:
     R = ends.pose.R_cam_room
     level = tilted(*pitch_roll(R)).mT @ R
     yaw = torch.atan2(level[:, 0, 2], level[:, 2, 2])
-    quarter = torch.pi / 2
-    off = torch.remainder(yaw - yaw[0] + quarter / 2, quarter) - quarter / 2
+    off = wrap(4 * (yaw - yaw[0])) / 4  # quarter turns aside
     mean, square = _over(ends, off[:, None], [2])  # about y
     spread = math.hypot(float(square) ** 0.5, SYSTEMATIC_TILT)
     return Heading(float(yaw[0] + mean), spread) if spread < VAGUE else None

@@ -84,7 +84,7 @@ def _own_axes(
 ) -> _Axes:
     """The room's axis, and of objects whose own edges agree their own."""
     one = torch.ones_like(along)
-    axes = _Axes(along.clone(), room[0] * one, _sharpness(room[1]) * one)
+    axes = _Axes(along.clone(), room[0] * one, _sharpness(SQUARE, room[1]) * one)
     if edges is None:
         return axes
     near = math.hypot(SQUARE, room[1]) * one
@@ -96,13 +96,13 @@ def _own_axes(
         yaw, off = room_axis([beside, (edges.yaw[own], spread[own], level[own])])
         if off < AGREED:
             axes.along[k], axes.yaw[k] = TOLD, yaw
-            axes.sharpness[k] = 1 / (4 * math.hypot(STRAIGHT, off)) ** 2
+            axes.sharpness[k] = _sharpness(STRAIGHT, off)
     return axes
 
 
-def _sharpness(spread: float) -> float:
-    """Of the density of yaws along an axis that is so far off [rad]."""
-    return 1 / (4 * math.hypot(SQUARE, spread)) ** 2
+def _sharpness(stands: float, off: float) -> float:
+    """Of the density of yaws that stand so well along an axis which is so far off [rad]."""
+    return 1 / (4 * math.hypot(stands, off)) ** 2
 
 
 def chance_along(categories: Sequence[str]) -> Float[Tensor, " objects"]:

@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 
 from mover.core.records import record
 from mover.core.types import Camera
+from mover.geometry.rotations import wrap
 from mover.stages.camera.room_lines import Segments
 
 BORDER = 3  # [px], how far off a mask edges are its own, too: outlines
@@ -48,26 +49,28 @@ def own_edges(
         people: Where people are.
         camera: With the lens and tilt as they are known now.
     """
-    of = _owners(segments, torch.cat([masks, people[None]]).cpu(), camera)
+    of = _owners(segments, masks, people, camera)
     yaw, upright = _level(segments, camera, 0.0)
     turned = torch.stack([_level(segments, camera, errors)[0] for errors in (-1.0, 1.0)])
-    half = torch.pi
-    spread = (torch.remainder(turned - yaw + half / 2, half) - half / 2).abs().amax(0)
+    spread = wrap(2 * (turned - yaw)).abs().amax(0) / 2  # half turns aside
     told = (of >= 0) & ~upright
     return OwnEdges(of[told], yaw[told].float(), spread[told].float())
 
 
 def _owners(
-    segments: Segments, masks: Bool[Tensor, "masks h w"], camera: Camera
+    segments: Segments,
+    masks: Bool[Tensor, "objects h w"],
+    people: Bool[Tensor, "h w"],
+    camera: Camera,
 ) -> Int[Tensor, " edges"]:
-    """Whose edge each is; -1: nobody's, of several, or of people, whose mask is the last."""
+    """Whose edge each is; -1: nobody's, of several, or of people."""
     x, y = (segments.middle + camera.K[:2, 2].double().cpu()).long().unbind(-1)
     beside = torch.arange(-BORDER, BORDER + 1)
     x = (x[:, None, None] + beside).clamp(0, camera.width - 1)
     y = (y[:, None, None] + beside[:, None]).clamp(0, camera.height - 1)
-    wide = masks[:, y, x].flatten(2).any(-1)
-    alone = (wide.sum(0) == 1) & ~wide[-1]
-    return torch.where(alone, wide.int().argmax(0), -1)
+    near = masks[:, y, x].flatten(2).any(-1).cpu()
+    alone = (near.sum(0) == 1) & ~people[y, x].flatten(1).any(-1).cpu()
+    return torch.where(alone, near.int().argmax(0), -1)
 
 
 def _level(
