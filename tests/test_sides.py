@@ -1,14 +1,20 @@
 """What is known of the sides of a box: where they are, or how far an object reaches at least."""
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from analytic import make_inputs
+from scipy.spatial import ConvexHull
 
 from mover.energy.terms.bbox import HIDDEN, LEAST, LIKELY, SEEN, SOFT, UNKNOWN, bbox_term
+from mover.geometry.camera import project
+from mover.geometry.rotations import rot_y
 from mover.stages.config import ImageConfig
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
+from mover.stages.objects.gather_given import believed_sides
 
 HEIGHT, WIDTH = 120, 200
 LEFT, TOP, RIGHT, BOTTOM = range(4)
@@ -39,6 +45,33 @@ def sides_of(first, *others, form="robust", people=None, behind=(), bounded=Fals
     return find_image_cues(inputs, ImageConfig(32, form, 0.1, bounded)).sides[0].tolist()
 
 
+def corners_at_border(K, random):
+    """Corners [px] of an upright box that one border of the image cuts, and none of the others."""
+    tall = torch.rand(3, generator=random) * 0.6 + 0.3
+    turn = float(torch.rand((), generator=random)) * math.pi
+    unit = torch.cartesian_prod(*(torch.tensor([-0.5, 0.5]),) * 3) * tall
+    for _ in range(1000):
+        aim = torch.rand(2, generator=random) * torch.tensor([WIDTH, HEIGHT])
+        away = 2 + 6 * float(torch.rand((), generator=random))
+        middle = away * torch.linalg.inv(K) @ torch.tensor([*aim.tolist(), 1.0])
+        pixels = project(unit @ rot_y(torch.tensor(turn)).mT + middle, K)
+        box = torch.cat([pixels.amin(0), pixels.amax(0)])
+        out = torch.cat([box[:2] < 0, box[2:] > torch.tensor([WIDTH, HEIGHT])])
+        inside = torch.tensor([2.0, 2.0, WIDTH - 2.0, HEIGHT - 2.0])
+        clear = (box - inside) * torch.tensor([1.0, 1.0, -1.0, -1.0]) > 0
+        if int(out.sum()) == 1 and bool((clear | out).all()):
+            return pixels
+    raise AssertionError("no box is cut by one border")
+
+
+def hull(pixels):
+    """What is covered of the image by the convex hull of points [px]."""
+    around = ConvexHull(pixels.double().numpy()).equations
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    beyond = around[:, 0, None, None] * x + around[:, 1, None, None] * y + around[:, 2, None, None]
+    return torch.from_numpy((beyond <= 0).all(0))
+
+
 class TestWhatIsKnown:
     def test_an_object_alone_is_seen_on_all_sides(self):
         assert sides_of(rectangle(50, 30, 90, 80)) == [SEEN] * 4
@@ -56,6 +89,17 @@ class TestWhatIsKnown:
         body = rectangle(50, 80, 90, 120)
         found = sides_of(rectangle(0, 30, 90, 80), people=body)
         assert found == [LEAST, SEEN, SEEN, LEAST]
+
+    @pytest.mark.parametrize("seed", range(30))
+    def test_where_it_truly_stands_a_box_that_a_border_cuts_costs_nothing(self, seed):
+        camera = replace(make_inputs().camera, width=WIDTH, height=HEIGHT)
+        pixels = corners_at_border(camera.K, torch.Generator().manual_seed(seed))
+        mask = hull(pixels)
+        sides = believed_sides(torch.tensor([sides_of(mask)]), torch.zeros(1))
+        box = box_of(mask)
+        price = bbox_term(pixels[None], box[None], sides, float(WIDTH), "robust")
+        whole = float((box[2:] - box[:2]).prod().sqrt())
+        assert float(price) < 4 / whole  # pixels are whole: each side is off by less than one
 
     def test_what_is_known_to_stand_behind_hides_nothing(self):
         sofa = rectangle(90, 20, 150, 90)

@@ -22,6 +22,7 @@ from mover.geometry.mesh import signed_volume, vertex_normals
 from mover.geometry.placement import place
 from mover.geometry.raster import Crops, Depths, layers
 from mover.geometry.volume import SHELL, Volume, sample
+from mover.geometry.warp_start import mapped
 from mover.stages.masks import small_camera
 
 FEW = 8  # pixels of each object and side whose body is looked for
@@ -118,15 +119,21 @@ def _owners_of_pixels(
     pixels, depth = torch.cat([t.pixels for t in tight]), torch.cat([t.depth for t in tight])
     best, owner = torch.full_like(depth, SAME), torch.full((len(depth),), -1)
     may = _may_give(pixels, depth, bodies, small)
-    for row in may.any(-1).nonzero()[:, 0].tolist():  # one at a time: memory stays that of one
+
+    def away(row: int) -> tuple[Int[Tensor, " asked"], Float[Tensor, " asked"]]:
         asked = may[row].nonzero()[:, 0]
         K = small.K.repeat(len(asked), 1, 1)
         K[:, :2, 2] -= pixels[asked].floor()
         verts = to_camera(bodies.verts[row], small.R_cam_world).expand(len(asked), -1, -1)
         drawn = layers(verts, bodies.faces, Crops(K, 1, 1))
-        away = torch.stack([drawn.front, drawn.exit]).flatten(1).sub(depth[asked]).abs().amin(0)
-        wins = away < best[asked]
-        best[asked[wins]], owner[asked[wins]] = away[wins], row
+        return asked, torch.stack([drawn.front, drawn.exit]).flatten(1).sub(
+            depth[asked]
+        ).abs().amin(0)
+
+    rows = may.any(-1).nonzero()[:, 0].tolist()
+    for row, (asked, off) in zip(rows, mapped(away, rows), strict=True):  # memory: one a thread
+        wins = off < best[asked]
+        best[asked[wins]], owner[asked[wins]] = off[wins], row
     return list(owner.split([len(t.pixels) for t in tight]))
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Heading, Layout, Objects
-from mover.energy.terms.bbox import LEAST, LIKELY, SEEN
+from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.terms.contact import ContactPoints
 from mover.energy.terms.given import COMMON, SIZE, TURN, Given
 from mover.furniture.library import STANDARD, WALL_PIECES, WIDE_CLASSES, canonical
@@ -154,6 +154,10 @@ def believed_sides(
 ) -> Int[Tensor, "objects 4"]:
     """What is known of the sides of boxes, with no bound (`LIKELY`) for shapes that fit.
 
+    A piece that is cut off on the left, by whatever, may be higher and lower there than all that is
+    seen of it: its top and its bottom are lower bounds, too. Its silhouette tells where it ends; a
+    shape that does not fit would grow behind what hides it.
+
     Where shapes do not fit, masks are coarse, too: what is near to a side may hide more behind it,
     and what touches all of it does so about as often as not (`ImageCues.beside`).
     """
@@ -162,7 +166,9 @@ def believed_sides(
         near = (sides == SEEN) & (beside[..., 1] > PART)
         covered = (sides == LIKELY) & (beside[..., 0] > WHOLE)
         sides = torch.where(~fits & near, LIKELY, torch.where(~fits & covered, LEAST, sides))
-    return torch.where(fits & (sides == LIKELY), LEAST, sides)
+    cut = (sides == LIKELY) | (sides == LEAST)
+    cut = cut | cut.roll(1, -1) | cut.roll(-1, -1)  # or a side beside it is
+    return torch.where(fits & cut & (sides != UNKNOWN), LEAST, sides)
 
 
 def standard_sizes(
