@@ -166,6 +166,38 @@ def test_the_covariance_is_calibrated(frames, noise):
     assert (np.mean(scores, 0) <= 0.97).all()
 
 
+def leaning(soles, slope):
+    """The same, of bodies whose distance is wrong by a share that grows with it [1/m]."""
+    points = soles.points_cam
+    away = points.norm(dim=-1, keepdim=True)
+    return FootContacts(points * (1 + slope * (away - away.mean())), soles.person, soles.frame, ())
+
+
+@pytest.mark.parametrize("slope", [-0.007, 0.007])
+def test_a_floor_that_leans_as_a_whole_is_set_right_by_a_tilt_that_is_told(slope):
+    told, soles = math.radians(0.3), leaning(soles_at(room(30), noise=0.01), slope)
+    alone = errors(align(soles, camera_off((0.1, -0.1))))
+    assert abs(alone[0]) > 0.4  # and states a tenth of that
+    believed, doubted = (
+        align_camera(AlignInputs(soles, camera_off((0.1, -0.1)), None, None, told, lean))
+        for lean in (0.0, math.radians(0.5))
+    )
+    assert abs(errors(doubted)[0]) < 0.2 < abs(errors(believed)[0])
+    spread = doubted.covariance.diag().sqrt()[:2]
+    assert bool((spread > 0.8 * told).all())
+    assert bool((spread < 1.2 * told).all())
+
+
+def test_where_no_tilt_is_told_a_lean_changes_nothing():
+    soles = soles_at(room(), noise=0.01)
+    found = [
+        align_camera(AlignInputs(soles, camera_off((2.0, 1.0)), None, None, None, lean))
+        for lean in (0.0, 0.02)
+    ]
+    assert torch.equal(found[0].camera.R_cam_world, found[1].camera.R_cam_world)
+    assert torch.equal(found[0].covariance, found[1].covariance)
+
+
 def test_frames_of_one_pose_are_no_new_evidence():
     rng = np.random.default_rng(0)
     spots = room(8)

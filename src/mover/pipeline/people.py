@@ -33,6 +33,7 @@ from mover.stages.objects.find_image_cues import image_evidence, people_in_refer
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
+LEAN = math.radians(0.5)  # of the floor under fitted bodies, whose distances err together [rad]
 NEAREST = 0.3  # [m], no object is nearer to the reference image's camera
 
 
@@ -111,7 +112,8 @@ def located(capture: Capture, config: Config, run: Run) -> PeopleState | None:
         feet, loose = feet_on(path), drift.covariance
     feet = replace(feet, lift=_lifts(feet, capture))
     camera, tilt_spread = _tilted(camera, capture)
-    known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread)
+    lean = 0.0 if bodies.size_spread is None else LEAN
+    known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread, lean)
     alignment = run.stage(align_camera, known, config.align)
     alignment = replace(alignment, covariance=alignment.covariance + loose)
     warnings = (*warnings, *told, *feet.warnings, *alignment.warnings)

@@ -272,6 +272,8 @@ class AlignInputs:
     """Known height of the camera above the floor [m]."""
     tilt_spread: float | None = None
     """How far off that pitch and roll are [rad]; None: as `AlignConfig` has it."""
+    lean: float = 0.0
+    """How far the plane under the feet may lean as a whole, which no foot tells [rad]."""
 
 
 @record
@@ -300,9 +302,10 @@ def align_camera(
     if not len(feet.person):
         return _without_feet(inputs, config)
     votes, first = vote(feet, config.votes), torch.stack(pitch_roll(camera.R_cam_world.double()))
+    votes, leaning = _doubted(inputs, config, votes, first)
     fit = _best_fit(inputs, config, votes, first)
     observe(Step("align_camera", 0, 1))
-    spread = covariance_of(fit, votes)
+    spread = covariance_of(fit, votes) + leaning
     people = [str(p) for p in votes.people.tolist()]
     found = Alignment(
         camera=_turned(camera, fit.at),
@@ -313,6 +316,24 @@ def align_camera(
     )
     warnings = (*_weak(found, votes), *_surprising(found, first, config))
     return dataclasses.replace(found, warnings=warnings)
+
+
+def _doubted(
+    inputs: AlignInputs, config: AlignConfig, votes: Votes, first: Float[Tensor, "2"]
+) -> tuple[Votes, Float[Tensor, "3 3"]]:
+    """The votes as light, beside a tilt that is told, as the lean of all makes them.
+
+    And what the lean adds to the covariance.
+    """
+    none = torch.zeros(3, 3, dtype=torch.float64)
+    if not inputs.lean or inputs.tilt_spread is None:
+        return votes, none
+    alone = _best_fit(dataclasses.replace(inputs, tilt_spread=None), config, votes, first)
+    own = float(covariance_of(alone, votes).diag()[:2].mean())
+    whole, told = own + inputs.lean**2, inputs.tilt_spread**2
+    tilt = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64).diag()
+    added = (inputs.lean * told / (told + whole)) ** 2 * tilt
+    return dataclasses.replace(votes, weight=votes.weight * own / whole), added
 
 
 def _best_fit(
