@@ -25,8 +25,8 @@ from mover.core.records import record
 from mover.core.types import Camera, CameraPath
 from mover.energy.terms.feet import FootContacts, heights, up_cam
 from mover.geometry.camera import pitch_roll, tilted
-from mover.stages.camera.align_camera import Votes, vote
 from mover.stages.camera.config import DriftConfig
+from mover.stages.camera.foot_votes import Votes, vote
 
 STEPS = 12  # for each scale of the robust price
 FIXED = 1e-4  # [m], how well the height at the reference image is known
