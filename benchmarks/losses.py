@@ -71,12 +71,10 @@ def _away(box: Box) -> torch.Tensor:
 
 def losses(job: Job) -> tuple[list[float], list[float]]:
     """Mean IoU3D over the true objects: as found and after each step; each step alone."""
-    trial, rebuilt = (
-        records.load(Trial, job.room),
-        records.load(Rebuilt, job.folder / "scenes"),
-    )
-    true = {piece.id: box_of(piece) for piece in trial.truth.objects}
-    found = {p.id: box_of(p) for p in rebuilt.full.objects if p.id in true}
+    truth = records.load(Trial, job.room).truth
+    result = records.load(Rebuilt, job.folder / "scenes").full
+    true = {piece.id: box_of(piece) for piece in truth.objects}
+    found = {piece.id: box_of(piece) for piece in result.objects if piece.id in true}
 
     def mean(boxes: Boxes) -> float:
         each = [float(iou3d(thick(box), thick(true[name]))) for name, box in boxes.items()]
@@ -100,6 +98,8 @@ def main() -> None:
     args = parser.parse_args()
     jobs = [Job(args.set, seed, args.preset, args.out) for seed in parse_seeds(args.seeds)]
     rows = [losses(job) for job in jobs if (job.folder / DONE).is_file()]
+    if not rows:
+        parser.error(f"{args.out / args.set}: no room of {args.seeds} is rebuilt by {args.preset}")
     whole, alone = (np.array(x).mean(0) for x in zip(*rows, strict=True))
     print(f"{args.set}, {args.preset}, {len(rows)} rooms\n\n| set right | IoU3D | alone |")
     print(f"|---|---|---|\n| nothing | {whole[0]:.3f} | |")

@@ -235,6 +235,12 @@ def test_a_side_that_may_be_hidden_bounds_nothing_of_a_shape_that_fits() -> None
         assert found.tolist() == [first, *sides[1:].tolist()]
 
 
+def test_a_side_of_which_nothing_is_known_stays_so_beside_others() -> None:
+    sides = torch.tensor([[SEEN, LEAST, LIKELY, UNKNOWN]] * 2)
+    found = believed_sides(sides, torch.tensor([UNFIT - 0.01, UNFIT + 0.01]))
+    assert found.tolist() == [[LEAST, LEAST, LEAST, UNKNOWN], sides[1].tolist()]
+
+
 @pytest.mark.parametrize("cut", range(4))
 @pytest.mark.parametrize("known", [LEAST, LIKELY])
 def test_neither_do_the_sides_beside_it(cut: int, known: int) -> None:

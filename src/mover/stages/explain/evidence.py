@@ -126,9 +126,8 @@ def _owners_of_pixels(
         K[:, :2, 2] -= pixels[asked].floor()
         verts = to_camera(bodies.verts[row], small.R_cam_world).expand(len(asked), -1, -1)
         drawn = layers(verts, bodies.faces, Crops(K, 1, 1))
-        return asked, torch.stack([drawn.front, drawn.exit]).flatten(1).sub(
-            depth[asked]
-        ).abs().amin(0)
+        ends = torch.stack([drawn.front, drawn.exit]).flatten(1)
+        return asked, ends.sub(depth[asked]).abs().amin(0)
 
     rows = may.any(-1).nonzero()[:, 0].tolist()
     for row, (asked, off) in zip(rows, mapped(away, rows), strict=True):  # memory: one a thread
