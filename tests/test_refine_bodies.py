@@ -42,7 +42,8 @@ K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 CAMERA = Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0])), 640, 480)
 GROUND = -1.4
 LINE = gather_neighbours(torch.arange(4), torch.zeros(4, dtype=torch.long), 5.0)
-WALL = Surface(torch.zeros(1, 3), torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1).long())
+UP, ONE = torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1)
+WALL = Surface(torch.zeros(1, 3), UP, ONE.long(), ONE)
 
 
 def still_people(turns, count=1, at=(0.0, -3.0), lift=0.0, fps=5.0):
@@ -101,7 +102,7 @@ MATCHES = Matches(
     torch.tensor([0, 2]), torch.tensor([1, 0]), torch.zeros(2, 3, dtype=torch.float64),
     torch.tensor([[0.0, 1, 0], [1, 0, 0]], dtype=torch.float64),
     torch.ones(2, dtype=torch.float64), torch.full((2,), 0.02, dtype=torch.float64),
-    torch.tensor([0, 1]),
+    torch.tensor([0, 1]), torch.full((2,), 0.01, dtype=torch.float64),
 )  # fmt: skip
 AWAY = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
 TERMS = {
@@ -193,7 +194,7 @@ def test_a_thigh_lies_on_the_seat_and_not_on_its_front():
     normals = torch.tensor([[[0.0, -1, 0], [0.0, -1, 0], [-1.0, -0.9, 0]]])
     seat = Surface(
         torch.tensor([[-0.3, 0.0, 0.0], [-0.2, 0.0, 0.0], [0.0, -0.02, 0.0]]),
-        torch.tensor([[0.0, 1, 0], [0.0, 1, 0], [1.0, 0, 0]]), torch.zeros(3).long(),
+        torch.tensor([[0.0, 1, 0], [0.0, 1, 0], [1.0, 0, 0]]), torch.zeros(3).long(), ONE,
     )  # fmt: skip
     found = gather_matches(skin_of(points, normals, [0, 0, 0]), seat, MatchConfig())
     assert found.point.tolist() == [0, 1]
@@ -236,14 +237,15 @@ def test_only_surfaces_that_face_the_skin_are_touched():
 def test_visible_skin_is_before_and_hidden_skin_behind_the_furniture():
     front = torch.full((2, 30), 3.0)
     yes, no = torch.ones(2, 30, dtype=torch.bool), torch.zeros(2, 30, dtype=torch.bool)
-    shown = bounds_of_skin(Sighting(front, yes, no, yes))
-    hidden = bounds_of_skin(Sighting(front, no, yes, yes))
+    sure = torch.zeros(2, 30)
+    shown = bounds_of_skin(Sighting(front, yes, no, yes, sure))
+    hidden = bounds_of_skin(Sighting(front, no, yes, yes, sure))
     near, far = torch.full((2, 30), 2.5), torch.full((2, 30), 3.5)
     assert (order_term(near, shown) == 0).all()
     assert (order_term(far, shown) > 1).all()
     assert (order_term(far, hidden) == 0).all()
     assert (order_term(near, hidden) > 1).all()
-    assert (order_term(far, bounds_of_skin(Sighting(front, yes, yes, no))) == 0).all()
+    assert (order_term(far, bounds_of_skin(Sighting(front, yes, yes, no, sure))) == 0).all()
 
 
 def test_a_corrected_body_is_its_puppet_moved():

@@ -1,6 +1,5 @@
 """The order of the stages, each kept on disk: from a capture to a consistent room."""
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -18,11 +17,9 @@ from mover.core.types import Camera, Capture, Layout, Room
 from mover.energy.config import SceneConfig, only
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, ImageCues
-from mover.geometry.path import scaled
-from mover.geometry.placement import larger
 from mover.geometry.warp_start import threads
 from mover.io.capture.plausible import check_plausible
-from mover.pipeline.further_views import further_views, larger_views, with_views
+from mover.pipeline.further_views import further_views, with_views
 from mover.pipeline.moves import Solving, with_moves
 from mover.pipeline.outcome import (
     PeopleState,
@@ -50,6 +47,7 @@ from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
 from mover.pipeline.presets import with_sizes
 from mover.pipeline.proposals import tops_of, with_proposals
+from mover.pipeline.sitters import with_common_scale, with_seats_lifted
 from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
 from mover.stages.contacts.contact_association import AssignInputs
@@ -81,7 +79,6 @@ from mover.stages.objects.place_objects import (
     without_search,
 )
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
-from mover.stages.objects.room_scale import ScaleKnown, common_scale, seats_tell
 from mover.stages.objects.starts import (
     ReinitInputs,
     alone,
@@ -92,7 +89,7 @@ from mover.stages.objects.starts import (
     other_starts,
     reference_yaw,
 )
-from mover.stages.people.find_depth import are_shapeless, nearer
+from mover.stages.people.find_depth import are_shapeless
 
 NOBODY = HumanCues()
 
@@ -148,12 +145,23 @@ def _reconstructed(
     people, state = with_common_scale(context, people, state)
     _begin(run, gather_cues, gather_inputs(context, people, state), config.gather)
     state = gathered(context, people, assigned(context, people, state))
-    state = placed_with_people(context, people, state, image_energy)
+    context, state = _by_people(context, people, state, image_energy)
     for _ in range(config.outer_iterations):
         state = assigned(context, people, with_order(context, state))
-        state = placed_with_people(context, people, state, image_energy)
+        context, state = _by_people(context, people, state, image_energy)
     room = explained(room_of(context, state, people), context, state, people)
     return with_proposals(room, capture, config, run, people, tops_of(context, state))
+
+
+def _by_people(
+    context: ReconstructionContext,
+    people: PeopleState,
+    state: SceneState,
+    image_energy: Float[Tensor, " objects"],
+) -> tuple[ReconstructionContext, SceneState]:
+    """Seats where people have them, then all placed beside the people."""
+    context = with_seats_lifted(context, people, state)
+    return context, placed_with_people(context, people, state, image_energy)
 
 
 def explained(
@@ -303,31 +311,6 @@ def with_refined_camera(
     found = placed_by_image(context, better.camera, better.ground, state)
     traces = {**state.traces, "camera": better.trace, **found.traces}
     return replace(found, traces=traces, views=better.views)
-
-
-def with_common_scale(
-    context: ReconstructionContext, people: PeopleState, state: SceneState
-) -> tuple[PeopleState, SceneState]:
-    """The whole room larger or smaller where nothing but the furniture tells its scale."""
-    given = None if state.priced is None else state.priced[0].image.given
-    spread, shared = scale_spread(context, people), context.capture.scene.size_spread
-    if given is None or not spread:
-        return people, state
-    kept = in_world(rows_of(people.bodies, people.kept), state.camera)
-    floor = floor_now(context, state)
-    seats = seats_tell(kept, people.parts, floor) if context.config.seat_heights else None
-    known = ScaleKnown(spread, shared, seats)
-    scale, left = common_scale(state.placed.layout, given, known)
-    factor = math.exp(-scale)
-    bodies = nearer(people.bodies, state.camera, state.ground, factor)
-    layouts = (state.start, state.alone, state.placed.layout, state.placed.candidates)
-    start, single, layout, candidates = (larger(x, factor) for x in layouts)
-    placed = replace(state.placed, layout=layout, candidates=candidates)
-    state = replace(
-        state, ground=factor * state.ground, start=start, alone=single, placed=placed,
-        views=larger_views(state.views, factor), scale_spread=left,
-    )  # fmt: skip
-    return replace(people, bodies=bodies, path=scaled(people.path, factor)), state
 
 
 def _begin(run: Run, fn: Callable[[In, Conf, Observer], object], inputs: In, config: Conf) -> None:

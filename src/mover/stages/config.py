@@ -166,6 +166,8 @@ class BendConfig:
     """Price of a nat of bending."""
     method: Adam = field(default_factory=lambda: Adam(100, 0.006, 0.001, beta2=0.98))
     """How shapes and places are found together."""
+    seat: Metres = 0.07
+    """Usual error of a seat's height in another design [m]; 0: none is moved (`seat_heights`)."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ def without_kept(
     off: Float[Tensor, " items"],
     trust: Float[Tensor, " items"],
     group: Int[Tensor, " items"],
-    usual: float,
+    usual: float | Float[Tensor, " groups"],
 ) -> tuple[Float[Tensor, " items"], Float[Tensor, " items"]]:
     """What is left of distances without the error that their group shares, and its price.
 
@@ -30,7 +30,7 @@ def without_kept(
         off: Signed distances [m].
         trust: One over the variance of each alone [1/m²].
         group: Which items share an error, from 0.
-        usual: Size of the shared error [m].
+        usual: Size of the shared error, of all groups or of each [m].
 
     Returns:
         The rest [m], and each item's share of the price [nats].
@@ -71,6 +71,8 @@ class Surface:
     """Outward unit normals."""
     piece: Int[Tensor, " points"]
     """Of the furniture, from 0."""
+    doubt: Float[Tensor, " pieces"]
+    """Usual error of the place of each piece's surface, beside `KEPT` [m]."""
 
 
 @record
@@ -109,6 +111,8 @@ class Matches:
     """Usual distance of skin that touches [m]."""
     kept: Int[Tensor, " matches"]
     """Which share an error that lasts: one part of one person on one piece; from 0."""
+    lasting: Float[Tensor, " kept"]
+    """Usual size of each of these errors [m]."""
 
 
 def gather_matches(
@@ -135,11 +139,14 @@ def gather_matches(
     arm = torch.linalg.cross(place - skin.pivot[body], normal).norm(dim=-1)
     who = skin.track[body] * groups + skin.group[point]
     kept = who * len(surface.points) + surface.piece[index]
+    kept, number = kept.unique(return_inverse=True)
+    doubt = surface.doubt[kept % len(surface.points)]
     return Matches(
         body, point, place, normal,
         weight=_shares(skin.chance[body, point] * _foremost(off, part), part),
         usual=(USUAL**2 + (skin.bent * arm).square()).sqrt(),
-        kept=kept.unique(return_inverse=True)[1],
+        kept=number,
+        lasting=(KEPT**2 + doubt.square()).sqrt(),
     )  # fmt: skip
 
 
@@ -209,7 +216,7 @@ def touch_term(
     off = (moved * matches.normal).sum(-1)
     robust = (rho**2 / (off.square() + rho**2)).square()
     off, lasting = without_kept(
-        off, robust * matches.weight / matches.usual.square(), matches.kept, KEPT
+        off, robust * matches.weight / matches.usual.square(), matches.kept, matches.lasting
     )
     price = 0.5 * (rho / matches.usual).square() * matches.weight * geman_mcclure(off, rho)
     price = price + lasting
@@ -219,4 +226,4 @@ def touch_term(
 def _nothing(skin: Skin) -> Matches:
     empty = torch.zeros(0, dtype=torch.long)
     none = skin.points.new_zeros(0, 3)
-    return Matches(empty, empty, none, none, none[:, 0], none[:, 0], empty)
+    return Matches(empty, empty, none, none, none[:, 0], none[:, 0], empty, none[:, 0])

@@ -42,6 +42,8 @@ class Sighting:
     """Well outside everybody's masks, inside the mask of the furniture that is drawn there."""
     facing: Bool[Tensor, "bodies points"]
     """The skin faces the camera."""
+    loose: Float[Tensor, "bodies points"]
+    """How far off that furniture may be along the ray, as its shape is doubted [m]."""
 
 
 def bounds_of_skin(seen: Sighting) -> Bounds:
@@ -50,8 +52,8 @@ def bounds_of_skin(seen: Sighting) -> Bounds:
     shown, hidden = seen.shown & real, seen.hidden & real
     more = (shown.sum(-1) - hidden.sum(-1))[:, None]
     none = torch.full_like(seen.front, torch.inf)
-    far = torch.where(shown & (more > 0), seen.front, none)
-    return Bounds(torch.where(hidden & (more < 0), seen.front, -none), far)
+    far = torch.where(shown & (more > 0), seen.front + seen.loose, none)
+    return Bounds(torch.where(hidden & (more < 0), seen.front - seen.loose, -none), far)
 
 
 def order_term(depth: Float[Tensor, "bodies points"], bounds: Bounds) -> Float[Tensor, " bodies"]:

@@ -30,6 +30,7 @@ from mover.stages.config import BendConfig
 from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import some_inputs, standing
 from mover.stages.objects.prepare_objects import Prepared
+from mover.stages.objects.seat_heights import offsets_of
 from mover.stages.objects.starts import merged, piles_of
 
 
@@ -135,7 +136,30 @@ def with_shapes(prepared: Prepared, bending: Bending) -> tuple[Prepared, Layout]
         cages.offset / unit[:, None, None, None],
     )  # fmt: skip
     there = replace(layout, t_world_object=moved, log_scale=layout.log_scale + grown.log())
-    return replace(prepared, objects=new, cages=own), merged(some, there, layout)
+    bent_ones = replace(prepared, objects=new, cages=own, straight=objects)
+    return bent_ones, merged(some, there, layout)
+
+
+def with_lifted_seats(prepared: Prepared, lift: Float[Tensor, " objects"]) -> Prepared:
+    """The furniture with its seats higher by so much [m], as bent as it was before (`cages`)."""
+    straight, cages = prepared.straight or prepared.objects, prepared.cages
+    rise = offsets_of(lift, straight)
+    some = rise.flatten(1).any(-1)
+    unit, center = prepared.scale, prepared.center
+    grid = unit[:, None, None, None]
+    flat = _cages(straight, torch.zeros_like(rise))
+    if cages is None:
+        cages = Cage(flat.low / unit + center, flat.high / unit + center, flat.offset)
+    cages = replace(cages, offset=cages.offset + rise / grid)
+    own = Cage((cages.low - center) * unit, (cages.high - center) * unit, cages.offset * grid)
+
+    def lifted(name: str) -> Tensor:
+        new = bent(getattr(straight, name), own)
+        return torch.where(some[:, None, None], new, getattr(prepared.objects, name))
+
+    names = ("verts", "samples", "top", "back")
+    objects = replace(prepared.objects, **{name: lifted(name) for name in names})
+    return replace(prepared, objects=objects, cages=cages, straight=straight)
 
 
 def _control_points(cages: Cage) -> Float[Tensor, "objects 3 3 3 3"]:

@@ -132,6 +132,8 @@ class Prepared:
     warnings: tuple[str, ...]
     cages: Cage | None = None
     """How each mesh is bent, in its own coordinates (`bend_shapes`); None: none is."""
+    straight: Objects | None = None
+    """The proxies before they were bent; None: none is."""
 
 
 @record

@@ -32,6 +32,9 @@ SKIN_POINTS = 400  # even points of a body
 PART_POINTS = 40  # at most, of each part that touches
 LOW = (0.08, 0.03)  # [m] over the lowest point of a body: a sole hangs, surely carries
 STILL = (0.5, 0.2)  # [m/s] of a sole: moves, surely at rest; bodies fitted frame by frame tremble
+DOUBT = 0.2  # [m] of a surface's place for a silhouette that does not fit at all
+FITS = 0.1  # share of a silhouette that masks of shapes that fit leave
+STEEPEST = 4.0  # metres of depth for a metre by which a surface is off, at most
 INNER = 2  # [px of an image 640 wide] by which masks shrink before they bound anything
 
 
@@ -43,10 +46,14 @@ class Surroundings:
     floor: Floor
     furniture: Volume | None
     """Signed distance to all pieces; None: there are none."""
+    firm: Volume | None
+    """The same to what they surely fill, as far as their shapes are doubted."""
     surface: Surface
     """Points of their surfaces."""
     front: Float[Tensor, "h w"]
     """Depth of the nearest piece in the image 640 wide [m]; inf: none."""
+    loose: Float[Tensor, "h w"]
+    """How far off that may be, as the shape of the piece is doubted [m]."""
     owned: Bool[Tensor, "h w"]
     """The piece that is drawn there is also detected there."""
 
@@ -79,41 +86,80 @@ def surroundings_of(room: Room, capture: Capture | None) -> Surroundings:
         for piece, proxy in zip(room.scene.objects, room.proxies, strict=True)
     ]
     small = small_camera(camera)
-    front, piece = _drawn(meshes, camera, small)
-    owned = torch.zeros_like(piece, dtype=torch.bool)
+    front, piece, slant = _drawn(meshes, camera, small)
+    owned, doubt = torch.zeros_like(piece, dtype=torch.bool), torch.zeros(len(meshes))
     if capture is not None and meshes:
         masks = small_masks(image_evidence(capture).masks, capture.scene.camera)
         owned = (piece >= 0) & masks.gather(0, piece.clamp_min(0)[None])[0]
-    return Surroundings(camera, floor, _volume(meshes), _surface(meshes), front, owned)
+        doubt = doubt_of_shapes(piece, masks)
+    furniture, firm = _volumes(meshes, doubt)
+    surface = _surface(meshes, doubt)
+    loose = torch.zeros_like(front) if not meshes else doubt[piece.clamp_min(0)] * slant
+    return Surroundings(camera, floor, furniture, firm, surface, front, loose, owned)
 
 
-def _drawn(meshes: list[Mesh], camera: Camera, small: Camera) -> tuple[Tensor, Tensor]:
-    """Depth of the nearest piece, and which it is; -1: none."""
+def doubt_of_shapes(
+    piece: Int[Tensor, "h w"], masks: Bool[Tensor, "objects h w"]
+) -> Float[Tensor, " objects"]:
+    """Usual error of the place of each piece's surface, as its outline tells it [m].
+
+    Args:
+        piece: Which piece is drawn; -1: none.
+        masks: Where each was detected.
+    """
+    shown = masks.any(0)
+    found = torch.zeros(len(masks))
+    for k, mask in enumerate(masks):
+        drawn = (piece == k) & (mask | ~shown)
+        seen = mask & ((piece == k) | (piece < 0))
+        union = max(1, int((drawn | seen).sum()))
+        overlap = int((drawn & seen).sum()) / union if bool(mask.any()) else 1.0
+        found[k] = DOUBT * max(0.0, 1 - overlap - FITS)
+    return found
+
+
+def _drawn(meshes: list[Mesh], camera: Camera, small: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth of the nearest piece, which it is (-1: none), and the slant of its surface."""
     size = (small.height, small.width)
     if not meshes:
         none = torch.full(size, torch.inf)
-        return none, torch.full(size, -1)
-    verts = to_camera(torch.cat([m.verts for m in meshes]), camera.R_cam_world)
+        return none, torch.full(size, -1), torch.zeros(size)
+    verts = to_camera(torch.cat([m.verts for m in meshes]), camera.R_cam_world).contiguous()
     starts = torch.tensor([0, *(len(m.verts) for m in meshes[:-1])]).cumsum(0)
     faces = torch.cat([m.faces + s for m, s in zip(meshes, starts, strict=True)])
     owner = torch.cat([torch.full((len(m.faces),), k) for k, m in enumerate(meshes)])
-    depth, face = first_hit(verts.contiguous(), faces, small.K, size)
-    return depth, torch.where(face >= 0, owner[face.clamp_min(0)], torch.full_like(face, -1).long())
+    depth, face = first_hit(verts, faces, small.K, size)
+    some = face.clamp_min(0)
+    slant = _slants(verts, faces)[some]
+    return depth, torch.where(face >= 0, owner[some], torch.full_like(face, -1).long()), slant
 
 
-def _volume(meshes: list[Mesh]) -> Volume | None:
+def _slants(verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]) -> Tensor:
+    """One over the cosine between each face's normal and the ray to its middle."""
+    corners = verts[faces]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing = torch.cosine_similarity(normals, corners.mean(1), dim=-1).abs()
+    return 1 / facing.clamp_min(1 / STEEPEST)
+
+
+def _volumes(
+    meshes: list[Mesh], doubt: Float[Tensor, " pieces"]
+) -> tuple[Volume | None, Volume | None]:
+    """The signed distance to all pieces, and to what they surely fill."""
     if not meshes:
-        return None
+        return None, None
     verts = torch.cat([m.verts for m in meshes]).float()
     low, high = verts.amin(0), verts.amax(0)
     cells = min(MOST_CELLS, max(8, int(float((high - low).max()) / CELL)))
-    volume = grid_around(low, high, cells, 0.1)
-    for mesh in meshes:  # each has its own triangles
-        volume = union_bodies(mesh.verts.float()[None], mesh.faces, volume, 1)
-    return volume
+    empty = grid_around(low, high, cells, 0.1)
+    whole = firm = empty.values
+    for mesh, give in zip(meshes, doubt, strict=True):  # each has its own triangles
+        own = union_bodies(mesh.verts.float()[None], mesh.faces, empty, 1).values
+        whole, firm = torch.minimum(whole, own), torch.minimum(firm, own + give)
+    return replace(empty, values=whole), replace(empty, values=firm)
 
 
-def _surface(meshes: list[Mesh]) -> Surface:
+def _surface(meshes: list[Mesh], doubt: Float[Tensor, " pieces"]) -> Surface:
     found = [sample_surface(m, SAMPLES) for m in meshes]
     none = torch.zeros(0, 3)
     pieces = [torch.full((len(p),), k) for k, (p, _) in enumerate(found)]
@@ -121,6 +167,7 @@ def _surface(meshes: list[Mesh]) -> Surface:
         torch.cat([none, *(p.float() for p, _ in found)]),
         torch.cat([none, *(n.float() for _, n in found)]),
         torch.cat([none[:, 0].long(), *pieces]),
+        doubt,
     )
 
 
@@ -199,6 +246,7 @@ def order_bounds(
         shown[body, y, x],
         away[body, y, x] & room.owned[y, x],
         (cam * facing).sum(-1) < 0,
+        room.loose[y, x],
     )
     return bounds_of_skin(seen)
 

@@ -124,7 +124,7 @@ def known_of(cast: Cast, bodies: Bodies, rows: Int[Tensor, " rows"]) -> Evidence
     room = cast.room
     soles = torch.stack([cast.picked.part == 0, cast.picked.part == 1])
     return Evidence(
-        camera=room.camera, floor=room.floor, furniture=room.furniture,
+        camera=room.camera, floor=room.floor, furniture=room.firm,
         near=gather_neighbours(bodies.frame, bodies.person, bodies.fps),
         feet=Feet(soles, cast.rest[rows]), matches=None, bounds=None, rho=0.1,
         even=cast.picked.even,
