@@ -130,28 +130,22 @@ def with_shapes(prepared: Prepared, bending: Bending) -> tuple[Prepared, Layout]
     )  # fmt: skip
     away = (layout.log_scale.exp() * base).unsqueeze(-1)
     moved = layout.t_world_object + (rot_y(layout.yaw) @ away).squeeze(-1)
-    unit, center = prepared.scale, prepared.center
-    own = Cage(
-        cages.low / unit + center, cages.high / unit + center,
-        cages.offset / unit[:, None, None, None],
-    )  # fmt: skip
     there = replace(layout, t_world_object=moved, log_scale=layout.log_scale + grown.log())
+    own = _to_mesh(cages, prepared)
     bent_ones = replace(prepared, objects=new, cages=own, straight=objects)
     return bent_ones, merged(some, there, layout)
 
 
 def with_lifted_seats(prepared: Prepared, lift: Float[Tensor, " objects"]) -> Prepared:
     """The furniture with its seats higher by so much [m], as bent as it was before (`cages`)."""
-    straight, cages = prepared.straight or prepared.objects, prepared.cages
+    straight = prepared.straight or prepared.objects
     rise = offsets_of(lift, straight)
     some = rise.flatten(1).any(-1)
-    unit, center = prepared.scale, prepared.center
-    grid = unit[:, None, None, None]
-    flat = _cages(straight, torch.zeros_like(rise))
-    if cages is None:
-        cages = Cage(flat.low / unit + center, flat.high / unit + center, flat.offset)
-    cages = replace(cages, offset=cages.offset + rise / grid)
-    own = Cage((cages.low - center) * unit, (cages.high - center) * unit, cages.offset * grid)
+    if not bool(some.any()):
+        return prepared
+    cages = prepared.cages or _to_mesh(_cages(straight, torch.zeros_like(rise)), prepared)
+    cages = replace(cages, offset=cages.offset + rise / prepared.scale[:, None, None, None])
+    own = _from_mesh(cages, prepared)
 
     def lifted(name: str) -> Tensor:
         new = bent(getattr(straight, name), own)
@@ -160,6 +154,20 @@ def with_lifted_seats(prepared: Prepared, lift: Float[Tensor, " objects"]) -> Pr
     names = ("verts", "samples", "top", "back")
     objects = replace(prepared.objects, **{name: lifted(name) for name in names})
     return replace(prepared, objects=objects, cages=cages, straight=straight)
+
+
+def _to_mesh(cages: Cage, prepared: Prepared) -> Cage:
+    """Cages in the objects' frames [m], in the units and about the origins of the given meshes."""
+    unit, center = prepared.scale, prepared.center
+    grid = unit[:, None, None, None]
+    return Cage(cages.low / unit + center, cages.high / unit + center, cages.offset / grid)
+
+
+def _from_mesh(cages: Cage, prepared: Prepared) -> Cage:
+    """The same back."""
+    unit, center = prepared.scale, prepared.center
+    grid = unit[:, None, None, None]
+    return Cage((cages.low - center) * unit, (cages.high - center) * unit, cages.offset * grid)
 
 
 def _control_points(cages: Cage) -> Float[Tensor, "objects 3 3 3 3"]:

@@ -23,10 +23,10 @@ TRIED = 121  # scales
 SEAT = 0.44  # [m], of a usual seat over the floor
 SEATS = 0.06  # standard deviation of its logarithm: chairs .43-.47, sofas .40-.45, offices .42-.50
 POSES = 0.04  # the same of how high people seem to sit: their poses are off everywhere alike
-CARRIED = ("seat", "left_thigh", "right_thigh")
+CARRIED = ("seat", "left_thigh", "right_thigh")  # of who sits
 LOWEST = 0.1  # share of a sitter's points below the top of the seat
 SAME = 0.3  # [m] between two who sit on one seat
-FEWEST = 3  # bodies that sit on it
+FEWEST = 3  # bodies that tell how high a seat is
 
 
 @record

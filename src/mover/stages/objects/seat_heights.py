@@ -19,11 +19,11 @@ from mover.core.types import Bodies, Layout, Objects
 from mover.furniture.floor import Floor, height_under_bodies
 from mover.geometry.placement import place
 from mover.stages.config import BendConfig
+from mover.stages.objects.room_scale import CARRIED, FEWEST
 
-CARRIED = (("seat", "left_thigh", "right_thigh"), ("seat",))  # of who sits, who lies
+CARRIERS = (CARRIED, ("seat",))  # of who sits, who lies
 TOLD = 0.025  # [m], usual error of the height of a seat as they tell it
 LOWEST = 0.15  # share of their points below the top of what carries them
-FEWEST = 3  # bodies
 NEAR = 20  # points of a seat that are nearest to a body
 BETWEEN = (0.15, 0.9)  # shares of the height of a piece between which a seat can be moved
 MOST = 0.3  # of a piece's height, that its middle control points move
@@ -65,7 +65,7 @@ def find_seat_heights(
     for k in (inputs.loose & objects.is_seat & objects.has_top).nonzero()[:, 0].tolist():
         rows = inputs.pairs[inputs.pairs[:, 1] == k, 0].unique()
         said: list[Tensor] = []
-        for does, names in zip((found.sitting, found.lying), CARRIED, strict=True):
+        for does, names in zip((found.sitting, found.lying), CARRIERS, strict=True):
             some, carried = rows[does[rows]], members(inputs.parts, *names)
             if len(some) >= FEWEST and bool(carried.any()):
                 said.append(_higher(inputs.bodies.verts[some][:, carried], tops[k]))

@@ -153,9 +153,11 @@ def _volumes(
     cells = min(MOST_CELLS, max(8, int(float((high - low).max()) / CELL)))
     empty = grid_around(low, high, cells, 0.1)
     whole = firm = empty.values
-    for mesh, give in zip(meshes, doubt, strict=True):  # each has its own triangles
+    for mesh, give in zip(meshes, doubt.tolist(), strict=True):  # each has its own triangles
         own = union_bodies(mesh.verts.float()[None], mesh.faces, empty, 1).values
-        whole, firm = torch.minimum(whole, own), torch.minimum(firm, own + give)
+        same = firm is whole and not give
+        whole = torch.minimum(whole, own)
+        firm = whole if same else torch.minimum(firm, own + give)
     return replace(empty, values=whole), replace(empty, values=firm)
 
 
