@@ -111,10 +111,11 @@ class TestGeometry:
         held, sizes = clouds(points), torch.rand(2, 3, generator=g) + 0.5
         index = nearest(to_device(held, device), query.to(device), sizes.to(device))
         assert torch.equal(index.cpu(), nearest_torch(held, query, sizes))
-        verts, faces = sphere([0.0, 0, 0], 0.5, 3)
-        grid = grid_around(verts.amin(0), verts.amax(0), 40, padding=0.1)
-        truth = union_bodies(verts[None], faces, grid)
-        found = union_bodies(verts[None].to(device), faces.to(device), to_device(grid, device))
+        ball, faces = sphere([0.0, 0, 0], 0.5, 3)
+        verts = ball + torch.rand(75, 1, 3, generator=g)  # more than a GPU has streams
+        grid = grid_around(verts.amin((0, 1)), verts.amax((0, 1)), 40, padding=0.1)
+        truth = union_bodies(verts, faces, grid)
+        found = union_bodies(verts.to(device), faces.to(device), to_device(grid, device))
         torch.testing.assert_close(found.values.cpu(), truth.values, rtol=0, atol=2e-6)
         places = torch.rand(50, 3, generator=g) - 0.5
         value = sample(found, places.to(device)).cpu()

@@ -277,7 +277,8 @@ def test_columns_that_know_nothing_of_each_other_find_the_same_bits() -> None:
     scratch = volume_warp._scratch(tools)
     scratch.work.beside = 0
     for body in range(len(verts)):
-        volume_warp.add_body(tools, scratch, body)
+        (ends,) = volume_warp._ends(tools, slice(body, body + 1))
+        volume_warp.add_body(tools, scratch, body, ends)
     assert torch.equal(scratch.field, volume_warp.union_bodies(verts, faces, grid, 1).values)
 
 

@@ -49,7 +49,7 @@ def constant(values: Any, like: Tensor) -> Tensor:  # noqa: ANN401
     """These values with the type and on the device of `like`: always the same tensor; copy it.
 
     What an energy needs at every step is made by this: a step that is recorded on a GPU
-    (`replay.Replay`) may take nothing from the host.
+    (`devices.Replay`) may take nothing from the host.
     """
     return _held(values, like.dtype, like.device)
 

@@ -29,6 +29,7 @@ In = TypeVar("In")
 Conf = TypeVar("Conf")
 Out = TypeVar("Out")
 ON_DEVICE = ("refine_camera", "gather_cues", "place_objects")  # where the time goes
+REPLAYED = ("place_objects",)  # ... of these, what a GPU does faster only where it replays steps
 
 
 @dataclass(frozen=True)
@@ -108,10 +109,16 @@ class Run:
     ) -> tuple[str, torch.device, Path]:
         """A stage's name, where it computes, and its files, by all that it is made from."""
         name = getattr(fn, "__name__", "stage")
-        device = self.device if name in ON_DEVICE else CPU
+        device = self.device if _gains(name, config) else CPU
         where = () if device == CPU else (named(device),)
         key = records.fingerprint(inputs, config, sources(_package(fn)), *where)
         return name, device, self.folder / "stages" / name / key
+
+
+def _gains(name: str, config: object) -> bool:
+    """Whether a GPU is worth it for a stage: `docs/engine.md` has the times."""
+    method = getattr(config, "method", None)
+    return name in ON_DEVICE and (name not in REPLAYED or getattr(method, "replays", True))
 
 
 @functools.cache

@@ -109,7 +109,7 @@ def minimize(
         observe: Told of every step.
         stage: Name for those who watch, and for errors.
         still: The energy asks the host for nothing and makes no choice by its numbers, so that on
-            a GPU a step is recorded once and replayed (`replay.Replay`).
+            a GPU a step is recorded once and replayed (`devices.Replay`).
 
     Raises:
         ValueError: If the energy stops being finite.

@@ -1,13 +1,14 @@
 """The space that bodies have moved through: the union of bodies by Warp kernels, on CPU and CUDA.
 
-A launch on the CPU is serial but leaves Python's lock, so bodies are measured in threads, each
-with a volume of its own; the least of these is the result, whoever measured what.
+A launch on the CPU is serial but leaves Python's lock, so bodies are measured in threads; on a GPU
+one body keeps few of its threads busy, so bodies go into many streams. Each thread and each stream
+has a volume of its own; the least of these is the result, whoever measured what.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import cycle
 from queue import SimpleQueue
 from typing import Any
 
@@ -21,6 +22,7 @@ from mover.geometry.volume import Volume
 from mover.geometry.warp_start import kernels, started
 
 REACH = 2  # [cells], that the shell reaches out of the body
+STREAMS = 32  # of a GPU
 EIGHT = 8  # children of a node, and faces of a leaf: one instruction serves all of them
 
 
@@ -120,15 +122,6 @@ class Scratch:
     stacks: int = 0
 
 
-def _in_a_ring(every: list[Scratch]) -> "SimpleQueue[Scratch]":
-    """All that wait for a body; each may look into the next one's field."""
-    idle: SimpleQueue[Scratch] = SimpleQueue()
-    for scratch, other in zip(every, every[1:] + every[:1], strict=True):
-        scratch.work.other = other.work.field
-        idle.put(scratch)
-    return idle
-
-
 def union_bodies(
     verts: Float[Tensor, "bodies verts 3"],
     faces: Int[Tensor, "faces 3"],
@@ -154,26 +147,53 @@ def union_bodies(
     if len(verts) == 0 or len(faces) == 0:
         return grid
     tools = _tools(verts.detach().float().contiguous(), faces, grid)
-    count = max(1, min(workers, len(verts))) if tools.device == "cpu" else 1
-    every = [_scratch(tools) for _ in range(count)]
-    idle = _in_a_ring(every)
-    add = partial(_add, tools, idle)
-    with ThreadPoolExecutor(count) as pool:
-        for done, _ in enumerate(pool.map(add, _spread(len(verts))), 1):
-            if observe is not None:
-                observe(done, len(verts))
+    own = tools.device == "cpu"
+    every = [_scratch(tools) for _ in range(max(1, min(workers if own else STREAMS, len(verts))))]
+    for scratch, other in zip(every, every[1:] + every[:1], strict=True):
+        scratch.work.other = other.work.field
+    for done, _ in enumerate((_in_threads if own else _in_streams)(tools, every), 1):
+        if observe is not None:
+            observe(done, len(verts))
     values = every[0].field
     for scratch in every[1:]:
         torch.minimum(values, scratch.field, out=values)
     return replace(grid, values=values.to(grid.values))
 
 
-def _add(tools: Tools, idle: "SimpleQueue[Scratch]", body: int) -> None:
-    scratch = idle.get()
-    try:
-        add_body(tools, scratch, body)
-    finally:
+def _in_threads(tools: Tools, every: list[Scratch]) -> Iterator[None]:
+    """All bodies, as many at a time as there are workers."""
+    idle: SimpleQueue[Scratch] = SimpleQueue()
+    for scratch in every:
         idle.put(scratch)
+
+    def add(body: int) -> None:
+        scratch = idle.get()
+        try:
+            add_body(tools, scratch, body, _ends(tools, slice(body, body + 1))[0])
+        finally:
+            idle.put(scratch)
+
+    with ThreadPoolExecutor(len(every)) as pool:
+        yield from pool.map(add, _spread(len(tools.verts)))
+
+
+def _in_streams(tools: Tools, every: list[Scratch]) -> Iterator[None]:
+    """All bodies, handed to a GPU without waiting for any."""
+    wp, ends = started(), _ends(tools, slice(None))
+    streams = [wp.Stream(tools.device) for _ in every]
+    most = np.nan_to_num((ends[:, 1] - ends[:, 0]).max(0)) + 2 * REACH + 2  # cells of a body's box
+    widest = np.minimum(np.ceil(most), every[0].field.shape).astype(np.int64)
+    for scratch in every:
+        _make_room(tools, scratch, widest)  # nothing is freed while a stream may use it
+    wp.synchronize_device(tools.device)
+    turns = cycle(zip(every, streams, strict=True))
+    try:
+        for body, (scratch, stream) in zip(_spread(len(ends)), turns, strict=False):
+            with wp.ScopedStream(stream, sync_enter=False):
+                add_body(tools, scratch, body, ends[body])
+            yield
+    finally:
+        wp.synchronize_device(tools.device)
 
 
 def _spread(count: int) -> list[int]:
@@ -228,8 +248,21 @@ def _tree(shape: FaceTree, device: str) -> Any:  # noqa: ANN401
     return tree
 
 
-def add_body(tools: Tools, scratch: Scratch, body: int) -> None:
+def _ends(tools: Tools, some: slice) -> Float[np.ndarray, "bodies 2 3"]:
+    """Lowest and highest corner of the box about each body [cells]."""
+    verts = tools.verts[some]
+    box = torch.stack([torch.stack(verts[..., k].aminmax(dim=-1), -1) for k in range(3)], -1)
+    return ((box.double().cpu() - tools.grid.origin.double().cpu()) / tools.grid.cell).numpy()
+
+
+def add_body(tools: Tools, scratch: Scratch, body: int, ends: Float[np.ndarray, "2 3"]) -> None:
     """Lower the worker's volume to the signed distance of one body [m].
+
+    Args:
+        tools: What the bodies share.
+        scratch: The worker's.
+        body: Which one.
+        ends: Corners of the box about it [cells].
 
     Raises:
         ValueError: If a vertex is not finite.
@@ -238,25 +271,21 @@ def add_body(tools: Tools, scratch: Scratch, body: int) -> None:
 
     from mover.geometry.kernels import bodies, lower
 
-    verts = tools.verts[body]
-    box = torch.stack([torch.stack(verts[:, k].aminmax()) for k in range(3)], 1).double().cpu()
-    if not bool(box.isfinite().all()):
+    if not np.isfinite(ends).all():
         raise ValueError(f"union_bodies: body {body} has vertices that are not finite")
-    ends = ((box - tools.grid.origin.double().cpu()) / tools.grid.cell).numpy()
-    size = np.array(scratch.field.shape)
     low = np.maximum(np.floor(ends[0]) - REACH, 0)
-    high = np.minimum(np.ceil(ends[1]) + REACH, size - 1)
+    high = np.minimum(np.ceil(ends[1]) + REACH, np.array(scratch.field.shape) - 1)
     if (high < low).any():
         return
     low, shape = low.astype(np.int64), (high - low + 1).astype(np.int64)
-    work = _resized(tools, scratch, shape)
+    work = _cleared(tools, scratch, shape)
     work.low, work.size = wp.vec3i(*low.tolist()), wp.vec3i(*shape.tolist())
-    work.world = wp.from_torch(verts, dtype=wp.vec3)
+    work.world = wp.from_torch(tools.verts[body], dtype=wp.vec3)
 
     def launch(kernel: Any, dim: int, *rest: int) -> None:  # noqa: ANN401
         wp.launch(kernel, dim, [work, *rest], device=tools.device)
 
-    launch(bodies.place, len(verts))
+    launch(bodies.place, tools.verts.shape[1])
     launch(bodies.leaves, len(tools.tree.corners))
     for pack, first, count in tools.tree.inner():
         launch(bodies.inner, count, pack, first)
@@ -269,8 +298,18 @@ def _columns(shape: np.ndarray) -> int:
     return int((shape[0] + 1) // 2 * ((shape[2] + 1) // 2))
 
 
-def _resized(tools: Tools, scratch: Scratch, shape: np.ndarray) -> Any:  # noqa: ANN401
+def _cleared(tools: Tools, scratch: Scratch, shape: np.ndarray) -> Any:  # noqa: ANN401
     """The scratch arrays, cleared, with room for a box."""
+    work, (places, blocks) = scratch.work, _make_room(tools, scratch, shape)
+    work.turn.zero_()
+    work.steps[:places].zero_()
+    work.near[:blocks].zero_()
+    work.crossed[: _columns(shape)].zero_()
+    return work
+
+
+def _make_room(tools: Tools, scratch: Scratch, shape: np.ndarray) -> tuple[int, int]:
+    """Enlarge the scratch arrays for a box, if need be; its places and blocks."""
     import warp as wp
 
     work = scratch.work
@@ -288,11 +327,7 @@ def _resized(tools: Tools, scratch: Scratch, shape: np.ndarray) -> Any:  # noqa:
     if stacks > scratch.stacks:
         scratch.stacks = stacks
         work.tree.stack = _blank(stacks * work.tree.longest, wp.int32, tools.device)
-    work.turn.zero_()
-    work.steps[:places].zero_()
-    work.near[:blocks].zero_()
-    work.crossed[: _columns(shape)].zero_()
-    return work
+    return places, blocks
 
 
 def _blank(size: int, dtype: Any, device: str) -> Any:  # noqa: ANN401

@@ -3,8 +3,7 @@
 On a CPU a launch is a plain loop that lets go of Python's lock. A thread draws a few items at a
 time, one after the other in the same working memory, and threads share nothing: the result does not
 depend on their number. On a GPU there is a thread for each vertex, triangle, edge and pixel; the
-same kernels run on a CPU, where tests hold them against the others. Their speed on a GPU has not
-been measured.
+same kernels run on a CPU, where tests hold them against the others.
 """
 
 from collections.abc import Sequence
