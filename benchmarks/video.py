@@ -5,6 +5,8 @@ truth with the errors of detectors (`mover_bench.rooms.seen`), under COCO's clas
 COCO has no class for is not found and not counted. With --other-designs no piece of the room's
 designs is among the shapes that the first scene is made of: no mesh is the true one.
 
+With --height everybody's is told.
+
     python benchmarks/video.py --seeds 100-103 --other-designs --out video
     python benchmarks/video.py --seeds 100-102 --other-designs --depth depth disparity --out video
 """
@@ -18,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from fit import misses, postures
+from fit import misses, postures, stature
 
 from mover.app.cli.config import preset_named
 from mover.app.cli.run import reconstruct_into
@@ -207,7 +209,8 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
         write_video(room, out / "video.mp4")
     seen = Seen(room, add_noise(room, NoiseConfig(), seed), seed)
     meshes = other_designs(room, out / "meshes") if args.other_designs else None
-    chain = ChainArgs(out / "chain", camera=lens_file(room, out), meshes=meshes)
+    heights = stature(room) if args.height else ()
+    chain = ChainArgs(out / "chain", camera=lens_file(room, out), meshes=meshes, height=heights)
     video_to_room(out / "video.mp4", chain, seen.finders())
     capture, row = out / "chain" / "capture", dict[str, Any]()
     for kind in ("", *args.depth):
@@ -247,6 +250,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="100-103")
     parser.add_argument("--out", type=Path, default=Path("video"))
     parser.add_argument("--other-designs", action="store_true", help="no mesh is the true one")
+    parser.add_argument("--height", action="store_true", help="it is told how tall people are")
     parser.add_argument("--depth", nargs="*", default=[], choices=KINDS, help="measured, too")
     args = parser.parse_args()
     torch.set_num_threads(1)

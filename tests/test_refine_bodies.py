@@ -184,7 +184,8 @@ def skin_of(points, normals, group, bent=0.0):
     bodies, count = points.shape[:2]
     return Skin(
         points, torch.nn.functional.normalize(normals, dim=-1), torch.ones(bodies, count),
-        torch.tensor(group), torch.zeros(bodies).long(), torch.zeros(bodies, 3), bent,
+        torch.tensor(group), torch.zeros(bodies).long(), torch.zeros(bodies, 3),
+        torch.zeros(bodies).bool(), bent,
     )  # fmt: skip
 
 

@@ -91,6 +91,8 @@ class Skin:
     """Number of each body's person, from 0."""
     pivot: Float[Tensor, "bodies 3"]
     """About which a body is turned by the errors of its pose: its pelvis [m]."""
+    flat: Bool[Tensor, " bodies"]
+    """Who lies: all parts have one foremost point, since backs arch over what they lie on."""
     bent: float
     """Usual angle by which the pose is wrong [rad]; 0: it may be corrected."""
 
@@ -137,13 +139,14 @@ def gather_matches(
         x[keep] for x in (body, point, place, normal, part, off, index)
     )
     arm = torch.linalg.cross(place - skin.pivot[body], normal).norm(dim=-1)
+    rests = torch.where(skin.flat[body], body * groups, part)
     who = skin.track[body] * groups + skin.group[point]
     kept = who * len(surface.points) + surface.piece[index]
     kept, number = kept.unique(return_inverse=True)
     doubt = surface.doubt[kept % len(surface.points)]
     return Matches(
         body, point, place, normal,
-        weight=_shares(skin.chance[body, point] * _foremost(off, part), part),
+        weight=_shares(skin.chance[body, point] * _foremost(off, rests), part),
         usual=(USUAL**2 + (skin.bent * arm).square()).sqrt(),
         kept=number,
         lasting=(KEPT**2 + doubt.square()).sqrt(),

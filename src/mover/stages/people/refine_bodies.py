@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.corrected import (
@@ -23,7 +23,7 @@ from mover.bodies.corrected import (
     puppet_of,
 )
 from mover.bodies.parts import parts_of
-from mover.bodies.posture import touching
+from mover.bodies.posture import postures, touching
 from mover.bodies.skin import PARTS
 from mover.core.errors import InputError
 from mover.core.observe import Observer, silent
@@ -69,6 +69,7 @@ class Cast:
     room: Surroundings
     chance: Float[Tensor, "bodies picked"]
     rest: Float[Tensor, "bodies feet"]
+    lying: Bool[Tensor, " bodies"]
     watched: Watched | None
 
 
@@ -109,7 +110,7 @@ def cast_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Cast:
     rest = resting_soles(bodies, parts, floor)
     return Cast(
         bodies, picked, surroundings, _furniture_only(chance[:, picked.index].float(), picked),
-        rest, watched_of(surroundings, people, bodies),
+        rest, postures(bodies, parts, under).lying, watched_of(surroundings, people, bodies),
     )  # fmt: skip
 
 
@@ -156,7 +157,7 @@ def _skin(cast: Cast, acted: Acted, known: Evidence, now: Moved, normals: Tensor
     """The skin where it is now; errors of poses count where they are not corrected."""
     return Skin(
         points=now.skin, normals=normals, chance=cast.chance[acted.rows], group=cast.picked.group,
-        track=known.near.track, pivot=now.points[:, 0],
+        track=known.near.track, pivot=now.points[:, 0], flat=cast.lying[acted.rows],
         bent=ANGLE if acted.puppet.model is None else 0.0,
     )  # fmt: skip
 
