@@ -27,7 +27,7 @@ from mover.fitting.energy import (
 from mover.fitting.limits import limit_price, limit_table, resting
 from mover.fitting.prior import ANGLES, same
 from mover.fitting.start import placed
-from mover.fitting.stature import height_price, size_of, stature_of
+from mover.fitting.stature import UNTOLD, height_price, size_of, stature_of
 from mover.fitting.tracks import best_path, seen_of, triples_of
 from mover.fitting.unknowns import Frame, Unknowns, move, points_of, rig_of
 from mover.geometry.camera import project
@@ -57,6 +57,10 @@ def walk():
 @pytest.fixture(scope="module")
 def found(walk):
     return fit_bodies(FitInputs(seen(walk, noise=3.0, missing=0.1), CAMERA, open_body()))
+
+
+def test_nobody_says_how_tall_people_are_and_the_bodies_say_so(found):
+    assert found.bodies.size_spread == UNTOLD
 
 
 def random_pose(rows=3, seed=0):
@@ -467,7 +471,9 @@ def test_people_whose_height_is_told_are_where_they_are(walk):
     tall = float(np.ptp(shaped(open_body(), walk.pose.betas[:1])[0][0, :, 1].numpy()))
     told = FitInputs(seen(walk, noise=3.0), CAMERA, open_body(), heights=(tall,))
     far = dataclasses.replace(told, heights=(1.1 * tall,))
-    (_, near), (_, wrong) = (off(fit_bodies(one, QUICK), walk) for one in (told, far))
+    right, tenth = (fit_bodies(one, QUICK) for one in (told, far))
+    assert right.bodies.size_spread == 0.0  # fitted bodies still: the floor under them may lean
+    (_, near), (_, wrong) = (off(one, walk) for one in (right, tenth))
     assert near < 0.1
     assert wrong > 0.3  # a tenth taller is a tenth farther away
 

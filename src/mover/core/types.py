@@ -160,7 +160,7 @@ class Bodies:
     pose: BodyPose | None
     size_spread: float | None = None
     """Standard deviation of the logarithm of all sizes, as far as they are wrong together: bodies
-    from keypoints of which no height is told. None: nobody says."""
+    from keypoints of which no height is told. 0: it was told. None: nobody says."""
 
 
 @record

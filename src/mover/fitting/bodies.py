@@ -129,9 +129,9 @@ def fit_bodies(
     at, frame, seen = _solved(begun, job)
     pose = pose_of(at, frame, inputs.model, inputs.prior)
     miss = miss_of(at, frame, seen, inputs.prior)
-    told = stature is not None or inputs.room is not None
     bodies = bodies_of(pose, inputs.model, some)
-    bodies = dataclasses.replace(bodies, size_spread=None if told else UNTOLD)
+    spread = None if inputs.room is not None else UNTOLD if stature is None else 0.0
+    bodies = dataclasses.replace(bodies, size_spread=spread)
     return Fitted(bodies, rows, miss, warnings)
 
 
