@@ -34,6 +34,7 @@ from mover.geometry.nearest_warp import clouds, nearest
 from mover.geometry.raster import Crops, layers
 from mover.geometry.volume import grid_around, sample, sample_torch
 from mover.geometry.volume_warp import union_bodies
+from mover.pipeline.presets import ROBUST
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.place_objects import energy_of, place_objects
@@ -292,6 +293,14 @@ class TestChoice:
             names.append(run.stages[0])
         assert not any(stage.kept for stage in names)
         assert names[0].fingerprint != names[1].fingerprint
+
+    def test_only_descents_whose_steps_can_be_replayed_are_a_devices(self, tmp_path):
+        second, first = ROBUST.place, replace(ROBUST.place, method=Adam(3))
+        run = Run(tmp_path, device=torch.device("meta"))
+        where = [
+            run._named(place_objects_like, Point(torch.zeros(2)), c)[1] for c in (second, first)
+        ]
+        assert where == [CPU, run.device]
 
 
 def place_objects_like(inputs: Point, _config: Adam, _observe) -> Point:
