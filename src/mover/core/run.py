@@ -29,7 +29,6 @@ In = TypeVar("In")
 Conf = TypeVar("Conf")
 Out = TypeVar("Out")
 ON_DEVICE = ("refine_camera", "gather_cues", "place_objects")  # where the time goes
-REPLAYED = ("place_objects",)  # ... of these, what a GPU does faster only where it replays steps
 
 
 @dataclass(frozen=True)
@@ -116,9 +115,8 @@ class Run:
 
 
 def _gains(name: str, config: object) -> bool:
-    """Whether a GPU is worth it for a stage: `docs/engine.md` has the times."""
-    method = getattr(config, "method", None)
-    return name in ON_DEVICE and (name not in REPLAYED or getattr(method, "replays", True))
+    """Whether a GPU is worth it: not for descents that ask after each step (`docs/engine.md`)."""
+    return name in ON_DEVICE and getattr(getattr(config, "method", None), "replays", True)
 
 
 @functools.cache

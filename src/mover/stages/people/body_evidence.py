@@ -8,13 +8,13 @@ from torch import Tensor
 
 from mover.bodies.corrected import spread
 from mover.bodies.parts import Parts, members
-from mover.bodies.posture import postures, speeds
+from mover.bodies.posture import speeds
 from mover.bodies.skin import PARTS
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Capture, Mesh, People, Room
 from mover.energy.body_terms.contact import Surface
 from mover.energy.body_terms.order import Bounds, Sighting, bounds_of_skin
-from mover.furniture.floor import Floor, floor_of, height_under_bodies
+from mover.furniture.floor import Floor, floor_of
 from mover.geometry.camera import project, to_camera
 from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place_object
@@ -187,9 +187,10 @@ def pick(bodies: Bodies, parts: Parts) -> Picked:
     return Picked(index, torch.isin(index, even), part, part + 1)
 
 
-def resting_soles(bodies: Bodies, parts: Parts, floor: Floor) -> Float[Tensor, "bodies feet"]:
+def resting_soles(
+    bodies: Bodies, parts: Parts, lying: Bool[Tensor, " bodies"]
+) -> Float[Tensor, "bodies feet"]:
     """Chance that each sole is at rest and carries its body, whatever its height over the floor."""
-    lying = postures(bodies, parts, height_under_bodies(floor, bodies)).lying
     low = bodies.verts[..., 1].amin(1)
     found: list[Tensor] = []
     for name in SOLES:

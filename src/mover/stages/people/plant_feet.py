@@ -20,7 +20,7 @@ from torch import Tensor
 from mover.bodies import load_model
 from mover.bodies.corrected import Correction, corrected
 from mover.bodies.parts import Parts, members
-from mover.bodies.posture import postures
+from mover.bodies.posture import Postures, postures
 from mover.bodies.skeleton import BODY
 from mover.bodies.smpl_model import vertex_subset
 from mover.core.types import Bodies
@@ -56,15 +56,17 @@ def plant_feet(bodies: Bodies, parts: Parts, floor: Floor) -> Bodies:
         floor: Of their room, with its platforms.
     """
     near = gather_neighbours(bodies.frame, bodies.person, bodies.fps)
-    rest = resting_soles(bodies, parts, floor).double()
+    posture = postures(bodies, parts, height_under_bodies(floor, bodies))
+    rest = resting_soles(bodies, parts, posture.lying).double()
     soles = [members(parts, f"{side}_sole").nonzero()[:, 0] for side in SIDES]
     if not len(near.pairs) or not all(len(sole) for sole in soles):
         return bodies
-    shift = _shifts(bodies, near, rest, (soles, floor), parts)
+    shift = _shifts(bodies, near, rest, (soles, floor), posture)
     moved = corrected(bodies, _by(bodies, shift))
     if bodies.pose is None:
         return moved
-    rest = resting_soles(moved, parts, floor).double()
+    lying = postures(moved, parts, height_under_bodies(floor, moved)).lying
+    rest = resting_soles(moved, parts, lying).double()
     ways = torch.stack([
         _way(moved.verts[:, sole], near, rest[:, k], floor) for k, sole in enumerate(soles)
     ])  # fmt: skip
@@ -149,7 +151,7 @@ def _shifts(
     near: Neighbours,
     rest: Float[Tensor, "bodies feet"],
     feet: tuple[list[Tensor], Floor],
-    parts: Parts,
+    posture: Postures,
 ) -> Float[Tensor, "bodies 3"]:
     """How far each body is moved as a whole [m]."""
     soles, floor = feet
@@ -162,7 +164,6 @@ def _shifts(
     across = side[:, :, None] * side[:, None]
     prior = (torch.eye(3, dtype=torch.float64) - across) / ALONG**2 + across / ACROSS**2
     none = torch.zeros_like(middle)
-    posture = postures(bodies, parts, height_under_bodies(floor, bodies))
     gaps = near.gaps.double()
     nothing = torch.zeros(len(pairs), 3, dtype=torch.float64)
     chain.pairs(pairs, _level(1 / (STEADY**2 * gaps), 1.0), nothing)

@@ -107,10 +107,11 @@ def cast_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Cast:
     floor = surroundings.floor
     under = height_under_bodies(floor, bodies)
     chance = given if given is not None else touching(bodies, parts, under)
-    rest = resting_soles(bodies, parts, floor)
+    lying = postures(bodies, parts, under).lying
+    rest = resting_soles(bodies, parts, lying)
     return Cast(
         bodies, picked, surroundings, _furniture_only(chance[:, picked.index].float(), picked),
-        rest, postures(bodies, parts, under).lying, watched_of(surroundings, people, bodies),
+        rest, lying, watched_of(surroundings, people, bodies),
     )  # fmt: skip
 
 
