@@ -352,6 +352,27 @@ def test_a_weight_of_zero_needs_no_evidence(walk):
     assert all((value >= 0).all() for value in parts.values())
 
 
+def test_a_told_height_leaves_fewer_frames_to_tell_of_proportions(walk):
+    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
+    looked = seen_of(seen(walk), rig, CAMERA, FitConfig())
+    person = (torch.arange(12) >= 8).long()  # eight rows of one, four of another
+    none, betas = torch.zeros(12, 0), torch.full((2, 10), 0.3)
+    at = Unknowns(torch.zeros(12, 3), walk.pose.body_pose, torch.ones(12, 3), betas, none, none)
+    frame = Frame(rig, axis_angle(walk.pose.global_orient), person)
+    by = Weighed(Stage(smooth=0.0), FitConfig(alike=6, alike_told=3), ANGLES.decode, learned=False)
+
+    def shares(given):
+        told = stature_of(open_body(), (1.7,), person, torch.arange(12))
+        told = None if given is None else dataclasses.replace(told, given=torch.tensor(given))
+        shape = body_energy(at, frame, dataclasses.replace(looked, stature=told), by).parts["shape"]
+        return shape / (by.stage.shape**2 * 0.9)
+
+    sixth, third, quarter = torch.full((8,), 1 / 6), torch.full((8,), 1 / 3), torch.full((4,), 0.25)
+    assert torch.allclose(shares(None), torch.cat([sixth, quarter]))
+    assert torch.allclose(shares([1.7, float("nan")]), torch.cat([third, quarter]))
+    assert torch.allclose(shares([float("nan"), 1.7]), torch.cat([sixth, third[:4]]))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["smpl", "smplh", "smplx"])
 def test_models_of_the_users_files_are_fitted_with_hands_and_face(name, tmp_path, monkeypatch):

@@ -172,13 +172,18 @@ def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy
     stage, config = by.stage, by.config
     angles = by.decode(at.code)
     count = torch.bincount(frame.person, minlength=len(at.betas)).to(at.betas)[frame.person]
-    news = count.clamp_max(config.alike)
     told = config.told if seen.stature is not None else 0.0
     hands, face = min(1, at.hands.shape[1]), min(1, at.face.shape[1])
     expression = at.face[:, 3:]
 
     def pose() -> Tensor:
         return at.code.square().sum(-1) if by.learned else pose_price(angles, seen)
+
+    def shape() -> Tensor:
+        most = torch.full_like(at.betas[:, 0], config.alike)
+        if seen.stature is not None:
+            most[seen.stature.given.isfinite().to(most.device)] = config.alike_told
+        return at.betas.square().sum(-1)[frame.person] / count.minimum(most[frame.person])
 
     def height() -> Tensor:
         assert seen.stature is not None
@@ -188,7 +193,7 @@ def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy
         ("pose", stage.pose**2, pose),
         ("limits", config.limits**2, lambda: limit_price(angles)),
         ("bending", config.bending * stage.pose, lambda: bending_price(angles)),
-        ("shape", stage.shape**2, lambda: at.betas.square().sum(-1)[frame.person] / news),
+        ("shape", stage.shape**2, shape),
         ("height", told**2, height),
         ("hands", stage.hands**2 * hands, lambda: at.hands.square().sum(-1)),
         ("jaw", stage.jaw**2 * face, lambda: jaw_price(at.face)),
