@@ -22,7 +22,7 @@ CAUTION = 5  # of fast_simplification: 7 is its default, less is slower and bett
 AT_ONCE = 16  # meshes whose normals are found together: what fits a processor's cache
 GENTLER = 1.5  # a target of faces that spoils a mesh is raised by this factor
 simplifying = Lock()
-"""Held while fast_simplification works: on global variables, without Python's lock."""
+"""Held while fast_simplification works: on global variables."""
 
 
 def box(verts: Float[Tensor, "verts 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
