@@ -25,6 +25,7 @@ from mover.fitting.energy import (
     smooth_joint_price,
 )
 from mover.fitting.limits import limit_price, limit_table, resting
+from mover.fitting.presets import PAPER
 from mover.fitting.prior import ANGLES, same
 from mover.fitting.start import placed
 from mover.fitting.stature import UNTOLD, height_price, size_of, stature_of
@@ -371,6 +372,7 @@ def test_a_told_height_leaves_fewer_frames_to_tell_of_proportions(walk):
     assert torch.allclose(shares(None), torch.cat([sixth, quarter]))
     assert torch.allclose(shares([1.7, float("nan")]), torch.cat([third, quarter]))
     assert torch.allclose(shares([float("nan"), 1.7]), torch.cat([sixth, third[:4]]))
+    assert PAPER.alike_told == PAPER.alike  # as published: all frames tell, whatever is told
 
 
 @pytest.mark.slow
@@ -435,7 +437,6 @@ def test_a_second_pass_takes_camera_and_floor_of_a_result(tmp_path):
 def test_the_preset_paper_prices_motion_as_printed():
     """L_smooth of a track at even times, by a loop over Sec. 3.2, with the released weights."""
     from mover.fitting.energy import Seen, smooth_pixel_price
-    from mover.fitting.presets import PAPER
 
     generator = torch.Generator().manual_seed(0)
     frames = torch.arange(5)
