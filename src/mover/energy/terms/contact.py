@@ -12,7 +12,8 @@ Release:   from each point of the object's part to the nearest body point, its m
            apart.
 Robust:    the mean of a Geman-McClure price (rho 0.3 m) from body to object, in full only once four
            bodies touch, the back a quarter of the seat; so that contact neither drags an object by
-           a few wrong points nor rules its size. `heading_term` turns seats with their sitters.
+           a few wrong points nor rules its size. `heading_term` turns seats with their sitters
+           and beds with those who lie on them.
 """
 
 from functools import cached_property
@@ -50,7 +51,8 @@ class ContactPoints:
     share: Float[Tensor, "touched 4"]
     """Of all body vertices that touch seats and tops, or backs, those that touch this part [1]."""
     heading: Float[Tensor, "touched 2"]
-    """Mean direction (x, z) that its sitters face, a unit vector; zero where nobody sits."""
+    """Mean direction (x, z) that its sitters face, or that who lies on a bed stretches to from the
+    neck to the hips, a unit vector; zero where nobody tells it."""
 
 
 def shares_of(weight: Float[Tensor, "touched 4 points"]) -> Float[Tensor, "touched 4"]:
@@ -135,7 +137,7 @@ def _nearest(
 
 
 def heading_term(layout: Layout, touches: ContactPoints) -> Float[Tensor, "*starts objects"]:
-    """Seats face where their sitters face: 1 - cos of the angle between them (`robust` only)."""
+    """Seats face as their sitters, beds run as who lies: 1 - cos of the angle (`robust` only)."""
     yaw = layout.yaw[..., touches.object_of]
     facing = yaw.sin() * touches.heading[:, 0] + yaw.cos() * touches.heading[:, 1]
     seated = touches.heading.square().sum(-1) > 0

@@ -7,9 +7,10 @@ distance in 3D: `contact_association` has the rules of the three presets (Sec. 3
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from mover.bodies.parts import Parts
-from mover.bodies.posture import headings, postures, touching
+from mover.bodies.posture import at, headings, landmarks, postures, touching
 from mover.bodies.skin import PARTS
 from mover.core.observe import Observer, silent
 from mover.core.records import record
@@ -176,16 +177,21 @@ def _pack(
 
 
 def _headings(rows: ContactRows, touched: Int[Tensor, " touched"], inputs: AssignInputs) -> Tensor:
-    """Mean horizontal direction of those who sit on each touched object; zero for none.
+    """Mean horizontal direction of those who sit or lie on each touched object; zero for none.
 
-    Only of objects with a back: one sits on the side of a bed, and round a stool.
+    Who sits tells it only of what has a back: one sits on the side of a bed, and round a stool.
+    Who lies tells it of a bed, whose back is where heads lie.
     """
-    facing = headings(inputs.bodies, inputs.parts)[:, [0, 2]]
-    sits = postures(inputs.bodies, inputs.parts).sitting
+    bodies, parts = inputs.bodies, inputs.parts
+    pose, places = postures(bodies, parts), landmarks(bodies, parts)
+    facing = headings(bodies, parts)[:, [0, 2]]
+    along = normalize((at(places, "hips") - at(places, "neck"))[:, [0, 2]], dim=-1)
     means: list[Tensor] = []
     for o in touched.tolist():
-        seated = rows.body[(rows.object_of == o) & ~rows.hand].unique()
-        mean = facing[seated[sits[seated]]].sum(0)
-        told = bool(inputs.objects.has_back[o]) and float(mean.norm()) > 0.1
+        bed = inputs.objects.categories[o] == "bed"
+        ways, does = (along, pose.lying) if bed else (facing, pose.sitting)
+        there = rows.body[(rows.object_of == o) & ~rows.hand].unique()
+        mean = ways[there[does[there]]].sum(0)
+        told = (bed or bool(inputs.objects.has_back[o])) and float(mean.norm()) > 0.1
         means.append(mean / mean.norm() if told else 0 * mean)
     return torch.stack(means)
