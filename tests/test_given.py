@@ -21,6 +21,7 @@ from mover.geometry.mesh import box
 from mover.geometry.placement import larger
 from mover.geometry.topology import is_closed
 from mover.stages.objects.gather_given import (
+    FIRM,
     UNFIT,
     WEIGHTS,
     believed_sides,
@@ -29,7 +30,9 @@ from mover.stages.objects.gather_given import (
     lighter_where_used,
     prior_weights,
     room_axis,
+    sizes_of_shapes,
     standard_sizes,
+    unplaced,
 )
 from mover.stages.objects.prepare_objects import levelled
 from mover.stages.people.find_depth import are_shapeless, nearer, size_spread
@@ -140,6 +143,31 @@ def test_of_a_room_without_a_guess_the_axis_alone_is_priced():
     torch.testing.assert_close(given_term(far, given), price)
     bed, chair = given_term(skew, given).tolist()
     assert bed > 3 > chair > 1
+
+
+def test_shapes_are_held_to_firm_standards_of_classes_with_one_meaning() -> None:
+    kinds = ("bed", "chair", "desk", "table", "nightstand", "aquarium")
+    sizes = torch.tensor([[1.4, 0.5, 1.15]]).repeat(6, 1)
+    standard, precision = sizes_of_shapes(kinds, sizes)
+    for i, kind in enumerate(kinds):
+        for axis, usual in enumerate(STANDARD.get(kind, (None,) * 3)):
+            told = usual is not None and usual[1] <= FIRM and kind not in ("chair", "table")
+            off = math.log(usual[0] / float(sizes[i, axis])) if told else 0.0
+            assert float(standard[i, axis]) == pytest.approx(off, abs=1e-5)
+            sharp = usual[1] ** -2 if told else 0.0
+            assert float(precision[i, axis]) == pytest.approx(sharp, rel=1e-5)
+    assert (precision > 0).sum(1).tolist() == [1, 0, 1, 0, 0, 0]
+
+
+def test_of_what_nobody_placed_sizes_cost_as_a_student_t_and_places_nothing() -> None:
+    nothing, layout = unplaced(2), somewhere(2)
+    assert cost(nothing, replace(layout, yaw=layout.yaw + 1, log_scale=layout.log_scale + 1)) == 0
+    size = torch.tensor([[0.0, 0.0, 0.5], [0.1, -0.2, 0.3]])
+    known = replace(nothing, standard=size, precision=torch.tensor([[0.0, 0.0, 100.0]] * 2))
+    for off in (-0.6, -0.1, 0.0, 0.3):
+        found = replace(layout, t_world_object=3 * layout.t_world_object, log_scale=size + off)
+        expected = 2 * 2 * math.log(1 + (off / 0.1) ** 2 / 3)
+        assert cost(known, found) == pytest.approx(expected, abs=1e-4)
 
 
 def test_standard_sizes_pull_what_they_know_and_leave_the_rest() -> None:

@@ -4,6 +4,7 @@
 2. Boxes alone tell the camera's height and which shapes and turns are possible (screen.py).
 3. Silhouettes decide: the descent of the main job (Eq. 1 with its image terms alone, in the robust
    form) from several turns of several shapes of each thing, all at once.
+In 2 and 3 axes and firm standard sizes count (`known_of`), as far as they are known.
 
 Everything stands on the ground. What is best becomes the scene; the next best shapes and places of
 each thing are kept beside it.
@@ -35,7 +36,7 @@ from mover.perceive.depth_map import floor_height, median_depths, range_in
 from mover.perceive.screen import Screened, ScreenInputs, outermost, screen
 from mover.stages.camera.room_lines import Segments
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
-from mover.stages.objects.gather_given import given_axis
+from mover.stages.objects.gather_given import given_axis, sizes_of_shapes, unplaced
 from mover.stages.objects.own_edges import own_edges
 from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import place_objects
@@ -274,7 +275,7 @@ def first_scene(
     pieces = _pieces(picture, [pairs[k] for k in items])
     prepared = run.stage(prepare_objects, PrepareInputs(pieces), config.prepare)
     starts = starts_of(screened, items, config.turns)
-    cues = replace(repeated(cues, things), given=axes_of(picture, things))
+    cues = replace(repeated(cues, things), given=known_of(picture, [pairs[k] for k in items]))
     inputs = _place_inputs(picture, cues, prepared, starts, screened.height)
     placed = run.stage(place_objects, inputs, config.place)
     found = to_objects(pieces, prepared, placed.layout)
@@ -320,7 +321,7 @@ def _screen_inputs(
         height=height,
         height_spread=picture.height_spread,
         tilt_spread=picture.tilt_spread,
-        given=axes_of(picture, things),
+        given=known_of(picture, pairs),
     )
 
 
@@ -333,13 +334,20 @@ def _pieces(picture: Picture, pairs: list[tuple[int, Shape]]) -> tuple[SceneObje
     return tuple(found)
 
 
-def axes_of(picture: Picture, things: Int[Tensor, " items"]) -> Given | None:
-    """Along what each item may run, as the room's edges and those of its thing tell."""
-    if picture.heading is None or picture.segments is None:
-        return None
-    edges = own_edges(picture.segments, picture.masks, picture.people, picture.camera)
+def known_of(picture: Picture, pairs: list[tuple[int, Shape]]) -> Given:
+    """Of what standard size each item may be, and along what it may run.
+
+    The axes are what the room's edges and those of its thing tell.
+    """
+    things = torch.tensor([thing for thing, _ in pairs])
     kinds = [canonical(found.category) for found in picture.detections]
-    return rows_of(given_axis(kinds, picture.heading, edges), things, "objects")
+    known = unplaced(len(kinds))
+    if picture.heading is not None and picture.segments is not None:
+        edges = own_edges(picture.segments, picture.masks, picture.people, picture.camera)
+        known = given_axis(kinds, picture.heading, edges)
+    sizes = torch.tensor([shape.size for _, shape in pairs])
+    standard, precision = sizes_of_shapes([kinds[thing] for thing, _ in pairs], sizes)
+    return replace(rows_of(known, things, "objects"), standard=standard, precision=precision)
 
 
 def _place_inputs(

@@ -9,6 +9,8 @@ Axis:      most furniture stands along one of two directions of the room.
 Size:      each of the three is about as large as given, or all are larger by as much as the object
            is farther (its picture was right): -\log of the mean of both chances, normal in the
            logarithms. And about as large as the standard dimensions of its class.
+First:     of what nobody placed before, axis and standard dimensions alone, these with the Student
+           t of places: the piece may be of a kind that no standard knows.
 Weight:    d_i grows with what is left of the image's energy where the object fits best: a shape or
            a mask that does not fit says by so much less where the object stands. Which way it
            faces, the worst outline still says better than a guess.
@@ -57,7 +59,7 @@ class Given:
     weight: Float[Tensor, " objects"]
     """How little the image tells of it: 1 is usual, 0 leaves it to the image."""
     told: bool = True
-    """Whether places, yaws and sizes were given; else the axis alone is known."""
+    """Whether places, yaws and sizes were given; else axes and standard sizes alone are known."""
 
     # What no layout changes is computed once: descents ask hundreds of times.
 
@@ -85,7 +87,7 @@ class Given:
 def given_term(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
     """How far places, yaws and sizes are from what is expected [nats, times the weight]."""
     if not given.told:
-        return given.weight.clamp_max(TURNS) * _axis(layout, given)
+        return given.weight.clamp_max(TURNS) * (_axis(layout, given) + _standard(layout, given))
     turned = _yaw(layout, given) + _axis(layout, given)
     placed = _place(layout, given) + _size(layout, given)
     return given.weight.clamp_max(TURNS) * turned + given.weight * placed
@@ -98,7 +100,12 @@ def _away(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
 
 
 def _place(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
-    return 2 * (1 + (_away(layout, given) / AWAY).square() / 3).log()
+    return _student((_away(layout, given) / AWAY).square())
+
+
+def _student(squares: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """Of squared standard deviations, with three degrees of freedom."""
+    return 2 * (1 + squares / 3).log()
 
 
 def _yaw(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
@@ -125,5 +132,14 @@ def _size(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
     farther = _away(layout, given).unsqueeze(-1)
     kept = layout.log_scale.square().sum(-1) / SIZE**2
     seen = (layout.log_scale - farther).square().sum(-1) / SIZE**2
-    usual = (given.precision * (layout.log_scale - given.standard).square()).sum(-1)
+    usual = _off_standard(layout, given).sum(-1)
     return usual / 2 + math.log(2) - torch.logaddexp(-kept / 2, -seen / 2)
+
+
+def _standard(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
+    return _student(_off_standard(layout, given)).sum(-1)
+
+
+def _off_standard(layout: Layout, given: Given) -> Float[Tensor, "*starts objects 3"]:
+    """Squared standard deviations from the standard sizes."""
+    return given.precision * (layout.log_scale - given.standard).square()

@@ -26,6 +26,7 @@ SQUARE = math.radians(5)  # how well furniture that stands along an axis does so
 WALLS = 0.95  # chance that furniture runs along the edges that a picture shows
 OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand along an axis
 CONTRADICTED = 3.0  # standard deviations between a given and a standard size, of another class
+FIRM = 0.06  # spread of standards that hold for nearly all: mattresses are as long as people
 STRAIGHT = math.radians(2)  # how well edges run along the sides of what they belong to [rad]
 LEVEL, TOLD = 0.5, 0.95  # chances that an edge is level, and that what edges agree on is so
 AGREED = math.radians(4)  # [rad], how well they must
@@ -113,9 +114,15 @@ def chance_along(categories: Sequence[str]) -> Float[Tensor, " objects"]:
 def given_axis(categories: Sequence[str], heading: Heading, edges: OwnEdges | None = None) -> Given:
     """The same where nothing was given: of a room whose walls are seen, the axis alone."""
     axes = _own_axes(chance_along(categories), (heading.yaw, heading.spread), edges)
-    known, none = torch.ones_like(axes.yaw), axes.yaw.new_zeros(len(axes.yaw), 3)
+    known = unplaced(len(axes.yaw))
+    return replace(known, along=axes.along, sharpness=axes.sharpness, axis=axes.yaw)
+
+
+def unplaced(count: int) -> Given:
+    """Nothing at all, of so many objects."""
+    known, none = torch.ones(count), torch.zeros(count, 3)
     return Given(
-        distance=known, yaw=0 * known, along=axes.along, sharpness=axes.sharpness, axis=axes.yaw,
+        distance=known, yaw=0 * known, along=0 * known, sharpness=known, axis=0 * known,
         standard=none, precision=none, weight=known, told=False,
     )  # fmt: skip
 
@@ -193,14 +200,37 @@ def _standard_of(
 ) -> list[tuple[int, Float[Tensor, ""], float]]:
     """Axis, logarithm over the given size and its spread, of the first class that fits the size."""
     for name in names:
-        known = [
-            (axis, math.log(usual[0]) - size[axis].log(), usual[1])
-            for axis, usual in enumerate(STANDARD.get(name, ()))
-            if usual is not None
-        ]
+        known = _off_standard(name, size)
         if all(abs(x) < CONTRADICTED * math.hypot(s, SIZE, COMMON) for _, x, s in known):
             return known
     return []
+
+
+def _off_standard(
+    name: str, size: Float[Tensor, "3"]
+) -> list[tuple[int, Float[Tensor, ""], float]]:
+    return [
+        (axis, math.log(usual[0]) - size[axis].log(), usual[1])
+        for axis, usual in enumerate(STANDARD.get(name, ()))
+        if usual is not None
+    ]
+
+
+def sizes_of_shapes(
+    categories: Sequence[str], sizes: Float[Tensor, "items 3"]
+) -> tuple[Float[Tensor, "items 3"], Float[Tensor, "items 3"]]:
+    """The same of shapes that may stand for things of a class.
+
+    Only of classes whose name has one meaning (a chair of COCO may be an armchair or a stool), and
+    only firm standards: of the rest the size of the shape itself says as much.
+    """
+    usual, sharp = torch.zeros_like(sizes), torch.zeros_like(sizes)
+    wide = {canonical(name) for name in WIDE_CLASSES}
+    for i, category in enumerate(categories):
+        for axis, off, sigma in [] if category in wide else _off_standard(category, sizes[i]):
+            if sigma <= FIRM:
+                usual[i, axis], sharp[i, axis] = off, 1 / sigma**2
+    return usual, sharp
 
 
 def room_axis(
