@@ -4,7 +4,7 @@
 2. Boxes alone tell the camera's height and which shapes and turns are possible (screen.py).
 3. Silhouettes decide: the descent of the main job (Eq. 1 with its image terms alone, in the robust
    form) from several turns of several shapes of each thing, all at once.
-In 2 and 3 axes and firm standard sizes count (`known_of`), as far as they are known.
+Along what a thing may run counts in 2 and 3, as far as it is seen, and firm standard sizes in 3.
 
 Everything stands on the ground. What is best becomes the scene; the next best shapes and places of
 each thing are kept beside it.
@@ -321,7 +321,7 @@ def _screen_inputs(
         height=height,
         height_spread=picture.height_spread,
         tilt_spread=picture.tilt_spread,
-        given=known_of(picture, pairs),
+        given=axes_of(picture, things),
     )
 
 
@@ -334,20 +334,23 @@ def _pieces(picture: Picture, pairs: list[tuple[int, Shape]]) -> tuple[SceneObje
     return tuple(found)
 
 
-def known_of(picture: Picture, pairs: list[tuple[int, Shape]]) -> Given:
-    """Of what standard size each item may be, and along what it may run.
-
-    The axes are what the room's edges and those of its thing tell.
-    """
-    things = torch.tensor([thing for thing, _ in pairs])
+def axes_of(picture: Picture, things: Int[Tensor, " items"]) -> Given:
+    """Along what each item may run, as the room's edges and those of its thing tell."""
     kinds = [canonical(found.category) for found in picture.detections]
     known = unplaced(len(kinds))
     if picture.heading is not None and picture.segments is not None:
         edges = own_edges(picture.segments, picture.masks, picture.people, picture.camera)
         known = given_axis(kinds, picture.heading, edges)
+    return rows_of(known, things, "objects")
+
+
+def known_of(picture: Picture, pairs: list[tuple[int, Shape]]) -> Given:
+    """The same, and of what standard size each item may be."""
+    kinds = [canonical(picture.detections[thing].category) for thing, _ in pairs]
     sizes = torch.tensor([shape.size for _, shape in pairs])
-    standard, precision = sizes_of_shapes([kinds[thing] for thing, _ in pairs], sizes)
-    return replace(rows_of(known, things, "objects"), standard=standard, precision=precision)
+    standard, precision = sizes_of_shapes(kinds, sizes)
+    known = axes_of(picture, torch.tensor([thing for thing, _ in pairs]))
+    return replace(known, standard=standard, precision=precision)
 
 
 def _place_inputs(
