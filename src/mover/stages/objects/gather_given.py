@@ -186,13 +186,12 @@ def standard_sizes(
     Detectors call a coffee table a dining table. So of the classes that have one name the first
     counts whose standard the given size does not contradict, and none where all are contradicted.
     """
-    usual, sharp = torch.zeros_like(objects.size), torch.zeros_like(objects.size)
     others = {canonical(name): kinds for name, kinds in WIDE_CLASSES.items()}
-    for i, category in enumerate(objects.categories):
-        names = dict.fromkeys((category, *others.get(category, ())))
-        for axis, off, sigma in _standard_of(tuple(names), objects.size[i]):
-            usual[i, axis], sharp[i, axis] = off, 1 / sigma**2
-    return usual, sharp
+    known = [
+        _standard_of(tuple(dict.fromkeys((category, *others.get(category, ())))), size)
+        for category, size in zip(objects.categories, objects.size, strict=True)
+    ]
+    return _in_tables(known, objects.size)
 
 
 def _standard_of(
@@ -224,12 +223,21 @@ def sizes_of_shapes(
     Only of classes whose name has one meaning (a chair of COCO may be an armchair or a stool), and
     only firm standards: of the rest the size of the shape itself says as much.
     """
-    usual, sharp = torch.zeros_like(sizes), torch.zeros_like(sizes)
     wide = {canonical(name) for name in WIDE_CLASSES}
-    for i, category in enumerate(categories):
-        for axis, off, sigma in [] if category in wide else _off_standard(category, sizes[i]):
-            if sigma <= FIRM:
-                usual[i, axis], sharp[i, axis] = off, 1 / sigma**2
+    known = [
+        [] if category in wide else [k for k in _off_standard(category, size) if k[2] <= FIRM]
+        for category, size in zip(categories, sizes, strict=True)
+    ]
+    return _in_tables(known, sizes)
+
+
+def _in_tables(
+    known: Sequence[list[tuple[int, Float[Tensor, ""], float]]], like: Float[Tensor, "items 3"]
+) -> tuple[Float[Tensor, "items 3"], Float[Tensor, "items 3"]]:
+    usual, sharp = torch.zeros_like(like), torch.zeros_like(like)
+    for i, row in enumerate(known):
+        for axis, off, sigma in row:
+            usual[i, axis], sharp[i, axis] = off, 1 / sigma**2
     return usual, sharp
 
 
