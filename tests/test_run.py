@@ -187,3 +187,13 @@ def test_what_is_wrong_is_refused_however_often_the_like_was_built(wrong: dict[s
         replace(PLANE, points=torch.zeros(5, 3))
         with pytest.raises(TypeCheckError):
             replace(PLANE, **wrong)
+
+
+def test_fingerprint_follows_what_is_written_into_a_tensor_that_it_knows():
+    plane = replace(PLANE, points=PLANE.points.clone())
+    before = records.fingerprint(plane)
+    plane.points[1, 2] = -7.0
+    changed = records.fingerprint(plane)
+    other = replace(plane, points=plane.points.clone())
+    plane.points.copy_(PLANE.points)
+    assert changed == records.fingerprint(other) != before == records.fingerprint(plane)
