@@ -13,7 +13,8 @@ from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig
 from mover.fitting.energy import Seen, pose_price
 from mover.fitting.ground import distances_of_who_lies, plane_of, sole_heights, soles_of
-from mover.fitting.limits import resting, spreads
+from mover.fitting.limits import limit_price, resting, spreads
+from mover.fitting.start import upright_guesses
 from mover.fitting.tracks import ALONE, image_speed
 from mover.geometry.rotations import axis_angle, rotation_vectors
 
@@ -126,3 +127,16 @@ def test_a_leaning_floor_lies_where_its_soles_are():
         for joint, over in zip(("ankle", "foot"), soles, strict=True):
             joints[0, BODY.index(f"{side}_{joint}")] = (height + over + more) * leaned
     assert float(sole_heights(joints, soles, leaned)) == pytest.approx(-1.4, abs=1e-5)
+
+
+def test_upright_bodies_are_expected_alike_on_both_sides_and_nearly_straight_where_they_stand():
+    poses = torch.stack([guess.pose for guess in upright_guesses(torch.zeros(1))[::4]])
+    assert not limit_price(poses).any()
+    mirrored = poses.unflatten(-1, (21, 3)) * torch.tensor([1.0, -1.0, -1.0])
+    other = [name.replace("left", "+").replace("right", "left").replace("+", "right")
+             for name in BODY[1:]]  # fmt: skip
+    swapped = mirrored[:, [BODY.index(name) - 1 for name in other]].flatten(1)
+    torch.testing.assert_close(swapped, poses)
+    axes = [3 * (BODY.index(f"left_{joint}") - 1) for joint in ("hip", "knee")]
+    stand, sit = poses[:, axes].rad2deg().abs()
+    assert stand.max() <= 20 < 75 <= sit.min()

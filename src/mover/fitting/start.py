@@ -13,7 +13,7 @@ end for end: of each stretch of lying the way of the most counts, and hypotheses
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,7 +35,11 @@ from mover.geometry.rotations import rot_x, rot_y, rot_z
 YAWS = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)
 BACK, OTHERS = (0.0,), (0.5 * math.pi, -0.5 * math.pi, math.pi)
 """How far who lies has rolled: on the back, on either side and on the belly [rad]."""
-SEATED = {"hip": -80.0, "knee": 85.0}  # [degrees] about x
+STANDING = {"hip": (0, -10.0), "knee": (0, 15.0), "elbow": (1, -25.0)}
+"""Axes and left angles [degrees] of who stands or walks, between quiet standing (nearly straight)
+and the mean of a gait cycle (hips 10, knees 20; Perry, Burnfield: Gait Analysis, 2010)."""
+SEATED = {"hip": (0, -80.0), "knee": (0, 85.0)}
+"""Of who sits."""
 TORSO = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 START = Stage(pose=12.0, shape=5.0, smooth=0.0)
 BEFORE = 3.5  # [m], where a body is put whose keypoints do not tell
@@ -89,13 +93,18 @@ class Tried:
 
 def upright_guesses(like: Tensor) -> list[Guess]:
     """Standing and sitting people who face four ways."""
-    stand = resting(1, like)[0]
-    sit = stand.clone()
-    for name, angle in SEATED.items():
-        for side in ("left", "right"):
-            sit[3 * (BODY.index(f"{side}_{name}") - 1)] = math.radians(angle)
     turns = rot_y(torch.tensor(YAWS).to(like)).unbind(0)
-    return [Guess(pose, turn, True) for pose in (stand, sit) for turn in turns]
+    poses = [_posed(angles, like) for angles in (STANDING, SEATED)]
+    return [Guess(pose, turn, True) for pose in poses for turn in turns]
+
+
+def _posed(angles: Mapping[str, tuple[int, float]], like: Tensor) -> Float[Tensor, "63"]:
+    """A resting body with some joints turned, alike on both sides."""
+    pose = resting(1, like)[0]
+    for name, (axis, angle) in angles.items():
+        for side, sign in (("left", 1.0), ("right", -1.0 if axis else 1.0)):
+            pose[3 * (BODY.index(f"{side}_{name}") - 1) + axis] = sign * math.radians(angle)
+    return pose
 
 
 def lying_guesses(like: Tensor, rolls: tuple[float, ...]) -> list[Guess]:
