@@ -150,7 +150,7 @@ def joined(a: Layout, b: Layout) -> Layout:
 def reference_yaw(
     initial: Float[Tensor, " objects"], touches: ContactPoints | None
 ) -> Float[Tensor, " objects"]:
-    """Yaw of the sitters of used seats, else the initial one [rad]."""
+    """Yaw of who sits or lies on it, else the initial one [rad]."""
     yaw = initial.clone()
     if touches is not None:
         x, z = touches.heading.unbind(-1)
@@ -266,7 +266,7 @@ def by_release(inputs: ReinitInputs, config: ReinitConfig, observe: Observer = s
 
 
 def _at_contacts(touches: ContactPoints, k: int, layout: Layout, i: int) -> tuple[Tensor, Tensor]:
-    """Mean of the contact points, and the turn towards the sitters' heading."""
+    """Mean of the contact points, and the turn towards the heading of who rests there."""
     weight = touches.weight[k].flatten()
     mean = (touches.points[k].flatten(0, 1) * weight.unsqueeze(-1)).sum(0) / weight.sum().clamp_min(
         1e-9
@@ -293,7 +293,7 @@ def _between_bounds(inputs: ReinitInputs, i: int) -> Tensor:
 
 
 def contact_start(layout: Layout, objects: Objects, touches: ContactPoints | None) -> Layout:
-    """Candidates of all objects: used seats under their sitters and facing as they do."""
+    """Candidates of all objects: what is rested on, under its people and facing as they do."""
     if touches is None:
         return layout
     t, yaw = layout.t_world_object.clone(), layout.yaw.clone()
