@@ -189,11 +189,13 @@ def test_what_is_wrong_is_refused_however_often_the_like_was_built(wrong: dict[s
             replace(PLANE, **wrong)
 
 
-def test_fingerprint_follows_what_is_written_into_a_tensor_that_it_knows():
-    plane = replace(PLANE, points=PLANE.points.clone())
+@pytest.mark.parametrize("inference", [False, True])
+def test_fingerprint_is_that_of_the_content_whoever_wrote_it(inference: bool):
+    with torch.inference_mode(inference):
+        plane = replace(PLANE, points=PLANE.points.clone())
     before = records.fingerprint(plane)
-    plane.points[1, 2] = -7.0
+    plane.points.numpy()[1, 2] = -7.0
     changed = records.fingerprint(plane)
-    other = replace(plane, points=plane.points.clone())
-    plane.points.copy_(PLANE.points)
+    other = replace(plane, points=torch.from_numpy(plane.points.numpy().copy()))
+    plane.points.numpy()[:] = PLANE.points.numpy()
     assert changed == records.fingerprint(other) != before == records.fingerprint(plane)

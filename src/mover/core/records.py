@@ -7,7 +7,7 @@ import types
 import typing
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Mapping
 from functools import cache, wraps
 from pathlib import Path
 from tokenize import TokenError
@@ -17,9 +17,7 @@ import numpy as np
 import torch
 from beartype import BeartypeConf, beartype
 from jaxtyping import jaxtyped
-from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.weak import WeakIdKeyDictionary
 
 from mover.core.errors import InputError
 from mover.core.files import replacing
@@ -32,8 +30,6 @@ BROKEN = (
 )  # fmt: skip
 """What reading a broken file of arrays raises."""
 _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
-_digests: MutableMapping[Tensor, tuple[int, str]] = WeakIdKeyDictionary()
-"""Versions and digests of the tensors that were hashed."""
 
 
 @dataclass_transform(frozen_default=True)
@@ -168,13 +164,12 @@ def save(value: Any, path: Path) -> None:  # noqa: ANN401
 
     The JSON file also holds a digest of both and of the path's last two names.
     """
-    tensors: dict[str, Tensor] = {}
+    tensors: dict[str, Any] = {}
     tree = _split(value, "", tensors)
-    arrays: dict[str, Any] = {name: _array_of(tensor) for name, tensor in tensors.items()}
     with replacing(path.with_suffix(".npz")) as part:
-        np.savez(part, **arrays)
+        np.savez(part, **tensors)
     with replacing(path.with_suffix(".json")) as part:
-        digest = _digest(tree, {name: _known_digest(x) for name, x in tensors.items()}, path)
+        digest = _digest(tree, tensors, path)
         part.write_text(json.dumps({"digest": digest, "record": tree}))
 
 
@@ -188,8 +183,7 @@ def load(kind: type[T], path: Path) -> T:
         whole = json.loads(path.with_suffix(".json").read_text())
         with path.with_suffix(".npz").open("rb") as file:
             tree, arrays = whole["record"], dict(np.load(file, allow_pickle=False))
-        digests = {name: _array_digest(array) for name, array in arrays.items()}
-        if whole["digest"] == _digest(tree, digests, path):
+        if whole["digest"] == _digest(tree, arrays, path):
             return typing.cast(T, _join(kind, tree, arrays))
         reason = "its digest is another"
     except BROKEN as error:
@@ -199,43 +193,29 @@ def load(kind: type[T], path: Path) -> T:
 
 def fingerprint(*values: Any) -> str:  # noqa: ANN401
     """Short hash of the content of records: equal content, equal name on disk."""
-    tensors: dict[str, Tensor] = {}
+    tensors: dict[str, Any] = {}
     tree = [_split(v, str(i), tensors) for i, v in enumerate(values)]
-    return _hashed(tree, {name: _known_digest(x) for name, x in tensors.items()})[:16]
+    return _hashed(tree, tensors)[:16]
 
 
-def _digest(tree: Any, digests: dict[str, str], path: Path) -> str:  # noqa: ANN401
+def _digest(tree: Any, tensors: dict[str, Any], path: Path) -> str:  # noqa: ANN401
     """Of a record under its name, so that another's file is not taken for it."""
-    return _hashed([path.parent.name, path.name, tree], digests)
+    return _hashed([path.parent.name, path.name, tree], tensors)
 
 
-def _hashed(tree: Any, digests: dict[str, str]) -> str:  # noqa: ANN401
-    return hashlib.sha256(json.dumps([tree, digests], sort_keys=True).encode()).hexdigest()
-
-
-def _array_digest(array: NDArray[Any]) -> str:
-    digest = hashlib.sha256(f"{array.dtype} {array.shape}".encode())
-    digest.update(np.ascontiguousarray(array).data)
+def _hashed(tree: Any, tensors: dict[str, Any]) -> str:  # noqa: ANN401
+    digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode())
+    for name in sorted(tensors):
+        array = np.ascontiguousarray(tensors[name])
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
     return digest.hexdigest()
 
 
-def _known_digest(tensor: Tensor) -> str:
-    """Of a tensor's content; of one tensor once, as long as torch does not write into it."""
-    version, digest = _digests.get(tensor, (-1, ""))
-    if version != tensor._version:
-        digest = _array_digest(_array_of(tensor))
-        _digests[tensor] = tensor._version, digest
-    return digest
-
-
-def _array_of(tensor: Tensor) -> NDArray[Any]:
-    return tensor.detach().cpu().numpy()
-
-
-def _split(value: Any, key: str, tensors: dict[str, Tensor]) -> Any:  # noqa: ANN401
+def _split(value: Any, key: str, tensors: dict[str, Any]) -> Any:  # noqa: ANN401
     match value:
         case Tensor():
-            tensors[key] = value
+            tensors[key] = value.detach().cpu().numpy()
             return {"tensor": key}
         case bytes():
             return {"bytes": value.decode("latin-1")}
