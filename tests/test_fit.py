@@ -446,7 +446,7 @@ def test_the_preset_paper_prices_motion_as_printed():
     none = torch.zeros(5, 63)
     seen = Seen(
         pixels, torch.ones(5, 4), torch.eye(3), 1080, torch.tensor([0.0, -1, 0]), None, triples,
-        none, torch.ones(63), None,
+        none, torch.ones(5, 63), None,
     )  # fmt: skip
     by = Weighed(PAPER.stages[0], PAPER, same, False)
     stage = PAPER.stages[0].smooth

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 from make_keypoints import CAMERA, as_bodies, keypoints_at, seen, walker
@@ -13,8 +14,8 @@ from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig
 from mover.fitting.energy import Seen, pose_price
 from mover.fitting.ground import distances_of_who_lies, plane_of, sole_heights, soles_of
-from mover.fitting.limits import limit_price, resting, spreads
-from mover.fitting.start import upright_guesses
+from mover.fitting.limits import limit_price, limit_table, resting, spreads
+from mover.fitting.start import BACK, lying_guesses, upright_guesses
 from mover.fitting.tracks import ALONE, image_speed
 from mover.geometry.rotations import axis_angle, rotation_vectors
 
@@ -68,7 +69,7 @@ def test_an_ankle_that_levels_the_foot_costs_no_more_than_one_at_rest():
     none = torch.zeros(1, 1)
     looked = Seen(
         none[..., None].expand(1, 1, 2), none, torch.eye(3), 540, torch.tensor([0.0, -1, 0]), None,
-        ALONE, rest, spreads(rest), None,
+        ALONE, rest, spreads(1, rest), None,
     )  # fmt: skip
     bent, level = rest.clone(), rest.clone()
     for joint, turn in (("left_hip", -0.7), ("left_knee", 1.0)):
@@ -140,3 +141,15 @@ def test_upright_bodies_are_expected_alike_on_both_sides_and_nearly_straight_whe
     axes = [3 * (BODY.index(f"left_{joint}") - 1) for joint in ("hip", "knee")]
     stand, sit = poses[:, axes].rad2deg().abs()
     assert stand.max() <= 20 < 75 <= sit.min()
+
+
+def test_only_who_lies_has_arms_anywhere_in_their_ranges():
+    like = torch.zeros(1, dtype=torch.float64)
+    usual, generator = spreads(1, like)[0], np.random.default_rng(0)
+    low, high = (x.numpy() for x in limit_table()[:2])
+    drawn = generator.uniform(low, high, (200_000, 63)).std(0)
+    arms = torch.tensor(["shoulder" in name for name in BODY[1:]]).repeat_interleave(3)
+    for guess in lying_guesses(like, BACK):
+        np.testing.assert_allclose(guess.spread[arms], drawn[arms.numpy()], rtol=0.01)
+        assert torch.equal(guess.spread[~arms], usual[~arms])
+    assert all(torch.equal(guess.spread, usual) for guess in upright_guesses(like))

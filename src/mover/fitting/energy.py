@@ -82,7 +82,7 @@ class Seen:
     triples: Triples
     centre: Float[Tensor, "bodies 63"]
     """The pose that the prior expects: of the row's posture, or of the body to start from [rad]."""
-    spread: Float[Tensor, "63"]
+    spread: Float[Tensor, "bodies 63"]
     """How far from it each angle may be [rad]."""
     joints: Float[Tensor, "bodies joints 3"] | None
     """Joints of the body that are known in 3D [m]; NaN: not known."""

@@ -75,6 +75,15 @@ def resting(bodies: int, like: Tensor) -> Float[Tensor, "bodies 63"]:
     return limit_table()[2].to(like).expand(bodies, -1).clone()
 
 
-def spreads(like: Tensor) -> Float[Tensor, "63"]:
-    """How far each angle is from its rest in daily life [rad]."""
-    return limit_table()[3].to(like)
+def spreads(bodies: int, like: Tensor, loose: tuple[str, ...] = ()) -> Float[Tensor, "bodies 63"]:
+    """How far each angle is from its rest in daily life [rad].
+
+    Args:
+        bodies: Rows, all alike.
+        like: For type and device.
+        loose: Joints that may be anywhere: the deviation of what is uniform in their ranges.
+    """
+    low, high, _, spread = limit_table().to(like)
+    free = torch.tensor([any(name in joint for name in loose) for joint in BODY[1:]])
+    free = free.repeat_interleave(3).to(like.device)
+    return torch.where(free, (high - low) / math.sqrt(12), spread).expand(bodies, -1)

@@ -26,7 +26,7 @@ from mover.core.types import Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, Weighed, body_energy, geman_mcclure
 from mover.fitting.ground import LIES, NEIGHBOURS, SITS, trunk_of
-from mover.fitting.limits import resting
+from mover.fitting.limits import resting, spreads
 from mover.fitting.prior import same
 from mover.fitting.tracks import best_path, chosen, every_so_often, tracks_of
 from mover.fitting.unknowns import OF_ROWS, Frame, Rig, Unknowns, place_of, points_of, solve
@@ -40,6 +40,8 @@ STANDING = {"hip": (0, -10.0), "knee": (0, 15.0), "elbow": (1, -25.0)}
 and the mean of a gait cycle (hips 10, knees 20; Perry, Burnfield: Gait Analysis, 2010)."""
 SEATED = {"hip": (0, -80.0), "knee": (0, 85.0)}
 """Of who sits."""
+ARMS = ("shoulder",)
+"""Hang by their weight where the trunk is upright; of who lies they may be anywhere."""
 TORSO = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 START = Stage(pose=12.0, shape=5.0, smooth=0.0)
 BEFORE = 3.5  # [m], where a body is put whose keypoints do not tell
@@ -62,7 +64,7 @@ class Begun:
     root: Float[Tensor, "bodies 3 3"]
     centre: Float[Tensor, "bodies 63"]
     """The pose that is expected [rad]."""
-    spread: Float[Tensor, "63"]
+    spread: Float[Tensor, "bodies 63"]
     """How far from it each angle may be [rad]."""
 
 
@@ -72,6 +74,8 @@ class Guess:
 
     pose: Float[Tensor, "63"]
     """Angles of the body [rad]."""
+    spread: Float[Tensor, "63"]
+    """How far from them each may be [rad]."""
     root: Float[Tensor, "3 3"]
     """The root's rotation in the world."""
     upright: bool
@@ -86,6 +90,8 @@ class Tried:
     root: Float[Tensor, "bodies 3 3"]
     centre: Float[Tensor, "bodies 63"]
     """The pose that it expects [rad]."""
+    spread: Float[Tensor, "bodies 63"]
+    """How far from it each angle may be [rad]."""
     cost: Float[Tensor, " bodies"]
     joints: Float[Tensor, "bodies joints 3"]
     """Of the body, in camera axes [m]."""
@@ -95,7 +101,8 @@ def upright_guesses(like: Tensor) -> list[Guess]:
     """Standing and sitting people who face four ways."""
     turns = rot_y(torch.tensor(YAWS).to(like)).unbind(0)
     poses = [_posed(angles, like) for angles in (STANDING, SEATED)]
-    return [Guess(pose, turn, True) for pose in poses for turn in turns]
+    usual = spreads(1, like)[0]
+    return [Guess(pose, usual, turn, True) for pose in poses for turn in turns]
 
 
 def _posed(angles: Mapping[str, tuple[int, float]], like: Tensor) -> Float[Tensor, "63"]:
@@ -109,11 +116,11 @@ def _posed(angles: Mapping[str, tuple[int, float]], like: Tensor) -> Float[Tenso
 
 def lying_guesses(like: Tensor, rolls: tuple[float, ...]) -> list[Guess]:
     """People who lie with the head in four directions, rolled as far."""
-    stand = resting(1, like)[0]
+    pose, spread = resting(1, like)[0], spreads(1, like, ARMS)[0]
     turns = rot_y(torch.tensor(YAWS).to(like)).unbind(0)
     back = rot_x(torch.tensor(-0.5 * math.pi).to(like))
     sides = [rot_z(torch.tensor(angle).to(like)) @ back for angle in rolls]
-    return [Guess(stand, turn @ side, False) for side in sides for turn in turns]
+    return [Guess(pose, spread, turn @ side, False) for side in sides for turn in turns]
 
 
 def before(pose: Float[Tensor, "bodies code"]) -> Float[Tensor, "bodies 3"]:
@@ -220,7 +227,8 @@ def begin(keypoints: Keypoints, seen: Seen, rig: Rig, camera: Camera, config: Fi
     at = _picked([one.at for one in tries], best, nearest)
     root = torch.stack([one.root for one in tries])[best, nearest]
     centre = torch.stack([one.centre for one in tries])[best, nearest]
-    return Begun(at, root, centre, seen.spread)
+    spread = torch.stack([one.spread for one in tries])[best, nearest]
+    return Begun(at, root, centre, spread)
 
 
 def _tried(
@@ -231,7 +239,9 @@ def _tried(
     body = guess.pose.expand(len(seen.pixels), -1)
     person = torch.zeros(len(body), dtype=torch.long)
     at = unknowns_at(body, before(body))
-    seen = dataclasses.replace(seen, centre=body)
+    spread = guess.spread.expand_as(body)
+    narrow = 2 * (seen.spread / spread).log().sum(-1)
+    seen = dataclasses.replace(seen, centre=body, spread=spread)
     frame = Frame(rig, (R @ guess.root).expand(len(body), -1, -1), person)
     if guess.upright:
         flat = points_of(at, frame, same).keypoints
@@ -242,12 +252,12 @@ def _tried(
         lambda u: body_energy(u, frame, seen, by), at, config.start_steps, ("turn", "code", "place")
     )
     with torch.no_grad():
-        cost = body_energy(at, frame, seen, by).per_item / START.pose**2
+        cost = body_energy(at, frame, seen, by).per_item / START.pose**2 - narrow
         joints = points_of(at, frame, same).joints[:, :22]
     if not guess.upright:
         slope = (trunk_of(joints) @ seen.up).clamp(-1, 1).asin()
         cost = cost + geman_mcclure(slope.square(), SLOPE) / LEVEL**2
-    return Tried(at, frame.root, body, cost, joints)
+    return Tried(at, frame.root, body, spread, cost, joints)
 
 
 def _among(some: Tried, rows: Int[Tensor, " some"], like: Tried) -> Tried:
@@ -261,6 +271,7 @@ def _among(some: Tried, rows: Int[Tensor, " some"], like: Tried) -> Tried:
         dataclasses.replace(like.at, **fields),
         put(some.root, like.root),
         put(some.centre, like.centre),
+        put(some.spread, like.spread),
         put(some.cost, torch.full_like(like.cost, torch.inf)),
         put(some.joints, like.joints),
     )

@@ -234,7 +234,7 @@ def seen_of(keypoints: Keypoints, rig: Rig, camera: Camera, config: FitConfig) -
         floor=None,
         triples=triples_of(keypoints, None, config),
         centre=resting(len(weight), pixels),
-        spread=spreads(pixels),
+        spread=spreads(len(weight), pixels),
         joints=None,
     )
 

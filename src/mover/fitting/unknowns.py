@@ -224,7 +224,7 @@ BEND = 0.3  # [rad]
 SCALES = {"turn": 0.2, "code": BEND, "place": (0.01, 0.01, 0.05), "betas": 1.0, "hands": 0.5,
           "face": 0.3, "floor": 0.03}  # fmt: skip
 """How far each usually moves: the solver works in these units."""
-BENDS = tuple(1 / math.hypot(1 / s, 1 / BEND) for s in spreads(torch.zeros(1)).tolist())
+BENDS = tuple(1 / math.hypot(1 / s, 1 / BEND) for s in spreads(1, torch.zeros(1))[0].tolist())
 """The same for angles, most of which people turn less than keypoints could tell."""
 
 Decode = Callable[[Float[Tensor, "bodies code"]], Float[Tensor, "bodies angles"]]
