@@ -145,18 +145,20 @@ def test_of_a_room_without_a_guess_the_axis_alone_is_priced():
     assert bed > 3 > chair > 1
 
 
-def test_shapes_are_held_to_firm_standards_of_classes_with_one_meaning() -> None:
-    kinds = ("bed", "chair", "desk", "table", "nightstand", "aquarium")
-    sizes = torch.tensor([[1.4, 0.5, 1.15]]).repeat(6, 1)
+def test_shapes_are_held_to_firm_standards_of_the_meaning_that_fits_their_size() -> None:
+    kinds = ("bed", "chair", "desk", "nightstand", "aquarium", "table", "table")
+    heights = torch.tensor([0.5, 0.5, 0.5, 0.5, 0.5, 0.65, 0.4])
+    sizes = torch.stack([torch.full((7,), 1.4), heights, torch.full((7,), 1.15)], -1)
     standard, precision = sizes_of_shapes(kinds, sizes)
-    for i, kind in enumerate(kinds):
+    meanings = (*kinds[:-1], "coffee table")  # COCO's dining table, as high as one
+    for i, kind in enumerate(meanings):
         for axis, usual in enumerate(STANDARD.get(kind, (None,) * 3)):
-            told = usual is not None and usual[1] <= FIRM and kind not in ("chair", "table")
+            told = usual is not None and usual[1] <= FIRM
             off = math.log(usual[0] / float(sizes[i, axis])) if told else 0.0
             assert float(standard[i, axis]) == pytest.approx(off, abs=1e-5)
             sharp = usual[1] ** -2 if told else 0.0
             assert float(precision[i, axis]) == pytest.approx(sharp, rel=1e-5)
-    assert (precision > 0).sum(1).tolist() == [1, 0, 1, 0, 0, 0]
+    assert (precision > 0).sum(1).tolist() == [1, 0, 1, 0, 0, 1, 0]
 
 
 def test_of_what_nobody_placed_sizes_cost_as_a_student_t_and_places_nothing() -> None:

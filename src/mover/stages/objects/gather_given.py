@@ -218,16 +218,19 @@ def _off_standard(
 def sizes_of_shapes(
     categories: Sequence[str], sizes: Float[Tensor, "items 3"]
 ) -> tuple[Float[Tensor, "items 3"], Float[Tensor, "items 3"]]:
-    """The same of shapes that may stand for things of a class.
+    """The same of shapes that may stand for things of a class: firm standards only.
 
-    Only of classes whose name has one meaning (a chair of COCO may be an armchair or a stool), and
-    only firm standards: of the rest the size of the shape itself says as much.
+    Of a class with several meanings (a dining table of COCO may be a desk or a coffee table) it is
+    that which the size of the shape fits; of what is not firm the shape itself says as much.
     """
-    wide = {canonical(name) for name in WIDE_CLASSES}
+    meanings = {canonical(name): names for name, names in WIDE_CLASSES.items()}
     known = [
-        [] if category in wide else [k for k in _off_standard(category, size) if k[2] <= FIRM]
+        _standard_of(meanings[category], size)
+        if category in meanings
+        else _off_standard(category, size)
         for category, size in zip(categories, sizes, strict=True)
     ]
+    known = [[row for row in rows if row[2] <= FIRM] for rows in known]
     return _in_tables(known, sizes)
 
 
