@@ -225,9 +225,10 @@ def begin(keypoints: Keypoints, seen: Seen, rig: Rig, camera: Camera, config: Fi
         best = _followed(tries, tracks, seen.up, config)
     best = best[nearest]
     at = _picked([one.at for one in tries], best, nearest)
-    root = torch.stack([one.root for one in tries])[best, nearest]
-    centre = torch.stack([one.centre for one in tries])[best, nearest]
-    spread = torch.stack([one.spread for one in tries])[best, nearest]
+    root, centre, spread = (
+        torch.stack([getattr(one, name) for one in tries])[best, nearest]
+        for name in ("root", "centre", "spread")
+    )
     return Begun(at, root, centre, spread)
 
 

@@ -178,6 +178,10 @@ def believed_sides(
     return torch.where(fits & cut & (sides != UNKNOWN), LEAST, sides)
 
 
+MEANINGS = {canonical(name): kinds for name, kinds in WIDE_CLASSES.items()}
+"""Of classes that detectors have one name for, the likeliest first."""
+
+
 def standard_sizes(
     objects: Objects,
 ) -> tuple[Float[Tensor, "objects 3"], Float[Tensor, "objects 3"]]:
@@ -186,9 +190,8 @@ def standard_sizes(
     Detectors call a coffee table a dining table. So of the classes that have one name the first
     counts whose standard the given size does not contradict, and none where all are contradicted.
     """
-    others = {canonical(name): kinds for name, kinds in WIDE_CLASSES.items()}
     known = [
-        _standard_of(tuple(dict.fromkeys((category, *others.get(category, ())))), size)
+        _standard_of(MEANINGS.get(category, (category,)), size)
         for category, size in zip(objects.categories, objects.size, strict=True)
     ]
     return _in_tables(known, objects.size)
@@ -223,10 +226,9 @@ def sizes_of_shapes(
     Of a class with several meanings (a dining table of COCO may be a desk or a coffee table) it is
     that which the size of the shape fits; of what is not firm the shape itself says as much.
     """
-    meanings = {canonical(name): names for name, names in WIDE_CLASSES.items()}
     known = [
-        _standard_of(meanings[category], size)
-        if category in meanings
+        _standard_of(MEANINGS[category], size)
+        if category in MEANINGS
         else _off_standard(category, size)
         for category, size in zip(categories, sizes, strict=True)
     ]
