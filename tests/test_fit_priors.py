@@ -12,17 +12,24 @@ from mover.bodies.skeleton import BODY
 from mover.bodies.skinning import open_body
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig
-from mover.fitting.energy import Seen, pose_price
+from mover.fitting.energy import UPPER, Seen, Weighed, geman_mcclure, held_price, pose_price
 from mover.fitting.ground import distances_of_who_lies, plane_of, sole_heights, soles_of
 from mover.fitting.limits import limit_price, limit_table, resting, spreads
+from mover.fitting.prior import same
 from mover.fitting.start import BACK, lying_guesses, upright_guesses
-from mover.fitting.tracks import ALONE, image_speed
+from mover.fitting.tracks import ALONE, joint_speed, triples_of
 from mover.geometry.rotations import axis_angle, rotation_vectors
 
 QUICK = FitConfig(
     start_steps=20,
     stages=(dataclasses.replace(STAGES[0], steps=25), dataclasses.replace(STAGES[1], steps=50)),
 )
+NONE, REST = torch.zeros(1, 1), resting(1, torch.zeros(1))
+NOTHING = Seen(
+    NONE[..., None].expand(1, 1, 2), NONE, torch.eye(3), 540, torch.tensor([0.0, -1, 0]), None,
+    ALONE, REST, spreads(1, REST), None,
+)  # fmt: skip
+"""Nothing is seen of one body."""
 
 
 @pytest.mark.parametrize("fps", [5.0, 30.0])
@@ -36,11 +43,17 @@ def test_the_speed_in_the_image_is_that_of_most_joints_whatever_the_frame_rate(f
     noisy = points + 2 * torch.randn(points.shape, generator=generator)
     there = torch.ones(len(frame), 17, dtype=torch.bool)
     there[:, 9] = False
-    speed = image_speed(keypoints_at(frame, fps, noisy), there)
+    speed = joint_speed(keypoints_at(frame, fps, noisy), there)
     assert torch.isinf(speed[[0, -1]]).all()
-    assert speed[(time > 0) & (time < 1.4)].max() < 12
-    walks = speed[(time > 2.6) & (time < 3.7)]
-    assert (walks - 60).abs().max() < 12
+    stands, walks = speed[(time > 0) & (time < 1.4)], speed[(time > 2.6) & (time < 3.7)]
+    assert stands[:, UPPER[:5]].max() < 12  # no keypoint shows the trunk
+    assert (walks[:, 0] - 60).abs().max() < 12
+    wrists = [BODY.index(f"{side}_wrist") for side in ("left", "right")]  # keypoints 9 and 10
+    assert torch.isinf(speed[:, wrists[0]]).all()
+    assert stands[:, wrists[1]].max() < 20
+    assert (speed >= speed[:, :1]).all()
+    feet = [BODY.index(f"left_{part}") for part in ("ankle", "foot")]
+    torch.testing.assert_close(speed[:, feet[0]], speed[:, feet[1]])
 
 
 @pytest.mark.slow
@@ -64,13 +77,34 @@ def test_a_body_along_the_view_does_not_jump_between_frames_that_look_alike():
     assert jumps[0] < 0.3 * jumps[1]
 
 
+def test_limbs_that_look_still_are_held_and_no_others():
+    row, time = torch.arange(5), torch.arange(5) / 5.0
+    joints = torch.randn(1, 22, 3, generator=torch.Generator().manual_seed(1)).expand(5, 22, 3)
+    slow = torch.zeros(5, 22)
+    fast = torch.full((5, 22), torch.inf)
+
+    def price(moved: torch.Tensor, speed: torch.Tensor) -> float:
+        triples = triples_of(keypoints_at(row, 5.0), speed, FitConfig())
+        by = Weighed(STAGES[1], FitConfig(), same, learned=False)
+        return float(held_price(moved, dataclasses.replace(NOTHING, triples=triples), by).sum())
+
+    steady = joints + time[:, None, None]
+    assert price(steady, slow) < 1e-6  # all of it moves evenly
+    leg, arm, whole = steady.clone(), steady.clone(), steady.clone()
+    leg[2, BODY.index("left_ankle")] += 0.1
+    arm[2, BODY.index("left_wrist"), 2] += 0.1
+    whole[2] += 0.1
+    assert price(leg, slow) < 1e-6
+    assert price(whole, slow) < 1e-6  # which is priced by `still_price`
+    second = torch.tensor([0.1, 0.2, 0.1]).square()
+    calm = FitConfig().jitter + FitConfig().calm / 25
+    wanted = geman_mcclure(second, FitConfig().sigma_held).sum() / calm**2
+    assert price(arm, slow) == pytest.approx(float(wanted), rel=1e-4)
+    assert price(arm, fast) < 0.02 * price(arm, slow)
+
+
 def test_an_ankle_that_levels_the_foot_costs_no_more_than_one_at_rest():
-    rest = resting(1, torch.zeros(1))
-    none = torch.zeros(1, 1)
-    looked = Seen(
-        none[..., None].expand(1, 1, 2), none, torch.eye(3), 540, torch.tensor([0.0, -1, 0]), None,
-        ALONE, rest, spreads(1, rest), None,
-    )  # fmt: skip
+    rest, looked = resting(1, torch.zeros(1)), NOTHING
     bent, level = rest.clone(), rest.clone()
     for joint, turn in (("left_hip", -0.7), ("left_knee", 1.0)):
         column = 3 * (BODY.index(joint) - 1)

@@ -29,7 +29,7 @@ from mover.fitting.tracks import (
     at_stage,
     chosen,
     confidence_of,
-    image_speed,
+    joint_speed,
     seen_at_all,
     seen_of,
     stages_of,
@@ -325,13 +325,13 @@ def _laid(
 
 def _speed(
     at: Unknowns, frame: Frame, keypoints: Keypoints, job: _Job
-) -> Float[Tensor, " rows"] | None:
-    """How fast bodies seem to move across the view [m/s]; None without a frame rate."""
+) -> Float[Tensor, "rows joints"] | None:
+    """How fast joints seem to move across the view [m/s]; None without a frame rate."""
     if keypoints.fps is None:
         return None
     there = confidence_of(keypoints, job.config) > 0
-    pixels = image_speed(keypoints, there).to(at.place)
-    return pixels * log_depth(at, frame).exp() / job.seen.K[0, 0]
+    pixels = joint_speed(keypoints, there).to(at.place)
+    return pixels * log_depth(at, frame).exp()[:, None] / job.seen.K[0, 0]
 
 
 # What was solved, as bodies.

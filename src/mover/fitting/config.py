@@ -88,6 +88,12 @@ class FitConfig:
     """Acceleration of a body whose picture stands still [m/s²],"""
     agility: Weight = 2.0
     """and what each m/s, across the view, adds to it [1/s]."""
+    held: Weight = 1.0
+    """Weight of the smoothness of trunk, head and arms about the pelvis, where they look still."""
+    sigma_held: Sigma = 0.25
+    """Geman-McClure's constant of it, in sizes of the body; or [m], see `by_size`."""
+    swing: Weight = 4.0
+    """What each m/s, across the view, adds to their acceleration: arms swing [1/s]."""
     jitter: Sigma = 0.004
     """Second difference that is free of charge at any frame rate [m]."""
     by_size: bool = True

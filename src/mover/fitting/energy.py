@@ -50,6 +50,9 @@ HIPS, KNEES, ANKLES = (
     [3 * (BODY.index(f"{side}_{joint}") - 1) for side in ("left", "right")]
     for joint in ("hip", "knee", "ankle")
 )  # their bending among the angles of the body
+LEGS = ("hip", "knee", "ankle", "foot")
+UPPER = [k for k, name in enumerate(BODY) if k and not name.endswith(LEGS)]
+"""Trunk, head and arms."""
 
 
 @record
@@ -61,8 +64,8 @@ class Triples:
     """Weight of the first in the straight line through first and last."""
     expected: Float[Tensor, " triples"]
     """Second difference that people make in that time [m]."""
-    whole: Float[Tensor, " triples"]
-    """That of the pelvis, which is less where the picture of the body stands still [m]."""
+    calm: Float[Tensor, "triples joints"]
+    """That of each joint, which is less where its picture stands still [m]."""
 
 
 @record
@@ -124,6 +127,7 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
         ("smooth_joints", smooth * solid, lambda: smooth_joint_price(joints, seen, by)),
         ("smooth_pixels", smooth * flat, lambda: smooth_pixel_price(pixels, seen, by)),
         ("still", smooth * by.config.still, lambda: still_price(joints, seen)),
+        ("held", smooth * by.config.held, lambda: held_price(joints, seen, by)),
     )
     room = room_terms(points, seen.room, by.stage)
     ground, prior = _ground_energy(points, at, frame, seen, by), _prior_energy(at, frame, seen, by)
@@ -275,8 +279,23 @@ def still_price(joints: Float[Tensor, "bodies joints 3"], seen: Seen) -> Float[T
     """
     triples = seen.triples
     second = second_difference(joints[:, :1], triples).square().sum((-1, -2))
-    price = second / triples.whole.square()
+    price = second / triples.calm[:, 0].square()
     return joints.new_zeros(len(joints)).index_add(0, triples.rows[:, 1], price)
+
+
+def held_price(
+    joints: Float[Tensor, "bodies joints 3"], seen: Seen, by: Weighed
+) -> Float[Tensor, " bodies"]:
+    """Robust squared second differences of trunk, head and arms about the pelvis, as `still_price`.
+
+    Where an arm is in depth single frames tell badly, too. Not of legs: a foot that stands still
+    belongs to a body that walks on.
+    """
+    triples = seen.triples
+    about = joints[:, UPPER] - joints[:, :1]
+    second = second_difference(about, triples).square().sum(-1)
+    price = geman_mcclure(second, by.config.sigma_held) / triples.calm[:, UPPER].square()
+    return joints.new_zeros(len(joints)).index_add(0, triples.rows[:, 1], price.sum(-1))
 
 
 def smooth_pixel_price(

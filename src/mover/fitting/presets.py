@@ -15,6 +15,7 @@ PAPER = FitConfig(
     smooth_joints=1e2,
     smooth_pixels=1e-2,
     still=0.0,
+    held=0.0,
     stands=0.0,
     lies=0.0,
     acceleration=0.0,

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS
+from mover.bodies.skeleton import BODY, PARENTS
 from mover.core.errors import InputError
 from mover.core.records import record, rows_of
 from mover.core.types import Camera, Keypoints
@@ -17,7 +18,9 @@ from mover.fitting.unknowns import Rig
 
 HALF = 0.5  # [s], over which motion in the image is measured, on either side
 MARGIN = 20  # rows of its neighbours that a stretch solves as well, at most
-ALONE = Triples(torch.zeros(0, 3, dtype=torch.long), torch.zeros(0), torch.zeros(0), torch.zeros(0))
+ALONE = Triples(
+    torch.zeros(0, 3, dtype=torch.long), torch.zeros(0), torch.zeros(0), torch.zeros(0, len(BODY))
+)
 """Nobody has neighbours in time."""
 
 
@@ -68,13 +71,13 @@ def tracks_of(
 
 
 def triples_of(
-    keypoints: Keypoints, speed: Float[Tensor, " rows"] | None, config: FitConfig
+    keypoints: Keypoints, speed: Float[Tensor, "rows joints"] | None, config: FitConfig
 ) -> Triples:
     """Neighbours in time of each person; none of unordered images and across long gaps.
 
     Args:
         keypoints: Their rows.
-        speed: How fast each body seems to move [m/s]; None: not known.
+        speed: How fast the joints of each body seem to move [m/s]; None: not known.
         config: How much people accelerate.
     """
     if keypoints.fps is None:
@@ -89,24 +92,45 @@ def triples_of(
     triples, before, after = triples[near], before[near], after[near]
     share = (after / (before + after)).float()
     expected = config.jitter + config.acceleration * before * after
-    whole = expected
+    calm = expected[:, None].expand(-1, len(BODY))
     if speed is not None:
-        most = (config.calm + config.agility * speed.double()).clamp_max(config.acceleration)
-        whole = config.jitter + most[triples[:, 1]] * before * after
-    return Triples(triples, share, expected.float(), whole.float())
+        factor = torch.tensor([config.agility, *[config.swing] * (len(BODY) - 1)])
+        most = (config.calm + factor * speed.double()).clamp_max(config.acceleration)
+        calm = config.jitter + most[triples[:, 1]] * (before * after)[:, None]
+    return Triples(triples, share, expected.float(), calm.float())
 
 
-def image_speed(keypoints: Keypoints, there: Bool[Tensor, "rows layout"]) -> Float[Tensor, " rows"]:
-    """How fast the keypoints of each row move in the image, the median of them [px/s].
+def joint_speed(
+    keypoints: Keypoints, there: Bool[Tensor, "rows layout"]
+) -> Float[Tensor, "rows joints"]:
+    """How fast each joint moves in the image, not less than most keypoints do [px/s].
 
-    Between the means of half a second before and after; infinite at the ends of a track.
+    The pelvis moves as most keypoints, joints that the layout lacks as their parents do. Infinite
+    where a joint is not seen and at the ends of a track.
+    """
+    each, names = image_speed(keypoints, there), LAYOUTS[keypoints.layout]
+    most = each.nanmedian(1).values.nan_to_num(torch.inf)
+    found = [most]
+    for joint, parent in zip(BODY[1:], PARENTS[1:], strict=False):
+        known = joint in names
+        own = each[:, names.index(joint)].nan_to_num(torch.inf) if known else found[parent]
+        found.append(torch.maximum(own, most))
+    return torch.stack(found, 1)
+
+
+def image_speed(
+    keypoints: Keypoints, there: Bool[Tensor, "rows layout"]
+) -> Float[Tensor, "rows layout"]:
+    """How fast each keypoint moves in the image [px/s].
+
+    Between the means of half a second before and after; NaN where it is not seen in one of them.
 
     Args:
         keypoints: With a frame rate.
         there: Which of them count.
     """
     assert keypoints.fps is not None
-    speed = torch.full((len(keypoints.frame),), torch.inf)
+    speed = torch.full(there.shape, torch.nan)
     ones = there[..., None].to(keypoints.points)
     known = torch.where(there[..., None], keypoints.points, torch.zeros_like(keypoints.points))
     for rows in tracks_of(keypoints.frame, keypoints.person):
@@ -115,8 +139,7 @@ def image_speed(keypoints: Keypoints, there: Bool[Tensor, "rows layout"]) -> Flo
         values = torch.cat([known[rows], clock[..., :1], ones[rows]], -1)
         past, coming = (_half(values, time, side) for side in (1, -1))
         gone = coming[..., :3] / coming[..., 3:] - past[..., :3] / past[..., 3:]
-        speeds = gone[..., :2].norm(dim=-1) / gone[..., 2]
-        speed[rows] = speeds.nanmedian(1).values.nan_to_num(torch.inf)
+        speed[rows] = gone[..., :2].norm(dim=-1) / gone[..., 2]
     return speed
 
 
