@@ -261,6 +261,13 @@ def second_difference(
     return 2 * (share * before + (1 - share) * after - now)
 
 
+def _of_rows(
+    price: Float[Tensor, " triples"], triples: Triples, rows: int
+) -> Float[Tensor, " bodies"]:
+    """What triples cost, each at its middle row."""
+    return price.new_zeros(rows).index_add(0, triples.rows[:, 1], price)
+
+
 def smooth_joint_price(
     joints: Float[Tensor, "bodies joints 3"], seen: Seen, by: Weighed
 ) -> Float[Tensor, " bodies"]:
@@ -268,7 +275,7 @@ def smooth_joint_price(
     triples = seen.triples
     second = second_difference(joints[:, :22], triples).square().sum(-1)
     price = geman_mcclure(second, by.config.sigma_joints).sum(-1) / triples.expected.square()
-    return joints.new_zeros(len(joints)).index_add(0, triples.rows[:, 1], price)
+    return _of_rows(price, triples, len(joints))
 
 
 def still_price(joints: Float[Tensor, "bodies joints 3"], seen: Seen) -> Float[Tensor, " bodies"]:
@@ -279,8 +286,7 @@ def still_price(joints: Float[Tensor, "bodies joints 3"], seen: Seen) -> Float[T
     """
     triples = seen.triples
     second = second_difference(joints[:, :1], triples).square().sum((-1, -2))
-    price = second / triples.calm[:, 0].square()
-    return joints.new_zeros(len(joints)).index_add(0, triples.rows[:, 1], price)
+    return _of_rows(second / triples.calm[:, 0].square(), triples, len(joints))
 
 
 def held_price(
@@ -295,14 +301,14 @@ def held_price(
     about = joints[:, UPPER] - joints[:, :1]
     second = second_difference(about, triples).square().sum(-1)
     price = geman_mcclure(second, by.config.sigma_held) / triples.calm[:, UPPER].square()
-    return joints.new_zeros(len(joints)).index_add(0, triples.rows[:, 1], price.sum(-1))
+    return _of_rows(price.sum(-1), triples, len(joints))
 
 
 def smooth_pixel_price(
     pixels: Float[Tensor, "bodies keypoints 2"], seen: Seen, by: Weighed
 ) -> Float[Tensor, " bodies"]:
     """Robust squared second differences of projections where the middle one is seen [px²]."""
-    middle = seen.triples.rows[:, 1]
-    second = second_difference(pixels, seen.triples).square().sum(-1)
-    price = geman_mcclure(second, by.config.sigma_pixels) * seen.weight[middle].square()
-    return pixels.new_zeros(len(pixels)).index_add(0, middle, price.sum(-1))
+    triples = seen.triples
+    second = second_difference(pixels, triples).square().sum(-1)
+    price = geman_mcclure(second, by.config.sigma_pixels) * seen.weight[triples.rows[:, 1]].square()
+    return _of_rows(price.sum(-1), triples, len(pixels))

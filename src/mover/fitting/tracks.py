@@ -111,7 +111,7 @@ def joint_speed(
     each, names = image_speed(keypoints, there), LAYOUTS[keypoints.layout]
     most = each.nanmedian(1).values.nan_to_num(torch.inf)
     found = [most]
-    for joint, parent in zip(BODY[1:], PARENTS[1:], strict=False):
+    for joint, parent in zip(BODY[1:], PARENTS[1 : len(BODY)], strict=True):
         known = joint in names
         own = each[:, names.index(joint)].nan_to_num(torch.inf) if known else found[parent]
         found.append(torch.maximum(own, most))
