@@ -30,7 +30,7 @@ from mover.core.errors import InputError
 from mover.core.run import Run
 from mover.core.types import Bodies, BodyPose, Scene, SceneObject, Segment
 from mover.geometry.placement import place_object, placed_at
-from mover.io.export.amass import export_bodies
+from mover.io.export.amass import export_amass
 from mover.io.export.finished import Finished, read_finished
 from mover.io.export.glb import export_glb
 from mover.io.export.people import keyframes
@@ -214,7 +214,7 @@ def test_parameters_of_the_capture_move_bodies_that_were_turned_and_sized(tmp_pa
     k, t = rows(result, 1)[3]
     miss = np.linalg.norm(glb.skinned("person_1_body", t) - result.verts[k].numpy(), axis=1)
     assert miss.max() < 0.006
-    arrays = np.load(export_bodies(home, tmp_path).files[1])
+    arrays = np.load(export_amass(home, tmp_path).files[1])
     assert arrays["size"] == pytest.approx(1.03, abs=1e-4)
     assert turn.shape == (3, 3)
 
@@ -404,7 +404,7 @@ def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path: Path):
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_the_parameters_give_the_bodies_back(tmp_path: Path, up: str):
     bodies = two_people()
-    found = export_bodies(finished(tmp_path, bodies), tmp_path, up)
+    found = export_amass(finished(tmp_path, bodies), tmp_path, up)
     for person, file in enumerate(found.files):
         arrays = np.load(file)
         angles = torch.from_numpy(arrays["poses"])
@@ -428,7 +428,7 @@ def test_the_parameters_give_the_bodies_back(tmp_path: Path, up: str):
 def test_bodies_without_parameters_are_refused_with_the_way_out(tmp_path: Path):
     home = finished(tmp_path, walkers(3))
     with pytest.raises(InputError, match="--capture"):
-        export_bodies(home, tmp_path)
+        export_amass(home, tmp_path)
 
 
 def test_single_objects_stand_in_the_world_in_both_formats(tmp_path: Path):
@@ -449,9 +449,9 @@ def test_single_objects_stand_in_the_world_in_both_formats(tmp_path: Path):
 
 def test_the_command_writes_what_is_asked_for(tmp_path: Path, capsys):
     out = write_out(tmp_path / "out", furnished(("chair",)), bodies_of(moving_pose(3)))
-    assert run_command("export", [str(out), "--to", "glb", "ply", "bodies"]) == 0
+    assert run_command("export", [str(out), "--to", "glb", "ply", "amass"]) == 0
     names = {p.name for p in (out / "export").rglob("*") if p.is_file()}
-    assert {"scene.glb", "chair_0.ply", "chair_0.obj", "bodies_0.npz"} <= names
+    assert {"scene.glb", "chair_0.ply", "chair_0.obj", "amass_0.npz"} <= names
     assert "on bones" in capsys.readouterr().out
 
 
@@ -468,7 +468,7 @@ def test_without_usd_core_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch)
 
 def test_a_second_export_gives_the_same_bytes(tmp_path: Path):
     home = finished(tmp_path, two_people(5))
-    for name in ("glb", "ply", "bodies"):
+    for name in ("glb", "ply", "amass"):
         one = chosen("--to", name, "export")(home, tmp_path / "a").files
         two = chosen("--to", name, "export")(home, tmp_path / "b").files
         assert [f.read_bytes() for f in one] == [f.read_bytes() for f in two]

@@ -17,7 +17,6 @@ from mover.io.export.finished import Finished
 from mover.io.export.looks import looks_of
 from mover.io.export.mjcf import export_mjcf
 from mover.io.export.solids import AXES, floor_height
-from mover.io.export.urdf import export_urdf
 
 SIDE = 4  # [px] of the picture, no two pixels alike
 PICTURE = np.arange(3 * SIDE * SIDE, dtype=np.uint8).reshape(SIDE, SIDE, 3) * 5
@@ -110,26 +109,6 @@ def test_mujoco_shows_every_corner_in_its_colour(tmp_path: Path, kind: str, mode
         for v, t in zip(face, across, strict=True)
     }
     assert near(found, truth(shape, piece, floor_height(home.scene)))
-
-
-def test_readers_of_urdf_find_the_material_and_its_picture(tmp_path: Path):
-    """As yourdfpy, PyBullet and assimp do: OBJ, its MTL, and the picture that this names."""
-    shape = textured("glb")
-    shape.export(tmp_path / "box.glb")
-    home, (piece,) = finished(tmp_path, tmp_path / "box.glb")
-    file = export_urdf(home, tmp_path).files[1]
-    tree = ElementTree.parse(file).getroot()
-    (mesh,) = tree.findall("link/visual/geometry/mesh")
-    (texture,) = tree.findall("link/visual/material/texture")
-    loaded = trimesh.load_mesh(file.parent / mesh.attrib["filename"], process=False)
-    picture = np.asarray(loaded.visual.material.image.convert("RGB"))
-    named = Image.open(file.parent / texture.attrib["filename"])
-    assert np.array_equal(picture, np.asarray(named))
-    rows = zip(np.asarray(loaded.vertices), np.asarray(loaded.visual.uv), strict=True)
-    assert near({corner(p, uv, picture) for p, uv in rows}, truth(shape, piece, None))
-    collision = [m.attrib["filename"] for m in tree.findall("link/collision/geometry/mesh")]
-    assert {Path(name).parent.name for name in collision} == {"collision"}
-    assert Path(mesh.attrib["filename"]).parent.name == "visual"
 
 
 def test_parts_keep_their_colours_and_equal_pictures_are_written_once(tmp_path: Path):

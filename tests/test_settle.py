@@ -5,7 +5,6 @@ import json
 import math
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -30,7 +29,6 @@ from mover.io.capture.scene_file import write_scene
 from mover.io.export.finished import read_finished
 from mover.io.export.mjcf import export_mjcf
 from mover.io.export.solids import DENSITY, ConvexConfig, ConvexInputs, cut_into_convex, solids_of
-from mover.io.export.urdf import export_urdf
 from mover.io.files.meshes import write_mesh
 
 BOXES = ("chair", "table")
@@ -175,31 +173,6 @@ def corners(model: Any, data: Any, geom: int) -> tuple[np.ndarray, int]:
     turn = np.array(data.geom_xmat[geom]).reshape(3, 3)
     verts = np.array(model.mesh_vert[start : start + count]) @ turn.T + data.geom_xpos[geom]
     return verts, int(model.geom_group[geom])
-
-
-@needs_mujoco
-def test_mujoco_reads_the_urdf_with_everything_in_place(tmp_path: Path):
-    import mujoco
-
-    home = read_finished(write_out(tmp_path / "out", furnished(BOXES)))
-    files = export_urdf(home, tmp_path).files
-    assert [f.name for f in files] == ["room.urdf", "chair_0.urdf", "table_0.urdf"]
-    model = mujoco.MjModel.from_xml_path(str(files[0]))
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    every = [corners(model, data, g)[0] for g in range(model.ngeom) if model.geom_dataid[g] >= 0]
-    flat = np.concatenate(every)
-    x, y, z = np.concatenate([place_object(p).verts.numpy() for p in home.scene.objects]).T
-    truth = np.stack([x, -z, y - GROUND], -1)
-    assert flat.min(0) == pytest.approx(truth.min(0), abs=2e-3)
-    assert flat.max(0) == pytest.approx(truth.max(0), abs=2e-3)
-    single = mujoco.MjModel.from_xml_path(str(files[1]))
-    tree = ElementTree.parse(files[1]).getroot()
-    assert tree.tag == "robot"
-    assert single.ngeom == len(tree.findall("link/visual")) + len(tree.findall("link/collision"))
-    mass = tree.find("link/inertial/mass")
-    assert mass is not None
-    assert 2 < float(mass.attrib["value"]) < 20
 
 
 @needs_mujoco

@@ -123,13 +123,9 @@ FORMATS = (
     Format("export", "glb", "the room with moving people, one file", "export.glb:export_glb"),
     Format("export", "usd", "the same as binary USD", "export.usd:export_usd"),
     Format("export", "mjcf", "a world of MuJoCo", "export.mjcf:export_mjcf"),
-    Format("export", "urdf", "each object and the whole room", "export.urdf:export_urdf"),
     Format("export", "ply", "each object by itself", "export.scene_glb:export_objects"),
-    Format("export", "amass", "people as AMASS' SMPL-X files", "export.humanoid:export_amass"),
-    Format("export", "gmr", "people for GMR", "export.humanoid:export_gmr"),
-    Format("export", "holosoma", "joints and a climb", "export.humanoid:export_holosoma"),
     Format("export", "contacts", "labels of contact", "export.contacts:export_contacts"),
-    Format("export", "bodies", "people's own frames, AMASS' names", "export.amass:export_bodies"),
+    Format("export", "amass", "people with the keys of AMASS", "export.amass:export_amass"),
 )  # fmt: skip
 """Names are unique within `capture`, `people`, `cameras`, `keypoints`, `export`, and `IMPORTED`."""
 

@@ -81,7 +81,7 @@ COMMANDS = {
     ),
     "export": (
         "mover.app.cli.results:export",
-        "Write a result for other programs: GLB, USD, MJCF, URDF, PLY, bodies.",
+        "Write a result for other programs: GLB, USD, MJCF, PLY, AMASS, contacts.",
     ),
     "render": (
         "mover.app.cli.results:render",

@@ -90,10 +90,10 @@ class ExportArgs:
     """glb, usd: how people move: on bones, by exact shapes of some frames, or not at all (also
     mjcf)."""
     walls: Literal["none", "guess"] = "none"
-    """usd, mjcf, urdf: guess walls from a layout that was given (Total3D), else from what stands
+    """usd, mjcf: guess walls from a layout that was given (Total3D), else from what stands
     along them; they are marked as guessed."""
     up: Literal["y", "z"] = "y"
-    """bodies, usd, contacts: y is the world of scene.json, z that of AMASS and of simulators."""
+    """amass, usd, contacts: y is the world of scene.json, z that of AMASS and of simulators."""
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,9 @@ def export(arguments: Sequence[str]) -> None:
     finished, folder = read_finished(args.out, args.capture, args.stable), args.out / "export"
     if finished.walls is not None and args.walls == "none":
         say("pieces were nudged along guessed walls; --walls guess writes these")
-    options = {"glb": {"body": args.body}, "bodies": {"up": args.up}, "contacts": {"up": args.up}}
+    options = {"glb": {"body": args.body}, "amass": {"up": args.up}, "contacts": {"up": args.up}}
     room = {"body": args.body, "walls": args.walls}
-    options |= {"usd": {**room, "up": args.up}, "mjcf": room, "urdf": {"walls": args.walls}}
+    options |= {"usd": {**room, "up": args.up}, "mjcf": room}
     for target, write in writers.items():
         found: Exported = write(finished, folder, **options.get(target, {}))
         shown = found.files if len(found.files) <= 3 else found.files[:1]

@@ -26,8 +26,8 @@ WIDTHS = {"smpl": 72, "smplh": 156, "smplx": 165, "makehuman": 165}
 """Angles of `poses` for each model."""
 
 
-def export_bodies(finished: Finished, folder: Path, up: Up = "y") -> Exported:
-    """Write `bodies_<person>.npz` with the keys of AMASS.
+def export_amass(finished: Finished, folder: Path, up: Up = "y") -> Exported:
+    """Write `amass_<person>.npz` with the keys of AMASS.
 
     Args:
         finished: The result.
@@ -39,12 +39,12 @@ def export_bodies(finished: Finished, folder: Path, up: Up = "y") -> Exported:
     """
     motion = motion_of(finished)
     if isinstance(motion, str):
-        raise InputError(f"--to bodies: {motion}")
+        raise InputError(f"--to amass: {motion}")
     assert finished.bodies is not None
     bodies, files = finished.bodies, list[Path]()
     moved = motion if up == "y" else upright(motion)
     for track in tracks_of(bodies):
-        path = folder / f"bodies_{track.person}.npz"
+        path = folder / f"amass_{track.person}.npz"
         write_npz({**_arrays(moved, track, bodies), "up_axis": np.array(up)}, path)
         files.append(path)
     return Exported(tuple(files), tuple(_notes(motion, bodies)))
