@@ -32,7 +32,7 @@ def test_help_names_every_command_and_imports_nothing_heavy():
         "assert not heavy, heavy"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    for name in ("demo", "check", "run", "evaluate", "experiment", "export", "simulate", "batch"):
+    for name in ("demo", "check", "run", "evaluate", "experiment", "export", "batch"):
         assert f"  {name} " in found.stdout
 
 

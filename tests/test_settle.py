@@ -1,7 +1,6 @@
 """Physics: convex pieces fill the furniture, simulators read it, gravity tells what is wrong."""
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,6 @@ from little_room import GROUND, box, camera, mesh_of, piece
 
 import mover.evaluate.stability
 import mover.io.export.solids
-from mover.app.cli import run_command
-from mover.app.simulate import simulation_table
 from mover.core.errors import InputError
 from mover.core.run import Run
 from mover.core.types import Mesh, Scene
@@ -25,7 +22,6 @@ from mover.furniture.library import PIECES, canonical, make_piece
 from mover.geometry.placement import place_object
 from mover.geometry.topology import is_closed
 from mover.geometry.watertight import close_mesh
-from mover.io.capture.scene_file import write_scene
 from mover.io.export.finished import read_finished
 from mover.io.export.mjcf import export_mjcf
 from mover.io.export.solids import DENSITY, ConvexConfig, ConvexInputs, cut_into_convex, solids_of
@@ -228,35 +224,6 @@ def test_what_stands_on_a_table_stays_on_it(tmp_path: Path):
 def test_a_scene_whose_floor_nobody_knows_stands_on_its_lowest_point(tmp_path: Path):
     scene = dataclasses.replace(furnished(BOXES), ground=None)
     assert max(found.moved for found in simulate(scene, Run(tmp_path))) < 0.001
-
-
-@needs_mujoco
-def test_the_command_compares_initial_and_result(tmp_path: Path, capsys):
-    out = write_out(tmp_path / "out", alone(box(0.6, 0.5, 0.6)))
-    write_scene(alone(box(0.6, 0.5, 0.6), lift=0.1), out / "initial.json")
-    assert run_command("simulate", [str(out)]) == 0
-    text = capsys.readouterr().out
-    assert "initial: 0 of 1 stay (< 1 cm, < 1 deg), 0 fell over; median 100 mm" in text
-    assert "result: 1 of 1 stay (< 1 cm, < 1 deg), 0 fell over; median 0 mm" in text
-    tree = json.loads((out / "settle.json").read_text())
-    assert tree["scenes"]["initial"][0]["fell"] == pytest.approx(0.1, abs=0.002)
-    assert tree["scenes"]["result"][0]["toppled"] is False
-
-
-def test_in_the_table_the_longest_words_stay_apart():
-    far = SimulatedObject(
-        "nightstand_0", "nightstand", 12.3456, 0.0, math.radians(127), 1.5, 0.287, 9.0, False
-    )
-    held = dataclasses.replace(far, id="lamp_0", fixed=True)
-    lines = simulation_table({"initial": [far, held], "result": [held]}).splitlines()
-    assert lines[2].split() == [
-        "nightstand_0", "12346", "mm", "127", "deg", "287", "mm", "fell", "over", "-",
-    ]  # fmt: skip
-    assert lines[3].split() == ["lamp_0", "held", "held"]
-    starts = [
-        line.rfind(word) for line, word in zip(lines[1:4], ("moved", "-", "held"), strict=True)
-    ]
-    assert len(set(starts)) == 1
 
 
 def test_without_mujoco_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):

@@ -4,20 +4,16 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 import trimesh
-from furnished import bodies_of, furnished, write_out
+from furnished import write_out
 from little_room import GROUND, box, camera, mesh_of, piece
 
 import mover.evaluate.stability
 from mover.app.cli import run_command
-from mover.app.free_places import Ranges, apart
-from mover.app.simulate import nudged
 from mover.bodies.skin import PARTS
-from mover.bodies.skinning import open_body, zero_pose
 from mover.core.contact_labels import ContactLabels
 from mover.core.run import Run
 from mover.core.types import Scene
@@ -30,9 +26,8 @@ from mover.evaluate.stability import (
     loads_of,
     simulate,
 )
-from mover.io.capture.scene_file import read_scene, write_scene
+from mover.io.capture.scene_file import write_scene
 from mover.io.export.contacts import write_labels
-from mover.io.export.finished import read_finished
 
 needs_mujoco = pytest.mark.skipif(
     not mover.evaluate.stability.find_spec("mujoco"), reason="needs the extra physics"
@@ -111,137 +106,6 @@ def test_what_moves_a_centimetre_or_turns_a_degree_does_not_stay():
         {"turned_loaded": math.radians(1.1)},
     ):  # fmt: skip
         assert not dataclasses.replace(row, **change).stays
-
-
-def floating(lift: float, **where: tuple[float, float]) -> tuple[Scene, Ranges]:
-    """A box over the floor, and what is stated of its place."""
-    scene = Scene(
-        camera(), GROUND, (piece("box_0", box(0.6, 0.5, 0.6), (0, -3), 0.0, GROUND + lift),)
-    )
-    here = {"x": 0.0, "y": GROUND + lift, "z": -3.0, "yaw": 0.0}
-    return scene, {"box_0": {k: (v - 0.03, v + 0.03) for k, v in here.items()} | where}
-
-
-@needs_mujoco
-def test_a_piece_that_floats_within_its_range_comes_down_and_stays(tmp_path: Path):
-    scene, ranges = floating(0.02)
-    steady, rows, (nudge,) = nudged(scene, Run(tmp_path), ranges)
-    assert nudge.done
-    assert nudge.moved == pytest.approx(0.02, abs=0.002)
-    assert rows[0].stays
-    assert float(steady.objects[0].t_world_object[1]) == pytest.approx(GROUND, abs=0.002)
-
-
-@needs_mujoco
-def test_a_piece_that_floats_beyond_its_range_is_left_and_it_is_said(tmp_path: Path):
-    scene, ranges = floating(0.2)
-    steady, _, (nudge,) = nudged(scene, Run(tmp_path), ranges)
-    assert not nudge.done
-    assert "y would change by -0.2" in nudge.reason
-    assert steady is scene
-    _, _, (unknown,) = nudged(scene, Run(tmp_path), {})
-    assert unknown.reason == "its uncertainty is not stated"
-
-
-@needs_mujoco
-def test_a_piece_that_falls_over_is_left(tmp_path: Path):
-    scene = bench()
-    (given,) = scene.objects
-    verts = given.mesh.verts + torch.tensor([0.9, 0.0, 0.0]) * (given.mesh.verts[:, 1:2] > 0.39)
-    leaning = dataclasses.replace(given, mesh=dataclasses.replace(given.mesh, verts=verts))
-    wide: Any = dict.fromkeys(("x", "y", "z", "yaw"), (-9.0, 9.0))
-    _, _, (nudge,) = nudged(
-        dataclasses.replace(scene, objects=(leaning,)), Run(tmp_path), {"bench_0": wide}
-    )
-    assert nudge.reason == "it falls over"
-
-
-def wedged(sure: float, unsure: float) -> tuple[Scene, Ranges]:
-    """A tall box and a low one stand in each other by 6 cm, askew so that they are thrown over."""
-    tall = piece("tall_0", box(0.4, 1.2, 0.4), (0, -3), 0.0, GROUND)
-    low = piece("low_0", box(0.6, 0.5, 0.6), (0.44, -3.1), 0.2, GROUND)
-    scene = Scene(camera(), GROUND, (tall, low))
-    ranges: Ranges = {}
-    for given, wide in ((tall, sure), (low, unsure)):
-        x, y, z = given.t_world_object.tolist()
-        here = {"x": x, "y": y, "z": z, "yaw": float(given.yaw)}
-        ranges[given.id] = {k: (v - wide, v + wide) for k, v in here.items()}
-    return scene, ranges
-
-
-@needs_mujoco
-def test_what_stands_in_each_other_comes_apart_the_least_certain_first(tmp_path: Path):
-    scene, ranges = wedged(0.02, 0.2)
-    assert not any(row.stays for row in simulate(scene, Run(tmp_path)))
-    clear = apart(scene, Run(tmp_path), ranges, {"tall_0"})
-    (still, _), (before, after) = scene.objects, (scene.objects[1], clear.objects[1])
-    assert torch.equal(clear.objects[0].t_world_object, still.t_world_object)
-    step = after.t_world_object - before.t_world_object
-    assert 0.05 < float(step.norm()) < 0.12
-    assert float(step[1]) == 0
-    assert all(row.stays and row.stuck < 0.003 for row in simulate(clear, Run(tmp_path)))
-
-
-@needs_mujoco
-def test_each_makes_as_much_room_as_its_range_allows(tmp_path: Path):
-    scene, ranges = wedged(0.06, 0.061)
-    steady, rows, nudges = nudged(scene, Run(tmp_path), ranges)
-    assert all(row.stays for row in rows)
-    assert {nudge.id for nudge in nudges} == {"tall_0", "low_0"}
-    for given, found in zip(scene.objects, steady.objects, strict=True):
-        away = (found.t_world_object - given.t_world_object).abs()
-        assert float(away.max()) < 0.0611
-    narrow = {name: dict.fromkeys(("x", "y", "z", "yaw"), (-9.0, -8.9)) for name in ranges}
-    left, rows, nudges = nudged(scene, Run(tmp_path), narrow)
-    assert left is scene
-    assert not any(nudge.done for nudge in nudges)
-
-
-@needs_mujoco
-def test_what_carries_others_is_not_moved_from_under_them(tmp_path: Path):
-    scene, ranges = wedged(0.02, 0.2)
-    carried = piece("cup_0", box(0.1, 0.1, 0.1), (0.5, -3.1), 0.0, GROUND + 0.5)
-    cup = dataclasses.replace(carried, support="low_0")
-    both = dataclasses.replace(scene, objects=(*scene.objects, cup))
-    clear = apart(both, Run(tmp_path), ranges, {"tall_0"})
-    assert torch.equal(clear.objects[1].t_world_object, both.objects[1].t_world_object)
-
-
-@needs_mujoco
-def test_ranges_speak_of_the_underside_wherever_the_mesh_has_its_origin(tmp_path: Path):
-    scene, ranges = floating(0.02)
-    (given,) = scene.objects
-    shift = torch.tensor([0.5, -0.25, 0.1])
-    mesh = dataclasses.replace(given.mesh, verts=given.mesh.verts - shift)
-    place = given.t_world_object + shift
-    moved = dataclasses.replace(given, mesh=mesh, t_world_object=place)
-    _, rows, (nudge,) = nudged(dataclasses.replace(scene, objects=(moved,)), Run(tmp_path), ranges)
-    assert nudge.done, nudge.reason
-    assert rows[0].stays
-
-
-@needs_mujoco
-def test_the_command_writes_a_scene_that_stays_and_exports_take_it(tmp_path: Path, capsys):
-    scene, ranges = floating(0.02)
-    bodies = bodies_of(zero_pose(2, open_body()))
-    out = write_out(tmp_path / "out", scene, bodies)
-    tree = json.loads((out / "scene.json").read_text())
-    tree["objects"][0]["uncertainty"] = {"level": 0.9, "ranges": ranges["box_0"]}
-    (out / "scene.json").write_text(json.dumps(tree))
-    assert run_command("simulate", [str(out), "--nudge"]) == 0
-    said = capsys.readouterr().out
-    assert "box_0: nudged by 20 mm" in said
-    assert "stable: 1 of 1 stay" in said
-    assert float(read_scene(out / "scene.json").objects[0].t_world_object[1]) > GROUND + 0.019
-    steady = read_finished(out, None, stable=True).scene
-    assert float(steady.objects[0].t_world_object[1]) == pytest.approx(GROUND, abs=0.002)
-    assert run_command("export", [str(out), "--to", "mjcf", "--stable"]) == 0
-
-
-def test_an_export_of_a_scene_that_nobody_made_is_refused(tmp_path: Path, capsys):
-    out = write_out(tmp_path / "out", furnished(("table",)))
-    assert run_command("export", [str(out), "--to", "ply", "--stable"]) == 2
-    assert "mover simulate OUT --nudge" in capsys.readouterr().err
 
 
 @needs_mujoco

@@ -14,7 +14,7 @@ TURNED = math.radians(45)  # [rad], a yaw error from which on an object is turne
 SEATS = ("chair", "armchair", "office chair", "sofa", "couch")  # pieces with a front and a back
 PLACING = ("place_objects", "find_image_cues", "refine_camera")  # stages that optimise
 TRAITS = ("category", "touched", "hidden", "truncated", "flipped", "stays")
-MEASURED = (*STAGES, "nudged", "true_room", "truth")  # scenes of a job that have metrics
+MEASURED = (*STAGES, "true_room", "truth")  # scenes of a job that have metrics
 SPENT = ("optimisation", "everything else")  # [s] of all stages
 LENGTH = ("frames", "seconds", "interactions")  # of what a job was given
 

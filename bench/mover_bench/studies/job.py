@@ -20,14 +20,12 @@ from torch import Tensor
 from mover import __version__
 from mover.app.batch.runner import write_tree
 from mover.app.results import labels_of
-from mover.app.simulate import nudged, ranges_in
 from mover.core import records
 from mover.core.explanation import Facts
 from mover.core.observe import Observer, silent
 from mover.core.run import Run, sources
 from mover.core.types import Bodies, Room, Scene
 from mover.evaluate.evaluation import EvaluateConfig
-from mover.evaluate.explanation import scene_fields
 from mover.evaluate.stability import SimulatedObject, loads_in, simulate
 from mover.furniture.library import SEATS
 from mover.pipeline.reconstruct import Config, reconstruct
@@ -288,22 +286,18 @@ if __name__ == "__main__":
 
 
 def measure_stability(truth: Scene, room: Room, run: Run) -> dict[str, Any]:
-    """Let gravity act on the initial scene, the result, the result nudged, and the truth.
+    """Let gravity act on the initial scene, the result, and the truth.
 
     Who sits in the result sits on the same place of each piece in all of them.
     """
     people = room.bodies
     loads = () if people is None else loads_in(labels_of(room, run), room.scene, people.fps)
-    ranges = ranges_in(scene_fields(room.explanations))
-    steady, _, nudges = nudged(room.scene, run, ranges, None, loads)
     scenes = {"initial": room.initial, "image": room.image_only, "full": room.scene,
-              "nudged": steady, "truth": truth}  # fmt: skip
+              "truth": truth}  # fmt: skip
     found = {name: simulate(scene, run, None, loads) for name, scene in scenes.items()}
-    said = {nudge.id: nudge.reason or "nudged" for nudge in nudges}
     objects = [
         {"id": row.id, "category": row.category}
         | {name: _values(rows[place]) for name, rows in found.items() if name != "truth"}
-        | {"full": _values(row) | {"nudge": said.get(row.id, "")}}
         for place, row in enumerate(found["full"])
         if not row.fixed
     ]

@@ -252,8 +252,7 @@ def _turned(ask: Ask, finished: Finished) -> str:
 # What simulators ask for: furniture that stays under gravity, people who do not slide or float.
 
 
-STAGES = {"initial": "initial scene", "image": "image alone", "full": "robust",
-          "nudged": "robust, nudged"}  # fmt: skip
+STAGES = {"initial": "initial scene", "image": "image alone", "full": "robust"}
 STAYS = ("stands", "toppled", "moved", "turned")
 MOVES = ("foot_skate", "float_height", "sink_depth", "penetration_depth", "jerk",
          "acceleration_error", "pje")  # fmt: skip
@@ -279,7 +278,7 @@ def fallen(_: Ask, finished: Finished) -> Sequence[str]:
 
 def _pieces(finished: Finished, stage: str) -> Frame:
     """All pieces of a scene that were simulated."""
-    columns = ("seed", "object", "stands", "moved", "stuck", "nudge")
+    columns = ("seed", "object", "stands", "moved", "stuck")
     pieces = finished.objects[finished.objects.stage == stage].reindex(columns=columns)
     return pieces[pieces.stands.notna()]
 
@@ -303,10 +302,10 @@ def _fallen(finished: Finished) -> str:
     for piece in pieces[pieces.stands < 1].itertuples():
         moved = f"{1000 * piece.moved:.0f}"
         stuck = f"{1000 * piece.stuck:.0f}"
-        rows.append([f"{piece.seed} {piece.object}", moved, stuck, piece.nudge])
+        rows.append([f"{piece.seed} {piece.object}", moved, stuck])
     if not rows:
         return "All pieces of the result stay."
-    table = markdown(["piece", "moved [mm]", "stuck [mm]", "nudge"], rows)
+    table = markdown(["piece", "moved [mm]", "stuck [mm]"], rows)
     return f"## What does not stay\n\n{table}"
 
 

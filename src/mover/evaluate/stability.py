@@ -187,7 +187,7 @@ def simulate(
         InputError: If mujoco is not installed.
     """
     if (missing := lacking()) is not None:
-        raise InputError(f"mover simulate: {missing}")
+        raise InputError(missing)
     config = config or SimulationConfig()
     solids = solids_of(scene, run)
     room = _Standing(scene, solids, walls)
@@ -247,11 +247,6 @@ def _settled(
             _press(data, body, (kilos * abs(float(model.opt.gravity[2])), place))
         mujoco.mj_step(model, data)
     return start, _states(data, solids), stuck
-
-
-def settled(scene: Scene, run: Run, seconds: float, walls: tuple[Wall, ...] = ()) -> list["State"]:
-    """Where gravity leaves each piece: its origin [m] and attitude in the simulator's axes."""
-    return _settled(_Standing(scene, solids_of(scene, run), walls), seconds, {})[1]
 
 
 def _press(data: Any, body: int, by: tuple[float, NDArray[np.float64]]) -> None:  # noqa: ANN401

@@ -91,17 +91,13 @@ COMMANDS = {
         "mover.app.cli.results:view",
         "Look at a result in the browser, correct it, solve it again.",
     ),
-    "simulate": (
-        "mover.app.cli.results:simulate",
-        "Let gravity act on a result: how far does each piece move?",
-    ),
     "batch": (
         "mover.app.cli.run:batch",
         "Run thousands of captures; what is finished is not run again.",
     ),
 }
 """Where a command is, and what it does."""
-ALIASES = {"bodies": "import-bodies", "settle": "simulate"}
+ALIASES = {"bodies": "import-bodies"}
 """Names of before, for one release: they work and say so."""
 USAGE = "usage: mover COMMAND [OPTIONS]; mover COMMAND --help tells more"
 
