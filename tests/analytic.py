@@ -129,9 +129,8 @@ def humans_at(objects, layout, camera, image):
     """Depth limits a hand's breadth off, bodies above the table, touched tops."""
     verts = to_camera(place(objects.verts, layout), camera.R_cam_world)
     _, seen = look(verts, Topology(objects.faces, objects.edges), image.views, depth=True)
-    lowest = torch.full_like(seen.nearest, float("-inf"))
-    near = torch.where(seen.covered, seen.nearest - 0.1, lowest)
-    far = torch.where(seen.covered, seen.nearest + 0.1, -lowest)
+    near = torch.where(seen.covered, seen.nearest - 0.1, -torch.inf)
+    far = torch.where(seen.covered, seen.nearest + 0.1, torch.inf)
     area = (640 / camera.width * camera.K[0, 0] / image.views.K[:, 0, 0]).square()
     y = GROUND + 0.15 * torch.arange(60) - 0.2
     values = (GROUND + 2.2 - y).clamp(-0.3, 0.3).to(near).expand(40, 40, 60).transpose(1, 2)
@@ -148,7 +147,7 @@ def humans_at(objects, layout, camera, image):
         shares_of(weight),
         heading,
     )
-    return HumanCues(DepthRange(near, far, lowest, area), BodySpace(volume), touches)
+    return HumanCues(DepthRange(near, far, area), BodySpace(volume), touches)
 
 
 def moved(layout, seed, size):

@@ -127,7 +127,7 @@ def test_a_run_of_before_gives_its_settings_and_says_their_names(preset, tmp_pat
 
 def test_a_wrong_preset_is_answered_with_the_known_ones(capsys):
     assert cli.run_command("run", ["capture", "--preset", "best"]) == 2
-    assert "paper, release, robust" in capsys.readouterr().err
+    assert "paper, robust" in capsys.readouterr().err
 
 
 @pytest.fixture

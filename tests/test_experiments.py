@@ -145,7 +145,7 @@ class Bench:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[ExperimentArgs, list[Step], Bench]:
     """Two rooms, one preset."""
-    args = ExperimentArgs("0,1", ("release", "paper"), tmp_path_factory.mktemp("out"), 2)
+    args = ExperimentArgs("0,1", ("robust", "paper"), tmp_path_factory.mktemp("out"), 2)
     steps, bench = list[Step](), Bench()
     run_experiment(args, steps.append, bench)
     return args, steps, bench
@@ -169,11 +169,11 @@ class TestSeeds:
 def test_every_job_is_done_once_and_rooms_come_before_their_presets(finished) -> None:
     _, steps, bench = finished
     assert sorted(bench.done) == sorted(
-        (seed, name) for seed in (0, 1) for name in (ROOM, "paper", "release")
+        (seed, name) for seed in (0, 1) for name in (ROOM, "paper", "robust")
     )
     for seed in (0, 1):
         assert bench.done.index((seed, ROOM)) < min(
-            bench.done.index((seed, name)) for name in ("paper", "release")
+            bench.done.index((seed, name)) for name in ("paper", "robust")
         )
     assert [step.index for step in steps] == list(range(6))
     assert {step.steps for step in steps} == {6}
@@ -193,7 +193,7 @@ def test_results_hold_every_object_of_every_stage(finished) -> None:
     args, _, _ = finished
     rows = rows_of(args.out / "rooms" / "results.csv")
     found = {(r["seed"], r["preset"], r["stage"], r["object"]) for r in rows}
-    stages = [("", "initial"), *((p, s) for p in ("paper", "release") for s in ("image", "full"))]
+    stages = [("", "initial"), *((p, s) for p in ("paper", "robust") for s in ("image", "full"))]
     assert found == {
         (seed, *stage, name) for seed in "01" for stage in stages for name in ("chair_0", "sofa_0")
     }
@@ -258,7 +258,7 @@ def test_pictures_show_the_worst_objects_of_the_last_preset(finished) -> None:
         assert f"({name})" in page
         with Image.open(args.out / "rooms" / name) as picture:
             assert len(picture.convert("L").getcolors()) > 20
-    assert "mover experiment --set rooms --seeds 0,1 --presets release paper" in page
+    assert "mover experiment --set rooms --seeds 0,1 --presets robust paper" in page
     assert "2 of 2 rooms, 4 objects: 2 touched" in page
 
 
@@ -375,7 +375,7 @@ def test_a_job_is_a_process_whose_last_words_are_kept(copied, tmp_path, monkeypa
     ("flags", "said"),
     [
         (["--set", "flats"], "--set: 'flats' is none of mini, rooms"),
-        (["--presets", "best"], "--presets: 'best' is none of paper, release, robust"),
+        (["--presets", "best"], "--presets: 'best' is none of paper, robust"),
         (["--seeds", "x"], "--seeds: 'x'"),
         (["--workers", "-1"], "--workers: has -1, expected a whole number from 0 to"),
     ],

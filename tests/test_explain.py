@@ -26,7 +26,6 @@ from mover.evaluate.calibration import (
     KINDS,
     VERSION,
     Calibration,
-    calibration_of,
     forms_of,
 )
 from mover.evaluate.explanation import (
@@ -246,7 +245,7 @@ class TestBounds:
         inf = torch.full_like(front[:1], float("inf"))
         near = leave.amax(0, keepdim=True) if side == "near" else -inf
         far = front.amin(0, keepdim=True) if side == "far" else inf
-        depth = DepthRange(near, far, -inf, torch.ones(1))
+        depth = DepthRange(near, far, torch.ones(1))
         masks = torch.ones(1, 64, 64)
         found = bounds_of_objects(seen_at(4.0), masks, depth, window, (bodies, here))
         ((bound,),) = found
@@ -269,7 +268,7 @@ class TestBounds:
             )  # fmt: skip
             front, _, window = maps_in_window(only, here, box)
             low = torch.full_like(front, -float("inf"))
-            depth = DepthRange(low, front, low, torch.ones(1))
+            depth = DepthRange(low, front, torch.ones(1))
             seen = seen_at(float(front.min()) + 0.2)
             masks = torch.ones(1, 64, 64)
             ((bound,),) = bounds_of_objects(seen, masks, depth, window, (bodies, here))
@@ -281,7 +280,7 @@ class TestBounds:
         window = crop_views(here.K, torch.tensor([[200.0, 100, 440, 300]]), 0.3, 64)
         far = torch.full((1, 64, 64), 9.0)
         low = torch.full_like(far, -float("inf"))
-        depth = DepthRange(low, far, low, torch.ones(1))
+        depth = DepthRange(low, far, torch.ones(1))
         who = (bodies, here)
         ((bound,),) = bounds_of_objects(seen_at(8.0), torch.ones(1, 64, 64), depth, window, who)
         assert (bound.frame, bound.person) == (-1, -1)
@@ -515,9 +514,6 @@ class TestCalibration:
     def test_the_weight_of_alternatives_is_how_often_they_are_true(self):
         cases = [([0.0], 1)] * 20 + [([0.0], 0)] * 80 + [([], 0)] * 50
         assert learn_share(cases) == pytest.approx(0.25, rel=0.1)
-
-    def test_settings_without_rooms_are_not_calibrated(self):
-        assert not calibration_of("release").learnt
 
 
 class TestStage:

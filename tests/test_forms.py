@@ -1,8 +1,7 @@
-"""`paper` and `release` as a run prices them: their formulas' numbers, the same bits twice."""
+"""The form `paper` as a run computes it: the numbers of its formulas, the same bits twice."""
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from analytic import make_inputs, moved
@@ -14,19 +13,14 @@ from mover.energy.config import Adam, SceneConfig, SceneWeights, only
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, scene_energy
 from mover.energy.terms.contact import contact_term, shares_of
-from mover.energy.terms.silhouette import edge_term, outline_root
 from mover.geometry.placement import place
 from mover.geometry.warp_start import use_threads
-from mover.stages.config import ImageConfig, PlaceConfig
-from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
+from mover.stages.config import PlaceConfig
 from mover.stages.objects.place_objects import place_objects, with_trees
 
 pytest.importorskip("warp")
 
-RELEASE = SceneWeights(
-    1000.0, 0.3, 1000.0, 80.0, 1000.0, 1e5, edge=0.03, offscreen=1.0, free_space=80.0
-)
-WEIGHTS = {"paper": SceneWeights(), "release": RELEASE}
+PAPER = SceneWeights()
 
 
 def disturbed(seed=0, size=64):
@@ -43,8 +37,7 @@ def disturbed(seed=0, size=64):
     keep[1] = False
     image = replace(image, masks=mask, keep=keep, trust=torch.tensor([1.0, 0.5, 0.2]))
     far = torch.where(chance(mask, 0.3), depth.far.roll(5, -1), torch.inf)
-    free = torch.where(chance(mask, 0.7), 3 + torch.rand(mask.shape, generator=g), -torch.inf)
-    depth = replace(depth, near=depth.near.roll(4, -2) + 0.3, far=far - 0.4, free=free)
+    depth = replace(depth, near=depth.near.roll(4, -2) + 0.3, far=far - 0.4)
     points = touches.points + 0.2 * torch.rand(touches.points.shape, generator=g)
     weight = torch.rand(touches.weight.shape, generator=g) * chance(touches.weight, 0.4)
     weight[1, 1:3] = 0.0
@@ -67,18 +60,17 @@ def slopes(values, layout):
     return [torch.zeros_like(x) if g is None else g for g, x in zip(found, free, strict=True)]
 
 
-@pytest.mark.parametrize("form", ["paper", "release"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_kernels_give_every_term_and_its_gradient(form, seed):
+def test_kernels_give_every_term_and_its_gradient(seed):
     inputs = disturbed(seed)
-    layout, config = many(inputs), SceneConfig(WEIGHTS[form], form)
+    layout, config = many(inputs), SceneConfig(PAPER, "paper")
     rest = (inputs.objects, inputs.camera, inputs.image)
-    fast = energy_function(*rest, with_trees(inputs, form).humans, config)(layout)
+    fast = energy_function(*rest, with_trees(inputs).humans, config)(layout)
     with use_engine("torch"):
         slow = scene_energy(layout, *rest, inputs.humans, config)
     assert list(fast.parts) == list(slow.parts)
     for name, values in slow.parts.items():
-        assert values.abs().max() > 0 or name in ("offscreen", "collision")
+        assert values.abs().max() > 0 or name == "collision"
         scale = float(values.detach().abs().max())
         torch.testing.assert_close(fast.parts[name], values, rtol=2e-5, atol=1e-5 * scale)
         found, wanted = slopes(fast.parts[name], layout), slopes(values, layout)
@@ -86,14 +78,14 @@ def test_kernels_give_every_term_and_its_gradient(form, seed):
             torch.testing.assert_close(a, b, rtol=2e-3, atol=1e-4 * float(b.abs().max()))
 
 
-@pytest.mark.parametrize("name", ["silhouette", "edge", "depth", "free_space"])
+@pytest.mark.parametrize("name", ["silhouette", "depth"])
 def test_one_term_alone_is_what_it_is_among_all(name):
     inputs = disturbed()
     layout = many(inputs, 1)
-    alone = SceneWeights(**{k: float(k == name) * v for k, v in vars(RELEASE).items()})
+    alone = SceneWeights(**{k: float(k == name) * v for k, v in vars(PAPER).items()})
     found = []
-    for weights in (RELEASE, alone):
-        config = SceneConfig(weights, "release")
+    for weights in (PAPER, alone):
+        config = SceneConfig(weights, "paper")
         rest = (inputs.camera, inputs.image, replace(inputs.humans, touches=None))
         parts = energy_function(inputs.objects, *rest, config)(layout).parts
         found.append([parts[name], *slopes(parts[name], layout)])
@@ -106,65 +98,17 @@ def test_objects_out_of_sight_cost_their_masks_and_have_no_gradient():
     inputs = disturbed()
     away = replace(inputs.starts, t_world_object=inputs.starts.t_world_object + 50.0)
     layout = map_tensors(lambda x: x.detach().requires_grad_(), away)
-    config = SceneConfig(replace(RELEASE, contact=0.0), "release")
+    config = SceneConfig(replace(PAPER, contact=0.0), "paper")
     rest = (inputs.camera, inputs.image, HumanCues(inputs.humans.depth))
     parts = energy_function(inputs.objects, *rest, config)(layout).parts
     image = inputs.image
     wanted = 0.3 * image.trust * (image.masks * image.keep).square().sum((-2, -1))
     torch.testing.assert_close(parts["silhouette"][0], wanted)
-    for name in ("edge", "depth", "free_space"):
-        assert not parts[name].any()
-        assert not any(g.any() for g in slopes(parts[name], layout))
+    assert not parts["depth"].any()
+    assert not any(g.any() for g in slopes(parts["depth"], layout))
 
 
-def present_edge(drawn, mask, keep):
-    """The formula by one square window and distances that are measured anew."""
-    from scipy.ndimage import distance_transform_edt
-
-    def ring(image):
-        flat = image.reshape(-1, 1, *image.shape[-2:])
-        grown = torch.nn.functional.max_pool2d(flat, 7, stride=1, padding=3)
-        return grown.reshape(image.shape) - image
-
-    edges = ring((mask > 0.5).to(drawn))
-    maps = torch.stack(
-        [torch.from_numpy(distance_transform_edt(np.asarray(e == 0))) for e in edges]
-    )
-    return 0.5 * (ring(drawn * keep) * maps.to(drawn).sqrt()).sum((-2, -1))
-
-
-@pytest.mark.parametrize("levels", [0, 4])
-def test_the_edge_term_is_that_of_square_windows_with_its_gradient(levels):
-    g = torch.Generator().manual_seed(levels)
-    drawn = torch.rand(2, 3, 21, 30, generator=g, dtype=torch.float64)
-    if levels:  # many pixels that are equally high
-        drawn = (drawn * levels).round() / levels
-    mask = torch.rand(3, 21, 30, generator=g, dtype=torch.float64)
-    keep = torch.rand(3, 21, 30, generator=g) < 0.8
-    drawn.requires_grad_()
-    wanted = present_edge(drawn, mask, keep)
-    for outline in (None, outline_root(mask)):
-        found = edge_term(drawn, mask, keep, outline)
-        torch.testing.assert_close(found, wanted)
-        a, b = (torch.autograd.grad(x.sum(), drawn, retain_graph=True)[0] for x in (found, wanted))
-        torch.testing.assert_close(a, b)
-
-
-def test_only_the_release_keeps_the_distance_to_outlines():
-    inputs, n = make_inputs(size=16), 3
-    masks = torch.zeros(n, 360, 640, dtype=torch.bool)
-    masks[:, 100:200, 200:400] = True
-    seen = ImageInputs(
-        inputs.camera, inputs.image.boxes, torch.ones(n, dtype=torch.bool), masks,
-        torch.zeros(360, 640, dtype=torch.bool), torch.zeros(n, n, dtype=torch.bool),
-    )  # fmt: skip
-    for form in ("paper", "robust"):
-        assert find_image_cues(seen, ImageConfig(32, form)).outline is None
-    cues = find_image_cues(seen, ImageConfig(32, "release"))
-    torch.testing.assert_close(cues.outline, outline_root(cues.masks))
-
-
-def naive_contact(inputs, layout, form):
+def naive_contact(inputs, layout):
     """Double loops over objects and parts in double precision."""
     wide = map_tensors(lambda x: x.double(), layout)
     tops, backs = (place(x.double(), wide) for x in (inputs.objects.top, inputs.objects.back))
@@ -177,39 +121,34 @@ def naive_contact(inputs, layout, form):
                 if known.any():
                     points = touches.points[k, part, known].double()
                     gap = (points[:, None] - region[s, i][None]).norm(dim=-1)
-                    if form == "paper":
-                        weight = touches.weight[k, part, known].double()
-                        price = (gap.amin(1) * weight).sum() / skin[part % 2]
-                    else:
-                        price = gap.amin(0).mean()
-                    total = total.index_put((torch.tensor([s]), torch.tensor([i])), price, True)
+                    weight = touches.weight[k, part, known].double()
+                    cost = (gap.amin(1) * weight).sum() / skin[part % 2]
+                    total = total.index_put((torch.tensor([s]), torch.tensor([i])), cost, True)
     return total
 
 
-@pytest.mark.parametrize("form", ["paper", "release"])
-def test_contact_by_trees_is_that_of_all_pairs(form):
+def test_contact_by_trees_is_that_of_all_pairs():
     inputs = disturbed(3)
     g = torch.Generator().manual_seed(5)
     back = 0.4 * torch.rand(inputs.objects.back.shape, generator=g)
     inputs = replace(inputs, objects=replace(inputs.objects, back=back))
     layout = many(inputs)
-    given = with_trees(inputs, form)
-    config = SceneConfig(only(contact=1.0), form)
+    given = with_trees(inputs)
+    config = SceneConfig(only(contact=1.0), "paper")
     rest = given.objects, given.camera, given.image, given.humans, config
     found = energy_function(*rest)(layout).parts["contact"]
-    wanted = naive_contact(inputs, layout, form)
+    wanted = naive_contact(inputs, layout)
     torch.testing.assert_close(found.double(), wanted, rtol=1e-5, atol=1e-5)
     for a, b in zip(slopes(found, layout), slopes(wanted, layout), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
     regions = (place(inputs.objects.top, layout), place(back, layout))
-    present = contact_term(regions, inputs.humans.touches, form)
+    present = contact_term(regions, inputs.humans.touches, "paper")
     torch.testing.assert_close(found, present, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("form", ["paper", "release"])
-def test_two_descents_give_the_same_bits_whatever_the_threads(form):
+def test_two_descents_give_the_same_bits_whatever_the_threads():
     inputs = disturbed(2, size=48)
-    config = PlaceConfig(WEIGHTS[form], form, Adam(25))
+    config = PlaceConfig(PAPER, "paper", Adam(25))
     found = []
     for threads in (1, 3, 1):
         with use_threads(threads):
@@ -222,8 +161,7 @@ def test_two_descents_give_the_same_bits_whatever_the_threads(form):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["paper", "release"])
-def test_a_preset_gives_the_same_room_twice(name, small_room, tmp_path):
+def test_a_preset_gives_the_same_room_twice(small_room, tmp_path):
     from test_pipeline import light
 
     from mover.core.run import Run
@@ -232,7 +170,7 @@ def test_a_preset_gives_the_same_room_twice(name, small_room, tmp_path):
     from mover_bench.rooms.noise import add_noise
 
     capture = add_noise(small_room, NoiseConfig(), 1)
-    rooms = [reconstruct(capture, light(name), Run(tmp_path / str(k))) for k in range(2)]
+    rooms = [reconstruct(capture, light("paper"), Run(tmp_path / str(k))) for k in range(2)]
     for one, two in zip(rooms[0].scene.objects, rooms[1].scene.objects, strict=True):
         assert torch.equal(one.t_world_object, two.t_world_object)
         assert torch.equal(one.yaw, two.yaw)

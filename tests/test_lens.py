@@ -15,7 +15,7 @@ from mover.geometry.boxes import box_of
 from mover.geometry.camera import project, tilted
 from mover.geometry.rotations import rot_y
 from mover.io.capture.folder import read_capture, write_capture
-from mover.pipeline.presets import PAPER, RELEASE, ROBUST
+from mover.pipeline.presets import PAPER, ROBUST
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.camera.config import LensConfig
 from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens
@@ -245,7 +245,6 @@ def test_the_picture_stays_under_another_lens(small_room):
 def test_only_robust_asks_the_lines():
     assert ROBUST.lens.use
     assert not PAPER.lens.use
-    assert not RELEASE.lens.use
 
 
 def test_a_capture_keeps_what_it_says_of_its_lens(small_room, tmp_path):

@@ -30,11 +30,11 @@ WEIGHTS = [f.name for f in fields(SceneWeights)]
 PRECISIONS = [torch.float32, torch.float64]
 
 
-def evidence(dtype, form):
+def evidence(dtype):
     """The analytic room with evidence for every term, and layouts about the truth."""
     inputs = make_inputs(dtype, size=32)
     truth = Layout(*(getattr(inputs.starts, f.name)[0] for f in fields(Layout)))
-    inputs = with_trees(with_walls(inputs, walls_at(inputs.objects, truth)), form)
+    inputs = with_trees(with_walls(inputs, walls_at(inputs.objects, truth)))
     many = [moved(inputs.starts, seed, 0.2) for seed in range(2)]
     return inputs, Layout(*(torch.cat([getattr(m, f.name) for m in many]) for f in fields(Layout)))
 

@@ -234,7 +234,7 @@ def test_what_is_asked_wrongly_is_one_sentence(tmp_path: Path, capsys) -> None:
         paper_table(TableArgs("prox", there, tmp_path / "out"))
     words = ["prox-quantitative", str(there), str(tmp_path / "out"), "--preset", "best"]
     assert run_command("paper-table", words) == 2
-    assert "--preset: 'best' is none of paper, release, robust" in capsys.readouterr().err
+    assert "--preset: 'best' is none of paper, robust" in capsys.readouterr().err
 
 
 def test_noise_is_uniform_and_within_its_level(small_room: KnownRoom) -> None:

@@ -13,7 +13,6 @@ from mover.geometry.warp_start import use_threads
 from mover.stages.config import PrepareConfig
 from mover.stages.objects.prepare_objects import (
     PrepareInputs,
-    find_regions,
     prepare_objects,
     proxy_meshes,
     to_objects,
@@ -121,11 +120,3 @@ def test_supports_name_the_carrying_object():
         torch.zeros(3), torch.tensor(0.0), torch.ones(3)))  # fmt: skip
     prepared = prepare_objects(PrepareInputs((table, lamp)), LIGHT)
     assert prepared.objects.supports.tolist() == [-1, 0]
-
-
-def test_the_release_rule_keeps_low_points_of_chairs_and_high_points_of_tables():
-    y = torch.tensor([0.5, 0.5, 0.5, 1.0])
-    points = torch.stack([torch.zeros(4), y, torch.zeros(4)], -1)
-    up = torch.tensor([[0.0, 1.0, 0.0]]).expand(4, -1)
-    assert find_regions(points, up, "chair", "release").top[:, 1].tolist() == [0.5, 0.5, 0.5]
-    assert find_regions(points, up, "table", "release").top[:, 1].tolist() == [1.0]

@@ -116,7 +116,7 @@ def test_bodies_without_keypoints_are_left_out_and_said(result, capsys):
     [
         (["--preset", "paper"], "--keypoints: is missing, expected a path"),
         (["--keypoints", "k.npz"], "--keypoints, --vposer: of --preset paper only"),
-        (["--preset", "release"], "--preset: 'release' is none of robust, paper"),
+        (["--preset", "best"], "--preset: 'best' is none of robust, paper"),
     ],
 )
 def test_what_is_asked_wrongly_is_one_sentence(tmp_path, capsys, words, said):

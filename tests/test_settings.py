@@ -118,7 +118,6 @@ def test_presets_are_within_their_own_ranges(name):
         (("--prepare.cells", "100000"), "--prepare.cells: has 100000"),
         (("--prepare.faces", "0"), "--prepare.faces: has 0"),
         (("--gather.erode", "-1"), "--gather.erode: has -1"),
-        (("--select.window", "nan"), "--select.window: has nan"),
         (("--format", "nope"), "--format: 'nope' is none of"),
         (("--preset", "nope"), "--preset: 'nope' is none of"),
     ],

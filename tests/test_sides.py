@@ -122,7 +122,7 @@ class TestWhatIsKnown:
             camera, whole, torch.tensor([False]), (mask & False)[None], mask & False,
             torch.zeros(1, 1, dtype=torch.bool),
         )  # fmt: skip
-        for form in ("paper", "release", "robust"):
+        for form in ("paper", "robust"):
             assert find_image_cues(inputs, ImageConfig(32, form)).sides.tolist() == [[UNKNOWN] * 4]
 
 

@@ -25,13 +25,7 @@ from mover.stages.objects.place_objects import energy_of
 TERMS = [f.name for f in fields(SceneWeights)]
 ONLY = {t: SceneWeights(**{n: float(n == t) for n in TERMS}) for t in TERMS}
 PAPER_TERMS = TERMS[:6]
-NOT_ZERO_AT_TRUTH = {
-    ("release", "depth"),
-    ("release", "edge"),
-    ("paper", "edge"),
-    ("robust", "edge"),
-}
-FORMS = ("paper", "release", "robust")
+FORMS = ("paper", "robust")
 
 
 def energy(inputs, layout, term, form="paper"):
@@ -47,8 +41,6 @@ def first_of(layout):
 @pytest.mark.parametrize("term", TERMS)
 class TestEveryTerm:
     def test_is_zero_at_the_truth(self, term, form):
-        if (form, term) in NOT_ZERO_AT_TRUTH:
-            pytest.skip("the release's back-surface bound and outer ring are not zero at the truth")
         inputs = make_inputs(torch.float64)
         assert float(energy(inputs, inputs.starts, term, form).total.abs()) < 1e-9
 
@@ -69,7 +61,7 @@ class TestEveryTerm:
 
     def test_gradient_equals_finite_differences(self, term, form):
         """Silhouettes of exact contours are piecewise smooth: they have their own test."""
-        if term in ("silhouette", "edge"):
+        if term == "silhouette":
             pytest.skip("see test_raster.py")
         inputs = make_inputs(torch.float64, size=24)
         at = moved(inputs.starts, 4, 0.05)
@@ -234,12 +226,28 @@ class TestPrintedTerms:
     def test_bounds_that_contradict_each_other_are_no_range(self):
         covered, four = torch.ones(1, 1, 1, 4, dtype=torch.bool), torch.ones(1, 1, 4)
         seen = Depths(4.0 * four[None], 4.0 * four[None], covered)
-        none = torch.full((1, 1, 4), float("-inf"))
         near = torch.tensor([[[9.0, 9.0, 4.5, -torch.inf]]])
         far = torch.tensor([[[1.0, torch.inf, 4.2, 3.0]]])
-        allowed = DepthRange(near, far, none, torch.ones(1))
+        allowed = DepthRange(near, far, torch.ones(1))
         found = float(depth_term(seen, four, allowed, "paper"))
         assert found == pytest.approx(5 + 1)
+
+
+@pytest.mark.parametrize(("form", "share"), [("paper", 1.0), ("robust", 0.1)])
+def test_collision_spares_used_seats_in_the_robust_form_alone(form, share):
+    inputs = make_inputs(torch.float64)
+    seats = torch.tensor([True, False, False])
+    inputs = replace(inputs, objects=replace(inputs.objects, is_seat=seats))
+    weights = replace(ONLY["collision"], contact=1.0)
+    high = torch.tensor([[0, 1.8, 0], [0, 1.8, 0], [0, 0.6, 0]])
+    tall = replace(inputs.starts, log_scale=inputs.starts.log_scale + high)
+    costs = [
+        energy_of(replace(inputs, humans=humans), PlaceConfig(weights, form))(tall)
+        for humans in (inputs.humans, replace(inputs.humans, touches=None))
+    ]
+    used, plain = (cost.parts["collision"][0] for cost in costs)
+    assert (plain > 0).all()
+    torch.testing.assert_close(used, plain * torch.tensor([share, 1.0, 1.0]).double())
 
 
 def test_a_term_without_its_evidence_is_not_computed():

@@ -25,7 +25,7 @@ class DemoArgs:
     seed: Seed = 0
     """Seed of the noise."""
     preset: str = "robust"
-    """paper, release or robust."""
+    """paper or robust."""
     device: Device = "cpu"
     """cpu, cuda or auto."""
 
@@ -159,7 +159,7 @@ class PaperTableArgs:
     results: Annotated[Positional[Path], arg(metavar="RESULTS")]
     """Folder for the rows' results and the page."""
     preset: str = "robust"
-    """paper, release or robust."""
+    """paper or robust."""
     detected: Path | None = None
     """The same captures with boxes and masks of a detector (PointRend), for rows of their own."""
     only: tuple[str, ...] = ()

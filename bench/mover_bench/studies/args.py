@@ -15,7 +15,7 @@ class ExperimentArgs:
 
     seeds: str = "0-9"
     """Which rooms: 0-9, or 0,3,5-7."""
-    presets: tuple[str, ...] = ("paper", "release", "robust")
+    presets: tuple[str, ...] = ("paper", "robust")
     """Which settings: presets, or `robust` without one of its parts (see docs/results.md)."""
     out: Path = Path("experiments")
     """Folder for the results."""
@@ -40,7 +40,7 @@ class StudyArgs:
     """Which rooms; empty: those that the study is meant for."""
     seeds: str = ""
     """Which of them: 1000-1009, or 1000,1003; empty: all that are held out."""
-    presets: tuple[str, ...] = ("paper", "release", "robust")
+    presets: tuple[str, ...] = ("paper", "robust")
     """Which presets the studies `sets` and `paper` try."""
     errors: tuple[str, ...] = ()
     """Which errors the study `sensitivity` tries: scale, place, ..., or `paper` switches off:

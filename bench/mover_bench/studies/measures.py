@@ -282,7 +282,7 @@ def seat_height(piece: SceneObject) -> float:
     mesh = place_object(piece)
     points, normals = sample_surface(mesh, SURFACE)
     points = points - torch.tensor([0.0, float(mesh.verts[:, 1].min()), 0.0])
-    top = find_regions(points, normals, canonical(piece.category), "level").top
+    top = find_regions(points, normals, canonical(piece.category)).top
     return float(top[:, 1].median())
 
 

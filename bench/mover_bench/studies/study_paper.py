@@ -1,4 +1,4 @@
-"""Why people help or harm under `paper` and `release`: true inputs, and terms one by one.
+"""Why people help or harm under `paper`: true inputs, and terms one by one.
 
 The rooms of a set are given with all errors, with one of camera, bodies, contacts and masks as it
 truly is, with camera and bodies true, and with all four. Under each, every term of the people is
@@ -15,7 +15,7 @@ from mover_bench.studies.study_rows import Ask, labelled, quoted_rows
 from mover_bench.studies.variants import HUMAN, NO_TERM
 from mover_bench.tables import published
 
-PRESETS = ("paper", "release")
+PRESETS = ("paper",)
 COLUMNS = ("iou3d", "p2s", "iou2d", "non_collision", "contact", "iou3d_touched", "iou3d_untouched")
 ADDED = {"nothing": NO_TERM, **{name: name for name in HUMAN}}
 """What the second stage adds to the first, by its heading."""

@@ -33,7 +33,7 @@ class Ask:
     """Name of the set."""
     seeds: Mapping[str, Sequence[int]]
     """The rooms of each set that takes part."""
-    presets: tuple[str, ...] = ("paper", "release", "robust")
+    presets: tuple[str, ...] = ("paper", "robust")
     """Which of them the study `sets` compares."""
     errors: tuple[str, ...] = tuple(CHANGES)
     """Which of them the study `sensitivity` tries, or `paper` switches off."""

@@ -125,7 +125,6 @@ def lone_term(preset: str, name: str) -> Variant:
     config = PRESETS[preset]
     weights = config.place.weights
     silent = {term: 0.0 for term in HUMAN if term != name}
-    silent |= {} if name == "depth" else {"free_space": 0.0}
     silent |= {} if name == "contact" else {"heading": 0.0}
     place = replace(config.place, weights=replace(weights, **silent))
     plain = replace(config, place=place, explain=replace(config.explain, use=False))
@@ -134,10 +133,10 @@ def lone_term(preset: str, name: str) -> Variant:
 
 ALONE: dict[str, Variant] = {
     f"{preset}-{name}": lone_term(preset, name)
-    for preset in ("paper", "release")
+    for preset in ("paper",)
     for name in (*HUMAN, NO_TERM)
 }
-"""`paper` and `release` with one term of the people, or none."""
+"""`paper` with one term of the people, or none."""
 
 _FEET = replace(ROBUST, refine=replace(ROBUST.refine, rounds=0))
 PARTS: dict[str, Variant] = {

@@ -5,8 +5,8 @@ from typing import Annotated, ClassVar, Literal
 
 from mover.core.settings import Share, Steps, Weight, float_in, int_in
 
-Variant = Literal["paper", "release", "robust"]
-"""How a term is priced: as printed, as in the authors' released code, or normalised and robust."""
+Variant = Literal["paper", "robust"]
+"""How a term is weighted: as printed, or normalised and robust."""
 
 
 GROWTH = 1.5  # price of another size as a whole, against that of another shape
@@ -28,12 +28,6 @@ class SceneWeights:
     """lambda 5: people move through free space."""
     contact: Weight = 1e5
     """lambda 6: touching surfaces share a place."""
-    edge: Weight = 0.0
-    """Outlines follow the outlines of the masks (release only)."""
-    offscreen: Weight = 0.0
-    """Objects stay inside the image (release only)."""
-    free_space: Weight = 0.0
-    """Nothing hides a person that is seen (release only)."""
     distance: Weight = 0.0
     """Objects stay at the distance they were given, where nothing else tells it (robust only)."""
     heading: Weight = 0.0
@@ -57,7 +51,7 @@ class SceneConfig:
 
     weights: SceneWeights = field(default_factory=SceneWeights)
     form: Variant = "paper"
-    """As printed, as the authors released it, or normalised and robust."""
+    """As printed, or normalised and robust."""
     growth: Weight = GROWTH
     """Price of another size as a whole, against that of another shape (robust only)."""
 

@@ -21,7 +21,7 @@ from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.minimize import Term, active_weights, sum_terms, there
 from mover.energy.terms.bbox import UNKNOWN, bbox_term
 from mover.energy.terms.border import Borders, Fitted, fit_borders
-from mover.energy.terms.collision import BodySpace, collision_term
+from mover.energy.terms.collision import BodySpace, collision_share, collision_term
 from mover.energy.terms.contact import (
     ContactPoints,
     Trees,
@@ -31,14 +31,12 @@ from mover.energy.terms.contact import (
     heading_term,
     some_touches,
 )
-from mover.energy.terms.depth import DepthRange, depth_term, free_space_term
+from mover.energy.terms.depth import DepthRange, depth_term
 from mover.energy.terms.distance import distance_term
-from mover.energy.terms.factors import Factors, factors
 from mover.energy.terms.given import Given, given_term
 from mover.energy.terms.measured import Measured, measured_term
-from mover.energy.terms.offscreen import offscreen_term
 from mover.energy.terms.scale import scale_term
-from mover.energy.terms.silhouette import edge_term, silhouette_term
+from mover.energy.terms.silhouette import silhouette_term
 from mover.energy.terms.wall import Walls, wall_term
 from mover.geometry.camera import outermost, project, to_camera
 from mover.geometry.placement import place, place_in
@@ -68,8 +66,6 @@ class ImageCues:
     """Weight of the silhouette, below one where the shape is known to be wrong."""
     distance: Float[Tensor, " objects"] | None = None
     """From the camera to the middle of the base in the initial scene [m]; None: not known."""
-    outline: Float[Tensor, "objects h w"] | None = None
-    """Root of the distance to the mask's outline [px^0.5]; None: the edge term finds it anew."""
     borders: Borders | None = None
     """What the masks may be if their outlines are too wide or too narrow; None: they are not."""
     walls: Walls | None = None
@@ -193,12 +189,6 @@ class PlacedScene:
         """First and last surfaces, for terms that need some evidence of `DEEP`."""
         return there(self._drawn[1])
 
-    @cached_property
-    def factors(self) -> Factors:
-        """How much depth order and collision count for seats that are used."""
-        touches = self.known.humans.touches if self.config.weights.contact else None
-        return factors(self.known.objects, touches, self.config.form)
-
     @property
     def loose(self) -> bool:
         """Whether box and silhouette choose the border of the mask."""
@@ -231,29 +221,28 @@ def _silhouette(s: PlacedScene) -> PerItem:
 
 def _depth(s: PlacedScene) -> PerItem:
     bounds = there(s.known.humans.depth)
-    return s.factors.depth * depth_term(s.depths, s.known.image.masks, bounds, s.config.form)
+    return depth_term(s.depths, s.known.image.masks, bounds, s.config.form)
 
 
 def _collision(s: PlacedScene) -> PerItem:
     points = place(s.known.objects.samples, s.layout)
     space = there(s.known.humans.space)
-    return s.factors.collision * collision_term(points, space, s.config.form)
+    touches = s.known.humans.touches if s.config.weights.contact else None
+    cost = collision_term(points, space)
+    if s.config.form == "paper":
+        return cost
+    return collision_share(s.known.objects, touches) * cost
 
 
 def _contact(s: PlacedScene) -> PerItem:
     """By search trees where there are any."""
     objects, humans, form = s.known.objects, s.known.humans, s.config.form
     touches = there(humans.touches)
-    if humans.trees is None or form == "release":
+    if humans.trees is None:
         regions = place(objects.top, s.layout), place(objects.back, s.layout)
         return contact_term(regions, touches, form)
     found = gaps(s.layout, objects, touches, humans.trees)
     return gap_term(found, touches, len(objects.ids), form)
-
-
-def _edge(s: PlacedScene) -> PerItem:
-    image = s.known.image
-    return edge_term(s.silhouettes, image.masks, image.keep, image.outline)
 
 
 def _corners(s: PlacedScene) -> Float[Tensor, "*starts objects 8 3"]:
@@ -273,17 +262,6 @@ SCENE_TERMS: tuple[Term[PlacedScene], ...] = (
     Term("depth", _depth, "who hides whom", ("depth",), fused=True),
     Term("collision", _collision, "free space", ("space",), fused=True),
     Term("contact", _contact, "touch", ("touches",), fused=True),
-    Term("edge", _edge, "its outline"),
-    Term(
-        "offscreen", lambda s: offscreen_term(
-            s.pixels, s.verts_cam, s.known.objects.real_verts, s.known.camera),
-        "the border of the image",
-    ),
-    Term(
-        "free_space", lambda s: free_space_term(
-            s.depths, s.known.image.masks, there(s.known.humans.depth)),
-        "people seen beside it", ("depth",),
-    ),
     Term(
         "distance", lambda s: distance_term(s.layout, there(s.known.image.distance)),
         "the distance it was given", ("distance",), fused=True,

@@ -1,8 +1,7 @@
-"""The settings of all stages, and the three presets.
+"""The settings of all stages, and the two presets.
 
-`paper`:   each formula and number as printed.
-`release`: what the authors' released code computes, without its bugs.
-`robust`:  ours; docs/method.md gives the reason for each departure.
+`paper`:  each formula and number as printed.
+`robust`: ours; docs/method.md gives the reason for each departure.
 """
 
 import argparse
@@ -29,7 +28,6 @@ from mover.stages.config import (
     PrepareConfig,
     ProposeConfig,
     RefineConfig,
-    ReinitConfig,
     SelectConfig,
     SpreadConfig,
 )
@@ -81,8 +79,6 @@ class Config:
     """Evidence from all people."""
     assign: AssignConfig = field(default_factory=AssignConfig)
     """Which object each touching body part touches."""
-    reinit: ReinitConfig = field(default_factory=ReinitConfig)
-    """Seats put where their contacts are (release)."""
     place: PlaceConfig = field(default_factory=PlaceConfig)
     """Stage 2: objects from the image and the people."""
     explain: ExplainConfig = field(default_factory=ExplainConfig)
@@ -119,28 +115,8 @@ PAPER = Config(
     align=_PLANE,
     layout=PlaceConfig(weights=IMAGE_ONLY, method=Adam(1000)),
     gather=GatherConfig(erode=2),
-    assign=AssignConfig(by="release"),
+    assign=AssignConfig(by="mask_hits"),
     place=PlaceConfig(),
-)
-
-_RELEASE_IMAGE = SceneWeights(600.0, 0.5, 1000.0, 0.0, 0.0, 0.0, edge=0.05, offscreen=1.0)
-_RELEASE_FULL = SceneWeights(
-    1000.0, 0.3, 1000.0, 80.0, 1000.0, 1e5, edge=0.03, offscreen=1.0, free_space=80.0
-)
-
-RELEASE = Config(
-    select=SelectConfig("each", 0.0, 0.18, 0.0, 0.09, "vector", 1, 0.2),
-    foot_contacts=_NAMED_FEET,
-    align=_PLANE,
-    prepare=PrepareConfig(rule="release"),
-    image=ImageConfig(form="release"),
-    layout=PlaceConfig(
-        _RELEASE_IMAGE, "release", Adam(1000), first=Adam(200, 0.01, 0.01), span=0.8, chair_span=0.6
-    ),
-    gather=GatherConfig(erode=2),
-    assign=AssignConfig(by="release"),
-    reinit=ReinitConfig(use=True),
-    place=PlaceConfig(_RELEASE_FULL, "release", Adam(2500), span=0.8, chair_span=0.6),
 )
 
 _GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300, hand_reach=0.25)
@@ -263,7 +239,7 @@ def with_methods(config: Config, arguments: Sequence[str]) -> tuple[Config, list
     return config, rest
 
 
-PRESETS = {"paper": PAPER, "release": RELEASE, "robust": ROBUST}
+PRESETS = {"paper": PAPER, "robust": ROBUST}
 _Pricing = TypeVar("_Pricing", PlaceConfig, RefineConfig)
 
 

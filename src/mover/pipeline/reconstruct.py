@@ -80,10 +80,8 @@ from mover.stages.objects.place_objects import (
 )
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
 from mover.stages.objects.starts import (
-    ReinitInputs,
     alone,
     best_few,
-    by_release,
     contact_start,
     joined,
     other_starts,
@@ -360,8 +358,7 @@ def placed_with_people(
         if image.given is not None and not are_shapeless(people.bodies):
             image = replace(image, given=lighter_where_used(image.given, image.trust, contacts))
     image = with_views(image, state.views)
-    seats = ReinitInputs(objects, state.camera, humans, image.masks, state.placed.layout)
-    starts = alone(run.stage(by_release, seats, config.reinit))
+    starts = alone(state.placed.layout)
     if config.layout.num_hypotheses > 1:
         contact = contact_start(state.placed.layout, objects, contacts)
         placed = state.placed

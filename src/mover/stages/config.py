@@ -8,7 +8,6 @@ from mover.core.settings import (
     Count,
     Degrees,
     Metres,
-    Seconds,
     Share,
     Sigma,
     Weight,
@@ -42,12 +41,6 @@ class SelectConfig:
     """Mean acceleration of shoulders, elbows, hips and knees relative to the pelvis [m/s²]."""
     local_jitter: Metres = 0.16
     """Its second difference that noise explains [m]."""
-    local: Literal["lengths", "vector"] = "lengths"
-    """How the joints are averaged: their lengths, or their vectors as the authors' code does."""
-    erode: Annotated[int, int_in(0, 1000)] = 0
-    """`each`: frames beside a wrong one that are left out as well."""
-    window: Seconds = 0.0
-    """Keep only the steadiest frame of every such stretch of time [s]; 0: all."""
 
 
 @dataclass(frozen=True)
@@ -146,8 +139,6 @@ class PrepareConfig:
     """Even surface samples of each object."""
     region: Annotated[int, int_in(1, 100_000)] = 400
     """Points of each region that can be touched."""
-    rule: Literal["level", "release"] = "level"
-    """How seats and backs are found (`prepare_objects.find_regions`)."""
     level_feet: bool = False
     """All feet of a proxy are put on the floor (`prepare_objects.levelled`)."""
     watertight: Literal["wrap", "occnet"] = "wrap"
@@ -177,7 +168,7 @@ class ImageConfig:
     size: Annotated[int, int_in(8, 2048)] = 256
     """Pixels along a side of each object's window."""
     form: Variant = "paper"
-    """`release`: beyond the border is background; `robust`: hidden sides are lower bounds."""
+    """`robust`: hidden sides are lower bounds."""
     hidden: Share = 0.5
     """Share of the strip beyond a side from which on more may be hidden there (`robust`)."""
     bounded: bool = False
@@ -195,8 +186,6 @@ class PlaceConfig:
     """How the terms are priced."""
     method: Adam | BatchedBFGS = field(default_factory=Adam)
     """The descent from each start that is left."""
-    first: Adam = field(default_factory=lambda: Adam(steps=0))
-    """A descent of the box term over the places alone, before all others (release)."""
     yaws: Annotated[int, int_in(1, 360)] = 1
     """Starts that are turned evenly round each object."""
     distances: tuple[Annotated[float, float_in(0.01, 100)], ...] = ()
@@ -217,10 +206,6 @@ class PlaceConfig:
     """How much a turn away from the reference yaw worsens a candidate: 1 doubles half a turn."""
     apart: Weight = 0.0
     """Weight of the space that objects share, in a last descent of all together."""
-    span: Annotated[float, float_in(0, 1.9)] = 0.0
-    """Release: scales stay within 1 +- span/2 by a sigmoid; 0: free."""
-    chair_span: Annotated[float, float_in(0, 1.9)] = 0.0
-    """The same for chairs."""
     uniform_scale_weight: Weight = GROWTH
     """Price of another size as a whole, against that of another shape (robust)."""
 
@@ -289,8 +274,8 @@ class GatherConfig:
 class AssignConfig:
     """How contact vertices find their objects."""
 
-    by: Literal["vertex", "group", "release"] = "vertex"
-    """What is assigned as one."""
+    by: Literal["vertex", "group", "mask_hits"] = "vertex"
+    """What is assigned as one (`contact_association`)."""
     split: Literal["normals", "parts"] = "normals"
     """Seat or back: by the normal of the vertex, or backs alone touch backs (unless they lie)."""
     chance: Share = 0.5
@@ -305,18 +290,6 @@ class AssignConfig:
     """Contact points nearer than this become one with their count as weight [m]."""
     most: Count = 2000
     """Points kept for each part of each object."""
-
-
-@dataclass(frozen=True)
-class ReinitConfig:
-    """Whether the authors' re-initialisation is done."""
-
-    use: bool = False
-    """True in `release`."""
-    span: Annotated[float, float_in(0, 1.9)] = 0.8
-    """Scales stay within 1 +- span/2."""
-    chair_span: Annotated[float, float_in(0, 1.9)] = 0.6
-    """The same for chairs."""
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ class RunArgs:
     format: str = "folder"
     """How the capture is written; see docs/data.md."""
     preset: str = "robust"
-    """paper, release or robust: the settings that the other flags change."""
+    """paper or robust: the settings that the other flags change."""
     config_from: Annotated[Path | None, arg(name="config")] = None
     """A run.json whose settings are used instead of a preset's."""
     edits: Path | None = None
@@ -153,7 +153,7 @@ class BatchArgs:
     format: str = "folder"
     """How the captures are written; see docs/data.md."""
     preset: str = "robust"
-    """paper, release or robust: the settings that the other flags change."""
+    """paper or robust: the settings that the other flags change."""
     config_from: Annotated[Path | None, arg(name="config")] = None
     """A run.json whose settings are used instead of a preset's."""
     refine: bool = False

@@ -210,7 +210,7 @@ class ChainArgs:
     weights: Path | None = None
     """Folder with the networks, for a machine without a network: one folder for each."""
     preset: str = "robust"
-    """Settings of the room: paper, release or robust."""
+    """Settings of the room: paper or robust."""
     device: Device = "cpu"
     """Where the room is computed: cpu, cuda or auto."""
     refine: bool = True

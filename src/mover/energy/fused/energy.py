@@ -25,7 +25,6 @@ from mover.energy.objective import (
     shares_of,
 )
 from mover.energy.terms.contact import trees_of
-from mover.energy.terms.silhouette import outline_root
 from mover.geometry.raster import engine
 
 
@@ -92,8 +91,6 @@ def _of_one_image(
     objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
 ) -> Callable[[Rows | None], EnergyOf]:
     """The same by the reference image, or another, alone."""
-    if config.weights.edge and image.outline is None:
-        image = replace(image, outline=outline_root(image.masks))
     known = SceneEvidence(objects, camera, image, humans)
     config = active_config(config, known)
     kernel = fused_energy(known, config)

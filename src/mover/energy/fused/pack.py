@@ -10,9 +10,8 @@ from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.fused.launch import BORDER, FusedEnergy, Room
 from mover.energy.objective import SCENE_TERMS, HumanCues, ImageCues
 from mover.energy.terms import bbox, border, contact, depth, distance, scale
-from mover.energy.terms.collision import SAMPLES
+from mover.energy.terms.collision import SAMPLES, collision_share
 from mover.energy.terms.contact import ContactPoints
-from mover.energy.terms.factors import factors
 from mover.geometry.nearest_warp import packed
 from mover.geometry.volume import Volume, field_of
 from mover.geometry.warp_start import array, started
@@ -185,15 +184,14 @@ def _field(volume: Volume) -> Any:  # noqa: ANN401
 def _facts(objects: Objects, image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Tensor:
     """See `kernels.given.SIZE` and those after it."""
     n, boxes = len(objects.ids), image.boxes
-    many = factors(objects, humans.touches if weights.contact else None, "robust")
-    facts = torch.zeros(n, 7)
+    share = collision_share(objects, humans.touches if weights.contact else None)
+    facts = torch.zeros(n, 6)
     facts[:, 0] = (boxes[:, 2:] - boxes[:, :2]).clamp_min(1).prod(-1).sqrt()
-    facts[:, 1] = many.depth
-    facts[:, 2] = many.collision * SAMPLES / max(1, objects.samples.shape[1])
+    facts[:, 1] = share * SAMPLES / max(1, objects.samples.shape[1])
     if image.distance is not None:
-        facts[:, 3] = image.distance.clamp_min(1e-3).log()
+        facts[:, 2] = image.distance.clamp_min(1e-3).log()
     touches: ContactPoints | None = humans.touches
     if touches is not None:
-        facts[touches.object_of, 4:6] = touches.heading
-        facts[touches.object_of, 6] = (touches.heading.square().sum(-1) > 0).to(facts)
+        facts[touches.object_of, 3:5] = touches.heading
+        facts[touches.object_of, 5] = (touches.heading.square().sum(-1) > 0).to(facts)
     return facts

@@ -3,7 +3,6 @@ r"""Objects fill their detected 2D boxes (supplement, "Loss Terms").
 Price:     L_bbox = \sum_i \| Proj_i^a - Det_i^a \|,  a in {x_min, y_min, width}
 Paper:     Proj_i is the projected 3D box (its eight corners); an l1 norm, in pixels of an image
            that is 640 wide.
-Release:   Proj_i is the extent of the projected mesh; smooth l1 with a knee of one pixel.
 Robust:    extent of the mesh, all four sides, each divided by the box's size \sqrt{w h}, so that
            near and far objects count alike. Where the image's border or something in front may hide
            more of the object, it reaches at least as far as it is seen, and may reach farther:
@@ -41,7 +40,7 @@ def bbox_term(
         detected: x_min, y_min, x_max, y_max [px].
         sides: `UNKNOWN`, `SEEN`, `LEAST` or `LIKELY`; an object without a box costs nothing.
         width: Width of the image [px].
-        form: How it is priced; [px at 640] for `paper` and `release`, else box sizes.
+        form: How it is priced; [px at 640] for `paper`, else box sizes.
         wider: How far the true sides lie outside the detected ones [px] (`robust` only).
     """
     drawn = torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
@@ -55,8 +54,6 @@ def bbox_term(
         free = (sides == UNKNOWN) | ((sides == LEAST) & (off * outward > 0))
         return (price * ~free).sum(-1)
     off = (_corner_and_width(drawn) - _corner_and_width(detected)).abs() * (WIDTH / width)
-    if form == "release":
-        off = torch.where(off < 1, 0.5 * off.square(), off - 0.5)
     return off.sum(-1) * sides.any(-1)
 
 

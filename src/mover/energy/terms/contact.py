@@ -8,8 +8,6 @@ Price:     L_contact = \sum_i \sum_v I(v, O_i)
 Paper:     CD is a mean over its source points, which the sum prints: all touching skin of the
            people, of which I(v, O_i) picks what touches this object. So what many bodies touch
            weighs more than what a few stray vertices touch. Body and hands together.
-Release:   from each point of the object's part to the nearest body point, its mean; body and hands
-           apart.
 Robust:    the mean of a Geman-McClure price (rho 0.3 m) from body to object, in full only once four
            bodies touch, the back a quarter of the seat; so that contact neither drags an object by
            a few wrong points nor rules its size. `heading_term` turns seats with their sitters
@@ -84,15 +82,12 @@ def contact_term(
     Args:
         regions: Points of the top and of the back of each object, placed [m].
         touches: The body points.
-        form: `paper` and `release` [m], `robust` [1].
+        form: `paper` [m], `robust` [1].
     """
     top, back = (r[..., touches.object_of, :, :].unsqueeze(-3) for r in regions)
     parts = torch.cat([top, back, top, back], -3)  # *starts touched 4 region 3
-    if form == "release":
-        price = _to_bodies(parts, touches)
-    else:
-        near = _nearest(touches.points.expand(*parts.shape[:-2], -1, 3), parts)
-        price = _price(near, touches, form)
+    near = _nearest(touches.points.expand(*parts.shape[:-2], -1, 3), parts)
+    price = _price(near, touches, form)
     total = torch.zeros_like(regions[0][..., 0, 0])
     return total.index_add(-1, touches.object_of, price)
 
@@ -103,7 +98,7 @@ def gap_term(
     objects: int,
     form: Variant,
 ) -> Float[Tensor, "*starts objects"]:
-    """`contact_term` of `paper` and `robust`, from distances that are known [m]."""
+    """`contact_term` from distances that are known [m]."""
     price = _price(gaps, touches, form)
     total = price.new_zeros(*price.shape[:-1], objects)
     return total.index_add(-1, touches.object_of, price)
@@ -117,13 +112,6 @@ def _price(near: Tensor, touches: ContactPoints, form: Variant) -> Float[Tensor,
     mean = (geman_mcclure(near, RHO) * touches.weight).sum(-1)
     mean = mean / touches.weight.sum(-1).clamp_min(1e-9)
     return (mean * share).sum(-1) * (touches.bodies / ENOUGH).clamp_max(1)
-
-
-def _to_bodies(parts: Tensor, touches: ContactPoints) -> Float[Tensor, "*starts touched"]:
-    far_away = torch.where(touches.weight.unsqueeze(-1) > 0, touches.points, 1e3)
-    near = _nearest(parts, far_away.expand(*parts.shape[:-2], -1, 3))
-    known = (touches.weight > 0).any(-1)
-    return (near.mean(-1) * known).sum(-1)
 
 
 def _nearest(

@@ -7,8 +7,6 @@ Evidence:  far(p) = min_t D_far^t(p),  near(p) = max_t D_near^t(p), gathered onc
 Price:     L_depth = \sum_i \sum_{q in Sil_i, M_i} ReLU(D_i(q) - far(q)) + ReLU(near(q) - D_i(q))
 Paper:     both bounds act on D_i, the front surface; pixels of an image that is 640 wide. Where
            near(p) > far(p) there is no range to lie in, and the pixel says nothing.
-Release:   the far bound acts on the back surface, both are clamped at 2 m, the region is eroded
-           by a pixel, and a third map keeps objects behind people outside their masks (`free`).
 Robust:    mean over the constrained pixels (at least 100), 2 cm margin, clamped at 2 m; pixels
            whose bounds contradict each other are dropped. What is missing from a person's mask
            counts as hidden only where it is thicker than the error of an outline (`Seen.reach`).
@@ -24,7 +22,7 @@ from mover.core.records import record
 from mover.energy.config import Variant
 from mover.geometry.raster import Depths
 
-CLAMP = 2.0  # [m], the authors' release
+CLAMP = 2.0  # [m], the authors' released code
 MARGIN = 0.02  # [m], slack of the robust form
 FEWEST = 100.0  # pixels by which the robust form divides at least
 
@@ -47,8 +45,6 @@ class DepthRange:
 
     near: Float[Tensor, "objects h w"]
     far: Float[Tensor, "objects h w"]
-    free: Float[Tensor, "objects h w"]
-    """Lower bound outside the object's mask (`release` only) [m]."""
     area: Float[Tensor, " objects"]
     """Area of a window pixel in pixels of an image that is 640 wide."""
 
@@ -108,10 +104,6 @@ def depth_term(
 ) -> Float[Tensor, "*starts objects"]:
     """Distance out of the allowed range [m px at 640], or its mean [m] (`robust`)."""
     inside = seen.covered & (mask > 0.5)
-    if form == "release":
-        inside = _erode(inside)
-        out = _short(allowed.near, seen.nearest, CLAMP) + _short(seen.farthest, allowed.far, CLAMP)
-        return (out * inside).sum((-2, -1)) * allowed.area
     if form == "robust":
         sane = allowed.near < allowed.far
         bounded = inside & sane & (allowed.near.isfinite() | allowed.far.isfinite())
@@ -121,14 +113,6 @@ def depth_term(
     ranged = inside & (allowed.near <= allowed.far)
     out = _short(allowed.near, seen.nearest) + _short(seen.nearest, allowed.far)
     return (out * ranged).sum((-2, -1)) * allowed.area
-
-
-def free_space_term(
-    seen: Depths, mask: Float[Tensor, "objects h w"], allowed: DepthRange
-) -> Float[Tensor, "*starts objects"]:
-    """Depth in front of people seen beside the object's mask [m px at 640] (`release` only)."""
-    outside = _erode(_erode(seen.covered & (mask <= 0.5)))
-    return (_short(allowed.free, seen.nearest, CLAMP) * outside).sum((-2, -1)) * allowed.area
 
 
 def _short(

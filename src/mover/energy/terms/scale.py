@@ -2,7 +2,6 @@ r"""Objects keep their initial size (supplement, "Loss Terms").
 
 Price:     L_scale = \sum_i \| s_i / s_i^{init} - 1 \|_2
 Paper:     the norm as printed (its square root is rounded off below one millionth).
-Release:   the squared norm.
 Robust:    in logarithms, so that half and double cost the same; an object that grows or shrinks as
            a whole pays less than half of what it pays for a change of shape (g = 1.5), and sizes
            beyond 0.6 or 1.6 of the initial one cost steeply more:
@@ -29,8 +28,6 @@ def scale_term(
     """Distance of the size from the initial one [1]; `growth`: price of all three together."""
     if form == "paper":
         return safe_norm(log_scale.exp() - 1)
-    if form == "release":
-        return (log_scale.exp() - 1).square().sum(-1)
     mean = log_scale.mean(-1, keepdim=True)
     out = (log_scale - HIGHEST).relu() + (LOWEST - log_scale).relu()
     shape = (log_scale - mean).square().sum(-1)

@@ -4,8 +4,6 @@ Price:     L_occ-sil = \sum_i \sum_q keep_i(q) (Sil_i(q) - M_i(q))^2
 Evidence:  M_i, the mask in a square window around the object's box; keep_i is 0 where another
            object, or a person, may hide this one, and beyond the border of the image.
 Paper:     the sum over a window of 256 x 256 pixels.
-Release:   the same, with an edge term of its own weight (`edge_term`) and with everything beyond
-           the border counted as background.
 Robust:    divided by the number of mask pixels, so that resolution and size carry no weight.
 
 The gradient is exact (rendering, docs/method.md), hence 10-14 times smaller than that of the
@@ -20,8 +18,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mover.energy.config import Variant
-
-RING = 7  # [px], PHOSA's window for the ring around a silhouette
 
 
 def silhouette_term(
@@ -66,45 +62,3 @@ class _Squares(torch.autograd.Function):
     ) -> tuple[Tensor, None, None]:
         (gap,) = ctx.saved_tensors
         return gap * (2 * grads[0][..., None, None]), None, None
-
-
-def edge_term(
-    drawn: Float[Tensor, "*starts objects h w"],
-    mask: Float[Tensor, "objects h w"],
-    keep: Bool[Tensor, "objects h w"],
-    outline: Float[Tensor, "objects h w"] | None = None,
-) -> Float[Tensor, "*starts objects"]:
-    """One-way distance of the drawn outline from the detected one (PHOSA) [px^1.5].
-
-    Half the sum of the outer ring of the kept silhouette times the root of the distance to the
-    ring of the mask. Only the `release` preset gives it a weight.
-
-    Args:
-        drawn: Silhouettes.
-        mask: Detected coverage.
-        keep: What is outside counts as empty.
-        outline: `outline_root` of the mask; None: it is found anew.
-    """
-    root = outline_root(mask).to(drawn) if outline is None else outline
-    return 0.5 * (_ring(drawn * keep) * root).sum((-2, -1))
-
-
-def outline_root(mask: Float[Tensor, "objects h w"]) -> Float[Tensor, "objects h w"]:
-    """Root of the distance to the ring of the mask [px^0.5]."""
-    return _distance_to(_ring((mask > 0.5).to(mask))).sqrt()
-
-
-def _ring(image: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w"]:
-    """What the highest pixel around exceeds each by; rows first, which finds the same pixel."""
-    flat, reach = image.reshape(-1, 1, *image.shape[-2:]), RING // 2
-    grown = torch.nn.functional.max_pool2d(flat, (1, RING), stride=1, padding=(0, reach))
-    grown = torch.nn.functional.max_pool2d(grown, (RING, 1), stride=1, padding=(reach, 0))
-    return grown.reshape(image.shape) - image
-
-
-def _distance_to(edges: Float[Tensor, "objects h w"]) -> Float[Tensor, "objects h w"]:
-    """Euclidean distance to the nearest edge pixel [px]."""
-    from scipy.ndimage import distance_transform_edt
-
-    maps = [torch.from_numpy(distance_transform_edt((e == 0).cpu().numpy())) for e in edges]
-    return torch.stack(maps).to(edges)

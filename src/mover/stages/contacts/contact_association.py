@@ -1,10 +1,11 @@
 """Which object each touching group of body parts touches (Sec. 3.1, "Contact constraint").
 
-`vertex` (paper) decides for every vertex, `release` by the rules of `decide_by_release`, `group`
-(robust) once for each body and group of parts, so that single wrong vertices have no say, and lets
-only seats take a sitter and only other furniture a hand. A body's back touches what its seat
-touches. Hands that rest in the air and backs that lean on nothing are the commonest false contacts
-of bodies with a few degrees of pose error: they touch only what is within reach.
+`vertex` decides for every vertex, `mask_hits` (paper) by the rules of the authors' released code
+(`decide_by_mask_hits`), `group` (robust) once for each body and group of parts, so that single
+wrong vertices have no say, and lets only seats take a sitter and only other furniture a hand. A
+body's back touches what its seat touches. Hands that rest in the air and backs that lean on nothing
+are the commonest false contacts of bodies with a few degrees of pose error: they touch only what is
+within reach.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +18,6 @@ from mover.bodies.parts import Parts
 from mover.bodies.skin import PARTS
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Layout, Objects, People
-from mover.energy.terms.factors import CHAIRS
 from mover.geometry.boxes import iou2d
 from mover.geometry.camera import at_pixels, project, to_camera
 from mover.geometry.placement import place
@@ -37,6 +37,7 @@ from mover.stages.masks import mask_table, small_boxes, small_camera, small_mask
 #    touched, unless the mean squared distance to it is above 1 m^2.
 # 4. A single candidate is touched if more than 20 vertices hit, however far it is.
 
+CHAIRS = ("chair", "armchair", "office chair", "stool")  # one class in the authors' detector
 TABLES = ("table", "coffee table", "dining table", "round table", "desk")
 KEPT = (*CHAIRS, *TABLES, "bed", "sofa")
 SHARE = 0.05  # of the hits of the best candidate
@@ -57,7 +58,7 @@ class Candidates:
     """Placed in the world [m]; padding is far away."""
 
 
-def decide_by_release(
+def decide_by_mask_hits(
     points: Float[Tensor, "verts 3"],
     pixels: Int[Tensor, "verts 2"],
     person: Bool[Tensor, "h w"] | None,
@@ -134,7 +135,7 @@ GROUPS = (
     ("right_palm", "right_forearm"),
 )
 FEWEST = 5  # vertices that a group must have to touch at all
-RELEASE_GROUPS = (
+MASK_HIT_GROUPS = (
     ("seat", "left_thigh", "right_thigh", "back"),
     ("left_palm", "right_palm", "left_forearm", "right_forearm"),
 )
@@ -155,7 +156,7 @@ class AssignInputs:
     objects: Objects
     layout: Layout
     people: People | None = None
-    """Their masks (`release`)."""
+    """Their masks (`mask_hits`)."""
 
 
 @record
@@ -201,13 +202,13 @@ class _Rivals:
     tops: Float[Tensor, "objects region 3"]
     backs: Float[Tensor, "objects region 3"]
     plain: Candidates
-    """For the rules of the release."""
+    """For the rule `mask_hits`."""
 
 
 def contact_rows(inputs: AssignInputs, config: AssignConfig) -> Iterator[ContactRows]:
     """All touching vertices with their objects, one group of one body at a time."""
     rivals = _rivals(inputs)
-    groups = RELEASE_GROUPS if config.by == "release" else GROUPS
+    groups = MASK_HIT_GROUPS if config.by == "mask_hits" else GROUPS
     members = [
         torch.isin(inputs.parts.part_of, torch.tensor([PARTS.index(n) for n in names]))
         for names in groups
@@ -236,7 +237,7 @@ def contact_rows(inputs: AssignInputs, config: AssignConfig) -> Iterator[Contact
 def _bodies(inputs: AssignInputs, config: AssignConfig, asked: Sequence[int]) -> Iterator[_Body]:
     camera, bodies = small_camera(inputs.camera), inputs.bodies
     table = None
-    if config.by == "release" and inputs.people is not None:
+    if config.by == "mask_hits" and inputs.people is not None:
         table = mask_table(inputs.people, bodies)
     for index in asked:  # one at a time: memory stays that of one
         points = bodies.verts[index]
@@ -264,8 +265,9 @@ def _decide(
     part: _Group, rivals: _Rivals, objects: Objects, config: AssignConfig
 ) -> Int[Tensor, " verts"]:
     """Index of the object that each vertex touches, -1 for none."""
-    if config.by == "release":
-        one = decide_by_release(part.points, part.pixels, part.mask, rivals.plain, arms=part.hands)
+    if config.by == "mask_hits":
+        plain = rivals.plain
+        one = decide_by_mask_hits(part.points, part.pixels, part.mask, plain, arms=part.hands)
         return torch.full_like(part.pixels[:, 0], one)
     grown, shown = at_pixels(rivals.grown, part.pixels)
     over = grown & shown

@@ -221,7 +221,6 @@ def cues_in_windows(
         depth = DepthRange(
             sample_nearest(cues.maps.near, views, K, lowest),
             sample_nearest(cues.maps.far, views, K, -lowest),
-            sample_nearest(cues.maps.free, views, K, lowest),
             scale.square(),
         )
     return HumanCues(depth, cues.space, touches)

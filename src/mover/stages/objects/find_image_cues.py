@@ -10,7 +10,6 @@ from mover.core.types import Camera, Capture
 from mover.energy.objective import ImageCues
 from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.terms.border import borders_of
-from mover.energy.terms.silhouette import outline_root
 from mover.geometry.crops import area_mean, crop_views
 from mover.geometry.rle import decode, tight_box
 from mover.geometry.warp_start import mapped
@@ -127,8 +126,6 @@ def find_image_cues(
     )
     inside = inside > 0.999
     known = inputs.masks.any(-1).any(-1)[:, None, None]
-    if config.form == "release":
-        own, hidden, inside = (own - hidden > 0).float(), (own < hidden).float(), inside | True
     keep = (hidden < 1e-6) & inside & known
     sides = torch.where(inputs.seen, SEEN, UNKNOWN).unsqueeze(-1).expand(-1, 4)
     beside = None
@@ -138,13 +135,12 @@ def find_image_cues(
         if config.bounded:
             beside = torch.stack([touched, _near(inputs, others)], -1)
     trust = torch.ones(len(own))
-    outline = outline_root(own) if config.form == "release" else None
     borders = None
     if config.borders:
         zoom = views.K[:, 0, 0] / inputs.camera.K[0, 0]
         borders = borders_of(own, zoom, config.borders)
     return ImageCues(
-        inputs.boxes, sides, views, own, keep, trust, inputs.distance, outline, borders,
+        inputs.boxes, sides, views, own, keep, trust, inputs.distance, borders,
         beside=beside,
     )  # fmt: skip
 

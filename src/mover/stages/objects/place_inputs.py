@@ -11,7 +11,6 @@ from mover.core.types import Camera, Layout, Objects
 from mover.energy.objective import HumanCues, ImageCues
 from mover.energy.terms.border import Borders
 from mover.energy.terms.depth import DepthRange
-from mover.energy.terms.silhouette import outline_root
 from mover.energy.terms.wall import Walls
 from mover.geometry.raster import Crops
 from mover.stages.objects.starts import merged
@@ -105,7 +104,6 @@ def coarser_image(image: ImageCues, factor: int) -> ImageCues:
     small = Crops(views.K * zoom, views.height // factor, views.width // factor)
     masks = _tiles(image.masks, factor).mean((-3, -1))
     keep = _tiles(image.keep, factor).all(-1).all(-2)
-    outline = None if image.outline is None else outline_root(masks)
     borders = image.borders
     if borders is not None:
         borders = Borders(borders.shifts, _tiles(borders.masks, factor).mean((-3, -1)))
@@ -114,7 +112,7 @@ def coarser_image(image: ImageCues, factor: int) -> ImageCues:
         measured = replace(measured, depth=_middles(measured.depth, factor))
     further = tuple(replace(v, image=coarser_image(v.image, factor)) for v in image.further)
     return replace(
-        image, views=small, masks=masks, keep=keep, outline=outline, borders=borders,
+        image, views=small, masks=masks, keep=keep, borders=borders,
         measured=measured, further=further,
     )  # fmt: skip
 
@@ -123,8 +121,8 @@ def coarser_humans(humans: HumanCues, factor: int) -> HumanCues:
     """The same with the bounds of the depth at one pixel of each tile."""
     if factor == 1 or humans.depth is None:
         return humans
-    near, far, free = (_middles(getattr(humans.depth, k), factor) for k in ("near", "far", "free"))
-    depth = DepthRange(near, far, free, humans.depth.area * factor**2)
+    near, far = (_middles(bound, factor) for bound in (humans.depth.near, humans.depth.far))
+    depth = DepthRange(near, far, humans.depth.area * factor**2)
     return replace(humans, depth=depth)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from mover.core.observe import Energy, Observer, Step, silent
 from mover.core.records import to_device
 from mover.core.types import Camera, Layout, Objects
-from mover.energy.config import Adam, BatchedBFGS, SceneConfig, Variant, only
+from mover.energy.config import Adam, BatchedBFGS, SceneConfig
 from mover.energy.fused.energy import energy_function, energy_of_rows, never_asks
 from mover.energy.minimize import Minimum, minimize
 from mover.energy.newton import Problems, settle
@@ -181,34 +181,9 @@ def _sections(objects: Objects, index: int) -> Sections:
     return sections_of(objects.verts[index][objects.real_verts[index]].float(), faces)
 
 
-# Ranges of the scales, and unknowns that cannot leave them (release).
-
-
-def spans_of(objects: Objects, span: float, chair_span: float) -> Float[Tensor, " objects"]:
-    """Range of the scale of each object, 0 where it is free."""
-    spans = [chair_span if c == "chair" else span for c in objects.categories]
-    return torch.tensor(spans, device=objects.size.device)
-
-
-def bounded(free: Layout, span: Float[Tensor, " objects"]) -> Layout:
-    """Scales s = 1 + span (sigmoid(x) - 1/2), where there is a span."""
-    wide = span.unsqueeze(-1)
-    scale = 1 + wide * (free.log_scale.sigmoid() - 0.5)
-    return replace(free, log_scale=torch.where(wide > 0, scale.log(), free.log_scale))
-
-
-def unbounded(layout: Layout, span: Float[Tensor, " objects"]) -> Layout:
-    """The inverse of `bounded` (the release codes it without its denominator, by mistake)."""
-    wide = span.unsqueeze(-1)
-    share = (layout.log_scale.exp() - 1) / wide.clamp_min(1e-6) + 0.5
-    return replace(
-        layout, log_scale=torch.where(wide > 0, share.clamp(0.01, 0.99).logit(), layout.log_scale)
-    )
-
-
 def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = silent) -> Placed:
     """Minimise Eq. 1 over the layout, from one start or from many."""
-    inputs = with_trees(inputs, config.form)
+    inputs = with_trees(inputs)
     found = descend(inputs, config, starts_left(inputs, config, observe), config.method, observe)
     for number in range(config.perturbation_rounds if config.perturbations else 0):
         around = shaken(best_few(found.at, found.value, 1), config.perturbations, number)
@@ -240,10 +215,7 @@ def _best_first(found: Minimum[Layout], inputs: PlaceInputs, config: PlaceConfig
 
 def starts_left(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = silent) -> Layout:
     """The starts of the main descents: spread, and thinned out by short descents."""
-    starts = inputs.starts
-    if config.first.steps:
-        starts = _by_boxes(inputs, config, starts, observe)
-    starts = spread_distance(starts, config.distances)
+    starts = spread_distance(inputs.starts, config.distances)
     if config.yaws > 1:
         starts = spread(starts, config.yaws)
     if not config.short.steps:
@@ -259,7 +231,7 @@ def starts_left(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = si
 
 def without_search(config: PlaceConfig) -> PlaceConfig:
     """The same from the starts as they are."""
-    return replace(config, first=Adam(0), yaws=1, distances=(), short=Adam(0))
+    return replace(config, yaws=1, distances=(), short=Adam(0))
 
 
 def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
@@ -291,10 +263,9 @@ def descend(
     observe: Observer,
 ) -> Minimum[Layout]:
     """Follow the energy from each start; the result stands on its supports."""
-    span = spans_of(inputs.objects, config.span, config.chair_span)
 
     def at(free: Layout) -> Layout:
-        return standing(inputs, bounded(free, span))
+        return standing(inputs, free)
 
     def watched(step: Step) -> None:
         free = step.at
@@ -304,38 +275,29 @@ def descend(
     def moment(layout: Layout) -> Moment:
         return to_device(Moment(layout, inputs.camera, inputs.ground), "cpu")
 
-    begin = unbounded(starts, span)
     if isinstance(method, BatchedBFGS):
-        found = settle(_problems(inputs, config, begin), method, watched, "place_objects")
+        found = settle(_problems(inputs, config, starts), method, watched, "place_objects")
     else:
-        energy = _free_energy(inputs, config)
+        energy = energy_of(inputs, config)
         still = never_asks(inputs.objects)
-        found = minimize(energy, begin, method, watched, "place_objects", still=still)
+        found = minimize(energy, starts, method, watched, "place_objects", still=still)
     return Minimum(at(found.at), found.value, found.trace)
 
 
-def with_trees(inputs: PlaceInputs, form: Variant = "robust") -> PlaceInputs:
+def with_trees(inputs: PlaceInputs) -> PlaceInputs:
     """The inputs with search trees of what is touched, where these help."""
     humans = inputs.humans
-    if humans.touches is None or form == "release":
+    if humans.touches is None:
         return inputs
     trees = trees_of(inputs.objects, humans.touches)
     return replace(inputs, humans=replace(humans, trees=trees))
-
-
-def _free_energy(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
-    """The energy as a function of the unknowns of a descent."""
-    span = spans_of(inputs.objects, config.span, config.chair_span)
-    energy = energy_of(inputs, config)
-    return (lambda free: energy(bounded(free, span))) if bool(span.any()) else energy
 
 
 def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Problems[Layout]:
     """Each start of each object as a problem of its own; loads belong to their carriers."""
     starts, n = begin.yaw.shape
     some_energy = energy_of_rows(*_evidence(inputs), priced(config))
-    span = spans_of(inputs.objects, config.span, config.chair_span)
-    objects, ranged = inputs.objects, bool(span.any())
+    objects = inputs.objects
 
     def of(rows: Tensor) -> Callable[[Layout], Energy]:
         index, energy = rows % n, some_energy(rows)
@@ -343,7 +305,7 @@ def _problems(inputs: PlaceInputs, config: PlaceConfig, begin: Layout) -> Proble
         pinned = inputs.pinned and of_objects(inputs.pinned, index, n)
 
         def price(free: Layout) -> Energy:
-            held = hold(bounded(free, span[index]) if ranged else free, pinned)
+            held = hold(free, pinned)
             return energy(rest_on_support(held, supports, heights, inputs.ground))
 
         return price
@@ -362,19 +324,3 @@ def some_inputs(inputs: PlaceInputs, rows: Int[Tensor, " rows"]) -> PlaceInputs:
     few = of_objects(replace(inputs, humans=HumanCues()), rows, n)
     humans = of_objects(inputs.humans, rows, n)
     return replace(few, objects=some_objects(inputs.objects, rows), humans=humans)
-
-
-def _by_boxes(
-    inputs: PlaceInputs, config: PlaceConfig, starts: Layout, observe: Observer
-) -> Layout:
-    """Release: the places alone, by the box term alone."""
-    energy = energy_of(inputs, replace(config, weights=only(bbox=600.0)))
-
-    def at(free: Layout) -> Layout:
-        return replace(starts, t_world_object=free.t_world_object)
-
-    found = minimize(
-        lambda free: energy(at(free)), starts, config.first, observe, "place_objects",
-        still=never_asks(inputs.objects),
-    )  # fmt: skip
-    return at(found.at)

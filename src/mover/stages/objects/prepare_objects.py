@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,8 +30,7 @@ from mover.stages.config import PrepareConfig
 # Sofas and chairs are touched at the seat and the back, beds, tables and the rest on their top. The
 # parts follow from the normals of even surface points: up for seats and tops, forward for backs.
 
-UPRIGHT = 0.866  # cosine of 30 degrees: normals of a seat or a back in the `level` rule
-STEEP = 0.966  # cosine of 15 degrees: the same in the release
+UPRIGHT = 0.866  # cosine of 30 degrees: normals of a seat or a back
 MISSING = 0.15  # of the height: a corner that hangs higher has no foot
 LEVEL = 0.005  # of the height: feet that differ by less stand level
 LAYER = 0.05  # [m], thickness of the layer that is one seat
@@ -52,20 +50,14 @@ def find_regions(
     points: Float[Tensor, "points 3"],
     normals: Float[Tensor, "points 3"],
     category: str,
-    rule: Literal["level", "release"],
 ) -> Regions:
     """Seat or top, and back, of one object.
 
-    `level`: the seat is the largest level layer above a quarter of the height, so that neither
-    arms nor the back's rim count; a top is the highest layer with a quarter of the largest one's
-    area. `release`: normals within 15 degrees above a third of the height; of those, chairs, sofas
-    and beds keep the points below the mean height, others those above it.
+    The seat is the largest level layer above a quarter of the height, so that neither arms nor the
+    back's rim count; a top is the highest layer with a quarter of the largest one's area.
     """
-    if rule == "release":
-        top, back = _by_means(points, normals, category)
-    else:
-        top = _level(points, normals, category)
-        back = _behind(points, normals, points[top])
+    top = _level(points, normals, category)
+    back = _behind(points, normals, points[top])
     if category not in BACKS:
         back = torch.zeros_like(back)
     return Regions(points[top], points[back], bool(top.any()), bool(back.any()))
@@ -95,21 +87,6 @@ def _behind(
         return torch.zeros(len(points), dtype=torch.bool)
     above = points[:, 1] > seat[:, 1].mean() + LAYER
     return (normals[:, 2] > UPRIGHT) & above & (points[:, 2] < seat[:, 2].mean())
-
-
-def _by_means(
-    points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], category: str
-) -> tuple[Bool[Tensor, " points"], Bool[Tensor, " points"]]:
-    y, z = points[:, 1], points[:, 2]
-    high = y > y.max() / 3
-    top, back = high & (normals[:, 1] > STEEP), high & (normals[:, 2] > STEEP)
-    if top.any():
-        mean = y[top].mean()
-        below = category in ("chair", "sofa", "bed")
-        top = top & ((y <= mean) if below else (y >= mean))
-    if back.any():
-        back = back & (z <= z[back].mean())
-    return top, back
 
 
 @record
@@ -251,7 +228,7 @@ def _proxy(piece: SceneObject, config: PrepareConfig, close: Callable[[Mesh], Me
     if config.level_feet:
         mesh = levelled(mesh)
     points, normals = sample_surface(mesh, 4 * config.samples)
-    regions = find_regions(points, normals, canonical(piece.category), config.rule)
+    regions = find_regions(points, normals, canonical(piece.category))
     samples, _ = sample_surface(mesh, config.samples)
     return _Proxy(mesh, edges_of(mesh.faces), samples, _thin(regions, config.region), center)
 

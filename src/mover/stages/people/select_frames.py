@@ -7,8 +7,8 @@ Reading:   A body departs from constant velocity because it is pushed (metres pe
            difference is `jitter + acceleration * h^2`, h the time between frames: 0.21 m for the
            pelvis at 30 frames a second (authors: 0.18 m at any rate) and 0.6 m at 5, where
            an honest step down makes 0.31 m and a jump by half a metre 1 m. Local joints are
-           measured by the mean of their lengths; the mean vector of the authors' code (limit
-           0.09 m, less noise) does not see that left and right are swapped.
+           measured by the mean of their lengths: their mean vector, which the authors' code
+           takes, does not see that left and right are swapped.
 Departure: A wrong frame also spoils the second differences of its neighbours. `chain` keeps the
            longest sequence of frames that is consistent; `each` judges every frame by itself.
 """
@@ -87,16 +87,10 @@ def _points(bodies: Bodies) -> Points:
 def _select(time: Float[np.ndarray, " frames"], points: Points, config: SelectConfig) -> np.ndarray:
     if config.rule == "each":
         inner = np.arange(1, len(time) - 1)
-        strain = np.zeros(len(time))
-        strain[1:-1] = _strain(time, points, (inner - 1, inner, inner + 1), config)
-        keep = _eroded(strain < 1, config.erode)
-    else:
-        keep = _longest(time, points, config)
-        strain = np.zeros(len(time))
-        at = np.flatnonzero(keep)
-        if len(at) > 2:
-            strain[at[1:-1]] = _strain(time, points, (at[:-2], at[1:-1], at[2:]), config)
-    return _steadiest(time, keep, strain, config.window)
+        keep = np.ones(len(time), dtype=bool)
+        keep[1:-1] = _strain(time, points, (inner - 1, inner, inner + 1), config) < 1
+        return keep
+    return _longest(time, points, config)
 
 
 def _strain(
@@ -112,30 +106,11 @@ def _strain(
     straight = points[i] * to_i[..., None, None] + points[k] * to_k[..., None, None]
     second, area = 2 * (points[j] - straight), h1 * h2  # a h1 h2 [m]
     pelvis, joints = np.linalg.norm(second[..., 0, :], axis=-1), second[..., 1:, :]
-    if config.local == "vector":
-        joints = joints.mean(-2, keepdims=True)
     local = np.linalg.norm(joints, axis=-1).mean(-1)
     return np.maximum(
         pelvis / (config.pelvis_jitter + config.pelvis_acceleration * area),
         local / (config.local_jitter + config.local_acceleration * area),
     )
-
-
-def _eroded(keep: np.ndarray, by: int) -> np.ndarray:
-    wrong = np.convolve(~keep, np.ones(2 * by + 1), mode="same") > 0.5
-    return ~wrong
-
-
-def _steadiest(time: np.ndarray, keep: np.ndarray, strain: np.ndarray, window: float) -> np.ndarray:
-    """Keep one frame of every window: the one with the least strain."""
-    if window <= 0:
-        return keep
-    chosen = np.zeros_like(keep)
-    part = np.floor((time - time[0]) / window + 1e-6).astype(int)
-    for one in np.unique(part[keep]):  # a few frames each
-        at = np.flatnonzero(keep & (part == one))
-        chosen[at[strain[at].argmin()]] = True
-    return chosen
 
 
 def _longest(time: np.ndarray, points: Points, config: SelectConfig) -> np.ndarray:

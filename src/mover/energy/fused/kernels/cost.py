@@ -27,7 +27,6 @@ from mover.energy.fused.kernels.given import (
     DISTANCE,
     FACES,
     HEADING,
-    ORDER,
     SCALE,
     SILHOUETTE,
     Answer,
@@ -112,8 +111,7 @@ def look_depth(
     cost, slope = depth_cost(given, work, p, drawn, neither == 0)
     if neither > 0:
         clear(work, work.behind, box)
-    order = given.facts[p.thing, ORDER]
-    return float(cost) * order, slope * order
+    return float(cost), slope
 
 
 @wp.func

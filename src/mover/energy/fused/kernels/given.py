@@ -8,7 +8,7 @@ from mover.geometry.kernels.scene import Scene, Scratch
 
 BBOX, SILHOUETTE, SCALE, DEPTH, COLLISION, CONTACT, DISTANCE, HEADING = range(8)
 VERTS, FACES, EDGES, SAMPLES, ASKED = range(5)  # columns of `Things.starts`
-SIZE, ORDER, BUMP, AWAY, FACE_X, FACE_Z, SEATED = range(7)  # columns of `Given.facts`
+SIZE, BUMP, AWAY, FACE_X, FACE_Z, SEATED = range(6)  # columns of `Given.facts`
 
 Slope = wp.types.vector(length=9, dtype=wp.float32)
 """Gradient of a place (3), of the yaw, of the logarithms of the scale (3), of turns about x, z."""

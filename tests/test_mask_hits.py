@@ -1,9 +1,9 @@
-"""Each rule of released_code: the object that a group of contact vertices touches."""
+"""Each rule of `mask_hits`: the object that a group of contact vertices touches."""
 
 import pytest
 import torch
 
-from mover.stages.contacts.contact_association import Candidates, decide_by_release
+from mover.stages.contacts.contact_association import Candidates, decide_by_mask_hits
 
 H, W = 40, 60
 
@@ -40,31 +40,31 @@ SHELF = ("shelf", (6, 6, 18, 18), (0.0, 0.0, 0.0))
 
 def test_a_single_candidate_needs_more_than_twenty_hits_and_may_be_far():
     far = room(("chair", (8, 8, 20, 20), (50.0, 0.0, 0.0)))
-    assert decide_by_release(points(20), pixels(20), PERSON, far, arms=False) == -1
-    assert decide_by_release(points(21), pixels(21), PERSON, far, arms=False) == 0
+    assert decide_by_mask_hits(points(20), pixels(20), PERSON, far, arms=False) == -1
+    assert decide_by_mask_hits(points(21), pixels(21), PERSON, far, arms=False) == 0
 
 
 def test_of_several_the_one_with_most_nearest_vertices_is_touched():
     objects = room(CHAIR, TABLE)
-    assert decide_by_release(points(5), pixels(5), PERSON, objects, arms=False) == 1
+    assert decide_by_mask_hits(points(5), pixels(5), PERSON, objects, arms=False) == 1
     near_chair = points(5, (0.3, 0.0, 0.0))
-    assert decide_by_release(near_chair, pixels(5), PERSON, objects, arms=False) == 0
+    assert decide_by_mask_hits(near_chair, pixels(5), PERSON, objects, arms=False) == 0
 
 
 def test_several_that_are_all_more_than_a_metre_away_are_not_touched():
     objects = room(CHAIR, TABLE)
-    assert decide_by_release(points(5, (1.0, 0, 0)), pixels(5), PERSON, objects, arms=False) == 0
-    assert decide_by_release(points(5, (1.4, 0, 0)), pixels(5), PERSON, objects, arms=False) == -1
+    assert decide_by_mask_hits(points(5, (1.0, 0, 0)), pixels(5), PERSON, objects, arms=False) == 0
+    assert decide_by_mask_hits(points(5, (1.4, 0, 0)), pixels(5), PERSON, objects, arms=False) == -1
 
 
 def test_arms_touch_tables_only():
-    assert decide_by_release(points(30), pixels(30), PERSON, room(CHAIR, TABLE), arms=True) == 1
-    assert decide_by_release(points(30), pixels(30), PERSON, room(CHAIR), arms=True) == -1
+    assert decide_by_mask_hits(points(30), pixels(30), PERSON, room(CHAIR, TABLE), arms=True) == 1
+    assert decide_by_mask_hits(points(30), pixels(30), PERSON, room(CHAIR), arms=True) == -1
 
 
 def test_other_classes_are_touched_only_without_a_rival():
-    assert decide_by_release(points(30), pixels(30), PERSON, room(SHELF), arms=False) == 0
-    assert decide_by_release(points(30), pixels(30), PERSON, room(SHELF, CHAIR), arms=False) == 1
+    assert decide_by_mask_hits(points(30), pixels(30), PERSON, room(SHELF), arms=False) == 0
+    assert decide_by_mask_hits(points(30), pixels(30), PERSON, room(SHELF, CHAIR), arms=False) == 1
 
 
 @pytest.mark.parametrize(("few", "touched"), [(1, 0), (2, 1)])
@@ -78,19 +78,19 @@ def test_candidates_with_at_most_a_twentieth_of_the_hits_fall_away(few, touched)
     where = pixels(21)
     where[:few] = torch.tensor([32, 10])
     person = rectangle(5, 5, 41, 30)
-    assert decide_by_release(points(21), where, person, objects, arms=False) == touched
+    assert decide_by_mask_hits(points(21), where, person, objects, arms=False) == touched
 
 
 def test_an_object_that_shares_no_pixel_with_the_person_is_no_candidate():
     elsewhere = rectangle(40, 30, 50, 38)
-    assert decide_by_release(points(30), pixels(30), elsewhere, room(CHAIR), arms=False) == -1
-    assert decide_by_release(points(30), pixels(30), None, room(CHAIR), arms=False) == 0
+    assert decide_by_mask_hits(points(30), pixels(30), elsewhere, room(CHAIR), arms=False) == -1
+    assert decide_by_mask_hits(points(30), pixels(30), None, room(CHAIR), arms=False) == 0
 
 
 def test_vertices_beyond_the_window_count_at_its_border():
     """The mask fills its window (1.3 boxes), so whatever lies outside hits."""
     objects = room(("chair", (8, 8, 18, 18), (0.0, 0.0, 0.0)))
     objects.masks[0] = rectangle(4, 4, 24, 24)
-    assert decide_by_release(points(30), pixels(30, 50, 35), PERSON, objects, arms=False) == 0
+    assert decide_by_mask_hits(points(30), pixels(30, 50, 35), PERSON, objects, arms=False) == 0
     objects.masks[0] = rectangle(8, 8, 18, 18)
-    assert decide_by_release(points(30), pixels(30, 50, 35), PERSON, objects, arms=False) == -1
+    assert decide_by_mask_hits(points(30), pixels(30, 50, 35), PERSON, objects, arms=False) == -1
