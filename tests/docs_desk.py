@@ -122,7 +122,6 @@ def write_scenes(desk: Path, room: KnownRoom) -> None:
     for name in ("SOURCE", "my_total3d"):
         layouts.write_total3d(desk / name, same)
     layouts.write_sam3d(desk / "sam3d", same)
-    layouts.write_gen3dsr(desk / "gen3dsr", same)
     layouts.write_holisticmesh(desk / "holisticmesh", same)
     layouts.write_glb(desk / "SCENE.glb", same)
     layouts.write_boxes(desk / "BOXES.json", same)

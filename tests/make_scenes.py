@@ -153,24 +153,6 @@ def write_sam3d(folder: Path, room: Room, *, kind: str = "npz", placed: bool = F
     return folder
 
 
-# --- Gen3DSR: vertices in a world of c2w; its camera is x right, y down, z forward ---
-def write_gen3dsr(folder: Path, room: Room, c2w: np.ndarray | None = None) -> Path:
-    home = folder / "reconstruction"
-    home.mkdir(parents=True)
-    c2w = np.eye(4) if c2w is None else c2w
-    for i, t in enumerate(room.things):
-        points = t.world @ room.R.T @ c2w[:3, :3].T + c2w[:3, 3]
-        mesh(points, t.faces).export(home / f"{i}_{t.category.replace(' ', '_')}.glb")
-    mesh(np.eye(3), np.array([[0, 1, 2]])).export(home / "background.ply")
-    mesh(np.eye(3), np.array([[0, 1, 2]])).export(home / "full_scene.glb")
-    K = room.K.copy()
-    K[:2, 2] -= 0.5  # pixels counted from the centre of the first
-    tree = {"K": K.tolist(), "c2w": c2w.tolist(), "W": room.size[0], "H": room.size[1]}
-    (folder / "cam_params.json").write_text(json.dumps(tree))
-    picture(room.size).save(folder / "input.png")
-    return folder
-
-
 # --- HolisticMesh (ZZWENG/holistic_mesh, code/main.py, scene_model.py `inference` and
 # `get_scene_mesh`, utils.py `render_image`): one mesh of all pieces, each with the vertices of a
 # sphere of 2562, right, down, forward of the flipped picture; boxes of the picture as stored ---

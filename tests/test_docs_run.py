@@ -56,7 +56,6 @@ SWAPS = {
     "mover import sam3d FOLDER --out C --image I.jpg --fov 60 --objects-masks MASKS": {
         "FOLDER": "sam3d", "C": "NEW", "MASKS": "MASKS.json",
     },
-    "mover import gen3dsr FOLDER --out C": {"FOLDER": "gen3dsr", "C": "NEW"},
     "mover import holisticmesh FOLDER --out C": {"FOLDER": "holisticmesh", "C": "NEW"},
     "mover import glb SCENE.glb --out C [--camera K] [--up z]": {
         "C": "NEW", "[--camera": "--camera", "K]": "CAPTURE/camera.json", "[--up": "", "z]": "",

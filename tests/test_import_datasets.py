@@ -11,15 +11,18 @@ from PIL import Image
 from test_import_scenes import check_truth, imported
 from test_import_scenes import plain as plain  # the fixture
 
+import mover.io.formats
+from mover.app.cli import run_command
 from mover.core.errors import InputError
 from mover.geometry.placement import place_object
 from mover.geometry.volume import sample
 from mover.io.capture.evidence import gather_evidence
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
-from mover.io.datasets.pigraphs import NAMES, capsule_people, read_segments
-from mover.io.datasets.prox_files import read_sdf, recordings_of
-from mover.io.datasets.true_boxes import FLOOR
+from mover.io.formats import names
+from mover_bench.datasets.pigraphs import NAMES, capsule_people, read_segments
+from mover_bench.datasets.prox_files import read_sdf, recordings_of
+from mover_bench.datasets.true_boxes import FLOOR
 
 RECORDING = "MPH8_00034_01"
 
@@ -176,3 +179,13 @@ def test_parts_of_an_object_become_one_box(plain: layouts.Room, tmp_path: Path) 
     for box, thing in zip(boxes, known, strict=True):
         size = thing.scale * np.ptp(thing.verts, axis=0)
         assert np.allclose(sorted(2 * box.half), sorted(size), atol=1e-6)
+
+
+def test_without_the_bench_the_command_says_where_data_sets_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(mover.io.formats, "find_spec", lambda _: None)
+    for name in names("dataset"):
+        assert run_command("import", [name, str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+        said = capsys.readouterr().err
+        assert f"{name}: is read by mover_bench, which is not part of the installed package" in said

@@ -56,7 +56,6 @@ def sources() -> Iterator[dict[str, Path]]:
         found = {
             "total3d": layouts.write_total3d(home / "t3d", room),
             "sam3d": layouts.write_sam3d(home / "sam3d", room),
-            "gen3dsr": layouts.write_gen3dsr(home / "gen", room),
             "holisticmesh": layouts.write_holisticmesh(home / "hm", room),
             "glb": layouts.write_glb(home / "glb" / "a.glb", room),
             "boxes": layouts.write_boxes(home / "boxes" / "a.json", room),
@@ -98,7 +97,7 @@ def copied(source: Path, home: Path) -> Path:
     return home / "in" / source.name
 
 
-FORMATS = ("total3d", "sam3d", "gen3dsr", "holisticmesh", "glb", "boxes", "release", "pigraphs",
+FORMATS = ("total3d", "sam3d", "holisticmesh", "glb", "boxes", "release", "pigraphs",
            "masks:coco_text", "masks:mover", "masks:sam3", "masks:sav", "masks:npz",
            "masks:labels")  # fmt: skip
 

@@ -23,8 +23,8 @@ from mover.core.errors import InputError
 from mover.core.types import Masks
 from mover.geometry.rle import decode
 from mover.io.capture.bodies_file import read_bodies
-from mover.io.datasets.prox_people import read_body_index
 from mover.io.people.values import frame_numbers
+from mover_bench.datasets.prox_people import read_body_index
 
 FIRST, SECOND = "vicon_03301_01", "vicon_03301_02"
 SHIFT = np.array([1.0, 2.0, 1.5])

@@ -17,8 +17,8 @@ from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.settings import int_in
-from mover.io.datasets import pigraphs, prox_files
 from mover.pipeline.presets import PRESETS
+from mover_bench.datasets import pigraphs, prox_files
 from mover_bench.studies.compare import markdown
 from mover_bench.tables import published, rows
 from mover_bench.tables.rows import TableRow

@@ -30,7 +30,6 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
-from mover.io.datasets.prox_files import scan_of
 from mover.io.files.fields import read_json
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from
@@ -40,6 +39,7 @@ from mover.pipeline.reconstruct import reconstruct
 from mover.pipeline.refit import refit_bodies
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
+from mover_bench.datasets.prox_files import scan_of
 from mover_bench.studies.measures import carry_all
 from mover_bench.studies.variants import withheld
 from mover_bench.tables.rows import PLAIN, Disturbance, disturbance_of, variants

@@ -7,6 +7,7 @@ import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,6 +20,7 @@ Kind = Literal["capture", "scene", "dataset", "masks", "people", "cameras", "key
 """What a function gives: a whole capture of a path; parts of one of a path and hints (scenes, data
 sets, masks); people or keypoints of a path and what is known; a camera's path; or files of a result
 and a folder."""
+BENCH = "mover_bench"
 IMPORTED: tuple[Kind, ...] = ("scene", "dataset", "masks")
 """What `mover import` takes."""
 
@@ -32,14 +34,24 @@ class Format:
     what: str
     """What the path is, or what is written, for people."""
     function: str
-    """`module:function` below mover.io."""
+    """`module:function`, below mover.io or in mover_bench, which is not part of the wheel."""
     options: Mapping[str, str] = field(default_factory=dict[str, str])
     """Arguments that the function takes by name."""
 
     def load(self) -> Callable[..., Any]:
-        """The function; its module is imported now."""
+        """The function; its module is imported now.
+
+        Raises:
+            InputError: If it belongs to mover_bench, which is not installed.
+        """
         module, _, name = self.function.partition(":")
-        found = getattr(importlib.import_module(f"mover.io.{module}"), name)
+        if module.startswith(BENCH) and find_spec(BENCH) is None:
+            raise InputError(
+                f"{self.name}: is read by {BENCH}, which is not part of the installed package; "
+                "add the folder bench of mover's repository to PYTHONPATH"
+            )
+        home = "" if module.startswith(BENCH) else "mover.io."
+        found = getattr(importlib.import_module(home + module), name)
         return partial(found, **self.options) if self.options else found
 
 
@@ -55,28 +67,27 @@ FORMATS = (
         "scene", "sam3d", "a folder of SAM 3D Objects: meshes and their poses",
         "scenes.sam3d:sam3d_parts",
     ),
-    Format(
-        "scene", "gen3dsr", "a folder of Gen3DSR: reconstruction/ and cam_params.json",
-        "scenes.without_axes:gen3dsr_parts",
-    ),
-    Format(
-        "scene", "holisticmesh", "a folder of HolisticMesh: models/scene.ply and detections.json",
-        "scenes.without_axes:holisticmesh_parts",
-    ),
     Format("scene", "glb", "a glTF scene: each node an object", "scenes.glb_scene:glb_parts"),
     Format(
         "scene", "boxes", "3D boxes (JSON); meshes come from the furniture library",
         "scenes.box_scene:box_parts",
     ),
     Format(
-        "scene", "release", "a sequence of the MOVER authors' release",
-        "scenes.release:release_parts",
+        "dataset", "holisticmesh", "a folder of HolisticMesh: models/scene.ply, detections.json",
+        "mover_bench.datasets.holisticmesh:holisticmesh_parts",
+    ),
+    Format(
+        "dataset", "release", "a sequence of the MOVER authors' release",
+        "mover_bench.datasets.release:release_parts",
     ),
     Format(
         "dataset", "prox", "PROX, qualitative or quantitative: one --recording",
-        "datasets.prox:prox_parts",
+        "mover_bench.datasets.prox:prox_parts",
     ),
-    Format("dataset", "pigraphs", "PiGraphs: one --recording", "datasets.pigraphs:pigraphs_parts"),
+    Format(
+        "dataset", "pigraphs", "PiGraphs: one --recording",
+        "mover_bench.datasets.pigraphs:pigraphs_parts",
+    ),
     Format(
         "masks", "masks", "masks alone: COCO, detectron2, SA-V, SAM 3, PNG, npz",
         "masks.instance_files:mask_parts",

@@ -36,7 +36,7 @@ def read_camera_file(path: Path, size: tuple[int, int] | None) -> At:
 
     Known are our own and nerfstudio's .json, 3 x 3 numbers in a text file (cam_K.txt), OpenCV's
     .json with `camera_mtx` (PROX, whose fits leave out its distortion `k`) and .xml with
-    `Intrinsics`, Gen3DSR's cam_params.json, MoGe's fov.json, GeoCalib's {"f", "roll", "pitch"} and
+    `Intrinsics`, MoGe's fov.json, GeoCalib's {"f", "roll", "pitch"} and
     SAM 3D Body's focal_length.json.
 
     Args:
@@ -63,12 +63,8 @@ def camera_of_tree(at: At, size: tuple[int, int] | None) -> At:
     if maybe(at, "fl_x") is not None:
         return At({"w": size[0], "h": size[1], **at.value} if size else at.value, at.file)
     if (mtx := maybe(at, "camera_mtx")) is not None:
-        return with_intrinsics(_matrix(mtx), size, mtx, shift=HALF)
-    if (mtx := maybe(at, "K")) is not None:
-        own = [maybe(at, key) for key in ("W", "H")]
-        if own[0] is not None and own[1] is not None:
-            size = int(number(own[0], 1, 1e5)), int(number(own[1], 1, 1e5))
-        return with_intrinsics(_matrix(mtx), size, mtx, shift=HALF)
+        K = _checked(np.array([vector(row, 3) for row in items(mtx, 3)]), mtx)
+        return with_intrinsics(K, size, mtx, shift=HALF)
     return _of_lens(at, _known(size, at))
 
 
@@ -134,10 +130,6 @@ def tilt_of(pitch: float, roll: float) -> list[list[float]]:
     return tilted(*torch.tensor([pitch, roll], dtype=torch.float64)).tolist()
 
 
-def _matrix(at: At) -> NDArray[np.float64]:
-    return _checked(np.array([vector(row, 3) for row in items(at, 3)]), at)
-
-
 def _checked(K: NDArray[np.float64], at: At) -> NDArray[np.float64]:
     if [K[0, 1], K[1, 0], *K[2]] != [0, 0, 0, 0, 1] or K[0, 0] <= 0 or K[1, 1] <= 0:
         refuse(at, "intrinsics [fx 0 cx; 0 fy cy; 0 0 1]")
@@ -164,7 +156,7 @@ def _of_lens(at: At, size: tuple[int, int]) -> At:
         fx = size[0] / 2 / math.tan(math.radians(number(across, 1, WIDEST)) / 2)
         fy = fx if up is None else size[1] / 2 / math.tan(math.radians(number(up, 1, WIDEST)) / 2)
         return At({**_centred(fx, fy, size, at.file).value, **tilt}, at.file)
-    known = "fl_x, K, camera_mtx, focal_length, f or fov_x"
+    known = "fl_x, camera_mtx, focal_length, f or fov_x"
     return refuse(at, f"a camera with one of the fields {known}")
 
 

@@ -15,11 +15,10 @@ from mover.core.errors import InputError
 from mover.core.types import Mesh
 from mover.furniture.library import BACKS, BEDS, canonical
 from mover.geometry.rotations import affine
-from mover.io.capture.parts import UNKNOWN, Hints, Parts
+from mover.io.capture.parts import UNKNOWN, Parts
 from mover.io.capture.scene_file import scene_tree
-from mover.io.files.fields import At, maybe, reason
+from mover.io.files.fields import At, reason
 from mover.io.files.meshes import check_gltf, mesh_of, read_mesh
-from mover.io.files.schema import rotation
 
 EXACT = 1e-4  # [share], below it a matrix is a yaw and a scale
 MOST_TILT = math.radians(30)  # a tool's error of an upright thing; beyond, the axes are others
@@ -87,12 +86,6 @@ def _baked(A: Matrix, t: Matrix, low: Matrix, high: Matrix) -> Posed:
     mirrored = " mirrored" if np.linalg.det(A) < 0 else ""
     note = f"it was{mirrored} about other axes, which went into a new mesh"
     return Posed(_fields(place, yaw, np.ones(3)), bake, note)
-
-
-def tilt_of(hints: Hints) -> Matrix | None:
-    """R_cam_world as the user gave it; None: nobody told it."""
-    given = None if hints.camera is None else maybe(hints.camera, "R_cam_world")
-    return None if given is None else rotation(given)
 
 
 def about_y(angle: float) -> Matrix:

@@ -21,7 +21,12 @@ from mover.core.types import Bodies, BodyPose, Scene
 from mover.io.capture.bodies_file import bodies_to_arrays
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts, image_parts
-from mover.io.datasets.prox_files import (
+from mover.io.files.fields import At, read_json
+from mover.io.files.images import mirrored_copy
+from mover.io.files.meshes import read_scan
+from mover.io.files.schema import rigid
+from mover.io.scenes.placing import Matrix
+from mover_bench.datasets.prox_files import (
     FITS,
     FOLDERS,
     FPS,
@@ -35,13 +40,8 @@ from mover.io.datasets.prox_files import (
     timelines,
     world_of,
 )
-from mover.io.datasets.prox_people import keypoint_trees, people_masks
-from mover.io.datasets.true_boxes import TrueBox, boxes_scene, floor_in, read_bbox3d
-from mover.io.files.fields import At, read_json
-from mover.io.files.images import mirrored_copy
-from mover.io.files.meshes import read_scan
-from mover.io.files.schema import rigid
-from mover.io.scenes.placing import Matrix
+from mover_bench.datasets.prox_people import keypoint_trees, people_masks
+from mover_bench.datasets.true_boxes import TrueBox, boxes_scene, floor_in, read_bbox3d
 
 COSTS = {
     "Color": "no pictures: nothing to draw on, masks of furniture must come from elsewhere",

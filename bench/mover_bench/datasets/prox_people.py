@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.types import Bodies, Camera
-from mover.io.datasets.prox_files import QUANTITATIVE, SIZE, Timeline
 from mover.io.files.fields import At, get, items, mapping, maybe, number, read_json, reason, refuse
 from mover.io.masks.instances import Instance, Instances, code_of, people_tree
+from mover_bench.datasets.prox_files import QUANTITATIVE, SIZE, Timeline
 
 BODIES = 6  # that Kinect tells apart
 NOBODY = 255

@@ -1,0 +1,1 @@
+"""Readers of what the paper is measured on: PROX, PiGraphs, HolisticMesh, MOVER's release."""

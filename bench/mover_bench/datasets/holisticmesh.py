@@ -1,0 +1,77 @@
+"""HolisticMesh (Weng and Yeung, 2021), the paper's baseline: what it made of one picture.
+
+It leaves models/scene.ply, all furniture of one picture, where `verts, faces, lo_bdb3D_cam_coord`
+are given to its `render_image`, as a commented line of its main.py does; and detections.json. The
+objects follow one another in the order of the detections, each with as many vertices (a sphere of
+2562), in the axes of the mirrored picture's camera (x right, y down, z forward), as PROX's pictures
+are stored mirrored and its bodies are fitted to the flipped ones. The meshes have no axes of their
+own: each gets an upright box, and its front is guessed. The camera is level unless --camera says
+more.
+"""
+
+import dataclasses
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mover.core.errors import InputError
+from mover.geometry.rotations import affine
+from mover.io.capture.parts import Hints, Parts
+from mover.io.files.fields import At, choice, get, items, maybe, read_json, refuse, vector
+from mover.io.files.meshes import load_arrays, mesh_of, write_mesh
+from mover.io.files.schema import rotation
+from mover.io.masks.coco import annotations_tree
+from mover.io.scenes.placing import LEVEL, Pieces, without_axes
+from mover.io.scenes.total3d import CLASSES, FURNITURE
+
+SCENE = Path("models") / "scene.ply"
+LENS = {"w": 1920, "h": 1080, "fl_x": 1060.5317, "fl_y": 1060.3856, "cx": 951.2999, "cy": 536.7704}
+"""Of PROX's colour camera, which its code takes for every picture."""
+
+
+def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
+    """What HolisticMesh made of one picture."""
+    if not (folder / SCENE).is_file():
+        why = "that main.py writes where the scene is given to render_image"
+        raise InputError(f"{SCENE}: there is no such file in {folder}, expected the mesh {why}")
+    if not (folder / "detections.json").is_file():
+        why = "the one of its --data_path, whose order names the objects"
+        raise InputError(f"detections.json: there is no such file in {folder}, expected {why}")
+    rows = items(read_json(folder / "detections.json"))
+    names = [choice(get(row, "class"), CLASSES) for row in rows]
+    given = {} if hints.camera is None else dict(hints.camera.value)
+    tilt = None if hints.camera is None else maybe(hints.camera, "R_cam_world")
+    R = np.array(LEVEL) if tilt is None else rotation(tilt)
+    camera: dict[str, Any] = {**LENS, **given, "R_cam_world": R.tolist()}
+    at = At(str(SCENE), str(SCENE))
+    verts, faces = load_arrays(at, folder / SCENE)
+    size, rest = divmod(len(verts), max(1, len(rows)))
+    if not rows or rest:
+        refuse(at, f"as many vertices for each of {len(rows)} detections", f"{len(verts)} vertices")
+    owner = faces // size
+    if (owner != owner[:, :1]).any():
+        refuse(at, "faces of one object each", "faces that join two objects")
+    found, annotations = Pieces(), list[dict[str, Any]]()
+    for i, (row, category) in enumerate(zip(rows, names, strict=True)):
+        if category not in FURNITURE:
+            continue
+        own = verts[i * size : (i + 1) * size]
+        file = hints.work / f"holisticmesh_{i}.glb"
+        write_mesh(mesh_of(own, faces[owner[:, 0] == i] - i * size, at), file)
+        copy = partial(without_axes, file, affine(R.T), category)
+        found.add(category, f"{category}_{i}", lambda key, c=copy: c(hints.work / f"{key}.glb"))
+        found.rows[-1]["annotation"] = i
+        box = get(row, "bbox")  # of the mirrored picture, with a score where it has five numbers
+        scored = isinstance(box.value, list) and len(box.value) == 5
+        left, top, right, bottom = vector(box, 5 if scored else 4)[:4]
+        place = [float(camera["w"]) - right, top, right - left, bottom - top]
+        annotations.append({"id": i, "image_id": 0, "category_id": category, "bbox": place})
+    how = "level, as --camera has no R_cam_world" if tilt is None else "as given"
+    return dataclasses.replace(
+        found.parts(folder.resolve().name, str(SCENE)),
+        camera=At(camera, "camera.json"),
+        objects=At(annotations_tree(annotations, {}, CLASSES), "detections.json"),
+        notes=(f"the camera is {how}; the fronts of the objects are guesses",),
+    )

@@ -1,1 +1,0 @@
-"""PROX and PiGraphs as they are published."""
