@@ -20,10 +20,11 @@ from mover.fitting.energy import Seen, Weighed, body_energy
 from mover.fitting.given import begin_at, begin_from, start_rows
 from mover.fitting.ground import distances_of_who_lies, sole_heights, soles_of
 from mover.fitting.noise import Bias, at_most, bias_of, noise_of, noisy, without
+from mover.fitting.offsets import lasting_of
 from mover.fitting.prior import ANGLES, PosePrior, encoded
 from mover.fitting.room import FitRoom
 from mover.fitting.start import Begun, begin
-from mover.fitting.stature import UNTOLD, stature_of
+from mover.fitting.stature import UNKNOWN, stature_of
 from mover.fitting.tracks import (
     Window,
     at_stage,
@@ -125,12 +126,15 @@ def fit_bodies(
     seen = dataclasses.replace(seen, floor=inputs.ground, room=_around(inputs))
     job = _Job(inputs, config, rig, names, seen, observe)
     begun = _begun(job)
-    job = dataclasses.replace(job, seen=dataclasses.replace(seen, stature=stature))
+    lasting = lasting_of(names) if config.lasting and inputs.room is None else None
+    seen = dataclasses.replace(seen, stature=stature, lasting=lasting)
+    job = dataclasses.replace(job, seen=seen)
     at, frame, seen = _solved(begun, job)
     pose = pose_of(at, frame, inputs.model, inputs.prior)
     miss = miss_of(at, frame, seen, inputs.prior)
     bodies = bodies_of(pose, inputs.model, some)
-    spread = None if inputs.room is not None else UNTOLD if stature is None else 0.0
+    unknown = UNKNOWN if bool(stature.given.isnan().any()) else 0.0
+    spread = None if inputs.room is not None else unknown
     bodies = dataclasses.replace(bodies, size_spread=spread)
     return Fitted(bodies, rows, miss, warnings)
 
@@ -168,17 +172,17 @@ def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
     first = _stages(at, frame, seen, windows[0], (job, EVERYTHING))
     bias, parts = _bias(first, job), [first.at]
     if len(windows) > 1:
-        at = dataclasses.replace(at, betas=first.at.betas, floor=first.at.floor)
+        shared = {name: getattr(first.at, name) for name in ("betas", "offset", "floor")}
+        at = dataclasses.replace(at, **shared)
         windows = windows[1:]
         parts = [_stages(at, frame, seen, window, (job, OF_ROWS)).at for window in windows]
-    betas = parts[0].betas
     fields = {
         name: torch.cat([getattr(p, name)[w.keep] for p, w in zip(parts, windows, strict=True)])
         for name in OF_ROWS
     }
     back = torch.argsort(torch.cat([w.rows[w.keep] for w in windows]))
     fields = {name: value[back] for name, value in fields.items()}
-    at = Unknowns(betas=betas, floor=parts[0].floor, **fields)
+    at = dataclasses.replace(parts[0], **fields)
     at = at if bias is None else without(at, bias, frame.person)
     return at, frame, seen
 
@@ -211,6 +215,7 @@ def _widened(at: Unknowns, people: int, job: _Job) -> dict[str, Tensor]:
         "betas": _shapes(people, shapes, job).to(at.place),
         "hands": at.place.new_zeros(rows, 2 * hands),
         "face": at.place.new_zeros(rows, face),
+        "offset": at.place.new_zeros(people, 0 if job.seen.lasting is None else len(job.names), 3),
     }
 
 

@@ -98,10 +98,11 @@ class FitConfig:
     """Second difference that is free of charge at any frame rate [m]."""
     by_size: bool = True
     """Price second differences of joints in sizes of the body: people are not near to be smooth."""
-    alike: Annotated[int, int_in(1, 1_000_000)] = 100
-    """Frames whose keypoints tell of a person's shape as much as all of a long track do."""
-    alike_told: Annotated[int, int_in(1, 1_000_000)] = 30
-    """The same where heights are told: proportions are what else, and detectors bend them."""
+    alike: Annotated[int, int_in(1, 1_000_000)] = 10
+    """Frames with errors of their own: more do not constrain shape, stature and offsets further."""
+    lasting: bool = True
+    """Keypoints lie lastingly off the model's, and statures are those of adults (else the shape
+    alone has a prior, as published)."""
     told: Weight = 1e4
     """Weight of a height that is told, off the body's [1/m]."""
     longest_gap: Seconds = 1.0

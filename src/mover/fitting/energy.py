@@ -36,8 +36,9 @@ from mover.fitting.ground import (
     support_price,
 )
 from mover.fitting.limits import limit_price
+from mover.fitting.offsets import offset_cost
 from mover.fitting.room import FitRoom, room_terms
-from mover.fitting.stature import Stature, height_price, size_of
+from mover.fitting.stature import Stature, height_cost, shape_cost, size_of
 from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, floor_of, points_of
 from mover.geometry.camera import project
 
@@ -92,7 +93,9 @@ class Seen:
     room: FitRoom | None = None
     """The room in which they are fitted; None: not known."""
     stature: Stature | None = None
-    """How tall they are; None: nobody told."""
+    """The prior of their heights; None: the mean shape's, as one more coefficient."""
+    lasting: Float[Tensor, " keypoints"] | None = None
+    """How far a detector puts each keypoint lastingly from the model's [m]; None: nowhere."""
     soles: Float[Tensor, "2"] | None = None
     """Heights of ankles and balls of the feet over the soles [m]; None: no floor is sought."""
     about: Float[Tensor, " bodies"] | None = None
@@ -176,29 +179,36 @@ def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy
     stage, config = by.stage, by.config
     angles = by.decode(at.code)
     count = torch.bincount(frame.person, minlength=len(at.betas)).to(at.betas)[frame.person]
-    told = config.told if seen.stature is not None else 0.0
+    given = config.told if seen.stature is not None else 0.0
+    lasting = stage.shape if seen.lasting is not None else 0.0
     hands, face = min(1, at.hands.shape[1]), min(1, at.face.shape[1])
     expression = at.face[:, 3:]
 
     def pose() -> Tensor:
         return at.code.square().sum(-1) if by.learned else pose_price(angles, seen)
 
+    same = count.clamp_max(config.alike)  # frames beyond these repeat the errors of others
+
     def shape() -> Tensor:
-        most = torch.full_like(at.betas[:, 0], config.alike)
-        if seen.stature is not None:
-            most[seen.stature.given.isfinite().to(most.device)] = config.alike_told
-        return at.betas.square().sum(-1)[frame.person] / count.minimum(most[frame.person])
+        if seen.stature is None or seen.lasting is None:
+            return at.betas.square().sum(-1)[frame.person] / same
+        return shape_cost(seen.stature, at.betas)[frame.person] / same
 
     def height() -> Tensor:
         assert seen.stature is not None
-        return height_price(seen.stature, at.betas)[frame.person] / count
+        return height_cost(seen.stature, at.betas)[frame.person] / count
+
+    def offset() -> Tensor:
+        assert seen.lasting is not None
+        return offset_cost(at.offset, seen.lasting)[frame.person] / same
 
     return weigh(
         ("pose", stage.pose**2, pose),
         ("limits", config.limits**2, lambda: limit_price(angles)),
         ("bending", config.bending * stage.pose, lambda: bending_price(angles)),
         ("shape", stage.shape**2, shape),
-        ("height", told**2, height),
+        ("height", given**2, height),
+        ("offset", lasting**2, offset),
         ("hands", stage.hands**2 * hands, lambda: at.hands.square().sum(-1)),
         ("jaw", stage.jaw**2 * face, lambda: jaw_price(at.face)),
         ("expression", stage.shape**2 * face, lambda: expression.square().sum(-1)),

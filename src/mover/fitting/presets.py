@@ -22,7 +22,7 @@ PAPER = FitConfig(
     jitter=1.0,
     by_size=False,
     alike=1_000_000,
-    alike_told=1_000_000,
+    lasting=False,
     stages=tuple(replace(stage, smooth=1.0, steps=300) for stage in PUBLISHED[3:]),
 )
 """SMPLify-X and L_smooth (Sec. 3.2), in the two stages that the authors' fit of videos runs.

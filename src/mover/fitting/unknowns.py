@@ -44,6 +44,8 @@ class Rig:
     """Which of its vertices stand for the skin, where a room is looked at."""
     normals: Float[Tensor, "picked 3"]
     """Their outward normals at rest."""
+    bones: Int[Tensor, " keypoints"]
+    """The joint whose rotation carries each keypoint: of a joint, its parent."""
 
     @property
     def skin(self) -> SkinnedBody:
@@ -100,7 +102,11 @@ def rig_of(
     whole = skin_of_model(model)
     assert whole is not None
     normals = vertex_normals(whole.verts, model.faces)[picked]
-    return Rig(small, levels, above, mix, index, torch.searchsorted(needed, picked), normals)
+    parents = torch.tensor(skin.parents).clamp_min(0)
+    first = torch.searchsorted(needed, vertex[:, 0].contiguous()).clamp_max(len(needed) - 1)
+    bones = torch.where(is_joint, parents[joint.clamp_min(0)], skin.weights[first].argmax(1))
+    picks = torch.searchsorted(needed, picked)
+    return Rig(small, levels, above, mix, index, picks, normals, bones)
 
 
 def _cut(skin: SkinnedBody, joints: int) -> SkinnedBody:
@@ -137,8 +143,12 @@ def move(
     betas: Float[Tensor, "bodies shape"],
     pelvis: Float[Tensor, "bodies 3"],
     expression: Float[Tensor, "bodies expression"] | None = None,
+    lasting: Float[Tensor, "bodies keypoints 3"] | None = None,
 ) -> Points:
-    """Keypoints and joints of bodies whose pelvis is at a place [m], differentiable in all."""
+    """Keypoints and joints of bodies whose pelvis is at a place [m], differentiable in all.
+
+    `lasting` moves each keypoint in the axes of its bone [m].
+    """
     verts, joints = shaped(rig.skin, betas)
     if isinstance(rig.model, SmplBody):
         verts, joints = _corrected(rig.model, turns, verts, joints, expression)
@@ -152,6 +162,8 @@ def move(
     turned = skin[:, rig.picked, :, :3].detach() @ rig.normals.to(skin)[..., None]
     facing = torch.nn.functional.normalize(turned[..., 0], dim=-1)
     keypoints = rig.mix.to(both) @ both + shift
+    if lasting is not None:
+        keypoints = keypoints + (world[:, rig.bones] @ lasting[..., None])[..., 0]
     return Points(keypoints, places + shift, moved[:, rig.picked] + shift, facing)
 
 
@@ -198,6 +210,7 @@ def _down_the_tree(
 
 HAND = 45
 NO_FLOOR = torch.zeros(0)
+NO_OFFSETS = torch.zeros(0, 0, 3)
 
 
 @record
@@ -218,11 +231,14 @@ class Unknowns:
     floor: Float[Tensor, " floor"] = NO_FLOOR
     """Two slopes of the floor, and its height along upright from the camera under people of the
     usual size [m]; or none."""
+    offset: Float[Tensor, "owners keypoints 3"] = NO_OFFSETS
+    """Of each person: how far the detector's keypoints lie lastingly from the model's, in the axes
+    of their bones [m]; no keypoints where that is not fitted."""
 
 
 BEND = 0.3  # [rad]
 SCALES = {"turn": 0.2, "code": BEND, "place": (0.01, 0.01, 0.05), "betas": 1.0, "hands": 0.5,
-          "face": 0.3, "floor": 0.03}  # fmt: skip
+          "face": 0.3, "offset": 0.02, "floor": 0.03}  # fmt: skip
 """How far each usually moves: the solver works in these units."""
 BENDS = tuple(1 / math.hypot(1 / s, 1 / BEND) for s in spreads(1, torch.zeros(1))[0].tolist())
 """The same for angles, most of which people turn less than keypoints could tell."""
@@ -277,7 +293,8 @@ def points_of(at: Unknowns, frame: Frame, decode: Decode) -> Points:
     """Keypoints and joints of the bodies, in camera axes [m]."""
     expression = at.face[:, 3:] if at.face.shape[1] > 3 else None
     turns = turns_of(at, frame, decode(at.code))
-    return move(frame.rig, turns, at.betas[frame.person], pelvis_of(at, frame), expression)
+    lasting = at.offset[frame.person] if at.offset.shape[1] else None
+    return move(frame.rig, turns, at.betas[frame.person], pelvis_of(at, frame), expression, lasting)
 
 
 def turns_of(
@@ -334,8 +351,8 @@ def _scale(name: str, value: Tensor) -> Tensor:
     return torch.tensor(SCALES[name], dtype=value.dtype, device=value.device)
 
 
-EVERYTHING = ("turn", "code", "place", "betas", "hands", "face", "floor")
-OF_ROWS = tuple(name for name in EVERYTHING if name not in ("betas", "floor"))
+EVERYTHING = ("turn", "code", "place", "betas", "hands", "face", "offset", "floor")
+OF_ROWS = tuple(name for name in EVERYTHING if name not in ("betas", "offset", "floor"))
 
 
 def solve(
