@@ -188,7 +188,6 @@ def write_persons(desk: Path) -> None:
         person = {"pose_keypoints_2d": triple.reshape(-1).tolist()}
         file = desk / "keypoints" / f"{k:06d}_keypoints.json"
         file.write_text(json.dumps({"people": [person]}))
-    make_people.write_wholebody(desk).rename(desk / "found.json")
     make_people.write_gvhmr(desk)
     folder = desk / "vposer_v1_0" / "snapshots"
     folder.mkdir(parents=True)

@@ -249,6 +249,12 @@ def write_pare_image(folder: Path) -> Path:
     return write_pare(folder, ("orig_cam",))
 
 
+def write_vibe(folder: Path) -> Path:
+    """As VIBE's demo.py: no joints in space."""
+    path = write_pare(folder, ("pred_cam", "bboxes", "orig_cam"))
+    return path.rename(folder / "vibe_output.pkl")
+
+
 def write_phalp(folder: Path) -> Path:
     true = person("smpl")
     place = true["transl"] + under(lens(5000 / 256 * max(WIDTH, HEIGHT)), true)
@@ -337,24 +343,6 @@ def write_slahmr(folder: Path) -> Path:
     return folder
 
 
-def write_multihmr(folder: Path) -> Path:
-    true = person("smplx")
-    used = lens(max(WIDTH, HEIGHT) / (2 * math.tan(math.radians(30))))
-    shift = under(used, true)
-    for k, frame in enumerate(FRAMES):
-        angles = true["angles"][k]
-        order = [0, *range(1, 22), *range(25, 55), 22]
-        human = {
-            "scores": np.float32(0.9), "shape": true["betas"][k], "expression": np.zeros(10),
-            "rotvec": angles[order], "transl_pelvis": (true["joints"][k, :1] + shift[k]),
-            "transl": true["joints"][k, 15] + shift[k], "v3d": true["verts"][k] + shift[k],
-        }  # fmt: skip
-        tensors = {key: torch.from_numpy(np.asarray(v)).float() for key, v in human.items()}
-        with (folder / f"{frame:06d}.pkl").open("wb") as file:
-            pickle.dump([tensors], file)
-    return folder
-
-
 def write_sam3dbody(folder: Path, focal=True) -> Path:
     """Meshes without parameters; another person stands still, listed in turn first and second."""
     true = person("smplx")
@@ -378,6 +366,30 @@ def write_sam3dbody(folder: Path, focal=True) -> Path:
         for j, one in enumerate(people if k % 2 else people[::-1]):
             np.savez(folder / f"{frame:06d}_subj{j:02d}.npz", **one)
     return folder
+
+
+def write_amass(folder: Path, model="smplh") -> Path:
+    """A motion in a world with +z up: of SMPL-H as released first, of SMPL-X as `stageii`."""
+    true = person(model)
+    z_up = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    root, place = in_world(true, z_up @ camera_matrix().T, np.zeros(3), model)
+    angles = true["angles"].copy()
+    angles[:, 0] = root
+    betas = np.zeros(16)
+    betas[:10] = true["betas"][0]
+    data = {"poses": angles.reshape(len(FRAMES), -1), "trans": place, "betas": betas}
+    if model == "smplx":
+        more = {"gender": "neutral", "mocap_frame_rate": 30.0, "surface_model_type": "smplx"}
+        labels = np.array([["LFHD", None]] * len(FRAMES), dtype=object)
+        np.savez(folder / "walk_stageii.npz", **data, **more, labels_obs=labels)
+        return folder / "walk_stageii.npz"
+    more = {"gender": np.array(b"neutral"), "mocap_framerate": 30.0, "dmpls": np.zeros((5, 8))}
+    np.savez(folder / "walk_poses.npz", **data, **more)
+    return folder / "walk_poses.npz"
+
+
+def write_amass_x(folder: Path) -> Path:
+    return write_amass(folder, "smplx")
 
 
 def smplx_parts(k: int) -> dict:
@@ -413,16 +425,6 @@ def write_prox(folder: Path) -> Path:
     return folder / "results"
 
 
-def write_mover(folder: Path) -> Path:
-    """All frames in one file: the gap is closed, as in a folder of kept images."""
-    true = person("smplx")
-    parts = [smplx_parts(k) for k in range(len(FRAMES))]
-    data = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
-    data |= {"betas": true["betas"][:1], "transl": true["transl"], "gender": "male",
-             "keypoints_3d": np.zeros((5, 25, 3))}  # fmt: skip
-    return store(data, folder / "001_all.pkl")
-
-
 def store(value, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file:
@@ -431,11 +433,11 @@ def store(value, path: Path) -> Path:
 
 
 BODIES = {
-    "4dhumans": write_phalp, "gem": write_gem, "gvhmr": write_gvhmr, "mover": write_mover,
-    "multihmr": write_multihmr, "pare": write_pare, "pare:pixels": write_pare_pixels,
+    "4dhumans": write_phalp, "amass": write_amass, "amass:smplx": write_amass_x, "gem": write_gem,
+    "gvhmr": write_gvhmr, "pare": write_pare, "pare:pixels": write_pare_pixels,
     "pare:image": write_pare_image, "phalp": write_phalp, "prompthmr": write_prompthmr,
     "prox": write_prox, "sam3dbody": write_sam3dbody, "slahmr": write_slahmr,
-    "smplifyx": write_smplifyx, "tram": write_tram, "wham": write_wham,
+    "smplifyx": write_smplifyx, "tram": write_tram, "vibe": write_vibe, "wham": write_wham,
     "wham:python": write_wham_python,
 }  # fmt: skip
 
@@ -456,9 +458,6 @@ OPENPOSE = ("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "lef
             "left_hip", "left_knee", "left_ankle", "right_eye", "left_eye", "right_ear",
             "left_ear", "left_big_toe", "left_small_toe", "left_heel", "right_big_toe",
             "right_small_toe", "right_heel")  # fmt: skip
-WHOLE = (*COCO, "left_big_toe", "left_small_toe", "left_heel", "right_big_toe",
-         "right_small_toe", "right_heel", *["?"] * 68, "left_wrist", *["?"] * 20,
-         "right_wrist", *["?"] * 20)  # fmt: skip
 
 
 def seen(names) -> np.ndarray:
@@ -511,26 +510,25 @@ def write_coco17(folder: Path) -> Path:
     return folder / "results.json"
 
 
-def write_wholebody(folder: Path) -> Path:
-    images = [
-        {"frame_id": int(f), "instances": [
-            {"keypoints": row[:, :2].tolist(), "keypoint_scores": row[:, 2].tolist()}
-        ]}
-        for f, row in zip(FRAMES, seen(WHOLE), strict=True)
-    ]  # fmt: skip
-    text = json.dumps({"meta_info": {}, "instance_info": images})
-    (folder / "mmpose.json").write_text(text)
-    return folder / "mmpose.json"
-
-
-def write_wholebody_arrays(folder: Path) -> Path:
-    rows = seen(WHOLE)
+def write_coco17_arrays(folder: Path) -> Path:
+    rows = seen(COCO)
     path = folder / "rtmlib.npz"
     np.savez(path, keypoints=rows[..., :2], scores=rows[..., 2], frame=FRAMES)
     return path
 
 
+def write_coco17_mmpose(folder: Path) -> Path:
+    images = [
+        {"frame_id": int(f), "instances": [
+            {"keypoints": row[:, :2].tolist(), "keypoint_scores": row[:, 2].tolist()}
+        ]}
+        for f, row in zip(FRAMES, seen(COCO), strict=True)
+    ]  # fmt: skip
+    (folder / "mmpose.json").write_text(json.dumps({"meta_info": {}, "instance_info": images}))
+    return folder / "mmpose.json"
+
+
 KEYPOINTS = {
-    "coco17": write_coco17, "halpe26": write_halpe26, "openpose": write_openpose,
-    "wholebody": write_wholebody, "wholebody:arrays": write_wholebody_arrays,
+    "coco17": write_coco17, "coco17:mmpose": write_coco17_mmpose,
+    "coco17:arrays": write_coco17_arrays, "halpe26": write_halpe26, "openpose": write_openpose,
 }  # fmt: skip

@@ -27,7 +27,7 @@ def load(path: Path) -> Any:
         case ".json":
             return json.loads(path.read_text())
         case ".npz":
-            with np.load(path) as arrays:
+            with np.load(path, allow_pickle=True) as arrays:
                 return dict(arrays)
         case ".npy":
             return np.load(path, allow_pickle=True).item()
@@ -63,7 +63,10 @@ def places(value: Any, start: tuple = ()) -> list[tuple]:
 
 def changed(old: Any, rng: np.random.Generator) -> Any:
     options: list[Any] = [None, "abc", 0, -5, np.zeros(0), [1, 2], {"a": 1}, 1e300, b"x"]
-    array = np.asarray(old).astype(float) if isinstance(old, np.ndarray | torch.Tensor) else None
+    numeric = isinstance(old, torch.Tensor) or (
+        isinstance(old, np.ndarray) and old.dtype.kind in "fiub"
+    )
+    array = np.asarray(old).astype(float) if numeric else None
     if array is not None and array.size > 1:
         broken = array.copy()
         broken.flat[0] = np.inf

@@ -17,26 +17,28 @@ from test_safe_pickle import BOMBS
 
 from mover.app import cli
 from mover.bodies import BODY_MODELS, load_model
+from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skeleton import JOINTS
 from mover.core.errors import InputError
 from mover.core.types import BodyPose, Keypoints
 from mover.geometry.camera import project
 from mover.io.capture.bodies_file import read_bodies, write_bodies
 from mover.io.capture.camera_file import camera_of
+from mover.io.capture.pose_file import into_camera
 from mover.io.files.fields import At
 from mover.io.formats import names
 from mover.io.people.bodies import attitude, bodies_from, camera_from, in_world
 from mover.io.people.found import Known
-from mover.io.people.keypoints import as_openpose, keypoints_from, read_keypoints, write_keypoints
+from mover.io.people.keypoints import keypoints_from, read_keypoints, write_keypoints
 
 pytest.importorskip("joblib", reason="the fixtures are written by joblib, as the tools do")
 
 CAMERA = camera_of(At(made.camera_json(), "camera.json"))
 KNOWN = Known(camera=CAMERA)
 GRAVITY = ("gem", "gvhmr", "prompthmr", "slahmr", "tram", "wham", "wham:python")
-GAPLESS = ("gvhmr", "gem", "mover")  # files whose rows are all frames of a video
-MODELS = {"sam3dbody": "smplx", "slahmr": "smplh"} | dict.fromkeys(
-    ("gem", "gvhmr", "mover", "multihmr", "prompthmr", "prox", "smplifyx"), "smplx"
+GAPLESS = ("gvhmr", "gem", "amass", "amass:smplx")  # files whose rows are all frames of a video
+MODELS = {"sam3dbody": "smplx", "slahmr": "smplh", "amass": "smplh"} | dict.fromkeys(
+    ("amass:smplx", "gem", "gvhmr", "prompthmr", "prox", "smplifyx"), "smplx"
 )
 
 
@@ -95,7 +97,13 @@ def imported(tool: str, folder: Path, faces: Path, **known: Any):
     source.mkdir()
     path = made.BODIES[tool](source)
     more = {"faces": faces} if tool == "sam3dbody" else {}
-    return bodies_from(tool.split(":")[0], path, replace(KNOWN, **more, **known))
+    found = bodies_from(tool.split(":")[0], path, replace(KNOWN, **more, **known))
+    if not tool.startswith("amass"):
+        assert found.bodies.space == "camera"
+        return found
+    assert found.bodies.space == "world"  # a motion has no camera: it is seen from the true one
+    R = torch.from_numpy(made.camera_matrix()).float()
+    return replace(found, bodies=into_camera(found.bodies, R))
 
 
 def seen(points: torch.Tensor) -> np.ndarray:
@@ -110,7 +118,6 @@ def test_bodies_fall_on_their_pixels_upright_and_not_mirrored(tool, tmp_path, fa
     assert found.warnings == () or tool == "slahmr"  # whose fixture has NaN
     near = bodies.verts[..., 2].mean(1).argmin()  # SAM 3D Body's fixture has another behind
     rows = bodies.person == bodies.person[near]
-    assert bodies.space == "camera"
     expected = range(5) if tool in GAPLESS else made.FRAMES.tolist()
     assert bodies.frame[rows].tolist() == list(expected)
     _, owner, _ = made.flesh(model)
@@ -263,13 +270,11 @@ def test_a_model_file_in_the_true_format_gives_meshes_and_keeps_flat_hands(tmp_p
         extra={"left_hand_pose": angles[:, 25:40].flatten(1), "flat_hand_mean": torch.ones(5, 1),
                "right_hand_pose": angles[:, 40:].flatten(1)},
     )  # fmt: skip
-    verts, joints = load_model("smplx").posed(pose)
-    human = {
-        "shape": np.zeros(10), "expression": np.zeros(10), "v3d": verts[0].numpy(),
-        "rotvec": true["angles"][0, [0, *range(1, 22), *range(25, 55), 22]],
-        "transl_pelvis": joints[0, :1].numpy(),
-    }  # fmt: skip
-    found = bodies_from("multihmr", made.store([human], tmp_path / "000000.pkl"))
+    verts, _ = load_model("smplx").posed(pose)
+    body = {"rotmat": made.matrices(true["angles"]), "shape": np.zeros(10), "trans": pose.transl}
+    people = {3: {"frames": made.FRAMES, "smplx_cam": body}}
+    found = bodies_from("prompthmr", made.store({"people": people}, tmp_path / "results.pkl"))
+    assert torch.allclose(found.bodies.verts, verts, atol=1e-4)
     assert found.warnings == ()
     assert found.bodies.joint_names[20] == "left_wrist"
     write_bodies(found.bodies, tmp_path / "bodies.npz")
@@ -277,7 +282,7 @@ def test_a_model_file_in_the_true_format_gives_meshes_and_keeps_flat_hands(tmp_p
     again = read_bodies(tmp_path / "bodies.npz", warnings.append)
     assert warnings == []  # the parameters in the file give the meshes in the file
     assert again.pose is not None
-    assert torch.allclose(again.pose.transl, pose.transl[:1], atol=1e-4)
+    assert torch.allclose(again.pose.transl, pose.transl, atol=1e-4)
 
 
 # What is wrong is told with its file, its key and the keys that are there.
@@ -303,7 +308,7 @@ def test_a_missing_key_is_told_with_the_keys_that_are_there(tmp_path):
         bodies_from("smplifyx", path)
 
 
-@pytest.mark.parametrize("tool", ["gvhmr", "slahmr", "wham", "phalp", "prompthmr", "multihmr"])
+@pytest.mark.parametrize("tool", ["gvhmr", "slahmr", "wham", "phalp", "prompthmr", "sam3dbody"])
 def test_a_file_of_another_tool_is_told_with_its_keys(tool, tmp_path):
     path = tmp_path / "some.pkl"
     made.store({"one": {"strange": np.zeros(3)}}, path)
@@ -369,7 +374,7 @@ class Hostile:
         return (os.system, ("touch owned",))
 
 
-@pytest.mark.parametrize("tool", ["smplifyx", "wham", "tram", "gvhmr", "multihmr", "phalp"])
+@pytest.mark.parametrize("tool", ["smplifyx", "wham", "tram", "gvhmr", "sam3dbody", "phalp"])
 def test_hostile_pickles_are_refused_and_not_run(tool, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {"tram": "hps/hps_track_0.npy", "gvhmr": "hmr4d_results.pt"}
@@ -414,6 +419,12 @@ def test_an_npz_with_pickled_objects_is_refused(tmp_path):
         bodies_from("slahmr", path)
 
 
+@pytest.mark.parametrize("write", [made.write_amass, made.write_amass_x])
+def test_a_motion_of_amass_given_as_bodies_is_named(write, tmp_path):
+    with pytest.raises(InputError, match=r"motion of AMASS.*--bodies-from amass"):
+        read_bodies(write(tmp_path))
+
+
 def test_a_missing_model_is_told_with_the_place_of_its_file(tmp_path, monkeypatch):
     monkeypatch.undo()
     monkeypatch.delenv("MOVER_BODY_MODELS", raising=False)
@@ -444,28 +455,21 @@ def test_keypoints_fall_on_the_joints_they_name(tool, tmp_path):
     found = keypoints_from(tool.split(":")[0], made.KEYPOINTS[tool](tmp_path), Known(fps=30.0))
     assert found.frame.tolist() == made.FRAMES.tolist()
     assert len(found.person.unique()) == 1
-    whole = as_openpose(found)
-    assert whole.points.shape == (5, 137, 2)
-    true = made.person("smplx")["pixels"]
-    told = 0
-    for k, name in enumerate(made.OPENPOSE):
-        sure = whole.confidence[:, k] > 0
-        if name in made.SHOWN and sure.all():
-            expected = true[:, made.SHOWN[name]]
-            if name in ("neck", "mid_hip") and tool not in ("openpose", "halpe26"):
-                pair = ("shoulder",) if name == "neck" else ("hip",)
-                sides = [made.SHOWN[f"{side}_{p}"] for side in ("left", "right") for p in pair]
-                expected = true[:, sides].mean(1)
-            assert np.linalg.norm(whole.points[:, k].numpy() - expected, axis=-1).max() < 0.01, name
-            told += 1
-    assert told == (15 if tool == "coco17" else 17)
-    left, right = (whole.points[:, k, 1] for k in (7, 4))
-    assert (left < whole.points[:, 0, 1]).all()  # the left hand is above the nose
-    assert (right > whole.points[:, 0, 1]).all()
-    if tool in ("openpose", "wholebody"):
-        assert torch.allclose(whole.points[:, 25], whole.points[:, 7])  # the left hand's wrist
-        assert torch.allclose(whole.points[:, 46], whole.points[:, 4])
-    assert (whole.confidence[:, 67:] == 0).all()
+    joints = LAYOUTS[found.layout]
+    assert found.points.shape == (5, len(joints), 2)
+    true, checked = made.person("smplx")["pixels"], 0
+    for k, name in enumerate(joints):
+        joint = made.SHOWN.get("mid_hip" if name == "pelvis" else name)
+        if joint is None:
+            assert (found.confidence[:, k] == 0).all()
+            continue
+        assert torch.allclose(found.confidence[:, k], torch.tensor(0.9))
+        assert np.abs(found.points[:, k].numpy() - true[:, joint]).max() < 0.01, name
+        checked += 1
+    assert checked == {"coco17": 13, "halpe26": 17, "openpose": 19}[tool.split(":")[0]]
+    if tool == "openpose":
+        for wrist, body in ((25, 7), (46, 4)):  # the first joint of a hand is its wrist
+            assert torch.allclose(found.points[:, wrist], found.points[:, body])
 
 
 def test_keypoints_that_are_written_are_read_again(tmp_path):

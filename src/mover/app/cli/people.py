@@ -175,7 +175,7 @@ def _counted(found: Any) -> str:  # noqa: ANN401
 
 
 NO_VPOSER = "note: the printed pose prior is VPoser's; without --vposer ours stands in for it"
-Detector = Literal["openpose", "coco17", "halpe26", "wholebody"]
+Detector = Literal["openpose", "coco17", "halpe26"]
 
 
 @dataclass(frozen=True)

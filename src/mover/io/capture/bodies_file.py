@@ -1,8 +1,10 @@
 """bodies.npz: people's meshes, or the parameters of a body model, or both."""
 
+import contextlib
 import dataclasses
 import logging
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.errors import InputError
+from mover.core.records import BROKEN
 from mover.core.types import Bodies
 from mover.io.capture.pose_file import pose_of, pose_to_arrays, posed, reproduces
 from mover.io.files.fields import (
@@ -37,13 +40,30 @@ TALLEST, SMALLEST = 3.5, 0.2  # [m], of a body that is in metres
 
 def read_bodies(path: Path, warn: Warn = log.warning) -> Bodies:
     """Read and check bodies, in the space that the file says."""
-    return bodies_of(read_npz(path), warn)
+    return bodies_of(_arrays(path), warn)
 
 
 def read_body_arrays(path: Path, fps: float | None = None) -> At:
     """The arrays of bodies.npz as they are, with a frame rate where one is given."""
-    at = read_npz(path)
+    at = _arrays(path)
     return at if fps is None else At({**at.value, "fps": np.array(fps)}, at.file)
+
+
+def _arrays(path: Path) -> At:
+    """The arrays of bodies.npz.
+
+    Raises:
+        InputError: If it cannot be read, or is a motion of AMASS.
+    """
+    names = set[str]()
+    with contextlib.suppress(*BROKEN), zipfile.ZipFile(path) as archive:
+        names = set(archive.namelist())
+    if "poses.npy" in names and "frame.npy" not in names:
+        raise InputError(
+            f"{path.name}: is a motion of AMASS, in a world of its own; expected bodies.npz (name "
+            "the tool: --bodies-from amass, or mover import-bodies amass, reads it upright)"
+        )
+    return read_npz(path)
 
 
 def bodies_of(at: At, warn: Warn) -> Bodies:

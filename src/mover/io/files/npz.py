@@ -16,8 +16,12 @@ from mover.core.records import BROKEN
 from mover.io.files.fields import LARGEST_FILE, At, reason
 
 
-def read_npz(path: Path) -> At:
+def read_npz(path: Path, *, without_objects: bool = False) -> At:
     """The arrays of an .npz file by name.
+
+    Args:
+        path: The file.
+        without_objects: Leave arrays of pickled objects out instead of refusing the file.
 
     Raises:
         InputError: If it is missing, broken, too large, or holds pickled objects.
@@ -26,30 +30,34 @@ def read_npz(path: Path) -> At:
     if not path.is_file():
         raise InputError(f"{name}: there is no such file in {path.parent}, expected an .npz file")
     try:
-        _check_headers(path)
+        kept = _checked_headers(path, without_objects)
         with np.load(path, allow_pickle=False) as arrays:
-            return At({key: arrays[key] for key in arrays.files}, name)
+            return At({key: arrays[key] for key in arrays.files if key in kept}, name)
     except BROKEN as error:
         raise InputError(
             f"{name}: cannot be read ({reason(error)}), expected an .npz file"
         ) from error
 
 
-def _check_headers(path: Path) -> None:
-    """Look at the sizes and types that the file promises before anything is unpacked."""
-    total = 0
+def _checked_headers(path: Path, without_objects: bool) -> set[str]:
+    """Names of the arrays, whose promised sizes and types are checked before any is unpacked."""
+    total, kept = 0, set[str]()
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             with archive.open(entry) as stream:
                 dtype, size = _header(stream)
             total += size
             key = entry.filename.removesuffix(".npy")
+            if dtype.hasobject and without_objects:
+                continue
+            kept.add(key)
             if dtype.hasobject or dtype.fields:
                 found = f"has {dtype}, expected plain numbers or text (no pickled objects)"
                 raise InputError(f"{path.name}: field '{key}' {found}")
             if total > LARGEST_FILE:
                 found = f"has {total} bytes or more, expected at most {LARGEST_FILE} in the file"
                 raise InputError(f"{path.name}: field '{key}' {found}")
+    return kept
 
 
 def _header(stream: Any) -> tuple[np.dtype[Any], int]:  # noqa: ANN401

@@ -13,7 +13,7 @@ from mover.core.errors import InputError
 from mover.core.records import record
 from mover.core.types import Bodies, BodyPose, Camera, Mesh
 from mover.geometry.camera import pitch_roll
-from mover.io.capture.pose_file import into_camera, rest_pelvis, run_model
+from mover.io.capture.pose_file import into_camera, run_model
 from mover.io.files.fields import LARGEST, At, listed
 from mover.io.files.meshes import read_mesh
 from mover.io.formats import chosen as format_of
@@ -25,7 +25,7 @@ SAME = 0.01  # [m], parameters that miss the tool's own vertices by more are lef
 
 @record
 class Imported:
-    """Bodies as another tool found them, in the camera frame."""
+    """Bodies as another tool found them, in the camera frame, or upright where it has none."""
 
     bodies: Bodies
     K: Float[Tensor, "3 3"] | None
@@ -36,7 +36,7 @@ class Imported:
 
 
 def bodies_from(tool: str, path: Path, known: Known | None = None) -> Imported:
-    """Bodies that another tool found, in the camera frame.
+    """Bodies that another tool found: with meshes, under the true lens, without failed rows.
 
     Raises:
         InputError: If the tool is not known, its files are not as it writes them, or a body model
@@ -56,11 +56,10 @@ def finish(found: Found, known: Known, file: str) -> Imported:
     warnings = [f"{file}: {w}" for w in found.warnings]
     found = _in_order(_sound(found, file, warnings), file)
     model = _model_of(found, known)
-    found = _with_place(found, model, file, warnings)
     found = _under_lens(_with_verts(found, model, file, warnings), known)
     assert found.verts is not None
     if not (found.verts.abs() <= LARGEST).all():
-        raise InputError(f"{file}: has bodies at places that are not finite under this lens")
+        raise InputError(f"{file}: has bodies at positions that are not finite under this lens")
     up, spread = (None, 0.0) if found.up is None else mean_up(found.up)
     if spread > TURNED:
         warnings.append(f"{file}: its gravity turns by {spread:.2f} rad: does the camera move?")
@@ -72,7 +71,7 @@ def finish(found: Found, known: Known, file: str) -> Imported:
         frame=found.frame,
         person=found.person,
         fps=known.fps or found.fps,
-        space="camera",
+        space=found.space,
         pose=found.pose,
     )
     used = None if found.K is None else found.K.median(0).values
@@ -98,9 +97,9 @@ def _sound(found: Found, file: str, warnings: list[str]) -> Found:
 
 
 def _finite(found: Found) -> Bool[Tensor, " bodies"]:
-    """Rows whose numbers are finite; a place that no row has is not asked for."""
+    """Rows whose numbers are finite; a translation that no row has is not needed."""
     pose = found.pose
-    values = [found.verts, found.pelvis, found.K]
+    values = [found.verts, found.K]
     if pose is not None:
         values += [pose.betas, pose.global_orient, pose.body_pose, *pose.extra.values()]
         values += [] if pose.transl.isnan().all() else [pose.transl]
@@ -134,22 +133,6 @@ def _model_of(found: Found, known: Known) -> BodyModel | None:
         return None
 
 
-def _with_place(found: Found, model: BodyModel | None, file: str, warnings: list[str]) -> Found:
-    """With `transl` where the tool tells the pelvis instead."""
-    pose = found.pose
-    if pose is None:
-        return found
-    if isinstance(model, SmplBody) and model.hands is not None:
-        pose = _from_mean_hands(pose, model.hands)
-    if found.pelvis is None:
-        return dataclasses.replace(found, pose=pose)
-    if model is None:
-        warnings.append(f"{file}: without the model '{found.model}' the parameters are left out")
-        return dataclasses.replace(found, pose=None)
-    pose = dataclasses.replace(pose, transl=found.pelvis - rest_pelvis(model, pose))
-    return dataclasses.replace(found, pose=pose, pelvis=None)
-
-
 def _from_mean_hands(pose: BodyPose, hands: Hands) -> BodyPose:
     """Hands whose angles count from flat ones, counted from the mean hand as smplx does."""
     if FLAT not in pose.extra:
@@ -167,8 +150,15 @@ def _with_verts(found: Found, model: BodyModel | None, file: str, warnings: list
     Tools differ in what their meshes are centred about: a constant shift belongs to `transl`.
     """
     pose = found.pose
-    if pose is None or model is None:
-        return found if pose is None else _unless_unplaced(found, pose, file, warnings)
+    if pose is None:
+        return found
+    if model is None:
+        if pose.transl.isfinite().all():
+            return found
+        warnings.append(f"{file}: without the model '{found.model}' the parameters are left out")
+        return dataclasses.replace(found, pose=None)
+    if isinstance(model, SmplBody) and model.hands is not None:
+        pose = _from_mean_hands(pose, model.hands)
     placed = dataclasses.replace(pose, transl=pose.transl.nan_to_num(0))
     verts, joints = run_model(model, placed)
     if found.verts is None:
@@ -184,14 +174,6 @@ def _with_verts(found: Found, model: BodyModel | None, file: str, warnings: list
     warnings.append(
         f"{file}: the parameters miss the vertices by up to {worst:.3g} m and are left out"
     )
-    return dataclasses.replace(found, pose=None)
-
-
-def _unless_unplaced(found: Found, pose: BodyPose, file: str, warnings: list[str]) -> Found:
-    """Without parameters that have no place and no model to find it."""
-    if pose.transl.isfinite().all():
-        return found
-    warnings.append(f"{file}: without the model '{found.model}' the parameters are left out")
     return dataclasses.replace(found, pose=None)
 
 
@@ -239,9 +221,6 @@ def mesh_file(path: Path) -> Mesh:
     return read_mesh(At(path.name, str(path)), path.parent)[0]
 
 
-# What a tool's gravity gives: bodies in the upright world, and a camera with pitch and roll.
-
-
 def attitude(up: Float[Tensor, "3"]) -> tuple[float, float]:
     """Pitch and roll of the camera that sees this as up [rad]."""
     pitch, roll = pitch_roll(level(up))
@@ -252,10 +231,12 @@ def in_world(found: Imported, file: str) -> Bodies:
     """The bodies in the world without heading, +y up, the camera at its origin.
 
     Raises:
-        InputError: If the tool does not tell gravity.
+        InputError: If the tool has no gravity.
     """
+    if found.bodies.space == "world":
+        return found.bodies
     if found.up is None:
-        raise InputError(f"{file}: tells no gravity, expected --space camera")
+        raise InputError(f"{file}: has no gravity, expected --space camera")
     R = level(found.up)
     given = dataclasses.replace(found.bodies, space="world")
     return dataclasses.replace(into_camera(given, R.mT), space="world")
@@ -268,7 +249,7 @@ def camera_from(found: Imported, known: Known) -> Camera:
         InputError: If no lens is known.
     """
     if found.K is None:
-        raise InputError("--write-camera: the tool tells no lens, expected --camera as well")
+        raise InputError("--write-camera: the tool has no lens, expected --camera as well")
     R = torch.diag(torch.tensor([1.0, -1.0, -1.0])) if found.up is None else level(found.up)
     if known.camera is not None:
         return dataclasses.replace(known.camera, R_cam_world=R)

@@ -1,10 +1,10 @@
-"""What the user knows, what a tool found, and who is who: rows of bodies that are not settled."""
+"""What the user knows and what a tool found: rows of bodies, with tracks."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,9 +15,7 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.records import record, rows_of
 from mover.core.types import BodyPose, Camera
-from mover.io.capture.pose_file import moved
 from mover.io.files.fields import At, mapping
-from mover.io.people.values import Numbers, tensor
 
 PATIENCE = 15  # a person who is gone for so many frames starts a new track
 REACH = 0.6  # of a person's size: how far one may move from frame to frame
@@ -37,10 +35,9 @@ def people_of(at: At) -> list[tuple[int, At]]:
     numbered = all(key.isdigit() for key in keys)
     people: list[tuple[int, At]] = []
     for index, (key, value) in enumerate(given.items()):
-        field = f"{at.field}.{key}" if at.field else str(key)
-        people.append((int(keys[index]) if numbered else index, At(value, at.file, field)))
-    for _, person in people:
+        person = At(value, at.file, f"{at.field}.{key}" if at.field else str(key))
         mapping(person)
+        people.append((int(keys[index]) if numbered else index, person))
     return people
 
 
@@ -49,53 +46,39 @@ def followed(
 ) -> NDArray[np.int64]:
     """Tracks of people that each frame lists in any order.
 
-    The nearest pair of a track and a person is joined first; nobody moves further than `REACH`
-    of the larger of the two sizes, and a little more after a gap.
+    The nearest pair of a track and a person is joined first, if the person moved no further than
+    `REACH` of the larger of the two sizes, and a little more after a gap.
 
     Args:
         frames: Frame of each row.
-        places: (rows, axes), where each is, in any unit.
-        sizes: (rows,), how large each is, in the same unit.
+        places: (rows, axes), positions in any unit.
+        sizes: (rows,), sizes in the same unit.
     """
     tracks = np.full(len(frames), -1, dtype=np.int64)
     last: dict[int, int] = {}
     order = np.asarray(frames)
     for frame in sorted(set(order.tolist())):
-        here = np.flatnonzero(order == frame)
-        alive = {t: row for t, row in last.items() if frame - order[row] <= PATIENCE}
-        for track, row in _pairs(alive, here, order, places, sizes):
-            tracks[row] = track
-        for row in here:
+        current = np.flatnonzero(order == frame)
+        options: list[tuple[float, int, int]] = []
+        for track, before in last.items():
+            gap = frame - int(order[before])
+            if gap > PATIENCE:
+                continue
+            for row in current:
+                size = max(sizes[row], sizes[before], 1e-9)
+                way = float(np.linalg.norm(places[row] - places[before]) / size)
+                if way <= REACH * (1 + GROWTH * (gap - 1)):
+                    options.append((way, track, int(row)))
+        taken: set[int] = set()
+        for _, track, row in sorted(options):
+            if track not in taken and tracks[row] < 0:
+                tracks[row] = track
+                taken.add(track)
+        for row in current:
             if tracks[row] < 0:
                 tracks[row] = len(last)
             last[int(tracks[row])] = int(row)
     return tracks
-
-
-def _pairs(
-    alive: dict[int, int],
-    here: NDArray[np.int64],
-    frames: NDArray[np.int64],
-    places: NDArray[np.float64],
-    sizes: NDArray[np.float64],
-) -> list[tuple[int, int]]:
-    """Tracks and rows that belong together, nearest first."""
-    options: list[tuple[float, int, int]] = []
-    for track, before in alive.items():
-        for row in here:
-            gap = int(frames[row] - frames[before])
-            size = max(sizes[row], sizes[before], 1e-9)
-            way = float(np.linalg.norm(places[row] - places[before]) / size)
-            if way <= REACH * (1 + GROWTH * (gap - 1)):
-                options.append((way, track, int(row)))
-    found: list[tuple[int, int]] = []
-    for _, track, row in sorted(options):
-        if all(track != t and row != r for t, r in found):
-            found.append((track, row))
-    return found
-
-
-# Rows of bodies.
 
 
 @dataclass(frozen=True)
@@ -120,12 +103,9 @@ class Known:
     """Angles of the 21 joints from VPoser's codes, where the user has its weights."""
 
 
-ROOT = 3  # angles of the root
-
-
 @record
 class Found:
-    """People in the camera axes of each frame; a row may hold NaN where the tool failed."""
+    """Rows of bodies in the camera axes of their frames; a row is NaN where the tool failed."""
 
     model: str
     """Whose vertices: smpl, smplh, smplx or mhr."""
@@ -136,45 +116,18 @@ class Found:
     """[m]."""
     joints: Float[Tensor, "bodies joints 3"] | None = None
     """As the model places them [m]."""
-    pelvis: Float[Tensor, "bodies 3"] | None = None
-    """Place of the pelvis where the tool tells it instead of `pose.transl` [m]."""
     K: Float[Tensor, "bodies 3 3"] | None = None
     """The lens that the tool assumed [px]."""
     up: Float[Tensor, "bodies 3"] | None = None
     """Away from the ground, where the tool knows gravity."""
     fps: float | None = None
+    space: Literal["camera", "world"] = "camera"
+    """world: +y up, where the tool knows no camera."""
     warnings: tuple[str, ...] = ()
 
 
-def pose_of(
-    model: str, gender: str | None, whole: Numbers, betas: Numbers, transl: Numbers | None
-) -> BodyPose:
-    """Parameters of rows: angles of root and body, shape, and place (None: not told)."""
-    angles, shape = tensor(whole), tensor(betas)
-    place = torch.full((len(angles), 3), torch.nan) if transl is None else tensor(transl)
-    root, body = angles[:, :ROOT], angles[:, ROOT:]
-    return BodyPose(model, gender or "neutral", shape, root, body, place, {})
-
-
-def people_rows(
-    known: Known,
-    model: str,
-    frame: Int[Tensor, " bodies"],
-    person: int | Int[Tensor, " bodies"],
-    told: tuple[Numbers, Numbers, Numbers | None],
-    extra: Mapping[str, Tensor] | None = None,
-    **more: Any,  # noqa: ANN401
-) -> Found:
-    """Rows of a body model: `told` are angles, shape and place as `pose_of` takes them."""
-    who = torch.full_like(frame, person) if isinstance(person, int) else person
-    pose = dataclasses.replace(pose_of(model, known.gender, *told), extra=dict(extra or {}))
-    return Found(model, frame, who, pose, **more)
-
-
-def shifted(found: Found, R: Float[Tensor, "bodies 3 3"], t: Float[Tensor, "bodies 3"]) -> Found:
-    """Rows whose parameters are those of the bodies R x + t."""
-    assert found.pose is not None
-    return dataclasses.replace(found, pose=moved(found.pose, R, t))
+_TENSORS = ("frame", "person", "verts", "joints", "K", "up")
+_POSE = ("global_orient", "body_pose", "transl")
 
 
 def joined(parts: Sequence[Found]) -> Found:
@@ -221,7 +174,3 @@ def chosen(found: Found, index: Int[Tensor, " rows"]) -> Found:
     picked = {name: None if v is None else v[index] for name, v in values.items()}
     pose = None if found.pose is None else rows_of(found.pose, index)
     return dataclasses.replace(found, **picked, pose=pose)
-
-
-_TENSORS = ("frame", "person", "verts", "joints", "pelvis", "K", "up")
-_POSE = ("global_orient", "body_pose", "transl")

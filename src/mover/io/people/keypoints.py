@@ -1,6 +1,10 @@
-"""Keypoints of detectors: their layouts, tracks, and the file keypoints.npz."""
+"""2D joints: what detectors write, with tracks, and the file keypoints.npz.
 
-import dataclasses
+Lists of instances are COCO's results, AlphaPose's (Halpe) and MMPose's; arrays are rtmlib's.
+OpenPose writes a file an image, with the body (BODY_25), and hands and face where detected.
+"""
+
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,65 +17,53 @@ from numpy.typing import NDArray
 from mover.bodies.keypoints import LAYOUTS as JOINTS
 from mover.core.errors import InputError
 from mover.core.types import Keypoints
-from mover.io.files.fields import LARGEST, At, array, choice, get, maybe, refuse
+from mover.io.files.fields import (
+    LARGEST,
+    At,
+    array,
+    choice,
+    get,
+    items,
+    mapping,
+    maybe,
+    read_json,
+    refuse,
+)
 from mover.io.files.npz import read_npz, write_npz
 from mover.io.formats import chosen
 from mover.io.people.found import Known, followed
+from mover.io.people.values import (
+    either,
+    files_of,
+    need,
+    number_in,
+    numbers,
+    read_any,
+    rows,
+    whole,
+    wide,
+)
 
-LAYOUTS = {name: len(JOINTS[name]) for name in
-           ("openpose25", "openpose137", "coco17", "halpe26", "wholebody133")}  # fmt: skip
+LAYOUTS = {name: len(JOINTS[name]) for name in ("openpose25", "openpose137", "coco17", "halpe26")}
 """Number of joints of each layout."""
-
-LEFT_HAND, RIGHT_HAND, FACE = 25, 46, 67
-"""Where the parts of `openpose137` start."""
-
-_COCO = {0: 0, 2: 6, 3: 8, 4: 10, 5: 5, 6: 7, 7: 9, 9: 12, 10: 14, 11: 16, 12: 11, 13: 13, 14: 15,
-         15: 2, 16: 1, 17: 4, 18: 3}  # fmt: skip
-_HALPE_FEET = {19: 20, 20: 22, 21: 24, 22: 21, 23: 23, 24: 25}
-_WHOLE_FEET = {19: 17, 20: 18, 21: 19, 22: 20, 23: 21, 24: 22}
-_HANDS = {LEFT_HAND + k: 91 + k for k in range(42)}
-_FACE = {FACE + k: 23 + k for k in range(68)}
-_MIDDLES = {1: (5, 6), 8: (11, 12)}
-
-SOURCES = {
-    "openpose25": {k: k for k in range(25)},
-    "openpose137": {k: k for k in range(137)},
-    "coco17": _COCO,
-    "halpe26": {**_COCO, **_HALPE_FEET, 1: 18, 8: 19},
-    "wholebody133": {**_COCO, **_WHOLE_FEET, **_HANDS, **_FACE},
-}
-"""For each joint of `openpose137` that a layout has, its index there."""
-
-
-def as_openpose(keypoints: Keypoints) -> Keypoints:
-    """The same keypoints as OpenPose's 25 + 21 + 21 + 70; what the detector lacks is missing.
-
-    COCO has no neck and no middle of the hips: they are the middles of the shoulders and hips, as
-    sure as the less sure of the two.
-    """
-    table = SOURCES[keypoints.layout]
-    count = LAYOUTS["openpose137"]
-    rows = len(keypoints.frame)
-    points = keypoints.points.new_zeros(rows, count, 2)
-    confidence = keypoints.confidence.new_zeros(rows, count)
-    there, here = list(table), list(table.values())
-    points[:, there] = keypoints.points[:, here]
-    confidence[:, there] = keypoints.confidence[:, here]
-    for joint, (a, b) in _MIDDLES.items():
-        if joint in table:
-            continue
-        points[:, joint] = (keypoints.points[:, a] + keypoints.points[:, b]) / 2
-        confidence[:, joint] = torch.minimum(keypoints.confidence[:, a], keypoints.confidence[:, b])
-    points = points * (confidence > 0)[..., None]
-    return dataclasses.replace(
-        keypoints, points=points, confidence=confidence, layout="openpose137"
-    )
-
-
-# From lists of joints by image to tracks of keypoints.
-
-
 CENTRE = 0.5  # [px], detectors call the centre of the top-left pixel (0, 0)
+JSON_LIMIT = "a list of instances, or an object with 'annotations' or 'instance_info'"
+PARTS = {
+    "pose_keypoints_2d": 25,
+    "hand_left_keypoints_2d": 21,
+    "hand_right_keypoints_2d": 21,
+    "face_keypoints_2d": 70,
+}
+"""Triples of a person of OpenPose."""
+
+
+def keypoints_from(tool: str, path: Path, known: Known | None = None) -> Keypoints:
+    """Keypoints that a detector found.
+
+    Raises:
+        InputError: If the detector is not known, or its files are not as it writes them.
+    """
+    return chosen("tool", tool, "keypoints")(Path(path), known or Known())
 
 
 @dataclass(frozen=True)
@@ -80,7 +72,7 @@ class Seen:
 
     frame: int
     person: int
-    """Its track; negative: not told."""
+    """Its track; negative: unknown."""
     joints: NDArray[np.float64]
     """(joints, 3): x, y [px], confidence."""
 
@@ -88,10 +80,10 @@ class Seen:
 def keypoints_of(seen: Sequence[Seen], layout: str, fps: float | None, file: str) -> Keypoints:
     """Keypoints with tracks; people without any joint are left out.
 
-    People are followed from image to image where the file does not tell who is who.
+    People are followed from image to image where the file has no tracks.
 
     Raises:
-        InputError: If nobody is left, or a frame is negative.
+        InputError: If no person is left, or a frame is negative.
     """
     kept = [s for s in map(_clean, seen) if s.joints[:, 2].any()]
     if not kept:
@@ -102,9 +94,10 @@ def keypoints_of(seen: Sequence[Seen], layout: str, fps: float | None, file: str
     person = np.array([s.person for s in kept])
     pairs = {(s.frame, s.person) for s in kept}
     if person.min() < 0 or len(pairs) < len(kept):
-        boxes = np.array([_box(s.joints) for s in kept])
-        size = np.linalg.norm(boxes[:, 2:] - boxes[:, :2], axis=1)
-        person = followed(frame.tolist(), (boxes[:, :2] + boxes[:, 2:]) / 2, size)
+        points = [s.joints[s.joints[:, 2] > 0, :2] for s in kept]
+        low, high = np.array([p.min(0) for p in points]), np.array([p.max(0) for p in points])
+        size = np.linalg.norm(high - low, axis=1)
+        person = followed(frame.tolist(), (low + high) / 2, size)
     order = np.lexsort((person, frame))
     joints = torch.from_numpy(np.stack([kept[i].joints for i in order]).astype(np.float32))
     return Keypoints(
@@ -119,20 +112,150 @@ def keypoints_of(seen: Sequence[Seen], layout: str, fps: float | None, file: str
 
 def _clean(seen: Seen) -> Seen:
     """Pixels as the package counts them; confidence from 0 to 1, 0 where a joint is missing."""
-    told = (np.abs(seen.joints) <= LARGEST).all(1, keepdims=True)  # false for NaN as well
-    joints = np.where(told, seen.joints, 0.0)
+    finite = (np.abs(seen.joints) <= LARGEST).all(1, keepdims=True)  # false for NaN as well
+    joints = np.where(finite, seen.joints, 0.0)
     sure = np.clip(joints[:, 2], 0, 1)
     points = (joints[:, :2] + CENTRE) * (sure > 0)[:, None]
     return Seen(seen.frame, seen.person, np.concatenate([points, sure[:, None]], 1))
 
 
-def _box(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where the joints lie: the low and the high corner [px]."""
-    points = joints[joints[:, 2] > 0, :2]
-    return np.concatenate([points.min(0), points.max(0)])
+def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
+    """Keypoints of a JSON file or of arrays (.npz: keypoints, scores, frame, person).
+
+    Raises:
+        InputError: If it is none of these, or has another number of joints.
+    """
+    at = read_any(path)
+    count = LAYOUTS[layout]
+    if path.suffix.lower() == ".npz":
+        seen = _arrays(at, count)
+    else:
+        seen = [_instance(one, frame, count) for one, frame in _listed(at)]
+    moved = [Seen(s.frame - known.first, s.person, s.joints) for s in seen]
+    return keypoints_of(moved, layout, known.fps, path.name)
 
 
-# keypoints.npz: the joints that a detector saw, by frame and person.
+def _listed(at: At) -> list[tuple[At, int]]:
+    """Instances with their frames."""
+    if isinstance(at.value, list):
+        return [(one, _frame(one)) for one in items(at)]
+    if not isinstance(at.value, dict):
+        refuse(at, JSON_LIMIT)
+    images = either(at, "instance_info")
+    if images is not None:
+        found: list[tuple[At, int]] = []
+        for index, image in enumerate(items(images)):
+            number = either(image, "frame_id", "image_id")
+            frame = index if number is None else _integer(number)
+            found += [(one, frame) for one in items(need(image, "instances"))]
+        return found
+    return [(one, _frame(one)) for one in items(need(at, "annotations", "instance_info"))]
+
+
+def _frame(at: At) -> int:
+    """The image of an instance: a number, or a file name with one."""
+    return _integer(need(at, "image_id", "frame_id", "frame"))
+
+
+def _integer(at: At) -> int:
+    """A whole number, or the last number in a name."""
+    found = re.findall(r"\d+", Path(str(at.value)).stem)
+    if isinstance(at.value, bool) or not found:
+        refuse(at, "a number, or a name with one")
+    return int(found[-1])
+
+
+def _instance(at: At, frame: int, count: int) -> Seen:
+    given = need(at, "keypoints")
+    scores = either(at, "keypoint_scores", "scores")
+    joints = _joints(given, None if scores is None else numbers(scores), count)
+    track = either(at, "track_id", "idx", "person_id")
+    marked = "num_keypoints" in mapping(at)  # ground truth: 0 absent, 1 hidden, 2 visible
+    if marked:
+        joints[:, 2] = joints[:, 2] > 0
+    return Seen(frame, -1 if track is None else _track(track), joints)
+
+
+def _track(at: At) -> int:
+    """A track as a number; -1 where it is written in another way."""
+    given: Any = at.value
+    while isinstance(given, list) and len(given) == 1:
+        given = given[0]
+    if isinstance(given, bool) or not isinstance(given, int | float) or not given >= 0:
+        return -1
+    return int(given)
+
+
+def _joints(at: At, scores: NDArray[np.float64] | None, count: int) -> NDArray[np.float64]:
+    value = numbers(at)
+    width = value.size // count if value.size % count == 0 else 0
+    if width not in (2, 3) or (value.ndim > 1 and value.shape[-1] != width):
+        refuse(at, f"{count} joints of 2 or 3 numbers", f"shape {value.shape}")
+    if width == 3:
+        return value.reshape(count, 3).copy()
+    if scores is None or scores.size != count:
+        refuse(at, f"{count} joints with 'keypoint_scores'", "points without confidences")
+    return np.concatenate([value.reshape(count, 2), scores.reshape(count, 1)], 1)
+
+
+def _arrays(at: At, count: int) -> list[Seen]:
+    given, scores = need(at, "keypoints", "points"), either(at, "scores", "confidence")
+    frames = whole(need(at, "frame", "frames"))
+    person = either(at, "person", "track_id")
+    who = np.full(len(frames), -1) if person is None else whole(person)
+    points = wide(given, len(frames))
+    if len(who) != len(frames):
+        refuse(given, "as many rows as frames", f"{len(frames)} frames and {len(who)} tracks")
+    sure = None if scores is None else rows(scores, len(frames), count)
+    return [
+        Seen(
+            int(frame),
+            int(track),
+            _joints(At(points[k], at.file, given.field), None if sure is None else sure[k], count),
+        )
+        for k, (frame, track) in enumerate(zip(frames, who, strict=True))
+    ]
+
+
+def read_openpose(path: Path, known: Known) -> Keypoints:
+    """Keypoints of a folder of OpenPose JSON, or of one file.
+
+    Raises:
+        InputError: If a file is not OpenPose's with BODY_25.
+    """
+    files = files_of(path, "*.json", "OpenPose's keypoints")
+    seen: list[Seen] = []
+    for index, file in enumerate(files):
+        name = file.stem.removesuffix("_keypoints")
+        frame = number_in(name, index) - known.first if path.is_dir() else 0
+        at = read_json(file)
+        seen += [_of_openpose(person, frame) for person in items(need(at, "people"))]
+    more = any(s.joints[25:, 2].any() for s in seen)
+    if not more:
+        seen = [Seen(s.frame, s.person, s.joints[:25]) for s in seen]
+    return keypoints_of(seen, "openpose137" if more else "openpose25", known.fps, path.name)
+
+
+def _of_openpose(at: At, frame: int) -> Seen:
+    need(at, "pose_keypoints_2d")
+    joints = np.concatenate([_part(at, name, count) for name, count in PARTS.items()])
+    given = either(at, "person_id")
+    ids = [-1.0] if given is None else numbers(given).reshape(-1).tolist() or [-1.0]
+    return Seen(frame, int(ids[0]), joints)
+
+
+def _part(at: At, name: str, count: int) -> NDArray[np.float64]:
+    """The triples of a part; zeros where it is not given."""
+    given = either(at, name)
+    if given is None or not np.size(numbers(given)):
+        return np.zeros((count, 3))
+    value = numbers(given)
+    if value.size != count * 3:
+        refuse(given, f"{count} triples x, y, confidence", f"{value.size} numbers")
+    return value.reshape(count, 3)
+
+
+# keypoints.npz.
 
 
 def write_keypoints(keypoints: Keypoints, path: Path) -> None:
@@ -173,12 +296,3 @@ def read_keypoints(path: Path) -> Keypoints:
         person=torch.from_numpy(person),
         fps=None if fps is None else float(array(fps, ())[()]),
     )
-
-
-def keypoints_from(tool: str, path: Path, known: Known | None = None) -> Keypoints:
-    """Keypoints that a detector found.
-
-    Raises:
-        InputError: If the detector is not known, or its files are not as it writes them.
-    """
-    return chosen("tool", tool, "keypoints")(Path(path), known or Known())

@@ -1,7 +1,7 @@
-"""Lenses: from weak perspective and assumed focal lengths to the true camera.
+"""Lenses and gravity of other tools: from weak perspective and assumed lenses to the true camera.
 
-A network sees a square crop of side b [px] about (x, y) and says how large (s) and where (p, q) a
-body is in it. Under a camera with focal length f and principal point c the body's origin is at
+A network that sees a square crop of side b [px] about (x, y) estimates the scale s of a body and
+its position (p, q) there. Under a camera of focal length f and principal point c the body is at
 
     t_z = 2 f / (s b),   t_x = p + 2 (x - c_x) / (s b),   t_y = q + 2 (y - c_y) / (s b)
 
@@ -24,6 +24,8 @@ from mover.io.people.found import Known
 from mover.io.people.values import need, one_number, rows, stacked, tensor
 
 SAME_LENS = 1e-4  # relative difference of focal lengths that is none
+TURNED = math.radians(5)  # cameras whose up-vectors spread more are not taken to stand still
+TRAVELLED = 0.1  # [m], the same for their positions
 
 
 def lens(
@@ -40,8 +42,8 @@ def assumed_lens(
     """The lens that a tool assumed; None where the size of the image is not known.
 
     Args:
-        known: What the user says.
-        focal: The tool's own, or how it follows from width and height [px].
+        known: The user's focal length goes before the tool's.
+        focal: The tool's own, or a function of width and height [px].
         count: Rows.
     """
     if known.camera is None:
@@ -51,8 +53,8 @@ def assumed_lens(
     return lens(known.focal or own, *size).float().expand(count, 3, 3)
 
 
-def told_lens(at: At, count: int) -> Float[Tensor, "rows 3 3"]:
-    """The lens that a file tells as `img_focal` and `img_center` [px].
+def image_lens(at: At, count: int) -> Float[Tensor, "rows 3 3"]:
+    """The lens that a file gives as `img_focal` and `img_center` [px].
 
     Raises:
         InputError: If a key is missing or is no number.
@@ -65,7 +67,7 @@ def told_lens(at: At, count: int) -> Float[Tensor, "rows 3 3"]:
 def from_crop(
     crop: Float[Tensor, "bodies 3"], box: Float[Tensor, "bodies 3"], K: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "bodies 3"]:
-    """Place of bodies that a network saw in square crops [m].
+    """Position of bodies that a network saw in square crops [m].
 
     Args:
         crop: s, p, q.
@@ -82,7 +84,7 @@ def from_crop(
 def from_image(
     whole: Float[Tensor, "bodies 4"], K: Float[Tensor, "3 3"], size: tuple[int, int]
 ) -> Float[Tensor, "bodies 3"]:
-    """Place of bodies by weak perspective of the whole image: s_x, s_y, p, q [m].
+    """Position of bodies by weak perspective of the whole image: s_x, s_y, p, q [m].
 
     A point (x, y) of the body is at (s_x (x + p), s_y (y + q)) of an image that spans -1 to 1.
     """
@@ -98,7 +100,7 @@ def from_pixels(
     pixels: Float[Tensor, "bodies joints 2"],
     K: Float[Tensor, "3 3"],
 ) -> Float[Tensor, "bodies 3"]:
-    """Place of bodies whose joints are seen at these pixels, by linear least squares [m]."""
+    """Position of bodies whose joints are seen at these pixels, by linear least squares [m]."""
     rays = (pixels - K[:2, 2]) / torch.stack([K[0, 0], K[1, 1]])
     one, none = torch.ones_like(rays[..., 0]), torch.zeros_like(rays[..., 0])
     left = torch.stack(
@@ -113,7 +115,7 @@ def from_pixels(
 def refocused(
     middle: Float[Tensor, "bodies 3"], used: Float[Tensor, "bodies 3 3"], K: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "bodies 3"]:
-    """How far bodies must move to keep place and size in the image under another lens [m]."""
+    """Shift that keeps position and size of bodies in the image under another lens [m]."""
     pixel = torch.einsum("bij,bj->bi", used, middle)
     pixel = pixel[:, :2] / pixel[:, 2:]
     f = torch.stack([K[0, 0], K[1, 1]])
@@ -128,13 +130,6 @@ def differs(used: Float[Tensor, "bodies 3 3"], K: Float[Tensor, "3 3"]) -> bool:
     return bool((used - K).abs().amax() > SAME_LENS * K[0, 0])
 
 
-# Gravity: which way is up in the camera, as the tools' own worlds tell it.
-
-
-TURNED = math.radians(5)  # cameras whose up-vectors spread more are not taken to stand still
-TRAVELLED = 0.1  # [m], the same for their places
-
-
 def up_of_roots(
     root_cam: Float[Tensor, "bodies 3"], root_world: Float[Tensor, "bodies 3"]
 ) -> Float[Tensor, "bodies 3"]:
@@ -146,8 +141,8 @@ def up_of_roots(
 def mean_up(up: Float[Tensor, "bodies 3"]) -> tuple[Float[Tensor, "3"] | None, float]:
     """The one direction that a camera at rest has, and the spread about it [rad].
 
-    The middle is the normalised median; the spread is the angle that nine of ten keep. None where
-    no row tells it.
+    The middle is the normalised median; the spread is the angle that nine of ten keep. None without
+    a row that has it.
     """
     known = up[up.isfinite().all(-1) & (up.norm(dim=-1) > 0)].double()
     if not len(known):
@@ -178,14 +173,14 @@ def movement(
     way = float((centre - centre[0]).norm(dim=-1).max())
     if angle < TURNED and way < TRAVELLED:
         return ()
-    told = f"turns by up to {math.degrees(angle):.1f} degrees and travels {way:.2f} m"
-    return (f"the camera {told}: give its poses, too (`mover import --cameras`)",)
+    path = f"turns by up to {math.degrees(angle):.1f} degrees and travels {way:.2f} m"
+    return (f"the camera {path}: give its poses, too (`mover import --cameras`)",)
 
 
 def cameras_of(
     turn: At, place: At, frame: Int[Tensor, " rows"]
 ) -> tuple[Float[Tensor, "frames 3 3"], Float[Tensor, "frames 3"]]:
-    """Rotations and places of a camera in all frames of a video.
+    """Rotations and positions of a camera in all frames of a video.
 
     Raises:
         InputError: If they have other shapes, or do not reach to the last frame of the bodies.
@@ -196,3 +191,17 @@ def cameras_of(
         named = f"field '{turn.field}' has {len(R)} frames, the bodies name {last}"
         raise InputError(f"{turn.file}: {named}")
     return R, tensor(rows(place, len(R), 3))
+
+
+def lens_of(
+    points: Float[Tensor, "points 3"], pixels: Float[Tensor, "points 2"]
+) -> Float[Tensor, "3 3"]:
+    """The lens that sees these points in camera axes at these pixels, by least squares [px]."""
+    rays = (points[:, :2] / points[:, 2:]).double()
+    one, none = torch.ones(len(rays)).double(), torch.zeros(len(rays)).double()
+    left = torch.cat(
+        [torch.stack([rays[:, 0], one, none], 1), torch.stack([rays[:, 1], none, one], 1)]
+    )
+    right = pixels.double().T.reshape(-1, 1)
+    f, cx, cy = torch.linalg.lstsq(left, right).solution[:, 0].tolist()
+    return torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""What a tool left on disk, as plain values: arrays, numbers, text, lists and mappings."""
+"""Files of other tools as plain values: fields under any of their names, NaN let through."""
 
 import math
 import re
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -48,23 +48,18 @@ def read_any(path: Path) -> At:
         case ".json":
             return read_json(path)
         case ".npy":
-            value = _read_npy(path)
+            try:
+                with path.open("rb") as file:
+                    value = np.load(file, allow_pickle=False)
+            except ValueError:  # a pickled object
+                value = load_plain(path)
+            except BROKEN as error:
+                raise InputError(f"{path.name}: cannot be read ({reason(error)})") from error
         case ".pkl" | ".pickle" | ".joblib" | ".pt" | ".pth":
             value = load_plain(path)
         case _:
             raise InputError(f"{path.name}: is no file of kind {', '.join(KINDS)}")
     return At(value, path.name)
-
-
-def _read_npy(path: Path) -> object:
-    """An array of plain numbers, or the pickled object in its place."""
-    try:
-        with path.open("rb") as file:
-            return np.load(file, allow_pickle=False)
-    except ValueError:
-        return load_plain(path)
-    except BROKEN as error:
-        raise InputError(f"{path.name}: cannot be read ({reason(error)})") from error
 
 
 def files_of(path: Path, pattern: str, what: str) -> list[Path]:
@@ -92,7 +87,7 @@ def only_file(path: Path, pattern: str, what: str) -> Path:
 
 
 def number_in(name: str, index: int) -> int:
-    """The last number in a file's name, else its place among the files."""
+    """The last number in a file's name, else its rank among the files."""
     found = re.findall(r"\d+", name)
     return int(found[-1]) if found else index
 
@@ -100,8 +95,8 @@ def number_in(name: str, index: int) -> int:
 def frame_numbers(names: Iterable[str], place: str) -> dict[str, int]:
     """Frames by the names of their files or folders, as `s001_frame_00012__00.00.00.401`.
 
-    The number after `frame` counts, else the last one. Where the names tell several shots (s001,
-    s002, ...) each is a still of its own, and they are numbered from 1 in their order.
+    The number after `frame` counts, else the last one. Where the names show several shots (s001,
+    s002, ...), each is a still of its own, and they are numbered from 1 in their order.
 
     Args:
         names: Of one recording, without endings.
@@ -117,8 +112,8 @@ def frame_numbers(names: Iterable[str], place: str) -> dict[str, int]:
     frames: dict[str, int] = {}
     owners: dict[int, str] = {}
     for rank, name in enumerate(known):
-        told = re.findall(r"frame_?(\d+)", name)
-        number = number_in(told[-1] if told else name, rank)
+        named = re.findall(r"frame_?(\d+)", name)
+        number = number_in(named[-1] if named else name, rank)
         if number in owners:
             raise InputError(f"{place}: {owners[number]} and {name} are both frame {number}")
         frames[name], owners[number] = number, name
@@ -126,12 +121,9 @@ def frame_numbers(names: Iterable[str], place: str) -> dict[str, int]:
 
 
 def natural(path: Path) -> tuple[tuple[int, str], ...]:
-    """A key that sorts names as people do: 2 before 10."""
+    """A key that sorts numbers in names by value: 2 before 10."""
     parts = re.split(r"(\d+)", str(path))
     return tuple((int(p), "") if p.isdigit() else (-1, p) for p in parts)
-
-
-# Values from the files of other tools: found under any of their names, NaN let through.
 
 
 Numbers = NDArray[Any] | Tensor
@@ -143,7 +135,7 @@ def need(at: At, *names: str) -> At:
     """The first of several names of a field that is there.
 
     Raises:
-        InputError: If there is none; the message tells the keys that were found.
+        InputError: If there is none; the message names the keys that were found.
     """
     found = either(at, *names)
     if found is None:
@@ -286,21 +278,3 @@ def tensor(value: Numbers) -> Float[Tensor, "*shape"]:
     if isinstance(value, Tensor):
         return value
     return torch.from_numpy(np.ascontiguousarray(value, dtype=np.float32))
-
-
-def frames_of(at: At, count: int | None, *names: str) -> Int[Tensor, " rows"]:
-    """The frames of the rows, under the first of several names that is there.
-
-    Raises:
-        InputError: If there is none, or there are others than `count`.
-    """
-    return torch.from_numpy(whole(need(at, *names), count))
-
-
-def meshes(at: At | None, verts: int, count: int) -> Float[Tensor, "rows verts 3"] | None:
-    """Vertices of `count` bodies, None where they are not told.
-
-    Raises:
-        InputError: If they are not so many.
-    """
-    return None if at is None else tensor(rows(at, count, verts * 3).reshape(count, -1, 3))
