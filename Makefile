@@ -12,7 +12,7 @@ JOBS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q
 EXTRA := slow or browser or docs or long
 
-.PHONY: demo test test-rest test-all check lint docs tables clean
+.PHONY: demo test test-rest test-all check lint docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/mover demo --out demo
@@ -54,9 +54,6 @@ $(VENV)/.developed: $(VENV)/.installed
 $(VENV)/.documented: $(VENV)/.installed
 	$(PIP) --constraint constraints.txt --editable ".[docs]"
 	touch $@
-
-tables: $(VENV)/.installed
-	$(BIN)/python benchmarks/tables.py --out experiments --write
 
 clean:
 	rm -rf $(VENV) demo out build dist docs/_build .pytest_cache .ruff_cache

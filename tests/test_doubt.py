@@ -10,7 +10,7 @@ from figures import SEATED, people, pose
 from mover.bodies.parts import parts_of
 from mover.core.types import Masks, People
 from mover.geometry.rle import encode
-from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
+from mover.stages.contacts.diagnostics import DiagnosticInputs, diagnostics
 
 
 def inputs_with(seated, touches=None, masks=None):

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import raycast
 import torch
 
 from mover.app.results import read_config, write_results
+from mover.core import records
 from mover.core.observe import Step, silent
 from mover.core.run import Run
 from mover.energy.config import Adam
@@ -20,7 +21,7 @@ from mover.io.capture.scene_file import read_scene
 from mover.io.formats import read
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
-from mover.stages.explain.placements import ExplainInputs
+from mover.stages.objects.place_inputs import Placed
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 PHOTO, TOTAL3D = SHARED / "photo_bench", SHARED / "total3d_1"
@@ -62,18 +63,6 @@ def run_in(folder, capture, config, observe=silent):
     room = reconstruct(capture, config, run)
     write_results(capture, room, config, run)
     return room
-
-
-@dataclass(frozen=True)
-class Listening(Run):
-    """Keeps what is explained."""
-
-    heard: list[ExplainInputs] = field(default_factory=list)
-
-    def stage(self, fn, inputs, config):
-        if isinstance(inputs, ExplainInputs):
-            self.heard.append(inputs)
-        return super().stage(fn, inputs, config)
 
 
 class Killed(Exception):
@@ -155,21 +144,25 @@ class TestRun:
         assert any("bodies" in w for w in room.warnings)
 
     @pytest.mark.parametrize("alone", [False, True])
-    def test_placements_are_explained_with_the_lines_of_walls_that_were_priced(
+    def test_evidence_lists_the_energy_that_was_minimised_by_term(
         self, capture_folder, tmp_path, alone
     ):
-        capture, run = read("folder", capture_folder), Listening(tmp_path)
+        capture, run = read("folder", capture_folder), Run(tmp_path)
         if alone:
             capture = replace(capture, bodies=None, people=None, touch=None)
         room = reconstruct(capture, light("robust", steps=4), run)
-        (asked,) = run.heard
-        walls = asked.priced.image.walls
-        assert walls is not None
-        assert torch.equal(walls.trust, asked.placed.walls.trust)
-        told = [asked.priced.objects.categories[i] for i in walls.trust.amax(-1).nonzero()]
-        assert set(told) == {"bed", "desk", "shelf", "cabinet"}
-        for explained in room.explanations:
-            assert "wall" in {pull.term for pull in explained.facts.pulls}
+        stage = [s for s in run.stages if s.name == "place_objects"][-1]
+        placed = records.load(Placed, tmp_path / "stages" / "place_objects" / stage.fingerprint)
+        energy = torch.tensor([e.energy for e in room.evidence])
+        assert ((placed.energy - energy).abs().amin(0) <= 1e-3 * energy).all()  # a candidate's
+        assert placed.walls is not None
+        along = placed.walls.trust.amax(-1) > 0
+        assert along.any()
+        for evidence, lined in zip(room.evidence, along.tolist(), strict=True):
+            assert evidence.energy == pytest.approx(sum(evidence.terms.values()))
+            assert ("depth" in evidence.terms) == (not alone)
+            assert (evidence.terms["wall"] > 0) == lined
+            assert (evidence.nearest_body is None) == alone
 
     def test_a_room_without_objects_still_has_a_floor_and_people(self, capture_folder, tmp_path):
         capture = read("folder", capture_folder)

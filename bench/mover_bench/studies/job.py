@@ -21,7 +21,6 @@ from mover import __version__
 from mover.app.batch.runner import write_tree
 from mover.app.results import labels_of
 from mover.core import records
-from mover.core.explanation import Facts
 from mover.core.observe import Observer, silent
 from mover.core.run import Run, sources
 from mover.core.types import Bodies, Room, Scene
@@ -101,11 +100,10 @@ class Job:
 
 @records.record
 class Rebuilt:
-    """The scenes of a job that pictures are drawn from, and why the objects stand there."""
+    """The scenes of a job that pictures are drawn from."""
 
     image: Scene
     full: Scene
-    facts: tuple[Facts, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -233,8 +231,7 @@ def rebuild(job: Job, variant: Variant, densities: EvaluateConfig | None = None)
     elif variant.bodies:
         found = measure_people(trial, room, variant.bodies)
     else:
-        facts = tuple(e.facts for e in room.explanations)
-        records.save(Rebuilt(room.image_only, room.scene, facts), job.folder / "scenes")
+        records.save(Rebuilt(room.image_only, room.scene), job.folder / "scenes")
         found = measure(trial, room, run, densities)
         if variant.cut is None:  # no table shows it of parts of a video
             found["true_room"] = measure_true_room(trial, room, run, densities)

@@ -127,8 +127,7 @@ def lone_term(preset: str, name: str) -> Variant:
     silent = {term: 0.0 for term in HUMAN if term != name}
     silent |= {} if name == "contact" else {"heading": 0.0}
     place = replace(config.place, weights=replace(weights, **silent))
-    plain = replace(config, place=place, explain=replace(config.explain, use=False))
-    return Variant(plain, "all" if name == "contact" else "no contact")
+    return Variant(replace(config, place=place), "all" if name == "contact" else "no contact")
 
 
 ALONE: dict[str, Variant] = {

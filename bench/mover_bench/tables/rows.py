@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from mover.pipeline.presets import PRESETS, Config
+from mover.pipeline.presets import PRESETS
 from mover_bench.studies.variants import HUMAN, LENGTHS, SEGMENTS, Cut, Variant, lone_term
 
 PLAIN = "full"
@@ -41,7 +41,7 @@ class TableRow:
 
 def variants(preset: str) -> dict[str, Variant]:
     """All jobs of a preset by name."""
-    config = _quiet(PRESETS[preset])
+    config = PRESETS[preset]
     pair = lone_term(preset, "contact")
     weights = replace(pair.config.place.weights, depth=PRESETS[preset].place.weights.depth)
     both = replace(pair.config, place=replace(pair.config.place, weights=weights))
@@ -75,10 +75,6 @@ def disturbance_of(job: str) -> Disturbance | None:
             if job == noise_job(kind, level):
                 return Disturbance(kind, level)
     return None
-
-
-def _quiet(config: Config) -> Config:
-    return replace(config, explain=replace(config.explain, use=False))
 
 
 ABLATION = (

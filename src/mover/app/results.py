@@ -21,7 +21,6 @@ from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.settings import read_settings
 from mover.core.types import Bodies, Capture, Mesh, Room, Scene
-from mover.evaluate.explanation import log_rows, scene_fields
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.edits import Edit, write_edits
 from mover.io.capture.proposals_file import PROPOSED, write_proposals
@@ -77,7 +76,8 @@ def write_results(
         write_edits(origin.edits, out / "edits.json")
     _write_log(room, config, run, origin)
     write_proposals(room, out / PROPOSED)
-    write_scene(room.scene, out / "scene.json", scene_fields(room.explanations))
+    evidence = {e.id: {"evidence": dataclasses.asdict(e)} for e in room.evidence}
+    write_scene(room.scene, out / "scene.json", evidence)
     if report:
         write_report(out, report_of(capture, room, config, run))
 
@@ -121,8 +121,11 @@ def report_of(
         warnings=room.warnings,
         stages=[dataclasses.asdict(s) for s in run.stages],
         config=records.plain(config),
-        objects=[dataclasses.asdict(e) for e in room.evidence],
-        explanations=room.explanations,
+        objects=[
+            {k: v for k, v in row.items() if k != "terms"}
+            | {f"energy of {term}": value for term, value in row["terms"].items()}
+            for row in map(dataclasses.asdict, room.evidence)
+        ],
         command=command_line(),
     )
 
@@ -157,7 +160,6 @@ def _write_log(room: Room, config: Config, run: Run, origin: Origin) -> None:
         "stages": [dataclasses.asdict(s) for s in run.stages],
         "warnings": list(room.warnings),
         "evidence": [dataclasses.asdict(e) for e in room.evidence],
-        "explanations": log_rows(room.explanations),
         "camera_covariance": None if room.covariance is None else room.covariance.tolist(),
         "traces": {
             name: trace[:: max(1, len(trace) // POINTS)].tolist()

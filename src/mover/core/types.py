@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.core.explanation import Explanation
 from mover.core.records import record
 
 
@@ -319,8 +318,12 @@ class Evidence:
     """Pixels where it hid people."""
     touching_bodies: int
     """Bodies that touch it."""
+    nearest_body: float | None
+    """From its surface to the nearest body of all frames [m]; negative: inside; None: no people."""
     energy: float
-    """What is left of Eq. 1 at its place."""
+    """What is left of Eq. 1 where it stands."""
+    terms: dict[str, float]
+    """The same by term of Eq. 1 (`SCENE_TERMS`)."""
 
 
 @record
@@ -364,8 +367,6 @@ class Room:
     traces: dict[str, Tensor]
     """Total energy before each step, by stage."""
     warnings: tuple[str, ...]
-    explanations: tuple[Explanation, ...] = ()
-    """Why each object stands where it stands; empty: nobody asked."""
     path: CameraPath = STILL
     """Where the cameras of the frames were, in the axes of that of `scene` [m]."""
     proposals: tuple[Proposal, ...] = ()

@@ -1,1 +1,1 @@
-"""How good a result is: metrics against a known truth, calibrated uncertainty, explanations."""
+"""How good a result is: metrics against a known truth."""

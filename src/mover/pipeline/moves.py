@@ -47,7 +47,7 @@ from mover.pipeline.outcome import Spans
 from mover.pipeline.people import carried, depths_of, found_path
 from mover.pipeline.presets import Config, with_sizes
 from mover.pipeline.proposals import told_of_proposals
-from mover.stages.config import ExplainConfig, ProposeConfig, SpreadConfig
+from mover.stages.config import ProposeConfig, SpreadConfig
 from mover.stages.masks import enlarged, thin
 from mover.stages.objects.find_image_cues import evidence_at
 from mover.stages.objects.find_moves import STEP, MoveInputs, Stay, find_moves
@@ -351,5 +351,4 @@ def _held(config: Config) -> Config:
         refine=replace(config.refine, rounds=0),
         sizes=SpreadConfig(),
         propose=ProposeConfig(use=False),
-        explain=ExplainConfig(use=False),
     )

@@ -1,6 +1,7 @@
 """What the pipeline holds on its way, and the room that it returns."""
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +12,6 @@ from torch import Tensor
 from mover.bodies.corrected import in_world
 from mover.bodies.parts import Parts, parts_of
 from mover.core.errors import InputError
-from mover.core.explanation import Explanation
 from mover.core.records import rows_of
 from mover.core.run import Run
 from mover.core.types import (
@@ -27,27 +27,27 @@ from mover.core.types import (
 )
 from mover.energy.objective import FurtherView
 from mover.energy.terms.feet import FootContacts
-from mover.evaluate.calibration import calibration_of
-from mover.evaluate.explanation import explain
 from mover.furniture.floor import Floor, floor_of
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import place, reproject, rest_on_support, standing_meshes
+from mover.geometry.volume import sample
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import Alignment
 from mover.stages.camera.room_lines import Segments
 from mover.stages.config import PlaceConfig
 from mover.stages.contacts.assign_contacts import ContactAssignment
+from mover.stages.contacts.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.contacts.gather_cues import Cues, GatherInputs
 from mover.stages.contacts.label_contacts import LabelInputs
-from mover.stages.explain.diagnostics import DiagnosticInputs, diagnostics
-from mover.stages.explain.placements import ExplainInputs, explain_placements
 from mover.stages.objects.bend_shapes import told_of_shapes
 from mover.stages.objects.find_image_cues import ImageInputs, Seen, order_of
 from mover.stages.objects.fronts import turned_to_people
 from mover.stages.objects.on_platforms import platforms_of, stood, supports_with_platforms
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
+from mover.stages.objects.place_objects import energy_of, with_trees
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
+from mover.stages.objects.starts import alone
 from mover.stages.people.find_depth import pelvis, size_spread
 
 Spans = tuple[tuple[int, int], ...]
@@ -101,14 +101,12 @@ class SceneState:
     """Total energy before each step of the descents so far."""
     alone: Layout
     """Where the image alone places the objects."""
+    descent: tuple[PlaceInputs, PlaceConfig]
+    """What the last descent minimised, and how."""
     cues: Cues | None = None
     contacts: ContactAssignment | None = None
     views: tuple[FurtherView, ...] = ()
     """Further frames of a moving camera."""
-    priced: tuple[PlaceInputs, PlaceConfig] | None = None
-    """What the last descent minimised; None: nothing is explained."""
-    scale_spread: float = 0.0
-    """Standard deviation of the logarithm of the room's scale; 0: it is known."""
 
 
 def as_given(context: ReconstructionContext, camera: Camera) -> Layout:
@@ -228,7 +226,7 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
     """The room with the user's own meshes where the proxies ended, its people and its doubts."""
     capture, placed = context.capture, state.placed
     pieces = to_objects(capture.scene.objects, context.prepared, placed.layout)
-    alone = to_objects(capture.scene.objects, context.prepared, state.alone)
+    by_image = to_objects(capture.scene.objects, context.prepared, state.alone)
     warnings = [*capture.warnings, *context.prepared.warnings, *told_of_shapes(pieces)]
     bodies = None
     if people is not None:
@@ -244,7 +242,7 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
     return Room(
         scene=Scene(state.camera, state.ground, pieces, layout_over(capture.scene, state.ground)),
         initial=capture.scene,
-        image_only=Scene(state.camera, state.ground, alone),
+        image_only=Scene(state.camera, state.ground, by_image),
         bodies=bodies,
         kept=None if people is None else people.kept,
         proxies=proxy_meshes(context.prepared),
@@ -275,30 +273,23 @@ def within(frames: Int[Tensor, " rows"], spans: Spans) -> Bool[Tensor, " rows"]:
     return found
 
 
-def explanations_of(
-    context: ReconstructionContext, state: SceneState, people: PeopleState | None
-) -> tuple[Explanation, ...]:
-    """What holds each object, and how well its place is known."""
-    if state.priced is None:
-        return ()
-    inputs, config = state.priced
-    bodies = None if people is None else in_world(rows_of(people.bodies, people.kept), state.camera)
-    pairs = None if state.contacts is None else state.contacts.pairs
-    tilt = None if people is None else people.alignment.covariance
-    whole = state.scale_spread, context.capture.focal_spread or 0.0
-    asked = ExplainInputs(inputs, config, state.placed, bodies, pairs, tilt, *whole)
-    found = context.run.stage(explain_placements, asked, context.config.explain)
-    return explain(found.facts, calibration_of(config.form))
-
-
 def _evidence(context: ReconstructionContext, state: SceneState) -> tuple[Evidence, ...]:
+    """What held each object, and its energy by term at the final layout."""
     ids = context.prepared.objects.ids
     near = far = bodies = (0,) * len(ids)
     if state.cues is not None and state.contacts is not None:
         near, far, bodies = state.cues.near_pixels, state.cues.far_pixels, state.contacts.bodies
+    near_body: Sequence[float | None] = [None] * len(ids)
+    if state.cues is not None:
+        samples = place(context.prepared.objects.samples, state.placed.layout)
+        near_body = sample(state.cues.space.volume, samples).amin(-1).tolist()
     pixels = context.seen.masks.sum((-2, -1)).tolist()
-    lowest = state.placed.energy.amin(0).tolist()
-    return tuple(Evidence(*row) for row in zip(ids, pixels, near, far, bodies, lowest, strict=True))
+    inputs, config = state.descent
+    parts = energy_of(with_trees(inputs), config)(alone(state.placed.layout)).parts
+    terms = [{name: float(part[0, i]) for name, part in parts.items()} for i in range(len(ids))]
+    energy = [sum(row.values()) for row in terms]
+    rows = zip(ids, pixels, near, far, bodies, near_body, energy, terms, strict=True)
+    return tuple(Evidence(*row) for row in rows)
 
 
 # Whether a result can be true: a run that ends in what no room is says so and writes nothing.

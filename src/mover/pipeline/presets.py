@@ -18,7 +18,6 @@ from mover.stages.config import (
     BendConfig,
     ContactConfig,
     DepthConfig,
-    ExplainConfig,
     FocalConfig,
     FootContactConfig,
     GatherConfig,
@@ -81,8 +80,6 @@ class Config:
     """Which object each touching body part touches."""
     place: PlaceConfig = field(default_factory=PlaceConfig)
     """Stage 2: objects from the image and the people."""
-    explain: ExplainConfig = field(default_factory=ExplainConfig)
-    """What holds each object, and how well its place is known."""
     moves: MoveConfig = field(default_factory=MoveConfig)
     """When an object counts as moved."""
     propose: ProposeConfig = field(default_factory=ProposeConfig)

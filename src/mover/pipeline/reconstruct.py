@@ -30,7 +30,6 @@ from mover.pipeline.outcome import (
     carried,
     check_floor,
     check_room,
-    explanations_of,
     floor_now,
     gather_inputs,
     is_pinned,
@@ -129,7 +128,7 @@ def _reconstructed(
         ground = ground_without_people(capture, prepared)
         check_floor(ground, capture)
         state = placed_by_image(context, capture.scene.camera, ground)
-        return explained(room_of(context, state, None), context, state, None)
+        return room_of(context, state, None)
     context = with_fronts(context, people)
     state = placed_by_image(context, people.alignment.camera, people.alignment.ground)
     context = with_size_prior(with_platforms(context, state), state)
@@ -147,7 +146,9 @@ def _reconstructed(
     for _ in range(config.outer_iterations):
         state = assigned(context, people, with_order(context, state))
         context, state = _by_people(context, people, state, image_energy)
-    room = explained(room_of(context, state, people), context, state, people)
+    room = room_of(context, state, people)
+    if context.capture.furniture is None:  # nothing of it will move
+        _begin(context.run, label_contacts, label_inputs(room), LabelConfig())
     return with_proposals(room, capture, config, run, people, tops_of(context, state))
 
 
@@ -160,15 +161,6 @@ def _by_people(
     """Seats where people have them, then all placed beside the people."""
     context = with_seats_lifted(context, people, state)
     return context, placed_with_people(context, people, state, image_energy)
-
-
-def explained(
-    room: Room, context: ReconstructionContext, state: SceneState, people: PeopleState | None
-) -> Room:
-    """The room with what holds each object; the labels of its contacts are begun beside."""
-    if room.bodies is not None and context.capture.furniture is None:  # nothing of it will move
-        _begin(context.run, label_contacts, label_inputs(room), LabelConfig())
-    return replace(room, explanations=explanations_of(context, state, people))
 
 
 def with_size_prior(context: ReconstructionContext, state: SceneState) -> ReconstructionContext:
@@ -211,9 +203,12 @@ def placed_by_image(
         objects, camera, ground, cues, NOBODY, starts, start.yaw, _pinned(context, start)
     )
     placed = context.run.stage(place_objects, inputs, searching)
-    found = SceneState(camera, ground, image, start, placed, {"image": placed.trace}, placed.layout)
+    descent = with_walls(inputs, placed.walls), searching
     views = () if before is None else before.views
-    return replace(found, priced=(with_walls(inputs, placed.walls), searching), views=views)
+    return SceneState(
+        camera, ground, image, start, placed, {"image": placed.trace}, placed.layout, descent,
+        views=views,
+    )  # fmt: skip
 
 
 def with_given(
@@ -262,9 +257,9 @@ def with_shapes_bent(
     context: ReconstructionContext, state: SceneState
 ) -> tuple[ReconstructionContext, SceneState]:
     """Meshes whose shapes do not fit the image bent towards it, and all placed anew."""
-    if context.config.shape == "keep" or state.priced is None:
+    if context.config.shape == "keep":
         return context, state
-    inputs, config = state.priced
+    inputs, config = state.descent
     given = inputs.image.given
     if given is None:
         return context, state
@@ -371,8 +366,8 @@ def placed_with_people(
     )  # fmt: skip
     placed = run.stage(place_objects, inputs, config.place)
     traces = {**state.traces, f"people {len(state.traces)}": placed.trace}
-    priced = with_walls(inputs, placed.walls), config.place
-    return replace(state, placed=placed, traces=traces, priced=priced)
+    descent = with_walls(inputs, placed.walls), config.place
+    return replace(state, placed=placed, traces=traces, descent=descent)
 
 
 def _pinned(context: ReconstructionContext, start: Layout) -> Pinned | None:

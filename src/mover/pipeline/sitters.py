@@ -46,7 +46,7 @@ def with_common_scale(
     context: ReconstructionContext, people: PeopleState, state: SceneState
 ) -> tuple[PeopleState, SceneState]:
     """The whole room larger or smaller where nothing but the furniture tells its scale."""
-    given = None if state.priced is None else state.priced[0].image.given
+    given = state.descent[0].image.given
     spread, shared = scale_spread(context, people), context.capture.scene.size_spread
     if given is None or not spread:
         return people, state
@@ -54,7 +54,7 @@ def with_common_scale(
     floor = floor_now(context, state)
     seats = seats_tell(kept, people.parts, floor) if context.config.seat_heights else None
     known = ScaleKnown(spread, shared, seats)
-    scale, left = common_scale(state.placed.layout, given, known)
+    scale, _ = common_scale(state.placed.layout, given, known)
     factor = math.exp(-scale)
     bodies = nearer(people.bodies, state.camera, state.ground, factor)
     layouts = (state.start, state.alone, state.placed.layout, state.placed.candidates)
@@ -62,6 +62,6 @@ def with_common_scale(
     placed = replace(state.placed, layout=layout, candidates=candidates)
     state = replace(
         state, ground=factor * state.ground, start=start, alone=single, placed=placed,
-        views=larger_views(state.views, factor), scale_spread=left,
+        views=larger_views(state.views, factor),
     )  # fmt: skip
     return replace(people, bodies=bodies, path=scaled(people.path, factor)), state

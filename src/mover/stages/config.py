@@ -293,14 +293,6 @@ class AssignConfig:
 
 
 @dataclass(frozen=True)
-class ExplainConfig:
-    """Whether placements are explained."""
-
-    use: bool = True
-    """Ask of each object what holds it and how well its place is known."""
-
-
-@dataclass(frozen=True)
 class RefineBodiesConfig:
     """How bodies are refined with the room."""
 

@@ -64,7 +64,6 @@ def draw_top(
     bodies: Bodies | None = None,
     *,
     extent: Extent | None = None,
-    over: str = "",
 ) -> str:
     """Plan of `scene` as inline SVG: x to the right, away from the camera upwards.
 
@@ -73,7 +72,6 @@ def draw_top(
         truth: Dashed footprints, in the truth's own world.
         bodies: People in the world of `scene`; their pelvises and soles are dotted.
         extent: Part of the floor to show; None: everything.
-        over: More SVG, in metres, drawn over the furniture.
     """
     extent = extent or extent_of(scene, truth, bodies)
     shapes = [_grid(extent), *_cone(scene.camera, extent)]
@@ -89,7 +87,6 @@ def draw_top(
         box=f"{extent.left:.3f} {extent.far:.3f} {width:.3f} {height:.3f}",
         shapes=shapes,
         people=[] if bodies is None else _people(bodies),
-        over=over,
         labels=[*(_label(piece) for piece in scene.objects), scale],
         bar=[bar],
     )

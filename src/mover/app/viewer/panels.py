@@ -197,6 +197,7 @@ WORDS = {
     "near_pixels": "pixels where people passed before it",
     "far_pixels": "pixels where it hid people",
     "touching_bodies": "bodies that touch it",
+    "nearest_body": "metres to the nearest body",
     "energy": "energy that is left",
 }
 
