@@ -442,7 +442,7 @@ def test_the_command_reads_openpose_and_writes_bodies(tmp_path, walk, capsys):
         (folder / f"{k:06d}_keypoints.json").write_text(json.dumps({"people": [person]}))
     (tmp_path / "camera.json").write_text(json.dumps(camera_to_json(CAMERA)))
     out = tmp_path / "bodies.npz"
-    words = ["--out", str(out), "--fps", "5", "--one-euro", "--drop"]
+    words = ["--out", str(out), "--fps", "5", "--drop"]
     fit([str(folder), "--camera", str(tmp_path / "camera.json"), *words])
     bodies = read_bodies(out)
     assert bodies.pose is not None

@@ -14,7 +14,6 @@ from mover_bench.tables import published
 METHODS = {
     "robust": ("scale", *(k for k in CHANGES if k != "scale")),
     "relaxed-scale": ("scale",),
-    "refined-focal": ("focal",),
 }
 """Kinds of errors that each variant is tried on."""
 

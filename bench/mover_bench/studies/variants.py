@@ -181,10 +181,6 @@ TIMED: dict[str, Variant] = {
     f"time-{share:g}": Variant(ROBUST, cut=Cut(share=share), fresh=True) for share in SHARES
 }
 RELAXED: dict[str, Variant] = {"relaxed-scale": Variant(relaxed(ROBUST))}
-LENS: dict[str, Variant] = {
-    "refined-focal": Variant(replace(ROBUST, focal=replace(ROBUST.focal, spread=0.05)))
-}
-"""The focal length is looked for, as where it is guessed and not measured."""
 PEOPLE: dict[str, Variant] = {
     f"people-{name}": Variant(ROBUST, bodies=row)
     for name, row in {
@@ -212,7 +208,7 @@ REFINED: dict[str, Variant] = {"refined-people": Variant(ROBUST, refined=True)}
 
 VARIANTS: dict[str, Variant] = {
     **{name: Variant(config) for name, config in PRESETS.items()},
-    **TERMS, **ALONE, **PARTS, **TOOLS, **NOBODY, **RELAXED, **LENS, **REFINED, **SINGLE, **SEGMENT,
+    **TERMS, **ALONE, **PARTS, **TOOLS, **NOBODY, **RELAXED, **REFINED, **SINGLE, **SEGMENT,
     **TIMED, **STANDS, **PEOPLE, **UNREFINED, **FITTED,
 }  # fmt: skip
 """By the name of the job."""

@@ -346,7 +346,6 @@ def _held(config: Config) -> Config:
         path="keep",
         shape="keep",
         height_spread=0.0,
-        focal=replace(config.focal, spread=0.0),
         align=replace(config.align, steps=0),
         refine=replace(config.refine, rounds=0),
         sizes=SpreadConfig(),

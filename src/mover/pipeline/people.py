@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from mover.bodies.parts import Parts, parts_of
@@ -23,7 +23,6 @@ from mover.stages.camera.align_camera import AlignInputs, align_camera
 from mover.stages.camera.align_views import ViewInputs, Views, align_views, aligned
 from mover.stages.camera.doubt_floor import doubt_floor
 from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
-from mover.stages.camera.find_focal import FocalInputs, find_focal, zoomed
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens, tilted_by
 from mover.stages.camera.find_scale import ScaleInputs, find_scale
@@ -92,7 +91,7 @@ def located(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
     path, told, along_views = found_path((bodies, parts), capture, config, run)
     kept = run.stage(select_frames, SelectInputs(carried(bodies, path)), config.select).keep
-    camera, warnings = _with_lens(capture, path, kept, config, run)
+    camera, warnings = scene.camera, tuple[str, ...]()
     if config.correct_depth and capture.people is not None:
         inputs = DepthInputs(bodies, parts, kept, capture.people, hiding(capture, path), camera)
         depth = run.stage(find_depth, inputs, config.depth)
@@ -219,15 +218,3 @@ def carried(bodies: Bodies, path: CameraPath) -> Bodies:
         bodies, verts=to_reference(bodies.verts, poses), pose=pose,
         joints=None if joints is None else to_reference(joints, poses),
     )  # fmt: skip
-
-
-def _with_lens(
-    capture: Capture, path: CameraPath, kept: Bool[Tensor, " bodies"], config: Config, run: Run
-) -> tuple[Camera, tuple[str, ...]]:
-    """The given camera, with the focal length that the people tell where one is looked for."""
-    camera, bodies, people = capture.scene.camera, capture.bodies, capture.people
-    if config.focal.spread <= 0 or bodies is None or people is None:
-        return camera, ()
-    inputs = FocalInputs(bodies, kept, people, hiding(capture, path), camera)
-    lens = run.stage(find_focal, inputs, config.focal)
-    return zoomed(camera, lens.zoom), lens.warnings

@@ -18,7 +18,6 @@ from mover.stages.config import (
     BendConfig,
     ContactConfig,
     DepthConfig,
-    FocalConfig,
     FootContactConfig,
     GatherConfig,
     ImageConfig,
@@ -40,8 +39,6 @@ class Config:
     """The focal length from the lines of the picture."""
     select: SelectConfig = field(default_factory=SelectConfig)
     """Which frames are believed."""
-    focal: FocalConfig = field(default_factory=FocalConfig)
-    """The focal length from the people; kept as given unless `focal.spread` is above 0."""
     depth: DepthConfig = field(default_factory=DepthConfig)
     """One depth factor a person."""
     correct_depth: bool = False

@@ -44,22 +44,6 @@ class SelectConfig:
 
 
 @dataclass(frozen=True)
-class FocalConfig:
-    """How the focal length is searched for."""
-
-    spread: Share = 0.0
-    """Standard deviation of the logarithm of the focal length; 0: it is kept as given."""
-    most: Count = 150
-    """At most so many frames of a person, spread over the video."""
-    width: Annotated[int, int_in(16, 4096)] = 240
-    """Width of the pictures that are compared [px]."""
-    seen: Share = 0.6
-    """Share of a body's picture that its mask has to fill, and least overlap with it."""
-    least: Count = 5
-    """Fewer sightings than that tell nothing."""
-
-
-@dataclass(frozen=True)
 class DepthConfig:
     """How the depth of people is searched for."""
 

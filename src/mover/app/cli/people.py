@@ -212,8 +212,6 @@ class FitArgs:
     """Frames a second, where the keypoints do not tell."""
     first: Index = 0
     """The number in the name of the first frame's file, 1 where they count from 1."""
-    one_euro: bool = False
-    """Filter the keypoints over time before the fit (One-Euro)."""
     drop: bool = False
     """Leave out bodies that no person can have been (the filter of `mover run`)."""
 
@@ -233,7 +231,6 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
     from mover.app.cli.progress import Bar
     from mover.bodies import load_model
     from mover.fitting.bodies import FitInputs, fit_bodies
-    from mover.fitting.one_euro import smooth_keypoints
     from mover.fitting.prior import prior_of
     from mover.io.capture.bodies_file import read_bodies, write_bodies
 
@@ -242,7 +239,7 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
     keypoints = keypoints_at(args.source, args.tool, args.fps, args.first)
     camera, ground = _world(args)
     inputs = FitInputs(
-        keypoints=smooth_keypoints(keypoints) if args.one_euro else keypoints,
+        keypoints=keypoints,
         camera=camera,
         model=load_model(args.model, args.gender),  # pyright: ignore[reportArgumentType]
         start=None if args.start is None else read_bodies(args.start),

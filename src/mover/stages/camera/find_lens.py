@@ -25,7 +25,6 @@ from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rotations import wrap
 from mover.stages.camera.config import LensConfig
-from mover.stages.camera.find_focal import zoomed
 from mover.stages.camera.room_lines import Ends, Prior, Segments, fit_room
 from mover.stages.people.find_depth import pelvis, shifted
 
@@ -183,3 +182,10 @@ def _people_deeper(bodies: Bodies, zoom: float) -> Bodies:
     gap = torch.zeros_like(bodies.verts[:, 0])
     gap[:, 2] = (zoom - 1) * away
     return shifted(bodies, gap)
+
+
+def zoomed(camera: Camera, zoom: float) -> Camera:
+    """The camera with a focal length that is longer by a factor."""
+    K = camera.K.clone()
+    K[0, 0], K[1, 1] = K[0, 0] * zoom, K[1, 1] * zoom
+    return dataclasses.replace(camera, K=K)
