@@ -100,14 +100,20 @@ def test_the_stated_error_holds():
     assert math.sqrt(np.mean(np.square(off))) < 1.5
 
 
-def test_a_lens_of_which_nothing_is_said_changes_only_where_lines_contradict_it():
-    picture = drawn(0.5, seed=1)
-    right, wrong = lens_of(picture, FOCAL, None), lens_of(picture, 1.09 * FOCAL, None)
-    assert right.zoom == 1
-    assert right.warnings == ()
-    assert wrong.zoom == pytest.approx(1 / 1.09, rel=0.025)
-    assert "focal length" in wrong.warnings[0]
-    assert "shorter" in wrong.warnings[0]
+@pytest.mark.parametrize("off", [0.94, 1.0, 1.09])
+def test_a_lens_of_which_nothing_is_stated_is_kept(off: float):
+    found = lens_of(drawn(0.5, seed=1), off * FOCAL, None)
+    assert found.zoom == 1
+    assert found.spread == pytest.approx(0.01)
+    assert found.warnings == ()
+
+
+@pytest.mark.parametrize(("off", "word"), [(1.09, "shorter"), (0.93, "longer")])
+def test_a_stated_guess_that_lines_correct_is_a_sentence(off: float, word: str):
+    found = lens_of(drawn(0.5, seed=1), off * FOCAL, 0.055)
+    assert found.zoom == pytest.approx(1 / off, rel=0.025)
+    assert "focal length" in found.warnings[0]
+    assert word in found.warnings[0]
 
 
 @pytest.mark.parametrize("picture", ["blank", "verticals", "noise"])

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mover.bodies.corrected import ADULTS, has_mean_shape
 from mover.core.errors import InputError
 from mover.core.records import BROKEN
 from mover.core.types import Bodies
@@ -83,6 +84,8 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
         faces = _faces(get(at, "faces"), verts.shape[1])
         joints, names = _joints(at, len(frame))
     spread = _scalar(at, "size_spread", 0.0, 1.0)
+    if spread is None and pose is not None and has_mean_shape(pose):
+        spread = ADULTS  # asked before the pose is dropped that no model here can check
     bodies = Bodies(
         verts, faces, joints, names, frame, person, _scalar(at, "fps", SLOWEST, FASTEST),
         _space(get(at, "space")), pose, spread,

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from mover.core.settings import Metres, Share, float_in, int_in
+from mover.core.settings import Metres, float_in, int_in
 
 
 @dataclass(frozen=True)
@@ -69,12 +69,6 @@ class LensConfig:
 
     use: bool = False
     """Whether they are asked."""
-    spread: Annotated[float, float_in(1e-3, 1)] = 0.055
-    """Standard deviation of the logarithm of a focal length that was guessed."""
-    measured: Share = 0.5
-    """Chance that a lens was measured and not guessed where camera.json has no `focal_spread`."""
-    least: Share = 0.6
-    """So probably it has to be a guess before anything is changed."""
     tilt: Annotated[float, float_in(1e-3, 1)] = 0.07
     """Standard deviation of the pitch and roll that are given [rad] ..."""
     feet: Annotated[float, float_in(1e-3, 1)] = 0.0175

@@ -2,13 +2,11 @@
 
 Not in the paper, which takes the lens as given. Bodies and scene that were made under a wrong lens
 contradict nothing: all is seen where it is, and only depths are off, by the same factor as the
-lens. The picture's own lines (`room_lines`) tell it. Three rules keep what is right:
+lens. The picture's own lines (`room_lines`) constrain it. Two rules keep what is right:
 
-- camera.json may say how its focal length was found (`focal_spread`): 0 is kept;
-- where it does not, a measured lens is as probable as a guess, and only lines that contradict it
-  clearly change it;
-- lines that fit several cameras, or none, tell little, and what they tell is weighed with the
-  guess.
+- only a focal length that is stated to be a guess (`focal_spread` in camera.json, `--fov`) is
+  changed; one of which nothing is stated counts as measured to 1 %;
+- lines that fit several cameras, or none, constrain little, and are weighted with the guess.
 """
 
 import dataclasses
@@ -29,6 +27,7 @@ from mover.stages.camera.room_lines import Ends, Prior, Segments, fit_room
 from mover.stages.people.find_depth import pelvis, shifted
 
 MEASURED = 0.003  # error of the logarithm of a measured focal length
+UNSTATED = 0.01  # the same where nothing is stated of how it was found
 SYSTEMATIC = 0.01  # error of the logarithm that more lines do not make smaller
 SYSTEMATIC_TILT = 0.003  # [rad]
 VAGUE = math.radians(5)  # spread of a heading that says nothing
@@ -57,9 +56,7 @@ class Lens:
     zoom: float
     """Focal length to take over the given one; 1 where it is kept."""
     spread: float
-    """Standard deviation of its logarithm if the given one was a guess."""
-    guessed: float
-    """Chance that it was."""
+    """Standard deviation of its logarithm."""
     tilt: Tilt | None
     """None: the lines do not tell it."""
     heading: Heading | None
@@ -68,30 +65,25 @@ class Lens:
 
 
 def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent) -> Lens:
-    """How much longer the lens is than it was said to be."""
-    declared, camera = inputs.focal_spread, inputs.camera
-    spread = config.spread if declared is None else max(declared, MEASURED)
+    """How much longer the lens is than the given one, if that was a guess."""
+    del config
+    stated, camera = inputs.focal_spread, inputs.camera
+    spread = UNSTATED if stated is None else max(stated, MEASURED)
     up = camera.R_cam_world[:, 1].double().cpu()
     focal = float(camera.K[0, 0].double().log())
     prior = Prior(focal, spread, up, inputs.tilt_spread, inputs.by_feet)
     ends = fit_room(inputs.segments, prior, camera.R_cam_world)
     observe(Step("find_lens", 0, 1))
-    told, tilt = _told(ends, focal, spread), tilt_of(ends, inputs.tilt_spread)
+    observed, tilt = _observed(ends, focal, spread), tilt_of(ends, inputs.tilt_spread)
     heading = heading_of(ends)
-    if told is None or declared == 0:
-        return Lens(1.0, spread, float(bool(declared)), tilt, heading)
-    off, error = told
+    if observed is None or not stated:
+        return Lens(1.0, spread, tilt, heading)
+    off, error = observed
     wide = math.hypot(error, spread)
-    guess = 1 - config.measured if declared is None else 1.0
-    fits = [share * math.exp(-0.5 * (off / s) ** 2) / s
-            for share, s in ((guess, wide), (1 - guess, error))]  # fmt: skip
-    guessed = fits[0] / sum(fits) if sum(fits) else 1.0
     left = error * spread / wide
-    if guessed < config.least:
-        return Lens(1.0, left, guessed, tilt, heading)
     zoom = math.exp(off * (spread / wide) ** 2)
     warnings = (_sentence(zoom, left),) if abs(math.log(zoom)) > left else ()
-    return Lens(zoom, left, guessed, tilt, heading, warnings)
+    return Lens(zoom, left, tilt, heading, warnings)
 
 
 def tilt_of(ends: Ends, before: float) -> Tilt | None:
@@ -119,8 +111,8 @@ def heading_of(ends: Ends) -> Heading | None:
     return Heading(float(yaw[0] + mean), spread) if spread < VAGUE else None
 
 
-def _told(ends: Ends, focal: float, spread: float) -> tuple[float, float] | None:
-    """What the lines alone say of the logarithm of the zoom, and its error; None: nothing."""
+def _observed(ends: Ends, focal: float, spread: float) -> tuple[float, float] | None:
+    """The logarithm of the zoom by the lines alone, and its error; None: not constrained."""
     off, square = _over(ends, (ends.pose.log_focal - focal)[:, None], [0])
     mean, left = float(off), float(square) ** 0.5
     if not left < SAYS_LITTLE * spread:
@@ -144,8 +136,8 @@ def _sentence(zoom: float, spread: float) -> str:
     change = f"{100 * abs(zoom - 1):.1f} ± {100 * spread:.1f} %"
     which = "longer" if zoom > 1 else "shorter"
     return (
-        f"camera.json: the lines of the picture tell a focal length {change} {which} than the"
-        ' given one, which is taken for a guess; "focal_spread": 0 in it keeps a measured one'
+        f"camera.json: the lines of the picture show a focal length {change} {which} than the"
+        ' given one, which "focal_spread" states to be a guess; 0 there keeps a measured one'
     )
 
 

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.corrected import larger
+from mover.bodies.corrected import has_mean_shape, larger
 from mover.bodies.parts import Parts
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
@@ -174,9 +174,6 @@ def find_depth(
     return DepthFactors(person, factor, spread, size, tuple(warnings))
 
 
-SHAPELESS = 0.05  # coefficients below it are the mean shape
-
-
 def apply_depth(bodies: Bodies, factors: DepthFactors) -> Bodies:
     """Move people to their true depth: scaled about the camera, then along the pelvis' ray."""
     same = (bodies.person[:, None] == factors.person.to(bodies.person)).to(bodies.verts)
@@ -200,8 +197,8 @@ def shifted(bodies: Bodies, shift: Float[Tensor, "bodies 3"]) -> Bodies:
 
 
 def are_shapeless(bodies: Bodies) -> bool:
-    """Whether all bodies have the mean shape of their model: then nothing tells their height."""
-    return bodies.pose is not None and float(bodies.pose.betas.abs().max()) < SHAPELESS
+    """Whether all bodies have the mean shape of their model, as far as it is known."""
+    return bodies.pose is not None and has_mean_shape(bodies.pose)
 
 
 def size_spread(bodies: Bodies, shapeless: float) -> float:
