@@ -20,7 +20,7 @@ from mover.io.capture.merge import import_into
 from mover.io.capture.parts import Parts
 from mover.io.files.fields import At
 from mover.io.formats import chosen, names
-from mover.io.people.paths import read_slam
+from mover.io.people.paths import read_colmap, read_slam, read_tum
 
 COUNT, FOCAL = 6, 0.625
 WIDTH, HEIGHT = 640, 360
@@ -62,30 +62,6 @@ def write_megasam(folder: Path) -> Path:
     return file
 
 
-def write_tram(folder: Path) -> Path:
-    """yufu-wang/tram, scripts/estimate_camera.py: a pickled dict in camera.npy."""
-    T, K = true_path(), lens()
-    camera = {
-        "pred_cam_R": T[:, :3, :3].astype(np.float32), "pred_cam_T": T[:, :3, 3],
-        "img_focal": K[0, 0], "img_center": K[:2, 2],
-    }  # fmt: skip
-    np.save(folder / "camera.npy", camera, allow_pickle=True)  # pyright: ignore
-    return folder
-
-
-def write_prompthmr(folder: Path) -> Path:
-    """yufu-wang/PromptHMR, pipeline/world.py: `camera_world` of results.pkl."""
-    T, K = true_path(), lens()
-    back = np.linalg.inv(T)
-    world = {
-        "pred_cam_R": T[:, :3, :3], "pred_cam_T": T[:, :3, 3], "Rwc": T[:, :3, :3],
-        "Twc": T[:, :3, 3], "Rcw": back[:, :3, :3], "Tcw": back[:, :3, 3],
-        "img_focal": K[0, 0], "img_center": K[:2, 2],
-    }  # fmt: skip
-    joblib.dump({"people": {}, "camera_world": world}, folder / "results.pkl")
-    return folder
-
-
 def seven() -> np.ndarray:
     """DPVO's terminate(): x y z, quaternion x y z w, camera to world."""
     T = true_path()
@@ -105,40 +81,31 @@ def write_gvhmr(folder: Path) -> Path:
     return folder
 
 
-def write_vggt(folder: Path) -> Path:
-    """facebookresearch/vggt, demo_gradio.py: predictions.npz, camera from world, (S, 3, 4)."""
-    pose = np.linalg.inv(true_path())[:, :3].astype(np.float32)
-    K = np.tile(lens(518 / WIDTH), (COUNT, 1, 1)).astype(np.float32)
-    depth = np.ones((COUNT, 29, 51, 1), np.float32)
-    np.savez(folder / "predictions.npz", extrinsic=pose, intrinsic=K, depth=depth)
+def write_tum(folder: Path) -> Path:
+    """MichaelGrupp/evo, evo/tools/file_interface.py: write_tum_trajectory_file, np.savetxt."""
+    table = np.concatenate([np.arange(COUNT)[:, None], seven()], 1)
+    np.savetxt(folder / "trajectory.txt", table, delimiter=" ")
     return folder
 
 
-def write_da3(folder: Path) -> Path:
-    """ByteDance-Seed/Depth-Anything-3, src/depth_anything_3/utils/export/npz.py."""
-    inside = folder / "exports" / "npz"
-    inside.mkdir(parents=True)
-    pose = np.linalg.inv(true_path())[:, :3].astype(np.float32)
-    K = np.tile(lens(504 / WIDTH), (COUNT, 1, 1)).astype(np.float32)
-    depth, image = np.ones((COUNT, 9, 16), np.float32), np.zeros((COUNT, 9, 16, 3), np.uint8)
-    np.savez_compressed(
-        inside / "results.npz", image=image, depth=depth, extrinsics=pose, intrinsics=K
-    )
-    return folder
-
-
-def write_mapanything(folder: Path) -> Path:
-    """facebookresearch/map-anything, scripts/gradio_app.py: `camera_poses` under `extrinsic`."""
-    K = np.tile(lens(518 / WIDTH), (COUNT, 1, 1)).astype(np.float32)
-    pose = true_path().astype(np.float32)
-    np.savez(folder / "predictions.npz", extrinsic=pose, intrinsic=K, conf=np.ones((COUNT, 2, 2)))
+def write_colmap(folder: Path) -> Path:
+    """colmap.github.io/format.html#text-format: two lines a picture, here not in their order."""
+    back = np.linalg.inv(true_path())
+    turn = Rotation.from_matrix(back[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    lines = ["# Image list with two lines of data per image:", "# Number of images: 6"]
+    for k in (2, 0, 1, *range(3, COUNT)):
+        pose = " ".join(f"{v:.17g}" for v in (*turn[k], *back[k, :3, 3]))
+        points = "" if k else "10.5 20.5 -1 30.25 40.5 17"
+        lines += [f"{k + 1} {pose} 1 my video/frame_{k:05d}.jpg", points]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    camera = f"1 SIMPLE_RADIAL {WIDTH} {HEIGHT} {FOCAL * WIDTH} {WIDTH / 2} {HEIGHT / 2} 0.01"
+    (folder / "cameras.txt").write_text(f"# Camera list\n{camera}\n")
     return folder
 
 
 WRITERS: dict[str, Callable[[Path], Path]] = {
-    "vipe": write_vipe, "megasam": write_megasam, "tram": write_tram, "wham": write_wham,
-    "prompthmr": write_prompthmr, "gvhmr": write_gvhmr, "vggt": write_vggt, "da3": write_da3,
-    "mapanything": write_mapanything,
+    "vipe": write_vipe, "megasam": write_megasam, "wham": write_wham, "gvhmr": write_gvhmr,
+    "tum": write_tum, "colmap": write_colmap,
 }  # fmt: skip
 
 
@@ -198,6 +165,29 @@ def test_whams_sign_for_no_slam_is_refused(tmp_path: Path) -> None:
     joblib.dump(row, tmp_path / "slam_results.pth")
     with pytest.raises(InputError, match="camera that was followed"):
         read_slam(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "words"),
+    [
+        ("t.txt", "0.5 0 0 0 0 0 0 1", "has 0.5, expected numbers of frames"),
+        ("t.txt", "1 0 0 0 0 0 1", "lines of 8 finite numbers"),
+        ("t.txt", "1 0 0 nan 0 0 0 1", "lines of 8 finite numbers"),
+        ("t.txt", "1 0 0 0 0 0 0 x", "another form"),
+        ("t.txt", "1 0 0 0 0 0 0 2", "quaternions of length 1"),
+        ("t.txt", "# nothing", "lines of 8 finite numbers"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1", "IMAGE_ID QW"),
+        ("images.txt", "# nothing", "IMAGE_ID QW"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1 2.jpg\n\n2 1 0 0 0 0 0 0 1 2.png", "each picture once"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1 a2.jpg\n\n2 1 0 0 0 0 0 0 1 2.png", "both frame 2"),
+    ],
+)  # fmt: skip
+def test_wrong_text_is_refused_in_a_sentence(
+    file: str, line: str, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / file).write_text(line + "\n")
+    with pytest.raises(InputError, match=words):
+        (read_colmap if file == "images.txt" else read_tum)(tmp_path)
 
 
 def test_a_pose_between_two_is_half_way(capture: Capture) -> None:

@@ -1,7 +1,6 @@
-"""A moving camera: its scale from people at rest, its drift from feet, masks seen from beside."""
+"""A moving camera: its scale from people at rest, masks seen from another position."""
 
 import dataclasses
-import math
 
 import little_room
 import numpy as np
@@ -11,11 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from mover.bodies.parts import parts_of
 from mover.core.types import STILL, Bodies, CameraPath
-from mover.energy.terms.feet import FootContacts
 from mover.geometry.camera import to_camera
 from mover.geometry.path import from_reference, poses_at, resampled, scaled, to_reference
 from mover.pipeline.people import carried
-from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
 from mover.stages.camera.find_scale import ScaleInputs, find_scale
 
 FRAMES, FPS = 200, 5.0
@@ -94,44 +91,6 @@ def test_people_are_carried_back_to_where_they_stood() -> None:
     path, bodies = swaying(), staying()
     assert torch.allclose(carried(seen_by(path, bodies), path).verts, bodies.verts, atol=1e-5)
     assert carried(bodies, STILL) is bodies
-
-
-def soles(lift: torch.Tensor, spread: float = 2.0) -> FootContacts:
-    """Feet all over a floor, put too high by a lift that changes in time [m]."""
-    rng = np.random.default_rng(0)
-    xz = torch.from_numpy(rng.uniform(-spread, spread, (FRAMES, 2))).float() / 2
-    xz = xz + torch.tensor([0, -3.5])
-    world = torch.stack([xz[:, 0], little_room.GROUND + lift, xz[:, 1]], -1)
-    frame = torch.arange(FRAMES)
-    return FootContacts(to_camera(world, CAMERA.R_cam_world), torch.zeros_like(frame), frame, ())
-
-
-def test_feet_tell_a_slow_drift_and_not_that_of_the_reference_image() -> None:
-    time = torch.arange(FRAMES) / FRAMES
-    lift = 0.08 * (1.5 * math.pi * time).sin()
-    path = scaled(swaying(2.0), 1.0)
-    found = find_drift(DriftInputs(soles(lift), CAMERA, path, FPS))
-    better = undrifted(path, found)
-    up = CAMERA.R_cam_world[:, 1]
-    height = (better.t_reference_camera - path.t_reference_camera) @ up
-    assert (height + lift).abs().max() < 0.02
-    assert height[0].abs() < 1e-3
-    assert "corrected by up to" in found.warnings[0]
-
-
-def test_a_wrong_gravity_is_not_taken_for_drift() -> None:
-    off = little_room.camera(pitch=-0.2 + math.radians(3), roll=math.radians(-2))
-    found = find_drift(DriftInputs(soles(torch.zeros(FRAMES)), off, swaying(2.0), FPS))
-    assert found.height.abs().max() < 0.01
-    assert math.degrees(float((found.up @ CAMERA.R_cam_world[:, 1]).clamp(max=1).acos())) < 0.5
-    assert found.warnings == ()
-
-
-def test_nobody_on_foot_leaves_the_path_alone() -> None:
-    none = FootContacts(torch.zeros(0, 3), *[torch.zeros(0, dtype=torch.long)] * 2, ())
-    path = swaying()
-    found = find_drift(DriftInputs(none, CAMERA, path, FPS))
-    assert torch.equal(undrifted(path, found).t_reference_camera, path.t_reference_camera)
 
 
 def test_a_mask_is_looked_up_where_the_other_camera_sees_the_surface() -> None:

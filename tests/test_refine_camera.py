@@ -1,16 +1,14 @@
 from dataclasses import replace
 
-import pytest
 import torch
-from analytic import GROUND, image_at, make_inputs
+from analytic import GROUND, make_inputs
 
 from mover.energy.config import Adam
 from mover.energy.objective import HumanCues
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.placement import reproject, rest_on_support
-from mover.geometry.rotations import rot_y
 from mover.pipeline.presets import ROBUST
-from mover.stages.camera.refine_camera import FurtherView, RefineInputs, refine_camera
+from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.config import RefineConfig
 from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import place_objects
@@ -70,54 +68,3 @@ def test_without_any_object_on_the_floor_nothing_changes():
     found = refine_camera(replace(inputs, objects=free), RefineConfig(rounds=1))
     assert found.ground == inputs.ground
     assert errors(found.camera, inputs.camera) == [0.0, 0.0]
-
-
-def larger_room(factor):
-    """All objects given too large, and put so much farther away that the image is the same."""
-    inputs = make_inputs(size=64)
-    objects, truth = inputs.objects, inputs.starts
-    wrong = replace(
-        objects, verts=factor * objects.verts, samples=factor * objects.samples,
-        size=factor * objects.size, top=factor * objects.top, back=factor * objects.back,
-    )  # fmt: skip
-    true = replace(
-        truth,
-        t_world_object=truth.t_world_object[0],
-        yaw=truth.yaw[0],
-        log_scale=truth.log_scale[0],
-    )
-    layout = replace(true, t_world_object=factor * true.t_world_object)
-    image = replace(inputs.image, given=None, distance=None)
-    start = RefineInputs(inputs.camera, factor * GROUND, LOOSE, wrong, image, layout)
-    return objects, true, start
-
-
-def view_from(place, turn, objects, layout, camera):
-    """What a camera that went there and turned sees of the objects."""
-    R, t = rot_y(torch.tensor(turn)), torch.tensor(place)
-    there = replace(layout, t_world_object=layout.t_world_object - camera.R_cam_world.mT @ t)
-    turned = replace(camera, R_cam_world=R.mT @ camera.R_cam_world)
-    image = image_at(objects, there, turned, 64)
-    return FurtherView(R, t, replace(image, given=None, distance=None))
-
-
-@pytest.mark.slow
-def test_views_from_elsewhere_tell_how_large_the_room_is():
-    objects, true, start = larger_room(1.06)
-    alone = refine_camera(start, RefineConfig(rounds=1))
-    views = tuple(
-        view_from([x, 0.0, z], -x / 4, objects, true, start.camera)
-        for x, z in ((0.8, 0.1), (-0.7, 0))
-    )
-    found = refine_camera(replace(start, views=views), RefineConfig(rounds=1))
-    assert abs(alone.ground - GROUND) > 0.06
-    assert abs(found.ground - GROUND) < 0.25 * abs(alone.ground - GROUND)
-
-
-@pytest.mark.slow
-def test_views_of_the_true_room_leave_it_as_it_is():
-    objects, true, start = larger_room(1.0)
-    view = view_from([0.8, 0.1, -0.2], -0.2, objects, true, start.camera)
-    found = refine_camera(replace(start, views=(view,)), RefineConfig(rounds=1))
-    assert abs(found.ground - GROUND) < 2e-3
-    assert max(errors(found.camera, start.camera)) < 1e-3

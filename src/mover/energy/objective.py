@@ -19,7 +19,7 @@ from mover.core.records import record, rows_of
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.minimize import Term, active_weights, sum_terms, there
-from mover.energy.terms.bbox import UNKNOWN, bbox_term
+from mover.energy.terms.bbox import bbox_term
 from mover.energy.terms.border import Borders, Fitted, fit_borders
 from mover.energy.terms.collision import BodySpace, collision_share, collision_term
 from mover.energy.terms.contact import (
@@ -76,37 +76,6 @@ class ImageCues:
     """What a depth network sees; None: there is none."""
     beside: Float[Tensor, "objects 4 2"] | None = None
     """Shares of each side that something touches, and that something is near to; None: unknown."""
-    further: "tuple[FurtherView, ...]" = ()
-    """What other frames of a moving camera say."""
-
-
-@record
-class FurtherView:
-    """Objects as the moving camera saw them in another frame."""
-
-    R_reference_camera: Float[Tensor, "3 3"]
-    t_reference_camera: Float[Tensor, "3"]
-    """[m]"""
-    image: ImageCues
-
-    @property
-    def seen(self) -> Bool[Tensor, " objects"]:
-        """The objects that it shows."""
-        return (self.image.sides != UNKNOWN).any(-1) & self.image.keep.flatten(1).any(1)
-
-
-def from_view(camera: Camera, layout: Layout, view: FurtherView) -> tuple[Camera, Layout]:
-    """The camera of a view and the objects in a world about it, with the reference's axes."""
-    R = view.R_reference_camera.mT @ camera.R_cam_world
-    centre = camera.R_cam_world.mT @ view.t_reference_camera
-    there = replace(layout, t_world_object=layout.t_world_object - centre)
-    return Camera(camera.K, R, camera.width, camera.height), there
-
-
-def shares_of(views: tuple[FurtherView, ...]) -> Float[Tensor, "views objects"]:
-    """Weight of each view of each object: all views of it count as much as the reference image."""
-    seen = torch.stack([view.seen for view in views]).to(views[0].t_reference_camera)
-    return seen / seen.sum(0).clamp_min(1)
 
 
 @record

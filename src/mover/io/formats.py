@@ -111,16 +111,10 @@ FORMATS = (
             ("wham", "wham_output.pkl of WHAM"),
         )
     ),
-    Format("cameras", "da3", "results.npz of Depth Anything 3", "people.paths:read_da3"),
+    Format("cameras", "colmap", "images.txt of COLMAP's text model", "people.paths:read_colmap"),
     Format("cameras", "gvhmr", "slam_results.pt of GVHMR", "people.paths:read_slam"),
-    Format(
-        "cameras", "mapanything", "predictions.npz of MapAnything",
-        "people.paths:read_mapanything",
-    ),
     Format("cameras", "megasam", "*_sgd_cvd_hr.npz of MegaSaM", "people.paths:read_megasam"),
-    Format("cameras", "prompthmr", "results.pkl of PromptHMR", "people.paths:read_prompthmr"),
-    Format("cameras", "tram", "camera.npy of TRAM", "people.paths:read_tram"),
-    Format("cameras", "vggt", "predictions.npz of VGGT", "people.paths:read_vggt"),
+    Format("cameras", "tum", "a trajectory in TUM's format", "people.paths:read_tum"),
     Format("cameras", "vipe", "a folder of ViPE", "people.paths:read_vipe"),
     Format("cameras", "wham", "slam_results.pth of WHAM", "people.paths:read_slam"),
     Format(

@@ -44,7 +44,7 @@ from mover.geometry.rle import encode, tight_box
 from mover.geometry.rotations import rot_y
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.outcome import Spans
-from mover.pipeline.people import carried, depths_of, found_path
+from mover.pipeline.people import carried
 from mover.pipeline.presets import Config, with_sizes
 from mover.pipeline.proposals import told_of_proposals
 from mover.stages.config import ProposeConfig, SpreadConfig
@@ -71,29 +71,13 @@ class Solving:
 def stays_of(capture: Capture, config: Config, run: Run) -> Stays:
     """When each object that is moved stands where; nothing without masks of it in the frames.
 
-    What is moved before a moving camera bends the path that is found with it. So moves are looked
-    for along the path as it was given first, then along the one that the others correct.
+    Before a moving camera no moves are looked for.
     """
-    if is_still(capture.path) or capture.bodies is None or capture.furniture is None:
-        return _stays_along(capture.path, capture, config, run)
-    people = capture.bodies, parts_of(capture.bodies, capture.scene.camera.R_cam_world[:, 1])
-    bare = replace(capture, furniture=None)
-    first = _stays_along(found_path(people, bare, config, run)[0], capture, config, run)
-    if 2 * len(first) > len(capture.scene.objects):  # then it is the path that moves
-        first = {}
-    steady = replace(capture, furniture=_where_shown(first, capture))
-    return _stays_along(found_path(people, steady, config, run)[0], capture, config, run)
-
-
-def _stays_along(path: CameraPath, capture: Capture, config: Config, run: Run) -> Stays:
-    """The same along a path [m]."""
-    camera = capture.scene.camera
     known = {p.annotation: p for p in capture.scene.objects if p.annotation is not None}
-    if capture.furniture is None or not known:
+    if capture.furniture is None or not known or not is_still(capture.path):
         return {}
     fps = None if capture.bodies is None else capture.bodies.fps
-    depth = depths_of(tuple(known.values()), camera)
-    inputs = MoveInputs(capture.furniture, capture.people, tuple(known), fps, depth, path, camera.K)
+    inputs = MoveInputs(capture.furniture, capture.people, tuple(known), fps)
     found: Stays = {}
     for stay in run.stage(find_moves, inputs, config.moves).stays:
         found.setdefault(stay.annotation, []).append(stay)

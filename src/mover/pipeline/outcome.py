@@ -25,7 +25,6 @@ from mover.core.types import (
     Scene,
     SceneObject,
 )
-from mover.energy.objective import FurtherView
 from mover.energy.terms.feet import FootContacts
 from mover.furniture.floor import Floor, floor_of
 from mover.geometry.camera import to_camera
@@ -105,8 +104,6 @@ class SceneState:
     """What the last descent minimised, and how."""
     cues: Cues | None = None
     contacts: ContactAssignment | None = None
-    views: tuple[FurtherView, ...] = ()
-    """Further frames of a moving camera."""
 
 
 def as_given(context: ReconstructionContext, camera: Camera) -> Layout:

@@ -1,7 +1,6 @@
 """The people of a run: where they are about the reference camera, and the floor they tell."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from mover.bodies.parts import Parts, parts_of
 from mover.core.run import Run
-from mover.core.types import Bodies, Camera, CameraPath, Capture, SceneObject
+from mover.core.types import Bodies, Camera, CameraPath, Capture
 from mover.energy.terms.feet import FootContacts
 from mover.furniture.floor import is_platform
 from mover.geometry.boxes import box_of
@@ -20,9 +19,7 @@ from mover.io.capture.pose_file import moved
 from mover.pipeline.outcome import PeopleState, check_floor
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import AlignInputs, align_camera
-from mover.stages.camera.align_views import ViewInputs, Views, align_views, aligned
 from mover.stages.camera.doubt_floor import doubt_floor
-from mover.stages.camera.find_drift import DriftInputs, find_drift, undrifted
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens, tilted_by
 from mover.stages.camera.find_scale import ScaleInputs, find_scale
@@ -89,33 +86,23 @@ def located(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     if bodies is None:
         return None
     parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
-    path, told, along_views = found_path((bodies, parts), capture, config, run)
+    path, odd = found_path((bodies, parts), capture, config, run)
     kept = run.stage(select_frames, SelectInputs(carried(bodies, path)), config.select).keep
     camera, warnings = scene.camera, tuple[str, ...]()
     if config.correct_depth and capture.people is not None:
         inputs = DepthInputs(bodies, parts, kept, capture.people, hiding(capture, path), camera)
         depth = run.stage(find_depth, inputs, config.depth)
         bodies, warnings = apply_depth(bodies, depth), (*warnings, *depth.warnings)
-        path, told, along_views = found_path((bodies, parts), capture, config, run)
+        path, odd = found_path((bodies, parts), capture, config, run)
     touch = capture.touch if config.foot_contacts.given else None
-
-    def feet_on(path: CameraPath) -> FootContacts:
-        standing = FootContactInputs(carried(bodies, path), parts, kept, camera, touch)
-        return run.stage(find_foot_contacts, standing, config.foot_contacts)
-
-    feet, loose = feet_on(path), torch.zeros(3, 3)
-    if not _is_known(path, config) and not along_views:  # furniture in further frames tells more
-        inputs = DriftInputs(feet, camera, path, bodies.fps or 1.0)
-        drift = run.stage(find_drift, inputs, config.drift)
-        path, told = undrifted(path, drift), (*told, *drift.warnings)
-        feet, loose = feet_on(path), drift.covariance
+    standing = FootContactInputs(carried(bodies, path), parts, kept, camera, touch)
+    feet = run.stage(find_foot_contacts, standing, config.foot_contacts)
     feet = replace(feet, lift=_lifts(feet, capture))
     camera, tilt_spread = _tilted(camera, capture)
     lean = 0.0 if bodies.size_spread is None else LEAN
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread, lean)
     alignment = run.stage(align_camera, known, config.align)
-    alignment = replace(alignment, covariance=alignment.covariance + loose)
-    warnings = (*warnings, *told, *feet.warnings, *alignment.warnings)
+    warnings = (*warnings, *odd, *feet.warnings, *alignment.warnings)
     return PeopleState(carried(bodies, path), path, kept, parts, feet, alignment, warnings)
 
 
@@ -149,51 +136,14 @@ def _lifts(feet: FootContacts, capture: Capture) -> Float[Tensor, " soles"] | No
     return found
 
 
-def _is_known(path: CameraPath, config: Config) -> bool:
-    return is_still(path) or config.path == "keep"
-
-
 def found_path(
     people: tuple[Bodies, Parts], capture: Capture, config: Config, run: Run
-) -> tuple[CameraPath, tuple[str, ...], bool]:
-    """The path in the people's scale, what is odd about it, and whether furniture told its errors.
-
-    What drifts is of another length, so that its scale is found again without.
-    """
-    if _is_known(capture.path, config):
-        return capture.path, (), False
+) -> tuple[CameraPath, tuple[str, ...]]:
+    """The path in the people's scale, and what is odd about it."""
+    if is_still(capture.path) or config.path == "keep":
+        return capture.path, ()
     scale = run.stage(find_scale, ScaleInputs(*people, capture.path), config.scale)
-    path = scaled(capture.path, scale.scale)
-    views = _views(path, capture, config, run)
-    if views is None:
-        return path, scale.warnings, False
-    scale = run.stage(find_scale, ScaleInputs(*people, aligned(path, views)), config.scale)
-    path = scaled(path, scale.scale)
-    views = _views(path, capture, config, run) or views
-    return aligned(path, views), (*scale.warnings, *views.warnings), True
-
-
-def _views(path: CameraPath, capture: Capture, config: Config, run: Run) -> Views | None:
-    """What furniture in further frames says of a path [m]."""
-    if capture.furniture is None:
-        return None
-    found = {one.id: one for one in capture.detections}
-    camera = capture.scene.camera
-    known = [p for p in capture.scene.objects if p.annotation in found]
-    if not known:
-        return None
-    inputs = ViewInputs(
-        camera, tuple(found[p.annotation] for p in known if p.annotation is not None),
-        depths_of(known, camera), capture.furniture, capture.people, path,
-    )  # fmt: skip
-    views = run.stage(align_views, inputs, config.views)
-    return views if len(views.frame) > 1 else None
-
-
-def depths_of(pieces: Sequence[SceneObject], camera: Camera) -> Float[Tensor, " objects"]:
-    """How far the middle of each object is from the reference image's camera [m]."""
-    middle = [camera.R_cam_world @ box_of(piece).center for piece in pieces]
-    return torch.stack(middle)[:, 2].clamp_min(NEAREST)
+    return scaled(capture.path, scale.scale), scale.warnings
 
 
 def as_given(capture: Capture) -> Bodies:

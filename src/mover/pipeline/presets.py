@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from mover.core.settings import float_in, int_in
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
-from mover.stages.camera.config import DriftConfig, LensConfig, ScaleConfig, ViewConfig
+from mover.stages.camera.config import LensConfig, ScaleConfig
 from mover.stages.config import (
     AlignConfig,
     AssignConfig,
@@ -47,12 +47,8 @@ class Config:
     """The scale of a moving camera's path."""
     foot_contacts: FootContactConfig = field(default_factory=FootContactConfig)
     """Feet at rest."""
-    views: ViewConfig = field(default_factory=ViewConfig)
-    """What furniture in further frames tells of a moving camera's path."""
-    drift: DriftConfig = field(default_factory=DriftConfig)
-    """The slow error of a moving camera's path."""
     path: Literal["find", "keep"] = "find"
-    """Scale and errors of a moving camera's path are found, or it is true as it is, in metres."""
+    """The scale of a moving camera's path is found, or the path is in metres as it is."""
     align: AlignConfig = field(default_factory=AlignConfig)
     """Camera pitch, roll and ground from the feet."""
     contacts: ContactConfig = field(default_factory=ContactConfig)
@@ -135,7 +131,7 @@ ROBUST = Config(
         num_hypotheses=6, coarse=2, perturbations=8, wall_alignment_steps=2,
         yaw_prior_weight=1.0,
     ),
-    refine=RefineConfig(rounds=1, views=4, apart=0.15),
+    refine=RefineConfig(rounds=1),
     sizes=SpreadConfig(0.05),
     shape="bend",
     gather=GatherConfig(erode=1, reach=0.1),

@@ -19,7 +19,6 @@ from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.warp_start import threads
 from mover.io.capture.plausible import check_plausible
-from mover.pipeline.further_views import further_views, with_views
 from mover.pipeline.moves import Solving, with_moves
 from mover.pipeline.outcome import (
     PeopleState,
@@ -204,10 +203,8 @@ def placed_by_image(
     )
     placed = context.run.stage(place_objects, inputs, searching)
     descent = with_walls(inputs, placed.walls), searching
-    views = () if before is None else before.views
     return SceneState(
         camera, ground, image, start, placed, {"image": placed.trace}, placed.layout, descent,
-        views=views,
     )  # fmt: skip
 
 
@@ -296,14 +293,11 @@ def with_refined_camera(
     """Camera and ground refined with the objects, and the objects placed anew under them."""
     cues = context.run.stage(find_image_cues, state.image, context.config.image)
     spread, objects = people.alignment.covariance, context.prepared.objects
-    views = state.views or further_views(context, people, state.camera)
-    inputs = RefineInputs(
-        state.camera, state.ground, spread, objects, cues, state.placed.layout, views
-    )
+    inputs = RefineInputs(state.camera, state.ground, spread, objects, cues, state.placed.layout)
     better = context.run.stage(refine_camera, inputs, context.config.refine)
     found = placed_by_image(context, better.camera, better.ground, state)
     traces = {**state.traces, "camera": better.trace, **found.traces}
-    return replace(found, traces=traces, views=better.views)
+    return replace(found, traces=traces)
 
 
 def _begin(run: Run, fn: Callable[[In, Conf, Observer], object], inputs: In, config: Conf) -> None:
@@ -352,7 +346,6 @@ def placed_with_people(
         image = replace(image, trust=inlier_weights(image_energy))
         if image.given is not None and not are_shapeless(people.bodies):
             image = replace(image, given=lighter_where_used(image.given, image.trust, contacts))
-    image = with_views(image, state.views)
     starts = alone(state.placed.layout)
     if config.layout.num_hypotheses > 1:
         contact = contact_start(state.placed.layout, objects, contacts)

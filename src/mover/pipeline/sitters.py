@@ -7,7 +7,6 @@ from mover.bodies.corrected import in_world
 from mover.core.records import rows_of
 from mover.geometry.path import scaled
 from mover.geometry.placement import larger
-from mover.pipeline.further_views import larger_views
 from mover.pipeline.outcome import (
     PeopleState,
     ReconstructionContext,
@@ -62,6 +61,5 @@ def with_common_scale(
     placed = replace(state.placed, layout=layout, candidates=candidates)
     state = replace(
         state, ground=factor * state.ground, start=start, alone=single, placed=placed,
-        views=larger_views(state.views, factor),
     )  # fmt: skip
     return replace(people, bodies=bodies, path=scaled(people.path, factor)), state

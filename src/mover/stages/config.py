@@ -207,16 +207,6 @@ class RefineConfig:
     uniform_scale_weight: Weight = GROWTH
     """Price of another size as a whole, against that of another shape."""
     method: Adam = field(default_factory=lambda: Adam(400, rate=0.3, last_rate=0.02, beta2=0.98))
-    views: Annotated[int, int_in(0, 1000)] = 0
-    """Of a moving camera, so many further frames with masks of the furniture count at most..."""
-    apart: Metres = 0.2
-    """... each seen from so far from all others."""
-    turn: Annotated[float, float_in(0, 90)] = 0.15
-    """How far their directions may be off [degrees]..."""
-    shift: Metres = 0.015
-    """... and their places [m]."""
-    path: Weight = 0.3
-    """Weight w_p of such errors."""
 
 
 @dataclass(frozen=True)

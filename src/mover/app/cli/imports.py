@@ -58,7 +58,7 @@ class ImportArgs:
     cameras: Path | None = None
     """Where a moving camera was: cameras.npz, or what the tool of --cameras-from wrote."""
     cameras_from: str = ""
-    """The tool that found the poses, as vipe, megasam, tram or vggt; else cameras.npz."""
+    """The tool that found the poses, as vipe, megasam, colmap or tum; else cameras.npz."""
     reference_frame: Index | None = None
     """The frame that the reference image shows, where the camera moves; else the first pose."""
     gender: str | None = None

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mover.core.observe import Energy
 from mover.core.types import Camera, Layout, Objects
-from mover.energy.config import SceneConfig, SceneWeights, only
+from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.fused.launch import FusedEnergy, fused_cost
 from mover.energy.fused.pack import FUSED, kernel_of, real_parts
 from mover.energy.objective import (
@@ -21,8 +21,6 @@ from mover.energy.objective import (
     SceneEvidence,
     active_config,
     energy_of_terms,
-    from_view,
-    shares_of,
 )
 from mover.energy.terms.contact import trees_of
 from mover.geometry.raster import engine
@@ -51,46 +49,8 @@ def energy_of_rows(
 ) -> Callable[[Rows | None], EnergyOf]:
     """The same for some starts of some objects, by their numbers; None: for all.
 
-    Rows count through (starts x objects); the layout has one row for each. Of further views
-    (`ImageCues.further`) box and silhouette count, by the cameras and masks of these.
+    Rows count through (starts x objects); the layout has one row for each.
     """
-    here = _of_one_image(objects, camera, replace(image, further=()), humans, config)
-    seen = only(bbox=config.weights.bbox, silhouette=config.weights.silhouette)
-    if not image.further or seen == SceneWeights():
-        return here
-    elsewhere: list[Callable[[Rows | None], EnergyOf]] = []
-    for view in image.further:  # few, and each has windows of its own
-        there = replace(camera, R_cam_world=view.R_reference_camera.mT @ camera.R_cam_world)
-        cues = replace(view.image, trust=image.trust)
-        priced = replace(config, weights=seen)
-        elsewhere.append(_of_one_image(objects, there, cues, HumanCues(), priced))
-    shares = shares_of(image.further)
-
-    def of(rows: Rows | None) -> EnergyOf:
-        first, others = here(rows), [view(rows) for view in elsewhere]
-        index = slice(None) if rows is None else rows % len(objects.ids)
-
-        def energy(layout: Layout, R_cam_world: Tensor | None = None) -> Energy:
-            turned = camera if R_cam_world is None else replace(camera, R_cam_world=R_cam_world)
-            found = first(layout, R_cam_world)
-            for view, share, other in zip(image.further, shares[:, index], others, strict=True):
-                there, moved = from_view(turned, layout, view)
-                more = other(moved, None if R_cam_world is None else there.R_cam_world)
-                parts = {
-                    n: part + share * more.parts.get(n, 0.0) for n, part in found.parts.items()
-                }
-                found = Energy(parts, found.per_item + share * more.per_item)
-            return found
-
-        return energy
-
-    return of
-
-
-def _of_one_image(
-    objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
-) -> Callable[[Rows | None], EnergyOf]:
-    """The same by the reference image, or another, alone."""
     known = SceneEvidence(objects, camera, image, humans)
     config = active_config(config, known)
     kernel = fused_energy(known, config)

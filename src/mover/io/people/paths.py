@@ -1,24 +1,26 @@
-"""Where a moving camera was, as tools tell it: SLAM, networks that see all frames, body trackers.
+"""Where a moving camera was, as SLAM and structure from motion write it.
 
 Each reader gives the arrays of cameras.npz (`io.capture.camera_file`): poses from camera to world,
-in OpenCV's axes, in whatever world and scale; and, where it is told, the focal length in widths of
-the image, which does not change when a tool looks at smaller images. Tools put the principal point
-in the middle, so the image is twice as wide as it. DPVO's rows are x y z and a quaternion x y z w.
+in OpenCV's axes, in whatever world and scale; and, where the file has it, the focal length in
+widths of the image, which does not change when a tool looks at smaller images. Tools put the
+principal point in the middle, so the image is twice as wide as it.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mover.core.errors import InputError
+from mover.core.records import BROKEN
 from mover.geometry.rotations import affine
-from mover.io.files.fields import At, refuse
+from mover.io.files.fields import LARGEST_FILE, At, reason, refuse
 from mover.io.people.values import (
-    either,
+    frame_numbers,
     need,
     numbers,
-    one_number,
     only_file,
     read_any,
     rows,
@@ -39,12 +41,12 @@ def read_vipe(path: Path) -> At:
     lens = lens if lens.suffix else lens / "intrinsics" / at.file
     focal = None
     if lens.is_file():
-        told = need(read_any(lens), "data")
-        focal = rows(told, None, 4)
+        given = need(read_any(lens), "data")
+        focal = rows(given, None, 4)
         if len(focal) != len(T):
-            refuse(told, f"{len(T)} rows, as there are poses", f"{len(focal)}")
-        focal = _in_widths(focal[:, 0], focal[:, 2])
-    return _arrays(at, T, frame, focal)
+            refuse(given, f"{len(T)} rows, as there are poses", f"{len(focal)}")
+        focal = focal[:, 0] / (2 * focal[:, 2])
+    return _arrays(at.file, T, frame, focal)
 
 
 def read_megasam(path: Path) -> At:
@@ -52,29 +54,13 @@ def read_megasam(path: Path) -> At:
     at = read_any(only_file(path, "*_sgd_cvd_hr.npz", "MegaSaM's result"))
     T = stacked(need(at, "cam_c2w"), 4, 4)
     K = rows(need(at, "intrinsic"), None, 9, 3).reshape(-1, 9)
-    return _arrays(at, T, None, _in_widths(K[:, 0], K[:, 2]))
-
-
-def read_tram(path: Path) -> At:
-    """TRAM: camera.npy (`pred_cam_R`, `pred_cam_T`: camera to world)."""
-    at = read_any(path / "camera.npy" if path.is_dir() else path)
-    T = _joined(need(at, "pred_cam_R"), need(at, "pred_cam_T"))
-    return _arrays(at, T, None, _told_focal(at))
-
-
-def read_prompthmr(path: Path) -> At:
-    """PromptHMR: `camera_world` of results.pkl (`Rwc`, `Twc`, or the way back)."""
-    at = read_any(path / "results.pkl" if path.is_dir() else path)
-    world = need(at, "camera_world")
-    turn = either(world, "Rwc")
-    if turn is None:
-        back = _joined(need(world, "Rcw"), need(world, "Tcw"))
-        return _arrays(at, np.linalg.inv(back), None, _told_focal(world))
-    return _arrays(at, _joined(turn, need(world, "Twc")), None, _told_focal(world))
+    return _arrays(at.file, T, np.arange(len(T)), K[:, 0] / (2 * K[:, 2]))
 
 
 def read_slam(path: Path) -> At:
     """WHAM's and GVHMR's slam_results: DPVO's rows, or SimpleVO's matrices from world to camera.
+
+    DPVO's rows are x y z and a quaternion x y z w.
 
     Raises:
         InputError: If it has another shape, or no camera was followed.
@@ -84,63 +70,99 @@ def read_slam(path: Path) -> At:
     )
     value = numbers(at)
     if value.ndim == 3:
-        return _arrays(at, np.linalg.inv(stacked(at, 4, 4)), None, None)
+        return _arrays(at.file, np.linalg.inv(stacked(at, 4, 4)), np.arange(len(value)))
     row = rows(at, None, 7)
     if (row[:, :3] == 0).all() and (row[:, 3:] == [1, 0, 0, 0]).all():
         refuse(at, "a camera that was followed (WHAM with its SLAM)", "WHAM's sign for none")
-    return _arrays(at, _of_quaternions(row), None, None)
+    T = affine(_turns(row[:, 3:], at.file), row[:, :3])
+    return _arrays(at.file, T, np.arange(len(T)))
 
 
-def read_vggt(path: Path) -> At:
-    """VGGT: predictions.npz (`extrinsic`: world to camera, `intrinsic`)."""
-    return _of_network(path, "predictions.npz", "extrinsic", "intrinsic", inverse=True)
+def read_tum(path: Path) -> At:
+    """A trajectory in TUM's format, `time x y z qx qy qz qw` a line, the time as frame number.
+
+    The writer is evo's `write_tum_trajectory_file` (github.com/MichaelGrupp/evo), which DPVO uses.
+
+    Raises:
+        InputError: If a line has another form, or the times are seconds.
+    """
+    file = only_file(path, "*.txt", "a trajectory in TUM's format")
+    table = _table([line for _, line in _lines(file)], file.name, 8)
+    frame = table[:, 0]
+    if (frame != np.round(frame)).any():
+        odd = float(frame[frame != np.round(frame)][0])
+        refuse(At(odd, file.name, "time"), "numbers of frames in place of seconds", f"{odd:g}")
+    T = affine(_turns(table[:, 4:], file.name), table[:, 1:4])
+    return _arrays(file.name, T, frame.astype(np.int64))
 
 
-def read_da3(path: Path) -> At:
-    """Depth Anything 3: exports/npz/results.npz (`extrinsics`: world to camera, `intrinsics`)."""
-    return _of_network(path, "**/results.npz", "extrinsics", "intrinsics", inverse=True)
+def read_colmap(path: Path) -> At:
+    """COLMAP's text model: images.txt (world to camera), and the lens of cameras.txt beside it.
+
+    The last number in a picture's name is its frame (colmap.github.io/format.html).
+
+    Raises:
+        InputError: If a line has another form, or two pictures are one frame.
+    """
+    file = path / "images.txt" if path.is_dir() else path
+    # Each picture has two lines, the second, of its points, may be empty.
+    known = [line.split(maxsplit=9) for number, line in _lines(file) if number % 2 == 0]
+    names = {str(Path(row[9]).with_suffix("")): row for row in known if len(row) == 10}
+    if len(names) < len(known) or not known:
+        form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, each picture once"
+        refuse(At(len(known), file.name), form)
+    numbered = frame_numbers(names, file.name)
+    order = sorted(names, key=numbered.__getitem__)
+    table = _table([" ".join(names[name][1:9]) for name in order], file.name, 8)
+    T = np.linalg.inv(affine(_turns(np.roll(table[:, :4], -1, 1), file.name), table[:, 4:7]))
+    frame = np.array([numbered[name] for name in order])
+    cameras = file.parent / "cameras.txt"
+    if not cameras.is_file():
+        return _arrays(file.name, T, frame)
+    lenses = {words[0]: words for words in (line.split() for _, line in _lines(cameras))}
+    used = [lenses.get(names[name][8], [])[:5] for name in order]
+    widths = _table([" ".join(row[2:]) for row in used], cameras.name, 3)
+    return _arrays(file.name, T, frame, widths[:, 2] / widths[:, 0])
 
 
-def read_mapanything(path: Path) -> At:
-    """MapAnything: predictions.npz (`extrinsic`: camera to world, `intrinsic`)."""
-    return _of_network(path, "predictions.npz", "extrinsic", "intrinsic", inverse=False)
+def _lines(file: Path) -> list[tuple[int, str]]:
+    """The lines of a text file without comments, numbered."""
+    if not file.is_file():
+        raise InputError(f"{file.name}: there is no such file in {file.parent}")
+    if file.stat().st_size > LARGEST_FILE:
+        size = file.stat().st_size
+        raise InputError(f"{file.name}: has {size} bytes, expected at most {LARGEST_FILE}")
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except BROKEN as error:
+        raise InputError(f"{file.name}: cannot be read ({reason(error)})") from error
+    lines = [line for line in text.splitlines() if not re.match(r"\s*#", line)]
+    return [(number, line) for number, line in enumerate(lines) if line.strip()]
 
 
-def _of_network(path: Path, pattern: str, pose: str, lens: str, *, inverse: bool) -> At:
-    """A network that sees all frames at once: matrices of three or four rows, and lenses."""
-    at = read_any(only_file(path, pattern, f"a file with '{pose}'"))
-    given = need(at, pose)
-    upper = rows(given, None, 12, 16)[:, :12]
-    last = np.tile([0.0, 0, 0, 1], (len(upper), 1))
-    T = np.concatenate([upper, last], 1).reshape(-1, 4, 4)
-    K = rows(need(at, lens), len(T), 9)
-    return _arrays(at, np.linalg.inv(T) if inverse else T, None, _in_widths(K[:, 0], K[:, 2]))
+def _table(lines: list[str], name: str, width: int) -> NDArray[np.float64]:
+    """So many finite numbers a line."""
+    try:
+        table = np.array([[float(word) for word in line.split()] for line in lines])
+    except ValueError as error:
+        raise InputError(f"{name}: has a line with another form ({reason(error)})") from error
+    if table.ndim != 2 or table.shape[1] != width or not np.isfinite(table).all():
+        refuse(At(table, name), f"lines of {width} finite numbers", f"shape {table.shape}")
+    return table
 
 
-def _joined(turn: At, place: At) -> Array:
-    R = stacked(turn, 3, 3)
-    return affine(R, rows(place, len(R), 3))
-
-
-def _of_quaternions(row: Array) -> Array:
+def _turns(quaternions: Array, name: str) -> NDArray[np.float64]:
+    """Rotations of quaternions x y z w."""
     from scipy.spatial.transform import Rotation
 
-    return affine(Rotation.from_quat(row[:, 3:]).as_matrix(), row[:, :3])
+    if not np.abs(np.linalg.norm(quaternions, axis=1) - 1).max() < 0.01:
+        refuse(At(quaternions, name), "quaternions of length 1", "others")
+    return Rotation.from_quat(quaternions).as_matrix()
 
 
-def _told_focal(at: At) -> Array:
-    """`img_focal` and `img_center` of TRAM and PromptHMR."""
-    middle = numbers(need(at, "img_center")).reshape(-1)
-    return _in_widths(np.array([one_number(need(at, "img_focal"))]), middle[:1])
-
-
-def _in_widths(focal: Array, middle: Array) -> Array:
-    return focal / (2 * middle)
-
-
-def _arrays(at: At, T: Array, frame: Array | None, focal: Array | None) -> At:
+def _arrays(name: str, T: Array, frame: Array, focal: Array | None = None) -> At:
     """The arrays of cameras.npz under the name of the tool's own file."""
-    found = {"frame": np.arange(len(T)) if frame is None else frame, "T_world_camera": T}
+    found = {"frame": frame, "T_world_camera": T}
     if focal is not None:
         found["focal"] = np.broadcast_to(focal, (len(T),)).copy()
-    return At(found, at.file)
+    return At(found, name)

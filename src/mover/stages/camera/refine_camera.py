@@ -12,14 +12,8 @@ d is the change of pitch, roll and ground, C their covariance from the feet: a f
 walked all around outweighs the objects, and what no foot told is left to them. The borders of the
 masks are held as they suit the objects at first (`fixed_borders`). An object is carried by the
 ray to the centre of its base, so a change of the camera leaves it where it is in the image.
-
-Of a moving camera further frames with masks of the furniture (views) count, too, all together as
-much as the reference image. Where they were seen from is known to a tenth of a degree and some
-millimetres only, which furniture would otherwise take for its own place: small turns and shifts of
-theirs are found together with all else, at the price  w_p/2 \sum |pose / sigma|^2.
 """
 
-import math
 from dataclasses import replace
 
 import torch
@@ -30,20 +24,12 @@ from mover.core.devices import constant
 from mover.core.observe import Energy, Observer, silent
 from mover.core.records import map_tensors, record
 from mover.core.types import Camera, Layout, Objects
-from mover.energy.config import SceneConfig, SceneWeights, only
-from mover.energy.fused.energy import EnergyOf, energy_function, never_asks
+from mover.energy.config import SceneConfig, SceneWeights
+from mover.energy.fused.energy import energy_function, never_asks
 from mover.energy.minimize import minimize
-from mover.energy.objective import (
-    FurtherView,
-    HumanCues,
-    ImageCues,
-    best_borders,
-    from_view,
-    shares_of,
-)
+from mover.energy.objective import HumanCues, ImageCues, best_borders
 from mover.geometry.camera import pitch_roll, tilted, to_camera
 from mover.geometry.placement import GROUND, LOWEST, hit_floor
-from mover.geometry.rotations import axis_angle
 from mover.stages.config import RefineConfig
 
 # Masks whose border has been found: evidence without that freedom.
@@ -68,14 +54,8 @@ def fixed_borders(
 
 
 SOFT = 0.02  # [1], added to an object's own residual
-UNITS = (
-    0.01,
-    0.01,
-    0.02,
-    0.01,
-    0.05,
-    0.03,
-)  # pitch, roll [rad], ground [m], rays, yaw [rad], log scale
+UNITS = (0.01, 0.01, 0.02, 0.01, 0.05, 0.03)
+"""Of pitch, roll [rad], ground [m], rays, yaw [rad] and logarithms of scales."""
 
 
 @record
@@ -89,8 +69,6 @@ class RefineInputs:
     objects: Objects
     image: ImageCues
     layout: Layout
-    views: tuple[FurtherView, ...] = ()
-    """Their image terms count as much, all together, as those of the reference image."""
 
 
 @record
@@ -100,8 +78,6 @@ class Refined:
     camera: Camera
     ground: float
     trace: Float[Tensor, " steps"]
-    views: tuple[FurtherView, ...] = ()
-    """From where the furniture says that they were seen."""
 
 
 @record
@@ -110,8 +86,6 @@ class _Joint:
     rays: Float[Tensor, "objects 2"]
     yaw: Float[Tensor, " objects"]
     log_scale: Float[Tensor, "objects 3"]
-    poses: Float[Tensor, "views 6"]
-    """Turns [rad] and shifts [m] of the further views."""
 
 
 def refine_camera(
@@ -121,77 +95,31 @@ def refine_camera(
     fixed, objects = _start(inputs), inputs.objects
     certainty = torch.linalg.inv(inputs.covariance)
     cues = fixed_borders(inputs.image, inputs.layout, objects, inputs.camera, config.weights)
-    priced = SceneConfig(config.weights, "robust", config.uniform_scale_weight)
-    seen = energy_function(objects, inputs.camera, cues, HumanCues(), priced)
-    usable, views = _usable(inputs), _views(inputs, config)
-    zero = map_tensors(torch.zeros_like, fixed)
+    terms = SceneConfig(config.weights, "robust", config.uniform_scale_weight)
+    of_layout = energy_function(objects, inputs.camera, cues, HumanCues(), terms)
+    usable, zero = _usable(inputs), map_tensors(torch.zeros_like, fixed)
 
-    def energies(joint: _Joint) -> tuple[Tensor, Tensor]:
+    def energies(joint: _Joint) -> Float[Tensor, " objects"]:
         camera, layout = _unpack(joint, inputs)
-        elsewhere = _in_views(camera, layout, views, joint.poses)
-        return seen(layout, camera.R_cam_world).per_item, elsewhere
+        return of_layout(layout, camera.R_cam_world).per_item
 
     with torch.no_grad():
-        own = energies(fixed)[0] + SOFT
+        residual = energies(fixed) + SOFT
 
     def energy(free: _Joint) -> Energy:
-        joint = _shift(fixed, free, config)
-        here, elsewhere = energies(joint)
-        terms = (here + elsewhere) / own
+        joint = _shift(fixed, free)
+        shares = energies(joint) / residual
         off = joint.tilt - fixed.tilt
         feet = 0.5 * config.feet * (off @ certainty @ off)
-        path = 0.5 * config.path * free.poses.square().sum()
-        return Energy({"objects": (terms * usable).sum(), "feet": feet, "path": path})
+        return Energy({"objects": (shares * usable).sum(), "feet": feet})
 
     if not bool(usable.any()):
-        return Refined(inputs.camera, inputs.ground, torch.zeros(0), inputs.views)
+        return Refined(inputs.camera, inputs.ground, torch.zeros(0))
     still = never_asks(inputs.objects)
     found = minimize(energy, zero, config.method, observe, "refine_camera", still=still)
-    joint = _shift(fixed, found.at, config)
+    joint = _shift(fixed, found.at)
     camera, _ = _unpack(joint, inputs)
-    aligned = (moved_view(*one) for one in zip(inputs.views, joint.poses, strict=True))
-    return Refined(camera, float(joint.tilt[2]), found.trace, tuple(aligned))
-
-
-def _seen_terms(config: RefineConfig) -> SceneConfig:
-    """Of further views only what is seen counts: sizes are believed once."""
-    weights = only(bbox=config.weights.bbox, silhouette=config.weights.silhouette)
-    return SceneConfig(weights, "robust", config.uniform_scale_weight)
-
-
-def moved_view(view: FurtherView, pose: Float[Tensor, "6"]) -> FurtherView:
-    """The view from a camera turned about its own axes [rad] and shifted [m]."""
-    return replace(
-        view,
-        R_reference_camera=view.R_reference_camera @ axis_angle(pose[:3]),
-        t_reference_camera=view.t_reference_camera + pose[3:],
-    )
-
-
-def _in_views(
-    camera: Camera,
-    layout: Layout,
-    views: list[tuple[FurtherView, EnergyOf]],
-    poses: Float[Tensor, "views 6"],
-) -> Float[Tensor, " objects"]:
-    """The mean energy of each object in the further views; zero where there are none."""
-    whole = torch.zeros_like(layout.yaw)
-    shares = shares_of(tuple(view for view, _ in views)) if views else poses
-    for (view, seen), share, pose in zip(views, shares, poses, strict=True):  # few
-        there, moved = from_view(camera, layout, moved_view(view, pose))
-        whole = whole + share * seen(moved, there.R_cam_world).per_item
-    return whole
-
-
-def _views(inputs: RefineInputs, config: RefineConfig) -> list[tuple[FurtherView, EnergyOf]]:
-    """The further views, by masks whose borders suit the objects as they stand."""
-    found: list[tuple[FurtherView, EnergyOf]] = []
-    for view in inputs.views:
-        camera, layout = from_view(inputs.camera, inputs.layout, view)
-        image = fixed_borders(view.image, layout, inputs.objects, camera, config.weights)
-        known = inputs.objects, camera, image, HumanCues()
-        found.append((view, energy_function(*known, _seen_terms(config))))
-    return found
+    return Refined(camera, float(joint.tilt[2]), found.trace)
 
 
 def _start(inputs: RefineInputs) -> _Joint:
@@ -199,8 +127,7 @@ def _start(inputs: RefineInputs) -> _Joint:
     rays = base[:, :2] / base[:, 2:].clamp_min(0.1)
     pitch, roll = pitch_roll(inputs.camera.R_cam_world)
     tilt = torch.stack([pitch, roll, pitch.new_tensor(inputs.ground)])
-    poses = tilt.new_zeros(len(inputs.views), 6)
-    return _Joint(tilt, rays, inputs.layout.yaw, inputs.layout.log_scale, poses)
+    return _Joint(tilt, rays, inputs.layout.yaw, inputs.layout.log_scale)
 
 
 def _usable(inputs: RefineInputs) -> Float[Tensor, " objects"]:
@@ -212,16 +139,13 @@ def _usable(inputs: RefineInputs) -> Float[Tensor, " objects"]:
     return ((inputs.objects.supports == GROUND) & low & ahead & seen).to(t)
 
 
-def _shift(fixed: _Joint, free: _Joint, config: RefineConfig) -> _Joint:
+def _shift(fixed: _Joint, free: _Joint) -> _Joint:
     units = constant(UNITS, fixed.tilt)
-    turn, shift = math.radians(config.turn), config.shift
-    steps = constant((turn,) * 3 + (shift,) * 3, fixed.tilt)
     return _Joint(
         fixed.tilt + free.tilt * units[:3],
         fixed.rays + free.rays * units[3],
         fixed.yaw + free.yaw * units[4],
         fixed.log_scale + free.log_scale * units[5],
-        fixed.poses + free.poses * steps,
     )
 
 

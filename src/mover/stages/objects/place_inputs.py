@@ -110,10 +110,8 @@ def coarser_image(image: ImageCues, factor: int) -> ImageCues:
     measured = image.measured
     if measured is not None:
         measured = replace(measured, depth=_middles(measured.depth, factor))
-    further = tuple(replace(v, image=coarser_image(v.image, factor)) for v in image.further)
     return replace(
-        image, views=small, masks=masks, keep=keep, borders=borders,
-        measured=measured, further=further,
+        image, views=small, masks=masks, keep=keep, borders=borders, measured=measured,
     )  # fmt: skip
 
 
