@@ -1,7 +1,7 @@
 """Batches: bad captures are told apart, what is finished is never done again."""
 
 import csv
-import importlib.util
+import dataclasses
 import json
 import os
 import signal
@@ -10,13 +10,21 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tiny_capture import write_capture
 
-from mover.app.batch import BatchPlan, captures_in, jobs_of, names_of, run_batch, write_summary
-from mover.app.batch.engines import EngineOptions, RayOptions, SlurmOptions
-from mover.app.batch.job import earlier, run_job
+from mover.app.batch import (
+    Job,
+    RayOptions,
+    captures_in,
+    earlier,
+    fingerprint,
+    names_of,
+    run_batch,
+    run_job,
+)
 from mover.core.errors import InputError
 
 FAKE = """
@@ -43,36 +51,6 @@ if task != "silent":
     (out / "scene.json").write_text(json.dumps({"name": capture.name, "length": len(task)}))
 """
 
-SLURM = """#!{python} -SE
-import os, subprocess, sys
-from pathlib import Path
-home, name = Path(__file__).parent, Path(__file__).name
-options = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
-if name == "sbatch":
-    if options.get("--partition") == "none":
-        sys.exit("sbatch: error: invalid partition specified: none")
-    for place in range(int(options["--array"].split("-")[1].split("%")[0]) + 1):
-        process = subprocess.Popen(
-            ["bash", "-c", options["--wrap"]], stdin=-3, stdout=-3, stderr=-3,
-            env=dict(os.environ, SLURM_ARRAY_TASK_ID=str(place)), start_new_session=True,
-        )
-        (home / f"{place}.pid").write_text(str(process.pid))
-    print("7;here")
-if name == "squeue":
-    for file in home.glob("*.pid"):
-        if Path("/proc", file.read_text()).is_dir():
-            print(file.stem)
-"""  # of SLURM's commands what a batch uses, as their manual pages tell it
-
-
-def pretend_slurm(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder.mkdir()
-    for name in ("sbatch", "squeue", "scancel"):
-        (folder / name).write_text(SLURM.replace("{python}", sys.executable))
-        (folder / name).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setattr("mover.app.batch.engines.WAIT", 0.05)
-
 
 def fakes(folder: Path, count: int, special: dict[int, str]) -> tuple[Path, ...]:
     (folder / "fake.py").write_text(FAKE)
@@ -83,9 +61,14 @@ def fakes(folder: Path, count: int, special: dict[int, str]) -> tuple[Path, ...]
     return captures_in(folder / "captures")
 
 
-def plan_of(folder: Path, captures: tuple[Path, ...], limit: float = 0.0) -> BatchPlan:
-    command = (sys.executable, "-S", "-E", str(folder / "fake.py"), "{capture}", "{out}")
-    return BatchPlan(captures, folder / "out", command, "settings", limit)
+def jobs_of(folder: Path, limit: float = 0.0, out: str = "out", settings: str = "") -> list[Job]:
+    jobs: list[Job] = []
+    for capture in captures_in(folder / "captures"):
+        place = str(folder / out / capture.name)
+        command = (sys.executable, "-S", "-E", str(folder / "fake.py"), str(capture), place)
+        mark = fingerprint(settings, capture)
+        jobs.append(Job(capture.name, str(capture), place, command, mark, limit))
+    return jobs
 
 
 def starts(folder: Path) -> list[str]:
@@ -102,8 +85,8 @@ def states(folder: Path) -> dict[str, str]:
         return {row["name"]: row["state"] for row in csv.DictReader(stream)}
 
 
-def run_here(plan: BatchPlan, workers: int = 2, **more: object) -> list[str]:
-    outcomes = run_batch(plan, EngineOptions("local", workers), quiet=True, **more)
+def run_here(folder: Path, workers: int = 2, retry: bool = False, **more: Any) -> list[str]:
+    outcomes = run_batch(jobs_of(folder, **more), folder / "out", workers, retry=retry)
     return [outcome.state for outcome in outcomes]
 
 
@@ -120,9 +103,9 @@ class Clock:
 
 def test_each_way_to_fail_leaves_its_own_clear_record(tmp_path: Path, monkeypatch):
     ways = {0: "refuse", 1: "crash", 2: "slow", 3: "killed", 4: "silent"}
-    plan = plan_of(tmp_path, fakes(tmp_path, 7, ways), limit=1.5)
-    monkeypatch.setattr("mover.app.batch.job.time", Clock(plan.out, 6))
-    found = run_here(plan)
+    fakes(tmp_path, 7, ways)
+    monkeypatch.setattr("mover.app.batch.time", Clock(tmp_path / "out", 6))
+    found = run_here(tmp_path, limit=1.5)
     assert found == ["failed"] * 5 + ["done"] * 2
     records = list(failures(tmp_path).values())
     assert [r["kind"] for r in records] == ["input", "exit", "time limit", "signal", "no result"]
@@ -138,115 +121,91 @@ def test_each_way_to_fail_leaves_its_own_clear_record(tmp_path: Path, monkeypatc
 
 
 def test_nothing_finished_or_failed_is_run_again_unless_it_is_asked_for(tmp_path: Path):
-    plan = plan_of(tmp_path, fakes(tmp_path, 3, {1: "crash"}))
-    run_here(plan)
-    assert run_here(plan) == ["kept", "failed", "kept"]
+    captures = fakes(tmp_path, 3, {1: "crash"})
+    run_here(tmp_path)
+    assert run_here(tmp_path) == ["kept", "failed", "kept"]
     assert len(starts(tmp_path)) == 3
-    (plan.captures[1] / "task.txt").write_text("mended")
-    assert run_here(plan) == ["kept", "done", "kept"]
-    assert failures(tmp_path) == {}
-    assert len(starts(tmp_path)) == 4
-
-
-def test_failures_are_run_again_when_asked(tmp_path: Path):
-    plan = plan_of(tmp_path, fakes(tmp_path, 2, {1: "crash"}))
-    run_here(plan)
-    assert run_here(plan, retry=True) == ["kept", "failed"]
+    assert run_here(tmp_path, retry=True) == ["kept", "failed", "kept"]
     assert starts(tmp_path).count("capture_01") == 2
+    (captures[1] / "task.txt").write_text("mended")
+    assert run_here(tmp_path) == ["kept", "done", "kept"]
+    assert failures(tmp_path) == {}
+    assert len(starts(tmp_path)) == 5
 
 
-def test_other_settings_or_a_changed_capture_are_other_work(tmp_path: Path):
+def test_other_settings_a_changed_capture_or_a_lost_file_are_work_to_do(tmp_path: Path):
     captures = fakes(tmp_path, 2, {})
-    plan = plan_of(tmp_path, captures)
-    run_here(plan)
+    run_here(tmp_path)
     (captures[0] / "task.txt").write_text("longer")
-    assert run_here(plan) == ["done", "kept"]
-    other = BatchPlan(captures, plan.out, plan.command, "other settings")
-    assert run_here(other) == ["done", "done"]
-
-
-def test_a_result_that_lost_a_file_is_made_again(tmp_path: Path):
-    plan = plan_of(tmp_path, fakes(tmp_path, 1, {}))
-    run_here(plan)
-    (plan.out / "capture_00" / "scene.json").unlink()
-    assert run_here(plan) == ["done"]
+    assert run_here(tmp_path) == ["done", "kept"]
+    assert run_here(tmp_path, settings="other") == ["done", "done"]
+    (tmp_path / "out" / "capture_00" / "scene.json").unlink()
+    assert run_here(tmp_path, settings="other") == ["done", "kept"]
 
 
 BATCH = """
 import sys
 from pathlib import Path
-from mover.app.batch import BatchPlan, captures_in, run_batch
-from mover.app.batch.engines import EngineOptions
+import test_batch
 folder = Path(sys.argv[1])
-command = (sys.executable, "-S", "-E", str(folder / "fake.py"), "{capture}", "{out}")
-plan = BatchPlan(captures_in(folder / "captures"), folder / "out", command, "settings", 4.0)
-run_batch(plan, EngineOptions("local", 4))
+test_batch.run_here(folder, 4, limit=4.0)
 """
 
 
+def killed_batch(folder: Path) -> "subprocess.Popen[bytes]":
+    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    return subprocess.Popen(
+        [sys.executable, "-c", BATCH, str(folder)], stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": paths},
+    )  # fmt: skip
+
+
 @pytest.mark.slow
-def test_forty_captures_survive_a_kill_half_way_and_three_bad_ones(tmp_path: Path):
-    plan = plan_of(tmp_path, fakes(tmp_path, 40, {7: "refuse", 19: "crash", 30: "slow"}), 4.0)
-    root = Path(__file__).parents[1]
-    variables = {**os.environ, "PYTHONPATH": str(root / "src"), "FAKE_SECONDS": "0.2"}
-    first = subprocess.Popen(
-        [sys.executable, "-c", BATCH, str(tmp_path)], env=variables, stderr=subprocess.DEVNULL
-    )
-    while sum(1 for _ in plan.out.glob("capture_*/batch.json")) < 15:
+def test_forty_captures_survive_a_kill_half_way_and_three_bad_ones(tmp_path: Path, monkeypatch):
+    fakes(tmp_path, 40, {7: "refuse", 19: "crash", 30: "slow"})
+    monkeypatch.setenv("FAKE_SECONDS", "0.2")
+    out, first = tmp_path / "out", killed_batch(tmp_path)
+    while sum(1 for _ in out.glob("capture_*/batch.json")) < 15:
         assert first.poll() is None
         time.sleep(0.02)
     first.send_signal(signal.SIGKILL)
     first.wait()
-    before = {path.name for path in plan.out.glob("capture_*") if (path / "batch.json").is_file()}
-    times = {name: (plan.out / name / "scene.json").stat().st_mtime_ns for name in before}
-    tried = set(starts(tmp_path))
+    before = {path.name for path in out.glob("capture_*") if (path / "batch.json").is_file()}
+    times = {name: (out / name / "scene.json").stat().st_mtime_ns for name in before}
     assert 15 <= len(before) < 37
-    found = run_here(plan, workers=4)
+    found = run_here(tmp_path, 4, limit=4.0)
     assert found.count("done") + found.count("kept") == 37
     assert found.count("failed") == 3
     assert {n: r["kind"] for n, r in failures(tmp_path).items()} == {
         "capture_07": "input", "capture_19": "exit", "capture_30": "time limit",
     }  # fmt: skip
-    now = {name: (plan.out / name / "scene.json").stat().st_mtime_ns for name in before}
+    now = {name: (out / name / "scene.json").stat().st_mtime_ns for name in before}
     assert now == times
     twice = [name for name in set(starts(tmp_path)) if starts(tmp_path).count(name) > 1]
-    assert set(twice) <= tried - before
+    assert before.isdisjoint(twice)
     assert len(twice) <= 4  # those that ran when the batch was killed
 
 
 @pytest.mark.slow
-def test_a_killed_batch_takes_its_processes_along(tmp_path: Path):
-    fakes(tmp_path, 1, {0: "slow"})
-    root = Path(__file__).parents[1]
-    variables = {**os.environ, "PYTHONPATH": str(root / "src")}
-    first = subprocess.Popen([sys.executable, "-c", BATCH, str(tmp_path)], env=variables)
+def test_a_process_that_outlives_a_killed_batch_is_waited_for(tmp_path: Path, monkeypatch):
+    fakes(tmp_path, 1, {})
+    monkeypatch.setenv("FAKE_SECONDS", "2")
+    first = killed_batch(tmp_path)
     while not (tmp_path / "starts.txt").exists():
         time.sleep(0.02)
-    children = Path(f"/proc/{first.pid}/task")
-    if not children.exists():
-        pytest.skip("needs /proc")
-    ids = [int(w) for f in children.glob("*/children") for w in f.read_text().split()]
-    assert ids
     first.kill()
     first.wait()
-    for _ in range(200):
-        alive = [p for p in ids if Path(f"/proc/{p}/status").exists() and not ended(p)]
-        if not alive:
-            break
-        time.sleep(0.02)
-    assert not alive
-
-
-def ended(process: int) -> bool:
-    try:
-        return "State:\tZ" in Path(f"/proc/{process}/status").read_text()
-    except OSError:
-        return True
+    begin = time.monotonic()
+    monkeypatch.setenv("FAKE_SECONDS", "0")
+    assert run_here(tmp_path) == ["done"]
+    assert time.monotonic() - begin > 1
+    assert (tmp_path / "out" / "capture_00" / "scene.json").is_file()
 
 
 def test_two_batches_do_not_run_one_capture_at_the_same_time(tmp_path: Path, monkeypatch):
     monkeypatch.setenv("FAKE_SECONDS", "0.3")
-    job = jobs_of(plan_of(tmp_path, fakes(tmp_path, 1, {})))[0]
+    fakes(tmp_path, 1, {})
+    (job,) = jobs_of(tmp_path)
     found: list[str] = []
     threads = [threading.Thread(target=lambda: found.append(run_job(job).state)) for _ in range(2)]
     for thread in threads:
@@ -258,7 +217,8 @@ def test_two_batches_do_not_run_one_capture_at_the_same_time(tmp_path: Path, mon
 
 
 def test_a_stopped_job_leaves_no_record(tmp_path: Path):
-    job = jobs_of(plan_of(tmp_path, fakes(tmp_path, 1, {0: "slow"})))[0]
+    fakes(tmp_path, 1, {0: "slow"})
+    (job,) = jobs_of(tmp_path)
     stop = threading.Event()
     threading.Timer(0.3, stop.set).start()
     assert run_job(job, stop).state == "stopped"
@@ -267,9 +227,10 @@ def test_a_stopped_job_leaves_no_record(tmp_path: Path):
 
 
 def test_a_command_that_does_not_exist_is_a_failure_not_an_end(tmp_path: Path):
-    captures = fakes(tmp_path, 2, {})
-    plan = BatchPlan(captures, tmp_path / "out", ("/no/such/program", "{capture}"), "settings")
-    assert run_here(plan) == ["failed", "failed"]
+    fakes(tmp_path, 2, {})
+    jobs = [dataclasses.replace(job, command=("/no/such/program",)) for job in jobs_of(tmp_path)]
+    found = run_batch(jobs, tmp_path / "out", 2)
+    assert [outcome.state for outcome in found] == ["failed", "failed"]
 
 
 def test_a_list_names_captures_relative_to_itself_with_remarks(tmp_path: Path):
@@ -299,61 +260,33 @@ def test_captures_of_one_name_get_different_folders():
     assert "failures" not in names
 
 
-def test_the_summary_has_a_table_for_other_programs_where_pyarrow_is(tmp_path: Path):
-    parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
-    plan = plan_of(tmp_path, fakes(tmp_path, 2, {1: "crash"}))
-    run_here(plan)
-    assert parquet.read_table(plan.out / "summary.parquet").num_rows == 2
-
-
 def test_an_empty_summary_still_has_its_head(tmp_path: Path):
-    write_summary([], tmp_path)
+    run_batch([], tmp_path, 1)
     assert (tmp_path / "summary.csv").read_text().startswith("name,state,seconds")
 
 
+def test_without_ray_the_way_to_get_it_is_said(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("mover.app.batch.find_spec", lambda _: None)
+    fakes(tmp_path, 1, {})
+    with pytest.raises(InputError, match=r"ray is not installed; pip install '\.\[ray\]'"):
+        run_batch(jobs_of(tmp_path), tmp_path / "out", 1, RayOptions())
+    assert states(tmp_path) == {"capture_00": "open"}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["ray", "slurm"])
-def test_other_engines_give_what_the_local_one_gives(tmp_path: Path, engine: str, monkeypatch):
-    if engine == "slurm":
-        pretend_slurm(tmp_path / "commands", monkeypatch)
-    elif importlib.util.find_spec(engine) is None:
-        pytest.skip(f"needs the extra {engine}")
-    count = {"ray": 40, "slurm": 6}[engine]
-    captures = fakes(tmp_path, count, {1: "refuse", 2: "crash", 3: "slow"})
-    here = plan_of(tmp_path, captures, 3.0)
-    there = BatchPlan(captures, tmp_path / "there", here.command, "settings", 3.0)
-    local = run_here(here)
-    options = EngineOptions(engine, 2, RayOptions(cpus=0.5), SlurmOptions(minutes=5))
-    found = run_batch(there, options, quiet=True)
+def test_ray_gives_what_this_machine_gives(tmp_path: Path):
+    pytest.importorskip("ray", reason="needs the extra ray")
+    fakes(tmp_path, 40, {1: "refuse", 2: "crash", 3: "slow"})
+    local, there = run_here(tmp_path, limit=3.0), jobs_of(tmp_path, 3.0, "there")
+    found = run_batch(there, tmp_path / "there", 2, RayOptions(cpus=0.5))
     assert [outcome.state for outcome in found] == local
-    for job in jobs_of(there):
+    for job in there:
         mine, theirs = (tmp_path / home / job.name / "scene.json" for home in ("out", "there"))
         assert mine.exists() == theirs.exists()
         assert not mine.exists() or mine.read_bytes() == theirs.read_bytes()
-    kinds = [json.loads(f.read_text())["kind"] for f in sorted((there.out / "failures").iterdir())]
+    files = sorted((tmp_path / "there" / "failures").iterdir())
+    kinds = [json.loads(file.read_text())["kind"] for file in files]
     assert kinds == [r["kind"] for r in failures(tmp_path).values()]
-
-
-def test_a_job_that_slurm_has_ended_without_a_word_is_a_failure(tmp_path: Path, monkeypatch):
-    pretend_slurm(tmp_path / "commands", monkeypatch)
-    monkeypatch.setattr("mover.app.batch.engines.LATE", 0.2)
-    monkeypatch.setattr("mover.app.batch.engines.sys.executable", "/bin/false")  # a node's own
-    plan = plan_of(tmp_path, fakes(tmp_path, 2, {}))
-    found = run_batch(plan, EngineOptions("slurm", 2), quiet=True)
-    assert [outcome.state for outcome in found] == ["failed", "failed"]
-    assert "SLURM has ended it, see" in found[0].reason
-    assert failures(tmp_path)["capture_01"]["kind"] == "worker"
-
-
-def test_what_slurm_says_when_it_refuses_is_passed_on(tmp_path: Path, monkeypatch):
-    pretend_slurm(tmp_path / "commands", monkeypatch)
-    plan = plan_of(tmp_path, fakes(tmp_path, 1, {}))
-    options = EngineOptions("slurm", 2, slurm=SlurmOptions("none"))
-    with pytest.raises(InputError, match=r"sbatch refuses the jobs: .* partition specified: none"):
-        run_batch(plan, options, quiet=True)
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(InputError, match="no sbatch, expected a machine with SLURM's commands"):
-        run_batch(plan, options, quiet=True)
 
 
 @pytest.mark.slow

@@ -2,10 +2,11 @@ import errno
 import functools
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -36,46 +37,33 @@ def test_help_names_every_command_and_imports_nothing_heavy():
         assert f"  {name} " in found.stdout
 
 
-@pytest.mark.parametrize(
-    ("body", "code"),
-    [("return", 0), ("raise SystemExit(3)", 3), ("raise SystemExit('a sentence')", 1),
-     ("raise KeyError('lost')", 1)],
-)  # fmt: skip
-def test_a_program_ends_with_its_code_and_all_that_it_had_to_say(body, code):
-    """`program` leaves at once, but what waits to be written or done at the end comes first."""
-    lines = (
-        "import atexit, sys; import mover.app.cli as cli",
-        "def main():",
-        "    atexit.register(lambda: sys.stdout.write('at the end'))",
-        "    sys.stdout.write('waits ')",
-        f"    {body}",
-        "cli.main = main; cli.program()",
-    )
-    found = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True)
-    assert found.returncode == code
-    assert found.stdout == "waits at the end"
-    assert ("a sentence" in found.stderr) == ("sentence" in body)
-    assert ("lost" in found.stderr) == ("lost" in body)
+def test_a_broken_pipe_ends_a_command_without_a_trace():
+    code = "from mover.app.cli import main, say; import mover.app.cli as cli, sys;"
+    code += "cli.command_of = lambda _: lambda _: [say('line') for _ in range(100_000)];"
+    code += "sys.argv = ['mover', 'run']; main()"
+    words = f'{sys.executable} -c "{code}" | head -1'
+    found = subprocess.run(["bash", "-c", words], capture_output=True, text=True)
+    assert (found.stdout, found.stderr) == ("line\n", "")
 
 
-def test_memory_is_kept_where_the_c_library_can_and_nothing_happens_elsewhere(monkeypatch):
-    asked: list[tuple[int, int]] = []
-
-    def mallopt(name: int, value: int) -> int:
-        """As an older glibc: no more than 32 MB before the system is asked."""
-        asked.append((name, value))
-        return int(name != -3 or value <= 32 << 20)
-
-    monkeypatch.setattr(cli.sys, "platform", "linux")
-    monkeypatch.setattr(cli.ctypes, "CDLL", lambda _: SimpleNamespace(mallopt=mallopt))
-    cli.keep_memory()
-    assert asked == [(-3, 256 << 20), (-3, 32 << 20), (-1, 512 << 20), (-8, 1)]
-    asked.clear()
-    monkeypatch.setattr(cli.ctypes, "CDLL", lambda _: SimpleNamespace())
-    cli.keep_memory()
-    monkeypatch.setattr(cli.sys, "platform", "win32")
-    cli.keep_memory()
-    assert not asked
+@pytest.mark.slow
+def test_ctrl_c_ends_a_run_at_once_and_the_same_command_goes_on(folder, tmp_path):
+    command = [sys.executable, "-m", "mover", "run", str(folder), "--out", str(tmp_path / "out")]
+    stages = tmp_path / "out" / "stages"
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
+        while len(list(stages.glob("*"))) < 2:
+            assert run.poll() is None
+            time.sleep(0.01)
+        run.send_signal(signal.SIGINT)
+        begin = time.monotonic()
+        said = run.communicate()[1]
+    assert time.monotonic() - begin < 3
+    assert run.returncode == 130
+    assert said.splitlines()[-1] == "mover run: stopped; the same command goes on from here"
+    assert "Traceback" not in said
+    kept = {path: path.stat().st_mtime_ns for path in stages.glob("*")}
+    assert subprocess.run(command, capture_output=True).returncode == 0
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
 
 
 def test_an_unknown_command_is_answered_with_the_known_ones():
@@ -182,16 +170,6 @@ def test_nan_in_the_bodies_is_named(folder, capsys):
 def test_a_missing_folder_is_named(capsys):
     assert cli.run_command("run", [str(Path("nowhere"))]) == 2
     assert "nowhere" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("old", "new"), sorted(cli.ALIASES.items()))
-def test_a_command_of_before_works_and_says_its_new_name(old, new, capsys):
-    with pytest.raises(SystemExit) as done:
-        cli.run_command(old, ["--help"])
-    assert done.value.code == 0
-    found = capsys.readouterr()
-    assert f"mover {old} is called mover {new} now" in found.err
-    assert f"usage: mover {new}" in found.out
 
 
 def test_a_file_as_the_folder_of_results_is_one_sentence(folder, tmp_path, capsys):

@@ -1,11 +1,6 @@
-"""Forty captures on clusters of two nodes on this machine, one of which dies on the way.
-
-Ray's nodes are two `ray start`; SLURM's are two `slurmd` under one controller with a `slurm.conf`
-of their own (Debian's packages: `apt-get install --no-install-recommends slurm-wlm munge`).
-"""
+"""Forty captures on clusters of two nodes on this machine, one of which dies on the way."""
 
 import csv
-import getpass
 import importlib.util
 import json
 import logging
@@ -15,7 +10,6 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
@@ -31,30 +25,6 @@ COUNT = 40
 PATIENCE = 60.0  # [s] for a cluster to stand
 SOURCES = str(Path(__file__).parents[1] / "src")
 QUICK = "--place.method.steps 2 --layout.method.steps 2 --prepare.cells 16 --prepare.faces 100"
-SLURM_CONF = """
-ClusterName=two
-SlurmctldHost={host}(127.0.0.1)
-SlurmctldPort={ports[0]}
-SlurmUser={user}
-SlurmdUser={user}
-AuthType=auth/munge
-AuthInfo=socket={folder}/munge.socket
-CryptoType=crypto/munge
-StateSaveLocation={folder}
-SlurmdSpoolDir={folder}/%n
-SlurmctldPidFile={folder}/controller.pid
-SlurmdPidFile={folder}/%n.pid
-ProctrackType=proctrack/pgid
-TaskPlugin=task/none
-MpiDefault=none
-ReturnToService=1
-SlurmdTimeout=10
-SelectType=select/cons_tres
-SelectTypeParameters=CR_CPU
-NodeName=first NodeHostname={host} NodeAddr=127.0.0.1 Port={ports[1]} CPUs=1
-NodeName=second NodeHostname={host} NodeAddr=127.0.0.1 Port={ports[2]} CPUs=1
-PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
-"""
 
 
 def free_ports(count: int) -> list[int]:
@@ -159,63 +129,3 @@ def test_a_ray_cluster_loses_a_node_and_no_capture(tmp_path: Path):
         wait_for(lambda: said(*status, env=env).count(" node_") == 2)
         flags = f"--engine ray --ray.address {address}"
         survives(tmp_path, flags, env, lambda: kill_group(second))
-
-
-@contextmanager
-def slurm(folder: Path) -> Generator[dict[str, str]]:
-    """A controller and two nodes with a configuration of their own."""
-    env = environment(SLURM_CONF=str(folder / "slurm.conf"))
-    conf = SLURM_CONF.format(
-        host=socket.gethostname(), user=getpass.getuser(), folder=folder, ports=free_ports(3)
-    )
-    (folder / "slurm.conf").write_text(conf)
-    key, pipe = folder / "munge.key", folder / "munge.socket"
-    key.write_bytes(os.urandom(128))
-    key.chmod(0o600)
-    folder.chmod(0o755)  # as munge wants it
-    kept = [f"--{name}-file={folder}/munge.{name}" for name in ("pid", "log", "seed")]
-    munge = ["munged", "-F", "--force", f"--key-file={key}", f"--socket={pipe}", *kept]
-    with ExitStack() as stack:
-
-        def start(*words: str) -> None:
-            stack.enter_context(running(*words, log=folder / f"{words[0]}.txt", env=env))
-
-        start(*munge)
-        wait_for(pipe.exists)
-        start("slurmctld", "-D")
-        for node in ("first", "second"):
-            start("slurmd", "-D", "-N", node)
-        wait_for(lambda: said("sinfo", "-h", "-N", "-o", "%T", env=env).split() == ["idle"] * 2)
-        yield env
-
-
-def kill_node(name: str, env: dict[str, str]) -> None:
-    """Kill a node of SLURM with all that runs on it."""
-    jobs: list[str] = []
-    while not jobs:  # it may be between two
-        jobs = said("squeue", "-h", "-t", "R", f"--nodelist={name}", "-o", "%A", env=env).split()
-    signs = [f"slurmstepd: [{job}.".encode() for job in jobs]
-    signs.append(b"\0".join([b"slurmd", b"-D", b"-N", name.encode()]))
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            line, inside = (process / "cmdline").read_bytes(), (process / "environ").read_bytes()
-        except OSError:  # it has ended
-            continue
-        home = f"SLURM_CONF={env['SLURM_CONF']}\0".encode()
-        ours = home in inside and f"SLURMD_NODENAME={name}\0".encode() in inside
-        if ours or (line.startswith(tuple(signs)) and home in inside):
-            os.kill(int(process.name), signal.SIGKILL)
-
-
-def test_a_slurm_cluster_loses_a_node_and_no_capture(tmp_path: Path):
-    missing = [name for name in ("slurmctld", "slurmd", "munged") if shutil.which(name) is None]
-    if missing:
-        pytest.skip(f"needs {missing[0]}: apt-get install slurm-wlm munge")
-    with (
-        tempfile.TemporaryDirectory(prefix="slurm", dir="/tmp") as place,
-        slurm(Path(place)) as env,
-    ):
-        flags = "--engine slurm --slurm.minutes 10"
-        survives(tmp_path, flags, env, lambda: kill_node("second", env))
-        down = said("sinfo", "-h", "-N", "-n", "second", "-o", "%T", env=env).strip()
-        assert down.startswith("down")

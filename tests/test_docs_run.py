@@ -27,7 +27,6 @@ for needed in ("transformers", "av", "viser", "mujoco", "pxr"):
 
 ELSEWHERE = {
     "--ray.address auto": "a running Ray cluster",
-    "--engine slurm": "a SLURM cluster",
     "--device cuda": "an NVIDIA GPU",
     "mover experiment --": "hours: many known rooms",
     "mover experiment study": "hours: many known rooms",

@@ -360,10 +360,7 @@ def test_running_jobs_are_stopped_when_the_user_stops(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("copied", [True, False])
-def test_a_job_is_a_process_whose_last_words_are_kept(copied, tmp_path, monkeypatch) -> None:
-    if not copied:
-        monkeypatch.setattr("mover.app.batch.runner.can_fork", lambda: False)
+def test_a_job_is_a_process_whose_last_words_are_kept(tmp_path) -> None:
     job = Job("rooms", 0, "paper", tmp_path)
     process = start(job)
     assert process.wait() == 1

@@ -10,8 +10,6 @@ from tyro.conf import Positional, arg
 from mover.app.cli import say
 from mover.app.cli.config import Device, parsed, preset_named
 from mover.app.cli.run import reconstruct_into
-from mover.app.cli.waiting import WAITING
-from mover.app.cli.warm import compile_beside
 from mover.core.settings import Seconds, Seed, float_in, int_in
 from mover_bench.studies.args import ExperimentArgs, MakeArgs, StudyArgs
 
@@ -48,15 +46,12 @@ def demo(arguments: Sequence[str]) -> None:
     device, folder = device_of(args.device), args.out / "capture"
     if not (folder / "truth" / "scene.json").exists():
         say("making a known room: furniture, a person, masks ...")
-        WAITING.show("making a known room")
-        compile_beside()
         room = demo_room()
         write_capture(add_noise(room, NoiseConfig(), args.seed), folder)
         write_truth(room.truth, room.bodies, folder / "truth")
     capture = read("folder", folder)
     origin = Origin(str(folder.resolve()), device=device)
     found, run = reconstruct_into(args.out / "room", capture, config, origin, report=False)
-    WAITING.show("comparing with the truth")
     metrics = evaluate_folder(args.out / "room", folder / "truth", physics=False)
     truth = read_scene(folder / "truth" / "scene.json", None)
     content = report_of(capture, found, config, run, truth=truth, metrics=metrics)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mover.app.batch.runner import read_tree
+from mover.app.batch import read_tree
 from mover_bench.studies.job import DONE, ROOM, STAGES, Job
 
 Frame = Any

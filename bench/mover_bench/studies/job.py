@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover import __version__
-from mover.app.batch.runner import write_tree
+from mover.app.batch import write_tree
 from mover.app.results import labels_of
 from mover.core import records
 from mover.core.observe import Observer, silent

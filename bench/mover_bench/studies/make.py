@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from mover import __version__
-from mover.app.batch.runner import write_tree
+from mover.app.batch import write_tree
 from mover.app.results import write_truth
 from mover.core.errors import InputError
 from mover.core.files import replacing

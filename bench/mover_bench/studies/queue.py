@@ -6,26 +6,14 @@ import shutil
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from mover.app.batch.runner import (
-    LOG,
-    Running,
-    last_lines,
-    read_tree,
-    record_failure,
-    run_jobs,
-    start_main,
-)
+from mover.app.batch import LOG, last_lines, read_tree, record_failure
 from mover.core.errors import InputError
 from mover.core.observe import Observer, Step
+from mover_bench.processes import Running, run_jobs, start_main
 from mover_bench.studies.job import DONE, ROOM, Job, key_of
 
 log = logging.getLogger(__name__)
 FAILED = "failure.json"
-PRELOADED = (
-    "mover_bench.studies.job", "mover_bench.studies.make", "warp", "scipy.interpolate",
-    "scipy.ndimage", "scipy.sparse.csgraph",
-)  # fmt: skip
-"""What jobs do, and what they import themselves when they first need it."""
 Launch = Callable[[Job], Running[int]]
 """Starts a job; where none is given, as a process of its own."""
 
@@ -33,7 +21,7 @@ Launch = Callable[[Job], Running[int]]
 def start(job: Job, module: str = "mover_bench.studies.job", *more: str) -> Running[int]:
     """Start a job in the process of a module, with `more` words; what it says goes to its log."""
     words = (job.rooms, str(job.seed), job.name, str(job.out), *more)
-    return start_main(module, words, job.folder / LOG, PRELOADED)
+    return start_main(module, words, job.folder / LOG)
 
 
 def open_jobs(jobs: Sequence[Job], keep: bool) -> list[Job]:

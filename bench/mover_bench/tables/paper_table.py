@@ -12,13 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from mover.app.batch.runner import LOG, Running, last_lines, read_tree, run_jobs, start_main
+from mover.app.batch import LOG, last_lines, read_tree
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.settings import int_in
 from mover.pipeline.presets import PRESETS
 from mover_bench.datasets import pigraphs, prox_files
+from mover_bench.processes import Running, run_jobs, start_main
 from mover_bench.studies.compare import markdown
 from mover_bench.tables import published, rows
 from mover_bench.tables.rows import TableRow

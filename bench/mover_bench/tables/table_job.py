@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mover.app.batch.runner import write_tree
+from mover.app.batch import write_tree
 from mover.core.records import fingerprint
 from mover.core.run import Run, sources
 from mover.core.types import Bodies, Capture, Room, Scene, SceneObject

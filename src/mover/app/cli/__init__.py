@@ -1,17 +1,12 @@
 """The command line. This file imports nothing heavy: `mover --help` answers at once."""
 
-import atexit
-import ctypes
-import gc
 import importlib
 import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any
 
-from mover.app.cli.waiting import WAITING, Lines
 from mover.core.errors import InputError
 
 COMMANDS = {
@@ -97,9 +92,7 @@ COMMANDS = {
     ),
 }
 """Where a command is, and what it does."""
-ALIASES = {"bodies": "import-bodies"}
-"""Names of before, for one release: they work and say so."""
-USAGE = "usage: mover COMMAND [OPTIONS]; mover COMMAND --help tells more"
+USAGE = "usage: mover COMMAND [OPTIONS]; mover COMMAND --help says more"
 
 
 def main() -> None:
@@ -114,62 +107,24 @@ def main() -> None:
 
         say(f"mover {__version__}")
         return
-    if arguments[0] not in COMMANDS and arguments[0] not in ALIASES:
+    if arguments[0] not in COMMANDS:
         say(f"mover: no command {arguments[0]!r}; there are {', '.join(COMMANDS)}\n{USAGE}")
         raise SystemExit(2)
-    gc.set_threshold(10_000)  # imports alone make millions of objects, hardly any in circles
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[Lines()])
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
     logging.getLogger("mover.geometry.kernels").setLevel(logging.INFO)  # what is compiled, once
     raise SystemExit(run_command(arguments[0], arguments[1:]))
 
 
-TRIM, MMAP, HEAPS = -1, -3, -8  # names of options in glibc's malloc.h
-MEGABYTE = 1 << 20
-
-
-def keep_memory() -> None:
-    """Keep what was freed for what comes next: the system clears each page that it gives.
-
-    Long videos and large pictures ask again and again for tens of megabytes; without this each
-    block is got and returned. Where the C library is another, nothing is done.
-    """
-    library = ctypes.CDLL(None) if sys.platform == "linux" else None
-    mallopt = getattr(library, "mallopt", None)
-    if mallopt is None:
-        return
-    if not mallopt(MMAP, 256 * MEGABYTE):
-        mallopt(MMAP, 32 * MEGABYTE)  # older versions take no more
-    mallopt(TRIM, 512 * MEGABYTE)
-    mallopt(HEAPS, 1)
-
-
-def program() -> None:
-    """`main` as a program, which ends at once: taking all modules apart takes half a second."""
-    keep_memory()
-    try:
-        main()
-        code = 0
-    except SystemExit as end:
-        if not isinstance(end.code, int):
-            raise
-        code = end.code
-    atexit._run_exitfuncs()  # pyright: ignore[reportPrivateUsage]
-    with suppress(OSError, ValueError):  # whoever listened is gone
-        sys.stdout.flush()
-        sys.stderr.flush()
-    os._exit(code)
-
-
 def run_command(name: str, arguments: Sequence[str]) -> int:
     """Parse the arguments of a command and run it; the exit code."""
-    if name in ALIASES:
-        say(f"mover {name} is called mover {ALIASES[name]} now", sys.stderr)
-        name = ALIASES[name]
     try:
         command_of(name)(arguments)
     except InputError as error:
         say(f"mover {name}: {error}", sys.stderr)
         return 2
+    except BrokenPipeError:  # such as `| head`; Python must not write to it again at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except OSError as error:  # a full disk, a folder that may not be written, a file as --out
         where = f"{error.filename}: " if error.filename else ""
         say(
@@ -179,8 +134,6 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         say(f"\nmover {name}: stopped; the same command goes on from here", sys.stderr)
         return 130
-    finally:
-        WAITING.hide()
     return 0
 
 
@@ -192,7 +145,6 @@ def command_of(name: str) -> Callable[[Sequence[str]], None]:
 
 def say(text: str, stream: Any = None) -> None:  # noqa: ANN401
     """Write a line to standard output, or to `stream`."""
-    WAITING.hide()
     where = stream or sys.stdout
     where.write(text + "\n")
     where.flush()

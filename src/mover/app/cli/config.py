@@ -10,7 +10,6 @@ import tyro
 from tyro.conf import arg
 
 from mover.app.cli import say
-from mover.app.cli.waiting import WAITING
 from mover.core.errors import InputError
 from mover.core.settings import check_settings
 from mover.pipeline.presets import PRESETS, Config, with_methods, with_present_flags
@@ -53,7 +52,8 @@ def parsed(kind: Callable[..., T], prog: str, arguments: Sequence[str], *markers
     parts: tuple[Any, ...] = found if isinstance(found, tuple) else (found,)
     for part in parts:
         check_settings(part, "--")
-    WAITING.show(prog)
+    if sys.stderr.isatty():
+        say(f"{prog}: loading ...", sys.stderr)  # of torch and others, some seconds
     return found
 
 

@@ -5,14 +5,13 @@ import sys
 from types import TracebackType
 from typing import Any
 
-from mover.app.cli.waiting import WAITING
 from mover.core.observe import Observer, Step
 
-log = logging.getLogger("mover.geometry.kernels")  # tells what is compiled
+log = logging.getLogger("mover.geometry.kernels")  # says what is compiled
 
 
 class Bar:
-    """An observer that draws what the stages tell."""
+    """An observer that draws how far the stages are."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -45,7 +44,6 @@ class Bar:
         self._level = log.level
         log.setLevel(logging.INFO)
         log.propagate = False
-        WAITING.hide()
         if self._console.is_terminal:
             self._task = self._progress.add_task("...", total=None)
             self._progress.start()

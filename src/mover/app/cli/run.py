@@ -1,6 +1,8 @@
 """What `run` does, the main job, and `batch`, which runs it on thousands of captures."""
 
+import os
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,12 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import AvoidSubcommands, Positional, arg
 
-from mover.app.batch import CAPTURE, OUT, BatchPlan, captures_in, cores, counted, run_batch
-from mover.app.batch.engines import ARRAY, EngineOptions, RayOptions, SlurmOptions
+from mover.app.batch import CONFIG, FAILURES, SUMMARY, Job, RayOptions
 from mover.app.cli import say
 from mover.app.cli.config import Device, chosen_config, parsed_with
-from mover.app.cli.waiting import WAITING
-from mover.app.cli.warm import compile_beside
 from mover.core.errors import InputError
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
@@ -107,12 +106,12 @@ def reconstruct_into(
 
     from mover.app.cli.progress import Bar, both
     from mover.app.results import write_results
+    from mover.core.observe import Step
     from mover.core.run import Run
     from mover.io.capture.edits import apply_edits
     from mover.pipeline.reconstruct import reconstruct
 
     torch.set_num_threads(THREADS)
-    compile_beside()
     capture, pinned = apply_edits(capture, origin.edits)
     with Bar() as bar:
         observe = bar if watch is None else both(bar, watch)
@@ -122,8 +121,8 @@ def reconstruct_into(
             from mover.pipeline.refinement import refined_room
 
             room = refined_room(room, capture, bar)
-    WAITING.show("writing the result")
-    write_results(capture, room, config, run, origin, report=report)
+        bar(Step("writing the result", 0, 1))
+        write_results(capture, room, config, run, origin, report=report)
     for warning in room.warnings:
         say(f"warning: {warning}")
     return room, run
@@ -140,10 +139,10 @@ class BatchArgs:
     """A text file with one capture a line, or a folder of captures."""
     out: Path = Path("batch")
     """Folder of all results, the failures and summary.csv."""
-    engine: Literal["local", "ray", "slurm"] = "local"
-    """Where captures run: on this machine, on a Ray cluster, or under SLURM."""
+    engine: Literal["local", "ray"] = "local"
+    """Where captures run: on this machine, or on a Ray cluster."""
     workers: Annotated[int, int_in(0, 10_000)] = 0
-    """Captures at a time; 0: as many as this machine has cores, on a cluster as it has room for."""
+    """Captures at a time on this machine; 0: as many as it has cores."""
     limit: Seconds = 0.0
     """Most seconds for one capture; 0: no limit."""
     threads: Annotated[int, int_in(1, 1024)] = 1
@@ -159,50 +158,45 @@ class BatchArgs:
     refine: bool = False
     """At the end of each run, refine the people with the room they helped to find."""
     ray: RayOptions = field(default_factory=RayOptions)
-    slurm: SlurmOptions = field(default_factory=SlurmOptions)
 
 
 def batch(arguments: Sequence[str]) -> None:
     """`mover batch`; the exit code is 1 if a capture failed."""
-    args, config = _parse_batch(arguments)
-    from mover import __version__
-    from mover.core import records
+    config, rest = chosen_config(arguments)
+    args, config = parsed_with(BatchArgs, config, "mover batch", rest, AvoidSubcommands)
+    from mover.app.batch import captures_in, run_batch
 
-    captures = captures_in(args.source, args.out)
-    plan = BatchPlan(
-        captures=captures,
-        out=args.out,
-        command=_command(args, config),
-        fingerprint=records.fingerprint(config, args.format, __version__, args.refine),
-        limit=args.limit,
-        threads=args.threads,
-    )
-    alone = args.engine == "local" or (args.engine == "ray" and args.ray.address == "local")
-    workers = args.workers or (cores() if alone else ARRAY)  # a cluster itself keeps them waiting
-    options = EngineOptions(args.engine, workers, args.ray, args.slurm)
-    outcomes = run_batch(plan, options, retry=args.retry)
-    say(f"{counted(outcomes)}: {args.out / 'summary.csv'}")
-    failed = [outcome for outcome in outcomes if outcome.state == "failed"]
-    for outcome in failed[:20]:
-        say(f"  {outcome.name}: {outcome.reason}")
-    if failed:
-        say(f"records of what failed: {args.out / 'failures'}; --retry runs them again")
+    jobs = _jobs(args, config, captures_in(args.source, args.out))
+    ray = args.ray if args.engine == "ray" else None
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    outcomes = run_batch(jobs, args.out, args.workers or own or 1, ray, args.retry)
+    states = Counter(outcome.state for outcome in outcomes)
+    before = f" ({states['kept']} of them before)" if states["kept"] else ""
+    done = states["done"] + states["kept"]
+    say(f"{done} done{before}, {states['failed']} failed: {args.out / SUMMARY}")
+    if states["failed"]:
+        say(f"records of what failed: {args.out / FAILURES}; --retry runs them again")
         raise SystemExit(1)
 
 
-def _parse_batch(arguments: Sequence[str]) -> tuple[BatchArgs, Config]:
-    config, rest = chosen_config(arguments)
-    return parsed_with(BatchArgs, config, "mover batch", rest, AvoidSubcommands)
-
-
-def _command(args: BatchArgs, config: Config) -> tuple[str, ...]:
-    """The command of one capture; the settings are handed over in one file for all."""
-    file = args.out.resolve() / "config.json"
+def _jobs(args: BatchArgs, config: Config, captures: Sequence[Path]) -> list[Job]:
+    """A job for each capture; the settings are handed over in one file for all."""
+    from mover import __version__
+    from mover.app.batch import fingerprint, names_of
     from mover.core import records
     from mover.io.files.fields import write_json
 
+    out = args.out.resolve()
     tree = {"format": "mover-config", "config": records.plain(config)}
-    write_json(tree, file)
-    start = (sys.executable, "-m", "mover", "run", CAPTURE, "--out", OUT)
-    refine = ("--refine",) if args.refine else ()
-    return (*start, "--format", args.format, "--config", str(file), *refine)
+    write_json(tree, out / CONFIG)
+    settings = records.fingerprint(config, args.format, __version__, args.refine)
+    more = ["--format", args.format, "--config", str(out / CONFIG)]
+    more += ["--refine"] if args.refine else []
+    jobs: list[Job] = []
+    for name, capture in zip(names_of(captures), captures, strict=True):
+        words = [sys.executable, "-m", "mover", "run", str(capture), "--out", str(out / name)]
+        print_ = fingerprint(settings, capture)
+        command = (*words, *more)
+        job = Job(name, str(capture), str(out / name), command, print_, args.limit, args.threads)
+        jobs.append(job)
+    return jobs

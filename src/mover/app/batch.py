@@ -1,0 +1,365 @@
+"""Many captures, each in a process of its own, none of them run twice.
+
+A capture is finished when its products and `batch.json` with its fingerprint stand in its folder;
+it has failed when its failure record holds that fingerprint. A batch that was killed goes on there.
+"""
+
+import csv
+import fcntl
+import hashlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from mover.core.errors import InputError
+from mover.core.files import replacing
+from mover.core.settings import float_in
+
+PRODUCTS, MARK, LOG = ("scene.json", "run.json"), "batch.json", "log.txt"  # of each capture
+FAILURES, SUMMARY, CONFIG = "failures", "summary.csv", "config.json"  # of the batch
+COLUMNS = (
+    "name", "state", "seconds", "peak_memory_mb", "warnings", "reason", "capture", "out",
+)  # fmt: skip
+POLL, GRACE = 0.05, 5.0  # [s] between two looks at a process; from the request to stop to its end
+LINES = 20  # last lines of the log that a failure record keeps
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+NEVER = threading.Event()
+
+
+@dataclass(frozen=True)
+class RayOptions:
+    """Share of a machine that each capture gets from Ray."""
+
+    address: str = "local"
+    """Of a running cluster (`auto`, `ray://...`); local: start one on this machine."""
+    cpus: Annotated[float, float_in(0.01, 1024)] = 1.0
+    """Cores for each capture; fractions share a core."""
+    gpus: Annotated[float, float_in(0, 64)] = 0.0
+    """GPUs for each capture; 0.25: four captures share one."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A capture to run."""
+
+    name: str
+    capture: str
+    out: str
+    """Folder of its result."""
+    command: tuple[str, ...]
+    """What to run; it exits with 0 when it is well."""
+    fingerprint: str
+    """Of the configuration and the capture's files."""
+    limit: float = 0.0
+    """Most seconds; 0: no limit."""
+    threads: int = 1
+    """Threads of the numerical libraries."""
+
+    @property
+    def record(self) -> Path:
+        """File that says why it failed."""
+        return Path(self.out).parent / FAILURES / f"{self.name}.json"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended."""
+
+    name: str
+    state: Literal["done", "kept", "failed", "stopped"]
+    seconds: float = 0.0
+    """Wall clock of the run that made the result."""
+    reason: str = ""
+    """Why it failed, in one line; empty if it did not."""
+
+
+def captures_in(listing: Path, out: Path | None = None) -> tuple[Path, ...]:
+    """The captures of a text file (one path a line, relative to it; `#` starts a remark) or folder.
+
+    Raises:
+        InputError: If there are none, or one is listed twice.
+    """
+    if listing.is_dir():
+        if (listing / "camera.json").is_file():
+            raise InputError(f"{listing}: is a capture, expected a folder or list of captures")
+        found = [p.resolve() for p in sorted(listing.iterdir()) if p.is_dir()]
+        found = [p for p in found if p.name[0] not in "._" and (out is None or p != out.resolve())]
+    elif listing.is_file():
+        lines = [line.split("#")[0].strip() for line in listing.read_text().splitlines()]
+        found = [(listing.parent / line).resolve() for line in lines if line]
+    else:
+        raise InputError(f"{listing}: there is no such file, expected a list or folder of captures")
+    if not found:
+        raise InputError(f"{listing}: names no captures, expected one path a line, or folders")
+    twice = [path for path, count in Counter(found).items() if count > 1]
+    if twice:
+        raise InputError(f"{listing}: names {twice[0]} twice, expected each capture once")
+    return tuple(found)
+
+
+def names_of(captures: Sequence[Path]) -> list[str]:
+    """A folder name for each capture: its own, with a mark of its path where two share one."""
+    taken = Counter([FAILURES, SUMMARY, CONFIG, *(path.name.casefold() for path in captures)])
+    marks = [hashlib.sha256(str(path).encode()).hexdigest()[:8] for path in captures]
+    return [
+        path.name if taken[path.name.casefold()] == 1 else f"{path.name}-{mark}"
+        for path, mark in zip(captures, marks, strict=True)
+    ]
+
+
+def fingerprint(settings: str, capture: Path) -> str:
+    """Of settings and of what a capture's files are: names, sizes, times of change."""
+    digest = hashlib.sha256(settings.encode())
+    for path in sorted(capture.rglob("*")) if capture.is_dir() else [capture]:
+        if path.is_file():
+            file = path.stat()
+            name = path.relative_to(capture).as_posix()
+            digest.update(f"\n{name} {file.st_size} {file.st_mtime_ns}".encode())
+    return digest.hexdigest()[:16]
+
+
+def earlier(job: Job, retry: bool = False) -> Outcome | None:
+    """How the job ended before; None: it is to be done, as are failed ones with `retry`."""
+    mark, failure = read_tree(Path(job.out) / MARK), read_tree(job.record)
+    whole = all((Path(job.out) / name).is_file() for name in PRODUCTS)
+    if whole and mark.get("fingerprint") == job.fingerprint:
+        return Outcome(job.name, "kept", float(mark.get("seconds", 0.0)))
+    if not retry and failure.get("fingerprint") == job.fingerprint:
+        seconds = float(failure.get("seconds", 0.0))
+        return Outcome(job.name, "failed", seconds, str(failure.get("reason", "")))
+    return None
+
+
+def run_job(job: Job, stop: threading.Event = NEVER) -> Outcome:
+    """Run a job to its end and record it; a finished one is left alone.
+
+    The lock is passed on to its process: one that outlives a killed batch is waited for.
+
+    Args:
+        job: What to run.
+        stop: Set from another thread, it ends the job; nothing is recorded then.
+    """
+    try:
+        Path(job.out).mkdir(parents=True, exist_ok=True)
+        with (Path(job.out) / ".lock").open("w") as lock:
+            while not stop.is_set():
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:  # another batch runs this capture
+                    stop.wait(POLL)
+                    continue
+                return earlier(job, retry=True) or _run(job, stop, lock.fileno())
+    except Exception as error:  # a full disk, a forbidden folder: it must not end the others
+        return lost(job, error)
+    return Outcome(job.name, "stopped")
+
+
+def _run(job: Job, stop: threading.Event, lock: int) -> Outcome:
+    out, start = Path(job.out), time.monotonic()
+    for stale in (out / MARK, job.record):
+        stale.unlink(missing_ok=True)
+    environment = {**dict.fromkeys(THREADS, str(job.threads)), **os.environ}
+    try:
+        with (out / LOG).open("wb") as log:
+            process = subprocess.Popen(
+                job.command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment,
+                start_new_session=True, pass_fds=(lock,),
+            )  # fmt: skip
+    except OSError as error:
+        return _failed(job, "no start", f"could not be started: {error}")
+    late = False
+    while (code := process.poll()) is None and not late and not stop.wait(POLL):
+        late = 0 < job.limit < time.monotonic() - start
+    _end(process)
+    seconds = time.monotonic() - start
+    if late:
+        reason = f"ran longer than its limit of {job.limit:g} s"
+        return _failed(job, "time limit", reason, None, seconds)
+    if code is None:
+        return Outcome(job.name, "stopped")
+    missing = [name for name in PRODUCTS if not (out / name).is_file()]
+    if code == 0 and not missing:
+        write_tree(out / MARK, {"fingerprint": job.fingerprint, "seconds": seconds})
+        return Outcome(job.name, "done", seconds)
+    kind, why = "no result", f"ended well without {' and '.join(missing)}"
+    if code < 0:
+        kind, why = "signal", f"ended by {signal_name(-code)}"
+    elif code > 0:
+        kind, why = "input" if code == 2 else "exit", f"exit code {code}"
+    last = (last_lines(out / LOG) or ["it said nothing"])[-1]
+    return _failed(job, kind, f"{why}: {last}", code, seconds)
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    """Ask the process and its children to stop, then make them."""
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        if process.poll() is not None:
+            return
+        try:
+            os.killpg(process.pid, number)
+            process.wait(GRACE)
+        except (ProcessLookupError, subprocess.TimeoutExpired):
+            continue
+    process.wait()
+
+
+def _failed(
+    job: Job, kind: str, reason: str, code: int | None = None, seconds: float = 0.0
+) -> Outcome:
+    about = {**asdict(job), "kind": kind, "reason": reason, "seconds": round(seconds, 3)}
+    record_failure(job.record, about, code, last_lines(Path(job.out) / LOG))
+    return Outcome(job.name, "failed", seconds, reason)
+
+
+def lost(job: Job, error: Exception) -> Outcome:
+    """Record a job whose worker vanished, so that it could not do so itself."""
+    text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+    return earlier(job) or _failed(job, "worker", f"its worker was lost: {text}")
+
+
+def record_failure(
+    path: Path, about: Mapping[str, Any], code: int | None, lines: Sequence[str]
+) -> None:
+    """Write down how a job failed: what it was, its exit code (minus a signal), its last lines."""
+    ended = {
+        "exit_code": code if code is not None and code >= 0 else None,
+        "signal": signal_name(-code) if code is not None and code < 0 else None,
+        "when": datetime.now(UTC).isoformat(timespec="seconds"),
+        "host": socket.gethostname(),
+        "last_lines": list(lines),
+    }
+    write_tree(path, {**about, **ended})
+
+
+def signal_name(number: int) -> str:
+    """`SIGKILL`."""
+    names = {one.value: one.name for one in signal.Signals}
+    return names.get(number, f"signal {number}")
+
+
+def read_tree(path: Path) -> dict[str, Any]:
+    """A JSON object, empty where there is none or it was cut short."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def write_tree(path: Path, tree: Mapping[str, Any]) -> None:
+    """Write a JSON object in one step."""
+    with replacing(path) as part:
+        part.write_text(json.dumps(tree, indent=1, allow_nan=False))
+
+
+def last_lines(log: Path) -> list[str]:
+    """What a job said last; empty where it said nothing."""
+    text = log.read_text(errors="replace")[-16_384:] if log.is_file() else ""
+    return [line.rstrip() for line in text.splitlines() if line.strip()][-LINES:]
+
+
+def on_this_machine(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
+    """So many processes at a time; those that run are ended when nobody waits for them."""
+    stop = threading.Event()
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(run_job, job, stop) for job in jobs]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+
+
+def on_ray(jobs: Sequence[Job], workers: int, share: RayOptions) -> Iterator[Outcome]:
+    """One Ray task a capture, which runs it in a process of its own; lost machines are replaced.
+
+    Raises:
+        InputError: If ray is not installed.
+    """
+    if find_spec("ray") is None:
+        raise InputError(
+            "--engine ray: ray is not installed; pip install '.[ray]' in mover's folder"
+        )
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    ray: Any = import_module("ray")
+    local: dict[str, Any] = {}
+    if share.address == "local":
+        local = {"num_cpus": max(1, round(workers * share.cpus)), "include_dashboard": False}
+    ray.init(
+        address=share.address, log_to_driver=False, logging_level="ERROR",
+        ignore_reinit_error=True, **local,
+    )  # fmt: skip
+    task = ray.remote(num_cpus=share.cpus, num_gpus=share.gpus, max_retries=2)(run_job)
+    waiting = {task.remote(job): job for job in jobs}
+    try:
+        while waiting:
+            handle = ray.wait(list(waiting))[0][0]
+            job = waiting.pop(handle)
+            try:
+                yield ray.get(handle)
+            except ray.exceptions.RayError as error:
+                yield lost(job, error)
+    finally:
+        ray.shutdown()
+
+
+def run_batch(
+    jobs: Sequence[Job], out: Path, workers: int, ray: RayOptions | None = None, retry: bool = False
+) -> list[Outcome]:
+    """Run what is not finished, show how far it is on stderr, and write `summary.csv`.
+
+    Args:
+        jobs: What to run.
+        out: Folder of all results.
+        workers: Captures at a time on this machine.
+        ray: Run them on Ray instead.
+        retry: Whether captures that failed before are run again.
+    """
+    from rich.console import Console
+    from rich.progress import track
+
+    out.mkdir(parents=True, exist_ok=True)
+    console = Console(stderr=True)
+    ended = {job.name: found for job in jobs if (found := earlier(job, retry)) is not None}
+    todo = [job for job in jobs if job.name not in ended]
+    if ended:
+        console.print(f"{len(ended)} of {len(jobs)} captures were run before", highlight=False)
+    running = on_this_machine(todo, workers) if ray is None else on_ray(todo, workers, ray)
+    try:
+        for outcome in track(running if todo else (), "captures", len(todo), console=console):
+            ended[outcome.name] = outcome
+            if outcome.state == "failed":
+                console.print(f"{outcome.name} failed: {outcome.reason}", markup=False)
+    finally:
+        with replacing(out / SUMMARY) as part, part.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, COLUMNS)
+            writer.writeheader()
+            writer.writerows(_row(job, ended.get(job.name)) for job in jobs)
+    return [ended[job.name] for job in jobs]
+
+
+def _row(job: Job, outcome: Outcome | None) -> dict[str, Any]:
+    """A line of the summary."""
+    if outcome is None or outcome.state == "stopped":
+        return {"name": job.name, "state": "open", "capture": job.capture}
+    row = {"name": job.name, "seconds": round(outcome.seconds, 2), "capture": job.capture}
+    if outcome.state == "failed":
+        return {**row, "state": "failed", "reason": outcome.reason}
+    log = read_tree(Path(job.out) / "run.json")
+    peak = max((stage.get("peak_memory", 0.0) for stage in log.get("stages", [])), default="")
+    warned = len(log["warnings"]) if "warnings" in log else ""
+    return {**row, "state": "done", "peak_memory_mb": peak, "warnings": warned, "out": job.out}
