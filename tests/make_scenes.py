@@ -504,15 +504,10 @@ def write_masks(folder: Path, masks: np.ndarray, names: list[str]) -> dict[str, 
         {"class": names[i], "bbox": [*b, 0.9], "mask": m.tolist()}
         for i, (m, b) in enumerate(zip(masks, boxes, strict=True))
     ])  # fmt: skip
-    save("sam3", "sam3.json", {
-        "orig_img_h": h, "orig_img_w": w, "pred_scores": [0.5] * n,
-        "pred_boxes": [[0, 0, 1, 1]] * n,
-        "pred_masks": [compressed(runs_of(m)) for m in masks],
-    })  # fmt: skip
-    save("sav", "sav.json", {
-        "video_width": float(w), "video_height": float(h), "masklet_id": list(range(n)),
-        "masklet": [[{"size": [h, w], "counts": compressed(runs_of(m))} for m in masks]],
-    })  # fmt: skip
+    out["labelme"] = write_labelme(folder / "labelme.json", [
+        (names[i], [[x0, y0], [x1, y1]], "rectangle", None)
+        for i, (x0, y0, x1, y1) in enumerate(boxes)
+    ])  # fmt: skip
     out["npz"] = folder / "masks.npz"
     np.savez(out["npz"], masks=masks, scores=np.full(n, 0.5), labels=np.array(names))
     out["npz_logits"] = folder / "logits.npz"
@@ -535,6 +530,19 @@ def write_masks(folder: Path, masks: np.ndarray, names: list[str]) -> dict[str, 
         Image.fromarray(rgba).save(out["alpha"] / f"{i}.png")
     picture((w, h)).save(out["alpha"] / "image.png")
     return out
+
+
+def write_labelme(path: Path, things: list[tuple[str, list[list[float]], str, int | None]]) -> Path:
+    """What labelme 5 saves of an image of 64 x 48: label, points, type and group of each shape."""
+    shapes = [
+        {"label": label, "points": points, "group_id": group, "description": "",
+         "shape_type": kind, "flags": {}, "mask": None}
+        for label, points, kind, group in things
+    ]  # fmt: skip
+    tree = {"version": "5.4.1", "flags": {}, "shapes": shapes, "imagePath": "a.jpg",
+            "imageData": None, "imageHeight": 48, "imageWidth": 64}  # fmt: skip
+    path.write_text(json.dumps(tree))
+    return path
 
 
 class Bomb:

@@ -98,7 +98,7 @@ def copied(source: Path, home: Path) -> Path:
 
 
 FORMATS = ("total3d", "sam3d", "holisticmesh", "glb", "boxes", "release", "pigraphs",
-           "masks:coco_text", "masks:mover", "masks:sam3", "masks:sav", "masks:npz",
+           "masks:coco_text", "masks:mover", "masks:labelme", "masks:npz",
            "masks:labels")  # fmt: skip
 
 

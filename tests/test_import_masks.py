@@ -24,10 +24,10 @@ from mover.io.masks.instances import fitted
 DATA = Path(__file__).parents[2] / "shared" / "data"
 WORDS = ["chair", "couch", "chair", "person"]
 KINDS = (
-    "coco_list", "coco_text", "results", "detectron2", "mover", "sam3", "sav", "npz",
+    "coco_list", "coco_text", "results", "detectron2", "mover", "npz",
     "npz_logits", "labels", "files", "alpha",
 )  # fmt: skip
-NAMELESS = {"sam3", "sav", "npz_logits", "alpha"}
+NAMELESS = {"npz_logits", "alpha"}
 
 
 def drawn() -> np.ndarray:
@@ -72,10 +72,31 @@ def test_polygons_fill_what_they_surround(tmp_path: Path) -> None:
     assert mask.sum() == 300
 
 
+def test_shapes_of_labelme_are_filled_and_those_of_a_group_are_one(tmp_path: Path) -> None:
+    shapes = [
+        ("chair", [[10, 10], [30, 10], [30, 25], [10, 25]], "polygon", 4),
+        ("lamp", [[50, 40], [45, 30]], "rectangle", None),
+        ("chair", [[40, 10], [44, 10], [44, 14], [40, 14]], "polygon", 4),
+        ("chair", [[0, 30], [8, 30], [8, 34], [0, 34]], "polygon", None),
+    ]
+    found = read_instances(layouts.write_labelme(tmp_path / "a.json", shapes), {}, None)
+    assert found.size == (64, 48)
+    assert [item.category for item in found.items] == ["chair", "lamp", "chair"]
+    truth = np.zeros((3, 48, 64), dtype=bool)
+    truth[0, 10:25, 10:30] = truth[0, 10:14, 40:44] = True
+    truth[1, 30:40, 45:50] = truth[2, 30:34, 0:8] = True
+    for item, mask in zip(found.items, truth, strict=True):
+        assert item.mask is not None
+        assert (decode(Masks(48, 64, (item.mask,)), 0).numpy() == mask).all()
+    bad = layouts.write_labelme(tmp_path / "b.json", [("chair", [[1, 1], [9, 9]], "line", None)])
+    with pytest.raises(InputError, match=r"shapes\[0\]\.shape_type.*polygon, rectangle"):
+        read_instances(bad, {}, None)
+
+
 def test_names_of_the_user_win(tmp_path: Path) -> None:
     files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
     names = {"0": "table", "1": "bed"}
-    for kind in ("sam3", "sav", "npz_logits", "alpha"):
+    for kind in NAMELESS:
         found = read_instances(files[kind], names, None)
         assert [i.category for i in found.items][:2] == ["table", "bed"], kind
 
@@ -104,12 +125,6 @@ class TestRealFiles:
             assert layouts.compressed(layouts.runs_of(mask)) == row["segmentation"]["counts"]
         assert found[0].category == "dog"
 
-    def test_a_real_masklet_has_its_tracks_through_all_frames(self) -> None:
-        found = read_instances(DATA / "formats" / "sav_000001_manual.json", {}, None)
-        assert found.size == (480, 848)
-        assert {i.track for i in found.items} == {0, 1, 2, 3, 4}
-        assert max(i.frame for i in found.items) == 120
-
     def test_real_total3d_and_masks_of_its_boxes_become_one_capture(self, tmp_path: Path) -> None:
         rows = json.loads((DATA / "total3d_1" / "input" / "detections.json").read_text())
         masks = np.zeros((len(rows), 530, 730), dtype=bool)
@@ -132,7 +147,7 @@ class TestRealFiles:
 
 def read_list(rows: list[dict[str, object]], name: str) -> list[layouts.Any]:
     from mover.io.files.fields import At
-    from mover.io.masks.instances_json import list_instances
+    from mover.io.masks.instance_files import list_instances
 
     return list(list_instances(At(rows, name), {}, None).items)
 

@@ -89,7 +89,7 @@ FORMATS = (
         "mover_bench.datasets.pigraphs:pigraphs_parts",
     ),
     Format(
-        "masks", "masks", "masks alone: COCO, detectron2, SA-V, SAM 3, PNG, npz",
+        "masks", "masks", "masks alone: COCO, labelme, PNG, npz",
         "masks.instance_files:mask_parts",
     ),
     *(

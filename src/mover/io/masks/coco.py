@@ -1,4 +1,4 @@
-"""What every COCO file has: images, categories, masks as polygons or run-length codes."""
+"""COCO: images, categories, masks as polygons or run-length codes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -49,7 +49,12 @@ def from_coco(segmentation: Any, height: int, width: int, where: str) -> bytes: 
         raise InputError(
             f"{where} has counts with {found}, expected runs that sum to {height} x {width}"
         )
-    return counts if isinstance(counts, bytes) else _compressed(runs, height, width)
+    if isinstance(counts, bytes):
+        return counts
+    from pycocotools import mask as coco
+
+    code: Any = {"size": [height, width], "counts": [int(n) for n in runs]}
+    return coco.frPyObjects(code, height, width)["counts"]  # pyright: ignore
 
 
 def _runs(counts: Any, where: str) -> NDArray[np.int64]:  # noqa: ANN401
@@ -67,13 +72,6 @@ def _runs(counts: Any, where: str) -> NDArray[np.int64]:  # noqa: ANN401
         raise InputError(
             f"{where} has counts with {error}, expected COCO's compressed code"
         ) from error
-
-
-def _compressed(runs: NDArray[np.int64], height: int, width: int) -> bytes:
-    from pycocotools import mask as coco
-
-    code: Any = {"size": [height, width], "counts": [int(n) for n in runs]}
-    return coco.frPyObjects(code, height, width)["counts"]  # pyright: ignore
 
 
 def _from_polygons(polygons: Sequence[Any], height: int, width: int, where: str) -> bytes:

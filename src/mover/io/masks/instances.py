@@ -1,4 +1,4 @@
-"""Instances in images: what mask tools find, on the way to objects.json and people.json."""
+"""Instances in images: masks and boxes, on the way to objects.json and people.json."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ class Instances:
 
     items: tuple[Instance, ...]
     size: tuple[int, int] | None
-    """Width and height of the images [px]; None: the source does not tell."""
+    """Width and height of the images [px]; None where the source has none."""
     file: str
 
 
@@ -65,16 +65,10 @@ def code_of(pixels: NDArray[Any]) -> bytes | None:
 
 
 def checked_code(segmentation: Any, size: tuple[int, int], at: At) -> bytes | None:  # noqa: ANN401
-    """The code of COCO's polygons or run lengths; None where it is empty."""
+    """The code of COCO's polygons or run lengths in an image of this size; None where empty."""
     width, height = size
     code = from_coco(segmentation, height, width, at.place)
     return code if area(Masks(height, width, (code,)), 0) else None
-
-
-def box_of_code(code: bytes, size: tuple[int, int]) -> tuple[float, ...]:
-    """The box of a mask that is not empty [px]."""
-    mask = decode(Masks(size[1], size[0], (code,)), 0)
-    return tuple(float(v) for v in tight_box(mask))
 
 
 def fitted(found: Instances, size: tuple[int, int] | None) -> Instances:
@@ -107,12 +101,12 @@ def _resized(item: Instance, old: tuple[int, int], new: tuple[int, int]) -> Inst
 
 
 def is_person(item: Instance) -> bool:
-    """Whether an instance is somebody."""
+    """Whether an instance is a person."""
     return item.category.lower() in PERSON
 
 
 def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
-    """The fields of objects.json; ids are the places in `items`.
+    """The fields of objects.json; ids are the ranks in `items`.
 
     Raises:
         InputError: If the size of the image is not known.
@@ -126,7 +120,8 @@ def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
         box = item.box
         if item.mask is not None:
             row["segmentation"] = _segmentation(item.mask, found.size)
-            box = box_of_code(item.mask, found.size)
+            mask = Masks(found.size[1], found.size[0], (item.mask,))
+            box = tuple(float(v) for v in tight_box(decode(mask, 0)))
         if box is None or box[2] <= box[0] or box[3] <= box[1]:
             continue  # empty: there is nothing of it in the image
         x, y, right, bottom = box
@@ -137,7 +132,7 @@ def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
 
 
 def people_tree(found: Instances, fps: float | None = None) -> At:
-    """The fields of people.json: everything in `found` is somebody.
+    """The fields of people.json: everything in `found` is a person.
 
     Raises:
         InputError: If the size of the images is not known.
@@ -160,7 +155,7 @@ def people_tree(found: Instances, fps: float | None = None) -> At:
 
 
 def followed(items: Sequence[Instance]) -> list[Instance]:
-    """Instances with a track each: those without one are numbered by size in their frame."""
+    """Instances with a track each: those without one are numbered by score in their frame."""
     frames: dict[int, list[Instance]] = {}
     for item in items:
         frames.setdefault(item.frame, []).append(item)
