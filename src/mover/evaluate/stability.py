@@ -26,8 +26,7 @@ from mover.core.types import Scene, SceneObject
 from mover.evaluate.scene import Metric
 from mover.geometry.rotations import rot_y
 from mover.io.export.contacts import FILE, read_labels
-from mover.io.export.mjcf import add_walls, body_name, mjcf_of, text_of
-from mover.io.export.shell import Wall
+from mover.io.export.mjcf import body_name, mjcf_of, text_of
 from mover.io.export.solids import AXES, Solid, solids_of
 from mover.io.files.npz import read_npz
 
@@ -172,7 +171,6 @@ def simulate(
     run: Run,
     config: SimulationConfig | None = None,
     loads: tuple[Load, ...] = (),
-    walls: tuple[Wall, ...] = (),
 ) -> tuple[SimulatedObject, ...]:
     """Simulate a scene in MuJoCo and compare where its pieces end with where they were.
 
@@ -181,7 +179,6 @@ def simulate(
         run: Its folder keeps the convex pieces.
         config: How long.
         loads: Who sits where; each object gets the hardest of its loads, in a second simulation.
-        walls: Still walls that pieces may lean on.
 
     Raises:
         InputError: If mujoco is not installed.
@@ -190,7 +187,7 @@ def simulate(
         raise InputError(missing)
     config = config or SimulationConfig()
     solids = solids_of(scene, run)
-    room = _Standing(scene, solids, walls)
+    room = _Standing(scene, solids)
     start, end, stuck = _settled(room, config.seconds, {})
     found = [_compare(*row) for row in zip(solids, start, end, stuck, strict=True)]
     pressed = {p.id: load for p in scene.objects if (load := hardest(loads, p)) is not None}
@@ -213,16 +210,12 @@ class _Standing:
 
     scene: Scene
     solids: tuple[Solid, ...]
-    walls: tuple[Wall, ...]
 
 
-def modelled(
-    scene: Scene, solids: tuple[Solid, ...], walls: tuple[Wall, ...] = ()
-) -> tuple[Any, Any, Any]:
+def modelled(scene: Scene, solids: tuple[Solid, ...]) -> tuple[Any, Any, Any]:
     """MuJoCo, its model of a scene without looks, and the data of that model at the start."""
     mujoco: Any = import_module("mujoco")
     root, meshes = mjcf_of(scene, solids, looks=False)
-    add_walls(root, walls)
     model = mujoco.MjModel.from_xml_string(text_of(root), meshes)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -234,7 +227,7 @@ def _settled(
 ) -> tuple[list["State"], list["State"], list[float]]:
     """Where the pieces are before and after, and how deep they were stuck."""
     scene, solids = room.scene, room.solids
-    mujoco, model, data = modelled(scene, solids, room.walls)
+    mujoco, model, data = modelled(scene, solids)
     start = _states(data, solids)
     stuck = [_stuck(model, data, body_name(solid)) for solid in solids]
     weights: list[tuple[int, float, NDArray[np.float64]]] = []  # places in the bodies' axes [m]

@@ -129,7 +129,7 @@ FORMATS = (
     Format("export", "glb", "the room with moving people, one file", "export.glb:export_glb"),
     Format("export", "usd", "the same as binary USD", "export.usd:export_usd"),
     Format("export", "mjcf", "a world of MuJoCo", "export.mjcf:export_mjcf"),
-    Format("export", "ply", "each object by itself", "export.scene_glb:export_objects"),
+    Format("export", "ply", "each object by itself", "export.scene_glb:export_ply"),
     Format("export", "contacts", "labels of contact", "export.contacts:export_contacts"),
     Format("export", "amass", "people with the keys of AMASS", "export.amass:export_amass"),
 )  # fmt: skip

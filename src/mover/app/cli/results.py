@@ -87,9 +87,6 @@ class ExportArgs:
     body: Literal["auto", "skin", "morph", "none"] = "auto"
     """glb, usd: how people move: on bones, by exact shapes of some frames, or not at all (also
     mjcf)."""
-    walls: Literal["none", "guess"] = "none"
-    """usd, mjcf: guess walls from a layout that was given (Total3D), else from what stands
-    along them; they are marked as guessed."""
     up: Literal["y", "z"] = "y"
     """amass, usd, contacts: y is the world of scene.json, z that of AMASS and of simulators."""
 
@@ -102,8 +99,7 @@ def export(arguments: Sequence[str]) -> None:
     writers = {target: chosen("--to", target, "export") for target in args.to}
     finished, folder = read_finished(args.out, args.capture), args.out / "export"
     options = {"glb": {"body": args.body}, "amass": {"up": args.up}, "contacts": {"up": args.up}}
-    room = {"body": args.body, "walls": args.walls}
-    options |= {"usd": {**room, "up": args.up}, "mjcf": room}
+    options |= {"usd": {"body": args.body, "up": args.up}, "mjcf": {"body": args.body}}
     for target, write in writers.items():
         found: Exported = write(finished, folder, **options.get(target, {}))
         shown = found.files if len(found.files) <= 3 else found.files[:1]

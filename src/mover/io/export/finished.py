@@ -8,7 +8,6 @@ from mover.core.errors import InputError
 from mover.core.types import Bodies, Scene
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
-from mover.io.export.shell import Wall, guess_walls
 
 BodyForm = Literal["auto", "skin", "morph", "none"]
 """How people move: on bones, by exact shapes, not at all; auto: on bones where these are known."""
@@ -27,10 +26,6 @@ class Finished:
     given: Bodies | None
     """People as the capture had them, with the parameters of their model."""
 
-    def shell(self) -> tuple[Wall, ...]:
-        """The walls, guessed."""
-        return guess_walls(self.scene, self.bodies)
-
 
 @dataclass(frozen=True)
 class Exported:
@@ -46,7 +41,7 @@ def read_finished(out: Path, capture: Path | None = None) -> Finished:
 
     Args:
         out: Folder of the result.
-        capture: Folder of the capture; its bodies.npz tells the parameters of the bodies where the
+        capture: Folder of the capture; its bodies.npz has the parameters of the bodies where the
             result has none.
     """
     scene = read_scene(out / "scene.json")

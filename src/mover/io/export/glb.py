@@ -1,5 +1,6 @@
-"""scene.glb: objects as nodes, floor, camera, and people who move on bones or by shapes."""
+"""scene.glb with one animation: people on the bones of their model or by shapes, moved objects."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,198 +10,21 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mover.bodies.skinning import SkinnedBody
-from mover.core.colours import Colour, person_colour
+from mover.core.colours import person_colour
 from mover.core.types import Bodies, SceneObject
 from mover.geometry.mesh import vertex_normals
 from mover.io.export.finished import BodyForm, Exported, Finished
-from mover.io.export.gltf import (
-    INDICES,
-    VERTICES,
-    Channel,
-    Document,
-    add_material,
-    add_presence,
-    add_sampler,
-    add_stays,
-)
-from mover.io.export.people import FPS, Track, keyframes, tracks_of
+from mover.io.export.people import FPS, Track, keyframes, seen_from_to, tracks_of
 from mover.io.export.posed import Skin, all_angles, bones_for, quaternions, rest_of
-from mover.io.export.scene_glb import write_glb
+from mover.io.export.scene_glb import linear, placement_of, write_glb
 
-TOLERANCE = 0.005  # [m]
+TOLERANCE = 0.005  # [m], of the straight lines between two shapes
 MOST = 60  # shapes of one person
-
-
-def add_morphing(
-    document: Document, animation: int, bodies: Bodies, track: Track, tint: Colour
-) -> tuple[list[Channel], float]:
-    """Append a person; what moves, and how far the shapes between miss the truth [m]."""
-    verts = bodies.verts[track.rows].detach().cpu().float()
-    keys, miss = keyframes(verts, track.time, TOLERANCE, MOST)
-    name = f"person_{track.person}"
-    shapes = verts[keys]
-    mesh = _add_shapes(document, shapes, bodies, add_material(document, tint, name), name)
-    body = document.add("nodes", {"name": f"{name}_body", "mesh": mesh})
-    node = document.add("nodes", {"name": name, "children": [body]})
-    document.add_root(node)
-    channels = add_presence(document, animation, node, track)
-    if len(keys) > 1:
-        times = document.add_array(track.time[keys].numpy().astype(np.float32), bounds=True)
-        weights = np.eye(len(keys), dtype=np.float32)[:, 1:].reshape(-1)
-        channels.append((add_sampler(document, animation, times, weights), body, "weights"))
-    return channels, miss
-
-
-def _add_shapes(
-    document: Document,
-    shapes: Float[Tensor, "keys verts 3"],
-    bodies: Bodies,
-    material: int,
-    name: str,
-) -> int:
-    """A mesh with its first shape and the way to each of the others."""
-    normals = _normals(shapes, bodies)
-    faces = bodies.faces.cpu().numpy().astype(np.uint32).reshape(-1)
-    targets = [
-        {
-            "POSITION": document.add_array(_moved(shapes, key), VERTICES, bounds=True),
-            "NORMAL": document.add_array(_moved(normals, key), VERTICES),
-        }
-        for key in range(1, len(shapes))
-    ]
-    primitive: dict[str, Any] = {
-        "attributes": {
-            "POSITION": document.add_array(shapes[0].numpy(), VERTICES, bounds=True),
-            "NORMAL": document.add_array(normals[0].numpy(), VERTICES),
-        },
-        "indices": document.add_array(faces, INDICES),
-        "material": material,
-    }
-    mesh: dict[str, Any] = {"name": name, "primitives": [primitive]}
-    if targets:
-        primitive["targets"] = targets
-        mesh["weights"] = [0.0] * len(targets)
-    return document.add("meshes", mesh)
-
-
-def _moved(values: Float[Tensor, "keys verts 3"], key: int) -> NDArray[np.float32]:
-    return (values[key] - values[0]).numpy()
-
-
-def _normals(
-    shapes: Float[Tensor, "keys verts 3"], bodies: Bodies
-) -> Float[Tensor, "keys verts 3"]:
-    """Unit normals; up at vertices that no face uses."""
-    found = vertex_normals(shapes, bodies.faces.cpu())
-    up = torch.tensor([0.0, 1.0, 0.0])
-    return torch.where(found.norm(dim=-1, keepdim=True) > 0.5, found, up)
-
-
-# A body that moves on the bones of its model.
-
-
+FAR_OFF = 0.01  # [m], of the lines between so many shapes; it is said
 INFLUENCES = 4  # joints that move a vertex: what every viewer draws
 STILL = 1e-6  # [rad], [m]; what moves less is not animated
-
-
-def add_skinned(
-    document: Document, animation: int, skin: Skin, track: Track, tint: Colour
-) -> list[Channel]:
-    """Append a person: mesh, bones and their motion; what moves."""
-    model, name = skin.model, f"person_{track.person}"
-    rest, joints = rest_of(skin, int(track.rows[0]))
-    bones = _add_bones(document, model, joints)
-    top = document.add("nodes", {"name": name, "children": [bones[0]]})
-    document.add_root(top)
-    mesh = _add_skin_mesh(document, model, rest, add_material(document, tint, name), name)
-    inverse = document.add_array(_inverse_bind(model, joints))
-    bind = document.add("skins", {"joints": bones, "inverseBindMatrices": inverse, "name": name})
-    document.add_root(document.add("nodes", {"name": f"{name}_body", "mesh": mesh, "skin": bind}))
-    channels = add_presence(document, animation, top, track)
-    return channels + _move(document, animation, skin, track, (bones, joints[0]))
-
-
-def _add_bones(
-    document: Document, model: SkinnedBody, joints: Float[Tensor, "joints 3"]
-) -> list[int]:
-    """A node for each joint, at its place in its parent; the indices."""
-    first = len(document.tree["nodes"])
-    for joint, parent in enumerate(model.parents):
-        node: dict[str, Any] = {"name": model.joint_names[joint]}
-        below = [first + k for k, p in enumerate(model.parents) if p == joint]
-        if below:
-            node["children"] = below
-        if parent >= 0:
-            bone = model.tpose[parent] @ (joints[joint] - joints[parent])
-            node["translation"] = bone.tolist()
-        document.add("nodes", node)
-    return list(range(first, first + len(model.parents)))
-
-
-def _inverse_bind(model: SkinnedBody, joints: Float[Tensor, "joints 3"]) -> NDArray[np.float32]:
-    """From the rest shape to the axes of each joint, by columns."""
-    matrix = torch.eye(4).repeat(len(joints), 1, 1)
-    matrix[:, :3, :3] = model.tpose
-    matrix[:, :3, 3] = -(model.tpose @ joints[..., None])[..., 0]
-    return matrix.mT.contiguous().numpy()
-
-
-def _add_skin_mesh(
-    document: Document,
-    model: SkinnedBody,
-    rest: Float[Tensor, "verts 3"],
-    material: int,
-    name: str,
-) -> int:
-    """The rest shape with its weights; joints without a share are number 0."""
-    share, joint = model.weights.topk(INFLUENCES, dim=1)
-    joint = torch.where(share > 0, joint, 0)
-    normals = vertex_normals(rest, model.faces)
-    faces = model.faces.numpy().astype(np.uint32).reshape(-1)
-    attributes = {
-        "POSITION": document.add_array(rest.numpy(), VERTICES, bounds=True),
-        "NORMAL": document.add_array(normals.numpy(), VERTICES),
-        "JOINTS_0": document.add_array(joint.numpy().astype(np.uint8), VERTICES),
-        "WEIGHTS_0": document.add_array(share.numpy(), VERTICES),
-    }
-    primitive = {
-        "attributes": attributes,
-        "indices": document.add_array(faces, INDICES),
-        "material": material,
-    }
-    return document.add("meshes", {"name": name, "primitives": [primitive]})
-
-
-def _move(
-    document: Document,
-    animation: int,
-    skin: Skin,
-    track: Track,
-    root: tuple[list[int], Float[Tensor, "3"]],
-) -> list[Channel]:
-    """Turns of all joints, and the place and size of the pelvis."""
-    bones, pelvis = root
-    times = document.add_array(track.time.numpy().astype(np.float32), bounds=True)
-    place = (skin.motion.pose.transl[track.rows] + pelvis).numpy()
-    size = skin.motion.size[track.rows, None].expand(-1, 3).contiguous().numpy()
-    turns = quaternions(all_angles(skin.motion.pose)[track.rows])
-    moving = [(bones[0], "translation", place), (bones[0], "scale", size)]
-    moving += [(bone, "rotation", turns[:, k]) for k, bone in enumerate(bones)]
-    channels: list[Channel] = []
-    for node, path, values in moving:
-        if np.ptp(values, axis=0).max() < STILL:
-            document.tree["nodes"][node][path] = values[0].tolist()
-        else:
-            values = np.ascontiguousarray(values, dtype=np.float32)
-            channels.append((add_sampler(document, animation, times, values), node, path))
-    return channels
-
-
-# The file with everything in it.
-
-
-FAR_OFF = 0.01  # [m]
+KINDS = {"float32": 5126, "uint32": 5125, "uint8": 5121}
+SHAPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
 
 def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exported:
@@ -216,71 +40,234 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
     Raises:
         InputError: If bones are asked for and there are none.
     """
-    path = write_glb(finished.scene, None, folder / "scene.glb")
+    scene, notes = finished.scene, list[str]()
     bodies = None if body == "none" else finished.bodies
-    moved = [piece for piece in finished.scene.objects if piece.segments]
-    if bodies is None and not moved:
-        return Exported((path,), ("no people",))
-    document = Document(path.read_bytes())
-    animation = document.add("animations", {"name": "motion", "channels": [], "samplers": []})
+    moved = [item for item in scene.objects if item.segments]
+    skin = bones_for(finished, body, INFLUENCES)
     first, step = 0, 1 / FPS
     if finished.bodies is not None and len(finished.bodies.frame):
         first, step = int(finished.bodies.frame.min()), 1 / (finished.bodies.fps or FPS)
-    notes = [f"frame {first} of the video is at 0 s, each next one {step:g} s later"]
-    channels = [c for p in moved for c in add_stays(document, animation, p, first, step)]
-    notes += [f"{piece.id} {_way(piece)}" for piece in moved]
+    if bodies is not None or moved:
+        notes.append(f"frame {first} of the video is at 0 s, each next one {step:g} s later")
+    notes += [_way(item) for item in moved]
     if bodies is None:
         notes.append("no people")
-    else:
-        added, said = _add_people(document, animation, finished, body)
-        channels, notes = channels + added, notes + said
-    _connect(document, animation, channels)
-    document.write(path)
-    return Exported((path,), tuple(notes))
-
-
-def _way(piece: SceneObject) -> str:
-    """How an object comes from one place to the next."""
-    held = any(segment.mover is not None for segment in piece.segments)
-    return "moves with who moves it, a step a frame" if held else "jumps where it is moved"
-
-
-def _add_people(
-    document: Document, animation: int, finished: Finished, body: BodyForm
-) -> tuple[list[Channel], list[str]]:
-    """Append everybody; what moves, and what there is to say about it.
-
-    Raises:
-        InputError: If bones are asked for and there are none.
-    """
-    bodies = finished.bodies
-    assert bodies is not None
-    skin = bones_for(finished, body, INFLUENCES)
-    channels: list[Channel] = []
-    notes: list[str] = []
-    if isinstance(skin, str):
-        notes += [] if body == "morph" else [f"people move by shapes, not on bones: {skin}"]
-    else:
+    elif isinstance(skin, Skin):
         notes.append(f"people move on bones, at most {1e3 * skin.miss:.0f} mm off the result")
+    elif body != "morph":
+        notes.append(f"people move by shapes, not on bones: {skin}")
+
+    def append(blocks: dict[Any, bytes], tree: dict[str, Any]) -> None:
+        file = Gltf(blocks, tree)
+        for item in moved:
+            _add_stays(file, item, first, step)
+        if bodies is not None:
+            notes.extend(_add_people(file, bodies, skin))
+        if file.channels:
+            motion = {"name": "motion", "channels": file.channels, "samplers": file.samplers}
+            tree["animations"] = [motion]
+
+    return Exported((write_glb(scene, None, folder / "scene.glb", append),), tuple(notes))
+
+
+def _way(item: SceneObject) -> str:
+    """How an object comes from one position to the next."""
+    held = any(segment.mover is not None for segment in item.segments)
+    way = (
+        "moves with the person who moves it, a step a frame" if held else "jumps where it is moved"
+    )
+    return f"{item.id} {way}"
+
+
+def _add_people(file: "Gltf", bodies: Bodies, skin: Skin | str) -> list[str]:
+    """Append all people; what there is to say about them."""
+    notes: list[str] = []
     for track in tracks_of(bodies):
-        tint = person_colour(track.person)
-        if isinstance(skin, str):
-            moved, miss = add_morphing(document, animation, bodies, track, tint)
-            if miss > FAR_OFF:
-                notes.append(f"person {track.person}: up to {100 * miss:.1f} cm off between shapes")
-        else:
-            moved = add_skinned(document, animation, skin, track, tint)
-        channels += moved
-    return channels, notes
+        if isinstance(skin, Skin):
+            _add_skinned(file, skin, track)
+        elif (miss := _add_morphing(file, bodies, track)) > FAR_OFF:
+            notes.append(f"person {track.person}: up to {100 * miss:.1f} cm off between shapes")
+    return notes
 
 
-def _connect(document: Document, animation: int, channels: list[Channel]) -> None:
-    """Fill the animation: which sampler moves which property of which node."""
-    animations = document.tree["animations"]
-    if not channels:
-        del document.tree["animations"]
-        return
-    animations[animation]["channels"] = [
-        {"sampler": sampler, "target": {"node": node, "path": path}}
-        for sampler, node, path in channels
+class Gltf:
+    """A glTF tree and its blocks of bytes, to which nodes, arrays and one animation are added."""
+
+    def __init__(self, blocks: dict[Any, bytes], tree: dict[str, Any]) -> None:
+        self.blocks, self.tree = blocks, tree
+        self.channels, self.samplers = list[dict[str, Any]](), list[dict[str, Any]]()
+
+    def add(self, key: str, value: Mapping[str, Any]) -> int:
+        """Append to a list of the tree; the index."""
+        found = self.tree.setdefault(key, [])
+        found.append(dict(value))
+        return len(found) - 1
+
+    def add_root(self, node: Mapping[str, Any]) -> int:
+        """A node at the top of the scene."""
+        index = self.add("nodes", node)
+        self.tree["scenes"][0]["nodes"].append(index)
+        return index
+
+    def add_array(self, array: NDArray[Any]) -> int:
+        """Append an accessor of one item a row, matrices by columns; the index."""
+        raw, key = np.ascontiguousarray(array).tobytes(), f"moving_{len(self.blocks)}"
+        self.blocks[key] = raw + bytes(-len(raw) % 4)
+        accessor: dict[str, Any] = {
+            "bufferView": len(self.blocks) - 1,
+            "componentType": KINDS[str(array.dtype)],
+            "count": len(array),
+            "type": SHAPES[array.shape[1:]],
+        }
+        if array.ndim < 3:
+            flat = array.reshape(len(array), -1)
+            accessor |= {"min": flat.min(0).tolist(), "max": flat.max(0).tolist()}
+        self.tree["accessors"][key] = accessor
+        return len(self.tree["accessors"]) - 1
+
+    def add_mesh(
+        self,
+        name: str,
+        person: int,
+        arrays: Mapping[str, Tensor],
+        faces: Tensor,
+        targets: Sequence[Mapping[str, int]] = (),
+    ) -> int:
+        """Append a mesh of attributes in the colour of a person, with shapes that it morphs to."""
+        surface = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+        surface["baseColorFactor"] = [*linear(person_colour(person)), 1.0]
+        primitive: dict[str, Any] = {
+            "attributes": {key: self.add_array(array.numpy()) for key, array in arrays.items()},
+            "indices": self.add_array(faces.cpu().numpy().astype(np.uint32).reshape(-1)),
+            "material": self.add("materials", {"name": name, "pbrMetallicRoughness": surface}),
+        }
+        if not targets:
+            return self.add("meshes", {"name": name, "primitives": [primitive]})
+        parts = {"primitives": [{**primitive, "targets": targets}]}
+        return self.add("meshes", {"name": name, "weights": [0.0] * len(targets), **parts})
+
+    def animate(
+        self, node: int, path: str, times: int, values: NDArray[Any], way: str = "LINEAR"
+    ) -> None:
+        """Let a property of a node have these values at the times of an accessor."""
+        output = self.add_array(np.asarray(values, np.float32))
+        self.samplers.append({"input": times, "output": output, "interpolation": way})
+        target = {"node": node, "path": path}
+        self.channels.append({"sampler": len(self.samplers) - 1, "target": target})
+
+
+def _add_presence(file: Gltf, node: int, track: Track) -> None:
+    """Hide a person who is not seen: a node of size zero is not drawn (glTF, Sec. 3.6)."""
+    events: dict[float, float] = {0.0: 0.0}
+    step = float(track.time.diff().min()) if len(track.time) > 1 else 0.2
+    for start, end in seen_from_to(track):
+        events[start] = 1.0
+        if end < track.last - 1e-6:
+            events[end + step] = 0.0
+    if set(events.values()) != {1.0}:
+        when = sorted(events)
+        times = file.add_array(np.array(when, np.float32))
+        file.animate(node, "scale", times, np.array([[events[t]] * 3 for t in when]), "STEP")
+
+
+def _add_stays(file: Gltf, item: SceneObject, first: int, step: float) -> None:
+    """Put an object where it stands in each of its segments; it jumps between them.
+
+    Args:
+        file: Has the object as a node of its placement.
+        item: An object with segments.
+        first: The frame at 0 s.
+        step: From one frame to the next [s].
+    """
+    wanted = placement_of(item).T.reshape(-1)
+    node = next(
+        index for index, node in enumerate(file.tree["nodes"])
+        if node.get("name", "").rstrip("_") == item.id.rstrip("_")
+        and np.allclose(node.get("matrix", np.eye(4).reshape(-1)), wanted, atol=1e-6)
+    )  # fmt: skip
+    stays = {max(0.0, (s.frame - first) * step): s for s in item.segments}
+    times = file.add_array(np.array(list(stays), np.float32))
+    half = np.array([float(yaw) / 2 for yaw in (item.yaw, *(s.yaw for s in stays.values()))])
+    turns = np.stack([0 * half, np.sin(half), 0 * half, np.cos(half)], 1)
+    file.tree["nodes"][node].pop("matrix", None)
+    file.tree["nodes"][node] |= {
+        "translation": item.t_world_object.tolist(), "scale": item.scale.tolist(),
+        "rotation": turns[0].tolist(),
+    }  # fmt: skip
+    places = np.array([s.t_world_object.tolist() for s in stays.values()])
+    file.animate(node, "translation", times, places, "STEP")
+    file.animate(node, "rotation", times, turns[1:], "STEP")
+
+
+def _add_morphing(file: Gltf, bodies: Bodies, track: Track) -> float:
+    """Append a person who moves by shapes; how far those between key frames are off [m]."""
+    verts = bodies.verts[track.rows].detach().cpu().float()
+    keys, miss = keyframes(verts, track.time, TOLERANCE, MOST)
+    shapes, name = verts[keys], f"person_{track.person}"
+    normals = vertex_normals(shapes, bodies.faces.cpu())
+    up = torch.tensor([0.0, 1.0, 0.0])  # at vertices that no face uses
+    normals = torch.where(normals.norm(dim=-1, keepdim=True) > 0.5, normals, up)
+    first = {"POSITION": shapes[0], "NORMAL": normals[0]}
+    targets = [
+        {
+            "POSITION": file.add_array((shapes[k] - shapes[0]).numpy()),
+            "NORMAL": file.add_array((normals[k] - normals[0]).numpy()),
+        }
+        for k in range(1, len(keys))
     ]
+    mesh = file.add_mesh(name, track.person, first, bodies.faces, targets)
+    body = file.add("nodes", {"name": f"{name}_body", "mesh": mesh})
+    _add_presence(file, file.add_root({"name": name, "children": [body]}), track)
+    if targets:
+        times = file.add_array(track.time[keys].numpy().astype(np.float32))
+        file.animate(body, "weights", times, np.eye(len(keys))[:, 1:].reshape(-1))
+    return miss
+
+
+def _add_skinned(file: Gltf, skin: Skin, track: Track) -> None:
+    """Append a person: mesh, bones and their motion."""
+    model, name = skin.model, f"person_{track.person}"
+    rest, joints = rest_of(skin, int(track.rows[0]))
+    first = len(file.tree["nodes"])
+    for joint, parent in enumerate(model.parents):
+        bone: dict[str, Any] = {"name": model.joint_names[joint]}
+        if below := [first + k for k, p in enumerate(model.parents) if p == joint]:
+            bone["children"] = below
+        if parent >= 0:
+            bone["translation"] = (model.tpose[parent] @ (joints[joint] - joints[parent])).tolist()
+        file.add("nodes", bone)
+    top = file.add_root({"name": name, "children": [first]})
+    share, joint = model.weights.topk(INFLUENCES, dim=1)
+    arrays = {
+        "POSITION": rest,
+        "NORMAL": vertex_normals(rest, model.faces),
+        "JOINTS_0": torch.where(share > 0, joint, 0).to(torch.uint8),
+        "WEIGHTS_0": share,
+    }
+    mesh = file.add_mesh(name, track.person, arrays, model.faces)
+    bind = {
+        "name": name,
+        "joints": list(range(first, first + len(model.parents))),
+        "inverseBindMatrices": file.add_array(_inverse_bind(skin, joints)),
+    }
+    file.add_root({"name": f"{name}_body", "mesh": mesh, "skin": file.add("skins", bind)})
+    _add_presence(file, top, track)
+    times = file.add_array(track.time.numpy().astype(np.float32))
+    place = (skin.motion.pose.transl[track.rows] + joints[0]).numpy()
+    size = skin.motion.size[track.rows, None].expand(-1, 3).numpy()
+    turns = quaternions(all_angles(skin.motion.pose)[track.rows])
+    moving = [(first, "translation", place), (first, "scale", size)]
+    moving += [(first + k, "rotation", turns[:, k]) for k in range(len(model.parents))]
+    for node, path, values in moving:
+        if np.ptp(values, axis=0).max() < STILL:
+            file.tree["nodes"][node][path] = values[0].tolist()
+        else:
+            file.animate(node, path, times, values)
+
+
+def _inverse_bind(skin: Skin, joints: Float[Tensor, "joints 3"]) -> NDArray[np.float32]:
+    """From the rest shape to the axes of each joint, by columns."""
+    matrix = torch.eye(4).repeat(len(joints), 1, 1)
+    matrix[:, :3, :3] = skin.model.tpose
+    matrix[:, :3, 3] = -(skin.model.tpose @ joints[..., None])[..., 0]
+    return matrix.mT.contiguous().numpy()

@@ -1,6 +1,7 @@
-"""The result as files that any 3D program opens: scene.glb, and single objects as OBJ and PLY."""
+"""The result as one glTF file: objects, floor, camera and some bodies; single objects as PLY."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,13 @@ GHOSTS = 12  # at most so many bodies
 FLOOR_MARGIN = 1.0  # [m] beyond the furniture
 FLOOR_COLOUR = (0.86, 0.85, 0.83)
 BODY_ALPHA = 0.55
+Append = Callable[[dict[Any, bytes], dict[str, Any]], None]
+"""Adds to a glTF file: takes its blocks of bytes and its tree."""
 
 
-def write_glb(scene: Scene, bodies: Bodies | None, path: Path) -> Path:
+def write_glb(
+    scene: Scene, bodies: Bodies | None, path: Path, append: Append | None = None
+) -> Path:
     """Write the scene with some of its bodies as one glTF file, all at once.
 
     Each object is a node of its id that holds its placement; its meshes are those of the user's
@@ -32,74 +37,77 @@ def write_glb(scene: Scene, bodies: Bodies | None, path: Path) -> Path:
 
     Args:
         scene: The furniture; +y is up, as in glTF.
-        bodies: People in the world of `scene`; None: nobody.
+        bodies: People in the world of `scene`; None: no people.
         path: The file to write.
+        append: Adds moving people and objects.
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb
 
     out = trimesh.Scene()
-    for index, piece in enumerate(scene.objects):
-        _add_object(out, piece, colour(index))
+    for index, item in enumerate(scene.objects):
+        above = _free(out, item.id)
+        out.graph.update(frame_to=above, frame_from=out.graph.base_frame, matrix=placement_of(item))
+        for part, transform in parts_of(item, colour(index)):
+            _add(out, f"{above}_mesh", part, parent_node_name=above, transform=transform)
     if scene.ground is not None:
-        floor = _solid(floor_of(scene, scene.ground), (*FLOOR_COLOUR, 1.0), "ground")
-        name = _free(out, "ground")
-        out.add_geometry(floor, node_name=name, geom_name=name)
-    if bodies is not None:
-        for row in _chosen(bodies):
-            _add_body(out, bodies, row)
+        _add(out, "ground", _solid(floor_of(scene, scene.ground), (*FLOOR_COLOUR, 1.0), "ground"))
+    for row in [] if bodies is None else _chosen(bodies):
+        assert bodies is not None
+        person, name = int(bodies.person[row]), f"body_{bodies.person[row]}_{bodies.frame[row]}"
+        mesh = Mesh(bodies.verts[row], bodies.faces)
+        body = _solid(mesh, (*person_colour(person), BODY_ALPHA), name)
+        body.vertex_normals = unit_normals(body.vertex_normals)  # skin is smooth
+        _add(out, name, body)
     _add_camera(out, scene.camera)
-    raw = export_glb(out, tree_postprocessor=lambda tree: _set_lens(tree, scene.camera))
+
+    def finish(blocks: dict[Any, bytes], tree: dict[str, Any]) -> None:
+        tree["cameras"][0]["perspective"] = _lens(scene.camera)
+        if append is not None:
+            append(blocks, tree)
+
+    raw = export_glb(out, buffer_postprocessor=finish)
     with replacing(path) as part:
         part.write_bytes(raw)
     return path
 
 
+def _add(out: Any, name: str, part: Any, **options: Any) -> None:  # noqa: ANN401
+    """A mesh in a node of this name, which is lengthened where another node has it."""
+    name = _free(out, name)
+    out.add_geometry(part, node_name=name, geom_name=name, **options)
+
+
 def _free(out: Any, name: str) -> str:  # noqa: ANN401
-    """The name, longer where a node has it already."""
     while name in out.graph.nodes:
         name += "_"
     return name
 
 
-def _add_object(out: Any, piece: SceneObject, tint: Colour) -> None:  # noqa: ANN401
-    """A node with the piece's id, and the meshes of its file below it."""
-    above = _free(out, piece.id)
-    out.graph.update(frame_to=above, frame_from=out.graph.base_frame, matrix=placement_of(piece))
-    for part, transform in parts_of(piece, tint):
-        name = _free(out, f"{above}_mesh")
-        out.add_geometry(
-            part, node_name=name, geom_name=name, parent_node_name=above, transform=transform
-        )
-
-
-def placement_of(piece: SceneObject) -> np.ndarray:
+def placement_of(item: SceneObject) -> np.ndarray:
     """Matrix of scale, then rotation about +y, then translation: glTF's order."""
-    turn = rot_y(piece.yaw.detach().cpu().double()).numpy()
-    stretched = turn * piece.scale.detach().cpu().double().numpy()
-    return affine(stretched, piece.t_world_object.detach().cpu().numpy())
+    turn = rot_y(item.yaw.detach().cpu().double()).numpy()
+    stretched = turn * item.scale.detach().cpu().double().numpy()
+    return affine(stretched, item.t_world_object.detach().cpu().numpy())
 
 
-def parts_of(piece: SceneObject, tint: Colour) -> list[tuple[Any, np.ndarray]]:
-    """Meshes of the user's file with their places in it; without a file, the mesh that is known."""
+def parts_of(item: SceneObject, tint: Colour) -> list[tuple[Any, np.ndarray]]:
+    """Meshes of the user's file with their transforms; without a file, the mesh that is known."""
     import trimesh
 
-    file = Path(piece.mesh_file)
-    if not (piece.mesh_file and file.is_file()):
-        return [(_solid(piece.mesh, (*tint, 1.0), piece.id), np.eye(4))]
-    loaded = trimesh.load_scene(file)
-    found: list[tuple[Any, np.ndarray]] = []
+    file, found = Path(item.mesh_file), list[tuple[Any, np.ndarray]]()
+    loaded = trimesh.load_scene(file) if item.mesh_file and file.is_file() else trimesh.Scene()
     for node in loaded.graph.nodes_geometry:
         transform, name = loaded.graph[node]
         part = loaded.geometry[name]
-        if piece.cage is not None:
-            part, transform = bent_part(part, transform, piece.cage), np.eye(4)
+        if item.cage is not None:
+            part, transform = bent_part(part, transform, item.cage), np.eye(4)
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
-            found.append((_finished(part, tint, piece.id), np.asarray(transform)))
-    return found or [(_solid(piece.mesh, (*tint, 1.0), piece.id), np.eye(4))]
+            found.append((_coloured(part, tint, item.id), np.asarray(transform)))
+    return found or [(_solid(item.mesh, (*tint, 1.0), item.id), np.eye(4))]
 
 
-def _finished(part: Any, tint: Colour, name: str) -> Any:  # noqa: ANN401
+def _coloured(part: Any, tint: Colour, name: str) -> Any:  # noqa: ANN401
     """The mesh with its own colours or texture, else in the object's colour.
 
     Normals of the file stay; without any, viewers shade each face flat, as glTF asks.
@@ -157,10 +165,8 @@ def floor_of(scene: Scene, height: float) -> Mesh:
     """A rectangle under everything, front side up."""
     stands = [place_object(p).verts.detach().cpu()[:, [0, 2]].float() for p in scene.objects]
     flat = torch.cat([torch.zeros(1, 2), *stands])
-    (x0, z0), (x1, z1) = (
-        (flat.amin(0) - FLOOR_MARGIN).tolist(),
-        (flat.amax(0) + FLOOR_MARGIN).tolist(),
-    )
+    x0, z0 = (flat.amin(0) - FLOOR_MARGIN).tolist()
+    x1, z1 = (flat.amax(0) + FLOOR_MARGIN).tolist()
     corners = [[x0, height, z1], [x1, height, z1], [x1, height, z0], [x0, height, z0]]
     return Mesh(torch.tensor(corners), torch.tensor([[0, 1, 2], [0, 2, 3]]))
 
@@ -172,20 +178,14 @@ def _chosen(bodies: Bodies) -> list[int]:
     return order[torch.linspace(0, len(order) - 1, count).round().long()].unique().tolist()
 
 
-def _add_body(out: Any, bodies: Bodies, row: int) -> None:  # noqa: ANN401
-    person, frame = int(bodies.person[row]), int(bodies.frame[row])
-    name = _free(out, f"body_{person}_{frame}")
-    body = _solid(Mesh(bodies.verts[row], bodies.faces), (*person_colour(person), BODY_ALPHA), name)
-    body.vertex_normals = unit_normals(body.vertex_normals)  # skin is smooth
-    out.add_geometry(body, node_name=name, geom_name=name)
-
-
 def _add_camera(out: Any, camera: Camera) -> None:  # noqa: ANN401
-    """The camera at the origin; glTF's cameras look along -z, with +y up."""
+    """The camera at the origin; its lens is exact in the file alone (see `_lens`)."""
     from trimesh.scene.cameras import Camera as View
 
-    sizes = (camera.width, camera.height)
-    out.camera = View(name=_free(out, "camera"), resolution=sizes, fov=_field_of_view(camera))
+    lens = _lens(camera)
+    across = 2 * math.atan(lens["aspectRatio"] * math.tan(lens["yfov"] / 2))
+    fov = [math.degrees(across), math.degrees(lens["yfov"])]
+    out.camera = View(_free(out, "camera"), resolution=(camera.width, camera.height), fov=fov)
     out.camera_transform = view_matrix(camera)
 
 
@@ -194,48 +194,24 @@ def view_matrix(camera: Camera) -> Float[np.ndarray, "4 4"]:
     return affine(camera.R_cam_world.detach().cpu().double().numpy().T @ np.diag([1.0, -1.0, -1.0]))
 
 
-def _field_of_view(camera: Camera) -> list[float]:
-    """Across and up [deg], as if the image's centre were on the optical axis."""
-    focal = (float(camera.K[0, 0]), float(camera.K[1, 1]))
-    sizes = (camera.width, camera.height)
-    return [math.degrees(2 * math.atan(s / (2 * f))) for s, f in zip(sizes, focal, strict=True)]
+def _lens(camera: Camera) -> dict[str, float]:
+    """As glTF has it: the ratio of lengths, not of angles, and the image's centre on the axis."""
+    wide = camera.width / float(camera.K[0, 0])
+    high = camera.height / float(camera.K[1, 1])
+    return {"aspectRatio": wide / high, "yfov": 2 * math.atan(high / 2), "znear": NEAR}
 
 
-def _set_lens(tree: dict[str, Any], camera: Camera) -> None:
-    """Say the camera's exact lens in the file: glTF's ratio is that of lengths, not of angles."""
-    across, up = (math.tan(math.radians(angle) / 2) for angle in _field_of_view(camera))
-    tree["cameras"][0]["perspective"] = {
-        "aspectRatio": across / up,
-        "yfov": 2 * math.atan(up),
-        "znear": NEAR,
-    }
-
-
-# Single objects in the world, as OBJ with their textures and as PLY.
-
-
-def export_objects(finished: Finished, folder: Path) -> Exported:
-    """Write each object by itself, where it stands in the world [m].
-
-    Args:
-        finished: The result.
-        folder: Gets `objects/<id>.ply` (shape alone) and `objects/<id>/<id>.obj` (with materials
-            and textures).
-    """
+def export_ply(finished: Finished, folder: Path) -> Exported:
+    """Write each object by itself, where it stands in the world [m], as `objects/<id>.ply`."""
     import trimesh
 
     files: list[Path] = []
-    for index, piece in enumerate(finished.scene.objects):
+    for index, item in enumerate(finished.scene.objects):
         placed = trimesh.Scene()
-        for part, transform in parts_of(piece, colour(index)):
-            placed.add_geometry(part, transform=placement_of(piece) @ transform)
+        for part, transform in parts_of(item, colour(index)):
+            placed.add_geometry(part, transform=placement_of(item) @ transform)
         whole = placed.to_mesh()
-        plain = trimesh.Trimesh(whole.vertices, whole.faces, process=False)
-        path = folder / "objects" / f"{piece.id}.ply"
-        with replacing(path) as target:
-            plain.export(target)
-        home = folder / "objects" / piece.id
-        home.mkdir(parents=True, exist_ok=True)
-        placed.export(home / f"{piece.id}.obj", mtl_name=f"{piece.id}.mtl")
-        files += [path, home / f"{piece.id}.obj"]
+        files.append(folder / "objects" / f"{item.id}.ply")
+        with replacing(files[-1]) as target:
+            trimesh.Trimesh(whole.vertices, whole.faces, process=False).export(target)
     return Exported(tuple(files))

@@ -1,9 +1,9 @@
-"""Furniture as physics wants it: convex pieces, mass, inertia, in a world with +z up.
+"""Furniture for simulators: convex parts, mass and inertia, in a world with +z up.
 
 A chair collides with its legs, not with its box: cuts along the axes are exact for boards and legs;
-coacd does the rest where it is installed. Simulators and robots have +z up and a floor at zero:
-(x, y, z) of scene.json becomes (x, -z, y - ground). A turn about +y becomes the same turn about +z,
-and the front of a piece, +z of its mesh, becomes -y.
+coacd does the rest where it is installed. Simulators have +z up and a floor at zero: (x, y, z) of
+scene.json becomes (x, -z, y - ground). A turn about +y becomes the same turn about +z, and the
+front of an object, +z of its mesh, becomes -y.
 """
 
 import dataclasses
@@ -12,7 +12,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import count
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -33,17 +32,17 @@ from mover.geometry.watertight import close_mesh
 from mover.io.files.fields import At
 from mover.io.files.meshes import read_mesh
 
-PLANES = 24  # places that are tried along each axis
+PLANES = 24  # cuts that are tried along each axis
 SMALLEST = 1e-7  # of the volume; less is a scrap of a cut
 
 
 def sliced(
     verts: NDArray[np.float64], faces: NDArray[np.int64], concavity: float, most: int
 ) -> tuple[list[NDArray[np.float64]], float]:
-    """Points of convex pieces of a closed mesh, and what their hulls add, as a share of its volume.
+    """Points of convex parts of a closed mesh, and what their hulls add, as a share of its volume.
 
-    The piece whose hull is the most too large is cut by the plane that leaves the smallest hulls,
-    until all that hulls add is a share `concavity` of the volume, or there are `most` pieces.
+    The part whose hull is the most too large is cut by the plane that leaves the smallest hulls,
+    until all that hulls add is a share `concavity` of the volume, or there are `most` parts.
     """
     import manifold3d
 
@@ -55,11 +54,15 @@ def sliced(
     if solid.is_empty():
         return [verts], float("inf")
     total, order = solid.volume(), count()
+
+    def excess(rows: list[tuple[float, int, Any]]) -> float:
+        return -sum(row[0] for row in rows)
+
     heap: list[tuple[float, int, Any]] = []
     done: list[Any] = []
     for part in solid.decompose():
         heapq.heappush(heap, (-_excess(part), next(order), part))
-    while heap and len(heap) + len(done) < most and _sum(heap) > concavity * total:
+    while heap and len(heap) + len(done) < most and excess(heap) > concavity * total:
         _, _, worst = heapq.heappop(heap)
         halves = _best_cut(worst)
         if halves is None:
@@ -74,12 +77,8 @@ def sliced(
     return clouds, sum(_excess(part) for part in parts) / total
 
 
-def _sum(heap: list[tuple[float, int, Any]]) -> float:
-    return -sum(excess for excess, _, _ in heap)
-
-
 def _excess(part: Any) -> float:  # noqa: ANN401
-    """What its hull adds to a piece [m³]."""
+    """What its hull adds to a part [m³]."""
     return part.hull().volume() - part.volume()
 
 
@@ -88,8 +87,8 @@ def _best_cut(part: Any) -> tuple[Any, Any] | None:  # noqa: ANN401
     verts = np.array(part.to_mesh64().vert_properties[:, :3])
     least, found = _excess(part) * 0.999, None
     for axis, normal in enumerate(np.eye(3)):
-        for place in _places(verts[:, axis]):
-            halves = part.split_by_plane(normal, place)
+        for at in _edges(verts[:, axis]):
+            halves = part.split_by_plane(normal, at)
             if any(half.is_empty() for half in halves):
                 continue
             excess = sum(_excess(half) for half in halves)
@@ -98,7 +97,7 @@ def _best_cut(part: Any) -> tuple[Any, Any] | None:  # noqa: ANN401
     return found
 
 
-def _places(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _edges(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Where edges lie along an axis, thinned to `PLANES`, without the ends."""
     inner = np.unique(np.round(values, 5))
     span = inner[-1] - inner[0]
@@ -108,23 +107,23 @@ def _places(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return inner[np.linspace(0, len(inner) - 1, PLANES).round().astype(int)]
 
 
-# The pieces, by whichever way fits.
+# The parts, by the method that fits.
 
 
-THINNEST = 0.001  # [m], of a convex piece; flatter ones are thickened
+THINNEST = 0.001  # [m], of a convex part; flatter ones are thickened
 
 
 @dataclass(frozen=True)
 class ConvexConfig:
-    """How furniture is cut into convex pieces."""
+    """How furniture is cut into convex parts."""
 
     method: Literal["best", "coacd", "slices"] = "best"
     """slices: cuts along the axes by manifold3d, exact for boards; coacd: any shape, slower; best:
     coacd where slices leave hollows."""
     concavity: Annotated[float, float_in(0.01, 1)] = 0.04
-    """How hollow a piece may be, as a share of the object's size (coacd) or volume (slices)."""
+    """How hollow a part may be, as a share of the object's size (coacd) or volume (slices)."""
     most: Annotated[int, int_in(1, 1000)] = 24
-    """Pieces of one object."""
+    """Parts of one object."""
 
 
 @record
@@ -132,7 +131,7 @@ class ConvexInputs:
     """What is cut."""
 
     mesh: Mesh
-    """Closed, in the coordinates of the piece's own mesh [m]."""
+    """Closed, in the coordinates of the object's own mesh [m]."""
 
 
 @record
@@ -148,19 +147,13 @@ class Convex:
     """About that centre, of a density of one [m^5]."""
 
 
-def convex_of(piece: SceneObject, run: Run) -> Convex:
-    """The convex pieces of a piece's mesh at its initial size, kept in the result's folder."""
+def convex_of(item: SceneObject, run: Run) -> Convex:
+    """The convex parts of an object's mesh at its initial size, kept in the result's folder."""
     config = ConvexConfig("slices" if find_spec("coacd") is None else "best")
-    return run.stage(cut_into_convex, ConvexInputs(_closed(piece, run.folder)), config)
-
-
-def _closed(piece: SceneObject, out: Path) -> Mesh:
-    """The proxy that the run wrote, or the mesh closed anew."""
-    file = out / "watertight" / f"{piece.id}.glb"
-    if file.is_file():
-        mesh, _ = read_mesh(At(file.name, "watertight", piece.id), file.parent)
-        return close_mesh(mesh)
-    return close_mesh(piece.mesh)
+    file, mesh = run.folder / "watertight" / f"{item.id}.glb", item.mesh
+    if file.is_file():  # the proxy that the run wrote
+        mesh, _ = read_mesh(At(file.name, "watertight", item.id), file.parent)
+    return run.stage(cut_into_convex, ConvexInputs(close_mesh(mesh)), config)
 
 
 def cut_into_convex(
@@ -190,7 +183,7 @@ def cut_into_convex(
 def _cut(
     verts: NDArray[np.float64], faces: NDArray[np.int64], config: ConvexConfig
 ) -> list[NDArray[np.float64]]:
-    """Points of each convex piece."""
+    """Points of each convex part."""
     if config.method == "coacd":
         return _by_coacd(verts, faces, config)
     clouds, excess = sliced(verts, faces, config.concavity, config.most)
@@ -259,7 +252,7 @@ DENSITY = {
     "step": 450.0,
 }  # fmt: skip
 """Mass over the volume of the closed mesh [kg/m³]. Boards and legs are wood (450 to 700); what is
-upholstered is mostly foam, and a cabinet's mesh is full where the piece is hollow: there the values
+upholstered is mostly foam, and a cabinet's mesh is full where it is hollow: there the values
 give usual weights (a sofa for two 45 kg, a wardrobe 80 kg)."""
 OTHER = 250.0
 LEAST = 0.05  # [kg]
@@ -270,7 +263,7 @@ AXES = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=
 
 @record
 class Solid:
-    """One piece of furniture in the simulator's axes."""
+    """One object in the simulator's axes."""
 
     id: str
     category: str
@@ -281,7 +274,7 @@ class Solid:
     free: bool
     """False: it hangs or is built in, so it does not move."""
     hulls: tuple[Mesh, ...]
-    """Convex pieces in its own axes, at its size [m]."""
+    """Convex parts in its own axes, at its size [m]."""
     mass: float
     """[kg]"""
     centre: Float[Tensor, "3"]
@@ -299,40 +292,36 @@ def floor_height(scene: Scene) -> float:
 
 
 def solids_of(scene: Scene, run: Run) -> tuple[Solid, ...]:
-    """All pieces of a scene; the folder of `run` keeps their convex pieces."""
+    """All objects of a scene; the folder of `run` keeps their convex parts."""
     floor = floor_height(scene)
-    return tuple(_solid(piece, convex_of(piece, run), floor) for piece in scene.objects)
+    return tuple(_solid(item, convex_of(item, run), floor) for item in scene.objects)
 
 
-def _solid(piece: SceneObject, convex: Convex, floor: float) -> Solid:
-    scale = piece.scale.detach().cpu().double()
-    place = AXES @ piece.t_world_object.detach().cpu().double()
+def _solid(item: SceneObject, convex: Convex, floor: float) -> Solid:
+    scale = item.scale.detach().cpu().double()
+    place = AXES @ item.t_world_object.detach().cpu().double()
     place = place - torch.tensor([0.0, 0.0, floor], dtype=torch.float64)
     volume = abs(convex.volume) * float(scale.prod())
-    mass = max(LEAST, volume * DENSITY.get(canonical(piece.category), OTHER))
+    mass = max(LEAST, volume * DENSITY.get(canonical(item.category), OTHER))
     inertia = AXES @ _stretched(convex.inertia, scale) @ AXES.mT * mass / max(volume, 1e-9)
     return Solid(
-        id=piece.id,
-        category=piece.category,
+        id=item.id,
+        category=item.category,
         place=place,
-        yaw=float(piece.yaw),
-        free=piece.support != "free" and not is_platform(piece.category),
-        hulls=tuple(_turned(hull, scale) for hull in convex.hulls),
+        yaw=float(item.yaw),
+        free=item.support != "free" and not is_platform(item.category),
+        hulls=tuple(Mesh(h.verts.double() * scale @ AXES.mT, h.faces) for h in convex.hulls),
         mass=mass,
         centre=AXES @ (scale * convex.centre),
         inertia=_physical(inertia, mass),
     )
 
 
-def moved_to(solid: Solid, piece: SceneObject, frame: int) -> Solid:
-    """The solid of a piece where that stands in a frame."""
-    there = placed_at(piece, frame)
-    way = AXES @ (there.t_world_object - piece.t_world_object).detach().cpu().double()
+def moved_to(solid: Solid, item: SceneObject, frame: int) -> Solid:
+    """The solid of an object where that stands in a frame."""
+    there = placed_at(item, frame)
+    way = AXES @ (there.t_world_object - item.t_world_object).detach().cpu().double()
     return dataclasses.replace(solid, place=solid.place + way, yaw=float(there.yaw))
-
-
-def _turned(mesh: Mesh, scale: Float[Tensor, "3"]) -> Mesh:
-    return Mesh((mesh.verts.detach().cpu().double() * scale) @ AXES.mT, mesh.faces.cpu())
 
 
 def _stretched(inertia: Float[Tensor, "3 3"], scale: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
@@ -350,7 +339,7 @@ def _physical(inertia: Float[Tensor, "3 3"], mass: float) -> Float[Tensor, "3 3"
     return axes @ torch.diag(values) @ axes.mT
 
 
-# Numbers and meshes as text for the formats of simulators.
+# Numbers and meshes as text.
 
 
 def numbers(values: Iterable[float]) -> str:
@@ -358,13 +347,10 @@ def numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.8g}" for value in values)
 
 
-def mesh_bytes(mesh: Mesh, kind: Literal["obj", "stl"]) -> bytes:
-    """A mesh as Wavefront OBJ (places and triangles) or as binary STL."""
+def mesh_bytes(mesh: Mesh) -> bytes:
+    """A mesh as Wavefront OBJ: vertices and triangles."""
     import trimesh
     from trimesh.exchange.obj import export_obj
-    from trimesh.exchange.stl import export_stl
 
     shape = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)
-    if kind == "stl":
-        return export_stl(shape)
     return export_obj(shape, include_normals=False, header="").encode()

@@ -1,8 +1,9 @@
 """Meshes of USD and their looks; OpenUSD's own modules, imported when they are asked for."""
 
-import hashlib
+from hashlib import sha256
 from importlib import import_module
 from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from mover.core.colours import Colour
 from mover.core.errors import InputError
 from mover.core.files import replacing
-from mover.io.export.looks import png_of
+from mover.io.export.scene_glb import linear
 
 Stage = Any
 """A file of OpenUSD, whose Python modules have no types and fill themselves when imported."""
@@ -35,9 +36,7 @@ def pxr(name: str) -> Any:  # noqa: ANN401
 
 def free_path(stage: Stage, parent: str, name: str) -> str:
     """A path that USD allows and that nothing has yet."""
-    Tf = pxr("Tf")
-
-    path = f"{parent}/{Tf.MakeValidIdentifier(name)}"
+    path = f"{parent}/{pxr('Tf').MakeValidIdentifier(name)}"
     while stage.GetPrimAtPath(path):
         path += "_"
     return path
@@ -48,27 +47,23 @@ def add_mesh(
 ) -> Prim:
     """Triangles of one colour, without a subdivision."""
     UsdGeom, Vt = pxr("UsdGeom"), pxr("Vt")
-
     mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateDoubleSidedAttr(True)
+    flat = np.ascontiguousarray(faces, np.int32).reshape(-1)
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(
-        Vt.IntArray.FromNumpy(np.ascontiguousarray(faces, np.int32).reshape(-1))
-    )
-    set_points(mesh, verts.astype(np.float32), None)
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(flat))
+    set_points(mesh, verts, pxr("Usd").TimeCode.Default())
     mesh.CreateDisplayColorAttr([tint])
     return mesh
 
 
-def set_points(mesh: Prim, points: NDArray[np.float32], time: float | None) -> None:
-    """Places and extent, always or at one time."""
-    Usd, Vt = pxr("Usd"), pxr("Vt")
-
-    when = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
-    mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points)), when)
+def set_points(mesh: Prim, points: NDArray[Any], time: Any) -> None:  # noqa: ANN401
+    """Vertices and extent at a time of USD."""
+    Vt, points = pxr("Vt"), np.ascontiguousarray(points, np.float32)
+    mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(points), time)
     extent = np.stack([points.min(0), points.max(0)])
-    mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), when)
+    mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), time)
 
 
 def add_look(stage: Stage, mesh: Prim, part: Any, folder: Path) -> None:  # noqa: ANN401
@@ -76,77 +71,57 @@ def add_look(stage: Stage, mesh: Prim, part: Any, folder: Path) -> None:  # noqa
     from trimesh.visual import ColorVisuals
     from trimesh.visual.material import PBRMaterial
 
+    Gf, Sdf, UsdShade, UsdGeom, Vt = (
+        pxr(name) for name in ("Gf", "Sdf", "UsdShade", "UsdGeom", "Vt")
+    )
+    kinds, vertex = Sdf.ValueTypeNames, UsdGeom.Tokens.vertex
     if isinstance(part.visual, ColorVisuals):
-        _add_vertex_colours(mesh, np.asarray(part.visual.vertex_colors))
+        share = np.asarray(part.visual.vertex_colors)[:, :3] / 255
+        light = np.array([linear((r, g, b)) for r, g, b in share.tolist()], np.float32)
+        mesh.CreateDisplayColorPrimvar(vertex).Set(Vt.Vec3fArray.FromNumpy(light))
         return
-    material = part.visual.material
+    material, uv = part.visual.material, part.visual.uv
     plain = material if isinstance(material, PBRMaterial) else material.to_pbr()
     rgba = plain.baseColorFactor
-    colour = [1.0, 1.0, 1.0] if rgba is None else [float(c) / 255 for c in np.asarray(rgba)[:3]]
-    picture, uv = plain.baseColorTexture, part.visual.uv
-    textured = picture is not None and uv is not None and len(uv) == len(part.vertices)
-    shader = _bind_surface(stage, mesh, colour)
-    if textured:
-        _add_uv(mesh, np.asarray(uv))
-        _connect_picture(stage, shader, _save_picture(picture, folder), colour)
-
-
-def _add_vertex_colours(mesh: Prim, rgba: Any) -> None:  # noqa: ANN401
-    UsdGeom, Vt = pxr("UsdGeom"), pxr("Vt")
-
-    share = rgba[:, :3].astype(np.float32) / 255
-    light = np.where(share > 0.04045, ((share + 0.055) / 1.055) ** 2.4, share / 12.92)
-    primvar = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-    primvar.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(light, np.float32)))
-
-
-def _add_uv(mesh: Prim, uv: Any) -> None:  # noqa: ANN401
-    """Texture coordinates from the lower left corner, as trimesh and USD both have them."""
-    Sdf, UsdGeom, Vt = pxr("Sdf"), pxr("UsdGeom"), pxr("Vt")
-
-    kind = Sdf.ValueTypeNames.TexCoord2fArray
-    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", kind, UsdGeom.Tokens.vertex)
-    primvar.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uv[:, :2], np.float32)))
-
-
-def _bind_surface(stage: Stage, mesh: Prim, colour: list[float]) -> Prim:
-    """A rough surface of one colour; its shader."""
-    Gf, Sdf, UsdShade = pxr("Gf"), pxr("Sdf"), pxr("UsdShade")
-
+    tint = [1.0, 1.0, 1.0] if rgba is None else [float(c) / 255 for c in np.asarray(rgba)[:3]]
     place = mesh.GetPath().AppendChild("look")
     look = UsdShade.Material.Define(stage, place)
-    shader = UsdShade.Shader.Define(stage, place.AppendChild("surface"))
-    shader.CreateIdAttr("UsdPreviewSurface")
-    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*colour))
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.9)
-    look.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+
+    def shader(name: str, kind: str, **inputs: tuple[Any, Any]) -> Prim:
+        made = UsdShade.Shader.Define(stage, place.AppendChild(name))
+        made.CreateIdAttr(kind)
+        for key, (form, value) in inputs.items():
+            made.CreateInput(key, form).Set(value)
+        return made
+
+    surface = shader(
+        "surface", "UsdPreviewSurface", diffuseColor=(kinds.Color3f, Gf.Vec3f(*tint)),
+        roughness=(kinds.Float, 0.9),
+    )  # fmt: skip
+    look.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(look)
-    return shader
-
-
-def _connect_picture(stage: Stage, shader: Prim, picture: str, colour: list[float]) -> None:
-    """Let a picture, multiplied with a colour, be that of a surface."""
-    Gf, Sdf, UsdShade = pxr("Gf"), pxr("Sdf"), pxr("UsdShade")
-
-    names, above = Sdf.ValueTypeNames, shader.GetPath().GetParentPath()
-    reader = UsdShade.Shader.Define(stage, above.AppendChild("uv"))
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", names.String).Set("st")
-    texture = UsdShade.Shader.Define(stage, above.AppendChild("picture"))
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", names.Asset).Set(Sdf.AssetPath(picture))
-    texture.CreateInput("scale", names.Float4).Set(Gf.Vec4f(*colour, 1.0))
-    for wrap in ("wrapS", "wrapT"):
-        texture.CreateInput(wrap, names.Token).Set("repeat")
-    texture.CreateInput("st", names.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
-    texture.CreateOutput("rgb", names.Float3)
-    shader.GetInput("diffuseColor").ConnectToSource(texture.ConnectableAPI(), "rgb")
+    if plain.baseColorTexture is None or uv is None or len(uv) != len(part.vertices):
+        return
+    corners = np.ascontiguousarray(np.asarray(uv)[:, :2], np.float32)  # from the lower left corner
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", kinds.TexCoord2fArray, vertex)
+    primvar.Set(Vt.Vec2fArray.FromNumpy(corners))
+    reader = shader("uv", "UsdPrimvarReader_float2", varname=(kinds.String, "st"))
+    file = Sdf.AssetPath(_save_picture(plain.baseColorTexture, folder))
+    texture = shader(
+        "picture", "UsdUVTexture", file=(kinds.Asset, file),
+        scale=(kinds.Float4, Gf.Vec4f(*tint, 1.0)),
+        wrapS=(kinds.Token, "repeat"), wrapT=(kinds.Token, "repeat"),
+    )  # fmt: skip
+    texture.CreateInput("st", kinds.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
+    texture.CreateOutput("rgb", kinds.Float3)
+    surface.GetInput("diffuseColor").ConnectToSource(texture.ConnectableAPI(), "rgb")
 
 
 def _save_picture(picture: Any, folder: Path) -> str:  # noqa: ANN401
     """Write a texture beside the scene, once for each content; its relative path."""
-    content = png_of(picture)
-    name = f"textures/{hashlib.sha256(content).hexdigest()[:16]}.png"
+    stream = BytesIO()
+    picture.convert("RGBA" if "A" in picture.getbands() else "RGB").save(stream, "PNG")
+    name = f"textures/{sha256(stream.getvalue()).hexdigest()[:16]}.png"
     with replacing(folder / name) as part:
-        part.write_bytes(content)
+        part.write_bytes(stream.getvalue())
     return f"./{name}"

@@ -1,9 +1,9 @@
 """People of USD: skeletons with animation where the parameters are known, else moving meshes."""
 
+from typing import Any
+
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from mover.core.colours import person_colour
 from mover.core.types import Bodies
@@ -25,15 +25,13 @@ def add_moving_mesh(stage: Stage, bodies: Bodies, track: Track) -> None:
     tint = person_colour(track.person)
     mesh = add_mesh(stage, path, verts[0].numpy(), bodies.faces.cpu().numpy(), tint)
     for key in keys:
-        set_points(mesh, verts[key].numpy(), float(track.frame[key]))
+        set_points(mesh, verts[key].numpy(), pxr("Usd").TimeCode(float(track.frame[key])))
     _show(mesh, bodies, track)
 
 
 def _show(what: Prim, bodies: Bodies, track: Track) -> None:
-    """Hide a person while nobody sees them."""
-    UsdGeom = pxr("UsdGeom")
-
-    seen = what.CreateVisibilityAttr()
+    """Hide a person while they are not seen."""
+    UsdGeom, seen = pxr("UsdGeom"), what.CreateVisibilityAttr()
     first, fps = int(bodies.frame.min()), bodies.fps or FPS
     for start, end in seen_from_to(track):
         if start > 0:
@@ -45,111 +43,82 @@ def _show(what: Prim, bodies: Bodies, track: Track) -> None:
 
 def add_skeleton(stage: Stage, skin: Skin, bodies: Bodies, track: Track) -> None:
     """One person as a skinned mesh on a skeleton, with one sample a frame."""
-    UsdGeom, UsdSkel = pxr("UsdGeom"), pxr("UsdSkel")
+    Gf, Tf, UsdGeom, UsdSkel, Vt = (
+        pxr(name) for name in ("Gf", "Tf", "UsdGeom", "UsdSkel", "Vt")
+    )  # fmt: skip
+    model, path = skin.model, free_path(stage, "/room", f"person_{track.person}")
+    rest, joints = rest_of(skin, int(track.rows[0]))
+    names: list[str] = []  # paths of the joints: pelvis/left_hip/left_knee
+    for name, parent in zip(model.joint_names, model.parents, strict=True):
+        own = Tf.MakeValidIdentifier(name)
+        names.append(own if parent < 0 else f"{names[parent]}/{own}")
+    bind = torch.eye(4, dtype=torch.float64).repeat(len(joints), 1, 1)
+    bind[:, :3, :3], bind[:, :3, 3] = model.tpose.mT.double(), joints.double()
+    local = [
+        here if parent < 0 else torch.linalg.inv(bind[parent]) @ here
+        for here, parent in zip(bind, model.parents, strict=True)
+    ]
 
-    path = free_path(stage, "/room", f"person_{track.person}")
+    def matrices(values: Any) -> Any:  # noqa: ANN401
+        """As USD has them, for rows."""
+        return Vt.Matrix4dArray([Gf.Matrix4d(value.T.tolist()) for value in values])
+
     root = UsdSkel.Root.Define(stage, path)
     skeleton = UsdSkel.Skeleton.Define(stage, f"{path}/skeleton")
-    _, joints = rest_of(skin, int(track.rows[0]))
-    names = _tokens(skin)
-    bind = _bind_matrices(skin, joints)
     skeleton.CreateJointsAttr(names)
-    skeleton.CreateJointNamesAttr([str(name) for name in skin.model.joint_names])
-    skeleton.CreateBindTransformsAttr(_matrices(bind))
-    skeleton.CreateRestTransformsAttr(_matrices(_local(skin, bind)))
+    skeleton.CreateJointNamesAttr([str(name) for name in model.joint_names])
+    skeleton.CreateBindTransformsAttr(matrices(bind))
+    skeleton.CreateRestTransformsAttr(matrices(local))
     motion = UsdSkel.Animation.Define(stage, f"{path}/skeleton/motion")
     motion.CreateJointsAttr(names)
     _move(motion, skin, track, joints)
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets(
-        [motion.GetPath()]
-    )
-    mesh = _add_skin(stage, skin, track, path)
-    UsdSkel.BindingAPI(mesh).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
-    places = bodies.verts[track.rows]
-    whole = torch.stack([places.amin((0, 1)), places.amax((0, 1))]).double().tolist()
-    hint = UsdGeom.ModelAPI.Apply(root.GetPrim())
-    hint.SetExtentsHint([tuple(corner) for corner in whole])
+    source = UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel()
+    source.SetTargets([motion.GetPath()])
+    tint = person_colour(track.person)
+    mesh = add_mesh(stage, f"{path}/body", rest.numpy(), model.faces.numpy(), tint)
+    _bind(mesh, skin, rest)
+    UsdSkel.BindingAPI(mesh.GetPrim()).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    verts = bodies.verts[track.rows]
+    whole = torch.stack([verts.amin((0, 1)), verts.amax((0, 1))]).double().tolist()
+    UsdGeom.ModelAPI.Apply(root.GetPrim()).SetExtentsHint([tuple(corner) for corner in whole])
     _show(UsdGeom.Imageable(root), bodies, track)
 
 
-def _tokens(skin: Skin) -> list[str]:
-    """Paths of the joints, as USD tells parents: pelvis/left_hip/left_knee."""
-    Tf = pxr("Tf")
-
-    names: list[str] = []
-    for name, parent in zip(skin.model.joint_names, skin.model.parents, strict=True):
-        own = Tf.MakeValidIdentifier(name)
-        names.append(own if parent < 0 else f"{names[parent]}/{own}")
-    return names
-
-
-def _bind_matrices(skin: Skin, joints: Float[Tensor, "joints 3"]) -> Float[Tensor, "joints 4 4"]:
-    """From the axes of each joint to the rest shape, for columns."""
-    matrix = torch.eye(4, dtype=torch.float64).repeat(len(joints), 1, 1)
-    matrix[:, :3, :3] = skin.model.tpose.mT.double()
-    matrix[:, :3, 3] = joints.double()
-    return matrix
-
-
-def _local(skin: Skin, bind: Float[Tensor, "joints 4 4"]) -> Float[Tensor, "joints 4 4"]:
-    """The same in the axes of each joint's parent."""
-    found = [
-        here if parent < 0 else torch.linalg.inv(bind[parent]) @ here
-        for here, parent in zip(bind, skin.model.parents, strict=True)
-    ]
-    return torch.stack(found)
-
-
-def _matrices(values: Float[Tensor, "joints 4 4"]) -> Prim:
-    """As USD has them, for rows."""
+def _move(motion: Prim, skin: Skin, track: Track, joints: torch.Tensor) -> None:
+    """Translation, turn and size of every joint in its parent, frame by frame."""
     Gf, Vt = pxr("Gf"), pxr("Vt")
-
-    return Vt.Matrix4dArray([Gf.Matrix4d(value.T.tolist()) for value in values])
-
-
-def _move(motion: Prim, skin: Skin, track: Track, joints: Float[Tensor, "joints 3"]) -> None:
-    """Place, turn and size of every joint in its parent, frame by frame."""
-    Gf, Vt = pxr("Gf"), pxr("Vt")
-
     pose, parents = skin.motion.pose, skin.model.parents
     above = torch.tensor([max(parent, 0) for parent in parents])
     bones = (skin.model.tpose[above] @ (joints - joints[above])[..., None])[..., 0]
     turns = quaternions(all_angles(pose)[track.rows])
-    moved = [attr() for attr in (
-        motion.CreateTranslationsAttr, motion.CreateRotationsAttr, motion.CreateScalesAttr,
-    )]  # fmt: skip
+    moved = [motion.CreateTranslationsAttr(), motion.CreateRotationsAttr()]
+    moved.append(motion.CreateScalesAttr())
     for k, row in enumerate(track.rows.tolist()):
-        places = bones.clone()
+        places, size = bones.clone(), np.ones((len(parents), 3), np.float16)
         places[0] = pose.transl[row] + joints[0]
-        size = np.ones((len(parents), 3), np.float16)
         size[0] = float(skin.motion.size[row])
-        quats = [Gf.Quatf(float(w), float(x), float(y), float(z)) for x, y, z, w in turns[k]]
         values = (
             Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(places.numpy(), np.float32)),
-            Vt.QuatfArray(quats),
+            Vt.QuatfArray([Gf.Quatf(w, x, y, z) for x, y, z, w in turns[k].tolist()]),
             Vt.Vec3hArray.FromNumpy(size),
         )
         for attr, value in zip(moved, values, strict=True):
             attr.Set(value, float(track.frame[k]))
 
 
-def _add_skin(stage: Stage, skin: Skin, track: Track, path: str) -> Prim:
-    """The rest shape with the share of each joint in its vertices."""
-    Gf, UsdGeom, UsdSkel, Vt = pxr("Gf"), pxr("UsdGeom"), pxr("UsdSkel"), pxr("Vt")
-
-    rest, _ = rest_of(skin, int(track.rows[0]))
-    model, tint = skin.model, person_colour(track.person)
-    mesh = add_mesh(stage, f"{path}/body", rest.numpy(), model.faces.numpy(), tint)
+def _bind(mesh: Prim, skin: Skin, rest: torch.Tensor) -> None:
+    """Normals of the rest shape, and the share of each joint in its vertices."""
+    UsdGeom, UsdSkel, Vt = pxr("UsdGeom"), pxr("UsdSkel"), pxr("Vt")
+    model = skin.model
     normals = np.ascontiguousarray(vertex_normals(rest, model.faces).numpy(), np.float32)
     mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     share, joint = model.weights.topk(INFLUENCES, dim=1)
-    joint = torch.where(share > 0, joint, 0)
-    share = share / share.sum(1, keepdim=True)
+    joint = torch.where(share > 0, joint, 0).to(torch.int32)
+    share = (share / share.sum(1, keepdim=True)).float()
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
-    indices = Vt.IntArray.FromNumpy(joint.numpy().astype(np.int32).reshape(-1))
-    binding.CreateJointIndicesPrimvar(False, INFLUENCES).Set(indices)
-    weights = Vt.FloatArray.FromNumpy(share.numpy().astype(np.float32).reshape(-1))
-    binding.CreateJointWeightsPrimvar(False, INFLUENCES).Set(weights)
-    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
-    return mesh.GetPrim()
+    indices = binding.CreateJointIndicesPrimvar(False, INFLUENCES)
+    indices.Set(Vt.IntArray.FromNumpy(joint.flatten().numpy()))
+    weights = binding.CreateJointWeightsPrimvar(False, INFLUENCES)
+    weights.Set(Vt.FloatArray.FromNumpy(share.flatten().numpy()))
+    binding.CreateGeomBindTransformAttr(pxr("Gf").Matrix4d(1.0))
