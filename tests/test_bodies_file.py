@@ -81,21 +81,6 @@ def test_meshes_count_and_parameters_stay_when_they_agree(tmp_path: Path) -> Non
         ({"body_pose": np.zeros((ROWS, 69))}, "cannot be used"),
     ],
 )
-def test_people_of_the_mean_shape_are_of_unknown_height_also_where_no_model_checks_it(
-    tmp_path: Path,
-) -> None:
-    own = {k: v for k, v in parameters().items() if k != "model"}
-    meshes = {k: v for k, v in tiny.bodies().items() if k in ("vertices", "faces")}
-    found, _ = told(save(tmp_path, **rows(), **own, **meshes, model=np.array("smplx")))
-    assert found.pose is None  # no file of that model is here
-    assert found.size_spread == pytest.approx(0.055)
-    own["betas"] = own["betas"] + 0.8
-    found, _ = told(save(tmp_path, **rows(), **own, **meshes, model=np.array("smplx")))
-    assert found.size_spread is None
-    found, _ = told(save(tmp_path, **rows(), **meshes))
-    assert found.size_spread is None
-
-
 def test_parameters_that_do_not_give_the_meshes_are_left_out_with_a_word(
     tmp_path: Path, change: dict[str, Any], words: str
 ) -> None:
@@ -133,6 +118,21 @@ def test_wrong_parameters_are_named(tmp_path: Path, change: dict[str, Any], word
     with pytest.raises(InputError, match=words) as caught:
         read_bodies(path)
     assert str(caught.value).startswith("bodies.npz: field")
+
+
+def test_people_of_the_mean_shape_are_of_unknown_height_also_where_no_model_checks_it(
+    tmp_path: Path,
+) -> None:
+    own = {k: v for k, v in parameters().items() if k != "model"}
+    meshes = {k: v for k, v in tiny.bodies().items() if k in ("vertices", "faces")}
+    found, _ = told(save(tmp_path, **rows(), **own, **meshes, model=np.array("smplx")))
+    assert found.pose is None  # no file of that model is here
+    assert found.size_spread == pytest.approx(0.055)
+    own["betas"] = own["betas"] + 0.8
+    found, _ = told(save(tmp_path, **rows(), **own, **meshes, model=np.array("smplx")))
+    assert found.size_spread is None
+    found, _ = told(save(tmp_path, **rows(), **meshes))
+    assert found.size_spread is None
 
 
 def test_bodies_survive_writing(tmp_path: Path) -> None:
