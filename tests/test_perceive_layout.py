@@ -40,7 +40,7 @@ from mover.perceive.layout import (
     is_placed,
     shapes_of,
 )
-from mover.perceive.screen import ScreenInputs, outermost, screen
+from mover.perceive.screen import CameraPrior, ScreenInputs, outermost, screen
 from mover.perceive.standing import seen_from, standing_on
 
 W, H, FOCAL = 480, 320, 420.0
@@ -135,8 +135,12 @@ def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[SceneObject]):
     )
     assert twice.height / found.height == pytest.approx(2, rel=0.05)
     known = screen(replace(inputs, height=1.2), ScreenConfig(tilt=0.0))
-    sure = screen(replace(inputs, height=1.2, height_spread=0.01), ScreenConfig(tilt=0.0))
-    assert abs(sure.height - 1.2) < 0.5 * abs(known.height - 1.2)
+    pitch, roll = (float(a) for a in pitch_roll(camera().R_cam_world))
+    mean = torch.tensor([pitch, roll, math.log(1.2)])
+    for spread, most in ((0.05, 1.1), (0.01, 0.5)):
+        precision = torch.tensor([1e6, 1e6, spread**-2]).diag()
+        sure = screen(replace(inputs, prior=CameraPrior(mean, precision)), ScreenConfig())
+        assert abs(sure.height - 1.2) < most * abs(known.height - 1.2)
     assert torch.equal(known.R_cam_world, camera().R_cam_world)
 
 
@@ -229,17 +233,23 @@ def test_feet_tell_the_tilt_and_the_height_of_the_camera(
     level = replace(true, R_cam_world=torch.diag(torch.tensor([1.0, -1.0, -1.0])))
     seen = replace(picture(pieces, camera()), camera=level)
     found = standing_on(seen, small_room.bodies, Run(tmp_path))
-    off = torch.rad2deg(torch.stack(pitch_roll(found.camera.R_cam_world)))
-    assert (off - torch.rad2deg(torch.stack(pitch_roll(true.R_cam_world)))).abs().max() < 1.5
-    assert found.height == pytest.approx(-small_room.truth.ground, abs=0.05)
-    # a height that is known stays, and feet of one frame tell neither
-    known = replace(seen, height=2.0)
-    assert standing_on(known, small_room.bodies, Run(tmp_path)) is known
-    assert found.height_spread is None
-    fitted = replace(small_room.bodies, size_spread=0.02)
-    assert standing_on(seen, fitted, Run(tmp_path)).height_spread == 0.02
-    once = rows_of(small_room.bodies, torch.tensor([0]))
-    assert standing_on(seen, once, Run(tmp_path)) is seen
+    tilt = torch.stack(pitch_roll(true.R_cam_world))
+    off = torch.rad2deg(torch.stack(pitch_roll(found.camera.R_cam_world)) - tilt)
+    assert off.abs().max() < 1.5
+    wanted = torch.cat([tilt, torch.tensor([-small_room.truth.ground]).log()])
+    miss = found.prior.mean - wanted
+    assert float(miss @ found.prior.precision @ miss) < 7.8  # 95 % of three unknowns
+    assert float(found.prior.mean[2].exp()) == pytest.approx(-small_room.truth.ground, abs=0.1)
+    # a height that is given stays, people of unknown size say less of it, one frame hardly anything
+    known = standing_on(replace(seen, height=2.0), small_room.bodies, Run(tmp_path)).prior
+    assert float(known.mean[2].exp()) == pytest.approx(2.0, rel=0.1)
+    fitted = standing_on(seen, replace(small_room.bodies, size_spread=0.06), Run(tmp_path)).prior
+    once = standing_on(seen, rows_of(small_room.bodies, torch.tensor([0])), Run(tmp_path)).prior
+    spreads = [
+        float(torch.linalg.inv(p.precision)[2, 2].sqrt()) for p in (found.prior, fitted, once)
+    ]
+    assert 0.05 <= spreads[0] < spreads[1] < spreads[2]
+    assert spreads[1] >= (0.05**2 + 0.06**2) ** 0.5
 
 
 @pytest.mark.parametrize("people", [True, False])
@@ -257,7 +267,7 @@ def test_edges_of_the_picture_tell_tilt_and_heading(people: bool, small_room, tm
     turned = abs(math.remainder(found.heading.yaw, math.pi / 2))
     assert turned < min(math.radians(1), 3 * found.heading.spread)
     if people:
-        assert found.height == pytest.approx(-small_room.truth.ground, abs=0.03)
+        assert float(found.prior.mean[2].exp()) == pytest.approx(-small_room.truth.ground, abs=0.03)
     blank = replace(seen, reference=torch.full_like(capture.reference, 0.5))
     nothing = seen_from(blank, None, Run(tmp_path))
     assert (nothing.tilt_spread, nothing.heading) == (None, None)

@@ -42,7 +42,7 @@ def range_in(
     infinity = torch.full_like(images, torch.inf)
     near = torch.where(known, images * (1 - slack), -infinity)
     far = torch.where(known, images * (1 + slack), infinity)
-    return DepthRange(near, far, -infinity, torch.ones(count))
+    return DepthRange(near, far, torch.ones(count))
 
 
 def floor_height(

@@ -33,7 +33,7 @@ from mover.io.files.fields import At
 from mover.io.files.meshes import KINDS, read_mesh
 from mover.perceive.config import LayoutConfig
 from mover.perceive.depth_map import floor_height, median_depths, range_in
-from mover.perceive.screen import Screened, ScreenInputs, outermost, screen
+from mover.perceive.screen import CameraPrior, Screened, ScreenInputs, outermost, screen
 from mover.stages.camera.room_lines import Segments
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
 from mover.stages.objects.gather_given import given_axis, sizes_of_shapes, unplaced
@@ -211,8 +211,8 @@ class Picture:
     """Of the camera above the floor, where it is known [m]."""
     depth: Float[Tensor, "h w"] | None
     """Measured distance along the view [m]; NaN: unknown. None: nothing was measured."""
-    height_spread: float | None = None
-    """Standard deviation of the logarithm of `height`; None: as people's heights differ."""
+    prior: CameraPrior | None = None
+    """Of its tilt and height, from the feet of people."""
     reference: Float[Tensor, "h w 3"] | None = None
     """The picture itself, in [0, 1]."""
     tilt_spread: float | None = None
@@ -287,12 +287,15 @@ def at_scale(picture: Picture) -> Picture:
 
     A network's depth is off by a factor for the whole picture, which its floor shows.
     """
-    if picture.depth is None or picture.height is None:
+    height = picture.height
+    if height is None and picture.prior is not None:
+        height = float(picture.prior.mean[2].exp())
+    if picture.depth is None or height is None:
         return picture
     seen = floor_height(picture.depth, picture.camera, picture.masks.any(0) | picture.people)
-    if seen is None or not 1 / MOST_OFF < picture.height / seen < MOST_OFF:
+    if seen is None or not 1 / MOST_OFF < height / seen < MOST_OFF:
         return picture
-    return replace(picture, depth=picture.depth * (picture.height / seen))
+    return replace(picture, depth=picture.depth * (height / seen))
 
 
 def _image(picture: Picture) -> ImageInputs:
@@ -319,8 +322,8 @@ def _screen_inputs(
         thing=things,
         points=torch.stack([outer_points(shape) for _, shape in pairs]),
         height=height,
-        height_spread=picture.height_spread,
         tilt_spread=picture.tilt_spread,
+        prior=picture.prior,
         given=axes_of(picture, things),
     )
 

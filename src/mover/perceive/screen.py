@@ -27,8 +27,19 @@ from mover.perceive.config import ScreenConfig
 
 DIRECTIONS = 60  # in which the outermost point of a shape is kept
 LITTLE = 0.01  # share of items that are not the best
+AROUND = (-1.5, -0.75, 0.0, 0.75, 1.5)  # standard deviations of the height of a prior
 NEAREST = 0.6  # [m], where a start is put at least
 FARTHEST = 15.0  # [m], and at most
+
+
+@record
+class CameraPrior:
+    """What the feet of people (and the lines of the picture) constrain before any furniture."""
+
+    mean: Float[Tensor, "3"]
+    """Pitch and roll [rad], logarithm of the height above the floor [m]."""
+    precision: Float[Tensor, "3 3"]
+    """Inverse covariance."""
 
 
 @record
@@ -46,11 +57,11 @@ class ScreenInputs:
     points: Float[Tensor, "items points 3"]
     """Outermost points of each shape, from the centre of its bottom [m]."""
     height: float | None
-    """The camera's, where people's feet or a depth map tell it, and then its tilt [m]."""
-    height_spread: float | None = None
-    """Standard deviation of its logarithm; None: `ScreenConfig.known`."""
+    """The camera's, where it is given or a depth map shows it [m]."""
     tilt_spread: float | None = None
-    """How far off pitch and roll are, where the picture tells them [rad]."""
+    """How far off pitch and roll are, where the picture shows them [rad]."""
+    prior: CameraPrior | None = None
+    """From the feet of people; it takes the place of `height` and `tilt_spread`."""
     given: Given | None = None
     """Along which axis each item may stand; None: nothing is seen of it."""
 
@@ -98,7 +109,7 @@ def outermost(verts: Float[Tensor, "verts 3"]) -> Float[Tensor, "points 3"]:
 
 def screen(inputs: ScreenInputs, config: ScreenConfig, observe: Observer = silent) -> Screened:
     """Begin at all heights, descend, choose the best."""
-    heights = torch.tensor(config.heights if inputs.height is None else (inputs.height,))
+    heights = _heights(inputs, config)
     start = _starts(inputs, config, heights)
 
     def energy(guess: Guess) -> Energy:
@@ -151,12 +162,23 @@ def _share(
         return share * voice[:, None, inputs.thing]
 
 
+def _heights(inputs: ScreenInputs, config: ScreenConfig) -> Float[Tensor, " heights"]:
+    """Heights of the camera from which the descents start [m]."""
+    if inputs.prior is not None:
+        spread = torch.linalg.inv(inputs.prior.precision)[2, 2].sqrt()
+        return (inputs.prior.mean[2] + spread * torch.tensor(AROUND)).exp()
+    return torch.tensor(config.heights if inputs.height is None else (inputs.height,))
+
+
 def _world(guess: Guess, inputs: ScreenInputs, config: ScreenConfig) -> Float[Tensor, " heights"]:
-    """How unusual height and tilt are, or how far from the known ones."""
+    """Squared deviations of height and tilt from what is known or usual, weighted."""
+    if inputs.prior is not None:
+        at = torch.stack(pitch_roll(inputs.camera.R_cam_world)) + guess.tilt
+        off = torch.cat([at, guess.log_height[:, None]], -1) - inputs.prior.mean
+        return config.prior * torch.einsum("hi,ij,hj->h", off, inputs.prior.precision, off)
     usual, spread, tilt = config.usual, config.spread, config.tilt
     if inputs.height is not None:
-        usual, spread, tilt = inputs.height, inputs.height_spread, config.tilt_known
-        spread = config.known if spread is None else spread
+        usual, spread, tilt = inputs.height, config.known, config.tilt_known
     tilt = tilt if inputs.tilt_spread is None else inputs.tilt_spread
     height = ((guess.log_height - math.log(usual)) / spread).square()
     turned = (guess.tilt / max(tilt, 1e-3)).square().sum(-1)

@@ -1,18 +1,23 @@
-"""Tilt of the camera and its height above the floor, as feet and straight edges tell them.
+"""Tilt of the camera and its height above the floor, from feet and straight edges.
 
-Boxes alone say little of either, and a first scene on a floor of the wrong height is wrong as a
-whole: bodies from keypoints, which know no floor either, still stand on one. Their poses are off
-together, and with them the tilt by a degree or more; edges of the room tell it far better, and
-along which directions furniture stands. Then the feet tell the height under that tilt.
+Boxes alone constrain neither well, and a first scene on a floor of the wrong height is wrong as a
+whole: bodies from keypoints, which know no floor either, still stand on one. Their poses err
+together, and with them the tilt by some degrees; edges of the room show it far better, and the
+directions along which furniture stands. What feet and edges leave open is decided with the boxes:
+they are handed on as an estimate with its covariance (`CameraPrior`).
 """
 
 import math
 from dataclasses import replace
 
+import torch
+
 from mover.bodies.parts import parts_of
 from mover.core.run import Run
 from mover.core.types import Bodies
+from mover.geometry.camera import pitch_roll, tilted
 from mover.perceive.layout import Picture
+from mover.perceive.screen import CameraPrior
 from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camera
 from mover.stages.camera.config import LensConfig
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
@@ -21,38 +26,43 @@ from mover.stages.camera.room_lines import SURE, Prior, find_segments, fit_room
 from mover.stages.config import AlignConfig, FootContactConfig, SelectConfig
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
-LOOSE = (math.radians(2), math.radians(2), 0.1)  # pitch, roll [rad] and ground [m] that are no news
-SEEN = AlignConfig(tilt_prior=math.radians(0.03))  # a tilt that edges told stays: feet err more
-GUESSED = AlignConfig(tilt_prior=math.radians(8))  # a camera that nobody measured looks anywhere
+POSES = math.radians(2.0)  # [rad] by which a floor under fitted bodies leans: feet err together
+HEIGHTS = 0.05  # of the logarithm of the floor's depth, beside the size of the people
+PITCH, ROLL = math.radians(8.0), math.radians(2.0)  # [rad] how cameras on shelves and tripods look
+GIVEN = 0.02  # of the logarithm of a given height of the camera
+SEEN = AlignConfig(tilt_prior=math.radians(0.03))  # a tilt from edges stays: feet err more
+GUESSED = AlignConfig(tilt_prior=PITCH)  # a camera of unknown tilt looks anywhere
 
 
 def seen_from(picture: Picture, bodies: Bodies | None, run: Run) -> Picture:
-    """The picture with what feet and its edges tell of camera and room.
+    """The picture with the camera and heading of the room by feet and by its own edges.
 
     Args:
         picture: Its camera is a guess.
-        bodies: Of the people; None: nobody is known.
+        bodies: Of the people; None: there are none.
         run: Keeps what is finished.
     """
     by_feet = picture if bodies is None else standing_on(picture, bodies, run)
-    found = along_edges(by_feet, by_feet is not picture)
+    found = along_edges(by_feet)
     if bodies is None or found.tilt_spread is None:
         return found
-    return standing_on(replace(found, height=picture.height), bodies, run)
+    return standing_on(replace(found, prior=None), bodies, run)
 
 
-def along_edges(picture: Picture, by_feet: bool) -> Picture:
-    """The picture with the tilt of its camera and the room's heading, where its edges tell them.
+def along_edges(picture: Picture) -> Picture:
+    """The picture with the tilt of its camera and the room's heading, where its edges show them.
 
     Args:
         picture: Its focal length counts as known.
-        by_feet: Whether feet told the tilt already.
     """
     camera = picture.camera
     if picture.reference is None:
         return picture
     segments = find_segments(picture.reference, picture.people, camera.K[:2, 2], SURE)
-    spread = LensConfig.feet if by_feet else LensConfig.tilt
+    spread = LensConfig.tilt
+    if picture.prior is not None:
+        tilts = torch.linalg.inv(picture.prior.precision).diagonal()[:2]
+        spread = min(spread, float(tilts.amax()) ** 0.5)
     up = camera.R_cam_world[:, 1].double()
     prior = Prior(float(camera.K[0, 0].double().log()), MEASURED, up, spread)
     ends = fit_room(segments, prior, camera.R_cam_world)
@@ -63,29 +73,52 @@ def along_edges(picture: Picture, by_feet: bool) -> Picture:
 
 
 def standing_on(picture: Picture, bodies: Bodies, run: Run) -> Picture:
-    """The picture with tilt and height of its camera, where the feet of people tell them.
+    """The picture with the camera that the feet of people constrain, and how well they do.
 
     Args:
         picture: Its camera is a guess.
         bodies: In camera axes; in world axes they say nothing that is not known.
         run: Keeps what is finished.
     """
-    if bodies.space != "camera" or picture.height is not None:
+    if bodies.space != "camera":
         return picture
     camera = picture.camera
     keep = run.stage(select_frames, SelectInputs(bodies), SelectConfig()).keep
     parts = parts_of(bodies, camera.R_cam_world[:, 1])
     standing = FootContactInputs(bodies, parts, keep, camera)
     feet = run.stage(find_foot_contacts, standing, FootContactConfig())
-    believed = GUESSED if picture.tilt_spread is None else SEEN
-    found = run.stage(align_camera, AlignInputs(feet, camera, None, None), believed)
-    if not _certain(found):
+    config = GUESSED if picture.tilt_spread is None else SEEN
+    found = run.stage(align_camera, AlignInputs(feet, camera, None, None), config)
+    if found.ground >= 0:
         return picture
-    spread = bodies.size_spread or None
-    return replace(picture, camera=found.camera, height=-found.ground, height_spread=spread)
+    prior = camera_prior(found, picture, bodies.size_spread or 0.0)
+    R = tilted(prior.mean[0], prior.mean[1]).to(camera.R_cam_world)
+    return replace(picture, camera=replace(camera, R_cam_world=R), prior=prior)
 
 
-def _certain(found: Alignment) -> bool:
-    """Whether the feet tell more than nothing."""
-    spreads = found.covariance.diagonal().clamp_min(0).sqrt().tolist()
-    return found.ground < 0 and all(s < most for s, most in zip(spreads, LOOSE, strict=True))
+def camera_prior(found: Alignment, picture: Picture, size: float) -> CameraPrior:
+    """The camera of the feet, with the errors that all of them share, and usual cameras.
+
+    A hundred feet err together: by the lean of all poses, and by the size of the people.
+
+    Args:
+        found: By the feet alone.
+        picture: Its camera before, with its tilt where the lines show it.
+        size: Standard deviation of the logarithm of the people's size.
+    """
+    height = -found.ground
+    to_log = torch.tensor([1.0, 1.0, -1 / height], dtype=torch.float64)
+    covariance = found.covariance.double().cpu() * to_log * to_log[:, None]
+    lean = POSES if picture.tilt_spread is None else picture.tilt_spread
+    covariance += torch.tensor([lean**2, lean**2, HEIGHTS**2 + size**2]).double().diag()
+    pitch, roll = (float(x) for x in pitch_roll(found.camera.R_cam_world.double()))
+    observed = torch.tensor([pitch, roll, math.log(height)], dtype=torch.float64)
+    before = [float(x) for x in pitch_roll(picture.camera.R_cam_world.double())]
+    usual = torch.tensor([*before, math.log(picture.height or height)], dtype=torch.float64)
+    known = GIVEN**-2 if picture.height is not None else 0.0
+    spreads = (PITCH, ROLL) if picture.tilt_spread is None else (picture.tilt_spread,) * 2
+    weight = torch.tensor([spreads[0] ** -2, spreads[1] ** -2, known]).double().diag()
+    own = torch.linalg.inv(covariance)
+    precision = own + weight
+    mean = torch.linalg.solve(precision, own @ observed + weight @ usual)
+    return CameraPrior(mean.float(), precision.float())
