@@ -12,7 +12,7 @@ JOBS ?= 2
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q
 EXTRA := slow or browser or docs or long
 
-.PHONY: demo test test-rest test-all check lint docs clean
+.PHONY: demo test test-rest test-all check gate lint docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/mover demo --out demo
@@ -26,6 +26,9 @@ test-rest: $(VENV)/.developed
 test-all: test test-rest
 
 check: lint test
+
+gate: $(VENV)/.developed
+	$(BIN)/python benchmarks/gate.py --workers $(JOBS)
 
 lint: $(VENV)/.developed
 	$(BIN)/ruff check .

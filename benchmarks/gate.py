@@ -1,83 +1,144 @@
-"""Whether figures of quality are as good as the committed baseline; times only warn.
+"""Whether results are what they were: the demo and development rooms of three sets.
 
-A figure is lower-is-better and may exceed the baseline by its tolerance. Energies of fixed inputs
-are held from both sides, because a lower one also says that something else is computed.
+    make gate                           # placements and bodies to the bit, the demo's seconds
+    python benchmarks/gate.py --means   # where a step changes results: means of six rooms a set
+    python benchmarks/gate.py --write   # store what is found (with --means: of six rooms a set)
+
+Bits are those of one kind of processor and one version of torch: on another machine, store them
+with an unchanged version of the program first.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+import argparse
+import hashlib
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
 
-SLOWER = 1.5  # times the baseline, from where a warning is given
+import torch
+from torch import Tensor
 
-# The first name that a figure begins with says how much it may change, and why as much.
-LIMITS = (
-    ("energy at", 1e-5, "sums of single precision in another order; the same bits on one machine"),
-    ("energy after", 1e-3, "what the issue calls an equal energy; 60 steps pass roundings on"),
-    ("energy of two", 0.5, "a count of bits that differ: none may"),
-    ("energy gradient", 1e-4, "single precision, where slopes of opposite signs cancel"),
-    ("energy", 1e-5, "single precision, a few hundred roundings of 6e-8"),
-    ("silhouette gradient", 1e-5, "as above, and 100 times less than the issue allows"),
-    ("silhouette Warp - torch", 1e-5, "the issue's; crossings are placed in single precision"),
-    ("silhouette Warp - DEODR eight", 1e-4, "a share of 1/64 at 100 pixels of an outline"),
-    ("silhouette Warp - DEODR", 2e-4, "three more of 15,728 centres that lie on a side"),
-    ("depth seen by one, Warp - torch", 0.5e-4, "half a pixel of a body: none may"),
-    ("depth seen", 1e-4, "one pixel of a body whose ray touches the outline"),
-    ("depth Warp - torch", 1e-5, "the issue's"),
-    ("depth", 1e-5, "single precision at 5 m is 5e-7; a surface seen from the side multiplies it"),
-    ("distance beyond", 0.5, "a count of places: none may"),
-    ("distance", 1e-6, "single precision of coordinates in cells, at 2 m"),
-    ("lookup gradient", 1e-4, "single precision of differences of neighbours"),
-    ("lookup", 1e-6, "single precision of the place in its cell"),
-    ("nearest", 1e-6, "which of two is nearer is decided in single precision"),
-    ("gathering", 0.5, "a count of bits that differ: none may"),
-)
-BOTH = ("energy at", "energy after")  # held from both sides, relative to their value
-EXTRA = ("DEODR", "Embree", "Open3D", "PyTorch3D")  # absent where these are
+from mover.core.run import Run
+from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
+from mover.pipeline.presets import PRESETS
+from mover.pipeline.reconstruct import reconstruct
+from mover_bench.experiment.job import noisy_room
+from mover_bench.experiment.measures import Trial
+from mover_bench.experiment.sets import SETS
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.noise import add_noise
+from mover_bench.rooms.room import demo_room
 
-
-class Verdict(NamedTuple):
-    """What a run says against the baseline."""
-
-    failures: list[str]
-    """Figures of quality that are worse, not finite or absent."""
-    warnings: list[str]
-    """Times that are much longer."""
+STORED = Path(__file__).with_name("gate.json")
+DEMO = ("demo", 0)
+ROOMS = ("rooms", "wrong-shape", "upstream")
+FEW, MORE = range(100, 103), range(100, 106)
+MEANS = {"iou3d": 0.005, "pje": 0.002}
+"""Metrics whose means are held, and how far these may be off: IoU3D, PJE [m]."""
+Case = tuple[str, int]
+"""Set and seed."""
 
 
-def held(name: str, value: float) -> dict[str, Any]:
-    """A figure as the baseline keeps it: with its tolerance, and why it is that."""
-    tolerance, why = next((t, w) for start, t, w in LIMITS if name.startswith(start))
-    both = name.startswith(BOTH)
+def trial_of(case: Case) -> Trial:
+    """The input and the truth of a case."""
+    if case != DEMO:
+        return noisy_room(case[1], SETS[case[0]])
+    room = demo_room()
+    return Trial(add_noise(room, NoiseConfig(), 0), room.truth, room.bodies, ())
+
+
+def digest(tensors: Iterable[Tensor]) -> str:
+    """Of the bits of some tensors."""
+    found = hashlib.sha256()
+    for tensor in tensors:
+        found.update(tensor.contiguous().numpy().tobytes())
+    return found.hexdigest()[:16]
+
+
+def solved(case: Case) -> dict[str, Any]:
+    """Reconstruct a case: digests, metrics, and processor seconds without making the room."""
+    torch.set_num_threads(1)
+    trial = trial_of(case)
+    begin = time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        room = reconstruct(trial.capture, PRESETS["robust"], Run(Path(folder)))
+    seconds = time.process_time() - begin
+    assert room.bodies is not None
+    camera = room.scene.camera
+    placed = [(x.t_world_object, x.yaw, x.scale) for x in room.scene.objects]
+    people = EvaluatedBodies(None, room.bodies, trial.bodies)
+    scenes = trial.capture.scene, room.scene, trial.truth
+    metrics = evaluate(*scenes, people, EvaluateConfig(by_place=False), ("result",))["result"]
     return {
-        "value": value,
-        "tolerance": tolerance * abs(value) if both else tolerance,
-        "why": why,
-        "both": both,
-        "optional": any(tool in name for tool in EXTRA),
+        "objects": digest([camera.K, camera.R_cam_world, *(x for row in placed for x in row)]),
+        "bodies": digest([room.bodies.verts]),
+        "seconds": round(seconds, 1),
+        **{name: round(metrics[name], 5) for name in MEANS},
     }
 
 
-def judge(
-    quality: Mapping[str, float], times: Mapping[str, float], baseline: Mapping[str, Any]
-) -> Verdict:
-    """Compare figures with those of the baseline.
+def means_of(found: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """Means of the metrics over the rooms of each set."""
+    means: dict[str, dict[str, float]] = {}
+    for rooms in ROOMS:
+        some = [one for name, one in found.items() if name.startswith(f"{rooms} ")]
+        means[rooms] = {name: sum(one[name] for one in some) / len(some) for name in MEANS}
+    return means
 
-    Args:
-        quality: Value of each figure, lower is better.
-        times: Wall time of each row [ms].
-        baseline: `quality`: what `held` gives of each figure; `times`: wall [ms] of each row.
-    """
-    failures, warnings = [], []
-    for name, one in baseline["quality"].items():
-        if name not in quality:
-            if not one["optional"]:
-                failures.append(f"{name}: not measured")
-            continue
-        off = quality[name] - one["value"]
-        if not (abs(off) if one["both"] else off) <= one["tolerance"]:  # also where it is no number
-            limit = f"{one['value']:.6g} and {one['tolerance']:.1g} more"
-            failures.append(f"{name}: {quality[name]:.6g}, expected at most {limit} ({one['why']})")
-    for name, spent in baseline["times"].items():
-        if name in times and times[name] > SLOWER * spent["wall"]:
-            warnings.append(f"{name}: {times[name]:.1f} ms, the baseline took {spent['wall']:.1f}")
-    return Verdict(failures, warnings)
+
+def changes_in_bits(found: dict[str, Any], known: dict[str, Any]) -> list[str]:
+    """Cases whose placements or bodies are not as stored."""
+    lines: list[str] = []
+    for name, one in found.items():
+        old = known.get(name, {})
+        other = [what for what in ("objects", "bodies") if one[what] != old.get(what)]
+        if other:
+            gap = one["iou3d"] - old.get("iou3d", float("nan"))
+            lines.append(f"{name}: other {' and '.join(other)}, IoU3D {gap:+.4f}")
+    return lines
+
+
+def changes_in_means(found: dict[str, Any], known: dict[str, Any]) -> list[str]:
+    """Sets whose means are farther off than allowed."""
+    lines: list[str] = []
+    for rooms, means in means_of(found).items():
+        old = means_of({name: known[name] for name in found})[rooms]
+        for name, allowed in MEANS.items():
+            gap = means[name] - old[name]
+            print(f"{rooms}: {name} {old[name]:.4f} -> {means[name]:.4f}")
+            if not abs(gap) <= allowed:
+                lines.append(f"{rooms}: {name} is off by {gap:+.4f}, allowed {allowed}")
+    return lines
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Solve all cases, compare, print; the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--means", action="store_true", help="six rooms a set, means only")
+    parser.add_argument("--write", action="store_true", help="store what is found")
+    parser.add_argument("--workers", type=int, default=2, help="rooms beside each other")
+    asked = parser.parse_args(arguments)
+    cases = [DEMO, *((rooms, k) for rooms in ROOMS for k in (MORE if asked.means else FEW))]
+    with ProcessPoolExecutor(asked.workers, get_context("spawn")) as pool:
+        answers = zip(cases, pool.map(solved, cases), strict=True)
+        found = {f"{rooms} {seed}": one for (rooms, seed), one in answers}
+    known: dict[str, Any] = json.loads(STORED.read_text()) if STORED.exists() else {}
+    demo = found["demo 0"]["seconds"]
+    print(f"demo: {demo} s of processor, stored {known.get('demo 0', {}).get('seconds', '-')}")
+    if asked.write:
+        STORED.write_text(json.dumps(known | found, indent=1) + "\n")
+        return 0
+    lines = (changes_in_means if asked.means else changes_in_bits)(found, known)
+    print("\n".join(lines) or "as stored")
+    return bool(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

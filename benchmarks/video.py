@@ -41,12 +41,12 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.meshes import write_mesh
+from mover_bench.experiment.sets import parse_seeds
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise
 from mover_bench.rooms.room import make_room
 from mover_bench.rooms.seen import COCO, Seen, write_video
-from mover_bench.studies.run import parse_seeds
 
 FPS = 5.0
 KINDS = ("depth", "disparity")

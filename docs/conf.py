@@ -34,7 +34,6 @@ BLUE = {"color-brand-primary": "#2f5d9b", "color-brand-content": "#2f5d9b"}
 html_theme_options = {"footer_icons": [], "light_css_variables": BLUE}
 
 
-TABLES = "% tables: conf.py puts what is in docs/tables here"
 OTHERS = "% others: conf.py puts pages here that are not named above"
 
 
@@ -64,14 +63,7 @@ def bare(_app, what, _name, obj, _options, _signature, _returns):
 
 
 def complete(_app, docname, source):
-    """Fill in the tables of experiments, and pages that the index does not name."""
-    if docname == "results":
-        found = sorted(path.relative_to(HERE) for path in HERE.glob("tables/*/summary.md"))
-        parts = [
-            f"```{{include}} {path}\n:heading-offset: 1\n:relative-images:\n```" for path in found
-        ]
-        none = "No table was kept with this version; the command above makes one."
-        source[0] = source[0].replace(TABLES, "\n\n".join(parts) or none)
+    """Name pages that the index does not name."""
     if docname == "index":
         pages = {path.stem for path in HERE.glob("*.md")} - {"index"} - set(source[0].splitlines())
         source[0] = source[0].replace(OTHERS, "\n".join(sorted(pages)))

@@ -29,8 +29,6 @@ ELSEWHERE = {
     "--ray.address auto": "a running Ray cluster",
     "--device cuda": "an NVIDIA GPU",
     "mover experiment --": "hours: many known rooms",
-    "mover experiment study": "hours: many known rooms",
-    "mover experiment make": "many minutes: whole sets (tests/test_room_sets.py has little ones)",
     "mover demo": "minutes: `make demo`",
 }
 RUN = [

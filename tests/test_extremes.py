@@ -10,10 +10,10 @@ from test_pipeline import light, run_in
 from mover.core.types import Capture, Masks, Mesh
 from mover.geometry.camera import to_camera
 from mover.geometry.rle import decode
+from mover_bench.experiment.variants import shortened
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.noise import add_noise
 from mover_bench.rooms.render import encode
-from mover_bench.studies.variants import shortened
 
 pytestmark = pytest.mark.slow
 FRAMES = 120  # somebody walks and sits

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from test_experiments import Ended, quick
+from test_experiment import quick
 from test_import_datasets import prox_room
 from test_import_scenes import imported
 from test_import_scenes import plain as plain  # the fixture
@@ -25,6 +26,7 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.scene_file import read_scene
 from mover.pipeline.presets import PRESETS
+from mover_bench.pool import Jobs
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise
@@ -150,17 +152,22 @@ class Answers:
         self.done: list[tuple[str, str]] = []
         self.broken = broken
 
-    def __call__(self, job: TableJob) -> Ended:
+    def __call__(self, module: str, jobs: Jobs, workers: int) -> Iterator[int]:
+        del module, workers
+        for index, ((capture, out, preset, name), log) in enumerate(jobs):
+            self.answer(TableJob(Path(capture), Path(out), preset, name), log)
+            yield index
+
+    def answer(self, job: TableJob, log: Path) -> None:
         self.done.append((job.capture.name, job.name))
         job.folder.mkdir(parents=True, exist_ok=True)
         if job.name == self.broken:
-            (job.folder / "log.txt").write_text("Traceback\nValueError: no floor\n")
-            return Ended(1)
+            log.write_text("Traceback\nValueError: no floor\n")
+            return
         scene = {"iou3d": 0.5, "p2s": 0.1, "iou2d": 0.8, "pitch_error": 0.02, "roll_error": 0.04,
                  "pje": 0.17, "v2v": 0.18}  # fmt: skip
         tree = {"key": key_of(job), "initial": {"iou3d": 0.25}, "image": scene, "full": scene}
         (job.folder / DONE).write_text(json.dumps(tree))
-        return Ended(0)
 
 
 def named_captures(folder: Path, *names: str) -> Path:
@@ -175,7 +182,7 @@ def test_every_table_makes_all_of_its_rows_once(name: str, tmp_path: Path) -> No
     there = named_captures(tmp_path / "c", "MPH8_00034_01", "vicon_03301", "room_kitchen_1")
     args = TableArgs(name, there, tmp_path / "out", workers=2)
     answers = Answers()
-    page = paper_table(args, launch=answers).read_text()
+    page = paper_table(args, pool=answers).read_text()
     assert len(answers.done) == len(set(answers.done))
     wanted = {"prox": "MPH8_00034_01", "prox-quantitative": "vicon_03301"}
     assert {capture for capture, _ in answers.done} <= {
@@ -194,14 +201,14 @@ def test_every_table_makes_all_of_its_rows_once(name: str, tmp_path: Path) -> No
     full = next(x for x in numbers if x["row"] == "full")
     assert float(full["iou3d"]) == (50 if name == "pigraphs" else 0.5)
     again = Answers()
-    paper_table(args, launch=again)
+    paper_table(args, pool=again)
     assert again.done == []
 
 
 def test_people_are_in_millimetres_and_overlaps_as_the_paper_prints_them(tmp_path: Path) -> None:
     there = named_captures(tmp_path / "c", "vicon_03301")
     args = TableArgs("prox-quantitative", there, tmp_path / "out", only=("baseline", "initial"))
-    page = paper_table(args, launch=Answers()).read_text()
+    page = paper_table(args, pool=Answers()).read_text()
     assert "| baseline | 170.0 | 180.0 |" in page
     assert "| *MOVER, +CamGP+SDF+Contact* (paper) | 174.4 | 178.3 |" in page
     assert "| initial | 0.250 |" in page
@@ -212,7 +219,7 @@ def test_detected_captures_have_rows_of_their_own(tmp_path: Path) -> None:
     there = named_captures(tmp_path / "c", "MPH8_00034_01")
     other = named_captures(tmp_path / "d", "MPH8_00034_01")
     args = TableArgs("prox", there, tmp_path / "out", other, only=("initial", "full"))
-    page = paper_table(args, launch=Answers()).read_text()
+    page = paper_table(args, pool=Answers()).read_text()
     assert "| initial, detected | 0.250 |" in page
     assert "| *Total3D, PointRend* (paper) | 0.246 |" in page
 
@@ -220,11 +227,11 @@ def test_detected_captures_have_rows_of_their_own(tmp_path: Path) -> None:
 def test_a_job_that_fails_is_named_and_done_again(tmp_path: Path) -> None:
     there = named_captures(tmp_path / "c", "vicon_03301")
     args = TableArgs("prox-quantitative", there, tmp_path / "out")
-    page = paper_table(args, launch=Answers(broken="people-sdf")).read_text()
+    page = paper_table(args, pool=Answers(broken="people-sdf")).read_text()
     assert "**Failed**: vicon_03301, people-sdf: ValueError: no floor" in page
     assert "| + CamGP + SDF | - | - | - | - | - | - | 0 |" in page
     again = Answers()
-    paper_table(args, launch=again)
+    paper_table(args, pool=again)
     assert again.done == [("vicon_03301", "people-sdf")]
 
 

@@ -29,8 +29,8 @@ from mover.pipeline.reconstruct import reconstruct
 from mover.stages.config import ProposeConfig
 from mover.stages.contacts.propose_supports import propose_supports
 from mover.stages.contacts.resting import NOTHING, KnownTops, ProposeInputs
-from mover_bench.studies.job import noisy_room
-from mover_bench.studies.sets import SETS
+from mover_bench.experiment.job import noisy_room
+from mover_bench.experiment.sets import SETS
 
 COUNT = 12  # frames: 2.4 s
 LYING = turned(pose(ARMS_DOWN, COUNT), -torch.pi / 2, 0.0, 0.0)

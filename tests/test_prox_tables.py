@@ -9,13 +9,14 @@ import make_prox
 import make_scenes as layouts
 import numpy as np
 import pytest
-from test_experiments import Ended, quick
+from test_experiment import quick
 from test_import_datasets import prox_room
 from test_import_scenes import imported
 from test_import_scenes import plain as plain  # the fixture
 
 from mover.pipeline.presets import PRESETS
 from mover_bench.datasets.pigraphs import NAMES
+from mover_bench.pool import Jobs
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.tables import rows, table_job
 from mover_bench.tables.paper_table import TABLES, TableArgs, asked, paper_table
@@ -65,15 +66,16 @@ def captures(
         yield out
 
 
-def at_once(job: TableJob) -> Ended:
-    """Do a job here; a traceback is its log."""
-    job.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        do_job(job)
-    except Exception:
-        (job.folder / "log.txt").write_text(traceback.format_exc())
-        return Ended(1)
-    return Ended(0)
+def at_once(module: str, jobs: Jobs, workers: int) -> Iterator[int]:
+    """Do jobs here; a traceback is the log of one."""
+    del module, workers
+    for index, ((capture, out, preset, name), log) in enumerate(jobs):
+        log.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            do_job(TableJob(Path(capture), Path(out), preset, name))
+        except Exception:
+            log.write_text(traceback.format_exc())
+        yield index
 
 
 @pytest.mark.parametrize("name", ["prox", "prox-quantitative"])
@@ -85,7 +87,7 @@ def test_every_row_is_made_from_the_files_of_prox(
     monkeypatch.setattr(table_job, "STEPS", 5)
     monkeypatch.setattr(rows, "SEGMENTS", 3)  # the middle one lies between the two videos
     args = TableArgs(name, captures, tmp_path, captures, preset="paper")
-    page = paper_table(args, launch=at_once).read_text()
+    page = paper_table(args, pool=at_once).read_text()
     assert "Failed" not in page
     assert "Not run" not in page
     with (tmp_path / f"{name}-paper.csv").open(newline="") as file:
@@ -139,7 +141,7 @@ def test_every_row_is_made_from_the_files_of_pigraphs(
     for preset, config in PRESETS.items():
         monkeypatch.setitem(PRESETS, preset, quick(config))
     args = TableArgs("pigraphs", graphs, tmp_path, graphs, preset="paper")
-    page = paper_table(args, launch=at_once).read_text()
+    page = paper_table(args, pool=at_once).read_text()
     assert "Failed" not in page
     assert "Not run" not in page
     with (tmp_path / "pigraphs-paper.csv").open(newline="") as file:

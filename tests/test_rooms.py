@@ -12,7 +12,6 @@ from raycast import draw
 
 from mover.bodies.skinning import open_body
 from mover.core.records import fingerprint
-from mover.furniture.floor import floor_of, height_under_bodies
 from mover.furniture.library import make_piece
 from mover.geometry.camera import to_world
 from mover.geometry.placement import place_object
@@ -23,16 +22,12 @@ from mover_bench.rooms.gait import duration, stations, walk
 from mover_bench.rooms.known import Actor, KnownRoom, build
 from mover_bench.rooms.lying import berth, on_side, supine
 from mover_bench.rooms.motion import Stage, Stop, Task, perform
-from mover_bench.rooms.noise import without_support
 from mover_bench.rooms.placed import NoWayError, Placed, free_of, way
 from mover_bench.rooms.poses import Person, Posture, make_person, skinned
 from mover_bench.rooms.render import see
 from mover_bench.rooms.room import demo_room, make_room
 from mover_bench.rooms.seating import hand_on, leaning, seat_spot, seated, table_stand
-from mover_bench.rooms.stepped import make_platform_room, make_stepped_room
 from mover_bench.rooms.truth import part
-from mover_bench.rooms.worked import make_worked_room
-from mover_bench.studies.sets import SETS
 
 SHAPES = ([0.0] * 10, [1.3, -1.0, 0.5] + [0.0] * 7)
 
@@ -300,60 +295,6 @@ def test_tasks_that_the_furniture_does_not_allow_are_refused_with_a_reason() -> 
 
 @pytest.mark.slow
 class TestWholeRooms:
-    def test_a_video_begins_on_a_step_that_is_withheld_and_ends_on_the_floor(self) -> None:
-        config = dataclasses.replace(SETS["mini"].room, support="step")
-        room = make_stepped_room(101, config)
-        step, count = room.truth.objects[-1], room.actions.count("step")
-        assert step.category == "step"
-        assert count >= 15
-        world = to_world(room.bodies.verts, room.truth.camera.R_cam_world)
-        assert room.truth.ground is not None
-        low = world[..., 1].amin(1) - room.truth.ground
-        assert (low[:count] - room.furniture[-1].top_height).abs().max() < 0.01
-        assert low[count + 10 :].abs().max() < 0.02
-        assert bool((room.touched[:count] == len(room.furniture) - 1).any(1).all())
-        given = without_support(room.capture, room, "step")
-        assert [p.id for p in given.scene.objects] == [p.id for p in room.truth.objects[:-1]]
-        assert len(given.detections) == len(room.capture.detections) - 1
-
-    def test_both_palms_lie_on_a_table_that_is_withheld_of_who_sits_and_of_who_stands(self) -> None:
-        config = dataclasses.replace(SETS["mini"].room, support="table")
-        room = make_worked_room(100, config)
-        given = without_support(room.capture, room, "table")
-        (lost,) = {p.id for p in room.truth.objects} - {p.id for p in given.scene.objects}
-        table = next(k for k, p in enumerate(room.truth.objects) if p.id == lost)
-        works = torch.tensor([action == "both hands" for action in room.actions])
-        assert int(works.sum()) > 15
-        hands = torch.from_numpy(np.stack([part("left_hand"), part("right_hand")]))
-        for hand in hands:
-            assert bool((room.touched[works][:, hand] == table).any(1).all())
-        world = to_world(room.bodies.verts, room.truth.camera.R_cam_world)
-        assert room.truth.ground is not None
-        top = room.truth.ground + room.furniture[table].top_height
-        assert (world[works][:, hands.any(0), 1].amin(1) - top).abs().max() < 0.02
-
-    def test_people_walk_onto_a_platform_and_sit_on_it_and_all_else_is_on_the_floor(self) -> None:
-        room = make_platform_room(100, dataclasses.replace(SETS["mini"].room, support="platform"))
-        seat = next(k for k, p in enumerate(room.truth.objects) if p.support == "platform_0")
-        high, floor = room.furniture[-1].top_height, floor_of(room.truth)
-        assert floor is not None
-        base = [float(p.t_world_object[1]) - floor.ground for p in room.truth.objects]
-        wanted = [high if k == seat else 0.0 for k in range(len(base))]
-        assert base == pytest.approx(wanted, abs=1e-6)
-        world = to_world(room.bodies.verts, room.truth.camera.R_cam_world)
-        over = world[..., 1].amin(1) - height_under_bodies(
-            floor, dataclasses.replace(room.bodies, verts=world, space="world")
-        )
-        sits = torch.tensor([action == "sit" for action in room.actions])
-        sits &= (room.touched == seat).any(1)
-        assert int(sits.sum()) > 10
-        assert over[sits].abs().max() < 0.02
-        on = world[..., 1].amin(1) > floor.ground + high - 0.02
-        off = world[..., 1].amin(1) < floor.ground + 0.02
-        assert float((on | off).float().mean()) > 0.85
-        assert int((on.int().diff() == 1).sum()) >= 1
-        assert {p.support for p in room.capture.scene.objects} == {"ground"}
-
     def test_a_third_of_the_pieces_of_drawn_rooms_is_partly_hidden_and_all_are_seen(self) -> None:
         hidden, pixels = [], []
         for seed in range(6):

@@ -137,8 +137,7 @@ def test_run_refuses_a_setting_before_it_reads_anything(flags, words, capsys):
         ("batch", ("x", "--ray.cpus", "nan"), "--ray.cpus: has nan"),
         ("video", ("x", "--out", "y", "--fov", "0"), "--fov: has 0"),
         ("fit", ("k.npz", "--fps", "0"), "--fps: has 0.0, expected a number from 0.001 to 10,000"),
-        ("rooms", ("x", "y", "--fps", "0"), "--fps: has 0.0, expected a number from 0.001 to 120"),
-        ("demo", ("--seed", "-1"), "--seed: has -1"),
+        ("experiment", ("--workers", "-1"), "--workers: has -1"),
     ],
 )
 def test_every_command_checks_its_numbers(command, flags, words, capsys):

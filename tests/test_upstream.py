@@ -1,7 +1,6 @@
-"""The set `upstream`: what today's tools give, all errors at once; each can be left out."""
+"""The set `upstream`: what today's tools give, all errors at once."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from test_noise import SILENT, size
 from test_rooms import shared_room
 
 from mover.bodies.skinning import open_body
-from mover.core.records import fingerprint
 from mover.core.types import SceneObject
 from mover.furniture.library import PIECES, make_piece
 from mover.geometry.boxes import box_of
@@ -24,7 +22,6 @@ from mover_bench.rooms.foreign import MAKERS, foreign_mesh
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise
 from mover_bench.rooms.noise_masks import coarse, wobbled
-from mover_bench.studies.sets import SETS, SWITCHES, set_named
 
 
 @pytest.fixture(scope="module")
@@ -136,23 +133,6 @@ def test_a_wrong_lens_keeps_the_picture_and_the_widths(room: KnownRoom, seed: in
         capture.bodies.joints[:, 0, 2], room.bodies.joints[:, 0, 2] * zoom, atol=1e-3
     )
     assert torch.allclose(capture.bodies.joints[..., :2], room.bodies.joints[..., :2], atol=1e-4)
-
-
-def test_each_error_of_the_set_can_be_switched_off_alone() -> None:
-    whole = SETS["upstream"].noise
-    assert set_named("upstream") is SETS["upstream"]
-    off = {name: set_named(f"upstream+no-{name}").noise for name in SWITCHES}
-    assert len({fingerprint(noise) for noise in off.values()}) == len(SWITCHES)
-    kind = NoiseConfig()
-    for name, noise in off.items():
-        assert all(not getattr(noise, field) for field in SWITCHES[name])
-        rest = [f.name for f in dataclasses.fields(noise) if f.name not in SWITCHES[name]]
-        assert all(getattr(noise, field) == getattr(whole, field) for field in rest)
-    touched = set(itertools.chain(*SWITCHES.values()))
-    changed = {
-        f.name for f in dataclasses.fields(whole) if getattr(whole, f.name) > getattr(kind, f.name)
-    }
-    assert changed - {"pose_seconds"} <= touched
 
 
 def test_the_other_sets_do_not_change(room: KnownRoom) -> None:

@@ -112,9 +112,7 @@ def on_the_way(room: KnownRoom, path: CameraPath) -> KnownRoom:
     drawn = _from(room, path)
     shown = visible(room.plan, seen, lambda frame: drawn(frame)[0])
     capture = dataclasses.replace(room.capture, bodies=seen, people=shown.people)
-    return dataclasses.replace(
-        room, bodies=seen, capture=capture, whole=shown.whole, passing=shown.passing
-    )
+    return dataclasses.replace(room, bodies=seen, capture=capture, whole=shown.whole)
 
 
 @one_thread()

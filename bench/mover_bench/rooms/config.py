@@ -5,8 +5,6 @@ from typing import Literal
 
 Rule = Literal["wall", "corner", "middle", "facing", "before", "around", "beside"]
 """Where a piece of furniture may stand."""
-Withheld = Literal["seat", "step", "table"]
-"""What people rest on and no detector saw."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +41,6 @@ class ActConfig:
     """Most tasks with furniture for each person."""
     walks: int = 2
     """Walks to free places: the first comes before all tasks, the others after them."""
-    rounds: int = 1
-    """How often each piece is thought of; more make other uses of the same piece."""
-    apart: float = 0.0
-    """More than 0: people only walk, and keep their skin so far from all furniture [m]."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +69,8 @@ class RoomConfig:
     """Factor on how long people sit, lie and stand."""
     most_frames: int = 0
     """The video ends after so many; 0: when everybody is done."""
-    moved: Literal["no", "put", "stays", "pushed", "rolled"] = "no"
-    """How a piece is moved in the middle of the video: put elsewhere between two visits (stays: two
-    visits, and nothing is moved), pushed by hand, or rolled under who sits on it."""
-    support: Literal["no", "step", "platform", "table"] = "no"
-    """There is a step, on which somebody stands first, or a platform under a seat, or a table at
-    which people work with both hands."""
-    least_passing: float = 0.0
-    """Least share of the bodies that furniture hides in part."""
+    moved: bool = False
+    """A piece is put elsewhere between the visits of two people."""
     plan: PlanConfig = field(default_factory=PlanConfig)
     """How the room is furnished and seen."""
     acts: ActConfig = field(default_factory=ActConfig)

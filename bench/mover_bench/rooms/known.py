@@ -1,15 +1,14 @@
 """What is known of a room: the capture that a perfect upstream would give, and the truth."""
 
-import dataclasses
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
-from itertools import groupby
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mover.app.demo import rounded
 from mover.bodies.skinning import open_body
 from mover.core.records import map_tensors, record
 from mover.core.types import Bodies, BodyPose, Capture, Detection, Masks, People, Scene, SceneObject
@@ -19,9 +18,8 @@ from mover.geometry.warp_start import beside, mapped
 from mover_bench.rooms.compose import Plan
 from mover_bench.rooms.config import RoomConfig
 from mover_bench.rooms.motion import Performance, Stage
-from mover_bench.rooms.placed import Placed
 from mover_bench.rooms.poses import angles
-from mover_bench.rooms.render import Sight, box_of_mask, encode, look_at, outlines, see
+from mover_bench.rooms.render import Sight, box_of_mask, encode, look_at, see
 from mover_bench.rooms.truth import GAPE, NONE, Nearness, nearness
 from mover_bench.rooms.turns import from_vector, to_vector
 
@@ -35,9 +33,6 @@ def one_thread() -> Generator[None, None, None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-PASSING = 0.1  # a body of which furniture hides more passes behind it
 
 
 @record
@@ -61,9 +56,7 @@ class KnownRoom:
     refused: tuple[str, ...]
     """Rooms and tasks that were not true enough, with the reasons."""
     whole: Int[Tensor, " bodies"]
-    """Pixels that each body would fill if nothing hid it."""
-    passing: Bool[Tensor, " bodies"]
-    """Furniture hides more than `PASSING` of what the image would show of the body."""
+    """Pixels that each body would fill if nothing occluded it."""
 
 
 class RefusedError(Exception):
@@ -105,63 +98,25 @@ class Actor:
         return Acted(pose, act.posture.pelvis, person.origin, act.labels, act.touched)
 
 
-Moving = Mapping[int, Placed]
-"""A piece of the plan in the frames in which it stands elsewhere."""
-NOWHERE: Moving = {}
-
-
-def plan_at(plan: Plan, moving: Moving, frame: int) -> Plan:
-    """The room in a frame."""
-    there = moving.get(frame)
-    if there is None:
-        return plan
-    pieces = tuple(there if piece.id == there.id else piece for piece in plan.pieces)
-    return dataclasses.replace(plan, pieces=pieces)
-
-
-def looks(
-    plan: Plan, moving: Moving, sight: Sight
-) -> Callable[[int], tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]]:
-    """Depth of the furniture [m] and the piece of each pixel, in a frame, without people."""
-    last: list[tuple[Placed, tuple[Tensor, Tensor]]] = []
-
-    def at(frame: int) -> tuple[Tensor, Tensor]:
-        there = moving.get(frame)
-        if there is None:
-            return sight.depth, sight.piece
-        held = last[0] if last else None
-        if held is None or held[0] is not there:
-            held = there, outlines(plan_at(plan, moving, frame))[:2]
-            last[:] = [held]
-        return held[1]
-
-    return at
-
-
 def build(
     plan: Plan,
-    actors: tuple[Actor | Acted, ...],
+    actors: tuple[Actor, ...],
     config: RoomConfig,
     name: str,
     refused: tuple[str, ...],
-    moving: Moving = NOWHERE,
 ) -> KnownRoom:
     """Put people and furniture before the camera.
 
     Raises:
         RefusedError: If too little is seen or happens.
     """
-    acts = tuple(a.acted if isinstance(a, Actor) else a for a in actors)
+    acts = tuple(actor.acted for actor in actors)
     _check(acts, config)
     sight = see(plan)
-    furniture_at = looks(plan, moving, sight)
     detections = _detections(plan, sight, config)
-    crowd = _crowd(plan, acts, config.fps, moving)
+    crowd = _crowd(plan, acts, config.fps)
     scene = _scene(plan)
-    shown = visible(plan, crowd.bodies, lambda frame: furniture_at(frame)[0])
-    share = float(shown.passing.double().mean())
-    if share < config.least_passing:
-        raise RefusedError(f"furniture hides a part of only {share:.0%} of the bodies")
+    shown = visible(plan, crowd.bodies, lambda _: sight.depth)
     capture = Capture(
         name=name, scene=scene, camera_height=None, detections=detections,
         reference=sight.picture, reference_people=None, bodies=crowd.bodies,
@@ -171,7 +126,7 @@ def build(
     return KnownRoom(
         capture=capture, truth=scene, bodies=crowd.bodies, touching=crowd.touching,
         touched=crowd.touched, actions=crowd.actions, furniture=furniture, plan=plan,
-        refused=refused, whole=shown.whole, passing=shown.passing,
+        refused=refused, whole=shown.whole,
     )  # fmt: skip
 
 
@@ -218,27 +173,16 @@ class _Crowd:
     actions: tuple[str, ...]
 
 
-def _nearness(skin: np.ndarray, plan: Plan, moving: Moving) -> Nearness:
-    """How near somebody is to what, while a piece moves."""
-    groups = groupby(range(len(skin)), key=lambda frame: id(moving.get(frame)))
-    parts = [list(frames) for _, frames in groups]
-    found = [nearness(skin[part], plan_at(plan, moving, part[0]).pieces) for part in parts]
-    distance, nearest = (
-        np.concatenate([getattr(near, name) for near in found]) for name in ("distance", "nearest")
-    )
-    return Nearness(distance, nearest)
-
-
-def _crowd(plan: Plan, acts: tuple[Acted, ...], fps: float, moving: Moving) -> _Crowd:
+def _crowd(plan: Plan, acts: tuple[Acted, ...], fps: float) -> _Crowd:
     """Everybody in camera axes, how near they are to what, and what they do."""
     model = open_body()
     rows = [(f, k) for k, a in enumerate(acts) for f in range(len(a.labels))]
     order = sorted(range(len(rows)), key=lambda k: rows[k])
     index = torch.tensor(order)
-    pose = _in_camera(plan, acts, index)
+    pose = in_camera(plan, acts, index)
 
     def near() -> list[Nearness]:
-        return [_nearness(model.posed(a.pose)[0].numpy(), plan, moving) for a in acts]
+        return [nearness(model.posed(a.pose)[0].numpy(), plan.pieces) for a in acts]
 
     nears, (verts, joints) = beside(near, lambda: model.posed(pose))
     distance = torch.cat([torch.from_numpy(n.distance).float() for n in nears])[index]
@@ -260,12 +204,7 @@ def _crowd(plan: Plan, acts: tuple[Acted, ...], fps: float, moving: Moving) -> _
     return _Crowd(bodies, touching, touched, tuple(labels[k] for k in order))
 
 
-def rounded(value: Tensor) -> Tensor:
-    """To 10 micrometres, so that the last bits of other machines do not show."""
-    return value.mul(1e5).round().div(1e5).float()
-
-
-def _in_camera(plan: Plan, acts: tuple[Acted, ...], index: Tensor) -> BodyPose:
+def in_camera(plan: Plan, acts: tuple[Acted, ...], index: Tensor) -> BodyPose:
     """Pose parameters in camera axes, float64; the root turns about the pelvis."""
     R = plan.view.camera.R_cam_world.double().numpy()
     eye = np.array([0.0, plan.view.height, 0.0])
@@ -290,37 +229,33 @@ class Shown:
     people: People
     """Masks without what furniture or a nearer person hides."""
     whole: Int[Tensor, " bodies"]
-    """Pixels of the body alone."""
-    passing: Bool[Tensor, " bodies"]
-    """Furniture hides more than `PASSING` of them."""
+    """Pixels of the body by itself."""
 
 
 def visible(plan: Plan, bodies: Bodies, furniture: Callable[[int], Tensor]) -> Shown:
     """What the camera sees of bodies in its axes; `furniture` is its depth in a frame [m]."""
 
-    def at(frame: int) -> list[tuple[bytes, int, int]]:
+    def at(frame: int) -> list[tuple[bytes, int]]:
         depth = furniture(frame)
         group = bodies.verts[bodies.frame == frame]
-        looks = [look_at(plan, verts, bodies.faces) for verts in group]
+        views = [look_at(plan, verts, bodies.faces) for verts in group]
         nearest = depth.clone()
-        for look in looks:
+        for look in views:
             nearest[look.window] = torch.minimum(nearest[look.window], look.depth)
-        found: list[tuple[bytes, int, int]] = []
-        for look in looks:
+        found: list[tuple[bytes, int]] = []
+        for look in views:
             whole = look.depth.isfinite()
-            free = whole & (look.depth <= depth[look.window])
             mask = torch.zeros_like(depth, dtype=torch.bool)
             mask[look.window] = whole & (look.depth <= nearest[look.window])
-            found.append((encode([mask.numpy()]).counts[0], int(whole.sum()), int(free.sum())))
+            found.append((encode([mask.numpy()]).counts[0], int(whole.sum())))
         return found
 
     # Rows are in the order of their frames.
     rows = [row for found in mapped(at, bodies.frame.unique().tolist()) for row in found]
     camera = plan.view.camera
-    coded = Masks(camera.height, camera.width, tuple(mask for mask, _, _ in rows))
-    whole, free = torch.tensor([counts for _, *counts in rows]).unbind(1)
+    coded = Masks(camera.height, camera.width, tuple(mask for mask, _ in rows))
     people = People(coded, bodies.frame, bodies.person, {})
-    return Shown(people, whole, free < (1 - PASSING) * whole)
+    return Shown(people, torch.tensor([count for _, count in rows]))
 
 
 def pieces_seen(

@@ -4,7 +4,6 @@ A task that would sink into furniture, or hang in the air where it should touch,
 left out; the reasons are kept.
 """
 
-from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -33,7 +32,6 @@ from mover_bench.rooms.seating import (
 from mover_bench.rooms.truth import faults
 from mover_bench.rooms.turns import facing, smooth
 
-ARM = 0.06  # [m], how far arms that swing reach out over the width of a way
 DOOR = 0.3  # [m], from a seat or table to where one turns round
 
 
@@ -84,8 +82,6 @@ class Stage:
     bounds: Float[np.ndarray, "2 2"]
     """Smallest and largest x and z that one may walk [m]."""
     fps: float
-    apart: float = 0.0
-    """More than 0: how far from all furniture the skin must stay [m]."""
 
 
 @record
@@ -97,22 +93,6 @@ class Performance:
     touched: tuple[int, ...]
     """Index of the piece in use in each frame, or -1."""
     refused: tuple[str, ...]
-    stop: Stop | None = None
-    """Where it ends."""
-
-
-def in_turn(start: Performance, takes: Sequence[Take], end: Performance) -> Performance:
-    """A performance, some takes and another performance, one after the other."""
-    frames = [(take, len(take.posture.pelvis)) for take in takes]
-    labels = [take.label for take, count in frames for _ in range(count)]
-    touched = [take.piece for take, count in frames for _ in range(count)]
-    return Performance(
-        chain([start.posture, *(take.posture for take in takes), end.posture]),
-        (*start.labels, *labels, *end.labels),
-        (*start.touched, *touched, *end.touched),
-        (*start.refused, *end.refused),
-        end.stop,
-    )
 
 
 def perform(
@@ -141,7 +121,7 @@ def perform(
     count = [len(t.posture.pelvis) for t in takes]
     labels = tuple(t.label for t, n in zip(takes, count, strict=True) for _ in range(n))
     touched = tuple(t.piece for t, n in zip(takes, count, strict=True) for _ in range(n))
-    return Performance(chain([t.posture for t in takes]), labels, touched, tuple(refused), here)
+    return Performance(chain([t.posture for t in takes]), labels, touched, tuple(refused))
 
 
 class RefusedTaskError(Exception):
@@ -150,26 +130,16 @@ class RefusedTaskError(Exception):
 
 def _played(stage: Stage, task: Task, way: tuple[Stop, Stop], phase: float) -> list[Take]:
     """Walk there and do it, checked against the furniture."""
-    return [walk_to(stage, *way), *done_there(stage, task, way[1], phase)]
-
-
-def walk_to(stage: Stage, here: Stop, stop: Stop) -> Take:
-    """Walk from one place to another, checked against the furniture."""
-    take = _walk(stage, here, stop)
-    _check(stage, [take])
-    return take
-
-
-def done_there(stage: Stage, task: Task, stop: Stop, phase: float = 0.0) -> list[Take]:
-    """Do a task where one stands, checked against the furniture."""
-    acts = _ACTS[task.kind](stage, task, stop, phase)
+    walked = _walk(stage, *way)
+    _check(stage, [walked])
+    acts = _ACTS[task.kind](stage, task, way[1], phase)
     _check(stage, acts)
-    return acts
+    return [walked, *acts]
 
 
 def _check(stage: Stage, takes: list[Take]) -> None:
     def wrong(take: Take) -> list[str]:
-        return faults(stage.person, take.posture, take.label, stage.pieces, take.piece, stage.apart)
+        return faults(stage.person, take.posture, take.label, stage.pieces, take.piece)
 
     found = [fault for faulty in mapped(wrong, takes) for fault in faulty]
     if found:
@@ -197,8 +167,7 @@ def stop_for(stage: Stage, task: Task, here: Stop) -> Stop:
 
 
 def _walk(stage: Stage, here: Stop, stop: Stop) -> Take:
-    more = stage.apart + ARM if stage.apart > 0 else 0.0
-    path = way(here.door, stop.door, stage.pieces, stage.bounds, more)
+    path = way(here.door, stop.door, stage.pieces, stage.bounds)
     outer = np.stack([here.place, stop.place])
     route: Stations = stations(path, here.heading, stop.heading, outer)
     return Take(walk(stage.person, route, _times(stage, duration(route))), "walk", -1)
@@ -271,11 +240,6 @@ def _table(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
     end = hand_on(stage.person, stop.place, stop.heading, piece, hand)
     label = ("left", "right")[hand] + " hand"
     still = Take(_still(stage, end, task.seconds, phase, 0.3), label, task.piece)
-    return there_and_back(stage, stop, end, still)
-
-
-def there_and_back(stage: Stage, stop: Stop, end: Posture, still: Take) -> list[Take]:
-    """From standing to hands on a top, what is done there, and back."""
     stand = standing(stage.person, stop.place, stop.heading)
     out = reach_out(end, stand, _shares(stage, REACH_TIME))
     return [Take(out, "reach", still.piece), still, Take(_reversed(out), "reach", still.piece)]

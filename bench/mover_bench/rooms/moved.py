@@ -7,7 +7,6 @@ a segmenter that tracks them would give it.
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,8 +26,7 @@ from mover_bench.rooms.known import (
     one_thread,
     pieces_seen,
 )
-from mover_bench.rooms.motion import RefusedTaskError
-from mover_bench.rooms.placed import NoWayError, Placed
+from mover_bench.rooms.placed import Placed
 from mover_bench.rooms.render import see
 from mover_bench.rooms.room import cast, make_room
 
@@ -38,8 +36,6 @@ EVERY = 2  # frames from one in which the objects are segmented to the next
 FAR = (0.5, 1.6)  # [m] by which a piece is moved
 TURN = 60.0  # [degrees] by which it is turned, at most
 TRIES = 60
-ROOMS = 4  # that are drawn for a seed
-OTHER = 1_000_000  # from the seed of one of them to that of the next
 Rows = TypeVar("Rows")
 
 
@@ -47,65 +43,24 @@ Rows = TypeVar("Rows")
 def make_moved_room(seed: int, config: RoomConfig) -> KnownRoom:
     """A room in which the piece that is used most, of those that can be moved, is moved.
 
-    Where `config.moved` is `stays`, the second visitor finds everything where it was.
-
     Raises:
         NoRoomError: If no piece of the room can be moved.
     """
     first = make_room(seed, config)
     rng = np.random.default_rng([seed, 77])
     refused: list[str] = []
-    for index in candidates(first, MOVABLE):
+    used = [int((first.touched == k).any(1).sum()) for k in range(len(first.furniture))]
+    movable = [k for k, piece in enumerate(first.furniture) if piece.category in MOVABLE]
+    for index in sorted(movable, key=lambda k: -used[k]):
         for _ in range(TRIES // 10):
             try:
-                stays = config.moved == "stays"
-                plan = first.plan if stays else _moved(first.plan, index, rng)
+                plan = _moved(first.plan, index, rng)
                 acts = cast(plan, config, rng, refused)
                 second = build(plan, acts, config, first.capture.name, ())
                 return _joined(first, second, index)
             except RefusedError as error:
                 refused.append(str(error))
     raise NoRoomError(f"seed {seed}: nothing can be moved: {refused[-3:]}")
-
-
-def candidates(room: KnownRoom, kinds: tuple[str, ...]) -> list[int]:
-    """Pieces of some kinds, those that are used most first."""
-    used = [int((room.touched == k).any(1).sum()) for k in range(len(room.furniture))]
-    can = [k for k, piece in enumerate(room.furniture) if piece.category in kinds]
-    return sorted(can, key=lambda k: -used[k])
-
-
-def first_draft(
-    seed: int,
-    config: RoomConfig,
-    chosen: Callable[[KnownRoom], Sequence[int]],
-    draft: Callable[[Plan, int], KnownRoom],
-    tries: int,
-    refusal: str,
-) -> KnownRoom:
-    """What can be acted first, in one of some rooms with one of some of its pieces.
-
-    Args:
-        seed: Of the first room.
-        config: How rooms are made.
-        chosen: Pieces of a room with which it may be acted, the best first.
-        draft: Acts with one of them, at random.
-        tries: Drafts with each.
-        refusal: What cannot be, where nothing can.
-
-    Raises:
-        NoRoomError: If no draft could be acted.
-    """
-    refused: list[str] = []
-    for other in range(ROOMS):
-        room = make_room(seed + other * OTHER, config)
-        for index in chosen(room):
-            for _ in range(tries):
-                try:
-                    return draft(room.plan, index)
-                except (RefusedError, RefusedTaskError, NoWayError, ValueError) as error:
-                    refused.append(str(error))
-    raise NoRoomError(f"seed {seed}: {refusal}: {refused[-3:]}")
 
 
 def _moved(plan: Plan, index: int, rng: np.random.Generator) -> Plan:
@@ -136,8 +91,7 @@ def _joined(first: KnownRoom, second: KnownRoom, index: int) -> KnownRoom:
     )
     end = int(second.bodies.frame.max()) + 1
     before, after = range(0, change, EVERY), range(change + change % EVERY, end, EVERY)
-    stays = first.plan is second.plan
-    truth = first.truth if stays else _scene(first.truth, second.truth, index, change)
+    truth = _scene(first.truth, second.truth, index, change)
     both = _both(first, second)
     capture = dataclasses.replace(
         first.capture,

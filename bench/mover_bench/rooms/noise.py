@@ -17,14 +17,14 @@ from torch import Tensor
 from mover.bodies.skinning import open_body
 from mover.core.records import map_tensors
 from mover.core.types import Bodies, BodyPose, Camera, Capture, Mesh, Scene, SceneObject
-from mover.furniture.library import SEATS, STEP, TOPS, another
+from mover.furniture.library import SEATS, another
 from mover.furniture.pieces import Furniture
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rle import decode
 from mover.geometry.rotations import rot_y
 from mover.geometry.warp_start import beside
 from mover.stages.camera.find_lens import through_lens
-from mover_bench.rooms.config import NoiseConfig, Withheld
+from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.foreign import foreign_mesh
 from mover_bench.rooms.known import KnownRoom, one_thread, rounded
 from mover_bench.rooms.noise_masks import (
@@ -41,8 +41,6 @@ from mover_bench.rooms.poses import LEG
 from mover_bench.rooms.turns import from_vector, to_vector
 
 SEATS_FOR_ONE = ("chair", "armchair", "office chair", "stool")
-LOST = {"seat": ("sit", "lean", "lie"), "step": ("step",), "table": ("both hands",)}
-"""Actions that tell which piece of each kind is used most."""
 HOLE = 0.1  # share of the surface that is missing where a mesh has a hole
 
 
@@ -115,7 +113,24 @@ LOST_SECONDS = 2.0  # memory of what loses them; a stretch lasts about a second
 
 
 def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) -> Bodies:
-    """Bodies as a network would see them, skinned anew from wrong pose parameters."""
+    """Bodies as a network would see them, skinned again from wrong pose parameters."""
+    bodies = room.bodies
+    pose, keep = noisy_pose(room, noise, rng)
+    verts, joints = open_body().posed(pose)
+    return dataclasses.replace(
+        bodies,
+        verts=rounded(verts[keep]),
+        joints=rounded(joints[keep]),
+        frame=bodies.frame[keep],
+        person=bodies.person[keep],
+        pose=map_tensors(lambda x: rounded(x[keep]), pose),
+    )
+
+
+def noisy_pose(
+    room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator
+) -> tuple[BodyPose, Tensor]:
+    """Wrong pose parameters of all bodies (float64), and the rows that are not missing."""
     bodies = room.bodies
     assert bodies.pose is not None, "a known room has parameters"
     pose = map_tensors(lambda x: x.double(), bodies.pose)
@@ -138,16 +153,8 @@ def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) 
         pose, shift = _of_mean_shape(pose, pelvis, shift)
     shift = shift + torch.from_numpy(noise.jitter * rng.normal(size=(count, 3)))
     pose = dataclasses.replace(pose, transl=pose.transl + shift)
-    verts, joints = open_body().posed(pose)
     keep = torch.from_numpy(np.flatnonzero(rng.uniform(size=count) >= noise.dropped))
-    return dataclasses.replace(
-        bodies,
-        verts=rounded(verts[keep]),
-        joints=rounded(joints[keep]),
-        frame=bodies.frame[keep],
-        person=bodies.person[keep],
-        pose=map_tensors(lambda x: rounded(x[keep]), pose),
-    )
+    return pose, keep
 
 
 def _of_mean_shape(pose: BodyPose, pelvis: Tensor, shift: Tensor) -> tuple[BodyPose, Tensor]:
@@ -270,19 +277,18 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     return wrong_lens(capture, noise.lens, np.random.default_rng([seed, 13]))
 
 
-def without_support(capture: Capture, room: KnownRoom, kind: Withheld) -> Capture:
-    """The capture without the piece of a kind on which people rest most.
+def without_seat(capture: Capture, room: KnownRoom) -> Capture:
+    """The capture without the seat that is used most.
 
-    A seat for one, whose middle its sitter tells, goes before sofas, benches and beds.
+    A seat for one person, whose middle its sitter gives, goes before sofas, benches and beds.
     """
-    actions = torch.tensor([action in LOST[kind] for action in room.actions])
-    used = [int((room.touched[actions] == k).any(1).sum()) for k in range(len(room.furniture))]
-    of_kind = {"step": {STEP}, "seat": SEATS, "table": TOPS - SEATS}[kind]
-    could = [k for k, n in enumerate(used) if n and room.furniture[k].category in of_kind]
-    single = [k for k in could if room.furniture[k].category in SEATS_FOR_ONE]
-    if not could:
+    resting = torch.tensor([action in ("sit", "lean", "lie") for action in room.actions])
+    used = [int((room.touched[resting] == k).any(1).sum()) for k in range(len(room.furniture))]
+    seats = [k for k, n in enumerate(used) if n and room.furniture[k].category in SEATS]
+    single = [k for k in seats if room.furniture[k].category in SEATS_FOR_ONE]
+    if not seats:
         return capture
-    lost = room.truth.objects[max(single or could, key=lambda k: used[k])]
+    lost = room.truth.objects[max(single or seats, key=lambda k: used[k])]
     return without(capture, {lost.annotation})
 
 

@@ -134,11 +134,8 @@ def way(
     goal: Float[np.ndarray, "2"],
     pieces: tuple[Placed, ...],
     bounds: Float[np.ndarray, "2 2"],
-    apart: float = 0.0,
 ) -> Floor:
     """Points (x, z) from start to goal, both included, inside of `bounds` [m].
-
-    They keep `apart` farther from furniture than usual.
 
     Raises:
         NoWayError: If furniture closes the way.
@@ -148,8 +145,8 @@ def way(
     shape = np.ceil((bounds[1] - bounds[0]) / CELL).astype(int) + 1
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1)
     points = bounds[0] + CELL * grid
-    cost = np.where(free_of(points, pieces, ROOMY + apart), 1.0, DEAR)
-    open_ = free_of(points, pieces, BODY + apart)
+    cost = np.where(free_of(points, pieces, ROOMY), 1.0, DEAR)
+    open_ = free_of(points, pieces, BODY)
     index = [_nearest(points, open_, end) for end in (start, goal)]
     _, before = dijkstra(_graph(open_, cost), indices=index[0], return_predecessors=True)
     cells = [index[1]]
@@ -158,7 +155,7 @@ def way(
         if cells[-1] < 0:
             raise NoWayError(f"no way from {start.round(2).tolist()} to {goal.round(2).tolist()}")
     middle = points.reshape(-1, 2)[cells[::-1]]
-    return _straightened(np.concatenate([start[None], middle, goal[None]]), pieces, apart)
+    return _straightened(np.concatenate([start[None], middle, goal[None]]), pieces)
 
 
 def _nearest(points: np.ndarray, open_: Bool[np.ndarray, "x z"], end: np.ndarray) -> int:
@@ -173,42 +170,40 @@ def _graph(open_: Bool[np.ndarray, "x z"], cost: Float[np.ndarray, "x z"]) -> ob
     from scipy.sparse import coo_matrix
 
     number = np.arange(open_.size).reshape(open_.shape)
-    rows, cols, prices = [], [], []
+    rows, cols, costs = [], [], []
     for dx, dz in ((1, 0), (0, 1), (1, 1), (1, -1)):
         a = (slice(0, -dx or None), slice(max(0, -dz), -dz if dz > 0 else None))
         b = (slice(dx, None), slice(max(0, dz), dz if dz < 0 else None))
         both = open_[a] & open_[b]
         rows.append(number[a][both])
         cols.append(number[b][both])
-        prices.append(np.hypot(dx, dz) * CELL * (cost[a][both] + cost[b][both]) / 2)
-    parts = tuple(np.concatenate(p) for p in (rows, cols, prices))
+        costs.append(np.hypot(dx, dz) * CELL * (cost[a][both] + cost[b][both]) / 2)
+    parts = tuple(np.concatenate(p) for p in (rows, cols, costs))
     one_way = coo_matrix((parts[2], (parts[0], parts[1])), shape=(open_.size, open_.size))
     return (one_way + one_way.T).tocsr()
 
 
-def _straightened(path: Floor, pieces: tuple[Placed, ...], apart: float) -> Floor:
-    """Leave out corners where the straight line is not dearer than the way around."""
-    ends = np.cumsum(_prices(path[:-1], path[1:], pieces, apart))
+def _straightened(path: Floor, pieces: tuple[Placed, ...]) -> Floor:
+    """Leave out corners where the straight line costs no more than the way around."""
+    ends = np.cumsum(_costs(path[:-1], path[1:], pieces))
     cumulative = np.concatenate([[0.0], ends])
     kept, at = [0], 0
     while at < len(path) - 1:
         later = np.arange(len(path) - 1, at, -1)
-        price = _prices(np.repeat(path[at][None], len(later), 0), path[later], pieces, apart)
-        cheap = price <= 1.01 * (cumulative[later] - cumulative[at]) + 1e-9
+        cost = _costs(np.repeat(path[at][None], len(later), 0), path[later], pieces)
+        cheap = cost <= 1.01 * (cumulative[later] - cumulative[at]) + 1e-9
         at = int(later[np.flatnonzero(cheap)[0]]) if cheap.any() else at + 1
         kept.append(at)
     return path[kept]
 
 
-def _prices(
-    start: Floor, end: Floor, pieces: tuple[Placed, ...], apart: float
-) -> Float[np.ndarray, " lines"]:
+def _costs(start: Floor, end: Floor, pieces: tuple[Placed, ...]) -> Float[np.ndarray, " lines"]:
     """Cost of straight lines; infinite where a line is blocked in its middle."""
     share = np.linspace(0, 1, 24)[:, None, None]
     points = start + share * (end - start)
     length = np.linalg.norm(end - start, axis=-1)
-    near = np.where(free_of(points, pieces, ROOMY + apart), 1.0, DEAR)
+    near = np.where(free_of(points, pieces, ROOMY), 1.0, DEAR)
     inner = np.linalg.norm(points - start, axis=-1) > 0.3
     inner &= np.linalg.norm(points - end, axis=-1) > 0.3
-    blocked = (~free_of(points, pieces, BODY + apart) & inner).any(0)
+    blocked = (~free_of(points, pieces, BODY) & inner).any(0)
     return np.where(blocked, np.inf, length * near.mean(0))

@@ -17,13 +17,10 @@ from mover_bench.rooms.placed import ROOMY, Placed, free_of
 from mover_bench.rooms.poses import jointed, make_person, rows
 from mover_bench.rooms.render import draw_bodies, see
 from mover_bench.rooms.seating import table_stand
-from mover_bench.rooms.truth import faults
 from mover_bench.rooms.turns import facing
 
 SITS = frozenset({"chair", "armchair", "office chair", "sofa", "stool", "bench"})
 STANDS = frozenset({"table", "desk", "cabinet"})
-PLACES = 60  # to choose walks from
-GONE = 4  # so many last goals the next one keeps away from
 
 
 def draw_person(rng: np.random.Generator) -> list[float]:
@@ -58,32 +55,10 @@ def draw_tasks(
 
     `length` is a factor on all times to stay.
     """
-    if acts.apart > 0:
-        return draw_walks(plan, rng, acts.walks)
-    tasks: list[Task] = []
-    for _ in range(acts.rounds):
-        uses = _uses(plan, rng, length)
-        tasks += [uses[k] for k in rng.permutation(len(uses))]
+    uses = _uses(plan, rng, length)
+    tasks = [uses[k] for k in rng.permutation(len(uses))]
     walks = [Task("walk", goal=_pair(free_place(plan, rng))) for _ in range(acts.walks)]
     return (*walks[:1], *tasks[: acts.tasks], *walks[1:])
-
-
-def draw_walks(plan: Plan, rng: np.random.Generator, count: int) -> tuple[Task, ...]:
-    """Walks to free places far from one another, every other one behind furniture if any is."""
-    places = np.array([free_place(plan, rng) for _ in range(PLACES)])
-    behind = places[[_is_behind(place, plan) for place in places]]
-    goals = places[:1]
-    for k in range(count):
-        pool = places if k % 2 or not len(behind) else behind
-        apart = np.linalg.norm(pool[:, None] - goals[-GONE:], axis=-1).min(1)
-        goals = np.concatenate([goals, pool[[int(apart.argmax())]]])
-    return tuple(Task("walk", goal=_pair(goal)) for goal in goals[1:])
-
-
-def _is_behind(place: np.ndarray, plan: Plan) -> bool:
-    """Whether furniture stands between the camera and a place."""
-    line = np.linspace(0, 1, 60)[:, None] * place
-    return not bool(free_of(line, plan.pieces, 0.0).all())
 
 
 def _uses(plan: Plan, rng: np.random.Generator, length: float) -> list[Task]:
@@ -184,18 +159,12 @@ def cast(
 def _actor(plan: Plan, config: RoomConfig, rng: np.random.Generator) -> Actor:
     """Somebody of a random shape who does random things."""
     bounds = np.stack([plan.walls[0] + 0.25, plan.walls[1] - 0.25])
-    person, apart = make_person(draw_person(rng)), config.acts.apart
-    stage = Stage(person, plan.pieces, bounds, config.fps, apart)
+    stage = Stage(make_person(draw_person(rng)), plan.pieces, bounds, config.fps)
     try:
         tasks, start = draw_tasks(plan, rng, config.stay, config.acts), draw_start(plan, rng)
     except ValueError as error:
         raise RefusedError(str(error)) from error
-    actor = Actor(stage, perform(stage, tasks, start, rng, config.most_frames))
-    if apart > 0:  # also between the tasks
-        near = faults(person, actor.performance.posture, "walk", plan.pieces, -1, apart)
-        if near:
-            raise RefusedError(near[0])
-    return actor
+    return Actor(stage, perform(stage, tasks, start, rng, config.most_frames))
 
 
 def patience(newcomer: Actor, others: list[Actor]) -> int | None:
@@ -257,6 +226,12 @@ _DEMO: tuple[tuple[str, str, int, int, tuple[float, float, float]], ...] = (
 @one_thread()
 def demo_room() -> KnownRoom:
     """A bed-sitting room whose tenant walks, sits, leans back, lies and stands at a table."""
+    plan, actor = demo_plan()
+    return build(plan, (actor,), RoomConfig(), "demo", actor.performance.refused)
+
+
+def demo_plan() -> tuple[Plan, Actor]:
+    """Its furniture, and what the tenant does."""
     pieces = tuple(
         Placed(name, make_piece(kind, np.random.default_rng(sizes), style), spot[:2], spot[2])
         for name, kind, style, sizes, spot in _DEMO
@@ -273,9 +248,7 @@ def demo_room() -> KnownRoom:
     )
     stage = Stage(make_person([0.0] * 10), pieces, np.array([[-2.5, -6.0], [2.5, -2.1]]), 5.0)
     start = Stop(np.array([0.9, -2.95]), 3.0, np.array([0.9, -2.95]))
-    performance = perform(stage, tasks, start, np.random.default_rng(5))
-    actors = (Actor(stage, performance),)
-    return build(plan, actors, RoomConfig(), "demo", performance.refused)
+    return plan, Actor(stage, perform(stage, tasks, start, np.random.default_rng(5)))
 
 
 @one_thread()

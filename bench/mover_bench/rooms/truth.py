@@ -110,7 +110,6 @@ RESTS = {
     "lie": ("torso",),
     "left hand": ("left_hand",),
     "right hand": ("right_hand",),
-    "both hands": ("left_hand", "right_hand"),
 }
 """Parts of the body that must touch the piece in use, by the name of the action."""
 ON_FEET = frozenset(
@@ -171,19 +170,16 @@ def faults(
     label: str,
     pieces: tuple[Placed, ...],
     index: int,
-    apart: float = 0.0,
 ) -> list[str]:
-    """Why these frames are not true: what sinks in, what hangs in the air, what comes too near.
+    """Why these frames are not true: what sinks in, what hangs in the air.
 
-    `index` is the piece that is used. Above 0, `apart` is what the skin keeps from furniture [m].
+    `index` is the piece that is used.
     """
     skin = skinned(person, posture)
     boxes = skin.min(1), skin.max(1)
     found: list[str] = []
     for piece in pieces:
-        near = around(piece, skin, boxes, apart)
-        if apart > 0 and near.min() < apart:
-            found.append(f"{label}: {100 * near.min():.1f} cm from {piece.id}")
+        near = around(piece, skin, boxes, 0.0)
         deep = -float(near.min())
         if deep > SINK:
             where = part_of(int(near.argmin()) % skin.shape[1])

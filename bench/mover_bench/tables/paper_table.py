@@ -6,27 +6,24 @@ done again, and what is finished so far is written as Markdown and CSV at every 
 
 import csv
 import math
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from mover.app.batch import LOG, last_lines, read_tree
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.settings import int_in
 from mover.pipeline.presets import PRESETS
 from mover_bench.datasets import pigraphs, prox_files
-from mover_bench.processes import Running, run_jobs, start_main
-from mover_bench.studies.compare import markdown
+from mover_bench.experiment.job import read_numbers
+from mover_bench.experiment.tables import markdown
+from mover_bench.pool import LOG, Pool, last_line, run_each
 from mover_bench.tables import published, rows
 from mover_bench.tables.rows import TableRow
 from mover_bench.tables.table_job import DONE, TableJob, key_of
 
-Launch = Callable[[TableJob], Running[int]]
-"""Starts a job; where none is given, as a process of its own."""
 MILLIMETRES = 1000.0
 
 
@@ -147,7 +144,7 @@ class TableArgs:
     """First words of the labels of rows; empty: all."""
 
 
-def paper_table(args: TableArgs, observe: Observer = silent, launch: Launch | None = None) -> Path:
+def paper_table(args: TableArgs, observe: Observer = silent, pool: Pool = run_each) -> Path:
     """Do all jobs that are not finished, and write OUT/NAME-PRESET.md and .csv.
 
     Returns:
@@ -168,11 +165,15 @@ def paper_table(args: TableArgs, observe: Observer = silent, launch: Launch | No
         where = f"{args.captures}/<name>/truth/scene.json"
         raise InputError(f"{args.captures}: has no capture of {table.title}, expected {where}")
     waiting = [] if args.look else [job for job in every if not is_finished(job)]
-    done = len(every) - len(waiting)
-    for job, code in run_jobs(waiting, args.workers or os.cpu_count() or 1, launch or start):
-        done += 1
-        observe(Step(f"{job.capture.name}: {job.name}", done - 1, len(every)))
-        del code  # a job without metrics.json has failed, and the page says so
+    for job in waiting:  # one without metrics.json has failed, and the page says so
+        (job.folder / DONE).unlink(missing_ok=True)
+    asked_jobs = [
+        ((str(job.capture), str(job.out), job.preset, job.name), job.folder / LOG)
+        for job in waiting
+    ]
+    ended = pool("mover_bench.tables.table_job", asked_jobs, args.workers)
+    for done, index in enumerate(ended, len(every) - len(waiting)):
+        observe(Step(f"{waiting[index].capture.name}: {waiting[index].name}", done, len(every)))
     return _written(table, jobs, args)
 
 
@@ -211,16 +212,9 @@ def belongs(name: str, table: str) -> bool:
     return (scene == prox_files.QUANTITATIVE) == (table == "prox-quantitative")
 
 
-def start(job: TableJob) -> Running[int]:
-    """Start a job; what it says goes to its log."""
-    (job.folder / DONE).unlink(missing_ok=True)
-    words = (str(job.capture), str(job.out), job.preset, job.name)
-    return start_main("mover_bench.tables.table_job", words, job.folder / LOG)
-
-
 def is_finished(job: TableJob) -> bool:
     """Whether its results are there, of these inputs and this version."""
-    return read_tree(job.folder / DONE).get("key") == key_of(job)
+    return read_numbers(job.folder / DONE).get("key") == key_of(job)
 
 
 def _written(
@@ -255,7 +249,7 @@ def _values(
     row: TableRow, jobs: Sequence[TableJob], part: Part, table: PaperTable
 ) -> dict[str, float]:
     """Means over the recordings of what is finished, in the units of the table."""
-    found = [read_tree(job.folder / DONE).get(row.stage, {}) for job in jobs]
+    found = [read_numbers(job.folder / DONE).get(row.stage, {}) for job in jobs]
     found = [tree for tree in found if tree]
     values: dict[str, float] = {"recordings": len({j.capture for j in jobs if _there(j)})}
     for column in part.columns:
@@ -268,7 +262,7 @@ def _values(
 
 
 def _there(job: TableJob) -> bool:
-    return bool(read_tree(job.folder / DONE))
+    return bool(read_numbers(job.folder / DONE))
 
 
 def _value(tree: Mapping[str, float], column: str) -> float:
@@ -323,10 +317,7 @@ def _failures(jobs: Mapping[TableRow, Sequence[TableJob]]) -> list[str]:
     """What is not there, so that nothing is left out silently."""
     lacking = [j for j in dict.fromkeys(j for f in jobs.values() for j in f) if not _there(j)]
     logs = {job: job.folder / LOG for job in lacking}
-    failed = {job: last_lines(path) for job, path in logs.items() if path.is_file()}
-    lines = [
-        f"**Failed**: {job.capture.name}, {job.name}: {said[-1] if said else 'it said nothing'}"
-        for job, said in failed.items()
-    ]
+    failed = {job: last_line(path) for job, path in logs.items() if path.is_file()}
+    lines = [f"**Failed**: {job.capture.name}, {job.name}: {said}" for job, said in failed.items()]
     rest = len(lacking) - len(failed)
     return lines + ([f"**Not run**: {rest} jobs."] if rest else [])

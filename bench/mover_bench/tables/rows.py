@@ -1,10 +1,10 @@
 """The rows of the paper's tables: what each is made of, and how the paper made it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from mover.pipeline.presets import PRESETS
-from mover_bench.studies.variants import HUMAN, LENGTHS, SEGMENTS, Cut, Variant, lone_term
+from mover_bench.experiment.variants import LENGTHS, SEGMENTS, TERMS, Cut, Variant, with_terms
 
 PLAIN = "full"
 STAGES = {"initial": "initial", "stage 1": "image", "full": "full"}
@@ -42,22 +42,19 @@ class TableRow:
 def variants(preset: str) -> dict[str, Variant]:
     """All jobs of a preset by name."""
     config = PRESETS[preset]
-    pair = lone_term(preset, "contact")
-    weights = replace(pair.config.place.weights, depth=PRESETS[preset].place.weights.depth)
-    both = replace(pair.config, place=replace(pair.config.place, weights=weights))
     people = {"baseline": "baseline", "camgp": "+CamGP", "sdf": "+CamGP+SDF",
               "contact": "+CamGP+SDF+Contact"}  # fmt: skip
     cuts = {
-        f"{LENGTH}-{seconds}-{k}": Cut(seconds, place=(k + 0.5) / SEGMENTS)
+        f"{LENGTH}-{seconds}-{k}": Cut(seconds, (k + 0.5) / SEGMENTS)
         for seconds in LENGTHS
         for k in range(SEGMENTS)
     }
     noises = {noise_job(k, x): Variant(config) for k, levels in NOISES.items() for x in levels}
     return {
         PLAIN: Variant(config),
-        **{name: lone_term(preset, name) for name in HUMAN},
-        "contact-depth": Variant(both),
-        **{f"people-{name}": Variant(config, bodies=row) for name, row in people.items()},
+        **{name: with_terms(config, name) for name in TERMS},
+        "contact-depth": with_terms(config, "contact", "depth"),
+        **{f"people-{name}": Variant(config, row=row) for name, row in people.items()},
         **{name: Variant(config, cut=cut) for name, cut in cuts.items()},
         **noises,
     }

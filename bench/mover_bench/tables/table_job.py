@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mover.app.batch import write_tree
+from mover.core.files import replacing
 from mover.core.records import fingerprint
 from mover.core.run import Run, sources
 from mover.core.types import Bodies, Capture, Room, Scene, SceneObject
@@ -40,11 +40,11 @@ from mover.pipeline.refit import refit_bodies
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
 from mover_bench.datasets.prox_files import scan_of
-from mover_bench.studies.measures import carry_all
-from mover_bench.studies.variants import withheld
+from mover_bench.experiment.measures import under_camera
+from mover_bench.experiment.variants import withheld
 from mover_bench.tables.rows import PLAIN, Disturbance, disturbance_of, variants
 
-DONE, FAILED = "metrics.json", "failure.json"
+DONE = "metrics.json"
 STEPS = 0  # iterations of a stage of the people's fit at most; 0: the preset's
 KEYPOINTS = "keypoints"
 """Folder of a capture with OpenPose's files, as the importer of PROX makes it."""
@@ -96,18 +96,19 @@ def do_job(job: TableJob) -> None:
     if disturbed is not None:
         scene = disturb(given.scene, disturbed, torch.Generator().manual_seed(0))
         given = replace(given, scene=scene)
-    capture = withheld(given, variant.hears, variant.cut)
+    capture = withheld(given, variant.given, variant.cut)
     room = reconstruct(capture, variant.config, Run(job.home))
     if given.bodies is not None and (room.bodies is None or variant.cut is not None):
-        room = carry_all(room, given)
+        room = under_camera(room, given, room.scene.camera)
     people = room.bodies
-    if variant.bodies and people is not None:
-        people = _refined(job, room, capture, variant.bodies)
+    if variant.row and people is not None:
+        people = _refined(job, room, capture, variant.row)
     scenes = {"full": (room.scene, people)}
     if job.name == PLAIN:  # other jobs have no rows of these
         scenes |= {"initial": (given.scene, given.bodies), "image": (room.image_only, people)}
     measured = {name: measure(job.capture, given, *scene) for name, scene in scenes.items()}
-    write_tree(job.folder / DONE, {"key": key_of(job), **measured})
+    with replacing(job.folder / DONE) as part:
+        part.write_text(json.dumps({"key": key_of(job), **measured}, indent=1, allow_nan=False))
 
 
 def _refined(job: TableJob, room: Room, capture: Capture, row: str) -> Bodies:

@@ -12,8 +12,8 @@ from mover.core.errors import InputError
 
 COMMANDS = {
     "demo": (
-        "mover_bench.cli:demo",
-        "Make a known room, reconstruct it, compare it with the truth.",
+        "mover.app.cli.demo:demo",
+        "Reconstruct a known room that comes with the package, compare it with the truth.",
     ),
     "video": (
         "mover.app.cli.video:video",
@@ -67,13 +67,9 @@ COMMANDS = {
         "mover_bench.cli:show_paper_table",
         "Print the paper's table for your copy of PROX or PiGraphs.",
     ),
-    "rooms": (
-        "mover_bench.cli:clip_rooms",
-        "Make a known room in which somebody moves as in a clip of motion capture.",
-    ),
     "experiment": (
-        "mover_bench.cli:run_presets",
-        "Rebuild known rooms with each preset and compare them with the truth.",
+        "mover_bench.cli:experiment",
+        "Reconstruct known rooms with variants of the method and compare them with the truth.",
     ),
     "export": (
         "mover.app.cli.results:export",
@@ -143,7 +139,13 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
 def command_of(name: str) -> Callable[[Sequence[str]], None]:
     """The function of a command; its module is imported now."""
     module, _, function = COMMANDS[name][0].partition(":")
-    return getattr(importlib.import_module(module), function)
+    try:
+        return getattr(importlib.import_module(module), function)
+    except ModuleNotFoundError as error:
+        if error.name != "mover_bench":
+            raise
+        where = "pip install --editable '.[bench]' in a copy of its repository"
+        raise InputError(f"mover_bench is not in the wheel of mover; {where}") from error
 
 
 def say(text: str, stream: Any = None) -> None:  # noqa: ANN401

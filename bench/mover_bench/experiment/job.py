@@ -1,0 +1,122 @@
+"""The variants of an experiment on the known room of one seed.
+
+A process a room (`python -m mover_bench.experiment.job SET SEED OUT KEEP VARIANT ...`) with one
+thread. Variants share their finished stages; what is finished is a file OUT/SET/SEED/VARIANT.json,
+and a variant that fails leaves its traceback there.
+"""
+
+import json
+import shutil
+import sys
+import traceback
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mover import __version__
+from mover.core import records
+from mover.core.files import replacing
+from mover.core.run import Run, sources
+from mover.pipeline.reconstruct import reconstruct
+from mover.stages.config import RefineBodiesConfig
+from mover.stages.people.refine_bodies import refine_bodies
+from mover_bench.experiment.measures import Judge, Trial, traits_of, under_camera
+from mover_bench.experiment.sets import RoomSet, changed, set_named
+from mover_bench.experiment.variants import VARIANTS, Variant, withheld
+from mover_bench.rooms.camera_path import filmed
+from mover_bench.rooms.known import KnownRoom
+from mover_bench.rooms.moved import make_moved_room
+from mover_bench.rooms.noise import without_seat
+from mover_bench.rooms.room import make_room
+
+
+def true_room(seed: int, rooms: RoomSet) -> KnownRoom:
+    """A generated room of a set, without noise."""
+    return (make_moved_room if rooms.room.moved else make_room)(seed, rooms.room)
+
+
+def noisy_room(seed: int, rooms: RoomSet) -> Trial:
+    """A generated room of a set, with the noise of the set."""
+    return with_noise(true_room(seed, rooms), seed, rooms)
+
+
+def with_noise(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
+    """A known room with the noise of a set."""
+    capture = filmed(room, rooms.noise, seed, rooms.paths[seed % len(rooms.paths)])
+    if rooms.withheld is not None:
+        capture = without_seat(capture, room)
+    return Trial(capture, room.truth, room.bodies, traits_of(room, capture.scene))
+
+
+def key_of(rooms: RoomSet, seed: int, variant: Variant) -> str:
+    """Digest of everything that the numbers of a variant depend on."""
+    made = rooms.room, rooms.noise, rooms.withheld, rooms.paths, rooms.version
+    return records.fingerprint(*made, seed, variant, sources("mover_bench"))
+
+
+def path_of(out: Path, rooms: str, seed: int, name: str) -> Path:
+    """The file of a variant's numbers."""
+    return out / rooms / str(seed) / f"{name}.json"
+
+
+def read_numbers(path: Path) -> dict[str, Any]:
+    """What a variant has left; empty where there is nothing or it was cut short."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+
+
+def is_finished(out: Path, rooms: str, seed: int, name: str, *, keep: bool) -> bool:
+    """Whether numbers are there, of this version unless others are taken as well."""
+    found = read_numbers(path_of(out, rooms, seed, name))
+    here = key_of(set_named(rooms), seed, VARIANTS[name])
+    return "full" in found and (keep or found["key"] == here)
+
+
+def measured(trial: Trial, judge: Judge, variant: Variant, run: Run) -> dict[str, Any]:
+    """Reconstruct a room as a variant does and measure it."""
+    capture = withheld(trial.capture, variant.given, variant.cut)
+    room = reconstruct(capture, variant.config, run)
+    if room.bodies is None or variant.cut is not None:
+        room = under_camera(room, trial.capture, room.scene.camera)
+    if variant.refined:
+        refined = refine_bodies(room, capture, RefineBodiesConfig())
+        room = replace(room, bodies=refined.bodies)
+    seconds = sum(stage.seconds for stage in run.stages)
+    return judge.room(room) | {"seconds": seconds}
+
+
+def do_room(out: Path, rooms: str, seed: int, names: Sequence[str]) -> None:
+    """Reconstruct and measure the room of a seed under each variant, and write their numbers."""
+    chosen = set_named(rooms)
+    folder = out / rooms / str(seed)
+    room = true_room(seed, chosen)
+    for change in dict.fromkeys(VARIANTS[name].change for name in names):
+        trial = with_noise(room, seed, changed(chosen, change))
+        judge = Judge(trial)
+        for name in (name for name in names if VARIANTS[name].change == change):
+            about = {"key": key_of(chosen, seed, VARIANTS[name]), "version": __version__}
+            try:
+                numbers = measured(trial, judge, VARIANTS[name], Run(folder))
+            except Exception:  # other variants go on; the summary names it
+                numbers = {"failed": traceback.format_exc()}
+            with replacing(path_of(out, rooms, seed, name)) as part:
+                part.write_text(json.dumps(about | numbers, indent=1, allow_nan=False))
+    shutil.rmtree(folder / "stages", ignore_errors=True)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Do what is named on the command line."""
+    rooms, seed, out, keep, *names = arguments
+    torch.set_num_threads(1)
+    where = Path(out), rooms, int(seed)
+    left = [name for name in names if not is_finished(*where, name, keep=keep == "keep")]
+    do_room(*where, left)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

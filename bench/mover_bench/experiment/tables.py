@@ -1,0 +1,243 @@
+"""The tables of an experiment: every object, the means, and a page that one can read."""
+
+import math
+import os
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from mover.core.files import replacing
+from mover.core.records import plain
+from mover_bench.experiment.args import ExperimentArgs
+from mover_bench.experiment.job import path_of, read_numbers
+from mover_bench.experiment.measures import ABOUT
+from mover_bench.experiment.sets import set_named
+from mover_bench.experiment.variants import VARIANTS
+from mover_bench.pool import LOG, last_line
+
+Frame = Any
+"""A `pandas.DataFrame`."""
+STAGES = ("initial", "image", "full")
+HIDDEN = 0.3  # share of an object that others occlude, from which on it counts as hidden
+RESAMPLES, LEVEL = 10_000, 0.95
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a metric is shown."""
+
+    title: str
+    better: int = 1
+    """1: larger is better, -1: smaller, 0: neither (it is compared with the truth's own)."""
+    unit: str = ""
+    factor: float = 1.0
+    """From metres, radians or shares to the unit."""
+    digits: int = 3
+
+    @property
+    def head(self) -> str:
+        """Name, unit, and the better side."""
+        unit = f" [{self.unit}]" if self.unit else ""
+        return f"{self.title}{unit}{ {1: ' ↑', -1: ' ↓', 0: ''}[self.better] }"
+
+    def shown(self, value: float, *, sign: bool = False) -> str:
+        """A value in the unit; `-` where there is none."""
+        if math.isnan(value):
+            return "-"
+        rounded = round(self.factor * value, self.digits) + 0.0  # no negative zero
+        return f"{rounded:{'+' if sign else ''}.{self.digits}f}"
+
+
+DEGREES = math.degrees(1)
+COLUMNS: dict[str, Column] = {
+    "iou3d": Column("IoU3D"),
+    "iou3d_aligned": Column("IoU3D aligned"),
+    "p2s": Column("P2S", -1, "cm", 100, 1),
+    "iou2d": Column("IoU2D"),
+    "center_error": Column("centre", -1, "cm", 100, 1),
+    "yaw_error": Column("yaw", -1, "°", DEGREES, 1),
+    "worse_by_10cm": Column("worse by > 10 cm", -1, "%", 100, 1),
+    "non_collision": Column("Non-Col"),
+    "contact": Column("Cont.", 0),
+    "contact_f1": Column("contact F1"),
+    "pitch_error": Column("pitch", -1, "°", DEGREES, 2),
+    "roll_error": Column("roll", -1, "°", DEGREES, 2),
+    "ground_error": Column("ground", -1, "cm", 100, 1),
+    "pje": Column("PJE", -1, "mm", 1000, 1),
+    "p_pje": Column("p.PJE", -1, "mm", 1000, 1),
+}
+"""Metrics of the tables, in their order."""
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table: the first column on the left, the others on the right."""
+    rule = ["---", *["--:"] * (len(head) - 1)]
+    return "\n".join("| " + " | ".join(row) + " |" for row in (head, rule, *rows))
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean over rooms and what the draw of the rooms leaves open."""
+
+    mean: float
+    low: float
+    """Lower end of the 95 % interval (percentiles of the resampled means)."""
+    high: float
+    rooms: int
+
+
+def interval(values: Sequence[float] | Float[np.ndarray, " rooms"], seed: int = 0) -> Interval:
+    """Mean over rooms and its interval by bootstrap; equal seeds and counts draw the same rooms.
+
+    Raises:
+        ValueError: If there are no rooms.
+    """
+    data = np.asarray(values, dtype=np.float64)
+    if not len(data):
+        raise ValueError("no rooms, expected at least 1")
+    drawn = data[np.random.default_rng(seed).integers(0, len(data), (RESAMPLES, len(data)))]
+    low, high = np.quantile(drawn.mean(1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Interval(float(data.mean()), float(low), float(high), len(data))
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What an experiment has found so far."""
+
+    scenes: Frame
+    """A row for each seed, variant (`name`, its table `row`) and stage, with all metrics."""
+    objects: Frame
+    """The same for each object, with what it is."""
+    lacking: Mapping[tuple[int, str], str]
+    """Why there are no numbers, by seed and variant."""
+    versions: tuple[str, ...]
+
+
+def read_finished(out: Path, rooms: str, seeds: Sequence[int], names: Sequence[str]) -> Finished:
+    """Read what the variants have left."""
+    from pandas import DataFrame
+
+    scenes, objects = list[dict[str, Any]](), list[dict[str, Any]]()
+    lacking: dict[tuple[int, str], str] = {}
+    versions: set[str] = set()
+    for seed, name in ((seed, name) for seed in seeds for name in names):
+        tree = read_numbers(path_of(out, rooms, seed, name))
+        if "full" not in tree:
+            log = out / rooms / str(seed) / LOG
+            told = tree["failed"].strip().split("\n")[-1] if "failed" in tree else last_line(log)
+            lacking[seed, name] = told
+            continue
+        versions.add(tree["version"])
+        for stage in STAGES:
+            about = {"seed": seed, "name": name, "row": VARIANTS[name].row or name, "stage": stage}
+            scenes.append(about | {"seconds": tree["seconds"]} | tree[stage])
+            objects += [
+                about | {key: item[key] for key in ABOUT} | item[stage] for item in tree["objects"]
+            ]
+    about = ["seed", "name", "row", "stage"]
+    rows = DataFrame(scenes, columns=None if scenes else [*about, "seconds"])
+    things = DataFrame(objects, columns=None if objects else [*about, *ABOUT])
+    return Finished(rows, things, lacking, tuple(sorted(versions)))
+
+
+def by_room(frame: Frame) -> Frame:
+    """Means over the variants of a row: a line for each row, stage and room."""
+    columns = [name for name in COLUMNS if name in frame]
+    return frame.groupby(["row", "stage", "seed"])[columns].mean()
+
+
+def write_tables(args: ExperimentArgs, names: Sequence[str], found: Finished) -> Path:
+    """Write results.csv, summary.csv and summary.md into OUT/SET; returns the latter."""
+    folder = args.out / args.set
+    _write_csv(found.objects, folder / "results.csv")
+    _write_csv(found.scenes, folder / "summary.csv")
+    with replacing(folder / "summary.md") as part:
+        part.write_text(page_of(args, names, found))
+    return folder / "summary.md"
+
+
+def _write_csv(frame: Frame, path: Path) -> None:
+    with replacing(path) as part:
+        frame.to_csv(part, index=False, float_format="%.6g", lineterminator="\n")
+
+
+def page_of(args: ExperimentArgs, names: Sequence[str], found: Finished) -> str:
+    """Means over rooms, differences from the first variant, means over kinds of objects."""
+    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    versions = " and ".join(found.versions) or "nothing is finished"
+    lines = [
+        f"# Known rooms: {args.set}",
+        f"    mover experiment --set {args.set} --seeds {args.seeds} --variants "
+        + " ".join(args.variants),
+        f"mover {versions}, torch {torch.__version__}, {machine}, one thread a room.",
+        set_named(args.set).about,
+        "Noise: "
+        + ", ".join(f"{n} {v:g}" for n, v in plain(set_named(args.set).noise).items() if v)
+        + ".",
+        "`initial` is the scene as it is given; `image` places the objects by the image alone,"
+        " under the camera that the full method has found. Intervals: 95 %, bootstrap over rooms.",
+    ]
+    lines += [
+        f"**Failed**: seed {seed}, {name}: {why}" for (seed, name), why in found.lacking.items()
+    ]
+    if not len(found.scenes):
+        return "\n\n".join(lines) + "\n"
+    rows = list(dict.fromkeys(VARIANTS[name].row or name for name in names))
+    shown = [(rows[0], "initial"), (rows[0], "image"), *((row, "full") for row in rows)]
+    means = by_room(found.scenes)
+    lines += ["## Mean over rooms", _means(means, shown)]
+    lines += [f"## Difference from {rows[0]}", _differences(means, rows)] if rows[1:] else []
+    used, hidden = found.objects.touched.astype(bool), found.objects.hidden >= HIDDEN
+    flipped = found.objects.flipped.astype(bool)
+    kinds = {"touched": used, "untouched": ~used, "hidden": hidden, "flipped": flipped}
+    for kind, chosen in kinds.items():
+        some = found.objects[chosen]
+        if len(some):
+            lines += [f"## Mean over {kind} objects", _means(by_room(some), shown)]
+    return "\n\n".join(lines) + "\n"
+
+
+def _chosen(means: Frame, row: str, stage: str) -> Frame:
+    """The means of one row and stage, by seed."""
+    level = means.index.get_level_values
+    return means[(level("row") == row) & (level("stage") == stage)].droplevel(["row", "stage"])
+
+
+def _means(means: Frame, shown: Iterable[tuple[str, str]]) -> str:
+    """One line for each row and stage; metrics that no line has are left out."""
+    columns = [name for name in COLUMNS if name in means and means[name].notna().any()]
+    lines: list[list[str]] = []
+    for key in shown:
+        rooms = _chosen(means, *key)
+        if not len(rooms):
+            continue
+        cells = [COLUMNS[name].shown(float(rooms[name].mean())) for name in columns]
+        lines.append([", ".join(key) if key[1] != "full" else key[0], *cells, str(len(rooms))])
+    return markdown(["", *(COLUMNS[name].head for name in columns), "rooms"], lines)
+
+
+def _differences(means: Frame, rows: Sequence[str]) -> str:
+    """What each row gains over the first one, in the rooms that both have."""
+    columns = [name for name in COLUMNS if name in means]
+    lines: list[list[str]] = []
+    for row in rows[1:]:
+        gaps = _chosen(means, row, "full") - _chosen(means, rows[0], "full")
+        if not gaps.notna().any(axis=None):
+            continue
+        cells: list[str] = []
+        for name in columns:
+            values = gaps[name].dropna().to_numpy()
+            if not len(values):
+                cells.append("-")
+                continue
+            gap, column = interval(values), COLUMNS[name]
+            ends = " … ".join(column.shown(x, sign=True) for x in (gap.low, gap.high))
+            cells.append(f"{column.shown(gap.mean, sign=True)} ({ends})")
+        lines.append([row, *cells, str(int(gaps[columns].notna().any(axis=1).sum()))])
+    return markdown(["", *(COLUMNS[name].head for name in columns), "rooms"], lines)

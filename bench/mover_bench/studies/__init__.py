@@ -1,1 +1,0 @@
-"""Known rooms rebuilt and measured: sets, jobs, tables and pictures."""
