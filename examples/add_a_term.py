@@ -16,7 +16,7 @@ from mover.core.observe import Energy
 from mover.core.types import Layout
 from mover.energy.config import Adam
 from mover.energy.minimize import minimize, weigh
-from mover.energy.terms.scale import scale_term
+from mover.energy.prior_terms import scale_term
 from mover.geometry.placement import place
 
 WALL = -4.0  # [m], z of the wall

@@ -5,14 +5,10 @@ from dataclasses import replace
 import torch
 
 from mover.core.types import Camera, Layout, Objects
+from mover.energy.human_terms import BodySpace, ContactPoints, DepthRange, shares_of
+from mover.energy.image_terms import SEEN, Measured
 from mover.energy.objective import HumanCues, ImageCues
-from mover.energy.terms.bbox import SEEN
-from mover.energy.terms.collision import BodySpace
-from mover.energy.terms.contact import ContactPoints, shares_of
-from mover.energy.terms.depth import DepthRange
-from mover.energy.terms.given import Given
-from mover.energy.terms.measured import Measured
-from mover.energy.terms.wall import Walls, rears_of
+from mover.energy.prior_terms import Given, Walls, rears_of
 from mover.geometry.camera import project, tilted, to_camera
 from mover.geometry.crops import crop_views
 from mover.geometry.placement import place

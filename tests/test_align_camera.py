@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mover.core.types import Camera
-from mover.energy.terms.feet import FootContacts, feet_term, heights, tilt_prior, up_cam
+from mover.energy.human_terms import FootContacts, feet_term, heights, tilt_prior, up_cam
 from mover.geometry.camera import pitch_roll, tilted
 from mover.stages.camera.align_camera import (
     AlignInputs,

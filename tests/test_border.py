@@ -10,10 +10,15 @@ from test_priced import agree, room, starts_of
 from mover.core.types import Layout
 from mover.energy.config import Adam, SceneConfig, SceneWeights
 from mover.energy.fused.energy import energy_function
+from mover.energy.image_terms import (
+    BORDER_WEIGHT,
+    SEEN,
+    bbox_term,
+    borders_of,
+    fit_borders,
+    silhouette_term,
+)
 from mover.energy.objective import HumanCues, best_borders, of_objects, scene_energy, some_objects
-from mover.energy.terms.bbox import SEEN, bbox_term
-from mover.energy.terms.border import PRICE, borders_of, fit_borders
-from mover.energy.terms.silhouette import silhouette_term
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import place
 from mover.geometry.raster import Crops, Topology, look
@@ -98,7 +103,7 @@ class TestTerm:
         found = fit_borders(drawn, seen, torch.ones(1), borders, (1.0, 1.0))
         assert borders.shifts[found.shift].tolist() == [-grow]
         assert float(found.bbox) == pytest.approx(0.0, abs=1e-7)
-        assert float(found.silhouette) == pytest.approx(PRICE, rel=1e-6)
+        assert float(found.silhouette) == pytest.approx(BORDER_WEIGHT, rel=1e-6)
 
     def test_the_box_alone_tells_the_shift_where_the_mask_is_unknown(self):
         seen = box_of(1), torch.full((1, 4), SEEN), torch.zeros(1, 64, 64).bool()
@@ -128,7 +133,7 @@ class TestTerm:
             one = replace(image, masks=mask, borders=None)
             rest = inputs.objects, inputs.camera, one, HumanCues()
             price = scene_energy(layout, *rest, ROBUSTLY).parts["silhouette"]
-            each.append(price + PRICE * shift**2)
+            each.append(price + BORDER_WEIGHT * shift**2)
         silhouettes = torch.stack(each)
         picked = silhouettes.gather(0, number[None])[0]
         torch.testing.assert_close(found["silhouette"], picked, rtol=1e-5, atol=1e-6)
@@ -157,7 +162,7 @@ class TestTerm:
                 for shift, mask in zip(SHIFTS, borders.masks, strict=True):
                     b = bbox_term(verts, image.boxes, sides, 1.0, "robust", shift)[start, i]
                     s = silhouette_term(drawn, mask, keep, "robust")[start, i]
-                    prices.append((float(b), float(trust[i] * s + PRICE * shift**2)))
+                    prices.append((float(b), float(trust[i] * s + BORDER_WEIGHT * shift**2)))
                 best = min(range(7), key=lambda k: prices[k][0] + 2 * prices[k][1])
                 assert int(found.shift[start, i]) == best
                 assert float(found.bbox[start, i]) == pytest.approx(prices[best][0], rel=1e-5)

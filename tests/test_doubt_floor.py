@@ -11,7 +11,7 @@ from mover.app.pictures.eye import video_eye
 from mover.app.pictures.paint import PERSON, draw, furniture, joined
 from mover.app.pictures.paint import people as surfaces_of
 from mover.core.types import Bodies, Detection, Masks, People, Scene
-from mover.energy.terms.feet import FootContacts
+from mover.energy.human_terms import FootContacts
 from mover.geometry.camera import to_camera
 from mover.geometry.rle import encode, tight_box
 from mover.stages.camera.doubt_floor import doubt_floor

@@ -11,8 +11,8 @@ from mover.core.records import map_tensors
 from mover.core.types import Layout
 from mover.energy.config import Adam, SceneConfig, SceneWeights, only
 from mover.energy.fused.energy import energy_function
+from mover.energy.human_terms import contact_distance, contact_term, shares_of
 from mover.energy.objective import HumanCues, scene_energy
-from mover.energy.terms.contact import contact_term, shares_of
 from mover.geometry.placement import place
 from mover.geometry.warp_start import use_threads
 from mover.stages.config import PlaceConfig
@@ -141,8 +141,9 @@ def test_contact_by_trees_is_that_of_all_pairs():
     torch.testing.assert_close(found.double(), wanted, rtol=1e-5, atol=1e-5)
     for a, b in zip(slopes(found, layout), slopes(wanted, layout), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
-    regions = (place(inputs.objects.top, layout), place(back, layout))
-    present = contact_term(regions, inputs.humans.touches, "paper")
+    touches = inputs.humans.touches
+    distance = contact_distance(layout, inputs.objects, touches)
+    present = contact_term(distance, touches, len(inputs.objects.ids), "paper")
     torch.testing.assert_close(found, present, rtol=1e-4, atol=1e-4)
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mover.energy.terms.depth import DepthMaps, Seen, bounds_of, merge
+from mover.energy.human_terms import BodyView, DepthMaps, bounds_of, merge
 from mover.stages.contacts.assign_contacts import in_turns, thin
 
 H, W = 12, 20
@@ -18,7 +18,7 @@ def seen(visible, others=None):
     front = torch.where(covered, torch.tensor(2.0), far)
     exit_ = torch.where(covered, torch.tensor(2.3), -far)
     none = torch.zeros(H, W, dtype=torch.bool)
-    return Seen(front, exit_, visible, none if others is None else others)
+    return BodyView(front, exit_, visible, none if others is None else others)
 
 
 def columns(first, last):

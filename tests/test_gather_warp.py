@@ -14,7 +14,7 @@ from test_volume import moving_spheres, posed_bodies, sphere
 from torch import Tensor
 
 from mover.core.types import Bodies, Camera, People
-from mover.energy.terms.depth import DepthMaps, Seen, bounds_of, merge
+from mover.energy.human_terms import BodyView, DepthMaps, bounds_of, merge
 from mover.geometry import volume_warp
 from mover.geometry.raster import Crops
 from mover.geometry.raster import layers as layers_warp
@@ -207,7 +207,7 @@ def test_bounds_are_those_of_whole_images_one_after_another() -> None:
     for row, verts in enumerate(sight.bodies.verts):
         cam = verts @ sight.camera.R_cam_world.mT
         drawn = raster_torch.layers(cam[None], sight.bodies.faces, views)
-        seen = Seen(drawn.front[0], drawn.exit[0], *sight.table.decode(row))
+        seen = BodyView(drawn.front[0], drawn.exit[0], *sight.table.decode(row))
         expected = merge(expected, bounds_of(seen, sight.masks, 2, vote=True))
     for workers in (1, 2, 3):
         found = gather_depth(sight, workers)

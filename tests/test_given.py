@@ -12,9 +12,9 @@ from analytic import FACES, box_verts, boxes_of, given_at
 from torch import Tensor
 
 from mover.core.types import Bodies, Camera, Heading, Layout, Mesh
-from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
-from mover.energy.terms.contact import ContactPoints
-from mover.energy.terms.given import AWAY, Given, given_term
+from mover.energy.human_terms import ContactPoints
+from mover.energy.image_terms import LEAST, LIKELY, SEEN, UNKNOWN
+from mover.energy.prior_terms import AWAY, Given, given_term
 from mover.furniture.library import PIECES, SIZES, STANDARD, STYLES, canonical, make_piece
 from mover.geometry.camera import tilted, to_camera, to_world
 from mover.geometry.mesh import box

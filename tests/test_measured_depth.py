@@ -12,7 +12,7 @@ from PIL import Image
 from mover.core.errors import InputError
 from mover.core.types import DepthImage, Layout
 from mover.energy.config import only
-from mover.energy.terms.measured import Measured
+from mover.energy.image_terms import Measured
 from mover.geometry.camera import to_world
 from mover.geometry.placement import place_in
 from mover.geometry.raster import Crops, Topology, look

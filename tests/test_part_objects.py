@@ -9,8 +9,8 @@ from analytic import FACES, box_verts, make_inputs
 
 from mover.core.observe import Energy
 from mover.core.types import Layout, Mesh
-from mover.energy.terms.apart import FAR, MARGIN, apart_term, gather_solids
-from mover.energy.terms.collision import SAMPLES
+from mover.energy.human_terms import SAMPLES
+from mover.energy.prior_terms import FAR, OVERLAP, apart_term, gather_solids
 from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place
 from mover.geometry.rotations import rot_y
@@ -113,7 +113,7 @@ def test_all_that_may_lie_in_one_share_what_each_does_alone_and_boxes_apart_shar
         points = place(objects.samples, near)[i] - t[j]
         size = near.log_scale[j].exp()
         own = points @ rot_y(near.yaw[j]) / size
-        deep = (-outline(solids.sections[j], own) * near.log_scale[j, ::2].mean().exp()) - MARGIN
+        deep = (-outline(solids.sections[j], own) * near.log_scale[j, ::2].mean().exp()) - OVERLAP
         deep = deep.relu() * solids.upright[i]
         least = deep.clamp_max(FAR)
         price = SAMPLES * (least * (2 * deep - least)).mean()

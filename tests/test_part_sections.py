@@ -8,7 +8,7 @@ import torch
 from analytic import FACES, SIZES, box_verts, make_inputs
 
 from mover.core.types import Layout, Mesh
-from mover.energy.terms.apart import FAR, MARGIN, UPRIGHT
+from mover.energy.prior_terms import FAR, OVERLAP, UPRIGHT
 from mover.geometry.mesh import sample_surface
 from mover.geometry.rotations import rot_y
 from mover.geometry.sections import CELL, WIDE, Sections, outline, sections_of
@@ -53,7 +53,7 @@ def test_above_and_below_a_thin_plate_is_free():
     sections = sections_of(box_verts((1.2, 0.03, 0.8)), FACES)
     for height in (-0.02, -0.003, 0.033, 0.05, 3.0):
         points = grid_of((-0.5, height, -0.3), (0.5, height, 0.3))
-        assert float(outline(sections, points).min()) > -MARGIN
+        assert float(outline(sections, points).min()) > -OVERLAP
 
 
 def test_it_is_measured_along_the_sides_of_a_turned_box():
@@ -114,7 +114,7 @@ def naive(objects, at, one, other):
     for sample in objects.samples[one]:
         world = rot_y(at.yaw[one]) @ (sample * at.log_scale[one].exp()) + at.t_world_object[one]
         x, y, z = (rot_y(at.yaw[other]).mT @ (world - at.t_world_object[other])).tolist()
-        deep = min(size[0] * grown / 2 - abs(x), size[2] * grown / 2 - abs(z)) - MARGIN
+        deep = min(size[0] * grown / 2 - abs(x), size[2] * grown / 2 - abs(z)) - OVERLAP
         upright = UPRIGHT < sample[1] < SIZES[one][1] - UPRIGHT
         if 0 < y < size[1] and deep > 0 and upright:
             total += deep**2 if deep < FAR else 2 * FAR * deep - FAR**2

@@ -14,7 +14,7 @@ from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.run import Run
 from mover.core.types import Camera, Detection, Masks, Scene, SceneObject
-from mover.energy.terms.bbox import SEEN
+from mover.energy.image_terms import SEEN
 from mover.furniture.library import make_piece
 from mover.geometry.boxes import box_of, iou3d
 from mover.geometry.camera import pitch_roll, tilted, to_camera, to_world

@@ -16,7 +16,7 @@ from mover.bodies.parts import members, parts_of
 from mover.bodies.posture import touching
 from mover.core.run import Run
 from mover.core.types import Bodies, Layout, Mesh, Proposal, Scene, SceneObject
-from mover.energy.terms.feet import FootContacts
+from mover.energy.human_terms import FootContacts
 from mover.evaluate.bodies import float_height, gather_gait, sink_depth
 from mover.evaluate.evaluation import evaluate_people
 from mover.furniture.floor import (

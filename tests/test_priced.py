@@ -14,10 +14,10 @@ from mover.core.records import record
 from mover.core.types import Layout
 from mover.energy.config import Adam, SceneConfig, SceneWeights
 from mover.energy.fused.energy import energy_function, energy_of_rows
+from mover.energy.human_terms import DepthRange
+from mover.energy.image_terms import LEAST, LIKELY, UNKNOWN
 from mover.energy.minimize import minimize
 from mover.energy.objective import scene_energy
-from mover.energy.terms.bbox import LEAST, LIKELY, UNKNOWN
-from mover.energy.terms.depth import DepthRange
 from mover.geometry.rotations import axis_angle
 from mover.geometry.topology import edges_of
 from mover.geometry.warp_start import use_threads

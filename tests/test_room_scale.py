@@ -11,7 +11,7 @@ from test_given import somewhere
 
 from mover.bodies.parts import parts_of
 from mover.core.types import Layout
-from mover.energy.terms.given import COMMON, SIZE
+from mover.energy.prior_terms import COMMON, SIZE
 from mover.furniture.floor import Floor
 from mover.stages.objects.gather_given import gather_given
 from mover.stages.objects.room_scale import (

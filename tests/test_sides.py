@@ -9,7 +9,7 @@ import torch
 from analytic import make_inputs
 from scipy.spatial import ConvexHull
 
-from mover.energy.terms.bbox import HIDDEN, LEAST, LIKELY, SEEN, SOFT, UNKNOWN, bbox_term
+from mover.energy.image_terms import HIDDEN, LEAST, LIKELY, SEEN, SOFT, UNKNOWN, bbox_term
 from mover.geometry.camera import project
 from mover.geometry.rotations import rot_y
 from mover.stages.config import ImageConfig

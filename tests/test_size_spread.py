@@ -9,7 +9,7 @@ from test_pipeline import light
 from mover.core.run import Run
 from mover.core.types import Layout
 from mover.energy.config import SceneWeights
-from mover.energy.terms.scale import scale_term
+from mover.energy.prior_terms import scale_term
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.config import SpreadConfig

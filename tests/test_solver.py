@@ -14,8 +14,8 @@ from mover.core.records import built, plain, record
 from mover.core.types import Layout
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
 from mover.energy.fused import energy as energy_warp
+from mover.energy.image_terms import squares
 from mover.energy.newton import Problems, _step, settle
-from mover.energy.terms.silhouette import squares
 from mover.geometry.camera import outermost, project, to_camera
 from mover.geometry.placement import place, place_in
 from mover.pipeline.presets import Config

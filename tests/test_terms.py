@@ -12,9 +12,14 @@ from hypothesis import strategies as st
 
 from mover.core.types import Layout
 from mover.energy.config import SceneWeights
+from mover.energy.human_terms import (
+    DepthRange,
+    contact_distance,
+    contact_term,
+    depth_term,
+    shares_of,
+)
 from mover.energy.objective import HumanCues
-from mover.energy.terms.contact import contact_term, shares_of
-from mover.energy.terms.depth import DepthRange, depth_term
 from mover.geometry.camera import project, to_camera
 from mover.geometry.placement import place, rest_on_support
 from mover.geometry.raster import Depths, Topology, look
@@ -198,15 +203,8 @@ class TestPrintedTerms:
         )
         assert torch.equal(shares_of(twice.weight), touches.share)
         one, other = (
-            contact_term(
-                (
-                    place(inputs.objects.top, away),
-                    place(inputs.objects.back, away),
-                ),
-                given,
-                "paper",
-            )
-            for given in (touches, twice)
+            contact_term(contact_distance(away, inputs.objects, some), some, 3, "paper")
+            for some in (touches, twice)
         )
         torch.testing.assert_close(one, other)
         assert one.max() > 0
@@ -217,9 +215,9 @@ class TestPrintedTerms:
         weight = touches.weight.clone()
         weight[1] *= 0.01
         away = replace(inputs.starts, t_world_object=inputs.starts.t_world_object + 0.3)
-        regions = tuple(place(x, away) for x in (inputs.objects.top, inputs.objects.back))
         few = replace(touches, weight=weight, share=shares_of(weight))
-        both, one = (contact_term(regions, t, "paper")[0] for t in (touches, few))
+        distance = contact_distance(away, inputs.objects, touches)
+        both, one = (contact_term(distance, t, 3, "paper")[0] for t in (touches, few))
         assert float(one[1]) == pytest.approx(2 / 101 * float(both[1]))
         assert float(one[0]) == pytest.approx(200 / 101 * float(both[0]))
 

@@ -16,8 +16,7 @@ from mover.app.viewer.session import Shown, start_session
 from mover.app.viewer.solve import Stopped, Watch, seen_in
 from mover.core.observe import Energy, Step
 from mover.core.types import Layout
-from mover.energy.terms.contact import ContactPoints, shares_of
-from mover.energy.terms.depth import DepthMaps
+from mover.energy.human_terms import ContactPoints, DepthMaps, shares_of
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, project, tilted, to_camera
 from mover.geometry.placement import hit_floor

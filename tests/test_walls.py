@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from mover.core.records import load, save
 from mover.core.types import Layout
 from mover.energy.config import BatchedBFGS, SceneConfig, SceneWeights
+from mover.energy.image_terms import LEAST, SEEN, UNKNOWN
 from mover.energy.objective import HumanCues, of_objects, scene_energy, some_objects
-from mover.energy.terms.bbox import LEAST, SEEN, UNKNOWN
-from mover.energy.terms.wall import ALONG, RHO, Walls, wall_term
+from mover.energy.prior_terms import ALONG, WALL_RHO, Walls, wall_term
 from mover.furniture.library import WALL_PIECES
 from mover.geometry.rotations import wrap
 from mover.pipeline.presets import ROBUST
@@ -88,7 +88,7 @@ class TestPrice:
                     a, b = normal.tolist()
                     if a * out[0] + b * out[1] > ALONG:
                         apart = sum((a * x + b * z - float(offset)) ** 2 for x, z in ends) / 2
-                        near.append(float(q) * (1 - apart / (apart + RHO**2)))
+                        near.append(float(q) * (1 - apart / (apart + WALL_RHO**2)))
                 want = float(walls.trust[i].max()) - max(near)
                 assert float(found[start, i]) == pytest.approx(want, abs=1e-12)
         assert (found[:, 0] == 0).all(), "nobody tells the first anything"
@@ -145,7 +145,7 @@ class TestPrice:
         for x in (0.0, 0.3, 1.0):
             t = torch.tensor([[x, GROUND, WALL + CABINET[2] / 2]]).double().requires_grad_()
             price = wall_term(Layout(t, *still), size, walls)
-            assert price.tolist() == pytest.approx([1 - 0.4 * 0.2])  # twice RHO off the other
+            assert price.tolist() == pytest.approx([1 - 0.4 * 0.2])  # twice WALL_RHO off the other
             (slope,) = torch.autograd.grad(price.sum(), t)
             assert float(slope[0, 0]) == 0
             assert float(slope[0, 2]) > 0, "it goes to its wall, along -z"

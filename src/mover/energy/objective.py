@@ -1,7 +1,8 @@
 """Eq. 1 as a list of terms: what each costs, the evidence that it needs, and its word for people.
 
-A new term is a file in `terms`, a weight in `SceneWeights` and a row in `SCENE_TERMS`; its evidence
-is a field of `ImageCues` or `HumanCues`, indexed by its axis `objects`.
+A new term is a function in `image_terms`, `human_terms` or `prior_terms`, a weight in
+`SceneWeights` and a row in `SCENE_TERMS`; its evidence is a field of `ImageCues` or `HumanCues`,
+indexed by its axis `objects`.
 """
 
 from collections.abc import Iterable
@@ -18,26 +19,37 @@ from mover.core.observe import Energy, PerItem
 from mover.core.records import record, rows_of
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights
-from mover.energy.minimize import Term, active_weights, sum_terms, there
-from mover.energy.terms.bbox import bbox_term
-from mover.energy.terms.border import Borders, Fitted, fit_borders
-from mover.energy.terms.collision import BodySpace, collision_share, collision_term
-from mover.energy.terms.contact import (
+from mover.energy.human_terms import (
+    BodySpace,
     ContactPoints,
+    DepthRange,
     Trees,
+    collision_share,
+    collision_term,
+    contact_distance,
     contact_term,
-    gap_term,
-    gaps,
+    depth_term,
     heading_term,
     some_touches,
 )
-from mover.energy.terms.depth import DepthRange, depth_term
-from mover.energy.terms.distance import distance_term
-from mover.energy.terms.given import Given, given_term
-from mover.energy.terms.measured import Measured, measured_term
-from mover.energy.terms.scale import scale_term
-from mover.energy.terms.silhouette import silhouette_term
-from mover.energy.terms.wall import Walls, wall_term
+from mover.energy.image_terms import (
+    Borders,
+    Fitted,
+    Measured,
+    bbox_term,
+    fit_borders,
+    measured_term,
+    silhouette_term,
+)
+from mover.energy.minimize import Term, active_weights, sum_terms, there
+from mover.energy.prior_terms import (
+    Given,
+    Walls,
+    distance_term,
+    given_term,
+    scale_term,
+    wall_term,
+)
 from mover.geometry.camera import outermost, project, to_camera
 from mover.geometry.placement import place, place_in
 from mover.geometry.raster import Crops, Depths, Topology, look
@@ -55,7 +67,7 @@ class ImageCues:
     boxes: Float[Tensor, "objects 4"]
     """Detected x_min, y_min, x_max, y_max [px]."""
     sides: Int[Tensor, "objects 4"]
-    """What is known of each side of the box, see `terms.bbox`."""
+    """What is known of each side of the box, see `image_terms`."""
     views: Crops
     """The window of each object."""
     masks: Float[Tensor, "objects h w"]
@@ -204,14 +216,10 @@ def _collision(s: PlacedScene) -> PerItem:
 
 
 def _contact(s: PlacedScene) -> PerItem:
-    """By search trees where there are any."""
-    objects, humans, form = s.known.objects, s.known.humans, s.config.form
+    objects, humans = s.known.objects, s.known.humans
     touches = there(humans.touches)
-    if humans.trees is None:
-        regions = place(objects.top, s.layout), place(objects.back, s.layout)
-        return contact_term(regions, touches, form)
-    found = gaps(s.layout, objects, touches, humans.trees)
-    return gap_term(found, touches, len(objects.ids), form)
+    distance = contact_distance(s.layout, objects, touches, humans.trees)
+    return contact_term(distance, touches, len(objects.ids), s.config.form)
 
 
 def _corners(s: PlacedScene) -> Float[Tensor, "*starts objects 8 3"]:

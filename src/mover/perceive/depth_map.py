@@ -5,8 +5,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.core.types import Camera
+from mover.energy.human_terms import DepthRange
 from mover.energy.objective import ImageCues
-from mover.energy.terms.depth import DepthRange
 from mover.geometry.camera import to_world
 from mover.geometry.crops import sample_nearest
 

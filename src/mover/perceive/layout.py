@@ -24,7 +24,7 @@ from mover.core.records import record, rows_of
 from mover.core.run import Run
 from mover.core.types import Camera, Detection, Heading, Layout, Mesh, Scene, SceneObject
 from mover.energy.objective import HumanCues, ImageCues
-from mover.energy.terms.given import Given
+from mover.energy.prior_terms import Given
 from mover.furniture.library import WIDE_CLASSES, canonical, catalogue, choose_piece
 from mover.geometry.mesh import box, used
 from mover.geometry.raster import Crops

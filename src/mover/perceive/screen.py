@@ -17,10 +17,9 @@ from torch import Tensor
 from mover.core.observe import Energy, Observer, silent
 from mover.core.records import record
 from mover.core.types import Camera, Layout
+from mover.energy.image_terms import SEEN, bbox_term
 from mover.energy.minimize import minimize
-from mover.energy.terms.bbox import SEEN, bbox_term
-from mover.energy.terms.given import Given, given_term
-from mover.energy.terms.scale import scale_term
+from mover.energy.prior_terms import Given, given_term, scale_term
 from mover.geometry.camera import pitch_roll, project, tilted, to_world
 from mover.geometry.placement import place
 from mover.perceive.config import ScreenConfig
@@ -49,7 +48,7 @@ class ScreenInputs:
     camera: Camera
     boxes: Float[Tensor, "things 4"]
     sides: Int[Tensor, "things 4"]
-    """What is known of each side of the box, see `terms.bbox`."""
+    """What is known of each side of the box, see `image_terms`."""
     depth: Float[Tensor, " things"]
     """Measured distance along the view of the visible surface [m]; NaN: unknown."""
     thing: Int[Tensor, " items"]

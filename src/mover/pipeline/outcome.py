@@ -25,7 +25,7 @@ from mover.core.types import (
     Scene,
     SceneObject,
 )
-from mover.energy.terms.feet import FootContacts
+from mover.energy.human_terms import FootContacts
 from mover.furniture.floor import Floor, floor_of
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import place, reproject, rest_on_support, standing_meshes

@@ -10,7 +10,7 @@ from torch import Tensor
 from mover.bodies.parts import Parts, parts_of
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, CameraPath, Capture
-from mover.energy.terms.feet import FootContacts
+from mover.energy.human_terms import FootContacts
 from mover.furniture.floor import is_platform
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import project

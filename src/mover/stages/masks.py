@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
 from mover.core.types import Bodies, Camera, Masks, People
-from mover.energy.terms.bbox import WIDTH
+from mover.energy.image_terms import WIDTH
 from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
 from mover.geometry.rle import decode, thinned

@@ -15,8 +15,7 @@ from torch import Tensor
 from mover.core import records
 from mover.core.records import record
 from mover.core.types import Camera, Mesh, Scene
-from mover.energy.terms.contact import ContactPoints
-from mover.energy.terms.depth import DepthMaps
+from mover.energy.human_terms import ContactPoints, DepthMaps
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted, to_camera, to_world
 from mover.geometry.placement import LOWEST, hit_floor

@@ -13,6 +13,7 @@ from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.fused.launch import FusedEnergy, fused_cost
 from mover.energy.fused.pack import FUSED, kernel_of, real_parts
+from mover.energy.human_terms import trees_of
 from mover.energy.objective import (
     SCENE_TERMS,
     HumanCues,
@@ -22,7 +23,6 @@ from mover.energy.objective import (
     active_config,
     energy_of_terms,
 )
-from mover.energy.terms.contact import trees_of
 from mover.geometry.raster import engine
 
 

@@ -6,12 +6,10 @@ import torch
 from torch import Tensor
 
 from mover.core.types import Camera, Objects
+from mover.energy import human_terms, image_terms, prior_terms
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.fused.launch import BORDER, FusedEnergy, Room
 from mover.energy.objective import SCENE_TERMS, HumanCues, ImageCues
-from mover.energy.terms import bbox, border, contact, depth, distance, scale
-from mover.energy.terms.collision import SAMPLES, collision_share
-from mover.energy.terms.contact import ContactPoints
 from mover.geometry.nearest_warp import packed
 from mover.geometry.volume import Volume, field_of
 from mover.geometry.warp_start import array, started
@@ -36,8 +34,8 @@ def kernel_of(
     given.windows = _windows(image, humans, weights)
     given.people = _people(humans, weights, asked, share)
     given.boxes = array(image.boxes.contiguous(), "vec4")
-    given.within = array((image.sides != bbox.UNKNOWN).float(), "vec4")
-    prices = torch.tensor([0.0, torch.inf, 0.0, bbox.HIDDEN])  # by what is known of a side
+    given.within = array((image.sides != image_terms.UNKNOWN).float(), "vec4")
+    prices = torch.tensor([0.0, torch.inf, 0.0, image_terms.HIDDEN])  # by what is known of a side
     given.beyond = array(prices[image.sides], "vec4")
     given.facts = wp.from_torch(_facts(objects, image, humans, weights))
     turn = camera.R_cam_world.detach().clone()
@@ -45,8 +43,8 @@ def kernel_of(
     K = camera.K.tolist()
     given.lens = wp.vec4(K[0][0], K[1][1], K[0][2], K[1][2])
     given.weights = tuple(getattr(weights, name) for name in FUSED)
-    given.soft, given.rho = bbox.SOFT, distance.RHO
-    given.sizes, given.growth = (scale.LOWEST, scale.HIGHEST), config.growth
+    given.soft, given.rho = image_terms.SOFT, prior_terms.DISTANCE_RHO
+    given.sizes, given.growth = (prior_terms.LOWEST, prior_terms.HIGHEST), config.growth
     views = image.views
     verts, faces, edges = (int(c.max()) for c in counts)
     shifts = 1 if image.borders is None else len(image.borders.shifts)
@@ -93,7 +91,7 @@ def _windows(image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Any:
     shifts, masks = mask.new_zeros(1), mask.unsqueeze(0)
     if image.borders is not None:
         shifts, masks = image.borders.shifts, image.borders.masks.detach()
-    windows.shifts, windows.loose = array(shifts.contiguous(), "float32"), border.PRICE
+    windows.shifts, windows.loose = array(shifts.contiguous(), "float32"), image_terms.BORDER_WEIGHT
     windows.mask, windows.keep = _grid(masks, 0.0), _grid(keep, 0.0)
     windows.gain = array(_sums(keep * (1 - 2 * masks)), "float64")
     windows.empty = array((keep * masks.double().square()).sum((-2, -1)).view(-1), "float64")
@@ -102,7 +100,7 @@ def _windows(image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Any:
     lower, upper, bounded = _bounds(mask, humans, weights)
     windows.lower, windows.upper = lower, upper
     windows.bounded = array(bounded, "vec4i")
-    windows.limit, windows.fewest = depth.CLAMP, depth.FEWEST
+    windows.limit, windows.fewest = human_terms.CLAMP, human_terms.FEWEST
     return windows
 
 
@@ -126,9 +124,13 @@ def _bounds(mask: Tensor, humans: HumanCues, weights: SceneWeights) -> tuple[Any
         return *(array(mask.new_zeros(1), "float32") for _ in range(2)), nothing
     near, far = humans.depth.near, humans.depth.far
     known = (mask > 0.5) & (near < far) & (near.isfinite() | far.isfinite())
-    lower = torch.where(known, near - depth.MARGIN, torch.inf)
+    lower = torch.where(known, near - human_terms.DEPTH_MARGIN, torch.inf)
     box = [_range(known.any(2)), _range(known.any(1))]
-    return _grid(lower, torch.inf), _grid(far + depth.MARGIN, 0.0), torch.cat(box, -1).int()
+    return (
+        _grid(lower, torch.inf),
+        _grid(far + human_terms.DEPTH_MARGIN, 0.0),
+        torch.cat(box, -1).int(),
+    )
 
 
 def _range(known: Tensor) -> Tensor:
@@ -147,9 +149,9 @@ def _asked(
         none = torch.zeros(1, 3)
         return none, none[:, 0].contiguous(), torch.zeros(n + 1, dtype=torch.long)
     weight = touches.weight
-    part = torch.tensor(contact.SHARE).to(weight)
+    part = torch.tensor(human_terms.CONTACT_SHARE).to(weight)
     whole = weight.sum(-1, keepdim=True).clamp_min(1e-9)
-    full = (touches.bodies / contact.ENOUGH).clamp_max(1)[:, None, None]
+    full = (touches.bodies / human_terms.ENOUGH).clamp_max(1)[:, None, None]
     share = weight / whole * part[:, None] * full * torch.tensor([1.0, -1.0, 1.0, -1.0])[:, None]
     order = touches.object_of.argsort()
     share, points = share[order].flatten(1), touches.points[order].flatten(1, 2)
@@ -165,7 +167,7 @@ def _people(humans: HumanCues, weights: SceneWeights, asked: Tensor, share: Tens
 
     people = People()
     people.asked, people.share = array(asked, "vec3"), array(share, "float32")
-    people.rho = contact.RHO
+    people.rho = human_terms.CONTACT_RHO
     if weights.contact and humans.trees is not None:
         people.top, people.back = packed(humans.trees.top), packed(humans.trees.back)
     if weights.collision and humans.space is not None:
@@ -184,13 +186,13 @@ def _field(volume: Volume) -> Any:  # noqa: ANN401
 def _facts(objects: Objects, image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Tensor:
     """See `kernels.given.SIZE` and those after it."""
     n, boxes = len(objects.ids), image.boxes
-    share = collision_share(objects, humans.touches if weights.contact else None)
+    share = human_terms.collision_share(objects, humans.touches if weights.contact else None)
     facts = torch.zeros(n, 6)
     facts[:, 0] = (boxes[:, 2:] - boxes[:, :2]).clamp_min(1).prod(-1).sqrt()
-    facts[:, 1] = share * SAMPLES / max(1, objects.samples.shape[1])
+    facts[:, 1] = share * human_terms.SAMPLES / max(1, objects.samples.shape[1])
     if image.distance is not None:
         facts[:, 2] = image.distance.clamp_min(1e-3).log()
-    touches: ContactPoints | None = humans.touches
+    touches: human_terms.ContactPoints | None = humans.touches
     if touches is not None:
         facts[touches.object_of, 3:5] = touches.heading
         facts[touches.object_of, 5] = (touches.heading.square().sum(-1) > 0).to(facts)

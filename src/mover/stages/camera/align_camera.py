@@ -21,7 +21,14 @@ from torch import Tensor
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Camera
-from mover.energy.terms.feet import TAIL, FootContacts, feet_term, over_floor, tilt_prior, up_cam
+from mover.energy.human_terms import (
+    TILT_TAIL,
+    FootContacts,
+    feet_term,
+    over_floor,
+    tilt_prior,
+    up_cam,
+)
 from mover.geometry.camera import pitch_roll, tilted, to_world
 from mover.stages.camera.foot_votes import PLACE_NOISE, STEP_NOISE, Votes, vote
 from mover.stages.config import AlignConfig
@@ -140,7 +147,7 @@ def _centre(at: Float[Tensor, " unknowns"], prior: Prior) -> Float[Tensor, " unk
 
 def _prior_weights(at: Float[Tensor, " unknowns"], prior: Prior) -> Float[Tensor, " unknowns"]:
     """One over the variance that the prior gives each unknown, its long tail included."""
-    tilt = prior.tilt**-2 / (1 + (at[:2] - prior.first).square().sum() / prior.tilt**2 / TAIL)
+    tilt = prior.tilt**-2 / (1 + (at[:2] - prior.first).square().sum() / prior.tilt**2 / TILT_TAIL)
     ground = at.new_tensor([0.0 if prior.ground is None else FIXED**-2])
     floats = torch.full_like(at[3:], max(prior.offset, FIXED) ** -2)
     return torch.cat([tilt.expand(2), ground, floats])

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.types import Camera, Detection, People
-from mover.energy.terms.feet import FootContacts
+from mover.energy.human_terms import FootContacts
 from mover.furniture.library import canonical
 from mover.geometry.camera import project
 from mover.geometry.rle import decode

@@ -15,7 +15,7 @@ from mover.bodies.posture import at, landmarks
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Bodies, Camera
-from mover.energy.terms.feet import FootContacts
+from mover.energy.human_terms import FootContacts
 from mover.stages.config import FootContactConfig
 
 SIDES = ("left", "right")

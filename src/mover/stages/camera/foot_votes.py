@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.records import record
-from mover.energy.terms.feet import FootContacts
+from mover.energy.human_terms import FootContacts
 
 STEP_NOISE = 0.015  # [m], of a sole's height, new in every frame
 PLACE_NOISE = 0.01  # [m], of a sole's height, the same in a place

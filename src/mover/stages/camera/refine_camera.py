@@ -38,7 +38,7 @@ from mover.stages.config import RefineConfig
 def fixed_borders(
     image: ImageCues, layout: Layout, objects: Objects, camera: Camera, weights: SceneWeights
 ) -> ImageCues:
-    """The masks and boxes under the shift that suits a layout best (`terms.border`).
+    """The masks and boxes under the shift that suits a layout best (`image_terms`).
 
     The layout has one place for each object.
     """

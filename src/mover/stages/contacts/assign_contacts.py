@@ -15,7 +15,7 @@ from mover.bodies.skin import PARTS
 from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.types import Bodies
-from mover.energy.terms.contact import ContactPoints, shares_of
+from mover.energy.human_terms import ContactPoints, shares_of
 from mover.furniture.floor import Floor, height_under_bodies
 from mover.geometry.mesh import vertex_normals
 from mover.stages.config import AssignConfig, ContactConfig

@@ -14,7 +14,7 @@ from mover.bodies.parts import Parts, members
 from mover.bodies.posture import postures
 from mover.core.records import record, rows_of
 from mover.core.types import STILL, Bodies, Camera, CameraPath, Layout, Objects, People
-from mover.energy.terms.contact import ContactPoints
+from mover.energy.human_terms import ContactPoints
 from mover.geometry.camera import project, to_camera
 from mover.geometry.path import from_reference, poses_at
 from mover.geometry.placement import place

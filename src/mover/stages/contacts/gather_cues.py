@@ -18,11 +18,17 @@ from torch import Tensor
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record, to_device
 from mover.core.types import STILL, Bodies, Camera, CameraPath, People
+from mover.energy.human_terms import (
+    BodySpace,
+    BodyView,
+    ContactPoints,
+    DepthMaps,
+    DepthRange,
+    bounds_of,
+    merge,
+)
+from mover.energy.image_terms import WIDTH
 from mover.energy.objective import HumanCues
-from mover.energy.terms.bbox import WIDTH
-from mover.energy.terms.collision import BodySpace
-from mover.energy.terms.contact import ContactPoints
-from mover.energy.terms.depth import DepthMaps, DepthRange, Seen, bounds_of, merge
 from mover.geometry.camera import to_camera
 from mover.geometry.crops import sample_nearest
 from mover.geometry.path import is_still, poses_at, resampled
@@ -58,7 +64,7 @@ class Sight:
     erode: int
     """Pixels by which masks and silhouettes shrink."""
     vote: bool
-    """See `terms.depth.bounds_of`."""
+    """See `human_terms.bounds_of`."""
     reach: float = 0.0
     """How far the outline of a body may be wrong [m]."""
     path: CameraPath = STILL
@@ -153,7 +159,7 @@ def _bounds(sight: Sight, block: list[int]) -> Iterator[tuple[Window, DepthMaps]
         reach = sight.reach
         if reach > 0:
             reach *= float(views.K[0, 0, 0] / verts[k, :, 2].median().clamp_min(NEAREST))
-        seen = Seen(drawn.front[k][window], drawn.exit[k][window], visible, others, reach)
+        seen = BodyView(drawn.front[k][window], drawn.exit[k][window], visible, others, reach)
         objects = sight.masks[sight.meeting(window)][:, *window]
         yield window, bounds_of(seen, objects, sight.erode, vote=sight.vote)
 

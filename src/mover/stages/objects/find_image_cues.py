@@ -7,9 +7,8 @@ from torch import Tensor
 from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.types import Camera, Capture
+from mover.energy.image_terms import LEAST, LIKELY, SEEN, UNKNOWN, borders_of
 from mover.energy.objective import ImageCues
-from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
-from mover.energy.terms.border import borders_of
 from mover.geometry.crops import area_mean, crop_views
 from mover.geometry.rle import decode, tight_box
 from mover.geometry.warp_start import mapped

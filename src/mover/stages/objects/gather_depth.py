@@ -14,8 +14,8 @@ from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Camera, DepthImage, Layout, Objects
+from mover.energy.image_terms import Measured
 from mover.energy.objective import ImageCues
-from mover.energy.terms.measured import Measured
 from mover.geometry.camera import to_world
 from mover.geometry.crops import sample_nearest
 from mover.geometry.placement import place_in

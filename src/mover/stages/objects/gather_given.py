@@ -10,9 +10,9 @@ from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Heading, Layout, Objects
-from mover.energy.terms.bbox import LEAST, LIKELY, SEEN, UNKNOWN
-from mover.energy.terms.contact import ContactPoints
-from mover.energy.terms.given import COMMON, SIZE, TURN, Given
+from mover.energy.human_terms import ContactPoints
+from mover.energy.image_terms import LEAST, LIKELY, SEEN, UNKNOWN
+from mover.energy.prior_terms import COMMON, SIZE, TURN, Given
 from mover.furniture.library import STANDARD, WALL_PIECES, WIDE_CLASSES, canonical
 from mover.stages.objects.own_edges import OwnEdges
 
@@ -41,7 +41,7 @@ def gather_given(
     heading: Heading | None = None,
     edges: OwnEdges | None = None,
 ) -> Given:
-    """The evidence of `terms.given`.
+    """The evidence of `prior_terms`.
 
     Args:
         objects: The furniture, as large as it was given.
@@ -123,12 +123,12 @@ def unplaced(count: int) -> Given:
     known, none = torch.ones(count), torch.zeros(count, 3)
     return Given(
         distance=known, yaw=0 * known, along=0 * known, sharpness=known, axis=0 * known,
-        standard=none, precision=none, weight=known, told=False,
+        standard=none, precision=none, weight=known, placed=False,
     )  # fmt: skip
 
 
 def prior_weights(energy: Float[Tensor, " objects"]) -> Float[Tensor, " objects"]:
-    """Weight of the guess of each object, by what the image leaves of it (`terms.given`).
+    """Weight of the guess of each object, by what the image leaves of it (`prior_terms`).
 
     A wrong shape can fit well where something hides half of it. So of an object that fits better
     than the room's usual one the geometric mean of both counts: shapes of one tool are alike.

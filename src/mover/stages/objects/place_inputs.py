@@ -8,10 +8,10 @@ from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Camera, Layout, Objects
+from mover.energy.human_terms import DepthRange
+from mover.energy.image_terms import Borders
 from mover.energy.objective import HumanCues, ImageCues
-from mover.energy.terms.border import Borders
-from mover.energy.terms.depth import DepthRange
-from mover.energy.terms.wall import Walls
+from mover.energy.prior_terms import Walls
 from mover.geometry.raster import Crops
 from mover.stages.objects.starts import merged
 

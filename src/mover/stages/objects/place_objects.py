@@ -12,6 +12,7 @@ from mover.core.records import to_device
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import Adam, BatchedBFGS, SceneConfig
 from mover.energy.fused.energy import energy_function, energy_of_rows, never_asks
+from mover.energy.human_terms import trees_of
 from mover.energy.minimize import Minimum, minimize
 from mover.energy.newton import Problems, settle
 from mover.energy.objective import (
@@ -21,8 +22,7 @@ from mover.energy.objective import (
     some_objects,
     some_supports,
 )
-from mover.energy.terms.apart import apart_term, gather_solids
-from mover.energy.terms.contact import trees_of
+from mover.energy.prior_terms import apart_term, gather_solids
 from mover.geometry.boxes import Box, corners
 from mover.geometry.placement import rest_on_support
 from mover.geometry.sections import Sections, sections_of
@@ -48,7 +48,7 @@ from mover.stages.objects.wall_alignment import line_up
 
 # How far the given sizes of a room's furniture are off, as its image tells (not in the paper).
 #
-# The price of sizes (`terms.scale`) suits tools whose sizes err as much as usual. Where the image
+# The price of sizes (`prior_terms`) suits tools whose sizes err as much as usual. Where the image
 # alone changes the shapes of a room's furniture more than that, the sizes that it cannot tell (the
 # depth of a cabinet that is seen from the front) are worth less too. Logarithms of the three sizes
 # of a piece are c + e_k, with c common (a piece that was placed too far was made too large) and e_k
@@ -148,7 +148,7 @@ def _pushed(shared: Callable[[Layout], Tensor], layout: Layout) -> Bool[Tensor, 
 
 
 def sharing(objects: Objects, layout: Layout) -> Callable[[Layout], Float[Tensor, " objects"]]:
-    """How much of each object stands in others, for places near a layout (`terms.apart`) [1]."""
+    """How much of each object stands in others, for places near a layout (`prior_terms`) [1]."""
     pairs = _pairs(objects, layout)
     sections = {i: _sections(objects, i) for i in pairs.unique().tolist()}
     solids = gather_solids(objects, sections, pairs)

@@ -14,7 +14,7 @@ from mover.bodies.parts import Parts, members
 from mover.bodies.posture import at, landmarks, postures
 from mover.core.records import record
 from mover.core.types import Bodies, Layout
-from mover.energy.terms.given import AWAY, COMMON, SIZE, Given
+from mover.energy.prior_terms import AWAY, COMMON, SIZE, Given
 from mover.furniture.floor import Floor, height_under_bodies
 
 TOOL = 0.04  # ... and all given sizes of a room: shapes of one tool fill their boxes alike

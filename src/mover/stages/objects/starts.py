@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mover.core.records import to_device
 from mover.core.types import Layout, Objects, SceneObject
-from mover.energy.terms.contact import ContactPoints
+from mover.energy.human_terms import ContactPoints
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import rot_y, wrap
 

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.types import Layout, Objects
-from mover.energy.terms.bbox import SEEN
-from mover.energy.terms.wall import ALONG, Walls, rears_of
+from mover.energy.image_terms import SEEN
+from mover.energy.prior_terms import ALONG, Walls, rears_of
 from mover.furniture.library import WALL_PIECES
 from mover.geometry.placement import GROUND
 from mover.geometry.rotations import wrap

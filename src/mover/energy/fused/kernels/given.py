@@ -35,7 +35,7 @@ class Windows:
     lens: wp.array(dtype=wp.vec4)
     """Focal lengths and principal point of each window, with the border [px]."""
     shifts: wp.array(dtype=wp.float32)
-    """By how much outlines may be off, see `terms.border` [px of the image]; `mask`, `gain`,
+    """By how much outlines may be off, see `image_terms` [px of the image]; `mask`, `gain`,
     `empty` and `trust` are by shift, then by object."""
     mask: wp.array(dtype=wp.float32)
     gain: wp.array(dtype=wp.float64)

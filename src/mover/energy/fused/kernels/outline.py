@@ -1,4 +1,4 @@
-"""The cost of a silhouette (`terms.silhouette`) and its gradient, from the outline alone.
+"""The cost of a silhouette (`image_terms`) and its gradient, from the outline alone.
 
 The pixels that the outline moves are counted anew; of the others only those that are covered.
 """

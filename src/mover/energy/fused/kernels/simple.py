@@ -64,7 +64,7 @@ def box_cost(
 
 @wp.func
 def scale_cost(given: Given, logs: wp.vec3) -> tuple[float, Slope]:
-    """How far the size is from the initial one, see `terms.scale`."""
+    """How far the size is from the initial one, see `prior_terms`."""
     mean = (logs[0] + logs[1] + logs[2]) / 3.0
     cost = given.growth * mean * mean
     pull = 2.0 / 3.0 * given.growth * mean

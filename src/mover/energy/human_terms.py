@@ -1,0 +1,456 @@
+r"""Terms of Eq. 1 that people say of the room: depth order, free space, contact; and their feet.
+
+    Depth order  L_depth     = \sum_i \sum_{q in Sil_i, M_i} ReLU(D_i(q) - far(q))
+                                                           + ReLU(near(q) - D_i(q))
+    Free space   L_collision = \sum_i \sum_u \| V(u_i) \|_2^2   where V(u_i) < 0
+    Contact      L_contact   = \sum_i \sum_v I(v, O_i) [CD(v^y, C(O_i)^y)
+                                                           + CD(v^{\perp y}, C(O_i)^{\perp y})]
+    Feet         L_feet      = \rho(R^T C^feet - [0, y_gp, 0]^T; \sigma_1)
+
+Sec. 3.1 and 3.2 of the paper: as printed (`paper`), and normalised and robust (`robust`).
+"""
+
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.core.devices import constant
+from mover.core.records import map_tensors, record
+from mover.core.types import Layout, Objects
+from mover.energy.config import Variant
+from mover.energy.minimize import geman_mcclure, safe_norm
+from mover.geometry.nearest_warp import Clouds, clouds, nearest
+from mover.geometry.raster import Depths, engine
+from mover.geometry.rotations import rot_y
+from mover.geometry.volume import Volume, sample
+
+# --- Depth order: who hides whom bounds the depth ------------------------------------------------
+#
+# far(p) = min_t D_far^t(p), near(p) = max_t D_near^t(p), gathered once over all frames: where a
+# person is seen in front of object i (p in M_i, Sil_t and M_t), the object is not nearer than where
+# the ray leaves the body; where object i hides the person (p in M_i and Sil_t, not in M_t), it is
+# not farther than where the ray would enter the body.
+# Departure: the near bound is the first exit of the ray from the visible body, not the farthest
+# layer of the body, which would forbid true positions (an arm in front of a chair).
+
+CLAMP = 2.0  # [m], the authors' released code
+DEPTH_MARGIN = 0.02  # [m], slack of the robust form
+FEWEST = 100.0  # pixels by which the robust form divides at least
+
+
+@record
+class DepthMaps:
+    """Bounds from all frames in the image, and who set them."""
+
+    near: Float[Tensor, "h w"]
+    """Lower bound [m]; -inf where no person stood in front of an object."""
+    far: Float[Tensor, "h w"]
+    """Upper bound [m]; inf where no object hid a person."""
+    free: Float[Tensor, "h w"]
+    """Nothing stands nearer than this [m], inside masks or out; -inf where no person was seen."""
+
+
+@record
+class DepthRange:
+    """The bounds in the windows of the objects, each inside its own mask."""
+
+    near: Float[Tensor, "objects h w"]
+    far: Float[Tensor, "objects h w"]
+    area: Float[Tensor, " objects"]
+    """Area of a window pixel in pixels of an image that is 640 wide."""
+
+
+@record
+class BodyView:
+    """One person in one frame: what was seen of the body, and what was hidden."""
+
+    front: Float[Tensor, "h w"]
+    """Depth where the ray enters the body [m]; inf where it misses."""
+    exit: Float[Tensor, "h w"]
+    """Depth where it first leaves the body [m]."""
+    visible: Bool[Tensor, "h w"]
+    """The person's visible mask."""
+    others: Bool[Tensor, "h w"]
+    """Masks of the other people of the frame."""
+    reach: float = 0.0
+    """How far the drawn outline may be wrong [px]."""
+
+
+def bounds_of(
+    seen: BodyView, objects: Bool[Tensor, "objects h w"], erode: int, *, vote: bool
+) -> DepthMaps:
+    """Bounds from one body in one frame.
+
+    Args:
+        seen: The drawn body and the masks.
+        objects: Masks of the objects in the clean image.
+        erode: Pixels by which silhouettes and masks shrink, so that rays that graze the body and
+            borders that leak bound nothing.
+        vote: Of each object, keep only the larger region: it is hidden or hides, not both.
+    """
+    body = eroded(seen.front.isfinite(), erode)
+    shown = body & eroded(seen.visible, erode)
+    hidden = body & eroded(~seen.visible, erode) & eroded(~seen.others, erode)
+    if seen.reach > 0:
+        hidden = _thick(hidden, seen.reach)
+    before, behind = objects & shown, objects & hidden
+    if vote:
+        more = before.sum((-2, -1)) - behind.sum((-2, -1))
+        before = before & (more > 0)[:, None, None]
+        behind = behind & (more < 0)[:, None, None]
+    infinity = torch.full_like(seen.front, float("inf"))
+    near = torch.where(before.any(0), seen.exit, -infinity)
+    free = torch.where(shown, seen.exit, -infinity)
+    return DepthMaps(near, torch.where(behind.any(0), seen.front, infinity), free)
+
+
+def merge(a: DepthMaps, b: DepthMaps) -> DepthMaps:
+    """The narrower bounds of two sets of frames."""
+    near, far = torch.maximum(a.near, b.near), torch.minimum(a.far, b.far)
+    return DepthMaps(near, far, torch.maximum(a.free, b.free))
+
+
+def depth_term(
+    seen: Depths, mask: Float[Tensor, "objects h w"], allowed: DepthRange, form: Variant
+) -> Float[Tensor, "*starts objects"]:
+    """Distance of the front surface out of the allowed range [m px at 640], or its mean [m].
+
+    Paper: the sum over pixels; where the bounds contradict each other there is no range, and the
+    pixel says nothing. Robust: the mean over the constrained pixels, with 2 cm slack, clamped.
+    """
+    inside = seen.covered & (mask > 0.5)
+    if form == "robust":
+        sane = allowed.near < allowed.far
+        bounded = inside & sane & (allowed.near.isfinite() | allowed.far.isfinite())
+        out = _short(allowed.near - DEPTH_MARGIN, seen.nearest, CLAMP)
+        out = out + _short(seen.nearest, allowed.far + DEPTH_MARGIN, CLAMP)
+        return (out * bounded).sum((-2, -1)) / bounded.sum((-2, -1)).clamp_min(FEWEST)
+    ranged = inside & (allowed.near <= allowed.far)
+    out = _short(allowed.near, seen.nearest) + _short(seen.nearest, allowed.far)
+    return (out * ranged).sum((-2, -1)) * allowed.area
+
+
+def _short(
+    lower: Float[Tensor, "*any h w"], upper: Float[Tensor, "*more h w"], limit: float = float("inf")
+) -> Float[Tensor, "*most h w"]:
+    """How much `lower` exceeds `upper`; unbounded pixels (infinite) cost nothing."""
+    gap = lower - upper
+    return gap.nan_to_num(0.0, 0.0, 0.0).clamp(0, limit)
+
+
+def _thick(hidden: Bool[Tensor, "h w"], reach: float) -> Bool[Tensor, "h w"]:
+    """What a wrong outline does not explain: discs of the radius `reach` that are wholly hidden.
+
+    An arm that the body has in a wrong position is not hidden by what stands behind it.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    inner = torch.from_numpy(distance_transform_edt(hidden.cpu().numpy())) > reach
+    if bool(inner.any()):
+        inner = torch.from_numpy(distance_transform_edt(~inner.numpy())) < reach / 2
+    return hidden & inner.to(hidden.device)
+
+
+def eroded(mask: Bool[Tensor, "*batch h w"], steps: int) -> Bool[Tensor, "*batch h w"]:
+    """The mask without pixels that lie so many steps (of four neighbours) from an unset one.
+
+    The border of the image is no edge.
+    """
+    for _ in range(steps):
+        padded = torch.nn.functional.pad(mask, (1, 1, 1, 1), value=True)
+        rows = padded[..., :-2, 1:-1] & padded[..., 2:, 1:-1]
+        mask = mask & rows & padded[..., 1:-1, :-2] & padded[..., 1:-1, 2:]
+    return mask
+
+
+# --- Free space: people move through it -----------------------------------------------------------
+#
+# V = min(V_1, ..., V_T) is the signed distance to all bodies on one grid [m]. In the paper u are
+# the vertices of a mesh that marching cubes made lie evenly on it, and how many they are is not
+# printed: here even surface samples, whose sum counts as that of 1000, as many as the authors'
+# code draws. So the resolution of a mesh has no weight.
+
+SAMPLES = 1000.0  # of an object in the authors' code; 3 cm inside on each costs one
+
+
+@record
+class BodySpace:
+    """The space that the people have moved through."""
+
+    volume: Volume
+    """Signed distance to the nearest body of any frame."""
+
+
+def collision_term(
+    points: Float[Tensor, "*starts objects points 3"], space: BodySpace
+) -> Float[Tensor, "*starts objects"]:
+    """Squared depth of even surface samples inside the bodies of all frames [m²]."""
+    depth = sample(space.volume, points).clamp_max(0)
+    return SAMPLES * depth.square().mean(-1)
+
+
+def collision_share(objects: Objects, touches: "ContactPoints | None") -> Float[Tensor, " objects"]:
+    """Weight of the collision of each object: a tenth for a seat that is used (`robust` only).
+
+    A body is soft and the shape of a seat is often wrong: the body of the sitter then lies inside
+    the mesh, and the seat would flee.
+    """
+    if touches is None:
+        return objects.verts.new_ones(len(objects.ids))
+    used = objects.verts.new_zeros(len(objects.ids)).index_fill(0, touches.object_of, 1.0)
+    return 1 - 0.9 * used * objects.is_seat.to(used)
+
+
+# --- Contact: touching surfaces are in the same position ------------------------------------------
+#
+# Body points that touch, from all frames, are each assigned to one object and to its part: to the
+# seat or top (C(O)^y) if their normal lies within 45 degrees of the vertical, else to the back;
+# thinned to small cells whose weight counts the points inside.
+# Paper:  CD is a mean over its source points, which the sum prints: all touching skin of the
+#         people, of which I(v, O_i) picks what touches this object. So what many bodies touch
+#         weighs more than what a few stray vertices touch. Body and hands together.
+# Robust: the mean of a Geman-McClure cost from body to object, in full only once four bodies touch,
+#         the back a quarter of the seat; so that contact neither drags an object by a few wrong
+#         points nor rules its size. `heading_term` turns seats and beds with their people.
+
+CONTACT_RHO = 0.3  # [m], docs/method.md: 0.15 gives up on objects half a metre away
+ENOUGH = 4.0  # bodies that touch before contact counts in full
+CONTACT_SHARE = (1.0, 0.25, 1.0, 0.25)  # of seat or top, back, then the same for hands
+
+
+@record
+class ContactPoints:
+    """Body points that touch furniture, from all frames, packed over the touched objects."""
+
+    object_of: Int[Tensor, " touched"]
+    """Index of each touched object."""
+    points: Float[Tensor, "touched 4 points 3"]
+    """Positions in the world [m] by part: top, back, top by hand, back by hand."""
+    weight: Float[Tensor, "touched 4 points"]
+    """Body vertices that a point stands for; 0 pads."""
+    bodies: Float[Tensor, " touched"]
+    """Number of bodies that touch the object."""
+    share: Float[Tensor, "touched 4"]
+    """Of all body vertices that touch seats and tops, or backs, those that touch this part [1]."""
+    heading: Float[Tensor, "touched 2"]
+    """Mean direction (x, z) that its sitters face, or that a person lying on a bed stretches to
+    from the neck to the hips, a unit vector; zero where it is not known."""
+
+
+def shares_of(weight: Float[Tensor, "touched 4 points"]) -> Float[Tensor, "touched 4"]:
+    """Of all vertices that touch seats and tops, or backs, those that touch each part."""
+    counts = weight.sum(-1)
+    of_region = counts.unflatten(-1, (2, 2)).sum((0, 1))
+    return counts / of_region.clamp_min(1e-9).repeat(2)
+
+
+def some_touches(touches: ContactPoints, index: Int[Tensor, " few"], count: int) -> ContactPoints:
+    """The evidence about the objects of this index, out of `count`."""
+    row = torch.full((count,), -1).to(index)
+    row[touches.object_of] = torch.arange(len(touches.object_of)).to(index)
+    touched = torch.nonzero(row[index] >= 0)[:, 0]
+    few = row[index[touched]]
+    rest = {k: getattr(touches, k)[few] for k in ("points", "weight", "bodies", "share", "heading")}
+    return ContactPoints(touched, **rest)
+
+
+@record
+class Trees:
+    """Search trees of what can be touched of each object, and which points ask for it."""
+
+    top: Clouds
+    back: Clouds
+    asking: Bool[Tensor, "objects 2 points"]
+    """By top and back: whether points of the body, then of the hands, have a weight."""
+
+    @cached_property
+    def most(self) -> tuple[int, ...]:
+        """Most points that ask for the top, and for the back, of one object."""
+        counts = self.asking.sum(-1)
+        return tuple(counts.amax(0).tolist()) if len(counts) else (0, 0)
+
+
+def trees_of(objects: Objects, touches: ContactPoints) -> Trees | None:
+    """Search trees of all objects; None where Warp is not the engine or cannot help."""
+    if engine() != "warp" or objects.top.dtype != torch.float32 or not objects.top.numel():
+        return None
+    weighty = _by_region(touches.weight > 0)
+    asking = weighty.new_zeros(len(objects.ids), *weighty.shape[1:])
+    asking[touches.object_of] = weighty
+    return Trees(clouds(objects.top), clouds(objects.back), asking)
+
+
+def contact_distance(
+    layout: Layout, objects: Objects, touches: ContactPoints, trees: Trees | None = None
+) -> Float[Tensor, "*starts touched 4 points"]:
+    """Distance from each body point to the nearest point of the part that it touches [m].
+
+    The pairing has no gradient. Points without weight may get zero.
+
+    Args:
+        layout: Where the objects stand.
+        objects: With points of their tops and backs.
+        touches: The body points.
+        trees: Of the objects (`trees_of`); None: all points are compared.
+    """
+    index = touches.object_of
+    t, scale = layout.t_world_object[..., index, :].unsqueeze(-2), layout.log_scale[..., index, :]
+    turn, scale = rot_y(layout.yaw[..., index]), scale.exp()
+    points, found = _by_region(touches.points), list[Tensor]()
+    held = None if trees is None else map_tensors(lambda x: x[index], trees)
+    for k, region in enumerate((objects.top[index], objects.back[index])):
+        query, order = points[:, k], None
+        if held is not None and trees is not None:
+            order = held.asking[:, k].byte().argsort(dim=-1, descending=True, stable=True)
+            order = order[:, : trees.most[k]]
+            query = query.gather(-2, order.unsqueeze(-1).expand(-1, -1, 3))
+        own = (query - t).detach() @ turn.detach()
+        if held is None:
+            pair = torch.cdist(own, (region * scale.unsqueeze(-2)).detach()).argmin(-1)
+        else:
+            pair = nearest(held.back if k else held.top, own, scale)
+        pairs = pair.unsqueeze(-1).expand(*pair.shape, 3)
+        chosen = region.expand(*pair.shape[:-1], -1, 3).gather(-2, pairs)
+        gap = safe_norm(query - (chosen * scale.unsqueeze(-2)) @ turn.mT - t)
+        if order is not None:
+            whole = gap.new_zeros(*gap.shape[:-1], points.shape[-2])
+            gap = whole.scatter(-1, order.expand(gap.shape), gap)
+        found.append(gap)
+    both = torch.stack(found, -2).unflatten(-1, (2, -1))  # region, body or hand
+    return both.transpose(-3, -2).flatten(-3, -2)
+
+
+def contact_term(
+    distance: Float[Tensor, "*starts touched 4 points"],
+    touches: ContactPoints,
+    objects: int,
+    form: Variant,
+) -> Float[Tensor, "*starts objects"]:
+    """Mean distance of body points from the parts that they touch: `paper` [m], `robust` [1].
+
+    Args:
+        distance: See `contact_distance`.
+        touches: The body points.
+        objects: Number of all objects.
+        form: Mean over all touching skin (`paper`), or over that of the part, bounded (`robust`).
+    """
+    weight = touches.weight.sum(-1).clamp_min(1e-9)
+    if form == "paper":
+        cost = ((distance * touches.weight).sum(-1) / weight * touches.share).sum(-1)
+    else:
+        mean = (geman_mcclure(distance, CONTACT_RHO) * touches.weight).sum(-1) / weight
+        cost = (mean * constant(CONTACT_SHARE, distance)).sum(-1)
+        cost = cost * (touches.bodies / ENOUGH).clamp_max(1)
+    return cost.new_zeros(*cost.shape[:-1], objects).index_add(-1, touches.object_of, cost)
+
+
+def heading_term(layout: Layout, touches: ContactPoints) -> Float[Tensor, "*starts objects"]:
+    """Seats face as their sitters, beds as people lying: 1 - cos of the angle (`robust` only)."""
+    yaw = layout.yaw[..., touches.object_of]
+    facing = yaw.sin() * touches.heading[:, 0] + yaw.cos() * touches.heading[:, 1]
+    seated = touches.heading.square().sum(-1) > 0
+    cost = torch.where(seated, 1 - facing, torch.zeros_like(facing))
+    return torch.zeros_like(layout.yaw).index_add(-1, touches.object_of, cost)
+
+
+def _by_region(parts: Tensor) -> Tensor:
+    """From (touched, 4 parts, points) to (touched, 2 regions, points of body and hand)."""
+    return parts.unflatten(1, (2, 2)).transpose(1, 2).flatten(2, 3)
+
+
+# --- Feet at rest stand on the ground -------------------------------------------------------------
+#
+# Reading:   as printed, rho would act on the sum of all points, and on x and z as well, which no
+#            floor bounds. Here rho acts on each point, as in the authors' code, and only on its
+#            height.
+# Departure: each person may float or sink by one offset, which absorbs a wrong depth of the body; a
+#            weak prior keeps the tilt that the feet cannot constrain where the first guess had it.
+
+TILT_TAIL = (
+    2.0  # degrees of freedom of the tilt's prior: small changes are squared, large ones forgiven
+)
+
+
+@record
+class FootContacts:
+    """Points under the feet that carry the people, from all frames."""
+
+    points_cam: Float[Tensor, "soles 3"]
+    """Positions in camera axes [m]."""
+    person: Int[Tensor, " soles"]
+    """Track of each point."""
+    frame: Int[Tensor, " soles"]
+    """Frame of each point."""
+    warnings: tuple[str, ...]
+    """What made the evidence weaker than it should be."""
+    lift: Float[Tensor, " soles"] | None = None
+    """How much higher than the plane each may be as well, as a platform is seen there [m]."""
+
+
+def up_cam(
+    pitch: Float[Tensor, "*starts"], roll: Float[Tensor, "*starts"]
+) -> Float[Tensor, "*starts 3"]:
+    """The world's up-vector in the axes of a camera with this pitch and roll [rad]."""
+    return torch.stack([-pitch.cos() * roll.sin(), -pitch.cos() * roll.cos(), pitch.sin()], -1)
+
+
+def heights(
+    points_cam: Float[Tensor, "soles 3"],
+    R_cam_world: Float[Tensor, "*starts 3 3"],
+    ground: Float[Tensor, "*starts"],
+) -> Float[Tensor, "*starts soles"]:
+    """Height of points above the ground, the residual of L_feet [m]."""
+    return R_cam_world[..., :, 1] @ points_cam.mT - ground.unsqueeze(-1)
+
+
+def over_floor(
+    soles: FootContacts,
+    R_cam_world: Float[Tensor, "*starts 3 3"],
+    ground: Float[Tensor, "*starts"],
+    offset: Float[Tensor, " soles"],
+) -> Float[Tensor, "*starts soles"]:
+    """Height of sole points above what is nearer, the plane or their platform [m].
+
+    The offset is how far each point's person floats [m].
+    """
+    high = heights(soles.points_cam, R_cam_world, ground) - offset
+    if soles.lift is None:
+        return high
+    return torch.where((high - soles.lift).abs() < high.abs(), high - soles.lift, high)
+
+
+def feet_term(
+    soles: FootContacts,
+    R_cam_world: Float[Tensor, "*starts 3 3"],
+    ground: Float[Tensor, "*starts"],
+    offset: Float[Tensor, " soles"],
+    rho: float,
+) -> Float[Tensor, "*starts soles"]:
+    """Cost of each sole point that is not on the ground, in [0, 1); one half at `rho` [m].
+
+    The offset is how far each point's person floats above the floor [m].
+    """
+    return geman_mcclure(over_floor(soles, R_cam_world, ground, offset), rho)
+
+
+def tilt_prior(
+    pitch: Float[Tensor, "*starts"],
+    roll: Float[Tensor, "*starts"],
+    first: Float[Tensor, "2"],
+    spread: float,
+) -> Float[Tensor, "*starts"]:
+    """Cost of leaving the first guess of pitch and roll, in nats.
+
+    Half the squared change over `spread` where it is small; it grows only as a logarithm, because a
+    guess is either a few degrees off or no guess at all (a camera that is said to be level).
+
+    Args:
+        pitch: Pitch [rad].
+        roll: Roll [rad].
+        first: Their first guess [rad].
+        spread: How far off a guess usually is [rad].
+    """
+    squared = ((pitch - first[0]).square() + (roll - first[1]).square()) / spread**2
+    return 0.5 * TILT_TAIL * (1 + squared / TILT_TAIL).log()

@@ -1,0 +1,248 @@
+r"""Terms of Eq. 1 that the image says: boxes, silhouettes, borders of masks, measured depth.
+
+    Boxes        L_bbox    = \sum_i \| Proj_i^a - Det_i^a \|,  a in {x_min, y_min, width}
+    Silhouettes  L_occ-sil = \sum_i \sum_q keep_i(q) (Sil_i(q) - M_i(q))^2
+    Borders      \min_\delta \lambda_1 L_bbox(\delta)
+                              + \lambda_2 (L_occ-sil(\delta) + \rho \delta^2)
+    Depth map    L_measured = \sum_i mean_{p in Sil_i, M_i} 2 \log(1 + \delta^2 / 3 \sigma^2)
+
+The first two are of the supplement ("Loss Terms") and Sec. 3.1 (after PHOSA), as printed (`paper`)
+and normalised (`robust`); the others are not in the paper.
+"""
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mover.core.devices import constant
+from mover.core.records import record
+from mover.energy.config import Variant
+from mover.geometry.raster import Depths
+
+# --- Boxes -------------------------------------------------------------------------------------
+
+WIDTH = 640.0  # [px], the image width at which the weights of the paper have their meaning
+UNKNOWN, SEEN, LEAST, LIKELY = range(4)
+"""What is known of a side: nothing, where it is, how far the object reaches at least, or where it
+is unless something in front hides more."""
+SOFT = 0.01  # of a box's size: half width of the rounded tip of the robust cost
+HIDDEN = 0.05  # the highest cost of reaching beyond a side that may be hidden
+
+
+def bbox_term(
+    pixels: Float[Tensor, "*starts objects points 2"],
+    detected: Float[Tensor, "objects 4"],
+    sides: Int[Tensor, "objects 4"],
+    width: float,
+    form: Variant,
+    wider: float = 0.0,
+) -> Float[Tensor, "*starts objects"]:
+    r"""Distance between projected and detected boxes.
+
+    Paper: the eight corners of the 3D box, an l1 norm of x_min, y_min and width. Robust: all four
+    sides of the mesh's extent, each divided by the box's size \sqrt{w h}, so that near and far
+    objects count the same. Where the border of the image or something in front may hide more of
+    the object, it reaches at least as far as it is seen, and may reach farther: beyond the border
+    free of cost, behind something at a bounded cost.
+
+    Args:
+        pixels: Projected corners (`paper`) or vertices [px].
+        detected: x_min, y_min, x_max, y_max [px].
+        sides: `UNKNOWN`, `SEEN`, `LEAST` or `LIKELY`; an object without a box costs nothing.
+        width: Width of the image [px].
+        form: How it is weighted; [px at 640] for `paper`, else box sizes.
+        wider: How far the true sides lie outside the detected ones [px] (`robust` only).
+    """
+    drawn = torch.cat([pixels.amin(-2), pixels.amax(-2)], -1)
+    if form == "robust":
+        size = (detected[:, 2:] - detected[:, :2]).clamp_min(1).prod(-1, keepdim=True).sqrt()
+        outward = constant((-1.0, -1.0, 1.0, 1.0), detected)
+        off = (drawn - (detected + wider * outward)) / size
+        cost = (off.square() + SOFT**2).sqrt() - SOFT
+        beyond = (sides == LIKELY) & (off * outward > 0)
+        cost = torch.where(beyond, HIDDEN * cost / (HIDDEN + cost), cost)
+        free = (sides == UNKNOWN) | ((sides == LEAST) & (off * outward > 0))
+        return (cost * ~free).sum(-1)
+    drawn, detected = (
+        torch.cat([box[..., :2], box[..., 2:3] - box[..., :1]], -1) for box in (drawn, detected)
+    )
+    return ((drawn - detected).abs() * (WIDTH / width)).sum(-1) * sides.any(-1)
+
+
+# --- Silhouettes that know what hides them -----------------------------------------------------
+
+
+def silhouette_term(
+    drawn: Float[Tensor, "*starts objects h w"],
+    mask: Float[Tensor, "objects h w"],
+    keep: Bool[Tensor, "objects h w"],
+    form: Variant,
+) -> Float[Tensor, "*starts objects"]:
+    """Squared difference between drawn and detected masks [px], or per mask pixel (`robust`).
+
+    `mask` is that in a square window around the object's box; `keep` is False where another
+    object, or a person, may hide this one, and beyond the border of the image. The gradient is
+    exact (docs/method.md), hence 10-14 times smaller than that of the neural renderer that the
+    authors used; their weight is kept as printed.
+    """
+    cost = squares(drawn, mask, keep)
+    if form == "robust":
+        return cost / (mask * keep).sum((-2, -1)).clamp_min(1)
+    return cost
+
+
+def squares(
+    drawn: Float[Tensor, "*starts objects h w"],
+    mask: Float[Tensor, "objects h w"],
+    keep: Bool[Tensor, "objects h w"],
+) -> Float[Tensor, "*starts objects"]:
+    """Sum of the kept squared differences; differentiable once, in what is drawn."""
+    cost = _Squares.apply(drawn, mask, keep)
+    assert isinstance(cost, Tensor)
+    return cost
+
+
+class _Squares(torch.autograd.Function):
+    """Keeps the differences."""
+
+    @staticmethod
+    def forward(ctx: Any, drawn: Tensor, mask: Tensor, keep: Tensor) -> Tensor:  # noqa: ANN401
+        gap = torch.where(keep, drawn - mask, 0.0)
+        ctx.save_for_backward(gap)
+        flat = gap.flatten(-2)
+        return (flat.unsqueeze(-2) @ flat.unsqueeze(-1))[..., 0, 0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any,  # noqa: ANN401
+        *grads: Tensor,
+    ) -> tuple[Tensor, None, None]:
+        (gap,) = ctx.saved_tensors
+        return gap * (2 * grads[0][..., None, None]), None, None
+
+
+# --- Borders: outlines of masks are too wide or too narrow by about the same all round -----------
+#
+# A segmenter that draws every outline a pixel too wide moves a shelf whose base is hidden, and
+# makes the legs of a chair twice as thick: the position at which that costs least is not the true
+# one. What all borders of an object have in common says nothing about where it stands.
+
+BORDER_WEIGHT = 0.0005  # rho [1/px^2]
+
+
+@record
+class Borders:
+    """The masks as they are where their outlines are drawn too narrow or too wide."""
+
+    shifts: Float[Tensor, " shifts"]
+    """By how much the true outline lies outside the detected one [px of the image]."""
+    masks: Float[Tensor, "shifts objects h w"]
+    """Coverage of the window's pixels by what is really there."""
+
+    @cached_property
+    def steps(self) -> tuple[float, ...]:
+        """The shifts as numbers."""
+        return tuple(self.shifts.tolist())
+
+
+class Fitted(NamedTuple):
+    """The terms of the image with the shift at which they are least."""
+
+    bbox: Float[Tensor, "*starts objects"]
+    silhouette: Float[Tensor, "*starts objects"]
+    shift: Int[Tensor, "*starts objects"]
+    """Its number."""
+
+
+def borders_of(
+    masks: Float[Tensor, "objects h w"], zoom: Float[Tensor, " objects"], shifts: tuple[float, ...]
+) -> Borders:
+    """The masks grown by each shift, with borders as wide as a pixel.
+
+    Args:
+        masks: Detected coverage.
+        zoom: Pixels of the window for one of the image.
+        shifts: [px of the image], below zero: taken in.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    def inside(mask: Tensor) -> Tensor:
+        within = (mask > 0.5).cpu().numpy()
+        if not within.any():
+            return torch.full_like(mask, -torch.inf)
+        near, beyond = (distance_transform_edt(x) for x in (within, ~within))
+        far = (torch.as_tensor(near) - torch.as_tensor(beyond)).to(mask)
+        return torch.where(far.abs() < 1.5, mask - 0.5, far - 0.5 * far.sign())
+
+    depth = torch.stack([inside(m) for m in masks]) if len(masks) else masks
+    grown = [
+        masks if shift == 0 else (0.5 + depth + (shift * zoom)[:, None, None]).clamp(0, 1)
+        for shift in shifts
+    ]
+    return Borders(masks.new_tensor(shifts), torch.stack(grown))
+
+
+def fit_borders(
+    drawn: tuple[Float[Tensor, "*starts objects h w"], Float[Tensor, "*starts objects verts 2"]],
+    seen: tuple[Float[Tensor, "objects 4"], Int[Tensor, "objects 4"], Bool[Tensor, "objects h w"]],
+    trust: Float[Tensor, " objects"],
+    borders: Borders,
+    weights: tuple[float, float],
+) -> Fitted:
+    """Box and silhouette (robust) with the shift of the border that suits each object best.
+
+    Args:
+        drawn: Silhouettes, and vertices in the image [px].
+        seen: Detected boxes [px], what is known of their sides, and which pixels are.
+        trust: Weight of each silhouette.
+        borders: What the masks may be.
+        weights: Of the box and of the silhouette.
+    """
+    boxes, sides, keep = seen
+    bbox, outline = [], []
+    for shift, mask in zip(borders.steps, borders.masks, strict=True):
+        bbox.append(bbox_term(drawn[1], boxes, sides, 1.0, "robust", shift))
+        outline.append(trust * silhouette_term(drawn[0], mask, keep, "robust"))
+    boxed, cost = torch.stack(bbox), BORDER_WEIGHT * borders.shifts.square()
+    silhouette = torch.stack(outline)
+    cost = cost.view(-1, *[1] * (silhouette.dim() - 1)).expand_as(silhouette)
+    best = (weights[0] * boxed + weights[1] * (silhouette + cost)).detach().argmin(0)
+    index = best.unsqueeze(0)
+    chosen = [x.gather(0, index)[0] for x in (boxed, silhouette, cost)]
+    return Fitted(chosen[0], chosen[1] + chosen[2], best)
+
+
+# --- Measured depth: front surfaces lie where a depth network sees them --------------------------
+
+FEWEST = 100.0  # pixels by which a sum is divided at least
+NEAREST = 0.05  # [m], nothing is nearer
+
+
+@record
+class Measured:
+    """The measured depth in the windows of the objects, after its scale was fitted to the room."""
+
+    depth: Float[Tensor, "objects h w"]
+    """[m]; 0 where it is not known."""
+    spread: Float[Tensor, " objects"]
+    """How far it is off: standard deviation of its logarithm."""
+
+
+def measured_term(
+    seen: Depths, mask: Float[Tensor, "objects h w"], known: Measured
+) -> Float[Tensor, "*starts objects"]:
+    """Distance of drawn from measured surfaces, a Student t of their logarithms [nats].
+
+    Errors of a network are smooth: the pixels of one object are off together. So it is their mean:
+    an object has one measurement, however large it is in the image.
+    """
+    there = seen.covered & (mask > 0.5) & (known.depth > 0)
+    drawn, measured = (x.clamp_min(NEAREST).log() for x in (seen.nearest, known.depth))
+    off = (drawn - measured) / known.spread[:, None, None]
+    cost = 2 * (1 + off.square() / 3).log()
+    return (cost * there).sum((-2, -1)) / there.sum((-2, -1)).clamp_min(FEWEST)
