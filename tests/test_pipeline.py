@@ -39,7 +39,6 @@ def light(name, steps=15):
             short=replace(config.layout.short, steps=min(5, config.layout.short.steps)),
         ),
         refine=replace(config.refine, method=replace(config.refine.method, steps=5)),
-        bend=replace(config.bend, method=replace(config.bend.method, steps=5)),
         gather=replace(config.gather, cells=48),
         place=replace(config.place, method=replace(config.place.method, steps=steps)),
     )  # fmt: skip

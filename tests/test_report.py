@@ -23,8 +23,7 @@ from mover.app.report.plan import draw_top, extent_of
 from mover.app.report.scene_view import pack_view, thin, thin_choice
 from mover.app.report.tables import find_changes, metrics_table, objects_table
 from mover.core.colours import colour, css
-from mover.core.types import Bodies, Cage, Capture, Scene
-from mover.geometry.cage import bent
+from mover.core.types import Bodies, Capture, Scene, SeatStretch
 from mover.geometry.camera import to_camera, to_world
 from mover.geometry.nearest import as_float64, as_int64, closest
 from mover.geometry.placement import place_object
@@ -268,13 +267,13 @@ class TestView:
         tree, _ = self.unpack(pack_view({"initial": room(0.5), "result": room()}, {}))
         assert len(tree["meshes"]) == 3
 
-    def test_a_bent_mesh_is_thinned_where_the_unbent_one_was(self):
+    def test_a_raised_mesh_is_thinned_where_the_given_one_was(self):
         ball = mesh_of(trimesh.creation.icosphere(subdivisions=5))
         one = dataclasses.replace(room().objects[0], mesh=ball)
-        offset = 0.4 * torch.randn(3, 3, 3, 3, generator=torch.Generator().manual_seed(0))
-        cage = Cage(ball.verts.amin(0), ball.verts.amax(0), offset)
+        low, high = ball.verts[:, 1].amin(), ball.verts[:, 1].amax()
+        stretch = SeatStretch(low, high, 0.4 * (high - low))
         other = dataclasses.replace(
-            one, mesh=dataclasses.replace(ball, verts=bent(ball.verts, cage)), cage=cage
+            one, mesh=dataclasses.replace(ball, verts=stretch.of(ball.verts)), stretch=stretch
         )
         scenes = {
             name: dataclasses.replace(room(), objects=(piece,))
@@ -285,7 +284,7 @@ class TestView:
             np.frombuffer(block, np.int16, 3 * mesh["n_verts"], mesh["verts"]).reshape(-1, 3)
             * mesh["step"] + mesh["middle"] for mesh in tree["meshes"]
         )  # fmt: skip
-        moved = bent(torch.from_numpy(before).float(), cage)
+        moved = stretch.of(torch.from_numpy(before).float())
         assert np.abs(after - moved.numpy()).max() < 1e-3
         squared, *_ = closest(after, as_float64(other.mesh.verts), as_int64(ball.faces))
         assert np.sqrt(squared).max() < 0.02

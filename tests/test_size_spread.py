@@ -106,7 +106,7 @@ class Weighing(Run):
 
 @pytest.mark.slow
 def test_all_stages_after_the_first_believe_wrong_sizes_less(small_room, tmp_path):
-    run, config = Weighing(tmp_path), replace(light("robust"), shape="keep")
+    run, config = Weighing(tmp_path), light("robust")
     reconstruct(add_noise(small_room, NoiseConfig(scale=0.35), 1), config, run)
     names, scales, growths = zip(*run.heard, strict=True)
     assert names == ("place_objects", "refine_camera", *["place_objects"] * 3)

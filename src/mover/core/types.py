@@ -43,15 +43,21 @@ class Segment:
 
 
 @record
-class Cage:
-    """A box of 3 x 3 x 3 control points by which a mesh is bent (`geometry.cage`)."""
+class SeatStretch:
+    """How the middle of a mesh is raised to where people sit; its bottom and its top stay."""
 
-    low: Float[Tensor, "*items 3"]
-    """Lowest corner, in the mesh's coordinates."""
-    high: Float[Tensor, "*items 3"]
-    """Highest corner."""
-    offset: Float[Tensor, "*items 3 3 3 3"]
-    """How far each control point is moved; the first three axes are x, y, z."""
+    bottom: Float[Tensor, "*items"]
+    """Lowest and highest y, in the mesh's coordinates."""
+    top: Float[Tensor, "*items"]
+    rise: Float[Tensor, "*items"]
+    """Points at the share t of the height go up by 2 t (1 - t) of it."""
+
+    def of(self, points: Float[Tensor, "*items points 3"]) -> Float[Tensor, "*items points 3"]:
+        """Points of the mesh, raised."""
+        bottom, height = self.bottom.unsqueeze(-1), (self.top - self.bottom).unsqueeze(-1)
+        share = ((points[..., 1] - bottom) / height.clamp_min(1e-9)).clamp(0, 1)
+        y = points[..., 1] + 2 * share * (1 - share) * self.rise.unsqueeze(-1)
+        return torch.stack([points[..., 0], y, points[..., 2]], -1)
 
 
 @record
@@ -62,7 +68,7 @@ class SceneObject:
     category: str
     mesh: Mesh
     mesh_file: str
-    """Where the mesh came from; it is copied, and rewritten only where it was bent (`cage`)."""
+    """Where the mesh came from; it is copied, and rewritten only where a seat moved (`stretch`)."""
     annotation: int | None
     """Id of its annotation in the reference image; None: no image evidence."""
     support: str
@@ -76,8 +82,8 @@ class SceneObject:
     segments: tuple[Segment, ...] = ()
     """Where it stands when, of an object that is moved; its own place is that of the reference
     image. Empty: it never moves."""
-    cage: Cage | None = None
-    """How `mesh` was bent from what its file holds; None: it is as in the file."""
+    stretch: SeatStretch | None = None
+    """How `mesh` was made from what its file holds; None: it is as in the file."""
 
 
 @record

@@ -328,7 +328,6 @@ def _held(config: Config) -> Config:
         config,
         correct_depth=False,
         path="keep",
-        shape="keep",
         height_spread=0.0,
         align=replace(config.align, steps=0),
         refine=replace(config.refine, rounds=0),

@@ -39,13 +39,13 @@ from mover.stages.contacts.assign_contacts import ContactAssignment
 from mover.stages.contacts.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.contacts.gather_cues import Cues, GatherInputs
 from mover.stages.contacts.label_contacts import LabelInputs
-from mover.stages.objects.bend_shapes import told_of_shapes
 from mover.stages.objects.find_image_cues import ImageInputs, Seen, order_of
 from mover.stages.objects.fronts import turned_to_people
 from mover.stages.objects.on_platforms import platforms_of, stood, supports_with_platforms
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.place_objects import energy_of, with_trees
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
+from mover.stages.objects.seat_heights import seat_warnings
 from mover.stages.objects.starts import alone
 from mover.stages.people.find_depth import pelvis, size_spread
 
@@ -66,8 +66,8 @@ class ReconstructionContext:
     """Ids of the objects that stay where the capture has them."""
     elsewhere: Spans = ()
     """In which an object is not where the reference image shows it."""
-    misfit: Float[Tensor, " objects"] | None = None
-    """What box and silhouette left of shapes before they were bent: doubt of them stays."""
+    unfit: Bool[Tensor, " objects"] | None = None
+    """Whose shapes do not fit the image: seats may be elsewhere in them; None: not asked."""
     segments: Segments | None = None
     """Straight edges of the reference image; None: nobody looks for them."""
 
@@ -224,7 +224,7 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
     capture, placed = context.capture, state.placed
     pieces = to_objects(capture.scene.objects, context.prepared, placed.layout)
     by_image = to_objects(capture.scene.objects, context.prepared, state.alone)
-    warnings = [*capture.warnings, *context.prepared.warnings, *told_of_shapes(pieces)]
+    warnings = [*capture.warnings, *context.prepared.warnings, *seat_warnings(pieces)]
     bodies = None
     if people is not None:
         bodies = to_world(people.bodies, state.camera)

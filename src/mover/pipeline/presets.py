@@ -15,7 +15,6 @@ from mover.stages.camera.config import LensConfig, ScaleConfig
 from mover.stages.config import (
     AlignConfig,
     AssignConfig,
-    BendConfig,
     ContactConfig,
     DepthConfig,
     FootContactConfig,
@@ -63,10 +62,6 @@ class Config:
     """Camera and ground refined with the objects."""
     sizes: SpreadConfig = field(default_factory=SpreadConfig)
     """How far the given sizes are believed in this room."""
-    shape: Literal["keep", "bend"] = "keep"
-    """Meshes whose shapes do not fit the image are bent a little towards it, or kept."""
-    bend: BendConfig = field(default_factory=BendConfig)
-    """How far they are bent."""
     gather: GatherConfig = field(default_factory=GatherConfig)
     """Evidence from all people."""
     assign: AssignConfig = field(default_factory=AssignConfig)
@@ -86,7 +81,8 @@ class Config:
     their model and no height is given: the furniture then tells the scale, too (and where bodies
     say how far their sizes may be off, as those of `mover fit` do); 0: believed."""
     seat_heights: bool = False
-    """How high people sit tells the scale of such a room, too."""
+    """How high people sit constrains the scale of such a room, and the seats of meshes that do not
+    fit the image."""
     turn_to_people: bool = False
     """Furniture along walls that was given with its back to the people begins turned to them."""
     silhouette_confidence: bool = False
@@ -133,7 +129,6 @@ ROBUST = Config(
     ),
     refine=RefineConfig(rounds=1),
     sizes=SpreadConfig(0.05),
-    shape="bend",
     gather=GatherConfig(erode=1, reach=0.1),
     assign=_GROUPS,
     place=PlaceConfig(

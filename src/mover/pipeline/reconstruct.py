@@ -52,7 +52,6 @@ from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import cues_in_windows, gather_cues
 from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
 from mover.stages.contacts.resting import NOTHING
-from mover.stages.objects.bend_shapes import BendInputs, bend_shapes, with_shapes
 from mover.stages.objects.find_image_cues import (
     ImageInputs,
     find_image_cues,
@@ -61,11 +60,12 @@ from mover.stages.objects.find_image_cues import (
 )
 from mover.stages.objects.gather_depth import DepthInputs, gather_depth
 from mover.stages.objects.gather_given import (
-    BENT,
+    UNFIT,
     believed_sides,
     gather_given,
     given_axis,
     lighter_where_used,
+    prior_weights,
 )
 from mover.stages.objects.own_edges import OwnEdges, own_edges
 from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
@@ -73,7 +73,6 @@ from mover.stages.objects.place_objects import (
     estimate_size_prior,
     inlier_weights,
     place_objects,
-    priced,
     without_search,
 )
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
@@ -136,8 +135,7 @@ def _reconstructed(
     if not scale_spread(context, people):
         _begin(run, gather_cues, gather_inputs(context, people, state), config.gather)
     image_energy = state.placed.energy[0]
-    context, state = with_shapes_bent(context, state)
-    image_energy = torch.maximum(image_energy, state.placed.energy[0])
+    context = with_unfit_shapes(context, state)
     people, state = with_common_scale(context, people, state)
     _begin(run, gather_cues, gather_inputs(context, people, state), config.gather)
     state = gathered(context, people, assigned(context, people, state))
@@ -225,8 +223,6 @@ def with_given(
         axes = None if heading is None else given_axis(objects.categories, heading, edges)
         return replace(free, given=to_device(axes, image.trust.device))
     left = misfit_of(context, free, before)
-    if context.misfit is not None:
-        left = torch.maximum(left, context.misfit)
     given, layout = as_given(context, camera), before.placed.layout
     known = gather_given(objects, given, layout, left, heading, edges)
     return replace(
@@ -250,28 +246,14 @@ def misfit_of(
     return energy(alone(state.placed.layout)).per_item[0].detach()
 
 
-def with_shapes_bent(
-    context: ReconstructionContext, state: SceneState
-) -> tuple[ReconstructionContext, SceneState]:
-    """Meshes whose shapes do not fit the image bent towards it, and all placed anew."""
-    if context.config.shape == "keep":
-        return context, state
-    inputs, config = state.descent
-    given = inputs.image.given
-    if given is None:
-        return context, state
-    loose = (given.weight >= BENT) & ~is_pinned(context)
-    if not bool(loose.any()):
-        return context, state
-    free = replace(inputs.image, sides=believed_sides(inputs.image.sides, 0 * given.weight))
-    misfit = misfit_of(context, free, state)
-    bend = BendInputs(inputs, priced(config), state.placed.layout, loose)
-    bending = context.run.stage(bend_shapes, bend, context.config.bend)
-    prepared, layout = with_shapes(context.prepared, bending)
-    context = replace(context, prepared=prepared, misfit=misfit)
-    state = replace(state, placed=replace(state.placed, layout=layout))
-    found = placed_by_image(context, state.camera, state.ground, state)
-    return context, replace(found, traces={**state.traces, **found.traces})
+def with_unfit_shapes(context: ReconstructionContext, state: SceneState) -> ReconstructionContext:
+    """Which shapes do not fit the image, where seats may be raised in them."""
+    image = state.descent[0].image
+    if not context.config.seat_heights or image.given is None:
+        return context
+    free = replace(image, sides=believed_sides(image.sides, 0 * image.given.weight))
+    unfit = prior_weights(misfit_of(context, free, state)) >= UNFIT
+    return replace(context, unfit=unfit & ~is_pinned(context))
 
 
 def with_measured(

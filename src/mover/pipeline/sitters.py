@@ -12,33 +12,25 @@ from mover.pipeline.outcome import (
     ReconstructionContext,
     SceneState,
     floor_now,
-    is_pinned,
     scale_spread,
 )
-from mover.stages.objects.bend_shapes import with_lifted_seats
-from mover.stages.objects.gather_given import UNFIT, prior_weights
 from mover.stages.objects.room_scale import ScaleKnown, common_scale, seats_tell
-from mover.stages.objects.seat_heights import SeatInputs, find_seat_heights
+from mover.stages.objects.seat_heights import SeatInputs, find_seat_heights, with_lifted_seats
 from mover.stages.people.find_depth import nearer
 
 
 def with_seats_lifted(
     context: ReconstructionContext, people: PeopleState, state: SceneState
 ) -> ReconstructionContext:
-    """The seats of loose shapes as high as people tell who are assigned to them."""
-    config = context.config
-    if not config.bend.seat or context.misfit is None or state.contacts is None:
-        return context
-    loose = (prior_weights(context.misfit) >= UNFIT) & ~is_pinned(context)
-    if not bool(loose.any()):
+    """The seats of shapes that do not fit as high as people sit who are assigned to them."""
+    if context.unfit is None or not bool(context.unfit.any()) or state.contacts is None:
         return context
     bodies = in_world(rows_of(people.bodies, people.kept), state.camera)
-    inputs = SeatInputs(
+    lift = find_seat_heights(SeatInputs(
         context.prepared.objects, state.placed.layout, bodies, people.parts,
-        floor_now(context, state), state.contacts.pairs, loose,
-    )  # fmt: skip
-    found = context.run.stage(find_seat_heights, inputs, config.bend)
-    return replace(context, prepared=with_lifted_seats(context.prepared, found.lift))
+        floor_now(context, state), state.contacts.pairs, context.unfit,
+    ))  # fmt: skip
+    return replace(context, prepared=with_lifted_seats(context.prepared, lift))
 
 
 def with_common_scale(

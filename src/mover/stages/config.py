@@ -132,20 +132,6 @@ class PrepareConfig:
 
 
 @dataclass(frozen=True)
-class BendConfig:
-    """How far meshes are bent whose shapes do not fit the image (`objects.bend_shapes`)."""
-
-    sigma: Annotated[float, float_in(1e-6, 1)] = 0.04
-    """Usual move of a control point [share of the box]."""
-    weight: Weight = 0.002
-    """Price of a nat of bending."""
-    method: Adam = field(default_factory=lambda: Adam(100, 0.006, 0.001, beta2=0.98))
-    """How shapes and places are found together."""
-    seat: Metres = 0.07
-    """Usual error of a seat's height in another design [m]; 0: none is moved (`seat_heights`)."""
-
-
-@dataclass(frozen=True)
 class ImageConfig:
     """How the image is sampled."""
 

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from mover.core.colours import colour, css, person_colour
 from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject
-from mover.geometry.cage import bent
 from mover.geometry.mesh import simplifying
 from mover.geometry.placement import place_object
 from mover.geometry.topology import distinct_rows
@@ -161,7 +160,7 @@ def _shared(
     for other in seen:
         if other.mesh is mesh or _alike(other.mesh, mesh):
             return other.place
-    fewer = _bent_alike(piece, seen) or thin(mesh, FACES_OBJECT)
+    fewer = _raised(piece, seen) or thin(mesh, FACES_OBJECT)
     low, step, coarse = _coarse(fewer.verts)
     packed.append(
         {
@@ -185,15 +184,15 @@ def _alike(one: Mesh, other: Mesh) -> bool:
     return one.faces.equal(other.faces) and one.verts.equal(other.verts)
 
 
-def _bent_alike(piece: SceneObject, seen: list[_Packed]) -> Mesh | None:
-    """The thinned mesh of what the piece was bent from, bent in the same way; None: not seen."""
-    if piece.cage is None:
+def _raised(piece: SceneObject, seen: list[_Packed]) -> Mesh | None:
+    """The thinned mesh of the given one, raised as this one was; None: it is not packed."""
+    if piece.stretch is None:
         return None
     for other in seen:
         if other.mesh.faces.equal(piece.mesh.faces) and piece.mesh.verts.equal(
-            bent(other.mesh.verts, piece.cage)
+            piece.stretch.of(other.mesh.verts)
         ):
-            return Mesh(bent(other.thinned.verts, piece.cage), other.thinned.faces)
+            return Mesh(piece.stretch.of(other.thinned.verts), other.thinned.faces)
     return None
 
 

@@ -30,7 +30,7 @@ from mover.io.files.fields import (
     unique,
     write_json,
 )
-from mover.io.files.meshes import bend_file, copy_mesh, read_mesh, write_mesh
+from mover.io.files.meshes import copy_mesh, read_mesh, stretch_file, write_mesh
 from mover.io.files.schema import Id, Index, Number, Sizes, Text, Vector, checked
 
 log = logging.getLogger(__name__)
@@ -240,7 +240,7 @@ def write_scene(
 ) -> None:
     """Write a scene: the user's meshes are copied as they are, new ones become meshes/<id>.glb.
 
-    Of a mesh that was bent, the copy is: with its parts, materials and textures (`bend_file`).
+    The copy of a mesh whose seat was raised keeps parts, materials and textures (`stretch_file`).
 
     Args:
         scene: What is written.
@@ -253,8 +253,8 @@ def write_scene(
         source = Path(piece.mesh_file)
         if source.is_absolute() and source.is_file():
             target = copy_mesh(source, meshes, piece.id)
-            if piece.cage is not None:
-                target = bend_file(target, piece.cage)
+            if piece.stretch is not None:
+                target = stretch_file(target, piece.stretch)
         else:
             target = meshes / f"{piece.id}.glb"
             write_mesh(piece.mesh, target)

@@ -16,7 +16,7 @@ from mover.geometry.camera import NEAR
 from mover.geometry.placement import place_object
 from mover.geometry.rotations import affine, rot_y
 from mover.io.export.finished import Exported, Finished
-from mover.io.files.meshes import bent_part
+from mover.io.files.meshes import stretched_part
 
 GHOSTS = 12  # at most so many bodies
 FLOOR_MARGIN = 1.0  # [m] beyond the furniture
@@ -100,8 +100,8 @@ def parts_of(item: SceneObject, tint: Colour) -> list[tuple[Any, np.ndarray]]:
     for node in loaded.graph.nodes_geometry:
         transform, name = loaded.graph[node]
         part = loaded.geometry[name]
-        if item.cage is not None:
-            part, transform = bent_part(part, transform, item.cage), np.eye(4)
+        if item.stretch is not None:
+            part, transform = stretched_part(part, transform, item.stretch), np.eye(4)
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
             found.append((_coloured(part, tint, item.id), np.asarray(transform)))
     return found or [(_solid(item.mesh, (*tint, 1.0), item.id), np.eye(4))]

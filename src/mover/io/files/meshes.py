@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.files import copy_whole, replacing
-from mover.core.types import Cage, Mesh
-from mover.geometry.cage import bent
+from mover.core.types import Mesh, SeatStretch
 from mover.io.files.fields import LARGEST, LARGEST_FILE, At, reason, refuse, shown, text
 
 KINDS = (".glb", ".gltf", ".obj", ".ply", ".off", ".stl")
@@ -168,12 +167,12 @@ def copy_mesh(source: Path, folder: Path, name: str) -> Path:
     return target
 
 
-def bend_file(path: Path, cage: Cage) -> Path:
-    """A mesh file bent where it lies: parts, materials and textures stay; it becomes a .glb.
+def stretch_file(path: Path, stretch: SeatStretch) -> Path:
+    """Raise the seat in a mesh file, which becomes a .glb; materials and textures stay.
 
     Args:
         path: A copy, which goes if it has another ending.
-        cage: In the coordinates of the whole, with the transforms of the nodes applied.
+        stretch: In the coordinates of the whole, with the transforms of the nodes applied.
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb
@@ -184,7 +183,7 @@ def bend_file(path: Path, cage: Cage) -> Path:
     out = trimesh.Scene()
     for node in whole.graph.nodes_geometry:
         matrix, name = whole.graph[node]
-        out.add_geometry(bent_part(whole.geometry[name], matrix, cage), node_name=node)
+        out.add_geometry(stretched_part(whole.geometry[name], matrix, stretch), node_name=node)
     target = path.with_suffix(".glb")
     with replacing(target) as file:
         file.write_bytes(export_glb(out))
@@ -193,12 +192,12 @@ def bend_file(path: Path, cage: Cage) -> Path:
     return target
 
 
-def bent_part(part: Any, matrix: NDArray[Any], cage: Cage) -> Any:  # noqa: ANN401
-    """A part of a scene of trimesh, put where its node has it, and bent there."""
+def stretched_part(part: Any, matrix: NDArray[Any], stretch: SeatStretch) -> Any:  # noqa: ANN401
+    """A part of a scene of trimesh, put where its node has it, and raised there."""
     part = part.copy()
     part.apply_transform(matrix)
     verts = torch.from_numpy(np.array(part.vertices, dtype=np.float32))
-    part.vertices = bent(verts, cage).numpy()
+    part.vertices = stretch.of(verts).numpy()
     return part
 
 

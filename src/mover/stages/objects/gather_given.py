@@ -19,7 +19,6 @@ from mover.stages.objects.own_edges import OwnEdges
 FIT = 0.1  # image energy (robust form) of a shape that fits
 PART, WHOLE = 0.2, 0.9  # shares of a side that something is near to, or touches
 UNFIT = 0.5  # weight from which on a shape does not fit, or only as something hides it
-BENT = 1.0  # weight from which on a mesh is bent: a shape that fits would leave less
 WEIGHTS = (0.05, 2.0)  # least and largest weight
 LOOSE = math.radians(8)  # how well the image alone turns objects of a weight of 1 [rad]
 SQUARE = math.radians(5)  # how well furniture that stands along an axis does so [rad]

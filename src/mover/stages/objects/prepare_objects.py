@@ -13,9 +13,8 @@ from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import fingerprint, record
 from mover.core.run import kept, sources
-from mover.core.types import Cage, Layout, Mesh, Objects, SceneObject
+from mover.core.types import Layout, Mesh, Objects, SceneObject, SeatStretch
 from mover.furniture.library import BACKS, SEATS, canonical
-from mover.geometry.cage import bent
 from mover.geometry.mesh import bottom_center, box, decimate, sample_surface, signed_volume, used
 from mover.geometry.occupancy import load_occupancy, occupied_mesh
 from mover.geometry.placement import FREE, GROUND
@@ -107,10 +106,10 @@ class Prepared:
     scale: Float[Tensor, "objects 3"]
     """Initial scale."""
     warnings: tuple[str, ...]
-    cages: Cage | None = None
-    """How each mesh is bent, in its own coordinates (`bend_shapes`); None: none is."""
+    stretch: SeatStretch | None = None
+    """How seats are raised, in the objects' frames [m] (`seat_heights`); None: none is."""
     straight: Objects | None = None
-    """The proxies before they were bent; None: none is."""
+    """The proxies before that; None: none is raised."""
 
 
 @record
@@ -160,7 +159,7 @@ def to_objects(
         dataclasses.replace(
             p, support=below[i], t_world_object=origin[i], yaw=layout.yaw[i], scale=scale[i]
         )
-        for i, p in enumerate(bent_pieces(pieces, prepared.cages))
+        for i, p in enumerate(_with_raised_seats(pieces, prepared))
     )
 
 
@@ -170,17 +169,20 @@ def support_names(objects: Objects) -> tuple[str, ...]:
     return tuple(words.get(below) or objects.ids[below] for below in objects.supports.tolist())
 
 
-def bent_pieces(pieces: tuple[SceneObject, ...], cages: Cage | None) -> tuple[SceneObject, ...]:
-    """The pieces with their meshes bent; those whose cage moves nothing stay as they are."""
-    if cages is None:
+def _with_raised_seats(
+    pieces: tuple[SceneObject, ...], prepared: Prepared
+) -> tuple[SceneObject, ...]:
+    """The objects with their own meshes raised; those whose seats stay are as they were."""
+    known = prepared.stretch
+    if known is None:
         return pieces
-    out: list[SceneObject] = []
-    for i, piece in enumerate(pieces):
-        cage = Cage(cages.low[i], cages.high[i], cages.offset[i])
-        if bool(cage.offset.any()):
-            mesh = Mesh(bent(piece.mesh.verts, cage), piece.mesh.faces)
-            piece = dataclasses.replace(piece, mesh=mesh, cage=cage)
-        out.append(piece)
+    unit, low = prepared.scale[:, 1], prepared.center[:, 1]
+    own = SeatStretch(low, low + known.top / unit, known.rise / unit)
+    out = list(pieces)
+    for i in known.rise.nonzero()[:, 0].tolist():
+        stretch, mesh = SeatStretch(own.bottom[i], own.top[i], own.rise[i]), pieces[i].mesh
+        mesh = dataclasses.replace(mesh, verts=stretch.of(mesh.verts))
+        out[i] = dataclasses.replace(pieces[i], mesh=mesh, stretch=stretch)
     return tuple(out)
 
 

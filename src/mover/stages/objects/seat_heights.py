@@ -1,11 +1,13 @@
 r"""Seats as high in their meshes as people sit and lie on them (not in the paper; its failure A).
 
-The image tells how large a piece is, from its feet to the top of its back, and not how high its
+The image gives the size of an object, from its feet to the top of its back, but not how high its
 seat is in between: that is inside the outline, and a mesh of another design has it elsewhere (7 cm
-off, root mean square, in rooms where no mesh is the true one). Who sits tells it to 2.5 cm: the
+off, root mean square, in rooms where no mesh is the true one). Seated people give it to 2.5 cm: the
 lowest of the skin that carries them is the seat. So the middle of a mesh whose shape does not fit
 is raised or lowered until its seat is there; feet and back stay where they are.
 """
+
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,20 +15,20 @@ from torch import Tensor
 
 from mover.bodies.parts import Parts, members
 from mover.bodies.posture import postures
-from mover.core.observe import Observer, silent
 from mover.core.records import record
-from mover.core.types import Bodies, Layout, Objects
+from mover.core.types import Bodies, Layout, Objects, SceneObject, SeatStretch
 from mover.furniture.floor import Floor, height_under_bodies
 from mover.geometry.placement import place
-from mover.stages.config import BendConfig
+from mover.stages.objects.prepare_objects import Prepared
 from mover.stages.objects.room_scale import CARRIED, FEWEST
 
-CARRIERS = (CARRIED, ("seat",))  # of who sits, who lies
-TOLD = 0.025  # [m], usual error of the height of a seat as they tell it
+CARRIERS = (CARRIED, ("seat",))  # of seated and of lying people
+OBSERVED = 0.025  # [m], usual error of the height of a seat as people give it
+SHAPE = 0.07  # [m], usual error of the height of a seat in a mesh of another design
 LOWEST = 0.15  # share of their points below the top of what carries them
 NEAR = 20  # points of a seat that are nearest to a body
-BETWEEN = (0.15, 0.9)  # shares of the height of a piece between which a seat can be moved
-MOST = 0.3  # of a piece's height, that its middle control points move
+BETWEEN = (0.15, 0.9)  # shares of the height of an object between which a seat can be moved
+MOST = 0.3  # of an object's height, that its middle is stretched by
 
 
 @record
@@ -41,37 +43,27 @@ class SeatInputs:
     floor: Floor
     pairs: Int[Tensor, "pairs 3"]
     """Who touches what: body, object, and part as in `ContactPoints.points`."""
-    loose: Bool[Tensor, " objects"]
-    """Whose shapes do not fit."""
+    unfit: Bool[Tensor, " objects"]
+    """Whose shapes do not fit the image."""
 
 
-@record
-class SeatHeights:
-    """How much higher seats are than in their meshes."""
-
-    lift: Float[Tensor, " objects"]
-    """In the objects' frames [m]; 0: nobody tells."""
-
-
-def find_seat_heights(
-    inputs: SeatInputs, config: BendConfig, observe: Observer = silent
-) -> SeatHeights:
-    """How much higher than in their meshes people find the seats on which they sit or lie."""
-    del observe
+def find_seat_heights(inputs: SeatInputs) -> Float[Tensor, " objects"]:
+    """How much higher than in their meshes people sit or lie, in the objects' frames [m]."""
     objects, layout = inputs.objects, inputs.layout
     tops, under = place(objects.top, layout), height_under_bodies(inputs.floor, inputs.bodies)
-    found = postures(inputs.bodies, inputs.parts, under)
+    posture = postures(inputs.bodies, inputs.parts, under)
     lift = torch.zeros_like(layout.yaw)
-    for k in (inputs.loose & objects.is_seat & objects.has_top).nonzero()[:, 0].tolist():
+    for k in (inputs.unfit & objects.is_seat & objects.has_top).nonzero()[:, 0].tolist():
         rows = inputs.pairs[inputs.pairs[:, 1] == k, 0].unique()
-        said: list[Tensor] = []
-        for does, names in zip((found.sitting, found.lying), CARRIERS, strict=True):
+        observed: list[Tensor] = []
+        for does, names in zip((posture.sitting, posture.lying), CARRIERS, strict=True):
             some, carried = rows[does[rows]], members(inputs.parts, *names)
             if len(some) >= FEWEST and bool(carried.any()):
-                said.append(_higher(inputs.bodies.verts[some][:, carried], tops[k]))
-        if said:
-            lift[k] = _believed(said, config.seat) / layout.log_scale[k, 1].exp()
-    return SeatHeights(lift)
+                observed.append(_higher(inputs.bodies.verts[some][:, carried], tops[k]))
+        if observed:  # the mean of what is observed and of the mesh's own height, by precision
+            mean = torch.stack(observed).sum() / (len(observed) + (OBSERVED / SHAPE) ** 2)
+            lift[k] = mean / layout.log_scale[k, 1].exp()
+    return lift
 
 
 def _higher(skin: Float[Tensor, "bodies points 3"], top: Float[Tensor, "region 3"]) -> Tensor:
@@ -82,28 +74,33 @@ def _higher(skin: Float[Tensor, "bodies points 3"], top: Float[Tensor, "region 3
     return (low - top[near, 1].median(-1).values).median()
 
 
-def _believed(said: list[Tensor], shape: float) -> Tensor:
-    """The mean of what is said, and of what the mesh says, by their precisions."""
-    return torch.stack(said).sum() / (len(said) + (TOLD / shape) ** 2)
+def with_lifted_seats(prepared: Prepared, lift: Float[Tensor, " objects"]) -> Prepared:
+    """The furniture with its seats higher by so much [m], beside earlier lifts (`stretch`).
 
-
-def offsets_of(
-    lift: Float[Tensor, " objects"], straight: Objects
-) -> Float[Tensor, "objects 3 3 3 3"]:
-    """Moves of control points, in the objects' frames [m], that lift the seats (`geometry.cage`).
-
-    The middle of the height moves as a whole: by 2 t (1 - t) of that at the share t of the height.
-
-    Args:
-        lift: Of each seat [m].
-        straight: The furniture before anything was bent.
+    A seat at the share t of the height moves by 2 t (1 - t) of the stretch of the middle.
     """
+    straight = prepared.straight or prepared.objects
     height = straight.size[:, 1].clamp_min(1e-9)
     share = straight.top[..., 1].median(-1).values / height
-    low, high = BETWEEN
-    some = (share > low) & (share < high)
-    most = MOST * height
-    rise = (lift / (2 * share * (1 - share)).clamp_min(1e-3)).clamp(-most, most)
-    offset = torch.zeros(len(lift), 3, 3, 3, 3).to(lift)
-    offset[:, :, 1, :, 1] = torch.where(some, rise, torch.zeros_like(rise))[:, None, None]
-    return offset
+    rise = (lift / (2 * share * (1 - share)).clamp_min(1e-3)).clamp(-MOST * height, MOST * height)
+    rise = torch.where((share > BETWEEN[0]) & (share < BETWEEN[1]), rise, 0.0)
+    if not bool(rise.any()):
+        return prepared
+    if prepared.stretch is not None:
+        rise = rise + prepared.stretch.rise
+    stretch = SeatStretch(torch.zeros_like(height), height, rise)
+    names = ("verts", "samples", "top", "back")
+    lifted = {name: stretch.of(getattr(straight, name)) for name in names}
+    objects = replace(prepared.objects, **lifted)
+    return replace(prepared, objects=objects, stretch=stretch, straight=straight)
+
+
+def seat_warnings(objects: tuple[SceneObject, ...]) -> tuple[str, ...]:
+    """A sentence for each object whose seat is at another height than in its mesh."""
+    return tuple(
+        f"{piece.id}: its mesh does not fit the image and its seat is moved to where people sit, by"
+        f" up to {50 * float(abs(piece.stretch.rise * piece.scale[1])):.0f} cm"
+        " (`--no-seat-heights` leaves it)"
+        for piece in objects
+        if piece.stretch is not None
+    )
