@@ -16,7 +16,6 @@ from mover.bodies.skinning import open_body, zero_pose
 from mover.core.contact_labels import ContactLabels
 from mover.core.errors import InputError
 from mover.core.types import Bodies, Mesh
-from mover.furniture.floor import Floor
 from mover.geometry.nearest import to_surface
 from mover.geometry.placement import StandingMesh
 from mover.io.export.contacts import export_contacts, read_labels, write_labels
@@ -35,10 +34,10 @@ def standing(frames: int = 6) -> Bodies:
     )
 
 
-LEVEL = Floor(GROUND)
+LEVEL = GROUND
 
 
-def labelled(bodies: Bodies, *meshes: Mesh, floor: Floor | None = LEVEL) -> ContactLabels:
+def labelled(bodies: Bodies, *meshes: Mesh, floor: float | None = LEVEL) -> ContactLabels:
     ids = tuple(f"box_{k}" for k in range(len(meshes)))
     stands = tuple((StandingMesh(mesh),) for mesh in meshes)
     return label_contacts(LabelInputs(bodies, parts_of(bodies), stands, ids, floor), LabelConfig())

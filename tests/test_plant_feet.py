@@ -13,7 +13,6 @@ from mover.bodies.corrected import corrected, no_correction, puppet_of
 from mover.bodies.parts import members, parts_of
 from mover.core.types import Bodies
 from mover.evaluate.bodies import float_height, foot_skate, gather_gait
-from mover.furniture.floor import Floor
 from mover.stages.people.plant_feet import plant_feet
 
 COUNT = 12
@@ -31,11 +30,11 @@ def shaken(truth: Bodies, place: float, angle: float, seed: int = 0) -> Bodies:
 
 
 def planted(bodies: Bodies) -> Bodies:
-    return plant_feet(bodies, parts_of(bodies), Floor(GROUND))
+    return plant_feet(bodies, parts_of(bodies), GROUND)
 
 
 def skate(bodies: Bodies) -> float:
-    found = foot_skate(gather_gait(bodies, None, Floor(GROUND)))
+    found = foot_skate(gather_gait(bodies, None, GROUND))
     assert found is not None
     return found
 
@@ -113,9 +112,7 @@ def test_feet_under_the_floor_come_up():
 
 def test_a_body_that_floats_comes_down():
     given = still_people(ARMS_DOWN, 6, lift=0.05)
-    before, after = (
-        float_height(gather_gait(b, None, Floor(GROUND))) for b in (given, planted(given))
-    )
+    before, after = (float_height(gather_gait(b, None, GROUND)) for b in (given, planted(given)))
     assert before == pytest.approx(0.05, abs=0.01)
     assert after < 0.4 * before
 
@@ -148,7 +145,7 @@ def test_swinging_people_keep_their_swing():
     """A body that swings all its joints has no still sole: nothing holds it."""
     given = bodies_of(moving_pose(20))
     low = float(given.verts[..., 1].amin())
-    found = plant_feet(given, parts_of(given), Floor(low))
+    found = plant_feet(given, parts_of(given), low)
     assert float((found.verts - given.verts).norm(dim=-1).mean()) < 0.05
     assert math.isfinite(float(found.verts.sum()))
     assert members(parts_of(given), "left_sole").any()

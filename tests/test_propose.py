@@ -17,7 +17,6 @@ from mover.core.errors import InputError
 from mover.core.records import fingerprint
 from mover.core.run import Run
 from mover.core.types import Bodies, Proposal, Room, SceneObject
-from mover.furniture.floor import Floor
 from mover.furniture.library import make_piece
 from mover.geometry.boxes import box_of
 from mover.geometry.placement import place_object
@@ -46,7 +45,7 @@ def somewhere(bodies: Bodies, yaw: float = TURN, lift: float = 0.0) -> Bodies:
 def proposed(bodies: Bodies, known: KnownTops = NOTHING) -> tuple[Proposal, ...]:
     parts = parts_of(bodies)
     chance = touching(bodies, parts, GROUND)
-    inputs = ProposeInputs(bodies, parts, chance, Floor(GROUND), camera(), known)
+    inputs = ProposeInputs(bodies, parts, chance, GROUND, camera(), known)
     return propose_supports(inputs, ProposeConfig()).found
 
 

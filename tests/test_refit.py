@@ -23,7 +23,6 @@ from mover.fitting.presets import FITS, PAPER_ROOM, ROOM_TERMS, at_most, without
 from mover.fitting.prior import ANGLES
 from mover.fitting.room import RHO, FitRoom, room_terms
 from mover.fitting.unknowns import Points
-from mover.furniture.floor import Floor, floor_of
 from mover.geometry.camera import project
 from mover.geometry.volume import grid_around
 from mover.geometry.volume_warp import union_bodies
@@ -152,7 +151,7 @@ def box_room(stands=(False, False)) -> FitRoom:
     volume = union_bodies(mesh.verts[None], mesh.faces, grid_around(low, high, 64, 0.2), 1)
     top = torch.tensor([[0.0, -0.5, 0.0]])
     return FitRoom(
-        torch.eye(3), Floor(-1.0), volume, top, torch.tensor([[0.0, 1.0, 0.0]]),
+        torch.eye(3), -1.0, volume, top, torch.tensor([[0.0, 1.0, 0.0]]),
         torch.arange(2), torch.tensor([True, True]), 10.0, torch.tensor([True, True]),
         torch.tensor([stands]),
     )  # fmt: skip
@@ -213,7 +212,7 @@ def test_the_chain_from_keypoints_gives_people_a_place_in_the_room(small_room, t
     def judged(scene: Scene, bodies: Bodies) -> dict[str, float]:
         truth = to_world(small_room.bodies, camera)
         solid = furniture_of(scene.objects, close_meshes(scene.objects))
-        return evaluate_people(bodies, floor_of(scene), solid, truth)
+        return evaluate_people(bodies, scene.ground, solid, truth)
 
     proxies = tuple(close_mesh(thing.mesh) for thing in trial.truth.objects)
     true = under_camera(replace(room, proxies=proxies, scene=trial.truth), capture, camera)

@@ -12,7 +12,6 @@ from test_given import somewhere
 from mover.bodies.parts import parts_of
 from mover.core.types import Layout
 from mover.energy.prior_terms import COMMON, SIZE
-from mover.furniture.floor import Floor
 from mover.stages.objects.gather_given import gather_given
 from mover.stages.objects.room_scale import (
     FITTED,
@@ -22,7 +21,7 @@ from mover.stages.objects.room_scale import (
     seats_tell,
 )
 
-ROOM = Floor(0.0)
+ROOM = 0.0
 
 
 @pytest.mark.parametrize("large", [0.93, 1.0, 1.06])

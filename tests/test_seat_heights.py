@@ -11,7 +11,6 @@ from test_export import textured
 
 from mover.bodies.parts import members, parts_of
 from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject, SeatStretch
-from mover.furniture.floor import Floor
 from mover.furniture.library import catalogue
 from mover.geometry.placement import place_object
 from mover.io.capture.scene_file import read_scene, write_scene
@@ -32,7 +31,7 @@ from mover.stages.objects.seat_heights import (
     with_lifted_seats,
 )
 
-FLOOR = Floor(0.0)
+FLOOR = 0.0
 SITTERS = people(pose(SEATED, 5), fps=5.0)
 PARTS = parts_of(SITTERS)
 CARRIED = members(PARTS, "seat", "left_thigh", "right_thigh")

@@ -385,8 +385,6 @@ class FootContacts:
     """Frame of each point."""
     warnings: tuple[str, ...]
     """What made the evidence weaker than it should be."""
-    lift: Float[Tensor, " soles"] | None = None
-    """How much higher than the plane each may be as well, as a platform is seen there [m]."""
 
 
 def up_cam(
@@ -405,22 +403,6 @@ def heights(
     return R_cam_world[..., :, 1] @ points_cam.mT - ground.unsqueeze(-1)
 
 
-def over_floor(
-    soles: FootContacts,
-    R_cam_world: Float[Tensor, "*starts 3 3"],
-    ground: Float[Tensor, "*starts"],
-    offset: Float[Tensor, " soles"],
-) -> Float[Tensor, "*starts soles"]:
-    """Height of sole points above what is nearer, the plane or their platform [m].
-
-    The offset is how far each point's person floats [m].
-    """
-    high = heights(soles.points_cam, R_cam_world, ground) - offset
-    if soles.lift is None:
-        return high
-    return torch.where((high - soles.lift).abs() < high.abs(), high - soles.lift, high)
-
-
 def feet_term(
     soles: FootContacts,
     R_cam_world: Float[Tensor, "*starts 3 3"],
@@ -432,7 +414,7 @@ def feet_term(
 
     The offset is how far each point's person floats above the floor [m].
     """
-    return geman_mcclure(over_floor(soles, R_cam_world, ground, offset), rho)
+    return geman_mcclure(heights(soles.points_cam, R_cam_world, ground) - offset, rho)
 
 
 def tilt_prior(

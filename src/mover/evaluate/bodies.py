@@ -15,7 +15,6 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera
 from mover.energy.body_terms.time import Neighbours, gather_neighbours
 from mover.evaluate.scene import Metric
-from mover.furniture.floor import Floor, height_under, height_under_bodies
 from mover.io.capture.pose_file import into_camera
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 
@@ -251,12 +250,12 @@ MOTION_METRICS: dict[str, Metric[Gait]] = {
 }
 
 
-def gather_gait(bodies: Bodies, truth: Bodies | None, floor: Floor | None) -> Gait:
+def gather_gait(bodies: Bodies, truth: Bodies | None, floor: float | None) -> Gait:
     """Feet and joints of bodies in the world, and of the true ones where they are known."""
     soles, over, lowest = _soles(bodies), None, None
     if floor is not None:
-        over = None if soles is None else soles[..., 1] - height_under(floor, soles)
-        lowest = bodies.verts[..., 1].amin(1) - height_under_bodies(floor, bodies)
+        over = None if soles is None else soles[..., 1] - floor
+        lowest = bodies.verts[..., 1].amin(1) - floor
     near = gather_neighbours(bodies.frame, bodies.person, bodies.fps)
     none = gather_neighbours(bodies.frame[:0], bodies.person[:0], bodies.fps)
     twins = None if truth is None else gather_twins(bodies, truth)

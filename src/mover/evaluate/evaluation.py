@@ -56,7 +56,6 @@ from mover.evaluate.scene import (
     unmatched,
 )
 from mover.evaluate.stability import PHYSICS_METRICS, lacking, result_loads, simulate
-from mover.furniture.floor import Floor, floor_of, height_under
 from mover.geometry.placement import StandingMesh
 from mover.geometry.warp_start import mapped
 from mover.io.capture.bodies_file import read_bodies
@@ -250,7 +249,7 @@ def table(metrics: Mapping[str, Any]) -> str:
 
 def evaluate_people(
     bodies: Bodies,
-    floor: Floor | None,
+    floor: float | None,
     furniture: Furniture,
     truth: Bodies | None = None,
 ) -> dict[str, float]:
@@ -258,7 +257,7 @@ def evaluate_people(
 
     Args:
         bodies: People in the world of their room.
-        floor: Of that room; None: not known.
+        floor: Its height in that room [m]; None: not known.
         furniture: Its closed objects where they stand, and when.
         truth: The true people in the world of the true room; None: not known.
     """
@@ -309,7 +308,7 @@ def _people(
     judged: _Populated, truth: _Populated, touch: TrueTouch | None, config: EvaluateConfig
 ) -> dict[str, float]:
     """The metrics of a scene's people; what they or the truth do not tell is left out."""
-    bodies, floor = judged.bodies, floor_of(judged.scene)
+    bodies, floor = judged.bodies, judged.scene.ground
     if bodies is None:
         return {}
     near = gather_touch(bodies, judged.furniture, touch, config.bodies, config.reach)
@@ -318,7 +317,7 @@ def _people(
     if floor is not None and (told or len(judged.soles)):
         soles = bodies.verts[:, judged.soles]
         places = feet_places(bodies, judged.scene.camera) if told else soles
-        heights = places[..., 1] - height_under(floor, places)
+        heights = places[..., 1] - floor
         values |= measure(GROUND_METRICS, Standing(heights, config.ground_tolerance))
     values |= measure(MOTION_METRICS, gather_gait(bodies, truth.bodies, floor))
     twins = None if truth.bodies is None else gather_twins(bodies, truth.bodies)

@@ -18,7 +18,6 @@ from torch import Tensor
 from mover.core.records import record
 from mover.fitting.config import Stage
 from mover.fitting.unknowns import Points
-from mover.furniture.floor import Floor, height_under
 from mover.geometry.camera import to_world
 from mover.geometry.nearest import nearest_points
 from mover.geometry.volume import Volume, sample
@@ -32,8 +31,8 @@ class FitRoom:
     """The estimated room, and which skin meets it."""
 
     R_cam_world: Float[Tensor, "3 3"]
-    floor: Floor
-    """In the world."""
+    floor: float
+    """Its height in the world [m]."""
     furniture: Volume | None
     """Signed distance to all pieces; None: there are none."""
     surface: Float[Tensor, "points 3"]
@@ -58,7 +57,7 @@ def room_terms(
     if room is None:
         return {}
     skin, facing = (to_world(x, room.R_cam_world.to(x)) for x in (points.skin, points.facing))
-    floor, found = height_under(room.floor, skin), dict[str, Tensor]()
+    floor, found = room.floor, dict[str, Tensor]()
     if stage.under:
         found["under"] = stage.under * under_term(skin, floor)
     if stage.feet:
@@ -71,9 +70,7 @@ def room_terms(
     return found
 
 
-def under_term(
-    skin: Float[Tensor, "bodies points 3"], floor: Float[Tensor, "bodies points"]
-) -> Float[Tensor, " bodies"]:
+def under_term(skin: Float[Tensor, "bodies points 3"], floor: float) -> Float[Tensor, " bodies"]:
     """Depth of the lowest point below the floor [m]."""
     return (floor - skin[..., 1]).clamp_min(0).amax(-1)
 
@@ -81,7 +78,7 @@ def under_term(
 def feet_term(
     skin: Float[Tensor, "bodies points 3"],
     stands: Bool[Tensor, "bodies points"],
-    floor: Float[Tensor, "bodies points"],
+    floor: float,
 ) -> Float[Tensor, " bodies"]:
     """Mean distance of soles that carry the body from the floor, robust; 0 without any."""
     return _mean_where((skin[..., 1] - floor).square(), stands)

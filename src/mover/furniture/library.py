@@ -144,7 +144,6 @@ WIDE_CLASSES: dict[str, tuple[str, ...]] = {
 }
 """What detectors have one name for (COCO's), the likeliest first."""
 
-STEP = "step"
 SEATS = frozenset({"chair", "armchair", "office chair", "sofa", "stool", "bench", "bed"})
 """Classes that may take a sitter."""
 

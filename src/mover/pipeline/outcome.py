@@ -23,12 +23,17 @@ from mover.core.types import (
     Layout,
     Room,
     Scene,
-    SceneObject,
 )
 from mover.energy.human_terms import FootContacts
-from mover.furniture.floor import Floor, floor_of
 from mover.geometry.camera import to_camera
-from mover.geometry.placement import place, reproject, rest_on_support, standing_meshes
+from mover.geometry.placement import (
+    GROUND,
+    place,
+    reproject,
+    rest_on_support,
+    slide_to_floor,
+    standing_meshes,
+)
 from mover.geometry.volume import sample
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.presets import Config
@@ -41,7 +46,6 @@ from mover.stages.contacts.gather_cues import Cues, GatherInputs
 from mover.stages.contacts.label_contacts import LabelInputs
 from mover.stages.objects.find_image_cues import ImageInputs, Seen, order_of
 from mover.stages.objects.fronts import turned_to_people
-from mover.stages.objects.on_platforms import platforms_of, stood, supports_with_platforms
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.place_objects import energy_of, with_trees
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
@@ -119,7 +123,8 @@ def carried(
     objects, (camera, ground) = context.prepared.objects, here
     there = reproject(layout, objects.size[:, 1], old.R_cam_world, camera.R_cam_world)
     if context.config.slide_to_floor:
-        there = stood(there, objects, ground, is_pinned(context))
+        loose = (objects.supports == GROUND) & ~is_pinned(context)
+        there = slide_to_floor(there, ground, loose)
     return rest_on_support(there, objects.supports, objects.size[:, 1], ground)
 
 
@@ -140,35 +145,12 @@ def with_fronts(context: ReconstructionContext, people: PeopleState) -> Reconstr
     return replace(context, prepared=replace(prepared, start=replace(start, yaw=yaw)))
 
 
-def with_platforms(context: ReconstructionContext, state: SceneState) -> ReconstructionContext:
-    """What stands on a platform, carried by it."""
-    objects = context.prepared.objects
-    if not bool(platforms_of(objects).any()):
-        return context
-    given = as_given(context, state.camera)
-    found = supports_with_platforms(objects, state.placed.layout, given, state.ground)
-    found = torch.where(is_pinned(context), objects.supports, found)
-    prepared = replace(context.prepared, objects=replace(objects, supports=found))
-    return replace(context, prepared=prepared)
-
-
 def with_order(context: ReconstructionContext, state: SceneState) -> SceneState:
     """The state with what stands behind what, as the objects are placed now."""
     verts = place(context.prepared.objects.verts, state.placed.layout)
     z = to_camera(verts, state.camera.R_cam_world)[..., 2]
     behind = order_of(z.amin(-1), z.amax(-1))
     return replace(state, image=replace(state.image, behind=behind))
-
-
-def floor_now(context: ReconstructionContext, state: SceneState) -> Floor:
-    """The floor with its platforms as they are placed now."""
-    pieces: tuple[SceneObject, ...] = ()
-    if bool(platforms_of(context.prepared.objects).any()):
-        given = context.capture.scene.objects
-        pieces = to_objects(given, context.prepared, state.placed.layout)
-    floor = floor_of(Scene(state.camera, state.ground, pieces))
-    assert floor is not None, "a placed room has a floor"
-    return floor
 
 
 def scale_spread(context: ReconstructionContext, people: PeopleState) -> float:
@@ -259,7 +241,7 @@ def label_inputs(room: Room) -> LabelInputs:
         for piece, proxy in zip(room.scene.objects, room.proxies, strict=True)
     )
     ids = tuple(piece.id for piece in room.scene.objects)
-    return LabelInputs(room.bodies, parts_of(room.bodies), solid, ids, floor_of(room.scene))
+    return LabelInputs(room.bodies, parts_of(room.bodies), solid, ids, room.scene.ground)
 
 
 def within(frames: Int[Tensor, " rows"], spans: Spans) -> Bool[Tensor, " rows"]:

@@ -3,17 +3,10 @@
 import math
 from dataclasses import replace
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from mover.bodies.parts import Parts, parts_of
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, CameraPath, Capture
 from mover.energy.human_terms import FootContacts
-from mover.furniture.floor import is_platform
-from mover.geometry.boxes import box_of
-from mover.geometry.camera import project
 from mover.geometry.path import is_still, poses_at, scaled, to_reference
 from mover.io.capture.pose_file import moved
 from mover.pipeline.outcome import PeopleState, check_floor
@@ -25,7 +18,7 @@ from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens, t
 from mover.stages.camera.find_scale import ScaleInputs, find_scale
 from mover.stages.camera.room_lines import FINE, SURE, Segments, find_segments
 from mover.stages.cover import hiding
-from mover.stages.objects.find_image_cues import image_evidence, people_in_reference
+from mover.stages.objects.find_image_cues import people_in_reference
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
@@ -97,7 +90,6 @@ def located(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     touch = capture.touch if config.foot_contacts.given else None
     standing = FootContactInputs(carried(bodies, path), parts, kept, camera, touch)
     feet = run.stage(find_foot_contacts, standing, config.foot_contacts)
-    feet = replace(feet, lift=_lifts(feet, capture))
     camera, tilt_spread = _tilted(camera, capture)
     lean = 0.0 if bodies.size_spread is None else LEAN
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread, lean)
@@ -119,21 +111,6 @@ def _tilted(camera: Camera, capture: Capture) -> tuple[Camera, float | None]:
     if tilt is None:
         return camera, None
     return tilted_by(camera, tilt), tilt.spread
-
-
-def _lifts(feet: FootContacts, capture: Capture) -> Float[Tensor, " soles"] | None:
-    """How much higher than the plane soles may be, as a platform is seen there [m]."""
-    pieces = capture.scene.objects
-    rows = [k for k, piece in enumerate(pieces) if is_platform(piece.category)]
-    if not rows:
-        return None
-    boxes = image_evidence(capture).boxes
-    pixels = project(feet.points_cam, capture.scene.camera.K)
-    found = torch.zeros_like(feet.points_cam[:, 0])
-    for k in rows:
-        there = ((pixels >= boxes[k, :2]) & (pixels <= boxes[k, 2:])).all(-1)
-        found = torch.where(there, box_of(pieces[k]).size[1].to(found), found)
-    return found
 
 
 def found_path(

@@ -8,7 +8,6 @@ from mover.bodies.corrected import in_world
 from mover.core.records import rows_of
 from mover.core.run import Run
 from mover.core.types import Capture, Room
-from mover.furniture.floor import floor_of
 from mover.pipeline.outcome import PeopleState, ReconstructionContext, SceneState
 from mover.pipeline.presets import Config
 from mover.stages.contacts.assign_contacts import ContactInputs, find_contacts
@@ -27,7 +26,7 @@ def with_proposals(
     known: KnownTops,
 ) -> Room:
     """The room with what people rest on that is not in it."""
-    camera, floor = room.scene.camera, floor_of(room.scene)
+    camera, floor = room.scene.camera, room.scene.ground
     if people is None or floor is None or not config.propose.use:
         return room
     bodies = in_world(rows_of(people.bodies, people.kept), camera)

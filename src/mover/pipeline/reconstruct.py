@@ -29,7 +29,6 @@ from mover.pipeline.outcome import (
     carried,
     check_floor,
     check_room,
-    floor_now,
     gather_inputs,
     is_pinned,
     label_inputs,
@@ -38,7 +37,6 @@ from mover.pipeline.outcome import (
     unfurnished,
     with_fronts,
     with_order,
-    with_platforms,
 )
 from mover.pipeline.people import lines_of, people_of, through_its_lens
 from mover.pipeline.presets import PRESETS as PRESETS
@@ -129,7 +127,7 @@ def _reconstructed(
         return room_of(context, state, None)
     context = with_fronts(context, people)
     state = placed_by_image(context, people.alignment.camera, people.alignment.ground)
-    context = with_size_prior(with_platforms(context, state), state)
+    context = with_size_prior(context, state)
     for _ in range(config.refine.rounds):
         state = with_refined_camera(context, people, state)
     if not scale_spread(context, people):
@@ -299,7 +297,7 @@ def assigned(context: ReconstructionContext, people: PeopleState, state: SceneSt
     bodies = in_world(rows_of(people.bodies, people.kept), state.camera)
     capture, config, seen, run = context.capture, context.config, context.seen, context.run
     given = None if capture.touch is None else capture.touch[people.kept]
-    inputs = ContactInputs(bodies, people.parts, floor_now(context, state), given)
+    inputs = ContactInputs(bodies, people.parts, state.ground, given)
     chance = run.stage(find_contacts, inputs, config.contacts).probability
     contacts = AssignInputs(
         bodies, chance, people.parts, seen.masks, seen.boxes, state.camera,

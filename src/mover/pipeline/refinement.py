@@ -19,7 +19,6 @@ from mover.core.types import Bodies, Capture, Keypoints, Mesh, Room
 from mover.evaluate.evaluation import evaluate_people
 from mover.fitting.config import FitConfig
 from mover.fitting.prior import prior_of
-from mover.furniture.floor import floor_of
 from mover.geometry.placement import standing_meshes
 from mover.io.capture.bodies_file import read_bodies, read_contacts, write_bodies
 from mover.io.capture.camera_file import camera_of
@@ -137,7 +136,7 @@ def measure_people(out: Path, truth: Path | None = None) -> dict[str, dict[str, 
     room, true = finished_room(out), None if truth is None else _true_people(truth)
     pieces = zip(room.scene.objects, room.proxies, strict=True)
     solid = [s for piece, proxy in pieces for s in standing_meshes(replace(piece, mesh=proxy))]
-    floor = floor_of(room.scene, room.proposals)
+    floor = room.scene.ground
     files = {"result": out / "bodies.npz", "refined": out / "refined" / "bodies.npz"}
     values = {
         name: evaluate_people(read_bodies(file), floor, solid, true) for name, file in files.items()

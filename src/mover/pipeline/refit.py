@@ -26,7 +26,6 @@ from mover.fitting.config import FitConfig
 from mover.fitting.presets import PAPER_ROOM
 from mover.fitting.prior import ANGLES, PosePrior
 from mover.fitting.room import FitRoom
-from mover.furniture.floor import height_under_bodies
 from mover.geometry.camera import project
 from mover.io.capture.pose_file import into_camera
 from mover.pipeline.outcome import to_world
@@ -132,7 +131,7 @@ def room_around(room: Room, bodies: Bodies, touch: Float[Tensor, "bodies verts"]
     picked = pick(bodies, parts)
     around = surroundings_of(room, None)
     if touch is None or touch.shape != bodies.verts.shape[:2]:
-        touch = touching(bodies, parts, height_under_bodies(around.floor, bodies))
+        touch = touching(bodies, parts, around.floor)
     sole = _of(picked, ("left_sole", "right_sole"))
     return FitRoom(
         R_cam_world=around.camera.R_cam_world.float(), floor=around.floor,

@@ -11,7 +11,6 @@ from mover.pipeline.outcome import (
     PeopleState,
     ReconstructionContext,
     SceneState,
-    floor_now,
     scale_spread,
 )
 from mover.stages.objects.room_scale import ScaleKnown, common_scale, seats_tell
@@ -28,7 +27,7 @@ def with_seats_lifted(
     bodies = in_world(rows_of(people.bodies, people.kept), state.camera)
     lift = find_seat_heights(SeatInputs(
         context.prepared.objects, state.placed.layout, bodies, people.parts,
-        floor_now(context, state), state.contacts.pairs, context.unfit,
+        state.ground, state.contacts.pairs, context.unfit,
     ))  # fmt: skip
     return replace(context, prepared=with_lifted_seats(context.prepared, lift))
 
@@ -42,8 +41,7 @@ def with_common_scale(
     if given is None or not spread:
         return people, state
     kept = in_world(rows_of(people.bodies, people.kept), state.camera)
-    floor = floor_now(context, state)
-    seats = seats_tell(kept, people.parts, floor) if context.config.seat_heights else None
+    seats = seats_tell(kept, people.parts, state.ground) if context.config.seat_heights else None
     known = ScaleKnown(spread, shared, seats)
     scale, _ = common_scale(state.placed.layout, given, known)
     factor = math.exp(-scale)

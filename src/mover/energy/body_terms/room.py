@@ -31,10 +31,8 @@ def sink_term(
     return _dent((-sample(furniture, skin)).clamp_min(0))
 
 
-def under_term(
-    skin: Float[Tensor, "bodies points 3"], floor: Float[Tensor, "bodies points"]
-) -> Float[Tensor, " bodies"]:
-    """Price of the skin's depth below the floor, whose height under each point is given [nats]."""
+def under_term(skin: Float[Tensor, "bodies points 3"], floor: float) -> Float[Tensor, " bodies"]:
+    """Price of the skin's depth below the floor, whose height is given [nats]."""
     depth = (floor - skin[..., 1]).clamp_min(0)
     return DEEPEST * _dent(depth.topk(min(FEW, depth.shape[-1]), -1).values) / POINTS
 
@@ -42,7 +40,7 @@ def under_term(
 def stand_term(
     soles: Float[Tensor, "bodies feet 3"],
     rest: Float[Tensor, "bodies feet"],
-    floor: Float[Tensor, "bodies feet"],
+    floor: float,
 ) -> Float[Tensor, " bodies"]:
     """Price of the lowest places of feet at rest (a chance) that are not on the floor [nats]."""
     off = geman_mcclure((soles[..., 1] - floor) / SOFT, TAIL)

@@ -25,7 +25,6 @@ from mover.core.records import record
 from mover.core.run import Run
 from mover.core.settings import float_in, int_in
 from mover.core.types import Mesh, Scene, SceneObject
-from mover.furniture.floor import is_platform
 from mover.furniture.library import canonical
 from mover.geometry.placement import place_object, placed_at
 from mover.geometry.watertight import close_mesh
@@ -309,7 +308,7 @@ def _solid(item: SceneObject, convex: Convex, floor: float) -> Solid:
         category=item.category,
         place=place,
         yaw=float(item.yaw),
-        free=item.support != "free" and not is_platform(item.category),
+        free=item.support != "free",
         hulls=tuple(Mesh(h.verts.double() * scale @ AXES.mT, h.faces) for h in convex.hulls),
         mass=mass,
         centre=AXES @ (scale * convex.centre),

@@ -25,7 +25,7 @@ from mover.energy.human_terms import (
     TILT_TAIL,
     FootContacts,
     feet_term,
-    over_floor,
+    heights,
     tilt_prior,
     up_cam,
 )
@@ -130,7 +130,7 @@ def _linear(
     """Heights above the floor [m] and their derivatives."""
     (pitch, roll), points = at[:2], votes.foot_contacts.points_cam
     offset = at[3:][votes.person_of]
-    residual = over_floor(votes.foot_contacts, tilted(pitch, roll), at[2], offset)
+    residual = heights(points, tilted(pitch, roll), at[2]) - offset
     up = up_cam(pitch, roll)
     by_pitch = up_cam(pitch + math.pi / 2, roll)
     by_roll = torch.stack([up[1], -up[0], torch.zeros_like(pitch)])
@@ -292,7 +292,6 @@ def _best_fit(
     tilt = inputs.tilt_spread or config.tilt_prior
     prior = Prior(first, tilt, offset if known is None else SIZE_PRIOR, known)
     height = votes.foot_contacts.points_cam @ tilted(first[0], first[1])[:, 1]
-    height = height if (lift := votes.foot_contacts.lift) is None else height - lift
     guesses = [g for g in (known, inputs.ground) if g is not None] or [float(height.median())]
     start = torch.cat([first, first.new_tensor(guesses[:1]), first.new_zeros(len(votes.people))])
     away = torch.cat([first, height.median()[None], torch.zeros_like(start[3:])])

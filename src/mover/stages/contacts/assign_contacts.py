@@ -16,7 +16,6 @@ from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.types import Bodies
 from mover.energy.human_terms import ContactPoints, shares_of
-from mover.furniture.floor import Floor, height_under_bodies
 from mover.geometry.mesh import vertex_normals
 from mover.stages.config import AssignConfig, ContactConfig
 from mover.stages.contacts.contact_association import AssignInputs, ContactRows, contact_rows
@@ -28,7 +27,8 @@ class ContactInputs:
 
     bodies: Bodies
     parts: Parts
-    floor: Floor
+    ground: float
+    """Height of the floor [m]."""
     given: Float[Tensor, "bodies verts"] | None
 
 
@@ -46,8 +46,7 @@ def find_contacts(
     del observe
     if config.given and inputs.given is not None:
         return ContactProbability(inputs.given)
-    under = height_under_bodies(inputs.floor, inputs.bodies)
-    return ContactProbability(touching(inputs.bodies, inputs.parts, under))
+    return ContactProbability(touching(inputs.bodies, inputs.parts, inputs.ground))
 
 
 # Thin clouds of points out to cells, so that their number does not grow with the video.

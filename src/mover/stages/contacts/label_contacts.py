@@ -21,7 +21,6 @@ from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.settings import Count, Metres, Share
 from mover.core.types import Bodies, Mesh
-from mover.furniture.floor import Floor, height_under_bodies
 from mover.geometry.nearest import as_float64, as_int64, closest, enclosed
 from mover.geometry.placement import StandingMesh
 from mover.geometry.volume import outward
@@ -55,7 +54,7 @@ class LabelInputs:
     meshes: tuple[tuple[StandingMesh, ...], ...]
     """Closed, of each object where it stands when."""
     ids: tuple[str, ...]
-    floor: Floor | None
+    ground: float | None
 
 
 @record
@@ -74,8 +73,8 @@ def label_contacts(
     """The labels of all frames, in the order of parts, objects, rows."""
     del observe
     bodies, parts = inputs.bodies, inputs.parts
-    floor = inputs.floor or Floor(float(bodies.verts[..., 1].amin()))
-    chance = touching(bodies, parts, height_under_bodies(floor, bodies))
+    ground = float(bodies.verts[..., 1].amin()) if inputs.ground is None else inputs.ground
+    chance = touching(bodies, parts, ground)
     known = [members(parts, name) for name in PARTS]
     named = [part for part, mine in enumerate(known) if bool(mine.any())]
     chosen = [_evenly(known[part].nonzero()[:, 0], config.most) for part in named]
@@ -85,8 +84,8 @@ def label_contacts(
         for k, stands in enumerate(inputs.meshes)
         for there in stands
     ]
-    if inputs.floor is not None:
-        floors = [_near_floor(some, inputs.floor.ground, config) for some in points]
+    if inputs.ground is not None:
+        floors = [_near_floor(some, inputs.ground, config) for some in points]
         surfaces.append((len(inputs.meshes), floors))
     found: list[tuple[int, int, _Touches, Tensor]] = []
     for number, part in enumerate(named):

@@ -26,7 +26,6 @@ from mover.bodies.posture import (
 )
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Layout, Objects
-from mover.furniture.floor import Floor, height_under_bodies
 from mover.geometry.boxes import Box
 from mover.geometry.camera import at_pixels, project, to_camera
 from mover.geometry.mesh import vertex_normals
@@ -108,7 +107,7 @@ class ProposeInputs:
     parts: Parts
     chance: Float[Tensor, "bodies verts"]
     """That a vertex touches something."""
-    floor: Floor
+    floor: float
     camera: Camera
     known: KnownTops
     hidden: Float[Tensor, "fh fw"] = NO_SIGHT
@@ -124,10 +123,10 @@ class ProposeInputs:
         """Of the skin, outwards."""
         return vertex_normals(self.bodies.verts, self.bodies.faces)
 
-    @cached_property
-    def under(self) -> Float[Tensor, " bodies"]:
-        """Height of the floor under each body [m]."""
-        return height_under_bodies(self.floor, self.bodies)
+    @property
+    def under(self) -> float:
+        """Height of the floor [m]."""
+        return self.floor
 
 
 @dataclass(frozen=True)

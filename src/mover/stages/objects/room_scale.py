@@ -15,7 +15,6 @@ from mover.bodies.posture import at, landmarks, postures
 from mover.core.records import record
 from mover.core.types import Bodies, Layout
 from mover.energy.prior_terms import AWAY, COMMON, SIZE, Given
-from mover.furniture.floor import Floor, height_under_bodies
 
 TOOL = 0.04  # ... and all given sizes of a room: shapes of one tool fill their boxes alike
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
@@ -100,22 +99,22 @@ def _cost_of_sizes(
     return 0.5 * (torch.einsum("nsoi,nij,nsoj->so", rest, fitted, rest) + disagree)
 
 
-def seats_tell(bodies: Bodies, parts: Parts, floor: Floor) -> tuple[float, float] | None:
+def seats_tell(bodies: Bodies, parts: Parts, floor: float) -> tuple[float, float] | None:
     """Logarithm of how much higher than usual people sit, and its standard deviation.
 
     Args:
         bodies: In the world, in the people's scale.
         parts: Of their mesh.
-        floor: Below them.
+        floor: Its height below them [m].
 
     Returns:
         None where nobody sits.
     """
-    under, carried = height_under_bodies(floor, bodies), members(parts, *CARRIED)
-    sits = postures(bodies, parts, under).sitting
+    carried = members(parts, *CARRIED)
+    sits = postures(bodies, parts, floor).sitting
     if not bool(sits.any()) or not bool(carried.any()):
         return None
-    height = bodies.verts[sits][:, carried, 1].quantile(LOWEST, dim=1) - under[sits]
+    height = bodies.verts[sits][:, carried, 1].quantile(LOWEST, dim=1) - floor
     hips = at(landmarks(bodies, parts), "hips")[sits][:, [0, 2]]
     heights = [height[rows].median() for rows in _places(hips) if int(rows.sum()) >= FEWEST]
     heights = [h for h in heights if float(h) > 0]

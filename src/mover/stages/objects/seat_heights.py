@@ -17,7 +17,6 @@ from mover.bodies.parts import Parts, members
 from mover.bodies.posture import postures
 from mover.core.records import record
 from mover.core.types import Bodies, Layout, Objects, SceneObject, SeatStretch
-from mover.furniture.floor import Floor, height_under_bodies
 from mover.geometry.placement import place
 from mover.stages.objects.prepare_objects import Prepared
 from mover.stages.objects.room_scale import CARRIED, FEWEST
@@ -40,7 +39,8 @@ class SeatInputs:
     bodies: Bodies
     """In the world."""
     parts: Parts
-    floor: Floor
+    ground: float
+    """Height of the floor [m]."""
     pairs: Int[Tensor, "pairs 3"]
     """Who touches what: body, object, and part as in `ContactPoints.points`."""
     unfit: Bool[Tensor, " objects"]
@@ -50,8 +50,8 @@ class SeatInputs:
 def find_seat_heights(inputs: SeatInputs) -> Float[Tensor, " objects"]:
     """How much higher than in their meshes people sit or lie, in the objects' frames [m]."""
     objects, layout = inputs.objects, inputs.layout
-    tops, under = place(objects.top, layout), height_under_bodies(inputs.floor, inputs.bodies)
-    posture = postures(inputs.bodies, inputs.parts, under)
+    tops = place(objects.top, layout)
+    posture = postures(inputs.bodies, inputs.parts, inputs.ground)
     lift = torch.zeros_like(layout.yaw)
     for k in (inputs.unfit & objects.is_seat & objects.has_top).nonzero()[:, 0].tolist():
         rows = inputs.pairs[inputs.pairs[:, 1] == k, 0].unique()

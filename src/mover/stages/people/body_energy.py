@@ -18,7 +18,6 @@ from mover.energy.body_terms.start import angle_term, depth_share, image_term, r
 from mover.energy.body_terms.time import Neighbours, lock_term, smooth_term, steady_term
 from mover.energy.config import BodyWeights
 from mover.energy.minimize import Term, active_weights, sum_terms, there
-from mover.furniture.floor import Floor, height_under
 from mover.geometry.camera import to_camera
 from mover.geometry.volume import Volume
 
@@ -37,7 +36,8 @@ class Evidence:
     """What is known about some rows of the bodies."""
 
     camera: Camera
-    floor: Floor
+    floor: float
+    """Its height in the world [m]."""
     furniture: Volume | None
     near: Neighbours
     feet: Feet
@@ -96,10 +96,6 @@ class MovedBodies:
         """Middle of each sole, and its middle again at the height of its lower half [m]."""
         return _soles(self.now, self.known.feet)
 
-    def floor_under(self, points: Float[Tensor, "*any 3"]) -> Float[Tensor, "*any"]:
-        """Height of the floor under points of the world [m]."""
-        return height_under(self.known.floor, points)
-
     def in_camera(self, points: Float[Tensor, "*any 3"]) -> Float[Tensor, "*any 3"]:
         """Points of the world in camera axes [m]."""
         return to_camera(points, self.known.camera.R_cam_world)
@@ -111,9 +107,9 @@ BODY_TERMS: tuple[Term[MovedBodies], ...] = (
     Term("range", lambda b: range_term(b.share, b.known.near.track), "the depth it was given"),
     Term("smooth", lambda b: smooth_term(b.now.points, b.known.near), "smooth motion"),
     Term("steady", lambda b: steady_term(b.angles, b.share, b.known.near), "steady corrections"),
-    Term("under", lambda b: under_term(b.even, b.floor_under(b.even)), "the floor below it"),
+    Term("under", lambda b: under_term(b.even, b.known.floor), "the floor below it"),
     Term(
-        "stand", lambda b: stand_term(b.soles[1], b.known.feet.rest, b.floor_under(b.soles[1])),
+        "stand", lambda b: stand_term(b.soles[1], b.known.feet.rest, b.known.floor),
         "soles on the floor", ("feet",),
     ),
     Term(

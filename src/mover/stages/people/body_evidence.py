@@ -14,7 +14,6 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera, Capture, Mesh, People, Room
 from mover.energy.body_terms.contact import Surface
 from mover.energy.body_terms.order import Bounds, Sighting, bounds_of_skin
-from mover.furniture.floor import Floor, floor_of
 from mover.geometry.camera import project, to_camera
 from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place_object
@@ -43,7 +42,8 @@ class Surroundings:
     """The estimated room, as bodies meet it."""
 
     camera: Camera
-    floor: Floor
+    floor: float
+    """Its height in the world [m]."""
     furniture: Volume | None
     """Signed distance to all pieces; None: there are none."""
     firm: Volume | None
@@ -77,7 +77,7 @@ def surroundings_of(room: Room, capture: Capture | None) -> Surroundings:
     Raises:
         ValueError: If the room has no floor.
     """
-    floor = floor_of(room.scene, room.proposals)
+    floor = room.scene.ground
     if floor is None:
         raise ValueError("surroundings_of: the room has no floor")
     camera = room.scene.camera

@@ -25,7 +25,6 @@ from mover.bodies.skeleton import BODY
 from mover.bodies.smpl_model import vertex_subset
 from mover.core.types import Bodies
 from mover.energy.body_terms.time import Neighbours, gather_neighbours
-from mover.furniture.floor import Floor, height_under, height_under_bodies
 from mover.stages.people.body_evidence import resting_soles
 
 ALONG, ACROSS = 0.015, 0.005  # [m], how far a body may be off in depth or height, and to the side
@@ -47,16 +46,16 @@ SIDES = ("left", "right")
 NUDGE = 1e-3  # [rad], for differences
 
 
-def plant_feet(bodies: Bodies, parts: Parts, floor: Floor) -> Bodies:
+def plant_feet(bodies: Bodies, parts: Parts, floor: float) -> Bodies:
     """The bodies with their resting soles still and on the floor.
 
     Args:
         bodies: In the world; a video. Unordered images have no rest, and come back as they are.
         parts: Parts of their mesh.
-        floor: Of their room, with its platforms.
+        floor: Its height in their room [m].
     """
     near = gather_neighbours(bodies.frame, bodies.person, bodies.fps)
-    posture = postures(bodies, parts, height_under_bodies(floor, bodies))
+    posture = postures(bodies, parts, floor)
     rest = resting_soles(bodies, parts, posture.lying).double()
     soles = [members(parts, f"{side}_sole").nonzero()[:, 0] for side in SIDES]
     if not len(near.pairs) or not all(len(sole) for sole in soles):
@@ -65,7 +64,7 @@ def plant_feet(bodies: Bodies, parts: Parts, floor: Floor) -> Bodies:
     moved = corrected(bodies, _by(bodies, shift))
     if bodies.pose is None:
         return moved
-    lying = postures(moved, parts, height_under_bodies(floor, moved)).lying
+    lying = postures(moved, parts, floor).lying
     rest = resting_soles(moved, parts, lying).double()
     ways = torch.stack([
         _way(moved.verts[:, sole], near, rest[:, k], floor) for k, sole in enumerate(soles)
@@ -150,7 +149,7 @@ def _shifts(
     bodies: Bodies,
     near: Neighbours,
     rest: Float[Tensor, "bodies feet"],
-    feet: tuple[list[Tensor], Floor],
+    feet: tuple[list[Tensor], float],
     posture: Postures,
 ) -> Float[Tensor, "bodies 3"]:
     """How far each body is moved as a whole [m]."""
@@ -180,10 +179,10 @@ def _shifts(
 
 
 def _floor(
-    foot: Float[Tensor, "bodies 3"], rest: Float[Tensor, " bodies"], floor: Floor, rise: float
+    foot: Float[Tensor, "bodies 3"], rest: Float[Tensor, " bodies"], floor: float, rise: float
 ) -> tuple[Float[Tensor, "bodies 3 3"], Float[Tensor, "bodies 3"]]:
     """A sole at rest near the floor lies on it, and none is below it."""
-    height = foot[:, 1] - height_under(floor, foot)
+    height = foot[:, 1] - floor
     share = torch.where(height < 0, torch.ones_like(rest), rest * (height < ON_FLOOR))
     at = torch.zeros(len(foot), 3, 3, dtype=torch.float64)
     at[:, 1, 1] = share / rise**2
@@ -196,7 +195,7 @@ def _way(
     points: Float[Tensor, "bodies sole 3"],
     near: Neighbours,
     rest: Float[Tensor, " bodies"],
-    floor: Floor,
+    floor: float,
 ) -> Float[Tensor, "bodies 3"]:
     """How far a foot has to go beside its body [m]."""
     foot, pairs = _foot(points), near.pairs

@@ -36,7 +36,6 @@ from mover.energy.body_terms.start import ANGLE
 from mover.energy.body_terms.time import gather_neighbours
 from mover.energy.config import BodyWeights, MatchConfig
 from mover.energy.minimize import minimize
-from mover.furniture.floor import height_under_bodies
 from mover.geometry.camera import to_camera
 from mover.geometry.path import is_still
 from mover.geometry.placement import changes, mover_at, placed_at
@@ -104,10 +103,8 @@ def cast_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Cast:
     given = None if capture is None else capture.touch
     if given is not None and given.shape != bodies.verts.shape[:2]:
         given = None
-    floor = surroundings.floor
-    under = height_under_bodies(floor, bodies)
-    chance = given if given is not None else touching(bodies, parts, under)
-    lying = postures(bodies, parts, under).lying
+    chance = given if given is not None else touching(bodies, parts, surroundings.floor)
+    lying = postures(bodies, parts, surroundings.floor).lying
     rest = resting_soles(bodies, parts, lying)
     return Cast(
         bodies, picked, surroundings, _furniture_only(chance[:, picked.index].float(), picked),
