@@ -71,7 +71,7 @@ def test_a_person_before_an_object_is_near_evidence_and_a_hidden_one_far(hide: b
     assert (hidden if hide else shown) == pytest.approx(inner if hide else half, rel=0.06)
     assert (shown if hide else hidden) < 0.1 * half
     assert cupboard.frames == (0 if hide else 1)
-    assert lamp.missing == ("nobody passes it",)
+    assert lamp.missing == ("no person passes it",)
     assert (box.mask_pixels, box.missing) == (0, ("no mask, only a box",))
     assert guess.missing == ("no annotation",)
 

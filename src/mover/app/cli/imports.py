@@ -29,8 +29,8 @@ FORMATS = f"How the source is written; see docs/your-own-data.md.\n{listing(*IMP
 class ImportArgs:
     """Turn what other tools wrote into a capture folder, part by part.
 
-    A part that is there already stays, unless it is given anew. Say `masks` as the format to add
-    masks alone. Afterwards the command tells what is still missing.
+    A part that is there already stays, unless it is given again. The format `masks` adds masks
+    alone. Afterwards the command says what is still missing.
     """
 
     format: Annotated[Positional[str], arg(metavar="FORMAT", help=FORMATS)]

@@ -203,9 +203,9 @@ class FitArgs:
     vposer: Path | None = None
     """VPoser's weights (a checkpoint, its folder, or .npz) instead of the ranges of motion."""
     preset: Literal["robust", "paper"] = "robust"
-    """How bodies are priced: ours, or E_Body as printed, with VPoser's weights (--vposer)."""
+    """The weights: ours, or E_Body as printed, with VPoser's weights (--vposer)."""
     ground: Annotated[float, float_in(-100, 100)] | None = None
-    """Height of the floor in the camera's world, where it is known: nobody sinks into it [m]."""
+    """Height of the floor in the camera's world, where it is known: people stand on it [m]."""
     height: tuple[Annotated[float, float_in(0.4, 2.6)], ...] = ()
     """How tall people are, one for everybody or for each in the order of their numbers [m]."""
     fps: Rate | None = None

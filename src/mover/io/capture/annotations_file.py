@@ -45,7 +45,7 @@ def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
         row = checked(item, AnnotationFields)
         if row.image_id != image:
             refuse(get(item, "image_id"), f"{image}, the id of the one image")
-        detection = _detection(item, row, camera, (names, warn))
+        detection = _detection(item, row, camera, names, warn)
         unique(get(item, "id"), seen, detection.id, "an id")
         found.append(detection)
     bare = [d.id for d in found if d.mask is None]
@@ -55,10 +55,9 @@ def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
 
 
 def _detection(
-    at: At, row: AnnotationFields, camera: Camera, told: tuple[dict[int, str], Warn]
+    at: At, row: AnnotationFields, camera: Camera, names: dict[int, str], warn: Warn
 ) -> Detection:
-    """One annotation, with the names of categories and who takes warnings."""
-    names, warn = told
+    """One annotation."""
     box = _box_of(get(at, "bbox"), row.bbox, camera, warn)
     mask = mask_of(at, camera, warn)
     if mask is not None:

@@ -29,7 +29,7 @@ from mover.io.capture.scene_file import hypotheses_of, scene_of
 from mover.io.files.fields import At, Warn, array, get, items, listed, maybe, number, refuse
 
 LEAST_HEIGHT, MOST_HEIGHT = 0.1, 20.0  # [m], of the camera above the floor
-NOBODY = PeopleFile(None, None, None, frozenset())
+NO_PEOPLE = PeopleFile(None, None, None, frozenset())
 
 
 def build_capture(parts: Parts) -> Capture:
@@ -46,7 +46,7 @@ def build_capture(parts: Parts) -> Capture:
     scene, turn = scene_of(parts.scene, parts.load_mesh, camera_of(parts.camera), warn)
     detections = detections_of(parts.objects, scene.camera, warn)
     _check_annotations(parts.scene, parts.objects.file, scene, detections, warn)
-    found = people_of(parts.people, scene.camera, warn) if parts.people else NOBODY
+    found = people_of(parts.people, scene.camera, warn) if parts.people else NO_PEOPLE
     bodies = _bodies_of(parts.bodies, scene.camera, turn, found.fps, warn)
     touch = _touch_of(parts.contacts, bodies, warn)
     _check_frames(parts, found, bodies)
@@ -96,7 +96,7 @@ def _focal_spread(at: At) -> float | None:
 def _check_annotations(
     tree: At, file: str, scene: Scene, detections: tuple[Detection, ...], warn: Warn
 ) -> None:
-    """Objects name annotations that exist; what has no partner is told."""
+    """Objects name annotations that exist; the others are named in warnings."""
     known, used = {d.id for d in detections}, {p.annotation for p in scene.objects}
     for item, piece in zip(items(get(tree, "objects")), scene.objects, strict=True):
         if piece.annotation is not None and piece.annotation not in known:
@@ -114,7 +114,7 @@ def _bodies_of(
 ) -> Bodies | None:
     """Bodies in the camera frame."""
     if at is None:
-        warn("bodies.npz: there is none, so only the image speaks")
+        warn("bodies.npz: there is none, so the image alone is used")
         return None
     bodies = bodies_of(at, warn)
     if bodies.space == "world":
@@ -155,7 +155,7 @@ def _touch_of(
 
 
 def _check_people(people: People | None, bodies: Bodies | None, warn: Warn) -> None:
-    """Rows of bodies and of masks that have no partner are told."""
+    """Warn of rows of bodies and of masks that have no partner."""
     if people is None:
         warn("people.json: there are no masks of people, so nothing is known about depth order")
         return

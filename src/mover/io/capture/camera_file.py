@@ -159,10 +159,10 @@ def _check_lens(at: At, count: int, camera: Camera, warn: Warn) -> None:
         found = f"{focal.min():.3g} to {focal.max():.3g}"
         refuse(given, "one focal length above 0 for all frames (no zoom)", found)
     own = float(camera.K[0, 0]) / camera.width
-    told = float(np.median(focal))
-    if abs(told / own - 1) > ZOOM:
+    usual = float(np.median(focal))
+    if abs(usual / own - 1) > ZOOM:
         warn(
-            f"{at.file}: its focal length is {told:.3g} widths of the image, that of camera.json"
+            f"{at.file}: its focal length is {usual:.3g} widths of the image, that of camera.json"
             f" {own:.3g}: people's depths fit camera.json"
         )
 

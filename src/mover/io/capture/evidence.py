@@ -133,7 +133,7 @@ def _object(
     elif mask is None:
         missing.append("no mask, only a box")
     elif capture.people is not None and not frames:
-        missing.append("nobody passes it")
+        missing.append("no person passes it")
     if frames and capture.bodies is not None:
         missing += ["no near bound"] if near < FEW else []
         missing += ["no far bound"] if far < FEW else []

@@ -173,7 +173,7 @@ def write_trees(
         capture: A checked one.
         folder: Where to.
         image: The name of the reference image in the folder.
-        info: What people.json told besides; None: it is only written where people were seen.
+        info: Further fields of `info` in people.json; None: written only with people.
 
     Returns:
         The names of the files.

@@ -1,4 +1,4 @@
-"""Put parts of several tools into one capture folder; what is there stays unless given anew."""
+"""Merge parts of several tools into one capture folder; what is there stays unless given again."""
 
 import dataclasses
 import logging
@@ -21,12 +21,13 @@ from mover.io.capture.bodies_file import bodies_of, write_bodies
 from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_of, turned
 from mover.io.capture.folder import folder_parts, read_capture, write_trees
-from mover.io.capture.pairing import linked, merged, with_links
-from mover.io.capture.parts import Parts
+from mover.io.capture.pairing import known_boxes, linked, pair_boxes
+from mover.io.capture.parts import UNKNOWN, Parts
 from mover.io.capture.scene_file import write_scene
 from mover.io.files.fields import At, get, items, maybe, write_json
 from mover.io.files.images import DEPTH, DISPARITY, write_image
 from mover.io.files.npz import write_npz
+from mover.io.masks.coco import annotations_tree
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +44,7 @@ class Imported:
     written: tuple[str, ...]
     """Files that are new."""
     missing: tuple[str, ...]
-    """What the capture still lacks, each with what that costs."""
+    """What the capture still lacks, each with its consequence."""
     notes: tuple[str, ...]
 
 
@@ -54,7 +55,7 @@ NEEDED = {
 WISHED = {
     "masks": "object masks in objects.json: only boxes hold the furniture (--objects-masks)",
     "objects": "objects.json: the image holds no furniture (--objects-masks)",
-    "bodies": "bodies.npz: nobody moves, so only the image speaks (--bodies)",
+    "bodies": "bodies.npz: no person moves, so the image alone is used (--bodies)",
     "people": "people.json: no depth order from people (--people-masks)",
     "image": "reference.jpg: nothing to draw on (--image)",
 }
@@ -116,7 +117,7 @@ def _added(old: Parts, new: Parts) -> Parts:
 
 
 def _camera(old: Parts, new: Parts) -> At | None:
-    """The newer camera; what it does not tell of tilt and height the older one does."""
+    """The newer camera, with tilt and height of the older one where it has none."""
     if new.camera is None or old.camera is None:
         return new.camera or old.camera
     kept = {k: v for k in ("R_cam_world", "height") if (v := old.camera.value.get(k)) is not None}
@@ -136,15 +137,52 @@ def _objects(old: Parts, new: Parts) -> At | None:
     """The annotations of both, under the ids that the scene uses."""
     if new.objects is None or old.objects is None:
         return new.objects or old.objects
-    if new.scene is not None and _annotations(new.scene):
-        return merged(new.objects, old.objects, newer=False, keep=None)
-    used = frozenset(_annotations(old.scene) if new.scene is None else ())
-    return merged(old.objects, new.objects, newer=True, keep=used)
+
+    def used(scene: At | None) -> set[int]:
+        rows = [] if scene is None else items(get(scene, "objects"))
+        return {key.value for row in rows if (key := maybe(row, "annotation")) is not None}
+
+    if new.scene is not None and used(new.scene):
+        return _merged(new.objects, old.objects, newer=False, keep=None)
+    keep = used(old.scene) if new.scene is None else set[int]()
+    return _merged(old.objects, new.objects, newer=True, keep=keep)
 
 
-def _annotations(scene: At | None) -> list[int]:
-    rows = [] if scene is None else items(get(scene, "objects"))
-    return [key.value for row in rows if (key := maybe(row, "annotation")) is not None]
+def _merged(primary: At, secondary: At, *, newer: bool, keep: set[int] | None) -> At:
+    """The annotations of two files of one image as one.
+
+    Args:
+        primary: objects.json whose ids the scene names.
+        secondary: The other one.
+        newer: The second file is the newer one: its boxes and masks win.
+        keep: Of the first file, ids to keep although the second has no partner; None: all.
+    """
+    pairs = pair_boxes(known_boxes(primary), known_boxes(secondary))
+    ours, theirs = _named_rows(primary), _named_rows(secondary)
+    rows: list[dict[str, Any]] = []
+    for i, row in enumerate(ours):
+        if i in pairs:
+            first, second = (theirs[pairs[i]], row) if newer else (row, theirs[pairs[i]])
+            if "segmentation" in second and "segmentation" not in first:
+                first, second = second, first  # masks before boxes
+            name = row["category_id"]
+            name = theirs[pairs[i]]["category_id"] if name == UNKNOWN else name
+            rows.append({**second, **first, "id": row["id"], "category_id": name})
+        elif keep is None or row["id"] in keep:
+            rows.append(row)
+    free = max((row["id"] for row in ours), default=-1) + 1
+    others = [row for j, row in enumerate(theirs) if j not in set(pairs.values())]
+    rows += [{**row, "id": free + k} for k, row in enumerate(others)]
+    return At(annotations_tree(rows, items(get(primary, "images"))[0].value), primary.file)
+
+
+def _named_rows(at: At) -> list[dict[str, Any]]:
+    """Annotations with the name of their category instead of its id."""
+    names = {c.value["id"]: str(c.value["name"]) for c in items(get(at, "categories"))}
+    return [
+        {**item.value, "category_id": names[item.value["category_id"]]}
+        for item in items(get(at, "annotations"))
+    ]
 
 
 def _with_size(parts: Parts) -> Parts:
@@ -168,11 +206,15 @@ def _capture(whole: Parts) -> Capture | None:
         wanted, _ = turned(camera_of(whole.camera))
         capture = dataclasses.replace(capture, scene=_under(capture.scene, wanted))
     links = linked(capture.scene, whole.objects)
-    return dataclasses.replace(capture, scene=with_links(capture.scene, links))
+    objects = tuple(
+        dataclasses.replace(p, annotation=links.get(p.id, p.annotation))
+        for p in capture.scene.objects
+    )
+    return dataclasses.replace(capture, scene=dataclasses.replace(capture.scene, objects=objects))
 
 
 def _under(scene: Scene, camera: Camera) -> Scene:
-    """The scene under a new tilt: box centres keep their place in the camera's frame."""
+    """The scene under a new tilt: box centres keep their position in the camera's frame."""
     old, new = scene.camera.R_cam_world.double(), camera.R_cam_world.double()
     if float((old - new).abs().max()) < SMALL_TURN:
         return scene
@@ -213,7 +255,7 @@ def _check_rest(whole: Parts, capture: Capture | None) -> None:
 
 
 def _missing(whole: Parts, capture: Capture | None) -> tuple[str, ...]:
-    """What is not there, each with what that costs."""
+    """What is not there, each with its consequence."""
     lacking = [text for key, text in NEEDED.items() if getattr(whole, key) is None]
     objects = None if whole.objects is None else items(get(whole.objects, "annotations"))
     if not objects:
@@ -245,28 +287,29 @@ def _stand_in(whole: Parts) -> Camera | None:
 
 
 def _write_whole(whole: Parts, old: Parts, capture: Capture | None, folder: Path) -> list[str]:
-    """Write what is new.
-
-    Returns:
-        The names of the files.
-    """
+    """Write what is new; the names of the files."""
     done: list[str] = []
     name = _write_image(whole, old, capture, folder, done)
     if capture is not None:
         known = None if whole.people is None else whole.people.value.get("info", {})
         done += write_trees(capture, folder, name, known)
-    else:
-        _write_loose(whole, old, folder, name, done)
+    for key in ("camera", "objects", "people") if capture is None else ():
+        tree: At | None = getattr(whole, key)
+        if tree is not None and tree is not getattr(old, key):
+            value: Mapping[str, Any] = tree.value
+            if key == "objects" and name is not None:
+                value = {**value, "images": [{**value["images"][0], "file_name": name}]}
+            write_json(value, folder / f"{key}.json")
+            done.append(f"{key}.json")
     if whole.bodies is not None and whole.bodies is not old.bodies:
         bodies = capture.bodies if capture is not None else None
         write_bodies(bodies or bodies_of(whole.bodies, log.info), folder / "bodies.npz")
         done.append("bodies.npz")
-    if whole.contacts is not None and whole.contacts is not old.contacts:
-        write_npz(whole.contacts.value, folder / "contacts.npz")
-        done.append("contacts.npz")
-    if whole.cameras is not None and whole.cameras is not old.cameras:
-        write_npz(whole.cameras.value, folder / "cameras.npz")
-        done.append("cameras.npz")
+    for key in ("contacts", "cameras"):
+        arrays: At | None = getattr(whole, key)
+        if arrays is not None and arrays is not getattr(old, key):
+            write_npz(arrays.value, folder / f"{key}.npz")
+            done.append(f"{key}.npz")
     return done + _write_beside(whole, folder)
 
 
@@ -307,15 +350,3 @@ def _write_image(
     write_image(picture, folder / "reference.png")
     done.append("reference.png")
     return "reference.png"
-
-
-def _write_loose(whole: Parts, old: Parts, folder: Path, name: str | None, done: list[str]) -> None:
-    """The parts of a capture that is not whole yet."""
-    for key in ("camera", "objects", "people"):
-        tree: At | None = getattr(whole, key)
-        if tree is not None and tree is not getattr(old, key):
-            value: Mapping[str, Any] = tree.value
-            if key == "objects" and name is not None:
-                value = {**value, "images": [{**value["images"][0], "file_name": name}]}
-            write_json(value, folder / f"{key}.json")
-            done.append(f"{key}.json")

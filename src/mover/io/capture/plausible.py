@@ -1,7 +1,7 @@
 """Whether a capture can be true: sizes, distances and places that no room has, each with its field.
 
 What cannot be is refused, so that nothing that grows with a number grows without a bound; what is
-odd is told. All of a capture is looked at here before any work, by `check` as by `run`.
+odd is a warning. All of a capture is checked here before any work, by `check` as by `run`.
 """
 
 import math
