@@ -139,7 +139,7 @@ def start(words: list[str]) -> subprocess.Popen[str]:
 
 def look_and_leave(words: list[str]) -> None:
     """Open the viewer's page once, then press Ctrl-C."""
-    server = start([*words, "--port", "0"] if words[0] == "view" else words)
+    server = start([*words, "--port", "18080"])
     assert server.stdout is not None
     said = server.stdout.readline()
     assert said.startswith("http://127.0.0.1:"), said + server.communicate()[1]
@@ -157,7 +157,7 @@ def do(line: str, desk: Path) -> None:
     swaps = SWAPS.get(line.split("  #")[0].strip(), {})
     words = [w for w in (swaps.get(word, word) for word in rest) if w]
     words += [word.format(desk=desk) for word in QUICK.get(name, [])]
-    if name == "view" or (name == "run" and "--view" in words):
+    if name == "view":
         look_and_leave([name, *words])
     elif name == "batch":  # tyro marks what is missing by a value that no type check lets by
         ended = start([name, *words])

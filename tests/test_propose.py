@@ -10,7 +10,6 @@ import torch
 from figures import ARMS_DOWN, SEATED, STRIDE, moving, people, pose, turned
 from little_room import GROUND, camera, room
 
-from mover.app.viewer.session import Shown, start_session
 from mover.bodies.parts import members, parts_of
 from mover.bodies.posture import touching
 from mover.core.errors import InputError
@@ -205,41 +204,6 @@ def test_proposals_are_a_file_of_their_own_that_is_read_again_and_goes_with_them
     write_proposals(result(()), path)
     assert not path.exists()
     assert read_proposals(path) == ()
-
-
-def test_an_accepted_proposal_is_an_object_where_it_was_proposed_and_a_dismissed_one_is_gone():
-    found = proposed(sitters())
-    session = start_session(Shown("x", room(), room(), None, None, proposals=found), None, None)
-    assert len(session.proposals) == 1
-    session.accept("proposed_stool_0")
-    assert session.proposals == ()
-    piece = session.piece("proposed_stool_0")
-    assert piece is not None
-    for key in ("center", "size"):
-        ours, theirs = (getattr(box_of(p), key) for p in (piece, found[0].object))
-        assert torch.allclose(ours, theirs, atol=1e-4)
-    session.undo()
-    assert len(session.proposals) == 1
-
-
-def test_a_dismissed_proposal_is_gone_for_good_and_neither_answer_changes_another_object(
-    tmp_path: Path,
-):
-    found, file = proposed(sitters()), tmp_path / "edits.json"
-    shown = Shown("x", room(), room(), None, None, proposals=found)
-    session = start_session(shown, file, None)
-    session.accept("proposed_stool_0")
-    assert same_objects(session.scene.objects[:3], room().objects)
-    session.undo()
-    session.dismiss("proposed_stool_0")
-    assert session.proposals == ()
-    assert same_objects(session.scene.objects, room().objects)
-    assert start_session(shown, file, None).proposals == ()
-    near, far = (somewhere_else(found[0], gap) for gap in (0.2, 0.5))
-    later = start_session(replace(shown, proposals=(near, far)), file, None)
-    assert [one.object.id for one in later.proposals] == [far.object.id]
-    session.undo()
-    assert len(session.proposals) == 1
 
 
 @pytest.mark.slow

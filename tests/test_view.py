@@ -1,4 +1,4 @@
-"""The viewer and the report of a real run in a real browser: seen, moved, solved again."""
+"""The viewer and the report of a real run in a real browser: looked at, moved, solved again."""
 
 import contextlib
 import dataclasses
@@ -26,7 +26,6 @@ from mover.geometry.rotations import rot_y
 from mover.io.capture.edits import Pin, Place, edit_scene, placement_of, read_edits, write_edits
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.fields import write_json
-from mover.io.formats import read
 
 __all__ = ["browser"]  # the fixture
 SQUARE = 0.9 / 7 * 1.7  # [m] along x and z, from the foot of the gizmo to its square's middle
@@ -50,7 +49,7 @@ def folder(tmp_path_factory, small_room) -> Path:
 
     folder = tmp_path_factory.mktemp("view")
     write_capture(add_noise(small_room, NoiseConfig(), 1), folder / "capture")
-    config, slow = light("robust"), Adam(15, 0.03)  # slow enough to be watched
+    config, slow = light("robust"), Adam(15, 0.03)
     config = dataclasses.replace(
         config,
         layout=dataclasses.replace(
@@ -101,14 +100,6 @@ class Viewer:
         raw = self.page.screenshot(path=self.shots / f"{name}.png")
         whole = np.asarray(Image.open(io.BytesIO(raw)).convert("RGB")).astype(int)
         return whole[:, : int(self.canvas()["width"])]
-
-    def see_until(self, text: str, name: str) -> list[np.ndarray]:
-        """The 3D view again and again until the page says `text`."""
-        ended, pictures = self.page.get_by_text(text), []
-        while not ended.is_visible():
-            assert len(pictures) < 600, f"the page never said {text!r}"
-            pictures.append(self.see(f"{name}_{len(pictures):03d}", wait=200))
-        return pictures
 
     def canvas(self) -> dict[str, float]:
         return self.page.locator("canvas").first.bounding_box()
@@ -172,7 +163,7 @@ def edited(file: Path) -> list[dict[str, Any]]:
 
 @pytest.mark.slow
 class TestViewer:
-    def test_shows_time_before_and_after_and_the_evidence(self, browser, folder, tmp_path):
+    def test_shows_time_before_and_after(self, browser, folder, tmp_path):
         with viewing(browser, tmp_path, "view", folder / "out", "--port", free_port()) as viewer:
             page, shots = viewer.page, [viewer.see("start")]
             moment = page.get_by_label("Moment").or_(page.locator("input[type=text]")).last
@@ -183,18 +174,6 @@ class TestViewer:
             shots.append(viewer.see("before"))
             page.get_by_text("after", exact=True).click()
             shots.append(viewer.see("after"))
-            page.get_by_text("As it was given").click()
-            page.get_by_label(nearest(read_scene(folder / "out/scene.json")).id).check()
-            shots.append(viewer.see("one_before"))
-            page.get_by_label("Glass furniture").check()
-            glass = viewer.see("glass")
-            shots.append(glass)
-            for name in ("People passed before", "Objects hid people", "People's space",
-                         "Contact points", "Camera doubt (95 %)",
-                         "Where it may stand (90 %)"):  # fmt: skip
-                page.get_by_label(name).check()
-                assert differ(glass, viewer.see(name.split()[0])) > 1e-4, name
-                page.get_by_label(name).uncheck()
             page.get_by_role("button", name="Look through the camera").click()
             shots.append(viewer.see("through"))
             changes = [differ(a, b) for a, b in pairwise(shots)]
@@ -211,11 +190,14 @@ class TestViewer:
             assert differ(first, viewer.see("second")) > 0.002
             assert viewer.troubles == []
 
-    def test_an_object_is_dragged_pinned_and_solved_again(self, browser, folder, tmp_path):
-        out, file = folder / "out", folder / "out" / "edits.json"
+    def test_an_object_is_dragged_pinned_and_a_run_solves_the_edits(
+        self, browser, folder, tmp_path
+    ):
+        out, file = folder / "out", tmp_path / "edits.json"
         scene = read_scene(out / "scene.json")
         piece = nearest(scene)
-        with viewing(browser, tmp_path, "view", out, "--port", free_port()) as viewer:
+        command = ("view", out, "--edits", file, "--port", free_port())
+        with viewing(browser, tmp_path, *command) as viewer:
             page, canvas = viewer.page, viewer.canvas()
             page.mouse.click(*where(box_of(piece).center, scene, canvas))
             viewer.tab("Object")
@@ -232,38 +214,16 @@ class TestViewer:
             went = np.subtract(moved[0]["translation"], piece.t_world_object.tolist())
             assert went == pytest.approx([-0.4, 0, 0.3], abs=0.06)
             page.get_by_label("Pinned").check()
-            viewer.tab("Solve")
-            page.get_by_role("button", name="Solve again").click()
-            live = viewer.see_until("done; the result is in", "solving")
-            assert sum(differ(a, b) > 1e-4 for a, b in pairwise(live)) >= 3  # furniture moves
-            assert page.locator(".uplot").is_visible()  # the energy of the last descent
-            viewer.see("solved")
+            page.get_by_text("mover run").wait_for()
             assert viewer.troubles == []
         assert [e["do"] for e in edited(file)] == ["place", "pin"]
-        solved = read_shown(out / "edited")
-        assert solved.edits_inside == 2
-        stays(read_edits(file)[0], solved.result)
+        solved = tmp_path / "solved"
+        call("run", folder / "capture", "--out", solved, "--config", folder / "config.json",
+             "--edits", file)  # fmt: skip
+        assert read_shown(solved).edits_inside == 2
+        stays(read_edits(file)[0], read_shown(solved).result)
 
-    def test_the_object_itself_can_be_dragged(self, browser, folder, tmp_path):
-        out, file = folder / "out", tmp_path / "edits.json"
-        scene = read_scene(out / "scene.json")
-        piece = nearest(scene)
-        command = ("view", out, "--edits", file, "--port", free_port())
-        with viewing(browser, tmp_path, *command) as viewer:
-            canvas, middle = viewer.canvas(), box_of(piece).center
-            viewer.page.mouse.click(*where(middle, scene, canvas))
-            viewer.tab("Object")
-            viewer.page.get_by_label("Drag the object itself").check()
-            viewer.page.wait_for_timeout(1000)
-            goal = middle + torch.tensor([0.3, 0.0, 0.2])
-            viewer.drag(where(middle, scene, canvas), where(goal, scene, canvas))
-            (place,) = edited(file)
-            went = np.subtract(place["translation"], piece.t_world_object.tolist())
-            assert went[1] == pytest.approx(0, abs=1e-5)
-            assert went[[0, 2]] == pytest.approx([0.3, 0.2], abs=0.2)  # its face is nearer
-            assert viewer.troubles == []
-
-    def test_numbers_library_and_undo_change_the_list(self, browser, folder, tmp_path):
+    def test_numbers_and_undo_change_the_list(self, browser, folder, tmp_path):
         out, file = folder / "out", tmp_path / "edits.json"
         piece = nearest(read_scene(out / "scene.json"))
         command = ("view", out, "--edits", file, "--port", free_port())
@@ -275,34 +235,16 @@ class TestViewer:
             page.wait_for_timeout(1000)
             page.get_by_label("Front [°]").fill("90")
             page.wait_for_timeout(800)
-            text = "xpath=following::*[self::input or self::textarea][1]"
-            page.get_by_text("Category", exact=True).locator(text).fill("stool")
-            page.wait_for_timeout(500)
-            page.get_by_role("button", name="Set the category").click()
-            page.wait_for_timeout(800)
-            assert [e["do"] for e in edited(file)] == ["place", "relabel"]
+            assert [e["do"] for e in edited(file)] == ["place"]
             assert edited(file)[0]["yaw"] == pytest.approx(math.pi / 2, abs=1e-4)
             page.get_by_role("button", name="Delete").click()
             page.wait_for_timeout(800)
             assert edited(file)[-1] == {"do": "delete", "id": piece.id}
             page.get_by_role("button", name="Undo the last edit").click()
-            page.get_by_text("Add from the library").click()
-            page.get_by_role("button", name="Add", exact=True).click()
-            page.wait_for_timeout(1500)
-            assert [e["do"] for e in edited(file)] == ["place", "relabel", "add"]
-            viewer.see("added")
+            page.wait_for_timeout(800)
+            assert [e["do"] for e in edited(file)] == ["place"]
+            viewer.see("undone")
             assert viewer.troubles == []
-
-    def test_a_run_can_be_watched(self, browser, folder, tmp_path):
-        run = ("run", folder / "capture", "--out", tmp_path / "out", "--view")
-        with viewing(browser, tmp_path, *run, "--config", folder / "config.json") as viewer:
-            viewer.tab("Solve")
-            live = viewer.see_until("done; the result is in", "watching")
-            assert sum(differ(a, b) > 1e-4 for a, b in pairwise(live)) >= 3  # furniture moves
-            viewer.see("watched")
-            assert viewer.troubles == []
-        a, b = ((folder / "out", tmp_path / "out")[i] / "scene.json" for i in (0, 1))
-        assert a.read_bytes() == b.read_bytes()  # who watches changes nothing
 
 
 def stays(place: Place, result) -> None:
@@ -332,7 +274,7 @@ class TestReplay:
         for file in ("scene.json", "edits.json", "bodies.npz"):
             assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
         stays(edits[0], read_scene(tmp_path / "a" / "scene.json"))
-        assert read_shown(tmp_path / "a", read("folder", folder / "capture")).image is not None
+        assert read_shown(tmp_path / "a").image is not None
 
 
 @pytest.mark.slow

@@ -187,26 +187,3 @@ class TestPinned:
         layout = Layout(torch.randn(2, 3, generator=torch.Generator()), torch.zeros(2),
                         torch.zeros(2, 3))  # fmt: skip
         assert hold(layout, None) is layout
-
-
-@pytest.mark.parametrize("refined", [False, True])
-def test_solving_again_refines_people_where_the_first_run_did(tmp_path, monkeypatch, refined):
-    from mover.app.viewer import show as commands_view
-    from mover.app.viewer import solve
-    from mover.core import records
-    from mover.core.observe import silent
-    from mover.io.files.fields import write_json
-    from mover.pipeline.presets import PRESETS
-
-    config = records.plain(PRESETS["robust"])
-    write_json({"config": config, "people_refined": refined}, tmp_path / "run.json")
-    log = json.loads((tmp_path / "run.json").read_text())
-    job = commands_view._job(tmp_path, ("folder", tmp_path), log)
-    kept = []
-    monkeypatch.setattr(solve, "apply_edits", lambda capture, _: (capture, ()))
-    monkeypatch.setattr(solve, "reconstruct", lambda *_: "room")
-    monkeypatch.setattr(solve, "refined_room", lambda room, *_: f"{room} with other people")
-    monkeypatch.setattr(solve, "write_results", lambda _, room, *__: kept.append(room))
-    capture = Capture("c", room(), None, (), None, None, None, None, None, ())
-    solve.solve_again(capture, job.origin, job.config, tmp_path, silent)
-    assert kept == ["room with other people" if refined else "room"]

@@ -30,7 +30,7 @@ from mover.core.settings import float_in
 
 PRODUCTS, MARK, LOG = ("scene.json", "run.json"), "batch.json", "log.txt"  # of each capture
 FAILURES, SUMMARY, CONFIG = "failures", "summary.csv", "config.json"  # of the batch
-COLUMNS = (
+COLUMNS: tuple[str, ...] = (
     "name", "state", "seconds", "peak_memory_mb", "warnings", "reason", "capture", "out",
 )  # fmt: skip
 POLL, GRACE = 0.05, 5.0  # [s] between two looks at a process; from the request to stop to its end

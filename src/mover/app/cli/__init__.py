@@ -81,7 +81,7 @@ COMMANDS = {
     ),
     "view": (
         "mover.app.cli.results:view",
-        "Look at a result in the browser, correct it, solve it again.",
+        "Look at a result in the browser, and correct it.",
     ),
     "batch": (
         "mover.app.cli.run:batch",

@@ -5,7 +5,7 @@ import sys
 from types import TracebackType
 from typing import Any
 
-from mover.core.observe import Observer, Step
+from mover.core.observe import Step
 
 log = logging.getLogger("mover.geometry.kernels")  # says what is compiled
 
@@ -76,13 +76,3 @@ class Bar:
         if self._task is not None:
             self._progress.remove_task(self._task)
         self._task = self._progress.add_task(step.stage, total=step.steps)
-
-
-def both(first: Observer, second: Observer) -> Observer:
-    """An observer that passes each step on to two."""
-
-    def observe(step: Step) -> None:
-        first(step)
-        second(step)
-
-    return observe

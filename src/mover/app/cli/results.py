@@ -150,28 +150,15 @@ def render(arguments: Sequence[str]) -> None:
 
 
 @dataclass(frozen=True)
-class Address:
-    """Where the viewer listens."""
-
-    host: str = "127.0.0.1"
-    """This machine only; 0.0.0.0 lets the network in, with the token of the URL."""
-    port: Annotated[int, int_in(1, 65535)] = 8080
-    """The next free one is taken where it is in use."""
-
-
-@dataclass(frozen=True)
 class ViewArgs:
-    """Look at a result in the browser, correct it, and solve it again."""
+    """Look at a result in the browser, and correct it: `mover run --edits` solves it again."""
 
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """Folder of the result."""
-    capture: Path | None = None
-    """The capture it was made from; by default the one that run.json names."""
-    format: str = "folder"
-    """How that capture is written."""
     edits: Path | None = None
     """The list of edits; by default OUT/edits.json."""
-    address: Annotated[Address, arg(name="")] = field(default_factory=Address)
+    port: Annotated[int, int_in(1, 65535)] = 8080
+    """The next free one is taken where it is in use."""
 
 
 def view(arguments: Sequence[str]) -> None:
@@ -179,5 +166,4 @@ def view(arguments: Sequence[str]) -> None:
     args = parsed(ViewArgs, "mover view", arguments)
     from mover.app.viewer.show import view_result
 
-    source = None if args.capture is None else (args.format, args.capture)
-    view_result(args.out, source, args.edits, args.address)
+    view_result(args.out, args.edits, args.port)

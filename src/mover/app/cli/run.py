@@ -20,7 +20,6 @@ from mover.pipeline.presets import Config
 
 if TYPE_CHECKING:
     from mover.app.results import Origin
-    from mover.core.observe import Observer
     from mover.core.run import Run
     from mover.core.types import Capture, Room
 
@@ -43,8 +42,6 @@ class RunArgs:
     """A run.json whose settings are used instead of a preset's."""
     edits: Path | None = None
     """A list of edits (edits.json of `mover view`) that is applied first."""
-    view: bool = False
-    """Watch the furniture move in the browser (extra `viewer`)."""
     device: Device = "cpu"
     """Where the heavy stages compute: cpu, cuda (an NVIDIA GPU; see docs/engine.md) or auto."""
     posa: Path | None = None
@@ -73,11 +70,6 @@ def run(arguments: Sequence[str]) -> None:
     capture = _with_contacts(read(args.source), args)
     edits = () if args.edits is None else read_edits(args.edits)
     origin = Origin(str(args.source.resolve()), args.format, edits, args.refine, device)
-    if args.view:
-        from mover.app.viewer.show import run_in_view
-
-        run_in_view(capture, config, args.out, origin)
-        return
     reconstruct_into(args.out, capture, config, origin)
     say(f"report: {args.out / 'report.html'}")
 
@@ -98,13 +90,12 @@ def reconstruct_into(
     capture: "Capture",
     config: Config,
     origin: "Origin",
-    watch: "Observer | None" = None,
     report: bool = True,
 ) -> "tuple[Room, Run]":
-    """Run the main job on the edited capture and write its result; `watch` sees every step."""
+    """Run the main job on the edited capture and write its result."""
     import torch
 
-    from mover.app.cli.progress import Bar, both
+    from mover.app.cli.progress import Bar
     from mover.app.results import write_results
     from mover.core.observe import Step
     from mover.core.run import Run
@@ -114,8 +105,7 @@ def reconstruct_into(
     torch.set_num_threads(THREADS)
     capture, pinned = apply_edits(capture, origin.edits)
     with Bar() as bar:
-        observe = bar if watch is None else both(bar, watch)
-        run = Run(out, observe, device=origin.device)
+        run = Run(out, bar, device=origin.device)
         room = reconstruct(capture, config, run, pinned)
         if origin.refine:
             from mover.pipeline.refinement import refined_room
