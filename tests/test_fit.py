@@ -17,7 +17,7 @@ from mover.bodies.smpl_model import heights_of
 from mover.core.errors import InputError
 from mover.core.types import Scene
 from mover.fitting.bodies import FitInputs, fit_bodies
-from mover.fitting.config import PUBLISHED, STAGES, FitConfig, Stage
+from mover.fitting.config import PAPER, PUBLISHED, STAGES, FitConfig, Stage
 from mover.fitting.energy import (
     Weighed,
     bending_price,
@@ -27,7 +27,6 @@ from mover.fitting.energy import (
 )
 from mover.fitting.limits import limit_price, limit_table, resting
 from mover.fitting.offsets import lasting_of, offset_cost
-from mover.fitting.presets import PAPER
 from mover.fitting.prior import ANGLES, same
 from mover.fitting.start import placed
 from mover.fitting.stature import UNKNOWN, height_cost, shape_cost, size_of, stature_of

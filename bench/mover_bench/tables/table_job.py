@@ -19,10 +19,8 @@ from torch import Tensor
 from mover.core.files import replacing
 from mover.core.records import fingerprint
 from mover.core.run import Run, sources
-from mover.core.types import Bodies, Capture, Room, Scene, SceneObject
+from mover.core.types import Bodies, Capture, Scene, SceneObject
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
-from mover.fitting.presets import PAPER_ROOM, at_most, without
-from mover.fitting.prior import ANGLES
 from mover.geometry.camera import to_camera
 from mover.geometry.camera import to_world as to_world_axes
 from mover.geometry.volume import sample
@@ -31,12 +29,8 @@ from mover.io.capture.camera_file import camera_of
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.fields import read_json
-from mover.io.people.found import Known
-from mover.io.people.keypoints import keypoints_from
 from mover.pipeline.outcome import to_world
-from mover.pipeline.people import as_given
 from mover.pipeline.reconstruct import reconstruct
-from mover.pipeline.refit import refit_bodies
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
 from mover_bench.datasets.prox_files import scan_of
@@ -45,13 +39,6 @@ from mover_bench.experiment.variants import withheld
 from mover_bench.tables.rows import PLAIN, Disturbance, disturbance_of, variants
 
 DONE = "metrics.json"
-STEPS = 0  # iterations of a stage of the people's fit at most; 0: the preset's
-KEYPOINTS = "keypoints"
-"""Folder of a capture with OpenPose's files, as the importer of PROX makes it."""
-LACKS: Mapping[str, tuple[str, ...]] = {
-    "+CamGP": ("sdf", "contact"), "+CamGP+SDF": ("contact",), "+CamGP+SDF+Contact": (),
-}  # fmt: skip
-"""Which of the room's terms the rows of the table of bodies lack; others are not fitted again."""
 BOXES = EvaluateConfig(boxes=True, feet="contacts")
 """The truth of both data sets is boxes; feet are those that touch the floor, as in the paper."""
 
@@ -102,32 +89,14 @@ def do_job(job: TableJob) -> None:
         room = under_camera(room, given, room.scene.camera)
     people = room.bodies
     if variant.row and people is not None:
-        people = _refined(job, room, capture, variant.row)
+        weights = RefineBodiesConfig(weights=ABLATION[variant.row])
+        people = refine_bodies(room, capture, weights).bodies
     scenes = {"full": (room.scene, people)}
     if job.name == PLAIN:  # other jobs have no rows of these
         scenes |= {"initial": (given.scene, given.bodies), "image": (room.image_only, people)}
     measured = {name: measure(job.capture, given, *scene) for name, scene in scenes.items()}
     with replacing(job.folder / DONE) as part:
         part.write_text(json.dumps({"key": key_of(job), **measured}, indent=1, allow_nan=False))
-
-
-def _refined(job: TableJob, room: Room, capture: Capture, row: str) -> Bodies:
-    """The people as a row of the table of bodies has them.
-
-    Under `paper` they are fitted to the capture's keypoints again, where it has these and the
-    parameters of a body model; the baseline is then as it was given.
-    """
-    people, seen = room.bodies, job.capture / KEYPOINTS
-    assert people is not None, "somebody is refined"
-    if job.preset != "paper" or people.pose is None or not seen.is_dir():
-        weights = RefineBodiesConfig(weights=ABLATION[row])
-        return refine_bodies(room, capture, weights).bodies
-    if row not in LACKS:
-        given = as_given(capture)
-        return to_world(given, capture.scene.camera)
-    keypoints = keypoints_from("openpose", seen, Known(fps=people.fps))
-    config = at_most(without(PAPER_ROOM, *LACKS[row]), STEPS)
-    return refit_bodies(room, keypoints, capture.touch, (config, ANGLES)).bodies
 
 
 def measure(

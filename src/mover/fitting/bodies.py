@@ -17,12 +17,11 @@ from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, Weighed, body_energy
-from mover.fitting.given import begin_at, begin_from, start_rows
+from mover.fitting.given import begin_from
 from mover.fitting.ground import distances_of_who_lies, sole_heights, soles_of
 from mover.fitting.noise import Bias, at_most, bias_of, noise_of, noisy, without
 from mover.fitting.offsets import lasting_of
 from mover.fitting.prior import ANGLES, PosePrior, encoded
-from mover.fitting.room import FitRoom
 from mover.fitting.start import Begun, begin
 from mover.fitting.stature import UNKNOWN, stature_of
 from mover.fitting.tracks import (
@@ -42,7 +41,6 @@ from mover.fitting.tracks import (
 from mover.fitting.unknowns import (
     EVERYTHING,
     HAND,
-    NO_SKIN,
     OF_ROWS,
     Frame,
     Rig,
@@ -78,8 +76,6 @@ class FitInputs:
     """Height of the floor in the camera's world [m], where it is known: nobody goes below it."""
     heights: tuple[float, ...] = ()
     """How tall each person is, in the order of their numbers, or one for everybody [m]."""
-    room: FitRoom | None = None
-    """The room around `start`, one row for each of its bodies: these are fitted where they are."""
 
 
 @record
@@ -119,40 +115,28 @@ def fit_bodies(
     stature = stature_of(inputs.model, inputs.heights, inputs.keypoints.person, rows)
     some = rows_of(inputs.keypoints, rows)
     inputs = dataclasses.replace(inputs, keypoints=some)
-    picked = NO_SKIN if inputs.room is None else inputs.room.picked
-    rig = rig_of(inputs.model, some.layout, seen_at_all(some, config), picked)
+    rig = rig_of(inputs.model, some.layout, seen_at_all(some, config))
     names = [LAYOUTS[some.layout][k] for k in rig.keypoints.tolist()]
     seen = seen_of(some, rig, inputs.camera, config)
-    seen = dataclasses.replace(seen, floor=inputs.ground, room=_around(inputs))
+    seen = dataclasses.replace(seen, floor=inputs.ground)
     job = _Job(inputs, config, rig, names, seen, observe)
     begun = _begun(job)
-    lasting = lasting_of(names) if config.lasting and inputs.room is None else None
+    lasting = lasting_of(names) if config.lasting else None
     seen = dataclasses.replace(seen, stature=stature, lasting=lasting)
     job = dataclasses.replace(job, seen=seen)
     at, frame, seen = _solved(begun, job)
     pose = pose_of(at, frame, inputs.model, inputs.prior)
     miss = miss_of(at, frame, seen, inputs.prior)
     bodies = bodies_of(pose, inputs.model, some)
-    unknown = UNKNOWN if bool(stature.given.isnan().any()) else 0.0
-    spread = None if inputs.room is not None else unknown
+    spread = UNKNOWN if bool(stature.given.isnan().any()) else 0.0
     bodies = dataclasses.replace(bodies, size_spread=spread)
     return Fitted(bodies, rows, miss, warnings)
-
-
-def _around(inputs: FitInputs) -> FitRoom | None:
-    """The room around the bodies of each row of the keypoints."""
-    if inputs.room is None or inputs.start is None:
-        return None
-    return rows_of(inputs.room, start_rows(inputs.start, inputs.keypoints, inputs.camera.K))
 
 
 def _begun(job: _Job) -> Begun:
     """From given bodies, or from keypoints alone; the code is that of the prior."""
     inputs = job.inputs
-    if inputs.start is not None and inputs.room is not None:
-        rows = start_rows(inputs.start, inputs.keypoints, job.seen.K)
-        begun = begin_at(inputs.start, rows, job.seen, job.rig, job.config)
-    elif inputs.start is None:
+    if inputs.start is None:
         begun = begin(inputs.keypoints, job.seen, job.rig, inputs.camera, job.config)
     else:
         begun = begin_from(inputs.start, inputs.keypoints, job.seen, job.rig, job.config)
@@ -165,8 +149,7 @@ def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
     seen = dataclasses.replace(job.seen, centre=begun.centre, spread=begun.spread)
     people, person = job.inputs.keypoints.person.unique(return_inverse=True)
     at = dataclasses.replace(begun.at, **_widened(begun.at, len(people), job))
-    growth = growth_of(job.inputs.model) if job.inputs.room is None else None
-    frame = Frame(job.rig, begun.root, person, growth)
+    frame = Frame(job.rig, begun.root, person, growth_of(job.inputs.model))
     seen, at = _on_a_floor(seen, at, frame, job)
     windows = windows_of(job.inputs.keypoints, job.config)
     first = _stages(at, frame, seen, windows[0], (job, EVERYTHING))
@@ -188,8 +171,8 @@ def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
 
 
 def _on_a_floor(seen: Seen, at: Unknowns, frame: Frame, job: _Job) -> tuple[Seen, Unknowns]:
-    """With a floor that is sought, first level and below the feet; not in a room that is known."""
-    if job.inputs.room is not None or not job.config.stands:
+    """With a floor that is sought, first level and below the feet."""
+    if not job.config.stands:
         return seen, at
     soles, decode = soles_of(job.inputs.model), job.inputs.prior.decode
     with torch.no_grad():
@@ -212,28 +195,11 @@ def _widened(at: Unknowns, people: int, job: _Job) -> dict[str, Tensor]:
     if len(skin.parents) == 55 and any(n.startswith("face_") for n in job.names):
         face = 3 + min(EXPRESSION, getattr(model, "expression_dirs").shape[-1])  # noqa: B009
     return {
-        "betas": _shapes(people, shapes, job).to(at.place),
+        "betas": at.place.new_zeros(people, shapes),
         "hands": at.place.new_zeros(rows, 2 * hands),
         "face": at.place.new_zeros(rows, face),
         "offset": at.place.new_zeros(people, 0 if job.seen.lasting is None else len(job.names), 3),
     }
-
-
-def _shapes(people: int, width: int, job: _Job) -> Tensor:
-    """The mean shape; people who are fitted where they are keep theirs to begin with."""
-    inputs, found = job.inputs, torch.zeros(people, width)
-    start = inputs.start
-    if inputs.room is None or start is None or start.pose is None:
-        return found
-    if start.pose.model != inputs.model.name:
-        return found
-    rows = start_rows(start, inputs.keypoints, job.seen.K)
-    person = inputs.keypoints.person.unique(return_inverse=True)[1]
-    count = min(width, start.pose.betas.shape[1])
-    own = start.pose.betas[rows, :count].float()
-    total = torch.zeros(people, count).index_add(0, person, own)
-    mean = total / torch.bincount(person, minlength=people)[:, None]
-    return torch.cat([mean, found[:, count:]], -1)
 
 
 @dataclass(frozen=True)
@@ -260,7 +226,7 @@ def _stages(
     seen = chosen(seen, rows, triples_of(some, _speed(at, frame, some, job), job.config))
     noise = None
     for index, stage in enumerate(stages):
-        if index == 1 and job.config.left and job.inputs.room is None:
+        if index == 1 and job.config.left:
             quick = dataclasses.replace(stage, steps=job.config.noise_steps)
             at = _lowered(at, frame, seen, (job, quick, free))
             off = _seen_at(at, frame, seen, job) - seen.pixels
@@ -313,7 +279,7 @@ def _laid(
     at: Unknowns, frame: Frame, keypoints: Keypoints, seen: Seen, job: _Job
 ) -> tuple[Unknowns, Seen]:
     """Who lies along the view put where they are expected."""
-    if keypoints.fps is None or job.inputs.room is not None or not job.config.lies:
+    if keypoints.fps is None or not job.config.lies:
         return at, seen
     with torch.no_grad():
         joints = points_of(at, frame, job.inputs.prior.decode).joints

@@ -1,7 +1,7 @@
 """Weights, stages and choices of the fit of bodies. Imports no torch: `--help` is quick."""
 
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Literal
 
 from mover.core.settings import Seconds, Share, Sigma, Steps, Weight, float_in, int_in
 
@@ -26,14 +26,6 @@ class Stage:
     """Constant-velocity terms."""
     steps: Steps = 30
     """Most iterations of L-BFGS."""
-    under: Weight = 0.0
-    """CamGP: depth of the lowest vertex below the floor, where a room is known."""
-    feet: Weight = 0.0
-    """CamGP: soles that carry the body, off the floor."""
-    sdf: Weight = 0.0
-    """SDF: vertices inside furniture."""
-    contact: Weight = 0.0
-    """Contact: skin that may touch, off the furniture; these four are not squared."""
 
 
 PUBLISHED = (
@@ -131,3 +123,33 @@ class FitConfig:
     """Price of such a move, in squared standard deviations of the pose."""
     stages: tuple[Stage, ...] = field(default=STAGES)
     """Weights of the stages."""
+
+
+Preset = Literal["robust", "paper"]
+
+PAPER = FitConfig(
+    loose=0.0,
+    left=0.0,
+    limits=0.0,
+    smooth_joints=1e2,
+    smooth_pixels=1e-2,
+    still=0.0,
+    held=0.0,
+    stands=0.0,
+    lies=0.0,
+    acceleration=0.0,
+    jitter=1.0,
+    by_size=False,
+    alike=1_000_000,
+    lasting=False,
+    stages=tuple(replace(stage, smooth=1.0, steps=300) for stage in PUBLISHED[3:]),
+)
+"""SMPLify-X and L_smooth (Sec. 3.2), in the two stages that the authors' fit of videos runs.
+
+With no acceleration and a jitter of 1 m a second difference is divided by 1: it is weighted as
+printed, by rho with sigma_2 = 0.1 m and sigma_3 = 100 px. lambda_smooth is not printed; here the
+released code's 10^2 and 0.1^2. The printed pose prior is VPoser's: give its weights (`--vposer`).
+"""
+
+FITS: dict[Preset, FitConfig] = {"robust": FitConfig(), "paper": PAPER}
+"""By name."""

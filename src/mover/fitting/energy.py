@@ -37,7 +37,6 @@ from mover.fitting.ground import (
 )
 from mover.fitting.limits import limit_price
 from mover.fitting.offsets import offset_cost
-from mover.fitting.room import FitRoom, room_terms
 from mover.fitting.stature import Stature, height_cost, shape_cost, size_of
 from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, floor_of, points_of
 from mover.geometry.camera import project
@@ -90,8 +89,6 @@ class Seen:
     """How far from it each angle may be [rad]."""
     joints: Float[Tensor, "bodies joints 3"] | None
     """Joints of the body that are known in 3D [m]; NaN: not known."""
-    room: FitRoom | None = None
-    """The room in which they are fitted; None: not known."""
     stature: Stature | None = None
     """The prior of their heights; None: the mean shape's, as one more coefficient."""
     lasting: Float[Tensor, " keypoints"] | None = None
@@ -132,9 +129,8 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
         ("still", smooth * by.config.still, lambda: still_price(joints, seen)),
         ("held", smooth * by.config.held, lambda: held_price(joints, seen, by)),
     )
-    room = room_terms(points, seen.room, by.stage)
     ground, prior = _ground_energy(points, at, frame, seen, by), _prior_energy(at, frame, seen, by)
-    parts = {**space.parts, **ground.parts, **room, **prior.parts}
+    parts = {**space.parts, **ground.parts, **prior.parts}
     if seen.about is None:
         return Energy(parts)
     share = torch.where(seen.about.isnan(), 1.0, OF_SHAPES)

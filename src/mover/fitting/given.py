@@ -118,29 +118,6 @@ def begin_from(
     return _lifted(start, rows, keypoints, seen, rig, config)
 
 
-def begin_at(
-    start: Bodies, rows: Int[Tensor, " rows"], seen: Seen, rig: Rig, config: FitConfig
-) -> Begun:
-    """Start from bodies with parameters where they are.
-
-    Args:
-        start: In the camera frame.
-        rows: The body of each row that is fitted.
-        seen: What is seen of them.
-        rig: Of the model that is fitted.
-        config: How near to them the fit stays.
-
-    Raises:
-        InputError: If they have no parameters or no joints.
-    """
-    if start.pose is None or start.joints is None:
-        raise InputError("bodies: have no parameters of a body model, which are fitted anew")
-    angles, root = _angles_of(start, rows, rig)
-    at = unknowns_at(angles, start.joints[rows, 0].float())
-    near = torch.full_like(seen.spread, math.radians(config.near))
-    return Begun(at, root, angles, near)
-
-
 def _angles_of(
     start: Bodies, rows: Int[Tensor, " rows"], rig: Rig
 ) -> tuple[Float[Tensor, "rows angles"], Float[Tensor, "rows 3 3"]]:

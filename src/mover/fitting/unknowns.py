@@ -19,7 +19,6 @@ from mover.bodies.smpl_model import Model, SmplBody, skin_of_model, vertex_subse
 from mover.core.observe import Energy
 from mover.core.records import record
 from mover.fitting.limits import spreads
-from mover.geometry.mesh import vertex_normals
 from mover.geometry.rotations import axis_angle
 
 HISTORY = 100
@@ -40,10 +39,6 @@ class Rig:
     """Share of each joint, then of each vertex, in each keypoint."""
     keypoints: Int[Tensor, " keypoints"]
     """Index of the keypoints in their layout: those that are used and that the model has."""
-    picked: Int[Tensor, " picked"]
-    """Which of its vertices stand for the skin, where a room is looked at."""
-    normals: Float[Tensor, "picked 3"]
-    """Their outward normals at rest."""
     bones: Int[Tensor, " keypoints"]
     """The joint whose rotation carries each keypoint: of a joint, its parent."""
 
@@ -59,23 +54,14 @@ class Points:
 
     keypoints: Float[Tensor, "bodies keypoints 3"]
     joints: Float[Tensor, "bodies joints 3"]
-    skin: Float[Tensor, "bodies picked 3"]
-    facing: Float[Tensor, "bodies picked 3"]
-    """Normals of the skin, as far as joints turn them; no gradients."""
 
 
-NO_SKIN = torch.zeros(0, dtype=torch.long)
 FAR = ("index", "middle", "ring", "pinky", "thumb", "jaw")
 """Keypoints that no part of the 22 joints moves."""
 
 
-def rig_of(
-    model: Model,
-    layout: str,
-    used: Bool[Tensor, " layout"],
-    picked: Int[Tensor, " picked"] = NO_SKIN,
-) -> Rig:
-    """The rig of the keypoints of a layout that are `used`, and of `picked` vertices of the skin.
+def rig_of(model: Model, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
+    """The rig of the keypoints of a layout that are `used`.
 
     Raises:
         ValueError: If there is no such layout.
@@ -83,11 +69,11 @@ def rig_of(
     spots = spots_of(model, layout)
     index = torch.nonzero(used.cpu() & spots.there)[:, 0]
     vertex, share, joint = spots.vertex[index], spots.share[index], spots.joint[index]
-    needed = torch.unique(torch.cat([vertex[joint < 0].flatten(), picked]))
+    needed = torch.unique(vertex[joint < 0])
     small = vertex_subset(model, needed)
     names = [LAYOUTS[layout][k] for k in index.tolist()]
     on_body = all(n in BODY or not any(part in n for part in FAR) for n in names)
-    if isinstance(small, SkinnedBody) and on_body and not len(picked):
+    if isinstance(small, SkinnedBody) and on_body:
         small = _cut(small, len(BODY))
     skin = skin_of_model(small)
     assert skin is not None
@@ -99,14 +85,10 @@ def rig_of(
     rows = torch.nonzero(~is_joint)[:, 0]
     mix[rows] = mix[rows].scatter_add(1, column[rows], share[rows])
     levels, above = _levels(skin.parents)
-    whole = skin_of_model(model)
-    assert whole is not None
-    normals = vertex_normals(whole.verts, model.faces)[picked]
     parents = torch.tensor(skin.parents).clamp_min(0)
     first = torch.searchsorted(needed, vertex[:, 0].contiguous()).clamp_max(len(needed) - 1)
     bones = torch.where(is_joint, parents[joint.clamp_min(0)], skin.weights[first].argmax(1))
-    picks = torch.searchsorted(needed, picked)
-    return Rig(small, levels, above, mix, index, picks, normals, bones)
+    return Rig(small, levels, above, mix, index, bones)
 
 
 def _cut(skin: SkinnedBody, joints: int) -> SkinnedBody:
@@ -159,12 +141,10 @@ def move(
     moved = (skin[..., :3] @ verts[..., None])[..., 0] + skin[..., 3]
     shift = (pelvis - places[:, 0])[:, None]
     both = torch.cat([places, moved], 1)
-    turned = skin[:, rig.picked, :, :3].detach() @ rig.normals.to(skin)[..., None]
-    facing = torch.nn.functional.normalize(turned[..., 0], dim=-1)
     keypoints = rig.mix.to(both) @ both + shift
     if lasting is not None:
         keypoints = keypoints + (world[:, rig.bones] @ lasting[..., None])[..., 0]
-    return Points(keypoints, places + shift, moved[:, rig.picked] + shift, facing)
+    return Points(keypoints, places + shift)
 
 
 def _corrected(

@@ -15,10 +15,8 @@ from mover.bodies.posa import load_posa, posa_contacts
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, silent
-from mover.core.types import Bodies, Capture, Keypoints, Mesh, Room
+from mover.core.types import Bodies, Capture, Mesh, Room
 from mover.evaluate.evaluation import evaluate_people
-from mover.fitting.config import FitConfig
-from mover.fitting.prior import prior_of
 from mover.geometry.placement import standing_meshes
 from mover.io.capture.bodies_file import read_bodies, read_contacts, write_bodies
 from mover.io.capture.camera_file import camera_of
@@ -30,7 +28,6 @@ from mover.io.files.meshes import read_mesh
 from mover.io.files.npz import write_npz
 from mover.io.formats import read
 from mover.pipeline.outcome import to_world
-from mover.pipeline.refit import Refit, refit_bodies
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import RefinedBodies, refine_bodies
 
@@ -82,33 +79,6 @@ def refine_result(
     if room.bodies is None:
         raise InputError(f"{out}: has no bodies.npz: there is nobody to refine")
     found = refine_bodies(room, source_capture(out, capture), config, observe)
-    write_bodies(found.bodies, out / "refined" / "bodies.npz")
-    return found
-
-
-def refine_as_paper(
-    out: Path,
-    seen: tuple[Keypoints, Path | None],
-    config: FitConfig,
-    capture: Path | None = None,
-    observe: Observer = silent,
-) -> Refit:
-    """Fit the people of a result again in its room and write OUT/refined/bodies.npz.
-
-    Args:
-        out: Folder of the result.
-        seen: 2D joints of the people, and VPoser's weights, where there are any.
-        config: Weights and settings.
-        capture: Its capture, for contacts; None: where run.json says.
-        observe: Called after each stage.
-
-    Raises:
-        InputError: If the result lacks people, their parameters or a floor, or cannot be read.
-    """
-    room = finished_room(out)
-    source = source_capture(out, capture)
-    touch = None if source is None else source.touch
-    found = refit_bodies(room, seen[0], touch, (config, prior_of(seen[1])), observe)
     write_bodies(found.bodies, out / "refined" / "bodies.npz")
     return found
 

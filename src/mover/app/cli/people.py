@@ -12,8 +12,7 @@ from mover.app.cli import say
 from mover.app.cli.config import parsed, parsed_with, preset_of
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, float_in
-from mover.fitting.config import FitConfig
-from mover.fitting.presets import FITS
+from mover.fitting.config import FITS, FitConfig
 from mover.io.formats import listing, names
 
 TOOLS = f"The tool that wrote the source; see docs/data.md.\n{listing('people', 'keypoints')}"

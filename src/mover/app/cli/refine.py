@@ -9,12 +9,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import AvoidSubcommands, Positional, arg
 
 from mover.app.cli import say
-from mover.app.cli.config import parsed, parsed_with, preset_of
-from mover.app.cli.people import NO_VPOSER, Detector, keypoints_at
+from mover.app.cli.config import parsed, parsed_with
 from mover.core.errors import InputError
-from mover.core.settings import Index, Rate, int_in
-from mover.fitting.config import FitConfig
-from mover.fitting.presets import PAPER_ROOM, without
+from mover.core.settings import Index, int_in
 from mover.stages.config import RefineBodiesConfig
 
 
@@ -27,29 +24,17 @@ class RefineArgs:
     capture: Path | None = None
     """Folder of its capture, for masks and contacts; by default where run.json says."""
     truth: Path | None = None
-    """Folder with the true people: their errors are told as well."""
+    """Folder with the true people: their errors are measured as well."""
     camgp: bool = True
-    """Use the floor: nobody under it, soles at rest on it."""
+    """Use the floor: no person under it, soles at rest on it."""
     sdf: bool = True
-    """Use the furniture's signed distance: nobody inside it."""
+    """Use the furniture's signed distance: no person inside it."""
     contact: bool = True
     """Use contacts: seats, backs and hands at rest lie on furniture."""
     order: bool = True
     """Use who hides whom."""
     masks: bool = True
     """Use the outlines of people's masks."""
-    preset: Literal["robust", "paper"] = "robust"
-    """robust: the bodies that are there, moved; paper: SMPLify-X again, with PROX's terms."""
-    keypoints: Path | None = None
-    """paper: the 2D joints of the video, keypoints.npz, or a file or folder of a detector."""
-    tool: Detector = "openpose"
-    """paper: the detector, where --keypoints is not keypoints.npz."""
-    fps: Rate | None = None
-    """paper: frames a second, where the keypoints do not tell."""
-    first: Index = 0
-    """paper: the number in the name of the first frame's file of the detector."""
-    vposer: Path | None = None
-    """paper: VPoser's weights (a checkpoint, its folder, or .npz), the printed prior of poses."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +63,11 @@ class ContactsArgs:
     """The file to write."""
 
 
-PRESETS = {"robust": RefineBodiesConfig(), "paper": PAPER_ROOM}
-"""What the flags of a preset change."""
-
-
 def refine(arguments: Sequence[str]) -> None:
     """`mover refine`."""
-    preset = PRESETS[preset_of(arguments, tuple(PRESETS))]
-    args, config = parsed_with(RefineArgs, preset, "mover refine", arguments, AvoidSubcommands)
+    args, config = parsed_with(
+        RefineArgs, RefineBodiesConfig(), "mover refine", arguments, AvoidSubcommands
+    )
     import torch
 
     from mover.app.cli.progress import Bar
@@ -100,33 +82,16 @@ def refine(arguments: Sequence[str]) -> None:
         say(f"{name:20}{before:10.4f}{values['refined'][name]:10.4f}")
 
 
-def _refined(args: RefineArgs, config: RefineBodiesConfig | FitConfig, observe: Any) -> str:  # noqa: ANN401
-    """Refine as the settings say; returns what was done.
-
-    Raises:
-        InputError: If something is asked for that a preset has not, or a file is wrong.
-    """
-    from mover.pipeline.refinement import refine_as_paper, refine_result, switched
+def _refined(args: RefineArgs, config: RefineBodiesConfig, observe: Any) -> str:  # noqa: ANN401
+    """Refine as the settings say; returns what was done."""
+    from mover.pipeline.refinement import refine_result, switched
 
     off = {"camgp": not args.camgp, "sdf": not args.sdf, "contact": not args.contact}
-    path = args.out / "refined" / "bodies.npz"
-    if isinstance(config, RefineBodiesConfig):
-        if args.keypoints is not None or args.vposer is not None:
-            raise InputError("--keypoints, --vposer: of --preset paper only")
-        more = {"order": not args.order, "masks": not args.masks}
-        found = refine_result(args.out, switched(config, off | more), args.capture, observe)
-        how = "rigidly" if found.bodies.pose is None else "with their pose"
-        way = f"moved by {1000 * float(found.shift.norm(dim=-1).median()):.0f} mm (median)"
-        return f"{len(found.shift)} bodies refined {how}, {way}: {path}"
-    source = _needed(args.keypoints, "--keypoints")
-    seen = keypoints_at(source, args.tool, args.fps, args.first)
-    if args.vposer is None:
-        say(NO_VPOSER)
-    config = without(config, *(name for name, is_off in off.items() if is_off))
-    found = refine_as_paper(args.out, (seen, args.vposer), config, args.capture, observe)
-    for warning in found.warnings:
-        say(f"warning: {warning}")
-    return f"{len(found.rows)} bodies fitted again in their room: {path}"
+    off |= {"order": not args.order, "masks": not args.masks}
+    found = refine_result(args.out, switched(config, off), args.capture, observe)
+    how = "rigidly" if found.bodies.pose is None else "with their pose"
+    way = f"moved by {1000 * float(found.shift.norm(dim=-1).median()):.0f} mm (median)"
+    return f"{len(found.shift)} bodies refined {how}, {way}: {args.out / 'refined' / 'bodies.npz'}"
 
 
 def contacts(arguments: Sequence[str]) -> None:
