@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 import tiny_capture as tiny
 import torch
-from test_fuzz_people import CAMERA, Toy
+from test_readers_people import CAMERA, Toy
 from test_run import PLANE, Twice, doubled, files
 
 from mover.bodies import BODY_MODELS
@@ -39,13 +39,23 @@ from mover.io.people.bodies import bodies_from
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from
 
-FEW, ALL = 60, 3000  # mutations of a capture
+FEW, ALL = 64, 3200  # mutations of a capture
 LONGEST = 20  # [s], of one read
 JUNK = (
     0, -1, 1, 1e-8, -1e-8, 1e8, -80, 500, 1000, 1e5, 10**30, math.nan, math.inf, -math.inf, True,
     None, "", "x", "..", "ground", "\ud800", [], {}, [[]], [1, 2], {"a": 1}, ["x"] * 3,
     [math.nan] * 3,
 )  # fmt: skip
+BAD_ARRAYS = (
+    *(np.zeros(shape) for shape in ((), 3, (3, 4, 3), (0, 3), (3, 63), (3, 10), (3, 3))),
+    *(np.full(shape, np.nan) for shape in ((), 3, (3, 4, 3))),
+    *(np.array([value] * 3) for value in (1 << 62, -(1 << 63), (1 << 64) - 1, 1e300, "a")),
+    *(np.array(word) for word in ("x", "world", "makehuman", "smplx", "")),
+    np.ones((3, 4), dtype=bool), np.zeros((5, 3), dtype=np.uint64), np.array([["a", "b"]]),
+    np.zeros((3, 4, 3), dtype=np.float16), np.zeros((2, 3), dtype="M8[s]"),
+)  # fmt: skip
+POSE = ("model", "gender", "betas", "body_pose", "global_orient", "transl", "left_hand_pose",
+        "expression")  # fmt: skip
 FACTORS = (0.001, 0.01, 0.3048, 3.28, 39.37, 100.0, 1000.0, 1e8, -1.0)
 
 
@@ -130,6 +140,17 @@ def in_arrays(folder: Path, rng: np.random.Generator) -> str:
     return f"{path.name} {name} {which}"
 
 
+def in_parameters(folder: Path, rng: np.random.Generator) -> str:
+    """Up to seven arrays of the bodies, among them parameters, are any arrays."""
+    path = folder / "bodies.npz"
+    with np.load(path) as file:
+        arrays = dict(file)
+    names = rng.choice([*arrays, *POSE], int(rng.integers(1, 8)), replace=False)
+    some = {str(name): BAD_ARRAYS[rng.integers(len(BAD_ARRAYS))] for name in names}
+    np.savez(path, **(arrays | some))
+    return f"{path.name} {some}"
+
+
 def in_bytes(folder: Path, rng: np.random.Generator) -> str:
     """A file is cut, or some of its bytes are others."""
     found = sorted(p for p in folder.rglob("*") if p.is_file())
@@ -162,7 +183,7 @@ def in_files(folder: Path, rng: np.random.Generator) -> str:
     return f"{path.name} {kind} {other.name}"
 
 
-KINDS = (in_json, in_json, in_json, in_arrays, in_arrays, in_bytes, in_files)
+KINDS = (in_json, in_json, in_json, in_arrays, in_parameters, in_arrays, in_bytes, in_files)
 
 
 def check_sane(capture: Capture) -> None:

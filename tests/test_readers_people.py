@@ -31,15 +31,42 @@ from mover.io.people.bodies import attitude, bodies_from, camera_from, in_world
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from, read_keypoints, write_keypoints
 
-pytest.importorskip("joblib", reason="the fixtures are written by joblib, as the tools do")
+joblib = pytest.importorskip("joblib", reason="the fixtures are written by joblib, as the tools do")
 
 CAMERA = camera_of(At(made.camera_json(), "camera.json"))
 KNOWN = Known(camera=CAMERA)
-GRAVITY = ("gem", "gvhmr", "prompthmr", "slahmr", "tram", "wham", "wham:python")
-GAPLESS = ("gvhmr", "gem", "amass", "amass:smplx")  # files whose rows are all frames of a video
-MODELS = {"sam3dbody": "smplx", "slahmr": "smplh", "amass": "smplh"} | dict.fromkeys(
-    ("amass:smplx", "gem", "gvhmr", "prompthmr", "prox", "smplifyx"), "smplx"
-)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is true of a tool's files beside the person in them."""
+
+    needed: str
+    """A field without which they are refused."""
+    model: str = "smpl"
+    gravity: bool = False
+    gapless: bool = False
+    """Its rows are all frames of a video."""
+    focal: float | None = None
+    """The lens that it assumes, about the image's middle [px]; None: the true one, or none."""
+
+
+DIAGONAL = float(np.hypot(made.WIDTH, made.HEIGHT))
+CASES = {
+    "4dhumans": Case("body_pose", focal=25000), "phalp": Case("smpl", focal=25000),
+    "amass": Case("poses", "smplh", gapless=True),
+    "amass:smplx": Case("trans", "smplx", gapless=True),
+    "gem": Case("body_params_incam", "smplx", gravity=True, gapless=True, focal=DIAGONAL),
+    "gvhmr": Case("transl", "smplx", gravity=True, gapless=True, focal=DIAGONAL),
+    "pare": Case("pose"), "pare:pixels": Case("joints3d"), "pare:image": Case("orig_cam"),
+    "vibe": Case("frame_ids"),
+    "prompthmr": Case("rotmat", "smplx", gravity=True, focal=1500),
+    "prox": Case("transl", "smplx"), "smplifyx": Case("body_pose", "smplx", focal=5000),
+    "sam3dbody": Case("pred_cam_t", "smplx"), "slahmr": Case("pose_body", "smplh", gravity=True),
+    "tram": Case("pred_trans", gravity=True, focal=900),
+    "wham": Case("betas", gravity=True, focal=DIAGONAL),
+    "wham:python": Case("poses_body", gravity=True, focal=DIAGONAL),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -110,17 +137,15 @@ def seen(points: torch.Tensor) -> np.ndarray:
     return project(points, CAMERA.K).numpy()
 
 
-@pytest.mark.parametrize("tool", made.BODIES)
-def test_bodies_fall_on_their_pixels_upright_and_not_mirrored(tool, tmp_path, faces):
-    found = imported(tool, tmp_path, faces)
-    model = MODELS.get(tool, "smpl")
-    true, bodies = made.person(model), found.bodies
+@pytest.mark.parametrize("tool", CASES)
+def test_bodies_are_right_upright_and_not_mirrored_and_read_again(tool, tmp_path, faces):
+    case, found = CASES[tool], imported(tool, tmp_path, faces, fps=30.0)
+    true, bodies = made.person(case.model), found.bodies
     assert found.warnings == () or tool == "slahmr"  # whose fixture has NaN
     near = bodies.verts[..., 2].mean(1).argmin()  # SAM 3D Body's fixture has another behind
     rows = bodies.person == bodies.person[near]
-    expected = range(5) if tool in GAPLESS else made.FRAMES.tolist()
-    assert bodies.frame[rows].tolist() == list(expected)
-    _, owner, _ = made.flesh(model)
+    assert bodies.frame[rows].tolist() == (list(range(5)) if case.gapless else [*made.FRAMES])
+    _, owner, _ = made.flesh(case.model)
     body = owner < 22  # GVHMR knows no hands
     verts = bodies.verts[rows]
     off = seen(verts)[:, body] - made.pixels(true["verts"])[:, body]
@@ -133,13 +158,21 @@ def test_bodies_fall_on_their_pixels_upright_and_not_mirrored(tool, tmp_path, fa
     assert (left - head > 0.2).all()  # the left arm is raised, the right one hangs
     assert (head - right > 0.2).all()
     assert (seen(part[2])[:, 0] > seen(part[3])[:, 0]).all()  # and they face the camera
+    assert (bodies.pose is None) == (tool == "sam3dbody")
+    if bodies.pose is not None:
+        check_parameters(bodies, case.model)
+    assert (found.up is not None) == case.gravity
+    if case.gravity:
+        check_gravity(found, case.model)
+    write_bodies(bodies, tmp_path / "bodies.npz")
+    again = read_bodies(tmp_path / "bodies.npz", lambda _: None)
+    assert torch.equal(again.verts, bodies.verts)
+    assert again.frame.tolist() == bodies.frame.tolist()
+    assert again.fps == 30.0
 
 
-@pytest.mark.parametrize("tool", [t for t in made.BODIES if t != "sam3dbody"])
-def test_parameters_are_kept_and_give_the_same_meshes(tool, tmp_path, faces):
-    bodies = imported(tool, tmp_path, faces).bodies
-    model = MODELS.get(tool, "smpl")
-    assert bodies.pose is not None
+def check_parameters(bodies, model):
+    """They are kept, and give the same meshes and joints."""
     assert bodies.pose.model == model
     verts, joints = Toy(model).posed(bodies.pose)
     assert torch.allclose(verts, bodies.verts, atol=2e-3)
@@ -149,46 +182,137 @@ def test_parameters_are_kept_and_give_the_same_meshes(tool, tmp_path, faces):
     assert torch.allclose(joints, bodies.joints, atol=2e-3)
 
 
-@pytest.mark.parametrize("tool", GRAVITY)
-def test_gravity_of_the_tool_is_the_cameras_pitch_and_roll(tool, tmp_path, faces):
-    found = imported(tool, tmp_path, faces)
-    assert found.up is not None
+def check_gravity(found, model):
+    """It is the camera's pitch and roll, and puts the bodies upright."""
     assert attitude(found.up) == pytest.approx((made.PITCH, made.ROLL), abs=1e-3)
     world = in_world(found, "file")
-    expected = made.person(MODELS.get(tool, "smpl"))["verts"] @ made.camera_matrix()
-    _, owner, _ = made.flesh(MODELS.get(tool, "smpl"))
-    error = np.abs(world.verts.numpy() - expected)[:, owner < 22]
+    expected = made.person(model)["verts"] @ made.camera_matrix()
+    _, owner, _ = made.flesh(model)
     assert world.space == "world"
-    assert error.max() < 0.01
+    assert np.abs(world.verts.numpy() - expected)[:, owner < 22].max() < 0.01
     assert np.allclose(camera_from(found, KNOWN).R_cam_world, made.camera_matrix(), atol=1e-3)
 
 
-@pytest.mark.parametrize("tool", [t for t in made.BODIES if ":" not in t])
-def test_what_is_written_is_read_again(tool, tmp_path, faces):
-    bodies = imported(tool, tmp_path, faces, fps=30.0).bodies
-    write_bodies(bodies, tmp_path / "bodies.npz")
-    warnings: list[str] = []
-    again = read_bodies(tmp_path / "bodies.npz", warnings.append)
-    assert torch.equal(again.verts, bodies.verts)
-    assert again.frame.tolist() == bodies.frame.tolist()
-    assert again.fps == 30.0
+def load(path: Path) -> Any:
+    match path.suffix:
+        case ".json":
+            return json.loads(path.read_text())
+        case ".npz":
+            with np.load(path, allow_pickle=True) as arrays:
+                return dict(arrays)
+        case ".npy":
+            return np.load(path, allow_pickle=True).item()
+        case ".pt":
+            return torch.load(path, weights_only=True)
+        case _:
+            return joblib.load(path)
+
+
+def dump(value: Any, path: Path) -> None:
+    match path.suffix:
+        case ".json":
+            path.write_text(json.dumps(value, default=lambda x: np.asarray(x).astype(str).tolist()))
+        case ".npz":
+            np.savez(path, **value)
+        case ".npy":
+            np.save(path, value, allow_pickle=True)
+        case ".pt":
+            torch.save(value, path)
+        case _:
+            path.write_bytes(pickle.dumps(value))
+
+
+def owners(tree: Any, start: tuple = ()) -> list[tuple[Any, tuple]]:
+    """Each value of nested lists and mappings: what holds it, and the way to it."""
+    found = []
+    for key in tree.keys() if isinstance(tree, dict) else range(len(tree)):
+        found.append((tree, (*start, key)))
+        if isinstance(tree[key], dict | list) and len(tree[key]) < 100:
+            found += owners(tree[key], (*start, key))
+    return found
+
+
+@pytest.mark.parametrize("tool", CASES)
+def test_a_field_that_is_missing_or_has_a_wrong_shape_is_named(tool, tmp_path, faces):
+    name, source = CASES[tool].needed, made.BODIES[tool](tmp_path)
+    known = replace(KNOWN, faces=faces if tool == "sam3dbody" else None)
+    for path in sorted(p for p in tmp_path.rglob("*") if p.is_file() and p != faces):
+        kept = path.read_bytes()
+        for value in (..., np.zeros(2), np.zeros((7, 1))):
+            tree = load(path)
+            held = [(node, way[-1]) for node, way in owners(tree) if way[-1] == name]
+            for node, key in held:
+                if value is ...:
+                    del node[key]
+                else:
+                    node[key] = torch.from_numpy(value) if path.suffix == ".pt" else value
+            if held:
+                dump(tree, path)
+                words = f"no key .*'{name}'" if value is ... else name
+                with pytest.raises(InputError, match=words):
+                    bodies_from(tool.split(":")[0], source, known)
+                path.write_bytes(kept)
+                return
+    raise AssertionError(f"no file has {name}")
+
+
+CHANGES = 10
+
+
+def changed(old: Any, rng: np.random.Generator) -> Any:
+    options: list[Any] = [None, "abc", 0, -5, np.zeros(0), [1, 2], {"a": 1}, 1e300, b"x"]
+    numeric = isinstance(old, torch.Tensor) or (
+        isinstance(old, np.ndarray) and old.dtype.kind in "fiub"
+    )
+    array = np.asarray(old).astype(float) if numeric else None
+    if array is not None and array.size > 1:
+        broken = array.copy()
+        broken.flat[0] = np.inf
+        options += [array[:-1], array.ravel(), array.T, array * 1e30, array * np.nan, broken]
+    new = options[rng.integers(len(options))]
+    is_array = isinstance(old, torch.Tensor) and isinstance(new, np.ndarray)
+    return torch.from_numpy(new.copy()) if is_array else new
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # the toy's sums
+@pytest.mark.parametrize("tool", [*made.BODIES, *made.KEYPOINTS])
+def test_a_file_with_one_wrong_field_is_read_or_refused(tool, tmp_path, faces):
+    folder = tmp_path / "source"
+    folder.mkdir()
+    source = (made.BODIES | made.KEYPOINTS)[tool](folder)
+    known = replace(KNOWN, faces=faces if tool == "sam3dbody" else None)
+    rng = np.random.default_rng(len(tool))
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    for _ in range(CHANGES):
+        path = files[rng.integers(len(files))]
+        kept, tree = path.read_bytes(), load(path)
+        found = owners(tree)
+        node, way = found[rng.integers(len(found))]
+        node[way[-1]] = changed(node[way[-1]], rng)
+        dump(tree, path)
+        try:
+            if tool in made.KEYPOINTS:
+                assert keypoints_from(tool.split(":")[0], source, known).points.isfinite().all()
+            else:
+                bodies = bodies_from(tool.split(":")[0], source, known).bodies
+                assert bodies.verts.isfinite().all()
+        except InputError as error:
+            assert 20 < len(str(error)) < 600  # noqa: PT017
+        path.write_bytes(kept)
 
 
 def test_every_tool_has_a_fixture():
+    assert set(CASES) == set(made.BODIES)
     assert {name.split(":")[0] for name in made.BODIES} == set(names("people"))
     assert {name.split(":")[0] for name in made.KEYPOINTS} == set(names("keypoints"))
 
 
-@pytest.mark.parametrize("tool", ["phalp", "slahmr", "wham", "gvhmr", "tram", "smplifyx"])
+@pytest.mark.parametrize("tool", [name for name, case in CASES.items() if case.focal])
 def test_without_the_true_lens_bodies_stay_where_the_tool_put_them(tool, tmp_path, faces):
-    bodies = imported(tool, tmp_path, faces, camera=None).bodies
-    used = {
-        "phalp": made.lens(25000), "wham": made.lens(1468.605), "gvhmr": made.lens(1468.605),
-        "tram": made.lens(900), "slahmr": made.K, "smplifyx": made.lens(5000),
-    }[tool]  # fmt: skip
-    true = made.person(MODELS.get(tool, "smpl"))
-    shift = made.under(used, true)
-    _, owner, _ = made.flesh(MODELS.get(tool, "smpl"))
+    bodies, case = imported(tool, tmp_path, faces, camera=None).bodies, CASES[tool]
+    true = made.person(case.model)
+    shift = made.under(made.lens(case.focal), true)
+    _, owner, _ = made.flesh(case.model)
     off = bodies.verts.numpy() - true["verts"] - shift[:, None]
     assert np.abs(off[:, owner < 22]).max() < 0.02
 
