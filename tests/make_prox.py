@@ -16,10 +16,8 @@ from make_smpl import make_model, write_npz
 from PIL import Image
 
 from mover.bodies.keypoints import keypoints_of
-from mover.bodies.skinning import open_body
 from mover.bodies.smpl_files import load_smpl
 from mover.bodies.smpl_model import SmplBody
-from mover.bodies.transfer import copy_pose
 from mover.core.records import rows_of
 from mover.core.types import BodyPose
 from mover.geometry.camera import project
@@ -41,8 +39,10 @@ def smplx_people(room: KnownRoom, rows: list[int], model: SmplBody) -> BodyPose:
     given = rows_of(room.bodies, torch.tensor(rows))
     assert given.pose is not None
     assert given.joints is not None
-    pose = copy_pose(given.pose, open_body(), model)
-    pose = replace(pose, gender="male", extra={}, betas=torch.zeros(len(rows), 10))
+    pose = replace(
+        given.pose, model="smplx", gender="male", extra={}, betas=torch.zeros(len(rows), 10),
+        body_pose=given.pose.body_pose[:, :63],
+    )  # fmt: skip
     _, joints = model.posed(pose)
     return replace(pose, transl=pose.transl + given.joints[:, 0] - joints[:, 0])
 

@@ -26,7 +26,7 @@ def looked_at(weight):
     rest = resting(len(weight), none)
     return Seen(
         none, weight, torch.eye(3), 540, torch.tensor([0.0, -1, 0]), None, ALONE, rest,
-        spreads(len(weight), none), None,
+        spreads(len(weight), none),
     )  # fmt: skip
 
 

@@ -27,7 +27,7 @@ QUICK = FitConfig(
 NONE, REST = torch.zeros(1, 1), resting(1, torch.zeros(1))
 NOTHING = Seen(
     NONE[..., None].expand(1, 1, 2), NONE, torch.eye(3), 540, torch.tensor([0.0, -1, 0]), None,
-    ALONE, REST, spreads(1, REST), None,
+    ALONE, REST, spreads(1, REST),
 )  # fmt: skip
 """Nothing is seen of one body."""
 

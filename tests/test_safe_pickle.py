@@ -258,7 +258,7 @@ def test_a_tree_of_a_bomb_is_refused_at_once(file, bomb):
 @pytest.mark.parametrize("bomb", BOMBS)
 def test_bombs_in_files_of_body_models_and_matrices_are_refused_at_once(file, bomb):
     path = file(pickle.dumps({"v_template": BOMBS[bomb](), "mtx": BOMBS[bomb]()}))
-    for read in (lambda: load_smpl("smpl", place=path), lambda: read_matrix(path, "smpl", "smplx")):
+    for read in (lambda: load_smpl("smpl", place=path), lambda: read_matrix(path)):
         with pytest.raises(InputError, match=r"^x\.pkl: (unfolds|holds a list)"):
             read()
 

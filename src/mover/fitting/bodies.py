@@ -70,7 +70,7 @@ class FitInputs:
     """The true lens; its rotation is the first guess of upright."""
     model: Model
     start: Bodies | None = None
-    """Bodies of another tool in the camera frame: with parameters, or with joints."""
+    """Bodies of another tool in the camera frame, with parameters."""
     prior: PosePrior = ANGLES
     ground: float | None = None
     """Height of the floor in the camera's world [m], where it is known: nobody goes below it."""

@@ -41,7 +41,6 @@ from mover.fitting.stature import Stature, height_cost, shape_cost, size_of
 from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, floor_of, points_of
 from mover.geometry.camera import project
 
-LIFTED = 10.0  # weight of joints that are known in 3D
 OF_SHAPES = 0.1  # what a body that lies along the view tells of shapes beside others
 HEIGHT = 1000.0  # [px], the image height at which the published weights were chosen
 BENT = ((17, 1, 1.0), (18, 1, -1.0), (3, 0, -1.0), (4, 0, -1.0))
@@ -87,8 +86,6 @@ class Seen:
     """The pose that the prior expects: of the row's posture, or of the body to start from [rad]."""
     spread: Float[Tensor, "bodies 63"]
     """How far from it each angle may be [rad]."""
-    joints: Float[Tensor, "bodies joints 3"] | None
-    """Joints of the body that are known in 3D [m]; NaN: not known."""
     stature: Stature | None = None
     """The prior of their heights; None: the mean shape's, as one more coefficient."""
     lasting: Float[Tensor, " keypoints"] | None = None
@@ -115,7 +112,6 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
     points = points_of(at, frame, by.decode)
     pixels = project(points.keypoints, seen.K)
     image, rho = (HEIGHT / seen.height) ** 2, by.config.rho
-    lifted = LIFTED if seen.joints is not None else 0.0
     smooth = by.stage.smooth if len(seen.triples.rows) else 0.0
     joints = points.joints
     if by.config.by_size:
@@ -123,7 +119,6 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
     solid, flat = by.config.smooth_joints, by.config.smooth_pixels
     space = weigh(
         ("keypoints", image, lambda: keypoint_price(pixels, seen, rho)),
-        ("joints", lifted**2, lambda: joint_price(points, seen)),
         ("smooth_joints", smooth * solid, lambda: smooth_joint_price(joints, seen, by)),
         ("smooth_pixels", smooth * flat, lambda: smooth_pixel_price(pixels, seen, by)),
         ("still", smooth * by.config.still, lambda: still_price(joints, seen)),
@@ -246,16 +241,6 @@ def pose_price(angles: Float[Tensor, "bodies angles"], seen: Seen) -> Float[Tens
 def jaw_price(face: Float[Tensor, "bodies face"]) -> Float[Tensor, " bodies"]:
     """Squared turns of the jaw; about y and z a hundred times as much as opening."""
     return face[:, 0].square() + 100 * face[:, 1:3].square().sum(-1)
-
-
-def joint_price(points: Points, seen: Seen) -> Float[Tensor, " bodies"]:
-    """Squared distances from joints that are known in 3D [m²]."""
-    assert seen.joints is not None
-    known = seen.joints.isfinite().all(-1)
-    count = seen.joints.shape[1]
-    goal = torch.where(known[..., None], seen.joints, torch.zeros_like(seen.joints))
-    price = (points.joints[:, :count] - goal).square().sum(-1)
-    return torch.where(known, price, torch.zeros_like(price)).sum(-1)
 
 
 def second_difference(

@@ -258,7 +258,6 @@ def seen_of(keypoints: Keypoints, rig: Rig, camera: Camera, config: FitConfig) -
         triples=triples_of(keypoints, None, config),
         centre=resting(len(weight), pixels),
         spread=spreads(len(weight), pixels),
-        joints=None,
     )
 
 

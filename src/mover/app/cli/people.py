@@ -43,10 +43,6 @@ class BodiesArgs:
     """The number in the name of the first frame's file, 1 where they count from 1."""
     vposer: Path | None = None
     """VPoser's weights (a checkpoint, its folder, or .npz), for codes that SMPLify-X stored."""
-    transfer: Literal["", "smpl", "smplh", "smplx"] = ""
-    """Change the bodies to another model, with its files: smplx after a tool that gives SMPL."""
-    matrix: Path | None = None
-    """The official smpl2smplx_deftrafo_setup.pkl for it; by default the one of the model folder."""
     space: Literal["camera", "world"] = "camera"
     """world: upright, +y up, by the gravity that the tool knows."""
     write_camera: Path | None = None
@@ -87,8 +83,6 @@ def _bodies(args: BodiesArgs) -> None:
     known = _known(args)
     found = bodies_from(args.tool, args.source, known)
     out = args.out or Path("bodies.npz")
-    if args.transfer:
-        found = replace(found, bodies=_transferred(found.bodies, args))
     people = found.bodies if args.space == "camera" else in_world(found, args.source.name)
     write_bodies(people, out)
     for warning in found.warnings:
@@ -132,36 +126,6 @@ def _known(args: BodiesArgs) -> Any:  # noqa: ANN401
         decode = vposer_prior(load_vposer(args.vposer)).decode
     known = Known(camera, args.focal, args.faces, args.fps, args.gender, args.first)
     return replace(known, decode=decode)
-
-
-def _transferred(people: Any, args: BodiesArgs) -> Any:  # noqa: ANN401
-    """The same people in another body model.
-
-    Raises:
-        InputError: If they have no parameters, or the matrix is none.
-    """
-    from mover.bodies.smpl_files import KINDS, load_smpl
-    from mover.bodies.transfer import find_matrix, read_matrix, transfer
-
-    pose = people.pose
-    if pose is None:
-        raise InputError("--transfer: the bodies are meshes only, expected parameters of a model")
-    if pose.model == args.transfer:
-        raise InputError(f"--transfer: the bodies are of {pose.model} already")
-    if pose.model not in KINDS:
-        raise InputError(f"--transfer: the bodies are of {pose.model}, expected {', '.join(KINDS)}")
-    source, target = (load_smpl(name, pose.gender) for name in (pose.model, args.transfer))
-    path = args.matrix or find_matrix(pose.model, args.transfer, args.model_folder)
-    matrix = None if path is None else read_matrix(path, pose.model, args.transfer)
-    found = transfer(pose, source, target, matrix=matrix)
-    verts, joints = target.posed(found.pose)
-    by = "by joints and matched skin" if path is None else f"by {path.name}"
-    miss = 1000 * float(found.miss.mean())
-    say(f"{pose.model} to {args.transfer} {by}: points missed by {miss:.1f} mm")
-    return replace(
-        people, verts=verts, joints=joints, joint_names=target.joint_names, faces=target.faces,
-        pose=found.pose,
-    )  # fmt: skip
 
 
 def _counted(found: Any) -> str:  # noqa: ANN401
