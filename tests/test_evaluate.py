@@ -12,7 +12,7 @@ from judged import CAMERA, FAST, GROUND, SELF_CONTAINED, cuboid, moved, pair, pe
 
 from mover.bodies.corrected import in_world
 from mover.core.errors import InputError
-from mover.core.types import SceneObject, Segment
+from mover.core.types import SceneObject
 from mover.evaluate.bodies import soles_of
 from mover.evaluate.evaluation import (
     METRICS,
@@ -187,24 +187,6 @@ def test_a_true_scene_without_a_camera_takes_that_of_camera_json(tmp_path: Path)
     (tmp_path / "truth" / "camera.json").write_text(json.dumps(camera))
     found = evaluate_folder(tmp_path / "out", tmp_path / "truth", FAST, physics=False)["result"]
     assert found["pitch_error"] == pytest.approx(0.1, abs=1e-6)
-
-
-def test_a_folder_tells_where_moved_objects_are_when(tmp_path: Path) -> None:
-    scene = room()
-    first = Segment(0, scene.objects[0].t_world_object, scene.objects[0].yaw)
-    away = replace(first, t_world_object=first.t_world_object + torch.tensor([1.0, 0, 0]))
-    true, late = (
-        replace(scene.objects[0], segments=(first, replace(away, frame=frame))) for frame in (8, 10)
-    )
-    renamed = replace(late, id="elsewhere")
-    for name, one in (("truth", true), ("out", renamed)):
-        moving = replace(scene, objects=(one, *scene.objects[1:]))
-        write_scene(moving, tmp_path / name / "scene.json")
-    write_scene(scene, tmp_path / "out" / "initial.json")
-    found = evaluate_folder(tmp_path / "out", tmp_path / "truth", FAST, physics=False)
-    row = {"id": true.id, "iou3d": pytest.approx([1.0, 1.0]), "late": [2.0], "on_the_way": None}
-    assert found["moved"] == {"objects": [row], "false": 0}
-    assert f"{true.id} is moved: iou3d in its places 1.000, 1.000; late by 2.0" in table(found)
 
 
 def test_a_folder_without_truth_is_refused(tmp_path: Path) -> None:

@@ -12,11 +12,10 @@ from mover.bodies.bone_frames import LANDMARKS
 from mover.bodies.parts import Parts
 from mover.core.types import Bodies, Scene, SceneObject, Segment
 from mover.evaluate.contact import StandingMesh, nearness
-from mover.evaluate.moves import measure_moves
+from mover.extensions.moved_furniture.measure import measure_moves
+from mover.extensions.moved_furniture.movers import Between, Followed, follow_mover
 from mover.geometry.placement import changes, mover_at, placed_at, standing_meshes
 from mover.geometry.rotations import rot_y, wrap
-from mover.stages.config import MoveConfig
-from mover.stages.objects.follow_movers import Between, Followed, follow_mover
 
 FPS = 5.0
 BEGIN, END, COUNT = 10, 22, 40  # frames in which something moves, and of the video
@@ -64,7 +63,7 @@ def someone(name: str, way: torch.Tensor, person: int = 0, jitter: float = 0.0) 
     )  # fmt: skip
 
 
-def nobody_known(bodies: Bodies) -> Parts:
+def unknown_parts(bodies: Bodies) -> Parts:
     return Parts(torch.full((bodies.verts.shape[1],), -1), torch.zeros(0, 1, dtype=torch.long))
 
 
@@ -89,7 +88,7 @@ def between(places: list[SceneObject]) -> Between:
 
 
 def followed(places: list[SceneObject], bodies: Bodies) -> Followed | None:
-    return follow_mover(between(places), (bodies, nobody_known(bodies)), GROUND, MoveConfig())
+    return follow_mover(between(places), bodies, unknown_parts(bodies), GROUND)
 
 
 @pytest.mark.parametrize(("name", "off", "hold"), [

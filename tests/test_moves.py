@@ -12,14 +12,13 @@ from little_room import room
 from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.types import Masks, People, Segment
+from mover.extensions.moved_furniture.stays import MoveInputs, find_moves
 from mover.geometry.placement import placed_at
 from mover.geometry.rle import decode, encode
 from mover.io.capture.edits import Place, edit_scene, placement_of
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.scene_file import read_scene, write_scene
-from mover.stages.config import MoveConfig
 from mover.stages.objects.find_image_cues import evidence_at
-from mover.stages.objects.find_moves import MoveInputs, find_moves
 
 SIZE = (90, 160)
 FPS = 5.0
@@ -41,7 +40,7 @@ def rows(seen: list[tuple[int, int, torch.Tensor]]) -> People:
 
 def stays(seen: list[tuple[int, int, torch.Tensor]], people: People | None = None):
     numbers = tuple(sorted({number for _, number, _ in seen}))
-    found = find_moves(MoveInputs(rows(seen), people, numbers, FPS), MoveConfig()).stays
+    found = find_moves(MoveInputs(rows(seen), people, numbers, FPS)).stays
     return [(stay.annotation, stay.first) for stay in found]
 
 
@@ -64,14 +63,14 @@ def test_a_stay_lasts_only_while_it_is_seen_and_not_while_it_may_be_hidden():
     seen = [(f, 3, patch(20, 30) if f < 20 else patch(90, 40)) for f in FRAMES]
     seen = [(f, n, m & ~body if 14 < f < 30 else m) for f, n, m in seen]
     people = rows([(f, 0, body) for f in FRAMES if 14 < f < 30])
-    found = find_moves(MoveInputs(rows(seen), people, (3,), FPS), MoveConfig()).stays
+    found = find_moves(MoveInputs(rows(seen), people, (3,), FPS)).stays
     assert [stay.sure for stay in found] == [(0, 14), (30, 58)]
 
 
 def test_an_object_that_stands_elsewhere_from_a_frame_on_has_two_stays():
     seen = [(f, 3, patch(20, 30) if f < 30 else patch(90, 40)) for f in FRAMES]
     assert stays(seen) == [(3, 0), (3, 29)]
-    found = find_moves(MoveInputs(rows(seen), None, (3,), FPS), MoveConfig()).stays
+    found = find_moves(MoveInputs(rows(seen), None, (3,), FPS)).stays
     assert torch.equal(found[1].mask, patch(90, 40)[1::3, 1::3])
 
 

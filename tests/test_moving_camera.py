@@ -1,6 +1,7 @@
 """A moving camera: its scale from people at rest, masks seen from another position."""
 
 import dataclasses
+from pathlib import Path
 
 import little_room
 import numpy as np
@@ -9,11 +10,18 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mover.bodies.parts import parts_of
-from mover.core.types import STILL, Bodies, CameraPath
+from mover.core.run import Run
+from mover.core.types import STILL, Bodies, CameraPath, Capture
+from mover.extensions.moving_camera import (
+    ScaleInputs,
+    bodies_as_given,
+    find_scale,
+    with_metric_path,
+)
 from mover.geometry.camera import to_camera
 from mover.geometry.path import from_reference, poses_at, resampled, scaled, to_reference
 from mover.pipeline.people import carried
-from mover.stages.camera.find_scale import ScaleInputs, find_scale
+from mover.pipeline.presets import PRESETS
 
 FRAMES, FPS = 200, 5.0
 CAMERA = little_room.camera()
@@ -85,6 +93,26 @@ def test_too_few_frames_are_told() -> None:
     )
     found = find_scale(ScaleInputs(few, parts_of(few, CAMERA.R_cam_world[:, 1]), path))
     assert "too few frames" in found.warnings[0]
+
+
+@pytest.mark.parametrize("path", ["find", "keep"])
+def test_a_capture_gets_its_path_in_metres_unless_it_is_so(path: str, tmp_path: Path) -> None:
+    bodies, given = staying(), scaled(swaying(), 7.0)
+    capture = Capture(
+        "room", dataclasses.replace(little_room.room(), objects=()), None, (), None, None,
+        seen_by(swaying(), bodies), None, None, ("odd",), path=given,
+    )  # fmt: skip
+    config = dataclasses.replace(PRESETS["robust"], path=path)
+    found = with_metric_path(capture, config, Run(tmp_path))
+    assert found.warnings == ("odd",)
+    if path == "keep":
+        assert found is capture
+        return
+    assert torch.allclose(found.path.t_reference_camera, swaying().t_reference_camera, atol=2e-3)
+    assert torch.allclose(bodies_as_given(capture).verts, bodies.verts, atol=5e-3)
+    still = dataclasses.replace(capture, path=STILL)
+    assert with_metric_path(still, config, Run(tmp_path)) is still
+    assert bodies_as_given(still) is still.bodies
 
 
 def test_people_are_carried_back_to_where_they_stood() -> None:

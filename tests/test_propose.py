@@ -1,6 +1,5 @@
 """Supports that no detector saw are found where people rest on nothing, and nowhere else."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,21 +11,24 @@ from little_room import GROUND, camera, room
 
 from mover.bodies.parts import members, parts_of
 from mover.bodies.posture import touching
-from mover.core.errors import InputError
 from mover.core.records import fingerprint
 from mover.core.run import Run
-from mover.core.types import Bodies, Proposal, Room, SceneObject
+from mover.core.types import Bodies, Proposal, Room, Segment
+from mover.extensions import reconstruct
+from mover.extensions.missing_seats import (
+    KnownTops,
+    Resting,
+    proposed,
+    with_missing_seats,
+    write_proposals,
+)
 from mover.furniture.library import make_piece
 from mover.geometry.boxes import box_of
 from mover.geometry.placement import place_object
 from mover.geometry.rotations import rot_y
-from mover.io.capture.proposals_file import read_proposals, write_proposals
 from mover.io.capture.scene_file import read_scene
 from mover.pipeline.presets import ROBUST
-from mover.pipeline.reconstruct import reconstruct
-from mover.stages.config import ProposeConfig
-from mover.stages.contacts.propose_supports import propose_supports
-from mover.stages.contacts.resting import NOTHING, KnownTops, ProposeInputs
+from mover.stages.masks import small_camera
 from mover_bench.experiment.job import noisy_room
 from mover_bench.experiment.sets import SETS
 
@@ -41,11 +43,15 @@ def somewhere(bodies: Bodies, yaw: float = TURN, lift: float = 0.0) -> Bodies:
     return replace(bodies, verts=bodies.verts @ rot_y(torch.tensor(yaw)).mT + there)
 
 
-def proposed(bodies: Bodies, known: KnownTops = NOTHING) -> tuple[Proposal, ...]:
+SMALL = small_camera(camera())
+NO_PIXELS = torch.zeros(0, 1, 1, dtype=torch.bool)
+NOTHING = KnownTops(torch.zeros(0, 1, 3), NO_PIXELS, NO_PIXELS[:, 0, 0], SMALL)
+
+
+def missing(bodies: Bodies, known: KnownTops = NOTHING) -> list[Proposal]:
     parts = parts_of(bodies)
-    chance = touching(bodies, parts, GROUND)
-    inputs = ProposeInputs(bodies, parts, chance, GROUND, camera(), known)
-    return propose_supports(inputs, ProposeConfig()).found
+    resting = Resting(bodies, parts, touching(bodies, parts, GROUND) > 0.5, GROUND)
+    return proposed(resting, known, {"proposed_chair_0"})
 
 
 def sitters(count: int = COUNT) -> Bodies:
@@ -70,12 +76,12 @@ def top(x: float, y: float, z: float) -> torch.Tensor:
 
 def tops_at(points: torch.Tensor, *, seat: bool = True, seen: bool = False) -> KnownTops:
     masks = torch.full((1, 360, 640), seen)
-    return KnownTops(points, masks, torch.tensor([seat]), ("chair_0",))
+    return KnownTops(points, masks, torch.tensor([seat]), SMALL)
 
 
 def test_a_sitter_on_nothing_proposes_a_seat_below_as_high_as_what_touches():
     bodies = sitters()
-    (found,) = proposed(bodies)
+    (found,) = missing(bodies)
     piece = make_piece(found.piece, np.random.default_rng(found.seed), 0)
     middle = seat_of(bodies)
     assert found.object.category == "stool"
@@ -94,10 +100,10 @@ def test_a_sitter_on_nothing_proposes_a_seat_below_as_high_as_what_touches():
 def test_who_leans_back_has_a_chair_and_who_lies_a_bed_with_the_feet_to_its_front():
     back = {**SEATED, "left_hip": (-1.2, 0, 0), "right_hip": (-1.2, 0, 0)}
     leaning = turned(pose(back, COUNT), -0.35, 0.0, 0.0)
-    (chair,) = proposed(somewhere(people(leaning, fps=5.0)))
+    (chair,) = missing(somewhere(people(leaning, fps=5.0)))
     assert chair.object.category == "chair"
     lying = somewhere(people(LYING, fps=5.0, floor=0.45))
-    (bed,) = proposed(lying)
+    (bed,) = missing(lying)
     assert bed.object.category == "bed"
     flat = (lying.verts[0] - bed.object.t_world_object) @ rot_y(bed.object.yaw)
     soles = members(parts_of(lying), "left_sole", "right_sole")
@@ -121,7 +127,7 @@ def on_a_sofa(yaw: float = TURN) -> Bodies:
 
 def test_who_sits_across_to_who_lies_sits_on_a_sofa_as_long_as_both():
     bodies = on_a_sofa()
-    (sofa,) = proposed(bodies)
+    (sofa,) = missing(bodies)
     assert sofa.object.category == "sofa"
     assert sofa.bodies > 1.5 * COUNT
     assert float(sofa.object.yaw) == pytest.approx(TURN + torch.pi / 2, abs=0.1)
@@ -129,14 +135,6 @@ def test_who_sits_across_to_who_lies_sits_on_a_sofa_as_long_as_both():
     lying, half = flat[:COUNT, :, 0], box_of(sofa.object).size[0] / 2
     assert lying.abs().max() < half
     assert lying.abs().max() > half - 0.45
-
-
-def test_feet_that_stand_above_the_floor_propose_a_step_of_that_height():
-    (step,) = proposed(somewhere(people(pose(ARMS_DOWN, COUNT), fps=5.0), lift=0.25))
-    assert step.object.category == "step"
-    assert float(box_of(step.object).size[1]) == pytest.approx(0.25, abs=0.03)
-    soles = people(pose(ARMS_DOWN)).verts[0]
-    assert float(soles[:, 1].min()) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -150,19 +148,19 @@ def test_feet_that_stand_above_the_floor_propose_a_step_of_that_height():
     ids=["stands", "walks", "lies on the floor", "hardly sits"],
 )
 def test_nothing_is_proposed_for_who(bodies: Bodies):
-    assert proposed(bodies) == ()
+    assert missing(bodies) == []
 
 
 def test_a_known_seat_below_or_one_that_is_seen_there_and_near_needs_no_proposal():
     bodies = sitters()
     x, y, z = seat_of(bodies).tolist()
-    assert proposed(bodies, tops_at(top(x, y, z))) == ()
-    assert proposed(bodies, tops_at(top(x, y, z), seat=False)) == ()
-    assert proposed(bodies, tops_at(top(x, y, z - 0.8), seen=True)) == ()
-    assert len(proposed(bodies, tops_at(top(x, y, z - 0.8)))) == 1
-    assert len(proposed(bodies, tops_at(top(x, y, z - 0.8), seat=False, seen=True))) == 1
-    assert len(proposed(bodies, tops_at(top(x, y, z - 1.6), seen=True))) == 1
-    assert len(proposed(bodies, tops_at(top(x, y + 0.35, z), seat=False))) == 1
+    assert missing(bodies, tops_at(top(x, y, z))) == []
+    assert missing(bodies, tops_at(top(x, y, z), seat=False)) == []
+    assert missing(bodies, tops_at(top(x, y, z - 0.8), seen=True)) == []
+    assert len(missing(bodies, tops_at(top(x, y, z - 0.8)))) == 1
+    assert len(missing(bodies, tops_at(top(x, y, z - 0.8), seat=False, seen=True))) == 1
+    assert len(missing(bodies, tops_at(top(x, y, z - 1.6), seen=True))) == 1
+    assert len(missing(bodies, tops_at(top(x, y + 0.35, z), seat=False))) == 1
 
 
 def test_two_people_on_two_seats_propose_two_and_two_visits_one():
@@ -172,9 +170,9 @@ def test_two_people_on_two_seats_propose_two_and_two_visits_one():
         one, verts=torch.cat([one.verts, aside.verts]), frame=torch.cat([one.frame, aside.frame]),
         person=torch.cat([one.person, aside.person]), pose=None,
     )  # fmt: skip
-    assert [p.object.id for p in proposed(both)] == ["proposed_stool_0", "proposed_stool_1"]
+    assert [p.object.id for p in missing(both)] == ["proposed_stool_0", "proposed_stool_1"]
     again = replace(both, verts=torch.cat([one.verts, one.verts]), frame=torch.arange(2 * COUNT))
-    (found,) = proposed(replace(again, person=torch.zeros(2 * COUNT, dtype=torch.long)))
+    (found,) = missing(replace(again, person=torch.zeros(2 * COUNT, dtype=torch.long)))
     assert found.bodies == 2 * COUNT
 
 
@@ -186,48 +184,36 @@ def result(found: tuple[Proposal, ...]) -> Room:
     )  # fmt: skip
 
 
-def test_proposals_are_a_file_of_their_own_that_is_read_again_and_goes_with_them(tmp_path: Path):
-    found, path = proposed(sitters()), tmp_path / "proposed.json"
-    write_proposals(result(found), path)
-    (same,) = read_proposals(path)
-    assert box_of(same.object).center.tolist() == pytest.approx(
-        box_of(found[0].object).center.tolist(), abs=1e-4
+def test_proposals_are_a_file_of_their_own_that_goes_with_them(tmp_path: Path):
+    (found,), path = missing(sitters()), tmp_path / "proposed.json"
+    write_proposals(result((found,)), path)
+    (same,) = read_scene(path).objects
+    assert same.id == "proposed_stool_0"
+    assert box_of(same).center.tolist() == pytest.approx(
+        box_of(found.object).center.tolist(), abs=1e-4
     )
-    for key in ("piece", "style", "seed", "certainty", "bodies", "seconds"):
-        assert getattr(same, key) == pytest.approx(getattr(found[0], key))
-    assert [p.id for p in read_scene(path).objects] == ["proposed_stool_0"]
-    tree = json.loads(path.read_text())
-    tree["objects"][0]["certainty"] = 2
-    path.write_text(json.dumps(tree))
-    with pytest.raises(InputError, match=r"certainty.* has 2, expected"):
-        read_proposals(path)
     write_proposals(result(()), path)
     assert not path.exists()
-    assert read_proposals(path) == ()
+
+
+def test_an_id_that_is_taken_is_not_given_again():
+    back = {**SEATED, "left_hip": (-1.2, 0, 0), "right_hip": (-1.2, 0, 0)}
+    (chair,) = missing(somewhere(people(turned(pose(back, COUNT), -0.35, 0.0, 0.0), fps=5.0)))
+    assert chair.object.id == "proposed_chair_1"
 
 
 @pytest.mark.slow
 def test_what_a_run_proposes_changes_nothing_else_of_its_room(tmp_path: Path):
     capture = noisy_room(103, replace(SETS["mini"], withheld="seat")).capture
-    run, without = Run(tmp_path), replace(ROBUST, propose=ProposeConfig(use=False))
+    run, without = Run(tmp_path), replace(ROBUST, propose_seats=False)
     with_it, bare = (reconstruct(capture, config, run) for config in (ROBUST, without))
     assert [one.piece for one in with_it.proposals] != []
     assert bare.proposals == ()
-    told = tuple(line for line in with_it.warnings if "is proposed there" not in line)
-    assert fingerprint(replace(with_it, proposals=(), warnings=told)) == fingerprint(bare)
-
-
-def somewhere_else(one: Proposal, gap: float) -> Proposal:
-    """A proposal of the next run, under another name."""
-    piece = one.object
-    there = piece.t_world_object + gap * torch.tensor([1.0, 0.0, 0.0])
-    return replace(one, object=replace(piece, id=f"proposed_{gap}", t_world_object=there))
-
-
-def same_objects(ours: tuple[SceneObject, ...], theirs: tuple[SceneObject, ...]) -> bool:
-    """Whether all stand where they stood, to the bit."""
-    return all(
-        a.id == b.id and torch.equal(a.t_world_object, b.t_world_object)
-        and torch.equal(a.yaw, b.yaw) and torch.equal(a.scale, b.scale)
-        for a, b in zip(ours, theirs, strict=True)
-    )  # fmt: skip
+    said = tuple(line for line in with_it.warnings if "is proposed there" not in line)
+    assert fingerprint(replace(with_it, proposals=(), warnings=said)) == fingerprint(bare)
+    seat = with_it.proposals[0].object
+    first, *others = bare.scene.objects
+    stays = tuple(Segment(n, p.t_world_object, p.yaw) for n, p in ((0, first), (9, seat)))
+    scene = replace(bare.scene, objects=(replace(first, segments=stays), *others))
+    moved = with_missing_seats(replace(bare, scene=scene), capture, ROBUST, run)
+    assert seat.id not in [one.object.id for one in moved.proposals]

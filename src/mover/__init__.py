@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from mover.core.types import Layout as Layout
     from mover.core.types import Room as Room
     from mover.core.types import Scene as Scene
+    from mover.extensions import reconstruct as reconstruct
     from mover.io.formats import read as read
     from mover.pipeline.presets import PRESETS as PRESETS
     from mover.pipeline.presets import Config as Config
-    from mover.pipeline.reconstruct import reconstruct as reconstruct
 
 _HOMES = {
     "PRESETS": "pipeline.presets", "Config": "pipeline.presets", "Run": "core.run",
-    "reconstruct": "pipeline.reconstruct", "read": "io.formats", "InputError": "core.errors",
+    "reconstruct": "extensions", "read": "io.formats", "InputError": "core.errors",
     **dict.fromkeys(("Camera", "Capture", "Layout", "Room", "Scene"), "core.types"),
 }  # fmt: skip
 

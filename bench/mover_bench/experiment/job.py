@@ -20,7 +20,7 @@ from mover import __version__
 from mover.core import records
 from mover.core.files import replacing
 from mover.core.run import Run, sources
-from mover.pipeline.reconstruct import reconstruct
+from mover.extensions import reconstruct
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
 from mover_bench.experiment.measures import Judge, Trial, traits_of, under_camera

@@ -14,6 +14,8 @@ from mover.core.types import Bodies, Camera, Capture, Room, Scene, SceneObject
 from mover.evaluate.contact import TrueTouch
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate, touch_in_truth
 from mover.evaluate.scene import unmatched
+from mover.extensions.moved_furniture.measure import measure_moves
+from mover.extensions.moving_camera import bodies_as_given
 from mover.furniture.library import SEATS, canonical
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera
@@ -22,7 +24,6 @@ from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 from mover.geometry.rotations import wrap
 from mover.pipeline.outcome import to_world
-from mover.pipeline.people import as_given
 from mover.stages.objects.prepare_objects import find_regions
 from mover_bench.rooms.known import KnownRoom
 
@@ -120,7 +121,7 @@ class Judge:
         if given is not None:
             bodies = EvaluatedBodies(None, given, trial.bodies)
             self.touch = touch_in_truth(trial.truth, bodies, self.config)
-        people = None if given is None else as_given(trial.capture)
+        people = None if given is None else bodies_as_given(trial.capture)
         self.initial = self.scene(trial.capture.scene, people)
 
     def scene(self, scene: Scene, people: Bodies | None) -> dict[str, Any]:
@@ -145,11 +146,13 @@ class Judge:
             for row, traits in enumerate(self.trial.traits)
         ]
         scenes = self.trial.capture.scene, room.scene, self.trial.truth
+        fps = None if room.bodies is None else room.bodies.fps
         return {
             **{stage: measured["result"] for stage, measured in found.items()},
             "objects": objects,
             "unmatched": unmatched(*scenes, by_place=False),
             "proposed": measure_proposals(self.trial, room),
+            "moved": measure_moves(self.trial.truth, room.scene, fps),
             "warnings": list(room.warnings),
         }
 
@@ -194,4 +197,4 @@ def seat_height(seat: SceneObject) -> float:
 def under_camera(room: Room, capture: Capture, camera: Camera) -> Room:
     """The same room seen by another camera, with all people of the capture as they were given."""
     scene = replace(room.scene, camera=camera)
-    return replace(room, scene=scene, bodies=to_world(as_given(capture), camera), kept=None)
+    return replace(room, scene=scene, bodies=to_world(bodies_as_given(capture), camera), kept=None)

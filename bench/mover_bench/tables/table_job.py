@@ -21,6 +21,7 @@ from mover.core.records import fingerprint
 from mover.core.run import Run, sources
 from mover.core.types import Bodies, Capture, Scene, SceneObject
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
+from mover.extensions import reconstruct
 from mover.geometry.camera import to_camera
 from mover.geometry.camera import to_world as to_world_axes
 from mover.geometry.volume import sample
@@ -30,7 +31,6 @@ from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.fields import read_json
 from mover.pipeline.outcome import to_world
-from mover.pipeline.reconstruct import reconstruct
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
 from mover_bench.datasets.prox_files import scan_of

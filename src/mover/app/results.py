@@ -21,15 +21,15 @@ from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.settings import read_settings
 from mover.core.types import Bodies, Capture, Mesh, Room, Scene
+from mover.extensions.missing_seats import PROPOSED, write_proposals
+from mover.extensions.moving_camera import bodies_as_given
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.edits import Edit, write_edits
-from mover.io.capture.proposals_file import PROPOSED, write_proposals
 from mover.io.capture.scene_file import write_scene
 from mover.io.export.contacts import write_labels
 from mover.io.export.scene_glb import write_glb
 from mover.io.files.fields import get, read_json, refuse
 from mover.pipeline.outcome import label_inputs
-from mover.pipeline.people import as_given
 from mover.pipeline.presets import Config, with_present_keys
 from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
 
@@ -95,7 +95,7 @@ def write_truth(scene: Scene, bodies: Bodies, folder: Path) -> None:
 
 def initial_bodies(capture: Capture) -> Bodies:
     """The bodies in the world of the initial camera."""
-    return in_world(as_given(capture), capture.scene.camera)
+    return in_world(bodies_as_given(capture), capture.scene.camera)
 
 
 def report_of(

@@ -5,7 +5,7 @@ Definitions, matching rules and sampling densities: docs/metrics.md.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -40,7 +40,6 @@ from mover.evaluate.contact import (
     gather_truth,
     penetration_depth,
 )
-from mover.evaluate.moves import measure_moves, moved_lines
 from mover.evaluate.scene import (
     CAMERA_METRICS,
     HARM_METRICS,
@@ -200,12 +199,6 @@ def evaluate_folder(
     true = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
     metrics = evaluate(initial, result, true, bodies, config)
     metrics["unmatched"] = unmatched(initial, result, true)
-    _, after = pairs(initial, result, true, (config or EvaluateConfig()).by_place)
-    named = tuple(replace(piece, id=name) for name, piece in after.items())
-    fps = None if true_people is None else true_people.fps
-    moves = measure_moves(true, replace(result, objects=named), fps)
-    if any(moves.values()):
-        metrics["moved"] = moves
     if physics:
         _add_stable(metrics, out, dict(zip(SIDES, (initial, result), strict=True)))
     with replacing(out / "metrics.json") as part:
@@ -240,7 +233,6 @@ def table(metrics: Mapping[str, Any]) -> str:
             for key in ("initial", "result")
         )
         lines.append(f"{item['id']:34.34}{cells}")
-    lines += moved_lines(metrics.get("moved", {}))
     for name, ids in metrics.get("unmatched", {}).items():
         lines += [f"{name}: {', '.join(ids)}"] if ids else []
     lines += [f"{n} is not measured: {why}" for n, why in metrics.get("not_measured", {}).items()]

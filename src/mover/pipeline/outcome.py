@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.bodies.corrected import in_world
@@ -53,9 +53,6 @@ from mover.stages.objects.seat_heights import seat_warnings
 from mover.stages.objects.starts import alone
 from mover.stages.people.find_depth import pelvis, size_spread
 
-Spans = tuple[tuple[int, int], ...]
-"""Frames, from the first of each to the first that is no longer in it."""
-
 
 @dataclass(frozen=True)
 class ReconstructionContext:
@@ -68,8 +65,6 @@ class ReconstructionContext:
     prepared: Prepared
     pinned: tuple[str, ...] = ()
     """Ids of the objects that stay where the capture has them."""
-    elsewhere: Spans = ()
-    """In which an object is not where the reference image shows it."""
     unfit: Bool[Tensor, " objects"] | None = None
     """Whose shapes do not fit the image: seats may be elsewhere in them; None: not asked."""
     segments: Segments | None = None
@@ -212,7 +207,7 @@ def room_of(context: ReconstructionContext, state: SceneState, people: PeopleSta
         bodies = to_world(people.bodies, state.camera)
         warnings += people.warnings
     if people is not None and bodies is not None and state.contacts is not None:
-        contacts, now = state.contacts, people.kept & ~within(bodies.frame, context.elsewhere)
+        contacts, now = state.contacts, people.kept
         warnings += diagnostics(DiagnosticInputs(
             rows_of(bodies, now), people.parts, capture.people, state.camera,
             context.prepared.objects, placed.layout, contacts.points,
@@ -242,14 +237,6 @@ def label_inputs(room: Room) -> LabelInputs:
     )
     ids = tuple(piece.id for piece in room.scene.objects)
     return LabelInputs(room.bodies, parts_of(room.bodies), solid, ids, room.scene.ground)
-
-
-def within(frames: Int[Tensor, " rows"], spans: Spans) -> Bool[Tensor, " rows"]:
-    """Whether frames lie in one of some spans."""
-    found = torch.zeros(len(frames), dtype=torch.bool)
-    for begin, end in spans:
-        found = found | ((frames >= begin) & (frames < end))
-    return found
 
 
 def _evidence(context: ReconstructionContext, state: SceneState) -> tuple[Evidence, ...]:

@@ -1,13 +1,16 @@
 """The people of a run: where they are about the reference camera, and the floor they tell."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
+from jaxtyping import Bool
+from torch import Tensor
 
 from mover.bodies.parts import Parts, parts_of
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, CameraPath, Capture
 from mover.energy.human_terms import FootContacts
-from mover.geometry.path import is_still, poses_at, scaled, to_reference
+from mover.geometry.path import is_still, poses_at, to_reference
 from mover.io.capture.pose_file import moved
 from mover.pipeline.outcome import PeopleState, check_floor
 from mover.pipeline.presets import Config
@@ -15,7 +18,6 @@ from mover.stages.camera.align_camera import AlignInputs, align_camera
 from mover.stages.camera.doubt_floor import doubt_floor
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens, tilted_by
-from mover.stages.camera.find_scale import ScaleInputs, find_scale
 from mover.stages.camera.room_lines import FINE, SURE, Segments, find_segments
 from mover.stages.cover import hiding
 from mover.stages.objects.find_image_cues import people_in_reference
@@ -78,24 +80,41 @@ def located(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     bodies, scene = capture.bodies, capture.scene
     if bodies is None:
         return None
-    parts = parts_of(bodies, scene.camera.R_cam_world[:, 1])
-    path, odd = found_path((bodies, parts), capture, config, run)
-    kept = run.stage(select_frames, SelectInputs(carried(bodies, path)), config.select).keep
-    camera, warnings = scene.camera, tuple[str, ...]()
-    if config.correct_depth and capture.people is not None:
-        inputs = DepthInputs(bodies, parts, kept, capture.people, hiding(capture, path), camera)
-        depth = run.stage(find_depth, inputs, config.depth)
-        bodies, warnings = apply_depth(bodies, depth), (*warnings, *depth.warnings)
-        path, odd = found_path((bodies, parts), capture, config, run)
+    parts, path = parts_of(bodies, scene.camera.R_cam_world[:, 1]), capture.path
+    chosen = chosen_people(capture, parts, config, run)
+    bodies, kept = carried(chosen.bodies, path), chosen.kept
     touch = capture.touch if config.foot_contacts.given else None
-    standing = FootContactInputs(carried(bodies, path), parts, kept, camera, touch)
+    standing = FootContactInputs(bodies, parts, kept, scene.camera, touch)
     feet = run.stage(find_foot_contacts, standing, config.foot_contacts)
-    camera, tilt_spread = _tilted(camera, capture)
+    camera, tilt_spread = _tilted(scene.camera, capture)
     lean = 0.0 if bodies.size_spread is None else LEAN
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread, lean)
     alignment = run.stage(align_camera, known, config.align)
-    warnings = (*warnings, *odd, *feet.warnings, *alignment.warnings)
-    return PeopleState(carried(bodies, path), path, kept, parts, feet, alignment, warnings)
+    warnings = (*chosen.warnings, *feet.warnings, *alignment.warnings)
+    return PeopleState(bodies, path, kept, parts, feet, alignment, warnings)
+
+
+@dataclass(frozen=True)
+class ChosenPeople:
+    """People at their corrected depth, in the axes of the cameras of their frames."""
+
+    bodies: Bodies
+    kept: Bool[Tensor, " bodies"]
+    """The frames that count."""
+    warnings: tuple[str, ...]
+
+
+def chosen_people(capture: Capture, parts: Parts, config: Config, run: Run) -> ChosenPeople:
+    """Choose frames (Sec. 3.1) and, with masks, correct the depth of each person."""
+    bodies, path, masks = capture.bodies, capture.path, capture.people
+    assert bodies is not None
+    kept = run.stage(select_frames, SelectInputs(carried(bodies, path)), config.select).keep
+    if not config.correct_depth or masks is None:
+        return ChosenPeople(bodies, kept, ())
+    camera = capture.scene.camera
+    inputs = DepthInputs(bodies, parts, kept, masks, hiding(capture, path), camera)
+    depth = run.stage(find_depth, inputs, config.depth)
+    return ChosenPeople(apply_depth(bodies, depth), kept, depth.warnings)
 
 
 def _doubts(feet: FootContacts, capture: Capture, camera: Camera) -> tuple[str, ...]:
@@ -111,26 +130,6 @@ def _tilted(camera: Camera, capture: Capture) -> tuple[Camera, float | None]:
     if tilt is None:
         return camera, None
     return tilted_by(camera, tilt), tilt.spread
-
-
-def found_path(
-    people: tuple[Bodies, Parts], capture: Capture, config: Config, run: Run
-) -> tuple[CameraPath, tuple[str, ...]]:
-    """The path in the people's scale, and what is odd about it."""
-    if is_still(capture.path) or config.path == "keep":
-        return capture.path, ()
-    scale = run.stage(find_scale, ScaleInputs(*people, capture.path), config.scale)
-    return scaled(capture.path, scale.scale), scale.warnings
-
-
-def as_given(capture: Capture) -> Bodies:
-    """The people as they were given, about the reference camera, in whatever scale they tell."""
-    assert capture.bodies is not None
-    if is_still(capture.path):
-        return capture.bodies
-    parts = parts_of(capture.bodies, capture.scene.camera.R_cam_world[:, 1])
-    scale = find_scale(ScaleInputs(capture.bodies, parts, capture.path)).scale
-    return carried(capture.bodies, scaled(capture.path, scale))
 
 
 def carried(bodies: Bodies, path: CameraPath) -> Bodies:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from mover.core.settings import float_in, int_in
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
-from mover.stages.camera.config import LensConfig, ScaleConfig
+from mover.stages.camera.config import LensConfig
 from mover.stages.config import (
     AlignConfig,
     AssignConfig,
@@ -20,10 +20,8 @@ from mover.stages.config import (
     FootContactConfig,
     GatherConfig,
     ImageConfig,
-    MoveConfig,
     PlaceConfig,
     PrepareConfig,
-    ProposeConfig,
     RefineConfig,
     SelectConfig,
     SpreadConfig,
@@ -42,8 +40,6 @@ class Config:
     """One depth factor a person."""
     correct_depth: bool = False
     """Whether it is looked for and applied."""
-    scale: ScaleConfig = field(default_factory=ScaleConfig)
-    """The scale of a moving camera's path."""
     foot_contacts: FootContactConfig = field(default_factory=FootContactConfig)
     """Feet at rest."""
     path: Literal["find", "keep"] = "find"
@@ -68,10 +64,8 @@ class Config:
     """Which object each touching body part touches."""
     place: PlaceConfig = field(default_factory=PlaceConfig)
     """Stage 2: objects from the image and the people."""
-    moves: MoveConfig = field(default_factory=MoveConfig)
-    """When an object counts as moved."""
-    propose: ProposeConfig = field(default_factory=ProposeConfig)
-    """Supports that no detector saw, where people rest on nothing that is known."""
+    propose_seats: bool = True
+    """Propose seats and beds that no detector saw, where people rest on nothing that is known."""
     outer_iterations: Annotated[int, int_in(0, 100)] = 0
     """Further passes of stage 2 with assignment and occlusion order renewed."""
     slide_to_floor: bool = False

@@ -19,12 +19,10 @@ from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.warp_start import threads
 from mover.io.capture.plausible import check_plausible
-from mover.pipeline.moves import Solving, with_moves
 from mover.pipeline.outcome import (
     PeopleState,
     ReconstructionContext,
     SceneState,
-    Spans,
     as_given,
     carried,
     check_floor,
@@ -42,14 +40,12 @@ from mover.pipeline.people import lines_of, people_of, through_its_lens
 from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
 from mover.pipeline.presets import with_sizes
-from mover.pipeline.proposals import tops_of, with_proposals
 from mover.pipeline.sitters import with_common_scale, with_seats_lifted
 from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.contacts.assign_contacts import ContactInputs, assign_contacts, find_contacts
 from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import cues_in_windows, gather_cues
 from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
-from mover.stages.contacts.resting import NOTHING
 from mover.stages.objects.find_image_cues import (
     ImageInputs,
     find_image_cues,
@@ -99,26 +95,23 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
     capture = replace(capture, warnings=tuple(dict.fromkeys((*capture.warnings, *told))))
     if capture.scene.objects:
         _begin(run, prepare_objects, PrepareInputs(capture.scene.objects), config.prepare)
-    seen = through_its_lens(capture, config, run, pinned)
-    room = check_room(with_moves(Solving(seen, config, run, _reconstructed), pinned))
-    return replace(room, initial=capture.scene)
+    given, capture = capture.scene, through_its_lens(capture, config, run, pinned)
+    room = check_room(_reconstructed(capture, config, run, pinned))
+    return replace(room, initial=given)
 
 
-def _reconstructed(
-    capture: Capture, config: Config, run: Run, pinned: tuple[str, ...], elsewhere: Spans = ()
-) -> Room:
+def _reconstructed(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]) -> Room:
     """The stages in their order."""
     furniture = PrepareInputs(capture.scene.objects)
     if capture.scene.objects:
         _begin(run, prepare_objects, furniture, config.prepare)
     people = people_of(capture, config, run)
     if not capture.scene.objects:
-        room = unfurnished(capture, people)
-        return with_proposals(room, capture, config, run, people, NOTHING)
+        return unfurnished(capture, people)
     seen = image_evidence(capture)
     prepared = run.stage(prepare_objects, furniture, config.prepare)
     context = ReconstructionContext(
-        capture, config, run, seen, prepared, pinned, elsewhere, segments=lines_of(capture, config)
+        capture, config, run, seen, prepared, pinned, segments=lines_of(capture, config)
     )
     if people is None:
         ground = ground_without_people(capture, prepared)
@@ -144,7 +137,7 @@ def _reconstructed(
     room = room_of(context, state, people)
     if context.capture.furniture is None:  # nothing of it will move
         _begin(context.run, label_contacts, label_inputs(room), LabelConfig())
-    return with_proposals(room, capture, config, run, people, tops_of(context, state))
+    return room
 
 
 def _by_people(

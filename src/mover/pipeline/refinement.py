@@ -20,7 +20,6 @@ from mover.evaluate.evaluation import evaluate_people
 from mover.geometry.placement import standing_meshes
 from mover.io.capture.bodies_file import read_bodies, read_contacts, write_bodies
 from mover.io.capture.camera_file import camera_of
-from mover.io.capture.proposals_file import PROPOSED, read_proposals
 from mover.io.capture.scene_file import read_scene
 from mover.io.export.finished import read_finished
 from mover.io.files.fields import At, read_json
@@ -46,7 +45,6 @@ def finished_room(out: Path) -> Room:
     return Room(
         scene=done.scene, initial=done.scene, image_only=done.scene, bodies=done.bodies, kept=None,
         proxies=proxies, evidence=(), covariance=None, traces={}, warnings=(),
-        proposals=read_proposals(out / PROPOSED),
     )  # fmt: skip
 
 

@@ -99,8 +99,8 @@ def reconstruct_into(
     from mover.app.results import write_results
     from mover.core.observe import Step
     from mover.core.run import Run
+    from mover.extensions import reconstruct
     from mover.io.capture.edits import apply_edits
-    from mover.pipeline.reconstruct import reconstruct
 
     torch.set_num_threads(THREADS)
     capture, pinned = apply_edits(capture, origin.edits)

@@ -88,14 +88,7 @@ class Add(_Edit, frozen=True, tag="add"):
     at: Placement
 
 
-class Dismiss(_Edit, frozen=True, tag="dismiss"):
-    """There is no support where a run proposes one; the room stays as it is."""
-
-    at: Placement
-
-
-Edit = Place | Relabel | Pin | Delete | Add | Dismiss
-NEAR = 0.3  # [m] from where a proposal was dismissed: what is proposed there is the same
+Edit = Place | Relabel | Pin | Delete | Add
 
 
 def apply_edits(capture: Capture, edits: Sequence[Edit]) -> tuple[Capture, tuple[str, ...]]:
@@ -126,7 +119,7 @@ def edit_scene(scene: Scene, edits: Sequence[Edit]) -> Scene:
                 pieces[edit.id] = _placed(_new(edit, index), edit.at, scene)
             case Delete():
                 pieces = _without(edit.id, pieces)
-            case Pin() | Dismiss():
+            case Pin():
                 pass
     return replace(scene, objects=tuple(pieces.values()))
 
@@ -140,13 +133,6 @@ def pinned_ids(scene: Scene, edits: Sequence[Edit]) -> tuple[str, ...]:
         elif isinstance(edit, Add | Delete):
             pinned[edit.id] = False
     return tuple(piece.id for piece in scene.objects if pinned.get(piece.id, False))
-
-
-def is_dismissed(proposed: SceneObject, scene: Scene, edits: Sequence[Edit]) -> bool:
-    """Whether a support that is proposed in a scene stands where one was dismissed before."""
-    gone = (_placed(proposed, edit.at, scene) for edit in edits if isinstance(edit, Dismiss))
-    here = box_of(proposed).center
-    return any(float((box_of(there).center - here).norm()) < NEAR for there in gone)
 
 
 def placement_of(piece: SceneObject, scene: Scene) -> Placement:
@@ -166,8 +152,6 @@ def joined(edits: Sequence[Edit], new: Edit) -> tuple[Edit, ...]:
 
 def _check(edit: Edit, index: int, pieces: dict[str, SceneObject]) -> None:
     place = f"edits[{index}]"
-    if isinstance(edit, Dismiss):
-        return
     if not isinstance(edit, Add):
         if edit.id not in pieces:
             known = ", ".join(pieces) or "none"

@@ -42,7 +42,6 @@ from mover.stages.masks import (
     small_camera,
     small_masks,
     small_views,
-    widened,
 )
 
 NEAREST = 0.3  # [m], bodies are taken to be at least that far when pixels become metres
@@ -230,19 +229,6 @@ def cues_in_windows(
             scale.square(),
         )
     return HumanCues(depth, cues.space, touches)
-
-
-def hidden_by_unknown(inputs: GatherInputs, config: GatherConfig) -> Float[Tensor, "fh fw"]:
-    """How near bodies are of which something hides a pixel that is no known object [m].
-
-    In the image 640 wide; infinite where nothing is hidden, or where a farther body was seen.
-    """
-    camera = small_camera(inputs.camera)
-    if inputs.people is None:
-        return torch.full((camera.height, camera.width), float("inf"))
-    known = widened(small_masks(inputs.masks, inputs.camera).cpu().any(0)[None], ASIDE)
-    maps = gather_depth(_sight(inputs, ~known, replace(config, vote=False)), config.workers)
-    return torch.where(maps.near < maps.far, maps.far, float("inf"))
 
 
 def _depth_maps(inputs: GatherInputs, config: GatherConfig, observe: Observer) -> DepthMaps | None:

@@ -1,6 +1,5 @@
 """Whether moved objects stand where they should when, and move when they should."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -55,16 +54,3 @@ def measure_moves(truth: Scene, found: Scene, fps: float | None = None) -> dict[
     still = {true.id for true in truth.objects if not true.segments}
     false = sum(bool(piece.segments) for name, piece in pieces.items() if name in still)
     return {"objects": rows, "false": false}
-
-
-def moved_lines(moves: Mapping[str, Any]) -> list[str]:
-    """What `measure_moves` found, in a sentence for each object."""
-    lines: list[str] = []
-    for row in moves.get("objects", ()):
-        places = ", ".join(f"{value:.3f}" for value in row["iou3d"])
-        way = "" if row["on_the_way"] is None else f", on the way {row['on_the_way']:.3f}"
-        late = ", ".join("not told" if gap is None else f"{gap:.1f}" for gap in row["late"])
-        lines.append(f"{row['id']} is moved: iou3d in its places {places}{way}; late by {late}")
-    if moves.get("false"):
-        lines.append(f"said to move by mistake: {moves['false']}")
-    return lines
