@@ -1,7 +1,6 @@
 """A device that is none: torch holds that its tensors lie elsewhere, and the CPU does the work.
 
-What would fail on a GPU fails here: tensors of two devices in one operation and, inside `asking`,
-whatever waits for a number or copies from the host. Kernels are launched as for a GPU.
+What would fail on a GPU fails here: tensors of two devices in one operation.
 Torch must know the device before the first gradient of a process, so whoever needs it runs in a
 process with `OWN` in its environment (`test_pretended.py`).
 """
@@ -18,17 +17,8 @@ from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 aten = torch.ops.aten
-ASKS = (
-    aten._local_scalar_dense, aten.nonzero, aten.masked_select, aten.unique_consecutive,
-    aten._unique2, aten.equal, aten.is_nonzero, aten.item,
-)  # fmt: skip
 NAME = "elsewhere"
 OWN = "MOVER_TESTS_PRETEND"
-_forbidden: list[bool] = [False]
-
-
-class Asked(RuntimeError):
-    """The host was asked where a recording would fail."""
 
 
 class Elsewhere(torch.Tensor):
@@ -50,7 +40,6 @@ class Elsewhere(torch.Tensor):
 
     def tolist(self):
         """The numbers."""
-        ask("tolist")
         return self.here.tolist()
 
     @classmethod
@@ -60,7 +49,6 @@ class Elsewhere(torch.Tensor):
         out = func(*tree_map(_here, args), **tree_map(_here, kwargs))
         asked = kwargs.get("device")
         if asked is not None and torch.device(asked).type == "cpu":
-            ask(str(func))
             return out
         out = tree_map(lambda x: Elsewhere(x) if isinstance(x, torch.Tensor) else x, out)
         return return_and_correct_aliasing(func, args, kwargs, out)
@@ -74,35 +62,11 @@ def _here(x):
 
 def _check(func, args, kwargs):
     """Refuse what a GPU would refuse."""
-    name = func.overloadpacket
     tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, torch.Tensor)]
     local = [x for x in tensors if not isinstance(x, Elsewhere)]
-    if name in ASKS or (name is aten.index and any(x.dtype == torch.bool for x in tensors[1:])):
-        ask(str(func))
-    if name is aten.copy_:
-        if local:
-            ask(str(func))
-    elif name in (aten.index, aten.index_put_, aten._index_put_impl_):
-        if local:
-            ask(str(func))  # numbers of the CPU are copied
-    elif any(x.dim() for x in local):
+    copies = func.overloadpacket in (aten.copy_, aten.index, aten.index_put_, aten._index_put_impl_)
+    if not copies and any(x.dim() for x in local):
         raise RuntimeError(f"{func}: tensors here and elsewhere, {[tuple(x.shape) for x in local]}")
-
-
-def ask(what):
-    """Note that the host is asked."""
-    if _forbidden[0]:
-        raise Asked(what)
-
-
-@contextmanager
-def asking_nothing() -> Generator[None, None, None]:
-    """Let nobody ask the host, as while a GPU records."""
-    _forbidden[0] = True
-    try:
-        yield
-    finally:
-        _forbidden[0] = False
 
 
 def _empty(size, dtype=None, **_rest):
@@ -114,7 +78,6 @@ def _empty_strided(size, stride, dtype=None, **_rest):
 
 
 def _copy_from(source, to, *_):
-    ask("copy")
     _here(to).copy_(_here(source))
     return to
 

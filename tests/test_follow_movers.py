@@ -8,8 +8,7 @@ import torch
 from judged import grid_body
 from little_room import GROUND, box, camera, piece
 
-from mover.bodies.bone_frames import LANDMARKS
-from mover.bodies.parts import Parts
+from mover.bodies.parts import LANDMARKS, Parts
 from mover.core.types import Bodies, Scene, SceneObject, Segment
 from mover.evaluate.contact import StandingMesh, nearness
 from mover.extensions.moved_furniture.measure import measure_moves

@@ -1,7 +1,6 @@
 """Gathering with Warp kernels: the same as without them, whoever does what."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ import raster_torch
 import torch
 import trimesh
 import volume_igl
-from sm90 import ptx_of
 from test_volume import moving_spheres, posed_bodies, sphere
 from torch import Tensor
 
@@ -19,7 +17,6 @@ from mover.geometry import volume_warp
 from mover.geometry.raster import Crops
 from mover.geometry.raster import layers as layers_warp
 from mover.geometry.volume import Volume, grid_around, sample, sample_torch
-from mover.geometry.volume_warp import face_tree
 from mover.stages.contacts.gather_cues import Sight, gather_depth
 from mover.stages.masks import mask_table
 from mover_bench.rooms.render import encode
@@ -76,25 +73,23 @@ def test_a_body_that_leaves_the_grid_is_cut_off() -> None:
     assert torch.equal(away, part.values)
 
 
-def test_any_number_of_workers_gives_the_same_bits() -> None:
+def test_any_number_of_workers_gives_the_same_bits_and_any_order_the_same_field() -> None:
     verts, faces = posed_bodies(7)
     verts = verts + torch.linspace(0, 0.5, 7)[:, None, None]
     grid = around(verts, 80)
     one, two, three = (volume_warp.union_bodies(verts, faces, grid, n).values for n in (1, 2, 3))
     assert torch.equal(one, two)
     assert torch.equal(one, three)
-    assert torch.equal(one, volume_warp.union_bodies(verts.flip(0), faces, grid, 2).values)
-    alone = [volume_warp.union_bodies(body[None], faces, grid, 1).values for body in verts]
-    assert torch.equal(one, torch.stack(alone).amin(0))
-
-
-def test_the_order_of_the_triangles_does_not_change_a_bit() -> None:
-    verts, faces = posed_bodies(2)
-    grid = around(verts, 64)
     mixed = faces[torch.randperm(len(faces), generator=torch.Generator().manual_seed(0))]
-    one = volume_warp.union_bodies(verts, faces, grid, 1).values
-    assert torch.equal(one, volume_warp.union_bodies(verts, mixed, grid, 1).values)
-    assert torch.equal(one, volume_warp.union_bodies(verts, faces.flip(-1), grid, 1).values)
+    alone = [volume_warp.union_bodies(body[None], faces, grid, 1).values for body in verts]
+    for other in (
+        volume_warp.union_bodies(verts.flip(0), faces, grid, 2).values,
+        volume_warp.union_bodies(verts, mixed, grid, 1).values,
+        volume_warp.union_bodies(verts, faces.flip(-1), grid, 1).values,
+        torch.stack(alone).amin(0),
+    ):
+        assert torch.equal(one < 0, other < 0)
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
 
 
 def test_no_frames_leave_the_grid_as_it_was() -> None:
@@ -109,31 +104,6 @@ def test_a_failure_in_a_worker_is_told() -> None:
     verts[7, 3] = torch.inf
     with pytest.raises(ValueError, match="body 7"):
         volume_warp.union_bodies(verts, faces, grid, 3)
-
-
-@pytest.mark.parametrize("count", [1, 2, 8, 9, 17, 33, 65, 100, 600, 3000])
-def test_each_triangle_is_in_one_leaf_and_each_leaf_under_the_first_pack(count: int) -> None:
-    verts = torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
-    order = torch.rand(count, 50, generator=torch.Generator().manual_seed(2)).argsort(1)
-    faces = order[:, :3]
-    tree = face_tree(verts, faces)
-    corners, side = tree.corners[:, :3].swapaxes(1, 2).reshape(-1, 3), tree.corners[:, 3].ravel()
-    assert (np.diff(corners, axis=1) > 0).all()
-    once = corners[side != 0]
-    once[side[side != 0] < 0] = once[side[side != 0] < 0][:, [0, 2, 1]]
-    start = faces.argmin(1, keepdim=True)
-    turned = faces.gather(1, (start + torch.arange(3)) % 3)
-    assert sorted(map(tuple, once.tolist())) == sorted(map(tuple, turned.tolist()))
-    leaves, slots = len(tree.corners), [s for s in range(8) if s + tree.shift > 0 or s >= tree.base]
-    found = []
-    while slots:
-        slot = slots.pop()
-        if slot >= tree.base:
-            found.append(slot - tree.base)
-        else:
-            slots += range(8 * (slot + tree.shift), 8 * (slot + tree.shift) + 8)
-    assert sorted(found) == list(range(leaves))
-    assert 8 * tree.levels[-1] == tree.base + leaves
 
 
 def cameras(items: int, size: tuple[int, int], focal: float) -> Crops:
@@ -269,19 +239,6 @@ def test_a_mesh_in_great_pieces_has_the_distances_of_libigl() -> None:
     assert (assert_same(verts[None], faces, part) < 0).all()
 
 
-def test_columns_that_know_nothing_of_each_other_find_the_same_bits() -> None:
-    """As on CUDA, where they are measured at the same time."""
-    verts, faces = posed_bodies(2)
-    grid = around(verts, 48)
-    tools = volume_warp._tools(verts.contiguous(), faces, grid)
-    scratch = volume_warp._scratch(tools)
-    scratch.work.beside = 0
-    for body in range(len(verts)):
-        (ends,) = volume_warp._ends(tools, slice(body, body + 1))
-        volume_warp.add_body(tools, scratch, body, ends)
-    assert torch.equal(scratch.field, volume_warp.union_bodies(verts, faces, grid, 1).values)
-
-
 def test_triangles_without_an_area_are_edges_and_points() -> None:
     one, faces = sphere([0.0, 0, 0], 0.5, level=2)
     a, b = one[faces[0, 0]], one[faces[0, 1]]
@@ -296,23 +253,7 @@ def test_triangles_without_an_area_are_edges_and_points() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 1, 2, 4, 5])
-def test_trees_of_any_depth_have_the_distances_of_libigl(level: int) -> None:
+def test_meshes_of_any_size_have_the_distances_of_libigl(level: int) -> None:
     verts, faces = sphere([0.1, -0.2, 0.3], 0.5, level)
     verts = torch.stack([verts, verts * torch.tensor([1.1, 0.8, 1.0])])
     assert_same(verts, faces, around(verts, 36))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "entries"),
-    [
-        ("bodies", ["place", "leaves", "inner"]),
-        ("lower", ["blocks"]),
-    ],
-)
-def test_kernels_compile_for_an_h100_without_a_driver(
-    name: str, entries: list[str], tmp_path: Path
-) -> None:
-    text = ptx_of(name, tmp_path)
-    for entry in entries:
-        assert f".entry {entry}_" in text

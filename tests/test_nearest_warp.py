@@ -5,7 +5,7 @@ import torch
 from nearest_torch import nearest_torch
 from scipy.spatial import KDTree
 
-from mover.geometry.nearest_warp import clouds, nearest
+from mover.geometry.nearest_warp import FAN, clouds, nearest
 
 pytest.importorskip("warp")
 
@@ -36,10 +36,9 @@ def test_boxes_hold_their_points_and_every_point_is_kept() -> None:
     for k in range(2):
         assert sorted(held.index[k].tolist()) == list(range(77))
         assert torch.equal(held.points[k], points[k, held.index[k]])
-        for leaf, part in enumerate(held.points[k].split(8)):
-            assert (part >= held.leaves[k, 0, leaf]).all()
-            assert (part <= held.leaves[k, 1, leaf]).all()
-        assert torch.equal(held.groups[k].amin((0, 1)), points[k].amin(0))
+        for box, part in enumerate(held.points[k].split(FAN)):
+            assert torch.equal(part.amin(0), held.boxes[k, 0, box])
+            assert torch.equal(part.amax(0), held.boxes[k, 1, box])
 
 
 def test_of_points_equally_near_the_first_is_found() -> None:

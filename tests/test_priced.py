@@ -6,7 +6,6 @@ import pytest
 import torch
 from analytic import humans_at, image_at, make_inputs, moved, walls_at
 from reference import use_engine
-from sm90 import ptx_of
 from test_raster import packed
 
 from mover.core.observe import Energy
@@ -246,10 +245,6 @@ class TestWhoPrices:
         config = SceneConfig(WEIGHTS, "robust")
         energy = energy_function(objects, inputs.camera, inputs.image, inputs.humans, config)
         assert energy(inputs.starts).whole is None
-
-    @pytest.mark.slow
-    def test_the_kernel_compiles_for_an_h100_without_a_driver(self, tmp_path):
-        ptx_of("cost", tmp_path, "mover.energy.fused.kernels")
 
 
 @record

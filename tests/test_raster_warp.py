@@ -9,24 +9,15 @@ import pytest
 import raster_torch
 import torch
 import trimesh
-from sm90 import ptx_of
 from test_raster import PINHOLE, edges_of, packed, posed, poses, slab, window
 
 from mover.geometry import raster
 from mover.geometry import raster as raster_warp
-from mover.geometry.raster import Crops, Topology, draw, drawn_by, engine
+from mover.geometry.raster import Crops, Topology, drawn_by, engine
 from mover.geometry.warp_start import _cores, threads, use_threads
 
 wp = pytest.importorskip("warp")
 NAMES = ["sphere", "torus", "chair", "table", "sofa"]
-
-
-@pytest.fixture(params=["a thread an item", "a thread an element"])
-def driver(request, monkeypatch):
-    """Both ways to launch the kernels; the second is that of a GPU, on the CPU."""
-    if request.param == "a thread an element":
-        monkeypatch.setattr(draw, "_in_loops", lambda _: False)
-    return request.param
 
 
 def scene(names=NAMES, size=96, seed=0, starts=1):
@@ -48,7 +39,6 @@ def pulled(drawer, verts_cam, shape, views, seed=0):
 
 
 class TestAgreement:
-    @pytest.mark.usefixtures("driver")
     @pytest.mark.parametrize("seed", [0, 1, 2])
     @pytest.mark.parametrize("size", [33, 128])
     def test_depths_and_gradients_are_those_of_torch_in_double_precision(self, size, seed):
@@ -61,13 +51,11 @@ class TestAgreement:
         for mine, truth in zip(found[4], exact[4], strict=True):
             assert (mine - truth).norm() <= 1e-3 * truth.norm()
 
-    @pytest.mark.usefixtures("driver")
     def test_silhouettes_have_the_bits_of_torch(self):
         verts_cam, shape, views = scene(size=150, starts=3)
         image = raster_warp.look(verts_cam, shape, views, depth=False)[0]
         assert torch.equal(image, raster_torch.look(verts_cam, shape, views, depth=False)[0])
 
-    @pytest.mark.usefixtures("driver")
     @pytest.mark.parametrize("shift", [0.0, 0.5, 1e-6])
     def test_edges_through_pixel_centres_are_decided_as_by_torch(self, shift):
         """Both test centres with the same operations, so not even a tie may differ."""
@@ -79,7 +67,6 @@ class TestAgreement:
         assert torch.equal(found[3], truth[3])
         torch.testing.assert_close(found[4], truth[4], atol=1e-3, rtol=1e-3)
 
-    @pytest.mark.usefixtures("driver")
     def test_first_hits_have_the_bits_of_torch(self):
         verts_cam, shape, views = scene(["chair"], 70)
         inputs = verts_cam[0], shape.faces[0], views.K[0], (60, 70)
@@ -88,7 +75,6 @@ class TestAgreement:
         ):
             assert torch.equal(values, truth)
 
-    @pytest.mark.usefixtures("driver")
     def test_a_triangle_across_the_window_is_shared_by_rows(self):
         verts = torch.tensor([[-9.0, 1, 9], [9, 1, 9], [0, 1, 0.5], [0, 2, 5]])
         faces = torch.tensor([[0, 1, 2], [0, 2, 3], [2, 1, 3], [1, 0, 3]])
@@ -151,7 +137,6 @@ class TestRepetition:
 class TestBadInput:
     """What `test_raster` asks of every engine is not repeated here."""
 
-    @pytest.mark.usefixtures("driver")
     @pytest.mark.parametrize(
         ("factor", "shift"),
         [(1, (0, 0, -3)), (1, (80, 0, 0)), (1e4, (0, 0, 0)), (1e12, (0, 0, 0)), (1e-9, (0, 0, 0))],
@@ -168,7 +153,6 @@ class TestBadInput:
         for values in pulled(raster_warp, verts, shape, views)[:3]:
             assert torch.isfinite(values).all()
 
-    @pytest.mark.usefixtures("driver")
     def test_one_triangle_is_drawn(self):
         verts = torch.tensor([[[-0.3, -0.2, 2.0], [0.04, 0.33, 1.9], [0.31, -0.14, 2.1]]])
         shape = Topology(torch.tensor([[[0, 1, 2]]]), torch.zeros(1, 0, 4, dtype=torch.int64))
@@ -179,7 +163,6 @@ class TestBadInput:
         assert image.sum().item() == pytest.approx(area, rel=0.01)
         assert ((image == 0) | (image == 1)).all()  # no edge, no antialiasing
 
-    @pytest.mark.usefixtures("driver")
     def test_no_objects_give_empty_images(self):
         verts_cam, shape, views = scene(["chair"], 16)
         none = Topology(shape.faces[:0], shape.edges[:0])
@@ -252,16 +235,3 @@ class TestEngine:
         )
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-    @pytest.mark.slow
-    def test_kernels_compile_for_an_h100_without_a_driver(self, tmp_path):
-        text = ptx_of("grid", tmp_path)
-        for name in (
-            "draw_rows",
-            "enter_edges",
-            "keep_edges",
-            "show_pixels",
-            "pull_cuts",
-            "pull_pixels",
-        ):
-            assert f".entry {name}_" in text

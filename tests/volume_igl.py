@@ -5,13 +5,14 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from threading import Lock
 
+import igl
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.geometry.nearest import as_float64, as_int64, closest
-from mover.geometry.volume import BAND, SHELL, Volume, outward, winding
+from mover.geometry.volume import BAND, SHELL, Volume, outward
 
 SPACING = 0.8  # [cells] between marks on the surface; no point is further than 0.47 from one
 REACH = 2  # [cells] along each axis from the cell of a mark
@@ -53,9 +54,11 @@ def add_body(
     if (high < 0).any() or (low >= size).any():
         return
     shape = high - low + 1
-    inside = winding(verts - low, faces, shape) > 0
+    place = np.stack(np.indices(shape), -1).reshape(-1, 3) + low
+    numbers = np.asarray(igl.fast_winding_number(verts, faces, place.astype(np.float64)))
+    inside = (numbers > 0.5).reshape(shape)
     near = np.flatnonzero(inside | near_surface(verts - low, faces, shape))
-    at = np.stack(np.unravel_index(near, inside.shape), -1) + low
+    at = place[near]
     is_in = np.asarray(inside.ravel()[near])
     keep = ((at >= 0) & (at < size)).all(-1)
     at, is_in = at[keep], is_in[keep]

@@ -1,276 +1,50 @@
-"""Parts of a human mesh of unknown topology: matched to the open body, vertex by vertex.
+"""Parts of a body that touch things: soles, seat, thighs, back, palms, forearms.
 
-1. Walking distances to head, hands and feet say roughly where a vertex lies (`intrinsic`).
-2. From that come places of the joints, and the limbs of the open body are laid over the mesh's.
-3. Distances cannot tell left from right. The way in which the limbs fit best can.
-4. The vertex of the open body that is nearest and of like direction gives a vertex its part.
+Of a skinned body they follow from the weights and from normals and heights in the zero pose; for
+MHR's topology their indices are an asset (made by `tools/body_parts`). The vertices of another mesh
+whose pose is given take those of the nearest vertices of the open body in the same pose.
 """
 
+import hashlib
 import logging
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.bone_frames import (
-    LANDMARKS,
-    LIMBS,
-    SIDED,
-    Walks,
-    ends,
-    landmark_rings,
-    limb_frames,
-    limb_of,
-    match_ends,
-    naturalness,
-    thin,
-)
 from mover.bodies.skin import PARTS, lowest_soles, model_parts
-from mover.bodies.skinning import SkinnedBody, open_body, zero_pose
+from mover.bodies.skinning import ASSETS, SkinnedBody, open_body, zero_pose
 from mover.bodies.smpl_files import KINDS, load_smpl
 from mover.bodies.smpl_model import skin_of_model
 from mover.core.errors import InputError
-from mover.core.records import fingerprint, record
+from mover.core.records import record
 from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals
 
 Array = np.ndarray
-
-NEAR = 40
-"""Candidates looked at for each vertex."""
-WORST_MATCH = 0.13
-"""Mismatch of the distances between head, hands and feet; real people give .01 to .08."""
-WORST_FIT = 60.0
-"""A vertex that fits worse belongs to no part."""
-ROUNDS = 3
-FEWEST = 20
-"""Vertices of a limb that are enough to lay it again."""
-REACH = 0.05
-"""A normal counts as much as a place that far from the middle [m]."""
-SAMPLED = 1500
-"""Vertices that tell left from right."""
-SPREAD = (0.06, 0.05, 0.5)
-"""Typical mismatch of walking distances [m], of places along a limb [m], and of normals."""
-
-
-@dataclass(frozen=True)
-class Atlas:
-    """The open body in its zero pose: what unknown meshes are matched to."""
-
-    verts: Float[Array, "verts 3"]
-    normals: Float[Array, "verts 3"]
-    walks: Walks
-    part: Int[Array, " verts"]
-    limb: Int[Array, " verts"]
-    """Index into `LIMBS` of the limb that moves each vertex."""
-    rings: Float[Array, "verts landmarks"]
-    """1 where a vertex lies around a landmark."""
-
-
-@dataclass(frozen=True)
-class Matched:
-    """What was found out about an unknown mesh."""
-
-    part: Int[Array, " verts"]
-    rings: Int[Array, "landmarks members"]
-
-
-@dataclass(frozen=True)
-class Near:
-    """Candidates for some vertices of an unknown mesh."""
-
-    rows: Int[Array, " rows"]
-    index: Int[Array, "rows candidates"]
-    """Vertices of the open body."""
-    price: Float[Array, "rows candidates"]
-    """Mismatch of the walking distances."""
-
-
-@dataclass(frozen=True)
-class Frames:
-    """How each of `LIMBS` lies: x_zero = back @ (x - start) / size + origin."""
-
-    back: Float[Array, "limbs 3 3"]
-    start: Float[Array, "limbs 3"]
-    origin: Float[Array, "limbs 3"]
-
-
-@dataclass(frozen=True)
-class Posed:
-    """An unknown mesh in one pose."""
-
-    verts: Float[Array, "verts 3"]
-    normals: Float[Array, "verts 3"]
-
-
-@cache
-def atlas() -> Atlas:
-    """The open body, measured."""
-    model = open_body()
-    verts, joints = (x[0].double() for x in model.posed(zero_pose(1, model)))
-    place = dict(zip(model.joint_names, joints.numpy(), strict=True))
-    goals = np.stack([
-        verts[verts[:, 1].argmax()].numpy(),
-        *(place[f"{side}_middle3"] for side in ("left", "right")),
-        *(place[f"{side}_foot"] + [0, 0, 0.1] for side in ("left", "right")),
-    ])  # fmt: skip
-    points = verts.numpy()
-    tips, far = ends(points, model.faces.numpy())
-    order = np.linalg.norm(points[tips][None] - goals[:, None], axis=-1).argmin(1)
-    return Atlas(
-        verts=points,
-        normals=vertex_normals(verts, model.faces).numpy(),
-        walks=Walks(tips[order], far[:, order]),
-        part=model_parts(model).numpy(),
-        limb=limb_of(model),
-        rings=landmark_rings(model),
-    )
-
-
-def match(meshes: Float[Array, "meshes verts 3"], faces: Int[Array, "faces 3"]) -> Matched | None:
-    """Match a human mesh, seen in one or more poses, to the open body.
-
-    Vertices that hang together with nothing (eyes, teeth) get no part. None: no whole human body.
-    """
-    known = atlas()
-    model = known.walks.far[known.walks.tips]
-    tries = [match_ends(mesh, faces, model) for mesh in meshes]
-    found, size, mismatch = min(tries, key=lambda item: item[2])
-    if not mismatch < WORST_MATCH:
-        return None
-    normals = vertex_normals(torch.from_numpy(meshes), torch.from_numpy(faces)).numpy()
-    linked = np.nonzero(np.isfinite(found.far[:, 0]))[0]
-    posed = [Posed(v[linked], n[linked]) for v, n in zip(meshes, normals, strict=True)]
-    tips, far = np.searchsorted(linked, found.tips), found.far[linked] / size
-    some = np.arange(0, len(linked), max(1, len(linked) // SAMPLED))
-    guesses = [Walks(tips[order], far[:, order]) for order in SIDED]
-    walks = min(guesses, key=lambda walks: _misfit(posed, walks, size, some))
-    rings = known.rings[_nearest(walks.far, known.walks.far, 1)[:, 0]]
-    near = _near(walks, np.arange(len(linked)))
-    laid = [_fit(mesh, walks, near, rings, size) for mesh in posed]
-    rings = np.mean([known.rings[chosen] for chosen, _ in laid], axis=0)
-    part = np.stack([np.where(price < WORST_FIT, known.part[chosen], -1) for chosen, price in laid])
-    counts = np.stack([(part == p).sum(0) for p in range(-1, int(known.part.max()) + 1)])
-    best = np.full(meshes.shape[1], -1)
-    best[linked] = counts.argmax(0) - 1
-    return Matched(best, linked[thin(posed[0].verts, rings)])
-
-
-def _nearest(
-    query: Float[Array, "queries dims"], points: Float[Array, "points dims"], count: int
-) -> Int[Array, "queries count"]:
-    from scipy.spatial import KDTree
-
-    return np.asarray(KDTree(points).query(query, k=count)[1]).reshape(len(query), count)
-
-
-def _landmarks(
-    mesh: Float[Array, "verts 3"], rings: Float[Array, "verts landmarks"]
-) -> dict[str, Float[Array, "3"]]:
-    """Middle of each ring of vertices [m]."""
-    share = rings / rings.sum(0).clip(min=1)
-    return dict(zip(LANDMARKS, share.T @ mesh, strict=True))
-
-
-def _fit(
-    mesh: Posed, walks: Walks, near: Near, rings: Float[Array, "verts landmarks"], size: float
-) -> tuple[Int[Array, " verts"], Float[Array, " verts"]]:
-    """Lay the limbs over the mesh by landmarks, then again by what fits."""
-    frames = _frames(mesh, walks, rings)
-    laid = _lay(mesh, near, frames, size)
-    for _ in range(ROUNDS):
-        frames = _refitted(mesh, laid[0], frames, size)
-        laid = _lay(mesh, near, frames, size)
-    return laid
-
-
-def _misfit(posed: list[Posed], walks: Walks, size: float, rows: Int[Array, " rows"]) -> float:
-    """How badly the limbs of the open body fit, and bend, if left and right are as in `walks`."""
-    known = atlas()
-    rings = known.rings[_nearest(walks.far, known.walks.far, 1)[:, 0]]
-    near = _near(walks, rows)
-    prices = [_lay(m, near, _frames(m, walks, rings), size)[1] for m in posed]
-    bent = [naturalness(_landmarks(m.verts, rings), m.verts[walks.tips]) for m in posed]
-    return float(np.minimum(prices, WORST_FIT).mean() - np.mean(bent))
-
-
-def _frames(mesh: Posed, walks: Walks, rings: Float[Array, "verts landmarks"]) -> Frames:
-    """The limbs' turn back into the zero pose and their starts, from landmarks."""
-    known = atlas()
-    here = limb_frames(_landmarks(mesh.verts, rings), mesh.verts[walks.tips])
-    there = limb_frames(_landmarks(known.verts, known.rings), known.verts[known.walks.tips])
-    return Frames(
-        back=np.stack([there[n][0] @ here[n][0].T for n in LIMBS]),
-        start=np.stack([here[n][1] for n in LIMBS]),
-        origin=np.stack([there[n][1] for n in LIMBS]),
-    )
-
-
-def _refitted(mesh: Posed, chosen: Int[Array, " verts"], frames: Frames, size: float) -> Frames:
-    """The limbs' frames that bring matched vertices and normals together best (Kabsch)."""
-    known = atlas()
-    back, start, origin = frames.back.copy(), frames.start.copy(), frames.origin.copy()
-    for limb in range(len(LIMBS)):
-        mine = known.limb[chosen] == limb
-        if mine.sum() < FEWEST:
-            continue
-        here, there = mesh.verts[mine], known.verts[chosen[mine]]
-        start[limb], origin[limb] = here.mean(0), there.mean(0)
-        spread = (here - start[limb]).T / size @ (there - origin[limb])
-        spread = spread + REACH**2 * mesh.normals[mine].T @ known.normals[chosen[mine]]
-        u, _, vt = np.linalg.svd(spread)
-        flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-        back[limb] = vt.T @ flip @ u.T
-    return Frames(back, start, origin)
-
-
-def _near(walks: Walks, rows: Int[Array, " rows"]) -> Near:
-    """The vertices of the open body that lie about as far from its ends as `rows` do."""
-    known = atlas().walks.far
-    far = walks.far[rows]
-    index = _nearest(far, known, NEAR)
-    return Near(rows, index, np.square(far[:, None] - known[index]).sum(-1) / SPREAD[0] ** 2)
-
-
-def _lay(
-    mesh: Posed, near: Near, frames: Frames, size: float
-) -> tuple[Int[Array, " rows"], Float[Array, " rows"]]:
-    """The vertex of the open body that fits each row of `near` best, and how badly it does.
-
-    The limbs of the open body are laid over those of the mesh; a vertex fits by its place along the
-    limb, its normal and its walking distances.
-    """
-    known = atlas()
-    row = np.arange(len(near.rows))
-    limb = known.limb[near.index]
-    from_start = (mesh.verts[near.rows, None] - frames.start) / size
-    place = np.einsum("lij,vlj->vli", frames.back, from_start) + frames.origin
-    facing = np.einsum("lij,vj->vli", frames.back, mesh.normals[near.rows])[row[:, None], limb]
-    price = (
-        near.price
-        + np.square(place[row[:, None], limb] - known.verts[near.index]).sum(-1) / SPREAD[1] ** 2
-        + np.square(facing - known.normals[near.index]).sum(-1) / SPREAD[2] ** 2
-    )
-    best = price.argmin(1)
-    chosen = near.index[row, best]
-    agree = np.einsum("vi,vi->v", facing[row, best], known.normals[chosen]) > 0
-    return chosen, np.where(agree, price[row, best], np.inf)
-
-
-# Parts of a body that touch things: soles, seat, thighs, back, palms, forearms.
-#
-# Of a skinned body they follow from the weights and from normals and heights in the zero pose, so
-# that no list of vertices is shipped. Meshes of unknown topology are matched to the open body.
-
-
 log = logging.getLogger(__name__)
 
+LANDMARKS = (
+    "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle", "neck",
+    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
+"""Joints that are found on any body."""
 
+ABOVE = {
+    "hip": ("pelvis",), "knee": ("hip",), "ankle": ("knee",), "neck": ("spine3",),
+    "shoulder": ("collar",), "elbow": ("shoulder",), "wrist": ("elbow",),
+}  # fmt: skip
+"""The joint whose skin blends with that of each landmark."""
 POSES = 4
 """Poses that vote on the parts of an unknown mesh."""
+ROUNDS = 4
+"""How often the open body is laid over an unknown mesh."""
+REACH = 0.05
+"""A normal counts as much as a position that far away [m]."""
+FAR = 0.1
+"""A vertex further than that from the open body has no part [m]; also the median, of a person."""
 
 
 @record
@@ -291,7 +65,7 @@ def members(parts: Parts, *names: str) -> Bool[Tensor, " verts"]:
 
 
 def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> Parts:
-    """Parts of these bodies: by the model's skin where it is known, else by geometry.
+    """Parts of these bodies: by the model's skin or lists where it is known, else by geometry.
 
     Args:
         bodies: People with one topology, in any poses.
@@ -307,35 +81,26 @@ def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> Parts:
 def _find(bodies: Bodies, up_cam: Float[Tensor, "3"] | None) -> Parts:
     model = known_model(bodies.faces, bodies.verts.shape[1]) or _users_model(bodies)
     if model is not None:
-        return _of_model(model)
-    if bodies.verts.shape[0] == 0:
-        return _unmatched(torch.full((bodies.verts.shape[1],), -1))
-    rows = torch.linspace(0, bodies.verts.shape[0] - 1, POSES).round().long().unique()
-    meshes = bodies.verts[rows].detach().cpu().double()
-    faces = bodies.faces.detach().cpu()
-    found = _matched(meshes, faces)
+        rings = thin(model.verts.numpy(), landmark_rings(model))
+        return Parts(model_parts(model), torch.from_numpy(rings))
+    found = _listed(bodies) or _from_pose(bodies)
     if found is not None:
-        return Parts(torch.from_numpy(found.part), torch.from_numpy(found.rings))
-    log.warning("the bodies' mesh does not look like a whole person: only its soles are looked for")
+        return found
+    none = torch.zeros((0, 0), dtype=torch.long)
+    if len(bodies.verts) == 0:
+        return Parts(torch.full((bodies.verts.shape[1],), -1), none)
+    log.warning(
+        "the bodies' mesh is not known to be a whole person (its topology is unknown, and no pose "
+        "that fits is given): only its soles are looked for"
+    )
     default = (0.0, -1.0, 0.0) if bodies.space == "camera" else (0.0, 1.0, 0.0)
     up = torch.tensor(default) if up_cam is None else up_cam.detach().cpu()
-    return _unmatched(lowest_soles(meshes, faces, up.to(meshes)))
+    meshes = bodies.verts[_some_rows(bodies)].detach().cpu().double()
+    return Parts(lowest_soles(meshes, bodies.faces.cpu(), up.to(meshes)), none)
 
 
-def _matched(
-    meshes: Float[Tensor, "meshes verts 3"], faces: Int[Tensor, "faces 3"]
-) -> Matched | None:
-    """`match`, once for the same poses: many ask, of the people of one capture."""
-    key = fingerprint(meshes, faces)
-    if key not in _matches:
-        while len(_matches) >= MOST_MATCHES:
-            _matches.pop(next(iter(_matches)), None)
-        _matches[key] = match(meshes.numpy(), faces.numpy())
-    return _matches[key]
-
-
-MOST_MATCHES = 16
-_matches: dict[str, Matched | None] = {}
+def _some_rows(bodies: Bodies) -> Int[Tensor, " rows"]:
+    return torch.linspace(0, len(bodies.verts) - 1, POSES).round().long().unique()
 
 
 def known_model(faces: Int[Tensor, "faces 3"], verts: int) -> SkinnedBody | None:
@@ -360,10 +125,102 @@ def _users_model(bodies: Bodies) -> SkinnedBody | None:
     return None
 
 
-def _of_model(model: SkinnedBody) -> Parts:
-    rings = thin(model.verts.numpy(), landmark_rings(model))
-    return Parts(model_parts(model), torch.from_numpy(rings))
+def digest_of(faces: Int[Array, "faces 3"]) -> str:
+    """What tells one topology from others."""
+    return hashlib.sha256(np.ascontiguousarray(faces, dtype="<i8").tobytes()).hexdigest()
 
 
-def _unmatched(part_of: Int[Tensor, " verts"]) -> Parts:
-    return Parts(part_of, torch.zeros((0, 0), dtype=torch.long))
+def _listed(bodies: Bodies) -> Parts | None:
+    """The parts of MHR, the body of SAM 3D Body, if this is its topology."""
+    with np.load(ASSETS / "mhr_parts.npz") as data:
+        part_of, rings, digest = data["part_of"], data["rings"], str(data["digest"])
+    if bodies.verts.shape[1] != len(part_of) or digest_of(bodies.faces.cpu().numpy()) != digest:
+        return None
+    return Parts(torch.from_numpy(part_of).long(), torch.from_numpy(rings).long())
+
+
+def _from_pose(bodies: Bodies) -> Parts | None:
+    """Parts of the nearest vertices of the open body in the same poses; None: it does not fit."""
+    pose, model = bodies.pose, open_body()
+    if pose is None or pose.body_pose.shape[-1] < 63 or len(bodies.verts) == 0:
+        return None
+    rows = _some_rows(bodies)
+    angles = {"global_orient": pose.global_orient[rows], "body_pose": pose.body_pose[rows, :63]}
+    known = {name: x.detach().cpu().float() for name, x in angles.items()}
+    with torch.no_grad():
+        posed, _ = model.posed(replace(zero_pose(len(rows), model), **known))
+    here = bodies.verts[rows].detach().cpu().double()
+    both = zip(_featured(here, bodies.faces.cpu()), _featured(posed, model.faces), strict=True)
+    laid = [_nearest_after_fit(mesh, other) for mesh, other in both]
+    chosen, near = (torch.from_numpy(np.stack(x)) for x in zip(*laid, strict=True))
+    if float(near.median()) > FAR:
+        return None
+    part_of = torch.where(near < FAR, model_parts(model)[chosen], -1).mode(0).values
+    part_of[~_linked(bodies)] = -1  # eyes, teeth
+    rings = landmark_rings(model)[chosen.numpy()].mean(0)
+    return Parts(part_of, torch.from_numpy(thin(here[0].numpy(), rings)))
+
+
+def _linked(bodies: Bodies) -> Bool[Tensor, " verts"]:
+    """Which vertices hang together with most others."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    count, (a, b, c) = bodies.verts.shape[1], bodies.faces.cpu().numpy().T
+    ends = np.concatenate([a, b]), np.concatenate([b, c])
+    links = coo_matrix((np.ones(len(ends[0])), ends), shape=(count, count))
+    _, label = connected_components(links, directed=False)
+    return torch.from_numpy(label == np.bincount(label).argmax())
+
+
+def _featured(verts: Tensor, faces: Tensor) -> Float[Array, "meshes verts 6"]:
+    """Positions and normals [m]."""
+    return torch.cat([verts, REACH * vertex_normals(verts, faces)], -1).double().numpy()
+
+
+def _nearest_after_fit(
+    mesh: Float[Array, "verts 6"], other: Float[Array, "others 6"]
+) -> tuple[Int[Array, " verts"], Float[Array, " verts"]]:
+    """The nearest vertex of another mesh once that is scaled and moved, and its distance [m]."""
+    from scipy.spatial import KDTree
+
+    low, high = mesh[:, :3].min(0), mesh[:, :3].max(0)
+    start, end = other[:, :3].min(0), other[:, :3].max(0)
+    scale = np.linalg.norm(high - low) / np.linalg.norm(end - start)
+    shift = (low + high) / 2 - scale * (start + end) / 2
+    for _ in range(ROUNDS):
+        placed = np.concatenate([scale * other[:, :3] + shift, other[:, 3:]], 1)
+        distance, chosen = KDTree(placed).query(mesh)
+        matched = other[chosen, :3]
+        away, back = mesh[:, :3] - mesh[:, :3].mean(0), matched - matched.mean(0)
+        scale = (away * back).sum() / np.square(back).sum()
+        shift = mesh[:, :3].mean(0) - scale * matched.mean(0)
+    return np.asarray(chosen), np.asarray(distance)
+
+
+def landmark_rings(model: SkinnedBody) -> Float[Array, "verts landmarks"]:
+    """1 where the skin of a landmark blends with the skin above it."""
+    weight = dict(zip(model.joint_names, model.weights.T.numpy(), strict=True))
+    rings: list[Array] = []
+    for name in LANDMARKS:
+        side, _, joint = name.rpartition("_")
+        above = [f"{side}_{n}" if f"{side}_{n}" in weight else n for n in ABOVE[joint]]
+        rings.append(sum(weight[n] for n in above) * weight[name] > 0.12)
+    return np.stack(rings, axis=1).astype(float)
+
+
+def thin(
+    mesh: Float[Array, "verts 3"], rings: Float[Array, "verts landmarks"], members: int = 24
+) -> Int[Array, "landmarks members"]:
+    """So many vertices of each ring, far from each other, so that their mean is its middle."""
+    rows: list[Array] = []
+    for ring in (rings > 0).T:
+        index = np.nonzero(ring)[0] if ring.any() else np.arange(len(mesh))
+        points = mesh[index]
+        far = np.linalg.norm(points - points.mean(0), axis=1)
+        chosen: list[int] = []
+        for _ in range(members):
+            chosen.append(int(far.argmax()))
+            far = np.minimum(far, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        rows.append(index[chosen])
+    return np.stack(rows)

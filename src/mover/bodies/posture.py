@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.bone_frames import LANDMARKS
-from mover.bodies.parts import Parts, members
+from mover.bodies.parts import LANDMARKS, Parts, members
 from mover.bodies.skin import PARTS
 from mover.core.records import record
 from mover.core.types import Bodies

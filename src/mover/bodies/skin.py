@@ -27,7 +27,7 @@ def lowest_soles(
     faces: Int[Tensor, "faces 3"],
     up: Float[Tensor, "3"],
 ) -> Int[Tensor, " verts"]:
-    """Index into `PARTS` (a sole) or -1 of each vertex; sides are told apart by place only."""
+    """Index into `PARTS` (a sole) or -1 of each vertex; sides by position only."""
     height = meshes @ up
     low, high = height.amin(1, keepdim=True), height.amax(1, keepdim=True)
     near = height < low + HEIGHT * (high - low)

@@ -153,14 +153,6 @@ def signed_distance(
     return torch.from_numpy(distance).to(points)
 
 
-# Closed triangle meshes on a grid: winding numbers of places.
-#
-# Vertices are in cells here: the centres of the grid's cells have integer coordinates.
-
-
-SNAP = 1 << 16  # vertices snap to this part of a cell, so that crossings are exact
-
-
 def outward(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The faces, turned over if they enclose a negative volume (as in a mirrored body)."""
     a, b, c = (verts[faces[:, k]] - verts[0] for k in range(3))
@@ -172,19 +164,19 @@ def winding(verts: np.ndarray, faces: np.ndarray, shape: np.ndarray) -> np.ndarr
 
     Counts signed crossings along the y lines. Coordinates x and z are snapped to fixed point and
     the top-left rule decides ties, so that a line through a shared edge or vertex counts once.
+
+    Args:
+        verts: In cells: the centres of cells have integer coordinates.
+        faces: Of a closed surface.
+        shape: Number of places along each axis.
     """
-    from mover.geometry.kernels.bodies import Pair, Work
+    from mover.geometry.kernels.bodies import Body
 
     wp, size, cross = started(), [int(n) for n in shape], kernels("bodies", "cpu").cross
-    steps = np.zeros((size[0], size[2], size[1] + 1), dtype=np.int32)
-    blocks = ((size[0] + 1) // 2) * ((size[2] + 1) // 2)
-    work = Work()
-    work.size = wp.vec3i(*size)
-    work.faces = wp.array(faces.astype(np.int32), dtype=wp.vec3i, device="cpu")
-    work.place = wp.array(verts, dtype=wp.vec3d, device="cpu")
-    lines = np.rint(verts[:, [0, 2]] * SNAP).astype(np.int64)
-    work.lines = wp.array(lines, dtype=Pair, device="cpu")
-    work.crossed = wp.zeros(blocks, dtype=wp.uint8, device="cpu")
-    work.steps = wp.array(steps.ravel(), dtype=wp.int32, device="cpu", copy=False)
-    wp.launch(cross, len(faces), [work], device="cpu")
+    body, steps = Body(), np.zeros((size[0], size[2], size[1] + 1), dtype=np.int32)
+    body.size = wp.vec3i(*size)
+    body.faces = wp.array(faces.astype(np.int32), dtype=wp.vec3i, device="cpu")
+    body.place = wp.array(verts, dtype=wp.vec3d, device="cpu")
+    body.winding = wp.array(steps, dtype=wp.int32, device="cpu", copy=False)
+    wp.launch(cross, len(faces), [body], device="cpu")
     return steps[..., :-1].cumsum(2, dtype=np.int32).swapaxes(1, 2)

@@ -238,7 +238,7 @@ def _workspace(room: Room) -> Any:  # noqa: ANN401
     scene.n_verts, scene.n_faces, scene.n_edges = room.verts, room.faces, room.edges
     scene.height, scene.width, scene.border = room.height, room.width, BORDER
     sizes = room.verts, room.faces, room.edges, grid, 2 * grid
-    space.scene, space.scratch = scene, scratch_of(sizes, torch.device("cpu"))
+    space.scene, space.scratch = scene, scratch_of(sizes)
     _marks(space, room)
     space.pairs = array(torch.empty(2 * grid, dtype=torch.int32), "int32")
     space.keys = array(torch.empty(2 * grid, dtype=torch.int64), "uint64")

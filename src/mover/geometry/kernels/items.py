@@ -1,28 +1,121 @@
-"""All stages in a row for a few items, in working memory of one that stays in the cache: for CPUs.
+"""All stages in a row for a few items, in working memory of one item that stays in the cache.
 
-Threads share nothing, so that results do not depend on their number.
+Threads share nothing, so that results do not depend on their number. Winners are chosen by maxima
+of whole keys, whatever the order of the triangles.
 """
 
 import warp as wp
 
-from mover.geometry.kernels.contour import pull_cut
-from mover.geometry.kernels.grid import (
-    bound_cut,
-    draw_face,
-    enter_cuts,
-    keep_cuts,
-    mark_cut,
-    place_vert,
-    show,
-)
+from mover.geometry.kernels.contour import contour, crossing, cut_of, gap, key, pull_cut
 from mover.geometry.kernels.scene import Maps, Pull, Scene, Scratch
-from mover.geometry.kernels.surface import pull_pixel
+from mover.geometry.kernels.spans import on_screen, paint, signed_area, triangle
+from mover.geometry.kernels.surface import pull_pixel, show_pixel
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
+NOWHERE, FRONT, BEHIND = 0, 1, 2  # where backs are drawn: with the fronts, or by themselves
+
 
 @wp.func
-def draw_item(scene: Scene, scratch: Scratch, maps: Maps, backs: int, at: wp.vec2i) -> wp.vec2i:
+def face_at(scene: Scene, item: int, f: int) -> wp.vec3l:
+    """A triangle of an item."""
+    return scene.faces[item % scene.shapes * scene.n_faces + f]
+
+
+@wp.func
+def draw_face(scene: Scene, scratch: Scratch, item: int, f: int, backs: int) -> None:
+    """Draw a triangle."""
+    face = face_at(scene, item, f)
+    a = scratch.screen[int(face[0])]
+    b = scratch.screen[int(face[1])]
+    c = scratch.screen[int(face[2])]
+    area = signed_area(a, b, c)
+    scratch.front[f] = wp.int8(wp.where(area < 0.0, 1, 0))
+    if area < 0.0 or (area > 0.0 and backs != NOWHERE):
+        t = triangle(a, b, c, face, wp.vec4i(0, scene.height, 0, scene.width))
+        near = area < 0.0 or backs == FRONT
+        for row in range(t.first, t.last + 1):
+            paint(scene, scratch, t, wp.vec3i(0, row, f), near)
+
+
+@wp.func
+def outline_face(scratch: Scratch, edge: wp.vec4l) -> int:
+    """The face of an edge that is drawn as a front where the other is not, else -1."""
+    one = scratch.front[int(edge[2])]
+    if one == scratch.front[int(edge[3])]:
+        return -1
+    return int(wp.where(one == wp.int8(1), edge[2], edge[3]))
+
+
+@wp.func
+def enter_cuts(scene: Scene, scratch: Scratch, item: int, e: int) -> None:
+    """Find the outermost cut for each pair of centres on either side of an edge."""
+    edge = scene.edges[item % scene.shapes * scene.n_edges + e]
+    f = outline_face(scratch, edge)
+    if f >= 0:
+        c = contour(scene, scratch, 0, edge, face_at(scene, item, f))
+        for line in range(c.first, c.last + 1):
+            g = gap(scene, c, line)
+            if g.distance >= 0.0:
+                if scratch.near[g.inner] != wp.uint64(0) and scratch.near[g.outer] == wp.uint64(0):
+                    scratch.pairs[g.pair] = wp.max(scratch.pairs[g.pair], key(g, e))
+
+
+@wp.func
+def keep_cuts(scene: Scene, scratch: Scratch, maps: Maps, item: int, e: int) -> None:
+    """List the cuts of an edge that won, take them out, and move the image by them."""
+    edge = scene.edges[item % scene.shapes * scene.n_edges + e]
+    f = outline_face(scratch, edge)
+    if f >= 0:
+        c = contour(scene, scratch, 0, edge, face_at(scene, item, f))
+        for line in range(c.first, c.last + 1):
+            g = gap(scene, c, line)
+            if g.distance >= 0.0:
+                if scratch.pairs[g.pair] == key(g, e):
+                    scratch.pairs[g.pair] = wp.uint64(0)
+                    cut = cut_of(scene, item, c, g, line)
+                    x = crossing(scene, cut)
+                    n = scratch.count[1]
+                    scratch.count[1] = n + 1
+                    scratch.cuts[n] = cut
+                    scratch.targets[n] = x.target
+                    if x.target >= 0:
+                        maps.image[x.target] = maps.image[x.target] + x.shift
+
+
+@wp.func
+def bound_cuts(scratch: Scratch, maps: Maps, first: int) -> None:
+    """Bound the pixels of the cuts from `first` on to [0, 1]; mark those that overshot."""
+    for i in range(first, scratch.count[1]):
+        target = scratch.targets[i]
+        if target >= 0:
+            if maps.image[target] < 0.0 or maps.image[target] > 1.0:
+                scratch.targets[i] = -2 - target
+    for i in range(first, scratch.count[1]):
+        target = -2 - scratch.targets[i]
+        if target >= 0:
+            maps.image[target] = wp.clamp(maps.image[target], 0.0, 1.0)
+
+
+@wp.func
+def show(scene: Scene, scratch: Scratch, maps: Maps, item: int, row: int) -> None:
+    """Write the maps of a row of pixels, and clear their winners."""
+    b = scene.border
+    high = scene.height - 2 * b
+    wide = scene.width - 2 * b
+    for column in range(scene.width):
+        grid = row * scene.width + column
+        near = scratch.near[grid]
+        far = scratch.far[grid]
+        if (near | far) != wp.uint64(0):
+            scratch.near[grid] = wp.uint64(0)
+            scratch.far[grid] = wp.uint64(0)
+            if row >= b and row < high + b and column >= b and column < wide + b:
+                show_pixel(maps, (item * high + row - b) * wide + column - b, near, far)
+
+
+@wp.func
+def draw_item(scene: Scene, scratch: Scratch, maps: Maps, backs: int, item: int) -> wp.vec2i:
     """Put the triangles of one item into the z-buffers, and find the cuts of its outline.
 
     Returns:
@@ -31,28 +124,17 @@ def draw_item(scene: Scene, scratch: Scratch, maps: Maps, backs: int, at: wp.vec
     low = float(scene.height)
     high = float(0.0)
     for v in range(scene.n_verts):
-        s = place_vert(scene, scratch, at, v)
+        s = on_screen(scene.verts[item * scene.n_verts + v], scene.window[item % scene.views])
+        scratch.screen[v] = s
         if s[2] > 0.0:
             low = wp.min(low, s[1])
             high = wp.max(high, s[1])
     for f in range(scene.n_faces):
-        draw_face(scene, scratch, at, f, backs, scene.height)
+        draw_face(scene, scratch, item, f, backs)
     if maps.silhouette:
         for e in range(scene.n_edges):
-            enter_cuts(scene, scratch, at, e)
+            enter_cuts(scene, scratch, item, e)
     return wp.vec2i(int(wp.max(low - 1.0, 0.0)), int(wp.min(high + 1.0, float(scene.height))))
-
-
-@wp.func
-def bound_item(scene: Scene, scratch: Scratch, maps: Maps, at: wp.vec2i) -> None:
-    """Move the silhouette of one item by its outline."""
-    first = scratch.count[1]
-    for e in range(scene.n_edges):
-        keep_cuts(scene, scratch, maps, at, e)
-    for i in range(first, scratch.count[1]):
-        mark_cut(scratch, maps, i)
-    for i in range(first, scratch.count[1]):
-        bound_cut(scratch, maps, i)
 
 
 @wp.kernel
@@ -61,13 +143,14 @@ def look_items(
 ) -> None:
     """Silhouettes, depths or hits of some items."""
     for item in range(first, stop):
-        at = wp.vec2i(item, 0)
-        rows = draw_item(scene, scratch, maps, backs, at)
+        rows = draw_item(scene, scratch, maps, backs, item)
         for row in range(rows[0], rows[1]):
-            for column in range(scene.width):
-                show(scene, scratch, maps, at, row, column)
+            show(scene, scratch, maps, item, row)
         if maps.silhouette:
-            bound_item(scene, scratch, maps, at)
+            begin = scratch.count[1]
+            for e in range(scene.n_edges):
+                keep_cuts(scene, scratch, maps, item, e)
+            bound_cuts(scratch, maps, begin)
 
 
 @wp.kernel

@@ -48,7 +48,7 @@ class Scratch:
     pairs: wp.array(dtype=wp.uint64)
     """Outermost cut of each pair of neighbours in a row, then in a column: its place, its edge."""
     queue: wp.array(dtype=wp.int32)
-    """Edges of the outline, or triangles that many threads share."""
+    """Edges of the outline."""
     cuts: wp.array(dtype=wp.vec4i)
     """Cuts that count: two vertices (over all items), line x 4 + flags, covered place."""
     targets: wp.array(dtype=wp.int32)

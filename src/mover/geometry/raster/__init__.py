@@ -1,9 +1,10 @@
 """Exact-contour silhouettes and depth of many objects at once.
 
 The grid of a window has its first pixel centre at (0.5, 0.5). Triangles with a vertex nearer than
-`camera.NEAR` are not drawn. The work is done by kernels in NVIDIA Warp on a CPU or an NVIDIA GPU,
-in single precision whatever that of the vertices, with gradients in closed form but none of the
-intrinsics. On a CPU two runs give the same bits. Inside `drawn_by` a reference draws instead.
+`camera.NEAR` are not drawn. The work is done by kernels in NVIDIA Warp on the CPU (vertices on a
+GPU are copied there, the maps back), in single precision whatever that of the vertices, with
+gradients in closed form but none of the intrinsics. Two runs give the same bits. Inside `drawn_by`
+a reference draws instead.
 """
 
 from collections.abc import Generator
@@ -139,23 +140,22 @@ def first_hit(
     """
     if reference := _reference_of(verts_cam):
         return reference.first_hit(verts_cam, faces, K, size)
-    depth = torch.full(size, torch.inf, device=verts_cam.device)
-    face = torch.full(size, -1, dtype=torch.int32, device=verts_cam.device)
+    depth, face = torch.full(size, torch.inf), torch.full(size, -1, dtype=torch.int32)
     if len(verts_cam):
         shape, views = Topology(faces[None], faces.new_zeros(1, 0, 4)), Crops(K[None], *size)
-        draw.first_hit(verts_cam.float()[None], shape, views, depth, face)
-    return depth.to(verts_cam), face.long()
+        draw.first_hit(verts_cam.detach().float().cpu()[None], shape, views, depth, face)
+    return depth.to(verts_cam), face.long().to(verts_cam.device)
 
 
 def _depths(maps: Maps, like: Tensor) -> Depths:
-    return Depths(maps.nearest.to(like), maps.farthest.to(like), maps.covered)
+    return Depths(maps.nearest.to(like), maps.farthest.to(like), maps.covered.to(like.device))
 
 
 def _maps(verts_cam: Tensor, shape: Topology, views: Crops, asked: tuple[bool, bool]) -> Maps:
     """Silhouettes and depths of starts x items, a list that is cut where it is too long."""
     *lead, n_verts, _ = verts_cam.shape
     size = (*lead, views.height, views.width)
-    flat = verts_cam.float().reshape(-1, n_verts, 3)
+    flat = verts_cam.float().cpu().reshape(-1, n_verts, 3)
     if views.K.requires_grad:
         raise ValueError("raster: the intrinsics have no gradient, found K that requires one")
     if flat.numel() == 0:

@@ -1,9 +1,8 @@
-"""Launches the kernels of the rasteriser on a CPU or an NVIDIA GPU.
+"""Runs the kernels that draw.
 
-On a CPU a launch is a plain loop that lets go of Python's lock. A thread draws a few items at a
-time, one after the other in the same working memory, and threads share nothing: the result does not
-depend on their number. On a GPU there is a thread for each vertex, triangle, edge and pixel; the
-same kernels run on a CPU, where tests hold them against the others.
+A launch is a plain loop that lets go of Python's lock. A thread draws a few items at a time, one
+after the other in the same working memory, and threads share nothing: the result does not depend on
+their number.
 """
 
 from collections.abc import Sequence
@@ -15,21 +14,13 @@ import torch
 from torch import Tensor
 
 from mover.geometry.raster.records import Crops, Cuts, Maps, Topology, Trace
-from mover.geometry.warp_start import (
-    filled,
-    kernels,
-    launch,
-    mapped,
-    name_of,
-    share,
-    started,
-    threads,
-)
+from mover.geometry.warp_start import filled, kernels, launch, mapped, share, started, threads
 
 BORDER = 1  # [px], so that an outline just outside the window still moves the window's pixels
-NOWHERE, FRONT, BEHIND = 0, 1, 2  # where backs are drawn, as in `kernels.grid`
-GROUPS = 3  # of items for each thread of a CPU, so that none waits long for the last
-KEPT = 1 << 22  # pixels up to which a thread of a CPU keeps its working memory (72 bytes each)
+NOWHERE, FRONT, BEHIND = 0, 1, 2  # where backs are drawn, as in `kernels.items`
+GROUPS = 3  # of items for each thread, so that none waits long for the last
+KEPT = 1 << 22  # pixels up to which a thread keeps its working memory (72 bytes each)
+CPU = torch.device("cpu")
 _own = local()
 
 
@@ -44,7 +35,7 @@ def look(
     maps = Maps(image, nearest, farthest, torch.zeros_like(nearest, dtype=torch.bool))
     near, far = (torch.empty_like(nearest, dtype=torch.int32) for _ in range(2))
     scene = _scene(verts, shape, views, BORDER)
-    cuts = _draw(scene, _maps(maps, near, far), BEHIND if depth else NOWHERE, verts.device)
+    cuts = _draw(scene, _maps(maps, near, far), BEHIND if depth else NOWHERE)
     return maps, Trace(scene, near, far, cuts)
 
 
@@ -52,122 +43,75 @@ def first_hit(verts: Tensor, shape: Topology, views: Crops, depth: Tensor, face:
     """Write the nearest surface and its face where there is one."""
     none = verts.new_zeros(0)
     packed = _maps(Maps(none, depth, none, none.bool()), face, face)
-    _draw(_scene(verts, shape, views, 0), packed, FRONT, verts.device)
+    _draw(_scene(verts, shape, views, 0), packed, FRONT)
 
 
 def pull(maps: Maps, trace: Trace, grads: dict[str, Tensor | None], verts: Tensor) -> None:
     """Add the gradients of `image`, `nearest` and `farthest` to those of the vertices."""
-    where, packed = verts.device, _maps(maps, trace.near_face, trace.far_face)
+    packed = _maps(maps, trace.near_face, trace.far_face)
     known = {name: g.contiguous().view(-1) for name, g in grads.items() if g is not None}
     known |= {f"has_{name}": name in known for name in grads}
 
     def pull_group(k: int) -> None:
         cuts, flat = trace.cuts[k], verts.view(-1, 3)
         given = _packed("Pull", cuts=cuts.table, targets=cuts.targets, verts=flat, **known)
-        if _in_loops(where):
-            ends = cuts.group.start, cuts.group.stop
-            _launch(where, "items.pull_items", 1, trace.scene, packed, given, *ends)
-            return
-        if given.has_image:
-            _launch(where, "grid.pull_cuts", len(cuts.targets), trace.scene, given)
-        if given.has_nearest or given.has_farthest:
-            _launch(where, "grid.pull_pixels", maps.nearest.numel(), trace.scene, packed, given)
+        inputs = [trace.scene, packed, given, cuts.group.start, cuts.group.stop]
+        launch(kernels("items", "cpu").pull_items, 1, inputs, CPU)
 
     share(pull_group, len(trace.cuts))
 
 
-def _draw(scene: Any, maps: Any, backs: int, where: torch.device) -> tuple[Cuts, ...]:  # noqa: ANN401
+def _draw(scene: Any, maps: Any, backs: int) -> tuple[Cuts, ...]:  # noqa: ANN401
     """Fill the maps; the cuts of the outlines, by groups of items."""
     count = len(scene.verts) // scene.n_verts
-    if not _in_loops(where):
-        return (_draw_at_once(scene, maps, backs, where),)
     size = max(4, count // (GROUPS * threads()))
     groups = [range(k, min(k + size, count)) for k in range(0, count, size)]
 
     def draw_group(group: range) -> Cuts:
         scratch = _own_scratch(scene, len(group) if maps.silhouette else 0)
-        ends = group.start, group.stop
-        _launch(where, "items.look_items", 1, scene, scratch, maps, backs, *ends)
+        inputs = [scene, scratch, maps, backs, group.start, group.stop]
+        launch(kernels("items", "cpu").look_items, 1, inputs, CPU)
         number = int(started().to_torch(scratch.count)[1])
-        table, targets = (x[:number].clone() for x in _listed(scratch))
-        return Cuts(group, table, targets)
+        listed = (started().to_torch(x)[:number].clone() for x in (scratch.cuts, scratch.targets))
+        return Cuts(group, *listed)
 
     return tuple(mapped(draw_group, groups))
 
 
-def _draw_at_once(scene: Any, maps: Any, backs: int, where: torch.device) -> Cuts:  # noqa: ANN401
-    """The same with a thread for each vertex, triangle, edge and pixel."""
-    from mover.geometry.kernels.grid import LANES
-
-    n = len(scene.verts) // scene.n_verts
-    scratch = scratch_of(_room(scene, n, n if maps.silhouette else 0), where)
-    table, targets = _listed(scratch)
-    edges = (n, scene.n_edges)
-    _launch(where, "grid.place_verts", (n, scene.n_verts), scene, scratch)
-    _launch(where, "grid.draw_faces", (n, scene.n_faces), scene, scratch, backs)
-    _launch(where, "grid.draw_rows", LANES, scene, scratch, backs)
-    if maps.silhouette:
-        _launch(where, "grid.enter_edges", edges, scene, scratch)
-    _launch(where, "grid.show_pixels", (n, scene.height, scene.width), scene, scratch, maps)
-    if maps.silhouette:
-        _launch(where, "grid.keep_edges", edges, scene, scratch, maps)
-        _launch(where, "grid.mark_cuts", len(targets), scratch, maps)
-        _launch(where, "grid.bound_cuts", len(targets), scratch, maps)
-    return Cuts(range(n), table, targets)
-
-
-def _in_loops(where: torch.device) -> bool:
-    """Whether a thread draws whole items."""
-    return where.type == "cpu"
-
-
 def _own_scratch(scene: Any, listed: int) -> Any:  # noqa: ANN401
-    """The working memory of this thread of a CPU, which kernels leave clean, for one item."""
-    room = _room(scene, 1, listed)
+    """The working memory of this thread, which kernels leave clean, for the cuts of some items."""
+    grid = scene.height * scene.width
+    room = [scene.n_verts, scene.n_faces, scene.n_edges, grid, 2 * listed * grid]
     if any(have < need for have, need in zip(getattr(_own, "room", [0]), room, strict=False)):
-        _own.room, _own.scratch = room, scratch_of(room, torch.device("cpu"))
+        _own.room, _own.scratch = room, scratch_of(room)
     scratch = _own.scratch
-    if scene.height * scene.width > KEPT:
+    if grid > KEPT:
         vars(_own).clear()
     started().to_torch(scratch.count).zero_()
     return scratch
 
 
-def _room(scene: Any, count: int, listed: int) -> list[int]:  # noqa: ANN401
-    """What `scratch_of` asks for some items at a time, and the cuts of some one after the other."""
-    grid = scene.height * scene.width
-    one = scene.n_verts, scene.n_faces, scene.n_edges, grid
-    return [*(count * n for n in one), 2 * listed * grid]
-
-
-def _listed(scratch: Any) -> tuple[Tensor, Tensor]:  # noqa: ANN401
-    """The memory of the cuts, and of the pixels that they move."""
-    return started().to_torch(scratch.cuts), started().to_torch(scratch.targets)
-
-
-def scratch_of(room: Sequence[int], device: torch.device) -> Any:  # noqa: ANN401
+def scratch_of(room: Sequence[int]) -> Any:  # noqa: ANN401
     """Working memory for so many vertices, faces, edges, pixels and cuts, zero where need be."""
     verts, faces, edges, pixels, cuts = room
-    count = torch.zeros(2, dtype=torch.int32, device=device)
+    count = torch.zeros(2, dtype=torch.int32)
+
+    def zeros(size: int) -> Tensor:
+        """Zeros that take memory only where they are written."""
+        return torch.from_numpy(np.zeros(size, dtype=np.int64))
+
     return _packed(
         "Scratch",
-        screen=torch.empty(verts, 3, device=device),
-        front=torch.empty(faces, dtype=torch.int8, device=device),
-        near=_zeros(pixels, device),
-        far=_zeros(pixels, device),
-        pairs=_zeros(2 * pixels, device),
+        screen=torch.empty(verts, 3),
+        front=torch.empty(faces, dtype=torch.int8),
+        near=zeros(pixels),
+        far=zeros(pixels),
+        pairs=zeros(2 * pixels),
         queue=count.new_empty(max(edges, faces)),
         cuts=count.new_empty(cuts, 4),
         targets=count.new_full((cuts,), -1),
         count=count,
     )
-
-
-def _zeros(size: int, device: torch.device) -> Tensor:
-    """Zeros that on a CPU take memory only where they are written."""
-    if device.type == "cpu":
-        return torch.from_numpy(np.zeros(size, dtype=np.int64))
-    return torch.zeros(size, dtype=torch.int64, device=device)
 
 
 def _scene(verts: Tensor, shape: Topology, views: Crops, border: int) -> Any:  # noqa: ANN401
@@ -210,9 +154,3 @@ def _packed(name: str, **fields: Any) -> Any:  # noqa: ANN401
     from mover.geometry.kernels import scene
 
     return filled(getattr(scene, name), **fields)
-
-
-def _launch(where: torch.device, name: str, dim: int | tuple[int, ...], *inputs: Any) -> None:  # noqa: ANN401
-    """Launch a kernel, by its module and name."""
-    module, kernel = name.split(".")
-    launch(getattr(kernels(module, name_of(where)), kernel), dim, list(inputs), where)

@@ -116,18 +116,6 @@ def _farthest(graph: Any, source: int) -> int:  # noqa: ANN401
 # The limbs of a body as frames: where each starts and how it is turned against the T-pose.
 
 
-LANDMARKS = (
-    "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle", "neck",
-    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
-)  # fmt: skip
-"""Joints that are found on any body."""
-
-ABOVE = {
-    "hip": ("pelvis",), "knee": ("hip",), "ankle": ("knee",), "neck": ("spine3",),
-    "shoulder": ("collar",), "elbow": ("shoulder",), "wrist": ("elbow",),
-}  # fmt: skip
-"""The joint whose skin blends with that of each landmark."""
-
 LIMBS = (
     "trunk", "head",
     *(f"{s}_{n}" for s in SIDES
@@ -168,34 +156,6 @@ def limb_of(model: SkinnedBody) -> Int[Array, " verts"]:
             high = name in ("neck", "head", "jaw") or "eye" in name
             table.append(LIMBS.index("head" if high else "trunk"))
     return np.array(table)[model.weights.argmax(1).numpy()]
-
-
-def landmark_rings(model: SkinnedBody) -> Float[Array, "verts landmarks"]:
-    """1 where the skin of a landmark blends with the skin above it."""
-    weight = dict(zip(model.joint_names, model.weights.T.numpy(), strict=True))
-    rings: list[Array] = []
-    for name in LANDMARKS:
-        side, _, joint = name.rpartition("_")
-        above = [f"{side}_{n}" if f"{side}_{n}" in weight else n for n in ABOVE[joint]]
-        rings.append(sum(weight[n] for n in above) * weight[name] > 0.12)
-    return np.stack(rings, axis=1).astype(float)
-
-
-def thin(
-    mesh: Float[Array, "verts 3"], rings: Float[Array, "verts landmarks"], members: int = 24
-) -> Int[Array, "landmarks members"]:
-    """So many vertices of each ring, far from each other, so that their mean is its middle."""
-    rows: list[Array] = []
-    for ring in (rings > 0).T:
-        index = np.nonzero(ring)[0] if ring.any() else np.arange(len(mesh))
-        points = mesh[index]
-        far = np.linalg.norm(points - points.mean(0), axis=1)
-        chosen: list[int] = []
-        for _ in range(members):
-            chosen.append(int(far.argmax()))
-            far = np.minimum(far, np.linalg.norm(points - points[chosen[-1]], axis=1))
-        rows.append(index[chosen])
-    return np.stack(rows)
 
 
 def limb_frames(
