@@ -33,7 +33,7 @@ from mover.perceive.track import (
     joints_in,
     link_people,
     matched,
-    nobody,
+    no_people,
     stack_of,
     track_people,
 )
@@ -189,7 +189,7 @@ def test_sam2_follows_everybody_through_a_segment(folders: ModelsConfig, tmp_pat
         Masks(H, W, codes), torch.zeros(2, dtype=torch.long), ("person",) * 2, torch.ones(2)
     )
     config = TrackConfig(folders, present=-1e9, least=0.0)
-    tracks = track_people(SegmentInputs(clip, 0, 3, found, nobody(clip)), config)
+    tracks = track_people(SegmentInputs(clip, 0, 3, found, no_people(clip)), config)
     assert tracks.frame.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
     assert tracks.person.tolist() == [0, 1] * 4
     first = stack_of(tracks.masks)[:2]
@@ -243,7 +243,7 @@ def test_joints_of_everybody_are_found_row_by_row(folders: ModelsConfig, tmp_pat
     assert found.points.shape == (3, 17, 2)
     assert found.layout == "coco17"
     assert found.points.isfinite().all()
-    empty = find_joints(JointsInputs(clip, nobody(clip)), JointsConfig(folders))
+    empty = find_joints(JointsInputs(clip, no_people(clip)), JointsConfig(folders))
     assert empty.points.shape == (0, 17, 2)
 
 

@@ -92,7 +92,7 @@ def _loose_points(bodies: Bodies) -> Float[Tensor, "bodies points 3"]:
 
 
 def no_correction(puppet: Puppet) -> Correction:
-    """Leave everybody where they are."""
+    """Leave all bodies where they are."""
     zero = torch.zeros_like(puppet.points[:, 0])
     width = 0 if puppet.pose is None else puppet.pose.body_pose.shape[-1]
     return Correction(zero, zero, zero.new_zeros(len(zero), width))
@@ -117,7 +117,7 @@ def normals_after(puppet: Puppet, by: Correction) -> Float[Tensor, "bodies picke
 
 
 def corrected(bodies: Bodies, by: Correction) -> Bodies:
-    """Bodies of the world after a correction (a row for each); those with parameters posed anew."""
+    """Bodies of the world after a correction (a row for each); those with parameters posed again."""
     if bodies.pose is None:
         return _moved_rigidly(bodies, by)
     pose = _new_pose(bodies.pose, by)

@@ -126,7 +126,7 @@ def _users_model(bodies: Bodies) -> SkinnedBody | None:
 
 
 def digest_of(faces: Int[Array, "faces 3"]) -> str:
-    """What tells one topology from others."""
+    """What distinguishes one topology from others."""
     return hashlib.sha256(np.ascontiguousarray(faces, dtype="<i8").tobytes()).hexdigest()
 
 

@@ -1,7 +1,7 @@
 """How people hold themselves (standing, sitting, lying, leaning back) and what of them touches.
 
-World frame, +y up. People are told apart by track; speeds are taken within a track over real time.
-What touches is told from posture, motion and normals alone: sitting, lying, leaning back, hands at
+World frame, +y up. People are distinguished by track; speeds are taken within a track over real time.
+What touches is estimated from posture, motion and normals alone: sitting, lying, leaning back, hands at
 rest and still soles. It stands in for POSA, whose weights cannot be shipped, and says nothing about
 what is touched.
 """
@@ -20,7 +20,7 @@ LEVEL_THIGH = 37.0  # [degrees] from level, at most, of a sitter's thighs
 UPRIGHT = 35.0  # [degrees] above level, at least, of an upright trunk
 LYING = 24.0  # [degrees] from level, at most, of a trunk that lies
 LOW_PELVIS = 0.78  # of its height when standing, at most, of a sitter's pelvis
-HIGH_PELVIS = 1.15  # ... at least, of who sits on something high: there nobody stands on the floor
+HIGH_PELVIS = 1.15  # ... at least, of a person seated on something high, not standing on the floor
 STILL_PELVIS = 0.3  # [m/s] at most, of a sitter's pelvis
 ANKLE = 0.085  # height of the ankle joints over the floor when standing [legs, hip to ankle]
 WINDOW = 0.1  # [s] before and after: long enough that trembling meshes are still
@@ -312,7 +312,7 @@ def from_lap(
 def _stand(bodies: Bodies, parts: Parts, ground: Height) -> Float[Tensor, "bodies verts"]:
     """Soles: hardly moving, and as low as the body reaches, which is about the ground.
 
-    A body whose depth is wrong floats or sinks by some centimetres: its own lowest point tells
+    A body whose depth is wrong floats or sinks by some centimetres: its own lowest point shows
     which foot carries it, the ground only whether it stands on the floor at all.
     """
     height = bodies.verts[..., 1]

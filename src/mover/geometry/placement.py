@@ -160,14 +160,14 @@ def changes(piece: SceneObject) -> list[int]:
 
 def mover_at(piece: SceneObject, frame: int) -> int | None:
     """Who moves an object in a frame; None: it stands."""
-    begun = [segment for segment in piece.segments if segment.frame <= frame]
-    return begun[-1].mover if begun else None
+    started = [segment for segment in piece.segments if segment.frame <= frame]
+    return started[-1].mover if started else None
 
 
 def placed_at(piece: SceneObject, frame: int) -> SceneObject:
-    """An object where it stands in a frame: in its last segment that has begun."""
-    begun = [segment for segment in piece.segments if segment.frame <= frame]
-    if not begun:
+    """An object where it stands in a frame: in its last segment that has started."""
+    started = [segment for segment in piece.segments if segment.frame <= frame]
+    if not started:
         return piece
-    now = max(begun, key=lambda segment: segment.frame)
+    now = max(started, key=lambda segment: segment.frame)
     return dataclasses.replace(piece, t_world_object=now.t_world_object, yaw=now.yaw)

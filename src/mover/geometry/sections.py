@@ -56,7 +56,7 @@ def sections_of(verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]) 
 def outline(sections: Sections, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """Signed distance to the outline of the section nearest in height to each point [m].
 
-    The gradient is horizontal: nothing is told to grow or to shrink out of a place.
+    The gradient is horizontal: nothing grows or shrinks out of a position.
     """
     volume = sections.outline
     x, y, z = points.unbind(-1)

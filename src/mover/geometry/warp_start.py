@@ -42,7 +42,7 @@ def _started() -> ModuleType:
 def kernels(name: str, device: str, package: str = KERNELS) -> ModuleType:
     """The module of that name in a package of kernels, compiled for the device.
 
-    The first call on a machine compiles (seconds, told before by a line of the log, which the
+    The first call on a machine compiles (seconds, announced by a line of the log, which the
     commands show); the result stays in Warp's cache, and later runs load it.
     """
     with _lock:

@@ -2,7 +2,7 @@
 
 The distance to the triangles on a grid has no inside and needs none: what cannot be reached from
 outside through cells that are far from every triangle is matter. Where holes are small, the winding
-number (of either sign) tells the inside as well. The level of that field, a wall of constant
+number (of either sign) marks the inside as well. The level of that field, a wall of constant
 thickness around the triangles, is a closed surface; its vertices then fall back onto the triangles
 up to a small rest, so that neither thickness nor box change and sheets keep two sides.
 """

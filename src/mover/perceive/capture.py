@@ -70,15 +70,15 @@ from mover.perceive.track import (
     Tracks,
     find_joints,
     link_people,
-    nobody,
+    no_people,
     track_people,
 )
 from mover.perceive.video import Clip, TakeInputs, opened_picture, stamp_of, take_frames
 
 log = logging.getLogger(__name__)
-MOST_SHOTS = 20  # that are told apart: what comes after them counts as one
+MOST_SHOTS = 20  # that are distinguished: what comes after them counts as one
 CHUNK = 50  # frames whose detections are kept together
-# How far off a focal length may be, of its logarithm; what a file tells stays as it says.
+# How far off a focal length may be, of its logarithm; what a file gives stays as it is.
 BY_EXIF = 0.05  # of a photo, while a video is cut by what steadies it
 ASSUMED = 0.15  # cameras of phones and rooms are 50 to 75 degrees wide
 FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal lengths refer
@@ -119,7 +119,7 @@ def perceive(
     say: Say,
     finders: Finders = NETWORKS,
 ) -> Camera:
-    """Fill a capture folder with all that a video tells of its pictures; gives the camera.
+    """Fill a capture folder with all that the pictures of a video give; gives the camera.
 
     Raises:
         InputError: If the source, OpenCV or a network is missing.
@@ -134,7 +134,7 @@ def perceive(
     detect = replace(config.detect, models=config.models)
     tracks = people_of_clip(clip, (detect, config), run, finders)
     clean = reference_of(clip, drift, tracks, config.clean)
-    say(_told(clean, tracks))
+    say(_summary(clean, tracks))
     clean_clip = clip_of_clean(clean, out / "perceived" / "reference")
     found = run.stage(finders.instances, DetectInputs(clean_clip, (0,)), detect)
     write_image(clean.picture, out / "reference.png")
@@ -153,9 +153,9 @@ def perceive(
     return camera
 
 
-def _told(clean: Clean, tracks: Tracks) -> str:
+def _summary(clean: Clean, tracks: Tracks) -> str:
     """What a user should know about people and picture."""
-    whole = "nobody hides furniture in it"
+    whole = "no person hides furniture in it"
     if bool(clean.hidden.any()):
         whole = f"{100 * float(clean.hidden.float().mean()):.1f} % of it are never seen empty"
     made = f"frame {clean.frame}" if clean.frame >= 0 else "put together from many frames"
@@ -218,7 +218,7 @@ def people_of_clip(
         found = [run.stage(finders.instances, DetectInputs(clip, c), detect) for c in chunks]
         return link_people(people_in(joined_finds(found)), config.track)
     track = replace(config.track, models=config.models)
-    parts, carried = list[Tracks](), nobody(clip)
+    parts, carried = list[Tracks](), no_people(clip)
     for first in range(0, count, track.segment):
         found = people_in(run.stage(finders.instances, DetectInputs(clip, (first,)), detect))
         last = min(first + track.segment, count - 1)  # it is also the next one's first
@@ -253,9 +253,9 @@ def lens_of(
 
     Args:
         size: Width and height of the frames [px].
-        file: A calibration of any known kind; GeoCalib's also tells pitch and roll.
+        file: A calibration of any known kind; GeoCalib's also gives pitch and roll.
         fov: Horizontal field of view [degrees].
-        photo: A picture whose EXIF tells the focal length.
+        photo: A picture whose EXIF gives the focal length.
 
     Raises:
         InputError: If what is given cannot be used.
@@ -295,7 +295,7 @@ def _in_pixels_of(size: tuple[int, int], at: At) -> At:
 
 
 def exif_focal(photo: Path, size: tuple[int, int]) -> float | None:
-    """Focal length of a picture's EXIF [px]; None: it tells none.
+    """Focal length of a picture's EXIF [px]; None: it gives none.
 
     The 35 mm equivalent refers to the diagonal, so it holds for any format and either way up.
 
@@ -321,8 +321,8 @@ def read_picture_of(folder: Path) -> Picture:
     file = folder / "camera.json"
     if not file.exists() or parts.objects is None:
         raise InputError(f"{folder}: a first scene needs camera.json and objects.json in it")
-    told = read_json(file)  # not the camera of a scene that is made anew
-    camera = _guessed(folder, camera_of(told))
+    given = read_json(file)  # not the camera of a scene that is made again
+    camera = _guessed(folder, camera_of(given))
     detections = detections_of(parts.objects, camera, log.warning)
     blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     masks = [blank if d.mask is None else decode(d.mask, 0) for d in detections]
@@ -332,7 +332,7 @@ def read_picture_of(folder: Path) -> Picture:
         for row in range(0 if reference is None else len(reference.counts)):
             assert reference is not None
             hidden = hidden | decode(reference, row)
-    known = maybe(told, "height")
+    known = maybe(given, "height")
     return Picture(
         camera=camera,
         detections=detections,

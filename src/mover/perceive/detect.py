@@ -32,7 +32,7 @@ KINDS = {
 }
 """Classes of transformers for each task: of the network, and of what prepares its input."""
 OWN_PROCESSOR = {"oneformer": "OneFormerProcessor"}
-"""Networks that are told their task in words, too."""
+"""Networks that are given their task in words, too."""
 PERSON = "person"
 TASK = "instance"  # what OneFormer is asked for
 
@@ -153,8 +153,8 @@ def instances(
 ) -> Finds:
     """What the network sees in a batch of pictures."""
     words = net.model.config.model_type == "oneformer"
-    told: dict[str, Any] = {"task_inputs": [TASK] * len(pictures)} if words else {}
-    inputs = net.processor(images=list(pictures), return_tensors="pt", **told).to(net.device)
+    task: dict[str, Any] = {"task_inputs": [TASK] * len(pictures)} if words else {}
+    inputs = net.processor(images=list(pictures), return_tensors="pt", **task).to(net.device)
     with torch.inference_mode():
         outputs = net.model(**inputs)
     sizes = [picture.shape[:2] for picture in pictures]

@@ -113,10 +113,10 @@ def absent(kind: str, models: ModelsConfig) -> str:
             "config.json and model.safetensors as transformers save them"
         )
     facts = FACTS.get(name)
-    told = "" if facts is None else f" ({facts.task}; {facts.licence}; {facts.size})"
+    known = "" if facts is None else f" ({facts.task}; {facts.licence}; {facts.size})"
     more = f" and `hf download {CLASSES}`" if "oneformer" in name.lower() else ""
     return (
-        f"--models.{kind}: {name}{told}: run `hf download {name}`{more} once where there is a "
+        f"--models.{kind}: {name}{known}: run `hf download {name}`{more} once where there is a "
         f"network, or --models.download, or --weights DIR with the folder "
         f"{name.rsplit('/', 1)[-1]}/ in it"
     )

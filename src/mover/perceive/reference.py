@@ -1,4 +1,4 @@
-"""One picture of the room in which nobody hides furniture: found, or put together from many."""
+"""One picture of the room in which no person hides furniture: found, or put together from many."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -45,12 +45,12 @@ def spread_frames(count: int, most: int) -> list[int]:
 def clean_picture(frames: Sequence[int], load: Load, config: CleanConfig) -> Clean:
     """A frame that shows the room alone, or the median of what all frames show.
 
-    Who stands in a frame without a mask is seen in no median: a frame is taken only if it agrees
+    A person standing in a frame without a mask is seen in no median: a frame is taken only if it agrees
     with that.
 
     Args:
         frames: Which may be used.
-        load: Gives a frame and where nobody is in it.
+        load: Gives a frame and where no person is in it.
         config: How.
     """
     empty, strips = _seen(frames, load, config.strips)

@@ -150,15 +150,15 @@ def _share(
 ) -> Float[Tensor, "heights yaws items"]:
     """How much an item in a turn moves camera and floor.
 
-    All of a thing have one voice together, and less where none fits; the best of them has most of
+    All of a thing have one vote together, and less where none fits; the best of them has most of
     it. The others keep a little, so that they go on (Adam's steps do not shrink with it).
     """
     with torch.no_grad():
         best = _best_of_things(inputs, each.amin(1))
         share = ((best[:, None, inputs.thing] - each) / config.soft).exp().clamp_min(LITTLE)
-        voices = torch.zeros_like(best).index_add(1, inputs.thing, share.sum(1))
-        voice = (1 + best / config.cap) ** -2 / voices
-        return share * voice[:, None, inputs.thing]
+        votes = torch.zeros_like(best).index_add(1, inputs.thing, share.sum(1))
+        vote = (1 + best / config.cap) ** -2 / votes
+        return share * vote[:, None, inputs.thing]
 
 
 def _heights(inputs: ScreenInputs, config: ScreenConfig) -> Float[Tensor, " heights"]:
@@ -193,7 +193,7 @@ def _standing(guess: Guess) -> Layout:
 def _each(
     guess: Guess, inputs: ScreenInputs, config: ScreenConfig
 ) -> Float[Tensor, "heights yaws items"]:
-    """Price of each item in each turn on the floor of each height."""
+    """Cost of each item in each turn on the floor of each height."""
     camera, thing = inputs.camera, inputs.thing
     pitch, roll = pitch_roll(camera.R_cam_world)
     turn = guess.tilt if config.tilt else torch.zeros_like(guess.tilt)

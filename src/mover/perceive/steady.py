@@ -1,7 +1,7 @@
 """Does the camera stand still? Where it only sways, the frames are turned back onto one of them.
 
 The method assumes one camera for all frames. A camera that turns a little about its centre (a hand,
-a loose tripod) is undone exactly by a homography; one that walks is not, and is told.
+a loose tripod) is undone exactly by a homography; one that walks is not, and gives a warning.
 """
 
 from collections.abc import Sequence
@@ -238,8 +238,8 @@ def find_drift(inputs: SteadyInputs, config: SteadyConfig, observe: Observer = s
 def _followed(first: Grey, picture: Grey, before: Fit) -> Fit:
     """A frame on the first one: from where the frame before it lay, or from scratch.
 
-    Stripes and tiles look alike when shifted, so that the nearest start counts unless a farther one
-    is clearly better.
+    Stripes and tiles look similar when shifted, so that the nearest start counts unless a farther
+    one is clearly better.
     """
     near = align(first, picture, before.H)
     if near.agree >= before.agree - CLEARLY:

@@ -54,8 +54,8 @@ class SegmentInputs:
     """People who were followed into the first frame."""
 
 
-def nobody(clip: Clip, used: int = 0) -> Tracks:
-    """Nobody is followed; so many numbers are used up."""
+def no_people(clip: Clip, used: int = 0) -> Tracks:
+    """No person is followed; so many numbers are used up."""
     none = torch.zeros(0, dtype=torch.long)
     return Tracks(Masks(clip.height, clip.width, ()), none, none, used)
 
@@ -75,7 +75,7 @@ def track_people(inputs: SegmentInputs, config: TrackConfig, observe: Observer =
     """
     seeds, names, used = seeded(inputs, config.same)
     if not names:
-        return nobody(inputs.clip, used)
+        return no_people(inputs.clip, used)
     net = network("tracker", config.models.tracker, config.models)
     codes: list[bytes] = []
     rows: list[tuple[int, int]] = []

@@ -198,7 +198,7 @@ def read_picture(path: Path) -> Picture:
 def opened_picture(
     path: Path, expected: str = "a picture", large: Literal["error", "ignore"] = "error"
 ) -> Generator[Any]:
-    """An open picture of PIL; what goes wrong while it is used is told in one sentence.
+    """An open picture of PIL; an error while it is used becomes one sentence.
 
     Args:
         path: The file.
@@ -246,7 +246,7 @@ def _rate(source: Path, config: FramesConfig) -> float | None:
 
 
 def _usual_rate(container: Any) -> float | None:  # noqa: ANN401
-    """Frames a second where a video is even; None: nothing tells."""
+    """Frames a second where a video is even; None: unknown."""
     try:
         packets = container.demux(container.streams.video[0])
         times = sorted(float(p.pts * p.time_base) for p in packets if p.pts is not None)

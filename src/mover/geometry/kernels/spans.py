@@ -1,7 +1,7 @@
 """A triangle's runs of pixel centres, row by row.
 
 The order of the operations is that of the reference in torch, and products are not fused with sums,
-so that both decide alike for centres on an edge.
+so that both decide the same for centres on an edge.
 """
 
 import warp as wp
