@@ -1,9 +1,16 @@
-"""A closed mesh from an Occupancy Network: multiresolution extraction and marching cubes."""
+"""A closed mesh from an Occupancy Network for point clouds (Mescheder et al., CVPR 2019).
+
+The paper closes the meshes of its detector with it. The parameters have the names and shapes of
+the authors' checkpoints (`onet_pcl2mesh`), so that a published file loads by its keys; widths are
+read off the file. Encoder: a ResNet-PointNet. Decoder: five residual blocks whose batch norms take
+scale and shift from the shape's code. The surface is found by multiresolution extraction and
+marching cubes.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,48 +18,40 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from mover.core.errors import InputError
-from mover.core.settings import float_in, int_in
 from mover.core.types import Mesh
 from mover.geometry.mesh import box, fit_box, sample_surface, used
 
-# The Occupancy Network for point clouds (Mescheder et al., CVPR 2019): shapes as a classifier.
-#
-# The paper closes the meshes of its detector with it. The parameters have the names and shapes of
-# the authors' checkpoints (`onet_pcl2mesh`), so that a published file loads by its keys; widths are
-# read off the file. Encoder: a ResNet-PointNet. Decoder: five residual blocks whose batch norms
-# take scale and shift from the shape's code (conditional batch normalisation).
-
-
 BLOCKS = 5
+PADDING = 1.1  # side of the box around the unit cube, as MOVER runs it; so is the next
+POINTS = 2048  # of the cloud that is encoded
+OUTSIDE = -1e6  # logit beyond the box, so that every surface closes
+AT_ONCE = 100_000  # points that the network sees
+Inside = Callable[[Float[Tensor, "points 3"]], Float[Tensor, " points"]]
 
 
-class ResidualLayer(nn.Module):
+class _Residual(nn.Module):
     """Two linear layers beside a shortcut."""
 
     def __init__(self, size_in: int, size_out: int) -> None:
         super().__init__()
         inner = min(size_in, size_out)
-        self.fc_0 = nn.Linear(size_in, inner)
-        self.fc_1 = nn.Linear(inner, size_out)
+        self.fc_0, self.fc_1 = nn.Linear(size_in, inner), nn.Linear(inner, size_out)
         self.shortcut = nn.Linear(size_in, size_out, bias=False)
 
-    def forward(self, x: Float[Tensor, "*b n"]) -> Float[Tensor, "*b m"]:
-        """The sum of both ways."""
+    def forward(self, x: Tensor) -> Tensor:
         return self.shortcut(x) + self.fc_1(self.fc_0(x.relu()).relu())
 
 
-class PointEncoder(nn.Module):
+class _Encoder(nn.Module):
     """Code of a point cloud; each block sees its own point and the largest value of all."""
 
     def __init__(self, hidden: int, code: int) -> None:
         super().__init__()
-        self.fc_pos = nn.Linear(3, 2 * hidden)
+        self.fc_pos, self.fc_c = nn.Linear(3, 2 * hidden), nn.Linear(hidden, code)
         for k in range(BLOCKS):
-            self.add_module(f"block_{k}", ResidualLayer(2 * hidden, hidden))
-        self.fc_c = nn.Linear(hidden, code)
+            self.add_module(f"block_{k}", _Residual(2 * hidden, hidden))
 
     def forward(self, points: Float[Tensor, "shapes points 3"]) -> Float[Tensor, "shapes code"]:
-        """The code of each shape."""
         x = self.get_submodule("block_0")(self.fc_pos(points))
         for k in range(1, BLOCKS):
             pooled = x.amax(1, keepdim=True).expand_as(x)
@@ -60,56 +59,47 @@ class PointEncoder(nn.Module):
         return self.fc_c(x.amax(1).relu())
 
 
-class ConditionalNorm(nn.Module):
+class _Norm(nn.Module):
     """Batch norm whose scale and shift are linear in the code."""
 
     def __init__(self, code: int, size: int) -> None:
         super().__init__()
-        self.conv_gamma = nn.Conv1d(code, size, 1)
-        self.conv_beta = nn.Conv1d(code, size, 1)
+        self.conv_gamma, self.conv_beta = nn.Conv1d(code, size, 1), nn.Conv1d(code, size, 1)
         self.bn = nn.BatchNorm1d(size, affine=False)
 
-    def forward(
-        self, x: Float[Tensor, "shapes size points"], code: Float[Tensor, "shapes code 1"]
-    ) -> Float[Tensor, "shapes size points"]:
-        """Normalised features."""
+    def forward(self, x: Tensor, code: Tensor) -> Tensor:
         return self.conv_gamma(code) * self.bn(x) + self.conv_beta(code)
 
 
-class ConditionalBlock(nn.Module):
+class _Block(nn.Module):
     """Two layers, each after a conditional norm, added to what came in."""
 
     def __init__(self, code: int, size: int) -> None:
         super().__init__()
-        self.bn_0, self.bn_1 = ConditionalNorm(code, size), ConditionalNorm(code, size)
+        self.bn_0, self.bn_1 = _Norm(code, size), _Norm(code, size)
         self.fc_0, self.fc_1 = nn.Conv1d(size, size, 1), nn.Conv1d(size, size, 1)
 
-    def forward(
-        self, x: Float[Tensor, "shapes size points"], code: Float[Tensor, "shapes code 1"]
-    ) -> Float[Tensor, "shapes size points"]:
-        """The sum of both ways."""
+    def forward(self, x: Tensor, code: Tensor) -> Tensor:
         inner = self.fc_0(self.bn_0(x, code).relu())
         return x + self.fc_1(self.bn_1(inner, code).relu())
 
 
-class OccupancyDecoder(nn.Module):
-    """Is a point inside the shape of a code?"""
+class _Decoder(nn.Module):
+    """Is a point inside the shape of a code? A latent code, where there is one, is at its mean."""
 
     def __init__(self, code: int, hidden: int, latent: int) -> None:
         super().__init__()
         if latent:
             self.fc_z = nn.Linear(latent, hidden)
         self.latent = latent
-        self.fc_p = nn.Conv1d(3, hidden, 1)
+        self.fc_p, self.fc_out = nn.Conv1d(3, hidden, 1), nn.Conv1d(hidden, 1, 1)
         for k in range(BLOCKS):
-            self.add_module(f"block{k}", ConditionalBlock(code, hidden))
-        self.bn = ConditionalNorm(code, hidden)
-        self.fc_out = nn.Conv1d(hidden, 1, 1)
+            self.add_module(f"block{k}", _Block(code, hidden))
+        self.bn = _Norm(code, hidden)
 
     def forward(
         self, points: Float[Tensor, "shapes points 3"], code: Float[Tensor, "shapes code"]
     ) -> Float[Tensor, "shapes points"]:
-        """Logits; a latent code, where the network has one, is at its mean (zero)."""
         x, column = self.fc_p(points.mT), code[..., None]
         if self.latent:
             x = x + self.fc_z(x.new_zeros(len(x), self.latent))[..., None]
@@ -123,8 +113,7 @@ class OccupancyNetwork(nn.Module):
 
     def __init__(self, code: int, encoder: int, decoder: int, latent: int = 0) -> None:
         super().__init__()
-        self.encoder = PointEncoder(encoder, code)
-        self.decoder = OccupancyDecoder(code, decoder, latent)
+        self.encoder, self.decoder = _Encoder(encoder, code), _Decoder(code, decoder, latent)
 
     def forward(
         self, cloud: Float[Tensor, "shapes cloud 3"], points: Float[Tensor, "shapes points 3"]
@@ -181,26 +170,16 @@ def network_of(tree: Any, name: str) -> OccupancyNetwork:  # noqa: ANN401
     return network.eval()
 
 
-OUTSIDE = -1e6  # logit beyond the box, so that every surface closes
-AT_ONCE = 100_000  # points that the network sees
-
-Inside = Callable[[Float[Tensor, "points 3"]], Float[Tensor, " points"]]
-
-
 @dataclass(frozen=True)
 class ExtractConfig:
-    """As MOVER runs it."""
+    """How finely the surface is searched: as MOVER runs it."""
 
-    coarse: Annotated[int, int_in(2, 256)] = 32
+    coarse: int = 32
     """Cells along a side at first."""
-    levels: Annotated[int, int_in(0, 4)] = 2
+    levels: int = 2
     """How often cells are halved near the surface."""
-    padding: Annotated[float, float_in(0, 10)] = 0.1
-    """The box is larger than the unit cube by this."""
-    threshold: Annotated[float, float_in(1e-6, 0.999999)] = 0.2
+    threshold: float = 0.2
     """Probability of the surface."""
-    points: Annotated[int, int_in(1, 1_000_000)] = 2048
-    """Points of the cloud that is encoded."""
 
 
 def extract(inside: Inside, config: ExtractConfig) -> Mesh:
@@ -221,9 +200,8 @@ def extract(inside: Inside, config: ExtractConfig) -> Mesh:
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")  # x runs fastest, as igl has it
     grid = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
     values = np.maximum(padded, -20.0).transpose(2, 1, 0).ravel()
-    places, faces, _ = igl.marching_cubes(-values, grid, n, n, n, isovalue=0.0)
-    size = (1 + config.padding) / (n - 3)
-    verts = (torch.from_numpy(np.asarray(places)) - 1) * size - (1 + config.padding) / 2
+    points, faces, _ = igl.marching_cubes(-values, grid, n, n, n, isovalue=0.0)
+    verts = (torch.from_numpy(np.asarray(points)) - 1) * (PADDING / (n - 3)) - PADDING / 2
     return Mesh(verts.float(), torch.from_numpy(np.asarray(faces, dtype=np.int64)))
 
 
@@ -234,38 +212,32 @@ def refined(field: Inside, config: ExtractConfig) -> Float[Tensor, "n n n"]:
     was taken for uniform, its corners are evaluated, too, until nothing changes: what hangs
     together with anything found is found wholly.
     """
-    cells = config.coarse
-    values = _evaluated(field, _all(cells + 1), cells, config)
+    cells, axis = config.coarse, torch.arange(config.coarse + 1)
+    values = _evaluated(field, torch.cartesian_prod(axis, axis, axis), cells)
     values = values.reshape(cells + 1, cells + 1, cells + 1)
     for _ in range(config.levels):
         split = _mixed(values)
+        for dim in range(3):
+            split = split.repeat_interleave(2, dim)
         cells *= 2
         values = torch.nn.functional.interpolate(
             values[None, None], size=(cells + 1,) * 3, mode="trilinear", align_corners=True
         )[0, 0]
         known = torch.zeros_like(values, dtype=torch.bool)
         known[::2, ::2, ::2] = True
-        wanted = _corners(split.repeat_interleave(2, 0).repeat_interleave(2, 1)
-                          .repeat_interleave(2, 2)) & ~known  # fmt: skip
+        wanted = _corners(split) & ~known
         while bool(wanted.any()):
-            index = wanted.nonzero()
-            values[wanted] = _evaluated(field, index, cells, config)
+            values[wanted] = _evaluated(field, wanted.nonzero(), cells)
             known = known | wanted
             wanted = _corners(_mixed(values)) & ~known
     return values
 
 
-def _all(n: int) -> Int[Tensor, "points 3"]:
-    axis = torch.arange(n)
-    return torch.cartesian_prod(axis, axis, axis)
-
-
 def _evaluated(
-    field: Inside, index: Int[Tensor, "points 3"], cells: int, config: ExtractConfig
+    field: Inside, index: Int[Tensor, "points 3"], cells: int
 ) -> Float[Tensor, " points"]:
     """The field at grid points."""
-    size = 1 + config.padding
-    points = index.float() * (size / cells) - size / 2
+    points = index.float() * (PADDING / cells) - PADDING / 2
     return torch.cat([field(part) for part in points.split(AT_ONCE)])
 
 
@@ -294,19 +266,13 @@ def occupied_mesh(
     Raises:
         ValueError: If the network finds nothing inside.
     """
-    config = config or ExtractConfig()
     source = used(mesh)
     low, high = box(source.verts)
     middle, longest = (low + high) / 2, (high - low).max()
-    points, _ = sample_surface(source, config.points)
-    cloud = _swapped((points - middle) / longest).float()
+    points, _ = sample_surface(source, POINTS)
+    cloud = ((points - middle) / longest).float().flip(-1)
     with torch.no_grad():
         code = network.encoder(cloud[None])
-        found = extract(lambda p: network.decoder(p[None], code)[0], config)
-    verts = _swapped(found.verts).to(mesh.verts)
-    faces = found.faces.flip(-1)  # the change of axes is a mirror
-    return fit_box(Mesh(verts, faces), low, high)
-
-
-def _swapped(points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
-    return points[:, [2, 1, 0]]
+        found = extract(lambda p: network.decoder(p[None], code)[0], config or ExtractConfig())
+    verts, faces = found.verts.flip(-1), found.faces.flip(-1)  # the change of axes is a mirror
+    return fit_box(Mesh(verts.to(mesh.verts), faces), low, high)
