@@ -60,12 +60,6 @@ def _loaded(package: str, name: str, device: str) -> ModuleType:
     return module
 
 
-def is_compiled(name: str, device: str, package: str = KERNELS) -> bool:
-    """Whether Warp's cache holds a module as it is now."""
-    with _lock:
-        return not _fresh(started(), import_module(f"{package}.{name}"), device)
-
-
 def name_of(device: torch.device) -> str:
     """What Warp calls a device of torch."""
     return str(started().device_from_torch(device))
