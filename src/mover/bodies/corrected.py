@@ -117,7 +117,7 @@ def normals_after(puppet: Puppet, by: Correction) -> Float[Tensor, "bodies picke
 
 
 def corrected(bodies: Bodies, by: Correction) -> Bodies:
-    """Bodies of the world after a correction (a row for each); those with parameters posed again."""
+    """Bodies of the world after a correction (a row for each); parameters are posed again."""
     if bodies.pose is None:
         return _moved_rigidly(bodies, by)
     pose = _new_pose(bodies.pose, by)

@@ -1,9 +1,9 @@
 """How people hold themselves (standing, sitting, lying, leaning back) and what of them touches.
 
-World frame, +y up. People are distinguished by track; speeds are taken within a track over real time.
-What touches is estimated from posture, motion and normals alone: sitting, lying, leaning back, hands at
-rest and still soles. It stands in for POSA, whose weights cannot be shipped, and says nothing about
-what is touched.
+World frame, +y up. People are distinguished by track; speeds are taken within a track over real
+time. What touches is estimated from posture, motion and normals alone: sitting, lying, leaning
+back, hands at rest and still soles. It stands in for POSA, whose weights cannot be shipped, and
+does not say what is touched.
 """
 
 import torch

@@ -45,8 +45,8 @@ def spread_frames(count: int, most: int) -> list[int]:
 def clean_picture(frames: Sequence[int], load: Load, config: CleanConfig) -> Clean:
     """A frame that shows the room alone, or the median of what all frames show.
 
-    A person standing in a frame without a mask is seen in no median: a frame is taken only if it agrees
-    with that.
+    A person standing in a frame without a mask is seen in no median: a frame is taken only if it
+    agrees with that.
 
     Args:
         frames: Which may be used.
