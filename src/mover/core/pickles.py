@@ -1,56 +1,47 @@
-"""Pickles of other programs, read as data: nothing that a file names is ever imported or called.
+"""Pickles of other programs, read as data by an allow list of names: nothing in them ever runs.
 
-The reader of the standard library (the one in Python) reads the opcodes of data; the others are
-refused. A class or function is a word of a short list, see `pickle_parts`.
+Python's own unpickler reads the opcodes; those that import, call or set are refused. What a file
+names is a word (`Word`), and what it would call is kept as data (`Call`). Only then is each call of
+the list worked out, by functions of this module. Torch files are read by torch's reader of weights.
 """
 
 import bz2
 import lzma
 import math
 import pickle
+import re
 import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.lib import format as npy
 
 from mover.core.errors import InputError
-from mover.core.pickle_parts import (
-    CONTENT,
-    JOBLIB,
-    TORCH_BYTES,
-    Name,
-    Part,
-    Row,
-    chumpy_array,
-    filled,
-    made,
-    named,
-    storage_of,
-    storage_type,
-)
 from mover.core.records import BROKEN
 
 LARGEST = 2 << 30
-"""No file and no array is larger [bytes]."""
+"""No file and no array is larger, and no tree that a file unfolds to [bytes]."""
+REPEATED = 1 << 26
+"""No tensor that repeats its numbers is larger [bytes]."""
 DEEPEST = 64
-"""Levels of lists and mappings in a plain value."""
+"""Levels of lists and mappings."""
 ITEM = 64  # what Python takes for an item of a list, nearly [bytes]
 TORCH = 0x1950A86A20F9469CFC6C
 """The number that old torch files start with."""
+PLAIN = "expected arrays, numbers, text and containers"
 READ: dict[int, Any] = pickle._Unpickler.dispatch  # pyright: ignore[reportPrivateUsage]
 REFUSED = (
     pickle.INST, pickle.OBJ, pickle.EXT1, pickle.EXT2, pickle.EXT4, pickle.PERSID,
-    pickle.NEWOBJ_EX, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER,
+    pickle.BINPERSID, pickle.NEWOBJ_EX, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER,
 )  # fmt: skip
 """Opcodes that would make more than data."""
-TUPLES = (pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3)
 BROKEN_PICKLE = (
     *BROKEN, OverflowError, AssertionError, struct.error, lzma.LZMAError, pickle.UnpicklingError,
 )  # fmt: skip
@@ -62,43 +53,39 @@ PACKED: Mapping[tuple[bytes, ...], Callable[[], Any]] = {
     (b"\xfd7zXZ\x00", b"\x5d\x00"): lzma.LZMADecompressor,
 }
 """How files with these first bytes are unpacked: gzip and zlib, bzip2, xz and lzma."""
-
-
-# Files: plain, compressed, joblib's, torch's, or inside an .npy file.
-
-
-def load_pickle(path: Path) -> Any:  # noqa: ANN401
-    """The content of a pickle, as data: nothing in it is imported or called.
-
-    Understood are numbers, text, containers, numpy arrays, scipy's sparse matrices (csc, csr, coo),
-    chumpy arrays and torch tensors (both become numpy arrays), paths (text); Python 2's text is
-    read as latin1. The file may be a pickle, one of joblib (compressed or not), a torch file, or an
-    .npy file with an object. What is shared in the file is shared here, so that a list may hold
-    itself: whoever walks through takes `load_plain`.
-
-    Raises:
-        InputError: If the file is missing, too large, broken, or names any other class.
-    """
-    return _read(path, lambda value: value)
+TYPES = re.compile(r"[<>=|]?(\?|[biufcSU]\d{1,7}|[bBhHiIlLqQefdFDgG]|O8?|object)")
+"""Names of types of numbers, of text and of objects; no fields."""
+SETS = ("builtins.set", "builtins.frozenset")
+SIMPLE = (int, float, complex, str, bytes, type(None))
+RENAMED = {
+    "__builtin__": "builtins", "copy_reg": "copyreg", "pathlib._local": "pathlib",
+    "numpy._core.multiarray": "numpy.core.multiarray",
+    "numpy._core.numeric": "numpy.core.numeric",
+    **{f"scipy.sparse.{dash}{form}": "scipy.sparse" for dash in ("", "_")
+       for form in ("csc", "csr", "coo")},
+}  # fmt: skip
+"""Modules that are the same as others: of Python 2, of other versions."""
 
 
 def load_plain(path: Path) -> Any:  # noqa: ANN401
-    """The content of a pickle as a tree: keys as text, arrays of objects and tuples as lists.
+    """The content of a pickle as a tree: keys as text; arrays of objects and tuples as lists.
+
+    Understood are numbers, text, containers, numpy arrays, scipy's sparse matrices (csc, csr, coo),
+    chumpy arrays and torch tensors (both become numpy arrays), paths (text); Python 2's text is
+    read as latin1. The file may be a pickle, one of joblib (compressed or not), a torch file of
+    tensors, or an .npy file with an object.
 
     Raises:
-        InputError: As `load_pickle`; also if it holds itself, or unfolds to more than `LARGEST`.
+        InputError: If the file is missing, too large or broken, names any other class, holds
+            itself, or unfolds to more than `LARGEST`.
     """
-    return _read(path, lambda value: _unfolded(value, {}, 0)[0])
-
-
-def _read(path: Path, finished: Callable[[Any], Any]) -> Any:  # noqa: ANN401
     name = path.name
     if not path.is_file():
         raise InputError(f"{name}: there is no such file in {path.parent}, expected a pickle")
     try:
         if path.stat().st_size > LARGEST:
             raise InputError(f"has {path.stat().st_size} bytes, expected at most {LARGEST}")
-        return finished(_loaded(path.read_bytes()))
+        return _plain(_loaded(path.read_bytes()), {}, 0)[0]
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
     except BROKEN_PICKLE as error:
@@ -107,13 +94,23 @@ def _read(path: Path, finished: Callable[[Any], Any]) -> Any:  # noqa: ANN401
 
 
 def _loaded(data: bytes) -> Any:  # noqa: ANN401
-    """The content of a file in any of the forms."""
-    if data[:4] == b"PK\x03\x04":
-        return _archive(data)
+    """The content of a file in any of the forms, with calls as data."""
     for heads, packed in PACKED.items():
         if data.startswith(heads):
-            data = _unpacked(data, packed())
+            unpacker = packed()
+            data = unpacker.decompress(data, LARGEST + 1)
+            if len(data) > LARGEST:
+                raise InputError(f"unpacks to more than {LARGEST} bytes, expected at most that")
+            if not unpacker.eof:
+                raise ValueError("it ends too early")
             break
+    if data[:4] == b"PK\x03\x04":
+        with zipfile.ZipFile(BytesIO(data)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > LARGEST:
+                raise InputError(f"unpacks to more than {LARGEST} bytes, expected at most that")
+            if sum(name.endswith("/data.pkl") for name in archive.namelist()) != 1:
+                raise InputError("is a zip archive without data.pkl, expected a torch file")
+        return _of_torch(data)
     stream = BytesIO(data)
     if data[:6] == b"\x93NUMPY":
         version = npy.read_magic(stream)
@@ -121,62 +118,70 @@ def _loaded(data: bytes) -> Any:  # noqa: ANN401
         if read(stream)[2] != np.dtype("O"):
             raise ValueError("an .npy file of plain numbers, which is no pickle")
     value = Reader(stream).load()
-    return _old_torch(stream) if type(value) is int and value == TORCH else value
+    return _of_torch(data) if type(value) is int and value == TORCH else value
 
 
-def _unpacked(data: bytes, packed: Any) -> bytes:  # noqa: ANN401
-    """The bytes without compression, never more than `LARGEST`.
-
-    Raises:
-        InputError: If they would be more.
-    """
-    result = packed.decompress(data, LARGEST + 1)
-    if len(result) > LARGEST:
-        raise InputError(f"unpacks to more than {LARGEST} bytes, expected at most that")
-    if not packed.eof:
-        raise ValueError("it ends too early")
-    return result
-
-
-def _archive(data: bytes) -> Any:  # noqa: ANN401
-    """A torch file of the form since 1.6: a zip archive."""
-    with zipfile.ZipFile(BytesIO(data)) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > LARGEST:
-            raise InputError(f"unpacks to more than {LARGEST} bytes, expected at most that")
-        names = [n for n in archive.namelist() if n.endswith("/data.pkl")]
-        if len(names) != 1:
-            raise InputError("is a zip archive without data.pkl, expected a torch file")
-        root = names[0].removesuffix("data.pkl")
-        stream = BytesIO(archive.read(names[0]))
-        return Reader(stream, lambda key: archive.read(f"{root}data/{key}")).load()
+def _of_torch(data: bytes) -> Any:  # noqa: ANN401
+    """The content of a torch file."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of storages that have types
+        try:
+            value = torch.load(BytesIO(data), map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError as error:  # its text names the way to run what a file holds
+            named = re.search(r"GLOBAL (\S+)", str(error))
+            held = f"the pickle holds {named[1][:200]}" if named else "is a broken torch file"
+            raise InputError(f"{held}, expected tensors, numbers, text and containers") from error
+        if isinstance(value, torch.storage.TypedStorage):
+            return torch.empty(0, dtype=value.dtype).set_(value)  # pyright: ignore[reportArgumentType]
+        return value
 
 
-def _old_torch(stream: BytesIO) -> Any:  # noqa: ANN401
-    """A torch file of the form before 1.6, behind its first number: numbers follow the pickle."""
-    Reader(stream).load()  # version
-    Reader(stream).load()  # sizes of types
-    reader = Reader(stream)
-    value = reader.load()
-    for key in Reader(stream).load():
-        kind, array = reader.storages[str(key)]
-        (count,) = struct.unpack("<q", stream.read(8))
-        raw = stream.read(count * storage_type(kind).itemsize)
-        if count != len(array):
-            raise ValueError("it ends too early")
-        array[:] = storage_of(kind, raw)
-    return value
+class Row(tuple[Any, ...]):
+    """A tuple that is a key only if its hash is quick: of numbers and text, not of more tuples."""
+
+    __slots__ = ()
+
+    def __hash__(self) -> int:
+        if not all(isinstance(v, SIMPLE) for v in self):
+            raise ValueError("a key that is no text, number or tuple of these")
+        return super().__hash__()
 
 
-# Opcodes.
+class Call:
+    """What a pickle would call, as data: name, arguments, and the state and items that follow."""
+
+    __slots__ = ("args", "items", "name", "state")
+
+    def __init__(self, name: Any, args: tuple[Any, ...]) -> None:  # noqa: ANN401
+        if not isinstance(name, Word):
+            raise ValueError("a call of something that has no name")
+        self.name, self.args, self.state = name, args, None
+        self.items: dict[Any, Any] = {}
+
+    def __setitem__(self, key: object, value: object) -> None:
+        self.items[key] = value
+
+    def __setstate__(self, state: Any) -> None:  # noqa: ANN401
+        self.state = state
 
 
-class Memo(dict[int, Any]):
-    """What a pickle may refer to again; parts know where they are, to be replaced when whole."""
+class Word(str):
+    """A class or function that a pickle names: a word, not the thing."""
 
-    def __setitem__(self, place: int, value: object) -> None:
-        if isinstance(value, Part):
-            value.places.append(place)
-        super().__setitem__(place, value)
+    __slots__ = ()
+
+    def __call__(self, *args: Any) -> Call | set[Any]:  # noqa: ANN401
+        """The call as data; of what is made for an object of a class, that of the class."""
+        if self in SETS and all(isinstance(items, list | tuple) for items in args):
+            return set(*args)  # items are hashed at once, as those of other sets
+        if self == "copyreg.__newobj__":
+            return Call(args[0], args[1:])
+        if self != "copyreg._reconstructor":
+            return Call(self, args)
+        kind, base, state = args
+        if not isinstance(base, Word) or not base.endswith(".object") or state is not None:
+            raise ValueError("an object of another class's")
+        return Call(kind, ())
 
 
 class Opcodes(dict[int, Callable[[Any], None]]):
@@ -191,7 +196,7 @@ def _as_row(code: int) -> Callable[[Any], None]:
 
     def act(reader: Any) -> None:  # noqa: ANN401
         READ[code](reader)
-        reader.append(Row(reader.stack.pop()))
+        reader.stack[-1] = Row(reader.stack[-1])
 
     return act
 
@@ -200,17 +205,10 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
     """Python's reader of a pickle, without any opcode that could import, call or set."""
 
     stack: list[Any]
-    memo: dict[int, Any]
-    append: Callable[[Any], None]
 
-    def __init__(self, stream: BytesIO, stored: Callable[[str], bytes] | None = None) -> None:
-        """Args: stream: Of one pickle. stored: The bytes of torch's storages, if not behind it."""
+    def __init__(self, stream: BytesIO) -> None:
         super().__init__(stream, encoding="latin1")
-        self.memo = Memo()
-        self.stream, self.stored = stream, stored
-        self.storages: dict[str, tuple[str, np.ndarray]] = {}
-        self.left = stream.getbuffer().nbytes
-        """Bytes that storages behind the pickle may still have."""
+        self.stream = stream
 
     def load(self) -> Any:  # noqa: ANN401
         """The value of one pickle."""
@@ -218,97 +216,50 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
             warnings.simplefilter("ignore", DeprecationWarning)
             return super().load()
 
-    def find_class(self, module: str, name: str) -> Name:
-        """A word, where Python's reader would import."""
-        return named(module, name)
-
-    def persistent_load(self, pid: Any) -> np.ndarray:  # noqa: ANN401
-        """The numbers of a storage of torch; zeros where they follow later.
+    def find_class(self, module: str, name: str) -> Word:
+        """The word for a class or function of the list.
 
         Raises:
-            ValueError: If it is none, or larger than the file.
+            InputError: If it is not in the list; nothing was imported or called.
         """
-        match pid:
-            case ("storage", Name() as kind, key, _, int() as count, *_) if count >= 0:
-                key = str(key)
-            case _:
-                raise ValueError("a reference to something outside")
-        if key not in self.storages:
-            size = count * storage_type(kind).itemsize
-            self.left -= 0 if self.stored else size
-            if self.left < 0:
-                raise ValueError("it ends too early")
-            self.storages[key] = (
-                kind,
-                storage_of(kind, self.stored(key) if self.stored else bytes(size)),
+        full = Word(f"{RENAMED.get(module, module)}.{name}")
+        chumpy = module.split(".")[0] == "chumpy" and name.isidentifier()
+        if not chumpy and full not in WORDS and full not in MADE:
+            shown = f"{module}.{name}"
+            odd = not shown.isprintable() or len(shown) >= 200
+            raise InputError(
+                f"the pickle holds {'a class with an odd name' if odd else shown}, {PLAIN}"
             )
-        return self.storages[key][1]
-
-    def make(self) -> None:
-        """REDUCE and NEWOBJ: what a call would make."""
-        args, name = self.stack.pop(), self.stack.pop()
-        self.append(_storage(*args) if name == TORCH_BYTES else made(name, args))
+        return full
 
     def build(self) -> None:
-        """BUILD: the content of a part, which becomes whole everywhere."""
-        state, part = self.stack.pop(), self.stack[-1]
-        if isinstance(part, dict):  # attributes of an OrderedDict
-            return
-        if not isinstance(part, Part):
+        """BUILD: the state of a call; behind that of joblib lies an array."""
+        READ[pickle.BUILD[0]](self)
+        call = self.stack[-1]
+        if not isinstance(call, Call):
             raise ValueError("a state for something that has none")
-        if part.name == JOBLIB:
-            value = self._array_behind(state)
-        else:
-            value = (CONTENT.get(part.name) or chumpy_array)(part, state)
-        self.stack[-1] = value
-        for place in part.places:
-            self.memo[place] = value
-
-    def _array_behind(self, form: Any) -> Any:  # noqa: ANN401
-        """The array that joblib wrote behind its description.
-
-        Raises:
-            ValueError: If the description is odd or the bytes are not there.
-        """
-        dtype, shape, stream = form["dtype"], form["shape"], self.stream
-        if not isinstance(dtype, np.dtype) or not isinstance(shape, tuple):
-            raise ValueError("an array without type or shape")
-        if dtype.hasobject:
-            return Reader(stream).load()
-        if form.get("numpy_array_alignment_bytes") is not None:
-            stream.read(stream.read(1)[0])
-        return filled(stream.read(math.prod(shape) * dtype.itemsize), dtype, shape, form["order"])
+        if call.name == JOBLIB:
+            form, stream = _plain(call.state, {}, 0)[0], self.stream
+            if form["dtype"].hasobject:
+                call.state = Reader(stream).load()
+                return
+            if form.get("numpy_array_alignment_bytes") is not None:
+                stream.read(stream.read(1)[0])
+            raw = stream.read(math.prod(form["shape"]) * form["dtype"].itemsize)
+            call.state = _filled(raw, form["dtype"], form["shape"], form["order"])
 
     dispatch = Opcodes(
         {code: act for code, act in READ.items() if bytes([code]) not in REFUSED}
-        | {code[0]: _as_row(code[0]) for code in TUPLES}
+        | {c[0]: _as_row(c[0]) for c in (pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3)}
         | {
-            pickle.REDUCE[0]: make, pickle.NEWOBJ[0]: make, pickle.BUILD[0]: build,
+            pickle.NEWOBJ[0]: READ[pickle.REDUCE[0]], pickle.BUILD[0]: build,
             pickle.BYTEARRAY8[0]: READ[pickle.BINBYTES8[0]],
         }
     )  # fmt: skip
 
 
-def _storage(data: bytes) -> np.ndarray:
-    """A storage of torch that was pickled by itself.
-
-    Raises:
-        ValueError: If it is none.
-    """
-    stream = BytesIO(data)
-    if Reader(stream).load() != TORCH:
-        raise ValueError("a storage that is none of torch")
-    found = _old_torch(stream)
-    if not isinstance(found, np.ndarray):
-        raise ValueError("a storage without numbers")
-    return found
-
-
-# Trees.
-
-
-def _unfolded(value: Any, done: dict[int, Any], depth: int) -> tuple[Any, int]:  # noqa: ANN401
-    """A value as a tree, and the bytes that it would take if all that it shares were written out.
+def _plain(value: Any, done: dict[int, Any], depth: int) -> tuple[Any, int]:  # noqa: ANN401
+    """A value as a tree with each call worked out, and its bytes if all that it shares is written.
 
     Args:
         value: What a pickle holds.
@@ -318,25 +269,194 @@ def _unfolded(value: Any, done: dict[int, Any], depth: int) -> tuple[Any, int]: 
     Raises:
         InputError: If it holds itself, is too deep or too large.
     """
-    if isinstance(value, str | bytes):
-        return value, ITEM + 4 * len(value)
-    objects = isinstance(value, np.ndarray) and value.dtype == object
-    if not objects and not isinstance(value, Mapping | list | tuple):
-        return value, ITEM + int(getattr(value, "nbytes", 0))
+    if not isinstance(value, Call | Mapping | list | tuple | set | frozenset):
+        value = _array_of(value) if isinstance(value, torch.Tensor) else value
+        letters = 4 * len(value) if isinstance(value, str | bytes) else 0
+        return value, ITEM + letters + int(getattr(value, "nbytes", 0))
     if id(value) not in done:
         if depth >= DEEPEST:
             raise InputError(f"holds lists in lists in more than {DEEPEST} levels, expected fewer")
         done[id(value)] = value, None
-        items = value.values() if isinstance(value, Mapping) else value
-        inner = [value.tolist()] if isinstance(value, np.ndarray) else items
-        found = [_unfolded(item, done, depth + 1) for item in inner]
-        size = ITEM + sum(size for _, size in found)
+        found = [_plain(item, done, depth + 1) for item in _inside(value)]
+        plain, size = [item for item, _ in found], ITEM + sum(size for _, size in found)
+        if isinstance(value, Call):
+            plain = MADE.get(value.name, _chumpy)(value.name, *plain)
+            size = size if isinstance(plain, list | dict) else ITEM + getattr(plain, "nbytes", 0)
+        elif isinstance(value, Mapping):
+            keys = (_plain(k, done, depth)[0] if isinstance(k, Call) else k for k in value)
+            plain = dict(zip(map(str, keys), plain, strict=True))
+        elif isinstance(value, set | frozenset):
+            plain = set(plain)
         if size > LARGEST:
             raise InputError(f"unfolds to more than {LARGEST} bytes, expected at most that")
-        plain: Any = [item for item, _ in found]
-        if isinstance(value, Mapping):
-            plain = dict(zip(map(str, value), plain, strict=True))
-        done[id(value)] = value, (plain[0] if objects else plain, size)
+        done[id(value)] = value, (plain, size)
     if done[id(value)][1] is None:
         raise InputError("holds a list that contains itself, expected a tree")
     return done[id(value)][1]
+
+
+def _inside(value: Any) -> Iterable[Any]:  # noqa: ANN401
+    """What a container or a call holds."""
+    if isinstance(value, Call):
+        return value.args, value.state, value.items
+    return value.values() if isinstance(value, Mapping) else value
+
+
+# What the calls of the list describe: each takes its name, arguments, state and items.
+
+
+def _array_of(tensor: torch.Tensor) -> np.ndarray:
+    """A tensor's numbers; those of bfloat16 as floats."""
+    held = tensor.untyped_storage().nbytes()
+    if tensor.numel() * tensor.element_size() > max(held, REPEATED):
+        raise ValueError("a tensor that is larger than what it holds")
+    plain = tensor.detach()
+    return (plain.float() if plain.dtype == torch.bfloat16 else plain).numpy()
+
+
+def _tensor(_: str, args: list[Any], *__: object) -> np.ndarray:
+    """A tensor in a pickle of Python: a view of its storage."""
+    storage, offset, size, stride = args[:4]
+    whole = all(type(n) is int and n >= 0 for n in (offset, *size, *stride))
+    if not whole or not isinstance(storage, np.ndarray) or len(size) != len(stride):
+        raise ValueError("a tensor with an odd shape")
+    if 0 in size:
+        return np.zeros(size, storage.dtype)
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    most = max(storage.nbytes, REPEATED)
+    if last >= len(storage) or math.prod(size) * storage.itemsize > most or len(size) > 32:
+        raise ValueError("a tensor that is larger than what it holds")
+    steps = [step * storage.itemsize for step in stride]
+    return np.lib.stride_tricks.as_strided(storage[offset:], size, steps)
+
+
+def _bytes(_: str, args: list[Any], *__: object) -> bytes:
+    """Bytes from text or bytes, never from a size."""
+    raw, coding = [*args, *(b"", "latin1")[len(args) :]]
+    if not isinstance(raw, str | bytes | list) or coding not in ("latin1", "latin-1"):
+        raise ValueError("bytes from something else than text")
+    return raw.encode("latin1") if isinstance(raw, str) else bytes(raw)
+
+
+def _list(_: str, args: list[Any], *__: object) -> list[Any]:
+    """The items of another container."""
+    if args and not isinstance(args[0], list):
+        raise ValueError("a container of something else than a list")
+    return args[0] if args else []
+
+
+def _mapping(name: str, args: list[Any], _: object, items: dict[str, Any]) -> dict[str, Any]:
+    """Of a mapping with a maker of defaults, that is not kept."""
+    pairs = args[0] if args and not name.endswith("defaultdict") else []
+    return {str(key): value for key, value in dict(pairs).items()} | items
+
+
+def _dtype(_: str, args: list[Any], state: Any, __: object) -> np.dtype[Any]:  # noqa: ANN401
+    if not isinstance(args[0], str) or not TYPES.fullmatch(args[0]):
+        raise ValueError("a type of something else than numbers and text")
+    found = np.dtype(args[0])
+    if isinstance(state, list) and len(state) > 4:
+        if any(x is not None for x in state[2:5]):
+            raise ValueError("a type with fields")
+        if state[1] in ("<", ">"):
+            found = found.newbyteorder(state[1])
+    return found
+
+
+def _filled(raw: Any, dtype: Any, shape: Any, order: Any) -> Any:  # noqa: ANN401
+    """The array of these bytes, or the nested list of these objects.
+
+    Raises:
+        ValueError: If they are not as many as the shape says.
+    """
+    if not isinstance(dtype, np.dtype) or not isinstance(shape, list):
+        raise ValueError("an array without type or shape")
+    if not all(type(n) is int and n >= 0 for n in shape) or len(shape) > 32:
+        raise ValueError("an array with an odd shape")
+    count = math.prod(shape)
+    if dtype.hasobject:
+        if not isinstance(raw, list) or len(raw) != count:
+            raise ValueError("an array with the wrong number of objects")
+        return np.fromiter(raw, object, count).reshape(shape, order=order).tolist()
+    data = raw.encode("latin1") if isinstance(raw, str) else raw
+    if not isinstance(data, bytes) or len(data) != count * dtype.itemsize:
+        raise ValueError("an array whose bytes do not fit its shape")
+    if not count or not dtype.itemsize:
+        return np.zeros((0,) if not dtype.itemsize else shape, dtype)
+    return np.frombuffer(bytearray(data), dtype).reshape(shape, order=order)
+
+
+def _array(_: str, args: list[Any], state: Any, __: object) -> Any:  # noqa: ANN401
+    if args[0] not in ("numpy.ndarray", "numpy.memmap") or not isinstance(state, list):
+        raise ValueError("an array without content")
+    shape, dtype, fortran, raw = state[-4:]
+    return _filled(raw, dtype, shape, "F" if fortran else "C")
+
+
+def _sparse(name: str, _: object, state: Any, __: object) -> Any:  # noqa: ANN401
+    """A scipy matrix from its arrays, whose indices scipy checks."""
+    from scipy import sparse
+
+    form = name.rpartition(".")[2][:3]
+    parts = ("row", "col") if form == "coo" else ("indices", "indptr")
+    arrays = [state["data"], *(state.get("coords") or [state[part] for part in parts])]
+    shape = state.get("_shape", state.get("shape"))
+    if not all(isinstance(a, np.ndarray) and a.ndim == 1 for a in arrays) or len(shape) != 2:
+        raise ValueError("a sparse matrix without its arrays")
+    if form == "coo":
+        return sparse.coo_matrix((arrays[0], (arrays[1], arrays[2])), shape=shape)
+    kind = sparse.csc_matrix if form == "csc" else sparse.csr_matrix
+    matrix = kind(tuple(arrays), shape=shape)
+    matrix.check_format(full_check=True)
+    return matrix
+
+
+def _chumpy(name: str, _: object, state: Any, __: object) -> np.ndarray:  # noqa: ANN401
+    """The array in an object of chumpy: its value, or a selection from, a new shape of another's.
+
+    Raises:
+        InputError: If it is computed from others in another way.
+    """
+    match state:
+        case {"x": np.ndarray() as value}:
+            return value
+        case {"a": np.ndarray() as base, "idxs": np.ndarray() as chosen, "preferred_shape": shape}:
+            return base.ravel()[chosen].reshape(shape)
+        case {"a": np.ndarray() as base, "newshape": shape}:
+            return base.reshape(shape)
+        case _:
+            raise InputError(f"the pickle holds {name} without an array, expected its values")
+
+
+JOBLIB = "joblib.numpy_pickle.NumpyArrayWrapper"
+WORDS = {
+    "copyreg._reconstructor", "copyreg.__newobj__", "numpy.ndarray", "numpy.memmap", "torch.bool",
+    "torch.bfloat16", *(f"builtins.{name}" for name in ("object", "int", "float", "str", "bool")),
+    *(f"{module}.{kind}{bits}" for module in ("numpy", "torch") for kind, sizes in
+      (("float", (16, 32, 64)), ("int", (8, 16, 32, 64)), ("uint", (8,))) for bits in sizes),
+}  # fmt: skip
+"""What a pickle may name, but not call; but for copyreg's two, see `Word`."""
+MADE: Mapping[str, Callable[..., Any]] = {
+    **dict.fromkeys((*SETS, "builtins.list", "builtins.tuple", "torch.Size"), _list),
+    **dict.fromkeys(("builtins.dict", "collections.OrderedDict"), _mapping),
+    "collections.defaultdict": _mapping,
+    **dict.fromkeys(("builtins.bytes", "builtins.bytearray", "_codecs.encode"), _bytes),
+    "builtins.complex": lambda _, args, *__: complex(*args),
+    **dict.fromkeys(
+        (f"pathlib.{name}Path" for name in ("Posix", "PurePosix", "Windows", "PureWindows")),
+        lambda _, args, *__: "/".join(args).replace("//", "/"),
+    ),
+    "numpy.dtype": _dtype,
+    "numpy.core.multiarray._reconstruct": _array,
+    "numpy.core.multiarray.scalar": lambda _, args, *__: _filled(args[1], args[0], [1], "C")[0],
+    "numpy.core.numeric._frombuffer": lambda _, args, *__: _filled(*args),
+    **{f"scipy.sparse.{form}_{kind}": _sparse for form in ("csc", "csr", "coo")
+       for kind in ("matrix", "array")},
+    JOBLIB: lambda *parts: parts[2],  # the reader put the array there
+    **dict.fromkeys(
+        ("torch.device", "torch._utils._rebuild_parameter"), lambda _, args, *__: args[0]
+    ),
+    "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch.storage._load_from_bytes": lambda _, args, *__: _plain(_of_torch(args[0]), {}, 0)[0],
+}  # fmt: skip
+"""What a pickle may call: worked out by functions that are all written here."""
