@@ -237,7 +237,7 @@ def shared_lists() -> list:
 
 
 def shared_tuples() -> tuple:
-    nested: tuple = (np.ones(1),)
+    nested: tuple = (1.0,)
     for _ in range(40):
         nested = (nested, nested)
     return nested
