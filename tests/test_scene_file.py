@@ -10,6 +10,8 @@ from mover.core.errors import InputError
 from mover.core.types import Camera, Mesh, Scene, SceneObject
 from mover.geometry.placement import place_object
 from mover.io.capture.scene_file import read_scene, write_scene
+from mover.io.files.fields import At
+from mover.io.files.meshes import read_mesh
 
 CAMERA = Camera(torch.eye(3) * 50, torch.diag(torch.tensor([1.0, -1, -1])), 20, 10)
 
@@ -128,3 +130,12 @@ def test_numbers_are_written_as_short_decimals_that_read_back_the_same(tmp_path:
     tree = json.loads((tmp_path / "scene.json").read_text())
     assert tree["objects"][0]["translation"] == [0.1, -1.0, -2.0]
     assert tree["objects"][0]["yaw"] == 0.3
+
+
+def test_a_mesh_whose_remarks_are_latin_1_is_read(tmp_path: Path):
+    """Trimesh decodes what is not UTF-8 by a library that it does not itself depend on."""
+    pytest.importorskip("charset_normalizer", reason="the environment is older than pyproject.toml")
+    text = "# Stühle für die Küche\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    (tmp_path / "chair.obj").write_bytes(text.encode("latin-1"))
+    mesh, _ = read_mesh(At("chair.obj", "scene.json"), tmp_path)
+    assert mesh.verts.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
