@@ -7,8 +7,8 @@ written as OpenPose's JSON, read as a user's would be, and fitted. PJE is the me
 
 `--detected` takes the joints of `benchmarks/video.py` instead: COCO's 17 with 3 to 6 px of noise,
 missed and swapped ones, guesses of hidden ones, and a camera whose tilt is 3 degrees off; the table
-tells postures apart, and heights. Without `--rooms` it takes 24 development rooms, in twelve of
-which somebody lies and in twelve of which somebody is half hidden. `--height` tells the fit how
+distinguishes postures, and heights. Without `--rooms` it takes 24 development rooms, in twelve of
+which a person lies and in twelve of which somebody is half hidden. `--height` gives the fit how
 tall everybody is.
 
 `--second` measures the second pass: the first has a camera whose tilt is guessed (3 degrees off),
@@ -146,7 +146,7 @@ def second(seed: int, fps: float) -> None:
 
 
 def means(absolute: Tensor, aligned: Tensor, actions: list[str]) -> str:
-    """Means and medians of all, and the means of who sits and who lies [mm]."""
+    """Means and medians of all, and the means of seated and lying people [mm]."""
     groups = [
         f"PJE {1e3 * aligned.mean():.0f} mm aligned (median {1e3 * aligned.median():.0f}), "
         f"{1e3 * absolute.mean():.0f} mm absolute (median {1e3 * absolute.median():.0f})"
@@ -249,13 +249,13 @@ def by_posture(seed: int, fps: float, tall: bool) -> tuple[dict[str, Tensor], Te
     assert found.bodies.joints is not None
     assert room.bodies.joints is not None
     pairs = misses(found.bodies.joints, room.bodies.joints[rows])
-    told = {name: 1e3 * pairs[which] for name, which in postures(room, rows).items() if which}
+    found = {name: 1e3 * pairs[which] for name, which in postures(room, rows).items() if which}
     means = ", ".join(
-        f"{n} {len(v)}: {v[:, 0].mean():.0f} / {v[:, 1].mean():.0f}" for n, v in told.items()
+        f"{n} {len(v)}: {v[:, 0].mean():.0f} / {v[:, 1].mean():.0f}" for n, v in found.items()
     )
     off = too_tall(found, heights)
     print(f"room {seed}: {means}, height {off.mean():+.1f} %", flush=True)
-    return told, off
+    return found, off
 
 
 def table(seeds: list[int], fps: float, tall: bool) -> None:
@@ -266,8 +266,9 @@ def table(seeds: list[int], fps: float, tall: bool) -> None:
     for name in dict.fromkeys(name for room in rooms for name in room):
         each = [room[name] for room in rooms if name in room]
         rows = [torch.cat(each), torch.stack([room.mean(0) for room in each])]
-        body, alike = (f"{a:.0f} / {p:.0f}" for a, p in (row.mean(0).tolist() for row in rows))
-        print(f"{name}: {len(rows[0])} bodies of {len(each)} rooms, {body} mm; rooms alike {alike}")
+        body, equal = (f"{a:.0f} / {p:.0f}" for a, p in (row.mean(0).tolist() for row in rows))
+        head = f"{name}: {len(rows[0])} bodies of {len(each)} rooms"
+        print(f"{head}, {body} mm; rooms weighted equally {equal}")
 
 
 def main() -> None:

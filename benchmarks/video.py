@@ -5,7 +5,7 @@ truth with the errors of detectors (`mover_bench.rooms.seen`), under COCO's clas
 COCO has no class for is not found and not counted. With --other-designs no piece of the room's
 designs is among the shapes that the first scene is made of: no mesh is the true one.
 
-With --height everybody's is told.
+With --height everybody's is given.
 
     python benchmarks/video.py --seeds 100-103 --other-designs --out video
     python benchmarks/video.py --seeds 100-102 --other-designs --depth depth disparity --out video
@@ -174,19 +174,19 @@ def errors_by_posture(found: Path, room: KnownRoom) -> dict[str, tuple[int, floa
     }
 
 
-def told_of_postures(rows: list[dict[str, tuple[int, float, float]]]) -> str:
+def lines_of_postures(rows: list[dict[str, tuple[int, float, float]]]) -> str:
     """Means over the bodies of all rooms, and over rooms."""
     lines: list[str] = []
     for name in dict.fromkeys(name for row in rows for name in row):
         each = np.array([row[name] for row in rows if name in row])
-        body, alike = np.average(each[:, 1:], 0, each[:, 0]), each[:, 1:].mean(0)
+        body, equal = np.average(each[:, 1:], 0, each[:, 0]), each[:, 1:].mean(0)
         count = f"{int(each[:, 0].sum())} bodies of {len(each)} rooms"
-        means = [f"{1e3 * a:.0f} / {1e3 * p:.0f} mm" for a, p in (body, alike)]
-        lines.append(f"refined, {name}: {count}, {means[0]}; rooms alike {means[1]}")
+        means = [f"{1e3 * a:.0f} / {1e3 * p:.0f} mm" for a, p in (body, equal)]
+        lines.append(f"refined, {name}: {count}, {means[0]}; rooms weighted equally {means[1]}")
     return "\n".join(lines)
 
 
-def told_of_objects(metrics: dict[str, Any]) -> str:
+def lines_of_objects(metrics: dict[str, Any]) -> str:
     """IoU3D and error of the centre of each object, first scene -> room."""
     lines: list[str] = []
     for piece in metrics["objects"]:
@@ -221,7 +221,7 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
             reconstruct_into(place, read_capture(capture), preset_named("robust"), origin)
             shutil.rmtree(capture / kind)
         metrics, word = judged(capture, place, room), f"{kind} ".lstrip()
-        print(f"room {seed} {kind}", told_of_objects(metrics), sep="\n", flush=True)
+        print(f"room {seed} {kind}", lines_of_objects(metrics), sep="\n", flush=True)
         row |= {f"{word}{s} {k}": metrics[s][k] for s in SIDES for k in KEYS if k in metrics[s]}
         row |= {f"{word}{name}": value for name, value in scale_of(place, room).items()}
         row |= {f"{word}postures": errors_by_posture(place, room)}
@@ -235,7 +235,7 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def lens_file(room: KnownRoom, out: Path) -> Path:
-    """The true lens; its tilt is not told."""
+    """The true lens; its tilt is not given."""
     camera, names = room.truth.camera, ("fl_x", "fl_y", "cx", "cy")
     K = camera.K
     values = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
@@ -250,7 +250,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="100-103")
     parser.add_argument("--out", type=Path, default=Path("video"))
     parser.add_argument("--other-designs", action="store_true", help="no mesh is the true one")
-    parser.add_argument("--height", action="store_true", help="it is told how tall people are")
+    parser.add_argument("--height", action="store_true", help="how tall people are is given")
     parser.add_argument("--depth", nargs="*", default=[], choices=KINDS, help="measured, too")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -259,7 +259,7 @@ def main() -> None:
     for name in names:
         values = [row[name] for row in rows.values() if name in row]
         if isinstance(values[0], dict):
-            print(told_of_postures(values))
+            print(lines_of_postures(values))
             continue
         if isinstance(values[0], list):
             print(f"{name}: {'; '.join(f'{s}: {v}' for s, row in rows.items() for v in row[name])}")

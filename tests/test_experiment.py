@@ -240,7 +240,7 @@ def test_the_page_has_the_means_and_differences_of_the_files(finished) -> None:
 def test_stage_1_and_full_share_camera_and_ground(finished) -> None:
     args, _, _ = finished
     tree = json.loads((args.out / "rooms" / "0" / "paper.json").read_text())
-    for name in ("pitch_error", "roll_error", "ground_error"):
+    for name in ("pitch_error", "roll_error"):
         assert tree["image"][name] == tree["full"][name]
     assert tree["image"]["iou3d"] != tree["full"]["iou3d"]
 
@@ -447,9 +447,9 @@ class TestTables:
     def test_columns_speak_of_centimetres_and_degrees(self) -> None:
         assert COLUMNS["p2s"].shown(0.123) == "12.3"
         assert COLUMNS["pitch_error"].shown(math.radians(0.25)) == "0.25"
-        assert COLUMNS["yaw_error"].shown(math.nan) == "-"
+        assert COLUMNS["pje"].shown(math.nan) == "-"
         assert COLUMNS["iou3d"].shown(-1e-9, sign=True) == "+0.000"
-        assert COLUMNS["ground_error"].head == "ground [cm] ↓"
+        assert COLUMNS["p2s"].head == "P2S [cm] ↓"
 
     def test_the_interval_is_that_of_another_library(self) -> None:
         values = np.random.default_rng(2).gamma(2.0, size=30)

@@ -35,7 +35,6 @@ from mover.evaluate.contact import (
     gather_truth,
     nearness,
     non_collision,
-    penetration_depth,
 )
 
 
@@ -44,7 +43,6 @@ def test_a_body_that_sinks_into_a_box_collides_by_its_share_and_depth() -> None:
     touch = gather_touch(some_people(grid_body(0.92, 1.32)), box, None, 10, 0.05)
     assert non_collision(touch) == pytest.approx(4 / 5)  # rows at .92, 1.02, 1.12, 1.22, 1.32
     assert contact(touch) == 1
-    assert penetration_depth(touch) == pytest.approx(0.08)
     assert contact_f1(touch) is None
 
 
@@ -52,7 +50,7 @@ def test_a_body_just_above_a_box_touches_it_without_colliding() -> None:
     box = [StandingMesh(cuboid(1, 1, 1))]
     above = some_people(grid_body(1.04, 1.44))
     touch = gather_touch(above, box, None, 10, 0.05)
-    assert (non_collision(touch), contact(touch), penetration_depth(touch)) == (1, 0, 0)
+    assert (non_collision(touch), contact(touch)) == (1, 0)
     assert int((touch.near.surface <= 0.05).sum()) == 5
 
 
@@ -62,7 +60,6 @@ def test_contact_scores_are_means_over_bodies() -> None:
     touch = gather_touch(both, box, None, 10, 0.05)
     assert non_collision(touch) == pytest.approx(0.9)
     assert contact(touch) == pytest.approx(0.5)
-    assert penetration_depth(touch) == pytest.approx(0.04)
 
 
 def test_contact_f1_compares_the_touching_vertices_with_the_true_ones() -> None:

@@ -42,8 +42,8 @@ def bare(scene: Scene) -> ReportContent:
 
 def full() -> ReportContent:
     bodies = walkers()
-    values = {"iou3d": 0.3, "yaw_error": 0.2, "contact_f1": 0.1, "center_error": 0.5}
-    better = {"iou3d": 0.6, "yaw_error": 0.1, "contact_f1": 0.5, "center_error": 0.1}
+    values = {"iou3d": 0.3, "p2s": 0.2, "contact_f1": 0.1, "center_error": 0.5}
+    better = {"iou3d": 0.6, "p2s": 0.1, "contact_f1": 0.5, "center_error": 0.1}
     each = [{"id": "sofa_0", "initial": values, "result": better}]
     return ReportContent(
         "A <b>room</b> & more",

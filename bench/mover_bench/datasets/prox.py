@@ -5,7 +5,7 @@ calibration and the fits belong to the flipped ones. Several recordings of a roo
 another. The stills of the quantitative part are frames of their own without a frame rate. The truth
 is the camera of cam2world, the floor of the scan and, where the user has them, the boxes of MOVER's
 authors (--boxes), and in the quantitative part the bodies of MoSh. The capture itself knows none of
-that: its camera is level, its furniture comes from elsewhere. What is missing is told.
+that: its camera is level, its furniture comes from elsewhere. What is missing is named.
 """
 
 import dataclasses
@@ -69,7 +69,7 @@ def prox_parts(root: Path, hints: Hints) -> Parts:
     )
     lines, lens = timelines(recordings), lens_of(root)
     camera = camera_of(lens)
-    notes = [_told(line) for line in lines]
+    notes = [_described(line) for line in lines]
     fits = [_fits(line, FITS, notes) for line in lines]
     bodies = _joined(zip(lines, fits, strict=True), _tracks(recordings), notes)
     trees: dict[str, Any] = {}
@@ -89,7 +89,7 @@ def prox_parts(root: Path, hints: Hints) -> Parts:
     return _with_truth(parts, lines, lens, hints)
 
 
-def _told(line: Timeline) -> str:
+def _described(line: Timeline) -> str:
     """Which frames a recording has become."""
     first, last = min(line.frames.values()), max(line.frames.values())
     kind = "stills" if line.stills else "frames"

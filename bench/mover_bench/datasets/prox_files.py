@@ -26,7 +26,7 @@ SCENES = (
 )  # fmt: skip
 """The ten scenes on which the paper measures."""
 BOOTHS = ("BasementSittingBooth", "N0SittingBooth")
-"""Left out: a bench and its table that cannot be told apart."""
+"""Left out: a bench and its table that cannot be distinguished."""
 VIDEOS, SHOTS = 51, 178
 """Recordings of the ten scenes, and frames of the quantitative part."""
 QUANTITATIVE = "vicon"
@@ -38,7 +38,7 @@ UNEVEN = 1e-3  # [share], cells that differ by no more are cubes
 MOST_CELLS = 512  # along an axis of a signed distance field
 
 
-PAUSE = 60.0  # [s] between two videos of one capture: nobody is followed across it
+PAUSE = 60.0  # [s] between two videos of one capture: no person is tracked across it
 FITS = ("PROXD", "PROX", "fittings/PROXD", "fittings/PROX", "fittings/RGB")
 """Where fitted bodies may lie; the first that is there counts."""
 

@@ -1,8 +1,8 @@
 """People in PROX's pictures, which are stored mirrored: their masks and OpenPose's keypoints.
 
 Masks are Kinect's body index on the colour frames: a pixel holds the number of a body, 0 to 5, or
-255 where nobody is. Kinect numbers a person anew when it has lost them, and there is one person in
-a recording, so all bodies of a frame are one.
+255 where there is no person. Kinect gives a person a new number when it has lost them, and there
+is one person in a recording, so all bodies of a frame are one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,8 +19,8 @@ from mover.io.files.fields import At, get, items, mapping, maybe, number, read_j
 from mover.io.masks.instances import Instance, Instances, code_of, people_tree
 from mover_bench.datasets.prox_files import QUANTITATIVE, SIZE, Timeline
 
-BODIES = 6  # that Kinect tells apart
-NOBODY = 255
+BODIES = 6  # that Kinect distinguishes
+NO_PEOPLE = 255
 MOST = 0.7  # of the picture that a person may fill
 
 
@@ -56,16 +56,16 @@ def read_body_index(path: Path) -> Bool[np.ndarray, "h w"]:
     if pixels.shape != SIZE[::-1]:
         found = f"{pixels.shape[1]} x {pixels.shape[0]} pixels"
         raise InputError(f"{path}: has {found}, expected {SIZE[0]} x {SIZE[1]}")
-    other = np.unique(pixels[(pixels >= BODIES) & (pixels != NOBODY)])
+    other = np.unique(pixels[(pixels >= BODIES) & (pixels != NO_PEOPLE)])
     if len(other):
         raise InputError(
-            f"{path}: has the number {other[0]}, expected bodies 0 to {BODIES - 1}, and {NOBODY}"
-            " where nobody is"
+            f"{path}: has the number {other[0]}, expected bodies 0 to {BODIES - 1}, and {NO_PEOPLE}"
+            " where there is no person"
         )
     somebody = pixels < BODIES
     if somebody.mean() > MOST:
         share = f"{somebody.mean():.0%} of the picture is a body"
-        raise InputError(f"{path}: {share}, expected {NOBODY} where nobody is")
+        raise InputError(f"{path}: {share}, expected {NO_PEOPLE} where there is no person")
     return somebody[:, ::-1]
 
 

@@ -61,14 +61,12 @@ COLUMNS: dict[str, Column] = {
     "p2s": Column("P2S", -1, "cm", 100, 1),
     "iou2d": Column("IoU2D"),
     "center_error": Column("centre", -1, "cm", 100, 1),
-    "yaw_error": Column("yaw", -1, "°", DEGREES, 1),
     "worse_by_10cm": Column("worse by > 10 cm", -1, "%", 100, 1),
     "non_collision": Column("Non-Col"),
     "contact": Column("Cont.", 0),
     "contact_f1": Column("contact F1"),
     "pitch_error": Column("pitch", -1, "°", DEGREES, 2),
     "roll_error": Column("roll", -1, "°", DEGREES, 2),
-    "ground_error": Column("ground", -1, "cm", 100, 1),
     "pje": Column("PJE", -1, "mm", 1000, 1),
     "p_pje": Column("p.PJE", -1, "mm", 1000, 1),
 }
@@ -130,8 +128,8 @@ def read_finished(out: Path, rooms: str, seeds: Sequence[int], names: Sequence[s
         tree = read_numbers(path_of(out, rooms, seed, name))
         if "full" not in tree:
             log = out / rooms / str(seed) / LOG
-            told = tree["failed"].strip().split("\n")[-1] if "failed" in tree else last_line(log)
-            lacking[seed, name] = told
+            reason = tree["failed"].strip().split("\n")[-1] if "failed" in tree else last_line(log)
+            lacking[seed, name] = reason
             continue
         versions.add(tree["version"])
         for stage in STAGES:

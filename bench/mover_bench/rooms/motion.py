@@ -100,7 +100,7 @@ def perform(
 ) -> Performance:
     """Do the tasks one after the other; refuse those that the furniture does not allow.
 
-    After `enough` frames no further task is begun, unless that is 0.
+    After `enough` frames no further task is started, unless that is 0.
     """
     takes: list[Take] = []
     refused: list[str] = []

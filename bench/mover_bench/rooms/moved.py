@@ -1,4 +1,4 @@
-"""Known rooms in which a piece of furniture is moved while nobody is in the room.
+"""Known rooms in which a piece of furniture is moved while the room is empty.
 
 Two rooms that differ in the place of one piece, each with a visitor of its own, become one video:
 the second visitor comes after the piece was moved. How the objects look in the frames is known, as
@@ -31,7 +31,7 @@ from mover_bench.rooms.render import see
 from mover_bench.rooms.room import cast, make_room
 
 MOVABLE = ("chair", "office chair", "stool", "armchair", "table", "coffee table")
-GAP = 10  # frames in which nobody is in the room, and in the middle of which the piece is moved
+GAP = 10  # frames in which the room is empty, and in the middle of which the piece is moved
 EVERY = 2  # frames from one in which the objects are segmented to the next
 FAR = (0.5, 1.6)  # [m] by which a piece is moved
 TURN = 60.0  # [degrees] by which it is turned, at most

@@ -49,7 +49,7 @@ def _littered(
 
 
 def _bent(picture: NDArray[np.float64], K: Float[Tensor, "3 3"], k1: float) -> NDArray[np.float64]:
-    """The picture under radial distortion that nobody took away."""
+    """The picture under radial distortion that was not corrected."""
     import cv2
 
     if not k1:

@@ -11,7 +11,7 @@ from mover_bench.rooms.gait import Floor
 from mover_bench.rooms.turns import facing, left_of
 
 SIGNS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # of the corners of a footprint
-FAR = 0.03  # [m], signed distances beyond this are not told apart
+FAR = 0.03  # [m], signed distances beyond this are not distinguished
 
 
 @record
@@ -120,7 +120,7 @@ def free_of(
 
 
 CELL = 0.06  # [m]
-BODY = 0.28  # [m], nearer than this to furniture nobody walks
+BODY = 0.28  # [m], people walk no nearer to furniture
 ROOMY = 0.42  # [m], nearer than this one walks only where one must
 DEAR = 6.0  # cost of a metre in between
 

@@ -54,7 +54,7 @@ class Person:
 
     @property
     def standing(self) -> float:
-        """Height of the pelvis of a person who stands with almost straight legs [m]."""
+        """Pelvis height of a standing person with almost straight legs [m]."""
         hip = self.joints[LEG[0][0]]
         spread = hip[0] - STANCE
         return self.ankle - float(hip[1]) + float(np.sqrt((0.988 * self.leg) ** 2 - spread**2))

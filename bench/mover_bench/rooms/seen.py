@@ -187,7 +187,7 @@ MISSING = 0.1  # share of the joints
 def joints_seen(
     bodies: Bodies, camera: Camera, seated: Bool[Tensor, " bodies"], rng: np.random.Generator
 ) -> Keypoints:
-    """Joints with noise, some missing, none outside of the image, and no legs of who sits.
+    """Joints with noise, some missing, none outside of the image, and no legs of seated people.
 
     The true people are in the axes of the true camera.
     """

@@ -1,6 +1,6 @@
 """Whether bodies and furniture are true: touched where they should, sunk in nowhere.
 
-A body is brought into touch by moving it until it presses a few millimetres into what carries it.
+A body is brought into touch by moving it until it presses a few millimetres into what supports it.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Overlap of a scene's objects after one similarity: what scale and place of the whole cost.
 
-A video does not tell how large a room is: people of unknown height and a guessed lens make all of
-it too large or too small at once. This tells that error from those of single objects.
+A video does not determine how large a room is: people of unknown height and a guessed lens make
+all of it too large or too small at once. This separates that error from those of single objects.
 """
 
 import torch
@@ -16,7 +16,7 @@ from mover.geometry.rotations import rot_y
 
 FEWEST = 3  # objects: fewer would always fit
 ROUNDS = 20  # of weights
-NEAR = 0.05  # [m], residuals below it weigh alike
+NEAR = 0.05  # [m], smaller residuals have the same weight
 STRETCH = (0.5, 2.0)  # range of the scale
 
 

@@ -1,4 +1,4 @@
-"""Whether people and furniture fit: collision, contact and depth of penetration.
+"""Whether people and furniture fit: collision and contact.
 
 Each body is measured against the furniture of its own scene; the floor is left out.
 """
@@ -62,11 +62,6 @@ def contact(touch: Touch) -> float:
     return float((touch.near.signed < 0).any(-1).double().mean())
 
 
-def penetration_depth(touch: Touch) -> float:
-    """Depth of a body's deepest vertex inside an object [m], 0 outside; mean over bodies."""
-    return float((-touch.near.signed).clamp_min(0).amax(-1).mean())
-
-
 def contact_f1(touch: Touch) -> float | None:
     """F1 score of the vertices that touch furniture, over all bodies; 1 if none should or does."""
     if touch.shared is None or touch.true_shared is None:
@@ -80,7 +75,6 @@ TOUCH_METRICS: dict[str, Metric[Touch]] = {
     "non_collision": Metric("", 1.0, non_collision),
     "contact": Metric("", 1.0, contact),
     "contact_f1": Metric("", 1.0, contact_f1),
-    "penetration_depth": Metric("m", 0.0, penetration_depth),
 }
 
 

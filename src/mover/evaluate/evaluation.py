@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.bodies.corrected import in_world
+from mover.bodies.parts import members, parts_of
 from mover.core.files import replacing
 from mover.core.records import map_tensors, record
 from mover.core.run import Run
@@ -22,11 +23,10 @@ from mover.core.types import Bodies, Mesh, Scene
 from mover.evaluate.aligned import SCENE_METRICS, Together
 from mover.evaluate.bodies import (
     GROUND_METRICS,
-    MOTION_METRICS,
     POSE_METRICS,
+    SOLES,
     Standing,
     feet_places,
-    gather_gait,
     gather_twins,
     soles_of,
 )
@@ -38,7 +38,6 @@ from mover.evaluate.contact import (
     furniture_of,
     gather_touch,
     gather_truth,
-    penetration_depth,
 )
 from mover.evaluate.scene import (
     CAMERA_METRICS,
@@ -54,7 +53,7 @@ from mover.evaluate.scene import (
     pairs,
     unmatched,
 )
-from mover.evaluate.stability import PHYSICS_METRICS, lacking, result_loads, simulate
+from mover.evaluate.stability import PHYSICS_METRICS, lacking, settle
 from mover.geometry.placement import StandingMesh
 from mover.geometry.warp_start import mapped
 from mover.io.capture.bodies_file import read_bodies
@@ -72,8 +71,10 @@ METRICS: dict[str, Metric[Any]] = {
     **CAMERA_METRICS,
     **GROUND_METRICS,
     **POSE_METRICS,
-    **MOTION_METRICS,
 }
+"""By name; with `PHYSICS_METRICS` all that metrics.json can hold."""
+FIRST = ("iou3d", "p2s", "pitch_error", "non_collision", "contact_f1", "pje")
+"""The six that the demo prints; its report has all."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class EvaluateConfig:
     boxes: bool = False
     """The true objects are boxes without meshes: 3D boxes are compared in the image (IoU2D)."""
     feet: Literal["soles", "contacts"] = "soles"
-    """What may be under the floor: all soles, or the foot contacts that bodies tell (paper)."""
+    """What may be under the floor: all soles, or the foot contacts of still bodies (paper)."""
 
 
 @record
@@ -207,21 +208,25 @@ def evaluate_folder(
 
 
 def _add_stable(metrics: dict[str, Any], out: Path, scenes: Mapping[str, Scene]) -> None:
-    """Add the shares of pieces that stay under gravity, or why they are not known."""
+    """Add the shares of objects that stay under gravity, or why they are not known."""
     if (missing := lacking()) is not None:
         metrics["not_measured"] = dict.fromkeys(PHYSICS_METRICS, missing)
         return
-    loads = result_loads(out, scenes["result"])
     for side, scene in scenes.items():
-        metrics[side] |= measure(PHYSICS_METRICS, simulate(scene, Run(out), None, loads))
+        metrics[side] |= measure(PHYSICS_METRICS, settle(scene, Run(out)))
 
 
-def table(metrics: Mapping[str, Any]) -> str:
-    """The metrics before and after as plain text, then the place of each object."""
+def table(metrics: Mapping[str, Any], shown: Sequence[str] | None = None) -> str:
+    """The metrics before and after as plain text, then each object.
+
+    Args:
+        metrics: What metrics.json holds.
+        shown: Names of metrics; None: all.
+    """
     initial, result = metrics["initial"], metrics["result"]
     lines = [f"{'metric':34}{'before':>10}{'after':>10}{'best':>8}"]
     for name, metric in (METRICS | PHYSICS_METRICS).items():
-        if name in initial or name in result:
+        if (shown is None or name in shown) and (name in initial or name in result):
             title = f"{name} [{metric.unit}]" if metric.unit else name
             values = _cell(initial, name) + _cell(result, name)
             lines.append(f"{title:34}{values}{metric.best:8.0f}")
@@ -245,7 +250,7 @@ def evaluate_people(
     furniture: Furniture,
     truth: Bodies | None = None,
 ) -> dict[str, float]:
-    """How people move, how deep they are in floor and furniture, how far they are from the truth.
+    """How people fit floor and furniture, and how far they are from the truth.
 
     Args:
         bodies: People in the world of their room.
@@ -254,11 +259,21 @@ def evaluate_people(
         truth: The true people in the world of the true room; None: not known.
     """
     config = EvaluateConfig()
-    values = measure(MOTION_METRICS, gather_gait(bodies, truth, floor))
     near = gather_touch(bodies, furniture, None, config.bodies, config.reach)
-    values["penetration_depth"] = penetration_depth(near)
+    values = measure(TOUCH_METRICS, near)
+    soles = members(parts_of(bodies), *SOLES)
+    if floor is not None and bool(soles.any()):
+        values |= _on_floor(bodies.verts[:, soles], floor, config)
     twins = None if truth is None else gather_twins(bodies, truth)
     return values | ({} if twins is None else measure(POSE_METRICS, twins))
+
+
+def _on_floor(
+    points: Float[Tensor, "bodies points 3"], floor: float, config: EvaluateConfig
+) -> dict[str, float]:
+    """The metrics of points that should not be under the floor."""
+    heights = points[..., 1] - floor
+    return measure(GROUND_METRICS, Standing(heights, config.ground_tolerance))
 
 
 def _cell(values: Mapping[str, float], name: str) -> str:
@@ -299,18 +314,16 @@ def _true_touch(
 def _people(
     judged: _Populated, truth: _Populated, touch: TrueTouch | None, config: EvaluateConfig
 ) -> dict[str, float]:
-    """The metrics of a scene's people; what they or the truth do not tell is left out."""
-    bodies, floor = judged.bodies, judged.scene.ground
+    """The metrics of a scene's people; what they or the truth do not give is left out."""
+    bodies, floor = judged.bodies, floor_of(judged.scene)
     if bodies is None:
         return {}
     near = gather_touch(bodies, judged.furniture, touch, config.bodies, config.reach)
     values = measure(TOUCH_METRICS, near)
-    told = config.feet == "contacts"
-    if floor is not None and (told or len(judged.soles)):
+    contacts = config.feet == "contacts"
+    if floor is not None and (contacts or len(judged.soles)):
         soles = bodies.verts[:, judged.soles]
-        places = feet_places(bodies, judged.scene.camera) if told else soles
-        heights = places[..., 1] - floor
-        values |= measure(GROUND_METRICS, Standing(heights, config.ground_tolerance))
-    values |= measure(MOTION_METRICS, gather_gait(bodies, truth.bodies, floor))
+        points = feet_places(bodies, judged.scene.camera) if contacts else soles
+        values |= _on_floor(points, floor, config)
     twins = None if truth.bodies is None else gather_twins(bodies, truth.bodies)
     return values | (measure(POSE_METRICS, twins) if twins is not None else {})

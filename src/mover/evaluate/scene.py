@@ -1,4 +1,4 @@
-"""What a scene is worth against the truth: its objects one by one, its camera and its ground.
+"""A scene against the truth: its objects one by one, and its camera.
 
 Objects are compared in the gravity-aligned world of their own scene (docs/metrics.md).
 """
@@ -6,7 +6,6 @@ Objects are compared in the gravity-aligned world of their own scene (docs/metri
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -15,8 +14,7 @@ from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Camera, Mesh, Scene, SceneObject
-from mover.evaluate import surfaces
-from mover.furniture.library import FRONTLESS, canonical
+from mover.furniture.library import canonical
 from mover.geometry.boxes import Box, box_of, corners
 from mover.geometry.boxes import iou2d as rectangle_iou
 from mover.geometry.boxes import iou3d as box_iou
@@ -56,21 +54,10 @@ class Pair:
     boxes: bool = False
     """The truth is a box: boxes are compared in the image, not what is drawn."""
 
-    @cached_property
-    def points(self) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"]]:
-        """Points of both surfaces where they stand [m]."""
-        estimate, truth = (place_object(piece) for piece in (self.estimate, self.truth))
-        return area_samples(estimate, surfaces.POINTS), area_samples(truth, surfaces.POINTS)
-
-    @cached_property
-    def apart(self) -> float:
-        """ADD-S of the two surfaces, as a share of the true diameter."""
-        return surfaces.add_s(*self.points)
-
 
 @record
 class Sight:
-    """An estimated scene and the true one, seen for their camera and ground."""
+    """An estimated scene and the true one, for their cameras."""
 
     estimate: Scene
     truth: Scene
@@ -101,46 +88,9 @@ def p2s(pair: Pair) -> float:
     return float(to_surface(points, mesh.verts, mesh.faces).mean())
 
 
-def yaw_error(pair: Pair) -> float:
-    """Angle between the two fronts [rad]; symmetries of a piece are not taken into account."""
-    return float(wrap(pair.estimate.yaw - pair.truth.yaw).abs())
-
-
-def yaw_error_symmetric(pair: Pair) -> float:
-    """`yaw_error`, after those turns under which a true piece without a front looks the same."""
-    off, truth = yaw_error(pair), pair.truth
-    if canonical(truth.category) not in FRONTLESS:
-        return off
-    fold = surfaces.folds(pair.points[1], place_object(truth), box_of(truth).center)
-    if fold == surfaces.FOLDS[0]:
-        return 0.0
-    step = 2 * math.pi / fold
-    return abs(off - step * round(off / step))
-
-
 def center_error(pair: Pair) -> float:
     """Distance between the centres of the two boxes [m]."""
     return float((box_of(pair.estimate).center - box_of(pair.truth).center).norm())
-
-
-def size_error(pair: Pair) -> float:
-    """Mean difference of width, height and depth of the two boxes, each along its own axes [m]."""
-    return float((box_of(pair.estimate).size - box_of(pair.truth).size).abs().mean())
-
-
-def add_s(pair: Pair) -> float:
-    """Mean distance between the two surfaces, both ways, as a share of the true diameter."""
-    return pair.apart
-
-
-def add_s_01(pair: Pair) -> float:
-    """1 where that is less than a tenth; the mean is the share of such objects."""
-    return float(pair.apart < surfaces.CLOSE)
-
-
-def icp_rotation(pair: Pair) -> float:
-    """Angle by which ICP turns the object onto the true one [rad]."""
-    return surfaces.icp_turn(*pair.points)
 
 
 def pitch_error(sight: Sight) -> float:
@@ -153,48 +103,33 @@ def roll_error(sight: Sight) -> float:
     return _tilt_errors(sight)[1]
 
 
-def ground_error(sight: Sight) -> float | None:
-    """Difference of the floor's height below the camera [m]."""
-    if sight.estimate.ground is None or sight.truth.ground is None:
-        return None
-    return abs(sight.estimate.ground - sight.truth.ground)
-
-
 OBJECT_METRICS: dict[str, Metric[Pair]] = {
     "iou3d": Metric("", 1.0, iou3d),
     "iou2d": Metric("", 1.0, iou2d),
     "p2s": Metric("m", 0.0, p2s),
-    "yaw_error": Metric("rad", 0.0, yaw_error),
-    "yaw_error_symmetric": Metric("rad", 0.0, yaw_error_symmetric),
     "center_error": Metric("m", 0.0, center_error),
-    "size_error": Metric("m", 0.0, size_error),
-    "add_s": Metric("", 0.0, add_s),
-    "add_s_01": Metric("", 1.0, add_s_01),
-    "icp_rotation": Metric("rad", 0.0, icp_rotation),
 }
 HARM_METRICS: dict[str, Metric[float]] = {
     "worse_by_10cm": Metric("", 0.0, lambda farther: float(farther > 0.1)),
-    "worse_by_50cm": Metric("", 0.0, lambda farther: float(farther > 0.5)),
 }
-"""Of how much farther from the truth an object's centre is than it was given [m]; means of these
-are the shares of objects that were made worse."""
+"""Of how much farther from the truth an object's centre is than initially [m]; the mean is the
+share of objects that were made worse."""
 CAMERA_METRICS: dict[str, Metric[Sight]] = {
     "pitch_error": Metric("rad", 0.0, pitch_error),
     "roll_error": Metric("rad", 0.0, roll_error),
-    "ground_error": Metric("m", 0.0, ground_error),
 }
 
 
 def measure(table: Mapping[str, Metric[T]], subject: T) -> dict[str, float]:
-    """Every metric of a table that can be told of the subject; what lacks its truth is left out."""
+    """Every metric of a table; what lacks its truth is left out."""
     values = {name: metric.measure(subject) for name, metric in table.items()}
     return {name: v for name, v in values.items() if v is not None and math.isfinite(v)}
 
 
 def measure_missing(truth: SceneObject, camera: Camera) -> dict[str, float]:
-    """A missing object scores 0 in overlaps, if the truth has them, and is not within a tenth."""
-    seen = image_box(truth, camera) is not None
-    return ({"iou3d": 0.0, "iou2d": 0.0} if seen else {"iou3d": 0.0}) | {"add_s_01": 0.0}
+    """A missing object scores 0 in overlaps, if the truth has them."""
+    shown = image_box(truth, camera) is not None
+    return {"iou3d": 0.0, "iou2d": 0.0} if shown else {"iou3d": 0.0}
 
 
 def area_samples(mesh: Mesh, count: int) -> Float[Tensor, "count 3"]:

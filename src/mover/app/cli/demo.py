@@ -29,7 +29,7 @@ def demo(arguments: Sequence[str]) -> None:
     from mover.app.report.page import write_report
     from mover.app.results import Origin, report_of
     from mover.core.devices import device_of
-    from mover.evaluate.evaluation import evaluate_folder, table
+    from mover.evaluate.evaluation import FIRST, evaluate_folder, table
     from mover.io.capture.scene_file import read_scene
     from mover.io.formats import read
 
@@ -44,4 +44,4 @@ def demo(arguments: Sequence[str]) -> None:
     truth = read_scene(folder / "truth" / "scene.json", None)
     content = report_of(capture, found, config, run, truth=truth, metrics=metrics)
     report = write_report(args.out / "room", content)
-    say(f"\n{table(metrics)}\n\nreport: {report}")
+    say(f"\n{table(metrics, FIRST)}\n\nreport: {report}")
