@@ -315,7 +315,7 @@ def _people(
     judged: _Populated, truth: _Populated, touch: TrueTouch | None, config: EvaluateConfig
 ) -> dict[str, float]:
     """The metrics of a scene's people; what they or the truth do not give is left out."""
-    bodies, floor = judged.bodies, floor_of(judged.scene)
+    bodies, floor = judged.bodies, judged.scene.ground
     if bodies is None:
         return {}
     near = gather_touch(bodies, judged.furniture, touch, config.bodies, config.reach)
