@@ -12,10 +12,8 @@ from mover.bodies.skinning import open_body
 from mover.core.records import fingerprint
 from mover.core.types import SceneObject
 from mover.geometry.camera import pitch_roll
-from mover.geometry.mesh import signed_volume
 from mover.geometry.rle import decode
 from mover.geometry.rotations import axis_angle, rot_y
-from mover.geometry.topology import is_closed
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise, slow
@@ -81,19 +79,18 @@ def test_a_wrong_camera_keeps_centres_in_the_camera_frame_and_projects_fronts(
 
 def test_camera_errors_have_the_stated_size(room: KnownRoom) -> None:
     true = torch.stack(pitch_roll(room.truth.camera.R_cam_world))
-    config = dataclasses.replace(SILENT, camera=3.0, focal=0.05)
-    errors, zooms = [], []
+    config = dataclasses.replace(SILENT, camera=3.0)
+    errors = []
     for seed in range(60):
         camera = add_noise(_light(room), config, seed).scene.camera
         errors.append(torch.stack(pitch_roll(camera.R_cam_world)) - true)
-        zooms.append(float(camera.K[0, 0] / room.truth.camera.K[0, 0]) - 1)
+        assert torch.equal(camera.K, room.truth.camera.K)
         assert abs(float(camera.R_cam_world[2, 0])) < 1e-6, "a guess has no heading"
     degrees = torch.stack(errors).rad2deg()
     assert float(degrees.abs().min()) > 1.99
     assert float(degrees.abs().max()) < 4.01
     assert abs(float(degrees.abs().mean()) - 3) < 0.2
     assert abs(float(degrees.mean())) < 0.9
-    assert 0.02 < np.abs(zooms).mean() < 0.03
 
 
 def _light(room: KnownRoom) -> KnownRoom:
@@ -257,24 +254,6 @@ def test_people_masks_are_off_by_at_most_the_stated_pixels_and_some_are_missed(
             assert np.asarray(distance_transform_edt(b))[lost].max() <= 3
 
 
-def test_lost_feet_turn_only_what_is_below_the_knee_in_the_stated_share(room: KnownRoom) -> None:
-    config = dataclasses.replace(SILENT, lost_feet=0.25)
-    bodies = add_noise(room, config, 0).bodies
-    assert bodies is not None
-    assert bodies.joints is not None
-    assert room.bodies.joints is not None
-    off = (bodies.joints - room.bodies.joints).norm(dim=-1)
-    names = open_body().joint_names
-    lower = [names.index(f"{side}_{part}") for side in SIDES for part in ("ankle", "foot")]
-    rest = [k for k in range(len(names)) if k not in lower]
-    lost = off[:, lower].amax(1) > 0.01
-    assert abs(float(lost.float().mean()) - 0.25) < 0.03
-    assert float(off[:, rest].max()) < 1e-4, "knees and all above stay"
-    assert float(off[lost][:, lower].amax(1).mean()) > 0.1
-    changes = int((lost[1:] != lost[:-1]).sum())
-    assert changes < 0.7 * int(lost.sum()), "1.5 if each frame were drawn alone"
-
-
 def test_a_leak_adds_one_disc_at_the_border(room: KnownRoom) -> None:
     mask = np.zeros((60, 90), dtype=bool)
     mask[20:40, 30:60] = True
@@ -335,16 +314,3 @@ def test_a_wrong_class_has_another_mesh_in_the_same_box(room: KnownRoom) -> None
         assert found.category == given.category
         assert torch.allclose(size(given), size(true), atol=1e-5)
         assert torch.allclose(centre(given), centre(true), atol=1e-5)
-
-
-def test_holes_open_meshes_and_inverted_meshes_have_negative_volume(room: KnownRoom) -> None:
-    holed = add_noise(room, dataclasses.replace(SILENT, holes=1.0), 0).scene.objects
-    turned = add_noise(room, dataclasses.replace(SILENT, inverted=1.0), 0).scene.objects
-    for hole, inside_out, true in zip(holed, turned, room.truth.objects, strict=True):
-        assert is_closed(true.mesh.faces)
-        assert not is_closed(hole.mesh.faces)
-        lost = len(true.mesh.faces) - len(hole.mesh.faces)
-        assert 0 < lost < 0.6 * len(true.mesh.faces)
-        assert torch.equal(hole.mesh.verts, true.mesh.verts)
-        assert is_closed(inside_out.mesh.faces)
-        assert math.isclose(signed_volume(inside_out.mesh), -signed_volume(true.mesh), rel_tol=1e-5)

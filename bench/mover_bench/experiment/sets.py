@@ -160,11 +160,9 @@ CHANGES: dict[str, Change] = {
     "scale": Change("scale", (0.0, 0.05, 0.15, 0.25)),
     "place": Change("sideways", (0.0, 0.1, 0.2, 0.3), "along_ray"),
     "turn": Change("yaw", (0.0, 15.0, 30.0, 45.0), "flips"),
-    "focal": Change("focal", (0.0, 0.025, 0.05)),
     "masks": Change("object_masks", (0, 1, 3, 6)),
     "pose": Change("pose", (0.0, 4.0, 8.0)),
     "depth": Change("depth_bias", (0.0, 0.03, 0.06)),
-    "feet": Change("lost_feet", (0.0, 0.2, 0.4)),
     "missed": Change("missed", (0.0, 0.1, 0.2)),
 }
 """Errors of the input by name (the paper's sensitivity, Tab. 7, has the first three)."""

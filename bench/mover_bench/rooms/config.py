@@ -123,8 +123,6 @@ class NoiseConfig:
     """Objects: share whose mesh is another piece of the same class, stretched to the same box."""
     camera: float = 3.0
     """Mean size of the error of pitch and of roll; between 2/3 and 4/3 of it [degrees]."""
-    focal: float = 0.0
-    """Largest error of the focal length, drawn evenly [share]."""
     depth_bias: float = 0.03
     """Bodies: largest error of a person's depth; the body keeps its size [share]."""
     depth_drift: float = 0.01
@@ -145,13 +143,6 @@ class NoiseConfig:
     """People's masks: share that is missing."""
     object_masks: int = 1
     """Objects' masks: most pixels by which they grow or shrink [px]."""
-    lost_feet: float = 0.0
-    """Bodies: share of rows whose lower legs and feet are lost, in runs of about a second.
-
-    Source: regressors guess the legs that furniture or the border of the image hides (PARE).
-    """
-    lost_angle: float = 35.0
-    """Bodies: standard deviation of the error of lost knees, ankles and toes [degrees]."""
     leaks: float = 0.0
     """Objects' masks: share that leaks over its border by a fifth of its own extent.
 
@@ -171,14 +162,6 @@ class NoiseConfig:
     """Detections: share that swallows a neighbour in the image, which is then missing."""
     wrong_class: float = 0.0
     """Detections: share with another class; the mesh is of that class and fills the same box."""
-    holes: float = 0.0
-    """Meshes: share with a hole of up to a tenth of the surface.
-
-    Source of this and of the next: meshes of Total3D are cut out of a deformed sphere, which
-    leaves open borders, and the paper makes them watertight; files of other origin are no better.
-    """
-    inverted: float = 0.0
-    """Meshes: share whose faces all wind the wrong way."""
     foreign: float = 0.0
     """Meshes: share that is another piece of the class as another program would make it.
 

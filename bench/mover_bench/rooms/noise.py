@@ -37,11 +37,9 @@ from mover_bench.rooms.noise_masks import (
     wobbling,
 )
 from mover_bench.rooms.noise_picture import worn_picture
-from mover_bench.rooms.poses import LEG
 from mover_bench.rooms.turns import from_vector, to_vector
 
 SEATS_FOR_ONE = ("chair", "armchair", "office chair", "stool")
-HOLE = 0.1  # share of the surface that is missing where a mesh has a hole
 
 
 def other_shapes(
@@ -79,37 +77,7 @@ def foreign_shapes(
     return tuple(out)
 
 
-def broken(
-    pieces: tuple[SceneObject, ...], noise: NoiseConfig, rng: np.random.Generator
-) -> tuple[SceneObject, ...]:
-    """Some meshes with a hole, some turned inside out."""
-    out: list[SceneObject] = []
-    for piece in pieces:
-        hole, invert = rng.uniform(size=2) < (noise.holes, noise.inverted)
-        start = int(rng.integers(len(piece.mesh.faces)))
-        mesh = _holed(piece.mesh, start) if hole else piece.mesh
-        faces = mesh.faces.flip(1) if invert else mesh.faces
-        out.append(dataclasses.replace(piece, mesh=Mesh(mesh.verts, faces)))
-    return tuple(out)
-
-
-def _holed(mesh: Mesh, start: int) -> Mesh:
-    """Without the faces nearest to one, at least that one and at most `HOLE` of the surface."""
-    corners = mesh.verts[mesh.faces].double()
-    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = area.norm(dim=-1) / 2
-    middle = corners.mean(1)
-    order = (middle - middle[start]).norm(dim=-1).argsort(stable=True)
-    gone = order[: max(1, int((area[order].cumsum(0) < HOLE * area.sum()).sum()))]
-    keep = torch.ones(len(mesh.faces), dtype=torch.bool)
-    keep[gone] = False
-    return Mesh(mesh.verts, mesh.faces[keep])
-
-
 # Errors of body regression: depth, pose and place, slow or fast in time; missing frames.
-
-
-LOST_SECONDS = 2.0  # memory of what loses them; a stretch lasts about a second
 
 
 def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) -> Bodies:
@@ -175,25 +143,6 @@ def _of_mean_shape(pose: BodyPose, pelvis: Tensor, shift: Tensor) -> tuple[BodyP
     return mean, there + pelvis * (share - 1) + shift * share
 
 
-def lose_feet(bodies: Bodies, noise: NoiseConfig, rng: np.random.Generator) -> Bodies:
-    """Legs below the knees guessed wrongly in some stretches of time."""
-    if noise.lost_feet == 0:
-        return bodies
-    assert bodies.pose is not None, "bodies of known rooms have parameters"
-    assert bodies.fps is not None, "a known room is a video"
-    when = bodies.frame.numpy(), bodies.person.numpy()
-    mood = slow(rng, when, (1,), bodies.fps * LOST_SECONDS)[:, 0]
-    lost = mood <= np.quantile(mood, noise.lost_feet)
-    wrong = slow(rng, when, (22, 3), bodies.fps * noise.pose_seconds) * np.radians(noise.lost_angle)
-    below = np.isin(np.arange(22), [joint for leg in LEG for joint in leg[1:]])
-    pose = map_tensors(lambda x: x.double(), bodies.pose)
-    pose = _turned(pose, wrong * lost[:, None, None] * below[:, None])
-    verts, joints = open_body().posed(pose)
-    return dataclasses.replace(
-        bodies, verts=rounded(verts), joints=rounded(joints), pose=map_tensors(rounded, pose)
-    )
-
-
 def slow(
     rng: np.random.Generator,
     when: tuple[np.ndarray, np.ndarray],
@@ -241,13 +190,13 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
     The guess of the camera is wrong, so the objects are given in a wrong world: they keep their
     box centres in the camera frame, and their fronts are projected onto its horizontal plane.
     """
-    streams = [np.random.default_rng([seed, k]) for k in range(9)]
+    streams = [np.random.default_rng([seed, k]) for k in range(8)]
     camera = _noisy_camera(room.truth.camera, noise, streams[0])
     pieces = tuple(
         _noisy_piece((piece, furniture), (room.truth.camera, camera), noise, streams[1])
         for piece, furniture in zip(room.truth.objects, room.furniture, strict=True)
     )
-    pieces = broken(other_shapes(pieces, room.furniture, noise, streams[2]), noise, streams[6])
+    pieces = other_shapes(pieces, room.furniture, noise, streams[2])
     if noise.foreign:
         pieces = foreign_shapes(pieces, room.furniture, noise, [seed, 10])
     detections = room.capture.detections
@@ -255,7 +204,7 @@ def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
         detections = headed(detections, room.truth, noise, np.random.default_rng([seed, 11]))
     detections = noisy_detections(detections, noise.object_masks, streams[3])
     bodies, people = beside(
-        lambda: lose_feet(noisy_bodies(room, noise, streams[4]), noise, streams[8]),
+        lambda: noisy_bodies(room, noise, streams[4]),
         lambda: noisy_people(
             room.capture.people, noise.person_masks, noise.missed_masks, streams[5]
         ),
@@ -311,10 +260,8 @@ def wrong_lens(capture: Capture, mean: float, rng: np.random.Generator) -> Captu
 def _noisy_camera(camera: Camera, noise: NoiseConfig, rng: np.random.Generator) -> Camera:
     pitch, roll = pitch_roll(camera.R_cam_world.double())
     error = np.radians(noise.camera) * rng.uniform(2 / 3, 4 / 3, 2) * rng.choice([-1.0, 1.0], 2)
-    zoom = 1 + noise.focal * float(rng.uniform(-1, 1))
-    K = camera.K * torch.tensor([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
     R = tilted(pitch + float(error[0]), roll + float(error[1])).float()
-    return Camera(K, R, camera.width, camera.height)
+    return Camera(camera.K, R, camera.width, camera.height)
 
 
 def _noisy_piece(

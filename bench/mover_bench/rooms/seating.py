@@ -215,7 +215,7 @@ def palm_height(person: Person) -> float:
 
 
 def span(person: Person, posture: Posture, hand: int, goal: np.ndarray) -> float:
-    """From a shoulder to a place [m]."""
+    """From a shoulder to a position [m]."""
     return float(np.linalg.norm(goal - chest_of(person, posture)[1][0, hand]))
 
 

@@ -67,9 +67,6 @@ NOISE: Mapping[str, Mapping[float, float]] = {
 """One video: IoU3D with uniform noise on the initial scene. (Its table prints 0.05 % and 10 m where
 5 % and 10 cm must be meant.)"""
 
-MINUTES: Mapping[str, float] = {"MOVER, a video": 30.0, "HolisticMesh, one image": 45.0}
-"""Optimisation of a room on the authors' machine [min]."""
-
 
 def quoted(columns: Sequence[str], values: Mapping[str, Values]) -> Quoted:
     """What is printed of some rows."""
