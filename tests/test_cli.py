@@ -233,3 +233,18 @@ def test_help_and_mistyped_names_of_every_command_import_nothing_heavy():
 def test_an_unknown_format_is_answered_with_the_known_ones(command, capsys):
     assert cli.run_command(command, ["capture", "--format", "nope"]) == 2
     assert "--format: 'nope' is none of folder, total3d" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["experiment", "paper-table"])
+def test_commands_of_the_bench_say_where_it_is_if_it_is_not_installed(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def absent(module: str) -> None:
+        top = module.partition(".")[0]
+        raise ModuleNotFoundError(f"No module named {top!r}", name=top)  # as Python does
+
+    monkeypatch.setattr(cli.importlib, "import_module", absent)
+    assert cli.run_command(name, []) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"mover {name}: mover_bench is not in the wheel of mover; pip install")
+    assert said.count("\n") == 1
