@@ -23,16 +23,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mover.app.demo import write_demo
 from mover.core.run import Run
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
+from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.folder import read_capture
+from mover.io.capture.scene_file import read_scene
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover_bench.experiment.job import noisy_room
 from mover_bench.experiment.measures import Trial
 from mover_bench.experiment.sets import SETS
-from mover_bench.rooms.config import NoiseConfig
-from mover_bench.rooms.noise import add_noise
-from mover_bench.rooms.room import demo_room
 
 STORED = Path(__file__).with_name("gate.json")
 DEMO = ("demo", 0)
@@ -48,8 +49,12 @@ def trial_of(case: Case) -> Trial:
     """The input and the truth of a case."""
     if case != DEMO:
         return noisy_room(case[1], SETS[case[0]])
-    room = demo_room()
-    return Trial(add_noise(room, NoiseConfig(), 0), room.truth, room.bodies, ())
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "demo"
+        write_demo(folder)
+        truth = read_scene(folder / "truth" / "scene.json", None)
+        people = read_bodies(folder / "truth" / "bodies.npz")
+        return Trial(read_capture(folder), truth, people, ())
 
 
 def digest(tensors: Iterable[Tensor]) -> str:

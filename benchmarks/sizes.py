@@ -21,13 +21,11 @@ from pathlib import Path
 
 import torch
 
+from mover.app.demo import write_demo
 from mover.core.records import map_tensors
 from mover.core.types import Capture, Detection, Masks, SceneObject
 from mover.geometry.rle import decode, encode
-from mover.io.capture.folder import write_capture
-from mover_bench.rooms.config import NoiseConfig
-from mover_bench.rooms.noise import add_noise
-from mover_bench.rooms.room import demo_room
+from mover.io.capture.folder import read_capture, write_capture
 
 TIMES, ZOOM = 4, 2
 STEP = 0.02  # [m] between a copy and the next
@@ -144,8 +142,9 @@ def main() -> None:
     )
     parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
     asked = parser.parse_args()
-    capture = add_noise(demo_room(), NoiseConfig(), 0)
     with tempfile.TemporaryDirectory() as place:
+        write_demo(Path(place) / "known")
+        capture = read_capture(Path(place) / "known")
         for name in asked.cases:
             folder = Path(place) / name
             write_capture(CASES[name](capture), folder)
