@@ -18,7 +18,13 @@ from mover.core.types import Bodies, BodyPose, Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, Weighed, body_energy
 from mover.fitting.given import begin_from
-from mover.fitting.ground import distances_of_who_lies, sole_heights, soles_of
+from mover.fitting.ground import (
+    distances_of_who_lies,
+    plane_of,
+    sole_heights,
+    soles_of,
+    standing_share,
+)
 from mover.fitting.noise import Bias, at_most, bias_of, noise_of, noisy, without
 from mover.fitting.offsets import lasting_of
 from mover.fitting.prior import ANGLES, PosePrior, encoded
@@ -45,6 +51,7 @@ from mover.fitting.unknowns import (
     Frame,
     Rig,
     Unknowns,
+    floor_of,
     grown,
     hand_angles,
     log_depth,
@@ -226,6 +233,7 @@ def _stages(
     seen = chosen(seen, rows, triples_of(some, _speed(at, frame, some, job), job.config))
     noise = None
     for index, stage in enumerate(stages):
+        seen = _standing(at, frame, seen, job)
         if index == 1 and job.config.left:
             quick = dataclasses.replace(stage, steps=job.config.noise_steps)
             at = _lowered(at, frame, seen, (job, quick, free))
@@ -273,6 +281,16 @@ def _bias(found: _Lowered, job: _Job) -> Bias | None:
     left = noise_of(_seen_at(again, found.frame, seen, job) - pixels, seen, person, job.config.left)
     share = (found.noise / left.clamp_min(1e-6)).square().clamp_max(1)
     return bias_of(found.at, again, person, share)
+
+
+def _standing(at: Unknowns, frame: Frame, seen: Seen, job: _Job) -> Seen:
+    """What is seen, with the bodies that their legs carry, as they are now."""
+    if not job.config.balance or not at.floor.numel():
+        return seen
+    with torch.no_grad():
+        joints = points_of(at, frame, job.inputs.prior.decode).joints
+        up, _ = plane_of(floor_of(at, frame), seen.up, seen.floor)
+    return dataclasses.replace(seen, standing=standing_share(joints, up))
 
 
 def _laid(

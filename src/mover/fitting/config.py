@@ -90,7 +90,7 @@ class FitConfig:
     """Second difference that is free of charge at any frame rate [m]."""
     by_size: bool = True
     """Price second differences of joints in sizes of the body: people are not near to be smooth."""
-    alike: Annotated[int, int_in(1, 1_000_000)] = 10
+    alike: Annotated[int, int_in(1, 1_000_000)] = 4
     """Frames with errors of their own: more do not constrain shape, stature and offsets further."""
     lasting: bool = True
     """Keypoints lie lastingly off the model's, and statures are those of adults (else the shape
@@ -103,6 +103,8 @@ class FitConfig:
     """How far a joint may be under the floor [m]."""
     stands: Weight = 20.0
     """Weight of one floor below the lower soles of all bodies, found with them [1/m]; 0: none."""
+    balance: Weight = 1.0
+    """Weight of the balance of standing bodies, beside the pose prior; 0: none."""
     lies: Weight = 50.0
     """Weight of the distance before and after lying, of who lies along the view; 0: none."""
     near: Annotated[float, float_in(1e-3, 180)] = 15.0

@@ -26,9 +26,12 @@ from mover.core.records import record
 from mover.energy.minimize import weigh
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.ground import (
+    BALANCE,
+    FALLING,
     FRAMES,
     STEP,
     Plane,
+    balance_cost,
     laid_price,
     level_price,
     plane_of,
@@ -92,6 +95,8 @@ class Seen:
     """How far a detector puts each keypoint lastingly from the model's [m]; None: nowhere."""
     soles: Float[Tensor, "2"] | None = None
     """Heights of ankles and balls of the feet over the soles [m]; None: no floor is sought."""
+    standing: Float[Tensor, " bodies"] | None = None
+    """From 0 to 1, how surely the legs carry each body; None: no floor is sought."""
     about: Float[Tensor, " bodies"] | None = None
     """Where `place` has the depth at which who lies is expected; NaN, None: nothing is."""
 
@@ -139,6 +144,7 @@ def _ground_energy(points: Points, at: Unknowns, frame: Frame, seen: Seen, by: W
     under = pose / by.config.support if sought or seen.floor is not None else 0.0
     stands = pose * by.config.stands if sought else 0.0
     lies = pose * by.config.lies if seen.about is not None else 0.0
+    balance = by.config.balance * pose / BALANCE if sought and seen.standing is not None else 0.0
 
     def plane() -> Plane:
         return plane_of(floor, seen.up, seen.floor)
@@ -148,6 +154,11 @@ def _ground_energy(points: Points, at: Unknowns, frame: Frame, seen: Seen, by: W
         up, level = plane()
         height = sole_heights(points.joints, seen.soles, up) - level
         return geman_mcclure(height.square(), STEP)
+
+    def balanced() -> Tensor:
+        assert seen.standing is not None
+        off = balance_cost(points.joints, plane()[0])
+        return seen.standing * geman_mcclure(off, FALLING)
 
     def lie() -> Tensor:
         assert seen.about is not None
@@ -160,6 +171,7 @@ def _ground_energy(points: Points, at: Unknowns, frame: Frame, seen: Seen, by: W
     return weigh(
         ("support", under**2, lambda: support_price(every, plane())),
         ("stands", stands**2, stand),
+        ("balance", balance**2, balanced),
         ("level", pose**2 * FRAMES / rows if sought else 0.0, level),
         ("lies", lies**2, lie),
     )

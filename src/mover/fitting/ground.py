@@ -26,7 +26,7 @@ Plane = tuple[Float[Tensor, "3"], Float[Tensor, ""] | float]
 """Away from the floor, in camera axes, and its height along that from the camera [m]."""
 
 STEP = 0.1  # [m], feet that are higher are not on the floor
-TILT = math.radians(4)  # how far off the first guess of upright is, where nothing tells the floor
+ROLL, PITCH = math.radians(2), math.radians(8)  # how far a camera of unknown tilt is from level
 KNOWN_TILT, KNOWN_HEIGHT = math.radians(0.3), 0.01  # [rad], [m], the same where the floor is told
 FRAMES = 20  # that tell of the floor as much as what is known before
 FEET = tuple([BODY.index(f"{side}_{joint}") for side in ("left", "right")]
@@ -35,6 +35,11 @@ NECK = BODY.index("neck")
 LIES = math.sin(math.radians(35))  # most that the trunk of who lies rises
 SITS = math.sin(math.radians(50))  # least that the trunk of who sits or stands does
 ALONG = 0.7  # cosine of trunk and view from which distance is hardly seen
+STRAIGHT, UPRIGHT = (0.6, 0.8), (0.5, 0.75)
+"""Where legs begin to carry a body and surely do: hip over ankle in lengths of the leg, and the
+cosine of trunk and up."""
+BALANCE = 0.08  # [m], of the centre of mass about the middle of the feet, as one walks
+FALLING = 0.3  # [m], farther out it is held by something else
 NEIGHBOURS = 1.0  # [s] before and after lying that tell where it is
 
 
@@ -73,9 +78,50 @@ def support_price(
 
 def level_price(floor: Float[Tensor, " floor"], known: float | None) -> Float[Tensor, ""]:
     """Squared slopes of the floor, and where it is known its height, in what may be."""
-    tilt = TILT if known is None else KNOWN_TILT
-    price = floor[:2].square().sum() / tilt**2
+    tilt = (ROLL, PITCH) if known is None else (KNOWN_TILT, KNOWN_TILT)
+    price = (floor[:2] / floor.new_tensor(tilt)).square().sum()
     return price if known is None else price + ((floor[2] - known) / KNOWN_HEIGHT).square()
+
+
+def center_of_mass(joints: Float[Tensor, "bodies joints 3"]) -> Float[Tensor, "bodies 3"]:
+    """Centre of mass by the segments of Winter 2009, Table 4.1 (head, arms, trunk as one) [m]."""
+
+    def middle(name: str) -> Float[Tensor, "bodies 3"]:
+        return joints[:, [BODY.index(f"{side}_{name}") for side in ("left", "right")]].mean(1)
+
+    hip, knee, ankle = middle("hip"), middle("knee"), middle("ankle")
+    upper = hip + 0.626 * (middle("shoulder") - hip)
+    thigh, shank = hip + 0.433 * (knee - hip), knee + 0.606 * (ankle - knee)
+    return 0.678 * upper + 0.2 * thigh + 0.122 * shank
+
+
+def standing_share(
+    joints: Float[Tensor, "bodies joints 3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, " bodies"]:
+    """From 0 to 1, how surely the legs carry a body: long legs below an upright trunk."""
+    hip, knee, ankle = (
+        joints[:, [BODY.index(f"{side}_{name}") for side in ("left", "right")]]
+        for name in ("hip", "knee", "ankle")
+    )
+    length = (hip - knee).norm(dim=-1) + (knee - ankle).norm(dim=-1)
+    legs = (((hip - ankle) @ up) / length.clamp_min(1e-3)).amin(1)
+    trunk = trunk_of(joints) @ up
+    ramps = [((x - low) / (high - low)).clamp(0, 1) for x, (low, high) in
+             ((legs, STRAIGHT), (trunk, UPRIGHT))]  # fmt: skip
+    return ramps[0] * ramps[1]
+
+
+def balance_cost(
+    joints: Float[Tensor, "bodies joints 3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, " bodies"]:
+    """Squared horizontal distance of the centre of mass from the middle of the feet [m²].
+
+    A standing body is in balance (Tripathi et al. 2023, IPMAN, Sec. 3.3): keypoints hardly show
+    that it leans towards the camera, which shortens it, so that it is put too near.
+    """
+    feet = joints[:, [joint for side in FEET for joint in side]].mean(1)
+    off = center_of_mass(joints) - feet
+    return (off - (off @ up)[:, None] * up).square().sum(-1)
 
 
 def laid_price(

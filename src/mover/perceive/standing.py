@@ -88,7 +88,9 @@ def standing_on(picture: Picture, bodies: Bodies, run: Run) -> Picture:
     standing = FootContactInputs(bodies, parts, keep, camera)
     feet = run.stage(find_foot_contacts, standing, FootContactConfig())
     config = GUESSED if picture.tilt_spread is None else SEEN
-    found = run.stage(align_camera, AlignInputs(feet, camera, None, None), config)
+    lean = POSES if picture.tilt_spread is None else 0.0
+    inputs = AlignInputs(feet, camera, None, None, lean=lean)
+    found = run.stage(align_camera, inputs, config)
     if found.ground >= 0:
         return picture
     prior = camera_prior(found, picture, bodies.size_spread or 0.0)
@@ -109,8 +111,8 @@ def camera_prior(found: Alignment, picture: Picture, size: float) -> CameraPrior
     height = -found.ground
     to_log = torch.tensor([1.0, 1.0, -1 / height], dtype=torch.float64)
     covariance = found.covariance.double().cpu() * to_log * to_log[:, None]
-    lean = POSES if picture.tilt_spread is None else picture.tilt_spread
-    covariance += torch.tensor([lean**2, lean**2, HEIGHTS**2 + size**2]).double().diag()
+    tilt = picture.tilt_spread or 0.0
+    covariance += torch.tensor([tilt**2, tilt**2, HEIGHTS**2 + size**2]).double().diag()
     pitch, roll = (float(x) for x in pitch_roll(found.camera.R_cam_world.double()))
     observed = torch.tensor([pitch, roll, math.log(height)], dtype=torch.float64)
     before = [float(x) for x in pitch_roll(picture.camera.R_cam_world.double())]

@@ -24,7 +24,7 @@ from mover.stages.objects.find_image_cues import people_in_reference
 from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
-LEAN = math.radians(0.5)  # of the floor under fitted bodies, whose distances err together [rad]
+LEAN = math.radians(2.0)  # of the floor under fitted bodies, whose poses err together [rad]
 NEAREST = 0.3  # [m], no object is nearer to the reference image's camera
 
 

@@ -220,7 +220,7 @@ class AlignInputs:
     tilt_spread: float | None = None
     """How far off that pitch and roll are [rad]; None: as `AlignConfig` has it."""
     lean: float = 0.0
-    """How far the plane under the feet may lean as a whole, which no foot tells [rad]."""
+    """How far the plane under the feet may lean as a whole, an error that all feet share [rad]."""
 
 
 @record
@@ -249,7 +249,7 @@ def align_camera(
     if not len(feet.person):
         return _without_feet(inputs, config)
     votes, first = vote(feet, config.votes), torch.stack(pitch_roll(camera.R_cam_world.double()))
-    votes, leaning = _doubted(inputs, config, votes, first)
+    votes, leaning = _leaning(inputs, config, votes, first)
     fit = _best_fit(inputs, config, votes, first)
     observe(Step("align_camera", 0, 1))
     spread = covariance_of(fit, votes) + leaning
@@ -265,22 +265,25 @@ def align_camera(
     return dataclasses.replace(found, warnings=warnings)
 
 
-def _doubted(
+def _leaning(
     inputs: AlignInputs, config: AlignConfig, votes: Votes, first: Float[Tensor, "2"]
 ) -> tuple[Votes, Float[Tensor, "3 3"]]:
-    """The votes as light, beside a tilt that is told, as the lean of all makes them.
+    """The votes down-weighted as a lean that all of them share makes them beside another tilt.
 
-    And what the lean adds to the covariance.
+    And what the lean adds to the covariance: the plane turns about the middle of the feet, so that
+    the ground below the camera moves with it.
     """
-    none = torch.zeros(3, 3, dtype=torch.float64)
-    if not inputs.lean or inputs.tilt_spread is None:
-        return votes, none
-    alone = _best_fit(dataclasses.replace(inputs, tilt_spread=None), config, votes, first)
-    own = float(covariance_of(alone, votes).diag()[:2].mean())
-    whole, told = own + inputs.lean**2, inputs.tilt_spread**2
-    tilt = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64).diag()
-    added = (inputs.lean * told / (told + whole)) ** 2 * tilt
-    return dataclasses.replace(votes, weight=votes.weight * own / whole), added
+    if not inputs.lean:
+        return votes, torch.zeros(3, 3, dtype=torch.float64)
+    free = _best_fit(dataclasses.replace(inputs, tilt_spread=None), config, votes, first)
+    own = float(covariance_of(free, votes).diag()[:2].mean())
+    whole, known = own + inputs.lean**2, (inputs.tilt_spread or config.tilt_prior) ** 2
+    _, slope = _linear(free.at, votes)
+    middle = (votes.weight[:, None] * slope[:, :2]).sum(0) / votes.weight.sum()
+    turns = torch.cat([torch.eye(2, dtype=torch.float64), middle[:, None]], 1)
+    share = inputs.lean * known / (known + whole)
+    weighted = dataclasses.replace(votes, weight=votes.weight * own / whole)
+    return weighted, share**2 * turns.mT @ turns
 
 
 def _best_fit(
