@@ -188,14 +188,21 @@ def test_a_floor_that_leans_as_a_whole_is_set_right_by_a_tilt_that_is_told(slope
     assert bool((spread < 1.2 * told).all())
 
 
-def test_where_no_tilt_is_told_a_lean_changes_nothing():
-    soles = soles_at(room(), noise=0.01)
-    found = [
-        align_camera(AlignInputs(soles, camera_off((2.0, 1.0)), None, None, None, lean))
-        for lean in (0.0, 0.02)
-    ]
-    assert torch.equal(found[0].camera.R_cam_world, found[1].camera.R_cam_world)
-    assert torch.equal(found[0].covariance, found[1].covariance)
+def test_a_lean_that_all_feet_share_is_in_the_covariance():
+    lean, soles = math.radians(2.0), soles_at(room(), noise=0.01)
+    plain, shared = (
+        align_camera(AlignInputs(soles, camera_off((0.5, -0.5)), None, None, None, value))
+        for value in (0.0, lean)
+    )
+    assert bool((shared.covariance.diag()[:2].sqrt() > 0.6 * lean).all())
+    assert bool((plain.covariance.diag()[:2].sqrt() < 0.3 * lean).all())
+    # the plane turns about the middle of the feet: pitch and ground err together
+    R = plain.camera.R_cam_world.to(soles.points_cam)
+    away = float((soles.points_cam @ R)[:, 2].mean().abs())
+    ground = float(shared.covariance[2, 2].sqrt() / shared.covariance[0, 0].sqrt())
+    assert ground == pytest.approx(away, rel=0.15)
+    correlation = shared.covariance[0, 2] / shared.covariance.diag()[[0, 2]].prod().sqrt()
+    assert abs(float(correlation)) > 0.9
 
 
 def test_frames_of_one_pose_are_no_new_evidence():

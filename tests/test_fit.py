@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from mover.fitting.energy import (
     geman_mcclure,
     smooth_joint_price,
 )
+from mover.fitting.ground import balance_cost, center_of_mass, standing_share
 from mover.fitting.limits import limit_price, limit_table, resting
 from mover.fitting.offsets import lasting_of, offset_cost
 from mover.fitting.prior import ANGLES, same
@@ -33,7 +35,7 @@ from mover.fitting.stature import UNKNOWN, height_cost, shape_cost, size_of, sta
 from mover.fitting.tracks import best_path, seen_of, triples_of
 from mover.fitting.unknowns import Frame, Unknowns, move, points_of, rig_of
 from mover.geometry.camera import project
-from mover.geometry.rotations import axis_angle
+from mover.geometry.rotations import axis_angle, rot_x
 from mover.io.capture.scene_file import write_scene
 
 QUICK = FitConfig(
@@ -93,6 +95,21 @@ def test_the_shape_costs_its_proportions_and_the_height_beside_those_of_adults()
     torch.testing.assert_close(
         shape_cost(known, betas), torch.tensor([0.0, 4.0]), atol=1e-4, rtol=0
     )
+
+
+def test_a_body_that_leans_as_a_whole_falls_and_one_that_stands_does_not(walk):
+    joints = walk.joints[:, :22]
+    up = torch.tensor([0.0, -1.0, 0.0])
+    assert standing_share(joints, up).median() == 1
+    feet = joints[:, [7, 8, 10, 11]].mean(1)
+    assert balance_cost(joints, up).sqrt().median() < 0.06
+    lean = math.radians(20)
+    turned = (joints - feet[:, None]) @ rot_x(torch.tensor(lean)).mT + feet[:, None]
+    high = ((center_of_mass(joints) - feet) @ up).median()
+    moved = balance_cost(turned, up).sqrt().median()
+    assert float(moved) == pytest.approx(float(high) * math.sin(lean), abs=0.06)
+    lying = (joints - feet[:, None]) @ rot_x(torch.tensor(math.pi / 2)).mT
+    assert standing_share(lying, up).max() == 0
 
 
 def test_offsets_cost_their_squared_deviations_by_the_name_of_the_keypoint():
