@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mover import __version__
 from mover.app.pictures.film import pixels
-from mover.app.pictures.overlay import WIDEST, canvas, draw_overlay, on_cpu, shrink
+from mover.app.pictures.overlay import WIDEST, canvas, draw_overlay, on_cpu
 from mover.app.report.plan import draw_top, extent_of
 from mover.app.report.scene_view import ReportScene, pack_view
 from mover.app.report.tables import (
@@ -112,7 +112,6 @@ def _page(content: ReportContent) -> str:
         curves=draw_curves(content.traces),
         longest=max([float(s.get("seconds") or 0) for s in content.stages], default=0.0) or 1.0,
         settings=settings_of(content.config),
-        photo="" if content.image is None else _data_url(shrink(content.image, WIDEST)),
         view=view,
     )
 

@@ -3,21 +3,23 @@
 import base64
 import json
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.core.colours import colour, css, person_colour
-from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject
+from mover.core.types import Bodies, Mesh, Scene
 from mover.geometry.mesh import simplifying
 from mover.geometry.placement import place_object
-from mover.geometry.topology import distinct_rows
 
 GRAIN = 1e-4  # share of the longest side within which vertices are the same
+FACES_OBJECT, FACES_BODY = 3000, 1600  # at most
+MOMENTS, ROWS = 120, 240  # at most so many frames, and so many bodies in them
+STEPS = 32767  # half of the range of a 16-bit coordinate
+EYE_HEIGHT = 1.5  # [m], of a camera above an unknown floor
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,17 @@ def thin(mesh: Mesh, count: int) -> Mesh:
     """The mesh with at most about `count` faces; soups are welded first."""
     from fast_simplification import simplify
 
-    verts, faces = _welded(mesh)
+    verts = mesh.verts.detach().cpu().double().numpy()
+    faces = mesh.faces.cpu().long().numpy()
+    used, faces = np.unique(faces, return_inverse=True)
+    verts, faces = verts[used], faces.reshape(-1, 3)
+    grain = GRAIN * max(float(np.ptp(verts, axis=0).max()), 1e-9)
+    rounded = np.round(verts / grain).astype(np.int64)
+    _, first, same = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    verts, faces = verts[first], same.reshape(-1)[faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]
+    faces = faces[np.sort(once)]
     if len(faces) > count:
         with simplifying:
             verts, faces, *_ = simplify(verts, faces.astype(np.int32), target_count=count)
@@ -70,31 +82,6 @@ def thin_choice(
     return Thinning(torch.from_numpy(choice), torch.from_numpy(np.asarray(kept_faces, np.int64)))
 
 
-def _welded(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices that share a place become one; collapsed and doubled triangles go."""
-    verts = mesh.verts.detach().cpu().double().numpy()
-    faces = mesh.faces.cpu().long().numpy()
-    used, faces = np.unique(faces, return_inverse=True)
-    verts, faces = verts[used], faces.reshape(-1, 3)
-    grain = GRAIN * max(float(np.ptp(verts, axis=0).max()), 1e-9)
-    first, same = distinct_rows(np.round(verts / grain).astype(np.int64))
-    faces = same[faces]
-    kept = (faces != np.roll(faces, 1, axis=1)).all(1)
-    once, _ = distinct_rows(np.sort(faces[kept], axis=1))
-    return verts[first], faces[kept][np.sort(once)]
-
-
-# The text and the bytes.
-
-
-FACES_OBJECT = 3000  # at most, of each object
-FACES_BODY = 1600
-MOMENTS = 120  # at most so many frames
-ROWS = 240  # and so many bodies in them
-STEPS = 32767  # half of the range of a 16-bit coordinate
-EYE_HEIGHT = 1.5  # [m], of a camera above a floor that nobody knows
-
-
 @dataclass(frozen=True)
 class ReportScene:
     """Data of the 3D view."""
@@ -102,129 +89,78 @@ class ReportScene:
     text: str
     """JSON: placements, cameras, and where each array lies in `block`."""
     block: str
-    """Little-endian arrays, base64."""
-
-
-class Block:
-    """Bytes that grow by arrays; each starts at a multiple of four."""
-
-    def __init__(self) -> None:
-        self.parts: list[bytes] = []
-        self.size = 0
-
-    def add(self, array: Tensor) -> int:
-        """Append `array` and return where it starts [bytes]."""
-        start, raw = self.size, array.contiguous().numpy().tobytes()
-        raw += bytes(-len(raw) % 4)
-        self.parts.append(raw)
-        self.size += len(raw)
-        return start
+    """Little-endian arrays, base64: 16-bit vertices in steps from a middle, and faces."""
 
 
 def pack_view(scenes: dict[str, Scene], bodies: dict[str, Bodies]) -> ReportScene:
     """Pack the scenes (`initial`, `result`, `truth`) and the bodies in the world of each."""
-    block = Block()
-    meshes: list[_Packed] = []
-    packed: list[dict[str, Any]] = []
-    tree: dict[str, Any] = {"scenes": {}}
+    block, meshes, packed = bytearray(), list[Mesh](), list[dict[str, Any]]()
+
+    def index_of(mesh: Mesh) -> int:
+        """A mesh that several scenes hold is packed once."""
+        for index, other in enumerate(meshes):
+            if other is mesh or (other.faces.equal(mesh.faces) and other.verts.equal(mesh.verts)):
+                return index
+        meshes.append(mesh)
+        few = thin(mesh, FACES_OBJECT)
+        wide = len(few.verts) >= 2**16
+        packed.append(
+            _packed_points(few.verts, block)
+            | _packed_faces(few.faces, wide, block)
+            | {"top": round(float(few.verts[:, 1].max()), 6)}
+        )
+        return len(packed) - 1
+
+    tree: dict[str, Any] = {"scenes": {}, "meshes": packed}
     for name, scene in scenes.items():
-        pieces = [
-            _pack_object(p, i, _shared(p, meshes, packed, block))
-            for i, p in enumerate(scene.objects)
-        ]
-        floor = floor_of(scene, bodies.get(name))
+        K = scene.camera.K.tolist()
         tree["scenes"][name] = {
-            "camera": _pack_camera(scene.camera),
-            "floor": floor,
-            "pieces": pieces,
-        }
-    tree["meshes"] = packed
-    tree["people"] = _pack_people(bodies, block)
+            "camera": {
+                "R": _numbers(scene.camera.R_cam_world.reshape(-1)),
+                "f": [K[0][0], K[1][1]],
+                "c": [K[0][2], K[1][2]],
+                "size": [scene.camera.width, scene.camera.height],
+            },
+            "floor": floor_of(scene, bodies.get(name)),
+            "pieces": [
+                {
+                    "id": item.id, "category": item.category, "colour": css(colour(index)),
+                    "mesh": index_of(item.mesh), "t": _numbers(item.t_world_object),
+                    "yaw": round(float(item.yaw), 6), "scale": _numbers(item.scale),
+                }
+                for index, item in enumerate(scene.objects)
+            ],
+        }  # fmt: skip
+    tree["people"] = _packed_people(bodies, block)
+    name = "result" if "result" in scenes else next(iter(scenes))
+    tree["room"] = _room(scenes[name], bodies.get(name))
     text = json.dumps(tree, separators=(",", ":")).replace("<", "\\u003c")
-    return ReportScene(text, base64.b64encode(b"".join(block.parts)).decode())
+    return ReportScene(text, base64.b64encode(bytes(block)).decode())
 
 
-class _Packed(NamedTuple):
-    """A mesh that is in the block."""
-
-    mesh: Mesh
-    thinned: Mesh
-    place: int
-
-
-def _shared(
-    piece: SceneObject, seen: list[_Packed], packed: list[dict[str, Any]], block: Block
-) -> int:
-    """Index of the packed mesh; a mesh that several scenes hold is packed once."""
-    mesh = piece.mesh
-    for other in seen:
-        if other.mesh is mesh or _alike(other.mesh, mesh):
-            return other.place
-    fewer = _raised(piece, seen) or thin(mesh, FACES_OBJECT)
-    low, step, coarse = _coarse(fewer.verts)
-    packed.append(
-        {
-            "verts": block.add(coarse),
-            "n_verts": len(coarse),
-            "faces": block.add(
-                fewer.faces.to(torch.uint16 if len(coarse) < 2**16 else torch.int32)
-            ),
-            "n_faces": len(fewer.faces),
-            "wide": len(coarse) >= 2**16,
-            "middle": low,
-            "step": step,
-        }
-    )
-    seen.append(_Packed(mesh, fewer, len(packed) - 1))
-    return len(packed) - 1
+def _added(array: Tensor, block: bytearray) -> int:
+    """Where an array starts in the block [bytes]: each at a multiple of four."""
+    start = len(block)
+    block += array.contiguous().numpy().tobytes()
+    block += bytes(-len(block) % 4)
+    return start
 
 
-def _alike(one: Mesh, other: Mesh) -> bool:
-    """Whether two meshes are the same, to the bit."""
-    return one.faces.equal(other.faces) and one.verts.equal(other.verts)
-
-
-def _raised(piece: SceneObject, seen: list[_Packed]) -> Mesh | None:
-    """The thinned mesh of the given one, raised as this one was; None: it is not packed."""
-    if piece.stretch is None:
-        return None
-    for other in seen:
-        if other.mesh.faces.equal(piece.mesh.faces) and piece.mesh.verts.equal(
-            piece.stretch.of(other.mesh.verts)
-        ):
-            return Mesh(piece.stretch.of(other.thinned.verts), other.thinned.faces)
-    return None
-
-
-def _coarse(points: Float[Tensor, "*any 3"]) -> tuple[list[float], float, Tensor]:
-    """Middle [m], step [m] and the points in steps from the middle, as 16-bit integers."""
-    flat = points.detach().cpu().double().reshape(-1, 3)
-    low, high = flat.amin(0), flat.amax(0)
+def _packed_points(points: Float[Tensor, "*any 3"], block: bytearray) -> dict[str, Any]:
+    """Middle [m], step [m] and where the points are, in steps from the middle."""
+    points = points.detach().cpu().double()
+    low, high = points.reshape(-1, 3).amin(0), points.reshape(-1, 3).amax(0)
     middle, step = (low + high) / 2, max(float((high - low).amax()) / 2 / STEPS, 1e-9)
-    whole = ((points.detach().cpu().double() - middle) / step).round().to(torch.int16)
-    return [round(v, 6) for v in middle.tolist()], step, whole
-
-
-def _pack_object(piece: SceneObject, index: int, mesh: int) -> dict[str, Any]:
+    whole = ((points - middle) / step).round().to(torch.int16)
     return {
-        "id": piece.id,
-        "category": piece.category,
-        "colour": css(colour(index)),
-        "mesh": mesh,
-        "t": _numbers(piece.t_world_object),
-        "yaw": round(float(piece.yaw), 6),
-        "scale": _numbers(piece.scale),
-    }
+        "verts": _added(whole, block), "n_verts": points.shape[-2], "middle": _numbers(middle),
+        "step": step,
+    }  # fmt: skip
 
 
-def _pack_camera(camera: Camera) -> dict[str, Any]:
-    K = camera.K.tolist()
-    return {
-        "R": _numbers(camera.R_cam_world.reshape(-1)),
-        "f": [K[0][0], K[1][1]],
-        "c": [K[0][2], K[1][2]],
-        "size": [camera.width, camera.height],
-    }
+def _packed_faces(faces: Int[Tensor, "faces 3"], wide: bool, block: bytearray) -> dict[str, Any]:
+    start = _added(faces.to(torch.int32 if wide else torch.uint16), block)
+    return {"faces": start, "n_faces": len(faces), "wide": wide}
 
 
 def _numbers(values: Tensor) -> list[float]:
@@ -232,53 +168,53 @@ def _numbers(values: Tensor) -> list[float]:
 
 
 def floor_of(scene: Scene, bodies: Bodies | None = None) -> float:
-    """Height of the floor, or of the lowest thing where no floor is known [m]."""
+    """Height of the floor, or of the lowest point where no floor is known [m]."""
     if scene.ground is not None:
         return scene.ground
-    lows = [place_object(p).verts[p.mesh.faces.unique(), 1].amin() for p in scene.objects]
+    lows = [place_object(o).verts[o.mesh.faces.unique(), 1].amin() for o in scene.objects]
     if bodies is not None and len(bodies.verts):
         lows.append(bodies.verts[..., 1].amin())
     return float(torch.stack(lows).amin()) if lows else -EYE_HEIGHT
 
 
-def _pack_people(bodies: dict[str, Bodies], block: Block) -> dict[str, Any] | None:
-    """Evenly chosen frames of everybody, in each world, with one thinned topology."""
+def _room(scene: Scene, bodies: Bodies | None) -> dict[str, Any]:
+    """Middle and radius of all that is seen, above the floor [m]."""
+    points = [place_object(o).verts.detach().reshape(-1, 3).double() for o in scene.objects]
+    if bodies is not None and len(bodies.verts):
+        points.append(bodies.verts[:, ::17].detach().reshape(-1, 3).double())
+    if not points:
+        return {"middle": [0.0, 0.6, -3.0], "radius": 4.0}
+    both = torch.cat(points) - torch.tensor([0.0, floor_of(scene, bodies), 0.0]).double()
+    low, high = both.amin(0), both.amax(0)
+    return {
+        "middle": _numbers((low + high) / 2),
+        "radius": max(1.0, float((high - low).norm()) / 2),
+    }
+
+
+def _packed_people(bodies: dict[str, Bodies], block: bytearray) -> dict[str, Any] | None:
+    """Evenly chosen frames of all people, in each world, with one thinned topology."""
     bodies = {name: b for name, b in bodies.items() if len(b.verts)}
     if not bodies:
         return None
     main = bodies.get("result", next(iter(bodies.values())))
-    bodies = {n: b for n, b in bodies.items() if b.verts.shape == main.verts.shape}
-    people = main.person.unique().tolist()
-    frames = _moments(main, max(1, min(MOMENTS, ROWS // len(people))))
+    people, frames = main.person.unique().tolist(), main.frame.unique()
+    count = min(len(frames), max(1, min(MOMENTS, ROWS // len(people))))
+    moments = frames[torch.linspace(0, len(frames) - 1, count).round().long().unique()].tolist()
     few = thin_choice(main.verts[len(main.verts) // 2], main.faces, FACES_BODY)
-    rows = [r for r in range(len(main.verts)) if int(main.frame[r]) in set(frames)]
+    rows = [r for r in range(len(main.verts)) if int(main.frame[r]) in set(moments)]
+    tops = [main.verts[main.frame == f, :, 1].amax(-1).amin() for f in moments]
     return {
-        "faces": block.add(few.faces.to(torch.uint16)),
-        "n_faces": len(few.faces),
+        **_packed_faces(few.faces, False, block),
         "n_verts": len(few.kept),
         "fps": main.fps,
-        "frames": frames,
+        "frames": moments,
         "colours": {str(p): css(person_colour(p)) for p in people},
         "rows": [[int(main.frame[r]), int(main.person[r])] for r in rows],
-        "worlds": {name: _pack_rows(b, rows, few, block) for name, b in bodies.items()},
-        "opening": _opening(main, frames),
+        "worlds": {
+            name: _packed_points(b.verts[rows][:, few.kept], block)
+            for name, b in bodies.items()
+            if b.verts.shape == main.verts.shape
+        },
+        "opening": int(torch.stack(tops).argmin()),  # where a body is lowest: seated or lying
     }
-
-
-def _pack_rows(bodies: Bodies, rows: list[int], few: Thinning, block: Block) -> dict[str, Any]:
-    middle, step, coarse = _coarse(bodies.verts[rows][:, few.kept])
-    return {"verts": block.add(coarse), "middle": middle, "step": step}
-
-
-def _moments(bodies: Bodies, count: int) -> list[int]:
-    """At most `count` frames, evenly chosen, the first and the last among them."""
-    frames = bodies.frame.unique()
-    picks = torch.linspace(0, len(frames) - 1, min(count, len(frames))).round().long()
-    return frames[picks.unique()].tolist()
-
-
-def _opening(bodies: Bodies, frames: list[int]) -> int:
-    """The moment to open with: where somebody's body is lowest (sitting or lying)."""
-    rows = [(bodies.frame == f).nonzero()[:, 0] for f in frames]
-    tops = torch.stack([bodies.verts[r, :, 1].amax(-1).amin() for r in rows])
-    return int(tops.argmin())
