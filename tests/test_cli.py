@@ -1,7 +1,7 @@
 import errno
-import functools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,9 +14,7 @@ import tiny_capture
 
 from mover.app import cli
 from mover.app.cli.run import parse_run
-from mover.app.results import read_config
-from mover.core.records import plain
-from mover.pipeline.presets import OLD_NAMES, PRESETS
+from mover.pipeline.presets import PRESETS
 
 
 def call(*arguments, cwd=None):
@@ -82,35 +80,16 @@ def test_flags_change_a_preset_wherever_they_stand(before):
     assert config.place.method == PRESETS["paper"].place.method
 
 
-FLAGS = {bool: "--no-{}", int: "--{}=7", float: "--{}=0.25"}  # another value than `robust` has
-INSIDE = {"soles": "--{}.points=7", "touches": "--{}.no-given"}  # of groups of settings
-
-
-@pytest.mark.parametrize(("old", "new"), OLD_NAMES.items())
-def test_an_old_flag_does_what_the_present_one_does_and_says_its_name(old, new, capsys):
-    before = functools.reduce(getattr, new.split("."), PRESETS["robust"])
-    flag = INSIDE.get(old) or FLAGS[type(before)]
-    _, config = parse_run(["capture", *flag.format(old).split("=")])
-    assert f"is called {flag.format(new).split('=')[0]} now" in capsys.readouterr().err
-    for present in (flag.format(new), flag.format(new).replace("_", "-")):
-        _, expected = parse_run(["capture", present])
-        assert config == expected != PRESETS["robust"]
-    assert not capsys.readouterr().err
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_a_run_of_before_gives_its_settings_and_says_their_names(preset, tmp_path, caplog):
-    tree = plain(PRESETS[preset])
-    for old, new in OLD_NAMES.items():
-        *stage, key = new.split(".")
-        settings = tree[stage[0]] if stage else tree
-        settings[old.rpartition(".")[2]] = settings.pop(key)
-    path = tmp_path / "run.json"
-    path.write_text(json.dumps({"config": tree}))
-    assert read_config(path) == PRESETS[preset]
-    assert len(caplog.messages) == len(OLD_NAMES)
-    for old, new in OLD_NAMES.items():
-        assert f"{path}: config.{old} is called config.{new} now" in caplog.messages
+def test_run_has_few_flags_and_the_first_screen_shows_those_that_people_use(capsys):
+    shown = {}
+    for word in ("--help", "--help-all"):
+        with pytest.raises(SystemExit):
+            cli.run_command("run", [word])
+        shown[word] = set(re.findall(r"^[│ ]*(--[a-z_.-]+)", capsys.readouterr().out, re.M))
+    assert len(shown["--help"]) <= 14
+    assert len(shown["--help-all"]) <= 60
+    assert {"--preset", "--out", "--edits"} <= shown["--help"] < shown["--help-all"]
+    assert "--place.weights.depth" in shown["--help-all"]
 
 
 def test_a_wrong_preset_is_answered_with_the_known_ones(capsys):

@@ -43,7 +43,7 @@ NETWORKS = [
 QUICK = {
     "run": RUN,
     "batch": RUN,
-    "perceive": [*NETWORKS, "--models.device", "cpu", "--detect.score", "0", "--no-layout"],
+    "perceive": [*NETWORKS, "--detect.score", "0", "--no-layout"],
     "layout": ["--shapes", "2", "--keep", "2", "--turns", "2", "--screen.method.steps", "10"],
     "export": ["--body", "skin"],
 }

@@ -170,10 +170,13 @@ def test_a_file_of_settings_is_refused_with_the_field(tree, words, tmp_path):
     assert "run.json" in str(caught.value)
 
 
-@pytest.mark.parametrize("command", list(COMMANDS))
-def test_help_shows_the_range_of_each_number(command, capsys):
+@pytest.mark.parametrize(
+    ("command", "word"),
+    [*((name, "--help") for name in COMMANDS), ("run", "--help-all"), ("video", "--help-all")],
+)
+def test_help_shows_the_range_of_each_number(command, word, capsys):
     with pytest.raises(SystemExit):
-        run_command(command, ("--help",))
+        run_command(command, (word,))
     shown = capsys.readouterr().out
     assert " INT " not in shown
     assert " FLOAT " not in shown

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import logging
 import platform
 import sys
 from collections.abc import Mapping
@@ -30,10 +29,9 @@ from mover.io.export.contacts import write_labels
 from mover.io.export.scene_glb import write_glb
 from mover.io.files.fields import get, read_json, refuse
 from mover.pipeline.outcome import label_inputs
-from mover.pipeline.presets import Config, with_present_keys
+from mover.pipeline.presets import Config
 from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
 
-log = logging.getLogger(__name__)
 POINTS = 500  # of a trace, about, that run.json keeps
 
 
@@ -179,7 +177,4 @@ def read_config(path: Path) -> Config:
     at = get(read_json(path), "config")
     if not isinstance(at.value, Mapping):
         refuse(at, "the settings of a run {...}")
-    config, renamed = with_present_keys(at.value)
-    for sentence in renamed:
-        log.warning("%s: %s", path, sentence)
-    return read_settings(Config, config, f"{path}: config")
+    return read_settings(Config, at.value, f"{path}: config")

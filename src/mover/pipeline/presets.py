@@ -4,10 +4,8 @@
 `robust`: ours; docs/method.md gives the reason for each departure.
 """
 
-import argparse
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from mover.core.settings import float_in, int_in
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
@@ -136,87 +134,6 @@ ROBUST = Config(
     turn_to_people=True,
     silhouette_confidence=True,
 )  # fmt: skip
-
-METHODS = {"adam": Adam, "newton": BatchedBFGS}
-"""How a descent goes down: `--place.method newton` chooses one, with its own settings."""
-
-
-OLD_NAMES = {
-    "soles": "foot_contacts",
-    "touches": "contacts",
-    "again": "outer_iterations",
-    "slide": "slide_to_floor",
-    "trust": "silhouette_confidence",
-    "refine.growth": "refine.uniform_scale_weight",
-    **{
-        f"{stage}.{old}": f"{stage}.{new}"
-        for stage in ("layout", "place")
-        for old, new in (
-            ("keep", "num_hypotheses"), ("shaken", "perturbations"),
-            ("rounds", "perturbation_rounds"), ("lined", "wall_alignment_steps"),
-            ("tie", "yaw_prior_weight"), ("growth", "uniform_scale_weight"),
-        )
-    },
-}  # fmt: skip
-"""What settings were called before, for one release: flags and run.json may still say so."""
-
-
-def with_present_flags(arguments: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
-    """The arguments with the present names of settings, and a sentence for each that had another.
-
-    A flag may have its value after `=`, dashes in place of underscores, and `no-` before a switch.
-    """
-    present: list[str] = []
-    sentences: list[str] = []
-    for argument in arguments:
-        flag, equals, value = argument.partition("=")
-        prefix = "--no-" if flag.startswith("--no-") else "--"
-        old = flag.removeprefix(prefix)
-        new = _present_name(old)
-        if flag.startswith("--") and new != old:
-            sentences.append(f"{flag} is called {prefix}{new} now")
-            argument = f"{prefix}{new}{equals}{value}"
-        present.append(argument)
-    return present, tuple(sentences)
-
-
-def _present_name(name: str) -> str:
-    """`soles.speed` is `foot_contacts.speed`."""
-    plain = name.replace("-", "_")
-    for old, new in OLD_NAMES.items():
-        if plain == old or plain.startswith(f"{old}."):
-            return new + name[len(old) :]
-    return name
-
-
-def with_present_keys(tree: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """The settings of a run.json under their present names, and a sentence for each old one."""
-    present = {k: dict(v) if isinstance(v, Mapping) else v for k, v in tree.items()}
-    sentences: list[str] = []
-    for old, new in OLD_NAMES.items():
-        stage, _, key = old.rpartition(".")
-        settings = present.get(stage) if stage else present
-        if isinstance(settings, dict) and key in settings:
-            settings[new.rpartition(".")[2]] = settings.pop(key)
-            sentences.append(f"config.{old} is called config.{new} now")
-    return present, tuple(sentences)
-
-
-def with_methods(config: Config, arguments: Sequence[str]) -> tuple[Config, list[str]]:
-    """Replace the methods of descents that are named, and return the other arguments."""
-    parser = argparse.ArgumentParser(prog="mover run", add_help=False, allow_abbrev=False)
-    names = [f"{stage}.{use}" for stage in ("layout", "place") for use in ("short", "method")]
-    for name in names:
-        parser.add_argument(f"--{name}", dest=name, choices=tuple(METHODS))
-    chosen, rest = parser.parse_known_args(list(arguments))
-    for name in names:
-        stage, use = name.split(".")
-        method = getattr(chosen, name)
-        if method is not None:
-            changed = replace(getattr(config, stage), **{use: METHODS[method]()})
-            config = replace(config, **{stage: changed})
-    return config, rest
-
 
 PRESETS = {"paper": PAPER, "robust": ROBUST}
 _Pricing = TypeVar("_Pricing", PlaceConfig, RefineConfig)

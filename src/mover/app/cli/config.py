@@ -1,79 +1,195 @@
-"""Which settings a command line asks for: a preset, a file, and the methods of descents."""
+"""Which settings a command line asks for: a preset or a file, and the flags that change it.
+
+The flags of a command are the fields of its arguments and the settings in a table; all other
+settings can be set by a file (`--config`).
+"""
 
 import argparse
+import functools
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import field, make_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import tyro
 from tyro.conf import arg
 
 from mover.app.cli import say
 from mover.core.errors import InputError
-from mover.core.settings import check_settings
-from mover.pipeline.presets import PRESETS, Config, with_methods, with_present_flags
+from mover.core.settings import check_settings, settings_of
+from mover.energy.config import Adam, BatchedBFGS
+from mover.pipeline.presets import PRESETS, Config
 
 T = TypeVar("T")
 C = TypeVar("C")
 Device = Literal["auto", "cpu", "cuda"]
 """Where the heavy stages compute, see `core.devices.device_of`."""
 
+_WEIGHTS = {
+    "bbox": "objects fill their detected boxes",
+    "silhouette": "objects cover their masks",
+    "scale": "objects keep their initial size",
+    "depth": "who hides whom bounds the depth",
+    "collision": "people move through free space",
+    "contact": "touching surfaces meet",
+    "heading": "seats face where their sitters face",
+    "wall": "furniture along a wall is in one line",
+    "given": "objects stay about as they are in the first scene",
+    "measured": "surfaces lie where a depth network sees them",
+}
+RUN_SETTINGS = {
+    **{f"place.weights.{term}": f"Weight: {text}." for term, text in _WEIGHTS.items()},
+    **{
+        f"layout.weights.{term}": f"The same before people are used: {_WEIGHTS[term]}."
+        for term in ("bbox", "silhouette", "scale", "wall", "given", "measured")
+    },
+    "place.method.steps": "Most steps of the descent with people.",
+    "place.perturbations": "Perturbed starts of that descent.",
+    "layout.method.steps": "Most steps of the descent from the image alone.",
+    "layout.yaws": "Initial orientations of each object.",
+    "layout.num_hypotheses": "Placements of each object that go on to the second descent.",
+    "layout.perturbations": "Perturbed starts of the best placements.",
+    "outer_iterations": "Further passes with contacts and occlusion order renewed.",
+    "select.rule": "How frames whose bodies jump are left out.",
+    "correct_depth": "Find one depth factor a person.",
+    "foot_contacts.speed": "A foot that is slower is at rest [m/s].",
+    "align.tilt_prior": "Expected error of the initial pitch and roll [rad].",
+    "align.offset_prior": "Expected error of the heights of feet [m].",
+    "lens.use": "Find the focal length from lines of the picture.",
+    "refine.rounds": "Rounds in which camera and floor are refined with the objects; 0: none.",
+    "sizes.usual": "Standard deviation of the logarithm of given sizes.",
+    "height_spread": "The same of people's height, where it is unknown.",
+    "seat_heights": "The height of sitters constrains the scale.",
+    "prepare.cells": "Cells along the longest side where a mesh is made watertight.",
+    "prepare.faces": "Faces of the watertight meshes.",
+    "prepare.samples": "Surface samples of an object.",
+    "prepare.watertight": "How meshes are made watertight.",
+    "prepare.occnet": "Weights of an Occupancy Network, for that.",
+    "image.size": "Longest side of an object's crop [px].",
+    "gather.cells": "Cells along the longest side of the free space.",
+    "gather.erode": "Pixels by which people's masks shrink.",
+    "contacts.given": "Use contacts.npz of the capture.",
+}
+"""Settings of `Config` that `mover run` and `mover batch` have as flags, and what they are."""
+PERCEIVE_SETTINGS = {
+    "frames.start": "Where the part of the video starts [s].",
+    "frames.end": "Where it ends; 0: with the video [s].",
+    "models.masks": "The network of masks.",
+    "models.tracker": "The network that follows people; empty: none.",
+    "models.keypoints": "The network of joints.",
+    "models.download": "Fetch networks that are missing.",
+    "detect.score": "Least certainty of a detection.",
+}
+"""The same of `PerceiveConfig`, of `mover video`, `image` and `perceive`."""
+LAYOUT_SETTINGS = {
+    "shapes": "Shapes of the library that are tried for each object.",
+    "keep": "Hypotheses of an object that are kept.",
+    "turns": "Orientations in which a shape is tried.",
+    "screen.method.steps": "Most steps of the descent of each hypothesis.",
+}
+"""The same of `LayoutConfig`, of `mover layout`."""
+METHODS = {"adam": Adam, "newton": BatchedBFGS}
+"""How a descent goes down: `--place.method newton` chooses one, with its own settings."""
+
 
 def chosen_config(arguments: Sequence[str]) -> tuple[Config, list[str]]:
     """The preset or file is read first, so that the other flags may stand before or after it."""
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early = argparse.ArgumentParser(prog="mover run", add_help=False, allow_abbrev=False)
     early.add_argument("--preset", default="robust")
     early.add_argument("--config", type=Path)
-    arguments, renamed = with_present_flags(arguments)
-    for sentence in renamed:
-        say(f"warning: {sentence}", sys.stderr)
     chosen, _ = early.parse_known_args(arguments)
-    if chosen.config is None:
-        return with_methods(preset_named(chosen.preset), arguments)
-    from mover.app.results import read_config
+    config = preset_named(chosen.preset)
+    if chosen.config is not None:
+        from mover.app.results import read_config
 
-    return with_methods(read_config(chosen.config), arguments)
+        config = read_config(chosen.config)
+    methods = argparse.ArgumentParser(prog="mover run", add_help=False, allow_abbrev=False)
+    for stage in ("layout", "place"):
+        methods.add_argument(f"--{stage}.method", dest=stage, choices=tuple(METHODS))
+    found, rest = methods.parse_known_args(list(arguments))
+    for stage, name in vars(found).items():
+        if name is not None:
+            config = _changed(config, [stage, "method"], METHODS[name]())
+    return config, rest
 
 
 def parsed(kind: Callable[..., T], prog: str, arguments: Sequence[str], *markers: Any) -> T:  # noqa: ANN401
     """The arguments of a command as its dataclass, checked before any work starts.
 
-    Args:
-        kind: The dataclass, or a function that returns dataclasses.
-        prog: The command's name.
-        arguments: What was typed after it.
-        markers: Of tyro.
-
     Raises:
         InputError: If a setting is out of its range.
     """
     found = tyro.cli(kind, prog=prog, args=list(arguments), config=markers)
-    parts: tuple[Any, ...] = found if isinstance(found, tuple) else (found,)
-    for part in parts:
-        check_settings(part, "--")
+    check_settings(found, "--")
     if sys.stderr.isatty():
         say(f"{prog}: loading ...", sys.stderr)  # of torch and others, some seconds
     return found
 
 
 def parsed_with(
-    kind: type[T],
-    config: C,
-    prog: str,
-    arguments: Sequence[str],
-    *markers: Any,  # noqa: ANN401
+    kind: type[T], config: C, settings: Mapping[str, str], prog: str, arguments: Sequence[str]
 ) -> tuple[T, C]:
-    """The same, and the settings of `config` that other flags of the command change."""
+    """The same, and the configuration with the settings that flags change.
+
+    `--help` shows the command's own flags, `--help-all` the settings as well.
+
+    Args:
+        kind: The dataclass of the command's own arguments.
+        config: What the flags change.
+        settings: The settings in it that are flags, by their dotted names, and their help.
+        prog: The command's name.
+        arguments: What was typed after it.
+
+    Raises:
+        InputError: If a setting is out of its range.
+    """
+    words = ["--help" if word == "--help-all" else word for word in arguments]
+    if "--help-all" not in arguments and {"-h", "--help"} & {*arguments} and settings:
+        more = f"{kind.__doc__}\n\n`{prog} --help-all` shows {len(settings)} settings more."
+        parsed_only: Any = functools.partial(tyro.cli, kind, prog=prog, description=more)
+        parsed_only(args=words)
+    flags: Any = make_dataclass(
+        "Settings",
+        [
+            (
+                name.replace(".", "__"),
+                Annotated[_hint(config, name), arg(name=name, help=text)],
+                field(default=functools.reduce(getattr, name.split("."), cast(Any, config))),
+            )
+            for name, text in settings.items()
+        ],
+        frozen=True,
+    )
+    default = flags()
 
     def both(
         args: Annotated[kind, arg(name="")],  # pyright: ignore[reportInvalidTypeForm]
-        config: Annotated[type(config), arg(name="")] = config,  # pyright: ignore
+        flags: Annotated[flags, arg(name="")] = default,  # pyright: ignore
     ) -> Any:  # noqa: ANN401
-        return args, config
+        return args, flags
 
     both.__doc__ = kind.__doc__
-    return parsed(both, prog, arguments, *markers)
+    args, found = tyro.cli(both, prog=prog, args=words, config=(tyro.conf.AvoidSubcommands,))
+    for name in settings:
+        config = _changed(config, name.split("."), getattr(found, name.replace(".", "__")))
+    check_settings(args, "--")
+    check_settings(config, "--")
+    if sys.stderr.isatty():
+        say(f"{prog}: loading ...", sys.stderr)
+    return args, config
+
+
+def _hint(config: Any, name: str) -> Any:  # noqa: ANN401
+    """The type of a setting, with its range."""
+    *way, key = name.split(".")
+    return settings_of(type(functools.reduce(getattr, way, config)))[key]
+
+
+def _changed(owner: Any, way: Sequence[str], value: Any) -> Any:  # noqa: ANN401
+    """Settings with one of them, or of those inside, replaced."""
+    key, *rest = way
+    return replace(owner, **{key: _changed(getattr(owner, key), rest, value) if rest else value})
 
 
 def preset_of(arguments: Sequence[str], names: Sequence[T]) -> T:

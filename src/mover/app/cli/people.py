@@ -182,7 +182,7 @@ class FitArgs:
 def fit(arguments: Sequence[str]) -> None:
     """`mover fit`."""
     preset = preset_of(arguments, tuple(FITS))
-    fit_into(*parsed_with(FitArgs, FITS[preset], "mover fit", arguments))
+    fit_into(*parsed_with(FitArgs, FITS[preset], {}, "mover fit", arguments))
 
 
 def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:

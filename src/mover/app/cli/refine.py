@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import AvoidSubcommands, Positional, arg
+from tyro.conf import Positional, arg
 
 from mover.app.cli import say
 from mover.app.cli.config import parsed, parsed_with
@@ -65,9 +65,7 @@ class ContactsArgs:
 
 def refine(arguments: Sequence[str]) -> None:
     """`mover refine`."""
-    args, config = parsed_with(
-        RefineArgs, RefineBodiesConfig(), "mover refine", arguments, AvoidSubcommands
-    )
+    args, config = parsed_with(RefineArgs, RefineBodiesConfig(), {}, "mover refine", arguments)
     import torch
 
     from mover.app.cli.progress import Bar

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import AvoidSubcommands, Positional, arg
+from tyro.conf import Positional, arg
 
 from mover.app.batch import CONFIG, FAILURES, SUMMARY, Job, RayOptions
 from mover.app.cli import say
-from mover.app.cli.config import Device, chosen_config, parsed_with
+from mover.app.cli.config import RUN_SETTINGS, Device, chosen_config, parsed_with
 from mover.core.errors import InputError
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
@@ -39,7 +39,7 @@ class RunArgs:
     preset: str = "robust"
     """paper or robust: the settings that the other flags change."""
     config_from: Annotated[Path | None, arg(name="config")] = None
-    """A run.json whose settings are used instead of a preset's."""
+    """A file of settings (a run.json) in place of a preset; it may set what has no flag, too."""
     edits: Path | None = None
     """A list of edits (edits.json of `mover view`) that is applied first."""
     device: Device = "cpu"
@@ -55,7 +55,7 @@ class RunArgs:
 def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
     """What `mover run` is asked for, and the settings."""
     config, rest = chosen_config(arguments)
-    return parsed_with(RunArgs, config, "mover run", rest, AvoidSubcommands)
+    return parsed_with(RunArgs, config, RUN_SETTINGS, "mover run", rest)
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -144,7 +144,7 @@ class BatchArgs:
     preset: str = "robust"
     """paper or robust: the settings that the other flags change."""
     config_from: Annotated[Path | None, arg(name="config")] = None
-    """A run.json whose settings are used instead of a preset's."""
+    """A file of settings (a run.json) in place of a preset; it may set what has no flag, too."""
     refine: bool = False
     """At the end of each run, refine the people with the room they helped to find."""
     ray: RayOptions = field(default_factory=RayOptions)
@@ -153,7 +153,7 @@ class BatchArgs:
 def batch(arguments: Sequence[str]) -> None:
     """`mover batch`; the exit code is 1 if a capture failed."""
     config, rest = chosen_config(arguments)
-    args, config = parsed_with(BatchArgs, config, "mover batch", rest, AvoidSubcommands)
+    args, config = parsed_with(BatchArgs, config, RUN_SETTINGS, "mover batch", rest)
     from mover.app.batch import captures_in, run_batch
 
     jobs = _jobs(args, config, captures_in(args.source, args.out))

@@ -5,11 +5,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Fixed, Positional, Suppress, arg
 
 from mover.app.chain import FIT, BodiesFrom, Steps, make_bodies, steps_in, tell_heights
 from mover.app.cli import say
-from mover.app.cli.config import Device, parsed, preset_named
+from mover.app.cli.config import (
+    LAYOUT_SETTINGS,
+    PERCEIVE_SETTINGS,
+    Device,
+    parsed_with,
+    preset_named,
+)
 from mover.app.cli.people import FitArgs, fit_into
 from mover.core.errors import InputError
 from mover.core.settings import float_in
@@ -37,7 +43,7 @@ class LayoutArgs:
     the capture, for `mover run`, too."""
     meshes: Path | None = None
     """Folder with your own shapes, named after their class: chair_0.obj."""
-    config: Annotated[LayoutConfig, arg(name="")] = field(default_factory=LayoutConfig)
+    config: Suppress[Fixed[LayoutConfig]] = field(default_factory=LayoutConfig)
 
 
 @dataclass(frozen=True)
@@ -65,12 +71,15 @@ class PerceiveArgs:
     """Find the first scene, too."""
     weights: Path | None = None
     """Folder with the networks, for a machine without a network: one folder for each."""
-    config: Annotated[PerceiveConfig, arg(name="")] = field(default_factory=PerceiveConfig)
+    config: Suppress[Fixed[PerceiveConfig]] = field(default_factory=PerceiveConfig)
 
 
 def perceive(arguments: Sequence[str]) -> None:
     """`mover perceive`."""
-    args = parsed(PerceiveArgs, "mover perceive", arguments)
+    args, config = parsed_with(
+        PerceiveArgs, PerceiveConfig(), PERCEIVE_SETTINGS, "mover perceive", arguments
+    )
+    args = replace(args, config=config)
     perceive_into(args, ready_models(args.config.models, args.weights))
     if args.layout:
         layout_into(LayoutArgs(args.out, args.depth, args.meshes))
@@ -80,8 +89,10 @@ def perceive(arguments: Sequence[str]) -> None:
 
 def layout(arguments: Sequence[str]) -> None:
     """`mover layout`."""
-    args = parsed(LayoutArgs, "mover layout", arguments)
-    layout_into(args)
+    args, config = parsed_with(
+        LayoutArgs, LayoutConfig(), LAYOUT_SETTINGS, "mover layout", arguments
+    )
+    layout_into(replace(args, config=config))
     say(f"next: mover check {args.capture}; mover run {args.capture} --out OUT")
 
 
@@ -215,7 +226,7 @@ class ChainArgs:
     """Where the room is computed: cpu, cuda or auto."""
     refine: bool = True
     """Refine the people with the room at the end."""
-    config: Annotated[PerceiveConfig, arg(name="")] = field(default_factory=PerceiveConfig)
+    config: Suppress[Fixed[PerceiveConfig]] = field(default_factory=PerceiveConfig)
 
 
 @dataclass(frozen=True)
@@ -238,15 +249,19 @@ class ImageArgs:
 
 def video(arguments: Sequence[str]) -> None:
     """`mover video`."""
-    args = parsed(VideoArgs, "mover video", arguments)
+    args, config = parsed_with(
+        VideoArgs, PerceiveConfig(), PERCEIVE_SETTINGS, "mover video", arguments
+    )
     if not args.source.exists():
         raise InputError(f"{args.source}: there is no such file, expected a video or a folder")
-    video_to_room(args.source, args.chain)
+    video_to_room(args.source, replace(args.chain, config=config))
 
 
 def image(arguments: Sequence[str]) -> None:
     """`mover image`."""
-    args = parsed(ImageArgs, "mover image", arguments)
+    args, config = parsed_with(
+        ImageArgs, PerceiveConfig(), PERCEIVE_SETTINGS, "mover image", arguments
+    )
     from mover.perceive.video import read_picture
 
     if not args.source.is_file():
@@ -258,7 +273,7 @@ def image(arguments: Sequence[str]) -> None:
     if not place.exists() or place.read_bytes() != args.source.read_bytes():
         place.write_bytes(args.source.read_bytes())
     say(ONE_IMAGE)
-    video_to_room(folder, args.chain)
+    video_to_room(folder, replace(args.chain, config=config))
 
 
 def video_to_room(source: Path, args: ChainArgs, finders: "Finders | None" = None) -> None:
