@@ -194,11 +194,7 @@ def bodies_to_arrays(bodies: Bodies) -> dict[str, NDArray[Any]]:
 
 
 def read_touch(at: At, bodies: Bodies) -> Float[Tensor, "bodies verts"]:
-    """contacts.npz: the chance that a body's vertex touches something.
-
-    Raises:
-        InputError: If it does not fit the bodies or is no probability.
-    """
+    """contacts.npz: the chance that a body's vertex touches something."""
     field = get(at, "probability")
     value = array(field, tuple(bodies.verts.shape[:2]))
     if value.min() < 0 or value.max() > 1:
@@ -221,9 +217,6 @@ def read_contacts(source: Path, bodies: Bodies, first: int = 0) -> Float[Tensor,
             a folder with one such file for each frame, whose names begin with the frame's number.
         bodies: Whose vertices these are.
         first: The number in the name of the first frame's file.
-
-    Raises:
-        InputError: If a file is missing or has other rows or vertices.
     """
     if not source.is_dir():
         return _checked(_array(source), source, bodies)

@@ -74,9 +74,6 @@ def read_instances(path: Path, names: Names, size: Size | None) -> Instances:
         path: A .json, .npz, .npy or .png file, or a folder.
         names: Categories where the source has none.
         size: Width and height of the image, for sources without it [px].
-
-    Raises:
-        InputError: If the masks are wrong or of no known kind.
     """
     if path.is_dir():
         return _of_folder(path, names, size)
@@ -148,11 +145,7 @@ class RowFields(Struct, frozen=True):
 
 
 def coco_instances(at: At, names: Names, size: Size | None) -> Instances:
-    """The annotations of a COCO file; frames are its images in the order of their ids.
-
-    Raises:
-        InputError: If a field is wrong, or the images have several sizes.
-    """
+    """The annotations of a COCO file; frames are its images in the order of their ids."""
     sizes: dict[int, Size] = {}
     for item in items(get(at, "images")):
         image = checked(item, ImageFields)
@@ -257,11 +250,7 @@ class ShapeFields(Struct, frozen=True):
 
 
 def labelme_instances(at: At) -> Instances:
-    """Labelme's polygons and rectangles; shapes of one label and `group_id` are one object.
-
-    Raises:
-        InputError: If a shape is of another type, or a field is wrong.
-    """
+    """Labelme's polygons and rectangles; shapes of one label and `group_id` are one object."""
     tree = checked(at, LabelmeFields)
     size = tree.image_width, tree.image_height
     groups: dict[tuple[str, int | None], list[list[float]]] = {}

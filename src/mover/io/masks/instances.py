@@ -45,11 +45,7 @@ class Instances:
 
 
 def mask_code(at: At) -> dict[str, Any]:
-    """The run-length code of rows of booleans, as MOVER's detections.json holds them.
-
-    Raises:
-        InputError: If they are no image of booleans.
-    """
+    """The run-length code of rows of booleans, as MOVER's detections.json holds them."""
     try:
         pixels = np.asarray(at.value)
     except ValueError:
@@ -72,11 +68,7 @@ def checked_code(segmentation: Any, size: tuple[int, int], at: At) -> bytes | No
 
 
 def fitted(found: Instances, size: tuple[int, int] | None) -> Instances:
-    """The instances in an image of this size, resampled where theirs has the same shape.
-
-    Raises:
-        InputError: If the shapes of the images differ.
-    """
+    """The instances in an image of this size, resampled where theirs has the same shape."""
     if size is None or found.size is None or found.size == size:
         return found if found.size is not None else dataclasses.replace(found, size=size)
     (w, h), (width, height) = found.size, size

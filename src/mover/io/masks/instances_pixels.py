@@ -123,9 +123,6 @@ def read_mask_pictures(
     A picture with an alpha channel that is not full is one mask. One with two values is one mask;
     one with more is a label map (a pixel is the number of a thing, 0 is nothing). Pictures whose
     names are numbers of six digits or more, all label maps, are frames of a video.
-
-    Raises:
-        InputError: If a picture cannot be read or sizes differ.
     """
     labels = (source if source.is_dir() else source.parent) / LABELS
     table = dict(names)

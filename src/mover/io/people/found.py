@@ -23,11 +23,7 @@ GROWTH = 0.25  # `REACH` grows by this share with each frame of a gap
 
 
 def people_of(at: At) -> list[tuple[int, At]]:
-    """The people of a mapping from track to person, numbered by their keys or in order.
-
-    Raises:
-        InputError: If it is no mapping of mappings, or is empty.
-    """
+    """The people of a mapping from track to person, numbered by their keys or in order."""
     given = mapping(at)
     if not given:
         raise InputError(f"{at.place} has no people, expected at least one track")
@@ -131,11 +127,7 @@ _POSE = ("global_orient", "body_pose", "transl")
 
 
 def joined(parts: Sequence[Found]) -> Found:
-    """Rows of several people or frames together; all are of one tool.
-
-    Raises:
-        InputError: If their meshes have different numbers of vertices.
-    """
+    """Rows of several people or frames together; all are of one tool."""
     first = parts[0]
     sizes = sorted({part.verts.shape[1] for part in parts if part.verts is not None})
     if len(sizes) > 1:

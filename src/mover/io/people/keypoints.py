@@ -41,7 +41,6 @@ from mover.io.people.values import (
     read_any,
     rows,
     whole,
-    wide,
 )
 
 LAYOUTS = {name: len(JOINTS[name]) for name in ("openpose25", "openpose137", "coco17", "halpe26")}
@@ -58,11 +57,7 @@ PARTS = {
 
 
 def keypoints_from(tool: str, path: Path, known: Known | None = None) -> Keypoints:
-    """Keypoints that a detector found.
-
-    Raises:
-        InputError: If the detector is not known, or its files are not as it writes them.
-    """
+    """Keypoints that a detector found."""
     return chosen("tool", tool, "keypoints")(Path(path), known or Known())
 
 
@@ -120,11 +115,7 @@ def _clean(seen: Seen) -> Seen:
 
 
 def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
-    """Keypoints of a JSON file or of arrays (.npz: keypoints, scores, frame, person).
-
-    Raises:
-        InputError: If it is none of these, or has another number of joints.
-    """
+    """Keypoints of a JSON file or of arrays (.npz: keypoints, scores, frame, person)."""
     at = read_any(path)
     count = LAYOUTS[layout]
     if path.suffix.lower() == ".npz":
@@ -203,7 +194,7 @@ def _arrays(at: At, count: int) -> list[Seen]:
     frames = whole(need(at, "frame", "frames"))
     person = either(at, "person", "track_id")
     who = np.full(len(frames), -1) if person is None else whole(person)
-    points = wide(given, len(frames))
+    points = rows(given, len(frames))
     if len(who) != len(frames):
         refuse(given, "as many rows as frames", f"{len(frames)} frames and {len(who)} tracks")
     sure = None if scores is None else rows(scores, len(frames), count)
@@ -218,11 +209,7 @@ def _arrays(at: At, count: int) -> list[Seen]:
 
 
 def read_openpose(path: Path, known: Known) -> Keypoints:
-    """Keypoints of a folder of OpenPose JSON, or of one file.
-
-    Raises:
-        InputError: If a file is not OpenPose's with BODY_25.
-    """
+    """Keypoints of a folder of OpenPose JSON, or of one file."""
     files = files_of(path, "*.json", "OpenPose's keypoints")
     seen: list[Seen] = []
     for index, file in enumerate(files):

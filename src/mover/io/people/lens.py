@@ -54,11 +54,7 @@ def assumed_lens(
 
 
 def image_lens(at: At, count: int) -> Float[Tensor, "rows 3 3"]:
-    """The lens that a file gives as `img_focal` and `img_center` [px].
-
-    Raises:
-        InputError: If a key is missing or is no number.
-    """
+    """The lens that a file gives as `img_focal` and `img_center` [px]."""
     focal = one_number(need(at, "img_focal"))
     cx, cy = stacked(need(at, "img_center"), 2)[0].tolist()
     return torch.tensor([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]).expand(count, 3, 3)

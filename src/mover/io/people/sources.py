@@ -27,7 +27,6 @@ from mover.io.people.values import (
     rows,
     stacked,
     whole,
-    wide,
 )
 
 TALL = 1.7  # [m], a person's size, by which people are followed from image to image
@@ -248,7 +247,7 @@ def amass(path: Path, _: Known) -> list[Person]:
     found: list[Person] = []
     for track, file in enumerate(files_of(path, "*.npz", "motions of AMASS")):
         at = read_npz(file, without_objects=True)
-        width = wide(need(at, "poses"), len(stacked(need(at, "trans"), 3))).shape[1]
+        width = rows(need(at, "poses"), len(stacked(need(at, "trans"), 3))).shape[1]
         if width not in AMASS:
             refuse(need(at, "poses"), f"rows of {' or '.join(map(str, AMASS))} angles")
         upright = {"turn": Y_UP, "shift": np.zeros(3)}

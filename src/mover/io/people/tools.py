@@ -46,7 +46,6 @@ from mover.io.people.values import (
     stacked,
     tensor,
     whole,
-    wide,
 )
 
 Names = tuple[str, ...]
@@ -102,11 +101,7 @@ class Tool:
 
 
 def read(path: Path, known: Known, tool: str) -> Found:
-    """Bodies that a tool found, as its row of the table says.
-
-    Raises:
-        InputError: If a file or field is missing or has the wrong shape.
-    """
+    """Bodies that a tool found, as its row of the table says."""
     row = TOOLS[tool]
     return joined([_rows(row, person, known) for person in row.people(path, known)])
 
@@ -127,9 +122,7 @@ def _rows(tool: Tool, person: Person, known: Known) -> Found:
     verts = None if verts is None else verts.reshape(count, -1, 3)
     place = _translation(tool, at, count, known, given is None)
     shape = (either if tool.shapeless else need)(at, *tool.shape)
-    betas = np.zeros((count, SHAPES)) if shape is None else wide(shape, count)
-    if shape is not None and tool.widths:
-        betas = rows(shape, count, *tool.widths)
+    betas = np.zeros((count, SHAPES)) if shape is None else rows(shape, count, *tool.widths)
     pose = BodyPose(
         model=model, gender=known.gender or _gender(at), betas=tensor(betas),
         global_orient=turns[:, :3], body_pose=turns[:, 3:body], transl=place, extra=extra,
@@ -165,12 +158,12 @@ def _turns(
     count = len(root)
     codes = numbers(body)
     if codes.ndim and codes.shape[-1] == CODE:
-        turned = _decoded(body, wide(body, count), known)
+        turned = _decoded(body, rows(body, count), known)
     elif model == "smpl":
         turned = tensor(angles(body, count, 23, 21))
     else:
         turned = tensor(angles(body, count, 21, 23))[:, :63]
-    found = {n: tensor(wide(v, count)) for n in EXTRA if (v := either(at, n)) is not None}
+    found = {n: tensor(rows(v, count)) for n in EXTRA if (v := either(at, n)) is not None}
     return torch.cat([root, turned], 1), found
 
 
@@ -260,7 +253,7 @@ def _crops(at: At, count: int, known: Known) -> Float[Tensor, "bodies 3"]:
     K, size = known.camera.K.double(), (known.camera.width, known.camera.height)
     joints, pixels = either(at, "joints3d", "smpl_joints3d"), either(at, "smpl_joints2d")
     if joints is not None and pixels is not None:
-        points = torch.from_numpy(wide(joints, count).reshape(count, -1, 3).copy())
+        points = torch.from_numpy(rows(joints, count).reshape(count, -1, 3).copy())
         flat = rows(pixels, count, points.shape[1] * 2, points.shape[1] * 3)
         image = torch.from_numpy(flat.reshape(count, points.shape[1], -1)[..., :2].copy())
         return from_pixels(points, image, K).float()

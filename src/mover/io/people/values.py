@@ -32,11 +32,7 @@ KINDS = (".npz", ".npy", ".pkl", ".pickle", ".joblib", ".pt", ".pth", ".json")
 
 
 def read_any(path: Path) -> At:
-    """The content of a file, read without running anything in it.
-
-    Raises:
-        InputError: If it is missing, too large, of another kind, broken, or holds objects.
-    """
+    """The content of a file, read without running anything in it."""
     if not path.is_file():
         raise InputError(f"{path.name}: there is no such file in {path.parent}")
     if path.stat().st_size > LARGEST_FILE:
@@ -63,11 +59,7 @@ def read_any(path: Path) -> At:
 
 
 def files_of(path: Path, pattern: str, what: str) -> list[Path]:
-    """The file itself, or the files of a folder, 2 before 10.
-
-    Raises:
-        InputError: If the folder has none.
-    """
+    """The file itself, or the files of a folder, 2 before 10."""
     files = sorted(path.glob(pattern), key=natural) if path.is_dir() else [path]
     if not files:
         raise InputError(f"{path}: has no {pattern.removeprefix('**/')}, expected {what}")
@@ -75,11 +67,7 @@ def files_of(path: Path, pattern: str, what: str) -> list[Path]:
 
 
 def only_file(path: Path, pattern: str, what: str) -> Path:
-    """The file itself, or the only one of a folder.
-
-    Raises:
-        InputError: If there are none or several.
-    """
+    """The file itself, or the only one of a folder."""
     files = files_of(path, pattern, what)
     if len(files) > 1:
         raise InputError(f"{path}: has {len(files)} files {pattern}, expected one: name it")
@@ -132,11 +120,7 @@ LEAST_TURN = 0.05  # an array of matrices whose rows are not unit vectors within
 
 
 def need(at: At, *names: str) -> At:
-    """The first of several names of a field that is there.
-
-    Raises:
-        InputError: If there is none; the message names the keys that were found.
-    """
+    """The first of several names of a field that is there."""
     found = either(at, *names)
     if found is None:
         place = f"{at.place}: " if at.field else f"{at.file}: "
@@ -173,45 +157,28 @@ def numbers(at: At) -> NDArray[np.float64]:
 
 
 def rows(at: At, count: int | None, *widths: int) -> NDArray[np.float64]:
-    """An array with `count` rows (any number: None), flattened to one of the widths.
+    """An array with `count` rows (any number: None), flattened to one of the widths (none: any).
 
     One row may stand for all.
-
-    Raises:
-        InputError: If it has another shape.
     """
     value = numbers(at)
     if value.ndim > 2 and len(value) == 1 and count not in (None, 1):
         value = value[0]  # a batch of one
-    if value.size in widths and (count == 1 or value.ndim == 1):
+    if (value.ndim == 1 and (value.size in widths or not widths)) or (
+        value.size in widths and count == 1
+    ):
         value = value.reshape(1, -1)
     flat = value.reshape(len(value), -1) if value.size and value.ndim else np.zeros((0, 0))
-    fits = flat.shape[1] in widths and (count is None or len(flat) in (count, 1))
-    if not fits:
-        shape = f"({'n' if count is None else count}, {' or '.join(map(str, widths))})"
+    fits = flat.size > 0 and (flat.shape[1] in widths or not widths)
+    if not fits or (count is not None and len(flat) not in (count, 1)):
+        width = " or ".join(map(str, widths)) or "any"
+        shape = f"({'n' if count is None else count}, {width})"
         refuse(at, f"numbers that give {shape}", f"shape {numbers(at).shape}")
     return flat if count is None else np.broadcast_to(flat, (count, flat.shape[1]))
 
 
-def wide(at: At, count: int) -> NDArray[np.float64]:
-    """Rows of whatever width, at least one number each.
-
-    Raises:
-        InputError: If they are not `count` rows, or one for all.
-    """
-    value = numbers(at)
-    if not value.ndim or not value.size:
-        refuse(at, f"{count} rows of numbers", f"shape {value.shape}")
-    flat = value[None] if value.ndim == 1 else value.reshape(len(value), -1)
-    return rows(At(flat, at.file, at.field), count, flat.shape[1])
-
-
 def stacked(at: At, *tail: int) -> NDArray[np.float64]:
-    """An array of any number of items of this shape.
-
-    Raises:
-        InputError: If its numbers do not give whole items, or none.
-    """
+    """An array of any number of items of this shape."""
     value = numbers(at)
     if not value.size or value.size % math.prod(tail):
         shape = ", ".join(map(str, ("n", *tail)))
@@ -228,11 +195,7 @@ def one_number(at: At) -> float:
 
 
 def whole(at: At, count: int | None = None) -> NDArray[np.int64]:
-    """Whole numbers along one axis.
-
-    Raises:
-        InputError: If they are not, or there are others than `count`.
-    """
+    """Whole numbers along one axis."""
     value = numbers(at).reshape(-1)
     if not (np.abs(value) <= LAST_INDEX).all() or (value != np.round(value)).any():
         refuse(at, f"whole numbers up to {LAST_INDEX}")
@@ -246,9 +209,6 @@ def angles(at: At, count: int | None, *joints: int) -> NDArray[np.float64]:
 
     Returns:
         (count, joints * 3) [rad].
-
-    Raises:
-        InputError: If it is neither.
     """
     flat = rows(at, count, *[j * 3 for j in joints], *[j * 9 for j in joints])
     if flat.shape[1] in [j * 3 for j in joints]:
@@ -257,11 +217,7 @@ def angles(at: At, count: int | None, *joints: int) -> NDArray[np.float64]:
 
 
 def vectors(matrices: NDArray[np.float64], at: At) -> NDArray[np.float64]:
-    """Axis-angle vectors of rotation matrices; NaN stays NaN.
-
-    Raises:
-        InputError: If the matrices are no rotations.
-    """
+    """Axis-angle vectors of rotation matrices; NaN stays NaN."""
     from scipy.spatial.transform import Rotation
 
     known: NDArray[np.bool_] = np.asarray(np.isfinite(matrices).all((-1, -2)))
