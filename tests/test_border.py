@@ -25,10 +25,10 @@ from mover.geometry.raster import Crops, Topology, look
 from mover.pipeline.presets import ROBUST
 from mover.stages.camera.refine_camera import fixed_borders
 from mover.stages.config import ImageConfig
+from mover.stages.objects.coarse_cues import coarser_image
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
-from mover.stages.objects.place_inputs import PlaceInputs, coarser_image
+from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import place_objects
-from mover.stages.objects.starts import alone
 
 SHIFTS = (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
 WEIGHTS = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
@@ -313,7 +313,7 @@ def seen_room(grow, hide):
         torch.zeros(1, 1).bool(),
     )  # fmt: skip
     room = replace(
-        inputs, objects=cabinet, starts=alone(true), humans=HumanCues(), reference=true.yaw,
+        inputs, objects=cabinet, starts=true[None], humans=HumanCues(), reference=true.yaw,
         image=of_objects(inputs.image, torch.tensor([2]), 3),
     )  # fmt: skip
     return room, lambda config: find_image_cues(seen, config)
@@ -324,7 +324,7 @@ def test_an_object_whose_base_is_hidden_is_placed_nearer_to_the_truth_if_borders
     inputs, cues = seen_room(grow, hide=True)
     config = replace(
         ROBUST.layout, weights=WEIGHTS, method=Adam(120, 0.03, 0.002, beta2=0.98, keep_best=True),
-        yaws=1, distances=(), short=Adam(0), num_hypotheses=1,
+        yaws=1, short=Adam(0), num_hypotheses=1,
     )  # fmt: skip
     true = inputs.starts.t_world_object[0]
 

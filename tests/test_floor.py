@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 
 from mover.core.types import Layout
 from mover.geometry.camera import heading, pitch_roll, tilted, to_camera
-from mover.geometry.placement import hit_floor, reproject, slide_to_floor
+from mover.geometry.placement import hit_floor, reproject
 from mover.geometry.rotations import rot_y
 
 ANGLE = st.floats(-0.5, 0.5)
@@ -57,13 +57,3 @@ def test_a_new_camera_keeps_box_centres_in_the_camera_frame():
         to_camera(found.t_world_object + half, new), to_camera(layout.t_world_object + half, old)
     )
     torch.testing.assert_close(reproject(found, heights, new, new).yaw, found.yaw)
-
-
-def test_sliding_to_the_floor_keeps_the_picture():
-    R = tilted(torch.tensor(-0.2), torch.tensor(0.0))
-    layout = Layout(torch.tensor([[0.5, -1.2, -3.0]]), torch.tensor([0.7]), torch.zeros(1, 3))
-    found = slide_to_floor(layout, -1.5, torch.tensor([True]))
-    a, b = to_camera(layout.t_world_object, R), to_camera(found.t_world_object, R)
-    torch.testing.assert_close(a / a[:, 2:], b / b[:, 2:])
-    assert abs(float(found.t_world_object[0, 1]) + 1.5) < 1e-6
-    torch.testing.assert_close(found.log_scale.exp(), torch.full((1, 3), 1.25))

@@ -15,7 +15,7 @@ from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place
 from mover.geometry.rotations import rot_y
 from mover.geometry.sections import outline
-from mover.stages.objects.place_objects import _sections, part_objects, sharing
+from mover.stages.objects.separate_objects import own_sections, separate_objects, sharing
 
 WEIGHT = 0.3
 
@@ -58,20 +58,20 @@ def meeting(at):
 def test_objects_apart_stay_bit_for_bit():
     objects, at = start()
     assert float(overlap(objects, at).sum()) == 0
-    assert part_objects(indifferent, objects, at, WEIGHT) is at
+    assert separate_objects(indifferent, objects, at, WEIGHT) is at
 
 
 def test_no_weight_changes_nothing():
     objects, at = start()
     both = meeting(at)
-    assert part_objects(indifferent, objects, both, 0.0) is both
+    assert separate_objects(indifferent, objects, both, 0.0) is both
 
 
 def test_one_inside_another_goes_out_and_the_sure_one_stays():
     objects, at = start()
     both = meeting(at)
     before = overlap(objects, both)
-    found = part_objects(stiff(both), objects, both, WEIGHT)
+    found = separate_objects(stiff(both), objects, both, WEIGHT)
     after = overlap(objects, found)
     assert float(before.sum()) > 0.1
     assert float(after.sum()) < 0.02 * float(before.sum())
@@ -86,7 +86,7 @@ def test_who_has_no_part_in_it_stays_bit_for_bit():
     objects, at = start()
     both = meeting(at)
     elsewhere = replace(both, t_world_object=both.t_world_object + torch.tensor([0.0, 0.0, -0.5]))
-    found = part_objects(stiff(elsewhere, 1.0), objects, both, WEIGHT)
+    found = separate_objects(stiff(elsewhere, 1.0), objects, both, WEIGHT)
     for name in ("t_world_object", "yaw", "log_scale"):
         assert torch.equal(getattr(found, name)[2], getattr(both, name)[2])
     assert float((found.t_world_object - both.t_world_object)[:2].norm(dim=-1).min()) > 0.01
@@ -105,7 +105,7 @@ def test_all_that_may_lie_in_one_share_what_each_does_alone_and_boxes_apart_shar
     shift = 0.5 * torch.randn(3, 3, generator=g) * torch.tensor([1.0, 0.2, 1.0])
     near = replace(at, t_world_object=at.t_world_object[:1] + shift)
     pairs = torch.tensor([[i, j] for i in range(3) for j in range(3) if i != j])
-    solids = gather_solids(objects, {i: _sections(objects, i) for i in range(3)}, pairs)
+    solids = gather_solids(objects, {i: own_sections(objects, i) for i in range(3)}, pairs)
     t = near.t_world_object.requires_grad_()
     whole = apart_term(near, objects, solids)
     alone = torch.zeros(3)
@@ -164,7 +164,7 @@ def table_and_chair(away, seat=0.45):
 @pytest.mark.parametrize("deep", [0.08, 0.2])
 def test_a_back_through_a_thin_top_goes_out_to_the_front_and_the_table_stays(deep):
     objects, at = table_and_chair(-deep)
-    found = part_objects(stiff(at), objects, at, WEIGHT)
+    found = separate_objects(stiff(at), objects, at, WEIGHT)
     moved = found.t_world_object - at.t_world_object
     back = float(at.t_world_object[1, 2] + moved[1, 2]) - 0.21 - (-3.0 + 0.4)
     assert -0.02 < back < 0.05
@@ -181,7 +181,7 @@ def test_a_seat_under_the_top_costs_nothing_where_the_back_is_outside():
     turned = replace(at, yaw=torch.tensor([0.0, math.pi, 0.0]))  # its seat reaches under
     assert float(overlap(objects, at).sum()) > 0
     assert float(overlap(objects, turned).sum()) == 0
-    assert part_objects(indifferent, objects, turned, WEIGHT) is turned
+    assert separate_objects(indifferent, objects, turned, WEIGHT) is turned
 
 
 def test_a_seat_that_grazes_the_top_from_below_may_stay():

@@ -12,7 +12,7 @@ from mover.energy.prior_terms import FAR, OVERLAP, UPRIGHT
 from mover.geometry.mesh import sample_surface
 from mover.geometry.rotations import rot_y
 from mover.geometry.sections import CELL, WIDE, Sections, outline, sections_of
-from mover.stages.objects.place_objects import sharing
+from mover.stages.objects.separate_objects import sharing
 
 
 def union(*boxes):

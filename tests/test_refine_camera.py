@@ -12,7 +12,6 @@ from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.config import RefineConfig
 from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import place_objects
-from mover.stages.objects.starts import alone
 
 LOOSE = torch.diag(torch.tensor([0.07, 0.07, 0.1]).square())
 TIGHT = torch.diag(torch.tensor([1e-4, 1e-4, 1e-4]).square())
@@ -35,7 +34,7 @@ def wrong_camera(covariance):
     )
     camera = replace(inputs.camera, R_cam_world=wrong)
     fitted = place_objects(
-        PlaceInputs(objects, camera, ground, inputs.image, HumanCues(), alone(start), start.yaw),
+        PlaceInputs(objects, camera, ground, inputs.image, HumanCues(), start[None], start.yaw),
         replace(ROBUST.layout, yaws=1, short=Adam(0)),
     )  # as in the pipeline: first the objects, under the wrong camera
     layout = fitted.layout

@@ -20,9 +20,9 @@ from mover.geometry.camera import outermost, project, to_camera
 from mover.geometry.placement import place, place_in
 from mover.pipeline.presets import Config
 from mover.stages.config import PlaceConfig
-from mover.stages.objects.place_inputs import Pinned, coarser_image
+from mover.stages.objects.coarse_cues import coarser_image
+from mover.stages.objects.place_inputs import Pinned
 from mover.stages.objects.place_objects import descend, energy_of, place_objects, with_trees
-from mover.stages.objects.starts import alone
 
 EXACT = BatchedBFGS(steps=400, gain=1e-12, least=1e-9, patience=10)
 
@@ -259,21 +259,6 @@ class TestPlacing:
         )
         assert len(packed) == 1
 
-    def test_rounds_of_shaking_never_worsen_the_result_and_are_the_same_in_every_run(self):
-        inputs = make_inputs(size=32)
-        inputs = replace(inputs, starts=alone(_first(moved(inputs.starts, 4, 0.1))))
-        once, thrice, again = (
-            place_objects(
-                inputs,
-                replace(
-                    ROBUST, method=BatchedBFGS(steps=6), perturbations=2, perturbation_rounds=n
-                ),
-            )
-            for n in (1, 3, 3)
-        )
-        assert (thrice.energy[0] <= once.energy[0]).all()
-        assert torch.equal(thrice.energy, again.energy)
-
     def test_pinned_objects_stay(self):
         inputs = make_inputs(size=32)
         off = moved(inputs.starts, 5, 0.2)
@@ -281,7 +266,7 @@ class TestPlacing:
         held = Layout(off.t_world_object[0] + 0.05, off.yaw[0] + 0.1, off.log_scale[0])
         fixed = torch.arange(n) == 0
         inputs = replace(inputs, starts=off, pinned=Pinned(fixed, held))
-        placed = place_objects(inputs, replace(ROBUST, perturbations=1)).layout
+        placed = place_objects(inputs, ROBUST).layout
         assert torch.equal(placed.yaw[0], held.yaw[0])
         assert torch.equal(placed.t_world_object[0, [0, 2]], held.t_world_object[0, [0, 2]])
         assert not torch.equal(placed.yaw[1:], off.yaw[0, 1:])
@@ -298,18 +283,11 @@ class TestPlacing:
         there = energy_of(inputs, ROBUST)(found.at).per_item
         torch.testing.assert_close(found.value, there, rtol=1e-4, atol=1e-6)
 
-    def test_coarse_short_descents_and_shaken_ends_never_worsen_the_result(self):
+    def test_coarse_short_descents_choose_among_turned_starts(self):
         inputs = make_inputs(size=32)
-        inputs = replace(inputs, starts=alone(_first(moved(inputs.starts, 4, 0.1))))
-        plain_ = place_objects(inputs, ROBUST)
-        more = place_objects(inputs, replace(ROBUST, perturbations=2))
-        assert (more.energy[0] <= plain_.energy[0]).all()
+        inputs = replace(inputs, starts=moved(inputs.starts, 4, 0.1)[:1])
         quick = replace(ROBUST, yaws=4, short=BatchedBFGS(steps=6), num_hypotheses=2, coarse=2)
         assert place_objects(inputs, quick).layout.yaw.isfinite().all()
-
-
-def _first(layout):
-    return Layout(layout.t_world_object[0], layout.yaw[0], layout.log_scale[0])
 
 
 class TestCommandLine:

@@ -1,18 +1,14 @@
 import torch
-from analytic import box_verts
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mover.core.types import Layout
-from mover.geometry.camera import project, to_camera
-from mover.geometry.placement import place
 from mover.stages.objects.starts import (
-    alike,
     best_few,
     choose,
+    duplicates_of,
     piles_of,
     spread,
-    spread_distance,
 )
 
 
@@ -59,56 +55,26 @@ def test_each_object_chooses_for_itself():
     assert found.yaw.tolist() == [1.0, 0.0]
 
 
-class TestDistance:
-    LEVEL = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
-    K = torch.tensor([[500.0, 0, 320], [0, 500, 180], [0, 0, 1]])
-
-    def starts(self):
-        r = torch.Generator().manual_seed(0)
-        t = torch.rand(2, 3, 3, generator=r) * torch.tensor([2.0, 0, -2]) + torch.tensor(
-            [-1.0, -1.4, -3]
-        )
-        yaw = torch.rand(2, 3, generator=r)
-        return Layout(t, yaw, 0.2 * torch.rand(2, 3, 3, generator=r))
-
-    def test_the_given_starts_come_first_then_each_share_of_the_distance(self):
-        start = self.starts()
-        found = spread_distance(start, (0.9, 1.1))
-        assert torch.equal(found.t_world_object[:2], start.t_world_object)
-        assert torch.equal(found.log_scale[:2], start.log_scale)
-        for k, factor in enumerate((0.9, 1.1)):
-            part = slice(2 + 2 * k, 4 + 2 * k)
-            ratio = found.t_world_object[part] / start.t_world_object
-            torch.testing.assert_close(ratio[..., [0, 2]], torch.full((2, 3, 2), factor))
-            assert torch.equal(found.t_world_object[part, :, 1], start.t_world_object[..., 1])
-            assert torch.equal(found.yaw[part], start.yaw)
-
-    def test_no_shares_no_further_starts(self):
-        start = self.starts()
-        found = spread_distance(start, ())
-        assert torch.equal(found.t_world_object, start.t_world_object)
-
-    def test_before_a_level_camera_columns_and_height_in_the_image_stay(self):
-        start = self.starts()
-        size = torch.tensor([0.6, 1.1, 0.4])
-        verts = (box_verts((1.0, 1.0, 1.0)).float() * size).expand(3, -1, -1)
-        axis = torch.tensor([[[0.0, 0, 0], [0, 1.1, 0]]]).expand(3, -1, -1)
-        found = spread_distance(start, (0.8, 1.25))
-
-        def seen(points, layout):
-            return project(to_camera(place(points, layout), self.LEVEL), self.K)
-
-        corners, ends = seen(verts, found)[..., 0], seen(axis, found)
-        tall = ends[..., 0, 1] - ends[..., 1, 1]
-        for k in (1, 2):
-            part = slice(2 * k, 2 * k + 2)
-            torch.testing.assert_close(corners[part], corners[:2], rtol=0, atol=1e-2)
-            torch.testing.assert_close(tall[part], tall[:2], rtol=0, atol=1e-2)
-            assert (ends[part, :, 0, 1] - ends[:2, :, 0, 1]).abs().min() > 5
+def test_layouts_are_joined_indexed_and_chosen_from_object_by_object():
+    g = torch.Generator().manual_seed(0)
+    one, other = (
+        Layout(*(torch.rand(2, 3, *end, generator=g) for end in ((3,), (), (3,)))) for _ in "ab"
+    )
+    both = Layout.cat(one, other)
+    index = torch.tensor([[0, 3, 2]])
+    for name in ("t_world_object", "yaw", "log_scale"):
+        a, b, c = (getattr(x, name) for x in (one, other, both))
+        assert torch.equal(c, torch.cat([a, b]))
+        assert torch.equal(getattr(both[1:3], name), c[1:3])
+        assert torch.equal(getattr(both[2][None], name)[0], b[0])
+        picked = getattr(both.gather(index), name)[0]
+        assert torch.equal(picked, torch.stack([a[0, 0], b[1, 1], b[0, 2]]))
+        mixed = getattr(Layout.where(torch.tensor([True, False, True]), one, other), name)
+        assert torch.equal(mixed, torch.stack([a[:, 0], b[:, 1], a[:, 2]], 1))
 
 
 @given(st.integers(0, 1000))
-def test_starts_are_alike_where_a_whole_pile_begins_alike(seed: int):
+def test_starts_are_duplicates_where_a_whole_pile_starts_the_same(seed: int):
     g = torch.Generator().manual_seed(seed)
     supports = torch.tensor([-1, 0, -1, 1])
     number = torch.randint(0, 2, (5, 4), generator=g)
@@ -116,7 +82,7 @@ def test_starts_are_alike_where_a_whole_pile_begins_alike(seed: int):
     layout = Layout(value, value[..., 0], value)
     pile = piles_of(supports)
     assert pile.tolist() == [0, 0, 2, 0]
-    found = alike(layout, pile)
+    found = duplicates_of(layout, pile)
     for start in range(5):
         for index in range(4):
             mine = [k for k in range(4) if pile[k] == pile[index]]

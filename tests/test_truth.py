@@ -45,17 +45,21 @@ def at_truth(room, preset, folder):
     )
     placed = Placed(
         prepared.start,
-        pipeline.alone(prepared.start),
+        prepared.start[None],
         torch.zeros(1, len(seen.boxes)),
         torch.zeros(0),
     )
-    view = pipeline.SceneState(camera, ground, image, prepared.start, placed, {}, prepared.start)
-    view = pipeline.assigned(job, crew, pipeline.gathered(job, crew, view))
     cues = run.stage(pipeline.find_image_cues, image, config.image)
+    start = prepared.start
+    bare = PlaceInputs(
+        prepared.objects, camera, ground, cues, pipeline.NOBODY, start[None], start.yaw
+    )
+    view = pipeline.SceneState(
+        camera, ground, image, start, placed, {}, start, (bare, config.place)
+    )
+    view = pipeline.assigned(job, crew, pipeline.gathered(job, crew, view))
     humans = pipeline.cues_in_windows(view.cues, view.contacts.points, cues.views, camera)
-    starts = pipeline.alone(prepared.start)
-    inputs = PlaceInputs(prepared.objects, camera, ground, cues, humans, starts, prepared.start.yaw)
-    return inputs, config
+    return replace(bare, humans=humans), config
 
 
 def perturbed(truth, count, seed):

@@ -52,10 +52,8 @@ def folder(tmp_path_factory, small_room) -> Path:
     config, slow = light("robust"), Adam(15, 0.03)
     config = dataclasses.replace(
         config,
-        layout=dataclasses.replace(
-            config.layout, method=slow, yaws=8, num_hypotheses=3, coarse=1, perturbations=0
-        ),
-        place=dataclasses.replace(config.place, method=slow, perturbations=0),
+        layout=dataclasses.replace(config.layout, method=slow, yaws=8, num_hypotheses=3, coarse=1),
+        place=dataclasses.replace(config.place, method=slow),
     )
     write_json({"config": records.plain(config)}, folder / "config.json")
     call("run", folder / "capture", "--out", folder / "out", "--config", folder / "config.json")

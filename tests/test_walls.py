@@ -18,9 +18,9 @@ from mover.energy.prior_terms import ALONG, WALL_RHO, Walls, wall_term
 from mover.furniture.library import WALL_PIECES
 from mover.geometry.rotations import wrap
 from mover.pipeline.presets import ROBUST
-from mover.stages.objects.place_inputs import Pinned, Placed, PlaceInputs, coarser_image, with_walls
+from mover.stages.objects.coarse_cues import coarser_image
+from mover.stages.objects.place_inputs import Pinned, Placed, PlaceInputs, with_walls
 from mover.stages.objects.place_objects import energy_of, place_objects
-from mover.stages.objects.starts import alone
 from mover.stages.objects.wall_alignment import NEAR, STRETCH, TURN, UNSEEN, find_walls, starts_at
 
 BOTTOM = 3
@@ -358,12 +358,12 @@ def a_hidden_shelf(given_at, size=48):
     objects = replace(objects, verts=objects.verts * share[:, None], size=objects.size * share)
     t = truth.t_world_object * torch.cat([share, torch.ones_like(share), share], -1)
     image = replace(image, distance=t.norm(dim=-1))
-    start = alone(replace(truth, t_world_object=t))
+    start = replace(truth, t_world_object=t)[None]
     return truth, PlaceInputs(objects, camera, GROUND, image, HumanCues(), start, truth.yaw)
 
 
 CONFIG = replace(
-    ROBUST.place, method=BatchedBFGS(), perturbations=2, perturbation_rounds=1,
+    ROBUST.place, method=BatchedBFGS(),
     weights=replace(ROBUST.place.weights, given=0.0, measured=0.0),  # in tests of their own
 )  # fmt: skip
 UNLINED = replace(CONFIG, wall_alignment_steps=0)

@@ -310,6 +310,35 @@ class Layout:
     log_scale: Float[Tensor, "*starts objects 3"]
     """Logarithm of the scale along each object axis; 0 keeps the initial size."""
 
+    def __getitem__(self, starts: int | slice | None) -> "Layout":
+        """Some starts; `layout[None]` is one layout as the only start."""
+        return Layout(self.t_world_object[starts], self.yaw[starts], self.log_scale[starts])
+
+    def gather(self, index: Int[Tensor, "few objects"]) -> "Layout":
+        """Starts by index, an own one for each object."""
+        wide = index.unsqueeze(-1).expand(-1, -1, 3)
+        t, log_scale = self.t_world_object.gather(0, wide), self.log_scale.gather(0, wide)
+        return Layout(t, self.yaw.gather(0, index), log_scale)
+
+    @staticmethod
+    def cat(*layouts: "Layout") -> "Layout":
+        """All starts of several layouts."""
+        return Layout(
+            torch.cat([one.t_world_object for one in layouts]),
+            torch.cat([one.yaw for one in layouts]),
+            torch.cat([one.log_scale for one in layouts]),
+        )
+
+    @staticmethod
+    def where(first: Bool[Tensor, " objects"], one: "Layout", other: "Layout") -> "Layout":
+        """The objects of one layout where `first`, else of the other; both may have starts."""
+        wide = first[:, None]
+        return Layout(
+            torch.where(wide, one.t_world_object, other.t_world_object),
+            torch.where(first, one.yaw, other.yaw),
+            torch.where(wide, one.log_scale, other.log_scale),
+        )
+
 
 @record
 class Evidence:

@@ -57,27 +57,6 @@ def reproject(
     return Layout(center - half, torch.atan2(front[..., 0], front[..., 2]), layout.log_scale)
 
 
-def slide_to_floor(
-    layout: Layout,
-    ground: float | Float[Tensor, "*starts objects"],
-    standing: Bool[Tensor, " objects"],
-    limit: float = 2.0,
-) -> Layout:
-    """Move standing objects along their rays to the floor, keeping their size in the image.
-
-    The floor has one height [m] for all or one for each.
-    Objects whose base is not below the camera are left alone; sizes change at most by `limit`.
-    """
-    t = layout.t_world_object
-    below = standing & (t[..., 1] < -1e-3)
-    factor = torch.where(below, ground / t[..., 1].clamp_max(-1e-3), 1.0)
-    factor = factor.clamp(1 / limit, limit).unsqueeze(-1)
-    return Layout(t * factor, layout.yaw, layout.log_scale + factor.log())
-
-
-# Place objects in the world.
-
-
 GROUND, FREE = -1, -2
 
 

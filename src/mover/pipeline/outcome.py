@@ -27,11 +27,9 @@ from mover.core.types import (
 from mover.energy.human_terms import FootContacts
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import (
-    GROUND,
     place,
     reproject,
     rest_on_support,
-    slide_to_floor,
     standing_meshes,
 )
 from mover.geometry.volume import sample
@@ -50,7 +48,6 @@ from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.place_objects import energy_of, with_trees
 from mover.stages.objects.prepare_objects import Prepared, proxy_meshes, to_objects
 from mover.stages.objects.seat_heights import seat_warnings
-from mover.stages.objects.starts import alone
 from mover.stages.people.find_depth import pelvis, size_spread
 
 
@@ -117,9 +114,6 @@ def carried(
     """A layout of another camera's world in that of this camera, standing on this ground."""
     objects, (camera, ground) = context.prepared.objects, here
     there = reproject(layout, objects.size[:, 1], old.R_cam_world, camera.R_cam_world)
-    if context.config.slide_to_floor:
-        loose = (objects.supports == GROUND) & ~is_pinned(context)
-        there = slide_to_floor(there, ground, loose)
     return rest_on_support(there, objects.supports, objects.size[:, 1], ground)
 
 
@@ -251,7 +245,7 @@ def _evidence(context: ReconstructionContext, state: SceneState) -> tuple[Eviden
         near_body = sample(state.cues.space.volume, samples).amin(-1).tolist()
     pixels = context.seen.masks.sum((-2, -1)).tolist()
     inputs, config = state.descent
-    parts = energy_of(with_trees(inputs), config)(alone(state.placed.layout)).parts
+    parts = energy_of(with_trees(inputs), config)(state.placed.layout[None]).parts
     terms = [{name: float(part[0, i]) for name, part in parts.items()} for i in range(len(ids))]
     energy = [sum(row.values()) for row in terms]
     rows = zip(ids, pixels, near, far, bodies, near_body, energy, terms, strict=True)

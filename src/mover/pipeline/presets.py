@@ -66,8 +66,6 @@ class Config:
     """Propose seats and beds that no detector saw, where people rest on nothing that is known."""
     outer_iterations: Annotated[int, int_in(0, 100)] = 0
     """Further passes of stage 2 with assignment and occlusion order renewed."""
-    slide_to_floor: bool = False
-    """Start on the floor along the rays with the size in the image kept; else dropped straight."""
     height_spread: Annotated[float, float_in(0, 0.3)] = 0.0
     """Standard deviation of the logarithm of people's height, where all have the mean shape of
     their model and no height is given: the furniture then tells the scale, too (and where bodies
@@ -115,8 +113,8 @@ ROBUST = Config(
         128, "robust", hidden=0.2, bounded=True, borders=(-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
     ),
     layout=PlaceConfig(
-        _ROBUST_IMAGE, "robust", BatchedBFGS(), yaws=16, distances=(0.9, 1.1), short=_SHORT,
-        num_hypotheses=6, coarse=2, perturbations=8, wall_alignment_steps=2,
+        _ROBUST_IMAGE, "robust", BatchedBFGS(), yaws=16, short=_SHORT,
+        num_hypotheses=6, coarse=2, wall_alignment_steps=2,
         yaw_prior_weight=1.0,
     ),
     refine=RefineConfig(rounds=1),
@@ -124,11 +122,10 @@ ROBUST = Config(
     gather=GatherConfig(erode=1, reach=0.1),
     assign=_GROUPS,
     place=PlaceConfig(
-        _ROBUST_FULL, "robust", BatchedBFGS(), perturbations=8, wall_alignment_steps=2,
+        _ROBUST_FULL, "robust", BatchedBFGS(), wall_alignment_steps=2,
         yaw_prior_weight=1.0, apart=0.3,
     ),
     outer_iterations=1,
-    slide_to_floor=True,
     height_spread=0.055,
     seat_heights=True,
     turn_to_people=True,

@@ -14,7 +14,7 @@ from mover.core.run import Conf, In
 from mover.core.run import Run as Run
 from mover.core.settings import check_settings
 from mover.core.types import Camera, Capture, Layout, Room
-from mover.energy.config import SceneConfig, only
+from mover.energy.config import Adam, SceneConfig, only
 from mover.energy.fused.energy import energy_function
 from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.warp_start import threads
@@ -64,17 +64,12 @@ from mover.stages.objects.gather_given import (
 from mover.stages.objects.own_edges import OwnEdges, own_edges
 from mover.stages.objects.place_inputs import Pinned, PlaceInputs, with_walls
 from mover.stages.objects.place_objects import (
-    estimate_size_prior,
-    inlier_weights,
     place_objects,
-    without_search,
 )
 from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
+from mover.stages.objects.size_prior import estimate_size_prior, inlier_weights
 from mover.stages.objects.starts import (
-    alone,
     best_few,
-    contact_start,
-    joined,
     other_starts,
     reference_yaw,
 )
@@ -168,16 +163,16 @@ def placed_by_image(
     objects, seen, capture = context.prepared.objects, context.seen, context.capture
     here, searching = (camera, ground), context.config.layout
     start = carried(context, context.prepared.start, capture.scene.camera, here)
-    starts = alone(start)
+    starts = start[None]
     if searching.num_hypotheses > 1 and before is not None:
         # Where the image has each object was searched: only the ends of that go down again.
         ends = best_few(before.placed.candidates, before.placed.energy, searching.num_hypotheses)
-        ends = joined(alone(before.placed.layout), ends)
-        starts = joined(starts, carried(context, ends, before.camera, here))
-        searching = without_search(searching)
+        ends = Layout.cat(before.placed.layout[None], ends)
+        starts = Layout.cat(starts, carried(context, ends, before.camera, here))
+        searching = replace(searching, yaws=1, short=Adam(0))
     elif searching.num_hypotheses > 1 and capture.hypotheses:
         others = other_starts(capture.hypotheses, objects, context.prepared.start)
-        starts = joined(starts, carried(context, others, capture.scene.camera, here))
+        starts = Layout.cat(starts, carried(context, others, capture.scene.camera, here))
     unordered = torch.zeros(len(objects.ids), len(objects.ids), dtype=torch.bool)
     given = context.prepared.start.t_world_object.norm(dim=-1)
     image = ImageInputs(
@@ -234,7 +229,7 @@ def misfit_of(
     """What box and silhouette leave of each object where it stands."""
     config = SceneConfig(only(bbox=1.0, silhouette=1.0), "robust")
     energy = energy_function(context.prepared.objects, state.camera, image, NOBODY, config)
-    return energy(alone(state.placed.layout)).per_item[0].detach()
+    return energy(state.placed.layout[None]).per_item[0].detach()
 
 
 def with_unfit_shapes(context: ReconstructionContext, state: SceneState) -> ReconstructionContext:
@@ -319,12 +314,11 @@ def placed_with_people(
         image = replace(image, trust=inlier_weights(image_energy))
         if image.given is not None and not are_shapeless(people.bodies):
             image = replace(image, given=lighter_where_used(image.given, image.trust, contacts))
-    starts = alone(state.placed.layout)
+    starts = state.placed.layout[None]
     if config.layout.num_hypotheses > 1:
-        contact = contact_start(state.placed.layout, objects, contacts)
         placed = state.placed
         different = best_few(placed.candidates, placed.energy, config.layout.num_hypotheses)
-        starts = joined(different, alone(contact))
+        starts = Layout.cat(different, state.placed.layout[None])
     reference = reference_yaw(state.start.yaw, contacts)
     inputs = PlaceInputs(
         objects, state.camera, state.ground, image, humans, starts, reference,

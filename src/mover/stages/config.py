@@ -158,18 +158,12 @@ class PlaceConfig:
     """The descent from each start that is left."""
     yaws: Annotated[int, int_in(1, 360)] = 1
     """Starts that are turned evenly round each object."""
-    distances: tuple[Annotated[float, float_in(0.01, 100)], ...] = ()
-    """Further starts at these shares of its distance, turned as often."""
     short: Adam | BatchedBFGS = field(default_factory=lambda: Adam(steps=0))
     """A short descent from each of them."""
     num_hypotheses: Annotated[int, int_in(1, 1000)] = 1
     """Starts of each object that are left after the short descents."""
     coarse: Annotated[int, int_in(1, 64)] = 1
     """Pixels of a window that are one, along each side, in the short descents."""
-    perturbations: Annotated[int, int_in(0, 1000)] = 0
-    """Further descents from places around the best one of each object."""
-    perturbation_rounds: Annotated[int, int_in(1, 100)] = 1
-    """How often that is done; each time around the best so far, and half as far from it."""
     wall_alignment_steps: Annotated[int, int_in(0, 100)] = 0
     """How often pieces along a wall are placed again with its line (robust)."""
     yaw_prior_weight: Weight = 0.0

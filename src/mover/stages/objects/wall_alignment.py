@@ -19,7 +19,7 @@ from mover.furniture.library import WALL_PIECES
 from mover.geometry.placement import GROUND
 from mover.geometry.rotations import wrap
 from mover.stages.objects.place_inputs import Placed, PlaceInputs, with_walls
-from mover.stages.objects.starts import alone, best_few, joined, merged, piles_of
+from mover.stages.objects.starts import best_few, piles_of
 
 NEAR = 0.3  # [m], root mean square distance of a rear from the line that it belongs to
 UNSEEN = 0.2  # how much an object whose base is not seen counts against one whose base is
@@ -51,7 +51,7 @@ def line_up(found: Placed, inputs: PlaceInputs, rounds: int, lower: Lower) -> Pl
             break
         starts = starts_at(lined.layout, inputs.objects, walls)
         few = best_few(found.candidates, found.energy, KEPT)
-        begin = _held(joined(starts, few), lined.layout, inputs.objects, walls)
+        begin = _held(Layout.cat(starts, few), lined.layout, inputs.objects, walls)
         more = lower(with_walls(inputs, walls), begin)
         lined = _where_told(more, found, walls)
     return lined
@@ -61,25 +61,20 @@ def _held(begin: Layout, layout: Layout, objects: Objects, walls: Walls) -> Layo
     """Starts of what stands with nothing that is told a line all alike, as one is enough there."""
     pile = piles_of(objects.supports)
     moves = torch.isin(pile, pile[walls.trust.amax(-1) > 0])
-    return merged(moves, begin, alone(layout))
+    return Layout.where(moves, begin, layout[None])
 
 
 def _where_told(lined: Placed, found: Placed, walls: Walls) -> Placed:
     """What is lined up where a line is told, else what was found; both as many candidates."""
     told = walls.trust.amax(-1) > 0
     count = min(len(lined.energy), len(found.energy))
-    few = (_first(placed.candidates, count) for placed in (lined, found))
     return Placed(
-        merged(told, lined.layout, found.layout),
-        merged(told, *few),
+        Layout.where(told, lined.layout, found.layout),
+        Layout.where(told, lined.candidates[:count], found.candidates[:count]),
         torch.where(told, lined.energy[:count], found.energy[:count]),
         found.trace,
         walls,
     )
-
-
-def _first(layout: Layout, count: int) -> Layout:
-    return Layout(layout.t_world_object[:count], layout.yaw[:count], layout.log_scale[:count])
 
 
 def find_walls(layout: Layout, objects: Objects, sides: Int[Tensor, "objects 4"]) -> Walls | None:
@@ -123,10 +118,8 @@ def starts_at(layout: Layout, objects: Objects, walls: Walls) -> Layout:
 
     They turn with the line and go along their rays, as large in the image as before.
     """
-    found = alone(layout)
-    for number in range(len(walls.offset)):  # as many as there are pieces along walls
-        found = joined(found, alone(_moved(layout, objects, walls, number)))
-    return found
+    moved = [_moved(layout, objects, walls, number) for number in range(len(walls.offset))]
+    return Layout.cat(*(one[None] for one in (layout, *moved)))
 
 
 def _moved(layout: Layout, objects: Objects, walls: Walls, number: int) -> Layout:
