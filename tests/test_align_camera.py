@@ -13,9 +13,9 @@ from mover.stages.camera.align_camera import (
     AlignInputs,
     Prior,
     align_camera,
+    cost_of,
     covariance_of,
     fit_plane,
-    price,
 )
 from mover.stages.camera.foot_votes import vote
 from mover.stages.config import AlignConfig
@@ -245,14 +245,14 @@ def test_the_result_is_a_minimum_of_feet_term_and_prior():
     start = torch.tensor([PITCH, ROLL, GROUND, 0.0]).double()
     fit = fit_plane(votes, prior, start, (0.1, 0.02), 60)
     at = fit.at.clone().requires_grad_()
-    price(at, votes, prior, 0.02).backward()
+    cost_of(at, votes, prior, 0.02).backward()
     assert at.grad is not None
     assert at.grad.abs().max() < 1e-4 * votes.weight.sum() * 0.02
     around = [
-        float(price(fit.at + d, votes, prior, 0.02))
+        float(cost_of(fit.at + d, votes, prior, 0.02))
         for d in 1e-3 * torch.randn(50, 4, generator=torch.Generator().manual_seed(0)).double()
     ]
-    assert min(around) >= fit.price
+    assert min(around) >= fit.cost
     assert torch.linalg.eigvalsh(covariance_of(fit, votes).double()).min() > 0
 
 

@@ -13,7 +13,7 @@ from mover.geometry.camera import project, to_camera
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 from mover.geometry.rle import encode
-from mover.stages.people.body_evidence import doubt_of_shapes
+from mover.stages.people.body_evidence import shape_uncertainty
 from mover.stages.people.refine_bodies import refine_bodies
 
 
@@ -28,11 +28,11 @@ def masked(drawn: torch.Tensor) -> torch.Tensor:
 def test_a_shape_is_doubted_as_far_as_its_outline_does_not_fit():
     drawn = torch.full((10, 20), -1)
     masks = masked(drawn)
-    doubt = doubt_of_shapes(drawn, masks)
+    doubt = shape_uncertainty(drawn, masks)
     assert doubt.tolist() == pytest.approx([0.0, 0.2 * (0.5 - 0.1)])
     drawn[:, 5:8] = 1  # what another hides is nobody's fault
-    assert float(doubt_of_shapes(drawn, masks)[0]) == 0
-    assert doubt_of_shapes(drawn, torch.zeros(2, 10, 20, dtype=torch.bool)).tolist() == [0, 0]
+    assert float(shape_uncertainty(drawn, masks)[0]) == 0
+    assert shape_uncertainty(drawn, torch.zeros(2, 10, 20, dtype=torch.bool)).tolist() == [0, 0]
 
 
 def test_what_may_end_elsewhere_hides_and_is_hidden_as_much_more_loosely():

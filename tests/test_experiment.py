@@ -110,7 +110,7 @@ def quick(config: Config) -> Config:
         ),
         place=replace(config.place, method=few, first=Adam(0)),
         refine=replace(config.refine, rounds=0),
-        gather=replace(config.gather, cells=16, workers=1),
+        gather=replace(config.gather, cells=16),
         prepare=replace(config.prepare, cells=16, samples=100),
         correct_depth=False,
         outer_iterations=0,

@@ -24,7 +24,7 @@ from mover.stages.objects.gather_given import (
     FIRM,
     UNFIT,
     WEIGHTS,
-    believed_sides,
+    bounded_sides,
     gather_given,
     given_axis,
     lighter_where_used,
@@ -261,13 +261,13 @@ def test_an_object_that_fits_among_shapes_that_do_not_is_doubted_more_than_alone
 def test_a_side_that_may_be_hidden_bounds_nothing_of_a_shape_that_fits() -> None:
     sides = torch.tensor([[SEEN, LIKELY, SEEN, LIKELY], [UNKNOWN] * 4, [SEEN] * 4])
     for weight, first in ((UNFIT - 0.01, [LEAST] * 4), (UNFIT + 0.01, sides[0].tolist())):
-        found = believed_sides(sides, torch.full((3,), weight))
+        found = bounded_sides(sides, torch.full((3,), weight))
         assert found.tolist() == [first, *sides[1:].tolist()]
 
 
 def test_a_side_of_which_nothing_is_known_stays_so_beside_others() -> None:
     sides = torch.tensor([[SEEN, LEAST, LIKELY, UNKNOWN]] * 2)
-    found = believed_sides(sides, torch.tensor([UNFIT - 0.01, UNFIT + 0.01]))
+    found = bounded_sides(sides, torch.tensor([UNFIT - 0.01, UNFIT + 0.01]))
     assert found.tolist() == [[LEAST, LEAST, LEAST, UNKNOWN], sides[1].tolist()]
 
 
@@ -276,7 +276,7 @@ def test_a_side_of_which_nothing_is_known_stays_so_beside_others() -> None:
 def test_neither_do_the_sides_beside_it(cut: int, known: int) -> None:
     sides = torch.full((2, 4), SEEN)
     sides[:, cut] = known
-    found = believed_sides(sides, torch.tensor([UNFIT - 0.01, UNFIT + 0.01]))
+    found = bounded_sides(sides, torch.tensor([UNFIT - 0.01, UNFIT + 0.01]))
     across = (cut + 2) % 4
     assert found[0].tolist() == [SEEN if s == across else LEAST for s in range(4)]
     assert found[1].tolist() == sides[1].tolist()

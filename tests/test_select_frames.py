@@ -121,11 +121,12 @@ def test_bodies_without_joints_are_judged_by_their_vertices():
     assert np.flatnonzero(~kept(bodies)).tolist() == [60]
 
 
-def test_the_rule_of_the_paper_equals_a_naive_loop():
+def test_the_rule_of_the_paper_equals_a_naive_loop(monkeypatch):
     joints = walk_and_sit(seed=4)
-    limits = {"pelvis_acceleration": 3.0, "pelvis_jitter": 0.06, "local_jitter": 0.07}
-    limits["local_acceleration"] = 0.0
-    keep = kept(bodies_of(joints, np.arange(240)), rule="each", **limits)
+    limits = {"PELVIS_ACCELERATION": 3.0, "PELVIS_JITTER": 0.06, "LOCAL_JITTER": 0.07}
+    for name, value in (limits | {"LOCAL_ACCELERATION": 0.0}).items():
+        monkeypatch.setattr(f"mover.stages.people.select_frames.{name}", value)
+    keep = kept(bodies_of(joints, np.arange(240)), rule="each")
     wrong = np.zeros(240, bool)
     for t in range(1, 239):
         second = joints[t + 1] - 2 * joints[t] + joints[t - 1]

@@ -14,7 +14,7 @@ from mover.geometry.camera import project
 from mover.geometry.rotations import rot_y
 from mover.stages.config import ImageConfig
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
-from mover.stages.objects.gather_given import believed_sides
+from mover.stages.objects.gather_given import bounded_sides
 
 HEIGHT, WIDTH = 120, 200
 LEFT, TOP, RIGHT, BOTTOM = range(4)
@@ -95,7 +95,7 @@ class TestWhatIsKnown:
         camera = replace(make_inputs().camera, width=WIDTH, height=HEIGHT)
         pixels = corners_at_border(camera.K, torch.Generator().manual_seed(seed))
         mask = hull(pixels)
-        sides = believed_sides(torch.tensor([sides_of(mask)]), torch.zeros(1))
+        sides = bounded_sides(torch.tensor([sides_of(mask)]), torch.zeros(1))
         box = box_of(mask)
         price = bbox_term(pixels[None], box[None], sides, float(WIDTH), "robust")
         whole = float((box[2:] - box[:2]).prod().sqrt())

@@ -9,13 +9,11 @@ from torch import Tensor
 from mover.bodies.parts import Parts, parts_of
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, CameraPath, Capture
-from mover.energy.human_terms import FootContacts
 from mover.geometry.path import is_still, poses_at, to_reference
 from mover.io.capture.pose_file import moved
 from mover.pipeline.outcome import PeopleState, check_floor
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import AlignInputs, align_camera
-from mover.stages.camera.doubt_floor import doubt_floor
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens, tilted_by
 from mover.stages.camera.room_lines import FINE, SURE, Segments, find_segments
@@ -62,7 +60,7 @@ def lines_of(
 
 
 def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
-    """The people of a run, with what makes the floor doubtful that their feet tell.
+    """The people of a run, with a warning where their floor is not the given one.
 
     Raises:
         InputError: If no camera stands above such a floor.
@@ -70,8 +68,7 @@ def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
     found = located(capture, config, run)
     if found is None:
         return None
-    feet, there = found.foot_contacts, found.alignment
-    odd = (*_doubts(feet, capture, there.camera), *check_floor(there.ground, capture))
+    odd = check_floor(found.alignment.ground, capture)
     return replace(found, warnings=(*found.warnings, *odd))
 
 
@@ -115,13 +112,6 @@ def chosen_people(capture: Capture, parts: Parts, config: Config, run: Run) -> C
     inputs = DepthInputs(bodies, parts, kept, masks, hiding(capture, path), camera)
     depth = run.stage(find_depth, inputs, config.depth)
     return ChosenPeople(apply_depth(bodies, depth), kept, depth.warnings)
-
-
-def _doubts(feet: FootContacts, capture: Capture, camera: Camera) -> tuple[str, ...]:
-    """What makes the floor doubtful that the feet tell, where nothing else tells it."""
-    if capture.camera_height is not None or not is_still(capture.path):
-        return ()
-    return doubt_floor(feet, capture.detections, capture.people, camera)
 
 
 def _tilted(camera: Camera, capture: Capture) -> tuple[Camera, float | None]:

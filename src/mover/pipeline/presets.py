@@ -91,11 +91,11 @@ PAPER = Config(
     align=_PLANE,
     layout=PlaceConfig(weights=IMAGE_ONLY, method=Adam(1000)),
     gather=GatherConfig(erode=2),
-    assign=AssignConfig(by="mask_hits"),
+    assign=AssignConfig("mask_hits"),
     place=PlaceConfig(),
 )
 
-_GROUPS = AssignConfig(by="group", split="parts", cell=0.02, most=300, hand_reach=0.25)
+_GROUPS = AssignConfig("group", cell=0.02, most=300)
 _SHORT = Adam(60, 0.03, 0.01, beta2=0.98, keep_best=True)
 _ROBUST_IMAGE = SceneWeights(
     1.0, 1.0, 0.3, 0.0, 0.0, 0.0, distance=0.02, wall=0.01, given=0.02, measured=0.05

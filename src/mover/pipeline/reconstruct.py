@@ -55,7 +55,7 @@ from mover.stages.objects.find_image_cues import (
 from mover.stages.objects.gather_depth import DepthInputs, gather_depth
 from mover.stages.objects.gather_given import (
     UNFIT,
-    believed_sides,
+    bounded_sides,
     gather_given,
     given_axis,
     lighter_where_used,
@@ -201,7 +201,7 @@ def with_given(
     believed.
     """
     objects, heading = context.prepared.objects, context.capture.heading
-    free = replace(image, sides=believed_sides(image.sides, torch.zeros_like(image.trust)))
+    free = replace(image, sides=bounded_sides(image.sides, torch.zeros_like(image.trust)))
     if not context.config.place.weights.given:
         return free
     edges = edges_under(context, camera)
@@ -211,9 +211,7 @@ def with_given(
     left = misfit_of(context, free, before)
     given, layout = as_given(context, camera), before.placed.layout
     known = gather_given(objects, given, layout, left, heading, edges)
-    return replace(
-        image, given=known, sides=believed_sides(image.sides, known.weight, image.beside)
-    )
+    return replace(image, given=known, sides=bounded_sides(image.sides, known.weight, image.beside))
 
 
 def edges_under(context: ReconstructionContext, camera: Camera) -> OwnEdges | None:
@@ -237,7 +235,7 @@ def with_unfit_shapes(context: ReconstructionContext, state: SceneState) -> Reco
     image = state.descent[0].image
     if not context.config.seat_heights or image.given is None:
         return context
-    free = replace(image, sides=believed_sides(image.sides, 0 * image.given.weight))
+    free = replace(image, sides=bounded_sides(image.sides, 0 * image.given.weight))
     unfit = prior_weights(misfit_of(context, free, state)) >= UNFIT
     return replace(context, unfit=unfit & ~is_pinned(context))
 

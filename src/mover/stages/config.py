@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 
 from mover.core.settings import (
     Count,
-    Degrees,
     Metres,
     Share,
     Sigma,
@@ -29,18 +28,10 @@ IMAGE_ONLY = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class SelectConfig:
-    """How much acceleration is honest."""
+    """Which frames are used."""
 
     rule: Literal["chain", "each"] = "chain"
     """`chain`: the longest consistent sequence; `each`: the paper's test of every frame."""
-    pelvis_acceleration: Annotated[float, float_in(0, 1e4)] = 10.0
-    """What a pelvis does when one jumps off a step [m/s²]."""
-    pelvis_jitter: Metres = 0.2
-    """Second difference of the pelvis that noise explains [m]."""
-    local_acceleration: Annotated[float, float_in(0, 1e4)] = 8.0
-    """Mean acceleration of shoulders, elbows, hips and knees relative to the pelvis [m/s²]."""
-    local_jitter: Metres = 0.16
-    """Its second difference that noise explains [m]."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +49,7 @@ class DepthConfig:
     whole: Count = 150
     """At most so many frames are searched for people who are seen well, or wholly."""
     least: Count = 3
-    """Fewer frames than that tell nothing."""
+    """Fewer frames than that are no evidence."""
     width: Annotated[int, int_in(16, 4096)] = 240
     """Width of the pictures that are compared [px]."""
     seen: Share = 0.6
@@ -73,16 +64,8 @@ class DepthConfig:
 class FootContactConfig:
     """When a foot carries a person."""
 
-    knee: Degrees = 145.0
-    """A leg is straight if the angle at the knee is larger [degrees]."""
-    hip: Degrees = 140.0
-    """... and the angle between thigh and trunk [degrees]."""
-    upright: Degrees = 60.0
-    """... and the leg leans less than this [degrees]."""
     speed: Annotated[float, float_in(0, 100)] = 0.2
     """A foot is still if it is slower [m/s]."""
-    points: Annotated[int, int_in(1, 1000)] = 4
-    """The lowest vertices of a sole that count."""
     given: bool = False
     """Where the capture has contacts of its own (POSA), these say which soles stand (paper)."""
 
@@ -92,7 +75,7 @@ class AlignConfig:
     """How feet make a floor; the paper has sigmas (0.1,), no priors, one vote a point."""
 
     sigmas: tuple[Annotated[float, float_in(1e-4, 100)], ...] = (0.1, 0.06, 0.035, 0.02)
-    """Scales of the Geman-McClure price, one descent after the other [m]."""
+    """Scales of the Geman-McClure cost, one descent after the other [m]."""
     tilt_prior: Annotated[float, float_in(1e-4, math.inf)] = math.radians(4.0)
     """How far off the first pitch and roll usually are [rad]; inf: no prior."""
     offset_prior: Metres = 0.03
@@ -153,7 +136,7 @@ class PlaceConfig:
 
     weights: SceneWeights = field(default_factory=SceneWeights)
     form: Variant = "paper"
-    """How the terms are priced."""
+    """How the terms are weighted."""
     method: Adam | BatchedBFGS = field(default_factory=Adam)
     """The descent from each start that is left."""
     yaws: Annotated[int, int_in(1, 360)] = 1
@@ -171,7 +154,7 @@ class PlaceConfig:
     apart: Weight = 0.0
     """Weight of the space that objects share, in a last descent of all together."""
     uniform_scale_weight: Weight = GROWTH
-    """Price of another size as a whole, against that of another shape (robust)."""
+    """Cost of another size as a whole, against that of another shape (robust)."""
 
 
 @dataclass(frozen=True)
@@ -180,18 +163,16 @@ class RefineConfig:
 
     rounds: Annotated[int, int_in(0, 100)] = 0
     """How often; 0: never (the paper)."""
-    feet: Weight = 0.04
-    """Weight w of what the feet say; each object counts about one."""
     weights: SceneWeights = IMAGE_ONLY
     """Of what the image says."""
     uniform_scale_weight: Weight = GROWTH
-    """Price of another size as a whole, against that of another shape."""
+    """Cost of another size as a whole, against that of another shape."""
     method: Adam = field(default_factory=lambda: Adam(400, rate=0.3, last_rate=0.02, beta2=0.98))
 
 
 @dataclass(frozen=True)
 class SpreadConfig:
-    """How the price of sizes follows the room."""
+    """How the cost of sizes follows the room."""
 
     usual: Share = 0.0
     """Usual standard deviation of the logarithm of a size; 0: nothing is learnt."""
@@ -199,8 +180,6 @@ class SpreadConfig:
     """That of what the three sizes of a piece have in common."""
     known: Annotated[float, float_in(0, 1e6)] = 2.0
     """How many pieces of a usual room count as if they were seen."""
-    most: Annotated[float, float_in(1, 1e3)] = 4.0
-    """The largest spread that is believed, in usual ones; the smallest is 1."""
 
 
 @dataclass(frozen=True)
@@ -215,31 +194,14 @@ class GatherConfig:
     """Per body and object, keep only the larger of the hidden and the hiding region."""
     cells: Annotated[int, int_in(8, 512)] = 256
     """Cells along the longest side of the volume of all bodies."""
-    padding: Annotated[float, float_in(0, 10)] = 0.2
-    """Space around the bodies in the volume [m]."""
-    beside: Metres = 0.25
-    """Farthest a moving camera may be from that of the image for which its frame tells who hides
-    whom: from farther away another object may be in between [m]."""
-    workers: Annotated[int, int_in(1, 256)] = 2
-    """Threads that draw and measure; the result does not depend on it."""
 
 
 @dataclass(frozen=True)
 class AssignConfig:
     """How contact vertices find their objects."""
 
-    by: Literal["vertex", "group", "mask_hits"] = "vertex"
-    """What is assigned as one (`contact_association`)."""
-    split: Literal["normals", "parts"] = "normals"
-    """Seat or back: by the normal of the vertex, or backs alone touch backs (unless they lie)."""
-    chance: Share = 0.5
-    """A vertex touches from here on."""
-    overlap: Share = 0.5
-    """Share of a group that must project into an object's mask."""
-    farthest: Metres = 1.0
-    """Farther than this from the object's part, nothing is touched [m]."""
-    hand_reach: Metres = 1.0
-    """The same for hands, and for backs of bodies that sit on no object (`group`) [m]."""
+    by: Literal["mask_hits", "group"] = "mask_hits"
+    """By the rules of the authors' released code, or by groups of parts (`contact_association`)."""
     cell: Annotated[float, float_in(1e-4, 10)] = 0.01
     """Contact points nearer than this become one with their count as weight [m]."""
     most: Count = 2000
@@ -259,7 +221,7 @@ class RefineBodiesConfig:
     method: Adam = field(default_factory=lambda: Adam(25, 0.01, 0.003, beta2=0.98))
     """The descent of one round that changes poses too."""
     rounds: Annotated[int, int_in(1, 1000)] = 3
-    """How often contacts and depth order are looked for anew."""
+    """How often contacts and depth order are looked for again."""
     rhos: tuple[Sigma, Sigma] = (0.15, 0.06)
     """Distances at which a contact pays half, in the first and in the last round [m]."""
     rows: Annotated[int, int_in(1, 100_000)] = 512

@@ -1,4 +1,4 @@
-"""Masks of people and of a smaller image: whose they are, what they tell of depth, how they fit."""
+"""Masks of people and of a smaller image: whose they are, and what they imply of depth."""
 
 import math
 from collections.abc import Callable
@@ -98,14 +98,18 @@ def compare_extents(
     Blocked pixels are of what may hide people in a frame.
 
     Returns:
-        None if nobody is seen wholly, upright and high enough.
+        None if no person is seen wholly, upright and high enough.
     """
+    views = Crops(camera.K[None].float(), camera.height, camera.width)
 
     def ratio(row: int) -> float:
-        """Height of the body over that of its mask; NaN where they tell nothing."""
-        if not _inside(bodies.verts[row], camera):
+        """Height of the body over that of its mask; NaN where they constrain nothing."""
+        verts = bodies.verts[row]
+        pixels = project(verts, camera.K.to(verts))
+        last = pixels.new_tensor([camera.width - 2, camera.height - 2])
+        if not bool((verts[:, 2] > 0).all() & ((pixels > 2) & (pixels < last)).all()):
             return math.nan
-        drawn = _drawn(bodies, row, camera)
+        drawn = layers(verts[None].float(), bodies.faces, views).front.isfinite()[0]
         high, wide = _extent(drawn)
         if high <= UPRIGHT * wide:
             return math.nan
@@ -123,18 +127,6 @@ def compare_extents(
     middle = found.median()
     off = GAUSS * float((found - middle).abs().median())
     return Extents(float(middle), 1.25 * off / len(found) ** 0.5, len(found))
-
-
-def _inside(verts: Float[Tensor, "verts 3"], camera: Camera) -> bool:
-    pixels = project(verts, camera.K.to(verts))
-    last = pixels.new_tensor([camera.width - 2, camera.height - 2])
-    ahead = bool((verts[:, 2] > 0).all())
-    return ahead and bool(((pixels > 2) & (pixels < last)).all())
-
-
-def _drawn(bodies: Bodies, row: int, camera: Camera) -> Bool[Tensor, "h w"]:
-    views = Crops(camera.K[None].float(), camera.height, camera.width)
-    return layers(bodies.verts[row : row + 1].float(), bodies.faces, views).front.isfinite()[0]
 
 
 def _extent(mask: Bool[Tensor, "h w"]) -> tuple[float, float]:

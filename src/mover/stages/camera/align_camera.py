@@ -7,8 +7,8 @@ with its covariance.
 Departure: In the paper every point has the same vote. Here every place where a person stood has one
            (it grows with the frames spent there, up to a limit), because the feet of one pose are
            wrong together.
-What no foot can tell: the size of the people. If all of them are too large and too far by the same
-factor, so is the depth of the ground; this is not part of the covariance.
+What no foot constrains: the size of the people. If all of them are too large and too far by the
+same factor, so is the depth of the ground; this is not part of the covariance.
 """
 
 import dataclasses
@@ -48,7 +48,7 @@ LARGE_OFFSET = 0.05  # [m], a body that floats that much has a wrong depth or si
 
 @record
 class Prior:
-    """What is believed before any foot is seen."""
+    """What is known before any foot is seen."""
 
     first: Float[Tensor, "2"]
     """Pitch and roll [rad]."""
@@ -65,13 +65,13 @@ class Fit:
     """A minimum: pitch, roll, ground, then the offset of each person."""
 
     at: Float[Tensor, " unknowns"]
-    price: float
+    cost: float
     sigma: float
-    """Scale of the robust price at the end [m]."""
+    """Scale of the robust cost at the end [m]."""
     prior: Prior
 
 
-def price(
+def cost_of(
     at: Float[Tensor, " unknowns"], votes: Votes, prior: Prior, sigma: float
 ) -> Float[Tensor, ""]:
     """What the fit minimises: L_feet in units of its noise, plus the priors, in nats."""
@@ -92,27 +92,29 @@ def fit_plane(
     sigmas: tuple[float, ...],
     steps: int,
 ) -> Fit:
-    """Descend from `start` with one scale of the robust price after the other."""
+    """Descend from `start` with one scale of the robust cost after the other."""
     at = start
     for sigma in sigmas:
         at = _descend(votes, prior, at, sigma, steps if sigma == sigmas[-1] else min(steps, ROUGH))
-    return Fit(at, float(price(at, votes, prior, sigmas[-1])), sigmas[-1], prior)
+    return Fit(at, float(cost_of(at, votes, prior, sigmas[-1])), sigmas[-1], prior)
 
 
 def _descend(
     votes: Votes, prior: Prior, at: Float[Tensor, " unknowns"], sigma: float, steps: int
 ) -> Float[Tensor, " unknowns"]:
     """Levenberg-Marquardt with the weights of Geman-McClure."""
-    damping, value = 1e-3, float(price(at, votes, prior, sigma))
+    damping, value = 1e-3, float(cost_of(at, votes, prior, sigma))
+    centre = torch.cat([prior.first, at[2:3], torch.zeros_like(at[3:])])
     for _ in range(steps):
         residual, slope = _linear(at, votes)
+        centre[2] = at[2] if prior.ground is None else prior.ground
         pull = votes.weight / (1 + (residual / sigma).square()).square()
         trust = _prior_weights(at, prior)
         hessian = slope.mT @ (pull[:, None] * slope) + trust.diag()
-        gradient = slope.mT @ (pull * residual) + trust * (at - _centre(at, prior))
+        gradient = slope.mT @ (pull * residual) + trust * (at - centre)
         while damping < 1e8:
             change = torch.linalg.solve(hessian + damping * hessian.diag().diag(), gradient)
-            lower = float(price(at - change, votes, prior, sigma))
+            lower = float(cost_of(at - change, votes, prior, sigma))
             if lower <= value:
                 break
             damping *= 5
@@ -140,11 +142,6 @@ def _linear(
     return residual, torch.cat([slope, -floats], -1)
 
 
-def _centre(at: Float[Tensor, " unknowns"], prior: Prior) -> Float[Tensor, " unknowns"]:
-    ground = at[2:3] if prior.ground is None else at.new_tensor([prior.ground])
-    return torch.cat([prior.first, ground, torch.zeros_like(at[3:])])
-
-
 def _prior_weights(at: Float[Tensor, " unknowns"], prior: Prior) -> Float[Tensor, " unknowns"]:
     """One over the variance that the prior gives each unknown, its long tail included."""
     tilt = prior.tilt**-2 / (1 + (at[:2] - prior.first).square().sum() / prior.tilt**2 / TILT_TAIL)
@@ -156,7 +153,7 @@ def _prior_weights(at: Float[Tensor, " unknowns"], prior: Prior) -> Float[Tensor
 def covariance_of(fit: Fit, votes: Votes) -> Float[Tensor, "3 3"]:
     """Covariance of pitch [rad], roll [rad] and ground [m] from the spread of the feet themselves.
 
-    A sandwich: the curvature of the price, and the variance of its gradient, in which the frames of
+    A sandwich: the curvature of the cost, and the variance of its gradient, in which the frames of
     one place err together. The mean offset of the people counts as known (see align_camera).
     """
     residual, slope = _linear(fit.at, votes)
@@ -172,7 +169,12 @@ def covariance_of(fit: Fit, votes: Votes) -> Float[Tensor, "3 3"]:
     squared = (height / fit.sigma).square()
     bend = ((1 - 3 * squared) / (1 + squared) ** 3).mean().clamp_min(0.2)
     curvature = bend * lean.mT @ (mass[:, None] * lean)
-    trust = _certain(fit)
+    # prior weights are never quite nothing here, and people float by zero on average
+    weights = _prior_weights(fit.at, fit.prior)
+    weights = torch.cat([weights[:2].clamp_min(FLAT**-2), weights[2:].clamp_min(1e-2)])
+    common = torch.cat([torch.zeros_like(weights[:3]), torch.ones_like(weights[3:])])
+    known = 0.0 if fit.prior.ground is not None else FIXED**-2
+    trust = weights.diag() + known * common[:, None] * common
     bread = torch.linalg.inv(curvature + trust)
     freedom = float((bread @ curvature).trace())
     step, spot = _noise(height, place, freedom)
@@ -181,15 +183,6 @@ def covariance_of(fit: Fit, votes: Votes) -> Float[Tensor, "3 3"]:
     step, spot = CAUTION * step * bend.square(), CAUTION * spot * bend.square()
     meat = step * lean.mT @ (mass.square()[:, None] * lean) + spot * shared.mT @ shared
     return (bread @ (meat + trust) @ bread)[:3, :3]
-
-
-def _certain(fit: Fit) -> Float[Tensor, "unknowns unknowns"]:
-    """Prior weights for the covariance: never quite nothing; people float by zero on average."""
-    weights = _prior_weights(fit.at, fit.prior)
-    weights = torch.cat([weights[:2].clamp_min(FLAT**-2), weights[2:].clamp_min(1e-2)])
-    common = torch.cat([torch.zeros_like(weights[:3]), torch.ones_like(weights[3:])])
-    known = 0.0 if fit.prior.ground is not None else FIXED**-2
-    return weights.diag() + known * common[:, None] * common
 
 
 def _noise(
@@ -242,8 +235,8 @@ def align_camera(
 ) -> Alignment:
     """Level the world: turn the camera and move the floor until still feet stand on it.
 
-    What the feet cannot tell (a straight walk, one frame) stays at the first guess, is large in the
-    covariance, and gives a warning. A known camera height fixes the ground.
+    What the feet do not constrain (a straight walk, one frame) stays at the first guess, is large
+    in the covariance, and gives a warning. A known camera height fixes the ground.
     """
     feet, camera = inputs.foot_contacts, inputs.camera
     if not len(feet.person):
@@ -301,7 +294,7 @@ def _best_fit(
     return min(
         fit_plane(votes, prior, start, config.sigmas, config.steps),
         fit_plane(votes, prior, away, (*WIDE, *config.sigmas), config.steps),
-        key=lambda fit: fit.price,
+        key=lambda fit: fit.cost,
     )
 
 
@@ -326,7 +319,7 @@ def _without_feet(inputs: AlignInputs, config: AlignConfig) -> Alignment:
 
 
 def _weak(found: Alignment, votes: Votes) -> tuple[str, ...]:
-    """Warnings about what the feet cannot tell."""
+    """Warnings about what the feet leave open."""
     pitch, roll, ground = found.covariance.diag().double().sqrt().tolist()
     loose = [
         f"{name} is uncertain by {math.degrees(spread):.1f} degrees"
@@ -355,7 +348,7 @@ def _cause(found: Alignment, votes: Votes) -> str:
 def _surprising(
     found: Alignment, first: Float[Tensor, "2"], config: AlignConfig
 ) -> tuple[str, ...]:
-    """Warnings about what contradicts what was believed."""
+    """Warnings about what contradicts the prior."""
     warnings: list[str] = []
     turned = float(torch.stack(pitch_roll(found.camera.R_cam_world.double())).sub(first).norm())
     if turned > 2.5 * config.tilt_prior:

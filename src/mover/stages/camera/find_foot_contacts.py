@@ -2,7 +2,7 @@
 
 Departure: The paper takes every foot vertex that a network calls a contact. But feet of people who
 sit or lie hang in the air or lie on furniture; here a foot counts only if it is the lower one, does
-not move, and its leg is straight, which is judged without knowing the floor. Where nobody ever
+not move, and its leg is straight, which is judged without knowing the floor. Where no person ever
 stands like this, the best there is counts, with a warning.
 """
 
@@ -18,10 +18,13 @@ from mover.core.types import Bodies, Camera
 from mover.energy.human_terms import FootContacts
 from mover.stages.config import FootContactConfig
 
+KNEE, HIP = 145.0, 140.0  # [degrees], a leg is straight whose knee and hip are opened wider ...
+UPRIGHT = 60.0  # [degrees] ... and that leans less
+POINTS = 4  # lowest vertices of a sole that count
 SIDES = ("left", "right")
 SOLES = tuple(f"{side}_sole" for side in SIDES)
 TOUCHING = 0.5  # the paper's threshold
-WITHIN = 0.5  # [s] between two frames that still tell whether a foot moved
+WITHIN = 0.5  # [s] between two frames that still show whether a foot moved
 FAR_ENOUGH = 0.15  # [s] between them, at least, where the video has them: jitter is no motion
 JITTER = 0.03  # [m] that a still foot seems to move
 TALL = 0.9  # of a person's usual height, from head to foot: who is lower does not stand
@@ -48,7 +51,7 @@ class _Feet:
 
     points: Float[Tensor, "bodies points 3"]
     carries: Bool[Tensor, " bodies"]
-    """Its leg is straight, as far as can be told."""
+    """Its leg is straight, as far as can be seen."""
     still: Bool[Tensor, " bodies"]
 
 
@@ -70,9 +73,10 @@ def find_foot_contacts(
         none = bodies.frame
         return FootContacts(bodies.verts.new_zeros(0, 3), none, none, ())
     if config.given and inputs.touch is not None:
-        named = _named(inputs, inputs.touch)
-        if len(named.person):
-            return named
+        named = (inputs.touch > TOUCHING) & members(inputs.parts, *SOLES) & inputs.keep[:, None]
+        row, vert = named.nonzero().unbind(1)
+        if len(row):
+            return FootContacts(bodies.verts[row, vert], bodies.person[row], bodies.frame[row], ())
     feet = _lower_feet(inputs, config)
     use, warnings = _best_evidence(feet, sound)
     observe(Step("find_foot_contacts", 0, 1))
@@ -85,26 +89,18 @@ def find_foot_contacts(
     )
 
 
-def _named(inputs: FootContactInputs, touch: Float[Tensor, "bodies verts"]) -> FootContacts:
-    """The sole points that the user's contacts name."""
-    bodies = inputs.bodies
-    touching = (touch > TOUCHING) & members(inputs.parts, *SOLES) & inputs.keep[:, None]
-    row, vert = touching.nonzero().unbind(1)
-    return FootContacts(bodies.verts[row, vert], bodies.person[row], bodies.frame[row], ())
-
-
 def _best_evidence(
     feet: _Feet, sound: Bool[Tensor, " bodies"]
 ) -> tuple[Bool[Tensor, " bodies"], tuple[str, ...]]:
     """The strictest choice that leaves something, and what to say about it."""
     levels = (
         (feet.carries & feet.still, ()),
-        (feet.carries, ("no standing foot is ever still: moving feet tell the floor",)),
+        (feet.carries, ("no standing foot is ever still: moving feet give the floor",)),
         (
             feet.still,
-            ("nobody ever stands on a straight leg: the lowest still feet tell the floor",),
+            ("no person ever stands on a straight leg: the lowest still feet give the floor",),
         ),
-        (sound, ("no foot is ever still: the lowest point of every body tells the floor",)),
+        (sound, ("no foot is ever still: the lowest point of every body gives the floor",)),
     )
     for chosen, warnings in levels:
         if bool((chosen & sound).any()):
@@ -115,12 +111,12 @@ def _best_evidence(
 def _lower_feet(inputs: FootContactInputs, config: FootContactConfig) -> _Feet:
     """Points, posture and motion of the lower foot of each body."""
     bodies, up = inputs.bodies, inputs.camera.R_cam_world[:, 1].to(inputs.bodies.verts)
-    straight = straight_legs(bodies, inputs.parts, up, config)
+    straight = straight_legs(bodies, inputs.parts, up)
     points, still, height = [], [], []
     for side in SIDES:
         sole = members(inputs.parts, f"{side}_sole")
         verts = bodies.verts[:, sole] if bool(sole.any()) else bodies.verts
-        lowest = (verts @ up).topk(min(config.points, verts.shape[1]), dim=1, largest=False)
+        lowest = (verts @ up).topk(min(POINTS, verts.shape[1]), dim=1, largest=False)
         points.append(verts.take_along_dim(lowest.indices[..., None], 1))
         height.append(lowest.values.mean(1))
         still.append(_still(verts.mean(1), bodies, config.speed))
@@ -133,7 +129,7 @@ def _lower_feet(inputs: FootContactInputs, config: FootContactConfig) -> _Feet:
 
 
 def straight_legs(
-    bodies: Bodies, parts: Parts, up: Float[Tensor, "3"], config: FootContactConfig
+    bodies: Bodies, parts: Parts, up: Float[Tensor, "3"]
 ) -> Bool[Tensor, "bodies sides"]:
     """Whether each leg, left and right, stands straight; `up` may be off by several degrees.
 
@@ -147,9 +143,9 @@ def straight_legs(
         hip, knee, ankle = (at(places, f"{side}_{joint}") for joint in ("hip", "knee", "ankle"))
         trunk = at(places, "neck") - at(places, "hips")
         lean = _angle(hip - ankle, up.expand_as(hip))
-        bent = _angle(hip - knee, ankle - knee) < config.knee
-        sits = _angle(knee - hip, trunk) < config.hip
-        legs.append(~bent & ~sits & (lean < config.upright))
+        bent = _angle(hip - knee, ankle - knee) < KNEE
+        sits = _angle(knee - hip, trunk) < HIP
+        legs.append(~bent & ~sits & (lean < UPRIGHT))
     return torch.stack(legs, 1)
 
 
@@ -198,7 +194,7 @@ def _rests(
     )
     for other in (before, after):
         wait = (time - time[other]).abs()
-        told = (wait > 0) & (wait <= WITHIN)
-        known = known | told
-        rests = rests | told & ((foot - foot[other]).norm(dim=-1) < JITTER + speed * wait)
+        near = (wait > 0) & (wait <= WITHIN)
+        known = known | near
+        rests = rests | near & ((foot - foot[other]).norm(dim=-1) < JITTER + speed * wait)
     return rests | ~known

@@ -1,4 +1,4 @@
-"""The voice of each sole point in where the floor is: places share theirs among their frames."""
+"""The weight of each sole point in the height of the floor: positions share theirs among frames."""
 
 import dataclasses
 from typing import Literal

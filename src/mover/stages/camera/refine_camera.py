@@ -2,16 +2,16 @@ r"""Refine camera and ground together with the objects that stand on it.
 
 Ours, not the paper's, which freezes the camera after the feet: one degree of pitch or 2 cm of
 ground is 5-15 cm of depth at 5 m, because an object stands where the ray to its base meets the
-floor. Objects whose shape fits tell the camera more exactly than noisy feet do.
+floor. Objects whose shape fits constrain the camera more than noisy feet do.
 
     min over pitch, roll, ground and all objects on the floor:
         sum_i E_i / (E_i(start) + 0.02)  +  w/2 d^T C^-1 d
 
 Each object's energy is divided by its own residual: exact shapes pull hard, wrong shapes softly.
 d is the change of pitch, roll and ground, C their covariance from the feet: a floor that was
-walked all around outweighs the objects, and what no foot told is left to them. The borders of the
-masks are held as they suit the objects at first (`fixed_borders`). An object is carried by the
-ray to the centre of its base, so a change of the camera leaves it where it is in the image.
+walked all around outweighs the objects, and what the feet left open is left to them. The borders
+of the masks are fixed as they suit the objects at first (`fixed_borders`). An object is carried by
+the ray to the centre of its base, so a change of the camera leaves it where it is in the image.
 """
 
 from dataclasses import replace
@@ -53,6 +53,7 @@ def fixed_borders(
     return replace(image, masks=masks, boxes=boxes, borders=None)
 
 
+FEET = 0.04  # weight w of the camera by the feet; each object counts about one
 SOFT = 0.02  # [1], added to an object's own residual
 UNITS = (0.01, 0.01, 0.02, 0.01, 0.05, 0.03)
 """Of pitch, roll [rad], ground [m], rays, yaw [rad] and logarithms of scales."""
@@ -92,12 +93,20 @@ def refine_camera(
     inputs: RefineInputs, config: RefineConfig, observe: Observer = silent
 ) -> Refined:
     """Minimise over the camera, the ground and all standing objects at once."""
-    fixed, objects = _start(inputs), inputs.objects
+    objects, t = inputs.objects, inputs.layout.t_world_object
+    base = to_camera(t, inputs.camera.R_cam_world)
+    rays = base[:, :2] / base[:, 2:].clamp_min(0.1)
+    pitch, roll = pitch_roll(inputs.camera.R_cam_world)
+    tilt = torch.stack([pitch, roll, pitch.new_tensor(inputs.ground)])
+    fixed = _Joint(tilt, rays, inputs.layout.yaw, inputs.layout.log_scale)
     certainty = torch.linalg.inv(inputs.covariance)
     cues = fixed_borders(inputs.image, inputs.layout, objects, inputs.camera, config.weights)
     terms = SceneConfig(config.weights, "robust", config.uniform_scale_weight)
     of_layout = energy_function(objects, inputs.camera, cues, HumanCues(), terms)
-    usable, zero = _usable(inputs), map_tensors(torch.zeros_like, fixed)
+    low = -t[:, 1] > 2 * LOWEST * t.norm(dim=-1)  # below the horizon, in front of the camera
+    usable = (objects.supports == GROUND) & low & (base[:, 2] > 0.3)
+    usable = (usable & inputs.image.keep.flatten(1).any(-1)).to(t)
+    zero = map_tensors(torch.zeros_like, fixed)
 
     def energies(joint: _Joint) -> Float[Tensor, " objects"]:
         camera, layout = _unpack(joint, inputs)
@@ -110,7 +119,7 @@ def refine_camera(
         joint = _shift(fixed, free)
         shares = energies(joint) / residual
         off = joint.tilt - fixed.tilt
-        feet = 0.5 * config.feet * (off @ certainty @ off)
+        feet = 0.5 * FEET * (off @ certainty @ off)
         return Energy({"objects": (shares * usable).sum(), "feet": feet})
 
     if not bool(usable.any()):
@@ -120,23 +129,6 @@ def refine_camera(
     joint = _shift(fixed, found.at)
     camera, _ = _unpack(joint, inputs)
     return Refined(camera, float(joint.tilt[2]), found.trace)
-
-
-def _start(inputs: RefineInputs) -> _Joint:
-    base = to_camera(inputs.layout.t_world_object, inputs.camera.R_cam_world)
-    rays = base[:, :2] / base[:, 2:].clamp_min(0.1)
-    pitch, roll = pitch_roll(inputs.camera.R_cam_world)
-    tilt = torch.stack([pitch, roll, pitch.new_tensor(inputs.ground)])
-    return _Joint(tilt, rays, inputs.layout.yaw, inputs.layout.log_scale)
-
-
-def _usable(inputs: RefineInputs) -> Float[Tensor, " objects"]:
-    """Objects on the ground, in front of the camera, below the horizon, with a mask."""
-    t = inputs.layout.t_world_object
-    low = -t[:, 1] > 2 * LOWEST * t.norm(dim=-1)
-    ahead = to_camera(t, inputs.camera.R_cam_world)[:, 2] > 0.3
-    seen = inputs.image.keep.flatten(1).any(-1)
-    return ((inputs.objects.supports == GROUND) & low & ahead & seen).to(t)
 
 
 def _shift(fixed: _Joint, free: _Joint) -> _Joint:

@@ -1,7 +1,7 @@
 """Find what body parts touch: the chance of every vertex, and the objects that they are given to.
 
 A part goes to an object by the overlap of its projection with the objects' masks and by the
-distance in 3D: `contact_association` has the rules of the three presets (Sec. 3.1).
+distance in 3D: `contact_association` has the rules of both presets (Sec. 3.1).
 """
 
 import torch
@@ -132,15 +132,11 @@ def assign_contacts(
     points = _pack(rows, part, inputs, config)
     for i, bodies in zip(points.object_of.tolist(), points.bodies.tolist(), strict=True):
         counts[i] = int(bodies)
-    pairs = _unique(torch.stack([rows.body, rows.object_of, part], -1))
-    return ContactAssignment(points, seated, tuple(counts), pairs)
-
-
-def _unique(rows: Int[Tensor, "rows 3"]) -> Int[Tensor, "pairs 3"]:
-    """Rows of numbers from 0 on, each once and sorted; as numbers, which sort far faster."""
-    sizes = rows.amax(0) + 1
+    pairs = torch.stack([rows.body, rows.object_of, part], -1)
+    sizes = pairs.amax(0) + 1  # unique as numbers, which sort far faster than rows
     place = torch.stack([sizes[1] * sizes[2], sizes[2], torch.ones_like(sizes[2])])
-    return (rows @ place).unique()[:, None] // place % sizes
+    pairs = (pairs @ place).unique()[:, None] // place % sizes
+    return ContactAssignment(points, seated, tuple(counts), pairs)
 
 
 def _parts(rows: ContactRows, inputs: AssignInputs, config: AssignConfig) -> Int[Tensor, " rows"]:
@@ -148,7 +144,7 @@ def _parts(rows: ContactRows, inputs: AssignInputs, config: AssignConfig) -> Int
     some, row = rows.body.unique(return_inverse=True)
     normals = vertex_normals(inputs.bodies.verts[some], inputs.bodies.faces)[row, rows.vert]
     level = normals[:, 1].abs() >= LEVEL
-    if config.split == "parts":
+    if config.by == "group":  # backs alone touch backs, unless they lie
         level = level | (inputs.parts.part_of[rows.vert] != PARTS.index("back"))
     return (~level).long() + 2 * rows.hand.long()
 
@@ -178,8 +174,8 @@ def _pack(
 def _headings(rows: ContactRows, touched: Int[Tensor, " touched"], inputs: AssignInputs) -> Tensor:
     """Mean horizontal direction of those who sit or lie on each touched object; zero for none.
 
-    Who sits tells it only of what has a back: one sits on the side of a bed, and round a stool.
-    Who lies tells it of a bed, whose back is where heads lie.
+    Seated people face as objects with a back do; on the side of a bed or round a stool they do
+    not. Lying people give the heading of a bed, whose back is where heads lie.
     """
     bodies, parts = inputs.bodies, inputs.parts
     pose, places = postures(bodies, parts), landmarks(bodies, parts)
@@ -191,6 +187,6 @@ def _headings(rows: ContactRows, touched: Int[Tensor, " touched"], inputs: Assig
         ways, does = (along, pose.lying) if bed else (facing, pose.sitting)
         there = rows.body[(rows.object_of == o) & ~rows.hand].unique()
         mean = ways[there[does[there]]].sum(0)
-        told = (bed or bool(inputs.objects.has_back[o])) and float(mean.norm()) > 0.1
-        means.append(mean / mean.norm() if told else 0 * mean)
+        known = (bed or bool(inputs.objects.has_back[o])) and float(mean.norm()) > 0.1
+        means.append(mean / mean.norm() if known else 0 * mean)
     return torch.stack(means)

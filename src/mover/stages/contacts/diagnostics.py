@@ -1,13 +1,13 @@
-"""Say where the result should be doubted (supplement, "Failure Cases").
+"""Warn where the result is uncertain (supplement, "Failure Cases").
 
-A person who sits on nothing (a missing object), a lower body that is hidden (a guessed pose), and a
-seat whose mesh has another height than its sitters (a wrong shape).
+A seated person without a seat (a missing object), a lower body that is hidden (a guessed pose), and
+a seat whose mesh has another height than its sitters (a wrong shape).
 """
 
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from mover.bodies.parts import Parts, members
@@ -98,23 +98,14 @@ def _wrong_seats(inputs: DiagnosticInputs) -> Iterator[str]:
         weight = contacts.weight[k, 0]
         if not bool(inputs.objects.is_seat[i]) or int(contacts.bodies[k]) < OFTEN:
             continue
-        gap = _gap(contacts.points[k, 0], weight, tops[i])
+        points = contacts.points[k, 0][weight > 0]
+        if not len(points):
+            continue
+        below = torch.cdist(points[:, [0, 2]], tops[i][:, [0, 2]]).argmin(-1)
+        gap = float((points[:, 1] - tops[i][below, 1]).median())  # over the seat below them [m]
         if abs(gap) > HEIGHT:
             side = "above" if gap > 0 else "below"
             yield (
                 f"{inputs.objects.ids[i]}: its sitters touch {100 * abs(gap):.0f} cm {side} its"
                 " seat: the mesh may have the wrong shape"
             )
-
-
-def _gap(
-    points: Float[Tensor, "points 3"],
-    weight: Float[Tensor, " points"],
-    seat: Float[Tensor, "region 3"],
-) -> float:
-    """Median height of contact points over the seat below them [m]."""
-    real = points[weight > 0]
-    if len(real) == 0:
-        return 0.0
-    below = torch.cdist(real[:, [0, 2]], seat[:, [0, 2]]).argmin(-1)
-    return float((real[:, 1] - seat[below, 1]).median())

@@ -46,6 +46,10 @@ from mover.stages.masks import (
 
 NEAREST = 0.3  # [m], bodies are taken to be at least that far when pixels become metres
 ASIDE = 3  # [px] around known objects in which what hides people may be one of them
+PADDING = 0.2  # [m], space around the bodies in the volume
+WORKERS = 2  # threads that draw and measure; the result does not depend on it
+BESIDE = 0.25  # [m] between a moving camera and that of the image, within which its frame shows who
+# hides whom: from farther away another object may be in between
 BLOCK = 4  # bodies that a thread draws at once
 
 Window = tuple[slice, slice]
@@ -68,14 +72,12 @@ class Sight:
     """How far the outline of a body may be wrong [m]."""
     path: CameraPath = STILL
     """Of the cameras that saw the people, in the axes of this one."""
-    beside: float = 0.0
-    """A camera that is farther away tells nothing [m]."""
 
     @cached_property
     def telling(self) -> list[int]:
         """Bodies that have a mask and were seen from here."""
         away = poses_at(self.path, self.bodies.frame).t_reference_camera.norm(dim=-1)
-        near = (away <= self.beside).tolist()
+        near = (away <= BESIDE).tolist()
         return [row for row, own in enumerate(self.table.own) if own is not None and near[row]]
 
     def seen(
@@ -126,7 +128,8 @@ def gather_depth(
     def add(block: list[int]) -> int:
         for window, found in _bounds(sight, block):
             with lock:  # the least and the greatest do not depend on the order
-                kept = merge(_cut(maps, window), found)
+                before = DepthMaps(maps.near[window], maps.far[window], maps.free[window])
+                kept = merge(before, found)
                 maps.near[window], maps.far[window], maps.free[window] = (
                     kept.near, kept.far, kept.free,
                 )  # fmt: skip
@@ -140,10 +143,6 @@ def gather_depth(
             if observe is not None:
                 observe(done, len(rows))
     return maps
-
-
-def _cut(maps: DepthMaps, window: Window) -> DepthMaps:
-    return DepthMaps(maps.near[window], maps.far[window], maps.free[window])
 
 
 def _bounds(sight: Sight, block: list[int]) -> Iterator[tuple[Window, DepthMaps]]:
@@ -237,7 +236,7 @@ def _depth_maps(inputs: GatherInputs, config: GatherConfig, observe: Observer) -
     masks = small_masks(inputs.masks, inputs.camera).cpu()
     return gather_depth(
         _sight(inputs, masks, config),
-        config.workers,
+        WORKERS,
         lambda done, of: observe(Step("gather_cues: depth", done, of)),
     )
 
@@ -248,19 +247,19 @@ def _sight(inputs: GatherInputs, masks: Bool[Tensor, "objects h w"], config: Gat
     table = mask_table(inputs.people, inputs.bodies)
     return Sight(
         inputs.bodies, table, masks, inputs.camera, config.erode, config.vote, config.reach,
-        inputs.path, config.beside,
+        inputs.path,
     )  # fmt: skip
 
 
 def _space(inputs: GatherInputs, config: GatherConfig, observe: Observer) -> BodySpace:
     flat = inputs.bodies.verts.flatten(1)  # long rows first: eight times as fast
     low, high = (end.view(-1, 3) for end in (flat.amin(0), flat.amax(0)))
-    grid = grid_around(low.amin(0), high.amax(0), config.cells, config.padding)
+    grid = grid_around(low.amin(0), high.amax(0), config.cells, PADDING)
     volume = union_bodies(
         inputs.bodies.verts,
         inputs.bodies.faces,
         grid,
-        config.workers,
+        WORKERS,
         lambda done, of: observe(Step("gather_cues: free space", done, of)),
     )
     return BodySpace(volume)

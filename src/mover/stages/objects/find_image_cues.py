@@ -79,7 +79,7 @@ def evidence_at(capture: Capture, frame: int) -> Seen:
 
 
 def ground_without_people(capture: Capture, prepared: Prepared) -> float:
-    """Height of the floor where no foot tells: given, or under the median object [m]."""
+    """Height of the floor where no foot is seen: given, or under the median object [m]."""
     if capture.camera_height is not None:
         return -capture.camera_height
     if capture.scene.ground is not None:
@@ -178,10 +178,12 @@ def _touched(
     inputs: ImageInputs, others: Bool[Tensor, "objects h w"]
 ) -> Float[Tensor, "objects 4"]:
     """Share of the strip beyond each side of the boxes in which something else is seen."""
-    return torch.stack([
-        torch.stack([_share(others[i], _strip(box, side)) for side in range(4)])
-        for i, box in enumerate(inputs.boxes)
-    ])  # fmt: skip
+    rows: list[Tensor] = []
+    for own, box in zip(others, inputs.boxes, strict=True):
+        for side in range(4):
+            part = _part(own, _strip(box, side))
+            rows.append(part.float().mean() if part.numel() else torch.zeros(()))
+    return torch.stack(rows).reshape(len(inputs.boxes), 4)
 
 
 def _near(inputs: ImageInputs, others: Bool[Tensor, "objects h w"]) -> Float[Tensor, "objects 4"]:
@@ -205,11 +207,6 @@ def _strip(box: Float[Tensor, "4"], side: int, least: float = 0.0) -> Float[Tens
     else:
         strip[axis], strip[axis + 2] = box[axis + 2], box[axis + 2] + depth
     return strip
-
-
-def _share(mask: Bool[Tensor, "h w"], box: Float[Tensor, "4"]) -> Float[Tensor, ""]:
-    part = _part(mask, box)
-    return part.float().mean() if part.numel() else torch.tensor(0.0)
 
 
 def _part(mask: Bool[Tensor, "h w"], box: Float[Tensor, "4"]) -> Bool[Tensor, "rows columns"]:

@@ -27,7 +27,7 @@ STRIP = 0.06  # of the picture's height: how far in front of an object the floor
 FEWEST = 20  # pixels of an object, or of the floor, that count
 MOST = 200  # pixels of each that are looked at
 ROUNDS = 10  # of the robust fit
-VARIED = 0.02  # of its mean: an inverse depth that varies less tells nothing
+VARIED = 0.02  # of its mean: an inverse depth that varies less is no evidence
 LEAST = 3  # objects and strips of floor that a scale with a shift needs
 
 
@@ -58,7 +58,7 @@ class References:
 
 
 def gather_depth(inputs: DepthInputs) -> Measured | None:
-    """The measured depth in the windows of the objects [m]; None: nothing tells its scale."""
+    """The measured depth in the windows of the objects [m]; None: its scale is unknown."""
     values = inputs.depth.values.nan_to_num(0.0)
     windows = sample_nearest(values, inputs.image.views, inputs.camera.K, 0.0)
     found = _references(inputs, values, windows)
@@ -83,7 +83,10 @@ def _references(inputs: DepthInputs, values: Tensor, windows: Tensor) -> Referen
     assert seen is not None
     inside = seen.covered & (image.masks > 0.5) & (windows > 0)
     parts = [(seen.nearest[k][inside[k]], windows[k][inside[k]]) for k in range(len(windows))]
-    floor = _floor(camera, inputs.ground, values.shape)
+    y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in values.shape), indexing="ij")
+    rays = torch.stack([x, y, torch.ones_like(x)], -1) @ torch.linalg.inv(camera.K).mT
+    down = to_world(rays, camera.R_cam_world)[..., 1]
+    floor = torch.where(down < -0.02, inputs.ground / down.clamp_max(-0.02), 0.0)  # its depth [m]
     free = (floor > 0) & (values > 0) & ~inputs.hidden
     for box in image.boxes:
         x0, x1 = (round(float(v)) for v in box[[0, 2]].clamp(0, camera.width))
@@ -100,14 +103,6 @@ def _references(inputs: DepthInputs, values: Tensor, windows: Tensor) -> Referen
     return References(known.detach(), measured, torch.cat(weights))
 
 
-def _floor(camera: Camera, ground: float, shape: torch.Size) -> Float[Tensor, "h w"]:
-    """Depth of the floor at each pixel [m]; 0 where it is not seen."""
-    y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in shape), indexing="ij")
-    pixels = torch.stack([x, y, torch.ones_like(x)], -1)
-    down = to_world(pixels @ torch.linalg.inv(camera.K).mT, camera.R_cam_world)[..., 1]
-    return torch.where(down < -0.02, ground / down.clamp_max(-0.02), torch.zeros_like(down))
-
-
 def _factor(found: References) -> float:
     """Logarithm of the factor between the room and what was measured."""
     off = found.known.log() - found.measured.log()
@@ -119,7 +114,7 @@ def _factor(found: References) -> float:
 
 
 def _line(found: References) -> tuple[float, float] | None:
-    """Factor and shift of an inverse depth, by reweighted squares; None: too little tells them."""
+    """Factor and shift of an inverse depth, by reweighted squares; None: too little evidence."""
     flat = float(found.measured.std()) < VARIED * float(found.measured.abs().mean())
     if flat or float(found.weight.sum()) < LEAST - 0.5:
         return None

@@ -27,7 +27,7 @@ OFTEN, SELDOM = 0.9, 0.4  # chances that pieces along walls, and others, stand a
 CONTRADICTED = 3.0  # standard deviations between a given and a standard size, of another class
 FIRM = 0.06  # spread of standards that hold for nearly all: mattresses are as long as people
 STRAIGHT = math.radians(2)  # how well edges run along the sides of what they belong to [rad]
-LEVEL, TOLD = 0.5, 0.95  # chances that an edge is level, and that what edges agree on is so
+LEVEL, AGREES = 0.5, 0.95  # chances that an edge is level, and that what edges agree on is so
 AGREED = math.radians(4)  # [rad], how well they must
 DIRECTIONS = 90  # that are tried within a quarter turn
 
@@ -95,7 +95,7 @@ def _own_axes(
         beside = (axes.yaw[mine], near[mine], along[mine])
         yaw, off = room_axis([beside, (edges.yaw[own], spread[own], level[own])])
         if off < AGREED:
-            axes.along[k], axes.yaw[k] = TOLD, yaw
+            axes.along[k], axes.yaw[k] = AGREES, yaw
             axes.sharpness[k] = _sharpness(STRAIGHT, off)
     return axes
 
@@ -130,7 +130,7 @@ def prior_weights(energy: Float[Tensor, " objects"]) -> Float[Tensor, " objects"
     """Weight of the guess of each object, by what the image leaves of it (`prior_terms`).
 
     A wrong shape can fit well where something hides half of it. So of an object that fits better
-    than the room's usual one the geometric mean of both counts: shapes of one tool are alike.
+    than the room's usual one the geometric mean of both counts: shapes of one tool are similar.
     """
     usual = energy.median().clamp_min(1e-6)
     return (torch.where(energy < usual, (energy * usual).sqrt(), energy) / FIT).clamp(*WEIGHTS)
@@ -153,16 +153,16 @@ def lighter_where_used(
     return replace(given, weight=given.weight.index_copy(0, index, less))
 
 
-def believed_sides(
+def bounded_sides(
     sides: Int[Tensor, "objects 4"],
     weight: Float[Tensor, " objects"],
     beside: Float[Tensor, "objects 4 2"] | None = None,
 ) -> Int[Tensor, "objects 4"]:
     """What is known of the sides of boxes, with no bound (`LIKELY`) for shapes that fit.
 
-    A piece that is cut off on the left, by whatever, may be higher and lower there than all that is
-    seen of it: its top and its bottom are lower bounds, too. Its silhouette tells where it ends; a
-    shape that does not fit would grow behind what hides it.
+    An object that is cut off on the left may be higher and lower there than all that is seen of it:
+    its top and its bottom are lower bounds, too. Its silhouette determines where it ends; a shape
+    that does not fit would grow behind what hides it.
 
     Where shapes do not fit, masks are coarse, too: what is near to a side may hide more behind it,
     and what touches all of it does so about as often as not (`ImageCues.beside`).

@@ -1,10 +1,10 @@
 """Which way each piece of furniture runs, by its own straight edges in the picture.
 
 Not in the paper. Beds, tables and shelves are square, and most of their edges level or upright: a
-level one tells the yaw of its piece up to quarter turns, whatever the shape of its mesh. The edge
-lies in the plane through the camera and its picture, and runs where that meets a level plane.
-Upright edges tell nothing, and slanted ones tell wrong, each in its own way: as for the axis of
-the room, each edge may be one of those, and edges that agree are believed.
+level one constrains the yaw of its object up to quarter turns, whatever the shape of its mesh. The
+edge lies in the plane through the camera and its picture, and runs where that meets a level plane.
+Upright edges constrain nothing, and slanted ones are wrong, each in its own way: as for the axis of
+the room, each edge may be one of those, and edges that agree are trusted.
 """
 
 import math
@@ -53,8 +53,8 @@ def own_edges(
     yaw, upright = _level(segments, camera, 0.0)
     turned = torch.stack([_level(segments, camera, errors)[0] for errors in (-1.0, 1.0)])
     spread = wrap(2 * (turned - yaw)).abs().amax(0) / 2  # half turns aside
-    told = (of >= 0) & ~upright
-    return OwnEdges(of[told], yaw[told].float(), spread[told].float())
+    level = (of >= 0) & ~upright
+    return OwnEdges(of[level], yaw[level].float(), spread[level].float())
 
 
 def _owners(
@@ -63,7 +63,7 @@ def _owners(
     people: Bool[Tensor, "h w"],
     camera: Camera,
 ) -> Int[Tensor, " edges"]:
-    """Whose edge each is; -1: nobody's, of several, or of people."""
+    """Whose edge each is; -1: of no object, of several, or of people."""
     x, y = (segments.middle + camera.K[:2, 2].double().cpu()).long().unbind(-1)
     beside = torch.arange(-BORDER, BORDER + 1)
     x = (x[:, None, None] + beside).clamp(0, camera.width - 1)

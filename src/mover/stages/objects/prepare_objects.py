@@ -56,9 +56,14 @@ def find_regions(
     back's rim count; a top is the highest layer with a quarter of the largest one's area.
     """
     top = _level(points, normals, category)
-    back = _behind(points, normals, points[top])
-    if category not in BACKS:
-        back = torch.zeros_like(back)
+    back = torch.zeros_like(top)
+    if category in BACKS and bool(top.any()):
+        seat = points[top]
+        above, behind = (
+            points[:, 1] > seat[:, 1].mean() + LAYER,
+            points[:, 2] < seat[:, 2].mean(),
+        )
+        back = (normals[:, 2] > UPRIGHT) & above & behind
     return Regions(points[top], points[back], bool(top.any()), bool(back.any()))
 
 
@@ -75,17 +80,6 @@ def _level(
         return inside[area.argmax()]
     wide = (area >= 0.25 * area.max()) & (area > 0)
     return inside[wide.nonzero()[-1, 0]] if wide.any() else facing
-
-
-def _behind(
-    points: Float[Tensor, "points 3"],
-    normals: Float[Tensor, "points 3"],
-    seat: Float[Tensor, "seat 3"],
-) -> Bool[Tensor, " points"]:
-    if len(seat) == 0:
-        return torch.zeros(len(points), dtype=torch.bool)
-    above = points[:, 1] > seat[:, 1].mean() + LAYER
-    return (normals[:, 2] > UPRIGHT) & above & (points[:, 2] < seat[:, 2].mean())
 
 
 @record
@@ -143,8 +137,12 @@ def prepare_objects(
     origin = torch.stack([p.t_world_object for p in pieces])
     moved = (rot_y(yaw) @ (scale * center).unsqueeze(-1)).squeeze(-1)
     start = Layout(origin + moved, yaw, torch.zeros_like(scale))
-    warnings = (*_warnings(pieces, proxies), *sorted(notes))
-    return Prepared(_pack(pieces, proxies), start, center, scale, warnings)
+    hollow = tuple(
+        f"{piece.id}: its mesh encloses almost nothing, its silhouette may be wrong"
+        for piece, proxy in zip(pieces, proxies, strict=True)
+        if signed_volume(proxy.mesh) <= 0
+    )
+    return Prepared(_pack(pieces, proxies), start, center, scale, (*hollow, *sorted(notes)))
 
 
 def to_objects(
@@ -197,7 +195,7 @@ def proxy_meshes(prepared: Prepared) -> tuple[Mesh, ...]:
 
 
 def _closing(config: PrepareConfig) -> tuple[Callable[[Mesh], Mesh], list[str]]:
-    """How meshes become closed and light, and what there is to tell of it afterwards."""
+    """How meshes become closed and light, and the warnings about it afterwards."""
     notes: list[str] = []
 
     def wrapped(mesh: Mesh) -> Mesh:
@@ -275,12 +273,14 @@ def _thin(regions: Regions, count: int) -> Regions:
 
 def _pack(pieces: tuple[SceneObject, ...], proxies: list[_Proxy]) -> Objects:
     categories = tuple(canonical(p.category) for p in pieces)
+    counts = torch.tensor([len(p.mesh.verts) for p in proxies])
+    index = {p.id: i for i, p in enumerate(pieces)} | {"ground": GROUND, "free": FREE}
     size = torch.stack([high - low for low, high in (box(p.mesh.verts) for p in proxies)])
     return Objects(
         ids=tuple(p.id for p in pieces),
         categories=categories,
         verts=_pad([p.mesh.verts for p in proxies], repeat=True),
-        real_verts=_real([len(p.mesh.verts) for p in proxies]),
+        real_verts=torch.arange(int(counts.max())) < counts.unsqueeze(-1),
         faces=_pad([p.mesh.faces for p in proxies]),
         edges=_pad([p.edges for p in proxies]),
         samples=torch.stack([p.samples for p in proxies]),
@@ -290,7 +290,7 @@ def _pack(pieces: tuple[SceneObject, ...], proxies: list[_Proxy]) -> Objects:
         has_top=torch.tensor([p.regions.has_top for p in proxies]),
         has_back=torch.tensor([p.regions.has_back for p in proxies]),
         is_seat=torch.tensor([c in SEATS for c in categories]),
-        supports=_supports(pieces),
+        supports=torch.tensor([index[p.support] for p in pieces]),
     )
 
 
@@ -299,21 +299,4 @@ def _pad(rows: list[Tensor], repeat: bool = False) -> Tensor:
     fill = [r[:1] if repeat else torch.zeros_like(r[:1]) for r in rows]
     return torch.stack(
         [torch.cat([r, f.expand(most - len(r), -1)]) for r, f in zip(rows, fill, strict=True)]
-    )
-
-
-def _real(counts: list[int]) -> Bool[Tensor, "objects verts"]:
-    return torch.arange(max(counts)) < torch.tensor(counts).unsqueeze(-1)
-
-
-def _supports(pieces: tuple[SceneObject, ...]) -> Int[Tensor, " objects"]:
-    index = {p.id: i for i, p in enumerate(pieces)} | {"ground": GROUND, "free": FREE}
-    return torch.tensor([index[p.support] for p in pieces])
-
-
-def _warnings(pieces: tuple[SceneObject, ...], proxies: list[_Proxy]) -> tuple[str, ...]:
-    return tuple(
-        f"{piece.id}: its mesh encloses almost nothing, its silhouette may be wrong"
-        for piece, proxy in zip(pieces, proxies, strict=True)
-        if signed_volume(proxy.mesh) <= 0
     )

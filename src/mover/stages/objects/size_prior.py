@@ -20,6 +20,7 @@ from mover.core.types import Layout
 from mover.stages.config import SpreadConfig
 
 FIT = 0.1  # image energy (robust form) from which on an object's shape is weighted less
+WIDEST = 4.0  # largest spread that is learnt, in usual ones; the smallest is 1
 LEAST = 0.1  # of the weight of a silhouette that fits
 
 
@@ -47,6 +48,6 @@ def estimate_size_prior(
     log_scale, usual, share = layout.log_scale, config.usual**2, trust.square()
     shape = (log_scale - log_scale.mean(-1, keepdim=True)).square().sum(-1) / 2
     found = (config.known * usual + float(share @ shape)) / (config.known + float(share.sum()))
-    found = min(max(found, usual), usual * config.most**2)
+    found = min(max(found, usual), usual * WIDEST**2)
     together = 3 * config.common**2
     return usual / found, (usual + together) / (found + together)

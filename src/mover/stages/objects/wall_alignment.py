@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from mover.core.types import Layout, Objects
@@ -33,7 +33,7 @@ Lower = Callable[[PlaceInputs, Layout], Placed]
 
 
 def line_up(found: Placed, inputs: PlaceInputs, rounds: int, lower: Lower) -> Placed:
-    """Place the pieces along walls again, with the lines that others tell them.
+    """Place the objects along walls again, with the lines of others.
 
     Args:
         found: Where a search ended that knew no lines.
@@ -42,7 +42,7 @@ def line_up(found: Placed, inputs: PlaceInputs, rounds: int, lower: Lower) -> Pl
         lower: Goes down from some starts.
 
     Returns:
-        Objects of which no line is told are as they were found.
+        Objects that belong to no line are as they were found.
     """
     lined = found
     for _ in range(rounds):
@@ -51,39 +51,35 @@ def line_up(found: Placed, inputs: PlaceInputs, rounds: int, lower: Lower) -> Pl
             break
         starts = starts_at(lined.layout, inputs.objects, walls)
         few = best_few(found.candidates, found.energy, KEPT)
-        begin = _held(Layout.cat(starts, few), lined.layout, inputs.objects, walls)
-        more = lower(with_walls(inputs, walls), begin)
-        lined = _where_told(more, found, walls)
+        pile = piles_of(inputs.objects.supports)  # one start is enough for those of no line
+        moves = torch.isin(pile, pile[walls.trust.amax(-1) > 0])
+        start = Layout.where(moves, Layout.cat(starts, few), lined.layout[None])
+        more = lower(with_walls(inputs, walls), start)
+        lined = _where_lined(more, found, walls)
     return lined
 
 
-def _held(begin: Layout, layout: Layout, objects: Objects, walls: Walls) -> Layout:
-    """Starts of what stands with nothing that is told a line all alike, as one is enough there."""
-    pile = piles_of(objects.supports)
-    moves = torch.isin(pile, pile[walls.trust.amax(-1) > 0])
-    return Layout.where(moves, begin, layout[None])
-
-
-def _where_told(lined: Placed, found: Placed, walls: Walls) -> Placed:
-    """What is lined up where a line is told, else what was found; both as many candidates."""
-    told = walls.trust.amax(-1) > 0
+def _where_lined(lined: Placed, found: Placed, walls: Walls) -> Placed:
+    """The objects of a line as lined up, the others as found; as many candidates of both."""
+    on_line = walls.trust.amax(-1) > 0
     count = min(len(lined.energy), len(found.energy))
     return Placed(
-        Layout.where(told, lined.layout, found.layout),
-        Layout.where(told, lined.candidates[:count], found.candidates[:count]),
-        torch.where(told, lined.energy[:count], found.energy[:count]),
+        Layout.where(on_line, lined.layout, found.layout),
+        Layout.where(on_line, lined.candidates[:count], found.candidates[:count]),
+        torch.where(on_line, lined.energy[:count], found.energy[:count]),
         found.trace,
         walls,
     )
 
 
 def find_walls(layout: Layout, objects: Objects, sides: Int[Tensor, "objects 4"]) -> Walls | None:
-    """The lines that the rears of at least one object tell to another.
+    """The lines that the rears of at least one object share with another.
 
     Returns:
         None where fewer than two objects usually stand along a wall.
     """
-    able = _able(objects)
+    usual = torch.tensor([c in WALL_PIECES for c in objects.categories], dtype=torch.bool)
+    able = usual.to(objects.supports.device) & (objects.supports == GROUND)
     if int(able.sum()) < 2:
         return None
     rears = rears_of(layout, objects.size)
@@ -96,21 +92,8 @@ def find_walls(layout: Layout, objects: Objects, sides: Int[Tensor, "objects 4"]
     weight = near * sure
     out = torch.nn.functional.normalize(weight @ rears.out, dim=-1)
     offset = (weight * (out @ middle.mT)).sum(-1) / weight.sum(-1)
-    return Walls(out, offset, _trust(weight) * able[:, None])
-
-
-def _able(objects: Objects) -> Bool[Tensor, " objects"]:
-    """Which objects stand on the floor and usually along a wall."""
-    usual = [c in WALL_PIECES for c in objects.categories]
-    return torch.tensor(usual, dtype=torch.bool).to(objects.supports.device) & (
-        objects.supports == GROUND
-    )
-
-
-def _trust(weight: Float[Tensor, "lines objects"]) -> Float[Tensor, "objects lines"]:
-    """The largest weight of any other object in each line."""
     others = weight[:, None] * ~torch.eye(weight.shape[1], dtype=torch.bool).to(weight.device)
-    return others.amax(-1).mT
+    return Walls(out, offset, others.amax(-1).mT * able[:, None])
 
 
 def starts_at(layout: Layout, objects: Objects, walls: Walls) -> Layout:

@@ -139,7 +139,7 @@ BODY_TERMS: tuple[Term[MovedBodies], ...] = (
 
 
 def body_energy(by: Correction, puppet: Puppet, known: Evidence, weights: BodyWeights) -> Energy:
-    """The price of a correction, one value for each body."""
+    """The cost of a correction, one value for each body."""
     at = MovedBodies(by, puppet, known, moved(puppet, by))
     return sum_terms(active_weights(weights, BODY_TERMS, known.has), BODY_TERMS, at)
 

@@ -47,13 +47,13 @@ class Surroundings:
     furniture: Volume | None
     """Signed distance to all pieces; None: there are none."""
     firm: Volume | None
-    """The same to what they surely fill, as far as their shapes are doubted."""
+    """The same to what they surely fill, as far as their shapes are uncertain."""
     surface: Surface
     """Points of their surfaces."""
     front: Float[Tensor, "h w"]
     """Depth of the nearest piece in the image 640 wide [m]; inf: none."""
     loose: Float[Tensor, "h w"]
-    """How far off that may be, as the shape of the piece is doubted [m]."""
+    """How far off that may be, as the shape of the object is uncertain [m]."""
     owned: Bool[Tensor, "h w"]
     """The piece that is drawn there is also detected there."""
 
@@ -87,21 +87,21 @@ def surroundings_of(room: Room, capture: Capture | None) -> Surroundings:
     ]
     small = small_camera(camera)
     front, piece, slant = _drawn(meshes, camera, small)
-    owned, doubt = torch.zeros_like(piece, dtype=torch.bool), torch.zeros(len(meshes))
+    owned, uncertain = torch.zeros_like(piece, dtype=torch.bool), torch.zeros(len(meshes))
     if capture is not None and meshes:
         masks = small_masks(image_evidence(capture).masks, capture.scene.camera)
         owned = (piece >= 0) & masks.gather(0, piece.clamp_min(0)[None])[0]
-        doubt = doubt_of_shapes(piece, masks)
-    furniture, firm = _volumes(meshes, doubt)
-    surface = _surface(meshes, doubt)
-    loose = torch.zeros_like(front) if not meshes else doubt[piece.clamp_min(0)] * slant
+        uncertain = shape_uncertainty(piece, masks)
+    furniture, firm = _volumes(meshes, uncertain)
+    surface = _surface(meshes, uncertain)
+    loose = torch.zeros_like(front) if not meshes else uncertain[piece.clamp_min(0)] * slant
     return Surroundings(camera, floor, furniture, firm, surface, front, loose, owned)
 
 
-def doubt_of_shapes(
+def shape_uncertainty(
     piece: Int[Tensor, "h w"], masks: Bool[Tensor, "objects h w"]
 ) -> Float[Tensor, " objects"]:
-    """Usual error of the place of each piece's surface, as its outline tells it [m].
+    """Usual error of the place of each piece's surface, by its outline [m].
 
     Args:
         piece: Which piece is drawn; -1: none.
@@ -130,20 +130,15 @@ def _drawn(meshes: list[Mesh], camera: Camera, small: Camera) -> tuple[Tensor, T
     owner = torch.cat([torch.full((len(m.faces),), k) for k, m in enumerate(meshes)])
     depth, face = first_hit(verts, faces, small.K, size)
     some = face.clamp_min(0)
-    slant = _slants(verts, faces)[some]
-    return depth, torch.where(face >= 0, owner[some], torch.full_like(face, -1).long()), slant
-
-
-def _slants(verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]) -> Tensor:
-    """One over the cosine between each face's normal and the ray to its middle."""
     corners = verts[faces]
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     facing = torch.cosine_similarity(normals, corners.mean(1), dim=-1).abs()
-    return 1 / facing.clamp_min(1 / STEEPEST)
+    slant = (1 / facing.clamp_min(1 / STEEPEST))[some]  # over the cosine with the ray
+    return depth, torch.where(face >= 0, owner[some], torch.full_like(face, -1).long()), slant
 
 
 def _volumes(
-    meshes: list[Mesh], doubt: Float[Tensor, " pieces"]
+    meshes: list[Mesh], uncertain: Float[Tensor, " pieces"]
 ) -> tuple[Volume | None, Volume | None]:
     """The signed distance to all pieces, and to what they surely fill."""
     if not meshes:
@@ -153,7 +148,7 @@ def _volumes(
     cells = min(MOST_CELLS, max(8, int(float((high - low).max()) / CELL)))
     empty = grid_around(low, high, cells, 0.1)
     whole = firm = empty.values
-    for mesh, give in zip(meshes, doubt.tolist(), strict=True):  # each has its own triangles
+    for mesh, give in zip(meshes, uncertain.tolist(), strict=True):  # each has its own triangles
         own = union_bodies(mesh.verts.float()[None], mesh.faces, empty, 1).values
         same = firm is whole and not give
         whole = torch.minimum(whole, own)
@@ -161,7 +156,7 @@ def _volumes(
     return replace(empty, values=whole), replace(empty, values=firm)
 
 
-def _surface(meshes: list[Mesh], doubt: Float[Tensor, " pieces"]) -> Surface:
+def _surface(meshes: list[Mesh], uncertain: Float[Tensor, " pieces"]) -> Surface:
     found = [sample_surface(m, SAMPLES) for m in meshes]
     none = torch.zeros(0, 3)
     pieces = [torch.full((len(p),), k) for k, (p, _) in enumerate(found)]
@@ -169,7 +164,7 @@ def _surface(meshes: list[Mesh], doubt: Float[Tensor, " pieces"]) -> Surface:
         torch.cat([none, *(p.float() for p, _ in found)]),
         torch.cat([none, *(n.float() for _, n in found)]),
         torch.cat([none[:, 0].long(), *pieces]),
-        doubt,
+        uncertain,
     )
 
 

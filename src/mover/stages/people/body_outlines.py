@@ -111,7 +111,7 @@ def _compare(
 def _wider(
     gap: Float[Tensor, " points"], normal: Float[Tensor, "points 2"], at: Float[Tensor, "points 2"]
 ) -> Tensor:
-    """By how much the mask is narrower all around, told from a body that is off or too large [px].
+    """By how much the mask is narrower all around, apart from a body that is off or too large [px].
 
     Least squares with a usual size for each: the border, two shifts, and the share of the size.
     """

@@ -29,7 +29,7 @@ from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
 from mover.geometry.warp_start import mapped
 from mover.stages.camera.find_foot_contacts import straight_legs
-from mover.stages.config import DepthConfig, FootContactConfig
+from mover.stages.config import DepthConfig
 from mover.stages.contacts.assign_contacts import evenly, in_turns
 from mover.stages.cover import Cover, clear, covered
 from mover.stages.masks import (
@@ -247,7 +247,7 @@ def _size(inputs: DepthInputs, rows: Int[Tensor, " rows"], person: str) -> tuple
     if known is None:
         return 1.0, []
     up = inputs.camera.R_cam_world[:, 1].to(inputs.bodies.verts)
-    straight = straight_legs(inputs.bodies, inputs.parts, up, FootContactConfig()).all(1)
+    straight = straight_legs(inputs.bodies, inputs.parts, up).all(1)
     standing = rows[straight[rows]]
     if not len(standing):
         return 1.0, [f"person {person} never stands straight: the known height is not used"]

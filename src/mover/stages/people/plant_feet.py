@@ -4,7 +4,7 @@ Energies make a sole slide less, and leave a rest, which goes here in three step
 
 1. Whole bodies are shifted so that soles at rest keep their place and lie on the floor, and who
    sits or lies is still. Shifts in depth, seen from the camera at the world's origin, and in height
-   are cheap, as pictures and bodies of unknown size tell them least; those to the side are dear.
+   are cheap, as pictures and bodies of unknown size constrain them least; others cost more.
 2. Each foot is to go where it rested on average; the way there fades in and out between steps.
 3. The leg is bent to reach it, as little as it can be, without a turn of the sole.
 """
@@ -33,7 +33,7 @@ SWAY = 0.03  # [m], error of a resting sole beside its body's: angles of the leg
 SINK = 0.01  # [m], the same over the floor
 RIGID = 0.01  # [m], the same where no leg can be bent
 SLIP, RISE = 0.003, 0.003  # [m], of a sole at rest from frame to frame, and over the floor, at last
-STILL = 0.01  # [m], of somebody who sits or lies, from frame to frame
+STILL = 0.01  # [m], of a seated or lying person, from frame to frame
 ON_FLOOR = 0.12  # [m]; a sole at rest that is higher stands on something else
 FOOT = 0.03  # [m], how far a foot is off beside its body
 FADE = 0.06  # [m/√s], by which that changes

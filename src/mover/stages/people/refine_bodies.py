@@ -14,7 +14,6 @@ from torch import Tensor
 
 from mover.bodies.corrected import (
     Correction,
-    Moved,
     Puppet,
     corrected,
     moved,
@@ -106,16 +105,11 @@ def cast_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Cast:
     chance = given if given is not None else touching(bodies, parts, surroundings.floor)
     lying = postures(bodies, parts, surroundings.floor).lying
     rest = resting_soles(bodies, parts, lying)
-    return Cast(
-        bodies, picked, surroundings, _furniture_only(chance[:, picked.index].float(), picked),
-        rest, lying, watched_of(surroundings, people, bodies),
-    )  # fmt: skip
-
-
-def _furniture_only(chance: Tensor, picked: Picked) -> Tensor:
-    """Without the soles, which the floor holds, and forearms, which seem to rest in the air."""
+    # without the soles, which the floor holds, and forearms, which seem to rest in the air
     without = torch.tensor([PARTS.index(f"{s}_{p}") for s in SIDES for p in ("sole", "forearm")])
-    return torch.where(torch.isin(picked.part, without), torch.zeros_like(chance), chance)
+    chance = torch.where(torch.isin(picked.part, without), 0.0, chance[:, picked.index].float())
+    watched = watched_of(surroundings, people, bodies)
+    return Cast(bodies, picked, surroundings, chance, rest, lying, watched)
 
 
 def known_of(cast: Cast, bodies: Bodies, rows: Int[Tensor, " rows"]) -> Evidence:
@@ -133,14 +127,18 @@ def known_of(cast: Cast, bodies: Bodies, rows: Int[Tensor, " rows"]) -> Evidence
 def looked(
     cast: Cast, acted: Acted, known: Evidence, weights: BodyWeights, match: MatchConfig
 ) -> Evidence:
-    """Look anew for what the skin touches, what hides it, and where outlines should go."""
+    """Look again for what the skin touches, what hides it, and where outlines should go."""
     puppet, by, rows = acted.puppet, acted.by, acted.rows
     with torch.no_grad():
         now, normals = moved(puppet, by), normals_after(puppet, by)
     matches: Matches | None = None
     bounds: Bounds | None = None
     if weights.touch:
-        skin = _skin(cast, acted, known, now, normals)
+        skin = Skin(  # errors of poses count where they are not corrected
+            points=now.skin, normals=normals, chance=cast.chance[rows], group=cast.picked.group,
+            track=known.near.track, pivot=now.points[:, 0], flat=cast.lying[rows],
+            bent=ANGLE if puppet.model is None else 0.0,
+        )  # fmt: skip
         matches = gather_matches(skin, cast.room.surface, match, cast.room.furniture)
     if weights.order and cast.watched is not None:
         even = cast.picked.even
@@ -149,15 +147,6 @@ def looked(
     if weights.outline and cast.watched is not None:
         outline = _outlines(cast, acted)
     return replace(known, matches=matches, bounds=bounds, outline=outline)
-
-
-def _skin(cast: Cast, acted: Acted, known: Evidence, now: Moved, normals: Tensor) -> Skin:
-    """The skin where it is now; errors of poses count where they are not corrected."""
-    return Skin(
-        points=now.skin, normals=normals, chance=cast.chance[acted.rows], group=cast.picked.group,
-        track=known.near.track, pivot=now.points[:, 0], flat=cast.lying[acted.rows],
-        bent=ANGLE if acted.puppet.model is None else 0.0,
-    )  # fmt: skip
 
 
 def _outlines(cast: Cast, acted: Acted) -> Outline:
@@ -197,7 +186,7 @@ class RefinedBodies:
     shift: Float[Tensor, "bodies 3"]
     """How far each pelvis has moved [m]."""
     energy: Float[Tensor, " bodies"]
-    """What is left of the price [nats]."""
+    """What is left of the cost [nats]."""
 
 
 def refine_bodies(
@@ -209,7 +198,7 @@ def refine_bodies(
     """Move the people of a room so that they agree with its floor and furniture.
 
     Furniture that is moved stands, for the people of each time between two moves, where it stood
-    then; nobody's motion is smoothed over a move. The capture gives masks and known contacts;
+    then; no motion is smoothed over a move. The capture gives masks and known contacts;
     without it there is no depth order.
 
     Raises:

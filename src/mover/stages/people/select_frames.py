@@ -28,15 +28,19 @@ LOCAL = (
     "left_hip", "right_hip", "left_knee", "right_knee",
 )  # fmt: skip
 SPREAD_VERTS = 32  # vertices that stand for the joints of a body without any
+PELVIS_ACCELERATION = 10.0  # [m/s²], what a pelvis does when one jumps off a step
+PELVIS_JITTER = 0.2  # [m], second difference of the pelvis that noise explains
+LOCAL_ACCELERATION = 8.0  # [m/s²], mean of shoulders, elbows, hips, knees relative to the pelvis
+LOCAL_JITTER = 0.16  # [m], its second difference that noise explains
 REACH = 13  # frames in a row that may be left out
-CUT = 6.0  # frames that one would rather leave out than believe that a track jumps
+CUT = 6.0  # frames that are rather left out than that a track jumps
 
 Points = Float[np.ndarray, "frames points 3"]
 
 
 @record
 class SelectInputs:
-    """Who moves."""
+    """People who move."""
 
     bodies: Bodies
 
@@ -66,7 +70,12 @@ def select_frames(
         rows = np.flatnonzero(bodies.person.cpu().numpy() == person)
         rows = rows[np.argsort(frame[rows], kind="stable")]
         if len(rows) >= 3:
-            keep[rows] = _select(frame[rows] / bodies.fps, points[rows], config)
+            time, inner = frame[rows] / bodies.fps, np.arange(1, len(rows) - 1)
+            if config.rule == "each":
+                strain = _strain(time, points[rows], inner - 1, inner, inner + 1)
+                keep[rows[1:-1]] = strain < 1
+            else:
+                keep[rows] = _longest(time, points[rows])
         observe(Step("select_frames", index, len(tracks)))
     return Selection(torch.from_numpy(keep).to(bodies.frame.device))
 
@@ -84,23 +93,14 @@ def _points(bodies: Bodies) -> Points:
     return points.detach().cpu().double().numpy()
 
 
-def _select(time: Float[np.ndarray, " frames"], points: Points, config: SelectConfig) -> np.ndarray:
-    if config.rule == "each":
-        inner = np.arange(1, len(time) - 1)
-        keep = np.ones(len(time), dtype=bool)
-        keep[1:-1] = _strain(time, points, (inner - 1, inner, inner + 1), config) < 1
-        return keep
-    return _longest(time, points, config)
-
-
 def _strain(
     time: Float[np.ndarray, " frames"],
     points: Points,
-    triple: tuple[np.ndarray, np.ndarray, np.ndarray],
-    config: SelectConfig,
+    i: np.ndarray,
+    j: np.ndarray,
+    k: np.ndarray,
 ) -> np.ndarray:
-    """Second difference over its limit at the middle of three frames; above 1 it is not honest."""
-    i, j, k = triple
+    """Second difference over its limit at the middle of three frames; above 1 no motion is so."""
     h1, h2 = time[j] - time[i], time[k] - time[j]
     to_i, to_k = h2 / (h1 + h2), h1 / (h1 + h2)
     straight = points[i] * to_i[..., None, None] + points[k] * to_k[..., None, None]
@@ -108,26 +108,28 @@ def _strain(
     pelvis, joints = np.linalg.norm(second[..., 0, :], axis=-1), second[..., 1:, :]
     local = np.linalg.norm(joints, axis=-1).mean(-1)
     return np.maximum(
-        pelvis / (config.pelvis_jitter + config.pelvis_acceleration * area),
-        local / (config.local_jitter + config.local_acceleration * area),
+        pelvis / (PELVIS_JITTER + PELVIS_ACCELERATION * area),
+        local / (LOCAL_JITTER + LOCAL_ACCELERATION * area),
     )
 
 
-def _longest(time: np.ndarray, points: Points, config: SelectConfig) -> np.ndarray:
-    """The sequence with the fewest frames left out whose every three neighbours are honest.
+def _longest(time: np.ndarray, points: Points) -> np.ndarray:
+    """The sequence with the fewest frames left out in which no three neighbours exceed the limit.
 
     Shortest path: `pair[b, k]` is the least cost of a sequence that ends with frames k - 1 - b
     and k. A frame left out costs 1, a jump of the track `CUT`.
     """
     n, back = len(time), np.arange(REACH)
     pair = np.full((REACH, n), np.inf)  # cost of (k - 1 - b, k)
-    came = np.full(
-        (REACH, n), -1
-    )  # the b of the frame before k - 1 - b; -1: a sequence begins there
+    came = np.full((REACH, n), -1)  # b of the frame before k - 1 - b; -1: a sequence starts there
     alone, before = np.zeros(n), np.full(n, -1)  # cost of beginning with k, and the frame before
     for j in range(n):
-        ends = alone[:j] if j == 0 else np.minimum(alone[:j], pair[:, :j].min(0))
-        alone[j], before[j] = _begin(ends, j)
+        alone[j] = j
+        if j:
+            jump = np.minimum(alone[:j], pair[:, :j].min(0)) + (j - 1 - np.arange(j)) + CUT
+            last = int(jump.argmin())
+            if jump[last] < j:
+                alone[j], before[j] = jump[last], last
         k = j + 1 + back[: max(0, min(REACH, n - 1 - j))]
         if not len(k):
             continue
@@ -135,21 +137,12 @@ def _longest(time: np.ndarray, points: Points, config: SelectConfig) -> np.ndarr
         cost = np.full((len(i) + 1, len(k)), alone[j])
         if len(i):
             i2, k2 = np.broadcast_arrays(i[:, None], k[None, :])
-            strain = _strain(time, points, (i2, np.full_like(i2, j), k2), config)
+            strain = _strain(time, points, i2, np.full_like(i2, j), k2)
             cost[1:] = np.where(strain < 1, pair[: len(i), j][:, None] + 1e-3 * strain, np.inf)
         best = cost.argmin(0)
         pair[k - 1 - j, k] = cost[best, np.arange(len(k))] + (k - 1 - j)
         came[k - 1 - j, k] = best - 1
     return _trace(pair, came, alone, before)
-
-
-def _begin(ends: np.ndarray, j: int) -> tuple[float, int]:
-    """Least cost of a sequence that begins with frame j, and the frame where the last one ended."""
-    if j == 0:
-        return 0.0, -1
-    jump = ends + (j - 1 - np.arange(j)) + CUT
-    last = int(jump.argmin())
-    return (float(j), -1) if j <= jump[last] else (float(jump[last]), last)
 
 
 def _trace(pair: np.ndarray, came: np.ndarray, alone: np.ndarray, before: np.ndarray) -> np.ndarray:
