@@ -11,7 +11,7 @@ from mover.energy.human_terms import FootContacts, feet_term, heights, tilt_prio
 from mover.geometry.camera import pitch_roll, tilted
 from mover.stages.camera.align_camera import (
     AlignInputs,
-    Prior,
+    PlanePrior,
     align_camera,
     cost_of,
     covariance_of,
@@ -241,7 +241,7 @@ def test_without_feet_everything_stays_and_a_warning_says_so():
 
 def test_the_result_is_a_minimum_of_feet_term_and_prior():
     votes = vote(soles_at(room(), noise=0.02, wrong=0.2), "places")
-    prior = Prior(torch.tensor([PITCH + 0.05, ROLL - 0.05]).double(), 0.07, 0.03, None)
+    prior = PlanePrior(torch.tensor([PITCH + 0.05, ROLL - 0.05]).double(), 0.07, 0.03, None)
     start = torch.tensor([PITCH, ROLL, GROUND, 0.0]).double()
     fit = fit_plane(votes, prior, start, (0.1, 0.02), 60)
     at = fit.at.clone().requires_grad_()

@@ -11,7 +11,7 @@ from mover.energy.body_terms.outline import POINTS, Outline, outline_term
 from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
 from mover.stages.masks import MaskTable
-from mover.stages.people.body_outlines import Seen, gather_outlines
+from mover.stages.people.body_outlines import SeenBodies, gather_outlines
 from mover_bench.rooms.render import encode
 
 K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -19,13 +19,13 @@ CAMERA = Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0])), 640, 480)
 NOTHING = torch.full((480, 640), torch.inf)
 
 
-def seen_box(x: float, front: torch.Tensor = NOTHING, deep: float = 4.0) -> Seen:
+def seen_box(x: float, front: torch.Tensor = NOTHING, deep: float = 4.0) -> SeenBodies:
     """A box as tall as a person, in camera axes."""
     verts = (box_verts((0.5, 1.6, 0.3)).float() + torch.tensor([x, -0.8, deep]))[None]
-    return Seen(verts, FACES, verts, CAMERA, front)
+    return SeenBodies(verts, FACES, verts, CAMERA, front)
 
 
-def drawn(seen: Seen) -> torch.Tensor:
+def drawn(seen: SeenBodies) -> torch.Tensor:
     return layers(seen.verts, seen.faces, Crops(K[None], 480, 640)).front[0].isfinite()
 
 
@@ -34,7 +34,7 @@ def table_of(mask: torch.Tensor | None) -> MaskTable:
     return MaskTable(masks, (None if mask is None else 0,), ((),))
 
 
-def wish(seen: Seen, mask: torch.Tensor | None) -> Outline:
+def wish(seen: SeenBodies, mask: torch.Tensor | None) -> Outline:
     return gather_outlines(seen, table_of(mask), torch.tensor([0]))
 
 

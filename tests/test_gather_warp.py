@@ -17,7 +17,7 @@ from mover.geometry import volume_warp
 from mover.geometry.raster import Crops
 from mover.geometry.raster import layers as layers_warp
 from mover.geometry.volume import Volume, grid_around, sample, sample_torch
-from mover.stages.contacts.gather_cues import Sight, gather_depth
+from mover.stages.contacts.gather_cues import PeopleView, gather_depth
 from mover.stages.masks import mask_table
 from mover_bench.rooms.render import encode
 
@@ -149,7 +149,7 @@ def test_nothing_to_draw_is_nothing_seen() -> None:
     assert_same_layers(verts[None].double(), faces, cameras(1, (8, 9), 9.0))
 
 
-def passing(count: int) -> Sight:
+def passing(count: int) -> PeopleView:
     """A ball that crosses the image (in part outside), its masks too small or shifted."""
     verts, faces = sphere([0.0, 0, 0], 0.4, level=2)
     way = torch.linspace(-1.6, 1.3, count)[:, None] * torch.tensor([1.0, 0.3, 0.2])
@@ -166,7 +166,7 @@ def passing(count: int) -> Sight:
     objects = torch.zeros(3, 60, 80, dtype=torch.bool)
     for k in range(3):
         objects[k, 10 + 5 * k : 45, 25 * k : 25 * k + 30] = True
-    return Sight(bodies, mask_table(people, bodies), objects, camera, erode=2, vote=True)
+    return PeopleView(bodies, mask_table(people, bodies), objects, camera, erode=2, vote=True)
 
 
 def test_bounds_are_those_of_whole_images_one_after_another() -> None:

@@ -47,7 +47,7 @@ LARGE_OFFSET = 0.05  # [m], a body that floats that much has a wrong depth or si
 
 
 @record
-class Prior:
+class PlanePrior:
     """What is known before any foot is seen."""
 
     first: Float[Tensor, "2"]
@@ -61,18 +61,18 @@ class Prior:
 
 
 @record
-class Fit:
+class PlaneFit:
     """A minimum: pitch, roll, ground, then the offset of each person."""
 
     at: Float[Tensor, " unknowns"]
     cost: float
     sigma: float
     """Scale of the robust cost at the end [m]."""
-    prior: Prior
+    prior: PlanePrior
 
 
 def cost_of(
-    at: Float[Tensor, " unknowns"], votes: Votes, prior: Prior, sigma: float
+    at: Float[Tensor, " unknowns"], votes: Votes, prior: PlanePrior, sigma: float
 ) -> Float[Tensor, ""]:
     """What the fit minimises: L_feet in units of its noise, plus the priors, in nats."""
     offsets = at[3:][votes.person_of]
@@ -87,20 +87,20 @@ def cost_of(
 
 def fit_plane(
     votes: Votes,
-    prior: Prior,
+    prior: PlanePrior,
     start: Float[Tensor, " unknowns"],
     sigmas: tuple[float, ...],
     steps: int,
-) -> Fit:
+) -> PlaneFit:
     """Descend from `start` with one scale of the robust cost after the other."""
     at = start
     for sigma in sigmas:
         at = _descend(votes, prior, at, sigma, steps if sigma == sigmas[-1] else min(steps, ROUGH))
-    return Fit(at, float(cost_of(at, votes, prior, sigmas[-1])), sigmas[-1], prior)
+    return PlaneFit(at, float(cost_of(at, votes, prior, sigmas[-1])), sigmas[-1], prior)
 
 
 def _descend(
-    votes: Votes, prior: Prior, at: Float[Tensor, " unknowns"], sigma: float, steps: int
+    votes: Votes, prior: PlanePrior, at: Float[Tensor, " unknowns"], sigma: float, steps: int
 ) -> Float[Tensor, " unknowns"]:
     """Levenberg-Marquardt with the weights of Geman-McClure."""
     damping, value = 1e-3, float(cost_of(at, votes, prior, sigma))
@@ -142,7 +142,7 @@ def _linear(
     return residual, torch.cat([slope, -floats], -1)
 
 
-def _prior_weights(at: Float[Tensor, " unknowns"], prior: Prior) -> Float[Tensor, " unknowns"]:
+def _prior_weights(at: Float[Tensor, " unknowns"], prior: PlanePrior) -> Float[Tensor, " unknowns"]:
     """One over the variance that the prior gives each unknown, its long tail included."""
     tilt = prior.tilt**-2 / (1 + (at[:2] - prior.first).square().sum() / prior.tilt**2 / TILT_TAIL)
     ground = at.new_tensor([0.0 if prior.ground is None else FIXED**-2])
@@ -150,7 +150,7 @@ def _prior_weights(at: Float[Tensor, " unknowns"], prior: Prior) -> Float[Tensor
     return torch.cat([tilt.expand(2), ground, floats])
 
 
-def covariance_of(fit: Fit, votes: Votes) -> Float[Tensor, "3 3"]:
+def covariance_of(fit: PlaneFit, votes: Votes) -> Float[Tensor, "3 3"]:
     """Covariance of pitch [rad], roll [rad] and ground [m] from the spread of the feet themselves.
 
     A sandwich: the curvature of the cost, and the variance of its gradient, in which the frames of
@@ -281,12 +281,12 @@ def _leaning(
 
 def _best_fit(
     inputs: AlignInputs, config: AlignConfig, votes: Votes, first: Float[Tensor, "2"]
-) -> Fit:
+) -> PlaneFit:
     """The better of two descents: from the first guess, and from the plane through most feet."""
     known = None if inputs.camera_height is None else -inputs.camera_height
     offset = config.offset_prior
     tilt = inputs.tilt_spread or config.tilt_prior
-    prior = Prior(first, tilt, offset if known is None else SIZE_PRIOR, known)
+    prior = PlanePrior(first, tilt, offset if known is None else SIZE_PRIOR, known)
     height = votes.foot_contacts.points_cam @ tilted(first[0], first[1])[:, 1]
     guesses = [g for g in (known, inputs.ground) if g is not None] or [float(height.median())]
     start = torch.cat([first, first.new_tensor(guesses[:1]), first.new_zeros(len(votes.people))])

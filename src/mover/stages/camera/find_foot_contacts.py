@@ -46,7 +46,7 @@ class FootContactInputs:
 
 
 @record
-class _Feet:
+class _LowerFeet:
     """The lower foot of each body."""
 
     points: Float[Tensor, "bodies points 3"]
@@ -90,7 +90,7 @@ def find_foot_contacts(
 
 
 def _best_evidence(
-    feet: _Feet, sound: Bool[Tensor, " bodies"]
+    feet: _LowerFeet, sound: Bool[Tensor, " bodies"]
 ) -> tuple[Bool[Tensor, " bodies"], tuple[str, ...]]:
     """The strictest choice that leaves something, and what to say about it."""
     levels = (
@@ -108,7 +108,7 @@ def _best_evidence(
     raise AssertionError("some body is sound")
 
 
-def _lower_feet(inputs: FootContactInputs, config: FootContactConfig) -> _Feet:
+def _lower_feet(inputs: FootContactInputs, config: FootContactConfig) -> _LowerFeet:
     """Points, posture and motion of the lower foot of each body."""
     bodies, up = inputs.bodies, inputs.camera.R_cam_world[:, 1].to(inputs.bodies.verts)
     straight = straight_legs(bodies, inputs.parts, up)
@@ -121,7 +121,7 @@ def _lower_feet(inputs: FootContactInputs, config: FootContactConfig) -> _Feet:
         height.append(lowest.values.mean(1))
         still.append(_still(verts.mean(1), bodies, config.speed))
     right = (height[1] < height[0]).long()
-    return _Feet(
+    return _LowerFeet(
         torch.stack(points, 1).take_along_dim(right[:, None, None, None], 1)[:, 0],
         straight.take_along_dim(right[:, None], 1)[:, 0],
         torch.stack(still, 1).take_along_dim(right[:, None], 1)[:, 0],

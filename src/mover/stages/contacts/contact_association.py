@@ -78,7 +78,7 @@ def contact_rows(inputs: AssignInputs, config: AssignConfig) -> Iterator[Contact
     ]
     touching = inputs.probability > CHANCE
     enough = torch.stack([(touching & mine).sum(1) >= FEWEST for mine in members], 1)
-    candidates, surfaces = _candidates(inputs), _surfaces(inputs)
+    candidates, surfaces = _candidates(inputs), _touchable(inputs)
     table = mask_table(inputs.people, bodies) if by_hits and inputs.people is not None else None
     for index in enough.any(1).nonzero()[:, 0].tolist():  # memory stays that of one body
         points, person, seat = bodies.verts[index], None, -1
@@ -110,7 +110,7 @@ def _candidates(inputs: AssignInputs) -> Candidates:
 
 
 @record
-class _Surfaces:
+class _Touchable:
     """What groups of parts can touch (`group`)."""
 
     objects: Objects
@@ -149,12 +149,12 @@ class _Surfaces:
         return int(able[score.argmax()]) if bool(score.isfinite().any()) else -1
 
 
-def _surfaces(inputs: AssignInputs) -> _Surfaces:
+def _touchable(inputs: AssignInputs) -> _Touchable:
     objects, layout, boxes = inputs.objects, inputs.layout, small_boxes(inputs.boxes, inputs.camera)
     masks = _filled(small_masks(inputs.masks, inputs.camera), boxes)
     down = torch.nn.functional.max_pool2d(masks.float().unsqueeze(1), (7, 1), 1, (3, 0))
     grown = torch.nn.functional.max_pool2d(down, (1, 7), 1, (0, 3)).squeeze(1) > 0
-    return _Surfaces(objects, grown, place(objects.top, layout), place(objects.back, layout))
+    return _Touchable(objects, grown, place(objects.top, layout), place(objects.back, layout))
 
 
 def _filled(masks: Bool[Tensor, "objects h w"], boxes: Float[Tensor, "objects 4"]) -> Tensor:

@@ -56,7 +56,7 @@ Window = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
-class Sight:
+class PeopleView:
     """The people, the objects and where they are seen from."""
 
     bodies: Bodies
@@ -112,7 +112,7 @@ class Sight:
 
 
 def gather_depth(
-    sight: Sight, workers: int, observe: Callable[[int, int], None] | None = None
+    sight: PeopleView, workers: int, observe: Callable[[int, int], None] | None = None
 ) -> DepthMaps:
     """The narrowest bounds of all frames; they do not depend on the number of workers.
 
@@ -145,7 +145,7 @@ def gather_depth(
     return maps
 
 
-def _bounds(sight: Sight, block: list[int]) -> Iterator[tuple[Window, DepthMaps]]:
+def _bounds(sight: PeopleView, block: list[int]) -> Iterator[tuple[Window, DepthMaps]]:
     """Where each of some bodies is seen, and its bounds there."""
     views = small_views(sight.camera)
     verts = to_camera(sight.bodies.verts[torch.tensor(block)], sight.camera.R_cam_world)
@@ -241,11 +241,13 @@ def _depth_maps(inputs: GatherInputs, config: GatherConfig, observe: Observer) -
     )
 
 
-def _sight(inputs: GatherInputs, masks: Bool[Tensor, "objects h w"], config: GatherConfig) -> Sight:
+def _sight(
+    inputs: GatherInputs, masks: Bool[Tensor, "objects h w"], config: GatherConfig
+) -> PeopleView:
     """What is drawn of the people, against some masks of the image 640 wide."""
     assert inputs.people is not None, "people have masks"
     table = mask_table(inputs.people, inputs.bodies)
-    return Sight(
+    return PeopleView(
         inputs.bodies, table, masks, inputs.camera, config.erode, config.vote, config.reach,
         inputs.path,
     )  # fmt: skip

@@ -57,7 +57,7 @@ class LabelInputs:
 
 
 @record
-class _Surface:
+class _SurfacePoints:
     """The nearest points of one surface to some vertices of all bodies."""
 
     gap: Float[Tensor, "bodies verts"]
@@ -100,7 +100,7 @@ def label_contacts(
 
 def _surfaces(
     points: Float[Tensor, "bodies verts 3"], inputs: LabelInputs, config: LabelConfig
-) -> Iterator[tuple[int, _Surface]]:
+) -> Iterator[tuple[int, _SurfacePoints]]:
     """Each object where it stands, and the floor; one at a time: memory stays that of one."""
     for k, stands in enumerate(inputs.meshes):
         for there in stands:
@@ -109,12 +109,12 @@ def _surfaces(
     if inputs.ground is not None:
         below, up = points.clone(), torch.zeros_like(points)
         below[..., 1], up[..., 1] = inputs.ground, 1.0
-        yield len(inputs.meshes), _Surface(points[..., 1] - inputs.ground, below, up)
+        yield len(inputs.meshes), _SurfacePoints(points[..., 1] - inputs.ground, below, up)
 
 
 def _solid(
     points: Float[Tensor, "bodies verts 3"], mesh: Mesh, now: Bool[Tensor, " bodies"], reach: float
-) -> _Surface:
+) -> _SurfacePoints:
     verts = as_float64(mesh.verts)
     faces = outward(verts, as_int64(mesh.faces))
     low, high = mesh.verts.amin(0) - reach, mesh.verts.amax(0) + reach
@@ -130,11 +130,11 @@ def _solid(
         gap[near] = torch.from_numpy(np.where(inside, -1, 1) * np.sqrt(squared)).to(gap)
         position[near] = torch.from_numpy(nearest).to(position)
         normal[near] = normalize(across, dim=-1).to(normal)
-    return _Surface(gap, position, normal)
+    return _SurfacePoints(gap, position, normal)
 
 
 def _touches(
-    surface: _Surface, part: Bool[Tensor, " verts"], config: LabelConfig
+    surface: _SurfacePoints, part: Bool[Tensor, " verts"], config: LabelConfig
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Bodies whose part is near, its gap, position and normal: means over its nearest points."""
     gap = surface.gap[:, part].amin(1)

@@ -39,16 +39,6 @@ class PlaceInputs:
 
 
 @record
-class Moment:
-    """The room in the middle of a descent, for the viewer."""
-
-    layout: Layout
-    """All starts."""
-    camera: Camera
-    ground: float
-
-
-@record
 class Placed:
     """Where the objects ended."""
 

@@ -6,8 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mover.core.observe import Energy, Observer, Step, silent
-from mover.core.records import to_device
+from mover.core.observe import Energy, Observer, silent
 from mover.core.types import Layout
 from mover.energy.config import Adam, BatchedBFGS, SceneConfig
 from mover.energy.fused.energy import energy_function, energy_of_rows, never_asks
@@ -18,7 +17,7 @@ from mover.energy.objective import of_objects, some_supports
 from mover.geometry.placement import rest_on_support
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.coarse_cues import coarser_humans, coarser_image
-from mover.stages.objects.place_inputs import Moment, Placed, PlaceInputs, hold, with_walls
+from mover.stages.objects.place_inputs import Placed, PlaceInputs, hold, with_walls
 from mover.stages.objects.separate_objects import separate_objects
 from mover.stages.objects.starts import best_few, choose, duplicates_of, piles_of, spread
 from mover.stages.objects.wall_alignment import line_up
@@ -85,25 +84,13 @@ def descend(
     observe: Observer,
 ) -> Minimum[Layout]:
     """Follow the energy from each start; the result stands on its supports."""
-
-    def at(free: Layout) -> Layout:
-        return standing(inputs, free)
-
-    def watched(step: Step) -> None:
-        free = step.at
-        assert free is not None
-        observe(replace(step, at=lambda: moment(at(free()))))
-
-    def moment(layout: Layout) -> Moment:
-        return to_device(Moment(layout, inputs.camera, inputs.ground), "cpu")
-
     if isinstance(method, BatchedBFGS):
-        found = settle(_problems(inputs, config, starts), method, watched, "place_objects")
+        found = settle(_problems(inputs, config, starts), method, observe, "place_objects")
     else:
         energy = energy_of(inputs, config)
         still = never_asks(inputs.objects)
-        found = minimize(energy, starts, method, watched, "place_objects", still=still)
-    return Minimum(at(found.at), found.value, found.trace)
+        found = minimize(energy, starts, method, observe, "place_objects", still=still)
+    return Minimum(standing(inputs, found.at), found.value, found.trace)
 
 
 def with_trees(inputs: PlaceInputs) -> PlaceInputs:

@@ -23,7 +23,7 @@ from mover.geometry.volume import Volume
 
 
 @dataclass(frozen=True)
-class Feet:
+class SolePoints:
     """The soles among the picked vertices."""
 
     members: Bool[Tensor, "feet picked"]
@@ -32,7 +32,7 @@ class Feet:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class BodyEvidence:
     """What is known about some rows of the bodies."""
 
     camera: Camera
@@ -40,7 +40,7 @@ class Evidence:
     """Its height in the world [m]."""
     furniture: Volume | None
     near: Neighbours
-    feet: Feet
+    feet: SolePoints
     matches: Matches | None
     bounds: Bounds | None
     rho: float
@@ -54,7 +54,7 @@ class Evidence:
         found = getattr(self, name)
         if isinstance(found, Matches | Outline):
             return len(found.body) > 0
-        return bool(found.members.any()) if isinstance(found, Feet) else found is not None
+        return bool(found.members.any()) if isinstance(found, SolePoints) else found is not None
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class MovedBodies:
 
     by: Correction
     puppet: Puppet
-    known: Evidence
+    known: BodyEvidence
     now: Moved
 
     @cached_property
@@ -138,13 +138,15 @@ BODY_TERMS: tuple[Term[MovedBodies], ...] = (
 """All terms of the bodies' energy; a new one is a file in `body_terms`, a weight and a row."""
 
 
-def body_energy(by: Correction, puppet: Puppet, known: Evidence, weights: BodyWeights) -> Energy:
+def body_energy(
+    by: Correction, puppet: Puppet, known: BodyEvidence, weights: BodyWeights
+) -> Energy:
     """The cost of a correction, one value for each body."""
     at = MovedBodies(by, puppet, known, moved(puppet, by))
     return sum_terms(active_weights(weights, BODY_TERMS, known.has), BODY_TERMS, at)
 
 
-def _soles(now: Moved, feet: Feet) -> tuple[Tensor, Tensor]:
+def _soles(now: Moved, feet: SolePoints) -> tuple[Tensor, Tensor]:
     """Middle of each sole, and its middle again at the height of its lower half [m]."""
     middles: list[Tensor] = []
     lows: list[Tensor] = []

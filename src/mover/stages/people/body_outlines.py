@@ -30,7 +30,7 @@ INDEPENDENT = 16.0  # places of an outline
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenBodies:
     """Bodies in camera axes, and what may hide them."""
 
     verts: Float[Tensor, "bodies verts 3"]
@@ -42,7 +42,7 @@ class Seen:
     """Depth of the nearest piece, in a picture of any size [m]; inf: none."""
 
 
-def gather_outlines(seen: Seen, table: MaskTable, rows: Int[Tensor, " bodies"]) -> Outline:
+def gather_outlines(seen: SeenBodies, table: MaskTable, rows: Int[Tensor, " bodies"]) -> Outline:
     """How far each body's outline is from that of its mask."""
     found: list[Outline] = []
     for first in range(0, len(rows), 64):  # 64 windows at a time, for memory
@@ -59,7 +59,7 @@ def gather_outlines(seen: Seen, table: MaskTable, rows: Int[Tensor, " bodies"]) 
     return _joined(found, seen.skin)
 
 
-def _windows(seen: Seen) -> tuple[Crops, Float[Tensor, "bodies 3"]]:
+def _windows(seen: SeenBodies) -> tuple[Crops, Float[Tensor, "bodies 3"]]:
     """A square window around each body; its corner [px] and its zoom."""
     at = project(seen.verts, seen.camera.K.to(seen.verts))
     low, high = at.amin(1), at.amax(1)
@@ -72,7 +72,7 @@ def _windows(seen: Seen) -> tuple[Crops, Float[Tensor, "bodies 3"]]:
 
 
 def _compare(
-    seen: Seen,
+    seen: SeenBodies,
     k: int,
     drawn: Float[Tensor, "side side"],
     window: tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]],

@@ -39,7 +39,7 @@ from mover.geometry.camera import to_camera
 from mover.geometry.path import is_still
 from mover.geometry.placement import changes, mover_at, placed_at
 from mover.stages.config import RefineBodiesConfig
-from mover.stages.people.body_energy import Evidence, Feet, body_energy
+from mover.stages.people.body_energy import BodyEvidence, SolePoints, body_energy
 from mover.stages.people.body_evidence import (
     Picked,
     Surroundings,
@@ -50,17 +50,15 @@ from mover.stages.people.body_evidence import (
     surroundings_of,
     watched_of,
 )
-from mover.stages.people.body_outlines import Seen, gather_outlines
+from mover.stages.people.body_outlines import SeenBodies, gather_outlines
 from mover.stages.people.plant_feet import plant_feet
-
-# Everybody who is refined, and what is found about them each time they have moved.
 
 SIDES = ("left", "right")
 
 
 @dataclass(frozen=True)
-class Cast:
-    """Everybody, and what is known before anything moves."""
+class RefineScene:
+    """All people, and what is known before anything moves."""
 
     bodies: Bodies
     picked: Picked
@@ -72,7 +70,7 @@ class Cast:
 
 
 @dataclass(frozen=True)
-class Acted:
+class MovedRows:
     """Some rows where they are now."""
 
     rows: Int[Tensor, " rows"]
@@ -82,8 +80,8 @@ class Acted:
     by: Correction
 
 
-def cast_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Cast:
-    """Everybody and the room, before anything moves.
+def scene_of(room: Room, capture: Capture | None, weights: BodyWeights) -> RefineScene:
+    """All people and the room, before anything moves.
 
     Raises:
         InputError: If the room has no bodies or no floor.
@@ -109,56 +107,60 @@ def cast_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Cast:
     without = torch.tensor([PARTS.index(f"{s}_{p}") for s in SIDES for p in ("sole", "forearm")])
     chance = torch.where(torch.isin(picked.part, without), 0.0, chance[:, picked.index].float())
     watched = watched_of(surroundings, people, bodies)
-    return Cast(bodies, picked, surroundings, chance, rest, lying, watched)
+    return RefineScene(bodies, picked, surroundings, chance, rest, lying, watched)
 
 
-def known_of(cast: Cast, bodies: Bodies, rows: Int[Tensor, " rows"]) -> Evidence:
+def known_of(scene: RefineScene, bodies: Bodies, rows: Int[Tensor, " rows"]) -> BodyEvidence:
     """What does not change while the bodies move."""
-    room = cast.room
-    soles = torch.stack([cast.picked.part == 0, cast.picked.part == 1])
-    return Evidence(
+    room = scene.room
+    soles = torch.stack([scene.picked.part == 0, scene.picked.part == 1])
+    return BodyEvidence(
         camera=room.camera, floor=room.floor, furniture=room.firm,
         near=gather_neighbours(bodies.frame, bodies.person, bodies.fps),
-        feet=Feet(soles, cast.rest[rows]), matches=None, bounds=None, rho=0.1,
-        even=cast.picked.even,
+        feet=SolePoints(soles, scene.rest[rows]), matches=None, bounds=None, rho=0.1,
+        even=scene.picked.even,
     )  # fmt: skip
 
 
 def looked(
-    cast: Cast, acted: Acted, known: Evidence, weights: BodyWeights, match: MatchConfig
-) -> Evidence:
+    scene: RefineScene,
+    moved_rows: MovedRows,
+    known: BodyEvidence,
+    weights: BodyWeights,
+    match: MatchConfig,
+) -> BodyEvidence:
     """Look again for what the skin touches, what hides it, and where outlines should go."""
-    puppet, by, rows = acted.puppet, acted.by, acted.rows
+    puppet, by, rows = moved_rows.puppet, moved_rows.by, moved_rows.rows
     with torch.no_grad():
         now, normals = moved(puppet, by), normals_after(puppet, by)
     matches: Matches | None = None
     bounds: Bounds | None = None
     if weights.touch:
         skin = Skin(  # errors of poses count where they are not corrected
-            points=now.skin, normals=normals, chance=cast.chance[rows], group=cast.picked.group,
-            track=known.near.track, pivot=now.points[:, 0], flat=cast.lying[rows],
+            points=now.skin, normals=normals, chance=scene.chance[rows], group=scene.picked.group,
+            track=known.near.track, pivot=now.points[:, 0], flat=scene.lying[rows],
             bent=ANGLE if puppet.model is None else 0.0,
         )  # fmt: skip
-        matches = gather_matches(skin, cast.room.surface, match, cast.room.furniture)
-    if weights.order and cast.watched is not None:
-        even = cast.picked.even
-        bounds = order_bounds(cast.watched, rows, now.skin[:, even], normals[:, even])
+        matches = gather_matches(skin, scene.room.surface, match, scene.room.furniture)
+    if weights.order and scene.watched is not None:
+        even = scene.picked.even
+        bounds = order_bounds(scene.watched, rows, now.skin[:, even], normals[:, even])
     outline: Outline | None = None
-    if weights.outline and cast.watched is not None:
-        outline = _outlines(cast, acted)
+    if weights.outline and scene.watched is not None:
+        outline = _outlines(scene, moved_rows)
     return replace(known, matches=matches, bounds=bounds, outline=outline)
 
 
-def _outlines(cast: Cast, acted: Acted) -> Outline:
+def _outlines(scene: RefineScene, moved_rows: MovedRows) -> Outline:
     """The outlines of the bodies where they stand now, against their masks."""
-    assert cast.watched is not None
-    room, bodies, rows = cast.room, acted.bodies, acted.rows
-    rigid = acted.puppet.model is None
-    whole = corrected(replace(bodies, pose=None) if rigid else bodies, acted.by)
+    assert scene.watched is not None
+    room, bodies, rows = scene.room, moved_rows.bodies, moved_rows.rows
+    rigid = moved_rows.puppet.model is None
+    whole = corrected(replace(bodies, pose=None) if rigid else bodies, moved_rows.by)
     verts = to_camera(whole.verts, room.camera.R_cam_world)
-    skin = verts[:, cast.picked.index]
-    seen = Seen(verts, bodies.faces, skin, room.camera, room.front)
-    return gather_outlines(seen, cast.watched.table, rows)
+    skin = verts[:, scene.picked.index]
+    seen = SeenBodies(verts, bodies.faces, skin, room.camera, room.front)
+    return gather_outlines(seen, scene.watched.table, rows)
 
 
 SMOOTHED = BodyWeights(under=0.0, stand=0.0, lock=0.0, sink=0.0, touch=0.0, order=0.0, outline=0.0)
@@ -244,10 +246,10 @@ def _refined(
     room: Room, capture: Capture | None, config: RefineBodiesConfig, observe: Observer
 ) -> RefinedBodies:
     """The people of a room whose furniture stays where it is."""
-    cast = cast_of(room, capture, config.weights)
+    scene = scene_of(room, capture, config.weights)
     order = sorted(
-        range(len(cast.bodies.frame)),
-        key=lambda k: (int(cast.bodies.person[k]), int(cast.bodies.frame[k])),
+        range(len(scene.bodies.frame)),
+        key=lambda k: (int(scene.bodies.person[k]), int(scene.bodies.frame[k])),
     )
     found: Correction | None = None
     energy = torch.zeros(len(order))
@@ -255,43 +257,43 @@ def _refined(
         inner = order[first : first + config.rows]
         start = max(0, first - config.overlap)
         rows = torch.tensor(order[start : first + config.rows + config.overlap])
-        by, left = _refine(cast, rows, config, observe)
+        by, left = _refine(scene, rows, config, observe)
         keep = slice(first - start, first - start + len(inner))
         found = _put(found, by, torch.tensor(inner), keep, len(order))
         energy[inner] = left[keep]
     assert found is not None, "bodies have at least one row"
-    bodies, shift = corrected(cast.bodies, found), found.shift
+    bodies, shift = corrected(scene.bodies, found), found.shift
     if config.plant and config.weights.lock:
-        planted = plant_feet(bodies, parts_of(bodies), cast.room.floor)
+        planted = plant_feet(bodies, parts_of(bodies), scene.room.floor)
         shift = shift + (planted.verts - bodies.verts).mean(1)
         bodies = planted
     return RefinedBodies(bodies, shift, energy)
 
 
 def _refine(
-    cast: Cast, rows: Int[Tensor, " rows"], config: RefineBodiesConfig, observe: Observer
+    scene: RefineScene, rows: Int[Tensor, " rows"], config: RefineBodiesConfig, observe: Observer
 ) -> tuple[Correction, Float[Tensor, " rows"]]:
     """Some rows, in rounds: first moved as a whole, then with their pose."""
-    bodies = rows_of(cast.bodies, rows)
-    puppet = puppet_of(bodies, cast.picked.index)
+    bodies = rows_of(scene.bodies, rows)
+    puppet = puppet_of(bodies, scene.picked.index)
     stiff = replace(puppet, model=None, pose=None)
-    by, known = no_correction(stiff), known_of(cast, bodies, rows)
+    by, known = no_correction(stiff), known_of(scene, bodies, rows)
     left = torch.zeros(len(rows))
     total = config.places + config.rounds
     for turn in range(total):
         now, method = (stiff, config.place) if turn < config.places else (puppet, config.method)
-        by = _begun(now, by)
+        by = _started(now, by)
         share = turn / max(1, total - 1)
         rho = config.rhos[0] * (config.rhos[1] / config.rhos[0]) ** share
-        acted = Acted(rows, bodies, now, by)
-        known = replace(looked(cast, acted, known, config.weights, config.match), rho=rho)
+        moved_rows = MovedRows(rows, bodies, now, by)
+        known = replace(looked(scene, moved_rows, known, config.weights, config.match), rho=rho)
         energy = partial(body_energy, puppet=now, known=known, weights=config.weights)
         found = minimize(energy, by, method, observe, "refine_bodies")
         by, left = found.at, found.value
-    return _begun(puppet, by), left
+    return _started(puppet, by), left
 
 
-def _begun(puppet: Puppet, by: Correction) -> Correction:
+def _started(puppet: Puppet, by: Correction) -> Correction:
     """The same correction with the angles of this puppet, which were not free before."""
     none = no_correction(puppet)
     if none.angles.shape == by.angles.shape:
@@ -302,7 +304,7 @@ def _begun(puppet: Puppet, by: Correction) -> Correction:
 def _put(
     whole: Correction | None, part: Correction, rows: Int[Tensor, " rows"], keep: slice, count: int
 ) -> Correction:
-    """Write the kept rows of a part into the correction of everybody."""
+    """Write the kept rows of a part into the correction of all people."""
 
     def into(name: str) -> Tensor:
         value = getattr(part, name)[keep]
