@@ -45,11 +45,9 @@ RUN_SETTINGS = {
         for term in ("bbox", "silhouette", "scale", "wall", "given", "measured")
     },
     "place.method.steps": "Most steps of the descent with people.",
-    "place.perturbations": "Perturbed starts of that descent.",
     "layout.method.steps": "Most steps of the descent from the image alone.",
     "layout.yaws": "Initial orientations of each object.",
     "layout.num_hypotheses": "Placements of each object that go on to the second descent.",
-    "layout.perturbations": "Perturbed starts of the best placements.",
     "outer_iterations": "Further passes with contacts and occlusion order renewed.",
     "select.rule": "How frames whose bodies jump are left out.",
     "correct_depth": "Find one depth factor a person.",
