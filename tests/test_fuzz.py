@@ -384,7 +384,7 @@ def test_a_stage_that_was_damaged_anywhere_is_said_and_computed_anew(tmp_path, c
         found = run.stage(doubled, PLANE, Twice())
     assert torch.equal(found.points, wanted.points)
     assert found.ground == wanted.ground
-    assert run.stages[0].kept or "computed anew" in caplog.text  # unused bytes of an archive
+    assert run.stages[0].kept or "computed again" in caplog.text  # unused bytes of an archive
 
 
 # Settings: every number at -1, 0 and the ends of its range, where these are taken.

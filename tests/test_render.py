@@ -21,7 +21,7 @@ from mover.app.pictures.eye import (
 )
 from mover.app.pictures.film import save_film, video_pictures
 from mover.app.pictures.paint import (
-    NOBODY,
+    NO_OWNER,
     PERSON,
     draw,
     furniture,
@@ -30,7 +30,7 @@ from mover.app.pictures.paint import (
     people,
     shadows,
 )
-from mover.app.pictures.render import Moment, render_result, render_worlds, set_up, show, world_of
+from mover.app.pictures.render import Shot, render_result, render_worlds, set_up, show, world_of
 from mover.core.errors import InputError
 from mover.core.types import Segment
 from mover.geometry.camera import project, to_camera
@@ -146,7 +146,7 @@ def test_a_shadow_is_darkest_where_something_stands():
     eye = above_eye(still.verts, (320, 240))
     dark = shadows(eye, ground, still)[..., 3]
     owner = draw(still, eye).owner
-    assert dark[owner == 2].mean() > 3 * dark[owner == NOBODY].mean()
+    assert dark[owner == 2].mean() > 3 * dark[owner == NO_OWNER].mean()
     assert dark[0, 0] == 0
 
 
@@ -202,7 +202,7 @@ def test_the_video_is_behind_the_furniture(tmp_path: Path):
         Image.new("RGB", (WIDTH, HEIGHT), colour).save(capture / "frames" / f"{frame:06d}.png")
     scene = room()
     world = world_of("after", scene, walkers(2))
-    moments = [Moment(0, 0.0), Moment(3, 0.5), Moment(9, 0.7)]
+    moments = [Shot(0, 0.0), Shot(3, 0.5), Shot(9, 0.7)]
     pictures = list(render_worlds([world], moments, RenderConfig(width=64), capture))
     for picture, channel in zip(pictures[:2], (0, 1), strict=True):
         assert picture[0, 0].argmax() == channel
@@ -234,7 +234,7 @@ def test_what_cannot_be_drawn_is_said(tmp_path: Path, name: str):
 def test_a_room_without_people_turns():
     world = world_of("after", room(), None)
     config = RenderConfig(view="orbit", turns=1, width=64)
-    a, b = render_worlds([world], [Moment(0, 0.0), Moment(0, 0.5)], config, None)
+    a, b = render_worlds([world], [Shot(0, 0.0), Shot(0, 0.5)], config, None)
     assert a.shape == b.shape == (36, 64, 3)
     assert (a - b).abs().max() > 0.2
 
@@ -248,12 +248,12 @@ def test_moved_furniture_is_drawn_where_it_stands_in_the_frame():
     stays = tuple(Segment(f, p.t_world_object, p.yaw) for f, p in ((0, chair), (5, there)))
     moved = dataclasses.replace(chair, segments=stays)
     world = world_of("after", dataclasses.replace(scene, objects=(moved, *others)), None)
-    config, moments = RenderConfig(width=64), [Moment(4, 0.0), Moment(5, 0.5), Moment(4, 0.9)]
+    config, moments = RenderConfig(width=64), [Shot(4, 0.0), Shot(5, 0.5), Shot(4, 0.9)]
     found = list(render_worlds([world], moments, config, None))
     for picture, piece in zip(found, (chair, there, chair), strict=True):
         alone = world_of("after", dataclasses.replace(scene, objects=(piece, *others)), None)
         alone = dataclasses.replace(alone, ground=world.ground)
-        expected = next(render_worlds([alone], [Moment(0, 0.0)], config, None))
+        expected = next(render_worlds([alone], [Shot(0, 0.0)], config, None))
         assert torch.equal(picture, expected)
     assert (found[0] - found[1]).abs().max() > 0.2
 

@@ -1,4 +1,4 @@
-"""Damaged stages are dropped, said, and computed anew; what is whole is kept."""
+"""Damaged stages are dropped, said, and computed again; what is whole is kept."""
 
 import json
 import logging
@@ -115,7 +115,7 @@ def test_a_damaged_stage_is_said_and_computed_anew(
     said = [r.getMessage() for r in caplog.records if "is damaged" in r.getMessage()]
     gone = damage is Path.unlink and which == 0
     assert len(said) == (0 if gone else 1)
-    assert all("doubled" in text and "computed anew" in text for text in said)
+    assert all("doubled" in text and "computed again" in text for text in said)
     again = Run(tmp_path)
     assert torch.equal(again.stage(doubled, PLANE, Twice()).points, wanted.points)
     assert [stage.kept for stage in again.stages] == [True]

@@ -252,14 +252,14 @@ class TestCuts:
 def test_heights_are_told_to_the_room_by_track(tmp_path: Path):
     rows = [{"track_id": 7}, {"track_id": 3}, {"track_id": 7}]
     (tmp_path / "people.json").write_text(json.dumps({"info": {"fps": 5}, "annotations": rows}))
-    chain.tell_heights(tmp_path, (1.6, 1.8))
+    chain.write_heights(tmp_path, (1.6, 1.8))
     info = json.loads((tmp_path / "people.json").read_text())["info"]
     assert info == {"fps": 5, "heights": {"3": 1.6, "7": 1.8}}
-    chain.tell_heights(tmp_path, (1.7,))
+    chain.write_heights(tmp_path, (1.7,))
     assert json.loads((tmp_path / "people.json").read_text())["info"]["heights"]["7"] == 1.7
     with pytest.raises(InputError, match="height: 3 are given, expected 1, or 2: one a person"):
-        chain.tell_heights(tmp_path, (1.6, 1.7, 1.8))
-    chain.tell_heights(tmp_path / "none", (1.7,))  # nobody is seen: nothing to tell
+        chain.write_heights(tmp_path, (1.6, 1.7, 1.8))
+    chain.write_heights(tmp_path / "none", (1.7,))  # no person is seen: nothing to write
 
 
 @pytest.mark.long

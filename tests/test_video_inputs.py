@@ -187,7 +187,7 @@ def test_without_people_the_picture_alone_places_the_furniture_and_that_is_said(
     out = tmp_path / "out"
     scene = room_of(tmp_path / "v.mp4", out, ChainArgs(out, fov=60.0))
     told = capsys.readouterr().out
-    assert "nobody is seen in the video: only the image places the furniture" in told
+    assert "no person is seen in the video: only the image places the furniture" in told
     assert [piece.id for piece in scene.objects] == ["chair_0"]
     assert not (out / "room" / "bodies.npz").exists()
 

@@ -272,7 +272,7 @@ def last_lines(log: Path) -> list[str]:
 
 
 def on_this_machine(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
-    """So many processes at a time; those that run are ended when nobody waits for them."""
+    """So many processes at a time; those that run are ended when the caller stops."""
     stop = threading.Event()
     with ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(run_job, job, stop) for job in jobs]

@@ -4,7 +4,7 @@ OUT/capture      an ordinary capture: every file in it may be replaced by a bett
 OUT/room         the result, as `mover run` writes it
 OUT/steps.json   what each step was made from, and what it took
 
-A step is done anew only where what it was made from has changed; a file that was replaced in
+A step is done again only where what it was made from has changed; a file that was replaced in
 between is what the later steps read.
 """
 
@@ -22,7 +22,7 @@ from mover.core.errors import InputError
 
 Say = Callable[[str], None]
 FIT = "fit"
-OUT = "{out}"  # by which a command is told from a file
+OUT = "{out}"  # which marks a command, not a file
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def steps_in(folder: Path, say: Say, names: tuple[str, ...]) -> Steps:
             tree = json.loads(file.read_text())["steps"]
             log = {str(name): dict(step) for name, step in tree.items()}
         except (ValueError, KeyError, TypeError, AttributeError):
-            say(f"warning: {file.name} is damaged and is dropped: all steps are done anew")
+            say(f"warning: {file.name} is damaged and is dropped: all steps are done again")
     return Steps(folder, say, names, log)
 
 
@@ -197,12 +197,12 @@ def import_bodies(source: Path, tool: str, capture: Path) -> None:
     write_bodies(bodies_from(tool, source, Known(camera)).bodies, capture / "bodies.npz")
 
 
-def tell_heights(capture: Path, heights: tuple[float, ...]) -> None:
-    """Write how tall people are into people.json, for the room; nothing where nothing is told.
+def write_heights(capture: Path, heights: tuple[float, ...]) -> None:
+    """Write how tall people are into people.json, for the room; nothing where no height is known.
 
     Args:
         capture: With people.json in it.
-        heights: Of each track in the order of their numbers, or one for everybody [m].
+        heights: Of each track in the order of their numbers, or one for all people [m].
 
     Raises:
         InputError: If there are others than there are people.
@@ -218,5 +218,5 @@ def tell_heights(capture: Path, heights: tuple[float, ...]) -> None:
         found = f"height: {len(heights)} are given, expected 1, or {len(tracks)}: one a person"
         raise InputError(found)
     each = heights * len(tracks) if len(heights) == 1 else heights
-    told = {str(track): height for track, height in zip(tracks, each, strict=True)}
-    write_json({**tree, "info": {**tree.get("info", {}), "heights": told}}, file)
+    known = {str(track): height for track, height in zip(tracks, each, strict=True)}
+    write_json({**tree, "info": {**tree.get("info", {}), "heights": known}}, file)

@@ -59,7 +59,7 @@ def write_results(
     *,
     report: bool = True,
 ) -> None:
-    """Write everything but metrics.json; the page last, unless there is more to tell in it."""
+    """Write everything but metrics.json; the page last, unless more is added to it."""
     origin = origin or Origin()
     out = run.folder
     write_scene(room.initial, out / "initial.json")

@@ -1,4 +1,4 @@
-"""What a descent tells those who watch: its energy, term by term, and each of its steps."""
+"""What a descent reports: its energy, term by term, and each of its steps."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

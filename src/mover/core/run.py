@@ -54,7 +54,7 @@ class Run:
     stages: list[StageLog] = field(default_factory=lambda: [])
     device: torch.device = CPU
     """Where the stages in `ON_DEVICE` compute; all others do on the processor."""
-    begun: dict[Path, "Future[tuple[Any, float]]"] = field(default_factory=lambda: {})
+    started: dict[Path, "Future[tuple[Any, float]]"] = field(default_factory=lambda: {})
     """Stages that are computed beside others, and how many seconds they took."""
 
     def stage(self, fn: Callable[[In, Conf, Observer], Out], inputs: In, config: Conf) -> Out:
@@ -65,7 +65,7 @@ class Run:
         Inputs and output lie on the processor; what another device computed has another name.
         """
         name, device, path = self._named(fn, inputs, config)
-        begin, beside = time.perf_counter(), self.begun.pop(path, None)
+        begin, beside = time.perf_counter(), self.started.pop(path, None)
         kind = typing.get_type_hints(fn)["return"]
         output: Out | None = _stored(kind, path) if beside is None else None
         kept = output is not None
@@ -94,14 +94,14 @@ class Run:
         The output is the same. Nothing is done where it is on disk, or where a GPU computes it.
         """
         _, device, path = self._named(fn, inputs, config)
-        if device != CPU or path in self.begun or path.with_suffix(".json").exists():
+        if device != CPU or path in self.started or path.with_suffix(".json").exists():
             return
 
         def work() -> tuple[Out, float]:
             begin = time.perf_counter()
             return fn(inputs, config, silent), time.perf_counter() - begin
 
-        self.begun[path] = _beside().submit(copy_context().run, work)
+        self.started[path] = _beside().submit(copy_context().run, work)
 
     def _named(
         self, fn: Callable[[In, Conf, Observer], Out], inputs: In, config: Conf
@@ -121,7 +121,7 @@ def _gains(name: str, config: object) -> bool:
 
 @functools.cache
 def _beside() -> ThreadPoolExecutor:
-    """One thread: what is begun is computed one after the other."""
+    """One thread: what is started is computed one after the other."""
     return ThreadPoolExecutor(1, thread_name_prefix="mover-beside")
 
 
@@ -132,7 +132,7 @@ def _stored(kind: type[Out], path: Path) -> Out | None:
     try:
         return records.load(kind, path)
     except InputError as error:
-        log.warning("warning: %s; it is computed anew", error)
+        log.warning("warning: %s; it is computed again", error)
         return None
 
 
@@ -180,7 +180,7 @@ def kept(kind: type[T], key: str, make: Callable[[], T]) -> T:
     """What was made under this key before, in any run; else it is made now and kept.
 
     Nothing hangs on the folder (`$XDG_CACHE_HOME/mover`, by default `~/.cache/mover`): what is
-    damaged is made anew, and where nothing can be written, nothing is kept.
+    damaged is made again, and where nothing can be written, nothing is kept.
 
     Args:
         kind: The record that `make` gives.

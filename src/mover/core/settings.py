@@ -106,7 +106,7 @@ def check_settings(settings: object, name: str) -> None:
 
 
 def read_settings(kind: type[T], tree: object, name: str) -> T:
-    """Settings from plain JSON values, checked; what is not told keeps its default.
+    """Settings from plain JSON values, checked; what is missing keeps its default.
 
     Raises:
         InputError: If one is unknown, of a wrong type, or out of its range.

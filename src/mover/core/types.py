@@ -165,7 +165,7 @@ class Bodies:
     pose: BodyPose | None
     size_spread: float | None = None
     """Standard deviation of the logarithm of all sizes, as far as they are wrong together: bodies
-    from keypoints of which no height is told. 0: it was told. None: nobody says."""
+    from keypoints of unknown height. 0: it was given. None: unknown."""
 
 
 @record
@@ -258,8 +258,8 @@ class Capture:
     depth: DepthImage | None = None
     """Measured depth of the reference picture."""
     focal_spread: float | None = None
-    """Standard deviation of the logarithm of the focal length; 0: it was measured. None: nobody
-    says."""
+    """Standard deviation of the logarithm of the focal length; 0: it was measured. None:
+    unknown."""
     tilt: Tilt | None = None
     """Of the camera, where it was looked for in the picture."""
     heading: Heading | None = None

@@ -83,7 +83,7 @@ class ExportArgs:
     to: tuple[Target, ...] = ("glb",)
     """What to write; several with spaces between them."""
     capture: Path | None = None
-    """Folder of the capture: its bodies.npz tells the parameters of the bodies."""
+    """Folder of the capture: its bodies.npz has the parameters of the bodies."""
     body: Literal["auto", "skin", "morph", "none"] = "auto"
     """glb, usd: how people move: on bones, by exact shapes of some frames, or not at all (also
     mjcf)."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Fixed, Positional, Suppress, arg
 
-from mover.app.chain import FIT, BodiesFrom, Steps, make_bodies, steps_in, tell_heights
+from mover.app.chain import FIT, BodiesFrom, Steps, make_bodies, steps_in, write_heights
 from mover.app.cli import say
 from mover.app.cli.config import (
     LAYOUT_SETTINGS,
@@ -33,7 +33,7 @@ class LayoutArgs:
     """Find a first scene: furniture of the library (or yours) where the picture shows some.
 
     Needs camera.json and objects.json in the capture, and is far better with bodies.npz, whose feet
-    tell where the floor is; writes scene.json, meshes/ and hypotheses.json.
+    show where the floor is; writes scene.json, meshes/ and hypotheses.json.
     """
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -58,11 +58,11 @@ class PerceiveArgs:
     out: Path
     """The capture folder."""
     camera: Path | None = None
-    """A calibration; GeoCalib's also tells pitch and roll."""
+    """A calibration; GeoCalib's also has pitch and roll."""
     fov: Annotated[float, float_in(1, 179)] | None = None
     """Horizontal field of view, where there is no calibration [degrees]."""
     photo: Path | None = None
-    """A photo of the same camera, whose EXIF tells the focal length."""
+    """A photo of the same camera, whose EXIF has the focal length."""
     depth: Path | None = None
     """Metric depth of the reference picture, for the first scene and `mover run`."""
     meshes: Path | None = None
@@ -187,8 +187,8 @@ def layout_into(args: LayoutArgs) -> None:
 
 STEPS = ("pictures", "bodies", "first scene", "room")
 ONE_IMAGE = (
-    "note: one picture shows one moment: nobody passes behind furniture, nothing is touched twice, "
-    "nobody's height is averaged; a video of ten seconds or more places furniture far better"
+    "note: one picture shows one moment: no person passes behind furniture, nothing is touched "
+    "twice, no height is averaged; a video of ten seconds or more places furniture far better"
 )
 
 
@@ -206,14 +206,14 @@ class ChainArgs:
     """What wrote FILE, or what COMMAND writes: a TOOL of `mover import-bodies`; empty: bodies.npz
     itself."""
     height: tuple[Annotated[float, float_in(0.4, 2.6)], ...] = ()
-    """How tall people are, one for everybody or for each in the order of their numbers [m]: tells
+    """How tall people are, one for all or for each in the order of their numbers [m]: gives
     `--bodies fit` and the room how far they are."""
     camera: Path | None = None
-    """A calibration; GeoCalib's also tells pitch and roll."""
+    """A calibration; GeoCalib's also has pitch and roll."""
     fov: Annotated[float, float_in(1, 179)] | None = None
     """Horizontal field of view, where there is no calibration [degrees]."""
     photo: Path | None = None
-    """A photo of the same camera, whose EXIF tells the focal length."""
+    """A photo of the same camera, whose EXIF has the focal length."""
     depth: Path | None = None
     """Metric depth of the reference picture, for the first scene and the room."""
     meshes: Path | None = None
@@ -329,7 +329,7 @@ def _tell_what_is_missing(capture: Path) -> None:
             "nothing to place; --detect.score 0.3 hears weaker finds"
         )
     if not json.loads((capture / "people.json").read_text())["annotations"]:
-        say("warning: nobody is seen in the video: only the image places the furniture")
+        say("warning: no person is seen in the video: only the image places the furniture")
 
 
 def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
@@ -339,7 +339,7 @@ def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
         say("warning: no keypoints were found, so there are no bodies")
         steps.undo(STEPS[1], capture / "bodies.npz")
         return
-    tell_heights(capture, args.height)
+    write_heights(capture, args.height)
     given = [] if args.bodies == FIT or bodies.is_command else [Path(args.bodies)]
     made_from = [keypoints, lens_in(capture), args.bodies, args.bodies_tool, *given]
     made_from += map(str, args.height)
@@ -351,7 +351,7 @@ def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
 
 
 def _first_scene(capture: Path, args: ChainArgs, steps: Steps) -> None:
-    """scene.json, under the camera that the bodies tell."""
+    """scene.json, under the camera that the bodies constrain."""
     from mover.io.files.images import find_depth_file
 
     names = ("objects.json", "people.json", "bodies.npz")

@@ -13,7 +13,7 @@ from mover.app.pictures.eye import RenderCamera, camera_sized
 from mover.app.pictures.film import pixels, save_still, sized
 from mover.app.pictures.paint import (
     FINE,
-    NOBODY,
+    NO_OWNER,
     Ink,
     draw,
     fine_eye,
@@ -57,7 +57,7 @@ def draw_overlay(
     drawn = draw(surfaces, fine_eye(eye))
     x, y, z = (-FILL * eye.R_eye_world[2]).tolist()
     ink = Ink(OPACITY, max(1, round(width / THICK)), AMBIENT, LAMP, (x, y, z))
-    free = avg_pool2d((drawn.owner == NOBODY).float()[None], FINE)[0, ..., None]
+    free = avg_pool2d((drawn.owner == NO_OWNER).float()[None], FINE)[0, ..., None]
     picture = over(paint(drawn, ink), over(_floor(eye, scene) * free, image))
     return _named(picture.clamp(0, 1), drawn.owner[::FINE, ::FINE], scene)
 

@@ -15,7 +15,7 @@ from mover.geometry.raster import first_hit
 
 FINE = 2  # drawn at twice the size and averaged: smooth edges
 LIGHT = (0.35, 0.85, 0.40)  # from where a lamp shines, in the world
-NOBODY = -1  # owner of a pixel that shows no surface
+NO_OWNER = -1  # owner of a pixel that shows no surface
 PERSON = 100_000  # owner of person 0; the furniture is counted from 0
 SHARP = 0.85  # cosine between two surfaces whose edge is drawn
 LINE, CREASE = 0.75, 0.25  # how opaque outlines and inner edges are
@@ -43,7 +43,7 @@ class Drawn:
     depth: Float[Tensor, "h w"]
     """Along the eye's axis [m], inf for nothing."""
     owner: Int[Tensor, "h w"]
-    """As in `Surfaces`; `NOBODY` for nothing."""
+    """As in `Surfaces`; `NO_OWNER` for nothing."""
     normal: Float[Tensor, "h w 3"]
     """Of the surface in the world, towards the eye."""
     tint: Float[Tensor, "h w 3"]
@@ -108,13 +108,13 @@ def draw(surfaces: Surfaces, eye: RenderCamera) -> Drawn:
     points = seen_from(eye, surfaces.verts)
     if not len(surfaces.faces):
         none = torch.zeros(*size, 3)
-        return Drawn(none[..., 0] + torch.inf, none[..., 0].long() + NOBODY, none, none)
+        return Drawn(none[..., 0] + torch.inf, none[..., 0].long() + NO_OWNER, none, none)
     depth, face = first_hit(points, surfaces.faces, eye.K, size)
     hit, index = (face >= 0)[..., None], face.clamp_min(0)
     middle = surfaces.verts[surfaces.faces].mean(1)
     away = ((middle - eye.t_world_eye) * surfaces.normals).sum(-1, keepdim=True) > 0
     normals = torch.where(away, -surfaces.normals, surfaces.normals)
-    owner = torch.where(hit[..., 0], surfaces.owner[index], torch.full_like(index, NOBODY))
+    owner = torch.where(hit[..., 0], surfaces.owner[index], torch.full_like(index, NO_OWNER))
     return Drawn(depth, owner, normals[index] * hit, surfaces.tint[index] * hit)
 
 
@@ -148,7 +148,7 @@ def paint(drawn: Drawn, ink: Ink) -> Float[Tensor, "height width 4"]:
     outline, crease = _lines(drawn, ink.thickness)
     colours = colours.lerp(drawn.tint * 0.40, CREASE * crease[..., None].float())
     colours = colours.lerp(drawn.tint * 0.40, LINE * outline[..., None].float())
-    seen = (drawn.owner != NOBODY).float()
+    seen = (drawn.owner != NO_OWNER).float()
     alpha = torch.maximum(ink.opacity * seen, LINE * outline.float())[..., None]
     fine = torch.cat([colours * alpha, alpha], -1)
     return avg_pool2d(fine.permute(2, 0, 1), FINE).permute(1, 2, 0)
@@ -187,10 +187,10 @@ def _lines(drawn: Drawn, thickness: int) -> tuple[Bool[Tensor, "h w"], Bool[Tens
         border = here != there
         outline.narrow(axis, 0, n).logical_or_(border)
         outline.narrow(axis, 1, n).logical_or_(border)
-        stiff = (here != NOBODY) & (here < PERSON)
+        stiff = (here != NO_OWNER) & (here < PERSON)
         crease.narrow(axis, 0, n).logical_or_(bent & ~border & stiff)
     wide = max_pool2d(outline[None, None].float(), 2 * thickness - 1, 1, thickness - 1)[0, 0] > 0
-    return wide & (drawn.owner != NOBODY), crease
+    return wide & (drawn.owner != NO_OWNER), crease
 
 
 CELL = 0.03  # [m], of the map of shadows

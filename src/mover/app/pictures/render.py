@@ -76,7 +76,7 @@ class World:
 
 
 @dataclass(frozen=True)
-class Moment:
+class Shot:
     """One picture of a film."""
 
     frame: int
@@ -111,7 +111,7 @@ def render_result(out: Path, path: Path, config: RenderConfig, capture: Path | N
 
 
 def render_worlds(
-    worlds: list[World], moments: list[Moment], config: RenderConfig, capture: Path | None
+    worlds: list[World], moments: list[Shot], config: RenderConfig, capture: Path | None
 ) -> Iterator[Float[Tensor, "h w 3"]]:
     """One picture after the other, worlds side by side."""
     panels = [_panels(world, worlds, moments, config, capture) for world in worlds]
@@ -146,18 +146,18 @@ def world_of(caption: str, scene: Scene, bodies: Bodies | None) -> World:
     return World(caption, scene, bodies, furniture(scene), ground, points)
 
 
-def _moments(worlds: list[World], config: RenderConfig, still: bool) -> list[Moment]:
+def _moments(worlds: list[World], config: RenderConfig, still: bool) -> list[Shot]:
     frames = sorted({f for w in worlds if w.bodies is not None for f in w.bodies.frame.tolist()})
     if still:
         middle = frames[len(frames) // 2] if frames else 0
-        return [Moment(middle if config.frame is None else config.frame, 0.0)]
+        return [Shot(middle if config.frame is None else config.frame, 0.0)]
     if not frames and (config.view != "orbit" or config.turns == 0):
         raise InputError("--to: nothing moves: ask for a .png, or for --view orbit --turns 1")
     count = len(frames) or round(TURN_RATE * TURN_SECONDS)
-    return [Moment(f, k / count) for k, f in enumerate(frames or [0] * count)]
+    return [Shot(f, k / count) for k, f in enumerate(frames or [0] * count)]
 
 
-def _rate(worlds: list[World], moments: list[Moment]) -> float:
+def _rate(worlds: list[World], moments: list[Shot]) -> float:
     """Pictures a second."""
     fps = [w.bodies.fps or FPS for w in worlds if w.bodies is not None]
     if not fps or len(moments) < 2:
@@ -169,7 +169,7 @@ def _rate(worlds: list[World], moments: list[Moment]) -> float:
 def _panels(
     world: World,
     worlds: list[World],
-    moments: list[Moment],
+    moments: list[Shot],
     config: RenderConfig,
     capture: Path | None,
 ) -> Iterator[Float[Tensor, "h w 3"]]:
@@ -209,7 +209,7 @@ def _rows_at(bodies: Bodies | None) -> dict[int, list[int]]:
 
 
 def _eyes(
-    world: World, worlds: list[World], moments: list[Moment], config: RenderConfig
+    world: World, worlds: list[World], moments: list[Shot], config: RenderConfig
 ) -> list[RenderCamera]:
     """The eye of each moment: one and the same where it stands still."""
     if config.view == "camera":
@@ -227,7 +227,7 @@ def _eyes(
 
 
 def _backs(
-    capture: Path, moments: list[Moment], eye: RenderCamera
+    capture: Path, moments: list[Shot], eye: RenderCamera
 ) -> Iterator[Float[Tensor, "h w 3"]]:
     """The picture behind each moment: of the video, or the reference image."""
     size = (eye.width, eye.height)

@@ -27,7 +27,7 @@ EVIDENCE = {
 
 
 @dataclass
-class Window:
+class Viewer:
     """Server, state and drawings of one viewer."""
 
     server: Any
@@ -40,7 +40,7 @@ class Window:
     """Whose furniture, people, floor and camera are shown."""
 
 
-def set_world(window: Window, world: World) -> None:
+def set_world(window: Viewer, world: World) -> None:
     """Show the room before or after the run."""
     shown, drawing = window.session.shown, window.drawing
     window.world = world
@@ -51,7 +51,7 @@ def set_world(window: Window, world: World) -> None:
     window.people.show(window.moment)
 
 
-def show_furniture(window: Window) -> None:
+def show_furniture(window: Viewer) -> None:
     """Show the furniture of the window's world only."""
     for handle in window.drawing.before.values():
         handle.visible = window.world == "before"
@@ -59,7 +59,7 @@ def show_furniture(window: Window) -> None:
         handle.visible = window.world == "after"
 
 
-def add_room_panel(window: Window) -> None:
+def add_room_panel(window: Viewer) -> None:
     """Fill the tab."""
     _add_time_line(window)
     worlds = window.server.gui.add_button_group("Room", ["after", "before"])
@@ -67,7 +67,7 @@ def add_room_panel(window: Window) -> None:
     _add_looks(window)
 
 
-def _add_time_line(window: Window) -> None:
+def _add_time_line(window: Viewer) -> None:
     gui, frames = window.server.gui, window.people.frames
     if not frames:
         gui.add_markdown("*There are no people in this capture.*")
@@ -106,7 +106,7 @@ def _pace(fps: float, frames: Any) -> tuple[float, int]:  # noqa: ANN401
     return moments / every, every
 
 
-def _add_looks(window: Window) -> None:
+def _add_looks(window: Viewer) -> None:
     gui, drawing = window.server.gui, window.drawing
     frustum = gui.add_checkbox("Camera", initial_value=True)
     through = gui.add_button("Look through the camera")
@@ -174,7 +174,7 @@ def _evidence(item: SceneObject, log: Mapping[str, Any]) -> list[tuple[str, str]
     ]
 
 
-def add_object_panel(window: Window) -> None:
+def add_object_panel(window: Viewer) -> None:
     """Fill the tab."""
     gui, session = window.server.gui, window.session
     choice = gui.add_dropdown("Object", [NONE, *window.drawing.after])
@@ -207,7 +207,7 @@ def _command(session: Session) -> str:
     return f"mover run {source} --edits {session.file} --out NEW"
 
 
-def _add_edits(window: Window) -> None:
+def _add_edits(window: Viewer) -> None:
     gui, session = window.server.gui, window.session
     folder = gui.add_folder("Edit", visible=False)
     with folder:

@@ -14,7 +14,7 @@ from mover.app.cli import say
 from mover.app.viewer.drawing import Drawing, People, draw_room, move_object
 from mover.app.viewer.gate import HOSTS, guarded
 from mover.app.viewer.panels import (
-    Window,
+    Viewer,
     add_object_panel,
     add_room_panel,
     set_world,
@@ -78,7 +78,7 @@ def _at_gizmo(item: SceneObject, gizmo: Any) -> SceneObject:  # noqa: ANN401
     return replace(item, t_world_object=place, yaw=torch.tensor(yaw))
 
 
-def open_viewer(session: Session, port: int) -> tuple[Window, str]:
+def open_viewer(session: Session, port: int) -> tuple[Viewer, str]:
     """Start the server and draw the room; the window and its URL.
 
     Raises:
@@ -99,7 +99,7 @@ def open_viewer(session: Session, port: int) -> tuple[Window, str]:
     )
     server.scene.set_up_direction("+y")
     drawing = Drawing(server)
-    window, grips = Window(server, session, drawing, People(server)), Grips(session, drawing)
+    window, grips = Viewer(server, session, drawing, People(server)), Grips(session, drawing)
 
     def redraw() -> None:
         draw_room(drawing, session.scene, "after")
