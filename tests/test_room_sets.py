@@ -10,9 +10,10 @@ from test_rooms import shared_room
 
 from mover.core.records import fingerprint
 from mover.core.types import SceneObject
+from mover.furniture.library import SEATS, canonical
 from mover.geometry.placement import placed_at
 from mover_bench.experiment.job import true_room, with_noise
-from mover_bench.experiment.measures import hidden_shares, is_flipped, traits_of
+from mover_bench.experiment.measures import hidden_shares, is_flipped, seat_height, traits_of
 from mover_bench.experiment.sets import SETS, parse_seeds
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
 from mover_bench.rooms.known import KnownRoom
@@ -53,6 +54,13 @@ class TestTraits:
         assert [t.id for t in traits] == [p.id for p in tiny.truth.objects]
         assert [t.touched for t in traits] == [True, True, False]
         assert [t.hidden for t in traits] == list(hidden_shares(tiny.truth))
+
+    def test_the_height_of_a_seat_is_that_of_its_furniture(self, tiny: KnownRoom) -> None:
+        known = zip(tiny.truth.objects, tiny.furniture, strict=True)
+        seats = [(thing, f) for thing, f in known if canonical(f.category) in SEATS]
+        assert seats
+        for thing, furniture in seats:
+            assert seat_height(thing) == pytest.approx(furniture.seat_height, abs=0.03)
 
 
 class TestSets:
