@@ -1,0 +1,149 @@
+"""Measure the method on i3DB: from library furniture, from the true shapes, beside iMapper."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mover.bodies import load_model
+from mover.bodies.smpl_model import heights_of
+from mover.core.observe import Observer, Step, silent
+from mover.core.run import Run
+from mover.core.types import Bodies, Camera, Capture, Scene, SceneObject
+from mover.evaluate.aligned import Together, iou3d_aligned
+from mover.evaluate.scene import Pair, iou3d
+from mover.fitting.bodies import FitInputs, fit_bodies
+from mover.geometry.camera import pitch_roll, tilted
+from mover.geometry.rle import decode
+from mover.geometry.rotations import rot_y
+from mover.perceive.config import LayoutConfig
+from mover.perceive.layout import Picture, first_scene
+from mover.perceive.standing import seen_from
+from mover.pipeline.presets import PRESETS
+from mover.pipeline.reconstruct import reconstruct
+from mover_bench.real.i3db import I3dbScene, read_i3db
+
+LEVEL = tilted(torch.tensor(0.0), torch.tensor(0.0))
+POINTS = 1  # of surfaces, which are not compared
+SAME_KIND = {"stool": "chair"}
+
+
+def judge_i3db(
+    source: Path, out: Path, preset: str = "robust", observe: Observer = silent
+) -> dict[str, dict[str, Any]]:
+    """The numbers of each scene below `source`.
+
+    Returns:
+        By scene: IoU3D of `first`, `run`, `given`, `run_given`, `imapper` (and `_aligned`), errors
+        of the camera, stature.
+    """
+    folders = sorted(path for path in source.iterdir() if (path / "gt").is_dir())
+    found: dict[str, dict[str, Any]] = {}
+    for done, folder in enumerate(folders):
+        observe(Step(f"i3db {folder.name}", done, len(folders)))
+        found[folder.name] = judge_scene(read_i3db(folder), Run(out / folder.name), preset)
+    return found
+
+
+def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
+    """Fit the people, find a first scene, reconstruct both starts, compare with the truth."""
+    camera = replace(scene.truth.camera, R_cam_world=LEVEL)  # its tilt is not given
+    model = load_model("makehuman")
+    bodies = fit_bodies(FitInputs(scene.keypoints, camera, model)).bodies
+    usual, growth = heights_of(model)
+    assert bodies.pose is not None
+    first = first_scene(seen_from(picture_of(scene, camera), bodies, run), LayoutConfig(), run)
+    numbers: dict[str, Any] = {
+        "stature": usual + float(bodies.pose.betas[0] @ growth[: bodies.pose.betas.shape[1]]),
+        **overlaps("first", first.scene.objects, scene),
+        **overlaps("imapper", by_kind(scene.imapper, scene.truth.objects), scene),
+    }
+    given = wrongly_placed(scene, camera)
+    numbers |= overlaps("given", given.objects, scene)
+    for name, start in (("run", first.scene), ("run_given", given)):
+        room = reconstruct(capture_of(scene, start, bodies), PRESETS[preset], run)
+        numbers |= overlaps(name, room.scene.objects, scene)
+        numbers |= camera_errors(name, room.scene, scene.truth)
+    return numbers
+
+
+def picture_of(scene: I3dbScene, camera: Camera) -> Picture:
+    """What the one picture shows: the masks of the furniture."""
+    masks = [decode(found.mask, 0) for found in scene.detections if found.mask is not None]
+    no_people = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    return Picture(camera, scene.detections, torch.stack(masks), no_people, None, None)
+
+
+def capture_of(scene: I3dbScene, start: Scene, bodies: Bodies) -> Capture:
+    """The capture that starts from a scene."""
+    return Capture(
+        name=scene.name, scene=start, camera_height=None, detections=scene.detections,
+        reference=None, reference_people=None, bodies=bodies, people=None, touch=None, warnings=(),
+    )  # fmt: skip
+
+
+def wrongly_placed(scene: I3dbScene, camera: Camera) -> Scene:
+    """The true shapes at wrong distances, sizes and yaws, under a level camera."""
+    rng = np.random.default_rng(int("".join(c for c in scene.name if c.isdigit()) or 0))
+    common = rng.uniform(0.8, 1.2)
+    carry = LEVEL.mT @ scene.truth.camera.R_cam_world
+    wrong: list[SceneObject] = []
+    for true in scene.truth.objects:
+        scale = torch.from_numpy(rng.uniform(0.85, 1.15, 3)).float()
+        far = common * float(np.clip(1 + 0.1 * rng.standard_normal(), 0.7, 1.3))
+        turn = math.radians(rng.uniform(-20, 20))
+        turn += math.pi / 2 * float(rng.choice([-1, 1])) if rng.random() < 0.15 else 0.0
+        middle = (true.mesh.verts.amin(0) + true.mesh.verts.amax(0)) / 2
+        centre = carry @ (rot_y(true.yaw) @ middle + true.t_world_object) * far
+        front = carry @ rot_y(true.yaw)[:, 2]
+        yaw = torch.atan2(front[0], front[2]) + turn
+        t = centre - rot_y(yaw) @ (scale * middle)
+        wrong.append(replace(true, t_world_object=t, yaw=yaw, scale=scale))
+    return Scene(camera, None, tuple(wrong))
+
+
+def by_kind(
+    objects: Sequence[SceneObject], truth: Sequence[SceneObject]
+) -> tuple[SceneObject, ...]:
+    """The nearest object of the same category for each true one, under its annotation."""
+    from scipy.optimize import linear_sum_assignment
+
+    def kind(thing: SceneObject) -> str:
+        return SAME_KIND.get(thing.category, thing.category)
+
+    cost = np.array([[
+        float((a.t_world_object - b.t_world_object).norm()) if kind(a) == kind(b) else 1e3
+        for b in objects] for a in truth]).reshape(len(truth), len(objects))  # fmt: skip
+    rows, columns = linear_sum_assignment(cost)
+    return tuple(
+        replace(objects[b], annotation=truth[a].annotation)
+        for a, b in zip(rows, columns, strict=True) if cost[a, b] < 1e3
+    )  # fmt: skip
+
+
+def overlaps(name: str, objects: Sequence[SceneObject], scene: I3dbScene) -> dict[str, Any]:
+    """Mean IoU3D, a missing object counting 0, as it is and after one similarity."""
+    found = {thing.annotation: thing for thing in objects}
+    camera, pairs = scene.truth.camera, list[Pair]()
+    for true in scene.truth.objects:
+        if true.annotation in found:
+            pairs.append(Pair(found[true.annotation], camera, true, camera, POINTS))
+    missing = len(scene.truth.objects) - len(pairs)
+    mean = sum(iou3d(pair) for pair in pairs) / len(scene.truth.objects)
+    return {name: mean, f"{name}_aligned": iou3d_aligned(Together(tuple(pairs), missing))}
+
+
+def camera_errors(name: str, found: Scene, truth: Scene) -> dict[str, float]:
+    """Errors of pitch and roll [degrees] and of the camera's height [share]."""
+    ours, true = (pitch_roll(scene.camera.R_cam_world.double()) for scene in (found, truth))
+    assert found.ground is not None
+    assert truth.ground is not None
+    return {
+        f"{name}_pitch": math.degrees(float(ours[0] - true[0])),
+        f"{name}_roll": math.degrees(float(ours[1] - true[1])),
+        f"{name}_height": found.ground / truth.ground - 1,
+    }
