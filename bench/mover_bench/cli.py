@@ -18,12 +18,15 @@ def experiment(arguments: Sequence[str]) -> None:
     args = parsed(ExperimentArgs, "mover experiment", arguments)
     from mover.app.cli.progress import Bar
     from mover_bench.experiment.run import run_experiment
+    from mover_bench.real.judge import judge_i3db
 
     with Bar() as bar:
-        summary = run_experiment(args, bar)
+        summary = (judge_i3db if args.set == REAL else run_experiment)(args, bar)
     say(f"{summary.read_text()}\nsummary: {summary}")
 
 
+REAL = "i3db"
+"""The set of real recordings; all others are known rooms."""
 Table = Literal["prox", "prox-quantitative", "pigraphs"]
 
 

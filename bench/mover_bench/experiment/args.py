@@ -21,6 +21,9 @@ class ExperimentArgs:
     workers: Annotated[int, int_in(0, 10_000)] = 0
     """How many rooms are worked on at once; 0: as many as there are cores."""
     set: str = "rooms"
-    """Set of rooms, see docs/rooms.md."""
+    """Set of rooms, see docs/rooms.md; or i3db, with --source."""
+    source: Path | None = None
+    """For the set i3db: the folder i3DB of amonszpart/iMapper. Its scenes are reconstructed with
+    the first variant, from library furniture and from the true shapes."""
     keep: bool = False
     """Take finished results of other versions or settings of the program as they are."""

@@ -1,5 +1,6 @@
 """Measure the method on i3DB: from library furniture, from the true shapes, beside iMapper."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,6 +12,8 @@ import torch
 
 from mover.bodies import load_model
 from mover.bodies.smpl_model import heights_of
+from mover.core.errors import InputError
+from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, Capture, Scene, SceneObject
@@ -25,6 +28,7 @@ from mover.perceive.layout import Picture, first_scene
 from mover.perceive.standing import seen_from
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
+from mover_bench.experiment.args import ExperimentArgs
 from mover_bench.real.i3db import I3dbScene, read_i3db
 
 LEVEL = tilted(torch.tensor(0.0), torch.tensor(0.0))
@@ -32,21 +36,54 @@ POINTS = 1  # of surfaces, which are not compared
 SAME_KIND = {"stool": "chair"}
 
 
-def judge_i3db(
-    source: Path, out: Path, preset: str = "robust", observe: Observer = silent
-) -> dict[str, dict[str, Any]]:
-    """The numbers of each scene below `source`.
+def judge_i3db(args: ExperimentArgs, observe: Observer = silent) -> Path:
+    """Measure the scenes below `args.source` with the preset that `args.variants` names first.
 
     Returns:
-        By scene: IoU3D of `first`, `run`, `given`, `run_given`, `imapper` (and `_aligned`), errors
-        of the camera, stature.
+        The summary, OUT/i3db/summary.md; the numbers are the .json beside it.
+
+    Raises:
+        InputError: If there is no source, no scene in it, or no such preset.
     """
-    folders = sorted(path for path in source.iterdir() if (path / "gt").is_dir())
-    found: dict[str, dict[str, Any]] = {}
+    if args.source is None or not args.source.is_dir():
+        raise InputError("--source: expected the folder i3DB of amonszpart/iMapper for --set i3db")
+    preset = args.variants[0]
+    if preset not in PRESETS:
+        raise InputError(f"--variants: {preset!r} is no preset; there are {', '.join(PRESETS)}")
+    folders = sorted(path for path in args.source.iterdir() if (path / "gt").is_dir())
+    if not folders:
+        raise InputError(f"{args.source}: has no scene of i3DB, expected folders like Scene04/gt")
+    torch.set_num_threads(1)
+    out, found = args.out / "i3db", dict[str, dict[str, Any]]()
     for done, folder in enumerate(folders):
         observe(Step(f"i3db {folder.name}", done, len(folders)))
         found[folder.name] = judge_scene(read_i3db(folder), Run(out / folder.name), preset)
-    return found
+    with replacing(out / "summary.json") as part:
+        part.write_text(json.dumps(found, indent=1))
+    with replacing(out / "summary.md") as part:
+        part.write_text(table_of(found))
+    return out / "summary.md"
+
+
+COLUMNS = {
+    "first": "first scene", "run": "run from it", "given": "true shapes, wrongly placed",
+    "run_given": "run from them", "imapper": "iMapper's own result", "run_pitch": "pitch [degrees]",
+    "run_height": "camera height [share]", "stature": "stature [m]",
+}  # fmt: skip
+"""What the summary shows: IoU3D, errors of the camera of `run`, the fitted stature."""
+
+
+def table_of(found: dict[str, dict[str, Any]]) -> str:
+    """The numbers as a table, with the mean of each overlap over the scenes."""
+    lines = ["| scene | " + " | ".join(COLUMNS.values()) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
+    for name, row in found.items():
+        lines.append(f"| {name} | " + " | ".join(f"{row[key]:.3f}" for key in COLUMNS) + " |")
+    means = [
+        f"{sum(row[key] for row in found.values()) / len(found):.3f}"
+        if key not in ("run_pitch", "run_height", "stature") else ""
+        for key in COLUMNS
+    ]  # fmt: skip
+    return "\n".join([*lines, "| mean | " + " | ".join(means) + " |", ""])
 
 
 def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
