@@ -253,7 +253,7 @@ def _crops(at: At, count: int, known: Known) -> Float[Tensor, "bodies 3"]:
     K, size = known.camera.K.double(), (known.camera.width, known.camera.height)
     joints, pixels = either(at, "joints3d", "smpl_joints3d"), either(at, "smpl_joints2d")
     if joints is not None and pixels is not None:
-        points = torch.from_numpy(rows(joints, count).reshape(count, -1, 3).copy())
+        points = torch.from_numpy(_in_space(joints, count))
         flat = rows(pixels, count, points.shape[1] * 2, points.shape[1] * 3)
         image = torch.from_numpy(flat.reshape(count, points.shape[1], -1)[..., :2].copy())
         return from_pixels(points, image, K).float()
@@ -261,8 +261,17 @@ def _crops(at: At, count: int, known: Known) -> Float[Tensor, "bodies 3"]:
     if crop is not None and box is not None:
         square = torch.from_numpy(rows(box, count, 4)[:, :3].copy())
         return from_crop(torch.from_numpy(rows(crop, count, 3).copy()), square, K).float()
-    image = torch.from_numpy(rows(need(at, "orig_cam", "smpl_joints2d"), count, 4).copy())
+    wanted = ("orig_cam",) if pixels is None else ("orig_cam", "joints3d")
+    image = torch.from_numpy(rows(need(at, *wanted), count, 4).copy())
     return from_image(image, K, size).float()
+
+
+def _in_space(at: At, count: int) -> NDArray[np.float64]:
+    """Points of each body [m]."""
+    flat = rows(at, count)
+    if flat.shape[1] % 3:
+        refuse(at, f"points of shape ({count}, n, 3)", f"shape {numbers(at).shape}")
+    return flat.reshape(count, -1, 3).copy()
 
 
 def _lens_of_file(person: Person, count: int, _: Known) -> Tensor | None:
