@@ -340,7 +340,7 @@ def prox_stem(recording: str, index: int) -> str:
 
 
 def body_index(size: tuple[int, int], index: int) -> Image.Image:
-    """Kinect's body index of a mirrored picture: 255 where nobody is, else the body's number.
+    """Kinect's body index of a mirrored picture: 255 where no person is, else the body's number.
 
     Read as grey and flipped, with 0 where the person is: data_parser.py of third-party readers of
     PROX (img_fn + '.png' in BodyIndexColor), and BodyIndex by a threshold at 254.

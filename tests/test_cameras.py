@@ -152,7 +152,7 @@ def test_the_poses_of_every_tool_come_back_from_a_capture(
     assert torch.allclose(points_of(again, list(range(COUNT))), expected, atol=1e-5)
 
 
-def test_simple_vo_of_gvhmr_tells_world_to_camera(tmp_path: Path) -> None:
+def test_simple_vo_of_gvhmr_leads_from_world_to_camera(tmp_path: Path) -> None:
     """zju3dv/GVHMR, hmr4d/utils/preproc/relpose/simple_vo.py: T_w2c, (L, 4, 4)."""
     np.save(tmp_path / "slam_results.npy", np.linalg.inv(true_path()))
     at = read_slam(tmp_path / "slam_results.npy")
@@ -252,8 +252,8 @@ def test_people_of_a_moving_camera_must_be_in_its_axes(capture: Capture, tmp_pat
         import_into(tmp_path / "room", Parts("cameras", cameras=at))
 
 
-def test_another_lens_is_told(capture: Capture) -> None:
-    told: list[str] = []
+def test_another_lens_is_said(capture: Capture) -> None:
+    said: list[str] = []
     at = {"frame": np.arange(COUNT), "T_world_camera": true_path(), "focal": np.full(COUNT, 0.9)}
-    path_of(At(at, "cameras.npz"), capture.scene.camera, None, told.append)
-    assert "focal length is 0.9 widths" in told[0]
+    path_of(At(at, "cameras.npz"), capture.scene.camera, None, said.append)
+    assert "focal length is 0.9 widths" in said[0]

@@ -165,7 +165,7 @@ def test_bones_carry_the_skin_to_the_result_in_every_frame(tmp_path: Path, perso
     assert f"{1e3 * worst:.0f} mm" in " ".join(found.notes) or person == 1
 
 
-def test_a_person_is_hidden_while_nobody_sees_them(tmp_path: Path):
+def test_a_person_is_hidden_while_they_are_not_seen(tmp_path: Path):
     bodies = two_people()
     glb = Glb(export_glb(finished(tmp_path, bodies), tmp_path).files[0])
     seen = [t for _, t in rows(bodies, 1)]
@@ -304,7 +304,7 @@ def test_keys_stop_where_there_are_enough():
 
 @pytest.fixture(autouse=True)
 def along_the_axes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """CoACD takes seconds for pieces that nobody looks at here."""
+    """CoACD takes seconds for parts that no test looks at."""
     monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
 
 
@@ -455,7 +455,7 @@ def test_a_folder_without_a_result_is_refused(tmp_path: Path, capsys):
     assert "scene.json" in capsys.readouterr().err
 
 
-def test_without_usd_core_the_way_to_get_it_is_told(tmp_path: Path, monkeypatch):
+def test_without_usd_core_the_way_to_get_it_is_said(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(mover.io.export.usd_mesh, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=r"\.\[usd\]"):
         export_usd(finished(tmp_path), tmp_path)

@@ -217,7 +217,7 @@ def test_boxes_come_back_with_furniture_of_their_class(
         (layouts.Z_UP, "its side"),
     ],
 )
-def test_a_scene_in_another_world_is_told_by_name(
+def test_a_scene_in_another_world_is_named(
     plain: layouts.Room, tmp_path: Path, turn: np.ndarray, word: str
 ) -> None:
     world = np.eye(4)
@@ -231,9 +231,9 @@ def test_a_scene_in_another_world_is_told_by_name(
     seen = tuple(
         dataclasses.replace(detections[0], id=i, box=boxes[p.id]) for i, p in enumerate(pieces)
     )
-    told = odd_world(dataclasses.replace(found.scene, objects=pieces), seen)
-    assert told is not None
-    assert word in told
+    said = odd_world(dataclasses.replace(found.scene, objects=pieces), seen)
+    assert said is not None
+    assert word in said
 
 
 def test_a_right_scene_is_not_called_odd(plain: layouts.Room, tmp_path: Path) -> None:

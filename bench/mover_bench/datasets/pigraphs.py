@@ -12,10 +12,9 @@ from mover.core.errors import InputError
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts, image_parts
 from mover.io.files.fields import At, get, items, mapping, maybe, read_json, refuse, text, vector
-from mover.io.files.meshes import read_scan
 from mover.io.scenes.placing import Matrix
 from mover_bench.datasets.prox_files import world_of
-from mover_bench.datasets.true_boxes import SIGNS, TrueBox, boxes_scene, floor_in
+from mover_bench.datasets.true_boxes import SIGNS, TrueBox, boxes_scene, floor_in, read_scan
 
 JOINTS = 25
 NAMES = (

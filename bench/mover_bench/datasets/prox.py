@@ -22,8 +22,7 @@ from mover.io.capture.bodies_file import bodies_to_arrays
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts, image_parts
 from mover.io.files.fields import At, read_json
-from mover.io.files.images import mirrored_copy
-from mover.io.files.meshes import read_scan
+from mover.io.files.images import opened
 from mover.io.files.schema import rigid
 from mover.io.scenes.placing import Matrix
 from mover_bench.datasets.prox_files import (
@@ -41,7 +40,7 @@ from mover_bench.datasets.prox_files import (
     world_of,
 )
 from mover_bench.datasets.prox_people import keypoint_trees, people_masks
-from mover_bench.datasets.true_boxes import TrueBox, boxes_scene, floor_in, read_bbox3d
+from mover_bench.datasets.true_boxes import TrueBox, boxes_scene, floor_in, read_bbox3d, read_scan
 
 COSTS = {
     "Color": "no pictures: nothing to draw on, masks of furniture must come from elsewhere",
@@ -124,13 +123,24 @@ def _with_pictures(parts: Parts, lines: Sequence[Timeline], hints: Hints) -> Par
     for line in lines:
         for frame, path in line.files("Color").items():
             first = first or path
-            copies[f"frames/{frame:06d}.jpg"] = mirrored_copy(
+            copies[f"frames/{frame:06d}.jpg"] = _mirrored_copy(
                 path, hints.work / line.recording.name
             )
     if first is None:
         return parts
     load, size = image_parts(first, mirrored=True)
     return dataclasses.replace(parts, load_image=load, image_size=size, copies=copies)
+
+
+def _mirrored_copy(path: Path, work: Path) -> Path:
+    """A picture flipped left to right, as a new file in `work`."""
+    from PIL import ImageOps
+
+    work.mkdir(parents=True, exist_ok=True)
+    target = work / f"mirrored_{path.stem}.jpg"
+    with opened(path) as picture:
+        ImageOps.mirror(picture.convert("RGB")).save(target, quality=95)
+    return target
 
 
 def _tracks(recordings: Sequence[Recording]) -> dict[str, int]:

@@ -41,7 +41,7 @@ def people_masks(
 
 
 def read_body_index(path: Path) -> Bool[np.ndarray, "h w"]:
-    """Where somebody is, in the flipped picture.
+    """Where a person is, in the flipped picture.
 
     Raises:
         InputError: If it cannot be read, has another size, or holds other numbers.
@@ -139,7 +139,7 @@ def _middle(at: At) -> float | None:
 
 
 def _vote(stored: dict[int, float | None], bodies: Bodies, camera: Camera) -> bool | None:
-    """Whether the files are of mirrored pictures; None where the bodies do not tell."""
+    """Whether the files are of mirrored pictures; None where the bodies do not decide."""
     from mover.geometry.camera import project
 
     gain = 0.0

@@ -26,13 +26,18 @@ from mover.io.capture.parts import Hints, Parts
 from mover.io.capture.scene_file import scene_of, scene_tree
 from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, get, items, maybe, read_json
-from mover.io.files.meshes import floor_of, read_scan
 from mover.io.files.npz import read_npy
 from mover.io.masks.instance_files import DETECTIONS, read_instances
 from mover.io.masks.instances import Instances, fitted, is_person, people_tree
 from mover.io.scenes.placing import FLIP, Matrix, level_of, load_from, posed
 from mover.io.scenes.total3d import read_shape, total3d_parts
-from mover_bench.datasets.true_boxes import boxes_scene, read_bbox3d, vertical_of
+from mover_bench.datasets.true_boxes import (
+    boxes_scene,
+    floor_of,
+    read_bbox3d,
+    read_scan,
+    vertical_of,
+)
 
 FPS = 30.0
 STAGES = ("smplifyx_results_st2*", "smplifyx_results_st0*", "*")

@@ -17,7 +17,7 @@ from mover.core.types import Mesh, Scene
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import scene_of, scene_tree
 from mover.io.files.fields import At, get, mapping, refuse, vector
-from mover.io.files.meshes import floor_of
+from mover.io.files.meshes import read_mesh
 from mover.io.scenes.placing import Matrix, category_of_name, free_id, load_from
 
 SIGNS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=float)
@@ -51,7 +51,7 @@ def read_bbox3d(path: Path, names: Mapping[str, str], file: At) -> list[TrueBox]
 
     Args:
         path: For messages.
-        names: Categories by id, where the id does not tell.
+        names: Categories by id, where the id is none.
         file: The content of bbox3d.json.
     """
     rows = {key: get(file, key) for key in mapping(file)}
@@ -191,3 +191,29 @@ def _inside(scan: Mesh, box: TrueBox, order: Sequence[int], signs: Matrix) -> Me
     kept, flat = np.unique(faces, return_inverse=True)
     verts = torch.from_numpy(np.ascontiguousarray(local[kept])).float()
     return Mesh(verts, torch.from_numpy(flat.reshape(-1, 3)))
+
+
+# Scans of rooms and their floors.
+
+
+BIN = 0.02  # [m], of the histogram of heights
+REACH = 0.6  # [m], the floor is so near to the lowest points
+SHARE = 0.25  # of the fullest bin there: less is noise below the floor
+OUTLIERS = 0.002  # share of the lowest points that may be anything
+
+
+def read_scan(path: Path) -> Mesh:
+    """A scan in the frame of its file."""
+    return read_mesh(At(path.name, path.name), path.parent)[0]
+
+
+def floor_of(heights: NDArray[np.float64]) -> float:
+    """The height at which a scan has its lowest large level part, of its vertices' heights [m]."""
+    lowest = float(np.quantile(heights, OUTLIERS))
+    near = heights[(heights >= lowest - BIN) & (heights <= lowest + REACH)]
+    edges = np.arange(lowest - BIN, lowest + REACH + BIN, BIN)
+    counts, _ = np.histogram(near, edges)
+    full = int(np.flatnonzero(counts >= SHARE * counts.max())[0])
+    best = full + int(counts[full : full + 3].argmax())
+    close = near[np.abs(near - (edges[best] + BIN / 2)) <= BIN]
+    return float(np.median(close)) if len(close) else float(edges[best] + BIN / 2)

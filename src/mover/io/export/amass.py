@@ -1,5 +1,6 @@
 """Bodies as AMASS and the tools around SMPL-X keep them: one npz a person."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +13,11 @@ from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle, rot_x, rotation_vectors
 from mover.io.export.finished import Exported, Finished, Up
 from mover.io.export.people import FPS, Track, tracks_of
-from mover.io.export.posed import (
-    Motion,
-    all_angles,
-    misses,
-    motion_of,
-    pelvis_of,
-    skin_of,
-)
+from mover.io.export.posed import Motion, all_angles, misses, motion_of, pelvis_of, skin_of
 from mover.io.files.npz import write_npz
 
-WIDTHS = {"smpl": 72, "smplh": 156, "smplx": 165, "makehuman": 165}
-"""Angles of `poses` for each model."""
+PARTS = {"pose_body": (3, 66), "pose_jaw": (66, 69), "pose_eye": (69, 75), "pose_hand": (75, 165)}
+"""Columns of the 165 angles of SMPL-X under the names that AMASS gives its parts."""
 
 
 def export_amass(finished: Finished, folder: Path, up: Up = "y") -> Exported:
@@ -37,27 +31,35 @@ def export_amass(finished: Finished, folder: Path, up: Up = "y") -> Exported:
     Raises:
         InputError: If the parameters of the bodies are not known.
     """
-    motion = motion_of(finished)
+    motion, bodies = motion_of(finished), finished.bodies
     if isinstance(motion, str):
         raise InputError(f"--to amass: {motion}")
-    assert finished.bodies is not None
-    bodies, files = finished.bodies, list[Path]()
-    moved = motion if up == "y" else upright(motion)
+    assert bodies is not None
+    files, notes = list[Path](), list[str]()
+    moved = motion if up == "y" else _upright(motion)
     for track in tracks_of(bodies):
-        path = folder / f"amass_{track.person}.npz"
-        write_npz({**_arrays(moved, track, bodies), "up_axis": np.array(up)}, path)
-        files.append(path)
-    return Exported(tuple(files), tuple(_notes(motion, bodies)))
+        files.append(folder / f"amass_{track.person}.npz")
+        write_npz({**_arrays(moved, track, bodies), "up_axis": np.array(up)}, files[-1])
+    model = skin_of(motion.pose, bodies)
+    if model is not None:
+        off = misses(motion, model, bodies)
+        notes.append(f"the parameters give the result's meshes within {off:.4f} m")
+    if float((motion.size - 1).abs().max()) > 1e-3:
+        low, high = float(motion.size.min()), float(motion.size.max())
+        notes.append(
+            f"bodies are {low:.3f} to {high:.3f} times the size that their betas say ('size')"
+        )
+    return Exported(tuple(files), tuple(notes))
 
 
 def _arrays(motion: Motion, track: Track, bodies: Bodies) -> dict[str, NDArray[Any]]:
-    """One person; rows are frames of the video, told by `frame` where some are missing."""
+    """One person; rows are frames of the video, whose numbers are in `frame`."""
     pose, rows = motion.pose, track.rows
     poses = angles_of(pose)[rows].numpy()
     steps = track.frame.diff()
-    stride = int(steps.median()) if len(steps) else 1
-    rate = np.array((bodies.fps or FPS) / stride)
+    rate = np.array((bodies.fps or FPS) / (int(steps.median()) if len(steps) else 1))
     shape = pose.betas[rows].double().mean(0).numpy()
+    parts = PARTS.items() if poses.shape[1] == 165 else ()
     return {
         "trans": pose.transl[rows].numpy(),
         "root_orient": pose.global_orient[rows].numpy(),
@@ -71,7 +73,7 @@ def _arrays(motion: Motion, track: Track, bodies: Bodies) -> dict[str, NDArray[A
         "frame": track.frame.numpy(),
         "size": motion.size[rows].numpy(),
         **{name: values[rows].numpy() for name, values in pose.extra.items()},
-        **_named_parts(poses, pose.model),
+        **{name: poses[:, start:end] for name, (start, end) in parts},
     }
 
 
@@ -80,46 +82,13 @@ def angles_of(pose: BodyPose) -> torch.Tensor:
     if pose.model == "smpl":
         return torch.cat([pose.global_orient, pose.body_pose], -1)
     whole = all_angles(pose).flatten(1)
-    if pose.model == "smplh":
-        return torch.cat([whole[:, :66], whole[:, 75:]], -1)
-    return whole
+    return torch.cat([whole[:, :66], whole[:, 75:]], -1) if pose.model == "smplh" else whole
 
 
-def _named_parts(poses: NDArray[Any], model: str) -> dict[str, NDArray[Any]]:
-    """The parts of `poses` under the names that AMASS gives those of SMPL-X."""
-    if WIDTHS.get(model) != WIDTHS["smplx"]:
-        return {}
-    parts = {
-        "pose_body": (3, 66),
-        "pose_jaw": (66, 69),
-        "pose_eye": (69, 75),
-        "pose_hand": (75, 165),
-    }
-    return {name: poses[:, start:end] for name, (start, end) in parts.items()}
-
-
-def upright(motion: Motion) -> Motion:
+def _upright(motion: Motion) -> Motion:
     """The same motion in a world with +z up; the root turns about the pelvis."""
-    import dataclasses
-
-    pose = motion.pose
-    turn = rot_x(torch.tensor(torch.pi / 2))
+    pose, turn = motion.pose, rot_x(torch.tensor(torch.pi / 2))
     offset = pelvis_of(pose)
     place = (pose.transl + offset) @ turn.mT - offset
     root = rotation_vectors(turn @ axis_angle(pose.global_orient))
     return Motion(dataclasses.replace(pose, transl=place, global_orient=root), motion.size)
-
-
-def _notes(motion: Motion, bodies: Bodies) -> list[str]:
-    notes: list[str] = []
-    model = skin_of(motion.pose, bodies)
-    if model is not None:
-        notes.append(
-            f"the parameters give the result's meshes within {misses(motion, model, bodies):.4f} m"
-        )
-    if float((motion.size - 1).abs().max()) > 1e-3:
-        low, high = float(motion.size.min()), float(motion.size.max())
-        notes.append(
-            f"bodies are {low:.3f} to {high:.3f} times the size that their betas say ('size')"
-        )
-    return notes

@@ -1,4 +1,4 @@
-"""contacts.npz of a result: who touches what, and the same as tables for learners."""
+"""contacts.npz of a result: which parts of bodies touch which objects; as tables for learners."""
 
 import dataclasses
 from pathlib import Path
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mover.core.contact_labels import ContactLabels
 from mover.core.errors import InputError
-from mover.core.types import Bodies
 from mover.io.export.finished import Exported, Finished, Up
 from mover.io.export.people import FPS, tracks_of
 from mover.io.export.solids import AXES, floor_height
@@ -60,6 +59,9 @@ def read_labels(path: Path) -> ContactLabels:
 def export_contacts(finished: Finished, folder: Path, up: Up = "y") -> Exported:
     """Write `contacts_<person>.npz`: a table of frames, parts of the body and objects.
 
+    Rows are the frames in which the person is seen; positions and normals are NaN where nothing is
+    touched.
+
     Args:
         finished: The result.
         folder: Where the files go.
@@ -68,47 +70,39 @@ def export_contacts(finished: Finished, folder: Path, up: Up = "y") -> Exported:
     Raises:
         InputError: If the result has no labels.
     """
-    labels = read_labels(finished.out / FILE)
-    if finished.bodies is None:
+    labels, bodies = read_labels(finished.out / FILE), finished.bodies
+    if bodies is None:
         raise InputError("--to contacts: the result has no bodies")
     if up == "z":
-        labels = _upright(labels, floor_height(finished.scene))
+        turn = AXES.to(labels.position)
+        shift = torch.tensor([0.0, 0.0, floor_height(finished.scene)]).to(labels.position)
+        position, normal = labels.position @ turn.mT - shift, labels.normal @ turn.mT
+        labels = dataclasses.replace(labels, position=position, normal=normal)
     files: list[Path] = []
-    for track in tracks_of(finished.bodies):
-        mine = labels.person == track.person
+    for track in tracks_of(bodies):
+        row_of = {frame: k for k, frame in enumerate(track.frame.tolist())}
+        of_person = (labels.person == track.person).tolist()
+        kept = [k for k, frame in enumerate(labels.frame.tolist())
+                if of_person[k] and frame in row_of]  # fmt: skip
+        rows = np.array([row_of[int(labels.frame[k])] for k in kept], np.int64)
+        cells = rows, labels.part[kept].numpy(), labels.object[kept].numpy()
+        shape = (len(track.frame), len(labels.parts), len(labels.objects))
+        contact = np.zeros(shape, np.float32)
+        contact[cells] = labels.confidence[kept].numpy()
+        spots = {key: np.full((*shape, 3), np.nan, np.float32) for key in ("position", "normal")}
+        for name, table in spots.items():
+            table[cells] = getattr(labels, name)[kept].numpy()
+        arrays = {
+            "frame": track.frame.numpy(),
+            "fps": np.array(bodies.fps or FPS),
+            "parts": np.array(labels.parts),
+            "objects": np.array(labels.objects),
+            "contact": contact,
+            "object_contact": contact.max(1) >= SURE,
+            "up_axis": np.array(up),
+            **spots,
+        }
         files.append(folder / f"contacts_{track.person}.npz")
-        arrays = _tables(labels, mine, track.frame, finished.bodies)
-        write_npz({**arrays, "up_axis": np.array(up)}, files[-1])
+        write_npz(arrays, files[-1])
     share = f"object_contact is a confidence of {SURE:g} or more of any part"
     return Exported(tuple(files), (share,))
-
-
-def _upright(labels: ContactLabels, floor: float) -> ContactLabels:
-    turn = AXES.to(labels.position)
-    place = labels.position @ turn.mT - torch.tensor([0.0, 0.0, floor]).to(labels.position)
-    return dataclasses.replace(labels, position=place, normal=labels.normal @ turn.mT)
-
-
-def _tables(
-    labels: ContactLabels, mine: torch.Tensor, frame: torch.Tensor, bodies: Bodies
-) -> dict[str, NDArray[Any]]:
-    """One person; rows are the frames in which they are seen, NaN where nothing is touched."""
-    row_of = {int(f): k for k, f in enumerate(frame)}
-    row = np.array([row_of.get(int(f), -1) for f in labels.frame[mine]], np.int64)
-    known = row >= 0
-    at = row[known], labels.part[mine].numpy()[known], labels.object[mine].numpy()[known]
-    shape = (len(frame), len(labels.parts), len(labels.objects))
-    sure = np.zeros(shape, np.float32)
-    sure[at] = labels.confidence[mine].numpy()[known]
-    places = {name: np.full((*shape, 3), np.nan, np.float32) for name in ("position", "normal")}
-    for name, table in places.items():
-        table[at] = getattr(labels, name)[mine].numpy()[known]
-    return {
-        "frame": frame.numpy(),
-        "fps": np.array(bodies.fps or FPS),
-        "parts": np.array(labels.parts),
-        "objects": np.array(labels.objects),
-        "contact": sure,
-        "object_contact": sure.max(1) >= SURE,
-        **places,
-    }

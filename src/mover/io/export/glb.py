@@ -15,7 +15,7 @@ from mover.core.types import Bodies, SceneObject
 from mover.geometry.mesh import vertex_normals
 from mover.io.export.finished import BodyForm, Exported, Finished
 from mover.io.export.people import FPS, Track, keyframes, seen_from_to, tracks_of
-from mover.io.export.posed import Skin, all_angles, bones_for, quaternions, rest_of
+from mover.io.export.posed import Skinned, all_angles, bones_for, quaternions, rest_of
 from mover.io.export.scene_glb import linear, placement_of, write_glb
 
 TOLERANCE = 0.005  # [m], of the straight lines between two shapes
@@ -52,7 +52,7 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
     notes += [_way(item) for item in moved]
     if bodies is None:
         notes.append("no people")
-    elif isinstance(skin, Skin):
+    elif isinstance(skin, Skinned):
         notes.append(f"people move on bones, at most {1e3 * skin.miss:.0f} mm off the result")
     elif body != "morph":
         notes.append(f"people move by shapes, not on bones: {skin}")
@@ -79,11 +79,11 @@ def _way(item: SceneObject) -> str:
     return f"{item.id} {way}"
 
 
-def _add_people(file: "Gltf", bodies: Bodies, skin: Skin | str) -> list[str]:
+def _add_people(file: "Gltf", bodies: Bodies, skin: Skinned | str) -> list[str]:
     """Append all people; what there is to say about them."""
     notes: list[str] = []
     for track in tracks_of(bodies):
-        if isinstance(skin, Skin):
+        if isinstance(skin, Skinned):
             _add_skinned(file, skin, track)
         elif (miss := _add_morphing(file, bodies, track)) > FAR_OFF:
             notes.append(f"person {track.person}: up to {100 * miss:.1f} cm off between shapes")
@@ -224,7 +224,7 @@ def _add_morphing(file: Gltf, bodies: Bodies, track: Track) -> float:
     return miss
 
 
-def _add_skinned(file: Gltf, skin: Skin, track: Track) -> None:
+def _add_skinned(file: Gltf, skin: Skinned, track: Track) -> None:
     """Append a person: mesh, bones and their motion."""
     model, name = skin.model, f"person_{track.person}"
     rest, joints = rest_of(skin, int(track.rows[0]))
@@ -265,7 +265,7 @@ def _add_skinned(file: Gltf, skin: Skin, track: Track) -> None:
             file.animate(node, path, times, values)
 
 
-def _inverse_bind(skin: Skin, joints: Float[Tensor, "joints 3"]) -> NDArray[np.float32]:
+def _inverse_bind(skin: Skinned, joints: Float[Tensor, "joints 3"]) -> NDArray[np.float32]:
     """From the rest shape to the axes of each joint, by columns."""
     matrix = torch.eye(4).repeat(len(joints), 1, 1)
     matrix[:, :3, :3] = skin.model.tpose

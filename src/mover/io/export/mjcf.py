@@ -21,7 +21,7 @@ from mover.core.types import Bodies, Camera, Mesh, Scene, SceneObject
 from mover.geometry.rotations import axis_angle
 from mover.io.export.finished import BodyForm, Exported, Finished
 from mover.io.export.people import FPS, Track, tracks_of
-from mover.io.export.posed import Skin, all_angles, rest_of, skin_for
+from mover.io.export.posed import Skinned, all_angles, rest_of, skin_for
 from mover.io.export.solids import (
     AXES,
     FRICTION,
@@ -219,7 +219,7 @@ def figures_of(finished: Finished) -> tuple[Figure, ...] | str:
     return tuple(_figure(skin, track, joints, floor) for track in tracks_of(finished.bodies))
 
 
-def _figure(skin: Skin, track: Track, joints: list[int], floor: float) -> Figure:
+def _figure(skin: Skinned, track: Track, joints: list[int], floor: float) -> Figure:
     from scipy.spatial.transform import Rotation
 
     pose, model = rows_of(skin.motion.pose, track.rows), skin.model
@@ -244,7 +244,7 @@ def _figure(skin: Skin, track: Track, joints: list[int], floor: float) -> Figure
 
 
 def _bones(
-    skin: Skin, rest: Float[Tensor, "joints 3"], joints: Sequence[int]
+    skin: Skinned, rest: Float[Tensor, "joints 3"], joints: Sequence[int]
 ) -> list[tuple[int, tuple[float, ...]]]:
     """A bone from each joint to every joint below it that is shown, in the zero pose."""
     model, found = skin.model, list[tuple[int, tuple[float, ...]]]()

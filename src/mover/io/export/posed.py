@@ -18,7 +18,8 @@ from mover.io.export.finished import BodyForm, Finished
 from mover.io.export.people import tracks_of
 
 SAME = 0.01  # [m], a similarity that leaves more did not make the result's body
-HANDS = ("left_hand_pose", "right_hand_pose")
+EXTRA = {"jaw_pose": (66, 69), "left_hand_pose": (75, 120), "right_hand_pose": (120, 165)}
+"""Columns among the angles of SMPL-X's joints."""
 
 
 @record
@@ -48,11 +49,7 @@ def motion_of(finished: Finished) -> Motion | str:
     same = given.verts.shape == bodies.verts.shape
     if not (same and (given.frame == bodies.frame).all() and (given.person == bodies.person).all()):
         return "the capture's bodies are not those of the result"
-    return _carried(given, given.pose, bodies)
-
-
-def _carried(given: Bodies, pose: BodyPose, bodies: Bodies) -> Motion | str:
-    """The capture's parameters in the result's world."""
+    pose = given.pose
     size, turn, shift, error = similarity(given.verts.double(), bodies.verts.double())
     if float(error.max()) > SAME:
         return f"the result's bodies are not those of the capture, by {float(error.max()):.3f} m"
@@ -95,23 +92,15 @@ def similarity(
 
 
 def all_angles(pose: BodyPose) -> Float[Tensor, "bodies joints 3"]:
-    """Axis-angle vectors of all 55 joints in SMPL-X's order; what is not given stays straight."""
+    """Axis-angle vectors of all 55 joints in SMPL-X's order; what is not given as angles is 0."""
     rows = pose.global_orient.shape[0]
-    hands = [pose.extra.get(name) for name in HANDS]
-    parts = [
-        pose.global_orient,
-        pose.body_pose[:, :63],
-        _or_zeros(pose.extra.get("jaw_pose"), rows, 3),
-        torch.zeros(rows, 6),
-        *(_or_zeros(hand, rows, 45) for hand in hands),
-    ]
-    return torch.cat([part.to(pose.global_orient) for part in parts], -1).reshape(rows, 55, 3)
-
-
-def _or_zeros(given: Tensor | None, rows: int, width: int) -> Tensor:
-    """The angles where they are given as angles; hands given as PCA weights stay straight."""
-    fits = given is not None and given.shape[-1] == width
-    return given if given is not None and fits else torch.zeros(rows, width)
+    angles = torch.zeros(rows, 165).to(pose.global_orient)
+    angles[:, :3], angles[:, 3:66] = pose.global_orient, pose.body_pose[:, :63]
+    for name, (start, end) in EXTRA.items():
+        given = pose.extra.get(name)
+        if given is not None and given.shape[-1] == end - start:  # PCA weights of hands have less
+            angles[:, start:end] = given
+    return angles.reshape(rows, 55, 3)
 
 
 def skin_of(pose: BodyPose, bodies: Bodies) -> SkinnedBody | None:
@@ -136,15 +125,12 @@ def misses(motion: Motion, model: SkinnedBody, bodies: Bodies) -> float:
     return worst
 
 
-# The skin of a body model on the bones of a result's people, for formats that have bones.
-
-
 SKIN_MISS = 0.02  # [m], the most that a skinned body may miss the result's mesh
 
 
 @record
-class Skin:
-    """Bones of everybody, each person with one shape."""
+class Skinned:
+    """Bones of all people, each person with one shape."""
 
     motion: Motion
     model: SkinnedBody
@@ -153,8 +139,11 @@ class Skin:
     """How far the skin is off the meshes of the result at most [m]."""
 
 
-def skin_for(finished: Finished, influences: int) -> Skin | str:
-    """The bones that move the bodies, `influences` joints a vertex, or why there are none."""
+def skin_for(finished: Finished, influences: int) -> Skinned | str:
+    """The bones that move the bodies, or why there are none.
+
+    Each person gets one shape, and each vertex `influences` joints; what that loses is measured.
+    """
     motion = motion_of(finished)
     if isinstance(motion, str):
         return motion
@@ -162,13 +151,20 @@ def skin_for(finished: Finished, influences: int) -> Skin | str:
     model = skin_of(motion.pose, finished.bodies)
     if model is None:
         return f"the model {motion.pose.model!r} has no bones that are known here"
-    skin = _fit(motion, model, finished.bodies, influences)
-    if not skin.miss <= SKIN_MISS:
-        return f"its bones miss the result's meshes by {skin.miss:.3f} m"
-    return skin
+    share, joint = model.weights.topk(influences, dim=1)
+    weights = torch.zeros_like(model.weights).scatter(1, joint, share / share.sum(1, keepdim=True))
+    simple = dataclasses.replace(model, weights=weights)
+    betas = motion.pose.betas.clone()
+    for track in tracks_of(finished.bodies):
+        betas[track.rows] = betas[track.rows].mean(0)
+    posed = Motion(dataclasses.replace(motion.pose, betas=betas), motion.size)
+    miss = misses(posed, simple, finished.bodies)
+    if not miss <= SKIN_MISS:
+        return f"its bones miss the result's meshes by {miss:.3f} m"
+    return Skinned(posed, simple, miss)
 
 
-def bones_for(finished: Finished, body: BodyForm, influences: int) -> Skin | str:
+def bones_for(finished: Finished, body: BodyForm, influences: int) -> Skinned | str:
     """The bones on which people move as was asked, or why they move by shapes.
 
     Raises:
@@ -182,20 +178,8 @@ def bones_for(finished: Finished, body: BodyForm, influences: int) -> Skin | str
     return skin
 
 
-def _fit(motion: Motion, model: SkinnedBody, bodies: Bodies, influences: int) -> Skin:
-    """One shape for each person, few weights for each vertex, and what they cost."""
-    share, joint = model.weights.topk(influences, dim=1)
-    weights = torch.zeros_like(model.weights).scatter(1, joint, share / share.sum(1, keepdim=True))
-    simple = dataclasses.replace(model, weights=weights)
-    betas = motion.pose.betas.clone()
-    for track in tracks_of(bodies):
-        betas[track.rows] = betas[track.rows].mean(0)
-    posed = Motion(dataclasses.replace(motion.pose, betas=betas), motion.size)
-    return Skin(posed, simple, misses(posed, simple, bodies))
-
-
-def rest_of(skin: Skin, row: int) -> tuple[Float[Tensor, "verts 3"], Float[Tensor, "joints 3"]]:
-    """Skin and joints of a row's person in the rest shape [m]."""
+def rest_of(skin: Skinned, row: int) -> tuple[Float[Tensor, "verts 3"], Float[Tensor, "joints 3"]]:
+    """Skinned and joints of a row's person in the rest shape [m]."""
     betas, model = skin.motion.pose.betas[row], skin.model
     count = len(betas)
     verts = model.verts + model.shape_dirs[..., :count] @ betas

@@ -13,7 +13,7 @@ from mover.core.types import Camera, SceneObject
 from mover.geometry.camera import NEAR
 from mover.io.export.finished import BodyForm, Exported, Finished, Up
 from mover.io.export.people import FPS, tracks_of
-from mover.io.export.posed import Skin, bones_for
+from mover.io.export.posed import Skinned, bones_for
 from mover.io.export.scene_glb import FLOOR_COLOUR, floor_of, parts_of, view_matrix
 from mover.io.export.solids import AXES, FRICTION, Solid, floor_height, solids_of
 from mover.io.export.usd_mesh import Prim, Stage, add_look, add_mesh, free_path, pxr
@@ -52,14 +52,14 @@ def export_usd(finished: Finished, folder: Path, body: BodyForm = "auto", up: Up
         _add_scene(stage, finished, folder)
         for track in () if bodies is None or body == "none" else tracks_of(bodies):
             assert bodies is not None
-            if isinstance(skin, Skin):
+            if isinstance(skin, Skinned):
                 add_skeleton(stage, skin, bodies, track)
             else:
                 add_moving_mesh(stage, bodies, track)
         stage.GetRootLayer().Save()
     if bodies is None or body == "none":
         return Exported((path,), ("no people",))
-    if isinstance(skin, Skin):
+    if isinstance(skin, Skinned):
         said = f"people are skeletons, at most {1e3 * skin.miss:.0f} mm off the result"
         return Exported((path,), (said,))
     why = () if body == "morph" else (f"people are moving meshes, not skeletons: {skin}",)

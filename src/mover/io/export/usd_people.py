@@ -9,7 +9,7 @@ from mover.core.colours import person_colour
 from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals
 from mover.io.export.people import FPS, Track, keyframes, seen_from_to
-from mover.io.export.posed import Skin, all_angles, quaternions, rest_of
+from mover.io.export.posed import Skinned, all_angles, quaternions, rest_of
 from mover.io.export.usd_mesh import Prim, Stage, add_mesh, free_path, pxr, set_points
 
 TOLERANCE = 0.002  # [m], of the straight lines between two samples of time
@@ -41,7 +41,7 @@ def _show(what: Prim, bodies: Bodies, track: Track) -> None:
             seen.Set(UsdGeom.Tokens.invisible, first + round(end * fps) + 1)
 
 
-def add_skeleton(stage: Stage, skin: Skin, bodies: Bodies, track: Track) -> None:
+def add_skeleton(stage: Stage, skin: Skinned, bodies: Bodies, track: Track) -> None:
     """One person as a skinned mesh on a skeleton, with one sample a frame."""
     Gf, Tf, UsdGeom, UsdSkel, Vt = (
         pxr(name) for name in ("Gf", "Tf", "UsdGeom", "UsdSkel", "Vt")
@@ -84,7 +84,7 @@ def add_skeleton(stage: Stage, skin: Skin, bodies: Bodies, track: Track) -> None
     _show(UsdGeom.Imageable(root), bodies, track)
 
 
-def _move(motion: Prim, skin: Skin, track: Track, joints: torch.Tensor) -> None:
+def _move(motion: Prim, skin: Skinned, track: Track, joints: torch.Tensor) -> None:
     """Translation, turn and size of every joint in its parent, frame by frame."""
     Gf, Vt = pxr("Gf"), pxr("Vt")
     pose, parents = skin.motion.pose, skin.model.parents
@@ -106,7 +106,7 @@ def _move(motion: Prim, skin: Skin, track: Track, joints: torch.Tensor) -> None:
             attr.Set(value, float(track.frame[k]))
 
 
-def _bind(mesh: Prim, skin: Skin, rest: torch.Tensor) -> None:
+def _bind(mesh: Prim, skin: Skinned, rest: torch.Tensor) -> None:
     """Normals of the rest shape, and the share of each joint in its vertices."""
     UsdGeom, UsdSkel, Vt = pxr("UsdGeom"), pxr("UsdSkel"), pxr("Vt")
     model = skin.model

@@ -41,7 +41,7 @@ def read_camera_file(path: Path, size: tuple[int, int] | None) -> At:
 
     Args:
         path: Of the file.
-        size: Width and height of the image, which most of them do not tell [px].
+        size: Width and height of the image, which most of them lack [px].
 
     Raises:
         InputError: If the file cannot be understood, or the size is needed and not known.
@@ -143,7 +143,7 @@ def _known(size: tuple[int, int] | None, at: At) -> tuple[int, int]:
 
 
 def _of_lens(at: At, size: tuple[int, int]) -> At:
-    """A camera from a focal length or a field of view, with its tilt where that is told."""
+    """A camera from a focal length or a field of view, with its tilt where the file has it."""
     tilt: dict[str, Any] = {}
     if (pitch := maybe(at, "pitch")) is not None and (roll := maybe(at, "roll")) is not None:
         tilt["R_cam_world"] = tilt_of(number(pitch, -1.6, 1.6), number(roll, -1.6, 1.6))

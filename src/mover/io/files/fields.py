@@ -194,11 +194,11 @@ def read_json(path: Path) -> At:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON whose names are told once each."""
+    """An object of JSON whose names are all different."""
     tree = dict(pairs)
     if len(tree) < len(pairs):
-        told: set[str] = set()
-        twice = next(key for key, _ in pairs if key in told or told.add(key))
+        known: set[str] = set()
+        twice = next(key for key, _ in pairs if key in known or known.add(key))
         raise ValueError(f"the name {shown(twice)} is there twice")
     return tree
 

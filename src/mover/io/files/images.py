@@ -97,17 +97,6 @@ def write_image(image: Float[Tensor, "h w 3"], path: Path) -> None:
         Image.fromarray(pixels).save(part, format="PNG")
 
 
-def mirrored_copy(path: Path, work: Path) -> Path:
-    """A picture flipped left to right, as a new file in `work`."""
-    from PIL import ImageOps
-
-    work.mkdir(parents=True, exist_ok=True)
-    target = work / f"mirrored_{path.stem}.jpg"
-    with opened(path) as picture:
-        ImageOps.mirror(picture.convert("RGB")).save(target, quality=95)
-    return target
-
-
 # Depth of the picture, as Depth Anything, MoGe, UniDepth, Depth Pro or MiDaS give it.
 
 

@@ -113,7 +113,7 @@ def _refuse(at: At, kind: Any, said: str) -> NoReturn:  # noqa: ANN401
     """Say in our words what msgspec says: `Expected ... - at `$.objects[0].scale``."""
     path = re.search(r"`\$([^`]*)`$", said)
     for name, index in re.findall(r"\.(\w+)|\[([0-9]+|\.\.\.)\]", path[1] if path else ""):
-        if index == "...":  # it does not tell the key
+        if index == "...":  # without the key
             _refuse_value(at, get_args(_bare(kind))[1])
         at, kind = _step(at, _bare(kind), name or int(index))
     if missing := re.match(r"Object missing required field `(\w+)`", said):
@@ -136,7 +136,7 @@ def _step(at: At, kind: Any, key: str | int) -> tuple[At, Any]:  # noqa: ANN401
         inner = get_args(kind)[key if get_origin(kind) is tuple else 0]
         return At(at.value[key], at.file, f"{at.field}[{key}]"), inner
     value = at.value.get(key, MISSING)
-    if isinstance(kind, tuple):  # structs that a field tells apart
+    if isinstance(kind, tuple):  # structs that a field distinguishes
         config = kind[0].__struct_config__
         tags = [one.__struct_config__.tag for one in kind]
         if key == config.tag_field:

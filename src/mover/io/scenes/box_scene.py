@@ -1,4 +1,4 @@
-"""Boxes only (JSON): each gets the piece of the furniture library that is most like it.
+"""Boxes only (JSON): each gets the object of the furniture library that is most like it.
 
 Schema: docs/data.md, "Boxes". A box is what a 3D detector or a person with a ruler gives: class,
 centre, full size, and yaw or a rotation.
@@ -136,7 +136,7 @@ def _upright(at: At, axes: Matrix) -> tuple[Sequence[int], float]:
 
 
 def _annotations(boxes: Sequence[BoxFields], camera: At | None, file: str) -> At | None:
-    """What objects.json says of boxes that tell their rectangle in the image."""
+    """What objects.json says of boxes that have a rectangle in the image."""
     if camera is None or all(box.box2d is None for box in boxes):
         return None
     found = [

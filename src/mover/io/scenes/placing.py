@@ -1,4 +1,4 @@
-"""Objects that another tool placed by a matrix, as upright pieces with yaw and scale."""
+"""Objects that another tool placed by a matrix, as upright ones with yaw and scale."""
 
 import math
 import re

@@ -98,7 +98,7 @@ Shape = tuple[NDArray[np.float64], NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
-class Box:
+class TotalBox:
     """A box of bdb_3d.mat in Total3D's world."""
 
     center: NDArray[np.float64]
@@ -112,14 +112,14 @@ def matrix(path: Path, key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
     return array(get(load_mat(path), key), shape).astype(np.float64)
 
 
-def read_boxes(path: Path) -> list[Box]:
+def read_boxes(path: Path) -> list[TotalBox]:
     """All boxes, in the order of the detections."""
     content = load_mat(path)
     cells = get(content, "bdb")
     if not isinstance(cells.value, np.ndarray) or cells.value.dtype != object:
         refuse(cells, "a cell of boxes")
     ids = array(get(content, "class_id"), (1, cells.value.size), "whole")[0]
-    found: list[Box] = []
+    found: list[TotalBox] = []
     for i, (cell, key) in enumerate(zip(cells.value.ravel(), ids.tolist(), strict=True)):
         at = At(cell, content.file, f"bdb[{i}]")
         if not 0 <= key < len(CLASSES):
@@ -128,7 +128,7 @@ def read_boxes(path: Path) -> list[Box]:
     return found
 
 
-def _box(at: At, name: str) -> Box:
+def _box(at: At, name: str) -> TotalBox:
     """One box: its axes are the rows of `basis`, upright; p = p_local @ basis + centroid."""
     names = (
         at.value.dtype.names if isinstance(at.value, np.ndarray) and at.value.size == 1 else None
@@ -144,7 +144,7 @@ def _box(at: At, name: str) -> Box:
     yaw = math.atan2(basis[2, 0], basis[2, 2])
     if abs(basis - about_y(-yaw)).max() > 1e-3:
         refuse(parts["basis"], "the axes of an upright box", f"{basis.round(3).tolist()}")
-    return Box(array(parts["centroid"], (1, 3)).astype(np.float64)[0], half, yaw, name)
+    return TotalBox(array(parts["centroid"], (1, 3)).astype(np.float64)[0], half, yaw, name)
 
 
 def find_mesh(folder: Path, index: int, name: str) -> Path:
@@ -198,22 +198,22 @@ def total3d_parts(folder: Path, hints: Hints) -> Parts:
     parts = [folder / name for name in ("input", "output")]
     source, result = [part if part.is_dir() else folder for part in parts]
     at = read_json(source / "detections.json")
-    rows = [choice(get(item, "class"), CLASSES) for item in items(at)]
+    names = [choice(get(item, "class"), CLASSES) for item in items(at)]
     boxes = read_boxes(result / "bdb_3d.mat")
     box = matrix(result / "layout.mat", "layout", (8, 3))  # the upper four corners, the lower four
     floor, walls = float(box[:, 1].min()), (box[4:] @ TO_OURS.T)[:, ::2].tolist()
-    if rows != [box.name for box in boxes]:
+    if names != [box.name for box in boxes]:
         found = f"{len(boxes)} boxes of {[b.name for b in boxes][:4]} ..."
         expected = "the classes of detections.json, in order"
         raise InputError(f"bdb_3d.mat: field 'class_id' has {found}, expected {expected}")
     kept = {i: box for i, box in enumerate(boxes) if box.name in FURNITURE}
     files = {i: find_mesh(result, i, box.name) for i, box in kept.items()}
     shapes = {path.name: read_shape(path) for path in files.values()}
-    pieces = [_piece(i, box, files[i].name, shapes, floor) for i, box in kept.items()]
+    rows = [_object(i, box, files[i].name, shapes, floor) for i, box in kept.items()]
     return Parts(
         name=folder.resolve().name,
         camera=_camera(source, result / "r_ex.mat"),
-        scene=scene_tree(pieces, result.name, floor, walls),
+        scene=scene_tree(rows, result.name, floor, walls),
         objects=At(_annotations(items(at), list(kept)), "detections.json"),
         load_mesh=partial(_load_mesh, result, shapes),
         load_image=partial(read_image, At("img.jpg", "input"), source),
@@ -257,8 +257,8 @@ def _annotations(rows: Sequence[At], kept: Sequence[int]) -> dict[str, Any]:
     return annotations_tree(annotations, {}, CLASSES)
 
 
-def _piece(
-    index: int, box: Box, file: str, shapes: Mapping[str, Shape], floor: float
+def _object(
+    index: int, box: TotalBox, file: str, shapes: Mapping[str, Shape], floor: float
 ) -> dict[str, Any]:
     """The fields of an object of scene.json; its mesh stays as it is in the file.
 
