@@ -17,7 +17,6 @@ from mover.geometry.rotations import rot_y
 from mover.io.capture.folder import read_capture, write_capture
 from mover.pipeline.presets import PAPER, ROBUST
 from mover.pipeline.reconstruct import reconstruct
-from mover.stages.camera.config import LensConfig
 from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens
 from mover.stages.camera.room_lines import (
     Prior,
@@ -28,6 +27,7 @@ from mover.stages.camera.room_lines import (
     find_segments,
     fit_room,
 )
+from mover.stages.config import LensConfig
 from mover.stages.people.find_depth import pelvis
 from mover_bench.rooms.noise import wrong_lens
 

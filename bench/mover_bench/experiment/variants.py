@@ -11,8 +11,7 @@ from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.types import Bodies, Capture
 from mover.pipeline.presets import PRESETS, Config
-from mover.stages.camera.config import LensConfig
-from mover.stages.config import SpreadConfig
+from mover.stages.config import LensConfig, SpreadConfig
 from mover_bench.experiment.sets import CHANGES
 
 Given = Literal["all", "no contact", "no people"]

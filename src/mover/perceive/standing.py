@@ -19,11 +19,10 @@ from mover.geometry.camera import pitch_roll, tilted
 from mover.perceive.layout import Picture
 from mover.perceive.screen import CameraPrior
 from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camera
-from mover.stages.camera.config import LensConfig
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_lens import MEASURED, heading_of, tilt_of, tilted_by
 from mover.stages.camera.room_lines import SURE, Prior, find_segments, fit_room
-from mover.stages.config import AlignConfig, FootContactConfig, SelectConfig
+from mover.stages.config import AlignConfig, FootContactConfig, LensConfig, SelectConfig
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
 POSES = math.radians(2.0)  # [rad] by which a floor under fitted bodies leans: feet err together

@@ -9,7 +9,6 @@ from typing import Annotated, Literal, TypeVar
 
 from mover.core.settings import float_in, int_in
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
-from mover.stages.camera.config import LensConfig
 from mover.stages.config import (
     AlignConfig,
     AssignConfig,
@@ -18,6 +17,7 @@ from mover.stages.config import (
     FootContactConfig,
     GatherConfig,
     ImageConfig,
+    LensConfig,
     PlaceConfig,
     PrepareConfig,
     RefineConfig,

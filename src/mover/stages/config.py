@@ -27,6 +27,18 @@ IMAGE_ONLY = SceneWeights(1.0, 1.0, 0.3, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
+class LensConfig:
+    """When the focal length follows from the lines of the picture."""
+
+    use: bool = False
+    """Whether they are asked."""
+    tilt: Annotated[float, float_in(1e-3, 1)] = 0.07
+    """Standard deviation of the pitch and roll that are given [rad] ..."""
+    feet: Annotated[float, float_in(1e-3, 1)] = 0.0175
+    """... and of those by the feet, beside their own covariance: poses are biased."""
+
+
+@dataclass(frozen=True)
 class SelectConfig:
     """Which frames are used."""
 

@@ -22,8 +22,8 @@ from mover.core.types import Bodies, Camera, Capture, Heading, SceneObject, Tilt
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted
 from mover.geometry.rotations import wrap
-from mover.stages.camera.config import LensConfig
 from mover.stages.camera.room_lines import Ends, Prior, Segments, fit_room
+from mover.stages.config import LensConfig
 from mover.stages.people.find_depth import pelvis, shifted
 
 MEASURED = 0.003  # error of the logarithm of a measured focal length
@@ -31,7 +31,7 @@ UNSTATED = 0.01  # the same where nothing is stated of how it was found
 SYSTEMATIC = 0.01  # error of the logarithm that more lines do not make smaller
 SYSTEMATIC_TILT = 0.003  # [rad]
 VAGUE = math.radians(5)  # spread of a heading that says nothing
-SAYS_LITTLE = 0.95  # of the spread before any line: lines that leave more of it tell nothing
+SAYS_LITTLE = 0.95  # of the spread before any line: lines that leave more of it are no evidence
 
 
 @record
@@ -40,7 +40,7 @@ class LensInputs:
 
     segments: Segments
     camera: Camera
-    """Pitch and roll as the feet tell them, or as they are given."""
+    """Pitch and roll by the feet, or as they are given."""
     focal_spread: float | None
     """What is said of the focal length; None: nothing."""
     tilt_spread: float
@@ -51,14 +51,14 @@ class LensInputs:
 
 @record
 class Lens:
-    """The lens, as the lines of the picture tell it."""
+    """The lens, by the lines of the picture."""
 
     zoom: float
     """Focal length to take over the given one; 1 where it is kept."""
     spread: float
     """Standard deviation of its logarithm."""
     tilt: Tilt | None
-    """None: the lines do not tell it."""
+    """None: the lines do not determine it."""
     heading: Heading | None
     """The same of the room."""
     warnings: tuple[str, ...] = ()
@@ -95,7 +95,7 @@ def tilt_of(ends: Ends, before: float) -> Tilt | None:
 
 
 def tilted_by(camera: Camera, tilt: Tilt) -> Camera:
-    """The camera with the tilt that lines told."""
+    """The camera with the tilt by lines."""
     R = tilted(torch.tensor(tilt.pitch), torch.tensor(tilt.roll)).to(camera.R_cam_world)
     return dataclasses.replace(camera, R_cam_world=R)
 

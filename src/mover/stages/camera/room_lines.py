@@ -1,11 +1,11 @@
 """Straight lines of a picture, and the camera under which they run along the axes of a room.
 
 Not in the paper. In a room most edges are vertical or run along one of two horizontal directions
-at right angles, so that their pictures meet in three vanishing points, which tell the focal length
+at right angles, so that their pictures meet in three vanishing points, which give the focal length
 and the attitude of the camera (Kosecka and Zhang, ECCV 2002). Line segments are those of von Gioi
 et al. (LSD, PAMI 2010), as OpenCV finds them. Each belongs to one of the three directions or to
 none, with the chances of both (expectation-maximisation); from every heading a descent begins, and
-all their ends are kept: two that fit alike say that the picture does not tell.
+all their ends are kept: two that fit equally well say that the picture is ambiguous.
 """
 
 from typing import Any
@@ -71,7 +71,7 @@ class Prior:
 
 @record
 class Ends:
-    """Where the descents ended, the best first; ends that are alike are one."""
+    """Where the descents ended, the best first; similar ends are one."""
 
     pose: RoomPose
     cost: Float[Tensor, " starts"]

@@ -1,7 +1,7 @@
-"""How large the whole room is: what people's size leaves open, furniture and seats tell.
+"""How large the whole room is: what people's size leaves open, furniture and seats constrain.
 
 Not in the paper, whose people have their own size. People of unknown height make floor, places and
-sizes too large at once, which no image tells. Three things do: how far away and how large each
+sizes too large at once, which no image shows. Three things do: how far away and how large each
 object was given, standard dimensions of furniture, and how high people sit, since seats are made
 for legs.
 """
@@ -16,21 +16,21 @@ from mover.core.records import record
 from mover.core.types import Bodies, Layout
 from mover.energy.prior_terms import AWAY, COMMON, SIZE, Given
 
-TOOL = 0.04  # ... and all given sizes of a room: shapes of one tool fill their boxes alike
+TOOL = 0.04  # ... and all given sizes of a room: shapes of one tool fill their boxes similarly
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
 TRIED = 121  # scales
 SEAT = 0.44  # [m], of a usual seat over the floor
 SEATS = 0.06  # standard deviation of its logarithm: chairs .43-.47, sofas .40-.45, offices .42-.50
-POSES = 0.04  # the same of how high people seem to sit: their poses are off everywhere alike
-CARRIED = ("seat", "left_thigh", "right_thigh")  # of who sits
+POSES = 0.04  # the same of how high people seem to sit: all their poses err together
+CARRIED = ("seat", "left_thigh", "right_thigh")  # of a seated person
 LOWEST = 0.1  # share of a sitter's points below the top of the seat
 SAME = 0.3  # [m] between two who sit on one seat
-FEWEST = 3  # bodies that tell how high a seat is
+FEWEST = 3  # bodies that give the height of a seat
 
 
 @record
 class ScaleKnown:
-    """What tells the scale of a room beside its furniture."""
+    """What constrains the scale of a room beside its furniture."""
 
     spread: float
     """Standard deviation of the logarithm of the people's size; 0: it is known."""
@@ -108,7 +108,7 @@ def seats_tell(bodies: Bodies, parts: Parts, floor: float) -> tuple[float, float
         floor: Its height below them [m].
 
     Returns:
-        None where nobody sits.
+        None where no person sits.
     """
     carried = members(parts, *CARRIED)
     sits = postures(bodies, parts, floor).sitting
@@ -125,7 +125,7 @@ def seats_tell(bodies: Bodies, parts: Parts, floor: float) -> tuple[float, float
 
 
 def _places(points: Float[Tensor, "rows 2"]) -> list[Bool[Tensor, " rows"]]:
-    """Who sits on one seat: all that are near to the first that is left."""
+    """People seated on one seat: all that are near to the first that is left."""
     left, found = torch.ones(len(points), dtype=torch.bool), list[Bool[Tensor, " rows"]]()
     while bool(left.any()):
         first = points[left.nonzero()[0, 0]]

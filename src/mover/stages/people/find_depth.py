@@ -8,7 +8,7 @@ image as they are (`compare_extents`), by their certainty. An error of the pose 
 great (smaller bodies overlap better) and the second too small (bent bodies are lower): both are
 corrected for it (`peak_of`), since one of them is often missing.
 
-Masks cannot tell a wrong size at a wrong depth. A known height can: then the person is first
+Masks do not show a wrong size at a wrong depth. A known height does: then the person is first
 scaled about the camera, which no picture sees.
 """
 
@@ -202,11 +202,11 @@ def are_shapeless(bodies: Bodies) -> bool:
 
 
 def size_spread(bodies: Bodies, shapeless: float) -> float:
-    """How far off all sizes may be together (of the logarithm); 0: they are believed.
+    """How far off all sizes may be together (of the logarithm); 0: they are trusted.
 
     Args:
         bodies: With what their maker says of it.
-        shapeless: The same of bodies of the mean shape; 0: all are believed.
+        shapeless: The same of bodies of the mean shape; 0: all are trusted.
     """
     if shapeless and bodies.size_spread is not None:
         return bodies.size_spread
@@ -233,12 +233,12 @@ def pelvis(bodies: Bodies) -> Float[Tensor, "bodies 3"]:
 
 def _with_heights(peak: Peak, found: Extents | None, config: DepthConfig) -> Peak:
     """The mean of what overlaps and heights say; the one that there is if the other is missing."""
-    told = [(peak.factor, peak.spread)] if peak.spread <= config.spread else []
+    used = [(peak.factor, peak.spread)] if peak.spread <= config.spread else []
     if found is not None and found.frames >= config.least and abs(found.factor - 1) <= config.span:
         spread = (found.spread**2 + SYSTEMATIC**2) ** 0.5
         if spread <= config.spread:
-            told.append((found.factor + peak.lower, spread))
-    return Peak(*fused(told), peak.misfit) if told else peak
+            used.append((found.factor + peak.lower, spread))
+    return Peak(*fused(used), peak.misfit) if used else peak
 
 
 def _size(inputs: DepthInputs, rows: Int[Tensor, " rows"], person: str) -> tuple[float, list[str]]:
