@@ -7,7 +7,7 @@ import torch
 from analytic import FACES, box_verts
 
 from mover.core.types import Camera
-from mover.energy.body_terms.outline import POINTS, Outline, outline_term
+from mover.energy.body_terms import OUTLINE_POINTS, Outline, outline_term
 from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
 from mover.stages.masks import MaskTable
@@ -77,7 +77,7 @@ def test_bodies_without_a_mask_or_without_overlap_have_no_outline():
 
 def test_the_price_is_zero_where_outlines_meet_and_is_shared_by_the_points():
     outline = wish(seen_box(0.0), drawn(seen_box(0.04)))
-    assert float(outline.weight.sum()) == pytest.approx(POINTS)
+    assert float(outline.weight.sum()) == pytest.approx(OUTLINE_POINTS)
     skin = seen_box(0.0).skin.double()
     at = replace(outline, gap=torch.zeros_like(outline.gap), pixel=project(skin, K.double())[0][
         outline.skin].float())  # fmt: skip

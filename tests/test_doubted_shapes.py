@@ -8,7 +8,7 @@ from analytic import FACES
 from test_refine_bodies import GROUND, QUICK, SEATED, room_with, seat_gap, still_people
 
 from mover.core.types import Capture, Detection, Masks, Room
-from mover.energy.body_terms.order import Sighting, bounds_of_skin, order_term
+from mover.energy.body_terms import Sighting, bounds_of_skin, order_term
 from mover.geometry.camera import project, to_camera
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit

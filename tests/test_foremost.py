@@ -2,7 +2,7 @@
 
 import torch
 
-from mover.energy.body_terms.contact import Skin, Surface, gather_matches, touch_term
+from mover.energy.body_contact import Skin, Surface, gather_matches, touch_term
 from mover.energy.config import MatchConfig
 
 SEAT, BACK = 0, 1

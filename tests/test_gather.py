@@ -67,9 +67,9 @@ def test_the_vote_keeps_the_larger_region_of_each_object():
 
 def test_frames_narrow_one_another_in_any_order():
     g = torch.Generator().manual_seed(0)
-    maps = [DepthMaps(*torch.rand(3, 4, 5, generator=g).unbind()) for _ in range(3)]
+    maps = [DepthMaps(*torch.rand(2, 4, 5, generator=g).unbind()) for _ in range(3)]
     one, other = merge(merge(maps[0], maps[1]), maps[2]), merge(maps[2], merge(maps[1], maps[0]))
-    for name in ("near", "far", "free"):
+    for name in ("near", "far"):
         assert torch.equal(getattr(one, name), getattr(other, name))
     assert torch.equal(one.near, torch.stack([m.near for m in maps]).amax(0))
     assert torch.equal(one.far, torch.stack([m.far for m in maps]).amin(0))

@@ -172,7 +172,7 @@ def passing(count: int) -> PeopleView:
 def test_bounds_are_those_of_whole_images_one_after_another() -> None:
     sight = passing(13)
     blank = torch.full((60, 80), torch.inf)
-    expected = DepthMaps(-blank, blank, -blank)
+    expected = DepthMaps(-blank, blank)
     views = Crops(sight.camera.K[None], 60, 80)
     for row, verts in enumerate(sight.bodies.verts):
         cam = verts @ sight.camera.R_cam_world.mT
@@ -181,7 +181,7 @@ def test_bounds_are_those_of_whole_images_one_after_another() -> None:
         expected = merge(expected, bounds_of(seen, sight.masks, 2, vote=True))
     for workers in (1, 2, 3):
         found = gather_depth(sight, workers)
-        for name in ("near", "far", "free"):
+        for name in ("near", "far"):
             assert getattr(expected, name).isfinite().any()
             assert torch.equal(getattr(found, name), getattr(expected, name))
 

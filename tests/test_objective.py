@@ -49,7 +49,7 @@ def some_of(layout, rows):
 def test_every_weight_counts_in_the_energy_of_a_run(name, preset, dtype):
     place = PRESETS[preset].place
     weights = replace(place.weights, **{name: getattr(place.weights, name) or 0.5})
-    inputs, layout = evidence(dtype, place.form)
+    inputs, layout = evidence(dtype)
     found = energy_of(inputs, PlaceConfig(weights, place.form))(layout)
     assert set(found.parts) == {n for n in WEIGHTS if getattr(weights, n)}
     whole = torch.stack(list(found.parts.values())).sum(0)
@@ -70,7 +70,7 @@ def test_the_list_has_each_weight_once_in_its_order_and_words_for_people():
 
 
 def test_the_evidence_of_each_term_exists_and_silences_it_where_it_is_missing():
-    inputs, _ = evidence(torch.float32, "robust")
+    inputs, _ = evidence(torch.float32)
     known = objective.SceneEvidence(inputs.objects, inputs.camera, inputs.image, inputs.humans)
     for term in SCENE_TERMS:
         for need in term.needs:
@@ -89,7 +89,7 @@ def test_the_evidence_of_each_term_exists_and_silences_it_where_it_is_missing():
 
 @pytest.mark.parametrize("term", [t for t in SCENE_TERMS if t.bare], ids=lambda t: t.name)
 def test_a_bare_term_sees_no_meshes_no_maps_and_no_people(term):
-    inputs, layout = evidence(torch.float32, "robust")
+    inputs, layout = evidence(torch.float32)
     known = SceneEvidence(inputs.objects, inputs.camera, inputs.image, inputs.humans)
     config = SceneConfig(only(**{term.name: 0.7}), "robust")
     rows = torch.tensor([5, 1, 3])
@@ -105,12 +105,11 @@ def test_a_bare_term_sees_no_meshes_no_maps_and_no_people(term):
 
 def test_terms_of_the_kernel_are_in_the_order_of_its_constants():
     pytest.importorskip("warp")
-    from mover.energy.fused.kernels import given
-    from mover.energy.fused.launch import TERMS
-    from mover.energy.fused.pack import FUSED
+    from mover.energy.fused.kernels import data
+    from mover.energy.fused.launch import FUSED, TERMS
 
     assert len(FUSED) == TERMS
-    assert [getattr(given, name.upper()) for name in FUSED] == list(range(TERMS))
+    assert [getattr(data, name.upper()) for name in FUSED] == list(range(TERMS))
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,7 @@ def newcomer(monkeypatch):
 class TestANewcomer:
     def test_counts_among_all_and_by_rows(self, preset, dtype, engine):
         place = PRESETS[preset].place
-        inputs, layout = evidence(dtype, place.form)
+        inputs, layout = evidence(dtype)
         rest = inputs.objects, inputs.camera, inputs.image, inputs.humans
         weights = More(**{n: getattr(place.weights, n) for n in WEIGHTS})
         config = SceneConfig(weights, place.form)
@@ -163,7 +162,7 @@ class TestANewcomer:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_evidence_by_rows_is_that_of_the_objects(preset):
     place = PRESETS[preset].place
-    inputs, layout = evidence(torch.float64, place.form)
+    inputs, layout = evidence(torch.float64)
     rest = inputs.objects, inputs.camera, inputs.image, inputs.humans
     config = SceneConfig(only(**dict.fromkeys(WEIGHTS, 0.5)), place.form)
     rows = torch.tensor([5, 1, 3, 1])
@@ -176,7 +175,7 @@ def test_evidence_by_rows_is_that_of_the_objects(preset):
 
 
 def test_a_tensor_is_indexed_where_its_annotation_counts_objects():
-    inputs, _ = evidence(torch.float32, "robust")
+    inputs, _ = evidence(torch.float32)
     index = torch.tensor([2, 0])
     image = of_objects(inputs.image, index, 3)
     assert torch.equal(image.boxes, inputs.image.boxes[index])

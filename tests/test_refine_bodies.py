@@ -14,7 +14,7 @@ from mover.bodies.parts import members, parts_of
 from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.types import Camera, Mesh, Room, Scene, SceneObject, Segment
-from mover.energy.body_terms.contact import (
+from mover.energy.body_contact import (
     Matches,
     Skin,
     Surface,
@@ -22,10 +22,23 @@ from mover.energy.body_terms.contact import (
     touch_term,
     without_kept,
 )
-from mover.energy.body_terms.order import Bounds, Sighting, bounds_of_skin, order_term
-from mover.energy.body_terms.room import sink_term, stand_term, under_term
-from mover.energy.body_terms.start import angle_term, depth_share, image_term, range_term
-from mover.energy.body_terms.time import gather_neighbours, lock_term, smooth_term, steady_term
+from mover.energy.body_terms import (
+    Bounds,
+    Sighting,
+    angle_term,
+    bounds_of_skin,
+    depth_share,
+    gather_neighbours,
+    image_term,
+    lock_term,
+    order_term,
+    range_term,
+    sink_term,
+    smooth_term,
+    stand_term,
+    steady_term,
+    under_term,
+)
 from mover.energy.config import Adam, MatchConfig
 from mover.geometry.mesh import vertex_normals
 from mover.geometry.volume import Volume
@@ -113,8 +126,8 @@ TERMS = {
     "steady": lambda x: steady_term(x.flatten(1), x[:, 0, 0], LINE),
     "lock": lambda x: lock_term(x[:, :2], torch.ones(4, 2, dtype=x.dtype), LINE),
     "sink": lambda x: sink_term(x, analytic_volume()),
-    "under": lambda x: under_term(x, torch.zeros_like(x[..., 1])),
-    "stand": lambda x: stand_term(x[:, :2], 0 * x[:, :2, 0].detach() + 1, 0 * x[:, :2, 0].detach()),
+    "under": lambda x: under_term(x, 0.0),
+    "stand": lambda x: stand_term(x[:, :2], 0 * x[:, :2, 0].detach() + 1, 0.0),
     "touch": lambda x: touch_term(x, MATCHES, 0.1),
     "order": lambda x: order_term(x[..., 2], Bounds(0 * x[..., 0].detach() + 0.05,
                                                     0 * x[..., 0].detach() + torch.inf)),

@@ -12,10 +12,10 @@ from mover.app.cli.run import parse_run
 from mover.core.observe import Energy, silent
 from mover.core.records import built, plain, record
 from mover.core.types import Layout
+from mover.energy.bfgs import Problems, _step, minimize_batched
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
 from mover.energy.fused import energy as energy_warp
 from mover.energy.image_terms import squares
-from mover.energy.newton import Problems, _step, settle
 from mover.geometry.camera import outermost, project, to_camera
 from mover.geometry.placement import place, place_in
 from mover.pipeline.presets import Config
@@ -84,10 +84,12 @@ def test_problems_that_are_alike_are_solved_once():
         asked.extend(rows.tolist())
         return some.of(like[rows])
 
-    apart = settle(Problems(of, start, (6,)), BatchedBFGS())
+    apart = minimize_batched(Problems(of, start, (6,)), BatchedBFGS())
     assert {*asked} == {*range(6)}
     asked.clear()
-    found = settle(Problems(of, start, (6,), None, torch.tensor([0, 1, 0, 3, 1, 3])), BatchedBFGS())
+    found = minimize_batched(
+        Problems(of, start, (6,), None, torch.tensor([0, 1, 0, 3, 1, 3])), BatchedBFGS()
+    )
     assert {*asked} == {0, 1, 3}
     for a, b in ((found.at.x, apart.at.x), (found.at.y, apart.at.y), (found.value, apart.value)):
         assert torch.equal(a, b)
@@ -96,26 +98,29 @@ def test_problems_that_are_alike_are_solved_once():
 
 def test_bottoms_of_bowls_are_found():
     problems, bottom = bowls(20)
-    found = settle(problems, EXACT)
+    found = minimize_batched(problems, EXACT)
     at = torch.cat([found.at.x[:, None], found.at.y], -1)
     torch.testing.assert_close(at, bottom, rtol=0, atol=1e-4)
 
 
 def test_the_end_of_each_of_rosenbrocks_valleys_is_found():
-    found = settle(valleys(12), EXACT)
+    found = minimize_batched(valleys(12), EXACT)
     assert float(found.value.max()) < 1e-8
     torch.testing.assert_close(found.at.x, torch.ones(12).double(), rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("k", [0, 3, 11])
 def test_a_problem_goes_its_way_whatever_else_is_in_the_batch(k):
-    together, one = settle(valleys(12), BatchedBFGS()), settle(only(valleys(12), k), BatchedBFGS())
+    together, one = (
+        minimize_batched(valleys(12), BatchedBFGS()),
+        minimize_batched(only(valleys(12), k), BatchedBFGS()),
+    )
     torch.testing.assert_close(one.at.x[0], together.at.x[k], rtol=0, atol=1e-6)
     torch.testing.assert_close(one.value[0], together.value[k], rtol=1e-6, atol=1e-9)
 
 
 def test_two_runs_give_the_same_bits():
-    a, b = settle(valleys(9), BatchedBFGS()), settle(valleys(9), BatchedBFGS())
+    a, b = minimize_batched(valleys(9), BatchedBFGS()), minimize_batched(valleys(9), BatchedBFGS())
     assert torch.equal(a.at.x, b.at.x)
     assert torch.equal(a.value, b.value)
 
@@ -134,7 +139,7 @@ def test_what_has_converged_leaves_the_batch_and_the_rest_goes_on():
         return counted
 
     steps = []
-    found = settle(replace(problems, of=of), BatchedBFGS(steps=500), steps.append)
+    found = minimize_batched(replace(problems, of=of), BatchedBFGS(steps=500), steps.append)
     assert sizes[0] == 12
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 12
@@ -160,7 +165,7 @@ def test_no_problem_ends_higher_than_it_starts_and_the_trace_falls(seed, steps):
 
     start = Point(torch.randn(6, generator=r).double(), torch.randn(6, 2, generator=r).double())
     problems = Problems(of, start, (6,))
-    found = settle(problems, BatchedBFGS(steps=steps))
+    found = minimize_batched(problems, BatchedBFGS(steps=steps))
     before = of(torch.arange(6))(start).per_item
     assert (found.value <= before).all()
     assert (found.trace.diff() <= 0).all()
@@ -172,7 +177,7 @@ def test_an_energy_that_is_not_finite_at_the_start_is_an_error():
     problems, _ = bowls(3)
     start = Point(problems.start.x * torch.nan, problems.start.y)
     with pytest.raises(ValueError, match="somewhere: the energy is not finite"):
-        settle(replace(problems, start=start), BatchedBFGS(), silent, "somewhere")
+        minimize_batched(replace(problems, start=start), BatchedBFGS(), silent, "somewhere")
 
 
 def test_a_cliff_of_nan_is_not_stepped_over():
@@ -180,7 +185,7 @@ def test_a_cliff_of_nan_is_not_stepped_over():
         return lambda p: Energy({"cliff": torch.where(p.x < 0.3, -p.x, torch.nan) + 0 * p.y[:, 0]})
 
     start = Point(torch.zeros(1).double(), torch.zeros(1, 1).double())
-    found = settle(Problems(of, start, (1,)), BatchedBFGS())
+    found = minimize_batched(Problems(of, start, (1,)), BatchedBFGS())
     assert 0.2 < float(found.at.x) < 0.3
 
 
@@ -217,7 +222,7 @@ def test_grouped_problems_decide_together():
         return energy
 
     start = Point(torch.zeros(2).double(), torch.zeros(2, 1).double())
-    found = settle(Problems(of, start, (2,), torch.zeros(2).long()), EXACT)
+    found = minimize_batched(Problems(of, start, (2,), torch.zeros(2).long()), EXACT)
     torch.testing.assert_close(found.at.x, torch.tensor([-1.0, 0.0]).double(), rtol=0, atol=1e-4)
 
 

@@ -9,7 +9,7 @@ Variant = Literal["paper", "robust"]
 """How a term is weighted: as printed, or normalised and robust."""
 
 
-GROWTH = 1.5  # price of another size as a whole, against that of another shape
+GROWTH = 1.5  # cost of another size as a whole, against that of another shape
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,10 @@ class SceneWeights:
     collision: Weight = 1000.0
     """lambda 5: people move through free space."""
     contact: Weight = 1e5
-    """lambda 6: touching surfaces share a place."""
+    """lambda 6: touching surfaces share a position."""
     distance: Weight = 0.0
-    """Objects stay at the distance they were given, where nothing else tells it (robust only)."""
+    """Objects stay at the distance they were given, where nothing else constrains it (robust
+    only)."""
     heading: Weight = 0.0
     """Seats face where their sitters face (robust only)."""
     wall: Weight = 0.0
@@ -47,13 +48,13 @@ def only(**weights: float) -> SceneWeights:
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """How the room is priced."""
+    """How the terms of the room are weighted."""
 
     weights: SceneWeights = field(default_factory=SceneWeights)
     form: Variant = "paper"
     """As printed, or normalised and robust."""
     growth: Weight = GROWTH
-    """Price of another size as a whole, against that of another shape (robust only)."""
+    """Cost of another size as a whole, against that of another shape (robust only)."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class BatchedBFGS:
 
 @dataclass(frozen=True)
 class MatchConfig:
-    """Which skin is believed to touch."""
+    """Which skin counts as touching."""
 
     least: Share = 0.5
     """Chance above which a point of the skin touches (the paper's threshold)."""

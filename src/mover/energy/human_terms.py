@@ -48,8 +48,6 @@ class DepthMaps:
     """Lower bound [m]; -inf where no person stood in front of an object."""
     far: Float[Tensor, "h w"]
     """Upper bound [m]; inf where no object hid a person."""
-    free: Float[Tensor, "h w"]
-    """Nothing stands nearer than this [m], inside masks or out; -inf where no person was seen."""
 
 
 @record
@@ -102,14 +100,12 @@ def bounds_of(
         behind = behind & (more < 0)[:, None, None]
     infinity = torch.full_like(seen.front, float("inf"))
     near = torch.where(before.any(0), seen.exit, -infinity)
-    free = torch.where(shown, seen.exit, -infinity)
-    return DepthMaps(near, torch.where(behind.any(0), seen.front, infinity), free)
+    return DepthMaps(near, torch.where(behind.any(0), seen.front, infinity))
 
 
 def merge(a: DepthMaps, b: DepthMaps) -> DepthMaps:
     """The narrower bounds of two sets of frames."""
-    near, far = torch.maximum(a.near, b.near), torch.minimum(a.far, b.far)
-    return DepthMaps(near, far, torch.maximum(a.free, b.free))
+    return DepthMaps(torch.maximum(a.near, b.near), torch.minimum(a.far, b.far))
 
 
 def depth_term(
@@ -368,9 +364,7 @@ def _by_region(parts: Tensor) -> Tensor:
 # Departure: each person may float or sink by one offset, which absorbs a wrong depth of the body; a
 #            weak prior keeps the tilt that the feet cannot constrain where the first guess had it.
 
-TILT_TAIL = (
-    2.0  # degrees of freedom of the tilt's prior: small changes are squared, large ones forgiven
-)
+TILT_TAIL = 2.0  # degrees of freedom of the prior of the tilt, which forgives large changes
 
 
 @record

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mover.core.devices import stepper
 from mover.core.observe import Energy, Observer, PerItem, Step, silent
 from mover.core.records import map_tensors
 from mover.energy.config import Adam, BodyWeights, SceneWeights
@@ -22,7 +21,7 @@ BETA1 = 0.9  # memory of the gradient
 
 
 def geman_mcclure(residual: Float[Tensor, "*any"], rho: float) -> Float[Tensor, "*any"]:
-    """Robust price r^2 / (r^2 + rho^2) in [0, 1); one half where |r| = rho."""
+    """Robust cost r^2 / (r^2 + rho^2) in [0, 1); one half where |r| = rho."""
     squared = residual.square()
     return squared / (squared + rho**2)
 
@@ -41,7 +40,7 @@ class Term(Generic[S]):
     cost: Callable[[S], PerItem]
     """What a state costs, before its weight."""
     word: str
-    """What it is to people, after "told by" and "without"."""
+    """What it is to people, after "held by" and "without"."""
     needs: tuple[str, ...] = ()
     """Names of the evidence without which it says nothing."""
     fused: bool = False
@@ -95,8 +94,6 @@ def minimize(
     method: Adam,
     observe: Observer = silent,
     stage: str = "",
-    *,
-    still: bool = False,
 ) -> Minimum[P]:
     """Follow the gradient of `energy` from `start`.
 
@@ -108,16 +105,13 @@ def minimize(
         method: How.
         observe: Told of every step.
         stage: Name for those who watch, and for errors.
-        still: The energy asks the host for nothing and makes no choice by its numbers, so that on
-            a GPU a step is recorded once and replayed (`devices.Replay`).
 
     Raises:
         ValueError: If the energy stops being finite.
     """
     free = _Unknowns(start, method)
-    step = stepper(lambda: free.step(energy), free.at.device, still=still)
     for index in range(method.steps):
-        value = step()
+        value = free.step(energy)
         observe(Step(stage, index, method.steps, value, lambda: free.record))
     with torch.no_grad():
         last = energy(free.record).per_item
@@ -132,10 +126,7 @@ def minimize(
 
 
 class _Unknowns(Generic[P]):
-    """All fields of a record in one piece of memory, and all that a step reads and changes.
-
-    Nothing of it moves, and a step asks the host for nothing, so that a GPU can replay it.
-    """
+    """All fields of a record in one tensor, and all that a step reads and changes."""
 
     trace: Tensor
     """Total energy before each step."""

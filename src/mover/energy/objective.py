@@ -316,7 +316,7 @@ def of_objects(evidence: E, index: Rows, count: int) -> E:
 
 
 def without_meshes(objects: Objects) -> Objects:
-    """The objects as boxes alone: what a layout is priced by where nothing is drawn or touched."""
+    """The objects as boxes alone: enough for terms that draw and touch nothing."""
     none = torch.zeros(0).to(objects.supports)
     return rows_of(objects, none, "verts", "faces", "edges", "samples", "region")
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from mover.core.observe import Energy
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights
-from mover.energy.fused.launch import FusedEnergy, fused_cost
-from mover.energy.fused.pack import FUSED, kernel_of, real_parts
+from mover.energy.fused.launch import FUSED, FusedEnergy, fused_cost
+from mover.energy.fused.pack import kernel_of, real_parts
 from mover.energy.human_terms import trees_of
 from mover.energy.objective import (
     SCENE_TERMS,
@@ -28,7 +28,7 @@ from mover.geometry.raster import engine
 
 @runtime_checkable
 class EnergyOf(Protocol):
-    """Eq. 1 of a layout, and of the camera's rotation if it is another than was told."""
+    """Eq. 1 of a layout, and of the camera's rotation if it is another."""
 
     def __call__(
         self, layout: Layout, R_cam_world: Float[Tensor, "3 3"] | None = None, /
@@ -79,12 +79,12 @@ def energy_of_rows(
 
 
 def _by_kernel(
-    priced: tuple[FusedEnergy, SceneWeights],
+    weighted: tuple[FusedEnergy, SceneWeights],
     layout: Layout,
     rows: Rows | None,
     turn: Tensor | None,
 ) -> Energy:
-    kernel, weights = priced
+    kernel, weights = weighted
     at = layout.t_world_object, layout.yaw, layout.log_scale
     whole, parts = fused_cost(kernel, *at, rows, turn)
     each = zip(FUSED, parts.unbind(-1), strict=True)
@@ -108,16 +108,8 @@ def fused_energy(known: SceneEvidence, config: SceneConfig) -> FusedEnergy | Non
     return kernel_of(known.objects, known.camera, known.image, humans, config)
 
 
-def never_asks(objects: Objects) -> bool:
-    """Whether Eq. 1 of such objects asks the host for nothing, so that a GPU can replay it.
-
-    That is so where Warp draws: torch alone draws by lists whose lengths the host must know.
-    """
-    return engine() == "warp" and objects.verts.dtype == torch.float32
-
-
 def _once(humans: HumanCues) -> bool:
-    """Whether the touched objects are told one after the other."""
+    """Whether the touched objects come one after the other."""
     touched = None if humans.touches is None else humans.touches.object_of
     return touched is None or len(touched.unique()) == len(touched)
 
@@ -147,7 +139,7 @@ def _pinhole(K: Tensor) -> bool:
 
 
 def _closed(objects: Objects) -> bool:
-    """Whether each edge lies between two faces that turn alike, as `topology.edges_of` has it."""
+    """Whether each edge lies between two faces of like direction (`topology.edges_of`)."""
     _, faces, edges = real_parts(objects)
     if not bool((2 * edges.sum(-1) == 3 * faces.sum(-1)).all()) or not bool(faces.any(-1).all()):
         return False

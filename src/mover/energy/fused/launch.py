@@ -13,18 +13,24 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from mover.energy.objective import SCENE_TERMS
 from mover.geometry.raster.draw import scratch_of
 from mover.geometry.warp_start import array, filled, kernels, share, started, threads
 
 KERNELS = "mover.energy.fused.kernels"
 BORDER = 1  # [px], as in the rasterisers
-TERMS = 8
-IMAGE = [0, 1, 3]  # box, silhouette and depth order: what changes with the camera
-FIRST = 3  # place of the first item among the arguments of the kernel
+FUSED = tuple(t.name for t in SCENE_TERMS if t.fused)
+"""Terms of the kernel, in the order of `kernels.data.BBOX` and those after it."""
+TERMS = len(FUSED)
+IMAGE = [FUSED.index(name) for name in ("bbox", "silhouette", "depth")]  # change with the camera
+UNKNOWNS = 7  # of an item: position, yaw, logarithms of the scale
+YAW, TURN_X, TURN_Z = 3, 7, 8  # columns of `kernels.data.Slope`
+SLOPES = 9
+FIRST = 3  # position of the first item among the arguments of the kernel
 
 
 @dataclass(frozen=True)
-class Room:
+class BufferSize:
     """What one item needs at most."""
 
     verts: int
@@ -42,12 +48,12 @@ class Room:
 class FusedEnergy:
     """The kernel and its memory, for layouts of one evidence; it is used by one at a time."""
 
-    given: Any
-    """`kernels.given.Given`."""
-    room: Room
+    data: Any
+    """`kernels.data.KernelInput`."""
+    size: BufferSize
     effort: Tensor
     """How much work each object is, roughly."""
-    asked: int
+    queries: int
     """Number of skin points that ask what they touch."""
     camera: Tensor
     """From the world to the camera, where nothing else is asked for."""
@@ -113,9 +119,9 @@ class _Cost(torch.autograd.Function):
         rows = torch.arange(len(flat)) if rows is None else rows
         with fused.lock:
             fused.turn.copy_(fused.camera if turn is None else turn)
-            held = _run(fused, flat, rows)
-            ctx.save_for_backward(held.slope[rows], held.slopes[rows], flat[:, :3], turn)
-            whole, parts = held.whole[rows], held.parts[rows]
+            buffers = _run(fused, flat, rows)
+            ctx.save_for_backward(buffers.slope[rows], buffers.slopes[rows], flat[:, :3], turn)
+            whole, parts = buffers.whole[rows], buffers.parts[rows]
         ctx.set_materialize_grads(False)
         return whole.view(axes), parts.view(*axes, -1)
 
@@ -129,9 +135,9 @@ class _Cost(torch.autograd.Function):
         whole, parts = grads
         found = None
         if whole is not None:
-            found = whole.unsqueeze(-1) * slope[:, :7].view(*whole.shape, -1)
+            found = whole.unsqueeze(-1) * slope[:, :UNKNOWNS].view(*whole.shape, -1)
         if parts is not None:
-            more = (parts.unsqueeze(-1) * slopes[..., :7].view(*parts.shape, -1)).sum(-2)
+            more = (parts.unsqueeze(-1) * slopes[..., :UNKNOWNS].view(*parts.shape, -1)).sum(-2)
             found = more if found is None else found + more
         if turn is None:
             return found, None, None, None
@@ -148,7 +154,7 @@ def _of_camera(slopes: Tensor, place: Tensor, turn: Tensor) -> Tensor:
     dE = w . sum X x F = < R [sum X x F] / 2, dR >.
     """
     pull = slopes.sum(1)
-    arm = torch.cross(place, pull[:, :3], dim=-1) + pull[:, [7, 3, 8]]
+    arm = torch.cross(place, pull[:, :3], dim=-1) + pull[:, [TURN_X, YAW, TURN_Z]]
     x, y, z = arm.sum(0).unbind()
     none = torch.zeros_like(x)
     skew = torch.stack([none, -z, y, z, none, -x, -y, x, none]).view(3, 3)
@@ -158,33 +164,33 @@ def _of_camera(slopes: Tensor, place: Tensor, turn: Tensor) -> Tensor:
 def _run(fused: FusedEnergy, layout: Tensor, rows: Tensor) -> _Buffers:
     """Sum these rows, the largest objects first, on as many threads as are wanted."""
     count = min(threads(), max(len(rows), 1))
-    held = _seated(fused, rows, count)
-    held.layout[rows] = layout
+    buffers = _acquire(fused, rows, count)
+    buffers.layout[rows] = layout
     todo = iter(_chunks(len(rows), count))
 
     def work(thread: int) -> None:
-        launch = held.launches[thread]
+        launch = buffers.launches[thread]
         for first, stop in todo:
             for k, value in ((FIRST, first), (FIRST + 1, stop)):
                 launch.set_param_at_index_from_ctype(k, value)
             launch.launch()
 
     share(work, count)
-    return held
+    return buffers
 
 
-def _seated(fused: FusedEnergy, rows: Tensor, count: int) -> _Buffers:
+def _acquire(fused: FusedEnergy, rows: Tensor, count: int) -> _Buffers:
     """Memory in which these rows are next; that of the last call where it is large enough."""
     need = int(rows.max()) + 1 if len(rows) else 0
-    held = next(iter(fused.buffers), None)
-    if held is None or len(held.layout) < need or len(held.launches) < count:
-        held = _buffers_of(fused, need, count)
-        fused.buffers[:] = [held]
-    if not held.rows or not torch.equal(held.rows[0], rows):
+    buffers = next(iter(fused.buffers), None)
+    if buffers is None or len(buffers.layout) < need or len(buffers.launches) < count:
+        buffers = _buffers_of(fused, need, count)
+        fused.buffers[:] = [buffers]
+    if not buffers.rows or not torch.equal(buffers.rows[0], rows):
         effort = fused.effort[rows % max(1, len(fused.effort))]
-        held.order[: len(rows)] = rows[effort.argsort(descending=True, stable=True)]
-        held.rows[:] = [rows.clone()]
-    return held
+        buffers.order[: len(rows)] = rows[effort.argsort(descending=True, stable=True)]
+        buffers.rows[:] = [rows.clone()]
+    return buffers
 
 
 def _chunks(items: int, threads: int) -> list[tuple[int, int]]:
@@ -199,24 +205,24 @@ def _chunks(items: int, threads: int) -> list[tuple[int, int]]:
 
 def _buffers_of(fused: FusedEnergy, items: int, count: int) -> _Buffers:
     """Memory for so many items, and so many launches."""
-    from mover.energy.fused.kernels.given import Answer
+    from mover.energy.fused.kernels.data import ItemCosts
 
     kernel, launch = kernels("cost", "cpu", KERNELS).cost_items, started().launch
     n = max(1, len(fused.effort))
-    layout, whole = torch.empty(items, 7), torch.empty(items)
-    parts, slope = torch.empty(items, TERMS), torch.empty(items, 9)
-    slopes = torch.empty(items, TERMS, 9)
+    layout, whole = torch.empty(items, UNKNOWNS), torch.empty(items)
+    parts, slope = torch.empty(items, TERMS), torch.empty(items, SLOPES)
+    slopes = torch.empty(items, TERMS, SLOPES)
     order = torch.zeros(items, dtype=torch.int32)
-    held = torch.full((max(1, fused.asked * -(-items // n)),), -1, dtype=torch.int32)
-    fused.given.people.held = array(held, "int32")
+    nearest = torch.full((max(1, fused.queries * -(-items // n)),), -1, dtype=torch.int32)
+    fused.data.people.nearest = array(nearest, "int32")
     answer = filled(
-        Answer, order=order, layout=layout, parts=parts, slopes=slopes, whole=whole, slope=slope
+        ItemCosts, order=order, layout=layout, parts=parts, slopes=slopes, whole=whole, slope=slope
     )
     launches = tuple(
         launch(
             kernel,
             1,
-            [fused.given, _workspace(fused.room), answer, 0, 0],
+            [fused.data, _workspace(fused.size), answer, 0, 0],
             device="cpu",
             record_cmd=True,
         )
@@ -225,34 +231,34 @@ def _buffers_of(fused: FusedEnergy, items: int, count: int) -> _Buffers:
     return _Buffers([], order, layout, parts, slopes, whole, slope, launches)
 
 
-def _workspace(room: Room) -> Any:  # noqa: ANN401
-    """`kernels.given.Workspace` of a thread."""
-    from mover.energy.fused.kernels.given import Workspace
+def _workspace(size: BufferSize) -> Any:  # noqa: ANN401
+    """`kernels.data.Workspace` of a thread."""
+    from mover.energy.fused.kernels.data import Workspace
     from mover.geometry.kernels.scene import Scene
 
-    grid = room.height * room.width
+    grid = size.height * size.width
     space, scene = Workspace(), Scene()
-    scene.verts = array(torch.zeros(room.verts, 3), "vec3")
+    scene.verts = array(torch.zeros(size.verts, 3), "vec3")
     scene.window = array(torch.zeros(1, 4), "vec4")
     scene.views = scene.shapes = 1
-    scene.n_verts, scene.n_faces, scene.n_edges = room.verts, room.faces, room.edges
-    scene.height, scene.width, scene.border = room.height, room.width, BORDER
-    sizes = room.verts, room.faces, room.edges, grid, 2 * grid
+    scene.n_verts, scene.n_faces, scene.n_edges = size.verts, size.faces, size.edges
+    scene.height, scene.width, scene.border = size.height, size.width, BORDER
+    sizes = size.verts, size.faces, size.edges, grid, 2 * grid
     space.scene, space.scratch = scene, scratch_of(sizes)
-    _marks(space, room)
+    _marks(space, size)
     space.pairs = array(torch.empty(2 * grid, dtype=torch.int32), "int32")
     space.keys = array(torch.empty(2 * grid, dtype=torch.int64), "uint64")
     space.crossings = array(torch.empty(2 * grid, 4), "vec4")
     space.shift = array(torch.zeros(grid), "float32")
     space.moved = array(torch.zeros(2 * grid), "float32")
-    space.squares = array(torch.zeros(room.shifts, dtype=torch.float64), "float64")
+    space.squares = array(torch.zeros(size.shifts, dtype=torch.float64), "float64")
     return space
 
 
-def _marks(space: Any, room: Room) -> None:  # noqa: ANN401
+def _marks(space: Any, size: BufferSize) -> None:  # noqa: ANN401
     """The memory of what is covered; two arrays are one, seen by bytes and by words."""
-    space.stride, space.across = (room.width // 8 + 1) * 8, -(-room.width // 64)
-    words = torch.zeros(room.height * space.stride // 8, dtype=torch.int64)
+    space.stride, space.across = (size.width // 8 + 1) * 8, -(-size.width // 64)
+    words = torch.zeros(size.height * space.stride // 8, dtype=torch.int64)
     space.words, space.steps = array(words, "uint64"), array(words.view(torch.uint8), "uint8")
-    bits = torch.zeros(2, room.height * space.across, dtype=torch.int64)
+    bits = torch.zeros(2, size.height * space.across, dtype=torch.int64)
     space.seen, space.behind = (array(b, "uint64") for b in bits)

@@ -8,65 +8,65 @@ from torch import Tensor
 from mover.core.types import Camera, Objects
 from mover.energy import human_terms, image_terms, prior_terms
 from mover.energy.config import SceneConfig, SceneWeights
-from mover.energy.fused.launch import BORDER, FusedEnergy, Room
-from mover.energy.objective import SCENE_TERMS, HumanCues, ImageCues
+from mover.energy.fused.launch import BORDER, FUSED, BufferSize, FusedEnergy
+from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.nearest_warp import packed
 from mover.geometry.volume import Volume, field_of
 from mover.geometry.warp_start import array, started
 
 BRICK = 8  # [cells], as in `Volume.busy`
 CALM = 2  # a brick without bodies, as in `kernels.simple`
-FUSED = tuple(t.name for t in SCENE_TERMS if t.fused)
-"""Terms of the kernel, in the order of `kernels.given.BBOX` and those after it."""
 
 
 def kernel_of(
     objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
 ) -> FusedEnergy:
     """The kernel of Eq. 1 with all that it needs to know."""
-    from mover.energy.fused.kernels.given import Given
+    from mover.energy.fused.kernels.data import KernelInput
 
     wp, weights = started(), config.weights
-    asked, share, ends = _asked(objects, humans, weights)
+    queries, share, ends = _queries(objects, humans, weights)
     things, counts = _things(objects, ends)
-    given = Given()
-    given.things = things
-    given.windows = _windows(image, humans, weights)
-    given.people = _people(humans, weights, asked, share)
-    given.boxes = array(image.boxes.contiguous(), "vec4")
-    given.within = array((image.sides != image_terms.UNKNOWN).float(), "vec4")
-    prices = torch.tensor([0.0, torch.inf, 0.0, image_terms.HIDDEN])  # by what is known of a side
-    given.beyond = array(prices[image.sides], "vec4")
-    given.facts = wp.from_torch(_facts(objects, image, humans, weights))
+    data = KernelInput()
+    data.things = things
+    data.windows = _windows(image, humans, weights)
+    data.people = _people(humans, weights, queries, share)
+    data.boxes = array(image.boxes.contiguous(), "vec4")
+    data.within = array((image.sides != image_terms.UNKNOWN).float(), "vec4")
+    costs = torch.tensor([0.0, torch.inf, 0.0, image_terms.HIDDEN])  # by what is known of a side
+    data.beyond = array(costs[image.sides], "vec4")
+    data.facts = wp.from_torch(_facts(objects, image, humans, weights))
     turn = camera.R_cam_world.detach().clone()
-    given.turn = array(turn[None], "mat33")
+    data.turn = array(turn[None], "mat33")
     K = camera.K.tolist()
-    given.lens = wp.vec4(K[0][0], K[1][1], K[0][2], K[1][2])
-    given.weights = tuple(getattr(weights, name) for name in FUSED)
-    given.soft, given.rho = image_terms.SOFT, prior_terms.DISTANCE_RHO
-    given.sizes, given.growth = (prior_terms.LOWEST, prior_terms.HIGHEST), config.growth
+    data.lens = wp.vec4(K[0][0], K[1][1], K[0][2], K[1][2])
+    data.weights = tuple(getattr(weights, name) for name in FUSED)
+    data.soft, data.rho = image_terms.SOFT, prior_terms.DISTANCE_RHO
+    data.sizes, data.growth = (prior_terms.LOWEST, prior_terms.HIGHEST), config.growth
     views = image.views
     verts, faces, edges = (int(c.max()) for c in counts)
     shifts = 1 if image.borders is None else len(image.borders.shifts)
-    room = Room(verts, faces, edges, views.height + 2 * BORDER, views.width + 2 * BORDER, shifts)
-    return FusedEnergy(given, room, counts[1], len(asked), camera.R_cam_world, turn)
+    size = BufferSize(
+        verts, faces, edges, views.height + 2 * BORDER, views.width + 2 * BORDER, shifts
+    )
+    return FusedEnergy(data, size, counts[1], len(queries), camera.R_cam_world, turn)
 
 
-def _things(objects: Objects, asked: Tensor) -> tuple[Any, list[Tensor]]:
+def _things(objects: Objects, queries: Tensor) -> tuple[Any, list[Tensor]]:
     """The objects without padding, and how many vertices, faces and edges each has."""
-    from mover.energy.fused.kernels.given import Things
+    from mover.energy.fused.kernels.data import ObjectData
 
     real = real_parts(objects)
     counts = [r.sum(-1) for r in real]
     n, samples = objects.samples.shape[:2]
     per = torch.full((n,), samples)
     starts = [torch.cat([c.new_zeros(1), c.cumsum(0)]) for c in (*counts, per)]
-    things = Things()
+    things = ObjectData()
     things.verts = array(objects.verts.detach()[real[0]], "vec3")
     things.faces = array(objects.faces[real[1]].int(), "vec3i")
     things.edges = array(objects.edges[real[2]].int(), "vec4i")
     things.samples = array(objects.samples.detach().reshape(-1, 3).contiguous(), "vec3")
-    things.starts = started().from_torch(torch.stack([*starts, asked], -1).int().contiguous())
+    things.starts = started().from_torch(torch.stack([*starts, queries], -1).int().contiguous())
     return things, counts
 
 
@@ -81,9 +81,9 @@ def real_parts(objects: Objects) -> list[Tensor]:
 
 
 def _windows(image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Any:  # noqa: ANN401
-    from mover.energy.fused.kernels.given import Windows
+    from mover.energy.fused.kernels.data import ImageData
 
-    views, windows = image.views, Windows()
+    views, windows = image.views, ImageData()
     K = views.K.detach()
     lens = torch.stack([K[:, 0, 0], K[:, 1, 1], K[:, 0, 2] + BORDER, K[:, 1, 2] + BORDER], -1)
     mask, keep = image.masks.detach(), image.keep.to(image.masks)
@@ -140,10 +140,10 @@ def _range(known: Tensor) -> Tensor:
     return torch.stack([first, torch.where(known, number + 1, 0).amax(1)], -1) + BORDER
 
 
-def _asked(
+def _queries(
     objects: Objects, humans: HumanCues, weights: SceneWeights
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Skin that touches, object by object; its share in the price; where each object begins."""
+    """Skin that touches, object by object; its share in the cost; where each object begins."""
     n, touches = len(objects.ids), humans.touches
     if touches is None or not weights.contact:
         none = torch.zeros(1, 3)
@@ -162,11 +162,11 @@ def _asked(
     return few, shares, count.cumsum(0)
 
 
-def _people(humans: HumanCues, weights: SceneWeights, asked: Tensor, share: Tensor) -> Any:  # noqa: ANN401
-    from mover.energy.fused.kernels.given import People
+def _people(humans: HumanCues, weights: SceneWeights, queries: Tensor, share: Tensor) -> Any:  # noqa: ANN401
+    from mover.energy.fused.kernels.data import HumanData
 
-    people = People()
-    people.asked, people.share = array(asked, "vec3"), array(share, "float32")
+    people = HumanData()
+    people.queries, people.share = array(queries, "vec3"), array(share, "float32")
     people.rho = human_terms.CONTACT_RHO
     if weights.contact and humans.trees is not None:
         people.top, people.back = packed(humans.trees.top), packed(humans.trees.back)
@@ -176,7 +176,7 @@ def _people(humans: HumanCues, weights: SceneWeights, asked: Tensor, share: Tens
 
 
 def _field(volume: Volume) -> Any:  # noqa: ANN401
-    """The volume, with bricks without bodies told apart."""
+    """The volume, with bricks without bodies marked."""
     some = volume.values[::BRICK, ::BRICK, ::BRICK]
     x, y, z = volume.busy.shape
     calm = (volume.busy == 0) & (some[:x, :y, :z] >= 0)
@@ -184,7 +184,7 @@ def _field(volume: Volume) -> Any:  # noqa: ANN401
 
 
 def _facts(objects: Objects, image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Tensor:
-    """See `kernels.given.SIZE` and those after it."""
+    """See `kernels.data.SIZE` and those after it."""
     n, boxes = len(objects.ids), image.boxes
     share = human_terms.collision_share(objects, humans.touches if weights.contact else None)
     facts = torch.zeros(n, 6)

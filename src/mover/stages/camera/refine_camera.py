@@ -25,7 +25,7 @@ from mover.core.observe import Energy, Observer, silent
 from mover.core.records import map_tensors, record
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights
-from mover.energy.fused.energy import energy_function, never_asks
+from mover.energy.fused.energy import energy_function
 from mover.energy.minimize import minimize
 from mover.energy.objective import HumanCues, ImageCues, best_borders
 from mover.geometry.camera import pitch_roll, tilted, to_camera
@@ -124,8 +124,7 @@ def refine_camera(
 
     if not bool(usable.any()):
         return Refined(inputs.camera, inputs.ground, torch.zeros(0))
-    still = never_asks(inputs.objects)
-    found = minimize(energy, zero, config.method, observe, "refine_camera", still=still)
+    found = minimize(energy, zero, config.method, observe, "refine_camera")
     joint = _shift(fixed, found.at)
     camera, _ = _unpack(joint, inputs)
     return Refined(camera, float(joint.tilt[2]), found.trace)

@@ -122,17 +122,15 @@ def gather_depth(
     """
     views = small_views(sight.camera)
     blank, lock = torch.full((views.height, views.width), float("inf")), Lock()
-    maps = DepthMaps(-blank, blank, -blank)
+    maps = DepthMaps(-blank, blank)
     rows = sight.telling
 
     def add(block: list[int]) -> int:
         for window, found in _bounds(sight, block):
             with lock:  # the least and the greatest do not depend on the order
-                before = DepthMaps(maps.near[window], maps.far[window], maps.free[window])
+                before = DepthMaps(maps.near[window], maps.far[window])
                 kept = merge(before, found)
-                maps.near[window], maps.far[window], maps.free[window] = (
-                    kept.near, kept.far, kept.free,
-                )  # fmt: skip
+                maps.near[window], maps.far[window] = kept.near, kept.far
         return len(block)
 
     done = 0

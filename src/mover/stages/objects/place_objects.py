@@ -8,11 +8,11 @@ from torch import Tensor
 
 from mover.core.observe import Energy, Observer, silent
 from mover.core.types import Layout
+from mover.energy.bfgs import Problems, minimize_batched
 from mover.energy.config import Adam, BatchedBFGS, SceneConfig
-from mover.energy.fused.energy import energy_function, energy_of_rows, never_asks
+from mover.energy.fused.energy import energy_function, energy_of_rows
 from mover.energy.human_terms import trees_of
 from mover.energy.minimize import Minimum, minimize
-from mover.energy.newton import Problems, settle
 from mover.energy.objective import of_objects, some_supports
 from mover.geometry.placement import rest_on_support
 from mover.stages.config import PlaceConfig
@@ -85,11 +85,11 @@ def descend(
 ) -> Minimum[Layout]:
     """Follow the energy from each start; the result stands on its supports."""
     if isinstance(method, BatchedBFGS):
-        found = settle(_problems(inputs, config, starts), method, observe, "place_objects")
+        problems = _problems(inputs, config, starts)
+        found = minimize_batched(problems, method, observe, "place_objects")
     else:
         energy = energy_of(inputs, config)
-        still = never_asks(inputs.objects)
-        found = minimize(energy, starts, method, observe, "place_objects", still=still)
+        found = minimize(energy, starts, method, observe, "place_objects")
     return Minimum(standing(inputs, found.at), found.value, found.trace)
 
 

@@ -14,7 +14,6 @@ from torch import Tensor
 from mover.core.observe import Energy, Observer, silent
 from mover.core.types import Layout, Objects
 from mover.energy.config import Adam
-from mover.energy.fused.energy import never_asks
 from mover.energy.minimize import minimize
 from mover.energy.prior_terms import apart_term, gather_solids
 from mover.geometry.boxes import Box, corners
@@ -54,8 +53,7 @@ def separate_objects(
     def together(free: Layout) -> Energy:
         return Energy({"alone": energy(free[None]).per_item[0], "apart": weight * shared(free)})
 
-    still = never_asks(objects)
-    found = minimize(together, layout, METHOD, observe, "place_objects", still=still).at
+    found = minimize(together, layout, METHOD, observe, "place_objects").at
     return Layout.where(_pushed(shared, layout) | _pushed(shared, found), found, layout)
 
 

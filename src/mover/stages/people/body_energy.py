@@ -10,12 +10,24 @@ from torch import Tensor
 from mover.bodies.corrected import Correction, Moved, Puppet, moved
 from mover.core.observe import Energy
 from mover.core.types import Camera
-from mover.energy.body_terms.contact import Matches, touch_term
-from mover.energy.body_terms.order import Bounds, order_term
-from mover.energy.body_terms.outline import Outline, outline_term
-from mover.energy.body_terms.room import sink_term, stand_term, under_term
-from mover.energy.body_terms.start import angle_term, depth_share, image_term, range_term
-from mover.energy.body_terms.time import Neighbours, lock_term, smooth_term, steady_term
+from mover.energy.body_contact import Matches, touch_term
+from mover.energy.body_terms import (
+    Bounds,
+    Neighbours,
+    Outline,
+    angle_term,
+    depth_share,
+    image_term,
+    lock_term,
+    order_term,
+    outline_term,
+    range_term,
+    sink_term,
+    smooth_term,
+    stand_term,
+    steady_term,
+    under_term,
+)
 from mover.energy.config import BodyWeights
 from mover.energy.minimize import Term, active_weights, sum_terms, there
 from mover.geometry.camera import to_camera
@@ -135,7 +147,7 @@ BODY_TERMS: tuple[Term[MovedBodies], ...] = (
         "its outline", ("outline",),
     ),
 )  # fmt: skip
-"""All terms of the bodies' energy; a new one is a file in `body_terms`, a weight and a row."""
+"""All terms of the energy of the bodies; a new one is a function, a weight and a row."""
 
 
 def body_energy(

@@ -12,8 +12,8 @@ from mover.bodies.posture import speeds
 from mover.bodies.skin import PARTS
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Capture, Mesh, People, Room
-from mover.energy.body_terms.contact import Surface
-from mover.energy.body_terms.order import Bounds, Sighting, bounds_of_skin
+from mover.energy.body_contact import Surface
+from mover.energy.body_terms import Bounds, Sighting, bounds_of_skin
 from mover.geometry.camera import project, to_camera
 from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place_object

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.types import Camera
-from mover.energy.body_terms.outline import POINTS, Outline
+from mover.energy.body_terms import OUTLINE_POINTS, Outline
 from mover.geometry.camera import project
 from mover.geometry.raster import Crops, layers
 from mover.stages.contacts.assign_contacts import evenly
@@ -101,7 +101,7 @@ def _compare(
     pixel = torch.stack([x, y], -1).float().add(0.5) / zoom + window[1][:2]
     skin = project(seen.skin[k], seen.camera.K.to(seen.skin))
     carrier = torch.cdist(pixel, skin.float()).argmin(-1)
-    weight = torch.full_like(gap[some], POINTS / len(some))
+    weight = torch.full_like(gap[some], OUTLINE_POINTS / len(some))
     return Outline(
         torch.full_like(carrier, k), carrier, skin[carrier].float(), normal[:, y, x].mT,
         gap[some], weight,

@@ -24,7 +24,7 @@ from mover.bodies.posture import Postures, postures
 from mover.bodies.skeleton import BODY
 from mover.bodies.smpl_model import vertex_subset
 from mover.core.types import Bodies
-from mover.energy.body_terms.time import Neighbours, gather_neighbours
+from mover.energy.body_terms import Neighbours, gather_neighbours
 from mover.stages.people.body_evidence import resting_soles
 
 ALONG, ACROSS = 0.015, 0.005  # [m], how far a body may be off in depth or height, and to the side

@@ -28,11 +28,8 @@ from mover.core.errors import InputError
 from mover.core.observe import Observer, silent
 from mover.core.records import map_tensors, record, rows_of, with_rows
 from mover.core.types import Bodies, Capture, Room
-from mover.energy.body_terms.contact import Matches, Skin, gather_matches
-from mover.energy.body_terms.order import Bounds
-from mover.energy.body_terms.outline import Outline
-from mover.energy.body_terms.start import ANGLE
-from mover.energy.body_terms.time import gather_neighbours
+from mover.energy.body_contact import Matches, Skin, gather_matches
+from mover.energy.body_terms import ANGLE, Bounds, Outline, gather_neighbours
 from mover.energy.config import BodyWeights, MatchConfig
 from mover.energy.minimize import minimize
 from mover.geometry.camera import to_camera

@@ -7,7 +7,7 @@ cut by rows as in `spans`.
 
 import warp as wp
 
-from mover.energy.fused.kernels.given import EDGES, FACES, VERTS, Given, Pose, Workspace
+from mover.energy.fused.kernels.data import EDGES, FACES, VERTS, KernelInput, Pose, Workspace
 from mover.geometry.camera import NEAR
 from mover.geometry.kernels.spans import is_above, on_screen, side, signed_area
 
@@ -32,18 +32,18 @@ class Extent:
 
 
 @wp.func
-def put(given: Given, work: Workspace, p: Pose) -> Extent:
+def put(data: KernelInput, work: Workspace, p: Pose) -> Extent:
     """Put the vertices before the camera and on the screen."""
     low = wp.vec2(FAR, FAR)
     high = wp.vec2(-FAR, -FAR)
     least = wp.vec2(FAR, FAR)
     most = wp.vec2(-FAR, -FAR)
     e = Extent()
-    lens = given.windows.lens[p.thing]
+    lens = data.windows.lens[p.thing]
     work.scene.window[0] = lens
-    first = given.things.starts[p.thing, VERTS]
-    for v in range(given.things.starts[p.thing + 1, VERTS] - first):
-        at = p.view * wp.cw_mul(given.things.verts[first + v], p.scale) + p.origin
+    first = data.things.starts[p.thing, VERTS]
+    for v in range(data.things.starts[p.thing + 1, VERTS] - first):
+        at = p.view * wp.cw_mul(data.things.verts[first + v], p.scale) + p.origin
         work.scene.verts[v] = at
         s = on_screen(at, lens)
         work.scratch.screen[v] = s
@@ -71,12 +71,12 @@ def put(given: Given, work: Workspace, p: Pose) -> Extent:
 
 
 @wp.func
-def face_all(given: Given, work: Workspace, p: Pose) -> int:
+def face_all(data: KernelInput, work: Workspace, p: Pose) -> int:
     """Tell fronts from backs; the number of faces that are neither."""
     neither = int(0)
-    first = given.things.starts[p.thing, FACES]
-    for f in range(given.things.starts[p.thing + 1, FACES] - first):
-        face = given.things.faces[first + f]
+    first = data.things.starts[p.thing, FACES]
+    for f in range(data.things.starts[p.thing + 1, FACES] - first):
+        face = data.things.faces[first + f]
         area = signed_area(
             work.scratch.screen[face[0]],
             work.scratch.screen[face[1]],
@@ -114,12 +114,12 @@ def wall(work: Workspace, i: int, j: int) -> None:
 
 
 @wp.func
-def walls(given: Given, work: Workspace, p: Pose, side: wp.int8) -> int:
+def walls(data: KernelInput, work: Workspace, p: Pose, side: wp.int8) -> int:
     """Enter the outline of the fronts, or of the backs; the number of its edges, in `queue`."""
     n = int(0)
-    first = given.things.starts[p.thing, EDGES]
-    for e in range(given.things.starts[p.thing + 1, EDGES] - first):
-        edge = given.things.edges[first + e]
+    first = data.things.starts[p.thing, EDGES]
+    for e in range(data.things.starts[p.thing + 1, EDGES] - first):
+        edge = data.things.edges[first + e]
         one = work.scratch.front[edge[2]] == side
         if one != (work.scratch.front[edge[3]] == side):
             if one == (side == FRONT):
@@ -133,7 +133,7 @@ def walls(given: Given, work: Workspace, p: Pose, side: wp.int8) -> int:
 
 @wp.func
 def flood(
-    given: Given, work: Workspace, p: Pose, box: wp.vec4i, bits: wp.array(dtype=wp.uint64)
+    data: KernelInput, work: Workspace, p: Pose, box: wp.vec4i, bits: wp.array(dtype=wp.uint64)
 ) -> None:
     """Mark what the outline encloses, and take it down; add what that changes to `squares`.
 
@@ -158,17 +158,17 @@ def flood(
                             begin = column
                         if after == 0:
                             mark(bits, row * work.across, begin, column)
-                            add(given, work, start + begin, start + column)
+                            add(data, work, start + begin, start + column)
                         layers = after
 
 
 @wp.func
-def add(given: Given, work: Workspace, begin: int, end: int) -> None:
+def add(data: KernelInput, work: Workspace, begin: int, end: int) -> None:
     """Add what covering a run of pixels changes, under each shift."""
-    things = given.things.starts.shape[0] - 1
+    things = data.things.starts.shape[0] - 1
     all_panes = things * work.scene.height * (work.scene.width + 1)
-    for i in range(given.windows.shifts.shape[0]):
-        gained = given.windows.gain[i * all_panes + end] - given.windows.gain[i * all_panes + begin]
+    for i in range(data.windows.shifts.shape[0]):
+        gained = data.windows.gain[i * all_panes + end] - data.windows.gain[i * all_panes + begin]
         work.squares[i] = work.squares[i] + gained
 
 

@@ -1,12 +1,20 @@
 """The cost of a silhouette (`image_terms`) and its gradient, from the outline alone.
 
-The pixels that the outline moves are counted anew; of the others only those that are covered.
+The pixels that the outline moves are counted again; of the others only those that are covered.
 """
 
 import warp as wp
 
 from mover.energy.fused.kernels.cover import FRONT, is_marked
-from mover.energy.fused.kernels.given import FACES, VERTS, Given, Pose, Slope, Workspace, slope_of
+from mover.energy.fused.kernels.data import (
+    FACES,
+    VERTS,
+    KernelInput,
+    Pose,
+    Slope,
+    Workspace,
+    slope_of,
+)
 from mover.geometry.kernels.contour import (
     STEEP,
     Contour,
@@ -21,18 +29,18 @@ from mover.geometry.kernels.contour import (
 
 
 @wp.func
-def edge_of_outline(given: Given, work: Workspace, p: Pose, e: int) -> Contour:
+def edge_of_outline(data: KernelInput, work: Workspace, p: Pose, e: int) -> Contour:
     """An edge between a front and what is none."""
-    edge = given.things.edges[e]
+    edge = data.things.edges[e]
     front = wp.where(work.scratch.front[edge[2]] == FRONT, edge[2], edge[3])
-    face = given.things.faces[given.things.starts[p.thing, FACES] + front]
+    face = data.things.faces[data.things.starts[p.thing, FACES] + front]
     wide = wp.vec4l(wp.int64(edge[0]), wp.int64(edge[1]), wp.int64(edge[2]), wp.int64(edge[3]))
     corners = wp.vec3l(wp.int64(face[0]), wp.int64(face[1]), wp.int64(face[2]))
     return contour(work.scene, work.scratch, 0, wide, corners)
 
 
 @wp.func
-def enter(given: Given, work: Workspace, p: Pose, edges: int) -> int:
+def enter(data: KernelInput, work: Workspace, p: Pose, edges: int) -> int:
     """List the cuts of pairs of a covered and an uncovered centre; their number.
 
     Of each pair, the outermost is remembered.
@@ -40,7 +48,7 @@ def enter(given: Given, work: Workspace, p: Pose, edges: int) -> int:
     n = int(0)
     for i in range(edges):
         e = work.scratch.queue[i]
-        c = edge_of_outline(given, work, p, e)
+        c = edge_of_outline(data, work, p, e)
         for line in range(c.first, c.last + 1):
             g = gap(work.scene, c, line)
             if g.distance >= 0.0 and parts(work, c, g, line) and n < work.pairs.shape[0]:
@@ -95,44 +103,44 @@ def on_grid(work: Workspace, pixel: int) -> int:
 
 
 @wp.func
-def pull_cuts(given: Given, work: Workspace, p: Pose, cuts: int, number: int) -> Slope:
+def pull_cuts(data: KernelInput, work: Workspace, p: Pose, cuts: int, number: int) -> Slope:
     """Change of the sum of squares under a shift, by its number, with the pose."""
     total = Slope()
     lens = work.scene.window[0]
     there = p.thing * work.scene.height * work.scene.width
-    shifted = pane_of(given, work, p, number)
-    verts = given.things.starts[p.thing, VERTS]
+    shifted = pane_of(data, work, p, number)
+    verts = data.things.starts[p.thing, VERTS]
     back = wp.transpose(p.view)
     for i in range(cuts):
         pixel = work.scratch.targets[i]
         x = work.crossings[i]
         drawn = x[3] + work.moved[i]
-        keep = given.windows.keep[there + pixel]
+        keep = data.windows.keep[there + pixel]
         if keep > 0.0 and drawn >= 0.0 and drawn <= 1.0:
             cut = work.scratch.cuts[i]
-            across = 2.0 * keep * (drawn - given.windows.mask[shifted + pixel]) * x[2]
+            across = 2.0 * keep * (drawn - data.windows.mask[shifted + pixel]) * x[2]
             along = -across * x[1]
             steep = (cut[2] & STEEP) != 0
             du = wp.where(steep, across, along) * lens[0]
             dv = wp.where(steep, along, across) * lens[1]
             a = (1.0 - x[0]) * pulled(work.scene.verts[cut[0]], du, dv)
             b = x[0] * pulled(work.scene.verts[cut[1]], du, dv)
-            arm = wp.cw_mul(given.things.verts[verts + cut[0]], p.scale)
+            arm = wp.cw_mul(data.things.verts[verts + cut[0]], p.scale)
             total += slope_of(back * a, arm)
-            arm = wp.cw_mul(given.things.verts[verts + cut[1]], p.scale)
+            arm = wp.cw_mul(data.things.verts[verts + cut[1]], p.scale)
             total += slope_of(back * b, arm)
     return total
 
 
 @wp.func
-def pane_of(given: Given, work: Workspace, p: Pose, number: int) -> int:
+def pane_of(data: KernelInput, work: Workspace, p: Pose, number: int) -> int:
     """Where the masks under a shift, by its number, begin."""
-    things = given.things.starts.shape[0] - 1
+    things = data.things.starts.shape[0] - 1
     return (number * things + p.thing) * work.scene.height * work.scene.width
 
 
 @wp.func
-def add_cuts(given: Given, work: Workspace, p: Pose, cuts: int) -> None:
+def add_cuts(data: KernelInput, work: Workspace, p: Pose, cuts: int) -> None:
     """Add what the outline changes to `squares`; what it adds to pixels is kept by cuts only."""
     for i in range(cuts):
         work.moved[i] = work.shift[work.scratch.targets[i]]
@@ -142,9 +150,9 @@ def add_cuts(given: Given, work: Workspace, p: Pose, cuts: int) -> None:
         shift = work.shift[pixel]
         if shift != 0.0:
             work.shift[pixel] = 0.0
-            keep = given.windows.keep[there + pixel]
-            for k in range(given.windows.shifts.shape[0]):
-                mask = given.windows.mask[pane_of(given, work, p, k) + pixel]
+            keep = data.windows.keep[there + pixel]
+            for k in range(data.windows.shifts.shape[0]):
+                mask = data.windows.mask[pane_of(data, work, p, k) + pixel]
                 old = work.crossings[i][3] - mask
                 new = wp.clamp(work.crossings[i][3] + shift, 0.0, 1.0) - mask
                 more = wp.float64(keep * (new * new - old * old))

@@ -3,16 +3,16 @@
 import warp as wp
 
 from mover.energy.fused.kernels.cover import Extent
-from mover.energy.fused.kernels.given import (
-    ASKED,
+from mover.energy.fused.kernels.data import (
     AWAY,
     FACE_X,
     FACE_Z,
+    QUERIES,
     SAMPLES,
     SEATED,
     SIZE,
     VERTS,
-    Given,
+    KernelInput,
     Pose,
     Slope,
     Workspace,
@@ -25,54 +25,54 @@ from mover.geometry.kernels.nearest import Query, nearest_of
 
 @wp.func
 def side_of_box(
-    given: Given, work: Workspace, p: Pose, v: int, k: int, wider: float
+    data: KernelInput, work: Workspace, p: Pose, v: int, k: int, wider: float
 ) -> tuple[float, Slope]:
     """The cost of side k of the box (x_min, y_min, x_max, y_max), at which vertex v lies."""
     axis = k % 2
     at = work.scene.verts[v]
     z = wp.max(at[2], NEAR)
-    focal = given.lens[axis]
-    size = given.facts[p.thing, SIZE]
-    soft = given.soft
-    known = given.boxes[p.thing][k] + wp.where(k < 2, -wider, wider)
-    off = (at[axis] / z * focal + given.lens[axis + 2] - known) / size
+    focal = data.lens[axis]
+    size = data.facts[p.thing, SIZE]
+    soft = data.soft
+    known = data.boxes[p.thing][k] + wp.where(k < 2, -wider, wider)
+    off = (at[axis] / z * focal + data.lens[axis + 2] - known) / size
     length = wp.sqrt(off * off + soft * soft)
     outside = off * wp.where(k < 2, -1.0, 1.0) > 0.0
-    most = wp.where(outside, given.beyond[p.thing][k], wp.inf)
+    most = wp.where(outside, data.beyond[p.thing][k], wp.inf)
     cost = length - soft
     share = wp.where(most < wp.inf, most / wp.max(most + cost, 1.0e-9), 1.0)
-    counts = given.within[p.thing][k] * share * share
+    counts = data.within[p.thing][k] * share * share
     pull = counts * off / (length * size) * focal / z
     force = wp.vec3(0.0, 0.0, wp.where(at[2] >= NEAR, -at[axis] / z * pull, 0.0))
     force[axis] = pull
-    arm = wp.cw_mul(given.things.verts[given.things.starts[p.thing, VERTS] + v], p.scale)
+    arm = wp.cw_mul(data.things.verts[data.things.starts[p.thing, VERTS] + v], p.scale)
     slope = slope_of(wp.transpose(p.view) * force, arm)
-    return given.within[p.thing][k] * share * cost, slope
+    return data.within[p.thing][k] * share * cost, slope
 
 
 @wp.func
 def box_cost(
-    given: Given, work: Workspace, p: Pose, e: Extent, wider: float
+    data: KernelInput, work: Workspace, p: Pose, e: Extent, wider: float
 ) -> tuple[float, Slope]:
     """How far the drawn box is from the detected one, whose sides are farther out by `wider`."""
-    a, da = side_of_box(given, work, p, e.left, 0, wider)
-    b, db = side_of_box(given, work, p, e.top, 1, wider)
-    c, dc = side_of_box(given, work, p, e.right, 2, wider)
-    d, dd = side_of_box(given, work, p, e.bottom, 3, wider)
+    a, da = side_of_box(data, work, p, e.left, 0, wider)
+    b, db = side_of_box(data, work, p, e.top, 1, wider)
+    c, dc = side_of_box(data, work, p, e.right, 2, wider)
+    d, dd = side_of_box(data, work, p, e.bottom, 3, wider)
     return a + b + c + d, da + db + dc + dd
 
 
 @wp.func
-def scale_cost(given: Given, logs: wp.vec3) -> tuple[float, Slope]:
+def scale_cost(data: KernelInput, logs: wp.vec3) -> tuple[float, Slope]:
     """How far the size is from the initial one, see `prior_terms`."""
     mean = (logs[0] + logs[1] + logs[2]) / 3.0
-    cost = given.growth * mean * mean
-    pull = 2.0 / 3.0 * given.growth * mean
+    cost = data.growth * mean * mean
+    pull = 2.0 / 3.0 * data.growth * mean
     slope = wp.vec3(pull, pull, pull)
     for k in range(3):
-        out = wp.max(logs[k] - given.sizes[1], 0.0) + wp.max(given.sizes[0] - logs[k], 0.0)
+        out = wp.max(logs[k] - data.sizes[1], 0.0) + wp.max(data.sizes[0] - logs[k], 0.0)
         sign = wp.where(
-            logs[k] > given.sizes[1], 20.0, wp.where(logs[k] < given.sizes[0], -20.0, 0.0)
+            logs[k] > data.sizes[1], 20.0, wp.where(logs[k] < data.sizes[0], -20.0, 0.0)
         )
         cost += (logs[k] - mean) * (logs[k] - mean) + 10.0 * out * out
         slope[k] += 2.0 * (logs[k] - mean) + sign * out
@@ -80,11 +80,11 @@ def scale_cost(given: Given, logs: wp.vec3) -> tuple[float, Slope]:
 
 
 @wp.func
-def distance_cost(given: Given, p: Pose) -> tuple[float, Slope]:
-    """Price of another distance from the camera than the given one."""
+def distance_cost(data: KernelInput, p: Pose) -> tuple[float, Slope]:
+    """Cost of another distance from the camera than the given one."""
     squared = wp.length_sq(p.place)
-    off = 0.5 * wp.log(wp.max(squared, 1.0e-6)) - given.facts[p.thing, AWAY]
-    rho2 = given.rho * given.rho
+    off = 0.5 * wp.log(wp.max(squared, 1.0e-6)) - data.facts[p.thing, AWAY]
+    rho2 = data.rho * data.rho
     whole = off * off + rho2
     pull = wp.where(squared >= 1.0e-6, 2.0 * off * rho2 / (whole * whole * squared), 0.0)
     force = wp.transpose(p.turn) * (pull * p.place)
@@ -92,13 +92,13 @@ def distance_cost(given: Given, p: Pose) -> tuple[float, Slope]:
 
 
 @wp.func
-def heading_cost(given: Given, p: Pose) -> tuple[float, Slope]:
+def heading_cost(data: KernelInput, p: Pose) -> tuple[float, Slope]:
     """One less the cosine between a seat and its sitters."""
-    x = given.facts[p.thing, FACE_X]
-    z = given.facts[p.thing, FACE_Z]
+    x = data.facts[p.thing, FACE_X]
+    z = data.facts[p.thing, FACE_Z]
     s = p.turn[0, 2]
     c = p.turn[0, 0]
-    seated = given.facts[p.thing, SEATED]
+    seated = data.facts[p.thing, SEATED]
     turn = seated * (s * z - c * x)
     return seated * (1.0 - s * x - c * z), Slope(0.0, 0.0, 0.0, turn, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -112,7 +112,7 @@ EPS = wp.constant(1.0e-12)  # [m²], as in `minimize.safe_norm`
 
 
 @wp.func
-def contact_cost(given: Given, p: Pose) -> tuple[float, Slope]:
+def contact_cost(data: KernelInput, p: Pose) -> tuple[float, Slope]:
     """Robust cost of the distance of the skin that touches, and its change."""
     total = wp.float64(0.0)
     slope = Slope()
@@ -120,20 +120,20 @@ def contact_cost(given: Given, p: Pose) -> tuple[float, Slope]:
     q.item = p.thing
     q.scale = p.scale
     back = wp.transpose(p.turn)
-    first = given.things.starts[p.thing, ASKED]
-    held = p.item / (given.things.starts.shape[0] - 1) * given.people.asked.shape[0]
-    rho2 = given.people.rho * given.people.rho
-    for k in range(first, given.things.starts[p.thing + 1, ASKED]):
-        q.place = back * (given.people.asked[k] - p.place)
-        share = given.people.share[k]
+    first = data.things.starts[p.thing, QUERIES]
+    start = p.item / (data.things.starts.shape[0] - 1) * data.people.queries.shape[0]
+    rho2 = data.people.rho * data.people.rho
+    for k in range(first, data.things.starts[p.thing + 1, QUERIES]):
+        q.place = back * (data.people.queries[k] - p.place)
+        share = data.people.share[k]
         near = wp.vec3()
         if share > 0.0:
-            place = nearest_of(given.people.top, q, given.people.held[held + k])
-            near = given.people.top.points[p.thing, place]
+            place = nearest_of(data.people.top, q, data.people.nearest[start + k])
+            near = data.people.top.points[p.thing, place]
         else:
-            place = nearest_of(given.people.back, q, given.people.held[held + k])
-            near = given.people.back.points[p.thing, place]
-        given.people.held[held + k] = place
+            place = nearest_of(data.people.back, q, data.people.nearest[start + k])
+            near = data.people.back.points[p.thing, place]
+        data.people.nearest[start + k] = place
         arm = wp.cw_mul(near, p.scale)
         off = q.place - arm
         length = wp.sqrt(wp.length_sq(off) + EPS)
@@ -147,19 +147,19 @@ def contact_cost(given: Given, p: Pose) -> tuple[float, Slope]:
 
 
 @wp.func
-def collision_cost(given: Given, p: Pose) -> tuple[float, Slope]:
+def collision_cost(data: KernelInput, p: Pose) -> tuple[float, Slope]:
     """Sum of the squared depths of the surface inside bodies [m²], and its change."""
     total = wp.float64(0.0)
     slope = Slope()
-    f = given.people.field
+    f = data.people.field
     back = wp.transpose(p.turn)
     top = wp.vec3(
         float(f.values.shape[0] - 1), float(f.values.shape[1] - 1), float(f.values.shape[2] - 1)
     )
     last = wp.vec3i(f.values.shape[0] - 2, f.values.shape[1] - 2, f.values.shape[2] - 2)
-    first = given.things.starts[p.thing, SAMPLES]
-    for k in range(first, given.things.starts[p.thing + 1, SAMPLES]):
-        arm = wp.cw_mul(given.things.samples[k], p.scale)
+    first = data.things.starts[p.thing, SAMPLES]
+    for k in range(first, data.things.starts[p.thing + 1, SAMPLES]):
+        arm = wp.cw_mul(data.things.samples[k], p.scale)
         at = (p.turn * arm + p.place - f.origin) / f.cell
         if wp.min(at) >= 0.0 and wp.min(top - at) >= 0.0:
             cell = wp.min(wp.vec3i(int(at[0]), int(at[1]), int(at[2])), last)

@@ -7,7 +7,7 @@ from mover.geometry.kernels.nearest import Cloud
 from mover.geometry.kernels.scene import Scene, Scratch
 
 BBOX, SILHOUETTE, SCALE, DEPTH, COLLISION, CONTACT, DISTANCE, HEADING = range(8)
-VERTS, FACES, EDGES, SAMPLES, ASKED = range(5)  # columns of `Things.starts`
+VERTS, FACES, EDGES, SAMPLES, QUERIES = range(5)  # columns of `Things.starts`
 SIZE, BUMP, AWAY, FACE_X, FACE_Z, SEATED = range(6)  # columns of `Given.facts`
 
 Slope = wp.types.vector(length=9, dtype=wp.float32)
@@ -16,7 +16,7 @@ Weights = wp.types.vector(length=8, dtype=wp.float32)
 
 
 @wp.struct
-class Things:
+class ObjectData:
     """The objects one after the other, without padding; numbers count within an object."""
 
     verts: wp.array(dtype=wp.vec3)
@@ -29,7 +29,7 @@ class Things:
 
 
 @wp.struct
-class Windows:
+class ImageData:
     """What the image says, on grids with a border, in which nothing is known."""
 
     lens: wp.array(dtype=wp.vec4)
@@ -41,11 +41,11 @@ class Windows:
     gain: wp.array(dtype=wp.float64)
     """What the cost changes by when all pixels of a row before this one are covered."""
     empty: wp.array(dtype=wp.float64)
-    """Price of each window in which nothing is drawn."""
+    """Cost of each window in which nothing is drawn."""
     trust: wp.array(dtype=wp.float32)
     """Weight of each silhouette."""
     loose: float
-    """Price of the square of a shift [1/px^2]."""
+    """Cost of the square of a shift [1/px^2]."""
     keep: wp.array(dtype=wp.float32)
     lower: wp.array(dtype=wp.float32)
     """Lowest depth, with its slack; infinite where a pixel has no bound at all [m]."""
@@ -60,15 +60,15 @@ class Windows:
 
 
 @wp.struct
-class People:
+class HumanData:
     """What the people say."""
 
     field: Field
-    asked: wp.array(dtype=wp.vec3)
+    queries: wp.array(dtype=wp.vec3)
     """Skin that touches, in the world [m]."""
     share: wp.array(dtype=wp.float32)
     """Its share in the cost of its object; negative: it touches the back."""
-    held: wp.array(dtype=wp.int32)
+    nearest: wp.array(dtype=wp.int32)
     """For each start the point that was nearest to each skin point, or -1; it is a first guess."""
     rho: float
     """Distance at which contact costs a half [m]."""
@@ -77,12 +77,12 @@ class People:
 
 
 @wp.struct
-class Given:
+class KernelInput:
     """Everything that stays as it is while the objects move."""
 
-    things: Things
-    windows: Windows
-    people: People
+    things: ObjectData
+    windows: ImageData
+    people: HumanData
     boxes: wp.array(dtype=wp.vec4)
     """Detected boxes [px]."""
     within: wp.array(dtype=wp.vec4)
@@ -100,7 +100,7 @@ class Given:
     sizes: wp.vec2
     """Logarithms of the lowest and highest scale that are usual."""
     growth: float
-    """Price of another size as a whole, against another shape."""
+    """Cost of another size as a whole, against another shape."""
     rho: float
     """Change of the logarithm of the distance that costs a half."""
 
@@ -139,8 +139,8 @@ class Workspace:
 
 
 @wp.struct
-class Answer:
-    """Prices of the items, with their weights, and how they change."""
+class ItemCosts:
+    """Costs of the items, with their weights, and how they change."""
 
     order: wp.array(dtype=wp.int32)
     """In which order the items are taken."""
@@ -173,18 +173,18 @@ class Pose:
 
 
 @wp.func
-def pose_of(given: Given, layout: wp.array2d(dtype=wp.float32), item: int) -> Pose:
+def pose_of(data: KernelInput, layout: wp.array2d(dtype=wp.float32), item: int) -> Pose:
     """The pose of a row of the layout."""
     p = Pose()
     p.item = item
-    p.thing = item % (given.things.starts.shape[0] - 1)
+    p.thing = item % (data.things.starts.shape[0] - 1)
     c = wp.cos(layout[item, 3])
     s = wp.sin(layout[item, 3])
     p.turn = wp.mat33(c, 0.0, s, 0.0, 1.0, 0.0, -s, 0.0, c)
     p.place = wp.vec3(layout[item, 0], layout[item, 1], layout[item, 2])
     p.scale = wp.vec3(wp.exp(layout[item, 4]), wp.exp(layout[item, 5]), wp.exp(layout[item, 6]))
-    p.view = given.turn[0] * p.turn
-    p.origin = given.turn[0] * p.place
+    p.view = data.turn[0] * p.turn
+    p.origin = data.turn[0] * p.place
     return p
 
 
@@ -197,7 +197,7 @@ def slope_of(force: wp.vec3, arm: wp.vec3) -> Slope:
 
 
 @wp.func
-def say(answer: Answer, p: Pose, term: int, cost: float, slope: Slope) -> None:
+def accumulate(answer: ItemCosts, p: Pose, term: int, cost: float, slope: Slope) -> None:
     """Enter a term, with its weight; the slopes of place and turns are in the item's axes."""
     t = p.turn * wp.vec3(slope[0], slope[1], slope[2])
     r = p.turn * wp.vec3(slope[7], 0.0, slope[8])

@@ -1,8 +1,10 @@
-"""An error that lasts says no more in a hundred frames than in one.
+"""Skin that touches lies on a surface that faces it (after PROX); errors that last count once.
+
+An error that lasts says no more in a hundred frames than in one.
 
 Evidence:  signed distances that should be zero, in groups whose items share an error: of a part of
            a person's skin over a piece that it touches.
-Price:     the shared error in its usual size, and the rest of each distance without it. The shared
+Cost:      the shared error in its usual size, and the rest of each distance without it. The shared
            error is the one that is cheapest, in closed form (ridge mean with robust weights).
 """
 
@@ -24,7 +26,7 @@ def without_kept(
     group: Int[Tensor, " items"],
     usual: float | Float[Tensor, " groups"],
 ) -> tuple[Float[Tensor, " items"], Float[Tensor, " items"]]:
-    """What is left of distances without the error that their group shares, and its price.
+    """What is left of distances without the error that their group shares, and its cost.
 
     Args:
         off: Signed distances [m].
@@ -33,7 +35,7 @@ def without_kept(
         usual: Size of the shared error, of all groups or of each [m].
 
     Returns:
-        The rest [m], and each item's share of the price [nats].
+        The rest [m], and each item's share of the cost [nats].
     """
     count = int(group.max()) + 1 if len(group) else 0
     total = off.new_zeros(count).index_add(0, group, trust)
@@ -45,9 +47,9 @@ def without_kept(
 # Skin that touches lies on a surface that faces it (after PROX, contact term).
 #
 # Evidence:  for each skin point that touches, the nearest surface point whose normal is opposed to
-#            the skin's within 45 degrees, and the plane there; found anew as the body moves. Where
+#            the skin's within 45 degrees, and the plane there; found again as the body moves. Where
 #            the distance to the furniture contradicts the plane, the surface ends before it.
-# Price:     Geman-McClure of the distance from the plane; the points of one group share one weight.
+# Cost:      Geman-McClure of the distance from the plane; the points of one group share one weight.
 # Paper:     distance to the nearest vertex of the scene, normals up to their sign: a thigh inside a
 #            seat may be drawn through it. Here the surface must face the skin, and one may slide.
 
@@ -71,7 +73,7 @@ class Surface:
     """Outward unit normals."""
     piece: Int[Tensor, " points"]
     """Of the furniture, from 0."""
-    doubt: Float[Tensor, " pieces"]
+    uncertainty: Float[Tensor, " pieces"]
     """Usual error of the place of each piece's surface, beside `KEPT` [m]."""
 
 
@@ -86,13 +88,13 @@ class Skin:
     chance: Float[Tensor, "bodies points"]
     group: Int[Tensor, " points"]
     """From 0: parts of the body; points of one part share a weight and have one foremost point, so
-    that a thigh that hangs does not speak for the seat."""
+    that a thigh that hangs does not count for the seat."""
     track: Int[Tensor, " bodies"]
     """Number of each body's person, from 0."""
     pivot: Float[Tensor, "bodies 3"]
     """About which a body is turned by the errors of its pose: its pelvis [m]."""
     flat: Bool[Tensor, " bodies"]
-    """Who lies: all parts have one foremost point, since backs arch over what they lie on."""
+    """Lying bodies: all parts have one foremost point, since backs arch over the mattress."""
     bent: float
     """Usual angle by which the pose is wrong [rad]; 0: it may be corrected."""
 
@@ -143,13 +145,13 @@ def gather_matches(
     who = skin.track[body] * groups + skin.group[point]
     kept = who * len(surface.points) + surface.piece[index]
     kept, number = kept.unique(return_inverse=True)
-    doubt = surface.doubt[kept % len(surface.points)]
+    uncertainty = surface.uncertainty[kept % len(surface.points)]
     return Matches(
         body, point, place, normal,
         weight=_shares(skin.chance[body, point] * _foremost(off, rests), part),
         usual=(USUAL**2 + (skin.bent * arm).square()).sqrt(),
         kept=number,
-        lasting=(KEPT**2 + doubt.square()).sqrt(),
+        lasting=(KEPT**2 + uncertainty.square()).sqrt(),
     )  # fmt: skip
 
 
@@ -214,16 +216,16 @@ def _foremost(off: Float[Tensor, " matches"], group: Int[Tensor, " matches"]) ->
 def touch_term(
     skin: Float[Tensor, "bodies points 3"], matches: Matches, rho: float
 ) -> Float[Tensor, " bodies"]:
-    """Price of the distance between skin and what it touches, half of the most at `rho` [nats]."""
+    """Cost of the distance between skin and what it touches, half of the most at `rho` [nats]."""
     moved = skin[matches.body, matches.point] - matches.place
     off = (moved * matches.normal).sum(-1)
     robust = (rho**2 / (off.square() + rho**2)).square()
     off, lasting = without_kept(
         off, robust * matches.weight / matches.usual.square(), matches.kept, matches.lasting
     )
-    price = 0.5 * (rho / matches.usual).square() * matches.weight * geman_mcclure(off, rho)
-    price = price + lasting
-    return skin.new_zeros(len(skin)).index_add(0, matches.body, price)
+    cost = 0.5 * (rho / matches.usual).square() * matches.weight * geman_mcclure(off, rho)
+    cost = cost + lasting
+    return skin.new_zeros(len(skin)).index_add(0, matches.body, cost)
 
 
 def _nothing(skin: Skin) -> Matches:

@@ -65,15 +65,15 @@ class _Live:
         return _Live(*(getattr(self, f.name)[stay] for f in dataclasses.fields(self)))
 
 
-Price = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+Evaluate = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
-def _pricing(problems: Problems[P]) -> Price:
+def _evaluation(problems: Problems[P]) -> Evaluate:
     """Energy and gradient of rows by number and place; the last energy asked for is kept."""
     start, axes = problems.start, len(problems.axes)
     held: list[tuple[Tensor, Callable[[P], Energy]]] = []
 
-    def price(index: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    def evaluate(index: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
         if not held or not torch.equal(held[0][0], index):
             held[:] = [(index, problems.of(index))]
         free = at.clone().requires_grad_()
@@ -81,10 +81,10 @@ def _pricing(problems: Problems[P]) -> Price:
         (slope,) = torch.autograd.grad(value.sum(), free)
         return value.detach().double(), slope
 
-    return price
+    return evaluate
 
 
-def settle(
+def minimize_batched(
     problems: Problems[P], method: BatchedBFGS, observe: Observer = silent, stage: str = ""
 ) -> Minimum[P]:
     """Lower the energy of each problem from its start until all have converged.
@@ -95,9 +95,9 @@ def settle(
     Raises:
         ValueError: If an energy is not finite at the start.
     """
-    start, axes, price = problems.start, problems.axes, _pricing(problems)
+    start, axes, evaluate = problems.start, problems.axes, _evaluation(problems)
     ends, like = _flat(start, len(axes)), _likes(problems)
-    live, values = _begin(price, like.unique(), ends, method), torch.zeros_like(ends[:, 0])
+    live, values = _start(evaluate, like.unique(), ends, method), torch.zeros_like(ends[:, 0])
     values[live.index] = live.value
     trace = [values[like].sum()]
     if not bool(live.value.isfinite().all() and live.slope.isfinite().all()):
@@ -106,7 +106,7 @@ def settle(
     def reached() -> P:
         return _shaped(ends[like], start, axes, len(axes))
 
-    def told(index: int) -> Step:
+    def reported(index: int) -> Step:
         seen = Energy({"energy": values[like].reshape(axes)})
         return Step(stage, index, method.steps, seen, reached)
 
@@ -114,14 +114,14 @@ def settle(
     for index in range(method.steps):
         if not len(live.index):
             break
-        live = _advance(problems, price, live, method)
+        live = _advance(problems, evaluate, live, method)
         ends[live.index], values[live.index] = live.at, live.value
         trace.append(values[like].sum())
-        observe(told(index))
+        observe(reported(index))
         moves = (live.idle < method.patience) & (live.radius > method.least)
         live = live.only(_pooled(problems, live, moves.double()) > 0)
     if method.steps:
-        observe(told(method.steps - 1))
+        observe(reported(method.steps - 1))
     value = values[like].to(_first(start).dtype).reshape(axes)
     return Minimum(reached(), value, torch.stack(trace).to(value.dtype))
 
@@ -133,10 +133,10 @@ def _likes(problems: Problems[P]) -> Tensor:
     return torch.arange(prod(problems.axes)).to(_first(problems.start).device)
 
 
-def _begin(price: Price, index: Rows, rows: Tensor, method: BatchedBFGS) -> _Live:
+def _start(evaluate: Evaluate, index: Rows, rows: Tensor, method: BatchedBFGS) -> _Live:
     """A round model of some rows whose minimum lies at the first radius."""
     at = rows[index]
-    value, slope = price(index, at)
+    value, slope = evaluate(index, at)
     radius = torch.full_like(value, method.reach)
     model = _round(slope, radius)
     return _Live(index, at, value, slope, model, radius, torch.zeros_like(index))
@@ -148,10 +148,10 @@ def _round(slope: Tensor, radius: Tensor) -> Tensor:
     return steep[:, None, None] * torch.eye(slope.shape[1]).to(slope)
 
 
-def _advance(problems: Problems[P], price: Price, live: _Live, method: BatchedBFGS) -> _Live:
+def _advance(problems: Problems[P], evaluate: Evaluate, live: _Live, method: BatchedBFGS) -> _Live:
     """One step of each problem, taken or refused."""
     step, promise = _step(live.model, live.slope, live.radius)
-    value, slope = price(live.index, live.at + step)
+    value, slope = evaluate(live.index, live.at + step)
     before, gain = (_pooled(problems, live, x) for x in (live.value, live.value - value))
     share = gain / _pooled(problems, live, promise).clamp_min(1e-300)
     taken = gain > 0  # not so where the energy is not finite
@@ -195,15 +195,15 @@ def _step(model: Tensor, slope: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]
 
 def _learned(model: Tensor, step: Tensor, change: Tensor) -> Tensor:
     """The model with the gradient's change along a step, damped so that it stays convex."""
-    told = (model * step.unsqueeze(-2)).sum(-1)
-    curve, seen = (step * told).sum(-1), (step * change).sum(-1)
+    push = (model * step.unsqueeze(-2)).sum(-1)
+    curve, seen = (step * push).sum(-1), (step * change).sum(-1)
     short = seen < DAMPED * curve
     part = torch.where(short, (1 - DAMPED) * curve / (curve - seen).clamp_min(1e-300), 1.0)
-    change = part.unsqueeze(-1) * change + (1 - part).unsqueeze(-1) * told
+    change = part.unsqueeze(-1) * change + (1 - part).unsqueeze(-1) * push
     seen = (step * change).sum(-1)
     usable = (curve > 1e-300) & (seen > 1e-300)
     old, new = (torch.where(usable, x, torch.inf)[:, None, None] for x in (curve, seen))
-    outer = told[:, :, None] * told[:, None, :] / old
+    outer = push[:, :, None] * push[:, None, :] / old
     return model - outer + change[:, :, None] * change[:, None, :] / new
 
 

@@ -1,0 +1,353 @@
+r"""Terms of the energy of the bodies (Sec. "HPS estimation"), by which they are refined in a room.
+
+Near to what was given (angles, image, range), smooth in time (smooth, steady, lock), in the room
+(under, stand, sink; after PROX), in the order of depths (order) and on their masks (outline). Skin
+that touches (touch) stands in `body_contact`. All are in nats, one value for each body.
+"""
+
+from itertools import pairwise
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.core.records import record
+from mover.energy.minimize import geman_mcclure, safe_norm
+from mover.geometry.camera import project
+from mover.geometry.volume import Volume, sample
+
+# --- Near to what was given: the prior of the refinement -----------------------------------------
+#
+# Evidence:  the bodies as they were given, whose pose is wrong by a few degrees, whose depth is
+#            wrong by a few percent, and which cover the right pixels.
+# Cost:      half the squared change over its usual size, in nats: of the joints' angles, of the
+#            depth, and of the place in the image (robust, in metres at the body's depth), but for
+#            the size there.
+# Departure: The paper fits the pose to the image again (SMPLify-X's terms). Here the first fit is
+#            the datum, so that bodies of any source, meshes too, can be refined.
+
+ANGLE = 0.09  # [rad], 5 degrees: usual error of a joint
+BIAS = 0.03  # usual error of a person's depth in all frames, as a share
+DRIFT = 0.012  # usual error that changes, as a share
+IMAGE_USUAL = 0.03  # [m], usual error of a joint across the ray
+IMAGE_LOST = 0.15  # [m], an error across the ray that is down-weighted
+IMAGE_POINTS = 3.0  # joints whose places are independent: a body that is off is off as a whole
+NEAR = 0.1  # [m], nearer no depth is taken to be
+
+
+def angle_term(angles: Float[Tensor, "bodies angles"]) -> Float[Tensor, " bodies"]:
+    """Cost of turning joints by these angles [rad]; of nothing, where there are none."""
+    return 0.5 * (angles / ANGLE).square().sum(-1)
+
+
+def depth_share(
+    points_cam: Float[Tensor, "bodies 3"], start_cam: Float[Tensor, "bodies 3"]
+) -> Float[Tensor, " bodies"]:
+    """Logarithm of the factor by which a body's depth has changed."""
+    here, there = (x[:, 2].clamp_min(NEAR) for x in (points_cam, start_cam))
+    return (here / there).log()
+
+
+def range_term(
+    share: Float[Tensor, " bodies"], track: Int[Tensor, " bodies"]
+) -> Float[Tensor, " bodies"]:
+    """Cost of a change of depth: one error that a person keeps, and one that drifts about it.
+
+    So what a seat says about a sitter's depth holds for the same person's way through the room.
+
+    Args:
+        share: See `depth_share`.
+        track: Number of each body's person, from 0.
+    """
+    tracks = int(track.max()) + 1 if len(track) else 0
+    count = share.new_zeros(tracks).index_add(0, track, torch.ones_like(share))
+    mean = share.new_zeros(tracks).index_add(0, track, share) / count.clamp_min(1)
+    kept = (mean / BIAS).square()[track] / count[track]
+    return 0.5 * (kept + ((share - mean[track]) / DRIFT).square())
+
+
+def image_term(
+    points_cam: Float[Tensor, "bodies points 3"], start_cam: Float[Tensor, "bodies points 3"]
+) -> Float[Tensor, " bodies"]:
+    """Cost of leaving the pixels where the joints were seen.
+
+    A body that moves along the ray of its pelvis pays nothing for its size in the image: its size
+    is known no better than its depth, in all frames.
+
+    Args:
+        points_cam: Joints in camera axes, the pelvis first [m].
+        start_cam: The same joints as they were given [m].
+    """
+    here, there = points_cam[..., :2], start_cam[..., :2]
+    farther = points_cam[:, :1, 2:].clamp_min(NEAR) / start_cam[:, :1, 2:].clamp_min(NEAR)
+    along = (farther - 1) * there[:, :1]
+    z, now = (x[..., 2:].clamp_min(NEAR) for x in (start_cam, points_cam))
+    leans = now - start_cam[:, :1, 2:].clamp_min(NEAR) * (farther - 1)
+    off = ((here - along) / leans.clamp_min(NEAR) - there / z) * z
+    robust = geman_mcclure(off.square().sum(-1).add(1e-12).sqrt(), IMAGE_LOST)
+    return 0.5 * IMAGE_POINTS * (IMAGE_LOST / IMAGE_USUAL) ** 2 * robust.mean(-1)
+
+
+# --- Time: people move smoothly, and errors last -------------------------------------------------
+#
+# Evidence:  rows of one track at most a second apart.
+# Cost:      smooth: rho(x(t) between its neighbours in time), x the joints and the pelvis, rho
+#            Geman-McClure; the size of an honest residual grows with the time between the frames.
+#            steady: change between two frames of what was changed: an error of pose or depth does
+#            not come and go. lock: way of a sole at rest between two frames.
+# Paper:     second differences of joints and of their pixels at the video's rate, whatever it is.
+
+GAP = 1.0  # [s], longer nothing is known about the way between two frames
+TREMBLE = 0.02  # [m], second difference of a body that is fitted frame by frame
+PUSH = 1.5  # [m/s²], usual acceleration of a joint
+SMOOTH_TAIL = 3.0  # usual residuals at which the cost is half of the most
+ANGLE_LASTS = 0.6  # [s]
+DEPTH = 0.015  # usual error of the depth that changes with time, as a share
+DEPTH_LASTS = 1.0  # [s]
+FRESH = 0.003  # share of the depth's error that is new in each frame
+SLIP = 0.02  # [m], usual way of a sole at rest in a fit
+SMOOTH_POINTS = 8.0  # joints whose ways are independent, of all of them
+
+
+@record
+class Neighbours:
+    """Which rows follow each other in time."""
+
+    triples: Int[Tensor, "triples 3"]
+    """Rows before, at and after a moment."""
+    steps: Float[Tensor, "triples 2"]
+    """Time from the first to the second and to the third [s]."""
+    pairs: Int[Tensor, "pairs 2"]
+    """Rows that follow each other."""
+    gaps: Float[Tensor, " pairs"]
+    """Time between them [s]."""
+    track: Int[Tensor, " rows"]
+    """Number of each row's person, from 0."""
+
+
+def gather_neighbours(
+    frame: Int[Tensor, " bodies"], person: Int[Tensor, " bodies"], fps: float | None
+) -> Neighbours:
+    """Rows of the same track that follow each other within a second; none of unordered images."""
+    count = len(frame)
+    order = sorted(range(count), key=lambda k: (int(person[k]), int(frame[k])))
+    pairs: list[tuple[int, int]] = []
+    gaps: list[float] = []
+    for a, b in pairwise(order):
+        gap = float(frame[b] - frame[a]) / (fps or 1.0)
+        if fps is not None and person[a] == person[b] and 0 < gap <= GAP:
+            pairs.append((a, b))
+            gaps.append(gap)
+    after = dict(zip(pairs, gaps, strict=True))
+    follows = dict(pairs)
+    triples = [(a, b, follows[b]) for a, b in pairs if b in follows]
+    steps = [(after[a, b], after[b, c]) for a, b, c in triples]
+    return Neighbours(
+        torch.tensor(triples, dtype=torch.long).reshape(-1, 3),
+        torch.tensor(steps).reshape(-1, 2),
+        torch.tensor(pairs, dtype=torch.long).reshape(-1, 2),
+        torch.tensor(gaps),
+        person.unique(return_inverse=True)[1],
+    )
+
+
+def smooth_term(
+    points: Float[Tensor, "bodies points 3"], near: Neighbours
+) -> Float[Tensor, " bodies"]:
+    """Cost of points that are off the straight way between their neighbours in time [nats]."""
+    i, j, k = near.triples.unbind(-1)
+    before, after = near.steps.to(points).unbind(-1)
+    to_i, to_k = (after / (before + after)), (before / (before + after))
+    straight = points[i] * to_i[:, None, None] + points[k] * to_k[:, None, None]
+    off = 2 * safe_norm(points[j] - straight)
+    usual = (TREMBLE + PUSH * before * after)[:, None]
+    cost = 0.5 * SMOOTH_POINTS * SMOOTH_TAIL**2 * geman_mcclure(off / usual, SMOOTH_TAIL).mean(-1)
+    return _per_row(cost, j, len(near.track))
+
+
+def steady_term(
+    angles: Float[Tensor, "bodies angles"], share: Float[Tensor, " bodies"], near: Neighbours
+) -> Float[Tensor, " bodies"]:
+    """Cost of changes of angles [rad] and of depth that come and go [nats]."""
+    i, j = near.pairs.unbind(-1)
+    gaps = near.gaps.to(angles)
+    turned = (angles[j] - angles[i]).square().sum(-1) / (ANGLE**2 * _fresh(gaps, ANGLE_LASTS))
+    moved = (share[j] - share[i]).square()
+    moved = moved / (DEPTH**2 * _fresh(gaps, DEPTH_LASTS) + FRESH**2)
+    return _per_row(0.5 * (turned + moved), j, len(near.track))
+
+
+def lock_term(
+    soles: Float[Tensor, "bodies feet 3"], rest: Float[Tensor, "bodies feet"], near: Neighbours
+) -> Float[Tensor, " bodies"]:
+    """Cost of soles at rest (a chance) that slide between rows that follow each other [nats]."""
+    i, j = near.pairs.unbind(-1)
+    slip = geman_mcclure(safe_norm(soles[j] - soles[i]) / SLIP, SMOOTH_TAIL)
+    both = rest[i] * rest[j]
+    return _per_row(0.5 * SMOOTH_TAIL**2 * (both * slip).sum(-1), j, len(near.track))
+
+
+def _fresh(gaps: Float[Tensor, " pairs"], lasts: float) -> Float[Tensor, " pairs"]:
+    """Variance of what is new after so long, of an error of variance one."""
+    return 2 * (1 - (-gaps / lasts).exp())
+
+
+def _per_row(cost: Float[Tensor, " items"], row: Int[Tensor, " items"], rows: int) -> Tensor:
+    return cost.new_zeros(rows).index_add(0, row, cost)
+
+
+# --- Room: bodies do not sink into it, and feet stand on its floor -------------------------------
+#
+# Evidence:  the signed distance to all furniture on one grid, and the floor's height.
+# Cost:      sink:  rho(depth of the skin inside furniture), summed over even points of the skin
+#            under: the same below the floor, of the deepest points
+#            stand: Geman-McClure of the height of soles at rest over the floor
+# Paper:     the sum of the depths, of all vertices. Here a squared cost up to 2 cm, because skin
+#            and cushions give way, and a linear one beyond; and points of the skin share one body's
+#            weight, so that the resolution of the mesh has none.
+
+SOFT = 0.02  # [m], as far skin gives way
+SKIN_POINTS = 80.0  # places of the skin that count, of all that are looked at
+FEW = 8  # deepest points of the skin that the floor holds: it does not give way as cushions do
+DEEPEST = 8.0  # independent places among them
+FEET = 4.0  # independent heights of a sole
+STAND_TAIL = 5.0  # times `SOFT`, from where on a sole is down-weighted
+
+
+def sink_term(
+    skin: Float[Tensor, "bodies points 3"], furniture: Volume
+) -> Float[Tensor, " bodies"]:
+    """Cost of the skin's depth inside furniture [nats]."""
+    return _dent((-sample(furniture, skin)).clamp_min(0))
+
+
+def under_term(skin: Float[Tensor, "bodies points 3"], floor: float) -> Float[Tensor, " bodies"]:
+    """Cost of the skin's depth below the floor, whose height is given [nats]."""
+    depth = (floor - skin[..., 1]).clamp_min(0)
+    return DEEPEST * _dent(depth.topk(min(FEW, depth.shape[-1]), -1).values) / SKIN_POINTS
+
+
+def stand_term(
+    soles: Float[Tensor, "bodies feet 3"],
+    rest: Float[Tensor, "bodies feet"],
+    floor: float,
+) -> Float[Tensor, " bodies"]:
+    """Cost of the lowest places of feet at rest (a chance) that are not on the floor [nats]."""
+    off = geman_mcclure((soles[..., 1] - floor) / SOFT, STAND_TAIL)
+    return 0.5 * FEET * STAND_TAIL**2 * (rest * off).sum(-1)
+
+
+def _dent(depth: Float[Tensor, "bodies points"]) -> Float[Tensor, " bodies"]:
+    """Squared up to `SOFT`, linear beyond (Huber)."""
+    share = depth / SOFT
+    cost = torch.where(share < 1, 0.5 * share.square(), share - 0.5)
+    return SKIN_POINTS * cost.mean(-1)
+
+
+# --- Depth order: who hides whom bounds the depth of people --------------------------------------
+#
+# Evidence:  the furniture of the estimated room is drawn once. Skin that faces the camera and is
+#            seen (inside the person's visible mask) before a piece of furniture is not farther
+#            than its front; skin that a piece hides (inside the mask of that piece, outside of all
+#            people) is not nearer than its front.
+# Cost:      how far the skin is out of these bounds, less a margin, at most half a metre.
+# Paper:     L_depth moves objects between people; the refinement of the bodies does not name it.
+
+ORDER_MARGIN = 0.03  # [m], outlines and fronts are not known better
+ORDER_MOST = 0.5  # [m], beyond, something else is wrong
+ORDER_USUAL = 0.05  # [m]
+ORDER_POINTS = 20.0  # independent places of a body's skin
+
+
+@record
+class Bounds:
+    """How near and far skin points may be."""
+
+    near: Float[Tensor, "bodies points"]
+    """Depth that hidden skin has at least [m]; -inf: no bound."""
+    far: Float[Tensor, "bodies points"]
+    """Depth that visible skin has at most [m]; inf: no bound."""
+
+
+@record
+class Sighting:
+    """What is seen where skin points are projected."""
+
+    front: Float[Tensor, "bodies points"]
+    """Depth of the nearest furniture there [m]; inf: none."""
+    shown: Bool[Tensor, "bodies points"]
+    """Well inside the person's visible mask."""
+    hidden: Bool[Tensor, "bodies points"]
+    """Well outside everybody's masks, inside the mask of the furniture that is drawn there."""
+    facing: Bool[Tensor, "bodies points"]
+    """The skin faces the camera."""
+    loose: Float[Tensor, "bodies points"]
+    """How far off that furniture may be along the ray, as its shape is doubted [m]."""
+
+
+def bounds_of_skin(seen: Sighting) -> Bounds:
+    """Bounds for the depth of the skin; of one body, only what the larger region says."""
+    real = seen.front.isfinite() & seen.facing
+    shown, hidden = seen.shown & real, seen.hidden & real
+    more = (shown.sum(-1) - hidden.sum(-1))[:, None]
+    none = torch.full_like(seen.front, torch.inf)
+    far = torch.where(shown & (more > 0), seen.front + seen.loose, none)
+    return Bounds(torch.where(hidden & (more < 0), seen.front - seen.loose, -none), far)
+
+
+def order_term(depth: Float[Tensor, "bodies points"], bounds: Bounds) -> Float[Tensor, " bodies"]:
+    """Cost of skin before what hides it or behind what it hides [nats]."""
+    known = bounds.near.isfinite() | bounds.far.isfinite()
+    none = torch.zeros_like(depth)
+    near = torch.where(bounds.near.isfinite(), bounds.near - ORDER_MARGIN - depth, none)
+    far = torch.where(bounds.far.isfinite(), depth - bounds.far - ORDER_MARGIN, none)
+    out = (near.clamp(0, ORDER_MOST) + far.clamp(0, ORDER_MOST)) / ORDER_USUAL
+    cost = torch.where(out < 1, 0.5 * out.square(), out - 0.5)
+    return ORDER_POINTS * cost.sum(-1) / known.sum(-1).clamp_min(ORDER_POINTS)
+
+
+# --- Outlines: the outline of a body lies on that of its mask ------------------------------------
+#
+# Not in the paper, whose refinement of bodies knows keypoints only.
+#
+# Evidence:  points of the drawn body's outline where nothing else can end the person's mask; for
+#            each the skin next to it, the outline's normal, and how far the mask's outline is from
+#            it.
+# Cost:      Geman-McClure of that distance along the normal, in usual errors of masks; the points
+#            of one body share a weight. A mask that is too wide all around says nothing: that much
+#            is taken out of the distances.
+
+OUTLINE_BORDER = 0.0025  # [image widths], usual error of an outline that is not the same all around
+OUTLINE_TAIL = 3.0  # usual errors at which the cost is half of the most
+OUTLINE_POINTS = 16.0  # independent places of an outline
+
+
+@record
+class Outline:
+    """Where the outlines of bodies should go, seen from where they are."""
+
+    body: Int[Tensor, " points"]
+    skin: Int[Tensor, " points"]
+    """Index of the skin point that carries the outline."""
+    pixel: Float[Tensor, "points 2"]
+    """Where that skin point is seen now [px]."""
+    normal: Float[Tensor, "points 2"]
+    """Of the outline in the image, outwards."""
+    gap: Float[Tensor, " points"]
+    """How far the outline is outside its mask [px]; negative: inside."""
+    weight: Float[Tensor, " points"]
+    """Share in the body's weight, at most `OUTLINE_POINTS` in sum."""
+
+
+def outline_term(
+    skin_cam: Float[Tensor, "bodies points 3"],
+    outline: Outline,
+    K: Float[Tensor, "3 3"],
+    width: int,
+) -> Float[Tensor, " bodies"]:
+    """Cost of outlines (of skin in camera axes) that leave the outlines of the masks [nats]."""
+    here = project(skin_cam[outline.body, outline.skin], K)
+    off = ((here - outline.pixel) * outline.normal).sum(-1) + outline.gap
+    robust = geman_mcclure(off / (OUTLINE_BORDER * width), OUTLINE_TAIL)
+    cost = 0.5 * OUTLINE_TAIL**2 * outline.weight * robust
+    return skin_cam.new_zeros(len(skin_cam)).index_add(0, outline.body, cost)

@@ -1,1 +1,0 @@
-"""The terms that refine bodies in a room."""
