@@ -56,7 +56,7 @@ def write_frames(folder: Path) -> None:
 def named(models: ModelsConfig) -> list[str]:
     return [
         "--models.masks", models.masks, "--models.tracker", models.tracker,
-        "--models.keypoints", models.keypoints,
+        "--models.keypoints", models.keypoints, "--models.device", "cpu",
     ]  # fmt: skip
 
 

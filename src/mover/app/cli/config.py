@@ -80,6 +80,17 @@ PERCEIVE_SETTINGS = {
     "detect.score": "Least certainty of a detection.",
 }
 """The same of `PerceiveConfig`, of `mover video`, `image` and `perceive`."""
+STEP_SETTINGS = {
+    **PERCEIVE_SETTINGS,
+    "frames.fps": "Frames a second that are taken.",
+    "frames.folder_fps": "Pictures a second of a folder.",
+    "models.device": "Where networks compute.",
+    "track.segment": "Frames that the tracker follows at once.",
+    "track.present": "Least score of a person who is followed.",
+}
+"""Those of `mover perceive`, which does this step alone."""
+REFINE_SETTINGS = {"rounds": "Rounds of the descent with evidence gathered again."}
+"""The same of `RefineBodiesConfig`, of `mover refine`."""
 LAYOUT_SETTINGS = {
     "shapes": "Shapes of the library that are tried for each object.",
     "keep": "Hypotheses of an object that are kept.",

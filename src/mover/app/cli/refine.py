@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from mover.app.cli import say
-from mover.app.cli.config import parsed, parsed_with
+from mover.app.cli.config import REFINE_SETTINGS, parsed, parsed_with
 from mover.core.errors import InputError
 from mover.core.settings import Index, int_in
 from mover.stages.config import RefineBodiesConfig
@@ -65,7 +65,9 @@ class ContactsArgs:
 
 def refine(arguments: Sequence[str]) -> None:
     """`mover refine`."""
-    args, config = parsed_with(RefineArgs, RefineBodiesConfig(), {}, "mover refine", arguments)
+    args, config = parsed_with(
+        RefineArgs, RefineBodiesConfig(), REFINE_SETTINGS, "mover refine", arguments
+    )
     import torch
 
     from mover.app.cli.progress import Bar

@@ -12,6 +12,7 @@ from mover.app.cli import say
 from mover.app.cli.config import (
     LAYOUT_SETTINGS,
     PERCEIVE_SETTINGS,
+    STEP_SETTINGS,
     Device,
     parsed_with,
     preset_named,
@@ -77,7 +78,7 @@ class PerceiveArgs:
 def perceive(arguments: Sequence[str]) -> None:
     """`mover perceive`."""
     args, config = parsed_with(
-        PerceiveArgs, PerceiveConfig(), PERCEIVE_SETTINGS, "mover perceive", arguments
+        PerceiveArgs, PerceiveConfig(), STEP_SETTINGS, "mover perceive", arguments
     )
     args = replace(args, config=config)
     perceive_into(args, ready_models(args.config.models, args.weights))
