@@ -105,10 +105,8 @@ def quick(config: Config) -> Config:
     return replace(
         config,
         image=replace(config.image, size=32),
-        layout=replace(
-            config.layout, method=few, first=Adam(0), short=Adam(0), yaws=1, num_hypotheses=1
-        ),
-        place=replace(config.place, method=few, first=Adam(0)),
+        layout=replace(config.layout, method=few, short=Adam(0), yaws=1, num_hypotheses=1),
+        place=replace(config.place, method=few),
         refine=replace(config.refine, rounds=0),
         gather=replace(config.gather, cells=16),
         prepare=replace(config.prepare, cells=16, samples=100),

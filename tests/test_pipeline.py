@@ -14,7 +14,6 @@ from mover.app.results import read_config, write_results
 from mover.core import records
 from mover.core.observe import Step, silent
 from mover.core.run import Run
-from mover.energy.config import Adam
 from mover.geometry.rle import decode
 from mover.geometry.warp_start import use_threads
 from mover.io.capture.scene_file import read_scene
@@ -35,7 +34,7 @@ def light(name, steps=15):
         prepare=replace(config.prepare, cells=32, faces=300, samples=200, region=60),
         image=replace(config.image, size=48),
         layout=replace(
-            config.layout, method=replace(config.layout.method, steps=steps), first=Adam(3),
+            config.layout, method=replace(config.layout.method, steps=steps),
             short=replace(config.layout.short, steps=min(5, config.layout.short.steps)),
         ),
         refine=replace(config.refine, method=replace(config.refine.method, steps=5)),
