@@ -128,7 +128,10 @@ def test_body_indices_are_masks_of_the_flipped_pictures(stills: Path, tmp_path: 
     ("pixels", "said"),
     [
         (np.full((1080, 1920), 128), "has the number 128, expected bodies 0 to 5, and 255"),
-        (np.zeros((1080, 1920)), "100% of the picture is a body, expected 255 where no person is"),
+        (
+            np.zeros((1080, 1920)),
+            "100% of the picture is a body, expected 255 where there is no person",
+        ),
         (np.full((424, 512), 255), "has 512 x 424 pixels, expected 1920 x 1080"),
     ],
 )
