@@ -18,8 +18,8 @@ from mover.io.capture.scene_file import read_scene
 from mover.io.export.contacts import write_labels
 from mover.io.files.meshes import write_mesh
 from mover.io.formats import names
-from mover.pipeline.outcome import to_world
-from mover.pipeline.refinement import finished_room
+from mover.pipeline.refine import finished_room
+from mover.pipeline.result import to_world
 from mover_bench.rooms.known import KnownRoom
 
 pytestmark = pytest.mark.slow

@@ -20,7 +20,7 @@ from mover.geometry.rotations import axis_angle, rot_y
 from mover.io.capture.bodies_file import read_contacts
 from mover.io.capture.folder import read_capture
 from mover.io.capture.pose_file import into_camera
-from mover.pipeline.refinement import with_posa
+from mover.pipeline.refine import with_posa
 
 OCTAHEDRON = np.array(
     [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]

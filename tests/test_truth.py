@@ -12,12 +12,19 @@ import trimesh
 from mover.bodies.corrected import in_world
 from mover.core.run import Run
 from mover.core.types import Layout
+from mover.energy.objective import HumanCues
 from mover.geometry.rle import decode
 from mover.io.capture.scene_file import write_scene
-from mover.pipeline import reconstruct as pipeline
+from mover.pipeline import objects as steps
+from mover.pipeline.people import estimate_people
 from mover.pipeline.presets import PRESETS
+from mover.stages.contacts.assign_contacts import assign_contacts
+from mover.stages.contacts.contact_association import AssignInputs
+from mover.stages.contacts.gather_cues import cues_in_windows
+from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues, image_evidence
 from mover.stages.objects.place_inputs import Placed, PlaceInputs
 from mover.stages.objects.place_objects import energy_of
+from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
 
 COUNT = 200  # perturbations of each object
 FLIP_X, FLIP_Y = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0])
@@ -30,36 +37,23 @@ def at_truth(room, preset, folder):
         config, correct_depth=False, refine=replace(config.refine, rounds=0), outer_iterations=0
     )
     config = replace(config, gather=replace(config.gather, cells=192))
-    capture = room.capture
-    seen = pipeline.image_evidence(capture)
-    run = Run(folder)
-    prepared = run.stage(
-        pipeline.prepare_objects, pipeline.PrepareInputs(room.truth.objects), config.prepare
-    )
-    job = pipeline.ReconstructionContext(capture, config, run, seen, prepared)
-    crew = pipeline.people_of(capture, config, run)
-    unordered = torch.zeros(len(seen.boxes), len(seen.boxes), dtype=torch.bool)
+    capture, run = room.capture, Run(folder)
+    seen = image_evidence(capture)
+    prepared = run.stage(prepare_objects, PrepareInputs(room.truth.objects), config.prepare)
+    count, first = len(seen.boxes), prepared.start
+    free = torch.zeros(count, dtype=torch.bool)
+    setup = steps.Setup(capture, config, run, seen, prepared, free, None)
+    people = estimate_people(capture, config, run)
     camera, ground = room.truth.camera, room.truth.ground
-    image = pipeline.ImageInputs(
-        camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered
-    )
-    placed = Placed(
-        prepared.start,
-        prepared.start[None],
-        torch.zeros(1, len(seen.boxes)),
-        torch.zeros(0),
-    )
-    cues = run.stage(pipeline.find_image_cues, image, config.image)
-    start = prepared.start
-    bare = PlaceInputs(
-        prepared.objects, camera, ground, cues, pipeline.NOBODY, start[None], start.yaw
-    )
-    view = pipeline.SceneState(
-        camera, ground, image, start, placed, {}, start, (bare, config.place)
-    )
-    view = pipeline.assigned(job, crew, pipeline.gathered(job, crew, view))
-    humans = pipeline.cues_in_windows(view.cues, view.contacts.points, cues.views, camera)
-    return replace(bare, humans=humans), config
+    unordered = torch.zeros(count, count, dtype=torch.bool)
+    image = ImageInputs(camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered)
+    cues, starts = run.stage(find_image_cues, image, config.image), first[None]
+    inputs = PlaceInputs(prepared.objects, camera, ground, cues, HumanCues(), starts, first.yaw)
+    placed = Placed(first, starts, torch.zeros(1, count), torch.zeros(0))
+    there = steps.Arrangement(camera, ground, image, first, placed, first, inputs, config.place, {})
+    found = steps.gather_humans(setup, people, there)
+    humans = cues_in_windows(found.cues, found.contacts.points, cues.views, camera)
+    return replace(inputs, humans=humans), config
 
 
 def perturbed(truth, count, seed):
@@ -91,12 +85,12 @@ def test_who_sits_tells_the_front_of_what_has_a_back_and_who_lies_that_of_beds(d
     facing = torch.atan2(*touches.heading[told].unbind(-1))
     off = (facing - inputs.starts.yaw[0, touches.object_of[told]]).cos()
     assert float(off.min()) > np.cos(np.radians(20))
-    crew = pipeline.people_of(demo_room.capture, config, Run(tmp_path))
+    people = estimate_people(demo_room.capture, config, Run(tmp_path))
     flat = replace(objects, has_back=torch.zeros_like(objects.has_back))
-    found = pipeline.assign_contacts(
-        pipeline.AssignInputs(
-            in_world(crew.bodies, inputs.camera), demo_room.touching.float(), crew.parts,
-            pipeline.image_evidence(demo_room.capture).masks, inputs.image.boxes, inputs.camera,
+    found = assign_contacts(
+        AssignInputs(
+            in_world(people.bodies, inputs.camera), demo_room.touching.float(), people.parts,
+            image_evidence(demo_room.capture).masks, inputs.image.boxes, inputs.camera,
             flat, Layout(*(x[0] for x in vars(inputs.starts).values())),
         ),
         config.assign,

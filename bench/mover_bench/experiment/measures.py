@@ -23,7 +23,7 @@ from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 from mover.geometry.rotations import wrap
-from mover.pipeline.outcome import to_world
+from mover.pipeline.result import to_world
 from mover.stages.objects.prepare_objects import find_regions
 from mover_bench.rooms.known import KnownRoom
 

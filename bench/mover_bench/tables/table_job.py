@@ -30,7 +30,7 @@ from mover.io.capture.camera_file import camera_of
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.files.fields import read_json
-from mover.pipeline.outcome import to_world
+from mover.pipeline.result import to_world
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
 from mover_bench.datasets.prox_files import scan_of

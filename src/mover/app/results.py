@@ -28,8 +28,8 @@ from mover.io.capture.scene_file import write_scene
 from mover.io.export.contacts import write_labels
 from mover.io.export.scene_glb import write_glb
 from mover.io.files.fields import get, read_json, refuse
-from mover.pipeline.outcome import label_inputs
 from mover.pipeline.presets import Config
+from mover.pipeline.result import label_inputs
 from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
 
 POINTS = 500  # of a trace, about, that run.json keeps

@@ -200,7 +200,7 @@ def resting_bodies(people: Resting, known: KnownTops) -> list[Rest]:
     return found
 
 
-def grouped(rests: list[Rest], people: Resting) -> "list[Group]":
+def grouped(rests: list[Rest], people: Resting) -> "list[RestGroup]":
     """Rests whose middles are near one another, directly or through others."""
     from scipy.sparse.csgraph import connected_components
 
@@ -209,11 +209,11 @@ def grouped(rests: list[Rest], people: Resting) -> "list[Group]":
     middle = torch.stack([rest.points.mean(0) for rest in rests])[:, [0, 2]]
     count, label = connected_components((torch.cdist(middle, middle) < SAME).numpy(), False)
     members = ([r for r, own in zip(rests, label, strict=True) if own == k] for k in range(count))
-    return [Group(own, people) for own in members]
+    return [RestGroup(own, people) for own in members]
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class RestGroup:
     """All rests at one position that one piece may carry."""
 
     rests: Sequence[Rest]
@@ -339,19 +339,19 @@ def proposed(people: Resting, known: KnownTops, taken: set[str]) -> list[Proposa
         under = [other for other in left if _holds(proposal, other)]
         if under and proposal.piece in LONG:
             rests = [rest for part in (group, *under) for rest in part.rests]
-            proposal = _proposal(Group(rests, group.people), taken)
+            proposal = _proposal(RestGroup(rests, group.people), taken)
         left = [other for other in left if not _holds(proposal, other)]
         found.append(proposal)
         taken = {*taken, proposal.object.id}
     return sorted(found, key=lambda one: -one.seconds)
 
 
-def _holds(proposal: Proposal, group: Group) -> bool:
+def _holds(proposal: Proposal, group: RestGroup) -> bool:
     """Whether a piece's footprint, and half of `SAME` around it, holds the middle of a group."""
     return bool((beyond(box_of(proposal.object), group.middle) < SAME / 2).all())
 
 
-def _proposal(group: Group, taken: set[str]) -> Proposal:
+def _proposal(group: RestGroup, taken: set[str]) -> Proposal:
     """A piece of the library under a group, on the floor."""
     height, yaw = float(group.heights.median()), group.yaw
     pieces = [make_piece(group.kind, np.random.default_rng(seed), 0) for seed in range(SEEDS)]
@@ -375,7 +375,7 @@ def _proposal(group: Group, taken: set[str]) -> Proposal:
     )  # fmt: skip
 
 
-def _scale(group: Group, piece: Furniture, height: float) -> Float[Tensor, "3"]:
+def _scale(group: RestGroup, piece: Furniture, height: float) -> Float[Tensor, "3"]:
     """Of a piece, so that it is as high as what rests on it, and as wide where that is known."""
     scale = torch.ones(3)
     scale[1] = height / piece.seat_height

@@ -1,4 +1,4 @@
-"""The people of a run: where they are about the reference camera, and the floor they tell."""
+"""The people of a run: frames, lens, depth, feet, and from these the camera and the ground."""
 
 import math
 from dataclasses import dataclass, replace
@@ -6,14 +6,17 @@ from dataclasses import dataclass, replace
 from jaxtyping import Bool
 from torch import Tensor
 
+from mover.bodies.corrected import in_world
 from mover.bodies.parts import Parts, parts_of
+from mover.core.errors import InputError
+from mover.core.records import rows_of
 from mover.core.run import Run
 from mover.core.types import Bodies, Camera, CameraPath, Capture
+from mover.energy.human_terms import FootContacts
 from mover.geometry.path import is_still, poses_at, to_reference
 from mover.io.capture.pose_file import moved
-from mover.pipeline.outcome import PeopleState, check_floor
 from mover.pipeline.presets import Config
-from mover.stages.camera.align_camera import AlignInputs, align_camera
+from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camera
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens, tilted_by
 from mover.stages.camera.room_lines import FINE, SURE, Segments, find_segments
@@ -23,18 +26,38 @@ from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
 LEAN = math.radians(2.0)  # of the floor under fitted bodies, whose poses err together [rad]
-NEAREST = 0.3  # [m], no object is nearer to the reference image's camera
+LOWEST, HIGHEST = -30.0, -0.05  # [m] of a floor, below the camera
+APART = 1.0  # [m] between the given floor and that of the people, from which on there is a warning
+
+
+@dataclass(frozen=True)
+class Located:
+    """The people, and the camera and the ground under them."""
+
+    bodies: Bodies
+    """All rows, in the axes of the reference image's camera, at their corrected depth."""
+    path: CameraPath
+    """Where the cameras of their frames were [m]."""
+    kept: Bool[Tensor, " bodies"]
+    parts: Parts
+    feet: FootContacts
+    alignment: Alignment
+    warnings: tuple[str, ...]
+
+    def in_world(self, camera: Camera) -> Bodies:
+        """The rows that count, in the world of a camera."""
+        return in_world(rows_of(self.bodies, self.kept), camera)
 
 
 def through_its_lens(
     capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]
 ) -> Capture:
-    """The capture under focal length and tilt as the lines of its picture tell them."""
+    """The capture under the focal length and tilt that the lines of its picture constrain."""
     camera, guessed = capture.scene.camera, bool(capture.focal_spread)
     segments = lines_of(capture, config, FINE if guessed else SURE)
     if segments is None:
         return capture
-    people, tilt = located(capture, config, run), config.lens.tilt
+    people, tilt = locate(capture, config, run), config.lens.tilt
     if people is not None:
         camera = replace(camera, R_cam_world=people.alignment.camera.R_cam_world)
         spread = people.alignment.covariance.diag()[:2].amax()
@@ -43,10 +66,10 @@ def through_its_lens(
     inputs = LensInputs(segments, camera, capture.focal_spread, tilt, by_feet)
     lens = run.stage(find_lens, inputs, config.lens)
     warnings = (*capture.warnings, *lens.warnings)
-    told = replace(capture, warnings=warnings, tilt=lens.tilt, heading=lens.heading)
+    found = replace(capture, warnings=warnings, tilt=lens.tilt, heading=lens.heading)
     if capture.focal_spread or lens.zoom != 1:
-        told = replace(told, focal_spread=lens.spread)
-    return through_lens(told, lens.zoom, pinned)
+        found = replace(found, focal_spread=lens.spread)
+    return through_lens(found, lens.zoom, pinned)
 
 
 def lines_of(
@@ -59,36 +82,38 @@ def lines_of(
     return find_segments(picture, people_in_reference(capture), centre, fineness)
 
 
-def people_of(capture: Capture, config: Config, run: Run) -> PeopleState | None:
+def estimate_people(capture: Capture, config: Config, run: Run) -> Located | None:
     """The people of a run, with a warning where their floor is not the given one.
 
     Raises:
         InputError: If no camera stands above such a floor.
     """
-    found = located(capture, config, run)
+    found = locate(capture, config, run)
     if found is None:
         return None
     odd = check_floor(found.alignment.ground, capture)
     return replace(found, warnings=(*found.warnings, *odd))
 
 
-def located(capture: Capture, config: Config, run: Run) -> PeopleState | None:
+def locate(capture: Capture, config: Config, run: Run) -> Located | None:
     """Choose frames, find the people's depth and their feet, and from these camera and ground."""
-    bodies, scene = capture.bodies, capture.scene
-    if bodies is None:
+    given, scene, path = capture.bodies, capture.scene, capture.path
+    if given is None:
         return None
-    parts, path = parts_of(bodies, scene.camera.R_cam_world[:, 1]), capture.path
+    parts = parts_of(given, scene.camera.R_cam_world[:, 1])
     chosen = chosen_people(capture, parts, config, run)
     bodies, kept = carried(chosen.bodies, path), chosen.kept
     touch = capture.touch if config.foot_contacts.given else None
     standing = FootContactInputs(bodies, parts, kept, scene.camera, touch)
     feet = run.stage(find_foot_contacts, standing, config.foot_contacts)
-    camera, tilt_spread = _tilted(scene.camera, capture)
+    tilt = capture.tilt
+    camera = scene.camera if tilt is None else tilted_by(scene.camera, tilt)
+    tilt_spread = None if tilt is None else tilt.spread
     lean = 0.0 if bodies.size_spread is None else LEAN
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread, lean)
     alignment = run.stage(align_camera, known, config.align)
     warnings = (*chosen.warnings, *feet.warnings, *alignment.warnings)
-    return PeopleState(bodies, path, kept, parts, feet, alignment, warnings)
+    return Located(bodies, path, kept, parts, feet, alignment, warnings)
 
 
 @dataclass(frozen=True)
@@ -114,14 +139,6 @@ def chosen_people(capture: Capture, parts: Parts, config: Config, run: Run) -> C
     return ChosenPeople(apply_depth(bodies, depth), kept, depth.warnings)
 
 
-def _tilted(camera: Camera, capture: Capture) -> tuple[Camera, float | None]:
-    """The camera with the tilt that the lines of the picture tell, and how far off that is."""
-    tilt = capture.tilt
-    if tilt is None:
-        return camera, None
-    return tilted_by(camera, tilt), tilt.spread
-
-
 def carried(bodies: Bodies, path: CameraPath) -> Bodies:
     """Bodies from the axes of their frames' cameras into those of the reference image's camera."""
     if is_still(path):
@@ -134,3 +151,27 @@ def carried(bodies: Bodies, path: CameraPath) -> Bodies:
         bodies, verts=to_reference(bodies.verts, poses), pose=pose,
         joints=None if joints is None else to_reference(joints, poses),
     )  # fmt: skip
+
+
+def check_floor(ground: float, capture: Capture) -> tuple[str, ...]:
+    """Refuse a floor that no camera stands above; warn where a given one is elsewhere.
+
+    Raises:
+        InputError: If the floor is above the camera, or farther below it than in any room.
+    """
+    if not LOWEST <= ground <= HIGHEST:
+        side = "above" if ground > 0 else "below"
+        cause = "scene.json: 'ground.height'"
+        if capture.bodies is not None:
+            cause = "bodies.npz: the feet of the people"
+        raise InputError(
+            f"{cause} put the floor {abs(ground):.3g} m {side} the camera, expected"
+            f" {-HIGHEST:g} to {-LOWEST:g} m below; are places in metres, and is z forward?"
+        )
+    given = capture.scene.ground
+    if given is None or abs(given - ground) <= APART:
+        return ()
+    return (
+        f"scene.json: field 'ground.height' has {given:.3g}, but people stand at {ground:.3g} m,"
+        " which is taken",
+    )

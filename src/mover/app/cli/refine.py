@@ -71,7 +71,7 @@ def refine(arguments: Sequence[str]) -> None:
     import torch
 
     from mover.app.cli.progress import Bar
-    from mover.pipeline.refinement import measure_people
+    from mover.pipeline.refine import measure_people
 
     torch.set_num_threads(1)
     with Bar() as bar:
@@ -84,7 +84,7 @@ def refine(arguments: Sequence[str]) -> None:
 
 def _refined(args: RefineArgs, config: RefineBodiesConfig, observe: Any) -> str:  # noqa: ANN401
     """Refine as the settings say; returns what was done."""
-    from mover.pipeline.refinement import refine_result, switched
+    from mover.pipeline.refine import refine_result, switched
 
     off = {"camgp": not args.camgp, "sdf": not args.sdf, "contact": not args.contact}
     off |= {"order": not args.order, "masks": not args.masks}
@@ -98,7 +98,7 @@ def contacts(arguments: Sequence[str]) -> None:
     """`mover contacts`."""
     args = parsed(ContactsArgs, "mover contacts", arguments)
     from mover.io.capture.bodies_file import read_bodies
-    from mover.pipeline.refinement import contacts_from, find_posa, write_contacts
+    from mover.pipeline.refine import contacts_from, find_posa, write_contacts
 
     if args.model_folder is not None:
         os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)

@@ -46,7 +46,7 @@ def check(arguments: Sequence[str]) -> None:
     read = chosen("--format", args.format, "capture")
     from mover.app.pictures.overlay import save_overlay
     from mover.io.capture.evidence import evidence_table, gather_evidence
-    from mover.pipeline.outcome import warnings_of
+    from mover.pipeline.result import warnings_of
 
     capture = read(args.source)
     warnings = warnings_of(capture)

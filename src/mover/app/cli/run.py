@@ -80,7 +80,7 @@ def _with_contacts(capture: "Capture", args: RunArgs) -> "Capture":
         return capture
     if args.posa is None or args.posa_meshes is None:
         raise InputError("--posa, --posa-meshes: one is missing, expected contact.pt and mesh_ds")
-    from mover.pipeline.refinement import with_posa
+    from mover.pipeline.refine import with_posa
 
     return with_posa(capture, args.posa, args.posa_meshes)
 
@@ -108,7 +108,7 @@ def reconstruct_into(
         run = Run(out, bar, device=origin.device)
         room = reconstruct(capture, config, run, pinned)
         if origin.refine:
-            from mover.pipeline.refinement import refined_room
+            from mover.pipeline.refine import refined_room
 
             room = refined_room(room, capture, bar)
         bar(Step("writing the result", 0, 1))

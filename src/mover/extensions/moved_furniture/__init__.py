@@ -35,7 +35,7 @@ FLOATING = " sits on nothing in "  # a diagnostic that holds only while the furn
 
 
 @dataclass(frozen=True)
-class _Moved:
+class _MovedObject:
     """One object that is moved, and its stays in the order of time."""
 
     given: SceneObject
@@ -62,7 +62,7 @@ def reconstruct_moved(
     return room
 
 
-def moved_objects(capture: Capture, run: Run) -> list[_Moved]:
+def moved_objects(capture: Capture, run: Run) -> list[_MovedObject]:
     """When each object that is moved stands where; none without masks of it in the frames."""
     known = {p.annotation: p for p in capture.scene.objects if p.annotation is not None}
     if capture.furniture is None or not known or not is_still(capture.path):
@@ -70,12 +70,12 @@ def moved_objects(capture: Capture, run: Run) -> list[_Moved]:
     fps = None if capture.bodies is None else capture.bodies.fps
     inputs = MoveInputs(capture.furniture, capture.people, tuple(known), fps)
     stays = run.stage(find_moves, inputs, None).stays
-    found: list[_Moved] = []
+    found: list[_MovedObject] = []
     for number, piece in known.items():
         of_it = tuple(stay for stay in stays if stay.annotation == number)
         if of_it:
             mask = next(d.mask for d in capture.detections if d.id == number)
-            found.append(_Moved(piece, of_it, _shown_in(of_it, mask)))
+            found.append(_MovedObject(piece, of_it, _shown_in(of_it, mask)))
     return found
 
 
@@ -88,7 +88,7 @@ def _shown_in(stays: tuple[Stay, ...], mask: Masks | None) -> int:
     return max(range(len(stays)), key=lambda k: common[k])
 
 
-def _where_shown(moved: list[_Moved], furniture: People | None) -> People | None:
+def _where_shown(moved: list[_MovedObject], furniture: People | None) -> People | None:
     """The objects' masks of the frames in which they are where the reference image shows them."""
     if furniture is None:
         return None
@@ -100,7 +100,9 @@ def _where_shown(moved: list[_Moved], furniture: People | None) -> People | None
     return rows_of(furniture, ~gone)
 
 
-def _with_segments(room: Room, one: _Moved, capture: Capture, config: Config, run: Run) -> Room:
+def _with_segments(
+    room: Room, one: _MovedObject, capture: Capture, config: Config, run: Run
+) -> Room:
     """The room with an object in its segments."""
     placed, warnings = _placed(room, one, capture, config, run)
     moves = _moves(room, placed, one.stays)
@@ -140,7 +142,7 @@ def _moves(room: Room, placed: list[SceneObject], stays: tuple[Stay, ...]) -> li
 
 
 def _placed(
-    room: Room, one: _Moved, capture: Capture, config: Config, run: Run
+    room: Room, one: _MovedObject, capture: Capture, config: Config, run: Run
 ) -> tuple[list[SceneObject], tuple[str, ...]]:
     """The object in each stay, as large as in that of the reference image; warnings of all."""
     piece = next(p for p in room.scene.objects if p.id == one.given.id)
@@ -183,7 +185,9 @@ def _foot(detections: tuple[Detection, ...], annotation: int, room: Room) -> Flo
     return hit_floor(ray, camera.R_cam_world, torch.tensor(room.scene.ground))
 
 
-def _segment(room: Room, start: SceneObject, one: _Moved, index: int, capture: Capture) -> Capture:
+def _segment(
+    room: Room, start: SceneObject, one: _MovedObject, index: int, capture: Capture
+) -> Capture:
     """A capture of one stay: its people before the room as it was found."""
     stay, people, bodies = one.stays[index], capture.people, room.bodies
     margin = 0.0 if bodies is None else MARGIN * (bodies.fps or 0.0)

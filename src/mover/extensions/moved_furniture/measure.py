@@ -11,7 +11,7 @@ SOON = 5  # frames after a true change, by which a video of any rate shows the o
 
 
 @dataclass(frozen=True)
-class Moved:
+class MovedMetrics:
     """An object that is truly moved, and what was found of it."""
 
     id: str
@@ -50,7 +50,9 @@ def measure_moves(truth: Scene, found: Scene, fps: float | None = None) -> dict[
             min((abs(change - when) / (fps or 1.0) for change in changes(piece)), default=None)
             for when in changes(true)
         ]
-        rows.append(asdict(Moved(true.id, [shared[frame] for frame in stays], late, on_the_way)))
+        rows.append(
+            asdict(MovedMetrics(true.id, [shared[frame] for frame in stays], late, on_the_way))
+        )
     still = {true.id for true in truth.objects if not true.segments}
     false = sum(bool(piece.segments) for name, piece in pieces.items() if name in still)
     return {"objects": rows, "false": false}

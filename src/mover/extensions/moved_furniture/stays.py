@@ -74,7 +74,7 @@ def find_moves(inputs: MoveInputs, config: None = None, observe: Observer = sile
     which are compared again without these pixels.
     """
     del config
-    sights, whole = _sights(inputs), dict[int, list[_Run]]()
+    sights, whole = _sights(inputs), dict[int, list[_Stretch]]()
     for index, (number, sight) in enumerate(sights.items()):
         observe(Step("find_moves", index, len(sights)))
         whole[number] = _stretches(sight)
@@ -83,7 +83,7 @@ def find_moves(inputs: MoveInputs, config: None = None, observe: Observer = sile
         for number, runs in whole.items()
     }
     found: list[Stay] = []
-    moved: tuple[_Sight, ...] = ()
+    moved: tuple[_ObjectMasks, ...] = ()
     for number in sorted((n for n, share in changed.items() if share < 1), key=changed.__getitem__):
         sight = sights[number]
         runs = _stretches(sight, moved) if moved else whole[number]
@@ -98,7 +98,7 @@ def find_moves(inputs: MoveInputs, config: None = None, observe: Observer = sile
 
 
 @dataclass(frozen=True)
-class _Sight:
+class _ObjectMasks:
     """How one object is seen."""
 
     furniture: People
@@ -110,16 +110,16 @@ class _Sight:
     fps: float | None
 
 
-def _sights(inputs: MoveInputs) -> dict[int, _Sight]:
+def _sights(inputs: MoveInputs) -> dict[int, _ObjectMasks]:
     """Each object, by its annotation."""
     furniture = inputs.furniture
     hidden = cache(lambda frame: _hidden(inputs.people, frame))
     covered = cache(lambda frame: _covered(furniture, frame))
-    found: dict[int, _Sight] = {}
+    found: dict[int, _ObjectMasks] = {}
     for number in inputs.annotations:
         rows = (furniture.person == number).nonzero()[:, 0]
         ordered = rows_of(furniture, rows[furniture.frame[rows].argsort()])
-        found[number] = _Sight(ordered, hidden, covered, inputs.fps)
+        found[number] = _ObjectMasks(ordered, hidden, covered, inputs.fps)
     return found
 
 
@@ -142,7 +142,7 @@ def _covered(furniture: People, frame: int) -> Bool[Tensor, "h w"]:
 
 
 @dataclass(frozen=True)
-class _Run:
+class _Stretch:
     """Frames in a row in which an object looks the same."""
 
     first: int
@@ -161,14 +161,14 @@ class _Run:
         """What most frames show."""
         return 2 * self.hits > self.times
 
-    def after(self, other: "_Run", sure: bool) -> "_Run":
+    def after(self, other: "_Stretch", sure: bool) -> "_Stretch":
         """Both as one."""
         last = self.sure if sure else other.sure
         hits, times = self.hits + other.hits, self.times + other.times
-        return _Run(other.first, self.last, last, hits, times, self.bare + other.bare)
+        return _Stretch(other.first, self.last, last, hits, times, self.bare + other.bare)
 
 
-def _frame(sight: _Sight, row: int, moved: tuple[_Sight, ...]) -> _Run:
+def _frame(sight: _ObjectMasks, row: int, moved: tuple[_ObjectMasks, ...]) -> _Stretch:
     """One of an object's frames as a run."""
     seen, frame = thin(sight.furniture.masks, row, STEP), int(sight.furniture.frame[row])
     people = sight.hidden(frame)
@@ -178,12 +178,12 @@ def _frame(sight: _Sight, row: int, moved: tuple[_Sight, ...]) -> _Run:
     seen, bare = seen & free, torch.zeros_like(seen)
     if people is not None:  # else people without a mask may hide it
         bare = seen | (free & ~sight.covered(frame))
-    return _Run(frame, frame, frame, *(mask.long() for mask in (seen, free, bare)))
+    return _Stretch(frame, frame, frame, *(mask.long() for mask in (seen, free, bare)))
 
 
-def _stretches(sight: _Sight, moved: tuple[_Sight, ...] = ()) -> list[_Run]:
+def _stretches(sight: _ObjectMasks, moved: tuple[_ObjectMasks, ...] = ()) -> list[_Stretch]:
     """The stretches in which an object stands."""
-    runs: list[_Run] = []
+    runs: list[_Stretch] = []
     for row in range(len(sight.furniture.frame)):  # what is usual grows
         run = _frame(sight, row, moved)
         similar = _similarity(run, runs[-1]) if runs else 0.0
@@ -191,7 +191,7 @@ def _stretches(sight: _Sight, moved: tuple[_Sight, ...] = ()) -> list[_Run]:
             runs[-1] = run.after(runs[-1], similar <= 1)
         else:
             runs.append(run)
-    stays: list[_Run] = []
+    stays: list[_Stretch] = []
     for run in (run for run in runs if run.last - run.first >= SECONDS * (sight.fps or 1.0)):
         if stays and _similarity(run, stays[-1]) > SIMILAR:
             stays[-1] = run.after(stays[-1], True)
@@ -200,7 +200,7 @@ def _stretches(sight: _Sight, moved: tuple[_Sight, ...] = ()) -> list[_Run]:
     return stays
 
 
-def _similarity(a: _Run, b: _Run) -> float:
+def _similarity(a: _Stretch, b: _Stretch) -> float:
     """Common pixels of an object in two runs, as a share; `UNSEEN`: too few are seen.
 
     Of those of the smaller, since the rest may be hidden; where no mask could hide it, of those of

@@ -26,7 +26,7 @@ from mover.io.files.fields import At, read_json
 from mover.io.files.meshes import read_mesh
 from mover.io.files.npz import write_npz
 from mover.io.formats import read
-from mover.pipeline.outcome import to_world
+from mover.pipeline.result import to_world
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import RefinedBodies, refine_bodies
 

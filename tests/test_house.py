@@ -1,0 +1,177 @@
+"""The size and the language of the project: limits that only shrink.
+
+A change that needs more than a limit allows says what it takes away; a change that needs less sets
+the limit to what is left (`python tests/test_house.py` prints all numbers).
+"""
+
+import ast
+import re
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+HOME = Path(__file__).parents[1]
+LINES = {
+    "src/mover/app": 0,
+}
+FILES = {"src/mover": 0, "bench": 0}
+LIMITS = {
+    "words in code": 0, "words in pages": 0, "class names with two meanings": 0,
+    "small helpers": 0, "modules in circles": 0,
+}  # fmt: skip
+WORDS = {
+    "price": "cost", "prices": "costs", "priced": "weighted, evaluated",
+    "pricing": "cost, weights", "told": "observed, given by, estimated from",
+    "tells": "constrains, determines", "doubt": "uncertainty, prior weight",
+    "doubts": "uncertainties", "doubted": "down-weighted", "believed": "weighted, trusted",
+    "believe": "weight, trust", "heard": "used", "voice": "observation, vote",
+    "voices": "observations", "alike": "similar, duplicate", "begun": "started",
+    "anew": "again", "crew": "workers", "whoever": "the person", "nobody": "no person",
+}  # fmt: skip
+"""Words of our own, and what the field says."""
+PHRASES = (
+    r"\bwho (lies|sits|stands|is seated|lay)\b",
+    r"\bwhat (lies|carries|hides) (it|them|who)\b",
+)
+SMALL = 6  # lines of the body of a helper that is better written where it is called
+
+
+def python(*folders: str) -> list[Path]:
+    """All files of Python below some folders of the project."""
+    return [path for folder in folders for path in sorted((HOME / folder).rglob("*.py"))]
+
+
+def lines_of(paths: Iterable[Path]) -> int:
+    """Lines of all files together."""
+    return sum(path.read_text(encoding="utf-8").count("\n") for path in paths)
+
+
+def words_of(paths: Iterable[Path]) -> Counter[str]:
+    """How often each file has words that are none of the field's."""
+    found: Counter[str] = Counter()
+    for path in paths:
+        text = path.read_text(encoding="utf-8").lower()
+        name = str(path.relative_to(HOME))
+        for word in WORDS:
+            found[name] += len(re.findall(rf"(?<![a-z_]){word}(?![a-z_])", text))
+            found[name] += len(re.findall(rf"(?<=_){word}\b|\b{word}(?=_)", text))
+        found[name] += sum(len(re.findall(phrase, text)) for phrase in PHRASES)
+    return +found
+
+
+def trees() -> dict[Path, ast.Module]:
+    """The syntax of each file of the program."""
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in python("src/mover")}
+
+
+def class_names_with_two_meanings() -> list[str]:
+    """Class names, without leading underscores, that the program has twice."""
+    names = Counter(
+        node.name.lstrip("_")
+        for tree in trees().values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+    )
+    return sorted(name for name, count in names.items() if count > 1)
+
+
+def small_helpers() -> list[str]:
+    """Private functions of fewer than `SMALL` lines, without docstring, with one caller."""
+    found: list[str] = []
+    for path, tree in trees().items():
+        used = Counter(node.id for node in ast.walk(tree) if isinstance(node, ast.Name))
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.FunctionDef) or not re.match("_[^_]", node.name):
+                continue
+            body = node.body[1:] if ast.get_docstring(node) else node.body
+            size = sum((part.end_lineno or part.lineno) - part.lineno + 1 for part in body)
+            if size < SMALL and used[node.name] == 1:
+                found.append(f"{path.relative_to(HOME)}: {node.name}")
+    return found
+
+
+def modules_in_circles() -> list[str]:
+    """Modules of the program that import themselves through others when they are loaded."""
+    known = {
+        ".".join(path.relative_to(HOME / "src").with_suffix("").parts).removesuffix(".__init__"): (
+            tree
+        )
+        for path, tree in trees().items()
+    }
+    imports: dict[str, set[str]] = {}
+    for name, tree in known.items():
+        wanted: set[str] = set()
+        for node in tree.body:
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                wanted |= {node.module, *(f"{node.module}.{part.name}" for part in node.names)}
+            elif isinstance(node, ast.Import):
+                wanted |= {part.name for part in node.names}
+        imports[name] = (wanted & known.keys()) - {name}
+    reached = {name: set(targets) for name, targets in imports.items()}
+    while True:  # until nothing more is reached
+        more = {n: t.union(*(reached[m] for m in t)) if t else t for n, t in reached.items()}
+        if more == reached:
+            return sorted(name for name, targets in reached.items() if name in targets)
+        reached = more
+
+
+def pages() -> list[Path]:
+    """The pages of the documentation."""
+    return [*sorted((HOME / "docs").glob("*.md")), HOME / "README.md"]
+
+
+def measured() -> dict[str, int]:
+    """What the limits hold."""
+    return {
+        "words in code": words_of(python("src/mover", "bench", "benchmarks")).total(),
+        "words in pages": words_of(pages()).total(),
+        "class names with two meanings": len(class_names_with_two_meanings()),
+        "small helpers": len(small_helpers()),
+        "modules in circles": len(modules_in_circles()),
+    }
+
+
+def folders() -> list[str]:
+    """The packages of the program, and what stands beside it."""
+    packages = sorted(path.parent for path in (HOME / "src" / "mover").glob("*/__init__.py"))
+    return [*(str(p.relative_to(HOME)) for p in packages), "bench", "benchmarks", "tests"]
+
+
+def test_every_package_has_a_budget() -> None:
+    assert sorted(LINES) == sorted(folders())
+
+
+@pytest.mark.parametrize(("folder", "most"), LINES.items())
+def test_packages_keep_to_their_lines(folder: str, most: int) -> None:
+    assert lines_of(python(folder)) <= most
+
+
+@pytest.mark.parametrize(("folder", "most"), FILES.items())
+def test_the_program_and_the_bench_keep_to_their_files(folder: str, most: int) -> None:
+    assert len(python(folder)) <= most
+
+
+def test_code_has_the_words_of_the_field() -> None:
+    found = words_of(python("src/mover", "bench", "benchmarks"))
+    assert found.total() <= LIMITS["words in code"], found
+
+
+def test_pages_have_the_words_of_the_field() -> None:
+    found = words_of(pages())
+    assert found.total() <= LIMITS["words in pages"], found
+
+
+@pytest.mark.parametrize(
+    "check", [class_names_with_two_meanings, small_helpers, modules_in_circles]
+)
+def test_what_reads_badly_becomes_no_more(check) -> None:
+    found = check()
+    assert len(found) <= LIMITS[check.__name__.replace("_", " ")], found
+
+
+if __name__ == "__main__":  # the numbers, to set the limits to
+    print({folder: lines_of(python(folder)) for folder in folders()})  # noqa: T201
+    print({folder: len(python(folder)) for folder in FILES})  # noqa: T201
+    print(measured(), modules_in_circles(), class_names_with_two_meanings())  # noqa: T201
