@@ -92,7 +92,7 @@ def test_without_the_floor_nobody_is_lifted(tmp_path):
 def test_a_result_without_people_is_refused_and_nothing_is_written(tmp_path, capsys):
     out = finished(tmp_path / "out", None)
     assert cli.run_command("refine", [str(out)]) != 0
-    assert "nobody to refine" in capsys.readouterr().err
+    assert "no people to refine" in capsys.readouterr().err
     assert not (out / "refined").exists()
 
 

@@ -230,7 +230,7 @@ def test_posa_in_a_run_says_what_is_missing(files, tmp_path, capsys):
     assert run_command("run", [*words, *both]) == 2
     assert "no.pt: no checkpoint can be read" in capsys.readouterr().err
     nobody = replace(read_capture(tmp_path / "c"), bodies=None)
-    with pytest.raises(InputError, match=r"has no bodies.npz, so nobody touches"):
+    with pytest.raises(InputError, match=r"has no bodies.npz, so there are no contacts"):
         with_posa(nobody, files / "contact.pt", files / "mesh_ds")
 
 

@@ -34,49 +34,18 @@ _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 @dataclass_transform(frozen_default=True)
 def record(cls: type[T]) -> type[T]:
-    """Make a frozen dataclass whose dtypes and shapes are checked when it is built.
-
-    What a check looks at (see `_looks`) is looked at once: descents build the same record, with
-    other numbers in it, thousands of times.
-    """
+    """Make a frozen dataclass whose dtypes and shapes are checked when it is built."""
     made: Any = dataclasses.dataclass(frozen=True, eq=False)(cls)
     plain = made.__init__
-    plain.__annotations__.pop("return")  # else all is looked at once more, after the call
+    plain.__annotations__.pop("return")  # else all is checked once more, after the call
     checked = cache(lambda: jaxtyped(typechecker=_check)(plain))  # made where it is built first
-    passed: set[Any] = set()
 
     @wraps(plain)
     def init(self: Any, *args: Any, **fields: Any) -> None:  # noqa: ANN401
-        looks = _looks((tuple(fields), *args, *fields.values()))
-        (plain if looks in passed else checked())(self, *args, **fields)
-        if looks is not None and len(passed) < MOST_LOOKS:
-            passed.add(looks)
+        checked()(self, *args, **fields)
 
     made.__init__ = init
     return made
-
-
-MOST_LOOKS = 10_000  # of one kind of record, so that no process grows with its rooms
-
-
-def _looks(values: tuple[Any, ...]) -> tuple[Any, ...] | None:
-    """Kinds, dtypes and shapes of values; None where a check looks at more than these."""
-    found: list[Any] = []
-    for value in values:
-        if isinstance(value, Tensor):
-            found.append((type(value), value.dtype, value.shape))
-        elif value is None or isinstance(value, str):
-            found.append(value)
-        elif isinstance(value, (int, float, bytes)) or dataclasses.is_dataclass(value):
-            found.append(type(value))
-        elif isinstance(value, tuple) and len(value) < 100:
-            inner = _looks(value)
-            if inner is None:
-                return None
-            found.append(inner)
-        else:
-            return None
-    return tuple(found)
 
 
 def map_tensors(fn: Callable[[Tensor], Tensor], value: T) -> T:

@@ -5,9 +5,9 @@ part (a seat, a back that lies) is covered where the top of a known object is wi
 it is seen before the mask of a seat that is not far. Rests at one position make a group, over all
 people and the whole video; a group that nothing known covers and that lasts is a support. Its class
 follows from posture, its height from the lowest layer of what touches, its front from where people
-look, its size from the class and from how wide the touched area is. Who sits across to those lying,
-near the edge, sits on a sofa: it reaches from one end of all of them to the other. What rests on a
-piece for several people belongs to it.
+look, its size from the class and from how wide the touched area is. A person sitting across to
+those lying, near the edge, sits on a sofa, which reaches from one end of all of them to the other.
+What rests on a piece for several people belongs to it.
 
 A proposal is no object of the room: nothing else depends on it.
 """
@@ -46,7 +46,7 @@ TOUCHES = 0.5  # chance of contact from which a vertex touches
 FEWEST = 10  # vertices of a part that rests
 LOW = 0.12  # [m] over the floor: lower rests need no support
 LEVEL = 0.2  # [m] from a top, up or down, at most, of what rests on it
-LOWEST = 0.2  # share of the points that touch below the height of what carries them
+LOWEST = 0.2  # share of the points that touch below the height of the support
 REACH = 0.25  # [m] aside of a known top that still carries
 SEEN = 0.3  # share of the points seen before a known seat that it then carries ...
 FARTHEST = 0.8  # ... [m] if it stands within this distance
@@ -62,7 +62,7 @@ THIGHS = 0.12  # [m] beyond the front edge of what touches of a sitter
 NARROW = 0.36  # [m] from the middle of those lying to the front edge: less is no bed
 LONG = frozenset({"single bed", "sofa", "bench"})
 WIDE = 0.8  # [m] of what touches, from side to side: more than one seat
-EDGE = 0.05  # [m] around what touches that at least belongs to what carries it
+EDGE = 0.05  # [m] around what touches that at least belongs to the support
 ENDS = 0.02  # share of the points, and of the rests, beyond each end
 STEADY = 0.04  # [m] by which the heights of rests on one support differ
 

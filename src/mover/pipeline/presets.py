@@ -33,7 +33,7 @@ class Config:
     lens: LensConfig = field(default_factory=LensConfig)
     """The focal length from the lines of the picture."""
     select: SelectConfig = field(default_factory=SelectConfig)
-    """Which frames are believed."""
+    """Which frames count."""
     depth: DepthConfig = field(default_factory=DepthConfig)
     """One depth factor a person."""
     correct_depth: bool = False
@@ -55,7 +55,7 @@ class Config:
     refine: RefineConfig = field(default_factory=RefineConfig)
     """Camera and ground refined with the objects."""
     sizes: SpreadConfig = field(default_factory=SpreadConfig)
-    """How far the given sizes are believed in this room."""
+    """How much weight the given sizes have in this room."""
     gather: GatherConfig = field(default_factory=GatherConfig)
     """Evidence from all people."""
     assign: AssignConfig = field(default_factory=AssignConfig)
@@ -68,15 +68,15 @@ class Config:
     """Further passes of stage 2 with assignment and occlusion order renewed."""
     height_spread: Annotated[float, float_in(0, 0.3)] = 0.0
     """Standard deviation of the logarithm of people's height, where all have the mean shape of
-    their model and no height is given: the furniture then tells the scale, too (and where bodies
-    say how far their sizes may be off, as those of `mover fit` do); 0: believed."""
+    their model and no height is given: the furniture then constrains the scale (and where bodies
+    say how far their sizes may be off, as those of `mover fit` do); 0: the scale is kept."""
     seat_heights: bool = False
     """How high people sit constrains the scale of such a room, and the seats of meshes that do not
     fit the image."""
     turn_to_people: bool = False
     """Furniture along walls that was given with its back to the people begins turned to them."""
     silhouette_confidence: bool = False
-    """Believe the silhouette of an object less whose shape does not fit."""
+    """Give the silhouette of an object less weight whose shape does not fit."""
 
 
 IMAGE_ONLY = SceneWeights(depth=0.0, collision=0.0, contact=0.0)

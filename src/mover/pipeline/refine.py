@@ -75,7 +75,7 @@ def refine_result(
     """
     room = finished_room(out)
     if room.bodies is None:
-        raise InputError(f"{out}: has no bodies.npz: there is nobody to refine")
+        raise InputError(f"{out}: has no bodies.npz: there are no people to refine")
     found = refine_bodies(room, source_capture(out, capture), config, observe)
     write_bodies(found.bodies, out / "refined" / "bodies.npz")
     return found
@@ -141,11 +141,11 @@ def with_posa(capture: Capture, weights: Path, meshes: Path) -> Capture:
     """The capture with contacts by POSA in place of its own, upright by its camera (Sec. 3).
 
     Raises:
-        InputError: If a file is missing or wrong, or the capture has nobody.
+        InputError: If a file is missing or wrong, or the capture has no people.
     """
     people = capture.bodies
     if people is None:
-        raise InputError(f"--posa: {capture.name} has no bodies.npz, so nobody touches anything")
+        raise InputError(f"--posa: {capture.name} has no bodies.npz, so there are no contacts")
     if people.space == "camera":
         people = to_world(people, capture.scene.camera)
     return replace(capture, touch=posa_contacts(load_posa(weights, meshes), people, 0))
