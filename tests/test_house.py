@@ -14,12 +14,30 @@ import pytest
 
 HOME = Path(__file__).parents[1]
 LINES = {
-    "src/mover/app": 0,
+    "src/mover/app": 5_497,
+    "src/mover/bodies": 2_457,
+    "src/mover/core": 1_786,
+    "src/mover/energy": 4_214,
+    "src/mover/evaluate": 1_651,
+    "src/mover/extensions": 1_319,
+    "src/mover/fitting": 2_635,
+    "src/mover/furniture": 870,
+    "src/mover/geometry": 4_131,
+    "src/mover/io": 10_770,
+    "src/mover/perceive": 2_890,
+    "src/mover/pipeline": 1_145,
+    "src/mover/stages": 6_950,
+    "bench": 7_816,
+    "benchmarks": 997,
+    "tests": 32_081,
 }
-FILES = {"src/mover": 0, "bench": 0}
+FILES = {"src/mover": 269, "bench": 46}
 LIMITS = {
-    "words in code": 0, "words in pages": 0, "class names with two meanings": 0,
-    "small helpers": 0, "modules in circles": 0,
+    "words in code": 480,
+    "words in pages": 282,
+    "class names with two meanings": 30,
+    "small helpers": 228,
+    "modules in circles": 0,
 }  # fmt: skip
 WORDS = {
     "price": "cost", "prices": "costs", "priced": "weighted, evaluated",
