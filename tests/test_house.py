@@ -14,29 +14,29 @@ import pytest
 
 HOME = Path(__file__).parents[1]
 LINES = {
-    "src/mover/app": 5_497,
+    "src/mover/app": 5_546,
     "src/mover/bodies": 2_457,
-    "src/mover/core": 1_786,
-    "src/mover/energy": 4_214,
-    "src/mover/evaluate": 1_651,
+    "src/mover/core": 1_755,
+    "src/mover/energy": 4_193,
+    "src/mover/evaluate": 1_164,
     "src/mover/extensions": 1_319,
-    "src/mover/fitting": 2_635,
+    "src/mover/fitting": 2_713,
     "src/mover/furniture": 870,
-    "src/mover/geometry": 4_131,
-    "src/mover/io": 10_770,
-    "src/mover/perceive": 2_890,
-    "src/mover/pipeline": 1_145,
-    "src/mover/stages": 6_950,
-    "bench": 7_816,
-    "benchmarks": 997,
-    "tests": 32_081,
+    "src/mover/geometry": 4_110,
+    "src/mover/io": 10_583,
+    "src/mover/perceive": 2_891,
+    "src/mover/pipeline": 1_095,
+    "src/mover/stages": 6_478,
+    "bench": 8_243,
+    "benchmarks": 1_002,
+    "tests": 31_771,
 }
-FILES = {"src/mover": 269, "bench": 46}
+FILES = {"src/mover": 265, "bench": 49}
 LIMITS = {
-    "words in code": 480,
+    "words in code": 140,
     "words in pages": 282,
-    "class names with two meanings": 30,
-    "small helpers": 228,
+    "class names with two meanings": 16,
+    "small helpers": 201,
     "modules in circles": 0,
 }  # fmt: skip
 WORDS = {
