@@ -111,7 +111,7 @@ def leaked(mask: Bool[np.ndarray, "h w"], where: float) -> Bool[np.ndarray, "h w
 # An initial scene has one object for each detection, so that the scene follows the detections.
 
 
-KINDS = tuple(name for name in PIECES if name != "step")  # what a detector has a class for
+KINDS = tuple(PIECES)  # what a detector has a class for
 TOUCH = 2  # [px], masks that come nearer than this may run together
 
 

@@ -63,7 +63,6 @@ PIECES: dict[str, Callable[[np.random.Generator, int], Furniture]] = {
     "wardrobe": storage.wardrobe,
     "nightstand": storage.nightstand,
     "floor lamp": storage.lamp,
-    "step": storage.step,
 }
 """A function for each piece: (random numbers, style) to a shape of new size."""
 
@@ -71,7 +70,6 @@ STYLES: dict[str, int] = {
     "chair": 4, "armchair": 3, "office chair": 2, "stool": 3, "bench": 3, "sofa": 4,
     "single bed": 3, "double bed": 3, "table": 4, "desk": 3, "coffee table": 3, "shelf": 4,
     "cabinet": 3, "wardrobe": 2, "nightstand": 3, "floor lamp": 3,
-    "step": 2,
 }  # fmt: skip
 """Number of designs of each piece."""
 
@@ -91,7 +89,6 @@ SIZES: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, fl
     "wardrobe": ((0.90, 1.70), (1.80, 2.20), (0.52, 0.70)),
     "nightstand": ((0.36, 0.55), (0.42, 0.60), (0.34, 0.55)),
     "floor lamp": ((0.26, 0.65), (1.40, 1.75), (0.26, 0.65)),
-    "step": ((0.40, 0.90), (0.15, 0.40), (0.30, 0.60)),
 }
 """Smallest and largest width (x), height (y) and depth (z) of each class [m]."""
 
@@ -133,7 +130,6 @@ SYNONYMS: dict[str, str] = {
     "arm chair": "armchair", "easy chair": "armchair", "lounge chair": "armchair",
     "swivel chair": "office chair", "desk chair": "office chair", "dining chair": "chair",
     "ottoman": "stool", "pouf": "stool", "footstool": "stool",
-    "platform": "step", "podium": "step",
 }  # fmt: skip
 """Other names of the classes."""
 

@@ -184,16 +184,6 @@ def _handle(x: tuple[float, float], y: tuple[float, float], z: float) -> Part:
     return block((mid - 0.07, mid + 0.07), (high - 0.008, high + 0.008), (z - 0.01, z + 0.02))
 
 
-def step(rng: np.random.Generator, style: int) -> Furniture:
-    """What one steps onto: 0 a solid block, 1 with a lower step before it."""
-    w, h, d = draw(rng, 0.4, 0.9), draw(rng, 0.15, 0.4), draw(rng, 0.3, 0.6)
-    x, z = pair(w / 2), d / 2
-    if style == 0:
-        return finish("step", style, [block(x, (0, h), pair(z))], top=h)
-    parts = [block(x, (0, h), (-z, 0.1 * z)), block(x, (0, h / 2), (0, z))]
-    return finish("step", style, parts, top=h)
-
-
 def lamp(rng: np.random.Generator, style: int) -> Furniture:
     """A floor lamp: 0 cone shade, 1 tripod with a drum, 2 an uplight."""
     h, r = draw(rng, 1.45, 1.7), draw(rng, 0.17, 0.22)

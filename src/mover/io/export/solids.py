@@ -248,7 +248,6 @@ DENSITY = {
     "chair": 500.0, "stool": 450.0, "bench": 450.0, "table": 450.0, "desk": 400.0,
     "coffee table": 400.0, "office chair": 250.0, "armchair": 90.0, "sofa": 80.0, "bed": 90.0,
     "shelf": 450.0, "cabinet": 170.0, "wardrobe": 120.0, "nightstand": 200.0, "floor lamp": 700.0,
-    "step": 450.0,
 }  # fmt: skip
 """Mass over the volume of the closed mesh [kg/m³]. Boards and legs are wood (450 to 700); what is
 upholstered is mostly foam, and a cabinet's mesh is full where it is hollow: there the values
