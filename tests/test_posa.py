@@ -12,8 +12,14 @@ from tiny_capture import write_capture
 
 from mover.app.cli import run_command
 from mover.bodies import BODY_MODELS
-from mover.bodies.half_edges import half_edges, spirals
-from mover.bodies.posa import canonical, decode, load_posa, posa_contacts
+from mover.bodies.posa import (
+    canonical,
+    decode,
+    half_edges,
+    load_posa,
+    posa_contacts,
+    spirals,
+)
 from mover.core.errors import InputError
 from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle, rot_y

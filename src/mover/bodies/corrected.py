@@ -59,7 +59,7 @@ class Puppet:
 
 
 @record
-class Moved:
+class MovedSkin:
     """Where picked vertices and joints have gone."""
 
     skin: Float[Tensor, "bodies picked 3"]
@@ -98,7 +98,7 @@ def no_correction(puppet: Puppet) -> Correction:
     return Correction(zero, zero, zero.new_zeros(len(zero), width))
 
 
-def moved(puppet: Puppet, by: Correction) -> Moved:
+def moved(puppet: Puppet, by: Correction) -> MovedSkin:
     """The picked vertices and the joints after a correction, differentiable in it."""
     skin, points = puppet.skin, puppet.points
     if puppet.model is not None and puppet.pose is not None:
@@ -108,7 +108,7 @@ def moved(puppet: Puppet, by: Correction) -> Moved:
     pivot = puppet.points[:, :1]
     turn = axis_angle(by.turn).mT
     goal = pivot + by.shift[:, None]
-    return Moved((skin - pivot) @ turn + goal, (points - pivot) @ turn + goal)
+    return MovedSkin((skin - pivot) @ turn + goal, (points - pivot) @ turn + goal)
 
 
 def normals_after(puppet: Puppet, by: Correction) -> Float[Tensor, "bodies picked 3"]:

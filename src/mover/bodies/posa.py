@@ -1,8 +1,18 @@
-"""The coarse meshes that POSA works on, and the ways between them: its folder mesh_ds."""
+"""Contacts of SMPL-X bodies from an official POSA checkpoint that the user has downloaded.
+
+POSA (Hassan et al. 2021) guesses from the pose alone which vertices touch something. The network is
+written from a description of its layers; neither weights nor meshes come with this package. It
+works on coarse meshes (its folder mesh_ds) and learnt weights for "the third neighbour", so the
+order of neighbours is part of its format: that in which OpenMesh links half-edges, written from a
+description of it.
+
+Departure: z = 0, the mean of the latent code, gives one answer; upstream draws z at random. The
+bodies are turned by the true direction of gravity; upstream trusts the camera to be level.
+"""
 
 import hashlib
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +21,180 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.bodies.half_edges import spirals
 from mover.core.errors import InputError
 from mover.core.records import BROKEN
 from mover.core.types import Bodies
 from mover.geometry.rotations import axis_angle, rot_x
 
-LEVELS = (10475, 2619, 655)
-"""Vertices of the full body and of the two coarser ones."""
+log = logging.getLogger(__name__)
+LEVELS = (10475, 2619, 655)  # vertices of the full body and of the two coarser ones
+LENGTH = 9  # vertices of a spiral
+CODE = 256  # numbers of the latent code
+GROUPS = 8  # of the normalisation
+COUNTS = {1: (1_875_009, 153_665), 43: (1_923_435, 177_899)}
+"""Numbers in the network and in its decoder, by the channels of the output."""
+OFFICIAL = "b61f137d02a33c49f9d83ee651f0d60b1ddb80fc0c1e5b6aa85469f707238fb4"
+"""Digest of the spirals of the official mesh_2."""
+DECODER = "decoder.de_spiral"
+CHUNK = 32  # bodies decoded at once
+NONE = -1
+
+
+@dataclass
+class HalfEdges:
+    """Half-edges 2e and 2e + 1 are opposite; those without a face lie on the boundary."""
+
+    out: list[int]
+    """An outgoing half-edge of each vertex, on the boundary where there is one; -1: isolated."""
+    to: list[int] = field(default_factory=list[int])
+    after: list[int] = field(default_factory=list[int])
+    before: list[int] = field(default_factory=list[int])
+    closed: list[bool] = field(default_factory=list[bool])
+    """Whether the half-edge has a face."""
+    named: dict[tuple[int, int], int] = field(default_factory=dict[tuple[int, int], int])
+
+    def around(self, vertex: int) -> list[int]:
+        """Neighbours of a vertex, clockwise from its stored half-edge."""
+        found: list[int] = []
+        half = first = self.out[vertex]
+        while half != NONE:
+            found.append(self.to[half])
+            half = self.after[half ^ 1]
+            if half == first:
+                break
+        return found
+
+
+def half_edges(faces: Int[np.ndarray, "faces 3"], count: int) -> tuple[HalfEdges, int]:
+    """Insert triangles in order; the mesh, and how many did not fit and were left out."""
+    mesh = HalfEdges([NONE] * count)
+    left_out = sum(not _insert(mesh, tuple(row)) for row in faces.tolist())
+    return mesh, left_out
+
+
+def _insert(mesh: HalfEdges, corners: tuple[int, ...]) -> bool:
+    """Add one triangle unless it would make the surface branch."""
+    if any(mesh.out[v] != NONE and mesh.closed[mesh.out[v]] for v in corners):
+        return False
+    sides = [(corners[k], corners[(k + 1) % 3]) for k in range(3)]
+    halves = [mesh.named.get(side, NONE) for side in sides]
+    if any(h != NONE and mesh.closed[h] for h in halves):
+        return False
+    new = [h == NONE for h in halves]
+    links = _patches(mesh, halves)
+    if links is None:
+        return False
+    halves = [_named(mesh, side) for side in sides]
+    turned: list[int] = []
+    for k in range(3):
+        links += _corner(mesh, (halves[k], halves[(k + 1) % 3]), (new[k], new[(k + 1) % 3]), turned)
+        mesh.closed[halves[k]] = True
+    for a, b in links:
+        mesh.after[a], mesh.before[b] = b, a
+    for vertex in turned:
+        _to_boundary(mesh, vertex)
+    return True
+
+
+def _patches(mesh: HalfEdges, halves: list[int]) -> list[tuple[int, int]] | None:
+    """Links that move what lies between two old sides into another gap; None: there is none."""
+    links: list[tuple[int, int]] = []
+    for k in range(3):
+        into, out = halves[k], halves[(k + 1) % 3]
+        if NONE in (into, out) or mesh.after[into] == out:
+            continue
+        gap = mesh.after[out ^ 1] ^ 1
+        while mesh.closed[gap]:
+            gap = mesh.after[gap] ^ 1
+        if gap == into:
+            return None
+        links += [(gap, mesh.after[into]), (mesh.before[out], mesh.after[gap]), (into, out)]
+    return links
+
+
+def _named(mesh: HalfEdges, side: tuple[int, int]) -> int:
+    """The half-edge from one vertex to another, made with its opposite if it is not there."""
+    if side not in mesh.named:
+        half = len(mesh.to)
+        mesh.to += [side[1], side[0]]
+        mesh.after += [NONE, NONE]
+        mesh.before += [NONE, NONE]
+        mesh.closed += [False, False]
+        mesh.named |= {side: half, (side[1], side[0]): half + 1}
+    return mesh.named[side]
+
+
+def _corner(
+    mesh: HalfEdges, halves: tuple[int, int], new: tuple[bool, bool], turned: list[int]
+) -> list[tuple[int, int]]:
+    """Links around one corner; its vertex may change its stored half-edge."""
+    into, out = halves
+    vertex = mesh.to[into]
+    outer_in, outer_out = out ^ 1, into ^ 1
+    match new:
+        case (False, False):
+            if mesh.out[vertex] == out:
+                turned.append(vertex)
+            return []
+        case (True, False):
+            links = [(mesh.before[out], outer_out)]
+            mesh.out[vertex] = outer_out
+        case (False, True):
+            links = [(outer_in, mesh.after[into])]
+            mesh.out[vertex] = mesh.after[into]
+        case _ if mesh.out[vertex] == NONE:
+            links = [(outer_in, outer_out)]
+            mesh.out[vertex] = outer_out
+        case _:
+            stored = mesh.out[vertex]
+            links = [(mesh.before[stored], outer_out), (outer_in, stored)]
+    return [*links, (into, out)]
+
+
+def _to_boundary(mesh: HalfEdges, vertex: int) -> None:
+    """Store the first outgoing half-edge without a face, if there is one."""
+    first = half = mesh.out[vertex]
+    while mesh.closed[half]:
+        half = mesh.after[half ^ 1]
+        if half == first:
+            return
+    mesh.out[vertex] = half
+
+
+def spirals(
+    verts: Float[np.ndarray, "verts 3"], faces: Int[np.ndarray, "faces 3"], length: int
+) -> Int[np.ndarray, "verts length"]:
+    """Each vertex, its ring of neighbours, the ring about that, and so on, cut at `length`.
+
+    Where the rings end before that (or would, one ring on), the nearest vertices stand instead.
+    """
+    mesh, _ = half_edges(faces, len(verts))
+    around = [mesh.around(v) for v in range(len(verts))]
+    rows: list[list[int]] = []
+    for vertex in range(len(verts)):  # spirals differ in the number of their rings
+        row, ahead = [vertex, *around[vertex]], _next_ring(around, around[vertex], [vertex])
+        while ahead and len(row) + len(ahead) < length:
+            row = [*row, *ahead]
+            ahead = _next_ring(around, ahead, row)
+        if not ahead:
+            distance = np.square(verts - verts[vertex]).sum(-1)
+            row = np.argsort(distance, kind="stable").tolist()
+        rows.append([*row, *ahead][:length])
+    return np.asarray(rows, dtype=np.int64)
+
+
+def _next_ring(around: list[list[int]], last: list[int], row: list[int]) -> list[int]:
+    """The ring outside of `last`: of each vertex first what follows a vertex of `last`."""
+    inner, taken = set(last), {*last, *row}
+    ring: list[int] = []
+    for vertex in last:
+        near = around[vertex]
+        start = next((k for k, n in enumerate(near) if n in inner), len(near))
+        for neighbour in [*near[start:], *near[:start]]:
+            if neighbour not in taken:
+                ring.append(neighbour)
+                taken.add(neighbour)
+    return ring
 
 
 @dataclass(frozen=True)
@@ -43,15 +219,10 @@ def read_pyramid(folder: Path) -> Pyramid:
     full, middle, coarse = LEVELS
     if len(verts) != coarse:
         raise InputError(f"mesh_2.obj: has {len(verts)} vertices, expected {coarse}")
-    down = (
-        _sparse(folder / "D_1.npz", (middle, full)),
-        _sparse(folder / "D_2.npz", (coarse, middle)),
-    )
-    up = (
-        _sparse(folder / "U_2.npz", (middle, coarse)),
-        _sparse(folder / "U_1.npz", (full, middle)),
-    )
-    return Pyramid(verts, faces, down, up)
+    maps = {"D_1": (middle, full), "D_2": (coarse, middle), "U_2": (middle, coarse),
+            "U_1": (full, middle)}  # fmt: skip
+    found = [_sparse(folder / f"{name}.npz", shape) for name, shape in maps.items()]
+    return Pyramid(verts, faces, tuple(found[:2]), tuple(found[2:]))
 
 
 def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -86,28 +257,6 @@ def _sparse(path: Path, shape: tuple[int, int]) -> Tensor:
     index = torch.from_numpy(np.stack([matrix.row, matrix.col]).astype(np.int64))
     values = torch.from_numpy(np.asarray(matrix.data, dtype=np.float32))
     return torch.sparse_coo_tensor(index, values, shape, check_invariants=True).coalesce()
-
-
-# Contacts of SMPL-X bodies from an official POSA checkpoint that the user has downloaded.
-#
-# POSA (Hassan et al. 2021) guesses from the pose alone which vertices touch something. The network
-# is written from a description of its layers; neither weights nor meshes come with this package.
-#
-# Departure: z = 0, the mean of the latent code, gives one answer; upstream draws z at random. The
-# bodies are turned by the true direction of gravity; upstream trusts the camera to be level.
-
-
-log = logging.getLogger(__name__)
-
-LENGTH = 9  # vertices of a spiral
-CODE = 256  # numbers of the latent code
-GROUPS = 8  # of the normalisation
-COUNTS = {1: (1_875_009, 153_665), 43: (1_923_435, 177_899)}
-"""Numbers in the network and in its decoder, by the channels of the output."""
-OFFICIAL = "b61f137d02a33c49f9d83ee651f0d60b1ddb80fc0c1e5b6aa85469f707238fb4"
-"""Digest of the spirals of the official mesh_2."""
-DECODER = "decoder.de_spiral"
-CHUNK = 32  # bodies decoded at once
 
 
 @dataclass(frozen=True)
@@ -217,16 +366,12 @@ def decode(
     x = torch.cat([coarse, code.expand(*coarse.shape[:2], -1)], -1)
     for layer in range(5):
         name = f"{DECODER}.{layer}"
-        x = _gathered(posa, x) if layer > 1 else x
+        x = x[:, posa.spirals].flatten(2) if layer > 1 else x
         x = _linear(posa, f"{name}.conv.layer", x)
         scale, shift = (posa.weights[f"{name}.norm.{k}"] for k in ("weight", "bias"))
         x = torch.nn.functional.group_norm(x.mT, GROUPS, scale, shift).mT.relu()
-    x = _linear(posa, f"{DECODER}.5.layer", _gathered(posa, x))
+    x = _linear(posa, f"{DECODER}.5.layer", x[:, posa.spirals].flatten(2))
     return torch.cat([x[..., :1].sigmoid(), x[..., 1:]], -1)
-
-
-def _gathered(posa: Posa, x: Float[Tensor, "bodies coarse c"]) -> Float[Tensor, "bodies coarse m"]:
-    return x[:, posa.spirals].flatten(2)
 
 
 def _linear(posa: Posa, name: str, x: Float[Tensor, "b v c"]) -> Float[Tensor, "b v d"]:

@@ -70,7 +70,7 @@ TURNED_APART = 0.6  # [rad], turns that are nearer count as one start
 
 
 @dataclass(frozen=True)
-class Shape:
+class ShapeChoice:
     """One possible shape at its usual size."""
 
     mesh: Mesh
@@ -85,7 +85,7 @@ def is_placed(category: str) -> bool:
     return canonical(category) not in NOT_ON_FLOOR
 
 
-def shapes_of(category: str, count: int, folder: Path | None = None) -> tuple[Shape, ...]:
+def shapes_of(category: str, count: int, folder: Path | None = None) -> tuple[ShapeChoice, ...]:
     """At most `count` shapes of a class that differ most in size and design.
 
     Args:
@@ -102,15 +102,17 @@ def shapes_of(category: str, count: int, folder: Path | None = None) -> tuple[Sh
         return _different(own, count)
     names = WIDE_CLASSES.get(category.lower(), (canonical(category),))
     known = [
-        Shape(piece.mesh, "", piece.size) for name in names for piece in catalogue(canonical(name))
+        ShapeChoice(piece.mesh, "", piece.size)
+        for name in names
+        for piece in catalogue(canonical(name))
     ]
     if not known:
         size = OTHER_SIZES.get(canonical(category), UNKNOWN_SIZE)
-        return (Shape(choose_piece(category, size), "", size),)
+        return (ShapeChoice(choose_piece(category, size), "", size),)
     return _different(tuple(known), count)
 
 
-def _different(shapes: tuple[Shape, ...], count: int) -> tuple[Shape, ...]:
+def _different(shapes: tuple[ShapeChoice, ...], count: int) -> tuple[ShapeChoice, ...]:
     """The most usual shape, then always the one that is farthest from all that are taken."""
     if len(shapes) <= count:
         return shapes
@@ -123,22 +125,22 @@ def _different(shapes: tuple[Shape, ...], count: int) -> tuple[Shape, ...]:
     return tuple(shapes[k] for k in taken)
 
 
-def _own_shapes(category: str, folder: Path) -> tuple[Shape, ...]:
+def _own_shapes(category: str, folder: Path) -> tuple[ShapeChoice, ...]:
     """The user's meshes of a class."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder, expected meshes like chair_0.obj")
-    found: list[Shape] = []
+    found: list[ShapeChoice] = []
     for path in sorted(folder.iterdir()):
         name = path.stem.rstrip("0123456789_- ")
         if path.suffix.lower() in KINDS and canonical(name) == category:
             mesh, file = read_mesh(At(path.name, path.name), folder)
             low, high = box(used(mesh).verts)
             x, y, z = (high - low).tolist()
-            found.append(Shape(mesh, file, (x, y, z)))
+            found.append(ShapeChoice(mesh, file, (x, y, z)))
     return tuple(found)
 
 
-def outer_points(shape: Shape) -> Float[Tensor, "points 3"]:
+def outer_points(shape: ShapeChoice) -> Float[Tensor, "points 3"]:
     """The outermost points of a shape, from the centre of its bottom [m]."""
     verts = used(shape.mesh).verts
     low, high = box(verts)
@@ -179,7 +181,7 @@ def _apart(yaw: Float[Tensor, " yaws"], energy: Tensor, turns: int) -> Int[Tenso
     return torch.tensor((kept + rest)[:turns])
 
 
-def piece_of(detection: Detection, shape: Shape, name: str) -> SceneObject:
+def piece_of(detection: Detection, shape: ShapeChoice, name: str) -> SceneObject:
     """A shape at the origin, standing for a detection."""
     return SceneObject(
         id=name, category=detection.category, mesh=shape.mesh, mesh_file=shape.file,
@@ -283,7 +285,7 @@ def first_scene(
 
 
 def at_scale(picture: Picture) -> Picture:
-    """The picture with its depth at the scale that the known height of the camera tells.
+    """The picture with its depth at the scale given by the known height of the camera.
 
     A network's depth is off by a factor for the whole picture, which its floor shows.
     """
@@ -307,7 +309,7 @@ def _image(picture: Picture) -> ImageInputs:
 
 
 def _screen_inputs(
-    picture: Picture, cues: ImageCues, pairs: list[tuple[int, Shape]]
+    picture: Picture, cues: ImageCues, pairs: list[tuple[int, ShapeChoice]]
 ) -> ScreenInputs:
     height = picture.height
     if height is None and picture.depth is not None:
@@ -328,8 +330,8 @@ def _screen_inputs(
     )
 
 
-def _pieces(picture: Picture, pairs: list[tuple[int, Shape]]) -> tuple[SceneObject, ...]:
-    """One piece for each item; the name tells thing and rank."""
+def _pieces(picture: Picture, pairs: list[tuple[int, ShapeChoice]]) -> tuple[SceneObject, ...]:
+    """One piece for each item; the name has thing and rank."""
     found: list[SceneObject] = []
     for index, (thing, shape) in enumerate(pairs):
         rank = sum(1 for other, _ in pairs[:index] if other == thing)
@@ -347,7 +349,7 @@ def axes_of(picture: Picture, things: Int[Tensor, " items"]) -> Given:
     return rows_of(known, things, "objects")
 
 
-def known_of(picture: Picture, pairs: list[tuple[int, Shape]]) -> Given:
+def known_of(picture: Picture, pairs: list[tuple[int, ShapeChoice]]) -> Given:
     """The same, and of what standard size each item may be."""
     kinds = [canonical(picture.detections[thing].category) for thing, _ in pairs]
     sizes = torch.tensor([shape.size for _, shape in pairs])

@@ -66,7 +66,7 @@ class ScreenInputs:
 
 
 @record
-class Guess:
+class ScreenGuess:
     """What descends, from each height."""
 
     t_world_object: Float[Tensor, "heights yaws items 3"]
@@ -111,7 +111,7 @@ def screen(inputs: ScreenInputs, config: ScreenConfig, observe: Observer = silen
     heights = _heights(inputs, config)
     start = _starts(inputs, config, heights)
 
-    def energy(guess: Guess) -> Energy:
+    def energy(guess: ScreenGuess) -> Energy:
         each = _each(guess, inputs, config)
         share = _share(each, inputs, config)
         world = _world(guess, inputs, config)
@@ -169,7 +169,9 @@ def _heights(inputs: ScreenInputs, config: ScreenConfig) -> Float[Tensor, " heig
     return torch.tensor(config.heights if inputs.height is None else (inputs.height,))
 
 
-def _world(guess: Guess, inputs: ScreenInputs, config: ScreenConfig) -> Float[Tensor, " heights"]:
+def _world(
+    guess: ScreenGuess, inputs: ScreenInputs, config: ScreenConfig
+) -> Float[Tensor, " heights"]:
     """Squared deviations of height and tilt from what is known or usual, weighted."""
     if inputs.prior is not None:
         at = torch.stack(pitch_roll(inputs.camera.R_cam_world)) + guess.tilt
@@ -184,14 +186,14 @@ def _world(guess: Guess, inputs: ScreenInputs, config: ScreenConfig) -> Float[Te
     return config.prior * (height + turned)
 
 
-def _standing(guess: Guess) -> Layout:
+def _standing(guess: ScreenGuess) -> Layout:
     x, _, z = guess.t_world_object.unbind(-1)
     y = -guess.log_height.exp()[:, None, None].expand_as(x)
     return Layout(torch.stack([x, y, z], -1), guess.yaw, guess.log_scale)
 
 
 def _each(
-    guess: Guess, inputs: ScreenInputs, config: ScreenConfig
+    guess: ScreenGuess, inputs: ScreenInputs, config: ScreenConfig
 ) -> Float[Tensor, "heights yaws items"]:
     """Cost of each item in each turn on the floor of each height."""
     camera, thing = inputs.camera, inputs.thing
@@ -219,7 +221,7 @@ def _off_depth(
     return torch.where(depth.isnan(), torch.zeros_like(off), off)
 
 
-def _starts(inputs: ScreenInputs, config: ScreenConfig, heights: Tensor) -> Guess:
+def _starts(inputs: ScreenInputs, config: ScreenConfig, heights: Tensor) -> ScreenGuess:
     """On the floor below the box where its lower edge is seen, else as far as its usual size says.
 
     An item whose floor point is not plausible (above the horizon) starts by its size, too.
@@ -241,7 +243,7 @@ def _starts(inputs: ScreenInputs, config: ScreenConfig, heights: Tensor) -> Gues
     if inputs.given is not None:
         yaw = yaw + inputs.given.axis
     shape = (len(heights), config.yaws, len(boxes))
-    return Guess(
+    return ScreenGuess(
         t_world_object=t[:, None].expand(*shape, 3).clone(),
         yaw=yaw.expand(shape).clone(),
         log_scale=torch.zeros(*shape, 3),

@@ -63,7 +63,7 @@ class SteadyInputs:
 
 
 @record
-class Fit:
+class Overlay:
     """How a picture lies over the reference."""
 
     H: Float[Tensor, "3 3"]
@@ -88,7 +88,7 @@ def opencv() -> Any:  # noqa: ANN401
 
 def align(
     reference: Grey, picture: Grey, start: Float[Tensor, "3 3"], focal: float | None = None
-) -> Fit:
+) -> Overlay:
     r"""How a camera turned (and zoomed) between two pictures.
 
         min_{R, z}  \sum_p  rho( H p - q ),   H = K diag(z, z, 1) R K^-1
@@ -112,7 +112,7 @@ def align(
     rough, four = _rough(points, places, K)
     near = np.linalg.norm(_mapped(rough, points) - places, axis=1) < 2 * ROUGH
     if near.sum() < LEAST:
-        return Fit(start, 0.0)
+        return Overlay(start, 0.0)
 
     def off(four: Matrix) -> Matrix:
         return (_mapped(_turned(four, K), points[near]) - places[near]).ravel()
@@ -120,7 +120,7 @@ def align(
     found = least_squares(off, four, loss="cauchy", f_scale=NOISE)
     turned = _turned(found.x, K)
     H = torch.from_numpy(turned / turned[2, 2]).to(start)
-    return Fit(H, _agreement(reference, picture, H))
+    return Overlay(H, _agreement(reference, picture, H))
 
 
 def _followed_points(
@@ -225,7 +225,7 @@ def find_drift(inputs: SteadyInputs, config: SteadyConfig, observe: Observer = s
     count = len(clip.time)
     scale = min(1.0, WIDE / clip.width)
     first = _grey(clip.path(0), scale)
-    fits = [Fit(torch.eye(3), 1.0)]
+    fits = [Overlay(torch.eye(3), 1.0)]
     for frame in range(1, count):
         fits.append(_followed(first, _grey(clip.path(frame), scale), fits[-1]))
         observe(Step("find_drift", frame, count))
@@ -235,7 +235,7 @@ def find_drift(inputs: SteadyInputs, config: SteadyConfig, observe: Observer = s
     return _judged(from_first, agree, (clip.height, clip.width), config)
 
 
-def _followed(first: Grey, picture: Grey, before: Fit) -> Fit:
+def _followed(first: Grey, picture: Grey, before: Overlay) -> Overlay:
     """A frame on the first one: from where the frame before it lay, or from scratch.
 
     Stripes and tiles look similar when shifted, so that the nearest start counts unless a farther

@@ -234,10 +234,10 @@ def _buffers_of(fused: FusedEnergy, items: int, count: int) -> _Buffers:
 def _workspace(size: BufferSize) -> Any:  # noqa: ANN401
     """`kernels.data.Workspace` of a thread."""
     from mover.energy.fused.kernels.data import Workspace
-    from mover.geometry.kernels.scene import Scene
+    from mover.geometry.kernels.scene import Items
 
     grid = size.height * size.width
-    space, scene = Workspace(), Scene()
+    space, scene = Workspace(), Items()
     scene.verts = array(torch.zeros(size.verts, 3), "vec3")
     scene.window = array(torch.zeros(1, 4), "vec4")
     scene.views = scene.shapes = 1

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from mover.geometry.kernels.scene import Scene, Scratch
+from mover.geometry.kernels.scene import Items, Scratch
 from mover.geometry.kernels.spans import TINY
 
 HALF = wp.constant(wp.uint64(32))
@@ -47,7 +47,7 @@ class Gap:
 
 
 @wp.func
-def contour(scene: Scene, scratch: Scratch, item: int, edge: wp.vec4l, face: wp.vec3l) -> Contour:
+def contour(scene: Items, scratch: Scratch, item: int, edge: wp.vec4l, face: wp.vec3l) -> Contour:
     """An edge between `face`, which is drawn and faces the camera, and one that does not."""
     c = Contour()
     i = int(edge[0])
@@ -86,7 +86,7 @@ def sign(x: float) -> int:
 
 
 @wp.func
-def gap(scene: Scene, c: Contour, line: int) -> Gap:
+def gap(scene: Items, c: Contour, line: int) -> Gap:
     """The two centres between which a line is cut, whatever they cover."""
     g = Gap()
     at = c.at + (float(line) + 0.5 - c.low) * c.slope - 0.5
@@ -112,7 +112,7 @@ def key(g: Gap, edge: int) -> wp.uint64:
 
 
 @wp.func
-def cut_of(scene: Scene, item: int, c: Contour, g: Gap, line: int) -> wp.vec4i:
+def cut_of(scene: Items, item: int, c: Contour, g: Gap, line: int) -> wp.vec4i:
     """What is kept of a cut."""
     flags = wp.where(c.steep, STEEP, 0) + wp.where(c.outward > 0, OUTWARD, 0)
     base = item * scene.n_verts
@@ -136,7 +136,7 @@ class Crossing:
 
 
 @wp.func
-def crossing(scene: Scene, cut: wp.vec4i) -> Crossing:
+def crossing(scene: Items, cut: wp.vec4i) -> Crossing:
     """Where a cut is, and which pixel it moves."""
     x = Crossing()
     item = cut[0] / scene.n_verts
@@ -171,7 +171,7 @@ def crossing(scene: Scene, cut: wp.vec4i) -> Crossing:
 
 
 @wp.func
-def pull_cut(scene: Scene, cut: wp.vec4i, gradient: float, grads: wp.array(dtype=wp.vec3)) -> None:
+def pull_cut(scene: Items, cut: wp.vec4i, gradient: float, grads: wp.array(dtype=wp.vec3)) -> None:
     """Add the gradient of a cut's pixel to the two vertices of its edge."""
     x = crossing(scene, cut)
     k = scene.window[cut[0] / scene.n_verts % scene.views]

@@ -7,7 +7,7 @@ of whole keys, whatever the order of the triangles.
 import warp as wp
 
 from mover.geometry.kernels.contour import contour, crossing, cut_of, gap, key, pull_cut
-from mover.geometry.kernels.scene import Maps, Pull, Scene, Scratch
+from mover.geometry.kernels.scene import Items, MapArrays, Pull, Scratch
 from mover.geometry.kernels.spans import on_screen, paint, signed_area, triangle
 from mover.geometry.kernels.surface import pull_pixel, show_pixel
 
@@ -17,13 +17,13 @@ NOWHERE, FRONT, BEHIND = 0, 1, 2  # where backs are drawn: with the fronts, or b
 
 
 @wp.func
-def face_at(scene: Scene, item: int, f: int) -> wp.vec3l:
+def face_at(scene: Items, item: int, f: int) -> wp.vec3l:
     """A triangle of an item."""
     return scene.faces[item % scene.shapes * scene.n_faces + f]
 
 
 @wp.func
-def draw_face(scene: Scene, scratch: Scratch, item: int, f: int, backs: int) -> None:
+def draw_face(scene: Items, scratch: Scratch, item: int, f: int, backs: int) -> None:
     """Draw a triangle."""
     face = face_at(scene, item, f)
     a = scratch.screen[int(face[0])]
@@ -48,7 +48,7 @@ def outline_face(scratch: Scratch, edge: wp.vec4l) -> int:
 
 
 @wp.func
-def enter_cuts(scene: Scene, scratch: Scratch, item: int, e: int) -> None:
+def enter_cuts(scene: Items, scratch: Scratch, item: int, e: int) -> None:
     """Find the outermost cut for each pair of centres on either side of an edge."""
     edge = scene.edges[item % scene.shapes * scene.n_edges + e]
     f = outline_face(scratch, edge)
@@ -62,7 +62,7 @@ def enter_cuts(scene: Scene, scratch: Scratch, item: int, e: int) -> None:
 
 
 @wp.func
-def keep_cuts(scene: Scene, scratch: Scratch, maps: Maps, item: int, e: int) -> None:
+def keep_cuts(scene: Items, scratch: Scratch, maps: MapArrays, item: int, e: int) -> None:
     """List the cuts of an edge that won, take them out, and move the image by them."""
     edge = scene.edges[item % scene.shapes * scene.n_edges + e]
     f = outline_face(scratch, edge)
@@ -84,7 +84,7 @@ def keep_cuts(scene: Scene, scratch: Scratch, maps: Maps, item: int, e: int) -> 
 
 
 @wp.func
-def bound_cuts(scratch: Scratch, maps: Maps, first: int) -> None:
+def bound_cuts(scratch: Scratch, maps: MapArrays, first: int) -> None:
     """Bound the pixels of the cuts from `first` on to [0, 1]; mark those that overshot."""
     for i in range(first, scratch.count[1]):
         target = scratch.targets[i]
@@ -98,7 +98,7 @@ def bound_cuts(scratch: Scratch, maps: Maps, first: int) -> None:
 
 
 @wp.func
-def show(scene: Scene, scratch: Scratch, maps: Maps, item: int, row: int) -> None:
+def show(scene: Items, scratch: Scratch, maps: MapArrays, item: int, row: int) -> None:
     """Write the maps of a row of pixels, and clear their winners."""
     b = scene.border
     high = scene.height - 2 * b
@@ -115,7 +115,7 @@ def show(scene: Scene, scratch: Scratch, maps: Maps, item: int, row: int) -> Non
 
 
 @wp.func
-def draw_item(scene: Scene, scratch: Scratch, maps: Maps, backs: int, item: int) -> wp.vec2i:
+def draw_item(scene: Items, scratch: Scratch, maps: MapArrays, backs: int, item: int) -> wp.vec2i:
     """Put the triangles of one item into the z-buffers, and find the cuts of its outline.
 
     Returns:
@@ -139,7 +139,7 @@ def draw_item(scene: Scene, scratch: Scratch, maps: Maps, backs: int, item: int)
 
 @wp.kernel
 def look_items(
-    scene: Scene, scratch: Scratch, maps: Maps, backs: int, first: int, stop: int
+    scene: Items, scratch: Scratch, maps: MapArrays, backs: int, first: int, stop: int
 ) -> None:
     """Silhouettes, depths or hits of some items."""
     for item in range(first, stop):
@@ -154,7 +154,7 @@ def look_items(
 
 
 @wp.kernel
-def pull_items(scene: Scene, maps: Maps, pull: Pull, first: int, stop: int) -> None:
+def pull_items(scene: Items, maps: MapArrays, pull: Pull, first: int, stop: int) -> None:
     """Gradients of the vertices of some items."""
     if pull.has_image:
         for i in range(pull.cuts.shape[0]):

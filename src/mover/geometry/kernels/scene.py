@@ -4,7 +4,7 @@ import warp as wp
 
 
 @wp.struct
-class Scene:
+class Items:
     """Items with their topologies and windows; item i has topology and window i % views."""
 
     verts: wp.array(dtype=wp.vec3)
@@ -59,7 +59,7 @@ class Scratch:
 
 
 @wp.struct
-class Maps:
+class MapArrays:
     """What is drawn, without the border; a pixel that nothing covers is left as it is."""
 
     image: wp.array(dtype=wp.float32)

@@ -7,7 +7,7 @@ so that both decide the same for centres on an edge.
 import warp as wp
 
 from mover.geometry.camera import NEAR
-from mover.geometry.kernels.scene import Scene, Scratch
+from mover.geometry.kernels.scene import Items, Scratch
 
 TINY = 1e-12  # [px], keeps the slope of level edges finite; their rows use its sign only
 AWAY = 1e9  # [px], vertices further off would overflow; their triangles are left out
@@ -112,7 +112,7 @@ def triangle(a: wp.vec3, b: wp.vec3, c: wp.vec3, face: wp.vec3l, box: wp.vec4i) 
 
 
 @wp.struct
-class Run:
+class PixelRun:
     """What a row cuts out of a triangle."""
 
     first: int
@@ -126,7 +126,7 @@ class Run:
 
 
 @wp.func
-def run_of(t: Triangle, row: int, left: int, right: int) -> Run:
+def run_of(t: Triangle, row: int, left: int, right: int) -> PixelRun:
     """The pixels of a row that cuts the triangle, from column `left` to before `right`."""
     y = float(row) + 0.5
     other = t.upper
@@ -138,7 +138,7 @@ def run_of(t: Triangle, row: int, left: int, right: int) -> Run:
     high = wp.where(x < x2, x2, x) - 0.5
     start = float(left)
     end = float(right)
-    r = Run()
+    r = PixelRun()
     r.first = int(wp.ceil(wp.where(low > start, wp.where(low < end, low, end), start)))
     last = wp.where(high > start - 1.0, wp.where(high < end, high, end - 1.0), start - 1.0)
     r.count = int(wp.floor(last)) - r.first + 1
@@ -152,7 +152,7 @@ def run_of(t: Triangle, row: int, left: int, right: int) -> Run:
 
 
 @wp.func
-def fill(keys: wp.array(dtype=wp.uint64), start: int, r: Run, tag: int) -> None:
+def fill(keys: wp.array(dtype=wp.uint64), start: int, r: PixelRun, tag: int) -> None:
     """Raise the keys of a run: where its key is greater than the pixel's it wins.
 
     The tag is face + 1 where the nearest run wins, less than zero where the farthest does.
@@ -168,7 +168,7 @@ def fill(keys: wp.array(dtype=wp.uint64), start: int, r: Run, tag: int) -> None:
 
 
 @wp.func
-def paint(scene: Scene, scratch: Scratch, t: Triangle, place: wp.vec3i, near: bool) -> None:
+def paint(scene: Items, scratch: Scratch, t: Triangle, place: wp.vec3i, near: bool) -> None:
     """Draw one row of a triangle to `near`, where the nearest wins, else to `far`.
 
     Its place is the item within `scratch`, the row and the face.

@@ -6,7 +6,7 @@ than the plane through the vertices, from which the gradient comes.
 
 import warp as wp
 
-from mover.geometry.kernels.scene import Maps, Pull, Scene
+from mover.geometry.kernels.scene import Items, MapArrays, Pull
 
 GRAZING = 0.01  # sine of the angle below which a triangle's depth has no gradient
 AGREE = 1e-3  # relative difference of plane and scan line in 1/z beyond which the plane is noise
@@ -29,14 +29,14 @@ def inverse_depth(key: wp.uint64, farthest: bool) -> float:
 
 
 @wp.func
-def item_of(scene: Scene, pixel: int) -> int:
+def item_of(scene: Items, pixel: int) -> int:
     """Item that a pixel of the windows belongs to."""
     border = 2 * scene.border
     return pixel / ((scene.width - border) * (scene.height - border))
 
 
 @wp.func
-def ray_of(scene: Scene, pixel: int) -> wp.vec3:
+def ray_of(scene: Items, pixel: int) -> wp.vec3:
     """Ray through the centre of a pixel of the windows, with a depth of 1."""
     wide = scene.width - 2 * scene.border
     high = scene.height - 2 * scene.border
@@ -47,7 +47,7 @@ def ray_of(scene: Scene, pixel: int) -> wp.vec3:
 
 
 @wp.func
-def show_pixel(maps: Maps, pixel: int, near: wp.uint64, far: wp.uint64) -> None:
+def show_pixel(maps: MapArrays, pixel: int, near: wp.uint64, far: wp.uint64) -> None:
     """Write the maps of one pixel from its winners."""
     if near != wp.uint64(0):
         if maps.silhouette:
@@ -64,7 +64,7 @@ def show_pixel(maps: Maps, pixel: int, near: wp.uint64, far: wp.uint64) -> None:
 
 
 @wp.func
-def pull_pixel(scene: Scene, maps: Maps, pull: Pull, pixel: int) -> None:
+def pull_pixel(scene: Items, maps: MapArrays, pull: Pull, pixel: int) -> None:
     """Add the gradients of both depths of a pixel to the vertices."""
     if maps.covered[pixel]:
         if pull.has_nearest:
@@ -77,7 +77,12 @@ def pull_pixel(scene: Scene, maps: Maps, pull: Pull, pixel: int) -> None:
 
 @wp.func
 def pull_depth(
-    scene: Scene, pixel: int, face: int, z: float, gradient: float, grads: wp.array(dtype=wp.vec3)
+    scene: Items,
+    pixel: int,
+    face: int,
+    z: float,
+    gradient: float,
+    grads: wp.array(dtype=wp.vec3),
 ) -> None:
     """Add the gradient of a pixel's depth to the vertices of the face that it sees.
 

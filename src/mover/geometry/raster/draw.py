@@ -119,7 +119,7 @@ def _scene(verts: Tensor, shape: Topology, views: Crops, border: int) -> Any:  #
     edges = shape.edges[:, : None if shape.faces.shape[1] else 0]
     faces, edges = (t.to(verts.device, torch.int64).contiguous() for t in (shape.faces, edges))
     return _packed(
-        "Scene",
+        "Items",
         verts=verts.detach().contiguous().view(-1, 3),
         window=windows(views.K.to(verts), border),
         faces=faces.view(-1, 3),
@@ -146,7 +146,7 @@ def _maps(maps: Maps, near_face: Tensor, far_face: Tensor) -> Any:  # noqa: ANN4
     flat = {name: value.view(-1) for name, value in vars(maps).items()} | faces
     drawn, both = maps.image.numel() > 0, maps.covered.numel() > 0
     hits = not drawn and not both
-    return _packed("Maps", **flat, silhouette=drawn, depth=both, hits=hits)
+    return _packed("MapArrays", **flat, silhouette=drawn, depth=both, hits=hits)
 
 
 def _packed(name: str, **fields: Any) -> Any:  # noqa: ANN401

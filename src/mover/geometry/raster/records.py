@@ -80,7 +80,7 @@ class Trace:
     """What the gradients need to know of a drawing."""
 
     scene: Any
-    """The items as the kernels read them: `kernels.scene.Scene`."""
+    """The items as the kernels read them: `kernels.scene.Items`."""
     near_face: Tensor
     """Face that is seen first (items, h, w); unset where not covered."""
     far_face: Tensor

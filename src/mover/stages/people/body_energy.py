@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mover.bodies.corrected import Correction, Moved, Puppet, moved
+from mover.bodies.corrected import Correction, MovedSkin, Puppet, moved
 from mover.core.observe import Energy
 from mover.core.types import Camera
 from mover.energy.body_contact import Matches, touch_term
@@ -76,7 +76,7 @@ class MovedBodies:
     by: Correction
     puppet: Puppet
     known: BodyEvidence
-    now: Moved
+    now: MovedSkin
 
     @cached_property
     def points_cam(self) -> Float[Tensor, "bodies points 3"]:
@@ -158,7 +158,7 @@ def body_energy(
     return sum_terms(active_weights(weights, BODY_TERMS, known.has), BODY_TERMS, at)
 
 
-def _soles(now: Moved, feet: SolePoints) -> tuple[Tensor, Tensor]:
+def _soles(now: MovedSkin, feet: SolePoints) -> tuple[Tensor, Tensor]:
     """Middle of each sole, and its middle again at the height of its lower half [m]."""
     middles: list[Tensor] = []
     lows: list[Tensor] = []

@@ -4,7 +4,7 @@ import warp as wp
 
 from mover.geometry.kernels.lookup import Field
 from mover.geometry.kernels.nearest import Cloud
-from mover.geometry.kernels.scene import Scene, Scratch
+from mover.geometry.kernels.scene import Items, Scratch
 
 BBOX, SILHOUETTE, SCALE, DEPTH, COLLISION, CONTACT, DISTANCE, HEADING = range(8)
 VERTS, FACES, EDGES, SAMPLES, QUERIES = range(5)  # columns of `Things.starts`
@@ -109,7 +109,7 @@ class KernelInput:
 class Workspace:
     """Working memory of a thread, for one item at a time; all but the lists is zero in between."""
 
-    scene: Scene
+    scene: Items
     """An item alone: its vertices in camera axes and its window."""
     scratch: Scratch
     steps: wp.array(dtype=wp.uint8)
