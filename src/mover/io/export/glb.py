@@ -134,7 +134,7 @@ class Gltf:
         targets: Sequence[Mapping[str, int]] = (),
     ) -> int:
         """Append a mesh of attributes in the colour of a person, with shapes that it morphs to."""
-        surface = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+        surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
         surface["baseColorFactor"] = [*linear(person_colour(person)), 1.0]
         primitive: dict[str, Any] = {
             "attributes": {key: self.add_array(array.numpy()) for key, array in arrays.items()},
