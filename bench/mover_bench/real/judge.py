@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mover.bodies import load_model
+from mover.bodies.skinning import open_body
 from mover.bodies.smpl_model import heights_of
 from mover.core.errors import InputError
 from mover.core.files import replacing
@@ -89,7 +89,7 @@ def table_of(found: dict[str, dict[str, Any]]) -> str:
 def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:
     """Fit the people, find a first scene, reconstruct both starts, compare with the truth."""
     camera = replace(scene.truth.camera, R_cam_world=LEVEL)  # its tilt is not given
-    model = load_model("makehuman")
+    model = open_body()
     bodies = fit_bodies(FitInputs(scene.keypoints, camera, model)).bodies
     usual, growth = heights_of(model)
     assert bodies.pose is not None
