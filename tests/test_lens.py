@@ -43,7 +43,10 @@ def camera_of(focal: float, pitch: float = -0.2, roll: float = 0.02) -> Camera:
     return Camera(K, tilted(torch.tensor(pitch), torch.tensor(roll)), W, H)
 
 
-def drawn(heading: float, seed: int, boxes: int = 9, askew: int = 0, only: int | None = None):
+def drawn(
+    heading: float, seed: int, boxes: int = 9, askew: int = 0, only: int | None = None,
+    off: tuple[float, float] = (0.0, 0.0),
+):  # fmt: skip
     """A picture of boxes' edges by OpenCV's pencil: a maker that shares nothing with the method."""
     rng, camera = np.random.default_rng(seed), camera_of(FOCAL)
     picture = np.full((H, W, 3), 235, np.uint8)
@@ -53,6 +56,9 @@ def drawn(heading: float, seed: int, boxes: int = 9, askew: int = 0, only: int |
     R = camera.R_cam_world.double().numpy()
     for k in range(boxes + askew):
         own = turn if k < boxes else rot_y(torch.tensor(rng.uniform(0, np.pi))).double().numpy()
+        if off[1]:  # each stands a little off the axes of the room
+            angle = np.radians(rng.uniform(*off)) * rng.choice([-1, 1])
+            own = own @ rot_y(torch.tensor(angle)).double().numpy()
         size = rng.uniform(0.4, 1.4, 3)
         middle = np.array([rng.uniform(-2, 2), rng.uniform(-1.4, 0), rng.uniform(-5, -3)])
         world = (corners * size) @ own.T + middle
@@ -98,6 +104,21 @@ def test_the_stated_error_holds():
         if (s := lens_of(drawn(0.1 * k, seed=k, askew=3), 1.06 * FOCAL, 0.055).spread)
     ]
     assert math.sqrt(np.mean(np.square(off))) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("off", "most", "stated"), [((3.0, 8.0), 0.025, 1.35), ((3.0, 15.0), 0.035, 1.7)]
+)
+def test_furniture_off_the_axes_of_the_room_is_in_the_stated_error(off, most, stated):
+    errors, spreads = [], []
+    for seed in range(12):
+        guess = math.exp(0.055 * np.random.default_rng(seed + 100).standard_normal())
+        found = lens_of(drawn(0.3, seed, off=off), guess * FOCAL, 0.055)
+        errors.append(math.log(found.zoom * guess))
+        spreads.append(found.spread)
+    rms, spread = (float(np.sqrt(np.mean(np.square(x)))) for x in (errors, spreads))
+    assert rms < most  # of a guess that is off by .055
+    assert 0.75 < rms / spread < stated
 
 
 @pytest.mark.parametrize("off", [0.94, 1.0, 1.09])
