@@ -10,8 +10,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from match import match
 
+from mover.bodies.match_mesh import match
 from mover.bodies.parts import digest_of
 
 

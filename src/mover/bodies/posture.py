@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.parts import LANDMARKS, Parts, members
+from mover.bodies.limbs import LANDMARKS
+from mover.bodies.parts import Parts, members
 from mover.bodies.skin import PARTS
 from mover.core.records import record
 from mover.core.types import Bodies

@@ -12,9 +12,20 @@ from functools import cache
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from limbs import LIMBS, SIDED, Walks, ends, limb_frames, limb_of, match_ends, naturalness
 
-from mover.bodies.parts import LANDMARKS, landmark_rings, thin
+from mover.bodies.limbs import (
+    LANDMARKS,
+    LIMBS,
+    SIDED,
+    Walks,
+    ends,
+    landmark_rings,
+    limb_frames,
+    limb_of,
+    match_ends,
+    naturalness,
+    thin,
+)
 from mover.bodies.skin import model_parts
 from mover.bodies.skinning import open_body, zero_pose
 from mover.geometry.mesh import vertex_normals

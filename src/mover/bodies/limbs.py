@@ -14,6 +14,18 @@ from jaxtyping import Float, Int
 from mover.bodies.skeleton import FINGERS, SIDES
 from mover.bodies.skinning import SkinnedBody
 
+LANDMARKS = (
+    "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle", "neck",
+    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
+"""Joints that are found on any body."""
+
+ABOVE = {
+    "hip": ("pelvis",), "knee": ("hip",), "ankle": ("knee",), "neck": ("spine3",),
+    "shoulder": ("collar",), "elbow": ("shoulder",), "wrist": ("elbow",),
+}  # fmt: skip
+"""The joint whose skin blends with that of each landmark."""
+
 Array = np.ndarray
 
 TIPS = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
@@ -143,6 +155,34 @@ BENDS = (
 OWNER = {"hip": "thigh", "knee": "shin", "ankle": "foot", "foot": "foot",
          "shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand",
          **{f"{f}{k}": "hand" for f in FINGERS for k in (1, 2, 3)}}  # fmt: skip
+
+
+def landmark_rings(model: SkinnedBody) -> Float[Array, "verts landmarks"]:
+    """1 where the skin of a landmark blends with the skin above it."""
+    weight = dict(zip(model.joint_names, model.weights.T.numpy(), strict=True))
+    rings: list[Array] = []
+    for name in LANDMARKS:
+        side, _, joint = name.rpartition("_")
+        above = [f"{side}_{n}" if f"{side}_{n}" in weight else n for n in ABOVE[joint]]
+        rings.append(sum(weight[n] for n in above) * weight[name] > 0.12)
+    return np.stack(rings, axis=1).astype(float)
+
+
+def thin(
+    mesh: Float[Array, "verts 3"], rings: Float[Array, "verts landmarks"], members: int = 24
+) -> Int[Array, "landmarks members"]:
+    """So many vertices of each ring, far from each other, so that their mean is its middle."""
+    rows: list[Array] = []
+    for ring in (rings > 0).T:
+        index = np.nonzero(ring)[0] if ring.any() else np.arange(len(mesh))
+        points = mesh[index]
+        far = np.linalg.norm(points - points.mean(0), axis=1)
+        chosen: list[int] = []
+        for _ in range(members):
+            chosen.append(int(far.argmax()))
+            far = np.minimum(far, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        rows.append(index[chosen])
+    return np.stack(rows)
 
 
 def limb_of(model: SkinnedBody) -> Int[Array, " verts"]:
