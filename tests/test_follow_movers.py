@@ -9,7 +9,7 @@ from judged import grid_body
 from little_room import GROUND, box, camera, piece
 
 from mover.bodies.limbs import LANDMARKS
-from mover.bodies.parts import Parts
+from mover.bodies.parts import BodyParts
 from mover.core.types import Bodies, Scene, SceneObject, Segment
 from mover.evaluate.contact import StandingMesh, nearness
 from mover.extensions.moved_furniture.measure import measure_moves
@@ -63,8 +63,8 @@ def someone(name: str, way: torch.Tensor, person: int = 0, jitter: float = 0.0) 
     )  # fmt: skip
 
 
-def unknown_parts(bodies: Bodies) -> Parts:
-    return Parts(torch.full((bodies.verts.shape[1],), -1), torch.zeros(0, 1, dtype=torch.long))
+def unknown_parts(bodies: Bodies) -> BodyParts:
+    return BodyParts(torch.full((bodies.verts.shape[1],), -1), torch.zeros(0, 1, dtype=torch.long))
 
 
 def straight(turn: float) -> torch.Tensor:

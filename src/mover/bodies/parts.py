@@ -33,7 +33,7 @@ _matches: dict[str, Matched | None] = {}
 
 
 @record
-class Parts:
+class BodyParts:
     """Which part of the body each vertex belongs to."""
 
     part_of: Int[Tensor, " verts"]
@@ -43,13 +43,13 @@ class Parts:
     mesh could not be matched to a human body."""
 
 
-def members(parts: Parts, *names: str) -> Bool[Tensor, " verts"]:
+def members(parts: BodyParts, *names: str) -> Bool[Tensor, " verts"]:
     """Which vertices belong to one of these parts."""
     wanted = torch.tensor([PARTS.index(n) for n in names], device=parts.part_of.device)
     return torch.isin(parts.part_of, wanted)
 
 
-def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> Parts:
+def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> BodyParts:
     """Parts of these bodies: by the model's skin or lists where it is known, else by geometry.
 
     Args:
@@ -60,29 +60,29 @@ def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> Parts:
     """
     found = _find(bodies, up_cam)
     device = bodies.verts.device
-    return Parts(found.part_of.to(device), found.rings.to(device))
+    return BodyParts(found.part_of.to(device), found.rings.to(device))
 
 
-def _find(bodies: Bodies, up_cam: Float[Tensor, "3"] | None) -> Parts:
+def _find(bodies: Bodies, up_cam: Float[Tensor, "3"] | None) -> BodyParts:
     model = known_model(bodies.faces, bodies.verts.shape[1]) or _users_model(bodies)
     if model is not None:
         rings = thin(model.verts.numpy(), landmark_rings(model))
-        return Parts(model_parts(model), torch.from_numpy(rings))
+        return BodyParts(model_parts(model), torch.from_numpy(rings))
     listed = _listed(bodies)
     if listed is not None:
         return listed
     none = torch.zeros((0, 0), dtype=torch.long)
     if len(bodies.verts) == 0:
-        return Parts(torch.full((bodies.verts.shape[1],), -1), none)
+        return BodyParts(torch.full((bodies.verts.shape[1],), -1), none)
     rows = torch.linspace(0, len(bodies.verts) - 1, POSES).round().long().unique()
     meshes, faces = bodies.verts[rows].detach().cpu().double(), bodies.faces.detach().cpu()
     found = _matched(meshes, faces)
     if found is not None:
-        return Parts(torch.from_numpy(found.part), torch.from_numpy(found.rings))
+        return BodyParts(torch.from_numpy(found.part), torch.from_numpy(found.rings))
     log.warning("the bodies' mesh does not look like a whole person: only its soles are looked for")
     default = (0.0, -1.0, 0.0) if bodies.space == "camera" else (0.0, 1.0, 0.0)
     up = torch.tensor(default) if up_cam is None else up_cam.detach().cpu()
-    return Parts(lowest_soles(meshes, faces, up.to(meshes)), none)
+    return BodyParts(lowest_soles(meshes, faces, up.to(meshes)), none)
 
 
 def _matched(
@@ -124,10 +124,10 @@ def digest_of(faces: Int[Array, "faces 3"]) -> str:
     return hashlib.sha256(np.ascontiguousarray(faces, dtype="<i8").tobytes()).hexdigest()
 
 
-def _listed(bodies: Bodies) -> Parts | None:
+def _listed(bodies: Bodies) -> BodyParts | None:
     """The parts of MHR, the body of SAM 3D Body, if this is its topology."""
     with np.load(ASSETS / "mhr_parts.npz") as data:
         part_of, rings, digest = data["part_of"], data["rings"], str(data["digest"])
     if bodies.verts.shape[1] != len(part_of) or digest_of(bodies.faces.cpu().numpy()) != digest:
         return None
-    return Parts(torch.from_numpy(part_of).long(), torch.from_numpy(rings).long())
+    return BodyParts(torch.from_numpy(part_of).long(), torch.from_numpy(rings).long())

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.limbs import LANDMARKS
-from mover.bodies.parts import Parts, members
+from mover.bodies.parts import BodyParts, members
 from mover.bodies.skin import PARTS
 from mover.core.records import record
 from mover.core.types import Bodies
@@ -39,7 +39,7 @@ class Postures:
     """How far the trunk is tilted backwards from upright [rad]; negative: forwards."""
 
 
-def landmarks(bodies: Bodies, parts: Parts) -> Float[Tensor, "bodies landmarks 3"]:
+def landmarks(bodies: Bodies, parts: BodyParts) -> Float[Tensor, "bodies landmarks 3"]:
     """Places of `LANDMARKS` [m]: from the joints by name, else the middle of rings of vertices.
 
     NaN where a mesh could not be matched to a human body.
@@ -101,7 +101,7 @@ Height = float | Float[Tensor, " bodies"]
 """Of the floor, everywhere or under each body [m]."""
 
 
-def postures(bodies: Bodies, parts: Parts, ground: Height | None = None) -> Postures:
+def postures(bodies: Bodies, parts: BodyParts, ground: Height | None = None) -> Postures:
     """Posture of each body in the world.
 
     `ground` is the height of the floor [m]; where it is not known, each body's lowest point counts.
@@ -157,7 +157,7 @@ def _level(vector: Float[Tensor, "bodies 3"]) -> Float[Tensor, "bodies 3"]:
 
 
 def headings(
-    bodies: Bodies, parts: Parts, ground: Height | None = None
+    bodies: Bodies, parts: BodyParts, ground: Height | None = None
 ) -> Float[Tensor, "bodies 3"]:
     """Level unit vector to where each sitter faces: the pelvis' front and the thighs' way.
 
@@ -187,7 +187,7 @@ FLOATS = (0.08, 0.16)  # [m] of that point from the ground: on the floor, surely
 UNDERSIDE = 0.1  # [m] over the lowest point: where a body that lies on its front or side touches
 
 
-def touching(bodies: Bodies, parts: Parts, ground: Height) -> Float[Tensor, "bodies verts"]:
+def touching(bodies: Bodies, parts: BodyParts, ground: Height) -> Float[Tensor, "bodies verts"]:
     """Chance that each vertex of people in the world (+y up) touches something.
 
     Raises:
@@ -231,7 +231,7 @@ def _flat(
 
 
 def _sit(
-    bodies: Bodies, parts: Parts, pose: Postures, down: Float[Tensor, "bodies verts"]
+    bodies: Bodies, parts: BodyParts, pose: Postures, down: Float[Tensor, "bodies verts"]
 ) -> Float[Tensor, "bodies verts"]:
     """Sitting: what faces down of seat and thighs, as far as it is low enough."""
     part = members(parts, "seat", "left_thigh", "right_thigh")
@@ -240,7 +240,7 @@ def _sit(
 
 def _recline(
     bodies: Bodies,
-    parts: Parts,
+    parts: BodyParts,
     pose: Postures,
     front: Float[Tensor, "bodies 3"],
     trunk: Float[Tensor, "bodies 3"],
@@ -257,7 +257,7 @@ def _recline(
 
 
 def _lie(
-    bodies: Bodies, parts: Parts, pose: Postures, down: Float[Tensor, "bodies verts"]
+    bodies: Bodies, parts: BodyParts, pose: Postures, down: Float[Tensor, "bodies verts"]
 ) -> Float[Tensor, "bodies verts"]:
     """Lying on the back: back, seat and thighs; else whatever lies lowest and faces down."""
     rear = members(parts, "back", "seat", "left_thigh", "right_thigh")
@@ -271,7 +271,7 @@ def _lie(
 
 def _rest_arms(
     bodies: Bodies,
-    parts: Parts,
+    parts: BodyParts,
     places: Float[Tensor, "bodies landmarks 3"],
     down: Float[Tensor, "bodies verts"],
     ground: Height,
@@ -310,7 +310,7 @@ def from_lap(
     return torch.minimum(*ways)
 
 
-def _stand(bodies: Bodies, parts: Parts, ground: Height) -> Float[Tensor, "bodies verts"]:
+def _stand(bodies: Bodies, parts: BodyParts, ground: Height) -> Float[Tensor, "bodies verts"]:
     """Soles: hardly moving, and as low as the body reaches, which is about the ground.
 
     A body whose depth is wrong floats or sinks by some centimetres: its own lowest point shows

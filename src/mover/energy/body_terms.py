@@ -282,7 +282,7 @@ class Sighting:
     facing: Bool[Tensor, "bodies points"]
     """The skin faces the camera."""
     loose: Float[Tensor, "bodies points"]
-    """How far off that furniture may be along the ray, as its shape is doubted [m]."""
+    """Uncertainty of the depth of that furniture along the ray, from that of its shape [m]."""
 
 
 def bounds_of_skin(seen: Sighting) -> Bounds:
@@ -296,7 +296,7 @@ def bounds_of_skin(seen: Sighting) -> Bounds:
 
 
 def order_term(depth: Float[Tensor, "bodies points"], bounds: Bounds) -> Float[Tensor, " bodies"]:
-    """Cost of skin before what hides it or behind what it hides [nats]."""
+    """Cost of skin in front of furniture that hides it or behind furniture that it hides [nats]."""
     known = bounds.near.isfinite() | bounds.far.isfinite()
     none = torch.zeros_like(depth)
     near = torch.where(bounds.near.isfinite(), bounds.near - ORDER_MARGIN - depth, none)

@@ -130,6 +130,6 @@ class BodyWeights:
     touch: Weight = 1.0
     """Contact: skin that touches, off the furniture."""
     order: Weight = 0.3
-    """Depth order: skin before what hides it, or behind what it hides."""
+    """Depth order: skin in front of its occluder, or behind furniture that it occludes."""
     outline: Weight = 1.0
     """Masks: the outline of the body on the outline of its mask."""

@@ -73,7 +73,7 @@ def bbox_term(
     return ((drawn - detected).abs() * (WIDTH / width)).sum(-1) * sides.any(-1)
 
 
-# --- Silhouettes that know what hides them -----------------------------------------------------
+# --- Silhouettes that account for occlusion ----------------------------------------------------
 
 
 def silhouette_term(
@@ -150,7 +150,7 @@ class Borders:
         return tuple(self.shifts.tolist())
 
 
-class Fitted(NamedTuple):
+class BestShift(NamedTuple):
     """The terms of the image with the shift at which they are least."""
 
     bbox: Float[Tensor, "*starts objects"]
@@ -193,7 +193,7 @@ def fit_borders(
     trust: Float[Tensor, " objects"],
     borders: Borders,
     weights: tuple[float, float],
-) -> Fitted:
+) -> BestShift:
     """Box and silhouette (robust) with the shift of the border that suits each object best.
 
     Args:
@@ -214,7 +214,7 @@ def fit_borders(
     best = (weights[0] * boxed + weights[1] * (silhouette + cost)).detach().argmin(0)
     index = best.unsqueeze(0)
     chosen = [x.gather(0, index)[0] for x in (boxed, silhouette, cost)]
-    return Fitted(chosen[0], chosen[1] + chosen[2], best)
+    return BestShift(chosen[0], chosen[1] + chosen[2], best)
 
 
 # --- Measured depth: front surfaces lie where a depth network sees them --------------------------

@@ -103,13 +103,13 @@ def minimize(
         energy: What to minimise.
         start: From where.
         method: How.
-        observe: Told of every step.
-        stage: Name for those who watch, and for errors.
+        observe: Receives every step.
+        stage: Name for observers and error messages.
 
     Raises:
         ValueError: If the energy stops being finite.
     """
-    free = _Unknowns(start, method)
+    free = _FreeTensors(start, method)
     for index in range(method.steps):
         value = free.step(energy)
         observe(Step(stage, index, method.steps, value, lambda: free.record))
@@ -125,7 +125,7 @@ def minimize(
     return Minimum(at, last, free.trace)
 
 
-class _Unknowns(Generic[P]):
+class _FreeTensors(Generic[P]):
     """All fields of a record in one tensor, and all that a step reads and changes."""
 
     trace: Tensor

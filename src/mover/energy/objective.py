@@ -33,8 +33,8 @@ from mover.energy.human_terms import (
     some_touches,
 )
 from mover.energy.image_terms import (
+    BestShift,
     Borders,
-    Fitted,
     Measured,
     bbox_term,
     fit_borders,
@@ -177,7 +177,7 @@ class PlacedScene:
         return self.config.form == "robust" and bool(free)
 
     @cached_property
-    def fitted(self) -> Fitted:
+    def fitted(self) -> BestShift:
         """Box and silhouette under the border of each mask that suits them best."""
         image, w = self.known.image, self.config.weights
         seen = image.boxes, image.sides, image.keep
@@ -322,10 +322,10 @@ def without_meshes(objects: Objects) -> Objects:
 
 
 def some_supports(supports: Int[Tensor, " objects"], rows: Rows) -> Int[Tensor, " rows"]:
-    """What carries rows of (starts x objects), counted through, by its number among them.
+    """Supports of rows of (starts x objects), as indices into `rows`; -1: the floor.
 
     Raises:
-        ValueError: If an object is asked for without what carries it.
+        ValueError: If an object is requested without its support.
     """
     n = len(supports)
     index = rows % n
@@ -334,7 +334,7 @@ def some_supports(supports: Int[Tensor, " objects"], rows: Rows) -> Int[Tensor, 
     below = supports[index]
     carrier = place[(rows - index + below).clamp_min(0)]
     if bool(((below >= 0) & (carrier < 0)).any()):
-        raise ValueError("some_supports: an object without the one that carries it")
+        raise ValueError("some_supports: an object without its support")
     return torch.where(below >= 0, carrier, below)
 
 
@@ -342,7 +342,7 @@ def some_objects(objects: Objects, rows: Rows) -> Objects:
     """The objects of rows of (starts x objects), counted through; carriers come with their loads.
 
     Raises:
-        ValueError: If an object is asked for without what carries it.
+        ValueError: If an object is requested without its support.
     """
     n = len(objects.ids)
     index = rows % n

@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.parts import Parts, members, parts_of
+from mover.bodies.parts import BodyParts, members, parts_of
 from mover.bodies.posture import Postures, at, headings, landmarks, postures
 from mover.core.records import rows_of
 from mover.core.run import Run
@@ -154,7 +154,7 @@ class Resting:
     """People in the world, and which of their vertices touch something."""
 
     bodies: Bodies
-    parts: Parts
+    parts: BodyParts
     touch: Bool[Tensor, "bodies verts"]
     ground: float
 

@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.bodies.parts import Parts, members, parts_of
+from mover.bodies.parts import BodyParts, members, parts_of
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.run import Run
@@ -79,7 +79,7 @@ class ScaleInputs:
     """People in the axes of the camera of their frame, and its path."""
 
     bodies: Bodies
-    parts: Parts
+    parts: BodyParts
     path: CameraPath
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from mover.bodies.corrected import in_world
-from mover.bodies.parts import Parts, parts_of
+from mover.bodies.parts import BodyParts, parts_of
 from mover.core.errors import InputError
 from mover.core.records import rows_of
 from mover.core.run import Run
@@ -39,7 +39,7 @@ class Located:
     path: CameraPath
     """Where the cameras of their frames were [m]."""
     kept: Bool[Tensor, " bodies"]
-    parts: Parts
+    parts: BodyParts
     feet: FootContacts
     alignment: Alignment
     warnings: tuple[str, ...]
@@ -126,7 +126,7 @@ class ChosenPeople:
     warnings: tuple[str, ...]
 
 
-def chosen_people(capture: Capture, parts: Parts, config: Config, run: Run) -> ChosenPeople:
+def chosen_people(capture: Capture, parts: BodyParts, config: Config, run: Run) -> ChosenPeople:
     """Choose frames (Sec. 3.1) and, with masks, correct the depth of each person."""
     bodies, path, masks = capture.bodies, capture.path, capture.people
     assert bodies is not None

@@ -133,13 +133,13 @@ ROBUST = Config(
 )  # fmt: skip
 
 PRESETS = {"paper": PAPER, "robust": ROBUST}
-_Pricing = TypeVar("_Pricing", PlaceConfig, RefineConfig)
+_Weighted = TypeVar("_Weighted", PlaceConfig, RefineConfig)
 
 
 def with_sizes(config: Config, shape: float, whole: float) -> Config:
-    """The price of another shape, and of another size as a whole, multiplied in all stages."""
+    """Multiply the weights of shape and of overall size in all stages."""
 
-    def of(stage: _Pricing) -> _Pricing:
+    def of(stage: _Weighted) -> _Weighted:
         weights = replace(stage.weights, scale=shape * stage.weights.scale)
         growth = stage.uniform_scale_weight * whole / shape
         return replace(stage, weights=weights, uniform_scale_weight=growth)

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.parts import Parts
+from mover.bodies.parts import BodyParts
 from mover.bodies.posture import at, facing, landmarks, postures
 from mover.core.records import rows_of
 from mover.core.types import Bodies, SceneObject, Segment
@@ -73,7 +73,9 @@ class _Holds:
     """Whether it can be held so: the person sits."""
 
 
-def follow_mover(between: Between, bodies: Bodies, parts: Parts, ground: float) -> Followed | None:
+def follow_mover(
+    between: Between, bodies: Bodies, parts: BodyParts, ground: float
+) -> Followed | None:
     """The person who moves an object from one stay to the next; None: none is seen to do so.
 
     Args:
@@ -102,7 +104,7 @@ def follow_mover(between: Between, bodies: Bodies, parts: Parts, ground: float) 
     return None if best is None else best[1]
 
 
-def _holds(bodies: Bodies, parts: Parts, ground: float) -> Iterator[tuple[Hold, _Holds]]:
+def _holds(bodies: Bodies, parts: BodyParts, ground: float) -> Iterator[tuple[Hold, _Holds]]:
     """The hands and the seat of one person."""
     points = landmarks(bodies, parts)
     front = _smooth(facing(points))

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mover.bodies.parts import Parts, members
+from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import at, landmarks
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
@@ -36,7 +36,7 @@ class FootContactInputs:
     """People, in camera axes, and a rough idea of where up is."""
 
     bodies: Bodies
-    parts: Parts
+    parts: BodyParts
     keep: Bool[Tensor, " bodies"]
     """Which rows are sound, from `select_frames`."""
     camera: Camera
@@ -129,7 +129,7 @@ def _lower_feet(inputs: FootContactInputs, config: FootContactConfig) -> _LowerF
 
 
 def straight_legs(
-    bodies: Bodies, parts: Parts, up: Float[Tensor, "3"]
+    bodies: Bodies, parts: BodyParts, up: Float[Tensor, "3"]
 ) -> Bool[Tensor, "bodies sides"]:
     """Whether each leg, left and right, stands straight; `up` may be off by several degrees.
 

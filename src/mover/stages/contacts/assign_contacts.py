@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from mover.bodies.parts import Parts
+from mover.bodies.parts import BodyParts
 from mover.bodies.posture import at, headings, landmarks, postures, touching
 from mover.bodies.skin import PARTS
 from mover.core.observe import Observer, silent
@@ -26,7 +26,7 @@ class ContactInputs:
     """Bodies in the world whose up is true, and what the user knows of their contacts."""
 
     bodies: Bodies
-    parts: Parts
+    parts: BodyParts
     ground: float
     """Height of the floor [m]."""
     given: Float[Tensor, "bodies verts"] | None

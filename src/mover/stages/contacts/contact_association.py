@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.parts import Parts
+from mover.bodies.parts import BodyParts
 from mover.bodies.skin import PARTS
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Layout, Objects, People
@@ -47,7 +47,7 @@ class AssignInputs:
 
     bodies: Bodies
     probability: Float[Tensor, "bodies verts"]
-    parts: Parts
+    parts: BodyParts
     masks: Bool[Tensor, "objects h w"]
     boxes: Float[Tensor, "objects 4"]
     """Used where an object has no mask [px]."""

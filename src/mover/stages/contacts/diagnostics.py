@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from mover.bodies.parts import Parts, members
+from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import postures
 from mover.core.records import record, rows_of
 from mover.core.types import STILL, Bodies, Camera, CameraPath, Layout, Objects, People
@@ -32,7 +32,7 @@ class DiagnosticInputs:
     """The finished room with its people."""
 
     bodies: Bodies
-    parts: Parts
+    parts: BodyParts
     people: People | None
     camera: Camera
     objects: Objects

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from mover.bodies.parts import Parts, members
+from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import touching
 from mover.bodies.skin import PARTS
 from mover.core.contact_labels import ContactLabels
@@ -49,7 +49,7 @@ class LabelInputs:
 
     bodies: Bodies
     """In the world."""
-    parts: Parts
+    parts: BodyParts
     meshes: tuple[tuple[StandingMesh, ...], ...]
     """Closed, of each object where it stands when."""
     ids: tuple[str, ...]

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mover.bodies.parts import Parts, members
+from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import at, landmarks, postures
 from mover.core.records import record
 from mover.core.types import Bodies, Layout
@@ -99,7 +99,7 @@ def _cost_of_sizes(
     return 0.5 * (torch.einsum("nsoi,nij,nsoj->so", rest, fitted, rest) + disagree)
 
 
-def seats_tell(bodies: Bodies, parts: Parts, floor: float) -> tuple[float, float] | None:
+def seats_tell(bodies: Bodies, parts: BodyParts, floor: float) -> tuple[float, float] | None:
     """Logarithm of how much higher than usual people sit, and its standard deviation.
 
     Args:

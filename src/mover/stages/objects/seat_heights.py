@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.parts import Parts, members
+from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import postures
 from mover.core.records import record
 from mover.core.types import Bodies, Layout, Objects, SceneObject, SeatStretch
@@ -38,7 +38,7 @@ class SeatInputs:
     layout: Layout
     bodies: Bodies
     """In the world."""
-    parts: Parts
+    parts: BodyParts
     ground: float
     """Height of the floor [m]."""
     pairs: Int[Tensor, "pairs 3"]

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.corrected import spread
-from mover.bodies.parts import Parts, members
+from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import speeds
 from mover.bodies.skin import PARTS
 from mover.core.records import record
@@ -168,7 +168,7 @@ def _surface(meshes: list[Mesh], uncertain: Float[Tensor, " pieces"]) -> Surface
     )
 
 
-def pick(bodies: Bodies, parts: Parts) -> Picked:
+def pick(bodies: Bodies, parts: BodyParts) -> Picked:
     """Even points of the whole skin, and more of the parts that touch."""
     verts = bodies.verts[len(bodies.verts) // 2]
     even = spread(verts, SKIN_POINTS)
@@ -183,7 +183,7 @@ def pick(bodies: Bodies, parts: Parts) -> Picked:
 
 
 def resting_soles(
-    bodies: Bodies, parts: Parts, lying: Bool[Tensor, " bodies"]
+    bodies: Bodies, parts: BodyParts, lying: Bool[Tensor, " bodies"]
 ) -> Float[Tensor, "bodies feet"]:
     """Chance that each sole is at rest and carries its body, whatever its height over the floor."""
     low = bodies.verts[..., 1].amin(1)

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.bodies.corrected import has_mean_shape, larger
-from mover.bodies.parts import Parts
+from mover.bodies.parts import BodyParts
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, People
@@ -124,7 +124,7 @@ class DepthInputs:
     """People in camera axes, and where they are seen."""
 
     bodies: Bodies
-    parts: Parts
+    parts: BodyParts
     keep: Bool[Tensor, " bodies"]
     """Which rows are sound, from `select_frames`."""
     people: People

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mover.bodies import load_model
 from mover.bodies.corrected import Correction, corrected
-from mover.bodies.parts import Parts, members
+from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import Postures, postures
 from mover.bodies.skeleton import BODY
 from mover.bodies.smpl_model import vertex_subset
@@ -46,7 +46,7 @@ SIDES = ("left", "right")
 NUDGE = 1e-3  # [rad], for differences
 
 
-def plant_feet(bodies: Bodies, parts: Parts, floor: float) -> Bodies:
+def plant_feet(bodies: Bodies, parts: BodyParts, floor: float) -> Bodies:
     """The bodies with their resting soles still and on the floor.
 
     Args:

@@ -10,7 +10,7 @@ from mover.energy.fused.kernels.cover import (
     BACK,
     FAR,
     FRONT,
-    Extent,
+    ScreenExtent,
     clear,
     face_all,
     flood,
@@ -77,7 +77,7 @@ def outline_cost(data: KernelInput, work: Workspace, p: Pose, number: int) -> fl
 
 
 @wp.func
-def choose(data: KernelInput, work: Workspace, p: Pose, e: Extent) -> int:
+def choose(data: KernelInput, work: Workspace, p: Pose, e: ScreenExtent) -> int:
     """The number of the shift at which box and silhouette cost least."""
     best = int(0)
     least = float(FAR)

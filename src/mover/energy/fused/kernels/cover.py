@@ -19,7 +19,7 @@ BYTE, ALL = wp.constant(wp.uint64(255)), wp.constant(wp.uint64(0xFFFFFFFFFFFFFFF
 
 
 @wp.struct
-class Extent:
+class ScreenExtent:
     """Where an item is on the screen."""
 
     box: wp.vec4i
@@ -32,13 +32,13 @@ class Extent:
 
 
 @wp.func
-def put(data: KernelInput, work: Workspace, p: Pose) -> Extent:
+def put(data: KernelInput, work: Workspace, p: Pose) -> ScreenExtent:
     """Put the vertices before the camera and on the screen."""
     low = wp.vec2(FAR, FAR)
     high = wp.vec2(-FAR, -FAR)
     least = wp.vec2(FAR, FAR)
     most = wp.vec2(-FAR, -FAR)
-    e = Extent()
+    e = ScreenExtent()
     lens = data.windows.lens[p.thing]
     work.scene.window[0] = lens
     first = data.things.starts[p.thing, VERTS]

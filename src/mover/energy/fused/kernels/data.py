@@ -52,7 +52,7 @@ class ImageData:
     upper: wp.array(dtype=wp.float32)
     """Highest depth, with its slack [m]."""
     bounded: wp.array(dtype=wp.vec4i)
-    """Rows and columns in which depths are bounded, as in `cover.Extent`."""
+    """Rows and columns in which depths are bounded, as in `cover.ScreenExtent`."""
     limit: float
     """Most that a depth can be out of its bounds [m]."""
     fewest: float

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from mover.energy.fused.kernels.cover import Extent
+from mover.energy.fused.kernels.cover import ScreenExtent
 from mover.energy.fused.kernels.data import (
     AWAY,
     FACE_X,
@@ -52,7 +52,7 @@ def side_of_box(
 
 @wp.func
 def box_cost(
-    data: KernelInput, work: Workspace, p: Pose, e: Extent, wider: float
+    data: KernelInput, work: Workspace, p: Pose, e: ScreenExtent, wider: float
 ) -> tuple[float, Slope]:
     """How far the drawn box is from the detected one, whose sides are farther out by `wider`."""
     a, da = side_of_box(data, work, p, e.left, 0, wider)
