@@ -21,11 +21,11 @@ from mover.io.capture.merge import import_into
 from mover.io.files.images import find_depth_file, read_depth_image
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.coarse_cues import coarser_image
-from mover.stages.objects.gather_depth import DepthInputs, gather_depth
+from mover.stages.objects.gather_depth import DepthImageInputs, gather_depth
 from mover.stages.objects.place_objects import energy_of
 
 
-def true_inputs(metric: bool = True) -> DepthInputs:
+def true_inputs(metric: bool = True) -> DepthImageInputs:
     """The boxes of the analytic room on its floor, and a network that sees them truly."""
     known = make_inputs(size=64)
     camera, objects = known.camera, known.objects
@@ -43,10 +43,10 @@ def true_inputs(metric: bool = True) -> DepthInputs:
     depth = torch.where(depth < 50, depth, torch.nan)
     image = DepthImage(depth, metric)
     hidden = seen.covered.any(0)
-    return DepthInputs(image, known.image, objects, camera, GROUND, layout, hidden)
+    return DepthImageInputs(image, known.image, objects, camera, GROUND, layout, hidden)
 
 
-def errors(found: Measured | None, inputs: DepthInputs) -> torch.Tensor:
+def errors(found: Measured | None, inputs: DepthImageInputs) -> torch.Tensor:
     """Logarithm of found over true depth within the masks."""
     assert found is not None
     true = inputs.image.measured
@@ -55,7 +55,7 @@ def errors(found: Measured | None, inputs: DepthInputs) -> torch.Tensor:
     return (found.depth / true.depth)[inside].log()
 
 
-def with_values(inputs: DepthInputs, values: torch.Tensor, metric: bool) -> DepthInputs:
+def with_values(inputs: DepthImageInputs, values: torch.Tensor, metric: bool) -> DepthImageInputs:
     return replace(inputs, depth=DepthImage(values, metric))
 
 

@@ -18,7 +18,7 @@ from mover.stages.objects.room_scale import (
     ScaleKnown,
     _cost_of_sizes,
     common_scale,
-    seats_tell,
+    seat_height_estimate,
 )
 
 ROOM = 0.0
@@ -90,7 +90,7 @@ def test_what_sizes_cost_is_the_least_squares_of_all_that_is_said_of_them() -> N
 def test_who_sits_as_high_as_people_do_tells_their_size(large: float) -> None:
     sitters = people(pose(SEATED, 5), fps=5.0)
     high = replace(sitters, verts=large * sitters.verts)
-    usual, found = (seats_tell(b, parts_of(b), ROOM) for b in (sitters, high))
+    usual, found = (seat_height_estimate(b, parts_of(b), ROOM) for b in (sitters, high))
     assert usual is not None
     assert found is not None
     assert abs(usual[0]) < 2 * usual[1]  # the open body on its own soles
@@ -107,17 +107,17 @@ def test_who_sits_as_high_as_people_do_tells_their_size(large: float) -> None:
 
 def test_who_stands_or_sits_on_the_floor_tells_nothing() -> None:
     standing = people(pose(ARMS_DOWN, 5), fps=5.0)
-    assert seats_tell(standing, parts_of(standing), ROOM) is None
+    assert seat_height_estimate(standing, parts_of(standing), ROOM) is None
     once = people(pose(SEATED, 2), fps=5.0)
-    assert seats_tell(once, parts_of(once), ROOM) is None  # too few to say
+    assert seat_height_estimate(once, parts_of(once), ROOM) is None  # too few to say
 
 
-def test_more_seats_tell_more() -> None:
+def test_more_seat_height_estimate_more() -> None:
     sitters = people(pose(SEATED, 12), fps=5.0)
     moved = sitters.verts.clone()
     moved[6:, :, 0] += 1.0
     two = replace(sitters, verts=moved)
-    one, both = (seats_tell(b, parts_of(b), ROOM) for b in (sitters, two))
+    one, both = (seat_height_estimate(b, parts_of(b), ROOM) for b in (sitters, two))
     assert one is not None
     assert both is not None
     assert both[0] == pytest.approx(one[0], abs=1e-4)

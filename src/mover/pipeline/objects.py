@@ -34,13 +34,13 @@ from mover.stages.contacts.contact_association import AssignInputs
 from mover.stages.contacts.gather_cues import Cues, GatherInputs, cues_in_windows, gather_cues
 from mover.stages.objects.find_image_cues import (
     ImageInputs,
-    Seen,
+    ObjectDetections,
     find_image_cues,
     image_evidence,
     order_of,
 )
 from mover.stages.objects.fronts import turned_to_people
-from mover.stages.objects.gather_depth import DepthInputs, gather_depth
+from mover.stages.objects.gather_depth import DepthImageInputs, gather_depth
 from mover.stages.objects.gather_given import (
     UNFIT,
     bounded_sides,
@@ -53,7 +53,7 @@ from mover.stages.objects.own_edges import own_edges
 from mover.stages.objects.place_inputs import Pinned, Placed, PlaceInputs, with_walls
 from mover.stages.objects.place_objects import place_objects
 from mover.stages.objects.prepare_objects import Prepared, PrepareInputs, prepare_objects
-from mover.stages.objects.room_scale import ScaleKnown, common_scale, seats_tell
+from mover.stages.objects.room_scale import ScaleKnown, common_scale, seat_height_estimate
 from mover.stages.objects.seat_heights import SeatInputs, find_seat_heights, with_lifted_seats
 from mover.stages.objects.size_prior import estimate_size_prior, inlier_weights
 from mover.stages.objects.starts import best_few, other_starts, reference_yaw
@@ -69,7 +69,7 @@ class Setup:
     capture: Capture
     config: Config
     run: Run
-    seen: Seen
+    seen: ObjectDetections
     prepared: Prepared
     pinned: Bool[Tensor, " objects"]
     """The objects that stay where the capture has them."""
@@ -223,7 +223,7 @@ def estimate_scale(
         return people, placed
     kept, seats = people.in_world(placed.camera), None
     if setup.config.seat_heights:
-        seats = seats_tell(kept, people.parts, placed.ground)
+        seats = seat_height_estimate(kept, people.parts, placed.ground)
     prior = ScaleKnown(spread, capture.scene.size_spread, seats)
     scale, _ = common_scale(placed.layout, given, prior)
     factor = math.exp(-scale)
@@ -364,5 +364,5 @@ def _with_measured(
     if depth is None:
         return image
     hidden = setup.seen.masks.any(0) | setup.seen.people
-    inputs = DepthInputs(depth, image, setup.objects, camera, ground, layout, hidden)
+    inputs = DepthImageInputs(depth, image, setup.objects, camera, ground, layout, hidden)
     return replace(image, measured=gather_depth(inputs))

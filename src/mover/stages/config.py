@@ -160,7 +160,7 @@ class PlaceConfig:
     coarse: Annotated[int, int_in(1, 64)] = 1
     """Pixels of a window that are one, along each side, in the short descents."""
     wall_alignment_steps: Annotated[int, int_in(0, 100)] = 0
-    """How often pieces along a wall are placed again with its line (robust)."""
+    """How often objects along a wall are placed again with its line (robust)."""
     yaw_prior_weight: Weight = 0.0
     """How much a turn away from the reference yaw worsens a candidate: 1 doubles half a turn."""
     apart: Weight = 0.0
@@ -189,9 +189,9 @@ class SpreadConfig:
     usual: Share = 0.0
     """Usual standard deviation of the logarithm of a size; 0: nothing is learnt."""
     common: Share = 0.03
-    """That of what the three sizes of a piece have in common."""
+    """That of the common factor of an object's three sizes."""
     known: Annotated[float, float_in(0, 1e6)] = 2.0
-    """How many pieces of a usual room count as if they were seen."""
+    """Number of objects of a usual room that count as observed."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """What furniture may hide of people, in each frame.
 
 Where the camera stands still, that is what the masks of the reference image cover. A moving camera
-has masks in the reference image and in the frames of furniture.json. Each piece is carried from the
-two of them whose cameras were most like that of the frame, as if it were flat and as far away as
-the initial scene says, and is widened by what that depth may be wrong.
+has masks in the reference image and in the frames of furniture.json. Each object mask is
+warped from the two of them whose cameras were most similar to that of the frame, as a plane at the
+depth of the initial scene, and is widened by the uncertainty of that depth.
 """
 
 import dataclasses
@@ -24,21 +24,21 @@ from mover.geometry.rle import decode, joined
 from mover.stages.masks import enlarged, thin, uncovered, widened
 
 STEP = 4  # [px] from one pixel of a carried mask to the next
-LIKE = 2  # so many masks of each piece are carried: a person may stand before one of them
+LIKE = 2  # masks of each object that are carried: a person may stand before one of them
 WRONG = 0.15
 WIDEST = 6  # [STEP px] by which a carried mask grows at most
-NEAREST = 0.3  # [m], no piece is nearer to a camera
+NEAREST = 0.3  # [m], no object is nearer to a camera
 
 
 @record
 class Cover:
-    """Masks of what may hide people; one row for each piece and picture."""
+    """Masks of possible occluders of people; one row for each object and image."""
 
     masks: Masks
     piece: Int[Tensor, " rows"] = torch.zeros(0, dtype=torch.long)
     """Only of a moving camera, as is all that follows."""
     depth: Float[Tensor, " rows"] = torch.zeros(0)
-    """Of the piece, from the camera that saw it [m]."""
+    """Depth of the object from the camera that saw it [m]."""
     seen: CameraPath = STILL
     """That camera."""
     path: CameraPath = STILL
@@ -70,7 +70,7 @@ def hiding(capture: Capture, path: CameraPath) -> Cover:
 def _in_frames(
     furniture: People | None, path: CameraPath
 ) -> Iterator[tuple[int, int, Masks, CameraPath]]:
-    """Frame, piece and mask of what is segmented in further frames, and the frame's camera."""
+    """Frame, object and mask of each segmentation in further frames, and the frame's camera."""
     if furniture is None:
         return
     keys = zip(furniture.frame.tolist(), furniture.person.tolist(), strict=True)
@@ -88,7 +88,7 @@ def covered(cover: Cover) -> Callable[[int], Bool[Tensor, "h w"]]:
 
 
 def clear(cover: Cover, width: int) -> Callable[[int], Bool[Tensor, "small_h small_w"]]:
-    """The pixels of a smaller picture in which nothing hides anybody, in a frame."""
+    """The pixels of a smaller picture in which no person is hidden in a frame."""
     blocked = covered(cover)
     if is_still(cover.path):
         same = uncovered(blocked(0), width)
@@ -121,7 +121,7 @@ def _carried(cover: Cover, frame: int) -> Bool[Tensor, "h w"]:
 
 
 def _warped(cover: Cover, row: int, pose: CameraPath, shape: torch.Size) -> Bool[Tensor, "h w"]:
-    """A mask as another camera sees it, were the piece flat."""
+    """A mask as another camera would see it if the object were flat."""
     source = thin(cover.masks, row, STEP)
     back = pose.R_reference_camera[0].mT
     turn = back @ cover.seen.R_reference_camera[row]

@@ -62,7 +62,7 @@ def mask_table(people: People, bodies: Bodies) -> MaskTable:
 # Not in the paper. A mask that is too wide by a few pixels all round adds as much to the height as
 # to the width of everything in it: the difference of both does not know it. An error of the pose,
 # which lowers the overlap of body and mask and so makes smaller, farther bodies look better,
-# changes the height of somebody upright by its square only.
+# changes the height of an upright person by its square only.
 #
 #     factor = median over frames of  (h_body - w_body) / (h_mask - w_mask)
 

@@ -52,8 +52,8 @@ class LensInputs:
 
 
 @record
-class Lens:
-    """The lens, by the lines of the picture."""
+class LensEstimate:
+    """The lens, as estimated from the lines of the image."""
 
     zoom: float
     """Focal length to take over the given one; 1 where it is kept."""
@@ -66,7 +66,7 @@ class Lens:
     warnings: tuple[str, ...] = ()
 
 
-def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent) -> Lens:
+def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent) -> LensEstimate:
     """How much longer the lens is than the given one, if that was a guess."""
     del config
     stated, camera = inputs.focal_spread, inputs.camera
@@ -79,13 +79,13 @@ def find_lens(inputs: LensInputs, config: LensConfig, observe: Observer = silent
     observed, tilt = _observed(ends, focal, spread), tilt_of(ends, inputs.tilt_spread)
     heading = heading_of(ends)
     if observed is None or not stated:
-        return Lens(1.0, spread, tilt, heading)
+        return LensEstimate(1.0, spread, tilt, heading)
     off, error = observed
     wide = math.hypot(error, spread)
     left = error * spread / wide
     zoom = math.exp(off * (spread / wide) ** 2)
     warnings = (_sentence(zoom, left),) if abs(math.log(zoom)) > left else ()
-    return Lens(zoom, left, tilt, heading, warnings)
+    return LensEstimate(zoom, left, tilt, heading, warnings)
 
 
 def tilt_of(ends: Ends, before: float) -> Tilt | None:

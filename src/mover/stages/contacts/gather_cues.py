@@ -74,7 +74,7 @@ class PeopleView:
     """Of the cameras that saw the people, in the axes of this one."""
 
     @cached_property
-    def telling(self) -> list[int]:
+    def observed_rows(self) -> list[int]:
         """Bodies that have a mask and were seen from here."""
         away = poses_at(self.path, self.bodies.frame).t_reference_camera.norm(dim=-1)
         near = (away <= BESIDE).tolist()
@@ -117,13 +117,13 @@ def gather_depth(
     """The narrowest bounds of all frames; they do not depend on the number of workers.
 
     Memory is that of a few frames for each worker, however many frames there are. Bodies whose
-    track has no mask say nothing. Bodies are drawn where their vertices are; the maps are on the
+    track has no mask give no bounds. Bodies are drawn where their vertices are; the maps are on the
     CPU.
     """
     views = small_views(sight.camera)
     blank, lock = torch.full((views.height, views.width), float("inf")), Lock()
     maps = DepthMaps(-blank, blank)
-    rows = sight.telling
+    rows = sight.observed_rows
 
     def add(block: list[int]) -> int:
         for window, found in _bounds(sight, block):

@@ -17,8 +17,8 @@ from mover.stages.objects.prepare_objects import Prepared
 
 
 @record
-class Seen:
-    """The detections of the pieces, in the order of the scene."""
+class ObjectDetections:
+    """The detections of the objects, in the order of the scene."""
 
     boxes: Float[Tensor, "objects 4"]
     """x_min, y_min, x_max, y_max [px]; the whole image where there is no detection."""
@@ -29,15 +29,15 @@ class Seen:
     """People in the reference image."""
 
 
-def image_evidence(capture: Capture) -> Seen:
-    """Line the detections up with the pieces of the scene."""
+def image_evidence(capture: Capture) -> ObjectDetections:
+    """Line the detections up with the objects of the scene."""
     camera, pieces = capture.scene.camera, capture.scene.objects
     by_id = {d.id: d for d in capture.detections}
     found = [by_id.get(-1 if p.annotation is None else p.annotation) for p in pieces]
     whole = torch.tensor([0.0, 0.0, camera.width, camera.height])
     blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     masks = [blank if d is None or d.mask is None else decode(d.mask, 0) for d in found]
-    return Seen(
+    return ObjectDetections(
         torch.stack([whole if d is None else d.box for d in found]) if found else torch.zeros(0, 4),
         torch.tensor([d is not None for d in found], dtype=torch.bool),
         torch.stack(masks) if masks else blank.expand(0, -1, -1),
@@ -55,7 +55,7 @@ def people_in_reference(capture: Capture) -> Bool[Tensor, "h w"]:
     return found
 
 
-def evidence_at(capture: Capture, frame: int) -> Seen:
+def evidence_at(capture: Capture, frame: int) -> ObjectDetections:
     """The same of a frame in which furniture is segmented (`furniture.json`)."""
     camera, pieces = capture.scene.camera, capture.scene.objects
     furniture, people = capture.furniture, capture.people
@@ -72,7 +72,7 @@ def evidence_at(capture: Capture, frame: int) -> Seen:
     there = masks.flatten(1).any(1)
     whole = torch.tensor([0.0, 0.0, camera.width, camera.height])
     boxes = [tight_box(mask) if bool(mask.any()) else whole for mask in masks]
-    return Seen(
+    return ObjectDetections(
         torch.stack(boxes) if boxes else torch.zeros(0, 4), there, masks,
         torch.stack([blank, *hidden]).any(0),
     )  # fmt: skip
@@ -95,13 +95,13 @@ MARGIN = 0.3  # of the box's larger side: how much a window is larger than the b
 
 @record
 class ImageInputs:
-    """The detections of the pieces, in their order."""
+    """The detections of the objects, in their order."""
 
     camera: Camera
     boxes: Float[Tensor, "objects 4"]
     """x_min, y_min, x_max, y_max [px]; the whole image where there is no detection."""
     seen: Bool[Tensor, " objects"]
-    """False where a piece has no annotation."""
+    """False where an object has no annotation."""
     masks: Bool[Tensor, "objects h w"]
     """Empty where only the box is known."""
     people: Bool[Tensor, "h w"]

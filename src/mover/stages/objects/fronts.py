@@ -1,9 +1,8 @@
 """Fronts of furniture that were guessed the wrong way round: they face the people.
 
-Not in the paper. Tools that guess a direction from one picture take a back for a front in one piece
-of ten. What stands along walls turns its front to the room, and the room is where people are: in
-known rooms 100 to 112 the mean cosine between front and people is .33 or more for all 42 such
-pieces.
+Not in the paper. Tools that estimate a direction from one image confuse back and front for one
+object in ten. Furniture along walls faces the room, and the room is where people are: in known
+rooms 100 to 112 the mean cosine between front and people is .33 or more for all 42 such objects.
 """
 
 import math
@@ -35,7 +34,7 @@ def facing(layout: Layout, people: Float[Tensor, "bodies 3"]) -> Float[Tensor, "
 def turned_to_people(
     layout: Layout, categories: tuple[str, ...], people: Float[Tensor, "bodies 3"]
 ) -> Layout:
-    """The layout with wall pieces that turn their back to people turned by the best quarters.
+    """Turn objects along walls whose back faces people by the best number of quarters.
 
     Args:
         layout: As it was given.

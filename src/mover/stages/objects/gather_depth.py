@@ -32,7 +32,7 @@ LEAST = 3  # objects and strips of floor that a scale with a shift needs
 
 
 @record
-class DepthInputs:
+class DepthImageInputs:
     """A measured picture, and the room as it is known."""
 
     depth: DepthImage
@@ -57,7 +57,7 @@ class References:
     weight: Float[Tensor, " pixels"]
 
 
-def gather_depth(inputs: DepthInputs) -> Measured | None:
+def gather_depth(inputs: DepthImageInputs) -> Measured | None:
     """The measured depth in the windows of the objects [m]; None: its scale is unknown."""
     values = inputs.depth.values.nan_to_num(0.0)
     windows = sample_nearest(values, inputs.image.views, inputs.camera.K, 0.0)
@@ -75,7 +75,7 @@ def gather_depth(inputs: DepthInputs) -> Measured | None:
     return Measured(torch.where(there, 1 / inverse.clamp_min(1e-3), 0.0), spread)
 
 
-def _references(inputs: DepthInputs, values: Tensor, windows: Tensor) -> References:
+def _references(inputs: DepthImageInputs, values: Tensor, windows: Tensor) -> References:
     """Drawn surfaces within the masks, and the floor in front of the objects."""
     objects, image, camera = inputs.objects, inputs.image, inputs.camera
     verts = place_in(objects.verts, inputs.layout, camera.R_cam_world)

@@ -162,7 +162,7 @@ def bounded_sides(
 
     An object that is cut off on the left may be higher and lower there than all that is seen of it:
     its top and its bottom are lower bounds, too. Its silhouette determines where it ends; a shape
-    that does not fit would grow behind what hides it.
+    that does not fit would grow behind its occluder.
 
     Where shapes do not fit, masks are coarse, too: what is near to a side may hide more behind it,
     and what touches all of it does so about as often as not (`ImageCues.beside`).

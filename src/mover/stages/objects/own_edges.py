@@ -1,4 +1,4 @@
-"""Which way each piece of furniture runs, by its own straight edges in the picture.
+"""Direction of each object, estimated from its own straight edges in the image.
 
 Not in the paper. Beds, tables and shelves are square, and most of their edges level or upright: a
 level one constrains the yaw of its object up to quarter turns, whatever the shape of its mesh. The

@@ -162,7 +162,7 @@ def to_objects(
 
 
 def support_names(objects: Objects) -> tuple[str, ...]:
-    """`ground`, `free`, or the id of what carries it, of each object."""
+    """Support of each object: `ground`, `free`, or the id of the object below it."""
     words = {GROUND: "ground", FREE: "free"}
     return tuple(words.get(below) or objects.ids[below] for below in objects.supports.tolist())
 
@@ -237,7 +237,7 @@ def levelled(mesh: Mesh) -> Mesh:
     """The mesh with all its feet on the floor, in the same box; unchanged where they are.
 
     A mesh of unclean origin touches the bottom of its box with one foot. What the image shows
-    below the others then pulls the piece nearer: by ten centimetres for three.
+    below the others then pulls the object nearer: by ten centimetres for three.
     """
     verts = mesh.verts
     low, high = box(verts)

@@ -99,8 +99,10 @@ def _cost_of_sizes(
     return 0.5 * (torch.einsum("nsoi,nij,nsoj->so", rest, fitted, rest) + disagree)
 
 
-def seats_tell(bodies: Bodies, parts: BodyParts, floor: float) -> tuple[float, float] | None:
-    """Logarithm of how much higher than usual people sit, and its standard deviation.
+def seat_height_estimate(
+    bodies: Bodies, parts: BodyParts, floor: float
+) -> tuple[float, float] | None:
+    """Logarithm of the ratio of observed to usual seat height, and its standard deviation.
 
     Args:
         bodies: In the world, in the people's scale.
@@ -108,7 +110,7 @@ def seats_tell(bodies: Bodies, parts: BodyParts, floor: float) -> tuple[float, f
         floor: Its height below them [m].
 
     Returns:
-        None where no person sits.
+        None where no person is seated.
     """
     carried = members(parts, *CARRIED)
     sits = postures(bodies, parts, floor).sitting

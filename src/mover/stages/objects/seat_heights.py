@@ -22,9 +22,9 @@ from mover.stages.objects.prepare_objects import Prepared
 from mover.stages.objects.room_scale import CARRIED, FEWEST
 
 CARRIERS = (CARRIED, ("seat",))  # of seated and of lying people
-OBSERVED = 0.025  # [m], usual error of the height of a seat as people give it
+OBSERVED = 0.025  # [m], usual error of a seat height estimated from people
 SHAPE = 0.07  # [m], usual error of the height of a seat in a mesh of another design
-LOWEST = 0.15  # share of their points below the top of what carries them
+LOWEST = 0.15  # share of the supported body points that lie below the top of the seat
 NEAR = 20  # points of a seat that are nearest to a body
 BETWEEN = (0.15, 0.9)  # shares of the height of an object between which a seat can be moved
 MOST = 0.3  # of an object's height, that its middle is stretched by
@@ -32,7 +32,7 @@ MOST = 0.3  # of an object's height, that its middle is stretched by
 
 @record
 class SeatInputs:
-    """Furniture where it stands, who touches it, and whose seat may be elsewhere in its mesh."""
+    """Placed furniture, its contacts with people, and which seat heights are uncertain."""
 
     objects: Objects
     layout: Layout
@@ -42,13 +42,13 @@ class SeatInputs:
     ground: float
     """Height of the floor [m]."""
     pairs: Int[Tensor, "pairs 3"]
-    """Who touches what: body, object, and part as in `ContactPoints.points`."""
+    """Contacts: body, object, and part as in `ContactPoints.points`."""
     unfit: Bool[Tensor, " objects"]
-    """Whose shapes do not fit the image."""
+    """Objects whose shape does not fit the image."""
 
 
 def find_seat_heights(inputs: SeatInputs) -> Float[Tensor, " objects"]:
-    """How much higher than in their meshes people sit or lie, in the objects' frames [m]."""
+    """Height of people above the seats of the meshes, in the objects' frames [m]."""
     objects, layout = inputs.objects, inputs.layout
     tops = place(objects.top, layout)
     posture = postures(inputs.bodies, inputs.parts, inputs.ground)

@@ -26,7 +26,7 @@ UNSEEN = 0.2  # how much an object whose base is not seen counts against one who
 TURN = math.pi / 4  # rears that are turned farther than this do not belong to a line
 STRETCH = (0.7, 1.4)  # of its distance, within which an object is moved to a line
 BOTTOM = 3  # number of the side of a box on which the object stands
-KEPT = 3  # candidates of the search without lines from which a piece goes down again
+KEPT = 3  # candidates of the search without lines from which an object descends again
 
 Lower = Callable[[PlaceInputs, Layout], Placed]
 """Goes down from some starts."""
@@ -38,7 +38,7 @@ def line_up(found: Placed, inputs: PlaceInputs, rounds: int, lower: Lower) -> Pl
     Args:
         found: Where a search ended that knew no lines.
         inputs: What was placed.
-        rounds: How often; each time with the lines of where the pieces stand by then.
+        rounds: How often; each time with the lines at the objects' current positions.
         lower: Goes down from some starts.
 
     Returns:

@@ -26,12 +26,12 @@ from mover.stages.objects.find_image_cues import image_evidence
 SOLES = ("left_sole", "right_sole")
 CELL = 0.025  # [m], of the furniture's volume
 MOST_CELLS = 320  # along its longest side
-SAMPLES = 1500  # points of each piece's surface
+SAMPLES = 1500  # points on the surface of each object
 SKIN_POINTS = 400  # even points of a body
 PART_POINTS = 40  # at most, of each part that touches
 LOW = (0.08, 0.03)  # [m] over the lowest point of a body: a sole hangs, surely carries
 STILL = (0.5, 0.2)  # [m/s] of a sole: moves, surely at rest; bodies fitted frame by frame tremble
-DOUBT = 0.2  # [m] of a surface's place for a silhouette that does not fit at all
+SURFACE_ERROR = 0.2  # [m] error of a surface position where the silhouette does not fit at all
 FITS = 0.1  # share of a silhouette that masks of shapes that fit leave
 STEEPEST = 4.0  # metres of depth for a metre by which a surface is off, at most
 INNER = 2  # [px of an image 640 wide] by which masks shrink before they bound anything
@@ -45,17 +45,17 @@ class Surroundings:
     floor: float
     """Its height in the world [m]."""
     furniture: Volume | None
-    """Signed distance to all pieces; None: there are none."""
+    """Signed distance to all objects; None: there are none."""
     firm: Volume | None
     """The same to what they surely fill, as far as their shapes are uncertain."""
     surface: Surface
     """Points of their surfaces."""
     front: Float[Tensor, "h w"]
-    """Depth of the nearest piece in the image 640 wide [m]; inf: none."""
+    """Depth of the nearest object in the image 640 wide [m]; inf: none."""
     loose: Float[Tensor, "h w"]
     """How far off that may be, as the shape of the object is uncertain [m]."""
     owned: Bool[Tensor, "h w"]
-    """The piece that is drawn there is also detected there."""
+    """The object that is drawn there is also detected there."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,10 @@ def surroundings_of(room: Room, capture: Capture | None) -> Surroundings:
 def shape_uncertainty(
     piece: Int[Tensor, "h w"], masks: Bool[Tensor, "objects h w"]
 ) -> Float[Tensor, " objects"]:
-    """Usual error of the place of each piece's surface, by its outline [m].
+    """Usual error of the surface position of each object, estimated from its silhouette [m].
 
     Args:
-        piece: Which piece is drawn; -1: none.
+        piece: Index of the drawn object; -1: none.
         masks: Where each was detected.
     """
     shown = masks.any(0)
@@ -114,12 +114,12 @@ def shape_uncertainty(
         seen = mask & ((piece == k) | (piece < 0))
         union = max(1, int((drawn | seen).sum()))
         overlap = int((drawn & seen).sum()) / union if bool(mask.any()) else 1.0
-        found[k] = DOUBT * max(0.0, 1 - overlap - FITS)
+        found[k] = SURFACE_ERROR * max(0.0, 1 - overlap - FITS)
     return found
 
 
 def _drawn(meshes: list[Mesh], camera: Camera, small: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth of the nearest piece, which it is (-1: none), and the slant of its surface."""
+    """Depth and index (-1: none) of the nearest object, and the slant of its surface."""
     size = (small.height, small.width)
     if not meshes:
         none = torch.full(size, torch.inf)
@@ -140,7 +140,7 @@ def _drawn(meshes: list[Mesh], camera: Camera, small: Camera) -> tuple[Tensor, T
 def _volumes(
     meshes: list[Mesh], uncertain: Float[Tensor, " pieces"]
 ) -> tuple[Volume | None, Volume | None]:
-    """The signed distance to all pieces, and to what they surely fill."""
+    """The signed distance to all objects, and to the volume that they surely fill."""
     if not meshes:
         return None, None
     verts = torch.cat([m.verts for m in meshes]).float()
@@ -250,7 +250,7 @@ def order_bounds(
 
 
 def _masks(watched: Watched, rows: Int[Tensor, " bodies"]) -> list[tuple[Tensor, Tensor]]:
-    """Well inside the own mask, and well outside everybody's; nothing where a mask is missing."""
+    """Pixels well inside the body's mask, and well outside all; none where a mask is missing."""
     found: list[tuple[Tensor, Tensor]] = []
     for row in rows.tolist():
         own, others = watched.table.decode(row)

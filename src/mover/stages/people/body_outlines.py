@@ -20,7 +20,7 @@ REACH = 0.02  # [image widths], farther no outline is looked for
 ALONG = 0.6  # least cosine between the drawn outline's normal and the way to the mask's outline
 MOST = 48  # points of one body's outline
 LEAST = 12  # fewer say nothing
-BEHIND = 0.1  # [m] a piece has to be behind a body for certain not to hide it
+BEHIND = 0.1  # [m] by which an object has to be behind a body to be surely no occluder
 SPREAD = 2  # [px of the window] around what may end a mask
 WIDER = 3.0  # [px], usual error of a mask's border that is the same all around
 SHIFT = 8.0  # [px], usual shift of a body against its mask
@@ -39,7 +39,7 @@ class SeenBodies:
     """The skin points that carry the outline [m]."""
     camera: Camera
     front: Float[Tensor, "h w"]
-    """Depth of the nearest piece, in a picture of any size [m]; inf: none."""
+    """Depth of the nearest object, in a picture of any size [m]; inf: none."""
 
 
 def gather_outlines(seen: SeenBodies, table: MaskTable, rows: Int[Tensor, " bodies"]) -> Outline:

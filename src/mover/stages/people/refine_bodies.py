@@ -126,7 +126,7 @@ def looked(
     weights: BodyWeights,
     match: MatchConfig,
 ) -> BodyEvidence:
-    """Look again for what the skin touches, what hides it, and where outlines should go."""
+    """Gather contacts, occlusion bounds and outline targets again at the current poses."""
     puppet, by, rows = moved_rows.puppet, moved_rows.by, moved_rows.rows
     with torch.no_grad():
         now, normals = moved(puppet, by), normals_after(puppet, by)
@@ -221,7 +221,7 @@ def _at_one_time(
 ) -> tuple[Room, Capture | None]:
     """The room with some of its people, and its furniture where it stands while they are there.
 
-    What somebody moves in that time is left out: it goes with their hands or their seat.
+    Objects that people move in that time are left out: they follow hands or the seated body.
     """
     assert room.bodies is not None
     bodies = rows_of(room.bodies, rows)
