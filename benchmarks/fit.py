@@ -8,11 +8,11 @@ written as OpenPose's JSON, read as a user's would be, and fitted. PJE is the me
 `--detected` takes the joints of `benchmarks/video.py` instead: COCO's 17 with 3 to 6 px of noise,
 missed and swapped ones, guesses of hidden ones, and a camera whose tilt is 3 degrees off; the table
 distinguishes postures, and heights. Without `--rooms` it takes 24 development rooms, in twelve of
-which a person lies and in twelve of which somebody is half hidden. `--height` gives the fit how
-tall everybody is.
+which a person lies and in twelve of which a person is half hidden. `--height` gives the fit the
+heights of the people.
 
 `--second` measures the second pass: the first has a camera whose tilt is guessed (3 degrees off),
-camera and floor are found from its feet, and everybody is fitted again under them.
+camera and floor are found from its feet, and all people are fitted again under them.
 """
 
 import argparse
@@ -275,10 +275,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rooms", type=int, nargs="+")
     parser.add_argument("--fps", type=float, default=5.0)
-    parser.add_argument("--ground", action="store_true", help="tell the fit the true floor")
+    parser.add_argument("--ground", action="store_true", help="give the fit the true floor")
     parser.add_argument("--second", action="store_true", help="measure the second pass")
     parser.add_argument("--detected", action="store_true", help="a detector's joints, by posture")
-    parser.add_argument("--height", action="store_true", help="tell the fit how tall people are")
+    parser.add_argument(
+        "--height", action="store_true", help="give the fit the heights of the people"
+    )
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the fits")
     args = parser.parse_args()
     torch.set_num_threads(1)

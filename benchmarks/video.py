@@ -5,7 +5,7 @@ truth with the errors of detectors (`mover_bench.rooms.seen`), under COCO's clas
 COCO has no class for is not found and not counted. With --other-designs no piece of the room's
 designs is among the shapes that the first scene is made of: no mesh is the true one.
 
-With --height everybody's is given.
+With --height the heights of all people are given.
 
     python benchmarks/video.py --seeds 100-103 --other-designs --out video
     python benchmarks/video.py --seeds 100-102 --other-designs --depth depth disparity --out video

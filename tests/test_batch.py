@@ -16,7 +16,7 @@ import pytest
 from tiny_capture import write_capture
 
 from mover.app.batch import (
-    Job,
+    BatchJob,
     RayOptions,
     captures_in,
     earlier,
@@ -61,13 +61,15 @@ def fakes(folder: Path, count: int, special: dict[int, str]) -> tuple[Path, ...]
     return captures_in(folder / "captures")
 
 
-def jobs_of(folder: Path, limit: float = 0.0, out: str = "out", settings: str = "") -> list[Job]:
-    jobs: list[Job] = []
+def jobs_of(
+    folder: Path, limit: float = 0.0, out: str = "out", settings: str = ""
+) -> list[BatchJob]:
+    jobs: list[BatchJob] = []
     for capture in captures_in(folder / "captures"):
         place = str(folder / out / capture.name)
         command = (sys.executable, "-S", "-E", str(folder / "fake.py"), str(capture), place)
         mark = fingerprint(settings, capture)
-        jobs.append(Job(capture.name, str(capture), place, command, mark, limit))
+        jobs.append(BatchJob(capture.name, str(capture), place, command, mark, limit))
     return jobs
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from little_room import GROUND, room, walkers
 
-from mover.app.viewer.drawing import People
+from mover.app.viewer.drawing import DrawnPeople
 from mover.app.viewer.panels import numbers_of
 from mover.app.viewer.session import Shown, start_session
 from mover.io.capture.edits import Delete, Place, placement_of, read_edits, write_edits
@@ -60,7 +60,7 @@ def test_the_table_of_an_object_has_position_change_and_evidence():
 
 
 def test_people_are_found_by_frame_and_person():
-    bodies, people = walkers(5, people=2), People(None)
+    bodies, people = walkers(5, people=2), DrawnPeople(None)
     people.replace(bodies)
     assert people.frames == [0, 3, 6, 9, 12]
     assert bodies.person[people.rows[(6, 1)]] == 1

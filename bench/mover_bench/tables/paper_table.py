@@ -65,8 +65,8 @@ BOX_NOTE = (
     " scan has inside them, without the floor."
 )
 FEET_NOTE = (
-    "Feet are those that bodies tell to stand (the paper: POSA's); more than 1 cm below the floor"
-    " counts. Angles in radians."
+    "Foot contacts are estimated from the bodies (the paper: POSA's); more than 1 cm below the"
+    " floor counts. Angles in radians."
 )
 
 

@@ -52,7 +52,7 @@ class RayOptions:
 
 
 @dataclass(frozen=True)
-class Job:
+class BatchJob:
     """A capture to run."""
 
     name: str
@@ -131,7 +131,7 @@ def fingerprint(settings: str, capture: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def earlier(job: Job, retry: bool = False) -> Outcome | None:
+def earlier(job: BatchJob, retry: bool = False) -> Outcome | None:
     """How the job ended before; None: it is to be done, as are failed ones with `retry`."""
     mark, failure = read_tree(Path(job.out) / MARK), read_tree(job.record)
     whole = all((Path(job.out) / name).is_file() for name in PRODUCTS)
@@ -143,7 +143,7 @@ def earlier(job: Job, retry: bool = False) -> Outcome | None:
     return None
 
 
-def run_job(job: Job, stop: threading.Event = NEVER) -> Outcome:
+def run_job(job: BatchJob, stop: threading.Event = NEVER) -> Outcome:
     """Run a job to its end and record it; a finished one is left alone.
 
     The lock is passed on to its process: one that outlives a killed batch is waited for.
@@ -167,7 +167,7 @@ def run_job(job: Job, stop: threading.Event = NEVER) -> Outcome:
     return Outcome(job.name, "stopped")
 
 
-def _run(job: Job, stop: threading.Event, lock: int) -> Outcome:
+def _run(job: BatchJob, stop: threading.Event, lock: int) -> Outcome:
     out, start = Path(job.out), time.monotonic()
     for stale in (out / MARK, job.record):
         stale.unlink(missing_ok=True)
@@ -217,14 +217,14 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
 
 
 def _failed(
-    job: Job, kind: str, reason: str, code: int | None = None, seconds: float = 0.0
+    job: BatchJob, kind: str, reason: str, code: int | None = None, seconds: float = 0.0
 ) -> Outcome:
     about = {**asdict(job), "kind": kind, "reason": reason, "seconds": round(seconds, 3)}
     record_failure(job.record, about, code, last_lines(Path(job.out) / LOG))
     return Outcome(job.name, "failed", seconds, reason)
 
 
-def lost(job: Job, error: Exception) -> Outcome:
+def lost(job: BatchJob, error: Exception) -> Outcome:
     """Record a job whose worker vanished, so that it could not do so itself."""
     text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
     return earlier(job) or _failed(job, "worker", f"its worker was lost: {text}")
@@ -271,7 +271,7 @@ def last_lines(log: Path) -> list[str]:
     return [line.rstrip() for line in text.splitlines() if line.strip()][-LINES:]
 
 
-def on_this_machine(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
+def on_this_machine(jobs: Sequence[BatchJob], workers: int) -> Iterator[Outcome]:
     """So many processes at a time; those that run are ended when the caller stops."""
     stop = threading.Event()
     with ThreadPoolExecutor(workers) as pool:
@@ -284,7 +284,7 @@ def on_this_machine(jobs: Sequence[Job], workers: int) -> Iterator[Outcome]:
             pool.shutdown(cancel_futures=True)
 
 
-def on_ray(jobs: Sequence[Job], workers: int, share: RayOptions) -> Iterator[Outcome]:
+def on_ray(jobs: Sequence[BatchJob], workers: int, share: RayOptions) -> Iterator[Outcome]:
     """One Ray task a capture, which runs it in a process of its own; lost machines are replaced.
 
     Raises:
@@ -318,7 +318,11 @@ def on_ray(jobs: Sequence[Job], workers: int, share: RayOptions) -> Iterator[Out
 
 
 def run_batch(
-    jobs: Sequence[Job], out: Path, workers: int, ray: RayOptions | None = None, retry: bool = False
+    jobs: Sequence[BatchJob],
+    out: Path,
+    workers: int,
+    ray: RayOptions | None = None,
+    retry: bool = False,
 ) -> list[Outcome]:
     """Run what is not finished, show how far it is on stderr, and write `summary.csv`.
 
@@ -352,7 +356,7 @@ def run_batch(
     return [ended[job.name] for job in jobs]
 
 
-def _row(job: Job, outcome: Outcome | None) -> dict[str, Any]:
+def _row(job: BatchJob, outcome: Outcome | None) -> dict[str, Any]:
     """A line of the summary."""
     if outcome is None or outcome.state == "stopped":
         return {"name": job.name, "state": "open", "capture": job.capture}

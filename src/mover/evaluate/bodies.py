@@ -84,7 +84,7 @@ POSE_METRICS: dict[str, Metric[Twins]] = {
 
 
 def soles_of(bodies: Bodies, camera: Camera) -> Int[Tensor, " soles"]:
-    """Indices of the vertices under the feet; empty where these bodies do not tell them."""
+    """Indices of the vertices under the feet; empty where their mesh is unknown."""
     up_world = torch.tensor([0.0, 1.0, 0.0]).to(bodies.verts)
     up_cam = camera.R_cam_world[:, 1].to(bodies.verts)
     parts = parts_of(bodies, up_cam if bodies.space == "camera" else up_world)
@@ -92,7 +92,7 @@ def soles_of(bodies: Bodies, camera: Camera) -> Int[Tensor, " soles"]:
 
 
 def feet_places(bodies: Bodies, camera: Camera) -> Float[Tensor, "points 1 3"]:
-    """Places in the world of the foot contacts that bodies in it tell: still, straight legs [m].
+    """Foot contacts in the world, estimated from the bodies: still, straight legs [m].
 
     The paper takes contacts of POSA; these are estimated as `find_foot_contacts` does.
     """

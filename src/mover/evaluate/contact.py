@@ -85,7 +85,7 @@ def close_meshes(pieces: Iterable[SceneObject]) -> dict[str, Mesh]:
 
 
 def furniture_of(pieces: Iterable[SceneObject], closed: Mapping[str, Mesh]) -> list[StandingMesh]:
-    """The closed proxies of the pieces where they stand in the world, and when."""
+    """The closed proxies of the objects at their positions in the world, and when."""
     solid = (replace(piece, mesh=closed[fingerprint(piece.mesh)]) for piece in pieces)
     return [there for piece in solid for there in standing_meshes(piece)]
 

@@ -185,7 +185,7 @@ def evaluate_folder(
     """Measure the result folder `out` against the folder `truth` and write out/metrics.json.
 
     Args:
-        out: The result; its convex pieces are kept in out/stages.
+        out: The result; its convex parts are kept in out/stages.
         truth: The true scene.
         config: Densities and thresholds.
         physics: Whether both scenes are simulated as well, for the share that is stable.

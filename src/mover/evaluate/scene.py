@@ -179,7 +179,7 @@ def match(
 
 
 def _box_mesh(piece: SceneObject) -> Mesh:
-    """The box of a piece, with triangles between all of its corners: only their edges are used."""
+    """The box of an object, with triangles between all corners: only their edges are used."""
     return Mesh(corners(box_of(piece)), torch.combinations(torch.arange(8), 3))
 
 

@@ -210,7 +210,7 @@ def people_of_clip(
     run: Run,
     finders: Finders = NETWORKS,
 ) -> Tracks:
-    """Everybody in all frames, segment by segment."""
+    """All people in all frames, segment by segment."""
     detect, config = settings
     count = len(clip.time)
     if not config.models.tracker:
@@ -271,7 +271,7 @@ def lens_of(
         return with_spread(At(fields, "EXIF"), BY_EXIF), None
     text = (
         f"the lens is not known: {USUAL:.0f} degrees across are assumed; give --camera FILE or "
-        "--fov DEGREES (GeoCalib, MoGe and others tell both lens and tilt)"
+        "--fov DEGREES (GeoCalib, MoGe and others estimate both lens and tilt)"
     )
     return with_spread(of_view(USUAL, size, "assumed"), ASSUMED), text
 

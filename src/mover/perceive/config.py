@@ -89,13 +89,13 @@ class TrackConfig:
     segment: Annotated[int, int_in(1, 100_000)] = 50
     """Frames between two detections."""
     same: Share = 0.3
-    """Overlap from which on a detection is somebody who is already followed."""
+    """Overlap from which a detection is matched to a tracked person."""
     present: Annotated[float, float_in(-100, 100)] = 0.0
     """Least score (logit) of SAM 2 that a person is in the picture."""
     least: Share = 0.0004
     """Smallest mask, as a share of the picture."""
     patience: Annotated[int, int_in(0, 100_000)] = 10
-    """Frames for which somebody who is not detected is remembered (without a tracker)."""
+    """Frames for which the track of an undetected person is kept (without a tracker)."""
 
 
 @dataclass(frozen=True)
@@ -156,8 +156,8 @@ class ScreenConfig:
     spread: Annotated[float, float_in(1e-3, 10)] = 0.4
     """and how much it varies (of its logarithm)."""
     known: Sigma = 0.05
-    """How far off a height is that people or depth tell (of its logarithm), where bodies.npz does
-    not say it: people's heights."""
+    """Standard deviation of a height estimated from people or depth (of its logarithm), where
+    bodies.npz gives no prior of people's heights."""
     yaws: Annotated[int, int_in(1, 360)] = 8
     """Turns that are tried."""
     scale: Weight = 0.3

@@ -1,7 +1,7 @@
 """A first scene from masks, boxes and classes of one picture, without any network.
 
 1. Each detected thing gets a few shapes of its class: the library's designs, or the user's meshes.
-2. Boxes alone tell the camera's height and which shapes and turns are possible (screen.py).
+2. Boxes alone constrain the camera's height and the possible shapes and turns (screen.py).
 3. Silhouettes decide: the descent of the main job (Eq. 1 with its image terms alone, in the robust
    form) from several turns of several shapes of each thing, all at once.
 Along what a thing may run counts in 2 and 3, as far as it is seen, and firm standard sizes in 3.
@@ -218,9 +218,9 @@ class Picture:
     reference: Float[Tensor, "h w 3"] | None = None
     """The picture itself, in [0, 1]."""
     tilt_spread: float | None = None
-    """How far off pitch and roll are where its lines tell them [rad]."""
+    """Standard deviation of pitch and roll where lines of the image constrain them [rad]."""
     heading: Heading | None = None
-    """Of the room, where they tell it."""
+    """Heading of the room, where they constrain it."""
     segments: Segments | None = None
     """These lines."""
 
@@ -240,7 +240,7 @@ class FirstScene:
 
     scene: Scene
     others: tuple[tuple[Hypothesis, ...], ...]
-    """Of each piece, best first; the first is the one in the scene."""
+    """Hypotheses of each object, best first; the first is the one in the scene."""
     skipped: tuple[str, ...]
     """Classes of things that do not stand on the ground and were left out."""
 
@@ -331,7 +331,7 @@ def _screen_inputs(
 
 
 def _pieces(picture: Picture, pairs: list[tuple[int, ShapeChoice]]) -> tuple[SceneObject, ...]:
-    """One piece for each item; the name has thing and rank."""
+    """One object for each item; its id has thing and rank."""
     found: list[SceneObject] = []
     for index, (thing, shape) in enumerate(pairs):
         rank = sum(1 for other, _ in pairs[:index] if other == thing)
@@ -340,7 +340,7 @@ def _pieces(picture: Picture, pairs: list[tuple[int, ShapeChoice]]) -> tuple[Sce
 
 
 def axes_of(picture: Picture, things: Int[Tensor, " items"]) -> Given:
-    """Along what each item may run, as the room's edges and those of its thing tell."""
+    """Likely axes of each item, from the edges of the room and of its thing."""
     kinds = [canonical(found.category) for found in picture.detections]
     known = unplaced(len(kinds))
     if picture.heading is not None and picture.segments is not None:

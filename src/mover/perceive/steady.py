@@ -27,7 +27,7 @@ CLEARLY = 0.03  # share of pixels by which a farther start must be better
 GRID = 4  # points along each side that measure a drift
 FOCAL = 0.9  # of the larger side: a lens of 58 degrees, where none is known
 POINTS, DETAIL, APART = 1000, 0.005, 5  # points that are followed: most, least detail, gap [px]
-LEAST = 10  # points, fewer tell nothing
+LEAST = 10  # points, fewer give no estimate
 ROUGH = 3.0  # [px], how far points may be off a shift of the picture
 NOISE = 0.3  # [px], of a point that was found again
 LIGHT = 19  # [px], what changes over more is light
@@ -274,7 +274,7 @@ def _judged(
 def cuts_of(drift: Drift, config: SteadyConfig | None = None) -> list[int]:
     """Frames at which the picture is another one all at once and stays so: the video was cut.
 
-    A camera that walks away loses its first picture little by little, and somebody who passes close
+    A camera that walks away loses its first picture little by little, and a person who passes close
     by gives it back.
     """
     least = (config or SteadyConfig()).agree

@@ -1,10 +1,10 @@
 """People through the video: SAM 2 carries masks on, detections bring new people in.
 
-The video is cut into segments. At the first frame of each, people are detected; who overlaps
-somebody that is already followed stays the same person, all others are new. SAM 2 then carries all
-masks through the segment. Each segment is kept on disk, so a killed run goes on with the next.
-Without a tracker detections in all frames are linked by their overlap. ViTPose then finds the
-joints of everybody in the box of their mask.
+The video is cut into segments. At the first frame of each, people are detected; a detection that
+overlaps a track continues it, all others start new tracks. SAM 2 then propagates all masks through
+the segment. Each segment is kept on disk, so a killed run continues with the next. Without a
+tracker, detections in all frames are linked by their overlap. ViTPose then finds the joints of each
+person in the box of their mask.
 """
 
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ def stack_of(masks: Masks) -> Bool[Tensor, "rows h w"]:
 
 
 def track_people(inputs: SegmentInputs, config: TrackConfig, observe: Observer = silent) -> Tracks:
-    """Follow everybody through a segment.
+    """Track all people through a segment.
 
     Raises:
         InputError: If the network is not there.
@@ -99,8 +99,8 @@ def track_people(inputs: SegmentInputs, config: TrackConfig, observe: Observer =
 def seeded(inputs: SegmentInputs, same: float) -> tuple[Bool[Tensor, "people h w"], list[int], int]:
     """Masks at the first frame, who they are, and how many numbers are used up.
 
-    Somebody who is followed and detected takes the detection's mask; followed but not detected
-    (hidden for a moment) goes on; detected but not followed is new.
+    A track with a detection takes its mask; a track without one (hidden for a moment) continues;
+    a detection without a track starts a new one.
     """
     old, new = stack_of(inputs.carried.masks), stack_of(inputs.found.masks)
     names = inputs.carried.person.tolist()
@@ -173,7 +173,7 @@ def add_masks(
     masks: Bool[Tensor, "people h w"],
     names: Sequence[int],
 ) -> None:
-    """Tell SAM 2 who is where in the first frame."""
+    """Prompt SAM 2 with the masks of all people in the first frame."""
     side = net.model.config.image_size
     square = torch.nn.functional.interpolate(
         masks[:, None].float(), (side, side), mode="bilinear", antialias=True
@@ -203,7 +203,7 @@ class JointsInputs:
 def find_joints(
     inputs: JointsInputs, config: JointsConfig, observe: Observer = silent
 ) -> Keypoints:
-    """Joints of everybody whose mask is known.
+    """Joints of all people with a mask.
 
     Raises:
         InputError: If the network is not there.

@@ -28,7 +28,7 @@ from mover.perceive.config import FramesConfig
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 LARGEST_AREA = 1 << 26  # [px²], of a frame
 QUALITY = 95  # of JPEG
-USUAL_RATE = 30.0  # frames a second, where a video does not tell
+USUAL_RATE = 30.0  # frames a second, where the video gives none
 SAME_GAP = 0.2  # difference of two gaps between frames that are meant to be one
 EARLY = 0.05  # of the time between two frames: how early the first may be taken
 

@@ -62,7 +62,7 @@ class ImportArgs:
     reference_frame: Index | None = None
     """The frame that the reference image shows, where the camera moves; else the first pose."""
     gender: str | None = None
-    """Of the bodies, where the tool does not tell: neutral, female or male."""
+    """Of the bodies, where the tool gives none: neutral, female or male."""
     fps: Rate | None = None
     """Frames a second of the people's masks and bodies."""
     up: str = ""
@@ -92,7 +92,7 @@ def run_import(args: ImportArgs, work: Path) -> None:
     hints = _hints(args, work)
     main: Parts = chosen("FORMAT", args.format, *IMPORTED)(args.source, hints)
     imported = import_into(args.out, *_parts(args, main, hints))
-    tell(imported, args.out)
+    print_import(imported, args.out)
 
 
 def _hints(args: ImportArgs, work: Path) -> "Hints":
@@ -233,7 +233,7 @@ def only_people(found: "Instances") -> "Instances":
     return dataclasses.replace(found, items=kept)
 
 
-def tell(imported: "Imported", folder: Path) -> None:
+def print_import(imported: "Imported", folder: Path) -> None:
     """Say what the capture has and what it lacks."""
     from mover.io.capture.evidence import evidence_table, gather_evidence
     from mover.io.capture.pairing import odd_world

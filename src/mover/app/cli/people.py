@@ -30,7 +30,7 @@ class BodiesArgs:
     camera: Path | None = None
     """The true lens (camera.json or a calibration): bodies keep their pixels under it."""
     focal: Annotated[float, float_in(1, 1e6)] | None = None
-    """The focal length that the tool assumed, where its files do not tell [px]."""
+    """The focal length that the tool assumed, where its files do not give it [px]."""
     model_folder: Path | None = None
     """Folder of the licensed body models; by default what MOVER_BODY_MODELS names."""
     faces: Path | None = None
@@ -89,12 +89,12 @@ def _bodies(args: BodiesArgs) -> None:
         say(f"warning: {warning}")
     model = "meshes only" if people.pose is None else f"parameters of {people.pose.model}"
     say(f"{_counted(people)}, {people.verts.shape[1]} vertices, {model}: {out}")
-    _tell_gravity(found)
+    _print_gravity(found)
     if args.write_camera is not None:
         _write_camera(found, known, args.write_camera)
 
 
-def _tell_gravity(found: Any) -> None:  # noqa: ANN401
+def _print_gravity(found: Any) -> None:  # noqa: ANN401
     from mover.io.people.bodies import attitude
 
     if found.up is not None:
@@ -170,9 +170,9 @@ class FitArgs:
     ground: Annotated[float, float_in(-100, 100)] | None = None
     """Height of the floor in the camera's world, where it is known: people stand on it [m]."""
     height: tuple[Annotated[float, float_in(0.4, 2.6)], ...] = ()
-    """How tall people are, one for everybody or for each in the order of their numbers [m]."""
+    """Heights of the people, one for all or one each in the order of their numbers [m]."""
     fps: Rate | None = None
-    """Frames a second, where the keypoints do not tell."""
+    """Frames a second, where the keypoints give none."""
     first: Index = 0
     """The number in the name of the first frame's file, 1 where they count from 1."""
     drop: bool = False

@@ -36,7 +36,7 @@ class EvaluateArgs:
     truth: Path
     """Folder with the true scene.json, meshes, and bodies.npz if there are any."""
     stable: bool = True
-    """Simulate both scenes in MuJoCo (the extra physics) for the share of pieces that stay."""
+    """Simulate both scenes in MuJoCo (the extra physics) for the share of objects that stay."""
 
 
 def check(arguments: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mover.app.batch import CONFIG, FAILURES, SUMMARY, Job, RayOptions
+from mover.app.batch import CONFIG, FAILURES, SUMMARY, BatchJob, RayOptions
 from mover.app.cli import say
 from mover.app.cli.config import RUN_SETTINGS, Device, chosen_config, parsed_with
 from mover.core.errors import InputError
@@ -169,7 +169,7 @@ def batch(arguments: Sequence[str]) -> None:
         raise SystemExit(1)
 
 
-def _jobs(args: BatchArgs, config: Config, captures: Sequence[Path]) -> list[Job]:
+def _jobs(args: BatchArgs, config: Config, captures: Sequence[Path]) -> list[BatchJob]:
     """A job for each capture; the settings are handed over in one file for all."""
     from mover import __version__
     from mover.app.batch import fingerprint, names_of
@@ -182,11 +182,13 @@ def _jobs(args: BatchArgs, config: Config, captures: Sequence[Path]) -> list[Job
     settings = records.fingerprint(config, args.format, __version__, args.refine)
     more = ["--format", args.format, "--config", str(out / CONFIG)]
     more += ["--refine"] if args.refine else []
-    jobs: list[Job] = []
+    jobs: list[BatchJob] = []
     for name, capture in zip(names_of(captures), captures, strict=True):
         words = [sys.executable, "-m", "mover", "run", str(capture), "--out", str(out / name)]
         print_ = fingerprint(settings, capture)
         command = (*words, *more)
-        job = Job(name, str(capture), str(out / name), command, print_, args.limit, args.threads)
+        job = BatchJob(
+            name, str(capture), str(out / name), command, print_, args.limit, args.threads
+        )
         jobs.append(job)
     return jobs

@@ -302,7 +302,7 @@ def video_to_room(source: Path, args: ChainArgs, finders: "Finders | None" = Non
         capture / "objects.json",
         lambda: perceive_into(pictures, config.models, finders),
     )
-    _tell_what_is_missing(capture)
+    _check_detections(capture)
     _bodies(source, capture, args, steps)
     _first_scene(capture, args, steps)
     _room(capture, args)
@@ -316,8 +316,8 @@ def _checked(args: ChainArgs, networks: bool) -> PerceiveConfig:
     return replace(args.config, models=ready_models(models, args.weights) if networks else models)
 
 
-def _tell_what_is_missing(capture: Path) -> None:
-    """No furniture ends the way; no people is a warning.
+def _check_detections(capture: Path) -> None:
+    """Stop without furniture, and warn without people.
 
     Raises:
         InputError: If the picture shows no furniture.
@@ -327,14 +327,14 @@ def _tell_what_is_missing(capture: Path) -> None:
     if not json.loads((capture / "objects.json").read_text())["annotations"]:
         raise InputError(
             f"{capture / 'reference.png'}: the network finds no furniture in it, so there is "
-            "nothing to place; --detect.score 0.3 hears weaker finds"
+            "nothing to place; --detect.score 0.3 keeps weaker detections"
         )
     if not json.loads((capture / "people.json").read_text())["annotations"]:
         say("warning: no person is seen in the video: only the image places the furniture")
 
 
 def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
-    """bodies.npz, where somebody is seen."""
+    """bodies.npz, where people are seen."""
     bodies, keypoints = BodiesFrom(args.bodies, args.bodies_tool), capture / "keypoints.npz"
     if args.bodies == FIT and not keypoints.is_file():
         say("warning: no keypoints were found, so there are no bodies")

@@ -23,7 +23,7 @@ LINE, CREASE = 0.75, 0.25  # how opaque outlines and inner edges are
 
 @record
 class Surfaces:
-    """Triangles in the world, each with a colour and somebody that it belongs to."""
+    """Triangles in the world, each with a colour and the index of its owner."""
 
     verts: Float[Tensor, "verts 3"]
     """[m]"""
@@ -205,8 +205,8 @@ SKY, FLOOR = (0.955, 0.965, 0.98), (0.80, 0.785, 0.76)
 
 
 @record
-class Ground:
-    """The floor's height and what part of it is shown."""
+class GroundPatch:
+    """The height of the floor and the rectangle of it that is drawn."""
 
     height: float
     """[m]"""
@@ -216,13 +216,13 @@ class Ground:
     """Largest x and z [m]."""
 
 
-def ground_under(points: Float[Tensor, "points 3"], height: float) -> Ground:
+def ground_under(points: Float[Tensor, "points 3"], height: float) -> GroundPatch:
     """The floor under everything."""
     flat = points[:, [0, 2]]
-    return Ground(height, flat.amin(0) - EDGE, flat.amax(0) + EDGE)
+    return GroundPatch(height, flat.amin(0) - EDGE, flat.amax(0) + EDGE)
 
 
-def backdrop(eye: RenderCamera, ground: Ground) -> Float[Tensor, "h w 3"]:
+def backdrop(eye: RenderCamera, ground: GroundPatch) -> Float[Tensor, "h w 3"]:
     """A plain room: a floor that ends softly, and light around it."""
     spread = torch.linspace(1.0, 0.93, eye.height)[:, None, None]
     sky = (torch.tensor(SKY) * spread).expand(eye.height, eye.width, 3)
@@ -230,7 +230,9 @@ def backdrop(eye: RenderCamera, ground: Ground) -> Float[Tensor, "h w 3"]:
     return sky.lerp(torch.tensor(FLOOR), 0.75 * _inside(points, ground)[..., None])
 
 
-def metre_lines(eye: RenderCamera, ground: Ground, brightness: float) -> Float[Tensor, "h w 4"]:
+def metre_lines(
+    eye: RenderCamera, ground: GroundPatch, brightness: float
+) -> Float[Tensor, "h w 4"]:
     """A sheet with lines at whole metres of the world, of one brightness in [0, 1]."""
     points = floor_seen(eye, ground.height)[..., [0, 2]]
     points = torch.where(points.isfinite(), points, 1e6)
@@ -242,7 +244,7 @@ def metre_lines(eye: RenderCamera, ground: Ground, brightness: float) -> Float[T
     return torch.cat([(brightness * alpha)[..., None].expand(-1, -1, 3), alpha[..., None]], -1)
 
 
-def shadows(eye: RenderCamera, ground: Ground, surfaces: Surfaces) -> Float[Tensor, "h w 4"]:
+def shadows(eye: RenderCamera, ground: GroundPatch, surfaces: Surfaces) -> Float[Tensor, "h w 4"]:
     """A black sheet: dark where an underside is near the floor."""
     sheet = torch.zeros(eye.height, eye.width, 4)
     if not len(surfaces.faces):
@@ -276,7 +278,7 @@ def _shadow_map(
     return (DARK * (0.6 * near + 0.4 * wide))[0, 0]
 
 
-def _inside(points: Float[Tensor, "h w 2"], ground: Ground) -> Float[Tensor, "h w"]:
+def _inside(points: Float[Tensor, "h w 2"], ground: GroundPatch) -> Float[Tensor, "h w"]:
     """1 on the shown part of the floor, fading to 0 at its border."""
     gap = torch.minimum(points - ground.low, ground.high - points).amin(-1)
     return (gap.nan_to_num(-1.0, -1.0, -1.0) / EDGE).clamp(0, 1)

@@ -32,7 +32,7 @@ from mover.app.pictures.film import (
 from mover.app.pictures.paint import (
     FINE,
     Drawn,
-    Ground,
+    GroundPatch,
     Ink,
     Surfaces,
     backdrop,
@@ -70,7 +70,7 @@ class World:
     scene: Scene
     bodies: Bodies | None
     still: Surfaces
-    ground: Ground
+    ground: GroundPatch
     points: Float[Tensor, "points 3"]
     """What an eye should see [m]."""
 
@@ -133,7 +133,7 @@ def world_of(caption: str, scene: Scene, bodies: Bodies | None) -> World:
     """A scene and the people in its world, ready to be drawn.
 
     Raises:
-        InputError: If there is neither furniture nor anybody.
+        InputError: If there are neither objects nor people.
     """
     parts = [place_object(piece).verts for piece in scene.objects]
     if bodies is not None:
@@ -261,7 +261,7 @@ class Tiles:
     """What does not move, drawn once."""
 
     eye: RenderCamera
-    ground: Ground
+    ground: GroundPatch
     ink: Ink
     still: Drawn
     """The furniture in fine pixels."""
@@ -274,7 +274,10 @@ class Tiles:
 
 
 def set_up(
-    eye: RenderCamera, ground: Ground, still: Surfaces, base: Float[Tensor, "h w 3"] | None = None
+    eye: RenderCamera,
+    ground: GroundPatch,
+    still: Surfaces,
+    base: Float[Tensor, "h w 3"] | None = None,
 ) -> Tiles:
     """Draw the furniture.
 

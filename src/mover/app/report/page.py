@@ -66,7 +66,7 @@ class ReportContent:
 
     @property
     def peopled(self) -> bool:
-        """Whether there is anybody to show."""
+        """Whether there are people to show."""
         return any(b is not None and len(b.verts) > 0 for b in (self.initial_bodies, self.bodies))
 
 

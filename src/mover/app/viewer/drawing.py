@@ -95,7 +95,7 @@ def bytes_of(tint: Colour) -> tuple[int, int, int]:
 
 
 @dataclass
-class People:
+class DrawnPeople:
     """The drawn people, at a moment of a time line of all frames that have any."""
 
     server: Any

@@ -11,7 +11,14 @@ import numpy as np
 import torch
 
 from mover.app.report.tables import find_changes
-from mover.app.viewer.drawing import Drawing, People, World, camera_wxyz, draw_camera, draw_room
+from mover.app.viewer.drawing import (
+    Drawing,
+    DrawnPeople,
+    World,
+    camera_wxyz,
+    draw_camera,
+    draw_room,
+)
 from mover.app.viewer.session import Session, Shown
 from mover.core.types import Scene, SceneObject
 from mover.geometry.boxes import box_of
@@ -33,7 +40,7 @@ class Viewer:
     server: Any
     session: Session
     drawing: Drawing
-    people: People
+    people: DrawnPeople
     moment: int = 0
     """Position on the time line."""
     world: World = "after"

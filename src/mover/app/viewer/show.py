@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from mover.app.cli import say
-from mover.app.viewer.drawing import Drawing, People, draw_room, move_object
+from mover.app.viewer.drawing import Drawing, DrawnPeople, draw_room, move_object
 from mover.app.viewer.gate import HOSTS, guarded
 from mover.app.viewer.panels import (
     Viewer,
@@ -99,7 +99,7 @@ def open_viewer(session: Session, port: int) -> tuple[Viewer, str]:
     )
     server.scene.set_up_direction("+y")
     drawing = Drawing(server)
-    window, grips = Viewer(server, session, drawing, People(server)), Grips(session, drawing)
+    window, grips = Viewer(server, session, drawing, DrawnPeople(server)), Grips(session, drawing)
 
     def redraw() -> None:
         draw_room(drawing, session.scene, "after")

@@ -74,7 +74,7 @@ class Parts:
     people_of: Mapping[str, Bodies] = field(default_factory=dict[str, Bodies])
     """People of those scenes, by their folder."""
     notes: tuple[str, ...] = ()
-    """What a reader wants to tell."""
+    """Notes of the reader to the user."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from mover.geometry.camera import to_camera
 from mover.io.capture.parts import UNKNOWN
 from mover.io.files.fields import Warn, listed
 
-LARGEST, SMALLEST = 30.0, 0.01  # [m], longest side of a piece of furniture
+LARGEST, SMALLEST = 30.0, 0.01  # [m], longest side of an object
 FARTHEST = 100.0  # [m] from the camera
 FAR = 30.0  # [m], odd for a room
 TURNS = 4 * math.pi  # [rad], a yaw beyond is odd: degrees?

@@ -304,7 +304,7 @@ class HypothesesFields(Struct, frozen=True):
 
 
 def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[SceneObject, ...]:
-    """Other places and shapes of the scene's objects; a piece's id is that of its object.
+    """Other positions and shapes of the scene's objects, under the ids of those objects.
 
     The first row of each object is the one that the scene has. Where it is not, the scene came
     from elsewhere or was changed since, and the object's rows are left out with a warning.

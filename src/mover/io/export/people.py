@@ -28,7 +28,7 @@ class Track:
 
 
 def tracks_of(bodies: Bodies) -> list[Track]:
-    """Everybody, by the number of their track."""
+    """All people, by the number of their track."""
     fps = bodies.fps or FPS
     begin = int(bodies.frame.min())
     last = (int(bodies.frame.max()) - begin) / fps

@@ -102,7 +102,7 @@ def with_spread(at: At, spread: float) -> At:
 
 
 def guessed_view(degrees: float, size: tuple[int, int]) -> At:
-    """The camera of `--fov`: somebody's guess of the angle across, which says so.
+    """The camera of `--fov`: an assumed horizontal angle of view, marked as such.
 
     Raises:
         InputError: If the angle is not that of a pinhole camera.

@@ -24,7 +24,7 @@ SAME = 0.01  # [m], parameters that miss the tool's own vertices by more are lef
 
 
 @record
-class Imported:
+class ImportedBodies:
     """Bodies as another tool found them, in the camera frame, or upright where it has none."""
 
     bodies: Bodies
@@ -35,7 +35,7 @@ class Imported:
     warnings: tuple[str, ...]
 
 
-def bodies_from(tool: str, path: Path, known: Known | None = None) -> Imported:
+def bodies_from(tool: str, path: Path, known: Known | None = None) -> ImportedBodies:
     """Bodies that another tool found: with meshes, under the true lens, without failed rows.
 
     Raises:
@@ -46,7 +46,7 @@ def bodies_from(tool: str, path: Path, known: Known | None = None) -> Imported:
     return finish(format_of("tool", tool, "people")(Path(path), known), known, Path(path).name)
 
 
-def finish(found: Found, known: Known, file: str) -> Imported:
+def finish(found: Found, known: Known, file: str) -> ImportedBodies:
     """Bodies of the rows that are bodies.
 
     Raises:
@@ -76,7 +76,7 @@ def finish(found: Found, known: Known, file: str) -> Imported:
     )
     used = None if found.K is None else found.K.median(0).values
     K = used if known.camera is None else known.camera.K
-    return Imported(bodies, None if K is None else K.float(), up, tuple(warnings))
+    return ImportedBodies(bodies, None if K is None else K.float(), up, tuple(warnings))
 
 
 def _sound(found: Found, file: str, warnings: list[str]) -> Found:
@@ -227,7 +227,7 @@ def attitude(up: Float[Tensor, "3"]) -> tuple[float, float]:
     return float(pitch), float(roll)
 
 
-def in_world(found: Imported, file: str) -> Bodies:
+def in_world(found: ImportedBodies, file: str) -> Bodies:
     """The bodies in the world without heading, +y up, the camera at its origin.
 
     Raises:
@@ -242,7 +242,7 @@ def in_world(found: Imported, file: str) -> Bodies:
     return dataclasses.replace(into_camera(given, R.mT), space="world")
 
 
-def camera_from(found: Imported, known: Known) -> Camera:
+def camera_from(found: ImportedBodies, known: Known) -> Camera:
     """The camera: the user's lens, else the tool's, with pitch and roll by the tool's gravity.
 
     Raises:

@@ -84,7 +84,7 @@ class Known:
     camera: Camera | None = None
     """The true lens: bodies are moved so that they keep their pixels under it."""
     focal: float | None = None
-    """The focal length that the tool assumed, where its files do not tell [px]."""
+    """The focal length that the tool assumed, where its files do not give it [px]."""
     faces: Path | None = None
     """A mesh file with the triangles of the bodies, where their model is not at hand."""
     fps: float | None = None

@@ -62,7 +62,7 @@ def keypoints_from(tool: str, path: Path, known: Known | None = None) -> Keypoin
 
 
 @dataclass(frozen=True)
-class Seen:
+class PersonJoints:
     """The joints of one person in one image, as a file has them."""
 
     frame: int
@@ -72,7 +72,9 @@ class Seen:
     """(joints, 3): x, y [px], confidence."""
 
 
-def keypoints_of(seen: Sequence[Seen], layout: str, fps: float | None, file: str) -> Keypoints:
+def keypoints_of(
+    seen: Sequence[PersonJoints], layout: str, fps: float | None, file: str
+) -> Keypoints:
     """Keypoints with tracks; people without any joint are left out.
 
     People are followed from image to image where the file has no tracks.
@@ -105,13 +107,13 @@ def keypoints_of(seen: Sequence[Seen], layout: str, fps: float | None, file: str
     )
 
 
-def _clean(seen: Seen) -> Seen:
+def _clean(seen: PersonJoints) -> PersonJoints:
     """Pixels as the package counts them; confidence from 0 to 1, 0 where a joint is missing."""
     finite = (np.abs(seen.joints) <= LARGEST).all(1, keepdims=True)  # false for NaN as well
     joints = np.where(finite, seen.joints, 0.0)
     sure = np.clip(joints[:, 2], 0, 1)
     points = (joints[:, :2] + CENTRE) * (sure > 0)[:, None]
-    return Seen(seen.frame, seen.person, np.concatenate([points, sure[:, None]], 1))
+    return PersonJoints(seen.frame, seen.person, np.concatenate([points, sure[:, None]], 1))
 
 
 def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
@@ -122,7 +124,7 @@ def read_instances(path: Path, known: Known, layout: str) -> Keypoints:
         seen = _arrays(at, count)
     else:
         seen = [_instance(one, frame, count) for one, frame in _listed(at)]
-    moved = [Seen(s.frame - known.first, s.person, s.joints) for s in seen]
+    moved = [PersonJoints(s.frame - known.first, s.person, s.joints) for s in seen]
     return keypoints_of(moved, layout, known.fps, path.name)
 
 
@@ -156,7 +158,7 @@ def _integer(at: At) -> int:
     return int(found[-1])
 
 
-def _instance(at: At, frame: int, count: int) -> Seen:
+def _instance(at: At, frame: int, count: int) -> PersonJoints:
     given = need(at, "keypoints")
     scores = either(at, "keypoint_scores", "scores")
     joints = _joints(given, None if scores is None else numbers(scores), count)
@@ -164,7 +166,7 @@ def _instance(at: At, frame: int, count: int) -> Seen:
     marked = "num_keypoints" in mapping(at)  # ground truth: 0 absent, 1 hidden, 2 visible
     if marked:
         joints[:, 2] = joints[:, 2] > 0
-    return Seen(frame, -1 if track is None else _track(track), joints)
+    return PersonJoints(frame, -1 if track is None else _track(track), joints)
 
 
 def _track(at: At) -> int:
@@ -189,7 +191,7 @@ def _joints(at: At, scores: NDArray[np.float64] | None, count: int) -> NDArray[n
     return np.concatenate([value.reshape(count, 2), scores.reshape(count, 1)], 1)
 
 
-def _arrays(at: At, count: int) -> list[Seen]:
+def _arrays(at: At, count: int) -> list[PersonJoints]:
     given, scores = need(at, "keypoints", "points"), either(at, "scores", "confidence")
     frames = whole(need(at, "frame", "frames"))
     person = either(at, "person", "track_id")
@@ -199,7 +201,7 @@ def _arrays(at: At, count: int) -> list[Seen]:
         refuse(given, "as many rows as frames", f"{len(frames)} frames and {len(who)} tracks")
     sure = None if scores is None else rows(scores, len(frames), count)
     return [
-        Seen(
+        PersonJoints(
             int(frame),
             int(track),
             _joints(At(points[k], at.file, given.field), None if sure is None else sure[k], count),
@@ -211,7 +213,7 @@ def _arrays(at: At, count: int) -> list[Seen]:
 def read_openpose(path: Path, known: Known) -> Keypoints:
     """Keypoints of a folder of OpenPose JSON, or of one file."""
     files = files_of(path, "*.json", "OpenPose's keypoints")
-    seen: list[Seen] = []
+    seen: list[PersonJoints] = []
     for index, file in enumerate(files):
         name = file.stem.removesuffix("_keypoints")
         frame = number_in(name, index) - known.first if path.is_dir() else 0
@@ -219,16 +221,16 @@ def read_openpose(path: Path, known: Known) -> Keypoints:
         seen += [_of_openpose(person, frame) for person in items(need(at, "people"))]
     more = any(s.joints[25:, 2].any() for s in seen)
     if not more:
-        seen = [Seen(s.frame, s.person, s.joints[:25]) for s in seen]
+        seen = [PersonJoints(s.frame, s.person, s.joints[:25]) for s in seen]
     return keypoints_of(seen, "openpose137" if more else "openpose25", known.fps, path.name)
 
 
-def _of_openpose(at: At, frame: int) -> Seen:
+def _of_openpose(at: At, frame: int) -> PersonJoints:
     need(at, "pose_keypoints_2d")
     joints = np.concatenate([_part(at, name, count) for name, count in PARTS.items()])
     given = either(at, "person_id")
     ids = [-1.0] if given is None else numbers(given).reshape(-1).tolist() or [-1.0]
-    return Seen(frame, int(ids[0]), joints)
+    return PersonJoints(frame, int(ids[0]), joints)
 
 
 def _part(at: At, name: str, count: int) -> NDArray[np.float64]:

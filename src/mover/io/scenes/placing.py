@@ -32,8 +32,8 @@ Placed = tuple[dict[str, Any], tuple[Mesh, str], str]
 
 
 @dataclass(frozen=True)
-class Posed:
-    """A mesh and its place."""
+class FilePose:
+    """The pose of a mesh in scene.json."""
 
     fields: dict[str, Any]
     """translation, yaw and scale of scene.json."""
@@ -43,7 +43,7 @@ class Posed:
     """What was lost; empty: nothing."""
 
 
-def posed(matrix: Matrix, low: Matrix, high: Matrix) -> Posed:
+def posed(matrix: Matrix, low: Matrix, high: Matrix) -> FilePose:
     """The place of a mesh whose vertices a matrix takes into the world (+y up).
 
     Yaw and scale are kept as such. A small tilt is dropped about the centre of the box, since
@@ -60,7 +60,7 @@ def posed(matrix: Matrix, low: Matrix, high: Matrix) -> Posed:
     rest = about_y(-yaw) @ A
     scale = np.diag(rest)
     if np.abs(rest - np.diag(scale)).max() <= EXACT * size and (scale > 0).all():
-        return Posed(_fields(t, yaw, scale), None, "")
+        return FilePose(_fields(t, yaw, scale), None, "")
     lengths = np.linalg.norm(A, axis=0)
     R = A / np.maximum(lengths, 1e-12)
     tilt = math.acos(float(np.clip(R[1, 1], -1, 1)))
@@ -68,11 +68,11 @@ def posed(matrix: Matrix, low: Matrix, high: Matrix) -> Posed:
     if not skewed and tilt <= MOST_TILT:
         centre = (low + high) / 2
         place = A @ centre + t - about_y(yaw) @ (lengths * centre)
-        return Posed(_fields(place, yaw, lengths), None, f"a tilt of {math.degrees(tilt):.1f}°")
+        return FilePose(_fields(place, yaw, lengths), None, f"a tilt of {math.degrees(tilt):.1f}°")
     return _baked(A, t, low, high)
 
 
-def _baked(A: Matrix, t: Matrix, low: Matrix, high: Matrix) -> Posed:
+def _baked(A: Matrix, t: Matrix, low: Matrix, high: Matrix) -> FilePose:
     """The matrix without its yaw in the vertices; the front is that axis which lies level."""
     axes = [A[:, 2], -A[:, 1], A[:, 0]]
     front = max(axes, key=lambda a: math.hypot(a[0], a[2]) / max(float(np.linalg.norm(a)), 1e-12))
@@ -85,7 +85,7 @@ def _baked(A: Matrix, t: Matrix, low: Matrix, high: Matrix) -> Posed:
     place = t + about_y(yaw) @ centre
     mirrored = " mirrored" if np.linalg.det(A) < 0 else ""
     note = f"it was{mirrored} about other axes, which went into a new mesh"
-    return Posed(_fields(place, yaw, np.ones(3)), bake, note)
+    return FilePose(_fields(place, yaw, np.ones(3)), bake, note)
 
 
 def about_y(angle: float) -> Matrix:
