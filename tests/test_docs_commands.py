@@ -92,12 +92,19 @@ def test_a_command_in_a_block_is_understood(line: str):
 
 ELSEWHERE = """
 import json, sys, tyro
-from mover.app import results
-from mover.app.cli import run
-from mover.pipeline.presets import PRESETS
-results.read_config = lambda path: PRESETS["robust"]
+from mover.app.cli import command_of
+real = tyro.cli
+class Parsed(Exception): pass
+def parse(*args, **options):
+    real(*args, **options)
+    raise Parsed
+tyro.cli = parse
 for words in json.loads(sys.argv[1]):
-    run._parse_batch(words)
+    try:
+        command_of("batch")(words)
+    except Parsed:
+        continue
+    raise SystemExit(f"not parsed: {words}")
 """
 
 
@@ -112,9 +119,14 @@ def test_batches_in_blocks_are_understood():
 
 @cache
 def help_of(name: str) -> str:
+    """The help, with all settings where the command has more of them."""
     text = io.StringIO()
-    with contextlib.redirect_stdout(text), pytest.raises(SystemExit):
-        command_of(name)(["--help"])
+    with contextlib.redirect_stdout(text):
+        with pytest.raises(SystemExit):
+            command_of(name)(["--help"])
+        if "--help-all" in text.getvalue():
+            with pytest.raises(SystemExit):
+                command_of(name)(["--help-all"])
     return text.getvalue()
 
 
@@ -128,7 +140,7 @@ def test_a_command_in_a_sentence_has_these_options(text: str):
     options = [word.split("=")[0] for word in words if word.startswith("--")]
     for option in options:
         words = help_of(name).replace("_", "-").replace(",", " ").split()
-        assert option in words or option == "--help", option
+        assert option in words or option in ("--help", "--help-all"), option
 
 
 def test_there_are_commands_to_check():

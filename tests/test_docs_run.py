@@ -30,6 +30,7 @@ ELSEWHERE = {
     "--device cuda": "an NVIDIA GPU",
     "mover experiment --": "hours: many known rooms",
     "mover demo": "minutes: `make demo`",
+    "mover video": "weights of networks",
 }
 RUN = [
     "--place.method.steps", "3", "--layout.method.steps", "3", "--gather.cells", "32",
