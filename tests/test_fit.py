@@ -21,13 +21,13 @@ from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import PAPER, PUBLISHED, STAGES, FitConfig, Stage
 from mover.fitting.energy import (
     Weighed,
-    bending_price,
+    bending_cost,
     body_energy,
     geman_mcclure,
-    smooth_joint_price,
+    smooth_joint_cost,
 )
 from mover.fitting.ground import balance_cost, center_of_mass, standing_share
-from mover.fitting.limits import limit_price, limit_table, resting
+from mover.fitting.limits import limit_cost, limit_table, resting
 from mover.fitting.offsets import lasting_of, offset_cost
 from mover.fitting.prior import ANGLES, same
 from mover.fitting.start import placed
@@ -347,10 +347,10 @@ def test_prices_are_those_of_the_publication():
     r = torch.tensor([0.0, 3.0, 100.0, 1e6])
     wanted = [0.0, 9e4 / 10009, 5000.0, 1e4]
     torch.testing.assert_close(geman_mcclure(r**2, 100.0), torch.tensor(wanted), rtol=1e-4, atol=0)
-    assert float(bending_price(torch.zeros(1, 63))) == 4.0
+    assert float(bending_cost(torch.zeros(1, 63))) == 4.0
     elbow = torch.zeros(1, 63)
     elbow[0, 52] = 0.7  # the left elbow, backwards: index 55 of the full pose less the root's three
-    assert float(bending_price(elbow)) == pytest.approx(3 + np.exp(1.4), rel=1e-5)
+    assert float(bending_cost(elbow)) == pytest.approx(3 + np.exp(1.4), rel=1e-5)
     assert PUBLISHED[2].pose == 57.4
 
 
@@ -361,9 +361,9 @@ def test_limits_mirror_left_and_right_and_hold_the_resting_pose():
         torch.testing.assert_close(low[left, 1:], -high[right, 1:])
     assert ((low < rest) & (rest < high)).all()
     pose = resting(1, torch.zeros(1))
-    assert float(limit_price(pose)) == 0
+    assert float(limit_cost(pose)) == 0
     pose[0, 9] = np.radians(-9)  # the left knee forwards: 4 degrees beyond its limit
-    assert float(limit_price(pose)) == pytest.approx(1, rel=1e-4)
+    assert float(limit_cost(pose)) == pytest.approx(1, rel=1e-4)
 
 
 def test_the_energy_has_the_gradient_of_finite_differences(walk):
@@ -411,10 +411,10 @@ def test_frames_beyond_those_with_errors_of_their_own_do_not_constrain_the_shape
     none, betas = torch.zeros(12, 0), torch.full((2, 10), 0.3)
     at = Unknowns(torch.zeros(12, 3), walk.pose.body_pose, torch.ones(12, 3), betas, none, none)
     frame = Frame(rig, axis_angle(walk.pose.global_orient), person)
-    by = Weighed(Stage(smooth=0.0), FitConfig(alike=6), ANGLES.decode, learned=False)
+    by = Weighed(Stage(smooth=0.0), FitConfig(independent_frames=6), ANGLES.decode, learned=False)
     shape = body_energy(at, frame, looked, by).parts["shape"] / (by.stage.shape**2 * 0.9)
     torch.testing.assert_close(shape, torch.tensor([1 / 6] * 8 + [1 / 4] * 4))
-    assert PAPER.alike >= 100_000  # as published: all frames count
+    assert PAPER.independent_frames >= 100_000  # as published: all frames count
 
 
 @pytest.mark.slow
@@ -478,7 +478,7 @@ def test_a_second_pass_takes_camera_and_floor_of_a_result(tmp_path):
 
 def test_the_preset_paper_prices_motion_as_printed():
     """L_smooth of a track at even times, by a loop over Sec. 3.2, with the released weights."""
-    from mover.fitting.energy import Seen, smooth_pixel_price
+    from mover.fitting.energy import Seen, smooth_pixel_cost
 
     generator = torch.Generator().manual_seed(0)
     frames = torch.arange(5)
@@ -492,8 +492,8 @@ def test_the_preset_paper_prices_motion_as_printed():
     )  # fmt: skip
     by = Weighed(PAPER.stages[0], PAPER, same, False)
     stage = PAPER.stages[0].smooth
-    solid = stage * PAPER.smooth_joints * smooth_joint_price(joints, seen, by).sum()
-    flat = stage * PAPER.smooth_pixels * smooth_pixel_price(pixels, seen, by).sum()
+    solid = stage * PAPER.smooth_joints * smooth_joint_cost(joints, seen, by).sum()
+    flat = stage * PAPER.smooth_pixels * smooth_pixel_cost(pixels, seen, by).sum()
 
     def rho(squared, sigma):
         return sigma**2 * squared / (squared + sigma**2)
@@ -549,6 +549,6 @@ def test_larger_bodies_do_not_move_less_smoothly(walk):
     by = Weighed(Stage(), FitConfig(), ANGLES.decode, learned=False)
     torch.testing.assert_close(size_of(1.1 * walk.joints), 1.1 * size_of(walk.joints))
     sized = [j / size_of(j)[:, None, None] for j in (walk.joints, 1.1 * walk.joints)]
-    prices = [smooth_joint_price(j, looked, by).sum() for j in sized]
+    prices = [smooth_joint_cost(j, looked, by).sum() for j in sized]
     torch.testing.assert_close(*prices)
-    assert smooth_joint_price(walk.joints, looked, by).sum() > 0
+    assert smooth_joint_cost(walk.joints, looked, by).sum() > 0

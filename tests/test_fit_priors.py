@@ -12,9 +12,9 @@ from mover.bodies.skeleton import BODY
 from mover.bodies.skinning import open_body
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig
-from mover.fitting.energy import UPPER, Seen, Weighed, geman_mcclure, held_price, pose_price
-from mover.fitting.ground import distances_of_who_lies, plane_of, sole_heights, soles_of
-from mover.fitting.limits import limit_price, limit_table, resting, spreads
+from mover.fitting.energy import UPPER, Seen, Weighed, geman_mcclure, held_cost, pose_cost
+from mover.fitting.ground import distances_of_lying_people, plane_of, sole_heights, soles_of
+from mover.fitting.limits import limit_cost, limit_table, resting, spreads
 from mover.fitting.prior import same
 from mover.fitting.start import BACK, lying_guesses, upright_guesses
 from mover.fitting.tracks import ALONE, joint_speed, triples_of
@@ -88,24 +88,24 @@ def test_limbs_that_look_still_are_held_and_no_others():
     slow = torch.zeros(5, 22)
     fast = torch.full((5, 22), torch.inf)
 
-    def price(moved: torch.Tensor, speed: torch.Tensor) -> float:
+    def cost(moved: torch.Tensor, speed: torch.Tensor) -> float:
         triples = triples_of(keypoints_at(row, 5.0), speed, FitConfig())
         by = Weighed(STAGES[1], FitConfig(), same, learned=False)
-        return float(held_price(moved, dataclasses.replace(NOTHING, triples=triples), by).sum())
+        return float(held_cost(moved, dataclasses.replace(NOTHING, triples=triples), by).sum())
 
     steady = joints + time[:, None, None]
-    assert price(steady, slow) < 1e-6  # all of it moves evenly
+    assert cost(steady, slow) < 1e-6  # all of it moves evenly
     leg, arm, whole = steady.clone(), steady.clone(), steady.clone()
     leg[2, BODY.index("left_ankle")] += 0.1
     arm[2, BODY.index("left_wrist"), 2] += 0.1
     whole[2] += 0.1
-    assert price(leg, slow) < 1e-6
-    assert price(whole, slow) < 1e-6  # which is priced by `still_price`
+    assert cost(leg, slow) < 1e-6
+    assert cost(whole, slow) < 1e-6  # which is penalised by `still_cost`
     second = torch.tensor([0.1, 0.2, 0.1]).square()
     calm = FitConfig().jitter + FitConfig().calm / 25
     wanted = geman_mcclure(second, FitConfig().sigma_held).sum() / calm**2
-    assert price(arm, slow) == pytest.approx(float(wanted), rel=1e-4)
-    assert price(arm, fast) < 0.02 * price(arm, slow)
+    assert cost(arm, slow) == pytest.approx(float(wanted), rel=1e-4)
+    assert cost(arm, fast) < 0.02 * cost(arm, slow)
 
 
 def test_an_ankle_that_levels_the_foot_costs_no_more_than_one_at_rest():
@@ -116,9 +116,9 @@ def test_an_ankle_that_levels_the_foot_costs_no_more_than_one_at_rest():
         bent[0, column] += turn
         level[0, column] += turn
     level[0, 3 * (BODY.index("left_ankle") - 1)] -= 0.3
-    assert float(pose_price(rest, looked)) == 0
+    assert float(pose_cost(rest, looked)) == 0
     ankle = (0.3 / math.radians(14)) ** 2
-    assert float(pose_price(bent, looked) - pose_price(level, looked)) == pytest.approx(ankle)
+    assert float(pose_cost(bent, looked) - pose_cost(level, looked)) == pytest.approx(ankle)
 
 
 def lying_down(depths, rises):
@@ -136,12 +136,12 @@ def test_who_lies_along_the_view_is_expected_where_they_sat_before_and_after():
     joints = lying_down([4.0] * 4 + [4.9] * 5 + [4.4] * 4, upright + [0.0] * 5 + upright)
     time = torch.arange(13) / 5
     track = [torch.arange(13)]
-    found = distances_of_who_lies(joints, torch.tensor([0.0, -1, 0]), track, time)
+    found = distances_of_lying_people(joints, torch.tensor([0.0, -1, 0]), track, time)
     assert found[:4].isnan().all()
     assert found[9:].isnan().all()
     between = torch.linspace(math.log(4.0), math.log(4.4), 7)[1:-1]
     torch.testing.assert_close(found[4:9], between)
-    alone = distances_of_who_lies(
+    alone = distances_of_lying_people(
         joints[4:9], torch.tensor([0.0, -1, 0]), [torch.arange(5)], time[4:9]
     )
     assert alone.isnan().all()  # nobody knows where they came from
@@ -151,7 +151,9 @@ def test_a_body_across_the_view_tells_its_distance_itself():
     joints = lying_down([4.0, 4.9, 4.0], [1.5, 0.0, 1.5])
     joints[1, BODY.index("neck")] = torch.tensor([0.5, 0.0, 4.9])
     track = [torch.arange(3)]
-    found = distances_of_who_lies(joints, torch.tensor([0.0, -1, 0]), track, torch.arange(3) / 5)
+    found = distances_of_lying_people(
+        joints, torch.tensor([0.0, -1, 0]), track, torch.arange(3) / 5
+    )
     assert found.isnan().all()
 
 
@@ -171,7 +173,7 @@ def test_a_leaning_floor_lies_where_its_soles_are():
 
 def test_upright_bodies_are_expected_alike_on_both_sides_and_nearly_straight_where_they_stand():
     poses = torch.stack([guess.pose for guess in upright_guesses(torch.zeros(1))[::4]])
-    assert not limit_price(poses).any()
+    assert not limit_cost(poses).any()
     mirrored = poses.unflatten(-1, (21, 3)) * torch.tensor([1.0, -1.0, -1.0])
     other = [name.replace("left", "+").replace("right", "left").replace("+", "right")
              for name in BODY[1:]]  # fmt: skip

@@ -78,7 +78,7 @@ class Near:
     rows: Int[Array, " rows"]
     index: Int[Array, "rows candidates"]
     """Vertices of the open body."""
-    price: Float[Array, "rows candidates"]
+    cost: Float[Array, "rows candidates"]
     """Mismatch of the walking distances."""
 
 
@@ -145,7 +145,7 @@ def match(meshes: Float[Array, "meshes verts 3"], faces: Int[Array, "faces 3"]) 
     near = _near(walks, np.arange(len(linked)))
     laid = [_fit(mesh, walks, near, rings, size) for mesh in posed]
     rings = np.mean([known.rings[chosen] for chosen, _ in laid], axis=0)
-    part = np.stack([np.where(price < WORST_FIT, known.part[chosen], -1) for chosen, price in laid])
+    part = np.stack([np.where(cost < WORST_FIT, known.part[chosen], -1) for chosen, cost in laid])
     counts = np.stack([(part == p).sum(0) for p in range(-1, int(known.part.max()) + 1)])
     best = np.full(meshes.shape[1], -1)
     best[linked] = counts.argmax(0) - 1
@@ -185,9 +185,9 @@ def _misfit(posed: list[Posed], walks: Walks, size: float, rows: Int[Array, " ro
     known = atlas()
     rings = known.rings[_nearest(walks.far, known.walks.far, 1)[:, 0]]
     near = _near(walks, rows)
-    prices = [_lay(m, near, _frames(m, walks, rings), size)[1] for m in posed]
+    costs = [_lay(m, near, _frames(m, walks, rings), size)[1] for m in posed]
     bent = [naturalness(_landmarks(m.verts, rings), m.verts[walks.tips]) for m in posed]
-    return float(np.minimum(prices, WORST_FIT).mean() - np.mean(bent))
+    return float(np.minimum(costs, WORST_FIT).mean() - np.mean(bent))
 
 
 def _frames(mesh: Posed, walks: Walks, rings: Float[Array, "verts landmarks"]) -> Frames:
@@ -242,12 +242,12 @@ def _lay(
     from_start = (mesh.verts[near.rows, None] - frames.start) / size
     place = np.einsum("lij,vlj->vli", frames.back, from_start) + frames.origin
     facing = np.einsum("lij,vj->vli", frames.back, mesh.normals[near.rows])[row[:, None], limb]
-    price = (
-        near.price
+    cost = (
+        near.cost
         + np.square(place[row[:, None], limb] - known.verts[near.index]).sum(-1) / SPREAD[1] ** 2
         + np.square(facing - known.normals[near.index]).sum(-1) / SPREAD[2] ** 2
     )
-    best = price.argmin(1)
+    best = cost.argmin(1)
     chosen = near.index[row, best]
     agree = np.einsum("vi,vi->v", facing[row, best], known.normals[chosen]) > 0
-    return chosen, np.where(agree, price[row, best], np.inf)
+    return chosen, np.where(agree, cost[row, best], np.inf)

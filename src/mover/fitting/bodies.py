@@ -1,7 +1,6 @@
 """From keypoints to bodies: the batch fit of a whole video."""
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -12,14 +11,14 @@ from mover.bodies import BodyModel
 from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skinning import shaped, widths_of
 from mover.bodies.smpl_model import FLAT, Model, SmplBody, growth_of, skin_of_model
-from mover.core.observe import Energy, Observer, Step, silent
+from mover.core.observe import Observer, Step, silent
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
 from mover.fitting.config import FitConfig, Stage
 from mover.fitting.energy import Seen, Weighed, body_energy
 from mover.fitting.given import begin_from
 from mover.fitting.ground import (
-    distances_of_who_lies,
+    distances_of_lying_people,
     plane_of,
     sole_heights,
     soles_of,
@@ -28,7 +27,7 @@ from mover.fitting.ground import (
 from mover.fitting.noise import Bias, at_most, bias_of, noise_of, noisy, without
 from mover.fitting.offsets import lasting_of
 from mover.fitting.prior import ANGLES, PosePrior, encoded
-from mover.fitting.start import Begun, begin
+from mover.fitting.start import FitStart, begin
 from mover.fitting.stature import UNKNOWN, stature_of
 from mover.fitting.tracks import (
     Window,
@@ -80,7 +79,7 @@ class FitInputs:
     """Bodies of another tool in the camera frame, with parameters."""
     prior: PosePrior = ANGLES
     ground: float | None = None
-    """Height of the floor in the camera's world [m], where it is known: nobody goes below it."""
+    """Height of the floor in the camera's world [m], where it is known: no person goes below it."""
     heights: tuple[float, ...] = ()
     """How tall each person is, in the order of their numbers, or one for everybody [m]."""
 
@@ -98,7 +97,7 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class _Job:
+class _BodyFit:
     """A fit under way."""
 
     inputs: FitInputs
@@ -126,12 +125,12 @@ def fit_bodies(
     names = [LAYOUTS[some.layout][k] for k in rig.keypoints.tolist()]
     seen = seen_of(some, rig, inputs.camera, config)
     seen = dataclasses.replace(seen, floor=inputs.ground)
-    job = _Job(inputs, config, rig, names, seen, observe)
-    begun = _begun(job)
+    job = _BodyFit(inputs, config, rig, names, seen, observe)
+    start = _start_of(job)
     lasting = lasting_of(names) if config.lasting else None
     seen = dataclasses.replace(seen, stature=stature, lasting=lasting)
     job = dataclasses.replace(job, seen=seen)
-    at, frame, seen = _solved(begun, job)
+    at, frame, seen = _solved(start, job)
     pose = pose_of(at, frame, inputs.model, inputs.prior)
     miss = miss_of(at, frame, seen, inputs.prior)
     bodies = bodies_of(pose, inputs.model, some)
@@ -140,23 +139,23 @@ def fit_bodies(
     return Fitted(bodies, rows, miss, warnings)
 
 
-def _begun(job: _Job) -> Begun:
+def _start_of(job: _BodyFit) -> FitStart:
     """From given bodies, or from keypoints alone; the code is that of the prior."""
     inputs = job.inputs
     if inputs.start is None:
-        begun = begin(inputs.keypoints, job.seen, job.rig, inputs.camera, job.config)
+        start = begin(inputs.keypoints, job.seen, job.rig, inputs.camera, job.config)
     else:
-        begun = begin_from(inputs.start, inputs.keypoints, job.seen, job.rig, job.config)
-    code = encoded(inputs.prior, begun.at.code)
-    return dataclasses.replace(begun, at=dataclasses.replace(begun.at, code=code))
+        start = begin_from(inputs.start, inputs.keypoints, job.seen, job.rig, job.config)
+    code = encoded(inputs.prior, start.at.code)
+    return dataclasses.replace(start, at=dataclasses.replace(start.at, code=code))
 
 
-def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
+def _solved(start: FitStart, job: _BodyFit) -> tuple[Unknowns, Frame, Seen]:
     """All rows; the shapes first from some of them where there are too many at once."""
-    seen = dataclasses.replace(job.seen, centre=begun.centre, spread=begun.spread)
+    seen = dataclasses.replace(job.seen, centre=start.centre, spread=start.spread)
     people, person = job.inputs.keypoints.person.unique(return_inverse=True)
-    at = dataclasses.replace(begun.at, **_widened(begun.at, len(people), job))
-    frame = Frame(job.rig, begun.root, person, growth_of(job.inputs.model))
+    at = dataclasses.replace(start.at, **_widened(start.at, len(people), job))
+    frame = Frame(job.rig, start.root, person, growth_of(job.inputs.model))
     seen, at = _on_a_floor(seen, at, frame, job)
     windows = windows_of(job.inputs.keypoints, job.config)
     first = _stages(at, frame, seen, windows[0], (job, EVERYTHING))
@@ -177,7 +176,7 @@ def _solved(begun: Begun, job: _Job) -> tuple[Unknowns, Frame, Seen]:
     return at, frame, seen
 
 
-def _on_a_floor(seen: Seen, at: Unknowns, frame: Frame, job: _Job) -> tuple[Seen, Unknowns]:
+def _on_a_floor(seen: Seen, at: Unknowns, frame: Frame, job: _BodyFit) -> tuple[Seen, Unknowns]:
     """With a floor that is sought, first level and below the feet."""
     if not job.config.stands:
         return seen, at
@@ -189,7 +188,7 @@ def _on_a_floor(seen: Seen, at: Unknowns, frame: Frame, job: _Job) -> tuple[Seen
     return dataclasses.replace(seen, soles=soles), dataclasses.replace(at, floor=floor)
 
 
-def _widened(at: Unknowns, people: int, job: _Job) -> dict[str, Tensor]:
+def _widened(at: Unknowns, people: int, job: _BodyFit) -> dict[str, Tensor]:
     """Shapes of all people, and hands and faces where they are seen and the model has them."""
     rows, model = len(at.turn), job.inputs.model
     skin = job.rig.skin
@@ -222,7 +221,7 @@ class _Lowered:
 
 
 def _stages(
-    at: Unknowns, frame: Frame, seen: Seen, window: Window, what: tuple[_Job, tuple[str, ...]]
+    at: Unknowns, frame: Frame, seen: Seen, window: Window, what: tuple[_BodyFit, tuple[str, ...]]
 ) -> _Lowered:
     """All stages over some of the rows."""
     job, free = what
@@ -242,34 +241,29 @@ def _stages(
             seen = at_most(seen, noise, stage.pose)
         at = _lowered(at, frame, seen, (job, stage, free))
         at, seen = _laid(at, frame, some, seen, job)
-        if seen.about is not None:  # before, who lies moved those by whom they are placed
+        if seen.about is not None:  # not jointly: the lying bodies moved the upright ones
             at = _lowered(at, frame, seen, (job, stage, OF_ROWS))
         job.observe(Step("fit_bodies", index, len(stages)))
     return _Lowered(at, seen, frame, noise)
 
 
 def _lowered(
-    at: Unknowns, frame: Frame, seen: Seen, what: tuple[_Job, Stage, tuple[str, ...]]
+    at: Unknowns, frame: Frame, seen: Seen, what: tuple[_BodyFit, Stage, tuple[str, ...]]
 ) -> Unknowns:
-    """The energy of one stage lowered."""
+    """Minimise E_Body of one stage."""
     job, stage, free = what
-    return solve(_energy(frame, seen, stage, job), at, stage.steps, free)
-
-
-def _energy(frame: Frame, seen: Seen, stage: Stage, job: _Job) -> Callable[[Unknowns], Energy]:
-    """E_Body of one stage."""
     by = Weighed(stage, job.config, job.inputs.prior.decode, job.inputs.prior.width > 0)
-    here = at_stage(seen, job.names, stage)
-    return lambda u: body_energy(u, frame, here, by)
+    observed = at_stage(seen, job.names, stage)
+    return solve(lambda u: body_energy(u, frame, observed, by), at, stage.steps, free)
 
 
-def _seen_at(at: Unknowns, frame: Frame, seen: Seen, job: _Job) -> Tensor:
+def _seen_at(at: Unknowns, frame: Frame, seen: Seen, job: _BodyFit) -> Tensor:
     """Where the keypoints of bodies are in the image [px]."""
     with torch.no_grad():
         return project(points_of(at, frame, job.inputs.prior.decode).keypoints, seen.K)
 
 
-def _bias(found: _Lowered, job: _Job) -> Bias | None:
+def _bias(found: _Lowered, job: _BodyFit) -> Bias | None:
     """What noise did to shapes and distances; None: not known."""
     if found.noise is None:
         return None
@@ -283,7 +277,7 @@ def _bias(found: _Lowered, job: _Job) -> Bias | None:
     return bias_of(found.at, again, person, share)
 
 
-def _standing(at: Unknowns, frame: Frame, seen: Seen, job: _Job) -> Seen:
+def _standing(at: Unknowns, frame: Frame, seen: Seen, job: _BodyFit) -> Seen:
     """What is seen, with the bodies that their legs carry, as they are now."""
     if not job.config.balance or not at.floor.numel():
         return seen
@@ -294,15 +288,15 @@ def _standing(at: Unknowns, frame: Frame, seen: Seen, job: _Job) -> Seen:
 
 
 def _laid(
-    at: Unknowns, frame: Frame, keypoints: Keypoints, seen: Seen, job: _Job
+    at: Unknowns, frame: Frame, keypoints: Keypoints, seen: Seen, job: _BodyFit
 ) -> tuple[Unknowns, Seen]:
-    """Who lies along the view put where they are expected."""
+    """Move people who lie along the view to their expected distance."""
     if keypoints.fps is None or not job.config.lies:
         return at, seen
     with torch.no_grad():
         joints = points_of(at, frame, job.inputs.prior.decode).joints
     tracks = tracks_of(keypoints.frame, keypoints.person)
-    about = distances_of_who_lies(joints, seen.up, tracks, keypoints.frame / keypoints.fps)
+    about = distances_of_lying_people(joints, seen.up, tracks, keypoints.frame / keypoints.fps)
     free = about.isnan()
     if bool(free.all()):
         return at, seen
@@ -313,7 +307,7 @@ def _laid(
 
 
 def _speed(
-    at: Unknowns, frame: Frame, keypoints: Keypoints, job: _Job
+    at: Unknowns, frame: Frame, keypoints: Keypoints, job: _BodyFit
 ) -> Float[Tensor, "rows joints"] | None:
     """How fast joints seem to move across the view [m/s]; None without a frame rate."""
     if keypoints.fps is None:

@@ -49,13 +49,13 @@ class FitConfig:
     """How bodies are fitted to keypoints."""
 
     rho: Sigma = 100.0
-    """Residual at which the Geman-McClure price of a keypoint has halved [px], per 1,080 rows."""
+    """Residual at which the Geman-McClure cost is half its maximum [px], per 1,080 rows."""
     loose: Weight = 0.3
     """Factor on the confidence of neck and hips, which detectors place elsewhere (SMPLify-X: 0)."""
     left: Share = 0.45
     """Share of the variance of keypoints' noise that a fit leaves; 0: noise is as assumed."""
     noise_steps: Steps = 100
-    """Iterations of the fit that tells how large noise is, and of the one that tells its bias."""
+    """Iterations of the fit that estimates the noise, and of the one that estimates its bias."""
     least_confidence: Share = 0.1
     """Keypoints below are missing."""
     least_joints: Annotated[int, int_in(1, 133)] = 4
@@ -89,14 +89,14 @@ class FitConfig:
     jitter: Sigma = 0.004
     """Second difference that is free of charge at any frame rate [m]."""
     by_size: bool = True
-    """Price second differences of joints in sizes of the body: people are not near to be smooth."""
-    alike: Annotated[int, int_in(1, 1_000_000)] = 4
-    """Frames with errors of their own: more do not constrain shape, stature and offsets further."""
+    """Second differences of joints in body sizes, so that smoothness pulls no person nearer."""
+    independent_frames: Annotated[int, int_in(1, 1_000_000)] = 4
+    """Frames with independent errors: more do not constrain shape, stature and offsets further."""
     lasting: bool = True
     """Keypoints lie lastingly off the model's, and statures are those of adults (else the shape
     alone has a prior, as published)."""
-    told: Weight = 1e4
-    """Weight of a height that is told, off the body's [1/m]."""
+    height_weight: Weight = 1e4
+    """Weight of the difference between a given height and the body's [1/m]."""
     longest_gap: Seconds = 1.0
     """Frames further apart do not smooth each other [s]."""
     support: Sigma = 0.05
@@ -106,7 +106,7 @@ class FitConfig:
     balance: Weight = 1.0
     """Weight of the balance of standing bodies, beside the pose prior; 0: none."""
     lies: Weight = 50.0
-    """Weight of the distance before and after lying, of who lies along the view; 0: none."""
+    """Weight of the distance before and after lying, for people lying along the view; 0: none."""
     near: Annotated[float, float_in(1e-3, 180)] = 15.0
     """With bodies to start from: how far each angle may be from theirs [degrees]."""
     hands: Annotated[int, int_in(0, 45)] = 12
@@ -122,7 +122,7 @@ class FitConfig:
     speed: Sigma = 1.5
     """How fast a pelvis moves [m/s]."""
     switch: Weight = 10.0
-    """Price of such a move, in squared standard deviations of the pose."""
+    """Weight of such a move, in squared standard deviations of the pose."""
     stages: tuple[Stage, ...] = field(default=STAGES)
     """Weights of the stages."""
 
@@ -142,7 +142,7 @@ PAPER = FitConfig(
     acceleration=0.0,
     jitter=1.0,
     by_size=False,
-    alike=1_000_000,
+    independent_frames=1_000_000,
     lasting=False,
     stages=tuple(replace(stage, smooth=1.0, steps=300) for stage in PUBLISHED[3:]),
 )

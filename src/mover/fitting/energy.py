@@ -10,8 +10,8 @@ after Pavlakos et al. 2019 (SMPLify-X, Sec. 3.2 and its published configuration)
 Departure: Second differences are taken over real time, so that gaps and frame rates make no
 acceleration, and are divided by what people do in that time and, in 3D, by the size of the body:
 most of them is noise of the keypoints, which is longer in metres the larger and the farther the
-body is held to be. σ2 and σ3 stay the lengths beyond which a jump is believed. Self-collision is
-left out, as in the authors' video configuration.
+body is estimated to be. σ2 and σ3 remain the lengths beyond which a jump counts as real motion.
+Self-collision is left out, as in the authors' video configuration.
 """
 
 from dataclasses import dataclass
@@ -32,19 +32,19 @@ from mover.fitting.ground import (
     STEP,
     Plane,
     balance_cost,
-    laid_price,
-    level_price,
+    level_cost,
+    lying_cost,
     plane_of,
     sole_heights,
-    support_price,
+    support_cost,
 )
-from mover.fitting.limits import limit_price
+from mover.fitting.limits import limit_cost
 from mover.fitting.offsets import offset_cost
 from mover.fitting.stature import Stature, height_cost, shape_cost, size_of
 from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, floor_of, points_of
 from mover.geometry.camera import project
 
-OF_SHAPES = 0.1  # what a body that lies along the view tells of shapes beside others
+OF_SHAPES = 0.1  # relative weight for the shape of a body that lies along the view
 HEIGHT = 1000.0  # [px], the image height at which the published weights were chosen
 BENT = ((17, 1, 1.0), (18, 1, -1.0), (3, 0, -1.0), (4, 0, -1.0))
 """Elbows and knees: joint of the body, axis, and the sign that is the wrong way."""
@@ -98,7 +98,7 @@ class Seen:
     standing: Float[Tensor, " bodies"] | None = None
     """From 0 to 1, how surely the legs carry each body; None: no floor is sought."""
     about: Float[Tensor, " bodies"] | None = None
-    """Where `place` has the depth at which who lies is expected; NaN, None: nothing is."""
+    """Expected depth of lying people, in the units of `place`; NaN, None: unconstrained."""
 
 
 @dataclass(frozen=True)
@@ -123,11 +123,11 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
         joints = joints / size_of(joints)[:, None, None]
     solid, flat = by.config.smooth_joints, by.config.smooth_pixels
     space = weigh(
-        ("keypoints", image, lambda: keypoint_price(pixels, seen, rho)),
-        ("smooth_joints", smooth * solid, lambda: smooth_joint_price(joints, seen, by)),
-        ("smooth_pixels", smooth * flat, lambda: smooth_pixel_price(pixels, seen, by)),
-        ("still", smooth * by.config.still, lambda: still_price(joints, seen)),
-        ("held", smooth * by.config.held, lambda: held_price(joints, seen, by)),
+        ("keypoints", image, lambda: keypoint_cost(pixels, seen, rho)),
+        ("smooth_joints", smooth * solid, lambda: smooth_joint_cost(joints, seen, by)),
+        ("smooth_pixels", smooth * flat, lambda: smooth_pixel_cost(pixels, seen, by)),
+        ("still", smooth * by.config.still, lambda: still_cost(joints, seen)),
+        ("held", smooth * by.config.held, lambda: held_cost(joints, seen, by)),
     )
     ground, prior = _ground_energy(points, at, frame, seen, by), _prior_energy(at, frame, seen, by)
     parts = {**space.parts, **ground.parts, **prior.parts}
@@ -138,7 +138,7 @@ def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
 
 
 def _ground_energy(points: Points, at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
-    """What the floor, and how people lie down, tell of how far they are."""
+    """How the floor and the way people lie down constrain their distances."""
     sought, pose, rows = bool(at.floor.numel()), by.stage.pose, len(at.place)
     floor = floor_of(at, frame)
     under = pose / by.config.support if sought or seen.floor is not None else 0.0
@@ -162,14 +162,14 @@ def _ground_energy(points: Points, at: Unknowns, frame: Frame, seen: Seen, by: W
 
     def lie() -> Tensor:
         assert seen.about is not None
-        return laid_price(at.place[:, 2], seen.about)
+        return lying_cost(at.place[:, 2], seen.about)
 
     def level() -> Tensor:
-        return level_price(floor, seen.floor).expand(rows)
+        return level_cost(floor, seen.floor).expand(rows)
 
     every = torch.cat([points.joints, points.keypoints], 1)
     return weigh(
-        ("support", under**2, lambda: support_price(every, plane())),
+        ("support", under**2, lambda: support_cost(every, plane())),
         ("stands", stands**2, stand),
         ("balance", balance**2, balanced),
         ("level", pose**2 * FRAMES / rows if sought else 0.0, level),
@@ -182,15 +182,15 @@ def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy
     stage, config = by.stage, by.config
     angles = by.decode(at.code)
     count = torch.bincount(frame.person, minlength=len(at.betas)).to(at.betas)[frame.person]
-    given = config.told if seen.stature is not None else 0.0
+    given = config.height_weight if seen.stature is not None else 0.0
     lasting = stage.shape if seen.lasting is not None else 0.0
     hands, face = min(1, at.hands.shape[1]), min(1, at.face.shape[1])
     expression = at.face[:, 3:]
 
     def pose() -> Tensor:
-        return at.code.square().sum(-1) if by.learned else pose_price(angles, seen)
+        return at.code.square().sum(-1) if by.learned else pose_cost(angles, seen)
 
-    same = count.clamp_max(config.alike)  # frames beyond these repeat the errors of others
+    same = count.clamp_max(config.independent_frames)  # further frames repeat their errors
 
     def shape() -> Tensor:
         if seen.stature is None or seen.lasting is None:
@@ -207,13 +207,13 @@ def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy
 
     return weigh(
         ("pose", stage.pose**2, pose),
-        ("limits", config.limits**2, lambda: limit_price(angles)),
-        ("bending", config.bending * stage.pose, lambda: bending_price(angles)),
+        ("limits", config.limits**2, lambda: limit_cost(angles)),
+        ("bending", config.bending * stage.pose, lambda: bending_cost(angles)),
         ("shape", stage.shape**2, shape),
         ("height", given**2, height),
         ("offset", lasting**2, offset),
         ("hands", stage.hands**2 * hands, lambda: at.hands.square().sum(-1)),
-        ("jaw", stage.jaw**2 * face, lambda: jaw_price(at.face)),
+        ("jaw", stage.jaw**2 * face, lambda: jaw_cost(at.face)),
         ("expression", stage.shape**2 * face, lambda: expression.square().sum(-1)),
     )
 
@@ -223,22 +223,22 @@ def geman_mcclure(squared: Float[Tensor, "*any"], rho: float) -> Float[Tensor, "
     return rho**2 * squared / (squared + rho**2)
 
 
-def keypoint_price(
+def keypoint_cost(
     pixels: Float[Tensor, "bodies keypoints 2"], seen: Seen, rho: float
 ) -> Float[Tensor, " bodies"]:
     """Robust squared distances of projected keypoints from detected ones [px²]."""
     scaled = rho * seen.height / 1080
-    price = geman_mcclure((pixels - seen.pixels).square(), scaled).sum(-1)
-    return (price * seen.weight.square()).sum(-1)
+    cost = geman_mcclure((pixels - seen.pixels).square(), scaled).sum(-1)
+    return (cost * seen.weight.square()).sum(-1)
 
 
-def bending_price(angles: Float[Tensor, "bodies angles"]) -> Float[Tensor, " bodies"]:
+def bending_cost(angles: Float[Tensor, "bodies angles"]) -> Float[Tensor, " bodies"]:
     """Elbows and knees that bend the wrong way: exp(±θ)²; 1 for a straight one."""
     bent = [(sign * angles[:, 3 * joint + axis]).exp().square() for joint, axis, sign in BENT]
     return torch.stack(bent, -1).sum(-1)
 
 
-def pose_price(angles: Float[Tensor, "bodies angles"], seen: Seen) -> Float[Tensor, " bodies"]:
+def pose_cost(angles: Float[Tensor, "bodies angles"], seen: Seen) -> Float[Tensor, " bodies"]:
     """Squared distance from the pose that is expected, in spreads; ankles keep the feet level.
 
     Few detectors see toes. An ankle that is expected to turn back what hip and knee turn forth
@@ -250,7 +250,7 @@ def pose_price(angles: Float[Tensor, "bodies angles"], seen: Seen) -> Float[Tens
     return (level / seen.spread).square().sum(-1)
 
 
-def jaw_price(face: Float[Tensor, "bodies face"]) -> Float[Tensor, " bodies"]:
+def jaw_cost(face: Float[Tensor, "bodies face"]) -> Float[Tensor, " bodies"]:
     """Squared turns of the jaw; about y and z a hundred times as much as opening."""
     return face[:, 0].square() + 100 * face[:, 1:3].square().sum(-1)
 
@@ -265,53 +265,53 @@ def second_difference(
 
 
 def _of_rows(
-    price: Float[Tensor, " triples"], triples: Triples, rows: int
+    cost: Float[Tensor, " triples"], triples: Triples, rows: int
 ) -> Float[Tensor, " bodies"]:
-    """What triples cost, each at its middle row."""
-    return price.new_zeros(rows).index_add(0, triples.rows[:, 1], price)
+    """Costs of triples, each added to its middle row."""
+    return cost.new_zeros(rows).index_add(0, triples.rows[:, 1], cost)
 
 
-def smooth_joint_price(
+def smooth_joint_cost(
     joints: Float[Tensor, "bodies joints 3"], seen: Seen, by: Weighed
 ) -> Float[Tensor, " bodies"]:
     """Robust squared second differences of the joints of the body, over what people do."""
     triples = seen.triples
     second = second_difference(joints[:, :22], triples).square().sum(-1)
-    price = geman_mcclure(second, by.config.sigma_joints).sum(-1) / triples.expected.square()
-    return _of_rows(price, triples, len(joints))
+    cost = geman_mcclure(second, by.config.sigma_joints).sum(-1) / triples.expected.square()
+    return _of_rows(cost, triples, len(joints))
 
 
-def still_price(joints: Float[Tensor, "bodies joints 3"], seen: Seen) -> Float[Tensor, " bodies"]:
+def still_cost(joints: Float[Tensor, "bodies joints 3"], seen: Seen) -> Float[Tensor, " bodies"]:
     """Squared second differences of the pelvis, over what a body does that looks so still.
 
-    The keypoints of a body along the view, of one that lies, hardly tell how far it is: frames that
-    show the same say it together. Not robust, since each of them alone is off by a metre.
+    The keypoints of a body that lies along the view hardly constrain its distance: frames that
+    show the same pose constrain it jointly. Not robust, since a single frame is off by a metre.
     """
     triples = seen.triples
     second = second_difference(joints[:, :1], triples).square().sum((-1, -2))
     return _of_rows(second / triples.calm[:, 0].square(), triples, len(joints))
 
 
-def held_price(
+def held_cost(
     joints: Float[Tensor, "bodies joints 3"], seen: Seen, by: Weighed
 ) -> Float[Tensor, " bodies"]:
-    """Robust squared second differences of trunk, head and arms about the pelvis, as `still_price`.
+    """Robust squared second differences of trunk, head and arms about the pelvis, as `still_cost`.
 
-    Where an arm is in depth single frames tell badly, too. Not of legs: a foot that stands still
-    belongs to a body that walks on.
+    Single frames hardly constrain the depth of an arm, either. Legs are left out: a foot that
+    stands still belongs to a body that walks on.
     """
     triples = seen.triples
     about = joints[:, UPPER] - joints[:, :1]
     second = second_difference(about, triples).square().sum(-1)
-    price = geman_mcclure(second, by.config.sigma_held) / triples.calm[:, UPPER].square()
-    return _of_rows(price.sum(-1), triples, len(joints))
+    cost = geman_mcclure(second, by.config.sigma_held) / triples.calm[:, UPPER].square()
+    return _of_rows(cost.sum(-1), triples, len(joints))
 
 
-def smooth_pixel_price(
+def smooth_pixel_cost(
     pixels: Float[Tensor, "bodies keypoints 2"], seen: Seen, by: Weighed
 ) -> Float[Tensor, " bodies"]:
     """Robust squared second differences of projections where the middle one is seen [px²]."""
     triples = seen.triples
     second = second_difference(pixels, triples).square().sum(-1)
-    price = geman_mcclure(second, by.config.sigma_pixels) * seen.weight[triples.rows[:, 1]].square()
-    return _of_rows(price.sum(-1), triples, len(pixels))
+    cost = geman_mcclure(second, by.config.sigma_pixels) * seen.weight[triples.rows[:, 1]].square()
+    return _of_rows(cost.sum(-1), triples, len(pixels))

@@ -13,7 +13,7 @@ from mover.core.errors import InputError
 from mover.core.types import Bodies, BodyPose, Keypoints
 from mover.fitting.config import FitConfig
 from mover.fitting.energy import Seen
-from mover.fitting.start import Begun, before, unknowns_at, where_seen
+from mover.fitting.start import FitStart, before, unknowns_at, where_seen
 from mover.fitting.unknowns import Frame, Rig
 from mover.geometry.camera import project
 from mover.geometry.rotations import axis_angle
@@ -84,7 +84,7 @@ def _apart(ours: dict[int, Tensor], theirs: dict[int, Tensor]) -> float:
 
 def begin_from(
     start: Bodies, keypoints: Keypoints, seen: Seen, rig: Rig, config: FitConfig
-) -> Begun:
+) -> FitStart:
     """Start from bodies with parameters: their pose, under the true camera.
 
     SMPL bodies start a fit of SMPL-X by the official matrix where the user has it (the paper's way
@@ -105,7 +105,7 @@ def begin_from(
     names = [LAYOUTS[keypoints.layout][k] for k in rig.keypoints.tolist()]
     frame = Frame(rig, root, torch.zeros(len(angles), dtype=torch.long))
     at = where_seen(unknowns_at(angles, before(angles)), frame, seen, names)
-    return Begun(at, root, angles, torch.full_like(seen.spread, math.radians(config.near)))
+    return FitStart(at, root, angles, torch.full_like(seen.spread, math.radians(config.near)))
 
 
 def _by_matrix(pose: BodyPose) -> BodyPose:

@@ -1,14 +1,14 @@
-r"""What tells how far people are, beside their keypoints: the floor, and that who lies stays.
+r"""Distances of people beyond keypoints: the floor, and that lying people do not move.
 
     E = Σ_t w_s² ρ(h_t; 10 cm) + Σ_t (|slope|² / σ² + ...) + Σ_{t lies} w_l² (log z_t - log z_0)²
 
 h is the height of the lower sole above one floor for everybody, whose slopes and height are found
-with the bodies: it tells of each body how far it is beside the others, not how tall they are.
+with the bodies: it constrains the relative distances of the bodies, not their heights.
 
-Seen along the body, from the feet or the head, who lies looks the same from afar: between 5.6 and
-6.4 m keypoints differ by nothing, and the pose prior, which says the same in each frame, moved a
-body by a metre (room 108). But nobody lies down far from where they sat: z_0 is the distance before
-and after.
+Seen along the body, from the feet or the head, a lying person looks the same over a wide range of
+distances: keypoints do not differ between 5.6 and 6.4 m, and the pose prior, which acts the same
+way in each frame, moved a body by a metre (room 108). But people lie down near where they sat: z_0
+is the distance before and after.
 """
 
 import math
@@ -27,20 +27,20 @@ Plane = tuple[Float[Tensor, "3"], Float[Tensor, ""] | float]
 
 STEP = 0.1  # [m], feet that are higher are not on the floor
 ROLL, PITCH = math.radians(2), math.radians(8)  # how far a camera of unknown tilt is from level
-KNOWN_TILT, KNOWN_HEIGHT = math.radians(0.3), 0.01  # [rad], [m], the same where the floor is told
-FRAMES = 20  # that tell of the floor as much as what is known before
+KNOWN_TILT, KNOWN_HEIGHT = math.radians(0.3), 0.01  # [rad], [m], the same for a given floor
+FRAMES = 20  # whose weight on the floor equals that of its prior
 FEET = tuple([BODY.index(f"{side}_{joint}") for side in ("left", "right")]
              for joint in ("ankle", "foot"))  # fmt: skip
 NECK = BODY.index("neck")
-LIES = math.sin(math.radians(35))  # most that the trunk of who lies rises
-SITS = math.sin(math.radians(50))  # least that the trunk of who sits or stands does
+LIES = math.sin(math.radians(35))  # largest rise of a lying person's trunk
+SITS = math.sin(math.radians(50))  # smallest rise of a seated or standing person's trunk
 ALONG = 0.7  # cosine of trunk and view from which distance is hardly seen
 STRAIGHT, UPRIGHT = (0.6, 0.8), (0.5, 0.75)
 """Where legs begin to carry a body and surely do: hip over ankle in lengths of the leg, and the
 cosine of trunk and up."""
 BALANCE = 0.08  # [m], of the centre of mass about the middle of the feet, as one walks
 FALLING = 0.3  # [m], farther out it is held by something else
-NEIGHBOURS = 1.0  # [s] before and after lying that tell where it is
+NEIGHBOURS = 1.0  # [s], upright frames this close to lying constrain its distance
 
 
 def soles_of(model: Model) -> Float[Tensor, "2"]:
@@ -69,18 +69,18 @@ def sole_heights(
     return (low - soles.to(low)).amin(-1)
 
 
-def support_price(
+def support_cost(
     points: Float[Tensor, "bodies points 3"], plane: Plane
 ) -> Float[Tensor, " bodies"]:
     """Squared depth of points under the floor [m²]."""
     return (plane[1] - points @ plane[0]).clamp_min(0).square().sum(-1)
 
 
-def level_price(floor: Float[Tensor, " floor"], known: float | None) -> Float[Tensor, ""]:
+def level_cost(floor: Float[Tensor, " floor"], known: float | None) -> Float[Tensor, ""]:
     """Squared slopes of the floor, and where it is known its height, in what may be."""
     tilt = (ROLL, PITCH) if known is None else (KNOWN_TILT, KNOWN_TILT)
-    price = (floor[:2] / floor.new_tensor(tilt)).square().sum()
-    return price if known is None else price + ((floor[2] - known) / KNOWN_HEIGHT).square()
+    cost = (floor[:2] / floor.new_tensor(tilt)).square().sum()
+    return cost if known is None else cost + ((floor[2] - known) / KNOWN_HEIGHT).square()
 
 
 def center_of_mass(joints: Float[Tensor, "bodies joints 3"]) -> Float[Tensor, "bodies 3"]:
@@ -124,7 +124,7 @@ def balance_cost(
     return (off - (off @ up)[:, None] * up).square().sum(-1)
 
 
-def laid_price(
+def lying_cost(
     depth: Float[Tensor, " bodies"], about: Float[Tensor, " bodies"]
 ) -> Float[Tensor, " bodies"]:
     """Squared logarithm of the distance over the one that is expected; NaN: none is."""
@@ -137,7 +137,7 @@ def trunk_of(joints: Float[Tensor, "*bodies joints 3"]) -> Float[Tensor, "*bodie
     return torch.nn.functional.normalize(joints[..., NECK, :] - joints[..., 0, :], dim=-1)
 
 
-def distances_of_who_lies(
+def distances_of_lying_people(
     joints: Float[Tensor, "bodies joints 3"],
     up: Float[Tensor, "3"],
     tracks: Sequence[Int[Tensor, " track"]],
@@ -159,12 +159,12 @@ def distances_of_who_lies(
     depth = joints[:, 0, 2].clamp_min(1e-3).log()
     for rows in tracks:
         clock = time[rows].double()
-        tells = _beside(lies[rows], rise[rows] > SITS, clock)
-        if not bool(tells.any()):
+        upright = _beside(lies[rows], rise[rows] > SITS, clock)
+        if not bool(upright.any()):
             continue
-        near = ((clock[tells][:, None] - clock[tells]).abs() <= NEIGHBOURS).double()
-        known = (near @ depth[rows][tells].double()) / near.sum(1)
-        expected = np.interp(clock[lies[rows]].numpy(), clock[tells].numpy(), known.numpy())
+        near = ((clock[upright][:, None] - clock[upright]).abs() <= NEIGHBOURS).double()
+        known = (near @ depth[rows][upright].double()) / near.sum(1)
+        expected = np.interp(clock[lies[rows]].numpy(), clock[upright].numpy(), known.numpy())
         found[rows[lies[rows]]] = torch.from_numpy(expected).to(found)
     return found
 

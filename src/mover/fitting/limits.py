@@ -62,7 +62,7 @@ def limit_table() -> Float[Tensor, "4 63"]:
     return torch.deg2rad(torch.tensor(rows, dtype=torch.float64)).mT.contiguous()
 
 
-def limit_price(angles: Float[Tensor, "bodies angles"]) -> Float[Tensor, " bodies"]:
+def limit_cost(angles: Float[Tensor, "bodies angles"]) -> Float[Tensor, " bodies"]:
     """Squared excess over the ranges of motion, in units of `1 / STIFFNESS`; 0 within them."""
     low, high, _, _ = limit_table().to(angles)
     body = angles[:, :63]
@@ -71,7 +71,7 @@ def limit_price(angles: Float[Tensor, "bodies angles"]) -> Float[Tensor, " bodie
 
 
 def resting(bodies: int, like: Tensor) -> Float[Tensor, "bodies 63"]:
-    """A person who stands with hanging arms [rad]."""
+    """A standing person with hanging arms [rad]."""
     return limit_table()[2].to(like).expand(bodies, -1).clone()
 
 
@@ -79,7 +79,7 @@ def spreads(bodies: int, like: Tensor, loose: tuple[str, ...] = ()) -> Float[Ten
     """How far each angle is from its rest in daily life [rad].
 
     Args:
-        bodies: Rows, all alike.
+        bodies: Number of identical rows.
         like: For type and device.
         loose: Joints that may be anywhere: the deviation of what is uniform in their ranges.
     """

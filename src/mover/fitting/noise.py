@@ -3,8 +3,8 @@
 A limb that looks too short is bent, one that looks too long cannot be: noise makes people look
 larger, so that they are put too near. How much depends on how noisy their keypoints are, how large
 they are seen and what they do. So the bodies that were found are seen once more with as much noise
-and fitted again (a parametric bootstrap): what changes is what noise had changed before. How much
-of the known noise that fit leaves tells how large the unknown one was.
+and fitted again (a parametric bootstrap): what changes is what noise had changed before. The
+share of the known noise that the fit leaves gives the size of the unknown one.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from mover.fitting.energy import HEIGHT, Seen
 from mover.fitting.unknowns import Unknowns
 
 NORMAL = 0.6745  # median of the absolute value of a normal number
-FEW = 20  # rows of a person that tell half of what noise does
+FEW = 20  # rows of a person at which half of the estimated bias is applied
 
 
 @record

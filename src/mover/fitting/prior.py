@@ -8,7 +8,7 @@ VPoser's decoder makes a body's pose from 32 normal numbers, with the user's own
 after Pavlakos et al. 2019 (Sec. 3.3). Three kinds of file hold it: the first version's checkpoint
 (`bodyprior_dec_fc1` ...), the second's (`vp_model.decoder_net.` ...), and arrays of another
 release (`fc1W` ..., where tanh takes the place of the leaky ReLU and the nearest rotation that of
-Gram-Schmidt). The network is written anew from its description; no weights are shipped.
+Gram-Schmidt). The network is reimplemented from its description; no weights are shipped.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,14 +1,15 @@
 """Where a fit begins: orientation, posture and place of each body from its keypoints alone.
 
 Each row is tried upright and facing the camera, turned left, right and away, standing and sitting;
-the picture of the trunk tells how far the body is tilted in the image; and lying on its back. The
+the direction of the observed trunk gives the tilt in the image; and lying on its back. The
 place follows from the torso by linear least squares under the true camera. All are fitted without
 shape for a few steps, and along a track the cheapest sequence is kept whose bodies move as bodies
 can. Rows that are not upright then are tried lying on either side and on the belly, too.
 
-Seen along the body, who lies looks nearly the same from the feet as from the head (depths reversed
-about the pelvis), so that single frames lay a body the wrong way round. But nobody who lies turns
-end for end: of each stretch of lying the way of the most counts, and hypotheses against it are out.
+Seen along the body, a lying person looks nearly the same from the feet as from the head (depths
+reversed about the pelvis), so that single frames lay a body the wrong way round. But lying people
+do not turn end for end: the majority of each stretch of lying decides the direction, and hypotheses
+against it are excluded.
 """
 
 import dataclasses
@@ -34,30 +35,30 @@ from mover.geometry.rotations import rot_x, rot_y, rot_z
 
 YAWS = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)
 BACK, OTHERS = (0.0,), (0.5 * math.pi, -0.5 * math.pi, math.pi)
-"""How far who lies has rolled: on the back, on either side and on the belly [rad]."""
+"""Roll of a lying person: on the back, on either side and on the belly [rad]."""
 STANDING = {"hip": (0, -10.0), "knee": (0, 15.0), "elbow": (1, -25.0)}
-"""Axes and left angles [degrees] of who stands or walks, between quiet standing (nearly straight)
-and the mean of a gait cycle (hips 10, knees 20; Perry, Burnfield: Gait Analysis, 2010)."""
+"""Axes and left angles [degrees] of an upright person, between quiet standing (nearly straight) and
+the mean of a gait cycle (hips 10, knees 20; Perry, Burnfield: Gait Analysis, 2010)."""
 SEATED = {"hip": (0, -80.0), "knee": (0, 85.0)}
-"""Of who sits."""
+"""Of a seated person."""
 ARMS = ("shoulder",)
-"""Hang by their weight where the trunk is upright; of who lies they may be anywhere."""
+"""Hang by their weight where the trunk is upright; those of lying people may be anywhere."""
 TORSO = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 START = Stage(pose=12.0, shape=5.0, smooth=0.0)
-BEFORE = 3.5  # [m], where a body is put whose keypoints do not tell
+BEFORE = 3.5  # [m], depth of a body that its keypoints do not constrain
 NEAREST, FARTHEST = 0.4, 40.0  # [m]
 START_FPS = 6.0  # hypotheses are tried so many times a second
-STRAIN = 4.0  # most that a jump costs, so that a track may begin anew
+STRAIN = 4.0  # largest cost of a jump, so that a track may start again
 NEVER = 1e4  # what a hypothesis costs that cannot be
 LEVEL, SLOPE = math.radians(5), math.radians(15)
-"""How far from level who lies is, and where that has cost half of its most [rad]."""
+"""Standard deviation of a lying body's slope, and the slope at half of the largest cost [rad]."""
 
 Track = tuple[Int[Tensor, " track"], Float[Tensor, " track"] | None]
-"""Rows of a person in the order of time, and when they are [s]; None: nobody knows."""
+"""Rows of a person in the order of time, and their times [s]; None: unknown."""
 
 
 @record
-class Begun:
+class FitStart:
     """Where all rows begin."""
 
     at: Unknowns
@@ -106,7 +107,7 @@ def upright_guesses(like: Tensor) -> list[Guess]:
 
 
 def _posed(angles: Mapping[str, tuple[int, float]], like: Tensor) -> Float[Tensor, "63"]:
-    """A resting body with some joints turned, alike on both sides."""
+    """A resting body with some joints turned symmetrically on both sides."""
     pose = resting(1, like)[0]
     for name, (axis, angle) in angles.items():
         for side, sign in (("left", 1.0), ("right", -1.0 if axis else 1.0)):
@@ -201,7 +202,9 @@ def tilt_of(
     return torch.where(there, angles[1] - angles[0], torch.zeros_like(angles[0]))
 
 
-def begin(keypoints: Keypoints, seen: Seen, rig: Rig, camera: Camera, config: FitConfig) -> Begun:
+def begin(
+    keypoints: Keypoints, seen: Seen, rig: Rig, camera: Camera, config: FitConfig
+) -> FitStart:
     """Start from keypoints alone: the best of all hypotheses, row by row and along each track."""
     fps = keypoints.fps
     step = 1 if fps is None else max(1, round(fps / START_FPS))
@@ -224,12 +227,16 @@ def begin(keypoints: Keypoints, seen: Seen, rig: Rig, camera: Camera, config: Fi
             tries.append(_among(some, down, tries[-1]))
         best = _followed(tries, tracks, seen.up, config)
     best = best[nearest]
-    at = _picked([one.at for one in tries], best, nearest)
+    fields = {
+        name: torch.stack([getattr(one.at, name) for one in tries])[best, nearest]
+        for name in OF_ROWS
+    }
+    at = dataclasses.replace(tries[0].at, **fields)
     root, centre, spread = (
         torch.stack([getattr(one, name) for one in tries])[best, nearest]
         for name in ("root", "centre", "spread")
     )
-    return Begun(at, root, centre, spread)
+    return FitStart(at, root, centre, spread)
 
 
 def _tried(
@@ -281,7 +288,7 @@ def _among(some: Tried, rows: Int[Tensor, " some"], like: Tried) -> Tried:
 def _down(
     trunk: Float[Tensor, "bodies 3"], up: Float[Tensor, "3"], tracks: Sequence[Track]
 ) -> Int[Tensor, " some"]:
-    """Rows of who is not upright, and those shortly before and after."""
+    """Rows of people who are not upright, and those shortly before and after."""
     found = trunk @ up <= SITS
     for track, time in tracks:
         if time is not None:
@@ -293,7 +300,7 @@ def _down(
 def _followed(
     tries: list[Tried], tracks: Sequence[Track], up: Float[Tensor, "3"], config: FitConfig
 ) -> Int[Tensor, " bodies"]:
-    """The hypothesis of each row, along each track; who lies keeps the head where it is."""
+    """The hypothesis of each row, along each track; lying people do not turn end for end."""
     cost = torch.stack([one.cost for one in tries], 1)
     joints = torch.stack([one.joints for one in tries], 1)
     best = torch.zeros(len(cost), dtype=torch.long)
@@ -341,13 +348,3 @@ def _path(
     reach = config.reach + config.speed * time.diff()[:, None, None]
     strain = (about / config.jump).square() + (gone[..., 0, :].norm(dim=-1) / reach).square()
     return best_path(cost, config.switch * strain.clamp_max(STRAIN))
-
-
-def _picked(
-    tries: list[Unknowns], best: Int[Tensor, " rows"], nearest: Int[Tensor, " rows"]
-) -> Unknowns:
-    """For each row, the unknowns of its hypothesis."""
-    fields = {
-        name: torch.stack([getattr(at, name) for at in tries])[best, nearest] for name in OF_ROWS
-    }
-    return dataclasses.replace(tries[0], **fields)

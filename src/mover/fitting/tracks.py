@@ -21,7 +21,7 @@ MARGIN = 20  # rows of its neighbours that a stretch solves as well, at most
 ALONE = Triples(
     torch.zeros(0, 3, dtype=torch.long), torch.zeros(0), torch.zeros(0), torch.zeros(0, len(BODY))
 )
-"""Nobody has neighbours in time."""
+"""No row has neighbours in time."""
 
 
 @record
@@ -273,6 +273,6 @@ def stages_of(config: FitConfig, names: list[str]) -> tuple[Stage, ...]:
     """The stages, without a last one that differs in hands and faces that no keypoint shows."""
     *_, before, last = (Stage(), *config.stages)
     own = {"steps": before.steps, "hand_joints": before.hand_joints}
-    alike = dataclasses.replace(last, face_joints=before.face_joints, **own) == before
+    similar = dataclasses.replace(last, face_joints=before.face_joints, **own) == before
     shown = any(kind_of(name) != "body" for name in names)
-    return config.stages if shown or not alike or len(config.stages) < 2 else config.stages[:-1]
+    return config.stages if shown or not similar or len(config.stages) < 2 else config.stages[:-1]

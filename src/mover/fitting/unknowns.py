@@ -22,7 +22,7 @@ from mover.fitting.limits import spreads
 from mover.geometry.rotations import axis_angle
 
 HISTORY = 100
-"""Steps that L-BFGS remembers: how tall people are is told by all poses together, slowly."""
+"""Steps that L-BFGS remembers: all poses jointly constrain the heights, which converge slowly."""
 
 
 @record
