@@ -92,7 +92,7 @@ class Frames:
 
 
 @dataclass(frozen=True)
-class Posed:
+class PosedMesh:
     """An unknown mesh in one pose."""
 
     verts: Float[Array, "verts 3"]
@@ -136,7 +136,7 @@ def match(meshes: Float[Array, "meshes verts 3"], faces: Int[Array, "faces 3"]) 
         return None
     normals = vertex_normals(torch.from_numpy(meshes), torch.from_numpy(faces)).numpy()
     linked = np.nonzero(np.isfinite(found.far[:, 0]))[0]
-    posed = [Posed(v[linked], n[linked]) for v, n in zip(meshes, normals, strict=True)]
+    posed = [PosedMesh(v[linked], n[linked]) for v, n in zip(meshes, normals, strict=True)]
     tips, far = np.searchsorted(linked, found.tips), found.far[linked] / size
     some = np.arange(0, len(linked), max(1, len(linked) // SAMPLED))
     guesses = [Walks(tips[order], far[:, order]) for order in SIDED]
@@ -169,7 +169,7 @@ def _landmarks(
 
 
 def _fit(
-    mesh: Posed, walks: Walks, near: Near, rings: Float[Array, "verts landmarks"], size: float
+    mesh: PosedMesh, walks: Walks, near: Near, rings: Float[Array, "verts landmarks"], size: float
 ) -> tuple[Int[Array, " verts"], Float[Array, " verts"]]:
     """Lay the limbs over the mesh by landmarks, then again by what fits."""
     frames = _frames(mesh, walks, rings)
@@ -180,7 +180,7 @@ def _fit(
     return laid
 
 
-def _misfit(posed: list[Posed], walks: Walks, size: float, rows: Int[Array, " rows"]) -> float:
+def _misfit(posed: list[PosedMesh], walks: Walks, size: float, rows: Int[Array, " rows"]) -> float:
     """How badly the limbs of the open body fit, and bend, if left and right are as in `walks`."""
     known = atlas()
     rings = known.rings[_nearest(walks.far, known.walks.far, 1)[:, 0]]
@@ -190,7 +190,7 @@ def _misfit(posed: list[Posed], walks: Walks, size: float, rows: Int[Array, " ro
     return float(np.minimum(costs, WORST_FIT).mean() - np.mean(bent))
 
 
-def _frames(mesh: Posed, walks: Walks, rings: Float[Array, "verts landmarks"]) -> Frames:
+def _frames(mesh: PosedMesh, walks: Walks, rings: Float[Array, "verts landmarks"]) -> Frames:
     """The limbs' turn back into the zero pose and their starts, from landmarks."""
     known = atlas()
     here = limb_frames(_landmarks(mesh.verts, rings), mesh.verts[walks.tips])
@@ -202,7 +202,7 @@ def _frames(mesh: Posed, walks: Walks, rings: Float[Array, "verts landmarks"]) -
     )
 
 
-def _refitted(mesh: Posed, chosen: Int[Array, " verts"], frames: Frames, size: float) -> Frames:
+def _refitted(mesh: PosedMesh, chosen: Int[Array, " verts"], frames: Frames, size: float) -> Frames:
     """The limbs' frames that bring matched vertices and normals together best (Kabsch)."""
     known = atlas()
     back, start, origin = frames.back.copy(), frames.start.copy(), frames.origin.copy()
@@ -229,7 +229,7 @@ def _near(walks: Walks, rows: Int[Array, " rows"]) -> Near:
 
 
 def _lay(
-    mesh: Posed, near: Near, frames: Frames, size: float
+    mesh: PosedMesh, near: Near, frames: Frames, size: float
 ) -> tuple[Int[Array, " rows"], Float[Array, " rows"]]:
     """The vertex of the open body that fits each row of `near` best, and how badly it does.
 
