@@ -31,6 +31,7 @@ from mover.stages.people.refine_bodies import RefinedBodies
 from mover_bench.experiment import job, run
 from mover_bench.experiment.args import ExperimentArgs
 from mover_bench.experiment.measures import Judge, Traits, Trial, hidden_shares
+from mover_bench.experiment.pool import Jobs, last_line, run_each
 from mover_bench.experiment.run import run_experiment
 from mover_bench.experiment.sets import CHANGES, SETS, changed, parse_seeds, set_named
 from mover_bench.experiment.tables import COLUMNS, interval
@@ -43,7 +44,6 @@ from mover_bench.experiment.variants import (
     names_in,
     withheld,
 )
-from mover_bench.pool import Jobs, last_line, run_each
 
 FEW = EvaluateConfig(samples=200, bodies=2)
 KNOWN = dict(VARIANTS)

@@ -26,7 +26,7 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.folder import read_capture, write_capture
 from mover.io.capture.scene_file import read_scene
 from mover.pipeline.presets import PRESETS
-from mover_bench.pool import Jobs
+from mover_bench.experiment.pool import Jobs
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise

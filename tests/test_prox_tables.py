@@ -16,7 +16,7 @@ from test_import_scenes import plain as plain  # the fixture
 
 from mover.pipeline.presets import PRESETS
 from mover_bench.datasets.pigraphs import NAMES
-from mover_bench.pool import Jobs
+from mover_bench.experiment.pool import Jobs
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.tables import rows, table_job
 from mover_bench.tables.paper_table import TABLES, TableArgs, asked, paper_table

@@ -23,9 +23,8 @@ from mover.app.report.plan import draw_top, extent_of
 from mover.app.report.scene_view import pack_view, thin, thin_choice
 from mover.app.report.tables import find_changes, metrics_table, objects_table
 from mover.core.colours import colour, css
-from mover.core.types import Bodies, Capture, Scene, SeatStretch
+from mover.core.types import Bodies, Capture, Scene
 from mover.geometry.camera import to_camera, to_world
-from mover.geometry.nearest import as_float64, as_int64, closest
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 
@@ -266,28 +265,6 @@ class TestView:
     def test_a_mesh_that_did_not_change_is_packed_once(self):
         tree, _ = self.unpack(pack_view({"initial": room(0.5), "result": room()}, {}))
         assert len(tree["meshes"]) == 3
-
-    def test_a_raised_mesh_is_thinned_where_the_given_one_was(self):
-        ball = mesh_of(trimesh.creation.icosphere(subdivisions=5))
-        one = dataclasses.replace(room().objects[0], mesh=ball)
-        low, high = ball.verts[:, 1].amin(), ball.verts[:, 1].amax()
-        stretch = SeatStretch(low, high, 0.4 * (high - low))
-        other = dataclasses.replace(
-            one, mesh=dataclasses.replace(ball, verts=stretch.of(ball.verts)), stretch=stretch
-        )
-        scenes = {
-            name: dataclasses.replace(room(), objects=(piece,))
-            for name, piece in (("initial", one), ("result", other))
-        }
-        tree, block = self.unpack(pack_view(scenes, {}))
-        before, after = (
-            np.frombuffer(block, np.int16, 3 * mesh["n_verts"], mesh["verts"]).reshape(-1, 3)
-            * mesh["step"] + mesh["middle"] for mesh in tree["meshes"]
-        )  # fmt: skip
-        moved = stretch.of(torch.from_numpy(before).float())
-        assert np.abs(after - moved.numpy()).max() < 1e-3
-        squared, *_ = closest(after, as_float64(other.mesh.verts), as_int64(ball.faces))
-        assert np.sqrt(squared).max() < 0.02
 
     def test_long_videos_are_sampled_with_both_ends(self):
         bodies = walkers(1000)

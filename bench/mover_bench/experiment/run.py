@@ -7,10 +7,10 @@ from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover_bench.experiment.args import ExperimentArgs
 from mover_bench.experiment.job import is_finished
+from mover_bench.experiment.pool import LOG, Pool, run_each
 from mover_bench.experiment.sets import parse_seeds, set_named
 from mover_bench.experiment.tables import read_finished, write_tables
 from mover_bench.experiment.variants import names_in
-from mover_bench.pool import LOG, Pool, run_each
 
 
 def run_experiment(args: ExperimentArgs, observe: Observer = silent, pool: Pool = run_each) -> Path:

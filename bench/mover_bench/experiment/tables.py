@@ -17,9 +17,9 @@ from mover.core.records import plain
 from mover_bench.experiment.args import ExperimentArgs
 from mover_bench.experiment.job import path_of, read_numbers
 from mover_bench.experiment.measures import ABOUT
+from mover_bench.experiment.pool import LOG, last_line
 from mover_bench.experiment.sets import set_named
 from mover_bench.experiment.variants import VARIANTS
-from mover_bench.pool import LOG, last_line
 
 Frame = Any
 """A `pandas.DataFrame`."""

@@ -18,8 +18,8 @@ from mover.core.settings import int_in
 from mover.pipeline.presets import PRESETS
 from mover_bench.datasets import pigraphs, prox_files
 from mover_bench.experiment.job import read_numbers
+from mover_bench.experiment.pool import LOG, Pool, last_line, run_each
 from mover_bench.experiment.tables import markdown
-from mover_bench.pool import LOG, Pool, last_line, run_each
 from mover_bench.tables import published, rows
 from mover_bench.tables.rows import TableRow
 from mover_bench.tables.table_job import DONE, TableJob, key_of

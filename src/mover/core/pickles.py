@@ -105,12 +105,7 @@ def _loaded(data: bytes) -> Any:  # noqa: ANN401
                 raise ValueError("it ends too early")
             break
     if data[:4] == b"PK\x03\x04":
-        with zipfile.ZipFile(BytesIO(data)) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > LARGEST:
-                raise InputError(f"unpacks to more than {LARGEST} bytes, expected at most that")
-            if sum(name.endswith("/data.pkl") for name in archive.namelist()) != 1:
-                raise InputError("is a zip archive without data.pkl, expected a torch file")
-        return _of_torch(data)
+        return _of_archive(data)
     stream = BytesIO(data)
     if data[:6] == b"\x93NUMPY":
         version = npy.read_magic(stream)
@@ -119,6 +114,20 @@ def _loaded(data: bytes) -> Any:  # noqa: ANN401
             raise ValueError("an .npy file of plain numbers, which is no pickle")
     value = Reader(stream).load()
     return _of_torch(data) if type(value) is int and value == TORCH else value
+
+
+def _of_archive(data: bytes) -> Any:  # noqa: ANN401
+    """The content of a torch file that is a zip archive."""
+    with zipfile.ZipFile(BytesIO(data)) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > LARGEST:
+            raise InputError(f"unpacks to more than {LARGEST} bytes, expected at most that")
+        names = archive.namelist()
+        pickles = [name for name in names if name.endswith("/data.pkl")]
+        if len(pickles) != 1:
+            raise InputError("is a zip archive without data.pkl, expected a torch file")
+        if any(name.startswith(pickles[0].removesuffix(".pkl") + "/") for name in names):
+            return _of_torch(data)
+        return Reader(BytesIO(archive.read(pickles[0]))).load()  # no tensors: as numpy's arrays
 
 
 def _of_torch(data: bytes) -> Any:  # noqa: ANN401

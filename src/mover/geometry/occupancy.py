@@ -10,7 +10,7 @@ marching cubes.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from mover.core.errors import InputError
+from mover.core.settings import float_in, int_in
 from mover.core.types import Mesh
 from mover.geometry.mesh import box, fit_box, sample_surface, used
 
@@ -174,11 +175,11 @@ def network_of(tree: Any, name: str) -> OccupancyNetwork:  # noqa: ANN401
 class ExtractConfig:
     """How finely the surface is searched: as MOVER runs it."""
 
-    coarse: int = 32
+    coarse: Annotated[int, int_in(2, 1024)] = 32
     """Cells along a side at first."""
-    levels: int = 2
+    levels: Annotated[int, int_in(0, 8)] = 2
     """How often cells are halved near the surface."""
-    threshold: float = 0.2
+    threshold: Annotated[float, float_in(1e-6, 1 - 1e-6)] = 0.2
     """Probability of the surface."""
 
 

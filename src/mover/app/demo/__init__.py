@@ -1,7 +1,7 @@
 """The capture of `mover demo`: a known room with realistic noise, and its truth.
 
 `data/` holds files of the capture format, and the people as parameters of the open body.
-`python -m mover_bench.rooms.demo_data` makes them again.
+The bench's module `rooms.demo_data` makes them again.
 """
 
 import shutil

@@ -153,10 +153,12 @@ class Face:
 def face_of(b: Body, f: int) -> Face:
     """See `Face`."""
     t = b.faces[f]
+    first = wp.min(t)  # in one order, so that a flipped triangle has the same roundings
+    last = wp.max(t)
     r = Face()
-    r.a = b.at[t[0]]
-    r.u = b.at[t[1]] - r.a
-    r.v = b.at[t[2]] - r.a
+    r.a = b.at[first]
+    r.u = b.at[t[0] + t[1] + t[2] - first - last] - r.a
+    r.v = b.at[last] - r.a
     normal = wp.cross(r.u, r.v)
     square = wp.length_sq(normal)
     if square > SLIVER * wp.length_sq(r.u) * wp.length_sq(r.v):

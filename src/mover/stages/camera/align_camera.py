@@ -242,41 +242,44 @@ def align_camera(
     if not len(feet.person):
         return _without_feet(inputs, config)
     votes, first = vote(feet, config.votes), torch.stack(pitch_roll(camera.R_cam_world.double()))
-    votes, leaning = _leaning(inputs, config, votes, first)
-    fit = _best_fit(inputs, config, votes, first)
+    free = dataclasses.replace(inputs, tilt_spread=None) if inputs.lean else inputs
+    fit = _best_fit(free, config, votes, first)
     observe(Step("align_camera", 0, 1))
-    spread = covariance_of(fit, votes) + leaning
+    at, spread = _with_lean(fit, votes, inputs, first)
     people = [str(p) for p in votes.people.tolist()]
     found = Alignment(
-        camera=_turned(camera, fit.at),
-        ground=float(fit.at[2]) if inputs.camera_height is None else -inputs.camera_height,
+        camera=_turned(camera, at),
+        ground=float(at[2]) if inputs.camera_height is None else -inputs.camera_height,
         covariance=spread.to(camera.K),
-        offsets=dict(zip(people, fit.at[3:].tolist(), strict=True)),
+        offsets=dict(zip(people, at[3:].tolist(), strict=True)),
         warnings=(),
     )
     warnings = (*_weak(found, votes), *_surprising(found, first, config))
     return dataclasses.replace(found, warnings=warnings)
 
 
-def _leaning(
-    inputs: AlignInputs, config: AlignConfig, votes: Votes, first: Float[Tensor, "2"]
-) -> tuple[Votes, Float[Tensor, "3 3"]]:
-    """The votes down-weighted as a lean that all of them share makes them beside another tilt.
+def _with_lean(
+    fit: PlaneFit, votes: Votes, inputs: AlignInputs, first: Float[Tensor, "2"]
+) -> tuple[Float[Tensor, " unknowns"], Float[Tensor, "3 3"]]:
+    """The minimum and its covariance with a lean that all feet share, beside a known tilt.
 
-    And what the lean adds to the covariance: the plane turns about the middle of the feet, so that
-    the ground below the camera moves with it.
+    The plane turns about the middle of the feet, so that the ground below the camera moves with
+    it. Feet are fitted with their full weights, as a robust fit gives them up otherwise.
     """
+    at, covariance = fit.at, covariance_of(fit, votes)
     if not inputs.lean:
-        return votes, torch.zeros(3, 3, dtype=torch.float64)
-    free = _best_fit(dataclasses.replace(inputs, tilt_spread=None), config, votes, first)
-    own = float(covariance_of(free, votes).diag()[:2].mean())
-    whole, known = own + inputs.lean**2, (inputs.tilt_spread or config.tilt_prior) ** 2
-    _, slope = _linear(free.at, votes)
+        return at, covariance
+    _, slope = _linear(at, votes)
     middle = (votes.weight[:, None] * slope[:, :2]).sum(0) / votes.weight.sum()
     turns = torch.cat([torch.eye(2, dtype=torch.float64), middle[:, None]], 1)
-    share = inputs.lean * known / (known + whole)
-    weighted = dataclasses.replace(votes, weight=votes.weight * own / whole)
-    return weighted, share**2 * turns.mT @ turns
+    covariance = covariance + CAUTION * inputs.lean**2 * turns.mT @ turns
+    if inputs.tilt_spread is None:
+        return at, covariance
+    known = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64).diag() / inputs.tilt_spread**2
+    own = torch.linalg.inv(covariance)
+    both = torch.linalg.inv(own + known)
+    mean = both @ (own @ at[:3] + known @ torch.cat([first, first.new_zeros(1)]))
+    return torch.cat([mean, at[3:]]), both
 
 
 def _best_fit(
