@@ -20,7 +20,6 @@ from mover.geometry.rotations import axis_angle, rotation_vectors
 from mover.geometry.thinning import farthest_first
 
 MEAN_SHAPE = 0.05  # shape coefficients below it are the mean shape
-ADULTS = 0.055  # standard deviation of the logarithm of adults' heights
 LOOSE_POINTS = 16  # vertices that stand for the joints of a body without any
 CHUNK = 64  # bodies posed at once
 

@@ -166,6 +166,8 @@ class Bodies:
     size_spread: float | None = None
     """Standard deviation of the logarithm of all sizes, as far as they are wrong together: bodies
     from keypoints of unknown height. 0: it was given. None: unknown."""
+    mean_shape: bool = False
+    """All have the mean shape of their model, so that their heights were not observed."""
 
 
 @record

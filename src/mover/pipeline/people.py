@@ -22,7 +22,7 @@ from mover.stages.camera.find_lens import LensInputs, find_lens, through_lens, t
 from mover.stages.camera.room_lines import FINE, SURE, Segments, find_segments
 from mover.stages.cover import hiding
 from mover.stages.objects.find_image_cues import people_in_reference
-from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth
+from mover.stages.people.find_depth import DepthInputs, apply_depth, find_depth, size_spread
 from mover.stages.people.select_frames import SelectInputs, select_frames
 
 LEAN = math.radians(2.0)  # of the floor under fitted bodies, whose poses err together [rad]
@@ -110,7 +110,9 @@ def locate(capture: Capture, config: Config, run: Run) -> Located | None:
     camera = scene.camera if tilt is None else tilted_by(scene.camera, tilt)
     tilt_spread = None if tilt is None else tilt.spread
     lean = 0.0 if bodies.size_spread is None else LEAN
-    known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread, lean)
+    heights = capture.people is not None and bool(capture.people.heights)
+    size = 0.0 if heights else size_spread(bodies, config.height_spread)
+    known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread, lean, size)
     alignment = run.stage(align_camera, known, config.align)
     warnings = (*chosen.warnings, *feet.warnings, *alignment.warnings)
     return Located(bodies, path, kept, parts, feet, alignment, warnings)

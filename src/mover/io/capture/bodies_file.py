@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mover.bodies.corrected import ADULTS, has_mean_shape
+from mover.bodies.corrected import has_mean_shape
 from mover.core.errors import InputError
 from mover.core.records import BROKEN
 from mover.core.types import Bodies
@@ -84,11 +84,10 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
         faces = _faces(get(at, "faces"), verts.shape[1])
         joints, names = _joints(at, len(frame))
     spread = _scalar(at, "size_spread", 0.0, 1.0)
-    if spread is None and pose is not None and has_mean_shape(pose):
-        spread = ADULTS  # asked before the pose is dropped that no model here can check
+    mean_shape = pose is not None and has_mean_shape(pose)  # before a pose is dropped unchecked
     bodies = Bodies(
         verts, faces, joints, names, frame, person, _scalar(at, "fps", SLOWEST, FASTEST),
-        _space(get(at, "space")), pose, spread,
+        _space(get(at, "space")), pose, spread, mean_shape,
     )  # fmt: skip
     extent = (bodies.verts.amax(1) - bodies.verts.amin(1)).norm(dim=-1).median()
     if not SMALLEST < extent < TALLEST:

@@ -8,7 +8,7 @@ Departure: In the paper every point has the same vote. Here every place where a 
            (it grows with the frames spent there, up to a limit), because the feet of one pose are
            wrong together.
 What no foot constrains: the size of the people. If all of them are too large and too far by the
-same factor, so is the depth of the ground; this is not part of the covariance.
+same factor, so is the depth of the ground: people of unknown size widen its variance.
 """
 
 import dataclasses
@@ -214,6 +214,8 @@ class AlignInputs:
     """How far off that pitch and roll are [rad]; None: as `AlignConfig` has it."""
     lean: float = 0.0
     """How far the plane under the feet may lean as a whole, an error that all feet share [rad]."""
+    size: float = 0.0
+    """Standard deviation of the logarithm of the people's size, which moves the floor with them."""
 
 
 @record
@@ -246,6 +248,8 @@ def align_camera(
     fit = _best_fit(free, config, votes, first)
     observe(Step("align_camera", 0, 1))
     at, spread = _with_lean(fit, votes, inputs, first)
+    if inputs.camera_height is None:  # people who are larger are farther, and so is their floor
+        spread[2, 2] += (inputs.size * at[2]) ** 2
     people = [str(p) for p in votes.people.tolist()]
     found = Alignment(
         camera=_turned(camera, at),

@@ -198,7 +198,7 @@ def shifted(bodies: Bodies, shift: Float[Tensor, "bodies 3"]) -> Bodies:
 
 def are_shapeless(bodies: Bodies) -> bool:
     """Whether all bodies have the mean shape of their model, as far as it is known."""
-    return bodies.pose is not None and has_mean_shape(bodies.pose)
+    return bodies.mean_shape or (bodies.pose is not None and has_mean_shape(bodies.pose))
 
 
 def size_spread(bodies: Bodies, shapeless: float) -> float:
