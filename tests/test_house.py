@@ -14,29 +14,29 @@ import pytest
 
 HOME = Path(__file__).parents[1]
 LINES = {
-    "src/mover/app": 5_560,
-    "src/mover/bodies": 2_429,
-    "src/mover/core": 1_755,
+    "src/mover/app": 5_578,
+    "src/mover/bodies": 2_843,
+    "src/mover/core": 1_766,
     "src/mover/energy": 4_193,
     "src/mover/evaluate": 1_164,
-    "src/mover/extensions": 1_319,
-    "src/mover/fitting": 2_713,
+    "src/mover/extensions": 1_321,
+    "src/mover/fitting": 2_704,
     "src/mover/furniture": 856,
-    "src/mover/geometry": 4_115,
-    "src/mover/io": 10_582,
+    "src/mover/geometry": 4_118,
+    "src/mover/io": 10_583,
     "src/mover/perceive": 2_895,
-    "src/mover/pipeline": 1_095,
-    "src/mover/stages": 6_480,
+    "src/mover/pipeline": 1_097,
+    "src/mover/stages": 6_488,
     "bench": 8_243,
-    "benchmarks": 1_002,
-    "tests": 31_798,
+    "benchmarks": 1_004,
+    "tests": 31_811,
 }
-FILES = {"src/mover": 264, "bench": 49}
+FILES = {"src/mover": 266, "bench": 49}
 LIMITS = {
-    "words in code": 138,
-    "words in pages": 282,
-    "class names with two meanings": 11,
-    "small helpers": 200,
+    "words in code": 0,
+    "words in pages": 0,
+    "class names with two meanings": 0,
+    "small helpers": 199,
     "modules in circles": 0,
 }  # fmt: skip
 WORDS = {
