@@ -113,4 +113,4 @@ def test_the_real_scene_reads_as_it_was_measured_by_others() -> None:
     assert math.degrees(float(pitch_roll(scene.truth.camera.R_cam_world)[0])) == pytest.approx(
         -4.72, abs=0.1
     )
-    assert len(scene.keypoints.frame) == 189
+    assert len(scene.keypoints.frame) == 175
