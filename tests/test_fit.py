@@ -168,7 +168,7 @@ def test_the_rig_of_smplx_has_its_hands_face_correctives_and_expression(tmp_path
 def test_bodies_are_found_from_keypoints_alone(found, walk):
     aligned, absolute = off(found, walk)
     assert aligned < 0.06
-    assert absolute < 0.25  # size and distance cannot be told apart: 5 % of 4 m
+    assert absolute < 1.1 * UNKNOWN * 4.0  # size and distance look the same: of adults, at 4 m
     assert found.miss.mean() < 5
     assert found.bodies.pose.betas.unique(dim=0).shape[0] == 1
 
