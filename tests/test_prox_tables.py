@@ -18,7 +18,7 @@ from mover.pipeline.presets import PRESETS
 from mover_bench.datasets.pigraphs import NAMES
 from mover_bench.experiment.pool import Jobs
 from mover_bench.rooms.known import KnownRoom
-from mover_bench.tables import rows, table_job
+from mover_bench.tables import rows
 from mover_bench.tables.paper_table import TABLES, TableArgs, asked, paper_table
 from mover_bench.tables.table_job import TableJob, do_job
 
@@ -84,7 +84,6 @@ def test_every_row_is_made_from_the_files_of_prox(
 ) -> None:
     for preset, config in PRESETS.items():
         monkeypatch.setitem(PRESETS, preset, quick(config))
-    monkeypatch.setattr(table_job, "STEPS", 5)
     monkeypatch.setattr(rows, "SEGMENTS", 3)  # the middle one lies between the two videos
     args = TableArgs(name, captures, tmp_path, captures, preset="paper")
     page = paper_table(args, pool=at_once).read_text()

@@ -90,7 +90,9 @@ def do_job(job: TableJob) -> None:
     people = room.bodies
     if variant.row and people is not None:
         weights = RefineBodiesConfig(weights=ABLATION[variant.row])
-        people = refine_bodies(room, capture, weights).bodies
+        level = variant.row == "baseline"  # nothing of the room is known, not even where down is
+        start = under_camera(room, capture, capture.scene.camera) if level else room
+        people = refine_bodies(start, capture, weights).bodies
     scenes = {"full": (room.scene, people)}
     if job.name == PLAIN:  # other jobs have no rows of these
         scenes |= {"initial": (given.scene, given.bodies), "image": (room.image_only, people)}
