@@ -23,7 +23,7 @@ from furnished import (
 from little_room import walkers
 
 import mover.io.export.solids
-import mover.io.export.usd_mesh
+import mover.io.export.usd
 from mover.app.cli import run_command
 from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
@@ -31,9 +31,8 @@ from mover.core.run import Run
 from mover.core.types import Bodies, BodyPose, Scene, SceneObject, Segment
 from mover.geometry.placement import place_object, placed_at
 from mover.io.export.amass import export_amass
-from mover.io.export.finished import Finished, read_finished
+from mover.io.export.finished import Finished, keyframes, read_finished
 from mover.io.export.glb import export_glb
-from mover.io.export.people import keyframes
 from mover.io.export.scene_glb import export_ply, placement_of
 from mover.io.export.solids import solids_of
 from mover.io.export.usd import export_usd
@@ -324,7 +323,7 @@ class TestUsd:
         Usd = pytest.importorskip("pxr.Usd", reason="needs usd-core")
         shutil.copytree(cut, tmp_path / "out" / "stages")
         self.home = finished(tmp_path, two_people())
-        return Usd.Stage.Open(str(export_usd(self.home, tmp_path, "morph").files[0]))
+        return Usd.Stage.Open(str(export_usd(self.home, tmp_path).files[0]))
 
     def test_objects_stand_where_they_stood_to_a_hundredth_of_a_millimetre(self, stage):
         from pxr import UsdGeom
@@ -341,20 +340,6 @@ class TestUsd:
             )
             node = stage.GetPrimAtPath(f"/room/{piece.id}")
             assert node.GetCustomDataByKey("mover:category") == piece.category
-
-    def test_people_are_where_they_were_in_every_frame(self, stage):
-        from pxr import UsdGeom
-
-        bodies = self.home.bodies
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/room/person_1"))
-        for k, _ in rows(bodies, 1):
-            frame = float(bodies.frame[k])
-            points = np.array(mesh.GetPointsAttr().Get(frame))
-            assert np.linalg.norm(points - bodies.verts[k].numpy(), axis=1).max() < 0.0025
-            assert mesh.ComputeVisibility(frame) == "inherited"
-        assert mesh.ComputeVisibility(float(bodies.frame.min())) == "invisible"
-        assert stage.GetTimeCodesPerSecond() == bodies.fps
-        assert stage.GetEndTimeCode() == float(bodies.frame.max())
 
     def test_the_camera_sees_the_same_pixels(self, stage):
         from pxr import UsdGeom
@@ -456,7 +441,7 @@ def test_a_folder_without_a_result_is_refused(tmp_path: Path, capsys):
 
 
 def test_without_usd_core_the_way_to_get_it_is_said(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(mover.io.export.usd_mesh, "find_spec", lambda _: None)
+    monkeypatch.setattr(mover.io.export.usd, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=r"\.\[usd\]"):
         export_usd(finished(tmp_path), tmp_path)
 

@@ -18,10 +18,10 @@ import mover.io.export.solids
 from mover.app.cli import run_command
 from mover.core.errors import InputError
 from mover.core.run import Run
-from mover.core.types import Mesh, Scene
+from mover.core.types import Mesh, Scene, Segment
 from mover.evaluate.stability import Settled, settle
 from mover.furniture.library import PIECES, canonical, make_piece
-from mover.geometry.placement import place_object
+from mover.geometry.placement import place_object, placed_at
 from mover.geometry.topology import is_closed
 from mover.geometry.watertight import close_mesh
 from mover.io.capture.scene_file import write_scene
@@ -172,6 +172,32 @@ def corners(model: Any, data: Any, geom: int) -> tuple[np.ndarray, int]:
     turn = np.array(data.geom_xmat[geom]).reshape(3, 3)
     verts = np.array(model.mesh_vert[start : start + count]) @ turn.T + data.geom_xpos[geom]
     return verts, int(model.geom_group[geom])
+
+
+@needs_mujoco
+def test_keyframes_put_furniture_where_it_then_stands(tmp_path: Path):
+    import mujoco
+
+    home = read_finished(write_out(tmp_path / "out", furnished(BOXES)))
+    chair, table = home.scene.objects
+    later = Segment(8, chair.t_world_object + torch.tensor([0.3, 0.0, 1.0]), chair.yaw + 1)
+    stays = (Segment(0, chair.t_world_object, chair.yaw), later)
+    objects = (table, dataclasses.replace(chair, segments=stays))
+    scene = dataclasses.replace(home.scene, objects=objects)
+    file = export_mjcf(dataclasses.replace(home, scene=scene), tmp_path).files[0]
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(model)
+    assert [model.key(k).name for k in range(model.nkey)] == ["frame_0", "frame_8"]
+    for key, frame in enumerate((0, 8)):
+        mujoco.mj_resetDataKeyframe(model, data, key)
+        mujoco.mj_forward(model, data)
+        for item in objects:
+            there = placed_at(item, frame)
+            x, y, z = there.t_world_object.double().tolist()
+            assert data.body(item.id).xpos == pytest.approx([x, -z, y - GROUND], abs=1e-6)
+            front = data.body(item.id).xmat.reshape(3, 3) @ [0, -1, 0]
+            yaw = float(there.yaw)
+            assert front == pytest.approx([np.sin(yaw), -np.cos(yaw), 0], abs=1e-6)
 
 
 @needs_mujoco

@@ -85,8 +85,7 @@ class ExportArgs:
     capture: Path | None = None
     """Folder of the capture: its bodies.npz has the parameters of the bodies."""
     body: Literal["auto", "skin", "morph", "none"] = "auto"
-    """glb, usd: how people move: on bones, by exact shapes of some frames, or not at all (also
-    mjcf)."""
+    """glb: how people move: on bones, by exact shapes of some frames, or not at all (also usd)."""
     up: Literal["y", "z"] = "y"
     """amass, usd, contacts: y is the world of scene.json, z that of AMASS and of simulators."""
 
@@ -99,7 +98,7 @@ def export(arguments: Sequence[str]) -> None:
     writers = {target: chosen("--to", target, "export") for target in args.to}
     finished, folder = read_finished(args.out, args.capture), args.out / "export"
     options = {"glb": {"body": args.body}, "amass": {"up": args.up}, "contacts": {"up": args.up}}
-    options |= {"usd": {"body": args.body, "up": args.up}, "mjcf": {"body": args.body}}
+    options |= {"usd": {"body": args.body, "up": args.up}}
     for target, write in writers.items():
         found: Exported = write(finished, folder, **options.get(target, {}))
         shown = found.files if len(found.files) <= 3 else found.files[:1]

@@ -9,10 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.core.types import Bodies, BodyPose
+from mover.core.types import Bodies
 from mover.geometry.rotations import axis_angle, rot_x, rotation_vectors
-from mover.io.export.finished import Exported, Finished, Up
-from mover.io.export.people import FPS, Track, tracks_of
+from mover.io.export.finished import Exported, Finished, Track, Up, clock_of, tracks_of
 from mover.io.export.posed import Motion, all_angles, misses, motion_of, pelvis_of, skin_of
 from mover.io.files.npz import write_npz
 
@@ -55,9 +54,15 @@ def export_amass(finished: Finished, folder: Path, up: Up = "y") -> Exported:
 def _arrays(motion: Motion, track: Track, bodies: Bodies) -> dict[str, NDArray[Any]]:
     """One person; rows are frames of the video, whose numbers are in `frame`."""
     pose, rows = motion.pose, track.rows
-    poses = angles_of(pose)[rows].numpy()
+    if pose.model == "smpl":  # all angles in the model's own order
+        angles = torch.cat([pose.global_orient, pose.body_pose], -1)
+    else:
+        angles = all_angles(pose).flatten(1)
+        if pose.model == "smplh":  # has no jaw and no eyes
+            angles = torch.cat([angles[:, :66], angles[:, 75:]], -1)
+    poses = angles[rows].numpy()
     steps = track.frame.diff()
-    rate = np.array((bodies.fps or FPS) / (int(steps.median()) if len(steps) else 1))
+    rate = np.array(clock_of(bodies)[1] / (int(steps.median()) if len(steps) else 1))
     shape = pose.betas[rows].double().mean(0).numpy()
     parts = PARTS.items() if poses.shape[1] == 165 else ()
     return {
@@ -77,18 +82,10 @@ def _arrays(motion: Motion, track: Track, bodies: Bodies) -> dict[str, NDArray[A
     }
 
 
-def angles_of(pose: BodyPose) -> torch.Tensor:
-    """All angles of each row in the model's own order."""
-    if pose.model == "smpl":
-        return torch.cat([pose.global_orient, pose.body_pose], -1)
-    whole = all_angles(pose).flatten(1)
-    return torch.cat([whole[:, :66], whole[:, 75:]], -1) if pose.model == "smplh" else whole
-
-
 def _upright(motion: Motion) -> Motion:
     """The same motion in a world with +z up; the root turns about the pelvis."""
     pose, turn = motion.pose, rot_x(torch.tensor(torch.pi / 2))
     offset = pelvis_of(pose)
-    place = (pose.transl + offset) @ turn.mT - offset
+    position = (pose.transl + offset) @ turn.mT - offset
     root = rotation_vectors(turn @ axis_angle(pose.global_orient))
-    return Motion(dataclasses.replace(pose, transl=place, global_orient=root), motion.size)
+    return Motion(dataclasses.replace(pose, transl=position, global_orient=root), motion.size)

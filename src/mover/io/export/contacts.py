@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from mover.core.contact_labels import ContactLabels
 from mover.core.errors import InputError
-from mover.io.export.finished import Exported, Finished, Up
-from mover.io.export.people import FPS, tracks_of
+from mover.io.export.finished import Exported, Finished, Up, clock_of, tracks_of
 from mover.io.export.solids import AXES, floor_height
 from mover.io.files.npz import read_npz, write_npz
 
@@ -80,27 +79,24 @@ def export_contacts(finished: Finished, folder: Path, up: Up = "y") -> Exported:
         labels = dataclasses.replace(labels, position=position, normal=normal)
     files: list[Path] = []
     for track in tracks_of(bodies):
-        row_of = {frame: k for k, frame in enumerate(track.frame.tolist())}
-        of_person = (labels.person == track.person).tolist()
-        kept = [k for k, frame in enumerate(labels.frame.tolist())
-                if of_person[k] and frame in row_of]  # fmt: skip
-        rows = np.array([row_of[int(labels.frame[k])] for k in kept], np.int64)
-        cells = rows, labels.part[kept].numpy(), labels.object[kept].numpy()
+        kept = (labels.person == track.person) & torch.isin(labels.frame, track.frame)
+        rows = torch.searchsorted(track.frame, labels.frame[kept])
+        cells = rows, labels.part[kept], labels.object[kept]
         shape = (len(track.frame), len(labels.parts), len(labels.objects))
-        contact = np.zeros(shape, np.float32)
-        contact[cells] = labels.confidence[kept].numpy()
-        spots = {key: np.full((*shape, 3), np.nan, np.float32) for key in ("position", "normal")}
+        contact = torch.zeros(shape)
+        contact[cells] = labels.confidence[kept].float()
+        spots = {key: torch.full((*shape, 3), torch.nan) for key in ("position", "normal")}
         for name, table in spots.items():
-            table[cells] = getattr(labels, name)[kept].numpy()
+            table[cells] = getattr(labels, name)[kept].float()
         arrays = {
             "frame": track.frame.numpy(),
-            "fps": np.array(bodies.fps or FPS),
+            "fps": np.array(clock_of(bodies)[1]),
             "parts": np.array(labels.parts),
             "objects": np.array(labels.objects),
-            "contact": contact,
-            "object_contact": contact.max(1) >= SURE,
+            "contact": contact.numpy(),
+            "object_contact": (contact.amax(1) >= SURE).numpy(),
             "up_axis": np.array(up),
-            **spots,
+            **{name: table.numpy() for name, table in spots.items()},
         }
         files.append(folder / f"contacts_{track.person}.npz")
         write_npz(arrays, files[-1])

@@ -13,9 +13,17 @@ from torch import Tensor
 from mover.core.colours import person_colour
 from mover.core.types import Bodies, SceneObject
 from mover.geometry.mesh import vertex_normals
-from mover.io.export.finished import BodyForm, Exported, Finished
-from mover.io.export.people import FPS, Track, keyframes, seen_from_to, tracks_of
-from mover.io.export.posed import Skinned, all_angles, bones_for, quaternions, rest_of
+from mover.io.export.finished import (
+    BodyForm,
+    Exported,
+    Finished,
+    Track,
+    clock_of,
+    keyframes,
+    tracks_of,
+    visible_spans,
+)
+from mover.io.export.posed import Skinned, all_angles, bones_for, rest_of
 from mover.io.export.scene_glb import linear, placement_of, write_glb
 
 TOLERANCE = 0.005  # [m], of the straight lines between two shapes
@@ -40,16 +48,17 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
     Raises:
         InputError: If bones are asked for and there are none.
     """
-    scene, notes = finished.scene, list[str]()
-    bodies = None if body == "none" else finished.bodies
+    scene, bodies = finished.scene, None if body == "none" else finished.bodies
     moved = [item for item in scene.objects if item.segments]
     skin = bones_for(finished, body, INFLUENCES)
-    first, step = 0, 1 / FPS
-    if finished.bodies is not None and len(finished.bodies.frame):
-        first, step = int(finished.bodies.frame.min()), 1 / (finished.bodies.fps or FPS)
+    first, fps = clock_of(finished.bodies)
+    notes = list[str]()
     if bodies is not None or moved:
-        notes.append(f"frame {first} of the video is at 0 s, each next one {step:g} s later")
-    notes += [_way(item) for item in moved]
+        notes.append(f"frame {first} of the video is at 0 s, each next one {1 / fps:g} s later")
+    for item in moved:
+        held = any(segment.mover is not None for segment in item.segments)
+        way = "moves with the person who moves it, a step a frame"
+        notes.append(f"{item.id} {way if held else 'jumps where it is moved'}")
     if bodies is None:
         notes.append("no people")
     elif isinstance(skin, Skinned):
@@ -60,7 +69,7 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
     def append(blocks: dict[Any, bytes], tree: dict[str, Any]) -> None:
         file = Gltf(blocks, tree)
         for item in moved:
-            _add_stays(file, item, first, step)
+            _add_stays(file, item, first, 1 / fps)
         if bodies is not None:
             notes.extend(_add_people(file, bodies, skin))
         if file.channels:
@@ -68,15 +77,6 @@ def export_glb(finished: Finished, folder: Path, body: BodyForm = "auto") -> Exp
             tree["animations"] = [motion]
 
     return Exported((write_glb(scene, None, folder / "scene.glb", append),), tuple(notes))
-
-
-def _way(item: SceneObject) -> str:
-    """How an object comes from one position to the next."""
-    held = any(segment.mover is not None for segment in item.segments)
-    way = (
-        "moves with the person who moves it, a step a frame" if held else "jumps where it is moved"
-    )
-    return f"{item.id} {way}"
 
 
 def _add_people(file: "Gltf", bodies: Bodies, skin: Skinned | str) -> list[str]:
@@ -141,10 +141,10 @@ class Gltf:
             "indices": self.add_array(faces.cpu().numpy().astype(np.uint32).reshape(-1)),
             "material": self.add("materials", {"name": name, "pbrMetallicRoughness": surface}),
         }
-        if not targets:
-            return self.add("meshes", {"name": name, "primitives": [primitive]})
-        parts = {"primitives": [{**primitive, "targets": targets}]}
-        return self.add("meshes", {"name": name, "weights": [0.0] * len(targets), **parts})
+        mesh: dict[str, Any] = {"name": name, "primitives": [primitive]}
+        if targets:
+            primitive["targets"], mesh["weights"] = targets, [0.0] * len(targets)
+        return self.add("meshes", mesh)
 
     def animate(
         self, node: int, path: str, times: int, values: NDArray[Any], way: str = "LINEAR"
@@ -157,10 +157,10 @@ class Gltf:
 
 
 def _add_presence(file: Gltf, node: int, track: Track) -> None:
-    """Hide a person who is not seen: a node of size zero is not drawn (glTF, Sec. 3.6)."""
+    """Hide a person who is not visible: a node of size zero is not drawn (glTF, Sec. 3.6)."""
     events: dict[float, float] = {0.0: 0.0}
     step = float(track.time.diff().min()) if len(track.time) > 1 else 0.2
-    for start, end in seen_from_to(track):
+    for start, end in visible_spans(track):
         events[start] = 1.0
         if end < track.last - 1e-6:
             events[end + step] = 0.0
@@ -177,7 +177,7 @@ def _add_stays(file: Gltf, item: SceneObject, first: int, step: float) -> None:
         file: Has the object as a node of its placement.
         item: An object with segments.
         first: The frame at 0 s.
-        step: From one frame to the next [s].
+        step: Between two frames [s].
     """
     wanted = placement_of(item).T.reshape(-1)
     node = next(
@@ -194,8 +194,8 @@ def _add_stays(file: Gltf, item: SceneObject, first: int, step: float) -> None:
         "translation": item.t_world_object.tolist(), "scale": item.scale.tolist(),
         "rotation": turns[0].tolist(),
     }  # fmt: skip
-    places = np.array([s.t_world_object.tolist() for s in stays.values()])
-    file.animate(node, "translation", times, places, "STEP")
+    positions = np.array([s.t_world_object.tolist() for s in stays.values()])
+    file.animate(node, "translation", times, positions, "STEP")
     file.animate(node, "rotation", times, turns[1:], "STEP")
 
 
@@ -245,18 +245,21 @@ def _add_skinned(file: Gltf, skin: Skinned, track: Track) -> None:
         "WEIGHTS_0": share,
     }
     mesh = file.add_mesh(name, track.person, arrays, model.faces)
+    inverse = torch.eye(4).repeat(len(joints), 1, 1)  # from the rest shape to each joint's axes
+    inverse[:, :3, :3] = model.tpose
+    inverse[:, :3, 3] = -(model.tpose @ joints[..., None])[..., 0]
     bind = {
         "name": name,
         "joints": list(range(first, first + len(model.parents))),
-        "inverseBindMatrices": file.add_array(_inverse_bind(skin, joints)),
+        "inverseBindMatrices": file.add_array(inverse.mT.contiguous().numpy()),
     }
     file.add_root({"name": f"{name}_body", "mesh": mesh, "skin": file.add("skins", bind)})
     _add_presence(file, top, track)
     times = file.add_array(track.time.numpy().astype(np.float32))
-    place = (skin.motion.pose.transl[track.rows] + joints[0]).numpy()
+    position = (skin.motion.pose.transl[track.rows] + joints[0]).numpy()
     size = skin.motion.size[track.rows, None].expand(-1, 3).numpy()
     turns = quaternions(all_angles(skin.motion.pose)[track.rows])
-    moving = [(first, "translation", place), (first, "scale", size)]
+    moving = [(first, "translation", position), (first, "scale", size)]
     moving += [(first + k, "rotation", turns[:, k]) for k in range(len(model.parents))]
     for node, path, values in moving:
         if np.ptp(values, axis=0).max() < STILL:
@@ -265,9 +268,12 @@ def _add_skinned(file: Gltf, skin: Skinned, track: Track) -> None:
             file.animate(node, path, times, values)
 
 
-def _inverse_bind(skin: Skinned, joints: Float[Tensor, "joints 3"]) -> NDArray[np.float32]:
-    """From the rest shape to the axes of each joint, by columns."""
-    matrix = torch.eye(4).repeat(len(joints), 1, 1)
-    matrix[:, :3, :3] = skin.model.tpose
-    matrix[:, :3, 3] = -(skin.model.tpose @ joints[..., None])[..., 0]
-    return matrix.mT.contiguous().numpy()
+def quaternions(vectors: Float[Tensor, "frames joints 3"]) -> NDArray[np.float32]:
+    """Rotations (x, y, z, w) of axis-angle vectors; neighbours in time are on one side."""
+    from scipy.spatial.transform import Rotation
+
+    flat = vectors.double().reshape(-1, 3).numpy()
+    found = Rotation.from_rotvec(flat).as_quat().reshape(*vectors.shape[:2], 4)
+    dots = (found[1:] * found[:-1]).sum(-1, keepdims=True)
+    found[1:] *= np.where(dots < 0, -1.0, 1.0).cumprod(0)
+    return found.astype(np.float32)

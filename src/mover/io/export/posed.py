@@ -2,10 +2,8 @@
 
 import dataclasses
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.bodies import load_model
@@ -14,10 +12,10 @@ from mover.core.errors import InputError
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose
 from mover.geometry.rotations import axis_angle, rotation_vectors
-from mover.io.export.finished import BodyForm, Finished
-from mover.io.export.people import tracks_of
+from mover.io.export.finished import BodyForm, Finished, tracks_of
 
 SAME = 0.01  # [m], a similarity that leaves more did not make the result's body
+SKIN_MISS = 0.02  # [m], the most that a skinned body may miss the result's mesh
 EXTRA = {"jaw_pose": (66, 69), "left_hand_pose": (75, 120), "right_hand_pose": (120, 165)}
 """Columns among the angles of SMPL-X's joints."""
 
@@ -78,7 +76,7 @@ def similarity(
     Float[Tensor, "rows 3"],
     Float[Tensor, " rows"],
 ]:
-    """Size, rotation and shift that best take `start` to `end`, and the largest miss [m]."""
+    """Size, rotation and shift that best carry `start` to `end`, and the largest miss [m]."""
     a, b = start.mean(1, keepdim=True), end.mean(1, keepdim=True)
     cross = (end - b).mT @ (start - a)
     u, s, vt = torch.linalg.svd(cross)
@@ -125,9 +123,6 @@ def misses(motion: Motion, model: SkinnedBody, bodies: Bodies) -> float:
     return worst
 
 
-SKIN_MISS = 0.02  # [m], the most that a skinned body may miss the result's mesh
-
-
 @record
 class Skinned:
     """Bones of all people, each person with one shape."""
@@ -139,58 +134,45 @@ class Skinned:
     """How far the skin is off the meshes of the result at most [m]."""
 
 
-def skin_for(finished: Finished, influences: int) -> Skinned | str:
-    """The bones that move the bodies, or why there are none.
-
-    Each person gets one shape, and each vertex `influences` joints; what that loses is measured.
-    """
-    motion = motion_of(finished)
-    if isinstance(motion, str):
-        return motion
-    assert finished.bodies is not None
-    model = skin_of(motion.pose, finished.bodies)
-    if model is None:
-        return f"the model {motion.pose.model!r} has no bones that are known here"
-    share, joint = model.weights.topk(influences, dim=1)
-    weights = torch.zeros_like(model.weights).scatter(1, joint, share / share.sum(1, keepdim=True))
-    simple = dataclasses.replace(model, weights=weights)
-    betas = motion.pose.betas.clone()
-    for track in tracks_of(finished.bodies):
-        betas[track.rows] = betas[track.rows].mean(0)
-    posed = Motion(dataclasses.replace(motion.pose, betas=betas), motion.size)
-    miss = misses(posed, simple, finished.bodies)
-    if not miss <= SKIN_MISS:
-        return f"its bones miss the result's meshes by {miss:.3f} m"
-    return Skinned(posed, simple, miss)
-
-
 def bones_for(finished: Finished, body: BodyForm, influences: int) -> Skinned | str:
     """The bones on which people move as was asked, or why they move by shapes.
+
+    Each person gets one shape, and each vertex `influences` joints; what that loses is measured.
 
     Raises:
         InputError: If bones are asked for and there are none.
     """
     if finished.bodies is None or body in ("morph", "none"):
         return "it was not asked for"
-    skin = skin_for(finished, influences)
+    skin = _skin_for(finished, finished.bodies, influences)
     if isinstance(skin, str) and body == "skin":
         raise InputError(f"--body skin: {skin}")
     return skin
 
 
+def _skin_for(finished: Finished, bodies: Bodies, influences: int) -> Skinned | str:
+    motion = motion_of(finished)
+    if isinstance(motion, str):
+        return motion
+    model = skin_of(motion.pose, bodies)
+    if model is None:
+        return f"the model {motion.pose.model!r} has no bones that are known here"
+    share, joint = model.weights.topk(influences, dim=1)
+    weights = torch.zeros_like(model.weights).scatter(1, joint, share / share.sum(1, keepdim=True))
+    simple = dataclasses.replace(model, weights=weights)
+    betas = motion.pose.betas.clone()
+    for track in tracks_of(bodies):
+        betas[track.rows] = betas[track.rows].mean(0)
+    posed = Motion(dataclasses.replace(motion.pose, betas=betas), motion.size)
+    miss = misses(posed, simple, bodies)
+    if not miss <= SKIN_MISS:
+        return f"its bones miss the result's meshes by {miss:.3f} m"
+    return Skinned(posed, simple, miss)
+
+
 def rest_of(skin: Skinned, row: int) -> tuple[Float[Tensor, "verts 3"], Float[Tensor, "joints 3"]]:
-    """Skinned and joints of a row's person in the rest shape [m]."""
+    """Vertices and joints of a row's person in the rest shape [m]."""
     betas, model = skin.motion.pose.betas[row], skin.model
     count = len(betas)
     verts = model.verts + model.shape_dirs[..., :count] @ betas
     return verts, model.joints + model.joint_dirs[..., :count] @ betas
-
-
-def quaternions(vectors: Float[Tensor, "frames joints 3"]) -> NDArray[np.float32]:
-    """Rotations (x, y, z, w) of axis-angle vectors; neighbours in time are on one side."""
-    angle = vectors.double().norm(dim=-1, keepdim=True)
-    half = torch.where(angle > 1e-9, (angle / 2).sin() / angle.clamp_min(1e-9), 0.5)
-    found = torch.cat([vectors.double() * half, (angle / 2).cos()], -1)
-    dots = (found[1:] * found[:-1]).sum(-1)
-    side = torch.where(dots < 0, -1.0, 1.0).cumprod(0)
-    return torch.cat([found[:1], found[1:] * side[..., None]]).float().numpy()

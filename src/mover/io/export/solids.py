@@ -7,12 +7,9 @@ front of an object, +z of its mesh, becomes -y.
 """
 
 import dataclasses
-import heapq
-from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.util import find_spec
-from itertools import count
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -23,7 +20,6 @@ from torch import Tensor
 from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.run import Run
-from mover.core.settings import float_in, int_in
 from mover.core.types import Mesh, Scene, SceneObject
 from mover.furniture.library import canonical
 from mover.geometry.placement import place_object, placed_at
@@ -33,15 +29,31 @@ from mover.io.files.meshes import read_mesh
 
 PLANES = 24  # cuts that are tried along each axis
 SMALLEST = 1e-7  # of the volume; less is a scrap of a cut
+HOLLOW = 0.04  # of a part, as a share of the object's size (CoACD) or volume (slices)
+MOST = 24  # parts of one object
+THINNEST = 0.001  # [m], of a convex part; flatter ones are thickened
+DENSITY = {
+    "chair": 500.0, "stool": 450.0, "bench": 450.0, "table": 450.0, "desk": 400.0,
+    "coffee table": 400.0, "office chair": 250.0, "armchair": 90.0, "sofa": 80.0, "bed": 90.0,
+    "shelf": 450.0, "cabinet": 170.0, "wardrobe": 120.0, "nightstand": 200.0, "floor lamp": 700.0,
+}  # fmt: skip
+"""Mass over the volume of the closed mesh [kg/m³]. Boards and legs are wood (450 to 700); what is
+upholstered is mostly foam, and a cabinet's mesh is full where it is hollow: there the values
+give usual weights (a sofa for two 45 kg, a wardrobe 80 kg)."""
+OTHER = 250.0
+LEAST = 0.05  # [kg]
+FRICTION = (0.8, 0.005, 0.0001)  # wood on wood or carpet; slip, spin, roll
+AXES = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+"""From +y up to +z up."""
 
 
 def sliced(
-    verts: NDArray[np.float64], faces: NDArray[np.int64], concavity: float, most: int
+    verts: NDArray[np.float64], faces: NDArray[np.int64]
 ) -> tuple[list[NDArray[np.float64]], float]:
     """Points of convex parts of a closed mesh, and what their hulls add, as a share of its volume.
 
     The part whose hull is the most too large is cut by the plane that leaves the smallest hulls,
-    until all that hulls add is a share `concavity` of the volume, or there are `most` parts.
+    until all that hulls add is a share `HOLLOW` of the volume, or there are `MOST` parts.
     """
     import manifold3d
 
@@ -52,28 +64,19 @@ def sliced(
     solid = manifold3d.Manifold(mesh)
     if solid.is_empty():
         return [verts], float("inf")
-    total, order = solid.volume(), count()
-
-    def excess(rows: list[tuple[float, int, Any]]) -> float:
-        return -sum(row[0] for row in rows)
-
-    heap: list[tuple[float, int, Any]] = []
-    done: list[Any] = []
-    for part in solid.decompose():
-        heapq.heappush(heap, (-_excess(part), next(order), part))
-    while heap and len(heap) + len(done) < most and excess(heap) > concavity * total:
-        _, _, worst = heapq.heappop(heap)
+    total, done = solid.volume(), list[Any]()
+    parts = [(_excess(part), part) for part in solid.decompose()]
+    while parts and len(parts) + len(done) < MOST and sum(e for e, _ in parts) > HOLLOW * total:
+        _, worst = parts.pop(max(range(len(parts)), key=lambda k: parts[k][0]))
         halves = _best_cut(worst)
         if halves is None:
             done.append(worst)
             continue
-        for half in halves:
-            for part in half.decompose():
-                if part.volume() > SMALLEST * total:
-                    heapq.heappush(heap, (-_excess(part), next(order), part))
-    parts = [*done, *(part for _, _, part in heap)]
-    clouds = [np.array(part.to_mesh64().vert_properties[:, :3]) for part in parts]
-    return clouds, sum(_excess(part) for part in parts) / total
+        pieces = [part for half in halves for part in half.decompose()]
+        parts += [(_excess(part), part) for part in pieces if part.volume() > SMALLEST * total]
+    done += [part for _, part in parts]
+    clouds = [np.array(part.to_mesh64().vert_properties[:, :3]) for part in done]
+    return clouds, sum(_excess(part) for part in done) / total
 
 
 def _excess(part: Any) -> float:  # noqa: ANN401
@@ -106,12 +109,6 @@ def _edges(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return inner[np.linspace(0, len(inner) - 1, PLANES).round().astype(int)]
 
 
-# The parts, by the method that fits.
-
-
-THINNEST = 0.001  # [m], of a convex part; flatter ones are thickened
-
-
 @dataclass(frozen=True)
 class ConvexConfig:
     """How furniture is cut into convex parts."""
@@ -119,10 +116,6 @@ class ConvexConfig:
     method: Literal["best", "coacd", "slices"] = "best"
     """slices: cuts along the axes by manifold3d, exact for boards; coacd: any shape, slower; best:
     coacd where slices leave hollows."""
-    concavity: Annotated[float, float_in(0.01, 1)] = 0.04
-    """How hollow a part may be, as a share of the object's size (coacd) or volume (slices)."""
-    most: Annotated[int, int_in(1, 1000)] = 24
-    """Parts of one object."""
 
 
 @record
@@ -165,43 +158,34 @@ def cut_into_convex(
     verts = inputs.mesh.verts.double().numpy()
     faces = inputs.mesh.faces.numpy()
     solid = trimesh.Trimesh(verts, faces, process=False)
-    whole = _hull(verts)
-    if whole.volume - solid.volume < 0.01 * whole.volume:
-        clouds = [verts]
-    else:
-        clouds = _cut(verts, faces, config)
-    hulls = [_hull(cloud) for cloud in clouds]
+    whole, method = _hull(verts), config.method
+    clouds, excess = [verts], 0.0
+    if whole.volume - solid.volume >= 0.01 * whole.volume:
+        if method != "coacd":
+            clouds, excess = sliced(verts, faces)
+        if method == "coacd" or (method == "best" and excess > HOLLOW):
+            clouds = _by_coacd(verts, faces)
     return Convex(
-        tuple(_mesh_of(hull) for hull in hulls if hull.volume > 0),
+        tuple(
+            Mesh(torch.from_numpy(np.array(hull.vertices)), torch.from_numpy(np.array(hull.faces)))
+            for hull in map(_hull, clouds)
+            if hull.volume > 0
+        ),
         float(solid.volume),
         torch.from_numpy(np.array(solid.center_mass)),
         torch.from_numpy(np.array(solid.moment_inertia)),
     )
 
 
-def _cut(
-    verts: NDArray[np.float64], faces: NDArray[np.int64], config: ConvexConfig
-) -> list[NDArray[np.float64]]:
-    """Points of each convex part."""
-    if config.method == "coacd":
-        return _by_coacd(verts, faces, config)
-    clouds, excess = sliced(verts, faces, config.concavity, config.most)
-    if config.method == "best" and excess > config.concavity:
-        return _by_coacd(verts, faces, config)
-    return clouds
-
-
-def _by_coacd(
-    verts: NDArray[np.float64], faces: NDArray[np.int64], config: ConvexConfig
-) -> list[NDArray[np.float64]]:
+def _by_coacd(verts: NDArray[np.float64], faces: NDArray[np.int64]) -> list[NDArray[np.float64]]:
     """Approximate convex decomposition (Wei et al. 2022)."""
     import coacd  # pyright: ignore[reportMissingImports]
 
     coacd.set_log_level("error")
     parts = coacd.run_coacd(
         coacd.Mesh(verts, faces.astype(np.int32)),
-        threshold=config.concavity,
-        max_convex_hull=config.most,
+        threshold=HOLLOW,
+        max_convex_hull=MOST,
         preprocess_mode="off",
         mcts_iterations=60,
         mcts_nodes=15,
@@ -215,48 +199,18 @@ def _hull(points: NDArray[np.float64]) -> Any:  # noqa: ANN401
     import trimesh
     from scipy.spatial import ConvexHull, QhullError
 
-    for grow in (0.0, THINNEST):
-        cloud = points
-        if grow:
-            corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, 8).T
-            cloud = (points[:, None] + grow * corners).reshape(-1, 3)
-        try:
-            found = ConvexHull(cloud)
-        except QhullError:
-            continue
-        if grow or 2 * found.volume > THINNEST * found.area / 2:
-            break
-    else:
-        raise AssertionError("a thickened cloud has a hull")
+    try:
+        found = ConvexHull(points)
+    except QhullError:
+        found = None
+    if found is None or 2 * found.volume <= THINNEST * found.area / 2:
+        corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, 8).T
+        points = (points[:, None] + THINNEST * corners).reshape(-1, 3)
+        found = ConvexHull(points)
     kept, faces = np.unique(found.simplices, return_inverse=True)
-    shape = trimesh.Trimesh(cloud[kept], faces.reshape(-1, 3), process=False)
+    shape = trimesh.Trimesh(points[kept], faces.reshape(-1, 3), process=False)
     shape.fix_normals()
     return shape
-
-
-def _mesh_of(shape: Any) -> Mesh:  # noqa: ANN401
-    return Mesh(
-        torch.from_numpy(np.array(shape.vertices, np.float64)),
-        torch.from_numpy(np.array(shape.faces, np.int64)),
-    )
-
-
-# Mass and inertia.
-
-
-DENSITY = {
-    "chair": 500.0, "stool": 450.0, "bench": 450.0, "table": 450.0, "desk": 400.0,
-    "coffee table": 400.0, "office chair": 250.0, "armchair": 90.0, "sofa": 80.0, "bed": 90.0,
-    "shelf": 450.0, "cabinet": 170.0, "wardrobe": 120.0, "nightstand": 200.0, "floor lamp": 700.0,
-}  # fmt: skip
-"""Mass over the volume of the closed mesh [kg/m³]. Boards and legs are wood (450 to 700); what is
-upholstered is mostly foam, and a cabinet's mesh is full where it is hollow: there the values
-give usual weights (a sofa for two 45 kg, a wardrobe 80 kg)."""
-OTHER = 250.0
-LEAST = 0.05  # [kg]
-FRICTION = (0.8, 0.005, 0.0001)  # wood on wood or carpet; slip, spin, roll
-AXES = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-"""From +y up to +z up."""
 
 
 @record
@@ -265,7 +219,7 @@ class Solid:
 
     id: str
     category: str
-    place: Float[Tensor, "3"]
+    position: Float[Tensor, "3"]
     """Of the mesh's origin; the floor is at zero [m]."""
     yaw: float
     """About +z [rad]."""
@@ -282,7 +236,7 @@ class Solid:
 
 
 def floor_height(scene: Scene) -> float:
-    """Height of the floor, or of the lowest thing where no floor is known [m]."""
+    """Height of the floor, or of the lowest point where no floor is known [m]."""
     if scene.ground is not None:
         return scene.ground
     lows = [float(place_object(p).verts[p.mesh.faces.unique(), 1].min()) for p in scene.objects]
@@ -297,15 +251,15 @@ def solids_of(scene: Scene, run: Run) -> tuple[Solid, ...]:
 
 def _solid(item: SceneObject, convex: Convex, floor: float) -> Solid:
     scale = item.scale.detach().cpu().double()
-    place = AXES @ item.t_world_object.detach().cpu().double()
-    place = place - torch.tensor([0.0, 0.0, floor], dtype=torch.float64)
+    position = AXES @ item.t_world_object.detach().cpu().double()
+    position = position - torch.tensor([0.0, 0.0, floor], dtype=torch.float64)
     volume = abs(convex.volume) * float(scale.prod())
     mass = max(LEAST, volume * DENSITY.get(canonical(item.category), OTHER))
     inertia = AXES @ _stretched(convex.inertia, scale) @ AXES.mT * mass / max(volume, 1e-9)
     return Solid(
         id=item.id,
         category=item.category,
-        place=place,
+        position=position,
         yaw=float(item.yaw),
         free=item.support != "free",
         hulls=tuple(Mesh(h.verts.double() * scale @ AXES.mT, h.faces) for h in convex.hulls),
@@ -319,7 +273,7 @@ def moved_to(solid: Solid, item: SceneObject, frame: int) -> Solid:
     """The solid of an object where that stands in a frame."""
     there = placed_at(item, frame)
     way = AXES @ (there.t_world_object - item.t_world_object).detach().cpu().double()
-    return dataclasses.replace(solid, place=solid.place + way, yaw=float(there.yaw))
+    return dataclasses.replace(solid, position=solid.position + way, yaw=float(there.yaw))
 
 
 def _stretched(inertia: Float[Tensor, "3 3"], scale: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
@@ -335,20 +289,3 @@ def _physical(inertia: Float[Tensor, "3 3"], mass: float) -> Float[Tensor, "3 3"
     spread = (values.sum() / 2 - values).clamp_min(mass * 1e-4 / 5)
     values = spread.sum() - spread
     return axes @ torch.diag(values) @ axes.mT
-
-
-# Numbers and meshes as text.
-
-
-def numbers(values: Iterable[float]) -> str:
-    """Decimals with a space between them."""
-    return " ".join(f"{value:.8g}" for value in values)
-
-
-def mesh_bytes(mesh: Mesh) -> bytes:
-    """A mesh as Wavefront OBJ: vertices and triangles."""
-    import trimesh
-    from trimesh.exchange.obj import export_obj
-
-    shape = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)
-    return export_obj(shape, include_normals=False, header="").encode()

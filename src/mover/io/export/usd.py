@@ -1,70 +1,92 @@
 """scene.usdc: metres, objects with looks and physics, floor, camera, people over time."""
 
+from hashlib import sha256
+from importlib import import_module
+from importlib.util import find_spec
+from io import BytesIO
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from mover.core.colours import Colour, colour
+from mover.core.colours import Colour, colour, person_colour
+from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.run import Run
-from mover.core.types import Camera, SceneObject
+from mover.core.types import Bodies, Camera, SceneObject
 from mover.geometry.camera import NEAR
-from mover.io.export.finished import BodyForm, Exported, Finished, Up
-from mover.io.export.people import FPS, tracks_of
-from mover.io.export.posed import Skinned, bones_for
-from mover.io.export.scene_glb import FLOOR_COLOUR, floor_of, parts_of, view_matrix
+from mover.io.export.finished import (
+    BodyForm,
+    Exported,
+    Finished,
+    Track,
+    Up,
+    clock_of,
+    keyframes,
+    tracks_of,
+    visible_spans,
+)
+from mover.io.export.scene_glb import FLOOR_COLOUR, floor_of, linear, parts_of, view_matrix
 from mover.io.export.solids import AXES, FRICTION, Solid, floor_height, solids_of
-from mover.io.export.usd_mesh import Prim, Stage, add_look, add_mesh, free_path, pxr
-from mover.io.export.usd_people import INFLUENCES, add_moving_mesh, add_skeleton
 
 GRAVITY = 9.81  # [m/s²]
 CONVEX = (0.55, 0.75, 0.9)
 """Colour of convex parts, which are drawn only where guides are asked for."""
 APERTURE = 20.955  # width of the film [tenths of a scene unit by USD's custom: mm]
 FAR = 1000.0  # [m]
+TOLERANCE = 0.002  # [m], of the straight lines between two samples of time
+MOST = 100_000  # samples of time
+Stage = Any
+"""A file of OpenUSD, whose Python modules have no types and fill themselves when imported."""
+Prim = Any
+"""A node in it, or the schema that defines it."""
+
+
+def pxr(name: str) -> Any:  # noqa: ANN401
+    """The module `pxr.<name>`.
+
+    Raises:
+        InputError: If usd-core is not installed.
+    """
+    if find_spec("pxr") is None:
+        raise InputError(
+            "--to usd: usd-core is not installed; pip install '.[usd]' in mover's folder"
+        )
+    return import_module(f"pxr.{name}")
 
 
 def export_usd(finished: Finished, folder: Path, body: BodyForm = "auto", up: Up = "y") -> Exported:
     """Write the room as one binary USD file.
 
     Each object is a rigid body (translation and turn) with two children: `visual`, the meshes of
-    the user's file at their size, and `collision`, convex parts. People are skeletons with
-    animation where the parameters of their bodies are known, else meshes with samples of time.
+    the user's file at their size, and `collision`, convex parts. People are meshes with samples of
+    time.
 
     Args:
         finished: The result; its folder keeps the convex parts.
         folder: Where `scene.usdc` goes.
-        body: How people move: on bones (skin), as meshes (morph), not at all (none), or on bones
-            where the parameters are known (auto).
+        body: none: without people.
         up: y: the world of scene.json; z: turned, with the floor at 0, as simulators have it.
 
     Raises:
-        InputError: If usd-core is not installed, or bones are asked for and there are none.
+        InputError: If usd-core is not installed.
     """
-    skin, bodies = bones_for(finished, body, INFLUENCES), finished.bodies
+    bodies = None if body == "none" else finished.bodies
     path = folder / "scene.usdc"
     with replacing(path) as part:
         part.unlink()
         stage = pxr("Usd").Stage.CreateNew(str(part))
         _head(stage, finished, up)
         _add_scene(stage, finished, folder)
-        for track in () if bodies is None or body == "none" else tracks_of(bodies):
+        for track in [] if bodies is None else tracks_of(bodies):
             assert bodies is not None
-            if isinstance(skin, Skinned):
-                add_skeleton(stage, skin, bodies, track)
-            else:
-                add_moving_mesh(stage, bodies, track)
+            _add_person(stage, bodies, track)
         stage.GetRootLayer().Save()
-    if bodies is None or body == "none":
-        return Exported((path,), ("no people",))
-    if isinstance(skin, Skinned):
-        said = f"people are skeletons, at most {1e3 * skin.miss:.0f} mm off the result"
-        return Exported((path,), (said,))
-    why = () if body == "morph" else (f"people are moving meshes, not skeletons: {skin}",)
-    said = "people's meshes move in straight lines between samples, 2 mm off"
-    return Exported((path,), (*why, said))
+    moving = "people's meshes move in straight lines between samples, 2 mm off"
+    return Exported((path,), ("no people" if bodies is None else moving,))
 
 
 def _head(stage: Stage, finished: Finished, up: Up) -> None:
@@ -82,9 +104,10 @@ def _head(stage: Stage, finished: Finished, up: Up) -> None:
         room.AddRotateXOp(double).Set(90.0)
     bodies = finished.bodies
     if bodies is not None:
-        stage.SetTimeCodesPerSecond(bodies.fps or FPS)
-        stage.SetFramesPerSecond(bodies.fps or FPS)
-        stage.SetStartTimeCode(int(bodies.frame.min()))
+        first, fps = clock_of(bodies)
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetFramesPerSecond(fps)
+        stage.SetStartTimeCode(first)
         stage.SetEndTimeCode(int(bodies.frame.max()))
 
 
@@ -146,7 +169,22 @@ def _add_camera(stage: Stage, camera: Camera) -> None:
     view.Set(Gf.Matrix4d(view_matrix(camera).T.tolist()))
 
 
-# Physics.
+def _add_person(stage: Stage, bodies: Bodies, track: Track) -> None:
+    """A mesh with samples of time, straight lines between them, hidden where not visible."""
+    UsdGeom, TimeCode = pxr("UsdGeom"), pxr("Usd").TimeCode
+    verts = bodies.verts[track.rows].detach().cpu().float()
+    path = free_path(stage, "/room", f"person_{track.person}")
+    tint = person_colour(track.person)
+    mesh = add_mesh(stage, path, verts[0].numpy(), bodies.faces.cpu().numpy(), tint)
+    for key in keyframes(verts, track.time, TOLERANCE, MOST)[0]:
+        set_points(mesh, verts[key].numpy(), TimeCode(float(track.frame[key])))
+    visible, (first, fps) = mesh.CreateVisibilityAttr(), clock_of(bodies)
+    for start, end in visible_spans(track):
+        if start > 0:
+            visible.Set(UsdGeom.Tokens.invisible, float(first))
+        visible.Set(UsdGeom.Tokens.inherited, first + round(start * fps))
+        if end < track.last:
+            visible.Set(UsdGeom.Tokens.invisible, first + round(end * fps) + 1)
 
 
 def _add_laws(stage: Stage) -> Prim:
@@ -185,14 +223,7 @@ def _add_floor(stage: Stage, height: float, wood: Prim) -> None:
 
 
 def _add_solid(stage: Stage, body: Prim, solid: Solid, wood: Prim) -> None:
-    """Make a transform a rigid body with convex parts, apart from what is drawn.
-
-    Args:
-        stage: The file.
-        body: Its transform: a translation and a turn, so that the parts have no scale of their own.
-        solid: Its parts in the simulator's axes.
-        wood: The material of their surfaces.
-    """
+    """Make a transform without scale a rigid body with convex parts, apart from what is drawn."""
     Gf, UsdGeom, UsdPhysics = pxr("Gf"), pxr("UsdGeom"), pxr("UsdPhysics")
     if solid.free:
         UsdPhysics.RigidBodyAPI.Apply(body)
@@ -213,3 +244,96 @@ def _add_solid(stage: Stage, body: Prim, solid: Solid, wood: Prim) -> None:
         shape = UsdPhysics.MeshCollisionAPI.Apply(part)
         shape.CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
         _collide(part, wood)
+
+
+def free_path(stage: Stage, parent: str, name: str) -> str:
+    """A path that USD allows and that nothing has yet."""
+    path = f"{parent}/{pxr('Tf').MakeValidIdentifier(name)}"
+    while stage.GetPrimAtPath(path):
+        path += "_"
+    return path
+
+
+def add_mesh(
+    stage: Stage, path: str, verts: NDArray[Any], faces: NDArray[Any], tint: Colour
+) -> Prim:
+    """Triangles of one colour, without a subdivision."""
+    UsdGeom, Vt = pxr("UsdGeom"), pxr("Vt")
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateDoubleSidedAttr(True)
+    flat = np.ascontiguousarray(faces, np.int32).reshape(-1)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(flat))
+    set_points(mesh, verts, pxr("Usd").TimeCode.Default())
+    mesh.CreateDisplayColorAttr([tint])
+    return mesh
+
+
+def set_points(mesh: Prim, points: NDArray[Any], time: Any) -> None:  # noqa: ANN401
+    """Vertices and extent at a time of USD."""
+    Vt, points = pxr("Vt"), np.ascontiguousarray(points, np.float32)
+    mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(points), time)
+    extent = np.stack([points.min(0), points.max(0)])
+    mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent), time)
+
+
+def add_look(stage: Stage, mesh: Prim, part: Any, folder: Path) -> None:  # noqa: ANN401
+    """Give a mesh the material of a trimesh part: its texture or colour, or colours of vertices."""
+    from trimesh.visual import ColorVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    Gf, Sdf, UsdShade, UsdGeom, Vt = (
+        pxr(name) for name in ("Gf", "Sdf", "UsdShade", "UsdGeom", "Vt")
+    )
+    kinds, vertex = Sdf.ValueTypeNames, UsdGeom.Tokens.vertex
+    if isinstance(part.visual, ColorVisuals):
+        share = np.asarray(part.visual.vertex_colors)[:, :3] / 255
+        light = np.array([linear((r, g, b)) for r, g, b in share.tolist()], np.float32)
+        mesh.CreateDisplayColorPrimvar(vertex).Set(Vt.Vec3fArray.FromNumpy(light))
+        return
+    material, uv = part.visual.material, part.visual.uv
+    plain = material if isinstance(material, PBRMaterial) else material.to_pbr()
+    rgba = plain.baseColorFactor
+    tint = [1.0, 1.0, 1.0] if rgba is None else [float(c) / 255 for c in np.asarray(rgba)[:3]]
+    home = mesh.GetPath().AppendChild("look")
+    look = UsdShade.Material.Define(stage, home)
+
+    def shader(name: str, kind: str, **inputs: tuple[Any, Any]) -> Prim:
+        made = UsdShade.Shader.Define(stage, home.AppendChild(name))
+        made.CreateIdAttr(kind)
+        for key, (form, value) in inputs.items():
+            made.CreateInput(key, form).Set(value)
+        return made
+
+    surface = shader(
+        "surface", "UsdPreviewSurface", diffuseColor=(kinds.Color3f, Gf.Vec3f(*tint)),
+        roughness=(kinds.Float, 0.9),
+    )  # fmt: skip
+    look.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(look)
+    if plain.baseColorTexture is None or uv is None or len(uv) != len(part.vertices):
+        return
+    corners = np.ascontiguousarray(np.asarray(uv)[:, :2], np.float32)  # from the lower left corner
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", kinds.TexCoord2fArray, vertex)
+    primvar.Set(Vt.Vec2fArray.FromNumpy(corners))
+    reader = shader("uv", "UsdPrimvarReader_float2", varname=(kinds.String, "st"))
+    file = Sdf.AssetPath(_save_picture(plain.baseColorTexture, folder))
+    texture = shader(
+        "picture", "UsdUVTexture", file=(kinds.Asset, file),
+        scale=(kinds.Float4, Gf.Vec4f(*tint, 1.0)),
+        wrapS=(kinds.Token, "repeat"), wrapT=(kinds.Token, "repeat"),
+    )  # fmt: skip
+    texture.CreateInput("st", kinds.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
+    texture.CreateOutput("rgb", kinds.Float3)
+    surface.GetInput("diffuseColor").ConnectToSource(texture.ConnectableAPI(), "rgb")
+
+
+def _save_picture(picture: Any, folder: Path) -> str:  # noqa: ANN401
+    """Write a texture beside the scene, once for each content; its relative path."""
+    stream = BytesIO()
+    picture.convert("RGBA" if "A" in picture.getbands() else "RGB").save(stream, "PNG")
+    name = f"textures/{sha256(stream.getvalue()).hexdigest()[:16]}.png"
+    with replacing(folder / name) as part:
+        part.write_bytes(stream.getvalue())
+    return f"./{name}"
