@@ -139,6 +139,11 @@ def under(other: np.ndarray, true: dict) -> np.ndarray:
     return np.concatenate([flat, depth[:, None]], 1) - middle
 
 
+def rolled(vector: np.ndarray, angle: float) -> np.ndarray:
+    """A root in a world that turns about its x axis."""
+    return (Rotation.from_rotvec([angle, 0, 0]) * Rotation.from_rotvec(vector)).as_rotvec()
+
+
 def matrices(vectors: np.ndarray) -> np.ndarray:
     flat = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
     return flat.reshape(*vectors.shape[:-1], 3, 3)
@@ -206,20 +211,8 @@ def write_wham(folder: Path) -> Path:
     return dump(results, folder / "wham_output.pkl")
 
 
-def write_wham_python(folder: Path) -> Path:
-    given = wham_person()
-    angles = given["pose"].reshape(-1, 24, 3)
-    data = {
-        "poses_body": matrices(angles[:, 1:]), "poses_root_cam": matrices(angles[:, :1]),
-        "poses_root_world": matrices(given["pose_world"].reshape(-1, 24, 3)[:, :1]),
-        "trans_world": given["trans_world"], "verts_cam": given["verts"],
-        "betas": given["betas"], "frame_id": FRAMES,
-    }  # fmt: skip
-    return dump({TRACK: data}, folder / "wham_output.pkl", compress=3)
-
-
-def write_pare(folder: Path, keys=("pred_cam", "bboxes")) -> Path:
-    """A square about the person; s, p, q by weak perspective of the place."""
+def pare_person() -> dict:
+    """A square about the person; s, p, q by weak perspective of the position."""
     true = person("smpl")
     t = true["transl"]
     low, high = true["pixels"].min(1), true["pixels"].max(1)
@@ -228,7 +221,7 @@ def write_pare(folder: Path, keys=("pred_cam", "bboxes")) -> Path:
     offset = t[:, :2] - 2 * (middle - K[:2, 2]) / (size * side)[:, None]
     half = np.array([WIDTH, HEIGHT]) / 2
     scale = K[0, 0] / t[:, 2:] / half
-    data = {
+    return {
         "pred_cam": np.concatenate([size[:, None], offset], 1),
         "bboxes": np.concatenate([middle, side[:, None], side[:, None]], 1),
         "orig_cam": np.concatenate([scale, (pixels(t) / half - 1) / scale], 1),
@@ -236,23 +229,24 @@ def write_pare(folder: Path, keys=("pred_cam", "bboxes")) -> Path:
         "verts": true["verts"] - t[:, None], "pose": matrices(true["angles"]),
         "betas": true["betas"], "frame_ids": FRAMES, "joints2d": None,
     }  # fmt: skip
-    other = {"pred_cam", "bboxes", "orig_cam", "joints3d", "smpl_joints2d"} - set(keys)
-    data = {k: v for k, v in data.items() if k not in other}
-    return dump({TRACK: data}, folder / "pare_output.pkl")
 
 
-def write_pare_pixels(folder: Path) -> Path:
-    return write_pare(folder, ("joints3d", "smpl_joints2d"))
-
-
-def write_pare_image(folder: Path) -> Path:
-    return write_pare(folder, ("orig_cam",))
+def write_pare(folder: Path) -> Path:
+    return dump({TRACK: pare_person()}, folder / "pare_output.pkl")
 
 
 def write_vibe(folder: Path) -> Path:
-    """As VIBE's demo.py: no joints in space."""
-    path = write_pare(folder, ("pred_cam", "bboxes", "orig_cam"))
-    return path.rename(folder / "vibe_output.pkl")
+    return dump({TRACK: pare_person()}, folder / "vibe_output.pkl")
+
+
+def write_pare_images(folder: Path) -> Path:
+    """One pickle an image, with a row a person."""
+    given = pare_person()
+    names = {"pose": "pred_pose", "betas": "pred_shape", "orig_cam": "orig_cam"}
+    for k, frame in enumerate(FRAMES):
+        rows = {new: given[old][k : k + 1] for old, new in names.items()}
+        dump(rows, folder / f"img_{frame:06d}.pkl")
+    return folder
 
 
 def write_phalp(folder: Path) -> Path:
@@ -434,11 +428,10 @@ def store(value, path: Path) -> Path:
 
 BODIES = {
     "4dhumans": write_phalp, "amass": write_amass, "amass:smplx": write_amass_x, "gem": write_gem,
-    "gvhmr": write_gvhmr, "pare": write_pare, "pare:pixels": write_pare_pixels,
-    "pare:image": write_pare_image, "phalp": write_phalp, "prompthmr": write_prompthmr,
+    "gvhmr": write_gvhmr, "pare": write_pare, "pare:images": write_pare_images,
+    "phalp": write_phalp, "prompthmr": write_prompthmr,
     "prox": write_prox, "sam3dbody": write_sam3dbody, "slahmr": write_slahmr,
     "smplifyx": write_smplifyx, "tram": write_tram, "vibe": write_vibe, "wham": write_wham,
-    "wham:python": write_wham_python,
 }  # fmt: skip
 
 # The joints of the skeleton that show where a detector's points are.

@@ -1,4 +1,4 @@
-"""People from today's tools: joints fall on their pixels, up stays up, left stays left."""
+"""People from today's tools: joints fall on their pixels, left stays left."""
 
 import json
 import os
@@ -27,7 +27,7 @@ from mover.io.capture.camera_file import camera_of
 from mover.io.capture.pose_file import into_camera
 from mover.io.files.fields import At
 from mover.io.formats import names
-from mover.io.people.bodies import attitude, bodies_from, camera_from, in_world
+from mover.io.people.bodies import bodies_from
 from mover.io.people.found import Known
 from mover.io.people.keypoints import keypoints_from, read_keypoints, write_keypoints
 
@@ -44,7 +44,6 @@ class Case:
     needed: str
     """A field without which they are refused."""
     model: str = "smpl"
-    gravity: bool = False
     gapless: bool = False
     """Its rows are all frames of a video."""
     focal: float | None = None
@@ -56,16 +55,14 @@ CASES = {
     "4dhumans": Case("body_pose", focal=25000), "phalp": Case("smpl", focal=25000),
     "amass": Case("poses", "smplh", gapless=True),
     "amass:smplx": Case("trans", "smplx", gapless=True),
-    "gem": Case("body_params_incam", "smplx", gravity=True, gapless=True, focal=DIAGONAL),
-    "gvhmr": Case("transl", "smplx", gravity=True, gapless=True, focal=DIAGONAL),
-    "pare": Case("pose"), "pare:pixels": Case("joints3d"), "pare:image": Case("orig_cam"),
-    "vibe": Case("betas"),
-    "prompthmr": Case("trans", "smplx", gravity=True, focal=1500),
+    "gem": Case("body_params_incam", "smplx", gapless=True, focal=DIAGONAL),
+    "gvhmr": Case("transl", "smplx", gapless=True, focal=DIAGONAL),
+    "pare": Case("pose"), "pare:images": Case("orig_cam"), "vibe": Case("betas"),
+    "prompthmr": Case("trans", "smplx", focal=1500),
     "prox": Case("global_orient", "smplx"), "smplifyx": Case("body_pose", "smplx", focal=5000),
-    "sam3dbody": Case("pred_cam_t", "smplx"), "slahmr": Case("pose_body", "smplh", gravity=True),
-    "tram": Case("pred_trans", gravity=True, focal=900),
-    "wham": Case("betas", gravity=True, focal=DIAGONAL),
-    "wham:python": Case("poses_body", gravity=True, focal=DIAGONAL),
+    "sam3dbody": Case("pred_cam_t", "smplx"), "slahmr": Case("pose_body", "smplh"),
+    "tram": Case("pred_trans", focal=900),
+    "wham": Case("betas", focal=DIAGONAL),
 }  # fmt: skip
 
 
@@ -161,9 +158,6 @@ def test_bodies_are_right_upright_and_not_mirrored_and_read_again(tool, tmp_path
     assert (bodies.pose is None) == (tool == "sam3dbody")
     if bodies.pose is not None:
         check_parameters(bodies, case.model)
-    assert (found.up is not None) == case.gravity
-    if case.gravity:
-        check_gravity(found, case.model)
     write_bodies(bodies, tmp_path / "bodies.npz")
     again = read_bodies(tmp_path / "bodies.npz", lambda _: None)
     assert torch.equal(again.verts, bodies.verts)
@@ -180,17 +174,6 @@ def check_parameters(bodies, model):
     assert np.linalg.norm(off, axis=-1).max() < 1
     assert bodies.joints is not None
     assert torch.allclose(joints, bodies.joints, atol=2e-3)
-
-
-def check_gravity(found, model):
-    """It is the camera's pitch and roll, and puts the bodies upright."""
-    assert attitude(found.up) == pytest.approx((made.PITCH, made.ROLL), abs=1e-3)
-    world = in_world(found, "file")
-    expected = made.person(model)["verts"] @ made.camera_matrix()
-    _, owner, _ = made.flesh(model)
-    assert world.space == "world"
-    assert np.abs(world.verts.numpy() - expected)[:, owner < 22].max() < 0.01
-    assert np.allclose(camera_from(found, KNOWN).R_cam_world, made.camera_matrix(), atol=1e-3)
 
 
 def load(path: Path) -> Any:
@@ -327,30 +310,6 @@ def test_tracks_of_slahmr_are_those_that_its_side_file_names(tmp_path):
     assert found.bodies.person.tolist() == [12] * 5
 
 
-def test_meshes_about_the_pelvis_give_transl_its_shift(tmp_path):
-    data = made.wham_person()
-    data["trans"] = data["trans"] + [0.0, 0.3, 0.0]  # parameters count from another origin
-    bodies = bodies_from("wham", made.dump({1: data}, tmp_path / "w.pkl"), KNOWN).bodies
-    assert bodies.pose is not None
-    verts, _ = Toy("smpl").posed(bodies.pose)
-    assert torch.allclose(verts, bodies.verts, atol=2e-3)
-
-
-def test_parameters_that_are_not_of_the_meshes_are_left_out(tmp_path):
-    data = made.wham_person()
-    data["pose"][:, 48] += 0.5
-    found = bodies_from("wham", made.dump({1: data}, tmp_path / "w.pkl"), KNOWN)
-    assert found.bodies.pose is None
-    assert any("miss the vertices" in warning for warning in found.warnings)
-
-
-def test_meshes_of_another_topology_are_refused(tmp_path):
-    data = made.wham_person()
-    data["verts"] = data["verts"][:, :-10]
-    with pytest.raises(InputError, match=r"verts.*20670"):
-        bodies_from("wham", made.dump({1: data}, tmp_path / "w.pkl"), KNOWN)
-
-
 def test_two_people_keep_their_tracks_though_each_image_lists_them_in_another_order(
     tmp_path, faces
 ):
@@ -371,13 +330,20 @@ def test_the_lens_follows_from_joints_where_the_focal_length_is_missing(tmp_path
     assert np.allclose(found.K, made.lens(1400), atol=0.5)
 
 
-def test_a_moving_camera_is_told(tmp_path):
+def test_a_moving_camera_is_named(tmp_path):
+    """By its path where the tool knows it, else by its gravity."""
     folder = made.write_tram(tmp_path)
     camera = np.load(folder / "camera.npy", allow_pickle=True).item()
     camera["world_cam_T"] = camera["world_cam_T"] + np.linspace(0, 1, 7)[:, None]
     np.save(folder / "camera.npy", camera, allow_pickle=True)
-    found = bodies_from("tram", folder, KNOWN)
-    assert any("travels 1.73 m" in warning for warning in found.warnings)
+    (warning,) = bodies_from("tram", folder, KNOWN).warnings
+    assert "turns by up to 0.0 degrees and travels 1.73 m" in warning
+    data = made.wham_person()
+    for k in range(5):  # the camera rolls
+        data["pose_world"][k, :3] = made.rolled(data["pose_world"][k, :3], 0.1 * k)
+    path = made.dump({1: data}, tmp_path / "wham_output.pkl")
+    (warning,) = bodies_from("wham", path, KNOWN).warnings
+    assert "its gravity turns by 0.2" in warning
 
 
 def test_a_model_file_in_the_true_format_gives_meshes_and_keeps_flat_hands(tmp_path, monkeypatch):
@@ -409,88 +375,90 @@ def test_a_model_file_in_the_true_format_gives_meshes_and_keeps_flat_hands(tmp_p
     assert torch.allclose(again.pose.transl, pose.transl, atol=1e-4)
 
 
-# What is wrong is told with its file, its key and the keys that are there.
+# What is wrong is named with its file, its key and the keys that are there.
 
 
-def smplify_file(folder: Path, change: Any = None) -> Path:
-    data = {**made.smplx_parts(0), "camera_translation": np.array([[0, 0, 3.0]])}
-    return made.store(change(data) if change else data, folder / "000.pkl")
+def smplify_file(folder: Path, **changed: Any) -> Path:
+    data = {**made.smplx_parts(0), "camera_translation": np.array([[0, 0, 3.0]]), **changed}
+    kept = {key: value for key, value in data.items() if value is not None}
+    return made.store(kept, folder / "000.pkl")
 
 
-def without(*names: str):
-    return lambda data: {k: v for k, v in data.items() if k not in names}
+def wham_file(folder: Path, **changed: Any) -> Path:
+    return made.dump({"7": {**made.wham_person(), **changed}}, folder / "wham_output.pkl")
+
+
+def tram_without_rotations(folder: Path) -> Path:
+    track = made.write_tram(folder) / "hps" / "hps_track_0.npy"
+    data = np.load(track, allow_pickle=True).item()
+    np.save(track, {**data, "pred_rotmat": data["pred_rotmat"] * 1.2}, allow_pickle=True)
+    return folder
+
+
+def of_objects(folder: Path) -> Path:
+    np.savez(folder / "a_world_results.npz", trans=np.array([{"a": 1}], dtype=object))
+    return folder
+
+
+def strange(folder: Path) -> Path:
+    return made.store({"one": {"strange": np.zeros(3)}}, folder / "some.pkl")
+
+
+TWICE, NAN = np.array([0, 1, 1, 2, 3]), np.full((1, 3), np.nan)
+REFUSED = {
+    "a missing key": ("smplifyx", lambda folder: smplify_file(folder, body_pose=None), KNOWN,
+                      r"000\.pkl.*'body_pose'.*found 'betas', 'global_orient'"),
+    "a code of VPoser": ("smplifyx", lambda f: smplify_file(f, body_pose=np.zeros((1, 32))), KNOWN,
+                         r"32 numbers, expected 63 angles: .*VPoser"),
+    "only NaN": ("smplifyx", lambda folder: smplify_file(folder, global_orient=NAN), KNOWN,
+                 "only rows with NaN"),
+    "a gender": ("smplifyx", lambda folder: smplify_file(folder, gender="some"), KNOWN,
+                 "gender.*one of neutral, female, male"),
+    "a person twice": ("wham", lambda folder: wham_file(folder, frame_ids=TWICE), KNOWN,
+                       "person 7 twice in frame 1"),
+    "a negative frame": ("wham", lambda f: wham_file(f, frame_ids=TWICE - 1), KNOWN,
+                         "frames are numbered from -1"),
+    "no rotations": ("tram", tram_without_rotations, KNOWN, "expected rotation matrices"),
+    "objects in an npz": ("slahmr", of_objects, KNOWN, r"'trans' .*no pickled objects"),
+    "no triangles": ("sam3dbody", made.write_sam3dbody, KNOWN, "--faces"),
+    "no lens": ("pare", made.write_pare, Known(), "--camera"),
+    "an unknown tool": ("hmr", lambda folder: folder, KNOWN, "gvhmr"),
+    **{f"a file for {tool}": (tool, strange, KNOWN, r"some\.pkl.*no key.*found '(one|strange)'")
+       for tool in ("gvhmr", "slahmr", "wham", "phalp", "prompthmr", "sam3dbody", "pare")},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_wrong_is_refused_by_name(case, tmp_path):
+    tool, write, known, words = REFUSED[case]
+    with pytest.raises(InputError, match=words):
+        bodies_from(tool, write(tmp_path), known)
 
 
 def test_one_frame_is_enough(tmp_path):
-    bodies = bodies_from("smplifyx", smplify_file(tmp_path)).bodies
-    assert bodies.frame.tolist() == [0]
-
-
-def test_a_missing_key_is_told_with_the_keys_that_are_there(tmp_path):
-    path = smplify_file(tmp_path, without("body_pose"))
-    with pytest.raises(InputError, match=r"000\.pkl.*'body_pose'.*found 'betas', 'global_orient'"):
-        bodies_from("smplifyx", path)
-
-
-@pytest.mark.parametrize("tool", ["gvhmr", "slahmr", "wham", "phalp", "prompthmr", "sam3dbody"])
-def test_a_file_of_another_tool_is_told_with_its_keys(tool, tmp_path):
-    path = tmp_path / "some.pkl"
-    made.store({"one": {"strange": np.zeros(3)}}, path)
-    with pytest.raises(InputError, match=r"some\.pkl.*no key.*found '(one|strange)'"):
-        bodies_from(tool, path, KNOWN)
-
-
-def test_codes_of_vposer_are_refused_with_the_way_out(tmp_path):
-    path = smplify_file(tmp_path, lambda d: {**d, "body_pose": np.zeros((1, 32))})
-    with pytest.raises(InputError, match=r"32 numbers, expected 63 angles: .*VPoser"):
-        bodies_from("smplifyx", path)
+    assert bodies_from("smplifyx", smplify_file(tmp_path)).bodies.frame.tolist() == [0]
 
 
 def test_codes_of_vposer_are_decoded_with_its_weights(tmp_path):
-    """Code 0 .. 31 of the fixture's decoder: the angles are a linear map of the code."""
+    """The fixture's decoder: the angles are a linear map of the code."""
     code = np.linspace(-1, 1, 32)[None]
-    path = smplify_file(tmp_path, lambda d: {**d, "body_pose": code})
 
     def decode(given):
         return torch.cat([given, given[:, :31]], 1) * 0.1
 
+    path = smplify_file(tmp_path, body_pose=code)
     found = bodies_from("smplifyx", path, replace(KNOWN, decode=decode))
     wanted = decode(torch.from_numpy(code).float())
     torch.testing.assert_close(found.bodies.pose.body_pose, wanted)
 
 
-def test_frames_with_nan_are_left_out_and_told(tmp_path):
+def test_frames_with_nan_are_left_out_and_named(tmp_path):
     data = made.wham_person()
     data["pose"][1, 5] = np.nan
-    data["verts"][1] = np.nan
-    path = made.dump({"7": data}, tmp_path / "wham_output.pkl")
-    found = bodies_from("wham", path, KNOWN)
+    found = bodies_from("wham", wham_file(tmp_path, pose=data["pose"]), KNOWN)
     assert found.bodies.frame.tolist() == [0, 2, 5, 6]
     assert found.bodies.person.tolist() == [7] * 4
     assert any("NaN in frame 1" in warning for warning in found.warnings)
-
-
-def test_only_nan_is_refused(tmp_path):
-    path = smplify_file(tmp_path, lambda d: {**d, "global_orient": np.full((1, 3), np.nan)})
-    with pytest.raises(InputError, match="only rows with NaN"):
-        bodies_from("smplifyx", path)
-
-
-def test_a_person_who_is_twice_in_a_frame_is_refused(tmp_path):
-    data = made.wham_person()
-    data["frame_ids"] = np.array([0, 1, 1, 2, 3])
-    with pytest.raises(InputError, match="person 3 twice in frame 1"):
-        bodies_from("wham", made.dump({3: data}, tmp_path / "w.pkl"), KNOWN)
-
-
-def test_matrices_that_are_no_rotations_are_refused(tmp_path):
-    folder = made.write_tram(tmp_path)
-    track = folder / "hps" / "hps_track_0.npy"
-    data = np.load(track, allow_pickle=True).item()
-    data["pred_rotmat"] = data["pred_rotmat"] * 1.2
-    np.save(track, data, allow_pickle=True)
-    with pytest.raises(InputError, match="expected rotation matrices"):
-        bodies_from("tram", folder, KNOWN)
 
 
 class Hostile:
@@ -536,13 +504,6 @@ def test_bombs_in_pickles_of_every_tool_are_refused_at_once(tool, bomb, tmp_path
     assert others <= {".npz", ".json"}  # these hold no pickles
 
 
-def test_an_npz_with_pickled_objects_is_refused(tmp_path):
-    path = tmp_path / "a_world_results.npz"
-    np.savez(path, trans=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(InputError, match=r"'trans' .*no pickled objects"):
-        bodies_from("slahmr", path)
-
-
 @pytest.mark.parametrize("write", [made.write_amass, made.write_amass_x])
 def test_a_motion_of_amass_given_as_bodies_is_named(write, tmp_path):
     with pytest.raises(InputError, match=r"motion of AMASS.*--bodies-from amass"):
@@ -554,21 +515,6 @@ def test_a_missing_model_is_told_with_the_place_of_its_file(tmp_path, monkeypatc
     monkeypatch.delenv("MOVER_BODY_MODELS", raising=False)
     with pytest.raises(InputError, match=r"'smplx'.*MOVER_BODY_MODELS.*SMPLX_NEUTRAL\.npz"):
         bodies_from("smplifyx", smplify_file(tmp_path))
-
-
-def test_meshes_of_mhr_without_triangles_ask_for_them(tmp_path):
-    with pytest.raises(InputError, match="--faces"):
-        bodies_from("sam3dbody", made.write_sam3dbody(tmp_path), KNOWN)
-
-
-def test_pare_without_a_lens_asks_for_it(tmp_path):
-    with pytest.raises(InputError, match="--camera"):
-        bodies_from("pare", made.write_pare(tmp_path), Known())
-
-
-def test_an_unknown_tool_is_answered_with_the_known_ones(tmp_path):
-    with pytest.raises(InputError, match="gvhmr"):
-        bodies_from("hmr", tmp_path)
 
 
 # Keypoints.
@@ -624,7 +570,7 @@ def test_people_who_are_not_named_are_followed_over_a_gap(tmp_path):
     assert found.person.tolist() == [0, 1, 0, 1, 1, 0, 1]
 
 
-def test_people_without_joints_are_left_out_and_nobody_is_refused(tmp_path):
+def test_people_without_joints_are_left_out_and_no_person_is_refused(tmp_path):
     openpose(tmp_path, 0, np.zeros((25, 3)), made.seen(made.OPENPOSE)[0])
     assert len(keypoints_from("openpose", tmp_path).frame) == 1
     openpose(tmp_path, 0, np.zeros((25, 3)))
@@ -657,21 +603,14 @@ def test_wrong_shapes_of_keypoints_are_refused():
 # The command.
 
 
-def test_the_command_writes_bodies_and_a_camera(tmp_path, capsys):
-    path = made.write_gvhmr(tmp_path)
+def test_the_command_writes_bodies(tmp_path, capsys):
+    path, out = made.write_gvhmr(tmp_path), tmp_path / "bodies.npz"
     (tmp_path / "camera.json").write_text(json.dumps(made.camera_json()))
-    out, camera = tmp_path / "bodies.npz", tmp_path / "found.json"
-    line = ["gvhmr", path, "--out", out, "--camera", tmp_path / "camera.json"]
-    line += ["--write-camera", camera, "--fps", "30", "--space", "world"]
+    line = ["gvhmr", path, "--out", out, "--camera", tmp_path / "camera.json", "--fps", "30"]
     assert cli.run_command("import-bodies", [str(word) for word in line]) == 0
-    text = capsys.readouterr().out
-    assert "5 rows, 1 people in 5 frames" in text
-    assert f"pitch {made.PITCH:.3f} rad" in text
+    assert "5 rows, 1 people in 5 frames" in capsys.readouterr().out
     bodies = read_bodies(out)
-    assert (bodies.space, bodies.fps) == ("world", 30.0)
-    written = json.loads(camera.read_text())
-    assert np.allclose(written["R_cam_world"], made.camera_matrix(), atol=1e-3)
-    assert (written["w"], written["fl_x"]) == (1280, 1100)
+    assert (bodies.space, bodies.fps) == ("camera", 30.0)
 
 
 def test_an_import_takes_the_bodies_of_a_tool_by_their_path(tmp_path):
@@ -687,7 +626,7 @@ def test_an_import_takes_the_bodies_of_a_tool_by_their_path(tmp_path):
     assert found.frame.tolist() == direct.frame.tolist()
     assert (found.verts - direct.verts).abs().max() < 1e-4
     assert found.pose is not None
-    bad = [*map(str, line), "--bodies-from", "nobody"]
+    bad = [*map(str, line), "--bodies-from", "hmr"]
     assert cli.run_command("import", bad) == 2
 
 

@@ -43,10 +43,6 @@ class BodiesArgs:
     """The number in the name of the first frame's file, 1 where they count from 1."""
     vposer: Path | None = None
     """VPoser's weights (a checkpoint, its folder, or .npz), for codes that SMPLify-X stored."""
-    space: Literal["camera", "world"] = "camera"
-    """world: upright, +y up, by the gravity that the tool knows."""
-    write_camera: Path | None = None
-    """Write a camera.json here: the lens, and pitch and roll by the tool's gravity."""
 
 
 def bodies(arguments: Sequence[str]) -> None:
@@ -76,40 +72,19 @@ def _keypoints(args: BodiesArgs) -> None:
 
 
 def _bodies(args: BodiesArgs) -> None:
-    """Bodies, and a camera where it is asked for."""
+    """Bodies."""
     from mover.io.capture.bodies_file import write_bodies
-    from mover.io.people.bodies import bodies_from, in_world
+    from mover.io.people.bodies import bodies_from
 
     known = _known(args)
     found = bodies_from(args.tool, args.source, known)
     out = args.out or Path("bodies.npz")
-    people = found.bodies if args.space == "camera" else in_world(found, args.source.name)
+    people = found.bodies
     write_bodies(people, out)
     for warning in found.warnings:
         say(f"warning: {warning}")
     model = "meshes only" if people.pose is None else f"parameters of {people.pose.model}"
     say(f"{_counted(people)}, {people.verts.shape[1]} vertices, {model}: {out}")
-    _print_gravity(found)
-    if args.write_camera is not None:
-        _write_camera(found, known, args.write_camera)
-
-
-def _print_gravity(found: Any) -> None:  # noqa: ANN401
-    from mover.io.people.bodies import attitude
-
-    if found.up is not None:
-        pitch, roll = attitude(found.up)
-        say(f"its gravity: pitch {pitch:.3f} rad, roll {roll:.3f} rad")
-
-
-def _write_camera(found: Any, known: Any, path: Path) -> None:  # noqa: ANN401
-    """camera.json; the image is as large as the user's, else twice the principal point."""
-    from mover.io.capture.camera_file import camera_to_json
-    from mover.io.files.fields import write_json
-    from mover.io.people.bodies import camera_from
-
-    write_json(camera_to_json(camera_from(found, known)), path)
-    say(f"camera: {path}")
 
 
 def _known(args: BodiesArgs) -> Any:  # noqa: ANN401

@@ -1,12 +1,13 @@
 """One table of the tools that find bodies: a row says where everything lies in their files.
 
-All give SMPL, SMPL-H, SMPL-X or MHR in OpenCV camera axes, but AMASS, whose world has +z up. From
-the worlds of the others (+y up) gravity alone is taken. Sources: the writers' own code, as of 2026.
+All give SMPL, SMPL-H, SMPL-X or MHR in OpenCV camera axes, but AMASS, whose world has +z up.
+Sources: the writers' own code, as of 2026.
 """
 
 import dataclasses
 import math
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,42 +19,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mover.bodies.smpl_model import FLAT
+from mover.core.errors import InputError
 from mover.core.types import BodyPose
-from mover.io.capture.pose_file import GENDERS, moved
-from mover.io.files.fields import At, get, refuse
-from mover.io.people import sources
-from mover.io.people.found import Found, Known, joined
-from mover.io.people.lens import (
-    assumed_lens,
-    cameras_of,
-    from_crop,
-    from_image,
-    from_pixels,
-    image_lens,
-    lens,
-    lens_of,
-    movement,
-    up_of_roots,
-)
-from mover.io.people.sources import Person
-from mover.io.people.values import (
-    angles,
-    either,
-    need,
-    numbers,
-    one_number,
-    rows,
-    stacked,
-    tensor,
-    whole,
-)
+from mover.io.capture.pose_file import GENDERS, NEEDED, moved
+from mover.io.files.fields import At, get, items, mapping, refuse
+from mover.io.files.npz import read_npz
+from mover.io.people import values as v
+from mover.io.people.found import Found, Known, followed, joined
+from mover.io.people.lens import assumed_lens, from_weak, lens, lens_of, movement, tilting
+from mover.io.people.values import either, need
 
 Names = tuple[str, ...]
-Lens = Callable[[Person, int, Known], Tensor | None]
-Gravity = Callable[[Person, Tensor, Tensor], tuple[Tensor | None, Names]]
-"""Up in the camera for the rows, from their roots and frames; and warnings."""
-
-VERTS = {"smpl": 6890, "smplh": 6890, "smplx": 10475}
 JOINTS = {"smpl": (24,), "smplh": (52, 22), "smplx": (55, 25, 22)}
 HANDS = {
     "smpl": {}, "smplh": {"left_hand_pose": (66, 111), "right_hand_pose": (111, 156)},
@@ -67,34 +43,49 @@ CODE = 32  # numbers of a VPoser code
 SHAPES = 10  # coefficients where none are given
 FOCAL = 5000.0  # [px], SMPLify-X's default, and of HMR2's crops
 CROP = 256.0  # [px], a side of these crops
-LEAST_OFFSET = 1e-4  # [m], a plane through the origin has no direction
+TALL = 1.7  # [m], a person's size, by which people are followed from image to image
+AMASS = {156: "smplh", 165: "smplx", 72: "smpl"}
+"""Body models by the numbers of a row of `poses`."""
+Y_UP = np.array([[1, 0, 0, 0, 0, 1, 0, -1, 0]])  # AMASS has +z up
+
+
+@dataclass(frozen=True)
+class Person:
+    """One person, with a row for each frame."""
+
+    fields: At
+    track: Any = 0
+    """A number, or one a row."""
+    frame: int = 0
+    """Of the first row, where no field holds the frames."""
+    K: At | None = None
+    """The lens that the tool assumed, one or a row each [px]."""
+    model: str = ""
+    """The body model where the file decides, else empty."""
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Tool:
     """Where a tool keeps what a body needs; several names of a field are all in use."""
 
+    people: Callable[[Path, Known], list[Person]]
+    """Finds the people in the files."""
     model: str
-    people: Callable[..., list[Person]]
-    """Finds the people in the files: their fields, and the fields of the camera."""
-    rotations: Names = ()
+    pose: Names = ()
     """All joints in one field."""
-    parts: tuple[Names, Names] = ((), ())
+    root: str = "global_orient"
     """The root and the body, where they are two fields."""
+    body: str = "body_pose"
     shape: Names = ("betas",)
     widths: tuple[int, ...] = ()
     """Of the shape; empty: any."""
     shapeless: bool = False
     """The shape may be missing."""
-    translation: Names | Callable[[At, int, Known], Tensor] = ("transl",)
+    translation: str = "transl"
     camera: Names = ()
     """Rotation and translation from the tool's world into the camera, where bodies lie in it."""
     frames: Names = ()
-    verts: Names = ()
-    centred: bool = False
-    """The vertices lie about the origin of the body."""
-    lens: Lens = lambda *_: None
-    gravity: Gravity = lambda *_: (None, ())
     rate: Names = ()
     """Frames a second."""
     space: Literal["camera", "world"] = "camera"
@@ -108,66 +99,61 @@ def read(path: Path, known: Known, tool: str) -> Found:
 
 def _rows(tool: Tool, person: Person, known: Known) -> Found:
     """The rows of one person."""
-    at, model = person.at, person.model or tool.model
-    if model == "mhr":
-        return _mesh(person, known)
-    frames = whole(need(at, *tool.frames)) if tool.frames else None
+    at, model = person.fields, person.model or tool.model
+    frames = v.whole(need(at, *tool.frames)) if tool.frames else None
     turns, extra = _turns(tool, at, model, None if frames is None else len(frames), known)
     count = len(turns)
     if frames is None:
         frames = np.arange(person.frame, person.frame + count)
-    body = 72 if model == "smpl" else 66
-    given = either(at, *tool.verts)
-    verts = None if given is None else tensor(rows(given, count, VERTS[model] * 3))
-    verts = None if verts is None else verts.reshape(count, -1, 3)
-    place = _translation(tool, at, count, known, given is None)
     shape = (either if tool.shapeless else need)(at, *tool.shape)
-    betas = np.zeros((count, SHAPES)) if shape is None else rows(shape, count, *tool.widths)
+    betas = np.zeros((count, SHAPES)) if shape is None else v.rows(shape, count, *tool.widths)
+    given, rate = either(at, tool.translation), either(at, *tool.rate)
+    turn, shift = (either(at, name) for name in tool.camera) if tool.camera else (None, None)
+    if given is None and shift is None:
+        need(at, tool.translation, *tool.camera[1:])
+    place = np.zeros((count, 3)) if given is None else v.rows(given, count, 3)
     pose = BodyPose(
-        model=model, gender=known.gender or _gender(at), betas=tensor(betas),
-        global_orient=turns[:, :3], body_pose=turns[:, 3:body], transl=place, extra=extra,
+        model=model, gender=known.gender or _gender(at), betas=v.tensor(betas),
+        global_orient=turns[:, :3], body_pose=turns[:, 3 : 72 if model == "smpl" else 66],
+        transl=v.tensor(place), extra=extra,
     )  # fmt: skip
     if tool.camera:
-        pose = _in_camera(pose, at, tool.camera)
-    frame = torch.from_numpy(frames)
-    up, warnings = tool.gravity(person, turns[:, :3], frame)
-    rate = either(at, *tool.rate)
-    return Found(
-        model, frame, torch.full_like(frame, person.track), pose,
-        verts=verts if verts is None or not tool.centred else verts + place[:, None],
-        K=tool.lens(person, count, known), up=up, fps=None if rate is None else one_number(rate),
-        space=tool.space, warnings=warnings,
-    )  # fmt: skip
+        R = np.eye(3).reshape(1, 9).repeat(count, 0) if turn is None else v.rows(turn, count, 9)
+        t = np.zeros((count, 3)) if shift is None else v.rows(shift, count, 3)
+        pose = moved(pose, v.tensor(R).reshape(-1, 3, 3), v.tensor(t))
+    values = {name: getattr(pose, name) for name in NEEDED} | dict(extra)
+    values["frame"] = torch.from_numpy(frames)
+    values["person"] = torch.as_tensor(person.track).expand(count)
+    if person.K is not None:
+        values["K"] = v.tensor(v.rows(person.K, count, 9)).reshape(-1, 3, 3)
+    fps = None if rate is None else v.one_number(rate)
+    return Found(model, values, pose.gender, fps, tool.space, person.warnings)
 
 
 def _turns(
     tool: Tool, at: At, model: str, count: int | None, known: Known
 ) -> tuple[Float[Tensor, "rows angles"], dict[str, Tensor]]:
     """Angles of root and body, and those of hands and face."""
-    given = either(at, *tool.rotations)
-    if given is not None:
-        turns = tensor(angles(given, count, *JOINTS[model]))
+    if tool.pose:
+        turns = v.angles(need(at, *tool.pose), count, *JOINTS[model])
         inside = {k: (a, b) for k, (a, b) in HANDS[model].items() if turns.shape[1] >= b}
         extra = {name: turns[:, a:b] for name, (a, b) in inside.items()}
         if "left_hand_pose" in extra:
             extra[FLAT] = torch.ones(len(turns), 1)
         return turns, extra
-    roots, bodies = tool.parts
-    body = need(at, *tool.rotations, *bodies)
-    root = tensor(angles(need(at, *roots), count, 1))
+    body = need(at, tool.body)
+    root = v.angles(need(at, tool.root), count, 1)
     count = len(root)
-    codes = numbers(body)
-    if codes.ndim and codes.shape[-1] == CODE:
-        turned = _decoded(body, rows(body, count), known)
-    elif model == "smpl":
-        turned = tensor(angles(body, count, 23, 21))
+    values = v.numbers(body)
+    if values.ndim and values.shape[-1] == CODE:
+        turned = _decoded(body, count, known)
     else:
-        turned = tensor(angles(body, count, 21, 23))[:, :63]
-    found = {n: tensor(rows(v, count)) for n in EXTRA if (v := either(at, n)) is not None}
-    return torch.cat([root, turned], 1), found
+        turned = v.angles(body, count, 23, 21)[:, : 69 if model == "smpl" else 63]
+    extra = {n: v.tensor(v.rows(one, count)) for n in EXTRA if (one := either(at, n)) is not None}
+    return torch.cat([root, turned], 1), extra
 
 
-def _decoded(at: At, codes: NDArray[np.float64], known: Known) -> Tensor:
+def _decoded(at: At, count: int, known: Known) -> Tensor:
     """VPoser's codes as angles, where its weights are known."""
     if known.decode is None:
         refuse(
@@ -178,29 +164,7 @@ def _decoded(at: At, codes: NDArray[np.float64], known: Known) -> Tensor:
             f"{CODE} numbers",
         )
     with torch.no_grad():
-        return known.decode(tensor(codes))
-
-
-def _translation(
-    tool: Tool, at: At, count: int, known: Known, needed: bool
-) -> Float[Tensor, "rows 3"]:
-    """`transl` of each row; NaN where the vertices show it, 0 where the camera has it."""
-    if not isinstance(tool.translation, tuple):
-        return tool.translation(at, count, known)
-    given = either(at, *tool.translation)
-    if given is not None:
-        return tensor(rows(given, count, 3))
-    if needed:
-        need(at, *tool.translation, *tool.camera[1:])
-    return torch.full((count, 3), 0.0 if tool.camera else torch.nan)
-
-
-def _in_camera(pose: BodyPose, at: At, names: Names) -> BodyPose:
-    count = len(pose.transl)
-    turn, shift = (either(at, name) for name in names)
-    flat = np.eye(3).reshape(1, 9).repeat(count, 0) if turn is None else rows(turn, count, 9)
-    t = np.zeros((count, 3)) if shift is None else rows(shift, count, 3)
-    return moved(pose, tensor(flat).reshape(-1, 3, 3), tensor(t))
+        return known.decode(v.tensor(v.rows(at, count)))
 
 
 def _gender(at: At) -> str:
@@ -216,188 +180,315 @@ def _gender(at: At) -> str:
     return word
 
 
-def _mesh(person: Person, known: Known) -> Found:
-    """SAM 3D Body: vertices about the origin of the body, whose camera_t is added [m]."""
-    at, frame = person.at, torch.tensor([person.frame])
-    given, place = need(at, "pred_vertices"), rows(need(at, "pred_cam_t"), 1, 3)
-    verts = numbers(given)
-    if verts.ndim == 3 and len(verts) == 1:
-        verts = verts[0]
-    if verts.ndim != 2 or verts.shape[1] != 3 or not len(verts):
-        refuse(given, "an array of shape (vertices, 3)", f"shape {verts.shape}")
-    who = torch.full_like(frame, person.track)
-    K = _lens_of_joints(at, place, known)
-    return Found("mhr", frame, who, None, verts=tensor((verts + place)[None]), K=K)
+# Where the people lie in the files of a tool.
 
 
-def _lens_of_joints(at: At, place: NDArray[np.float64], known: Known) -> Tensor | None:
-    """SAM 3D Body: by joints in space and in the image, else by the focal length."""
-    joints, pixels = either(at, "pred_keypoints_3d"), either(at, "pred_keypoints_2d")
-    if joints is not None and pixels is not None:
-        points = stacked(joints, 3) + place
-        image = rows(pixels, len(points), 2)
-        if np.isfinite(points).all() and np.isfinite(image).all():
-            return lens_of(tensor(points), tensor(image))[None]
-    focal = either(at, "focal_length")
-    if focal is not None:
-        return assumed_lens(dataclasses.replace(known, focal=None), one_number(focal), 1)
-    return None if known.focal is None else assumed_lens(known, known.focal, 1)
+def _in_folder(path: Path, *names: str) -> At:
+    """The file itself, or the first of these that a folder has."""
+    inside = (path / name for name in names if (path / name).is_file())
+    return v.read_any(next(inside, path / names[0]) if path.is_dir() else path)
 
 
-# What single tools know of their camera.
-
-
-def _crops(at: At, count: int, known: Known) -> Float[Tensor, "bodies 3"]:
-    """PARE and VIBE: the position under the true lens, by joints in the image, else by the crop."""
-    assert known.camera is not None
-    K, size = known.camera.K.double(), (known.camera.width, known.camera.height)
-    joints, pixels = either(at, "joints3d", "smpl_joints3d"), either(at, "smpl_joints2d")
-    if joints is not None and pixels is not None:
-        points = torch.from_numpy(_in_space(joints, count))
-        flat = rows(pixels, count, points.shape[1] * 2, points.shape[1] * 3)
-        image = torch.from_numpy(flat.reshape(count, points.shape[1], -1)[..., :2].copy())
-        return from_pixels(points, image, K).float()
-    crop, box = either(at, "pred_cam"), either(at, "bboxes")
-    if crop is not None and box is not None:
-        square = torch.from_numpy(rows(box, count, 4)[:, :3].copy())
-        return from_crop(torch.from_numpy(rows(crop, count, 3).copy()), square, K).float()
-    wanted = ("orig_cam",) if pixels is None else ("orig_cam", "joints3d")
-    image = torch.from_numpy(rows(need(at, *wanted), count, 4).copy())
-    return from_image(image, K, size).float()
-
-
-def _in_space(at: At, count: int) -> NDArray[np.float64]:
-    """Points of each body [m]."""
-    flat = rows(at, count)
-    if flat.shape[1] % 3:
-        refuse(at, f"points of shape ({count}, n, 3)", f"shape {numbers(at).shape}")
-    return flat.reshape(count, -1, 3).copy()
-
-
-def _lens_of_file(person: Person, count: int, _: Known) -> Tensor | None:
-    """GVHMR and SLAHMR: the lens as a matrix or four numbers beside the people."""
-    assert person.source is not None
-    K, four = either(person.source, "K_fullimg"), either(person.source, "intrins")
-    if K is not None:
-        return tensor(rows(K, count, 9)).reshape(-1, 3, 3)
-    if four is None:
-        return None
-    fx, fy, cx, cy = stacked(four, 4)[0].tolist()
-    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]).expand(count, 3, 3)
-
-
-def _lens_of_camera(person: Person, count: int, _: Known) -> Tensor | None:
-    """TRAM's camera.npy, and the camera in PromptHMR's results."""
-    at = person.source
-    if at is None or either(at, "people") is None:
-        return None if at is None else image_lens(at, count)
-    camera = either(at, "camera", "camera_world")
-    return None if camera is None else image_lens(camera, count)
-
-
-def _lens_of_size(person: Person, count: int, known: Known) -> Tensor | None:
-    """PHALP: crops of 256 px at 5000 px, the image padded to a square."""
-    assert person.source is not None
-    sizes = either(person.source, "size")
-    if sizes is None:
-        return assumed_lens(known, lambda *size: FOCAL / CROP * max(size), count)
-    pairs = stacked(sizes, 2)
-    height, width = pairs[min(person.source.value["row"], len(pairs) - 1)].tolist()
-    return lens(known.focal or FOCAL / CROP * max(width, height), width, height).float()[None]
-
-
-def _up_by_root(person: Person, root: Tensor, _: Tensor) -> tuple[Tensor | None, Names]:
-    """WHAM, GVHMR: one body's root in the camera and in a world with +y up."""
-    given = either(person.at, "pose_world", "poses_root_world")
-    if person.source is not None:
-        world = either(person.source, "smpl_params_global", "body_params_global")
-        given = None if world is None else need(world, "global_orient")
-    if given is None:
-        return None, ()
-    return up_of_roots(root, tensor(angles(given, len(root), 1, 24)[:, :3])), ()
-
-
-def _up_by_camera(person: Person, _: Tensor, frame: Tensor) -> tuple[Tensor | None, Names]:
-    """PromptHMR and TRAM: the cameras of all frames, in a world with +y up."""
-    at = person.source
-    world = None if at is None else either(at, "camera_world")
-    turn = None if at is None else either(at, "world_cam_R")
+def gvhmr(path: Path, _: Known) -> list[Person]:
+    """hmr4d_results.pt of GVHMR, smpl_params.pt of GEM: one person in all frames."""
+    at = _in_folder(path, "hmr4d_results.pt", "smpl_params.pt")
+    body = need(at, "smpl_params_incam", "body_params_incam")
+    world = either(at, "smpl_params_global", "body_params_global")
+    warnings: tuple[str, ...] = ()
     if world is not None:
-        R, t = cameras_of(need(world, "Rcw"), need(world, "Tcw"), frame)
-        return R[frame][..., 1], movement(R, t)
-    if at is not None and turn is not None:
-        back, place = cameras_of(turn, need(at, "world_cam_T"), frame)
-        warnings = movement(back.mT, -(back.mT @ place[..., None])[..., 0])
-        return back[frame, 1], warnings
-    return None, ()
+        root = v.angles(need(body, "global_orient"), None, 1)
+        warnings = tilting(root, v.angles(need(world, "global_orient"), len(root), 1))
+    return [Person(body, K=either(at, "K_fullimg"), warnings=warnings)]
 
 
-def _up_by_floor(person: Person, root: Tensor, _: Tensor) -> tuple[Tensor | None, Names]:
-    """SLAHMR: the ground's plane, normal times offset; its sign is that with -y up."""
-    assert person.source is not None
-    R = tensor(rows(get(person.at, "cam_R"), len(root), 9)).reshape(-1, 3, 3)
-    t = tensor(rows(get(person.at, "cam_t"), len(root), 3))
-    up, plane = torch.tensor([0.0, -1.0, 0.0]), either(person.source, "floor_plane")
-    if plane is not None:
-        planes = stacked(plane, 4 if numbers(plane).shape[-1:] == (4,) else 3)[:, :3]
-        normal = tensor(planes[min(person.at.value["row"], len(planes) - 1)])
-        if normal.isfinite().all() and normal.norm() > LEAST_OFFSET:
-            up = normal / normal.norm()
-            up = -up if up[1] > 0 else up
-    return (R @ up[:, None])[..., 0], movement(R, t)
+def wham(path: Path, known: Known) -> list[Person]:
+    """wham_output.pkl: people by their tracks."""
+    found: list[Person] = []
+    for track, at in v.people_of(_in_folder(path, "wham_output.pkl")):
+        world, warnings = either(at, "pose_world"), ()
+        if world is not None:
+            root = v.angles(need(at, "pose"), None, 24)[:, :3]
+            warnings = tilting(root, v.angles(world, len(root), 24)[:, :3])
+        K = assumed_lens(known, math.hypot)
+        found.append(Person(at, track, K=K, warnings=warnings))
+    return found
 
 
-HMR2 = Tool(
-    "smpl", sources.phalp, parts=(("global_orient",), ("body_pose",)), widths=(10,),
-    translation=("camera",), lens=_lens_of_size,
-)  # fmt: skip
+def prompthmr(path: Path, _: Known) -> list[Person]:
+    """results.pkl: `people`, and the cameras beside them."""
+    source = _in_folder(path, "results.pkl")
+    camera, world = either(source, "camera", "camera_world"), either(source, "camera_world")
+    K = None if camera is None else _image_lens(camera)
+    warnings: tuple[str, ...] = ()
+    if world is not None:
+        R = v.stacked(need(world, "Rcw"), 3, 3)
+        warnings = movement(R, v.rows(need(world, "Tcw"), len(R), 3))
+    found: list[Person] = []
+    for track, one in v.people_of(need(source, "people")):
+        body = need(one, "smplx_cam")
+        fields = {**mapping(body), "frames": need(one, "frames").value}
+        found.append(Person(At(fields, body.file, body.field), track, K=K, warnings=warnings))
+    return found
+
+
+def tram(path: Path, _: Known) -> list[Person]:
+    """A folder with camera.npy and hps/hps_track_<k>.npy."""
+    tracks = v.files_of(path, "hps/hps_track_*.npy", "TRAM's results")
+    file = (path if path.is_dir() else path.parent.parent) / "camera.npy"
+    source, warnings = v.read_any(file) if file.is_file() else None, ()
+    K = None if source is None else _image_lens(source)
+    turn = None if source is None else either(source, "world_cam_R")
+    if source is not None and turn is not None:  # x_world = R x_cam + t
+        R = np.swapaxes(v.stacked(turn, 3, 3), 1, 2)
+        t = v.rows(need(source, "world_cam_T"), len(R), 3)
+        warnings = movement(R, -np.einsum("tij,tj->ti", R, t))
+    return [Person(v.read_any(one), k, K=K, warnings=warnings) for k, one in enumerate(tracks)]
+
+
+def _image_lens(at: At) -> At:
+    """The lens that a file gives as `img_focal` and `img_center` [px]."""
+    focal = v.one_number(need(at, "img_focal"))
+    return lens(focal, focal, *v.stacked(need(at, "img_center"), 2)[0].tolist())
+
+
+def pare(path: Path, known: Known) -> list[Person]:
+    """pare_output.pkl or vibe_output.pkl of a video, or one pickle an image.
+
+    Raises:
+        InputError: If the lens is not known, for these networks have none.
+    """
+    camera = known.camera
+    if camera is None:
+        raise InputError(f"{path.name}: PARE knows no lens: --camera names a camera.json")
+
+    def placed(at: At, track: Any, more: Mapping[str, Any]) -> Person:  # noqa: ANN401
+        crop = torch.from_numpy(v.rows(need(at, "orig_cam"), None, 4).copy())
+        fields = {**mapping(at), **more, "transl": from_weak(crop, camera).numpy()}
+        return Person(At(fields, at.file, at.field), track)
+
+    videos = [path / n for n in ("pare_output.pkl", "vibe_output.pkl") if (path / n).is_file()]
+    if not path.is_dir() or videos:
+        at = v.read_any([*videos, path][0])
+        if either(at, "orig_cam") is None:
+            return [placed(one, track, {}) for track, one in v.people_of(at)]
+        files, frames = [path], [0]
+    else:
+        files = v.files_of(path, "*.pkl", "PARE's results")
+        frames = [v.number_in(file.stem, k) - known.first for k, file in enumerate(files)]
+    found: list[Person] = []
+    for file, frame in zip(files, frames, strict=True):
+        at = v.read_any(file)
+        count = len(v.rows(need(at, "orig_cam"), None, 4))
+        found.append(placed(at, torch.arange(count), {"frame_ids": np.full(count, frame)}))
+    return found
+
+
+def phalp(path: Path, known: Known) -> list[Person]:
+    """results/demo_<video>.pkl of 4D-Humans: frames by name, whose lists go person by person.
+
+    People who are only predicted in a frame, not detected, are left out. Bodies were seen in crops
+    of 256 px at 5000 px, the image padded to a square.
+    """
+    source = v.read_any(v.only_file(path, "**/*.pkl", "the results of PHALP"))
+    frames = mapping(source)
+    found: list[Person] = []
+    for index, name in enumerate(sorted(frames, key=lambda key: v.natural(Path(str(key))))):
+        found += _in_frame(At(frames[name], source.file, str(name)), index, known)
+    if not found:
+        raise InputError(f"{source.file}: has no people in {len(frames)} frames")
+    return found
+
+
+def _in_frame(at: At, index: int, known: Known) -> Iterator[Person]:
+    camera = need(at, "camera")
+    listed = list(camera.value) if isinstance(camera.value, np.ndarray) else camera.value
+    bodies, cameras = items(need(at, "smpl")), items(At(listed, camera.file, camera.field))
+    tracks, ages, sizes = (either(at, name) for name in ("tid", "tracked_time", "size"))
+    tracks = v.whole(need(at, "tid") if tracks is None else tracks)
+    if not len(bodies) == len(cameras) == len(tracks):
+        n = f"{len(tracks)} tracks, {len(bodies)} bodies and {len(cameras)} cameras"
+        raise InputError(f"{at.place} has {n}, expected as many of each")
+    age = np.zeros(len(tracks)) if ages is None else v.numbers(ages).reshape(-1)
+    time = either(at, "time")
+    frame = index if time is None or v.one_number(time) < 0 else int(v.one_number(time))
+    for k in range(len(tracks)):
+        if len(age) == len(tracks) and age[k] != 0:
+            continue
+        size = None
+        if sizes is not None:
+            pairs = v.stacked(sizes, 2)  # height, width
+            size = pairs[min(k, len(pairs) - 1), 1], pairs[min(k, len(pairs) - 1), 0]
+        K = assumed_lens(known, lambda *sides: FOCAL / CROP * max(sides), size)
+        fields = {**mapping(bodies[k]), "camera": cameras[k].value}
+        person = At(fields, bodies[k].file, bodies[k].field)
+        yield Person(person, int(tracks[k]), frame, K=K)
+
+
+def slahmr(path: Path, _: Known) -> list[Person]:
+    """The last *_world_results.npz of a folder: arrays of (people, frames, numbers).
+
+    track_info.json beside it gives the tracks and the frames in which a person is visible.
+    """
+    path = v.files_of(path, "**/*_world_results.npz", "SLAHMR's results")[-1]
+    source = v.read_any(path)
+    shape = v.numbers(need(source, "trans")).shape
+    if len(shape) != 3 or 0 in shape:
+        raise InputError(f"{source.file}: field 'trans' has shape {shape}, expected (B, T, 3)")
+    people, count = shape[:2]
+    betas, fields = v.rows(need(source, "betas"), people), dict[str, NDArray[np.float64]]()
+    for name in ("trans", "root_orient", "pose_body", "cam_R", "cam_t"):
+        given = need(source, name)
+        fields[name] = v.numbers(given)
+        if fields[name].shape[:2] != (people, count):
+            refuse(given, f"({people}, {count}, n) numbers", f"shape {fields[name].shape}")
+    intrins = either(source, "intrins")
+    K = None if intrins is None else lens(*v.stacked(intrins, 4)[0].tolist())
+    whole = [(who, who, np.arange(count)) for who in range(people)]
+    found: list[Person] = []
+    for track, who, frames in _visible(path, count, people) or whole:
+        of_one = {name: values[who][frames] for name, values in fields.items()}
+        at = At({**of_one, "betas": betas[who], "frames": frames}, source.file)
+        R, t = v.stacked(get(at, "cam_R"), 3, 3), v.stacked(get(at, "cam_t"), 3)
+        found.append(Person(at, track, K=K, warnings=movement(R, t)))
+    return found
+
+
+def _visible(path: Path, count: int, people: int) -> list[tuple[int, int, NDArray[np.int64]]]:
+    """Track, index and visible frames of each person; empty without a file of tracks."""
+    files = (folder / "track_info.json" for folder in (path.parent, path.parent.parent))
+    file = next((file for file in files if file.is_file()), None)
+    found: list[tuple[int, int, NDArray[np.int64]]] = []
+    for track, one in [] if file is None else v.people_of(need(v.read_any(file), "tracks")):
+        index = int(v.one_number(need(one, "index")))
+        mask = v.numbers(need(one, "vis_mask")).reshape(-1) > 0
+        if 0 <= index < people and len(mask) == count and mask.any():
+            found.append((track, index, np.flatnonzero(mask)))
+    return found
+
+
+def prox(path: Path, known: Known) -> list[Person]:
+    """results/<frame>/<person>.pkl or <frame>.pkl of SMPLify-X and PROX, or one such file."""
+    files = v.files_of(path, "**/*.pkl", "fits")
+    if not path.is_dir():
+        return [Person(v.read_any(files[0]))]
+    names: list[tuple[str, int]] = []
+    for file in files:
+        inside = re.fullmatch(r"\d{1,3}", file.stem) and re.search(r"\d", file.parent.name)
+        names.append((file.parent.name, int(file.stem)) if inside else (file.stem, 0))
+    frames = known.frames
+    if frames is None:
+        numbered = v.frame_numbers((name for name, _ in names), path.name)
+        frames = {name: number - known.first for name, number in numbered.items()}
+    found: list[Person] = []
+    for file, (name, track) in zip(files, names, strict=True):
+        if name not in frames:
+            raise InputError(f"{file}: {name!r} is no frame of the recording")
+        found.append(Person(v.read_any(file), track, frames[name]))
+    return found
+
+
+def smplifyx(path: Path, known: Known) -> list[Person]:
+    """As PROX, under a lens of its own."""
+    K = assumed_lens(known, lambda *_: FOCAL)
+    return [dataclasses.replace(person, K=K) for person in prox(path, known)]
+
+
+def amass(path: Path, _: Known) -> list[Person]:
+    """Motions of AMASS: one npz a person."""
+    found: list[Person] = []
+    for track, file in enumerate(v.files_of(path, "*.npz", "motions of AMASS")):
+        at = read_npz(file, without_objects=True)
+        width = v.rows(need(at, "poses"), len(v.stacked(need(at, "trans"), 3))).shape[1]
+        if width not in AMASS:
+            refuse(need(at, "poses"), f"rows of {' or '.join(map(str, AMASS))} angles")
+        at = At({**mapping(at), "turn": Y_UP, "shift": np.zeros(3)}, at.file, at.field)
+        found.append(Person(at, track, model=AMASS[width]))
+    return found
+
+
+# SAM 3D Body lists people by image: they are followed from image to image by their positions.
+
+
+def read_sam3dbody(path: Path, known: Known) -> Found:
+    """Meshes of MHR: a file a person (`<image>_subj00.npz`), or a file with a list of people.
+
+    Names that end in `_subj00` or `_person1` are people of the image before; the last number of
+    what is left is the frame. The vertices lie about the origin of the body, whose camera_t is
+    added [m].
+    """
+    files, images = [path], [path.stem]
+    if path.is_dir():
+        files = sorted((f for f in path.iterdir() if f.suffix.lower() in v.KINDS), key=v.natural)
+        images = [re.sub(r"_?(?:subj|person|human)_?\d+$", "", file.stem) for file in files]
+    if not files:
+        raise InputError(f"{path}: has no files of kind {', '.join(v.KINDS)}")
+    numbered = v.frame_numbers(images, path.name) if path.is_dir() else {path.stem: known.first}
+    seen: list[tuple[int, At]] = []
+    for file, image in zip(files, images, strict=True):
+        at = v.read_any(file)
+        people = at.value.tolist() if isinstance(at.value, np.ndarray) else at.value
+        listed = [at] if isinstance(people, Mapping) else items(At(people, at.file))
+        seen += [(numbered[image] - known.first, one) for one in listed]
+    if not seen:
+        raise InputError(f"{path}: has no people, expected at least one")
+    found = joined([_mesh(at, frame, known) for frame, at in seen])
+    middles = found.values["verts"].double().mean(1).numpy()
+    tracks = followed([frame for frame, _ in seen], middles, np.full(len(seen), TALL))
+    return dataclasses.replace(found, values={**found.values, "person": torch.from_numpy(tracks)})
+
+
+def _mesh(at: At, frame: int, known: Known) -> Found:
+    """One person, under the lens of joints in space and in the image, else the focal length."""
+    place = v.rows(need(at, "pred_cam_t"), 1, 3)
+    verts = v.tensor(v.stacked(need(at, "pred_vertices"), 3) + place)
+    joints, pixels = either(at, "pred_keypoints_3d"), either(at, "pred_keypoints_2d")
+    focal = either(at, "focal_length")
+    f = known.focal if focal is None else v.one_number(focal)
+    assumed = dataclasses.replace(known, focal=f)
+    given = None if f is None else assumed_lens(assumed, lambda *_: f)
+    if joints is not None and pixels is not None:
+        points = v.stacked(joints, 3) + place
+        image = v.rows(pixels, len(points), 2)
+        if np.isfinite(points).all() and np.isfinite(image).all():
+            given = lens_of(v.tensor(points), v.tensor(image))
+    values = {"frame": torch.tensor([frame]), "person": torch.tensor([0]), "verts": verts[None]}
+    if given is not None:
+        values["K"] = v.tensor(given.value).reshape(1, 3, 3)
+    return Found("mhr", values)
+
+
 CROPS = Tool(
-    "smpl", sources.pare, ("pose", "pred_pose"), shape=("betas", "pred_shape"), widths=(10,),
-    translation=_crops, frames=("frame_ids",), verts=("verts", "smpl_vertices"), centred=True,
+    pare, "smpl", pose=("pose", "pred_pose"), shape=("betas", "pred_shape"), widths=(10,),
+    frames=("frame_ids",),
 )  # fmt: skip
-GVHMR = Tool(
-    "smplx", sources.gvhmr, parts=(("global_orient",), ("body_pose",)), shapeless=True,
-    lens=_lens_of_file, gravity=_up_by_root,
-)  # fmt: skip
-PROX = Tool(
-    "smplx", sources.smplifyx, parts=(("global_orient",), ("body_pose",)),
-    camera=("camera_rotation", "camera_translation"),
-)  # fmt: skip
+HMR2 = Tool(phalp, "smpl", widths=(10,), translation="camera")
 TOOLS = {
     "4dhumans": HMR2,
     "amass": Tool(
-        "smplx", sources.amass, ("poses",), translation=("trans",), camera=("turn", "shift"),
+        amass, "smplx", pose=("poses",), translation="trans", camera=("turn", "shift"),
         rate=("mocap_frame_rate", "mocap_framerate"), space="world",
     ),
-    "gem": GVHMR,
-    "gvhmr": GVHMR,
+    "gem": Tool(gvhmr, "smplx", shapeless=True),
+    "gvhmr": Tool(gvhmr, "smplx", shapeless=True),
     "pare": CROPS,
     "phalp": HMR2,
     "prompthmr": Tool(
-        "smplx", sources.prompthmr, ("rotmat", "pose"), shape=("shape", "betas"),
-        widths=(10, 11, 16), translation=("trans", "transl"), frames=("frames",),
-        lens=_lens_of_camera, gravity=_up_by_camera,
+        prompthmr, "smplx", pose=("rotmat",), shape=("shape",), widths=(10, 11, 16),
+        translation="trans", frames=("frames",),
     ),
-    "prox": PROX,
-    "sam3dbody": Tool("mhr", sources.sam3dbody),
+    "prox": Tool(prox, "smplx", camera=("camera_rotation", "camera_translation")),
     "slahmr": Tool(
-        "smplh", sources.slahmr, parts=(("root_orient",), ("pose_body",)), translation=("trans",),
-        camera=("cam_R", "cam_t"), frames=("frames",), lens=_lens_of_file, gravity=_up_by_floor,
+        slahmr, "smplh", root="root_orient", body="pose_body", translation="trans",
+        camera=("cam_R", "cam_t"), frames=("frames",),
     ),
-    "smplifyx": dataclasses.replace(
-        PROX, lens=lambda _, count, known: assumed_lens(known, FOCAL, count)
-    ),
+    "smplifyx": Tool(smplifyx, "smplx", camera=("camera_rotation", "camera_translation")),
     "tram": Tool(
-        "smpl", sources.tram, ("pred_rotmat", "pred_pose"), shape=("pred_shape",), widths=(10,),
-        translation=("pred_trans",), frames=("frame", "frames"), lens=_lens_of_camera,
-        gravity=_up_by_camera,
+        tram, "smpl", pose=("pred_rotmat",), shape=("pred_shape",), widths=(10,),
+        translation="pred_trans", frames=("frame",),
     ),
     "vibe": CROPS,
     "wham": Tool(
-        "smpl", sources.wham, ("pose",), (("poses_root_cam",), ("poses_body",)), widths=(10,),
-        translation=("trans", "trans_cam"), frames=("frame_ids", "frame_id", "frames"),
-        verts=("verts", "verts_cam"), gravity=_up_by_root,
-        lens=lambda _, count, known: assumed_lens(known, math.hypot, count),
+        wham, "smpl", pose=("pose",), widths=(10,), translation="trans", frames=("frame_ids",),
     ),
 }  # fmt: skip
 """The tools by name; `mover.io.formats` lists them."""

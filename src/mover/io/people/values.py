@@ -28,34 +28,40 @@ from mover.io.files.fields import (
 )
 from mover.io.files.npz import read_npz
 
-KINDS = (".npz", ".npy", ".pkl", ".pickle", ".joblib", ".pt", ".pth", ".json")
+PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth")
+KINDS = (".npz", ".npy", *PICKLES, ".json")
+SHOWN_KEYS = 24
+LEAST_TURN = 0.05  # an array of matrices whose rows are not unit vectors within this is none
 
 
-def read_any(path: Path) -> At:
-    """The content of a file, read without running anything in it."""
+def existing(path: Path) -> Path:
+    """The path of a file that is there and not too large."""
     if not path.is_file():
         raise InputError(f"{path.name}: there is no such file in {path.parent}")
     if path.stat().st_size > LARGEST_FILE:
         size = path.stat().st_size
         raise InputError(f"{path.name}: has {size} bytes, expected at most {LARGEST_FILE}")
-    match path.suffix.lower():
-        case ".npz":
-            return read_npz(path)
-        case ".json":
-            return read_json(path)
-        case ".npy":
-            try:
-                with path.open("rb") as file:
-                    value = np.load(file, allow_pickle=False)
-            except ValueError:  # a pickled object
-                value = load_plain(path)
-            except BROKEN as error:
-                raise InputError(f"{path.name}: cannot be read ({reason(error)})") from error
-        case ".pkl" | ".pickle" | ".joblib" | ".pt" | ".pth":
-            value = load_plain(path)
-        case _:
-            raise InputError(f"{path.name}: is no file of kind {', '.join(KINDS)}")
-    return At(value, path.name)
+    return path
+
+
+def read_any(path: Path) -> At:
+    """The content of a file, read without running anything in it."""
+    kind = existing(path).suffix.lower()
+    if kind not in KINDS:
+        raise InputError(f"{path.name}: is no file of kind {', '.join(KINDS)}")
+    if kind == ".npz":
+        return read_npz(path)
+    if kind == ".json":
+        return read_json(path)
+    if kind in PICKLES:
+        return At(load_plain(path), path.name)
+    try:
+        with path.open("rb") as file:
+            return At(np.load(file, allow_pickle=False), path.name)
+    except ValueError:  # a pickled object
+        return At(load_plain(path), path.name)
+    except BROKEN as error:
+        raise InputError(f"{path.name}: cannot be read ({reason(error)})") from error
 
 
 def files_of(path: Path, pattern: str, what: str) -> list[Path]:
@@ -114,35 +120,38 @@ def natural(path: Path) -> tuple[tuple[int, str], ...]:
     return tuple((int(p), "") if p.isdigit() else (-1, p) for p in parts)
 
 
-Numbers = NDArray[Any] | Tensor
-SHOWN_KEYS = 24
-LEAST_TURN = 0.05  # an array of matrices whose rows are not unit vectors within this is none
-
-
 def need(at: At, *names: str) -> At:
     """The first of several names of a field that is there."""
     found = either(at, *names)
     if found is None:
         place = f"{at.place}: " if at.field else f"{at.file}: "
         wanted = " or ".join(f"'{name}'" for name in names)
-        raise InputError(f"{place}there is no key {wanted}, found {keys_of(at)}")
+        keys = [f"'{key}'" for key in mapping(at)]
+        more = f" and {len(keys) - SHOWN_KEYS} more" if len(keys) > SHOWN_KEYS else ""
+        known = (", ".join(keys[:SHOWN_KEYS]) or "none") + more
+        raise InputError(f"{place}there is no key {wanted}, found {known}")
     return found
 
 
 def either(at: At, *names: str) -> At | None:
     """The first of several names of a field that is there and not null, None without."""
     given = mapping(at)
-    for name in names:
-        if name in given and given[name] is not None:
-            return get(at, name)
-    return None
+    return next((get(at, name) for name in names if given.get(name) is not None), None)
 
 
-def keys_of(at: At) -> str:
-    """The keys of a mapping for a message."""
-    keys = [str(key) for key in mapping(at)]
-    more = f" and {len(keys) - SHOWN_KEYS} more" if len(keys) > SHOWN_KEYS else ""
-    return (", ".join(f"'{key}'" for key in keys[:SHOWN_KEYS]) or "none") + more
+def people_of(at: At) -> list[tuple[int, At]]:
+    """The people of a mapping from track to person, numbered by their keys or in order."""
+    given = mapping(at)
+    if not given:
+        raise InputError(f"{at.place} has no people, expected at least one track")
+    keys = [str(key) for key in given]
+    numbered = all(key.isdigit() for key in keys)
+    people: list[tuple[int, At]] = []
+    for index, (key, value) in enumerate(zip(keys, given.values(), strict=True)):
+        person = At(value, at.file, f"{at.field}.{key}" if at.field else key)
+        mapping(person)
+        people.append((int(key) if numbered else index, person))
+    return people
 
 
 def numbers(at: At) -> NDArray[np.float64]:
@@ -204,16 +213,12 @@ def whole(at: At, count: int | None = None) -> NDArray[np.int64]:
     return value.astype(np.int64)
 
 
-def angles(at: At, count: int | None, *joints: int) -> NDArray[np.float64]:
-    """Axis-angle vectors of so many joints, given as such or as rotation matrices.
-
-    Returns:
-        (count, joints * 3) [rad].
-    """
+def angles(at: At, count: int | None, *joints: int) -> Float[Tensor, "rows angles"]:
+    """Axis-angle vectors of so many joints, given as such or as rotation matrices [rad]."""
     flat = rows(at, count, *[j * 3 for j in joints], *[j * 9 for j in joints])
     if flat.shape[1] in [j * 3 for j in joints]:
-        return flat
-    return vectors(flat.reshape(len(flat), -1, 3, 3), at)
+        return tensor(flat)
+    return tensor(vectors(flat.reshape(len(flat), -1, 3, 3), at))
 
 
 def vectors(matrices: NDArray[np.float64], at: At) -> NDArray[np.float64]:
@@ -229,8 +234,6 @@ def vectors(matrices: NDArray[np.float64], at: At) -> NDArray[np.float64]:
     return np.where(known[..., None], found, np.nan).reshape(len(matrices), -1)
 
 
-def tensor(value: Numbers) -> Float[Tensor, "*shape"]:
+def tensor(value: NDArray[Any]) -> Float[Tensor, "*shape"]:
     """Numbers as the package keeps them."""
-    if isinstance(value, Tensor):
-        return value
     return torch.from_numpy(np.ascontiguousarray(value, dtype=np.float32))
