@@ -503,13 +503,6 @@ def write_coco17(folder: Path) -> Path:
     return folder / "results.json"
 
 
-def write_coco17_arrays(folder: Path) -> Path:
-    rows = seen(COCO)
-    path = folder / "rtmlib.npz"
-    np.savez(path, keypoints=rows[..., :2], scores=rows[..., 2], frame=FRAMES)
-    return path
-
-
 def write_coco17_mmpose(folder: Path) -> Path:
     images = [
         {"frame_id": int(f), "instances": [
@@ -523,5 +516,5 @@ def write_coco17_mmpose(folder: Path) -> Path:
 
 KEYPOINTS = {
     "coco17": write_coco17, "coco17:mmpose": write_coco17_mmpose,
-    "coco17:arrays": write_coco17_arrays, "halpe26": write_halpe26, "openpose": write_openpose,
+    "halpe26": write_halpe26, "openpose": write_openpose,
 }  # fmt: skip

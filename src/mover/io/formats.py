@@ -118,11 +118,11 @@ FORMATS = (
     Format("cameras", "vipe", "a folder of ViPE", "people.paths:read_vipe"),
     Format("cameras", "wham", "slam_results.pth of WHAM", "people.paths:read_slam"),
     Format(
-        "keypoints", "coco17", "COCO's 17 joints: JSON or npz", "people.keypoints:read_instances",
+        "keypoints", "coco17", "COCO's 17 joints: JSON", "people.keypoints:read_instances",
         {"layout": "coco17"},
     ),
     Format(
-        "keypoints", "halpe26", "Halpe's 26 joints: JSON or npz",
+        "keypoints", "halpe26", "Halpe's 26 joints: JSON",
         "people.keypoints:read_instances", {"layout": "halpe26"},
     ),
     Format("keypoints", "openpose", "a folder of OpenPose", "people.keypoints:read_openpose"),

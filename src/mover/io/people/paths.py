@@ -16,17 +16,9 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.core.records import BROKEN
 from mover.geometry.rotations import affine
-from mover.io.files.fields import LARGEST_FILE, At, reason, refuse
-from mover.io.people.values import (
-    frame_numbers,
-    need,
-    numbers,
-    only_file,
-    read_any,
-    rows,
-    stacked,
-    whole,
-)
+from mover.io.files.fields import At, reason, refuse
+from mover.io.people import values as v
+from mover.io.people.values import need
 
 Array = NDArray[Any]
 
@@ -34,15 +26,15 @@ Array = NDArray[Any]
 def read_vipe(path: Path) -> At:
     """ViPE: pose/NAME.npz (`data`, `inds`), and intrinsics/NAME.npz beside it."""
     folder = path / "pose" if (path / "pose").is_dir() else path
-    at = read_any(only_file(folder, "*.npz", "ViPE's poses"))
-    T = stacked(need(at, "data"), 4, 4)
-    frame = whole(need(at, "inds"), len(T))
-    lens = folder.parent / "intrinsics" / at.file if folder.is_dir() else path.parent.parent
-    lens = lens if lens.suffix else lens / "intrinsics" / at.file
+    file = v.only_file(folder, "*.npz", "ViPE's poses")
+    at = v.read_any(file)
+    T = v.stacked(need(at, "data"), 4, 4)
+    frame = v.whole(need(at, "inds"), len(T))
+    lens = file.parent.parent / "intrinsics" / file.name
     focal = None
     if lens.is_file():
-        given = need(read_any(lens), "data")
-        focal = rows(given, None, 4)
+        given = need(v.read_any(lens), "data")
+        focal = v.rows(given, None, 4)
         if len(focal) != len(T):
             refuse(given, f"{len(T)} rows, as there are poses", f"{len(focal)}")
         focal = focal[:, 0] / (2 * focal[:, 2])
@@ -51,9 +43,9 @@ def read_vipe(path: Path) -> At:
 
 def read_megasam(path: Path) -> At:
     """MegaSaM: NAME_sgd_cvd_hr.npz, or NAME_droid.npz of its first stage."""
-    at = read_any(only_file(path, "*_sgd_cvd_hr.npz", "MegaSaM's result"))
-    T = stacked(need(at, "cam_c2w"), 4, 4)
-    K = rows(need(at, "intrinsic"), None, 9, 3).reshape(-1, 9)
+    at = v.read_any(v.only_file(path, "*_sgd_cvd_hr.npz", "MegaSaM's result"))
+    T = v.stacked(need(at, "cam_c2w"), 4, 4)
+    K = v.rows(need(at, "intrinsic"), None, 9, 3).reshape(-1, 9)
     return _arrays(at.file, T, np.arange(len(T)), K[:, 0] / (2 * K[:, 2]))
 
 
@@ -65,13 +57,13 @@ def read_slam(path: Path) -> At:
     Raises:
         InputError: If it has another shape, or no camera was followed.
     """
-    at = read_any(
-        only_file(path, "**/slam_results.p*t*", "slam_results.pth of WHAM or .pt of GVHMR")
+    at = v.read_any(
+        v.only_file(path, "**/slam_results.p*t*", "slam_results.pth of WHAM or .pt of GVHMR")
     )
-    value = numbers(at)
+    value = v.numbers(at)
     if value.ndim == 3:
-        return _arrays(at.file, np.linalg.inv(stacked(at, 4, 4)), np.arange(len(value)))
-    row = rows(at, None, 7)
+        return _arrays(at.file, np.linalg.inv(v.stacked(at, 4, 4)), np.arange(len(value)))
+    row = v.rows(at, None, 7)
     if (row[:, :3] == 0).all() and (row[:, 3:] == [1, 0, 0, 0]).all():
         refuse(at, "a camera that was followed (WHAM with its SLAM)", "WHAM's sign for none")
     T = affine(_turns(row[:, 3:], at.file), row[:, :3])
@@ -86,7 +78,7 @@ def read_tum(path: Path) -> At:
     Raises:
         InputError: If a line has another form, or the times are seconds.
     """
-    file = only_file(path, "*.txt", "a trajectory in TUM's format")
+    file = v.only_file(path, "*.txt", "a trajectory in TUM's format")
     table = _table([line for _, line in _lines(file)], file.name, 8)
     frame = table[:, 0]
     if (frame != np.round(frame)).any():
@@ -111,29 +103,24 @@ def read_colmap(path: Path) -> At:
     if len(names) < len(known) or not known:
         form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, each picture once"
         refuse(At(len(known), file.name), form)
-    numbered = frame_numbers(names, file.name)
+    numbered = v.frame_numbers(names, file.name)
     order = sorted(names, key=numbered.__getitem__)
     table = _table([" ".join(names[name][1:9]) for name in order], file.name, 8)
     T = np.linalg.inv(affine(_turns(np.roll(table[:, :4], -1, 1), file.name), table[:, 4:7]))
-    frame = np.array([numbered[name] for name in order])
+    frame, focal = np.array([numbered[name] for name in order]), None
     cameras = file.parent / "cameras.txt"
-    if not cameras.is_file():
-        return _arrays(file.name, T, frame)
-    lenses = {words[0]: words for words in (line.split() for _, line in _lines(cameras))}
-    used = [lenses.get(names[name][8], [])[:5] for name in order]
-    widths = _table([" ".join(row[2:]) for row in used], cameras.name, 3)
-    return _arrays(file.name, T, frame, widths[:, 2] / widths[:, 0])
+    if cameras.is_file():
+        lenses = {words[0]: words for words in (line.split() for _, line in _lines(cameras))}
+        used = [" ".join(lenses.get(names[name][8], [])[2:5]) for name in order]
+        widths = _table(used, cameras.name, 3)
+        focal = widths[:, 2] / widths[:, 0]
+    return _arrays(file.name, T, frame, focal)
 
 
 def _lines(file: Path) -> list[tuple[int, str]]:
     """The lines of a text file without comments, numbered."""
-    if not file.is_file():
-        raise InputError(f"{file.name}: there is no such file in {file.parent}")
-    if file.stat().st_size > LARGEST_FILE:
-        size = file.stat().st_size
-        raise InputError(f"{file.name}: has {size} bytes, expected at most {LARGEST_FILE}")
     try:
-        text = file.read_text(encoding="utf-8-sig")
+        text = v.existing(file).read_text(encoding="utf-8-sig")
     except BROKEN as error:
         raise InputError(f"{file.name}: cannot be read ({reason(error)})") from error
     lines = [line for line in text.splitlines() if not re.match(r"\s*#", line)]
