@@ -13,9 +13,8 @@ from mover.app.cli import run_command
 from mover.bodies.parts import members, parts_of
 from mover.bodies.skin import PARTS
 from mover.bodies.skinning import open_body, zero_pose
-from mover.core.contact_labels import ContactLabels
 from mover.core.errors import InputError
-from mover.core.types import Bodies, Mesh
+from mover.core.types import Bodies, ContactLabels, Mesh
 from mover.geometry.nearest import to_surface
 from mover.geometry.placement import StandingMesh
 from mover.io.export.contacts import export_contacts, read_labels, write_labels

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from mover.app.cli.run import parse_run
 from mover.core.observe import Energy, silent
-from mover.core.records import built, plain, record
+from mover.core.records import plain, record
+from mover.core.settings import read_settings
 from mover.core.types import Layout
 from mover.energy.bfgs import Problems, _step, minimize_batched
 from mover.energy.config import Adam, BatchedBFGS, SceneWeights
@@ -308,7 +309,7 @@ class TestCommandLine:
 
     def test_settings_come_back_from_a_file_with_the_right_method(self):
         _, config = parse_run(["room", "--place.method", "newton", "--preset", "paper"])
-        again = built(Config, plain(config))
+        again = read_settings(Config, plain(config), "config")
         assert again.place.method == BatchedBFGS()
         assert again.layout.method == config.layout.method
 

@@ -14,12 +14,11 @@ from mover import __version__
 from mover.app.report.page import ReportContent, write_report
 from mover.bodies.corrected import in_world
 from mover.core import records
-from mover.core.contact_labels import ContactLabels
 from mover.core.devices import CPU, named
 from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.settings import read_settings
-from mover.core.types import Bodies, Capture, Mesh, Room, Scene
+from mover.core.types import Bodies, Capture, ContactLabels, Mesh, Room, Scene
 from mover.extensions.missing_seats import PROPOSED, write_proposals
 from mover.extensions.moving_camera import bodies_as_given
 from mover.io.capture.bodies_file import write_bodies

@@ -14,7 +14,7 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -193,23 +193,6 @@ class Word(str):
         return Call(kind, ())
 
 
-class Opcodes(dict[int, Callable[[Any], None]]):
-    """What each opcode does; INST, OBJ, EXT and the like are not there."""
-
-    def __missing__(self, code: int) -> Callable[[Any], None]:
-        raise ValueError(f"opcode {code:#04x}")
-
-
-def _as_row(code: int) -> Callable[[Any], None]:
-    """What an opcode of a tuple does."""
-
-    def act(reader: Any) -> None:  # noqa: ANN401
-        READ[code](reader)
-        reader.stack[-1] = Row(reader.stack[-1])
-
-    return act
-
-
 class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAttributeAccessIssue]
     """Python's reader of a pickle, without any opcode that could import, call or set."""
 
@@ -231,15 +214,12 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
         Raises:
             InputError: If it is not in the list; nothing was imported or called.
         """
-        full = Word(f"{RENAMED.get(module, module)}.{name}")
+        full, shown = Word(f"{RENAMED.get(module, module)}.{name}"), f"{module}.{name}"
         chumpy = module.split(".")[0] == "chumpy" and name.isidentifier()
-        if not chumpy and full not in WORDS and full not in MADE:
-            shown = f"{module}.{name}"
-            odd = not shown.isprintable() or len(shown) >= 200
-            raise InputError(
-                f"the pickle holds {'a class with an odd name' if odd else shown}, {PLAIN}"
-            )
-        return full
+        if chumpy or full in WORDS or full in MADE:
+            return full
+        shown = shown if shown.isprintable() and len(shown) < 200 else "a class with an odd name"
+        raise InputError(f"the pickle holds {shown}, {PLAIN}")
 
     def build(self) -> None:
         """BUILD: the state of a call; behind that of joblib lies an array."""
@@ -257,9 +237,14 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
             raw = stream.read(math.prod(form["shape"]) * form["dtype"].itemsize)
             call.state = _filled(raw, form["dtype"], form["shape"], form["order"])
 
-    dispatch = Opcodes(
+    def row(self, code: int) -> None:
+        """TUPLE and its like: as a row."""
+        READ[code](self)
+        self.stack[-1] = Row(self.stack[-1])
+
+    dispatch = (
         {code: act for code, act in READ.items() if bytes([code]) not in REFUSED}
-        | {c[0]: _as_row(c[0]) for c in (pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3)}
+        | {code: lambda reader, code=code: reader.row(code) for code in b"t\x85\x86\x87"}
         | {
             pickle.NEWOBJ[0]: READ[pickle.REDUCE[0]], pickle.BUILD[0]: build,
             pickle.BYTEARRAY8[0]: READ[pickle.BINBYTES8[0]],
@@ -286,7 +271,10 @@ def _plain(value: Any, done: dict[int, Any], depth: int) -> tuple[Any, int]:  # 
         if depth >= DEEPEST:
             raise InputError(f"holds lists in lists in more than {DEEPEST} levels, expected fewer")
         done[id(value)] = value, None
-        found = [_plain(item, done, depth + 1) for item in _inside(value)]
+        inside = value.values() if isinstance(value, Mapping) else value
+        if isinstance(value, Call):
+            inside = value.args, value.state, value.items
+        found = [_plain(item, done, depth + 1) for item in inside]
         plain, size = [item for item, _ in found], ITEM + sum(size for _, size in found)
         if isinstance(value, Call):
             plain = MADE.get(value.name, _chumpy)(value.name, *plain)
@@ -304,13 +292,6 @@ def _plain(value: Any, done: dict[int, Any], depth: int) -> tuple[Any, int]:  # 
     return done[id(value)][1]
 
 
-def _inside(value: Any) -> Iterable[Any]:  # noqa: ANN401
-    """What a container or a call holds."""
-    if isinstance(value, Call):
-        return value.args, value.state, value.items
-    return value.values() if isinstance(value, Mapping) else value
-
-
 # What the calls of the list describe: each takes its name, arguments, state and items.
 
 
@@ -326,17 +307,12 @@ def _array_of(tensor: torch.Tensor) -> np.ndarray:
 def _tensor(_: str, args: list[Any], *__: object) -> np.ndarray:
     """A tensor in a pickle of Python: a view of its storage."""
     storage, offset, size, stride = args[:4]
-    whole = all(type(n) is int and n >= 0 for n in (offset, *size, *stride))
-    if not whole or not isinstance(storage, np.ndarray) or len(size) != len(stride):
-        raise ValueError("a tensor with an odd shape")
-    if 0 in size:
-        return np.zeros(size, storage.dtype)
-    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-    most = max(storage.nbytes, REPEATED)
-    if last >= len(storage) or math.prod(size) * storage.itemsize > most or len(size) > 32:
-        raise ValueError("a tensor that is larger than what it holds")
-    steps = [step * storage.itemsize for step in stride]
-    return np.lib.stride_tricks.as_strided(storage[offset:], size, steps)
+    try:
+        return _array_of(torch.from_numpy(storage).as_strided(size, stride, offset))
+    except TypeError as error:
+        raise ValueError("a tensor with an odd shape") from error
+    except RuntimeError as error:
+        raise ValueError("a tensor that is larger than what it holds") from error
 
 
 def _bytes(_: str, args: list[Any], *__: object) -> bytes:
@@ -378,10 +354,9 @@ def _filled(raw: Any, dtype: Any, shape: Any, order: Any) -> Any:  # noqa: ANN40
     Raises:
         ValueError: If they are not as many as the shape says.
     """
-    if not isinstance(dtype, np.dtype) or not isinstance(shape, list):
-        raise ValueError("an array without type or shape")
-    if not all(type(n) is int and n >= 0 for n in shape) or len(shape) > 32:
-        raise ValueError("an array with an odd shape")
+    whole = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
+    if not isinstance(dtype, np.dtype) or not whole or len(shape) > 32:
+        raise ValueError("an array without type, or with an odd shape")
     count = math.prod(shape)
     if dtype.hasobject:
         if not isinstance(raw, list) or len(raw) != count:

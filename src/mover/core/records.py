@@ -50,22 +50,21 @@ def record(cls: type[T]) -> type[T]:
 
 def map_tensors(fn: Callable[[Tensor], Tensor], value: T) -> T:
     """Return a copy of `value` with `fn` applied to each tensor inside."""
-    return typing.cast(T, _map(fn, value))
-
-
-def _map(fn: Callable[[Tensor], Tensor], value: Any) -> Any:  # noqa: ANN401
-    match value:
+    found: Any = value
+    match found:
         case Tensor():
-            return fn(value)
+            found = fn(found)
         case tuple():
-            return tuple(_map(fn, v) for v in value)
+            found = tuple(map_tensors(fn, v) for v in found)
         case Mapping():
-            return {k: _map(fn, v) for k, v in value.items()}
-        case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            names = [f.name for f in dataclasses.fields(value)]
-            return dataclasses.replace(value, **{n: _map(fn, getattr(value, n)) for n in names})
+            found = {k: map_tensors(fn, v) for k, v in found.items()}
+        case _ if dataclasses.is_dataclass(found) and not isinstance(found, type):
+            names = [f.name for f in dataclasses.fields(found)]
+            parts = {n: map_tensors(fn, getattr(found, n)) for n in names}
+            found = dataclasses.replace(found, **parts)
         case _:
-            return value
+            pass
+    return typing.cast(T, found)
 
 
 def to_device(value: T, device: torch.device | str) -> T:
@@ -167,6 +166,11 @@ def fingerprint(*values: Any) -> str:  # noqa: ANN401
     return _hashed(tree, tensors)[:16]
 
 
+def plain(value: Any) -> Any:  # noqa: ANN401
+    """A record without tensors as plain JSON values."""
+    return _split(value, "", {})
+
+
 def _digest(tree: Any, tensors: dict[str, Any], path: Path) -> str:  # noqa: ANN401
     """Of a record under its name, so that another's file is not taken for it."""
     return _hashed([path.parent.name, path.name, tree], tensors)
@@ -204,8 +208,11 @@ def _split(value: Any, key: str, tensors: dict[str, Any]) -> Any:  # noqa: ANN40
 def _join(kind: Any, tree: Any, arrays: dict[str, Any]) -> Any:  # noqa: ANN401
     if tree is None:
         return None
-    if typing.get_origin(kind) in (typing.Union, types.UnionType):
-        kind = _chosen([k for k in typing.get_args(kind) if k is not types.NoneType], tree)
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):  # the kind with these fields
+        kinds = [k for k in typing.get_args(kind) if k is not types.NoneType]
+        fits = (k for k in kinds if dataclasses.is_dataclass(k) and isinstance(tree, dict)
+                and {f.name for f in dataclasses.fields(k)} == set(tree))  # fmt: skip
+        kind = next(fits, kinds[0])
     if isinstance(tree, dict) and set(tree) == {"tensor"}:
         return torch.from_numpy(arrays[tree["tensor"]])
     if isinstance(tree, dict) and set(tree) == {"bytes"}:
@@ -217,31 +224,6 @@ def _join(kind: Any, tree: Any, arrays: dict[str, Any]) -> Any:  # noqa: ANN401
     if isinstance(tree, dict):
         return {k: _join(args[1], v, arrays) for k, v in tree.items()}
     if isinstance(tree, list):
-        return tuple(
-            _join(k, v, arrays) for k, v in zip(_kinds(args, len(tree)), tree, strict=True)
-        )
+        kinds = args[:1] * len(tree) if Ellipsis in args else args
+        return tuple(_join(k, v, arrays) for k, v in zip(kinds, tree, strict=True))
     return tree
-
-
-def _chosen(kinds: list[Any], tree: Any) -> Any:  # noqa: ANN401
-    """Of several kinds the one whose fields the tree has, else the first."""
-    names = set(tree) if isinstance(tree, dict) else set[str]()
-    for kind in kinds:
-        if dataclasses.is_dataclass(kind) and {f.name for f in dataclasses.fields(kind)} == names:
-            return kind
-    return kinds[0]
-
-
-def _kinds(args: tuple[Any, ...], length: int) -> tuple[Any, ...]:
-    """Types of the items of a tuple: one for all (`tuple[X, ...]`) or one for each."""
-    return args[:1] * length if Ellipsis in args else args
-
-
-def plain(value: Any) -> Any:  # noqa: ANN401
-    """A record without tensors as plain JSON values; `built` is the way back."""
-    return _split(value, "", {})
-
-
-def built(kind: type[T], tree: Any) -> T:  # noqa: ANN401
-    """A record of type `kind` from plain JSON values."""
-    return typing.cast(T, _join(kind, tree, {}))

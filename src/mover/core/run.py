@@ -65,27 +65,26 @@ class Run:
         Inputs and output lie on the processor; what another device computed has another name.
         """
         name, device, path = self._named(fn, inputs, config)
-        begin, beside = time.perf_counter(), self.started.pop(path, None)
+        start, beside = time.perf_counter(), self.started.pop(path, None)
         kind = typing.get_type_hints(fn)["return"]
         output: Out | None = _stored(kind, path) if beside is None else None
         kept = output is not None
         if beside is not None:
             self.observe(Step(name, 0, 1))
             output, took = beside.result()
-            begin = time.perf_counter() - took
-        if output is None:
-            output = _computed(fn, inputs, config, self.observe, device)
+            start = time.perf_counter() - took
+        if output is None and device == CPU:
+            output = fn(inputs, config, self.observe)
+        elif output is None:  # it lies on the processor, wherever it is computed
+            found = fn(records.to_device(inputs, device), config, self.observe)
+            output = records.to_device(found, CPU)
         if not kept:
             records.save(output, path)
-        seconds = time.perf_counter() - begin
-        self.stages.append(StageLog(name, seconds, _peak_memory(), kept, path.name))
-        log.info(
-            "%s: %s %s in %.1f s",
-            name,
-            "kept" if kept else "made",
-            path.name,
-            self.stages[-1].seconds,
-        )
+        seconds = time.perf_counter() - start
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        megabytes = peak / (1e6 if sys.platform == "darwin" else 1e3)
+        self.stages.append(StageLog(name, seconds, megabytes, kept, path.name))
+        log.info("%s: %s %s in %.1f s", name, "kept" if kept else "made", path.name, seconds)
         return output
 
     def begin(self, fn: Callable[[In, Conf, Observer], Out], inputs: In, config: Conf) -> None:
@@ -98,25 +97,25 @@ class Run:
             return
 
         def work() -> tuple[Out, float]:
-            begin = time.perf_counter()
-            return fn(inputs, config, silent), time.perf_counter() - begin
+            start = time.perf_counter()
+            return fn(inputs, config, silent), time.perf_counter() - start
 
         self.started[path] = _beside().submit(copy_context().run, work)
 
     def _named(
         self, fn: Callable[[In, Conf, Observer], Out], inputs: In, config: Conf
     ) -> tuple[str, torch.device, Path]:
-        """A stage's name, where it computes, and its files, by all that it is made from."""
+        """A stage's name, where it computes, and its files, by all that it is made from.
+
+        A GPU is not worth it for descents that ask after each step (`docs/engine.md`).
+        """
         name = getattr(fn, "__name__", "stage")
-        device = self.device if _gains(name, config) else CPU
+        gains = name in ON_DEVICE and getattr(getattr(config, "method", None), "replays", True)
+        device = self.device if gains else CPU
         where = () if device == CPU else (named(device),)
-        key = records.fingerprint(inputs, config, sources(_package(fn)), *where)
+        package = (getattr(fn, "__module__", None) or "").partition(".")[0]
+        key = records.fingerprint(inputs, config, sources(package), *where)
         return name, device, self.folder / "stages" / name / key
-
-
-def _gains(name: str, config: object) -> bool:
-    """Whether a GPU is worth it: not for descents that ask after each step (`docs/engine.md`)."""
-    return name in ON_DEVICE and getattr(getattr(config, "method", None), "replays", True)
 
 
 @functools.cache
@@ -134,28 +133,6 @@ def _stored(kind: type[Out], path: Path) -> Out | None:
     except InputError as error:
         log.warning("warning: %s; it is computed again", error)
         return None
-
-
-def _computed(
-    fn: Callable[[In, Conf, Observer], Out],
-    inputs: In,
-    config: Conf,
-    observe: Observer,
-    device: torch.device,
-) -> Out:
-    """The output on the processor, wherever it is computed."""
-    if device == CPU:
-        return fn(inputs, config, observe)
-    return records.to_device(fn(records.to_device(inputs, device), config, observe), CPU)
-
-
-def _peak_memory() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1e6 if sys.platform == "darwin" else 1e3)
-
-
-def _package(fn: Callable[..., object]) -> str:
-    return (getattr(fn, "__module__", None) or "").partition(".")[0]
 
 
 @functools.cache
@@ -196,21 +173,13 @@ def kept(kind: type[T], key: str, make: Callable[[], T]) -> T:
     made = make()
     try:
         records.save(made, path)
-        _bound(folder)
+        ages: list[tuple[float, Path]] = []
+        for file in folder.glob("*.json"):
+            with suppress(OSError):  # another process removes it
+                ages.append((file.stat().st_mtime, file))
+        for _, file in sorted(ages)[: MOST // 2 if len(ages) > MOST else 0]:
+            for suffix in (".json", ".npz"):
+                file.with_suffix(suffix).unlink(missing_ok=True)
     except OSError as error:
         log.info("%s: %s; nothing is kept there", folder, error.strerror)
     return made
-
-
-def _bound(folder: Path) -> None:
-    """Remove the half that was not used for longest where there are too many."""
-    found = list(folder.glob("*.json"))
-    if len(found) <= MOST:
-        return
-    ages: list[tuple[float, Path]] = []
-    for path in found:
-        with suppress(OSError):  # another process removes it
-            ages.append((path.stat().st_mtime, path))
-    for _, path in sorted(ages)[: MOST // 2]:
-        for suffix in (".json", ".npz"):
-            path.with_suffix(suffix).unlink(missing_ok=True)

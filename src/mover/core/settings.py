@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
@@ -20,6 +20,8 @@ from mover.core.errors import InputError
 
 T = TypeVar("T")
 MOST_SHOWN = 60  # letters of a wrong value in a message
+UNIONS = (Union, types.UnionType)
+WORDS = {bool: "true or false", str: "text", Path: "a path", types.NoneType: "nothing"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,10 +62,8 @@ def _range(kind: type[int] | type[float], low: float, high: float) -> Range:
         instance_from_str=lambda words: kind(words[0]),
         is_instance=lambda value: type(value) is kind or (kind is float and type(value) is int),
         str_from_instance=lambda value: [str(value)],
-        low=low,
-        high=high,
-        kind=kind,
-    )
+        low=low, high=high, kind=kind,
+    )  # fmt: skip
 
 
 def _short(number: float) -> str:
@@ -90,6 +90,13 @@ Index = Annotated[int, int_in(0, 2**31 - 1)]
 """Of a frame."""
 
 
+@functools.cache
+def settings_of(kind: type[Any]) -> dict[str, Any]:
+    """The types of a dataclass's fields, with their ranges."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+
+
 def check_settings(settings: object, name: str) -> None:
     """Check every setting of a dataclass and of those inside.
 
@@ -114,91 +121,61 @@ def read_settings(kind: type[T], tree: object, name: str) -> T:
     return typing.cast(T, _built(kind, tree, name))
 
 
-@functools.cache
-def settings_of(kind: type[Any]) -> dict[str, Any]:
-    """The types of a dataclass's fields, with their ranges."""
-    hints = typing.get_type_hints(kind, include_extras=True)
-    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
-
-
 def _joined(name: str, key: str) -> str:
     return f"{name}{key}" if name in ("--", "") else f"{name}.{key}"
 
 
 def _check(value: Any, hint: Any, name: str) -> None:  # noqa: ANN401
     if expected := _wrong(value, hint, name):
-        raise InputError(f"{name}: has {_shown(value)}, expected {expected}")
+        shown = repr(value)
+        shown = shown if len(shown) <= MOST_SHOWN else shown[:MOST_SHOWN] + "..."
+        raise InputError(f"{name}: has {shown}, expected {expected}")
 
 
 def _wrong(value: Any, hint: Any, name: str) -> str:  # noqa: ANN401
     """What is expected in place of a value; empty: it fits."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        ranges = [one for one in args[1:] if isinstance(one, Range)]
-        wrong = [one.words() for one in ranges if not one.holds(value)]
-        return wrong[0] if wrong else "" if ranges else _wrong(value, args[0], name)
-    if origin in (Union, types.UnionType):
-        return _wrong_of_all(value, args, name)
-    if origin is tuple:
-        return _wrong_items(value, args, name)
+        span = next((one for one in args[1:] if isinstance(one, Range)), None)
+        if span is None:
+            return _wrong(value, args[0], name)
+        return "" if span.holds(value) else span.words()
+    if origin in UNIONS:
+        wrong = [_wrong(value, kind, name) for kind in args]
+        return "" if "" in wrong else wrong[0]
     if origin is Literal:
         return "" if value in args else f"one of {', '.join(map(str, args))}"
-    if dataclasses.is_dataclass(hint):
-        if isinstance(value, typing.cast(type, hint)):
-            check_settings(value, name)
-            return ""
-        return "settings {...}"
-    words = {bool: "true or false", str: "text", Path: "a path", types.NoneType: "nothing"}
-    return "" if hint not in words or isinstance(value, hint) else words[hint]
-
-
-def _wrong_of_all(value: Any, kinds: Sequence[Any], name: str) -> str:  # noqa: ANN401
-    """What is expected where there is a choice of types."""
-    wrong = [_wrong(value, kind, name) for kind in kinds if kind is not types.NoneType]
-    if "" in wrong or (value is None and types.NoneType in kinds):
+    if origin is tuple:
+        many = Ellipsis in args
+        if not isinstance(value, tuple) or not (many or len(value) == len(args)):
+            return f"a list of {len(args)}" if isinstance(value, tuple) else "a list"
+        for i, one in enumerate(value):
+            _check(one, args[0 if many else i], f"{name}[{i}]")
         return ""
-    return wrong[0]
-
-
-def _wrong_items(value: Any, kinds: Sequence[Any], name: str) -> str:  # noqa: ANN401
-    """What is expected of a tuple; its items are checked, too."""
-    if not isinstance(value, tuple):
-        return "a list"
-    if Ellipsis not in kinds and len(value) != len(kinds):
-        return f"a list of {len(kinds)}"
-    for i, one in enumerate(value):
-        _check(one, kinds[0 if Ellipsis in kinds else i], f"{name}[{i}]")
-    return ""
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= MOST_SHOWN else text[:MOST_SHOWN] + "..."
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, typing.cast(type, hint)):
+            return "settings {...}"
+        check_settings(value, name)
+        return ""
+    return "" if hint not in WORDS or isinstance(value, hint) else WORDS[hint]
 
 
 def _built(hint: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
     """A value of plain JSON values, checked before a record is built of it."""
-    kinds = _dataclasses(hint)
+    args = get_args(hint)
+    kinds = [one for one in (args if get_origin(hint) in UNIONS else (hint,))
+             if isinstance(one, type) and dataclasses.is_dataclass(one)]  # fmt: skip
     if kinds and isinstance(tree, Mapping):
         kind = next((k for k in kinds if set(settings_of(k)) == set(tree)), kinds[0])
-        for key in tree:
-            if key not in settings_of(kind):
-                known = ", ".join(settings_of(kind))
-                raise InputError(f"{_joined(name, key)}: is no setting, expected one of {known}")
         fields = settings_of(kind)
+        for key in tree:
+            if key not in fields:
+                known = ", ".join(fields)
+                raise InputError(f"{_joined(name, key)}: is no setting, expected one of {known}")
         return kind(**{k: _built(fields[k], v, _joined(name, k)) for k, v in tree.items()})
-    value = tree
     if isinstance(tree, list):
-        args = get_args(hint)
         items = args[:1] * len(tree) if Ellipsis in args else (*args, *[Any] * len(tree))
         pairs = enumerate(zip(items, tree, strict=False))
-        value = tuple(_built(kind, one, f"{name}[{i}]") for i, (kind, one) in pairs)
-    _check(value, hint, name)
-    return value
-
-
-def _dataclasses(hint: Any) -> list[type[Any]]:  # noqa: ANN401
-    """The dataclasses among the types that a hint allows."""
-    if get_origin(hint) in (Union, types.UnionType):
-        return [kind for one in get_args(hint) for kind in _dataclasses(one)]
-    return [hint] if isinstance(hint, type) and dataclasses.is_dataclass(hint) else []
+        tree = tuple(_built(kind, one, f"{name}[{i}]") for i, (kind, one) in pairs)
+    _check(tree, hint, name)
+    return tree

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mover.core.contact_labels import ContactLabels
 from mover.core.errors import InputError
+from mover.core.types import ContactLabels
 from mover.io.export.finished import Exported, Finished, Up, clock_of, tracks_of
 from mover.io.export.solids import AXES, floor_height
 from mover.io.files.npz import read_npz, write_npz

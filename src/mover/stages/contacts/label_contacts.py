@@ -17,11 +17,10 @@ from torch.nn.functional import normalize
 from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import touching
 from mover.bodies.skin import PARTS
-from mover.core.contact_labels import ContactLabels
 from mover.core.observe import Observer, silent
 from mover.core.records import record
 from mover.core.settings import Metres, Share
-from mover.core.types import Bodies, Mesh
+from mover.core.types import Bodies, ContactLabels, Mesh
 from mover.geometry.nearest import as_float64, as_int64, closest, enclosed
 from mover.geometry.placement import StandingMesh
 from mover.geometry.volume import outward
