@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from mover.core.errors import InputError
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts, image_parts
+from mover.io.capture.scene_file import write_scene
 from mover.io.files.fields import At, get, items, mapping, maybe, read_json, refuse, text, vector
 from mover.io.scenes.placing import Matrix
 from mover_bench.datasets.prox_files import world_of
@@ -222,7 +224,8 @@ def _with_truth(parts: Parts, root: Path, room: str, scan_cam: Matrix) -> Parts:
     scans = sorted(home.rglob(f"{room}.ply"))
     if scans:
         ground = floor_in(read_scan(scans[0]), world)
-    return dataclasses.replace(parts, scenes={"truth": boxes_scene(boxes, world, camera, ground)})
+    truth = boxes_scene(boxes, world, camera, ground)
+    return dataclasses.replace(parts, beside={"truth/scene.json": partial(write_scene, truth)})
 
 
 def read_segments(path: Path) -> list[TrueBox]:

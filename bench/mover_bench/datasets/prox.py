@@ -10,6 +10,7 @@ that: its camera is level, its furniture comes from elsewhere. What is missing i
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,13 @@ import numpy as np
 import torch
 
 from mover.core.errors import InputError
+from mover.core.files import copy_whole
 from mover.core.types import Bodies, BodyPose, Scene
-from mover.io.capture.bodies_file import bodies_to_arrays
+from mover.io.capture.bodies_file import bodies_to_arrays, write_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts, image_parts
-from mover.io.files.fields import At, read_json
+from mover.io.capture.scene_file import write_scene
+from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.images import opened
 from mover.io.files.schema import rigid
 from mover.io.scenes.placing import Matrix
@@ -81,7 +84,7 @@ def prox_parts(root: Path, hints: Hints) -> Parts:
         camera=lens,
         bodies=None if bodies is None else At(bodies_to_arrays(bodies), name),
         people=people_masks(lines, _tracks(recordings), fps),
-        trees=trees,
+        beside={place: partial(write_json, tree) for place, tree in trees.items()},
         notes=(*notes, *_missing(lines)),
     )
     parts = _with_pictures(parts, lines, hints)
@@ -118,18 +121,17 @@ def _missing(lines: Sequence[Timeline]) -> list[str]:
 
 def _with_pictures(parts: Parts, lines: Sequence[Timeline], hints: Hints) -> Parts:
     """The parts with all pictures, flipped; the first is the reference image."""
-    copies: dict[str, Path] = {}
+    beside = dict(parts.beside)
     first: Path | None = None
     for line in lines:
         for frame, path in line.files("Color").items():
             first = first or path
-            copies[f"frames/{frame:06d}.jpg"] = _mirrored_copy(
-                path, hints.work / line.recording.name
-            )
+            picture = _mirrored_copy(path, hints.work / line.recording.name)
+            beside[f"frames/{frame:06d}.jpg"] = partial(copy_whole, picture)
     if first is None:
         return parts
     load, size = image_parts(first, mirrored=True)
-    return dataclasses.replace(parts, load_image=load, image_size=size, copies=copies)
+    return dataclasses.replace(parts, load_image=load, image_size=size, beside=beside)
 
 
 def _mirrored_copy(path: Path, work: Path) -> Path:
@@ -233,20 +235,20 @@ def _with_truth(parts: Parts, lines: Sequence[Timeline], lens: At, hints: Hints)
         boxes = read_bbox3d(hints.boxes, hints.names, read_json(hints.boxes))
     else:
         notes.append("without --boxes the truth has no furniture")
-    scenes = _true_scenes(recording, boxes, (world, cam2world), camera)
-    people: dict[str, Bodies] = {}
+    beside = dict(parts.beside)
+    for place, scene in _true_scenes(recording, boxes, (world, cam2world), camera).items():
+        beside[f"{place}/scene.json"] = partial(write_scene, scene)
     if recording.scene == QUANTITATIVE:
         true = [(line, _fits(line, ("mosh",), notes)) for line in lines]
         mosh = _joined(true, _tracks([line.recording for line in lines]), notes)
         if mosh is not None:
-            people["truth"] = _into_camera(mosh, root, cam2world)
-    trees = dict(parts.trees)
+            true_bodies = _into_camera(mosh, root, cam2world)
+            beside["truth/bodies.npz"] = partial(write_bodies, true_bodies)
     if (root / "sdf" / f"{recording.scene}.json").is_file():
         place = {"root": str(root.resolve()), "scene": recording.scene}
-        trees[SCAN_SDF] = {**place, "world_scan": world.tolist()}
-    return dataclasses.replace(
-        parts, scenes=scenes, people_of=people, notes=tuple(notes), trees=trees
-    )
+        tree = {**place, "world_scan": world.tolist()}
+        beside[SCAN_SDF] = partial(write_json, tree)
+    return dataclasses.replace(parts, notes=tuple(notes), beside=beside)
 
 
 def _true_scenes(

@@ -12,6 +12,7 @@ Folders are found by what they hold, so that renamed ones do as well.
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,12 @@ from typing import Any
 import numpy as np
 
 from mover.core.errors import InputError
+from mover.core.files import copy_whole
 from mover.core.types import Scene
 from mover.geometry.rotations import affine
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts
-from mover.io.capture.scene_file import scene_of, scene_tree
+from mover.io.capture.scene_file import scene_of, scene_tree, write_scene
 from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, get, items, maybe, read_json
 from mover.io.files.npz import read_npy
@@ -140,11 +142,13 @@ def release_parts(folder: Path, hints: Hints) -> Parts:
         bodies=bodies,
         contacts=contact_arrays(folder, bodies, notes),
         people=people,
-        copies=_frames(folder, first),
+        beside=_frames(folder, first),
     )
     authors = _authors(folder, parts, R, notes)
     truth = _truth(folder, lens, hints)
-    return dataclasses.replace(parts, scenes={**truth, **authors}, notes=tuple(notes))
+    scenes = {**truth, **authors}
+    beside = {f"{place}/scene.json": partial(write_scene, one) for place, one in scenes.items()}
+    return dataclasses.replace(parts, beside={**parts.beside, **beside}, notes=tuple(notes))
 
 
 def found(folder: Path, name: str) -> Path | None:
@@ -191,13 +195,17 @@ def _people(folder: Path, home: Path, size: tuple[int, int]) -> At | None:
     return people_tree(Instances(tuple(first.values()), size, seen.file))
 
 
-def _frames(folder: Path, first: int) -> dict[str, Path]:
-    """Pictures by their place in the capture."""
+def _frames(folder: Path, first: int) -> dict[str, Callable[[Path], object]]:
+    """What copies the pictures to their places in the capture."""
     one = found(folder, f"{first:06d}.jpg")
     if one is None:
         return {}
     paths = sorted(one.parent.glob("[0-9]*.jpg"))
-    return {f"frames/{int(p.stem) - first:06d}.jpg": p for p in paths if p.stem.isdecimal()}
+    return {
+        f"frames/{int(p.stem) - first:06d}.jpg": partial(copy_whole, p)
+        for p in paths
+        if p.stem.isdecimal()
+    }
 
 
 def _authors(folder: Path, parts: Parts, R: Matrix | None, notes: list[str]) -> dict[str, Scene]:

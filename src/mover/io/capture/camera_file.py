@@ -1,18 +1,18 @@
 """The camera of camera.json and scene.json, and where a moving one was (cameras.npz)."""
 
 import dataclasses
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-from msgspec import Struct
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from mover.core.types import STILL, Bodies, Camera, CameraPath
 from mover.geometry.camera import heading, pitch_roll
 from mover.geometry.rotations import affine, rot_y
 from mover.io.files.fields import LAST_INDEX, At, Warn, array, get, maybe, plain, refuse
-from mover.io.files.schema import Number, Positive, Rows, Side, checked, rotation
+from mover.io.files.schema import Number, Positive, Rows, Share, Side, checked, rotation
 
 LARGEST_AREA = 1 << 28  # [px²]
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -22,7 +22,10 @@ LEVEL = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 
 
 class CameraFields(Struct, frozen=True):
-    """camera.json, and `camera` of scene.json; lengths in pixels."""
+    """camera.json, and `camera` of scene.json; lengths in pixels, the height above the floor [m].
+
+    The spread is the standard deviation of the logarithm of the focal length.
+    """
 
     w: Side
     h: Side
@@ -31,6 +34,8 @@ class CameraFields(Struct, frozen=True):
     cx: Number
     cy: Number
     R_cam_world: Rows | None = None
+    height: Annotated[float, Meta(ge=0.1, le=20)] | None = None
+    focal_spread: Share | None = None
 
 
 def camera_of(at: At, other: Camera | None = None) -> Camera:

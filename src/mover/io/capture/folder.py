@@ -1,13 +1,15 @@
 """Capture folders (FORMAT.md): camera, initial scene, annotations, bodies, people."""
 
-import dataclasses
 import re
+import shutil
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from mover.core.errors import InputError
+from mover.core.files import copy_whole
 from mover.core.types import Camera, Capture, DepthImage
 from mover.geometry.path import is_still
 from mover.io.capture.annotations_file import (
@@ -19,18 +21,10 @@ from mover.io.capture.annotations_file import (
 from mover.io.capture.bodies_file import write_bodies
 from mover.io.capture.build import build_capture
 from mover.io.capture.camera_file import camera_to_json, path_to_arrays
-from mover.io.capture.parts import Hints, LoadImage, Parts, image_parts
+from mover.io.capture.parts import Hints, Parts, image_parts
 from mover.io.capture.scene_file import HYPOTHESES, write_hypotheses, write_scene
+from mover.io.files import images
 from mover.io.files.fields import At, read_json, write_json
-from mover.io.files.images import (
-    DEPTH,
-    DISPARITY,
-    find_depth_file,
-    read_depth_image,
-    read_image,
-    write_depth_image,
-    write_image,
-)
 from mover.io.files.meshes import read_mesh
 from mover.io.files.npz import read_npz, write_npz
 
@@ -46,9 +40,8 @@ def read_capture(folder: Path) -> Capture:
     named = image_name(parts.objects)
     if named is None and (folder / REFERENCE).is_file():
         named = At(REFERENCE, "objects.json", "images[0].file_name")
-    if named is None:
-        return build_capture(parts)
-    return build_capture(dataclasses.replace(parts, load_image=partial(read_image, named, folder)))
+    load = None if named is None else partial(images.read_image, named, folder)
+    return build_capture(replace(parts, load_image=load))
 
 
 def folder_parts(folder: Path, hints: Hints | None = None) -> Parts:
@@ -62,11 +55,20 @@ def folder_parts(folder: Path, hints: Hints | None = None) -> Parts:
         if isinstance(own, dict) and isinstance(base, dict):
             camera = At({**base, **own}, scene.file, "camera")
         scene = At({k: v for k, v in scene.value.items() if k != "camera"}, scene.file)
-    load, size = _reference(folder, parts.objects)
-    return dataclasses.replace(
-        parts, camera=camera, scene=scene, load_image=load, image_size=size,
+    named = None if parts.objects is None else image_name(parts.objects)
+    first = [named.value] if named is not None and isinstance(named.value, str) else []
+    paths = ((folder / name).resolve() for name in (*first, "reference.png", REFERENCE))
+    inside = (path for path in paths if path.is_relative_to(folder.resolve()) and path.is_file())
+    picture = next(inside, None)
+    load, size = (None, None) if picture is None else image_parts(picture)
+    depth = images.find_depth_file(folder)
+    beside = {} if depth is None else {
+        f"{images.DEPTH if depth[1] else images.DISPARITY}/000000{depth[0].suffix.lower()}":
+            partial(_put_depth, depth[0])
+    }  # fmt: skip
+    return replace(
+        parts, camera=camera, scene=scene, load_image=load, image_size=size, beside=beside,
         n_frames=None, hypotheses=None, furniture=None,  # they may be of what is replaced
-        copies=_measured(folder),
     )  # fmt: skip
 
 
@@ -89,29 +91,18 @@ def _files(folder: Path, needed: Callable[[Path], At | None]) -> Parts:
     )
 
 
-def _measured(folder: Path) -> dict[str, Path]:
-    """The measured depth of a folder, by its place in a capture."""
-    found = find_depth_file(folder)
-    if found is None:
-        return {}
-    return {f"{DEPTH if found[1] else DISPARITY}/000000{found[0].suffix.lower()}": found[0]}
-
-
 def _depth_in(folder: Path, camera: Camera) -> DepthImage | None:
-    found = find_depth_file(folder)
-    return None if found is None else read_depth_image(found[0], camera, metric=found[1])
+    found = images.find_depth_file(folder)
+    return None if found is None else images.read_depth_image(found[0], camera, metric=found[1])
 
 
-def _reference(folder: Path, objects: At | None) -> tuple[LoadImage | None, tuple[int, int] | None]:
-    names = ["reference.png", REFERENCE]
-    named = None if objects is None else image_name(objects)
-    if named is not None and isinstance(named.value, str):
-        names = [named.value, *names]
-    for name in names:
-        path = (folder / name).resolve()
-        if path.is_relative_to(folder.resolve()) and path.is_file():
-            return image_parts(path)
-    return None, None
+def _put_depth(source: Path, target: Path) -> None:
+    """Copy measured depth into a capture, where it is the only one: a picture has one depth."""
+    folder = target.parents[1]
+    if not source.resolve().is_relative_to(folder.resolve()):
+        for name in (images.DEPTH, images.DISPARITY):
+            shutil.rmtree(folder / name, ignore_errors=True)
+    copy_whole(source, target)
 
 
 def _if_there(read: Callable[[Path], At], path: Path) -> At | None:
@@ -120,11 +111,9 @@ def _if_there(read: Callable[[Path], At], path: Path) -> At | None:
 
 def _count_frames(folder: Path) -> int | None:
     """One more than the last numbered picture, None without pictures."""
-    if not folder.is_dir():
-        return None
-    names = (re.fullmatch(r"([0-9]{6,8})\.(jpg|jpeg|png)", p.name) for p in folder.iterdir())
-    numbers = [int(name[1]) for name in names if name]
-    return max(numbers) + 1 if numbers else None
+    files = folder.iterdir() if folder.is_dir() else ()
+    names = (re.fullmatch(r"([0-9]{6,8})\.(jpg|jpeg|png)", p.name) for p in files)
+    return max((int(name[1]) + 1 for name in names if name), default=None)
 
 
 def write_capture(capture: Capture, folder: Path) -> None:
@@ -135,33 +124,35 @@ def write_capture(capture: Capture, folder: Path) -> None:
     Raises:
         ValueError: If the folder has a file that this capture lacks: the two would mix.
     """
-    _check_room_for(capture, folder)
-    name = None
+    people, depth = capture.people or capture.reference_people, capture.depth
+    wanted = {
+        "bodies.npz": capture.bodies, "people.json": people, "contacts.npz": capture.touch,
+        FURNITURE: capture.furniture, "cameras.npz": None if is_still(capture.path) else True,
+        images.DEPTH: depth if depth is not None and depth.metric else None,
+        images.DISPARITY: depth if depth is not None and not depth.metric else None,
+    }  # fmt: skip
+    for name, part in wanted.items():
+        if part is None and (folder / name).exists():
+            raise ValueError(f"{folder} has {name}, which the capture lacks; choose a new folder")
     if capture.reference is not None:
-        name = "reference.png"
-        write_image(capture.reference, folder / name)
+        images.write_image(capture.reference, folder / "reference.png")
     if capture.bodies is not None:
         write_bodies(capture.bodies, folder / "bodies.npz")
-    _write_evidence(capture, folder)
-    write_trees(capture, folder, name)
-    if capture.hypotheses:
-        own = {piece.id: [piece] for piece in capture.scene.objects}
-        for piece in capture.hypotheses:
-            own[piece.id].append(piece)
-        write_hypotheses(folder, {k: v for k, v in own.items() if len(v) > 1}, {})
-
-
-def _write_evidence(capture: Capture, folder: Path) -> None:
-    """Files that a capture may lack."""
     if capture.touch is not None:
         touch = capture.touch.detach().cpu().numpy()
         write_npz({"probability": touch}, folder / "contacts.npz")
     if not is_still(capture.path):
         write_npz(path_to_arrays(capture.path), folder / "cameras.npz")
-    if capture.depth is not None:
-        write_depth_image(capture.depth, folder)
+    if depth is not None:
+        images.write_depth_image(depth, folder)
     if capture.furniture is not None:
         write_json(furniture_to_json(capture.furniture), folder / FURNITURE)
+    write_trees(capture, folder, None if capture.reference is None else "reference.png")
+    others = {h.id for h in capture.hypotheses}
+    groups = {one.id: [one, *(h for h in capture.hypotheses if h.id == one.id)]
+              for one in capture.scene.objects if one.id in others}  # fmt: skip
+    if groups:
+        write_hypotheses(folder, groups, {})
 
 
 def write_trees(
@@ -195,19 +186,3 @@ def write_trees(
     tree = people_to_json(people, hidden, None if bodies is None else bodies.fps, frames)
     write_json({**tree, "info": {**(info or {}), **tree["info"]}}, folder / "people.json")
     return [*done, "people.json"]
-
-
-def _check_room_for(capture: Capture, folder: Path) -> None:
-    """Refuse a folder whose optional files would join a capture that has none."""
-    wanted = {
-        "bodies.npz": capture.bodies is not None,
-        "people.json": capture.people is not None or capture.reference_people is not None,
-        "contacts.npz": capture.touch is not None,
-        FURNITURE: capture.furniture is not None,
-        "cameras.npz": not is_still(capture.path),
-        DEPTH: capture.depth is not None and capture.depth.metric,
-        DISPARITY: capture.depth is not None and not capture.depth.metric,
-    }
-    for name, is_written in wanted.items():
-        if not is_written and (folder / name).exists():
-            raise ValueError(f"{folder} has {name}, which the capture lacks; choose a new folder")

@@ -9,12 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.errors import InputError
-from mover.core.types import Bodies, Camera, DepthImage, Mesh, Scene
+from mover.core.types import Camera, DepthImage, Mesh
 from mover.io.files.fields import At
 from mover.io.files.images import image_size, read_image_file
 
 LoadMesh = Callable[[At], tuple[Mesh, str]]
 LoadImage = Callable[[Camera], Float[Tensor, "h w 3"]]
+LoadDepth = Callable[[Camera], DepthImage | None]
 UNKNOWN = "object"
 """The category of what a tool gives no name; it fits any other."""
 
@@ -22,11 +23,6 @@ UNKNOWN = "object"
 def no_mesh(at: At) -> NoReturn:
     """There are no meshes."""
     raise InputError(f"{at.place} names a mesh, expected none here")
-
-
-def no_depth(camera: Camera) -> None:
-    """Nothing was measured."""
-    del camera
 
 
 @dataclass(frozen=True)
@@ -41,17 +37,13 @@ class Parts:
     tilt: Any = None
     """R_cam_world of the world in which `scene` is, where it is not that of `camera`."""
     objects: At | None = None
-    """The fields of objects.json."""
+    """The fields of objects.json, as below those of people.json and furniture.json."""
     people: At | None = None
-    """The fields of people.json."""
     furniture: At | None = None
-    """The fields of furniture.json."""
     bodies: At | None = None
-    """The arrays of bodies.npz."""
+    """The arrays of bodies.npz, as below those of contacts.npz and cameras.npz."""
     contacts: At | None = None
-    """The arrays of contacts.npz."""
     cameras: At | None = None
-    """The arrays of cameras.npz."""
     load_mesh: LoadMesh = no_mesh
     """Gives the mesh that a field of `scene` names."""
     load_image: LoadImage | None = None
@@ -59,20 +51,16 @@ class Parts:
     """What the warning names where there is no picture."""
     image_size: tuple[int, int] | None = None
     """Width and height of the image, where it is known [px]."""
-    load_depth: Callable[[Camera], DepthImage | None] = no_depth
+    load_depth: LoadDepth | None = None
     """Gives the measured depth of the reference picture."""
     n_frames: int | None = None
     """How many frames the video has, where that is known."""
     hypotheses: At | None = None
     """The fields of hypotheses.json."""
-    copies: Mapping[str, Path] = field(default_factory=dict[str, Path])
-    """Files that are taken as they are, by their place in the capture."""
-    trees: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """JSON files beside the rest, by their place in the capture."""
-    scenes: Mapping[str, Scene] = field(default_factory=dict[str, Scene])
-    """Scenes beside the initial one, by their folder: `truth`, ..."""
-    people_of: Mapping[str, Bodies] = field(default_factory=dict[str, Bodies])
-    """People of those scenes, by their folder."""
+    beside: Mapping[str, Callable[[Path], object]] = field(
+        default_factory=dict[str, Callable[[Path], object]]
+    )
+    """What writes further files (frames, keypoints, truth/scene.json), by their place."""
     notes: tuple[str, ...] = ()
     """Notes of the reader to the user."""
 
@@ -100,16 +88,10 @@ class Hints:
 
 
 def image_parts(path: Path, *, mirrored: bool = False) -> tuple[LoadImage, tuple[int, int]]:
-    """How to load a picture, and its size.
-
-    Args:
-        path: Of the picture.
-        mirrored: It is stored mirrored and must be flipped left to right.
-    """
-    size = image_size(path)
+    """How to load a picture (flipped left to right, where it is stored mirrored), and its size."""
 
     def load(camera: Camera) -> Float[Tensor, "h w 3"]:
         picture = read_image_file(At(path.name, path.name), path, camera)
         return picture.flip(1) if mirrored else picture
 
-    return load, size
+    return load, image_size(path)
