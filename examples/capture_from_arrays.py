@@ -11,7 +11,7 @@ from mover.io.capture.arrays import ObjectArrays, capture_from_arrays
 
 
 def make_capture() -> Capture:
-    """One table, seen by a camera that nobody has levelled yet."""
+    """One table, seen by a camera that is not levelled yet."""
     table = make_piece("table", np.random.default_rng(0), style=0).mesh  # +y up, +z front, metres
     mask = np.zeros((240, 320), dtype=bool)
     mask[128:176, 117:204] = True

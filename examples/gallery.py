@@ -104,7 +104,7 @@ def furniture_cells() -> list[Cell]:
 
 @dataclass(frozen=True)
 class Played:
-    """What somebody did among pieces."""
+    """What a person did among objects."""
 
     stage: Stage
     done: Performance
@@ -190,7 +190,7 @@ def pass_cells() -> list[Cell]:
 
 
 def seat_cells() -> list[Cell]:
-    """Somebody on every style of everything that one sits or lies on, from the side."""
+    """A person on every style of everything that one sits or lies on, from the side."""
     cells: list[Cell] = []
     for name, style in _designs(SEATS):
         pieces = one(name, style, style)

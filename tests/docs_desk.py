@@ -167,7 +167,7 @@ class Vposer(torch.nn.Module):
 
 
 def person_of(model: BodyModel) -> Bodies:
-    """Somebody of the user's model before the camera."""
+    """A person of the user's model before the camera."""
     place, still = torch.tensor([[0.0, 0.0, 3.0]]), torch.zeros(1, 3)
     pose = BodyPose("smplx", "neutral", torch.zeros(1, 10), still, torch.zeros(1, 63), place, {})
     verts, joints = model.posed(pose)
@@ -202,7 +202,7 @@ def write_persons(desk: Path) -> None:
 
 
 def write_video(path: Path) -> None:
-    """Somebody grey walks through a room."""
+    """A grey person walks through a room."""
     import av
 
     rng = np.random.default_rng(1)

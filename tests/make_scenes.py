@@ -353,7 +353,7 @@ def body_index(size: tuple[int, int], index: int) -> Image.Image:
 def write_prox(root: Path, room: Room, recording: str, frames: int, shift: np.ndarray) -> Path:
     """The camera stands at `shift` in the scan's frame; pictures are stored mirrored."""
     place = recording.split("_")[0]
-    for name in ("calibration", "cam2world", "scenes", "sdf"):
+    for name in ("calibration", "cam2world", "scenes"):
         (root / name).mkdir(parents=True, exist_ok=True)
     lens = {"camera_mtx": (room.K - HALF).tolist(), "k": [0.1, 0.0, 0.0, 0.0, 0.0]}
     (root / "calibration" / "Color.json").write_text(json.dumps(lens))
@@ -381,19 +381,6 @@ def write_prox(root: Path, room: Room, recording: str, frames: int, shift: np.nd
         (keypoints / f"{stem}_keypoints.json").write_text(json.dumps(tree))
     write_truth(root / "boxes", room)
     return root
-
-
-def write_sdf(root: Path, place: str, dim: int = 16) -> None:
-    """A ball of 0.5 m about (1, 2, 3), in a cube of 4 m."""
-    low = np.array([-1.0, 0.0, 1.0])
-    cell = 4.0 / dim
-    axes = [low[i] + (np.arange(dim) + 0.5) * cell for i in range(3)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    values = np.linalg.norm(points - [1, 2, 3], axis=-1) - 0.5
-    (root / "sdf").mkdir(parents=True, exist_ok=True)
-    np.save(root / "sdf" / f"{place}_sdf.npy", values.ravel())
-    tree = {"min": low.tolist(), "max": (low + 4).tolist(), "dim": dim}
-    (root / "sdf" / f"{place}.json").write_text(json.dumps(tree))
 
 
 # --- PiGraphs ---

@@ -1,4 +1,4 @@
-"""Camera and ground from soles: analytic floors, noise, and what feet cannot tell."""
+"""Camera and ground from soles: analytic floors, noise, and what feet cannot observe."""
 
 import math
 
@@ -174,18 +174,18 @@ def leaning(soles, slope):
 
 
 @pytest.mark.parametrize("slope", [-0.007, 0.007])
-def test_a_floor_that_leans_as_a_whole_is_set_right_by_a_tilt_that_is_told(slope):
-    told, soles = math.radians(0.3), leaning(soles_at(room(30), noise=0.01), slope)
+def test_a_floor_that_leans_as_a_whole_is_set_right_by_a_tilt_that_is_observed(slope):
+    observed, soles = math.radians(0.3), leaning(soles_at(room(30), noise=0.01), slope)
     alone = errors(align(soles, camera_off((0.1, -0.1))))
     assert abs(alone[0]) > 0.4  # and states a tenth of that
-    believed, doubted = (
-        align_camera(AlignInputs(soles, camera_off((0.1, -0.1)), None, None, told, lean))
+    fixed, free = (
+        align_camera(AlignInputs(soles, camera_off((0.1, -0.1)), None, None, observed, lean))
         for lean in (0.0, math.radians(0.5))
     )
-    assert abs(errors(doubted)[0]) < 0.2 < abs(errors(believed)[0])
-    spread = doubted.covariance.diag().sqrt()[:2]
-    assert bool((spread > 0.8 * told).all())
-    assert bool((spread < 1.2 * told).all())
+    assert abs(errors(free)[0]) < 0.2 < abs(errors(fixed)[0])
+    spread = free.covariance.diag().sqrt()[:2]
+    assert bool((spread > 0.8 * observed).all())
+    assert bool((spread < 1.2 * observed).all())
 
 
 def test_a_lean_that_all_feet_share_is_in_the_covariance():
@@ -220,7 +220,7 @@ def test_frames_of_one_pose_are_no_new_evidence():
     assert spread[1] > 0.2
 
 
-def test_a_known_camera_height_is_the_ground_and_people_of_a_wrong_size_are_told():
+def test_a_known_camera_height_is_the_ground_and_people_of_a_wrong_size_are_reported():
     soles = soles_at(room(), noise=0.005, bias=-0.08)
     found = align(soles, camera_off((2.0, -2.0)), height=-GROUND)
     assert found.ground == GROUND

@@ -181,15 +181,15 @@ def test_the_commands_of_a_block_run_one_after_the_other(lines: list[str], desk:
 
 @pytest.mark.parametrize("line", SWAPS)
 def test_a_command_of_a_sentence_or_a_table_runs(line: str, desk: Path):
-    told = " ".join(" ".join(page.read_text().split()) for page in PAGES)
-    assert line in told
+    text = " ".join(" ".join(page.read_text().split()) for page in PAGES)
+    assert line in text
     do(line, desk)
 
 
 def test_what_is_not_run_is_still_in_the_docs():
     """Else the reason is stale."""
-    told = "\n".join(page.read_text() for page in PAGES)
-    assert all(re.search(re.escape(key), told) for key in ELSEWHERE)
+    text = "\n".join(page.read_text() for page in PAGES)
+    assert all(re.search(re.escape(key), text) for key in ELSEWHERE)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -199,8 +199,8 @@ def test_benchmarks_that_a_page_names_have_these_options(page: Path):
     for script, rest in dict.fromkeys(found):
         assert (root / script).is_file()
         if script.startswith("benchmarks"):
-            told = subprocess.run(
+            text = subprocess.run(
                 [sys.executable, str(root / script), "--help"], check=True, text=True,
                 capture_output=True, env={**os.environ, "PYTHONPATH": str(root / "src")},
             ).stdout  # fmt: skip
-            assert all(flag in told for flag in re.findall(r"--[a-z-]+", rest)), (script, rest)
+            assert all(flag in text for flag in re.findall(r"--[a-z-]+", rest)), (script, rest)

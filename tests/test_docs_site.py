@@ -105,11 +105,11 @@ def test_the_weights_in_the_table_are_those_of_the_presets():
     )
     for text, name in zip(row.strip("| ").split("|")[1:], PRESETS, strict=True):
         w = PRESETS[name].place.weights
-        told = [float(word.strip().replace("10⁵", "1e5")) for word in text.split(",")]
-        assert told == [w.bbox, w.silhouette, w.scale, w.depth, w.collision, w.contact]
+        printed = [float(word.strip().replace("10⁵", "1e5")) for word in text.split(",")]
+        assert printed == [w.bbox, w.silhouette, w.scale, w.depth, w.collision, w.contact]
 
 
-def test_every_name_of_the_api_is_one_object_and_told_once():
+def test_every_name_of_the_api_is_one_object_and_listed_once():
     named = re.findall(r"\.\. auto(\w+):: ([\w.]+)", (DOCS / "api.md").read_text())
     assert len(named) == len(set(named)) > 50
     for kind, name in named:

@@ -64,7 +64,7 @@ def test_the_better_scene_is_measured_as_better():
     assert before["center_error"] == pytest.approx(0.25 * 2**0.5, abs=1e-4)
 
 
-def test_the_gallery_shows_a_piece_and_somebody_who_sits_on_it():
+def test_the_gallery_shows_an_object_and_a_seated_person():
     import gallery
 
     from mover_bench.rooms.motion import Task

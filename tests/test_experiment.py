@@ -30,11 +30,10 @@ from mover.pipeline.presets import PRESETS, Config
 from mover.stages.people.refine_bodies import RefinedBodies
 from mover_bench.experiment import job, run
 from mover_bench.experiment.args import ExperimentArgs
-from mover_bench.experiment.measures import Judge, Traits, Trial, hidden_shares
-from mover_bench.experiment.pool import Jobs, last_line, run_each
-from mover_bench.experiment.run import run_experiment
+from mover_bench.experiment.measures import Judge, Trial
+from mover_bench.experiment.run import Jobs, run_each, run_experiment
 from mover_bench.experiment.sets import CHANGES, SETS, changed, parse_seeds, set_named
-from mover_bench.experiment.tables import COLUMNS, interval
+from mover_bench.experiment.tables import COLUMNS, interval, last_line
 from mover_bench.experiment.variants import (
     LISTS,
     VARIANTS,
@@ -95,8 +94,7 @@ def trial(shift: float = 0.2) -> Trial:
     capture = Capture(
         "two boxes", initial, None, detections(truth), None, None, shown, None, None, ()
     )
-    traits = tuple(Traits(p.id, p.category, i == 0, 0.5 * i) for i, p in enumerate(truth.objects))
-    return Trial(capture, truth, shown, traits)
+    return Trial(capture, truth, shown, (True, False))
 
 
 def quick(config: Config) -> Config:
@@ -198,9 +196,7 @@ def test_results_hold_every_object_of_every_stage_and_the_initial_row_is_moved_b
         for thing in ("chair_0", "sofa_0")
     }
     assert len(rows) == len(found)
-    assert {(r["id"], r["touched"], r["hidden"]) for r in rows} == {
-        ("chair_0", "True", "0"), ("sofa_0", "False", "0.5"),
-    }  # fmt: skip
+    assert {(r["id"], r["category"]) for r in rows} == {("chair_0", "chair"), ("sofa_0", "sofa")}
     for row in rows:
         if row["stage"] == "initial":
             shift = 0.1 * (int(row["seed"]) + 1) * math.sqrt(2)
@@ -231,8 +227,6 @@ def test_the_page_has_the_means_and_differences_of_the_files(finished) -> None:
     gap = mean("paper", "full") - mean("robust", "full")
     assert float(paper.split("|")[2].split("(")[0]) == pytest.approx(gap, abs=6e-4)
     assert "mover experiment --set rooms --seeds 0,1 --variants robust paper no-people" in page
-    assert "## Mean over touched objects" in page
-    assert "## Mean over hidden objects" in page
 
 
 def test_stage_1_and_full_share_camera_and_ground(finished) -> None:
@@ -414,31 +408,6 @@ class TestWithheld:
         part = withheld(trial().capture, "no people", None)
         assert part.bodies is None
         assert part.people is None
-
-
-def test_shares_that_others_occlude_agree_with_a_plain_count() -> None:
-    behind, before = true_scene().objects
-    wall = little_room.piece("wall_0", little_room.box(4.0, 3.0, 0.1), (2.0, -2.0), 0.0, -1.5)
-    scene = replace(true_scene(), objects=(behind, before, wall))
-    camera = little_room.camera()
-    zoom = torch.tensor([0.75, 0.75, 1.0])
-    depths = []
-    for thing in scene.objects:
-        mesh = place_object(thing)
-        verts = to_camera(mesh.verts, camera.R_cam_world)
-        depths.append(first_hit(verts, mesh.faces, camera.K * zoom[:, None], (270, 480))[0])
-    for index, share in enumerate(hidden_shares(scene)):
-        mine = [(y, x) for y, x in depths[index].isfinite().nonzero().tolist()]
-        lost = sum(any(float(d[at]) < float(depths[index][at]) for d in depths) for at in mine[::7])
-        assert share == pytest.approx(lost / len(mine[::7]), abs=0.02)
-    assert hidden_shares(scene)[0] > 0.4 > 0.1 > hidden_shares(scene)[2]
-
-
-def test_what_is_in_no_picture_is_hidden() -> None:
-    scene = true_scene()
-    lost = replace(scene.objects[0], t_world_object=torch.tensor([0.0, -1.5, 9.0]))
-    assert hidden_shares(replace(scene, objects=(lost,))) == (1.0,)
-    assert hidden_shares(replace(scene, objects=())) == ()
 
 
 class TestTables:

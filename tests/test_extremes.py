@@ -1,4 +1,4 @@
-"""The main job on extreme captures: it ends, every number is finite, and two runs are the same."""
+"""The main job on extreme captures: it ends, and every number is finite."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from mover_bench.rooms.noise import add_noise
 from mover_bench.rooms.render import encode
 
 pytestmark = pytest.mark.slow
-FRAMES = 120  # somebody walks and sits
+FRAMES = 60  # a person walks and sits
 GROWN = 8  # 480 x 270 to 3,840 x 2,160
 
 
@@ -32,15 +32,14 @@ def changed(capture: Capture, **fields: object) -> Capture:
     return replace(capture, scene=replace(capture.scene, objects=pieces))
 
 
-def ends_finite(capture: Capture, folder: Path) -> list[torch.Tensor]:
-    """Where a short run puts everything; all of it is finite."""
+def ends_finite(capture: Capture, folder: Path) -> None:
+    """Whether a short run puts everything at finite positions."""
     room = run_in(folder, capture, light("robust", steps=5))
     found = [torch.tensor(room.scene.ground), room.scene.camera.R_cam_world]
     for piece in room.scene.objects:
         found += [piece.t_world_object, piece.yaw, piece.scale]
     for value in found:
         assert value.isfinite().all()
-    return found
 
 
 def behind(capture: Capture) -> torch.Tensor:
@@ -85,30 +84,19 @@ def test_bodies_behind_the_camera(capture, tmp_path):
 def test_an_image_of_4k(capture, tmp_path):
     scene, people = capture.scene, capture.people
     camera = replace(
-        scene.camera,
-        K=scene.camera.K * torch.tensor([[GROWN], [GROWN], [1.0]]),
-        width=GROWN * scene.camera.width,
-        height=GROWN * scene.camera.height,
-    )
+        scene.camera, K=scene.camera.K * torch.tensor([[GROWN], [GROWN], [1.0]]),
+        width=GROWN * scene.camera.width, height=GROWN * scene.camera.height,
+    )  # fmt: skip
     assert (camera.width, camera.height) == (3840, 2160)
     found = tuple(
         replace(d, box=GROWN * d.box, mask=None if d.mask is None else enlarged(d.mask))
         for d in capture.detections
     )
     large = replace(
-        capture,
-        scene=replace(scene, camera=camera),
-        reference=None,
-        reference_people=None,
-        detections=found,
-        people=None if people is None else replace(people, masks=enlarged(people.masks)),
-    )
+        capture, scene=replace(scene, camera=camera), reference=None, reference_people=None,
+        detections=found, people=replace(people, masks=enlarged(people.masks)),
+    )  # fmt: skip
     ends_finite(large, tmp_path)
-
-
-def test_two_runs_are_the_same_to_the_bit(capture, tmp_path):
-    one, two = (ends_finite(capture, tmp_path / name) for name in ("one", "two"))
-    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
 
 
 def enlarged(masks: Masks) -> Masks:

@@ -114,7 +114,7 @@ def test_jitter_of_a_resting_foot_is_no_motion():
     assert len(soles_of(bodies).frame.unique()) > 50
 
 
-def test_seated_people_tell_the_floor_only_where_nobody_stands():
+def test_seated_people_give_the_floor_only_where_no_person_stands():
     soles = soles_of(filmed(at(SEATED, SPOTS)))
     assert "no person ever stands" in soles.warnings[0]
     assert heights_of(soles).abs().max() < 0.02
@@ -127,8 +127,10 @@ def test_rejected_frames_and_other_people_do_not_count():
     soles = soles_of(dataclasses.replace(bodies, fps=None), keep=keep)
     assert sorted(soles.frame.unique().tolist()) == [r for r in range(15) if r not in (2, 7)]
     assert torch.equal(soles.person, soles.frame % 2 + 4)
-    nobody = soles_of(dataclasses.replace(bodies, fps=None), keep=torch.zeros(15, dtype=torch.bool))
-    assert len(nobody.frame.unique()) == 15
+    no_frames = soles_of(
+        dataclasses.replace(bodies, fps=None), keep=torch.zeros(15, dtype=torch.bool)
+    )
+    assert len(no_frames.frame.unique()) == 15
 
 
 def test_a_mesh_that_is_no_person_gives_its_lowest_points(caplog, monkeypatch):

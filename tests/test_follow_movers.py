@@ -1,4 +1,4 @@
-"""Furniture that moves with somebody: who moves it, when, and where it is meanwhile."""
+"""Furniture that moves with a person: who moves it, when, and where it is meanwhile."""
 
 import math
 from dataclasses import replace
@@ -95,7 +95,7 @@ def followed(places: list[SceneObject], bodies: Bodies) -> Followed | None:
     ("stands", (0.05, 0.6), "hands"), ("sits", (0.0, 0.05), "seat"),
 ])  # fmt: skip
 @pytest.mark.parametrize("turn", [0.0, 0.9])
-def test_what_somebody_moves_is_before_the_hands_or_below_the_seat_in_each_frame(
+def test_what_a_person_moves_is_before_the_hands_or_below_the_seat_in_each_frame(
     name: str, off: tuple[float, float], hold: str, turn: float
 ):
     way = straight(turn)
@@ -158,7 +158,7 @@ def test_a_symmetric_piece_that_is_found_half_a_turn_round_does_not_spin():
     assert found is not None
     yaws = torch.stack([segment.yaw for segment in found.segments])
     turns = wrap(yaws.diff()).abs()
-    assert int((turns > 0.05).sum()) == 1  # it is told once, as the same piece the other way round
+    assert int((turns > 0.05).sum()) == 1  # it changes once, as the same object the other way round
 
 
 def pushed() -> SceneObject:

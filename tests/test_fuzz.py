@@ -427,14 +427,15 @@ def part_of(capture: Capture, objects: int, rows: int) -> Capture:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(4))
-def test_every_setting_at_its_ends_runs_to_the_end(small_room, tmp_path, part):
+def test_every_setting_at_its_ends_runs_to_the_end(tmp_path, part):
     from test_pipeline import light
+    from test_rooms import shared_room
 
     from mover.pipeline.reconstruct import reconstruct
     from mover_bench.rooms.config import NoiseConfig
     from mover_bench.rooms.noise import add_noise
 
-    capture = part_of(add_noise(small_room, NoiseConfig(), 1), 2, 24)
+    capture = part_of(add_noise(shared_room(), NoiseConfig(), 1), 2, 12)
     config, counts = light("robust", steps=2), Counter[str]()
     for way, span in itertools.islice(ways_of(config), part, None, 4):
         for value in {span.kind(v) for v in (-1, 0, span.low) if span.holds(span.kind(v))}:

@@ -60,7 +60,7 @@ def test_hypotheses_come_back_from_the_folder(capture: Capture, tmp_path: Path):
     assert not [w for w in found.warnings if "hypotheses" in w]
 
 
-def test_hypotheses_of_another_scene_are_left_out_and_told(capture: Capture, tmp_path: Path):
+def test_hypotheses_of_another_scene_are_left_out_and_reported(capture: Capture, tmp_path: Path):
     write_capture(with_others(capture), tmp_path / "out")
     scene = json.loads((tmp_path / "out" / "scene.json").read_text())
     scene["objects"][0]["translation"][0] += 0.5
@@ -71,7 +71,7 @@ def test_hypotheses_of_another_scene_are_left_out_and_told(capture: Capture, tmp
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "words"),
     [
         ({"format": "x"}, "format"),
         ({"objects": []}, "objects"),
@@ -80,12 +80,12 @@ def test_hypotheses_of_another_scene_are_left_out_and_told(capture: Capture, tmp
     ],
 )
 def test_wrong_fields_are_refused_by_name(
-    capture: Capture, tmp_path: Path, change: dict[str, object], told: str
+    capture: Capture, tmp_path: Path, change: dict[str, object], words: str
 ):
     write_capture(with_others(capture), tmp_path / "out")
     file = tmp_path / "out" / "hypotheses.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=words):
         read_capture(tmp_path / "out")
 
 
@@ -119,21 +119,21 @@ def test_starts_have_the_boxes_of_the_hypotheses(capture: Capture):
 
 def test_strangers_and_nothing_give_no_starts(capture: Capture):
     prepared = prepare_objects(PrepareInputs(capture.scene.objects), QUICK)
-    stranger = replace(capture.scene.objects[0], id="nobody")
+    stranger = replace(capture.scene.objects[0], id="unknown")
     assert len(other_starts((stranger,), prepared.objects, prepared.start).yaw) == 0
     assert len(other_starts((), prepared.objects, prepared.start).yaw) == 0
 
 
-class HeardError(Exception):
+class StoppedError(Exception):
     """The first descent was asked for."""
 
 
-class Listening(Run):
+class Stopping(Run):
     """Stops before the first descent."""
 
     def stage(self, stage, inputs, config):
         if isinstance(inputs, PlaceInputs):
-            raise HeardError(inputs)
+            raise StoppedError(inputs)
         return super().stage(stage, inputs, config)
 
 
@@ -143,9 +143,9 @@ def test_the_main_job_starts_from_all_of_them(
 ):
     """The paper has one start; ours takes all, each on the floor."""
     given = replace(with_others(capture), bodies=None, people=None, touch=None)
-    with pytest.raises(HeardError) as heard:
-        reconstruct(given, light(preset, steps=2), Listening(tmp_path / preset))
-    inputs = heard.value.args[0]
+    with pytest.raises(StoppedError) as stopped:
+        reconstruct(given, light(preset, steps=2), Stopping(tmp_path / preset))
+    inputs = stopped.value.args[0]
     assert len(inputs.starts.yaw) == count
     heights = inputs.starts.t_world_object[:, 0, 1].tolist()
     assert heights == pytest.approx([inputs.ground] * count)

@@ -15,13 +15,12 @@ import mover.io.formats
 from mover.app.cli import run_command
 from mover.core.errors import InputError
 from mover.geometry.placement import place_object
-from mover.geometry.volume import sample
 from mover.io.capture.evidence import gather_evidence
 from mover.io.capture.folder import read_capture
 from mover.io.capture.scene_file import read_scene
 from mover.io.formats import names
 from mover_bench.datasets.pigraphs import NAMES, capsule_people, read_segments
-from mover_bench.datasets.prox_files import read_sdf, recordings_of
+from mover_bench.datasets.prox_files import recordings_of
 from mover_bench.datasets.true_boxes import FLOOR
 
 RECORDING = "MPH8_00034_01"
@@ -104,14 +103,6 @@ def test_axes_by_columns_are_understood(plain: layouts.Room, tmp_path: Path) -> 
         boxes=tmp_path / "p" / "boxes" / "bbox3d.json",
     )  # fmt: skip
     check_truth(tmp_path / "out" / "truth", prox_room(plain))
-
-
-def test_an_sdf_is_read_where_it_is(tmp_path: Path) -> None:
-    layouts.write_sdf(tmp_path, "MPH8", 64)
-    volume = read_sdf(tmp_path, "MPH8")
-    points = torch.tensor([[1.5, 2.0, 3.0], [1.0, 2.9, 3.0], [0.2, 1.4, 3.7]])
-    truth = (points - torch.tensor([1.0, 2, 3])).norm(dim=-1) - 0.5
-    assert torch.allclose(sample(volume, points), truth, atol=5e-3)  # half a cell is 0.03
 
 
 def test_an_unknown_recording_is_named_with_those_there_are(prox: Path, tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_an_object_that_stands_wrong_does_not_pull_the_others(metric: bool):
     assert float(errors(gather_depth(moved), inputs).abs().median()) < 0.03
 
 
-def test_nothing_is_said_where_nothing_tells_the_scale():
+def test_nothing_is_said_where_nothing_gives_the_scale():
     inputs = true_inputs()
     empty = torch.full_like(inputs.depth.values, torch.nan)
     assert gather_depth(with_values(inputs, empty, True)) is None
@@ -96,9 +96,9 @@ def test_a_wrong_distance_costs_the_same_in_windows_of_fewer_pixels():
     config = PlaceConfig(only(measured=1.0), "robust")
     far = replace(known.starts, t_world_object=1.1 * known.starts.t_world_object)
     images = [coarser_image(known.image, factor) for factor in (1, 2)]
-    prices = [energy_of(replace(known, image=image), config)(far).per_item for image in images]
-    assert (prices[0] > 1).all()
-    assert torch.allclose(prices[0], prices[1], rtol=0.1)
+    costs = [energy_of(replace(known, image=image), config)(far).per_item for image in images]
+    assert (costs[0] > 1).all()
+    assert torch.allclose(costs[0], costs[1], rtol=0.1)
 
 
 def test_a_capture_keeps_its_depth(tmp_path: Path, small_room):

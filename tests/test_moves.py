@@ -46,7 +46,7 @@ def stays(seen: list[tuple[int, int, torch.Tensor]], people: People | None = Non
 
 FRAMES = range(0, 60, 2)
 ASIDE = rows([(f, 0, patch(0, 0, 10, 20)) for f in FRAMES])
-"""Somebody who hides nothing."""
+"""A person who occludes nothing."""
 
 
 def test_some_rows_of_people_keep_their_own_masks_and_known_heights():
@@ -125,7 +125,7 @@ def test_what_is_pushed_straight_away_or_towards_the_camera_moves(frames: int):
         (_, first), (_, second) = stays(seen, ASIDE)
         assert first == 0
         assert 24 <= second <= 24 + frames
-        assert stays(seen) == []  # somebody whom no mask tells may be before it
+        assert stays(seen) == []  # a person without a mask may be before it
 
 
 def test_what_comes_before_an_object_does_not_move_it_though_it_looks_smaller():
@@ -150,7 +150,7 @@ def moved_room():
     return replace(scene, objects=tuple(replace(piece, annotation=None) for piece in pieces))
 
 
-def test_an_object_stands_in_its_last_segment_that_has_begun():
+def test_an_object_stands_in_its_last_segment_that_has_started():
     chair, sofa = moved_room().objects[:2]
     assert torch.equal(placed_at(chair, 11).t_world_object, chair.t_world_object)
     assert placed_at(chair, 12).t_world_object.tolist() == [0.0, -1.5, -2.5]
@@ -226,7 +226,7 @@ def test_a_capture_may_have_the_objects_masks_in_its_frames(tmp_path: Path):
         read_capture(folder)
 
 
-def test_furniture_without_masks_is_told(tmp_path: Path):
+def test_furniture_without_masks_is_reported(tmp_path: Path):
     folder = tiny.write_capture(tmp_path / "tiny")
     (folder / "furniture.json").write_text('{"images": [], "annotations": []}')
     capture = read_capture(folder)

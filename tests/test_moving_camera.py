@@ -40,7 +40,7 @@ def swaying(amount: float = 0.6) -> CameraPath:
 
 
 def staying(noise: float = 0.0) -> Bodies:
-    """Somebody who stays at one spot after the other and walks between, about the reference."""
+    """A person who stays at one spot after the other and walks between, about the reference."""
     walker = little_room.walkers(1)
     stay = torch.arange(FRAMES) / FRAMES * len(SPOTS)
     spot, share = stay.floor().long(), ((stay - stay.floor()) * 4 - 3).clamp_min(0)[:, None]
@@ -66,7 +66,7 @@ def seen_by(path: CameraPath, bodies: Bodies) -> Bodies:
 
 @pytest.mark.parametrize(("noise", "within"), [(0.0, 1e-3), (0.01, 0.02)])
 @pytest.mark.parametrize("units", [0.1, 1.0, 7.0])
-def test_people_at_rest_tell_the_scale_in_any_units(noise, within, units) -> None:
+def test_people_at_rest_give_the_scale_in_any_units(noise, within, units) -> None:
     path = swaying()
     bodies = seen_by(path, staying(noise))
     parts = parts_of(bodies, CAMERA.R_cam_world[:, 1])
@@ -85,7 +85,7 @@ def test_people_who_are_all_too_far_make_the_path_longer_by_as_much() -> None:
     assert found.scale == pytest.approx(1.1, rel=1e-3)
 
 
-def test_too_few_frames_are_told() -> None:
+def test_too_few_frames_are_reported() -> None:
     path = swaying()
     bodies = seen_by(path, staying())
     few = dataclasses.replace(

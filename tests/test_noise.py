@@ -9,8 +9,8 @@ import torch
 from test_rooms import shared_room
 
 from mover.bodies.skinning import open_body
-from mover.core.records import fingerprint
-from mover.core.types import SceneObject
+from mover.core.records import fingerprint, rows_of
+from mover.core.types import Bodies, BodyPose, Capture, Detection, People, SceneObject
 from mover.geometry.camera import pitch_roll
 from mover.geometry.rle import decode
 from mover.geometry.rotations import axis_angle, rot_y
@@ -19,7 +19,6 @@ from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise, slow
 from mover_bench.rooms.noise_masks import grown, leaked
 
-SIDES = ("left", "right")
 SILENT = NoiseConfig(
     along_ray=0, sideways=0, yaw=0, flips=0, scale=0, camera=0, depth_bias=0, depth_drift=0, pose=0,
     jitter=0, dropped=0, person_masks=0, missed_masks=0, object_masks=0, pose_hidden=1,
@@ -29,6 +28,29 @@ SILENT = NoiseConfig(
 @pytest.fixture(scope="module")
 def room() -> KnownRoom:
     return shared_room()
+
+
+def noisy(room: KnownRoom, seed: int = 0, **errors: float) -> Capture:
+    """A capture with these errors alone."""
+    return add_noise(room, dataclasses.replace(SILENT, **errors), seed)
+
+
+def posed(bodies: Bodies | None) -> tuple[Bodies, torch.Tensor, BodyPose]:
+    """Bodies with their joints and parameters, which known rooms have."""
+    assert bodies is not None
+    assert bodies.joints is not None
+    assert bodies.pose is not None
+    return bodies, bodies.joints, bodies.pose
+
+
+def shown(one: Detection) -> torch.Tensor:
+    assert one.mask is not None
+    return decode(one.mask, 0)
+
+
+def pairs(room: KnownRoom, capture: Capture) -> list[tuple[SceneObject, SceneObject]]:
+    """The given and the true objects."""
+    return list(zip(capture.scene.objects, room.truth.objects, strict=True))
 
 
 def centre(piece: SceneObject) -> torch.Tensor:
@@ -41,15 +63,13 @@ def size(piece: SceneObject) -> torch.Tensor:
 
 
 def test_no_noise_gives_the_truth_back(room: KnownRoom) -> None:
-    capture = add_noise(room, SILENT, 3)
-    for given, true in zip(capture.scene.objects, room.truth.objects, strict=True):
-        assert torch.allclose(given.t_world_object, true.t_world_object, atol=1e-6)
-        assert torch.allclose(given.yaw, true.yaw, atol=1e-6)
-        assert torch.allclose(given.scale, true.scale, atol=1e-6)
-    assert capture.bodies is not None
-    assert torch.allclose(capture.bodies.verts, room.bodies.verts, atol=5e-5)
-    assert capture.people is not None
-    assert room.capture.people is not None
+    capture = noisy(room, 3)
+    for given, true in pairs(room, capture):
+        for name in ("t_world_object", "yaw", "scale"):
+            assert torch.allclose(getattr(given, name), getattr(true, name), atol=1e-6)
+    assert torch.allclose(posed(capture.bodies)[0].verts, room.bodies.verts, atol=5e-5)
+    assert isinstance(capture.people, People)
+    assert isinstance(room.capture.people, People)
     assert capture.people.masks.counts == room.capture.people.masks.counts
     assert capture.scene.ground is None
 
@@ -65,24 +85,21 @@ def test_noise_is_repeatable_differs_by_seed_and_leaves_the_truth(room: KnownRoo
 def test_a_wrong_camera_keeps_centres_in_the_camera_frame_and_projects_fronts(
     room: KnownRoom,
 ) -> None:
-    capture = add_noise(room, dataclasses.replace(SILENT, camera=5.0), 0)
+    capture = noisy(room, camera=5.0)
     true, wrong = room.truth.camera.R_cam_world, capture.scene.camera.R_cam_world
-    for given, piece in zip(capture.scene.objects, room.truth.objects, strict=True):
+    for given, piece in pairs(room, capture):
         assert torch.allclose(wrong @ centre(given), true @ centre(piece), atol=1e-5)
         front = true @ torch.stack([piece.yaw.sin(), torch.tensor(0.0), piece.yaw.cos()])
-        projected = wrong.mT @ front
-        assert math.isclose(
-            float(torch.atan2(projected[0], projected[2])), float(given.yaw), abs_tol=1e-5
-        )
+        x, _, z = (wrong.mT @ front).tolist()
+        assert math.isclose(math.atan2(x, z), float(given.yaw), abs_tol=1e-5)
         assert torch.allclose(given.scale, piece.scale, atol=1e-6)
 
 
 def test_camera_errors_have_the_stated_size(room: KnownRoom) -> None:
-    true = torch.stack(pitch_roll(room.truth.camera.R_cam_world))
-    config = dataclasses.replace(SILENT, camera=3.0)
+    true, light = torch.stack(pitch_roll(room.truth.camera.R_cam_world)), _light(room)
     errors = []
     for seed in range(60):
-        camera = add_noise(_light(room), config, seed).scene.camera
+        camera = noisy(light, seed, camera=3.0).scene.camera
         errors.append(torch.stack(pitch_roll(camera.R_cam_world)) - true)
         assert torch.equal(camera.K, room.truth.camera.K)
         assert abs(float(camera.R_cam_world[2, 0])) < 1e-6, "a guess has no heading"
@@ -96,44 +113,20 @@ def test_camera_errors_have_the_stated_size(room: KnownRoom) -> None:
 def _light(room: KnownRoom) -> KnownRoom:
     """The room with three bodies only, for statistics over many seeds."""
     few = torch.arange(3)
-    pose, joints = room.bodies.pose, room.bodies.joints
-    assert pose is not None
-    assert joints is not None
-    assert room.capture.people is not None
-    masks = dataclasses.replace(
-        room.capture.people.masks, counts=room.capture.people.masks.counts[:3]
+    bodies = rows_of(room.bodies, few)
+    assert isinstance(room.capture.people, People)
+    capture = dataclasses.replace(
+        room.capture, bodies=bodies, people=rows_of(room.capture.people, few)
     )
-    people = dataclasses.replace(
-        room.capture.people,
-        masks=masks,
-        frame=room.bodies.frame[few],
-        person=room.bodies.person[few],
-    )
-    thin = {
-        f.name: getattr(pose, f.name)[few]
-        for f in dataclasses.fields(pose)
-        if isinstance(getattr(pose, f.name), torch.Tensor)
-    }
-    bodies = dataclasses.replace(
-        room.bodies, verts=room.bodies.verts[few], joints=joints[few],
-        frame=room.bodies.frame[few], person=room.bodies.person[few],
-        pose=dataclasses.replace(pose, **thin),
-    )  # fmt: skip
-    capture = dataclasses.replace(room.capture, bodies=bodies, people=people)
     return dataclasses.replace(room, bodies=bodies, capture=capture)
 
 
 def test_object_errors_have_the_stated_ranges_and_lie_along_the_ray(room: KnownRoom) -> None:
-    light = _light(room)
-    ray_only = dataclasses.replace(SILENT, along_ray=0.3, yaw=30.0, scale=0.0)
-    along, turn = [], []
+    light, along, turn = _light(room), [], []
     for seed in range(60):
-        for given, true in zip(
-            add_noise(light, ray_only, seed).scene.objects, room.truth.objects, strict=True
-        ):
+        for given, true in pairs(room, noisy(light, seed, along_ray=0.3, yaw=30.0)):
             c = centre(true)
-            off = centre(given) - c
-            ray = c / c.norm()
+            off, ray = centre(given) - c, c / c.norm()
             assert float((off - (off @ ray) * ray).norm()) < 1e-5
             along.append(float(off @ ray))
             factor = size(given) / size(true)
@@ -147,13 +140,9 @@ def test_object_errors_have_the_stated_ranges_and_lie_along_the_ray(room: KnownR
 
 
 def test_sizes_and_flips_follow_their_configuration(room: KnownRoom) -> None:
-    light = _light(room)
-    config = dataclasses.replace(SILENT, scale=0.15, flips=0.3)
-    factors, quarters = [], []
+    light, factors, quarters = _light(room), [], []
     for seed in range(60):
-        for given, true in zip(
-            add_noise(light, config, seed).scene.objects, room.truth.objects, strict=True
-        ):
+        for given, true in pairs(room, noisy(light, seed, scale=0.15, flips=0.3)):
             factors.append(size(given) / size(true))
             turned = float(torch.remainder((given.yaw - true.yaw) / (math.pi / 2) + 0.5, 4) - 0.5)
             assert abs(turned - round(turned)) < 1e-4
@@ -166,20 +155,23 @@ def test_sizes_and_flips_follow_their_configuration(room: KnownRoom) -> None:
     assert set(quarters) == {0, 1, 2, 3}
 
 
-def test_other_shapes_fill_the_same_box(room: KnownRoom) -> None:
-    capture = add_noise(room, dataclasses.replace(SILENT, other_shapes=1.0), 0)
-    for given, true in zip(capture.scene.objects, room.truth.objects, strict=True):
-        assert given.mesh.verts.shape != true.mesh.verts.shape
+@pytest.mark.parametrize("error", ["other_shapes", "wrong_class"])
+def test_other_shapes_and_classes_fill_the_same_box(room: KnownRoom, error: str) -> None:
+    capture = noisy(room, **{error: 1.0})
+    for (given, true), found in zip(pairs(room, capture), capture.detections, strict=True):
+        assert given.id == true.id
         assert torch.allclose(size(given), size(true), atol=1e-5)
         assert torch.allclose(centre(given), centre(true), atol=1e-5)
+        assert found.category == given.category
+        if error == "wrong_class":
+            assert given.category != true.category
+        else:
+            assert given.mesh.verts.shape != true.mesh.verts.shape
 
 
 def test_depth_bias_moves_a_body_along_its_ray_and_keeps_its_size(room: KnownRoom) -> None:
-    bodies = add_noise(room, dataclasses.replace(SILENT, depth_bias=0.03), 4).bodies
-    assert bodies is not None
-    assert bodies.joints is not None
-    assert room.bodies.joints is not None
-    pelvis, given = room.bodies.joints[:, 0], bodies.joints[:, 0]
+    bodies, joints, _ = posed(noisy(room, 4, depth_bias=0.03).bodies)
+    pelvis, given = posed(room.bodies)[1][:, 0], joints[:, 0]
     factor = (given / pelvis)[:, 2]
     assert torch.allclose(given, pelvis * factor[:, None], atol=1e-4)
     assert float(factor.std()) < 1e-4
@@ -189,12 +181,9 @@ def test_depth_bias_moves_a_body_along_its_ray_and_keeps_its_size(room: KnownRoo
 
 
 def test_pose_errors_turn_every_joint_by_the_stated_angle(room: KnownRoom) -> None:
-    bodies = add_noise(room, dataclasses.replace(SILENT, pose=4.0), 0).bodies
-    assert bodies is not None
-    pose, true = bodies.pose, room.bodies.pose
-    assert pose is not None
-    assert true is not None
-    wrong, right = (axis_angle(p.body_pose.double().reshape(-1, 21, 3)) for p in (pose, true))
+    bodies, _, pose = posed(noisy(room, pose=4.0).bodies)
+    both = (pose, posed(room.bodies)[2])
+    wrong, right = (axis_angle(p.body_pose.double().reshape(-1, 21, 3)) for p in both)
     step = right.mT @ wrong
     cosine = ((step.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1)
     rms = float(cosine.acos().square().mean().sqrt().rad2deg())
@@ -211,14 +200,12 @@ def test_slow_noise_has_variance_one_and_forgets_in_time() -> None:
 
 
 def test_jitter_and_dropped_rows_follow_their_configuration(room: KnownRoom) -> None:
-    bodies = add_noise(room, dataclasses.replace(SILENT, jitter=0.015, dropped=0.2), 1).bodies
-    assert bodies is not None
+    bodies, _, pose = posed(noisy(room, 1, jitter=0.015, dropped=0.2).bodies)
     kept = torch.isin(room.bodies.frame, bodies.frame)
     assert 0.05 < 1 - float(kept.float().mean()) < 0.35
     shift = (bodies.verts - room.bodies.verts[kept])[:, 0]
     assert abs(float(shift.std()) - 0.015) < 0.002
-    assert bodies.pose is not None
-    assert len(bodies.pose.transl) == len(bodies.frame)
+    assert len(pose.transl) == len(bodies.frame)
 
 
 def test_masks_grow_and_shrink_by_whole_pixels() -> None:
@@ -237,21 +224,16 @@ def test_people_masks_are_off_by_at_most_the_stated_pixels_and_some_are_missed(
 ) -> None:
     from scipy.ndimage import distance_transform_edt
 
-    people = add_noise(
-        room, dataclasses.replace(SILENT, person_masks=3, missed_masks=0.25), 0
-    ).people
-    true = room.capture.people
-    assert people is not None
-    assert true is not None
+    people, true = noisy(room, person_masks=3, missed_masks=0.25).people, room.capture.people
+    assert isinstance(people, People)
+    assert isinstance(true, People)
     assert 0.1 < 1 - len(people.frame) / len(true.frame) < 0.4
     rows = {int(f): k for k, f in enumerate(true.frame.tolist())}
     for k, frame in enumerate(people.frame.tolist()):
         a, b = decode(people.masks, k).numpy(), decode(true.masks, rows[frame]).numpy()
         extra, lost = a & ~b, b & ~a
-        if extra.any():
-            assert np.asarray(distance_transform_edt(~b))[extra].max() <= 3
-        if lost.any():
-            assert np.asarray(distance_transform_edt(b))[lost].max() <= 3
+        assert np.asarray(distance_transform_edt(~b))[extra].max(initial=0) <= 3
+        assert np.asarray(distance_transform_edt(b))[lost].max(initial=0) <= 3
 
 
 def test_a_leak_adds_one_disc_at_the_border(room: KnownRoom) -> None:
@@ -264,18 +246,15 @@ def test_a_leak_adds_one_disc_at_the_border(room: KnownRoom) -> None:
         reach = 0.2 * math.sqrt(mask.sum())
         assert 0.3 * math.pi * reach**2 < extra.sum() < math.pi * reach**2
         assert max(np.ptp(rows), np.ptp(cols)) <= 2 * reach + 1
-    capture = add_noise(room, dataclasses.replace(SILENT, leaks=1.0), 0)
-    for given, true in zip(capture.detections, room.capture.detections, strict=True):
-        assert given.mask is not None
-        assert true.mask is not None
-        assert decode(given.mask, 0).sum() > decode(true.mask, 0).sum()
+    for given, true in zip(noisy(room, leaks=1.0).detections, room.capture.detections, strict=True):
+        assert shown(given).sum() > shown(true).sum()
 
 
 def test_detections_and_pieces_are_missed_and_invented_together(room: KnownRoom) -> None:
     light = _light(room)
     missed = invented = 0
     for seed in range(40):
-        capture = add_noise(light, dataclasses.replace(SILENT, missed=0.3, false=0.2), seed)
+        capture = noisy(light, seed, missed=0.3, false=0.2)
         found = {d.id: d for d in capture.detections}
         assert len(found) == len(capture.detections)
         assert sorted(found) == sorted(p.annotation or 0 for p in capture.scene.objects)
@@ -292,25 +271,12 @@ def test_detections_and_pieces_are_missed_and_invented_together(room: KnownRoom)
 
 
 def test_merged_masks_are_the_union_of_two_and_one_object_is_missing(room: KnownRoom) -> None:
-    capture = add_noise(room, dataclasses.replace(SILENT, merged=1.0), 0)
-    true = {d.id: decode(d.mask, 0) for d in room.capture.detections if d.mask is not None}
-    assert len(capture.detections) < len(true)
-    assert {p.annotation for p in capture.scene.objects} == {d.id for d in capture.detections}
-    left = {d.id: d for d in capture.detections}
-    gone = [true[k] for k in true if k not in left]
-    unions = torch.stack([decode(d.mask, 0) for d in left.values() if d.mask is not None])
+    capture = noisy(room, merged=1.0)
+    true = {d.id: shown(d) for d in room.capture.detections}
+    left = {d.id: shown(d) for d in capture.detections}
+    assert len(left) == len(capture.detections) < len(true)
+    assert {p.annotation for p in capture.scene.objects} == set(left)
+    unions = torch.stack(list(left.values()))
     assert torch.equal(unions.any(0), torch.stack(list(true.values())).any(0)), "no pixel is lost"
-    for mask in gone:
+    for mask in (true[k] for k in true if k not in left):
         assert any(bool((union & mask).sum() == mask.sum()) for union in unions)
-
-
-def test_a_wrong_class_has_another_mesh_in_the_same_box(room: KnownRoom) -> None:
-    capture = add_noise(room, dataclasses.replace(SILENT, wrong_class=1.0), 0)
-    for given, true, found in zip(
-        capture.scene.objects, room.truth.objects, capture.detections, strict=True
-    ):
-        assert given.id == true.id
-        assert given.category != true.category
-        assert found.category == given.category
-        assert torch.allclose(size(given), size(true), atol=1e-5)
-        assert torch.allclose(centre(given), centre(true), atol=1e-5)

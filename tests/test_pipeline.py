@@ -1,5 +1,6 @@
 """The main job as a whole, on small captures: resume, determinism, and no look at the truth."""
 
+import functools
 import json
 import shutil
 from dataclasses import replace
@@ -63,6 +64,18 @@ def run_in(folder, capture, config, observe=silent):
     return room
 
 
+@pytest.fixture(scope="module")
+def whole(capture_folder, tmp_path_factory):
+    """Makes the whole run of a preset, once: its folder and its room."""
+
+    @functools.cache
+    def made(name):
+        folder = tmp_path_factory.mktemp(name)
+        return folder, run_in(folder, read("folder", capture_folder), light(name))
+
+    return made
+
+
 class Killed(Exception):
     pass
 
@@ -70,10 +83,9 @@ class Killed(Exception):
 @pytest.mark.slow
 class TestRun:
     def test_a_run_that_was_killed_goes_on_and_gives_the_same_result(
-        self, capture_folder, tmp_path
+        self, capture_folder, whole, tmp_path
     ):
         capture, config = read("folder", capture_folder), light("robust")
-        run_in(tmp_path / "whole", capture, config)
         seen = []
 
         def die(step: Step):
@@ -89,43 +101,36 @@ class TestRun:
         run_in(tmp_path / "cut", capture, config, lambda step: second.append(step.stage))
         assert "prepare_objects" not in second
         for name in ("scene.json", "bodies.npz"):
-            a, b = (tmp_path / f / name for f in ("whole", "cut"))
+            a, b = (folder / name for folder in (whole("robust")[0], tmp_path / "cut"))
             assert a.read_bytes() == b.read_bytes()
 
-    def test_the_result_is_the_same_without_the_truth(self, capture_folder, tmp_path):
+    def test_the_result_is_the_same_without_the_truth(self, capture_folder, whole, tmp_path):
         blind = tmp_path / "capture"
         shutil.copytree(capture_folder, blind)
         shutil.rmtree(blind / "truth")
-        config = light("paper")
-        run_in(tmp_path / "a", read("folder", capture_folder), config)
-        run_in(tmp_path / "b", read("folder", blind), config)
-        assert (tmp_path / "a/scene.json").read_bytes() == (tmp_path / "b/scene.json").read_bytes()
+        run_in(tmp_path, read("folder", blind), light("paper"))
+        known = whole("paper")[0] / "scene.json"
+        assert known.read_bytes() == (tmp_path / "scene.json").read_bytes()
 
     @pytest.mark.parametrize("name", sorted(PRESETS))
-    def test_every_preset_writes_a_whole_result(self, capture_folder, tmp_path, name):
+    def test_every_preset_writes_a_whole_result(self, capture_folder, whole, name):
         capture, config = read("folder", capture_folder), light(name)
-        room = run_in(tmp_path, capture, config)
-        for file in (
-            "scene.json",
-            "scene.glb",
-            "bodies.npz",
-            "run.json",
-            "report.html",
-            "initial.json",
-        ):
-            assert (tmp_path / file).stat().st_size > 100, file
-        scene = read_scene(tmp_path / "scene.json")
+        folder, room = whole(name)
+        named = ("scene.json", "scene.glb", "bodies.npz", "run.json", "report.html", "initial.json")
+        for file in named:
+            assert (folder / file).stat().st_size > 100, file
+        scene = read_scene(folder / "scene.json")
         assert [p.id for p in scene.objects] == [p.id for p in capture.scene.objects]
-        assert len(list((tmp_path / "watertight").iterdir())) == len(scene.objects)
+        assert len(list((folder / "watertight").iterdir())) == len(scene.objects)
         assert len(room.bodies.frame) == len(capture.bodies.frame)
-        log = json.loads((tmp_path / "run.json").read_text())
+        log = json.loads((folder / "run.json").read_text())
         assert {"place_objects", "align_camera"} <= {s["name"] for s in log["stages"]}
-        assert read_config(tmp_path / "run.json") == config
+        assert read_config(folder / "run.json") == config
 
-    def test_objects_of_the_result_stand_on_the_ground(self, capture_folder, tmp_path):
+    def test_objects_of_the_result_stand_on_the_ground(self, whole):
         from mover.geometry.placement import place_object
 
-        room = run_in(tmp_path, read("folder", capture_folder), light("robust"))
+        _, room = whole("robust")
         for piece in room.scene.objects:
             lowest = float(place_object(piece).verts[:, 1].min())
             assert abs(lowest - room.scene.ground) < 1e-4, piece.id

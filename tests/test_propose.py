@@ -97,7 +97,7 @@ def test_a_sitter_on_nothing_proposes_a_seat_below_as_high_as_what_touches():
     assert 0.6 < found.certainty < 1
 
 
-def test_who_leans_back_has_a_chair_and_who_lies_a_bed_with_the_feet_to_its_front():
+def test_a_leaning_person_has_a_chair_and_a_lying_one_a_bed_with_the_feet_to_its_front():
     back = {**SEATED, "left_hip": (-1.2, 0, 0), "right_hip": (-1.2, 0, 0)}
     leaning = turned(pose(back, COUNT), -0.35, 0.0, 0.0)
     (chair,) = missing(somewhere(people(leaning, fps=5.0)))
@@ -112,7 +112,7 @@ def test_who_leans_back_has_a_chair_and_who_lies_a_bed_with_the_feet_to_its_fron
 
 
 def on_a_sofa(yaw: float = TURN) -> Bodies:
-    """Somebody lies, and another sits across at the feet, on a seat .45 m high."""
+    """One person lies, and another sits across at the feet, on a seat .45 m high."""
     lying = somewhere(people(LYING, fps=5.0, floor=0.45), yaw)
     middle = lying.verts[0].mean(0)
     feet = torch.stack([torch.tensor(yaw).sin(), torch.zeros(()), torch.tensor(yaw).cos()])
@@ -125,7 +125,7 @@ def on_a_sofa(yaw: float = TURN) -> Bodies:
     )  # fmt: skip
 
 
-def test_who_sits_across_to_who_lies_sits_on_a_sofa_as_long_as_both():
+def test_a_person_seated_across_to_a_lying_one_is_on_a_sofa_as_long_as_both():
     bodies = on_a_sofa()
     (sofa,) = missing(bodies)
     assert sofa.object.category == "sofa"

@@ -24,7 +24,7 @@ from mover.core.types import Masks
 from mover.geometry.rle import decode
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.people.values import frame_numbers
-from mover_bench.datasets.prox_people import read_body_index
+from mover_bench.datasets.prox_files import read_body_index
 
 FIRST, SECOND = "vicon_03301_01", "vicon_03301_02"
 SHIFT = np.array([1.0, 2.0, 1.5])
@@ -53,7 +53,6 @@ def write_stills(root: Path, room: layouts.Room) -> Path:
     for name, frames in ((FIRST, 3), (SECOND, 2)):
         layouts.write_prox(root, room, name, frames, SHIFT)
         write_fits(root, name, frames, ("fittings/PROX", "fittings/mosh"))
-    layouts.write_sdf(root, "vicon")
     world = np.eye(4).tolist()
     (root / "vicon2scene.json").write_text(json.dumps(world))
     return root
@@ -181,7 +180,6 @@ def test_a_recording_of_another_room_is_refused(stills: Path, tmp_path: Path) ->
         ("fittings/mosh/vicon_03301_01", "no true bodies"),
         ("cam2world", "no truth of the camera"),
         ("scenes", "the truth has no floor"),
-        ("sdf", "people are not measured against the scan"),
     ],
 )
 def test_a_missing_part_is_named_and_the_rest_still_works(

@@ -16,10 +16,12 @@ from test_import_scenes import plain as plain  # the fixture
 
 from mover.pipeline.presets import PRESETS
 from mover_bench.datasets.pigraphs import NAMES
-from mover_bench.experiment.pool import Jobs
+from mover_bench.experiment.args import TableArgs
+from mover_bench.experiment.run import Jobs
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.tables import rows
-from mover_bench.tables.paper_table import TABLES, TableArgs, asked, paper_table
+from mover_bench.tables.paper_table import asked, paper_table
+from mover_bench.tables.rows import TABLES
 from mover_bench.tables.table_job import TableJob, do_job
 
 STILLS = ("vicon_03301_01", "vicon_03301_02")
@@ -53,7 +55,6 @@ def captures(
             make_prox.write_recording(root, room, name, small_room, sits, ["PROXD"])
         world = (root / "cam2world" / "vicon.json").read_text()
         (root / "vicon2scene.json").write_text(world)  # MoSh's bodies are where the fits are
-        layouts.write_sdf(root, "vicon")
         furniture = make_prox.write_furniture(root / "total3d", room)
         masks = make_prox.write_object_masks(root / "masks.json", room, small_room)
         out = tmp_path_factory.mktemp("captures")
@@ -85,7 +86,7 @@ def test_every_row_is_made_from_the_files_of_prox(
     for preset, config in PRESETS.items():
         monkeypatch.setitem(PRESETS, preset, quick(config))
     monkeypatch.setattr(rows, "SEGMENTS", 3)  # the middle one lies between the two videos
-    args = TableArgs(name, captures, tmp_path, captures, preset="paper")
+    args = TableArgs(name, captures, tmp_path, "paper", captures)
     page = paper_table(args, pool=at_once).read_text()
     assert "Failed" not in page
     assert "Not run" not in page
@@ -139,7 +140,7 @@ def test_every_row_is_made_from_the_files_of_pigraphs(
 ) -> None:
     for preset, config in PRESETS.items():
         monkeypatch.setitem(PRESETS, preset, quick(config))
-    args = TableArgs("pigraphs", graphs, tmp_path, graphs, preset="paper")
+    args = TableArgs("pigraphs", graphs, tmp_path, "paper", graphs)
     page = paper_table(args, pool=at_once).read_text()
     assert "Failed" not in page
     assert "Not run" not in page

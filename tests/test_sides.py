@@ -40,8 +40,8 @@ def sides_of(first, *others, form="robust", people=None, behind=(), bounded=Fals
     camera = replace(make_inputs().camera, width=WIDTH, height=HEIGHT)
     seen = torch.ones(len(masks), dtype=torch.bool)
     boxes = torch.stack([box_of(m) for m in masks])
-    nobody = torch.zeros_like(first) if people is None else people
-    inputs = ImageInputs(camera, boxes, seen, masks, nobody, hidden_by)
+    no_people = torch.zeros_like(first) if people is None else people
+    inputs = ImageInputs(camera, boxes, seen, masks, no_people, hidden_by)
     return find_image_cues(inputs, ImageConfig(32, form, 0.1, bounded)).sides[0].tolist()
 
 
@@ -97,9 +97,9 @@ class TestWhatIsKnown:
         mask = hull(pixels)
         sides = bounded_sides(torch.tensor([sides_of(mask)]), torch.zeros(1))
         box = box_of(mask)
-        price = bbox_term(pixels[None], box[None], sides, float(WIDTH), "robust")
+        cost = bbox_term(pixels[None], box[None], sides, float(WIDTH), "robust")
         whole = float((box[2:] - box[:2]).prod().sqrt())
-        assert float(price) < 4 / whole  # pixels are whole: each side is off by less than one
+        assert float(cost) < 4 / whole  # pixels are whole: each side is off by less than one
 
     def test_what_is_known_to_stand_behind_hides_nothing(self):
         sofa = rectangle(90, 20, 150, 90)
@@ -126,22 +126,24 @@ class TestWhatIsKnown:
             assert find_image_cues(inputs, ImageConfig(32, form)).sides.tolist() == [[UNKNOWN] * 4]
 
 
-class TestPrice:
+class TestCost:
     detected = torch.tensor([[40.0, 30.0, 80.0, 70.0]])
 
-    def price(self, drawn, sides):
+    def cost(self, drawn, sides):
         corners = torch.tensor([[drawn[:2], drawn[2:]]])
         return float(bbox_term(corners, self.detected, torch.tensor([sides]), 200.0, "robust"))
 
     @pytest.mark.parametrize("known", [LEAST, LIKELY])
     @pytest.mark.parametrize("side", range(4))
-    def test_a_lower_bound_is_priced_as_a_seen_side_where_the_object_falls_short(self, side, known):
+    def test_a_lower_bound_is_as_costly_as_a_seen_side_where_the_object_falls_short(
+        self, side, known
+    ):
         short = self.detected[0].clone()
         short[side] += 8.0 if side < 2 else -8.0
         sides = [SEEN] * 4
-        expected = self.price(short.tolist(), sides)
+        expected = self.cost(short.tolist(), sides)
         sides[side] = known
-        assert self.price(short.tolist(), sides) == expected
+        assert self.cost(short.tolist(), sides) == expected
         assert expected == pytest.approx((0.2**2 + SOFT**2) ** 0.5 - SOFT, rel=1e-5)
 
     @pytest.mark.parametrize("side", range(4))
@@ -150,14 +152,14 @@ class TestPrice:
         wide[side] += -25.0 if side < 2 else 25.0
         sides = [SEEN] * 4
         sides[side] = LEAST
-        assert self.price(wide.tolist(), sides) == 0
+        assert self.cost(wide.tolist(), sides) == 0
 
     @pytest.mark.parametrize("side", range(4))
     def test_beyond_a_side_that_may_be_hidden_it_costs_less_and_less(self, side):
         def beyond(far, known):
             wide = self.detected[0].clone()
             wide[side] += -far if side < 2 else far
-            return self.price(wide.tolist(), [known if k == side else SEEN for k in range(4)])
+            return self.cost(wide.tolist(), [known if k == side else SEEN for k in range(4)])
 
         costs = [beyond(far, LIKELY) for far in (0.5, 5.0, 50.0, 5000.0)]
         assert costs[0] == pytest.approx(beyond(0.5, SEEN), rel=0.2)
@@ -167,4 +169,4 @@ class TestPrice:
     def test_an_unknown_side_never_costs(self):
         for off in (-20.0, 20.0):
             drawn = (self.detected[0] + off).tolist()
-            assert self.price(drawn, [UNKNOWN] * 4) == 0
+            assert self.cost(drawn, [UNKNOWN] * 4) == 0

@@ -1,4 +1,4 @@
-"""The price of sizes that a room teaches, against the normal distribution that it stands for."""
+"""The cost of sizes that a room teaches, against the normal distribution that it stands for."""
 
 from dataclasses import dataclass, field, replace
 
@@ -20,7 +20,7 @@ from mover_bench.rooms.noise import add_noise
 USUAL, COMMON = 0.07, 0.045
 CONFIG = SpreadConfig(usual=USUAL, common=COMMON, known=0.0)
 GROWTH = 3 * USUAL**2 / (USUAL**2 + 3 * COMMON**2)
-"""Price of growing as a whole, of the normal distribution with the usual spread."""
+"""Cost of growing as a whole, of the normal distribution with the usual spread."""
 
 
 def layout_of(log_scale: torch.Tensor) -> Layout:
@@ -41,13 +41,13 @@ def drawn(spread: float, count: int = 4000) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("spread", [0.07, 0.1, 0.15])
-def test_the_price_is_that_of_the_normal_distribution_the_room_was_drawn_from(spread: float):
+def test_the_cost_is_that_of_the_normal_distribution_the_room_was_drawn_from(spread: float):
     shape, whole = taught(drawn(spread), CONFIG)
     within = (torch.rand(50, 3) - 0.5) * 0.6  # no size beyond 0.6 or 1.6
-    price = shape * scale_term(within, "robust", GROWTH * whole / shape)
+    cost = shape * scale_term(within, "robust", GROWTH * whole / shape)
     covariance = spread**2 * torch.eye(3) + COMMON**2 * torch.ones(3, 3)
     normal = (within @ torch.linalg.inv(covariance) * within).sum(-1)
-    torch.testing.assert_close(price, USUAL**2 * normal, rtol=0.06, atol=0)
+    torch.testing.assert_close(cost, USUAL**2 * normal, rtol=0.06, atol=0)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.03, 0.065])
@@ -78,7 +78,7 @@ def test_pieces_whose_silhouettes_cannot_be_made_to_fit_teach_hardly_anything():
     assert USUAL**2 / shape == pytest.approx((0.1**2 + 0.01 * 0.5**2) / 1.01, rel=0.05)
 
 
-def test_a_silhouette_is_believed_less_the_worse_it_can_be_made_to_fit():
+def test_a_silhouette_is_weighted_less_the_worse_it_can_be_made_to_fit():
     trust = inlier_weights(torch.tensor([0.0, 0.05, 0.1, 0.2, 0.4, 3.0]))
     torch.testing.assert_close(trust, torch.tensor([1, 1, 1, 0.5, 0.25, 0.1]))
 
@@ -87,28 +87,28 @@ def test_the_paper_learns_nothing():
     assert taught(drawn(0.2, 8), PRESETS["paper"].sizes) == (1, 1)
 
 
-def test_a_room_without_furniture_has_the_usual_price():
+def test_a_room_without_furniture_has_the_usual_cost():
     assert taught(torch.zeros(0, 3), SpreadConfig(0.07)) == (1, 1)
 
 
 @dataclass(frozen=True)
 class Weighing(Run):
-    """Keeps what sizes cost in each stage that prices them."""
+    """Keeps what sizes cost in each stage that weighs them."""
 
-    heard: list[tuple[str, float, float]] = field(default_factory=list)
+    weighed: list[tuple[str, float, float]] = field(default_factory=list)
 
     def stage(self, fn, inputs, config):
         weights = getattr(config, "weights", None)
         if isinstance(weights, SceneWeights):
-            self.heard.append((fn.__name__, weights.scale, config.uniform_scale_weight))
+            self.weighed.append((fn.__name__, weights.scale, config.uniform_scale_weight))
         return super().stage(fn, inputs, config)
 
 
 @pytest.mark.slow
-def test_all_stages_after_the_first_believe_wrong_sizes_less(small_room, tmp_path):
+def test_all_stages_after_the_first_trust_wrong_sizes_less(small_room, tmp_path):
     run, config = Weighing(tmp_path), light("robust")
     reconstruct(add_noise(small_room, NoiseConfig(scale=0.35), 1), config, run)
-    names, scales, growths = zip(*run.heard, strict=True)
+    names, scales, growths = zip(*run.weighed, strict=True)
     assert names == ("place_objects", "refine_camera", *["place_objects"] * 3)
     assert (scales[0], growths[0]) == (config.layout.weights.scale, 1.5)
     assert len(set(scales[1:])) == len(set(growths[1:])) == 1

@@ -1,5 +1,6 @@
 """On known rooms the truth is a minimum of the full energy, and files say what masks show."""
 
+import functools
 import json
 from dataclasses import replace
 
@@ -30,13 +31,27 @@ COUNT = 200  # perturbations of each object
 FLIP_X, FLIP_Y = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0])
 
 
-def at_truth(room, preset, folder):
+CONFIG = replace(
+    PRESETS["robust"], correct_depth=False, outer_iterations=0,
+    refine=replace(PRESETS["robust"].refine, rounds=0),
+    gather=replace(PRESETS["robust"].gather, cells=192),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def known(demo_room, small_room, tmp_path_factory):
+    """By name: a noiseless room, and the evidence that is gathered at its truth."""
+    rooms = {"demo": demo_room, "small": small_room}
+
+    @functools.cache
+    def made(which):
+        return rooms[which], at_truth(rooms[which], CONFIG, tmp_path_factory.mktemp(which))
+
+    return made
+
+
+def at_truth(room, config, folder):
     """The evidence of a noiseless room, gathered at the truth, and the true layout."""
-    config = PRESETS[preset]
-    config = replace(
-        config, correct_depth=False, refine=replace(config.refine, rounds=0), outer_iterations=0
-    )
-    config = replace(config, gather=replace(config.gather, cells=192))
     capture, run = room.capture, Run(folder)
     seen = image_evidence(capture)
     prepared = run.stage(prepare_objects, PrepareInputs(room.truth.objects), config.prepare)
@@ -53,7 +68,7 @@ def at_truth(room, preset, folder):
     there = steps.Arrangement(camera, ground, image, first, placed, first, inputs, config.place, {})
     found = steps.gather_humans(setup, people, there)
     humans = cues_in_windows(found.cues, found.contacts.points, cues.views, camera)
-    return replace(inputs, humans=humans), config
+    return replace(inputs, humans=humans)
 
 
 def perturbed(truth, count, seed):
@@ -74,26 +89,28 @@ def perturbed(truth, count, seed):
 
 
 @pytest.mark.slow
-def test_who_sits_tells_the_front_of_what_has_a_back_and_who_lies_that_of_beds(demo_room, tmp_path):
-    inputs, config = at_truth(demo_room, "robust", tmp_path)
+def test_seated_people_observe_the_front_of_seats_with_backs_and_lying_people_that_of_beds(
+    known, tmp_path
+):
+    room, inputs = known("demo")
     touches, objects = inputs.humans.touches, inputs.objects
-    told = touches.heading.norm(dim=-1) > 0
+    observed = touches.heading.norm(dim=-1) > 0
     bed = torch.tensor([name == "bed" for name in objects.categories])[touches.object_of]
-    assert bool((told & ~bed).any())
-    assert bool((told & bed).any())
-    assert bool((objects.has_back[touches.object_of] | bed)[told].all())
-    facing = torch.atan2(*touches.heading[told].unbind(-1))
-    off = (facing - inputs.starts.yaw[0, touches.object_of[told]]).cos()
+    assert bool((observed & ~bed).any())
+    assert bool((observed & bed).any())
+    assert bool((objects.has_back[touches.object_of] | bed)[observed].all())
+    facing = torch.atan2(*touches.heading[observed].unbind(-1))
+    off = (facing - inputs.starts.yaw[0, touches.object_of[observed]]).cos()
     assert float(off.min()) > np.cos(np.radians(20))
-    people = estimate_people(demo_room.capture, config, Run(tmp_path))
+    people = estimate_people(room.capture, CONFIG, Run(tmp_path))
     flat = replace(objects, has_back=torch.zeros_like(objects.has_back))
     found = assign_contacts(
         AssignInputs(
-            in_world(people.bodies, inputs.camera), demo_room.touching.float(), people.parts,
-            image_evidence(demo_room.capture).masks, inputs.image.boxes, inputs.camera,
+            in_world(people.bodies, inputs.camera), room.touching.float(), people.parts,
+            image_evidence(room.capture).masks, inputs.image.boxes, inputs.camera,
             flat, Layout(*(x[0] for x in vars(inputs.starts).values())),
         ),
-        config.assign,
+        CONFIG.assign,
     )  # fmt: skip
     assert found.points is not None
     torch.testing.assert_close(found.points.heading, touches.heading * bed[:, None])
@@ -101,11 +118,10 @@ def test_who_sits_tells_the_front_of_what_has_a_back_and_who_lies_that_of_beds(d
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", ["small", "demo"])
-def test_the_truth_is_a_minimum_of_the_full_energy(which, request, tmp_path):
+def test_the_truth_is_a_minimum_of_the_full_energy(which, known):
     """Of `robust`; the printed formulas are not least at the truth (docs/method.md)."""
-    room = request.getfixturevalue(f"{which}_room")
-    inputs, config = at_truth(room, "robust", tmp_path)
-    energy = energy_of(inputs, config.place)
+    _, inputs = known(which)
+    energy = energy_of(inputs, CONFIG.place)
     with torch.no_grad():
         true = energy(inputs.starts).per_item[0]
         lower = torch.zeros_like(true)

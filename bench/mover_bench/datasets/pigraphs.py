@@ -42,10 +42,8 @@ def capsule_people(
 ) -> dict[str, Any]:
     """The arrays of bodies.npz.
 
-    Args:
-        skeletons: Frame, person and joints (25, 3) in Kinect's camera space [m].
-        turn: The camera's axes (x right, y down, z forward) from there (3, 3).
-        fps: Frames a second.
+    `skeletons` are frame, person and joints (25, 3) in Kinect's camera space [m]; `turn` gives the
+    camera's axes (x right, y down, z forward) from there.
     """
     joints = np.stack([joints @ turn.T for _, _, joints in skeletons])
     unit, faces = _unit_capsule()

@@ -24,6 +24,7 @@ from mover.io.capture.bodies_file import bodies_to_arrays, write_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.parts import Hints, Parts, image_parts
 from mover.io.capture.scene_file import write_scene
+from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.images import opened
 from mover.io.files.schema import rigid
@@ -33,16 +34,15 @@ from mover_bench.datasets.prox_files import (
     FOLDERS,
     FPS,
     QUANTITATIVE,
-    SCAN_SDF,
+    SIZE,
     Recording,
     Timeline,
     asked_for,
-    lens_of,
-    scene_camera,
+    keypoint_trees,
+    people_masks,
     timelines,
     world_of,
 )
-from mover_bench.datasets.prox_people import keypoint_trees, people_masks
 from mover_bench.datasets.true_boxes import TrueBox, boxes_scene, floor_in, read_bbox3d, read_scan
 
 COSTS = {
@@ -53,10 +53,9 @@ COSTS = {
     "cam2world": "no truth of the camera, and so none at all",
     "scenes": "no scan: the truth has no floor and no surfaces (P2S)",
     "mosh": "no true bodies: no errors of people",
-    "sdf": "people are not measured against the scan",
 }
 """What each part of a user's copy is for."""
-OF_SCENES = {"cam2world": "cam2world/{}.json", "scenes": "scenes/{}.ply", "sdf": "sdf/{}.json"}
+OF_SCENES = {"cam2world": "cam2world/{}.json", "scenes": "scenes/{}.ply"}
 """The parts that belong to a scene, by their files."""
 
 
@@ -66,36 +65,33 @@ def prox_parts(root: Path, hints: Hints) -> Parts:
     Raises:
         InputError: If there is no such recording, or a file is wrong.
     """
-    recordings = asked_for(
-        root, hints.recordings or ((hints.recording,) if hints.recording else ())
-    )
-    lines, lens = timelines(recordings), lens_of(root)
-    camera = camera_of(lens)
-    notes = [_described(line) for line in lines]
+    asked = hints.recordings or ((hints.recording,) if hints.recording else ())
+    recordings = asked_for(root, asked)
+    lines = timelines(recordings)
+    lens = read_camera_file(root / "calibration" / "Color.json", SIZE)  # of flipped pictures
+    notes: list[str] = []
+    for line in lines:
+        first, last = min(line.frames.values()), max(line.frames.values())
+        kind = f"{len(line.frames)} {'stills' if line.stills else 'frames'}"
+        notes.append(f"{line.recording.name}: {kind}, {first} to {last} of the capture")
+    tracks = _tracks(recordings)
     fits = [_fits(line, FITS, notes) for line in lines]
-    bodies = _joined(zip(lines, fits, strict=True), _tracks(recordings), notes)
+    bodies = _joined(zip(lines, fits, strict=True), tracks, notes)
     trees: dict[str, Any] = {}
     for line, found in zip(lines, fits, strict=True):
-        trees |= keypoint_trees(line, found, camera, notes)
+        trees |= keypoint_trees(line, found, camera_of(lens), notes)
     fps = None if lines[0].stills else FPS
     name = recordings[0].name if len(recordings) == 1 else recordings[0].scene
     parts = Parts(
         name=name,
         camera=lens,
         bodies=None if bodies is None else At(bodies_to_arrays(bodies), name),
-        people=people_masks(lines, _tracks(recordings), fps),
+        people=people_masks(lines, tracks, fps),
         beside={place: partial(write_json, tree) for place, tree in trees.items()},
         notes=(*notes, *_missing(lines)),
     )
     parts = _with_pictures(parts, lines, hints)
     return _with_truth(parts, lines, lens, hints)
-
-
-def _described(line: Timeline) -> str:
-    """Which frames a recording has become."""
-    first, last = min(line.frames.values()), max(line.frames.values())
-    kind = "stills" if line.stills else "frames"
-    return f"{line.recording.name}: {len(line.frames)} {kind}, {first} to {last} of the capture"
 
 
 def _missing(lines: Sequence[Timeline]) -> list[str]:
@@ -120,29 +116,21 @@ def _missing(lines: Sequence[Timeline]) -> list[str]:
 
 
 def _with_pictures(parts: Parts, lines: Sequence[Timeline], hints: Hints) -> Parts:
-    """The parts with all pictures, flipped; the first is the reference image."""
-    beside = dict(parts.beside)
-    first: Path | None = None
-    for line in lines:
-        for frame, path in line.files("Color").items():
-            first = first or path
-            picture = _mirrored_copy(path, hints.work / line.recording.name)
-            beside[f"frames/{frame:06d}.jpg"] = partial(copy_whole, picture)
-    if first is None:
-        return parts
-    load, size = image_parts(first, mirrored=True)
-    return dataclasses.replace(parts, load_image=load, image_size=size, beside=beside)
-
-
-def _mirrored_copy(path: Path, work: Path) -> Path:
-    """A picture flipped left to right, as a new file in `work`."""
+    """The parts with all pictures, flipped left to right; the first is the reference image."""
     from PIL import ImageOps
 
-    work.mkdir(parents=True, exist_ok=True)
-    target = work / f"mirrored_{path.stem}.jpg"
-    with opened(path) as picture:
-        ImageOps.mirror(picture.convert("RGB")).save(target, quality=95)
-    return target
+    beside = dict(parts.beside)
+    paths = [(line, *one) for line in lines for one in line.files("Color").items()]
+    for line, frame, path in paths:
+        target = hints.work / line.recording.name / f"mirrored_{path.stem}.jpg"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with opened(path) as picture:
+            ImageOps.mirror(picture.convert("RGB")).save(target, quality=95)
+        beside[f"frames/{frame:06d}.jpg"] = partial(copy_whole, target)
+    if not paths:
+        return parts
+    load, size = image_parts(paths[0][2], mirrored=True)
+    return dataclasses.replace(parts, load_image=load, image_size=size, beside=beside)
 
 
 def _tracks(recordings: Sequence[Recording]) -> dict[str, int]:
@@ -227,7 +215,7 @@ def _with_truth(parts: Parts, lines: Sequence[Timeline], lens: At, hints: Hints)
     root, notes = recording.root, list(parts.notes)
     if not (root / "cam2world" / f"{recording.scene}.json").is_file():
         return parts
-    cam2world = scene_camera(root, recording.scene)
+    cam2world = rigid(read_json(root / "cam2world" / f"{recording.scene}.json"))
     world, R = world_of(cam2world)
     camera = {**lens.value, "R_cam_world": R.tolist()}
     boxes: list[TrueBox] = []
@@ -236,7 +224,7 @@ def _with_truth(parts: Parts, lines: Sequence[Timeline], lens: At, hints: Hints)
     else:
         notes.append("without --boxes the truth has no furniture")
     beside = dict(parts.beside)
-    for place, scene in _true_scenes(recording, boxes, (world, cam2world), camera).items():
+    for place, scene in _true_scenes(recording, boxes, world, cam2world, camera).items():
         beside[f"{place}/scene.json"] = partial(write_scene, scene)
     if recording.scene == QUANTITATIVE:
         true = [(line, _fits(line, ("mosh",), notes)) for line in lines]
@@ -244,21 +232,17 @@ def _with_truth(parts: Parts, lines: Sequence[Timeline], lens: At, hints: Hints)
         if mosh is not None:
             true_bodies = _into_camera(mosh, root, cam2world)
             beside["truth/bodies.npz"] = partial(write_bodies, true_bodies)
-    if (root / "sdf" / f"{recording.scene}.json").is_file():
-        place = {"root": str(root.resolve()), "scene": recording.scene}
-        tree = {**place, "world_scan": world.tolist()}
-        beside[SCAN_SDF] = partial(write_json, tree)
     return dataclasses.replace(parts, notes=tuple(notes), beside=beside)
 
 
 def _true_scenes(
     recording: Recording,
     boxes: list[TrueBox],
-    frames: tuple[Matrix, Matrix],
+    world: Matrix,
+    cam2world: Matrix,
     camera: dict[str, Any],
 ) -> dict[str, Scene]:
     """The boxes, and the scan's parts in them; the boxes are in the camera's frame."""
-    world, cam2world = frames
     path = recording.root / "scenes" / f"{recording.scene}.ply"
     scan = read_scan(path) if path.is_file() else None
     ground = None if scan is None else floor_in(scan, world)

@@ -1,20 +1,25 @@
-"""Files of PROX: calibration, cameras, scans, signed distances, names of frames and recordings."""
+"""Files of PROX: calibration, cameras, names of frames and recordings, and people in pictures.
+
+The pictures are stored mirrored. Masks are Kinect's body index on the colour frames: a pixel holds
+the number of a body, 0 to 5, or 255 where there is no person. Kinect gives a person a new number
+when it has lost them, and there is one person in a recording, so all bodies of a frame are one.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
+from jaxtyping import Bool
 from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.core.types import Bodies, Camera
 from mover.geometry.rotations import affine
-from mover.geometry.volume import Volume
-from mover.io.files.cameras import read_camera_file
-from mover.io.files.fields import At, get, integer, read_json, refuse, text, vector
-from mover.io.files.schema import rigid
+from mover.io.files.fields import At, get, items, mapping, maybe, number, read_json, reason, refuse
+from mover.io.masks.instances import Instance, Instances, code_of, people_tree
 from mover.io.people.values import frame_numbers
 from mover.io.scenes.placing import Matrix
 
@@ -34,10 +39,6 @@ FEMALE = ("162", "3452", "159", "03403", "3403")
 """Subjects whose fits are of the female model; all others are male."""
 Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """The scans' z up -> +y up."""
-UNEVEN = 1e-3  # [share], cells that differ by no more are cubes
-MOST_CELLS = 512  # along an axis of a signed distance field
-
-
 PAUSE = 60.0  # [s] between two videos of one capture: no person is tracked across it
 FITS = ("PROXD", "PROX", "fittings/PROXD", "fittings/PROX", "fittings/RGB")
 """Where fitted bodies may lie; the first that is there counts."""
@@ -179,75 +180,160 @@ def asked_for(root: Path, names: Sequence[str]) -> tuple[Recording, ...]:
     return chosen
 
 
-def lens_of(root: Path) -> At:
-    """The colour camera; images are mirrored before it holds, and cx is not."""
-    return read_camera_file(root / "calibration" / "Color.json", SIZE)
-
-
-def scene_camera(root: Path, scene: str) -> Matrix:
-    """cam2world: the scan's frame (z up) from the camera's (4, 4).
-
-    Raises:
-        InputError: If the file is missing or is no rigid transform.
-    """
-    return rigid(read_json(root / "cam2world" / f"{scene}.json"))
-
-
 def world_of(cam2world: Matrix) -> tuple[Matrix, Matrix]:
     """Our world (+y up, origin at the camera) from the scan's frame (4, 4), and R_cam_world."""
     turn = Z_UP @ cam2world[:3, :3]
     return affine(Z_UP, -Z_UP @ cam2world[:3, 3]), turn.T
 
 
-SCAN_SDF = "truth/scan_sdf.json"
-"""Where a capture says which signed distance is that of its scan: it is too large for a copy."""
+BODIES = 6  # that Kinect distinguishes
+NO_PEOPLE = 255
+MOST = 0.7  # of the picture that a person may fill
 
 
-def scan_of(capture: Path) -> tuple[Volume, Matrix] | None:
-    """The signed distance of the scan of a capture, and the true world from its frame (4, 4).
-
-    Raises:
-        InputError: If what the capture names is not there, or is wrong.
-    """
-    path = capture / SCAN_SDF
-    if not path.is_file():
+def people_masks(
+    lines: Sequence[Timeline], tracks: Mapping[str, int], fps: float | None
+) -> At | None:
+    """The fields of people.json; None where no recording has masks; stills have no `fps`."""
+    items: list[Instance] = []
+    for line in lines:
+        for frame, path in line.files("BodyIndexColor").items():
+            code = code_of(read_body_index(path))
+            if code is not None:
+                track = tracks[line.recording.subject]
+                items.append(Instance("person", None, code, frame=frame, track=track))
+    if not items:
         return None
-    at = read_json(path)
-    root, scene = text(get(at, "root")), text(get(at, "scene"))
-    return read_sdf(Path(root), scene), rigid(get(at, "world_scan"))
+    return people_tree(Instances(tuple(items), SIZE, "BodyIndexColor"), fps)
 
 
-def read_sdf(root: Path, scene: str) -> Volume:
-    """The signed distance of a scan in its own frame, negative inside [m].
-
-    The array is [x, y, z]; min and max are the outer borders of the grid, as its cells are
-    (max - min) / dim wide.
+def read_body_index(path: Path) -> Bool[np.ndarray, "h w"]:
+    """Where a person is, in the flipped picture.
 
     Raises:
-        InputError: If a file is missing, or the array is not dim³ numbers.
+        InputError: If it cannot be read, has another size, or holds other numbers.
     """
-    at = read_json(root / "sdf" / f"{scene}.json")
-    dim = integer(get(at, "dim"), 2, MOST_CELLS)
-    low, high = np.array(vector(get(at, "min"), 3)), np.array(vector(get(at, "max"), 3))
-    path = root / "sdf" / f"{scene}_sdf.npy"
-    values = _read_npy(path)
-    if values.size != dim**3 or (high <= low).any():
-        raise InputError(f"{path.name}: has {values.size} values, expected {dim}³ of {at.file}")
-    cell = (high - low) / dim
-    if np.ptp(cell) > UNEVEN * cell.max():
-        refuse(get(at, "max"), "a grid of cubes")
-    return Volume(
-        values=torch.from_numpy(values.reshape(dim, dim, dim).astype(np.float32)),
-        origin=torch.from_numpy((low + cell / 2).astype(np.float32)),
-        cell=float(cell.mean()),
-    )
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            pixels = np.asarray(picture.convert("L"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: cannot be read ({reason(error)}), expected a picture") from error
+    if pixels.shape != SIZE[::-1]:
+        found = f"{pixels.shape[1]} x {pixels.shape[0]} pixels"
+        raise InputError(f"{path}: has {found}, expected {SIZE[0]} x {SIZE[1]}")
+    other = np.unique(pixels[(pixels >= BODIES) & (pixels != NO_PEOPLE)])
+    if len(other):
+        raise InputError(
+            f"{path}: has the number {other[0]}, expected bodies 0 to {BODIES - 1}, and {NO_PEOPLE}"
+            " where there is no person"
+        )
+    person = pixels < BODIES
+    if person.mean() > MOST:
+        share = f"{person.mean():.0%} of the picture is a body"
+        raise InputError(f"{path}: {share}, expected {NO_PEOPLE} where there is no person")
+    return person[:, ::-1]
 
 
-def _read_npy(path: Path) -> NDArray[np.float64]:
-    """The numbers of an .npy file."""
-    from mover.io.files.npz import read_npy
+# OpenPose's keypoints of PROX, of pictures that are stored mirrored or of flipped ones.
 
-    at = read_npy(path)
-    if not isinstance(at.value, np.ndarray) or at.value.dtype.kind != "f":
-        refuse(at, "floating-point numbers")
-    return at.value
+
+PAIRS_25 = ((2, 5), (3, 6), (4, 7), (9, 12), (10, 13), (11, 14), (15, 16), (17, 18),
+            (19, 22), (20, 23), (21, 24))  # fmt: skip
+"""BODY_25: right and left."""
+FACE = (
+    *((i, 16 - i) for i in range(8)), *((17 + i, 26 - i) for i in range(5)), (31, 35), (32, 34),
+    (36, 45), (37, 44), (38, 43), (39, 42), (40, 47), (41, 46), (48, 54), (49, 53), (50, 52),
+    (55, 59), (56, 58), (60, 64), (61, 63), (65, 67), (68, 69),
+)  # fmt: skip
+"""The 70 points of a face: right and left."""
+BODY, LEFT, RIGHT, HEAD = (
+    "pose_keypoints_2d",
+    "hand_left_keypoints_2d",
+    "hand_right_keypoints_2d",
+    "face_keypoints_2d",
+)
+SURE = 0.3  # joints with less confidence do not vote
+LEAST = 20.0  # [px], the difference that decides
+
+
+def keypoint_trees(
+    line: Timeline, bodies: Bodies | None, camera: Camera, notes: list[str]
+) -> dict[str, Any]:
+    """OpenPose files of a recording by their place in the capture, in the flipped pictures.
+
+    Third-party code says that those of the qualitative part are of the mirrored pictures and those
+    of the quantitative part are not. Where the fitted `bodies` are known, in the frame of the
+    camera of the flipped pictures, they decide instead.
+    """
+    trees = {frame: read_json(path) for frame, path in line.files("keypoints").items()}
+    if not trees:
+        return {}
+    stored = {frame: _middle(at) for frame, at in trees.items()}
+    mirrored, why = line.recording.scene != QUANTITATIVE, "as third-party code says"
+    vote = None if bodies is None else _vote(stored, bodies, camera)
+    if vote is not None:
+        mirrored, why = vote, "as the fitted bodies say"
+    notes.append(f"the keypoints were {'flipped' if mirrored else 'kept'}, {why}")
+    return {
+        f"keypoints/{frame:06d}_keypoints.json": _flipped(at) if mirrored else dict(mapping(at))
+        for frame, at in trees.items()
+    }
+
+
+def _triples(at: At) -> NDArray[np.float64]:
+    """x, y and confidence."""
+    values = [number(v) for v in items(at)]
+    if len(values) % 3:
+        refuse(at, "triples of x, y, confidence")
+    return np.array(values).reshape(-1, 3)
+
+
+def _middle(at: At) -> float | None:
+    """Mean x of what is seen of the first person."""
+    people = items(get(at, "people"))
+    if not people:
+        return None
+    joints = _triples(get(people[0], BODY))
+    seen = joints[joints[:, 2] > SURE]
+    return float(seen[:, 0].mean()) if len(seen) else None
+
+
+def _vote(stored: dict[int, float | None], bodies: Bodies, camera: Camera) -> bool | None:
+    """Whether the files are of mirrored pictures; None where the bodies do not decide."""
+    from mover.geometry.camera import project
+
+    gain = 0.0
+    for row, frame in enumerate(bodies.frame.tolist()):
+        x = stored.get(frame)
+        if x is not None:
+            true = float(project(bodies.verts[row], camera.K)[:, 0].mean())
+            gain += abs(x - true) - abs(SIZE[0] - x - true)
+    return None if abs(gain) < LEAST else gain > 0
+
+
+def _flipped(at: At) -> dict[str, Any]:
+    """A file of a mirrored picture as that of the true one: left is right."""
+    people: list[dict[str, Any]] = []
+    for person in items(get(at, "people")):
+        row = dict(mapping(person))
+        hands = {LEFT: maybe(person, RIGHT), RIGHT: maybe(person, LEFT)}
+        parts = {BODY: maybe(person, BODY), HEAD: maybe(person, HEAD), **hands}
+        for key, given in parts.items():
+            if given is not None:
+                pairs = PAIRS_25 if key == BODY else FACE if key == HEAD else ()
+                row[key] = _mirror(_triples(given), pairs).ravel().tolist()
+        people.append(row)
+    return {**mapping(at), "people": people}
+
+
+def _mirror(joints: NDArray[np.float64], pairs: tuple[tuple[int, int], ...]) -> NDArray[np.float64]:
+    """Joints of the flipped picture; those that are missing stay zeros."""
+    order = np.arange(len(joints))
+    for a, b in pairs:
+        if max(a, b) < len(joints):
+            order[a], order[b] = b, a
+    out = joints[order].copy()
+    out[:, 0] = np.where(out[:, 2] > 0, SIZE[0] - out[:, 0], 0.0)
+    return out

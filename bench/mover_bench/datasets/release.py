@@ -49,10 +49,7 @@ CONTACTS = "*_sample_00.npy"
 def body_arrays(folder: Path, R: Matrix | None, notes: list[str]) -> tuple[At | None, int]:
     """The arrays of bodies.npz in the camera's frame, and the number of frame 0.
 
-    Args:
-        folder: The sequence.
-        R: R_cam_world of the world of the meshes, whose y is down; None: not known.
-        notes: Takes what is odd.
+    `R` is R_cam_world of the world of the meshes, whose y is down, where it is known.
 
     Raises:
         InputError: If a mesh cannot be read or has another topology than the first.
@@ -133,22 +130,26 @@ def release_parts(folder: Path, hints: Hints) -> Parts:
     lens: dict[str, Any] = dict(parts.camera.value)
     size = lens["w"], lens["h"]
     notes: list[str] = []
-    R = _rotation(folder, size, notes)
+    xml, R = found(folder, "001.xml"), None
+    if xml is None:
+        notes.append("there is no smplifyx_cam/001.xml, so the bodies' world is not known")
+    else:
+        R = np.array(get(read_camera_file(xml, size), "R_cam_world").value)
     bodies, first = body_arrays(folder, R, notes)
     people = _people(folder, home.parent, size)
-    parts = dataclasses.replace(
-        parts,
-        name=folder.resolve().name,
-        bodies=bodies,
-        contacts=contact_arrays(folder, bodies, notes),
-        people=people,
-        beside=_frames(folder, first),
-    )
-    authors = _authors(folder, parts, R, notes)
-    truth = _truth(folder, lens, hints)
-    scenes = {**truth, **authors}
-    beside = {f"{place}/scene.json": partial(write_scene, one) for place, one in scenes.items()}
-    return dataclasses.replace(parts, beside={**parts.beside, **beside}, notes=tuple(notes))
+    one = found(folder, f"{first:06d}.jpg")
+    pictures = sorted(one.parent.glob("[0-9]*.jpg")) if one is not None else []
+    beside: dict[str, Callable[[Path], object]] = dict(parts.beside)
+    for picture in (p for p in pictures if p.stem.isdecimal()):
+        beside[f"frames/{int(picture.stem) - first:06d}.jpg"] = partial(copy_whole, picture)
+    contacts = contact_arrays(folder, bodies, notes)
+    scenes = {**_truth(folder, lens, hints), **_authors(folder, parts, R, notes)}
+    for place, scene in scenes.items():
+        beside[f"{place}/scene.json"] = partial(write_scene, scene)
+    return dataclasses.replace(
+        parts, name=folder.resolve().name, bodies=bodies, contacts=contacts, people=people,
+        beside=beside, notes=tuple(notes),
+    )  # fmt: skip
 
 
 def found(folder: Path, name: str) -> Path | None:
@@ -175,15 +176,6 @@ def _unsure_dropped(parts: Parts) -> Parts:
     )
 
 
-def _rotation(folder: Path, size: tuple[int, int], notes: list[str]) -> Matrix | None:
-    """R_cam_world of the authors' camera stage, whose world the bodies are in."""
-    path = found(folder, "001.xml")
-    if path is None:
-        notes.append("there is no smplifyx_cam/001.xml, so the bodies' world is not known")
-        return None
-    return np.array(get(read_camera_file(path, size), "R_cam_world").value)
-
-
 def _people(folder: Path, home: Path, size: tuple[int, int]) -> At | None:
     """The first person of every frame, in frames numbered from 0."""
     paths = sorted(p for p in folder.rglob(f"[0-9]*/{DETECTIONS}") if p.parent != home)
@@ -193,19 +185,6 @@ def _people(folder: Path, home: Path, size: tuple[int, int]) -> At | None:
     items_of = [dataclasses.replace(i, track=0) for i in seen.items if is_person(i)]
     first = {item.frame: item for item in reversed(items_of)}
     return people_tree(Instances(tuple(first.values()), size, seen.file))
-
-
-def _frames(folder: Path, first: int) -> dict[str, Callable[[Path], object]]:
-    """What copies the pictures to their places in the capture."""
-    one = found(folder, f"{first:06d}.jpg")
-    if one is None:
-        return {}
-    paths = sorted(one.parent.glob("[0-9]*.jpg"))
-    return {
-        f"frames/{int(p.stem) - first:06d}.jpg": partial(copy_whole, p)
-        for p in paths
-        if p.stem.isdecimal()
-    }
 
 
 def _authors(folder: Path, parts: Parts, R: Matrix | None, notes: list[str]) -> dict[str, Scene]:
@@ -224,7 +203,11 @@ def _authors(folder: Path, parts: Parts, R: Matrix | None, notes: list[str]) -> 
     for row, path in zip(rows, last, strict=True):
         verts = meshes[row.value["mesh"]][0].verts.double().numpy()
         theirs = _used(path, len(verts)) @ FLIP
-        matrix = _moved(verts, theirs, path)
+        if len(verts) < LEAST:
+            raise InputError(f"{path.name}: has {len(verts)} vertices, expected {LEAST} or more")
+        corners = np.concatenate([verts, np.ones((len(verts), 1))], axis=1)
+        matrix = np.eye(4)  # the affine transform between two meshes of one topology
+        matrix[:3] = np.linalg.lstsq(corners, theirs, rcond=None)[0].T
         place = posed(matrix, verts.min(0), verts.max(0))
         placed.append({**row.value, **place.fields, "annotation": None})
     lens = camera_of(At({**parts.camera.value, "R_cam_world": R.tolist()}, "refine_results"))
@@ -241,17 +224,6 @@ def _used(path: Path, count: int) -> Matrix:
     if len(kept) != count or kept.max(initial=-1) >= len(verts):
         raise InputError(f"{path.name}: has {len(kept)} vertices, expected the {count} of its mesh")
     return verts[kept]
-
-
-def _moved(verts: Matrix, theirs: Matrix, path: Path) -> Matrix:
-    """The affine transform between two meshes of one topology (4, 4)."""
-    if len(verts) < LEAST:
-        raise InputError(f"{path.name}: has {len(verts)} vertices, expected {LEAST} or more")
-    rows = np.concatenate([verts, np.ones((len(verts), 1))], axis=1)
-    solution = np.linalg.lstsq(rows, theirs, rcond=None)[0]
-    out = np.eye(4)
-    out[:3] = solution.T
-    return out
 
 
 def _truth(folder: Path, camera: dict[str, Any], hints: Hints) -> dict[str, Scene]:

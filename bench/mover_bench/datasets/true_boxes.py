@@ -47,12 +47,7 @@ def read_bbox3d(path: Path, names: Mapping[str, str], file: At) -> list[TrueBox]
     """The boxes of MOVER's authors: {id: {centroid, basis, coeffs}}, with half sizes.
 
     The page does not say whether the axes are the rows or the columns of `basis`: the reading in
-    which the boxes agree better on what is up counts.
-
-    Args:
-        path: For messages.
-        names: Categories by id, where the id is none.
-        file: The content of bbox3d.json.
+    which the boxes agree better on what is up counts. `names` are categories by id.
     """
     rows = {key: get(file, key) for key in mapping(file)}
     if not rows:
@@ -113,14 +108,10 @@ def boxes_scene(
     ground: float | None,
     scan: Mesh | None = None,
 ) -> Scene:
-    """A scene of the boxes, or of what a scan has inside them.
+    """A scene of the boxes, or of what a scan (in their frame) has inside them.
 
-    Args:
-        boxes: In the frame of their file.
-        world: Our world (+y up, the camera at the origin) from that frame (4, 4).
-        camera: The fields of camera.json with its true rotation.
-        ground: Height of the floor in our world [m].
-        scan: In the frame of the boxes; None: the boxes themselves.
+    `world` is our world (+y up, the camera at the origin) from the frame of the boxes (4, 4),
+    `ground` the height of the floor in it [m].
     """
     if scan is not None and ground is not None:
         scan = without_floor(scan, world, ground)
@@ -146,13 +137,7 @@ def floor_in(scan: Mesh, world: Matrix) -> float:
 
 
 def without_floor(scan: Mesh, world: Matrix, ground: float) -> Mesh:
-    """A scan without the triangles that lie on the floor.
-
-    Args:
-        scan: In any frame.
-        world: Our world (+y up) from that frame (4, 4).
-        ground: Height of the floor in our world [m].
-    """
+    """A scan without the triangles that lie on the floor, `ground` [m] high in our `world`."""
     heights = scan.verts.double().numpy() @ world[1, :3] + world[1, 3] - ground
     low: NDArray[np.bool_] = np.abs(heights) < FLOOR
     faces = scan.faces.numpy()

@@ -1,10 +1,14 @@
-"""What `mover experiment` can be asked for. Imports no torch: `--help` is quick."""
+"""What the bench's commands can be asked for. Imports no torch: `--help` is quick."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
 
 from mover.core.settings import int_in
+
+Workers = Annotated[int, int_in(0, 10_000)]
 
 
 @dataclass(frozen=True)
@@ -18,8 +22,8 @@ class ExperimentArgs:
     The first one is what the others are compared with."""
     out: Path = Path("experiments")
     """Folder for the results."""
-    workers: Annotated[int, int_in(0, 10_000)] = 0
-    """How many rooms are worked on at once; 0: as many as there are cores."""
+    workers: Workers = 0
+    """How many rooms are processed at once; 0: as many as there are cores."""
     set: str = "rooms"
     """Set of rooms, see docs/rooms.md; or i3db, with --source."""
     source: Path | None = None
@@ -27,3 +31,32 @@ class ExperimentArgs:
     the first variant, from library furniture and from the true shapes."""
     keep: bool = False
     """Take finished results of other versions or settings of the program as they are."""
+
+
+Table = Literal["prox", "prox-quantitative", "pigraphs"]
+
+
+@dataclass(frozen=True)
+class TableArgs:
+    """Make all rows of the paper's table for your copy of a data set, beside the published ones.
+
+    Rows run beside each other and go on where they stopped; the page is RESULTS/TABLE-PRESET.md,
+    its numbers are the .csv beside it.
+    """
+
+    table: Annotated[Positional[Table], arg(metavar="TABLE")]
+    """prox, prox-quantitative or pigraphs."""
+    captures: Annotated[Positional[Path], arg(metavar="CAPTURES")]
+    """Folder of captures made by `mover import`, one for each recording, under its name."""
+    results: Annotated[Positional[Path], arg(metavar="RESULTS")]
+    """Folder for the rows' results and the page."""
+    preset: str = "robust"
+    """paper or robust."""
+    detected: Path | None = None
+    """The same captures with boxes and masks of a detector (PointRend), for rows of their own."""
+    only: tuple[str, ...] = ()
+    """Rows whose names begin so, as initial full; empty: all."""
+    workers: Workers = 0
+    """How many jobs run at once; 0: as many as there are cores."""
+    look: bool = False
+    """Run nothing: write the page from the jobs that are finished."""

@@ -23,7 +23,7 @@ from mover.core.run import Run, sources
 from mover.extensions import reconstruct
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import refine_bodies
-from mover_bench.experiment.measures import Judge, Trial, traits_of, under_camera
+from mover_bench.experiment.measures import Judge, Trial, under_camera
 from mover_bench.experiment.sets import RoomSet, changed, set_named
 from mover_bench.experiment.variants import VARIANTS, Variant, withheld
 from mover_bench.rooms.camera_path import filmed
@@ -48,7 +48,8 @@ def with_noise(room: KnownRoom, seed: int, rooms: RoomSet) -> Trial:
     capture = filmed(room, rooms.noise, seed, rooms.paths[seed % len(rooms.paths)])
     if rooms.withheld is not None:
         capture = without_seat(capture, room)
-    return Trial(capture, room.truth, room.bodies, traits_of(room, capture.scene))
+    used = tuple(bool((room.touched == k).any()) for k in range(len(room.truth.objects)))
+    return Trial(capture, room.truth, room.bodies, used)
 
 
 def key_of(rooms: RoomSet, seed: int, variant: Variant) -> str:

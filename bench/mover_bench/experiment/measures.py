@@ -1,13 +1,10 @@
 """Measure a reconstructed known room against the truth: objects, camera, people."""
 
-import math
 from collections import Counter
 from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Capture, Room, Scene, SceneObject
@@ -18,33 +15,13 @@ from mover.extensions.moved_furniture.measure import measure_moves
 from mover.extensions.moving_camera import bodies_as_given
 from mover.furniture.library import SEATS, canonical
 from mover.geometry.boxes import box_of
-from mover.geometry.camera import to_camera
 from mover.geometry.mesh import sample_surface
 from mover.geometry.placement import place_object
-from mover.geometry.raster import first_hit
-from mover.geometry.rotations import wrap
 from mover.pipeline.result import to_world
 from mover.stages.objects.prepare_objects import find_regions
-from mover_bench.rooms.known import KnownRoom
 
-WIDTH = 480  # [px] of the picture in which occluded shares are counted
-FLIPPED = math.radians(60)  # [rad]
 NEAR = 0.6  # [m] from the middle of a seat, at most, of its proposal
 SURFACE = 4000  # points that give the height of a seat
-
-
-@record
-class Traits:
-    """An object of the truth, for the rows of the tables."""
-
-    id: str
-    category: str
-    touched: bool
-    """People sit or lie on it, lean on it or lay a hand on it."""
-    hidden: float
-    """Share of what the image would show of it that other furniture occludes; 1: all."""
-    flipped: bool = False
-    """The initial yaw is wrong by more than `FLIPPED`; false where there is none."""
 
 
 @record
@@ -56,58 +33,8 @@ class Trial:
     truth: Scene
     bodies: Bodies | None
     """The true people."""
-    traits: tuple[Traits, ...]
-    """Of the true objects, in their order."""
-
-
-def traits_of(room: KnownRoom, initial: Scene) -> tuple[Traits, ...]:
-    """What each object of a known room is, whether people use it, how well it is seen and given."""
-    used = set(room.touched.unique().tolist())
-    hidden = hidden_shares(room.truth)
-    given = {thing.id: thing for thing in initial.objects}
-    return tuple(
-        Traits(
-            thing.id,
-            thing.category,
-            index in used,
-            hidden[index],
-            is_flipped(thing, given.get(thing.id)),
-        )
-        for index, thing in enumerate(room.truth.objects)
-    )
-
-
-def is_flipped(truth: SceneObject, initial: SceneObject | None) -> bool:
-    """Whether an initial object looks another way."""
-    return initial is not None and float(wrap(initial.yaw - truth.yaw).abs()) > FLIPPED
-
-
-def hidden_shares(scene: Scene) -> tuple[float, ...]:
-    """Share of each object's pixels within the image that other objects occlude."""
-    depths = torch.stack(_depths(scene)) if scene.objects else torch.zeros(0, 1, 1)
-    covered = depths.isfinite()
-    front = covered & (depths <= depths.amin(0, keepdim=True)) if len(depths) else covered
-    whole, left = covered.sum((1, 2)), front.sum((1, 2))
-    shares = torch.where(whole > 0, 1 - left / whole.clamp_min(1), torch.ones_like(whole).float())
-    return tuple(round(share, 4) for share in shares.tolist())
-
-
-def _depths(scene: Scene) -> list[Float[Tensor, "h w"]]:
-    """Depth of each object drawn by itself in a small picture [m], inf where it is not."""
-    camera = scene.camera
-    zoom = min(1.0, WIDTH / camera.width)
-    size = (max(1, round(camera.height * zoom)), max(1, round(camera.width * zoom)))
-    zooms = torch.tensor([size[1] / camera.width, size[0] / camera.height, 1.0]).to(camera.K)
-    meshes = [place_object(thing) for thing in scene.objects]
-    return [
-        first_hit(
-            to_camera(mesh.verts.to(camera.K), camera.R_cam_world),
-            mesh.faces,
-            camera.K * zooms[:, None],
-            size,
-        )[0]
-        for mesh in meshes
-    ]
+    used: tuple[bool, ...] = ()
+    """Which true objects people sit or lie on, lean on or lay a hand on."""
 
 
 class Judge:
@@ -141,9 +68,9 @@ class Judge:
             "full": self.scene(room.scene, room.bodies),
         }
         objects = [
-            {name: getattr(traits, name) for name in ABOUT}
+            {"id": thing.id, "category": thing.category}
             | {stage: measured["objects"][row]["result"] for stage, measured in found.items()}
-            for row, traits in enumerate(self.trial.traits)
+            for row, thing in enumerate(self.trial.truth.objects)
         ]
         scenes = self.trial.capture.scene, room.scene, self.trial.truth
         fps = None if room.bodies is None else room.bodies.fps
@@ -157,9 +84,6 @@ class Judge:
         }
 
 
-ABOUT = ("id", "category", "touched", "hidden", "flipped")
-
-
 def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:
     """How well seats that were not given, and are used, are proposed, and what else is.
 
@@ -170,8 +94,8 @@ def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:
     centres = [turn @ box_of(one.object).center for one in room.proposals]
     claimed: Counter[int] = Counter()
     rows: list[dict[str, Any]] = []
-    for seat, traits in zip(trial.truth.objects, trial.traits, strict=True):
-        if seat.id in given or not traits.touched or canonical(seat.category) not in SEATS:
+    for seat, used in zip(trial.truth.objects, trial.used, strict=True):
+        if seat.id in given or not used or canonical(seat.category) not in SEATS:
             continue
         away = [float((at - box_of(seat).center)[[0, 2]].norm()) for at in centres]
         near = [k for k, gap in enumerate(away) if gap < NEAR]

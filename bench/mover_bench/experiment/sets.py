@@ -33,29 +33,14 @@ class RoomSet:
 
 
 _SMALL = RoomConfig(
-    width=320,
-    height=180,
-    pieces=5,
-    least_pieces=3,
-    least_frames=40,
-    most_frames=80,
-    least_touches=1,
-    least_pixels=60,
-    stay=0.25,
-    acts=ActConfig(tasks=2, walks=1),
-)
+    width=320, height=180, pieces=5, least_pieces=3, least_frames=40, most_frames=80,
+    least_touches=1, least_pixels=60, stay=0.25, acts=ActConfig(tasks=2, walks=1),
+)  # fmt: skip
 _CROWDED = RoomConfig(
-    pieces=14,
-    least_pieces=9,
-    least_frames=150,
+    pieces=14, least_pieces=9, least_frames=150,
     plan=PlanConfig(
-        camera_height=(0.9, 1.25),
-        look_down=(5.0, 9.0),
-        field_of_view=(52.0, 58.0),
-        visible=0.4,
-        hidden=0.85,
-        crowded=0.7,
-        spacing=0.6,
+        camera_height=(0.9, 1.25), look_down=(5.0, 9.0), field_of_view=(52.0, 58.0), visible=0.4,
+        hidden=0.85, crowded=0.7, spacing=0.6,
         more=(
             ("chair", "around"), ("armchair", "facing"), ("stool", "facing"), ("bench", "facing"),
             ("cabinet", "wall"), ("coffee table", "facing"), ("nightstand", "wall"),
@@ -64,23 +49,13 @@ _CROWDED = RoomConfig(
     ),
 )  # fmt: skip
 _MOVED = RoomConfig(
-    least_frames=80,
-    most_frames=130,
-    least_touches=1,
-    stay=0.6,
-    moved=True,
+    least_frames=80, most_frames=130, least_touches=1, stay=0.6, moved=True,
     acts=ActConfig(tasks=3, walks=1),
-)
+)  # fmt: skip
 _DETECTED = NoiseConfig(
-    object_masks=3,
-    person_masks=4,
-    missed_masks=0.08,
-    leaks=0.25,
-    missed=0.1,
-    false=0.1,
-    merged=0.05,
-    wrong_class=0.08,
-)
+    object_masks=3, person_masks=4, missed_masks=0.08, leaks=0.25, missed=0.1, false=0.1,
+    merged=0.05, wrong_class=0.08,
+)  # fmt: skip
 _UPSTREAM = NoiseConfig(
     foreign=1.0, warp=0.03,
     mask_head=28, mask_box=0.03, amodal=0.15, leaks=0.15, object_masks=0,

@@ -6,7 +6,7 @@ import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,15 +16,13 @@ from mover.core.files import replacing
 from mover.core.records import plain
 from mover_bench.experiment.args import ExperimentArgs
 from mover_bench.experiment.job import path_of, read_numbers
-from mover_bench.experiment.measures import ABOUT
-from mover_bench.experiment.pool import LOG, last_line
 from mover_bench.experiment.sets import set_named
 from mover_bench.experiment.variants import VARIANTS
 
 Frame = Any
 """A `pandas.DataFrame`."""
+LOG = "log.txt"
 STAGES = ("initial", "image", "full")
-HIDDEN = 0.3  # share of an object that others occlude, from which on it counts as hidden
 RESAMPLES, LEVEL = 10_000, 0.95
 
 
@@ -79,13 +77,11 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, rule, *rows))
 
 
-@dataclass(frozen=True)
-class Interval:
-    """A mean over rooms and what the draw of the rooms leaves open."""
+class Interval(NamedTuple):
+    """A mean over rooms and its 95 % interval (percentiles of the resampled means)."""
 
     mean: float
     low: float
-    """Lower end of the 95 % interval (percentiles of the resampled means)."""
     high: float
     rooms: int
 
@@ -102,6 +98,12 @@ def interval(values: Sequence[float] | Float[np.ndarray, " rooms"], seed: int = 
     drawn = data[np.random.default_rng(seed).integers(0, len(data), (RESAMPLES, len(data)))]
     low, high = np.quantile(drawn.mean(1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Interval(float(data.mean()), float(low), float(high), len(data))
+
+
+def last_line(log: Path) -> str:
+    """What a process said last."""
+    lines = log.read_text(errors="replace").split("\n") if log.is_file() else []
+    return next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
 
 
 @dataclass(frozen=True)
@@ -136,11 +138,12 @@ def read_finished(out: Path, rooms: str, seeds: Sequence[int], names: Sequence[s
             about = {"seed": seed, "name": name, "row": VARIANTS[name].row or name, "stage": stage}
             scenes.append(about | {"seconds": tree["seconds"]} | tree[stage])
             objects += [
-                about | {key: item[key] for key in ABOUT} | item[stage] for item in tree["objects"]
+                about | {key: item[key] for key in ("id", "category")} | item[stage]
+                for item in tree["objects"]
             ]
     about = ["seed", "name", "row", "stage"]
     rows = DataFrame(scenes, columns=None if scenes else [*about, "seconds"])
-    things = DataFrame(objects, columns=None if objects else [*about, *ABOUT])
+    things = DataFrame(objects, columns=None if objects else about)
     return Finished(rows, things, lacking, tuple(sorted(versions)))
 
 
@@ -153,20 +156,16 @@ def by_room(frame: Frame) -> Frame:
 def write_tables(args: ExperimentArgs, names: Sequence[str], found: Finished) -> Path:
     """Write results.csv, summary.csv and summary.md into OUT/SET; returns the latter."""
     folder = args.out / args.set
-    _write_csv(found.objects, folder / "results.csv")
-    _write_csv(found.scenes, folder / "summary.csv")
+    for name, frame in (("results.csv", found.objects), ("summary.csv", found.scenes)):
+        with replacing(folder / name) as part:
+            frame.to_csv(part, index=False, float_format="%.6g", lineterminator="\n")
     with replacing(folder / "summary.md") as part:
         part.write_text(page_of(args, names, found))
     return folder / "summary.md"
 
 
-def _write_csv(frame: Frame, path: Path) -> None:
-    with replacing(path) as part:
-        frame.to_csv(part, index=False, float_format="%.6g", lineterminator="\n")
-
-
 def page_of(args: ExperimentArgs, names: Sequence[str], found: Finished) -> str:
-    """Means over rooms, differences from the first variant, means over kinds of objects."""
+    """Means over rooms, and differences from the first variant."""
     machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
     versions = " and ".join(found.versions) or "nothing is finished"
     lines = [
@@ -191,13 +190,6 @@ def page_of(args: ExperimentArgs, names: Sequence[str], found: Finished) -> str:
     means = by_room(found.scenes)
     lines += ["## Mean over rooms", _means(means, shown)]
     lines += [f"## Difference from {rows[0]}", _differences(means, rows)] if rows[1:] else []
-    used, hidden = found.objects.touched.astype(bool), found.objects.hidden >= HIDDEN
-    flipped = found.objects.flipped.astype(bool)
-    kinds = {"touched": used, "untouched": ~used, "hidden": hidden, "flipped": flipped}
-    for kind, chosen in kinds.items():
-        some = found.objects[chosen]
-        if len(some):
-            lines += [f"## Mean over {kind} objects", _means(by_room(some), shown)]
     return "\n\n".join(lines) + "\n"
 
 

@@ -85,11 +85,6 @@ def _without_given(config: Config) -> Config:
     return weighted(replace(config, layout=layout), given=0.0)
 
 
-def _at_level(name: str, level: float) -> tuple[str, Variant]:
-    change = f"{name}={level:g}"
-    return change, Variant(ROBUST, change=change)
-
-
 LISTS: dict[str, dict[str, Variant]] = {
     "ablation": {
         "robust": Variant(ROBUST),
@@ -124,7 +119,11 @@ LISTS: dict[str, dict[str, Variant]] = {
     },
     "sensitivity": {
         "robust": Variant(ROBUST),
-        **dict(_at_level(name, x) for name, error in CHANGES.items() for x in error.levels),
+        **{
+            change: Variant(ROBUST, change=change)
+            for name, error in CHANGES.items()
+            for change in (f"{name}={level:g}" for level in error.levels)
+        },
     },
 }
 """Lists of variants by name: the paper's tables, and `robust` without what it adds to the paper."""

@@ -78,12 +78,9 @@ def table_of(found: dict[str, dict[str, Any]]) -> str:
     lines = ["| scene | " + " | ".join(COLUMNS.values()) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
     for name, row in found.items():
         lines.append(f"| {name} | " + " | ".join(f"{row[key]:.3f}" for key in COLUMNS) + " |")
-    means = [
-        f"{sum(row[key] for row in found.values()) / len(found):.3f}"
-        if key not in ("run_pitch", "run_height", "stature") else ""
-        for key in COLUMNS
-    ]  # fmt: skip
-    return "\n".join([*lines, "| mean | " + " | ".join(means) + " |", ""])
+    overlaps = list(COLUMNS)[:5]
+    means = [f"{sum(row[key] for row in found.values()) / len(found):.3f}" for key in overlaps]
+    return "\n".join([*lines, "| mean | " + " | ".join([*means, "", "", ""]) + " |", ""])
 
 
 def judge_scene(scene: I3dbScene, run: Run, preset: str) -> dict[str, Any]:

@@ -6,7 +6,6 @@ the path in another scale, with a drift that grows with the way.
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -14,21 +13,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mover.core.records import map_tensors
-from mover.core.types import CameraPath, Capture, People
+from mover.core.types import CameraPath, Capture
 from mover.geometry.path import from_reference, is_still, poses_at, scaled
-from mover.geometry.placement import placed_at
 from mover.geometry.raster import first_hit
 from mover.geometry.rotations import axis_angle
 from mover.io.capture.pose_file import moved
-from mover_bench.rooms.compose import Plan
 from mover_bench.rooms.config import NoiseConfig, PathConfig
-from mover_bench.rooms.known import KnownRoom, one_thread, pieces_seen, rounded, visible
+from mover_bench.rooms.known import KnownRoom, one_thread, rounded, visible
 from mover_bench.rooms.noise import add_noise, slow
 from mover_bench.rooms.render import furniture
 
 TARGET = 4.0  # [m] ahead, at which a camera that travels looks
 SHAKE = 0.7  # [s], how long a hand keeps its error
-LEAST_PIXELS = 100  # [px] of a piece; what is seen of less is not segmented
 PATHS = 20  # number of the stream of random numbers
 
 
@@ -40,13 +36,7 @@ def filmed(room: KnownRoom, noise: NoiseConfig, seed: int, config: PathConfig) -
     frames, fps = int(room.bodies.frame.max()) + 1, room.bodies.fps
     assert fps is not None, "a known room is a video"
     true = draw_path(frames, fps, config, rng)
-    known = on_the_way(room, true)
-    if config.views:
-        seen = furniture_seen(known, true, max(1, round(config.views * fps)))
-        known = dataclasses.replace(
-            known, capture=dataclasses.replace(known.capture, furniture=seen)
-        )
-    capture = add_noise(known, noise, seed)
+    capture = add_noise(on_the_way(room, true), noise, seed)
     return dataclasses.replace(capture, path=slam_path(true, config, rng))
 
 
@@ -109,45 +99,13 @@ def on_the_way(room: KnownRoom, path: CameraPath) -> KnownRoom:
         joints=rounded(from_reference(bodies.joints, poses)),
         pose=map_tensors(rounded, moved(bodies.pose, back[0], shift)),
     )
-    drawn = _from(room, path)
-    shown = visible(room.plan, seen, lambda frame: drawn(frame)[0])
+    camera, (verts, faces, _) = room.truth.camera, furniture(room.plan)
+    still = room.plan.view.seen(verts)[None]
+
+    def depth(frame: int) -> Tensor:
+        points = from_reference(still, poses_at(path, torch.tensor([frame])))[0]
+        return first_hit(points, faces, camera.K, (camera.height, camera.width))[0]
+
+    shown = visible(room.plan, seen, depth)
     capture = dataclasses.replace(room.capture, bodies=seen, people=shown.people)
     return dataclasses.replace(room, bodies=seen, capture=capture, whole=shown.whole)
-
-
-@one_thread()
-def furniture_seen(room: KnownRoom, path: CameraPath, every: int) -> People:
-    """What the moving camera sees of the furniture in some frames, as `furniture.json` has it."""
-    drawn, owner = _from(room, path), furniture(room.plan)[2]
-
-    def piece(frame: int) -> Tensor:
-        face = drawn(frame)[1]
-        return torch.where(face >= 0, owner[face.clamp_min(0)], -1)
-
-    frames = range(every, int(path.frame[-1]) + 1, every)
-    return pieces_seen(room.capture.people, frames, piece, LEAST_PIXELS)
-
-
-def _from(room: KnownRoom, path: CameraPath) -> Callable[[int], tuple[Tensor, Tensor]]:
-    """Depth [m] and face of the furniture at each pixel of a frame."""
-    camera = room.truth.camera
-    size = (camera.height, camera.width)
-
-    def drawn(frame: int) -> tuple[Tensor, Tensor]:
-        verts, faces, _ = furniture(_plan_in(room, frame))
-        still = room.plan.view.seen(verts)[None]
-        points = from_reference(still, poses_at(path, torch.tensor([frame])))[0]
-        return first_hit(points, faces, camera.K, size)
-
-    return drawn
-
-
-def _plan_in(room: KnownRoom, frame: int) -> Plan:
-    """The room with its moved pieces where they stand in a frame."""
-    pieces = list(room.plan.pieces)
-    for index, true in enumerate(room.truth.objects):
-        if true.segments:
-            now = placed_at(true, frame)
-            x, _, z = now.t_world_object.tolist()
-            pieces[index] = dataclasses.replace(pieces[index], at=(x, z), heading=float(now.yaw))
-    return dataclasses.replace(room.plan, pieces=tuple(pieces))

@@ -18,7 +18,7 @@ from mover.furniture.library import make_piece
 from mover.geometry.camera import project, tilted, to_camera
 from mover.geometry.raster import first_hit
 from mover_bench.rooms.config import PlanConfig, Rule
-from mover_bench.rooms.placed import Placed, corners, verts_on_floor
+from mover_bench.rooms.placed import Placed, corners, on_floor, verts_on_floor
 from mover_bench.rooms.turns import facing, heading_of
 
 Pose = tuple[float, float, float]
@@ -57,39 +57,40 @@ def _facing(rng: np.random.Generator, _: Size, walls: np.ndarray, __: Others) ->
     return x, z, heading
 
 
+def _first(others: Others, category: str) -> Placed | None:
+    return next((p for p in others if p.furniture.category == category), None)
+
+
 def _before(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
-    sofas = [p for p in others if p.furniture.category == "sofa"]
-    if not sofas:
+    sofa = _first(others, "sofa")
+    if sofa is None:
         return None
-    away = sofas[0].furniture.size[2] / 2 + size[2] / 2 + float(rng.uniform(0.8, 1.0))
-    place = sofas[0].place + away * sofas[0].axes[1]
-    return float(place[0]), float(place[1]), sofas[0].heading
+    away = sofa.furniture.size[2] / 2 + size[2] / 2 + float(rng.uniform(0.8, 1.0))
+    x, z = sofa.place + away * sofa.axes[1]
+    return float(x), float(z), sofa.heading
 
 
 def _around(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
-    tables = [p for p in others if p.furniture.category == "table"]
-    if not tables:
+    table = _first(others, "table")
+    if table is None:
         return None
     side = int(rng.integers(4))
-    w, d = tables[0].furniture.size[0], tables[0].furniture.size[2]
+    w, d = table.furniture.size[0], table.furniture.size[2]
     away = (d if side % 2 == 0 else w) / 2 + size[2] / 2 + float(rng.uniform(0.06, 0.45))
-    out = tables[0].heading + side * np.pi / 2
-    place = tables[0].place + away * facing(np.array(out))
+    out = table.heading + side * np.pi / 2
+    x, z = table.place + away * facing(np.array(out))
     turn = float(rng.choice([np.pi, np.pi / 2, -np.pi / 2, 0.0])) + np.radians(rng.uniform(-20, 20))
-    return float(place[0]), float(place[1]), float(out + turn)
+    return float(x), float(z), float(out + turn)
 
 
 def _beside(rng: np.random.Generator, size: Size, _: np.ndarray, others: Others) -> Pose | None:
-    beds = [p for p in others if p.furniture.category == "bed"]
-    if not beds:
+    bed = _first(others, "bed")
+    if bed is None:
         return None
-    bed = beds[0]
     side = 1 if rng.integers(2) else -1
     across = side * (bed.furniture.size[0] / 2 + size[0] / 2 + float(rng.uniform(0.06, 0.12)))
-    along = -bed.furniture.size[2] / 2 + size[2] / 2
-    left, front = bed.axes
-    place = bed.place + across * left + along * front
-    return float(place[0]), float(place[1]), bed.heading
+    x, z = on_floor(bed, across, -bed.furniture.size[2] / 2 + size[2] / 2)
+    return float(x), float(z), bed.heading
 
 
 RULES: dict[Rule, Callable[[np.random.Generator, Size, np.ndarray, Others], Pose | None]] = {
@@ -129,12 +130,10 @@ def depth_of(piece: Placed, view: Viewpoint) -> Float[Tensor, "h w"]:
 
 
 def worth(depths: list[Float[Tensor, "h w"]], least: float, most: float) -> float:
-    """How many pieces others hide well, plus a little; -1 where one can hardly be seen.
+    """How many objects others occlude well, plus a little; -1 where one can hardly be seen.
 
-    Args:
-        depths: Of each piece drawn alone [m].
-        least: Fewest pixels of the small picture that a piece must show.
-        most: No piece may be hidden more than this share.
+    `depths` are those of each object drawn alone [m]; each must show `least` pixels of the small
+    picture, and others may occlude no more than the share `most` of it.
     """
     alone = torch.stack(depths)
     covered = alone.isfinite()
@@ -143,9 +142,6 @@ def worth(depths: list[Float[Tensor, "h w"]], least: float, most: float) -> floa
     if (hidden > most).any() or (seen < least).any():
         return -1.0
     return float((hidden >= HIDDEN).sum() + 0.1 * hidden.mean())
-
-
-# Furnish a room: what stands where, and from where the camera sees it.
 
 
 @record
@@ -198,23 +194,23 @@ MARGIN: dict[Rule, float] = {
 """Free floor around a piece, by where it stands [m]."""
 
 
-def make_view(size: tuple[int, int], numbers: tuple[float, float, float, float]) -> Viewpoint:
-    """A camera of a width and height [px] with (height [m], pitch, roll, field of view [rad])."""
-    width, height = size
-    above, pitch, roll, fov = numbers
-    focal = width / 2 / np.tan(fov / 2)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+def make_view(
+    size: tuple[int, int], height: float, pitch: float, roll: float, fov: float
+) -> Viewpoint:
+    """A camera of a width and height [px] above the floor [m], with its angles [rad]."""
+    focal = size[0] / 2 / np.tan(fov / 2)
+    K = torch.tensor([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
     turn = tilted(torch.tensor(pitch, dtype=torch.float64), torch.tensor(roll, dtype=torch.float64))
-    return Viewpoint(Camera(K.float(), turn.float(), width, height), above)
+    return Viewpoint(Camera(K.float(), turn.float(), *size), height)
 
 
 def draw_view(rng: np.random.Generator, size: tuple[int, int], config: PlanConfig) -> Viewpoint:
-    """A camera as somebody would put it up: the higher, the more it looks down."""
+    """A camera as a person would put it up: the higher, the more it looks down."""
     height = float(rng.uniform(*config.camera_height))
     pitch = -np.radians(rng.uniform(*config.look_down) + 4 * (height - 1.2))
     roll = np.radians(rng.uniform(-2, 2))
     fov = np.radians(rng.uniform(*config.field_of_view))
-    return make_view(size, (height, float(pitch), float(roll), float(fov)))
+    return make_view(size, height, float(pitch), float(roll), float(fov))
 
 
 def draw_plan(
@@ -224,9 +220,9 @@ def draw_plan(
     least: int,
     config: PlanConfig | None = None,
 ) -> Plan:
-    """A room of a random kind, many of whose pieces are partly hidden.
+    """A room of a random kind, many of whose objects are partly occluded.
 
-    At most `most` pieces stand in it, each of which shows at least `least` pixels of the image.
+    At most `most` objects stand in it, each of which shows at least `least` pixels of the image.
     """
     config = config or PlanConfig()
     kind = sorted(KINDS)[int(rng.integers(len(KINDS)))]
@@ -249,15 +245,14 @@ def _furnished(
     least: int,
     config: PlanConfig,
 ) -> tuple[Plan, float]:
-    """One room, and how many of its pieces are well hidden."""
+    """One room, and how many of its objects are well occluded."""
     view = draw_view(rng, size, config)
     wide, deep = float(rng.uniform(*config.wide)), float(rng.uniform(*config.far))
-    low, high = (-wide / 2, -deep), (wide / 2, -1.9)
-    plan, value = Plan((), view, low, high), 0.0
+    plan, value = Plan((), view, (-wide / 2, -deep), (wide / 2, -1.9)), 0.0
     few = SPARE * least * (WIDTH / size[0]) ** 2
     drawn: list[Float[Tensor, "h w"]] = []
-    for what in wanted:
-        spots = _spots(plan, what, rng, config)
+    for name, rule in wanted:
+        spots = _spots(plan, name, rule, rng, config)
         looks = [depth_of(spot, view) for spot in spots]
         values = [worth([*drawn, look], few, config.hidden) for look in looks]
         best = int(np.argmax(values)) if values else -1
@@ -268,10 +263,9 @@ def _furnished(
 
 
 def _spots(
-    plan: Plan, what: tuple[str, Rule], rng: np.random.Generator, config: PlanConfig
+    plan: Plan, name: str, rule: Rule, rng: np.random.Generator, config: PlanConfig
 ) -> list[Placed]:
-    """Up to `CHOICES` places where a new piece stands free and in view."""
-    name, rule = what
+    """Up to `CHOICES` positions where a new object stands free and in view."""
     furniture = make_piece(name, rng)
     others = list(plan.pieces)
     count = sum(p.furniture.category == furniture.category for p in others)
@@ -281,7 +275,7 @@ def _spots(
         spot = RULES[rule](rng, furniture.size, plan.walls, others)
         if spot is None or len(found) == CHOICES:
             break
-        piece = Placed(label, furniture, (spot[0], spot[1]), spot[2])
+        piece = Placed(label, furniture, spot[:2], spot[2])
         free = fits(piece, others, config.spacing * MARGIN[rule], plan.walls)
         if free and in_view(piece, plan.view) >= config.visible:
             found.append(piece)

@@ -38,7 +38,7 @@ def main() -> None:
     plan, actor = demo_plan()
     frame, fps = room.bodies.frame, room.bodies.fps
     assert fps is not None
-    true = in_camera(plan, (actor.acted,), torch.arange(len(frame)))
+    true = in_camera(plan, (actor,), torch.arange(len(frame)))
     write_people(true, frame, fps, DATA / "truth.npz")
     pose, keep = noisy_pose(room, noise, np.random.default_rng([SEED, 4]))
     write_people(rows_of(pose, keep), frame[keep], fps, DATA / "capture.npz")

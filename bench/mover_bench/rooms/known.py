@@ -1,11 +1,12 @@
 """What is known of a room: the capture that a perfect upstream would give, and the truth."""
 
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from mover.app.demo import rounded
@@ -13,7 +14,6 @@ from mover.bodies.skinning import open_body
 from mover.core.records import map_tensors, record
 from mover.core.types import Bodies, BodyPose, Capture, Detection, Masks, People, Scene, SceneObject
 from mover.furniture.pieces import Furniture
-from mover.geometry.rle import decode
 from mover.geometry.warp_start import beside, mapped
 from mover_bench.rooms.compose import Plan
 from mover_bench.rooms.config import RoomConfig
@@ -45,13 +45,13 @@ class KnownRoom:
     bodies: Bodies
     """In the camera frame, with pose parameters of the open body."""
     touching: Bool[Tensor, "bodies verts"]
-    """Skin within 1 cm of a piece or of the floor."""
+    """Skin within 1 cm of an object or of the floor."""
     touched: Int[Tensor, "bodies verts"]
-    """What it touches: index of the piece, -1 the floor, -2 nothing."""
+    """What it touches: index of the object, -1 the floor, -2 nothing."""
     actions: tuple[str, ...]
     """What each body does."""
     furniture: tuple[Furniture, ...]
-    """The pieces in the order of `truth.objects`."""
+    """The objects in the order of `truth.objects`."""
     plan: Plan
     refused: tuple[str, ...]
     """Rooms and tasks that were not true enough, with the reasons."""
@@ -68,22 +68,6 @@ class NoRoomError(ValueError):
 
 
 @record
-class Acted:
-    """One person, frame by frame, in the frame of the floor."""
-
-    pose: BodyPose
-    """Of the open body, float64."""
-    pelvis: Float[np.ndarray, "frames 3"]
-    """[m]"""
-    origin: Float[np.ndarray, "3"]
-    """The pelvis of the rest shape: what `transl` leaves out [m]."""
-    labels: tuple[str, ...]
-    """What is done in each frame."""
-    touched: tuple[int, ...]
-    """Index of the piece in use in each frame, or -1."""
-
-
-@record
 class Actor:
     """One person and what they do."""
 
@@ -91,65 +75,73 @@ class Actor:
     performance: Performance
 
     @property
-    def acted(self) -> Acted:
-        """The person frame by frame."""
-        person, act = self.stage.person, self.performance
-        pose = angles(person, act.posture)
-        return Acted(pose, act.posture.pelvis, person.origin, act.labels, act.touched)
+    def pose(self) -> BodyPose:
+        """Of the open body in the frame of the floor, float64."""
+        return angles(self.stage.person, self.performance.posture)
 
 
 def build(
-    plan: Plan,
-    actors: tuple[Actor, ...],
-    config: RoomConfig,
-    name: str,
-    refused: tuple[str, ...],
+    plan: Plan, actors: tuple[Actor, ...], config: RoomConfig, name: str, refused: tuple[str, ...]
 ) -> KnownRoom:
     """Put people and furniture before the camera.
 
     Raises:
-        RefusedError: If too little is seen or happens.
+        RefusedError: If too little is visible or happens.
     """
-    acts = tuple(actor.acted for actor in actors)
-    _check(acts, config)
-    sight = see(plan)
-    detections = _detections(plan, sight, config)
-    crowd = _crowd(plan, acts, config.fps)
-    scene = _scene(plan)
-    shown = visible(plan, crowd.bodies, lambda _: sight.depth)
-    capture = Capture(
-        name=name, scene=scene, camera_height=None, detections=detections,
-        reference=sight.picture, reference_people=None, bodies=crowd.bodies,
-        people=shown.people, touch=None, warnings=(),
-    )  # fmt: skip
-    furniture = tuple(piece.furniture for piece in plan.pieces)
-    return KnownRoom(
-        capture=capture, truth=scene, bodies=crowd.bodies, touching=crowd.touching,
-        touched=crowd.touched, actions=crowd.actions, furniture=furniture, plan=plan,
-        refused=refused, whole=shown.whole,
-    )  # fmt: skip
-
-
-def _check(acts: tuple[Acted, ...], config: RoomConfig) -> None:
-    """Whether there is enough to see."""
-    frames = max(len(a.labels) for a in acts)
-    used = {(k, i) for k, a in enumerate(acts) for i in a.touched if i >= 0}
+    acts = [actor.performance for actor in actors]
+    frames = max(len(act.labels) for act in acts)
+    used = {(k, i) for k, act in enumerate(acts) for i in act.touched if i >= 0}
     if frames < config.least_frames or len(used) < config.least_touches:
         raise RefusedError(f"{frames} frames, {len(used)} pieces used")
+    sight = see(plan)
+    detections = _detections(plan, sight, config)
+    rows = sorted((f, k) for k, act in enumerate(acts) for f in range(len(act.labels)))
+    starts = np.cumsum([0, *(len(act.labels) for act in acts)])
+    index = torch.tensor([int(starts[k]) + f for f, k in rows])
+    model, pose = open_body(), in_camera(plan, actors, index)
+
+    def near() -> list[Nearness]:
+        return [nearness(model.posed(a.pose)[0].numpy(), plan.pieces) for a in actors]
+
+    nears, (verts, joints) = beside(near, lambda: model.posed(pose))
+    distance = torch.cat([torch.from_numpy(n.distance).float() for n in nears])[index]
+    nearest = torch.cat([torch.from_numpy(n.nearest) for n in nears])[index]
+    touching = distance < GAPE
+    bodies = Bodies(
+        verts=rounded(verts), faces=model.faces, joints=rounded(joints),
+        joint_names=model.joint_names, frame=torch.tensor([f for f, _ in rows]),
+        person=torch.tensor([k for _, k in rows]), fps=config.fps, space="camera",
+        pose=map_tensors(rounded, pose),
+    )  # fmt: skip
+    scene = scene_of(plan)
+    shown = visible(plan, bodies, lambda _: sight.depth)
+    capture = Capture(
+        name=name, scene=scene, camera_height=None, detections=detections,
+        reference=sight.picture, reference_people=None, bodies=bodies, people=shown.people,
+        touch=None, warnings=(),
+    )  # fmt: skip
+    return KnownRoom(
+        capture=capture, truth=scene, bodies=bodies, touching=touching,
+        touched=torch.where(touching, nearest, torch.full_like(nearest, NONE)),
+        actions=tuple(acts[k].labels[f] for f, k in rows),
+        furniture=tuple(piece.furniture for piece in plan.pieces), plan=plan, refused=refused,
+        whole=shown.whole,
+    )  # fmt: skip
 
 
-def _scene(plan: Plan) -> Scene:
-    pieces = []
+def scene_of(plan: Plan) -> Scene:
+    """The furniture in the world of the camera."""
+    objects = []
     for index, piece in enumerate(plan.pieces):
         x, z = piece.place.tolist()
-        place = torch.tensor([x, piece.height - plan.view.height, z])
-        pieces.append(
+        t = torch.tensor([x, piece.height - plan.view.height, z])
+        objects.append(
             SceneObject(
                 piece.id, piece.furniture.category, piece.furniture.mesh, "", index + 1,
-                piece.support, place, torch.tensor(float(piece.heading)), torch.ones(3),
+                piece.support, t, torch.tensor(float(piece.heading)), torch.ones(3),
             )
         )  # fmt: skip
-    return Scene(plan.view.camera, -plan.view.height, tuple(pieces))
+    return Scene(plan.view.camera, -plan.view.height, tuple(objects))
 
 
 def _detections(plan: Plan, sight: Sight, config: RoomConfig) -> tuple[Detection, ...]:
@@ -163,63 +155,20 @@ def _detections(plan: Plan, sight: Sight, config: RoomConfig) -> tuple[Detection
     return tuple(found)
 
 
-@record
-class _Crowd:
-    """Everybody, row by row."""
-
-    bodies: Bodies
-    touching: Bool[Tensor, "bodies verts"]
-    touched: Int[Tensor, "bodies verts"]
-    actions: tuple[str, ...]
-
-
-def _crowd(plan: Plan, acts: tuple[Acted, ...], fps: float) -> _Crowd:
-    """Everybody in camera axes, how near they are to what, and what they do."""
-    model = open_body()
-    rows = [(f, k) for k, a in enumerate(acts) for f in range(len(a.labels))]
-    order = sorted(range(len(rows)), key=lambda k: rows[k])
-    index = torch.tensor(order)
-    pose = in_camera(plan, acts, index)
-
-    def near() -> list[Nearness]:
-        return [nearness(model.posed(a.pose)[0].numpy(), plan.pieces) for a in acts]
-
-    nears, (verts, joints) = beside(near, lambda: model.posed(pose))
-    distance = torch.cat([torch.from_numpy(n.distance).float() for n in nears])[index]
-    nearest = torch.cat([torch.from_numpy(n.nearest) for n in nears])[index]
-    labels = [name for a in acts for name in a.labels]
-    bodies = Bodies(
-        verts=rounded(verts),
-        faces=model.faces,
-        joints=rounded(joints),
-        joint_names=model.joint_names,
-        frame=torch.tensor([rows[k][0] for k in order]),
-        person=torch.tensor([rows[k][1] for k in order]),
-        fps=fps,
-        space="camera",
-        pose=map_tensors(rounded, pose),
-    )
-    touching = distance < GAPE
-    touched = torch.where(touching, nearest, torch.full_like(nearest, NONE))
-    return _Crowd(bodies, touching, touched, tuple(labels[k] for k in order))
-
-
-def in_camera(plan: Plan, acts: tuple[Acted, ...], index: Tensor) -> BodyPose:
+def in_camera(plan: Plan, actors: Sequence[Actor], index: Tensor) -> BodyPose:
     """Pose parameters in camera axes, float64; the root turns about the pelvis."""
     R = plan.view.camera.R_cam_world.double().numpy()
     eye = np.array([0.0, plan.view.height, 0.0])
-    fields: dict[str, list[Tensor]] = {
-        n: [] for n in ("betas", "global_orient", "body_pose", "transl")
-    }
-    for act in acts:
-        turn = R @ from_vector(act.pose.global_orient.numpy())
-        pelvis = (act.pelvis - eye) @ R.T
-        fields["betas"].append(act.pose.betas)
-        fields["body_pose"].append(act.pose.body_pose)
-        fields["global_orient"].append(torch.from_numpy(to_vector(turn)))
-        fields["transl"].append(torch.from_numpy(pelvis - act.origin))
-    rows = {n: torch.cat(parts)[index] for n, parts in fields.items()}
-    return BodyPose(model="makehuman", gender="neutral", extra={}, **rows)
+    poses: list[BodyPose] = []
+    for actor in actors:
+        pose = actor.pose
+        turn = R @ from_vector(pose.global_orient.numpy())
+        pelvis = (actor.performance.posture.pelvis - eye) @ R.T
+        transl = torch.from_numpy(pelvis - actor.stage.person.origin)
+        poses.append(replace(pose, global_orient=torch.from_numpy(to_vector(turn)), transl=transl))
+    names = ("betas", "global_orient", "body_pose", "transl")
+    rows = {n: torch.cat([getattr(pose, n) for pose in poses])[index] for n in names}
+    return replace(poses[0], **rows)
 
 
 @record
@@ -256,27 +205,3 @@ def visible(plan: Plan, bodies: Bodies, furniture: Callable[[int], Tensor]) -> S
     coded = Masks(camera.height, camera.width, tuple(mask for mask, _ in rows))
     people = People(coded, bodies.frame, bodies.person, {})
     return Shown(people, torch.tensor([count for _, count in rows]))
-
-
-def pieces_seen(
-    people: People | None, frames: Iterable[int], piece: Callable[[int], Tensor], least: int = 1
-) -> People:
-    """Masks of at least so many pixels of the furniture in some frames, as `furniture.json` has it.
-
-    `piece` is the index of the piece at each pixel of a frame, -1 for none, without people; the
-    rows' `person` is the number of an annotation.
-    """
-    assert people is not None, "a known room has masks"
-    rows: list[tuple[int, int]] = []
-    masks: list[np.ndarray] = []
-    for frame in frames:
-        seen = piece(frame).clone()
-        for row in (people.frame == frame).nonzero()[:, 0].tolist():
-            seen[decode(people.masks, row)] = -1
-        for index in seen.unique().tolist():
-            mask = seen == index
-            if index >= 0 and int(mask.sum()) >= least:
-                rows.append((frame, index + 1))
-                masks.append(mask.numpy())
-    frame, number = torch.tensor(rows).unbind(1)
-    return People(encode(masks), frame, number, {})

@@ -11,22 +11,27 @@ from jaxtyping import Float
 
 from mover.core.records import record
 from mover.geometry.warp_start import mapped
-from mover_bench.rooms.gait import Stations, duration, stations, walk
-from mover_bench.rooms.lying import LIE_TIME, berth, lie_down, on_side, roll_over, supine
+from mover_bench.rooms.gait import duration, stations, walk
 from mover_bench.rooms.placed import NoWayError, Placed, way
-from mover_bench.rooms.poses import Person, Posture, blend, chain, rows
-from mover_bench.rooms.seating import (
+from mover_bench.rooms.poses import SIDES, Person, Posture, blend, chain, rows
+from mover_bench.rooms.resting import (
+    LIE_TIME,
     REACH_TIME,
     SIT_TIME,
     before,
+    berth,
     hand_on,
     leaning,
+    lie_down,
+    on_side,
     reach_out,
+    roll_over,
     seat_spot,
     seated,
     settle_down,
     sit_down,
     standing,
+    supine,
     table_stand,
 )
 from mover_bench.rooms.truth import faults
@@ -111,9 +116,10 @@ def perform(
             break
         try:
             stop = stop_for(stage, task, here)
-            new = _played(stage, task, (here, stop), phase)
+            new = _played(stage, task, here, stop, phase)
         except (NoWayError, RefusedTaskError, ValueError) as error:
-            refused.append(f"{task.kind} {_name(stage, task)}: {error}")
+            name = stage.pieces[task.piece].id if task.piece >= 0 else "to a place"
+            refused.append(f"{task.kind} {name}: {error}")
         else:
             takes, here = takes + new, stop
     if not takes:
@@ -128,11 +134,13 @@ class RefusedTaskError(Exception):
     """Bodies would sink into furniture, or hang in the air."""
 
 
-def _played(stage: Stage, task: Task, way: tuple[Stop, Stop], phase: float) -> list[Take]:
+def _played(stage: Stage, task: Task, here: Stop, stop: Stop, phase: float) -> list[Take]:
     """Walk there and do it, checked against the furniture."""
-    walked = _walk(stage, *way)
+    path = way(here.door, stop.door, stage.pieces, stage.bounds)
+    route = stations(path, here.heading, stop.heading, np.stack([here.place, stop.place]))
+    walked = Take(walk(stage.person, route, _times(stage, duration(route))), "walk", -1)
     _check(stage, [walked])
-    acts = _ACTS[task.kind](stage, task, way[1], phase)
+    acts = _ACTS[task.kind](stage, task, stop, phase)
     _check(stage, acts)
     return [walked, *acts]
 
@@ -144,10 +152,6 @@ def _check(stage: Stage, takes: list[Take]) -> None:
     found = [fault for faulty in mapped(wrong, takes) for fault in faulty]
     if found:
         raise RefusedTaskError(found[0])
-
-
-def _name(stage: Stage, task: Task) -> str:
-    return stage.pieces[task.piece].id if task.piece >= 0 else "to a place"
 
 
 def stop_for(stage: Stage, task: Task, here: Stop) -> Stop:
@@ -166,13 +170,6 @@ def stop_for(stage: Stage, task: Task, here: Stop) -> Stop:
     return Stop(place, spot.heading, place + DOOR * facing(np.array(spot.heading)))
 
 
-def _walk(stage: Stage, here: Stop, stop: Stop) -> Take:
-    path = way(here.door, stop.door, stage.pieces, stage.bounds)
-    outer = np.stack([here.place, stop.place])
-    route: Stations = stations(path, here.heading, stop.heading, outer)
-    return Take(walk(stage.person, route, _times(stage, duration(route))), "walk", -1)
-
-
 def _times(stage: Stage, seconds: float) -> Float[np.ndarray, " frames"]:
     return np.arange(1, max(1, round(seconds * stage.fps)) + 1) / stage.fps
 
@@ -186,27 +183,22 @@ def _still(stage: Stage, posture: Posture, seconds: float, phase: float, amount:
     return settle_down(posture, _times(stage, seconds), phase, amount)
 
 
-def _nothing(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
-    del stage, task, stop, phase
-    return []
-
-
 def _sit(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
     piece = stage.pieces[task.piece]
     spot = seat_spot(stage.pieces, task.piece, task.along)
     sitting = seated(stage.person, spot, piece)
     down = sit_down(stage.person, sitting, stop.heading, _shares(stage, SIT_TIME))
-    takes = [Take(down, "sit down", task.piece)]
-    if task.kind == "lean":
+    if task.kind == "sit":
+        parts = [("sit", _still(stage, sitting, task.seconds, phase, 1.0))]
+    else:
         back = leaning(stage.person, sitting, piece)
         move = blend(sitting, back, smooth(_shares(stage, 1.0)))
-        rest = _still(stage, back, task.seconds, phase, 0.0)
-        takes.append(Take(_still(stage, sitting, 1.6, phase, 1.0), "sit", task.piece))
-        takes += [Take(move, "sit", task.piece), Take(rest, "lean", task.piece)]
-        takes.append(Take(_reversed(move), "sit", task.piece))
-    else:
-        takes.append(Take(_still(stage, sitting, task.seconds, phase, 1.0), "sit", task.piece))
-    return [*takes, Take(_reversed(down), "stand up", task.piece)]
+        parts = [
+            ("sit", _still(stage, sitting, 1.6, phase, 1.0)), ("sit", move),
+            ("lean", _still(stage, back, task.seconds, phase, 0.0)), ("sit", _reversed(move)),
+        ]  # fmt: skip
+    parts = [("sit down", down), *parts, ("stand up", _reversed(down))]
+    return [Take(posture, label, task.piece) for label, posture in parts]
 
 
 def _lie(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
@@ -216,33 +208,27 @@ def _lie(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
     back = supine(person, place, piece)
     down = sit_down(person, sitting, stop.heading, _shares(stage, SIT_TIME))
     lay = lie_down(person, sitting, back, piece, _shares(stage, LIE_TIME))
-    takes = [
-        Take(down, "sit down", task.piece),
-        Take(_still(stage, sitting, 1.0, phase, 1.0), "sit", task.piece),
-    ]
-    takes += [
-        Take(lay, "lie down", task.piece),
-        Take(_still(stage, back, task.seconds, phase, 0.0), "lie", task.piece),
-    ]
+    parts = [
+        ("sit down", down), ("sit", _still(stage, sitting, 1.0, phase, 1.0)), ("lie down", lay),
+        ("lie", _still(stage, back, task.seconds, phase, 0.0)),
+    ]  # fmt: skip
     if task.roll:
         side = on_side(person, back, place, piece)
         roll = roll_over(person, back, side, piece, _shares(stage, 2.0))
         rest = _still(stage, rows(roll, slice(-1, None)), 0.6 * task.seconds, phase, 0.0)
-        takes += [Take(roll, "lie", task.piece), Take(rest, "lie", task.piece)]
-        takes += [Take(_reversed(roll), "lie", task.piece)]
-    takes.append(Take(_reversed(lay), "get up", task.piece))
-    return [*takes, Take(_reversed(down), "stand up", task.piece)]
+        parts += [("lie", roll), ("lie", rest), ("lie", _reversed(roll))]
+    parts += [("get up", _reversed(lay)), ("stand up", _reversed(down))]
+    return [Take(posture, label, task.piece) for label, posture in parts]
 
 
 def _table(stage: Stage, task: Task, stop: Stop, phase: float) -> list[Take]:
     hand = int(phase > np.pi)
-    piece = stage.pieces[task.piece]
-    end = hand_on(stage.person, stop.place, stop.heading, piece, hand)
-    label = ("left", "right")[hand] + " hand"
-    still = Take(_still(stage, end, task.seconds, phase, 0.3), label, task.piece)
+    end = hand_on(stage.person, stop.place, stop.heading, stage.pieces[task.piece], hand)
     stand = standing(stage.person, stop.place, stop.heading)
     out = reach_out(end, stand, _shares(stage, REACH_TIME))
-    return [Take(out, "reach", still.piece), still, Take(_reversed(out), "reach", still.piece)]
+    still = _still(stage, end, task.seconds, phase, 0.3)
+    parts = [("reach", out), (f"{SIDES[hand]} hand", still), ("reach", _reversed(out))]
+    return [Take(posture, label, task.piece) for label, posture in parts]
 
 
 def _reversed(posture: Posture) -> Posture:
@@ -251,4 +237,4 @@ def _reversed(posture: Posture) -> Posture:
     return rows(posture, order)
 
 
-_ACTS = {"walk": _nothing, "sit": _sit, "lean": _sit, "lie": _lie, "table": _table}
+_ACTS = {"walk": lambda *_: [], "sit": _sit, "lean": _sit, "lie": _lie, "table": _table}

@@ -15,19 +15,12 @@ from torch import Tensor
 
 from mover.core.records import axis_of
 from mover.core.types import Bodies, BodyPose, Masks, People, Scene, Segment
-from mover.geometry.rle import joined
+from mover.geometry.rle import decode, joined
 from mover_bench.rooms.compose import Plan, fits, in_view
 from mover_bench.rooms.config import RoomConfig
-from mover_bench.rooms.known import (
-    KnownRoom,
-    NoRoomError,
-    RefusedError,
-    build,
-    one_thread,
-    pieces_seen,
-)
+from mover_bench.rooms.known import KnownRoom, NoRoomError, RefusedError, build, one_thread
 from mover_bench.rooms.placed import Placed
-from mover_bench.rooms.render import see
+from mover_bench.rooms.render import encode, see
 from mover_bench.rooms.room import cast, make_room
 
 MOVABLE = ("chair", "office chair", "stool", "armchair", "table", "coffee table")
@@ -126,9 +119,21 @@ def _both(first: Rows, second: Rows) -> Rows:
 
 
 def _seen(room: KnownRoom, frames: range) -> People:
-    """What of each piece is seen in some frames; `person` is the number of its annotation."""
-    piece = see(room.plan).piece
-    return pieces_seen(room.capture.people, frames, lambda _: piece)
+    """Masks of the objects in some frames; `person` is the number of the annotation."""
+    people, objects = room.capture.people, see(room.plan).piece
+    assert people is not None, "a known room has masks"
+    rows: list[tuple[int, int]] = []
+    masks: list[np.ndarray] = []
+    for frame in frames:
+        shown = objects.clone()
+        for row in (people.frame == frame).nonzero()[:, 0].tolist():
+            shown[decode(people.masks, row)] = -1
+        for index in shown.unique().tolist():
+            if index >= 0:
+                rows.append((frame, index + 1))
+                masks.append((shown == index).numpy())
+    frame, number = torch.tensor(rows).unbind(1)
+    return People(encode(masks), frame, number, {})
 
 
 def _scene(first: Scene, second: Scene, index: int, change: int) -> Scene:

@@ -7,7 +7,8 @@ sources in `NoiseConfig`. Every part has its own stream of
 random numbers, so that changing one leaves the others as they were.
 """
 
-import dataclasses
+import io
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -36,44 +37,40 @@ from mover_bench.rooms.noise_masks import (
     without,
     wobbling,
 )
-from mover_bench.rooms.noise_picture import worn_picture
 from mover_bench.rooms.turns import from_vector, to_vector
 
 SEATS_FOR_ONE = ("chair", "armchair", "office chair", "stool")
 
 
 def other_shapes(
-    pieces: tuple[SceneObject, ...],
+    objects: tuple[SceneObject, ...],
     furniture: tuple[Furniture, ...],
     noise: NoiseConfig,
     rng: np.random.Generator,
 ) -> tuple[SceneObject, ...]:
     """Some meshes replaced by other designs that fill the same box."""
     out: list[SceneObject] = []
-    for piece, known in zip(pieces, furniture, strict=True):
+    for thing, known in zip(objects, furniture, strict=True):
         swap = float(rng.uniform()) < noise.other_shapes
         new = another(known, rng)
-        if not swap:
-            out.append(piece)
-            continue
         ratio = torch.tensor(known.size) / torch.tensor(new.size)
-        out.append(dataclasses.replace(piece, mesh=Mesh(new.mesh.verts * ratio, new.mesh.faces)))
+        mesh = Mesh(new.mesh.verts * ratio, new.mesh.faces) if swap else thing.mesh
+        out.append(replace(thing, mesh=mesh))
     return tuple(out)
 
 
 def foreign_shapes(
-    pieces: tuple[SceneObject, ...],
+    objects: tuple[SceneObject, ...],
     furniture: tuple[Furniture, ...],
     noise: NoiseConfig,
     seed: list[int],
 ) -> tuple[SceneObject, ...]:
-    """Some meshes replaced by pieces of the class as other programs would make them."""
+    """Some meshes replaced by objects of the class as other programs would make them."""
     out: list[SceneObject] = []
-    for index, (piece, known) in enumerate(zip(pieces, furniture, strict=True)):
+    for index, (thing, known) in enumerate(zip(objects, furniture, strict=True)):
         rng = np.random.default_rng([*seed, index])
         swap = float(rng.uniform()) < noise.foreign
-        mesh = foreign_mesh(known, noise.warp, rng) if swap else piece.mesh
-        out.append(dataclasses.replace(piece, mesh=mesh))
+        out.append(replace(thing, mesh=foreign_mesh(known, noise.warp, rng)) if swap else thing)
     return tuple(out)
 
 
@@ -85,7 +82,7 @@ def noisy_bodies(room: KnownRoom, noise: NoiseConfig, rng: np.random.Generator) 
     bodies = room.bodies
     pose, keep = noisy_pose(room, noise, rng)
     verts, joints = open_body().posed(pose)
-    return dataclasses.replace(
+    return replace(
         bodies,
         verts=rounded(verts[keep]),
         joints=rounded(joints[keep]),
@@ -120,7 +117,7 @@ def noisy_pose(
     if noise.mean_bodies:
         pose, shift = _of_mean_shape(pose, pelvis, shift)
     shift = shift + torch.from_numpy(noise.jitter * rng.normal(size=(count, 3)))
-    pose = dataclasses.replace(pose, transl=pose.transl + shift)
+    pose = replace(pose, transl=pose.transl + shift)
     keep = torch.from_numpy(np.flatnonzero(rng.uniform(size=count) >= noise.dropped))
     return pose, keep
 
@@ -128,19 +125,16 @@ def noisy_pose(
 def _of_mean_shape(pose: BodyPose, pelvis: Tensor, shift: Tensor) -> tuple[BodyPose, Tensor]:
     """Bodies of the mean shape, as large in the picture as they are, and shifted as much."""
     model = open_body()
-    mean = dataclasses.replace(pose, betas=torch.zeros_like(pose.betas))
+    mean = replace(pose, betas=torch.zeros_like(pose.betas))
 
     def heights(some: BodyPose) -> Tensor:
-        still = dataclasses.replace(
-            some, body_pose=torch.zeros_like(some.body_pose), transl=torch.zeros_like(some.transl)
-        )
-        upright = dataclasses.replace(still, global_orient=torch.zeros_like(still.global_orient))
+        names = ("body_pose", "transl", "global_orient")
+        upright = replace(some, **{name: torch.zeros_like(getattr(some, name)) for name in names})
         rest = model.posed(upright)[0][..., 1]
         return rest.amax(-1) - rest.amin(-1)
 
     share = (heights(mean) / heights(pose))[:, None]
-    there = pelvis - model.posed(mean)[1][:, 0]
-    return mean, there + pelvis * (share - 1) + shift * share
+    return mean, pelvis - model.posed(mean)[1][:, 0] + pelvis * (share - 1) + shift * share
 
 
 def slow(
@@ -178,52 +172,89 @@ def _turned(pose: BodyPose, error: Float[np.ndarray, "bodies 22 3"]) -> BodyPose
     root = pose.global_orient.reshape(count, 1, 3)
     local = torch.cat([root, pose.body_pose.reshape(count, 21, 3)], 1).numpy()
     wrong = torch.from_numpy(to_vector(from_vector(local) @ from_vector(error)))
-    return dataclasses.replace(
-        pose, global_orient=wrong[:, 0], body_pose=wrong[:, 1:].reshape(count, -1)
-    )
+    return replace(pose, global_orient=wrong[:, 0], body_pose=wrong[:, 1:].reshape(count, -1))
+
+
+# What a real camera makes of a reference picture: clutter whose lines are not the room's, a lens
+# that bends lines, grain, and a JPEG's traces.
+
+
+LENGTH = (0.03, 0.15)  # of the picture's width: longer side of what lies about
+FLAT = (0.1, 0.6)  # its shorter side over the longer one
+BLUR = 0.8  # [px]
+QUALITY = 80  # of a JPEG
+
+
+def worn_picture(capture: Capture, noise: NoiseConfig, rng: np.random.Generator) -> Capture:
+    """The capture with clutter, a lens that bends lines, grain and JPEG in its picture."""
+    if capture.reference is None or not (noise.things or noise.distortion or noise.grain):
+        return capture
+    import cv2
+    from PIL import Image
+
+    picture = (255 * capture.reference.double().numpy()).round()
+    height, width = picture.shape[:2]
+    for _ in range(noise.things):  # rectangles of any direction and colour
+        middle = rng.uniform([0, 0], [width, height])
+        angle, long = rng.uniform(0, np.pi), rng.uniform(*LENGTH) * width
+        u = np.array([np.cos(angle), np.sin(angle)]) * long / 2
+        v = np.array([-u[1], u[0]]) * rng.uniform(*FLAT)
+        corners = np.array([middle - u - v, middle + u - v, middle + u + v, middle - u + v])
+        colour = rng.uniform(40, 220, 3).tolist()
+        cv2.fillConvexPoly(picture, corners.round().astype(np.int32), colour)
+    k1, K = float(rng.normal(0, noise.distortion)), capture.scene.camera.K.double().numpy()
+    if k1:
+        bend = np.array([k1, 0.0, 0.0, 0.0])
+        maps = cv2.initUndistortRectifyMap(K, bend, np.eye(3), K, (width, height), cv2.CV_32FC1)
+        bent = cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        picture = np.asarray(bent, np.float64)
+    if noise.grain:
+        soft = cv2.GaussianBlur(picture, (0, 0), BLUR)
+        soft = soft + rng.normal(0, 255 * noise.grain, picture.shape)
+        file = io.BytesIO()
+        Image.fromarray(soft.clip(0, 255).astype(np.uint8)).save(file, "jpeg", quality=QUALITY)
+        picture = np.asarray(Image.open(file), np.float64)
+    return replace(capture, reference=torch.from_numpy(picture / 255).float())
 
 
 @one_thread()
 def add_noise(room: KnownRoom, noise: NoiseConfig, seed: int) -> Capture:
-    """What upstream tools would say about a room; the same for the same seed on every machine.
+    """What upstream tools would estimate of a room; the same for the same seed on every machine.
 
     The guess of the camera is wrong, so the objects are given in a wrong world: they keep their
     box centres in the camera frame, and their fronts are projected onto its horizontal plane.
     """
-    streams = [np.random.default_rng([seed, k]) for k in range(8)]
-    camera = _noisy_camera(room.truth.camera, noise, streams[0])
-    pieces = tuple(
-        _noisy_piece((piece, furniture), (room.truth.camera, camera), noise, streams[1])
-        for piece, furniture in zip(room.truth.objects, room.furniture, strict=True)
+
+    def stream(number: int) -> np.random.Generator:
+        return np.random.default_rng([seed, number])
+
+    camera, rng = _noisy_camera(room.truth.camera, noise, stream(0)), stream(1)
+    objects = tuple(
+        _noisy_object(thing, room.truth.camera, camera, noise, rng) for thing in room.truth.objects
     )
-    pieces = other_shapes(pieces, room.furniture, noise, streams[2])
+    objects = other_shapes(objects, room.furniture, noise, stream(2))
     if noise.foreign:
-        pieces = foreign_shapes(pieces, room.furniture, noise, [seed, 10])
+        objects = foreign_shapes(objects, room.furniture, noise, [seed, 10])
     detections = room.capture.detections
     if noise.mask_head or noise.mask_box or noise.amodal:
-        detections = headed(detections, room.truth, noise, np.random.default_rng([seed, 11]))
-    detections = noisy_detections(detections, noise.object_masks, streams[3])
+        detections = headed(detections, room.truth, noise, stream(11))
+    detections = noisy_detections(detections, noise.object_masks, stream(3))
     bodies, people = beside(
-        lambda: noisy_bodies(room, noise, streams[4]),
+        lambda: noisy_bodies(room, noise, stream(4)),
         lambda: noisy_people(
-            room.capture.people, noise.person_masks, noise.missed_masks, streams[5]
+            room.capture.people, noise.person_masks, noise.missed_masks, stream(5)
         ),
     )
-    capture = dataclasses.replace(
-        room.capture, scene=Scene(camera, None, pieces), bodies=bodies, people=people,
-        detections=leaking(detections, noise.leaks, streams[7]),
+    capture = replace(
+        room.capture, scene=Scene(camera, None, objects), bodies=bodies,
+        people=wobbling(people, noise.wobble, stream(12)),
+        detections=leaking(detections, noise.leaks, stream(7)),
+        furniture=noisy_people(room.capture.furniture, noise.object_masks, 0.0, stream(14)),
     )  # fmt: skip
-    furniture = noisy_people(
-        room.capture.furniture, noise.object_masks, 0.0, np.random.default_rng([seed, 14])
-    )
-    capture = dataclasses.replace(capture, furniture=furniture)
-    people = wobbling(capture.people, noise.wobble, np.random.default_rng([seed, 12]))
     assert room.truth.ground is not None, "a known room has a floor"
-    capture = noisy_finds(
-        dataclasses.replace(capture, people=people), room.truth.ground, noise, [seed, 9]
-    )
-    capture = worn_picture(capture, noise, np.random.default_rng([seed, 15]))
-    return wrong_lens(capture, noise.lens, np.random.default_rng([seed, 13]))
+    capture = noisy_finds(capture, room.truth.ground, noise, [seed, 9])
+    capture = worn_picture(capture, noise, stream(15))
+    return wrong_lens(capture, noise.lens, stream(13))
 
 
 def without_seat(capture: Capture, room: KnownRoom) -> Capture:
@@ -246,15 +277,15 @@ def wrong_lens(capture: Capture, mean: float, rng: np.random.Generator) -> Captu
     zoom = 1 + mean * float(rng.uniform(6 / 11, 16 / 11) * rng.choice([-1.0, 1.0]))
     if zoom == 1:
         return capture
-    capture = dataclasses.replace(through_lens(capture, zoom), focal_spread=mean)
+    capture = replace(through_lens(capture, zoom), focal_spread=mean)
     bodies = capture.bodies
     if bodies is None or bodies.joints is None or bodies.pose is None:
         return capture
-    bodies = dataclasses.replace(
+    bodies = replace(
         bodies, verts=rounded(bodies.verts), joints=rounded(bodies.joints),
         pose=map_tensors(rounded, bodies.pose),
     )  # fmt: skip
-    return dataclasses.replace(capture, bodies=bodies)
+    return replace(capture, bodies=bodies)
 
 
 def _noisy_camera(camera: Camera, noise: NoiseConfig, rng: np.random.Generator) -> Camera:
@@ -264,28 +295,22 @@ def _noisy_camera(camera: Camera, noise: NoiseConfig, rng: np.random.Generator) 
     return Camera(camera.K, R, camera.width, camera.height)
 
 
-def _noisy_piece(
-    known: tuple[SceneObject, Furniture],
-    cameras: tuple[Camera, Camera],
-    noise: NoiseConfig,
-    rng: np.random.Generator,
+def _noisy_object(
+    thing: SceneObject, true: Camera, wrong: Camera, noise: NoiseConfig, rng: np.random.Generator
 ) -> SceneObject:
-    """The piece in the world of the wrong camera, moved, turned and stretched."""
-    piece, _ = known
-    turn = cameras[1].R_cam_world.double().mT @ cameras[0].R_cam_world.double()
-    low, high = piece.mesh.verts.amin(0).double(), piece.mesh.verts.amax(0).double()
-    middle = (low + high) / 2 * piece.scale.double()
-    yaw = piece.yaw.double()
-    centre = turn @ (rot_y(yaw) @ middle + piece.t_world_object.double())
+    """The object in the world of the wrong camera, moved, rotated and stretched."""
+    turn = wrong.R_cam_world.double().mT @ true.R_cam_world.double()
+    low, high = thing.mesh.verts.amin(0).double(), thing.mesh.verts.amax(0).double()
+    middle = (low + high) / 2 * thing.scale.double()
+    yaw = thing.yaw.double()
+    centre = turn @ (rot_y(yaw) @ middle + thing.t_world_object.double())
     front = turn @ torch.stack([yaw.sin(), torch.zeros_like(yaw), yaw.cos()])
     far = 1 + noise.along_ray * float(rng.uniform(-1, 1)) / float(centre.norm())
     aside = torch.from_numpy(noise.sideways * rng.uniform(-1, 1, 3))
-    size = piece.scale.double() * far * torch.from_numpy(1 + noise.scale * rng.uniform(-1, 1, 3))
-    wrong = np.radians(noise.yaw) * float(rng.uniform(-1, 1))
+    size = thing.scale.double() * far * torch.from_numpy(1 + noise.scale * rng.uniform(-1, 1, 3))
+    off = np.radians(noise.yaw) * float(rng.uniform(-1, 1))
     quarter = float(rng.integers(1, 4)) if float(rng.uniform()) < noise.flips else 0.0
-    angle = torch.atan2(front[0], front[2]) + wrong + quarter * np.pi / 2
+    angle = torch.atan2(front[0], front[2]) + off + quarter * np.pi / 2
     angle = torch.atan2(angle.sin(), angle.cos())
-    place = centre * far + aside - rot_y(angle) @ ((low + high) / 2 * size)
-    return dataclasses.replace(
-        piece, t_world_object=place.float(), yaw=angle.float(), scale=size.float()
-    )
+    t = centre * far + aside - rot_y(angle) @ ((low + high) / 2 * size)
+    return replace(thing, t_world_object=t.float(), yaw=angle.float(), scale=size.float())

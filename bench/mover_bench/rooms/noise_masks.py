@@ -30,11 +30,7 @@ def grown(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]
 
     if pixels == 0 or not mask.any() or mask.all():
         return mask
-    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    pad = abs(pixels) + 1
-    window = np.s_[
-        max(0, rows[0] - pad) : rows[-1] + pad + 1, max(0, cols[0] - pad) : cols[-1] + pad + 1
-    ]
+    window = _window(mask, abs(pixels) + 1)
     part = mask[window]
     out = np.zeros_like(mask)
     if pixels > 0:
@@ -42,6 +38,14 @@ def grown(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]
     else:
         out[window] = np.asarray(distance_transform_edt(part)) > -pixels
     return out if out.any() else mask
+
+
+def _window(mask: Bool[np.ndarray, "h w"], pad: int) -> tuple[slice, slice]:
+    """Rows and columns of a mask that is not empty, and so many pixels around it."""
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return np.s_[
+        max(0, rows[0] - pad) : rows[-1] + pad + 1, max(0, cols[0] - pad) : cols[-1] + pad + 1
+    ]
 
 
 def noisy_people(
@@ -77,7 +81,7 @@ def noisy_detections(
 def leaking(
     detections: tuple[Detection, ...], share: float, rng: np.random.Generator
 ) -> tuple[Detection, ...]:
-    """Some masks of objects run over at one place of their border; the boxes follow."""
+    """Some masks of objects run over at one point of their border; the boxes follow."""
     draws = [rng.uniform(size=2) for _ in detections]
     return tuple(
         redrawn(one, leaked(_mask(one), float(where))) if one.mask and leaks < share else one
@@ -90,13 +94,13 @@ def redrawn(detection: Detection, mask: Bool[np.ndarray, "h w"]) -> Detection:
     return dataclasses.replace(detection, mask=encode([mask]), box=box_of_mask(mask))
 
 
-def leaked(mask: Bool[np.ndarray, "h w"], where: float) -> Bool[np.ndarray, "h w"]:
-    """The mask and a disc around a point of its border.
+def _mask(detection: Detection) -> Bool[np.ndarray, "h w"]:
+    assert isinstance(detection.mask, Masks), "detections of known rooms have masks"
+    return decode(detection.mask, 0).numpy()
 
-    Args:
-        mask: Not empty.
-        where: In [0, 1), which point of the border.
-    """
+
+def leaked(mask: Bool[np.ndarray, "h w"], where: float) -> Bool[np.ndarray, "h w"]:
+    """A mask that is not empty and a disc around a point of its border, `where` in [0, 1)."""
     rows, cols = np.nonzero(mask & ~grown(mask, -1))
     if not len(rows):
         return mask
@@ -107,8 +111,6 @@ def leaked(mask: Bool[np.ndarray, "h w"], where: float) -> Bool[np.ndarray, "h w
 
 
 # Errors of an instance detector: objects missed, invented, run together, or called by wrong names.
-#
-# An initial scene has one object for each detection, so that the scene follows the detections.
 
 
 KINDS = tuple(PIECES)  # what a detector has a class for
@@ -124,7 +126,7 @@ def noisy_finds(capture: Capture, floor: float, noise: NoiseConfig, seed: list[i
     capture = _renamed(capture, noise.wrong_class, rngs[2])
     count = int(rngs[3].binomial(len(capture.detections), noise.false))
     for index in range(count):
-        capture = _with_false(capture, (index, floor), rngs[3])
+        capture = _with_false(capture, index, floor, rngs[3])
     return capture
 
 
@@ -168,11 +170,6 @@ def _touch(a: Detection, b: Detection) -> bool:
     return bool((binary_dilation(_mask(a), iterations=TOUCH) & _mask(b)).any())
 
 
-def _mask(detection: Detection) -> Bool[np.ndarray, "h w"]:
-    assert isinstance(detection.mask, Masks), "detections of known rooms have masks"
-    return decode(detection.mask, 0).numpy()
-
-
 def _renamed(capture: Capture, share: float, rng: np.random.Generator) -> Capture:
     """Some objects get another class, and a piece of that class stretched to the same box."""
     if share == 0:
@@ -194,9 +191,8 @@ def _renamed(capture: Capture, share: float, rng: np.random.Generator) -> Captur
     return dataclasses.replace(capture, scene=scene, detections=tuple(found))
 
 
-def _with_false(capture: Capture, what: tuple[int, float], rng: np.random.Generator) -> Capture:
-    """One more object that is not there: a patch of the image, and a piece that it shows."""
-    index, floor = what
+def _with_false(capture: Capture, index: int, floor: float, rng: np.random.Generator) -> Capture:
+    """One more object that is not there, and a patch of the image as its mask."""
     camera = capture.scene.camera
     new = make_piece(KINDS[int(rng.integers(len(KINDS)))], rng)
     z = float(rng.uniform(-5.0, -2.8))
@@ -237,9 +233,11 @@ def headed(
         if one.mask is None:
             out.append(one)
             continue
-        mask = decode(one.mask, 0).numpy()
+        mask = _mask(one)
         if draws[0] < noise.amodal and one.id in pieces:
-            mask = mask | _whole(truth, pieces[one.id])
+            mesh, camera = place_object(truth.objects[pieces[one.id]]), truth.camera
+            verts, size = to_camera(mesh.verts, camera.R_cam_world), (camera.height, camera.width)
+            mask = mask | first_hit(verts, mesh.faces, camera.K, size)[0].isfinite().numpy()
         box = _jittered(box_of_mask(mask).double().numpy(), jitter, mask.shape)
         cells = noise.mask_head * (2 if draws[1] < FINER else 1)
         drawn = coarse(mask, box, cells) if cells else mask
@@ -247,14 +245,6 @@ def headed(
         found = box_of_mask(mask) if not noise.mask_box else torch.from_numpy(box).float()
         out.append(dataclasses.replace(one, mask=encode([mask]), box=found))
     return tuple(out)
-
-
-def _whole(truth: Scene, index: int) -> Bool[np.ndarray, "h w"]:
-    """The picture of a piece if nothing hid it."""
-    camera, mesh = truth.camera, place_object(truth.objects[index])
-    verts = to_camera(mesh.verts, camera.R_cam_world)
-    size = (camera.height, camera.width)
-    return first_hit(verts, mesh.faces, camera.K, size)[0].isfinite().numpy()
 
 
 def _jittered(
@@ -295,9 +285,8 @@ def wobbling(people: People | None, pixels: float, rng: np.random.Generator) -> 
     """Masks of people whose outlines are off by some pixels (standard deviation), out and in."""
     if people is None or pixels == 0:
         return people
-    masks = [
-        wobbled(decode(people.masks, k).numpy(), pixels, rng) for k in range(len(people.frame))
-    ]
+    count = len(people.frame)
+    masks = [wobbled(decode(people.masks, k).numpy(), pixels, rng) for k in range(count)]
     return dataclasses.replace(people, masks=encode(masks)) if masks else people
 
 
@@ -307,12 +296,9 @@ def wobbled(
     """The mask with its outline moved by a smooth random field of a spread [px]."""
     from scipy.ndimage import distance_transform_edt, zoom
 
-    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
+    if not mask.any():
         return mask
-    pad = int(3 * pixels) + 2
-    window = np.s_[max(0, rows[0] - pad) : rows[-1] + pad + 1,
-                   max(0, cols[0] - pad) : cols[-1] + pad + 1]  # fmt: skip
+    window = _window(mask, int(3 * pixels) + 2)
     part = mask[window]
     size = [int(np.ceil(side / WOBBLE)) + 2 for side in part.shape]
     field = np.asarray(zoom(rng.normal(size=size), WOBBLE, order=1))

@@ -116,9 +116,6 @@ def free_of(
     return free
 
 
-# Ways around the furniture: cheapest paths on a grid that keep away from footprints.
-
-
 CELL = 0.06  # [m]
 BODY = 0.28  # [m], people walk no nearer to furniture
 ROOMY = 0.42  # [m], nearer than this one walks only where one must

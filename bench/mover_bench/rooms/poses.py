@@ -141,12 +141,8 @@ def blend(start: Posture, end: Posture, share: Float[np.ndarray, " frames"]) -> 
 def moved(posture: Posture, offset: np.ndarray) -> Posture:
     """The whole body elsewhere: `offset` is one vector, or one a frame [m]."""
     shift = np.broadcast_to(offset, posture.pelvis.shape)
-    return dataclasses.replace(
-        posture,
-        pelvis=posture.pelvis + shift,
-        ankles=posture.ankles + shift[:, None],
-        palms=posture.palms + shift[:, None],
-    )
+    ankles, palms = posture.ankles + shift[:, None], posture.palms + shift[:, None]
+    return dataclasses.replace(posture, pelvis=posture.pelvis + shift, ankles=ankles, palms=palms)
 
 
 def angles(person: Person, posture: Posture) -> BodyPose:
@@ -159,14 +155,11 @@ def angles(person: Person, posture: Posture) -> BodyPose:
     vectors = torch.from_numpy(to_vector(local))
     frames = len(vectors)
     return BodyPose(
-        model="makehuman",
-        gender="neutral",
+        model="makehuman", gender="neutral", extra={},
         betas=torch.from_numpy(person.betas).expand(frames, -1).clone(),
-        global_orient=vectors[:, 0],
-        body_pose=vectors[:, 1:].reshape(frames, -1),
+        global_orient=vectors[:, 0], body_pose=vectors[:, 1:].reshape(frames, -1),
         transl=torch.from_numpy(posture.pelvis - person.origin),
-        extra={},
-    )
+    )  # fmt: skip
 
 
 def skinned(
@@ -222,24 +215,23 @@ def _world_turns(person: Person, posture: Posture) -> Float[np.ndarray, "frames 
         hip, knee, ankle, foot = LEG[k]
         start = posture.pelvis + apply(posture.turn, person.joints[hip])
         turns[hip], turns[knee] = _two_bones(
-            person, LEG[k][:3], (start, posture.ankles[:, k], posture.knees[:, k]), X
+            person, LEG[k][:3], start, posture.ankles[:, k], posture.knees[:, k], X
         )
         turns[ankle] = posture.feet[:, k]
         turns[foot] = posture.feet[:, k] @ about(X, -posture.toes[:, k])
-        turns.update(_arm_turns(person, posture, k, (chest, shoulders[:, k])))
+        turns.update(_arm_turns(person, posture, k, chest, shoulders[:, k]))
     return np.stack([turns[j] for j in range(22)], 1)
 
 
 def _arm_turns(
-    person: Person, posture: Posture, side: int, trunk: tuple[np.ndarray, np.ndarray]
+    person: Person, posture: Posture, side: int, chest: np.ndarray, shoulder: np.ndarray
 ) -> dict[int, np.ndarray]:
-    chest, shoulder = trunk
     rest = posture.resting[:, side, None]
     free = shoulder + apply(chest, posture.wrists[:, side])
     goal = rest * posture.palms[:, side] + (1 - rest) * free
     hinge = -Y if side == 0 else Y
     pole = apply(chest, posture.elbows[:, side])
-    upper, lower = _two_bones(person, ARM[side], (shoulder, goal, pole), hinge)
+    upper, lower = _two_bones(person, ARM[side], shoulder, goal, pole, hinge)
     front = apply(posture.turn, Z) * np.array([1.0, 0, 1.0]) + 1e-6 * Z
     inward = 1.0 if side == 0 else -1.0
     flat = frame(inward * unit(front), np.broadcast_to(Y, front.shape))
@@ -248,13 +240,10 @@ def _arm_turns(
 
 
 def _two_bones(
-    person: Person,
-    joints: Sequence[int],
-    way: tuple[np.ndarray, np.ndarray, np.ndarray],
+    person: Person, joints: Sequence[int], start: np.ndarray, goal: np.ndarray, pole: np.ndarray,
     hinge: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Rotations of two bones that lead from a start to a goal and bend towards a pole."""
-    start, goal, pole = way
     first = person.joints[joints[1]] - person.joints[joints[0]]
     second = person.joints[joints[2]] - person.joints[joints[1]]
     a, b = float(np.linalg.norm(first)), float(np.linalg.norm(second))

@@ -60,39 +60,20 @@ def box_of_mask(mask: Bool[np.ndarray, "h w"]) -> Float[Tensor, "4"]:
     return rle.tight_box(torch.from_numpy(mask))
 
 
-def outlines(plan: Plan) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Depth of the furniture [m], and which piece and which face each pixel shows (-1: none)."""
-    camera = plan.view.camera
-    verts, faces, owner = furniture(plan)
-    cam = plan.view.seen(verts)
-    depth, face = first_hit(cam, faces, camera.K, (camera.height, camera.width))
-    return depth, torch.where(face >= 0, owner[face.clamp_min(0)], torch.full_like(face, -1)), face
-
-
 def see(plan: Plan) -> Sight:
     """Draw the furniture, the floor and the walls."""
-    depth, piece, face = outlines(plan)
+    camera = plan.view.camera
     verts, faces, owner = furniture(plan)
+    size = (camera.height, camera.width)
+    depth, face = first_hit(plan.view.seen(verts), faces, camera.K, size)
     hit = face >= 0
     colours = torch.tensor(
         [COLOURS.get(p.furniture.category, (0.6, 0.6, 0.6)) for p in plan.pieces]
     )
-    shade = _shades(verts, faces)
     picture = _background(plan)
-    picture[hit] = (colours[owner] * shade[:, None])[face[hit]].float()
+    picture[hit] = (colours[owner] * _shades(verts, faces)[:, None])[face[hit]].float()
+    piece = torch.where(hit, owner[face.clamp_min(0)], torch.full_like(face, -1))
     return Sight(depth, piece, picture.clamp(0, 1))
-
-
-def see_body(
-    plan: Plan, verts_cam: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]
-) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Depth [m] and face of a body alone."""
-    camera = plan.view.camera
-    depth = torch.full((camera.height, camera.width), torch.inf)
-    face = torch.full((camera.height, camera.width), -1)
-    look = look_at(plan, verts_cam, faces)
-    depth[look.window], face[look.window] = look.depth, look.face
-    return depth, face
 
 
 def look_at(plan: Plan, verts_cam: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"]) -> Look:
@@ -119,12 +100,12 @@ def draw_bodies(plan: Plan, sight: Sight, bodies: list[Mesh]) -> Float[Tensor, "
     picture, nearest = sight.picture.clone(), sight.depth.clone()
     R = plan.view.camera.R_cam_world
     for index, body in enumerate(bodies):
-        depth, face = see_body(plan, body.verts, body.faces)
+        look = look_at(plan, body.verts, body.faces)
         shade = _shades(body.verts @ R, body.faces)
-        mine = depth < nearest
+        front = look.depth < nearest[look.window]
         colour = torch.tensor(SKIN[index % len(SKIN)])
-        picture[mine] = (shade[face[mine]][:, None] * colour).float()
-        nearest = torch.minimum(nearest, depth)
+        picture[look.window][front] = (shade[look.face[front]][:, None] * colour).float()
+        nearest[look.window] = torch.minimum(nearest[look.window], look.depth)
     return picture.clamp(0, 1)
 
 

@@ -16,7 +16,7 @@ from mover_bench.rooms.motion import DOOR, Performance, Stage, Stop, Task, perfo
 from mover_bench.rooms.placed import ROOMY, Placed, free_of
 from mover_bench.rooms.poses import jointed, make_person, rows
 from mover_bench.rooms.render import draw_bodies, see
-from mover_bench.rooms.seating import table_stand
+from mover_bench.rooms.resting import table_stand
 from mover_bench.rooms.turns import facing
 
 SITS = frozenset({"chair", "armchair", "office chair", "sofa", "stool", "bench"})
@@ -57,40 +57,29 @@ def draw_tasks(
     """
     uses = _uses(plan, rng, length)
     tasks = [uses[k] for k in rng.permutation(len(uses))]
-    walks = [Task("walk", goal=_pair(free_place(plan, rng))) for _ in range(acts.walks)]
+    goals = [free_place(plan, rng).tolist() for _ in range(acts.walks)]
+    walks = [Task("walk", goal=(x, z)) for x, z in goals]
     return (*walks[:1], *tasks[: acts.tasks], *walks[1:])
 
 
 def _uses(plan: Plan, rng: np.random.Generator, length: float) -> list[Task]:
-    """What can be done with each piece, once."""
+    """What can be done with each object, once."""
     tasks: list[Task] = []
     for index, piece in enumerate(plan.pieces):
-        name = canonical(piece.furniture.category)
-        stay = length * float(rng.uniform(4.5, 6.5))
+        seat, name = piece.furniture, canonical(piece.furniture.category)
+        stay, wide = length * float(rng.uniform(4.5, 6.5)), seat.seat_right - seat.seat_left
         if name in SITS:
-            lean = piece.furniture.back_height > 0 and rng.uniform() < 0.6
-            along = _along(piece, rng)
-            tasks.append(Task("lean" if lean else "sit", index, seconds=stay, along=along))
-        if name == "bed" or (
-            name == "sofa"
-            and piece.furniture.seat_right - piece.furniture.seat_left > 1.3
-            and rng.uniform() < 0.5
-        ):
+            kind = "lean" if seat.back_height > 0 and rng.uniform() < 0.6 else "sit"
+            room = wide / 2 - 0.3
+            along = float(rng.uniform(-room, room)) if room > 0 else 0.0
+            tasks.append(Task(kind, index, seconds=stay, along=along))
+        if name == "bed" or (name == "sofa" and wide > 1.3 and rng.uniform() < 0.5):
             side, roll = (1 if rng.integers(2) else -1), name == "bed"
             tasks.append(Task("lie", index, seconds=stay, side=side, roll=roll))
-        if name in STANDS and 0.65 < piece.furniture.top_height < 1.0:
+        if name in STANDS and 0.65 < seat.top_height < 1.0:
             side = _open_side(plan, index, rng)
             tasks.append(Task("table", index, seconds=0.7 * stay, side=side))
     return tasks
-
-
-def _pair(place: np.ndarray) -> tuple[float, float]:
-    return float(place[0]), float(place[1])
-
-
-def _along(piece: Placed, rng: np.random.Generator) -> float:
-    room = (piece.furniture.seat_right - piece.furniture.seat_left) / 2 - 0.3
-    return float(rng.uniform(-room, room)) if room > 0 else 0.0
 
 
 def _open_side(plan: Plan, index: int, rng: np.random.Generator) -> int:
@@ -107,7 +96,7 @@ def _open_side(plan: Plan, index: int, rng: np.random.Generator) -> int:
 
 
 CLEAR = 0.25  # [m], between the joints of two people
-MOST_WAIT = 24.0  # [s], before somebody begins
+MOST_WAIT = 24.0  # [s], before a person starts
 
 
 @one_thread()
@@ -124,13 +113,10 @@ def make_room(seed: int, config: RoomConfig | None = None) -> KnownRoom:
         try:
             size = (config.width, config.height)
             plan = draw_plan(rng, size, config.pieces, config.least_pixels, config.plan)
-            room = build(
-                plan, cast(plan, config, rng, refused), config, f"room_{seed}", tuple(refused)
-            )
+            actors = cast(plan, config, rng, refused)
+            return build(plan, actors, config, f"room_{seed}", tuple(refused))
         except RefusedError as error:
             refused.append(f"draft {draft}: {error}")
-        else:
-            return room
     raise NoRoomError(f"seed {seed}: 60 drafts were refused: {refused[-3:]}")
 
 
@@ -148,8 +134,7 @@ def cast(
         wait = patience(actor, actors)
         if wait is not None:
             refused += actor.performance.refused
-            whole = late(actor.performance, wait)
-            acted = cut(whole, config.most_frames) if config.most_frames else whole
+            acted = shown(actor.performance, wait, config.most_frames)
             actors.append(dataclasses.replace(actor, performance=acted))
     if len(actors) < config.people:
         raise RefusedError("people run into each other")
@@ -157,7 +142,7 @@ def cast(
 
 
 def _actor(plan: Plan, config: RoomConfig, rng: np.random.Generator) -> Actor:
-    """Somebody of a random shape who does random things."""
+    """A person of a random shape who does random things."""
     bounds = np.stack([plan.walls[0] + 0.25, plan.walls[1] - 0.25])
     stage = Stage(make_person(draw_person(rng)), plan.pieces, bounds, config.fps)
     try:
@@ -188,26 +173,15 @@ def _clear(a: np.ndarray, b: np.ndarray) -> bool:
     return bool(gap.size == 0 or gap.min() > CLEAR)
 
 
-def cut(performance: Performance, frames: int) -> Performance:
-    """The first frames of it."""
-    first = slice(0, frames)
-    return Performance(
-        rows(performance.posture, first),
-        performance.labels[first],
-        performance.touched[first],
-        performance.refused,
-    )
-
-
-def late(performance: Performance, wait: int) -> Performance:
-    """The same, after standing still for so many frames."""
+def shown(performance: Performance, wait: int, most: int) -> Performance:
+    """The same after standing still for so many frames; at most `most` frames, unless that is 0."""
     order = np.maximum(np.arange(-wait, len(performance.labels)), 0)
-    return Performance(
-        rows(performance.posture, order),
-        ("stand",) * wait + performance.labels,
-        (-1,) * wait + performance.touched,
-        performance.refused,
-    )
+    first = slice(0, most or None)
+    return dataclasses.replace(
+        performance, posture=rows(performance.posture, order[first]),
+        labels=(("stand",) * wait + performance.labels)[first],
+        touched=((-1,) * wait + performance.touched)[first],
+    )  # fmt: skip
 
 
 _DEMO: tuple[tuple[str, str, int, int, tuple[float, float, float]], ...] = (
@@ -236,7 +210,7 @@ def demo_plan() -> tuple[Plan, Actor]:
         Placed(name, make_piece(kind, np.random.default_rng(sizes), style), spot[:2], spot[2])
         for name, kind, style, sizes, spot in _DEMO
     )
-    view = make_view((960, 540), (1.62, float(np.radians(-12.5)), float(np.radians(1.1)), 1.15))
+    view = make_view((960, 540), 1.62, float(np.radians(-12.5)), float(np.radians(1.1)), 1.15)
     plan = Plan(pieces, view, (-2.75, -6.25), (2.75, -1.9))
     tasks = (
         Task("walk", goal=(1.1, -4.9)),

@@ -7,18 +7,19 @@ objects' masks as in `NoiseConfig`; joints of COCO's 17 miss by 3 to 6 px on peo
 every hundredth pair of left and right is swapped.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS, keypoints_of
 from mover.bodies.skinning import open_body
 from mover.core.observe import Observer, silent
-from mover.core.types import Bodies, Camera, Capture, Keypoints, Masks
+from mover.core.types import Capture, Keypoints, Masks
 from mover.geometry.camera import project
 from mover.geometry.rle import decode
 from mover.perceive.capture import Finders
@@ -63,57 +64,40 @@ class Seen:
     ) -> Finds:
         """Furniture in the clean picture, people in frames."""
         if inputs.clip.fps is None:
-            return self._furniture()
-        frames = self.frames_of(inputs.clip)
-        return self._people([(k, frames[k]) for k in inputs.frames])
-
-    def _furniture(self) -> Finds:
-        found = [
-            (d.mask, COCO[d.category])
-            for d in self.noisy.detections
-            if d.category in COCO and d.mask is not None
-        ]
-        height, width = self.noisy.scene.camera.height, self.noisy.scene.camera.width
-        return Finds(
-            Masks(height, width, tuple(mask.counts[0] for mask, _ in found)),
-            torch.zeros(len(found), dtype=torch.long),
-            tuple(name for _, name in found),
-            torch.linspace(0.99, 0.9, len(found)),
-        )
-
-    def _people(self, frames: list[tuple[int, int]]) -> Finds:
-        rows = [(k, row) for k, frame in frames for row in self._rows(frame)]
-        masks = self._masks([row for _, row in rows])
-        frame = torch.tensor([k for k, _ in rows], dtype=torch.long)
-        return Finds(masks, frame, (PERSON,) * len(rows), torch.full((len(rows),), 0.95))
+            found = [
+                (d.mask.counts[0], COCO[d.category])
+                for d in self.noisy.detections
+                if d.category in COCO and d.mask is not None
+            ]
+            camera = self.noisy.scene.camera
+            masks = Masks(camera.height, camera.width, tuple(code for code, _ in found))
+            frame = torch.zeros(len(found), dtype=torch.long)
+            names = tuple(name for _, name in found)
+            return Finds(masks, frame, names, torch.linspace(0.99, 0.9, len(found)))
+        masks, frame, person = self._people(inputs.clip, inputs.frames)
+        return Finds(masks, frame, (PERSON,) * len(frame), torch.full((len(person),), 0.95))
 
     def tracks(
         self, inputs: SegmentInputs, _config: TrackConfig, _observe: Observer = silent
     ) -> Tracks:
-        """Everybody through a segment, under their true numbers."""
-        frames = self.frames_of(inputs.clip)
-        segment = range(inputs.first, inputs.last + 1)
-        rows = [(k, row) for k in segment for row in self._rows(frames[k])]
-        people = self.noisy.people
+        """All people through a segment, under their true numbers."""
+        found = self._people(inputs.clip, range(inputs.first, inputs.last + 1))
+        return Tracks(*found, self.people)
+
+    def _people(self, clip: Clip, frames: Iterable[int]) -> tuple[Masks, Tensor, Tensor]:
+        """Masks of people in frames of a clip, the frames, and the people's numbers."""
+        people, of_room = self.noisy.people, self.frames_of(clip)
         assert people is not None
-        person = people.person[[row for _, row in rows]]
-        frame = torch.tensor([k for k, _ in rows], dtype=torch.long)
-        return Tracks(self._masks([row for _, row in rows]), frame, person, self.people)
+        pairs = [(k, r) for k in frames for r in (people.frame == of_room[k]).nonzero()[:, 0]]
+        rows = torch.tensor([int(r) for _, r in pairs], dtype=torch.long)
+        counts = tuple(people.masks.counts[row] for row in rows.tolist())
+        frame = torch.tensor([k for k, _ in pairs], dtype=torch.long)
+        return replace(people.masks, counts=counts), frame, people.person[rows]
 
     @property
     def people(self) -> int:
         """How many there are."""
         return int(self.room.bodies.person.max()) + 1
-
-    def _rows(self, frame: int) -> list[int]:
-        """Rows of the masks of a frame of the room."""
-        people = self.noisy.people
-        return [] if people is None else (people.frame == frame).nonzero()[:, 0].tolist()
-
-    def _masks(self, rows: list[int]) -> Masks:
-        people = self.noisy.people
-        assert people is not None
-        return replace(people.masks, counts=tuple(people.masks.counts[row] for row in rows))
 
     def joints(
         self, inputs: JointsInputs, _config: JointsConfig, _observe: Observer = silent
@@ -173,34 +157,3 @@ def write_video(room: KnownRoom, path: Path) -> None:
 
     frames = int(room.bodies.frame.max()) + 1
     save_film((draw_frame(room, k) for k in range(frames)), room.bodies.fps or 5.0, path)
-
-
-# What OpenPose would see, with legs that furniture hides.
-
-
-LAYOUT = "openpose25"
-LEGS = ("knee", "ankle", "toe", "heel")
-NOISE = 3.0  # [px], standard deviation, of an image 960 wide
-MISSING = 0.1  # share of the joints
-
-
-def joints_seen(
-    bodies: Bodies, camera: Camera, seated: Bool[Tensor, " bodies"], rng: np.random.Generator
-) -> Keypoints:
-    """Joints with noise, some missing, none outside of the image, and no legs of seated people.
-
-    The true people are in the axes of the true camera.
-    """
-    assert bodies.joints is not None, "the open body has joints"
-    points = keypoints_of(open_body(), bodies.verts, bodies.joints, LAYOUT)
-    pixels = project(points, camera.K).double().numpy()
-    seen = rng.uniform(size=pixels.shape[:2]) >= MISSING
-    pixels = pixels + NOISE * rng.normal(size=pixels.shape)
-    seen &= ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(-1)
-    legs = np.array([any(part in name for part in LEGS) for name in LAYOUTS[LAYOUT]])
-    seen &= ~(legs & seated.numpy()[:, None])
-    sure = np.where(seen, rng.uniform(0.5, 1.0, seen.shape), 0.0)
-    return Keypoints(
-        torch.from_numpy(pixels * seen[..., None]).float(), torch.from_numpy(sure).float(), LAYOUT,
-        bodies.frame, bodies.person, bodies.fps,
-    )  # fmt: skip

@@ -59,12 +59,9 @@ def gap(person: Person, posture: Posture, piece: Placed, group: str) -> float:
 def approach(distance: Callable[[float], float], start: float, speed: float, most: float) -> float:
     """The first value after `start` at which the distance has shrunk to `-PRESS`.
 
-    Args:
-        distance: Of a part of the body to a piece, for a value (a height, an angle) [m].
-        start: A value without touch.
-        speed: No point of the part moves farther than this for one unit of the value; its sign
-            is that of the way to go.
-        most: Where to give up, as a change of the value.
+    `distance` is that of a part of the body to an object for a value (a height, an angle) [m]. No
+    point of the part moves farther than `speed` for one unit of the value; its sign is that of the
+    way to go. The search gives up after a change of the value by `most`.
     """
     value = start
     for _ in range(25):
@@ -112,17 +109,9 @@ RESTS = {
     "right hand": ("right_hand",),
 }
 """Parts of the body that must touch the piece in use, by the name of the action."""
-ON_FEET = frozenset(
-    {
-        "walk",
-        "sit down",
-        "sit",
-        "lean",
-        "stand up",
-        "reach",
-        *(name for name in RESTS if "hand" in name),
-    }
-)
+ON_FEET = frozenset({
+    "walk", "sit down", "sit", "lean", "stand up", "reach", "left hand", "right hand",
+})  # fmt: skip
 
 
 @record
@@ -165,11 +154,7 @@ def around(
 
 
 def faults(
-    person: Person,
-    posture: Posture,
-    label: str,
-    pieces: tuple[Placed, ...],
-    index: int,
+    person: Person, posture: Posture, label: str, pieces: tuple[Placed, ...], index: int
 ) -> list[str]:
     """Why these frames are not true: what sinks in, what hangs in the air.
 

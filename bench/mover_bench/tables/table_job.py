@@ -11,10 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from mover.core.files import replacing
 from mover.core.records import fingerprint
@@ -22,9 +19,6 @@ from mover.core.run import Run, sources
 from mover.core.types import Bodies, Capture, Scene, SceneObject
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate
 from mover.extensions import reconstruct
-from mover.geometry.camera import to_camera
-from mover.geometry.camera import to_world as to_world_axes
-from mover.geometry.volume import sample
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.folder import read_capture
@@ -33,10 +27,9 @@ from mover.io.files.fields import read_json
 from mover.pipeline.result import to_world
 from mover.stages.config import RefineBodiesConfig
 from mover.stages.people.refine_bodies import ABLATION, refine_bodies
-from mover_bench.datasets.prox_files import scan_of
 from mover_bench.experiment.measures import under_camera
 from mover_bench.experiment.variants import withheld
-from mover_bench.tables.rows import PLAIN, Disturbance, disturbance_of, variants
+from mover_bench.tables.rows import PLAIN, variants
 
 DONE = "metrics.json"
 BOXES = EvaluateConfig(boxes=True, feet="contacts")
@@ -78,10 +71,10 @@ def key_of(job: TableJob) -> str:
 
 def do_job(job: TableJob) -> None:
     """Rebuild, measure, and write metrics.json."""
-    variant, disturbed = variants(job.preset)[job.name], disturbance_of(job.name)
+    variant = variants(job.preset)[job.name]
     given = read_capture(job.capture)
-    if disturbed is not None:
-        scene = disturb(given.scene, disturbed, torch.Generator().manual_seed(0))
+    if variant.change:
+        scene = disturb(given.scene, variant.change, torch.Generator().manual_seed(0))
         given = replace(given, scene=scene)
     capture = withheld(given, variant.given, variant.cut)
     room = reconstruct(capture, variant.config, Run(job.home))
@@ -125,52 +118,24 @@ def measure(
             found |= values
         elif "p2s" in values:
             found["p2s"] = values["p2s"]
-        if name == "truth" and people is not None:
-            found |= beside_scan(folder, to_camera(people.verts, scene.camera.R_cam_world), true)
     return found
 
 
-def beside_scan(
-    capture: Path, verts_cam: Float[Tensor, "bodies verts 3"], truth: Scene
-) -> dict[str, float]:
-    """How people fit the scanned room (its `sdf`), wherever the estimated one is.
-
-    Args:
-        capture: Folder that may name the scan's signed distance.
-        verts_cam: People in the axes of the camera [m].
-        truth: Its camera is the scan's.
-
-    Returns:
-        The paper's non-collision and contact against the scan; nothing where there is none.
-    """
-    scan = scan_of(capture)
-    if scan is None:
-        return {}
-    volume, world_scan = scan
-    turn = torch.from_numpy(np.linalg.inv(world_scan)).float()
-    world = to_world_axes(verts_cam.float(), truth.camera.R_cam_world.float())
-    inside = sample(volume, world @ turn[:3, :3].mT + turn[:3, 3]) < 0
-    return {
-        "scan_non_collision": 1 - float(inside.double().mean()),
-        "scan_contact": float(inside.any(-1).double().mean()),
-    }
-
-
-def disturb(scene: Scene, noise: Disturbance, generator: torch.Generator) -> Scene:
-    """The initial scene with uniform noise on every object."""
+def disturb(scene: Scene, change: str, generator: torch.Generator) -> Scene:
+    """The initial scene with uniform noise on every object, as `scale=0.25`."""
+    kind, _, level = change.partition("=")
 
     def drawn(count: int) -> torch.Tensor:
-        return noise.level * (2 * torch.rand(count, generator=generator) - 1)
+        return float(level) * (2 * torch.rand(count, generator=generator) - 1)
 
-    def changed(piece: SceneObject) -> SceneObject:
-        if noise.kind == "scale":
-            return replace(piece, scale=piece.scale * (1 + drawn(3)).to(piece.scale))
-        if noise.kind == "place":
-            place = piece.t_world_object + drawn(3).to(piece.t_world_object)
-            return replace(piece, t_world_object=place)
-        return replace(piece, yaw=piece.yaw + drawn(1)[0].deg2rad().to(piece.yaw))
+    def changed(thing: SceneObject) -> SceneObject:
+        if kind == "scale":
+            return replace(thing, scale=thing.scale * (1 + drawn(3)).to(thing.scale))
+        if kind == "place":
+            return replace(thing, t_world_object=thing.t_world_object + drawn(3))
+        return replace(thing, yaw=thing.yaw + drawn(1)[0].deg2rad().to(thing.yaw))
 
-    return replace(scene, objects=tuple(changed(piece) for piece in scene.objects))
+    return replace(scene, objects=tuple(changed(thing) for thing in scene.objects))
 
 
 def main(arguments: Sequence[str]) -> None:

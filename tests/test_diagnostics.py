@@ -26,13 +26,13 @@ def inputs_with(seated, touches=None, masks=None):
     )  # fmt: skip
 
 
-def test_a_person_who_sits_on_nothing_is_named():
+def test_a_seated_person_on_nothing_is_named():
     (text,) = diagnostics(inputs_with(seated=False))
     assert "person 0 sits on nothing in 6 bodies" in text
     assert "missing" in text
 
 
-def test_a_person_who_sits_on_something_gives_no_warning():
+def test_a_seated_person_on_something_gives_no_warning():
     assert diagnostics(inputs_with(seated=True)) == ()
 
 

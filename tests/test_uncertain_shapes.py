@@ -1,4 +1,4 @@
-"""Shapes whose outlines do not fit are believed less beside people."""
+"""Shapes whose outlines do not fit are down-weighted beside people."""
 
 from dataclasses import replace
 
@@ -25,12 +25,12 @@ def masked(drawn: torch.Tensor) -> torch.Tensor:
     return masks
 
 
-def test_a_shape_is_doubted_as_far_as_its_outline_does_not_fit():
+def test_a_shape_is_uncertain_as_far_as_its_outline_does_not_fit():
     drawn = torch.full((10, 20), -1)
     masks = masked(drawn)
-    doubt = shape_uncertainty(drawn, masks)
-    assert doubt.tolist() == pytest.approx([0.0, 0.2 * (0.5 - 0.1)])
-    drawn[:, 5:8] = 1  # what another hides is nobody's fault
+    share = shape_uncertainty(drawn, masks)
+    assert share.tolist() == pytest.approx([0.0, 0.2 * (0.5 - 0.1)])
+    drawn[:, 5:8] = 1  # what another object occludes does not count
     assert float(shape_uncertainty(drawn, masks)[0]) == 0
     assert shape_uncertainty(drawn, torch.zeros(2, 10, 20, dtype=torch.bool)).tolist() == [0, 0]
 
@@ -61,7 +61,7 @@ def seen_as(room: Room, share: float) -> Capture:
 
 @pytest.mark.slow
 def test_a_sitter_is_not_lifted_by_a_seat_whose_shape_does_not_fit():
-    """As fitted to a few millimetres; of a shape that fits the seat itself is believed."""
+    """As fitted to a few millimetres; of a shape that fits the seat itself is trusted."""
     sitter = still_people(SEATED, 3)
     height = float(seat_gap(sitter, 0.0)[0]) + 0.06
     room = room_with(sitter, ((0.6, height, 0.6), (0.0, GROUND, -3.1)))
