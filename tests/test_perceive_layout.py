@@ -40,8 +40,9 @@ from mover.perceive.layout import (
     is_placed,
     shapes_of,
 )
-from mover.perceive.screen import CameraPrior, ScreenInputs, outermost, screen
+from mover.perceive.screen import ScreenInputs, outermost, screen
 from mover.perceive.standing import seen_from, standing_on
+from mover.stages.posterior import Gaussian
 
 W, H, FOCAL = 480, 320, 420.0
 HEIGHT = 1.35
@@ -139,7 +140,7 @@ def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[SceneObject]):
     mean = torch.tensor([pitch, roll, math.log(1.2)])
     for spread, most in ((0.05, 1.1), (0.01, 0.5)):
         precision = torch.tensor([1e6, 1e6, spread**-2]).diag()
-        sure = screen(replace(inputs, prior=CameraPrior(mean, precision)), ScreenConfig())
+        sure = screen(replace(inputs, prior=Gaussian(mean, precision)), ScreenConfig())
         assert abs(sure.height - 1.2) < most * abs(known.height - 1.2)
     assert torch.equal(known.R_cam_world, camera().R_cam_world)
 

@@ -12,6 +12,7 @@ from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.config import RefineConfig
 from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import place_objects
+from mover.stages.posterior import Gaussian
 
 LOOSE = torch.diag(torch.tensor([0.07, 0.07, 0.1]).square())
 TIGHT = torch.diag(torch.tensor([1e-4, 1e-4, 1e-4]).square())
@@ -38,7 +39,9 @@ def wrong_camera(covariance):
         replace(ROBUST.layout, yaws=1, short=Adam(0)),
     )  # as in the pipeline: first the objects, under the wrong camera
     layout = fitted.layout
-    return inputs.camera, RefineInputs(camera, ground, covariance, objects, inputs.image, layout)
+    at = torch.stack([*pitch_roll(camera.R_cam_world), torch.tensor(ground)])
+    feet = Gaussian(at, torch.linalg.inv(covariance))
+    return inputs.camera, RefineInputs(camera, ground, feet, objects, inputs.image, layout)
 
 
 def errors(camera, truth):

@@ -33,7 +33,7 @@ from mover.io.files.fields import At
 from mover.io.files.meshes import KINDS, read_mesh
 from mover.perceive.config import LayoutConfig
 from mover.perceive.depth_map import floor_height, median_depths, range_in
-from mover.perceive.screen import CameraPrior, Screened, ScreenInputs, outermost, screen
+from mover.perceive.screen import Screened, ScreenInputs, outermost, screen
 from mover.stages.camera.room_lines import Segments
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
 from mover.stages.objects.gather_given import given_axis, sizes_of_shapes, unplaced
@@ -46,6 +46,7 @@ from mover.stages.objects.prepare_objects import (
     prepare_objects,
     to_objects,
 )
+from mover.stages.posterior import Gaussian
 
 OTHER_SIZES: dict[str, tuple[float, float, float]] = {
     "refrigerator": (0.70, 1.70, 0.70), "oven": (0.60, 0.90, 0.60), "toilet": (0.40, 0.78, 0.66),
@@ -213,7 +214,7 @@ class Picture:
     """Of the camera above the floor, where it is known [m]."""
     depth: Float[Tensor, "h w"] | None
     """Measured distance along the view [m]; NaN: unknown. None: nothing was measured."""
-    prior: CameraPrior | None = None
+    prior: Gaussian | None = None
     """Of its tilt and height, from the feet of people."""
     reference: Float[Tensor, "h w 3"] | None = None
     """The picture itself, in [0, 1]."""

@@ -23,22 +23,13 @@ from mover.energy.prior_terms import Given, given_term, scale_term
 from mover.geometry.camera import pitch_roll, project, tilted, to_world
 from mover.geometry.placement import place
 from mover.perceive.config import ScreenConfig
+from mover.stages.posterior import Gaussian
 
 DIRECTIONS = 60  # in which the outermost point of a shape is kept
 LITTLE = 0.01  # share of items that are not the best
 AROUND = (-1.5, -0.75, 0.0, 0.75, 1.5)  # standard deviations of the height of a prior
 NEAREST = 0.6  # [m], where a start is put at least
 FARTHEST = 15.0  # [m], and at most
-
-
-@record
-class CameraPrior:
-    """What the feet of people (and the lines of the picture) constrain before any furniture."""
-
-    mean: Float[Tensor, "3"]
-    """Pitch and roll [rad], logarithm of the height above the floor [m]."""
-    precision: Float[Tensor, "3 3"]
-    """Inverse covariance."""
 
 
 @record
@@ -59,8 +50,9 @@ class ScreenInputs:
     """The camera's, where it is given or a depth map shows it [m]."""
     tilt_spread: float | None = None
     """How far off pitch and roll are, where the picture shows them [rad]."""
-    prior: CameraPrior | None = None
-    """From the feet of people; it takes the place of `height` and `tilt_spread`."""
+    prior: Gaussian | None = None
+    """Pitch and roll [rad], logarithm of the height [m] by the feet of people; it takes the place
+    of `height` and `tilt_spread`."""
     given: Given | None = None
     """Along which axis each item may stand; None: nothing is seen of it."""
 

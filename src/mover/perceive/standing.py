@@ -4,7 +4,7 @@ Boxes alone constrain neither well, and a first scene on a floor of the wrong he
 whole: bodies from keypoints, which know no floor either, still stand on one. Their poses err
 together, and with them the tilt by some degrees; edges of the room show it far better, and the
 directions along which furniture stands. What feet and edges leave open is decided with the boxes:
-they are handed on as an estimate with its covariance (`CameraPrior`).
+they are handed on as an estimate with its covariance (`Gaussian`).
 """
 
 import math
@@ -17,13 +17,13 @@ from mover.core.run import Run
 from mover.core.types import Bodies
 from mover.geometry.camera import pitch_roll, tilted
 from mover.perceive.layout import Picture
-from mover.perceive.screen import CameraPrior
 from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camera
 from mover.stages.camera.find_foot_contacts import FootContactInputs, find_foot_contacts
 from mover.stages.camera.find_lens import MEASURED, heading_of, tilt_of, tilted_by
 from mover.stages.camera.room_lines import SURE, Prior, find_segments, fit_room
 from mover.stages.config import AlignConfig, FootContactConfig, LensConfig, SelectConfig
 from mover.stages.people.select_frames import SelectInputs, select_frames
+from mover.stages.posterior import Gaussian, diagonal
 
 POSES = math.radians(2.0)  # [rad] by which a floor under fitted bodies leans: feet err together
 HEIGHTS = 0.05  # of the logarithm of the floor's depth, beside the size of the people
@@ -97,7 +97,7 @@ def standing_on(picture: Picture, bodies: Bodies, run: Run) -> Picture:
     return replace(picture, camera=replace(camera, R_cam_world=R), prior=prior)
 
 
-def camera_prior(found: Alignment, picture: Picture, size: float) -> CameraPrior:
+def camera_prior(found: Alignment, picture: Picture, size: float) -> Gaussian:
     """The camera of the feet, with the errors that all of them share, and usual cameras.
 
     A hundred feet err together: by the lean of all poses, and by the size of the people.
@@ -116,10 +116,8 @@ def camera_prior(found: Alignment, picture: Picture, size: float) -> CameraPrior
     observed = torch.tensor([pitch, roll, math.log(height)], dtype=torch.float64)
     before = [float(x) for x in pitch_roll(picture.camera.R_cam_world.double())]
     usual = torch.tensor([*before, math.log(picture.height or height)], dtype=torch.float64)
-    known = GIVEN**-2 if picture.height is not None else 0.0
+    known = math.inf if picture.height is None else GIVEN
     spreads = (PITCH, ROLL) if picture.tilt_spread is None else (picture.tilt_spread,) * 2
-    weight = torch.tensor([spreads[0] ** -2, spreads[1] ** -2, known]).double().diag()
-    own = torch.linalg.inv(covariance)
-    precision = own + weight
-    mean = torch.linalg.solve(precision, own @ observed + weight @ usual)
-    return CameraPrior(mean.float(), precision.float())
+    prior = diagonal(usual, torch.tensor([*spreads, known], dtype=torch.float64))
+    found = Gaussian(observed, torch.linalg.inv(covariance)).times(prior)
+    return Gaussian(found.mean.float(), found.precision.float())

@@ -194,7 +194,7 @@ def refine_camera_and_objects(setup: Setup, people: Located, placed: Arrangement
     """Camera and ground refined with the objects, and the objects placed again under them."""
     cues = setup.run.stage(find_image_cues, placed.image, setup.config.image)
     inputs = RefineInputs(
-        placed.camera, placed.ground, people.alignment.covariance, setup.objects, cues,
+        placed.camera, placed.ground, people.alignment.posterior, setup.objects, cues,
         placed.layout,
     )  # fmt: skip
     better = setup.run.stage(refine_camera, inputs, setup.config.refine)
@@ -225,7 +225,7 @@ def estimate_scale(
     if setup.config.seat_heights:
         seats = seat_height_estimate(kept, people.parts, placed.ground)
     prior = ScaleKnown(spread, capture.scene.size_spread, seats)
-    scale, _ = common_scale(placed.layout, given, prior)
+    scale, _ = common_scale(placed.layout, given, setup.objects.categories, prior)
     factor = math.exp(-scale)
     layout, candidates = (larger(x, factor) for x in (placed.layout, placed.placed.candidates))
     bodies = nearer(people.bodies, placed.camera, placed.ground, factor)

@@ -117,7 +117,7 @@ ROBUST = Config(
         num_hypotheses=6, coarse=2, wall_alignment_steps=2,
         yaw_prior_weight=1.0,
     ),
-    refine=RefineConfig(rounds=1),
+    refine=RefineConfig(rounds=2),
     sizes=SpreadConfig(0.05),
     gather=GatherConfig(erode=1, reach=0.1),
     assign=_GROUPS,

@@ -32,6 +32,7 @@ from mover.energy.human_terms import (
 from mover.geometry.camera import pitch_roll, tilted, to_world
 from mover.stages.camera.foot_votes import PLACE_NOISE, STEP_NOISE, Votes, vote
 from mover.stages.config import AlignConfig
+from mover.stages.posterior import Gaussian, diagonal
 
 FIXED = 1e-3  # [m], spread of what is known
 CAUTION = 1.4  # variance of the robust fit over that of least squares, feet with 1-2 cm of noise
@@ -231,6 +232,13 @@ class Alignment:
     """By track, how far a person floats above the floor [m]."""
     warnings: tuple[str, ...]
 
+    @property
+    def posterior(self) -> Gaussian:
+        """Pitch [rad], roll [rad] and ground [m]."""
+        tilt = torch.stack(pitch_roll(self.camera.R_cam_world))
+        mean = torch.cat([tilt, tilt.new_tensor([self.ground])])
+        return Gaussian(mean, torch.linalg.inv(self.covariance).to(mean))
+
 
 def align_camera(
     inputs: AlignInputs, config: AlignConfig = AlignConfig(), observe: Observer = silent
@@ -279,11 +287,10 @@ def _with_lean(
     covariance = covariance + CAUTION * inputs.lean**2 * turns.mT @ turns
     if inputs.tilt_spread is None:
         return at, covariance
-    known = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64).diag() / inputs.tilt_spread**2
-    own = torch.linalg.inv(covariance)
-    both = torch.linalg.inv(own + known)
-    mean = both @ (own @ at[:3] + known @ torch.cat([first, first.new_zeros(1)]))
-    return torch.cat([mean, at[3:]]), both
+    spreads = first.new_tensor([inputs.tilt_spread, inputs.tilt_spread, torch.inf])
+    known = diagonal(torch.cat([first, first.new_zeros(1)]), spreads)
+    both = Gaussian(at[:3], torch.linalg.inv(covariance)).times(known)
+    return torch.cat([both.mean, at[3:]]), both.covariance
 
 
 def _best_fit(

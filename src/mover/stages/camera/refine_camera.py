@@ -8,7 +8,7 @@ floor. Objects whose shape fits constrain the camera more than noisy feet do.
         sum_i E_i / (E_i(start) + 0.02)  +  w/2 d^T C^-1 d
 
 Each object's energy is divided by its own residual: exact shapes pull hard, wrong shapes softly.
-d is the change of pitch, roll and ground, C their covariance from the feet: a floor that was
+d is how far pitch, roll and ground are from those of the feet, C their covariance: a floor that was
 walked all around outweighs the objects, and what the feet left open is left to them. The borders
 of the masks are fixed as they suit the objects at first (`fixed_borders`). An object is carried by
 the ray to the centre of its base, so a change of the camera leaves it where it is in the image.
@@ -31,6 +31,7 @@ from mover.energy.objective import HumanCues, ImageCues, best_borders
 from mover.geometry.camera import pitch_roll, tilted, to_camera
 from mover.geometry.placement import GROUND, LOWEST, hit_floor
 from mover.stages.config import RefineConfig
+from mover.stages.posterior import Gaussian
 
 # Masks whose border has been found: evidence without that freedom.
 
@@ -61,12 +62,13 @@ UNITS = (0.01, 0.01, 0.02, 0.01, 0.05, 0.03)
 
 @record
 class RefineInputs:
-    """Camera and ground from the feet, objects from the image alone."""
+    """A first camera and ground, what the feet say of them, objects from the image alone."""
 
     camera: Camera
+    """Where the descent starts, and the ground below it [m]."""
     ground: float
-    covariance: Float[Tensor, "3 3"]
-    """Of pitch [rad], roll [rad] and ground [m], from the feet."""
+    feet: Gaussian
+    """Pitch [rad], roll [rad] and ground [m] by the feet."""
     objects: Objects
     image: ImageCues
     layout: Layout
@@ -99,7 +101,7 @@ def refine_camera(
     pitch, roll = pitch_roll(inputs.camera.R_cam_world)
     tilt = torch.stack([pitch, roll, pitch.new_tensor(inputs.ground)])
     fixed = _Joint(tilt, rays, inputs.layout.yaw, inputs.layout.log_scale)
-    certainty = torch.linalg.inv(inputs.covariance)
+    mean, certainty = inputs.feet.mean.to(tilt), inputs.feet.precision.to(tilt)
     cues = fixed_borders(inputs.image, inputs.layout, objects, inputs.camera, config.weights)
     terms = SceneConfig(config.weights, "robust", config.uniform_scale_weight)
     of_layout = energy_function(objects, inputs.camera, cues, HumanCues(), terms)
@@ -118,7 +120,7 @@ def refine_camera(
     def energy(free: _Joint) -> Energy:
         joint = _shift(fixed, free)
         shares = energies(joint) / residual
-        off = joint.tilt - fixed.tilt
+        off = joint.tilt - mean
         feet = 0.5 * FEET * (off @ certainty @ off)
         return Energy({"objects": (shares * usable).sum(), "feet": feet})
 

@@ -3,8 +3,16 @@
 Not in the paper, whose people have their own size. People of unknown height make floor, places and
 sizes too large at once, which no image shows. Three things do: how far away and how large each
 object was given, standard dimensions of furniture, and how high people sit, since seats are made
-for legs.
+for legs. All of it is one least-squares problem in logarithms, each line with an error of its own:
+
+    people: s = 0,   seats: s = how much too high people sit
+    distance, placed / given  = s + m + d          d: error that all given distances share
+    size, placed / given      = s + x_ik           x: true size / given
+    0                         = x_ik - m - t - o_i t: error of one tool, o: of one object, m: of all
+    size, standard / given    = x_ik - g_ck        g: what the objects of one category share
 """
+
+import math
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,10 +23,12 @@ from mover.bodies.posture import at, landmarks, postures
 from mover.core.records import record
 from mover.core.types import Bodies, Layout
 from mover.energy.prior_terms import AWAY, COMMON, SIZE, Given
+from mover.stages.posterior import Observations, least_squares
 
+DISTANCES = 0.1  # error that all given distances have in common, of the logarithm: as one's own
 TOOL = 0.04  # ... and all given sizes of a room: shapes of one tool fill their boxes similarly
 FITTED = 0.06  # error of a logarithm of a distance or size that the image alone finds
-TRIED = 121  # scales
+KIND = 0.5  # share of a standard's variance that the objects of one category have in common
 SEAT = 0.44  # [m], of a usual seat over the floor
 SEATS = 0.06  # standard deviation of its logarithm: chairs .43-.47, sofas .40-.45, offices .42-.50
 POSES = 0.04  # the same of how high people seem to sit: all their poses err together
@@ -40,63 +50,45 @@ class ScaleKnown:
     """Logarithm of how much too high people sit, and its standard deviation."""
 
 
-def common_scale(layout: Layout, given: Given, known: ScaleKnown) -> tuple[float, float]:
+def common_scale(
+    layout: Layout, given: Given, categories: tuple[str, ...], known: ScaleKnown
+) -> tuple[float, float]:
     """Logarithm of how much too large the whole room is, and its standard deviation.
 
     Args:
         layout: Where the objects were placed under the people's scale.
         given: What was expected of them.
+        categories: Of the objects.
         known: What else is known.
     """
-    spread, shared = known.spread, known.shared
-    if spread <= 0:
+    if known.spread <= 0:
         return 0.0, 0.0
-    tried = torch.linspace(-3 * spread, 3 * spread, TRIED, dtype=torch.float64)
-    if shared:
-        wide = torch.linspace(-3, 3, TRIED, dtype=torch.float64) * (spread + shared)
-        near = -0.5 * ((tried[:, None] - wide) / shared).square()
-        total = -torch.logsumexp(near - _cost_of_scales(layout, given, wide), 1)
-    else:
-        total = _cost_of_scales(layout, given, tried)
-    total = total + 0.5 * (tried / spread).square()
+    count, kinds = len(categories), sorted(set(categories))
+    kind = torch.tensor([kinds.index(name) for name in categories])
+    unknowns = torch.eye(4 + 4 * count + 3 * len(kinds), dtype=torch.float64)
+    scale, common, far, tool = unknowns[:4]
+    own, true, usual = unknowns[4:].split((count, 3 * count, 3 * len(kinds)))
+    true = true.view(count, 3, -1)
+    seen = Observations()
+    seen.add(scale, 0.0, known.spread)
+    seen.add(common, 0.0, max(known.shared, 1e-6))
+    seen.add(far, 0.0, DISTANCES)
+    seen.add(tool, 0.0, TOOL)
+    seen.add(own, 0.0, COMMON)
+    seen.add(usual, 0.0, 1.0, robust=True)
     if known.seats is not None:
-        total = total + 0.5 * ((tried - known.seats[0]) / known.seats[1]).square()
-    weight = (total.min() - total).exp()
-    mean = float((weight * tried).sum() / weight.sum())
-    return mean, float((weight * (tried - mean).square()).sum() / weight.sum()) ** 0.5
-
-
-def _cost_of_scales(
-    layout: Layout, given: Given, tried: Float[Tensor, " scales"]
-) -> Float[Tensor, " scales"]:
-    """What places and sizes cost in rooms too large by the exponential of each [nats]."""
-    away = (layout.t_world_object.norm(dim=-1) / given.distance).log().double()
-    near = away[:, None] - tried
-    places = 2 * (1 + near.square() / (3 * (AWAY**2 + FITTED**2))).log()
-    off = torch.linspace(-3, 3, TRIED, dtype=torch.float64) * TOOL
-    sizes = _cost_of_sizes(layout, given, tried, off) + 0.5 * (off / TOOL).square()
-    return places.sum(0) - torch.logsumexp(-sizes, 1)
-
-
-def _cost_of_sizes(
-    layout: Layout, given: Given, tried: Float[Tensor, " scales"], off: Float[Tensor, " offs"]
-) -> Float[Tensor, "scales offs"]:
-    """The same of sizes alone, where all were given too small by the exponential of each `off`."""
-    one, each = torch.ones(3).to(off), torch.eye(3).to(off)
-    own = torch.linalg.inv(SIZE**2 * each + COMMON**2)
-    sharp = torch.diag_embed(given.precision.to(off))
-    said = off[:, None] * one  # offs, 3
-    usual = given.standard.to(off)
-    precision = own + sharp
-    mean = torch.linalg.solve(
-        precision[:, None], ((said @ own)[None] + (usual[:, None] @ sharp)).unsqueeze(-1)
-    ).squeeze(-1)  # objects, offs, 3
-    apart = usual[:, None] - said
-    parted = sharp @ torch.linalg.inv(precision) @ own  # between both: parallel sum
-    disagree = torch.einsum("noi,nij,noj->o", apart, parted, apart)
-    fitted = torch.linalg.inv(torch.linalg.inv(precision) + FITTED**2 * each)
-    rest = layout.log_scale.to(off)[:, None, None] - mean[:, None] - tried[:, None, None]
-    return 0.5 * (torch.einsum("nsoi,nij,nsoj->so", rest, fitted, rest) + disagree)
+        seen.add(scale, *known.seats)
+    away = (layout.t_world_object.norm(dim=-1) / given.distance).log()
+    seen.add((scale + common + far).expand(count, -1), away, math.hypot(AWAY, FITTED), robust=True)
+    seen.add(scale + true, layout.log_scale, FITTED)
+    seen.add(true - common - tool - own[:, None], 0.0, SIZE)
+    known_sizes = given.precision > 0
+    wide = given.precision[known_sizes].double().rsqrt()
+    shared = KIND**0.5 * wide[:, None] * usual.view(-1, 3, len(unknowns))[kind][known_sizes]
+    standard = given.standard[known_sizes]
+    seen.add(true[known_sizes] - shared, standard, (1 - KIND) ** 0.5 * wide, robust=True)
+    found = least_squares(seen)
+    return float(found.mean[0]), float(found.covariance[0, 0]) ** 0.5
 
 
 def seat_height_estimate(
