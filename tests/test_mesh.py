@@ -1,5 +1,7 @@
 """Meshes: topology, normals, even samples, fewer faces."""
 
+import dataclasses
+
 import manifold3d
 import numpy as np
 import pytest
@@ -9,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from mover.bodies.skinning import open_body, zero_pose
 from mover.core.types import Mesh
 from mover.geometry import mesh as m
 from mover.geometry.nearest import nearest_points, to_surface
 from mover.geometry.rotations import axis_angle
-from mover.geometry.thinning import farthest_first
+from mover.geometry.thinning import coarser, farthest_first
 from mover.geometry.topology import manifold
 
 
@@ -271,3 +274,21 @@ def test_a_hollow_whose_way_out_becomes_too_narrow_does_not_keep_a_mesh_heavy():
     assert m.is_closed(light.faces)
     outside = mesh.verts.abs().amax(1) > 0.499
     assert to_surface(mesh.verts[outside], light.verts, light.faces).max() < 0.03
+
+
+def test_coarser_bodies_stay_closed_and_near_the_skin_in_every_pose():
+    model = open_body()
+    pose = zero_pose(3, model)
+    angles = 0.3 * torch.randn(2, 63, generator=torch.Generator().manual_seed(0))
+    pose = dataclasses.replace(pose, body_pose=torch.cat([pose.body_pose[:1], angles]))
+    verts, _ = model.posed(pose)
+    few, faces = coarser(verts, model.faces, 4000)
+    assert len(faces) <= 4000
+    assert m.is_closed(faces)
+    for body, thin in zip(verts, few, strict=True):
+        away = to_surface(body, thin, faces)
+        assert float(away.mean()) < 0.0015
+        assert float(away.max()) < 0.02
+    same, whole = coarser(few, faces, 4000)
+    assert torch.equal(same, few)
+    assert torch.equal(whole, faces)

@@ -1,7 +1,5 @@
 """Triangle meshes: boxes, normals, even samples, fewer faces."""
 
-from threading import Lock
-
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -9,7 +7,7 @@ from torch import Tensor
 
 from mover.core.types import Mesh
 from mover.geometry.nearest import as_float64, as_int64, closest
-from mover.geometry.thinning import farthest_first
+from mover.geometry.thinning import farthest_first, simplifying
 from mover.geometry.topology import edges_of as edges_of
 from mover.geometry.topology import is_closed as is_closed
 from mover.geometry.topology import manifold, volumes
@@ -21,8 +19,6 @@ FOLD = 1e-9  # of the cube of the longest side; closed pieces of less volume are
 CAUTION = 5  # of fast_simplification: 7 is its default, less is slower and better
 AT_ONCE = 16  # meshes whose normals are found together: what fits a processor's cache
 GENTLER = 1.5  # a target of faces that spoils a mesh is raised by this factor
-simplifying = Lock()
-"""Held while fast_simplification works: on global variables."""
 
 
 def box(verts: Float[Tensor, "verts 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

@@ -1,9 +1,17 @@
-"""An order of points in which each next one is the farthest from those before."""
+"""Fewer points and fewer triangles that still show the shape."""
+
+from threading import Lock
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from mover.geometry.nearest import as_float64, as_int64
+from mover.geometry.topology import is_closed
+
+simplifying = Lock()
+"""Held while fast_simplification works: on global variables."""
 
 
 def farthest_first(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor, " count"]:
@@ -16,3 +24,29 @@ def farthest_first(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor,
         np.minimum(nearest, (x - x[at]) ** 2 + (y - y[at]) ** 2 + (z - z[at]) ** 2, out=nearest)
         chosen[row] = nearest.argmax()
     return torch.from_numpy(chosen).to(points.device)
+
+
+def coarser(
+    meshes: Float[Tensor, "meshes verts 3"], faces: Int[Tensor, "faces 3"], count: int
+) -> tuple[Float[Tensor, "meshes fewer 3"], Int[Tensor, "triangles 3"]]:
+    """Meshes of one topology with about `count` triangles, all simplified as the first one is.
+
+    Each of the new vertices is an old one. Meshes of fewer triangles, and those that would not be
+    closed any more, stay as they are.
+    """
+    import fast_simplification
+
+    if len(meshes) == 0 or len(faces) <= count:
+        return meshes, faces
+    verts, rows = as_float64(meshes[0]), as_int64(faces).astype(np.int32)
+    with simplifying:
+        collapses = fast_simplification.simplify(
+            verts, rows, target_count=count, return_collapses=True
+        )[2]
+        points, rows, group = fast_simplification.replay_simplification(verts, rows, collapses)
+    order = np.lexsort([np.linalg.norm(verts - points[group], axis=1), group])
+    nearest = order[np.unique(group[order], return_index=True)[1]]
+    triangles = torch.from_numpy(rows.astype(np.int64)).to(faces)
+    if len(nearest) < len(points) or not is_closed(triangles):
+        return meshes, faces
+    return meshes[:, torch.from_numpy(nearest).to(meshes.device)].contiguous(), triangles

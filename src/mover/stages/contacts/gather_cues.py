@@ -33,6 +33,7 @@ from mover.geometry.camera import to_camera
 from mover.geometry.crops import sample_nearest
 from mover.geometry.path import is_still, poses_at, resampled
 from mover.geometry.raster import Crops, layers
+from mover.geometry.thinning import coarser
 from mover.geometry.volume import grid_around
 from mover.geometry.volume_warp import union_bodies
 from mover.stages.config import GatherConfig
@@ -50,6 +51,7 @@ PADDING = 0.2  # [m], space around the bodies in the volume
 WORKERS = 2  # threads that draw and measure; the result does not depend on it
 BESIDE = 0.25  # [m] between a moving camera and that of the image, within which its frame shows who
 # hides whom: from farther away another object may be in between
+FACES = 4000  # of a body in the volume: an adult's skin is within 1 mm of them in the mean
 BLOCK = 4  # bodies that a thread draws at once
 
 Window = tuple[slice, slice]
@@ -256,8 +258,7 @@ def _space(inputs: GatherInputs, config: GatherConfig, observe: Observer) -> Bod
     low, high = (end.view(-1, 3) for end in (flat.amin(0), flat.amax(0)))
     grid = grid_around(low.amin(0), high.amax(0), config.cells, PADDING)
     volume = union_bodies(
-        inputs.bodies.verts,
-        inputs.bodies.faces,
+        *coarser(inputs.bodies.verts, inputs.bodies.faces, FACES),
         grid,
         WORKERS,
         lambda done, of: observe(Step("gather_cues: free space", done, of)),
