@@ -17,8 +17,8 @@ from mover.core.types import Camera, Keypoints
 from mover.evaluate.bodies import procrustes
 from mover.fitting.bodies import FitInputs, Fitted, fit_bodies
 from mover.geometry.camera import project
-from mover.perceive.config import JointsConfig
-from mover.perceive.track import JointsInputs, Tracks
+from mover.perceive.config import ModelsConfig
+from mover.perceive.networks import JointsInputs, Tracks
 from mover.perceive.video import Clip
 from mover_bench.rooms.config import NoiseConfig, RoomConfig
 from mover_bench.rooms.known import KnownRoom
@@ -38,8 +38,8 @@ def detected(room: KnownRoom, seed: int, fps: float) -> tuple[Keypoints, Camera]
     count = int(people.frame.max()) + 1
     clip = Clip("", camera.width, camera.height, torch.arange(count) / fps, fps)
     seen = Seen(room, noisy, seed)
-    tracks = Tracks(people.masks, people.frame, people.person, seen.people)
-    return seen.joints(JointsInputs(clip, tracks), JointsConfig()), camera
+    tracks = Tracks(people.masks, people.frame, people.person)
+    return seen.joints(JointsInputs(clip, tracks), ModelsConfig()), camera
 
 
 def postures(room: KnownRoom, rows: list[int]) -> dict[str, list[int]]:

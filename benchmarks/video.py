@@ -24,7 +24,7 @@ from fit import misses, postures, stature
 
 from mover.app.cli.config import preset_named
 from mover.app.cli.run import reconstruct_into
-from mover.app.cli.video import ChainArgs, video_to_room
+from mover.app.cli.video import VideoArgs, video_to_room
 from mover.app.results import Origin
 from mover.bodies.corrected import in_world
 from mover.core.types import Scene
@@ -210,8 +210,9 @@ def trial(seed: int, out: Path, args: argparse.Namespace) -> dict[str, Any]:
     seen = Seen(room, add_noise(room, NoiseConfig(), seed), seed)
     meshes = other_designs(room, out / "meshes") if args.other_designs else None
     heights = stature(room) if args.height else ()
-    chain = ChainArgs(out / "chain", camera=lens_file(room, out), meshes=meshes, height=heights)
-    video_to_room(out / "video.mp4", chain, seen.finders())
+    lens = lens_file(room, out)
+    chain = VideoArgs(out / "video.mp4", out / "chain", camera=lens, meshes=meshes, height=heights)
+    video_to_room(chain, seen.finders())
     capture, row = out / "chain" / "capture", dict[str, Any]()
     for kind in ("", *args.depth):
         place = out / "chain" / f"room {kind}".rstrip()

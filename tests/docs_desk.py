@@ -16,7 +16,6 @@ from make_keypoints import seen as seen_by
 from make_smpl import make_model, write_npz
 from PIL import Image
 from test_posa import write_checkpoint, write_meshes
-from tiny_models import tiny_mask2former, tiny_sam2, tiny_vitpose
 
 from mover.app.results import write_truth
 from mover.bodies import BodyModel
@@ -176,7 +175,7 @@ def person_of(model: BodyModel) -> Bodies:
 
 
 def write_persons(desk: Path) -> None:
-    """Keypoints, bodies, contacts and the networks' files."""
+    """Keypoints, bodies and contacts."""
     walk = as_bodies(*walker(6))
     write_json(camera_to_json(CAMERA), desk / "camera.json")
     write_bodies(walk, desk / "bodies_of_hmr.npz")
@@ -228,7 +227,4 @@ def write_desk(desk: Path, room: KnownRoom) -> Path:
     write_scenes(desk, room)
     write_persons(desk)
     write_video(desk / "room.mp4")
-    shutil.copy(desk / "room.mp4", desk / "VIDEO")
-    for make in (tiny_mask2former, tiny_sam2, tiny_vitpose):
-        make(desk / "networks" / make.__name__)
     return desk

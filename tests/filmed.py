@@ -6,7 +6,7 @@ which is turned, cut or taken at another time gives other masks and joints.
 
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -20,9 +20,8 @@ from mover.core.observe import Observer, silent
 from mover.core.types import Keypoints, Masks
 from mover.geometry.rle import decode, encode, tight_box
 from mover.perceive.capture import Finders
-from mover.perceive.config import DetectConfig, JointsConfig, TrackConfig
-from mover.perceive.detect import PERSON, DetectInputs, Finds
-from mover.perceive.track import JointsInputs, SegmentInputs, Tracks
+from mover.perceive.config import ModelsConfig, PerceiveConfig
+from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs
 from mover.perceive.video import Clip, read_picture
 
 COLOURS = {PERSON: (225, 30, 200), "chair": (20, 190, 60)}
@@ -140,7 +139,7 @@ def mask_of(clip: Clip, frame: int, category: str) -> torch.Tensor:
     return torch.from_numpy(np.abs(picture - COLOURS[category]).max(-1) < NEAR)
 
 
-def instances(inputs: DetectInputs, _config: DetectConfig, _observe: Observer = silent) -> Finds:
+def instances(inputs: DetectInputs, _config: PerceiveConfig, _observe: Observer = silent) -> Finds:
     """Whatever has the colour of a person or a chair."""
     found = [
         (frame, category, mask)
@@ -153,17 +152,7 @@ def instances(inputs: DetectInputs, _config: DetectConfig, _observe: Observer = 
     return Finds(masks, frames, tuple(c for _, c, _ in found), torch.full((len(found),), 0.9))
 
 
-def tracks(inputs: SegmentInputs, _config: TrackConfig, _observe: Observer = silent) -> Tracks:
-    """The only person there is."""
-    frames = tuple(range(inputs.first, inputs.last + 1))
-    found = instances(DetectInputs(inputs.clip, frames), DetectConfig())
-    rows = [k for k, category in enumerate(found.category) if category == PERSON]
-    masks = replace(found.masks, counts=tuple(found.masks.counts[k] for k in rows))
-    frame = found.frame[rows]
-    return Tracks(masks, frame, torch.zeros_like(frame), min(1, len(rows)))
-
-
-def joints(inputs: JointsInputs, _config: JointsConfig, _observe: Observer = silent) -> Keypoints:
+def joints(inputs: JointsInputs, _config: ModelsConfig, _observe: Observer = silent) -> Keypoints:
     """A figure in the box of each mask."""
     rows = range(len(inputs.tracks.frame))
     boxes = torch.stack([tight_box(decode(inputs.tracks.masks, k)) for k in rows])
@@ -175,4 +164,4 @@ def joints(inputs: JointsInputs, _config: JointsConfig, _observe: Observer = sil
     )  # fmt: skip
 
 
-FINDERS = Finders(instances, tracks, joints)
+FINDERS = Finders(instances, joints)

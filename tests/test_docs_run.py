@@ -37,14 +37,9 @@ RUN = [
     "--prepare.cells", "24", "--prepare.faces", "200", "--prepare.samples", "100",
     "--image.size", "48",
 ]  # fmt: skip
-NETWORKS = [
-    f"--models.{name}={{desk}}/networks/tiny_{kind}"
-    for name, kind in (("masks", "mask2former"), ("tracker", "sam2"), ("keypoints", "vitpose"))
-]
 QUICK = {
     "run": RUN,
     "batch": RUN,
-    "perceive": [*NETWORKS, "--detect.score", "0", "--no-layout"],
     "layout": ["--shapes", "2", "--keep", "2", "--turns", "2", "--screen.method.steps", "10"],
     "export": ["--body", "skin"],
 }
@@ -70,7 +65,6 @@ SWAPS = {
     "mover layout C": {},
     "mover layout C --depth depth.npz": {},
     "mover layout C --meshes FOLDER": {"FOLDER": "shapes"},
-    "mover perceive VIDEO --out C --fov 65": {"C": "NEW"},
     "mover refine OUT": {},
     "mover contacts posa bodies.npz --weights contact.pt --mesh-folder mesh_ds"
     " --camera camera.json": {},

@@ -1,4 +1,4 @@
-"""The whole way from a video to a capture, on tiny networks."""
+"""The way from a video to a capture, on tiny networks, and what is kept of their finds."""
 
 import json
 from pathlib import Path
@@ -7,35 +7,20 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tiny_models import tiny_mask2former, tiny_sam2, tiny_vitpose
+from tiny_models import tiny_mask2former, tiny_vitpose
 
-from mover.app.cli import run_command
 from mover.core.run import Run
 from mover.core.types import Masks
 from mover.geometry.rle import decode, encode
 from mover.io.people.keypoints import read_keypoints
-from mover.perceive.capture import people_of_clip
-from mover.perceive.config import DetectConfig, ModelsConfig, PerceiveConfig
-from mover.perceive.detect import Finds
+from mover.perceive.capture import Finders, Video, perceive
+from mover.perceive.config import FramesConfig, Lens, ModelsConfig, PerceiveConfig
+from mover.perceive.networks import Finds, Tracks
 from mover.perceive.reference import Clean, detections_in, grown, hidden_mask, reference_of
 from mover.perceive.steady import Drift
-from mover.perceive.track import Tracks
 from mover.perceive.video import Clip, write_jpeg
 
-pytest.importorskip("transformers")
-pytestmark = pytest.mark.filterwarnings("default")  # transformers warns about itself
 W, H, FRAMES = 128, 96, 7
-
-
-@pytest.fixture(scope="module")
-def models(tmp_path_factory: pytest.TempPathFactory) -> ModelsConfig:
-    base = tmp_path_factory.mktemp("models")
-    return ModelsConfig(
-        masks=str(tiny_mask2former(base / "masks")),
-        tracker=str(tiny_sam2(base / "tracker")),
-        keypoints=str(tiny_vitpose(base / "keypoints")),
-        device="cpu",
-    )
 
 
 def room() -> np.ndarray:
@@ -44,64 +29,8 @@ def room() -> np.ndarray:
     return np.array(small.resize((W, H), Image.Resampling.BICUBIC))
 
 
-def write_frames(folder: Path) -> None:
-    """Somebody grey walks through a room."""
-    folder.mkdir()
-    for k in range(FRAMES):
-        picture = room()
-        picture[20:90, 10 + 12 * k : 30 + 12 * k] = 90
-        Image.fromarray(picture).save(folder / f"im{k}.png")
-
-
-def named(models: ModelsConfig) -> list[str]:
-    return [
-        "--models.masks", models.masks, "--models.tracker", models.tracker,
-        "--models.keypoints", models.keypoints, "--models.device", "cpu",
-    ]  # fmt: skip
-
-
-@pytest.mark.slow
-def test_a_folder_of_pictures_becomes_a_capture_and_is_not_read_twice(
-    models: ModelsConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    write_frames(tmp_path / "in")
-    out = tmp_path / "c"
-    loose = ["--detect.score", "0", "--track.present", "-1000", "--track.segment", "3"]
-    command = [
-        str(tmp_path / "in"), "--out", str(out), *named(models), *loose, "--fov", "65",
-        "--no-layout", "--frames.folder-fps", "5",
-    ]  # fmt: skip
-    assert run_command("perceive", command) == 0
-    told = capsys.readouterr().out
-    assert "still missing: bodies.npz" in told
-    assert sorted(p.name for p in (out / "frames").iterdir())[-1] == f"{FRAMES - 1:06d}.jpg"
-    people = json.loads((out / "people.json").read_text())
-    assert [image["id"] for image in people["images"]] == list(range(FRAMES))
-    rows = [(row["image_id"], row["track_id"]) for row in people["annotations"]]
-    assert len(set(rows)) == len(rows) > 0
-    keypoints = read_keypoints(out / "keypoints.npz")
-    assert list(zip(keypoints.frame.tolist(), keypoints.person.tolist(), strict=True)) == rows
-    camera = json.loads((out / "camera.json").read_text())
-    assert camera["w"] == W
-    assert json.loads((out / "objects.json").read_text())["images"][0]["width"] == W
-    before = {p: p.stat().st_mtime_ns for p in out.rglob("stages/*/*.json")}
-    assert run_command("perceive", command) == 0
-    assert {p: p.stat().st_mtime_ns for p in out.rglob("stages/*/*.json")} == before
-
-
-def test_a_network_that_is_not_there_is_one_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    write_frames(tmp_path / "in")
-    command = [str(tmp_path / "in"), "--out", str(tmp_path / "c"), "--models.masks", "no/such"]
-    assert run_command("perceive", command) == 2
-    errors = [line for line in capsys.readouterr().err.splitlines() if "mover perceive" in line]
-    assert len(errors) == 1
-    assert "hf download no/such" in errors[0]
-
-
 def clip_of(folder: Path) -> Clip:
+    """A grey person walks through a room."""
     folder.mkdir()
     for k in range(FRAMES):
         picture = room()
@@ -110,26 +39,49 @@ def clip_of(folder: Path) -> Clip:
     return Clip(str(folder), W, H, torch.arange(FRAMES) / 5, 5.0)
 
 
-def walkers() -> Tracks:
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # transformers warns about itself
+def test_a_folder_of_pictures_becomes_a_capture_and_is_not_read_twice(tmp_path: Path):
+    pytest.importorskip("transformers")
+    clip_of(tmp_path / "in")
+    out, said = tmp_path / "c", list[str]()
+    masks, joints = tiny_mask2former(tmp_path / "masks"), tiny_vitpose(tmp_path / "joints")
+    models = ModelsConfig(str(masks), str(joints), "cpu")
+    config = PerceiveConfig(FramesConfig(folder_fps=5.0), models, score=0.0)
+
+    def go() -> None:
+        run = Run(out / "perceived")
+        perceive(Video(tmp_path / "in", Lens(fov=65.0)), out, config, run, said.append, Finders())
+
+    go()
+    assert "% of the room are never seen" in said[-1]
+    assert sorted(p.name for p in (out / "frames").iterdir())[-1] == f"{FRAMES - 1:06d}.jpg"
+    people = json.loads((out / "people.json").read_text())
+    assert [image["id"] for image in people["images"]] == list(range(FRAMES))
+    rows = [(row["image_id"], row["track_id"]) for row in people["annotations"]]
+    assert len(set(rows)) == len(rows) > 0
+    keypoints = read_keypoints(out / "keypoints.npz")
+    assert list(zip(keypoints.frame.tolist(), keypoints.person.tolist(), strict=True)) == rows
+    assert json.loads((out / "camera.json").read_text())["w"] == W
+    assert json.loads((out / "objects.json").read_text())["images"][0]["width"] == W
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("stages/*/*.json")}
+    go()
+    assert {p: p.stat().st_mtime_ns for p in out.rglob("stages/*/*.json")} == before
+
+
+def test_the_reference_is_the_room_without_the_walker(tmp_path: Path):
     masks = torch.zeros(FRAMES, H, W, dtype=torch.bool)
     for k in range(FRAMES):
         masks[k, 20:90, 10 + 12 * k : 30 + 12 * k] = True
     codes = tuple(encode(mask) for mask in masks)
     zeros = torch.zeros(FRAMES, dtype=torch.long)
-    return Tracks(Masks(H, W, codes), torch.arange(FRAMES), zeros, 1)
-
-
-def test_the_reference_is_the_room_without_the_walker(tmp_path: Path):
-    still = Drift(
-        torch.eye(3).expand(FRAMES, 3, 3), torch.zeros(FRAMES), torch.ones(FRAMES), 0, 0.0, "still"
-    )
-    config = PerceiveConfig().clean
-    clean = reference_of(clip_of(tmp_path / "f"), still, walkers(), config)
-    assert clean.frame == -1
+    tracks = Tracks(Masks(H, W, codes), torch.arange(FRAMES), zeros)
+    still = Drift(torch.eye(3).expand(FRAMES, 3, 3), torch.ones(FRAMES), 0, 0.0, "still")
+    clean = reference_of(clip_of(tmp_path / "f"), still, tracks)
     assert not clean.hidden.any()
     assert hidden_mask(clean) is None
     assert (clean.picture - torch.from_numpy(room()) / 255).abs().mean() < 0.03
-    inner = torch.zeros(H, W, dtype=torch.bool)
+    inner = np.zeros((H, W), dtype=bool)
     inner[40, 50] = True
     assert int(grown(inner, 2).sum()) == 13
 
@@ -146,21 +98,7 @@ def test_furniture_is_kept_once_and_cups_are_not():
     kept = detections_in(found)
     assert [(d.id, d.category) for d in kept] == [(0, "couch"), (1, "bed")]
     assert kept[1].box.tolist() == [60, 60, 90, 90]
-    hidden = Clean(torch.zeros(H, W, 3), masks[0], -1)
+    hidden = Clean(torch.zeros(H, W, 3), masks[0])
     one = hidden_mask(hidden)
     assert one is not None
     assert torch.equal(decode(one, 0), masks[0])
-
-
-@pytest.mark.slow
-def test_numbers_of_people_go_on_from_segment_to_segment(models: ModelsConfig, tmp_path: Path):
-    clip = clip_of(tmp_path / "f")
-    config = PerceiveConfig(models=models)
-    loose = DetectConfig(models, score=0.0, least=0.0)
-    for segment in (2, 3, 50):
-        track = type(config.track)(models, segment=segment, present=-1e9, least=0.0)
-        run = Run(tmp_path / f"r{segment}")
-        tracks = people_of_clip(clip, (loose, PerceiveConfig(models=models, track=track)), run)
-        pairs = list(zip(tracks.frame.tolist(), tracks.person.tolist(), strict=True))
-        assert len(set(pairs)) == len(pairs)
-        assert sorted(set(tracks.frame.tolist())) == list(range(FRAMES))

@@ -12,13 +12,13 @@ import torch
 from mover.app import chain
 from mover.app.chain import BodiesFrom, digest, import_bodies, make_bodies, steps_in
 from mover.app.cli import run_command
-from mover.app.cli.video import ChainArgs, video_to_room
+from mover.app.cli.video import VideoArgs, video_to_room
 from mover.core.errors import InputError
 from mover.io.capture.bodies_file import read_bodies, write_bodies
-from mover.perceive import networks
+from mover.perceive import needs
 from mover.perceive.config import ModelsConfig
-from mover.perceive.networks import FACTS, in_folder, missing
-from mover.perceive.steady import Drift, cut_warning, cuts_of
+from mover.perceive.needs import FACTS, missing
+from mover.perceive.steady import Drift, first_cut, warnings_of
 
 NAMES = ("first", "second")
 
@@ -167,17 +167,16 @@ class TestNetworks:
     def test_everything_that_is_missing_is_said_at_once_with_licence_size_and_what_to_do(
         self, monkeypatch: pytest.MonkeyPatch
     ):
-        monkeypatch.setattr(networks.importlib.util, "find_spec", lambda _: None)
+        monkeypatch.setattr(needs.importlib.util, "find_spec", lambda _: None)
         found = "; ".join(missing(ModelsConfig()))
         for name, facts in FACTS.items():
             assert f"hf download {name}" in found
-            assert facts.licence in found
-            assert facts.size in found
-        assert all(f"the package {name}" in found for name in networks.PACKAGES)
+            assert all(fact in found for fact in facts)
+        assert all(f"the package {name}" in found for name in needs.PACKAGES)
 
     def test_all_default_networks_have_their_facts(self):
         models = ModelsConfig()
-        assert {models.masks, models.tracker, models.keypoints} == set(FACTS)
+        assert {models.masks, models.keypoints} == set(FACTS)
 
     def test_the_command_says_so_before_any_work(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -185,53 +184,28 @@ class TestNetworks:
         monkeypatch.setenv("HF_HUB_OFFLINE", "1")
         monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "empty"))
         (tmp_path / "a.mp4").write_bytes(b"no video")
-        for name in ("video", "image"):
-            file = tmp_path / ("a.mp4" if name == "video" else "a.png")
-            if name == "image":
-                from PIL import Image
-
-                Image.new("RGB", (8, 8)).save(file)
-            assert run_command(name, [str(file), "--out", str(tmp_path / "out")]) == 2
-            error = capsys.readouterr().err
-            assert error.startswith(f"mover {name}: not on this machine: ")
-            assert len(error.splitlines()) == 1
+        assert run_command("video", [str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out")]) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert lines[0] == "mover video: not on this machine:"
+        assert sum("hf download" in line for line in lines[1:]) == 2
         assert not (tmp_path / "out" / "capture").exists()
-
-    def test_a_folder_of_weights_gives_each_network_by_its_whole_or_its_last_name(
-        self, tmp_path: Path
-    ):
-        models = ModelsConfig()
-        (tmp_path / "sam2.1-hiera-large").mkdir()
-        (tmp_path / models.masks).mkdir(parents=True)
-        found = in_folder(models, tmp_path)
-        assert found.tracker == str(tmp_path / "sam2.1-hiera-large")
-        assert found.masks == str(tmp_path / models.masks)
-        assert found.keypoints == models.keypoints
-        with pytest.raises(
-            InputError, match=r"--weights: .* is no folder, expected one with mask2"
-        ):
-            in_folder(models, tmp_path / "nowhere")
 
     @pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
     def test_a_folder_without_weights_is_missing_and_one_with_them_is_not(self, tmp_path: Path):
-        models = ModelsConfig(str(tmp_path), "", "")
+        models = ModelsConfig(str(tmp_path), "")
         assert len([s for s in missing(models) if "holds no network" in s]) == 1
         (tmp_path / "config.json").write_text("{}")
         (tmp_path / "model.safetensors").write_bytes(b"")
         assert not [s for s in missing(models) if "holds no network" in s]
 
 
-def drift(agree: list[float]) -> Drift:
-    n = len(agree)
-    eye = torch.eye(3).expand(n, 3, 3)
-    return Drift(eye, torch.zeros(n), torch.tensor(agree), 0, 0.0, "moves")
-
-
 class TestCuts:
     def test_a_picture_that_changes_at_once_and_for_good_is_a_cut(self):
-        found = drift([1.0, 0.95, 0.9, *[0.05] * 7])
-        assert cuts_of(found) == [3]
-        text = cut_warning(torch.arange(10) / 5, cuts_of(found), (3, 10)) or ""
+        agree = [1.0, 0.95, 0.9, *[0.05] * 7]
+        assert first_cut(agree) == 3
+        eye = torch.eye(3).expand(7, 3, 3)
+        drift = Drift(eye, torch.ones(7), 0, 0.0, "still", 3, (3,))
+        (text,) = warnings_of(drift, torch.arange(10) / 5)
         assert "cut at 0.6 s" in text
         assert "--frames.end 0.6" in text
         assert "the longest is used, 0.6 to 1.8 s" in text
@@ -239,14 +213,13 @@ class TestCuts:
     @pytest.mark.parametrize(
         "agree",
         [
-            [1.0, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9],  # somebody passes close by
+            [1.0, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9, 0.9],  # a person passes close by
             [1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.1],  # the camera walks away
             [1.0] * 8,
         ],
     )
-    def test_somebody_who_passes_by_and_a_camera_that_walks_are_none(self, agree: list[float]):
-        assert cuts_of(drift(agree)) == []
-        assert cut_warning(torch.arange(8) / 5, cuts_of(drift(agree)), (0, 8)) is None
+    def test_a_person_who_passes_by_and_a_camera_that_walks_are_none(self, agree: list[float]):
+        assert first_cut(agree) is None
 
 
 def test_heights_are_told_to_the_room_by_track(tmp_path: Path):
@@ -288,8 +261,8 @@ def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
     (tmp_path / "lens.json").write_text(
         json.dumps({**lens, "cx": float(K[0, 2]), "cy": float(K[1, 2])})
     )
-    args = ChainArgs(out, camera=tmp_path / "lens.json")
-    video_to_room(video, args, finders)
+    args = VideoArgs(video, out, camera=tmp_path / "lens.json")
+    video_to_room(args, finders)
     assert (out / "room" / "report.html").is_file()
     found = read_bodies(out / "room" / "bodies.npz")
     true = {k: i for i, k in enumerate(small_room.bodies.frame.tolist())}
@@ -298,14 +271,14 @@ def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
     assert (found.verts.norm(dim=-1).mean() / heights - 1).abs() < 0.15
     capsys.readouterr()
     write_bodies(bodies, out / "capture" / "bodies.npz")
-    args = ChainArgs(out, camera=args.camera, refine=False)
-    video_to_room(video, args, finders)
+    args = VideoArgs(video, out, camera=args.camera, refine=False)
+    video_to_room(args, finders)
     told = capsys.readouterr().out
     assert [line for line in told.splitlines() if line.endswith("kept")] == [
         "1/4 pictures: kept", "2/4 bodies: kept",
     ]  # fmt: skip
     assert "3/4 first scene ..." in told.splitlines()  # other feet stand on another floor
-    video_to_room(video, args, finders)
+    video_to_room(args, finders)
     kept = [line for line in capsys.readouterr().out.splitlines() if line.endswith("kept")]
     assert kept == ["1/4 pictures: kept", "2/4 bodies: kept", "3/4 first scene: kept"]
     after = read_bodies(out / "capture" / "bodies.npz")

@@ -10,13 +10,15 @@ from filmed import FINDERS, Shot, filmed, held, turned, walk, write_film
 from PIL import Image
 from test_pipeline import light
 
-from mover.app.cli.video import ChainArgs, PerceiveArgs, perceive_into, video_to_room
+from mover.app.cli.video import VideoArgs, video_to_room
 from mover.core.errors import InputError
+from mover.core.run import Run
 from mover.core.types import Scene
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.people.keypoints import read_keypoints
-from mover.perceive.config import FramesConfig, PerceiveConfig
+from mover.perceive.capture import Video, perceive
+from mover.perceive.config import FramesConfig, Lens, PerceiveConfig
 from mover.perceive.video import TakeInputs, stamp_of, take_frames
 from mover.pipeline.presets import PRESETS
 
@@ -26,8 +28,8 @@ SECOND = 30
 
 def perceived(source: Path, out: Path, fps: float = 5.0, lens: Path | None = None) -> Path:
     config = PerceiveConfig(FramesConfig(fps=fps))
-    fov = 60.0 if lens is None else None
-    perceive_into(PerceiveArgs(source, out, lens, fov, config=config), config.models, FINDERS)
+    video = Video(source, Lens(lens, 60.0 if lens is None else None))
+    perceive(video, out, config, Run(out / "perceived"), print, FINDERS)
     return out
 
 
@@ -127,8 +129,8 @@ def test_a_camera_that_moves_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_a_video_without_furniture_ends_with_one_sentence(tmp_path: Path):
     filmed(tmp_path / "v.mp4", Shot(chair=False), range(0, SECOND, 3))
-    with pytest.raises(InputError, match=r"finds no furniture in it.*--detect\.score 0\.3"):
-        video_to_room(tmp_path / "v.mp4", ChainArgs(tmp_path / "out", fov=60), FINDERS)
+    with pytest.raises(InputError, match=r"finds no furniture in it.*--score 0\.3"):
+        video_to_room(VideoArgs(tmp_path / "v.mp4", tmp_path / "out", fov=60), FINDERS)
     assert not (tmp_path / "out" / "room").exists()
 
 
@@ -173,10 +175,10 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PRESETS, "robust", light("robust"))
 
 
-def room_of(source: Path, out: Path, args: ChainArgs, finders=FINDERS) -> Scene:
-    video_to_room(source, args, finders)
-    assert (out / "room" / "report.html").is_file()
-    return read_scene(out / "room" / "scene.json")
+def room_of(args: VideoArgs, finders=FINDERS) -> Scene:
+    video_to_room(args, finders)
+    assert (args.out / "room" / "report.html").is_file()
+    return read_scene(args.out / "room" / "scene.json")
 
 
 @pytest.mark.slow
@@ -185,7 +187,7 @@ def test_without_people_the_picture_alone_places_the_furniture_and_that_is_said(
 ):
     filmed(tmp_path / "v.mp4", Shot(person=False), range(0, SECOND, 3))
     out = tmp_path / "out"
-    scene = room_of(tmp_path / "v.mp4", out, ChainArgs(out, fov=60.0))
+    scene = room_of(VideoArgs(tmp_path / "v.mp4", out, fov=60.0))
     told = capsys.readouterr().out
     assert "no person is seen in the video: only the image places the furniture" in told
     assert [piece.id for piece in scene.objects] == ["chair_0"]
@@ -198,7 +200,7 @@ def test_ten_minutes_become_a_room(tmp_path: Path):
     times = range(0, 600 * SECOND, 3 * SECOND)  # the picture changes every three seconds
     filmed(tmp_path / "v.mp4", Shot(), times)
     out = tmp_path / "out"
-    scene = room_of(tmp_path / "v.mp4", out, ChainArgs(out, fov=60.0))
+    scene = room_of(VideoArgs(tmp_path / "v.mp4", out, fov=60.0))
     assert [piece.id for piece in scene.objects] == ["chair_0"]
     found = read_keypoints(out / "capture" / "keypoints.npz")
     assert found.fps is not None
@@ -229,9 +231,9 @@ def test_three_seconds_of_a_phone_held_upright_become_a_room(tmp_path: Path):
     K = camera.K.tolist()
     lens = {"w": 270, "h": 480, "fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}
     (tmp_path / "lens.json").write_text(json.dumps(lens))
-    args = ChainArgs(out, camera=tmp_path / "lens.json")
+    args = VideoArgs(tmp_path / "v.mp4", out, camera=tmp_path / "lens.json")
     finders = Seen(room, add_noise(room, NoiseConfig(), 4), 4).finders()
-    scene = room_of(tmp_path / "v.mp4", out, args, finders)
+    scene = room_of(args, finders)
     assert (scene.camera.width, scene.camera.height) == (270, 480)
     found = read_bodies(out / "room" / "bodies.npz")
     assert 0 < len(found.frame.unique()) <= 15

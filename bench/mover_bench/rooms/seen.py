@@ -7,7 +7,6 @@ objects' masks as in `NoiseConfig`; joints of COCO's 17 miss by 3 to 6 px on peo
 every hundredth pair of left and right is swapped.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,9 +22,8 @@ from mover.core.types import Capture, Keypoints, Masks
 from mover.geometry.camera import project
 from mover.geometry.rle import decode
 from mover.perceive.capture import Finders
-from mover.perceive.config import DetectConfig, JointsConfig, TrackConfig
-from mover.perceive.detect import PERSON, DetectInputs, Finds
-from mover.perceive.track import JointsInputs, SegmentInputs, Tracks
+from mover.perceive.config import ModelsConfig, PerceiveConfig
+from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs, Tracks
 from mover.perceive.video import Clip
 from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.room import draw_frame
@@ -52,7 +50,7 @@ class Seen:
 
     def finders(self) -> Finders:
         """What stands for the networks."""
-        return Finders(self.instances, self.tracks, self.joints)
+        return Finders(self.instances, self.joints)
 
     def frames_of(self, clip: Clip) -> list[int]:
         """The room's frame that each frame of the clip shows."""
@@ -60,7 +58,7 @@ class Seen:
         return [round(float(t) * fps) for t in clip.time]
 
     def instances(
-        self, inputs: DetectInputs, _config: DetectConfig, _observe: Observer = silent
+        self, inputs: DetectInputs, _config: PerceiveConfig, _observe: Observer = silent
     ) -> Finds:
         """Furniture in the clean picture, people in frames."""
         if inputs.clip.fps is None:
@@ -74,33 +72,15 @@ class Seen:
             frame = torch.zeros(len(found), dtype=torch.long)
             names = tuple(name for _, name in found)
             return Finds(masks, frame, names, torch.linspace(0.99, 0.9, len(found)))
-        masks, frame, person = self._people(inputs.clip, inputs.frames)
-        return Finds(masks, frame, (PERSON,) * len(frame), torch.full((len(person),), 0.95))
-
-    def tracks(
-        self, inputs: SegmentInputs, _config: TrackConfig, _observe: Observer = silent
-    ) -> Tracks:
-        """All people through a segment, under their true numbers."""
-        found = self._people(inputs.clip, range(inputs.first, inputs.last + 1))
-        return Tracks(*found, self.people)
-
-    def _people(self, clip: Clip, frames: Iterable[int]) -> tuple[Masks, Tensor, Tensor]:
-        """Masks of people in frames of a clip, the frames, and the people's numbers."""
-        people, of_room = self.noisy.people, self.frames_of(clip)
+        people, of_room = self.noisy.people, self.frames_of(inputs.clip)
         assert people is not None
-        pairs = [(k, r) for k in frames for r in (people.frame == of_room[k]).nonzero()[:, 0]]
-        rows = torch.tensor([int(r) for _, r in pairs], dtype=torch.long)
-        counts = tuple(people.masks.counts[row] for row in rows.tolist())
+        pairs = [(k, int(r)) for k in inputs.frames for r in (people.frame == of_room[k]).nonzero()]
+        masks = replace(people.masks, counts=tuple(people.masks.counts[r] for _, r in pairs))
         frame = torch.tensor([k for k, _ in pairs], dtype=torch.long)
-        return replace(people.masks, counts=counts), frame, people.person[rows]
-
-    @property
-    def people(self) -> int:
-        """How many there are."""
-        return int(self.room.bodies.person.max()) + 1
+        return Finds(masks, frame, (PERSON,) * len(pairs), torch.full((len(pairs),), 0.95))
 
     def joints(
-        self, inputs: JointsInputs, _config: JointsConfig, _observe: Observer = silent
+        self, inputs: JointsInputs, _config: ModelsConfig, _observe: Observer = silent
     ) -> Keypoints:
         """COCO's 17 joints of everybody whose mask is known."""
         tracks, frames = inputs.tracks, self.frames_of(inputs.clip)
@@ -119,11 +99,14 @@ class Seen:
         )  # fmt: skip
 
     def _bodies(self, tracks: Tracks, frames: list[int]) -> Int[Tensor, " rows"]:
-        """The true body of each row of the tracks."""
-        bodies = self.room.bodies
+        """The true body of each row of the tracks, which are numbered as people appear."""
+        bodies, people = self.room.bodies, self.noisy.people
+        assert people is not None
         keys = list(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True))
-        pairs = zip(tracks.frame.tolist(), tracks.person.tolist(), strict=True)
-        return torch.tensor([keys.index((frames[k], person)) for k, person in pairs])
+        rows = zip(people.frame.tolist(), people.masks.counts, people.person.tolist(), strict=True)
+        known = {(frame, code): person for frame, code, person in rows}
+        rows = zip(tracks.frame.tolist(), tracks.masks.counts, strict=True)
+        return torch.tensor([keys.index((frames[k], known[frames[k], code])) for k, code in rows])
 
 
 def spoilt(

@@ -8,22 +8,19 @@ CAPTURE/reference.png, objects.json, people.json, keypoints.npz, camera.json, sc
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.observe import Observer
 from mover.core.records import fingerprint
 from mover.core.run import Run
 from mover.core.types import Camera, Keypoints, People
-from mover.geometry.rle import decode, joined
+from mover.geometry.rle import decode
 from mover.io.capture.annotations_file import (
     detections_of,
     detections_to_json,
@@ -37,46 +34,23 @@ from mover.io.files.cameras import guessed_view, of_view, read_camera_file, with
 from mover.io.files.fields import At, get, maybe, number, read_json, write_json
 from mover.io.files.images import find_depth_file, read_depth, write_image
 from mover.io.people.keypoints import write_keypoints
-from mover.perceive.config import (
-    DetectConfig,
-    JointsConfig,
-    Lens,
-    PerceiveConfig,
-    SteadyConfig,
-    TrackConfig,
-)
-from mover.perceive.detect import DetectInputs, Finds, find_instances, joined_finds, people_in
+from mover.perceive.config import Lens, ModelsConfig, PerceiveConfig
 from mover.perceive.layout import FirstScene, Picture
-from mover.perceive.reference import (
-    Clean,
-    clip_of_clean,
-    detections_in,
-    hidden_mask,
-    reference_of,
-)
-from mover.perceive.steady import (
-    Drift,
-    SteadyInputs,
-    cut_warning,
-    cuts_of,
-    find_drift,
-    opencv,
-    steady_frames,
-    warning_of,
-)
-from mover.perceive.track import (
+from mover.perceive.networks import (
+    DetectInputs,
+    Finds,
     JointsInputs,
-    SegmentInputs,
     Tracks,
+    find_instances,
     find_joints,
+    joined_finds,
     link_people,
-    no_people,
-    track_people,
 )
+from mover.perceive.reference import clip_of_clean, detections_in, hidden_mask, reference_of
+from mover.perceive.steady import Drift, SteadyInputs, find_drift, steady_frames, warnings_of
 from mover.perceive.video import Clip, TakeInputs, opened_picture, stamp_of, take_frames
 
 log = logging.getLogger(__name__)
-MOST_SHOTS = 20  # that are distinguished: what comes after them counts as one
 CHUNK = 50  # frames whose detections are kept together
 # How far off a focal length may be, of its logarithm; what a file gives stays as it is.
 BY_EXIF = 0.05  # of a photo, while a video is cut by what steadies it
@@ -94,12 +68,8 @@ Say = Callable[[str], None]
 class Finders:
     """Stages that look at pictures: the networks, or what stands for them."""
 
-    instances: Callable[[DetectInputs, DetectConfig, Observer], Finds] = find_instances
-    tracks: Callable[[SegmentInputs, TrackConfig, Observer], Tracks] = track_people
-    joints: Callable[[JointsInputs, JointsConfig, Observer], Keypoints] = find_joints
-
-
-NETWORKS = Finders()
+    instances: Callable[[DetectInputs, PerceiveConfig, Observer], Finds] = find_instances
+    joints: Callable[[JointsInputs, ModelsConfig, Observer], Keypoints] = find_joints
 
 
 @dataclass(frozen=True)
@@ -107,159 +77,87 @@ class Video:
     """What is looked at."""
 
     source: Path
-    """A video, or a folder of pictures."""
+    """A video, a folder of pictures, or one picture."""
     lens: Lens = field(default_factory=Lens)
 
 
 def perceive(
-    video: Video,
-    out: Path,
-    config: PerceiveConfig,
-    run: Run,
-    say: Say,
-    finders: Finders = NETWORKS,
-) -> Camera:
-    """Fill a capture folder with all that the pictures of a video give; gives the camera.
+    video: Video, out: Path, config: PerceiveConfig, run: Run, say: Say, finders: Finders
+) -> None:
+    """Fill a capture folder with all that the pictures of a video give.
 
     Raises:
-        InputError: If the source, OpenCV or a network is missing.
+        InputError: If the source or a network is missing.
     """
-    opencv()
     clip, drift = steady_clip(video.source, out, config, run, say)
-    size, lens = (clip.width, clip.height), video.lens
-    at, text = lens_of(size, file=lens.file, fov=lens.fov, photo=lens.photo)
+    at, text = lens_of((clip.width, clip.height), video.lens)
     if text is not None:
         say(f"warning: {text}")
     camera = camera_of(at)
-    detect = replace(config.detect, models=config.models)
-    tracks = people_of_clip(clip, (detect, config), run, finders)
-    clean = reference_of(clip, drift, tracks, config.clean)
-    say(_summary(clean, tracks))
-    clean_clip = clip_of_clean(clean, out / "perceived" / "reference")
-    found = run.stage(finders.instances, DetectInputs(clean_clip, (0,)), detect)
+    tracks = people_of_clip(clip, config, run, finders)
+    clean = reference_of(clip, drift, tracks)
+    unseen = 100 * float(clean.hidden.float().mean())
+    count = int(tracks.person.max()) + 1 if len(tracks.person) else 0
+    say(
+        f"people: {count}, {len(tracks.frame)} masks; {unseen:.1f} % of the room are never seen "
+        "without a person"
+    )
     write_image(clean.picture, out / "reference.png")
+    clean_clip = clip_of_clean(clean, out / "perceived" / "reference")
+    found = run.stage(finders.instances, DetectInputs(clean_clip, (0,)), config)
     objects = detections_to_json(detections_in(found), camera, "reference.png")
     write_json(objects, out / "objects.json")
-    write_json(_people_tree(clip, tracks, clean), out / "people.json")
-    known = {k: at.value[k] for k in ("height", "focal_spread") if k in at.value}
-    write_json({**camera_to_json(camera), **known}, out / "camera.json")
-    if config.models.keypoints and len(tracks.frame):
-        inputs, joints = JointsInputs(clip, tracks), JointsConfig(config.models)
-        found = run.stage(finders.joints, inputs, joints)
-        found = replace(found, frame=clip.numbers[found.frame])
-        write_keypoints(found, out / "keypoints.npz")
-    else:
-        (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
-    return camera
-
-
-def _summary(clean: Clean, tracks: Tracks) -> str:
-    """What a user should know about people and picture."""
-    whole = "no person hides furniture in it"
-    if bool(clean.hidden.any()):
-        whole = f"{100 * float(clean.hidden.float().mean()):.1f} % of it are never seen empty"
-    made = f"frame {clean.frame}" if clean.frame >= 0 else "put together from many frames"
-    return f"people: {tracks.people}, {len(tracks.frame)} masks; reference: {made}, {whole}"
-
-
-def _people_tree(clip: Clip, tracks: Tracks, clean: Clean) -> dict[str, object]:
     people = None
     if tracks.masks.counts:
         people = People(tracks.masks, clip.numbers[tracks.frame], tracks.person, {})
-    return people_to_json(people, hidden_mask(clean), clip.fps, clip.numbers.tolist())
+    tree = people_to_json(people, hidden_mask(clean), clip.fps, clip.numbers.tolist())
+    write_json(tree, out / "people.json")
+    known = {k: at.value[k] for k in ("height", "focal_spread") if k in at.value}
+    write_json({**camera_to_json(camera), **known}, out / "camera.json")
+    if config.models.keypoints and people is not None:
+        joints = run.stage(finders.joints, JointsInputs(clip, tracks), config.models)
+        joints = replace(joints, frame=clip.numbers[joints.frame])
+        write_keypoints(joints, out / "keypoints.npz")
+    else:
+        (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
 
 
 def steady_clip(
     source: Path, out: Path, config: PerceiveConfig, run: Run, say: Say
 ) -> tuple[Clip, Drift]:
-    """Frames of a camera that stands still, in CAPTURE/frames."""
-    work = out / "perceived"
-    whole = run.stage(
-        take_frames, TakeInputs(source, stamp_of(source), work / "raw"), config.frames
-    )
-    raw, drift = one_shot(whole, config.steady, run, say)
-    text = warning_of(drift)
-    if text is not None:
+    """The longest shot of a video, as a camera that stands still saw it, in CAPTURE/frames."""
+    taken = TakeInputs(source, stamp_of(source), out / "perceived" / "raw")
+    whole = run.stage(take_frames, taken, config.frames)
+    drift = run.stage(find_drift, SteadyInputs(whole), None)
+    for text in warnings_of(drift, whole.time):
         say(f"warning: {text}")
+    raw = whole.part(drift.first, drift.first + len(drift.agree))
     steady = replace(raw, folder=str(out / "frames"), origin=fingerprint(raw.origin, drift))
     if not steady.path(len(raw.time) - 1).is_file() or not run.stages[-1].kept:
         steady_frames(raw, drift, out / "frames", run.observe)
     return steady, drift
 
 
-def one_shot(whole: Clip, config: SteadyConfig, run: Run, say: Say) -> tuple[Clip, Drift]:
-    """The longest part of a video that is not cut, and how its camera moved."""
-    drift = run.stage(find_drift, SteadyInputs(whole), config)
-    starts, count, cuts = [0], len(whole.time), cuts_of(drift, config)
-    while cuts and len(starts) < MOST_SHOTS:
-        starts.append(starts[-1] + cuts[0])
-        rest = whole.part(starts[-1], count)
-        cuts = cuts_of(run.stage(find_drift, SteadyInputs(rest), config), config)
-    if len(starts) == 1:
-        return whole, drift
-    shots = list(pairwise([*starts, count]))
-    taken = max(shots, key=lambda shot: shot[1] - shot[0])
-    say(f"warning: {cut_warning(whole.time, starts[1:], taken)}")
-    clip = whole.part(*taken)
-    return clip, run.stage(find_drift, SteadyInputs(clip), config)
-
-
-def people_of_clip(
-    clip: Clip,
-    settings: tuple[DetectConfig, PerceiveConfig],
-    run: Run,
-    finders: Finders = NETWORKS,
-) -> Tracks:
-    """All people in all frames, segment by segment."""
-    detect, config = settings
+def people_of_clip(clip: Clip, config: PerceiveConfig, run: Run, finders: Finders) -> Tracks:
+    """All people in all frames; detections are kept chunk by chunk."""
     count = len(clip.time)
-    if not config.models.tracker:
-        chunks = [tuple(range(k, min(k + CHUNK, count))) for k in range(0, count, CHUNK)]
-        found = [run.stage(finders.instances, DetectInputs(clip, c), detect) for c in chunks]
-        return link_people(people_in(joined_finds(found)), config.track)
-    track = replace(config.track, models=config.models)
-    parts, carried = list[Tracks](), no_people(clip)
-    for first in range(0, count, track.segment):
-        found = people_in(run.stage(finders.instances, DetectInputs(clip, (first,)), detect))
-        last = min(first + track.segment, count - 1)  # it is also the next one's first
-        part = run.stage(finders.tracks, SegmentInputs(clip, first, last, found, carried), track)
-        carried = where(part, part.frame == last)
-        parts.append(part if last == count - 1 else where(part, part.frame != last))
-        if last == count - 1:
-            break
-    return _joined(parts)
+    chunks = [tuple(range(k, min(k + CHUNK, count))) for k in range(0, count, CHUNK)]
+    found = [run.stage(finders.instances, DetectInputs(clip, c), config) for c in chunks]
+    return link_people(joined_finds(found))
 
 
-def where(tracks: Tracks, keep: Bool[Tensor, " rows"]) -> Tracks:
-    """The rows that are kept."""
-    counts = tuple(tracks.masks.counts[k] for k in keep.nonzero()[:, 0].tolist())
-    masks = replace(tracks.masks, counts=counts)
-    return Tracks(masks, tracks.frame[keep], tracks.person[keep], tracks.people)
-
-
-def _joined(parts: Sequence[Tracks]) -> Tracks:
-    return Tracks(
-        joined([p.masks for p in parts]),
-        torch.cat([p.frame for p in parts]),
-        torch.cat([p.person for p in parts]),
-        max(p.people for p in parts),
-    )
-
-
-def lens_of(
-    size: tuple[int, int], *, file: Path | None, fov: float | None, photo: Path | None
-) -> tuple[At, str | None]:
+def lens_of(size: tuple[int, int], lens: Lens) -> tuple[At, str | None]:
     """The fields of camera.json, and a warning where the lens is a guess.
 
     Args:
         size: Width and height of the frames [px].
-        file: A calibration of any known kind; GeoCalib's also gives pitch and roll.
-        fov: Horizontal field of view [degrees].
-        photo: A picture whose EXIF gives the focal length.
+        lens: A calibration of any known kind (GeoCalib's also gives pitch and roll), the
+            horizontal field of view [degrees], or a picture whose EXIF gives the focal length.
 
     Raises:
         InputError: If what is given cannot be used.
     """
+    file, fov, photo = lens.file, lens.fov, lens.photo
     if file is not None:
         return _in_pixels_of(size, read_camera_file(file, size)), None
     if fov is not None:
@@ -332,22 +230,16 @@ def read_picture_of(folder: Path) -> Picture:
         for row in range(0 if reference is None else len(reference.counts)):
             assert reference is not None
             hidden = hidden | decode(reference, row)
-    known = maybe(given, "height")
+    known, depth = maybe(given, "height"), find_depth_file(folder)
     return Picture(
         camera=camera,
         detections=detections,
         masks=torch.stack(masks) if masks else blank[None][:0],
         people=hidden,
         height=None if known is None else number(known, 0.1, 100.0),
-        depth=_metric_depth(folder, camera),
+        depth=None if depth is None or not depth[1] else read_depth(depth[0], camera),  # in metres
         reference=None if parts.load_image is None else parts.load_image(camera),
     )
-
-
-def _metric_depth(folder: Path, camera: Camera) -> Float[Tensor, "h w"] | None:
-    """The capture's depth, where it is in metres."""
-    own = find_depth_file(folder)
-    return read_depth(own[0], camera) if own is not None and own[1] else None
 
 
 def _guessed(folder: Path, camera: Camera) -> Camera:

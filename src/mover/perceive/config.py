@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from mover.core.settings import Count, Seconds, Share, Sigma, Weight, float_in, int_in
+from mover.core.settings import Seconds, Share, Sigma, Weight, float_in, int_in
 from mover.energy.config import Adam, SceneWeights
 from mover.stages.config import ImageConfig, PlaceConfig, PrepareConfig
 
@@ -17,37 +17,11 @@ class FramesConfig:
     fps: Annotated[float, float_in(0, 1e4)] = 5.0
     """Frames a second; 0: all, at the rate of the video."""
     start: Seconds = 0.0
-    """Where to begin [s]."""
+    """Start of the part that is used [s]."""
     end: Seconds = 0.0
-    """Where to stop [s]; 0: at the end."""
+    """Its end [s]; 0: the end of the video."""
     folder_fps: Annotated[float, float_in(0, 1e4)] = 0.0
     """Frames a second of a folder of pictures; 0: unknown, all are taken."""
-
-
-@dataclass(frozen=True)
-class SteadyConfig:
-    """What counts as still."""
-
-    still: Share = 0.002
-    """Largest drift of a camera that stands still, as a share of the image's larger side."""
-    small: Share = 0.15
-    """Largest drift that is undone; beyond it the camera walks."""
-    agree: Share = 0.35
-    """Least share of pixels that must agree with the homography of a frame."""
-
-
-@dataclass(frozen=True)
-class CleanConfig:
-    """How the reference picture is made."""
-
-    frames: Annotated[int, int_in(1, 10_000)] = 40
-    """Most frames that are looked at, evenly over the video."""
-    free: Share = 0.0005
-    """Share of the picture that may be hidden in a frame that is taken as it is."""
-    least: Count = 3
-    """Fewest frames that must show a pixel; with fewer it is hidden."""
-    strips: Annotated[int, int_in(1, 10_000)] = 16
-    """Parts in which the picture is put together, to save memory."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +29,7 @@ class ModelsConfig:
     """Which networks do what: names on Hugging Face, or folders."""
 
     masks: str = "facebook/mask2former-swin-large-coco-instance"
-    """Furniture and people in one picture (Mask2Former, MaskFormer or OneFormer on COCO)."""
-    tracker: str = "facebook/sam2.1-hiera-large"
-    """People through the video (SAM 2); empty: detections are linked frame by frame."""
+    """Furniture and people in pictures (Mask2Former or MaskFormer on COCO)."""
     keypoints: str = "usyd-community/vitpose-base-simple"
     """Joints of people (ViTPose on COCO's 17); empty: none."""
     device: str = "auto"
@@ -67,63 +39,15 @@ class ModelsConfig:
 
 
 @dataclass(frozen=True)
-class DetectConfig:
-    """How instances are found."""
-
-    models: ModelsConfig = field(default_factory=ModelsConfig)
-    """Which network."""
-    score: Share = 0.5
-    """Least score."""
-    batch: Annotated[int, int_in(1, 1024)] = 4
-    """Pictures that the network sees at once."""
-    least: Share = 0.0004
-    """Smallest instance, as a share of the picture."""
-
-
-@dataclass(frozen=True)
-class TrackConfig:
-    """How people are followed."""
-
-    models: ModelsConfig = field(default_factory=ModelsConfig)
-    """Which network."""
-    segment: Annotated[int, int_in(1, 100_000)] = 50
-    """Frames between two detections."""
-    same: Share = 0.3
-    """Overlap from which a detection is matched to a tracked person."""
-    present: Annotated[float, float_in(-100, 100)] = 0.0
-    """Least score (logit) of SAM 2 that a person is in the picture."""
-    least: Share = 0.0004
-    """Smallest mask, as a share of the picture."""
-    patience: Annotated[int, int_in(0, 100_000)] = 10
-    """Frames for which the track of an undetected person is kept (without a tracker)."""
-
-
-@dataclass(frozen=True)
-class JointsConfig:
-    """How joints are found."""
-
-    models: ModelsConfig = field(default_factory=ModelsConfig)
-    """Which network."""
-    batch: Annotated[int, int_in(1, 1024)] = 16
-    """People that the network sees at once."""
-
-
-@dataclass(frozen=True)
 class PerceiveConfig:
     """How a video is read."""
 
     frames: FramesConfig = field(default_factory=FramesConfig)
     """Which frames."""
-    steady: SteadyConfig = field(default_factory=SteadyConfig)
-    """What counts as a camera that stands still."""
-    clean: CleanConfig = field(default_factory=CleanConfig)
-    """The reference picture without people."""
     models: ModelsConfig = field(default_factory=ModelsConfig)
     """Which networks do what."""
-    detect: DetectConfig = field(default_factory=DetectConfig)
-    """Furniture and people in pictures (its models are those above)."""
-    track: TrackConfig = field(default_factory=TrackConfig)
-    """People through the video (its models are those above)."""
+    score: Share = 0.5
+    """Least score of a detection."""
 
 
 @dataclass(frozen=True)
@@ -137,19 +61,11 @@ class Lens:
 
 @dataclass(frozen=True)
 class ScreenConfig:
-    """How the quick look is done."""
+    """How the first look by boxes is done."""
 
     heights: tuple[Annotated[float, float_in(0.1, 20)], ...] = (
-        0.8,
-        0.95,
-        1.1,
-        1.25,
-        1.4,
-        1.6,
-        1.8,
-        2.05,
-        2.35,
-    )
+        0.8, 0.95, 1.1, 1.25, 1.4, 1.6, 1.8, 2.05, 2.35,
+    )  # fmt: skip
     """Heights of the camera that are tried [m]."""
     usual: Annotated[float, float_in(0.1, 20)] = 1.5
     """The usual one [m],"""
@@ -180,12 +96,6 @@ class ScreenConfig:
     """The descent."""
 
 
-SHORT = Adam(40, 0.03, 0.01, beta2=0.98, keep_best=True)
-
-
-LONG = Adam(100, 0.02, 0.003, beta2=0.98, keep_best=True)
-
-
 @dataclass(frozen=True)
 class LayoutConfig:
     """How the first scene is found."""
@@ -206,11 +116,9 @@ class LayoutConfig:
     """How shapes are made fit."""
     place: PlaceConfig = field(
         default_factory=lambda: PlaceConfig(
-            SceneWeights(1.0, 1.0, 0.3, 1.0, 0.0, 0.0, given=0.1),
-            "robust",
-            LONG,
-            short=SHORT,
-            num_hypotheses=2,
+            SceneWeights(1.0, 1.0, 0.3, 1.0, 0.0, 0.0, given=0.1), "robust",
+            Adam(100, 0.02, 0.003, beta2=0.98, keep_best=True),
+            short=Adam(40, 0.03, 0.01, beta2=0.98, keep_best=True), num_hypotheses=2,
         )
-    )
+    )  # fmt: skip
     """The descent by silhouettes."""

@@ -41,7 +41,6 @@ from mover.stages.objects.own_edges import own_edges
 from mover.stages.objects.place_inputs import PlaceInputs
 from mover.stages.objects.place_objects import place_objects
 from mover.stages.objects.prepare_objects import (
-    Prepared,
     PrepareInputs,
     prepare_objects,
     to_objects,
@@ -141,24 +140,6 @@ def _own_shapes(category: str, folder: Path) -> tuple[ShapeChoice, ...]:
     return tuple(found)
 
 
-def outer_points(shape: ShapeChoice) -> Float[Tensor, "points 3"]:
-    """The outermost points of a shape, from the centre of its bottom [m]."""
-    verts = used(shape.mesh).verts
-    low, high = box(verts)
-    origin = torch.stack([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    return outermost(verts - origin).float()
-
-
-def best_items(screened: Screened, owner: list[int], keep: int) -> list[int]:
-    """The `keep` best shapes of each thing, in the order of the things, best first."""
-    best = screened.energy.amin(0)
-    found: list[int] = []
-    for thing in sorted(set(owner)):
-        own = [k for k, o in enumerate(owner) if o == thing]
-        found += sorted(own, key=lambda k: float(best[k]))[:keep]
-    return found
-
-
 def starts_of(screened: Screened, items: list[int], turns: int) -> Layout:
     """The best turns of each item, spread so that both fronts of a box are tried."""
     yaw = screened.layout.yaw[:, items]
@@ -180,24 +161,6 @@ def _apart(yaw: Float[Tensor, " yaws"], energy: Tensor, turns: int) -> Int[Tenso
         near = [abs(float(wrap(yaw[k] - yaw[j]))) for j in kept]
         (kept if all(d > TURNED_APART for d in near) else rest).append(k)
     return torch.tensor((kept + rest)[:turns])
-
-
-def piece_of(detection: Detection, shape: ShapeChoice, name: str) -> SceneObject:
-    """A shape at the origin, standing for a detection."""
-    return SceneObject(
-        id=name, category=detection.category, mesh=shape.mesh, mesh_file=shape.file,
-        annotation=detection.id, support="ground", t_world_object=torch.zeros(3),
-        yaw=torch.tensor(0.0), scale=torch.ones(3),
-    )  # fmt: skip
-
-
-def repeated(cues: ImageCues, things: Int[Tensor, " items"]) -> ImageCues:
-    """The cues of each item's thing."""
-    views = Crops(cues.views.K[things], cues.views.height, cues.views.width)
-    return ImageCues(
-        cues.boxes[things], cues.sides[things], views, cues.masks[things], cues.keep[things],
-        cues.trust[things],
-    )  # fmt: skip
 
 
 @record
@@ -268,21 +231,83 @@ def first_scene(
     )
     picture = at_scale(picture)
     shapes = [shapes_of(d.category, config.shapes, meshes) for d in picture.detections]
-    cues = run.stage(find_image_cues, _image(picture), config.image)
     pairs = [(thing, shape) for thing, known in enumerate(shapes) for shape in known]
+    cues = run.stage(find_image_cues, _image(picture), config.image)
     screened = run.stage(screen, _screen_inputs(picture, cues, pairs), config.screen)
     camera = replace(picture.camera, R_cam_world=screened.R_cam_world)
     picture = replace(picture, camera=camera)
-    items = best_items(screened, [thing for thing, _ in pairs], config.keep)
-    things = torch.tensor([pairs[k][0] for k in items])
-    pieces = _pieces(picture, [pairs[k] for k in items])
+
+    best, items = screened.energy.amin(0), list[int]()
+    for thing in range(len(shapes)):  # the shapes of each thing that go on, best first
+        own = [k for k, (owner, _) in enumerate(pairs) if owner == thing]
+        items += sorted(own, key=lambda k: float(best[k]))[: config.keep]
+    chosen = [pairs[k] for k in items]
+    things = torch.tensor([thing for thing, _ in chosen])
+    pieces = _pieces(picture, chosen)
     prepared = run.stage(prepare_objects, PrepareInputs(pieces), config.prepare)
+    cues = _cues_of(picture, cues, chosen)
+    depth = None if picture.depth is None else range_in(picture.depth, cues, camera, SLACK)
     starts = starts_of(screened, items, config.turns)
-    cues = replace(repeated(cues, things), given=known_of(picture, [pairs[k] for k in items]))
-    inputs = _place_inputs(picture, cues, prepared, starts, screened.height)
-    placed = run.stage(place_objects, inputs, config.place)
-    found = to_objects(pieces, prepared, placed.layout)
-    return _scene(picture, (found, things, placed.energy[0]), screened.height, skipped)
+    inputs = PlaceInputs(
+        prepared.objects, camera, -screened.height, cues, HumanCues(depth=depth), starts,
+        starts.yaw[0],
+    )  # fmt: skip
+    found = run.stage(place_objects, inputs, config.place)
+    objects = to_objects(pieces, prepared, found.layout)
+    others = _ranked(picture, objects, things, found.energy[0])
+    scene_objects = tuple(group[0].piece for group in others)
+    scene = Scene(camera, -screened.height, scene_objects, size_spread=SOUGHT)
+    return FirstScene(scene, others, skipped)
+
+
+def _pieces(picture: Picture, chosen: list[tuple[int, ShapeChoice]]) -> tuple[SceneObject, ...]:
+    """One object for each shape of a thing; its id has thing and rank."""
+    rank: Counter[int] = Counter()
+    found: list[SceneObject] = []
+    for thing, shape in chosen:
+        detection = picture.detections[thing]
+        found.append(
+            SceneObject(
+                id=f"{thing}_{rank[thing]}", category=detection.category, mesh=shape.mesh,
+                mesh_file=shape.file, annotation=detection.id, support="ground",
+                t_world_object=torch.zeros(3), yaw=torch.tensor(0.0), scale=torch.ones(3),
+            )
+        )  # fmt: skip
+        rank[thing] += 1
+    return tuple(found)
+
+
+def _cues_of(picture: Picture, cues: ImageCues, chosen: list[tuple[int, ShapeChoice]]) -> ImageCues:
+    """The cues of each shape's thing, with its likely axes and standard size."""
+    things = torch.tensor([thing for thing, _ in chosen])
+    kinds = [canonical(picture.detections[thing].category) for thing, _ in chosen]
+    sizes = torch.tensor([shape.size for _, shape in chosen])
+    standard, precision = sizes_of_shapes(kinds, sizes)
+    known = rows_of(axes_of(picture), things, "objects")
+    views = Crops(cues.views.K[things], cues.views.height, cues.views.width)
+    return ImageCues(
+        cues.boxes[things], cues.sides[things], views, cues.masks[things], cues.keep[things],
+        cues.trust[things], given=replace(known, standard=standard, precision=precision),
+    )  # fmt: skip
+
+
+def _ranked(
+    picture: Picture,
+    objects: tuple[SceneObject, ...],
+    things: Int[Tensor, " items"],
+    energy: Float[Tensor, " items"],
+) -> tuple[tuple[Hypothesis, ...], ...]:
+    """The hypotheses of each thing, best first, under its name."""
+    count: Counter[str] = Counter()
+    groups: list[tuple[Hypothesis, ...]] = []
+    for thing, detection in enumerate(picture.detections):
+        word = canonical(detection.category).replace(" ", "_")
+        name = f"{word}_{count[word]}"
+        count[word] += 1
+        own = sorted((things == thing).nonzero()[:, 0].tolist(), key=lambda k: float(energy[k]))
+        group = [Hypothesis(replace(objects[k], id=name), float(energy[k])) for k in own]
+        groups.append(tuple(group))
+    return tuple(groups)
 
 
 def at_scale(picture: Picture) -> Picture:
@@ -316,6 +341,12 @@ def _screen_inputs(
     if height is None and picture.depth is not None:
         hidden = picture.masks.any(0) | picture.people
         height = floor_height(picture.depth, picture.camera, hidden)
+    points = list[Tensor]()
+    for _, shape in pairs:  # from the centre of its bottom
+        verts = used(shape.mesh).verts
+        low, high = box(verts)
+        origin = torch.stack([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+        points.append(outermost(verts - origin).float())
     things = torch.tensor([thing for thing, _ in pairs])
     return ScreenInputs(
         camera=picture.camera,
@@ -323,70 +354,18 @@ def _screen_inputs(
         sides=cues.sides,
         depth=median_depths(picture.depth, picture.masks),
         thing=things,
-        points=torch.stack([outer_points(shape) for _, shape in pairs]),
+        points=torch.stack(points),
         height=height,
         tilt_spread=picture.tilt_spread,
         prior=picture.prior,
-        given=axes_of(picture, things),
+        given=rows_of(axes_of(picture), things, "objects"),
     )
 
 
-def _pieces(picture: Picture, pairs: list[tuple[int, ShapeChoice]]) -> tuple[SceneObject, ...]:
-    """One object for each item; its id has thing and rank."""
-    found: list[SceneObject] = []
-    for index, (thing, shape) in enumerate(pairs):
-        rank = sum(1 for other, _ in pairs[:index] if other == thing)
-        found.append(piece_of(picture.detections[thing], shape, f"{thing}_{rank}"))
-    return tuple(found)
-
-
-def axes_of(picture: Picture, things: Int[Tensor, " items"]) -> Given:
-    """Likely axes of each item, from the edges of the room and of its thing."""
+def axes_of(picture: Picture) -> Given:
+    """Likely axes of each thing, from the edges of the room and of the thing."""
     kinds = [canonical(found.category) for found in picture.detections]
-    known = unplaced(len(kinds))
-    if picture.heading is not None and picture.segments is not None:
-        edges = own_edges(picture.segments, picture.masks, picture.people, picture.camera)
-        known = given_axis(kinds, picture.heading, edges)
-    return rows_of(known, things, "objects")
-
-
-def known_of(picture: Picture, pairs: list[tuple[int, ShapeChoice]]) -> Given:
-    """The same, and of what standard size each item may be."""
-    kinds = [canonical(picture.detections[thing].category) for thing, _ in pairs]
-    sizes = torch.tensor([shape.size for _, shape in pairs])
-    standard, precision = sizes_of_shapes(kinds, sizes)
-    known = axes_of(picture, torch.tensor([thing for thing, _ in pairs]))
-    return replace(known, standard=standard, precision=precision)
-
-
-def _place_inputs(
-    picture: Picture, cues: ImageCues, prepared: Prepared, starts: Layout, height: float
-) -> PlaceInputs:
-    depth = None
-    if picture.depth is not None:
-        depth = range_in(picture.depth, cues, picture.camera, SLACK)
-    return PlaceInputs(
-        prepared.objects, picture.camera, -height, cues, HumanCues(depth=depth), starts,
-        starts.yaw[0],
-    )  # fmt: skip
-
-
-def _scene(
-    picture: Picture,
-    found: tuple[tuple[SceneObject, ...], Int[Tensor, " items"], Float[Tensor, " items"]],
-    height: float,
-    skipped: tuple[str, ...],
-) -> FirstScene:
-    """The best item of each thing, and the others behind it."""
-    pieces, things, energy = found
-    count: Counter[str] = Counter()
-    groups: list[tuple[Hypothesis, ...]] = []
-    for thing, detection in enumerate(picture.detections):
-        word = canonical(detection.category).replace(" ", "_")
-        name = f"{word}_{count[word]}"
-        count[word] += 1
-        own = sorted((things == thing).nonzero()[:, 0].tolist(), key=lambda k: float(energy[k]))
-        groups.append(tuple(Hypothesis(replace(pieces[k], id=name), float(energy[k])) for k in own))
-    pieces = tuple(group[0].piece for group in groups)
-    scene = Scene(picture.camera, -height, pieces, size_spread=SOUGHT)
-    return FirstScene(scene, tuple(groups), skipped)
+    if picture.heading is None or picture.segments is None:
+        return unplaced(len(kinds))
+    edges = own_edges(picture.segments, picture.masks, picture.people, picture.camera)
+    return given_axis(kinds, picture.heading, edges)

@@ -1,133 +1,260 @@
-"""Which networks a video needs: what they are for, and which of them are not on this machine.
+"""Furniture, people and their joints in pictures, by pretrained networks of transformers.
 
-Nothing is loaded here, so that everything that is missing is said at once, before any work.
+A network finds masks of COCO's classes in each frame; people are linked from frame to frame by
+their place; another network finds the joints of each person in the box of the mask.
+Networks come by name from the cache of Hugging Face, or from a folder.
 """
 
 import importlib
-import importlib.util
-from dataclasses import dataclass, fields, replace
-from pathlib import Path
+import logging
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
-from mover.core.errors import InputError
-from mover.perceive.config import ModelsConfig
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
-WEIGHTS = (
-    "model.safetensors",
-    "model.safetensors.index.json",
-    "pytorch_model.bin",
-    "pytorch_model.bin.index.json",
-)
-"""Files in which transformers saves a network; one of them has to be there."""
-PACKAGES = {
-    "transformers": "runs the networks",
-    "av": "reads videos",
-    "cv2": "holds the camera still (OpenCV)",
+from mover.core.errors import InputError
+from mover.core.observe import Observer, Step, silent
+from mover.core.records import record
+from mover.core.types import Keypoints, Masks
+from mover.geometry.rle import decode, encode, joined, tight_box
+from mover.io.people.found import followed
+from mover.perceive.config import ModelsConfig, PerceiveConfig
+from mover.perceive.needs import absent, install
+from mover.perceive.video import Clip, read_picture
+
+log = logging.getLogger(__name__)
+CLASSES = {
+    "masks": "AutoModelForUniversalSegmentation",
+    "keypoints": "VitPoseForPoseEstimation",
 }
+"""Classes of transformers for each task."""
+PERSON = "person"
+LEAST = 0.0004  # smallest instance, as a share of the picture
+PICTURES, PEOPLE = 4, 16  # that a network sees at once
 
 
 @dataclass(frozen=True)
-class NetworkFacts:
-    """One of the networks that are used where no other is named."""
+class Network:
+    """A network that is ready, and what prepares its input."""
 
-    task: str
-    """What it finds."""
-    licence: str
-    size: str
-    """Of its files."""
+    model: Any
+    processor: Any
+    device: str
 
 
-FACTS = {
-    "facebook/mask2former-swin-large-coco-instance": NetworkFacts(
-        "furniture and people in single pictures", "MIT (its repository; see its card)", "0.9 GB"
-    ),
-    "facebook/sam2.1-hiera-large": NetworkFacts("people through the video", "Apache-2.0", "0.9 GB"),
-    "usyd-community/vitpose-base-simple": NetworkFacts("joints of people", "Apache-2.0", "0.34 GB"),
-}
-"""Of the networks of `ModelsConfig`, by their names on Hugging Face."""
-CLASSES = "shi-labs/oneformer_demo"
-"""Where OneFormer's processor looks for the names of its classes, if they are not in its folder."""
-KINDS = ("masks", "tracker", "keypoints")
-
-
-def in_folder(models: ModelsConfig, weights: Path) -> ModelsConfig:
-    """The same networks, from a folder that holds one folder for each: `weights/NAME`.
-
-    NAME is the whole name with `/` as in the folder tree, or its last part.
+def network(kind: str, config: ModelsConfig) -> Network:
+    """The network of a kind, `masks` or `keypoints`; it is loaded once.
 
     Raises:
-        InputError: If the folder is not there.
+        InputError: If transformers, the weights or the device are missing; the message says what
+            to do.
     """
-    if not weights.is_dir():
-        raise InputError(f"--weights: {weights} is no folder, expected one with {_folders(models)}")
-    found: dict[str, str] = {}
-    for kind in KINDS:
-        name = str(getattr(models, kind))
-        places = [weights / name, weights / name.rsplit("/", 1)[-1]]
-        here = [place for place in places if name and place.is_dir()]
-        if here:
-            found[kind] = str(here[0])
-    return replace(models, **found)
+    device = config.device
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    if device.split(":")[0] not in ("cpu", "cuda"):
+        raise InputError(f"--models.device: {device!r} is none of auto, cpu, cuda")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise InputError("--models.device: there is no GPU that torch can use, expected cpu")
+    return _loaded(kind, str(getattr(config, kind)), device, config.download)
 
 
-def _folders(models: ModelsConfig) -> str:
-    names = [str(getattr(models, kind)) for kind in KINDS]
-    return ", ".join(f"{name.rsplit('/', 1)[-1]}/" for name in names if name)
+@lru_cache(maxsize=4)
+def _loaded(kind: str, name: str, device: str, download: bool) -> Network:
+    try:
+        library: Any = importlib.import_module("transformers")
+    except ImportError as error:
+        raise InputError(f"perceive needs transformers: {install('perceive')}") from error
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            own: dict[str, Any] = {"local_files_only": not download}
+            model = getattr(library, CLASSES[kind]).from_pretrained(name, **own)
+            processor = library.AutoImageProcessor.from_pretrained(name, **own)
+    except (OSError, ValueError, KeyError, ImportError) as error:
+        log.debug("loading %s: %s", name, error)
+        raise InputError(absent(kind, replace(ModelsConfig(), **{kind: name}))) from error
+    return Network(model.to(device).eval(), processor, device)
 
 
-def missing(models: ModelsConfig) -> list[str]:
-    """A sentence for each thing that a video needs and this machine lacks; empty: all is there."""
-    lacking = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
-    found = [
-        f"the package {name}, which {PACKAGES[name]}: pip install '.[perceive]' in mover's folder"
-        for name in lacking
-    ]
-    if "transformers" in lacking:
-        return found + [absent(kind, models) for kind in KINDS if getattr(models, kind)]
-    kinds = [f.name for f in fields(models) if f.name in KINDS]
-    return found + [absent(kind, models) for kind in kinds if not _is_here(kind, models)]
+# Instances.
 
 
-def _is_here(kind: str, models: ModelsConfig) -> bool:
-    """Whether a network can be loaded; a network that may be fetched counts as there."""
-    name = str(getattr(models, kind))
-    if not name or models.download:
-        return True
-    if Path(name).is_dir():
-        held = {path.name for path in Path(name).iterdir()}
-        return "config.json" in held and any(file in held for file in WEIGHTS)
-    hub: Any = importlib.import_module("huggingface_hub")  # transformers brings it
+@record
+class DetectInputs:
+    """Pictures of a clip."""
 
-    def cached(file: str) -> bool:
-        return isinstance(hub.try_to_load_from_cache(name, file), str)
-
-    return cached("config.json") and any(cached(file) for file in WEIGHTS)
+    clip: Clip
+    frames: tuple[int, ...]
 
 
-def absent(kind: str, models: ModelsConfig) -> str:
-    """What a network is that is not there or cannot be loaded, and how it gets here."""
-    name = str(getattr(models, kind))
-    if Path(name).is_dir():
-        return (
-            f"--models.{kind}: the folder {name} holds no network for this task, expected "
-            "config.json and model.safetensors as transformers save them"
-        )
-    facts = FACTS.get(name)
-    known = "" if facts is None else f" ({facts.task}; {facts.licence}; {facts.size})"
-    more = f" and `hf download {CLASSES}`" if "oneformer" in name.lower() else ""
-    return (
-        f"--models.{kind}: {name}{known}: run `hf download {name}`{more} once where there is a "
-        f"network, or --models.download, or --weights DIR with the folder "
-        f"{name.rsplit('/', 1)[-1]}/ in it"
+@record
+class Finds:
+    """Instances in pictures, row by row."""
+
+    masks: Masks
+    frame: Int[Tensor, " rows"]
+    category: tuple[str, ...]
+    score: Float[Tensor, " rows"]
+
+
+def find_instances(
+    inputs: DetectInputs, config: PerceiveConfig, observe: Observer = silent
+) -> Finds:
+    """Instance masks in some frames.
+
+    Raises:
+        InputError: If the network is not there.
+    """
+    net = network("masks", config.models)
+    nothing = Masks(inputs.clip.height, inputs.clip.width, ())
+    parts = [Finds(nothing, torch.zeros(0, dtype=torch.long), (), torch.zeros(0))]
+    for begin in range(0, len(inputs.frames), PICTURES):
+        frames = inputs.frames[begin : begin + PICTURES]
+        pictures = [read_picture(inputs.clip.path(k)) for k in frames]
+        parts.append(instances(net, pictures, frames, config.score))
+        observe(Step("find_instances", begin + len(frames), len(inputs.frames)))
+    return joined_finds(parts)
+
+
+def instances(
+    net: Network, pictures: Sequence[Any], frames: Sequence[int], score: float, least: float = LEAST
+) -> Finds:
+    """What the network sees in a batch of pictures of one size.
+
+    Args:
+        net: Mask2Former or MaskFormer.
+        pictures: In bytes.
+        frames: Their numbers.
+        score: Least score.
+        least: Smallest instance, as a share of the picture.
+    """
+    inputs = net.processor(images=list(pictures), return_tensors="pt").to(net.device)
+    with torch.inference_mode():
+        outputs = net.model(**inputs)
+    sizes = [picture.shape[:2] for picture in pictures]
+    found = net.processor.post_process_instance_segmentation(
+        outputs, threshold=score, target_sizes=sizes, return_binary_maps=True
+    )
+    codes: list[bytes] = []
+    rows: list[tuple[int, str, float]] = []
+    for frame, one in zip(frames, found, strict=True):
+        maps = one["segmentation"].cpu()
+        for index, info in enumerate(one["segments_info"]):
+            mask = maps[index] > 0 if maps.dim() == 3 else maps == int(info["id"])  # a map of ids
+            if int(mask.sum()) < max(1, least * mask.numel()):
+                continue
+            codes.append(encode(mask))
+            name = str(net.model.config.id2label[int(info["label_id"])]).lower()
+            rows.append((frame, name, float(info["score"])))
+    return Finds(
+        Masks(int(sizes[0][0]), int(sizes[0][1]), tuple(codes)),
+        torch.tensor([r[0] for r in rows], dtype=torch.long),
+        tuple(r[1] for r in rows),
+        torch.tensor([r[2] for r in rows], dtype=torch.float32),
     )
 
 
-def check_networks(models: ModelsConfig) -> None:
-    """Refuse to begin where something is missing.
+def joined_finds(parts: Sequence[Finds]) -> Finds:
+    """Rows of several batches."""
+    return Finds(
+        joined([p.masks for p in parts]),
+        torch.cat([p.frame for p in parts]),
+        tuple(c for p in parts for c in p.category),
+        torch.cat([p.score for p in parts]),
+    )
+
+
+def stack_of(masks: Masks) -> Bool[Tensor, "rows h w"]:
+    """Masks as pixels."""
+    if not masks.counts:
+        return torch.zeros(0, masks.height, masks.width, dtype=torch.bool)
+    return torch.stack([decode(masks, k) for k in range(len(masks.counts))])
+
+
+def overlap(a: Bool[Tensor, "n h w"], b: Bool[Tensor, "m h w"]) -> Float[Tensor, "n m"]:
+    """Shared area over joint area of masks."""
+    flat = [x.flatten(1).float() for x in (a, b)]
+    shared = flat[0] @ flat[1].mT
+    return shared / (flat[0].sum(1)[:, None] + flat[1].sum(1)[None] - shared).clamp_min(1)
+
+
+# People through the video.
+
+
+@record
+class Tracks:
+    """People's masks, one row for each (frame, person)."""
+
+    masks: Masks
+    frame: Int[Tensor, " rows"]
+    person: Int[Tensor, " rows"]
+
+
+def link_people(found: Finds) -> Tracks:
+    """People of all frames, linked by where each was last seen."""
+    kept = [k for k, name in enumerate(found.category) if name == PERSON]
+    people = replace(found.masks, counts=tuple(found.masks.counts[k] for k in kept))
+    boxes = np.array([tight_box(decode(people, k)).tolist() for k in range(len(kept))])
+    low, high = boxes.reshape(-1, 2, 2).swapaxes(0, 1)
+    frames, size = found.frame[kept], np.linalg.norm(high - low, axis=1)
+    person = followed(frames.tolist(), (low + high) / 2, size)
+    return Tracks(people, frames, torch.from_numpy(person))
+
+
+# Joints.
+
+
+@record
+class JointsInputs:
+    """People in the frames of a clip."""
+
+    clip: Clip
+    tracks: Tracks
+
+
+def find_joints(
+    inputs: JointsInputs, config: ModelsConfig, observe: Observer = silent
+) -> Keypoints:
+    """Joints of all people with a mask.
 
     Raises:
-        InputError: With everything that is missing, and what to do about each.
+        InputError: If the network is not there.
     """
-    lacking = missing(models)
-    if lacking:
-        raise InputError("not on this machine: " + "; ".join(lacking))
+    net = network("keypoints", config)
+    tracks = inputs.tracks
+    parts = [torch.zeros(0, 17, 3)]
+    for begin in range(0, len(tracks.frame), PEOPLE):
+        rows = range(begin, min(begin + PEOPLE, len(tracks.frame)))
+        boxes = [tight_box(decode(tracks.masks, row)) for row in rows]
+        pictures = [read_picture(inputs.clip.path(int(tracks.frame[row]))) for row in rows]
+        parts.append(torch.stack(joints_in(net, pictures, boxes)))
+        observe(Step("find_joints", rows[-1] + 1, len(tracks.frame)))
+    found = torch.cat(parts)
+    return Keypoints(
+        found[..., :2], found[..., 2].clamp(0, 1), "coco17", tracks.frame, tracks.person,
+        inputs.clip.fps,
+    )  # fmt: skip
+
+
+def joints_in(
+    net: Network, pictures: list[Any], boxes: list[Float[Tensor, "4"]]
+) -> list[Float[Tensor, "joints 3"]]:
+    """x, y [px] and confidence of one person's joints in each picture."""
+    corners = [
+        [[x, y, right - x, bottom - y]] for x, y, right, bottom in (b.tolist() for b in boxes)
+    ]
+    inputs = net.processor(images=pictures, boxes=corners, return_tensors="pt").to(net.device)
+    with torch.inference_mode():
+        outputs = net.model(**inputs)
+    found = net.processor.post_process_pose_estimation(outputs, boxes=corners)
+    return [
+        torch.cat([one[0]["keypoints"], one[0]["scores"].reshape(-1, 1)], -1).float().cpu()
+        for one in found
+    ]

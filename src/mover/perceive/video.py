@@ -24,6 +24,7 @@ from mover.core.records import fingerprint, record
 from mover.io.files.fields import reason
 from mover.io.people.values import natural
 from mover.perceive.config import FramesConfig
+from mover.perceive.needs import install
 
 PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 LARGEST_AREA = 1 << 26  # [px²], of a frame
@@ -33,8 +34,9 @@ SAME_GAP = 0.2  # difference of two gaps between frames that are meant to be one
 EARLY = 0.05  # of the time between two frames: how early the first may be taken
 
 Picture = UInt8[np.ndarray, "h w 3"]
-Timed = tuple[float, Callable[[], Picture]]
-"""When a frame was taken [s], and its pixels, upright: made when they are asked for."""
+Timed = tuple[int, float, Callable[[], Picture]]
+"""Number of a frame, when it was taken [s], and its pixels, upright: made when they are asked for.
+"""
 
 
 @record
@@ -52,6 +54,8 @@ class Clip:
     """What the pictures were made from: another source is another clip."""
     number: Int[Tensor, " frames"] | None = None
     """Number of each by the clock; None: they are counted."""
+    index: Int[Tensor, " frames"] | None = None
+    """Number of each in the source, from 0; None: it is not known."""
 
     @property
     def numbers(self) -> Int[Tensor, " frames"]:
@@ -65,7 +69,8 @@ class Clip:
 
     def part(self, first: int, end: int) -> "Clip":
         """The frames from the first to before the end."""
-        return replace(self, time=self.time[first:end], number=self.numbers[first:end])
+        index = None if self.index is None else self.index[first:end]
+        return replace(self, time=self.time[first:end], number=self.numbers[first:end], index=index)
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,7 @@ class TakeInputs:
     """Where frames come from and go to."""
 
     source: Path
-    """A video, or a folder of pictures."""
+    """A video, a folder of pictures, or one picture."""
     stamp: tuple[int, int]
     """Its size and when it was changed, so that another file is not taken for it."""
     folder: Path
@@ -103,10 +108,10 @@ def take_frames(inputs: TakeInputs, config: FramesConfig, observe: Observer = si
     inputs.folder.mkdir(parents=True, exist_ok=True)
     for old in inputs.folder.glob("*.jpg"):  # of another source
         old.unlink()
-    times, numbers = list[float](), list[int]()
+    times, numbers, indices = list[float](), list[int](), list[int]()
     size: tuple[int, int] | None = None
     fps = _rate(inputs.source, config)
-    for number, (time, pixels) in chosen(read_frames(inputs.source, config), config, fps):
+    for number, (index, time, pixels) in chosen(read_frames(inputs.source, config), config, fps):
         picture = pixels()
         found = picture.shape[1], picture.shape[0]
         if size is not None and found != size:
@@ -119,26 +124,29 @@ def take_frames(inputs: TakeInputs, config: FramesConfig, observe: Observer = si
         observe(Step("take_frames", len(times), len(times) + 1))
         times.append(time)
         numbers.append(number)
+        indices.append(index)
     if size is None:
         raise InputError(f"{inputs.source.name}: has no frames, expected some in the chosen time")
     origin = fingerprint(inputs.stamp, str(inputs.source.resolve()), config)
-    clock = torch.tensor(numbers)
-    return Clip(str(inputs.folder), *size, torch.tensor(times), fps, origin, clock)
+    return Clip(
+        str(inputs.folder), *size, torch.tensor(times), fps, origin, torch.tensor(numbers),
+        torch.tensor(indices),
+    )  # fmt: skip
 
 
 def read_frames(source: Path, config: FramesConfig) -> Iterator[Timed]:
-    """Time [s] and pixels of each frame, upright.
+    """Number, time [s] and pixels of each frame, upright.
 
     Raises:
         InputError: If it cannot be read.
     """
-    if source.is_dir():
+    if pictures := pictures_of(source):
         rate = config.folder_fps or 1.0
-        for index, path in enumerate(pictures_of(source)):
-            yield index / rate, partial(read_picture, path)
+        for index, path in enumerate(pictures):
+            yield index, index / rate, partial(read_picture, path)
         return
     try:
-        yield from _decoded(source, config.start)
+        yield from _decoded(source)
     except (OSError, ValueError) as error:  # av's errors are of both kinds
         raise InputError(
             f"{source.name}: cannot be read ({reason(error)}), expected a video"
@@ -153,11 +161,11 @@ def chosen(
     A tick to which no frame is nearer than to the next has none: nothing was seen then.
     """
     best: tuple[int, float, Timed] | None = None
-    for index, frame in enumerate(frames):
-        since = frame[0] - config.start
-        if config.end and frame[0] > config.end:
+    for frame in frames:
+        since = frame[1] - config.start
+        if config.end and frame[1] > config.end:
             break
-        tick = index if fps is None else round(since * fps)
+        tick = frame[0] if fps is None else round(since * fps)
         off = 0.0 if fps is None else abs(since * fps - tick)
         if since < -EARLY / (fps or 1.0) or (best is not None and tick < best[0]):
             continue
@@ -170,15 +178,17 @@ def chosen(
         yield best[0], best[2]
 
 
-def pictures_of(folder: Path) -> list[Path]:
-    """The pictures of a folder, `2.jpg` before `10.jpg`.
+def pictures_of(source: Path) -> list[Path]:
+    """The pictures of a folder, `2.jpg` before `10.jpg`; a picture itself; none of a video.
 
     Raises:
-        InputError: If there are none.
+        InputError: If a folder has none.
     """
-    found = [p for p in folder.iterdir() if p.suffix.lower() in PICTURES and p.is_file()]
+    if not source.is_dir():
+        return [source] if source.suffix.lower() in PICTURES else []
+    found = [p for p in source.iterdir() if p.suffix.lower() in PICTURES and p.is_file()]
     if not found:
-        raise InputError(f"{folder}: has no pictures, expected {', '.join(PICTURES[:3])} ...")
+        raise InputError(f"{source}: has no pictures, expected {', '.join(PICTURES[:3])} ...")
     return sorted(found, key=natural)
 
 
@@ -237,7 +247,7 @@ def load_frame(path: Path) -> Float[Tensor, "h w 3"]:
 def _rate(source: Path, config: FramesConfig) -> float | None:
     """Frames a second of what is taken."""
     known = config.folder_fps or None
-    if not source.is_dir():
+    if not pictures_of(source):
         with _opened(source) as container:
             known = float(container.streams.video[0].average_rate or USUAL_RATE)
             if not config.fps or known < config.fps:  # a pause or a late end spoils the average
@@ -262,9 +272,7 @@ def _opened(source: Path) -> Any:  # noqa: ANN401
     try:
         import av
     except ImportError as error:
-        raise InputError(
-            "reading video needs PyAV: pip install '.[perceive]' in mover's folder"
-        ) from error
+        raise InputError(f"reading video needs PyAV: {install('perceive')}") from error
     try:
         container = av.open(str(source))
     except (OSError, ValueError) as error:
@@ -276,20 +284,18 @@ def _opened(source: Path) -> Any:  # noqa: ANN401
     return container
 
 
-def _decoded(source: Path, start: float) -> Iterator[Timed]:
+def _decoded(source: Path) -> Iterator[Timed]:
     with _opened(source) as container:
         stream = container.streams.video[0]
         context = stream.codec_context
         if context.width * context.height > LARGEST_AREA:
             raise ValueError(f"{context.width} x {context.height} pixels are too many")
         first = float((stream.start_time or 0) * stream.time_base)
-        if start > 0:
-            container.seek(int((start + first) / stream.time_base), stream=stream)
         rate = float(stream.average_rate or USUAL_RATE)
         for index, frame in enumerate(container.decode(stream)):
             stamped = frame.pts is not None  # the frames of a bare stream are not
             time = float(frame.pts * frame.time_base) - first if stamped else index / rate
-            yield time, partial(_upright, frame)
+            yield index, time, partial(_upright, frame)
 
 
 def _upright(frame: Any) -> Picture:  # noqa: ANN401

@@ -17,19 +17,11 @@ COMMANDS = {
     ),
     "video": (
         "mover.app.cli.video:video",
-        "From a video to a room: pictures, first scene, bodies, room, report.",
-    ),
-    "image": (
-        "mover.app.cli.video:image",
-        "The same from one picture.",
+        "From a video or a picture to a room: pictures, bodies, first scene, room, report.",
     ),
     "import": (
         "mover.app.cli.imports:import_",
         "Turn what other tools wrote into a capture folder.",
-    ),
-    "perceive": (
-        "mover.app.cli.video:perceive",
-        "From a video to a capture: frames, masks, joints, a first scene.",
     ),
     "layout": (
         "mover.app.cli.video:layout",

@@ -71,24 +71,15 @@ RUN_SETTINGS = {
 }
 """Settings of `Config` that `mover run` and `mover batch` have as flags, and what they are."""
 PERCEIVE_SETTINGS = {
+    "frames.fps": "Frames a second that are taken.",
     "frames.start": "Where the part of the video starts [s].",
     "frames.end": "Where it ends; 0: with the video [s].",
     "models.masks": "The network of masks.",
-    "models.tracker": "The network that follows people; empty: none.",
     "models.keypoints": "The network of joints.",
     "models.download": "Fetch networks that are missing.",
-    "detect.score": "Least certainty of a detection.",
+    "score": "Least score of a detection.",
 }
-"""The same of `PerceiveConfig`, of `mover video`, `image` and `perceive`."""
-STEP_SETTINGS = {
-    **PERCEIVE_SETTINGS,
-    "frames.fps": "Frames a second that are taken.",
-    "frames.folder_fps": "Pictures a second of a folder.",
-    "models.device": "Where networks compute.",
-    "track.segment": "Frames that the tracker follows at once.",
-    "track.present": "Least score of a person who is followed.",
-}
-"""Those of `mover perceive`, which does this step alone."""
+"""The same of `PerceiveConfig`, of `mover video`."""
 REFINE_SETTINGS = {"rounds": "Rounds of the descent with evidence gathered again."}
 """The same of `RefineBodiesConfig`, of `mover refine`."""
 LAYOUT_SETTINGS = {

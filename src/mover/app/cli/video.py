@@ -1,5 +1,6 @@
-"""What `perceive` and `layout` do, and `video` and `image`: the whole way in one command."""
+"""What `layout` does, and `video`: the whole way in one command."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +13,6 @@ from mover.app.cli import say
 from mover.app.cli.config import (
     LAYOUT_SETTINGS,
     PERCEIVE_SETTINGS,
-    STEP_SETTINGS,
     Device,
     parsed_with,
     preset_named,
@@ -20,8 +20,8 @@ from mover.app.cli.config import (
 from mover.app.cli.people import FitArgs, fit_into
 from mover.core.errors import InputError
 from mover.core.settings import float_in
-from mover.perceive.config import LayoutConfig, Lens, ModelsConfig, PerceiveConfig
-from mover.perceive.networks import check_networks, in_folder
+from mover.perceive.config import LayoutConfig, Lens, PerceiveConfig
+from mover.perceive.needs import check_needs
 
 if TYPE_CHECKING:
     from mover.perceive.capture import Finders
@@ -47,47 +47,6 @@ class LayoutArgs:
     config: Suppress[Fixed[LayoutConfig]] = field(default_factory=LayoutConfig)
 
 
-@dataclass(frozen=True)
-class PerceiveArgs:
-    """From a video to a capture: frames, masks, joints, a clean picture and a first scene.
-
-    A run that was killed goes on where it stopped. Bodies in 3D are still missing afterwards.
-    """
-
-    source: Annotated[Positional[Path], arg(metavar="VIDEO")]
-    """A video, or a folder of pictures."""
-    out: Path
-    """The capture folder."""
-    camera: Path | None = None
-    """A calibration; GeoCalib's also has pitch and roll."""
-    fov: Annotated[float, float_in(1, 179)] | None = None
-    """Horizontal field of view, where there is no calibration [degrees]."""
-    photo: Path | None = None
-    """A photo of the same camera, whose EXIF has the focal length."""
-    depth: Path | None = None
-    """Metric depth of the reference picture, for the first scene and `mover run`."""
-    meshes: Path | None = None
-    """Folder with your own shapes, for the first scene."""
-    layout: bool = True
-    """Find the first scene, too."""
-    weights: Path | None = None
-    """Folder with the networks, for a machine without a network: one folder for each."""
-    config: Suppress[Fixed[PerceiveConfig]] = field(default_factory=PerceiveConfig)
-
-
-def perceive(arguments: Sequence[str]) -> None:
-    """`mover perceive`."""
-    args, config = parsed_with(
-        PerceiveArgs, PerceiveConfig(), STEP_SETTINGS, "mover perceive", arguments
-    )
-    args = replace(args, config=config)
-    perceive_into(args, ready_models(args.config.models, args.weights))
-    if args.layout:
-        layout_into(LayoutArgs(args.out, args.depth, args.meshes))
-    say("still missing: bodies.npz (mover fit, or mover import-bodies TOOL PATH)")
-    say(f"next: mover check {args.out}; mover run {args.out} --out OUT")
-
-
 def layout(arguments: Sequence[str]) -> None:
     """`mover layout`."""
     args, config = parsed_with(
@@ -95,43 +54,6 @@ def layout(arguments: Sequence[str]) -> None:
     )
     layout_into(replace(args, config=config))
     say(f"next: mover check {args.capture}; mover run {args.capture} --out OUT")
-
-
-def ready_models(models: ModelsConfig, weights: Path | None) -> ModelsConfig:
-    """The networks, from the folder where one is given; all that is missing is said at once.
-
-    Raises:
-        InputError: If something is missing.
-    """
-    models = models if weights is None else in_folder(models, weights)
-    check_networks(models)
-    return models
-
-
-def perceive_into(
-    args: PerceiveArgs, models: ModelsConfig, finders: "Finders | None" = None
-) -> None:
-    """Fill the capture with all but the first scene.
-
-    Args:
-        args: What is asked.
-        models: The networks.
-        finders: What stands for them; None: they themselves.
-    """
-    import torch
-
-    from mover.app.cli.progress import Bar
-    from mover.core.run import Run
-    from mover.perceive.capture import NETWORKS, Video
-    from mover.perceive.capture import perceive as fill
-
-    torch.set_num_threads(THREADS)
-    video = Video(args.source, Lens(args.camera, args.fov, args.photo))
-    config = replace(args.config, models=models)
-    with Bar() as bar:
-        run = Run(args.out / "perceived", bar)
-        fill(video, args.out, config, run, say, finders or NETWORKS)
-    say(f"{args.out}: wrote frames/, reference.png, objects.json, people.json, camera.json")
 
 
 def take_depth(depth: Path, capture: Path) -> None:
@@ -183,7 +105,7 @@ def layout_into(args: LayoutArgs) -> None:
         say(f"note: not on the floor, left out: {', '.join(sorted(set(first.skipped)))}")
 
 
-# The whole way in one command: `video` and `image`.
+# The whole way in one command.
 
 
 STEPS = ("pictures", "bodies", "first scene", "room")
@@ -194,9 +116,11 @@ ONE_IMAGE = (
 
 
 @dataclass(frozen=True)
-class ChainArgs:
-    """What both commands ask."""
+class VideoArgs:
+    """From a video to a room: pictures, bodies, first scene, room, report."""
 
+    source: Annotated[Positional[Path], arg(metavar="VIDEO")]
+    """A video, a folder of pictures, or one picture."""
     out: Path
     """Folder for the capture (OUT/capture) and the room (OUT/room); a run that was killed goes on
     there."""
@@ -219,8 +143,6 @@ class ChainArgs:
     """Metric depth of the reference picture, for the first scene and the room."""
     meshes: Path | None = None
     """Folder with your own shapes, named after their class: chair_0.obj."""
-    weights: Path | None = None
-    """Folder with the networks, for a machine without a network: one folder for each."""
     preset: str = "robust"
     """Settings of the room: paper or robust."""
     device: Device = "cpu"
@@ -230,128 +152,93 @@ class ChainArgs:
     config: Suppress[Fixed[PerceiveConfig]] = field(default_factory=PerceiveConfig)
 
 
-@dataclass(frozen=True)
-class VideoArgs:
-    """From a video to a room: pictures, bodies, first scene, room, report."""
-
-    source: Annotated[Positional[Path], arg(metavar="VIDEO")]
-    """A video, or a folder of pictures."""
-    chain: Annotated[ChainArgs, arg(name="")]
-
-
-@dataclass(frozen=True)
-class ImageArgs:
-    """From one picture to a room; the command says what one picture cannot give."""
-
-    source: Annotated[Positional[Path], arg(metavar="IMAGE")]
-    """A picture with people and furniture in it."""
-    chain: Annotated[ChainArgs, arg(name="")]
-
-
 def video(arguments: Sequence[str]) -> None:
     """`mover video`."""
     args, config = parsed_with(
         VideoArgs, PerceiveConfig(), PERCEIVE_SETTINGS, "mover video", arguments
     )
-    if not args.source.exists():
-        raise InputError(f"{args.source}: there is no such file, expected a video or a folder")
-    video_to_room(args.source, replace(args.chain, config=config))
+    video_to_room(replace(args, config=config))
 
 
-def image(arguments: Sequence[str]) -> None:
-    """`mover image`."""
-    args, config = parsed_with(
-        ImageArgs, PerceiveConfig(), PERCEIVE_SETTINGS, "mover image", arguments
-    )
-    from mover.perceive.video import read_picture
-
-    if not args.source.is_file():
-        raise InputError(f"{args.source}: there is no such file, expected a picture")
-    read_picture(args.source)
-    folder = args.chain.out / "picture"
-    folder.mkdir(parents=True, exist_ok=True)
-    place = folder / args.source.name
-    if not place.exists() or place.read_bytes() != args.source.read_bytes():
-        place.write_bytes(args.source.read_bytes())
-    say(ONE_IMAGE)
-    video_to_room(folder, replace(args.chain, config=config))
-
-
-def video_to_room(source: Path, args: ChainArgs, finders: "Finders | None" = None) -> None:
+def video_to_room(args: VideoArgs, finders: "Finders | None" = None) -> None:
     """All steps; what cannot work is said before the first.
 
     Args:
-        source: A video, or a folder of pictures.
         args: What is asked.
         finders: What stands for the networks; None: they themselves.
 
     Raises:
         InputError: If something is missing, or there is no furniture.
     """
-    config = _checked(args, finders is None)  # in the first second: nothing heavy is loaded yet
-    from mover.perceive.video import stamp_of
+    source = args.source  # in the first second: nothing heavy is loaded yet
+    if not source.exists():
+        raise InputError(f"{source}: there is no such file, expected a video or a folder")
+    preset_named(args.preset)
+    BodiesFrom(args.bodies, args.bodies_tool).check()
+    if finders is None:
+        check_needs(args.config.models)
+    from mover.perceive.video import pictures_of, read_picture, stamp_of
 
+    pictures = pictures_of(source)
+    if len(pictures) == 1:
+        read_picture(pictures[0])
+        say(ONE_IMAGE)
     capture, steps = args.out / "capture", steps_in(args.out, say, STEPS)
-    stamp = str((str(source.resolve()), *stamp_of(source)))
     lens = args.camera, args.fov, args.photo
-    pictures = PerceiveArgs(source, capture, *lens, config=config)
-    seen = [stamp, repr(config), *map(str, lens)]
-    steps.do(
-        STEPS[0],
-        seen,
-        capture / "objects.json",
-        lambda: perceive_into(pictures, config.models, finders),
-    )
-    _check_detections(capture)
-    _bodies(source, capture, args, steps)
+    seen = [str((str(source.resolve()), *stamp_of(source))), repr(args.config), *map(str, lens)]
+    steps.do(STEPS[0], seen, capture / "objects.json", lambda: _pictures(args, capture, finders))
+    if not json.loads((capture / "objects.json").read_text())["annotations"]:
+        raise InputError(
+            f"{capture / 'reference.png'}: the network finds no furniture in it, so there is "
+            "nothing to place; --score 0.3 keeps weaker detections"
+        )
+    if not json.loads((capture / "people.json").read_text())["annotations"]:
+        say("warning: no person is seen in the video: only the image places the furniture")
+    _bodies(capture, args, steps)
     _first_scene(capture, args, steps)
     _room(capture, args)
 
 
-def _checked(args: ChainArgs, networks: bool) -> PerceiveConfig:
-    """The settings, with all that is missing on this machine said at once."""
-    preset_named(args.preset)
-    BodiesFrom(args.bodies, args.bodies_tool).check()
-    models = args.config.models
-    return replace(args.config, models=ready_models(models, args.weights) if networks else models)
+def _pictures(args: VideoArgs, capture: Path, finders: "Finders | None") -> None:
+    """All of the capture but bodies and the first scene."""
+    import torch
+
+    from mover.app.cli.progress import Bar
+    from mover.core.run import Run
+    from mover.perceive.capture import Finders, Video, perceive
+
+    torch.set_num_threads(THREADS)
+    with Bar() as bar:
+        run = Run(capture / "perceived", bar)
+        lens = Lens(args.camera, args.fov, args.photo)
+        perceive(Video(args.source, lens), capture, args.config, run, say, finders or Finders())
+    say(f"{capture}: wrote frames/, reference.png, objects.json, people.json, camera.json")
 
 
-def _check_detections(capture: Path) -> None:
-    """Stop without furniture, and warn without people.
-
-    Raises:
-        InputError: If the picture shows no furniture.
-    """
-    import json
-
-    if not json.loads((capture / "objects.json").read_text())["annotations"]:
-        raise InputError(
-            f"{capture / 'reference.png'}: the network finds no furniture in it, so there is "
-            "nothing to place; --detect.score 0.3 keeps weaker detections"
-        )
-    if not json.loads((capture / "people.json").read_text())["annotations"]:
-        say("warning: no person is seen in the video: only the image places the furniture")
-
-
-def _bodies(source: Path, capture: Path, args: ChainArgs, steps: Steps) -> None:
+def _bodies(capture: Path, args: VideoArgs, steps: Steps) -> None:
     """bodies.npz, where people are seen."""
     bodies, keypoints = BodiesFrom(args.bodies, args.bodies_tool), capture / "keypoints.npz"
+    made = capture / "bodies.npz"
     if args.bodies == FIT and not keypoints.is_file():
         say("warning: no keypoints were found, so there are no bodies")
-        steps.undo(STEPS[1], capture / "bodies.npz")
+        steps.undo(STEPS[1], made)
         return
     write_heights(capture, args.height)
     given = [] if args.bodies == FIT or bodies.is_command else [Path(args.bodies)]
     made_from = [keypoints, lens_in(capture), args.bodies, args.bodies_tool, *given]
     made_from += map(str, args.height)
 
+    def fit() -> None:
+        camera = capture / "camera.json"
+        fit_into(FitArgs(keypoints, camera, out=made, drop=True, height=args.height))
+
     def work() -> None:
-        make_bodies(bodies, source, capture, lambda: _fit(capture, args.height))
+        make_bodies(bodies, args.source, capture, fit)
 
-    steps.do(STEPS[1], made_from, capture / "bodies.npz", work, yours=args.bodies == FIT)
+    steps.do(STEPS[1], made_from, made, work, yours=args.bodies == FIT)
 
 
-def _first_scene(capture: Path, args: ChainArgs, steps: Steps) -> None:
+def _first_scene(capture: Path, args: VideoArgs, steps: Steps) -> None:
     """scene.json, under the camera that the bodies constrain."""
     from mover.io.files.images import find_depth_file
 
@@ -373,12 +260,7 @@ def lens_in(capture: Path) -> str:
     return f"{camera.width} {camera.height} " + " ".join(f"{v:.6g}" for v in camera.K.flatten())
 
 
-def _fit(capture: Path, height: tuple[float, ...]) -> None:
-    camera, made = capture / "camera.json", capture / "bodies.npz"
-    fit_into(FitArgs(capture / "keypoints.npz", camera, out=made, drop=True, height=height))
-
-
-def _room(capture: Path, args: ChainArgs) -> None:
+def _room(capture: Path, args: VideoArgs) -> None:
     """The room and its report; its own stages are kept by themselves."""
     from mover.app.cli.run import reconstruct_into
     from mover.app.results import Origin
