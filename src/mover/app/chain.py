@@ -156,12 +156,17 @@ def make_bodies(bodies: BodiesFrom, video: Path, capture: Path, fit: Callable[[]
         source = capture / "bodies-by-command"
         source = source if bodies.tool else source.with_suffix(".npz")
         places = {"video": video, "frames": capture / "frames", "camera": capture / "camera.json"}
-        run_command_line(bodies.source, {**places, "out": source})
+        run_command_line("--bodies", bodies.source, {**places, "out": source})
     import_bodies(source, bodies.tool, capture)
 
 
-def run_command_line(command: str, places: dict[str, Path]) -> None:
-    """Run a user's command without a shell; {video}, {frames}, {camera} and {out} are filled in.
+def run_command_line(flag: str, command: str, places: dict[str, Path]) -> None:
+    """Run a user's command without a shell.
+
+    Args:
+        flag: By which it was given.
+        command: With the names of places in braces, such as {video} and {out}.
+        places: What stands for them.
 
     Raises:
         InputError: If it cannot be run, fails, or leaves nothing at {out}.
@@ -172,12 +177,12 @@ def run_command_line(command: str, places: dict[str, Path]) -> None:
     try:
         code = subprocess.run(words, check=False).returncode
     except OSError as error:
-        raise InputError(f"--bodies: {words[0]}: {error.strerror or error}") from error
+        raise InputError(f"{flag}: {words[0]}: {error.strerror or error}") from error
     if code:
-        raise InputError(f"--bodies: the command ended with code {code}: {shlex.join(words)}")
+        raise InputError(f"{flag}: the command ended with code {code}: {shlex.join(words)}")
     if not places["out"].exists():
         raise InputError(
-            f"--bodies: the command wrote nothing to {places['out'].name}, which stands for "
+            f"{flag}: the command wrote nothing to {places['out'].name}, which stands for "
             f"{OUT}: {shlex.join(words)}"
         )
 

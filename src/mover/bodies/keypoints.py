@@ -150,6 +150,11 @@ LAYOUTS: dict[str, tuple[str, ...]] = {
         *_COCO, "head_top", "neck", "pelvis",
         *(f"{side}_{n}" for n in ("big_toe", "small_toe", "heel") for side in SIDES),
     ),
+    "mediapipe33": (
+        "nose", MISSING, "left_eye", MISSING, MISSING, "right_eye", MISSING, "left_ear",
+        "right_ear", MISSING, MISSING, *_COCO[5:11], *(MISSING,) * 6, *_COCO[11:],
+        "left_heel", "right_heel", "left_big_toe", "right_big_toe",
+    ),
     "wholebody133": (*_COCO, *_FEET, *_FACE, *_LEFT, *_RIGHT),
 }  # fmt: skip
 """Names of the keypoints of each layout, in order.

@@ -125,6 +125,10 @@ FORMATS = (
         "keypoints", "halpe26", "Halpe's 26 joints: JSON",
         "people.keypoints:read_instances", {"layout": "halpe26"},
     ),
+    Format(
+        "keypoints", "mediapipe", "MediaPipe's 33 landmarks in pixels: JSON or npz",
+        "people.keypoints:read_instances", {"layout": "mediapipe33"},
+    ),
     Format("keypoints", "openpose", "a folder of OpenPose", "people.keypoints:read_openpose"),
     Format("export", "glb", "the room with moving people, one file", "export.glb:export_glb"),
     Format("export", "usd", "the same as binary USD", "export.usd:export_usd"),

@@ -36,6 +36,13 @@ from mover.io.files.images import find_depth_file, read_depth, write_image
 from mover.io.people.keypoints import write_keypoints
 from mover.perceive.config import Lens, ModelsConfig, PerceiveConfig
 from mover.perceive.layout import FirstScene, Picture
+from mover.perceive.mediapipe import (
+    PoseInputs,
+    Poses,
+    find_poses,
+    pose_inputs,
+    poses_to_keypoints,
+)
 from mover.perceive.networks import (
     DetectInputs,
     Finds,
@@ -46,6 +53,7 @@ from mover.perceive.networks import (
     joined_finds,
     link_people,
 )
+from mover.perceive.own import Own, own_keypoints, own_masks, own_objects, same_people
 from mover.perceive.reference import clip_of_clean, detections_in, hidden_mask, reference_of
 from mover.perceive.steady import Drift, SteadyInputs, find_drift, steady_frames, warnings_of
 from mover.perceive.video import Clip, TakeInputs, opened_picture, stamp_of, take_frames
@@ -70,6 +78,7 @@ class Finders:
 
     instances: Callable[[DetectInputs, PerceiveConfig, Observer], Finds] = find_instances
     joints: Callable[[JointsInputs, ModelsConfig, Observer], Keypoints] = find_joints
+    poses: Callable[[PoseInputs, None, Observer], Poses] = find_poses
 
 
 @dataclass(frozen=True)
@@ -79,6 +88,7 @@ class Video:
     source: Path
     """A video, a folder of pictures, or one picture."""
     lens: Lens = field(default_factory=Lens)
+    own: Own = field(default_factory=Own)
 
 
 def perceive(
@@ -87,39 +97,48 @@ def perceive(
     """Fill a capture folder with all that the pictures of a video give.
 
     Raises:
-        InputError: If the source or a network is missing.
+        InputError: If the source, a file or a network is missing; if it is only that of furniture,
+            all else is written.
     """
     clip, drift = steady_clip(video.source, out, config, run, say)
     at, text = lens_of((clip.width, clip.height), video.lens)
     if text is not None:
         say(f"warning: {text}")
     camera = camera_of(at)
-    tracks = people_of_clip(clip, config, run, finders)
+    known = {k: at.value[k] for k in ("height", "focal_spread") if k in at.value}
+    write_json({**camera_to_json(camera), **known}, out / "camera.json")
+    tracks, joints = people_of_clip(clip, drift, video.own, config, run, say, finders)
     clean = reference_of(clip, drift, tracks)
     unseen = 100 * float(clean.hidden.float().mean())
-    count = int(tracks.person.max()) + 1 if len(tracks.person) else 0
+    count = len(tracks.person.unique())
     say(
         f"people: {count}, {len(tracks.frame)} masks; {unseen:.1f} % of the room are never seen "
         "without a person"
     )
     write_image(clean.picture, out / "reference.png")
-    clean_clip = clip_of_clean(clean, out / "perceived" / "reference")
-    found = run.stage(finders.instances, DetectInputs(clean_clip, (0,)), config)
-    objects = detections_to_json(detections_in(found), camera, "reference.png")
-    write_json(objects, out / "objects.json")
     people = None
     if tracks.masks.counts:
         people = People(tracks.masks, clip.numbers[tracks.frame], tracks.person, {})
     tree = people_to_json(people, hidden_mask(clean), clip.fps, clip.numbers.tolist())
     write_json(tree, out / "people.json")
-    known = {k: at.value[k] for k in ("height", "focal_spread") if k in at.value}
-    write_json({**camera_to_json(camera), **known}, out / "camera.json")
-    if config.models.keypoints and people is not None:
-        joints = run.stage(finders.joints, JointsInputs(clip, tracks), config.models)
-        joints = replace(joints, frame=clip.numbers[joints.frame])
-        write_keypoints(joints, out / "keypoints.npz")
+    if joints is not None and len(joints.frame):
+        joints = same_people(joints, tracks)
+        write_keypoints(replace(joints, frame=clip.numbers[joints.frame]), out / "keypoints.npz")
     else:
         (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
+    if video.own.objects is not None:
+        write_json(own_objects(video.own, clip, drift).value, out / "objects.json")
+        return
+    clean_clip = clip_of_clean(clean, out / "perceived" / "reference")
+    try:
+        found = run.stage(finders.instances, DetectInputs(clean_clip, (0,)), config)
+    except InputError as error:
+        raise InputError(
+            f"furniture is not known yet: outline it in {out / 'reference.png'} (labelme, COCO, or "
+            f"boxes alone), and add --objects FILE to the command; or a network finds it: {error}"
+        ) from error
+    objects = detections_to_json(detections_in(found), camera, "reference.png")
+    write_json(objects, out / "objects.json")
 
 
 def steady_clip(
@@ -138,12 +157,27 @@ def steady_clip(
     return steady, drift
 
 
-def people_of_clip(clip: Clip, config: PerceiveConfig, run: Run, finders: Finders) -> Tracks:
-    """All people in all frames; detections are kept chunk by chunk."""
-    count = len(clip.time)
-    chunks = [tuple(range(k, min(k + CHUNK, count))) for k in range(0, count, CHUNK)]
-    found = [run.stage(finders.instances, DetectInputs(clip, c), config) for c in chunks]
-    return link_people(joined_finds(found))
+def people_of_clip(
+    clip: Clip, drift: Drift, own: Own, config: PerceiveConfig, run: Run, say: Say, finders: Finders
+) -> tuple[Tracks, Keypoints | None]:
+    """People's masks and joints in all frames: those of the user, of MediaPipe, or of networks."""
+    joints = own_keypoints(own, clip, drift, say)
+    poses = None
+    if own.mediapipe and (joints is None or own.masks is None):
+        poses = run.stage(finders.poses, pose_inputs(clip), None)
+        joints = poses_to_keypoints(poses, clip.fps) if joints is None else joints
+    if own.masks is not None:
+        tracks = own_masks(own.masks, clip, drift, say)
+    elif poses is not None:
+        tracks = Tracks(poses.masks, poses.frame, poses.person)
+    else:
+        count = len(clip.time)
+        chunks = [tuple(range(k, min(k + CHUNK, count))) for k in range(0, count, CHUNK)]
+        found = [run.stage(finders.instances, DetectInputs(clip, c), config) for c in chunks]
+        tracks = link_people(joined_finds(found))
+    if joints is None and config.models.keypoints and tracks.masks.counts:
+        joints = run.stage(finders.joints, JointsInputs(clip, tracks), config.models)
+    return tracks, joints
 
 
 def lens_of(size: tuple[int, int], lens: Lens) -> tuple[At, str | None]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mover.core.errors import InputError
+from mover.perceive import weights
 from mover.perceive.config import ModelsConfig
 
 FILES = tuple(
@@ -14,9 +15,11 @@ FILES = tuple(
 )
 """Files in which transformers saves a network; one of them has to be there."""
 PACKAGES = {
-    "transformers": "runs the networks",
-    "av": "reads videos",
+    "transformers": ("runs the networks", "perceive"),
+    "ai_edge_litert": ("runs MediaPipe's networks", "mediapipe"),
+    "av": ("reads videos", ""),
 }
+"""What a package does, and the extra that brings it; empty: all of them."""
 FACTS = {
     "facebook/mask2former-swin-large-coco-instance": (
         "furniture and people in pictures", "MIT (its repository; see its card)", "0.9 GB",
@@ -35,19 +38,27 @@ def install(extra: str) -> str:
     return f"pip install 'mover[{extra}]'"
 
 
-def missing(models: ModelsConfig, kinds: Sequence[str] = NETWORKS) -> list[str]:
+def missing(
+    models: ModelsConfig, kinds: Sequence[str] = NETWORKS, *, mediapipe: bool = False
+) -> list[str]:
     """A sentence for each thing that a video needs and this machine lacks; empty: all is there.
 
     Args:
         models: The networks.
         kinds: Which of them are used.
+        mediapipe: Whether MediaPipe's are used.
     """
     kinds = [kind for kind in kinds if getattr(models, kind)]
-    packages = [name for name in PACKAGES if kinds or name != "transformers"]
+    extra = "perceive" if kinds else "mediapipe"
+    packages = ["av", *(["transformers"] if kinds else [])]
+    packages += ["ai_edge_litert"] if mediapipe else []
     lacking = [name for name in packages if importlib.util.find_spec(name) is None]
     found = [
-        f"the package {name}, which {PACKAGES[name]}: {install('perceive')}" for name in lacking
+        f"the package {name}, which {PACKAGES[name][0]}: {install(PACKAGES[name][1] or extra)}"
+        for name in lacking
     ]
+    if mediapipe and weights.networks() is None:
+        found.append(f"MediaPipe's networks (Apache-2.0; 9 MB): {weights.COMMAND}")
     unknown = "transformers" in lacking  # which finds the cache
     return found + [absent(kind, models) for kind in kinds if unknown or not _is_here(kind, models)]
 
@@ -80,12 +91,14 @@ def absent(kind: str, models: ModelsConfig) -> str:
     )
 
 
-def check_needs(models: ModelsConfig, kinds: Sequence[str] = NETWORKS) -> None:
-    """Refuse to begin where something is missing.
+def check_needs(
+    models: ModelsConfig, kinds: Sequence[str] = NETWORKS, *, mediapipe: bool = False
+) -> None:
+    """Refuse to begin where something is missing, see `missing`.
 
     Raises:
         InputError: With everything that is missing, a line each, and what to do about it.
     """
-    lacking = missing(models, kinds)
+    lacking = missing(models, kinds, mediapipe=mediapipe)
     if lacking:
         raise InputError("\n  ".join(["not on this machine:", *lacking]))

@@ -19,6 +19,10 @@ COMMANDS = {
         "mover.app.cli.video:video",
         "From a video or a picture to a room: pictures, bodies, first scene, room, report.",
     ),
+    "weights": (
+        "mover.app.cli.video:bring_weights",
+        "Bring small networks for `mover video` into the cache folder.",
+    ),
     "import": (
         "mover.app.cli.imports:import_",
         "Turn what other tools wrote into a capture folder.",

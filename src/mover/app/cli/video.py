@@ -4,11 +4,21 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import tyro
 from tyro.conf import Fixed, Positional, Suppress, arg
 
-from mover.app.chain import FIT, BodiesFrom, Steps, make_bodies, steps_in, write_heights
+from mover.app.chain import (
+    FIT,
+    OUT,
+    BodiesFrom,
+    Steps,
+    make_bodies,
+    run_command_line,
+    steps_in,
+    write_heights,
+)
 from mover.app.cli import say
 from mover.app.cli.config import (
     LAYOUT_SETTINGS,
@@ -25,8 +35,10 @@ from mover.perceive.needs import check_needs
 
 if TYPE_CHECKING:
     from mover.perceive.capture import Finders
+    from mover.perceive.own import Own
 
 THREADS = 1  # of torch, as in `run`
+NETWORK, MEDIAPIPE = "network", "mediapipe"
 
 
 @dataclass(frozen=True)
@@ -105,6 +117,25 @@ def layout_into(args: LayoutArgs) -> None:
         say(f"note: not on the floor, left out: {', '.join(sorted(set(first.skipped)))}")
 
 
+@dataclass(frozen=True)
+class WeightsArgs:
+    """Bring MediaPipe's two networks of people's poses (Apache-2.0) into the cache folder."""
+
+    name: Annotated[Positional[Literal["mediapipe"]], arg(metavar="mediapipe")]
+    """What is brought."""
+    file: Annotated[Positional[Path | None], arg(metavar="FILE")] = None
+    """The wheel of mediapipe, pose_landmarker_*.task, or another landmark network .tflite (heavy)
+    that is there; without it, pip downloads the wheel."""
+
+
+def bring_weights(arguments: Sequence[str]) -> None:
+    """`mover weights`."""
+    from mover.perceive.weights import fetch
+
+    args = tyro.cli(WeightsArgs, prog="mover weights", args=list(arguments))
+    fetch(say, args.file)
+
+
 # The whole way in one command.
 
 
@@ -124,6 +155,16 @@ class VideoArgs:
     out: Path
     """Folder for the capture (OUT/capture) and the room (OUT/room); a run that was killed goes on
     there."""
+    keypoints: str = NETWORK
+    """People's joints: network (ViTPose); mediapipe (masks, too); a FILE of joints in the video; or
+    a COMMAND with {video} or {frames}, and {out}, in it."""
+    people_masks: Path | None = None
+    """People's masks in the video: COCO, pictures, arrays."""
+    objects: Path | None = None
+    """Outlines or boxes of furniture (labelme, COCO) in OUT/capture/reference.png, or in a frame
+    of the video."""
+    objects_frame: int | None = None
+    """The number of that frame, from 0."""
     bodies: str = FIT
     """fit: by the open body, to the keypoints; or a FILE; or a COMMAND of a body network with
     {video}, {frames}, {camera} and {out} in it."""
@@ -176,7 +217,7 @@ def video_to_room(args: VideoArgs, finders: "Finders | None" = None) -> None:
     preset_named(args.preset)
     BodiesFrom(args.bodies, args.bodies_tool).check()
     if finders is None:
-        check_needs(args.config.models)
+        _check_needs(args)
     from mover.perceive.video import pictures_of, read_picture, stamp_of
 
     pictures = pictures_of(source)
@@ -185,7 +226,9 @@ def video_to_room(args: VideoArgs, finders: "Finders | None" = None) -> None:
         say(ONE_IMAGE)
     capture, steps = args.out / "capture", steps_in(args.out, say, STEPS)
     lens = args.camera, args.fov, args.photo
+    own = [path for path in (args.people_masks, args.objects, Path(args.keypoints)) if path]
     seen = [str((str(source.resolve()), *stamp_of(source))), repr(args.config), *map(str, lens)]
+    seen += [args.keypoints, str(args.objects_frame), *own]
     steps.do(STEPS[0], seen, capture / "objects.json", lambda: _pictures(args, capture, finders))
     if not json.loads((capture / "objects.json").read_text())["annotations"]:
         raise InputError(
@@ -210,9 +253,48 @@ def _pictures(args: VideoArgs, capture: Path, finders: "Finders | None") -> None
     torch.set_num_threads(THREADS)
     with Bar() as bar:
         run = Run(capture / "perceived", bar)
-        lens = Lens(args.camera, args.fov, args.photo)
-        perceive(Video(args.source, lens), capture, args.config, run, say, finders or Finders())
+        video = Video(args.source, Lens(args.camera, args.fov, args.photo), _own(args, capture))
+        perceive(video, capture, args.config, run, say, finders or Finders())
     say(f"{capture}: wrote frames/, reference.png, objects.json, people.json, camera.json")
+
+
+def _check_needs(args: VideoArgs) -> None:
+    """Refuse to begin where what is still needed is missing; furniture may be outlined later.
+
+    Raises:
+        InputError: With a line for each thing that is missing.
+    """
+    for path in (args.people_masks, args.objects):
+        if path is not None and not path.exists():
+            raise InputError(f"{path}: there is no such file, expected masks or outlines")
+    own = args.keypoints not in (NETWORK, MEDIAPIPE)
+    if own and OUT not in args.keypoints and not Path(args.keypoints).exists():
+        raise InputError(
+            f"--keypoints: {args.keypoints!r} is neither network nor mediapipe, nor a file or "
+            "folder that is there, nor a command with {out} in it"
+        )
+    masks = args.people_masks is None and args.keypoints != MEDIAPIPE
+    kinds = [*(["masks"] if masks else []), *(["keypoints"] if args.keypoints == NETWORK else [])]
+    check_needs(args.config.models, kinds, mediapipe=args.keypoints == MEDIAPIPE)
+
+
+def _own(args: VideoArgs, capture: Path) -> "Own":
+    """What the user hands in."""
+    from mover.perceive.own import Own
+
+    def joints() -> Path:
+        if OUT not in args.keypoints:
+            return Path(args.keypoints)
+        out = capture / "joints-by-command"
+        places = {"video": args.source, "frames": capture / "frames", "out": out}
+        run_command_line("--keypoints", args.keypoints, places)
+        return out
+
+    given = None if args.keypoints in (NETWORK, MEDIAPIPE) else joints
+    return Own(
+        given, "{frames}" in args.keypoints, args.keypoints == MEDIAPIPE, args.people_masks,
+        args.objects, args.objects_frame,
+    )  # fmt: skip
 
 
 def _bodies(capture: Path, args: VideoArgs, steps: Steps) -> None:

@@ -34,7 +34,8 @@ from mover.io.formats import chosen
 from mover.io.people.found import Known, followed
 from mover.io.people.values import either, files_of, need, number_in, numbers, tensor
 
-LAYOUTS = {name: len(JOINTS[name]) for name in ("openpose25", "openpose137", "coco17", "halpe26")}
+_NAMES = ("openpose25", "openpose137", "coco17", "halpe26", "mediapipe33")
+LAYOUTS = {name: len(JOINTS[name]) for name in _NAMES}
 """Number of joints of each layout."""
 CENTRE = 0.5  # [px], detectors call the centre of the top-left pixel (0, 0)
 PARTS = {

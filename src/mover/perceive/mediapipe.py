@@ -1,0 +1,263 @@
+r"""People's joints and masks by MediaPipe's networks (BlazePose), without the package mediapipe.
+
+A detector looks at the whole picture, and gives of each person the middle of the hips and a point
+that marks size and direction; the landmark network looks at the crop that stands upright about
+them, and gives 33 landmarks, a map of where each is likely, and a mask:
+
+    side = 2.5 |q - p|,   turn = pi/2 - atan2(p_y - q_y, q_x - p_x)
+
+Frame by frame: at few frames a second the tracking of MediaPipe loses legs. People are linked by
+their place. Written from the model card (BlazePose GHUM 3D) and the public graphs' settings; pixels
+are counted as there: whole numbers in a crop are whole numbers in the picture.
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mover.core.errors import InputError
+from mover.core.observe import Observer, Step, silent
+from mover.core.records import record
+from mover.core.types import Keypoints, Masks
+from mover.geometry.rle import encode
+from mover.io.people.found import followed
+from mover.perceive import weights
+from mover.perceive.needs import install
+from mover.perceive.video import Clip, read_picture
+
+LAYOUT = "mediapipe33"
+CELLS = ((28, 2), (14, 2), (7, 6))  # anchors: cells along a side, and boxes in each
+SEEN = 0.5  # least score of the detector, and that the landmark network sees a person
+SAME = 0.3  # overlap of boxes of one person
+WIDER = 1.25  # of the circle through the detector's two points
+KERNEL = 7  # cells of a map about a landmark
+LIKELY = 0.5  # least maximum of a map that moves a landmark
+INSIDE = 0.5  # least coverage of a mask
+TWICE = 0.7  # overlap of two masks, over the smaller one, from which they are one person
+SIZES = 224, 256  # [px], of the pictures that the networks see
+
+Array = NDArray[np.floating[Any]]
+
+
+Runs = Callable[[Array], dict[tuple[int, ...], Array]]
+"""A network that is ready: a picture (h, w, 3) in, an array for the shape of each output out."""
+
+
+@record
+class PoseInputs:
+    """Frames in which people are looked for."""
+
+    clip: Clip
+    networks: tuple[str, str]
+    """Files of the detector and of the landmark network,"""
+    digest: str
+    """and a hash of their content."""
+
+
+@record
+class Poses:
+    """People in frames, row by row."""
+
+    masks: Masks
+    points: Float[Tensor, "rows 33 2"]
+    """Pixels."""
+    confidence: Float[Tensor, "rows 33"]
+    frame: Int[Tensor, " rows"]
+    person: Int[Tensor, " rows"]
+
+
+def pose_inputs(clip: Clip) -> PoseInputs:
+    """A clip with the networks of this machine.
+
+    Raises:
+        InputError: If they are not there.
+    """
+    found = weights.networks()
+    if found is None:
+        raise InputError(f"MediaPipe's networks are not here: {weights.COMMAND}")
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in found)).hexdigest()
+    return PoseInputs(clip, (str(found[0]), str(found[1])), digest)
+
+
+def poses_to_keypoints(poses: Poses, fps: float | None) -> Keypoints:
+    """The joints alone."""
+    return Keypoints(poses.points, poses.confidence, LAYOUT, poses.frame, poses.person, fps)
+
+
+def find_poses(inputs: PoseInputs, _config: None = None, observe: Observer = silent) -> Poses:
+    """People in all frames of a clip.
+
+    Raises:
+        InputError: If the networks cannot be run.
+    """
+    detector, landmarks = (loaded(path) for path in inputs.networks)
+    clip = inputs.clip
+    codes, frames = list[bytes](), list[int]()
+    found: list[tuple[Array, Array]] = []
+    for frame in range(len(clip.time)):
+        for points, sure, mask in people_in(read_picture(clip.path(frame)), detector, landmarks):
+            codes.append(encode(torch.from_numpy(mask)))
+            frames.append(frame)
+            found.append((points, sure))
+        observe(Step("find_poses", frame + 1, len(clip.time)))
+    points = np.array([p for p, _ in found]).reshape(-1, 33, 2)
+    low, high = points.min(1), points.max(1)
+    person = followed(frames, (low + high) / 2, np.linalg.norm(high - low, axis=1))
+    return Poses(
+        Masks(clip.height, clip.width, tuple(codes)),
+        torch.from_numpy(points).float(),
+        torch.from_numpy(np.array([s for _, s in found]).reshape(-1, 33)).float(),
+        torch.tensor(frames, dtype=torch.long),
+        torch.from_numpy(person),
+    )
+
+
+def people_in(
+    picture: NDArray[np.uint8], detector: Runs, landmarks: Runs
+) -> list[tuple[Array, Array, NDArray[np.bool_]]]:
+    """Landmarks (33, 2) [px], their visibility, and the mask of each person in a picture."""
+    import cv2
+
+    h, w = picture.shape[:2]
+    kept: list[tuple[Array, Array, NDArray[np.bool_]]] = []
+    for middle, edge in detected(picture, detector):
+        far = edge - middle
+        turn = np.pi / 2 - np.arctan2(-far[1], far[0])
+        side = 2 * WIDER * float(np.linalg.norm(far))
+        crop, M = cropped(picture, middle, side, turn, SIZES[1], cv2.BORDER_REPLICATE)
+        out = landmarks(crop / 255)
+        if float(out[1, 1][0, 0]) < SEEN:
+            continue
+        rows = out[1, 195].reshape(39, 5)
+        places = refined(rows[:33, :2], out[1, 64, 64, 39][0])
+        points = places @ M[:, :2].T + M[:, 2]
+        cover = 1 / (1 + np.exp(-out[1, 256, 256, 1][0, ..., 0].clip(-50, 50)))
+        mask = cv2.warpAffine(cover.astype(np.float32), M, (w, h)) > INSIDE
+        if mask.any() and not any(_shared(mask, other) > TWICE for *_, other in kept):
+            kept.append((points, 1 / (1 + np.exp(-rows[:33, 3].clip(-50, 50))), mask))
+    return kept
+
+
+def detected(picture: NDArray[np.uint8], detector: Runs) -> list[tuple[Array, Array]]:
+    """Middle of the hips of each person, and a point on the circle about them [px], surest first.
+
+    Boxes that overlap the surest one are averaged with it by their scores.
+    """
+    import cv2
+
+    h, w = picture.shape[:2]
+    side, middle = max(h, w), np.array([w / 2, h / 2])
+    crop, M = cropped(picture, middle, side, 0.0, SIZES[0], cv2.BORDER_CONSTANT)
+    out = detector(crop / 127.5 - 1)
+    score = 1 / (1 + np.exp(-out[1, 2254, 1][0, :, 0].clip(-50, 50)))
+    sure = score >= SEEN
+    values = out[1, 2254, 12][0, sure].reshape(-1, 6, 2)  # middle, size, four points
+    anchors = _anchors()[sure] * SIZES[0]
+    values = values + np.where(np.arange(6)[:, None] == 1, 0, anchors[:, None])
+    found: list[tuple[Array, Array]] = []
+    left = np.argsort(-score[sure], kind="stable")
+    while len(left):
+        low, high = values[left, 0] - values[left, 1] / 2, values[left, 0] + values[left, 1] / 2
+        shared = (np.minimum(high, high[0]) - np.maximum(low, low[0])).clip(0).prod(1)
+        area = (high - low).prod(1)
+        same = shared > SAME * (area + area[0] - shared)
+        same[0] = True
+        mean = np.average(values[left[same]], axis=0, weights=score[sure][left[same]])
+        hips, edge = mean[2:4] @ M[:, :2].T + M[:, 2]
+        found.append((hips, edge))
+        left = left[~same]
+    return found
+
+
+@lru_cache(maxsize=1)
+def _anchors() -> Array:
+    """Middles of the detector's boxes in the picture, from 0 to 1 (Liu et al., SSD)."""
+    rows: list[Array] = []
+    for cells, boxes in CELLS:
+        y, x = np.mgrid[:cells, :cells]
+        rows.append(np.repeat(np.stack([x.ravel(), y.ravel()], -1) + 0.5, boxes, 0) / cells)
+    return np.concatenate(rows)
+
+
+def cropped(
+    picture: NDArray[np.uint8], middle: Array, side: float, turn: float, size: int, border: int
+) -> tuple[Array, Array]:
+    """A turned square of a picture, and the matrix (2, 3) from its pixels to the picture's.
+
+    Args:
+        picture: In bytes.
+        middle: Of the square [px].
+        side: Its length [px].
+        turn: Of its x axis, clockwise [rad].
+        size: Pixels along its sides.
+        border: What OpenCV puts where the picture ends.
+    """
+    import cv2
+
+    step = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) * side / size
+    M = np.column_stack([step, middle - step @ [size / 2, size / 2]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    crop = cv2.warpAffine(picture, M, (size, size), flags=flags, borderMode=border)
+    return crop.astype(np.float32), M
+
+
+def refined(places: Array, maps: Array) -> Array:
+    """Landmarks [px of the crop] at the mean of their map about them, where it is sure.
+
+    Args:
+        places: Of the landmarks.
+        maps: (cells, cells, landmarks), logits.
+    """
+    cells, half = len(maps), KERNEL // 2
+    found = places.copy()
+    for k, (x, y) in enumerate((places * cells / SIZES[1]).astype(int)):
+        if not (0 <= x < cells and 0 <= y < cells):
+            continue
+        top, left = max(0, y - half), max(0, x - half)
+        near = maps[top : y + half + 1, left : x + half + 1, k]
+        likely = 1 / (1 + np.exp(-near.clip(-50, 50)))
+        if likely.max() >= LIKELY:
+            at = np.array([likely.sum(0) @ np.arange(left, left + near.shape[1]),
+                           likely.sum(1) @ np.arange(top, top + near.shape[0])])  # fmt: skip
+            found[k] = at / likely.sum() * SIZES[1] / cells
+    return found
+
+
+def _shared(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    """Shared area of two masks over that of the smaller one."""
+    return float((a & b).sum() / max(1, min(a.sum(), b.sum())))
+
+
+@lru_cache(maxsize=4)
+def loaded(path: str) -> Runs:
+    """A network of TensorFlow Lite, on one thread.
+
+    Raises:
+        InputError: If ai-edge-litert is missing, or it cannot read the file.
+    """
+    try:
+        library: Any = import_module("ai_edge_litert.interpreter")
+    except ImportError as error:
+        raise InputError(f"MediaPipe's networks need LiteRT: {install('mediapipe')}") from error
+    try:
+        net = library.Interpreter(model_path=path, num_threads=1)
+        net.allocate_tensors()
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"{Path(path).name}: cannot be read ({error})") from error
+    outputs: Sequence[dict[str, Any]] = net.get_output_details()
+
+    def run(picture: Array) -> dict[tuple[int, ...], Array]:
+        net.set_tensor(net.get_input_details()[0]["index"], picture[None].astype(np.float32))
+        net.invoke()
+        return {tuple(o["shape"].tolist()): net.get_tensor(o["index"]) for o in outputs}
+
+    return run

@@ -1,0 +1,205 @@
+"""What the user hands in of a video: joints, people's masks, outlines or boxes of furniture.
+
+Files count frames and pixels as in the video; both are carried to the frames that are taken, as the
+steadied camera sees them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from mover.core.errors import InputError
+from mover.core.types import Keypoints, Masks
+from mover.geometry.rle import decode, encode
+from mover.io.files.fields import At
+from mover.io.formats import names
+from mover.io.masks.instance_files import read_instances
+from mover.io.masks.instances import Instance, Instances, fitted, followed, is_person, objects_tree
+from mover.io.people.found import Known
+from mover.io.people.keypoints import keypoints_from, read_keypoints
+from mover.perceive.networks import Tracks
+from mover.perceive.steady import Drift, moved, warp
+from mover.perceive.video import Clip
+
+FEW = 0.5  # share of the frames: with fewer in a file the user is warned
+
+
+@dataclass(frozen=True)
+class Own:
+    """What is handed in, or MediaPipe's, in place of what the networks of transformers find."""
+
+    keypoints: Callable[[], Path] | None = None
+    """Gives the file of people's joints, once the frames are written."""
+    of_frames: bool = False
+    """Whether it is made of CAPTURE/frames, not of the video."""
+    mediapipe: bool = False
+    """Whether joints, and masks where none are handed in, are MediaPipe's."""
+    masks: Path | None = None
+    """People's masks."""
+    objects: Path | None = None
+    """Furniture: COCO, labelme or boxes alone."""
+    objects_frame: int | None = None
+    """The frame of the video in which it is outlined; None: the clean picture."""
+
+
+def own_keypoints(
+    own: Own, clip: Clip, drift: Drift, say: Callable[[str], None]
+) -> Keypoints | None:
+    """Joints of the frames that are taken (by their place in the clip), in steadied pixels.
+
+    Raises:
+        InputError: If the file cannot be read or has none of these frames.
+    """
+    if own.keypoints is None:
+        return None
+    path = own.keypoints()
+    found = _read_joints(path)
+    frames = clip.numbers if own.of_frames else clip.index
+    rows, at = _taken(found.frame, frames, path, say)
+    points = found.points[rows]
+    if not own.of_frames and drift.verdict != "still":
+        for k, frame in enumerate(at.tolist()):
+            points[k] = torch.from_numpy(
+                moved(np.linalg.inv(drift.H[frame].double().numpy()), points[k].numpy())
+            )
+    return Keypoints(points, found.confidence[rows], found.layout, at, found.person[rows], clip.fps)
+
+
+def _read_joints(path: Path) -> Keypoints:
+    """A file or folder of joints of any known layout: the first whose reader takes it."""
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file, expected joints of people")
+    first: InputError | None = None
+    for name in ("", *names("keypoints")):
+        try:
+            return keypoints_from(name, path, Known()) if name else read_keypoints(path)
+        except InputError as error:
+            known = path.suffix == ".npz" and "layout" not in str(error)
+            first = error if first is None or (known and not name) else first
+    raise InputError(f"{first}; known are keypoints.npz and {', '.join(names('keypoints'))}")
+
+
+def own_masks(path: Path, clip: Clip, drift: Drift, say: Callable[[str], None]) -> Tracks:
+    """People's masks of the frames that are taken, as the steadied camera sees them.
+
+    Raises:
+        InputError: If the file cannot be read, has another size, or none of these frames.
+    """
+    size = clip.width, clip.height
+    found = fitted(read_instances(path, {}, size), size)
+    items = [item for item in followed(found.items) if item.mask is not None]
+    if any(is_person(item) for item in items):
+        items = [item for item in items if is_person(item)]
+    frames = torch.tensor([item.frame for item in items], dtype=torch.long)
+    rows, at = _taken(frames, clip.index, path, say)
+    codes, kept = list[bytes](), list[int]()
+    for k, (row, frame) in enumerate(zip(rows.tolist(), at.tolist(), strict=True)):
+        mask = decode(Masks(clip.height, clip.width, (items[row].mask or b"",)), 0)
+        mask = mask if drift.verdict == "still" else _carried(mask, drift.H[frame])
+        if bool(mask.any()):
+            codes.append(encode(mask))
+            kept.append(k)
+    person = torch.tensor([items[rows[k]].track or 0 for k in kept], dtype=torch.long)
+    return Tracks(Masks(clip.height, clip.width, tuple(codes)), at[kept], person)
+
+
+def own_objects(own: Own, clip: Clip, drift: Drift) -> At:
+    """The fields of objects.json from outlines or boxes.
+
+    Raises:
+        InputError: If the file cannot be read, has another size or no object.
+    """
+    assert own.objects is not None
+    size = clip.width, clip.height
+    found = fitted(read_instances(own.objects, {}, size), size)
+    items = [item for item in found.items if not is_person(item)]
+    if not items:
+        raise InputError(f"{own.objects.name}: has no furniture, expected outlines or boxes")
+    if own.objects_frame is not None:
+        frame = int((_indices(clip) - own.objects_frame).abs().argmin())
+        items = [_moved_item(item, drift.H[frame], size) for item in items]
+    return objects_tree(Instances(tuple(items), size, found.file), items)
+
+
+def _moved_item(item: Instance, H: Float[Tensor, "3 3"], size: tuple[int, int]) -> Instance:
+    """Outline and box in the pixels of the steadied camera."""
+    mask, box = item.mask, item.box
+    if mask is not None:
+        pixels = _carried(decode(Masks(size[1], size[0], (mask,)), 0), H)
+        mask = encode(pixels) if bool(pixels.any()) else None
+    if box is not None:
+        x0, y0, x1, y1 = box
+        corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+        places = moved(np.linalg.inv(H.double().numpy()), corners).clip(0, size)
+        box = *places.min(0).tolist(), *places.max(0).tolist()
+    return replace(item, mask=mask, box=box)
+
+
+def _carried(mask: Bool[Tensor, "h w"], H: Float[Tensor, "3 3"]) -> Bool[Tensor, "h w"]:
+    """A mask of a frame as the steadied camera sees it."""
+    pixels = mask.numpy().astype(np.float32)
+    return torch.from_numpy(warp(pixels, H.double().numpy(), mask.shape) > 0.5)
+
+
+def _indices(clip: Clip) -> Int[Tensor, " frames"]:
+    return clip.numbers if clip.index is None else clip.index
+
+
+def _taken(
+    frames: Int[Tensor, " rows"],
+    wanted: Int[Tensor, " frames"] | None,
+    path: Path,
+    say: Callable[[str], None],
+) -> tuple[Int[Tensor, " kept"], Int[Tensor, " kept"]]:
+    """Rows of a file whose frame is taken, and its place in the clip.
+
+    Raises:
+        InputError: If there is none.
+    """
+    assert wanted is not None
+    place = {frame: k for k, frame in enumerate(wanted.tolist())}
+    rows = [k for k, frame in enumerate(frames.tolist()) if frame in place]
+    at = [place[int(frames[k])] for k in rows]
+    if not rows:
+        few = ", ".join(map(str, wanted.tolist()[:4]))
+        raise InputError(
+            f"{path.name}: has none of the frames that are taken of the video, expected {few} ... "
+            "(from 0; --frames.fps takes others)"
+        )
+    if len(set(at)) < FEW * len(place):
+        say(f"warning: {path.name} has {len(set(at))} of the {len(place)} frames that are taken")
+    return torch.tensor(rows), torch.tensor(at)
+
+
+def same_people(keypoints: Keypoints, tracks: Tracks) -> Keypoints:
+    """The joints under the numbers of the masks that hold most of them; others are numbered on."""
+    from scipy.optimize import linear_sum_assignment
+
+    rows = {
+        (f, p): k
+        for k, (f, p) in enumerate(zip(tracks.frame.tolist(), tracks.person.tolist(), strict=True))
+    }
+    people, masks = keypoints.person.unique().tolist(), tracks.person.unique().tolist()
+    votes = np.zeros((len(people), len(masks)))
+    for k, (frame, person) in enumerate(
+        zip(keypoints.frame.tolist(), keypoints.person.tolist(), strict=True)
+    ):
+        x, y = keypoints.points[k][keypoints.confidence[k] > 0].long().unbind(-1)
+        for j, other in enumerate(masks):
+            if (frame, other) in rows:
+                mask = decode(tracks.masks, rows[frame, other])
+                inside = (x >= 0) & (y >= 0) & (x < mask.shape[1]) & (y < mask.shape[0])
+                votes[people.index(person), j] += int(mask[y[inside], x[inside]].sum())
+    pairs = zip(*linear_sum_assignment(-votes), strict=True)
+    number = {people[i]: masks[j] for i, j in pairs if votes[i, j] > 0}
+    free = max([*masks, -1]) + 1
+    for person in people:
+        if person not in number:
+            number[person], free = free, free + 1
+    person = torch.tensor([number[p] for p in keypoints.person.tolist()], dtype=torch.long)
+    return replace(keypoints, person=person)

@@ -1,0 +1,223 @@
+"""MediaPipe's networks: pixels in and out, against what mediapipe itself found in real clips."""
+
+import hashlib
+import sys
+import zipfile
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mover.app.cli import run_command
+from mover.bodies.keypoints import LAYOUTS
+from mover.core.errors import InputError
+from mover.geometry.rle import decode
+from mover.perceive import mediapipe, needs, weights
+from mover.perceive.config import FramesConfig, ModelsConfig
+from mover.perceive.mediapipe import (
+    PoseInputs,
+    detected,
+    find_poses,
+    people_in,
+    pose_inputs,
+    refined,
+)
+from mover.perceive.video import Clip, read_frames, write_jpeg
+
+CLIPS = Path(__file__).parents[2] / "shared" / "data" / "clips"
+H, W = 240, 320
+PEOPLE = {(90.0, 120.0): 40.0, (230.0, 110.0): 36.0}
+"""Middle of the hips of the people in the picture [px], and half of their height."""
+
+
+def logit(share: float) -> float:
+    return float(np.log(share / (1 - share)))
+
+
+def detector(picture: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
+    """Finds white squares: two boxes that overlap for each person, the hips, a point above."""
+    assert picture.shape == (224, 224, 3)
+    assert picture.min() >= -1
+    assert picture.max() <= 1
+    scores, values = np.full((2254, 1), -50.0), np.zeros((2254, 12))
+    anchors = mediapipe._anchors() * 224
+    scale = 224 / W
+    for x, y in PEOPLE:
+        at = np.array([x, y + (W - H) / 2]) * scale
+        if picture[tuple(at[::-1].astype(int))].min() < 0.5:
+            continue
+        for k in np.square(anchors - at).sum(1).argsort()[:2]:
+            half = PEOPLE[x, y] * scale
+            edge = at - [0, 2 * half]
+            scores[k] = logit(0.9)
+            values[k] = [*(at - anchors[k]), half, half, *(at - anchors[k]), *(edge - anchors[k]),
+                         *np.zeros(4)]  # fmt: skip
+    return {(1, 2254, 12): values[None], (1, 2254, 1): scores[None]}
+
+
+def landmarks(picture: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
+    """Finds the hips in the middle of its crop, and a mask about them."""
+    assert picture.shape == (256, 256, 3)
+    assert picture.max() <= 1
+    white = picture.min(-1) > 0.5
+    rows = np.zeros((39, 5))
+    rows[:, :2], rows[:, 3] = 128, logit(0.8)
+    rows[0, :2] = 128, 28  # the nose, up in the crop
+    maps = np.full((64, 64, 39), -50.0)
+    maps[32, 34, 1] = 5.0  # the second one is sure two cells to the right
+    return {
+        (1, 195): rows.reshape(1, -1), (1, 1): np.array([[0.9 if white[128, 128] else 0.1]]),
+        (1, 64, 64, 39): maps[None], (1, 256, 256, 1): np.where(white, 9.0, -9.0)[None, ..., None],
+    }  # fmt: skip
+
+
+def crowd(*people: tuple[float, float]) -> np.ndarray:
+    picture = np.zeros((H, W, 3), np.uint8)
+    for x, y in people:
+        half = int(PEOPLE[x, y])
+        picture[int(y) - half : int(y) + half, int(x) - half // 2 : int(x) + half // 2] = 255
+    return picture
+
+
+def test_several_people_are_found_upright_in_the_pixels_of_the_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    one, two = PEOPLE
+    for k, people in enumerate([(one, two), (two,), (), (one, two)]):
+        write_jpeg(crowd(*people), tmp_path / f"{k:06d}.jpg")
+    monkeypatch.setattr(mediapipe, "loaded", {"d": detector, "l": landmarks}.__getitem__)
+    clip = Clip(str(tmp_path), W, H, torch.arange(4) / 5, 5.0)
+    found = find_poses(PoseInputs(clip, ("d", "l"), ""))
+    assert found.frame.tolist() == [0, 0, 1, 3, 3]
+    middle = found.points[:, 5]
+    names = {one: 0, two: 1} if float(middle[0, 0]) < 160 else {one: 1, two: 0}
+    assert found.person.tolist() == [0, 1, names[two], *found.person.tolist()[3:]]
+    assert sorted(found.person.tolist()[3:]) == [0, 1]
+    for k in range(5):
+        at = {v: key for key, v in names.items()}[int(found.person[k])]
+        side = 5 * PEOPLE[at]
+        assert middle[k].tolist() == pytest.approx(at, abs=0.6)
+        nose = (at[0], at[1] - 100 / 256 * side)
+        assert found.points[k, 0].tolist() == pytest.approx(nose, abs=0.6)
+        moved = (at[0] + 8 / 256 * side, at[1])
+        assert found.points[k, 1].tolist() == pytest.approx(moved, abs=0.6)
+        true = torch.from_numpy(crowd(at)[..., 0] > 127)
+        mask = decode(found.masks, k)
+        assert float((mask & true).sum() / (mask | true).sum()) > 0.9
+    assert found.confidence.flatten().tolist() == pytest.approx([0.8] * 5 * 33)
+
+
+def test_nothing_is_found_in_an_empty_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_jpeg(crowd(), tmp_path / "000000.jpg")
+    monkeypatch.setattr(mediapipe, "loaded", {"d": detector, "l": landmarks}.__getitem__)
+    clip = Clip(str(tmp_path), W, H, torch.zeros(1), 5.0)
+    found = find_poses(PoseInputs(clip, ("d", "l"), ""))
+    assert found.points.shape == (0, 33, 2)
+    assert detected(crowd(), detector) == []
+    assert np.array_equal(refined(np.full((39, 2), -9.0), np.zeros((64, 64, 39)))[0], [-9, -9])
+
+
+def test_the_layout_names_what_the_body_model_has():
+    names = LAYOUTS["mediapipe33"]
+    assert len(names) == 33
+    for k, name in {0: "nose", 11: "left_shoulder", 16: "right_wrist", 24: "right_hip",
+                    28: "right_ankle", 29: "left_heel", 32: "right_big_toe"}.items():  # fmt: skip
+        assert names[k] == name
+
+
+class TestWeights:
+    @pytest.fixture(autouse=True)
+    def cache(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+    def archive(self, path: Path, files: dict[str, bytes]) -> Path:
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in files.items():
+                archive.writestr(name, content)
+        return path
+
+    def test_networks_come_out_of_a_wheel_or_a_bundle_and_a_single_file_replaces_one(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ):
+        content = b"\0\0\0\0TFL3" + bytes(9)
+        digest = hashlib.sha256(content).hexdigest()
+        wheel = {name: (here, digest) for name, (here, _) in weights.IN_WHEEL.items()}
+        monkeypatch.setattr(weights, "IN_WHEEL", wheel)
+        source = self.archive(tmp_path / "m.whl", dict.fromkeys(wheel, content))
+        assert weights.networks() is None
+        assert run_command("weights", ["mediapipe", str(source)]) == 0
+        assert weights.networks() is not None
+        assert capsys.readouterr().out.count("wrote") == 2
+        heavy = tmp_path / "heavy.tflite"
+        heavy.write_bytes(content + b"1")
+        weights.fetch(print, heavy)
+        bundle = dict.fromkeys(weights.IN_TASK, content + b"2")
+        for source, last in ((heavy, b"1"), (self.archive(tmp_path / "h.task", bundle), b"2")):
+            weights.fetch(print, source)
+            assert (weights.folder() / weights.LANDMARKS).read_bytes()[-1:] == last
+
+    @pytest.mark.parametrize(
+        ("name", "content", "words"),
+        [
+            ("m.whl", b"PK", "cannot be read"),
+            ("m.whl", None, "is not that of mediapipe==0.10.21"),
+            ("m.task", None, "cannot be read"),
+            ("m.tflite", b"nonsense", "no network of TensorFlow Lite"),
+        ],
+    )
+    def test_what_is_no_network_is_refused(
+        self, name: str, content: bytes | None, words: str, tmp_path: Path
+    ):
+        path = tmp_path / name
+        if content is None:
+            self.archive(path, dict.fromkeys(weights.IN_WHEEL, b"\0\0\0\0TFL3other"))
+        else:
+            path.write_bytes(content)
+        with pytest.raises(InputError, match=words):
+            weights.fetch(print, path)
+        with pytest.raises(InputError, match="no such file"):
+            weights.fetch(print, tmp_path / "none.whl")
+        assert weights.networks() is None
+
+    def test_a_download_that_fails_says_what_to_do(self, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.setattr(sys, "executable", "false")
+        with pytest.raises(InputError, match=r"mover weights mediapipe FILE\.whl"):
+            weights.fetch(print)
+
+    def test_only_what_is_needed_is_asked_for(self, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.setattr(needs.importlib.util, "find_spec", lambda _: None)
+        found = needs.missing(ModelsConfig(), (), mediapipe=True)
+        assert [line.split(":")[0].split(",")[0] for line in found] == [
+            "the package av", "the package ai_edge_litert",
+            "MediaPipe's networks (Apache-2.0; 9 MB)",
+        ]  # fmt: skip
+        assert all("mediapipe" in line for line in found)
+        assert not any("mediapipe" in line for line in needs.missing(ModelsConfig()))
+        with pytest.raises(InputError, match="mover weights mediapipe"):
+            pose_inputs(Clip("", 1, 1, torch.zeros(1), None))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CLIPS.is_dir(), reason="shared/data is not there")
+@pytest.mark.skipif(find_spec("ai_edge_litert") is None, reason="ai-edge-litert is not installed")
+@pytest.mark.skipif(weights.networks() is None, reason="mover weights mediapipe has not been run")
+@pytest.mark.parametrize("name", ["s1_ADL_16", "s3_ADL_18", "s4_ADL_19"])
+def test_joints_and_masks_are_those_of_mediapipe(name: str):
+    stored = np.load(CLIPS / name / "mediapipe_full.npz")
+    wanted, misses, overlaps = stored["frame"].tolist(), list[float](), list[float]()
+    nets = [mediapipe.loaded(str(path)) for path in weights.networks() or ()]
+    for index, _, pixels in read_frames(CLIPS / name / "video.mp4", FramesConfig()):
+        if index not in wanted[5::9]:
+            continue
+        row, picture = wanted.index(index), pixels()
+        found = people_in(picture, *nets)
+        off = [np.linalg.norm(p - stored["points33"][row], axis=1).mean() for p, *_ in found]
+        misses.append(min(off))
+        mask, size = found[int(np.argmin(off))][2], picture.shape[:2]
+        true = np.unpackbits(stored["mask"][row]).ravel()[: mask.size].reshape(size) > 0
+        overlaps.append(float((mask & true).sum() / (mask | true).sum()))
+    assert len(misses) >= 2
+    assert np.median(misses) < 0.8  # px; the networks' own noise is 1.6
+    assert min(overlaps) > 0.95
