@@ -21,7 +21,7 @@ from mover.core.types import Keypoints, Masks
 from mover.geometry.rle import decode, encode, tight_box
 from mover.perceive.capture import Finders
 from mover.perceive.config import ModelsConfig, PerceiveConfig
-from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs
+from mover.perceive.networks import PERSON, DetectInputs, Finds, JointsInputs, Tracks
 from mover.perceive.video import Clip, read_picture
 
 COLOURS = {PERSON: (225, 30, 200), "chair": (20, 190, 60)}
@@ -164,4 +164,9 @@ def joints(inputs: JointsInputs, _config: ModelsConfig, _observe: Observer = sil
     )  # fmt: skip
 
 
+def no_network(inputs: object, _config: object, _observe: Observer = silent) -> Tracks:
+    raise AssertionError(f"a network is asked for {inputs}")
+
+
 FINDERS = Finders(instances, joints)
+NO_FINDERS = Finders(no_network, no_network, no_network)

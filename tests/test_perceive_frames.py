@@ -24,7 +24,14 @@ from mover.perceive.steady import (
     warnings_of,
     warp,
 )
-from mover.perceive.video import Clip, TakeInputs, load_frame, stamp_of, take_frames, write_jpeg
+from mover.perceive.video import (
+    Clip,
+    TakeInputs,
+    read_picture,
+    stamp_of,
+    take_frames,
+    write_jpeg,
+)
 
 BEDROOM = Path(__file__).parents[2] / "shared" / "data" / "sam2_bedroom" / "bedroom.mp4"
 W, H = 320, 180
@@ -103,6 +110,10 @@ def write_clip(folder: Path, turns: list[np.ndarray], walkers: bool = False) -> 
         pixels = (picture * 255).round().to(torch.uint8).numpy()
         write_jpeg(np.ascontiguousarray(pixels), folder / f"{k:06d}.jpg")
     return Clip(str(folder), W, H, torch.arange(len(turns)) / 5, 5.0)
+
+
+def load_frame(path: Path) -> torch.Tensor:
+    return torch.from_numpy(read_picture(path)).float() / 255
 
 
 def found_in(clip: Clip) -> tuple[Drift, list[str]]:

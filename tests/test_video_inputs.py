@@ -1,24 +1,46 @@
 """Videos as people film them: turned, uneven, short, long, cut, without people or furniture."""
 
 import json
+import re
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from filmed import FINDERS, Shot, filmed, held, turned, walk, write_film
+from filmed import (
+    FIGURE,
+    FINDERS,
+    NO_FINDERS,
+    H,
+    Shot,
+    W,
+    filmed,
+    held,
+    instances,
+    turned,
+    walk,
+    write_film,
+)
 from PIL import Image
 from test_pipeline import light
 
 from mover.app.cli.video import VideoArgs, video_to_room
 from mover.core.errors import InputError
+from mover.core.observe import Observer, silent
 from mover.core.run import Run
-from mover.core.types import Scene
+from mover.core.types import Masks, Scene
+from mover.geometry.rle import decode, tight_box
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.people.keypoints import read_keypoints
+from mover.perceive import capture as capture_of_video
 from mover.perceive.capture import Video, perceive
 from mover.perceive.config import FramesConfig, Lens, PerceiveConfig
+from mover.perceive.mediapipe import PoseInputs, Poses
+from mover.perceive.networks import DetectInputs, Finds, link_people
+from mover.perceive.own import Own
 from mover.perceive.video import TakeInputs, stamp_of, take_frames
 from mover.pipeline.presets import PRESETS
 
@@ -95,6 +117,109 @@ def test_another_video_in_the_same_folder_leaves_nothing_of_the_first(tmp_path: 
     perceived(tmp_path / "w.mp4", tmp_path / "c")
     assert len(list((tmp_path / "c" / "frames").iterdir())) == 5
     assert not (tmp_path / "c" / "keypoints.npz").exists()
+
+
+SWAY = [(0, 0), (3, 1), (5, 2), (4, 1), (2, 0), (0, 0)]
+"""Where in the world the pictures of a swaying camera begin [px]."""
+
+
+def swaying(path: Path) -> Path:
+    """A film of a swaying camera, five pictures a second of which every second one repeats."""
+    shots = [Shot(look=(4 + x, 4 + y)) for x, y in SWAY for _ in range(2)]
+    pictures = [shot.at(0.2 * (k // 2)) for k, shot in enumerate(shots)]
+    write_film(path, pictures, [3 * k for k in range(len(pictures))])
+    return path
+
+
+def test_joints_masks_and_outlines_in_pixels_of_a_swaying_video_are_carried_along(tmp_path: Path):
+    """Each file counts the frames of the video; the people's numbers are those of the masks."""
+    film = swaying(tmp_path / "v.mp4")
+    boxes = [(round(walk(0.2 * k)), H - 70, 20, 62) for k in range(len(SWAY))]  # x, y, w, h
+    joints, images, people = [], [], []
+    for k, (x, y, w, h) in enumerate(boxes):
+        points = [v for a, b in FIGURE for v in (x + a * w - 0.5, y + b * h - 0.5, 1.0)]
+        images.append({"id": 2 * k, "width": W, "height": H})
+        outline = [[x, y, x + w, y, x + w, y + h, x, y + h]]
+        row = {"id": k, "image_id": 2 * k, "category_id": 1}
+        people.append({**row, "track_id": 5, "bbox": [x, y, w, h], "segmentation": outline})
+        joints.append({"image_id": 2 * k, "keypoints": points, "score": 1.0, "track_id": 2})
+    names = [{"id": 1, "name": "person"}]
+    masks = {"images": images, "annotations": people, "categories": names}
+    chair = [[W - 34, H - 40], [W - 10, H - 40], [W - 10, H - 12], [W - 34, H - 12]]
+    shape = {"label": "chair", "points": chair, "shape_type": "polygon"}
+    labelme = {"imageWidth": W, "imageHeight": H, "shapes": [shape]}
+    for name, tree in (("joints", joints), ("masks", masks), ("chair", labelme)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(tree))
+    own = Own(
+        lambda: tmp_path / "joints.json", masks=tmp_path / "masks.json",
+        objects=tmp_path / "chair.json", objects_frame=4,
+    )  # fmt: skip
+    out, said = tmp_path / "c", list[str]()
+    video = Video(film, Lens(fov=60.0), own)
+    perceive(video, out, PerceiveConfig(), Run(out / "perceived"), said.append, NO_FINDERS)
+    (reference,) = re.findall(r"sways .* onto frame (\d+)", "\n".join(said))
+    at = SWAY[int(reference)]
+    found = read_keypoints(out / "keypoints.npz")
+    assert found.frame.tolist() == list(range(len(SWAY)))
+    assert found.person.tolist() == [5] * len(SWAY)
+    for k, (x, y, w, h) in enumerate(boxes):
+        true = np.add((x, y), FIGURE * (w, h)) + np.subtract(SWAY[k], at)
+        assert np.abs(found.points[k].numpy() - true).max() < 0.7
+    for k, row in enumerate(rows(out, "people.json")):
+        mask = decode(Masks(H, W, (row["segmentation"]["counts"].encode(),)), 0)
+        left, top = np.add(boxes[k][:2], np.subtract(SWAY[k], at))
+        right = left + 20, top + 62
+        assert tight_box(mask).tolist() == pytest.approx([left, top, *right], abs=1.5)
+        assert (row["image_id"], row["track_id"]) == (k, 5)
+    (row,) = rows(out, "objects.json")
+    assert row["bbox"] == pytest.approx([W - 34 + 5 - at[0], H - 40 + 2 - at[1], 24, 28], abs=1.5)
+    (tmp_path / "joints.json").write_text(json.dumps([{**joints[0], "image_id": 1}]))
+    with pytest.raises(InputError, match=r"none of the frames .* expected 0, 2, 4, 6"):
+        perceive(video, out, PerceiveConfig(), Run(out / "perceived"), print, NO_FINDERS)
+
+
+def test_without_a_network_for_furniture_all_else_is_written_and_the_outlines_are_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """And MediaPipe's masks and joints, or a command's joints, are all that is needed of people."""
+    filmed(tmp_path / "v.mp4", Shot(), range(0, SECOND, 3))
+
+    monkeypatch.setattr(
+        capture_of_video, "pose_inputs", lambda clip: PoseInputs(clip, ("", ""), "")
+    )
+
+    def poses(inputs: PoseInputs, _config: None, _observe: Observer = silent) -> Poses:
+        frames = tuple(range(len(inputs.clip.time)))
+        tracks = link_people(instances(DetectInputs(inputs.clip, frames), PerceiveConfig()))
+        count = len(tracks.frame)
+        return Poses(
+            tracks.masks, torch.full((count, 33, 2), 40.0), torch.ones(count, 33), tracks.frame,
+            tracks.person,
+        )  # fmt: skip
+
+    def absent(_inputs: DetectInputs, _config: PerceiveConfig, _: Observer = silent) -> Finds:
+        raise InputError("no network")
+
+    finders = replace(NO_FINDERS, poses=poses, instances=absent)
+    out = tmp_path / "out"
+    code = (
+        "import sys, json; rows = [{'image_id': k, 'keypoints': [9, 8, 1] * 17} for k in range(5)];"
+        "json.dump(rows, open(sys.argv[2], 'w'))"
+    )
+    command = f"{sys.executable} -c {json.dumps(code)} {{frames}} {{out}}"
+    for joints, layout in (("mediapipe", "mediapipe33"), (command, "coco17")):
+        args = VideoArgs(tmp_path / "v.mp4", out, keypoints=joints, fov=60)
+        args = args if joints == "mediapipe" else replace(args, people_masks=tmp_path / "masks")
+        with pytest.raises(InputError, match=r"outline it in .*reference\.png .* --objects FILE"):
+            video_to_room(args, finders)
+        found = read_keypoints(out / "capture" / "keypoints.npz")
+        assert found.layout == layout
+        assert found.frame.tolist() == list(range(5))
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        for k in range(0, 10, 2):
+            picture = Image.new("L", (W, H), 0)
+            picture.paste(1, (4, 4, 24, 40))
+            picture.save(tmp_path / "masks" / f"{k:06d}.png")
 
 
 def test_of_a_video_that_is_cut_the_longest_shot_is_used_and_said(

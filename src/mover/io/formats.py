@@ -126,7 +126,7 @@ FORMATS = (
         "people.keypoints:read_instances", {"layout": "halpe26"},
     ),
     Format(
-        "keypoints", "mediapipe", "MediaPipe's 33 landmarks in pixels: JSON or npz",
+        "keypoints", "mediapipe", "MediaPipe's 33 landmarks in pixels: JSON",
         "people.keypoints:read_instances", {"layout": "mediapipe33"},
     ),
     Format("keypoints", "openpose", "a folder of OpenPose", "people.keypoints:read_openpose"),

@@ -32,7 +32,7 @@ from mover.io.capture.folder import folder_parts
 from mover.io.capture.scene_file import write_hypotheses, write_scene
 from mover.io.files.cameras import guessed_view, of_view, read_camera_file, with_spread
 from mover.io.files.fields import At, get, maybe, number, read_json, write_json
-from mover.io.files.images import find_depth_file, read_depth, write_image
+from mover.io.files.images import find_depth_file, opened, read_depth, write_image
 from mover.io.people.keypoints import write_keypoints
 from mover.perceive.config import Lens, ModelsConfig, PerceiveConfig
 from mover.perceive.layout import FirstScene, Picture
@@ -56,7 +56,7 @@ from mover.perceive.networks import (
 from mover.perceive.own import Own, own_keypoints, own_masks, own_objects, same_people
 from mover.perceive.reference import clip_of_clean, detections_in, hidden_mask, reference_of
 from mover.perceive.steady import Drift, SteadyInputs, find_drift, steady_frames, warnings_of
-from mover.perceive.video import Clip, TakeInputs, opened_picture, stamp_of, take_frames
+from mover.perceive.video import Clip, TakeInputs, stamp_of, take_frames
 
 log = logging.getLogger(__name__)
 CHUNK = 50  # frames whose detections are kept together
@@ -122,7 +122,6 @@ def perceive(
     tree = people_to_json(people, hidden_mask(clean), clip.fps, clip.numbers.tolist())
     write_json(tree, out / "people.json")
     if joints is not None and len(joints.frame):
-        joints = same_people(joints, tracks)
         write_keypoints(replace(joints, frame=clip.numbers[joints.frame]), out / "keypoints.npz")
     else:
         (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
@@ -177,6 +176,8 @@ def people_of_clip(
         tracks = link_people(joined_finds(found))
     if joints is None and config.models.keypoints and tracks.masks.counts:
         joints = run.stage(finders.joints, JointsInputs(clip, tracks), config.models)
+    if joints is not None and not (own.keypoints is None and own.masks is None):
+        joints = same_people(joints, tracks)
     return tracks, joints
 
 
@@ -234,7 +235,7 @@ def exif_focal(photo: Path, size: tuple[int, int]) -> float | None:
     Raises:
         InputError: If it is no picture.
     """
-    with opened_picture(photo, large="ignore") as picture:
+    with opened(photo) as picture:
         found: Any = picture.getexif().get_ifd(EXIF_IFD).get(FOCAL_35)
     if found is None or not 1 <= float(found) <= 2000:
         return None

@@ -72,15 +72,14 @@ def own_keypoints(
 
 def _read_joints(path: Path) -> Keypoints:
     """A file or folder of joints of any known layout: the first whose reader takes it."""
-    if not path.exists():
-        raise InputError(f"{path}: there is no such file, expected joints of people")
+    if path.suffix == ".npz":
+        return read_keypoints(path)
     first: InputError | None = None
-    for name in ("", *names("keypoints")):
+    for name in names("keypoints"):
         try:
-            return keypoints_from(name, path, Known()) if name else read_keypoints(path)
+            return keypoints_from(name, path, Known())
         except InputError as error:
-            known = path.suffix == ".npz" and "layout" not in str(error)
-            first = error if first is None or (known and not name) else first
+            first = first or error
     raise InputError(f"{first}; known are keypoints.npz and {', '.join(names('keypoints'))}")
 
 
@@ -180,26 +179,16 @@ def same_people(keypoints: Keypoints, tracks: Tracks) -> Keypoints:
     """The joints under the numbers of the masks that hold most of them; others are numbered on."""
     from scipy.optimize import linear_sum_assignment
 
-    rows = {
-        (f, p): k
-        for k, (f, p) in enumerate(zip(tracks.frame.tolist(), tracks.person.tolist(), strict=True))
-    }
     people, masks = keypoints.person.unique().tolist(), tracks.person.unique().tolist()
     votes = np.zeros((len(people), len(masks)))
-    for k, (frame, person) in enumerate(
-        zip(keypoints.frame.tolist(), keypoints.person.tolist(), strict=True)
-    ):
+    for k, row in (keypoints.frame[:, None] == tracks.frame).nonzero().tolist():
+        mask = decode(tracks.masks, row)
         x, y = keypoints.points[k][keypoints.confidence[k] > 0].long().unbind(-1)
-        for j, other in enumerate(masks):
-            if (frame, other) in rows:
-                mask = decode(tracks.masks, rows[frame, other])
-                inside = (x >= 0) & (y >= 0) & (x < mask.shape[1]) & (y < mask.shape[0])
-                votes[people.index(person), j] += int(mask[y[inside], x[inside]].sum())
+        inside = mask[y.clamp(0, mask.shape[0] - 1), x.clamp(0, mask.shape[1] - 1)]
+        pair = people.index(int(keypoints.person[k])), masks.index(int(tracks.person[row]))
+        votes[pair] += int(inside.sum())
     pairs = zip(*linear_sum_assignment(-votes), strict=True)
     number = {people[i]: masks[j] for i, j in pairs if votes[i, j] > 0}
-    free = max([*masks, -1]) + 1
-    for person in people:
-        if person not in number:
-            number[person], free = free, free + 1
-    person = torch.tensor([number[p] for p in keypoints.person.tolist()], dtype=torch.long)
-    return replace(keypoints, person=person)
+    others = [person for person in people if person not in number]
+    number |= {person: max([*masks, -1]) + 1 + k for k, person in enumerate(others)}
+    return replace(keypoints, person=torch.tensor([number[p] for p in keypoints.person.tolist()]))

@@ -75,7 +75,7 @@ def align(first: Grey, picture: Grey, start: Matrix) -> Fit:
     """
     import cv2
 
-    corners = cv2.goodFeaturesToTrack(first, POINTS, DETAIL, APART)
+    corners: Any = cv2.goodFeaturesToTrack(first, POINTS, DETAIL, APART)
     if corners is None:
         return Fit(start, 0.0)
     points = corners[:, 0] + 0.5
@@ -86,8 +86,10 @@ def align(first: Grey, picture: Grey, start: Matrix) -> Fit:
     known = found[:, 0] > 0
     if known.sum() < LEAST:
         return Fit(start, 0.0)
-    H, _ = cv2.findHomography(points[known], places[known, 0] + 0.5, cv2.USAC_ACCURATE, NOISE)
-    return Fit(start, 0.0) if H is None else Fit(H, _agreement(first, picture, H))
+    fit: Any = cv2.findHomography(points[known], places[known, 0] + 0.5, cv2.USAC_ACCURATE, NOISE)[
+        0
+    ]
+    return Fit(start, 0.0) if fit is None else Fit(fit, _agreement(first, picture, fit))
 
 
 def _agreement(first: Grey, picture: Grey, H: Matrix) -> float:
@@ -211,8 +213,8 @@ def _judged(from_first: Matrix, agree: list[float], size: tuple[int, int]) -> Dr
     places = np.stack([moved(H, points) for H in from_first])
     off = np.linalg.norm(places - np.median(places, axis=0), axis=-1).max(-1)
     reference = int(off.argmin())
-    H = from_first @ np.linalg.inv(from_first[reference])
-    H /= H[:, 2:, 2:]
+    turned = from_first @ np.linalg.inv(from_first[reference])
+    H = turned / turned[:, 2:, 2:]
     far = max(np.linalg.norm(moved(one, points) - points, axis=-1).max() for one in H)
     lost = np.mean(np.array(agree) < AGREE)
     verdict = "still" if far <= STILL * max(size) else "sways"

@@ -4,13 +4,11 @@ A frame of number k was taken about k/fps after the chosen start. Phones' videos
 one has no picture for a while, numbers are missing.
 """
 
-import warnings
-from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +20,7 @@ from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import fingerprint, record
 from mover.io.files.fields import reason
+from mover.io.files.images import opened
 from mover.io.people.values import natural
 from mover.perceive.config import FramesConfig
 from mover.perceive.needs import install
@@ -200,35 +199,8 @@ def read_picture(path: Path) -> Picture:
     """
     from PIL import ImageOps
 
-    with opened_picture(path) as picture:
+    with opened(path, bombs="error") as picture:
         return np.array(ImageOps.exif_transpose(picture).convert("RGB"))
-
-
-@contextmanager
-def opened_picture(
-    path: Path, expected: str = "a picture", large: Literal["error", "ignore"] = "error"
-) -> Generator[Any]:
-    """An open picture of PIL; an error while it is used becomes one sentence.
-
-    Args:
-        path: The file.
-        expected: What it should be.
-        large: What becomes of one with suspiciously many pixels.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter(large, Image.DecompressionBombWarning)
-            with Image.open(path) as picture:
-                yield picture
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Warning) as error:
-        raise InputError(
-            f"{path.name}: cannot be read ({reason(error)}), expected {expected}"
-        ) from error
 
 
 def write_jpeg(picture: Picture, path: Path) -> None:
@@ -239,32 +211,23 @@ def write_jpeg(picture: Picture, path: Path) -> None:
         Image.fromarray(picture).save(part, format="JPEG", quality=QUALITY)
 
 
-def load_frame(path: Path) -> Float[Tensor, "h w 3"]:
-    """A frame in [0, 1]."""
-    return torch.from_numpy(read_picture(path)).float() / 255
-
-
 def _rate(source: Path, config: FramesConfig) -> float | None:
     """Frames a second of what is taken."""
     known = config.folder_fps or None
     if not pictures_of(source):
         with _opened(source) as container:
-            known = float(container.streams.video[0].average_rate or USUAL_RATE)
+            stream = container.streams.video[0]
+            known = float(stream.average_rate or USUAL_RATE)
             if not config.fps or known < config.fps:  # a pause or a late end spoils the average
-                known = _usual_rate(container) or known
+                try:
+                    packets = [p for p in container.demux(stream) if p.pts is not None]
+                except (OSError, ValueError):  # decoding will say so
+                    packets = []
+                gaps = np.diff(np.unique([float(p.pts * p.time_base) for p in packets]))
+                if len(gaps):
+                    near = np.abs(gaps - np.median(gaps)) < SAME_GAP * np.median(gaps)
+                    known = 1 / float(gaps[near].mean())
     return known if known is None or not config.fps else min(known, config.fps)
-
-
-def _usual_rate(container: Any) -> float | None:  # noqa: ANN401
-    """Frames a second where a video is even; None: unknown."""
-    try:
-        packets = container.demux(container.streams.video[0])
-        times = sorted(float(p.pts * p.time_base) for p in packets if p.pts is not None)
-    except (OSError, ValueError):  # decoding will say so
-        return None
-    gaps = np.diff(np.unique(times))
-    usual = gaps[np.abs(gaps - np.median(gaps)) < SAME_GAP * np.median(gaps)] if len(gaps) else gaps
-    return 1 / float(usual.mean()) if len(usual) else None
 
 
 def _opened(source: Path) -> Any:  # noqa: ANN401
