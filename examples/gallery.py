@@ -17,8 +17,14 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from mover.app.pictures.eye import orbit_eye
 from mover.app.pictures.film import pixels
-from mover.app.pictures.paint import Surfaces, furniture, ground_under, joined, people
-from mover.app.pictures.render import set_up, show
+from mover.app.pictures.paint import (
+    Surfaces,
+    draw_picture,
+    furniture,
+    ground_under,
+    joined,
+    people,
+)
 from mover.bodies.skinning import open_body
 from mover.core.types import Bodies, Camera, Scene, SceneObject
 from mover.furniture.library import STYLES, make_piece
@@ -62,10 +68,9 @@ def coloured(pieces: tuple[Placed, ...]) -> Surfaces:
 
 def picture_of(still: Surfaces, moving: Surfaces, azimuth: float, elevation: float) -> Image.Image:
     """A picture from around."""
-    points = torch.cat([still.verts, moving.verts])
-    eye = orbit_eye(points, CELL, azimuth, elevation)
-    board = set_up(eye, ground_under(points, 0.0), still)
-    return Image.fromarray(pixels(show(board, moving)))
+    both = joined([still, moving])
+    eye = orbit_eye(both.verts, CELL, azimuth, elevation)
+    return Image.fromarray(pixels(draw_picture(both, eye, ground_under(both.verts, 0.0))[0]))
 
 
 def surfaces_of(verts: np.ndarray) -> Surfaces:

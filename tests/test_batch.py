@@ -27,6 +27,7 @@ from mover.app.batch import (
 )
 from mover.core.errors import InputError
 
+REFUSED = "mover run: camera.json: field 'w' has 0, expected a number above 0"
 FAKE = """
 import json, os, sys, time
 from pathlib import Path
@@ -43,6 +44,8 @@ if task == "crash":
     os._exit(86)
 if task == "killed":
     os.kill(os.getpid(), 11)
+if task == "interrupted":
+    os.kill(os.getpid(), 2)
 if task == "slow":
     time.sleep(600)
 time.sleep(float(os.environ.get("FAKE_SECONDS", "0")))
@@ -92,33 +95,25 @@ def run_here(folder: Path, workers: int = 2, retry: bool = False, **more: Any) -
     return [outcome.state for outcome in outcomes]
 
 
-class Clock:
-    """Stands still until all captures but one have ended; then the limit of the last is over."""
-
-    def __init__(self, out: Path, others: int) -> None:
-        self.out, self.others = out, others
-
-    def monotonic(self) -> float:
-        ended = [*self.out.glob("failures/*.json"), *self.out.glob("*/batch.json")]
-        return 100.0 if len(ended) >= self.others else 0.0
-
-
-def test_each_way_to_fail_leaves_its_own_clear_record(tmp_path: Path, monkeypatch):
+def test_each_way_to_fail_leaves_its_own_clear_record(tmp_path: Path):
     ways = {0: "refuse", 1: "crash", 2: "slow", 3: "killed", 4: "silent"}
     fakes(tmp_path, 7, ways)
-    monkeypatch.setattr("mover.app.batch.time", Clock(tmp_path / "out", 6))
-    found = run_here(tmp_path, limit=1.5)
+    jobs = jobs_of(tmp_path)
+    jobs[2] = dataclasses.replace(jobs[2], limit=0.5)
+    found = [outcome.state for outcome in run_batch(jobs, tmp_path / "out", 2)]
     assert found == ["failed"] * 5 + ["done"] * 2
     records = list(failures(tmp_path).values())
-    assert [r["kind"] for r in records] == ["input", "exit", "time limit", "signal", "no result"]
-    assert records[0]["reason"] == (
-        "exit code 2: mover run: camera.json: field 'w' has 0, expected a number above 0"
-    )
-    assert records[1]["exit_code"] == 86
+    assert [(r["kind"], r["reason"]) for r in records] == [
+        (
+            "input",
+            "exit code 2: mover run: camera.json: field 'w' has 0, expected a number above 0",
+        ),
+        ("exit", "exit code 86: about to die"),
+        ("time limit", "ran longer than its limit of 0.5 s"),
+        ("signal", "ended by SIGSEGV: it said nothing"),
+        ("no result", "ended well without scene.json and run.json: it said nothing"),
+    ]
     assert records[1]["last_lines"] == ["about to die"]
-    assert records[2]["reason"] == "ran longer than its limit of 1.5 s"
-    assert records[3]["signal"] == "SIGSEGV"
-    assert records[4]["reason"] == ("ended well without scene.json and run.json: it said nothing")
     assert list(states(tmp_path).values()) == found
 
 
@@ -218,14 +213,13 @@ def test_two_batches_do_not_run_one_capture_at_the_same_time(tmp_path: Path, mon
     assert len(starts(tmp_path)) == 1
 
 
-def test_a_stopped_job_leaves_no_record(tmp_path: Path):
-    fakes(tmp_path, 1, {0: "slow"})
+def test_an_interrupted_job_leaves_no_record(tmp_path: Path):
+    fakes(tmp_path, 1, {0: "interrupted"})
     (job,) = jobs_of(tmp_path)
-    stop = threading.Event()
-    threading.Timer(0.3, stop.set).start()
-    assert run_job(job, stop).state == "stopped"
+    assert run_here(tmp_path) == ["stopped"]
     assert earlier(job) is None
     assert failures(tmp_path) == {}
+    assert states(tmp_path) == {"capture_00": "open"}
 
 
 def test_a_command_that_does_not_exist_is_a_failure_not_an_end(tmp_path: Path):

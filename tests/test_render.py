@@ -13,9 +13,9 @@ from PIL import Image
 from mover.app.pictures.config import RenderConfig
 from mover.app.pictures.eye import (
     above_eye,
-    floor_seen,
+    floor_points,
+    in_eye,
     orbit_eye,
-    seen_from,
     spinning_eyes,
     video_eye,
 )
@@ -24,22 +24,24 @@ from mover.app.pictures.paint import (
     NO_OWNER,
     PERSON,
     draw,
+    draw_picture,
     furniture,
     ground_under,
     joined,
     people,
     shadows,
 )
-from mover.app.pictures.render import Shot, render_result, render_worlds, set_up, show, world_of
+from mover.app.pictures.render import render_result, render_room
 from mover.core.errors import InputError
 from mover.core.types import Segment
 from mover.geometry.camera import project, to_camera
+from mover.geometry.placement import place_object
 from mover.geometry.rle import thinned
 from mover_bench.rooms.render import see
 
 
 def pixels_of(points_world, eye):
-    return project(seen_from(eye, points_world), eye.K)
+    return project(in_eye(eye, points_world), eye.K)
 
 
 def test_an_object_is_drawn_on_the_pixels_of_its_mask(small_room):
@@ -73,33 +75,35 @@ def test_the_eye_of_the_video_sees_the_same_points_at_any_size():
         assert torch.allclose(pixels_of(points, eye), truth * width / 640, atol=1e-3)
 
 
+POINTS = torch.cat([p.mesh.verts + p.t_world_object for p in room().objects])
+SIZE = (400, 300)
+
+
+def assert_all_inside(eye):
+    pixel = pixels_of(POINTS, eye)
+    assert (pixel > 0).all()
+    assert (pixel < torch.tensor(SIZE)).all()
+
+
 @pytest.mark.parametrize("azimuth", [0.0, 0.7, 2.0, -2.5])
 @pytest.mark.parametrize("elevation", [0.0, 0.4, 1.2, -0.3])
 def test_an_eye_around_the_room_sees_everything_upright(azimuth: float, elevation: float):
-    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().objects])
-    eye = orbit_eye(points, (400, 300), azimuth, elevation)
+    eye = orbit_eye(POINTS, SIZE, azimuth, elevation)
     assert torch.allclose(eye.R_eye_world @ eye.R_eye_world.mT, torch.eye(3), atol=1e-6)
     assert torch.linalg.det(eye.R_eye_world) == pytest.approx(1, abs=1e-5)
-    pixel = pixels_of(points, eye)
-    assert (pixel > 0).all()
-    assert (pixel < torch.tensor([400.0, 300.0])).all()
-    middle = (points.amin(0) + points.amax(0)) / 2
+    assert_all_inside(eye)
+    middle = (POINTS.amin(0) + POINTS.amax(0)) / 2
     higher = pixels_of(torch.stack([middle, middle + torch.tensor([0, 0.1, 0])]), eye)
     assert higher[1, 1] < higher[0, 1]
 
 
-def test_from_the_right_the_right_of_the_image_is_near():
-    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().objects])
-    right = torch.tensor([1.0, -1.0, -3.5])
-    front, side = (orbit_eye(points, (400, 300), a, 0.3) for a in (0.0, math.pi / 2))
-    centre = points.mean(0)
+def test_eyes_lie_as_the_video_and_the_plan_of_the_report_have_it():
+    """From the right the right of the image is near; from above +x is right, away is up."""
+    right, centre = torch.tensor([1.0, -1.0, -3.5]), POINTS.mean(0)
+    front, side = (orbit_eye(POINTS, SIZE, a, 0.3) for a in (0.0, math.pi / 2))
     assert pixels_of(right, front)[0] > pixels_of(centre, front)[0]
-    assert seen_from(side, right)[2] < seen_from(side, centre)[2]
-
-
-def test_from_above_the_plan_lies_as_in_the_report():
-    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().objects])
-    eye = above_eye(points, (400, 300))
+    assert in_eye(side, right)[2] < in_eye(side, centre)[2]
+    eye = above_eye(POINTS, SIZE)
     near_left, near_right, far_left = (
         pixels_of(torch.tensor([x, -1.0, z]), eye) for x, z in ((-1, -3), (1, -3), (-1, -4))
     )
@@ -108,35 +112,22 @@ def test_from_above_the_plan_lies_as_in_the_report():
 
 
 def test_eyes_that_go_around_keep_their_distance():
-    points = torch.cat([p.mesh.verts + p.t_world_object for p in room().objects])
-    eyes = spinning_eyes(points, (400, 300), [0.0, 1.0, 2.0, 4.0], 0.4)
-    middle = (points.amin(0) + points.amax(0)) / 2
+    eyes = spinning_eyes(POINTS, SIZE, [0.0, 1.0, 2.0, 4.0], 0.4)
+    middle = (POINTS.amin(0) + POINTS.amax(0)) / 2
     far = torch.stack([(e.t_world_eye - middle).norm() for e in eyes])
     assert torch.allclose(far, far[0])
     for eye in eyes:
-        assert (pixels_of(points, eye) > 0).all()
+        assert_all_inside(eye)
 
 
 def test_rays_to_the_floor_project_back_to_their_pixels():
     eye = video_eye(room().camera, 64)
-    floor = floor_seen(eye, GROUND)
+    floor = floor_points(eye, GROUND)
     seen = floor.isfinite().all(-1)
     rows, columns = torch.nonzero(seen, as_tuple=True)
     centre = torch.stack([columns, rows], -1) + 0.5
     assert torch.allclose(pixels_of(floor[seen], eye), centre.float(), atol=1e-2)
     assert torch.allclose(floor[seen][:, 1], torch.tensor(GROUND), atol=1e-5)
-
-
-def test_people_drawn_in_their_window_are_people_drawn_whole():
-    scene, bodies = room(), walkers(3, people=2)
-    still, moving = furniture(scene), people(bodies, [1, 4])
-    eye = video_eye(scene.camera, 320)
-    points = torch.cat([still.verts, moving.verts])
-    ground = ground_under(points, GROUND)
-    base = torch.full((eye.height, eye.width, 3), 0.4)
-    whole = set_up(eye, ground, joined([still, moving]), base)
-    part = show(set_up(eye, ground, still, base), moving)
-    assert (part - show(whole)).abs().max() < 1e-5
 
 
 def test_a_shadow_is_darkest_where_something_stands():
@@ -169,12 +160,12 @@ def folder(tmp_path: Path) -> Path:
 def test_a_film_has_a_picture_for_each_frame_at_the_size_asked_for(tmp_path: Path):
     av = pytest.importorskip("av")
     out, film = folder(tmp_path), tmp_path / "room.mp4"
-    count = render_result(out, film, RenderConfig(scene="both", width=161))
+    count = render_result(out, film, RenderConfig(width=161))
     with av.open(str(film)) as video:
         pictures = list(video.decode(video=0))
         rate = float(video.streams.video[0].average_rate)
     assert len(pictures) == count == 6
-    assert {(p.width, p.height) for p in pictures} == {(320, 90)}
+    assert {(p.width, p.height) for p in pictures} == {(160, 90)}
     assert rate == pytest.approx(15.0 / 3)
     moved = [np.asarray(p.to_image()).astype(float) for p in (pictures[0], pictures[-1])]
     assert np.abs(moved[0] - moved[1]).max() > 50
@@ -200,10 +191,8 @@ def test_the_video_is_behind_the_furniture(tmp_path: Path):
     colours = {0: (250, 0, 0), 3: (0, 250, 0)}
     for frame, colour in colours.items():
         Image.new("RGB", (WIDTH, HEIGHT), colour).save(capture / "frames" / f"{frame:06d}.png")
-    scene = room()
-    world = world_of("after", scene, walkers(2))
-    moments = [Shot(0, 0.0), Shot(3, 0.5), Shot(9, 0.7)]
-    pictures = list(render_worlds([world], moments, RenderConfig(width=64), capture))
+    config = RenderConfig(width=64)
+    pictures = list(render_room(room(), walkers(2), [0, 3, 9], config, capture))
     for picture, channel in zip(pictures[:2], (0, 1), strict=True):
         assert picture[0, 0].argmax() == channel
         assert picture[0, 0, channel] > 0.95
@@ -232,9 +221,8 @@ def test_what_cannot_be_drawn_is_said(tmp_path: Path, name: str):
 
 
 def test_a_room_without_people_turns():
-    world = world_of("after", room(), None)
     config = RenderConfig(view="orbit", turns=1, width=64)
-    a, b = render_worlds([world], [Shot(0, 0.0), Shot(0, 0.5)], config, None)
+    a, b = render_room(room(), None, [0, 0], config)
     assert a.shape == b.shape == (36, 64, 3)
     assert (a - b).abs().max() > 0.2
 
@@ -247,13 +235,14 @@ def test_moved_furniture_is_drawn_where_it_stands_in_the_frame():
     )
     stays = tuple(Segment(f, p.t_world_object, p.yaw) for f, p in ((0, chair), (5, there)))
     moved = dataclasses.replace(chair, segments=stays)
-    world = world_of("after", dataclasses.replace(scene, objects=(moved, *others)), None)
-    config, moments = RenderConfig(width=64), [Shot(4, 0.0), Shot(5, 0.5), Shot(4, 0.9)]
-    found = list(render_worlds([world], moments, config, None))
-    for picture, piece in zip(found, (chair, there, chair), strict=True):
-        alone = world_of("after", dataclasses.replace(scene, objects=(piece, *others)), None)
-        alone = dataclasses.replace(alone, ground=world.ground)
-        expected = next(render_worlds([alone], [Shot(0, 0.0)], config, None))
+    config = RenderConfig(width=64)
+    world = dataclasses.replace(scene, objects=(moved, *others))
+    found = list(render_room(world, None, [4, 5, 4], config))
+    points = torch.cat([place_object(p).verts for p in scene.objects])
+    for picture, item in zip(found, (chair, there, chair), strict=True):
+        alone = furniture(dataclasses.replace(scene, objects=(item, *others)))
+        eye = video_eye(scene.camera, 64)
+        expected, _ = draw_picture(alone, eye, ground_under(points, GROUND))
         assert torch.equal(picture, expected)
     assert (found[0] - found[1]).abs().max() > 0.2
 

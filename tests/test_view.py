@@ -218,7 +218,7 @@ class TestViewer:
         solved = tmp_path / "solved"
         call("run", folder / "capture", "--out", solved, "--config", folder / "config.json",
              "--edits", file)  # fmt: skip
-        assert read_shown(solved).edits_inside == 2
+        assert read_shown(solved).log["edits"] == 2
         stays(read_edits(file)[0], read_shown(solved).result)
 
     def test_numbers_and_undo_change_the_list(self, browser, folder, tmp_path):

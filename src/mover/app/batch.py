@@ -10,15 +10,12 @@ import hashlib
 import json
 import os
 import signal
-import socket
 import subprocess
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,10 +30,9 @@ FAILURES, SUMMARY, CONFIG = "failures", "summary.csv", "config.json"  # of the b
 COLUMNS: tuple[str, ...] = (
     "name", "state", "seconds", "peak_memory_mb", "warnings", "reason", "capture", "out",
 )  # fmt: skip
-POLL, GRACE = 0.05, 5.0  # [s] between two looks at a process; from the request to stop to its end
+INTERRUPTED = (-signal.SIGINT, 130)  # exit codes after Ctrl-C: the job is still to be done
 LINES = 20  # last lines of the log that a failure record keeps
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-NEVER = threading.Event()
 
 
 @dataclass(frozen=True)
@@ -80,6 +76,7 @@ class Outcome:
 
     name: str
     state: Literal["done", "kept", "failed", "stopped"]
+    """stopped: interrupted, so that nothing is recorded."""
     seconds: float = 0.0
     """Wall clock of the run that made the result."""
     reason: str = ""
@@ -143,52 +140,38 @@ def earlier(job: BatchJob, retry: bool = False) -> Outcome | None:
     return None
 
 
-def run_job(job: BatchJob, stop: threading.Event = NEVER) -> Outcome:
+def run_job(job: BatchJob) -> Outcome:
     """Run a job to its end and record it; a finished one is left alone.
 
     The lock is passed on to its process: one that outlives a killed batch is waited for.
-
-    Args:
-        job: What to run.
-        stop: Set from another thread, it ends the job; nothing is recorded then.
     """
+    out = Path(job.out)
     try:
-        Path(job.out).mkdir(parents=True, exist_ok=True)
-        with (Path(job.out) / ".lock").open("w") as lock:
-            while not stop.is_set():
-                try:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:  # another batch runs this capture
-                    stop.wait(POLL)
-                    continue
-                return earlier(job, retry=True) or _run(job, stop, lock.fileno())
+        out.mkdir(parents=True, exist_ok=True)
+        with (out / ".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # another batch may run this capture
+            return earlier(job, retry=True) or _run(job, out, lock.fileno())
     except Exception as error:  # a full disk, a forbidden folder: it must not end the others
         return lost(job, error)
-    return Outcome(job.name, "stopped")
 
 
-def _run(job: BatchJob, stop: threading.Event, lock: int) -> Outcome:
-    out, start = Path(job.out), time.monotonic()
+def _run(job: BatchJob, out: Path, lock: int) -> Outcome:
     for stale in (out / MARK, job.record):
         stale.unlink(missing_ok=True)
     environment = {**dict.fromkeys(THREADS, str(job.threads)), **os.environ}
+    start = time.monotonic()
     try:
         with (out / LOG).open("wb") as log:
-            process = subprocess.Popen(
+            code = subprocess.run(
                 job.command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment,
-                start_new_session=True, pass_fds=(lock,),
-            )  # fmt: skip
+                timeout=job.limit or None, pass_fds=(lock,), check=False,
+            ).returncode  # fmt: skip
     except OSError as error:
         return _failed(job, "no start", f"could not be started: {error}")
-    late = False
-    while (code := process.poll()) is None and not late and not stop.wait(POLL):
-        late = 0 < job.limit < time.monotonic() - start
-    _end(process)
+    except subprocess.TimeoutExpired:
+        return _failed(job, "time limit", f"ran longer than its limit of {job.limit:g} s")
     seconds = time.monotonic() - start
-    if late:
-        reason = f"ran longer than its limit of {job.limit:g} s"
-        return _failed(job, "time limit", reason, None, seconds)
-    if code is None:
+    if code in INTERRUPTED:
         return Outcome(job.name, "stopped")
     missing = [name for name in PRODUCTS if not (out / name).is_file()]
     if code == 0 and not missing:
@@ -196,31 +179,18 @@ def _run(job: BatchJob, stop: threading.Event, lock: int) -> Outcome:
         return Outcome(job.name, "done", seconds)
     kind, why = "no result", f"ended well without {' and '.join(missing)}"
     if code < 0:
-        kind, why = "signal", f"ended by {signal_name(-code)}"
+        names = {one.value: one.name for one in signal.Signals}
+        kind, why = "signal", f"ended by {names.get(-code, f'signal {-code}')}"
     elif code > 0:
         kind, why = "input" if code == 2 else "exit", f"exit code {code}"
     last = (last_lines(out / LOG) or ["it said nothing"])[-1]
-    return _failed(job, kind, f"{why}: {last}", code, seconds)
+    return _failed(job, kind, f"{why}: {last}", seconds)
 
 
-def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Ask the process and its children to stop, then make them."""
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        if process.poll() is not None:
-            return
-        try:
-            os.killpg(process.pid, number)
-            process.wait(GRACE)
-        except (ProcessLookupError, subprocess.TimeoutExpired):
-            continue
-    process.wait()
-
-
-def _failed(
-    job: BatchJob, kind: str, reason: str, code: int | None = None, seconds: float = 0.0
-) -> Outcome:
-    about = {**asdict(job), "kind": kind, "reason": reason, "seconds": round(seconds, 3)}
-    record_failure(job.record, about, code, last_lines(Path(job.out) / LOG))
+def _failed(job: BatchJob, kind: str, reason: str, seconds: float = 0.0) -> Outcome:
+    """Write down how a job failed: what it was, why, and its last lines."""
+    ended = {"kind": kind, "reason": reason, "seconds": round(seconds, 3)}
+    write_tree(job.record, {**asdict(job), **ended, "last_lines": last_lines(Path(job.out) / LOG)})
     return Outcome(job.name, "failed", seconds, reason)
 
 
@@ -228,26 +198,6 @@ def lost(job: BatchJob, error: Exception) -> Outcome:
     """Record a job whose worker vanished, so that it could not do so itself."""
     text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
     return earlier(job) or _failed(job, "worker", f"its worker was lost: {text}")
-
-
-def record_failure(
-    path: Path, about: Mapping[str, Any], code: int | None, lines: Sequence[str]
-) -> None:
-    """Write down how a job failed: what it was, its exit code (minus a signal), its last lines."""
-    ended = {
-        "exit_code": code if code is not None and code >= 0 else None,
-        "signal": signal_name(-code) if code is not None and code < 0 else None,
-        "when": datetime.now(UTC).isoformat(timespec="seconds"),
-        "host": socket.gethostname(),
-        "last_lines": list(lines),
-    }
-    write_tree(path, {**about, **ended})
-
-
-def signal_name(number: int) -> str:
-    """`SIGKILL`."""
-    names = {one.value: one.name for one in signal.Signals}
-    return names.get(number, f"signal {number}")
 
 
 def read_tree(path: Path) -> dict[str, Any]:
@@ -272,16 +222,13 @@ def last_lines(log: Path) -> list[str]:
 
 
 def on_this_machine(jobs: Sequence[BatchJob], workers: int) -> Iterator[Outcome]:
-    """So many processes at a time; those that run are ended when the caller stops."""
-    stop = threading.Event()
-    with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(run_job, job, stop) for job in jobs]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        finally:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
+    """So many processes at a time; Ctrl-C reaches them, and no further one is started."""
+    pool = ThreadPoolExecutor(workers)
+    try:
+        for future in as_completed([pool.submit(run_job, job) for job in jobs]):
+            yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def on_ray(jobs: Sequence[BatchJob], workers: int, share: RayOptions) -> Iterator[Outcome]:
@@ -296,13 +243,10 @@ def on_ray(jobs: Sequence[BatchJob], workers: int, share: RayOptions) -> Iterato
         )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ray: Any = import_module("ray")
-    local: dict[str, Any] = {}
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if share.address == "local":
-        local = {"num_cpus": max(1, round(workers * share.cpus)), "include_dashboard": False}
-    ray.init(
-        address=share.address, log_to_driver=False, logging_level="ERROR",
-        ignore_reinit_error=True, **local,
-    )  # fmt: skip
+        options |= {"num_cpus": max(1, round(workers * share.cpus)), "include_dashboard": False}
+    ray.init(address=share.address, ignore_reinit_error=True, **options)
     task = ray.remote(num_cpus=share.cpus, num_gpus=share.gpus, max_retries=2)(run_job)
     waiting = {task.remote(job): job for job in jobs}
     try:

@@ -10,7 +10,6 @@ from tyro.conf import Positional, arg
 from mover.app.cli import say
 from mover.app.cli.config import parsed
 from mover.app.pictures.config import STILL, RenderConfig, check_ending
-from mover.core.errors import InputError
 from mover.core.settings import int_in
 from mover.io.formats import chosen, names
 
@@ -65,9 +64,6 @@ def evaluate(arguments: Sequence[str]) -> None:
     say(table(evaluate_folder(args.out, args.truth, physics=args.stable)))
 
 
-# `export`.
-
-
 if TYPE_CHECKING:
     Target = str
 else:
@@ -108,12 +104,6 @@ def export(arguments: Sequence[str]) -> None:
             say(f"  {note}")
 
 
-# `render`.
-
-
-WIDTHS = (16, 8192)  # [px]
-
-
 @dataclass(frozen=True)
 class RenderArgs:
     """Draw a result without a screen, as a picture or a film."""
@@ -130,22 +120,11 @@ class RenderArgs:
 def render(arguments: Sequence[str]) -> None:
     """`mover render`."""
     args = parsed(RenderArgs, "mover render", arguments)
-    import torch
-
     from mover.app.pictures.render import render_result
 
-    low, high = WIDTHS
-    if not low <= args.config.width <= high:
-        raise InputError(f"--width: {args.config.width}, expected {low} to {high}")
-    if not -89 <= args.config.elevation <= 89:
-        raise InputError(f"--elevation: {args.config.elevation:g}, expected -89 to 89")
-    torch.set_num_threads(1)
     count = render_result(args.out, args.to, args.config, args.capture)
     what = "one picture" if count == 1 else f"{count} pictures"
     say(f"{args.to}: {what}")
-
-
-# `view`.
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ class RenderConfig:
     """What is drawn."""
 
     view: Literal["camera", "above", "orbit"] = "camera"
-    """From the video's camera, from above, or from a place around the room."""
-    scene: Literal["result", "initial", "both"] = "result"
-    """The result, the scene as it was given, or both side by side."""
+    """From the video's camera, from above, or from around the room."""
+    scene: Literal["result", "initial"] = "result"
+    """The result, or the initial scene."""
     width: Annotated[int, int_in(16, 8192)] = 960
     """Of one picture [px]."""
     azimuth: Annotated[float, float_in(-3600, 3600)] = 35.0
     """orbit: 0 is the video's side, 90 the right of its image [degrees]."""
-    elevation: Annotated[float, float_in(-90, 90)] = 25.0
+    elevation: Annotated[float, float_in(-89, 89)] = 25.0
     """orbit: above the floor [degrees]."""
     turns: Annotated[float, float_in(-1000, 1000)] = 0.0
     """orbit: how often the eye goes around during a film."""

@@ -12,8 +12,8 @@ from mover.core.records import record
 from mover.core.types import Camera
 
 FIELD = math.radians(42)  # [rad], height of the field of view of an eye that is not the video's
-MARGIN = 1.06  # free border around what an eye is to see
 ABOVE = math.radians(20)  # [rad], height of the field of view from above: nearly a plan
+MARGIN = 1.06  # free border around what an eye is to see
 
 
 @record
@@ -29,6 +29,12 @@ class RenderCamera:
     """[px]"""
     height: int
     """[px]"""
+
+    def finer(self, factor: int) -> "RenderCamera":
+        """The same view in pictures of more pixels."""
+        K = self.K * torch.tensor([factor, factor, 1.0])[:, None]
+        size = factor * self.width, factor * self.height
+        return RenderCamera(K, self.R_eye_world, self.t_world_eye, *size)
 
 
 def video_eye(camera: Camera, width: int) -> RenderCamera:
@@ -51,21 +57,37 @@ def above_eye(points: Float[Tensor, "points 3"], size: tuple[int, int]) -> Rende
         points: In the world [m].
         size: Width and height of its pictures [px].
     """
-    return _fitted(points, torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), size, ABOVE)
+    return orbit_eye(points, size, 0.0, math.pi / 2, ABOVE)
 
 
 def orbit_eye(
-    points: Float[Tensor, "points 3"], size: tuple[int, int], azimuth: float, elevation: float
+    points: Float[Tensor, "points 3"],
+    size: tuple[int, int],
+    azimuth: float,
+    elevation: float,
+    field: float = FIELD,
 ) -> RenderCamera:
-    """An eye somewhere around the room that sees all points.
+    """An eye somewhere around the room, as near to the middle as it may be to see all points.
 
     Args:
         points: In the world [m].
         size: Width and height of its pictures [px].
         azimuth: 0 is the video's side, pi / 2 the right of its image [rad].
         elevation: 0 is level, pi / 2 straight above [rad].
+        field: Height of its field of view [rad].
     """
-    return _fitted(points, _turn(azimuth, elevation), size, FIELD)
+    (width, height), flat = size, math.cos(elevation)
+    out = [math.sin(azimuth) * flat, math.sin(elevation), math.cos(azimuth) * flat]
+    away, right = torch.tensor(out), torch.tensor([math.cos(azimuth), 0.0, -math.sin(azimuth)])
+    down = normalize(torch.linalg.cross(-away, right), dim=0)
+    R_eye_world = torch.stack([right, down, -away])
+    focal = height / 2 / math.tan(field / 2)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    middle = (points.amin(0) + points.amax(0)) / 2
+    x, y, z = ((points - middle) @ R_eye_world.mT).unbind(-1)
+    reach = MARGIN * torch.maximum(x.abs() * focal * 2 / width, y.abs() * focal * 2 / height)
+    far = float((reach - z).amax().clamp_min(1.0))
+    return RenderCamera(K, R_eye_world, middle + far * away, width, height)
 
 
 def spinning_eyes(
@@ -75,31 +97,21 @@ def spinning_eyes(
     elevation: float,
 ) -> list[RenderCamera]:
     """Eyes on a circle around the room, all at the distance of the farthest."""
-    middle = _middle(points)
+    middle = (points.amin(0) + points.amax(0)) / 2
     eyes = [orbit_eye(points, size, azimuth, elevation) for azimuth in azimuths]
     far = max(float((eye.t_world_eye - middle).norm()) for eye in eyes)
-    places = [middle - far * eye.R_eye_world[2] for eye in eyes]
     return [
-        RenderCamera(eye.K, eye.R_eye_world, place, *size)
-        for eye, place in zip(eyes, places, strict=True)
+        RenderCamera(eye.K, eye.R_eye_world, middle - far * eye.R_eye_world[2], *size)
+        for eye in eyes
     ]
 
 
-def seen_from(
-    eye: RenderCamera, points_world: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 3"]:
+def in_eye(eye: RenderCamera, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """World points in the axes of the eye [m]."""
     return (points_world - eye.t_world_eye) @ eye.R_eye_world.mT
 
 
-def part_of(eye: RenderCamera, left: int, top: int, right: int, bottom: int) -> RenderCamera:
-    """The same eye that sees only a window of its picture [px]."""
-    shift = torch.tensor([[0.0, 0, left], [0, 0, top], [0, 0, 0]])
-    size = (right - left, bottom - top)
-    return RenderCamera(eye.K - shift, eye.R_eye_world, eye.t_world_eye, *size)
-
-
-def floor_seen(eye: RenderCamera, height: float) -> Float[Tensor, "h w 3"]:
+def floor_points(eye: RenderCamera, height: float) -> Float[Tensor, "h w 3"]:
     """Where the ray of each pixel meets the plane y = `height` [m]; inf where it never does."""
     rows, columns = torch.arange(eye.height) + 0.5, torch.arange(eye.width) + 0.5
     v, u = torch.meshgrid(rows, columns, indexing="ij")
@@ -109,33 +121,3 @@ def floor_seen(eye: RenderCamera, height: float) -> Float[Tensor, "h w 3"]:
     along = fall / torch.where(rays[..., 1].abs() < 1e-6, 1e-6, rays[..., 1])
     points = eye.t_world_eye + rays * along[..., None]
     return torch.where((along > 0)[..., None], points, torch.inf)
-
-
-def _turn(azimuth: float, elevation: float) -> Float[Tensor, "3 3"]:
-    """Axes of an eye that looks at the middle from there."""
-    flat, up = math.cos(elevation), math.sin(elevation)
-    out = torch.tensor([math.sin(azimuth) * flat, up, math.cos(azimuth) * flat])
-    right = torch.tensor([math.cos(azimuth), 0.0, -math.sin(azimuth)])
-    down = torch.linalg.cross(-out, right)
-    return torch.stack([right, normalize(down, dim=0), -out])
-
-
-def _middle(points: Float[Tensor, "points 3"]) -> Float[Tensor, "3"]:
-    return (points.amin(0) + points.amax(0)) / 2
-
-
-def _fitted(
-    points: Float[Tensor, "points 3"],
-    R_eye_world: Float[Tensor, "3 3"],
-    size: tuple[int, int],
-    field: float,
-) -> RenderCamera:
-    """As near to the middle of the points as it may be to see them all."""
-    width, height = size
-    focal = height / 2 / math.tan(field / 2)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    middle = _middle(points)
-    x, y, z = ((points - middle) @ R_eye_world.mT).unbind(-1)
-    reach = MARGIN * torch.maximum(x.abs() * focal * 2 / width, y.abs() * focal * 2 / height)
-    far = float((reach - z).amax().clamp_min(1.0))
-    return RenderCamera(K, R_eye_world, middle - far * R_eye_world[2], width, height)

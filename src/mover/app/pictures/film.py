@@ -1,6 +1,6 @@
 """Pictures on disk: a still as PNG or JPEG, a film as MP4 (H.264), and the pictures of a video."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 from torch import Tensor
 
 from mover.core.errors import InputError
@@ -69,13 +69,8 @@ def pixels(picture: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return (picture.detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8).numpy()
 
 
-def has_video(capture: Path) -> bool:
-    """Whether a capture folder has the pictures of its video."""
-    return any((capture / name).exists() for name in (FRAMES, VIDEO))
-
-
 def video_pictures(
-    capture: Path, frames: list[int], size: tuple[int, int]
+    capture: Path, frames: Sequence[int], size: tuple[int, int]
 ) -> Iterator[Float[Tensor, "h w 3"] | None]:
     """The wanted pictures of a capture's video in order, None for those that are missing.
 
@@ -85,51 +80,24 @@ def video_pictures(
         size: Width and height that they get [px].
     """
     film = next((f for f in (capture / VIDEO, capture / FRAMES / VIDEO) if f.is_file()), None)
-    if film is not None:
-        yield from _decoded(film, frames, size)
+    if film is None:
+        for frame in frames:
+            names = (capture / FRAMES / f"{frame:06d}{ending}" for ending in (".jpg", ".png"))
+            path = next((name for name in names if name.is_file()), None)
+            if path is None:
+                yield None
+            else:
+                with Image.open(path) as picture:
+                    yield sized(picture, size)
         return
-    for frame in frames:
-        names = (capture / FRAMES / f"{frame:06d}{ending}" for ending in (".jpg", ".png"))
-        path = next((name for name in names if name.is_file()), None)
-        if path is None:
-            yield None
-        else:
-            with Image.open(path) as picture:
-                yield sized(picture, size)
-
-
-def _decoded(
-    film: Path, frames: list[int], size: tuple[int, int]
-) -> Iterator[Float[Tensor, "h w 3"] | None]:
-    av = video_library(str(film))
-    wanted = iter(frames)
-    frame = next(wanted, None)
-    with av.open(str(film)) as video:
-        for number, picture in enumerate(video.decode(video=0)):
-            if frame is None:
-                return
-            if number == frame:
-                yield sized(picture.to_image(), size)
-                frame = next(wanted, None)
-    while frame is not None:
-        yield None
-        frame = next(wanted, None)
+    with video_library(str(film)).open(str(film)) as video:
+        decoded = enumerate(video.decode(video=0))
+        for frame in frames:
+            found = next((picture for number, picture in decoded if number == frame), None)
+            yield None if found is None else sized(found.to_image(), size)
 
 
 def sized(picture: Image.Image, size: tuple[int, int]) -> Float[Tensor, "h w 3"]:
     """A picture in [0, 1] at a width and height [px]."""
     small = picture.convert("RGB").resize(size, Image.Resampling.LANCZOS)
     return torch.from_numpy(np.asarray(small).copy()).float() / 255
-
-
-def captioned(picture: Float[Tensor, "h w 3"], text: str) -> Float[Tensor, "h w 3"]:
-    """A picture with a word in its corner."""
-    page = Image.fromarray(pixels(picture))
-    pen, height = ImageDraw.Draw(page), max(12.0, picture.shape[1] / 48)
-    font = ImageFont.load_default(height)
-    wide = pen.textlength(text, font)
-    box = (height * 0.6, height * 0.6, height * 1.8 + wide, height * 2.2)
-    pen.rounded_rectangle(box, height * 0.4, fill=(38, 42, 50))
-    middle = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
-    pen.text(middle, text, fill="white", font=font, anchor="mm")
-    return torch.from_numpy(np.asarray(page).copy()).float() / 255

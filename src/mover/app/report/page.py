@@ -6,7 +6,7 @@ The page is one file without any address outside it: it opens from disk, today a
 import base64
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -94,7 +94,6 @@ def _page(content: ReportContent) -> str:
     view, (before, after) = beside(
         lambda: _view(content), lambda: mapped(lambda s: _overlay(content, s), scenes)
     )
-    objects = objects_table(content.initial, content.result, content.objects, content.metrics)
     return fill(
         "page.html",
         content=content,
@@ -107,7 +106,10 @@ def _page(content: ReportContent) -> str:
         plans=_plans(content),
         tables=(
             ("How far from the truth", metrics_table(content.metrics or {})),
-            ("Objects", objects),
+            (
+                "Objects",
+                objects_table(content.initial, content.result, content.objects, content.metrics),
+            ),
         ),
         curves=draw_curves(content.traces),
         longest=max([float(s.get("seconds") or 0) for s in content.stages], default=0.0) or 1.0,
@@ -117,60 +119,47 @@ def _page(content: ReportContent) -> str:
 
 
 def lead(content: ReportContent) -> str:
-    """What the run saw, in a sentence, and what it did, in another."""
-    parts = [_count(len(content.result.objects), "object")]
+    """What the run was given, in a sentence, and what it did, in another."""
+    parts = [_count(len(content.result.objects), "object", "objects")]
     if content.bodies is not None:
         parts.append(_count(len(content.bodies.person.unique()), "person", "people"))
-        parts.append(_count(len(content.bodies.frame.unique()), "frame"))
+        parts.append(_count(len(content.bodies.frame.unique()), "frame", "frames"))
     changes = sorted(c.moved for c in find_changes(content.initial, content.result).values())
-    moves = f"furniture moved {100 * changes[len(changes) // 2]:.0f} cm (median)" if changes else ""
+    did = [f"furniture moved {100 * changes[len(changes) // 2]:.0f} cm (median)"] if changes else []
     scenes = (content.initial, content.result)
-    seen = f"camera pitch {_from_to([_tilt(s) for s in scenes], '°')}"
-    heights = [-s.ground for s in scenes if s.ground is not None]
-    above = f", height {_from_to([f'{h:.2f}' for h in heights], ' m')}" if heights else ""
-    did = "; ".join(part for part in (moves, seen + above) if part)
-    return f"{', '.join(parts)}. {did[0].upper()}{did[1:]}."
+    tilts = [math.degrees(float(pitch_roll(s.camera.R_cam_world)[0])) for s in scenes]
+    texts = [f"{round(t, 1) + 0.0:.1f}".replace("-", "\N{MINUS SIGN}") for t in tilts]
+    camera = f"camera pitch {_from_to(texts)}°"
+    heights = [f"{-s.ground:.2f}" for s in scenes if s.ground is not None]
+    did.append(f"{camera}, height {_from_to(heights)} m" if heights else camera)
+    text = "; ".join(did)
+    return f"{', '.join(parts)}. {text[0].upper()}{text[1:]}."
 
 
-def _from_to(values: list[str], unit: str) -> str:
+def _from_to(values: list[str]) -> str:
     """The first and the last value; one alone where they are the same."""
-    return " → ".join(dict.fromkeys((values[0], values[-1]))) + unit
+    return " → ".join(dict.fromkeys((values[0], values[-1])))
 
 
-def _tilt(scene: Scene) -> str:
-    degrees = math.degrees(float(pitch_roll(scene.camera.R_cam_world)[0]))
-    return f"{round(degrees, 1) + 0.0:.1f}".replace("-", "\N{MINUS SIGN}")
-
-
-def _count(number: int, one: str, many: str = "") -> str:
-    return f"{number:,} {one if number == 1 else many or one + 's'}"
+def _count(number: int, one: str, many: str) -> str:
+    return f"{number:,} {one if number == 1 else many}"
 
 
 def _tiles(content: ReportContent) -> list[tuple[str, str, str]]:
     """The few numbers that matter most, before and after."""
     before, after = ((content.metrics or {}).get(k) or {} for k in ("initial", "result"))
-    return [
-        (
-            QUANTITIES[k].label,
-            write_quantity(k, before.get(k), False),
-            write_quantity(k, after.get(k)),
-        )
-        for k in TILES
-        if k in after
-    ]
+    pairs = [(k, write_quantity(k, before.get(k), False)) for k in TILES if k in after]
+    return [(QUANTITIES[k].label, old, write_quantity(k, after.get(k))) for k, old in pairs]
 
 
 def _plans(content: ReportContent) -> list[tuple[str, str]]:
     """The room from above, before and after."""
     scenes = [content.initial, content.result, content.truth]
     extent = extent_of(*scenes, content.initial_bodies, content.bodies)
-    sides = (
-        ("Before", content.initial, content.initial_bodies),
-        ("After", content.result, content.bodies),
-    )
+    people = (content.initial_bodies, content.bodies)
     return [
         (name, draw_top(scene, content.truth, bodies, extent=extent))
-        for name, scene, bodies in sides
+        for name, scene, bodies in zip(("Before", "After"), scenes, people, strict=False)
     ]
 
 
@@ -185,13 +174,8 @@ def _view(content: ReportContent) -> ReportScene:
 
 
 def _overlay(content: ReportContent, scene: Scene) -> str:
-    """The image with the furniture drawn over it."""
-    return _data_url(draw_overlay(canvas(content.image, scene, WIDEST), scene))
-
-
-def _data_url(image: Float[Tensor, "h w 3"]) -> str:
-    """The image as a JPEG that stands in the page itself."""
-    file = io.BytesIO()
+    """The image with the furniture drawn over it, as a JPEG that stands in the page itself."""
+    image, file = draw_overlay(canvas(content.image, scene, WIDEST), scene), io.BytesIO()
     Image.fromarray(pixels(image)).save(file, "JPEG", quality=QUALITY, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
 
@@ -200,38 +184,39 @@ WIDTH, HEIGHT = 420.0, 200.0  # [px] of a plot
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 12.0, 12.0, 28.0  # [px] around its frame
 POINTS = 320  # at most so many points are drawn
 DEEPEST = 1e-12  # a curve is drawn down to this share of its highest value
-DECADES = 2.2  # below this many decades, 2 and 5 are ticks too
+TICKS = 4  # parts into which the axes are divided
 
 
 def draw_curves(traces: Mapping[str, Sequence[float]]) -> str:
     """Plot the total energy of each stage over its iterations on a logarithmic scale."""
-    plots = [
-        {
-            "name": name,
-            "curve": draw_curve(trace),
-            "first": _short(_finite(trace)[0]),
-            "last": _short(_finite(trace)[-1]),
-            "steps": len(trace),
-        }
-        for name, trace in traces.items()
-        if _finite(trace)
-    ]
+    plots: list[dict[str, Any]] = []
+    for name, trace in traces.items():
+        finite = [v for v in trace if math.isfinite(v)]
+        if finite:
+            ends = {"first": f"{finite[0]:.3g}", "last": f"{finite[-1]:.3g}"}
+            plots.append({"name": name, "curve": draw_curve(trace), "steps": len(trace), **ends})
     return fill("curves.html", plots=plots) if plots else ""
 
 
 def draw_curve(trace: Sequence[float]) -> str:
     """One plot; values that have no logarithm are drawn at the lower edge."""
-    pairs = _thinned(trace)
-    low, high = _range([v for _, v in pairs])
-    last = max(1, len(trace) - 1)
+    finite = [(s, v) for s, v in enumerate(trace) if math.isfinite(v)]
+    pairs = finite[:: max(1, math.ceil(len(finite) / POINTS))]
+    pairs += finite[-1:] if pairs[-1] != finite[-1] else []
+    positive = [v for _, v in pairs if v > 0] or [1.0]
+    low, high = max(min(positive), max(positive) * DEEPEST), max(positive)
+    pad, last = max(1.05, (high / low) ** 0.06), max(1, len(trace) - 1)
+    bottom, top = math.log10(low / pad), math.log10(high * pad)
 
     def x(step: float) -> float:
         return LEFT + (WIDTH - LEFT - RIGHT) * step / last
 
     def y(value: float) -> float:
-        share = (math.log10(max(value, low)) - math.log10(low)) / math.log10(high / low)
+        share = (math.log10(max(value, low / pad)) - bottom) / (top - bottom)
         return HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * share
 
+    levels = [10 ** (bottom + (top - bottom) * k / TICKS) for k in range(TICKS + 1)]
+    steps = sorted({round(last * k / TICKS) for k in range(TICKS + 1)})
     return fill(
         "curve.svg",
         width=f"{WIDTH:.0f}",
@@ -240,58 +225,10 @@ def draw_curve(trace: Sequence[float]) -> str:
         right=WIDTH - RIGHT,
         floor=HEIGHT - BOTTOM,
         levels=[
-            {"at": f"{y(v):.1f}", "below": f"{y(v) + 4:.1f}", "text": _short(v)}
-            for v in _ticks(low, high)
+            {"at": f"{y(v):.1f}", "below": f"{y(v) + 4:.1f}", "text": f"{v:.2g}"} for v in levels
         ],
-        steps=[{"at": f"{x(s):.1f}", "text": s} for s in _steps(last)],
+        steps=[{"at": f"{x(s):.1f}", "text": s} for s in steps],
         line="L".join(f"{x(s):.1f} {y(v):.1f}" for s, v in pairs),
         start=f"{x(pairs[0][0]):.1f}",
         end=f"{x(pairs[-1][0]):.1f}",
     )
-
-
-def _finite(trace: Iterable[float]) -> list[float]:
-    return [v for v in trace if math.isfinite(v)]
-
-
-def _thinned(trace: Sequence[float]) -> list[tuple[int, float]]:
-    """(step, value) at an even stride, the last step always included."""
-    stride = max(1, math.ceil(len(trace) / POINTS))
-    steps = sorted({*range(0, len(trace), stride), len(trace) - 1})
-    return [(s, trace[s]) for s in steps if math.isfinite(trace[s])] or [(0, _finite(trace)[0])]
-
-
-def _range(values: Sequence[float]) -> tuple[float, float]:
-    positive = [v for v in values if v > 0] or [1.0]
-    high = max(positive)
-    low = max(min(positive), high * DEEPEST)
-    pad = max(1.05, (high / low) ** 0.06)
-    return low / pad, high * pad
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    span = math.log10(high / low)
-    marks = (1, 2, 5) if span < DECADES else (1,)
-    if span < 0.35:
-        marks = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
-    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    ticks = [m * 10.0**d for d in decades for m in marks if low <= m * 10.0**d <= high]
-    return ticks[:: max(1, math.ceil(len(ticks) / 5))]
-
-
-def _steps(last: int) -> list[int]:
-    raw = last / 4
-    base = 10 ** math.floor(math.log10(max(raw, 1)))
-    step = next((m * base for m in (1, 2, 5, 10) if m * base >= raw), 10 * base)
-    return list(range(0, last + 1, step))
-
-
-def _short(value: float) -> str:
-    """Three significant digits."""
-    if value == 0:
-        return "0"
-    if 1e-3 <= abs(value) < 1e5:
-        digits = max(0, 2 - math.floor(math.log10(abs(value))))
-        text = f"{value:,.{digits}f}"
-        return text.rstrip("0").rstrip(".") if "." in text else text
-    return f"{value:.2g}".replace("e-0", "e-").replace("e+0", "e")

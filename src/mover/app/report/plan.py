@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from mover.app.report.templates import fill
 from mover.core.colours import colour, css, person_colour
@@ -18,6 +19,7 @@ MARGIN = 0.5  # [m] around everything that is drawn
 RANGE = 2.0  # how far beyond the furthest object the camera's cone is drawn
 FEW = 8  # bodies whose dots are drawn larger
 BASE = (1, 5, 4, 0)  # corners of a box around its bottom, the first two at its front
+ARROW = 0.11  # [m]
 DOTS = 400  # at most so many bodies are dotted for each person
 
 
@@ -75,9 +77,12 @@ def draw_top(
     """
     extent = extent or extent_of(scene, truth, bodies)
     shapes = [_grid(extent), *_cone(scene.camera, extent)]
-    for index, piece in enumerate(scene.objects):
-        shapes += _footprint(piece, css(colour(index)))
-    shapes += [_dashed(piece) for piece in (truth.objects if truth is not None else ())]
+    labels: list[dict[str, str]] = []
+    for index, item in enumerate(scene.objects):
+        shapes += _footprint(item, css(colour(index)))
+        x, z = _corners(item)[:4].mean(0).tolist()
+        labels.append({"kind": "name", "x": f"{x:.3f}", "z": f"{z:.3f}", "text": item.id})
+    shapes += [_dashed(item) for item in (truth.objects if truth is not None else ())]
     width, height = extent.right - extent.left, extent.near - extent.far
     x, z = extent.left + 0.25, extent.near - 0.2
     bar = Shape("bar", f"M{x:.2f} {z - 0.07:.2f}v.07h1v-.07")
@@ -87,7 +92,7 @@ def draw_top(
         box=f"{extent.left:.3f} {extent.far:.3f} {width:.3f} {height:.3f}",
         shapes=shapes,
         people=[] if bodies is None else _people(bodies),
-        labels=[*(_label(piece) for piece in scene.objects), scale],
+        labels=[*labels, scale],
         bar=[bar],
     )
 
@@ -118,47 +123,29 @@ def _cone(camera: Camera, extent: Extent) -> tuple[Shape, ...]:
     )
 
 
-def _corners(piece: SceneObject) -> Float[Tensor, "5 2"]:
+def _corners(item: SceneObject) -> Float[Tensor, "5 2"]:
     """Corners of the box seen from above, front left first, and the middle of the front [m]."""
-    base = corners(box_of(piece))[list(BASE)][:, [0, 2]]
+    base = corners(box_of(item))[list(BASE)][:, [0, 2]]
     return torch.cat([base, base[:2].mean(0, keepdim=True)])
 
 
-def _footprint(piece: SceneObject, tint: str) -> tuple[Shape, ...]:
-    points = _corners(piece)
-    inward = (points[3] - points[0]) / (points[3] - points[0]).norm().clamp_min(1e-6)
-    across = (points[1] - points[0]) / (points[1] - points[0]).norm().clamp_min(1e-6)
-    size = 0.11
-    tip = points[4] - 0.55 * size * inward
-    arrow = [tip + size * (inward - across), tip, tip + size * (inward + across)]
+def _footprint(item: SceneObject, tint: str) -> tuple[Shape, ...]:
+    """The box of an object and an arrow at its front."""
+    points = _corners(item)
+    inward, across = (normalize(points[k] - points[0], dim=0, eps=1e-6) for k in (3, 1))
+    tip = points[4] - 0.55 * ARROW * inward
+    arrow = [tip + ARROW * (inward - across), tip, tip + ARROW * (inward + across)]
     return (
-        Shape("piece", _closed(_hull(piece)), tint),
-        Shape("foot", _closed(points[:4]), tint),
+        Shape("foot", _line(points[:4]) + "Z", tint),
         Shape("front", _line(torch.stack(arrow)), tint),
     )
 
 
-def _hull(piece: SceneObject) -> Float[Tensor, "corners 2"]:
-    """Convex outline of the object seen from above [m]."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    flat = place_object(piece).verts[piece.mesh.faces.unique()][:, [0, 2]]
-    try:
-        return flat[torch.from_numpy(ConvexHull(flat.double().numpy()).vertices.copy()).long()]
-    except (QhullError, ValueError):  # a line or a point has no area
-        return _corners(piece)[:4]
-
-
-def _dashed(piece: SceneObject) -> Shape:
-    points = _corners(piece)
-    inward = 0.12 * (points[3] - points[0]) / (points[3] - points[0]).norm().clamp_min(1e-6)
+def _dashed(item: SceneObject) -> Shape:
+    points = _corners(item)
+    inward = 0.12 * normalize(points[3] - points[0], dim=0, eps=1e-6)
     tick = torch.stack([points[4], points[4] - inward])
-    return Shape("truth", _closed(points[:4]) + _line(tick))
-
-
-def _label(piece: SceneObject) -> dict[str, str]:
-    x, z = _corners(piece)[:4].mean(0).tolist()
-    return {"kind": "name", "x": f"{x:.3f}", "z": f"{z:.3f}", "text": piece.id}
+    return Shape("truth", _line(points[:4]) + "Z" + _line(tick))
 
 
 def _people(bodies: Bodies) -> list[dict[str, Any]]:
@@ -183,17 +170,13 @@ def _hips(bodies: Bodies, rows: Tensor) -> Float[Tensor, "rows 2"]:
 
 
 def _soles(bodies: Bodies, rows: Tensor) -> Float[Tensor, "rows 2"]:
-    """Place of the lowest vertex of each body [m]."""
+    """Position of the lowest vertex of each body [m]."""
     lowest = bodies.verts[rows, :, 1].argmin(1)
     return bodies.verts[rows, lowest][:, [0, 2]]
 
 
 def _line(points: Float[Tensor, "points 2"]) -> str:
     return "M" + "L".join(f"{x:.3f} {z:.3f}" for x, z in points.tolist())
-
-
-def _closed(points: Float[Tensor, "points 2"]) -> str:
-    return _line(points) + "Z"
 
 
 def _dots(points: Float[Tensor, "points 2"]) -> str:

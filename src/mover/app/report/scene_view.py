@@ -34,19 +34,16 @@ class Thinning:
 
 def thin(mesh: Mesh, count: int) -> Mesh:
     """The mesh with at most about `count` faces; soups are welded first."""
+    import trimesh
     from fast_simplification import simplify
 
     verts = mesh.verts.detach().cpu().double().numpy()
-    faces = mesh.faces.cpu().long().numpy()
-    used, faces = np.unique(faces, return_inverse=True)
-    verts, faces = verts[used], faces.reshape(-1, 3)
-    grain = GRAIN * max(float(np.ptp(verts, axis=0).max()), 1e-9)
-    rounded = np.round(verts / grain).astype(np.int64)
-    _, first, same = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-    verts, faces = verts[first], same.reshape(-1)[faces]
-    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
-    once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]
-    faces = faces[np.sort(once)]
+    shape = trimesh.Trimesh(verts, mesh.faces.cpu().long().numpy(), process=False)
+    grain = GRAIN * max(float(np.ptp(verts[np.unique(shape.faces)], axis=0).max()), 1e-9)
+    shape.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=round(-np.log10(grain)))
+    faces = shape.faces[(shape.faces != np.roll(shape.faces, 1, axis=1)).all(1)]
+    faces = faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]
+    verts = np.asarray(shape.vertices)
     if len(faces) > count:
         with simplifying:
             verts, faces, *_ = simplify(verts, faces.astype(np.int32), target_count=count)
@@ -178,7 +175,7 @@ def floor_of(scene: Scene, bodies: Bodies | None = None) -> float:
 
 
 def _room(scene: Scene, bodies: Bodies | None) -> dict[str, Any]:
-    """Middle and radius of all that is seen, above the floor [m]."""
+    """Middle and radius of all that is shown, above the floor [m]."""
     points = [place_object(o).verts.detach().reshape(-1, 3).double() for o in scene.objects]
     if bodies is not None and len(bodies.verts):
         points.append(bodies.verts[:, ::17].detach().reshape(-1, 3).double())
@@ -186,10 +183,8 @@ def _room(scene: Scene, bodies: Bodies | None) -> dict[str, Any]:
         return {"middle": [0.0, 0.6, -3.0], "radius": 4.0}
     both = torch.cat(points) - torch.tensor([0.0, floor_of(scene, bodies), 0.0]).double()
     low, high = both.amin(0), both.amax(0)
-    return {
-        "middle": _numbers((low + high) / 2),
-        "radius": max(1.0, float((high - low).norm()) / 2),
-    }
+    radius = max(1.0, float((high - low).norm()) / 2)
+    return {"middle": _numbers((low + high) / 2), "radius": radius}
 
 
 def _packed_people(bodies: dict[str, Bodies], block: bytearray) -> dict[str, Any] | None:

@@ -109,21 +109,21 @@ class Change:
 
 def find_changes(initial: Scene, result: Scene) -> dict[str, Change]:
     """What happened to each object that both scenes hold."""
-    old = {piece.id: piece for piece in initial.objects}
+
+    def centre(item: SceneObject, scene: Scene) -> torch.Tensor:
+        verts = place_object(item).verts[item.mesh.faces.unique()]
+        return to_camera((verts.amin(0) + verts.amax(0)) / 2, scene.camera.R_cam_world)
+
+    old = {item.id: item for item in initial.objects}
     return {
-        piece.id: Change(
-            float((_centre(piece, result) - _centre(old[piece.id], initial)).norm()),
-            float(wrap(piece.yaw - old[piece.id].yaw)),
-            tuple((piece.scale / old[piece.id].scale).tolist()),
+        item.id: Change(
+            float((centre(item, result) - centre(old[item.id], initial)).norm()),
+            float(wrap(item.yaw - old[item.id].yaw)),
+            tuple((item.scale / old[item.id].scale).tolist()),
         )
-        for piece in result.objects
-        if piece.id in old
+        for item in result.objects
+        if item.id in old
     }
-
-
-def _centre(piece: SceneObject, scene: Scene) -> torch.Tensor:
-    verts = place_object(piece).verts[piece.mesh.faces.unique()]
-    return to_camera((verts.amin(0) + verts.amax(0)) / 2, scene.camera.R_cam_world)
 
 
 @dataclass(frozen=True)
@@ -145,13 +145,9 @@ def draw_table(titles: Sequence[Cell], rows: Sequence[Sequence[Cell]]) -> str:
 def metrics_table(metrics: Mapping[str, Any]) -> str:
     """Each metric before and after, coloured by whether it became better."""
     before, after = metrics.get("initial") or {}, metrics.get("result") or {}
-    keys = [k for k in QUANTITIES if k in before or k in after]
-    keys += [
-        k
-        for k in (*before, *after)
-        if k not in QUANTITIES and is_number(before.get(k, after.get(k)))
-    ]
-    rows = [_metric_row(k, before.get(k), after.get(k)) for k in dict.fromkeys(keys)]
+    every = dict.fromkeys((*(k for k in QUANTITIES if k in before or k in after), *before, *after))
+    keys = [k for k in every if k in QUANTITIES or is_number(before.get(k, after.get(k)))]
+    rows = [_metric_row(k, before.get(k), after.get(k)) for k in keys]
     return draw_table([Cell("Metric", "text"), *map(Cell, ("Before", "After", "Change"))], rows)
 
 
@@ -182,11 +178,14 @@ def objects_table(
     titles = ["Moved", "Turned", "Size", *(QUANTITIES[k].short for k in judged)]
     titles += [f.replace("_", " ") for f in fields]
     lines: list[list[Cell]] = []
-    for index, piece in enumerate(result.objects):
-        head = [Cell(piece.id, tint=css(colour(index))), Cell(piece.category, "text")]
-        values = [*_change_cells(changes.get(piece.id))]
-        values += [_score_cell(scores.get(piece.id), k) for k in judged]
-        values += [write_value(extra.get(piece.id, {}).get(f)) for f in fields]
+    for index, item in enumerate(result.objects):
+        sides = [(scores.get(item.id) or {}).get(side) or {} for side in ("initial", "result")]
+        values = [*_change_cells(changes.get(item.id))]
+        for key in judged:
+            before, after = (side.get(key) for side in sides)
+            values.append(f"{write_quantity(key, before, False)} → {write_quantity(key, after)}")
+        values += [write_value(extra.get(item.id, {}).get(f)) for f in fields]
+        head = [Cell(item.id, tint=css(colour(index))), Cell(item.category, "text")]
         lines.append([*head, *map(Cell, values)])
     return draw_table([Cell("Object"), Cell("Category", "text"), *map(Cell, titles)], lines)
 
@@ -198,11 +197,6 @@ def _change_cells(change: Change | None) -> tuple[str, str, str]:
     size = f"{grown[0]} %" if len(set(grown)) == 1 else f"{' / '.join(grown)} %"
     turned = f"{signed(math.degrees(change.turned), 1)}°"
     return (f"{100 * change.moved:.0f} cm", turned, size)
-
-
-def _score_cell(score: Mapping[str, Any] | None, key: str) -> str:
-    before, after = ((score or {}).get(k) or {} for k in ("initial", "result"))
-    return f"{write_quantity(key, before.get(key), False)} → {write_quantity(key, after.get(key))}"
 
 
 def settings_of(config: Mapping[str, Any], above: str = "") -> list[tuple[str, str]]:

@@ -4,17 +4,15 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-HOME = files("mover.app.report")
-
 
 @cache
 def _environment() -> Any:  # noqa: ANN401
     """Everything that is filled in is escaped, and what is missing is an error."""
-    from jinja2 import Environment, FunctionLoader, StrictUndefined
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
     return Environment(
         autoescape=True,
-        loader=FunctionLoader(lambda name: _text("templates", name)),
+        loader=PackageLoader("mover.app.report"),
         lstrip_blocks=True,
         trim_blocks=True,
         undefined=StrictUndefined,
@@ -32,8 +30,4 @@ def asset(name: str) -> str:
     """Text of a file that stands in the page as it is."""
     from markupsafe import Markup
 
-    return Markup(_text("assets", name))
-
-
-def _text(folder: str, name: str) -> str:
-    return HOME.joinpath(folder, name).read_text(encoding="utf-8")
+    return Markup(files("mover.app.report").joinpath("assets", name).read_text(encoding="utf-8"))

@@ -3,95 +3,21 @@
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from mover.app.report.scene_view import Thinning, floor_of, thin, thin_choice
+from mover.app.viewer.session import Session
 from mover.core.colours import Colour, colour, person_colour
-from mover.core.types import Bodies, Camera, Scene, SceneObject
+from mover.core.types import Bodies, Camera, SceneObject
 
 FACES, FACES_BODY = 20_000, 6000  # of an object and of a body, at most
 WIDEST = 800  # [px] of the picture in the frustum
 World = Literal["after", "before"]
-
-
-@dataclass
-class Drawing:
-    """Handles of everything that is drawn."""
-
-    server: Any
-    after: dict[str, Any] = field(default_factory=dict[str, Any])
-    """Furniture as it is, by id."""
-    before: dict[str, Any] = field(default_factory=dict[str, Any])
-    """Furniture as it was initially."""
-    ground: Any = None
-    camera: Any = None
-    camera_visible: bool = True
-    colours: dict[str, Colour] = field(default_factory=dict[str, Colour])
-
-
-def draw_room(drawing: Drawing, scene: Scene, world: World) -> None:
-    """Draw the furniture of a world; what is drawn already only moves."""
-    handles: dict[str, Any] = getattr(drawing, world)
-    for name in set(handles) - {item.id for item in scene.objects}:
-        handles.pop(name).remove()
-    for item in scene.objects:
-        tint = drawing.colours.setdefault(item.id, colour(len(drawing.colours)))
-        if item.id not in handles:
-            small = thin(item.mesh, FACES)
-            handles[item.id] = drawing.server.scene.add_mesh_simple(
-                f"/{world}/{item.id}", small.verts.detach().numpy(), small.faces.numpy(),
-                color=bytes_of(tint), flat_shading=True, side="double",
-            )  # fmt: skip
-        move_object(handles[item.id], item)
-
-
-def move_object(handle: Any, item: SceneObject) -> None:  # noqa: ANN401
-    """Put a drawn object where it stands."""
-    half = float(item.yaw) / 2
-    handle.position = tuple(item.t_world_object.detach().tolist())
-    handle.wxyz = (math.cos(half), 0.0, math.sin(half), 0.0)
-    handle.scale = tuple(item.scale.detach().tolist())
-
-
-def draw_camera(drawing: Drawing, scene: Scene, image: Float[Tensor, "h w 3"] | None) -> None:
-    """Draw the floor and the camera with its picture."""
-    for handle in (drawing.ground, drawing.camera):
-        if handle is not None:
-            handle.remove()
-    camera = scene.camera
-    picture = None
-    if image is not None:
-        every = max(1, -(-image.shape[1] // WIDEST))
-        picture = (255 * image[::every, ::every]).round().clamp(0, 255).to(torch.uint8).numpy()
-    drawing.ground = drawing.server.scene.add_grid(
-        "/ground", 40.0, 40.0, plane="xz", cell_size=0.5, section_size=1.0, plane_opacity=0.0,
-        position=(0.0, floor_of(scene), 0.0), fade_distance=30.0,
-    )  # fmt: skip
-    drawing.camera = drawing.server.scene.add_camera_frustum(
-        "/camera", fov=2 * math.atan(camera.height / (2 * float(camera.K[1, 1]))),
-        aspect=camera.width / camera.height, scale=0.4, thickness=0.006, color=(60, 60, 60),
-        image=picture, cast_shadow=False, wxyz=camera_wxyz(camera),
-    )  # fmt: skip
-    drawing.camera.visible = drawing.camera_visible
-
-
-def camera_wxyz(camera: Camera) -> Float[np.ndarray, "4"]:
-    """The quaternion of the camera's axes in the world."""
-    from viser.transforms import SO3  # pyright: ignore[reportMissingImports]
-
-    return SO3.from_matrix(camera.R_cam_world.detach().double().numpy().T).wxyz
-
-
-def bytes_of(tint: Colour) -> tuple[int, int, int]:
-    """A colour in whole numbers up to 255."""
-    red, green, blue = (round(255 * c) for c in tint)
-    return red, green, blue
 
 
 @dataclass
@@ -146,3 +72,134 @@ class DrawnPeople:
             f"/people/{person}", verts, self.few.faces.numpy(),
             color=bytes_of(person_colour(person)), side="double",
         )  # fmt: skip
+
+
+@dataclass
+class Window:
+    """Server, state and handles of what is drawn in one viewer."""
+
+    server: Any
+    session: Session
+    people: DrawnPeople
+    furniture: dict[World, dict[str, Any]] = field(
+        default_factory=lambda: {"after": {}, "before": {}}
+    )
+    """As it is and as it was initially, by id."""
+    colours: dict[str, Colour] = field(default_factory=dict[str, Colour])
+    ground: Any = None
+    camera: Any = None
+    camera_visible: bool = True
+    gizmo: Any = None
+    """What the mouse holds."""
+    moment: int = 0
+    """Position on the time line."""
+    world: World = "after"
+    """Whose furniture, people, floor and camera are shown."""
+
+    def set_world(self, world: World) -> None:
+        """Show the room before or after the run."""
+        shown, self.world = self.session.shown, world
+        self.draw_furniture()
+        self._draw_camera()
+        self.people.replace(shown.bodies if world == "after" else shown.initial_bodies)
+        self.people.show(self.moment)
+
+    def redraw(self) -> None:
+        """Draw the furniture as it is now, and let the mouse hold the selected object."""
+        self.draw_furniture()
+        self._hold_selected()
+
+    def draw_furniture(self) -> None:
+        """Draw both worlds' furniture, of which one is visible; what is drawn only moves."""
+        scenes = {"after": self.session.scene, "before": self.session.shown.initial}
+        for world, handles in self.furniture.items():
+            for name in set(handles) - {item.id for item in scenes[world].objects}:
+                handles.pop(name).remove()
+            for item in scenes[world].objects:
+                if item.id not in handles:
+                    handles[item.id] = self._added(world, item)
+                move_object(handles[item.id], item)
+                handles[item.id].visible = world == self.world
+
+    def _added(self, world: World, item: SceneObject) -> Any:  # noqa: ANN401
+        """A new mesh, which a click selects in the room as it is."""
+        tint = self.colours.setdefault(item.id, colour(len(self.colours)))
+        small = thin(item.mesh, FACES)
+        handle = self.server.scene.add_mesh_simple(
+            f"/{world}/{item.id}", small.verts.detach().numpy(), small.faces.numpy(),
+            color=bytes_of(tint), flat_shading=True, side="double",
+        )  # fmt: skip
+        if world == "after":
+            handle.on_click(lambda _event: self.session.select(item.id))
+        return handle
+
+    def _draw_camera(self) -> None:
+        """Draw the floor and the camera with its picture."""
+        for handle in (self.ground, self.camera):
+            if handle is not None:
+                handle.remove()
+        shown = self.session.shown
+        scene = shown.result if self.world == "after" else shown.initial
+        camera, picture = scene.camera, None
+        if shown.image is not None:
+            every = max(1, -(-shown.image.shape[1] // WIDEST))
+            small = (255 * shown.image[::every, ::every]).round().clamp(0, 255)
+            picture = small.to(torch.uint8).numpy()
+        self.ground = self.server.scene.add_grid(
+            "/ground", 40.0, 40.0, plane="xz", cell_size=0.5, section_size=1.0, plane_opacity=0.0,
+            position=(0.0, floor_of(scene), 0.0), fade_distance=30.0,
+        )  # fmt: skip
+        self.camera = self.server.scene.add_camera_frustum(
+            "/camera", fov=2 * math.atan(camera.height / (2 * float(camera.K[1, 1]))),
+            aspect=camera.width / camera.height, scale=0.4, thickness=0.006, color=(60, 60, 60),
+            image=picture, cast_shadow=False, wxyz=camera_wxyz(camera),
+        )  # fmt: skip
+        self.camera.visible = self.camera_visible
+
+    def _hold_selected(self) -> None:
+        """Give the selected object a gizmo; the last one loses its own."""
+        if self.gizmo is not None:
+            self.gizmo.remove()
+            self.gizmo = None
+        item = self.session.object_named(self.session.selected)
+        if item is None:
+            return
+        handle = self.furniture["after"][item.id]
+        self.gizmo = gizmo = self.server.scene.add_transform_controls(
+            "/gizmo", scale=0.9, active_axes=(True, item.support == "free", True),
+            depth_test=False, position=handle.position, wxyz=handle.wxyz,
+        )  # fmt: skip
+
+        @gizmo.on_update
+        async def _(event: Any) -> None:  # noqa: ANN401
+            now = self.session.object_named(item.id)
+            if now is None:
+                return
+            w, x, y, z = (float(v) for v in gizmo.wxyz)
+            yaw = math.atan2(2 * (w * y + x * z), 1 - 2 * (x * x + y * y))
+            position = torch.tensor([float(v) for v in gizmo.position])
+            moved = replace(now, t_world_object=position, yaw=torch.tensor(yaw))
+            move_object(handle, moved)
+            if event.phase == "end":  # the mouse lets it go
+                self.session.put(moved)
+
+
+def move_object(handle: Any, item: SceneObject) -> None:  # noqa: ANN401
+    """Put a drawn object where it stands."""
+    half = float(item.yaw) / 2
+    handle.position = tuple(item.t_world_object.detach().tolist())
+    handle.wxyz = (math.cos(half), 0.0, math.sin(half), 0.0)
+    handle.scale = tuple(item.scale.detach().tolist())
+
+
+def camera_wxyz(camera: Camera) -> Float[np.ndarray, "4"]:
+    """The quaternion of the camera's axes in the world."""
+    from viser.transforms import SO3  # pyright: ignore[reportMissingImports]
+
+    return SO3.from_matrix(camera.R_cam_world.detach().double().numpy().T).wxyz
+
+
+def bytes_of(tint: Colour) -> tuple[int, int, int]:
+    """A colour in whole numbers up to 255."""
+    red, green, blue = (round(255 * c) for c in tint)
+    return red, green, blue

@@ -3,23 +3,16 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from mover.app.report.tables import find_changes
-from mover.app.viewer.drawing import (
-    Drawing,
-    DrawnPeople,
-    World,
-    camera_wxyz,
-    draw_camera,
-    draw_room,
-)
-from mover.app.viewer.session import Session, Shown
+from mover.app.viewer.drawing import Window, camera_wxyz
+from mover.app.viewer.session import Shown
 from mover.core.types import Scene, SceneObject
 from mover.geometry.boxes import box_of
 
@@ -33,48 +26,15 @@ EVIDENCE = {
 }
 
 
-@dataclass
-class Viewer:
-    """Server, state and drawings of one viewer."""
-
-    server: Any
-    session: Session
-    drawing: Drawing
-    people: DrawnPeople
-    moment: int = 0
-    """Position on the time line."""
-    world: World = "after"
-    """Whose furniture, people, floor and camera are shown."""
-
-
-def set_world(window: Viewer, world: World) -> None:
-    """Show the room before or after the run."""
-    shown, drawing = window.session.shown, window.drawing
-    window.world = world
-    draw_room(drawing, shown.initial, "before")
-    draw_camera(drawing, shown.result if world == "after" else shown.initial, shown.image)
-    show_furniture(window)
-    window.people.replace(shown.bodies if world == "after" else shown.initial_bodies)
-    window.people.show(window.moment)
-
-
-def show_furniture(window: Viewer) -> None:
-    """Show the furniture of the window's world only."""
-    for handle in window.drawing.before.values():
-        handle.visible = window.world == "before"
-    for handle in window.drawing.after.values():
-        handle.visible = window.world == "after"
-
-
-def add_room_panel(window: Viewer) -> None:
+def add_room_panel(window: Window) -> None:
     """Fill the tab."""
     _add_time_line(window)
     worlds = window.server.gui.add_button_group("Room", ["after", "before"])
-    worlds.on_click(lambda _event: set_world(window, worlds.value))
+    worlds.on_click(lambda _event: window.set_world(worlds.value))
     _add_looks(window)
 
 
-def _add_time_line(window: Viewer) -> None:
+def _add_time_line(window: Window) -> None:
     gui, frames = window.server.gui, window.people.frames
     if not frames:
         gui.add_markdown("*There are no people in this capture.*")
@@ -105,7 +65,7 @@ def _add_time_line(window: Viewer) -> None:
         play.label = "Play"
 
 
-def _pace(fps: float, frames: Any) -> tuple[float, int]:  # noqa: ANN401
+def _pace(fps: float, frames: Sequence[int]) -> tuple[float, int]:
     """Pictures a second, and the moments from one to the next."""
     gap = float(np.median(np.diff(frames))) if len(frames) > 1 else 1.0
     moments = fps / max(gap, 1.0)
@@ -113,14 +73,14 @@ def _pace(fps: float, frames: Any) -> tuple[float, int]:  # noqa: ANN401
     return moments / every, every
 
 
-def _add_looks(window: Viewer) -> None:
-    gui, drawing = window.server.gui, window.drawing
+def _add_looks(window: Window) -> None:
+    gui = window.server.gui
     frustum = gui.add_checkbox("Camera", initial_value=True)
     through = gui.add_button("Look through the camera")
     above = gui.add_button("Look from above")
 
     def show(visible: bool) -> None:
-        frustum.value = drawing.camera_visible = drawing.camera.visible = visible
+        frustum.value = window.camera_visible = window.camera.visible = visible
 
     @through.on_click
     def _(event: Any) -> None:  # noqa: ANN401
@@ -148,56 +108,49 @@ def numbers_of(item: SceneObject, scene: Scene, shown: Shown) -> str:
     box = box_of(item)
     x, y, z = box.center.tolist()
     width, height, depth = (100 * v for v in box.size.tolist())
+    change = find_changes(shown.initial, scene).get(item.id)
+    evidence = next((r for r in shown.log.get("evidence", ()) if r.get("id") == item.id), {})
     rows = [
         ("category", item.category),
         ("centre x, y, z", f"{x:.2f}, {y:.2f}, {z:.2f} m"),
         ("front", f"{math.degrees(float(item.yaw)):.0f}°"),
         ("width, height, depth", f"{width:.0f}, {height:.0f}, {depth:.0f} cm"),
         ("stands on", item.support),
-        *_changes(item, scene, shown),
-        *_evidence(item, shown.log),
     ]
+    if change is None:
+        rows.append(("before", "not there"))
+    else:
+        rows += [
+            ("moved since the start", f"{100 * change.moved:.0f} cm"),
+            ("turned", f"{math.degrees(change.turned):+.0f}°"),
+            ("grown", ", ".join(f"{factor:.2f}" for factor in change.grown)),
+        ]
+    for key, text in EVIDENCE.items():
+        if isinstance(evidence.get(key), int | float):
+            rows.append((text, f"{evidence[key]:,}"))
     lines = [f"| {name} | {value} |" for name, value in rows]
     return "\n".join([f"| **{item.id}** | |", "|---|---|", *lines])
 
 
-def _changes(item: SceneObject, scene: Scene, shown: Shown) -> list[tuple[str, str]]:
-    change = find_changes(shown.initial, scene).get(item.id)
-    if change is None:
-        return [("before", "not there")]
-    return [
-        ("moved since the start", f"{100 * change.moved:.0f} cm"),
-        ("turned", f"{math.degrees(change.turned):+.0f}°"),
-        ("grown", ", ".join(f"{factor:.2f}" for factor in change.grown)),
-    ]
-
-
-def _evidence(item: SceneObject, log: Mapping[str, Any]) -> list[tuple[str, str]]:
-    row = next((r for r in log.get("evidence", ()) if r.get("id") == item.id), {})
-    return [
-        (text, f"{row[key]:,}")
-        for key, text in EVIDENCE.items()
-        if isinstance(row.get(key), int | float)
-    ]
-
-
-def add_object_panel(window: Viewer) -> None:
+def add_object_panel(window: Window) -> None:
     """Fill the tab."""
     gui, session = window.server.gui, window.session
-    choice = gui.add_dropdown("Object", [NONE, *window.drawing.after])
+    choice = gui.add_dropdown("Object", [NONE, *window.furniture["after"]])
     table = gui.add_markdown("")
     _add_edits(window)
     undo = gui.add_button("Undo the last edit")
     saved = gui.add_markdown("")
 
     def refresh() -> None:
-        choice.options = [NONE, *window.drawing.after]
+        choice.options = [NONE, *window.furniture["after"]]
         choice.value = session.selected or NONE
         item = session.object_named(session.selected)
         none = "Click on an object."
         table.content = none if item is None else numbers_of(item, session.scene, session.shown)
         new = len(session.edits) - session.done
-        saved.content = f"{new} new edits in `{session.file}`; `{_command(session)}` solves them."
+        source = session.shown.log.get("source") or "CAPTURE"
+        command = f"mover run {source} --edits {session.file} --out NEW"
+        saved.content = f"{new} new edits in `{session.file}`; `{command}` solves them."
         saved.visible = new > 0
 
     @choice.on_update
@@ -209,17 +162,12 @@ def add_object_panel(window: Viewer) -> None:
     session.listen(refresh)
 
 
-def _command(session: Session) -> str:
-    source = session.shown.log.get("source") or "CAPTURE"
-    return f"mover run {source} --edits {session.file} --out NEW"
-
-
-def _add_edits(window: Viewer) -> None:
+def _add_edits(window: Window) -> None:
     gui, session = window.server.gui, window.session
     folder = gui.add_folder("Edit", visible=False)
     with folder:
         gui.add_markdown("Pull at its arrows, its square or its arc, or write:")
-        place = gui.add_vector3("Position [m]", (0.0, 0.0, 0.0), step=0.01)
+        position = gui.add_vector3("Position [m]", (0.0, 0.0, 0.0), step=0.01)
         yaw = gui.add_number("Front [°]", 0.0, step=1.0)
         size = gui.add_vector3("Size [cm]", (1.0, 1.0, 1.0), min=(1.0, 1.0, 1.0), step=1.0)
         pin = gui.add_checkbox("Pinned", False, hint="The next run does not move it")
@@ -229,7 +177,7 @@ def _add_edits(window: Viewer) -> None:
         item = session.object_named(session.selected)
         folder.visible = item is not None
         if item is not None:
-            place.value = tuple(round(v, 3) for v in item.t_world_object.tolist())
+            position.value = tuple(round(v, 3) for v in item.t_world_object.tolist())
             yaw.value = round(math.degrees(float(item.yaw)), 1)
             size.value = tuple(round(100 * v, 1) for v in box_of(item).size.tolist())
             pin.value = item.id in session.pinned
@@ -247,7 +195,11 @@ def _add_edits(window: Viewer) -> None:
     # The fields are rounded: numbers that still say what they said change nothing.
     def put(item: SceneObject) -> None:
         now, turn = item.t_world_object, torch.tensor(math.radians(yaw.value))
-        t, asked, box = torch.tensor(place.value), torch.tensor(size.value) / 100, box_of(item).size
+        t, asked, box = (
+            torch.tensor(position.value),
+            torch.tensor(size.value) / 100,
+            box_of(item).size,
+        )
         scale = item.scale * asked / box.clamp_min(1e-6)
         session.put(
             replace(
@@ -258,7 +210,7 @@ def _add_edits(window: Viewer) -> None:
             )
         )
 
-    for written in (place, yaw, size):
+    for written in (position, yaw, size):
         written.on_update(by_user(put))
     pin.on_update(by_user(lambda item: session.pin(item.id, pin.value)))
     delete.on_click(by_user(lambda item: session.delete(item.id)))

@@ -1,6 +1,5 @@
 """The state behind the viewer: a result, the edits on top of it, and the selected object."""
 
-import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,12 +42,7 @@ class Shown:
     image: Float[Tensor, "h w 3"] | None = None
     """The reference image, in [0, 1]."""
     log: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """What run.json holds."""
-
-    @property
-    def edits_inside(self) -> int:
-        """How many edits of the list are part of the result already."""
-        return int(self.log.get("edits", 0))
+    """What run.json holds; `edits`: how many of the list are part of the result already."""
 
 
 def read_shown(out: Path) -> Shown:
@@ -86,7 +80,6 @@ class Session:
     """Number of edits that are part of `shown.result`."""
     selected: str | None = None
     listeners: list[Callable[[], None]] = field(default_factory=list[Callable[[], None]])
-    lock: threading.RLock = field(default_factory=threading.RLock)
 
     @property
     def scene(self) -> Scene:
@@ -140,10 +133,8 @@ class Session:
 
     def record(self, edit: Edit) -> None:
         """Append an edit; several placements of one object in a row become one."""
-        with self.lock:
-            fresh = joined(self.edits[self.done :], edit)
-            self.edits = (*self.edits[: self.done], *fresh)
-            self._save()
+        self.edits = (*self.edits[: self.done], *joined(self.edits[self.done :], edit))
+        self._save()
 
     def listen(self, listener: Callable[[], None]) -> None:
         """Call it now, and whenever the room, its edits or the choice have changed."""
@@ -170,6 +161,6 @@ def start_session(shown: Shown, file: Path | None) -> Session:
         InputError: If the edits do not fit the result.
     """
     edits = read_edits(file) if file is not None and file.is_file() else ()
-    session = Session(shown, file, edits, min(shown.edits_inside, len(edits)))
+    session = Session(shown, file, edits, min(int(shown.log.get("edits", 0)), len(edits)))
     assert session.scene is not None  # edits that do not fit are refused here
     return session
