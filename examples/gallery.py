@@ -15,16 +15,9 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from mover.app.pictures.eye import orbit_eye
 from mover.app.pictures.film import pixels
-from mover.app.pictures.paint import (
-    Surfaces,
-    draw_picture,
-    furniture,
-    ground_under,
-    joined,
-    people,
-)
+from mover.app.pictures.overlay import backdrop
+from mover.app.pictures.paint import Surfaces, draw_picture, furniture, joined, people
 from mover.bodies.skinning import open_body
 from mover.core.types import Bodies, Camera, Scene, SceneObject
 from mover.furniture.library import STYLES, make_piece
@@ -67,10 +60,21 @@ def coloured(pieces: tuple[Placed, ...]) -> Surfaces:
 
 
 def picture_of(still: Surfaces, moving: Surfaces, azimuth: float, elevation: float) -> Image.Image:
-    """A picture from around."""
-    both = joined([still, moving])
-    eye = orbit_eye(both.verts, CELL, azimuth, elevation)
-    return Image.fromarray(pixels(draw_picture(both, eye, ground_under(both.verts, 0.0))[0]))
+    """A picture from around, as near as it may be to see everything."""
+    both, (width, height) = joined([still, moving]), CELL
+    flat = math.cos(elevation)
+    out = [math.sin(azimuth) * flat, math.sin(elevation), math.cos(azimuth) * flat]
+    away, right = torch.tensor(out), torch.tensor([math.cos(azimuth), 0.0, -math.sin(azimuth)])
+    down = torch.linalg.cross(-away, right)
+    R, focal = torch.stack([right, down / down.norm(), -away]), 1.3 * height
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    middle = (both.verts.amin(0) + both.verts.amax(0)) / 2
+    x, y, z = ((both.verts - middle) @ R.mT).unbind(-1)
+    reach = 2.12 * focal * torch.maximum(x.abs() / width, y.abs() / height)
+    eye = middle + float((reach - z).amax().clamp_min(1.0)) * away
+    seen = dataclasses.replace(both, verts=both.verts - eye)
+    base = backdrop(height, width)
+    return Image.fromarray(pixels(draw_picture(seen, Camera(K, R, width, height), base)[0]))
 
 
 def surfaces_of(verts: np.ndarray) -> Surfaces:

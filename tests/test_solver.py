@@ -297,21 +297,21 @@ class TestPlacing:
 
 
 class TestCommandLine:
-    def test_a_method_is_chosen_by_name_and_set_by_its_own_flags(self):
-        args = ["room", "--place.method", "adam", "--place.method.steps", "9"]
-        run, config = parse_run([*args, "--layout.method.steps", "3"])
+    def test_steps_of_each_method_are_set_by_flags(self):
+        flags = ["--place.method.steps", "9", "--layout.method.steps", "3"]
+        run, config = parse_run(["room", *flags])
         assert run.source.name == "room"
-        assert config.place.method == Adam(9)
+        assert config.place.method == BatchedBFGS(steps=9)
         assert config.layout.method == BatchedBFGS(steps=3)
-        _, config = parse_run(["room", "--preset", "paper", "--place.method", "newton"])
-        assert config.place.method == BatchedBFGS()
-        assert config.layout.method == Adam(1000)
+        _, config = parse_run(["room", *flags, "--preset", "paper"])
+        assert config.place.method == Adam(9)
 
     def test_settings_come_back_from_a_file_with_the_right_method(self):
-        _, config = parse_run(["room", "--place.method", "newton", "--preset", "paper"])
-        again = read_settings(Config, plain(config), "config")
-        assert again.place.method == BatchedBFGS()
-        assert again.layout.method == config.layout.method
+        for preset in ("robust", "paper"):
+            _, config = parse_run(["room", "--preset", preset])
+            again = read_settings(Config, plain(config), "config")
+            assert again.place.method == config.place.method
+            assert again.layout.method == config.layout.method
 
 
 def random_maps(seed, n=3, starts=2, size=24):

@@ -1,4 +1,4 @@
-"""Write a room to disk: scene, meshes, proxies, bodies, log and report (FORMAT.md, "Result")."""
+"""Write a room to disk: scene, meshes, proxies, bodies, log and report (docs/data.md)."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ from mover.core.devices import CPU, named
 from mover.core.files import replacing
 from mover.core.run import Run
 from mover.core.settings import read_settings
-from mover.core.types import Bodies, Capture, ContactLabels, Mesh, Room, Scene
+from mover.core.types import Bodies, Capture, ContactLabels, Room, Scene
 from mover.extensions.missing_seats import PROPOSED, write_proposals
 from mover.extensions.moving_camera import bodies_as_given
 from mover.io.capture.bodies_file import write_bodies
@@ -59,15 +59,18 @@ def write_results(
     report: bool = True,
 ) -> None:
     """Write everything but metrics.json; the page last, unless more is added to it."""
-    origin = origin or Origin()
-    out = run.folder
+    import trimesh
+
+    origin, out = origin or Origin(), run.folder
     write_scene(room.initial, out / "initial.json")
     if room.bodies is not None:
         write_bodies(room.bodies, out / "bodies.npz")
         write_bodies(initial_bodies(capture), out / "initial_bodies.npz")
         write_labels(labels_of(room, run), out / "contacts.npz")
-    for piece, proxy in zip(room.scene.objects, room.proxies, strict=True):
-        _write_mesh(proxy, out / "watertight" / f"{piece.id}.glb")
+    for item, proxy in zip(room.scene.objects, room.proxies, strict=True):
+        shape = trimesh.Trimesh(proxy.verts.numpy(), proxy.faces.numpy(), process=False)
+        with replacing(out / "watertight" / f"{item.id}.glb") as part:
+            shape.export(part)
     write_glb(room.scene, room.bodies, out / "scene.glb")
     if origin.edits:
         write_edits(origin.edits, out / "edits.json")
@@ -113,7 +116,6 @@ def report_of(
         truth=truth,
         initial_bodies=None if room.bodies is None else initial_bodies(capture),
         bodies=room.bodies,
-        traces={name: trace.tolist() for name, trace in room.traces.items()},
         metrics=metrics,
         warnings=room.warnings,
         stages=[dataclasses.asdict(s) for s in run.stages],
@@ -130,14 +132,6 @@ def report_of(
 def command_line() -> str:
     """What was typed."""
     return " ".join(["mover", *sys.argv[1:]])
-
-
-def _write_mesh(mesh: Mesh, path: Path) -> None:
-    import trimesh
-
-    shape = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)
-    with replacing(path) as part:
-        shape.export(part)
 
 
 def _write_log(room: Room, config: Config, run: Run, origin: Origin) -> None:

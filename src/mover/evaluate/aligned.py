@@ -1,4 +1,4 @@
-"""Overlap of a scene's objects after one similarity: what scale and place of the whole cost.
+"""Overlap of a scene's objects after one similarity: what the scale and position of the whole cost.
 
 A video does not determine how large a room is: people of unknown height and a guessed lens make
 all of it too large or too small at once. This separates that error from those of single objects.
@@ -42,24 +42,19 @@ def iou3d_aligned(scene: Together) -> float | None:
     """Mean overlap of the boxes after the similarity that brings most centres together."""
     if len(scene.pairs) < FEWEST:
         return None
-    ours = [box_of(pair.estimate) for pair in scene.pairs]
-    true = [box_of(pair.truth) for pair in scene.pairs]
-    found = _fitted(*(torch.stack([b.center.double() for b in boxes]) for boxes in (ours, true)))
-    total = sum(
-        float(box_iou(thick(_carried(a, found)), thick(_double(b))))
-        for a, b in zip(ours, true, strict=True)
-    )
+    ours = [_double(box_of(pair.estimate)) for pair in scene.pairs]
+    true = [_double(box_of(pair.truth)) for pair in scene.pairs]
+    by = _fitted(*(torch.stack([box.center for box in boxes]) for boxes in (ours, true)))
+    total = 0.0
+    for box, aim in zip(ours, true, strict=True):
+        centre = by.scale * (rot_y(by.yaw) @ box.center) + by.away
+        carried = Box(centre, by.scale * box.size, box.yaw + by.yaw)
+        total += float(box_iou(thick(carried), thick(aim)))
     return total / (len(scene.pairs) + scene.missing)
 
 
 def _double(box: Box) -> Box:
     return Box(box.center.double(), box.size.double(), box.yaw.double())
-
-
-def _carried(box: Box, by: _Similarity) -> Box:
-    box = _double(box)
-    centre = by.scale * (rot_y(by.yaw) @ box.center) + by.away
-    return Box(centre, by.scale * box.size, box.yaw + by.yaw)
 
 
 def _fitted(ours: Float[Tensor, "n 3"], true: Float[Tensor, "n 3"]) -> _Similarity:

@@ -33,6 +33,7 @@ from mover.evaluate.bodies import (
 from mover.evaluate.contact import (
     TOUCH_METRICS,
     Furniture,
+    Touch,
     TrueTouch,
     close_meshes,
     furniture_of,
@@ -149,26 +150,27 @@ def evaluate(
     scenes = before.scene, after.scene, true.scene
     objects = measure_objects(scenes, sides, config.samples, config.by_place, config.boxes)
     touch = bodies.touch or _true_touch(true, after.bodies or before.bodies, config)
+    matched = dict(zip(SIDES, pairs(*scenes, config.by_place), strict=True))
 
     def of(key: str) -> dict[str, float]:
         judged = asked[key]
-        return (
-            means_of(objects, key)
-            | _aligned(key, scenes, config.by_place)
-            | measure(CAMERA_METRICS, Sight(judged.scene, true.scene))
-            | _people(judged, true, touch, config)
+        found, camera = matched[key], judged.scene.camera
+        known = [t for t in true.scene.objects if t.id in found]
+        there = tuple(Pair(found[t.id], camera, t, true.scene.camera, 0) for t in known)
+        together = Together(there, len(true.scene.objects) - len(there))
+        values = means_of(objects, key) | measure(SCENE_METRICS, together)
+        values |= measure(CAMERA_METRICS, Sight(judged.scene, true.scene))
+        if judged.bodies is None:
+            return values
+        near = gather_touch(judged.bodies, judged.furniture, touch, config.bodies, config.reach)
+        feet = judged.bodies.verts[:, judged.soles] if len(judged.soles) else None
+        if config.feet == "contacts":
+            feet = feet_places(judged.bodies, judged.scene.camera)
+        return values | _people(
+            judged.bodies, near, feet, judged.scene.ground, config.ground_tolerance, true.bodies
         )
 
     return dict(zip(asked, mapped(of, list(asked)), strict=True)) | {"objects": objects}
-
-
-def _aligned(side: str, scenes: tuple[Scene, Scene, Scene], by_place: bool) -> dict[str, float]:
-    """The objects of one of `SIDES` after one similarity of all of them."""
-    initial, result, truth = scenes
-    before, after = pairs(initial, result, truth, by_place)
-    found, camera = (before, initial.camera) if side == SIDES[0] else (after, result.camera)
-    there = [Pair(found[t.id], camera, t, truth.camera, 0) for t in truth.objects if t.id in found]
-    return measure(SCENE_METRICS, Together(tuple(there), len(truth.objects) - len(there)))
 
 
 def touch_in_truth(
@@ -200,20 +202,14 @@ def evaluate_folder(
     true = read_scene(truth / "scene.json", camera_of(read_json(own)) if own.exists() else None)
     metrics = evaluate(initial, result, true, bodies, config)
     metrics["unmatched"] = unmatched(initial, result, true)
-    if physics:
-        _add_stable(metrics, out, dict(zip(SIDES, (initial, result), strict=True)))
+    if physics and (missing := lacking()) is not None:
+        metrics["not_measured"] = dict.fromkeys(PHYSICS_METRICS, missing)
+    elif physics:
+        for side, scene in zip(SIDES, (initial, result), strict=True):
+            metrics[side] |= measure(PHYSICS_METRICS, settle(scene, Run(out)))
     with replacing(out / "metrics.json") as part:
         part.write_text(json.dumps(metrics, indent=1, allow_nan=False))
     return metrics
-
-
-def _add_stable(metrics: dict[str, Any], out: Path, scenes: Mapping[str, Scene]) -> None:
-    """Add the shares of objects that stay under gravity, or why they are not known."""
-    if (missing := lacking()) is not None:
-        metrics["not_measured"] = dict.fromkeys(PHYSICS_METRICS, missing)
-        return
-    for side, scene in scenes.items():
-        metrics[side] |= measure(PHYSICS_METRICS, settle(scene, Run(out)))
 
 
 def table(metrics: Mapping[str, Any], shown: Sequence[str] | None = None) -> str:
@@ -258,22 +254,27 @@ def evaluate_people(
         furniture: Its closed objects where they stand, and when.
         truth: The true people in the world of the true room; None: not known.
     """
+    soles = members(parts_of(bodies), *SOLES)
+    feet = bodies.verts[:, soles] if bool(soles.any()) else None
     config = EvaluateConfig()
     near = gather_touch(bodies, furniture, None, config.bodies, config.reach)
+    return _people(bodies, near, feet, floor, config.ground_tolerance, truth)
+
+
+def _people(
+    bodies: Bodies,
+    near: Touch,
+    feet: Float[Tensor, "bodies points 3"] | None,
+    floor: float | None,
+    tolerance: float,
+    truth: Bodies | None,
+) -> dict[str, float]:
+    """The metrics of a scene's people; what they or the truth do not give is left out."""
     values = measure(TOUCH_METRICS, near)
-    soles = members(parts_of(bodies), *SOLES)
-    if floor is not None and bool(soles.any()):
-        values |= _on_floor(bodies.verts[:, soles], floor, config)
+    if floor is not None and feet is not None:
+        values |= measure(GROUND_METRICS, Standing(feet[..., 1] - floor, tolerance))
     twins = None if truth is None else gather_twins(bodies, truth)
     return values | ({} if twins is None else measure(POSE_METRICS, twins))
-
-
-def _on_floor(
-    points: Float[Tensor, "bodies points 3"], floor: float, config: EvaluateConfig
-) -> dict[str, float]:
-    """The metrics of points that should not be under the floor."""
-    heights = points[..., 1] - floor
-    return measure(GROUND_METRICS, Standing(heights, config.ground_tolerance))
 
 
 def _cell(values: Mapping[str, float], name: str) -> str:
@@ -295,8 +296,8 @@ def _populated(scene: Scene, bodies: Bodies | None, closed: Mapping[str, Mesh]) 
         return _Populated(_double(scene), None, torch.zeros(0, dtype=torch.long), ())
     soles = soles_of(bodies, scene.camera)
     furniture = _double(tuple(furniture_of(scene.objects, closed)))
-    scene = _double(scene)
-    return _Populated(scene, in_world(_double(bodies), scene.camera), soles, furniture)
+    people = in_world(_double(bodies), scene.camera)
+    return _Populated(_double(scene), people, soles, furniture)
 
 
 def _double(value: T) -> T:
@@ -309,21 +310,3 @@ def _true_touch(
     if truth.bodies is None or judged is None:
         return None
     return gather_truth(truth.bodies, truth.furniture, judged, config.bodies, config.reach)
-
-
-def _people(
-    judged: _Populated, truth: _Populated, touch: TrueTouch | None, config: EvaluateConfig
-) -> dict[str, float]:
-    """The metrics of a scene's people; what they or the truth do not give is left out."""
-    bodies, floor = judged.bodies, judged.scene.ground
-    if bodies is None:
-        return {}
-    near = gather_touch(bodies, judged.furniture, touch, config.bodies, config.reach)
-    values = measure(TOUCH_METRICS, near)
-    contacts = config.feet == "contacts"
-    if floor is not None and (contacts or len(judged.soles)):
-        soles = bodies.verts[:, judged.soles]
-        points = feet_places(bodies, judged.scene.camera) if contacts else soles
-        values |= _on_floor(points, floor, config)
-    twins = None if truth.bodies is None else gather_twins(bodies, truth.bodies)
-    return values | (measure(POSE_METRICS, twins) if twins is not None else {})

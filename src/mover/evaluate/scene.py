@@ -25,6 +25,7 @@ from mover.geometry.rotations import wrap
 
 T = TypeVar("T")
 THINNEST = 1e-3  # [m], flat objects (rugs, pictures) count as this thick in the 3D IoU
+SIDES = ("initial", "result")
 PLASTIC = 1.32471795724474602596  # x³ = x + 1: its powers spread points evenly over a square
 NEARER = 1e-3  # [1/m], boxes that do not overlap are paired by distance: this breaks the tie
 
@@ -95,12 +96,14 @@ def center_error(pair: Pair) -> float:
 
 def pitch_error(sight: Sight) -> float:
     """Difference of the cameras' pitch [rad]."""
-    return _tilt_errors(sight)[0]
+    pitch, true = (pitch_roll(s.camera.R_cam_world)[0] for s in (sight.estimate, sight.truth))
+    return float((pitch - true).abs())
 
 
 def roll_error(sight: Sight) -> float:
     """Difference of the cameras' roll [rad]."""
-    return _tilt_errors(sight)[1]
+    roll, true = (pitch_roll(s.camera.R_cam_world)[1] for s in (sight.estimate, sight.truth))
+    return float(wrap(roll - true).abs())
 
 
 OBJECT_METRICS: dict[str, Metric[Pair]] = {
@@ -124,12 +127,6 @@ def measure(table: Mapping[str, Metric[T]], subject: T) -> dict[str, float]:
     """Every metric of a table; what lacks its truth is left out."""
     values = {name: metric.measure(subject) for name, metric in table.items()}
     return {name: v for name, v in values.items() if v is not None and math.isfinite(v)}
-
-
-def measure_missing(truth: SceneObject, camera: Camera) -> dict[str, float]:
-    """A missing object scores 0 in overlaps, if the truth has them."""
-    shown = image_box(truth, camera) is not None
-    return {"iou3d": 0.0, "iou2d": 0.0} if shown else {"iou3d": 0.0}
 
 
 def area_samples(mesh: Mesh, count: int) -> Float[Tensor, "count 3"]:
@@ -231,18 +228,6 @@ def thick(box: Box) -> Box:
     return Box(box.center, box.size.clamp_min(THINNEST), box.yaw)
 
 
-def _tilt_errors(sight: Sight) -> tuple[float, float]:
-    pitch, roll = pitch_roll(sight.estimate.camera.R_cam_world)
-    true_pitch, true_roll = pitch_roll(sight.truth.camera.R_cam_world)
-    return float((pitch - true_pitch).abs()), float(wrap(roll - true_roll).abs())
-
-
-# Who is who: the true objects, and what stands for them before and after (docs/metrics.md).
-
-
-SIDES = ("initial", "result")
-
-
 def pairs(
     initial: Scene, result: Scene, truth: Scene, by_place: bool = True
 ) -> tuple[dict[str, SceneObject], dict[str, SceneObject]]:
@@ -286,16 +271,15 @@ def measure_objects(
         boxes: Whether the truth is boxes without meshes.
     """
     initial, result, truth = scenes
-    found: dict[str, dict[str, SceneObject]] = dict(
-        zip(SIDES, pairs(initial, result, truth, by_place), strict=True)
-    )
-    there: dict[str, Scene] = dict(zip(SIDES, (initial, result), strict=True))
+    found = dict(zip(SIDES, pairs(initial, result, truth, by_place), strict=True))
+    cameras = {"initial": initial.camera, "result": result.camera}
 
     def of(side: str, true: SceneObject) -> dict[str, float]:
-        piece = found[side].get(true.id)
-        if piece is None:
-            return measure_missing(true, truth.camera)
-        pair = Pair(piece, there[side].camera, true, truth.camera, samples, boxes)
+        item = found[side].get(true.id)
+        if item is None:  # scores 0 in overlaps, if the truth has them
+            shown = image_box(true, truth.camera) is not None
+            return {"iou3d": 0.0, "iou2d": 0.0} if shown else {"iou3d": 0.0}
+        pair = Pair(item, cameras[side], true, truth.camera, samples, boxes)
         given = found["initial"].get(true.id)
         values = measure(OBJECT_METRICS, pair)
         if given is None:

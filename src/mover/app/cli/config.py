@@ -18,7 +18,6 @@ from tyro.conf import arg
 from mover.app.cli import say
 from mover.core.errors import InputError
 from mover.core.settings import check_settings, settings_of
-from mover.energy.config import Adam, BatchedBFGS
 from mover.pipeline.presets import PRESETS, Config
 
 T = TypeVar("T")
@@ -89,11 +88,36 @@ LAYOUT_SETTINGS = {
     "screen.method.steps": "Most steps of the descent of each hypothesis.",
 }
 """The same of `LayoutConfig`, of `mover layout`."""
-METHODS = {"adam": Adam, "newton": BatchedBFGS}
-"""How a descent goes down: `--place.method newton` chooses one, with its own settings."""
 
 
-def chosen_config(arguments: Sequence[str]) -> tuple[Config, list[str]]:
+def preset_of(arguments: Sequence[str], table: Mapping[Any, T]) -> T:
+    """The preset that a command line names (or the first), whose settings the other flags change.
+
+    Raises:
+        InputError: If there is none of that name.
+    """
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--preset", default=next(iter(table)))
+    return named(early.parse_known_args(arguments)[0].preset, table)
+
+
+def preset_named(name: str) -> Config:
+    """A preset of the main job by its name.
+
+    Raises:
+        InputError: If there is none of that name.
+    """
+    return named(name, PRESETS)
+
+
+def named(name: str, table: Mapping[Any, T]) -> T:
+    """An entry of a table that a flag names."""
+    if name not in table:
+        raise InputError(f"--preset: {name!r} is none of {', '.join(table)}")
+    return table[name]
+
+
+def chosen_config(arguments: Sequence[str]) -> Config:
     """The preset or file is read first, so that the other flags may stand before or after it."""
     early = argparse.ArgumentParser(prog="mover run", add_help=False, allow_abbrev=False)
     early.add_argument("--preset", default="robust")
@@ -104,14 +128,7 @@ def chosen_config(arguments: Sequence[str]) -> tuple[Config, list[str]]:
         from mover.app.results import read_config
 
         config = read_config(chosen.config)
-    methods = argparse.ArgumentParser(prog="mover run", add_help=False, allow_abbrev=False)
-    for stage in ("layout", "place"):
-        methods.add_argument(f"--{stage}.method", dest=stage, choices=tuple(METHODS))
-    found, rest = methods.parse_known_args(list(arguments))
-    for stage, name in vars(found).items():
-        if name is not None:
-            config = _changed(config, [stage, "method"], METHODS[name]())
-    return config, rest
+    return config
 
 
 def parsed(kind: Callable[..., T], prog: str, arguments: Sequence[str], *markers: Any) -> T:  # noqa: ANN401
@@ -121,10 +138,15 @@ def parsed(kind: Callable[..., T], prog: str, arguments: Sequence[str], *markers
         InputError: If a setting is out of its range.
     """
     found = tyro.cli(kind, prog=prog, args=list(arguments), config=markers)
-    check_settings(found, "--")
+    _checked(prog, found)
+    return found
+
+
+def _checked(prog: str, *settings: object) -> None:
+    for some in settings:
+        check_settings(some, "--")
     if sys.stderr.isatty():
         say(f"{prog}: loading ...", sys.stderr)  # of torch and others, some seconds
-    return found
 
 
 def parsed_with(
@@ -149,18 +171,13 @@ def parsed_with(
         more = f"{kind.__doc__}\n\n`{prog} --help-all` shows {len(settings)} settings more."
         parsed_only: Any = functools.partial(tyro.cli, kind, prog=prog, description=more)
         parsed_only(args=words)
-    flags: Any = make_dataclass(
-        "Settings",
-        [
-            (
-                name.replace(".", "__"),
-                Annotated[_hint(config, name), arg(name=name, help=text)],
-                field(default=functools.reduce(getattr, name.split("."), cast(Any, config))),
-            )
-            for name, text in settings.items()
-        ],
-        frozen=True,
-    )
+    fields: list[Any] = []
+    for name, text in settings.items():
+        *way, key = name.split(".")
+        owner: Any = functools.reduce(getattr, way, cast(Any, config))
+        hint = Annotated[settings_of(type(owner))[key], arg(name=name, help=text)]
+        fields.append((name.replace(".", "__"), hint, field(default=getattr(owner, key))))
+    flags: Any = make_dataclass("Settings", fields, frozen=True)
     default = flags()
 
     def both(
@@ -173,45 +190,11 @@ def parsed_with(
     args, found = tyro.cli(both, prog=prog, args=words, config=(tyro.conf.AvoidSubcommands,))
     for name in settings:
         config = _changed(config, name.split("."), getattr(found, name.replace(".", "__")))
-    check_settings(args, "--")
-    check_settings(config, "--")
-    if sys.stderr.isatty():
-        say(f"{prog}: loading ...", sys.stderr)
+    _checked(prog, args, config)
     return args, config
-
-
-def _hint(config: Any, name: str) -> Any:  # noqa: ANN401
-    """The type of a setting, with its range."""
-    *way, key = name.split(".")
-    return settings_of(type(functools.reduce(getattr, way, config)))[key]
 
 
 def _changed(owner: Any, way: Sequence[str], value: Any) -> Any:  # noqa: ANN401
     """Settings with one of them, or of those inside, replaced."""
     key, *rest = way
     return replace(owner, **{key: _changed(getattr(owner, key), rest, value) if rest else value})
-
-
-def preset_of(arguments: Sequence[str], names: Sequence[T]) -> T:
-    """The preset that a command line names, whose settings the other flags change.
-
-    Raises:
-        InputError: If there is none of that name.
-    """
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--preset", default=names[0])
-    name = early.parse_known_args(arguments)[0].preset
-    if name not in names:
-        raise InputError(f"--preset: {name!r} is none of {', '.join(map(str, names))}")
-    return name
-
-
-def preset_named(name: str) -> Config:
-    """A preset by its name.
-
-    Raises:
-        InputError: If there is none of that name.
-    """
-    if name not in PRESETS:
-        raise InputError(f"--preset: {name!r} is none of {', '.join(PRESETS)}")
-    return PRESETS[name]

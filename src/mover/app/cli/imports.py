@@ -134,8 +134,11 @@ def _names(given: Sequence[str]) -> dict[str, str]:
 
 def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
     """The source and what the options add."""
+    import numpy as np
+
     from mover.io.capture.bodies_file import read_body_arrays
     from mover.io.capture.parts import Parts, image_parts
+    from mover.io.files.npz import read_npz
 
     found = [main]
     extra = Parts(name=args.out.name)
@@ -149,22 +152,14 @@ def _parts(args: ImportArgs, main: "Parts", hints: "Hints") -> "list[Parts]":
         bodies = bodies or _bodies_of_tool(args, [*found, extra], hints)
         extra = dataclasses.replace(extra, bodies=bodies)
     if args.cameras is not None:
-        extra = dataclasses.replace(extra, cameras=_cameras(args, args.cameras))
+        tool = args.cameras_from
+        read = chosen("--cameras-from", tool, "cameras") if tool else read_npz
+        poses: At = read(args.cameras)
+        if args.reference_frame is not None:
+            number = np.array(args.reference_frame)
+            poses = dataclasses.replace(poses, value={**poses.value, "reference": number})
+        extra = dataclasses.replace(extra, cameras=poses)
     return [*found, extra, *_masks(args, [*found, extra], hints)]
-
-
-def _cameras(args: ImportArgs, source: Path) -> "At":
-    """Poses of a moving camera, as the arrays of cameras.npz."""
-    import numpy as np
-
-    from mover.io.files.fields import At
-    from mover.io.files.npz import read_npz
-
-    read = chosen("--cameras-from", args.cameras_from, "cameras") if args.cameras_from else read_npz
-    at: At = read(source)
-    if args.reference_frame is None:
-        return at
-    return At({**at.value, "reference": np.array(args.reference_frame)}, at.file)
 
 
 def _bodies_of_tool(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "At":
@@ -188,8 +183,10 @@ def _bodies_of_tool(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") 
 
 
 def _masks(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "list[Parts]":
-    """Masks of the options, in an image of the size that the camera says."""
-    from mover.io.capture.parts import Parts
+    """Masks of the options, in an image of the camera's size; people too where none has a name."""
+    from mover.io.capture.parts import UNKNOWN, Parts
+    from mover.io.files.images import image_size
+    from mover.io.masks.instance_files import read_instances
     from mover.io.masks.instances import (
         fitted,
         is_person,
@@ -200,37 +197,28 @@ def _masks(args: ImportArgs, parts: "Sequence[Parts]", hints: "Hints") -> "list[
 
     camera = next((p.camera for p in reversed(parts) if p.camera is not None), hints.camera)
     size = None if camera is None else (camera.value.get("w"), camera.value.get("h"))
+    shape = None if hints.image is None else image_size(hints.image)
+
+    def masks_at(path: Path, only_people: bool) -> "Instances":
+        masks = fitted(read_instances(path, hints.names, shape), size)
+        if not only_people:
+            return masks
+        kept = tuple(i for i in masks.items if is_person(i) or i.category == UNKNOWN)
+        return dataclasses.replace(masks, items=kept)
+
     found: list[Parts] = []
     if args.objects_masks is not None:
-        masks = fitted(_read(args.objects_masks, hints), size)
+        masks = masks_at(args.objects_masks, only_people=False)
         things = [item for item in masks.items if not is_person(item)]
         found.append(Parts(name="", objects=objects_tree(masks, things)))
     if args.people_masks is not None:
-        masks = only_people(fitted(_read(args.people_masks, hints), size))
+        masks = masks_at(args.people_masks, only_people=True)
         found.append(Parts(name="", people=people_tree(masks, args.fps)))
     if args.reference_people is not None:
-        masks = only_people(fitted(_read(args.reference_people, hints), size))
+        masks = masks_at(args.reference_people, only_people=True)
         people = next((p.people for p in reversed([*parts, *found]) if p.people is not None), None)
         found.append(Parts(name="", people=with_reference_people(people, masks, args.out)))
     return found
-
-
-def _read(path: Path, hints: "Hints") -> "Instances":
-    """Masks of an option."""
-    from mover.io.files.images import image_size
-    from mover.io.masks.instance_files import read_instances
-
-    size = None if hints.image is None else image_size(hints.image)
-    return read_instances(path, hints.names, size)
-
-
-def only_people(found: "Instances") -> "Instances":
-    """The people among the instances; all of them where nothing has a name."""
-    from mover.io.capture.parts import UNKNOWN
-    from mover.io.masks.instances import is_person
-
-    kept = tuple(i for i in found.items if is_person(i) or i.category == UNKNOWN)
-    return dataclasses.replace(found, items=kept)
 
 
 def print_import(imported: "Imported", folder: Path) -> None:

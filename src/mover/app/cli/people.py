@@ -48,68 +48,43 @@ class BodiesArgs:
 def bodies(arguments: Sequence[str]) -> None:
     """`mover import-bodies`."""
     args = parsed(BodiesArgs, "mover import-bodies", arguments)
-    if args.fps is not None and not args.fps > 0:
-        raise InputError(f"--fps: {args.fps:g}, expected more than 0")
     if args.model_folder is not None:
         os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
-    if args.tool in names("keypoints"):
-        _keypoints(args)
-    elif args.tool in names("people"):
-        _bodies(args)
-    else:
+    if args.tool not in names("people", "keypoints"):
         known = ", ".join(names("people", "keypoints"))
         raise InputError(f"TOOL: {args.tool!r} is none of {known}")
-
-
-def _keypoints(args: BodiesArgs) -> None:
-    """2D joints."""
+    from mover.io.capture.bodies_file import write_bodies
+    from mover.io.capture.camera_file import camera_of
+    from mover.io.files.cameras import read_camera_file
+    from mover.io.people.bodies import bodies_from
+    from mover.io.people.found import Known
     from mover.io.people.keypoints import keypoints_from, write_keypoints
 
-    found = keypoints_from(args.tool, args.source, _known(args))
-    out = args.out or Path("keypoints.npz")
-    write_keypoints(found, out)
-    say(f"{_counted(found)}, joints: {found.layout}: {out}")
+    camera = None if args.camera is None else camera_of(read_camera_file(args.camera, None))
+    known = Known(camera, args.focal, args.faces, args.fps, args.gender, args.first)
+    if args.vposer is not None:
+        from mover.fitting.prior import load_vposer, vposer_prior
 
-
-def _bodies(args: BodiesArgs) -> None:
-    """Bodies."""
-    from mover.io.capture.bodies_file import write_bodies
-    from mover.io.people.bodies import bodies_from
-
-    known = _known(args)
+        known = replace(known, decode=vposer_prior(load_vposer(args.vposer)).decode)
+    if args.tool in names("keypoints"):
+        joints = keypoints_from(args.tool, args.source, known)
+        out = args.out or Path("keypoints.npz")
+        write_keypoints(joints, out)
+        say(f"{len(joints.frame)} rows, {_counted(joints)}, joints: {joints.layout}: {out}")
+        return
     found = bodies_from(args.tool, args.source, known)
-    out = args.out or Path("bodies.npz")
-    people = found.bodies
+    people, out = found.bodies, args.out or Path("bodies.npz")
     write_bodies(people, out)
     for warning in found.warnings:
         say(f"warning: {warning}")
     model = "meshes only" if people.pose is None else f"parameters of {people.pose.model}"
-    say(f"{_counted(people)}, {people.verts.shape[1]} vertices, {model}: {out}")
-
-
-def _known(args: BodiesArgs) -> Any:  # noqa: ANN401
-    """What the options say."""
-    from mover.io.capture.camera_file import camera_of
-    from mover.io.files.cameras import read_camera_file
-    from mover.io.people.found import Known
-
-    camera = None if args.camera is None else camera_of(read_camera_file(args.camera, None))
-    decode = None
-    if args.vposer is not None:
-        from mover.fitting.prior import load_vposer, vposer_prior
-
-        decode = vposer_prior(load_vposer(args.vposer)).decode
-    known = Known(camera, args.focal, args.faces, args.fps, args.gender, args.first)
-    return replace(known, decode=decode)
+    rows = f"{len(people.frame)} rows, {_counted(people)}"
+    say(f"{rows}, {people.verts.shape[1]} vertices, {model}: {out}")
 
 
 def _counted(found: Any) -> str:  # noqa: ANN401
-    """`12 rows, 2 people in 6 frames`."""
-    people, frames = len(found.person.unique()), len(found.frame.unique())
-    return f"{len(found.frame)} rows, {people} people in {frames} frames"
-
-
-# Fit: bodies from the 2D joints of a video.
+    """`2 people in 6 frames`."""
+    return f"{len(found.person.unique())} people in {len(found.frame.unique())} frames"
 
 
 NO_VPOSER = "note: the printed pose prior is VPoser's; without --vposer ours stands in for it"
@@ -156,8 +131,7 @@ class FitArgs:
 
 def fit(arguments: Sequence[str]) -> None:
     """`mover fit`."""
-    preset = preset_of(arguments, tuple(FITS))
-    fit_into(*parsed_with(FitArgs, FITS[preset], {}, "mover fit", arguments))
+    fit_into(*parsed_with(FitArgs, preset_of(arguments, FITS), {}, "mover fit", arguments))
 
 
 def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
@@ -168,16 +142,17 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
     """
     from mover.app.cli.progress import Bar
     from mover.bodies import load_model
+    from mover.core.records import rows_of
     from mover.fitting.bodies import FitInputs, fit_bodies
     from mover.fitting.prior import prior_of
     from mover.io.capture.bodies_file import read_bodies, write_bodies
+    from mover.stages.people.select_frames import SelectInputs, select_frames
 
     if args.model_folder is not None:
         os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
-    keypoints = keypoints_at(args.source, args.tool, args.fps, args.first)
     camera, ground = _world(args)
     inputs = FitInputs(
-        keypoints=keypoints,
+        keypoints=_keypoints(args),
         camera=camera,
         model=load_model(args.model, args.gender),  # pyright: ignore[reportArgumentType]
         start=None if args.start is None else read_bodies(args.start),
@@ -191,10 +166,14 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
         found = fit_bodies(inputs, config or FITS[args.preset], observe=bar)
     for warning in found.warnings:
         say(f"warning: {warning}")
-    bodies = _without_outliers(found.bodies) if args.drop else found.bodies
+    bodies = found.bodies
+    if args.drop:
+        keep = select_frames(SelectInputs(bodies)).keep
+        say(f"{int((~keep).sum())} of {len(keep)} bodies are left out by the frame filter")
+        bodies = rows_of(bodies, keep)
     write_bodies(bodies, args.out)
-    counts = f"{len(bodies.person.unique())} people in {len(bodies.frame.unique())} frames"
-    say(f"{counts}, keypoints missed by {float(found.miss.mean()):.1f} px: {args.out}")
+    miss = float(found.miss.mean())
+    say(f"{_counted(bodies)}, keypoints missed by {miss:.1f} px: {args.out}")
 
 
 def _world(args: FitArgs) -> tuple[Any, float | None]:
@@ -212,22 +191,12 @@ def _world(args: FitArgs) -> tuple[Any, float | None]:
     return scene.camera, scene.ground if args.ground is None else args.ground
 
 
-def keypoints_at(source: Path, tool: str, fps: float | None, first: int) -> Any:  # noqa: ANN401
+def _keypoints(args: FitArgs) -> Any:  # noqa: ANN401
     """The 2D joints of keypoints.npz, or of a detector's file or folder."""
     from mover.io.people.found import Known
     from mover.io.people.keypoints import keypoints_from, read_keypoints
 
-    if source.suffix != ".npz":
-        return keypoints_from(tool, source, Known(fps=fps, first=first))
-    found = read_keypoints(source)
-    return found if fps is None else replace(found, fps=fps)
-
-
-def _without_outliers(bodies: Any) -> Any:  # noqa: ANN401
-    """The rows that the frame filter keeps."""
-    from mover.core.records import rows_of
-    from mover.stages.people.select_frames import SelectInputs, select_frames
-
-    keep = select_frames(SelectInputs(bodies)).keep
-    say(f"{int((~keep).sum())} of {len(keep)} bodies are left out by the frame filter")
-    return rows_of(bodies, keep)
+    if args.source.suffix != ".npz":
+        return keypoints_from(args.tool, args.source, Known(fps=args.fps, first=args.first))
+    found = read_keypoints(args.source)
+    return found if args.fps is None else replace(found, fps=args.fps)

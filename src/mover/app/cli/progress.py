@@ -2,7 +2,6 @@
 
 import logging
 import sys
-from types import TracebackType
 from typing import Any
 
 from mover.core.observe import Step
@@ -24,37 +23,25 @@ class Bar:
             TimeElapsedColumn,
         )
 
-        self._stage, self._task = "", None
-        self._level = log.level
-        self._console = Console(file=sys.stderr)
+        self._stage, self._task, self._level = "", None, log.level
+        self._console = console = Console(file=sys.stderr)
         self._lines = RichHandler(
-            console=self._console, show_time=False, show_level=False, show_path=False
+            console=console, show_time=False, show_level=False, show_path=False
         )
-        columns = (
-            TextColumn("{task.description:<28}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-        )
-        self._progress = Progress(
-            *columns, TimeElapsedColumn(), console=self._console, transient=True
-        )
+        name = TextColumn("{task.description:<28}")
+        columns = (name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self._progress = Progress(*columns, console=console, transient=True)
 
     def __enter__(self) -> "Bar":
         log.addHandler(self._lines)
-        self._level = log.level
+        self._level, log.propagate = log.level, False
         log.setLevel(logging.INFO)
-        log.propagate = False
         if self._console.is_terminal:
             self._task = self._progress.add_task("...", total=None)
             self._progress.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._progress.stop()
         log.removeHandler(self._lines)
         log.setLevel(self._level)
@@ -62,17 +49,13 @@ class Bar:
 
     def __call__(self, step: Step) -> None:
         """Show how far the stage is."""
-        if step.stage != self._stage:
-            self._begin(step)
         task: Any = self._task
+        if step.stage != self._stage:
+            self._stage = step.stage
+            if task is None:
+                self._console.print(f"{step.stage} ...", highlight=False)
+            else:
+                self._progress.remove_task(task)
+                self._task = task = self._progress.add_task(step.stage, total=step.steps)
         if task is not None:
             self._progress.update(task, completed=step.index + 1, total=step.steps)
-
-    def _begin(self, step: Step) -> None:
-        self._stage = step.stage
-        if not self._console.is_terminal:
-            self._console.print(f"{step.stage} ...", highlight=False)
-            return
-        if self._task is not None:
-            self._progress.remove_task(self._task)
-        self._task = self._progress.add_task(step.stage, total=step.steps)

@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -71,27 +71,21 @@ def refine(arguments: Sequence[str]) -> None:
     import torch
 
     from mover.app.cli.progress import Bar
-    from mover.pipeline.refine import measure_people
+    from mover.pipeline.refine import measure_people, refine_result, switched
 
     torch.set_num_threads(1)
+    off = {"camgp": not args.camgp, "sdf": not args.sdf, "contact": not args.contact}
+    off |= {"order": not args.order, "masks": not args.masks}
     with Bar() as bar:
-        say(_refined(args, config, bar))
+        found = refine_result(args.out, switched(config, off), args.capture, bar)
+    how = "rigidly" if found.bodies.pose is None else "with their pose"
+    way = f"moved by {1000 * float(found.shift.norm(dim=-1).median()):.0f} mm (median)"
+    file = args.out / "refined" / "bodies.npz"
+    say(f"{len(found.shift)} bodies refined {how}, {way}: {file}")
     values = measure_people(args.out, args.truth)
     say(f"\n{'':20}{'result':>10}{'refined':>10}")
     for name, before in values["result"].items():
         say(f"{name:20}{before:10.4f}{values['refined'][name]:10.4f}")
-
-
-def _refined(args: RefineArgs, config: RefineBodiesConfig, observe: Any) -> str:  # noqa: ANN401
-    """Refine as the settings say; returns what was done."""
-    from mover.pipeline.refine import refine_result, switched
-
-    off = {"camgp": not args.camgp, "sdf": not args.sdf, "contact": not args.contact}
-    off |= {"order": not args.order, "masks": not args.masks}
-    found = refine_result(args.out, switched(config, off), args.capture, observe)
-    how = "rigidly" if found.bodies.pose is None else "with their pose"
-    way = f"moved by {1000 * float(found.shift.norm(dim=-1).median()):.0f} mm (median)"
-    return f"{len(found.shift)} bodies refined {how}, {way}: {args.out / 'refined' / 'bodies.npz'}"
 
 
 def contacts(arguments: Sequence[str]) -> None:

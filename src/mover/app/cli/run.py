@@ -54,8 +54,8 @@ class RunArgs:
 
 def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
     """What `mover run` is asked for, and the settings."""
-    config, rest = chosen_config(arguments)
-    return parsed_with(RunArgs, config, RUN_SETTINGS, "mover run", rest)
+    config = chosen_config(arguments)
+    return parsed_with(RunArgs, config, RUN_SETTINGS, "mover run", arguments)
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -66,23 +66,17 @@ def run(arguments: Sequence[str]) -> None:
     from mover.core.devices import device_of
     from mover.io.capture.edits import read_edits
 
-    device = device_of(args.device)
-    capture = _with_contacts(read(args.source), args)
+    device, capture = device_of(args.device), read(args.source)
+    if (args.posa is None) != (args.posa_meshes is None):
+        raise InputError("--posa, --posa-meshes: one is missing, expected contact.pt and mesh_ds")
+    if args.posa is not None and args.posa_meshes is not None:
+        from mover.pipeline.refine import with_posa
+
+        capture = with_posa(capture, args.posa, args.posa_meshes)
     edits = () if args.edits is None else read_edits(args.edits)
     origin = Origin(str(args.source.resolve()), args.format, edits, args.refine, device)
     reconstruct_into(args.out, capture, config, origin)
     say(f"report: {args.out / 'report.html'}")
-
-
-def _with_contacts(capture: "Capture", args: RunArgs) -> "Capture":
-    """The capture with POSA's contacts where these are asked for."""
-    if args.posa is None and args.posa_meshes is None:
-        return capture
-    if args.posa is None or args.posa_meshes is None:
-        raise InputError("--posa, --posa-meshes: one is missing, expected contact.pt and mesh_ds")
-    from mover.pipeline.refine import with_posa
-
-    return with_posa(capture, args.posa, args.posa_meshes)
 
 
 def reconstruct_into(
@@ -118,9 +112,6 @@ def reconstruct_into(
     return room, run
 
 
-# `batch`.
-
-
 @dataclass(frozen=True)
 class BatchArgs:
     """Run thousands of captures; what is finished is not run again."""
@@ -152,8 +143,8 @@ class BatchArgs:
 
 def batch(arguments: Sequence[str]) -> None:
     """`mover batch`; the exit code is 1 if a capture failed."""
-    config, rest = chosen_config(arguments)
-    args, config = parsed_with(BatchArgs, config, RUN_SETTINGS, "mover batch", rest)
+    config = chosen_config(arguments)
+    args, config = parsed_with(BatchArgs, config, RUN_SETTINGS, "mover batch", arguments)
     from mover.app.batch import captures_in, run_batch
 
     jobs = _jobs(args, config, captures_in(args.source, args.out))
@@ -184,11 +175,8 @@ def _jobs(args: BatchArgs, config: Config, captures: Sequence[Path]) -> list[Bat
     more += ["--refine"] if args.refine else []
     jobs: list[BatchJob] = []
     for name, capture in zip(names_of(captures), captures, strict=True):
-        words = [sys.executable, "-m", "mover", "run", str(capture), "--out", str(out / name)]
-        print_ = fingerprint(settings, capture)
-        command = (*words, *more)
-        job = BatchJob(
-            name, str(capture), str(out / name), command, print_, args.limit, args.threads
-        )
-        jobs.append(job)
+        words = (sys.executable, "-m", "mover", "run", str(capture), "--out", str(out / name))
+        mark = fingerprint(settings, capture)
+        paths = (str(capture), str(out / name))
+        jobs.append(BatchJob(name, *paths, (*words, *more), mark, args.limit, args.threads))
     return jobs

@@ -8,9 +8,8 @@ from jaxtyping import Float, Int
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from mover.app.pictures.eye import camera_sized
 from mover.app.pictures.film import pixels, save_still, sized
-from mover.app.pictures.paint import FINE, draw_picture, furniture, ground_under, joined, skin
+from mover.app.pictures.paint import FINE, draw_picture, furniture, joined, skin
 from mover.core.colours import colour, css
 from mover.core.records import map_tensors
 from mover.core.types import Capture, Mesh, Scene
@@ -30,19 +29,13 @@ def draw_overlay(
         bodies: People to draw with it, in the scene's world [m].
     """
     if image is None:
-        image = _backdrop(scene.camera.height, scene.camera.width)
-    height, width = image.shape[:2]
+        image = backdrop(scene.camera.height, scene.camera.width)
     people = [] if bodies is None else [skin(bodies.verts, bodies.faces, 0)]
-    things = furniture(scene)
-    surfaces = joined([things, *people])
+    surfaces = joined([furniture(scene), *people])
     if not len(surfaces.faces):
         return image
-    ground = None
-    if scene.ground is not None and scene.objects and scene.ground < 0:
-        ground = ground_under(things.verts, scene.ground)
-    eye = camera_sized(scene.camera, width, height)
-    picture, drawn = draw_picture(surfaces, eye, ground, image)
-    return _named(picture, drawn.owner[::FINE, ::FINE], scene)
+    picture, owner = draw_picture(surfaces, scene.camera, image, scene.ground)
+    return _named(picture, owner[::FINE, ::FINE], scene)
 
 
 def save_overlay(capture: Capture, path: Path) -> Path:
@@ -64,14 +57,14 @@ def canvas(
     """What the furniture is drawn on, at most `widest` pixels wide: the image or a backdrop."""
     if image is None:
         width = min(widest, scene.camera.width)
-        return _backdrop(max(1, round(width * scene.camera.height / scene.camera.width)), width)
+        return backdrop(max(1, round(width * scene.camera.height / scene.camera.width)), width)
     if image.shape[1] <= widest:
         return image.detach().cpu().float()
     size = (widest, max(1, round(widest * image.shape[0] / image.shape[1])))
     return sized(Image.fromarray(pixels(image)), size)
 
 
-def _backdrop(height: int, width: int) -> Float[Tensor, "height width 3"]:
+def backdrop(height: int, width: int) -> Float[Tensor, "height width 3"]:
     """A neutral picture, a little lighter above."""
     fade = torch.linspace(0.93, 0.80, height)[:, None, None]
     return fade.expand(height, width, 3) * torch.tensor([0.985, 0.99, 1.0])

@@ -1,4 +1,4 @@
-"""Surfaces become shaded, outlined pixels over a picture, or over a plain floor with shadows.
+"""Surfaces in front of a camera become shaded, outlined pixels over a picture.
 
 A sheet is a picture of four channels: colour times opacity, and opacity.
 """
@@ -6,12 +6,12 @@ A sheet is a picture of four channels: colour times opacity, and opacity.
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d, normalize
+from torch.nn.functional import avg_pool2d, max_pool2d, normalize
 
-from mover.app.pictures.eye import RenderCamera, floor_points, in_eye
 from mover.core.colours import colour, person_colour
 from mover.core.records import record
-from mover.core.types import Bodies, Scene
+from mover.core.types import Bodies, Camera, Scene
+from mover.geometry.camera import to_camera
 from mover.geometry.mesh import face_normals, vertex_normals
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
@@ -23,17 +23,10 @@ PERSON = 100_000  # owner of person 0; the furniture is counted from 0
 SHARP = 0.85  # cosine between two surfaces whose edge is drawn
 LINE, CREASE = 0.75, 0.25  # how opaque outlines and inner edges are
 THICK = 550  # [px] of width for each fine pixel of an outline's thickness
-OPACITY = 0.62  # of surfaces over a picture
-FAINT = 0.6  # of the floor's lines over a picture
-CELL = 0.03  # [m], of the map of shadows
-MOST = 600  # cells along a side of it at most
-BELOW = 60.0  # [m], from where the undersides are drawn: nearly in parallel
-REACH = 0.35  # [m], height over the floor at which a shadow has faded to 1/e
-SOFT = (2, 7)  # cells that a shadow is blurred by: at the contact, around it
-DARK = 0.55  # of the darkest shadow
-METRE = 0.5  # opacity of the metre lines
+OPACITY = 0.62  # of surfaces
+AMBIENT, LAMP, FILL = 0.62, 0.48, 0.12  # light of the room, the lamp and the camera
+METRE, FAINT = 0.5, 0.6  # opacity of the floor's lines, and their brightness
 EDGE = 1.2  # [m], how far the floor reaches beyond what stands on it
-SKY, FLOOR = (0.955, 0.965, 0.98), (0.80, 0.785, 0.76)
 
 
 @record
@@ -60,18 +53,6 @@ class Drawn:
     normal: Float[Tensor, "h w 3"]
     """Of the surface in the world, towards the eye."""
     tint: Float[Tensor, "h w 3"]
-
-
-@record
-class GroundPatch:
-    """The height of the floor and the rectangle of it that is drawn."""
-
-    height: float
-    """[m]"""
-    low: Float[Tensor, "2"]
-    """Smallest x and z [m]."""
-    high: Float[Tensor, "2"]
-    """Largest x and z [m]."""
 
 
 def furniture(scene: Scene) -> Surfaces:
@@ -115,75 +96,68 @@ def joined(parts: list[Surfaces]) -> Surfaces:
 
 
 def draw_picture(
-    surfaces: Surfaces,
-    eye: RenderCamera,
-    ground: GroundPatch | None,
-    base: Float[Tensor, "h w 3"] | None = None,
-) -> tuple[Float[Tensor, "h w 3"], Drawn]:
-    """Surfaces as an eye sees them: translucent over a picture, or solid in a plain room.
+    surfaces: Surfaces, camera: Camera, base: Float[Tensor, "h w 3"], ground: float | None = None
+) -> tuple[Float[Tensor, "h w 3"], Int[Tensor, "fine_h fine_w"]]:
+    """Surfaces over a picture of a camera.
 
     Args:
         surfaces: Furniture and people.
-        eye: From where.
-        ground: The floor; None: none is drawn.
-        base: A picture of the size of the eye's; None: a plain room.
+        camera: Whose picture it is, of any size.
+        base: What is behind.
+        ground: Height of the floor, whose lines are drawn [m]; None: none.
 
     Returns:
-        The picture, and what its pixels show in `FINE` pixels.
+        The picture, and the owners of its pixels, `FINE` along each side of one.
     """
-    drawn = draw(surfaces, eye.finer(FINE))
-    behind = base if base is not None else _sky(eye)
-    if ground is not None and base is not None:
+    camera = sized_camera(camera, base.shape[1], base.shape[0])
+    drawn = draw(surfaces, sized_camera(camera, FINE * camera.width, FINE * camera.height))
+    if ground is not None and ground < 0 and len(surfaces.verts):
         free = avg_pool2d((drawn.owner == NO_OWNER).float()[None], FINE)[0, ..., None]
-        behind = over(FAINT * metre_lines(eye, ground, 1.0) * free, behind)
-    elif ground is not None:
-        points = floor_points(eye, ground.height)[..., [0, 2]]
-        floor = behind.lerp(torch.tensor(FLOOR), 0.75 * _inside(points, ground)[..., None])
-        behind = over(shadows(eye, ground, surfaces), over(metre_lines(eye, ground, 0.58), floor))
-    return over(paint(drawn, base is not None), behind).clamp(0, 1), drawn
+        flat = surfaces.verts[:, [0, 2]]
+        lines = metre_lines(camera, ground, flat.amin(0) - EDGE, flat.amax(0) + EDGE)
+        base = over(FAINT * lines * free, base)
+    return over(paint(drawn), base).clamp(0, 1), drawn.owner
 
 
-def draw(surfaces: Surfaces, eye: RenderCamera) -> Drawn:
-    """What the eye sees of the surfaces, whatever their winding."""
-    size = (eye.height, eye.width)
+def sized_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The same view in pictures of another size [px]."""
+    zoom = torch.tensor([width / camera.width, height / camera.height, 1.0])
+    K = camera.K.detach().float() * zoom[:, None]
+    return Camera(K, camera.R_cam_world.detach().float(), width, height)
+
+
+def draw(surfaces: Surfaces, camera: Camera) -> Drawn:
+    """What the camera sees of the surfaces, whatever their winding."""
+    size = (camera.height, camera.width)
     if not len(surfaces.faces):
         none = torch.zeros(*size, 3)
         return Drawn(none[..., 0].long() + NO_OWNER, none, none)
-    _, face = first_hit(in_eye(eye, surfaces.verts), surfaces.faces, eye.K, size)
+    points = to_camera(surfaces.verts, camera.R_cam_world)
+    _, face = first_hit(points, surfaces.faces, camera.K, size)
     hit, index = (face >= 0)[..., None], face.clamp_min(0)
     middle = surfaces.verts[surfaces.faces].mean(1)
-    away = ((middle - eye.t_world_eye) * surfaces.normals).sum(-1, keepdim=True) > 0
+    away = (middle * surfaces.normals).sum(-1, keepdim=True) > 0
     normals = torch.where(away, -surfaces.normals, surfaces.normals)
     owner = torch.where(hit[..., 0], surfaces.owner[index], torch.full_like(index, NO_OWNER))
     return Drawn(owner, normals[index] * hit, surfaces.tint[index] * hit)
 
 
-def paint(drawn: Drawn, translucent: bool) -> Float[Tensor, "height width 4"]:
-    """A sheet at 1 / `FINE` of the size of what is drawn.
-
-    Args:
-        drawn: With `FINE` pixels along each side of a pixel of the sheet.
-        translucent: Over a picture: brighter, with a weak light from the video's camera.
-    """
-    ambient, lamp = (0.62, 0.48) if translucent else (0.50, 0.42)  # without and by the lamp
-    fill = torch.tensor([0.0, 0.0, 0.12] if translucent else [0.0, 0.16, 0.0])
-    facing = drawn.normal @ normalize(torch.tensor(LIGHT), dim=0)
-    shade = ambient + lamp * facing.clamp_min(0) + drawn.normal @ fill
+def paint(drawn: Drawn) -> Float[Tensor, "height width 4"]:
+    """A sheet at 1 / `FINE` of the size of what is drawn."""
+    facing = (drawn.normal @ normalize(torch.tensor(LIGHT), dim=0)).clamp_min(0)
+    shade = AMBIENT + LAMP * facing + FILL * drawn.normal[..., 2]
     colours = (drawn.tint * shade[..., None]).clamp(0, 1)
     outline, crease = _lines(drawn, max(1, round(drawn.owner.shape[1] / FINE / THICK)))
     colours = colours.lerp(drawn.tint * 0.40, CREASE * crease[..., None].float())
     colours = colours.lerp(drawn.tint * 0.40, LINE * outline[..., None].float())
-    opacity = (OPACITY if translucent else 1.0) * (drawn.owner != NO_OWNER).float()
-    alpha = torch.maximum(opacity, LINE * outline.float())[..., None]
-    fine = torch.cat([colours * alpha, alpha], -1)
+    alpha = torch.maximum(OPACITY * (drawn.owner != NO_OWNER).float(), LINE * outline.float())
+    fine = torch.cat([colours * alpha[..., None], alpha[..., None]], -1)
     return avg_pool2d(fine.permute(2, 0, 1), FINE).permute(1, 2, 0)
 
 
-def over(
-    sheet: Float[Tensor, "h w 4"], picture: Float[Tensor, "h w channels"]
-) -> Float[Tensor, "h w channels"]:
-    """A sheet on a picture (3 channels) or on another sheet (4 channels)."""
-    return sheet[..., : picture.shape[-1]] + (1 - sheet[..., 3:]) * picture
+def over(sheet: Float[Tensor, "h w 4"], picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """A sheet on a picture."""
+    return sheet[..., :3] + (1 - sheet[..., 3:]) * picture
 
 
 def _lines(drawn: Drawn, thickness: int) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
@@ -202,66 +176,26 @@ def _lines(drawn: Drawn, thickness: int) -> tuple[Bool[Tensor, "h w"], Bool[Tens
     return wide & (drawn.owner != NO_OWNER), crease
 
 
-def ground_under(points: Float[Tensor, "points 3"], height: float) -> GroundPatch:
-    """The floor under everything."""
-    flat = points[:, [0, 2]]
-    return GroundPatch(height, flat.amin(0) - EDGE, flat.amax(0) + EDGE)
-
-
-def _sky(eye: RenderCamera) -> Float[Tensor, "h w 3"]:
-    spread = torch.linspace(1.0, 0.93, eye.height)[:, None, None]
-    return (torch.tensor(SKY) * spread).expand(eye.height, eye.width, 3)
+def floor_points(camera: Camera, height: float) -> Float[Tensor, "h w 3"]:
+    """Where the ray of each pixel meets the plane y = `height` [m]; inf where it never does."""
+    rows, columns = torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    rays = torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(camera.K).mT
+    rays = rays @ camera.R_cam_world
+    along = height / torch.where(rays[..., 1].abs() < 1e-6, 1e-6, rays[..., 1])
+    return torch.where((along > 0)[..., None], rays * along[..., None], torch.inf)
 
 
 def metre_lines(
-    eye: RenderCamera, ground: GroundPatch, brightness: float
+    camera: Camera, height: float, low: Float[Tensor, "2"], high: Float[Tensor, "2"]
 ) -> Float[Tensor, "h w 4"]:
-    """A sheet with lines at whole metres of the world, of one brightness in [0, 1]."""
-    points = floor_points(eye, ground.height)[..., [0, 2]]
+    """A sheet with white lines at whole metres of the floor, fading at two corners (x, z) [m]."""
+    points = floor_points(camera, height)[..., [0, 2]]
     points = torch.where(points.isfinite(), points, 1e6)
     steps = [torch.gradient(points, dim=d)[0].abs() for d in (0, 1)]
     spread = torch.maximum(*steps).clamp_min(1e-6)
     near = ((points - points.round()).abs() / spread).amin(-1)
     coarse = (1 - spread.amax(-1) * 4).clamp(0, 1)
-    alpha = METRE * (1.2 - near).clamp(0, 1) * coarse * _inside(points, ground)
-    return torch.cat([(brightness * alpha)[..., None].expand(-1, -1, 3), alpha[..., None]], -1)
-
-
-def shadows(eye: RenderCamera, ground: GroundPatch, surfaces: Surfaces) -> Float[Tensor, "h w 4"]:
-    """A black sheet: dark where an underside is near the floor."""
-    sheet = torch.zeros(eye.height, eye.width, 4)
-    if not len(surfaces.faces):
-        return sheet
-    flat = surfaces.verts[:, [0, 2]]
-    low, high = flat.amin(0) - 0.4, flat.amax(0) + 0.4
-    darkness = _shadow_map(surfaces, ground.height, low, high)
-    points = floor_points(eye, ground.height)[..., [0, 2]]
-    where = ((points - low) / (high - low) * 2 - 1).nan_to_num(9.0, 9.0, -9.0).clamp(-9, 9)
-    sheet[..., 3] = grid_sample(
-        darkness[None, None], where[None], align_corners=False, padding_mode="zeros"
-    )[0, 0]
-    return sheet
-
-
-def _shadow_map(
-    surfaces: Surfaces, floor: float, low: Tensor, high: Tensor
-) -> Float[Tensor, "rows columns"]:
-    """Darkness of the floor between two corners, x along the columns and z along the rows."""
-    cell = max(CELL, float((high - low).max()) / MOST)
-    columns, rows = ((high - low) / cell).ceil().int().tolist()
-    scale = torch.tensor([columns, rows]) / (high - low)
-    x, y, z = surfaces.verts.unbind(-1)
-    depth = BELOW + (y - floor).clamp_min(0)
-    middle = (low + high) / 2
-    straight = torch.stack([(x - middle[0]) * depth, (z - middle[1]) * depth, depth], -1)
-    K = torch.tensor([[scale[0], 0, columns / 2], [0, scale[1], rows / 2], [0, 0, 1]])
-    away, face = first_hit(straight, surfaces.faces, K, (rows, columns))
-    dark = torch.where(face >= 0, (-(away - BELOW) / REACH).exp(), 0.0)[None, None]
-    near, wide = (avg_pool2d(avg_pool2d(dark, 2 * r + 1, 1, r), 2 * r + 1, 1, r) for r in SOFT)
-    return (DARK * (0.6 * near + 0.4 * wide))[0, 0]
-
-
-def _inside(points: Float[Tensor, "h w 2"], ground: GroundPatch) -> Float[Tensor, "h w"]:
-    """1 on the shown part of the floor, fading to 0 at its border."""
-    gap = torch.minimum(points - ground.low, ground.high - points).amin(-1)
-    return (gap.nan_to_num(-1.0, -1.0, -1.0) / EDGE).clamp(0, 1)
+    inside = (torch.minimum(points - low, high - points).amin(-1) / EDGE).clamp(0, 1)
+    alpha = METRE * (1.2 - near).clamp(0, 1) * coarse * inside
+    return alpha[..., None].expand(-1, -1, 4)

@@ -1,4 +1,4 @@
-"""One page that shows what a run did: pictures, plans, a 3D view, curves and numbers.
+"""One page that shows what a run did: pictures, plans, a 3D view and numbers.
 
 The page is one file without any address outside it: it opens from disk, today and in ten years.
 """
@@ -50,8 +50,6 @@ class ReportContent:
     """People in the world of `initial`."""
     bodies: Bodies | None = None
     """People in the world of `result`."""
-    traces: Mapping[str, Sequence[float]] = field(default_factory=lambda: {})
-    """Total energy before each step, by stage."""
     metrics: Mapping[str, Any] | None = None
     """What metrics.json holds."""
     warnings: tuple[str, ...] = ()
@@ -111,7 +109,6 @@ def _page(content: ReportContent) -> str:
                 objects_table(content.initial, content.result, content.objects, content.metrics),
             ),
         ),
-        curves=draw_curves(content.traces),
         longest=max([float(s.get("seconds") or 0) for s in content.stages], default=0.0) or 1.0,
         settings=settings_of(content.config),
         view=view,
@@ -178,57 +175,3 @@ def _overlay(content: ReportContent, scene: Scene) -> str:
     image, file = draw_overlay(canvas(content.image, scene, WIDEST), scene), io.BytesIO()
     Image.fromarray(pixels(image)).save(file, "JPEG", quality=QUALITY, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
-
-
-WIDTH, HEIGHT = 420.0, 200.0  # [px] of a plot
-LEFT, RIGHT, TOP, BOTTOM = 52.0, 12.0, 12.0, 28.0  # [px] around its frame
-POINTS = 320  # at most so many points are drawn
-DEEPEST = 1e-12  # a curve is drawn down to this share of its highest value
-TICKS = 4  # parts into which the axes are divided
-
-
-def draw_curves(traces: Mapping[str, Sequence[float]]) -> str:
-    """Plot the total energy of each stage over its iterations on a logarithmic scale."""
-    plots: list[dict[str, Any]] = []
-    for name, trace in traces.items():
-        finite = [v for v in trace if math.isfinite(v)]
-        if finite:
-            ends = {"first": f"{finite[0]:.3g}", "last": f"{finite[-1]:.3g}"}
-            plots.append({"name": name, "curve": draw_curve(trace), "steps": len(trace), **ends})
-    return fill("curves.html", plots=plots) if plots else ""
-
-
-def draw_curve(trace: Sequence[float]) -> str:
-    """One plot; values that have no logarithm are drawn at the lower edge."""
-    finite = [(s, v) for s, v in enumerate(trace) if math.isfinite(v)]
-    pairs = finite[:: max(1, math.ceil(len(finite) / POINTS))]
-    pairs += finite[-1:] if pairs[-1] != finite[-1] else []
-    positive = [v for _, v in pairs if v > 0] or [1.0]
-    low, high = max(min(positive), max(positive) * DEEPEST), max(positive)
-    pad, last = max(1.05, (high / low) ** 0.06), max(1, len(trace) - 1)
-    bottom, top = math.log10(low / pad), math.log10(high * pad)
-
-    def x(step: float) -> float:
-        return LEFT + (WIDTH - LEFT - RIGHT) * step / last
-
-    def y(value: float) -> float:
-        share = (math.log10(max(value, low / pad)) - bottom) / (top - bottom)
-        return HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * share
-
-    levels = [10 ** (bottom + (top - bottom) * k / TICKS) for k in range(TICKS + 1)]
-    steps = sorted({round(last * k / TICKS) for k in range(TICKS + 1)})
-    return fill(
-        "curve.svg",
-        width=f"{WIDTH:.0f}",
-        height=f"{HEIGHT:.0f}",
-        left=LEFT,
-        right=WIDTH - RIGHT,
-        floor=HEIGHT - BOTTOM,
-        levels=[
-            {"at": f"{y(v):.1f}", "below": f"{y(v) + 4:.1f}", "text": f"{v:.2g}"} for v in levels
-        ],
-        steps=[{"at": f"{x(s):.1f}", "text": s} for s in steps],
-        line="L".join(f"{x(s):.1f} {y(v):.1f}" for s, v in pairs),
-        start=f"{x(pairs[0][0]):.1f}",
-        end=f"{x(pairs[-1][0]):.1f}",
-    )

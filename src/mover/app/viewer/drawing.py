@@ -75,7 +75,7 @@ class DrawnPeople:
 
 
 @dataclass
-class Window:
+class RoomWindow:
     """Server, state and handles of what is drawn in one viewer."""
 
     server: Any

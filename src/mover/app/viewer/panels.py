@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from mover.app.report.tables import find_changes
-from mover.app.viewer.drawing import Window, camera_wxyz
+from mover.app.viewer.drawing import RoomWindow, camera_wxyz
 from mover.app.viewer.session import Shown
 from mover.core.types import Scene, SceneObject
 from mover.geometry.boxes import box_of
@@ -26,7 +26,7 @@ EVIDENCE = {
 }
 
 
-def add_room_panel(window: Window) -> None:
+def add_room_panel(window: RoomWindow) -> None:
     """Fill the tab."""
     _add_time_line(window)
     worlds = window.server.gui.add_button_group("Room", ["after", "before"])
@@ -34,7 +34,7 @@ def add_room_panel(window: Window) -> None:
     _add_looks(window)
 
 
-def _add_time_line(window: Window) -> None:
+def _add_time_line(window: RoomWindow) -> None:
     gui, frames = window.server.gui, window.people.frames
     if not frames:
         gui.add_markdown("*There are no people in this capture.*")
@@ -73,7 +73,7 @@ def _pace(fps: float, frames: Sequence[int]) -> tuple[float, int]:
     return moments / every, every
 
 
-def _add_looks(window: Window) -> None:
+def _add_looks(window: RoomWindow) -> None:
     gui = window.server.gui
     frustum = gui.add_checkbox("Camera", initial_value=True)
     through = gui.add_button("Look through the camera")
@@ -132,7 +132,7 @@ def numbers_of(item: SceneObject, scene: Scene, shown: Shown) -> str:
     return "\n".join([f"| **{item.id}** | |", "|---|---|", *lines])
 
 
-def add_object_panel(window: Window) -> None:
+def add_object_panel(window: RoomWindow) -> None:
     """Fill the tab."""
     gui, session = window.server.gui, window.session
     choice = gui.add_dropdown("Object", [NONE, *window.furniture["after"]])
@@ -162,7 +162,7 @@ def add_object_panel(window: Window) -> None:
     session.listen(refresh)
 
 
-def _add_edits(window: Window) -> None:
+def _add_edits(window: RoomWindow) -> None:
     gui, session = window.server.gui, window.session
     folder = gui.add_folder("Edit", visible=False)
     with folder:

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from mover.app.cli import say
-from mover.app.viewer.drawing import DrawnPeople, Window
+from mover.app.viewer.drawing import DrawnPeople, RoomWindow
 from mover.app.viewer.gate import HOSTS, guarded
 from mover.app.viewer.panels import add_object_panel, add_room_panel
 from mover.app.viewer.session import Session, read_shown, start_session
@@ -17,7 +17,7 @@ from mover.core.errors import InputError
 from mover.geometry.boxes import box_of
 
 
-def open_viewer(session: Session, port: int) -> tuple[Window, str]:
+def open_viewer(session: Session, port: int) -> tuple[RoomWindow, str]:
     """Start the server and draw the room; the window and its URL.
 
     Raises:
@@ -44,7 +44,7 @@ def open_viewer(session: Session, port: int) -> tuple[Window, str]:
     start = server.initial_camera
     start.up, start.position = (0.0, 1.0, 0.0), (x + 1.0, 2.2, 1.8)
     start.look_at, start.fov = (x, y, z), math.radians(55)
-    window = Window(server, session, DrawnPeople(server))
+    window = RoomWindow(server, session, DrawnPeople(server))
     window.set_world("after")
     session.listen(window.redraw)
     tabs = server.gui.add_tab_group()
