@@ -77,24 +77,20 @@ def near_box(points: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> np.nda
 
 
 def test_a_planted_foot_does_not_slide_and_stands_on_the_floor(person: Person) -> None:
-    path = np.array([[0, 0], [1.2, 0.8], [1.2, 2.5]], dtype=float)
-    route = stations(path, -1.0, 2.5)
-    times = np.arange(0, duration(route), 0.05)
-    skin = skinned(person, walk(person, route, times), part("feet"))
-    low = skin[..., 1].min(1)
-    assert np.abs(low).max() < 0.01
+    route = stations(np.array([[0, 0], [1.2, 0.8], [1.2, 2.5]], dtype=float), -1.0, 2.5)
+    skin = skinned(person, walk(person, route, np.arange(0, duration(route), 0.05)), part("feet"))
+    assert np.abs(skin[..., 1].min(1)).max() < 0.01
     down = skin[..., 1] < 0.003
     both = down[1:] & down[:-1]
     slide = np.linalg.norm(np.diff(skin, axis=0)[..., [0, 2]], axis=-1)
     assert both.any(1).mean() > 0.95
     start: dict[int, np.ndarray] = {}
     for frame in range(len(both)):
-        for vertex in np.flatnonzero(down[frame]):
-            start.setdefault(int(vertex), skin[frame, vertex])
-            drift = np.linalg.norm((skin[frame, vertex] - start[int(vertex)])[[0, 2]])
+        start = {v: where for v, where in start.items() if down[frame, v]}
+        for vertex in np.flatnonzero(down[frame]).tolist():
+            first = start.setdefault(vertex, skin[frame, vertex])
+            drift = np.linalg.norm((skin[frame, vertex] - first)[[0, 2]])
             assert drift < 0.01, "a sole slides within one step"
-        for vertex in [v for v in start if not down[frame, v]]:
-            del start[vertex]
     assert slide[both].max() < 0.004
 
 
@@ -185,11 +181,8 @@ def test_a_way_goes_around_furniture_or_there_is_none() -> None:
 
 def tiny_room() -> KnownRoom:
     """A chair, a table and a shelf; a person sits down and puts a hand on the table."""
-    spots = (
-        ("chair", 0, (0.7, -3.4), 0.2),
-        ("table", 0, (-0.8, -3.9), 0.0),
-        ("shelf", 2, (0.4, -5.0), 0.0),
-    )
+    spots = (("chair", 0, (0.7, -3.4), 0.2), ("table", 0, (-0.8, -3.9), 0.0),
+             ("shelf", 2, (0.4, -5.0), 0.0))  # fmt: skip
     pieces = tuple(
         Placed(f"{n}_0", make_piece(n, np.random.default_rng(2), s), at, heading)
         for n, s, at, heading in spots
@@ -237,15 +230,13 @@ def test_masks_are_what_an_independent_ray_caster_sees(tiny: KnownRoom) -> None:
 def test_visible_people_and_furniture_share_the_image(tiny: KnownRoom) -> None:
     people, bodies = tiny.capture.people, tiny.bodies
     assert people is not None
-    for row in (20,):
-        body = (
-            to_world(bodies.verts[row], tiny.truth.camera.R_cam_world).numpy(),
-            bodies.faces.numpy(),
-        )
-        rest = [place_object(p) for p in tiny.truth.objects]
-        seen = draw([body, *((m.verts.numpy(), m.faces.numpy()) for m in rest)], tiny.truth.camera)
-        mask = decode(people.masks, row).numpy()
-        assert (mask & (seen == 0)).sum() / (mask | (seen == 0)).sum() > 0.97
+    row, R = 20, tiny.truth.camera.R_cam_world
+    meshes = [place_object(p) for p in tiny.truth.objects]
+    body = (to_world(bodies.verts[row], R).numpy(), bodies.faces.numpy())
+    all_of_it = [body, *((m.verts.numpy(), m.faces.numpy()) for m in meshes)]
+    seen = draw(all_of_it, tiny.truth.camera) == 0
+    mask = decode(people.masks, row).numpy()
+    assert (mask & seen).sum() / (mask | seen).sum() > 0.97
 
 
 def test_pose_parameters_give_the_bodies(tiny: KnownRoom) -> None:
@@ -269,12 +260,10 @@ def test_truth_neither_sinks_nor_gapes(tiny: KnownRoom) -> None:
         verts, faces = mesh.verts.double().numpy(), mesh.faces.numpy()
         far = near_box(world.reshape(-1, 3), verts, faces).reshape(count, -1)
         assert far.min() > -0.02
-        sitting = [k for k, a in enumerate(tiny.actions) if a == "sit"]
-        hands = [k for k, a in enumerate(tiny.actions) if a.endswith("hand")]
-        if index == 0:
-            assert far[sitting].min(1).max() < 0.01
-        if index == 1:
-            assert far[hands].min(1).max() < 0.01
+        used = {0: ("sit",), 1: ("left hand", "right hand")}.get(index, ())
+        resting = [k for k, action in enumerate(tiny.actions) if action in used]
+        assert bool(resting) == bool(used)
+        assert far[resting].min(1).max(initial=0) < 0.01
         nearest = np.minimum(nearest, far)
     floor = world[..., 1] - tiny.truth.ground
     touching = np.minimum(nearest, floor) < 0.01
@@ -290,10 +279,7 @@ def test_a_room_is_the_same_every_time(tiny: KnownRoom) -> None:
 def test_tasks_that_the_furniture_does_not_allow_are_refused_with_a_reason() -> None:
     chair = make_piece("chair", np.random.default_rng(0), 0)
     wall = make_piece("wardrobe", np.random.default_rng(0), 1)
-    pieces = (
-        Placed("chair_0", chair, (0.0, -4.0), 0.0),
-        Placed("wardrobe_0", wall, (0.0, -3.4), 0.0),
-    )
+    pieces = (Placed("chair_0", chair, (0.0, -4.0), 0.0), Placed("wall_0", wall, (0.0, -3.4), 0.0))
     stage = Stage(make_person(SHAPES[0]), pieces, np.array([[-2.0, -6.0], [2.0, -2.0]]), 5.0)
     start = Stop(np.array([0.0, -2.5]), 0.0, np.array([0.0, -2.5]))
     result = perform(stage, (Task("sit", 0),), start, np.random.default_rng(0))

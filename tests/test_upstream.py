@@ -1,11 +1,9 @@
 """The set `upstream`: what today's tools give, all errors at once."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
-from test_noise import SILENT, size
+from test_noise import noisy, pairs, posed, shown, size
 from test_rooms import shared_room
 
 from mover.bodies.skinning import open_body
@@ -14,7 +12,6 @@ from mover.furniture.library import PIECES, make_piece
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import project, to_camera
 from mover.geometry.nearest import to_surface
-from mover.geometry.rle import decode
 from mover.geometry.topology import is_closed
 from mover_bench.rooms import foreign
 from mover_bench.rooms.config import NoiseConfig
@@ -27,10 +24,6 @@ from mover_bench.rooms.noise_masks import coarse, wobbled
 @pytest.fixture(scope="module")
 def room() -> KnownRoom:
     return shared_room()
-
-
-def with_only(**errors: float) -> NoiseConfig:
-    return dataclasses.replace(SILENT, **errors)
 
 
 @pytest.mark.parametrize("maker", MAKERS, ids=lambda m: m.__name__.strip("_"))
@@ -78,61 +71,47 @@ def test_an_outline_wobbles_by_the_stated_pixels() -> None:
 
 
 def test_amodal_masks_hold_what_is_hidden(room: KnownRoom) -> None:
-    capture = add_noise(room, with_only(amodal=1.0), 0)
-    pairs = list(zip(capture.detections, room.capture.detections, strict=True))
-    grown = [
-        int(decode(a.mask, 0).sum()) - int(decode(b.mask, 0).sum())
-        for a, b in pairs
-        if a.mask is not None and b.mask is not None
-    ]
+    both = zip(noisy(room, amodal=1.0).detections, room.capture.detections, strict=True)
+    grown = [int(shown(a).sum()) - int(shown(b).sum()) for a, b in both]
     assert min(grown) >= 0
     assert max(grown) > 0
 
 
 def test_mean_bodies_have_one_shape_and_fill_their_pictures(room: KnownRoom) -> None:
-    given, true = add_noise(room, with_only(mean_bodies=True), 0).bodies, room.bodies
-    assert given is not None
-    assert given.pose is not None
-    assert float(given.pose.betas.abs().max()) == 0
+    given, _, pose = posed(noisy(room, mean_bodies=True).bodies)
+    assert float(pose.betas.abs().max()) == 0
 
     def height(verts: torch.Tensor) -> torch.Tensor:
         pixel = project(verts, room.truth.camera.K)[..., 1]
         return pixel.amax(-1) - pixel.amin(-1)
 
-    share = height(given.verts) / height(true.verts)
+    share = height(given.verts) / height(room.bodies.verts)
     assert 0.93 < float(share.median()) < 1.07
-    assert open_body().posed(given.pose)[0].sub(given.verts).abs().max() < 1e-4
+    assert open_body().posed(pose)[0].sub(given.verts).abs().max() < 1e-4
 
 
 def test_a_biased_pose_stays_biased(room: KnownRoom) -> None:
-    given = add_noise(room, with_only(pose_bias=6.0), 0).bodies
-    assert given is not None
-    assert given.pose is not None
-    assert room.bodies.pose is not None
-    off = given.pose.body_pose - room.bodies.pose.body_pose
+    given, true = (posed(b)[2] for b in (noisy(room, pose_bias=6.0).bodies, room.bodies))
+    off = given.body_pose - true.body_pose
     assert float(off.mean(0).abs().mean()) > 3 * float(off.std(0).median())
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_wrong_lens_keeps_the_picture_and_the_widths(room: KnownRoom, seed: int) -> None:
-    capture = add_noise(room, with_only(lens=0.055), seed)
+    capture = noisy(room, seed, lens=0.055)
     zoom = float(capture.scene.camera.K[0, 0] / room.truth.camera.K[0, 0])
     assert 0.029 < abs(zoom - 1) < 0.081
 
     def seen(piece: SceneObject, K: torch.Tensor) -> torch.Tensor:
         return project(to_camera(box_of(piece).center, room.truth.camera.R_cam_world), K)
 
-    for given, true in zip(capture.scene.objects, room.truth.objects, strict=True):
+    for given, true in pairs(room, capture):
         assert torch.allclose(size(given), size(true), atol=1e-5)
         pixels = seen(given, capture.scene.camera.K), seen(true, room.truth.camera.K)
         assert torch.allclose(*pixels, atol=0.05)
-    assert capture.bodies is not None
-    assert capture.bodies.joints is not None
-    assert room.bodies.joints is not None
-    assert torch.allclose(
-        capture.bodies.joints[:, 0, 2], room.bodies.joints[:, 0, 2] * zoom, atol=1e-3
-    )
-    assert torch.allclose(capture.bodies.joints[..., :2], room.bodies.joints[..., :2], atol=1e-4)
+    given, true = (posed(b)[1] for b in (capture.bodies, room.bodies))
+    assert torch.allclose(given[:, 0, 2], true[:, 0, 2] * zoom, atol=1e-3)
+    assert torch.allclose(given[..., :2], true[..., :2], atol=1e-4)
 
 
 def test_the_other_sets_do_not_change(room: KnownRoom) -> None:
