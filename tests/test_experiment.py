@@ -84,13 +84,8 @@ def trial(shift: float = 0.2) -> Trial:
     people = records.map_tensors(
         lambda x: x.float() if x.is_floating_point() else x, judged.people(2)
     )
-    R = truth.camera.R_cam_world
-    shown = replace(
-        people,
-        verts=to_camera(people.verts, R),
-        joints=to_camera(people.joints, R),
-        space="camera",
-    )
+    verts, joints = (to_camera(x, truth.camera.R_cam_world) for x in (people.verts, people.joints))
+    shown = replace(people, verts=verts, joints=joints, space="camera")
     capture = Capture(
         "two boxes", initial, None, detections(truth), None, None, shown, None, None, ()
     )
@@ -101,16 +96,12 @@ def quick(config: Config) -> Config:
     """The same settings with hardly any work."""
     few = Adam(2)
     return replace(
-        config,
-        image=replace(config.image, size=32),
+        config, correct_depth=False, outer_iterations=0, image=replace(config.image, size=32),
         layout=replace(config.layout, method=few, short=Adam(0), yaws=1, num_hypotheses=1),
-        place=replace(config.place, method=few),
-        refine=replace(config.refine, rounds=0),
+        place=replace(config.place, method=few), refine=replace(config.refine, rounds=0),
         gather=replace(config.gather, cells=16),
         prepare=replace(config.prepare, cells=16, samples=100),
-        correct_depth=False,
-        outer_iterations=0,
-    )
+    )  # fmt: skip
 
 
 class Here:
@@ -159,12 +150,9 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-class TestSeeds:
-    def test_ranges_and_numbers_are_joined_in_order(self) -> None:
-        assert parse_seeds("7,0-2, 2-3") == (0, 1, 2, 3, 7)
-
-    @pytest.mark.parametrize("text", ["", "a", "3-1", "1-", "-2", "1..3", "1,,2", "²"])
-    def test_anything_else_is_refused(self, text: str) -> None:
+def test_seeds_are_numbers_and_ranges_in_order_and_anything_else_is_refused() -> None:
+    assert parse_seeds("7,0-2, 2-3") == (0, 1, 2, 3, 7)
+    for text in ("", "a", "3-1", "1-", "-2", "1..3", "1,,2", "²"):
         with pytest.raises(InputError, match="--seeds"):
             parse_seeds(text)
 
@@ -229,19 +217,18 @@ def test_the_page_has_the_means_and_differences_of_the_files(finished) -> None:
     assert "mover experiment --set rooms --seeds 0,1 --variants robust paper no-people" in page
 
 
-def test_stage_1_and_full_share_camera_and_ground(finished) -> None:
-    args, _, _ = finished
-    tree = json.loads((args.out / "rooms" / "0" / "paper.json").read_text())
+def test_stages_share_a_camera_and_people_who_are_withheld_are_measured_all_the_same(
+    finished,
+) -> None:
+    paper, alone = (
+        json.loads((finished[0].out / "rooms" / "0" / f"{name}.json").read_text())
+        for name in ("paper", "no-people")
+    )
     for name in ("pitch_error", "roll_error"):
-        assert tree["image"][name] == tree["full"][name]
-    assert tree["image"]["iou3d"] != tree["full"]["iou3d"]
-
-
-def test_people_who_are_not_given_are_measured_all_the_same(finished) -> None:
-    args, _, _ = finished
-    tree = json.loads((args.out / "rooms" / "0" / "no-people.json").read_text())
-    assert tree["full"]["pitch_error"] == tree["initial"]["pitch_error"]
-    assert "contact_f1" in tree["full"]
+        assert paper["image"][name] == paper["full"][name]
+    assert paper["image"]["iou3d"] != paper["full"]["iou3d"]
+    assert alone["full"]["pitch_error"] == alone["initial"]["pitch_error"]
+    assert "contact_f1" in alone["full"]
 
 
 def test_a_variant_that_fails_is_named_and_done_again_by_the_next_pass(
@@ -263,16 +250,16 @@ def test_a_variant_that_fails_is_named_and_done_again_by_the_next_pass(
 
 
 @pytest.mark.usefixtures("patched")
-def test_a_result_of_other_sources_is_done_again_unless_kept(finished, tmp_path) -> None:
+def test_a_result_of_other_sources_is_done_again(finished, tmp_path) -> None:
     args = replace(finished[0], out=tmp_path, seeds="0", variants=("robust",))
     path = tmp_path / "rooms" / "0" / "robust.json"
     path.parent.mkdir(parents=True)
     tree = json.loads((finished[0].out / "rooms" / "0" / "robust.json").read_text())
-    path.write_text(json.dumps({**tree, "key": "old"}))
-    kept, renewed = Here(), Here()
-    run_experiment(replace(args, keep=True), pool=kept)
-    run_experiment(args, pool=renewed)
-    assert (kept.seeds, renewed.seeds) == ([], [0])
+    for key, done in ((tree["key"], []), ("old", [0])):
+        path.write_text(json.dumps({**tree, "key": key}))
+        here = Here()
+        run_experiment(args, pool=here)
+        assert here.seeds == done
 
 
 def test_refined_people_change_what_is_measured_of_people_only(tmp_path, monkeypatch) -> None:
@@ -379,21 +366,22 @@ class TestVariants:
 class TestWithheld:
     def test_a_segment_holds_its_seconds_and_nothing_else(self) -> None:
         capture = trial().capture
-        bodies = replace(capture.bodies, fps=1.0)
-        frames = frames_of(bodies, Cut(seconds=1.0, start=1.0))
-        assert frames.tolist() == [int(bodies.frame.max())]
-        part = withheld(replace(capture, bodies=bodies), "all", Cut(seconds=1.0, start=1.0))
-        assert part.bodies.frame.unique().tolist() == frames.tolist()
-        rows = [k for k, f in enumerate(bodies.frame.tolist()) if f in frames.tolist()]
+        bodies, cut = replace(capture.bodies, fps=1.0), Cut(seconds=1.0, start=1.0)
+        frames = frames_of(bodies, cut).tolist()
+        assert frames == [int(bodies.frame.max())]
+        part = withheld(replace(capture, bodies=bodies), "all", cut)
+        assert part.bodies.frame.unique().tolist() == frames
+        rows = [k for k, f in enumerate(bodies.frame.tolist()) if f in frames]
         assert (part.bodies.verts == bodies.verts[rows]).all()
 
-    def test_a_segment_without_people_is_an_image_alone(self) -> None:
+    def test_without_people_an_image_is_left(self) -> None:
         capture = trial().capture
         last = int(capture.bodies.frame.max())
         gap = replace(capture.bodies, fps=1.0, frame=3 * capture.bodies.frame)
         late = withheld(replace(capture, bodies=gap), "all", Cut(seconds=1.0, start=1 / (3 * last)))
-        assert late.bodies is None
-        assert late.people is None
+        for part in (late, withheld(capture, "no people", None)):
+            assert part.bodies is None
+            assert part.people is None
 
     def test_a_part_longer_than_the_video_is_all_of_it_and_a_frame_is_one(self) -> None:
         bodies = trial().capture.bodies
@@ -401,13 +389,10 @@ class TestWithheld:
         assert frames_of(replace(bodies, fps=5.0), Cut(seconds=1e4)).tolist() == whole
         assert frames_of(bodies, Cut(start=1.0)).tolist() == whole[-1:]
 
-    def test_people_touch_nothing_without_contact_and_are_gone_without_people(self) -> None:
+    def test_people_touch_nothing_without_contact(self) -> None:
         part = withheld(trial().capture, "no contact", None)
         assert part.touch.shape == part.bodies.verts.shape[:2]
         assert not part.touch.any()
-        part = withheld(trial().capture, "no people", None)
-        assert part.bodies is None
-        assert part.people is None
 
 
 class TestTables:

@@ -81,10 +81,7 @@ def check_scan(folder: Path, room: layouts.Room) -> None:
         assert (verts[mesh.faces.numpy()][..., 1].max(1) - truth.ground > 0.9 * FLOOR).all()
 
 
-def test_keypoints_of_mirrored_pictures_change_sides(
-    prox: Path, plain: layouts.Room, tmp_path: Path
-) -> None:
-    del plain
+def test_keypoints_of_mirrored_pictures_change_sides(prox: Path, tmp_path: Path) -> None:
     imported("prox", prox, tmp_path / "out", tmp_path, recording=RECORDING)
     tree = json.loads((tmp_path / "out" / "keypoints" / "000001_keypoints.json").read_text())
     joints = np.array(tree["people"][0]["pose_keypoints_2d"]).reshape(-1, 3)
@@ -149,8 +146,6 @@ def test_pigraphs_gives_skeletons_with_skin_and_the_truth(
 
 
 def test_capsules_are_closed_and_outward() -> None:
-    from mover.geometry.mesh import box
-
     arrays = capsule_people([(0, 0, walking(1)[0])], np.eye(3), 5.0)
     verts, faces = arrays["vertices"][0].astype(float), arrays["faces"]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -159,7 +154,6 @@ def test_capsules_are_closed_and_outward() -> None:
                        np.cross(verts[faces[:, 1]], verts[faces[:, 2]])).sum() / 6  # fmt: skip
     assert 0.03 < volume < 0.2
     assert len(NAMES) == 25
-    del box
 
 
 def test_parts_of_an_object_become_one_box(plain: layouts.Room, tmp_path: Path) -> None:

@@ -29,8 +29,6 @@ class ExperimentArgs:
     source: Path | None = None
     """For the set i3db: the folder i3DB of amonszpart/iMapper. Its scenes are reconstructed with
     the first variant, from library furniture and from the true shapes."""
-    keep: bool = False
-    """Take finished results of other versions or settings of the program as they are."""
 
 
 Table = Literal["prox", "prox-quantitative", "pigraphs"]

@@ -1,6 +1,6 @@
 """The variants of an experiment on the known room of one seed.
 
-A process a room (`python -m mover_bench.experiment.job SET SEED OUT KEEP VARIANT ...`) with one
+A process a room (`python -m mover_bench.experiment.job SET SEED OUT VARIANT ...`) with one
 thread. Variants share their finished stages; what is finished is a file OUT/SET/SEED/VARIANT.json,
 and a variant that fails leaves its traceback there.
 """
@@ -71,11 +71,10 @@ def read_numbers(path: Path) -> dict[str, Any]:
         return {}
 
 
-def is_finished(out: Path, rooms: str, seed: int, name: str, *, keep: bool) -> bool:
-    """Whether numbers are there, of this version unless others are taken as well."""
+def is_finished(out: Path, rooms: str, seed: int, name: str) -> bool:
+    """Whether numbers of this version are there."""
     found = read_numbers(path_of(out, rooms, seed, name))
-    here = key_of(set_named(rooms), seed, VARIANTS[name])
-    return "full" in found and (keep or found["key"] == here)
+    return "full" in found and found["key"] == key_of(set_named(rooms), seed, VARIANTS[name])
 
 
 def measured(trial: Trial, judge: Judge, variant: Variant, run: Run) -> dict[str, Any]:
@@ -112,11 +111,10 @@ def do_room(out: Path, rooms: str, seed: int, names: Sequence[str]) -> None:
 
 def main(arguments: Sequence[str]) -> None:
     """Do what is named on the command line."""
-    rooms, seed, out, keep, *names = arguments
+    rooms, seed, out, *names = arguments
     torch.set_num_threads(1)
     where = Path(out), rooms, int(seed)
-    left = [name for name in names if not is_finished(*where, name, keep=keep == "keep")]
-    do_room(*where, left)
+    do_room(*where, [name for name in names if not is_finished(*where, name)])
 
 
 if __name__ == "__main__":

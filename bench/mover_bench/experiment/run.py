@@ -81,13 +81,10 @@ def run_experiment(args: ExperimentArgs, observe: Observer = silent, pool: Pool 
     seeds, names = parse_seeds(args.seeds), names_in(args.variants)
     set_named(args.set)
     open_seeds = [
-        seed
-        for seed in seeds
-        if not all(is_finished(args.out, args.set, seed, n, keep=args.keep) for n in names)
+        seed for seed in seeds if not all(is_finished(args.out, args.set, seed, n) for n in names)
     ]
-    keep = "keep" if args.keep else "new"
     jobs = [
-        ((args.set, str(seed), str(args.out), keep, *names), args.out / args.set / str(seed) / LOG)
+        ((args.set, str(seed), str(args.out), *names), args.out / args.set / str(seed) / LOG)
         for seed in open_seeds
     ]
     ended = pool("mover_bench.experiment.job", jobs, args.workers)
