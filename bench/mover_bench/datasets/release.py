@@ -130,11 +130,10 @@ def release_parts(folder: Path, hints: Hints) -> Parts:
     lens: dict[str, Any] = dict(parts.camera.value)
     size = lens["w"], lens["h"]
     notes: list[str] = []
-    xml, R = found(folder, "001.xml"), None
-    if xml is None:
+    xml = found(folder, "001.xml")
+    R = None if xml is None else np.array(get(read_camera_file(xml, size), "R_cam_world").value)
+    if R is None:
         notes.append("there is no smplifyx_cam/001.xml, so the bodies' world is not known")
-    else:
-        R = np.array(get(read_camera_file(xml, size), "R_cam_world").value)
     bodies, first = body_arrays(folder, R, notes)
     people = _people(folder, home.parent, size)
     one = found(folder, f"{first:06d}.jpg")
