@@ -122,16 +122,12 @@ def write_total3d(folder: Path, room: Room, *, flat: bool = False, kind: str = "
 
 
 # --- SAM 3D Objects: z-up local frame stored y-up; rows times R(q); PyTorch3D camera ---
-def write_sam3d(folder: Path, room: Room, *, kind: str = "npz", placed: bool = False) -> Path:
+def write_sam3d(folder: Path, room: Room, *, kind: str = "npz") -> Path:
     """A mesh and a pose for each thing; the tool's scale is the same along all axes."""
     folder.mkdir(parents=True)
     to_p3d = np.diag([-1.0, -1.0, 1.0])
     for i, t in enumerate(room.things):
         verts = t.verts * t.scale
-        if placed:
-            camera = t.world @ room.R.T
-            mesh(camera @ FLIP, t.faces).export(folder / f"{i}.glb")
-            continue
         size = float(np.ptp(verts, axis=0).max())
         stored = verts / size
         mesh(stored, t.faces).export(folder / f"{i}.glb")

@@ -10,20 +10,31 @@ more.
 """
 
 import dataclasses
+import math
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mover.core.errors import InputError
+from mover.furniture.library import BACKS, BEDS, canonical
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.fields import At, choice, get, items, maybe, read_json, refuse, vector
-from mover.io.files.meshes import load_arrays, mesh_of, write_mesh
+from mover.io.files.meshes import load_arrays, mesh_of, read_mesh, write_mesh
 from mover.io.files.schema import rotation
 from mover.io.masks.coco import annotations_tree
-from mover.io.scenes.placing import LEVEL, Pieces, without_axes
+from mover.io.scenes.placing import (
+    LEVEL,
+    Matrix,
+    Pieces,
+    Placed,
+    about_y,
+    load_parts,
+    write_parts,
+)
 from mover.io.scenes.total3d import CLASSES, FURNITURE
 
 SCENE = Path("models") / "scene.ply"
@@ -75,3 +86,62 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
         objects=At(annotations_tree(annotations, {}, CLASSES), "detections.json"),
         notes=(f"the camera is {how}; the fronts of the objects are guesses",),
     )
+
+
+# Where the front of a mesh is that has no axes of its own.
+
+
+TURNS = 90  # angles that are tried for the box around a footprint, over a quarter turn
+UPPER = 0.75  # [share of the height], above it a seat has only its back
+CLEAR = 0.05  # [share of the size], a back that is so far off the middle is one
+
+
+def guess_front(verts: NDArray[np.float64], category: str) -> float:
+    """The yaw of a box around the points whose +z is most likely the front [rad].
+
+    The box is the one with the smallest footprint. What has a back (chairs, sofas, beds with a
+    headboard) turns it away from where its highest points are; all else faces the camera, as
+    things along walls do.
+
+    Args:
+        verts: Points in the world: +y up, the camera at the origin.
+        category: Free text.
+    """
+    flat = verts[:, [0, 2]]
+    angles = np.arange(TURNS) * (math.pi / 2 / TURNS)
+    x = flat @ np.stack([np.cos(angles), -np.sin(angles)])
+    z = flat @ np.stack([np.sin(angles), np.cos(angles)])
+    areas = np.ptp(x, axis=0) * np.ptp(z, axis=0)
+    best = float(angles[int(areas.argmin())])
+    centre = (flat.max(0) + flat.min(0)) / 2
+    wanted = -centre  # towards the camera
+    if canonical(category) in BACKS | BEDS:
+        low, high = verts[:, 1].min(), verts[:, 1].max()
+        top = flat[verts[:, 1] >= low + UPPER * (high - low)]
+        off = (top.max(0) + top.min(0)) / 2 - centre
+        if np.linalg.norm(off) > CLEAR * np.ptp(flat, axis=0).max():
+            wanted = -off
+    quarters = best + np.arange(4) * math.pi / 2
+    towards = np.sin(quarters) * wanted[0] + np.cos(quarters) * wanted[1]
+    yaw = float(quarters[int(towards.argmax())])
+    return math.atan2(math.sin(yaw), math.cos(yaw))
+
+
+def without_axes(path: Path, world: Matrix, category: str, file: Path) -> Placed:
+    """The object of a mesh that lies where it is, and a copy about the middle of its bottom.
+
+    Args:
+        path: The mesh.
+        world: Our world (+y up, the camera at the origin) from its vertices (4, 4).
+        category: Free text.
+        file: Where the copy goes.
+    """
+    mesh, _ = read_mesh(At(path.name, path.name), path.parent)
+    verts = mesh.verts.double().numpy() @ world[:3, :3].T + world[:3, 3]
+    yaw = guess_front(verts, category)
+    local = verts @ about_y(yaw)  # rows: R_y(-yaw) v
+    low, high = local.min(0), local.max(0)
+    origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    found = write_parts(load_parts(path), affine(about_y(-yaw), -origin) @ world, file)
+    fields = {"translation": (about_y(yaw) @ origin).tolist(), "yaw": yaw, "scale": [1.0] * 3}
+    return fields, found, ""

@@ -29,8 +29,8 @@ from mover.io.capture.scene_file import scene_of, scene_tree, write_scene
 from mover.io.files.cameras import read_camera_file
 from mover.io.files.fields import At, get, items, maybe, read_json
 from mover.io.files.npz import read_npy
-from mover.io.masks.instance_files import DETECTIONS, read_instances
-from mover.io.masks.instances import Instances, fitted, is_person, people_tree
+from mover.io.masks.instance_files import list_instances
+from mover.io.masks.instances import Instance, Instances, fitted, is_person, people_tree
 from mover.io.scenes.placing import FLIP, Matrix, level_of, load_from, posed
 from mover.io.scenes.total3d import read_shape, total3d_parts
 from mover_bench.datasets.true_boxes import (
@@ -110,6 +110,7 @@ def contact_arrays(folder: Path, bodies: At | None, notes: list[str]) -> At | No
 
 
 DEEPEST = 5  # folders below the sequence's own that are looked through
+DETECTIONS = "detections.json"
 SURE = 0.7  # the authors drop detections of the reference image that are less so
 LEAST = 4  # points that settle a transform
 
@@ -177,13 +178,22 @@ def _unsure_dropped(parts: Parts) -> Parts:
 
 def _people(folder: Path, home: Path, size: tuple[int, int]) -> At | None:
     """The first person of every frame, in frames numbered from 0."""
-    paths = sorted(p for p in folder.rglob(f"[0-9]*/{DETECTIONS}") if p.parent != home)
+    paths = sorted(
+        p for p in folder.rglob(f"[0-9]*/{DETECTIONS}")
+        if p.parent != home and p.parent.name.isdecimal()
+    )  # fmt: skip
+    paths = [path for path in paths if path.parent.parent == paths[0].parent.parent]
     if not paths:
         return None
-    seen = fitted(read_instances(paths[0].parent.parent, {}, size), size)
-    items_of = [dataclasses.replace(i, track=0) for i in seen.items if is_person(i)]
-    first = {item.frame: item for item in reversed(items_of)}
-    return people_tree(Instances(tuple(first.values()), size, seen.file))
+    start = 1 if int(paths[0].parent.name) == 1 else 0
+    first: dict[int, Instance] = {}
+    for path in paths:
+        seen = fitted(list_instances(read_json(path), {}, size), size)
+        frame = int(path.parent.name) - start
+        one = next((item for item in seen.items if is_person(item)), None)
+        if one is not None:
+            first[frame] = dataclasses.replace(one, frame=frame, track=0)
+    return people_tree(Instances(tuple(first.values()), size, paths[0].parent.parent.name))
 
 
 def _authors(folder: Path, parts: Parts, R: Matrix | None, notes: list[str]) -> dict[str, Scene]:

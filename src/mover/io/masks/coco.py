@@ -98,15 +98,6 @@ def _check_polygon(polygon: Any, height: int, width: int, where: str) -> None:  
         raise InputError(f"{where} a corner far outside, expected pixels of the image")
 
 
-def leaves_image(segmentation: Any, height: int, width: int) -> bool:  # noqa: ANN401
-    """Whether polygons reach more than a pixel beyond the image and are clipped."""
-    if not isinstance(segmentation, list):
-        return False
-    xs = [v for polygon in segmentation for v in polygon[0::2]]
-    ys = [v for polygon in segmentation for v in polygon[1::2]]
-    return min(xs) < -1 or max(xs) > width + 1 or min(ys) < -1 or max(ys) > height + 1
-
-
 def check_image(at: At, camera: Camera) -> int:
     """The id of an image, whose size must be the camera's."""
     for key, size in (("width", camera.width), ("height", camera.height)):
@@ -144,10 +135,13 @@ def mask_of(at: At, camera: Camera, warn: Warn) -> Masks | None:
     given = maybe(at, "segmentation")
     if given is None:
         return None
-    size = camera.height, camera.width
+    size, polygons = (camera.height, camera.width), isinstance(given.value, list)
     code = from_coco(given.value, *size, given.place)
-    if leaves_image(given.value, *size):
-        warn(f"{given.place} leaves the image and was clipped")
+    for k, side in ((0, camera.width), (1, camera.height)) if polygons else ():
+        ends = [v for polygon in given.value for v in polygon[k::2]]
+        if min(ends) < -1 or max(ends) > side + 1:  # by more than a pixel
+            warn(f"{given.place} leaves the image and was clipped")
+            break
     return Masks(*size, (code,))
 
 

@@ -1,41 +1,46 @@
 """Files of masks: COCO, lists of detections and labelme (JSON), pictures, arrays."""
 
-import dataclasses
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from msgspec import Struct, field
+from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.io.capture.parts import UNKNOWN, Hints, Parts
 from mover.io.files.fields import (
     LAST_INDEX,
     At,
+    array,
     choice,
     get,
     items,
+    mapping,
     maybe,
     number,
     read_json,
     refuse,
+    text,
     vector,
 )
-from mover.io.files.images import image_size
+from mover.io.files.images import image_size, opened
+from mover.io.files.npz import read_npy, read_npz
 from mover.io.files.schema import Id, Index, Share, Side, Text, checked
 from mover.io.masks.coco import CategoryFields
 from mover.io.masks.instances import (
     Instance,
     Instances,
     checked_code,
+    code_of,
     fitted,
     is_person,
     mask_code,
     objects_tree,
 )
-from mover.io.masks.instances_pixels import read_mask_arrays, read_mask_pictures
 
-DETECTIONS = "detections.json"
 COCO_CLASSES = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
     "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog",
@@ -53,6 +58,13 @@ GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
 """Ids that COCO leaves out."""
 COCO_IDS = tuple(n for n in range(1, 91) if n not in GAPS)
 """COCO's own ids of its classes."""
+MASKS = ("masks", "pred_masks", "mask", "segmentation", "arr_0")
+TRACKS = ("object_ids", "obj_ids", "track_ids", "track", "person", "ids")
+CLASSES = ("labels", "classes", "category", "class_names")
+LABELS = "labels.json"
+NOT_MASKS = frozenset({"image", "rgb", "input", "reference", "depth"})
+"""Names of pictures that lie beside masks."""
+MOST_LABELS = 256
 Size = tuple[int, int]
 """Width and height of an image [px]."""
 Names = Mapping[str, str]
@@ -76,7 +88,10 @@ def read_instances(path: Path, names: Names, size: Size | None) -> Instances:
         size: Width and height of the image, for sources without it [px].
     """
     if path.is_dir():
-        return _of_folder(path, names, size)
+        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() == ".png")
+        if not pictures:
+            raise InputError(f"{path}: has no masks, expected pictures (.png)")
+        return read_mask_pictures(pictures, path, names, size)
     match path.suffix.lower():
         case ".json":
             return _of_json(read_json(path), names, size)
@@ -91,36 +106,15 @@ def read_instances(path: Path, names: Names, size: Size | None) -> Instances:
 
 def _of_json(at: At, names: Names, size: Size | None) -> Instances:
     """JSON, by its keys."""
+    if isinstance(at.value, list):
+        return list_instances(at, names, size)
     keys = set(at.value) if isinstance(at.value, dict) else set[str]()
     if "annotations" in keys:
         return coco_instances(at, names, size)
     if "shapes" in keys:
         return labelme_instances(at)
-    if isinstance(at.value, list):
-        return list_instances(at, names, size)
     known = "COCO's 'annotations', labelme's 'shapes' or a list of detections"
     raise InputError(f"{at.file}: has the keys {sorted(keys)[:5]}, expected {known}")
-
-
-def _of_folder(folder: Path, names: Names, size: Size | None) -> Instances:
-    """Pictures, or MOVER's `<frame>/detections.json`, whose frames count from the first."""
-    frames = sorted(p for p in folder.iterdir() if p.is_dir() and (p / DETECTIONS).is_file())
-    pictures = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".png")
-    if not frames and not pictures:
-        expected = f"pictures (.png), or folders of frames with {DETECTIONS}"
-        raise InputError(f"{folder}: has no masks, expected {expected}")
-    if not frames:
-        return read_mask_pictures(pictures, folder, names, size)
-    found, sizes = list[Instance](), set[Size]()
-    first = 1 if frames[0].name.isdecimal() and int(frames[0].name) == 1 else 0
-    for index, frame in enumerate(frames):
-        number = int(frame.name) - first if frame.name.isdecimal() else index
-        one = list_instances(read_json(frame / DETECTIONS), names, size)
-        found += [dataclasses.replace(item, frame=number) for item in one.items]
-        sizes |= set() if one.size is None else {one.size}
-    if len(sizes) > 1:
-        raise InputError(f"{folder}: has images of {len(sizes)} sizes, expected one")
-    return Instances(tuple(found), sizes.pop() if sizes else size, folder.name)
 
 
 class ImageFields(Struct, frozen=True):
@@ -270,3 +264,125 @@ def labelme_instances(at: At) -> Instances:
         for key, polygons in groups.items()
     ]
     return Instances(tuple(found), size, at.file)
+
+
+def read_mask_arrays(path: Path, names: Names) -> Instances:
+    """Masks of an .npz or .npy file.
+
+    `masks` is (n, h, w), (n, 1, h, w) or (frames, objects, h, w), as booleans, bytes or logits
+    (above 0 is inside); or (h, w), a label map. Beside it may stand `scores`, `labels` (names),
+    `object_ids` and `frame`. With a single object id (n, 1, h, w) is one thing in n frames. Boxes
+    are those of the masks.
+    """
+    npz = path.suffix.lower() == ".npz"
+    at = read_npz(path) if npz else At({"masks": read_npy(path).value}, path.name)
+    given = _first(at, MASKS)
+    if given is None:
+        refuse(at, f"an array named {', '.join(MASKS)}", f"the arrays {sorted(at.value)[:6]}")
+    stack = given.value
+    if not isinstance(stack, np.ndarray) or stack.dtype.kind not in "buif" or stack.ndim < 2:
+        refuse(given, "an array of masks (n, h, w), (frames, objects, h, w) or labels (h, w)")
+    if stack.ndim == 2 and stack.dtype != np.bool_:
+        values = [int(v) for v in np.unique(stack[np.isfinite(stack)]).tolist() if v > 0]
+        items = [Instance(names.get(str(v), UNKNOWN), None, code_of(stack == v)) for v in values]
+        return Instances(tuple(items), (stack.shape[1], stack.shape[0]), path.name)
+    if stack.ndim > 4 or not stack.size:
+        refuse(given, "an array of masks (n, h, w) or (frames, objects, h, w)")
+    return _of_stack(at, stack, names)
+
+
+def _of_stack(at: At, stack: NDArray[Any], names: Names) -> Instances:
+    """The masks of a stack: of one image, of frames that an array names, or of all frames."""
+    ids, frame = _first(at, TRACKS), maybe(at, "frame")
+    one_id = ids is not None and isinstance(ids.value, np.ndarray) and ids.value.shape == (1,)
+    height, width = stack.shape[-2:]
+    flat = stack.reshape(-1, height, width)
+    rows, tracks = len(flat), None
+    if stack.ndim == 4 and (stack.shape[1] != 1 or (one_id and frame is None)):
+        count = stack.shape[1]
+        frames = np.repeat(np.arange(len(stack)), count)
+        each = np.arange(count) if ids is None else _counted(ids, count)
+        tracks = np.tile(each, len(stack))
+    else:
+        frames = np.zeros(rows, dtype=np.int64) if frame is None else _counted(frame, rows)
+        tracks = None if ids is None else _counted(ids, rows)
+    words, scores = _first(at, CLASSES), maybe(at, "scores")
+    labels, sure = [UNKNOWN] * rows, np.ones(rows)
+    if words is not None and isinstance(words.value, np.ndarray) and words.value.dtype.kind == "U":
+        labels = [str(word) for word in array(words, (rows,), "text")]
+    if scores is not None and isinstance(scores.value, np.ndarray) and scores.value.size == rows:
+        sure = np.clip(array(scores, scores.value.shape).reshape(-1), 0, 1)
+    found: list[Instance] = []
+    for i, pixels in enumerate(flat):
+        code, track = code_of(pixels > 0), None if tracks is None else int(tracks[i])
+        name = names.get(str(i if track is None else track)) or labels[i]
+        if code is not None:
+            found.append(Instance(name, None, code, float(sure[i]), int(frames[i]), track))
+    return Instances(tuple(found), (width, height), at.file)
+
+
+def _first(at: At, keys: Sequence[str]) -> At | None:
+    """The first of several names of an array that is there."""
+    return next((found for key in keys if (found := maybe(at, key)) is not None), None)
+
+
+def _counted(at: At, rows: int) -> NDArray[np.int64]:
+    """Frames or tracks, one a row."""
+    value = array(at, (rows,), "whole").astype(np.int64)
+    if (value < 0).any() or (value > LAST_INDEX).any():
+        refuse(at, f"whole numbers from 0 to {LAST_INDEX}")
+    return value
+
+
+def read_mask_pictures(
+    paths: Sequence[Path], source: Path, names: Names, size: Size | None
+) -> Instances:
+    """Masks of pictures; a category is looked up in labels.json, `names`, then the file name.
+
+    A picture with an alpha channel that is not full is one mask. One with two values is one mask;
+    one with more is a label map (a pixel is the number of a thing, 0 is nothing). Pictures whose
+    names are numbers of five digits or more, all label maps, are frames of a video.
+    """
+    labels = (source if source.is_dir() else source.parent) / LABELS
+    table = dict(names)
+    if labels.is_file():
+        at = read_json(labels)
+        words = {key: text(At(value, at.file, key)) for key, value in mapping(at).items()}
+        table = words | table
+    paths = [p for p in paths if p.stem.lower() not in NOT_MASKS]
+    video = len(paths) > 1 and all(re.fullmatch(r"[0-9]{5,8}", p.stem) for p in paths)
+    found, sizes = list[Instance](), set[Size]()
+    for path in paths:
+        pixels = read_labels(path)
+        sizes.add((pixels.shape[1], pixels.shape[0]))
+        values = [v for v in np.unique(pixels).tolist() if v != 0]
+        if len(values) > MOST_LABELS:
+            n = f"{len(values)} different values"
+            raise InputError(f"{path.name}: has {n}, expected at most {MOST_LABELS} labels")
+        if len(values) == 1 and not video:
+            parts = re.sub(r"[\d_-]+", " ", path.stem).split()  # `chair` of chair_0, 03_chair
+            plain = " ".join(word for word in parts if word.lower() not in ("mask", "masks"))
+            name = table.get(path.stem) or plain or UNKNOWN
+            found.append(Instance(name, None, code_of(pixels == values[0])))
+            continue
+        for value in values:
+            name, frame = table.get(str(value), UNKNOWN), int(path.stem) if video else 0
+            track = value if video else None
+            found.append(Instance(name, None, code_of(pixels == value), frame=frame, track=track))
+    if len(sizes) > 1:
+        raise InputError(f"{source.name}: has pictures of {len(sizes)} sizes, expected one")
+    return Instances(tuple(found), sizes.pop() if sizes else size, source.name)
+
+
+def read_labels(path: Path) -> NDArray[np.int64]:
+    """The numbers of a picture of labels (h, w): palette or grey values, or alpha above 0."""
+    with opened(path, expected="a picture of masks", bombs="error") as picture:
+        if picture.mode in ("RGBA", "LA", "PA"):
+            alpha = np.asarray(picture.getchannel("A"))
+            if (alpha < 255).any():
+                return (alpha > 0).astype(np.int64)
+            picture = picture.convert("RGB")
+        pixels = np.asarray(picture).astype(np.int64)
+    if pixels.ndim == 3:
+        pixels = pixels[..., 0] + 256 * pixels[..., 1] + 65536 * pixels[..., 2]
+    return pixels

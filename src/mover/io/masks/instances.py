@@ -14,7 +14,7 @@ from mover.core.errors import InputError
 from mover.core.types import Masks
 from mover.geometry.rle import area, decode, encode, tight_box
 from mover.io.files.fields import At, read_json, refuse
-from mover.io.masks.coco import annotations_tree, from_coco
+from mover.io.masks.coco import annotations_tree, from_coco, segmentation
 
 PERSON = frozenset({"person", "people", "human", "man", "woman", "child"})
 SAME_SHAPE = 0.02  # masks of another size fit an image whose sides have this ratio, nearly
@@ -60,10 +60,10 @@ def code_of(pixels: NDArray[Any]) -> bytes | None:
     return encode(torch.from_numpy(np.ascontiguousarray(pixels))) if pixels.any() else None
 
 
-def checked_code(segmentation: Any, size: tuple[int, int], at: At) -> bytes | None:  # noqa: ANN401
+def checked_code(given: Any, size: tuple[int, int], at: At) -> bytes | None:  # noqa: ANN401
     """The code of COCO's polygons or run lengths in an image of this size; None where empty."""
     width, height = size
-    code = from_coco(segmentation, height, width, at.place)
+    code = from_coco(given, height, width, at.place)
     return code if area(Masks(height, width, (code,)), 0) else None
 
 
@@ -75,21 +75,17 @@ def fitted(found: Instances, size: tuple[int, int] | None) -> Instances:
     if abs(w * height / (h * width) - 1) > SAME_SHAPE:
         at = f"{found.file}: masks of {w} x {h} pixels"
         raise InputError(f"{at}, expected those of an image of {width} x {height}")
-    items = tuple(_resized(item, found.size, size) for item in found.items)
-    return Instances(items, size, found.file)
-
-
-def _resized(item: Instance, old: tuple[int, int], new: tuple[int, int]) -> Instance:
-    factor = new[0] / old[0], new[1] / old[1]
-    box, mask = item.box, item.mask
-    if box is not None:
-        box = tuple(v * factor[i % 2] for i, v in enumerate(box))
-    if mask is not None:
-        pixels = decode(Masks(old[1], old[0], (mask,)), 0).numpy()
-        rows = ((np.arange(new[1]) + 0.5) / factor[1]).astype(np.int64)
-        columns = ((np.arange(new[0]) + 0.5) / factor[0]).astype(np.int64)
-        mask = code_of(pixels[rows.clip(0, old[1] - 1)][:, columns.clip(0, old[0] - 1)])
-    return dataclasses.replace(item, box=box, mask=mask)
+    rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64).clip(0, h - 1)
+    columns = ((np.arange(width) + 0.5) * w / width).astype(np.int64).clip(0, w - 1)
+    items: list[Instance] = []
+    for item in found.items:
+        box, mask = item.box, item.mask
+        if box is not None:
+            box = tuple(v * (width / w, height / h)[i % 2] for i, v in enumerate(box))
+        if mask is not None:
+            mask = code_of(decode(Masks(h, w, (mask,)), 0).numpy()[rows][:, columns])
+        items.append(dataclasses.replace(item, box=box, mask=mask))
+    return Instances(tuple(items), size, found.file)
 
 
 def is_person(item: Instance) -> bool:
@@ -103,22 +99,20 @@ def objects_tree(found: Instances, items: Sequence[Instance]) -> At:
     Raises:
         InputError: If the size of the image is not known.
     """
-    if found.size is None:
-        raise InputError(f"{found.file}: has no size of the image, expected --image beside it")
+    width, height = _size_of(found, "image")
     names = list(dict.fromkeys(item.category for item in items))
     rows: list[dict[str, Any]] = []
     for i, item in enumerate(items):
         row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": item.category}
         box = item.box
         if item.mask is not None:
-            row["segmentation"] = _segmentation(item.mask, found.size)
-            mask = Masks(found.size[1], found.size[0], (item.mask,))
+            mask = Masks(height, width, (item.mask,))
+            row["segmentation"] = segmentation(mask, 0)
             box = tuple(float(v) for v in tight_box(decode(mask, 0)))
         if box is None or box[2] <= box[0] or box[3] <= box[1]:
             continue  # empty: there is nothing of it in the image
         x, y, right, bottom = box
         rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": item.score})
-    width, height = found.size
     image = {"id": 0, "width": width, "height": height}
     return At(annotations_tree(rows, image, names), found.file)
 
@@ -129,21 +123,28 @@ def people_tree(found: Instances, fps: float | None = None) -> At:
     Raises:
         InputError: If the size of the images is not known.
     """
-    if found.size is None:
-        raise InputError(f"{found.file}: has no size of the images, expected --image beside it")
+    width, height = _size_of(found, "images")
     rows: list[dict[str, Any]] = []
     for item in followed(found.items):
         row = {"id": len(rows), "image_id": item.frame, "track_id": item.track, "category_id": 1}
         if item.mask is not None:
-            rows.append({**row, "segmentation": _segmentation(item.mask, found.size)})
+            mask = segmentation(Masks(height, width, (item.mask,)), 0)
+            rows.append({**row, "segmentation": mask})
     frames = sorted({item.frame for item in found.items})
     tree = {
         "info": {} if fps is None else {"fps": fps},
-        "images": [{"id": f, "width": found.size[0], "height": found.size[1]} for f in frames],
+        "images": [{"id": f, "width": width, "height": height} for f in frames],
         "categories": [{"id": 1, "name": "person"}],
         "annotations": rows,
     }
     return At(tree, found.file)
+
+
+def _size_of(found: Instances, what: str) -> tuple[int, int]:
+    """Width and height [px]."""
+    if found.size is None:
+        raise InputError(f"{found.file}: has no size of the {what}, expected --image beside it")
+    return found.size
 
 
 def followed(items: Sequence[Instance]) -> list[Instance]:
@@ -165,10 +166,6 @@ def followed(items: Sequence[Instance]) -> list[Instance]:
     return found
 
 
-def _segmentation(code: bytes, size: tuple[int, int]) -> dict[str, Any]:
-    return {"size": [size[1], size[0]], "counts": code.decode("ascii")}
-
-
 def with_reference_people(people: At | None, found: Instances, folder: Path) -> At:
     """people.json with these masks as the people of the reference image.
 
@@ -181,8 +178,9 @@ def with_reference_people(people: At | None, found: Instances, folder: Path) -> 
         people = read_json(folder / "people.json")
     empty = {"images": [], "annotations": [], "categories": [{"id": 1, "name": "person"}]}
     tree: dict[str, Any] = dict(empty if people is None else people.value)
+    width, height = found.size or (0, 0)
     tree["reference_people"] = [
-        {"segmentation": _segmentation(item.mask, found.size or (0, 0))}
+        {"segmentation": segmentation(Masks(height, width, (item.mask,)), 0)}
         for item in found.items
         if item.mask is not None
     ]

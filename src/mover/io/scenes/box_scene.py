@@ -68,7 +68,10 @@ def box_parts(path: Path, hints: Hints) -> Parts:
     if camera is None and tree.camera is not None:
         size = None if hints.image is None else image_size(hints.image)
         camera = camera_of_tree(At(tree.camera, at.file, "camera"), size)
-    turn = _world(tree, camera, hints.up)
+    turn = up_axes(hints.up or tree.up or "y")
+    if tree.frame == "camera":
+        tilt = None if camera is None else maybe(camera, "R_cam_world")
+        turn = (np.array(LEVEL) if tilt is None else rotation(tilt)).T
     found = Pieces()
     for i, (item, box) in enumerate(zip(items(get(at, "objects")), tree.objects, strict=True)):
         kind = Id if isinstance(box.id, int) else Text
@@ -81,17 +84,15 @@ def box_parts(path: Path, hints: Hints) -> Parts:
     )
 
 
-def _world(tree: BoxesFields, camera: At | None, up: str) -> Matrix:
-    """Our world from the file's: its `up` in a world, or the camera's axes."""
-    if tree.frame != "camera":
-        return up_axes(up or tree.up or "y")
-    tilt = None if camera is None else maybe(camera, "R_cam_world")
-    return (np.array(LEVEL) if tilt is None else rotation(tilt)).T
-
-
 def _placed(at: At, box: BoxFields, turn: Matrix, index: int, _key: str) -> Placed:
     """The object of a box: the mesh of the library that fills it."""
-    order, yaw = _upright(at, _axes(at, box, turn))
+    if box.rotation is not None:
+        axes = turn @ rotation(get(at, "rotation"))  # columns
+    elif box.yaw is not None:
+        axes = about_y(box.yaw)  # about the vertical, from the front at +z
+    else:
+        refuse(get(at, "yaw"), "an angle, or a 'rotation'")
+    order, yaw = _upright(at, axes)
     size = np.array(box.size)[order]
     mesh = choose_piece(str(box.category), (float(size[0]), float(size[1]), float(size[2])))
     low, high = mesh.verts.double().numpy().min(0), mesh.verts.double().numpy().max(0)
@@ -107,15 +108,6 @@ def _placed(at: At, box: BoxFields, turn: Matrix, index: int, _key: str) -> Plac
     return fields, (mesh, ""), ""
 
 
-def _axes(at: At, box: BoxFields, turn: Matrix) -> Matrix:
-    """The box's axes as columns in our world; a yaw is about the vertical, from the front at +z."""
-    if box.rotation is not None:
-        return turn @ rotation(get(at, "rotation"))
-    if box.yaw is None:
-        refuse(get(at, "yaw"), "an angle, or a 'rotation'")
-    return about_y(box.yaw)
-
-
 def _upright(at: At, axes: Matrix) -> tuple[Sequence[int], float]:
     """Which axes are width, height and depth, and the yaw of the front, in our world.
 
@@ -123,12 +115,7 @@ def _upright(at: At, axes: Matrix) -> tuple[Sequence[int], float]:
     the box's own z where that is level, else the axis that leads to it by turning the box upright.
     """
     up = int(np.abs(axes[1]).argmax())
-    if up == 1:
-        order = [0, 1, 2]
-    elif up == 2:
-        order = [0, 2, 1]  # z-up boxes: x stays, their -y is the front
-    else:
-        order = [1, 0, 2]
+    order = ([1, 0, 2], [0, 1, 2], [0, 2, 1])[up]  # z-up boxes: x stays, their -y is the front
     front = axes[:, order[2]] * (-1.0 if up == 2 and axes[1, 2] > 0 else 1.0)
     if math.hypot(front[0], front[2]) < 0.1:
         refuse(get(at, "rotation"), "a box with an axis that is nearly level")
@@ -139,8 +126,9 @@ def _annotations(boxes: Sequence[BoxFields], camera: At | None, file: str) -> At
     """What objects.json says of boxes that have a rectangle in the image."""
     if camera is None or all(box.box2d is None for box in boxes):
         return None
-    found = [
-        Instance(str(b.category), b.box2d, None, 1.0 if b.score is None else b.score) for b in boxes
-    ]
+    found = tuple(
+        Instance(str(box.category), box.box2d, None, 1.0 if box.score is None else box.score)
+        for box in boxes
+    )
     size = integer(get(camera, "w"), 1), integer(get(camera, "h"), 1)
-    return objects_tree(Instances(tuple(found), size, file), found)
+    return objects_tree(Instances(found, size, file), found)

@@ -20,17 +20,8 @@ from mover.io.capture.parts import Hints, Parts
 from mover.io.files.fields import At, maybe, reason
 from mover.io.files.images import image_size
 from mover.io.files.meshes import gltf_tree
-from mover.io.scenes.placing import (
-    FLIP,
-    Matrix,
-    Pieces,
-    Placed,
-    category_of_name,
-    corners,
-    load_parts,
-    posed,
-    write_parts,
-)
+from mover.io.people.values import natural
+from mover.io.scenes.placing import FLIP, Matrix, Pieces, category_of_name, load_parts, placed
 
 UP: dict[str, Matrix] = {
     "y": np.eye(3),
@@ -38,7 +29,7 @@ UP: dict[str, Matrix] = {
     "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
 }
 """The user's world -> +y up, right-handed."""
-OURS = ("ground", "camera", "light")
+OURS = ("ground", "camera", "light")  # what a scene.glb of this program has beside its furniture
 NO_ROOM = 1e-5  # [share], a transform that is nothing but rounding
 
 
@@ -63,7 +54,8 @@ def glb_parts(path: Path, hints: Hints) -> Parts:
     found = Pieces()
     for node in _nodes(scene):
         category = hints.names.get(node) or category_of_name(node)
-        found.add(category, node, partial(_placed, scene, node, turn, hints.work))
+        matrix = turn @ np.asarray(scene.graph[node][0])
+        found.add(category, node, partial(placed, _below(scene, node), matrix, hints.work))
     if not found.rows:
         raise InputError(f"{path.name}: has no meshes, expected a glTF scene of furniture")
     parts = found.parts(path.stem, path.name, _ground(scene, turn))
@@ -81,15 +73,6 @@ def up_axes(up: str) -> Matrix:
     return UP[up or "y"]
 
 
-def _placed(scene: Any, node: str, turn: Matrix, work: Path, key: str) -> Placed:  # noqa: ANN401
-    own, file = _below(scene, node), work / f"{key}.glb"
-    mesh, _ = found = write_parts(own, np.eye(4), file)
-    place = posed(turn @ np.asarray(scene.graph[node][0]), *corners(mesh))
-    if place.bake is not None:
-        found = write_parts(own, place.bake, file)
-    return place.fields, found, place.note
-
-
 def _nodes(scene: Any) -> list[str]:  # noqa: ANN401
     """The nodes that are objects: the highest ones that are not mere groups, in order."""
     children: dict[str, list[str]] = scene.graph.transforms.children
@@ -97,7 +80,7 @@ def _nodes(scene: Any) -> list[str]:  # noqa: ANN401
 
     def walk(node: str) -> Iterator[str]:
         below = [child for child in children.get(node, []) if child in full]
-        if _is_ours(node):
+        if node.startswith("body_") or node.rstrip("_") in OURS:
             return
         if node == scene.graph.base_frame or _is_group(scene, node, below):
             for child in below:
@@ -105,7 +88,7 @@ def _nodes(scene: Any) -> list[str]:  # noqa: ANN401
         else:
             yield node
 
-    return sorted(walk(scene.graph.base_frame), key=_natural)
+    return sorted(walk(scene.graph.base_frame), key=lambda node: natural(Path(node)))
 
 
 def _up(scene: Any, leaf: str) -> Iterator[str]:  # noqa: ANN401
@@ -117,11 +100,6 @@ def _up(scene: Any, leaf: str) -> Iterator[str]:  # noqa: ANN401
         node = parents.get(node)
 
 
-def _is_ours(node: str) -> bool:
-    """What a scene.glb of this program has beside its furniture."""
-    return node.startswith("body_") or node.rstrip("_") in OURS
-
-
 def _is_group(scene: Any, node: str, below: list[str]) -> bool:  # noqa: ANN401
     """A node without mesh above several that have places of their own."""
     edges = scene.graph.transforms.edge_data
@@ -129,14 +107,6 @@ def _is_group(scene: Any, node: str, below: list[str]) -> bool:  # noqa: ANN401
     places = [np.asarray(edges[(node, c)].get("matrix", np.eye(4))) for c in below]
     moved = [bool(np.abs(p - np.eye(4)).max() > NO_ROOM) for p in places]
     return geometry is None and len(below) > 1 and sum(moved) > 1
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """A key that sorts numbers as numbers."""
-    import re
-
-    parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts]
 
 
 def _below(scene: Any, node: str) -> Any:  # noqa: ANN401
@@ -165,7 +135,10 @@ def _ground(scene: Any, turn: Matrix) -> float | None:  # noqa: ANN401
 
 
 def _view(path: Path, hints: Hints) -> tuple[dict[str, Any], Matrix] | None:
-    """The first camera of the file: fields of camera.json, and its place in the file's world."""
+    """The first camera of the file: fields of camera.json, and its pose in the file's world.
+
+    Without an image it is 1080 pixels high.
+    """
     try:
         tree: Any = gltf_tree(path)
         nodes = tree.get("nodes", [])
@@ -173,11 +146,15 @@ def _view(path: Path, hints: Hints) -> tuple[dict[str, Any], Matrix] | None:
         if index is None:
             return None
         lens = tree["cameras"][nodes[index]["camera"]]["perspective"]
-        at = At(lens, path.name, "cameras.perspective")
-        tall = float(lens["yfov"])
-        ratio = maybe(at, "aspectRatio")
-        pose = _pose_of(nodes, index)
-        return _fields(tall, None if ratio is None else float(ratio.value), hints), pose
+        at = maybe(At(lens, path.name, "cameras.perspective"), "aspectRatio")
+        ratio = None if at is None else float(at.value)
+        w, h = (0, 1080) if hints.image is None else image_size(hints.image)
+        w = w or round(h * (ratio or 16 / 9))
+        tangent = math.tan(float(lens["yfov"]) / 2)
+        fy = h / 2 / tangent
+        fx = fy if ratio is None else w / 2 / (tangent * ratio)
+        fields = {"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": w / 2, "cy": h / 2}
+        return fields, _pose_of(nodes, index)
     except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
         raise InputError(
             f"{path.name}: has a camera that cannot be read ({reason(error)}), "
@@ -185,38 +162,24 @@ def _view(path: Path, hints: Hints) -> tuple[dict[str, Any], Matrix] | None:
         ) from error
 
 
-def _fields(tall: float, ratio: float | None, hints: Hints) -> dict[str, Any]:
-    """Fields of camera.json of a lens; without an image it is 1080 pixels high."""
-    if hints.image is not None:
-        w, h = image_size(hints.image)
-    else:
-        h = 1080
-        w = round(h * (ratio or 16 / 9))
-    fy = h / 2 / math.tan(tall / 2)
-    fx = fy if ratio is None else w / 2 / (math.tan(tall / 2) * ratio)
-    return {"w": w, "h": h, "fl_x": fx, "fl_y": fy, "cx": w / 2, "cy": h / 2}
-
-
 def _pose_of(nodes: Any, index: int) -> Matrix:  # noqa: ANN401
-    """World from a node, without scale."""
+    """World from a node, without scale: matrices by columns, or translation, rotation and scale."""
+    from scipy.spatial.transform import Rotation
+
     parent = {child: i for i, node in enumerate(nodes) for child in node.get("children", [])}
     pose, seen = np.eye(4), set[int]()
     at: int | None = index
     while at is not None and at not in seen:
         seen.add(at)
-        pose = _local(nodes[at]) @ pose
+        node = nodes[at]
+        if "matrix" in node:
+            own = np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+        else:
+            turn = Rotation.from_quat(node.get("rotation", [0.0, 0.0, 0.0, 1.0])).as_matrix()
+            place = np.array(node.get("translation", [0.0, 0.0, 0.0]), dtype=np.float64)
+            own = affine(turn @ np.diag(node.get("scale", [1.0, 1.0, 1.0])), place)
+        pose = own @ pose
         at = parent.get(at)
     u, _, v = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = u @ v
     return pose
-
-
-def _local(node: Any) -> Matrix:  # noqa: ANN401
-    """The transform of a node: a matrix by columns, or translation, rotation and scale."""
-    if "matrix" in node:
-        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_quat(node.get("rotation", [0.0, 0.0, 0.0, 1.0])).as_matrix()
-    place = np.array(node.get("translation", [0.0, 0.0, 0.0]), dtype=np.float64)
-    return affine(turn @ np.diag(node.get("scale", [1.0, 1.0, 1.0])), place)

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from mover.core.errors import InputError
 from mover.core.types import Mesh
-from mover.furniture.library import BACKS, BEDS, canonical
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import UNKNOWN, Parts
 from mover.io.capture.scene_file import scene_tree
 from mover.io.files.fields import At, reason
-from mover.io.files.meshes import check_gltf, mesh_of, read_mesh
+from mover.io.files.meshes import check_gltf, mesh_of
 
 EXACT = 1e-4  # [share], below it a matrix is a yaw and a scale
 MOST_TILT = math.radians(30)  # a tool's error of an upright thing; beyond, the axes are others
@@ -136,26 +135,6 @@ def level_of(up_cam: Matrix) -> Matrix:
     return out
 
 
-def common_up(ups: Sequence[Matrix]) -> Matrix | None:
-    """The direction on which most objects agree that it is up; None: they do not."""
-    if not ups:
-        return None
-    rows = np.stack(ups).astype(np.float64)
-    lengths = np.maximum(np.sqrt((rows * rows).sum(axis=1, keepdims=True)), 1e-12)
-    unit = rows / lengths
-    close = unit @ unit.T > math.cos(MOST_TILT)
-    best = close[int(close.sum(axis=1).argmax())]
-    if 2 * best.sum() <= len(ups) and len(ups) > 1:
-        return None
-    return np.asarray(unit[best].mean(0), dtype=np.float64)
-
-
-def corners(mesh: Mesh) -> tuple[Matrix, Matrix]:
-    """Smallest and largest corner of a mesh."""
-    verts = mesh.verts.double().numpy()
-    return verts.min(0), verts.max(0)
-
-
 def load_parts(path: Path) -> Any:  # noqa: ANN401
     """A mesh file with materials and textures, as trimesh has it.
 
@@ -212,6 +191,17 @@ def load_from(meshes: Mapping[str, tuple[Mesh, str]], at: At) -> tuple[Mesh, str
     return meshes[at.value]
 
 
+def placed(scene: Any, matrix: Matrix, work: Path, key: str) -> Placed:  # noqa: ANN401
+    """The object of parts that a matrix takes into the world, and a file of its mesh in `work`."""
+    file = work / f"{key}.glb"
+    mesh, _ = found = write_parts(scene, np.eye(4), file)
+    verts = mesh.verts.double().numpy()
+    pose = posed(matrix, verts.min(0), verts.max(0))
+    if pose.bake is not None:
+        found = write_parts(scene, pose.bake, file)
+    return pose.fields, found, pose.note
+
+
 # Names of nodes and files as categories and ids.
 
 
@@ -237,62 +227,3 @@ def free_id(category: str, name: str, used: Container[str]) -> str:
     while taken in used:
         taken, number = f"{plain}_{number}", number + 1
     return taken
-
-
-# Where the front of a mesh is that has no axes of its own.
-
-
-TURNS = 90  # angles that are tried for the box around a footprint, over a quarter turn
-UPPER = 0.75  # [share of the height], above it a seat has only its back
-CLEAR = 0.05  # [share of the size], a back that is so far off the middle is one
-
-
-def guess_front(verts: NDArray[np.float64], category: str) -> float:
-    """The yaw of a box around the points whose +z is most likely the front [rad].
-
-    The box is the one with the smallest footprint. What has a back (chairs, sofas, beds with a
-    headboard) turns it away from where its highest points are; all else faces the camera, as
-    things along walls do.
-
-    Args:
-        verts: Points in the world: +y up, the camera at the origin.
-        category: Free text.
-    """
-    flat = verts[:, [0, 2]]
-    angles = np.arange(TURNS) * (math.pi / 2 / TURNS)
-    x = flat @ np.stack([np.cos(angles), -np.sin(angles)])
-    z = flat @ np.stack([np.sin(angles), np.cos(angles)])
-    areas = np.ptp(x, axis=0) * np.ptp(z, axis=0)
-    best = float(angles[int(areas.argmin())])
-    centre = (flat.max(0) + flat.min(0)) / 2
-    wanted = -centre  # towards the camera
-    if canonical(category) in BACKS | BEDS:
-        low, high = verts[:, 1].min(), verts[:, 1].max()
-        top = flat[verts[:, 1] >= low + UPPER * (high - low)]
-        off = (top.max(0) + top.min(0)) / 2 - centre
-        if np.linalg.norm(off) > CLEAR * np.ptp(flat, axis=0).max():
-            wanted = -off
-    quarters = best + np.arange(4) * math.pi / 2
-    towards = np.sin(quarters) * wanted[0] + np.cos(quarters) * wanted[1]
-    yaw = float(quarters[int(towards.argmax())])
-    return math.atan2(math.sin(yaw), math.cos(yaw))
-
-
-def without_axes(path: Path, world: Matrix, category: str, file: Path, note: str = "") -> Placed:
-    """The place of a mesh that lies where it is, and a copy about the middle of its box's bottom.
-
-    Args:
-        path: The mesh.
-        world: Our world (+y up, the camera at the origin) from its vertices (4, 4).
-        category: Free text.
-        file: Where the copy goes.
-        note: What was lost.
-    """
-    mesh, _ = read_mesh(At(path.name, path.name), path.parent)
-    verts = mesh.verts.double().numpy() @ world[:3, :3].T + world[:3, 3]
-    yaw = guess_front(verts, category)
-    local = verts @ about_y(yaw)  # rows: R_y(-yaw) v
-    low, high = local.min(0), local.max(0)
-    origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
-    found = write_parts(load_parts(path), affine(about_y(-yaw), -origin) @ world, file)
-    return _fields(about_y(yaw) @ origin, yaw, np.ones(3)), found, note

@@ -62,9 +62,11 @@ LIFTED = ("television", "box", "sink", "lamp")
 """What may stand on something else or hang on a wall."""
 
 
-# MATLAB files, read in a process of their own: scipy's reader can die of a damaged one.
-
-
+ON_FLOOR = 0.3  # [m], such a thing stands on the floor if its box ends so close above it
+TO_OURS = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+"""x forward, y up, z right -> x right, y up, z backward."""
+TO_IMAGE = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])
+"""x forward, y up, z right -> x right, y down, z forward."""
 READ = """
 import pickle, sys, warnings
 from scipy.io import loadmat
@@ -75,24 +77,7 @@ except Exception as error:  # the parser raises anything on broken files
     said = " ".join(f"{type(error).__name__}: {error}".split())[:160]
 sys.stdout.buffer.write(pickle.dumps(said))
 """
-"""Writes the arrays, or the error in one line."""
-
-
-def load_mat(path: Path) -> At:
-    """The arrays of a MATLAB file."""
-    if not path.is_file():
-        raise InputError(f"{path.name}: there is no such file in {path.parent}")
-    call = [sys.executable, "-P", "-c", READ, str(path.resolve())]
-    done = subprocess.run(call, capture_output=True, check=False)
-    said = pickle.loads(done.stdout) if done.returncode == 0 else "its reader died"
-    if isinstance(said, str):
-        raise InputError(f"{path.name}: cannot be read ({said}), expected a .mat file")
-    return At(said, path.name)
-
-
-# The files of Total3D and Implicit3D: boxes and matrices (.mat), meshes.
-
-
+"""Writes the arrays of a MATLAB file, or the error in one line: scipy's reader can die of one."""
 Shape = tuple[NDArray[np.float64], NDArray[np.int64]]
 """All vertices and triangles of a mesh, used or not."""
 
@@ -105,6 +90,18 @@ class TotalBox:
     half: NDArray[np.float64]
     yaw: float
     name: str
+
+
+def load_mat(path: Path) -> At:
+    """The arrays of a MATLAB file, read in a process of its own."""
+    if not path.is_file():
+        raise InputError(f"{path.name}: there is no such file in {path.parent}")
+    call = [sys.executable, "-P", "-c", READ, str(path.resolve())]
+    done = subprocess.run(call, capture_output=True, check=False)
+    said = pickle.loads(done.stdout) if done.returncode == 0 else "its reader died"
+    if isinstance(said, str):
+        raise InputError(f"{path.name}: cannot be read ({said}), expected a .mat file")
+    return At(said, path.name)
 
 
 def matrix(path: Path, key: str, shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -148,16 +145,13 @@ def _box(at: At, name: str) -> TotalBox:
 
 
 def find_mesh(folder: Path, index: int, name: str) -> Path:
-    """The mesh of a box: `<index>_<class id>.obj`, or another kind of mesh with this name.
-
-    Raises:
-        InputError: If there is none.
-    """
+    """The mesh of a box: `<index>_<class id>.obj`, or another kind of mesh with this name."""
     stem = f"{index}_{CLASSES.index(name)}"
-    for kind in (".obj", *KINDS):
-        if (path := folder / (stem + kind)).is_file():
-            return path
-    raise InputError(f"{stem}.obj: there is no such file in {folder}, expected a mesh")
+    found = (path for kind in (".obj", *KINDS) if (path := folder / (stem + kind)).is_file())
+    path = next(found, None)
+    if path is None:
+        raise InputError(f"{stem}.obj: there is no such file in {folder}, expected a mesh")
+    return path
 
 
 def read_shape(path: Path) -> Shape:
@@ -176,13 +170,6 @@ def read_shape(path: Path) -> Shape:
     if not len(verts):
         raise InputError(f"{path.name}: has an empty mesh, expected vertices and triangles")
     return verts, faces
-
-
-ON_FLOOR = 0.3  # [m], such a thing stands on the floor if its box ends so close above it
-TO_OURS = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-"""x forward, y up, z right -> x right, y up, z backward."""
-TO_IMAGE = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])
-"""x forward, y up, z right -> x right, y down, z forward."""
 
 
 def read_total3d(folder: Path) -> Capture:
@@ -227,18 +214,12 @@ def _load_mesh(result: Path, shapes: Mapping[str, Shape], at: At) -> tuple[Mesh,
 
 def _camera(source: Path, attitude: Path) -> At:
     """The fields of camera.json; p_total3d = cam_R @ (camera axes: forward, up, right)."""
-    K = read_intrinsics(source / "cam_K.txt")
+    K = read_intrinsics(source / "cam_K.txt").tolist()
     R = TO_IMAGE @ matrix(attitude, "cam_R", (3, 3)).T @ TO_OURS.T
     width, height = image_size(source / "img.jpg")
-    return At(
-        {
-            "w": width, "h": height,
-            "fl_x": K[0, 0].item(), "fl_y": K[1, 1].item(),
-            "cx": K[0, 2].item(), "cy": K[1, 2].item(),
-            "R_cam_world": R.tolist(),
-        },
-        "cam_K.txt, r_ex.mat",
-    )  # fmt: skip
+    lens = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}
+    fields = {"w": width, "h": height, **lens, "R_cam_world": R.tolist()}
+    return At(fields, "cam_K.txt, r_ex.mat")
 
 
 def _annotations(rows: Sequence[At], kept: Sequence[int]) -> dict[str, Any]:
