@@ -18,7 +18,8 @@ from mover.geometry.rle import decode
 from mover.io.capture.folder import read_capture
 from mover.io.capture.merge import import_into
 from mover.io.capture.parts import Parts
-from mover.io.masks.instance_files import read_instances
+from mover.io.files.fields import At
+from mover.io.masks.instance_files import list_instances, read_instances
 from mover.io.masks.instances import fitted
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -58,12 +59,10 @@ def test_every_layout_gives_the_same_masks(tmp_path: Path, kind: str) -> None:
 
 
 def test_polygons_fill_what_they_surround(tmp_path: Path) -> None:
-    tree = {
-        "images": [{"id": 1, "width": 64, "height": 48}],
-        "categories": [{"id": 1, "name": "bed"}],
-        "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "bbox": [10, 10, 20, 15],
-                         "segmentation": [[10, 10, 30, 10, 30, 25, 10, 25]]}],
-    }  # fmt: skip
+    row = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [10, 10, 20, 15],
+           "segmentation": [[10, 10, 30, 10, 30, 25, 10, 25]]}  # fmt: skip
+    tree = {"images": [{"id": 1, "width": 64, "height": 48}], "annotations": [row],
+            "categories": [{"id": 1, "name": "bed"}]}  # fmt: skip
     (tmp_path / "a.json").write_text(json.dumps(tree))
     found = read_instances(tmp_path / "a.json", {}, None).items[0]
     assert found.mask is not None
@@ -116,7 +115,7 @@ class TestRealFiles:
     def test_real_results_of_coco_have_their_runs(self) -> None:
         path = DATA / "formats" / "coco_instances_val2014_fakesegm100_results.json"
         rows = [row for row in json.loads(path.read_text()) if row["image_id"] == 42]
-        found = read_list(rows, path.name)
+        found = list_instances(At(rows, path.name), {}, None).items
         assert len(found) == len(rows)
         for item, row in zip(found, rows, strict=True):
             height, width = row["segmentation"]["size"]
@@ -145,34 +144,28 @@ class TestRealFiles:
             assert (decode(code, 0).numpy() == mask).all()
 
 
-def read_list(rows: list[dict[str, object]], name: str) -> list[layouts.Any]:
-    from mover.io.files.fields import At
-    from mover.io.masks.instance_files import list_instances
-
-    return list(list_instances(At(rows, name), {}, None).items)
+def of_boxes(room: layouts.Room, things: list[layouts.Thing], path: Path, **more: object) -> Path:
+    """Masks that fill the boxes of things."""
+    w, h = room.size
+    masks = np.zeros((len(things), h, w), dtype=bool)
+    for mask, thing in zip(masks, things, strict=True):
+        x0, y0, x1, y1 = (round(v) for v in room.box2d(thing))
+        mask[y0:y1, x0:x1] = True
+    np.savez(path, masks=masks, **more)  # pyright: ignore[reportArgumentType]
+    return path
 
 
 def test_parts_come_in_any_order_and_stay(plain: layouts.Room, tmp_path: Path) -> None:
     """Masks first and the scene later is the same capture as the other way round."""
-    w, h = plain.size
-    masks = np.zeros((len(plain.things), h, w), dtype=bool)
-    for mask, thing in zip(masks, plain.things, strict=True):
-        x0, y0, x1, y1 = (round(v) for v in plain.box2d(thing))
-        mask[y0:y1, x0:x1] = True
-    np.savez(
-        tmp_path / "masks.npz", masks=masks, labels=np.array([t.category for t in plain.things])
-    )
-    t3d = layouts.write_total3d(tmp_path / "in", plain)
-    layouts.picture(plain.size).save(tmp_path / "photo.png")
-    steps = {
-        "scene": ImportArgs("total3d", t3d, tmp_path / "a"),
-        "masks": ImportArgs("masks", tmp_path / "masks.npz", tmp_path / "a"),
+    words = np.array([thing.category for thing in plain.things])
+    sources = {
+        "total3d": layouts.write_total3d(tmp_path / "in", plain),
+        "masks": of_boxes(plain, plain.things, tmp_path / "masks.npz", labels=words),
     }
     found = []
-    for name, order in (("a", ("scene", "masks")), ("b", ("masks", "scene"))):
+    for name, order in (("a", ("total3d", "masks")), ("b", ("masks", "total3d"))):
         for step in order:
-            args = steps[step]
-            run_import(ImportArgs(args.format, args.source, tmp_path / name), tmp_path)
+            run_import(ImportArgs(step, sources[step], tmp_path / name), tmp_path)
         found.append(read_capture(tmp_path / name))
     for capture in found:
         assert all(d.mask is not None for d in capture.detections)
@@ -186,17 +179,11 @@ def test_parts_come_in_any_order_and_stay(plain: layouts.Room, tmp_path: Path) -
 
 
 def test_a_scene_without_annotations_finds_its_masks(plain: layouts.Room, tmp_path: Path) -> None:
-    w, h = plain.size
-    masks = np.zeros((len(plain.things), h, w), dtype=bool)
-    for mask, thing in zip(masks, plain.things[::-1], strict=True):
-        x0, y0, x1, y1 = (round(v) for v in plain.box2d(thing))
-        mask[y0:y1, x0:x1] = True
-    np.savez(tmp_path / "masks.npz", masks=masks)
     source = layouts.write_glb(tmp_path / "in.glb", plain)
     layouts.picture(plain.size).save(tmp_path / "photo.png")
     args = ImportArgs(
         "glb", source, tmp_path / "out", image=tmp_path / "photo.png",
-        objects_masks=tmp_path / "masks.npz",
+        objects_masks=of_boxes(plain, plain.things[::-1], tmp_path / "masks.npz"),
     )  # fmt: skip
     run_import(args, tmp_path)
     found = read_capture(tmp_path / "out")
@@ -224,47 +211,29 @@ def test_a_new_tilt_keeps_box_centres_in_the_camera(plain: layouts.Room, tmp_pat
     assert second.scene.camera.R_cam_world.tolist() == np.diag([1.0, -1, -1]).tolist()
 
 
-def test_people_keep_their_tracks_and_frames(plain: layouts.Room, tmp_path: Path) -> None:
-    w, h = plain.size
-    stack = np.zeros((3, 2, h, w), dtype=bool)
-    for frame in range(3):
-        stack[frame, 0, 10:50, 10 + frame : 30 + frame] = True
-        stack[frame, 1, 60:90, 40:60] = frame != 1
-    np.savez(tmp_path / "people.npz", masks=stack, object_ids=np.array([4, 9]))
-    source = layouts.write_total3d(tmp_path / "in", plain)
-    args = ImportArgs(
-        "total3d", source, tmp_path / "out", people_masks=tmp_path / "people.npz", fps=5.0
-    )
-    run_import(args, tmp_path)
-    people = read_capture(tmp_path / "out").people
-    assert people is not None
-    rows = list(zip(people.frame.tolist(), people.person.tolist(), strict=True))
-    assert rows == [(0, 4), (0, 9), (1, 4), (2, 4), (2, 9)]
-    for row, (frame, person) in enumerate(rows):
-        truth = stack[frame, [4, 9].index(person)]
-        assert (decode(people.masks, row).numpy() == truth).all()
-
-
-def test_one_person_in_many_frames_is_told_by_a_single_id(
-    plain: layouts.Room, tmp_path: Path
+@pytest.mark.parametrize("tracks", [[4, 9], [4]])
+def test_people_keep_their_tracks_and_frames(
+    plain: layouts.Room, tmp_path: Path, tracks: list[int]
 ) -> None:
     """(n, 1, h, w) alone is n things; with one object id it is one thing in n frames."""
     w, h = plain.size
-    stack = np.zeros((3, 1, h, w), dtype=bool)
+    stack = np.zeros((3, len(tracks), h, w), dtype=bool)
     for frame in range(3):
         stack[frame, 0, 10:50, 10 + frame : 30 + frame] = True
-    np.savez(tmp_path / "people.npz", masks=stack, object_ids=np.array([4]))
-    source = layouts.write_total3d(tmp_path / "in", plain)
-    out = tmp_path / "out"
+        stack[frame, 1:, 60:90, 40:60] = frame != 1
+    np.savez(tmp_path / "people.npz", masks=stack, object_ids=np.array(tracks))
+    source, out = layouts.write_total3d(tmp_path / "in", plain), tmp_path / "out"
     run_import(
         ImportArgs("total3d", source, out, people_masks=tmp_path / "people.npz", fps=5.0), tmp_path
     )
     people = read_capture(out).people
     assert people is not None
     rows = list(zip(people.frame.tolist(), people.person.tolist(), strict=True))
-    assert rows == [(0, 4), (1, 4), (2, 4)]
-    for row in range(3):
-        assert (decode(people.masks, row).numpy() == stack[row, 0]).all()
+    every = [(frame, track) for frame in range(3) for track in tracks]
+    assert rows == [row for row in every if row != (1, 9)]
+    for row, (frame, person) in enumerate(rows):
+        truth = stack[frame, tracks.index(person)]
+        assert (decode(people.masks, row).numpy() == truth).all()
 
 
 def test_masks_alone_make_a_part_and_what_is_missing_is_said(
@@ -272,10 +241,10 @@ def test_masks_alone_make_a_part_and_what_is_missing_is_said(
 ) -> None:
     files = layouts.write_masks(tmp_path / "in", drawn(), WORDS)
     run_import(ImportArgs("masks", files["coco_text"], tmp_path / "out"), tmp_path)
-    told = capsys.readouterr().out
-    assert "wrote objects.json" in told
+    said = capsys.readouterr().out
+    assert "wrote objects.json" in said
     for word in ("camera.json", "scene.json", "bodies.npz", "people.json", "reference.jpg"):
-        assert f"still missing: {word}" in told
+        assert f"still missing: {word}" in said
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["objects.json"]
 
 

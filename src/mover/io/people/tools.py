@@ -69,7 +69,7 @@ class Person:
 class Tool:
     """Where a tool keeps what a body needs; several names of a field are all in use."""
 
-    people: Callable[[Path, Known], list[Person]]
+    people: Callable[[Path, Known], Iterator[Person]]
     """Finds the people in the files."""
     model: str
     pose: Names = ()
@@ -94,7 +94,10 @@ class Tool:
 def read(path: Path, known: Known, tool: str) -> Found:
     """Bodies that a tool found, as its row of the table says."""
     row = TOOLS[tool]
-    return joined([_rows(row, person, known) for person in row.people(path, known)])
+    found = [_rows(row, person, known) for person in row.people(path, known)]
+    if not found:
+        raise InputError(f"{path.name}: has no people, expected at least one")
+    return joined(found)
 
 
 def _rows(tool: Tool, person: Person, known: Known) -> Found:
@@ -189,7 +192,7 @@ def _in_folder(path: Path, *names: str) -> At:
     return v.read_any(next(inside, path / names[0]) if path.is_dir() else path)
 
 
-def gvhmr(path: Path, _: Known) -> list[Person]:
+def gvhmr(path: Path, _: Known) -> Iterator[Person]:
     """hmr4d_results.pt of GVHMR, smpl_params.pt of GEM: one person in all frames."""
     at = _in_folder(path, "hmr4d_results.pt", "smpl_params.pt")
     body = need(at, "smpl_params_incam", "body_params_incam")
@@ -198,51 +201,47 @@ def gvhmr(path: Path, _: Known) -> list[Person]:
     if world is not None:
         root = v.angles(need(body, "global_orient"), None, 1)
         warnings = tilting(root, v.angles(need(world, "global_orient"), len(root), 1))
-    return [Person(body, K=either(at, "K_fullimg"), warnings=warnings)]
+    yield Person(body, K=either(at, "K_fullimg"), warnings=warnings)
 
 
-def wham(path: Path, known: Known) -> list[Person]:
+def wham(path: Path, known: Known) -> Iterator[Person]:
     """wham_output.pkl: people by their tracks."""
-    found: list[Person] = []
     for track, at in v.people_of(_in_folder(path, "wham_output.pkl")):
         world, warnings = either(at, "pose_world"), ()
         if world is not None:
             root = v.angles(need(at, "pose"), None, 24)[:, :3]
             warnings = tilting(root, v.angles(world, len(root), 24)[:, :3])
-        K = assumed_lens(known, math.hypot)
-        found.append(Person(at, track, K=K, warnings=warnings))
-    return found
+        yield Person(at, track, K=assumed_lens(known, math.hypot), warnings=warnings)
 
 
-def prompthmr(path: Path, _: Known) -> list[Person]:
+def prompthmr(path: Path, _: Known) -> Iterator[Person]:
     """results.pkl: `people`, and the cameras beside them."""
     source = _in_folder(path, "results.pkl")
     camera, world = either(source, "camera", "camera_world"), either(source, "camera_world")
-    K = None if camera is None else _image_lens(camera)
-    warnings: tuple[str, ...] = ()
+    K, warnings = None if camera is None else _image_lens(camera), ()
     if world is not None:
         R = v.stacked(need(world, "Rcw"), 3, 3)
         warnings = movement(R, v.rows(need(world, "Tcw"), len(R), 3))
-    found: list[Person] = []
     for track, one in v.people_of(need(source, "people")):
         body = need(one, "smplx_cam")
         fields = {**mapping(body), "frames": need(one, "frames").value}
-        found.append(Person(At(fields, body.file, body.field), track, K=K, warnings=warnings))
-    return found
+        yield Person(At(fields, body.file, body.field), track, K=K, warnings=warnings)
 
 
-def tram(path: Path, _: Known) -> list[Person]:
+def tram(path: Path, _: Known) -> Iterator[Person]:
     """A folder with camera.npy and hps/hps_track_<k>.npy."""
     tracks = v.files_of(path, "hps/hps_track_*.npy", "TRAM's results")
     file = (path if path.is_dir() else path.parent.parent) / "camera.npy"
-    source, warnings = v.read_any(file) if file.is_file() else None, ()
-    K = None if source is None else _image_lens(source)
-    turn = None if source is None else either(source, "world_cam_R")
-    if source is not None and turn is not None:  # x_world = R x_cam + t
-        R = np.swapaxes(v.stacked(turn, 3, 3), 1, 2)
-        t = v.rows(need(source, "world_cam_T"), len(R), 3)
-        warnings = movement(R, -np.einsum("tij,tj->ti", R, t))
-    return [Person(v.read_any(one), k, K=K, warnings=warnings) for k, one in enumerate(tracks)]
+    lens_of_all, warnings = None, ()
+    if file.is_file():
+        source = v.read_any(file)
+        lens_of_all, turn = _image_lens(source), either(source, "world_cam_R")
+        if turn is not None:  # x_world = R x_cam + t
+            R = np.swapaxes(v.stacked(turn, 3, 3), 1, 2)
+            t = v.rows(need(source, "world_cam_T"), len(R), 3)
+            warnings = movement(R, -np.einsum("tij,tj->ti", R, t))
+    for k, one in enumerate(tracks):
+        yield Person(v.read_any(one), k, K=lens_of_all, warnings=warnings)
 
 
 def _image_lens(at: At) -> At:
@@ -251,39 +250,33 @@ def _image_lens(at: At) -> At:
     return lens(focal, focal, *v.stacked(need(at, "img_center"), 2)[0].tolist())
 
 
-def pare(path: Path, known: Known) -> list[Person]:
-    """pare_output.pkl or vibe_output.pkl of a video, or one pickle an image.
+def pare(path: Path, known: Known) -> Iterator[Person]:
+    """pare_output.pkl or vibe_output.pkl of a video, or one pickle an image with a row a person.
 
     Raises:
         InputError: If the lens is not known, for these networks have none.
     """
-    camera = known.camera
-    if camera is None:
+    if known.camera is None:
         raise InputError(f"{path.name}: PARE knows no lens: --camera names a camera.json")
-
-    def placed(at: At, track: Any, more: Mapping[str, Any]) -> Person:  # noqa: ANN401
-        crop = torch.from_numpy(v.rows(need(at, "orig_cam"), None, 4).copy())
-        fields = {**mapping(at), **more, "transl": from_weak(crop, camera).numpy()}
-        return Person(At(fields, at.file, at.field), track)
-
-    videos = [path / n for n in ("pare_output.pkl", "vibe_output.pkl") if (path / n).is_file()]
-    if not path.is_dir() or videos:
-        at = v.read_any([*videos, path][0])
+    names = ("pare_output.pkl", "vibe_output.pkl")
+    videos = [path / name for name in names if (path / name).is_file()]
+    files = videos[:1] or v.files_of(path, "*.pkl", "PARE's results")
+    for k, file in enumerate(files):
+        at, people = v.read_any(file), list[tuple[Any, At]]()
         if either(at, "orig_cam") is None:
-            return [placed(one, track, {}) for track, one in v.people_of(at)]
-        files, frames = [path], [0]
-    else:
-        files = v.files_of(path, "*.pkl", "PARE's results")
-        frames = [v.number_in(file.stem, k) - known.first for k, file in enumerate(files)]
-    found: list[Person] = []
-    for file, frame in zip(files, frames, strict=True):
-        at = v.read_any(file)
-        count = len(v.rows(need(at, "orig_cam"), None, 4))
-        found.append(placed(at, torch.arange(count), {"frame_ids": np.full(count, frame)}))
-    return found
+            people += v.people_of(at)
+        else:
+            count = len(v.rows(need(at, "orig_cam"), None, 4))
+            frame = v.number_in(file.stem, k) - known.first if path.is_dir() else 0
+            fields = {**mapping(at), "frame_ids": np.full(count, frame)}
+            people.append((torch.arange(count), At(fields, at.file)))
+        for track, one in people:
+            crop = torch.from_numpy(v.rows(need(one, "orig_cam"), None, 4).copy())
+            fields = {**mapping(one), "transl": from_weak(crop, known.camera).numpy()}
+            yield Person(At(fields, one.file, one.field), track)
 
 
-def phalp(path: Path, known: Known) -> list[Person]:
+def phalp(path: Path, known: Known) -> Iterator[Person]:
     """results/demo_<video>.pkl of 4D-Humans: frames by name, whose lists go person by person.
 
     People who are only predicted in a frame, not detected, are left out. Bodies were seen in crops
@@ -291,40 +284,28 @@ def phalp(path: Path, known: Known) -> list[Person]:
     """
     source = v.read_any(v.only_file(path, "**/*.pkl", "the results of PHALP"))
     frames = mapping(source)
-    found: list[Person] = []
     for index, name in enumerate(sorted(frames, key=lambda key: v.natural(Path(str(key))))):
-        found += _in_frame(At(frames[name], source.file, str(name)), index, known)
-    if not found:
-        raise InputError(f"{source.file}: has no people in {len(frames)} frames")
-    return found
-
-
-def _in_frame(at: At, index: int, known: Known) -> Iterator[Person]:
-    camera = need(at, "camera")
-    listed = list(camera.value) if isinstance(camera.value, np.ndarray) else camera.value
-    bodies, cameras = items(need(at, "smpl")), items(At(listed, camera.file, camera.field))
-    tracks, ages, sizes = (either(at, name) for name in ("tid", "tracked_time", "size"))
-    tracks = v.whole(need(at, "tid") if tracks is None else tracks)
-    if not len(bodies) == len(cameras) == len(tracks):
-        n = f"{len(tracks)} tracks, {len(bodies)} bodies and {len(cameras)} cameras"
-        raise InputError(f"{at.place} has {n}, expected as many of each")
-    age = np.zeros(len(tracks)) if ages is None else v.numbers(ages).reshape(-1)
-    time = either(at, "time")
-    frame = index if time is None or v.one_number(time) < 0 else int(v.one_number(time))
-    for k in range(len(tracks)):
-        if len(age) == len(tracks) and age[k] != 0:
-            continue
-        size = None
-        if sizes is not None:
-            pairs = v.stacked(sizes, 2)  # height, width
-            size = pairs[min(k, len(pairs) - 1), 1], pairs[min(k, len(pairs) - 1), 0]
+        at = At(frames[name], source.file, str(name))
+        camera = need(at, "camera")
+        listed = list(camera.value) if isinstance(camera.value, np.ndarray) else camera.value
+        bodies, cameras = items(need(at, "smpl")), items(At(listed, camera.file, camera.field))
+        tracks = v.whole(need(at, "tid"))
+        ages, sizes = either(at, "tracked_time"), either(at, "size")
+        if not len(bodies) == len(cameras) == len(tracks):
+            n = f"{len(tracks)} tracks, {len(bodies)} bodies and {len(cameras)} cameras"
+            raise InputError(f"{at.place} has {n}, expected as many of each")
+        age = np.zeros(len(tracks)) if ages is None else v.numbers(ages).reshape(-1)
+        size = None if sizes is None or not len(tracks) else v.stacked(sizes, 2)[0, ::-1].tolist()
         K = assumed_lens(known, lambda *sides: FOCAL / CROP * max(sides), size)
-        fields = {**mapping(bodies[k]), "camera": cameras[k].value}
-        person = At(fields, bodies[k].file, bodies[k].field)
-        yield Person(person, int(tracks[k]), frame, K=K)
+        time = either(at, "time")
+        frame = index if time is None or v.one_number(time) < 0 else int(v.one_number(time))
+        for k in range(len(tracks)):
+            if len(age) != len(tracks) or age[k] == 0:
+                body = At({**mapping(bodies[k]), "camera": cameras[k].value}, at.file, at.field)
+                yield Person(body, int(tracks[k]), frame, K=K)
 
 
-def slahmr(path: Path, _: Known) -> list[Person]:
+def slahmr(path: Path, _: Known) -> Iterator[Person]:
     """The last *_world_results.npz of a folder: arrays of (people, frames, numbers).
 
     track_info.json beside it gives the tracks and the frames in which a person is visible.
@@ -344,66 +325,58 @@ def slahmr(path: Path, _: Known) -> list[Person]:
     intrins = either(source, "intrins")
     K = None if intrins is None else lens(*v.stacked(intrins, 4)[0].tolist())
     whole = [(who, who, np.arange(count)) for who in range(people)]
-    found: list[Person] = []
-    for track, who, frames in _visible(path, count, people) or whole:
+    for track, who, frames in [*_visible(path, count, people)] or whole:
         of_one = {name: values[who][frames] for name, values in fields.items()}
         at = At({**of_one, "betas": betas[who], "frames": frames}, source.file)
         R, t = v.stacked(get(at, "cam_R"), 3, 3), v.stacked(get(at, "cam_t"), 3)
-        found.append(Person(at, track, K=K, warnings=movement(R, t)))
-    return found
+        yield Person(at, track, K=K, warnings=movement(R, t))
 
 
-def _visible(path: Path, count: int, people: int) -> list[tuple[int, int, NDArray[np.int64]]]:
-    """Track, index and visible frames of each person; empty without a file of tracks."""
+def _visible(path: Path, count: int, people: int) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
+    """Track, index and visible frames of each person; none without a file of tracks."""
     files = (folder / "track_info.json" for folder in (path.parent, path.parent.parent))
     file = next((file for file in files if file.is_file()), None)
-    found: list[tuple[int, int, NDArray[np.int64]]] = []
     for track, one in [] if file is None else v.people_of(need(v.read_any(file), "tracks")):
         index = int(v.one_number(need(one, "index")))
         mask = v.numbers(need(one, "vis_mask")).reshape(-1) > 0
         if 0 <= index < people and len(mask) == count and mask.any():
-            found.append((track, index, np.flatnonzero(mask)))
-    return found
+            yield track, index, np.flatnonzero(mask)
 
 
-def prox(path: Path, known: Known) -> list[Person]:
+def prox(path: Path, known: Known) -> Iterator[Person]:
     """results/<frame>/<person>.pkl or <frame>.pkl of SMPLify-X and PROX, or one such file."""
     files = v.files_of(path, "**/*.pkl", "fits")
-    if not path.is_dir():
-        return [Person(v.read_any(files[0]))]
     names: list[tuple[str, int]] = []
     for file in files:
         inside = re.fullmatch(r"\d{1,3}", file.stem) and re.search(r"\d", file.parent.name)
         names.append((file.parent.name, int(file.stem)) if inside else (file.stem, 0))
     frames = known.frames
-    if frames is None:
+    if not path.is_dir():
+        names, frames = [(path.name, 0)], {path.name: 0}
+    elif frames is None:
         numbered = v.frame_numbers((name for name, _ in names), path.name)
         frames = {name: number - known.first for name, number in numbered.items()}
-    found: list[Person] = []
     for file, (name, track) in zip(files, names, strict=True):
         if name not in frames:
             raise InputError(f"{file}: {name!r} is no frame of the recording")
-        found.append(Person(v.read_any(file), track, frames[name]))
-    return found
+        yield Person(v.read_any(file), track, frames[name])
 
 
-def smplifyx(path: Path, known: Known) -> list[Person]:
+def smplifyx(path: Path, known: Known) -> Iterator[Person]:
     """As PROX, under a lens of its own."""
     K = assumed_lens(known, lambda *_: FOCAL)
-    return [dataclasses.replace(person, K=K) for person in prox(path, known)]
+    return (dataclasses.replace(person, K=K) for person in prox(path, known))
 
 
-def amass(path: Path, _: Known) -> list[Person]:
+def amass(path: Path, _: Known) -> Iterator[Person]:
     """Motions of AMASS: one npz a person."""
-    found: list[Person] = []
     for track, file in enumerate(v.files_of(path, "*.npz", "motions of AMASS")):
         at = read_npz(file, without_objects=True)
         width = v.rows(need(at, "poses"), len(v.stacked(need(at, "trans"), 3))).shape[1]
         if width not in AMASS:
             refuse(need(at, "poses"), f"rows of {' or '.join(map(str, AMASS))} angles")
         at = At({**mapping(at), "turn": Y_UP, "shift": np.zeros(3)}, at.file, at.field)
-        found.append(Person(at, track, model=AMASS[width]))
-    return found
+        yield Person(at, track, model=AMASS[width])
 
 
 # SAM 3D Body lists people by image: they are followed from image to image by their positions.
