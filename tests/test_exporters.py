@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import shutil
 import struct
 from pathlib import Path
 from typing import Any
@@ -27,14 +26,12 @@ import mover.io.export.usd
 from mover.app.cli import run_command
 from mover.bodies.skinning import open_body
 from mover.core.errors import InputError
-from mover.core.run import Run
 from mover.core.types import Bodies, BodyPose, Scene, SceneObject, Segment
 from mover.geometry.placement import place_object, placed_at
 from mover.io.export.amass import export_amass
 from mover.io.export.finished import Finished, keyframes, read_finished
 from mover.io.export.glb import export_glb
 from mover.io.export.scene_glb import export_ply, placement_of
-from mover.io.export.solids import solids_of
 from mover.io.export.usd import export_usd
 from mover.io.formats import chosen
 
@@ -305,53 +302,6 @@ def test_keys_stop_where_there_are_enough():
 def along_the_axes(monkeypatch: pytest.MonkeyPatch) -> None:
     """CoACD takes seconds for parts that no test looks at."""
     monkeypatch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
-
-
-@pytest.fixture(scope="module")
-def cut(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The convex pieces of the room, cut once."""
-    folder = tmp_path_factory.mktemp("cut")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mover.io.export.solids, "find_spec", lambda _: None)
-        solids_of(scaled(furnished()), Run(folder))
-    return folder / "stages"
-
-
-class TestUsd:
-    @pytest.fixture
-    def stage(self, tmp_path: Path, cut: Path):
-        Usd = pytest.importorskip("pxr.Usd", reason="needs usd-core")
-        shutil.copytree(cut, tmp_path / "out" / "stages")
-        self.home = finished(tmp_path, two_people())
-        return Usd.Stage.Open(str(export_usd(self.home, tmp_path).files[0]))
-
-    def test_objects_stand_where_they_stood_to_a_hundredth_of_a_millimetre(self, stage):
-        from pxr import UsdGeom
-
-        assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
-        assert UsdGeom.GetStageUpAxis(stage) == "Y"
-        for piece in self.home.scene.objects:
-            mesh = stage.GetPrimAtPath(f"/room/{piece.id}/visual/mesh")
-            points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get(), float)
-            matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh))
-            found = np.concatenate([points, np.ones((len(points), 1))], 1) @ matrix
-            assert np.stack([found.min(0), found.max(0)])[:, :3] == pytest.approx(
-                world(piece), abs=1e-5
-            )
-            node = stage.GetPrimAtPath(f"/room/{piece.id}")
-            assert node.GetCustomDataByKey("mover:category") == piece.category
-
-    def test_the_camera_sees_the_same_pixels(self, stage):
-        from pxr import UsdGeom
-
-        camera = self.home.scene.camera
-        frustum = UsdGeom.Camera(stage.GetPrimAtPath("/room/camera")).GetCamera(0).frustum
-        point = np.array([0.4, -0.8, -3.5])
-        matrix = np.array(frustum.ComputeViewMatrix()) @ np.array(frustum.ComputeProjectionMatrix())
-        x, y, _, w = np.append(point, 1.0) @ matrix
-        seen = (camera.K @ camera.R_cam_world @ torch.tensor(point).float()).numpy()
-        u, v = camera.width * (1 + x / w) / 2, camera.height * (1 - y / w) / 2
-        assert [u, v] == pytest.approx(seen[:2] / seen[2], abs=0.01)
 
 
 def test_usd_keeps_textures_and_names_that_it_does_not_allow(tmp_path: Path):

@@ -128,7 +128,9 @@ def test_pieces_and_looks_fill_the_same_place_and_the_floor_is_below(out: Path, 
         truth = place_object(piece).verts.double().numpy()
         if up == "z":
             truth = np.stack([truth[:, 0], -truth[:, 2], truth[:, 1] - GROUND], -1)
-        for part, off in (("visual", 1e-4), ("collision", 2e-3)):
+        node = stage.GetPrimAtPath(f"/room/{piece.id}")
+        assert node.GetCustomDataByKey("mover:category") == piece.category
+        for part, off in (("visual", 1e-5), ("collision", 2e-3)):
             found = points_of(stage, f"/room/{piece.id}/{part}")
             assert found.min(0) == pytest.approx(truth.min(0), abs=off)
             assert found.max(0) == pytest.approx(truth.max(0), abs=off)
@@ -190,6 +192,20 @@ def test_people_are_where_they_were_in_every_frame(out: Path, up: str):
     assert mesh.ComputeVisibility(float(bodies.frame.min())) == "invisible"
     assert stage.GetTimeCodesPerSecond() == bodies.fps
     assert stage.GetEndTimeCode() == float(bodies.frame.max())
+
+
+def test_the_camera_sees_the_same_pixels(out: Path):
+    from pxr import UsdGeom
+
+    stage, home = stage_of(out)
+    camera = home.scene.camera
+    frustum = UsdGeom.Camera(stage.GetPrimAtPath("/room/camera")).GetCamera(0).frustum
+    point = np.array([0.4, -0.8, -3.5])
+    matrix = np.array(frustum.ComputeViewMatrix()) @ np.array(frustum.ComputeProjectionMatrix())
+    x, y, _, w = np.append(point, 1.0) @ matrix
+    seen = (camera.K @ camera.R_cam_world @ torch.tensor(point).float()).numpy()
+    u, v = camera.width * (1 + x / w) / 2, camera.height * (1 - y / w) / 2
+    assert [u, v] == pytest.approx(seen[:2] / seen[2], abs=0.01)
 
 
 def test_ids_that_the_file_keeps_for_itself_stay_apart(out: Path):

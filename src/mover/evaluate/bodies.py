@@ -3,8 +3,6 @@
 Both are measured in the gravity-aligned worlds of their scenes, without alignment.
 """
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -110,9 +108,11 @@ def gather_twins(bodies: Bodies, truth: Bodies) -> Twins | None:
         return None
     same = bodies.verts.shape[1] == truth.verts.shape[1]
     verts = (bodies.verts[rows], truth.verts[true_rows]) if same else (None, None)
-    ours, theirs = _common_joints(bodies.joint_names, truth.joint_names)
-    if not ours or bodies.joints is None or truth.joints is None:
+    common = [name for name in bodies.joint_names if name in truth.joint_names]
+    common = [name for name in common if name in BODY] or common  # of the body, where there are any
+    if not common or bodies.joints is None or truth.joints is None:
         return Twins(*verts, None, None)
+    ours, theirs = ([b.joint_names.index(n) for n in common] for b in (bodies, truth))
     return Twins(*verts, bodies.joints[rows][:, ours], truth.joints[true_rows][:, theirs])
 
 
@@ -140,13 +140,6 @@ def shared_rows(bodies: Bodies, truth: Bodies) -> tuple[Int[Tensor, " rows"], In
 
 def _keys(bodies: Bodies) -> list[tuple[int, int]]:
     return list(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True))
-
-
-def _common_joints(names: Sequence[str], true_names: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Places of the joints that both have: of the 22 of the body, where they have any of those."""
-    common = [name for name in names if name in true_names]
-    body = [name for name in common if name in BODY] or common
-    return [names.index(name) for name in body], [true_names.index(name) for name in body]
 
 
 AT_ONCE = 16  # bodies that are aligned together: what fits a processor's cache

@@ -78,16 +78,16 @@ TOUCH_METRICS: dict[str, Metric[Touch]] = {
 }
 
 
-def close_meshes(pieces: Iterable[SceneObject]) -> dict[str, Mesh]:
+def close_meshes(objects: Iterable[SceneObject]) -> dict[str, Mesh]:
     """The closed proxies of all meshes by the fingerprint of the mesh; equal ones only once."""
-    meshes = {fingerprint(piece.mesh): piece.mesh for piece in pieces}
+    meshes = {fingerprint(item.mesh): item.mesh for item in objects}
     return {key: close_mesh(mesh) for key, mesh in meshes.items()}
 
 
-def furniture_of(pieces: Iterable[SceneObject], closed: Mapping[str, Mesh]) -> list[StandingMesh]:
+def furniture_of(objects: Iterable[SceneObject], closed: Mapping[str, Mesh]) -> list[StandingMesh]:
     """The closed proxies of the objects at their positions in the world, and when."""
-    solid = (replace(piece, mesh=closed[fingerprint(piece.mesh)]) for piece in pieces)
-    return [there for piece in solid for there in standing_meshes(piece)]
+    solid = (replace(item, mesh=closed[fingerprint(item.mesh)]) for item in objects)
+    return [there for item in solid for there in standing_meshes(item)]
 
 
 def gather_truth(

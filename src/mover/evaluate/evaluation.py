@@ -287,7 +287,7 @@ def _populate(scenes: tuple[Scene, Scene, Scene], people: EvaluatedBodies) -> li
         b if b and len(b.frame) else None for b in (people.initial, people.result, people.truth)
     ]
     pairs = list(zip(scenes, rows, strict=True))
-    closed = close_meshes(piece for scene, b in pairs if b is not None for piece in scene.objects)
+    closed = close_meshes(item for scene, b in pairs if b is not None for item in scene.objects)
     return [_populated(scene, b, closed) for scene, b in pairs]
 
 

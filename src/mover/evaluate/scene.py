@@ -25,7 +25,7 @@ from mover.geometry.rotations import wrap
 
 T = TypeVar("T")
 THINNEST = 1e-3  # [m], flat objects (rugs, pictures) count as this thick in the 3D IoU
-SIDES = ("initial", "result")
+SIDES: tuple[str, ...] = ("initial", "result")
 PLASTIC = 1.32471795724474602596  # x³ = x + 1: its powers spread points evenly over a square
 NEARER = 1e-3  # [1/m], boxes that do not overlap are paired by distance: this breaks the tie
 
@@ -74,7 +74,11 @@ def iou2d(pair: Pair) -> float | None:
 
     Where the truth is a box without a mesh (`Pair.boxes`) the two 3D boxes are drawn instead.
     """
-    shape = _box_mesh if pair.boxes else place_object
+
+    def box_mesh(item: SceneObject) -> Mesh:  # only the edges of its triangles are used
+        return Mesh(corners(box_of(item)), torch.combinations(torch.arange(8), 3))
+
+    shape = box_mesh if pair.boxes else place_object
     truth = image_box(pair.truth, pair.truth_camera, shape)
     estimate = image_box(pair.estimate, pair.estimate_camera, shape)
     if truth is None:
@@ -161,11 +165,11 @@ def match(
     Returns:
         The estimated object by id of the true one; a true object that is missing is not in it.
     """
-    by_id = {piece.id: piece for piece in estimate.objects}
+    by_id = {item.id: item for item in estimate.objects}
     found = {p.id: by_id[known[p.id]] for p in truth.objects if known.get(p.id) in by_id}
     if not by_place:
         return found
-    taken = {piece.id for piece in found.values()}
+    taken = {item.id for item in found.values()}
     rest = [p for p in truth.objects if p.id not in found]
     free = [p for p in estimate.objects if p.id not in taken]
     for category in sorted({canonical(p.category) for p in rest}):
@@ -175,19 +179,14 @@ def match(
     return found
 
 
-def _box_mesh(piece: SceneObject) -> Mesh:
-    """The box of an object, with triangles between all corners: only their edges are used."""
-    return Mesh(corners(box_of(piece)), torch.combinations(torch.arange(8), 3))
-
-
 def image_box(
-    piece: SceneObject, camera: Camera, shape: Callable[[SceneObject], Mesh] = place_object
+    item: SceneObject, camera: Camera, shape: Callable[[SceneObject], Mesh] = place_object
 ) -> Float[Tensor, "4"] | None:
     """Box around the drawn mesh, cut at the image border, as shares of its width and height.
 
     None: nothing of the mesh is on the image.
     """
-    mesh = shape(piece)
+    mesh = shape(item)
     visible = _in_front(to_camera(mesh.verts, camera.R_cam_world), mesh.faces)
     if len(visible) == 0:
         return None
@@ -232,9 +231,9 @@ def pairs(
     initial: Scene, result: Scene, truth: Scene, by_place: bool = True
 ) -> tuple[dict[str, SceneObject], dict[str, SceneObject]]:
     """Initial objects and those of the result by true id; settled on the initial scene."""
-    same = {piece.id: piece.id for piece in truth.objects}
+    same = {item.id: item.id for item in truth.objects}
     before = match(initial, truth, same, by_place)
-    known = same | {name: piece.id for name, piece in before.items()}
+    known = same | {name: item.id for name, item in before.items()}
     return before, match(result, truth, known, by_place)
 
 
@@ -247,10 +246,10 @@ def unmatched(
         `missed`, which count as IoU 0 in the means, and `false`, which are in no mean.
     """
     found = pairs(initial, result, truth, by_place)[1]
-    partners = {piece.id for piece in found.values()}
+    partners = {item.id for item in found.values()}
     return {
-        "missed": [piece.id for piece in truth.objects if piece.id not in found],
-        "false": [piece.id for piece in result.objects if piece.id not in partners],
+        "missed": [item.id for item in truth.objects if item.id not in found],
+        "false": [item.id for item in result.objects if item.id not in partners],
     }
 
 

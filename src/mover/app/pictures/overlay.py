@@ -15,7 +15,6 @@ from mover.core.records import map_tensors
 from mover.core.types import Capture, Mesh, Scene
 
 WIDEST = 1280  # [px], of a picture in the report
-Box = tuple[float, float, float, float]
 
 
 def draw_overlay(
@@ -78,24 +77,21 @@ def _named(
     pen = ImageDraw.Draw(page)
     size = max(10.0, picture.shape[1] / 80)
     font = ImageFont.load_default(size)
-    taken: list[Box] = []
+    taken: list[tuple[float, float, float, float]] = []
     for index, item in enumerate(scene.objects):
         visible = (owner == index).nonzero()
         if len(visible) < size * size:
             continue
         y, x = visible.double().mean(0).tolist()
-        half = (pen.textlength(item.id, font) / 2 + 0.55 * size, 0.75 * size)
-        while any(_overlap((x, y), half, other) for other in taken):
+        wide, high = pen.textlength(item.id, font) / 2 + 0.55 * size, 0.75 * size
+        box = (x - wide, y - high, x + wide, y + high)
+        while any(
+            box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken
+        ):
             y += 0.5 * size
-        box = (x - half[0], y - half[1], x + half[0], y + half[1])
+            box = (x - wide, y - high, x + wide, y + high)
         taken.append(box)
         red, green, blue = (0.72 * c for c in colour(index))
         pen.rounded_rectangle(box, size * 0.45, fill=css((red, green, blue)))
         pen.text((x, y), item.id, fill="white", font=font, anchor="mm")
     return torch.from_numpy(np.asarray(page).copy()).float() / 255
-
-
-def _overlap(middle: tuple[float, float], half: tuple[float, float], box: Box) -> bool:
-    """Whether a label around a point covers a part of another one [px]."""
-    (x, y), (w, h) = middle, half
-    return x - w < box[2] and box[0] < x + w and y - h < box[3] and box[1] < y + h

@@ -151,12 +151,15 @@ def _tiles(content: ReportContent) -> list[tuple[str, str, str]]:
 
 def _plans(content: ReportContent) -> list[tuple[str, str]]:
     """The room from above, before and after."""
-    scenes = [content.initial, content.result, content.truth]
-    extent = extent_of(*scenes, content.initial_bodies, content.bodies)
-    people = (content.initial_bodies, content.bodies)
+    sides = (
+        ("Before", content.initial, content.initial_bodies),
+        ("After", content.result, content.bodies),
+    )
+    things = [thing for _, *both in sides for thing in both]
+    extent = extent_of(*things, content.truth)
     return [
         (name, draw_top(scene, content.truth, bodies, extent=extent))
-        for name, scene, bodies in zip(("Before", "After"), scenes, people, strict=False)
+        for name, scene, bodies in sides
     ]
 
 

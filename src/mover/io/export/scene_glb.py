@@ -52,7 +52,12 @@ def write_glb(
             _add(out, f"{above}_mesh", part, parent_node_name=above, transform=transform)
     if scene.ground is not None:
         _add(out, "ground", _solid(floor_of(scene, scene.ground), (*FLOOR_COLOUR, 1.0), "ground"))
-    for row in [] if bodies is None else _chosen(bodies):
+    chosen: list[int] = []
+    if bodies is not None:  # evenly over the frames
+        order = torch.argsort(bodies.frame, stable=True)
+        steps = torch.linspace(0, len(order) - 1, min(GHOSTS, len(order))).round().long()
+        chosen = order[steps].unique().tolist()
+    for row in chosen:
         assert bodies is not None
         person, name = int(bodies.person[row]), f"body_{bodies.person[row]}_{bodies.frame[row]}"
         mesh = Mesh(bodies.verts[row], bodies.faces)
@@ -169,13 +174,6 @@ def floor_of(scene: Scene, height: float) -> Mesh:
     x1, z1 = (flat.amax(0) + FLOOR_MARGIN).tolist()
     corners = [[x0, height, z1], [x1, height, z1], [x1, height, z0], [x0, height, z0]]
     return Mesh(torch.tensor(corners), torch.tensor([[0, 1, 2], [0, 2, 3]]))
-
-
-def _chosen(bodies: Bodies) -> list[int]:
-    """Rows of at most `GHOSTS` bodies, evenly over the frames."""
-    order = torch.argsort(bodies.frame, stable=True)
-    count = min(GHOSTS, len(order))
-    return order[torch.linspace(0, len(order) - 1, count).round().long()].unique().tolist()
 
 
 def _add_camera(out: Any, camera: Camera) -> None:  # noqa: ANN401

@@ -72,8 +72,8 @@ def sliced(
         if halves is None:
             done.append(worst)
             continue
-        pieces = [part for half in halves for part in half.decompose()]
-        parts += [(_excess(part), part) for part in pieces if part.volume() > SMALLEST * total]
+        smaller = [part for half in halves for part in half.decompose()]
+        parts += [(_excess(part), part) for part in smaller if part.volume() > SMALLEST * total]
     done += [part for _, part in parts]
     clouds = [np.array(part.to_mesh64().vert_properties[:, :3]) for part in done]
     return clouds, sum(_excess(part) for part in done) / total
