@@ -94,8 +94,6 @@ class Scene:
     ground: float | None
     """Height of the floor in the world [m], negative below the camera; None: unknown."""
     objects: tuple[SceneObject, ...]
-    layout: Float[Tensor, "4 2"] | None = None
-    """Corners (x, z) of a rectangular room in order around it, as a tool guessed it [m]."""
     size_spread: float = 0.0
     """How far off all places and sizes may be together, the standard deviation of a logarithm."""
 

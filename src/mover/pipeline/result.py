@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from mover.bodies.parts import parts_of
 from mover.core.errors import InputError
@@ -35,19 +33,12 @@ def to_world(bodies: Bodies, camera: Camera) -> Bodies:
     return replace(turned, space="world")
 
 
-def layout_over(given: Scene, ground: float | None) -> Float[Tensor, "4 2"] | None:
-    """The corners that were given; their distances are as much larger as the floor is lower."""
-    if given.layout is None or not given.ground or ground is None:
-        return given.layout
-    return given.layout * (ground / given.ground)
-
-
 def unfurnished(capture: Capture, people: Located | None) -> Room:
     """A room without objects still has a camera, a floor and people."""
     found = None if people is None else people.alignment
     camera = capture.scene.camera if found is None else found.camera
     ground = capture.scene.ground if found is None else found.ground
-    scene = Scene(camera, ground, (), layout_over(capture.scene, ground))
+    scene = Scene(camera, ground, ())
     warnings = (*capture.warnings, *(() if people is None else people.warnings))
     return Room(
         scene=scene, initial=capture.scene, image_only=scene,
@@ -76,9 +67,8 @@ def furnished(
                 prepared.objects, placed.layout, humans.contacts.points,
                 humans.contacts.seated_on, people.path,
             ))  # fmt: skip
-    corners = layout_over(capture.scene, placed.ground)
     return Room(
-        scene=Scene(camera, placed.ground, objects, corners),
+        scene=Scene(camera, placed.ground, objects),
         initial=capture.scene,
         image_only=Scene(camera, placed.ground, by_image),
         bodies=bodies,

@@ -1,17 +1,16 @@
 """scene.json: the initial scene, the result and the truth."""
 
-import dataclasses
 import json
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import torch
-from jaxtyping import Float
 from msgspec import Meta, Struct
 from torch import Tensor
 
@@ -31,7 +30,7 @@ from mover.io.files.fields import (
     write_json,
 )
 from mover.io.files.meshes import copy_mesh, read_mesh, stretch_file, write_mesh
-from mover.io.files.schema import Id, Index, Number, Sizes, Text, Vector, checked
+from mover.io.files.schema import Id, Index, Number, Share, Sizes, Text, Vector, checked
 
 log = logging.getLogger(__name__)
 
@@ -52,11 +51,7 @@ def read_scene(path: Path, camera: Camera | None = None, warn: Warn = log.warnin
         camera: Used where the file has none.
         warn: Takes what is odd but not wrong.
     """
-
-    def load(at: At) -> tuple[Mesh, str]:
-        return read_mesh(at, path.parent)
-
-    return scene_of(read_json(path), load, camera, warn)[0]
+    return scene_of(read_json(path), partial(read_mesh, folder=path.parent), camera, warn)[0]
 
 
 class PlaceFields(Struct, frozen=True):
@@ -67,6 +62,11 @@ class PlaceFields(Struct, frozen=True):
     yaw: Number
     scale: Sizes
     energy: Number | None = None
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Translation, yaw and scale, by their names in `SceneObject`."""
+        found = {"t_world_object": self.translation, "yaw": self.yaw, "scale": self.scale}
+        return {name: torch.tensor(value) for name, value in found.items()}
 
 
 class SegmentFields(Struct, frozen=True):
@@ -94,10 +94,6 @@ class Ground(Struct, frozen=True):
     height: Annotated[float, Meta(ge=-LOWEST, le=LOWEST)]
 
 
-Spot = tuple[Number, Number]
-"""(x, z) [m]"""
-
-
 class SceneFields(Struct, frozen=True):
     """scene.json."""
 
@@ -106,8 +102,7 @@ class SceneFields(Struct, frozen=True):
     objects: list[ObjectFields]
     camera: Any = None
     ground: Ground | None = None
-    layout: tuple[Spot, Spot, Spot, Spot] | None = None
-    size_spread: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    size_spread: Share = 0.0
 
 
 def scene_of(at: At, load: LoadMesh, camera: Camera | None, warn: Warn) -> tuple[Scene, float]:
@@ -124,28 +119,36 @@ def scene_of(at: At, load: LoadMesh, camera: Camera | None, warn: Warn) -> tuple
     ground = None if fields.ground is None else fields.ground.height
     if ground is not None and ground >= 0:
         warn(f"{at.file}: the ground is not below the camera (height {ground:g} m)")
-    pieces = _pieces_of(get(at, "objects"), fields.objects, load)
+    objects = _objects_of(get(at, "objects"), fields.objects, load)
     camera, angle = turned(camera)
     check_attitude(camera, at.file, warn)
-    layout = None if fields.layout is None else _turned_spots(fields.layout, angle)
-    pieces = tuple(_turn(piece, angle) for piece in pieces)
-    return Scene(camera, ground, pieces, layout, fields.size_spread), angle
+    objects = tuple(_turn(one, angle) for one in objects) if angle else tuple(objects)
+    return Scene(camera, ground, objects, fields.size_spread), angle
 
 
-def _pieces_of(at: At, rows: Sequence[ObjectFields], load: LoadMesh) -> list[SceneObject]:
+def _objects_of(at: At, rows: Sequence[ObjectFields], load: LoadMesh) -> list[SceneObject]:
     """All objects of a scene, with their relations checked."""
-    ids: set[object] = set()
-    annotations: set[object] = set()
-    pieces: list[SceneObject] = []
+    ids, annotations = set[object](), set[object]()
+    objects: list[SceneObject] = []
     for item, row in zip(items(at), rows, strict=True):
         check_id(get(item, "id"))
         unique(get(item, "id"), ids, row.id.casefold(), "an id (in any case)")
         if row.annotation is not None:
             unique(get(item, "annotation"), annotations, row.annotation, "an annotation")
-        _check_segments(item, row)
-        pieces.append(_piece_of(row, *load(get(item, "mesh"))))
-    _check_supports(at, pieces)
-    return pieces
+        segments = [Segment(one.frame, torch.tensor(one.translation), torch.tensor(one.yaw),
+                            one.mover) for one in row.segments or ()]  # fmt: skip
+        for k, (before, after) in enumerate(pairwise(one.frame for one in segments), 1):
+            if after <= before:
+                field = At(after, at.file, f"{item.field}.segments[{k}].frame")
+                refuse(field, f"a frame after {before}, in which the segment before begins")
+        mesh, file = load(get(item, "mesh"))
+        support = "ground" if row.support is None else str(row.support)
+        objects.append(
+            SceneObject(str(row.id), str(row.category), mesh, file, row.annotation, support,
+                        **row.tensors(), segments=tuple(segments))
+        )  # fmt: skip
+    _check_supports(at, objects)
+    return objects
 
 
 def check_id(at: At) -> None:
@@ -155,83 +158,35 @@ def check_id(at: At) -> None:
         refuse(at, "letters, digits, '_', '-' or '.', not 'ground' or 'free'")
 
 
-def _piece_of(row: ObjectFields, mesh: Mesh, file: str) -> SceneObject:
-    support = "ground" if row.support is None else str(row.support)
-    place = _place_of(row)
-    segments = tuple(
-        Segment(part.frame, torch.tensor(part.translation), torch.tensor(part.yaw), part.mover)
-        for part in row.segments or ()
-    )
-    name, category = str(row.id), str(row.category)
-    return SceneObject(name, category, mesh, file, row.annotation, support, *place, segments)
-
-
-def _check_segments(at: At, row: ObjectFields) -> None:
-    """Segments begin one after the other."""
-    frames = [part.frame for part in row.segments or ()]
-    for k, (before, after) in enumerate(pairwise(frames), 1):
-        if after <= before:
-            field = At(after, at.file, f"{at.field}.segments[{k}].frame")
-            refuse(field, f"a frame after {before}, in which the segment before begins")
-
-
-def _place_of(row: PlaceFields) -> tuple[Tensor, Tensor, Tensor]:
-    """Translation, yaw and scale."""
-    return torch.tensor(row.translation), torch.tensor(row.yaw), torch.tensor(row.scale)
-
-
-def _check_supports(at: At, pieces: list[SceneObject]) -> None:
+def _check_supports(at: At, objects: list[SceneObject]) -> None:
     """Each object stands on the ground, is free, or stands on others without a circle."""
-    under = {piece.id: piece.support for piece in pieces}
-    for i, piece in enumerate(pieces):
-        field = At(piece.support, at.file, f"{at.field}[{i}].support")
-        below, seen = piece.support, {piece.id}
+    under = {one.id: one.support for one in objects}
+    for i, one in enumerate(objects):
+        field = At(one.support, at.file, f"{at.field}[{i}].support")
+        below, visited = one.support, {one.id}
         while below not in WORDS:
             if below not in under:
                 refuse(field, "'ground', 'free' or the id of an object", f"{below!r}")
-            if below in seen:
+            if below in visited:
                 refuse(field, "supports that end at the ground", "a circle of supports")
-            seen.add(below)
+            visited.add(below)
             below = under[below]
 
 
-def _turned_spots(spots: Sequence[Spot], angle: float) -> Float[Tensor, "spots 2"]:
-    """Places on the floor, turned about +y."""
-    flat = torch.tensor(spots, dtype=torch.float64)
-    turn = rot_y(torch.tensor(angle, dtype=torch.float64))[::2, ::2]
-    return (flat @ turn.mT).float()
-
-
-def _turn(piece: SceneObject, angle: float) -> SceneObject:
-    if not angle:
-        return piece
+def _turn(one: SceneObject, angle: float) -> SceneObject:
+    """The object in the world turned about +y [rad]."""
     turn = torch.tensor(angle, dtype=torch.float64)
 
     def turned_by(place: P) -> P:
         t = (rot_y(turn) @ place.t_world_object.double()).to(place.t_world_object)
-        yaw = wrap(place.yaw.double() + turn).to(place.yaw)
-        return dataclasses.replace(place, t_world_object=t, yaw=yaw)
+        return replace(place, t_world_object=t, yaw=wrap(place.yaw.double() + turn).to(place.yaw))
 
-    segments = tuple(turned_by(segment) for segment in piece.segments)
-    return dataclasses.replace(turned_by(piece), segments=segments)
+    return replace(turned_by(one), segments=tuple(turned_by(part) for part in one.segments))
 
 
-def scene_tree(
-    objects: Sequence[Mapping[str, Any]],
-    file: str,
-    ground: float | None = None,
-    layout: list[list[float]] | None = None,
-) -> At:
-    """scene.json of objects that a reader found.
-
-    Args:
-        objects: Their fields.
-        file: How messages call it.
-        ground: Its height [m].
-        layout: Four corners of the room on the floor, (x, z) [m].
-    """
+def scene_tree(objects: Sequence[Mapping[str, Any]], file: str, ground: float | None = None) -> At:
+    """scene.json of the fields of objects that a reader found; `ground` is its height [m]."""
     below = {} if ground is None else {"ground": {"height": ground}}
-    below |= {} if layout is None else {"layout": layout}
     return At({"format": FORMAT, "version": VERSION, **below, "objects": list(objects)}, file)
 
 
@@ -258,28 +213,23 @@ def write_scene(
         else:
             target = meshes / f"{piece.id}.glb"
             write_mesh(piece.mesh, target)
-        fields = _object_to_json(piece, target.relative_to(path.parent).as_posix())
-        objects.append(fields | dict((more or {}).get(piece.id, {})))
-    layout = None if scene.layout is None else [plain(spot) for spot in scene.layout]
-    tree: dict[str, Any] = scene_tree(objects, "scene.json", scene.ground, layout).value
-    head = {key: tree.pop(key) for key in ("format", "version")}
+        mesh = target.relative_to(path.parent).as_posix()
+        annotation = {} if piece.annotation is None else {"annotation": piece.annotation}
+        row = {"id": piece.id, "category": piece.category, "mesh": mesh, **annotation,
+               **_placed(piece), "scale": plain(piece.scale), "support": piece.support}  # fmt: skip
+        if piece.segments:
+            row["segments"] = [{"frame": s.frame, **_placed(s)}
+                               | ({} if s.mover is None else {"mover": s.mover})
+                               for s in piece.segments]  # fmt: skip
+        objects.append({**row, **(more or {}).get(piece.id, {})})
     spread = {"size_spread": scene.size_spread} if scene.size_spread else {}
-    write_json({**head, "camera": camera_to_json(scene.camera), **spread, **tree}, path)
+    below = {} if scene.ground is None else {"ground": {"height": scene.ground}}
+    head = {"format": FORMAT, "version": VERSION, "camera": camera_to_json(scene.camera)}
+    write_json({**head, **spread, **below, "objects": objects}, path)
 
 
-def _object_to_json(piece: SceneObject, mesh: str) -> dict[str, Any]:
-    annotation = {} if piece.annotation is None else {"annotation": piece.annotation}
-    segments = [
-        {"frame": s.frame, "translation": plain(s.t_world_object), "yaw": plain(s.yaw)}
-        | ({} if s.mover is None else {"mover": s.mover})
-        for s in piece.segments
-    ]
-    return {
-        "id": piece.id, "category": piece.category, "mesh": mesh, **annotation,
-        "translation": plain(piece.t_world_object), "yaw": plain(piece.yaw),
-        "scale": plain(piece.scale), "support": piece.support,
-        **({"segments": segments} if segments else {}),
-    }  # fmt: skip
+def _placed(one: SceneObject | Segment) -> dict[str, Any]:
+    return {"translation": plain(one.t_world_object), "yaw": plain(one.yaw)}
 
 
 # hypotheses.json: other ways in which the objects of a first scene may stand.
@@ -288,8 +238,6 @@ def _object_to_json(piece: SceneObject, mesh: str) -> dict[str, Any]:
 HYPOTHESES = "hypotheses.json"
 MOST = 16  # of one object
 SAME = 0.01  # [m] and [rad]: the first row of an object is its place in the scene
-
-
 Places = Annotated[
     list[PlaceFields], Meta(max_length=MOST, description=f"at most {MOST} hypotheses")
 ]
@@ -315,30 +263,24 @@ def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[Sce
         scene: The scene beside the file.
         warn: Takes what is odd but not wrong.
     """
-    objects, own = get(at, "objects"), {piece.id: piece for piece in scene.objects}
+    objects, own = get(at, "objects"), {one.id: one for one in scene.objects}
     found: list[SceneObject] = []
     stale: list[str] = []
     for name, rows in checked(at, HypothesesFields).objects.items():
-        if name not in own or not rows or not _is_at(rows[0], own[name]):
+        first, home = own.get(name), rows[0].tensors() if rows else None
+        near = first is not None and home is not None and max(
+            float((home["t_world_object"] - first.t_world_object).norm()),
+            float(wrap(home["yaw"] - first.yaw).abs()),
+        ) < SAME  # fmt: skip
+        if first is None or not near:
             stale.append(name)
             continue
-        places = items(get(objects, name))
-        pairs = zip(rows[1:], places[1:], strict=True)
-        for row, place in pairs:
+        for row, place in zip(rows[1:], items(get(objects, name))[1:], strict=True):
             mesh, file = load(get(place, "mesh"))
-            t, yaw, scale = _place_of(row)
-            where = {"t_world_object": t, "yaw": yaw, "scale": scale}
-            found.append(replace(own[name], mesh=mesh, mesh_file=file, **where))
+            found.append(replace(first, mesh=mesh, mesh_file=file, **row.tensors()))
     if stale:
         warn(f"{at.file}: not of this scene, so not used: {listed('object', stale)}")
     return tuple(found)
-
-
-def _is_at(row: PlaceFields, piece: SceneObject) -> bool:
-    """Whether a row is where the scene has the object."""
-    t, yaw, _ = _place_of(row)
-    away = (t - piece.t_world_object).norm()
-    return float(away) < SAME and float(wrap(yaw - piece.yaw).abs()) < SAME
 
 
 def write_hypotheses(
@@ -357,18 +299,13 @@ def write_hypotheses(
     meshes = {row["id"]: row["mesh"] for row in scene["objects"]}
     rows: dict[str, list[dict[str, Any]]] = {}
     for name, group in groups.items():
-        names = [meshes[name]]
-        for rank, piece in enumerate(group[1:], 1):
-            names.append(f"meshes/other/{name}_{rank}.glb")
-            write_mesh(piece.mesh, folder / names[-1])
-        rows[name] = [
-            {"mesh": mesh, "translation": plain(piece.t_world_object), "yaw": plain(piece.yaw),
-             "scale": plain(piece.scale)}
-            for mesh, piece in zip(names, group, strict=True)
-        ]  # fmt: skip
+        rows[name] = []
+        for rank, one in enumerate(group):
+            mesh = f"meshes/other/{name}_{rank}.glb" if rank else meshes[name]
+            if rank:
+                write_mesh(one.mesh, folder / mesh)
+            rows[name].append({"mesh": mesh, **_placed(one), "scale": plain(one.scale)})
         for row, energy in zip(rows[name], energies.get(name, ()), strict=False):
             row["energy"] = energy
-    write_json(
-        {"format": "mover-hypotheses", "version": VERSION, "objects": rows},
-        folder / HYPOTHESES,
-    )
+    tree = {"format": "mover-hypotheses", "version": VERSION, "objects": rows}
+    write_json(tree, folder / HYPOTHESES)

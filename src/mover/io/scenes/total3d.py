@@ -188,7 +188,7 @@ def total3d_parts(folder: Path, hints: Hints) -> Parts:
     names = [choice(get(item, "class"), CLASSES) for item in items(at)]
     boxes = read_boxes(result / "bdb_3d.mat")
     box = matrix(result / "layout.mat", "layout", (8, 3))  # the upper four corners, the lower four
-    floor, walls = float(box[:, 1].min()), (box[4:] @ TO_OURS.T)[:, ::2].tolist()
+    floor = float(box[:, 1].min())
     if names != [box.name for box in boxes]:
         found = f"{len(boxes)} boxes of {[b.name for b in boxes][:4]} ..."
         expected = "the classes of detections.json, in order"
@@ -200,7 +200,7 @@ def total3d_parts(folder: Path, hints: Hints) -> Parts:
     return Parts(
         name=folder.resolve().name,
         camera=_camera(source, result / "r_ex.mat"),
-        scene=scene_tree(rows, result.name, floor, walls),
+        scene=scene_tree(rows, result.name, floor),
         objects=At(_annotations(items(at), list(kept)), "detections.json"),
         load_mesh=partial(_load_mesh, result, shapes),
         load_image=partial(read_image, At("img.jpg", "input"), source),
