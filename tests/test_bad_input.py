@@ -430,8 +430,8 @@ def test_a_link_to_nothing_is_no_missing_file(folder: Path, name: str) -> None:
     refused(folder, name, "no such file")
 
 
-def test_an_energy_that_is_no_number_is_refused(folder: Path) -> None:
+def test_a_wrong_hypothesis_is_named_by_its_object_and_row(folder: Path) -> None:
     tree = tiny.hypotheses()
-    tree["objects"]["chair_0"][1]["energy"] = NAN
+    tree["objects"]["chair_0"][1]["yaw"] = NAN
     (folder / "hypotheses.json").write_text(json.dumps(tree))
-    refused(folder, "hypotheses.json", r"objects.chair_0\[1\].energy' has nan")
+    refused(folder, "hypotheses.json", r"objects.chair_0\[1\].yaw' has nan")

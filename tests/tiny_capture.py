@@ -96,7 +96,7 @@ def hypotheses() -> dict[str, Any]:
     """The chair in its place, and in another one in the shape of the lamp."""
     keys = ("mesh", "translation", "yaw", "scale")
     first = {key: scene()["objects"][0][key] for key in keys}
-    other = {**first, "mesh": "meshes/lamp.glb", "translation": [-0.2, -1.4, -3.5], "energy": 0.25}
+    other = {**first, "mesh": "meshes/lamp.glb", "translation": [-0.2, -1.4, -3.5]}
     objects = {"chair_0": [first, other]}
     return {"format": "mover-hypotheses", "version": 1, "objects": objects}
 

@@ -28,12 +28,6 @@ def device_of(choice: Choice) -> torch.device:
     )
 
 
-def finish(device: torch.device) -> None:
-    """Wait until a GPU has done what it was given: before a clock is read."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
 def named(device: torch.device) -> str:
     """What a log calls it: `cpu`, or `cuda` and the name of the GPU."""
     if device.type != "cuda":

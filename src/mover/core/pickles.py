@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -242,7 +242,7 @@ class Reader(pickle._Unpickler):  # pyright: ignore[reportPrivateUsage, reportAt
         READ[code](self)
         self.stack[-1] = Row(self.stack[-1])
 
-    dispatch = (
+    dispatch: ClassVar[dict[int, Any]] = dict[int, Any](
         {code: act for code, act in READ.items() if bytes([code]) not in REFUSED}
         | {code: lambda reader, code=code: reader.row(code) for code in b"t\x85\x86\x87"}
         | {
@@ -271,7 +271,7 @@ def _plain(value: Any, done: dict[int, Any], depth: int) -> tuple[Any, int]:  # 
         if depth >= DEEPEST:
             raise InputError(f"holds lists in lists in more than {DEEPEST} levels, expected fewer")
         done[id(value)] = value, None
-        inside = value.values() if isinstance(value, Mapping) else value
+        inside: Any = value.values() if isinstance(value, Mapping) else value
         if isinstance(value, Call):
             inside = value.args, value.state, value.items
         found = [_plain(item, done, depth + 1) for item in inside]

@@ -79,13 +79,11 @@ Metres = Annotated[float, float_in(0, 100)]
 Seconds = Annotated[float, float_in(0, 1e6)]
 Rate = Annotated[float, float_in(1e-3, 1e4)]
 """Of frames a second."""
-Degrees = Annotated[float, float_in(0, 180)]
 Pixels = Annotated[int, int_in(1, 32768)]
 """Along a side of a picture."""
 Count = Annotated[int, int_in(1, 1_000_000)]
 Steps = Annotated[int, int_in(0, 1_000_000)]
 """Of a descent, or rounds of one; 0: none."""
-Seed = Annotated[int, int_in(0, 2**32 - 1)]
 Index = Annotated[int, int_in(0, 2**31 - 1)]
 """Of a frame."""
 

@@ -80,7 +80,7 @@ class SceneObject:
     scale: Float[Tensor, "3"]
     """Factor along each mesh axis."""
     segments: tuple[Segment, ...] = ()
-    """Where it stands when, of an object that is moved; its own place is that of the reference
+    """Where it stands when, of an object that is moved; its own position is that of the reference
     image. Empty: it never moves."""
     stretch: SeatStretch | None = None
     """How `mesh` was made from what its file holds; None: it is as in the file."""
@@ -95,7 +95,7 @@ class Scene:
     """Height of the floor in the world [m], negative below the camera; None: unknown."""
     objects: tuple[SceneObject, ...]
     size_spread: float = 0.0
-    """How far off all places and sizes may be together, the standard deviation of a logarithm."""
+    """Standard deviation of the logarithm of a common error of all positions and sizes."""
 
 
 @record
@@ -148,7 +148,7 @@ class BodyPose:
 
 @record
 class Bodies:
-    """People in all frames: one row for each (frame, person), one topology; places in [m]."""
+    """People in all frames: one row for each (frame, person), one topology; positions in [m]."""
 
     verts: Float[Tensor, "bodies verts 3"]
     faces: Int[Tensor, "faces 3"]
@@ -222,7 +222,7 @@ class Heading:
 
 @record
 class Tilt:
-    """Pitch and roll as the lines of the reference picture tell them [rad]."""
+    """Pitch and roll as the lines of the reference picture show them [rad]."""
 
     pitch: float
     roll: float
@@ -252,7 +252,7 @@ class Capture:
     furniture: People | None = None
     """Visible masks of the objects in some frames, `person` being the number of an annotation."""
     hypotheses: tuple[SceneObject, ...] = ()
-    """Other places and shapes of the scene's objects, under their ids: further starts."""
+    """Other positions and shapes of the scene's objects, under their ids: further starts."""
     path: CameraPath = STILL
     """Where the camera was when it saw the people."""
     depth: DepthImage | None = None
@@ -317,17 +317,14 @@ class Layout:
     def gather(self, index: Int[Tensor, "few objects"]) -> "Layout":
         """Starts by index, an own one for each object."""
         wide = index.unsqueeze(-1).expand(-1, -1, 3)
-        t, log_scale = self.t_world_object.gather(0, wide), self.log_scale.gather(0, wide)
-        return Layout(t, self.yaw.gather(0, index), log_scale)
+        parts = self.t_world_object.gather(0, wide), self.yaw.gather(0, index)
+        return Layout(*parts, self.log_scale.gather(0, wide))
 
     @staticmethod
     def cat(*layouts: "Layout") -> "Layout":
         """All starts of several layouts."""
-        return Layout(
-            torch.cat([one.t_world_object for one in layouts]),
-            torch.cat([one.yaw for one in layouts]),
-            torch.cat([one.log_scale for one in layouts]),
-        )
+        parts = zip(*((one.t_world_object, one.yaw, one.log_scale) for one in layouts), strict=True)
+        return Layout(*(torch.cat(part) for part in parts))
 
     @staticmethod
     def where(first: Bool[Tensor, " objects"], one: "Layout", other: "Layout") -> "Layout":
@@ -342,7 +339,7 @@ class Layout:
 
 @record
 class Evidence:
-    """What held an object in its place."""
+    """What held an object in its position."""
 
     id: str
     mask_pixels: int

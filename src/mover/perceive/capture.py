@@ -310,5 +310,4 @@ def write_first_scene(first: FirstScene, folder: Path, guess: Camera) -> None:
     write_json({**found, **given}, folder / "camera.json")
     write_json({"before": camera_to_json(guess), "found": found}, folder / GUESS)
     groups = {group[0].piece.id: [h.piece for h in group] for group in first.others}
-    energies = {group[0].piece.id: [h.energy for h in group] for group in first.others}
-    write_hypotheses(folder, groups, energies)
+    write_hypotheses(folder, groups)

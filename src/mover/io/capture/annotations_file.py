@@ -1,7 +1,7 @@
 """What COCO's JSON says: objects.json (the reference image), people.json and furniture.json."""
 
 import re
-from collections.abc import Container, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -39,31 +39,23 @@ def detections_of(at: At, camera: Camera, warn: Warn) -> tuple[Detection, ...]:
     """The instances of objects.json."""
     image = check_image(items(get(at, "images"), 1)[0], camera)
     names = categories_of(get(at, "categories"))
-    seen: set[object] = set()
-    found: list[Detection] = []
+    known, found = set[object](), list[Detection]()
     for item in items(get(at, "annotations")):
         row = checked(item, AnnotationFields)
         if row.image_id != image:
             refuse(get(item, "image_id"), f"{image}, the id of the one image")
-        detection = _detection(item, row, camera, names, warn)
-        unique(get(item, "id"), seen, detection.id, "an id")
-        found.append(detection)
+        box = _box_of(get(item, "bbox"), row.bbox, camera, warn)
+        mask = mask_of(item, camera, warn)
+        if mask is not None:
+            _check_mask(item, mask, box, warn)
+        category = category_of(get(item, "category_id"), names)
+        score = 1.0 if row.score is None else row.score
+        found.append(Detection(row.id, category, box, mask, score))
+        unique(get(item, "id"), known, row.id, "an id")
     bare = [d.id for d in found if d.mask is None]
     if bare:
         warn(f"{at.file}: {listed('annotation', bare)} without segmentation, only the box counts")
     return tuple(found)
-
-
-def _detection(
-    at: At, row: AnnotationFields, camera: Camera, names: dict[int, str], warn: Warn
-) -> Detection:
-    """One annotation."""
-    box = _box_of(get(at, "bbox"), row.bbox, camera, warn)
-    mask = mask_of(at, camera, warn)
-    if mask is not None:
-        _check_mask(at, mask, box, warn)
-    category = category_of(get(at, "category_id"), names)
-    return Detection(row.id, category, box, mask, 1.0 if row.score is None else row.score)
 
 
 def image_name(at: At) -> At | None:
@@ -95,12 +87,6 @@ def _check_mask(at: At, mask: Masks, box: Float[Tensor, "4"], warn: Warn) -> Non
         warn(f"{at.place} has a box and a mask in different places")
 
 
-def _corners_to_json(box: Float[Tensor, "4"]) -> list[float]:
-    """COCO's [x, y, w, h]."""
-    x, y, right, bottom = plain(box)
-    return [x, y, right - x, bottom - y]
-
-
 def detections_to_json(
     detections: tuple[Detection, ...], camera: Camera, file_name: str | None
 ) -> dict[str, Any]:
@@ -108,10 +94,11 @@ def detections_to_json(
     image: dict[str, Any] = {"id": 0, "width": camera.width, "height": camera.height}
     annotations: list[dict[str, Any]] = []
     for d in detections:
+        x, y, right, bottom = plain(d.box)
+        row = {"id": d.id, "image_id": 0, "category_id": d.category,
+               "bbox": [x, y, right - x, bottom - y], "score": d.score}  # fmt: skip
         mask = {} if d.mask is None else {"segmentation": segmentation(d.mask, 0)}
-        place = {"id": d.id, "image_id": 0, "category_id": d.category}
-        score = {"bbox": _corners_to_json(d.box), "score": d.score}
-        annotations.append({**place, **score, **mask})
+        annotations.append({**row, **mask})
     image |= {} if file_name is None else {"file_name": file_name}
     return annotations_tree(annotations, image, first=1)
 
@@ -164,57 +151,46 @@ def people_of(at: At, camera: Camera, warn: Warn) -> PeopleFile:
         if frame in frames:
             refuse(get(item, "id"), "a frame that is not used twice")
         frames[frame] = None
-    given = maybe(at, "categories")
+    given, hidden = maybe(at, "categories"), maybe(at, "reference_people")
     names = None if given is None else categories_of(given)
-    rows, masks = _rows_of(get(at, "annotations"), frames, camera, names, warn)
-    people = None
-    if masks:
-        frame, person = torch.tensor(rows).unbind(1)
-        people = People(joined(masks), frame, person, heights)
-    return PeopleFile(people, _reference(at, camera, names, warn), known.fps, frozenset(frames))
-
-
-def _rows_of(
-    at: At, frames: Container[int], camera: Camera, names: dict[int, str] | None, warn: Warn
-) -> tuple[list[tuple[int, int]], list[Masks]]:
-    """Frame, track and mask of each annotation that has one."""
-    rows: list[tuple[int, int]] = []
-    masks: list[Masks] = []
-    seen: set[object] = set()
-    for item in items(at):
+    pairs, known_pairs = list[tuple[int, int]](), set[object]()
+    for item in items(get(at, "annotations")):
         row = checked(item, PersonFields)
         if row.image_id not in frames:
             refuse(get(item, "image_id"), "the id of one of the images")
-        pair = row.image_id, row.track_id
-        unique(get(item, "track_id"), seen, pair, "a track of this frame")
-        mask = _person_mask(item, camera, names, warn)
-        if mask is not None:
-            rows.append(pair)
-            masks.append(mask)
-    if missing := len(seen) - len(rows):
-        warn(f"{at.file}: {missing} of {len(seen)} people without mask or an empty one")
-    return rows, masks
+        pairs.append((row.image_id, row.track_id))
+        unique(get(item, "track_id"), known_pairs, pairs[-1], "a track of this frame")
+    masks = _masks_of(get(at, "annotations"), camera, names, warn)
+    rows = [(*pair, mask) for pair, mask in zip(pairs, masks, strict=True) if mask is not None]
+    if missing := len(pairs) - len(rows):
+        warn(f"{at.file}: {missing} of {len(pairs)} people without mask or an empty one")
+    people = None
+    if rows:
+        frame, person = torch.tensor([row[:2] for row in rows]).unbind(1)
+        people = People(joined([row[2] for row in rows]), frame, person, heights)
+    found = [] if hidden is None else _masks_of(hidden, camera, names, warn)
+    reference = [mask for mask in found if mask is not None]
+    if lost := len(found) - len(reference):
+        warn(f"{at.file}: {lost} people of the reference image without mask")
+    return PeopleFile(
+        people, joined(reference) if reference else None, known.fps, frozenset(frames)
+    )
 
 
-def _person_mask(at: At, camera: Camera, names: dict[int, str] | None, warn: Warn) -> Masks | None:
-    """The visible mask of a person; None where it is missing or empty."""
-    category, box = maybe(at, "category_id"), maybe(at, "bbox")
-    if category is not None and names is not None:
-        category_of(category, names)
-    if box is not None:
-        checked(box, Box)
-    mask = mask_of(at, camera, warn)
-    return mask if mask is not None and area(mask, 0) else None
-
-
-def _reference(at: At, camera: Camera, names: dict[int, str] | None, warn: Warn) -> Masks | None:
-    """People in the reference image."""
-    given = maybe(at, "reference_people")
-    found = [] if given is None else [_person_mask(i, camera, names, warn) for i in items(given)]
-    masks = [mask for mask in found if mask is not None]
-    if len(masks) < len(found):
-        warn(f"{at.file}: {len(found) - len(masks)} people of the reference image without mask")
-    return joined(masks) if masks else None
+def _masks_of(
+    at: At, camera: Camera, names: dict[int, str] | None, warn: Warn
+) -> list[Masks | None]:
+    """The visible masks of people; None where one is missing or empty."""
+    masks: list[Masks | None] = []
+    for item in items(at):
+        category, box = maybe(item, "category_id"), maybe(item, "bbox")
+        if category is not None and names is not None:
+            category_of(category, names)
+        if box is not None:
+            checked(box, Box)
+        mask = mask_of(item, camera, warn)
+        masks.append(mask if mask is not None and area(mask, 0) else None)
+    return masks
 
 
 def furniture_of(

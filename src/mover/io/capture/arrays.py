@@ -88,19 +88,17 @@ def capture_from_arrays(
     Raises:
         InputError: If anything is wrong.
     """
-    fields = {k: np.asarray(v).tolist() for k, v in camera.items()}
     arrays = None if bodies is None else {k: np.asarray(v) for k, v in bodies.items()}
-    touch = None if arrays is None or "probability" not in arrays else At(arrays, FILE, "bodies")
-
+    at = None if arrays is None else At(arrays, FILE, "bodies")
     return build_capture(
         Parts(
             name=name,
-            camera=At(fields, FILE, "camera"),
+            camera=At({k: np.asarray(v).tolist() for k, v in camera.items()}, FILE, "camera"),
             scene=_scene(objects),
             objects=At(_annotations(objects), FILE),
             people=None if people is None else At(_people(people), FILE, "people"),
-            bodies=None if arrays is None else At(arrays, FILE, "bodies"),
-            contacts=touch,
+            bodies=at,
+            contacts=at if arrays is not None and "probability" in arrays else None,
             load_mesh=partial(_load_mesh, objects),
             load_image=None if image is None else partial(_load_image, image),
             no_image=FILE,
@@ -120,23 +118,14 @@ def _scene(objects: Sequence[ObjectArrays]) -> At:
     """The content of scene.json, where a mesh is named by its index."""
     rows = [
         {
-            "id": o.id,
-            "category": o.category,
-            "mesh": str(i),
+            "id": o.id, "category": o.category, "mesh": str(i), "support": o.support,
             "annotation": None if o.mask is None and o.box is None else i,
-            "translation": _list(o.translation),
-            "yaw": _list(o.yaw),
-            "scale": _list(o.scale),
-            "support": o.support,
+            "translation": np.asarray(o.translation).tolist(),
+            "yaw": np.asarray(o.yaw).tolist(), "scale": np.asarray(o.scale).tolist(),
         }
         for i, o in enumerate(objects)
-    ]
+    ]  # fmt: skip
     return scene_tree(rows, FILE)
-
-
-def _list(value: Numbers) -> Any:  # noqa: ANN401
-    """Numbers of any array library as JSON has them."""
-    return np.asarray(value).tolist()
 
 
 def _annotations(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
@@ -148,22 +137,24 @@ def _annotations(objects: Sequence[ObjectArrays]) -> dict[str, Any]:
         row: dict[str, Any] = {"id": i, "image_id": 0, "category_id": o.category}
         box = o.box
         if o.mask is not None:
-            mask = _mask(At(o.mask, FILE, f"objects[{i}].mask"))
+            mask = _masks(o.mask, f"objects[{i}].mask", "h, w")
+            if not mask.any():
+                field = At(o.mask, FILE, f"objects[{i}].mask")
+                refuse(field, "a mask with pixels", "an empty mask")
             box = tight_box(mask).tolist() if box is None else box
             row["segmentation"] = _code(mask)
         x, y, right, bottom = array(At(np.asarray(box), FILE, f"objects[{i}].box"), (4,)).tolist()
-        rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": _list(o.score)})
+        score = np.asarray(o.score).tolist()
+        rows.append({**row, "bbox": [x, y, right - x, bottom - y], "score": score})
     return annotations_tree(rows, {})
 
 
-def _mask(at: At) -> Tensor:
-    """One mask that is not empty."""
-    value: NDArray[Any] = np.asarray(at.value)
-    if value.dtype != np.bool_ or value.ndim != 2:
-        refuse(At(value, at.file, at.field), "an array of booleans of shape (h, w)")
-    if not value.any():
-        refuse(at, "a mask with pixels", "an empty mask")
-    return torch.from_numpy(value)
+def _masks(value: Numbers, field: str, axes: str) -> Tensor:
+    """One mask or several."""
+    given: NDArray[Any] = np.asarray(value)
+    if given.dtype != np.bool_ or given.ndim != len(axes.split()):
+        refuse(At(given, FILE, field), f"an array of booleans of shape ({axes})")
+    return torch.from_numpy(given)
 
 
 def _code(mask: Tensor) -> dict[str, Any]:
@@ -173,30 +164,22 @@ def _code(mask: Tensor) -> dict[str, Any]:
 
 def _people(people: PeopleArrays) -> dict[str, Any]:
     """The content of people.json."""
-    masks = _stack(people.masks, "people.masks")
-    rows_of = (len(masks),)
-    frames = array(At(np.asarray(people.frame), FILE, "people.frame"), rows_of, "whole").tolist()
-    persons = array(At(np.asarray(people.person), FILE, "people.person"), rows_of, "whole").tolist()
-    rows = [
-        {"image_id": frame, "track_id": person, "segmentation": _code(mask)}
-        for frame, person, mask in zip(frames, persons, masks, strict=True)
-    ]
+    masks, hidden = _masks(people.masks, "people.masks", "rows, h, w"), people.reference
+    frames, persons = (
+        array(At(np.asarray(value), FILE, f"people.{name}"), (len(masks),), "whole").tolist()
+        for name, value in (("frame", people.frame), ("person", people.person))
+    )
     heights = {} if people.heights is None else mapping(At(people.heights, FILE, "people.heights"))
-    hidden = [] if people.reference is None else _stack(people.reference, "people.reference")
+    behind = () if hidden is None else _masks(hidden, "people.reference", "rows, h, w")
     return {
         "info": {"heights": heights},
         "images": [{"id": frame} for frame in dict.fromkeys(frames)],
-        "annotations": rows,
-        "reference_people": [{"segmentation": _code(mask)} for mask in hidden],
+        "annotations": [
+            {"image_id": frame, "track_id": person, "segmentation": _code(mask)}
+            for frame, person, mask in zip(frames, persons, masks, strict=True)
+        ],
+        "reference_people": [{"segmentation": _code(mask)} for mask in behind],
     }
-
-
-def _stack(value: Numbers, field: str) -> Tensor:
-    """Several masks, some of which may be empty."""
-    given: NDArray[Any] = np.asarray(value)
-    if given.dtype != np.bool_ or given.ndim != 3:
-        refuse(At(given, FILE, field), "an array of booleans of shape (rows, h, w)")
-    return torch.from_numpy(given)
 
 
 def _load_image(image: Numbers, camera: Camera) -> Float[Tensor, "h w 3"]:

@@ -1,7 +1,6 @@
 """bodies.npz: people's meshes, or the parameters of a body model, or both."""
 
 import contextlib
-import dataclasses
 import logging
 import re
 import zipfile
@@ -32,6 +31,7 @@ from mover.io.files.fields import (
     number,
     refuse,
 )
+from mover.io.files.meshes import check_faces
 from mover.io.files.npz import read_npy, read_npz, write_npz
 
 log = logging.getLogger(__name__)
@@ -41,17 +41,11 @@ TALLEST, SMALLEST = 3.5, 0.2  # [m], of a body that is in metres
 
 def read_bodies(path: Path, warn: Warn = log.warning) -> Bodies:
     """Read and check bodies, in the space that the file says."""
-    return bodies_of(_arrays(path), warn)
+    return bodies_of(read_body_arrays(path), warn)
 
 
 def read_body_arrays(path: Path, fps: float | None = None) -> At:
-    """The arrays of bodies.npz as they are, with a frame rate where one is given."""
-    at = _arrays(path)
-    return at if fps is None else At({**at.value, "fps": np.array(fps)}, at.file)
-
-
-def _arrays(path: Path) -> At:
-    """The arrays of bodies.npz.
+    """The arrays of bodies.npz as they are, with a frame rate where one is given.
 
     Raises:
         InputError: If it cannot be read, or is a motion of AMASS.
@@ -64,7 +58,8 @@ def _arrays(path: Path) -> At:
             f"{path.name}: is a motion of AMASS, in a world of its own; expected bodies.npz (name "
             "the tool: --bodies-from amass, or mover import-bodies amass, reads it upright)"
         )
-    return read_npz(path)
+    at = read_npz(path)
+    return at if fps is None else At({**at.value, "fps": np.array(fps)}, at.file)
 
 
 def bodies_of(at: At, warn: Warn) -> Bodies:
@@ -83,27 +78,21 @@ def bodies_of(at: At, warn: Warn) -> Bodies:
         verts = _places(given, (len(frame), "V", 3))
         faces = _faces(get(at, "faces"), verts.shape[1])
         joints, names = _joints(at, len(frame))
+    space = get(at, "space")
+    word: Any = choice(At(str(array(space, (), "text")), at.file, space.field), ("camera", "world"))
     spread = _scalar(at, "size_spread", 0.0, 1.0)
     mean_shape = pose is not None and has_mean_shape(pose)  # before a pose is dropped unchecked
-    bodies = Bodies(
-        verts, faces, joints, names, frame, person, _scalar(at, "fps", SLOWEST, FASTEST),
-        _space(get(at, "space")), pose, spread, mean_shape,
-    )  # fmt: skip
-    extent = (bodies.verts.amax(1) - bodies.verts.amin(1)).norm(dim=-1).median()
+    fps = _scalar(at, "fps", SLOWEST, FASTEST)
+    extent = float((verts.amax(1) - verts.amin(1)).norm(dim=-1).median())
     if not SMALLEST < extent < TALLEST:
-        warn(f"{at.file}: the bodies measure {float(extent):.3g} across; are they in metres?")
-    return _with_checked_pose(bodies, at, warn) if given is not None else bodies
-
-
-def _with_checked_pose(bodies: Bodies, at: At, warn: Warn) -> Bodies:
-    """The bodies without their parameters where the model does not give the same meshes."""
-    if bodies.pose is None:
-        return bodies
-    reason = reproduces(bodies.pose, bodies.verts, at)
-    if reason is None:
-        return bodies
-    warn(f"{at.file}: {reason}; the bodies can only be refined rigidly")
-    return dataclasses.replace(bodies, pose=None)
+        warn(f"{at.file}: the bodies measure {extent:.3g} across; are they in metres?")
+    reason = reproduces(pose, verts, at) if given is not None and pose is not None else None
+    if reason is not None:
+        warn(f"{at.file}: {reason}; the bodies can only be refined rigidly")
+        pose = None
+    return Bodies(
+        verts, faces, joints, names, frame, person, fps, word, pose, spread, mean_shape
+    )  # fmt: skip
 
 
 def _indices(at: At, count: int | str) -> Int[Tensor, " rows"]:
@@ -138,9 +127,7 @@ def _faces(at: At, n_verts: int) -> Int[Tensor, "faces 3"]:
     value = array(at, ("F", 3), "whole").astype(np.int64)
     if not len(value):
         refuse(at, "at least one face", "an empty mesh")
-    if value.min() < 0 or value.max() >= n_verts:
-        found = f"faces that name vertices {value.min()} to {value.max()}"
-        refuse(at, f"vertices 0 to {n_verts - 1}", found)
+    check_faces(at, value, n_verts)
     return torch.from_numpy(value)
 
 
@@ -160,11 +147,6 @@ def _scalar(at: At, name: str, least: float, most: float) -> float | None:
     if given is None:
         return None
     return number(At(float(array(given, ())[()]), given.file, given.field), least, most)
-
-
-def _space(at: At) -> Any:  # noqa: ANN401
-    """`camera` or `world`."""
-    return choice(At(str(array(at, (), "text")), at.file, at.field), ("camera", "world"))
 
 
 def write_bodies(bodies: Bodies, path: Path) -> None:
@@ -217,22 +199,31 @@ def read_contacts(source: Path, bodies: Bodies, first: int = 0) -> Float[Tensor,
         bodies: Whose vertices these are.
         first: The number in the name of the first frame's file.
     """
-    if not source.is_dir():
-        return _checked(_array(source), source, bodies)
-    files = sorted(p for p in source.iterdir() if p.suffix in (".npy", ".npz"))
-    by_frame = {number - first: p for p in files if (number := _number(p)) is not None}
-    missing = sorted(set(bodies.frame.tolist()) - set(by_frame))
-    if missing:
-        raise InputError(f"{source}: has no file for frame {missing[0]}, expected an .npy or .npz")
-    if len(set(bodies.frame.tolist())) < len(bodies.frame):
-        raise InputError(f"{source}: one file a frame, but the bodies have several people a frame")
-    rows = [_array(by_frame[k]) for k in bodies.frame.tolist()]
-    return _checked(np.concatenate([r.reshape(1, -1) for r in rows]), source, bodies)
-
-
-def _number(path: Path) -> int | None:
-    found = re.match(r"\D*(\d+)", path.stem)
-    return int(found.group(1)) if found else None
+    if source.is_dir():
+        files = sorted(p for p in source.iterdir() if p.suffix in (".npy", ".npz"))
+        numbers = ((re.match(r"\D*(\d+)", p.stem), p) for p in files)
+        by_frame = {int(found[1]) - first: p for found, p in numbers if found}
+        frames: list[int] = bodies.frame.tolist()
+        if missing := sorted(set(frames) - set(by_frame)):
+            found = f"has no file for frame {missing[0]}"
+            raise InputError(f"{source}: {found}, expected an .npy or .npz")
+        if len(set(frames)) < len(frames):
+            raise InputError(
+                f"{source}: one file a frame, but the bodies have several people a frame"
+            )
+        value = np.concatenate([_array(by_frame[k]).reshape(1, -1) for k in frames])
+    else:
+        value = _array(source)
+    rows, verts = bodies.verts.shape[:2]
+    if value.dtype.kind not in "biuf" or value.size != rows * verts:
+        raise InputError(
+            f"{source.name}: has {value.dtype} of shape {value.shape}, expected "
+            f"numbers of shape ({rows}, {verts})"
+        )
+    chance = torch.from_numpy(value.reshape(rows, verts).astype(np.float32))
+    if not bool(chance.isfinite().all()):
+        raise InputError(f"{source.name}: has values that are not finite, expected chances")
+    return chance.clamp(0, 1)
 
 
 def _array(path: Path) -> np.ndarray:
@@ -246,16 +237,3 @@ def _array(path: Path) -> np.ndarray:
     if not path.is_file():
         raise InputError(f"{path}: there is no such file, expected an .npy or .npz file")
     return np.asarray(read_npy(path).value)
-
-
-def _checked(value: np.ndarray, source: Path, bodies: Bodies) -> Float[Tensor, "bodies verts"]:
-    rows, verts = bodies.verts.shape[:2]
-    if value.dtype.kind not in "biuf" or value.size != rows * verts:
-        raise InputError(
-            f"{source.name}: has {value.dtype} of shape {value.shape}, expected "
-            f"numbers of shape ({rows}, {verts})"
-        )
-    chance = torch.from_numpy(value.reshape(rows, verts).astype(np.float32))
-    if not bool(chance.isfinite().all()):
-        raise InputError(f"{source.name}: has values that are not finite, expected chances")
-    return chance.clamp(0, 1)

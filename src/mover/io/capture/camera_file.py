@@ -117,10 +117,17 @@ def path_of(at: At, camera: Camera, bodies: Bodies | None, warn: Warn) -> Camera
         refuse(get(at, "frame"), f"rising frames from 0 to {LAST_INDEX}")
     T = _poses(get(at, "T_world_camera"), len(frame))
     _check_lens(at, len(frame), camera, warn)
-    reference = _reference(at, frame)
-    if bodies is not None:
-        _check_reach(at, frame, bodies)
-    relative = np.linalg.inv(T[reference]) @ T
+    given, first = maybe(at, "reference"), 0
+    if given is not None:
+        number = int(array(given, (), "whole"))
+        if number not in frame:
+            refuse(given, "a frame that has a pose", f"{number}")
+        first = int(np.flatnonzero(frame == number)[0])
+    for end in () if bodies is None else (int(bodies.frame.min()), int(bodies.frame.max())):
+        if not frame[0] <= end <= frame[-1]:
+            reach = f"frames {frame[0]} to {frame[-1]}"
+            refuse(get(at, "frame"), f"poses for all bodies, also for frame {end}", reach)
+    relative = np.linalg.inv(T[first]) @ T
     if np.abs(relative - np.eye(4)).max() < STILL_POSES:
         return STILL
     R, t = (
@@ -142,18 +149,6 @@ def _poses(at: At, count: int) -> NDArray[np.float64]:
     return T
 
 
-def _reference(at: At, frame: NDArray[Any]) -> int:
-    """Row of the reference image's pose."""
-    given = maybe(at, "reference")
-    if given is None:
-        return 0
-    number = int(array(given, (), "whole"))
-    rows = np.flatnonzero(frame == number)
-    if not len(rows):
-        refuse(given, "a frame that has a pose", f"{number}")
-    return int(rows[0])
-
-
 def _check_lens(at: At, count: int, camera: Camera, warn: Warn) -> None:
     """One lens sees all frames and the reference image."""
     given = maybe(at, "focal")
@@ -163,21 +158,12 @@ def _check_lens(at: At, count: int, camera: Camera, warn: Warn) -> None:
     if focal.min() <= 0 or focal.max() / focal.min() > 1 + ZOOM:
         found = f"{focal.min():.3g} to {focal.max():.3g}"
         refuse(given, "one focal length above 0 for all frames (no zoom)", found)
-    own = float(camera.K[0, 0]) / camera.width
-    usual = float(np.median(focal))
+    own, usual = float(camera.K[0, 0]) / camera.width, float(np.median(focal))
     if abs(usual / own - 1) > ZOOM:
         warn(
             f"{at.file}: its focal length is {usual:.3g} widths of the image, that of camera.json"
             f" {own:.3g}: people's depths fit camera.json"
         )
-
-
-def _check_reach(at: At, frame: NDArray[Any], bodies: Bodies) -> None:
-    """Each body's frame has a pose, or lies between two."""
-    for number in (int(bodies.frame.min()), int(bodies.frame.max())):
-        if not frame[0] <= number <= frame[-1]:
-            reach = f"frames {frame[0]} to {frame[-1]}"
-            refuse(get(at, "frame"), f"poses for all bodies, also for frame {number}", reach)
 
 
 def path_to_arrays(path: CameraPath) -> dict[str, NDArray[Any]]:

@@ -16,7 +16,7 @@ from mover.core.errors import InputError
 from mover.core.types import Capture, Scene, SceneObject
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import pitch_roll, tilted, to_camera, to_world
-from mover.io.files.fields import At, get, items, mapping, plain, read_json, text, write_json
+from mover.io.files.fields import At, get, items, mapping, plain, read_json, write_json
 from mover.io.files.schema import Number, Sizes, Vector, checked
 
 
@@ -142,9 +142,9 @@ def read_edits(path: Path) -> tuple[Edit, ...]:
     for item in items(get(at, "edits")):
         row = mapping(item)
         if row.get("do") == "place":  # its row has the fields of the placement
-            row = {**row, "at": checked(item, Placement)}
+            checked(item, Placement)
+            row = {**row, "at": row}
         found.append(checked(At(row, item.file, item.field), Edit))
-        text(get(item, "id"))
     return tuple(found)
 
 

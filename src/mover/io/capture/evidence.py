@@ -50,6 +50,31 @@ def gather_evidence(capture: Capture) -> tuple[ObjectEvidence, ...]:
     known = {d.id: d.mask for d in capture.detections}
     masks = [None if p.annotation is None else known.get(p.annotation)
              for p in capture.scene.objects]  # fmt: skip
+    counts = zip(*passing_people(capture, masks), contact_frames(capture, masks), strict=True)
+    found: list[ObjectEvidence] = []
+    for one, mask, (near, far, frames, contacts) in zip(
+        capture.scene.objects, masks, counts, strict=True
+    ):
+        missing: list[str] = []
+        if one.annotation is None:
+            missing.append("no annotation")
+        elif mask is None:
+            missing.append("no mask, only a box")
+        elif capture.people is not None and not frames:
+            missing.append("no person passes it")
+        if frames and capture.bodies is not None:
+            missing += ["no near bound"] * (near < FEW) + ["no far bound"] * (far < FEW)
+        size = 0 if mask is None else area(mask, 0)
+        found.append(
+            ObjectEvidence(one.id, one.category, size, near, far, frames, contacts, tuple(missing))
+        )
+    return tuple(found)
+
+
+def passing_people(
+    capture: Capture, masks: Sequence[Masks | None]
+) -> tuple[list[int], list[int], list[int]]:
+    """Of each object: pixels where people stand before it, where it hides them, and frames."""
     camera, people, bodies = capture.scene.camera, capture.people, capture.bodies
     step = max(1, camera.width // CELLS)
     shape = len(range(step // 2, camera.height, step)), len(range(step // 2, camera.width, step))
@@ -76,13 +101,8 @@ def gather_evidence(capture: Capture) -> tuple[ObjectEvidence, ...]:
             more = before.sum((1, 2)) - behind.sum((1, 2))  # it hides or is hidden, not both
             near |= before & (more > 0)[:, None, None]
             far |= behind & (more < 0)[:, None, None]
-    return tuple(
-        _object(capture, i, masks[i], (int(n), int(f), len(frames[i]), contacts))
-        for i, (n, f, contacts) in enumerate(
-            zip(near.sum((1, 2)) * step**2, far.sum((1, 2)) * step**2,
-                contact_frames(capture, masks), strict=True)
-        )
-    )  # fmt: skip
+    pixels = ((found.sum((1, 2)) * step**2).tolist() for found in (near, far))
+    return *pixels, [len(found) for found in frames]
 
 
 def contact_frames(capture: Capture, masks: Sequence[Masks | None]) -> list[int]:
@@ -108,25 +128,6 @@ def contact_frames(capture: Capture, masks: Sequence[Masks | None]) -> list[int]
             if shape is not None and int(shape[y[shown], x[shown]].sum()) >= FEWEST:
                 frames[i].add(int(bodies.frame[row]))
     return [len(f) for f in frames]
-
-
-def _object(
-    capture: Capture, index: int, mask: Masks | None, counts: tuple[int, int, int, int]
-) -> ObjectEvidence:
-    """The evidence of one object, with what is missing."""
-    one, (near, far, frames, contacts) = capture.scene.objects[index], counts
-    missing: list[str] = []
-    if one.annotation is None:
-        missing.append("no annotation")
-    elif mask is None:
-        missing.append("no mask, only a box")
-    elif capture.people is not None and not frames:
-        missing.append("no person passes it")
-    if frames and capture.bodies is not None:
-        missing += ["no near bound"] if near < FEW else []
-        missing += ["no far bound"] if far < FEW else []
-    size = 0 if mask is None else area(mask, 0)
-    return ObjectEvidence(one.id, one.category, size, near, far, frames, contacts, tuple(missing))
 
 
 def _shrunk(grid: Grid) -> Grid:

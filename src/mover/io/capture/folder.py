@@ -74,6 +74,14 @@ def folder_parts(folder: Path, hints: Hints | None = None) -> Parts:
 
 def _files(folder: Path, needed: Callable[[Path], At | None]) -> Parts:
     """The files of a folder as they are; `needed` reads those that a capture cannot lack."""
+
+    def load_depth(camera: Camera) -> DepthImage | None:
+        found = images.find_depth_file(folder)
+        return found and images.read_depth_image(found[0], camera, metric=found[1])
+
+    frames = folder / "frames"
+    files = frames.iterdir() if frames.is_dir() else ()
+    names = (re.fullmatch(r"([0-9]{6,8})\.(jpg|jpeg|png)", path.name) for path in files)
     return Parts(
         name=folder.resolve().name,
         camera=needed(folder / "camera.json"),
@@ -85,15 +93,10 @@ def _files(folder: Path, needed: Callable[[Path], At | None]) -> Parts:
         contacts=_if_there(read_npz, folder / "contacts.npz"),
         cameras=_if_there(read_npz, folder / "cameras.npz"),
         load_mesh=partial(read_mesh, folder=folder),
-        load_depth=partial(_depth_in, folder),
-        n_frames=_count_frames(folder / "frames"),
+        load_depth=load_depth,
+        n_frames=max((int(name[1]) + 1 for name in names if name), default=None),
         hypotheses=_if_there(read_json, folder / HYPOTHESES),
     )
-
-
-def _depth_in(folder: Path, camera: Camera) -> DepthImage | None:
-    found = images.find_depth_file(folder)
-    return None if found is None else images.read_depth_image(found[0], camera, metric=found[1])
 
 
 def _put_depth(source: Path, target: Path) -> None:
@@ -107,13 +110,6 @@ def _put_depth(source: Path, target: Path) -> None:
 
 def _if_there(read: Callable[[Path], At], path: Path) -> At | None:
     return read(path) if path.exists() or path.is_symlink() else None
-
-
-def _count_frames(folder: Path) -> int | None:
-    """One more than the last numbered picture, None without pictures."""
-    files = folder.iterdir() if folder.is_dir() else ()
-    names = (re.fullmatch(r"([0-9]{6,8})\.(jpg|jpeg|png)", p.name) for p in files)
-    return max((int(name[1]) + 1 for name in names if name), default=None)
 
 
 def write_capture(capture: Capture, folder: Path) -> None:
@@ -152,7 +148,7 @@ def write_capture(capture: Capture, folder: Path) -> None:
     groups = {one.id: [one, *(h for h in capture.hypotheses if h.id == one.id)]
               for one in capture.scene.objects if one.id in others}  # fmt: skip
     if groups:
-        write_hypotheses(folder, groups, {})
+        write_hypotheses(folder, groups)
 
 
 def write_trees(

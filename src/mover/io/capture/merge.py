@@ -234,7 +234,8 @@ def _write(whole: Parts, old: Parts, capture: Capture | None, folder: Path) -> l
         at: At | None = getattr(whole, key)
         if at is None or at is getattr(old, key):
             continue
-        value, file = at.value, folder / f"{key}.{'json' if key in trees else 'npz'}"
+        value: Any = at.value
+        file = folder / f"{key}.{'json' if key in trees else 'npz'}"
         if key == "objects" and name is not None:
             value = {**value, "images": [{**value["images"][0], "file_name": name}]}
         if key == "bodies":

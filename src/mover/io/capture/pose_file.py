@@ -27,49 +27,42 @@ SAME = 0.01  # [m], a model that comes so close gives the same meshes
 LOOKED_AT = 64  # so many rows are compared, spread over the video
 CHUNK = 128  # rows posed at once
 NO_TURN = 1e-6
+UNUSABLE = (InputError, ValueError, RuntimeError, KeyError, OSError)
+"""What a model raises that is not there, or cannot take the parameters."""
 
 
 def pose_of(at: At, rows: int) -> BodyPose | None:
     """The parameters among the arrays of a file, None if it has none."""
     if all(maybe(at, key) is None for key in ("model", *NEEDED, *EXTRA)):
         return None
-    model = choice(_word(get(at, "model")), MODELS)
-    gender = maybe(at, "gender")
-    body = get(at, "body_pose")
-    angles = array(body, (rows, "63 or 69"))
+
+    def word(field: At, choices: tuple[str, ...]) -> str:
+        return choice(At(str(array(field, (), "text")), field.file, field.field), choices)
+
+    def values(field: At, *shape: int | str) -> Tensor:
+        return torch.from_numpy(array(field, shape).astype(np.float32))
+
+    model, gender = word(get(at, "model"), MODELS), maybe(at, "gender")
+    angles = values(get(at, "body_pose"), rows, "63 or 69")
     if angles.shape[1] not in ANGLES:
-        refuse(body, f"{ANGLES[0]} or {ANGLES[1]} angles a row", f"{angles.shape[1]}")
-    extra = {key: _rows(found, rows) for key in EXTRA if (found := maybe(at, key)) is not None}
+        found = f"{angles.shape[1]}"
+        refuse(get(at, "body_pose"), f"{ANGLES[0]} or {ANGLES[1]} angles a row", found)
+    extra: dict[str, Tensor] = {}
+    for key in EXTRA:  # values for each row; the axes behind the first are joined
+        if (field := maybe(at, key)) is not None:
+            axes = max(np.ndim(field.value) - 1, 1)
+            extra[key] = values(field, rows, *("N" * axes)).flatten(1)
+    betas = get(at, "betas")  # of one person or of each row
+    wide = ("S",) if isinstance(betas.value, np.ndarray) and betas.value.ndim == 1 else (rows, "S")
     return BodyPose(
         model=model,
-        gender="neutral" if gender is None else choice(_word(gender), GENDERS),
-        betas=_betas(get(at, "betas"), rows),
-        global_orient=_tensor(array(get(at, "global_orient"), (rows, 3))),
-        body_pose=_tensor(angles),
-        transl=_tensor(array(get(at, "transl"), (rows, 3))),
+        gender="neutral" if gender is None else word(gender, GENDERS),
+        betas=values(betas, *wide).expand(rows, -1).clone(),
+        global_orient=values(get(at, "global_orient"), rows, 3),
+        body_pose=angles,
+        transl=values(get(at, "transl"), rows, 3),
         extra=extra,
     )
-
-
-def _word(at: At) -> At:
-    return At(str(array(at, (), "text")), at.file, at.field)
-
-
-def _tensor(value: NDArray[Any]) -> Tensor:
-    return torch.from_numpy(value.astype(np.float32))
-
-
-def _betas(at: At, rows: int) -> Float[Tensor, "bodies shape"]:
-    """Shapes, of one person or of each row."""
-    shape = ("S",) if isinstance(at.value, np.ndarray) and at.value.ndim == 1 else (rows, "S")
-    return _tensor(array(at, shape)).expand(rows, -1).clone()
-
-
-def _rows(at: At, rows: int) -> Float[Tensor, "bodies values"]:
-    """Values for each row; the axes behind the first are joined."""
-    value = at.value
-    axes = value.ndim - 1 if isinstance(value, np.ndarray) and value.ndim > 1 else 1
-    return _tensor(array(at, (rows, *("N" * axes)))).flatten(1)
 
 
 def posed(
@@ -88,7 +81,7 @@ def posed(
     try:
         model = load_model(pose.model, pose.gender)
         verts, joints = run_model(model, pose)
-    except (InputError, ValueError, RuntimeError, KeyError, OSError) as error:
+    except UNUSABLE as error:
         message = f"{str(pose.model)!r}, which gives no meshes ({reason(error)})"
         refuse(
             get(at, "model"), "a body model that can be posed, or 'vertices' and 'faces'", message
@@ -103,7 +96,7 @@ def reproduces(pose: BodyPose, verts: Float[Tensor, "bodies verts 3"], at: At) -
         count = min(LOOKED_AT, len(verts))
         index = torch.linspace(0, len(verts) - 1, count).round().long()
         found, _ = run_model(model, rows_of(pose, index))
-    except (InputError, ValueError, RuntimeError, KeyError, OSError) as error:
+    except UNUSABLE as error:
         return f"the parameters of '{pose.model}' cannot be used ({reason(error)})"
     if found.shape[1] != verts.shape[1]:
         return f"{pose.model} has {found.shape[1]} vertices, {at.file} has {verts.shape[1]}"
@@ -117,20 +110,16 @@ def into_camera(bodies: Bodies, R_cam_world: Float[Tensor, "3 3"]) -> Bodies:
     """World bodies in the camera frame, parameters included."""
     if bodies.space == "camera":
         return bodies
-    R = R_cam_world.to(bodies.verts)
+    R, pose = R_cam_world.to(bodies.verts), bodies.pose
     joints = None if bodies.joints is None else bodies.joints @ R.mT
-    pose = None if bodies.pose is None else _turned(bodies.pose, R)
+    if pose is not None:  # the root turns about the pelvis, not about the origin
+        pelvis = run_model(load_model(pose.model, pose.gender), pose)[1][:, 0]
+        root = rotation_vectors(R @ axis_angle(pose.global_orient))
+        transl = (pelvis @ R.mT - (pelvis - pose.transl)).to(pose.transl)
+        pose = dataclasses.replace(pose, global_orient=root, transl=transl)
     return dataclasses.replace(
         bodies, verts=bodies.verts @ R.mT, joints=joints, pose=pose, space="camera"
     )
-
-
-def _turned(pose: BodyPose, R: Float[Tensor, "3 3"]) -> BodyPose:
-    """The parameters of the turned body: its root turns about the pelvis, not about the origin."""
-    joints = run_model(load_model(pose.model, pose.gender), pose)[1][:, 0]
-    root = rotation_vectors(R @ axis_angle(pose.global_orient))
-    transl = joints @ R.mT - (joints - pose.transl)
-    return dataclasses.replace(pose, global_orient=root, transl=transl.to(pose.transl))
 
 
 def pose_to_arrays(pose: BodyPose) -> dict[str, NDArray[Any]]:
@@ -155,12 +144,6 @@ def run_model(
     return torch.cat([verts for verts, _ in parts]), torch.cat([joints for _, joints in parts])
 
 
-def rest_pelvis(model: BodyModel, pose: BodyPose) -> Float[Tensor, "bodies 3"]:
-    """From `transl` to the pelvis, about which the root turns [m]."""
-    zero = torch.zeros_like(pose.transl)
-    return run_model(model, dataclasses.replace(pose, transl=zero, global_orient=zero))[1][:, 0]
-
-
 def moved(pose: BodyPose, R: Float[Tensor, "bodies 3 3"], t: Float[Tensor, "bodies 3"]) -> BodyPose:
     """The parameters of the bodies x' = R x + t; NaN stays NaN.
 
@@ -169,7 +152,9 @@ def moved(pose: BodyPose, R: Float[Tensor, "bodies 3 3"], t: Float[Tensor, "bodi
     """
     if (R - torch.eye(3).to(R)).abs().nan_to_num(0).amax() < NO_TURN:
         return dataclasses.replace(pose, transl=pose.transl + t)
-    offset = rest_pelvis(load_model(pose.model, pose.gender), pose)
+    zero = torch.zeros_like(pose.transl)
+    rest = dataclasses.replace(pose, transl=zero, global_orient=zero)
+    offset = run_model(load_model(pose.model, pose.gender), rest)[1][:, 0]  # `transl` to pelvis
     place = (R @ (offset + pose.transl)[..., None])[..., 0] + t - offset
     whole = (R.double() @ axis_angle(pose.global_orient.double())).numpy()
     root = torch.from_numpy(vectors(whole, At(whole, "the camera"))).to(pose.global_orient)

@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import torch
 from msgspec import Meta, Struct
-from torch import Tensor
 
 from mover.core.types import Camera, Mesh, Scene, SceneObject, Segment
 from mover.geometry.rotations import rot_y, wrap
@@ -61,9 +60,8 @@ class PlaceFields(Struct, frozen=True):
     translation: Vector
     yaw: Number
     scale: Sizes
-    energy: Number | None = None
 
-    def tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> dict[str, Any]:
         """Translation, yaw and scale, by their names in `SceneObject`."""
         found = {"t_world_object": self.translation, "yaw": self.yaw, "scale": self.scale}
         return {name: torch.tensor(value) for name, value in found.items()}
@@ -283,17 +281,12 @@ def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[Sce
     return tuple(found)
 
 
-def write_hypotheses(
-    folder: Path,
-    groups: Mapping[str, Sequence[SceneObject]],
-    energies: Mapping[str, Sequence[float]],
-) -> None:
+def write_hypotheses(folder: Path, groups: Mapping[str, Sequence[SceneObject]]) -> None:
     """Write hypotheses.json beside a scene.json that is written already, and their meshes.
 
     Args:
         folder: The capture folder.
         groups: Of each object, best first; the first is the one in the scene.
-        energies: What is left of the image terms at each, where that is known.
     """
     scene = json.loads((folder / "scene.json").read_text())
     meshes = {row["id"]: row["mesh"] for row in scene["objects"]}
@@ -305,7 +298,5 @@ def write_hypotheses(
             if rank:
                 write_mesh(one.mesh, folder / mesh)
             rows[name].append({"mesh": mesh, **_placed(one), "scale": plain(one.scale)})
-        for row, energy in zip(rows[name], energies.get(name, ()), strict=False):
-            row["energy"] = energy
     tree = {"format": "mover-hypotheses", "version": VERSION, "objects": rows}
     write_json(tree, folder / HYPOTHESES)

@@ -18,12 +18,12 @@ from mover.io.files.fields import (
     items,
     maybe,
     number,
-    positive,
     read_json,
     reason,
     refuse,
     vector,
 )
+from mover.io.files.schema import Positive, checked
 
 LARGEST_TEXT = 1 << 20  # [bytes], of a calibration
 HALF = 0.5  # [px], calibrations count from the centre of the first pixel
@@ -71,14 +71,7 @@ def camera_of_tree(at: At, size: tuple[int, int] | None) -> At:
 def with_intrinsics(
     K: NDArray[np.float64], size: tuple[int, int] | None, at: At, *, shift: float
 ) -> At:
-    """The fields of camera.json of a matrix.
-
-    Args:
-        K: [fx 0 cx; 0 fy cy; 0 0 1] [px].
-        size: Width and height of the image [px].
-        at: Where the matrix is from.
-        shift: What its principal point lacks [px].
-    """
+    """The fields of camera.json of a matrix whose principal point lacks a `shift` [px]."""
     w, h = _known(size, at)
     cx, cy = K[0, 2].item() + shift, K[1, 2].item() + shift
     return At({"w": w, "h": h, "fl_x": K[0, 0].item(), "fl_y": K[1, 1].item(), "cx": cx, "cy": cy},
@@ -91,8 +84,7 @@ def of_view(degrees: float, size: tuple[int, int], file: str) -> At:
     Raises:
         InputError: If the angle is not that of a pinhole camera.
     """
-    angle = number(At(degrees, file), 1, WIDEST)
-    focal = size[0] / 2 / math.tan(math.radians(angle) / 2)
+    focal = _focal(At(degrees, file), size[0])
     return _centred(focal, focal, size, file)
 
 
@@ -147,17 +139,22 @@ def _of_lens(at: At, size: tuple[int, int]) -> At:
     tilt: dict[str, Any] = {}
     if (pitch := maybe(at, "pitch")) is not None and (roll := maybe(at, "roll")) is not None:
         tilt["R_cam_world"] = tilt_of(number(pitch, -1.6, 1.6), number(roll, -1.6, 1.6))
-    for key in ("focal_length", "f", "focal"):
-        if (focal := maybe(at, key)) is not None:
-            value = positive(focal)
-            return At({**_centred(value, value, size, at.file).value, **tilt}, at.file)
-    if (across := maybe(at, "fov_x")) is not None:
-        up = maybe(at, "fov_y")
-        fx = size[0] / 2 / math.tan(math.radians(number(across, 1, WIDEST)) / 2)
-        fy = fx if up is None else size[1] / 2 / math.tan(math.radians(number(up, 1, WIDEST)) / 2)
-        return At({**_centred(fx, fy, size, at.file).value, **tilt}, at.file)
-    known = "fl_x, camera_mtx, focal_length, f or fov_x"
-    return refuse(at, f"a camera with one of the fields {known}")
+    focal = next((f for k in ("focal_length", "f", "focal") if (f := maybe(at, k))), None)
+    across, up = maybe(at, "fov_x"), maybe(at, "fov_y")
+    if focal is not None:
+        fx = fy = checked(focal, Positive)
+    elif across is not None:
+        fx = _focal(across, size[0])
+        fy = fx if up is None else _focal(up, size[1])
+    else:
+        known = "fl_x, camera_mtx, focal_length, f or fov_x"
+        refuse(at, f"a camera with one of the fields {known}")
+    return At({**_centred(fx, fy, size, at.file).value, **tilt}, at.file)
+
+
+def _focal(at: At, side: int) -> float:
+    """The focal length of an angle of view [degrees] along a side [px]."""
+    return side / 2 / math.tan(math.radians(number(at, 1, WIDEST)) / 2)
 
 
 def _centred(fx: float, fy: float, size: tuple[int, int], file: str) -> At:
@@ -167,7 +164,15 @@ def _centred(fx: float, fy: float, size: tuple[int, int], file: str) -> At:
 
 def _of_opencv(path: Path, size: tuple[int, int] | None) -> At:
     """OpenCV's FileStorage: `Intrinsics`, and in `CameraMatrix` [R | 0] of world and camera."""
-    tree = _read_xml(path)
+    try:
+        content = path.read_bytes()[: LARGEST_TEXT + 1]
+        if len(content) > LARGEST_TEXT or b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+            raise ValueError("the file is too large or has entities")  # which could be bombs
+        tree = ElementTree.fromstring(content)
+    except (OSError, ValueError, ElementTree.ParseError) as error:
+        raise InputError(
+            f"{path.name}: cannot be read ({reason(error)}), expected OpenCV's XML"
+        ) from error
     K = _checked(_of_node(tree, path, "Intrinsics", (3, 3)), At(None, path.name, "Intrinsics"))
     if tree.find("Distortion") is not None and _of_node(tree, path, "Distortion", None).any():
         refuse(At(None, path.name, "Distortion"), "zeros: undistort the images first", "a lens's")
@@ -176,19 +181,6 @@ def _of_opencv(path: Path, size: tuple[int, int] | None) -> At:
         R = _of_node(tree, path, "CameraMatrix", (3, 4))[:, :3]
         found["R_cam_world"] = (R @ np.diag([1.0, -1.0, -1.0])).tolist()  # their world is y-down
     return At(found, path.name)
-
-
-def _read_xml(path: Path) -> ElementTree.Element:
-    """The root of an XML file without entities, which could be bombs."""
-    try:
-        content = path.read_bytes()[: LARGEST_TEXT + 1]
-        if len(content) > LARGEST_TEXT or b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-            raise ValueError("the file is too large or has entities")
-        return ElementTree.fromstring(content)
-    except (OSError, ValueError, ElementTree.ParseError) as error:
-        raise InputError(
-            f"{path.name}: cannot be read ({reason(error)}), expected OpenCV's XML"
-        ) from error
 
 
 def _of_node(

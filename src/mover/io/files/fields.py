@@ -119,19 +119,10 @@ def number(at: At, low: float = -LARGEST, high: float = LARGEST) -> float:
     """A finite number between the bounds."""
     bounds = "" if (low, high) == (-LARGEST, LARGEST) else f" from {low:g} to {high:g}"
     value = at.value
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        refuse(at, f"a finite number{bounds}")
-    if not (low <= value <= high):  # false for NaN as well
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not low <= value <= high:  # false for NaN as well
         refuse(at, f"a finite number{bounds}")
     return float(value)
-
-
-def positive(at: At) -> float:
-    """A number above zero."""
-    value = number(at)
-    if value < 1 / LARGEST:
-        refuse(at, "a number above 0")
-    return value
 
 
 def integer(at: At, low: int = 0, high: int = LAST_INDEX) -> int:

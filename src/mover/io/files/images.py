@@ -129,7 +129,7 @@ def find_depth_file(folder: Path) -> tuple[Path, bool] | None:
 
 def read_depth_image(path: Path, camera: Camera, *, metric: bool) -> DepthImage:
     """The measured depth of the reference picture."""
-    return DepthImage(read_depth(path, camera) if metric else read_disparity(path, camera), metric)
+    return DepthImage(read_depth(path, camera, metric=metric), metric)
 
 
 def write_depth_image(depth: DepthImage, folder: Path) -> None:
@@ -140,60 +140,37 @@ def write_depth_image(depth: DepthImage, folder: Path) -> None:
         np.save(file, values, allow_pickle=False)
 
 
-def read_disparity(path: Path, camera: Camera) -> Float[Tensor, "h w"]:
-    """Inverse depth up to a factor and a shift; NaN where it is not positive."""
-    if path.suffix.lower() == ".png":
-        with opened(path, expected="a map of inverse depth", bombs="error") as picture:
-            mode, values = picture.mode, np.asarray(picture, dtype=np.float64)
-        if values.ndim != 2:
-            raise InputError(
-                f"{path.name}: has {mode} pixels, expected one grey value, larger where nearer"
-            )
-    else:
-        values = _values_of(path, (DISPARITY, *NAMES))
-    return _on_pixels(np.where(np.isfinite(values) & (values > 0), values, np.nan), path, camera)
-
-
-def read_depth(path: Path, camera: Camera) -> Float[Tensor, "h w"]:
-    """Distance along the view of each pixel [m]; NaN where it is unknown.
+def read_depth(path: Path, camera: Camera, *, metric: bool = True) -> Float[Tensor, "h w"]:
+    """Distance along the view of each pixel [m], or inverse depth; NaN where it is unknown.
 
     `.npz` and `.npy` hold metres (`depth`, or MoGe's `points`, whose z counts); `.png` with 16
-    bits holds millimetres. Another resolution of the same shape is stretched.
+    bits holds millimetres. Another resolution of the same shape is stretched. Inverse depth is
+    known up to a factor and a shift, and larger where nearer.
     """
-    values = _of_png(path) if path.suffix.lower() == ".png" else _values_of(path, NAMES)
-    known = np.isfinite(values) & (values > 0) & (values < FARTHEST)
-    return _on_pixels(np.where(known, values, np.nan), path, camera)
-
-
-def _values_of(path: Path, names: tuple[str, ...]) -> NDArray[np.float64]:
     match path.suffix.lower():
+        case ".png":
+            values = _of_png(path, metric)
         case ".npz":
-            return _of_npz(path, names)
+            values = _of_npz(path, NAMES if metric else (DISPARITY, *NAMES), metric)
         case ".npy":
-            return _two_axes(read_npy(path))
+            values = _two_axes(read_npy(path))
         case _:
             raise InputError(f"{path.name}: is no depth map, expected .npz, .npy or .png")
-
-
-def _on_pixels(values: NDArray[np.float64], path: Path, camera: Camera) -> Float[Tensor, "h w"]:
-    """The values at the pixels of the camera."""
-    depth = torch.from_numpy(values.astype(np.float32))
+    known = np.isfinite(values) & (values > 0) & (values < (FARTHEST if metric else np.inf))
+    depth = torch.from_numpy(np.where(known, values, np.nan).astype(np.float32))
     h, w = depth.shape
     if abs(w * camera.height - h * camera.width) > 0.02 * w * camera.height:
-        raise InputError(
-            f"{path.name}: has {w} x {h} values, expected the shape of {camera.width} x "
-            f"{camera.height} pixels"
-        )
+        shape = f"{camera.width} x {camera.height} pixels"
+        raise InputError(f"{path.name}: has {w} x {h} values, expected the shape of {shape}")
     rows = ((torch.arange(camera.height) + 0.5) * h / camera.height).long()
     columns = ((torch.arange(camera.width) + 0.5) * w / camera.width).long()
     return depth[rows][:, columns]
 
 
-def _of_npz(path: Path, names: tuple[str, ...]) -> NDArray[np.float64]:
+def _of_npz(path: Path, names: tuple[str, ...], metric: bool) -> NDArray[np.float64]:
     at = read_npz(path)
     points = maybe(at, "points")
     found = next((v for n in names if (v := maybe(at, n)) is not None), None)
-    metric = DISPARITY not in names
     if found is None and metric and points is not None and np.ndim(points.value) == 3:
         return np.asarray(points.value, dtype=np.float64)[..., 2]
     if found is None:
@@ -210,12 +187,17 @@ def _two_axes(at: At) -> NDArray[np.float64]:
     return array(At(value, at.file, at.field), ("h", "w")).astype(np.float64)
 
 
-def _of_png(path: Path) -> NDArray[np.float64]:
-    with opened(path, expected="a depth map", bombs="error") as picture:
-        mode, values = picture.mode, np.asarray(picture)
-    if not mode.startswith("I"):
+def _of_png(path: Path, metric: bool) -> NDArray[np.float64]:
+    kind = "a depth map" if metric else "a map of inverse depth"
+    with opened(path, expected=kind, bombs="error") as picture:
+        mode, values = picture.mode, np.asarray(picture, dtype=np.float64)
+    if metric and not mode.startswith("I"):
         raise InputError(
             f"{path.name}: has {mode} pixels, expected 16 bits of millimetres (8 bits or colours "
             "have no unit)"
         )
-    return values.astype(np.float64) / MILLIMETRES
+    if values.ndim != 2:
+        raise InputError(
+            f"{path.name}: has {mode} pixels, expected one grey value, larger where nearer"
+        )
+    return values / MILLIMETRES if metric else values

@@ -63,7 +63,7 @@ def load_arrays(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
             check_gltf(at, path)
             scene = trimesh.load_scene(str(path), process=False, skip_materials=True)
             for part in scene.geometry.values():
-                _check_faces(at, np.asarray(part.faces), len(part.vertices))
+                check_faces(at, np.asarray(part.faces), len(part.vertices))
             whole = scene.to_mesh()
             return np.asarray(whole.vertices), np.asarray(whole.faces)
         except InputError:
@@ -106,7 +106,7 @@ def gltf_tree(path: Path) -> Any:  # noqa: ANN401
     return json.loads(content)
 
 
-def _check_faces(at: At, faces: NDArray[Any], count: int) -> None:
+def check_faces(at: At, faces: NDArray[Any], count: int) -> None:
     """Refuse faces that name vertices which do not exist."""
     if faces.size and (faces.min() < 0 or faces.max() >= count):
         found = f"faces that name vertices {faces.min()} to {faces.max()}"
@@ -122,7 +122,7 @@ def mesh_of(verts: NDArray[Any], faces: NDArray[Any], at: At) -> Mesh:
     if verts.ndim != 2 or verts.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
         found = f"vertices of shape {verts.shape} and faces of shape {faces.shape}"
         refuse(at, "triangles: (vertices, 3) and (faces, 3)", found)
-    _check_faces(at, faces, len(verts))
+    check_faces(at, faces, len(verts))
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     if not len(faces):
@@ -154,9 +154,6 @@ def copy_mesh(source: Path, folder: Path, name: str) -> Path:
         source: The user's file.
         folder: Where meshes are kept.
         name: New name without its ending.
-
-    Returns:
-        The copy.
     """
     beside = companions(source)
     home = folder / name if beside else folder

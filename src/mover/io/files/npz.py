@@ -71,29 +71,22 @@ def _header(stream: Any) -> tuple[np.dtype[Any], int]:  # noqa: ANN401
     return dtype, dtype.itemsize * math.prod(shape)
 
 
-def check_array_header(path: Path) -> None:
-    """Refuse an .npy file that holds objects or promises more than it has.
-
-    Raises:
-        InputError: If it does.
-    """
-    with path.open("rb") as stream:
-        dtype, size = _header(stream)
-    if dtype.hasobject or dtype.fields:
-        raise InputError(f"{path.name}: has {dtype}, expected plain numbers (no pickled objects)")
-    if size > min(LARGEST_FILE, path.stat().st_size):
-        raise InputError(f"{path.name}: promises {size} bytes, expected no more than it has")
-
-
 def read_npy(path: Path) -> At:
     """The array of an .npy file.
 
     Raises:
-        InputError: If it is missing, broken, or holds pickled objects.
+        InputError: If it is missing, broken, promises more than it has or holds pickled objects.
     """
     try:
-        check_array_header(path)
         with path.open("rb") as file:
+            dtype, size = _header(file)
+            if dtype.hasobject or dtype.fields:
+                found = f"has {dtype}, expected plain numbers (no pickled objects)"
+                raise InputError(f"{path.name}: {found}")
+            if size > min(LARGEST_FILE, path.stat().st_size):
+                found = f"promises {size} bytes, expected no more than it has"
+                raise InputError(f"{path.name}: {found}")
+            file.seek(0)
             return At(np.load(file, allow_pickle=False), path.name)
     except BROKEN as error:
         raise InputError(

@@ -1,11 +1,13 @@
-"""Schemas of JSON files: msgspec checks a value, and what it refuses is said with its field.
+"""Schemas of JSON files: what is refused is said with its field.
 
 A schema is a `Struct` whose fields have the types below. Fields that it does not name are let be.
 """
 
-import re
+import functools
 import types
-from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, overload
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, overload
 
 import msgspec
 import numpy as np
@@ -20,7 +22,13 @@ from mover.io.files.fields import (
     MISSING,
     SLOWEST,
     At,
+    get,
+    integer,
+    items,
+    mapping,
+    number,
     refuse,
+    text,
 )
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="a finite number")]
@@ -59,25 +67,69 @@ def checked(at: At, kind: Any) -> Any:
     Raises:
         InputError: If a field is missing or wrong: file, field, found, expected.
     """
-    try:
-        return msgspec.convert(at.value, kind, dec_hook=_text)
-    except msgspec.ValidationError as error:
-        if "got `numpy." not in str(error):
-            _refuse(at, kind, str(error))
-    except UnicodeEncodeError:  # half of a pair of surrogates, which no text has
-        pass
-    return checked(At(_plain(at.value), at.file, at.field), kind)
+    value = at.value.item() if isinstance(at.value, np.generic) else at.value
+    at, origin, args = At(value, at.file, at.field), get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        if value is None and types.NoneType in args:
+            return None
+        kinds = [one for one in args if one is not types.NoneType]
+        return checked(at, kinds[0] if len(kinds) == 1 else _tagged(at, kinds))
+    if origin is Annotated:
+        return _within(at, *args)
+    if origin is Literal:
+        if not any(type(value) is type(one) and value == one for one in args):
+            refuse(at, "one of " + ", ".join(map(str, args)))
+        return value
+    if origin is tuple:
+        return tuple(checked(*pair) for pair in zip(items(at, len(args)), args, strict=True))
+    if origin is list:
+        return [checked(item, args[0]) for item in items(at)]
+    if origin is dict:
+        return {key: checked(get(at, key), args[1]) for key in mapping(at)}
+    if isinstance(kind, type) and issubclass(kind, Struct):
+        given = [(f, get(at, f.encode_name)) for f in _fields(kind)]
+        given.sort(key=lambda pair: pair[1].value is MISSING)  # what is wrong before what lacks
+        return kind(**{f.name: checked(one, f.type) for f, one in given
+                       if f.required or one.value is not MISSING})  # fmt: skip
+    return PLAIN[kind](at) if kind in PLAIN else value
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401
-    """Numbers of numpy and text that is none, which msgspec does not take, as those of Python."""
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
-        return "\0"
-    return value.item() if isinstance(value, np.generic) else value
+def _truth(at: At) -> bool:
+    if not isinstance(at.value, bool):
+        refuse(at, "true or false")
+    return at.value
+
+
+PLAIN: Mapping[Any, Callable[[At], Any]] = {
+    Text: text, str: text, float: number, bool: _truth,
+    int: partial(integer, low=-LAST_ID, high=LAST_ID),
+}  # fmt: skip
+
+
+@functools.cache
+def _fields(kind: type[Struct]) -> tuple[msgspec.structs.FieldInfo, ...]:
+    return msgspec.structs.fields(kind)
+
+
+def _tagged(at: At, kinds: list[type[Struct]]) -> type[Struct]:
+    """Of several structs the one that a field names."""
+    tags = {kind.__struct_config__.tag: kind for kind in kinds}
+    field = get(at, kinds[0].__struct_config__.tag_field or "type")
+    return tags[checked(field, Literal[tuple(tags)])]
+
+
+def _within(at: At, base: Any, meta: Any) -> Any:  # noqa: ANN401
+    """A number between bounds, or a list that is not too long."""
+    if base is int:
+        return integer(at, meta.ge, meta.le)
+    if base is float:
+        is_number = isinstance(at.value, int | float) and not isinstance(at.value, bool)
+        if not is_number or not meta.ge <= at.value <= meta.le:
+            refuse(at, meta.description or f"a finite number from {meta.ge:g} to {meta.le:g}")
+        return float(at.value)
+    if len(items(at)) > meta.max_length:
+        refuse(at, meta.description, f"{len(at.value)} items")
+    return checked(at, base)
 
 
 def rotation(at: At) -> NDArray[np.float64]:
@@ -99,80 +151,3 @@ def rigid(at: At) -> NDArray[np.float64]:
         refuse(at, "a rigid transform whose last row is 0 0 0 1")
     out[:3, :3] = rotation(At(out[:3, :3].tolist(), at.file, at.field))
     return out
-
-
-def _text(kind: type, value: object) -> object:
-    """The one type that msgspec does not know."""
-    assert kind is Text
-    if not isinstance(value, str) or not value.strip() or not value.isprintable():
-        raise ValueError("no text")
-    return Text(value)
-
-
-def _refuse(at: At, kind: Any, said: str) -> NoReturn:  # noqa: ANN401
-    """Say in our words what msgspec says: `Expected ... - at `$.objects[0].scale``."""
-    path = re.search(r"`\$([^`]*)`$", said)
-    for name, index in re.findall(r"\.(\w+)|\[([0-9]+|\.\.\.)\]", path[1] if path else ""):
-        if index == "...":  # without the key
-            _refuse_value(at, get_args(_bare(kind))[1])
-        at, kind = _step(at, _bare(kind), name or int(index))
-    if missing := re.match(r"Object missing required field `(\w+)`", said):
-        at, kind = _step(at, _bare(kind), missing[1])
-    wrong_length = isinstance(at.value, list | tuple) and "length" in said
-    refuse(at, _expected(kind), f"{len(at.value)} items" if wrong_length else None)
-
-
-def _refuse_value(at: At, kind: Any) -> NoReturn:  # noqa: ANN401
-    """Refuse the first value of a dictionary that is wrong."""
-    for key, value in at.value.items():
-        checked(At(value, at.file, f"{at.field}.{key}" if at.field else key), kind)
-    raise AssertionError(at.place)
-
-
-def _step(at: At, kind: Any, key: str | int) -> tuple[At, Any]:  # noqa: ANN401
-    """The field or item of a value, and its type."""
-    if isinstance(key, int):
-        kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
-        inner = get_args(kind)[key if get_origin(kind) is tuple else 0]
-        return At(at.value[key], at.file, f"{at.field}[{key}]"), inner
-    value = at.value.get(key, MISSING)
-    if isinstance(kind, tuple):  # structs that a field distinguishes
-        config = kind[0].__struct_config__
-        tags = [one.__struct_config__.tag for one in kind]
-        if key == config.tag_field:
-            kind = Literal[tuple(tags)]
-        else:
-            kind = _field(kind[tags.index(at.value[config.tag_field])], key)
-    else:
-        kind = _field(kind, key)
-    return At(value, at.file, f"{at.field}.{key}" if at.field else key), kind
-
-
-def _field(kind: type[Struct], key: str) -> Any:  # noqa: ANN401
-    return next(f.type for f in msgspec.structs.fields(kind) if f.encode_name == key)
-
-
-def _bare(kind: Any) -> Any:  # noqa: ANN401
-    """A type without what may be left out; several structs as a tuple of them."""
-    if get_origin(kind) in (Union, types.UnionType):
-        rest = tuple(one for one in get_args(kind) if one is not types.NoneType)
-        return _bare(rest[0]) if len(rest) == 1 else rest
-    return kind
-
-
-def _expected(kind: Any) -> str:  # noqa: ANN401
-    """What a type takes, in words."""
-    kind = _bare(kind)
-    if get_origin(kind) is Annotated:
-        base, meta = get_args(kind)
-        if meta.description:
-            return meta.description
-        if base is int:
-            return f"a whole number from {meta.ge} to {meta.le}"
-        return f"a finite number from {meta.ge:g} to {meta.le:g}"
-    if get_origin(kind) is Literal:
-        return "one of " + ", ".join(map(str, get_args(kind)))
-    if get_origin(kind) is tuple:
-        return f"a list of {len(get_args(kind))}"
-    words = {list: "a list", bool: "true or false", Text: "printable text"}
-    return words.get(get_origin(kind) or kind, "an object {...}")
