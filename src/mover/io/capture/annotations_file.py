@@ -221,14 +221,7 @@ def furniture_to_json(furniture: People) -> dict[str, Any]:
 def people_to_json(
     people: People | None, reference: Masks | None, fps: float | None, frames: Iterable[int]
 ) -> dict[str, Any]:
-    """The content of people.json.
-
-    Args:
-        people: Visible masks in the frames.
-        reference: People in the reference image.
-        fps: Frames a second.
-        frames: Frames of bodies, listed even where they have no mask.
-    """
+    """The content of people.json; the frames of bodies are listed even without a mask."""
     info: dict[str, Any] = {} if fps is None else {"fps": fps}
     rows: list[dict[str, Any]] = []
     shown_in = set(frames)

@@ -154,16 +154,13 @@ def write_capture(capture: Capture, folder: Path) -> None:
 def write_trees(
     capture: Capture, folder: Path, image: str | None, info: Mapping[str, Any] | None = None
 ) -> list[str]:
-    """Write the JSON files of a capture, and its meshes.
+    """Write the JSON files of a capture, and its meshes; the names of the files.
 
     Args:
         capture: A checked one.
         folder: Where to.
         image: The name of the reference image in the folder.
         info: Further fields of `info` in people.json; None: written only with people.
-
-    Returns:
-        The names of the files.
     """
     camera = camera_to_json(capture.scene.camera)
     if capture.camera_height is not None:

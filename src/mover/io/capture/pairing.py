@@ -82,12 +82,9 @@ def linked(scene: Scene, at: At) -> dict[str, int]:
 def outline(
     piece: SceneObject, camera: Camera, turn: Float[Tensor, "3 3"] | None = None
 ) -> Box | None:
-    """The rectangle around an object in the image, clipped to it; None where it is not seen.
+    """The rectangle around an object in the image, clipped to it; None where it is not visible.
 
-    Args:
-        piece: The object.
-        camera: That looks at it.
-        turn: Of the world before that.
+    The world is turned by `turn` before the camera looks at it.
     """
     verts = place_object(piece).verts
     verts = to_camera(verts if turn is None else verts @ turn.mT, camera.R_cam_world)

@@ -147,11 +147,6 @@ def _check_pairs(capture: Capture, known: dict[int, Detection], warn: Warn) -> N
 def check_bodies(bodies: Bodies, file: str, warn: Warn) -> None:
     """Bodies have the size of people, are near, before the camera, and around their joints.
 
-    Args:
-        bodies: In camera axes, or in the world.
-        file: How messages call their file.
-        warn: Takes what is odd but may be.
-
     Raises:
         InputError: If they cannot be people whom this camera sees.
     """

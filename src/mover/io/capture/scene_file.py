@@ -254,12 +254,6 @@ def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[Sce
 
     The first row of each object is the one that the scene has. Where it is not, the scene came
     from elsewhere or was changed since, and the object's rows are left out with a warning.
-
-    Args:
-        at: The content of the file.
-        load: Gives the mesh that a field names.
-        scene: The scene beside the file.
-        warn: Takes what is odd but not wrong.
     """
     objects, own = get(at, "objects"), {one.id: one for one in scene.objects}
     found: list[SceneObject] = []
@@ -284,9 +278,7 @@ def hypotheses_of(at: At, load: LoadMesh, scene: Scene, warn: Warn) -> tuple[Sce
 def write_hypotheses(folder: Path, groups: Mapping[str, Sequence[SceneObject]]) -> None:
     """Write hypotheses.json beside a scene.json that is written already, and their meshes.
 
-    Args:
-        folder: The capture folder.
-        groups: Of each object, best first; the first is the one in the scene.
+    The groups hold those of each object, best first; the first is the one in the scene.
     """
     scene = json.loads((folder / "scene.json").read_text())
     meshes = {row["id"]: row["mesh"] for row in scene["objects"]}

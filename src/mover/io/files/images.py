@@ -27,13 +27,9 @@ def opened(
     expected: str = "a picture",
     bombs: Literal["error", "ignore"] = "ignore",
 ) -> Generator[Any, None, None]:
-    """An open picture.
+    """An open picture, which messages call by `at`, else by its file.
 
-    Args:
-        path: Its file.
-        at: How messages call it; None: by its file.
-        expected: What it should be.
-        bombs: Whether a picture is refused that is large enough to make Pillow warn.
+    With `bombs="error"` a picture is refused that is large enough to make Pillow warn.
     """
     from PIL import Image
 
@@ -62,11 +58,7 @@ def read_image(at: At, folder: Path, camera: Camera) -> Float[Tensor, "h w 3"]:
 
 
 def read_image_file(at: At, path: Path, camera: Camera) -> Float[Tensor, "h w 3"]:
-    """A picture wherever it lies, upright, in [0, 1]; its size must be the camera's.
-
-    Raises:
-        InputError: If it cannot be read or has another size.
-    """
+    """A picture wherever it lies, upright, in [0, 1]; its size must be the camera's."""
     from PIL import ImageOps
 
     wanted, pixels = (camera.width, camera.height), None

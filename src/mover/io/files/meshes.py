@@ -76,13 +76,7 @@ def load_arrays(at: At, path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
 def check_gltf(at: At, path: Path, *, pictures: bool = False) -> None:
     """Refuse buffers outside of the file's folder, and more numbers than a file can hold.
 
-    Args:
-        at: How messages call the file.
-        path: Of a mesh; other kinds than glTF pass.
-        pictures: Refuse pictures outside of the folder as well.
-
-    Raises:
-        InputError: If it does so.
+    Other kinds than glTF pass; with `pictures` those outside of the folder are refused as well.
     """
     if path.suffix.lower() not in (".glb", ".gltf"):
         return
@@ -148,13 +142,7 @@ def write_mesh(mesh: Mesh, path: Path) -> None:
 
 
 def copy_mesh(source: Path, folder: Path, name: str) -> Path:
-    """Copy a mesh file as it is, into a folder of its own where other files belong to it.
-
-    Args:
-        source: The user's file.
-        folder: Where meshes are kept.
-        name: New name without its ending.
-    """
+    """Copy a user's mesh as it is under a new name; into a folder of its own with other files."""
     beside = companions(source)
     home = folder / name if beside else folder
     target = home / (name + source.suffix)
@@ -165,11 +153,9 @@ def copy_mesh(source: Path, folder: Path, name: str) -> Path:
 
 
 def stretch_file(path: Path, stretch: SeatStretch) -> Path:
-    """Raise the seat in a mesh file, which becomes a .glb; materials and textures stay.
+    """Raise the seat in a copy of a mesh file, which becomes a .glb; materials and textures stay.
 
-    Args:
-        path: A copy, which goes if it has another ending.
-        stretch: In the coordinates of the whole, with the transforms of the nodes applied.
+    The stretch is in the coordinates of the whole, with the transforms of the nodes applied.
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb
