@@ -27,6 +27,7 @@ import tiny_capture as tiny
 import torch
 from test_readers_people import CAMERA, Toy
 from test_run import PLANE, Twice, doubled, files
+from test_safe_pickle import BOMBS, shared_lists
 
 from mover.bodies import BODY_MODELS
 from mover.core.errors import InputError
@@ -274,20 +275,12 @@ def bad_pickles(mark: Path) -> dict[str, bytes]:
         )
     }  # fmt: skip
     found |= {f"opcode {op!r}": b"\x80\x04" + op + b"\x00" * 12 + b"." for op in REFUSED}
-    nested: Any = [1.0]
-    for _ in range(40):
-        nested = [nested, nested]
-    pairs: Any = (1.0,)
-    for _ in range(40):
-        pairs = (pairs, pairs)
-    loop: list[Any] = [1]
-    loop.append(loop)
     ring: dict[str, Any] = {}
     ring["betas"] = ring
+    nested = shared_lists()
+    found |= {name: pickle.dumps(bomb()) for name, bomb in BOMBS.items()}
     found |= {
-        "shared lists": pickle.dumps(nested), "shared tuples": pickle.dumps(pairs),
         "shared lists in a field": pickle.dumps({"betas": nested, "pose": nested}),
-        "a list that holds itself": pickle.dumps(loop),
         "a mapping that holds itself": pickle.dumps(ring),
         "deep lists": b"\x80\x02" + b"](" * 5000 + b"e" * 5000 + b".",
         "deep tuples": b"\x80\x02)" + b"\x85" * 50_000 + b".",
