@@ -17,22 +17,26 @@ from mover.bodies.smpl_files import load_smpl
 from mover.bodies.smpl_model import heights_of
 from mover.core.errors import InputError
 from mover.core.types import Scene
+from mover.energy.body_energy import BODY_TERMS
+from mover.energy.body_terms import deviation_term, robust_square, second_difference
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import PAPER, PUBLISHED, STAGES, FitConfig, Stage
-from mover.fitting.energy import (
-    Weighed,
-    bending_cost,
-    body_energy,
-    geman_mcclure,
-    smooth_joint_cost,
-)
+from mover.fitting.energy import FitState
 from mover.fitting.ground import balance_cost, center_of_mass, standing_share
-from mover.fitting.limits import limit_cost, limit_table, resting
-from mover.fitting.offsets import lasting_of, offset_cost
-from mover.fitting.prior import ANGLES, same
+from mover.fitting.priors import (
+    UNKNOWN,
+    bent_wrong,
+    excess_of,
+    height_cost,
+    lasting_of,
+    limit_table,
+    resting,
+    shape_cost,
+    size_of,
+    stature_of,
+)
 from mover.fitting.start import placed
-from mover.fitting.stature import UNKNOWN, height_cost, shape_cost, size_of, stature_of
-from mover.fitting.tracks import best_path, seen_of, triples_of
+from mover.fitting.tracks import best_path, motion_of, seen_of
 from mover.fitting.unknowns import Frame, Unknowns, move, points_of, rig_of
 from mover.geometry.camera import project
 from mover.geometry.rotations import axis_angle, rot_x
@@ -43,6 +47,7 @@ QUICK = FitConfig(
     stages=(dataclasses.replace(STAGES[0], steps=25), dataclasses.replace(STAGES[1], steps=50)),
 )
 
+TERM = {term.name: term.cost for term in BODY_TERMS}
 FEW = FitConfig(start_steps=2, stages=(dataclasses.replace(STAGES[1], steps=5),))
 """Enough to see that it runs, not to be right."""
 
@@ -53,6 +58,23 @@ def off(found, truth):
     return float((miss - miss[:, :1]).norm(dim=-1).mean()), float(miss.norm(dim=-1).mean())
 
 
+def fit(keypoints, config=QUICK, start=None, model=None, **more):
+    return fit_bodies(FitInputs(keypoints, CAMERA, model or open_body(), start, **more), config)
+
+
+def state_of(keypoints, pose, betas=None, person=None, config=None):
+    """Bodies in these poses, all of whose 25 keypoints are fitted."""
+    config, rows = config or FitConfig(), len(keypoints.frame)
+    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
+    person, none = keypoints.person if person is None else person, torch.zeros(rows, 0)
+    at = Unknowns(
+        torch.zeros(rows, 3), pose.body_pose[:rows], torch.ones(rows, 3),
+        torch.zeros(1, 10) if betas is None else betas, none, none,
+    )  # fmt: skip
+    frame = Frame(rig, axis_angle(pose.global_orient[:rows]), person)
+    return FitState(at, frame, seen_of(keypoints, rig, CAMERA, config), config)
+
+
 @pytest.fixture(scope="module")
 def walk():
     return as_bodies(*walker())
@@ -60,7 +82,7 @@ def walk():
 
 @pytest.fixture(scope="module")
 def found(walk):
-    return fit_bodies(FitInputs(seen(walk, noise=3.0, missing=0.1), CAMERA, open_body()))
+    return fit(seen(walk, noise=3.0, missing=0.1), None)
 
 
 def test_people_of_unknown_height_are_as_uncertain_in_size_as_adults_differ(found):
@@ -77,7 +99,7 @@ def test_lasting_offsets_of_a_detector_do_not_change_the_stature(walk):
             off[:, names.index(f"{side}_{name}"), 1] = share * height
     wrong = dataclasses.replace(keypoints, points=keypoints.points + off)
     usual, dirs = heights_of(open_body())
-    fits = [fit_bodies(FitInputs(k, CAMERA, open_body()), QUICK) for k in (keypoints, wrong)]
+    fits = [fit(k) for k in (keypoints, wrong)]
     right, biased = (usual + float(f.bodies.pose.betas[0] @ dirs) for f in fits)
     assert abs(biased - right) < 0.04
     assert 1.5 < biased < 1.85
@@ -113,9 +135,10 @@ def test_a_body_that_leans_as_a_whole_falls_and_one_that_stands_does_not(walk):
 
 
 def test_offsets_cost_their_squared_deviations_by_the_name_of_the_keypoint():
-    lasting = lasting_of(["left_hip", "nose", "left_index3"])
+    lasting = lasting_of(("left_hip", "nose", "left_index3"))
     assert lasting.tolist() == pytest.approx([0.03, 0.015, 0.003])
-    assert float(offset_cost(lasting[None, :, None].expand(1, 3, 3), lasting)) == pytest.approx(9)
+    every = lasting[:, None].expand(3, 3).reshape(1, 9)
+    assert float(deviation_term(every, lasting.repeat_interleave(3))) == pytest.approx(9)
 
 
 def random_pose(rows=3, seed=0):
@@ -159,7 +182,7 @@ def test_the_rig_of_smplx_has_its_hands_face_correctives_and_expression(tmp_path
         torch.cat([torch.zeros(2, 3), expression], -1),
     )  # fmt: skip
     frame = Frame(rig, axis_angle(pose.global_orient), torch.arange(2))
-    points = points_of(at, frame, same)
+    points = points_of(at, frame)
     about = points.keypoints - points.joints[:, :1]
     torch.testing.assert_close(about, wanted - joints[:, :1], atol=1e-5, rtol=0)
 
@@ -188,7 +211,7 @@ def test_a_fitted_body_is_what_its_parameters_say_and_looks_where_it_should(foun
 @pytest.mark.parametrize("yaw", [0.0, 1.6, 3.1])
 def test_people_are_not_turned_about(yaw):
     truth = as_bodies(*walker(4, yaw=yaw))
-    out = fit_bodies(FitInputs(seen(truth, noise=2.0), CAMERA, open_body()), QUICK)
+    out = fit(seen(truth, noise=2.0))
     front = axis_angle(out.bodies.pose.global_orient)[..., 2]
     assert ((front * axis_angle(truth.pose.global_orient)[..., 2]).sum(-1) > 0.85).all()
 
@@ -204,14 +227,14 @@ def test_bodies_of_another_tool_are_put_under_the_true_camera(walk):
     )
     start = as_bodies(wrong, walk.frame)
     before = (start.joints - start.joints[:, :1] - walk.joints + walk.joints[:, :1])[:, :22]
-    out = fit_bodies(FitInputs(seen(walk, noise=2.0), CAMERA, open_body(), start))
+    out = fit(seen(walk, noise=2.0), None, start)
     aligned, absolute = off(out, walk)
     assert aligned < 0.6 * float(before.norm(dim=-1).mean())
     assert absolute < 0.25
 
 
 @pytest.mark.slow
-def test_legs_of_a_sitter_that_nobody_sees_stay_as_they_were_before_and_after():
+def test_legs_of_a_sitter_that_no_row_shows_stay_as_they_were_before_and_after():
     pose, frame = walker(9)
     angles = pose.body_pose.reshape(9, 21, 3).clone()
     angles[:, :2, 0], angles[:, 3:5, 0] = -1.4, 1.4
@@ -223,7 +246,7 @@ def test_legs_of_a_sitter_that_nobody_sees_stay_as_they_were_before_and_after():
     sure = keypoints.confidence.clone()
     sure[3:6, leg_columns()] = 0
     hidden = dataclasses.replace(keypoints, confidence=sure)
-    out = fit_bodies(FitInputs(hidden, CAMERA, open_body()), QUICK)
+    out = fit(hidden)
     miss = out.bodies.joints - truth.joints
     about = (miss - miss[:, :1])[:, [4, 5, 7, 8]].norm(dim=-1).mean(1)
     assert about[3:6].mean() < about[:3].mean() + 0.05
@@ -240,7 +263,7 @@ def test_two_people_keep_their_own_shapes_and_places():
         frame=torch.cat([a.frame, b.frame]),
         person=torch.cat([a.person, b.person]),
     )
-    out = fit_bodies(FitInputs(both, CAMERA, open_body()), QUICK).bodies
+    out = fit(both).bodies
     assert out.person.tolist() == [0] * 5 + [4] * 5
     assert out.pose.betas.unique(dim=0).shape[0] == 2
     assert (out.joints[:5, 0] - one.joints[:, 0]).norm(dim=-1).mean() < 0.4
@@ -255,7 +278,7 @@ def test_rows_without_joints_are_left_out_and_nan_is_missing(walk):
     sure[7] = 0
     sure[8, 4] = torch.nan
     bad = dataclasses.replace(keypoints, points=points, confidence=sure)
-    out = fit_bodies(FitInputs(bad, CAMERA, open_body()), FEW)
+    out = fit(bad, FEW)
     assert out.rows.tolist() == [0, 1, 3, 4, 5, 6, 8, 9, 10, 11]
     assert out.bodies.frame.tolist() == out.rows.tolist()
     assert out.bodies.verts.isfinite().all()
@@ -265,7 +288,7 @@ def test_rows_without_joints_are_left_out_and_nan_is_missing(walk):
 def test_keypoints_that_are_all_missing_are_refused(walk):
     nothing = dataclasses.replace(seen(walk), confidence=torch.zeros(12, 25))
     with pytest.raises(InputError, match=r"12 rows with at most 0 joints.*expected a row with 4"):
-        fit_bodies(FitInputs(nothing, CAMERA, open_body()), QUICK)
+        fit(nothing)
 
 
 @pytest.mark.slow
@@ -275,7 +298,7 @@ def test_a_person_in_one_frame_and_an_unordered_image_are_fitted(walk):
             seen(walk), points=seen(walk).points[3:4], confidence=torch.ones(1, 25),
             frame=torch.tensor([40]), person=torch.tensor([2]), fps=fps,
         )  # fmt: skip
-        out = fit_bodies(FitInputs(one, CAMERA, open_body()), QUICK)
+        out = fit(one)
         assert out.bodies.frame.tolist() == [40]
         miss = out.bodies.joints[0, :22] - walk.joints[3, :22]
         assert (miss - miss[0]).norm(dim=-1).mean() < 0.08
@@ -285,8 +308,8 @@ def test_a_person_in_one_frame_and_an_unordered_image_are_fitted(walk):
 def test_a_known_floor_carries_people(walk):
     keypoints = seen(walk, noise=3.0)
     floor = float((walk.verts @ CAMERA.R_cam_world[:, 1]).min()) + 0.2
-    plain = fit_bodies(FitInputs(keypoints, CAMERA, open_body()), QUICK).bodies
-    carried = fit_bodies(FitInputs(keypoints, CAMERA, open_body(), ground=floor), QUICK).bodies
+    plain = fit(keypoints).bodies
+    carried = fit(keypoints, ground=floor).bodies
     depth = [
         (floor - b.joints @ CAMERA.R_cam_world[:, 1]).clamp_min(0).amax(1).mean()
         for b in (plain, carried)
@@ -297,10 +320,8 @@ def test_a_known_floor_carries_people(walk):
 @pytest.mark.slow
 def test_a_long_video_in_stretches_is_the_video_at_once(walk):
     keypoints = seen(walk, noise=1.0)
-    whole = fit_bodies(FitInputs(keypoints, CAMERA, open_body()), QUICK)
-    parts = fit_bodies(
-        FitInputs(keypoints, CAMERA, open_body()), dataclasses.replace(QUICK, chunk=10)
-    )
+    whole = fit(keypoints)
+    parts = fit(keypoints, dataclasses.replace(QUICK, chunk=10))
     assert parts.bodies.frame.tolist() == whole.bodies.frame.tolist()
     assert abs(off(parts, walk)[0] - off(whole, walk)[0]) < 0.02
 
@@ -327,30 +348,28 @@ def test_the_best_path_is_that_of_all_paths():
 
 def test_constant_velocity_costs_nothing_over_gaps_and_long_gaps_join_nothing():
     frame = torch.tensor([0, 1, 3, 4, 40, 41, 42])
-    triples = triples_of(keypoints_at(frame, 10.0), None, FitConfig())
-    assert triples.rows.tolist() == [[0, 1, 2], [1, 2, 3], [4, 5, 6]]
-    from mover.fitting.energy import second_difference
-
+    motion = motion_of(keypoints_at(frame, 10.0), None, FitConfig())
+    assert motion.near.triples.tolist() == [[0, 1, 2], [1, 2, 3], [4, 5, 6]]
     line = (0.3 * frame.float())[:, None, None].expand(-1, 2, 3)
-    assert second_difference(line, triples).abs().max() < 1e-5
-    assert len(triples_of(keypoints_at(frame, None), None, FitConfig()).rows) == 0
+    assert second_difference(line, motion.near).abs().max() < 1e-5
+    assert len(motion_of(keypoints_at(frame, None), None, FitConfig()).expected) == 0
     speed = torch.tensor([0, 0, 5, 5, 5, 0, 5.0])[:, None].repeat(1, 22)
-    speed[5, 20] = 5.0  # a wrist of who stands still
-    calm = triples_of(keypoints_at(frame, 10.0), speed, FitConfig())
+    speed[5, 20] = 5.0  # a wrist of a person at rest
+    calm = motion_of(keypoints_at(frame, 10.0), speed, FitConfig())
     still = calm.calm < 0.2 * calm.expected[:, None]
     assert still.all(1).tolist() == [True, False, False]
     assert still.sum(1).tolist() == [22, 0, 21]
-    torch.testing.assert_close(calm.calm[1], triples.calm[1])
+    torch.testing.assert_close(calm.calm[1], motion.calm[1])
 
 
-def test_prices_are_those_of_the_publication():
+def test_costs_are_those_of_the_publication():
     r = torch.tensor([0.0, 3.0, 100.0, 1e6])
     wanted = [0.0, 9e4 / 10009, 5000.0, 1e4]
-    torch.testing.assert_close(geman_mcclure(r**2, 100.0), torch.tensor(wanted), rtol=1e-4, atol=0)
-    assert float(bending_cost(torch.zeros(1, 63))) == 4.0
-    elbow = torch.zeros(1, 63)
-    elbow[0, 52] = 0.7  # the left elbow, backwards: index 55 of the full pose less the root's three
-    assert float(bending_cost(elbow)) == pytest.approx(3 + np.exp(1.4), rel=1e-5)
+    torch.testing.assert_close(robust_square(r**2, 100.0), torch.tensor(wanted), rtol=1e-4, atol=0)
+    elbow = torch.zeros(2, 63)
+    elbow[1, 52] = 0.7  # the left elbow, backwards: index 55 of the full pose less the root's three
+    cost = bent_wrong(elbow).exp().square().sum(-1)
+    assert cost.tolist() == pytest.approx([4.0, 3 + np.exp(1.4)], rel=1e-5)
     assert PUBLISHED[2].pose == 57.4
 
 
@@ -361,9 +380,9 @@ def test_limits_mirror_left_and_right_and_hold_the_resting_pose():
         torch.testing.assert_close(low[left, 1:], -high[right, 1:])
     assert ((low < rest) & (rest < high)).all()
     pose = resting(1, torch.zeros(1))
-    assert float(limit_cost(pose)) == 0
+    assert float(excess_of(pose).max()) == 0
     pose[0, 9] = np.radians(-9)  # the left knee forwards: 4 degrees beyond its limit
-    assert float(limit_cost(pose)) == pytest.approx(1, rel=1e-4)
+    assert float(excess_of(pose).square().sum()) == pytest.approx(1, rel=1e-4)
 
 
 def test_the_energy_has_the_gradient_of_finite_differences(walk):
@@ -371,11 +390,9 @@ def test_the_energy_has_the_gradient_of_finite_differences(walk):
         seen(walk), points=seen(walk).points[:3].double(), frame=torch.arange(3),
         confidence=torch.ones(3, 25).double(), person=torch.zeros(3, dtype=torch.long),
     )  # fmt: skip
-    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
-    looked = seen_of(keypoints, rig, CAMERA, FitConfig())
-    looked = dataclasses.replace(looked, K=looked.K.double(), floor=-0.5)
-    frame = Frame(rig, axis_angle(walk.pose.global_orient[:3]).double(), keypoints.person)
-    by = Weighed(Stage(), FitConfig(), ANGLES.decode, learned=False)
+    state = state_of(keypoints, walk.pose)
+    looked = dataclasses.replace(state.seen, K=state.seen.K.double(), floor=-0.5)
+    frame = dataclasses.replace(state.frame, root=state.frame.root.double())
     none = torch.zeros(3, 0).double()
     base = (
         0.1 * torch.ones(3, 3).double(),
@@ -384,35 +401,28 @@ def test_the_energy_has_the_gradient_of_finite_differences(walk):
         0.2 * torch.ones(1, 10).double(),
     )
 
-    def total(turn, code, place, betas):
-        return body_energy(Unknowns(turn, code, place, betas, none, none), frame, looked, by).total
+    def total(*values):
+        return (
+            FitState(Unknowns(*values, none, none), frame, looked, FitConfig())
+            .energy(Stage())
+            .total
+        )
 
     leaves = [v.clone().requires_grad_() for v in base]
     assert torch.autograd.gradcheck(total, leaves, eps=1e-6, rtol=1e-4, atol=1e-2, fast_mode=True)
 
 
 def test_a_weight_of_zero_needs_no_evidence(walk):
-    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
-    looked = seen_of(seen(walk), rig, CAMERA, FitConfig())
-    none = torch.zeros(12, 0)
-    at = Unknowns(torch.zeros(12, 3), walk.pose.body_pose, torch.ones(12, 3),
-                  torch.zeros(1, 10), none, none)  # fmt: skip
-    frame = Frame(rig, axis_angle(walk.pose.global_orient), walk.person)
-    by = Weighed(Stage(smooth=0.0), FitConfig(), ANGLES.decode, learned=False)
-    parts = body_energy(at, frame, looked, by).parts
+    parts = state_of(seen(walk), walk.pose).energy(Stage(smooth=0.0)).parts
     assert set(parts) == {"keypoints", "pose", "limits", "bending", "shape"}
     assert all((value >= 0).all() for value in parts.values())
 
 
 def test_frames_beyond_those_with_errors_of_their_own_do_not_constrain_the_shape(walk):
-    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
-    looked = seen_of(seen(walk), rig, CAMERA, FitConfig())
     person = (torch.arange(12) >= 8).long()  # eight rows of one, four of another
-    none, betas = torch.zeros(12, 0), torch.full((2, 10), 0.3)
-    at = Unknowns(torch.zeros(12, 3), walk.pose.body_pose, torch.ones(12, 3), betas, none, none)
-    frame = Frame(rig, axis_angle(walk.pose.global_orient), person)
-    by = Weighed(Stage(smooth=0.0), FitConfig(independent_frames=6), ANGLES.decode, learned=False)
-    shape = body_energy(at, frame, looked, by).parts["shape"] / (by.stage.shape**2 * 0.9)
+    config = FitConfig(independent_frames=6)
+    state = state_of(seen(walk), walk.pose, torch.full((2, 10), 0.3), person, config)
+    shape = state.energy(Stage(smooth=0.0)).parts["shape"] / (Stage().shape ** 2 * 0.9)
     torch.testing.assert_close(shape, torch.tensor([1 / 6] * 8 + [1 / 4] * 4))
     assert PAPER.independent_frames >= 100_000  # as published: all frames count
 
@@ -426,13 +436,13 @@ def test_models_of_the_users_files_are_fitted_with_hands_and_face(name, tmp_path
     walk = as_bodies(*walker(4))
     keypoints = seen(walk, layout="openpose137", noise=1.0)
     config = dataclasses.replace(QUICK, stages=(*QUICK.stages, Stage(4.78, 5, 4.78, 47.8, 1, 1)))
-    out = fit_bodies(FitInputs(keypoints, CAMERA, model), config)
+    out = fit(keypoints, config, model=model)
     assert out.bodies.verts.shape[1] == len(model.posed(out.bodies.pose)[0][0])
     miss = out.bodies.joints[:, :22] - walk.joints[:, :22]
     assert (miss - miss[:, :1]).norm(dim=-1).mean() < 0.08
     if name != "smpl":
         assert out.bodies.pose.extra["left_hand_pose"].shape == (4, 45)
-    again = fit_bodies(FitInputs(keypoints, CAMERA, model, start=out.bodies), config)
+    again = fit(keypoints, config, out.bodies, model)
     assert again.miss.mean() < 6
 
 
@@ -476,36 +486,24 @@ def test_a_second_pass_takes_camera_and_floor_of_a_result(tmp_path):
             _world(FitArgs(Path("k.npz"), **both))
 
 
-def test_the_preset_paper_prices_motion_as_printed():
+def test_the_preset_paper_weighs_motion_as_printed(walk):
     """L_smooth of a track at even times, by a loop over Sec. 3.2, with the released weights."""
-    from mover.fitting.energy import Seen, smooth_pixel_cost
-
-    generator = torch.Generator().manual_seed(0)
-    frames = torch.arange(5)
-    joints = torch.rand(5, 22, 3, generator=generator)
-    pixels = 900 * torch.rand(5, 4, 2, generator=generator)
-    triples = triples_of(keypoints_at(frames, 30.0), None, PAPER)
-    none = torch.zeros(5, 63)
-    seen = Seen(
-        pixels, torch.ones(5, 4), torch.eye(3), 1080, torch.tensor([0.0, -1, 0]), None, triples,
-        none, torch.ones(5, 63),
-    )  # fmt: skip
-    by = Weighed(PAPER.stages[0], PAPER, same, False)
-    stage = PAPER.stages[0].smooth
-    solid = stage * PAPER.smooth_joints * smooth_joint_cost(joints, seen, by).sum()
-    flat = stage * PAPER.smooth_pixels * smooth_pixel_cost(pixels, seen, by).sum()
+    keypoints = dataclasses.replace(seen(walk), fps=30.0, confidence=torch.ones(12, 25))
+    state = state_of(keypoints, walk.pose, config=PAPER)
+    parts = state.energy(PAPER.stages[0]).parts
 
     def rho(squared, sigma):
         return sigma**2 * squared / (squared + sigma**2)
 
-    wanted = [0.0, 0.0]
-    for t in range(1, 4):
+    joints, pixels = state.points.joints[:, :22], state.pixels
+    weight, wanted = state.seen.weight, [0.0, 0.0]
+    for t in range(1, 11):
         second = joints[t - 1] + joints[t + 1] - 2 * joints[t]
         wanted[0] += 1e2 * float(sum(rho(float(j.square().sum()), 0.1) for j in second))
-        second = pixels[t - 1] + pixels[t + 1] - 2 * pixels[t]
-        wanted[1] += 1e-2 * float(sum(rho(float(j.square().sum()), 100.0) for j in second))
-    assert float(solid) == pytest.approx(wanted[0], rel=1e-4)
-    assert float(flat) == pytest.approx(wanted[1], rel=1e-4)
+        second = (pixels[t - 1] + pixels[t + 1] - 2 * pixels[t]).square().sum(-1)
+        wanted[1] += 1e-2 * float((weight[t].square() * rho(second, 100.0)).sum())
+    assert float(parts["smooth_joints"].sum()) == pytest.approx(wanted[0], rel=1e-4)
+    assert float(parts["smooth_pixels"].sum()) == pytest.approx(wanted[1], rel=1e-4)
     assert [s.pose for s in PAPER.stages] == [4.78, 4.78]
 
 
@@ -524,18 +522,17 @@ def test_the_height_of_numbers_of_the_shape_is_that_of_the_body():
     betas = torch.tensor([[1.5, -1.0, 0.5], [0.0, 2.0, 0.0]])
     y = shaped(open_body(), betas)[0][..., 1]
     tall = y.amax(-1) - y.amin(-1)
-    told = stature_of(open_body(), tuple((tall + 0.02).tolist()), torch.arange(2), torch.arange(2))
+    known = stature_of(open_body(), tuple((tall + 0.02).tolist()), torch.arange(2), torch.arange(2))
     torch.testing.assert_close(
-        height_cost(told, betas), torch.full((2,), 4e-4), atol=1e-4, rtol=0.2
+        height_cost(known, betas), torch.full((2,), 4e-4), atol=1e-4, rtol=0.2
     )
 
 
 @pytest.mark.slow
-def test_people_whose_height_is_told_are_where_they_are(walk):
+def test_people_of_known_height_are_where_they_are(walk):
     tall = float(np.ptp(shaped(open_body(), walk.pose.betas[:1])[0][0, :, 1].numpy()))
-    told = FitInputs(seen(walk, noise=3.0), CAMERA, open_body(), heights=(tall,))
-    far = dataclasses.replace(told, heights=(1.1 * tall,))
-    right, tenth = (fit_bodies(one, QUICK) for one in (told, far))
+    keypoints = seen(walk, noise=3.0)
+    right, tenth = (fit(keypoints, heights=(share * tall,)) for share in (1.0, 1.1))
     assert right.bodies.size_spread == 0.0  # fitted bodies still: the floor under them may lean
     (_, near), (_, wrong) = (off(one, walk) for one in (right, tenth))
     assert near < 0.1
@@ -543,12 +540,13 @@ def test_people_whose_height_is_told_are_where_they_are(walk):
 
 
 def test_larger_bodies_do_not_move_less_smoothly(walk):
-    keypoints = seen(walk, noise=3.0)
-    rig = rig_of(open_body(), "openpose25", torch.ones(25, dtype=torch.bool))
-    looked = seen_of(keypoints, rig, CAMERA, FitConfig())
-    by = Weighed(Stage(), FitConfig(), ANGLES.decode, learned=False)
+    state = state_of(seen(walk, noise=3.0), walk.pose)
+    costs: list[torch.Tensor] = []
+    for joints in (walk.joints, 1.1 * walk.joints):
+        points = dataclasses.replace(state.points, joints=joints)
+        larger = dataclasses.replace(state)
+        larger.__dict__["points"] = points
+        costs.append(TERM["smooth_joints"](larger).sum())
     torch.testing.assert_close(size_of(1.1 * walk.joints), 1.1 * size_of(walk.joints))
-    sized = [j / size_of(j)[:, None, None] for j in (walk.joints, 1.1 * walk.joints)]
-    prices = [smooth_joint_cost(j, looked, by).sum() for j in sized]
-    torch.testing.assert_close(*prices)
-    assert smooth_joint_cost(walk.joints, looked, by).sum() > 0
+    torch.testing.assert_close(*costs)
+    assert costs[0] > 0

@@ -1,4 +1,4 @@
-"""Where a fit begins with people who lie: which way the head is, and what they are rolled to."""
+"""Where a fit begins with lying people: which way the head is, and what they are rolled to."""
 
 import dataclasses
 import math
@@ -16,12 +16,12 @@ from mover.fitting.start import turned_round
 from mover.geometry.rotations import rot_x, rot_y, rot_z, rotation_vectors
 
 UP = torch.tensor([0.0, -1.0, 0.0])
-BEGUN = FitConfig(stages=(dataclasses.replace(STAGES[1], steps=10),))
+STARTED = FitConfig(stages=(dataclasses.replace(STAGES[1], steps=10),))
 """Little more than the hypotheses, which decide."""
 
 
 def sleeper(rolls: torch.Tensor, head: float) -> Bodies:
-    """Somebody who lies 4 m away, 0.9 m below the camera, rolled from the back as far [rad]."""
+    """A person lying 4 m away, 0.9 m below the camera, rolled from the back as far [rad]."""
     pose, frame = walker(len(rolls))
     back = rot_y(torch.tensor(head)) @ rot_z(rolls) @ rot_x(torch.tensor(-0.5 * math.pi))
     place = torch.tensor([0.3, -0.9, -4.0]) @ CAMERA.R_cam_world.mT
@@ -37,9 +37,9 @@ def sleeper(rolls: torch.Tensor, head: float) -> Bodies:
 @pytest.mark.slow
 @pytest.mark.parametrize("head", [0.2, 3.0])
 @pytest.mark.parametrize("roll", [0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi])
-def test_who_lies_along_the_view_has_the_head_where_it_is(roll, head):
+def test_a_person_lying_along_the_view_has_the_head_where_it_is(roll, head):
     truth = sleeper(torch.full((10,), roll), head)
-    found = fit_bodies(FitInputs(seen(truth, "coco17", noise=4.0), CAMERA, open_body()), BEGUN)
+    found = fit_bodies(FitInputs(seen(truth, "coco17", noise=4.0), CAMERA, open_body()), STARTED)
     along = (trunk_of(found.bodies.joints) * trunk_of(truth.joints)).sum(-1)
     assert along.min() > 0.9
     miss = found.bodies.joints[:, :22] - truth.joints[:, :22]
@@ -54,11 +54,11 @@ def test_of_a_stretch_of_lying_the_way_of_the_most_counts():
     assert not against[:, 0].any()
     assert against[1:5, 1].all()
     assert not against[1:5, 2].any()
-    assert against[6:8, 2].all()  # lies the other way after having stood
+    assert against[6:8, 2].all()  # lying the other way after having stood
     assert not against[6:8, 1].any()
     assert not against[[0, 5, 8]].any()
 
 
-def test_where_nobody_lies_nothing_is_against_anything():
+def test_where_no_person_lies_nothing_is_against_anything():
     trunks = torch.stack([UP, torch.tensor([0.0, -0.7, 0.7])]).expand(4, 2, 3)
     assert not turned_round(trunks, torch.tensor([0, 1, 1, 0]), UP).any()

@@ -13,9 +13,9 @@ from mover.evaluate.bodies import procrustes
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig, Stage
 from mover.fitting.energy import HEIGHT, Seen
-from mover.fitting.limits import resting, spreads
 from mover.fitting.noise import FEW, at_most, bias_of, noise_of, without
-from mover.fitting.tracks import ALONE, stages_of
+from mover.fitting.priors import resting, spreads
+from mover.fitting.tracks import stages_of
 from mover.fitting.unknowns import NO_FLOOR, Frame, Unknowns, floor_of, rig_of
 
 LEFT = 0.45
@@ -25,7 +25,7 @@ def looked_at(weight):
     none = torch.zeros(len(weight), weight.shape[1], 2)
     rest = resting(len(weight), none)
     return Seen(
-        none, weight, torch.eye(3), 540, torch.tensor([0.0, -1, 0]), None, ALONE, rest,
+        none, weight, torch.eye(3), 540, torch.tensor([0.0, -1, 0]), None, rest,
         spreads(len(weight), none),
     )  # fmt: skip
 
@@ -52,7 +52,7 @@ def test_the_noise_of_each_person_is_found_beside_swaps_and_missing_joints():
 
 def test_a_keypoint_off_by_its_noise_costs_no_more_than_an_angle_off_by_its_spread():
     weight = torch.tensor([[0.9, 0.2, 0.0], [0.9, 0.2, 0.0]])
-    bounded = at_most(looked_at(weight), torch.tensor([6.0, 0.0]), pose=4.78).weight
+    bounded = at_most(looked_at(weight), torch.tensor([6.0, 0.0]), pose=4.78)
     cost = (HEIGHT / 540) ** 2 * bounded[0].square() * 6.0**2
     assert float(cost[0]) == pytest.approx(4.78**2, rel=1e-5)
     torch.testing.assert_close(bounded[0, 1:], weight[0, 1:])  # those that are less sure stay
@@ -86,7 +86,7 @@ def test_the_floor_is_as_much_lower_as_people_are_taller():
 
 
 def test_a_last_stage_is_spared_where_no_hand_or_face_is_seen():
-    body, hands = ["left_knee", "nose"], ["left_knee", "left_index1"]
+    body, hands = ("left_knee", "nose"), ("left_knee", "left_index1")
     assert stages_of(FitConfig(), body) == STAGES[:-1]
     assert stages_of(FitConfig(), hands) == STAGES
     assert stages_of(FitConfig(stages=(Stage(),)), body) == (Stage(),)

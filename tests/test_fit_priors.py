@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,26 +11,22 @@ from make_keypoints import CAMERA, as_bodies, keypoints_at, seen, walker
 
 from mover.bodies.skeleton import BODY
 from mover.bodies.skinning import open_body
+from mover.energy.body_energy import BODY_TERMS
+from mover.energy.body_terms import SIGMA_HELD, deviation_term, robust_square
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig
-from mover.fitting.energy import UPPER, Seen, Weighed, geman_mcclure, held_cost, pose_cost
+from mover.fitting.energy import UPPER
 from mover.fitting.ground import distances_of_lying_people, plane_of, sole_heights, soles_of
-from mover.fitting.limits import limit_cost, limit_table, resting, spreads
-from mover.fitting.prior import same
+from mover.fitting.priors import excess_of, limit_table, off_pose, resting, spreads
 from mover.fitting.start import BACK, lying_guesses, upright_guesses
-from mover.fitting.tracks import ALONE, joint_speed, triples_of
+from mover.fitting.tracks import CALM, joint_speed, motion_of
 from mover.geometry.rotations import axis_angle, rotation_vectors
 
 QUICK = FitConfig(
     start_steps=20,
     stages=(dataclasses.replace(STAGES[0], steps=25), dataclasses.replace(STAGES[1], steps=50)),
 )
-NONE, REST = torch.zeros(1, 1), resting(1, torch.zeros(1))
-NOTHING = Seen(
-    NONE[..., None].expand(1, 1, 2), NONE, torch.eye(3), 540, torch.tensor([0.0, -1, 0]), None,
-    ALONE, REST, spreads(1, REST),
-)  # fmt: skip
-"""Nothing is seen of one body."""
+REST = resting(1, torch.zeros(1))
 
 
 @pytest.mark.parametrize("fps", [5.0, 30.0])
@@ -57,7 +54,7 @@ def test_the_speed_in_the_image_is_that_of_most_joints_whatever_the_frame_rate(f
 
 
 @pytest.mark.slow
-def test_a_body_along_the_view_does_not_jump_between_frames_that_look_alike():
+def test_a_body_along_the_view_does_not_jump_between_frames_that_look_similar():
     pose, frame = walker(12)
     lying = axis_angle(torch.tensor([[-1.35, 0.0, 0.0]])) @ axis_angle(pose.global_orient[:1])
     still = dataclasses.replace(
@@ -88,10 +85,11 @@ def test_limbs_that_look_still_are_held_and_no_others():
     slow = torch.zeros(5, 22)
     fast = torch.full((5, 22), torch.inf)
 
+    held = next(term.cost for term in BODY_TERMS if term.name == "held")
+
     def cost(moved: torch.Tensor, speed: torch.Tensor) -> float:
-        triples = triples_of(keypoints_at(row, 5.0), speed, FitConfig())
-        by = Weighed(STAGES[1], FitConfig(), same, learned=False)
-        return float(held_cost(moved, dataclasses.replace(NOTHING, triples=triples), by).sum())
+        motion = motion_of(keypoints_at(row, 5.0), speed, FitConfig())
+        return float(held(SimpleNamespace(sized=moved, upper=UPPER, motion=motion)).sum())
 
     steady = joints + time[:, None, None]
     assert cost(steady, slow) < 1e-6  # all of it moves evenly
@@ -100,25 +98,25 @@ def test_limbs_that_look_still_are_held_and_no_others():
     arm[2, BODY.index("left_wrist"), 2] += 0.1
     whole[2] += 0.1
     assert cost(leg, slow) < 1e-6
-    assert cost(whole, slow) < 1e-6  # which is penalised by `still_cost`
+    assert cost(whole, slow) < 1e-6  # which is penalised by `still`
     second = torch.tensor([0.1, 0.2, 0.1]).square()
-    calm = FitConfig().jitter + FitConfig().calm / 25
-    wanted = geman_mcclure(second, FitConfig().sigma_held).sum() / calm**2
+    calm = FitConfig().jitter + CALM / 25
+    wanted = robust_square(second, SIGMA_HELD).sum() / calm**2
     assert cost(arm, slow) == pytest.approx(float(wanted), rel=1e-4)
     assert cost(arm, fast) < 0.02 * cost(arm, slow)
 
 
 def test_an_ankle_that_levels_the_foot_costs_no_more_than_one_at_rest():
-    rest, looked = resting(1, torch.zeros(1)), NOTHING
+    rest, spread = REST, spreads(1, REST)
     bent, level = rest.clone(), rest.clone()
     for joint, turn in (("left_hip", -0.7), ("left_knee", 1.0)):
         column = 3 * (BODY.index(joint) - 1)
         bent[0, column] += turn
         level[0, column] += turn
     level[0, 3 * (BODY.index("left_ankle") - 1)] -= 0.3
-    assert float(pose_cost(rest, looked)) == 0
-    ankle = (0.3 / math.radians(14)) ** 2
-    assert float(pose_cost(bent, looked) - pose_cost(level, looked)) == pytest.approx(ankle)
+    costs = [deviation_term(off_pose(pose, REST), spread) for pose in (rest, bent, level)]
+    assert float(costs[0]) == 0
+    assert float(costs[1] - costs[2]) == pytest.approx((0.3 / math.radians(14)) ** 2)
 
 
 def lying_down(depths, rises):
@@ -131,7 +129,7 @@ def lying_down(depths, rises):
     return joints
 
 
-def test_who_lies_along_the_view_is_expected_where_they_sat_before_and_after():
+def test_a_person_lying_along_the_view_is_expected_where_they_sat_before_and_after():
     upright = [1.5] * 4
     joints = lying_down([4.0] * 4 + [4.9] * 5 + [4.4] * 4, upright + [0.0] * 5 + upright)
     time = torch.arange(13) / 5
@@ -144,10 +142,10 @@ def test_who_lies_along_the_view_is_expected_where_they_sat_before_and_after():
     alone = distances_of_lying_people(
         joints[4:9], torch.tensor([0.0, -1, 0]), [torch.arange(5)], time[4:9]
     )
-    assert alone.isnan().all()  # nobody knows where they came from
+    assert alone.isnan().all()  # it is not known where they came from
 
 
-def test_a_body_across_the_view_tells_its_distance_itself():
+def test_a_body_across_the_view_shows_its_distance_itself():
     joints = lying_down([4.0, 4.9, 4.0], [1.5, 0.0, 1.5])
     joints[1, BODY.index("neck")] = torch.tensor([0.5, 0.0, 4.9])
     track = [torch.arange(3)]
@@ -171,9 +169,9 @@ def test_a_leaning_floor_lies_where_its_soles_are():
     assert float(sole_heights(joints, soles, leaned)) == pytest.approx(-1.4, abs=1e-5)
 
 
-def test_upright_bodies_are_expected_alike_on_both_sides_and_nearly_straight_where_they_stand():
+def test_upright_bodies_are_symmetric_and_nearly_straight_where_they_stand():
     poses = torch.stack([guess.pose for guess in upright_guesses(torch.zeros(1))[::4]])
-    assert not limit_cost(poses).any()
+    assert not excess_of(poses).any()
     mirrored = poses.unflatten(-1, (21, 3)) * torch.tensor([1.0, -1.0, -1.0])
     other = [name.replace("left", "+").replace("right", "left").replace("+", "right")
              for name in BODY[1:]]  # fmt: skip
@@ -184,7 +182,7 @@ def test_upright_bodies_are_expected_alike_on_both_sides_and_nearly_straight_whe
     assert stand.max() <= 20 < 75 <= sit.min()
 
 
-def test_only_who_lies_has_arms_anywhere_in_their_ranges():
+def test_only_lying_people_have_arms_anywhere_in_their_ranges():
     like = torch.zeros(1, dtype=torch.float64)
     usual, generator = spreads(1, like)[0], np.random.default_rng(0)
     low, high = (x.numpy() for x in limit_table()[:2])

@@ -3,7 +3,6 @@
 import torch
 
 from mover.energy.body_contact import Skin, Surface, gather_matches, touch_term
-from mover.energy.config import MatchConfig
 
 SEAT, BACK = 0, 1
 HEIGHTS = torch.tensor([0.0, 0.01, 0.03, 0.035])  # over the mattress: a back arches
@@ -25,7 +24,7 @@ def on_a_mattress(lying: list[bool], lift: float = 0.0) -> tuple[Skin, Surface]:
 
 def test_the_hollow_back_of_who_lies_is_not_drawn_down_while_the_seat_rests() -> None:
     skin, mattress = on_a_mattress([True, False])
-    found = gather_matches(skin, mattress, MatchConfig())
+    found = gather_matches(skin, mattress)
     asked = torch.zeros(2, 4).index_put((found.body, found.point), found.weight)
     torch.testing.assert_close(asked, torch.tensor([[1.0, 1, 0, 0], [1.0, 1, 1, 1]]))
     slope = torch.autograd.functional.jacobian(
@@ -38,9 +37,9 @@ def test_the_hollow_back_of_who_lies_is_not_drawn_down_while_the_seat_rests() ->
 def test_a_mattress_bears_who_lies_by_what_rests_on_it_wherever_the_body_begins() -> None:
     for lift in (-0.05, 0.05):
         skin, mattress = on_a_mattress([True], lift)
-        found = gather_matches(skin, mattress, MatchConfig())
+        found = gather_matches(skin, mattress)
         shifts = torch.linspace(-0.08, 0.08, 161)
         up = torch.tensor([0.0, 1.0, 0.0])
-        price = torch.stack([touch_term(skin.points + s * up, found, 0.1).sum() for s in shifts])
-        lowest = (skin.points[0, :, 1] + shifts[price.argmin()]).min()
+        cost = torch.stack([touch_term(skin.points + s * up, found, 0.1).sum() for s in shifts])
+        lowest = (skin.points[0, :, 1] + shifts[cost.argmin()]).min()
         assert abs(float(lowest)) < 0.007  # between both points of the seat

@@ -9,6 +9,7 @@ from reference import use_engine
 
 from mover.core.types import Layout
 from mover.energy import objective
+from mover.energy.body_energy import BODY_TERMS
 from mover.energy.config import BodyWeights, SceneConfig, SceneWeights, only
 from mover.energy.fused import energy
 from mover.energy.fused.energy import energy_function, energy_of_rows
@@ -24,7 +25,6 @@ from mover.pipeline.presets import PRESETS
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.place_inputs import with_walls
 from mover.stages.objects.place_objects import energy_of, with_trees
-from mover.stages.people.body_energy import BODY_TERMS
 
 WEIGHTS = [f.name for f in fields(SceneWeights)]
 PRECISIONS = [torch.float32, torch.float64]

@@ -18,7 +18,7 @@ COUNT = 12
 
 
 def shaken(truth: Bodies, place: float, angle: float, seed: int = 0) -> Bodies:
-    """Bodies off their place, and their angles off, anew in each frame [m], [rad]."""
+    """Bodies off their place, and their angles off, again in each frame [m], [rad]."""
     rng = torch.Generator().manual_seed(seed)
     by = no_correction(puppet_of(truth, torch.arange(3)))
     size = by.angles.shape

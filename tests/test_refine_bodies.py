@@ -23,11 +23,12 @@ from mover.energy.body_contact import (
     without_kept,
 )
 from mover.energy.body_terms import (
+    ANGLE,
     Bounds,
     Sighting,
-    angle_term,
     bounds_of_skin,
     depth_share,
+    deviation_term,
     gather_neighbours,
     image_term,
     lock_term,
@@ -39,7 +40,7 @@ from mover.energy.body_terms import (
     steady_term,
     under_term,
 )
-from mover.energy.config import Adam, MatchConfig
+from mover.energy.config import Adam
 from mover.geometry.mesh import vertex_normals
 from mover.geometry.volume import Volume
 from mover.io.people.bodies import bodies_from
@@ -119,7 +120,7 @@ MATCHES = Matches(
 )  # fmt: skip
 AWAY = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
 TERMS = {
-    "angles": lambda x: angle_term(x.flatten(1)),
+    "angles": lambda x: 0.5 * deviation_term(x.flatten(1), ANGLE),
     "range": lambda x: range_term(x[:, 0, 0], LINE.track),
     "image": lambda x: image_term(x + AWAY, 0 * x.detach() + AWAY),
     "smooth": lambda x: smooth_term(x, LINE),
@@ -185,7 +186,7 @@ def test_the_size_in_the_image_says_nothing_about_the_depth():
     assert (image_term(bent + ray, start) > 0.5).all()
 
 
-def test_points_behind_the_camera_have_finite_prices():
+def test_points_behind_the_camera_have_finite_costs():
     behind = torch.tensor([[[0.1, 0.2, -1.0]]], requires_grad=True)
     start = torch.tensor([[[0.1, 0.2, 3.0]]])
     (image_term(behind, start).sum() + depth_share(behind[:, 0], start[:, 0]).sum()).backward()
@@ -210,28 +211,28 @@ def test_a_thigh_lies_on_the_seat_and_not_on_its_front():
         torch.tensor([[-0.3, 0.0, 0.0], [-0.2, 0.0, 0.0], [0.0, -0.02, 0.0]]),
         torch.tensor([[0.0, 1, 0], [0.0, 1, 0], [1.0, 0, 0]]), torch.zeros(3).long(), ONE,
     )  # fmt: skip
-    found = gather_matches(skin_of(points, normals, [0, 0, 0]), seat, MatchConfig())
+    found = gather_matches(skin_of(points, normals, [0, 0, 0]), seat)
     assert found.point.tolist() == [0, 1]
-    alone = gather_matches(skin_of(points, normals, [0, 0, 1]), seat, MatchConfig())
+    alone = gather_matches(skin_of(points, normals, [0, 0, 1]), seat)
     assert alone.point.tolist() == [0, 1, 2]
 
 
-def test_far_skin_is_believed_less_while_the_pose_may_be_wrong():
+def test_far_skin_is_trusted_less_while_the_pose_may_be_wrong():
     points = torch.tensor([[[0.4, 0.0, 0.0], [0.0, 0.0, 0.0]]])
     normals = torch.tensor([[[0.0, -1, 0], [0.0, -1, 0]]])
     floor = replace(WALL, points=points[0], normals=-normals[0], piece=torch.zeros(2).long())
-    usual = gather_matches(skin_of(points, normals, [0, 1], 0.09), floor, MatchConfig()).usual
+    usual = gather_matches(skin_of(points, normals, [0, 1], 0.09), floor).usual
     torch.testing.assert_close(usual, torch.tensor([(0.02**2 + 0.036**2) ** 0.5, 0.02]))
 
 
 def test_an_error_that_lasts_says_no_more_in_a_hundred_frames_than_in_one():
     """The shared error is that of the normal equations; a lone error costs as without it."""
     off, trust = torch.tensor([0.03, 0.05, 0.01]).double(), torch.tensor([4e3, 1e3, 2e3]).double()
-    rest, price = without_kept(off, trust, torch.tensor([0, 0, 1]), 0.02)
+    rest, cost = without_kept(off, trust, torch.tensor([0, 0, 1]), 0.02)
     left = torch.tensor([[5e3 + 2500.0, 0], [0, 2e3 + 2500.0]]).double()
     shared = torch.linalg.solve(left, torch.tensor([4e3 * 0.03 + 1e3 * 0.05, 2e3 * 0.01]).double())
     torch.testing.assert_close(rest, off - shared[[0, 0, 1]])
-    torch.testing.assert_close(float(price.sum()), float((0.5 * (shared / 0.02) ** 2).sum()))
+    torch.testing.assert_close(float(cost.sum()), float((0.5 * (shared / 0.02) ** 2).sum()))
     many = without_kept(off[:1].expand(100), trust[:1].expand(100), torch.zeros(100).long(), 0.02)
     total = (0.5 * trust[0] * many[0].square() + many[1]).sum()
     assert float(total) < 0.5 * (0.03 / 0.02) ** 2
@@ -240,12 +241,12 @@ def test_an_error_that_lasts_says_no_more_in_a_hundred_frames_than_in_one():
 def test_only_surfaces_that_face_the_skin_are_touched():
     points = torch.tensor([[[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]])
     skin = skin_of(points, torch.tensor([[[0.0, -1, 0], [0.0, 1, 0]]]), [0, 1])
-    found = gather_matches(skin, WALL, MatchConfig())
+    found = gather_matches(skin, WALL)
     assert found.point.tolist() == [0]
     sunk = replace(skin, points=-points)
-    assert gather_matches(sunk, WALL, MatchConfig()).point.tolist() == [0]
+    assert gather_matches(sunk, WALL).point.tolist() == [0]
     unsure = replace(skin, chance=torch.full((1, 2), 0.5))
-    assert len(gather_matches(unsure, WALL, MatchConfig()).body) == 0
+    assert len(gather_matches(unsure, WALL).body) == 0
 
 
 def test_visible_skin_is_before_and_hidden_skin_behind_the_furniture():
@@ -321,7 +322,7 @@ def test_bare_meshes_move_rigidly():
 @pytest.mark.slow
 @pytest.mark.skipif(not SAM.is_dir(), reason="the real SAM 3D Body files are not here")
 def test_real_people_of_sam_3d_body_stand_on_the_floor_of_their_feet(tmp_path):
-    """A photograph of four people who jump: who is far above the floor stays in the air."""
+    """A photograph of four people who jump: a person far above the floor stays in the air."""
     for file in SAM.glob("img_*.npz"):
         (tmp_path / file.name).symlink_to(file)
     read = bodies_from("sam3dbody", tmp_path, Known(faces=SAM / "mhr_lod1_topology.ply"))
@@ -344,7 +345,7 @@ def test_real_people_of_sam_3d_body_stand_on_the_floor_of_their_feet(tmp_path):
     torch.testing.assert_close(kept, shape, atol=1e-4, rtol=0)
 
 
-def test_who_touches_nothing_stays_where_they_are():
+def test_people_who_touch_nothing_stay_where_they_are():
     bodies = still_people(ARMS_DOWN, 3, lift=0.4, at=(1.0, -4.0))
     room = room_with(bodies, ((0.5, 0.5, 0.5), (-1.0, GROUND, -3.0)))
     config = replace(QUICK, rounds=1, weights=replace(QUICK.weights, stand=0.0))
@@ -364,7 +365,7 @@ def test_chunks_do_not_show():
 
 @pytest.mark.slow
 def test_people_meet_moved_furniture_where_it_stands_while_they_are_there():
-    """As two videos, one of each time, and nobody knows of the other time."""
+    """As two videos, one of each time, and none knows of the other time."""
     bodies = replace(still_people(SEATED, 4), frame=torch.tensor([9, 0, 8, 1]))
     height = float(seat_gap(bodies, 0.0)[0]) + 0.05
     room = room_with(bodies, ((0.6, height, 0.6), (2.0, GROUND, -3.1)))

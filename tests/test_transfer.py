@@ -13,7 +13,7 @@ from scipy import sparse
 from mover.bodies.smpl_files import FOLDER, load_smpl
 from mover.bodies.transfer import as_smplx, find_matrix, read_matrix
 from mover.core.errors import InputError
-from mover.fitting.given import _by_matrix
+from mover.fitting.start import _by_matrix
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
 import torch
 from make_keypoints import CAMERA, as_bodies, seen, walker
@@ -17,7 +16,6 @@ from mover.fitting.prior import (
     encoded,
     gram_schmidt,
     load_vposer,
-    nearest_rotations,
     vectors_of,
     vposer_prior,
 )
@@ -90,21 +88,6 @@ def test_our_decoder_gives_the_rotations_of_the_network(both):
     eye = torch.eye(3).double().expand(5, 21, 3, 3)
     torch.testing.assert_close(turns @ turns.mT, eye, atol=1e-5, rtol=0)
     assert (torch.linalg.det(turns) > 0.99).all()
-
-
-def test_arrays_of_the_third_kind_are_read(tmp_path):
-    rng = np.random.default_rng(0)
-    sizes = ((32, 64), (64, 64), (64, 23 * 9))
-    arrays = {}
-    for k, size in enumerate(sizes, 1):
-        arrays |= {f"fc{k}W": rng.normal(size=size), f"fc{k}b": rng.normal(size=size[1])}
-    np.savez(tmp_path / "vposer.npz", **arrays)
-    z = rng.normal(size=(2, 32))
-    x = np.tanh(z @ arrays["fc1W"] + arrays["fc1b"])
-    x = np.tanh(x @ arrays["fc2W"] + arrays["fc2b"]) @ arrays["fc3W"] + arrays["fc3b"]
-    turns = decoded(load_vposer(tmp_path / "vposer.npz"), torch.tensor(z).float())
-    wanted = nearest_rotations(torch.tensor(x).float().reshape(2, 23, 3, 3)[:, :21])
-    torch.testing.assert_close(turns, wanted, atol=1e-3, rtol=0)
 
 
 def test_vectors_are_the_inverse_of_rotations_with_finite_gradients():

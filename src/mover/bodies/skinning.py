@@ -1,7 +1,7 @@
 """Linear blend skinning: from shape and pose to vertices and joints, batched, differentiable."""
 
 import dataclasses
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -69,7 +69,7 @@ def skinned(
     transl: Float[Tensor, "bodies 3"],
 ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
     """Vertices and joints in a pose, from rest shapes and the rotation of each joint [m]."""
-    world, places = _pose_joints(model, turns, joints)
+    world, places = pose_joints(model, turns, joints)
     offset = places - torch.einsum("bjik,bjk->bji", world, joints)
     moves = torch.cat([world, offset[..., None]], -1)
     some = (x.split(AT_ONCE) for x in (moves, verts, transl))
@@ -147,27 +147,34 @@ def shaped(
     return model.verts.to(betas) + verts, model.joints.to(betas) + joints
 
 
-def _pose_joints(
+def pose_joints(
     model: SkinnedBody,
     turns: Float[Tensor, "bodies joints 3 3"],
     joints: Float[Tensor, "bodies joints 3"],
 ) -> tuple[Float[Tensor, "bodies joints 3 3"], Float[Tensor, "bodies joints 3"]]:
-    """World rotation (from the rest shape) and place of each joint, down the tree."""
+    """World rotation (from the rest shape) and position of each joint, level by level."""
     tpose = model.tpose.to(turns)
-    world: list[Tensor] = []
-    places: list[Tensor] = []
-    above = torch.tensor([max(p, 0) for p in model.parents], device=joints.device)
-    bones = (tpose[above] @ (joints - joints[:, above])[..., None]).unbind(1)
-    for parent, turn, bone, start in zip(
-        model.parents, turns.unbind(1), bones, joints.unbind(1), strict=True
-    ):
-        if parent < 0:
-            world.append(turn)
-            places.append(start)
-            continue
-        world.append(world[parent] @ turn)
-        places.append(places[parent] + (world[parent] @ bone)[..., 0])
-    return torch.stack(world, 1) @ tpose, torch.stack(places, 1)
+    parents = torch.tensor([max(p, 0) for p in model.parents], device=joints.device)
+    bones = tpose[parents] @ (joints - joints[:, parents])[..., None]
+    levels, above, back = _levels(model.parents)
+    world, places = [turns[:, levels[0]]], [joints[:, levels[0]]]
+    for level, up in zip(levels[1:], above, strict=True):  # all knees at once
+        parent = world[-1][:, up]
+        world.append(parent @ turns[:, level])
+        places.append(places[-1][:, up] + (parent @ bones[:, level])[..., 0])
+    return torch.cat(world, 1)[:, back] @ tpose, torch.cat(places, 1)[:, back]
+
+
+@lru_cache(maxsize=16)
+def _levels(parents: tuple[int, ...]) -> tuple[list[list[int]], list[list[int]], list[int]]:
+    """Joints by depth, their parents' index in the level above, and the way back to their order."""
+    depth: list[int] = []
+    for parent in parents:
+        depth.append(depth[parent] + 1 if parent >= 0 else 0)
+    levels = [[j for j, d in enumerate(depth) if d == k] for k in range(max(depth) + 1)]
+    above = [[levels[k - 1].index(parents[j]) for j in levels[k]] for k in range(1, len(levels))]
+    order = [joint for level in levels for joint in level]
+    return levels, above, sorted(range(len(order)), key=order.__getitem__)
 
 
 @cache

@@ -85,23 +85,34 @@ class SmplBody:
             InputError: If the numbers of coefficients or angles are not this model's.
         """
         turns = axis_angle(angles_of(self.skin, with_full_hands(self, pose)))
-        verts, joints = shaped(self.skin, pose.betas)
         face = pose.extra.get("expression")
-        if face is not None and self.name == "smplx":
-            count = face.shape[-1]
-            if count > self.expression_dirs.shape[-1]:
-                most = self.expression_dirs.shape[-1]
+        verts, joints = self.rest(turns, pose.betas, face if self.name == "smplx" else None)
+        return skinned(self.skin, turns, verts, joints, pose.transl)
+
+    def rest(
+        self,
+        turns: Float[Tensor, "bodies joints 3 3"],
+        betas: Float[Tensor, "bodies shape"],
+        face: Float[Tensor, "bodies expression"] | None,
+    ) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
+        """Rest shape and joints with the correctives of pose and expression [m].
+
+        Raises:
+            InputError: If there are more coefficients than the model knows.
+        """
+        verts, joints = shaped(self.skin, betas)
+        if face is not None:
+            count, most = face.shape[-1], self.expression_dirs.shape[-1]
+            if count > most:
                 found = f"has {count} columns, the model '{self.name}' knows {most}"
                 raise InputError(f"bodies.npz: 'expression' {found}")
             dirs = self.expression_dirs[..., :count].to(verts)
             verts = verts + torch.einsum("vik,bk->bvi", dirs, face.to(verts))
             dirs = self.expression_joint_dirs[..., :count].to(verts)
             joints = joints + torch.einsum("jik,bk->bji", dirs, face.to(verts))
-        eye = torch.eye(3, dtype=turns.dtype, device=turns.device)
-        features = (turns[:, 1:] - eye).flatten(1)
+        features = (turns[:, 1:] - torch.eye(3).to(turns)).flatten(1)
         moved = features @ self.pose_dirs.to(verts).flatten(1)
-        verts = verts + moved.reshape(verts.shape)
-        return skinned(self.skin, turns, verts, joints, pose.transl)
+        return verts + moved.reshape(verts.shape), joints
 
 
 Model = SkinnedBody | SmplBody

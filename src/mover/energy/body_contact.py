@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.records import record
-from mover.energy.config import MatchConfig
 from mover.energy.minimize import geman_mcclure
 from mover.geometry.nearest import as_float64
 from mover.geometry.volume import Volume, sample
@@ -60,6 +59,8 @@ USUAL = 0.02  # [m], usual distance of skin that touches
 LAYER = 0.015  # [m], skin of a group that is no farther than this from its foremost point touches
 POINTS = 3.0  # independent places of a group that touches
 KEPT = 0.01  # [m], usual error that a part of a person has on one piece in all frames
+LEAST_CHANCE = 0.5  # above it a point of the skin touches (the paper's threshold)
+REACH = 0.25  # [m], farther no surface is touched
 EDGE = 0.03  # [m], by which a plane and the furniture's own distance may differ
 
 
@@ -119,13 +120,12 @@ class Matches:
     """Usual size of each of these errors [m]."""
 
 
-def gather_matches(
-    skin: Skin, surface: Surface, config: MatchConfig, furniture: Volume | None = None
-) -> Matches:
+def gather_matches(skin: Skin, surface: Surface, furniture: Volume | None = None) -> Matches:
     """The nearest surface that faces each skin point that touches."""
-    body, point = (skin.chance > config.least).nonzero(as_tuple=True)
+    body, point = (skin.chance > LEAST_CHANCE).nonzero(as_tuple=True)
     if not len(body) or not len(surface.points):
-        return _nothing(skin)
+        none, empty = skin.points.new_zeros(0, 3), torch.zeros(0, dtype=torch.long)
+        return Matches(empty, empty, none, none, none[:, 0], none[:, 0], empty, none[:, 0])
     places, facing = skin.points[body, point].detach(), skin.normals[body, point].detach()
     index = _nearest(places, facing, surface)
     place, normal = surface.points[index], surface.normals[index]
@@ -134,7 +134,7 @@ def gather_matches(
     part = body * groups + skin.group[point]
     looks = _looks(facing, skin.chance[body, point], part)
     keep = ((facing * normal).sum(-1) < FACING) & ((looks * normal).sum(-1) < FACING)
-    keep = keep & ((places - place).norm(dim=-1) < config.reach)
+    keep = keep & ((places - place).norm(dim=-1) < REACH)
     if furniture is not None:
         keep = keep & _on_surface(sample(furniture, places), off)
     body, point, place, normal, part, off, index = (
@@ -226,9 +226,3 @@ def touch_term(
     cost = 0.5 * (rho / matches.usual).square() * matches.weight * geman_mcclure(off, rho)
     cost = cost + lasting
     return skin.new_zeros(len(skin)).index_add(0, matches.body, cost)
-
-
-def _nothing(skin: Skin) -> Matches:
-    empty = torch.zeros(0, dtype=torch.long)
-    none = skin.points.new_zeros(0, 3)
-    return Matches(empty, empty, none, none, none[:, 0], none[:, 0], empty, none[:, 0])

@@ -1,11 +1,17 @@
-r"""Terms of the energy of the bodies (Sec. "HPS estimation"), by which they are refined in a room.
+r"""Terms of the energy of bodies: E_Body of `mover fit`, and the refinement in a room (Sec. 3.2).
 
-Near to what was given (angles, image, range), smooth in time (smooth, steady, lock), in the room
-(under, stand, sink; after PROX), in the order of depths (order) and on their masks (outline). Skin
-that touches (touch) stands in `body_contact`. All are in nats, one value for each body.
+    E_Body = Σ_t E_SMPLify-X(t) + λ_smooth L_smooth,
+    E_SMPLify-X = (1000 / H)² Σ_j (w_j c_j)² ρ(π(J_j) - x_j) + E_pose + E_shape + E_hands + E_face
+                  + E_bend,
+    L_smooth = Σ_t ρ(|J_{t-1} + J_{t+1} - 2 J_t|; σ2) + ρ(|π(J_{t-1}) + π(J_{t+1}) - 2 π(J_t)|; σ3)
+
+after Pavlakos et al. 2019 (SMPLify-X, Sec. 3.2 and its published configuration) and the paper;
+ρ(r; σ) = σ² r² / (r² + σ²), for keypoints on each coordinate. The refinement keeps bodies near to
+what was given (angles, image, range), smooth in time (smooth, steady, lock), in the room (under,
+stand, sink; after PROX), in the order of depths (order) and on their masks (outline), in nats; skin
+that touches stands in `body_contact`. All return one value for each body; `body_energy` lists them.
+Self-collision is left out, as in the authors' video configuration.
 """
-
-from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,6 +21,32 @@ from mover.core.records import record
 from mover.energy.minimize import geman_mcclure, safe_norm
 from mover.geometry.camera import project
 from mover.geometry.volume import Volume, sample
+
+
+def robust_square(
+    squared: Float[Tensor, "*any"], rho: float | Float[Tensor, "*#any"]
+) -> Float[Tensor, "*any"]:
+    """ρ² r² / (r² + ρ²): r² near zero, ρ² far away."""
+    return rho**2 * squared / (squared + rho**2)
+
+
+def deviation_term(
+    off: Float[Tensor, "bodies numbers"], usual: float | Float[Tensor, "*bodies numbers"] = 1.0
+) -> Float[Tensor, " bodies"]:
+    """Squared deviations over their usual size: of angles, coefficients and offsets."""
+    return (off / usual).square().sum(-1)
+
+
+def keypoint_term(
+    pixels: Float[Tensor, "bodies keypoints 2"],
+    seen: Float[Tensor, "bodies keypoints 2"],
+    weight: Float[Tensor, "bodies keypoints"],
+    rho: float,
+) -> Float[Tensor, " bodies"]:
+    """Robust squared distances of projected keypoints from detected ones [px²]."""
+    cost = robust_square((pixels - seen).square(), rho).sum(-1)
+    return (cost * weight.square()).sum(-1)
+
 
 # --- Near to what was given: the prior of the refinement -----------------------------------------
 #
@@ -33,11 +65,6 @@ IMAGE_USUAL = 0.03  # [m], usual error of a joint across the ray
 IMAGE_LOST = 0.15  # [m], an error across the ray that is down-weighted
 IMAGE_POINTS = 3.0  # joints whose places are independent: a body that is off is off as a whole
 NEAR = 0.1  # [m], nearer no depth is taken to be
-
-
-def angle_term(angles: Float[Tensor, "bodies angles"]) -> Float[Tensor, " bodies"]:
-    """Cost of turning joints by these angles [rad]; of nothing, where there are none."""
-    return 0.5 * (angles / ANGLE).square().sum(-1)
 
 
 def depth_share(
@@ -91,11 +118,14 @@ def image_term(
 # --- Time: people move smoothly, and errors last -------------------------------------------------
 #
 # Evidence:  rows of one track at most a second apart.
-# Cost:      smooth: rho(x(t) between its neighbours in time), x the joints and the pelvis, rho
-#            Geman-McClure; the size of an honest residual grows with the time between the frames.
+# Cost:      motion: rho(second difference of x), x the joints, their projections or the pelvis,
+#            over what people do in that time; Geman-McClure.
 #            steady: change between two frames of what was changed: an error of pose or depth does
 #            not come and go. lock: way of a sole at rest between two frames.
-# Paper:     second differences of joints and of their pixels at the video's rate, whatever it is.
+# Paper:     second differences at the video's rate, whatever it is (L_smooth).
+# Departure: they are taken over real time, so that gaps and frame rates make no acceleration. A fit
+#            divides those of 3D joints by the size of the body: most of them is noise of the
+#            keypoints, which is longer in metres the larger and the farther the body is estimated.
 
 GAP = 1.0  # [s], longer nothing is known about the way between two frames
 TREMBLE = 0.02  # [m], second difference of a body that is fitted frame by frame
@@ -107,6 +137,9 @@ DEPTH_LASTS = 1.0  # [s]
 FRESH = 0.003  # share of the depth's error that is new in each frame
 SLIP = 0.02  # [m], usual way of a sole at rest in a fit
 SMOOTH_POINTS = 8.0  # joints whose ways are independent, of all of them
+SIGMA_JOINTS = 0.1  # sigma_2 of the paper [m]
+SIGMA_PIXELS = 100.0  # sigma_3 of the paper [px]
+SIGMA_HELD = 0.25  # of limbs about the pelvis, in sizes of the body
 
 
 @record
@@ -129,40 +162,50 @@ def gather_neighbours(
     frame: Int[Tensor, " bodies"], person: Int[Tensor, " bodies"], fps: float | None
 ) -> Neighbours:
     """Rows of the same track that follow each other within a second; none of unordered images."""
-    count = len(frame)
-    order = sorted(range(count), key=lambda k: (int(person[k]), int(frame[k])))
-    pairs: list[tuple[int, int]] = []
-    gaps: list[float] = []
-    for a, b in pairwise(order):
-        gap = float(frame[b] - frame[a]) / (fps or 1.0)
-        if fps is not None and person[a] == person[b] and 0 < gap <= GAP:
-            pairs.append((a, b))
-            gaps.append(gap)
-    after = dict(zip(pairs, gaps, strict=True))
-    follows = dict(pairs)
-    triples = [(a, b, follows[b]) for a, b in pairs if b in follows]
-    steps = [(after[a, b], after[b, c]) for a, b, c in triples]
-    return Neighbours(
-        torch.tensor(triples, dtype=torch.long).reshape(-1, 3),
-        torch.tensor(steps).reshape(-1, 2),
-        torch.tensor(pairs, dtype=torch.long).reshape(-1, 2),
-        torch.tensor(gaps),
-        person.unique(return_inverse=True)[1],
-    )
+    order = torch.argsort(frame, stable=True)
+    order = order[torch.argsort(person[order], stable=True)]
+    pairs = torch.stack([order[:-1], order[1:]], 1)
+    gaps = frame[pairs].double().diff(dim=1)[:, 0] / (fps or 1.0)
+    same = (person[pairs[:, 0]] == person[pairs[:, 1]]) & (gaps > 0) & (gaps <= GAP)
+    follows = same if fps is not None else torch.zeros_like(same)
+    both = follows[:-1] & follows[1:]
+    triples = torch.cat([pairs[:-1], pairs[1:, 1:]], 1)[both]
+    steps = torch.stack([gaps[:-1], gaps[1:]], 1)[both]
+    track = person.unique(return_inverse=True)[1]
+    return Neighbours(triples, steps, pairs[follows], gaps[follows], track)
+
+
+def second_difference(
+    values: Float[Tensor, "bodies points axes"], near: Neighbours
+) -> Float[Tensor, "triples points axes"]:
+    """Twice the distance from the straight line through the neighbours, at their real times."""
+    before, now, after = (values[near.triples[:, k]] for k in range(3))
+    share = (near.steps[:, 1] / near.steps.sum(1)).to(values)[:, None, None]
+    return 2 * (share * before + (1 - share) * after - now)
+
+
+def motion_term(
+    points: Float[Tensor, "bodies points axes"],
+    near: Neighbours,
+    usual: Float[Tensor, "triples some"],
+    tail: float | Float[Tensor, "triples some"] | None = None,
+) -> Float[Tensor, " bodies"]:
+    """Squared second differences of points over usual ones, added to the rows in their middle.
+
+    They are robust beyond `tail` where it is given.
+    """
+    squared = second_difference(points, near).square().sum(-1)
+    cost = squared if tail is None else robust_square(squared, tail)
+    return _per_row((cost / usual.square()).sum(-1), near.triples[:, 1], len(near.track))
 
 
 def smooth_term(
     points: Float[Tensor, "bodies points 3"], near: Neighbours
 ) -> Float[Tensor, " bodies"]:
     """Cost of points that are off the straight way between their neighbours in time [nats]."""
-    i, j, k = near.triples.unbind(-1)
-    before, after = near.steps.to(points).unbind(-1)
-    to_i, to_k = (after / (before + after)), (before / (before + after))
-    straight = points[i] * to_i[:, None, None] + points[k] * to_k[:, None, None]
-    off = 2 * safe_norm(points[j] - straight)
-    usual = (TREMBLE + PUSH * before * after)[:, None]
-    cost = 0.5 * SMOOTH_POINTS * SMOOTH_TAIL**2 * geman_mcclure(off / usual, SMOOTH_TAIL).mean(-1)
-    return _per_row(cost, j, len(near.track))
+    usual = (TREMBLE + PUSH * near.steps.prod(1, keepdim=True)).to(points)
+    share = 0.5 * SMOOTH_POINTS / points.shape[1]
+    return share * motion_term(points, near, usual, SMOOTH_TAIL * usual)
 
 
 def steady_term(
@@ -235,6 +278,13 @@ def stand_term(
     """Cost of the lowest places of feet at rest (a chance) that are not on the floor [nats]."""
     off = geman_mcclure((soles[..., 1] - floor) / SOFT, STAND_TAIL)
     return 0.5 * FEET * STAND_TAIL**2 * (rest * off).sum(-1)
+
+
+def support_term(
+    points: Float[Tensor, "bodies points 3"], up: Float[Tensor, "3"], level: float | Tensor
+) -> Float[Tensor, " bodies"]:
+    """Squared depth of points under a floor of this height along `up` [m²]; of a fit."""
+    return (level - points @ up).clamp_min(0).square().sum(-1)
 
 
 def _dent(depth: Float[Tensor, "bodies points"]) -> Float[Tensor, " bodies"]:

@@ -96,40 +96,75 @@ class BatchedBFGS:
 
 
 @dataclass(frozen=True)
-class MatchConfig:
-    """Which skin counts as touching."""
-
-    least: Share = 0.5
-    """Chance above which a point of the skin touches (the paper's threshold)."""
-    reach: Annotated[float, float_in(1e-3, 100)] = 0.25
-    """Farther no surface is touched [m]."""
-
-
-@dataclass(frozen=True)
 class BodyWeights:
-    """How much each term counts; 0: it is left out. All are in nats, so 1 is the natural weight."""
+    """How much each term of the energy of bodies counts; 0: it is left out."""
 
-    angles: Weight = 1.0
-    """Distance of all angles from those that were given."""
-    image: Weight = 1.0
+    keypoints: Weight = 0.0
+    """E_Body: projected keypoints off the detected ones."""
+    smooth_joints: Weight = 0.0
+    """L_smooth: second differences of 3D joints, over the acceleration that people have."""
+    smooth_pixels: Weight = 0.0
+    """L_smooth: second differences of projections; confidence of the middle frame counts."""
+    still: Weight = 0.0
+    """The pelvis, which does not move where its picture does not."""
+    held: Weight = 0.0
+    """Trunk, head and arms about the pelvis, where they look still."""
+    support: Weight = 0.0
+    """Points under the floor of a fit."""
+    stands: Weight = 0.0
+    """Lower soles of all bodies off one floor that is found with them."""
+    balance: Weight = 0.0
+    """Centres of mass of standing bodies that are not over their feet."""
+    level: Weight = 0.0
+    """Slopes of the floor that is found."""
+    lies: Weight = 0.0
+    """Distance before and after lying, for people lying along the view."""
+    pose: Weight = 0.0
+    """The pose off the usual one, or the code of a learned prior."""
+    limits: Weight = 0.0
+    """Ranges of motion."""
+    bending: Weight = 0.0
+    """Elbows and knees bent the wrong way."""
+    shape: Weight = 0.0
+    """Proportions, and the stature of people of unknown height."""
+    height: Weight = 0.0
+    """A given height."""
+    offset: Weight = 0.0
+    """Lasting offsets of a detector's keypoints."""
+    hands: Weight = 0.0
+    """Usual hands."""
+    jaw: Weight = 0.0
+    """The jaw's opening; its other turns cost a hundred times as much."""
+    expression: Weight = 0.0
+    """Usual faces."""
+    angles: Weight = 0.0
+    """Refinement, in nats: distance of all angles from those that were given."""
+    image: Weight = 0.0
     """Distance of the joints from where they were seen."""
-    range: Weight = 1.0
+    range: Weight = 0.0
     """Change of the depth."""
-    smooth: Weight = 1.0
+    smooth: Weight = 0.0
     """E_smooth: joints between their neighbours in time."""
-    steady: Weight = 0.5
+    steady: Weight = 0.0
     """Corrections that come and go."""
-    under: Weight = 1.0
+    under: Weight = 0.0
     """CamGP: skin below the floor."""
-    stand: Weight = 1.0
+    stand: Weight = 0.0
     """CamGP: soles at rest off the floor."""
-    lock: Weight = 1.0
+    lock: Weight = 0.0
     """CamGP: soles at rest that slide."""
-    sink: Weight = 1.0
+    sink: Weight = 0.0
     """SDF: skin inside furniture."""
-    touch: Weight = 1.0
+    touch: Weight = 0.0
     """Contact: skin that touches, off the furniture."""
-    order: Weight = 0.3
+    order: Weight = 0.0
     """Depth order: skin in front of its occluder, or behind furniture that it occludes."""
-    outline: Weight = 1.0
+    outline: Weight = 0.0
     """Masks: the outline of the body on the outline of its mask."""
+
+
+REFINE = BodyWeights(
+    angles=1.0, image=1.0, range=1.0, smooth=1.0, steady=0.5, under=1.0, stand=1.0, lock=1.0,
+    sink=1.0, touch=1.0, order=0.3, outline=1.0,
+)  # fmt: skip
+"""The refinement in a room; all terms are in nats, so 1 is the natural weight."""

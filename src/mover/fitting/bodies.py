@@ -8,63 +8,40 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.bodies import BodyModel
-from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skinning import shaped, widths_of
 from mover.bodies.smpl_model import FLAT, Model, SmplBody, growth_of, skin_of_model
-from mover.core.observe import Observer, Step, silent
+from mover.core.observe import Energy, Observer, Step, silent
 from mover.core.records import record, rows_of
 from mover.core.types import Bodies, BodyPose, Camera, Keypoints
+from mover.fitting import ground, tracks
 from mover.fitting.config import FitConfig, Stage
-from mover.fitting.energy import Seen, Weighed, body_energy
-from mover.fitting.given import begin_from
-from mover.fitting.ground import (
-    distances_of_lying_people,
-    plane_of,
-    sole_heights,
-    soles_of,
-    standing_share,
-)
+from mover.fitting.energy import FitState
 from mover.fitting.noise import Bias, at_most, bias_of, noise_of, noisy, without
-from mover.fitting.offsets import lasting_of
-from mover.fitting.prior import ANGLES, PosePrior, encoded
-from mover.fitting.start import FitStart, begin
-from mover.fitting.stature import UNKNOWN, stature_of
-from mover.fitting.tracks import (
-    Window,
-    at_stage,
-    chosen,
-    confidence_of,
-    joint_speed,
-    seen_at_all,
-    seen_of,
-    stages_of,
-    tracks_of,
-    triples_of,
-    usable_rows,
-    windows_of,
-)
+from mover.fitting.prior import encoded
+from mover.fitting.priors import UNKNOWN, kind_of, lasting_of, stature_of
+from mover.fitting.start import begin, begin_from
 from mover.fitting.unknowns import (
+    ANGLES,
     EVERYTHING,
     HAND,
     OF_ROWS,
     Frame,
+    PosePrior,
     Rig,
     Unknowns,
-    floor_of,
     grown,
     hand_angles,
     log_depth,
     pelvis_of,
-    points_of,
     rig_of,
     solve,
     turns_of,
 )
-from mover.geometry.camera import project
 from mover.geometry.rotations import rotation_vectors
 
 SHAPES = 10
 EXPRESSION = 10
+HANDS = 12  # principal components of each hand, where the model has them; else its angles are used
 
 
 @dataclass(frozen=True)
@@ -96,18 +73,6 @@ class Fitted:
     warnings: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _BodyFit:
-    """A fit under way."""
-
-    inputs: FitInputs
-    config: FitConfig
-    rig: Rig
-    names: list[str]
-    seen: Seen
-    observe: Observer
-
-
 def fit_bodies(
     inputs: FitInputs, config: FitConfig | None = None, observe: Observer = silent
 ) -> Fitted:
@@ -116,205 +81,180 @@ def fit_bodies(
     Raises:
         InputError: If no row has enough keypoints.
     """
-    config = config or FitConfig()
-    rows, warnings = usable_rows(inputs.keypoints, config)
-    stature = stature_of(inputs.model, inputs.heights, inputs.keypoints.person, rows)
+    config, model, camera = config or FitConfig(), inputs.model, inputs.camera
+    rows, warnings = tracks.usable_rows(inputs.keypoints, config)
+    stature = stature_of(model, inputs.heights, inputs.keypoints.person, rows)
     some = rows_of(inputs.keypoints, rows)
-    inputs = dataclasses.replace(inputs, keypoints=some)
-    rig = rig_of(inputs.model, some.layout, seen_at_all(some, config))
-    names = [LAYOUTS[some.layout][k] for k in rig.keypoints.tolist()]
-    seen = seen_of(some, rig, inputs.camera, config)
-    seen = dataclasses.replace(seen, floor=inputs.ground)
-    job = _BodyFit(inputs, config, rig, names, seen, observe)
-    start = _start_of(job)
-    lasting = lasting_of(names) if config.lasting else None
-    seen = dataclasses.replace(seen, stature=stature, lasting=lasting)
-    job = dataclasses.replace(job, seen=seen)
-    at, frame, seen = _solved(start, job)
-    pose = pose_of(at, frame, inputs.model, inputs.prior)
-    miss = miss_of(at, frame, seen, inputs.prior)
-    bodies = bodies_of(pose, inputs.model, some)
-    spread = UNKNOWN if bool(stature.given.isnan().any()) else 0.0
-    bodies = dataclasses.replace(bodies, size_spread=spread)
-    return Fitted(bodies, rows, miss, warnings)
-
-
-def _start_of(job: _BodyFit) -> FitStart:
-    """From given bodies, or from keypoints alone; the code is that of the prior."""
-    inputs = job.inputs
+    rig = rig_of(model, some.layout, tracks.seen_at_all(some, config))
+    seen = dataclasses.replace(tracks.seen_of(some, rig, camera, config), floor=inputs.ground)
     if inputs.start is None:
-        start = begin(inputs.keypoints, job.seen, job.rig, inputs.camera, job.config)
+        start = begin(some, seen, rig, camera, config)
     else:
-        start = begin_from(inputs.start, inputs.keypoints, job.seen, job.rig, job.config)
+        start = begin_from(inputs.start, some, seen, rig)
+    seen = dataclasses.replace(
+        seen, centre=start.centre, spread=start.spread, stature=stature,
+        lasting=lasting_of(rig.names) if config.lasting else None,
+    )  # fmt: skip
+    people, person = some.person.unique(return_inverse=True)
+    frame = Frame(rig, start.root, person, growth_of(model), inputs.prior)
     code = encoded(inputs.prior, start.at.code)
-    return dataclasses.replace(start, at=dataclasses.replace(start.at, code=code))
+    at = dataclasses.replace(
+        start.at, code=code, **_widened(len(code), len(people), rig, model, config)
+    )
+    state = _on_a_floor(FitState(at, frame, seen, config), model)
+    state = _solved(state, some, observe)
+    bodies = bodies_of(pose_of(state.at, frame, model), model, some)
+    spread = UNKNOWN if bool(stature.given.isnan().any()) else 0.0
+    return Fitted(dataclasses.replace(bodies, size_spread=spread), rows, miss_of(state), warnings)
 
 
-def _solved(start: FitStart, job: _BodyFit) -> tuple[Unknowns, Frame, Seen]:
-    """All rows; the shapes first from some of them where there are too many at once."""
-    seen = dataclasses.replace(job.seen, centre=start.centre, spread=start.spread)
-    people, person = job.inputs.keypoints.person.unique(return_inverse=True)
-    at = dataclasses.replace(start.at, **_widened(start.at, len(people), job))
-    frame = Frame(job.rig, start.root, person, growth_of(job.inputs.model))
-    seen, at = _on_a_floor(seen, at, frame, job)
-    windows = windows_of(job.inputs.keypoints, job.config)
-    first = _stages(at, frame, seen, windows[0], (job, EVERYTHING))
-    bias, parts = _bias(first, job), [first.at]
-    if len(windows) > 1:
-        shared = {name: getattr(first.at, name) for name in ("betas", "offset", "floor")}
-        at = dataclasses.replace(at, **shared)
-        windows = windows[1:]
-        parts = [_stages(at, frame, seen, window, (job, OF_ROWS)).at for window in windows]
-    fields = {
-        name: torch.cat([getattr(p, name)[w.keep] for p, w in zip(parts, windows, strict=True)])
-        for name in OF_ROWS
-    }
-    back = torch.argsort(torch.cat([w.rows[w.keep] for w in windows]))
-    fields = {name: value[back] for name, value in fields.items()}
-    at = dataclasses.replace(parts[0], **fields)
-    at = at if bias is None else without(at, bias, frame.person)
-    return at, frame, seen
-
-
-def _on_a_floor(seen: Seen, at: Unknowns, frame: Frame, job: _BodyFit) -> tuple[Seen, Unknowns]:
-    """With a floor that is sought, first level and below the feet."""
-    if not job.config.stands:
-        return seen, at
-    soles, decode = soles_of(job.inputs.model), job.inputs.prior.decode
-    with torch.no_grad():
-        low = sole_heights(points_of(at, frame, decode).joints, soles, seen.up)
-    level = low.median() if seen.floor is None else low.new_tensor(seen.floor)
-    floor = torch.stack([torch.zeros_like(level), torch.zeros_like(level), level])
-    return dataclasses.replace(seen, soles=soles), dataclasses.replace(at, floor=floor)
-
-
-def _widened(at: Unknowns, people: int, job: _BodyFit) -> dict[str, Tensor]:
+def _widened(
+    rows: int, people: int, rig: Rig, model: Model, config: FitConfig
+) -> dict[str, Tensor]:
     """Shapes of all people, and hands and faces where they are seen and the model has them."""
-    rows, model = len(at.turn), job.inputs.model
-    skin = job.rig.skin
-    shapes = min(SHAPES, skin.shape_dirs.shape[-1])
+    skin = rig.skin
     hands, face = 0, 0
-    full = len(skin.parents) > 24
-    if full and any("index" in name for name in job.names):
+    if len(skin.parents) > 24 and any("index" in name for name in rig.names):
         space = getattr(model, "hands", None)
-        hands = HAND if space is None else min(job.config.hands, space.components.shape[1])
-    if len(skin.parents) == 55 and any(n.startswith("face_") for n in job.names):
+        hands = HAND if space is None else min(HANDS, space.components.shape[1])
+    if len(skin.parents) == 55 and any(n.startswith("face_") for n in rig.names):
         face = 3 + min(EXPRESSION, getattr(model, "expression_dirs").shape[-1])  # noqa: B009
     return {
-        "betas": at.place.new_zeros(people, shapes),
-        "hands": at.place.new_zeros(rows, 2 * hands),
-        "face": at.place.new_zeros(rows, face),
-        "offset": at.place.new_zeros(people, 0 if job.seen.lasting is None else len(job.names), 3),
+        "betas": torch.zeros(people, min(SHAPES, skin.shape_dirs.shape[-1])),
+        "hands": torch.zeros(rows, 2 * hands),
+        "face": torch.zeros(rows, face),
+        "offset": torch.zeros(people, len(rig.names) if config.lasting else 0, 3),
     }
 
 
-@dataclass(frozen=True)
-class _Lowered:
-    """What all stages make of some rows."""
+def _on_a_floor(state: FitState, model: Model) -> FitState:
+    """With a floor that is sought, first level and below the feet."""
+    seen = state.seen
+    if not state.config.stands:
+        return state
+    soles = ground.soles_of(model)
+    with torch.no_grad():
+        low = ground.sole_heights(state.points.joints, soles, seen.up)
+    level = low.median() if seen.floor is None else low.new_tensor(seen.floor)
+    floor = torch.stack([torch.zeros_like(level), torch.zeros_like(level), level])
+    return state.at_values(floor=floor).given(soles=soles)
 
-    at: Unknowns
-    seen: Seen
-    """What they were fitted to at last."""
-    frame: Frame
-    noise: Float[Tensor, " bodies"] | None
-    """Of the keypoints [px]; None: as assumed."""
+
+def _solved(state: FitState, keypoints: Keypoints, observe: Observer) -> FitState:
+    """All rows; the shapes first from some of them where there are too many at once."""
+    windows = tracks.windows_of(keypoints, state.config)
+    first, bias = _stages(state, keypoints, windows[0].rows, EVERYTHING, observe)
+    parts = [first]
+    if len(windows) > 1:
+        shared = {name: getattr(first, name) for name in ("betas", "offset", "floor")}
+        whole = state.at_values(**shared)
+        windows = windows[1:]
+        parts = [_stages(whole, keypoints, w.rows, OF_ROWS, observe)[0] for w in windows]
+    back = torch.argsort(torch.cat([w.rows[w.keep] for w in windows]))
+    fields = {
+        name: torch.cat([
+            getattr(part, name)[w.keep] for part, w in zip(parts, windows, strict=True)
+        ])[back]
+        for name in OF_ROWS
+    }  # fmt: skip
+    at = dataclasses.replace(parts[0], **fields)
+    at = at if bias is None else without(at, bias, state.frame.person)
+    return dataclasses.replace(state, at=at)
 
 
 def _stages(
-    at: Unknowns, frame: Frame, seen: Seen, window: Window, what: tuple[_BodyFit, tuple[str, ...]]
-) -> _Lowered:
-    """All stages over some of the rows."""
-    job, free = what
-    rows, stages = window.rows, stages_of(job.config, job.names)
-    some = rows_of(job.inputs.keypoints, rows)
-    at = dataclasses.replace(at, **{name: getattr(at, name)[rows] for name in OF_ROWS})
-    frame = dataclasses.replace(frame, root=frame.root[rows], person=frame.person[rows])
-    seen = chosen(seen, rows, triples_of(some, _speed(at, frame, some, job), job.config))
-    noise = None
+    state: FitState,
+    keypoints: Keypoints,
+    rows: Int[Tensor, " rows"],
+    free: tuple[str, ...],
+    observe: Observer,
+) -> tuple[Unknowns, Bias | None]:
+    """All stages over some of the rows, and what noise did to all of them; None: not known."""
+    config, names = state.config, state.frame.rig.names
+    stages, some = tracks.stages_of(config, names), rows_of(keypoints, rows)
+    at, frame = rows_of(state.at, rows, "bodies"), rows_of(state.frame, rows, "bodies")
+    state, noise = FitState(at, frame, rows_of(state.seen, rows, "bodies"), config), None
+    state = state.given(motion=tracks.motion_of(some, _speed(state, some), config))
     for index, stage in enumerate(stages):
-        seen = _standing(at, frame, seen, job)
-        if index == 1 and job.config.left:
-            quick = dataclasses.replace(stage, steps=job.config.noise_steps)
-            at = _lowered(at, frame, seen, (job, quick, free))
-            off = _seen_at(at, frame, seen, job) - seen.pixels
-            noise = noise_of(off, seen, frame.person, job.config.left)
-            seen = at_most(seen, noise, stage.pose)
-        at = _lowered(at, frame, seen, (job, stage, free))
-        at, seen = _laid(at, frame, some, seen, job)
-        if seen.about is not None:  # not jointly: the lying bodies moved the upright ones
-            at = _lowered(at, frame, seen, (job, stage, OF_ROWS))
-        job.observe(Step("fit_bodies", index, len(stages)))
-    return _Lowered(at, seen, frame, noise)
+        state = _standing(state)
+        if index == 1 and config.left:
+            state = _lowered(state, dataclasses.replace(stage, steps=config.noise_steps), free)
+            off = _pixels(state) - state.seen.pixels
+            noise = noise_of(off, state.seen, state.frame.person, config.left)
+            state = state.given(weight=at_most(state.seen, noise, stage.pose))
+        state = _laid(_lowered(state, stage, free), some)
+        if state.seen.about is not None:  # not jointly: the lying bodies moved the upright ones
+            state = _lowered(state, stage, OF_ROWS)
+        observe(Step("fit_bodies", index, len(stages)))
+    shared = len(free) == len(EVERYTHING)
+    return state.at, _bias(state, noise, stages[-1]) if shared and noise is not None else None
 
 
-def _lowered(
-    at: Unknowns, frame: Frame, seen: Seen, what: tuple[_BodyFit, Stage, tuple[str, ...]]
-) -> Unknowns:
+def _lowered(state: FitState, stage: Stage, free: tuple[str, ...]) -> FitState:
     """Minimise E_Body of one stage."""
-    job, stage, free = what
-    by = Weighed(stage, job.config, job.inputs.prior.decode, job.inputs.prior.width > 0)
-    observed = at_stage(seen, job.names, stage)
-    return solve(lambda u: body_energy(u, frame, observed, by), at, stage.steps, free)
+    factor = tracks.factors_of(stage)
+    weight = state.seen.weight
+    weight = weight * weight.new_tensor([factor[kind_of(n)] for n in state.frame.rig.names])
+    staged = state.given(weight=weight)
+
+    def energy(at: Unknowns) -> Energy:
+        return dataclasses.replace(staged, at=at).energy(stage)
+
+    return dataclasses.replace(state, at=solve(energy, state.at, stage.steps, free))
 
 
-def _seen_at(at: Unknowns, frame: Frame, seen: Seen, job: _BodyFit) -> Tensor:
+def _pixels(state: FitState) -> Float[Tensor, "bodies keypoints 2"]:
     """Where the keypoints of bodies are in the image [px]."""
     with torch.no_grad():
-        return project(points_of(at, frame, job.inputs.prior.decode).keypoints, seen.K)
+        return state.pixels
 
 
-def _bias(found: _Lowered, job: _BodyFit) -> Bias | None:
-    """What noise did to shapes and distances; None: not known."""
-    if found.noise is None:
-        return None
-    person, stage = found.frame.person, stages_of(job.config, job.names)[-1]
-    pixels = noisy(_seen_at(found.at, found.frame, found.seen, job), found.noise)
-    seen = dataclasses.replace(found.seen, pixels=pixels)
-    quick = dataclasses.replace(stage, steps=job.config.noise_steps)
-    again = _lowered(found.at, found.frame, seen, (job, quick, EVERYTHING))
-    left = noise_of(_seen_at(again, found.frame, seen, job) - pixels, seen, person, job.config.left)
-    share = (found.noise / left.clamp_min(1e-6)).square().clamp_max(1)
-    return bias_of(found.at, again, person, share)
+def _bias(state: FitState, noise: Float[Tensor, " bodies"], stage: Stage) -> Bias:
+    """What noise did to shapes and distances."""
+    config, person = state.config, state.frame.person
+    pixels = noisy(_pixels(state), noise)
+    quick = dataclasses.replace(stage, steps=config.noise_steps)
+    again = _lowered(state.given(pixels=pixels), quick, EVERYTHING)
+    left = noise_of(_pixels(again) - pixels, state.seen, person, config.left)
+    share = (noise / left.clamp_min(1e-6)).square().clamp_max(1)
+    return bias_of(state.at, again.at, person, share)
 
 
-def _standing(at: Unknowns, frame: Frame, seen: Seen, job: _BodyFit) -> Seen:
-    """What is seen, with the bodies that their legs carry, as they are now."""
-    if not job.config.balance or not at.floor.numel():
-        return seen
+def _standing(state: FitState) -> FitState:
+    """With the share of the bodies that their legs carry, as they are now."""
+    if not state.at.floor.numel():
+        return state
     with torch.no_grad():
-        joints = points_of(at, frame, job.inputs.prior.decode).joints
-        up, _ = plane_of(floor_of(at, frame), seen.up, seen.floor)
-    return dataclasses.replace(seen, standing=standing_share(joints, up))
+        standing = ground.standing_share(state.points.joints, state.plane[0])
+    return state.given(standing=standing)
 
 
-def _laid(
-    at: Unknowns, frame: Frame, keypoints: Keypoints, seen: Seen, job: _BodyFit
-) -> tuple[Unknowns, Seen]:
+def _laid(state: FitState, keypoints: Keypoints) -> FitState:
     """Move people who lie along the view to their expected distance."""
-    if keypoints.fps is None or not job.config.lies:
-        return at, seen
+    if keypoints.fps is None or not state.config.lies:
+        return state
+    at, seen = state.at, state.seen
+    time = keypoints.frame / keypoints.fps
+    rows = tracks.tracks_of(keypoints.frame, keypoints.person)
     with torch.no_grad():
-        joints = points_of(at, frame, job.inputs.prior.decode).joints
-    tracks = tracks_of(keypoints.frame, keypoints.person)
-    about = distances_of_lying_people(joints, seen.up, tracks, keypoints.frame / keypoints.fps)
+        joints = state.points.joints
+    about = ground.distances_of_lying_people(joints, seen.up, rows, time)
     free = about.isnan()
     if bool(free.all()):
-        return at, seen
-    about = about - grown(at, frame)[frame.person]
+        return state
+    about = about - grown(at, state.frame)[state.frame.person]
     depth = torch.where(free, at.place[:, 2], about)
     place = torch.cat([at.place[:, :2], depth[:, None]], -1)
-    return dataclasses.replace(at, place=place), dataclasses.replace(seen, about=about)
+    return state.at_values(place=place).given(about=about)
 
 
-def _speed(
-    at: Unknowns, frame: Frame, keypoints: Keypoints, job: _BodyFit
-) -> Float[Tensor, "rows joints"] | None:
+def _speed(state: FitState, keypoints: Keypoints) -> Float[Tensor, "rows joints"] | None:
     """How fast joints seem to move across the view [m/s]; None without a frame rate."""
     if keypoints.fps is None:
         return None
-    there = confidence_of(keypoints, job.config) > 0
-    pixels = joint_speed(keypoints, there).to(at.place)
-    return pixels * log_depth(at, frame).exp()[:, None] / job.seen.K[0, 0]
+    there = tracks.confidence_of(keypoints, state.config) > 0
+    pixels = tracks.joint_speed(keypoints, there).to(state.at.place)
+    return pixels * log_depth(state.at, state.frame).exp()[:, None] / state.seen.K[0, 0]
 
 
 # What was solved, as bodies.
@@ -323,9 +263,9 @@ def _speed(
 CHUNK = 128  # rows that are posed at once
 
 
-def pose_of(at: Unknowns, frame: Frame, model: Model, prior: PosePrior) -> BodyPose:
+def pose_of(at: Unknowns, frame: Frame, model: Model) -> BodyPose:
     """Parameters of the fitted bodies."""
-    angles = prior.decode(at.code)
+    angles = frame.prior.decode(at.code)
     skin = skin_of_model(model)
     assert skin is not None
     width = widths_of(skin)["body_pose"]
@@ -348,7 +288,7 @@ def pose_of(at: Unknowns, frame: Frame, model: Model, prior: PosePrior) -> BodyP
         model=model.name,
         gender=model.gender if isinstance(model, SmplBody) else "neutral",
         betas=betas,
-        global_orient=rotation_vectors(turns_of(at, frame, angles)[:, 0]),
+        global_orient=rotation_vectors(turns_of(at, frame)[:, 0]),
         body_pose=body,
         transl=pelvis_of(at, frame) - rest,
         extra=extra,
@@ -374,10 +314,8 @@ def bodies_of(pose: BodyPose, model: BodyModel, keypoints: Keypoints) -> Bodies:
     )
 
 
-def miss_of(at: Unknowns, frame: Frame, seen: Seen, prior: PosePrior) -> Float[Tensor, " bodies"]:
+def miss_of(state: FitState) -> Float[Tensor, " bodies"]:
     """Root mean square distance of the keypoints that are seen from their projections [px]."""
-    with torch.no_grad():
-        pixels = project(points_of(at, frame, prior.decode).keypoints, seen.K)
-    there = (seen.weight > 0).to(pixels)
-    squared = (pixels - seen.pixels).square().sum(-1) * there
+    there = (state.seen.weight > 0).to(state.seen.pixels)
+    squared = (_pixels(state) - state.seen.pixels).square().sum(-1) * there
     return (squared.sum(1) / there.sum(1).clamp_min(1)).sqrt()

@@ -1,30 +1,28 @@
 """Weights, stages and choices of the fit of bodies. Imports no torch: `--help` is quick."""
 
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
-
-from mover.core.settings import Seconds, Share, Sigma, Steps, Weight, float_in, int_in
+from dataclasses import dataclass, replace
+from typing import Literal
 
 
 @dataclass(frozen=True)
 class Stage:
     """Weights of one stage; all are squared where SMPLify-X squares them."""
 
-    pose: Weight = 4.78
+    pose: float = 4.78
     """Prior of the body's pose; the bending prior follows it (times 3.17)."""
-    shape: Weight = 5.0
+    shape: float = 5.0
     """Numbers of the shape, and of the expression."""
-    hands: Weight = 4.78
+    hands: float = 4.78
     """Prior of the hands."""
-    jaw: Weight = 47.8
+    jaw: float = 47.8
     """Prior of the jaw's opening; its other turns cost ten times as much."""
-    hand_joints: Weight = 0.0
+    hand_joints: float = 0.0
     """Factor on the confidence of keypoints of the hands."""
-    face_joints: Weight = 0.0
+    face_joints: float = 0.0
     """Factor on the confidence of keypoints of the face."""
-    smooth: Weight = 5.0
+    smooth: float = 5.0
     """Constant-velocity terms."""
-    steps: Steps = 30
+    steps: int = 30
     """Most iterations of L-BFGS."""
 
 
@@ -46,84 +44,44 @@ STAGES = (
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How bodies are fitted to keypoints."""
+    """What presets and experiments change in the fit of bodies to keypoints."""
 
-    rho: Sigma = 100.0
-    """Residual at which the Geman-McClure cost is half its maximum [px], per 1,080 rows."""
-    loose: Weight = 0.3
+    loose: float = 0.3
     """Factor on the confidence of neck and hips, which detectors place elsewhere (SMPLify-X: 0)."""
-    left: Share = 0.45
+    left: float = 0.45
     """Share of the variance of keypoints' noise that a fit leaves; 0: noise is as assumed."""
-    noise_steps: Steps = 100
+    noise_steps: int = 100
     """Iterations of the fit that estimates the noise, and of the one that estimates its bias."""
-    least_confidence: Share = 0.1
-    """Keypoints below are missing."""
-    least_joints: Annotated[int, int_in(1, 133)] = 4
-    """Rows with fewer keypoints of the body are left out."""
-    bending: Weight = 3.17
-    """Multiple of the pose weight for elbows and knees bent the wrong way."""
-    limits: Weight = 4.78
+    limits: float = 4.78
     """Weight of the ranges of motion."""
-    sigma_joints: Sigma = 0.1
-    """sigma_2 of the paper: Geman-McClure's constant for second differences of 3D joints [m]."""
-    sigma_pixels: Sigma = 100.0
-    """sigma_3 of the paper: the same for their projections [px]."""
-    smooth_joints: Weight = 1.0
+    smooth_joints: float = 1.0
     """Weight of the smoothness of 3D joints, over the acceleration that people have."""
-    smooth_pixels: Weight = 0.1
+    smooth_pixels: float = 0.1
     """Weight of the smoothness of projections; confidence of the middle frame counts."""
-    acceleration: Annotated[float, float_in(0, 1e4)] = 3.0
+    acceleration: float = 3.0
     """What joints of people do all the time [m/s²]."""
-    still: Weight = 6.0
+    still: float = 6.0
     """Weight of the smoothness of the pelvis, which does not move where its picture does not."""
-    calm: Sigma = 0.05
-    """Acceleration of a body whose picture stands still [m/s²],"""
-    agility: Weight = 2.0
-    """and what each m/s, across the view, adds to it [1/s]."""
-    held: Weight = 1.0
+    held: float = 1.0
     """Weight of the smoothness of trunk, head and arms about the pelvis, where they look still."""
-    sigma_held: Sigma = 0.25
-    """Geman-McClure's constant of it, in sizes of the body; or [m], see `by_size`."""
-    swing: Weight = 4.0
-    """What each m/s, across the view, adds to their acceleration: arms swing [1/s]."""
-    jitter: Sigma = 0.004
+    jitter: float = 0.004
     """Second difference that is free of charge at any frame rate [m]."""
     by_size: bool = True
     """Second differences of joints in body sizes, so that smoothness pulls no person nearer."""
-    independent_frames: Annotated[int, int_in(1, 1_000_000)] = 4
+    independent_frames: int = 4
     """Frames with independent errors: more do not constrain shape, stature and offsets further."""
     lasting: bool = True
     """Keypoints lie lastingly off the model's, and statures are those of adults (else the shape
     alone has a prior, as published)."""
-    height_weight: Weight = 1e4
-    """Weight of the difference between a given height and the body's [1/m]."""
-    longest_gap: Seconds = 1.0
-    """Frames further apart do not smooth each other [s]."""
-    support: Sigma = 0.05
-    """How far a joint may be under the floor [m]."""
-    stands: Weight = 20.0
+    stands: float = 20.0
     """Weight of one floor below the lower soles of all bodies, found with them [1/m]; 0: none."""
-    balance: Weight = 1.0
-    """Weight of the balance of standing bodies, beside the pose prior; 0: none."""
-    lies: Weight = 50.0
+    lies: float = 50.0
     """Weight of the distance before and after lying, for people lying along the view; 0: none."""
-    near: Annotated[float, float_in(1e-3, 180)] = 15.0
-    """With bodies to start from: how far each angle may be from theirs [degrees]."""
-    hands: Annotated[int, int_in(0, 45)] = 12
-    """Principal components of each hand, where the model has them; else its angles are used."""
-    chunk: Annotated[int, int_in(1, 100_000)] = 1000
+    chunk: int = 1000
     """Frames that are solved at once."""
-    start_steps: Steps = 30
+    start_steps: int = 30
     """Iterations from each hypothesis of orientation and posture."""
-    jump: Sigma = 0.25
-    """How far joints move about the pelvis between rows of a track that hypotheses explain [m]."""
-    reach: Sigma = 0.3
-    """How far a pelvis is misplaced by a hypothesis [m]."""
-    speed: Sigma = 1.5
-    """How fast a pelvis moves [m/s]."""
-    switch: Weight = 10.0
-    """Weight of such a move, in squared standard deviations of the pose."""
-    stages: tuple[Stage, ...] = field(default=STAGES)
+    stages: tuple[Stage, ...] = STAGES
     """Weights of the stages."""
 
 

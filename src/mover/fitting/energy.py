@@ -1,69 +1,51 @@
-r"""E_Body: what keypoints say of bodies, and what is known of bodies and of motion (Sec. 3.2).
+"""The state of a fit: bodies, what is seen of them, and what the energy of bodies needs of both.
 
-    E_Body = Σ_t E_SMPLify-X(t) + λ_smooth L_smooth,
-    E_SMPLify-X = (1000 / H)² Σ_j (w_j c_j)² ρ(π(J_j) - x_j) + E_pose + E_shape + E_hands + E_face
-                  + E_bend,
-    L_smooth = Σ_t ρ(|J_{t-1} + J_{t+1} - 2 J_t|; σ2) + ρ(|π(J_{t-1}) + π(J_{t+1}) - 2 π(J_t)|; σ3)
-
-after Pavlakos et al. 2019 (SMPLify-X, Sec. 3.2 and its published configuration) and the paper;
-ρ(r; σ) = σ² r² / (r² + σ²), for keypoints on each coordinate.
-Departure: Second differences are taken over real time, so that gaps and frame rates make no
-acceleration, and are divided by what people do in that time and, in 3D, by the size of the body:
-most of them is noise of the keypoints, which is longer in metres the larger and the farther the
-body is estimated to be. σ2 and σ3 remain the lengths beyond which a jump counts as real motion.
-Self-collision is left out, as in the authors' video configuration.
+Departure from the paper: terms whose weight is 0 in the preset `paper`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from mover.bodies.skeleton import BODY
 from mover.core.observe import Energy
 from mover.core.records import record
-from mover.energy.minimize import weigh
+from mover.energy.body_energy import body_energy
+from mover.energy.body_terms import Neighbours
+from mover.energy.config import BodyWeights
+from mover.fitting import ground
 from mover.fitting.config import FitConfig, Stage
-from mover.fitting.ground import (
-    BALANCE,
-    FALLING,
-    FRAMES,
-    STEP,
-    Plane,
-    balance_cost,
-    level_cost,
-    lying_cost,
-    plane_of,
-    sole_heights,
-    support_cost,
+from mover.fitting.priors import (
+    Stature,
+    bent_wrong,
+    excess_of,
+    height_cost,
+    off_pose,
+    shape_cost,
+    size_of,
 )
-from mover.fitting.limits import limit_cost
-from mover.fitting.offsets import offset_cost
-from mover.fitting.stature import Stature, height_cost, shape_cost, size_of
-from mover.fitting.unknowns import Decode, Frame, Points, Unknowns, floor_of, points_of
+from mover.fitting.unknowns import Frame, Points, Unknowns, floor_of, points_of
 from mover.geometry.camera import project
 
 OF_SHAPES = 0.1  # relative weight for the shape of a body that lies along the view
 HEIGHT = 1000.0  # [px], the image height at which the published weights were chosen
-BENT = ((17, 1, 1.0), (18, 1, -1.0), (3, 0, -1.0), (4, 0, -1.0))
-"""Elbows and knees: joint of the body, axis, and the sign that is the wrong way."""
-HIPS, KNEES, ANKLES = (
-    [3 * (BODY.index(f"{side}_{joint}") - 1) for side in ("left", "right")]
-    for joint in ("hip", "knee", "ankle")
-)  # their bending among the angles of the body
+RHO = 100.0  # [px] at 1,080 rows, residual of a keypoint at which its cost is half of the most
+BENDING = 3.17  # of the pose weight, for elbows and knees bent the wrong way (SMPLify-X)
+HEIGHT_WEIGHT = 1e4  # [1/m], of the difference between a given height and the body's
 LEGS = ("hip", "knee", "ankle", "foot")
 UPPER = [k for k, name in enumerate(BODY) if k and not name.endswith(LEGS)]
-"""Trunk, head and arms."""
+"""Trunk, head and arms. A foot that stands still belongs to a body that walks on."""
 
 
 @record
-class Triples:
-    """Rows of one track at three moments."""
+class Motion:
+    """Rows of one track at three moments, and how far people leave a straight line there."""
 
-    rows: Int[Tensor, "triples 3"]
-    share: Float[Tensor, " triples"]
-    """Weight of the first in the straight line through first and last."""
+    near: Neighbours
     expected: Float[Tensor, " triples"]
     """Second difference that people make in that time [m]."""
     calm: Float[Tensor, "triples joints"]
@@ -84,11 +66,12 @@ class Seen:
     """Away from the floor, in camera axes."""
     floor: float | None
     """Height of the floor along `up` from the camera [m]."""
-    triples: Triples
     centre: Float[Tensor, "bodies 63"]
     """The pose that the prior expects: of the row's posture, or of the body to start from [rad]."""
     spread: Float[Tensor, "bodies 63"]
     """How far from it each angle may be [rad]."""
+    motion: Motion | None = None
+    """None: rows are not neighbours in time."""
     stature: Stature | None = None
     """The prior of their heights; None: the mean shape's, as one more coefficient."""
     lasting: Float[Tensor, " keypoints"] | None = None
@@ -101,217 +84,181 @@ class Seen:
     """Expected depth of lying people, in the units of `place`; NaN, None: unconstrained."""
 
 
+def weights_of(stage: Stage, config: FitConfig, height: int, rows: int) -> BodyWeights:
+    """E_Body of a stage for an image of this height and so many bodies."""
+    pose, smooth = stage.pose, stage.smooth
+    return BodyWeights(
+        keypoints=(HEIGHT / height) ** 2,
+        smooth_joints=smooth * config.smooth_joints,
+        smooth_pixels=smooth * config.smooth_pixels,
+        still=smooth * config.still,
+        held=smooth * config.held,
+        support=(pose / ground.SUPPORT) ** 2,
+        stands=(pose * config.stands) ** 2,
+        balance=(pose / ground.BALANCE) ** 2,
+        level=pose**2 * ground.FRAMES / rows,
+        lies=(pose * config.lies) ** 2,
+        pose=pose**2,
+        limits=config.limits**2,
+        bending=BENDING * pose,
+        shape=stage.shape**2,
+        height=HEIGHT_WEIGHT**2,
+        offset=stage.shape**2,
+        hands=stage.hands**2,
+        jaw=stage.jaw**2,
+        expression=stage.shape**2,
+    )
+
+
 @dataclass(frozen=True)
-class Weighed:
-    """Weights of a stage with the settings that all stages share."""
+class FitState:
+    """Bodies of a fit where they are now, in camera axes."""
 
-    stage: Stage
+    at: Unknowns
+    frame: Frame
+    seen: Seen
     config: FitConfig
-    decode: Decode
-    learned: bool
-    """The code is that of a learned prior, normally distributed."""
+    upper: ClassVar = UPPER
 
+    def has(self, name: str) -> bool:
+        """Whether the evidence of a term is there."""
+        floor = self.at.floor.numel() > 0
+        match name:
+            case "motion":
+                return self.seen.motion is not None and len(self.seen.motion.expected) > 0
+            case "free_floor":
+                return floor
+            case "plane":
+                return floor or self.seen.floor is not None
+            case "hands" | "face":
+                return getattr(self.at, name).shape[1] > 0
+            case _:
+                return getattr(self.seen, name, None) is not None
 
-def body_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
-    """E_Body, row by row."""
-    points = points_of(at, frame, by.decode)
-    pixels = project(points.keypoints, seen.K)
-    image, rho = (HEIGHT / seen.height) ** 2, by.config.rho
-    smooth = by.stage.smooth if len(seen.triples.rows) else 0.0
-    joints = points.joints
-    if by.config.by_size:
-        joints = joints / size_of(joints)[:, None, None]
-    solid, flat = by.config.smooth_joints, by.config.smooth_pixels
-    space = weigh(
-        ("keypoints", image, lambda: keypoint_cost(pixels, seen, rho)),
-        ("smooth_joints", smooth * solid, lambda: smooth_joint_cost(joints, seen, by)),
-        ("smooth_pixels", smooth * flat, lambda: smooth_pixel_cost(pixels, seen, by)),
-        ("still", smooth * by.config.still, lambda: still_cost(joints, seen)),
-        ("held", smooth * by.config.held, lambda: held_cost(joints, seen, by)),
-    )
-    ground, prior = _ground_energy(points, at, frame, seen, by), _prior_energy(at, frame, seen, by)
-    parts = {**space.parts, **ground.parts, **prior.parts}
-    if seen.about is None:
-        return Energy(parts)
-    share = torch.where(seen.about.isnan(), 1.0, OF_SHAPES)
-    return Energy({name: share * part for name, part in parts.items()})
+    def at_values(self, **fields: Tensor) -> "FitState":
+        """The state with other values of some unknowns."""
+        return replace(self, at=replace(self.at, **fields))
 
+    def given(self, **fields: Any) -> "FitState":  # noqa: ANN401
+        """The state with other evidence."""
+        return replace(self, seen=replace(self.seen, **fields))
 
-def _ground_energy(points: Points, at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
-    """How the floor and the way people lie down constrain their distances."""
-    sought, pose, rows = bool(at.floor.numel()), by.stage.pose, len(at.place)
-    floor = floor_of(at, frame)
-    under = pose / by.config.support if sought or seen.floor is not None else 0.0
-    stands = pose * by.config.stands if sought else 0.0
-    lies = pose * by.config.lies if seen.about is not None else 0.0
-    balance = by.config.balance * pose / BALANCE if sought and seen.standing is not None else 0.0
+    def energy(self, stage: Stage) -> Energy:
+        """E_Body with the weights of a stage; less of it where a body lies along the view."""
+        weights = weights_of(stage, self.config, self.seen.height, len(self.at.place))
+        found = body_energy(self, weights)
+        if self.seen.about is None:
+            return found
+        share = torch.where(self.seen.about.isnan(), 1.0, OF_SHAPES)
+        return Energy({name: share * part for name, part in found.parts.items()})
 
-    def plane() -> Plane:
-        return plane_of(floor, seen.up, seen.floor)
+    @cached_property
+    def points(self) -> Points:
+        """Keypoints and joints [m]."""
+        return points_of(self.at, self.frame)
 
-    def stand() -> Tensor:
-        assert seen.soles is not None
-        up, level = plane()
-        height = sole_heights(points.joints, seen.soles, up) - level
-        return geman_mcclure(height.square(), STEP)
+    @cached_property
+    def pixels(self) -> Float[Tensor, "bodies keypoints 2"]:
+        """Projected keypoints [px]."""
+        return project(self.points.keypoints, self.seen.K)
 
-    def balanced() -> Tensor:
-        assert seen.standing is not None
-        off = balance_cost(points.joints, plane()[0])
-        return seen.standing * geman_mcclure(off, FALLING)
+    @property
+    def motion(self) -> Motion:
+        """Which rows follow each other."""
+        assert self.seen.motion is not None
+        return self.seen.motion
 
-    def lie() -> Tensor:
-        assert seen.about is not None
-        return lying_cost(at.place[:, 2], seen.about)
+    @property
+    def weight_between(self) -> Float[Tensor, "triples keypoints"]:
+        """Weight of each keypoint in the middle one of three rows."""
+        return self.seen.weight[self.motion.near.triples[:, 1]]
 
-    def level() -> Tensor:
-        return level_cost(floor, seen.floor).expand(rows)
+    @property
+    def rho(self) -> float:
+        """Residual of a keypoint at which its cost is half of the most [px]."""
+        return RHO * self.seen.height / 1080
 
-    every = torch.cat([points.joints, points.keypoints], 1)
-    return weigh(
-        ("support", under**2, lambda: support_cost(every, plane())),
-        ("stands", stands**2, stand),
-        ("balance", balance**2, balanced),
-        ("level", pose**2 * FRAMES / rows if sought else 0.0, level),
-        ("lies", lies**2, lie),
-    )
+    @cached_property
+    def sized(self) -> Float[Tensor, "bodies 22 3"]:
+        """Joints of the body, in sizes of it, so that smoothness pulls no person nearer."""
+        joints = self.points.joints
+        if self.config.by_size:
+            joints = joints / size_of(joints)[:, None, None]
+        return joints[:, : len(BODY)]
 
+    @cached_property
+    def plane(self) -> ground.Plane:
+        """The floor."""
+        return ground.plane_of(floor_of(self.at, self.frame), self.seen.up, self.seen.floor)
 
-def _prior_energy(at: Unknowns, frame: Frame, seen: Seen, by: Weighed) -> Energy:
-    """What is known of poses and shapes, whatever is seen."""
-    stage, config = by.stage, by.config
-    angles = by.decode(at.code)
-    count = torch.bincount(frame.person, minlength=len(at.betas)).to(at.betas)[frame.person]
-    given = config.height_weight if seen.stature is not None else 0.0
-    lasting = stage.shape if seen.lasting is not None else 0.0
-    hands, face = min(1, at.hands.shape[1]), min(1, at.face.shape[1])
-    expression = at.face[:, 3:]
+    @property
+    def sole_height(self) -> Float[Tensor, " bodies"]:
+        """Of the lower sole over the floor [m]."""
+        assert self.seen.soles is not None
+        up, level = self.plane
+        return ground.sole_heights(self.points.joints, self.seen.soles, up) - level
 
-    def pose() -> Tensor:
-        return at.code.square().sum(-1) if by.learned else pose_cost(angles, seen)
+    @property
+    def falling(self) -> Float[Tensor, " bodies"]:
+        """Squared distance of the centre of mass from the middle of the feet [m²]."""
+        return ground.balance_cost(self.points.joints, self.plane[0])
 
-    same = count.clamp_max(config.independent_frames)  # further frames repeat their errors
+    @property
+    def slope(self) -> Float[Tensor, " bodies"]:
+        """Of the floor, in what may be, squared."""
+        cost = ground.level_cost(floor_of(self.at, self.frame), self.seen.floor)
+        return cost.expand(len(self.at.place))
 
-    def shape() -> Tensor:
-        if seen.stature is None or seen.lasting is None:
-            return at.betas.square().sum(-1)[frame.person] / same
-        return shape_cost(seen.stature, at.betas)[frame.person] / same
+    @property
+    def away_from_lying(self) -> Float[Tensor, " bodies"]:
+        """Logarithm of the distance over the one that is expected; 0: none is."""
+        assert self.seen.about is not None
+        depth, about = self.at.place[:, 2], self.seen.about
+        return torch.where(about.isnan(), torch.zeros_like(depth), depth - about.nan_to_num())
 
-    def height() -> Tensor:
-        assert seen.stature is not None
-        return height_cost(seen.stature, at.betas)[frame.person] / count
+    @cached_property
+    def angles(self) -> Float[Tensor, "bodies angles"]:
+        """Of the joints [rad]."""
+        return self.frame.prior.decode(self.at.code)
 
-    def offset() -> Tensor:
-        assert seen.lasting is not None
-        return offset_cost(at.offset, seen.lasting)[frame.person] / same
+    @property
+    def off_pose(self) -> tuple[Tensor, Tensor | float]:
+        """The pose off the one that is expected and what is usual, or a learned prior's code."""
+        if self.frame.prior.width:
+            return self.at.code, 1.0
+        return off_pose(self.angles, self.seen.centre), self.seen.spread
 
-    return weigh(
-        ("pose", stage.pose**2, pose),
-        ("limits", config.limits**2, lambda: limit_cost(angles)),
-        ("bending", config.bending * stage.pose, lambda: bending_cost(angles)),
-        ("shape", stage.shape**2, shape),
-        ("height", given**2, height),
-        ("offset", lasting**2, offset),
-        ("hands", stage.hands**2 * hands, lambda: at.hands.square().sum(-1)),
-        ("jaw", stage.jaw**2 * face, lambda: jaw_cost(at.face)),
-        ("expression", stage.shape**2 * face, lambda: expression.square().sum(-1)),
-    )
+    @property
+    def excess(self) -> Float[Tensor, "bodies 63"]:
+        """Angles beyond the ranges of motion."""
+        return excess_of(self.angles)
 
+    @property
+    def bent(self) -> Float[Tensor, "bodies 4"]:
+        """Elbows and knees, the wrong way [rad]."""
+        return bent_wrong(self.angles)
 
-def geman_mcclure(squared: Float[Tensor, "*any"], rho: float) -> Float[Tensor, "*any"]:
-    """ρ² r² / (r² + ρ²): r² near zero, ρ² far away."""
-    return rho**2 * squared / (squared + rho**2)
+    @cached_property
+    def count(self) -> Float[Tensor, " bodies"]:
+        """Rows of each body's person."""
+        rows = torch.bincount(self.frame.person, minlength=len(self.at.betas))
+        return rows.to(self.at.betas)[self.frame.person]
 
+    @property
+    def same(self) -> Float[Tensor, " bodies"]:
+        """Rows with independent errors: further frames repeat them."""
+        return self.count.clamp_max(self.config.independent_frames)
 
-def keypoint_cost(
-    pixels: Float[Tensor, "bodies keypoints 2"], seen: Seen, rho: float
-) -> Float[Tensor, " bodies"]:
-    """Robust squared distances of projected keypoints from detected ones [px²]."""
-    scaled = rho * seen.height / 1080
-    cost = geman_mcclure((pixels - seen.pixels).square(), scaled).sum(-1)
-    return (cost * seen.weight.square()).sum(-1)
+    @property
+    def shape(self) -> Float[Tensor, " bodies"]:
+        """Squared standard deviations of the shape, one share for each row."""
+        stature, cost = self.seen.stature, self.at.betas.square().sum(-1)
+        if stature is not None and self.seen.lasting is not None:
+            cost = shape_cost(stature, self.at.betas)
+        return cost[self.frame.person] / self.same
 
-
-def bending_cost(angles: Float[Tensor, "bodies angles"]) -> Float[Tensor, " bodies"]:
-    """Elbows and knees that bend the wrong way: exp(±θ)²; 1 for a straight one."""
-    bent = [(sign * angles[:, 3 * joint + axis]).exp().square() for joint, axis, sign in BENT]
-    return torch.stack(bent, -1).sum(-1)
-
-
-def pose_cost(angles: Float[Tensor, "bodies angles"], seen: Seen) -> Float[Tensor, " bodies"]:
-    """Squared distance from the pose that is expected, in spreads; ankles keep the feet level.
-
-    Few detectors see toes. An ankle that is expected to turn back what hip and knee turn forth
-    keeps the foot as level as the trunk is upright; one at rest would stand people on their toes.
-    """
-    away = angles[:, :63] - seen.centre
-    level = away.index_add(1, away.new_tensor(ANKLES, dtype=torch.long), away[:, HIPS])
-    level = level.index_add(1, away.new_tensor(ANKLES, dtype=torch.long), away[:, KNEES])
-    return (level / seen.spread).square().sum(-1)
-
-
-def jaw_cost(face: Float[Tensor, "bodies face"]) -> Float[Tensor, " bodies"]:
-    """Squared turns of the jaw; about y and z a hundred times as much as opening."""
-    return face[:, 0].square() + 100 * face[:, 1:3].square().sum(-1)
-
-
-def second_difference(
-    values: Float[Tensor, "bodies points axes"], triples: Triples
-) -> Float[Tensor, "triples points axes"]:
-    """Twice the distance from the straight line through the neighbours, at their real times."""
-    before, now, after = (values[triples.rows[:, k]] for k in range(3))
-    share = triples.share[:, None, None]
-    return 2 * (share * before + (1 - share) * after - now)
-
-
-def _of_rows(
-    cost: Float[Tensor, " triples"], triples: Triples, rows: int
-) -> Float[Tensor, " bodies"]:
-    """Costs of triples, each added to its middle row."""
-    return cost.new_zeros(rows).index_add(0, triples.rows[:, 1], cost)
-
-
-def smooth_joint_cost(
-    joints: Float[Tensor, "bodies joints 3"], seen: Seen, by: Weighed
-) -> Float[Tensor, " bodies"]:
-    """Robust squared second differences of the joints of the body, over what people do."""
-    triples = seen.triples
-    second = second_difference(joints[:, :22], triples).square().sum(-1)
-    cost = geman_mcclure(second, by.config.sigma_joints).sum(-1) / triples.expected.square()
-    return _of_rows(cost, triples, len(joints))
-
-
-def still_cost(joints: Float[Tensor, "bodies joints 3"], seen: Seen) -> Float[Tensor, " bodies"]:
-    """Squared second differences of the pelvis, over what a body does that looks so still.
-
-    The keypoints of a body that lies along the view hardly constrain its distance: frames that
-    show the same pose constrain it jointly. Not robust, since a single frame is off by a metre.
-    """
-    triples = seen.triples
-    second = second_difference(joints[:, :1], triples).square().sum((-1, -2))
-    return _of_rows(second / triples.calm[:, 0].square(), triples, len(joints))
-
-
-def held_cost(
-    joints: Float[Tensor, "bodies joints 3"], seen: Seen, by: Weighed
-) -> Float[Tensor, " bodies"]:
-    """Robust squared second differences of trunk, head and arms about the pelvis, as `still_cost`.
-
-    Single frames hardly constrain the depth of an arm, either. Legs are left out: a foot that
-    stands still belongs to a body that walks on.
-    """
-    triples = seen.triples
-    about = joints[:, UPPER] - joints[:, :1]
-    second = second_difference(about, triples).square().sum(-1)
-    cost = geman_mcclure(second, by.config.sigma_held) / triples.calm[:, UPPER].square()
-    return _of_rows(cost.sum(-1), triples, len(joints))
-
-
-def smooth_pixel_cost(
-    pixels: Float[Tensor, "bodies keypoints 2"], seen: Seen, by: Weighed
-) -> Float[Tensor, " bodies"]:
-    """Robust squared second differences of projections where the middle one is seen [px²]."""
-    triples = seen.triples
-    second = second_difference(pixels, triples).square().sum(-1)
-    cost = geman_mcclure(second, by.config.sigma_pixels) * seen.weight[triples.rows[:, 1]].square()
-    return _of_rows(cost.sum(-1), triples, len(pixels))
+    @property
+    def off_height(self) -> Float[Tensor, " bodies"]:
+        """Squared distance from the given height, one share for each row [m²]."""
+        assert self.seen.stature is not None
+        return height_cost(self.seen.stature, self.at.betas)[self.frame.person] / self.count

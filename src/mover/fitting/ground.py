@@ -25,7 +25,7 @@ from mover.bodies.smpl_model import Model, skin_of_model
 Plane = tuple[Float[Tensor, "3"], Float[Tensor, ""] | float]
 """Away from the floor, in camera axes, and its height along that from the camera [m]."""
 
-STEP = 0.1  # [m], feet that are higher are not on the floor
+SUPPORT = 0.05  # [m], how far a joint may be under the floor
 ROLL, PITCH = math.radians(2), math.radians(8)  # how far a camera of unknown tilt is from level
 KNOWN_TILT, KNOWN_HEIGHT = math.radians(0.3), 0.01  # [rad], [m], the same for a given floor
 FRAMES = 20  # whose weight on the floor equals that of its prior
@@ -39,7 +39,6 @@ STRAIGHT, UPRIGHT = (0.6, 0.8), (0.5, 0.75)
 """Where legs begin to carry a body and surely do: hip over ankle in lengths of the leg, and the
 cosine of trunk and up."""
 BALANCE = 0.08  # [m], of the centre of mass about the middle of the feet, as one walks
-FALLING = 0.3  # [m], farther out it is held by something else
 NEIGHBOURS = 1.0  # [s], upright frames this close to lying constrain its distance
 
 
@@ -67,13 +66,6 @@ def sole_heights(
     """Height of the lower sole along `up` from the camera [m]."""
     low = torch.stack([(joints[:, both] @ up).amin(-1) for both in FEET], -1)
     return (low - soles.to(low)).amin(-1)
-
-
-def support_cost(
-    points: Float[Tensor, "bodies points 3"], plane: Plane
-) -> Float[Tensor, " bodies"]:
-    """Squared depth of points under the floor [m²]."""
-    return (plane[1] - points @ plane[0]).clamp_min(0).square().sum(-1)
 
 
 def level_cost(floor: Float[Tensor, " floor"], known: float | None) -> Float[Tensor, ""]:
@@ -122,14 +114,6 @@ def balance_cost(
     feet = joints[:, [joint for side in FEET for joint in side]].mean(1)
     off = center_of_mass(joints) - feet
     return (off - (off @ up)[:, None] * up).square().sum(-1)
-
-
-def lying_cost(
-    depth: Float[Tensor, " bodies"], about: Float[Tensor, " bodies"]
-) -> Float[Tensor, " bodies"]:
-    """Squared logarithm of the distance over the one that is expected; NaN: none is."""
-    off = torch.where(about.isnan(), torch.zeros_like(depth), depth - about.nan_to_num())
-    return off.square()
 
 
 def trunk_of(joints: Float[Tensor, "*bodies joints 3"]) -> Float[Tensor, "*bodies 3"]:

@@ -55,10 +55,10 @@ def noise_of(
     return noise
 
 
-def at_most(seen: Seen, noise: Float[Tensor, " bodies"], pose: float) -> Seen:
-    """No keypoint surer than its noise [px] lets it be, beside a pose prior of this weight."""
+def at_most(seen: Seen, noise: Float[Tensor, " bodies"], pose: float) -> Tensor:
+    """Weights, none larger than the noise [px] allows beside a pose prior of this weight."""
     most = pose * seen.height / HEIGHT / noise.clamp_min(1e-6)
-    return dataclasses.replace(seen, weight=torch.minimum(seen.weight, most[:, None]))
+    return torch.minimum(seen.weight, most[:, None])
 
 
 def noisy(pixels: Float[Tensor, "bodies keypoints 2"], noise: Float[Tensor, " bodies"]) -> Tensor:

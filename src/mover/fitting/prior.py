@@ -1,20 +1,18 @@
-r"""Priors of the pose: joint limits, a pose to stay near to, or a learned code.
+r"""A learned prior of the pose: VPoser's decoder, with the user's own weights.
 
-VPoser's decoder makes a body's pose from 32 normal numbers, with the user's own weights:
+It makes a body's pose from 32 normal numbers:
 
     z -> linear(32, h) -> leaky ReLU -> linear(h, h) -> leaky ReLU -> linear(h, 6 J)
       -> J x two columns -> Gram-Schmidt -> rotations
 
-after Pavlakos et al. 2019 (Sec. 3.3). Three kinds of file hold it: the first version's checkpoint
-(`bodyprior_dec_fc1` ...), the second's (`vp_model.decoder_net.` ...), and arrays of another
-release (`fc1W` ..., where tanh takes the place of the leaky ReLU and the nearest rotation that of
-Gram-Schmidt). The network is reimplemented from its description; no weights are shipped.
+after Pavlakos et al. 2019 (Sec. 3.3), from the checkpoint of the first version
+(`bodyprior_dec_fc1` ...) or of the second (`vp_model.decoder_net.` ...). The network is
+reimplemented from its description; no weights are shipped.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -22,31 +20,11 @@ from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.observe import Energy
-from mover.core.records import BROKEN, record
-from mover.fitting.unknowns import lowered
+from mover.core.records import record
+from mover.fitting.unknowns import ANGLES, PosePrior, lowered
 from mover.geometry.rotations import axis_angle
 
-Decode = Callable[[Float[Tensor, "bodies code"]], Float[Tensor, "bodies angles"]]
 ENCODING_STEPS = 100
-
-
-@dataclass(frozen=True)
-class PosePrior:
-    """How a code becomes the angles of a body."""
-
-    decode: Decode
-    """From codes to angles [rad]."""
-    width: int
-    """Numbers of a code; 0: the code is the angles themselves."""
-
-
-def same(code: Float[Tensor, "bodies code"]) -> Float[Tensor, "bodies code"]:
-    """Angles that are their own code."""
-    return code
-
-
-ANGLES = PosePrior(same, 0)
-"""No learned prior: ranges of motion, a resting pose, and the pose to start from."""
 
 
 def encoded(
@@ -67,62 +45,42 @@ def encoded(
 
 
 BODY_JOINTS = 21
-SLOPES = {"v1": 0.2, "v2": 0.01, "arrays": 0.0}
-NAMES = {
-    "v1": ("bodyprior_dec_fc1", "bodyprior_dec_fc2", "bodyprior_dec_out"),
-    "v2": ("decoder_net.0", "decoder_net.3", "decoder_net.5"),
-}
-"""Layers of the decoder in the checkpoints of both versions."""
+LAYERS = (
+    (0.2, ("bodyprior_dec_fc1", "bodyprior_dec_fc2", "bodyprior_dec_out")),
+    (0.01, ("decoder_net.0", "decoder_net.3", "decoder_net.5")),
+)
+"""Slope of the leaky ReLU and names of the layers in the checkpoints of both versions."""
 
 
 @record
 class Vposer:
     """Three layers; weights are (out, in)."""
 
-    kind: Literal["v1", "v2", "arrays"]
+    slope: float
     weights: tuple[Float[Tensor, "_ _"], ...]
     biases: tuple[Float[Tensor, " _"], ...]
 
 
 def load_vposer(path: Path) -> Vposer:
-    """The decoder of a checkpoint, of a folder with `snapshots/`, or of an .npz file.
+    """The decoder of a checkpoint, or of the newest one of a folder with `snapshots/`.
 
     Raises:
         InputError: If there is none, or its layers are not VPoser's.
     """
-    file = _file(path)
-    state = _arrays(file) if file.suffix == ".npz" else _checkpoint(file)
-    if "fc1W" in state:
-        layers = [(state[f"fc{k}W"].mT, state[f"fc{k}b"]) for k in (1, 2, 3) if f"fc{k}W" in state]
-        kind: Literal["v1", "v2", "arrays"] = "arrays"
-    else:
-        kind = "v1" if any(NAMES["v1"][0] in key for key in state) else "v2"
-        layers = [_layer(state, name, file) for name in NAMES[kind]]
+    file = path
+    if path.is_dir():
+        found = sorted(p for s in ("*.pt", "*.ckpt") for p in path.rglob(s))
+        if not found:
+            raise InputError(f"{path}: has no .pt or .ckpt file, expected VPoser's snapshots")
+        file = found[-1]
+    if not file.exists():
+        raise InputError(f"{path}: does not exist, expected VPoser's weights")
+    state = _checkpoint(file)
+    slope, names = LAYERS[0 if any(LAYERS[0][1][0] in key for key in state) else 1]
+    layers = [_layer(state, name, file) for name in names]
     _check(layers, file)
     weights = tuple(weight.float().contiguous() for weight, _ in layers)
-    return Vposer(kind, weights, tuple(bias.float() for _, bias in layers))
-
-
-def _file(path: Path) -> Path:
-    """The newest snapshot of a folder."""
-    if path.is_dir():
-        found = sorted(p for s in ("*.pt", "*.ckpt", "*.npz") for p in path.rglob(s))
-        if not found:
-            raise InputError(f"{path}: has no .pt, .ckpt or .npz file, expected VPoser's snapshots")
-        return found[-1]
-    if not path.exists():
-        raise InputError(f"{path}: does not exist, expected VPoser's weights")
-    return path
-
-
-def _arrays(file: Path) -> dict[str, Tensor]:
-    import numpy as np
-
-    try:
-        with np.load(file, allow_pickle=False) as data:
-            return {key: torch.from_numpy(data[key]) for key in data.files}
-    except BROKEN as error:
-        raise InputError(f"{file.name}: cannot be read as arrays ({error})") from error
+    return Vposer(slope, weights, tuple(bias.float() for _, bias in layers))
 
 
 def _checkpoint(file: Path) -> dict[str, Tensor]:
@@ -164,13 +122,11 @@ def _check(layers: list[tuple[Tensor, Tensor]], file: Path) -> None:
 
 def decoded(network: Vposer, code: Float[Tensor, "bodies code"]) -> Float[Tensor, "bodies 21 3 3"]:
     """Rotations of the 21 joints of the body."""
-    x, slope = code, SLOPES[network.kind]
+    x = code
     for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         x = x @ weight.mT.to(x) + bias.to(x)
         if k < 2:
-            x = x.tanh() if network.kind == "arrays" else torch.nn.functional.leaky_relu(x, slope)
-    if network.kind == "arrays" and x.shape[-1] % 9 == 0 and x.shape[-1] % 6:
-        return nearest_rotations(x.unflatten(-1, (-1, 3, 3))[:, :BODY_JOINTS])
+            x = torch.nn.functional.leaky_relu(x, network.slope)
     return gram_schmidt(x.unflatten(-1, (-1, 3, 2))[:, :BODY_JOINTS])
 
 
@@ -181,14 +137,6 @@ def gram_schmidt(columns: Float[Tensor, "*batch 3 2"]) -> Float[Tensor, "*batch 
     y = second - (x * second).sum(-1, keepdim=True) * x
     y = torch.nn.functional.normalize(y, dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)], -1)
-
-
-def nearest_rotations(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """The rotations nearest to matrices."""
-    u, _, vt = torch.linalg.svd(matrix)
-    sign = torch.linalg.det(u @ vt)[..., None, None]
-    ends = torch.cat([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
-    return (u * ends) @ vt
 
 
 def vectors_of(turns: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:

@@ -10,28 +10,35 @@ Seen along the body, a lying person looks nearly the same from the feet as from 
 reversed about the pelvis), so that single frames lay a body the wrong way round. But lying people
 do not turn end for end: the majority of each stretch of lying decides the direction, and hypotheses
 against it are excluded.
+
+Where another tool found bodies, a fit starts from their poses instead.
 """
 
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.keypoints import LAYOUTS
 from mover.bodies.skeleton import BODY
-from mover.core.records import record
-from mover.core.types import Camera, Keypoints
+from mover.bodies.smpl_files import load_smpl
+from mover.bodies.transfer import ANGLES, as_smplx, find_matrix, read_matrix
+from mover.core.errors import InputError
+from mover.core.observe import Energy
+from mover.core.records import record, rows_of, with_rows
+from mover.core.types import Bodies, BodyPose, Camera, Keypoints
+from mover.energy.body_terms import robust_square
 from mover.fitting.config import FitConfig, Stage
-from mover.fitting.energy import Seen, Weighed, body_energy, geman_mcclure
+from mover.fitting.energy import FitState, Seen
 from mover.fitting.ground import LIES, NEIGHBOURS, SITS, trunk_of
-from mover.fitting.limits import resting, spreads
-from mover.fitting.prior import same
-from mover.fitting.tracks import best_path, chosen, every_so_often, tracks_of
-from mover.fitting.unknowns import OF_ROWS, Frame, Rig, Unknowns, place_of, points_of, solve
-from mover.geometry.rotations import rot_x, rot_y, rot_z
+from mover.fitting.priors import resting, spreads
+from mover.fitting.tracks import best_path, every_so_often, tracks_of
+from mover.fitting.unknowns import Frame, Rig, Unknowns, place_of, points_of, solve
+from mover.geometry.camera import project
+from mover.geometry.rotations import axis_angle, rot_x, rot_y, rot_z
 
 YAWS = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)
 BACK, OTHERS = (0.0,), (0.5 * math.pi, -0.5 * math.pi, math.pi)
@@ -45,6 +52,10 @@ ARMS = ("shoulder",)
 """Hang by their weight where the trunk is upright; those of lying people may be anywhere."""
 TORSO = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 START = Stage(pose=12.0, shape=5.0, smooth=0.0)
+NEAR = math.radians(15)  # how far each angle may be from that of a body to start from
+JUMP = 0.25  # [m], joints about the pelvis between rows of a track that hypotheses explain
+REACH, SPEED = 0.3, 1.5  # [m], [m/s], how far a hypothesis misplaces a pelvis, how fast it moves
+SWITCH = 10.0  # weight of such a move, in squared standard deviations of the pose
 BEFORE = 3.5  # [m], depth of a body that its keypoints do not constrain
 NEAREST, FARTHEST = 0.4, 40.0  # [m]
 START_FPS = 6.0  # hypotheses are tried so many times a second
@@ -84,15 +95,9 @@ class Guess:
 
 
 @record
-class Tried:
+class Tried(FitStart):
     """A hypothesis that was fitted to rows."""
 
-    at: Unknowns
-    root: Float[Tensor, "bodies 3 3"]
-    centre: Float[Tensor, "bodies 63"]
-    """The pose that it expects [rad]."""
-    spread: Float[Tensor, "bodies 63"]
-    """How far from it each angle may be [rad]."""
     cost: Float[Tensor, " bodies"]
     joints: Float[Tensor, "bodies joints 3"]
     """Of the body, in camera axes [m]."""
@@ -116,7 +121,7 @@ def _posed(angles: Mapping[str, tuple[int, float]], like: Tensor) -> Float[Tenso
 
 
 def lying_guesses(like: Tensor, rolls: tuple[float, ...]) -> list[Guess]:
-    """People who lie with the head in four directions, rolled as far."""
+    """People lying with the head in four directions, rolled as far."""
     pose, spread = resting(1, like)[0], spreads(1, like, ARMS)[0]
     turns = rot_y(torch.tensor(YAWS).to(like)).unbind(0)
     back = rot_x(torch.tensor(-0.5 * math.pi).to(like))
@@ -137,10 +142,13 @@ def unknowns_at(pose: Float[Tensor, "bodies code"], pelvis: Float[Tensor, "bodie
     )
 
 
-def where_seen(at: Unknowns, frame: Frame, seen: Seen, names: list[str]) -> Unknowns:
+def where_seen(at: Unknowns, frame: Frame, seen: Seen) -> Unknowns:
     """Bodies that are `before` the camera, put where it sees their keypoints."""
-    origin = points_of(at, frame, same).keypoints - before(at.code)[:, None]
-    pelvis = placed(origin, seen.pixels, torso_first(seen.weight, names), seen.K)
+    origin = points_of(at, frame).keypoints - before(at.code)[:, None]
+    torso = torch.tensor([n in TORSO for n in frame.rig.names], device=origin.device)
+    enough = ((seen.weight > 0) & torso).sum(1, keepdim=True) >= 3
+    weight = torch.where(enough & ~torso, 0.2 * seen.weight, seen.weight)
+    pelvis = placed(origin, seen.pixels, weight, seen.K)
     return dataclasses.replace(at, place=place_of(pelvis))
 
 
@@ -155,11 +163,7 @@ def placed(
     Linear least squares under the true camera: what turns weak perspective into perspective.
     """
     rays = (pixels - K[:2, 2]) / torch.stack([K[0, 0], K[1, 1]])
-    one, none = torch.ones_like(rays[..., 0]), torch.zeros_like(rays[..., 0])
-    left = torch.stack(
-        [torch.stack([one, none, -rays[..., 0]], -1), torch.stack([none, one, -rays[..., 1]], -1)],
-        -2,
-    )
+    left = torch.cat([torch.eye(2).to(rays).expand(*rays.shape, 2), -rays[..., None]], -1)
     right = rays * points[..., 2:] - points[..., :2]
     left, right = left * weight[..., None, None], right * weight[..., None]
     left, right = left.flatten(1, 2).double(), right.flatten(1).double()
@@ -173,21 +177,11 @@ def placed(
     return torch.where(good[:, None], place, ahead)
 
 
-def torso_first(
-    weight: Float[Tensor, "bodies keypoints"], names: list[str]
-) -> Float[Tensor, "bodies keypoints"]:
-    """Weights by which a body is placed: mostly its torso, where two of its joints are seen."""
-    torso = torch.tensor([name in TORSO for name in names], device=weight.device)
-    enough = ((weight > 0) & torso).sum(1, keepdim=True) >= 3
-    return torch.where(enough & ~torso, 0.2 * weight, weight)
-
-
 def tilt_of(
-    points: Float[Tensor, "bodies keypoints 3"], seen: Seen, names: list[str]
+    points: Float[Tensor, "bodies keypoints 3"], seen: Seen, names: tuple[str, ...]
 ) -> Float[Tensor, " bodies"]:
     """Angle in the image from the trunk of a hypothesis to the one that is seen [rad]."""
-    weight = (seen.weight > 0).to(points)
-    angles: list[Tensor] = []
+    weight, angles = (seen.weight > 0).to(points), list[Tensor]()
     there = torch.ones(len(points), dtype=torch.bool, device=points.device)
     for place in (points[..., :2], seen.pixels):
         ends: list[Tensor] = []
@@ -197,92 +191,69 @@ def tilt_of(
             there = there & (share.sum(1) > 0)
             total = (place[:, index] * share[..., None]).sum(1)
             ends.append(total / share.sum(1, keepdim=True).clamp_min(1e-9))
-        trunk = ends[0] - ends[1]
-        angles.append(torch.atan2(trunk[:, 1], trunk[:, 0]))
-    return torch.where(there, angles[1] - angles[0], torch.zeros_like(angles[0]))
+        x, y = (ends[0] - ends[1]).unbind(-1)
+        angles.append(torch.atan2(y, x))
+    return torch.where(there, angles[1] - angles[0], 0.0)
 
 
 def begin(
     keypoints: Keypoints, seen: Seen, rig: Rig, camera: Camera, config: FitConfig
 ) -> FitStart:
     """Start from keypoints alone: the best of all hypotheses, row by row and along each track."""
-    fps = keypoints.fps
+    fps, like = keypoints.fps, seen.pixels
     step = 1 if fps is None else max(1, round(fps / START_FPS))
     rows, nearest = every_so_often(keypoints.frame, keypoints.person, step)
-    names = [LAYOUTS[keypoints.layout][k] for k in rig.keypoints.tolist()]
-    what = (camera.R_cam_world.to(seen.pixels), rig, names, config)
+    R = camera.R_cam_world.to(like)
     tracks = [
         (track, None if fps is None else keypoints.frame[rows][track] / fps)
         for track in tracks_of(keypoints.frame[rows], keypoints.person[rows])
     ]
-    like = seen.pixels
-    first = [*upright_guesses(like), *lying_guesses(like, BACK)]
-    tries = [_tried(guess, chosen(seen, rows), what) for guess in first]
-    best = _followed(tries, tracks, seen.up, config)
+
+    def tried(guess: Guess, rows: Int[Tensor, " some"]) -> Tried:
+        some = dataclasses.replace(rows_of(seen, rows, "bodies"), motion=None)
+        return _tried(guess, some, R, rig, config)
+
+    tries = [tried(g, rows) for g in (*upright_guesses(like), *lying_guesses(like, BACK))]
+    best = _followed(tries, tracks, seen.up)
     trunks = torch.stack([trunk_of(one.joints) for one in tries])
     down = _down(trunks[best, torch.arange(len(best))], seen.up, tracks)
     if len(down):
-        for guess in lying_guesses(like, OTHERS):
-            some = _tried(guess, chosen(seen, rows[down]), what)
-            tries.append(_among(some, down, tries[-1]))
-        best = _followed(tries, tracks, seen.up, config)
-    best = best[nearest]
-    fields = {
-        name: torch.stack([getattr(one.at, name) for one in tries])[best, nearest]
-        for name in OF_ROWS
-    }
-    at = dataclasses.replace(tries[0].at, **fields)
-    root, centre, spread = (
-        torch.stack([getattr(one, name) for one in tries])[best, nearest]
-        for name in ("root", "centre", "spread")
-    )
-    return FitStart(at, root, centre, spread)
+        for guess in lying_guesses(like, OTHERS):  # no other row may take these
+            none = dataclasses.replace(tries[0], cost=torch.full_like(tries[0].cost, torch.inf))
+            tries.append(with_rows(none, down, tried(guess, rows[down]), "bodies"))
+        best = _followed(tries, tracks, seen.up)
+    found = rows_of(tries[0], nearest, "bodies")
+    for number, one in enumerate(tries):
+        own = (best[nearest] == number).nonzero()[:, 0]
+        found = with_rows(found, own, rows_of(one, nearest[own], "bodies"), "bodies")
+    return found
 
 
-def _tried(
-    guess: Guess, seen: Seen, what: tuple[Float[Tensor, "3 3"], Rig, list[str], FitConfig]
-) -> Tried:
+def _tried(guess: Guess, seen: Seen, R: Float[Tensor, "3 3"], rig: Rig, config: FitConfig) -> Tried:
     """One hypothesis fitted to all rows."""
-    R, rig, names, config = what
     body = guess.pose.expand(len(seen.pixels), -1)
-    person = torch.zeros(len(body), dtype=torch.long)
     at = unknowns_at(body, before(body))
     spread = guess.spread.expand_as(body)
     narrow = 2 * (seen.spread / spread).log().sum(-1)
     seen = dataclasses.replace(seen, centre=body, spread=spread)
-    frame = Frame(rig, (R @ guess.root).expand(len(body), -1, -1), person)
+    root = (R @ guess.root).expand(len(body), -1, -1)
+    frame = Frame(rig, root, torch.zeros(len(body), dtype=torch.long))
     if guess.upright:
-        flat = points_of(at, frame, same).keypoints
-        frame = Frame(rig, rot_z(tilt_of(flat, seen, names)) @ frame.root, person)
-    at = where_seen(at, frame, seen, names)
-    by = Weighed(START, config, same, learned=False)
-    at = solve(
-        lambda u: body_energy(u, frame, seen, by), at, config.start_steps, ("turn", "code", "place")
-    )
+        tilt = tilt_of(points_of(at, frame).keypoints, seen, rig.names)
+        frame = dataclasses.replace(frame, root=rot_z(tilt) @ root)
+    state = FitState(where_seen(at, frame, seen), frame, seen, config)
+
+    def energy(u: Unknowns) -> Energy:
+        return dataclasses.replace(state, at=u).energy(START)
+
+    at = solve(energy, state.at, config.start_steps, ("turn", "code", "place"))
     with torch.no_grad():
-        cost = body_energy(at, frame, seen, by).per_item / START.pose**2 - narrow
-        joints = points_of(at, frame, same).joints[:, :22]
+        cost = energy(at).per_item / START.pose**2 - narrow
+        joints = points_of(at, frame).joints[:, :22]
     if not guess.upright:
         slope = (trunk_of(joints) @ seen.up).clamp(-1, 1).asin()
-        cost = cost + geman_mcclure(slope.square(), SLOPE) / LEVEL**2
+        cost = cost + robust_square(slope.square(), SLOPE) / LEVEL**2
     return Tried(at, frame.root, body, spread, cost, joints)
-
-
-def _among(some: Tried, rows: Int[Tensor, " some"], like: Tried) -> Tried:
-    """A hypothesis of some rows as one of all, which none of the others may take."""
-
-    def put(part: Tensor, whole: Tensor) -> Tensor:
-        return whole.index_copy(0, rows, part)
-
-    fields = {name: put(getattr(some.at, name), getattr(like.at, name)) for name in OF_ROWS}
-    return Tried(
-        dataclasses.replace(like.at, **fields),
-        put(some.root, like.root),
-        put(some.centre, like.centre),
-        put(some.spread, like.spread),
-        put(some.cost, torch.full_like(like.cost, torch.inf)),
-        put(some.joints, like.joints),
-    )
 
 
 def _down(
@@ -298,17 +269,17 @@ def _down(
 
 
 def _followed(
-    tries: list[Tried], tracks: Sequence[Track], up: Float[Tensor, "3"], config: FitConfig
+    tries: list[Tried], tracks: Sequence[Track], up: Float[Tensor, "3"]
 ) -> Int[Tensor, " bodies"]:
     """The hypothesis of each row, along each track; lying people do not turn end for end."""
     cost = torch.stack([one.cost for one in tries], 1)
     joints = torch.stack([one.joints for one in tries], 1)
     best = torch.zeros(len(cost), dtype=torch.long)
     for track, time in tracks:
-        best[track] = _path(cost[track], joints[track], time, config)
+        best[track] = _path(cost[track], joints[track], time)
         if time is not None:
             against = turned_round(trunk_of(joints[track]), best[track], up)
-            best[track] = _path(cost[track] + NEVER * against, joints[track], time, config)
+            best[track] = _path(cost[track] + NEVER * against, joints[track], time)
     return best
 
 
@@ -338,13 +309,89 @@ def _path(
     cost: Float[Tensor, "rows tries"],
     joints: Float[Tensor, "rows tries joints 3"],
     time: Float[Tensor, " rows"] | None,
-    config: FitConfig,
 ) -> Int[Tensor, " rows"]:
     """The hypotheses of a track: cheap ones whose joints stay near from frame to frame."""
     if time is None or len(cost) < 2:
         return cost.argmin(1)
     gone = joints[:-1, :, None] - joints[1:, None]
     about = (gone - gone[..., :1, :]).norm(dim=-1).mean(-1)
-    reach = config.reach + config.speed * time.diff()[:, None, None]
-    strain = (about / config.jump).square() + (gone[..., 0, :].norm(dim=-1) / reach).square()
-    return best_path(cost, config.switch * strain.clamp_max(STRAIN))
+    reach = REACH + SPEED * time.diff()[:, None, None]
+    strain = (about / JUMP).square() + (gone[..., 0, :].norm(dim=-1) / reach).square()
+    return best_path(cost, SWITCH * strain.clamp_max(STRAIN))
+
+
+# From the bodies of another tool.
+
+
+def start_rows(
+    start: Bodies, keypoints: Keypoints, K: Float[Tensor, "3 3"]
+) -> Int[Tensor, " rows"]:
+    """The row of `start` for each row of the keypoints: the same person, the nearest frame.
+
+    People are paired by where they are in the image.
+
+    Raises:
+        InputError: If a person of the keypoints has no body.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    points = start.joints if start.joints is not None else start.verts[:, ::50]
+    theirs = project(points, K.to(points)).nanmean(1)
+    seen = keypoints.points.where(keypoints.confidence[..., None] > 0, torch.nan)
+    ours = seen.nanmean(1)
+    people, tracks = keypoints.person.unique().tolist(), start.person.unique().tolist()
+    mine = [(keypoints.person == one).nonzero()[:, 0] for one in people]
+    other = [(start.person == one).nonzero()[:, 0] for one in tracks]
+    cost = np.full((len(people), len(tracks)), 1e6)  # mean distance in the frames of both [px]
+    for k, other_k in np.ndindex(cost.shape):
+        a, b = mine[k], other[other_k]
+        _, i, j = np.intersect1d(
+            keypoints.frame[a].numpy(), start.frame[b].numpy(), return_indices=True
+        )
+        if len(i):
+            far = (ours[a[i]] - theirs[b[j]]).norm(dim=-1).nan_to_num(1e6)
+            cost[k, other_k] = min(1e6, float(far.mean()))
+    pairs = dict(zip(*(x.tolist() for x in linear_sum_assignment(cost)), strict=True))
+    found = torch.zeros(len(keypoints.frame), dtype=torch.long)
+    for k, rows in enumerate(mine):
+        if k not in pairs:
+            raise InputError(
+                f"bodies to start from: there is none for person {people[k]} of the keypoints "
+                f"(there are tracks {tracks})"
+            )
+        own = other[pairs[k]]
+        apart = (start.frame[own] - keypoints.frame[rows][:, None]).abs()
+        found[rows] = own[apart.argmin(1)]
+    return found
+
+
+def begin_from(start: Bodies, keypoints: Keypoints, seen: Seen, rig: Rig) -> FitStart:
+    """Start from bodies with parameters: their pose, under the true camera.
+
+    SMPL bodies start a fit of SMPL-X by the official matrix where the user has it (the paper's way
+    from PARE), else by the angles of the joints that both models have.
+
+    Raises:
+        InputError: If they have no parameters, are not in the camera frame, or a person is missing.
+    """
+    if start.space != "camera":
+        raise InputError("bodies to start from: 'space' is 'world', expected 'camera'")
+    rows, pose = start_rows(start, keypoints, seen.K), start.pose
+    if pose is None or pose.body_pose.shape[1] < ANGLES:
+        raise InputError("bodies to start from: have no parameters, expected 'body_pose' ...")
+    if (pose.model, rig.model.name) == ("smpl", "smplx"):
+        pose = _by_matrix(pose)
+    angles = pose.body_pose[rows, :ANGLES].float()
+    root = axis_angle(pose.global_orient[rows].float())
+    frame = Frame(rig, root, torch.zeros(len(angles), dtype=torch.long))
+    at = where_seen(unknowns_at(angles, before(angles)), frame, seen)
+    return FitStart(at, root, angles, torch.full_like(seen.spread, NEAR))
+
+
+def _by_matrix(pose: BodyPose) -> BodyPose:
+    """SMPL-X parameters of SMPL bodies where the official matrix is there."""
+    path = find_matrix()
+    if path is None:
+        return pose
+    smpl, smplx = (load_smpl(name, pose.gender) for name in ("smpl", "smplx"))
+    return as_smplx(pose, smpl, smplx, read_matrix(path))

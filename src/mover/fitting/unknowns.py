@@ -1,12 +1,13 @@
 """A body model reduced to what a fit looks at, what is solved of it, and L-BFGS over all frames.
 
-The joints are turned level by level down the tree (all knees at once), and of the skin only the
-vertices that are keypoints are moved, so that hundreds of frames cost a few milliseconds.
+Of the skin only the vertices that are keypoints are moved, so that hundreds of frames cost a few
+milliseconds.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,31 +15,26 @@ from torch import Tensor
 
 from mover.bodies.keypoints import LAYOUTS, spots_of
 from mover.bodies.skeleton import BODY
-from mover.bodies.skinning import SkinnedBody, shaped, widths_of
+from mover.bodies.skinning import SkinnedBody, pose_joints, shaped, widths_of
 from mover.bodies.smpl_model import Model, SmplBody, skin_of_model, vertex_subset
 from mover.core.observe import Energy
-from mover.core.records import record
-from mover.fitting.limits import spreads
+from mover.core.records import record, rows_of
+from mover.fitting.priors import kind_of, spreads
 from mover.geometry.rotations import axis_angle
-
-HISTORY = 100
-"""Steps that L-BFGS remembers: all poses jointly constrain the heights, which converge slowly."""
 
 
 @record
 class Rig:
-    """Joints in levels, keypoint vertices, and how keypoints are mixed of both."""
+    """Joints, keypoint vertices, and how keypoints are mixed of both."""
 
     model: SkinnedBody | SmplBody
     """The body with its keypoint vertices only; of the open body only the joints that are used."""
-    levels: tuple[tuple[int, ...], ...]
-    """Joints by their depth in the tree."""
-    above: tuple[tuple[int, ...], ...]
-    """Where the parents of the joints of a level are in the level before."""
     mix: Float[Tensor, "keypoints points"]
     """Share of each joint, then of each vertex, in each keypoint."""
     keypoints: Int[Tensor, " keypoints"]
     """Index of the keypoints in their layout: those that are used and that the model has."""
+    names: tuple[str, ...]
+    """Of these keypoints."""
     bones: Int[Tensor, " keypoints"]
     """The joint whose rotation carries each keypoint: of a joint, its parent."""
 
@@ -56,10 +52,6 @@ class Points:
     joints: Float[Tensor, "bodies joints 3"]
 
 
-FAR = ("index", "middle", "ring", "pinky", "thumb", "jaw")
-"""Keypoints that no part of the 22 joints moves."""
-
-
 def rig_of(model: Model, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
     """The rig of the keypoints of a layout that are `used`.
 
@@ -68,13 +60,13 @@ def rig_of(model: Model, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
     """
     spots = spots_of(model, layout)
     index = torch.nonzero(used.cpu() & spots.there)[:, 0]
+    names = tuple(LAYOUTS[layout][k] for k in index.tolist())
     vertex, share, joint = spots.vertex[index], spots.share[index], spots.joint[index]
     needed = torch.unique(vertex[joint < 0])
     small = vertex_subset(model, needed)
-    names = [LAYOUTS[layout][k] for k in index.tolist()]
-    on_body = all(n in BODY or not any(part in n for part in FAR) for n in names)
+    on_body = not any(kind_of(name) == "hand" or "jaw" in name for name in names)
     if isinstance(small, SkinnedBody) and on_body:
-        small = _cut(small, len(BODY))
+        small = _of_first_joints(small, len(BODY))
     skin = skin_of_model(small)
     assert skin is not None
     count = len(skin.parents)
@@ -84,39 +76,19 @@ def rig_of(model: Model, layout: str, used: Bool[Tensor, " layout"]) -> Rig:
     column = count + torch.searchsorted(needed, vertex)
     rows = torch.nonzero(~is_joint)[:, 0]
     mix[rows] = mix[rows].scatter_add(1, column[rows], share[rows])
-    levels, above = _levels(skin.parents)
     parents = torch.tensor(skin.parents).clamp_min(0)
     first = torch.searchsorted(needed, vertex[:, 0].contiguous()).clamp_max(len(needed) - 1)
     bones = torch.where(is_joint, parents[joint.clamp_min(0)], skin.weights[first].argmax(1))
-    return Rig(small, levels, above, mix, index, bones)
+    return Rig(small, mix, index, names, bones)
 
 
-def _cut(skin: SkinnedBody, joints: int) -> SkinnedBody:
+def _of_first_joints(skin: SkinnedBody, joints: int) -> SkinnedBody:
     """The body with its first joints only; none of its vertices follows another one."""
-    weights = skin.weights[:, :joints]
+    first = rows_of(skin, torch.arange(joints), "joints")
     return dataclasses.replace(
-        skin,
-        joint_names=skin.joint_names[:joints],
-        parents=skin.parents[:joints],
-        joints=skin.joints[:joints],
-        weights=weights / weights.sum(1, keepdim=True),
-        joint_dirs=skin.joint_dirs[:joints],
-        tpose=skin.tpose[:joints],
-    )
-
-
-def _levels(
-    parents: tuple[int, ...],
-) -> tuple[tuple[tuple[int, ...], ...], tuple[tuple[int, ...], ...]]:
-    """Joints by depth, and the places of their parents in the level above."""
-    depth = [0] * len(parents)
-    for joint, parent in enumerate(parents):
-        depth[joint] = depth[parent] + 1 if parent >= 0 else 0
-    levels = [tuple(j for j, d in enumerate(depth) if d == k) for k in range(max(depth) + 1)]
-    above = [
-        tuple(levels[k - 1].index(parents[j]) for j in levels[k]) for k in range(1, len(levels))
-    ]
-    return tuple(levels), ((), *above)
+        first, joint_names=skin.joint_names[:joints], parents=skin.parents[:joints],
+        weights=first.weights / first.weights.sum(1, keepdim=True),
+    )  # fmt: skip
 
 
 def move(
@@ -127,14 +99,15 @@ def move(
     expression: Float[Tensor, "bodies expression"] | None = None,
     lasting: Float[Tensor, "bodies keypoints 3"] | None = None,
 ) -> Points:
-    """Keypoints and joints of bodies whose pelvis is at a place [m], differentiable in all.
+    """Keypoints and joints of bodies whose pelvis is at a position [m], differentiable in all.
 
     `lasting` moves each keypoint in the axes of its bone [m].
     """
-    verts, joints = shaped(rig.skin, betas)
     if isinstance(rig.model, SmplBody):
-        verts, joints = _corrected(rig.model, turns, verts, joints, expression)
-    world, places = _down_the_tree(rig, turns, joints)
+        verts, joints = rig.model.rest(turns, betas, expression)
+    else:
+        verts, joints = shaped(rig.skin, betas)
+    world, places = pose_joints(rig.skin, turns, joints)
     offset = places - (world @ joints[..., None])[..., 0]
     moves = torch.cat([world, offset[..., None]], -1).flatten(2)
     skin = (rig.skin.weights.to(moves) @ moves).unflatten(-1, (3, 4))
@@ -145,44 +118,6 @@ def move(
     if lasting is not None:
         keypoints = keypoints + (world[:, rig.bones] @ lasting[..., None])[..., 0]
     return Points(keypoints, places + shift)
-
-
-def _corrected(
-    model: SmplBody,
-    turns: Float[Tensor, "bodies joints 3 3"],
-    verts: Float[Tensor, "bodies verts 3"],
-    joints: Float[Tensor, "bodies joints 3"],
-    expression: Float[Tensor, "bodies expression"] | None,
-) -> tuple[Float[Tensor, "bodies verts 3"], Float[Tensor, "bodies joints 3"]]:
-    """The rest shape with the correctives of the pose and the expression."""
-    features = (turns[:, 1:] - torch.eye(3).to(turns)).flatten(1)
-    verts = verts + (features @ model.pose_dirs.to(verts).flatten(1)).reshape(verts.shape)
-    if expression is not None and expression.shape[-1]:
-        count = expression.shape[-1]
-        dirs = model.expression_dirs[..., :count].to(verts)
-        verts = verts + torch.einsum("vik,bk->bvi", dirs, expression)
-        joint_dirs = model.expression_joint_dirs[..., :count].to(verts)
-        joints = joints + torch.einsum("jik,bk->bji", joint_dirs, expression)
-    return verts, joints
-
-
-def _down_the_tree(
-    rig: Rig, turns: Float[Tensor, "bodies joints 3 3"], joints: Float[Tensor, "bodies joints 3"]
-) -> tuple[Float[Tensor, "bodies joints 3 3"], Float[Tensor, "bodies joints 3"]]:
-    """World rotation (from the rest shape) and place of each joint."""
-    tpose = rig.skin.tpose.to(turns)
-    parents = torch.tensor([max(p, 0) for p in rig.skin.parents], device=turns.device)
-    bones = tpose[parents] @ (joints - joints[:, parents])[..., None]
-    first = list(rig.levels[0])
-    world, places = [turns[:, first]], [joints[:, first]]
-    for level, above in zip(rig.levels[1:], rig.above[1:], strict=True):
-        here, up = list(level), list(above)
-        parent = world[-1][:, up]
-        world.append(parent @ turns[:, here])
-        places.append(places[-1][:, up] + (parent @ bones[:, here])[..., 0])
-    order = torch.tensor([j for level in rig.levels for j in level], device=turns.device)
-    back = torch.argsort(order)
-    return torch.cat(world, 1)[:, back] @ tpose, torch.cat(places, 1)[:, back]
 
 
 # What is solved, and what it means: joints' rotations, shapes, places.
@@ -223,7 +158,19 @@ SCALES = {"turn": 0.2, "code": BEND, "place": (0.01, 0.01, 0.05), "betas": 1.0, 
 BENDS = tuple(1 / math.hypot(1 / s, 1 / BEND) for s in spreads(1, torch.zeros(1))[0].tolist())
 """The same for angles, most of which people turn less than keypoints could tell."""
 
-Decode = Callable[[Float[Tensor, "bodies code"]], Float[Tensor, "bodies angles"]]
+
+@dataclass(frozen=True)
+class PosePrior:
+    """How a code becomes the angles of a body."""
+
+    decode: Callable[[Float[Tensor, "bodies code"]], Float[Tensor, "bodies angles"]]
+    """From codes to angles [rad]."""
+    width: int
+    """Numbers of a code, which are normally distributed; 0: the code is the angles themselves."""
+
+
+ANGLES = PosePrior(lambda code: code, 0)
+"""No learned prior: ranges of motion, a resting pose, and the pose to start from."""
 
 
 @record
@@ -236,8 +183,9 @@ class Frame:
     person: Int[Tensor, " bodies"]
     """Row of `betas`."""
     growth: Float[Tensor, " shape"] | None = None
-    """What each number of the shape adds to the logarithm of the depth: who is taller and farther
-    looks the same, so that shapes alone would hardly move. None: nothing."""
+    """What each number of the shape adds to the logarithm of the depth: a taller person farther
+    away looks the same, so that shapes alone would hardly move. None: nothing."""
+    prior: PosePrior = ANGLES
 
 
 def log_depth(at: Unknowns, frame: Frame) -> Float[Tensor, " bodies"]:
@@ -269,35 +217,27 @@ def place_of(pelvis: Float[Tensor, "bodies 3"]) -> Float[Tensor, "bodies 3"]:
     return torch.cat([pelvis[:, :2] / depth, depth.log()], -1)
 
 
-def points_of(at: Unknowns, frame: Frame, decode: Decode) -> Points:
+def points_of(at: Unknowns, frame: Frame) -> Points:
     """Keypoints and joints of the bodies, in camera axes [m]."""
     expression = at.face[:, 3:] if at.face.shape[1] > 3 else None
-    turns = turns_of(at, frame, decode(at.code))
+    turns = turns_of(at, frame)
     lasting = at.offset[frame.person] if at.offset.shape[1] else None
     return move(frame.rig, turns, at.betas[frame.person], pelvis_of(at, frame), expression, lasting)
 
 
-def turns_of(
-    at: Unknowns, frame: Frame, angles: Float[Tensor, "bodies angles"]
-) -> Float[Tensor, "bodies joints 3 3"]:
-    """Rotations of all joints of the rig."""
-    root = axis_angle(at.turn) @ frame.root
-    rest = torch.cat([angles, *_others(at, frame.rig)], -1)
-    return torch.cat([root[:, None], axis_angle(rest.unflatten(-1, (-1, 3)))], 1)
-
-
-def _others(at: Unknowns, rig: Rig) -> list[Tensor]:
-    """Angles of jaw, eyes and hands, as the rig's joints follow; SMPL's palms are straight."""
+def turns_of(at: Unknowns, frame: Frame) -> Float[Tensor, "bodies joints 3 3"]:
+    """Rotations of all joints of the rig; eyes look straight, SMPL's palms are straight."""
+    rig, none = frame.rig, at.turn.new_zeros(len(at.turn), 3)
+    parts = [frame.prior.decode(at.code)]
     if len(rig.skin.parents) <= 24:
-        return [at.turn.new_zeros(len(at.turn), 3 * (len(rig.skin.parents) - 22))]
-    parts: list[Tensor] = []
-    none = at.turn.new_zeros(len(at.turn), 3)
-    for name in widths_of(rig.skin):
-        if name == "jaw_pose":
-            parts.append(at.face[:, :3] if at.face.shape[1] else none)
-        elif name in ("leye_pose", "reye_pose"):
-            parts.append(none)
-    return [*parts, *(hand_angles(rig, at.hands, side) for side in (0, 1))]
+        parts += [none] * (len(rig.skin.parents) - 22)
+    else:
+        jaw = at.face[:, :3] if at.face.shape[1] else none
+        own = {"jaw_pose": jaw, "leye_pose": none, "reye_pose": none}
+        parts += [own[name] for name in widths_of(rig.skin) if name in own]
+        parts += [hand_angles(rig, at.hands, side) for side in (0, 1)]
+    root = axis_angle(at.turn) @ frame.root
+    return torch.cat([root[:, None], axis_angle(torch.cat(parts, -1).unflatten(-1, (-1, 3)))], 1)
 
 
 def hand_angles(
@@ -311,24 +251,6 @@ def hand_angles(
         mean = space.mean[side].to(hands).expand(len(hands), -1)
         return mean + own @ space.components[side][:width].to(hands) if width else mean
     return own if width == HAND else hands.new_zeros(len(hands), HAND)
-
-
-def with_values(at: Unknowns, values: dict[str, Tensor]) -> Unknowns:
-    """The unknowns with some fields from the solver's units."""
-    real = {name: value * _scale(name, value) for name, value in values.items()}
-    return dataclasses.replace(at, **real)
-
-
-def to_values(at: Unknowns, free: tuple[str, ...]) -> dict[str, Tensor]:
-    """Some fields in the solver's units; fields without columns are left out."""
-    found = {name: getattr(at, name) for name in free}
-    return {n: (v / _scale(n, v)).detach() for n, v in found.items() if v.numel()}
-
-
-def _scale(name: str, value: Tensor) -> Tensor:
-    if name == "code" and value.shape[-1] == len(BENDS):
-        return torch.tensor(BENDS, dtype=value.dtype, device=value.device)
-    return torch.tensor(SCALES[name], dtype=value.dtype, device=value.device)
 
 
 EVERYTHING = ("turn", "code", "place", "betas", "hands", "face", "offset", "floor")
@@ -346,8 +268,19 @@ def solve(
     Raises:
         ValueError: If the energy is not finite at the start.
     """
-    values = to_values(start, free)
-    return with_values(start, lowered(lambda v: energy(with_values(start, v)), values, steps))
+    scale = {
+        name: torch.tensor(
+            BENDS if name == "code" and at.shape[-1] == len(BENDS) else SCALES[name],
+            dtype=at.dtype, device=at.device,
+        )
+        for name in free if (at := getattr(start, name)).numel()
+    }  # fmt: skip
+
+    def real(values: dict[str, Tensor]) -> Unknowns:
+        return dataclasses.replace(start, **{n: v * scale[n] for n, v in values.items()})
+
+    values = {name: (getattr(start, name) / scale[name]).detach() for name in scale}
+    return real(lowered(lambda v: energy(real(v)), values, steps))
 
 
 def lowered(

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -15,16 +14,15 @@ from mover.bodies.posa import load_posa, posa_contacts
 from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, silent
-from mover.core.types import Bodies, Capture, Mesh, Room
+from mover.core.types import Bodies, Capture, Room
 from mover.evaluate.evaluation import evaluate_people
 from mover.geometry.placement import standing_meshes
-from mover.io.capture.bodies_file import read_bodies, read_contacts, write_bodies
+from mover.io.capture.bodies_file import read_bodies, write_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import read_scene
 from mover.io.export.finished import read_finished
 from mover.io.files.fields import At, read_json
 from mover.io.files.meshes import read_mesh
-from mover.io.files.npz import write_npz
 from mover.io.formats import read
 from mover.pipeline.result import to_world
 from mover.stages.config import RefineBodiesConfig
@@ -40,16 +38,17 @@ def finished_room(out: Path) -> Room:
         InputError: If there is no result, or something in it is wrong.
     """
     done = read_finished(out)
-    folder = out / "watertight"
-    proxies = tuple(_proxy(piece.id, folder) for piece in done.scene.objects)
+    proxies = tuple(
+        read_mesh(
+            At(f"{piece.id}.glb", "scene.json", f"watertight mesh of '{piece.id}'"),
+            out / "watertight",
+        )[0]
+        for piece in done.scene.objects
+    )
     return Room(
         scene=done.scene, initial=done.scene, image_only=done.scene, bodies=done.bodies, kept=None,
         proxies=proxies, evidence=(), covariance=None, traces={}, warnings=(),
     )  # fmt: skip
-
-
-def _proxy(name: str, folder: Path) -> Mesh:
-    return read_mesh(At(f"{name}.glb", "scene.json", f"watertight mesh of '{name}'"), folder)[0]
 
 
 def source_capture(out: Path, given: Path | None) -> Capture | None:
@@ -96,7 +95,7 @@ def measure_people(out: Path, truth: Path | None = None) -> dict[str, dict[str, 
 
     Args:
         out: Folder of the result.
-        truth: Folder of the true scene and people, to tell their errors as well.
+        truth: Folder of the true scene and people, for their errors.
 
     Raises:
         InputError: If a file is missing or wrong.
@@ -149,16 +148,6 @@ def with_posa(capture: Capture, weights: Path, meshes: Path) -> Capture:
     if people.space == "camera":
         people = to_world(people, capture.scene.camera)
     return replace(capture, touch=posa_contacts(load_posa(weights, meshes), people, 0))
-
-
-def write_contacts(chance: Float[Tensor, "bodies verts"], out: Path) -> None:
-    """Write contacts.npz of a capture."""
-    write_npz({"probability": chance.to(torch.float32).numpy()}, out)
-
-
-def contacts_from(source: Path, bodies: Bodies, first: int) -> Float[Tensor, "bodies verts"]:
-    """Contacts from files of another tool, see `io.capture.bodies_file`."""
-    return read_contacts(source, bodies, first)
 
 
 def switched(config: RefineBodiesConfig, off: Mapping[str, bool]) -> RefineBodiesConfig:

@@ -15,10 +15,10 @@ from mover.core.settings import (
 )
 from mover.energy.config import (
     GROWTH,
+    REFINE,
     Adam,
     BatchedBFGS,
     BodyWeights,
-    MatchConfig,
     SceneWeights,
     Variant,
 )
@@ -224,8 +224,7 @@ class AssignConfig:
 class RefineBodiesConfig:
     """How bodies are refined with the room."""
 
-    weights: BodyWeights = field(default_factory=BodyWeights)
-    match: MatchConfig = field(default_factory=MatchConfig)
+    weights: BodyWeights = REFINE
     place: Adam = field(default_factory=lambda: Adam(60, 0.02, 0.004, beta2=0.98))
     """The descent of one round that moves bodies as a whole."""
     places: Annotated[int, int_in(0, 1000)] = 2

@@ -42,7 +42,7 @@ class BodiesArgs:
     first: Index = 0
     """The number in the name of the first frame's file, 1 where they count from 1."""
     vposer: Path | None = None
-    """VPoser's weights (a checkpoint, its folder, or .npz), for codes that SMPLify-X stored."""
+    """VPoser's weights (a checkpoint or its folder), for codes that SMPLify-X stored."""
 
 
 def bodies(arguments: Sequence[str]) -> None:
@@ -114,7 +114,7 @@ class FitArgs:
     start: Path | None = None
     """bodies.npz to start from: parameters of any model, or joints, in the camera frame."""
     vposer: Path | None = None
-    """VPoser's weights (a checkpoint, its folder, or .npz) instead of the ranges of motion."""
+    """VPoser's weights (a checkpoint or its folder) instead of the ranges of motion."""
     preset: Literal["robust", "paper"] = "robust"
     """The weights: ours, or E_Body as printed, with VPoser's weights (--vposer)."""
     ground: Annotated[float, float_in(-100, 100)] | None = None

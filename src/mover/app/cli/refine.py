@@ -91,19 +91,22 @@ def refine(arguments: Sequence[str]) -> None:
 def contacts(arguments: Sequence[str]) -> None:
     """`mover contacts`."""
     args = parsed(ContactsArgs, "mover contacts", arguments)
-    from mover.io.capture.bodies_file import read_bodies
-    from mover.pipeline.refine import contacts_from, find_posa, write_contacts
+    import torch
+
+    from mover.io.capture.bodies_file import read_bodies, read_contacts
+    from mover.io.files.npz import write_npz
+    from mover.pipeline.refine import find_posa
 
     if args.model_folder is not None:
         os.environ["MOVER_BODY_MODELS"] = str(args.model_folder)
     people = read_bodies(args.bodies)
     if args.tool == "files":
-        chance = contacts_from(_needed(args.source, "--source"), people, args.first)
+        chance = read_contacts(_needed(args.source, "--source"), people, args.first)
     else:
         weights = _needed(args.weights, "--weights")
         meshes = _needed(args.mesh_folder, "--mesh-folder")
         chance = find_posa(people, weights, meshes, args.samples, args.camera)
-    write_contacts(chance, args.out)
+    write_npz({"probability": chance.to(torch.float32).numpy()}, args.out)
     touching = int((chance > 0.5).any(1).sum())
     say(f"{touching} of {len(chance)} bodies touch something: {args.out}")
 

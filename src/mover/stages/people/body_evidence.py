@@ -1,4 +1,4 @@
-"""What the room, the masks and the feet say about bodies, gathered before they are refined."""
+"""What room, masks and feet constrain about bodies, gathered before they are refined."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from mover.bodies.parts import BodyParts, members
 from mover.bodies.posture import speeds
 from mover.bodies.skin import PARTS
 from mover.core.records import record
-from mover.core.types import Bodies, Camera, Capture, Mesh, People, Room
+from mover.core.types import Bodies, Camera, Capture, Mesh, Room
 from mover.energy.body_contact import Surface
 from mover.energy.body_terms import Bounds, Sighting, bounds_of_skin
 from mover.geometry.camera import project, to_camera
@@ -20,7 +20,7 @@ from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
 from mover.geometry.volume import Volume, grid_around
 from mover.geometry.volume_warp import union_bodies
-from mover.stages.masks import MaskTable, mask_table, small_camera, small_masks
+from mover.stages.masks import MaskTable, small_camera, small_masks
 from mover.stages.objects.find_image_cues import image_evidence
 
 SOLES = ("left_sole", "right_sole")
@@ -194,73 +194,47 @@ def resting_soles(
             found.append(torch.zeros_like(low))
             continue
         sole = bodies.verts[:, own]
-        still = _ramp(speeds(sole.mean(1, keepdim=True), bodies)[:, 0], *STILL)
-        found.append(still * _ramp(sole[..., 1].amin(1) - low, *LOW) * ~lying)
+        speed = speeds(sole.mean(1, keepdim=True), bodies)[:, 0]
+        still, carries = (
+            ((value - zero) / (one - zero)).clamp(0, 1)
+            for value, (zero, one) in ((speed, STILL), (sole[..., 1].amin(1) - low, LOW))
+        )
+        found.append(still * carries * ~lying)
     return torch.stack(found, 1)
 
 
-def _ramp(value: Tensor, zero: float, one: float) -> Tensor:
-    """0 up to `zero`, 1 from `one` on; `one` is the smaller."""
-    return ((value - zero) / (one - zero)).clamp(0, 1)
-
-
-@dataclass(frozen=True)
-class Watched:
-    """People's masks, and the furniture that may hide them."""
-
-    room: Surroundings
-    table: MaskTable
-    camera: Camera
-    """Of the masks."""
-
-
-def watched_of(room: Surroundings, people: People | None, bodies: Bodies) -> Watched | None:
-    """The masks of these bodies; None where there are none."""
-    if people is None:
-        return None
-    return Watched(room, mask_table(people, bodies), room.camera)
-
-
 def order_bounds(
-    watched: Watched,
+    room: Surroundings,
+    table: MaskTable,
     rows: Int[Tensor, " bodies"],
     skin: Float[Tensor, "bodies points 3"],
     normals: Float[Tensor, "bodies points 3"],
 ) -> Bounds:
-    """Bounds of the depth of skin points where they are now."""
-    room = watched.room
+    """Bounds of the depth of skin points where they are now, by people's masks and furniture."""
     small = small_camera(room.camera)
-    cam, facing = (
-        to_camera(skin, room.camera.R_cam_world),
-        to_camera(normals, room.camera.R_cam_world),
-    )
+    cam, facing = (to_camera(x, room.camera.R_cam_world) for x in (skin, normals))
     at = project(cam, small.K).floor().long()
     inside = (at >= 0).all(-1) & (at[..., 0] < small.width) & (at[..., 1] < small.height)
     x, y = at[..., 0].clamp(0, small.width - 1), at[..., 1].clamp(0, small.height - 1)
-    shown, away = (torch.stack(masks) for masks in zip(*_masks(watched, rows), strict=True))
-    body = torch.arange(len(rows))[:, None].expand_as(x)
-    seen = Sighting(
-        torch.where(inside, room.front[y, x], torch.full_like(cam[..., 2], torch.inf)),
-        shown[body, y, x],
-        away[body, y, x] & room.owned[y, x],
-        (cam * facing).sum(-1) < 0,
-        room.loose[y, x],
-    )
-    return bounds_of_skin(seen)
-
-
-def _masks(watched: Watched, rows: Int[Tensor, " bodies"]) -> list[tuple[Tensor, Tensor]]:
-    """Pixels well inside the body's mask, and well outside all; none where a mask is missing."""
-    found: list[tuple[Tensor, Tensor]] = []
+    masks: list[Tensor] = []  # well inside the body's mask, and well outside all
     for row in rows.tolist():
-        own, others = watched.table.decode(row)
-        own, others = small_masks(torch.stack([own, others]), watched.camera)
-        known = watched.table.own[row] is not None
-        found.append((_shrunk(own) & known, _shrunk(~(own | others)) & known))
-    return found
+        own, others = small_masks(torch.stack(table.decode(row)), room.camera)
+        both = torch.stack([own, ~(own | others)])
+        masks.append(_shrunk(both) & (table.own[row] is not None))
+    shown, away = torch.stack(masks, 1)
+    body = torch.arange(len(rows))[:, None].expand_as(x)
+    return bounds_of_skin(
+        Sighting(
+            torch.where(inside, room.front[y, x], torch.full_like(cam[..., 2], torch.inf)),
+            shown[body, y, x],
+            away[body, y, x] & room.owned[y, x],
+            (cam * facing).sum(-1) < 0,
+            room.loose[y, x],
+        )
+    )
 
 
-def _shrunk(mask: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    inverse = (~mask).float()[None, None]
+def _shrunk(masks: Bool[Tensor, "masks h w"]) -> Bool[Tensor, "masks h w"]:
+    inverse = (~masks).float()[:, None]
     size = 2 * INNER + 1
-    return torch.nn.functional.max_pool2d(inverse, size, stride=1, padding=INNER)[0, 0] < 0.5
+    return torch.nn.functional.max_pool2d(inverse, size, stride=1, padding=INNER)[:, 0] < 0.5

@@ -1,6 +1,6 @@
 """Compare the outlines of bodies, where they stand now, with their masks."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -53,10 +53,13 @@ def gather_outlines(seen: SeenBodies, table: MaskTable, rows: Int[Tensor, " bodi
         for k, row in enumerate(rows[part].tolist()):  # masks are decoded one by one
             if table.own[row] is None:
                 continue
-            one = _compare(some, k, drawn[k], (views.K[k], corner[k]), table.decode(row))
+            one = _compare(some, k, drawn[k], corner[k], *table.decode(row))
             if one is not None:
                 found.append(replace(one, body=one.body + first))
-    return _joined(found, seen.skin)
+    pair, one = seen.skin.new_zeros(0, 2).float(), torch.zeros(0, dtype=torch.long)
+    found.append(Outline(one, one, pair, pair, pair[:, 0], pair[:, 0]))
+    names = [field.name for field in fields(Outline)]
+    return Outline(**{name: torch.cat([getattr(o, name) for o in found]) for name in names})
 
 
 def _windows(seen: SeenBodies) -> tuple[Crops, Float[Tensor, "bodies 3"]]:
@@ -75,17 +78,18 @@ def _compare(
     seen: SeenBodies,
     k: int,
     drawn: Float[Tensor, "side side"],
-    window: tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]],
-    masks: tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]],
+    window: Float[Tensor, "3"],
+    own: Bool[Tensor, "h w"],
+    others: Bool[Tensor, "h w"],
 ) -> Outline | None:
     """The outline of one body; None where too little of it can be compared."""
-    body, zoom = drawn.isfinite(), float(window[1][2])
-    own, others = (_sampled(m, window[1], seen.camera) for m in masks)
+    body, zoom = drawn.isfinite(), float(window[2])
+    own, others = (_sampled(m, window, seen.camera) for m in (own, others))
     if not bool(own.any()) or not bool(body.any()):
         return None
     depth = drawn[body].median()
-    front = _sampled(seen.front, window[1], seen.camera)
-    blocked = _grown(others | (front < depth + BEHIND) | _outside(window[1], seen.camera))
+    front = _sampled(seen.front, window, seen.camera)
+    blocked = _grown(others | (front < depth + BEHIND) | _outside(window, seen.camera))
     away = _signed(own)
     normal, rises = _slope(_signed(body)), _slope(away)
     agree = (normal * rises).sum(0) > ALONG
@@ -98,7 +102,7 @@ def _compare(
     gap = gap - _wider(gap, normal[:, y, x].mT, torch.stack([x, y], -1) / zoom)
     some = evenly(torch.arange(len(y)), MOST)
     y, x = y[some], x[some]
-    pixel = torch.stack([x, y], -1).float().add(0.5) / zoom + window[1][:2]
+    pixel = torch.stack([x, y], -1).float().add(0.5) / zoom + window[:2]
     skin = project(seen.skin[k], seen.camera.K.to(seen.skin))
     carrier = torch.cdist(pixel, skin.float()).argmin(-1)
     weight = torch.full_like(gap[some], OUTLINE_POINTS / len(some))
@@ -166,17 +170,3 @@ def _slope(image: Float[Tensor, "h w"]) -> Float[Tensor, "2 h w"]:
     down, right = torch.gradient(smooth)
     both = torch.stack([right, down])
     return both / both.norm(dim=0).clamp_min(1e-6)
-
-
-def _joined(found: list[Outline], like: Tensor) -> Outline:
-    none = torch.zeros(0, dtype=torch.long)
-    empty = like.new_zeros(0).float()
-    pair = empty.reshape(0, 2)
-    return Outline(
-        torch.cat([none, *(o.body for o in found)]),
-        torch.cat([none, *(o.skin for o in found)]),
-        torch.cat([pair, *(o.pixel for o in found)]),
-        torch.cat([pair, *(o.normal for o in found)]),
-        torch.cat([empty, *(o.gap for o in found)]),
-        torch.cat([empty, *(o.weight for o in found)]),
-    )

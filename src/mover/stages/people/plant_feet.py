@@ -2,9 +2,9 @@
 
 Energies make a sole slide less, and leave a rest, which goes here in three steps:
 
-1. Whole bodies are shifted so that soles at rest keep their place and lie on the floor, and who
-   sits or lies is still. Shifts in depth, seen from the camera at the world's origin, and in height
-   are cheap, as pictures and bodies of unknown size constrain them least; others cost more.
+1. Whole bodies are shifted so that soles at rest keep their position and lie on the floor, and
+   seated and lying people are still. Shifts in depth, seen from the camera at the world's origin,
+   and in height are cheap, as pictures and bodies of unknown size constrain them least.
 2. Each foot is to go where it rested on average; the way there fades in and out between steps.
 3. The leg is bent to reach it, as little as it can be, without a turn of the sole.
 """
@@ -20,7 +20,7 @@ from torch import Tensor
 from mover.bodies import load_model
 from mover.bodies.corrected import Correction, corrected
 from mover.bodies.parts import BodyParts, members
-from mover.bodies.posture import Postures, postures
+from mover.bodies.posture import postures
 from mover.bodies.skeleton import BODY
 from mover.bodies.smpl_model import vertex_subset
 from mover.core.types import Bodies
@@ -60,9 +60,12 @@ def plant_feet(bodies: Bodies, parts: BodyParts, floor: float) -> Bodies:
     soles = [members(parts, f"{side}_sole").nonzero()[:, 0] for side in SIDES]
     if not len(near.pairs) or not all(len(sole) for sole in soles):
         return bodies
-    shift = _shifts(bodies, near, rest, (soles, floor), posture)
-    moved = corrected(bodies, _by(bodies, shift))
-    if bodies.pose is None:
+    calm = (posture.sitting | posture.lying).double()
+    shift = _shifts(bodies, near, rest, calm, soles, floor)
+    zero, pose = torch.zeros_like(bodies.verts[:, 0]), bodies.pose
+    width = 0 if pose is None else pose.body_pose.shape[-1]
+    moved = corrected(bodies, Correction(shift.to(zero), zero, zero.new_zeros(len(zero), width)))
+    if pose is None:
         return moved
     lying = postures(moved, parts, floor).lying
     rest = resting_soles(moved, parts, lying).double()
@@ -72,12 +75,6 @@ def plant_feet(bodies: Bodies, parts: BodyParts, floor: float) -> Bodies:
     for k, side in enumerate(SIDES):
         moved = _bend(moved, side, soles[k], ways[k])
     return moved
-
-
-def _by(bodies: Bodies, shift: Float[Tensor, "bodies 3"]) -> Correction:
-    width = 0 if bodies.pose is None else bodies.pose.body_pose.shape[-1]
-    zero = torch.zeros_like(bodies.verts[:, 0])
-    return Correction(shift.to(zero), zero, zero.new_zeros(len(zero), width))
 
 
 def _foot(points: Float[Tensor, "bodies sole 3"]) -> Float[Tensor, "bodies 3"]:
@@ -149,11 +146,11 @@ def _shifts(
     bodies: Bodies,
     near: Neighbours,
     rest: Float[Tensor, "bodies feet"],
-    feet: tuple[list[Tensor], float],
-    posture: Postures,
+    calm: Float[Tensor, " bodies"],
+    soles: list[Tensor],
+    floor: float,
 ) -> Float[Tensor, "bodies 3"]:
     """How far each body is moved as a whole [m]."""
-    soles, floor = feet
     chain, pairs = _Chain(len(bodies.frame)), near.pairs
     sway = SWAY if bodies.pose is not None else RIGID
     middle = bodies.verts.double().mean(1)
@@ -162,17 +159,14 @@ def _shifts(
     side = side / side.norm(dim=-1, keepdim=True).clamp_min(1e-6)
     across = side[:, :, None] * side[:, None]
     prior = (torch.eye(3, dtype=torch.float64) - across) / ALONG**2 + across / ACROSS**2
-    none = torch.zeros_like(middle)
-    gaps = near.gaps.double()
     nothing = torch.zeros(len(pairs), 3, dtype=torch.float64)
-    chain.pairs(pairs, _level(1 / (STEADY**2 * gaps), 1.0), nothing)
-    chain.prior(prior, none)
+    chain.pairs(pairs, _level(1 / (STEADY**2 * near.gaps.double()), 1.0), nothing)
+    chain.prior(prior, torch.zeros_like(middle))
     for k, sole in enumerate(soles):
         foot = _foot(bodies.verts[:, sole])
         way = foot[pairs[:, 1]] - foot[pairs[:, 0]]
         chain.pairs(pairs, _level(_both(rest[:, k], pairs) / sway**2), -way)
         chain.prior(*_floor(foot, rest[:, k], floor, SINK))
-    calm = (posture.sitting | posture.lying).double()
     way = middle[pairs[:, 1]] - middle[pairs[:, 0]]
     chain.pairs(pairs, _level(_both(calm, pairs) / STILL**2, 1.0), -way)
     return chain.solve()
@@ -240,7 +234,7 @@ def _bend(
             normal = slope.mT @ slope / REACHED**2 + damp
             right = (slope.mT @ left[..., None])[..., 0] / REACHED**2 - angles / BENT**2
             angles = angles + torch.linalg.solve(normal, right)
-    by = _by(bodies, torch.zeros_like(way))
-    whole = by.angles.clone()
+    whole = torch.zeros_like(pose.body_pose)
     whole[:, columns] = angles.to(whole)
-    return corrected(bodies, replace(by, angles=whole))
+    zero = torch.zeros_like(bodies.verts[:, 0])
+    return corrected(bodies, Correction(zero, zero, whole))

@@ -6,7 +6,7 @@ moved along and thrown away, so that memory does not grow with the video.
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mover.bodies.corrected import (
     Correction,
+    MovedSkin,
     Puppet,
     corrected,
     moved,
@@ -25,32 +26,124 @@ from mover.bodies.parts import parts_of
 from mover.bodies.posture import postures, touching
 from mover.bodies.skin import PARTS
 from mover.core.errors import InputError
-from mover.core.observe import Observer, silent
+from mover.core.observe import Energy, Observer, silent
 from mover.core.records import map_tensors, record, rows_of, with_rows
-from mover.core.types import Bodies, Capture, Room
+from mover.core.types import Bodies, Camera, Capture, Room
 from mover.energy.body_contact import Matches, Skin, gather_matches
-from mover.energy.body_terms import ANGLE, Bounds, Outline, gather_neighbours
-from mover.energy.config import BodyWeights, MatchConfig
+from mover.energy.body_energy import body_energy
+from mover.energy.body_terms import (
+    ANGLE,
+    Bounds,
+    Neighbours,
+    Outline,
+    depth_share,
+    gather_neighbours,
+)
+from mover.energy.config import REFINE, BodyWeights
 from mover.energy.minimize import minimize
 from mover.geometry.camera import to_camera
 from mover.geometry.path import is_still
 from mover.geometry.placement import changes, mover_at, placed_at
+from mover.geometry.volume import Volume
 from mover.stages.config import RefineBodiesConfig
-from mover.stages.people.body_energy import BodyEvidence, SolePoints, body_energy
+from mover.stages.masks import MaskTable, mask_table
 from mover.stages.people.body_evidence import (
     Picked,
     Surroundings,
-    Watched,
     order_bounds,
     pick,
     resting_soles,
     surroundings_of,
-    watched_of,
 )
 from mover.stages.people.body_outlines import SeenBodies, gather_outlines
 from mover.stages.people.plant_feet import plant_feet
 
 SIDES = ("left", "right")
+
+
+@dataclass(frozen=True)
+class BodyEvidence:
+    """What is known about some rows of the bodies."""
+
+    camera: Camera
+    floor: float
+    """Its height in the world [m]."""
+    furniture: Volume | None
+    near: Neighbours
+    soles: Bool[Tensor, "feet picked"]
+    """Which picked vertices they are."""
+    rest: Float[Tensor, "bodies feet"]
+    """Chance that each is at rest and carries the body."""
+    even: Bool[Tensor, " picked"]
+    """Points of the skin that lie evenly over the body."""
+    rho: float = 0.1
+    """Of the contact [m]."""
+    matches: Matches | None = None
+    bounds: Bounds | None = None
+    outline: Outline | None = None
+
+
+@dataclass(frozen=True)
+class MovedBodies:
+    """The bodies after a correction, and what several terms need of them."""
+
+    by: Correction
+    puppet: Puppet
+    known: BodyEvidence
+
+    def has(self, name: str) -> bool:
+        """Whether the evidence of a term is there."""
+        if name in ("given", "feet"):
+            return name == "given" or bool(self.known.soles.any())
+        found = getattr(self.known, name, None)
+        return len(found.body) > 0 if isinstance(found, Matches | Outline) else found is not None
+
+    @cached_property
+    def now(self) -> MovedSkin:
+        """Where picked vertices and joints are [m]."""
+        return moved(self.puppet, self.by)
+
+    def in_camera(self, points: Float[Tensor, "*any 3"]) -> Float[Tensor, "*any 3"]:
+        """Points of the world in camera axes [m]."""
+        return to_camera(points, self.known.camera.R_cam_world)
+
+    @cached_property
+    def points_cam(self) -> Float[Tensor, "bodies points 3"]:
+        """Joints in camera axes [m]."""
+        return self.in_camera(self.now.points)
+
+    @cached_property
+    def start_cam(self) -> Float[Tensor, "bodies points 3"]:
+        """The same before the correction [m]."""
+        return self.in_camera(self.puppet.points)
+
+    @cached_property
+    def share(self) -> Float[Tensor, " bodies"]:
+        """Logarithm of the factor by which depths have changed."""
+        return depth_share(self.points_cam[:, 0], self.start_cam[:, 0])
+
+    @cached_property
+    def angles(self) -> Float[Tensor, "bodies angles"]:
+        """All by which the body was turned [rad]."""
+        return torch.cat([self.by.turn, self.by.angles], -1)
+
+    @cached_property
+    def even(self) -> Float[Tensor, "bodies even 3"]:
+        """Points that lie evenly over the skin [m]."""
+        return self.now.skin[:, self.known.even]
+
+    @cached_property
+    def feet(self) -> tuple[Float[Tensor, "bodies feet 3"], Float[Tensor, "bodies feet 3"]]:
+        """Middle of each sole, and its middle again at the height of its lower half [m]."""
+        middles, lows = list[Tensor](), list[Tensor]()
+        for own in self.known.soles:  # two feet
+            sole = self.now.skin[:, own]
+            middle = sole.mean(1) if sole.shape[1] else self.now.points[:, 0]
+            heights = sole[..., 1].sort(1).values[:, : max(1, (sole.shape[1] + 1) // 2)]
+            low = heights.mean(1) if sole.shape[1] else middle[:, 1]
+            middles.append(middle)
+            lows.append(torch.stack([middle[:, 0], low, middle[:, 2]], -1))
+        return torch.stack(middles, 1), torch.stack(lows, 1)
 
 
 @dataclass(frozen=True)
@@ -63,18 +156,7 @@ class RefineScene:
     chance: Float[Tensor, "bodies picked"]
     rest: Float[Tensor, "bodies feet"]
     lying: Bool[Tensor, " bodies"]
-    watched: Watched | None
-
-
-@dataclass(frozen=True)
-class MovedRows:
-    """Some rows where they are now."""
-
-    rows: Int[Tensor, " rows"]
-    bodies: Bodies
-    """As they were given."""
-    puppet: Puppet
-    by: Correction
+    masks: MaskTable | None
 
 
 def scene_of(room: Room, capture: Capture | None, weights: BodyWeights) -> RefineScene:
@@ -83,9 +165,9 @@ def scene_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Refin
     Raises:
         InputError: If the room has no bodies or no floor.
     """
-    bodies, ground = room.bodies, room.scene.ground
-    if bodies is None or not len(bodies.frame) or ground is None:
-        lack = "bodies" if ground is not None else "floor"
+    bodies, floor = room.bodies, room.scene.ground
+    if bodies is None or not len(bodies.frame) or floor is None:
+        lack = "bodies" if floor is not None else "floor"
         raise InputError(f"the room has no {lack}: there is nothing to refine")
     bodies = map_tensors(lambda x: x.float() if x.is_floating_point() else x, bodies)
     parts = parts_of(bodies)
@@ -97,81 +179,64 @@ def scene_of(room: Room, capture: Capture | None, weights: BodyWeights) -> Refin
     given = None if capture is None else capture.touch
     if given is not None and given.shape != bodies.verts.shape[:2]:
         given = None
-    chance = given if given is not None else touching(bodies, parts, surroundings.floor)
-    lying = postures(bodies, parts, surroundings.floor).lying
-    rest = resting_soles(bodies, parts, lying)
+    chance = given if given is not None else touching(bodies, parts, floor)
+    lying = postures(bodies, parts, floor).lying
     # without the soles, which the floor holds, and forearms, which seem to rest in the air
     without = torch.tensor([PARTS.index(f"{s}_{p}") for s in SIDES for p in ("sole", "forearm")])
     chance = torch.where(torch.isin(picked.part, without), 0.0, chance[:, picked.index].float())
-    watched = watched_of(surroundings, people, bodies)
-    return RefineScene(bodies, picked, surroundings, chance, rest, lying, watched)
-
-
-def known_of(scene: RefineScene, bodies: Bodies, rows: Int[Tensor, " rows"]) -> BodyEvidence:
-    """What does not change while the bodies move."""
-    room = scene.room
-    soles = torch.stack([scene.picked.part == 0, scene.picked.part == 1])
-    return BodyEvidence(
-        camera=room.camera, floor=room.floor, furniture=room.firm,
-        near=gather_neighbours(bodies.frame, bodies.person, bodies.fps),
-        feet=SolePoints(soles, scene.rest[rows]), matches=None, bounds=None, rho=0.1,
-        even=scene.picked.even,
+    return RefineScene(
+        bodies, picked, surroundings, chance, resting_soles(bodies, parts, lying), lying,
+        None if people is None else mask_table(people, bodies),
     )  # fmt: skip
 
 
-def looked(
+def gathered(
     scene: RefineScene,
-    moved_rows: MovedRows,
-    known: BodyEvidence,
+    rows: Int[Tensor, " rows"],
+    bodies: Bodies,
+    state: MovedBodies,
     weights: BodyWeights,
-    match: MatchConfig,
 ) -> BodyEvidence:
-    """Gather contacts, occlusion bounds and outline targets again at the current poses."""
-    puppet, by, rows = moved_rows.puppet, moved_rows.by, moved_rows.rows
+    """Contacts, occlusion bounds and outline targets at the current poses of some rows.
+
+    `bodies` are these rows as they were given.
+    """
+    known, puppet, room = state.known, state.puppet, scene.room
     with torch.no_grad():
-        now, normals = moved(puppet, by), normals_after(puppet, by)
-    matches: Matches | None = None
-    bounds: Bounds | None = None
+        now, normals = state.now, normals_after(puppet, state.by)
+    matches, bounds, outline = None, None, None
     if weights.touch:
         skin = Skin(  # errors of poses count where they are not corrected
             points=now.skin, normals=normals, chance=scene.chance[rows], group=scene.picked.group,
             track=known.near.track, pivot=now.points[:, 0], flat=scene.lying[rows],
             bent=ANGLE if puppet.model is None else 0.0,
         )  # fmt: skip
-        matches = gather_matches(skin, scene.room.surface, match, scene.room.furniture)
-    if weights.order and scene.watched is not None:
+        matches = gather_matches(skin, room.surface, room.furniture)
+    if weights.order and scene.masks is not None:
         even = scene.picked.even
-        bounds = order_bounds(scene.watched, rows, now.skin[:, even], normals[:, even])
-    outline: Outline | None = None
-    if weights.outline and scene.watched is not None:
-        outline = _outlines(scene, moved_rows)
+        bounds = order_bounds(room, scene.masks, rows, now.skin[:, even], normals[:, even])
+    if weights.outline and scene.masks is not None:
+        whole = replace(bodies, pose=None) if puppet.model is None else bodies
+        verts = state.in_camera(corrected(whole, state.by).verts)
+        skin = verts[:, scene.picked.index]
+        seen = SeenBodies(verts, bodies.faces, skin, room.camera, room.front)
+        outline = gather_outlines(seen, scene.masks, rows)
     return replace(known, matches=matches, bounds=bounds, outline=outline)
 
 
-def _outlines(scene: RefineScene, moved_rows: MovedRows) -> Outline:
-    """The outlines of the bodies where they stand now, against their masks."""
-    assert scene.watched is not None
-    room, bodies, rows = scene.room, moved_rows.bodies, moved_rows.rows
-    rigid = moved_rows.puppet.model is None
-    whole = corrected(replace(bodies, pose=None) if rigid else bodies, moved_rows.by)
-    verts = to_camera(whole.verts, room.camera.R_cam_world)
-    skin = verts[:, scene.picked.index]
-    seen = SeenBodies(verts, bodies.faces, skin, room.camera, room.front)
-    return gather_outlines(seen, scene.watched.table, rows)
-
-
-SMOOTHED = BodyWeights(under=0.0, stand=0.0, lock=0.0, sink=0.0, touch=0.0, order=0.0, outline=0.0)
+SMOOTHED = BodyWeights(angles=1.0, image=1.0, range=1.0, smooth=1.0, steady=0.5)
 """No room at all: smooth in time, near to what was given."""
+FLOOR = replace(SMOOTHED, under=1.0, stand=1.0, lock=1.0)
 ABLATION = {
     "baseline": SMOOTHED,
-    "+CamGP": replace(SMOOTHED, under=1.0, stand=1.0, lock=1.0),
-    "+CamGP+SDF": replace(BodyWeights(), touch=0.0, order=0.0, outline=0.0),
-    "+CamGP+Contact": replace(BodyWeights(), sink=0.0, order=0.0, outline=0.0),
-    "+CamGP+SDF+Contact": replace(BodyWeights(), order=0.0, outline=0.0),
+    "+CamGP": FLOOR,
+    "+CamGP+SDF": replace(FLOOR, sink=1.0),
+    "+CamGP+Contact": replace(FLOOR, touch=1.0),
+    "+CamGP+SDF+Contact": replace(FLOOR, sink=1.0, touch=1.0),
     "masks": replace(SMOOTHED, outline=1.0),
-    "masks+CamGP": replace(SMOOTHED, under=1.0, stand=1.0, lock=1.0, outline=1.0),
-    "masks+CamGP+SDF+Contact": replace(BodyWeights(), order=0.0),
-    "all": BodyWeights(),
+    "masks+CamGP": replace(FLOOR, outline=1.0),
+    "masks+CamGP+SDF+Contact": replace(FLOOR, outline=1.0, sink=1.0, touch=1.0),
+    "all": REFINE,
 }
 """Weights of the paper's table, the same with the outlines of masks, and with the depth order."""
 
@@ -248,17 +313,17 @@ def _refined(
         range(len(scene.bodies.frame)),
         key=lambda k: (int(scene.bodies.person[k]), int(scene.bodies.frame[k])),
     )
-    found: Correction | None = None
-    energy = torch.zeros(len(order))
+    pose, zero = scene.bodies.pose, torch.zeros(len(order), 3)
+    width = 0 if pose is None else pose.body_pose.shape[-1]
+    found, energy = Correction(zero, zero, zero.new_zeros(len(order), width)), zero[:, 0].clone()
     for first in range(0, len(order), config.rows):
-        inner = order[first : first + config.rows]
+        inner = torch.tensor(order[first : first + config.rows])
         start = max(0, first - config.overlap)
         rows = torch.tensor(order[start : first + config.rows + config.overlap])
         by, left = _refine(scene, rows, config, observe)
-        keep = slice(first - start, first - start + len(inner))
-        found = _put(found, by, torch.tensor(inner), keep, len(order))
+        keep = torch.arange(first - start, first - start + len(inner))
+        found = with_rows(found, inner, rows_of(by, keep))
         energy[inner] = left[keep]
-    assert found is not None, "bodies have at least one row"
     bodies, shift = corrected(scene.bodies, found), found.shift
     if config.plant and config.weights.lock:
         planted = plant_feet(bodies, parts_of(bodies), scene.room.floor)
@@ -271,20 +336,27 @@ def _refine(
     scene: RefineScene, rows: Int[Tensor, " rows"], config: RefineBodiesConfig, observe: Observer
 ) -> tuple[Correction, Float[Tensor, " rows"]]:
     """Some rows, in rounds: first moved as a whole, then with their pose."""
-    bodies = rows_of(scene.bodies, rows)
-    puppet = puppet_of(bodies, scene.picked.index)
+    bodies, room, picked = rows_of(scene.bodies, rows), scene.room, scene.picked
+    puppet = puppet_of(bodies, picked.index)
     stiff = replace(puppet, model=None, pose=None)
-    by, known = no_correction(stiff), known_of(scene, bodies, rows)
-    left = torch.zeros(len(rows))
+    known = BodyEvidence(
+        room.camera, room.floor, room.firm,
+        gather_neighbours(bodies.frame, bodies.person, bodies.fps),
+        torch.stack([picked.part == 0, picked.part == 1]), scene.rest[rows], picked.even,
+    )  # fmt: skip
+    by, left = no_correction(stiff), torch.zeros(len(rows))
     total = config.places + config.rounds
     for turn in range(total):
         now, method = (stiff, config.place) if turn < config.places else (puppet, config.method)
         by = _started(now, by)
         share = turn / max(1, total - 1)
         rho = config.rhos[0] * (config.rhos[1] / config.rhos[0]) ** share
-        moved_rows = MovedRows(rows, bodies, now, by)
-        known = replace(looked(scene, moved_rows, known, config.weights, config.match), rho=rho)
-        energy = partial(body_energy, puppet=now, known=known, weights=config.weights)
+        known = gathered(scene, rows, bodies, MovedBodies(by, now, known), config.weights)
+        state = MovedBodies(by, now, replace(known, rho=rho))
+
+        def energy(by: Correction, state: MovedBodies = state) -> Energy:
+            return body_energy(replace(state, by=by), config.weights)
+
         found = minimize(energy, by, method, observe, "refine_bodies")
         by, left = found.at, found.value
     return _started(puppet, by), left
@@ -293,19 +365,6 @@ def _refine(
 def _started(puppet: Puppet, by: Correction) -> Correction:
     """The same correction with the angles of this puppet, which were not free before."""
     none = no_correction(puppet)
-    if none.angles.shape == by.angles.shape:
-        return by
-    return replace(none, shift=by.shift, turn=by.turn)
-
-
-def _put(
-    whole: Correction | None, part: Correction, rows: Int[Tensor, " rows"], keep: slice, count: int
-) -> Correction:
-    """Write the kept rows of a part into the correction of all people."""
-
-    def into(name: str) -> Tensor:
-        value = getattr(part, name)[keep]
-        before = value.new_zeros(count, value.shape[1]) if whole is None else getattr(whole, name)
-        return before.index_copy(0, rows, value)
-
-    return Correction(into("shift"), into("turn"), into("angles"))
+    return (
+        by if none.angles.shape == by.angles.shape else replace(none, shift=by.shift, turn=by.turn)
+    )
