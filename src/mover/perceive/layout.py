@@ -35,7 +35,7 @@ from mover.perceive.config import LayoutConfig
 from mover.perceive.depth_map import floor_height, median_depths, range_in
 from mover.perceive.screen import Screened, ScreenInputs, outermost, screen
 from mover.stages.camera.room_lines import Segments
-from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
+from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues, order_in_image
 from mover.stages.objects.gather_given import given_axis, sizes_of_shapes, unplaced
 from mover.stages.objects.own_edges import own_edges
 from mover.stages.objects.place_inputs import PlaceInputs
@@ -327,11 +327,10 @@ def at_scale(picture: Picture) -> Picture:
 
 
 def _image(picture: Picture) -> ImageInputs:
-    count = len(picture.detections)
     boxes = torch.stack([d.box for d in picture.detections])
-    unordered = torch.zeros(count, count, dtype=torch.bool)
-    seen = torch.ones(count, dtype=torch.bool)
-    return ImageInputs(picture.camera, boxes, seen, picture.masks, picture.people, unordered)
+    seen = torch.ones(len(boxes), dtype=torch.bool)
+    behind = order_in_image(picture.masks, picture.people)
+    return ImageInputs(picture.camera, boxes, seen, picture.masks, picture.people, behind)
 
 
 def _screen_inputs(

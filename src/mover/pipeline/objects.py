@@ -37,6 +37,7 @@ from mover.stages.objects.find_image_cues import (
     ObjectDetections,
     find_image_cues,
     image_evidence,
+    order_in_image,
     order_of,
 )
 from mover.stages.objects.fronts import turned_to_people
@@ -172,9 +173,9 @@ def place_by_image(
     elif searching.num_hypotheses > 1 and capture.hypotheses:
         others = other_starts(capture.hypotheses, objects, given)
         starts = Layout.cat(starts, _carried(setup, others, capture.scene.camera, camera, ground))
-    unordered = torch.zeros(len(objects.ids), len(objects.ids), dtype=torch.bool)
+    behind = order_in_image(seen.masks, seen.people)
     image = ImageInputs(
-        camera, seen.boxes, seen.detected, seen.masks, seen.people, unordered,
+        camera, seen.boxes, seen.detected, seen.masks, seen.people, behind,
         given.t_world_object.norm(dim=-1),
     )  # fmt: skip
     cues = setup.run.stage(find_image_cues, image, setup.config.image)

@@ -90,6 +90,9 @@ def ground_without_people(capture: Capture, prepared: Prepared) -> float:
 BORDER = 1.5  # [px], a side this close to the image's border is cut by it
 STRIP = 0.06  # of the box's size: how far beyond a side one looks for what may hide it
 GAP = 0.02  # of the image's width: two cells of a coarse mask, by which masks of neighbours part
+BASE = 0.02  # of the image's height, within which bases are equally high
+SHARED = 0.01  # of the image's width that two objects share at least, to be compared
+MOST = 0.8  # of these columns in which one of them is lower
 MARGIN = 0.3  # of the box's larger side: how much a window is larger than the box (PHOSA)
 
 
@@ -213,6 +216,43 @@ def _part(mask: Bool[Tensor, "h w"], box: Float[Tensor, "4"]) -> Bool[Tensor, "r
     height, width = mask.shape
     x0, y0, x1, y1 = (round(v) for v in box.tolist())
     return mask[max(0, y0) : min(height, max(y1, y0 + 1)), max(0, x0) : min(width, max(x1, x0 + 1))]
+
+
+def order_in_image(
+    masks: Bool[Tensor, "objects h w"], people: Bool[Tensor, "h w"]
+) -> Bool[Tensor, "objects objects"]:
+    """[i, j]: object j stands behind object i, since its base is higher in the image.
+
+    Of two objects on the floor the nearer one has the lower base. Where something else hides the
+    base of j, or the border cuts it off, nothing is known. The top of a table reaches over a chair
+    whose base is lower there, so both count: the columns that the two share, and the whole bases.
+
+    Args:
+        masks: Of the objects; empty where only the box is known.
+        people: Pixels of people.
+    """
+    count, height, width = masks.shape
+    rows = torch.arange(1, height + 1, dtype=torch.int32, device=masks.device)[:, None]
+    lowest = torch.stack([(mask * rows).amax(0) for mask in masks])  # 0: none in this column
+    base = lowest.amax(1)
+    gap, slack = max(2, round(GAP * height)), BASE * height
+    found = torch.zeros(count, count, dtype=torch.bool, device=masks.device)
+    for j in range(count):
+        at = lowest[j] > (base[j] - slack).clamp_min(0)
+        if not bool(at.any()) or int(base[j]) > height - gap:
+            continue
+        under = slice(int(base[j] - slack), int(base[j]) + gap)
+        near = masks[:, under][:, :, at].flatten(1).any(1)  # what may hide its base
+        near[j] = False
+        if bool(people[under][:, at].any()) or int(near.sum()) > 1:
+            continue
+        for i in range(count):
+            both = (lowest[i] > 0) & (lowest[j] > 0)
+            if i == j or int(both.sum()) < SHARED * width or (bool(near.any()) and not near[i]):
+                continue
+            lower = lowest[i][both] > lowest[j][both] + slack
+            found[i, j] = float(lower.float().mean()) > MOST and base[i] > base[j] + slack
+    return found
 
 
 def order_of(
