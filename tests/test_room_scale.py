@@ -8,9 +8,12 @@ import torch
 from analytic import boxes_of
 from figures import ARMS_DOWN, SEATED, people, pose
 from test_given import somewhere
+from test_pipeline import light
 
 from mover.bodies.parts import parts_of
+from mover.core.run import Run
 from mover.core.types import Layout
+from mover.pipeline.reconstruct import reconstruct
 from mover.stages.objects.gather_given import gather_given
 from mover.stages.objects.room_scale import (
     DISTANCES,
@@ -19,6 +22,8 @@ from mover.stages.objects.room_scale import (
     common_scale,
     seat_height_estimate,
 )
+from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.noise import add_noise
 
 ROOM = 0.0
 
@@ -104,3 +109,18 @@ def test_more_seat_height_estimate_more() -> None:
     assert both is not None
     assert both[0] == pytest.approx(one[0], abs=1e-4)
     assert both[1] < one[1]
+
+
+@pytest.mark.slow
+def test_a_room_of_people_of_unknown_height_says_how_uncertain_it_is(small_room, tmp_path) -> None:
+    known = add_noise(small_room, NoiseConfig(), 0)
+    assert known.bodies is not None
+    unknown = replace(known, bodies=replace(known.bodies, size_spread=0.06))
+    given = [
+        [w for w in reconstruct(capture, light("robust"), Run(tmp_path)).warnings if "heights" in w]
+        for capture in (known, unknown)
+    ]
+    assert given[0] == []
+    (warning,) = given[1]
+    assert "uncertain by" in warning
+    assert "--height" in warning

@@ -61,6 +61,7 @@ from mover.stages.objects.starts import best_few, other_starts, reference_yaw
 from mover.stages.people.find_depth import are_shapeless, nearer, pelvis, size_spread
 
 NO_PEOPLE = HumanCues()
+LOOSE_SCALE = 0.02  # of the logarithm of a room's size: a spread that deserves a warning
 
 
 @dataclass(frozen=True)
@@ -226,11 +227,19 @@ def estimate_scale(
     if setup.config.seat_heights:
         seats = seat_height_estimate(kept, people.parts, placed.ground)
     prior = ScaleKnown(spread, capture.scene.size_spread, seats)
-    scale, _ = common_scale(placed.layout, given, setup.objects.categories, prior)
+    scale, left = common_scale(placed.layout, given, setup.objects.categories, prior)
     factor = math.exp(-scale)
+    warnings = people.warnings
+    if left > LOOSE_SCALE:
+        warnings += (
+            f"people's heights are not known, so the size of the whole room is uncertain by"
+            f" {100 * left:.0f} %: the height of a person (mover fit --height, or 'heights' in"
+            " people.json) or of the camera ('height' in camera.json) would fix it",
+        )
     layout, candidates = (larger(x, factor) for x in (placed.layout, placed.placed.candidates))
     bodies = nearer(people.bodies, placed.camera, placed.ground, factor)
-    return replace(people, bodies=bodies, path=scaled(people.path, factor)), replace(
+    path = scaled(people.path, factor)
+    return replace(people, bodies=bodies, path=path, warnings=warnings), replace(
         placed,
         ground=factor * placed.ground,
         start=larger(placed.start, factor),
