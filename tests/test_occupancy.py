@@ -115,7 +115,7 @@ def test_a_checkpoint_in_the_published_shapes_loads_by_its_keys(tmp_path: Path):
 
 def test_it_computes_what_its_equations_say():
     state = random_state(published(12, 10, 8))
-    network = network_of({"module." + k: v for k, v in state.items()}, "x.pt")
+    network = network_of({"module." + k: v for k, v in state.items()})
     generator = torch.Generator().manual_seed(1)
     clouds, points = (torch.randn(2, n, 3, generator=generator) for n in (30, 4))
     with torch.no_grad():
@@ -130,12 +130,12 @@ def test_old_checkpoints_do_not_count_batches_and_a_latent_code_is_at_its_mean()
     state = random_state(published(12, 10, 8))
     short = {k: v for k, v in state.items() if not k.endswith("tracked")}
     cloud, points = torch.ones(1, 5, 3), torch.zeros(1, 2, 3)
-    plain = network_of(short, "x.pt")(cloud, points)
-    torch.testing.assert_close(plain, network_of(state, "x.pt")(cloud, points))
+    plain = network_of(short)(cloud, points)
+    torch.testing.assert_close(plain, network_of(state)(cloud, points))
     bias = torch.zeros(8)
     latent = short | {"decoder.fc_z.weight": torch.randn(8, 6, generator=torch.Generator()),
                       "decoder.fc_z.bias": bias}  # fmt: skip
-    torch.testing.assert_close(network_of(latent, "x.pt")(cloud, points), plain)
+    torch.testing.assert_close(network_of(latent)(cloud, points), plain)
 
 
 @pytest.mark.parametrize("change", ["missing", "shape", "image", "list", "code"])
@@ -207,7 +207,7 @@ def test_nothing_inside_is_told():
 
 
 def test_the_shape_comes_back_in_its_own_box_and_axes(monkeypatch: pytest.MonkeyPatch):
-    network = network_of(random_state(published(12, 10, 8)), "x.pt")
+    network = network_of(random_state(published(12, 10, 8)))
     seen: list[torch.Tensor] = []
 
     def encode(cloud: torch.Tensor) -> torch.Tensor:

@@ -11,7 +11,6 @@ import trimesh
 from mover.core.types import Mesh
 from mover.geometry import mesh as m
 from mover.geometry.nearest import to_surface
-from mover.geometry.topology import distinct_rows
 from mover.geometry.volume import signed_distance
 from mover.geometry.watertight import LARGE, close_mesh
 
@@ -29,17 +28,6 @@ REAL = [
 
 def as_mesh(shape: trimesh.Trimesh) -> Mesh:
     return Mesh(torch.from_numpy(shape.vertices.copy()), torch.from_numpy(shape.faces.copy()))
-
-
-@pytest.mark.parametrize(("low", "high"), [(-5, 5), (-(2**40), 2**40), (-(2**62), 2**62)])
-@pytest.mark.parametrize("count", [0, 1, 300])
-def test_rows_are_found_once_as_numpy_finds_them(low: int, high: int, count: int) -> None:
-    rows = np.random.default_rng(count).integers(low, high, (count, 3))
-    rows = np.concatenate([rows, rows[: count // 3]])
-    _, first, same = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    found = distinct_rows(rows)
-    assert np.array_equal(found[0], first)
-    assert np.array_equal(found[1], same.ravel())
 
 
 def joined(*meshes: Mesh) -> Mesh:

@@ -1,7 +1,6 @@
-"""Points of the skin that people click in pictures: nose, eyes, ears, toes, heels, finger tips.
+"""Keypoints of bodies in the orders that 2D detectors use.
 
-Of models with a fixed mesh they are vertices known by number; of the open body they are found by
-its geometry in the zero pose, so that any level of detail has them.
+Nose, eyes, ears, toes, heels and finger tips are vertices known by number.
 """
 
 from functools import lru_cache
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from mover.bodies import BodyModel
 from mover.bodies.skeleton import FINGERS, SIDES
-from mover.bodies.skinning import SkinnedBody, zero_pose
+from mover.bodies.skinning import SkinnedBody
 from mover.bodies.smpl_model import SmplBody, skin_of_model
 from mover.core.records import record
 
@@ -21,99 +20,27 @@ HEAD_MARKS = ("nose", "right_eye", "left_eye", "right_ear", "left_ear")
 FOOT_MARKS = tuple(f"{side}_{mark}" for side in SIDES for mark in ("big_toe", "small_toe", "heel"))
 MARKS = (*HEAD_MARKS, *FOOT_MARKS, *TIPS, "head_top")
 """Names of all points."""
-
-_NUMBERED = (*HEAD_MARKS, *FOOT_MARKS, *TIPS)
 VERTEX_OF = {
-    "smplx": dict(
-        zip(
-            _NUMBERED,
-            (9120, 9929, 9448, 616, 6, 5770, 5780, 8846, 8463, 8474, 8635,
-             4933, 5058, 5286, 5169, 5361, 7669, 7794, 8022, 7905, 8079),
-            strict=True,
-        )
-    ),
-    "smplh": dict(
-        zip(
-            _NUMBERED,
-            (332, 6260, 2800, 4071, 583, 3216, 3226, 3387, 6617, 6624, 6787,
-             2319, 2445, 2673, 2556, 2746, 5782, 5905, 6133, 6016, 6191),
-            strict=True,
-        )
-    ),
+    10475: (9120, 9929, 9448, 616, 6, 5770, 5780, 8846, 8463, 8474, 8635,
+            4933, 5058, 5286, 5169, 5361, 7669, 7794, 8022, 7905, 8079),
+    6890: (332, 6260, 2800, 4071, 583, 3216, 3226, 3387, 6617, 6624, 6787,
+           2319, 2445, 2673, 2556, 2746, 5782, 5905, 6133, 6016, 6191),
+    5002: (1904, 1844, 2479, 2022, 4534, 4349, 4933, 4618, 1864, 2423, 2123,
+           3143, 3170, 3269, 3256, 3337, 669, 720, 853, 813, 862),
+    13380: (5054, 6756, 13352, 5507, 12106, 11551, 13209, 12453, 4933, 6613, 5856,
+            8595, 8787, 9171, 8982, 9348, 1927, 2119, 2503, 2314, 2680),
 }  # fmt: skip
-"""Vertex of each point in the meshes of SMPL-X (10,475) and of SMPL and SMPL-H (6,890)."""
+"""Vertices of all points but the top of the head by the size of the mesh: SMPL-X; SMPL and SMPL-H;
+the open body, small and full."""
 
 
+@lru_cache(maxsize=16)
 def marks_of(model: SkinnedBody) -> dict[str, int]:
-    """Vertex of each point of `MARKS` that this body has."""
-    known = VERTEX_OF.get("smplh" if model.name == "smpl" else model.name)
-    top = _top(model)
-    return {**known, "head_top": top} if known is not None else _found(model)
-
-
-@lru_cache(maxsize=16)
-def _top(model: SkinnedBody) -> int:
-    """The highest vertex of the rest shape that moves with the head."""
+    """Vertex of each point of `MARKS`; the top of the head is the highest that moves with it."""
+    marks = dict(zip(MARKS, VERTEX_OF[len(model.verts)], strict=False))
     head = model.weights[:, model.joint_names.index("head")] > 0.5
-    height = model.verts[:, 1].clone()
-    height[~head] = -torch.inf
-    return int((height if head.any() else model.verts[:, 1]).argmax())
-
-
-@lru_cache(maxsize=16)
-def _found(model: SkinnedBody) -> dict[str, int]:
-    """Points by geometry, in the zero pose (T-pose, +y up, +z front)."""
-    verts, joints = (x[0].detach() for x in model.posed(zero_pose(1, model)))
-    place = dict(zip(model.joint_names, joints, strict=True))
-    main = model.weights.argmax(1).cpu()
-
-    def of(*names: str) -> Bool[Tensor, " verts"]:
-        wanted = torch.tensor([model.joint_names.index(n) for n in names])
-        return torch.isin(main, wanted).to(verts.device)
-
-    head = of("head", "jaw", "left_eye_smplhf", "right_eye_smplhf")
-    marks = _head_marks(verts, head, place)
-    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
-        foot = of(f"{side}_ankle", f"{side}_foot")
-        ball = place[f"{side}_foot"]
-        outward, front = sign * (verts[:, 0] - ball[0]), verts[:, 2] - ball[2]
-        low = verts[:, 1] < verts[foot, 1].min() + 0.04
-        toes = foot & (front > 0.02)
-        marks[f"{side}_big_toe"] = _most(front, toes & (outward < -0.01))
-        marks[f"{side}_small_toe"] = _most(outward + 0.7 * front, toes & (outward > 0.02))
-        marks[f"{side}_heel"] = _most(-verts[:, 2], foot & low)
-        for finger in FINGERS:
-            end = place[f"{side}_{finger}3"]
-            along = (verts - end) @ (end - place[f"{side}_{finger}2"])
-            marks[f"{side}_{finger}_tip"] = _most(along, of(f"{side}_{finger}3"))
-    return marks
-
-
-def _head_marks(
-    verts: Float[Tensor, "verts 3"], head: Bool[Tensor, " verts"], place: dict[str, Tensor]
-) -> dict[str, int]:
-    """Nose, eyes, ears, and the top of the head."""
-    x, y, z = verts.unbind(-1)
-    eyes = place["left_eye_smplhf"][1]
-    marks = {
-        "nose": _most(z, head & (x.abs() < 0.012) & (y < eyes) & (y > eyes - 0.06)),
-        "head_top": _most(y, head),
-    }
-    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
-        eye = place[f"{side}_eye_smplhf"]
-        near = (verts - eye)[:, :2].norm(dim=-1)
-        marks[f"{side}_eye"] = _most(-near, head & (z > eye[2]))
-        ear = head & (sign * x > 0.9 * (sign * x[head]).max()) & (y < eyes + 0.03)
-        marks[f"{side}_ear"] = _most(-(verts - verts[ear].mean(0)).norm(dim=-1), ear)
-    return marks
-
-
-def _most(score: Float[Tensor, " verts"], among: Bool[Tensor, " verts"]) -> int:
-    """The vertex of the highest score."""
-    return int(torch.where(among, score, -torch.inf).argmax())
-
-
-# Keypoints of bodies in the orders that 2D detectors use.
+    height = torch.where(head, model.verts[:, 1], -torch.inf)
+    return {**marks, "head_top": int((height if head.any() else model.verts[:, 1]).argmax())}
 
 
 MISSING = ""

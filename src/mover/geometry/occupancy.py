@@ -129,45 +129,44 @@ def load_occupancy(path: Path) -> OccupancyNetwork:
     No code in the file is executed.
 
     Raises:
-        InputError: If the file is missing or is no checkpoint of a point-cloud network.
+        InputError: If the file is missing, is no checkpoint of a point-cloud network, or keys are
+            missing, unknown, or of another shape.
     """
+    name = path.name
     if not path.is_file():
         raise InputError(f"{path}: there is no such file, expected an Occupancy Network")
     try:
         tree: Any = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises what the damage happens to cause
         text = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise InputError(f"{path.name}: cannot be read ({text}), expected a checkpoint") from error
-    return network_of(tree, path.name)
-
-
-def network_of(tree: Any, name: str) -> OccupancyNetwork:  # noqa: ANN401
-    """The network of a state dictionary, which may lie under `model`.
-
-    Raises:
-        InputError: If keys are missing, unknown, or of another shape.
-    """
+        raise InputError(f"{name}: cannot be read ({text}), expected a checkpoint") from error
     state: Any = tree.get("model", tree) if isinstance(tree, dict) else None
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
         raise InputError(f"{name}: holds no parameters, expected the field 'model' of a checkpoint")
-    state = {key.removeprefix("module."): value for key, value in state.items()}
     try:
-        code, encoder = state["encoder.fc_c.weight"].shape
-        decoder = state["decoder.fc_p.weight"].shape[0]
-        latent = state["decoder.fc_z.weight"].shape[1] if "decoder.fc_z.weight" in state else 0
-        network = OccupancyNetwork(code, encoder, decoder, latent)
-        own = network.state_dict()
-        kept = {k: v for k, v in state.items() if not k.startswith("encoder_latent.")}
-        for key in own:  # checkpoints of old torch do not count batches
-            if key.endswith("num_batches_tracked"):
-                kept.setdefault(key, own[key])
-        network.load_state_dict(kept)
+        return network_of(state)
     except (KeyError, ValueError, RuntimeError, IndexError) as error:
         text = str(error).splitlines()[0][:120]
         raise InputError(
             f"{name}: is not an Occupancy Network for point clouds ({text}), expected "
             "pointnet_resnet and cbatchnorm, as in onet_pcl2mesh"
         ) from error
+
+
+def network_of(state: dict[str, Tensor]) -> OccupancyNetwork:
+    """The network whose parameters have these names and shapes.
+
+    Raises:
+        KeyError, ValueError, RuntimeError, IndexError: If it is another network's.
+    """
+    state = {key.removeprefix("module."): value for key, value in state.items()}
+    code, encoder = state["encoder.fc_c.weight"].shape
+    decoder = state["decoder.fc_p.weight"].shape[0]
+    latent = state["decoder.fc_z.weight"].shape[1] if "decoder.fc_z.weight" in state else 0
+    network = OccupancyNetwork(code, encoder, decoder, latent)
+    kept = {k: v for k, v in state.items() if not k.startswith("encoder_latent.")}
+    counts = {k: v for k, v in network.state_dict().items() if k.endswith("num_batches_tracked")}
+    network.load_state_dict({**counts, **kept})  # checkpoints of old torch do not count batches
     return network.eval()
 
 

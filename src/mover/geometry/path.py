@@ -27,12 +27,6 @@ def about(path: CameraPath, view: CameraPath) -> CameraPath:
     return CameraPath(path.frame, R.mT @ path.R_reference_camera, (path.t_reference_camera - t) @ R)
 
 
-def reversed_poses(path: CameraPath) -> CameraPath:
-    """From the axes of the reference image's camera into those of each frame's."""
-    back = path.R_reference_camera.mT
-    return CameraPath(path.frame, back, -(back @ path.t_reference_camera[..., None])[..., 0])
-
-
 def poses_at(path: CameraPath, frame: Int[Tensor, " rows"]) -> CameraPath:
     """The poses of some frames; evenly between two known ones, at the ends' beyond them."""
     R, t = path.R_reference_camera, path.t_reference_camera

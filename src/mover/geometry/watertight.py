@@ -18,7 +18,6 @@ from mover.geometry.nearest import as_float64, as_int64, closest
 from mover.geometry.topology import (
     Triangles,
     areas,
-    distinct_rows,
     is_closed,
     labels,
     manifold,
@@ -229,4 +228,4 @@ def _cleaned(verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     turned = np.take_along_axis(faces, (faces.argmin(1)[:, None] + np.arange(3)) % 3, 1)
-    return verts, faces[np.sort(distinct_rows(turned)[0])]
+    return verts, faces[np.sort(np.unique(turned, axis=0, return_index=True)[1])]
