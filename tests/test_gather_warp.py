@@ -1,4 +1,4 @@
-"""Gathering with Warp kernels: the same as without them, whoever does what."""
+"""Gathering with Warp kernels: the same as without them, for any number of workers."""
 
 import dataclasses
 
@@ -98,10 +98,11 @@ def test_no_frames_leave_the_grid_as_it_was() -> None:
     assert torch.equal(volume_warp.union_bodies(verts[:0], faces, grid, 2).values, grid.values)
 
 
-def test_a_failure_in_a_worker_is_told() -> None:
+@pytest.mark.parametrize("wrong", [torch.inf, torch.nan])
+def test_vertices_that_are_not_finite_are_refused_by_their_body(wrong: float) -> None:
     verts, faces = moving_spheres(9)
     grid = around(verts, 20)
-    verts[7, 3] = torch.inf
+    verts[7, 3] = wrong
     with pytest.raises(ValueError, match="body 7"):
         volume_warp.union_bodies(verts, faces, grid, 3)
 
@@ -191,8 +192,8 @@ def test_progress_of_the_bounds_ends_with_all_bodies() -> None:
     sight = passing(9)
     gather_depth(sight, 2, lambda done, of: seen.append((done, of)))
     assert seen[-1] == (9, 9)
-    nobody = dataclasses.replace(sight, table=dataclasses.replace(sight.table, own=(None,) * 9))
-    assert gather_depth(nobody, 2).near.max() == -torch.inf
+    unmasked = dataclasses.replace(sight, table=dataclasses.replace(sight.table, own=(None,) * 9))
+    assert gather_depth(unmasked, 2).near.max() == -torch.inf
 
 
 def some_field(size: tuple[int, int, int]) -> Volume:

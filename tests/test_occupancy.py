@@ -201,7 +201,7 @@ def test_refinement_finds_what_the_dense_grid_finds_with_few_points():
     torch.testing.assert_close(sparse[near], dense[near])
 
 
-def test_nothing_inside_is_told():
+def test_nothing_inside_is_an_error():
     with pytest.raises(ValueError, match="nothing is inside"):
         extract(lambda p: -5 * torch.ones(len(p)), SMALL)
 

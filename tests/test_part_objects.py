@@ -33,7 +33,7 @@ def overlap(objects, at):
 
 
 def indifferent(layout):
-    """Nobody minds where an object is."""
+    """No term depends on where an object is."""
     return Energy({"none": 0.0 * layout.t_world_object.square().sum(-1)})
 
 
@@ -116,8 +116,8 @@ def test_all_that_may_lie_in_one_share_what_each_does_alone_and_boxes_apart_shar
         deep = (-outline(solids.sections[j], own) * near.log_scale[j, ::2].mean().exp()) - OVERLAP
         deep = deep.relu() * solids.upright[i]
         least = deep.clamp_max(FAR)
-        price = SAMPLES * (least * (2 * deep - least)).mean()
-        alone = alone + price * torch.nn.functional.one_hot(torch.tensor(i), 3)
+        cost = SAMPLES * (least * (2 * deep - least)).mean()
+        alone = alone + cost * torch.nn.functional.one_hot(torch.tensor(i), 3)
     torch.testing.assert_close(whole, alone)
     slopes = (torch.autograd.grad(x.sum(), t)[0] for x in (whole, alone))
     torch.testing.assert_close(*slopes)

@@ -1,4 +1,4 @@
-"""The horizontal way out of a solid, however thin it is in height, and the price made of it."""
+"""The horizontal way out of a solid, however thin it is in height, and its cost."""
 
 import math
 from dataclasses import replace

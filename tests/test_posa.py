@@ -235,9 +235,9 @@ def test_posa_in_a_run_says_what_is_missing(files, tmp_path, capsys):
     both = ["--posa", str(tmp_path / "no.pt"), "--posa-meshes", str(files / "mesh_ds")]
     assert run_command("run", [*words, *both]) == 2
     assert "no.pt: no checkpoint can be read" in capsys.readouterr().err
-    nobody = replace(read_capture(tmp_path / "c"), bodies=None)
+    empty = replace(read_capture(tmp_path / "c"), bodies=None)
     with pytest.raises(InputError, match=r"has no bodies.npz, so there are no contacts"):
-        with_posa(nobody, files / "contact.pt", files / "mesh_ds")
+        with_posa(empty, files / "contact.pt", files / "mesh_ds")
 
 
 def test_samples_average_random_codes(files):

@@ -1,7 +1,7 @@
 """Where a vertex lies on a body, whatever the pose: walking distances to head, hands and feet.
 
-Distances along the skin hardly change when a person moves, so they tell head, hands and feet of any
-human mesh apart, and match its vertices to those of a known one.
+Distances along the skin hardly change when a person moves, so they distinguish head, hands and
+feet of any human mesh, and match its vertices to those of a known one.
 """
 
 import itertools
@@ -53,13 +53,24 @@ def ends(
 
     The belly is often farther from all hands and feet than the head is, hence more than five.
     """
+    from scipy.sparse.csgraph import connected_components, dijkstra
+
     graph = _graph(verts, faces)
-    tips = [_farthest(graph, _farthest(graph, _largest(graph)))]
-    far = [_from(graph, tips[0])]
-    while len(tips) < count:
+    _, label = connected_components(graph, directed=False)
+    start = int(np.argmax(label == np.bincount(label).argmax()))  # of the largest component
+
+    def walk(source: int) -> Float[Array, " verts"]:
+        return dijkstra(graph, directed=False, indices=source)
+
+    def farthest(far: list[Float[Array, " verts"]]) -> int:
         nearest = np.min(far, axis=0)
-        tips.append(int(np.argmax(np.where(np.isfinite(nearest), nearest, -1))))
-        far.append(_from(graph, tips[-1]))
+        return int(np.argmax(np.where(np.isfinite(nearest), nearest, -1)))
+
+    tips = [farthest([walk(farthest([walk(start)]))])]
+    far = [walk(tips[0])]
+    while len(tips) < count:
+        tips.append(farthest(far))
+        far.append(walk(tips[-1]))
     return np.array(tips), np.stack(far, axis=1)
 
 
@@ -68,7 +79,7 @@ def match_ends(
 ) -> tuple[Walks, float, float]:
     """Find head, hands and feet by the distances between them in a known body.
 
-    Left and right may be exchanged: distances cannot tell.
+    Left and right may be exchanged: distances are the same.
 
     Returns:
         The walks, the size relative to the known body, and the root mean square of the mismatch of
@@ -104,25 +115,6 @@ def _graph(verts: Float[Array, "verts 3"], faces: Int[Array, "faces 3"]) -> Any:
     row, col = pairs.row[keep], pairs.col[keep]
     length = np.maximum(np.linalg.norm(verts[row] - verts[col], axis=1), 1e-9)
     return sparse.coo_matrix((length, (row, col)), shape=size).tocsr()
-
-
-def _largest(graph: Any) -> int:  # noqa: ANN401
-    """A vertex of the component with the most vertices."""
-    from scipy.sparse.csgraph import connected_components
-
-    _, label = connected_components(graph, directed=False)
-    return int(np.argmax(label == np.bincount(label).argmax()))
-
-
-def _from(graph: Any, source: int) -> Float[Array, " verts"]:  # noqa: ANN401
-    from scipy.sparse.csgraph import dijkstra
-
-    return dijkstra(graph, directed=False, indices=source)
-
-
-def _farthest(graph: Any, source: int) -> int:  # noqa: ANN401
-    far = _from(graph, source)
-    return int(np.argmax(np.where(np.isfinite(far), far, -1)))
 
 
 # The limbs of a body as frames: where each starts and how it is turned against the T-pose.

@@ -2,7 +2,7 @@
 
 1. Walking distances to head, hands and feet say roughly where a vertex lies (`intrinsic`).
 2. From that come places of the joints, and the limbs of the open body are laid over the mesh's.
-3. Distances cannot tell left from right. The way in which the limbs fit best can.
+3. Distances are the same for left and right. The way in which the limbs fit best can.
 4. The vertex of the open body that is nearest and of like direction gives a vertex its part.
 """
 
@@ -44,7 +44,7 @@ FEWEST = 20
 REACH = 0.05
 """A normal counts as much as a place that far from the middle [m]."""
 SAMPLED = 1500
-"""Vertices that tell left from right."""
+"""Vertices that distinguish left from right."""
 SPREAD = (0.06, 0.05, 0.5)
 """Typical mismatch of walking distances [m], of places along a limb [m], and of normals."""
 

@@ -119,11 +119,6 @@ def _check_size(template: Any, name: str, file: str) -> None:  # noqa: ANN401
         )
 
 
-def _plain(value: Any) -> Array:  # noqa: ANN401
-    """A dense array, also of a sparse matrix."""
-    return np.asarray(value.toarray() if hasattr(value, "toarray") else value)
-
-
 def _numbers(
     arrays: Mapping[str, Any], key: str, shape: tuple[int | None, ...], file: str
 ) -> NDArray[np.float64]:
@@ -135,7 +130,7 @@ def _numbers(
     value = arrays[key]
     if tuple(getattr(value, "shape", ())) and not _fits(value.shape, shape):
         raise InputError(_wrong(file, key, f"shape {tuple(value.shape)}", shape))
-    array = _plain(value)
+    array: Array = np.asarray(value.toarray() if hasattr(value, "toarray") else value)
     if array.dtype.kind not in "fiu" or not _fits(array.shape, shape):
         raise InputError(_wrong(file, key, f"shape {array.shape} of {array.dtype}", shape))
     if not np.isfinite(array).all():
@@ -305,20 +300,14 @@ def _npz(path: Path, name: str) -> dict[str, Any]:
         arrays: dict[str, Any] = dict.fromkeys(sizes)
         with np.load(path, allow_pickle=False) as data:
             for key in sorted(wanted & set(sizes)):
-                arrays[key] = _member(data, key, file)
+                try:
+                    arrays[key] = data[key]
+                except ValueError as error:
+                    if "allow_pickle" not in str(error):
+                        raise
+                    found = f"{file}: field '{key}' is a pickled object, expected plain numbers"
+                    raise InputError(found) from error
     except BROKEN as error:
         why = " ".join(f"{type(error).__name__}: {error}".split())[:160]
         raise InputError(f"{file}: cannot be read ({why}), expected an .npz file") from error
     return arrays
-
-
-def _member(data: Any, key: str, file: str) -> Any:  # noqa: ANN401
-    """One array of numbers."""
-    try:
-        return data[key]
-    except ValueError as error:
-        if "allow_pickle" not in str(error):
-            raise
-        raise InputError(
-            f"{file}: field '{key}' is a pickled object, expected plain numbers"
-        ) from error

@@ -156,7 +156,7 @@ WALL_PIECES = frozenset({"sofa", "bed", "desk", "shelf", "cabinet", "wardrobe", 
 """Classes that usually stand with their back to a wall."""
 
 FRONTLESS = frozenset({"table", "coffee table", "stool", "bench", "floor lamp"})
-"""Classes of which no side is the front, so that their shapes alone tell turns apart."""
+"""Classes of which no side is the front, so that only their shapes distinguish turns."""
 
 
 def canonical(category: str) -> str:
