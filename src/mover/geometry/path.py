@@ -21,12 +21,6 @@ def scaled(path: CameraPath, factor: float) -> CameraPath:
     return replace(path, t_reference_camera=path.t_reference_camera * factor)
 
 
-def about(path: CameraPath, view: CameraPath) -> CameraPath:
-    """The path in the axes of another camera, whose one pose is given."""
-    R, t = view.R_reference_camera[0], view.t_reference_camera[0]
-    return CameraPath(path.frame, R.mT @ path.R_reference_camera, (path.t_reference_camera - t) @ R)
-
-
 def poses_at(path: CameraPath, frame: Int[Tensor, " rows"]) -> CameraPath:
     """The poses of some frames; evenly between two known ones, at the ends' beyond them."""
     R, t = path.R_reference_camera, path.t_reference_camera

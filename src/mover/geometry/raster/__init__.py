@@ -55,6 +55,11 @@ def drawn_by(module: ModuleType) -> Generator[None, None, None]:
         _reference.reset(token)
 
 
+def _reference_of(_verts_cam: Tensor) -> ModuleType | None:
+    """Who draws such vertices in place of the kernels."""
+    return _reference.get()
+
+
 def silhouettes(
     verts_cam: Float[Tensor, "*starts items verts 3"], shape: Topology, views: Crops
 ) -> Float[Tensor, "*starts items h w"]:
@@ -76,7 +81,7 @@ def depths(
     The outline's motion has no share in the gradient (`silhouettes` has it). A triangle seen at
     less than half a degree gives a depth but no gradient, which would be without bound.
     """
-    if reference := _reference.get():
+    if reference := _reference_of(verts_cam):
         return reference.depths(verts_cam, shape, views)
     return _depths(_maps(verts_cam, shape, views, (False, True)), verts_cam)
 
@@ -88,7 +93,7 @@ def look(
     depth: bool = True,
 ) -> tuple[Float[Tensor, "*starts items h w"], Depths | None]:
     """`silhouettes` and, where asked for, `depths`: both from one pass over the triangles."""
-    if reference := _reference.get():
+    if reference := _reference_of(verts_cam):
         return reference.look(verts_cam, shape, views, depth)
     maps = _maps(verts_cam, shape, views, (True, depth))
     return maps.image.to(verts_cam), _depths(maps, verts_cam) if depth else None
@@ -104,7 +109,7 @@ def layers(
     Items are streamed, so memory does not grow with their number but for the result. A call works
     in one thread and leaves Python's lock to others.
     """
-    if reference := _reference.get():
+    if reference := _reference_of(verts_cam):
         return reference.layers(verts_cam, faces, views)
     wp = started()
     items, n_verts, _ = verts_cam.shape
@@ -133,7 +138,7 @@ def first_hit(
 
     The size is height and width [px]; triangles need not be closed or consistent.
     """
-    if reference := _reference.get():
+    if reference := _reference_of(verts_cam):
         return reference.first_hit(verts_cam, faces, K, size)
     depth, face = torch.full(size, torch.inf), torch.full(size, -1, dtype=torch.int32)
     if len(verts_cam):
