@@ -15,8 +15,8 @@ from mover.bodies import BODY_MODELS
 from mover.bodies.posa import (
     canonical,
     decode,
-    half_edges,
     load_posa,
+    neighbours,
     posa_contacts,
     spirals,
 )
@@ -122,10 +122,10 @@ def smplx_people(turn=(0.0, 0.4, 0.0)):
 
 def test_neighbours_go_round_clockwise_and_are_those_of_the_faces():
     verts, faces = sphere(6, 12)
-    mesh, left_out = half_edges(faces, len(verts))
+    mesh, left_out = neighbours(faces, len(verts))
     assert left_out == 0
     for v in range(len(verts)):
-        around = mesh.around(v)
+        around = mesh[v]
         assert set(around) == set(faces[(faces == v).any(1)].ravel()) - {v}
         assert len(around) == len(set(around))
         turn = 0.0
@@ -135,35 +135,35 @@ def test_neighbours_go_round_clockwise_and_are_those_of_the_faces():
 
 
 def test_a_branching_triangle_is_left_out():
-    mesh, left_out = half_edges(np.concatenate([OCTAHEDRON, [[0, 2, 1]]]), 6)
+    mesh, left_out = neighbours(np.concatenate([OCTAHEDRON, [[0, 2, 1]]]), 6)
     assert left_out == 1
-    assert all(len(mesh.around(v)) == 4 for v in range(6))
+    assert all(len(mesh[v]) == 4 for v in range(6))
 
 
 def test_triangles_may_come_in_any_order():
     verts, faces = sphere(5, 9)
     shuffled = np.random.default_rng(4).permutation(faces)
-    mesh, left_out = half_edges(shuffled, len(verts))
+    mesh, left_out = neighbours(shuffled, len(verts))
     assert left_out == 0
     for v in range(len(verts)):
-        assert set(mesh.around(v)) == set(faces[(faces == v).any(1)].ravel()) - {v}
+        assert set(mesh[v]) == set(faces[(faces == v).any(1)].ravel()) - {v}
 
 
 def test_an_open_fan_begins_at_its_border():
-    mesh, _ = half_edges(np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4]]), 5)
-    assert mesh.around(0) == [4, 3, 2, 1]
-    assert mesh.around(2) in ([3, 0, 1], [1, 0, 3])
+    mesh, _ = neighbours(np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4]]), 5)
+    assert mesh[0] == [4, 3, 2, 1]
+    assert mesh[2] in ([3, 0, 1], [1, 0, 3])
 
 
 def test_spirals_go_outwards_ring_by_ring():
     verts, faces = sphere(8, 12)
     rows = spirals(verts, faces, 9)
-    mesh, _ = half_edges(faces, len(verts))
+    mesh, _ = neighbours(faces, len(verts))
     for v in range(20, 60):
-        ring = mesh.around(v)
+        ring = mesh[v]
         assert rows[v, 0] == v
         assert rows[v, 1 : len(ring) + 1].tolist() == ring[:8]
-        outer = {n for r in ring for n in mesh.around(r)} - {v, *ring}
+        outer = {n for r in ring for n in mesh[r]} - {v, *ring}
         assert set(rows[v, len(ring) + 1 :]) <= outer
         assert len(set(rows[v])) == 9
 

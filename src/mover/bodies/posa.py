@@ -3,8 +3,7 @@
 POSA (Hassan et al. 2021) guesses from the pose alone which vertices touch something. The network is
 written from a description of its layers; neither weights nor meshes come with this package. It
 works on coarse meshes (its folder mesh_ds) and learnt weights for "the third neighbour", so the
-order of neighbours is part of its format: that in which OpenMesh links half-edges, written from a
-description of it.
+order of neighbours is part of its format: that in which OpenMesh links half-edges.
 
 Departure: z = 0, the mean of the latent code, gives one answer; upstream draws z at random. The
 bodies are turned by the true direction of gravity; upstream trusts the camera to be level.
@@ -12,7 +11,7 @@ bodies are turned by the true direction of gravity; upstream trusts the camera t
 
 import hashlib
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,128 +36,54 @@ OFFICIAL = "b61f137d02a33c49f9d83ee651f0d60b1ddb80fc0c1e5b6aa85469f707238fb4"
 """Digest of the spirals of the official mesh_2."""
 DECODER = "decoder.de_spiral"
 CHUNK = 32  # bodies decoded at once
-NONE = -1
 
 
-@dataclass
-class HalfEdges:
-    """Half-edges 2e and 2e + 1 are opposite; those without a face lie on the boundary."""
+def neighbours(faces: Int[np.ndarray, "faces 3"], count: int) -> tuple[list[list[int]], int]:
+    """Neighbours of each vertex, clockwise, and how many triangles did not fit and were left out.
 
-    out: list[int]
-    """An outgoing half-edge of each vertex, on the boundary where there is one; -1: isolated."""
-    to: list[int] = field(default_factory=list[int])
-    after: list[int] = field(default_factory=list[int])
-    before: list[int] = field(default_factory=list[int])
-    closed: list[bool] = field(default_factory=list[bool])
-    """Whether the half-edge has a face."""
-    named: dict[tuple[int, int], int] = field(default_factory=dict[tuple[int, int], int])
-
-    def around(self, vertex: int) -> list[int]:
-        """Neighbours of a vertex, clockwise from its stored half-edge."""
-        found: list[int] = []
-        half = first = self.out[vertex]
-        while half != NONE:
-            found.append(self.to[half])
-            half = self.after[half ^ 1]
-            if half == first:
-                break
-        return found
-
-
-def half_edges(faces: Int[np.ndarray, "faces 3"], count: int) -> tuple[HalfEdges, int]:
-    """Insert triangles in order; the mesh, and how many did not fit and were left out."""
-    mesh = HalfEdges([NONE] * count)
-    left_out = sum(not _insert(mesh, tuple(row)) for row in faces.tolist())
-    return mesh, left_out
-
-
-def _insert(mesh: HalfEdges, corners: tuple[int, ...]) -> bool:
-    """Add one triangle unless it would make the surface branch."""
-    if any(mesh.out[v] != NONE and mesh.closed[mesh.out[v]] for v in corners):
-        return False
-    sides = [(corners[k], corners[(k + 1) % 3]) for k in range(3)]
-    halves = [mesh.named.get(side, NONE) for side in sides]
-    if any(h != NONE and mesh.closed[h] for h in halves):
-        return False
-    new = [h == NONE for h in halves]
-    links = _patches(mesh, halves)
-    if links is None:
-        return False
-    halves = [_named(mesh, side) for side in sides]
-    turned: list[int] = []
-    for k in range(3):
-        links += _corner(mesh, (halves[k], halves[(k + 1) % 3]), (new[k], new[(k + 1) % 3]), turned)
-        mesh.closed[halves[k]] = True
-    for a, b in links:
-        mesh.after[a], mesh.before[b] = b, a
-    for vertex in turned:
-        _to_boundary(mesh, vertex)
-    return True
-
-
-def _patches(mesh: HalfEdges, halves: list[int]) -> list[tuple[int, int]] | None:
-    """Links that move what lies between two old sides into another gap; None: there is none."""
-    links: list[tuple[int, int]] = []
-    for k in range(3):
-        into, out = halves[k], halves[(k + 1) % 3]
-        if NONE in (into, out) or mesh.after[into] == out:
+    Triangles are inserted in order. About a vertex they form fans, rows of neighbours of which each
+    two next to one another have a triangle; the first fan begins at the stored half-edge.
+    """
+    fans: list[list[list[int]]] = [[] for _ in range(count)]
+    taken, inner, left_out = set[tuple[int, int]](), set[int](), 0
+    for a, b, c in faces.tolist():
+        corners, sides = [(c, a, b), (a, b, c), (b, c, a)], {(a, b), (b, c), (c, a)}
+        joined = [_joined(fans[v], into, out) for into, v, out in corners]
+        rings = [ring for ring in joined if ring is not None]
+        if len(rings) < 3 or inner & {a, b, c} or taken & sides:
+            left_out += 1
             continue
-        gap = mesh.after[out ^ 1] ^ 1
-        while mesh.closed[gap]:
-            gap = mesh.after[gap] ^ 1
-        if gap == into:
-            return None
-        links += [(gap, mesh.after[into]), (mesh.before[out], mesh.after[gap]), (into, out)]
-    return links
+        taken |= sides
+        for (_, v, _), ring in zip(corners, rings, strict=True):
+            if ring is fans[v]:
+                inner.add(v)
+            fans[v] = ring
+    return [[n for fan in each for n in fan] for each in fans], left_out
 
 
-def _named(mesh: HalfEdges, side: tuple[int, int]) -> int:
-    """The half-edge from one vertex to another, made with its opposite if it is not there."""
-    if side not in mesh.named:
-        half = len(mesh.to)
-        mesh.to += [side[1], side[0]]
-        mesh.after += [NONE, NONE]
-        mesh.before += [NONE, NONE]
-        mesh.closed += [False, False]
-        mesh.named |= {side: half, (side[1], side[0]): half + 1}
-    return mesh.named[side]
+def _joined(fans: list[list[int]], into: int, out: int) -> list[list[int]] | None:
+    """The fans of a vertex with a triangle from one neighbour to another.
 
-
-def _corner(
-    mesh: HalfEdges, halves: tuple[int, int], new: tuple[bool, bool], turned: list[int]
-) -> list[tuple[int, int]]:
-    """Links around one corner; its vertex may change its stored half-edge."""
-    into, out = halves
-    vertex = mesh.to[into]
-    outer_in, outer_out = out ^ 1, into ^ 1
-    match new:
-        case (False, False):
-            if mesh.out[vertex] == out:
-                turned.append(vertex)
-            return []
-        case (True, False):
-            links = [(mesh.before[out], outer_out)]
-            mesh.out[vertex] = outer_out
-        case (False, True):
-            links = [(outer_in, mesh.after[into])]
-            mesh.out[vertex] = mesh.after[into]
-        case _ if mesh.out[vertex] == NONE:
-            links = [(outer_in, outer_out)]
-            mesh.out[vertex] = outer_out
-        case _:
-            stored = mesh.out[vertex]
-            links = [(mesh.before[stored], outer_out), (outer_in, stored)]
-    return [*links, (into, out)]
-
-
-def _to_boundary(mesh: HalfEdges, vertex: int) -> None:
-    """Store the first outgoing half-edge without a face, if there is one."""
-    first = half = mesh.out[vertex]
-    while mesh.closed[half]:
-        half = mesh.after[half ^ 1]
-        if half == first:
-            return
-    mesh.out[vertex] = half
+    They are the same where its last gap closes; None where it does not fit.
+    """
+    ends = [fan for fan in fans if fan[-1] == into]
+    starts = [fan for fan in fans if fan[0] == out]
+    if not ends and not starts:
+        return [*fans, [into, out]]
+    at = fans.index((ends or starts)[0])
+    others = [*fans[at + 1 :], *fans[:at]]
+    if not ends:
+        return [[into, *starts[0]], *others]
+    if not starts:
+        return [*others, [*ends[0], out]]
+    if ends[0] is starts[0]:
+        return None if others else fans
+    others.remove(starts[0])  # it moves to where the first one ends
+    if fans[0] is starts[0]:
+        return [*others, [*ends[0], *starts[0]]]
+    ring = [[*ends[0], *starts[0]], *others]
+    turn = 0 if fans[0] is ends[0] else ring.index(fans[0])
+    return [*ring[turn:], *ring[:turn]]
 
 
 def spirals(
@@ -168,8 +93,7 @@ def spirals(
 
     Where the rings end before that (or would, one ring on), the nearest vertices stand instead.
     """
-    mesh, _ = half_edges(faces, len(verts))
-    around = [mesh.around(v) for v in range(len(verts))]
+    around, _ = neighbours(faces, len(verts))
     rows: list[list[int]] = []
     for vertex in range(len(verts)):  # spirals differ in the number of their rings
         row, ahead = [vertex, *around[vertex]], _next_ring(around, around[vertex], [vertex])
