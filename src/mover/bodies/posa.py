@@ -33,7 +33,7 @@ GROUPS = 8  # of the normalisation
 COUNTS = {1: (1_875_009, 153_665), 43: (1_923_435, 177_899)}
 """Numbers in the network and in its decoder, by the channels of the output."""
 OFFICIAL = "b61f137d02a33c49f9d83ee651f0d60b1ddb80fc0c1e5b6aa85469f707238fb4"
-"""Digest of the spirals of the official mesh_2."""
+"""Digest of the spirals of the official mesh_2, little-endian 64-bit numbers, row by row."""
 DECODER = "decoder.de_spiral"
 CHUNK = 32  # bodies decoded at once
 
@@ -121,34 +121,6 @@ def _next_ring(around: list[list[int]], last: list[int], row: list[int]) -> list
     return ring
 
 
-@dataclass(frozen=True)
-class Pyramid:
-    """From the full body to the coarse mesh, and back."""
-
-    verts: Float[np.ndarray, "coarse 3"]
-    faces: Int[np.ndarray, "faces 3"]
-    down: tuple[Tensor, ...]
-    """Sparse matrices to coarser meshes, in order."""
-    up: tuple[Tensor, ...]
-    """Sparse matrices back, in order."""
-
-
-def read_pyramid(folder: Path) -> Pyramid:
-    """Read mesh_2.obj, D_1, D_2, U_1 and U_2 from POSA's folder mesh_ds.
-
-    Raises:
-        InputError: If a file is missing or has the wrong size.
-    """
-    verts, faces = read_obj(folder / "mesh_2.obj")
-    full, middle, coarse = LEVELS
-    if len(verts) != coarse:
-        raise InputError(f"mesh_2.obj: has {len(verts)} vertices, expected {coarse}")
-    maps = {"D_1": (middle, full), "D_2": (coarse, middle), "U_2": (middle, coarse),
-            "U_1": (full, middle)}  # fmt: skip
-    found = [_sparse(folder / f"{name}.npz", shape) for name, shape in maps.items()]
-    return Pyramid(verts, faces, tuple(found[:2]), tuple(found[2:]))
-
-
 def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles in the order of the file; nothing is merged.
 
@@ -190,13 +162,16 @@ class Posa:
     weights: dict[str, Tensor]
     """Of the decoder."""
     spirals: Int[Tensor, "coarse 9"]
-    pyramid: Pyramid
+    down: tuple[Tensor, ...]
+    """Sparse matrices from the full body to coarser meshes, in order."""
+    up: tuple[Tensor, ...]
+    """Sparse matrices back, in order."""
     channels: int
     """1: contact; 43: contact and the kind of object."""
 
 
 def load_posa(weights: Path, meshes: Path) -> Posa:
-    """Read a checkpoint (contact.pt, contact_semantics.pt) and the folder mesh_ds.
+    """Read a checkpoint (contact.pt, contact_semantics.pt) and POSA's folder mesh_ds.
 
     Raises:
         InputError: If a file is missing, or is not what the published network needs.
@@ -213,16 +188,18 @@ def load_posa(weights: Path, meshes: Path) -> Posa:
             f"{weights.name}: has {found[0]} numbers, {found[1]} of them in the decoder, "
             f"expected {COUNTS[channels][0]} and {COUNTS[channels][1]}"
         )
-    pyramid = read_pyramid(meshes)
-    index = spirals(pyramid.verts, pyramid.faces, LENGTH)
-    if spiral_digest(index) != OFFICIAL:
+    verts, faces = read_obj(meshes / "mesh_2.obj")
+    full, middle, coarse = LEVELS
+    if len(verts) != coarse:
+        raise InputError(f"mesh_2.obj: has {len(verts)} vertices, expected {coarse}")
+    index = spirals(verts, faces, LENGTH)
+    digest = hashlib.sha256(np.ascontiguousarray(index, dtype="<i8").tobytes()).hexdigest()
+    if digest != OFFICIAL:
         log.warning("%s: mesh_2.obj is not the official one: are the contacts right?", meshes)
-    return Posa(decoder, torch.from_numpy(index), pyramid, channels)
-
-
-def spiral_digest(index: Int[np.ndarray, "verts 9"]) -> str:
-    """Digest of spirals as little-endian 64-bit numbers, row by row."""
-    return hashlib.sha256(np.ascontiguousarray(index, dtype="<i8").tobytes()).hexdigest()
+    maps = {"D_1": (middle, full), "D_2": (coarse, middle), "U_2": (middle, coarse),
+            "U_1": (full, middle)}  # fmt: skip
+    found = [_sparse(meshes / f"{name}.npz", shape) for name, shape in maps.items()]
+    return Posa(decoder, torch.from_numpy(index), tuple(found[:2]), tuple(found[2:]), channels)
 
 
 def _state(path: Path) -> dict[str, Tensor]:
@@ -251,7 +228,7 @@ def posa_contacts(
     """
     if bodies.space != "world":
         raise ValueError(f"posa_contacts: bodies are in space '{bodies.space}', expected 'world'")
-    full = posa.pyramid.down[0].shape[1]
+    full = posa.down[0].shape[1]
     if bodies.verts.shape[1] != full:
         raise InputError(f"bodies: {bodies.verts.shape[1]} vertices, POSA expects {full} (SMPL-X)")
     if bodies.pose is None or bodies.joints is None:
@@ -261,10 +238,10 @@ def posa_contacts(
     still = canonical(bodies.verts, bodies.joints[:, 0], axis_angle(bodies.pose.global_orient))
     found: list[Tensor] = []
     for part in still.float().split(CHUNK):
-        coarse = _through(posa.pyramid.down, part)
+        coarse = _through(posa.down, part)
         with torch.no_grad():
             chance = torch.stack([decode(posa, coarse, z)[..., :1] for z in codes]).mean(0)
-        found.append(_through(posa.pyramid.up, chance)[..., 0].clamp(0, 1))
+        found.append(_through(posa.up, chance)[..., 0].clamp(0, 1))
     return torch.cat(found)
 
 
