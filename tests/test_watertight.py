@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from test_mesh import as_mesh, joined
 
 from mover.core.types import Mesh
 from mover.geometry import mesh as m
@@ -17,23 +18,9 @@ from mover.geometry.watertight import LARGE, close_mesh
 DATA = Path(__file__).parents[2] / "shared" / "data"
 REAL = [
     path
-    for folder, suffix in (
-        ("total3d_1/output", "obj"),
-        ("kaykit", "obj"),
-        ("photo_bench/meshes", "glb"),
-    )
-    for path in sorted((DATA / folder).glob(f"*.{suffix}"))
+    for pattern in ("total3d_1/output/*.obj", "kaykit/*.obj", "photo_bench/meshes/*.glb")
+    for path in sorted(DATA.glob(pattern))
 ]
-
-
-def as_mesh(shape: trimesh.Trimesh) -> Mesh:
-    return Mesh(torch.from_numpy(shape.vertices.copy()), torch.from_numpy(shape.faces.copy()))
-
-
-def joined(*meshes: Mesh) -> Mesh:
-    starts = np.cumsum([0] + [len(one.verts) for one in meshes]).tolist()
-    faces = [one.faces + start for one, start in zip(meshes, starts, strict=False)]
-    return Mesh(torch.cat([one.verts for one in meshes]), torch.cat(faces))
 
 
 def block(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> Mesh:
@@ -95,21 +82,15 @@ def test_closed_meshes_pass_through(shape: Mesh):
     check(shape, closed)
 
 
-def test_inverted_meshes_are_turned_over():
+@pytest.mark.parametrize("every", [1, 3])
+def test_inverted_and_scattered_faces_are_turned_over(every: int):
     shape = sphere()
-    closed = close_mesh(inside_out(shape))
-    check(shape, closed)
-    assert m.signed_volume(closed) == pytest.approx(m.signed_volume(shape))
-    assert len(closed.faces) == len(shape.faces)
-
-
-def test_faces_with_scattered_winding_are_oriented():
-    shape = sphere()
-    turn = torch.arange(len(shape.faces)) % 3 == 0
+    turn = torch.arange(len(shape.faces)) % every == 0
     mixed = Mesh(shape.verts, torch.where(turn[:, None], shape.faces.flip(-1), shape.faces))
     closed = close_mesh(mixed)
     check(shape, closed)
     assert m.signed_volume(closed) == pytest.approx(m.signed_volume(shape))
+    assert len(closed.faces) == len(shape.faces)
 
 
 def test_unwelded_and_degenerate_triangles_and_unused_vertices_do_not_count():
