@@ -53,7 +53,9 @@ def kernels(name: str, device: str, package: str = KERNELS) -> ModuleType:
 def _loaded(package: str, name: str, device: str) -> ModuleType:
     wp = started()
     module = import_module(f"{package}.{name}")
-    if _fresh(wp, module, device):
+    threads = 1 if device == "cpu" else None  # of a block; it is a part of the name
+    folder = wp.get_module(module.__name__).get_module_identifier(threads)
+    if not (Path(wp.config.kernel_cache_dir) / folder).is_dir():
         log.info("compiling kernels, once on this machine: %s for %s ...", name, device)
     with _quiet(wp):
         wp.load_module(module, device=device)
@@ -79,13 +81,6 @@ def launch(
 @cache  # torch's streams live as long as the process
 def _stream(stream: Any) -> Any:  # noqa: ANN401
     return started().stream_from_torch(stream)
-
-
-def _fresh(wp: ModuleType, module: ModuleType, device: str) -> bool:
-    """Whether Warp's cache does not hold a module as it is now."""
-    threads = 1 if device == "cpu" else None  # of a block; it is a part of the name
-    folder = wp.get_module(module.__name__).get_module_identifier(threads)
-    return not (Path(wp.config.kernel_cache_dir) / folder).is_dir()
 
 
 @contextmanager

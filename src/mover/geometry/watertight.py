@@ -52,16 +52,26 @@ def wrap(verts: np.ndarray, faces: np.ndarray, cells: int) -> Triangles:
     level = np.ascontiguousarray(field.transpose(2, 1, 0).ravel())
     points, shell, _ = igl.marching_cubes(level, places, *counts.tolist(), isovalue=WALL * cell)
     points, shell = _bodies(np.asarray(points), np.asarray(shell))
-    return _drawn_tight(points, verts, faces, WALL * cell), shell
+    squared, _, onto = closest(points, verts, faces)  # which lay a wall's thickness away
+    distance, wall = np.sqrt(squared)[:, None], WALL * cell
+    pull = np.clip((REACH * wall - distance) / ((REACH - 1) * wall), 0, 1)
+    step = np.minimum((1 - REST) * wall * pull / np.maximum(distance, 1e-300), 1)
+    return points + step * (onto - points), shell
 
 
 def _field(
     verts: np.ndarray, faces: np.ndarray, start: np.ndarray, cell: float, counts: np.ndarray
 ) -> np.ndarray:
     """Distance to the triangles [m] where air is; at most that, and below the wall, in matter."""
-    wall = WALL * cell
-    distance = _distances(verts, faces, start, cell, counts)
-    air = _outside(distance > wall)
+    from scipy.ndimage import label
+
+    wall, far = WALL * cell, torch.full(counts.tolist(), BAND * cell, dtype=torch.float32)
+    grid = Volume(far, torch.zeros(3), cell)  # from its corner: kernels count in single precision
+    corners = torch.from_numpy(verts - start).float()[None]
+    distance = union_bodies(corners, torch.from_numpy(faces), grid).values.abs().double().numpy()
+    found: Any = label(distance > wall)
+    region = np.asarray(found[0])
+    air = (distance > wall) & (region == region[0, 0, 0])  # in steps from the grid's first corner
     field = np.where(air, distance, np.minimum(distance, wall / 2))
     shell = ~air & (distance <= wall)
     field[shell] = distance[shell]
@@ -87,7 +97,10 @@ def _windings(
     """
     import igl
 
-    winding, known = np.zeros(air.shape), _beyond(verts, start, cell, air.shape)
+    winding, known = np.zeros(air.shape), np.ones(air.shape, dtype=bool)
+    first = np.floor((verts.min(0) - start) / cell).astype(int) + 1
+    last = np.ceil((verts.max(0) - start) / cell).astype(int)
+    known[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] = False  # the box
     for step in (FAR, FAR // 2, 1):
         some = np.s_[::step, ::step, ::step]
         if step < FAR:
@@ -97,17 +110,6 @@ def _windings(
         found = igl.fast_winding_number(verts, faces, start + cell * step * at)
         winding[some][left], known[some][left] = np.abs(found), True
     return winding
-
-
-def _beyond(
-    verts: np.ndarray, start: np.ndarray, cell: float, shape: tuple[int, ...]
-) -> np.ndarray:
-    """The places outside of the box of the triangles, where nothing is inside."""
-    low, high = (verts.min(0) - start) / cell, (verts.max(0) - start) / cell
-    beyond = np.ones(shape, dtype=bool)
-    first, last = np.floor(low).astype(int) + 1, np.ceil(high).astype(int)
-    beyond[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] = False
-    return beyond
 
 
 def _draw_between(winding: np.ndarray, known: np.ndarray, allowed: np.ndarray) -> None:
@@ -129,28 +131,6 @@ def _draw_between(winding: np.ndarray, known: np.ndarray, allowed: np.ndarray) -
         winding[odd][fresh], known[odd][fresh] = total[fresh] / weight[fresh], True
 
 
-def _outside(free: np.ndarray) -> np.ndarray:
-    """The free cells that can be reached from the grid's first corner in steps along the axes."""
-    from scipy.ndimage import label
-
-    found: Any = label(free)
-    region = np.asarray(found[0])
-    return free & (region == region[0, 0, 0])
-
-
-def _distances(
-    verts: np.ndarray, faces: np.ndarray, start: np.ndarray, cell: float, counts: np.ndarray
-) -> np.ndarray:
-    """Distance to the triangles at the grid's places [m]: exact up to two cells from them.
-
-    Measured from the grid's corner: the kernels count in single precision.
-    """
-    empty = torch.full(counts.tolist(), BAND * cell, dtype=torch.float32)
-    corners = torch.from_numpy(verts - start).float()[None]
-    grid = Volume(empty, torch.zeros(3), cell)
-    return union_bodies(corners, torch.from_numpy(faces), grid).values.abs().double().numpy()
-
-
 def _bodies(points: np.ndarray, shell: np.ndarray) -> Triangles:
     """The outer surfaces of the larger bodies, each edge with two faces."""
     part_of, volume = volumes(points, shell)
@@ -160,17 +140,6 @@ def _bodies(points: np.ndarray, shell: np.ndarray) -> Triangles:
     closed = manifold(points, shell)
     assert closed is not None  # the border of the grid is air
     return closed
-
-
-def _drawn_tight(
-    points: np.ndarray, verts: np.ndarray, faces: np.ndarray, wall: float
-) -> np.ndarray:
-    """Points that lay a wall's thickness away from the triangles, moved to the rest of it."""
-    squared, _, onto = closest(points, verts, faces)
-    distance = np.sqrt(squared)[:, None]
-    pull = np.clip((REACH * wall - distance) / ((REACH - 1) * wall), 0, 1)
-    step = np.minimum((1 - REST) * wall * pull / np.maximum(distance, 1e-300), 1)
-    return points + step * (onto - points)
 
 
 # Any furniture mesh as one closed solid in the same box.
