@@ -107,13 +107,7 @@ def filmed(path: Path, shot: Shot, times: Iterable[int], rate: int = 30) -> Path
     return path
 
 
-def held(path: Path, shot: Shot, times: Iterable[int], turns: int) -> Path:
-    """The same by a phone that was turned."""
-    stamps = list(times)
-    return turned(path, [shot.at(t / 30) for t in stamps], stamps, turns)
-
-
-def turned(path: Path, pictures: list[Pixels], times: Iterable[int], turns: int) -> Path:
+def turned_film(path: Path, pictures: list[Pixels], times: Iterable[int], turns: int) -> Path:
     """A film in the pixels of a turned sensor, with the matrix that turns them back.
 
     Phones write the turn into the matrix of the track header (tkhd; ISO/IEC 14496-12, 8.3.2): a

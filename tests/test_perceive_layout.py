@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from mover.app.cli import run_command
 from mover.core.errors import InputError
@@ -117,19 +118,23 @@ def test_outermost_points_have_the_box_of_the_shape(pieces: list[SceneObject]):
     assert ((points.amax(0) - points.amin(0)) > 0.97 * size).all()
 
 
-@pytest.mark.slow
-def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[SceneObject]):
-    seen = picture(pieces, camera())
-    shapes = [shape for p in pieces for shape in shapes_of(p.category, 1)]
-    low = [(s.mesh.verts - torch.tensor([0, float(s.mesh.verts[:, 1].min()), 0])) for s in shapes]
-    inputs = ScreenInputs(
-        camera(), torch.stack([d.box for d in seen.detections]),
+def screen_inputs(pieces: list[SceneObject], height: float | None) -> ScreenInputs:
+    """One shape of each class, in the boxes of a perfect picture."""
+    verts = [shapes_of(piece.category, 1)[0].mesh.verts for piece in pieces]
+    low = [v - torch.tensor([0, float(v[:, 1].min()), 0]) for v in verts]
+    return ScreenInputs(
+        camera(), torch.stack([d.box for d in picture(pieces, camera()).detections]),
         torch.full((4, 4), SEEN), torch.full((4,), torch.nan), torch.arange(4),
-        torch.stack([outermost(v) for v in low]), None,
+        torch.stack([outermost(v) for v in low]), height,
     )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_usual_sizes_constrain_the_height_of_the_camera(pieces: list[SceneObject]):
+    inputs = screen_inputs(pieces, None)
     found = screen(inputs, ScreenConfig(heights=(0.9, 1.2, 1.5, 1.9)))
     assert found.height == pytest.approx(HEIGHT, rel=0.15)
-    # a picture cannot tell a doll's house: doubled shapes double the height
+    # a picture of a doll's house looks the same: doubled shapes double the height
     twice = screen(
         replace(inputs, points=2 * inputs.points),
         ScreenConfig(heights=(1.8, 2.4, 3.0, 3.8), usual=3.0),
@@ -148,18 +153,11 @@ def test_usual_sizes_tell_the_height_of_the_camera(pieces: list[SceneObject]):
 def test_a_thing_of_which_many_shapes_are_known_says_no_more_than_another(
     pieces: list[SceneObject],
 ):
-    seen = picture(pieces, camera())
-    shapes = [shapes_of(p.category, 1)[0].mesh.verts for p in pieces]
-    points = torch.stack(
-        [outermost(v - torch.tensor([0, float(v[:, 1].min()), 0])) for v in shapes]
-    )
-    points = points * torch.tensor([1.3, 1, 1, 1])[:, None, None]  # one is not of the usual size
-    once = ScreenInputs(
-        camera(), torch.stack([d.box for d in seen.detections]),
-        torch.full((4, 4), SEEN), torch.full((4,), torch.nan), torch.arange(4), points, 1.2,
-    )  # fmt: skip
+    once = screen_inputs(pieces, 1.2)
+    odd = torch.tensor([1.3, 1, 1, 1])[:, None, None]  # one is not of the usual size
+    once = replace(once, points=once.points * odd)
     rows = torch.tensor([0] * 8 + [1, 2, 3])
-    often = replace(once, thing=rows, points=points[rows])
+    often = replace(once, thing=rows, points=once.points[rows])
     config = ScreenConfig(tilt=0.0, tilt_known=0.0)
     assert screen(often, config).height == pytest.approx(screen(once, config).height, abs=5e-4)
 
@@ -315,21 +313,17 @@ def test_the_users_own_shapes_come_first(tmp_path: Path, pieces: list[SceneObjec
 
 @pytest.mark.parametrize("kind", ["npz", "moge", "npy", "png", "half"])
 def test_depth_maps_of_all_kinds_say_the_same(kind: str, tmp_path: Path):
-    from PIL import Image
-
     depth = floor_depth(camera()).numpy()
-    match kind:
-        case "npz":
-            np.savez(tmp_path / "d.npz", depth=depth[None])
-        case "moge":
-            np.savez(tmp_path / "d.npz", points=np.repeat(depth[..., None], 3, -1), mask=depth > 0)
-        case "npy":
-            np.save(tmp_path / "d.npy", depth.astype(np.float16))
-        case "png":
-            values = (np.nan_to_num(depth).clip(0, 65) * 1000).round().astype(np.uint16)
-            Image.fromarray(values).save(tmp_path / "d.png")
-        case _:
-            np.savez(tmp_path / "d.npz", depth=depth[::2, ::2])
+    points = np.repeat(depth[..., None], 3, -1)
+    if kind == "npy":
+        np.save(tmp_path / "d.npy", depth.astype(np.float16))
+    elif kind == "png":
+        values = (np.nan_to_num(depth).clip(0, 65) * 1000).round().astype(np.uint16)
+        Image.fromarray(values).save(tmp_path / "d.png")
+    else:
+        arrays = {"npz": {"depth": depth[None]}, "moge": {"points": points, "mask": depth > 0},
+                  "half": {"depth": depth[::2, ::2]}}  # fmt: skip
+        np.savez(tmp_path / "d.npz", **arrays[kind])
     found = read_depth(next(tmp_path.iterdir()), camera())
     known = ~np.isnan(depth) & (depth < 40)
     rows = slice(H // 2 + 40, H)
@@ -339,19 +333,15 @@ def test_depth_maps_of_all_kinds_say_the_same(kind: str, tmp_path: Path):
 
 
 def test_depth_maps_without_a_unit_or_of_another_shape_are_refused(tmp_path: Path):
-    from PIL import Image
-
     Image.new("L", (W, H), 80).save(tmp_path / "d.png")
-    with pytest.raises(InputError, match="16 bits of millimetres"):
-        read_depth(tmp_path / "d.png", camera())
     np.savez(tmp_path / "d.npz", depth=np.ones((H, H)))
-    with pytest.raises(InputError, match="expected the shape of 480 x 320"):
-        read_depth(tmp_path / "d.npz", camera())
     np.savez(tmp_path / "e.npz", other=np.ones((H, W)))
-    with pytest.raises(InputError, match="one of the arrays depth"):
-        read_depth(tmp_path / "e.npz", camera())
-    with pytest.raises(InputError, match=r"expected \.npz"):
-        read_depth(tmp_path / "d.exr", camera())
+    for name, words in {
+        "d.png": "16 bits of millimetres", "d.npz": "expected the shape of 480 x 320",
+        "e.npz": "one of the arrays depth", "d.exr": r"expected \.npz",
+    }.items():  # fmt: skip
+        with pytest.raises(InputError, match=words):
+            read_depth(tmp_path / name, camera())
 
 
 def write_capture_without_scene(folder: Path, seen: Picture) -> None:

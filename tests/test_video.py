@@ -29,79 +29,55 @@ def said() -> tuple[list[str], chain.Say]:
 
 
 class TestSteps:
-    def test_a_step_is_done_again_only_where_what_it_is_made_from_changed(self, tmp_path: Path):
+    def do(self, folder: Path, word: str, yours: bool = False) -> list[str]:
+        """One step in a new process that writes a word, made from in.txt and the word."""
+        lines, say = said()
+        made = folder / "made.txt"
+        steps = steps_in(folder, say, NAMES)
+        steps.do("first", [folder / "in.txt", word], made, lambda: made.write_text(word) and None,
+                 yours=yours)  # fmt: skip
+        return lines
+
+    @pytest.mark.parametrize("yours", [False, True])
+    def test_a_step_is_done_again_only_where_what_it_is_made_from_changed(
+        self, tmp_path: Path, yours: bool
+    ):
         source, made = tmp_path / "in.txt", tmp_path / "made.txt"
         source.write_text("a")
-        done: list[str] = []
-
-        def work() -> None:
-            done.append(source.read_text())
-            made.write_text("program's")
-
-        def go(word: str = "setting") -> None:
-            steps_in(tmp_path / "out", said()[1], NAMES).do("first", [source, word], made, work)
-
-        go()
-        go()
-        assert done == ["a"]
+        assert len(self.do(tmp_path, "one", yours)) == 2
+        assert self.do(tmp_path, "one", yours) == ["1/2 first: kept"]
+        assert (len(self.do(tmp_path, "two", yours)), made.read_text()) == (2, "two")
         made.write_text("user's")
-        go()
-        assert (done, made.read_text()) == (["a"], "user's")
+        assert self.do(tmp_path, "two", yours) == ["1/2 first: kept"]
         source.write_text("b")
-        go()
-        assert done == ["a", "b"]
-        go("another")
+        lines = self.do(tmp_path, "two", yours)
+        if yours:  # what replaced a result outlives what it was made from
+            assert lines == ["1/2 first: made.txt is yours and stays; without it, it is made"]
+            assert made.read_text() == "user's"
+        else:
+            assert made.read_text() == "two"
         made.unlink()
-        go("another")
-        assert len(done) == 4
-
-    def test_a_result_that_was_replaced_outlives_what_it_was_made_from(self, tmp_path: Path):
-        source, made = tmp_path / "in.txt", tmp_path / "made.txt"
-
-        def go(word: str) -> list[str]:
-            source.write_text(word)
-            lines, say = said()
-            steps = steps_in(tmp_path / "out", say, NAMES)
-            steps.do("first", [source], made, lambda: made.write_text(word) and None, yours=True)
-            return lines
-
-        go("a")
-        go("b")
-        assert made.read_text() == "b"
-        made.write_text("user's")
-        assert go("c") == ["1/2 first: made.txt is yours and stays; without it, it is made"]
-        assert made.read_text() == "user's"
-        made.unlink()
-        go("c")
-        assert made.read_text() == "c"
+        self.do(tmp_path, "three", yours)
+        assert made.read_text() == "three"
 
     def test_what_a_step_made_of_another_video_goes_and_what_replaced_it_stays(
         self, tmp_path: Path
     ):
-        made = tmp_path / "bodies.npz"
-        steps = steps_in(tmp_path, said()[1], NAMES)
-        steps.do("first", [], made, lambda: made.write_text("made") and None)
-        steps_in(tmp_path, said()[1], NAMES).undo("first", made)
-        assert not made.exists()
-        steps.do("first", [], made, lambda: made.write_text("made") and None)
-        made.write_text("user's")
-        steps_in(tmp_path, said()[1], NAMES).undo("first", made)
-        assert made.read_text() == "user's"
+        made = tmp_path / "made.txt"
+        for text in (None, "user's"):
+            self.do(tmp_path, "one")
+            made.write_text(text or made.read_text())
+            steps_in(tmp_path, said()[1], NAMES).undo("first", made)
+            assert made.exists() == (text is not None)
 
     def test_a_step_that_dies_is_not_taken_for_finished(self, tmp_path: Path):
-        made = tmp_path / "made.txt"
-
         def dies() -> None:
-            made.write_text("half")
+            (tmp_path / "made.txt").write_text("half")
             raise InputError("no")
 
-        steps = steps_in(tmp_path, said()[1], NAMES)
         with pytest.raises(InputError):
-            steps.do("first", [], made, dies)
-        done: list[int] = []
-        again = steps_in(tmp_path, said()[1], NAMES)
-        again.do("first", [], made, lambda: done.append(1))
-        assert done == [1]
+            steps_in(tmp_path, said()[1], NAMES).do("first", [], tmp_path / "made.txt", dies)
+        assert len(self.do(tmp_path, "one")) == 2
 
     @pytest.mark.parametrize("text", ["", "{", "[]", '{"steps": 3}', '{"steps": {"first": 5}}'])
     def test_a_damaged_log_is_said_and_dropped(self, tmp_path: Path, text: str):
@@ -112,8 +88,8 @@ class TestSteps:
 
     def test_files_count_by_their_content_and_words_are_no_files(self, tmp_path: Path):
         a, b = tmp_path / "a", tmp_path / "b"
-        a.write_text("x")
-        b.write_text("x")
+        for path in (a, b):
+            path.write_text("x")
         assert digest([a]) == digest([b]) != digest(["x"])
         assert digest([tmp_path / "none"]) != digest([])
 
@@ -131,16 +107,11 @@ class TestBodies:
         command = f"{sys.executable} -c {json.dumps(code)} {{video}} {{frames}} {{camera}} {{out}}"
         make_bodies(BodiesFrom(command), capture / "video.mp4", capture, lambda: None)
 
-    @pytest.mark.parametrize(
-        ("code", "words"),
-        [("import sys; sys.exit(3)", "ended with code 3"), ("pass", "wrote nothing to")],
-    )
-    def test_a_command_that_fails_is_one_sentence(self, tmp_path: Path, code: str, words: str):
-        with pytest.raises(InputError, match=words):
-            self.make(tmp_path, code)
-
-    def test_a_program_that_is_not_there_is_one_sentence(self, tmp_path: Path):
-        with pytest.raises(InputError, match=r"no-such-program: No such file"):
+    def test_a_command_that_fails_is_one_sentence(self, tmp_path: Path):
+        for code, words in (("exit(3)", "ended with code 3"), ("pass", "wrote nothing to")):
+            with pytest.raises(InputError, match=words):
+                self.make(tmp_path, code)
+        with pytest.raises(InputError, match=r"--bodies: no-such-program: No such file"):
             make_bodies(BodiesFrom("no-such-program {out}"), tmp_path, tmp_path, lambda: None)
 
     def test_a_command_gets_the_video_the_frames_and_the_lens_and_its_bodies_are_read(

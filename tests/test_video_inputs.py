@@ -17,9 +17,8 @@ from filmed import (
     Shot,
     W,
     filmed,
-    held,
     instances,
-    turned,
+    turned_film,
     walk,
     write_film,
 )
@@ -36,7 +35,7 @@ from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.scene_file import read_scene
 from mover.io.people.keypoints import read_keypoints
 from mover.perceive import capture as capture_of_video
-from mover.perceive.capture import Video, perceive
+from mover.perceive.capture import Video, perceive, read_picture_of
 from mover.perceive.config import FramesConfig, Lens, PerceiveConfig
 from mover.perceive.mediapipe import PoseInputs, Poses
 from mover.perceive.networks import DetectInputs, Finds, link_people
@@ -66,7 +65,10 @@ def test_a_phone_that_was_turned_gives_what_an_upright_one_gives(
 ):
     shot, times = Shot(tall=tall), range(0, SECOND, 3)
     upright = perceived(filmed(tmp_path / "a.mp4", shot, times), tmp_path / "upright")
-    turned = perceived(held(tmp_path / "b.mp4", shot, times, turns), tmp_path / "turned")
+    turned = perceived(
+        turned_film(tmp_path / "b.mp4", [shot.at(t / 30) for t in times], times, turns),
+        tmp_path / "turned",
+    )
     cameras = [json.loads((c / "camera.json").read_text()) for c in (upright, turned)]
     assert cameras[0] == cameras[1]
     assert (cameras[1]["h"], cameras[1]["w"]) == shot.size
@@ -171,6 +173,7 @@ def test_joints_masks_and_outlines_in_pixels_of_a_swaying_video_are_carried_alon
         right = left + 20, top + 62
         assert tight_box(mask).tolist() == pytest.approx([left, top, *right], abs=1.5)
         assert (row["image_id"], row["track_id"]) == (k, 5)
+    assert read_picture_of(out).reference is not None
     (row,) = rows(out, "objects.json")
     assert row["bbox"] == pytest.approx([W - 34 + 5 - at[0], H - 40 + 2 - at[1], 24, 28], abs=1.5)
     (tmp_path / "joints.json").write_text(json.dumps([{**joints[0], "image_id": 1}]))
@@ -259,22 +262,18 @@ def test_a_video_without_furniture_ends_with_one_sentence(tmp_path: Path):
     assert not (tmp_path / "out" / "room").exists()
 
 
-def test_a_calibration_of_the_other_format_is_one_sentence(tmp_path: Path):
-    filmed(tmp_path / "v.mp4", Shot(tall=True), range(0, SECOND, 3))
-    lens = {"w": 128, "h": 96, "fl_x": 110, "fl_y": 110, "cx": 64, "cy": 48}
-    (tmp_path / "lens.json").write_text(json.dumps(lens))
-    with pytest.raises(InputError, match=r"lens\.json: .*128 x 96.*96 x 128"):
-        perceived(tmp_path / "v.mp4", tmp_path / "c", lens=tmp_path / "lens.json")
-
-
-def test_a_calibration_of_another_resolution_is_scaled(tmp_path: Path):
-    filmed(tmp_path / "v.mp4", Shot(), range(0, SECOND, 3))
+def test_a_calibration_is_scaled_to_the_frames_and_of_another_format_refused(tmp_path: Path):
+    file = tmp_path / "lens.json"
     lens = {"w": 640, "h": 480, "fl_x": 550, "fl_y": 560, "cx": 330, "cy": 235, "height": 1.4}
-    (tmp_path / "lens.json").write_text(json.dumps(lens))
-    capture = perceived(tmp_path / "v.mp4", tmp_path / "c", lens=tmp_path / "lens.json")
+    file.write_text(json.dumps(lens))
+    filmed(tmp_path / "v.mp4", Shot(), range(0, SECOND, 3))
+    capture = perceived(tmp_path / "v.mp4", tmp_path / "c", lens=file)
     found = json.loads((capture / "camera.json").read_text())
     expected = {"w": 128, "h": 96, "fl_x": 110, "fl_y": 112, "cx": 66, "cy": 47, "height": 1.4}
     assert {name: found[name] for name in expected} == pytest.approx(expected)
+    filmed(tmp_path / "tall.mp4", Shot(tall=True), range(0, SECOND, 3))
+    with pytest.raises(InputError, match=r"lens\.json: .*640 x 480.*96 x 128"):
+        perceived(tmp_path / "tall.mp4", tmp_path / "d", lens=file)
 
 
 def test_frames_without_time_stamps_are_counted(tmp_path: Path):
@@ -351,7 +350,7 @@ def test_three_seconds_of_a_phone_held_upright_become_a_room(tmp_path: Path):
     room = kept(drawn, 4, config)
     first = int(room.bodies.frame.min())
     pictures = [(draw_frame(room, first + k).numpy() * 255).astype(np.uint8) for k in range(15)]
-    turned(tmp_path / "v.mp4", pictures, [6 * k for k in range(15)], 1)
+    turned_film(tmp_path / "v.mp4", pictures, [6 * k for k in range(15)], 1)
     out, camera = tmp_path / "out", room.truth.camera
     K = camera.K.tolist()
     lens = {"w": 270, "h": 480, "fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}

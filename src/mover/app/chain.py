@@ -92,13 +92,16 @@ def steps_in(folder: Path, say: Say, names: tuple[str, ...]) -> Steps:
 
 
 def digest(made_from: Iterable[Path | str]) -> str:
-    """Hash of the content of files and of words; a file that is missing counts as such."""
+    """Hash of words, of files by content and of folders by sizes and times; what is missing counts."""
     found = hashlib.sha256()
     for part in made_from:
         if isinstance(part, str):
             found.update(b"word" + part.encode())
         elif part.is_file():
             found.update(b"file" + hashlib.sha256(part.read_bytes()).digest())
+        elif part.is_dir():
+            stats = sorted((str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in part.iterdir())
+            found.update(b"folder" + repr(stats).encode())
         else:
             found.update(b"none")
     return found.hexdigest()[:16]

@@ -126,7 +126,7 @@ def perceive(
     else:
         (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
     if video.own.objects is not None:
-        write_json(own_objects(video.own, clip, drift).value, out / "objects.json")
+        write_json(own_objects(video.own, clip, drift), out / "objects.json")
         return
     clean_clip = clip_of_clean(clean, out / "perceived" / "reference")
     try:

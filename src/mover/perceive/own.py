@@ -7,6 +7,7 @@ steadied camera sees them.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +17,6 @@ from torch import Tensor
 from mover.core.errors import InputError
 from mover.core.types import Keypoints, Masks
 from mover.geometry.rle import decode, encode
-from mover.io.files.fields import At
 from mover.io.formats import names
 from mover.io.masks.instance_files import read_instances
 from mover.io.masks.instances import Instance, Instances, fitted, followed, is_person, objects_tree
@@ -107,7 +107,7 @@ def own_masks(path: Path, clip: Clip, drift: Drift, say: Callable[[str], None]) 
     return Tracks(Masks(clip.height, clip.width, tuple(codes)), at[kept], person)
 
 
-def own_objects(own: Own, clip: Clip, drift: Drift) -> At:
+def own_objects(own: Own, clip: Clip, drift: Drift) -> dict[str, Any]:
     """The fields of objects.json from outlines or boxes.
 
     Raises:
@@ -122,7 +122,7 @@ def own_objects(own: Own, clip: Clip, drift: Drift) -> At:
     if own.objects_frame is not None:
         frame = int((_indices(clip) - own.objects_frame).abs().argmin())
         items = [_moved_item(item, drift.H[frame], size) for item in items]
-    return objects_tree(Instances(tuple(items), size, found.file), items)
+    return objects_tree(Instances(tuple(items), size, found.file), items).value
 
 
 def _moved_item(item: Instance, H: Float[Tensor, "3 3"], size: tuple[int, int]) -> Instance:

@@ -226,9 +226,9 @@ def video_to_room(args: VideoArgs, finders: "Finders | None" = None) -> None:
         say(ONE_IMAGE)
     capture, steps = args.out / "capture", steps_in(args.out, say, STEPS)
     lens = args.camera, args.fov, args.photo
-    own = [path for path in (args.people_masks, args.objects, Path(args.keypoints)) if path]
+    own = [args.people_masks, args.objects, None if OUT in args.keypoints else Path(args.keypoints)]
     seen = [str((str(source.resolve()), *stamp_of(source))), repr(args.config), *map(str, lens)]
-    seen += [args.keypoints, str(args.objects_frame), *own]
+    seen += [args.keypoints, str(args.objects_frame), *("none" if p is None else p for p in own)]
     steps.do(STEPS[0], seen, capture / "objects.json", lambda: _pictures(args, capture, finders))
     if not json.loads((capture / "objects.json").read_text())["annotations"]:
         raise InputError(
