@@ -1,12 +1,12 @@
 """Frames, the steady camera, the clean picture and the lens."""
 
 import math
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from filmed import write_film
 from PIL import Image
 
 from mover.core.errors import InputError
@@ -152,21 +152,6 @@ def test_a_swaying_camera_is_turned_back(tmp_path: Path):
     assert (a - b).abs().mean() < 0.2 * raw
 
 
-def write_video(path: Path, colours: list[int], times: list[int], rate: int = 30) -> None:
-    """A video of grey frames with given time stamps in 1/rate seconds."""
-    av = pytest.importorskip("av")
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=rate)
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        stream.codec_context.time_base = Fraction(1, rate)
-        for colour, time in zip(colours, times, strict=True):
-            pixels = np.full((48, 64, 3), colour, dtype=np.uint8)
-            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-            frame.pts, frame.time_base = time, Fraction(1, rate)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-
-
 def take(source: Path, out: Path, config: FramesConfig | None = None) -> Clip:
     return take_frames(TakeInputs(source, stamp_of(source), out), config or FramesConfig())
 
@@ -174,7 +159,8 @@ def take(source: Path, out: Path, config: FramesConfig | None = None) -> Clip:
 def test_frames_are_chosen_by_the_clock_not_by_counting(tmp_path: Path):
     colours = [10 * k for k in range(20)]
     times = [*range(10), *range(20, 30)]  # a third of a second is missing
-    write_video(tmp_path / "v.mp4", colours, times)
+    greys = [np.full((48, 64, 3), colour, dtype=np.uint8) for colour in colours]
+    write_film(tmp_path / "v.mp4", greys, times)
     clip = take(tmp_path / "v.mp4", tmp_path / "f", FramesConfig(fps=10))
     assert clip.time.mul(30).round().tolist() == [0, 3, 6, 9, 21, 24, 27, 29]
     assert clip.numbers.tolist() == [0, 1, 2, 3, 7, 8, 9, 10]  # a tenth of a second each

@@ -92,7 +92,7 @@ def steps_in(folder: Path, say: Say, names: tuple[str, ...]) -> Steps:
 
 
 def digest(made_from: Iterable[Path | str]) -> str:
-    """Hash of words, of files by content and of folders by sizes and times; what is missing counts."""
+    """Hash of words, of files by content, of folders by sizes and times; what lacks counts, too."""
     found = hashlib.sha256()
     for part in made_from:
         if isinstance(part, str):

@@ -132,6 +132,7 @@ def perceive(
     try:
         found = run.stage(finders.instances, DetectInputs(clean_clip, (0,)), config)
     except InputError as error:
+        (out / "objects.json").unlink(missing_ok=True)  # of another video
         raise InputError(
             f"furniture is not known yet: outline it in {out / 'reference.png'} (labelme, COCO, or "
             f"boxes alone), and add --objects FILE to the command; or a network finds it: {error}"
@@ -162,9 +163,9 @@ def people_of_clip(
     """People's masks and joints in all frames: those of the user, of MediaPipe, or of networks."""
     joints = own_keypoints(own, clip, drift, say)
     poses = None
-    if own.mediapipe and (joints is None or own.masks is None):
+    if own.mediapipe:
         poses = run.stage(finders.poses, pose_inputs(clip), None)
-        joints = poses_to_keypoints(poses, clip.fps) if joints is None else joints
+        joints = poses_to_keypoints(poses, clip.fps)
     if own.masks is not None:
         tracks = own_masks(own.masks, clip, drift, say)
     elif poses is not None:

@@ -38,7 +38,7 @@ class Own:
     of_frames: bool = False
     """Whether it is made of CAPTURE/frames, not of the video."""
     mediapipe: bool = False
-    """Whether joints, and masks where none are handed in, are MediaPipe's."""
+    """Whether joints, and masks where none are handed in, are MediaPipe's; no joints then."""
     masks: Path | None = None
     """People's masks."""
     objects: Path | None = None
