@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -40,8 +39,6 @@ class Step:
     index: int
     steps: int
     energy: Energy | None = None
-    at: Callable[[], Any] | None = None
-    """Gives the state after the step; not called unless somebody draws it."""
 
 
 Observer = Callable[[Step], None]

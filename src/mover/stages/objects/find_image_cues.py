@@ -10,7 +10,7 @@ from mover.core.types import Camera, Capture
 from mover.energy.image_terms import LEAST, LIKELY, SEEN, UNKNOWN, borders_of
 from mover.energy.objective import ImageCues
 from mover.geometry.crops import area_mean, crop_views
-from mover.geometry.rle import decode, tight_box
+from mover.geometry.rle import decode
 from mover.geometry.warp_start import mapped
 from mover.stages.config import ImageConfig
 from mover.stages.objects.prepare_objects import Prepared
@@ -53,29 +53,6 @@ def people_in_reference(capture: Capture) -> Bool[Tensor, "h w"]:
         for row in range(len(people.counts)):
             found = found | decode(people, row)
     return found
-
-
-def evidence_at(capture: Capture, frame: int) -> ObjectDetections:
-    """The same of a frame in which furniture is segmented (`furniture.json`)."""
-    camera, pieces = capture.scene.camera, capture.scene.objects
-    furniture, people = capture.furniture, capture.people
-    blank = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    masks = torch.zeros(len(pieces), camera.height, camera.width, dtype=torch.bool)
-    assert furniture is not None, "furniture is segmented in this frame"
-    index = {piece.annotation: k for k, piece in enumerate(pieces)}
-    for row in (furniture.frame == frame).nonzero()[:, 0].tolist():
-        number = int(furniture.person[row])
-        if number in index:
-            masks[index[number]] = decode(furniture.masks, row)
-    rows = [] if people is None else (people.frame == frame).nonzero()[:, 0].tolist()
-    hidden = [decode(people.masks, row) for row in rows] if people is not None else []
-    there = masks.flatten(1).any(1)
-    whole = torch.tensor([0.0, 0.0, camera.width, camera.height])
-    boxes = [tight_box(mask) if bool(mask.any()) else whole for mask in masks]
-    return ObjectDetections(
-        torch.stack(boxes) if boxes else torch.zeros(0, 4), there, masks,
-        torch.stack([blank, *hidden]).any(0),
-    )  # fmt: skip
 
 
 def ground_without_people(capture: Capture, prepared: Prepared) -> float:
@@ -145,11 +122,6 @@ def find_image_cues(
         inputs.boxes, sides, views, own, keep, trust, inputs.distance, borders,
         beside=beside,
     )  # fmt: skip
-
-
-def free_sides(inputs: ImageInputs, config: ImageConfig) -> Bool[Tensor, "objects 4"]:
-    """Which sides of the boxes are seen: neither the image's border nor something cuts them off."""
-    return _sides(inputs, _touched(inputs, _others(inputs)), config) == SEEN
 
 
 def _others(inputs: ImageInputs) -> Bool[Tensor, "objects h w"]:
