@@ -1,6 +1,7 @@
 """Fewer points and fewer triangles that still show the shape."""
 
 from threading import Lock
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,10 +41,10 @@ def coarser(
         return meshes, faces
     verts, rows = as_float64(meshes[0]), as_int64(faces).astype(np.int32)
     with simplifying:
-        collapses = fast_simplification.simplify(
+        found: Any = fast_simplification.simplify(
             verts, rows, target_count=count, return_collapses=True
-        )[2]
-        points, rows, group = fast_simplification.replay_simplification(verts, rows, collapses)
+        )
+        points, rows, group = fast_simplification.replay_simplification(verts, rows, found[2])
     order = np.lexsort([np.linalg.norm(verts - points[group], axis=1), group])
     nearest = order[np.unique(group[order], return_index=True)[1]]
     triangles = torch.from_numpy(rows.astype(np.int64)).to(faces)
