@@ -48,7 +48,7 @@ def volumes(verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
     if len(faces) == 0:
         return faces[:, 0], np.zeros(0)
-    _, part_of = igl.facet_components(faces)
+    part_of = np.asarray(igl.facet_components(faces)[1])
     a, b, c = np.moveaxis(verts[faces] - verts.mean(0), 1, 0)
     return part_of, np.bincount(part_of, (np.cross(a, b) * c).sum(-1) / 6)
 
