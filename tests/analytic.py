@@ -156,3 +156,8 @@ def moved(layout, seed, size):
         layout, t_world_object=layout.t_world_object + noise(layout.t_world_object),
         yaw=layout.yaw + noise(layout.yaw), log_scale=layout.log_scale + noise(layout.log_scale),
     )  # fmt: skip
+
+
+def several(layout, count=3, amount=0.1):
+    """Some layouts about one."""
+    return Layout.cat(*(moved(layout, seed, amount) for seed in range(count)))

@@ -10,8 +10,8 @@ from test_find_depth import CAMERA, SIZE, masks_of, moved
 
 from mover.core.types import Masks
 from mover.geometry.rle import decode, encode
-from mover.stages.cover import Cover, covered, pixels_of
-from mover.stages.masks import compare_extents, mask_table
+from mover.stages.cover import Cover, covered
+from mover.stages.masks import compare_extents, mask_table, pixels_of
 
 NOBODY = Masks(*SIZE, ())
 UPRIGHT = {"left_shoulder": (0.0, 0.0, -1.45), "right_shoulder": (0.0, 0.0, 1.45)}

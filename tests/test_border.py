@@ -4,8 +4,8 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from analytic import GROUND, make_inputs
-from test_priced import agree, room, starts_of
+from analytic import GROUND, make_inputs, several, walls_at
+from test_fused import agree, rest_of, room
 
 from mover.core.types import Layout
 from mover.energy.config import Adam, SceneConfig, SceneWeights
@@ -25,9 +25,8 @@ from mover.geometry.raster import Crops, Topology, look
 from mover.pipeline.presets import ROBUST
 from mover.stages.camera.refine_camera import fixed_borders
 from mover.stages.config import ImageConfig
-from mover.stages.objects.coarse_cues import coarser_image
 from mover.stages.objects.find_image_cues import ImageInputs, find_image_cues
-from mover.stages.objects.place_inputs import PlaceInputs
+from mover.stages.objects.place_inputs import PlaceInputs, coarser_image
 from mover.stages.objects.place_objects import place_objects
 
 SHIFTS = (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
@@ -51,10 +50,6 @@ def loosened(inputs, shifts=SHIFTS):
     image = inputs.image
     zoom = image.views.K[:, 0, 0] / inputs.camera.K[0, 0]
     return replace(inputs, image=replace(image, borders=borders_of(image.masks, zoom, shifts)))
-
-
-def rest_of(inputs):
-    return inputs.objects, inputs.camera, inputs.image, inputs.humans
 
 
 class TestMasks:
@@ -100,7 +95,7 @@ class TestTerm:
         seen = box_of(grow), torch.full((1, 4), SEEN), torch.ones(1, 64, 64).bool()
         drawn = rectangle(0), box_of(0).view(1, 2, 2)
         borders = borders_of(rectangle(grow), torch.ones(1), SHIFTS)
-        found = fit_borders(drawn, seen, torch.ones(1), borders, (1.0, 1.0))
+        found = fit_borders(*drawn, *seen, torch.ones(1), borders, (1.0, 1.0))
         assert borders.shifts[found.shift].tolist() == [-grow]
         assert float(found.bbox) == pytest.approx(0.0, abs=1e-7)
         assert float(found.silhouette) == pytest.approx(BORDER_WEIGHT, rel=1e-6)
@@ -109,7 +104,7 @@ class TestTerm:
         seen = box_of(1), torch.full((1, 4), SEEN), torch.zeros(1, 64, 64).bool()
         drawn = rectangle(0), box_of(0).view(1, 2, 2)
         borders = borders_of(rectangle(1), torch.ones(1), SHIFTS)
-        found = fit_borders(drawn, seen, torch.ones(1), borders, (1.0, 1.0))
+        found = fit_borders(*drawn, *seen, torch.ones(1), borders, (1.0, 1.0))
         assert borders.shifts[found.shift].tolist() == [-1.0]
         assert float(found.bbox) == pytest.approx(0.0, abs=1e-7)
 
@@ -117,13 +112,13 @@ class TestTerm:
         seen = box_of(0) + 4, torch.full((1, 4), SEEN), torch.ones(1, 64, 64).bool()
         drawn = rectangle(0), box_of(0).view(1, 2, 2)
         borders = borders_of(rectangle(0).roll((4, 4), (1, 2)), torch.ones(1), SHIFTS)
-        found = fit_borders(drawn, seen, torch.ones(1), borders, (1.0, 0.0))
-        assert borders.shifts[found.shift].tolist() == [0.0]  # the price of a side is convex
+        found = fit_borders(*drawn, *seen, torch.ones(1), borders, (1.0, 0.0))
+        assert borders.shifts[found.shift].tolist() == [0.0]  # the cost of a side is convex
         assert float(found.bbox) > 0.25
 
-    def test_each_start_and_object_takes_its_least_price(self):
+    def test_each_start_and_object_takes_its_least_cost(self):
         inputs = loosened(make_inputs(size=64))
-        layout = starts_of(inputs, 4)
+        layout = several(inputs.starts, 4)
         image = inputs.image
         assert image.borders is not None
         found = scene_energy(layout, *rest_of(inputs), ROBUSTLY).parts
@@ -132,8 +127,8 @@ class TestTerm:
         for shift, mask in zip(image.borders.shifts, image.borders.masks, strict=True):
             one = replace(image, masks=mask, borders=None)
             rest = inputs.objects, inputs.camera, one, HumanCues()
-            price = scene_energy(layout, *rest, ROBUSTLY).parts["silhouette"]
-            each.append(price + BORDER_WEIGHT * shift**2)
+            cost = scene_energy(layout, *rest, ROBUSTLY).parts["silhouette"]
+            each.append(cost + BORDER_WEIGHT * shift**2)
         silhouettes = torch.stack(each)
         picked = silhouettes.gather(0, number[None])[0]
         torch.testing.assert_close(found["silhouette"], picked, rtol=1e-5, atol=1e-6)
@@ -141,7 +136,7 @@ class TestTerm:
 
     def test_the_shift_zero_alone_is_the_energy_without_borders(self):
         inputs = make_inputs(size=48)
-        layout = starts_of(inputs)
+        layout = several(inputs.starts)
         free = scene_energy(layout, *rest_of(loosened(inputs, (0.0,))), ROBUSTLY)
         bound = scene_energy(layout, *rest_of(inputs), ROBUSTLY)
         assert set(free.parts) == set(bound.parts)
@@ -155,18 +150,18 @@ class TestTerm:
         verts = torch.rand(2, 3, 8, 2, generator=torch.Generator().manual_seed(3)) * 300
         drawn = image.masks.roll(2, -1).repeat(2, 1, 1, 1)
         borders = borders_of(image.masks, torch.ones(3), SHIFTS)
-        found = fit_borders((drawn, verts), (image.boxes, sides, keep), trust, borders, (1.0, 2.0))
+        found = fit_borders(drawn, verts, image.boxes, sides, keep, trust, borders, (1.0, 2.0))
         for start in range(2):
             for i in range(3):
-                prices = []
+                costs = []
                 for shift, mask in zip(SHIFTS, borders.masks, strict=True):
                     b = bbox_term(verts, image.boxes, sides, 1.0, "robust", shift)[start, i]
                     s = silhouette_term(drawn, mask, keep, "robust")[start, i]
-                    prices.append((float(b), float(trust[i] * s + BORDER_WEIGHT * shift**2)))
-                best = min(range(7), key=lambda k: prices[k][0] + 2 * prices[k][1])
+                    costs.append((float(b), float(trust[i] * s + BORDER_WEIGHT * shift**2)))
+                best = min(range(7), key=lambda k: costs[k][0] + 2 * costs[k][1])
                 assert int(found.shift[start, i]) == best
-                assert float(found.bbox[start, i]) == pytest.approx(prices[best][0], rel=1e-5)
-                assert float(found.silhouette[start, i]) == pytest.approx(prices[best][1], rel=1e-5)
+                assert float(found.bbox[start, i]) == pytest.approx(costs[best][0], rel=1e-5)
+                assert float(found.silhouette[start, i]) == pytest.approx(costs[best][1], rel=1e-5)
 
 
 class TestKernel:
@@ -176,7 +171,7 @@ class TestKernel:
         pytest.importorskip("warp")
         inputs = loosened(room(size))
         fast = energy_function(*rest_of(inputs), ROBUSTLY)
-        layout = starts_of(inputs, 5, amount)
+        layout = several(inputs.starts, 5, amount)
         assert fast(layout).whole is not None
         for term in (None, "bbox", "silhouette"):
             agree(fast, lambda x: scene_energy(x, *rest_of(inputs), ROBUSTLY), layout, term)
@@ -184,7 +179,7 @@ class TestKernel:
     def test_its_shift_is_the_best_one(self):
         pytest.importorskip("warp")
         inputs = loosened(room())
-        layout = starts_of(inputs, 6, 0.05)
+        layout = several(inputs.starts, 6, 0.05)
         image = inputs.image
         assert image.borders is not None
         names = ("bbox", "silhouette")
@@ -214,7 +209,7 @@ class TestKernel:
         pytest.importorskip("warp")
         config = SceneConfig(replace(WEIGHTS, silhouette=0.0), "robust")
         inputs = room()
-        layout = starts_of(inputs)
+        layout = several(inputs.starts)
         free, bound = (
             energy_function(*rest_of(i), config)(layout).parts["bbox"]
             for i in (loosened(inputs), inputs)
@@ -226,7 +221,8 @@ class TestKernel:
 
 class TestParts:
     def test_coarser_windows_hold_the_same_masks_under_each_shift(self):
-        image = loosened(make_inputs(size=64)).image
+        inputs = loosened(make_inputs(size=64))
+        image = replace(inputs.image, walls=walls_at(inputs.objects, inputs.starts[0]))
         small = coarser_image(image, 4)
         assert image.borders is not None
         assert small.borders is not None
@@ -236,10 +232,11 @@ class TestParts:
             16 * small.borders.masks.sum((-2, -1)), image.borders.masks.sum((-2, -1))
         )
         assert torch.equal(small.borders.shifts, image.borders.shifts)
+        assert small.walls is image.walls
 
     def test_rows_of_starts_and_objects_cost_what_the_whole_costs(self):
         inputs = loosened(make_inputs(size=48))
-        layout = starts_of(inputs, 3, 0.05)
+        layout = several(inputs.starts, 3, 0.05)
         rows = torch.tensor([7, 2, 3, 3])
         index = rows % 3
         few = Layout(*(getattr(layout, f.name).flatten(0, 1)[rows] for f in fields(Layout)))
@@ -253,7 +250,7 @@ class TestParts:
 class TestFixed:
     def test_masks_and_boxes_are_those_of_the_best_shift(self):
         inputs = loosened(make_inputs(size=64))
-        one = Layout(*(getattr(inputs.starts, f.name)[0] for f in fields(Layout)))
+        one = inputs.starts[0]
         sizes = torch.tensor([-0.04, 0.0, 0.04])[:, None].expand(-1, 3)
         one = replace(one, log_scale=sizes.contiguous())
         image = inputs.image
@@ -274,14 +271,14 @@ class TestFixed:
 
     def test_masks_without_freedom_stay_as_they_are(self):
         inputs = make_inputs(size=32)
-        one = Layout(*(getattr(inputs.starts, f.name)[0] for f in fields(Layout)))
+        one = inputs.starts[0]
         image = inputs.image
         assert fixed_borders(image, one, inputs.objects, inputs.camera, WEIGHTS) is image
 
     @pytest.mark.parametrize("grow", [-1, 1])
     def test_masks_too_wide_are_taken_in_and_masks_too_narrow_are_grown(self, grow):
         inputs, cues = seen_room(grow, hide=False)
-        true = Layout(*(getattr(inputs.starts, f.name)[0] for f in fields(Layout)))
+        true = inputs.starts[0]
         image = cues(ImageConfig(128, "robust", borders=SHIFTS))
         found = fixed_borders(image, true, inputs.objects, inputs.camera, WEIGHTS)
         assert float(found.boxes[0, 2] - image.boxes[0, 2]) * grow < 0

@@ -6,10 +6,11 @@ from dataclasses import replace
 import pytest
 import raster_torch
 import torch
+from analytic import several
 from nearest_torch import nearest_torch
 from pretended import Elsewhere, kernels_elsewhere, registered
+from test_fused import WEIGHTS, room, with_slopes
 from test_pipeline import light
-from test_priced import WEIGHTS, room, starts_of, told
 from test_raster_warp import pulled, scene
 from test_volume import sphere
 
@@ -101,7 +102,7 @@ class TestGeometry:
         torch.testing.assert_close(value, sample_torch(truth, places), rtol=1e-5, atol=1e-5)
 
 
-def energy_in(inputs, weights, form):
+def energy_under(inputs, weights, form):
     rest = inputs.objects, inputs.camera, inputs.image, inputs.humans
     return lambda layout: scene_energy(layout, *rest, SceneConfig(weights, form))
 
@@ -109,16 +110,18 @@ def energy_in(inputs, weights, form):
 @pytest.mark.parametrize(("form", "weights"), [("robust", WEIGHTS), ("paper", SceneWeights())])
 def test_all_terms_and_their_gradients_are_those_of_the_cpu(device, form, weights):
     inputs = room(32)
-    layout = starts_of(inputs, 2)
-    here = told(energy_in(inputs, weights, form), layout)
-    there = told(energy_in(to_device(inputs, device), weights, form), to_device(layout, device))
+    layout = several(inputs.starts, 2)
+    here = with_slopes(energy_under(inputs, weights, form), layout)
+    there = with_slopes(
+        energy_under(to_device(inputs, device), weights, form), to_device(layout, device)
+    )
     for value, truth in zip(there, here, strict=True):
         assert value.device.type == device.type
         assert (value.cpu() - truth).norm() <= 1e-3 * truth.norm()
 
 
 def test_a_whole_placing_ends_where_it_ends_on_the_cpu(device):
-    inputs = replace(room(32), starts=starts_of(room(32), 1))
+    inputs = replace(room(32), starts=several(room(32).starts, 1))
     config = PlaceConfig(
         WEIGHTS,
         "robust",

@@ -36,7 +36,7 @@ from mover.stages.people.find_depth import (
 SIZE = (360, 640)
 K = torch.tensor([[520.0, 0, 320], [0, 520, 180], [0, 0, 1]])
 CAMERA = Camera(K, tilted(torch.tensor(math.radians(-8)), torch.tensor(0.0)), SIZE[1], SIZE[0])
-QUICK = DepthConfig(every=1, factors=13, width=160)
+QUICK = DepthConfig(factors=13, width=160)
 
 
 def film(spots, person=0, scale=1.0):
@@ -272,7 +272,7 @@ class TestOverlapAndHeight:
     def test_heights_alone_are_used_and_nothing_is_warned_of(self, monkeypatch):
         found = self.told(monkeypatch, self.LOST, Extents(0.97, 0.004, QUICK.least))
         spread = math.hypot(0.004, SYSTEMATIC, COMMON)
-        assert found == (pytest.approx(0.97 + self.LOST.lower), pytest.approx(spread), ())
+        assert found == (pytest.approx(0.97 + NEAR * (FULL - BENT)), pytest.approx(spread), ())
 
     @pytest.mark.parametrize(
         "heights",

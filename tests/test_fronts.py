@@ -7,7 +7,7 @@ import pytest
 import torch
 from test_given import somewhere
 
-from mover.stages.objects.fronts import facing, turned_to_people
+from mover.stages.objects.starts import facing, turned_to_people
 
 PEOPLE = torch.tensor([[0.2, -0.5, -2.0], [-0.3, -0.5, -2.2], [0.4, -0.5, -1.5]])
 """Between the camera and an object 4 m before it."""

@@ -28,7 +28,7 @@ def columns(first, last):
 
 
 def test_an_object_behind_a_seen_person_is_not_nearer_than_where_the_ray_leaves_the_body():
-    found = bounds_of(seen(columns(4, 16)), columns(6, 12)[None], 1, vote=True)
+    found = bounds_of(seen(columns(4, 16)), columns(6, 12)[None], 1)
     assert (found.near[:, 6:12] == torch.tensor(2.3)).all()
     assert found.near[:, :6].max() == float("-inf")
     assert not found.far.isfinite().any()
@@ -36,13 +36,13 @@ def test_an_object_behind_a_seen_person_is_not_nearer_than_where_the_ray_leaves_
 
 def test_an_object_that_hides_a_person_is_not_farther_than_where_the_ray_enters_the_body():
     nothing = torch.zeros(H, W, dtype=torch.bool)
-    found = bounds_of(seen(nothing), columns(6, 12)[None], 1, vote=True)
+    found = bounds_of(seen(nothing), columns(6, 12)[None], 1)
     assert (found.far[:, 6:12] == 2.0).all()
     assert not found.near.isfinite().any()
 
 
 def test_rays_that_graze_the_body_bound_nothing():
-    found = bounds_of(seen(columns(4, 16)), columns(0, 20)[None], 2, vote=False)
+    found = bounds_of(seen(columns(4, 16)), columns(0, 20)[None], 2)
     assert found.near[:, 4:6].max() == float("-inf")
     assert found.near[:, 14:16].max() == float("-inf")
     assert (found.near[:, 6:14] == torch.tensor(2.3)).all()
@@ -50,18 +50,16 @@ def test_rays_that_graze_the_body_bound_nothing():
 
 def test_one_person_hidden_by_another_says_nothing_about_the_furniture():
     nothing = torch.zeros(H, W, dtype=torch.bool)
-    found = bounds_of(seen(nothing, columns(0, 20)), columns(6, 12)[None], 1, vote=True)
+    found = bounds_of(seen(nothing, columns(0, 20)), columns(6, 12)[None], 1)
     assert not found.far.isfinite().any()
 
 
 def test_the_vote_keeps_the_larger_region_of_each_object():
     objects = torch.stack([columns(5, 11), columns(11, 15)])
     half = seen(columns(4, 10))  # the rest of the body is hidden
-    voted = bounds_of(half, objects, 0, vote=True)
-    both = bounds_of(half, objects, 0, vote=False)
+    voted = bounds_of(half, objects, 0)
     assert voted.near[:, 5:10].isfinite().all()
     assert not voted.far[:, 10].isfinite().any()
-    assert both.far[:, 10].isfinite().all()
     assert voted.far[:, 11:15].isfinite().all()
 
 
@@ -93,9 +91,9 @@ def test_thinning_keeps_every_weight_and_does_not_grow_with_the_video():
 def test_what_a_wrong_outline_explains_is_not_hidden():
     nothing = torch.zeros(H, W, dtype=torch.bool)
     thin_strip = columns(4, 14)  # two of the twelve columns of the body are not seen
-    found = bounds_of(replace(seen(thin_strip), reach=2.0), columns(0, 20)[None], 0, vote=False)
+    found = bounds_of(replace(seen(thin_strip), reach=2.0), columns(0, 20)[None], 0)
     assert not found.far.isfinite().any()
-    found = bounds_of(replace(seen(nothing), reach=2.0), columns(0, 20)[None], 0, vote=False)
+    found = bounds_of(replace(seen(nothing), reach=2.0), columns(0, 20)[None], 0)
     assert (found.far[:, 6:14] == 2.0).all()
     assert not found.far[:, [4, 15]].isfinite().any()
 

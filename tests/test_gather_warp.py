@@ -17,7 +17,8 @@ from mover.geometry import volume_warp
 from mover.geometry.raster import Crops
 from mover.geometry.raster import layers as layers_warp
 from mover.geometry.volume import Volume, grid_around, sample, sample_torch
-from mover.stages.contacts.gather_cues import PeopleView, gather_depth
+from mover.stages.config import GatherConfig
+from mover.stages.contacts.gather_cues import GatherInputs, depth_bounds
 from mover.stages.masks import mask_table
 from mover_bench.rooms.render import encode
 
@@ -150,7 +151,10 @@ def test_nothing_to_draw_is_nothing_seen() -> None:
     assert_same_layers(verts[None].double(), faces, cameras(1, (8, 9), 9.0))
 
 
-def passing(count: int) -> PeopleView:
+SETTINGS = GatherConfig(erode=2)
+
+
+def passing(count: int) -> GatherInputs:
     """A ball that crosses the image (in part outside), its masks too small or shifted."""
     verts, faces = sphere([0.0, 0, 0], 0.4, level=2)
     way = torch.linspace(-1.6, 1.3, count)[:, None] * torch.tensor([1.0, 0.3, 0.2])
@@ -167,21 +171,22 @@ def passing(count: int) -> PeopleView:
     objects = torch.zeros(3, 60, 80, dtype=torch.bool)
     for k in range(3):
         objects[k, 10 + 5 * k : 45, 25 * k : 25 * k + 30] = True
-    return PeopleView(bodies, mask_table(people, bodies), objects, camera, erode=2, vote=True)
+    return GatherInputs(bodies, people, objects, camera)
 
 
 def test_bounds_are_those_of_whole_images_one_after_another() -> None:
     sight = passing(13)
+    table = mask_table(sight.people, sight.bodies)
     blank = torch.full((60, 80), torch.inf)
     expected = DepthMaps(-blank, blank)
     views = Crops(sight.camera.K[None], 60, 80)
     for row, verts in enumerate(sight.bodies.verts):
         cam = verts @ sight.camera.R_cam_world.mT
         drawn = raster_torch.layers(cam[None], sight.bodies.faces, views)
-        seen = BodyView(drawn.front[0], drawn.exit[0], *sight.table.decode(row))
-        expected = merge(expected, bounds_of(seen, sight.masks, 2, vote=True))
+        seen = BodyView(drawn.front[0], drawn.exit[0], *table.decode(row))
+        expected = merge(expected, bounds_of(seen, sight.masks, 2))
     for workers in (1, 2, 3):
-        found = gather_depth(sight, workers)
+        found = depth_bounds(sight, SETTINGS, workers)
         for name in ("near", "far"):
             assert getattr(expected, name).isfinite().any()
             assert torch.equal(getattr(found, name), getattr(expected, name))
@@ -190,10 +195,11 @@ def test_bounds_are_those_of_whole_images_one_after_another() -> None:
 def test_progress_of_the_bounds_ends_with_all_bodies() -> None:
     seen: list[tuple[int, int]] = []
     sight = passing(9)
-    gather_depth(sight, 2, lambda done, of: seen.append((done, of)))
+    depth_bounds(sight, SETTINGS, 2, lambda done, of: seen.append((done, of)))
     assert seen[-1] == (9, 9)
-    unmasked = dataclasses.replace(sight, table=dataclasses.replace(sight.table, own=(None,) * 9))
-    assert gather_depth(unmasked, 2).near.max() == -torch.inf
+    others = dataclasses.replace(sight.people, person=sight.people.person + 1)
+    unmasked = dataclasses.replace(sight, people=others)
+    assert depth_bounds(unmasked, SETTINGS, 2).near.max() == -torch.inf
 
 
 def some_field(size: tuple[int, int, int]) -> Volume:

@@ -116,7 +116,7 @@ def test_the_axis_of_a_room_is_found_from_rough_yaws() -> None:
     assert nothing > 3 * wide
 
 
-def test_walls_that_are_seen_tell_the_axis_better_than_rough_yaws():
+def test_walls_that_are_seen_give_the_axis_better_than_rough_yaws():
     rough = replace(somewhere(3), yaw=torch.tensor([0.45, 0.30, -0.05]))
     objects, left = boxes_of(("bed",) * 3, [(1.4, 0.5, 2.0)] * 3), torch.full((3,), 0.1)
     walls = Heading(0.1 + math.pi / 2, math.radians(0.5))
@@ -125,12 +125,12 @@ def test_walls_that_are_seen_tell_the_axis_better_than_rough_yaws():
     assert abs(math.remainder(float(alone.axis[0]) - 0.1, math.pi / 2)) > 0.1
     assert math.remainder(float(seen.axis[0]) - 0.1, math.pi / 2) == pytest.approx(0, abs=0.03)
     assert float(seen.sharpness[0]) > float(alone.sharpness[0])
-    said = [(yaw, math.radians(2), 0.9) for yaw in (0.6, 0.61, 0.59, 0.6, 0.6)]  # all disagree
-    many, wall = (torch.tensor(x).unbind(-1) for x in (said, [(0.1, math.radians(0.5), 0.95)]))
+    observed = [(yaw, math.radians(2), 0.9) for yaw in (0.6, 0.61, 0.59, 0.6, 0.6)]  # all disagree
+    many, wall = (torch.tensor(x).unbind(-1) for x in (observed, [(0.1, math.radians(0.5), 0.95)]))
     assert room_axis([many, wall])[0] == pytest.approx(0.6, abs=0.02)
 
 
-def test_of_a_room_without_a_guess_the_axis_alone_is_priced():
+def test_of_a_room_without_a_guess_the_axis_alone_costs():
     objects = boxes_of(("bed", "chair"), [(1.4, 0.5, 2.0), (0.5, 0.9, 0.5)])
     given = given_axis(objects.categories, Heading(0.3, math.radians(0.5)))
     straight = replace(somewhere(2), yaw=torch.full((2,), 0.3 - math.pi))
@@ -138,9 +138,9 @@ def test_of_a_room_without_a_guess_the_axis_alone_is_priced():
     far = replace(
         straight, t_world_object=3 * straight.t_world_object, log_scale=0.4 + 0 * straight.log_scale
     )
-    price = given_term(straight, given)
-    torch.testing.assert_close(price, torch.zeros(2), atol=1e-5, rtol=0)
-    torch.testing.assert_close(given_term(far, given), price)
+    along = given_term(straight, given)
+    torch.testing.assert_close(along, torch.zeros(2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(given_term(far, given), along)
     bed, chair = given_term(skew, given).tolist()
     assert bed > 3 > chair > 1
 
@@ -153,15 +153,15 @@ def test_shapes_are_held_to_firm_standards_of_the_meaning_that_fits_their_size()
     meanings = (*kinds[:-1], "coffee table")  # COCO's dining table, as high as one
     for i, kind in enumerate(meanings):
         for axis, usual in enumerate(STANDARD.get(kind, (None,) * 3)):
-            told = usual is not None and usual[1] <= FIRM
-            off = math.log(usual[0] / float(sizes[i, axis])) if told else 0.0
+            known = usual is not None and usual[1] <= FIRM
+            off = math.log(usual[0] / float(sizes[i, axis])) if known else 0.0
             assert float(standard[i, axis]) == pytest.approx(off, abs=1e-5)
-            sharp = usual[1] ** -2 if told else 0.0
+            sharp = usual[1] ** -2 if known else 0.0
             assert float(precision[i, axis]) == pytest.approx(sharp, rel=1e-5)
     assert (precision > 0).sum(1).tolist() == [1, 0, 1, 0, 0, 1, 0]
 
 
-def test_of_what_nobody_placed_sizes_cost_as_a_student_t_and_places_nothing() -> None:
+def test_of_what_was_not_placed_sizes_cost_as_a_student_t_and_places_nothing() -> None:
     nothing, layout = unplaced(2), somewhere(2)
     assert cost(nothing, replace(layout, yaw=layout.yaw + 1, log_scale=layout.log_scale + 1)) == 0
     size = torch.tensor([[0.0, 0.0, 0.5], [0.1, -0.2, 0.3]])
@@ -244,13 +244,13 @@ def test_standards_are_those_of_the_classes_and_near_what_the_library_has() -> N
             assert known is None or low * 0.9 < known[0] < high * 1.1
 
 
-def test_doubt_follows_the_misfit_within_bounds() -> None:
+def test_prior_weights_follow_the_misfit_within_bounds() -> None:
     objects = boxes_of(("table", "chair", "sofa"), [(1.0, 0.7, 1.0)] * 3)
     given = gather_given(objects, somewhere(3), somewhere(3), torch.tensor([1e-6, 0.15, 3.0]))
     assert given.weight.tolist() == pytest.approx([WEIGHTS[0], 1.5, WEIGHTS[1]])
 
 
-def test_an_object_that_fits_among_shapes_that_do_not_is_doubted_more_than_alone() -> None:
+def test_an_object_that_fits_among_shapes_that_do_not_has_more_prior_weight_than_alone() -> None:
     energy = torch.tensor([0.01, 0.16, 0.16, 0.12, 0.9])
     found = prior_weights(energy)
     assert float(found[0]) == pytest.approx((0.01 * 0.16) ** 0.5 / 0.1)
@@ -258,28 +258,29 @@ def test_an_object_that_fits_among_shapes_that_do_not_is_doubted_more_than_alone
     assert torch.allclose(prior_weights(torch.full((3,), 0.01)), torch.full((3,), 0.1))
 
 
-def test_a_side_that_may_be_hidden_bounds_nothing_of_a_shape_that_fits() -> None:
-    sides = torch.tensor([[SEEN, LIKELY, SEEN, LIKELY], [UNKNOWN] * 4, [SEEN] * 4])
-    for weight, first in ((UNFIT - 0.01, [LEAST] * 4), (UNFIT + 0.01, sides[0].tolist())):
-        found = bounded_sides(sides, torch.full((3,), weight))
-        assert found.tolist() == [first, *sides[1:].tolist()]
+CUTS = {known: [[known if s == cut else SEEN for s in range(4)] for cut in range(4)]
+        for known in (LEAST, LIKELY)}  # fmt: skip
 
 
-def test_a_side_of_which_nothing_is_known_stays_so_beside_others() -> None:
-    sides = torch.tensor([[SEEN, LEAST, LIKELY, UNKNOWN]] * 2)
-    found = bounded_sides(sides, torch.tensor([UNFIT - 0.01, UNFIT + 0.01]))
-    assert found.tolist() == [[LEAST, LEAST, LEAST, UNKNOWN], sides[1].tolist()]
-
-
-@pytest.mark.parametrize("cut", range(4))
-@pytest.mark.parametrize("known", [LEAST, LIKELY])
-def test_neither_do_the_sides_beside_it(cut: int, known: int) -> None:
-    sides = torch.full((2, 4), SEEN)
-    sides[:, cut] = known
-    found = bounded_sides(sides, torch.tensor([UNFIT - 0.01, UNFIT + 0.01]))
-    across = (cut + 2) % 4
-    assert found[0].tolist() == [SEEN if s == across else LEAST for s in range(4)]
-    assert found[1].tolist() == sides[1].tolist()
+@pytest.mark.parametrize(
+    ("sides", "fits"),
+    [
+        ([SEEN, LIKELY, SEEN, LIKELY], [LEAST] * 4),
+        ([UNKNOWN] * 4, [UNKNOWN] * 4),
+        ([SEEN] * 4, [SEEN] * 4),
+        ([SEEN, LEAST, LIKELY, UNKNOWN], [LEAST, LEAST, LEAST, UNKNOWN]),
+        *(
+            (CUTS[known][cut], [SEEN if s == (cut + 2) % 4 else LEAST for s in range(4)])
+            for cut in range(4)
+            for known in (LEAST, LIKELY)
+        ),
+    ],
+)
+def test_sides_that_may_be_hidden_and_those_beside_them_bound_nothing_of_a_shape_that_fits(
+    sides: list[int], fits: list[int]
+) -> None:
+    found = bounded_sides(torch.tensor([sides] * 2), torch.tensor([UNFIT - 0.01, UNFIT + 0.01]))
+    assert found.tolist() == [fits, sides]
 
 
 def test_of_what_people_use_a_guess_says_less_beside_them() -> None:
@@ -294,7 +295,7 @@ def test_of_what_people_use_a_guess_says_less_beside_them() -> None:
     assert lighter_where_used(given, trust, None) is given
 
 
-def test_doubt_counts_for_places_and_sizes_but_not_beyond_one_for_yaws() -> None:
+def test_prior_weights_count_for_positions_and_sizes_but_not_beyond_one_for_yaws() -> None:
     layout = somewhere()
     given = given_at(layout)
     turned = replace(layout, yaw=layout.yaw + 0.4)
@@ -331,22 +332,13 @@ def test_a_foot_that_hangs_comes_down_and_the_box_stays() -> None:
 
 def test_a_larger_room_moves_the_floor_below_people_and_keeps_them_on_it() -> None:
     camera = Camera(torch.eye(3), tilted(torch.tensor(-0.2), torch.tensor(0.03)), 640, 360)
-    world = Bodies(
-        verts=torch.tensor([[[0.5, -1.4, -3.0], [0.5, 0.3, -3.0]]]),
-        faces=torch.zeros(1, 3, dtype=torch.long),
-        joints=torch.tensor([[[0.5, -0.5, -3.0]]]),
-        joint_names=("pelvis",),
-        frame=torch.zeros(1, dtype=torch.long),
-        person=torch.zeros(1, dtype=torch.long),
-        fps=5.0,
-        space="camera",
-        pose=None,
-    )
-    seen = replace(
-        world,
-        verts=to_camera(world.verts, camera.R_cam_world),
-        joints=to_camera(world.joints, camera.R_cam_world),
-    )
+    verts, joint = ([[0.5, y, -3.0] for y in heights] for heights in ((-1.4, 0.3), (-0.5,)))
+    one = torch.zeros(1, dtype=torch.long)
+    seen = Bodies(
+        to_camera(torch.tensor([verts]), camera.R_cam_world), one.expand(1, 3),
+        to_camera(torch.tensor([joint]), camera.R_cam_world), ("pelvis",), one, one, 5.0, "camera",
+        None,
+    )  # fmt: skip
     there = nearer(seen, camera, -1.4, 0.9)
     moved = to_world(there.verts, camera.R_cam_world)[0]
     assert torch.allclose(moved[0], torch.tensor([0.45, -1.26, -2.7]), atol=1e-5)
@@ -354,7 +346,7 @@ def test_a_larger_room_moves_the_floor_below_people_and_keeps_them_on_it() -> No
     assert not are_shapeless(seen)
     fitted = replace(seen, size_spread=0.02)
     assert [size_spread(b, 0.055) for b in (seen, fitted)] == [0.0, 0.02]
-    assert size_spread(fitted, 0.0) == 0  # everybody is believed
+    assert size_spread(fitted, 0.0) == 0  # all sizes are trusted
 
 
 def test_a_larger_room_is_the_same_picture() -> None:

@@ -20,8 +20,8 @@ from mover.io.capture.folder import folder_parts, read_capture, write_capture
 from mover.io.capture.merge import import_into
 from mover.io.files.images import find_depth_file, read_depth_image
 from mover.stages.config import PlaceConfig
-from mover.stages.objects.coarse_cues import coarser_image
 from mover.stages.objects.gather_depth import DepthImageInputs, gather_depth
+from mover.stages.objects.place_inputs import coarser_image
 from mover.stages.objects.place_objects import energy_of
 
 

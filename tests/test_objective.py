@@ -24,7 +24,7 @@ from mover.energy.objective import (
 from mover.pipeline.presets import PRESETS
 from mover.stages.config import PlaceConfig
 from mover.stages.objects.place_inputs import with_walls
-from mover.stages.objects.place_objects import energy_of, with_trees
+from mover.stages.objects.place_objects import energy_of
 
 WEIGHTS = [f.name for f in fields(SceneWeights)]
 PRECISIONS = [torch.float32, torch.float64]
@@ -33,10 +33,10 @@ PRECISIONS = [torch.float32, torch.float64]
 def evidence(dtype):
     """The analytic room with evidence for every term, and layouts about the truth."""
     inputs = make_inputs(dtype, size=32)
-    truth = Layout(*(getattr(inputs.starts, f.name)[0] for f in fields(Layout)))
-    inputs = with_trees(with_walls(inputs, walls_at(inputs.objects, truth)))
+    truth = inputs.starts[0]
+    inputs = with_walls(inputs, walls_at(inputs.objects, truth))
     many = [moved(inputs.starts, seed, 0.2) for seed in range(2)]
-    return inputs, Layout(*(torch.cat([getattr(m, f.name) for m in many]) for f in fields(Layout)))
+    return inputs, Layout.cat(*many)
 
 
 def some_of(layout, rows):

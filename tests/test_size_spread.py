@@ -13,7 +13,7 @@ from mover.energy.prior_terms import scale_term
 from mover.pipeline.presets import PRESETS
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.config import SpreadConfig
-from mover.stages.objects.size_prior import WIDEST, estimate_size_prior, inlier_weights
+from mover.stages.objects.gather_given import WIDEST, estimate_size_prior, inlier_weights
 from mover_bench.rooms.config import NoiseConfig
 from mover_bench.rooms.noise import add_noise
 

@@ -114,7 +114,7 @@ def seat_height(seat: SceneObject) -> float:
     mesh = place_object(seat)
     points, normals = sample_surface(mesh, SURFACE)
     points = points - torch.tensor([0.0, float(mesh.verts[:, 1].min()), 0.0])
-    top = find_regions(points, normals, canonical(seat.category)).top
+    top, _ = find_regions(points, normals, canonical(seat.category))
     return float(top[:, 1].median())
 
 

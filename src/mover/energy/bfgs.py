@@ -69,7 +69,7 @@ Evaluate = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def _evaluation(problems: Problems[P]) -> Evaluate:
-    """Energy and gradient of rows by number and place; the last energy asked for is kept."""
+    """Energy and gradient of rows by number; the last energy function is kept."""
     start, axes = problems.start, len(problems.axes)
     held: list[tuple[Tensor, Callable[[P], Energy]]] = []
 
@@ -96,8 +96,15 @@ def minimize_batched(
         ValueError: If an energy is not finite at the start.
     """
     start, axes, evaluate = problems.start, problems.axes, _evaluation(problems)
-    ends, like = _flat(start, len(axes)), _likes(problems)
-    live, values = _start(evaluate, like.unique(), ends, method), torch.zeros_like(ends[:, 0])
+    dtype, ends = getattr(start, _names(start)[0]).dtype, _flat(start, len(axes))
+    like = torch.arange(prod(axes)).to(ends.device) if problems.like is None else problems.like
+    solved = like.unique()
+    value, slope = evaluate(solved, ends[solved])
+    radius = torch.full_like(value, method.reach)
+    round_ = (slope.norm(dim=-1) / radius)[:, None, None] * torch.eye(slope.shape[1]).to(slope)
+    idle = torch.zeros_like(solved)
+    live = _Live(solved, ends[solved], value, slope, round_, radius, idle)
+    values = torch.zeros_like(ends[:, 0])
     values[live.index] = live.value
     trace = [values[like].sum()]
     if not bool(live.value.isfinite().all() and live.slope.isfinite().all()):
@@ -106,9 +113,9 @@ def minimize_batched(
     def reached() -> P:
         return _shaped(ends[like], start, axes, len(axes))
 
-    def reported(index: int) -> Step:
+    def report(index: int) -> None:
         seen = Energy({"energy": values[like].reshape(axes)})
-        return Step(stage, index, method.steps, seen, reached)
+        observe(Step(stage, index, method.steps, seen, reached))
 
     live = live.only(_pooled(problems, live, live.slope.norm(dim=-1)) > 0)
     for index in range(method.steps):
@@ -117,35 +124,12 @@ def minimize_batched(
         live = _advance(problems, evaluate, live, method)
         ends[live.index], values[live.index] = live.at, live.value
         trace.append(values[like].sum())
-        observe(reported(index))
+        report(index)
         moves = (live.idle < method.patience) & (live.radius > method.least)
         live = live.only(_pooled(problems, live, moves.double()) > 0)
     if method.steps:
-        observe(reported(method.steps - 1))
-    value = values[like].to(_first(start).dtype).reshape(axes)
-    return Minimum(reached(), value, torch.stack(trace).to(value.dtype))
-
-
-def _likes(problems: Problems[P]) -> Tensor:
-    """The problem that is solved for each."""
-    if problems.like is not None:
-        return problems.like
-    return torch.arange(prod(problems.axes)).to(_first(problems.start).device)
-
-
-def _start(evaluate: Evaluate, index: Rows, rows: Tensor, method: BatchedBFGS) -> _Live:
-    """A round model of some rows whose minimum lies at the first radius."""
-    at = rows[index]
-    value, slope = evaluate(index, at)
-    radius = torch.full_like(value, method.reach)
-    model = _round(slope, radius)
-    return _Live(index, at, value, slope, model, radius, torch.zeros_like(index))
-
-
-def _round(slope: Tensor, radius: Tensor) -> Tensor:
-    """A model of the same curvature in all directions, with its minimum at the radius."""
-    steep = slope.norm(dim=-1) / radius
-    return steep[:, None, None] * torch.eye(slope.shape[1]).to(slope)
+        report(method.steps - 1)
+    return Minimum(reached(), values[like].to(dtype).reshape(axes), torch.stack(trace).to(dtype))
 
 
 def _advance(problems: Problems[P], evaluate: Evaluate, live: _Live, method: BatchedBFGS) -> _Live:
@@ -154,10 +138,9 @@ def _advance(problems: Problems[P], evaluate: Evaluate, live: _Live, method: Bat
     value, slope = evaluate(live.index, live.at + step)
     before, gain = (_pooled(problems, live, x) for x in (live.value, live.value - value))
     share = gain / _pooled(problems, live, promise).clamp_min(1e-300)
-    taken = gain > 0  # not so where the energy is not finite
-    small = gain <= method.gain * before.abs().clamp_min(FLOOR)
     known = slope.isfinite().all(-1)
-    taken = taken & known
+    taken = (gain > 0) & known  # not so where the energy is not finite
+    small = gain <= method.gain * before.abs().clamp_min(FLOOR)
     learned = _learned(live.model, step, slope - live.slope)
     length = step.norm(dim=-1)
     grown = torch.where((share > GOOD) & (length > 0.9 * live.radius), 2.0, 1.0) * live.radius
@@ -215,24 +198,23 @@ def _pooled(problems: Problems[P], live: _Live, x: Tensor) -> Tensor:
     return x.new_zeros(len(names)).index_add(0, row, x)[row]
 
 
-def _first(record: object) -> Tensor:
-    return getattr(record, dataclasses.fields(record)[0].name)  # type: ignore[arg-type]
+def _names(record: object) -> list[str]:
+    return [field.name for field in dataclasses.fields(record)]  # type: ignore[arg-type]
 
 
 def _flat(start: object, axes: int) -> Tensor:
     """Rows of unknowns, in double precision."""
-    fields = [getattr(start, f.name).detach() for f in dataclasses.fields(start)]  # type: ignore[arg-type]
+    fields = [getattr(start, name).detach() for name in _names(start)]
     n = prod(fields[0].shape[:axes])
     return torch.cat([x.reshape(n, prod(x.shape[axes:])) for x in fields], 1).double()
 
 
 def _shaped(rows: Tensor, like: P, lead: tuple[int, ...], axes: int) -> P:
     """The inverse of `_flat`, with other first axes."""
-    fields, at = {}, 0
-    for field in dataclasses.fields(like):  # type: ignore[arg-type]
-        old = getattr(like, field.name)
-        width = prod(old.shape[axes:])
-        part = rows[:, at : at + width].to(old.dtype)
-        fields[field.name] = part.reshape(*lead, *old.shape[axes:])
-        at += width
+    old = {name: getattr(like, name) for name in _names(like)}
+    parts = rows.split([prod(x.shape[axes:]) for x in old.values()], 1)
+    fields = {
+        name: part.to(x.dtype).reshape(*lead, *x.shape[axes:])
+        for (name, x), part in zip(old.items(), parts, strict=True)
+    }
     return dataclasses.replace(like, **fields)  # type: ignore[type-var]

@@ -1,7 +1,7 @@
 """Weights of Eq. 1 and the ways down it. Imports no torch: `--help` is quick."""
 
 from dataclasses import dataclass, field, fields
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from mover.core.settings import Share, Steps, Weight, float_in, int_in
 
@@ -61,8 +61,6 @@ class SceneConfig:
 class Adam:
     """Adam with a step that falls geometrically from `rate` to `last_rate`."""
 
-    replays: ClassVar[bool] = True
-    """Whether a GPU can record a step and replay it."""
     steps: Steps = 3000
     """Number of steps."""
     rate: Annotated[float, float_in(1e-9, 100)] = 0.002
@@ -80,7 +78,6 @@ class Adam:
 class BatchedBFGS:
     """Second-order steps of each problem within its own radius, until each has converged."""
 
-    replays: ClassVar[bool] = False
     steps: Steps = 100
     """Most steps: a problem that still moves stops then."""
     reach: Annotated[float, float_in(1e-6, 100)] = 0.05

@@ -10,8 +10,6 @@ r"""Terms of Eq. 1 that people say of the room: depth order, free space, contact
 Sec. 3.1 and 3.2 of the paper: as printed (`paper`), and normalised and robust (`robust`).
 """
 
-from functools import cached_property
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -76,17 +74,16 @@ class BodyView:
     """How far the drawn outline may be wrong [px]."""
 
 
-def bounds_of(
-    seen: BodyView, objects: Bool[Tensor, "objects h w"], erode: int, *, vote: bool
-) -> DepthMaps:
+def bounds_of(seen: BodyView, objects: Bool[Tensor, "objects h w"], erode: int) -> DepthMaps:
     """Bounds from one body in one frame.
+
+    Of each object only the larger region counts: it is hidden or hides, not both.
 
     Args:
         seen: The drawn body and the masks.
         objects: Masks of the objects in the clean image.
         erode: Pixels by which silhouettes and masks shrink, so that rays that graze the body and
             borders that leak bound nothing.
-        vote: Of each object, keep only the larger region: it is hidden or hides, not both.
     """
     body = eroded(seen.front.isfinite(), erode)
     shown = body & eroded(seen.visible, erode)
@@ -94,13 +91,10 @@ def bounds_of(
     if seen.reach > 0:
         hidden = _thick(hidden, seen.reach)
     before, behind = objects & shown, objects & hidden
-    if vote:
-        more = before.sum((-2, -1)) - behind.sum((-2, -1))
-        before = before & (more > 0)[:, None, None]
-        behind = behind & (more < 0)[:, None, None]
+    more = (before.sum((-2, -1)) - behind.sum((-2, -1)))[:, None, None]
     infinity = torch.full_like(seen.front, float("inf"))
-    near = torch.where(before.any(0), seen.exit, -infinity)
-    return DepthMaps(near, torch.where(behind.any(0), seen.front, infinity))
+    near = torch.where((before & (more > 0)).any(0), seen.exit, -infinity)
+    return DepthMaps(near, torch.where((behind & (more < 0)).any(0), seen.front, infinity))
 
 
 def merge(a: DepthMaps, b: DepthMaps) -> DepthMaps:
@@ -254,28 +248,17 @@ def some_touches(touches: ContactPoints, index: Int[Tensor, " few"], count: int)
 
 @record
 class Trees:
-    """Search trees of what can be touched of each object, and which points ask for it."""
+    """Search trees of what can be touched of each object."""
 
     top: Clouds
     back: Clouds
-    asking: Bool[Tensor, "objects 2 points"]
-    """By top and back: whether points of the body, then of the hands, have a weight."""
-
-    @cached_property
-    def most(self) -> tuple[int, ...]:
-        """Most points that ask for the top, and for the back, of one object."""
-        counts = self.asking.sum(-1)
-        return tuple(counts.amax(0).tolist()) if len(counts) else (0, 0)
 
 
-def trees_of(objects: Objects, touches: ContactPoints) -> Trees | None:
+def trees_of(objects: Objects, touches: ContactPoints | None) -> Trees | None:
     """Search trees of all objects; None where Warp is not the engine or cannot help."""
-    if engine() != "warp" or objects.top.dtype != torch.float32 or not objects.top.numel():
+    if touches is None or engine() != "warp" or objects.top.dtype != torch.float32:
         return None
-    weighty = _by_region(touches.weight > 0)
-    asking = weighty.new_zeros(len(objects.ids), *weighty.shape[1:])
-    asking[touches.object_of] = weighty
-    return Trees(clouds(objects.top), clouds(objects.back), asking)
+    return Trees(clouds(objects.top), clouds(objects.back)) if objects.top.numel() else None
 
 
 def contact_distance(
@@ -283,37 +266,23 @@ def contact_distance(
 ) -> Float[Tensor, "*starts touched 4 points"]:
     """Distance from each body point to the nearest point of the part that it touches [m].
 
-    The pairing has no gradient. Points without weight may get zero.
-
-    Args:
-        layout: Where the objects stand.
-        objects: With points of their tops and backs.
-        touches: The body points.
-        trees: Of the objects (`trees_of`); None: all points are compared.
+    The pairing has no gradient.
     """
     index = touches.object_of
     t, scale = layout.t_world_object[..., index, :].unsqueeze(-2), layout.log_scale[..., index, :]
     turn, scale = rot_y(layout.yaw[..., index]), scale.exp()
-    points, found = _by_region(touches.points), list[Tensor]()
-    held = None if trees is None else map_tensors(lambda x: x[index], trees)
+    found: list[Tensor] = []
     for k, region in enumerate((objects.top[index], objects.back[index])):
-        query, order = points[:, k], None
-        if held is not None and trees is not None:
-            order = held.asking[:, k].byte().argsort(dim=-1, descending=True, stable=True)
-            order = order[:, : trees.most[k]]
-            query = query.gather(-2, order.unsqueeze(-1).expand(-1, -1, 3))
+        query = touches.points[:, k::2].flatten(1, 2)  # of the body, then of the hands
         own = (query - t).detach() @ turn.detach()
-        if held is None:
+        if trees is None:
             pair = torch.cdist(own, (region * scale.unsqueeze(-2)).detach()).argmin(-1)
         else:
-            pair = nearest(held.back if k else held.top, own, scale)
+            held = map_tensors(lambda x: x[index], trees.back if k else trees.top)
+            pair = nearest(held, own, scale)
         pairs = pair.unsqueeze(-1).expand(*pair.shape, 3)
         chosen = region.expand(*pair.shape[:-1], -1, 3).gather(-2, pairs)
-        gap = safe_norm(query - (chosen * scale.unsqueeze(-2)) @ turn.mT - t)
-        if order is not None:
-            whole = gap.new_zeros(*gap.shape[:-1], points.shape[-2])
-            gap = whole.scatter(-1, order.expand(gap.shape), gap)
-        found.append(gap)
+        found.append(safe_norm(query - (chosen * scale.unsqueeze(-2)) @ turn.mT - t))
     both = torch.stack(found, -2).unflatten(-1, (2, -1))  # region, body or hand
     return both.transpose(-3, -2).flatten(-3, -2)
 
@@ -324,13 +293,9 @@ def contact_term(
     objects: int,
     form: Variant,
 ) -> Float[Tensor, "*starts objects"]:
-    """Mean distance of body points from the parts that they touch: `paper` [m], `robust` [1].
+    """Mean distance of body points from the parts that they touch.
 
-    Args:
-        distance: See `contact_distance`.
-        touches: The body points.
-        objects: Number of all objects.
-        form: Mean over all touching skin (`paper`), or over that of the part, bounded (`robust`).
+    Over all touching skin (`paper`) [m], or over that of the part, bounded (`robust`) [1].
     """
     weight = touches.weight.sum(-1).clamp_min(1e-9)
     if form == "paper":
@@ -349,11 +314,6 @@ def heading_term(layout: Layout, touches: ContactPoints) -> Float[Tensor, "*star
     seated = touches.heading.square().sum(-1) > 0
     cost = torch.where(seated, 1 - facing, torch.zeros_like(facing))
     return torch.zeros_like(layout.yaw).index_add(-1, touches.object_of, cost)
-
-
-def _by_region(parts: Tensor) -> Tensor:
-    """From (touched, 4 parts, points) to (touched, 2 regions, points of body and hand)."""
-    return parts.unflatten(1, (2, 2)).transpose(1, 2).flatten(2, 3)
 
 
 # --- Feet at rest stand on the ground -------------------------------------------------------------
@@ -421,12 +381,6 @@ def tilt_prior(
 
     Half the squared change over `spread` where it is small; it grows only as a logarithm, because a
     guess is either a few degrees off or no guess at all (a camera that is said to be level).
-
-    Args:
-        pitch: Pitch [rad].
-        roll: Roll [rad].
-        first: Their first guess [rad].
-        spread: How far off a guess usually is [rad].
     """
     squared = ((pitch - first[0]).square() + (roll - first[1]).square()) / spread**2
     return 0.5 * TILT_TAIL * (1 + squared / TILT_TAIL).log()

@@ -162,12 +162,9 @@ class BestShift(NamedTuple):
 def borders_of(
     masks: Float[Tensor, "objects h w"], zoom: Float[Tensor, " objects"], shifts: tuple[float, ...]
 ) -> Borders:
-    """The masks grown by each shift, with borders as wide as a pixel.
+    """The masks grown by each shift [px of the image; below zero: taken in], borders a pixel wide.
 
-    Args:
-        masks: Detected coverage.
-        zoom: Pixels of the window for one of the image.
-        shifts: [px of the image], below zero: taken in.
+    `zoom` is the number of pixels of the window for one of the image.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -188,26 +185,20 @@ def borders_of(
 
 
 def fit_borders(
-    drawn: tuple[Float[Tensor, "*starts objects h w"], Float[Tensor, "*starts objects verts 2"]],
-    seen: tuple[Float[Tensor, "objects 4"], Int[Tensor, "objects 4"], Bool[Tensor, "objects h w"]],
+    drawn: Float[Tensor, "*starts objects h w"],
+    pixels: Float[Tensor, "*starts objects verts 2"],
+    boxes: Float[Tensor, "objects 4"],
+    sides: Int[Tensor, "objects 4"],
+    keep: Bool[Tensor, "objects h w"],
     trust: Float[Tensor, " objects"],
     borders: Borders,
     weights: tuple[float, float],
 ) -> BestShift:
-    """Box and silhouette (robust) with the shift of the border that suits each object best.
-
-    Args:
-        drawn: Silhouettes, and vertices in the image [px].
-        seen: Detected boxes [px], what is known of their sides, and which pixels are.
-        trust: Weight of each silhouette.
-        borders: What the masks may be.
-        weights: Of the box and of the silhouette.
-    """
-    boxes, sides, keep = seen
+    """Box and silhouette (robust) with the shift of the border that suits each object best."""
     bbox, outline = [], []
     for shift, mask in zip(borders.steps, borders.masks, strict=True):
-        bbox.append(bbox_term(drawn[1], boxes, sides, 1.0, "robust", shift))
-        outline.append(trust * silhouette_term(drawn[0], mask, keep, "robust"))
+        bbox.append(bbox_term(pixels, boxes, sides, 1.0, "robust", shift))
+        outline.append(trust * silhouette_term(drawn, mask, keep, "robust"))
     boxed, cost = torch.stack(bbox), BORDER_WEIGHT * borders.shifts.square()
     silhouette = torch.stack(outline)
     cost = cost.view(-1, *[1] * (silhouette.dim() - 1)).expand_as(silhouette)

@@ -50,13 +50,7 @@ class Term(Generic[S]):
 
 
 def active_weights(weights: W, terms: Iterable[Term[S]], has: Callable[[str], bool]) -> W:
-    """The weights without those whose evidence is missing.
-
-    Args:
-        weights: A dataclass of numbers.
-        terms: The objective.
-        has: Whether the evidence of a name is there.
-    """
+    """The weights without those whose evidence is missing."""
     missing = {t.name: 0.0 for t in terms if not all(map(has, t.needs))}
     return dataclasses.replace(weights, **missing)
 
@@ -95,121 +89,57 @@ def minimize(
     observe: Observer = silent,
     stage: str = "",
 ) -> Minimum[P]:
-    """Follow the gradient of `energy` from `start`.
+    """Follow the gradient of `energy` from `start`, by Adam.
 
     Every field of `P` is a tensor; with `keep_best` its leading axes are those of the items.
-
-    Args:
-        energy: What to minimise.
-        start: From where.
-        method: How.
-        observe: Receives every step.
-        stage: Name for observers and error messages.
 
     Raises:
         ValueError: If the energy stops being finite.
     """
-    free = _FreeTensors(start, method)
-    for index in range(method.steps):
-        value = free.step(energy)
-        observe(Step(stage, index, method.steps, value, lambda: free.record))
-    with torch.no_grad():
-        last = energy(free.record).per_item
-        free.note(last)
-        if not torch.cat([free.trace, last.sum().view(1)]).isfinite().all():
-            raise ValueError(f"{stage}: the energy is not finite")
-        if method.keep_best:
-            last = free.lowest
-            free.at.copy_(free.best)
-    at = map_tensors(lambda x: x.detach().clone(), free.record)
-    return Minimum(at, last, free.trace)
-
-
-class _FreeTensors(Generic[P]):
-    """All fields of a record in one tensor, and all that a step reads and changes."""
-
-    trace: Tensor
-    """Total energy before each step."""
-    lowest: Tensor
-    """Lowest energy of each item so far (`keep_best`)."""
-    owner: Tensor
-    """Number of the item that each unknown belongs to (`keep_best`)."""
-
-    def __init__(self, start: P, method: Adam) -> None:
-        names = [f.name for f in dataclasses.fields(start)]  # type: ignore[arg-type]
-        fields = [getattr(start, n).detach() for n in names]
-        self.at = torch.cat([x.flatten() for x in fields])
-        self.best = self.at.clone()
-        self.slope, self.mean, self.square = (torch.zeros_like(self.at) for _ in range(3))
-        sizes = [x.numel() for x in fields]
-        leaves: dict[str, Tensor] = {}
-        for name, x, part, grad in zip(
-            names, fields, self.at.split(sizes), self.slope.split(sizes), strict=True
-        ):
-            leaves[name] = part.view(x.shape).detach().requires_grad_()
-            leaves[name].grad = grad.view(x.shape)
-        self.record: P = dataclasses.replace(start, **leaves)  # type: ignore[type-var]
-        self.shapes = [x.shape for x in fields]
-        self.method, self.noted = method, False
-        self.table = torch.tensor(_table(method)).to(self.at)
-        self.index = torch.zeros(1, dtype=torch.int64, device=self.at.device)
-
-    def step(self, energy: Callable[[P], Energy]) -> Energy:
-        """One step down, and the energy before it."""
-        self.slope.zero_()
-        value = energy(self.record)
-        value.total.backward()
-        with torch.no_grad():
-            items = value.per_item.detach()
-            self.note(items)
-            self.trace.index_copy_(0, self.index, items.sum().view(1))
-            self.move()
-            self.index.add_(1)
-        return value
-
-    def move(self) -> None:
-        """Adam's step, in the operations of `torch.optim.Adam`."""
-        beta2, grad = self.method.beta2, self.slope
-        spread, rate = self.table.index_select(0, self.index)[0].unbind()
-        self.mean.lerp_(grad, 1 - BETA1)
-        self.square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-        length = (self.square.sqrt() / spread).add_(1e-8)
-        self.at.add_((self.mean * rate).div_(length))
-
-    def note(self, items: Tensor) -> None:
-        """Keep, item by item, the state with the lowest energy so far, and that energy."""
-        if not self.noted:
-            self._begin(items)
-        if self.method.keep_best:
-            wins = items < self.lowest
-            torch.where(wins.flatten()[self.owner], self.at, self.best, out=self.best)
-            torch.where(wins, items, self.lowest, out=self.lowest)
-
-    def _begin(self, items: Tensor) -> None:
-        """Room for what is known of each item, once it is known how many there are."""
-        self.noted, self.trace = True, items.new_zeros(self.method.steps)
-        if not self.method.keep_best:
-            return
-        self.lowest = torch.full_like(items, torch.inf)
-        number = torch.arange(items.numel(), device=items.device).view(items.shape)
-        parts = [
-            number.reshape(items.shape + (1,) * (len(shape) - items.ndim)).expand(shape)
-            for shape in self.shapes
-        ]
-        self.owner = torch.cat([x.flatten() for x in parts])
-
-
-def _table(method: Adam) -> list[tuple[float, float]]:
-    """By what the root of the squares is divided, and how far to go, at each step."""
-    return [
-        (
-            (1 - method.beta2 ** (index + 1)) ** 0.5,
-            -_rate(method, index) / (1 - BETA1 ** (index + 1)),
-        )
-        for index in range(method.steps)
+    names = [f.name for f in dataclasses.fields(start)]  # type: ignore[arg-type]
+    fields = [getattr(start, name).detach() for name in names]
+    at = torch.cat([x.flatten() for x in fields])  # all unknowns in one tensor; leaves share it
+    parts = at.split([x.numel() for x in fields])
+    leaves = [
+        part.view(x.shape).detach().requires_grad_() for part, x in zip(parts, fields, strict=True)
     ]
+    free: P = dataclasses.replace(start, **dict(zip(names, leaves, strict=True)))  # type: ignore[type-var]
+    mean, square, trace = torch.zeros_like(at), torch.zeros_like(at), list[Tensor]()
+    best: tuple[Tensor, Tensor] | None = None
+    for index in range(method.steps):
+        value = energy(free)
+        slopes = torch.autograd.grad(value.total, leaves, materialize_grads=True)
+        slope, items = torch.cat([x.flatten() for x in slopes]), value.per_item.detach()
+        best = _lower(best, items, at, fields) if method.keep_best else None
+        trace.append(items.sum())
+        share = index / max(1, method.steps - 1)
+        rate = method.rate * (method.last_rate / method.rate) ** share
+        mean.lerp_(slope, 1 - BETA1)
+        square.mul_(method.beta2).addcmul_(slope, slope, value=1 - method.beta2)
+        length = (square.sqrt() / (1 - method.beta2 ** (index + 1)) ** 0.5).add_(1e-8)
+        at.add_((mean * (-rate / (1 - BETA1 ** (index + 1)))).div_(length))
+        observe(Step(stage, index, method.steps, value, lambda: free))
+    with torch.no_grad():
+        last = energy(free).per_item
+    best = _lower(best, last, at, fields) if method.keep_best else None
+    totals = torch.stack([*trace, last.sum()])
+    if not bool(totals.isfinite().all()):
+        raise ValueError(f"{stage}: the energy is not finite")
+    if best is not None:
+        last = best[0]
+        at.copy_(best[1])
+    return Minimum(map_tensors(lambda x: x.detach().clone(), free), last, totals[:-1])
 
 
-def _rate(method: Adam, index: int) -> float:
-    share = index / max(1, method.steps - 1)
-    return method.rate * (method.last_rate / method.rate) ** share
+def _lower(
+    best: tuple[Tensor, Tensor] | None, items: Tensor, at: Tensor, fields: list[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """The lowest energy of each item so far, and the unknowns of all items there."""
+    if best is None:
+        return items.clone(), at.clone()
+    wins = items < best[0]
+    owners = [
+        wins.reshape(items.shape + (1,) * (x.ndim - items.ndim)).expand(x.shape) for x in fields
+    ]
+    there = torch.where(torch.cat([x.flatten() for x in owners]), at, best[1])
+    return torch.where(wins, items, best[0]), there

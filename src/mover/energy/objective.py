@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mover.core.devices import constant
 from mover.core.observe import Energy, PerItem
-from mover.core.records import record, rows_of
+from mover.core.records import map_tensors, record, rows_of
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.human_terms import (
@@ -97,8 +97,6 @@ class HumanCues:
     depth: DepthRange | None = None
     space: BodySpace | None = None
     touches: ContactPoints | None = None
-    trees: Trees | None = None
-    """Finds what is touched faster; None: all points are compared."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +107,8 @@ class SceneEvidence:
     camera: Camera
     image: ImageCues
     humans: HumanCues
+    trees: Trees | None = None
+    """Finds what is touched faster (`trees_of`); None: all points are compared."""
 
     def has(self, name: str) -> bool:
         """Whether a field of the cues is known."""
@@ -119,12 +119,14 @@ class SceneEvidence:
         n = len(self.objects.ids)
         image = of_objects(self.image, rows % n, n)
         humans = of_objects(self.humans, rows % n, n)
-        return SceneEvidence(some_objects(self.objects, rows), self.camera, image, humans)
+        trees = map_tensors(lambda x: x[rows % n], self.trees)
+        return SceneEvidence(some_objects(self.objects, rows), self.camera, image, humans, trees)
 
     def bare(self) -> "SceneEvidence":
         """That without meshes, maps and people, which `Term.bare` terms do not look at."""
-        image = rows_of(self.image, torch.zeros(0).to(self.image.sides), "h")
-        return SceneEvidence(without_meshes(self.objects), self.camera, image, HumanCues())
+        none = torch.zeros(0).to(self.image.sides)
+        objects = rows_of(self.objects, none, "verts", "faces", "edges", "samples", "region")
+        return SceneEvidence(objects, self.camera, rows_of(self.image, none, "h"), HumanCues())
 
 
 @dataclass(frozen=True)
@@ -180,9 +182,10 @@ class PlacedScene:
     def fitted(self) -> BestShift:
         """Box and silhouette under the border of each mask that suits them best."""
         image, w = self.known.image, self.config.weights
-        seen = image.boxes, image.sides, image.keep
-        drawn = self.silhouettes, self.extent
-        return fit_borders(drawn, seen, image.trust, there(image.borders), (w.bbox, w.silhouette))
+        return fit_borders(
+            self.silhouettes, self.extent, image.boxes, image.sides, image.keep, image.trust,
+            there(image.borders), (w.bbox, w.silhouette),
+        )  # fmt: skip
 
 
 def _bbox(s: PlacedScene) -> PerItem:
@@ -218,7 +221,7 @@ def _collision(s: PlacedScene) -> PerItem:
 def _contact(s: PlacedScene) -> PerItem:
     objects, humans = s.known.objects, s.known.humans
     touches = there(humans.touches)
-    distance = contact_distance(s.layout, objects, touches, humans.trees)
+    distance = contact_distance(s.layout, objects, touches, s.known.trees)
     return contact_term(distance, touches, len(objects.ids), s.config.form)
 
 
@@ -313,12 +316,6 @@ def of_objects(evidence: E, index: Rows, count: int) -> E:
         rest = rows_of(replace(evidence, touches=None), index, "objects", "items")
         return cast(E, replace(rest, touches=touches))
     return rows_of(evidence, index, "objects", "items")
-
-
-def without_meshes(objects: Objects) -> Objects:
-    """The objects as boxes alone: enough for terms that draw and touch nothing."""
-    none = torch.zeros(0).to(objects.supports)
-    return rows_of(objects, none, "verts", "faces", "edges", "samples", "region")
 
 
 def some_supports(supports: Int[Tensor, " objects"], rows: Rows) -> Int[Tensor, " rows"]:

@@ -21,7 +21,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.core.devices import constant
 from mover.core.records import record
 from mover.core.types import Layout, Objects
 from mover.energy.config import GROWTH, Variant
@@ -46,11 +45,6 @@ def scale_term(
     logarithms, so that half and double cost the same; an object that grows or shrinks as a whole
     costs less than half of a change of shape, and sizes beyond 0.6 or 1.6 of the initial one cost
     steeply more: \sum_k (l_k - m)^2 + g m^2 + 10 \sum_k out(l_k)^2,  m = mean l_k.
-
-    Args:
-        log_scale: Logarithms of the scales.
-        form: As printed, or robust.
-        growth: g, the weight of another size as a whole.
     """
     if form == "paper":
         return safe_norm(log_scale.exp() - 1)
@@ -151,12 +145,30 @@ class Given:
 
 
 def given_term(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
-    """How far places, yaws and sizes are from what is expected [nats, times the weight]."""
+    """How far positions, yaws and sizes are from what is expected [nats, times the weight]."""
+    turns = given.weight.clamp_max(TURNS)
     if not given.placed:
-        return given.weight.clamp_max(TURNS) * (_axis(layout, given) + _standard(layout, given))
-    turned = _yaw(layout, given) + _axis(layout, given)
-    placed = _place(layout, given) + _size(layout, given)
-    return given.weight.clamp_max(TURNS) * turned + given.weight * placed
+        return turns * (_axis(layout, given) + _student(_off_standard(layout, given)).sum(-1))
+    yaw = given.unturned - _density(layout.yaw - given.yaw).log()
+    turned = yaw + _axis(layout, given)
+    position = _student((_away(layout, given) / AWAY).square())
+    farther = _away(layout, given).unsqueeze(-1)
+    kept = layout.log_scale.square().sum(-1) / SIZE**2
+    seen = (layout.log_scale - farther).square().sum(-1) / SIZE**2
+    usual = _off_standard(layout, given).sum(-1)
+    size = usual / 2 + math.log(2) - torch.logaddexp(-kept / 2, -seen / 2)
+    return turns * turned + given.weight * (position + size)
+
+
+def _axis(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
+    """Densities over a quarter turn, against an even one."""
+    free, turned = 1 - given.along, (4 * (layout.yaw - given.axis)).cos() - 1
+    return given.aligned - (free + given.level * (given.sharpness * turned).exp()).log()
+
+
+def _off_standard(layout: Layout, given: Given) -> Float[Tensor, "*starts objects 3"]:
+    """Squared standard deviations from the standard sizes."""
+    return given.precision * (layout.log_scale - given.standard).square()
 
 
 def _away(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
@@ -165,17 +177,9 @@ def _away(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
     return away - given.log_distance
 
 
-def _place(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
-    return _student((_away(layout, given) / AWAY).square())
-
-
 def _student(squares: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
     """Of squared standard deviations, with three degrees of freedom."""
     return 2 * (1 + squares / 3).log()
-
-
-def _yaw(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
-    return given.unturned - _density(layout.yaw - given.yaw).log()
 
 
 def _density(turned: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
@@ -185,30 +189,6 @@ def _density(turned: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
     flipped = torch.stack([(sharp * (c - 1)).exp() for c in quarters]).sum(0)
     right = (sharp * (turned.cos() - 1)).exp()
     return (1 - FLIPPED) * right + FLIPPED / 3 * flipped + ANY
-
-
-def _axis(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
-    """Densities over a quarter turn, against an even one."""
-    free = 1 - given.along
-    turned = (4 * (layout.yaw - given.axis)).cos() - 1
-    return given.aligned - (free + given.level * (given.sharpness * turned).exp()).log()
-
-
-def _size(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
-    farther = _away(layout, given).unsqueeze(-1)
-    kept = layout.log_scale.square().sum(-1) / SIZE**2
-    seen = (layout.log_scale - farther).square().sum(-1) / SIZE**2
-    usual = _off_standard(layout, given).sum(-1)
-    return usual / 2 + math.log(2) - torch.logaddexp(-kept / 2, -seen / 2)
-
-
-def _standard(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
-    return _student(_off_standard(layout, given)).sum(-1)
-
-
-def _off_standard(layout: Layout, given: Given) -> Float[Tensor, "*starts objects 3"]:
-    """Squared standard deviations from the standard sizes."""
-    return given.precision * (layout.log_scale - given.standard).square()
 
 
 # --- Walls: furniture along a wall has its back in one line with its neighbours' ------------------
@@ -323,14 +303,10 @@ def apart_term(layout: Layout, objects: Objects, solids: Solids) -> Float[Tensor
     """Cost of the samples of each object that lie inside others [1]; one position an object."""
     layout = replace(layout, yaw=layout.yaw.detach(), log_scale=layout.log_scale.detach())
     points, pairs = place(objects.samples, layout), solids.pairs
-    here = points.device.type == "cpu"
-    if here:
-        pairs = pairs[_meet(layout, objects, pairs)]
+    pairs = pairs[_meet(layout, objects, pairs).cpu()]
     total = torch.zeros_like(layout.yaw) + 0 * layout.t_world_object.sum(-1)  # of all positions
-    index = total.new_zeros(0, dtype=torch.long)
     for other in pairs[:, 1].unique().tolist():  # each with a volume of its own
-        ones = pairs[pairs[:, 1] == other, 0]
-        ones = ones if here else constant(tuple(ones.tolist()), index)
+        ones = pairs[pairs[:, 1] == other, 0].to(points.device)
         scale = layout.log_scale[other]
         away = points[ones] - layout.t_world_object[other]
         own = away @ rot_y(layout.yaw[other]) / scale.exp()

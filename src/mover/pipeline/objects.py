@@ -40,13 +40,14 @@ from mover.stages.objects.find_image_cues import (
     order_in_image,
     order_of,
 )
-from mover.stages.objects.fronts import turned_to_people
 from mover.stages.objects.gather_depth import DepthImageInputs, gather_depth
 from mover.stages.objects.gather_given import (
     UNFIT,
     bounded_sides,
+    estimate_size_prior,
     gather_given,
     given_axis,
+    inlier_weights,
     lighter_where_used,
     prior_weights,
 )
@@ -56,8 +57,7 @@ from mover.stages.objects.place_objects import place_objects
 from mover.stages.objects.prepare_objects import Prepared, PrepareInputs, prepare_objects
 from mover.stages.objects.room_scale import ScaleKnown, common_scale, seat_height_estimate
 from mover.stages.objects.seat_heights import SeatInputs, find_seat_heights, with_lifted_seats
-from mover.stages.objects.size_prior import estimate_size_prior, inlier_weights
-from mover.stages.objects.starts import best_few, other_starts, reference_yaw
+from mover.stages.objects.starts import best_few, other_starts, reference_yaw, turned_to_people
 from mover.stages.people.find_depth import are_shapeless, nearer, pelvis, size_spread
 
 NO_PEOPLE = HumanCues()
@@ -183,8 +183,9 @@ def place_by_image(
     cues = _with_prior(cues, setup, camera, before)
     if before is not None:  # the room as it was given does not give the scale of a depth
         cues = _with_measured(cues, setup, camera, ground, before.layout)
-    pinned = _pinned(setup, first)
-    inputs = PlaceInputs(objects, camera, ground, cues, NO_PEOPLE, starts, first.yaw, pinned)
+    inputs = PlaceInputs(
+        objects, camera, ground, cues, NO_PEOPLE, starts, first.yaw, _pinned(setup, first)
+    )
     placed = setup.run.stage(place_objects, inputs, searching)
     return Arrangement(
         camera, ground, image, first, placed, placed.layout, with_walls(inputs, placed.walls),
@@ -248,33 +249,28 @@ def estimate_scale(
     )
 
 
-def gather_humans(setup: Setup, people: Located, placed: Arrangement) -> Humans:
-    """Depth range and free space from all frames, and contacts, each given to an object."""
-    bodies = people.in_world(placed.camera)
-    inputs = GatherInputs(
-        bodies, setup.capture.people, setup.seen.masks, placed.camera, people.path
-    )
-    start(setup.run, gather_cues, inputs, setup.config.gather)
-    contacts = _assigned(setup, people, placed)
-    return Humans(setup.run.stage(gather_cues, inputs, setup.config.gather), contacts)
+def gather_humans(
+    setup: Setup, people: Located, placed: Arrangement, before: Humans | None = None
+) -> Humans:
+    """Depth range and free space from all frames, and contacts, each given to an object.
 
-
-def with_contacts(setup: Setup, people: Located, placed: Arrangement, humans: Humans) -> Humans:
-    """The contacts assigned again, to the objects where they stand now."""
-    return replace(humans, contacts=_assigned(setup, people, placed))
-
-
-def _assigned(setup: Setup, people: Located, placed: Arrangement) -> ContactAssignment:
-    """Contact points, each given to an object where it stands now."""
+    With `before`, only the contacts are assigned again, to the objects where they stand now.
+    """
     bodies, capture, seen = people.in_world(placed.camera), setup.capture, setup.seen
+    inputs = GatherInputs(bodies, capture.people, seen.masks, placed.camera, people.path)
+    if before is None:
+        start(setup.run, gather_cues, inputs, setup.config.gather)
     given = None if capture.touch is None else capture.touch[people.kept]
-    inputs = ContactInputs(bodies, people.parts, placed.ground, given)
-    chance = setup.run.stage(find_contacts, inputs, setup.config.contacts).probability
-    contacts = AssignInputs(
+    touching = ContactInputs(bodies, people.parts, placed.ground, given)
+    chance = setup.run.stage(find_contacts, touching, setup.config.contacts).probability
+    assigned = AssignInputs(
         bodies, chance, people.parts, seen.masks, seen.boxes, placed.camera, setup.objects,
         placed.layout, capture.people,
     )  # fmt: skip
-    return setup.run.stage(assign_contacts, contacts, setup.config.assign)
+    contacts = setup.run.stage(assign_contacts, assigned, setup.config.assign)
+    if before is not None:
+        return replace(before, contacts=contacts)
+    return Humans(setup.run.stage(gather_cues, inputs, setup.config.gather), contacts)
 
 
 def ordered(setup: Setup, placed: Arrangement) -> Arrangement:

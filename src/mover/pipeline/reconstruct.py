@@ -64,7 +64,7 @@ def from_image_and_people(
     for number in range(1 + config.outer_iterations):
         if number:
             placed = steps.ordered(setup, placed)
-            humans = steps.with_contacts(setup, people, placed, humans)
+            humans = steps.gather_humans(setup, people, placed, humans)
         setup = steps.with_seats_lifted(setup, people, placed, humans, fit)  # robust
         placed = steps.place_by_all(setup, people, placed, humans, fit)  # Eq. 1
     room = furnished(setup, placed, people, humans)

@@ -20,7 +20,7 @@ from mover.pipeline.people import Located, estimate_people
 from mover.pipeline.presets import ROBUST
 from mover.stages.contacts.diagnostics import DiagnosticInputs, diagnostics
 from mover.stages.contacts.label_contacts import LabelInputs
-from mover.stages.objects.place_objects import energy_of, with_trees
+from mover.stages.objects.place_objects import energy_of
 from mover.stages.objects.prepare_objects import proxy_meshes, to_objects
 from mover.stages.objects.seat_heights import seat_warnings
 
@@ -93,7 +93,7 @@ def _evidence(setup: Setup, placed: Arrangement, humans: Humans | None) -> tuple
         samples = place(setup.objects.samples, placed.layout)
         near_body = sample(cues.space.volume, samples).amin(-1).tolist()
     pixels = setup.seen.masks.sum((-2, -1)).tolist()
-    parts = energy_of(with_trees(placed.minimised), placed.config)(placed.layout[None]).parts
+    parts = energy_of(placed.minimised, placed.config)(placed.layout[None]).parts
     terms = [{name: float(part[0, i]) for name, part in parts.items()} for i in range(len(ids))]
     energy = [sum(row.values()) for row in terms]
     rows = zip(ids, pixels, near, far, bodies, near_body, energy, terms, strict=True)

@@ -54,10 +54,8 @@ class DepthConfig:
     """Factors from 1 - span to 1 + span are tried."""
     factors: Annotated[int, int_in(3, 1000)] = 13
     """How many."""
-    every: Count = 1
-    """Use every so many of a person's frames ..."""
     most: Count = 40
-    """... and at most so many in which it is seen well, spread over the video."""
+    """At most so many of a person's frames in which it is seen well, spread over the video."""
     whole: Count = 150
     """At most so many frames are searched for people who are seen well, or wholly."""
     least: Count = 3
@@ -202,8 +200,6 @@ class GatherConfig:
     """Pixels (of an image 640 wide) by which masks and silhouettes shrink."""
     reach: Metres = 0.0
     """How far the outlines of bodies may be wrong: what is thinner is not hidden (robust) [m]."""
-    vote: bool = True
-    """Per body and object, keep only the larger of the hidden and the hiding region."""
     cells: Annotated[int, int_in(8, 512)] = 256
     """Cells along the longest side of the volume of all bodies."""
 

@@ -20,8 +20,8 @@ from mover.core.types import STILL, CameraPath, Capture, Masks, People
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import at_pixels
 from mover.geometry.path import is_still, poses_at
-from mover.geometry.rle import decode, joined
-from mover.stages.masks import enlarged, thin, uncovered, widened
+from mover.geometry.rle import joined
+from mover.stages.masks import enlarged, pixels_of, thin, widened
 
 STEP = 4  # [px] from one pixel of a carried mask to the next
 LIKE = 2  # masks of each object that are carried: a person may stand before one of them
@@ -85,23 +85,6 @@ def covered(cover: Cover) -> Callable[[int], Bool[Tensor, "h w"]]:
         same = pixels_of(cover.masks)
         return lambda _: same
     return cache(lambda frame: _carried(cover, frame))
-
-
-def clear(cover: Cover, width: int) -> Callable[[int], Bool[Tensor, "small_h small_w"]]:
-    """The pixels of a smaller picture in which no person is hidden in a frame."""
-    blocked = covered(cover)
-    if is_still(cover.path):
-        same = uncovered(blocked(0), width)
-        return lambda _: same
-    return cache(lambda frame: uncovered(blocked(frame), width))
-
-
-def pixels_of(masks: Masks) -> Bool[Tensor, "h w"]:
-    """The pixels that are in any of some masks."""
-    found = torch.zeros(masks.height, masks.width, dtype=torch.bool)
-    for row in range(len(masks.counts)):
-        found = found | decode(masks, row)
-    return found
 
 
 def _carried(cover: Cover, frame: int) -> Bool[Tensor, "h w"]:

@@ -31,28 +31,33 @@ class MaskTable:
 
     def decode(self, body: int) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
         """The visible mask of a body, and the union of the other people's."""
-        own = self.own[body]
-        blank = torch.zeros(self.masks.height, self.masks.width, dtype=torch.bool)
-        rest = blank
-        for row in self.others[body]:
-            rest = rest | decode(self.masks, row)
-        return (blank if own is None else decode(self.masks, own)), rest
+        own, size = self.own[body], (self.masks.height, self.masks.width)
+        counts = tuple(self.masks.counts[row] for row in self.others[body])
+        visible = torch.zeros(size, dtype=torch.bool) if own is None else decode(self.masks, own)
+        return visible, pixels_of(Masks(*size, counts))
+
+
+def pixels_of(masks: Masks) -> Bool[Tensor, "h w"]:
+    """The pixels that are in any of some masks."""
+    found = torch.zeros(masks.height, masks.width, dtype=torch.bool)
+    for row in range(len(masks.counts)):
+        found = found | decode(masks, row)
+    return found
 
 
 def mask_table(people: People, bodies: Bodies) -> MaskTable:
     """Match masks with bodies by frame and track."""
-    row_of = {
-        key: row
-        for row, key in enumerate(zip(people.frame.tolist(), people.person.tolist(), strict=True))
-    }
+    row_of: dict[tuple[int, int], int] = {}
     in_frame: dict[int, list[int]] = {}
-    for row, frame in enumerate(people.frame.tolist()):
+    masked = zip(people.frame.tolist(), people.person.tolist(), strict=True)
+    for row, (frame, person) in enumerate(masked):
+        row_of[frame, person] = row
         in_frame.setdefault(frame, []).append(row)
-    keys = list(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True))
-    own = tuple(row_of.get(key) for key in keys)
+    frames, persons = bodies.frame.tolist(), bodies.person.tolist()
+    own = tuple(row_of.get(key) for key in zip(frames, persons, strict=True))
     others = tuple(
-        tuple(row for row in in_frame.get(frame, []) if row != mine)
-        for (frame, _), mine in zip(keys, own, strict=True)
+        tuple(row for row in in_frame.get(frame, ()) if row != mine)
+        for frame, mine in zip(frames, own, strict=True)
     )
     return MaskTable(people.masks, own, others)
 
@@ -177,10 +182,8 @@ def overlaps(
     """
     where = known.flatten().nonzero()[:, 0]
     inside = mask.flatten()[where]
-    exact, wide, narrow = (
-        image.flatten(1).index_select(1, where).float()
-        for image in (drawn, _grown(drawn), ~_grown(~drawn))
-    )
+    images = drawn, _grown(drawn), ~_grown(~drawn)
+    exact, wide, narrow = (x.flatten(1).index_select(1, where).float() for x in images)
     best = torch.zeros(len(drawn)).to(mask)
     for margin in torch.linspace(-1, 1, MARGINS).tolist():  # a few; all at once is much memory
         part = exact + abs(margin) * ((wide if margin > 0 else narrow) - exact)

@@ -51,7 +51,8 @@ def energy_of_rows(
 
     Rows count through (starts x objects); the layout has one row for each.
     """
-    known = SceneEvidence(objects, camera, image, humans)
+    trees = trees_of(objects, humans.touches) if config.weights.contact else None
+    known = SceneEvidence(objects, camera, image, humans, trees)
     config = active_config(config, known)
     kernel = fused_energy(known, config)
     left = [t for t in SCENE_TERMS if kernel is None or not t.fused]
@@ -67,7 +68,7 @@ def energy_of_rows(
                 here = replace(few, camera=replace(camera, R_cam_world=R_cam_world))
             if kernel is None:
                 return energy_of_terms(rest, layout, here, config)
-            found = _by_kernel((kernel, config.weights), layout, rows, R_cam_world)
+            found = _by_kernel(kernel, config.weights, layout, rows, R_cam_world)
             if not rest:
                 return found
             others = energy_of_terms(rest, layout, here, config)
@@ -79,12 +80,12 @@ def energy_of_rows(
 
 
 def _by_kernel(
-    weighted: tuple[FusedEnergy, SceneWeights],
+    kernel: FusedEnergy,
+    weights: SceneWeights,
     layout: Layout,
     rows: Rows | None,
     turn: Tensor | None,
 ) -> Energy:
-    kernel, weights = weighted
     at = layout.t_world_object, layout.yaw, layout.log_scale
     whole, parts = fused_cost(kernel, *at, rows, turn)
     each = zip(FUSED, parts.unbind(-1), strict=True)
@@ -96,22 +97,13 @@ def fused_energy(known: SceneEvidence, config: SceneConfig) -> FusedEnergy | Non
 
     It can on a CPU in single precision, for the robust form and closed meshes.
     """
-    humans = known.humans
     if engine() != "warp" or config.form != "robust" or not _plain(known):
         return None
-    if humans.touches is not None and humans.trees is None and config.weights.contact:
-        humans = replace(humans, trees=trees_of(known.objects, humans.touches))
-    if config.weights.contact and humans.trees is None:
+    touches = known.humans.touches
+    once = touches is None or len(touches.object_of.unique()) == len(touches.object_of)
+    if (config.weights.contact and known.trees is None) or not once or not _closed(known.objects):
         return None
-    if not _once(humans) or not _closed(known.objects):
-        return None
-    return kernel_of(known.objects, known.camera, known.image, humans, config)
-
-
-def _once(humans: HumanCues) -> bool:
-    """Whether the touched objects come one after the other."""
-    touched = None if humans.touches is None else humans.touches.object_of
-    return touched is None or len(touched.unique()) == len(touched)
+    return kernel_of(known, config)
 
 
 def _plain(known: SceneEvidence) -> bool:
@@ -128,14 +120,10 @@ def _plain(known: SceneEvidence) -> bool:
     here = all(x.dtype == torch.float32 and x.device.type == "cpu" for x in tensors)
     if not here or any(x.requires_grad for x in tensors) or not len(objects.ids):
         return False
-    turned = float(torch.linalg.det(camera.R_cam_world)) > 0
-    return turned and _pinhole(camera.K[None]) and _pinhole(image.views.K)
-
-
-def _pinhole(K: Tensor) -> bool:
-    """Whether there is no skew, and nothing is mirrored."""
-    zero = torch.cat([K[:, 0, 1], K[:, 1, 0], K[:, 2, 0], K[:, 2, 1], K[:, 2, 2] - 1])
-    return not bool(zero.any()) and bool((K[:, 0, 0] > 0).all() and (K[:, 1, 1] > 0).all())
+    K = torch.cat([camera.K[None], image.views.K])  # without skew; nothing is mirrored
+    off = torch.stack([K[:, 0, 1], K[:, 1, 0], K[:, 2, 0], K[:, 2, 1], K[:, 2, 2] - 1])
+    pinhole = not bool(off.any()) and bool((K[:, [0, 1], [0, 1]] > 0).all())
+    return pinhole and float(torch.linalg.det(camera.R_cam_world)) > 0
 
 
 def _closed(objects: Objects) -> bool:
@@ -145,12 +133,8 @@ def _closed(objects: Objects) -> bool:
         return False
     row, _ = torch.nonzero(edges, as_tuple=True)
     v0, v1, one, two = objects.edges[edges].unbind(-1)
-    return bool(
-        (_runs(objects.faces[row, one], v0, v1) & _runs(objects.faces[row, two], v1, v0)).all()
-    )
-
-
-def _runs(face: Tensor, tail: Tensor, head: Tensor) -> Tensor:
-    """Whether a face runs from one vertex to the other."""
-    after = face.roll(-1, -1)
-    return ((face == tail[:, None]) & (after == head[:, None])).any(-1)
+    runs = torch.ones_like(v0, dtype=torch.bool)
+    for number, tail, head in ((one, v0, v1), (two, v1, v0)):  # each face along its edge
+        face = objects.faces[row, number]
+        runs &= ((face == tail[:, None]) & (face.roll(-1, -1) == head[:, None])).any(-1)
+    return bool(runs.all())

@@ -59,16 +59,16 @@ class FusedEnergy:
     """From the world to the camera, where nothing else is asked for."""
     turn: Tensor
     """The same as it is now; memory of the kernel."""
-    buffers: list["_Buffers"] = field(default_factory=list)
+    buffers: "_Buffers | None" = None
     """Memory for the most items so far."""
     lock: Any = field(default_factory=Lock)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Buffers:
     """Memory for all starts of all objects, and a launch for each thread."""
 
-    rows: list[Tensor]
+    rows: Tensor
     """Which items `order` is about."""
     order: Tensor
     layout: Tensor
@@ -164,7 +164,14 @@ def _of_camera(slopes: Tensor, place: Tensor, turn: Tensor) -> Tensor:
 def _run(fused: FusedEnergy, layout: Tensor, rows: Tensor) -> _Buffers:
     """Sum these rows, the largest objects first, on as many threads as are wanted."""
     count = min(threads(), max(len(rows), 1))
-    buffers = _acquire(fused, rows, count)
+    need = int(rows.max()) + 1 if len(rows) else 0
+    buffers = fused.buffers
+    if buffers is None or len(buffers.layout) < need or len(buffers.launches) < count:
+        fused.buffers = buffers = _buffers_of(fused, need, count)
+    if not torch.equal(buffers.rows, rows):
+        effort = fused.effort[rows % max(1, len(fused.effort))]
+        buffers.order[: len(rows)] = rows[effort.argsort(descending=True, stable=True)]
+        buffers.rows = rows.clone()
     buffers.layout[rows] = layout
     todo = iter(_chunks(len(rows), count))
 
@@ -176,20 +183,6 @@ def _run(fused: FusedEnergy, layout: Tensor, rows: Tensor) -> _Buffers:
             launch.launch()
 
     share(work, count)
-    return buffers
-
-
-def _acquire(fused: FusedEnergy, rows: Tensor, count: int) -> _Buffers:
-    """Memory in which these rows are next; that of the last call where it is large enough."""
-    need = int(rows.max()) + 1 if len(rows) else 0
-    buffers = next(iter(fused.buffers), None)
-    if buffers is None or len(buffers.layout) < need or len(buffers.launches) < count:
-        buffers = _buffers_of(fused, need, count)
-        fused.buffers[:] = [buffers]
-    if not buffers.rows or not torch.equal(buffers.rows[0], rows):
-        effort = fused.effort[rows % max(1, len(fused.effort))]
-        buffers.order[: len(rows)] = rows[effort.argsort(descending=True, stable=True)]
-        buffers.rows[:] = [rows.clone()]
     return buffers
 
 
@@ -218,17 +211,10 @@ def _buffers_of(fused: FusedEnergy, items: int, count: int) -> _Buffers:
     answer = filled(
         ItemCosts, order=order, layout=layout, parts=parts, slopes=slopes, whole=whole, slope=slope
     )
-    launches = tuple(
-        launch(
-            kernel,
-            1,
-            [fused.data, _workspace(fused.size), answer, 0, 0],
-            device="cpu",
-            record_cmd=True,
-        )
-        for _ in range(count)
-    )
-    return _Buffers([], order, layout, parts, slopes, whole, slope, launches)
+    inputs = [[fused.data, _workspace(fused.size), answer, 0, 0] for _ in range(count)]
+    launches = tuple(launch(kernel, 1, row, device="cpu", record_cmd=True) for row in inputs)
+    none = torch.zeros(0, dtype=torch.long)
+    return _Buffers(none, order, layout, parts, slopes, whole, slope, launches)
 
 
 def _workspace(size: BufferSize) -> Any:  # noqa: ANN401
@@ -245,7 +231,12 @@ def _workspace(size: BufferSize) -> Any:  # noqa: ANN401
     scene.height, scene.width, scene.border = size.height, size.width, BORDER
     sizes = size.verts, size.faces, size.edges, grid, 2 * grid
     space.scene, space.scratch = scene, scratch_of(sizes)
-    _marks(space, size)
+    # What is covered: two arrays are one memory, seen by bytes and by words.
+    space.stride, space.across = (size.width // 8 + 1) * 8, -(-size.width // 64)
+    words = torch.zeros(size.height * space.stride // 8, dtype=torch.int64)
+    space.words, space.steps = array(words, "uint64"), array(words.view(torch.uint8), "uint8")
+    bits = torch.zeros(2, size.height * space.across, dtype=torch.int64)
+    space.seen, space.behind = (array(b, "uint64") for b in bits)
     space.pairs = array(torch.empty(2 * grid, dtype=torch.int32), "int32")
     space.keys = array(torch.empty(2 * grid, dtype=torch.int64), "uint64")
     space.crossings = array(torch.empty(2 * grid, 4), "vec4")
@@ -253,12 +244,3 @@ def _workspace(size: BufferSize) -> Any:  # noqa: ANN401
     space.moved = array(torch.zeros(2 * grid), "float32")
     space.squares = array(torch.zeros(size.shifts, dtype=torch.float64), "float64")
     return space
-
-
-def _marks(space: Any, size: BufferSize) -> None:  # noqa: ANN401
-    """The memory of what is covered; two arrays are one, seen by bytes and by words."""
-    space.stride, space.across = (size.width // 8 + 1) * 8, -(-size.width // 64)
-    words = torch.zeros(size.height * space.stride // 8, dtype=torch.int64)
-    space.words, space.steps = array(words, "uint64"), array(words.view(torch.uint8), "uint8")
-    bits = torch.zeros(2, size.height * space.across, dtype=torch.int64)
-    space.seen, space.behind = (array(b, "uint64") for b in bits)

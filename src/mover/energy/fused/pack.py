@@ -5,32 +5,31 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mover.core.types import Camera, Objects
+from mover.core.types import Objects
 from mover.energy import human_terms, image_terms, prior_terms
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.fused.launch import BORDER, FUSED, BufferSize, FusedEnergy
-from mover.energy.objective import HumanCues, ImageCues
+from mover.energy.objective import HumanCues, ImageCues, SceneEvidence
 from mover.geometry.nearest_warp import packed
-from mover.geometry.volume import Volume, field_of
+from mover.geometry.volume import field_of
 from mover.geometry.warp_start import array, started
 
 BRICK = 8  # [cells], as in `Volume.busy`
 CALM = 2  # a brick without bodies, as in `kernels.simple`
 
 
-def kernel_of(
-    objects: Objects, camera: Camera, image: ImageCues, humans: HumanCues, config: SceneConfig
-) -> FusedEnergy:
+def kernel_of(known: SceneEvidence, config: SceneConfig) -> FusedEnergy:
     """The kernel of Eq. 1 with all that it needs to know."""
     from mover.energy.fused.kernels.data import KernelInput
 
     wp, weights = started(), config.weights
+    objects, camera, image, humans = known.objects, known.camera, known.image, known.humans
     queries, share, ends = _queries(objects, humans, weights)
     things, counts = _things(objects, ends)
     data = KernelInput()
     data.things = things
     data.windows = _windows(image, humans, weights)
-    data.people = _people(humans, weights, queries, share)
+    data.people = _people(known, weights, queries, share)
     data.boxes = array(image.boxes.contiguous(), "vec4")
     data.within = array((image.sides != image_terms.UNKNOWN).float(), "vec4")
     costs = torch.tensor([0.0, torch.inf, 0.0, image_terms.HIDDEN])  # by what is known of a side
@@ -93,7 +92,8 @@ def _windows(image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Any:
         shifts, masks = image.borders.shifts, image.borders.masks.detach()
     windows.shifts, windows.loose = array(shifts.contiguous(), "float32"), image_terms.BORDER_WEIGHT
     windows.mask, windows.keep = _grid(masks, 0.0), _grid(keep, 0.0)
-    windows.gain = array(_sums(keep * (1 - 2 * masks)), "float64")
+    gain = torch.nn.functional.pad((keep * (1 - 2 * masks)).double(), [BORDER + 1, *[BORDER] * 3])
+    windows.gain = array(gain.cumsum(-1).view(-1), "float64")  # of the pixels of a row before each
     windows.empty = array((keep * masks.double().square()).sum((-2, -1)).view(-1), "float64")
     area = (masks * keep).sum((-2, -1)).clamp_min(1)
     windows.trust = array((image.trust / area).view(-1).contiguous(), "float32")
@@ -102,12 +102,6 @@ def _windows(image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Any:
     windows.bounded = array(bounded, "vec4i")
     windows.limit, windows.fewest = human_terms.CLAMP, human_terms.FEWEST
     return windows
-
-
-def _sums(gain: Tensor) -> Tensor:
-    """Sum of the pixels of a row before each, on the grid and one column more, flat."""
-    padded = torch.nn.functional.pad(gain.double(), [BORDER + 1, BORDER, BORDER, BORDER])
-    return padded.cumsum(-1).view(-1)
 
 
 def _grid(maps: Tensor, border: float) -> Any:  # noqa: ANN401
@@ -125,19 +119,13 @@ def _bounds(mask: Tensor, humans: HumanCues, weights: SceneWeights) -> tuple[Any
     near, far = humans.depth.near, humans.depth.far
     known = (mask > 0.5) & (near < far) & (near.isfinite() | far.isfinite())
     lower = torch.where(known, near - human_terms.DEPTH_MARGIN, torch.inf)
-    box = [_range(known.any(2)), _range(known.any(1))]
-    return (
-        _grid(lower, torch.inf),
-        _grid(far + human_terms.DEPTH_MARGIN, 0.0),
-        torch.cat(box, -1).int(),
-    )
-
-
-def _range(known: Tensor) -> Tensor:
-    """First index, and the one after the last, of each row's marks, in the grid."""
-    size, number = known.shape[1], torch.arange(known.shape[1])
-    first = torch.where(known, number, size).amin(1)
-    return torch.stack([first, torch.where(known, number + 1, 0).amax(1)], -1) + BORDER
+    ends: list[Tensor] = []  # first row of each mask that is bounded and the one after the last
+    for lines in (known.any(2), known.any(1)):
+        size, number = lines.shape[1], torch.arange(lines.shape[1])
+        ends.append(torch.where(lines, number, size).amin(1))
+        ends.append(torch.where(lines, number + 1, 0).amax(1))
+    upper = _grid(far + human_terms.DEPTH_MARGIN, 0.0)
+    return _grid(lower, torch.inf), upper, (torch.stack(ends, -1) + BORDER).int()
 
 
 def _queries(
@@ -162,25 +150,21 @@ def _queries(
     return few, shares, count.cumsum(0)
 
 
-def _people(humans: HumanCues, weights: SceneWeights, queries: Tensor, share: Tensor) -> Any:  # noqa: ANN401
+def _people(known: SceneEvidence, weights: SceneWeights, queries: Tensor, share: Tensor) -> Any:  # noqa: ANN401
     from mover.energy.fused.kernels.data import HumanData
 
     people = HumanData()
     people.queries, people.share = array(queries, "vec3"), array(share, "float32")
     people.rho = human_terms.CONTACT_RHO
-    if weights.contact and humans.trees is not None:
-        people.top, people.back = packed(humans.trees.top), packed(humans.trees.back)
-    if weights.collision and humans.space is not None:
-        people.field = _field(humans.space.volume)
+    if weights.contact and known.trees is not None:
+        people.top, people.back = packed(known.trees.top), packed(known.trees.back)
+    if weights.collision and known.humans.space is not None:
+        volume = known.humans.space.volume
+        some = volume.values[::BRICK, ::BRICK, ::BRICK]
+        x, y, z = volume.busy.shape
+        calm = (volume.busy == 0) & (some[:x, :y, :z] >= 0)  # bricks without bodies
+        people.field = field_of(volume, torch.where(calm, CALM, 1).to(torch.uint8))
     return people
-
-
-def _field(volume: Volume) -> Any:  # noqa: ANN401
-    """The volume, with bricks without bodies marked."""
-    some = volume.values[::BRICK, ::BRICK, ::BRICK]
-    x, y, z = volume.busy.shape
-    calm = (volume.busy == 0) & (some[:x, :y, :z] >= 0)
-    return field_of(volume, torch.where(calm, CALM, 1).to(torch.uint8))
 
 
 def _facts(objects: Objects, image: ImageCues, humans: HumanCues, weights: SceneWeights) -> Tensor:

@@ -74,18 +74,16 @@ def thin(
     key = torch.cat([group.unsqueeze(-1), (points / cell).floor().long()], -1)
     cells, owner, count = key.unique(dim=0, return_inverse=True, return_counts=True)
     means = torch.zeros(len(cells), 3, dtype=points.dtype).index_add(0, owner, points)
-    means = means / count.unsqueeze(-1)
-    rows: list[tuple[Tensor, Tensor]] = []
-    for g in range(groups):
-        mine = (cells[:, 0] == g).nonzero()[:, 0]
-        kept = evenly(mine, most)
-        total = count[mine].sum().to(points)
-        share = count[kept].to(points)
-        rows.append((means[kept], share * (total / share.sum().clamp_min(1))))
-    longest = max(1, max(len(p) for p, _ in rows))
-    padded = [torch.nn.functional.pad(p, (0, 0, 0, longest - len(p))) for p, _ in rows]
-    weight = [torch.nn.functional.pad(w, (0, longest - len(w))) for _, w in rows]
-    return torch.stack(padded), torch.stack(weight)
+    means, count = means / count.unsqueeze(-1), count.to(points)
+    every = [(cells[:, 0] == g).nonzero()[:, 0] for g in range(groups)]
+    kept = [evenly(mine, most) for mine in every]
+    longest = max(1, max(len(rows) for rows in kept))
+    found, weight = points.new_zeros(groups, longest, 3), points.new_zeros(groups, longest)
+    for g, (mine, rows) in enumerate(zip(every, kept, strict=True)):
+        share = count[rows]
+        found[g, : len(rows)] = means[rows]
+        weight[g, : len(rows)] = share * (count[mine].sum() / share.sum().clamp_min(1))
+    return found, weight
 
 
 def evenly(rows: Int[Tensor, " rows"], most: int) -> Int[Tensor, " some"]:
@@ -103,7 +101,7 @@ LEVEL = 0.7071  # cosine of 45 degrees, the released code's split of the normals
 
 @record
 class ContactAssignment:
-    """Who touches what."""
+    """Which body touches which object."""
 
     points: ContactPoints | None
     """Contact points of each object; None: nothing is touched."""
@@ -112,7 +110,7 @@ class ContactAssignment:
     bodies: tuple[int, ...]
     """Number of bodies that touch each object."""
     pairs: Int[Tensor, "pairs 3"]
-    """Who touches what: body, object, and part as in `ContactPoints.points`."""
+    """Contacts: body, object, and part as in `ContactPoints.points`."""
 
 
 def assign_contacts(
@@ -120,18 +118,31 @@ def assign_contacts(
 ) -> ContactAssignment:
     """Give each touching part of each body to the object that it touches."""
     del observe
+    bodies, objects = inputs.bodies, inputs.objects
     found = [c for c in contact_rows(inputs, config) if len(c.body)]
-    seated = torch.zeros(len(inputs.bodies.frame), dtype=torch.bool)
-    counts = [0] * len(inputs.objects.ids)
+    seated, counts = torch.zeros(len(bodies.frame), dtype=torch.bool), [0] * len(objects.ids)
     if not found:
         return ContactAssignment(None, seated, tuple(counts), torch.zeros(0, 3, dtype=torch.long))
     names = ("body", "vert", "object_of", "hand")
     rows = ContactRows(*(torch.cat([getattr(c, n) for c in found]) for n in names))
     seated[rows.body[~rows.hand]] = True
-    part = _parts(rows, inputs, config)
-    points = _pack(rows, part, inputs, config)
-    for i, bodies in zip(points.object_of.tolist(), points.bodies.tolist(), strict=True):
-        counts[i] = int(bodies)
+    part, touched = _parts(rows, inputs, config), rows.object_of.unique()
+    packed, weight = thin(
+        bodies.verts[rows.body, rows.vert],
+        torch.searchsorted(touched, rows.object_of) * 4 + part,
+        4 * len(touched),
+        (config.cell, config.most),
+    )
+    back = objects.has_back[touched].float()
+    usable = torch.stack([torch.ones_like(back), back, torch.ones_like(back), back], -1)
+    weight = weight.unflatten(0, (len(touched), 4)) * usable.unsqueeze(-1)
+    for i in touched.tolist():
+        counts[i] = len(rows.body[rows.object_of == i].unique())
+    points = ContactPoints(
+        touched, packed.unflatten(0, (len(touched), 4)), weight,
+        torch.tensor([counts[i] for i in touched.tolist()], dtype=packed.dtype),
+        shares_of(weight), _headings(rows, touched, inputs),
+    )  # fmt: skip
     pairs = torch.stack([rows.body, rows.object_of, part], -1)
     sizes = pairs.amax(0) + 1  # unique as numbers, which sort far faster than rows
     place = torch.stack([sizes[1] * sizes[2], sizes[2], torch.ones_like(sizes[2])])
@@ -149,30 +160,8 @@ def _parts(rows: ContactRows, inputs: AssignInputs, config: AssignConfig) -> Int
     return (~level).long() + 2 * rows.hand.long()
 
 
-def _pack(
-    rows: ContactRows, part: Int[Tensor, " rows"], inputs: AssignInputs, config: AssignConfig
-) -> ContactPoints:
-    points = inputs.bodies.verts[rows.body, rows.vert]
-    touched = rows.object_of.unique()
-    packed, weight = thin(
-        points,
-        torch.searchsorted(touched, rows.object_of) * 4 + part,
-        4 * len(touched),
-        (config.cell, config.most),
-    )
-    back = inputs.objects.has_back[touched].float()
-    usable = torch.stack([torch.ones_like(back), back, torch.ones_like(back), back], -1)
-    weight = weight.unflatten(0, (len(touched), 4)) * usable.unsqueeze(-1)
-    bodies = [len(rows.body[rows.object_of == o].unique()) for o in touched.tolist()]
-    return ContactPoints(
-        touched, packed.unflatten(0, (len(touched), 4)), weight,
-        torch.tensor(bodies, dtype=points.dtype), shares_of(weight),
-        _headings(rows, touched, inputs),
-    )  # fmt: skip
-
-
 def _headings(rows: ContactRows, touched: Int[Tensor, " touched"], inputs: AssignInputs) -> Tensor:
-    """Mean horizontal direction of those who sit or lie on each touched object; zero for none.
+    """Mean horizontal direction of the people sitting or lying on each touched object; else zero.
 
     Seated people face as objects with a back do; on the side of a bed or round a stool they do
     not. Lying people give the heading of a bed, whose back is where heads lie.

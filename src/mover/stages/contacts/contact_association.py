@@ -13,15 +13,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.parts import BodyParts
-from mover.bodies.skin import PARTS
+from mover.bodies.parts import BodyParts, members
 from mover.core.records import record
 from mover.core.types import Bodies, Camera, Layout, Objects, People
+from mover.geometry.boxes import iou2d
 from mover.geometry.camera import at_pixels, project, to_camera
 from mover.geometry.placement import place
 from mover.stages.config import AssignConfig
-from mover.stages.contacts.mask_hits import Candidates, decide_by_mask_hits
-from mover.stages.masks import mask_table, small_boxes, small_camera, small_masks
+from mover.stages.masks import mask_table, small_boxes, small_camera, small_masks, widened
 
 GROUPS = (
     ("seat", "left_thigh", "right_thigh"),
@@ -38,6 +37,7 @@ FEWEST = 5  # vertices that a group must have to touch at all
 OVERLAP = 0.5  # share of a group that must project into an object's mask
 FARTHEST = 1.0  # [m] from the object's part, at most (authors' code)
 HAND_REACH = 0.25  # [m], the same for hands, and for backs of bodies that sit on no object
+COMPARED = 40  # vertices of a group whose distances are measured, at least
 FAR_AWAY = 1e3  # [m], where padding goes
 
 
@@ -68,17 +68,33 @@ class ContactRows:
     hand: Bool[Tensor, " rows"]
 
 
+@record
+class Candidates:
+    """The objects in the image at most 640 wide and in the room."""
+
+    categories: tuple[str, ...]
+    masks: Bool[Tensor, "objects h w"]
+    boxes: Float[Tensor, "objects 4"]
+    """x_min, y_min, x_max, y_max [px]."""
+    verts: Float[Tensor, "objects verts 3"]
+    """Placed in the world [m]; padding is far away."""
+
+
 def contact_rows(inputs: AssignInputs, config: AssignConfig) -> Iterator[ContactRows]:
     """All touching vertices with their objects, one group of one body at a time."""
     by_hits, bodies, camera = config.by == "mask_hits", inputs.bodies, small_camera(inputs.camera)
     groups = MASK_HIT_GROUPS if by_hits else GROUPS
-    members = [
-        torch.isin(inputs.parts.part_of, torch.tensor([PARTS.index(n) for n in names]))
-        for names in groups
-    ]
+    verts_of = [members(inputs.parts, *names) for names in groups]
     touching = inputs.probability > CHANCE
-    enough = torch.stack([(touching & mine).sum(1) >= FEWEST for mine in members], 1)
-    candidates, surfaces = _candidates(inputs), _touchable(inputs)
+    enough = torch.stack([(touching & mine).sum(1) >= FEWEST for mine in verts_of], 1)
+    candidates = _candidates(inputs)
+    objects, layout = inputs.objects, inputs.layout
+    surfaces = _Touchable(
+        objects,
+        widened(candidates.masks, 3),
+        place(objects.top, layout),
+        place(objects.back, layout),
+    )
     table = mask_table(inputs.people, bodies) if by_hits and inputs.people is not None else None
     for index in enough.any(1).nonzero()[:, 0].tolist():  # memory stays that of one body
         points, person, seat = bodies.verts[index], None, -1
@@ -86,7 +102,7 @@ def contact_rows(inputs: AssignInputs, config: AssignConfig) -> Iterator[Contact
         if table is not None and table.own[index] is not None:
             person = small_masks(table.decode(index)[0].unsqueeze(0), inputs.camera)[0]
         for group in enough[index].nonzero()[:, 0].tolist():
-            names, verts = groups[group], (members[group] & touching[index]).nonzero()[:, 0]
+            names, verts = groups[group], (verts_of[group] & touching[index]).nonzero()[:, 0]
             skin, hands = (points[verts], pixels[verts]), names[0].endswith("palm")
             if by_hits:
                 touched = decide_by_mask_hits(*skin, person, candidates, arms=hands)
@@ -95,15 +111,19 @@ def contact_rows(inputs: AssignInputs, config: AssignConfig) -> Iterator[Contact
             if names[0] == "seat":
                 seat = touched
             if touched >= 0:
-                rows = (torch.full_like(verts, value) for value in (index, touched))
-                body, object_of = rows
+                body, object_of = (torch.full_like(verts, value) for value in (index, touched))
                 yield ContactRows(body, verts, object_of, torch.full_like(verts, hands).bool())
 
 
 def _candidates(inputs: AssignInputs) -> Candidates:
     """The objects for `decide_by_mask_hits`; an object without a mask has its box."""
     objects, boxes = inputs.objects, small_boxes(inputs.boxes, inputs.camera)
-    masks = _filled(small_masks(inputs.masks, inputs.camera), boxes)
+    masks = small_masks(inputs.masks, inputs.camera)
+    y, x = (torch.arange(n) + 0.5 for n in masks.shape[-2:])
+    low, high = boxes[:, :2, None, None], boxes[:, 2:, None, None]
+    inside = (x > low[:, 0]) & (x < high[:, 0])
+    inside = inside & (y[:, None] > low[:, 1]) & (y[:, None] < high[:, 1])
+    masks = torch.where(masks.any(-1).any(-1)[:, None, None], masks, inside)
     verts = place(objects.verts, inputs.layout)
     verts = torch.where(objects.real_verts.unsqueeze(-1), verts, torch.full_like(verts, FAR_AWAY))
     return Candidates(objects.categories, masks, boxes, verts)
@@ -126,14 +146,7 @@ class _Touchable:
         names: tuple[str, ...],
         seat: int,
     ) -> int:
-        """Index of the object that a group touches, -1 for none.
-
-        Args:
-            points: Its touching vertices in the world [m].
-            pixels: Where they are seen.
-            names: The parts of the group.
-            seat: What the body sits on; -1: no object.
-        """
+        """Index of the object that a group touches, -1 for none."""
         objects, hands, back = self.objects, names[0].endswith("palm"), names == ("back",)
         may = objects.has_top & ~objects.is_seat if hands else objects.is_seat
         if back and seat >= 0:
@@ -143,37 +156,88 @@ class _Touchable:
         able = (may & (share >= OVERLAP)).nonzero()[:, 0]
         if not len(able):
             return -1
-        distance = _distances(points, self.tops[able], self.backs[able]).mean(-1)
+        some = points[:: max(1, len(points) // COMPARED)]
+        ways = (torch.cdist(some, part[able]).amin(-1) for part in (self.tops, self.backs))
+        distance = torch.minimum(*ways)[:, torch.cdist(points, some).argmin(-1)].mean(-1)
         near = HAND_REACH if hands or (back and seat < 0) else FARTHEST
         score = torch.where(distance < near, share[able] - distance, -torch.inf)
         return int(able[score.argmax()]) if bool(score.isfinite().any()) else -1
 
 
-def _touchable(inputs: AssignInputs) -> _Touchable:
-    objects, layout, boxes = inputs.objects, inputs.layout, small_boxes(inputs.boxes, inputs.camera)
-    masks = _filled(small_masks(inputs.masks, inputs.camera), boxes)
-    down = torch.nn.functional.max_pool2d(masks.float().unsqueeze(1), (7, 1), 1, (3, 0))
-    grown = torch.nn.functional.max_pool2d(down, (1, 7), 1, (0, 3)).squeeze(1) > 0
-    return _Touchable(objects, grown, place(objects.top, layout), place(objects.back, layout))
+# Which object a group of contact vertices touches, by the rules of the authors' released code.
+#
+# The whole body (seat, thighs, back) and both arms (hands, forearms) are each given to one object:
+# 1. An object is a candidate if its mask shares a pixel with the person's mask and its box overlaps
+#    the person's box; arms take tables only.
+# 2. Each contact vertex is looked up in the object's mask inside its window (a square of 1.3 times
+#    the box); vertices beyond the window count at its border. No hit: no candidate.
+# 3. Several candidates: those with at most 5 % of the hits of the best fall away, and all classes
+#    but beds, chairs, sofas and tables. The one that owns most of the nearest object vertices is
+#    touched, unless the mean squared distance to it is above 1 m^2.
+# 4. A single candidate is touched if more than 20 vertices hit, however far it is.
+
+CHAIRS = ("chair", "armchair", "office chair", "stool")  # one class in the authors' detector
+TABLES = ("table", "coffee table", "dining table", "round table", "desk")
+KEPT = (*CHAIRS, *TABLES, "bed", "sofa")
+SHARE = 0.05  # of the hits of the best candidate
+HITS = 20  # of a single candidate
+SQUARED = 1.0  # [m^2]
+WINDOW = 1.3  # of the larger side of the box
 
 
-def _filled(masks: Bool[Tensor, "objects h w"], boxes: Float[Tensor, "objects 4"]) -> Tensor:
-    """Masks; where an object has none, its box."""
-    height, width = masks.shape[-2:]
-    y, x = torch.arange(height)[:, None] + 0.5, torch.arange(width) + 0.5
-    low, high = boxes[:, :2, None, None], boxes[:, 2:, None, None]
-    inside = (x > low[:, 0]) & (x < high[:, 0]) & (y > low[:, 1]) & (y < high[:, 1])
-    known = masks.any(-1).any(-1)[:, None, None]
-    return torch.where(known, masks, inside)
-
-
-def _distances(
+def decide_by_mask_hits(
     points: Float[Tensor, "verts 3"],
-    tops: Float[Tensor, "objects region 3"],
-    backs: Float[Tensor, "objects region 3"],
-) -> Float[Tensor, "objects verts"]:
-    """Distance of each vertex from each object's parts, through at most 40 of the vertices [m]."""
-    some = points[:: max(1, len(points) // 40)]
-    ways = [torch.cdist(some, region).amin(-1) for region in (tops, backs)]
-    nearest = torch.cdist(points, some).argmin(-1)
-    return torch.minimum(*ways)[:, nearest]
+    pixels: Int[Tensor, "verts 2"],
+    person: Bool[Tensor, "h w"] | None,
+    objects: Candidates,
+    *,
+    arms: bool,
+) -> int:
+    """Index of the object that one group of one body touches, -1 for none.
+
+    Args:
+        points: Contact vertices in the world [m].
+        pixels: Where they are seen, x and y [px].
+        person: The person's visible mask; None: unknown, so rule 1 asks for the class alone.
+        objects: The objects that may be touched.
+        arms: The group is hands and forearms.
+    """
+    boxed = zip(objects.masks, objects.boxes, strict=True)
+    hits = torch.stack([_hits(pixels, mask, box) for mask, box in boxed])
+    may = hits > 0
+    if person is not None:
+        may = may & (objects.masks & person).any(-1).any(-1)
+        if bool(person.any()):
+            y, x = person.nonzero().unbind(-1)
+            box = torch.stack([x.min(), y.min(), x.max() + 1, y.max() + 1]).to(objects.boxes)
+            may = may & (iou2d(objects.boxes, box.expand_as(objects.boxes)) > 0)
+    if arms:
+        may = may & torch.tensor([c in TABLES for c in objects.categories])
+    if int(may.sum()) > 1:
+        kept = torch.tensor([c in KEPT for c in objects.categories])
+        may = may & (hits > SHARE * hits[may].max()) & kept
+        return _nearest(points, objects, may)
+    only = int(may.int().argmax())
+    return only if bool(may.any()) and int(hits[only]) > HITS else -1
+
+
+def _hits(
+    pixels: Int[Tensor, "verts 2"], mask: Bool[Tensor, "h w"], box: Float[Tensor, "4"]
+) -> Int[Tensor, ""]:
+    """Number of vertices on the mask, clamped to the object's window."""
+    middle, half = (box[:2] + box[2:]) / 2, WINDOW / 2 * (box[2:] - box[:2]).max()
+    inside = torch.minimum(torch.maximum(pixels, middle - half), middle + half - 1).long()
+    covered, shown = at_pixels(mask, inside)
+    return (covered & shown).sum()
+
+
+def _nearest(
+    points: Float[Tensor, "verts 3"], objects: Candidates, may: Bool[Tensor, " objects"]
+) -> int:
+    """The candidate that owns most nearest vertices, if it is near enough."""
+    if not bool(may.any()):
+        return -1
+    away = torch.full((len(may), len(points)), torch.inf).to(points)
+    away[may] = torch.stack([torch.cdist(points, v).amin(-1) for v in objects.verts[may]])
+    best = int(away.argmin(0).mode().values)
+    return best if float(away[best].square().mean()) <= SQUARED else -1

@@ -15,7 +15,7 @@ from mover.bodies.posture import postures
 from mover.core.records import record, rows_of
 from mover.core.types import STILL, Bodies, Camera, CameraPath, Layout, Objects, People
 from mover.energy.human_terms import ContactPoints
-from mover.geometry.camera import project, to_camera
+from mover.geometry.camera import at_pixels, project, to_camera
 from mover.geometry.path import from_reference, poses_at
 from mover.geometry.placement import place
 from mover.stages.masks import mask_table
@@ -76,12 +76,11 @@ def _hidden_legs(inputs: DiagnosticInputs) -> Iterator[str]:
     for row in range(0, len(bodies.frame), EVERY):
         if table.own[row] is None:
             continue
-        seen, _ = table.decode(row)
         pose = rows_of(poses, torch.tensor([row]), "poses")
         there = to_camera(bodies.verts[row, legs], camera.R_cam_world)
         pixels = project(from_reference(there[None], pose)[0], camera.K).long()
-        x, y = pixels[:, 0].clamp(0, seen.shape[1] - 1), pixels[:, 1].clamp(0, seen.shape[0] - 1)
-        hidden[row] = seen[y, x].float().mean() < SEEN
+        seen, _ = at_pixels(table.decode(row)[0], pixels)
+        hidden[row] = seen.float().mean() < SEEN
     for person, count, frames in _often(hidden, bodies):
         yield (
             f"the lower body of person {person} is hidden in about {EVERY * count} bodies (frames"
@@ -90,22 +89,19 @@ def _hidden_legs(inputs: DiagnosticInputs) -> Iterator[str]:
 
 
 def _wrong_seats(inputs: DiagnosticInputs) -> Iterator[str]:
-    contacts = inputs.contacts
+    contacts, objects = inputs.contacts, inputs.objects
     if contacts is None:
         return
-    tops = place(inputs.objects.top, inputs.layout)
+    tops = place(objects.top, inputs.layout)
     for k, i in enumerate(contacts.object_of.tolist()):
-        weight = contacts.weight[k, 0]
-        if not bool(inputs.objects.is_seat[i]) or int(contacts.bodies[k]) < OFTEN:
-            continue
-        points = contacts.points[k, 0][weight > 0]
-        if not len(points):
+        points = contacts.points[k, 0][contacts.weight[k, 0] > 0]
+        if not bool(objects.is_seat[i]) or int(contacts.bodies[k]) < OFTEN or not len(points):
             continue
         below = torch.cdist(points[:, [0, 2]], tops[i][:, [0, 2]]).argmin(-1)
         gap = float((points[:, 1] - tops[i][below, 1]).median())  # over the seat below them [m]
         if abs(gap) > HEIGHT:
             side = "above" if gap > 0 else "below"
             yield (
-                f"{inputs.objects.ids[i]}: its sitters touch {100 * abs(gap):.0f} cm {side} its"
-                " seat: the mesh may have the wrong shape"
+                f"{objects.ids[i]}: its sitters touch {100 * abs(gap):.0f} cm {side} its seat: the"
+                " mesh may have the wrong shape"
             )

@@ -6,13 +6,14 @@ from torch import Tensor
 
 from mover.core.observe import Observer, silent
 from mover.core.records import record
-from mover.core.types import Camera, Capture
+from mover.core.types import Camera, Capture, Masks
 from mover.energy.image_terms import LEAST, LIKELY, SEEN, UNKNOWN, borders_of
 from mover.energy.objective import ImageCues
 from mover.geometry.crops import area_mean, crop_views
 from mover.geometry.rle import decode
 from mover.geometry.warp_start import mapped
 from mover.stages.config import ImageConfig
+from mover.stages.masks import pixels_of
 from mover.stages.objects.prepare_objects import Prepared
 
 
@@ -48,11 +49,7 @@ def image_evidence(capture: Capture) -> ObjectDetections:
 def people_in_reference(capture: Capture) -> Bool[Tensor, "h w"]:
     """Where people are in the reference image."""
     camera, people = capture.scene.camera, capture.reference_people
-    found = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    if people is not None:
-        for row in range(len(people.counts)):
-            found = found | decode(people, row)
-    return found
+    return pixels_of(Masks(camera.height, camera.width, ()) if people is None else people)
 
 
 def ground_without_people(capture: Capture, prepared: Prepared) -> float:
@@ -107,19 +104,18 @@ def find_image_cues(
     known = inputs.masks.any(-1).any(-1)[:, None, None]
     keep = (hidden < 1e-6) & inside & known
     sides = torch.where(inputs.seen, SEEN, UNKNOWN).unsqueeze(-1).expand(-1, 4)
-    beside = None
+    beside = borders = None
     if config.form == "robust":
-        touched = _touched(inputs, others)
+        touched = _beside(inputs, others, 0.0)
         sides = torch.where(sides == SEEN, _sides(inputs, touched, config), sides)
         if config.bounded:
-            beside = torch.stack([touched, _near(inputs, others)], -1)
-    trust = torch.ones(len(own))
-    borders = None
+            near = _beside(inputs, others, GAP * inputs.camera.width)
+            beside = torch.stack([touched, near], -1)
     if config.borders:
         zoom = views.K[:, 0, 0] / inputs.camera.K[0, 0]
         borders = borders_of(own, zoom, config.borders)
     return ImageCues(
-        inputs.boxes, sides, views, own, keep, trust, inputs.distance, borders,
+        inputs.boxes, sides, views, own, keep, torch.ones(len(own)), inputs.distance, borders,
         beside=beside,
     )  # fmt: skip
 
@@ -149,45 +145,31 @@ def _sides(
     return torch.where(inside, torch.where(free, SEEN, LIKELY if config.bounded else LEAST), LEAST)
 
 
-def _touched(
-    inputs: ImageInputs, others: Bool[Tensor, "objects h w"]
+def _beside(
+    inputs: ImageInputs, others: Bool[Tensor, "objects h w"], gap: float
 ) -> Float[Tensor, "objects 4"]:
-    """Share of the strip beyond each side of the boxes in which something else is seen."""
+    """Share of the strip beyond each side of the boxes in which something else is seen.
+
+    With a gap, the least width of the strip [px]: share of the side that something is near to.
+    """
     rows: list[Tensor] = []
+    height, width = others.shape[-2:]
     for own, box in zip(others, inputs.boxes, strict=True):
-        for side in range(4):
-            part = _part(own, _strip(box, side))
+        depth = STRIP * (box[2:] - box[:2]).clamp_min(1).prod().sqrt().clamp_min(2)
+        depth = depth.clamp_min(gap)
+        for side in range(4):  # left, top, right, bottom
+            axis, strip = side % 2, box.clone()
+            strip[axis], strip[axis + 2] = (
+                (box[axis] - depth, box[axis]) if side < 2 else (box[side], box[side] + depth)
+            )
+            x0, y0, x1, y1 = (round(v) for v in strip.tolist())
+            part = own[
+                max(0, y0) : min(height, max(y1, y0 + 1)), max(0, x0) : min(width, max(x1, x0 + 1))
+            ]
+            if gap:
+                part = part.any(1 - axis) if part.numel() else part
             rows.append(part.float().mean() if part.numel() else torch.zeros(()))
     return torch.stack(rows).reshape(len(inputs.boxes), 4)
-
-
-def _near(inputs: ImageInputs, others: Bool[Tensor, "objects h w"]) -> Float[Tensor, "objects 4"]:
-    """Share of each side of the boxes that something else is near to."""
-    rows: list[Tensor] = []
-    for own, box in zip(others, inputs.boxes, strict=True):
-        for side in range(4):
-            part = _part(own, _strip(box, side, GAP * inputs.camera.width))
-            near = part.any(1 - side % 2).float().mean() if part.numel() else torch.zeros(())
-            rows.append(near)
-    return torch.stack(rows).reshape(len(inputs.boxes), 4)
-
-
-def _strip(box: Float[Tensor, "4"], side: int, least: float = 0.0) -> Float[Tensor, "4"]:
-    """The thin box just beyond one side (0 left, 1 top, 2 right, 3 bottom)."""
-    depth = STRIP * (box[2:] - box[:2]).clamp_min(1).prod().sqrt().clamp_min(2)
-    depth = depth.clamp_min(least)
-    axis, strip = side % 2, box.clone()
-    if side < 2:
-        strip[axis], strip[axis + 2] = box[axis] - depth, box[axis]
-    else:
-        strip[axis], strip[axis + 2] = box[axis + 2], box[axis + 2] + depth
-    return strip
-
-
-def _part(mask: Bool[Tensor, "h w"], box: Float[Tensor, "4"]) -> Bool[Tensor, "rows columns"]:
-    height, width = mask.shape
-    x0, y0, x1, y1 = (round(v) for v in box.tolist())
-    return mask[max(0, y0) : min(height, max(y1, y0 + 1)), max(0, x0) : min(width, max(x1, x0 + 1))]
 
 
 def order_in_image(

@@ -94,11 +94,8 @@ def _references(inputs: DepthImageInputs, values: Tensor, windows: Tensor) -> Re
         strip = slice(y0, y0 + round(STRIP * camera.height)), slice(x0, x1)
         parts.append((floor[strip][free[strip]], values[strip][free[strip]]))
     few = [(k[:: 1 + len(k) // MOST], v[:: 1 + len(v) // MOST]) for k, v in parts]
-    few = [(known, measured) for known, measured in few if len(known) >= FEWEST]
-    if not few:
-        none = values.new_zeros(0)
-        return References(none, none, none)
-    weights = [torch.full_like(known, 1 / len(known)) for known, _ in few]
+    few = [part for part in few if len(part[0]) >= FEWEST] or [(values.new_zeros(0),) * 2]
+    weights = [torch.full_like(known, 1 / max(1, len(known))) for known, _ in few]
     known, measured = (torch.cat([part[k] for part in few]) for k in (0, 1))
     return References(known.detach(), measured, torch.cat(weights))
 
@@ -106,10 +103,9 @@ def _references(inputs: DepthImageInputs, values: Tensor, windows: Tensor) -> Re
 def _factor(found: References) -> float:
     """Logarithm of the factor between the room and what was measured."""
     off = found.known.log() - found.measured.log()
-    order = off.argsort()
+    order, count = off.argsort(), float(found.weight.sum())
     share = found.weight[order].cumsum(0) / found.weight.sum()
     middle = float(off[order][int((share < 0.5).sum())])
-    count = float(found.weight.sum())
     return middle * count / (count + (SPREAD / SCALE) ** 2)
 
 

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mover.core.records import record
 from mover.core.types import Heading, Layout, Objects
 from mover.energy.human_terms import ContactPoints
 from mover.energy.image_terms import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.prior_terms import COMMON, SIZE, TURN, Given
 from mover.furniture.library import STANDARD, WALL_PIECES, WIDE_CLASSES, canonical
+from mover.stages.config import SpreadConfig
 from mover.stages.objects.own_edges import OwnEdges
 
 FIT = 0.1  # image energy (robust form) of a shape that fits
@@ -51,53 +51,39 @@ def gather_given(
         edges: Of the objects, where they are seen.
     """
     standard, precision = standard_sizes(objects)
-    along = chance_along(objects.categories)
-    known = torch.ones_like(start.yaw)
+    along, known = chance_along(objects.categories), torch.ones_like(start.yaw)
     weight = prior_weights(energy)
-    found = (LOOSE * (0.1 + weight).sqrt()).clamp(SQUARE, TURN)
-    said = [(start.yaw, TURN * known, along), (layout.yaw, found, along)]
+    loose = (LOOSE * (0.1 + weight).sqrt()).clamp(SQUARE, TURN)
+    observed = [(start.yaw, TURN * known, along), (layout.yaw, loose, along)]
     if heading is not None:
         yaw, off, sure = along.new_tensor([[heading.yaw], [heading.spread], [WALLS]])
-        said.append((yaw, off, sure))
-    axes = _own_axes(along, room_axis(said), edges)
-    return Given(
-        distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=axes.along.to(known),
-        sharpness=axes.sharpness.to(known), axis=axes.yaw.to(known),
-        standard=standard, precision=precision, weight=weight,
+        observed.append((yaw, off, sure))
+    given = Given(
+        distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=known, sharpness=known,
+        axis=known, standard=standard, precision=precision, weight=weight,
     )  # fmt: skip
+    return _along_axes(given, along, room_axis(observed), edges)
 
 
-@record
-class _Axes:
-    """Along what each object runs."""
-
-    along: Float[Tensor, " objects"]
-    """The chance that it does."""
-    yaw: Float[Tensor, " objects"]
-    """Up to quarter turns [rad]."""
-    sharpness: Float[Tensor, " objects"]
-    """Of the density of yaws along it."""
-
-
-def _own_axes(
-    along: Float[Tensor, " objects"], room: tuple[float, float], edges: OwnEdges | None
-) -> _Axes:
-    """The room's axis, and of objects whose own edges agree their own."""
+def _along_axes(
+    given: Given, along: Float[Tensor, " objects"], room: tuple[float, float],
+    edges: OwnEdges | None,
+) -> Given:  # fmt: skip
+    """With the room's axis, and of objects whose own edges agree their own."""
     one = torch.ones_like(along)
-    axes = _Axes(along.clone(), room[0] * one, _sharpness(SQUARE, room[1]) * one)
-    if edges is None:
-        return axes
-    near = math.hypot(SQUARE, room[1]) * one
-    spread = torch.hypot(edges.spread, torch.full_like(edges.spread, STRAIGHT))
-    level = torch.full_like(edges.yaw, LEVEL)
-    for k in edges.of.unique():
-        mine, own = k.view(1), edges.of == k
-        beside = (axes.yaw[mine], near[mine], along[mine])
-        yaw, off = room_axis([beside, (edges.yaw[own], spread[own], level[own])])
-        if off < AGREED:
-            axes.along[k], axes.yaw[k] = AGREES, yaw
-            axes.sharpness[k] = _sharpness(STRAIGHT, off)
-    return axes
+    chance, axis, sharpness = along.clone(), room[0] * one, _sharpness(SQUARE, room[1]) * one
+    if edges is not None:
+        near = math.hypot(SQUARE, room[1]) * one
+        spread = torch.hypot(edges.spread, torch.full_like(edges.spread, STRAIGHT))
+        level = torch.full_like(edges.yaw, LEVEL)
+        for k in edges.of.unique():
+            mine, own = k.view(1), edges.of == k
+            beside = (axis[mine], near[mine], along[mine])
+            yaw, off = room_axis([beside, (edges.yaw[own], spread[own], level[own])])
+            if off < AGREED:
+                chance[k], axis[k], sharpness[k] = AGREES, yaw, _sharpness(STRAIGHT, off)
+    like = given.weight
+    return replace(given, along=chance.to(like), sharpness=sharpness.to(like), axis=axis.to(like))
 
 
 def _sharpness(stands: float, off: float) -> float:
@@ -112,9 +98,8 @@ def chance_along(categories: Sequence[str]) -> Float[Tensor, " objects"]:
 
 def given_axis(categories: Sequence[str], heading: Heading, edges: OwnEdges | None = None) -> Given:
     """The same where nothing was given: of a room whose walls are seen, the axis alone."""
-    axes = _own_axes(chance_along(categories), (heading.yaw, heading.spread), edges)
-    known = unplaced(len(axes.yaw))
-    return replace(known, along=axes.along, sharpness=axes.sharpness, axis=axes.yaw)
+    along = chance_along(categories)
+    return _along_axes(unplaced(len(along)), along, (heading.yaw, heading.spread), edges)
 
 
 def unplaced(count: int) -> Given:
@@ -139,13 +124,7 @@ def prior_weights(energy: Float[Tensor, " objects"]) -> Float[Tensor, " objects"
 def lighter_where_used(
     given: Given, trust: Float[Tensor, " objects"], touches: ContactPoints | None
 ) -> Given:
-    """The same, lighter for what people use: they say where it stands, whatever its outline.
-
-    Args:
-        given: What is known without the people.
-        trust: Weight of each silhouette beside them.
-        touches: What they touch.
-    """
+    """The same, lighter for what people use: they say where it stands, whatever its outline."""
     if touches is None:
         return given
     index = touches.object_of
@@ -189,32 +168,7 @@ def standard_sizes(
     Detectors call a coffee table a dining table. So of the classes that have one name the first
     counts whose standard the given size does not contradict, and none where all are contradicted.
     """
-    known = [
-        _standard_of(MEANINGS.get(category, (category,)), size)
-        for category, size in zip(objects.categories, objects.size, strict=True)
-    ]
-    return _in_tables(known, objects.size)
-
-
-def _standard_of(
-    names: Sequence[str], size: Float[Tensor, "3"]
-) -> list[tuple[int, Float[Tensor, ""], float]]:
-    """Axis, logarithm over the given size and its spread, of the first class that fits the size."""
-    for name in names:
-        known = _off_standard(name, size)
-        if all(abs(x) < CONTRADICTED * math.hypot(s, SIZE, COMMON) for _, x, s in known):
-            return known
-    return []
-
-
-def _off_standard(
-    name: str, size: Float[Tensor, "3"]
-) -> list[tuple[int, Float[Tensor, ""], float]]:
-    return [
-        (axis, math.log(usual[0]) - size[axis].log(), usual[1])
-        for axis, usual in enumerate(STANDARD.get(name, ()))
-        if usual is not None
-    ]
+    return _standards(objects.categories, objects.size, firm=False)
 
 
 def sizes_of_shapes(
@@ -225,23 +179,26 @@ def sizes_of_shapes(
     Of a class with several meanings (a dining table of COCO may be a desk or a coffee table) it is
     that which the size of the shape fits; of what is not firm the shape itself says as much.
     """
-    known = [
-        _standard_of(MEANINGS[category], size)
-        if category in MEANINGS
-        else _off_standard(category, size)
-        for category, size in zip(categories, sizes, strict=True)
-    ]
-    known = [[row for row in rows if row[2] <= FIRM] for rows in known]
-    return _in_tables(known, sizes)
+    return _standards(categories, sizes, firm=True)
 
 
-def _in_tables(
-    known: Sequence[list[tuple[int, Float[Tensor, ""], float]]], like: Float[Tensor, "items 3"]
+def _standards(
+    categories: Sequence[str], sizes: Float[Tensor, "items 3"], *, firm: bool
 ) -> tuple[Float[Tensor, "items 3"], Float[Tensor, "items 3"]]:
-    usual, sharp = torch.zeros_like(like), torch.zeros_like(like)
-    for i, row in enumerate(known):
-        for axis, off, sigma in row:
-            usual[i, axis], sharp[i, axis] = off, 1 / sigma**2
+    usual, sharp = torch.zeros_like(sizes), torch.zeros_like(sizes)
+    for i, (category, size) in enumerate(zip(categories, sizes, strict=True)):
+        for name in MEANINGS.get(category, (category,)):
+            known = [
+                (axis, math.log(standard[0]) - size[axis].log(), standard[1])
+                for axis, standard in enumerate(STANDARD.get(name, ()))
+                if standard is not None
+            ]
+            fits = all(abs(x) < CONTRADICTED * math.hypot(s, SIZE, COMMON) for _, x, s in known)
+            if fits or (firm and category not in MEANINGS):
+                for axis, off, sigma in known:
+                    if sigma <= FIRM or not firm:
+                        usual[i, axis], sharp[i, axis] = off, 1 / sigma**2
+                break
     return usual, sharp
 
 
@@ -266,3 +223,44 @@ def room_axis(
     x, y = float(weight @ (4 * tried).cos()), float(weight @ (4 * tried).sin())
     length = min(max(math.hypot(x, y), 1e-3), 1 - 1e-9)
     return math.atan2(y, x) / 4, math.sqrt(-2 * math.log(length)) / 4
+
+
+# How far the initial sizes of a room's furniture are off, from its image (not in the paper).
+#
+# The cost of sizes (the scale term) suits tools whose sizes err as much as usual. Where the image
+# alone changes the shapes of a room's furniture more than that, the sizes that it cannot
+# constrain (the depth of a cabinet that is seen from the front) are weighted less too. Logarithms
+# of the three sizes of an object are c + e_k, with c common (an object that was placed too far
+# was made too large) and e_k independent; then the cost of a normal distribution is
+#
+#     \sum_k (l_k - m)^2 / v + 3 m^2 / (v + 3 w),   m = mean l_k,  v = var e_k,  w = var c,
+#
+# of which v is learnt from the room (empirical Bayes) and w is not. An object whose silhouette
+# cannot be made to fit (another shape, a bad mask) changes its sizes whether they are wrong or
+# not, so it counts by the square of the weight of its silhouette.
+
+WIDEST = 4.0  # largest spread that is learnt, in usual ones; the smallest is 1
+LIGHTEST = 0.1  # of the weight of a silhouette that fits
+
+
+def inlier_weights(energy: Float[Tensor, " objects"]) -> Float[Tensor, " objects"]:
+    """Weights of the shapes of objects: 1 where the image can be made to fit.
+
+    Args:
+        energy: What is left of the image's energy (robust form) where each object fits best.
+    """
+    return (FIT / energy.clamp_min(1e-6)).clamp(LIGHTEST, 1)
+
+
+def estimate_size_prior(
+    layout: Layout, trust: Float[Tensor, " objects"], config: SpreadConfig
+) -> tuple[float, float]:
+    """Factors on the cost of another shape, and on that of another size as a whole."""
+    if config.usual <= 0:
+        return 1.0, 1.0
+    log_scale, usual, share = layout.log_scale, config.usual**2, trust.square()
+    shape = (log_scale - log_scale.mean(-1, keepdim=True)).square().sum(-1) / 2
+    found = (config.known * usual + float(share @ shape)) / (config.known + float(share.sum()))
+    found = min(max(found, usual), usual * WIDEST**2)
+    together = 3 * config.common**2
+    return usual / found, (usual + together) / (found + together)

@@ -41,14 +41,7 @@ def own_edges(
     people: Bool[Tensor, "h w"],
     camera: Camera,
 ) -> OwnEdges:
-    """The straight edges of each object, and where they run.
-
-    Args:
-        segments: Of the picture.
-        masks: What is seen of the objects.
-        people: Where people are.
-        camera: With the lens and tilt as they are known now.
-    """
+    """The straight edges of each object, and where they run."""
     of = _owners(segments, masks, people, camera)
     yaw, upright = _level(segments, camera, 0.0)
     turned = torch.stack([_level(segments, camera, errors)[0] for errors in (-1.0, 1.0)])

@@ -2,21 +2,23 @@
 
 from dataclasses import replace
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mover.core.records import record
 from mover.core.types import Camera, Layout, Objects
+from mover.energy.human_terms import DepthRange
+from mover.energy.image_terms import Borders
 from mover.energy.objective import HumanCues, ImageCues
 from mover.energy.prior_terms import Walls
+from mover.geometry.raster import Crops
 
 
 @record
 class Pinned:
     """Objects that the user has placed: they are part of the energy but do not move."""
 
-    fixed: Bool[torch.Tensor, " objects"]
+    fixed: Bool[Tensor, " objects"]
     layout: Layout
     """Without an axis of starts; rows that are not fixed have no meaning."""
 
@@ -62,3 +64,51 @@ def hold(layout: Layout, pinned: Pinned | None) -> Layout:
 def with_walls(inputs: PlaceInputs, walls: Walls | None) -> PlaceInputs:
     """The inputs with the lines along which furniture stands."""
     return replace(inputs, image=replace(inputs.image, walls=walls))
+
+
+# Windows of fewer pixels: what is far off is found there, at a fraction of the work.
+
+
+def coarser_image(image: ImageCues, factor: int) -> ImageCues:
+    """The same with `factor` times fewer pixels along each side.
+
+    Raises:
+        ValueError: If the windows are not a multiple of it.
+    """
+    views = image.views
+    if factor < 1 or views.height % factor or views.width % factor:
+        raise ValueError(
+            f"coarser_image: windows of {views.height} x {views.width}, which {factor} does not"
+            " divide"
+        )
+    if factor == 1:
+        return image
+    zoom = views.K.new_tensor([1 / factor, 1 / factor, 1.0])[:, None]
+    borders, measured = image.borders, image.measured
+    return replace(
+        image,
+        views=Crops(views.K * zoom, views.height // factor, views.width // factor),
+        masks=_tiles(image.masks, factor).mean((-3, -1)),
+        keep=_tiles(image.keep, factor).all(-1).all(-2),
+        borders=borders and Borders(borders.shifts, _tiles(borders.masks, factor).mean((-3, -1))),
+        measured=measured and replace(measured, depth=_middles(measured.depth, factor)),
+    )
+
+
+def coarser_humans(humans: HumanCues, factor: int) -> HumanCues:
+    """The same with the bounds of the depth at one pixel of each tile."""
+    if factor == 1 or humans.depth is None:
+        return humans
+    near, far = (_middles(bound, factor) for bound in (humans.depth.near, humans.depth.far))
+    depth = DepthRange(near, far, humans.depth.area * factor**2)
+    return replace(humans, depth=depth)
+
+
+def _middles(image: Tensor, factor: int) -> Tensor:
+    """One pixel of each tile: bounds and depths have no mean."""
+    middle = factor // 2
+    return image[..., middle::factor, middle::factor]
+
+
+def _tiles(image: Tensor, factor: int) -> Tensor:
+    return image.unflatten(-1, (-1, factor)).unflatten(-3, (-1, factor))

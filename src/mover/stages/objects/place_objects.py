@@ -10,14 +10,19 @@ from mover.core.observe import Energy, Observer, silent
 from mover.core.types import Layout
 from mover.energy.bfgs import Problems, minimize_batched
 from mover.energy.config import Adam, BatchedBFGS, SceneConfig
-from mover.energy.fused.energy import energy_function, energy_of_rows
-from mover.energy.human_terms import trees_of
+from mover.energy.fused.energy import EnergyOf, energy_of_rows
 from mover.energy.minimize import Minimum, minimize
-from mover.energy.objective import of_objects, some_supports
+from mover.energy.objective import Rows, of_objects, some_supports
 from mover.geometry.placement import rest_on_support
 from mover.stages.config import PlaceConfig
-from mover.stages.objects.coarse_cues import coarser_humans, coarser_image
-from mover.stages.objects.place_inputs import Placed, PlaceInputs, hold, with_walls
+from mover.stages.objects.place_inputs import (
+    Placed,
+    PlaceInputs,
+    coarser_humans,
+    coarser_image,
+    hold,
+    with_walls,
+)
 from mover.stages.objects.separate_objects import separate_objects
 from mover.stages.objects.starts import best_few, choose, duplicates_of, piles_of, spread
 from mover.stages.objects.wall_alignment import line_up
@@ -25,7 +30,6 @@ from mover.stages.objects.wall_alignment import line_up
 
 def place_objects(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = silent) -> Placed:
     """Minimise Eq. 1 over the layout, from one start or from many."""
-    inputs = with_trees(inputs)
 
     def lower(given: PlaceInputs, starts: Layout) -> Placed:
         found = descend(given, config, starts, config.method, observe)
@@ -57,17 +61,15 @@ def starts_left(inputs: PlaceInputs, config: PlaceConfig, observe: Observer = si
     return best_few(found.at, found.value, config.num_hypotheses)
 
 
-def scene_config(config: PlaceConfig) -> SceneConfig:
-    """The weights of Eq. 1 in this stage."""
-    return SceneConfig(config.weights, config.form, config.uniform_scale_weight)
-
-
 def energy_of(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Layout], Energy]:
     """The energy as a function of layouts whose heights are still to be eliminated."""
-    energy = energy_function(
-        inputs.objects, inputs.camera, inputs.image, inputs.humans, scene_config(config)
-    )
+    energy = _rows(inputs, config)(None)
     return lambda layout: energy(standing(inputs, layout))
+
+
+def _rows(inputs: PlaceInputs, config: PlaceConfig) -> Callable[[Rows | None], EnergyOf]:
+    weights = SceneConfig(config.weights, config.form, config.uniform_scale_weight)
+    return energy_of_rows(inputs.objects, inputs.camera, inputs.image, inputs.humans, weights)
 
 
 def standing(inputs: PlaceInputs, layout: Layout) -> Layout:
@@ -93,21 +95,9 @@ def descend(
     return Minimum(standing(inputs, found.at), found.value, found.trace)
 
 
-def with_trees(inputs: PlaceInputs) -> PlaceInputs:
-    """The inputs with search trees of what is touched, where these help."""
-    humans = inputs.humans
-    if humans.touches is None:
-        return inputs
-    trees = trees_of(inputs.objects, humans.touches)
-    return replace(inputs, humans=replace(humans, trees=trees))
-
-
 def _problems(inputs: PlaceInputs, config: PlaceConfig, starts: Layout) -> Problems[Layout]:
     """Each start of each object as a problem of its own; loads belong to their carriers."""
-    (count, n), objects = starts.yaw.shape, inputs.objects
-    some_energy = energy_of_rows(
-        objects, inputs.camera, inputs.image, inputs.humans, scene_config(config)
-    )
+    (count, n), objects, some_energy = starts.yaw.shape, inputs.objects, _rows(inputs, config)
 
     def of(rows: Tensor) -> Callable[[Layout], Energy]:
         index, energy = rows % n, some_energy(rows)

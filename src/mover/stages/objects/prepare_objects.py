@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.errors import InputError
@@ -35,41 +35,14 @@ LEVEL = 0.005  # of the height: feet that differ by less stand level
 LAYER = 0.05  # [m], thickness of the layer that is one seat
 
 
-@record
-class Regions:
-    """Surface points that can be touched, in the object's frame [m]."""
-
-    top: Float[Tensor, "tops 3"]
-    back: Float[Tensor, "backs 3"]
-    has_top: bool
-    has_back: bool
-
-
 def find_regions(
-    points: Float[Tensor, "points 3"],
-    normals: Float[Tensor, "points 3"],
-    category: str,
-) -> Regions:
-    """Seat or top, and back, of one object.
+    points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], category: str
+) -> tuple[Float[Tensor, "tops 3"], Float[Tensor, "backs 3"]]:
+    """Surface points of the seat or top, and of the back, in the object's frame [m].
 
     The seat is the largest level layer above a quarter of the height, so that neither arms nor the
     back's rim count; a top is the highest layer with a quarter of the largest one's area.
     """
-    top = _level(points, normals, category)
-    back = torch.zeros_like(top)
-    if category in BACKS and bool(top.any()):
-        seat = points[top]
-        above, behind = (
-            points[:, 1] > seat[:, 1].mean() + LAYER,
-            points[:, 2] < seat[:, 2].mean(),
-        )
-        back = (normals[:, 2] > UPRIGHT) & above & behind
-    return Regions(points[top], points[back], bool(top.any()), bool(back.any()))
-
-
-def _level(
-    points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], category: str
-) -> Bool[Tensor, " points"]:
     y = points[:, 1]
     height = float(y.max())
     facing = (normals[:, 1] > UPRIGHT) & (y > 0.25 * height)
@@ -77,9 +50,15 @@ def _level(
     inside = facing & ((y - layers.unsqueeze(-1)).abs() <= LAYER)
     area = inside.sum(-1)
     if category in SEATS or category == "bed":
-        return inside[area.argmax()]
-    wide = (area >= 0.25 * area.max()) & (area > 0)
-    return inside[wide.nonzero()[-1, 0]] if wide.any() else facing
+        level = inside[area.argmax()]
+    else:
+        wide = (area >= 0.25 * area.max()) & (area > 0)
+        level = inside[wide.nonzero()[-1, 0]] if wide.any() else facing
+    seat, back = points[level], torch.zeros_like(level)
+    if category in BACKS and len(seat):
+        above, behind = y > seat[:, 1].mean() + LAYER, points[:, 2] < seat[:, 2].mean()
+        back = (normals[:, 2] > UPRIGHT) & above & behind
+    return seat, points[back]
 
 
 @record
@@ -111,7 +90,8 @@ class _Proxy:
     mesh: Mesh
     edges: Int[Tensor, "edges 4"]
     samples: Float[Tensor, "samples 3"]
-    regions: Regions
+    top: Float[Tensor, "tops 3"]
+    back: Float[Tensor, "backs 3"]
     center: Float[Tensor, "3"]
 
 
@@ -132,9 +112,10 @@ def prepare_objects(
             observe(Step("prepare_objects", index, len(inputs.objects)))
     pieces = inputs.objects
     center = torch.stack([p.center for p in proxies])
-    scale = torch.stack([p.scale for p in pieces])
-    yaw = torch.stack([p.yaw for p in pieces])
-    origin = torch.stack([p.t_world_object for p in pieces])
+    scale, yaw, origin = (
+        torch.stack([getattr(p, name) for p in pieces])
+        for name in ("scale", "yaw", "t_world_object")
+    )
     moved = (rot_y(yaw) @ (scale * center).unsqueeze(-1)).squeeze(-1)
     start = Layout(origin + moved, yaw, torch.zeros_like(scale))
     hollow = tuple(
@@ -142,7 +123,8 @@ def prepare_objects(
         for piece, proxy in zip(pieces, proxies, strict=True)
         if signed_volume(proxy.mesh) <= 0
     )
-    return Prepared(_pack(pieces, proxies), start, center, scale, (*hollow, *sorted(notes)))
+    objects = _pack(pieces, proxies, config.region)
+    return Prepared(objects, start, center, scale, (*hollow, *sorted(notes)))
 
 
 def to_objects(
@@ -151,20 +133,15 @@ def to_objects(
     """Turn a layout of proxies back into placements of the user's own meshes."""
     scale = prepared.scale * layout.log_scale.exp()
     back = (rot_y(layout.yaw) @ (scale * prepared.center).unsqueeze(-1)).squeeze(-1)
-    origin = layout.t_world_object - back
-    below = support_names(prepared.objects)
+    origin, objects = layout.t_world_object - back, prepared.objects
+    words = {GROUND: "ground", FREE: "free"}
+    below = [words.get(k) or objects.ids[k] for k in objects.supports.tolist()]
     return tuple(
         dataclasses.replace(
             p, support=below[i], t_world_object=origin[i], yaw=layout.yaw[i], scale=scale[i]
         )
         for i, p in enumerate(_with_raised_seats(pieces, prepared))
     )
-
-
-def support_names(objects: Objects) -> tuple[str, ...]:
-    """Support of each object: `ground`, `free`, or the id of the object below it."""
-    words = {GROUND: "ground", FREE: "free"}
-    return tuple(words.get(below) or objects.ids[below] for below in objects.supports.tolist())
 
 
 def _with_raised_seats(
@@ -175,10 +152,9 @@ def _with_raised_seats(
     if known is None:
         return pieces
     unit, low = prepared.scale[:, 1], prepared.center[:, 1]
-    own = SeatStretch(low, low + known.top / unit, known.rise / unit)
-    out = list(pieces)
+    top, rise, out = low + known.top / unit, known.rise / unit, list(pieces)
     for i in known.rise.nonzero()[:, 0].tolist():
-        stretch, mesh = SeatStretch(own.bottom[i], own.top[i], own.rise[i]), pieces[i].mesh
+        stretch, mesh = SeatStretch(low[i], top[i], rise[i]), pieces[i].mesh
         mesh = dataclasses.replace(mesh, verts=stretch.of(mesh.verts))
         out[i] = dataclasses.replace(pieces[i], mesh=mesh, stretch=stretch)
     return tuple(out)
@@ -221,16 +197,14 @@ def _closing(config: PrepareConfig) -> tuple[Callable[[Mesh], Mesh], list[str]]:
 
 def _proxy(piece: SceneObject, config: PrepareConfig, close: Callable[[Mesh], Mesh]) -> _Proxy:
     mesh = used(piece.mesh)
-    low, high = box(mesh.verts)
-    center = bottom_center(low, high)
-    mesh = Mesh((mesh.verts - center) * piece.scale, mesh.faces)
-    mesh = close(mesh)
+    center = bottom_center(*box(mesh.verts))
+    mesh = close(Mesh((mesh.verts - center) * piece.scale, mesh.faces))
     if config.level_feet:
         mesh = levelled(mesh)
-    points, normals = sample_surface(mesh, 4 * config.samples)
-    regions = find_regions(points, normals, canonical(piece.category))
+    points = sample_surface(mesh, 4 * config.samples)
     samples, _ = sample_surface(mesh, config.samples)
-    return _Proxy(mesh, edges_of(mesh.faces), samples, _thin(regions, config.region), center)
+    regions = find_regions(*points, canonical(piece.category))
+    return _Proxy(mesh, edges_of(mesh.faces), samples, *regions, center)
 
 
 def levelled(mesh: Mesh) -> Mesh:
@@ -262,20 +236,15 @@ def levelled(mesh: Mesh) -> Mesh:
     return Mesh(torch.stack([verts[:, 0], y, verts[:, 2]], -1), mesh.faces)
 
 
-def _thin(regions: Regions, count: int) -> Regions:
-    def some(points: Tensor) -> Tensor:
-        if len(points) == 0:
-            return points.new_zeros(count, 3)
-        return points[torch.linspace(0, len(points) - 1, count).round().long()]
+def _pack(pieces: tuple[SceneObject, ...], proxies: list[_Proxy], region: int) -> Objects:
+    def thin(points: Tensor) -> Tensor:
+        if not len(points):
+            return points.new_zeros(region, 3)
+        return points[torch.linspace(0, len(points) - 1, region).round().long()]
 
-    return Regions(some(regions.top), some(regions.back), regions.has_top, regions.has_back)
-
-
-def _pack(pieces: tuple[SceneObject, ...], proxies: list[_Proxy]) -> Objects:
     categories = tuple(canonical(p.category) for p in pieces)
     counts = torch.tensor([len(p.mesh.verts) for p in proxies])
     index = {p.id: i for i, p in enumerate(pieces)} | {"ground": GROUND, "free": FREE}
-    size = torch.stack([high - low for low, high in (box(p.mesh.verts) for p in proxies)])
     return Objects(
         ids=tuple(p.id for p in pieces),
         categories=categories,
@@ -284,11 +253,11 @@ def _pack(pieces: tuple[SceneObject, ...], proxies: list[_Proxy]) -> Objects:
         faces=_pad([p.mesh.faces for p in proxies]),
         edges=_pad([p.edges for p in proxies]),
         samples=torch.stack([p.samples for p in proxies]),
-        size=size,
-        top=torch.stack([p.regions.top for p in proxies]),
-        back=torch.stack([p.regions.back for p in proxies]),
-        has_top=torch.tensor([p.regions.has_top for p in proxies]),
-        has_back=torch.tensor([p.regions.has_back for p in proxies]),
+        size=torch.stack([high - low for low, high in (box(p.mesh.verts) for p in proxies)]),
+        top=torch.stack([thin(p.top) for p in proxies]),
+        back=torch.stack([thin(p.back) for p in proxies]),
+        has_top=torch.tensor([bool(len(p.top)) for p in proxies]),
+        has_back=torch.tensor([bool(len(p.back)) for p in proxies]),
         is_seat=torch.tensor([c in SEATS for c in categories]),
         supports=torch.tensor([index[p.support] for p in pieces]),
     )

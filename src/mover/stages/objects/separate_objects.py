@@ -32,13 +32,6 @@ def separate_objects(
 ) -> Layout:
     """Minimise the energy of all objects and the volume that they share.
 
-    Args:
-        energy: Of layouts with one start.
-        objects: The objects.
-        layout: Where they were found alone.
-        weight: Of the shared volume.
-        observe: Gets every step.
-
     Returns:
         The same layout if none stands in another; in any case the same position of each object that
         has no part in it.

@@ -1,4 +1,4 @@
-"""Several starts of the descent: spread, thin out, choose."""
+"""Starts of the descent: turned to the people, spread, thinned out, chosen."""
 
 import math
 from collections.abc import Sequence
@@ -11,11 +11,39 @@ from torch import Tensor
 from mover.core.records import to_device
 from mover.core.types import Layout, Objects, SceneObject
 from mover.energy.human_terms import ContactPoints
+from mover.furniture.library import WALL_PIECES
 from mover.geometry.boxes import box_of
 from mover.geometry.rotations import wrap
 
 TURNED = math.radians(20)  # candidates nearer than this in yaw,
 MOVED = 0.3  # and than this in position [m], are one
+BEHIND = -0.25  # mean cosine of the angle from front to people, at most, of what faces away
+
+
+# Fronts of furniture that were guessed the wrong way round face the people (not in the paper).
+# Tools that estimate a direction from one image confuse back and front for one object in ten.
+# Furniture along walls faces the room, and the room is where people are: in known rooms 100 to
+# 112 the mean cosine between front and people is .33 or more for all 42 such objects.
+
+
+def facing(layout: Layout, people: Float[Tensor, "bodies 3"]) -> Float[Tensor, " objects"]:
+    """Mean cosine of the angle from above between each object's front and the way to people."""
+    front = torch.stack([layout.yaw.sin(), layout.yaw.cos()], -1)
+    way = people[None, :, [0, 2]].to(front) - layout.t_world_object[:, None, [0, 2]]
+    return (torch.nn.functional.normalize(way, dim=-1) * front[:, None]).sum(-1).mean(1)
+
+
+def turned_to_people(
+    layout: Layout, categories: tuple[str, ...], people: Float[Tensor, "bodies 3"]
+) -> Layout:
+    """Turn objects along walls whose back faces people by the best number of quarters."""
+    along = torch.tensor([name in WALL_PIECES for name in categories], device=layout.yaw.device)
+    if not len(people) or not bool(along.any()):
+        return layout
+    yaws = torch.stack([wrap(layout.yaw + k * math.pi / 2) for k in range(4)])
+    faces = torch.stack([facing(replace(layout, yaw=yaw), people) for yaw in yaws])
+    best = torch.where(along & (faces[0] < BEHIND), faces.argmax(0), 0)
+    return replace(layout, yaw=yaws.gather(0, best[None])[0])
 
 
 def spread(layout: Layout, yaws: int) -> Layout:
@@ -103,30 +131,19 @@ def duplicates_of(layout: Layout, pile: Int[Tensor, " objects"]) -> Int[Tensor, 
 def other_starts(others: Sequence[SceneObject], objects: Objects, start: Layout) -> Layout:
     """Starts in which each object stands as its next hypothesis says.
 
-    An object keeps its own shape, and gets the place, front and size of the hypothesis; one with
-    fewer hypotheses than others stays at its start in the rest.
-
-    Args:
-        others: Hypotheses; the id of each is that of its object. Those of unknown objects are left
-            out.
-        objects: The furniture.
-        start: Where the objects stand in the scene.
-
-    Returns:
-        As many starts as the object with most hypotheses has; none without hypotheses.
+    An object keeps its own shape, and gets the position, front and size of the hypothesis with its
+    id; one with fewer hypotheses than others stays at its start in the rest. Hypotheses of unknown
+    objects are left out.
     """
     index = {name: i for i, name in enumerate(objects.ids)}
+    known = [piece for piece in others if piece.id in index]
     ranks = dict.fromkeys(objects.ids, 0)
-    found: list[tuple[int, int, SceneObject]] = []
-    for piece in others:
-        if piece.id in index:
-            found.append((ranks[piece.id], index[piece.id], piece))
-            ranks[piece.id] += 1
-    count = max(ranks.values(), default=0)
+    count = max((sum(piece.id == name for piece in known) for name in index), default=0)
     place = start.t_world_object.repeat(count, 1, 1)
     yaw, sizes = start.yaw.repeat(count, 1), start.log_scale.repeat(count, 1, 1)
-    for rank, k, piece in found:
-        box = box_of(piece)
+    for piece in known:
+        rank, k, box = ranks[piece.id], index[piece.id], box_of(piece)
+        ranks[piece.id] += 1
         half = torch.stack([torch.zeros(()), box.size[1] / 2, torch.zeros(())])
         place[rank, k] = (box.center - half).to(place)
         yaw[rank, k] = piece.yaw.to(yaw)

@@ -28,18 +28,11 @@ STRETCH = (0.7, 1.4)  # of its distance, within which an object is moved to a li
 BOTTOM = 3  # number of the side of a box on which the object stands
 KEPT = 3  # candidates of the search without lines from which an object descends again
 
-Lower = Callable[[PlaceInputs, Layout], Placed]
-"""Goes down from some starts."""
 
-
-def line_up(found: Placed, inputs: PlaceInputs, rounds: int, lower: Lower) -> Placed:
+def line_up(
+    found: Placed, inputs: PlaceInputs, rounds: int, lower: Callable[[PlaceInputs, Layout], Placed]
+) -> Placed:
     """Place the objects along walls again, with the lines of others.
-
-    Args:
-        found: Where a search ended that knew no lines.
-        inputs: What was placed.
-        rounds: How often; each time with the lines at the objects' current positions.
-        lower: Goes down from some starts.
 
     Returns:
         Objects that belong to no line are as they were found.
@@ -55,21 +48,16 @@ def line_up(found: Placed, inputs: PlaceInputs, rounds: int, lower: Lower) -> Pl
         moves = torch.isin(pile, pile[walls.trust.amax(-1) > 0])
         start = Layout.where(moves, Layout.cat(starts, few), lined.layout[None])
         more = lower(with_walls(inputs, walls), start)
-        lined = _where_lined(more, found, walls)
+        on_line = walls.trust.amax(-1) > 0
+        count = min(len(more.energy), len(found.energy))  # as many candidates of both
+        lined = Placed(
+            Layout.where(on_line, more.layout, found.layout),
+            Layout.where(on_line, more.candidates[:count], found.candidates[:count]),
+            torch.where(on_line, more.energy[:count], found.energy[:count]),
+            found.trace,
+            walls,
+        )
     return lined
-
-
-def _where_lined(lined: Placed, found: Placed, walls: Walls) -> Placed:
-    """The objects of a line as lined up, the others as found; as many candidates of both."""
-    on_line = walls.trust.amax(-1) > 0
-    count = min(len(lined.energy), len(found.energy))
-    return Placed(
-        Layout.where(on_line, lined.layout, found.layout),
-        Layout.where(on_line, lined.candidates[:count], found.candidates[:count]),
-        torch.where(on_line, lined.energy[:count], found.energy[:count]),
-        found.trace,
-        walls,
-    )
 
 
 def find_walls(layout: Layout, objects: Objects, sides: Int[Tensor, "objects 4"]) -> Walls | None:

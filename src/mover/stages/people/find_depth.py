@@ -15,6 +15,7 @@ scaled about the camera, which no picture sees.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,7 +32,7 @@ from mover.geometry.warp_start import mapped
 from mover.stages.camera.find_foot_contacts import straight_legs
 from mover.stages.config import DepthConfig
 from mover.stages.contacts.assign_contacts import evenly, in_turns
-from mover.stages.cover import Cover, clear, covered
+from mover.stages.cover import Cover, covered
 from mover.stages.masks import (
     Extents,
     MaskTable,
@@ -42,12 +43,11 @@ from mover.stages.masks import (
     uncovered,
 )
 
-# The factor of depth at which bodies fill their masks best, and that of their heights.
-#
-# Errors of the pose bias both, as far as bodies cannot be made to fill their masks: the misfit, one
-# minus the best overlap. Learnt on development rooms of the known rooms with pose errors of 0, 4
-# and 8 degrees a joint (seeds 100 to 129): overlaps put people too far, by 1 % from a misfit of 0.3
-# on; heights, since bent bodies are lower, put them too near by 1 % there and by more beyond.
+# Errors of the pose bias both factors as far as bodies cannot be made to fill their masks: the
+# misfit, one minus the best overlap. Learnt on development rooms of the known rooms with pose
+# errors of 0, 4 and 8 degrees a joint (seeds 100 to 129): overlaps put people too far, by 1 % from
+# a misfit of 0.3 on; heights, since bent bodies are lower, put them too near by 1 % there and by
+# more beyond.
 
 SYSTEMATIC = 0.003  # error of the factor that more frames do not make smaller
 
@@ -70,18 +70,12 @@ class Peak:
     warnings: tuple[str, ...] = ()
     """Why the factor may not be used."""
 
-    @property
-    def lower(self) -> float:
-        """What heights say too little, by errors of the pose."""
-        return NEAR * max(0.0, self.misfit - BENT)
-
 
 def peak_of(curves: Float[Tensor, "used factors"], config: DepthConfig) -> Peak:
     """Best factor by a parabola, its spread, and why it may not be used."""
     factors = curves.shape[1]
     if len(curves) < config.least:
-        seen = f"{len(curves)} of at least {config.least} bodies are seen well enough"
-        return _unknown(f"{seen}, it stays as given")
+        return _unknown(f"{len(curves)} of at least {config.least} bodies are seen well enough")
     total = curves.double().mean(0)
     best, reach = int(total.argmax()), max(2, factors // 6)
     low, high = max(0, best - reach), min(factors, best + reach + 1)
@@ -90,30 +84,21 @@ def peak_of(curves: Float[Tensor, "used factors"], config: DepthConfig) -> Peak:
     design = torch.stack([x.square(), x, torch.ones_like(x)], -1)
     bend, slope, _ = torch.linalg.lstsq(design, total[low:high]).solution.tolist()
     if bend >= 0 or best in (0, factors - 1):
-        wrong = f"more than {100 * config.span:.0f} % wrong or unclear, it stays as given"
-        return _unknown(wrong)
+        return _unknown(f"more than {100 * config.span:.0f} % wrong or unclear")
     factor = 1 + float(grid[best]) - slope / (2 * bend)
     each = torch.linalg.lstsq(design, curves.double()[:, low:high].mT).solution
     lean = each[1] + 2 * each[0] * (factor - 1 - float(grid[best]))
     error = float(lean.std()) / len(curves) ** 0.5 / abs(2 * bend)
     spread = (error**2 + SYSTEMATIC**2) ** 0.5
     if spread > config.spread:
-        return _unknown(f"uncertain by {100 * spread:.1f} %, it stays as given")
+        return _unknown(f"uncertain by {100 * spread:.1f} %")
     misfit = 1 - float(total.max())
     farther = FAR * max(0.0, min(misfit, FULL) - FREE)
     return Peak(factor - farther, spread, misfit)
 
 
-def fused(factors: list[tuple[float, float]]) -> tuple[float, float]:
-    """Mean of (factor, spread) by their certainty, and its spread."""
-    weights = [1 / (spread**2 + COMMON**2) for _, spread in factors]
-    whole = sum(weights)
-    mean = sum(w * factor for w, (factor, _) in zip(weights, factors, strict=True)) / whole
-    return mean, whole**-0.5
-
-
 def _unknown(why: str) -> Peak:
-    return Peak(1.0, float("inf"), FULL, (why,))
+    return Peak(1.0, float("inf"), FULL, (f"{why}, it stays as given",))
 
 
 LIKELY_SIZE = (0.8, 1.25)  # a body whose size is off by more is a mistake in the height
@@ -154,10 +139,10 @@ def find_depth(
     """Compare every person's silhouettes at several depths with the visible masks."""
     bodies, warnings = inputs.bodies, []
     tracks = bodies.person.unique().tolist()
-    found = torch.ones(3, len(tracks)) * torch.tensor([[1.0], [torch.inf], [1.0]])
+    found = torch.ones(3, len(tracks))
     table = mask_table(inputs.people, bodies)
     blocked = covered(inputs.objects)
-    free = clear(inputs.objects, config.width)
+    free = cache(lambda frame: uncovered(blocked(frame), config.width))
     for index, person in enumerate(tracks):  # each has its own frames
         rows = ((bodies.person == person) & inputs.keep).nonzero()[:, 0]
         size, note = _size(inputs, rows, str(person))
@@ -177,23 +162,19 @@ def find_depth(
 def apply_depth(bodies: Bodies, factors: DepthFactors) -> Bodies:
     """Move people to their true depth: scaled about the camera, then along the pelvis' ray."""
     same = (bodies.person[:, None] == factors.person.to(bodies.person)).to(bodies.verts)
-    both = factors.factor, factors.size  # people without a factor keep their place
+    both = factors.factor, factors.size  # people without a factor keep their position
     factor, size = (1 + same @ (x.to(bodies.verts) - 1) for x in both)
     bodies = larger(bodies, size) if bool((size != 1).any()) else bodies
-    shift = (factor - 1)[:, None] * pelvis(bodies)
-    return shifted(bodies, shift)
+    return shifted(bodies, (factor - 1)[:, None] * pelvis(bodies))
 
 
 def shifted(bodies: Bodies, shift: Float[Tensor, "bodies 3"]) -> Bodies:
     """Each body moved by its own vector [m]."""
-    joints, pose = bodies.joints, bodies.pose
-    if joints is not None:
-        joints = joints + shift[:, None]
+    joints, pose, by = bodies.joints, bodies.pose, shift[:, None]
     if pose is not None:
         pose = dataclasses.replace(pose, transl=pose.transl + shift.to(pose.transl))
-    return dataclasses.replace(
-        bodies, verts=bodies.verts + shift[:, None], joints=joints, pose=pose
-    )
+    joints = None if joints is None else joints + by
+    return dataclasses.replace(bodies, verts=bodies.verts + by, joints=joints, pose=pose)
 
 
 def are_shapeless(bodies: Bodies) -> bool:
@@ -232,13 +213,20 @@ def pelvis(bodies: Bodies) -> Float[Tensor, "bodies 3"]:
 
 
 def _with_heights(peak: Peak, found: Extents | None, config: DepthConfig) -> Peak:
-    """The mean of what overlaps and heights say; the one that there is if the other is missing."""
+    """The mean of both factors by their certainty; the one that there is if the other is missing.
+
+    Heights are too low where bodies do not fit their masks: they count as so much higher.
+    """
     used = [(peak.factor, peak.spread)] if peak.spread <= config.spread else []
     if found is not None and found.frames >= config.least and abs(found.factor - 1) <= config.span:
         spread = (found.spread**2 + SYSTEMATIC**2) ** 0.5
         if spread <= config.spread:
-            used.append((found.factor + peak.lower, spread))
-    return Peak(*fused(used), peak.misfit) if used else peak
+            used.append((found.factor + NEAR * max(0.0, peak.misfit - BENT), spread))
+    if not used:
+        return peak
+    weights = [1 / (spread**2 + COMMON**2) for _, spread in used]
+    mean = sum(w * factor for w, (factor, _) in zip(weights, used, strict=True)) / sum(weights)
+    return Peak(mean, sum(weights) ** -0.5, peak.misfit)
 
 
 def _size(inputs: DepthInputs, rows: Int[Tensor, " rows"], person: str) -> tuple[float, list[str]]:
@@ -281,25 +269,19 @@ def _curves(
             return None
         return overlaps(_drawn(inputs, row, free, factors), mask, known)
 
+    pixels = project(inputs.bodies.verts[rows], inputs.camera.K.to(inputs.bodies.verts))
+    size = pixels.new_tensor([inputs.camera.width, inputs.camera.height])
+    inside = ((pixels > 0) & (pixels < size)).all(-1).float().mean(1) >= config.inside
+    tried = evenly(rows[inside], config.whole)
+    first = evenly(tried, config.most)
+    others = tried[~torch.isin(tried, first)]  # stand in for bodies that are hidden
+    asked = torch.cat([first, others[in_turns(len(others))]]).tolist()
     curves: list[Tensor] = []
-    asked = _spread_out(rows[:: config.every], inputs, config)
     while asked and len(curves) < config.most:  # no more than may be needed
         left = config.most - len(curves)
         curves += [found for found in mapped(curve, asked[:left]) if found is not None]
         asked = asked[left:]
     return torch.stack(curves) if curves else torch.zeros(0, config.factors)
-
-
-def _spread_out(rows: Int[Tensor, " rows"], inputs: DepthInputs, config: DepthConfig) -> list[int]:
-    """Bodies inside the image: evenly spread ones, then those that stand in for hidden ones."""
-    camera, verts = inputs.camera, inputs.bodies.verts[rows]
-    pixels = project(verts, camera.K.to(verts))
-    size = pixels.new_tensor([camera.width, camera.height])
-    inside = ((pixels > 0) & (pixels < size)).all(-1).float().mean(1) >= config.inside
-    tried = evenly(rows[inside], config.whole)
-    first = evenly(tried, config.most)
-    others = tried[~torch.isin(tried, first)]
-    return torch.cat([first, others[in_turns(len(others))]]).tolist()
 
 
 def _drawn(

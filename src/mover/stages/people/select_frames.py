@@ -62,12 +62,12 @@ def select_frames(
     """
     bodies = inputs.bodies
     keep = np.ones(len(bodies.frame), dtype=bool)
-    tracks = bodies.person.unique().tolist()
     if bodies.fps is None:
         return Selection(torch.from_numpy(keep))
-    frame, points = bodies.frame.cpu().numpy(), _points(bodies)
+    frame, persons = bodies.frame.cpu().numpy(), bodies.person.cpu().numpy()
+    points, tracks = _points(bodies), np.unique(persons)
     for index, person in enumerate(tracks):
-        rows = np.flatnonzero(bodies.person.cpu().numpy() == person)
+        rows = np.flatnonzero(persons == person)
         rows = rows[np.argsort(frame[rows], kind="stable")]
         if len(rows) >= 3:
             time, inner = frame[rows] / bodies.fps, np.arange(1, len(rows) - 1)
@@ -94,11 +94,7 @@ def _points(bodies: Bodies) -> Points:
 
 
 def _strain(
-    time: Float[np.ndarray, " frames"],
-    points: Points,
-    i: np.ndarray,
-    j: np.ndarray,
-    k: np.ndarray,
+    time: np.ndarray, points: Points, i: np.ndarray, j: np.ndarray, k: np.ndarray
 ) -> np.ndarray:
     """Second difference over its limit at the middle of three frames; above 1 no motion is so."""
     h1, h2 = time[j] - time[i], time[k] - time[j]
@@ -142,16 +138,9 @@ def _longest(time: np.ndarray, points: Points) -> np.ndarray:
         best = cost.argmin(0)
         pair[k - 1 - j, k] = cost[best, np.arange(len(k))] + (k - 1 - j)
         came[k - 1 - j, k] = best - 1
-    return _trace(pair, came, alone, before)
-
-
-def _trace(pair: np.ndarray, came: np.ndarray, alone: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Walk back along the best path."""
-    n = len(alone)
     keep = np.zeros(n, dtype=bool)
-    best = np.minimum(alone, pair.min(0)) + (n - 1 - np.arange(n))
-    k = int(best.argmin())
-    while k >= 0:
+    k = int((np.minimum(alone, pair.min(0)) + (n - 1 - np.arange(n))).argmin())
+    while k >= 0:  # back along the best path
         keep[k] = True
         b = int(pair[:, k].argmin())
         if alone[k] <= pair[b, k]:
