@@ -42,7 +42,7 @@ UPPER = [k for k, name in enumerate(BODY) if k and not name.endswith(LEGS)]
 
 
 @record
-class Motion:
+class TrackMotion:
     """Rows of one track at three moments, and how far people leave a straight line there."""
 
     near: Neighbours
@@ -70,7 +70,7 @@ class Seen:
     """The pose that the prior expects: of the row's posture, or of the body to start from [rad]."""
     spread: Float[Tensor, "bodies 63"]
     """How far from it each angle may be [rad]."""
-    motion: Motion | None = None
+    motion: TrackMotion | None = None
     """None: rows are not neighbours in time."""
     stature: Stature | None = None
     """The prior of their heights; None: the mean shape's, as one more coefficient."""
@@ -163,7 +163,7 @@ class FitState:
         return project(self.points.keypoints, self.seen.K)
 
     @property
-    def motion(self) -> Motion:
+    def motion(self) -> TrackMotion:
         """Which rows follow each other."""
         assert self.seen.motion is not None
         return self.seen.motion

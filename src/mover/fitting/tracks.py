@@ -13,7 +13,7 @@ from mover.core.records import record
 from mover.core.types import Camera, Keypoints
 from mover.energy.body_terms import gather_neighbours
 from mover.fitting.config import FitConfig, Stage
-from mover.fitting.energy import Motion, Seen
+from mover.fitting.energy import Seen, TrackMotion
 from mover.fitting.priors import kind_of, resting, spreads
 from mover.fitting.unknowns import Rig
 
@@ -71,7 +71,7 @@ def tracks_of(
 
 def motion_of(
     keypoints: Keypoints, speed: Float[Tensor, "rows joints"] | None, config: FitConfig
-) -> Motion:
+) -> TrackMotion:
     """Neighbours in time of each person, and how much they accelerate.
 
     Args:
@@ -87,7 +87,7 @@ def motion_of(
         factor = torch.tensor([AGILITY, *[SWING] * (len(BODY) - 1)])
         most = (CALM + factor * speed.double()).clamp_max(config.acceleration)
         calm = config.jitter + most[near.triples[:, 1]] * time[:, None]
-    return Motion(near, expected.float(), calm.float())
+    return TrackMotion(near, expected.float(), calm.float())
 
 
 def joint_speed(
