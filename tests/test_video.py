@@ -139,7 +139,7 @@ class TestNetworks:
         self, monkeypatch: pytest.MonkeyPatch
     ):
         monkeypatch.setattr(needs.importlib.util, "find_spec", lambda _: None)
-        found = "; ".join(missing(ModelsConfig()))
+        found = "; ".join(missing(ModelsConfig(), mediapipe=True))
         for name, facts in FACTS.items():
             assert f"hf download {name}" in found
             assert all(fact in found for fact in facts)
