@@ -110,12 +110,9 @@ def minimize_batched(
     if not bool(live.value.isfinite().all() and live.slope.isfinite().all()):
         raise ValueError(f"{stage}: the energy is not finite")
 
-    def reached() -> P:
-        return _shaped(ends[like], start, axes, len(axes))
-
     def report(index: int) -> None:
         seen = Energy({"energy": values[like].reshape(axes)})
-        observe(Step(stage, index, method.steps, seen, reached))
+        observe(Step(stage, index, method.steps, seen))
 
     live = live.only(_pooled(problems, live, live.slope.norm(dim=-1)) > 0)
     for index in range(method.steps):
@@ -129,7 +126,8 @@ def minimize_batched(
         live = live.only(_pooled(problems, live, moves.double()) > 0)
     if method.steps:
         report(method.steps - 1)
-    return Minimum(reached(), values[like].to(dtype).reshape(axes), torch.stack(trace).to(dtype))
+    found = _shaped(ends[like], start, axes, len(axes))
+    return Minimum(found, values[like].to(dtype).reshape(axes), torch.stack(trace).to(dtype))
 
 
 def _advance(problems: Problems[P], evaluate: Evaluate, live: _Live, method: BatchedBFGS) -> _Live:

@@ -118,7 +118,7 @@ def minimize(
         square.mul_(method.beta2).addcmul_(slope, slope, value=1 - method.beta2)
         length = (square.sqrt() / (1 - method.beta2 ** (index + 1)) ** 0.5).add_(1e-8)
         at.add_((mean * (-rate / (1 - BETA1 ** (index + 1)))).div_(length))
-        observe(Step(stage, index, method.steps, value, lambda: free))
+        observe(Step(stage, index, method.steps, value))
     with torch.no_grad():
         last = energy(free).per_item
     best = _lower(best, last, at, fields) if method.keep_best else None
