@@ -119,5 +119,5 @@ def camera_prior(found: Alignment, picture: Picture, size: float) -> Gaussian:
     known = math.inf if picture.height is None else GIVEN
     spreads = (PITCH, ROLL) if picture.tilt_spread is None else (picture.tilt_spread,) * 2
     prior = diagonal(usual, torch.tensor([*spreads, known], dtype=torch.float64))
-    found = Gaussian(observed, torch.linalg.inv(covariance)).times(prior)
-    return Gaussian(found.mean.float(), found.precision.float())
+    both = Gaussian(observed, torch.linalg.inv(covariance)).times(prior)
+    return Gaussian(both.mean.float(), both.precision.float())

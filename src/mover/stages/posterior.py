@@ -75,11 +75,13 @@ def least_squares(seen: Observations) -> Gaussian:
     values, spreads = (
         torch.cat([x.double() for x in rows]) for rows in (seen.values, seen.spreads)
     )
+    found: Gaussian | None = None
     weight = spreads.square().reciprocal()
     for _ in range(ROUNDS):
         precision = slopes.mT @ (weight[:, None] * slopes)
-        mean = torch.linalg.solve(precision, slopes.mT @ (weight * values))
-        off = ((values - slopes @ mean) / spreads).square()
+        found = Gaussian(torch.linalg.solve(precision, slopes.mT @ (weight * values)), precision)
+        off = ((values - slopes @ found.mean) / spreads).square()
         student = (FREEDOM + 1) / (FREEDOM + off)
         weight = torch.where(robust, student.clamp_max(1.0), 1.0) / spreads.square()
-    return Gaussian(mean, precision)
+    assert found is not None
+    return found
