@@ -122,7 +122,8 @@ def own_objects(own: Own, clip: Clip, drift: Drift) -> dict[str, Any]:
     if own.objects_frame is not None:
         frame = int((_indices(clip) - own.objects_frame).abs().argmin())
         items = [_moved_item(item, drift.H[frame], size) for item in items]
-    return objects_tree(Instances(tuple(items), size, found.file), items).value
+    tree = objects_tree(Instances(tuple(items), size, found.file), items).value
+    return {**tree, "images": [{**tree["images"][0], "file_name": "reference.png"}]}
 
 
 def _moved_item(item: Instance, H: Float[Tensor, "3 3"], size: tuple[int, int]) -> Instance:
