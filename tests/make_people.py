@@ -446,6 +446,11 @@ COCO = ("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder
         "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")  # fmt: skip
 HALPE = (*COCO, "head_top", "neck", "mid_hip", "left_big_toe", "right_big_toe", "left_small_toe",
          "right_small_toe", "left_heel", "right_heel")  # fmt: skip
+MEDIAPIPE = ("nose", "", "left_eye", "", "", "right_eye", "", "left_ear", "right_ear", "", "",
+             "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist",
+             "right_wrist", *("",) * 6, "left_hip", "right_hip", "left_knee", "right_knee",
+             "left_ankle", "right_ankle", "left_heel", "right_heel", "left_big_toe",
+             "right_big_toe")  # fmt: skip
 OPENPOSE = ("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder",
             "left_elbow", "left_wrist", "mid_hip", "right_hip", "right_knee", "right_ankle",
             "left_hip", "left_knee", "left_ankle", "right_eye", "left_eye", "right_ear",
@@ -503,6 +508,15 @@ def write_coco17(folder: Path) -> Path:
     return folder / "results.json"
 
 
+def write_mediapipe(folder: Path) -> Path:
+    rows = [
+        {"image_id": int(f), "category_id": 1, "keypoints": row.ravel().tolist(), "score": 0.8}
+        for f, row in zip(FRAMES, seen(MEDIAPIPE), strict=True)
+    ]
+    (folder / "landmarks.json").write_text(json.dumps(rows))
+    return folder / "landmarks.json"
+
+
 def write_coco17_mmpose(folder: Path) -> Path:
     images = [
         {"frame_id": int(f), "instances": [
@@ -516,5 +530,5 @@ def write_coco17_mmpose(folder: Path) -> Path:
 
 KEYPOINTS = {
     "coco17": write_coco17, "coco17:mmpose": write_coco17_mmpose,
-    "halpe26": write_halpe26, "openpose": write_openpose,
+    "halpe26": write_halpe26, "openpose": write_openpose, "mediapipe": write_mediapipe,
 }  # fmt: skip

@@ -36,7 +36,7 @@ def named(model, layout, base=None):
 
 def test_layouts_have_the_order_of_their_detectors():
     sizes = {"openpose25": 25, "openpose137": 137, "smplifyx118": 118, "coco17": 17}
-    sizes |= {"halpe26": 26, "wholebody133": 133}
+    sizes |= {"halpe26": 26, "wholebody133": 133, "mediapipe33": 33}
     assert {name: len(points) for name, points in LAYOUTS.items()} == sizes
     body = dict(enumerate(LAYOUTS["openpose25"]))
     wanted = {

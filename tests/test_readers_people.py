@@ -521,7 +521,8 @@ def test_keypoints_fall_on_the_joints_they_name(tool, tmp_path):
         assert torch.allclose(found.confidence[:, k], torch.tensor(0.9))
         assert np.abs(found.points[:, k].numpy() - true[:, joint]).max() < 0.01, name
         checked += 1
-    assert checked == {"coco17": 13, "halpe26": 17, "openpose": 19}[tool.split(":")[0]]
+    counts = {"coco17": 13, "halpe26": 17, "openpose": 19, "mediapipe": 15}
+    assert checked == counts[tool.split(":")[0]]
     if tool == "openpose":
         for wrist, body in ((25, 7), (46, 4)):  # the first joint of a hand is its wrist
             assert torch.allclose(found.points[:, wrist], found.points[:, body])

@@ -110,7 +110,7 @@ class Run:
         A GPU is not worth it for descents that ask after each step (`docs/engine.md`).
         """
         name = getattr(fn, "__name__", "stage")
-        gains = name in ON_DEVICE and getattr(getattr(config, "method", None), "replays", True)
+        gains = name in ON_DEVICE and getattr(getattr(config, "method", None), "on_device", True)
         device = self.device if gains else CPU
         where = () if device == CPU else (named(device),)
         package = (getattr(fn, "__module__", None) or "").partition(".")[0]

@@ -1,7 +1,7 @@
 """Weights of Eq. 1 and the ways down it. Imports no torch: `--help` is quick."""
 
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from mover.core.settings import Share, Steps, Weight, float_in, int_in
 
@@ -78,6 +78,9 @@ class Adam:
 class BatchedBFGS:
     """Second-order steps of each problem within its own radius, until each has converged."""
 
+    on_device: ClassVar[bool] = (
+        False  # it asks after each step, which costs a GPU more than it gains
+    )
     steps: Steps = 100
     """Most steps: a problem that still moves stops then."""
     reach: Annotated[float, float_in(1e-6, 100)] = 0.05

@@ -1,28 +1,30 @@
 """Weights, stages and choices of the fit of bodies. Imports no torch: `--help` is quick."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
+
+from mover.core.settings import Count, Share, Sigma, Steps, Weight, float_in, int_in
 
 
 @dataclass(frozen=True)
 class Stage:
     """Weights of one stage; all are squared where SMPLify-X squares them."""
 
-    pose: float = 4.78
+    pose: Weight = 4.78
     """Prior of the body's pose; the bending prior follows it (times 3.17)."""
-    shape: float = 5.0
+    shape: Weight = 5.0
     """Numbers of the shape, and of the expression."""
-    hands: float = 4.78
+    hands: Weight = 4.78
     """Prior of the hands."""
-    jaw: float = 47.8
+    jaw: Weight = 47.8
     """Prior of the jaw's opening; its other turns cost ten times as much."""
-    hand_joints: float = 0.0
+    hand_joints: Weight = 0.0
     """Factor on the confidence of keypoints of the hands."""
-    face_joints: float = 0.0
+    face_joints: Weight = 0.0
     """Factor on the confidence of keypoints of the face."""
-    smooth: float = 5.0
+    smooth: Weight = 5.0
     """Constant-velocity terms."""
-    steps: int = 30
+    steps: Steps = 30
     """Most iterations of L-BFGS."""
 
 
@@ -46,40 +48,40 @@ STAGES = (
 class FitConfig:
     """What presets and experiments change in the fit of bodies to keypoints."""
 
-    loose: float = 0.3
+    loose: Weight = 0.3
     """Factor on the confidence of neck and hips, which detectors place elsewhere (SMPLify-X: 0)."""
-    left: float = 0.45
+    left: Share = 0.45
     """Share of the variance of keypoints' noise that a fit leaves; 0: noise is as assumed."""
-    noise_steps: int = 100
+    noise_steps: Steps = 100
     """Iterations of the fit that estimates the noise, and of the one that estimates its bias."""
-    limits: float = 4.78
+    limits: Weight = 4.78
     """Weight of the ranges of motion."""
-    smooth_joints: float = 1.0
+    smooth_joints: Weight = 1.0
     """Weight of the smoothness of 3D joints, over the acceleration that people have."""
-    smooth_pixels: float = 0.1
+    smooth_pixels: Weight = 0.1
     """Weight of the smoothness of projections; confidence of the middle frame counts."""
-    acceleration: float = 3.0
+    acceleration: Annotated[float, float_in(0, 1e4)] = 3.0
     """What joints of people do all the time [m/s²]."""
-    still: float = 6.0
+    still: Weight = 6.0
     """Weight of the smoothness of the pelvis, which does not move where its picture does not."""
-    held: float = 1.0
+    held: Weight = 1.0
     """Weight of the smoothness of trunk, head and arms about the pelvis, where they look still."""
-    jitter: float = 0.004
+    jitter: Sigma = 0.004
     """Second difference that is free of charge at any frame rate [m]."""
     by_size: bool = True
     """Second differences of joints in body sizes, so that smoothness pulls no person nearer."""
-    independent_frames: int = 4
+    independent_frames: Count = 4
     """Frames with independent errors: more do not constrain shape, stature and offsets further."""
     lasting: bool = True
     """Keypoints lie lastingly off the model's, and statures are those of adults (else the shape
     alone has a prior, as published)."""
-    stands: float = 20.0
+    stands: Weight = 20.0
     """Weight of one floor below the lower soles of all bodies, found with them [1/m]; 0: none."""
-    lies: float = 50.0
+    lies: Weight = 50.0
     """Weight of the distance before and after lying, for people lying along the view; 0: none."""
-    chunk: int = 1000
+    chunk: Annotated[int, int_in(1, 100_000)] = 1000
     """Frames that are solved at once."""
-    start_steps: int = 30
+    start_steps: Steps = 30
     """Iterations from each hypothesis of orientation and posture."""
     stages: tuple[Stage, ...] = STAGES
     """Weights of the stages."""

@@ -29,7 +29,7 @@ from mover.app.cli.config import (
 )
 from mover.app.cli.people import FitArgs, fit_into
 from mover.core.errors import InputError
-from mover.core.settings import float_in
+from mover.core.settings import Index, float_in
 from mover.perceive.config import LayoutConfig, Lens, PerceiveConfig
 from mover.perceive.needs import check_needs
 
@@ -163,7 +163,7 @@ class VideoArgs:
     objects: Path | None = None
     """Outlines or boxes of furniture (labelme, COCO) in OUT/capture/reference.png, or in a frame
     of the video."""
-    objects_frame: int | None = None
+    objects_frame: Index | None = None
     """The number of that frame, from 0."""
     bodies: str = FIT
     """fit: by the open body, to the keypoints; or a FILE; or a COMMAND of a body network with

@@ -263,7 +263,7 @@ def pare(path: Path, known: Known) -> Iterator[Person]:
     files = videos[:1] or v.files_of(path, "*.pkl", "PARE's results")
     for k, file in enumerate(files):
         at, people = v.read_any(file), list[tuple[Any, At]]()
-        if either(at, "orig_cam") is None:
+        if either(at, "orig_cam", "pred_pose") is None:  # of a video: people by track
             people += v.people_of(at)
         else:
             count = len(v.rows(need(at, "orig_cam"), None, 4))
@@ -295,7 +295,10 @@ def phalp(path: Path, known: Known) -> Iterator[Person]:
             n = f"{len(tracks)} tracks, {len(bodies)} bodies and {len(cameras)} cameras"
             raise InputError(f"{at.place} has {n}, expected as many of each")
         age = np.zeros(len(tracks)) if ages is None else v.numbers(ages).reshape(-1)
-        size = None if sizes is None or not len(tracks) else v.stacked(sizes, 2)[0, ::-1].tolist()
+        size = None
+        if sizes is not None and len(tracks):
+            height, width = v.stacked(sizes, 2)[0].tolist()
+            size = width, height
         K = assumed_lens(known, lambda *sides: FOCAL / CROP * max(sides), size)
         time = either(at, "time")
         frame = index if time is None or v.one_number(time) < 0 else int(v.one_number(time))
