@@ -84,15 +84,15 @@ def test_a_sitter_on_nothing_proposes_a_seat_below_as_high_as_what_touches():
     (found,) = missing(bodies)
     piece = make_piece(found.piece, np.random.default_rng(found.seed), 0)
     middle = seat_of(bodies)
-    assert found.object.category == "stool"
-    assert found.object.id == "proposed_stool_0"
-    height = piece.seat_height * float(found.object.scale[1])
+    assert found.proposed.category == "stool"
+    assert found.proposed.id == "proposed_stool_0"
+    height = piece.seat_height * float(found.proposed.scale[1])
     assert height == pytest.approx(float(middle[1]) - GROUND, abs=0.01)
-    front = torch.stack([found.object.yaw.sin(), torch.zeros(()), found.object.yaw.cos()])
-    away = found.object.t_world_object - (middle - 0.1 * front)
+    front = torch.stack([found.proposed.yaw.sin(), torch.zeros(()), found.proposed.yaw.cos()])
+    away = found.proposed.t_world_object - (middle - 0.1 * front)
     assert away[[0, 2]].abs().max() < 0.01
-    assert float(place_object(found.object).verts[:, 1].min()) == pytest.approx(GROUND, abs=1e-5)
-    assert float(found.object.yaw) == pytest.approx(TURN, abs=0.05)
+    assert float(place_object(found.proposed).verts[:, 1].min()) == pytest.approx(GROUND, abs=1e-5)
+    assert float(found.proposed.yaw) == pytest.approx(TURN, abs=0.05)
     assert (found.bodies, found.seconds) == (COUNT, pytest.approx(COUNT / 5))
     assert 0.6 < found.certainty < 1
 
@@ -101,14 +101,14 @@ def test_a_leaning_person_has_a_chair_and_a_lying_one_a_bed_with_the_feet_to_its
     back = {**SEATED, "left_hip": (-1.2, 0, 0), "right_hip": (-1.2, 0, 0)}
     leaning = turned(pose(back, COUNT), -0.35, 0.0, 0.0)
     (chair,) = missing(somewhere(people(leaning, fps=5.0)))
-    assert chair.object.category == "chair"
+    assert chair.proposed.category == "chair"
     lying = somewhere(people(LYING, fps=5.0, floor=0.45))
     (bed,) = missing(lying)
-    assert bed.object.category == "bed"
-    flat = (lying.verts[0] - bed.object.t_world_object) @ rot_y(bed.object.yaw)
+    assert bed.proposed.category == "bed"
+    flat = (lying.verts[0] - bed.proposed.t_world_object) @ rot_y(bed.proposed.yaw)
     soles = members(parts_of(lying), "left_sole", "right_sole")
     assert flat[soles, 2].mean() > 0.5
-    assert flat[:, [0, 2]].abs().amax(0)[1] < box_of(bed.object).size[2] / 2 + 0.1
+    assert flat[:, [0, 2]].abs().amax(0)[1] < box_of(bed.proposed).size[2] / 2 + 0.1
 
 
 def on_a_sofa(yaw: float = TURN) -> Bodies:
@@ -128,11 +128,11 @@ def on_a_sofa(yaw: float = TURN) -> Bodies:
 def test_a_person_seated_across_to_a_lying_one_is_on_a_sofa_as_long_as_both():
     bodies = on_a_sofa()
     (sofa,) = missing(bodies)
-    assert sofa.object.category == "sofa"
+    assert sofa.proposed.category == "sofa"
     assert sofa.bodies > 1.5 * COUNT
-    assert float(sofa.object.yaw) == pytest.approx(TURN + torch.pi / 2, abs=0.1)
-    flat = (bodies.verts - sofa.object.t_world_object) @ rot_y(sofa.object.yaw)
-    lying, half = flat[:COUNT, :, 0], box_of(sofa.object).size[0] / 2
+    assert float(sofa.proposed.yaw) == pytest.approx(TURN + torch.pi / 2, abs=0.1)
+    flat = (bodies.verts - sofa.proposed.t_world_object) @ rot_y(sofa.proposed.yaw)
+    lying, half = flat[:COUNT, :, 0], box_of(sofa.proposed).size[0] / 2
     assert lying.abs().max() < half
     assert lying.abs().max() > half - 0.45
 
@@ -170,7 +170,7 @@ def test_two_people_on_two_seats_propose_two_and_two_visits_one():
         one, verts=torch.cat([one.verts, aside.verts]), frame=torch.cat([one.frame, aside.frame]),
         person=torch.cat([one.person, aside.person]), pose=None,
     )  # fmt: skip
-    assert [p.object.id for p in missing(both)] == ["proposed_stool_0", "proposed_stool_1"]
+    assert [p.proposed.id for p in missing(both)] == ["proposed_stool_0", "proposed_stool_1"]
     again = replace(both, verts=torch.cat([one.verts, one.verts]), frame=torch.arange(2 * COUNT))
     (found,) = missing(replace(again, person=torch.zeros(2 * COUNT, dtype=torch.long)))
     assert found.bodies == 2 * COUNT
@@ -190,7 +190,7 @@ def test_proposals_are_a_file_of_their_own_that_goes_with_them(tmp_path: Path):
     (same,) = read_scene(path).objects
     assert same.id == "proposed_stool_0"
     assert box_of(same).center.tolist() == pytest.approx(
-        box_of(found.object).center.tolist(), abs=1e-4
+        box_of(found.proposed).center.tolist(), abs=1e-4
     )
     write_proposals(result(()), path)
     assert not path.exists()
@@ -199,7 +199,7 @@ def test_proposals_are_a_file_of_their_own_that_goes_with_them(tmp_path: Path):
 def test_an_id_that_is_taken_is_not_given_again():
     back = {**SEATED, "left_hip": (-1.2, 0, 0), "right_hip": (-1.2, 0, 0)}
     (chair,) = missing(somewhere(people(turned(pose(back, COUNT), -0.35, 0.0, 0.0), fps=5.0)))
-    assert chair.object.id == "proposed_chair_1"
+    assert chair.proposed.id == "proposed_chair_1"
 
 
 @pytest.mark.slow
@@ -211,9 +211,9 @@ def test_what_a_run_proposes_changes_nothing_else_of_its_room(tmp_path: Path):
     assert bare.proposals == ()
     said = tuple(line for line in with_it.warnings if "is proposed there" not in line)
     assert fingerprint(replace(with_it, proposals=(), warnings=said)) == fingerprint(bare)
-    seat = with_it.proposals[0].object
+    seat = with_it.proposals[0].proposed
     first, *others = bare.scene.objects
     stays = tuple(Segment(n, p.t_world_object, p.yaw) for n, p in ((0, first), (9, seat)))
     scene = replace(bare.scene, objects=(replace(first, segments=stays), *others))
     moved = with_missing_seats(replace(bare, scene=scene), capture, ROBUST, run)
-    assert seat.id not in [one.object.id for one in moved.proposals]
+    assert seat.id not in [one.proposed.id for one in moved.proposals]

@@ -91,7 +91,7 @@ def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:
     """
     given = {thing.id for thing in trial.capture.scene.objects}
     turn = trial.truth.camera.R_cam_world.mT @ room.scene.camera.R_cam_world
-    centres = [turn @ box_of(one.object).center for one in room.proposals]
+    centres = [turn @ box_of(one.proposed).center for one in room.proposals]
     claimed: Counter[int] = Counter()
     rows: list[dict[str, Any]] = []
     for seat, used in zip(trial.truth.objects, trial.used, strict=True):
@@ -102,7 +102,7 @@ def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:
         row = {"id": seat.id, "category": seat.category, "found": bool(near)}
         if near:
             best = min(near, key=lambda k: away[k])
-            height = seat_height(room.proposals[best].object) - seat_height(seat)
+            height = seat_height(room.proposals[best].proposed) - seat_height(seat)
             row |= {"centre": away[best], "height": height}
         claimed.update(near)
         rows.append(row)

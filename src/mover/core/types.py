@@ -385,7 +385,7 @@ class ContactLabels:
 class Proposal:
     """A support that no detector saw: people rest on it."""
 
-    object: SceneObject
+    proposed: SceneObject
     """Of the library, where they rest; without an annotation."""
     piece: str
     """Its name in the library."""

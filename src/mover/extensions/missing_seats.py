@@ -81,11 +81,11 @@ def with_missing_seats(room: Room, capture: Capture, config: Config, run: Run) -
     proposals = [
         one
         for one in proposed(people, known, taken)
-        if not any(_stood_there(piece, box_of(one.object).center) for piece in room.scene.objects)
+        if not any(_stood_there(piece, box_of(one.proposed).center) for piece in room.scene.objects)
     ]
     warnings = (
-        f"{one.object.id}: people rest for {one.seconds:.0f} s on nothing that is known; a"
-        f" {one.object.category} is proposed there (certainty {one.certainty:.2f})"
+        f"{one.proposed.id}: people rest for {one.seconds:.0f} s on nothing that is known; a"
+        f" {one.proposed.category} is proposed there (certainty {one.certainty:.2f})"
         for one in proposals
     )
     return replace(room, proposals=tuple(proposals), warnings=(*room.warnings, *warnings))
@@ -103,8 +103,8 @@ def write_proposals(room: Room, path: Path) -> None:
         path.unlink(missing_ok=True)
         return
     keys = ("piece", "style", "seed", "certainty", "bodies", "seconds")
-    more = {one.object.id: {key: getattr(one, key) for key in keys} for one in room.proposals}
-    objects = tuple(one.object for one in room.proposals)
+    more = {one.proposed.id: {key: getattr(one, key) for key in keys} for one in room.proposals}
+    objects = tuple(one.proposed for one in room.proposals)
     write_scene(replace(room.scene, objects=objects), path, more)
 
 
@@ -342,13 +342,13 @@ def proposed(people: Resting, known: KnownTops, taken: set[str]) -> list[Proposa
             proposal = _proposal(RestGroup(rests, group.people), taken)
         left = [other for other in left if not _holds(proposal, other)]
         found.append(proposal)
-        taken = {*taken, proposal.object.id}
+        taken = {*taken, proposal.proposed.id}
     return sorted(found, key=lambda one: -one.seconds)
 
 
 def _holds(proposal: Proposal, group: RestGroup) -> bool:
     """Whether a piece's footprint, and half of `SAME` around it, holds the middle of a group."""
-    return bool((beyond(box_of(proposal.object), group.middle) < SAME / 2).all())
+    return bool((beyond(box_of(proposal.proposed), group.middle) < SAME / 2).all())
 
 
 def _proposal(group: RestGroup, taken: set[str]) -> Proposal:

@@ -124,7 +124,7 @@ def trunk_of(joints: Float[Tensor, "*bodies joints 3"]) -> Float[Tensor, "*bodie
 def distances_of_lying_people(
     joints: Float[Tensor, "bodies joints 3"],
     up: Float[Tensor, "3"],
-    tracks: Sequence[Int[Tensor, " track"]],
+    tracks: Sequence[Int[Tensor, " _"]],
     time: Float[Tensor, " bodies"],
 ) -> Float[Tensor, " bodies"]:
     """Logarithm of the distance along the view before and after lying, by time; NaN: free [m].

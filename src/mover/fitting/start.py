@@ -64,7 +64,7 @@ NEVER = 1e4  # what a hypothesis costs that cannot be
 LEVEL, SLOPE = math.radians(5), math.radians(15)
 """Standard deviation of a lying body's slope, and the slope at half of the largest cost [rad]."""
 
-Track = tuple[Int[Tensor, " track"], Float[Tensor, " track"] | None]
+Track = tuple[Int[Tensor, " _"], Float[Tensor, " _"] | None]
 """Rows of a person in the order of time, and their times [s]; None: unknown."""
 
 

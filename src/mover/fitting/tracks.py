@@ -58,9 +58,7 @@ def windows_of(keypoints: Keypoints, config: FitConfig) -> list[Window]:
 # Rows of the same person in the order of time.
 
 
-def tracks_of(
-    frame: Int[Tensor, " rows"], person: Int[Tensor, " rows"]
-) -> list[Int[Tensor, " track"]]:
+def tracks_of(frame: Int[Tensor, " rows"], person: Int[Tensor, " rows"]) -> list[Int[Tensor, " _"]]:
     """Rows of each person, in the order of their frames."""
     found: list[Tensor] = []
     for one in person.unique().tolist():
