@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -23,6 +24,7 @@ from mover.stages.objects.room_scale import (
     seat_height_estimate,
 )
 from mover_bench.rooms.config import NoiseConfig
+from mover_bench.rooms.known import KnownRoom
 from mover_bench.rooms.noise import add_noise
 
 ROOM = 0.0
@@ -41,13 +43,14 @@ def test_furniture_tells_how_large_the_room_is(large: float) -> None:
     found = Layout(true.t_world_object * large, true.yaw, math.log(large) - off)
     given = gather_given(objects, start, found, torch.full((count,), 0.1))
     kinds = objects.categories
-    scale, spread = common_scale(found, given, kinds, ScaleKnown(0.055))
+    scale, spread = common_scale(found, given, kinds, ScaleKnown((0.0, 0.055)))
     assert abs(scale - math.log(large)) < 0.03
     assert 0.01 < spread < 0.04  # of .055: what one tool gave is off together
-    assert common_scale(found, given, kinds, ScaleKnown(0.0)) == (0, 0)
-    assert abs(common_scale(found, given, kinds, ScaleKnown(0.005))[0]) < 0.006
+    assert common_scale(found, given, kinds, ScaleKnown((0.0, 0.0))) == (0, 0)
+    assert abs(common_scale(found, given, kinds, ScaleKnown((0.0, 0.005)))[0]) < 0.006
     (same, near), (less, far), (none, nothing) = (
-        common_scale(found, given, kinds, ScaleKnown(0.055, off)) for off in (0.01, 0.04, 5.0)
+        common_scale(found, given, kinds, ScaleKnown((0.0, 0.055), off))
+        for off in (0.01, 0.04, 5.0)
     )
     assert spread < near < far < nothing == pytest.approx(0.055, rel=0.02)
     assert same == pytest.approx(scale, abs=0.005)
@@ -55,7 +58,7 @@ def test_furniture_tells_how_large_the_room_is(large: float) -> None:
     assert min(0.0, scale) <= less <= max(0.0, scale)  # what was given may be off together
     metres = Layout(found.t_world_object.clone(), found.yaw, found.log_scale)
     metres.t_world_object[0] *= 1.8
-    assert abs(common_scale(metres, given, kinds, ScaleKnown(0.055))[0] - scale) < 0.015
+    assert abs(common_scale(metres, given, kinds, ScaleKnown((0.0, 0.055)))[0] - scale) < 0.015
 
 
 def test_objects_that_err_together_count_as_few() -> None:
@@ -66,7 +69,7 @@ def test_objects_that_err_together_count_as_few() -> None:
         layout = somewhere(count)
         given = gather_given(objects, layout, layout, torch.full((count,), 0.1))
         larger = replace(layout, t_world_object=1.1 * layout.t_world_object)
-        scale, spread = common_scale(larger, given, objects.categories, ScaleKnown(1.0))
+        scale, spread = common_scale(larger, given, objects.categories, ScaleKnown((0.0, 1.0)))
         spreads.append(spread)
         scales.append(scale)
     assert (DISTANCES**-2 + TOOL**-2) ** -0.5 / 2 < spreads[1] < spreads[0]
@@ -85,7 +88,7 @@ def test_who_sits_as_high_as_people_do_tells_their_size(large: float) -> None:
     layout = somewhere(1)
     given = gather_given(boxes_of(("aquarium",), [(1.0, 1.0, 1.0)]), layout, layout, torch.ones(1))
     told = [
-        common_scale(layout, given, ("aquarium",), ScaleKnown(0.055, seats=seats))[0]
+        common_scale(layout, given, ("aquarium",), ScaleKnown((0.0, 0.055), seats=seats))[0]
         for seats in (None, (0.05, 0.06), (0.05, 0.001))
     ]
     assert told[0] == pytest.approx(0, abs=1e-3)
@@ -112,7 +115,9 @@ def test_more_seat_height_estimate_more() -> None:
 
 
 @pytest.mark.slow
-def test_a_room_of_people_of_unknown_height_says_how_uncertain_it_is(small_room, tmp_path) -> None:
+def test_a_room_of_people_of_unknown_height_says_how_uncertain_it_is(
+    small_room: KnownRoom, tmp_path: Path
+) -> None:
     known = add_noise(small_room, NoiseConfig(), 0)
     assert known.bodies is not None
     unknown = replace(known, bodies=replace(known.bodies, size_spread=0.06))

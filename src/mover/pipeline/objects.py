@@ -224,10 +224,15 @@ def estimate_scale(
     spread = 0.0 if known else size_spread(people.bodies, setup.config.height_spread)
     if given is None or not spread:
         return people, placed
-    kept, seats = people.in_world(placed.camera), None
+    camera, (floor, loose) = placed.camera, people.alignment.ground_under(placed.camera)
+    kept, seats = people.in_world(camera), None
+    larger_than_theirs = math.log(placed.ground / floor)  # the room as placed, than people's own
     if setup.config.seat_heights:
-        seats = seat_height_estimate(kept, people.parts, placed.ground)
-    prior = ScaleKnown(spread, capture.scene.size_spread, seats)
+        seats = seat_height_estimate(kept, people.parts, floor)
+    if seats is not None:
+        seats = seats[0] + larger_than_theirs, seats[1]
+    own = larger_than_theirs, loose / abs(floor)
+    prior = ScaleKnown(own, capture.scene.size_spread, seats)
     scale, left = common_scale(placed.layout, given, setup.objects.categories, prior)
     factor = math.exp(-scale)
     warnings = people.warnings
@@ -238,8 +243,9 @@ def estimate_scale(
             " people.json) or of the camera ('height' in camera.json) would fix it",
         )
     layout, candidates = (larger(x, factor) for x in (placed.layout, placed.placed.candidates))
-    bodies = nearer(people.bodies, placed.camera, placed.ground, factor)
-    path = scaled(people.path, factor)
+    theirs = factor * placed.ground / floor
+    bodies = nearer(people.bodies, camera, floor, theirs)
+    path = scaled(people.path, theirs)
     return replace(people, bodies=bodies, path=path, warnings=warnings), replace(
         placed,
         ground=factor * placed.ground,

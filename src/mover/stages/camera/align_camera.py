@@ -239,6 +239,13 @@ class Alignment:
         mean = torch.cat([tilt, tilt.new_tensor([self.ground])])
         return Gaussian(mean, torch.linalg.inv(self.covariance).to(mean))
 
+    def ground_under(self, camera: Camera) -> tuple[float, float]:
+        """The ground of the same feet under a camera of another tilt, and its spread [m]."""
+        own = self.posterior
+        tilt = torch.stack(pitch_roll(camera.R_cam_world)) - own.mean[:2]
+        along = own.precision[2, :2] / own.precision[2, 2]
+        return float(own.mean[2] - along @ tilt), float(own.precision[2, 2]) ** -0.5
+
 
 def align_camera(
     inputs: AlignInputs, config: AlignConfig = AlignConfig(), observe: Observer = silent

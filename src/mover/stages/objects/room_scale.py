@@ -5,7 +5,7 @@ sizes too large at once, which no image shows. Three things do: how far away and
 object was given, standard dimensions of furniture, and how high people sit, since seats are made
 for legs. All of it is one least-squares problem in logarithms, each line with an error of its own:
 
-    people: s = 0,   seats: s = how much too high people sit
+    people: s = how much larger than theirs,   seats: s = how much too high people sit
     distance, placed / given  = s + m + d          d: error that all given distances share
     size, placed / given      = s + x_ik           x: true size / given
     0                         = x_ik - m - t - o_i t: error of one tool, o: of one object, m: of all
@@ -42,8 +42,9 @@ FEWEST = 3  # bodies that give the height of a seat
 class ScaleKnown:
     """What constrains the scale of a room beside its furniture."""
 
-    spread: float
-    """Standard deviation of the logarithm of the people's size; 0: it is known."""
+    people: tuple[float, float]
+    """Logarithm of how much larger the room is than people of the usual size have it, and its
+    standard deviation; 0: their size is known."""
     shared: float = 0.0
     """The same of all that was given, together (`Scene.size_spread`)."""
     seats: tuple[float, float] | None = None
@@ -61,7 +62,7 @@ def common_scale(
         categories: Of the objects.
         known: What else is known.
     """
-    if known.spread <= 0:
+    if known.people[1] <= 0:
         return 0.0, 0.0
     count, kinds = len(categories), sorted(set(categories))
     kind = torch.tensor([kinds.index(name) for name in categories])
@@ -70,7 +71,7 @@ def common_scale(
     own, true, usual = unknowns[4:].split((count, 3 * count, 3 * len(kinds)))
     true = true.view(count, 3, -1)
     seen = Observations()
-    seen.add(scale, 0.0, known.spread)
+    seen.add(scale, *known.people)
     seen.add(common, 0.0, max(known.shared, 1e-6))
     seen.add(far, 0.0, DISTANCES)
     seen.add(tool, 0.0, TOOL)
