@@ -1,6 +1,7 @@
 """Camera and ground from soles: analytic floors, noise, and what feet cannot observe."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -203,6 +204,19 @@ def test_a_lean_that_all_feet_share_is_in_the_covariance():
     assert ground == pytest.approx(away, rel=0.15)
     correlation = shared.covariance[0, 2] / shared.covariance.diag()[[0, 2]].prod().sqrt()
     assert abs(float(correlation)) > 0.9
+
+
+@pytest.mark.parametrize("turn", [(1.5, 0.0), (-1.5, 1.0), (0.0, 0.0)])
+def test_the_ground_under_another_tilt_is_where_the_same_feet_are(turn):
+    soles = soles_at(room(), noise=0.01)
+    found = align_camera(AlignInputs(soles, camera_off((0.5, -0.5)), None, None, None, 0.035))
+    pitch, roll = (float(x) for x in pitch_roll(found.camera.R_cam_world))
+    at = [torch.tensor(x + math.radians(t)) for x, t in zip((pitch, roll), turn, strict=True)]
+    R = tilted(at[0], at[1])
+    other = replace(found.camera, R_cam_world=R.to(found.camera.R_cam_world))
+    ground, spread = found.ground_under(other)
+    assert ground == pytest.approx(float((soles.points_cam.to(R) @ R)[:, 1].mean()), abs=0.02)
+    assert spread <= float(found.covariance[2, 2]) ** 0.5 + 1e-6
 
 
 def test_frames_of_one_pose_are_no_new_evidence():

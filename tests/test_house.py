@@ -24,19 +24,19 @@ LINES = {
     "src/mover/furniture": 856,
     "src/mover/geometry": 4_004,
     "src/mover/io": 8_832,
-    "src/mover/perceive": 2_884,
-    "src/mover/pipeline": 1_088,
+    "src/mover/perceive": 2_888,
+    "src/mover/pipeline": 1_089,
     "src/mover/stages": 6_079,
     "bench": 7_428,
     "benchmarks": 844,
-    "tests": 31_029,
+    "tests": 31_069,
 }
 FILES = {"src/mover": 255, "bench": 44}
 LIMITS = {
     "words in code": 0,
     "words in pages": 0,
     "class names with two meanings": 0,
-    "small helpers": 92,
+    "small helpers": 91,
     "modules in circles": 0,
 }  # fmt: skip
 WORDS = {

@@ -126,6 +126,7 @@ def people_in(
 ) -> list[tuple[Array, Array, NDArray[np.bool_]]]:
     """Landmarks (33, 2) [px], their visibility, and the mask of each person in a picture."""
     import cv2
+    from scipy.special import expit
 
     h, w = picture.shape[:2]
     kept: list[tuple[Array, Array, NDArray[np.bool_]]] = []
@@ -140,10 +141,10 @@ def people_in(
         rows = out[1, 195].reshape(39, 5)
         places = refined(rows[:33, :2], out[1, 64, 64, 39][0])
         points = places @ M[:, :2].T + M[:, 2]
-        cover = 1 / (1 + np.exp(-out[1, 256, 256, 1][0, ..., 0].clip(-50, 50)))
+        cover = expit(out[1, 256, 256, 1][0, ..., 0])
         mask = cv2.warpAffine(cover.astype(np.float32), M, (w, h)) > INSIDE
         if mask.any() and not any(_shared(mask, other) > TWICE for *_, other in kept):
-            kept.append((points, 1 / (1 + np.exp(-rows[:33, 3].clip(-50, 50))), mask))
+            kept.append((points, expit(rows[:33, 3]), mask))
     return kept
 
 
@@ -153,12 +154,13 @@ def detected(picture: NDArray[np.uint8], detector: Runs) -> list[tuple[Array, Ar
     Boxes that overlap the surest one are averaged with it by their scores.
     """
     import cv2
+    from scipy.special import expit
 
     h, w = picture.shape[:2]
     side, middle = max(h, w), np.array([w / 2, h / 2])
     crop, M = cropped(picture, middle, side, 0.0, SIZES[0], cv2.BORDER_CONSTANT)
     out = detector(crop / 127.5 - 1)
-    score = 1 / (1 + np.exp(-out[1, 2254, 1][0, :, 0].clip(-50, 50)))
+    score = expit(out[1, 2254, 1][0, :, 0])
     sure = score >= SEEN
     values = out[1, 2254, 12][0, sure].reshape(-1, 6, 2)  # middle, size, four points
     anchors = _anchors()[sure] * SIZES[0]
@@ -217,6 +219,8 @@ def refined(places: Array, maps: Array) -> Array:
         places: Of the landmarks.
         maps: (cells, cells, landmarks), logits.
     """
+    from scipy.special import expit
+
     cells, half = len(maps), KERNEL // 2
     found = places.copy()
     for k, (x, y) in enumerate((places * cells / SIZES[1]).astype(int)):
@@ -224,7 +228,7 @@ def refined(places: Array, maps: Array) -> Array:
             continue
         top, left = max(0, y - half), max(0, x - half)
         near = maps[top : y + half + 1, left : x + half + 1, k]
-        likely = 1 / (1 + np.exp(-near.clip(-50, 50)))
+        likely = expit(near)
         if likely.max() >= LIKELY:
             at = np.array([likely.sum(0) @ np.arange(left, left + near.shape[1]),
                            likely.sum(1) @ np.arange(top, top + near.shape[0])])  # fmt: skip

@@ -59,7 +59,7 @@ def own_keypoints(
         return None
     path = own.keypoints()
     found = _read_joints(path)
-    frames = clip.numbers if own.of_frames else clip.index
+    frames = clip.numbers if own.of_frames else clip.in_source
     rows, at = _taken(found.frame, frames, path, say)
     points = found.points[rows]
     if not own.of_frames and drift.verdict != "still":
@@ -95,7 +95,7 @@ def own_masks(path: Path, clip: Clip, drift: Drift, say: Callable[[str], None]) 
     if any(is_person(item) for item in items):
         items = [item for item in items if is_person(item)]
     frames = torch.tensor([item.frame for item in items], dtype=torch.long)
-    rows, at = _taken(frames, clip.index, path, say)
+    rows, at = _taken(frames, clip.in_source, path, say)
     codes, kept = list[bytes](), list[int]()
     for k, (row, frame) in enumerate(zip(rows.tolist(), at.tolist(), strict=True)):
         mask = decode(Masks(clip.height, clip.width, (items[row].mask or b"",)), 0)
@@ -120,7 +120,7 @@ def own_objects(own: Own, clip: Clip, drift: Drift) -> dict[str, Any]:
     if not items:
         raise InputError(f"{own.objects.name}: has no furniture, expected outlines or boxes")
     if own.objects_frame is not None:
-        frame = int((_indices(clip) - own.objects_frame).abs().argmin())
+        frame = int((clip.in_source - own.objects_frame).abs().argmin())
         items = [_moved_item(item, drift.H[frame], size) for item in items]
     tree = objects_tree(Instances(tuple(items), size, found.file), items).value
     return {**tree, "images": [{**tree["images"][0], "file_name": "reference.png"}]}
@@ -146,13 +146,9 @@ def _carried(mask: Bool[Tensor, "h w"], H: Float[Tensor, "3 3"]) -> Bool[Tensor,
     return torch.from_numpy(warp(pixels, H.double().numpy(), mask.shape) > 0.5)
 
 
-def _indices(clip: Clip) -> Int[Tensor, " frames"]:
-    return clip.numbers if clip.index is None else clip.index
-
-
 def _taken(
     frames: Int[Tensor, " rows"],
-    wanted: Int[Tensor, " frames"] | None,
+    wanted: Int[Tensor, " frames"],
     path: Path,
     say: Callable[[str], None],
 ) -> tuple[Int[Tensor, " kept"], Int[Tensor, " kept"]]:
@@ -161,7 +157,6 @@ def _taken(
     Raises:
         InputError: If there is none.
     """
-    assert wanted is not None
     place = {frame: k for k, frame in enumerate(wanted.tolist())}
     rows = [k for k, frame in enumerate(frames.tolist()) if frame in place]
     at = [place[int(frames[k])] for k in rows]

@@ -61,6 +61,11 @@ class Clip:
         """Number of each frame."""
         return torch.arange(len(self.time)) if self.number is None else self.number
 
+    @property
+    def in_source(self) -> Int[Tensor, " frames"]:
+        """Number of each in the source, from 0; as they are counted where that is not known."""
+        return self.numbers if self.index is None else self.index
+
     def path(self, frame: int) -> Path:
         """The file of a frame, which is counted from 0 without gaps."""
         number = frame if self.number is None else int(self.number[frame])

@@ -19,7 +19,7 @@ from mover.geometry.camera import to_camera
 from mover.geometry.path import scaled
 from mover.geometry.placement import larger, place, reproject, rest_on_support
 from mover.geometry.warp_start import threads
-from mover.pipeline.people import Located, lines_of
+from mover.pipeline.people import HIGHEST, Located, lines_of
 from mover.pipeline.presets import Config, with_sizes
 from mover.stages.camera.refine_camera import RefineInputs, refine_camera
 from mover.stages.camera.room_lines import Segments
@@ -174,7 +174,7 @@ def place_by_image(
     elif searching.num_hypotheses > 1 and capture.hypotheses:
         others = other_starts(capture.hypotheses, objects, given)
         starts = Layout.cat(starts, _carried(setup, others, capture.scene.camera, camera, ground))
-    behind = order_in_image(seen.masks, seen.people)
+    behind = order_in_image(seen.masks, seen.people) if before is None else before.image.behind
     image = ImageInputs(
         camera, seen.boxes, seen.detected, seen.masks, seen.people, behind,
         given.t_world_object.norm(dim=-1),
@@ -221,14 +221,15 @@ def estimate_scale(
     given, capture = placed.minimised.image.given, setup.capture
     heights = {} if capture.people is None else capture.people.heights
     known = bool(heights) or capture.camera_height is not None
-    spread = 0.0 if known else size_spread(people.bodies, setup.config.height_spread)
-    if given is None or not spread:
+    if given is None or known or not size_spread(people.bodies, setup.config.height_spread):
         return people, placed
     camera, (floor, loose) = placed.camera, people.alignment.ground_under(placed.camera)
-    kept, seats = people.in_world(camera), None
+    if max(floor, placed.ground) > HIGHEST:  # no room has its floor there: nothing to compare
+        return people, placed
     larger_than_theirs = math.log(placed.ground / floor)  # the room as placed, than people's own
+    seats = None
     if setup.config.seat_heights:
-        seats = seat_height_estimate(kept, people.parts, floor)
+        seats = seat_height_estimate(people.in_world(camera), people.parts, floor)
     if seats is not None:
         seats = seats[0] + larger_than_theirs, seats[1]
     own = larger_than_theirs, loose / abs(floor)

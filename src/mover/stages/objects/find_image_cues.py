@@ -195,7 +195,7 @@ def order_in_image(
         at = lowest[j] > (base[j] - slack).clamp_min(0)
         if not bool(at.any()) or int(base[j]) > height - gap:
             continue
-        under = slice(int(base[j] - slack), int(base[j]) + gap)
+        under = slice(max(0, int(base[j] - slack)), int(base[j]) + gap)
         near = masks[:, under][:, :, at].flatten(1).any(1)  # what may hide its base
         near[j] = False
         if bool(people[under][:, at].any()) or int(near.sum()) > 1:
