@@ -10,7 +10,6 @@ from scipy import sparse
 from test_readers_people import Toy
 from tiny_capture import write_capture
 
-from mover.app.cli import run_command
 from mover.bodies import BODY_MODELS
 from mover.bodies.posa import (
     canonical,
@@ -26,7 +25,7 @@ from mover.geometry.rotations import axis_angle, rot_y
 from mover.io.capture.bodies_file import read_contacts
 from mover.io.capture.folder import read_capture
 from mover.io.capture.pose_file import into_camera
-from mover.pipeline.refine import with_posa
+from mover.pipeline.refine import find_posa
 
 OCTAHEDRON = np.array(
     [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
@@ -211,33 +210,19 @@ def test_synthetic_weights_in_the_true_layout_run(files, caplog):
     torch.testing.assert_close(turned, found, atol=1e-4, rtol=0)
 
 
-def test_a_capture_takes_its_contacts_from_posa_under_its_cameras_tilt(
-    files, tmp_path, monkeypatch
-):
+def test_bodies_in_a_cameras_axes_are_upright_by_its_tilt(files, tmp_path, monkeypatch):
     monkeypatch.setitem(BODY_MODELS, "smplx", lambda _: Toy("smplx"))
     write_capture(tmp_path / "c")
     capture, people = read_capture(tmp_path / "c"), smplx_people()
-    wanted = posa_contacts(load_posa(files / "contact.pt", files / "mesh_ds"), people)
+    paths = files / "contact.pt", files / "mesh_ds", 0
+    wanted = posa_contacts(load_posa(*paths[:2]), people)
     in_camera = into_camera(people, capture.scene.camera.R_cam_world)
-    capture = replace(capture, bodies=in_camera)
-    found = with_posa(capture, files / "contact.pt", files / "mesh_ds").touch
+    found = find_posa(in_camera, *paths, tmp_path / "c" / "camera.json")
     torch.testing.assert_close(found, wanted, atol=1e-4, rtol=0)
-    level = replace(capture, bodies=replace(in_camera, space="world"))
-    other = with_posa(level, files / "contact.pt", files / "mesh_ds").touch
+    other = find_posa(replace(in_camera, space="world"), *paths, None)
     assert (other - wanted).abs().max() > 1e-3
-
-
-def test_posa_in_a_run_says_what_is_missing(files, tmp_path, capsys):
-    write_capture(tmp_path / "c")
-    posa, words = str(files / "contact.pt"), [str(tmp_path / "c"), "--out", str(tmp_path / "o")]
-    assert run_command("run", [*words, "--posa", posa]) == 2
-    assert "--posa, --posa-meshes: one is missing" in capsys.readouterr().err
-    both = ["--posa", str(tmp_path / "no.pt"), "--posa-meshes", str(files / "mesh_ds")]
-    assert run_command("run", [*words, *both]) == 2
-    assert "no.pt: no checkpoint can be read" in capsys.readouterr().err
-    empty = replace(read_capture(tmp_path / "c"), bodies=None)
-    with pytest.raises(InputError, match=r"has no bodies.npz, so there are no contacts"):
-        with_posa(empty, files / "contact.pt", files / "mesh_ds")
+    with pytest.raises(InputError, match=r"in the camera's axes; --camera must say where up is"):
+        find_posa(in_camera, *paths, None)
 
 
 def test_samples_average_random_codes(files):

@@ -136,20 +136,6 @@ def find_posa(
     return posa_contacts(load_posa(weights, meshes), bodies, samples)
 
 
-def with_posa(capture: Capture, weights: Path, meshes: Path) -> Capture:
-    """The capture with contacts by POSA in place of its own, upright by its camera (Sec. 3).
-
-    Raises:
-        InputError: If a file is missing or wrong, or the capture has no people.
-    """
-    people = capture.bodies
-    if people is None:
-        raise InputError(f"--posa: {capture.name} has no bodies.npz, so there are no contacts")
-    if people.space == "camera":
-        people = to_world(people, capture.scene.camera)
-    return replace(capture, touch=posa_contacts(load_posa(weights, meshes), people, 0))
-
-
 def switched(config: RefineBodiesConfig, off: Mapping[str, bool]) -> RefineBodiesConfig:
     """The settings without some of the evidence: camgp, sdf, contact, order, masks."""
     terms = {

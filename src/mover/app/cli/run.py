@@ -13,7 +13,6 @@ from tyro.conf import Positional, arg
 from mover.app.batch import CONFIG, FAILURES, SUMMARY, BatchJob, RayOptions
 from mover.app.cli import say
 from mover.app.cli.config import RUN_SETTINGS, Device, chosen_config, parsed_with
-from mover.core.errors import InputError
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
 from mover.pipeline.presets import Config
@@ -44,10 +43,6 @@ class RunArgs:
     """A list of edits (edits.json of `mover view`) that is applied first."""
     device: Device = "cpu"
     """Where the heavy stages compute: cpu, cuda (an NVIDIA GPU; see docs/engine.md) or auto."""
-    posa: Path | None = None
-    """POSA's contact.pt: its network says what touches, in place of contacts.npz and geometry."""
-    posa_meshes: Path | None = None
-    """The folder mesh_ds that comes with it."""
     refine: bool = False
     """At the end, refine the people with the room they helped to find: bodies.npz holds them."""
 
@@ -67,12 +62,6 @@ def run(arguments: Sequence[str]) -> None:
     from mover.io.capture.edits import read_edits
 
     device, capture = device_of(args.device), read(args.source)
-    if (args.posa is None) != (args.posa_meshes is None):
-        raise InputError("--posa, --posa-meshes: one is missing, expected contact.pt and mesh_ds")
-    if args.posa is not None and args.posa_meshes is not None:
-        from mover.pipeline.refine import with_posa
-
-        capture = with_posa(capture, args.posa, args.posa_meshes)
     edits = () if args.edits is None else read_edits(args.edits)
     origin = Origin(str(args.source.resolve()), args.format, edits, args.refine, device)
     reconstruct_into(args.out, capture, config, origin)
