@@ -8,8 +8,8 @@ import torch
 from judged import grid_body
 from little_room import GROUND, box, camera, piece
 
-from mover.bodies.limbs import LANDMARKS
 from mover.bodies.parts import BodyParts
+from mover.bodies.skin import LANDMARKS
 from mover.core.types import Bodies, Scene, SceneObject, Segment
 from mover.evaluate.contact import StandingMesh, nearness
 from mover.extensions.moved_furniture.measure import measure_moves

@@ -1,35 +1,37 @@
-"""Parts of a body that touch things: soles, seat, thighs, back, palms, forearms.
+"""Which vertices of a body touch things: soles, seat, thighs, back, palms, forearms.
 
 Of a skinned body they follow from the weights and from normals and heights in the zero pose; for
-MHR's topology their indices are an asset (made by `tools/body_parts`). Other meshes, as SMPL's
-where its model files are not there, are matched to the open body (`match_mesh`).
+MHR's topology they are an asset. A mesh of another topology that comes with joints takes them from
+the nearest vertices of the open body in the same pose; without joints only its soles are found.
 """
 
 import hashlib
 import logging
+from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.limbs import landmark_rings, thin
-from mover.bodies.match_mesh import Matched, match
-from mover.bodies.skin import PARTS, lowest_soles, model_parts
-from mover.bodies.skinning import ASSETS, SkinnedBody, open_body
+from mover.bodies.skeleton import BODY
+from mover.bodies.skin import LANDMARKS, PARTS, landmark_rings, lowest_soles, model_parts
+from mover.bodies.skinning import ASSETS, SkinnedBody, open_body, zero_pose
 from mover.bodies.smpl_files import KINDS, load_smpl
-from mover.bodies.smpl_model import skin_of_model
+from mover.bodies.smpl_model import skin_of_model, vertex_subset
+from mover.bodies.transfer import solved
 from mover.core.errors import InputError
-from mover.core.records import fingerprint, record
+from mover.core.records import record
 from mover.core.types import Bodies
+from mover.geometry.mesh import vertex_normals
+from mover.geometry.rotations import rotation_vectors
 
-Array = np.ndarray
 log = logging.getLogger(__name__)
-
-POSES = 4
-"""Poses that vote on the parts of an unknown mesh."""
-MOST_MATCHES = 16
-_matches: dict[str, Matched | None] = {}
+POSES = 4  # rows that show where the soles of an unknown mesh are
+STEPS = 60  # of L-BFGS, of the open body's pose
+SIGMA_JOINT, SIGMA_ANGLE, SIGMA_SHAPE = 0.01, 1.0, 2.0  # [m], [rad] and coefficients
+NORMAL = 0.05  # a normal counts as much as a position that far away [m]
+FAR = 0.15  # [m], a vertex that is farther from the open body belongs to no part
 
 
 @record
@@ -40,7 +42,7 @@ class BodyParts:
     """Index into `PARTS`; -1: none."""
     rings: Int[Tensor, "landmarks members"]
     """Vertices around each of `LANDMARKS`: their mean is about where the joint is. Empty where the
-    mesh could not be matched to a human body."""
+    topology is unknown."""
 
 
 def members(parts: BodyParts, *names: str) -> Bool[Tensor, " verts"]:
@@ -55,46 +57,73 @@ def parts_of(bodies: Bodies, up_cam: Float[Tensor, "3"] | None = None) -> BodyPa
     Args:
         bodies: People with one topology, in any poses.
         up_cam: Direction of up in the frame of `bodies`; a level camera or +y of the world if not
-            given. Asked only of a mesh that cannot be matched to a human body: its soles are what
-            lies lowest.
+            given. Used only for a mesh of unknown topology without joints: its soles lie lowest.
     """
-    found = _find(bodies, up_cam)
-    device = bodies.verts.device
+    found, device = _find(bodies, up_cam), bodies.verts.device
     return BodyParts(found.part_of.to(device), found.rings.to(device))
 
 
 def _find(bodies: Bodies, up_cam: Float[Tensor, "3"] | None) -> BodyParts:
     model = known_model(bodies.faces, bodies.verts.shape[1]) or _users_model(bodies)
     if model is not None:
-        rings = thin(model.verts.numpy(), landmark_rings(model))
-        return BodyParts(model_parts(model), torch.from_numpy(rings))
+        return BodyParts(model_parts(model), landmark_rings(model))
     listed = _listed(bodies)
     if listed is not None:
         return listed
     none = torch.zeros((0, 0), dtype=torch.long)
     if len(bodies.verts) == 0:
         return BodyParts(torch.full((bodies.verts.shape[1],), -1), none)
+    if bodies.joints is not None and set(LANDMARKS) <= set(bodies.joint_names):
+        return BodyParts(_of_open_body(bodies), none)
+    log.warning(
+        "the bodies' mesh has an unknown topology and no joints by name (%s): only its soles are "
+        "looked for", ", ".join(LANDMARKS[:3]) + ", ...",
+    )  # fmt: skip
     rows = torch.linspace(0, len(bodies.verts) - 1, POSES).round().long().unique()
     meshes, faces = bodies.verts[rows].detach().cpu().double(), bodies.faces.detach().cpu()
-    found = _matched(meshes, faces)
-    if found is not None:
-        return BodyParts(torch.from_numpy(found.part), torch.from_numpy(found.rings))
-    log.warning("the bodies' mesh does not look like a whole person: only its soles are looked for")
     default = (0.0, -1.0, 0.0) if bodies.space == "camera" else (0.0, 1.0, 0.0)
     up = torch.tensor(default) if up_cam is None else up_cam.detach().cpu()
     return BodyParts(lowest_soles(meshes, faces, up.to(meshes)), none)
 
 
-def _matched(
-    meshes: Float[Tensor, "meshes verts 3"], faces: Int[Tensor, "faces 3"]
-) -> Matched | None:
-    """`match`, once for the same poses of one capture."""
-    key = fingerprint(meshes, faces)
-    if key not in _matches:
-        while len(_matches) >= MOST_MATCHES:
-            _matches.pop(next(iter(_matches)), None)
-        _matches[key] = match(meshes.numpy(), faces.numpy())
-    return _matches[key]
+def _of_open_body(bodies: Bodies) -> Int[Tensor, " verts"]:
+    """Part of each vertex of the first body: that of the nearest vertex of the open body.
+
+    The open body is posed by L-BFGS so that its joints lie where those of the mesh do; vertices
+    are near by position and normal.
+    """
+    from scipy.spatial import KDTree
+
+    assert bodies.joints is not None
+    model = open_body()
+    names = [name for name in BODY if name in bodies.joint_names]
+    goal = bodies.joints[0, [bodies.joint_names.index(n) for n in names]].detach().cpu().float()
+    known = torch.tensor([model.joint_names.index(n) for n in names])
+    bones, straight = vertex_subset(model, torch.zeros(1, dtype=torch.long)), zero_pose(1, model)
+    rest = bones.posed(straight)[1][0, known]
+    u, _, vt = torch.linalg.svd((rest - rest.mean(0)).T @ (goal - goal.mean(0)))
+    side = torch.diag(torch.tensor([1.0, 1.0, float(torch.sign(torch.det(vt.T @ u.T)))]))
+    start = {
+        "global_orient": rotation_vectors((vt.T @ side @ u.T)[None]),
+        "body_pose": straight.body_pose, "betas": straight.betas,
+        "transl": (goal.mean(0) - rest.mean(0))[None],
+    }  # fmt: skip
+
+    def energy(at: dict[str, Tensor]) -> Float[Tensor, ""]:
+        miss = bones.posed(replace(straight, **at))[1][0, known] - goal
+        bent = at["body_pose"].square().sum() / SIGMA_ANGLE**2
+        odd = at["betas"].square().sum() / SIGMA_SHAPE**2
+        return miss.square().sum() / SIGMA_JOINT**2 + bent + odd
+
+    at = solved(start, tuple(start), energy, STEPS)
+    with torch.no_grad():
+        posed = model.posed(replace(straight, **at))[0][0]
+    mesh = bodies.verts[0].detach().cpu().float()
+    normals = [vertex_normals(v, f.cpu()) for v, f in ((posed, model.faces), (mesh, bodies.faces))]
+    tree = KDTree(torch.cat([posed, NORMAL * normals[0]], 1).numpy())
+    far, index = tree.query(torch.cat([mesh, NORMAL * normals[1]], 1).numpy())
+    part = model_parts(model)[torch.from_numpy(index)]
+    return torch.where(torch.from_numpy(far) < FAR, part, -1)
 
 
 def known_model(faces: Int[Tensor, "faces 3"], verts: int) -> SkinnedBody | None:
@@ -119,15 +148,11 @@ def _users_model(bodies: Bodies) -> SkinnedBody | None:
     return None
 
 
-def digest_of(faces: Int[Array, "faces 3"]) -> str:
-    """What distinguishes one topology from others."""
-    return hashlib.sha256(np.ascontiguousarray(faces, dtype="<i8").tobytes()).hexdigest()
-
-
 def _listed(bodies: Bodies) -> BodyParts | None:
-    """The parts of MHR, the body of SAM 3D Body, if this is its topology."""
+    """The parts of MHR, the body of SAM 3D Body, if the faces have its digest."""
     with np.load(ASSETS / "mhr_parts.npz") as data:
         part_of, rings, digest = data["part_of"], data["rings"], str(data["digest"])
-    if bodies.verts.shape[1] != len(part_of) or digest_of(bodies.faces.cpu().numpy()) != digest:
+    faces = np.ascontiguousarray(bodies.faces.cpu().numpy(), dtype="<i8").tobytes()
+    if bodies.verts.shape[1] != len(part_of) or hashlib.sha256(faces).hexdigest() != digest:
         return None
     return BodyParts(torch.from_numpy(part_of).long(), torch.from_numpy(rings).long())

@@ -10,9 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mover.bodies.limbs import LANDMARKS
 from mover.bodies.parts import BodyParts, members
-from mover.bodies.skin import PARTS
+from mover.bodies.skin import LANDMARKS, PARTS
 from mover.core.records import record
 from mover.core.types import Bodies
 from mover.geometry.mesh import vertex_normals

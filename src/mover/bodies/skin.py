@@ -1,5 +1,6 @@
-"""Names of the parts of a body that touch things."""
+"""The parts of a body that touch things, and the joints that are found on any body."""
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -13,9 +14,40 @@ PARTS = (
     "left_palm", "right_palm", "left_forearm", "right_forearm",
 )  # fmt: skip
 """Patches of skin; of thighs and forearms only the undersides."""
+LANDMARKS = (
+    "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle", "neck",
+    "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
+"""Joints that are found on any body."""
+ABOVE = {
+    "hip": "pelvis", "knee": "hip", "ankle": "knee", "neck": "spine3",
+    "shoulder": "collar", "elbow": "shoulder", "wrist": "elbow",
+}  # fmt: skip
+"""The joint whose skin blends with that of each landmark."""
+BLEND = 0.12  # product of the weights of both, at least, around a landmark
+MEMBERS = 24  # vertices of a ring
 
 
-# Soles of a mesh that is no whole human body: what lies lowest and faces down.
+def landmark_rings(model: SkinnedBody) -> Int[Tensor, "landmarks members"]:
+    """Vertices around each of `LANDMARKS`, far from each other: their mean is its middle."""
+    weight = dict(zip(model.joint_names, model.weights.T.numpy(), strict=True))
+    mesh, rows = model.verts.numpy(), list[np.ndarray]()
+    for name in LANDMARKS:
+        side, _, joint = name.rpartition("_")
+        above = weight.get(f"{side}_{ABOVE[joint]}", weight.get(ABOVE[joint]))
+        ring = np.nonzero(above * weight[name] > BLEND)[0]
+        index = ring if len(ring) else np.arange(len(mesh))
+        points = mesh[index]
+        far = np.linalg.norm(points - points.mean(0), axis=1)
+        chosen: list[int] = []
+        for _ in range(MEMBERS):
+            chosen.append(int(far.argmax()))
+            far = np.minimum(far, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        rows.append(index[chosen])
+    return torch.from_numpy(np.stack(rows))
+
+
+# Soles of a mesh of unknown topology without joints: what lies lowest and faces down.
 
 
 HEIGHT = 0.03

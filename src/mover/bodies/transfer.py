@@ -139,19 +139,20 @@ def as_smplx(pose: BodyPose, smpl: SmplBody, smplx: SmplBody, matrix: TransferMa
     }
     with torch.no_grad():
         at["transl"] = (goal - small.posed(laid(at))[0]).mean(1)
-    at = _solved(at, ("betas", "transl"), energy)
-    return laid(_solved(at, ("betas", "transl", "turn"), energy))
+    at = solved(at, ("betas", "transl"), energy, STEPS)
+    return laid(solved(at, ("betas", "transl", "turn"), energy, STEPS))
 
 
-def _solved(
+def solved(
     start: dict[str, Tensor],
     free: tuple[str, ...],
     energy: Callable[[dict[str, Tensor]], Float[Tensor, ""]],
+    steps: int,
 ) -> dict[str, Tensor]:
     """Lower the energy in some of the unknowns by L-BFGS with a strong Wolfe line search."""
     values = {name: start[name].detach().clone().requires_grad_() for name in free}
     solver = torch.optim.LBFGS(
-        list(values.values()), max_iter=STEPS, history_size=20, line_search_fn="strong_wolfe"
+        list(values.values()), max_iter=steps, history_size=20, line_search_fn="strong_wolfe"
     )
 
     def closure() -> Tensor:
