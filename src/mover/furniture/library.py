@@ -1,13 +1,14 @@
 """The piece of the library that is most like a box of a class."""
 
-from collections.abc import Callable
+import difflib
+import re
+from collections.abc import Callable, Iterable
 from functools import cache
 
 import numpy as np
 
 from mover.core.types import Mesh
 from mover.furniture import seats, storage
-from mover.furniture import seats as sofas
 from mover.furniture.pieces import Furniture, block, finish
 
 SEEDS = 6  # sizes that are tried of each design
@@ -33,7 +34,8 @@ def choose_piece(category: str, size: Size) -> Mesh:
     Nearest is the smallest sum of squared logarithms of the ratios of width, height and depth,
     so that the mesh is stretched as little as possible when it fills the box.
     """
-    pieces = catalogue(canonical(category))
+    kind = canonical(category)
+    pieces = catalogue("stool" if kind == "bar stool" else kind)
     if not pieces:
         low = (-size[0] / 2, 0.0, -size[2] / 2)
         high = (size[0] / 2, size[1], size[2] / 2)
@@ -52,9 +54,9 @@ PIECES: dict[str, Callable[[np.random.Generator, int], Furniture]] = {
     "office chair": seats.office_chair,
     "stool": seats.stool,
     "bench": seats.bench,
-    "sofa": sofas.sofa,
-    "single bed": sofas.single_bed,
-    "double bed": sofas.double_bed,
+    "sofa": seats.sofa,
+    "single bed": seats.single_bed,
+    "double bed": seats.double_bed,
     "table": storage.table,
     "desk": storage.desk,
     "coffee table": storage.coffee_table,
@@ -114,24 +116,68 @@ deviation of the logarithm; None: there is no such standard. Tables and desks ar
 seats .40-.50 m for the sake of the body, beds as long as mattresses, wardrobes as deep as hangers.
 """
 
-SYNONYMS: dict[str, str] = {
-    "couch": "sofa", "loveseat": "sofa", "settee": "sofa", "sectional": "sofa",
-    "corner sofa": "sofa",
-    "single bed": "bed", "double bed": "bed", "bunk bed": "bed",
-    "dining table": "table", "kitchen table": "table", "round table": "table",
-    "writing desk": "desk", "computer desk": "desk", "office desk": "desk",
-    "tea table": "coffee table", "side table": "coffee table", "end table": "coffee table",
-    "bookshelf": "shelf", "bookcase": "shelf", "bookshelves": "shelf", "shelves": "shelf",
-    "cupboard": "cabinet", "sideboard": "cabinet", "dresser": "cabinet",
-    "chest of drawers": "cabinet",
-    "drawers": "cabinet", "tv stand": "cabinet", "closet": "wardrobe",
-    "night stand": "nightstand", "bedside table": "nightstand",
-    "lamp": "floor lamp", "standing lamp": "floor lamp",
-    "arm chair": "armchair", "easy chair": "armchair", "lounge chair": "armchair",
-    "swivel chair": "office chair", "desk chair": "office chair", "dining chair": "chair",
-    "ottoman": "stool", "pouf": "stool", "footstool": "stool",
+OTHER_NAMES: dict[str, str] = {
+    "sofa": "couch, loveseat, love seat, settee, settle, sectional, studio couch, corner sofa, "
+    "futon, sofa bed, sleeper sofa, daybed, day bed, divan, chaise, chaise longue, "
+    "chaise lounge, lounge, диван, тахта, schlafsofa, ecksofa",
+    "bed": "single bed, double bed, bunk bed, loft bed, bed frame, bedframe, кровать, bett, "
+    "doppelbett",
+    "table": "dining table, kitchen table, round table, console table, picnic table, tisch, "
+    "esstisch, стол, обеденный стол",
+    "desk": "writing desk, computer desk, office desk, computer table, work table, writing "
+    "table, dressing table, vanity table, schreibtisch, письменный стол",
+    "coffee table": "tea table, side table, end table, cocktail table, low table, corner table, "
+    "couchtisch, beistelltisch, журнальный стол, журнальный столик",
+    "shelf": "bookshelf, bookcase, book shelf, shelving, shelving unit, rack shelf, regal, "
+    "bücherregal, полка, стеллаж",
+    "cabinet": "cabinetry, cupboard, sideboard, buffet, credenza, dresser, dresser mirror, "
+    "bureau, chest of drawers, drawer chest, chest of drawer, drawer, drawers, tv "
+    "stand, tv unit, tv bench, television stand, kommode, anrichte, комод, тумба, "
+    "schrank",
+    "wardrobe": "closet, armoire, kleiderschrank, шкаф, гардероб",
+    "nightstand": "night stand, bedside table, night table, bedside cabinet, nachttisch, "
+    "тумбочка, прикроватная тумбочка",
+    "floor lamp": "lamp, standing lamp, stehlampe, торшер",
+    "armchair": "arm chair, easy chair, lounge chair, club chair, wing chair, sofa chair, "
+    "recliner, rocking chair, rocker, massage chair, gaming armchair, lazy sofa, "
+    "sessel, кресло",
+    "office chair": "swivel chair, desk chair, task chair, computer chair, gaming chair, "
+    "bürostuhl",
+    "chair": "dining chair, kitchen chair, side chair, stuhl, стул",
+    "stool": "ottoman, pouf, pouffe, puff, footstool, foot stool, foot rest, footrest, hassock, "
+    "hocker, табурет, табуретка, пуф",
+    "bar stool": "counter stool, bar chair, high stool, barhocker, барный стул",
+    "bench": "sitzbank, скамья, скамейка, лавка",
 }  # fmt: skip
-"""Other names of the classes."""
+"""Other names of the classes: of COCO, ADE20K, NYU40, ScanNet, SUN RGB-D, 3D-FRONT, Objectron and
+Open Images, and the commonest German and Russian ones."""
+
+OTHER_THINGS = (
+    "object, other furniture, otherfurniture, otherstructure, otherprop, tv, television, "
+    "monitor, screen, computer, laptop, keyboard, mouse, remote, cell phone, telephone, "
+    "printer, sink, toilet, bathtub, bath, shower, refrigerator, refridgerator, fridge, mini "
+    "fridge, oven, stove, microwave, toaster, dishwasher, washing machine, dryer, radiator, "
+    "heater, fireplace, fan, air conditioner, piano, guitar, book, vase, clock, plant, potted "
+    "plant, houseplant, flower, pillow, cushion, blanket, towel, clothes, bag, backpack, "
+    "handbag, suitcase, box, basket, bucket, bin, trash can, recycle bin, bottle, cup, bowl, "
+    "picture, painting, poster, whiteboard, blackboard, mirror, curtain, shower curtain, "
+    "blinds, window, door, wall, floor, ceiling, stairs, column, beam, rug, carpet, mat, floor "
+    "mat, table lamp, desk lamp, ceiling lamp, pendant lamp, wall lamp, bedside lamp, "
+    "chandelier, light, counter, countertop, kitchen counter, kitchen island, bar, ladder, "
+    "crib, infant bed, cradle, dog bed, cat bed, pet bed, flower bed, wheelchair, wheel chair, "
+    "bean bag, beanbag, workbench, work bench, billiard table, pool table, camera, shoe, bike, "
+    "bicycle, cereal box, toy, teddy bear, car, person, umbrella, rack, coat rack, shoe rack, "
+    "paper, books, structure, bar counter, mattress, partition, screen divider, treadmill"
+)
+"""Things that are no furniture of the library, or none that its sizes fit; they are known names."""
+
+NOISE = (
+    "sm sk skm bp mi geo geom mesh obj prop asset model lod node grp group instance inst static "
+    "item furniture the left right front rear middle small big large new old black white red "
+    "blue brown green grey gray dark light wood wooden leather metal plastic modern copy clone "
+    "final low high poly lowpoly highpoly"
+)
+"""Words of file names and nodes that say nothing of the class."""
 
 WIDE_CLASSES: dict[str, tuple[str, ...]] = {
     "dining table": ("table", "coffee table", "desk"),
@@ -140,7 +186,9 @@ WIDE_CLASSES: dict[str, tuple[str, ...]] = {
 }
 """What detectors have one name for (COCO's), the likeliest first."""
 
-SEATS = frozenset({"chair", "armchair", "office chair", "sofa", "stool", "bench", "bed"})
+SEATS = frozenset(
+    {"chair", "armchair", "office chair", "sofa", "stool", "bar stool", "bench", "bed"}
+)
 """Classes that may take a sitter."""
 
 BACKS = frozenset({"chair", "armchair", "office chair", "sofa"})
@@ -159,10 +207,71 @@ FRONTLESS = frozenset({"table", "coffee table", "stool", "bench", "floor lamp"})
 """Classes of which no side is the front, so that only their shapes distinguish turns."""
 
 
+@cache
+def _known_names() -> dict[str, str]:
+    """The class of each known name, also where it is written as one word."""
+    every = {name: name for name in OTHER_THINGS.split(", ")} | {name: name for name in SIZES}
+    for kind, others in OTHER_NAMES.items():
+        every |= dict.fromkeys([kind, *others.split(", ")], kind)
+    return {name.replace(" ", ""): kind for name, kind in every.items()} | every
+
+
+def _spelled(text: str) -> str:
+    """Lower case without punctuation, numbers, CamelCase: `dining table` of SM_DiningTable_02."""
+    parted = re.sub(
+        r"(?<=[a-z\u0430-\u0451ß])(?=[A-Z\u0410-\u042f])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text
+    )
+    return " ".join(re.sub(r"[\W\d_]+", " ", parted).lower().split())
+
+
+def _singular(name: str) -> str | None:
+    """A known name of which this is the plural, or the name itself where it is known."""
+    endings = (("", ""), ("s", ""), ("es", ""), ("ves", "f"), ("ies", "y"))
+    forms = (name[: len(name) - len(old)] + new for old, new in endings if name.endswith(old))
+    return next((form for form in forms if form in _known_names()), None)
+
+
+@cache
+def plain_name(category: str) -> str:
+    """The known name in free text: `couch` of `SM_Couches_02`, else the text in lower case.
+
+    Of several names with commas or slashes between them the first known one counts, and of a long
+    name its last words (a leather sofa is a sofa).
+    """
+    parts = [_spelled(part) for part in re.split(r"[,;/|(]", category)]
+    short = [" ".join(w for w in part.split() if w not in NOISE.split()) for part in parts]
+    for name in (*parts, *short):
+        if (found := _singular(name)) is not None:
+            return found
+    for words in (name.split() for name in short):
+        for start in range(1, len(words)):
+            if (found := _singular(" ".join(words[start:]))) is not None:
+                return found
+    whole = _spelled(category)
+    return short[0] if len(parts) == 1 and short[0] else whole or category.strip().lower()
+
+
 def canonical(category: str) -> str:
-    """The class that `category` names, without case; unknown names are kept in lower case."""
-    name = " ".join(category.lower().replace("_", " ").replace("-", " ").split())
-    return SYNONYMS.get(name, name)
+    """The class that `category` names; names that are not known are kept in lower case."""
+    name = plain_name(category)
+    return _known_names().get(name, name)
+
+
+def meanings(category: str) -> tuple[str, ...]:
+    """The classes that a detector may mean, the likeliest first."""
+    return WIDE_CLASSES.get(plain_name(category), (canonical(category),))
+
+
+def unknown_names(categories: Iterable[str]) -> str:
+    """What to say of names that mean nothing here, with the nearest known ones; empty: all do."""
+    known, said = _known_names(), list[str]()
+    for word in sorted({c for c in categories if plain_name(c) not in known}):
+        near = difflib.get_close_matches(plain_name(word), known, n=1, cutoff=0.7)
+        said.append(f"{word!r}" + (f" (is it {near[0]!r}?)" if near else ""))
+    if not said:
+        return ""
+    kinds = f"known are {', '.join(sorted(SIZES))}"
+    return f"nothing is known of {', '.join(said)}: no usual size, seat or shape; {kinds}"
 
 
 def make_piece(name: str, rng: np.random.Generator, style: int | None = None) -> Furniture:

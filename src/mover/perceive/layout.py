@@ -25,7 +25,7 @@ from mover.core.run import Run
 from mover.core.types import Camera, Detection, Heading, Layout, Mesh, Scene, SceneObject
 from mover.energy.objective import HumanCues, ImageCues
 from mover.energy.prior_terms import Given
-from mover.furniture.library import WIDE_CLASSES, canonical, catalogue, choose_piece
+from mover.furniture.library import canonical, catalogue, choose_piece, meanings
 from mover.geometry.mesh import box, used
 from mover.geometry.raster import Crops
 from mover.geometry.rotations import wrap
@@ -51,6 +51,7 @@ OTHER_SIZES: dict[str, tuple[float, float, float]] = {
     "refrigerator": (0.70, 1.70, 0.70), "oven": (0.60, 0.90, 0.60), "toilet": (0.40, 0.78, 0.66),
     "potted plant": (0.50, 0.90, 0.50), "piano": (1.50, 1.15, 0.60), "bathtub": (1.60, 0.58, 0.75),
     "washing machine": (0.60, 0.86, 0.60), "box": (0.50, 0.40, 0.50),
+    "bar stool": (0.42, 0.75, 0.42),
 }  # fmt: skip
 """Usual width, height and depth of things that the library lacks [m]; they become blocks."""
 
@@ -100,7 +101,7 @@ def shapes_of(category: str, count: int, folder: Path | None = None) -> tuple[Sh
     own = () if folder is None else _own_shapes(canonical(category), folder)
     if own:
         return _different(own, count)
-    names = WIDE_CLASSES.get(category.lower(), (canonical(category),))
+    names = meanings(category)
     known = [
         ShapeChoice(piece.mesh, "", piece.size)
         for name in names

@@ -95,6 +95,7 @@ def layout_into(args: LayoutArgs) -> None:
 
     from mover.app.cli.progress import Bar
     from mover.core.run import Run
+    from mover.furniture.library import unknown_names
     from mover.io.capture.bodies_file import read_bodies
     from mover.perceive.capture import read_picture_of, write_first_scene
     from mover.perceive.layout import first_scene
@@ -112,6 +113,8 @@ def layout_into(args: LayoutArgs) -> None:
     write_first_scene(first, args.capture, guess)
     ground = first.scene.ground
     height = "" if ground is None else f", camera {-ground:.2f} m above the floor"
+    if unknown := unknown_names(one.category for one in picture.detections):
+        say(f"warning: {unknown}")
     say(f"{args.capture}: first scene of {len(first.scene.objects)} objects{height}")
     if first.skipped:
         say(f"note: not on the floor, left out: {', '.join(sorted(set(first.skipped)))}")

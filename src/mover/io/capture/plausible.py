@@ -11,7 +11,7 @@ import torch
 
 from mover.core.errors import InputError
 from mover.core.types import Bodies, Camera, Capture, Detection, SceneObject
-from mover.furniture.library import canonical
+from mover.furniture.library import canonical, unknown_names
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import to_camera
 from mover.io.capture.parts import UNKNOWN
@@ -45,6 +45,8 @@ def check_plausible(capture: Capture, warn: Warn) -> None:
     known = {d.id: d for d in capture.detections}
     camera = capture.scene.camera
     _check_lens(camera, warn)
+    if unknown := unknown_names(one.category for one in capture.scene.objects):
+        warn(f"{SCENE}: {unknown}")
     named = [(f"{SCENE}: field 'objects[{i}].{{}}' of {one.id}", one)
              for i, one in enumerate(capture.scene.objects)]  # fmt: skip
     named += [(f"hypotheses.json: '{{}}' of a place of {h.id}", h) for h in capture.hypotheses]
