@@ -397,7 +397,8 @@ def with_far(verts: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda a: {**a, "person": a["person"] + 1}, "3 of 3 bodies have no mask"),
+        (lambda a: {**a, "frame": a["frame"] + 9}, "3 of 3 bodies have no mask"),
+        (lambda a: {**a, "person": a["person"] + 5}, "people.json: by its position"),
         (lambda a: {**a, "joints": a["joints"] + 5}, "'joints' is 8.5 m off the meshes"),
     ],
 )

@@ -15,6 +15,7 @@ from mover.io.capture.parts import Parts
 from mover.io.capture.plausible import check_plausible
 from mover.io.capture.pose_file import into_camera
 from mover.io.capture.scene_file import hypotheses_of, scene_of
+from mover.io.capture.tracks import pair_tracks, paired
 from mover.io.files.fields import At, Warn, array, get, items, listed, refuse
 from mover.io.files.schema import checked
 
@@ -44,7 +45,7 @@ def build_capture(parts: Parts) -> Capture:
     elif parts.contacts is not None:
         warn("contacts.npz: there are no bodies, so it is not used")
     _check_frames(parts, people, bodies)
-    _check_people(people, bodies, warn)
+    bodies, people = _same_people(bodies, people, camera, warn)
     others, furniture, path = (), None, STILL
     if parts.hypotheses is not None:
         others = hypotheses_of(parts.hypotheses, parts.load_mesh, scene, warn)
@@ -108,19 +109,27 @@ def _bodies_of(
     return dataclasses.replace(bodies, fps=fps) if bodies.fps is None else bodies
 
 
-def _check_people(people: PeopleFile, bodies: Bodies | None, warn: Warn) -> None:
-    """Warn of rows of bodies and of masks that have no partner."""
+def _same_people(
+    bodies: Bodies | None, people: PeopleFile, camera: Camera, warn: Warn
+) -> tuple[Bodies | None, PeopleFile]:
+    """Bodies and masks with one number for each person; warns of rows without a partner."""
     if people.people is None:
         warn("people.json: there are no masks of people, so nothing is known about depth order")
-    elif bodies is not None:
-        masks, rows = (
-            set(zip(one.frame.tolist(), one.person.tolist(), strict=True))
-            for one in (people.people, bodies)
-        )
-        if lone := len(rows - masks):
-            warn(f"people.json: {lone} of {len(rows)} bodies have no mask and no depth order")
-        if lone := len(masks - rows):
-            warn(f"bodies.npz: {lone} of {len(masks)} masks of people have no body")
+        return bodies, people
+    if bodies is None:
+        return bodies, people
+    pairs = pair_tracks(bodies, people.people, camera)
+    for note in pairs.notes:
+        warn(note)
+    bodies, masks = paired(bodies, people.people, pairs)
+    shown, rows = (
+        set(zip(one.frame.tolist(), one.person.tolist(), strict=True)) for one in (masks, bodies)
+    )
+    if lone := len(rows - shown):
+        warn(f"people.json: {lone} of {len(rows)} bodies have no mask and no depth order")
+    if lone := len(shown - rows):
+        warn(f"bodies.npz: {lone} of {len(shown)} masks of people have no body")
+    return bodies, dataclasses.replace(people, people=masks)
 
 
 def _check_frames(parts: Parts, people: PeopleFile, bodies: Bodies | None) -> None:
