@@ -54,7 +54,10 @@ def full() -> ReportContent:
         bodies,
         {"initial": values, "result": better, "objects": each},
         ("table_0: nobody touches it <script>",),
-        [{"name": "place_objects", "seconds": 12.5, "memory": 800.0, "kept": True}],
+        [
+            {"name": name, "seconds": 12.5, "memory": 800.0, "kept": True}
+            for name in ("place_objects", "refine_camera")
+        ],
         {"place": {"weights": {"depth": 8.0}}, "seed": 0},
         [{"id": "sofa_0", "category": "sofa", "mask_pixels": 1234, "touched": True}],
         command="mover demo",
@@ -478,11 +481,18 @@ class TestBrowser:
         assert visit.troubles == []
 
     def test_a_phone_needs_no_sideways_scrolling(self, browser: Any, tmp_path: Path):
-        how = {"viewport": {"width": 375, "height": 700}, "has_touch": True, "is_mobile": True}
+        how = {"viewport": {"width": 400, "height": 700}, "has_touch": True, "is_mobile": True}
         visit = Visit(browser, write_report(tmp_path, full()), **how)
-        assert visit.page.evaluate("document.documentElement.scrollWidth") <= 375
+        assert visit.page.evaluate("document.documentElement.scrollWidth") <= 400
+        tops = "d => [...d.querySelectorAll('.number')].map(n => [n.offsetTop, n.offsetHeight])"
+        for stage in visit.page.locator(".stages > div").all():  # its numbers stand beside it
+            first = stage.locator("span").first.evaluate("s => s.offsetTop")
+            assert all(abs(t - first) < 8 and h > 0 for t, h in stage.evaluate(tops))
         visit.page.locator("#stage canvas").scroll_into_view_if_needed()
+        visit.page.uncheck("[data-show=labels]")
         before = visit.see("#stage canvas")
+        sides = np.concatenate([before[:, :4], before[:, -4:]])
+        assert np.ptp(sides, axis=-1).max() < 30  # grey: no furniture is cut at either side
         hand = visit.page.context.new_cdp_session(visit.page)
         for kind, gap in (
             ("touchStart", 40),

@@ -118,6 +118,7 @@ def report_of(
         bodies=room.bodies,
         metrics=metrics,
         warnings=room.warnings,
+        estimates=room.estimates,
         stages=[dataclasses.asdict(s) for s in run.stages],
         config=records.plain(config),
         objects=[
@@ -150,6 +151,7 @@ def _write_log(room: Room, config: Config, run: Run, origin: Origin) -> None:
         "config": records.plain(config),
         "stages": [dataclasses.asdict(s) for s in run.stages],
         "warnings": list(room.warnings),
+        "estimates": list(room.estimates),
         "evidence": [dataclasses.asdict(e) for e in room.evidence],
         "camera_covariance": None if room.covariance is None else room.covariance.tolist(),
         "traces": {

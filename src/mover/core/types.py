@@ -426,3 +426,5 @@ class Room:
     """Where the cameras of the frames were, in the axes of that of `scene` [m]."""
     proposals: tuple[Proposal, ...] = ()
     """What people rest on that is not in the scene; nothing else depends on them."""
+    estimates: tuple[str, ...] = ()
+    """Lens and scale with their spreads, and what would narrow them, each a line."""

@@ -247,7 +247,7 @@ def estimate_scale(
     theirs = factor * placed.ground / floor
     bodies = nearer(people.bodies, camera, floor, theirs)
     path = scaled(people.path, theirs)
-    return replace(people, bodies=bodies, path=path, warnings=warnings), replace(
+    return replace(people, bodies=bodies, path=path, warnings=warnings, size=left), replace(
         placed,
         ground=factor * placed.ground,
         start=larger(placed.start, factor),

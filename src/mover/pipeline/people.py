@@ -43,6 +43,8 @@ class Located:
     feet: FootContacts
     alignment: Alignment
     warnings: tuple[str, ...]
+    size: float
+    """Standard deviation of the logarithm of all lengths together; 0: people's are trusted."""
 
     def in_world(self, camera: Camera) -> Bodies:
         """The rows that count, in the world of a camera."""
@@ -115,7 +117,7 @@ def locate(capture: Capture, config: Config, run: Run) -> Located | None:
     known = AlignInputs(feet, camera, scene.ground, capture.camera_height, tilt_spread, lean, size)
     alignment = run.stage(align_camera, known, config.align)
     warnings = (*chosen.warnings, *feet.warnings, *alignment.warnings)
-    return Located(bodies, path, kept, parts, feet, alignment, warnings)
+    return Located(bodies, path, kept, parts, feet, alignment, warnings, size)
 
 
 @dataclass(frozen=True)

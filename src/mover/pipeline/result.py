@@ -15,6 +15,7 @@ from mover.core.types import Bodies, Camera, Capture, Evidence, Room, Scene
 from mover.geometry.placement import place, standing_meshes
 from mover.geometry.volume import sample
 from mover.io.capture.pose_file import into_camera
+from mover.pipeline.estimates import lens_and_scale, odd_sizes, odd_statures
 from mover.pipeline.objects import Arrangement, Humans, Setup
 from mover.pipeline.people import Located, estimate_people
 from mover.pipeline.presets import ROBUST
@@ -46,6 +47,7 @@ def unfurnished(capture: Capture, people: Located | None) -> Room:
         kept=None if people is None else people.kept, proxies=(), evidence=(),
         covariance=None if found is None else found.covariance, traces={}, warnings=warnings,
         path=capture.path if people is None else people.path,
+        estimates=_lens_and_scale(capture, camera, people),
     )  # fmt: skip
 
 
@@ -57,10 +59,11 @@ def furnished(
     objects = to_objects(capture.scene.objects, prepared, placed.layout)
     by_image = to_objects(capture.scene.objects, prepared, placed.by_image)
     warnings = [*capture.warnings, *prepared.warnings, *seat_warnings(objects)]
+    warnings += odd_sizes(objects)
     bodies = None
     if people is not None:
         bodies = to_world(people.bodies, camera)
-        warnings += people.warnings
+        warnings += (*people.warnings, *_odd_people(people, camera))
         if humans is not None:
             warnings += diagnostics(DiagnosticInputs(
                 rows_of(bodies, people.kept), people.parts, capture.people, camera,
@@ -79,7 +82,17 @@ def furnished(
         traces=placed.traces,
         warnings=tuple(dict.fromkeys(warnings)),
         path=capture.path if people is None else people.path,
+        estimates=_lens_and_scale(capture, camera, people),
     )
+
+
+def _lens_and_scale(capture: Capture, camera: Camera, people: Located | None) -> tuple[str, ...]:
+    size = None if people is None else people.size
+    return lens_and_scale(camera, capture.focal_spread, size)
+
+
+def _odd_people(people: Located, camera: Camera) -> tuple[str, ...]:
+    return odd_statures(people.in_world(camera), people.parts)
 
 
 def _evidence(setup: Setup, placed: Arrangement, humans: Humans | None) -> tuple[Evidence, ...]:
@@ -130,8 +143,11 @@ def check_room(room: Room) -> Room:
     return room
 
 
-def warnings_of(capture: Capture) -> tuple[str, ...]:
+def warnings_of(capture: Capture) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What a run would warn of besides the capture's own warnings, before it places anything.
+
+    Returns:
+        Warnings, and lens and scale with their spreads (`Room.estimates`).
 
     Raises:
         InputError: What it would refuse.
@@ -140,7 +156,11 @@ def warnings_of(capture: Capture) -> tuple[str, ...]:
 
     with tempfile.TemporaryDirectory() as folder:
         people = estimate_people(capture, ROBUST, Run(Path(folder)))
+    ground, camera = capture.scene.ground, capture.scene.camera
+    warnings = odd_sizes(capture.scene.objects)
     if people is not None:
-        return people.warnings
-    ground = capture.scene.ground
-    return () if ground is None else check_floor(ground, capture)
+        camera = people.alignment.camera
+        warnings += (*people.warnings, *_odd_people(people, camera))
+    elif ground is not None:
+        warnings += check_floor(ground, capture)
+    return warnings, _lens_and_scale(capture, camera, people)

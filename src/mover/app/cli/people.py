@@ -146,6 +146,7 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
     from mover.fitting.bodies import FitInputs, fit_bodies
     from mover.fitting.prior import prior_of
     from mover.io.capture.bodies_file import read_bodies, write_bodies
+    from mover.pipeline.estimates import poor_fits
     from mover.stages.people.select_frames import SelectInputs, select_frames
 
     if args.model_folder is not None:
@@ -164,9 +165,9 @@ def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
         say(NO_VPOSER)
     with Bar() as bar:
         found = fit_bodies(inputs, config or FITS[args.preset], observe=bar)
-    for warning in found.warnings:
-        say(f"warning: {warning}")
     bodies = found.bodies
+    for warning in (*found.warnings, *poor_fits(bodies, found.miss, camera)):
+        say(f"warning: {warning}")
     if args.drop:
         keep = select_frames(SelectInputs(bodies)).keep
         say(f"{int((~keep).sum())} of {len(keep)} bodies are left out by the frame filter")

@@ -48,11 +48,12 @@ def check(arguments: Sequence[str]) -> None:
     from mover.pipeline.result import warnings_of
 
     capture = read(args.source)
-    warnings = warnings_of(capture)
+    warnings, estimates = warnings_of(capture)
     say(evidence_table(capture, gather_evidence(capture)))
     save_overlay(capture, args.out)
     for warning in warnings:
         say(f"warning: {warning}")
+    say("\n".join(estimates))
     say(f"{args.source} is a valid capture; its initial scene is drawn in {args.out}")
 
 

@@ -98,6 +98,7 @@ def reconstruct_into(
         write_results(capture, room, config, run, origin, report=report)
     for warning in room.warnings:
         say(f"warning: {warning}")
+    say("\n".join(room.estimates))
     return room, run
 
 

@@ -61,6 +61,8 @@ class ReportContent:
     command: str = ""
     """What the user typed."""
     version: str = __version__
+    estimates: tuple[str, ...] = ()
+    """Lens and scale with their spreads, and what would narrow them."""
 
     @property
     def peopled(self) -> bool:

@@ -89,15 +89,18 @@
   }
 
   // ---------------------------------------------------------------- viewpoints
-  const orbit = { target: [...room.middle], azimuth: 0.42, elevation: 0.42, distance: 8 };
+  // The ball around the room fits between both sides; above and below, rooms fill little of it.
+  const LENS = 2.6, orbit = { distance: 8 };
+  let held = false; // by the user: a canvas of another shape leaves the view as it is
   function home() {
-    const aspect = canvas.clientWidth / Math.max(1, canvas.clientHeight);
+    const aspect = canvas.clientWidth / Math.max(1, canvas.clientHeight), away = (side) => room.radius * Math.hypot(1, LENS / side);
     Object.assign(orbit, { target: [room.middle[0], Math.min(room.middle[1], 0.7), room.middle[2]], azimuth: 0.42, elevation: 0.42,
-      distance: (room.radius * 2.45) / Math.min(1, 0.3 + 0.62 * aspect) });
+      distance: Math.max(0.88 * away(1), away(aspect)) });
+    held = false;
   }
 
   function orbitPose() {
-    const { target, azimuth: a, elevation: e, distance: d } = orbit, f = 2.6;
+    const { target, azimuth: a, elevation: e, distance: d } = orbit, f = LENS;
     const z = [Math.sin(a) * Math.cos(e), Math.sin(e), Math.cos(a) * Math.cos(e)];
     const x = [Math.cos(a), 0, -Math.sin(a)], y = cross(z, x);
     return { eye: target.map((v, i) => v + d * z[i]), R: [...x, ...y, ...z], lens: [(f * canvas.height) / canvas.width, f, 0, 0] };
@@ -263,6 +266,7 @@
       Object.assign(orbit, { elevation: Math.asin(clamp(z[1], -0.2, 1)), azimuth: Math.atan2(z[0], z[2]), distance,
         target: eye.map((v, i) => v - distance * z[i]) });
     }
+    held = true;
     state.mode = "orbit";
     marks();
     redraw();
@@ -274,7 +278,7 @@
   }
   function pan(dx, dy) {
     leaveCamera();
-    const { R } = orbitPose(), step = (orbit.distance * 2) / (2.6 * canvas.clientHeight);
+    const { R } = orbitPose(), step = (orbit.distance * 2) / (LENS * canvas.clientHeight);
     orbit.target = orbit.target.map((v, k) => v - step * (dx * R[k] - dy * R[3 + k]));
   }
   function zoom(factor) {
@@ -324,6 +328,7 @@
   for (const button of stage.querySelectorAll("[data-look]")) button.addEventListener("click", () => {
     state.mode = button.dataset.look;
     if (state.mode !== "camera") home();
+    held = state.mode !== "orbit";
     if (state.mode === "above") Object.assign(orbit, { azimuth: 0, elevation: 1.5607, distance: orbit.distance * 1.05 });
     marks();
     redraw();
@@ -352,6 +357,7 @@
     const ratio = Math.min(devicePixelRatio || 1, 2);
     canvas.width = Math.max(1, Math.round(canvas.clientWidth * ratio));
     canvas.height = Math.max(1, Math.round(canvas.clientHeight * ratio));
+    if (!held) home();
     render(); // at once: a resized canvas is blank
   }).observe(canvas);
 })();
