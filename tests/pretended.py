@@ -1,8 +1,8 @@
 """A device that is none: torch holds that its tensors lie elsewhere, and the CPU does the work.
 
 What would fail on a GPU fails here: tensors of two devices in one operation.
-Torch must know the device before the first gradient of a process, so whoever needs it runs in a
-process with `OWN` in its environment (`test_pretended.py`).
+Torch must know the device before the first gradient of a process, so what needs it runs in a
+process with `OWN` in its environment (`test_device.py`).
 """
 
 import os
@@ -86,7 +86,7 @@ def _copy_from(source, to, *_):
 def registered() -> torch.library.Library:
     """Make the device known to torch; skips where a GPU is, whose work torch would then neglect."""
     if OWN not in os.environ:
-        pytest.skip("test_pretended.py runs it in a process of its own")
+        pytest.skip("in a process of its own: run by test_device.py")
     if torch.cuda.is_available():
         pytest.skip("a GPU is here: nothing is pretended")
     _setup_privateuseone_for_python_backend(NAME)

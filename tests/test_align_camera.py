@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mover.core.types import Camera
-from mover.energy.human_terms import FootContacts, feet_term, heights, tilt_prior, up_cam
+from mover.energy.human_terms import FootContacts, feet_term, tilt_prior, up_cam
 from mover.geometry.camera import pitch_roll, tilted
 from mover.stages.camera.align_camera import (
     AlignInputs,
@@ -145,13 +145,6 @@ def test_two_people_with_opposite_depth_bias_are_never_worse_than_the_guess(bias
     assert abs(found.offsets["4"] + found.offsets["9"]) < 1e-6
     if not apart:
         assert abs(found.offsets["4"] - bias) < 0.01
-
-
-def test_offsets_help_where_people_walk_in_the_same_place():
-    biased = [soles_at(room(12, s), person=s, bias=b, seed=s) for s, b in ((0, 0.03), (1, -0.03))]
-    without = AlignConfig(offset_prior=0)
-    free, stiff = (align(joined(*biased), camera_off(), config=c) for c in (AlignConfig(), without))
-    assert np.abs(errors(free)[:2]).max() < np.abs(errors(stiff)[:2]).max() < 2
 
 
 @pytest.mark.slow
@@ -291,20 +284,7 @@ def test_the_term_is_the_printed_formula_point_by_point():
         assert float(got[i]) == pytest.approx(r**2 / (r**2 + 0.01), abs=1e-5)
     up = up_cam(torch.tensor([-0.2]).double(), torch.tensor([0.1]).double())
     assert torch.allclose(up[0], R[:, 1])
-
-
-def test_gradients_of_term_and_prior():
-    soles = soles_at(room(2), frames=1)
-    points = soles.points_cam.double()
-    start = torch.tensor([[-0.2, 0.1], [0.1, 0.0]]).double()[:, :, None].repeat(1, 1, 1)[..., 0]
-
-    def term(x):
-        return heights(points, tilted(x[:, 0], x[:, 1]), x[:, 0]).square() + 0
-
-    assert torch.autograd.gradcheck(term, start.clone().requires_grad_())
-    first = torch.tensor([0.0, 0.05]).double()
-    prior = lambda x: tilt_prior(x[:, 0], x[:, 1], first, 0.07)  # noqa: E731
-    assert torch.autograd.gradcheck(prior, start.clone().requires_grad_())
-    at = first[None] + torch.tensor([[0.0, 0.007]]).double()
-    assert float(prior(first[None])) == 0
-    assert float(prior(at)) == pytest.approx(0.5 * 0.01, rel=0.01)
+    for off, cost in ((0.0, 0.0), (0.007, 0.5 * 0.01)):
+        pitch, roll = torch.tensor([[0.0], [0.05 + off]]).double()
+        prior = tilt_prior(pitch, roll, torch.tensor([0.0, 0.05]).double(), 0.07)
+        assert float(prior) == pytest.approx(cost, rel=0.01)

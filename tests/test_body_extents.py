@@ -13,7 +13,7 @@ from mover.geometry.rle import decode, encode
 from mover.stages.cover import Cover, covered
 from mover.stages.masks import compare_extents, mask_table, pixels_of
 
-NOBODY = Masks(*SIZE, ())
+NO_PEOPLE = Masks(*SIZE, ())
 UPRIGHT = {"left_shoulder": (0.0, 0.0, -1.45), "right_shoulder": (0.0, 0.0, 1.45)}
 WALKING = STRIDE | UPRIGHT
 L_SHAPE = {**UPRIGHT, "left_hip": (-1.5, 0.0, 0.0), "right_hip": (-1.5, 0.0, 0.0)}
@@ -48,7 +48,7 @@ def wider(seen, pixels):
     return dataclasses.replace(seen, masks=Masks(*SIZE, coded))
 
 
-def compared(bodies, seen, objects=NOBODY):
+def compared(bodies, seen, objects=NO_PEOPLE):
     rows, table = torch.arange(len(bodies.frame)), mask_table(seen, bodies)
     return compare_extents(bodies, rows, CAMERA, table, covered(Cover(objects)))
 
@@ -131,7 +131,7 @@ def test_some_wrong_masks_do_not_move_the_factor():
 
 
 def test_the_pixels_of_no_masks_are_none_and_of_several_their_union():
-    assert not pixels_of(NOBODY).any()
+    assert not pixels_of(NO_PEOPLE).any()
     a, b = torch.zeros(2, *SIZE, dtype=torch.bool)
     a[10:20], b[:, 30:40] = True, True
     assert torch.equal(pixels_of(Masks(*SIZE, (encode(a), encode(b)))), a | b)

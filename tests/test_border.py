@@ -53,11 +53,6 @@ def loosened(inputs, shifts=SHIFTS):
 
 
 class TestMasks:
-    @pytest.mark.parametrize("shift", [-5, -2, -1, 0, 1])
-    def test_a_rectangle_by_whole_pixels_is_the_smaller_or_larger_one(self, shift):
-        found = borders_of(rectangle(0), torch.ones(1), (float(shift),)).masks[0]
-        assert torch.equal(found, rectangle(shift))
-
     @pytest.mark.parametrize("zoom", [0.5, 1.0, 2.0])
     @pytest.mark.parametrize("shift", SHIFTS)
     def test_a_straight_outline_moves_by_the_shift_in_pixels_of_the_image(self, zoom, shift):
@@ -100,22 +95,6 @@ class TestTerm:
         assert float(found.bbox) == pytest.approx(0.0, abs=1e-7)
         assert float(found.silhouette) == pytest.approx(BORDER_WEIGHT, rel=1e-6)
 
-    def test_the_box_alone_tells_the_shift_where_the_mask_is_unknown(self):
-        seen = box_of(1), torch.full((1, 4), SEEN), torch.zeros(1, 64, 64).bool()
-        drawn = rectangle(0), box_of(0).view(1, 2, 2)
-        borders = borders_of(rectangle(1), torch.ones(1), SHIFTS)
-        found = fit_borders(*drawn, *seen, torch.ones(1), borders, (1.0, 1.0))
-        assert borders.shifts[found.shift].tolist() == [-1.0]
-        assert float(found.bbox) == pytest.approx(0.0, abs=1e-7)
-
-    def test_a_mask_that_is_off_to_one_side_is_not_widened(self):
-        seen = box_of(0) + 4, torch.full((1, 4), SEEN), torch.ones(1, 64, 64).bool()
-        drawn = rectangle(0), box_of(0).view(1, 2, 2)
-        borders = borders_of(rectangle(0).roll((4, 4), (1, 2)), torch.ones(1), SHIFTS)
-        found = fit_borders(*drawn, *seen, torch.ones(1), borders, (1.0, 0.0))
-        assert borders.shifts[found.shift].tolist() == [0.0]  # the cost of a side is convex
-        assert float(found.bbox) > 0.25
-
     def test_each_start_and_object_takes_its_least_cost(self):
         inputs = loosened(make_inputs(size=64))
         layout = several(inputs.starts, 4)
@@ -133,15 +112,6 @@ class TestTerm:
         picked = silhouettes.gather(0, number[None])[0]
         torch.testing.assert_close(found["silhouette"], picked, rtol=1e-5, atol=1e-6)
         assert len(number.unique()) > 1
-
-    def test_the_shift_zero_alone_is_the_energy_without_borders(self):
-        inputs = make_inputs(size=48)
-        layout = several(inputs.starts)
-        free = scene_energy(layout, *rest_of(loosened(inputs, (0.0,))), ROBUSTLY)
-        bound = scene_energy(layout, *rest_of(inputs), ROBUSTLY)
-        assert set(free.parts) == set(bound.parts)
-        for name, value in bound.parts.items():
-            assert torch.equal(free.parts[name], value), name
 
     def test_the_fit_is_the_sum_of_the_two_terms_of_one_shift(self):
         inputs = make_inputs(size=48)
@@ -175,35 +145,6 @@ class TestKernel:
         assert fast(layout).whole is not None
         for term in (None, "bbox", "silhouette"):
             agree(fast, lambda x: scene_energy(x, *rest_of(inputs), ROBUSTLY), layout, term)
-
-    def test_its_shift_is_the_best_one(self):
-        pytest.importorskip("warp")
-        inputs = loosened(room())
-        layout = several(inputs.starts, 6, 0.05)
-        image = inputs.image
-        assert image.borders is not None
-        names = ("bbox", "silhouette")
-
-        def fit(image):
-            parts = energy_function(inputs.objects, inputs.camera, image, inputs.humans, ROBUSTLY)(
-                layout
-            )
-            return torch.stack([parts.parts[n].detach() for n in names])
-
-        each = torch.stack([
-            fit(replace(image, borders=replace(
-                image.borders, shifts=image.borders.shifts[k : k + 1],
-                masks=image.borders.masks[k : k + 1],
-            )))
-            for k in range(len(SHIFTS))
-        ])  # fmt: skip
-        number = each.sum(1).argmin(0)
-        assert torch.equal(
-            number, best_borders(layout, inputs.objects, inputs.camera, image, WEIGHTS)
-        )
-        assert len(number.unique()) > 1
-        index = number[None, None].expand(1, 2, -1, -1)
-        torch.testing.assert_close(fit(image), each.gather(0, index)[0], rtol=1e-6, atol=1e-7)
 
     def test_a_room_without_silhouettes_has_no_free_borders(self):
         pytest.importorskip("warp")
@@ -274,15 +215,6 @@ class TestFixed:
         one = inputs.starts[0]
         image = inputs.image
         assert fixed_borders(image, one, inputs.objects, inputs.camera, WEIGHTS) is image
-
-    @pytest.mark.parametrize("grow", [-1, 1])
-    def test_masks_too_wide_are_taken_in_and_masks_too_narrow_are_grown(self, grow):
-        inputs, cues = seen_room(grow, hide=False)
-        true = inputs.starts[0]
-        image = cues(ImageConfig(128, "robust", borders=SHIFTS))
-        found = fixed_borders(image, true, inputs.objects, inputs.camera, WEIGHTS)
-        assert float(found.boxes[0, 2] - image.boxes[0, 2]) * grow < 0
-        assert float(found.masks.sum() - image.masks.sum()) * grow < 0
 
 
 def seen_room(grow, hide):

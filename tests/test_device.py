@@ -1,18 +1,19 @@
 """The main job on a device that is not the CPU: a pretended one, and a GPU where there is one."""
 
 import json
+import os
+import re
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
-import raster_torch
 import torch
 from analytic import several
-from nearest_torch import nearest_torch
-from pretended import Elsewhere, kernels_elsewhere, registered
+from pretended import OWN, Elsewhere, kernels_elsewhere, registered
 from test_fused import WEIGHTS, room, with_slopes
 from test_pipeline import light
-from test_raster_warp import pulled, scene
-from test_volume import sphere
 
 from mover.app import cli
 from mover.app.results import write_results
@@ -20,21 +21,13 @@ from mover.core.devices import CPU, device_of, named
 from mover.core.errors import InputError
 from mover.core.records import record, to_device
 from mover.core.run import Run
-from mover.energy.config import Adam, SceneConfig, SceneWeights
+from mover.energy.config import Adam, BatchedBFGS, SceneConfig, SceneWeights
 from mover.energy.objective import scene_energy
-from mover.geometry import raster as raster_warp
-from mover.geometry.nearest_warp import clouds, nearest
-from mover.geometry.raster import Crops, layers
-from mover.geometry.volume import grid_around, sample, sample_torch
-from mover.geometry.volume_warp import union_bodies
-from mover.pipeline.presets import ROBUST
 from mover.pipeline.reconstruct import reconstruct
 from mover.stages.config import PlaceConfig
-from mover.stages.objects.place_objects import place_objects
 
 pytest.importorskip("warp")
 GPU = pytest.param("cuda", marks=pytest.mark.gpu)
-ADAM = Adam(4, 0.03, 0.01, beta2=0.98, keep_best=True)
 
 
 @pytest.fixture(params=["pretended", GPU])
@@ -49,57 +42,29 @@ def device(request):
         yield there
 
 
-class TestPretended:
-    def test_what_a_gpu_refuses_is_refused(self):
-        registered()
-        there = torch.arange(4.0).to("elsewhere")
-        assert isinstance(there, Elsewhere)
-        with pytest.raises(RuntimeError, match="here and elsewhere"):
-            there + torch.ones(4)
-        assert isinstance(there * 2 + torch.full_like(there, 3), Elsewhere)
-        assert torch.equal(there.cpu(), torch.arange(4.0))
+@pytest.mark.slow
+@pytest.mark.skipif(OWN in os.environ, reason="this is the process of its own")
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here: nothing is pretended")
+def test_the_pretended_device_in_a_process_that_knows_it_from_the_start():
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-rs"]
+    command += ["-m", "not gpu", str(Path(__file__))]
+    environment = {**os.environ, OWN: "1"}
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stdout
+    assert "in a process of its own" not in ended.stdout
+    passed = re.search(r"(\d+) passed", ended.stdout)
+    assert passed is not None
+    assert int(passed[1]) >= 7
 
 
-class TestGeometry:
-    def test_what_is_drawn_and_its_gradient_are_those_of_torch(self, device):
-        verts_cam, shape, views = scene(size=96, starts=2)
-        there = (to_device(x, device) for x in (verts_cam, shape, views))
-        found = pulled(raster_warp, *there)
-        exact = pulled(raster_torch, verts_cam.double(), shape, views)
-        assert torch.equal(found[3].cpu(), exact[3])
-        for values, truth in zip(found[:3], exact[:3], strict=True):
-            torch.testing.assert_close(values.cpu().double(), truth, atol=1e-5, rtol=0)
-        assert (found[4].cpu() - exact[4]).norm() <= 1e-3 * exact[4].norm()
-
-    def test_first_hits_and_layers_are_those_of_torch(self, device):
-        verts_cam, shape, views = scene(["sphere"], 50)
-        inputs = verts_cam[0], shape.faces[0], views.K[0]
-        there = [x.to(device) for x in inputs]
-        found, truth = (
-            r.first_hit(*x, (50, 40)) for r, x in ((raster_warp, there), (raster_torch, inputs))
-        )
-        for values, expected in zip(found, truth, strict=True):
-            assert torch.equal(values.cpu(), expected)
-        seen = layers(there[0][None], there[1], Crops(there[2][None], 50, 40))
-        exact = raster_torch.layers(inputs[0][None], inputs[1], Crops(inputs[2][None], 50, 40))
-        for values, expected in ((seen.front, exact.front), (seen.exit, exact.exit)):
-            torch.testing.assert_close(values.cpu(), expected, atol=1e-5, rtol=0)
-
-    def test_nearest_points_volumes_and_lookups_are_those_of_the_cpu(self, device):
-        g = torch.Generator().manual_seed(0)
-        points, query = (torch.rand(2, n, 3, generator=g) for n in (90, 30))
-        held, sizes = clouds(points), torch.rand(2, 3, generator=g) + 0.5
-        index = nearest(to_device(held, device), query.to(device), sizes.to(device))
-        assert torch.equal(index.cpu(), nearest_torch(held, query, sizes))
-        ball, faces = sphere([0.0, 0, 0], 0.5, 3)
-        verts = ball + torch.rand(9, 1, 3, generator=g)
-        grid = grid_around(verts.amin((0, 1)), verts.amax((0, 1)), 40, padding=0.1)
-        truth = union_bodies(verts, faces, grid)
-        found = union_bodies(verts.to(device), faces.to(device), to_device(grid, device))
-        torch.testing.assert_close(found.values.cpu(), truth.values, rtol=0, atol=2e-6)
-        places = torch.rand(50, 3, generator=g) - 0.5
-        value = sample(found, places.to(device)).cpu()
-        torch.testing.assert_close(value, sample_torch(truth, places), rtol=1e-5, atol=1e-5)
+def test_what_a_gpu_refuses_is_refused():
+    registered()
+    there = torch.arange(4.0).to("elsewhere")
+    assert isinstance(there, Elsewhere)
+    with pytest.raises(RuntimeError, match="here and elsewhere"):
+        there + torch.ones(4)
+    assert isinstance(there * 2 + torch.full_like(there, 3), Elsewhere)
+    assert torch.equal(there.cpu(), torch.arange(4.0))
 
 
 def energy_under(inputs, weights, form):
@@ -118,26 +83,6 @@ def test_all_terms_and_their_gradients_are_those_of_the_cpu(device, form, weight
     for value, truth in zip(there, here, strict=True):
         assert value.device.type == device.type
         assert (value.cpu() - truth).norm() <= 1e-3 * truth.norm()
-
-
-def test_a_whole_placing_ends_where_it_ends_on_the_cpu(device):
-    inputs = replace(room(32), starts=several(room(32).starts, 1))
-    config = PlaceConfig(
-        WEIGHTS,
-        "robust",
-        ADAM,
-        yaws=2,
-        short=Adam(3, 0.03),
-        num_hypotheses=1,
-        yaw_prior_weight=1.0,
-        apart=0.3,
-    )
-    here = place_objects(inputs, config)
-    found = to_device(place_objects(to_device(inputs, device), config), "cpu")
-    torch.testing.assert_close(found.energy, here.energy, rtol=0.05, atol=1e-3)
-    for name in ("t_world_object", "yaw", "log_scale"):
-        expected = getattr(here.layout, name)
-        torch.testing.assert_close(getattr(found.layout, name), expected, rtol=0, atol=0.02)
 
 
 @record
@@ -192,25 +137,19 @@ class TestChoice:
         assert code == 2
         assert "mover run: --device cuda: torch" in capsys.readouterr().err
 
-    def test_what_a_device_computed_is_not_taken_for_the_processors(self, tmp_path):
+    @pytest.mark.parametrize(("config", "kept"), [(Adam(), False), (BatchedBFGS(), True)])
+    def test_what_a_device_computed_is_not_taken_for_the_processors(self, tmp_path, config, kept):
+        """Descents whose steps cannot be replayed are the processor's everywhere."""
         names = []
         for device in (CPU, torch.device("meta")):
             run = Run(tmp_path, device=device)
-            run.stage(place_objects_like, Point(torch.zeros(2)), Adam())
+            run.stage(place_objects_like, Point(torch.zeros(2)), PlaceConfig(method=config))
             names.append(run.stages[0])
-        assert not any(stage.kept for stage in names)
-        assert names[0].fingerprint != names[1].fingerprint
-
-    def test_only_descents_whose_steps_can_be_replayed_are_a_devices(self, tmp_path):
-        second, first = ROBUST.place, replace(ROBUST.place, method=Adam(3))
-        run = Run(tmp_path, device=torch.device("meta"))
-        where = [
-            run._named(place_objects_like, Point(torch.zeros(2)), c)[1] for c in (second, first)
-        ]
-        assert where == [CPU, run.device]
+        assert [stage.kept for stage in names] == [False, kept]
+        assert (names[0].fingerprint == names[1].fingerprint) == kept
 
 
-def place_objects_like(inputs: Point, _config: Adam, _observe) -> Point:
+def place_objects_like(inputs: Point, _config: PlaceConfig, _observe) -> Point:
     """A stage that is computed on the device."""
     return inputs if inputs.x.device.type == "cpu" else Point(torch.zeros(2))
 

@@ -27,11 +27,9 @@ import tiny_capture as tiny
 import torch
 from test_readers_people import CAMERA, Toy
 from test_run import PLANE, Twice, doubled, files
-from test_safe_pickle import BOMBS, shared_lists
 
 from mover.bodies import BODY_MODELS
 from mover.core.errors import InputError
-from mover.core.pickles import REFUSED
 from mover.core.run import Run
 from mover.core.settings import Range, settings_of
 from mover.core.types import Capture
@@ -234,22 +232,22 @@ def mutations(whole: Path, numbers: range) -> Counter[str]:
         except Exception as error:
             raise AssertionError(f"mutation {number} ({what}): {error!r}") from error
         check_sane(capture)
-        counts["told" if capture.warnings else "taken"] += 1
+        counts["warned" if capture.warnings else "taken"] += 1
     return counts
 
 
-def test_some_mutated_captures_are_taken_told_or_refused(whole):
+def test_some_mutated_captures_are_taken_warned_of_or_refused(whole):
     assert sum(mutations(whole, range(FEW)).values()) == FEW
 
 
 @pytest.mark.slow
-def test_a_thousand_mutated_captures_are_taken_told_or_refused(whole):
+def test_thousands_of_mutated_captures_are_taken_warned_of_or_refused(whole):
     counts = mutations(whole, range(FEW, FEW + ALL))
     print(f"{ALL} mutations of a capture: {dict(counts)}")  # noqa: T201
     assert sum(counts.values()) == ALL
 
 
-# Pickles.
+# Pickles: `test_safe_pickle.py` has those that pickle refuses, here each reader is handed some.
 
 
 class Runs:
@@ -263,35 +261,22 @@ class Runs:
 
 
 def bad_pickles(mark: Path) -> dict[str, bytes]:
-    """Pickles that call, bombs, and broken ones, by their names."""
+    """Pickles that call, hold themselves or are broken, by their names."""
     good = pickle.dumps({"betas": np.zeros((2, 10)), "frame": [1, 2], "x": [1.0, "a", None]})
+    calls = ((os.system, (f"touch {mark}",)), (open, (str(mark), "w")), (os.mkdir, (str(mark),)))
     found = {
         f"calls {call.__name__}, protocol {p}": pickle.dumps(Runs(call, *arguments), protocol=p)
         for p in (0, 2, 4)
-        for call, arguments in (
-            (os.system, (f"touch {mark}",)), (open, (str(mark), "w")),
-            (eval, (f"open({str(mark)!r},'w')",)), (os.mkdir, (str(mark),)),
-            (getattr, ("x", "upper")), (__import__, ("os",)),
-        )
-    }  # fmt: skip
-    found |= {f"opcode {op!r}": b"\x80\x04" + op + b"\x00" * 12 + b"." for op in REFUSED}
+        for call, arguments in calls
+    }
     ring: dict[str, Any] = {}
     ring["betas"] = ring
-    nested = shared_lists()
-    found |= {name: pickle.dumps(bomb()) for name, bomb in BOMBS.items()}
     found |= {
-        "shared lists in a field": pickle.dumps({"betas": nested, "pose": nested}),
         "a mapping that holds itself": pickle.dumps(ring),
         "deep lists": b"\x80\x02" + b"](" * 5000 + b"e" * 5000 + b".",
-        "deep tuples": b"\x80\x02)" + b"\x85" * 50_000 + b".",
-        "a deep key": b"\x80\x04})" + b"\x85" * 20_000 + b"K\x01s.",
         "huge bytes": b"\x80\x04\x8e" + struct.pack("<Q", 1 << 60) + b".",
-        "huge text": b"\x80\x04\x8d" + struct.pack("<Q", 1 << 62) + b".",
-        "a huge number": b"\x80\x02\x8b" + struct.pack("<i", 1 << 30) + b".",
-        "a huge frame": b"\x80\x04\x95" + struct.pack("<Q", 1 << 62) + b".",
-        "a far memo": b"\x80\x02j\xff\xff\xff\x7f.", "nothing": b"", "no end": b"\x80\x04]",
-        "only an end": b".", "text": b"hello\n", "an archive": b"PK\x03\x04" + b"\0" * 60,
-        "gzip of nothing": b"\x1f\x8b\x08" + b"\0" * 7, "an unknown protocol": b"\x80\x63N.",
+        "a far memo": b"\x80\x02j\xff\xff\xff\x7f.", "nothing": b"", "text": b"hello\n",
+        "an archive": b"PK\x03\x04" + b"\0" * 60, "gzip of nothing": b"\x1f\x8b\x08" + b"\0" * 7,
         "a huge array": pickle.dumps(np.zeros(3)).replace(b"K\x03\x85", b"J\xff\xff\xff\x7f\x85"),
     }  # fmt: skip
     for number in range(12):
@@ -323,7 +308,6 @@ def read_pickles(home: Path, every: int, monkeypatch: pytest.MonkeyPatch) -> Cou
     counts: Counter[str] = Counter()
     mark = home / "mark"
     bad = bad_pickles(mark)
-    assert len(bad) >= 50
     for number, (tool, folder, read) in enumerate(readers(home)):
         path = sorted(p for p in folder.rglob("*") if p.is_file())[0]
         for name, content in list(bad.items())[number % every :: every]:
@@ -344,7 +328,7 @@ def read_pickles(home: Path, every: int, monkeypatch: pytest.MonkeyPatch) -> Cou
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # the toy's sums
 def test_some_bad_pickles_are_refused_by_every_reader(tmp_path, monkeypatch):
-    assert read_pickles(tmp_path, 12, monkeypatch)["refused"] > 50
+    assert read_pickles(tmp_path, 5, monkeypatch)["refused"] > 50
 
 
 @pytest.mark.slow
@@ -352,14 +336,14 @@ def test_some_bad_pickles_are_refused_by_every_reader(tmp_path, monkeypatch):
 def test_all_bad_pickles_are_refused_by_every_reader(tmp_path, monkeypatch):
     counts = read_pickles(tmp_path, 1, monkeypatch)
     print(f"bad pickles x readers: {dict(counts)}")  # noqa: T201
-    assert sum(counts.values()) > 50 * 15
+    assert sum(counts.values()) > 25 * 15
 
 
 # Stages.
 
 
 @pytest.mark.parametrize("seed", range(24))
-def test_a_stage_that_was_damaged_anywhere_is_said_and_computed_anew(tmp_path, caplog, seed):
+def test_a_stage_that_was_damaged_anywhere_is_said_and_computed_again(tmp_path, caplog, seed):
     rng = np.random.default_rng(seed)
     wanted = Run(tmp_path).stage(doubled, PLANE, Twice())
     path = files(tmp_path)[seed % 2]

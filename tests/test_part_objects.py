@@ -9,13 +9,8 @@ from analytic import FACES, box_verts, make_inputs
 
 from mover.core.observe import Energy
 from mover.core.types import Layout, Mesh
-from mover.energy.human_terms import SAMPLES
-from mover.energy.prior_terms import FAR, OVERLAP, apart_term, gather_solids
 from mover.geometry.mesh import sample_surface
-from mover.geometry.placement import place
-from mover.geometry.rotations import rot_y
-from mover.geometry.sections import outline
-from mover.stages.objects.separate_objects import own_sections, separate_objects, sharing
+from mover.stages.objects.separate_objects import separate_objects, sharing
 
 WEIGHT = 0.3
 
@@ -96,32 +91,6 @@ def test_who_carries_is_not_left():
     objects, at = start()
     carried = replace(objects, supports=torch.tensor([-1, 0, -1]))
     assert float(overlap(carried, meeting(at)).sum()) == 0
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_all_that_may_lie_in_one_share_what_each_does_alone_and_boxes_apart_share_nothing(seed):
-    objects, at = start()
-    g = torch.Generator().manual_seed(seed)
-    shift = 0.5 * torch.randn(3, 3, generator=g) * torch.tensor([1.0, 0.2, 1.0])
-    near = replace(at, t_world_object=at.t_world_object[:1] + shift)
-    pairs = torch.tensor([[i, j] for i in range(3) for j in range(3) if i != j])
-    solids = gather_solids(objects, {i: own_sections(objects, i) for i in range(3)}, pairs)
-    t = near.t_world_object.requires_grad_()
-    whole = apart_term(near, objects, solids)
-    alone = torch.zeros(3)
-    for i, j in pairs.tolist():
-        points = place(objects.samples, near)[i] - t[j]
-        size = near.log_scale[j].exp()
-        own = points @ rot_y(near.yaw[j]) / size
-        deep = (-outline(solids.sections[j], own) * near.log_scale[j, ::2].mean().exp()) - OVERLAP
-        deep = deep.relu() * solids.upright[i]
-        least = deep.clamp_max(FAR)
-        cost = SAMPLES * (least * (2 * deep - least)).mean()
-        alone = alone + cost * torch.nn.functional.one_hot(torch.tensor(i), 3)
-    torch.testing.assert_close(whole, alone)
-    slopes = (torch.autograd.grad(x.sum(), t)[0] for x in (whole, alone))
-    torch.testing.assert_close(*slopes)
-    assert bool((whole > 0).any())
 
 
 TOP = 0.72  # [m], underside of a table top 3 cm thick

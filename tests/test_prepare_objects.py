@@ -76,17 +76,6 @@ def test_proxy_and_mesh_stand_in_the_same_place_after_any_move():
     assert abs(float(low[1]) + 1.5) < 1e-5
 
 
-def test_scaling_and_turning_act_about_the_centre_of_the_bottom():
-    pieces = (piece_of(off_centre_box()),)
-    prepared = prepare_objects(PrepareInputs(pieces), LIGHT)
-    start = prepared.start
-    turned = Layout(start.t_world_object, start.yaw + 1.0, start.log_scale + 0.3)
-    low, high = box(place_object(to_objects(pieces, prepared, turned)[0]).verts)
-    center = (low + high) / 2
-    torch.testing.assert_close(center[[0, 2]], start.t_world_object[0, [0, 2]], atol=2e-5, rtol=0)
-    assert abs(float(low[1] - start.t_world_object[0, 1])) < 2e-5
-
-
 def test_open_and_inverted_meshes_become_closed_proxies():
     mesh = off_centre_box()
     holed = Mesh(mesh.verts, mesh.faces[2:].flip(-1))

@@ -57,7 +57,7 @@ def test_exact_objects_find_the_camera_that_the_feet_missed():
     assert after[1] < 0.3 * before[1]
 
 
-def test_feet_that_are_certain_are_believed():
+def test_feet_that_are_certain_are_trusted():
     _, inputs = wrong_camera(TIGHT)
     found = refine_camera(inputs, RefineConfig(rounds=1))
     assert max(errors(found.camera, inputs.camera)) < 1e-3
