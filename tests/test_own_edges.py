@@ -40,7 +40,7 @@ def ends_of(yaw: float, at: tuple[float, float, float], view: Camera) -> Tensor:
 def segments_of(ends: Tensor, error: float = 1e-3) -> Segments:
     along = torch.nn.functional.normalize(ends[:, 1] - ends[:, 0], dim=-1)
     one = torch.ones(len(ends), dtype=torch.float64)
-    return Segments(ends.mean(1) - K[:2, 2].double(), along, error * one, one)
+    return Segments(ends.mean(1) - K[:2, 2].double(), along, error * one, one, one.long())
 
 
 def everywhere(view: Camera) -> Tensor:
@@ -86,7 +86,7 @@ def test_edges_are_as_uncertain_as_they_are_when_their_angles_err():
         turn = error * torch.randn(len(ends), generator=generator, dtype=torch.float64)
         x, y = exact.along.unbind(-1)
         along = torch.stack([turn.cos() * x - turn.sin() * y, turn.sin() * x + turn.cos() * y], -1)
-        noisy = Segments(exact.middle, along, exact.error, exact.vote)
+        noisy = Segments(exact.middle, along, exact.error, exact.vote, exact.group)
         rolled.append(off(own_edges(noisy, everywhere(view), nowhere(view), view).yaw, 0.5))
     spread = torch.stack(rolled).square().mean(0).sqrt()
     torch.testing.assert_close(stated.spread, spread, atol=0, rtol=0.15)

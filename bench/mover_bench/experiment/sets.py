@@ -98,6 +98,12 @@ SETS: dict[str, RoomSet] = {
         " masks of a coarse head, mean bodies with biased poses, a guessed lens.",
         "1000-1029", "100-129", noise=_UPSTREAM,
     ),
+    "askew": RoomSet(
+        "The rooms of `rooms` with each object turned 3 to 15 degrees away from the walls, under a"
+        " guessed lens.",
+        "1000-1029", "100-129", RoomConfig(plan=PlanConfig(askew=(3.0, 15.0))),
+        NoiseConfig(lens=0.055),
+    ),
     "moved": RoomSet(
         "Two people use a room one after the other; between them a chair or a table is moved.",
         "1000-1029", "100-129", _MOVED,

@@ -275,7 +275,10 @@ def _spots(
         spot = RULES[rule](rng, furniture.size, plan.walls, others)
         if spot is None or len(found) == CHOICES:
             break
-        piece = Placed(label, furniture, spot[:2], spot[2])
+        turn = 0.0
+        if config.askew[1]:
+            turn = np.radians(rng.uniform(*config.askew)) * rng.choice([-1, 1])
+        piece = Placed(label, furniture, spot[:2], spot[2] + float(turn))
         free = fits(piece, others, config.spacing * MARGIN[rule], plan.walls)
         if free and in_view(piece, plan.view) >= config.visible:
             found.append(piece)

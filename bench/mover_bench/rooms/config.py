@@ -24,6 +24,8 @@ class PlanConfig:
     spacing: float = 1.0  #: factor on the free floor around each object
     more: tuple[tuple[str, Rule], ...] = ()
     """What stands in the room after the objects of its kind, and where."""
+    askew: tuple[float, float] = (0.0, 0.0)
+    """How far each object is turned away from its rule's heading, to either side [degrees]."""
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,8 @@ def along_edges(picture: Picture) -> Picture:
     camera = picture.camera
     if picture.reference is None:
         return picture
-    segments = find_segments(picture.reference, picture.people, camera.K[:2, 2], SURE)
+    centre, masks = camera.K[:2, 2], picture.masks
+    segments = find_segments(picture.reference, picture.people, centre, SURE, masks)
     spread = LensConfig.tilt
     if picture.prior is not None:
         tilts = torch.linalg.inv(picture.prior.precision).diagonal()[:2]

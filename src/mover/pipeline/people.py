@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -14,6 +15,7 @@ from mover.core.run import Run
 from mover.core.types import Bodies, Camera, CameraPath, Capture
 from mover.energy.human_terms import FootContacts
 from mover.geometry.path import is_still, poses_at, to_reference
+from mover.geometry.rle import decode
 from mover.io.capture.pose_file import moved
 from mover.pipeline.presets import Config
 from mover.stages.camera.align_camera import AlignInputs, Alignment, align_camera
@@ -81,7 +83,9 @@ def lines_of(
     picture, centre = capture.reference, capture.scene.camera.K[:2, 2]
     if not config.lens.use or picture is None or not is_still(capture.path):
         return None
-    return find_segments(picture, people_in_reference(capture), centre, fineness)
+    masks = [decode(d.mask, 0) for d in capture.detections if d.mask is not None]
+    objects = torch.stack(masks) if masks else None
+    return find_segments(picture, people_in_reference(capture), centre, fineness, objects)
 
 
 def estimate_people(capture: Capture, config: Config, run: Run) -> Located | None:
