@@ -18,10 +18,10 @@ demo: $(VENV)/.installed
 	$(BIN)/mover demo --out demo
 
 test: $(VENV)/.developed
-	$(PYTEST) -n $(JOBS) -m "not ($(EXTRA)) and not gpu and not licensed"
+	$(PYTEST) -n $(JOBS) --dist loadfile -m "not ($(EXTRA)) and not gpu and not licensed"
 
 test-rest: $(VENV)/.developed
-	$(PYTEST) -n $(JOBS) -m "($(EXTRA)) and not gpu and not licensed"
+	$(PYTEST) -n $(JOBS) --dist loadfile -m "($(EXTRA)) and not gpu and not licensed"
 
 test-all: test test-rest
 

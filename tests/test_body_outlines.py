@@ -1,4 +1,4 @@
-"""The outlines of bodies against their masks: what is found, and what it is worth."""
+"""The outlines of bodies against their masks: what is found, and what it costs."""
 
 from dataclasses import replace
 
@@ -60,7 +60,7 @@ def test_a_mask_too_wide_all_around_says_nothing():
     assert step(outline)[:2].abs().max() < 0.4
 
 
-def test_where_furniture_may_hide_the_body_the_mask_is_not_asked():
+def test_where_furniture_may_hide_the_body_the_mask_is_not_used():
     front = NOTHING.clone()
     front[260:] = 2.0
     cut = drawn(seen_box(0.0)) & torch.arange(480)[:, None].lt(260)
@@ -75,7 +75,7 @@ def test_bodies_without_a_mask_or_without_overlap_have_no_outline():
     assert not len(wish(seen_box(-1.0), drawn(seen_box(1.0))).body)
 
 
-def test_the_price_is_zero_where_outlines_meet_and_is_shared_by_the_points():
+def test_the_cost_is_zero_where_outlines_meet_and_is_shared_by_the_points():
     outline = wish(seen_box(0.0), drawn(seen_box(0.04)))
     assert float(outline.weight.sum()) == pytest.approx(OUTLINE_POINTS)
     skin = seen_box(0.0).skin.double()
@@ -87,7 +87,7 @@ def test_the_price_is_zero_where_outlines_meet_and_is_shared_by_the_points():
     assert after < 0.2 * before
 
 
-def test_the_gradient_of_the_price_equals_finite_differences():
+def test_the_gradient_of_the_cost_equals_finite_differences():
     outline = wish(seen_box(0.0), drawn(seen_box(0.02)))
     outline = replace(
         outline, pixel=outline.pixel.double(), normal=outline.normal.double(),

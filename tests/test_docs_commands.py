@@ -50,20 +50,6 @@ def words_of(line: str) -> list[str]:
     return shlex.split(line, comments=True)[1:]
 
 
-LINES = [
-    pytest.param(line, id=f"{page.stem}: {line.split('  ')[0]}")
-    for page in PAGES
-    for line in dict.fromkeys(blocks(page))
-]
-MENTIONS = [
-    pytest.param(text, id=f"{page.stem}: {text}")
-    for page in PAGES
-    for text in dict.fromkeys(
-        " ".join(found.split()) for found in INLINE.findall(FENCE.sub("", page.read_text()))
-    )
-]
-
-
 @pytest.fixture
 def _only_parse(monkeypatch: pytest.MonkeyPatch):
     """Commands stop as soon as their arguments are read; run.json need not exist."""
@@ -77,17 +63,15 @@ def _only_parse(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(results, "read_config", lambda _path: PRESETS["robust"])
 
 
-def parse(name: str, words: list[str]) -> None:
-    with pytest.raises(ParsedError):
-        command_of(name)(words)
-
-
 @pytest.mark.usefixtures("_only_parse")
-@pytest.mark.parametrize("line", [p for p in LINES if words_of(p.values[0])[0] != "batch"])
-def test_a_command_in_a_block_is_understood(line: str):
-    name, *words = words_of(line)
-    assert name in COMMANDS
-    parse(name, words)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_commands_in_blocks_are_understood(page: Path):
+    for line in blocks(page):
+        name, *words = words_of(line)
+        assert name in COMMANDS
+        if name != "batch":
+            with pytest.raises(ParsedError):
+                command_of(name)(words)
 
 
 ELSEWHERE = """
@@ -110,8 +94,9 @@ for words in json.loads(sys.argv[1]):
 
 def test_batches_in_blocks_are_understood():
     """In a process of its own: tyro marks what is missing by a value that no type check lets by."""
-    wanted = [words_of(p.values[0])[1:] for p in LINES if words_of(p.values[0])[0] == "batch"]
-    assert wanted
+    lines = [words_of(line) for page in PAGES for line in blocks(page)]
+    assert {name for name, *_ in lines} >= {"batch", "check", "run", "export", "render"}
+    wanted = [words for name, *words in lines if name == "batch"]
     run = [sys.executable, "-c", ELSEWHERE, json.dumps(wanted)]
     done = subprocess.run(run, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -130,21 +115,17 @@ def help_of(name: str) -> str:
     return text.getvalue()
 
 
-@pytest.mark.parametrize("text", MENTIONS)
-def test_a_command_in_a_sentence_has_these_options(text: str):
-    name, *words = text.split()[1:]
-    if name.startswith("-"):
-        assert name in ("--help", "--version")
-        return
-    assert name.rstrip(",.") in COMMANDS
-    options = [word.split("=")[0] for word in words if word.startswith("--")]
-    for option in options:
-        words = help_of(name).replace("_", "-").replace(",", " ").split()
-        assert option in words or option in ("--help", "--help-all"), option
-
-
-def test_there_are_commands_to_check():
-    assert {words_of(line.values[0])[0] for line in LINES} >= {"check", "run", "export", "render"}
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_commands_in_sentences_have_these_options(page: Path):
+    for text in INLINE.findall(FENCE.sub("", page.read_text())):
+        name, *words = text.split()[1:]
+        if name.startswith("-"):
+            assert name in ("--help", "--version")
+            continue
+        assert name.rstrip(",.") in COMMANDS
+        for option in (word.split("=")[0] for word in words if word.startswith("--")):
+            known = help_of(name).replace("_", "-").replace(",", " ").split()
+            assert option in known or option in ("--help", "--help-all"), (text, option)
 
 
 @pytest.mark.usefixtures("_only_parse")

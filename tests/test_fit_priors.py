@@ -1,4 +1,4 @@
-"""What the fit knows beyond keypoints: bodies that stand still, and feet that are level."""
+"""What the fit knows beyond keypoints: bodies at rest, level feet, and which way people lie."""
 
 import dataclasses
 import math
@@ -11,16 +11,23 @@ from make_keypoints import CAMERA, as_bodies, keypoints_at, seen, walker
 
 from mover.bodies.skeleton import BODY
 from mover.bodies.skinning import open_body
+from mover.core.types import Bodies
 from mover.energy.body_energy import BODY_TERMS
 from mover.energy.body_terms import SIGMA_HELD, deviation_term, robust_square
 from mover.fitting.bodies import FitInputs, fit_bodies
 from mover.fitting.config import STAGES, FitConfig
 from mover.fitting.energy import UPPER
-from mover.fitting.ground import distances_of_lying_people, plane_of, sole_heights, soles_of
+from mover.fitting.ground import (
+    distances_of_lying_people,
+    plane_of,
+    sole_heights,
+    soles_of,
+    trunk_of,
+)
 from mover.fitting.priors import excess_of, limit_table, off_pose, resting, spreads
-from mover.fitting.start import BACK, lying_guesses, upright_guesses
+from mover.fitting.start import BACK, lying_guesses, turned_round, upright_guesses
 from mover.fitting.tracks import CALM, joint_speed, motion_of
-from mover.geometry.rotations import axis_angle, rotation_vectors
+from mover.geometry.rotations import axis_angle, rot_x, rot_y, rot_z, rotation_vectors
 
 QUICK = FitConfig(
     start_steps=20,
@@ -192,3 +199,54 @@ def test_only_lying_people_have_arms_anywhere_in_their_ranges():
         np.testing.assert_allclose(guess.spread[arms], drawn[arms.numpy()], rtol=0.01)
         assert torch.equal(guess.spread[~arms], usual[~arms])
     assert all(torch.equal(guess.spread, usual) for guess in upright_guesses(like))
+
+
+# Which way the head is, and what lying people are rolled to.
+
+UP = torch.tensor([0.0, -1.0, 0.0])
+STARTED = FitConfig(stages=(dataclasses.replace(STAGES[1], steps=10),))
+"""Little more than the hypotheses, which decide."""
+
+
+def sleeper(rolls: torch.Tensor, head: float) -> Bodies:
+    """A person lying 4 m away, 0.9 m below the camera, rolled from the back as far [rad]."""
+    pose, frame = walker(len(rolls))
+    back = rot_y(torch.tensor(head)) @ rot_z(rolls) @ rot_x(torch.tensor(-0.5 * math.pi))
+    place = torch.tensor([0.3, -0.9, -4.0]) @ CAMERA.R_cam_world.mT
+    lying = dataclasses.replace(
+        pose,
+        global_orient=rotation_vectors(CAMERA.R_cam_world @ back),
+        body_pose=pose.body_pose[:1].expand(len(rolls), -1).clone(),
+        transl=place.expand(len(rolls), 3).clone(),
+    )
+    return as_bodies(lying, frame)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("head", [0.2, 3.0])
+@pytest.mark.parametrize("roll", [0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi])
+def test_a_person_lying_along_the_view_has_the_head_where_it_is(roll, head):
+    truth = sleeper(torch.full((10,), roll), head)
+    found = fit_bodies(FitInputs(seen(truth, "coco17", noise=4.0), CAMERA, open_body()), STARTED)
+    along = (trunk_of(found.bodies.joints) * trunk_of(truth.joints)).sum(-1)
+    assert along.min() > 0.9
+    miss = found.bodies.joints[:, :22] - truth.joints[:, :22]
+    assert (miss - miss[:, :1]).norm(dim=-1).mean() < 0.12
+
+
+def test_of_a_stretch_of_lying_the_way_of_the_most_counts():
+    stands, near, far = UP, torch.tensor([0.0, 0.0, -1.0]), torch.tensor([0.1, 0.0, 1.0])
+    trunks = torch.stack([stands, near, far]).expand(9, 3, 3)
+    best = torch.tensor([0, 2, 1, 2, 2, 0, 1, 1, 0])
+    against = turned_round(trunks, best, UP)
+    assert not against[:, 0].any()
+    assert against[1:5, 1].all()
+    assert not against[1:5, 2].any()
+    assert against[6:8, 2].all()  # lying the other way after having stood
+    assert not against[6:8, 1].any()
+    assert not against[[0, 5, 8]].any()
+
+
+def test_where_no_person_lies_nothing_is_against_anything():
+    trunks = torch.stack([UP, torch.tensor([0.0, -0.7, 0.7])]).expand(4, 2, 3)
+    assert not turned_round(trunks, torch.tensor([0, 1, 1, 0]), UP).any()

@@ -1,14 +1,11 @@
 """The frame filter: wrong frames go, honest motion stays."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from make_keypoints import as_bodies, walker
 
-from mover.core.records import rows_of
 from mover.core.types import Bodies
 from mover.stages.config import SelectConfig
 from mover.stages.people.select_frames import LOCAL, SelectInputs, select_frames
@@ -147,17 +144,3 @@ def test_real_people_who_climb_and_sit_are_kept(every):
     pelvis = np.array(hips)[::every] * 2.54 / 45
     joints = np.repeat(pelvis[:, None], 9, 1)
     assert kept(bodies_of(joints, np.arange(len(joints)), 120 / every)).all()
-
-
-@pytest.mark.parametrize("fps", [5.0, 30.0])
-def test_bodies_that_jump_are_dropped_by_the_filter_of_the_pipeline(fps):
-    pose, frame = walker(30, fps=fps)
-    wrong = [7, 16, 17]
-    transl = pose.transl.clone()
-    transl[wrong] += torch.tensor([0.0, 0.0, 0.8])
-    bodies = as_bodies(dataclasses.replace(pose, transl=transl), frame, fps)
-    keep = select_frames(SelectInputs(bodies)).keep
-    left = rows_of(bodies, keep)
-    assert sorted(set(range(30)) - set(left.frame.tolist())) == wrong
-    images = dataclasses.replace(bodies, fps=None)
-    assert select_frames(SelectInputs(images)).keep.all()

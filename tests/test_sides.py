@@ -72,23 +72,28 @@ def hull(pixels):
     return torch.from_numpy((beyond <= 0).all(0))
 
 
+BOX, FRONT = rectangle(50, 30, 90, 80), rectangle(90, 20, 150, 90)
+CUT = rectangle(0, 30, 90, 80)  # by the left border of the image
+KNOWN = {
+    "alone": ((BOX,), {}, [SEEN] * 4),
+    "one in front": ((BOX, FRONT), {}, [SEEN, SEEN, LEAST, SEEN]),
+    "one in front, bounded, but not by the border": (
+        (CUT, FRONT), {"bounded": True}, [LEAST, SEEN, LIKELY, SEEN]),
+    "people and the border": (
+        (CUT,), {"people": rectangle(50, 80, 90, 120)}, [LEAST, SEEN, SEEN, LEAST]),
+    "known to stand behind": ((BOX, FRONT), {"behind": (1,)}, [SEEN] * 4),
+    "the preset of the paper": ((BOX, FRONT), {"form": "paper"}, [SEEN] * 4),
+    "legs hidden at both ends of a top": (
+        (rectangle(60, 40, 120, 52), rectangle(10, 10, 60, 100), rectangle(112, 52, 150, 100)),
+        {}, [LEAST, SEEN, SEEN, LEAST]),
+}  # fmt: skip
+
+
 class TestWhatIsKnown:
-    def test_an_object_alone_is_seen_on_all_sides(self):
-        assert sides_of(rectangle(50, 30, 90, 80)) == [SEEN] * 4
-
-    def test_what_stands_in_front_makes_a_side_a_lower_bound(self):
-        sofa = rectangle(90, 20, 150, 90)
-        assert sides_of(rectangle(50, 30, 90, 80), sofa) == [SEEN, SEEN, LEAST, SEEN]
-
-    def test_where_reaching_beyond_is_bounded_the_border_of_the_image_still_bounds_nothing(self):
-        sofa = rectangle(90, 20, 150, 90)
-        found = sides_of(rectangle(0, 30, 90, 80), sofa, bounded=True)
-        assert found == [LEAST, SEEN, LIKELY, SEEN]
-
-    def test_so_do_people_and_the_border_of_the_image(self):
-        body = rectangle(50, 80, 90, 120)
-        found = sides_of(rectangle(0, 30, 90, 80), people=body)
-        assert found == [LEAST, SEEN, SEEN, LEAST]
+    @pytest.mark.parametrize("name", KNOWN)
+    def test_sides_of_masks(self, name):
+        masks, rest, wanted = KNOWN[name]
+        assert sides_of(*masks, **rest) == wanted
 
     @pytest.mark.parametrize("seed", range(30))
     def test_where_it_truly_stands_a_box_that_a_border_cuts_costs_nothing(self, seed):
@@ -100,19 +105,6 @@ class TestWhatIsKnown:
         cost = bbox_term(pixels[None], box[None], sides, float(WIDTH), "robust")
         whole = float((box[2:] - box[:2]).prod().sqrt())
         assert float(cost) < 4 / whole  # pixels are whole: each side is off by less than one
-
-    def test_what_is_known_to_stand_behind_hides_nothing(self):
-        sofa = rectangle(90, 20, 150, 90)
-        assert sides_of(rectangle(50, 30, 90, 80), sofa, behind=(1,)) == [SEEN] * 4
-
-    def test_the_other_presets_know_every_side_of_a_detected_box(self):
-        sofa = rectangle(90, 20, 150, 90)
-        assert sides_of(rectangle(50, 30, 90, 80), sofa, form="paper") == [SEEN] * 4
-
-    def test_the_legs_of_a_table_may_be_hidden_at_both_ends_of_its_top(self):
-        top = rectangle(60, 40, 120, 52)
-        wardrobe, armchair = rectangle(10, 10, 60, 100), rectangle(112, 52, 150, 100)
-        assert sides_of(top, wardrobe, armchair)[BOTTOM] == LEAST
 
     def test_a_piece_without_a_detection_knows_none(self):
         mask = rectangle(50, 30, 90, 80)
