@@ -1,8 +1,8 @@
 """The space that bodies have moved through: the union of bodies by Warp kernels.
 
-Triangles write their distances into the cells near them; for cells deep inside, Warp's mesh finds
-the nearest triangle. A launch on the CPU is serial but releases Python's lock, so bodies are
-measured in threads, each with a volume of its own; the minimum of these is the result.
+Signed crossings give the winding numbers, Warp's mesh the distances. A launch on the CPU is serial
+but releases Python's lock, so bodies are measured in threads, each with a volume of its own; the
+minimum of these is the result.
 """
 
 from collections.abc import Callable
@@ -19,6 +19,7 @@ from mover.geometry.volume import Volume
 from mover.geometry.warp_start import array, kernels, launch, name_of, started
 
 REACH = 2  # [cells], that the shell reaches out of the body
+SLIVER = 1e-9  # squared sine of an angle below which a triangle has no area
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,13 @@ def union_bodies(
 
 
 def _worker(verts: Tensor, corners: Tensor, grid: Volume) -> Worker:
+    """One body's mesh without the triangles that have no area, and a copy of the volume."""
     wp = started()
-    mesh = wp.Mesh(array(verts.clone(), "vec3"), array(corners.flatten(), "int32"))
+    a, b, c = verts[corners.long()].unbind(-2)
+    square = torch.linalg.cross(b - a, c - a).square().sum(-1)
+    flat = square <= SLIVER * (b - a).square().sum(-1) * (c - a).square().sum(-1)
+    some = corners if bool(flat.all()) else corners[~flat]
+    mesh = wp.Mesh(array(verts.clone(), "vec3"), array(some.flatten(), "int32"))
     return Worker(mesh, grid.values.detach().float().to(verts.device).clone().contiguous())
 
 
@@ -106,16 +112,12 @@ def add_body(
     shape = size[0], size[2], size[1]
     body = bodies.Body()
     body.faces, body.place = array(corners, "vec3i"), array(place, "vec3d")
-    body.at = array(place.float(), "vec3")
     body.low, body.size = wp.vec3i(*low.tolist()), wp.vec3i(*size)
     steps = torch.zeros(*shape[:2], shape[2] + 1, dtype=torch.int32, device=device)
     body.winding = array(steps, "int32")
-    body.least = array(torch.empty(shape, device=device), "float32")
-    body.owner = array(torch.full(shape, -1, dtype=torch.int32, device=device), "int32")
-    wp.copy(worker.mesh.points, body.at)
+    at = place.float()
+    wp.copy(worker.mesh.points, array(at, "vec3"))
     worker.mesh.refit()
     field = array(worker.field, "float32")
     launch(bodies.cross, len(corners), [body], device)
-    launch(bodies.add_up, shape[:2], [body, side, field, grid.cell], device)
-    launch(bodies.scatter, len(corners), [body], device)
-    launch(bodies.lower, shape[:2], [body, worker.mesh.id, field, grid.cell], device)
+    launch(bodies.lower, shape[:2], [body, worker.mesh.id, side, field, grid.cell], device)
