@@ -15,12 +15,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mover.core.devices import constant
-from mover.core.records import map_tensors, record
+from mover.core.records import record
 from mover.core.types import Layout, Objects
 from mover.energy.config import Variant
 from mover.energy.minimize import geman_mcclure, safe_norm
-from mover.geometry.nearest_warp import Clouds, clouds, nearest
-from mover.geometry.raster import Depths, engine
+from mover.geometry.raster import Depths
 from mover.geometry.rotations import rot_y
 from mover.geometry.volume import Volume, sample
 
@@ -246,23 +245,8 @@ def some_touches(touches: ContactPoints, index: Int[Tensor, " few"], count: int)
     return ContactPoints(touched, **rest)
 
 
-@record
-class Trees:
-    """Search trees of what can be touched of each object."""
-
-    top: Clouds
-    back: Clouds
-
-
-def trees_of(objects: Objects, touches: ContactPoints | None) -> Trees | None:
-    """Search trees of all objects; None where Warp is not the engine or cannot help."""
-    if touches is None or engine() != "warp" or objects.top.dtype != torch.float32:
-        return None
-    return Trees(clouds(objects.top), clouds(objects.back)) if objects.top.numel() else None
-
-
 def contact_distance(
-    layout: Layout, objects: Objects, touches: ContactPoints, trees: Trees | None = None
+    layout: Layout, objects: Objects, touches: ContactPoints
 ) -> Float[Tensor, "*starts touched 4 points"]:
     """Distance from each body point to the nearest point of the part that it touches [m].
 
@@ -274,12 +258,9 @@ def contact_distance(
     found: list[Tensor] = []
     for k, region in enumerate((objects.top[index], objects.back[index])):
         query = touches.points[:, k::2].flatten(1, 2)  # of the body, then of the hands
-        own = (query - t).detach() @ turn.detach()
-        if trees is None:
-            pair = torch.cdist(own, (region * scale.unsqueeze(-2)).detach()).argmin(-1)
-        else:
-            held = map_tensors(lambda x: x[index], trees.back if k else trees.top)
-            pair = nearest(held, own, scale)
+        own, points = (query - t) @ turn, region * scale.unsqueeze(-2)
+        exact = "donot_use_mm_for_euclid_dist"
+        pair = torch.cdist(own.detach(), points.detach(), compute_mode=exact).argmin(-1)
         pairs = pair.unsqueeze(-1).expand(*pair.shape, 3)
         chosen = region.expand(*pair.shape[:-1], -1, 3).gather(-2, pairs)
         found.append(safe_norm(query - (chosen * scale.unsqueeze(-2)) @ turn.mT - t))

@@ -16,14 +16,13 @@ from torch import Tensor
 
 from mover.core.devices import constant
 from mover.core.observe import Energy, PerItem
-from mover.core.records import map_tensors, record, rows_of
+from mover.core.records import record, rows_of
 from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.human_terms import (
     BodySpace,
     ContactPoints,
     DepthRange,
-    Trees,
     collision_share,
     collision_term,
     contact_distance,
@@ -107,8 +106,6 @@ class SceneEvidence:
     camera: Camera
     image: ImageCues
     humans: HumanCues
-    trees: Trees | None = None
-    """Finds what is touched faster (`trees_of`); None: all points are compared."""
 
     def has(self, name: str) -> bool:
         """Whether a field of the cues is known."""
@@ -119,8 +116,7 @@ class SceneEvidence:
         n = len(self.objects.ids)
         image = of_objects(self.image, rows % n, n)
         humans = of_objects(self.humans, rows % n, n)
-        trees = map_tensors(lambda x: x[rows % n], self.trees)
-        return SceneEvidence(some_objects(self.objects, rows), self.camera, image, humans, trees)
+        return SceneEvidence(some_objects(self.objects, rows), self.camera, image, humans)
 
     def bare(self) -> "SceneEvidence":
         """That without meshes, maps and people, which `Term.bare` terms do not look at."""
@@ -221,7 +217,7 @@ def _collision(s: PlacedScene) -> PerItem:
 def _contact(s: PlacedScene) -> PerItem:
     objects, humans = s.known.objects, s.known.humans
     touches = there(humans.touches)
-    distance = contact_distance(s.layout, objects, touches, s.known.trees)
+    distance = contact_distance(s.layout, objects, touches)
     return contact_term(distance, touches, len(objects.ids), s.config.form)
 
 

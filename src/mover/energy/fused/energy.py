@@ -13,7 +13,6 @@ from mover.core.types import Camera, Layout, Objects
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.fused.launch import FUSED, FusedEnergy, fused_cost
 from mover.energy.fused.pack import kernel_of, real_parts
-from mover.energy.human_terms import trees_of
 from mover.energy.objective import (
     SCENE_TERMS,
     HumanCues,
@@ -51,8 +50,7 @@ def energy_of_rows(
 
     Rows count through (starts x objects); the layout has one row for each.
     """
-    trees = trees_of(objects, humans.touches) if config.weights.contact else None
-    known = SceneEvidence(objects, camera, image, humans, trees)
+    known = SceneEvidence(objects, camera, image, humans)
     config = active_config(config, known)
     kernel = fused_energy(known, config)
     left = [t for t in SCENE_TERMS if kernel is None or not t.fused]
@@ -101,7 +99,7 @@ def fused_energy(known: SceneEvidence, config: SceneConfig) -> FusedEnergy | Non
         return None
     touches = known.humans.touches
     once = touches is None or len(touches.object_of.unique()) == len(touches.object_of)
-    if (config.weights.contact and known.trees is None) or not once or not _closed(known.objects):
+    if not once or not _closed(known.objects):
         return None
     return kernel_of(known, config)
 

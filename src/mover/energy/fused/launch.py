@@ -53,8 +53,6 @@ class FusedEnergy:
     size: BufferSize
     effort: Tensor
     """How much work each object is, roughly."""
-    queries: int
-    """Number of skin points that ask what they touch."""
     camera: Tensor
     """From the world to the camera, where nothing else is asked for."""
     turn: Tensor
@@ -201,13 +199,10 @@ def _buffers_of(fused: FusedEnergy, items: int, count: int) -> _Buffers:
     from mover.energy.fused.kernels.data import ItemCosts
 
     kernel, launch = kernels("cost", "cpu", KERNELS).cost_items, started().launch
-    n = max(1, len(fused.effort))
     layout, whole = torch.empty(items, UNKNOWNS), torch.empty(items)
     parts, slope = torch.empty(items, TERMS), torch.empty(items, SLOPES)
     slopes = torch.empty(items, TERMS, SLOPES)
     order = torch.zeros(items, dtype=torch.int32)
-    nearest = torch.full((max(1, fused.queries * -(-items // n)),), -1, dtype=torch.int32)
-    fused.data.people.nearest = array(nearest, "int32")
     answer = filled(
         ItemCosts, order=order, layout=layout, parts=parts, slopes=slopes, whole=whole, slope=slope
     )

@@ -10,7 +10,6 @@ from mover.energy import human_terms, image_terms, prior_terms
 from mover.energy.config import SceneConfig, SceneWeights
 from mover.energy.fused.launch import BORDER, FUSED, BufferSize, FusedEnergy
 from mover.energy.objective import HumanCues, ImageCues, SceneEvidence
-from mover.geometry.nearest_warp import packed
 from mover.geometry.volume import field_of
 from mover.geometry.warp_start import array, started
 
@@ -48,7 +47,7 @@ def kernel_of(known: SceneEvidence, config: SceneConfig) -> FusedEnergy:
     size = BufferSize(
         verts, faces, edges, views.height + 2 * BORDER, views.width + 2 * BORDER, shifts
     )
-    return FusedEnergy(data, size, counts[1], len(queries), camera.R_cam_world, turn)
+    return FusedEnergy(data, size, counts[1], camera.R_cam_world, turn)
 
 
 def _things(objects: Objects, queries: Tensor) -> tuple[Any, list[Tensor]]:
@@ -156,8 +155,10 @@ def _people(known: SceneEvidence, weights: SceneWeights, queries: Tensor, share:
     people = HumanData()
     people.queries, people.share = array(queries, "vec3"), array(share, "float32")
     people.rho = human_terms.CONTACT_RHO
-    if weights.contact and known.trees is not None:
-        people.top, people.back = packed(known.trees.top), packed(known.trees.back)
+    objects = known.objects
+    people.top, people.back = (
+        array(x.detach().contiguous(), "vec3") for x in (objects.top, objects.back)
+    )
     if weights.collision and known.humans.space is not None:
         volume = known.humans.space.volume
         some = volume.values[::BRICK, ::BRICK, ::BRICK]

@@ -3,7 +3,6 @@
 import warp as wp
 
 from mover.geometry.kernels.lookup import Field
-from mover.geometry.kernels.nearest import Cloud
 from mover.geometry.kernels.scene import Items, Scratch
 
 BBOX, SILHOUETTE, SCALE, DEPTH, COLLISION, CONTACT, DISTANCE, HEADING = range(8)
@@ -68,12 +67,10 @@ class HumanData:
     """Skin that touches, in the world [m]."""
     share: wp.array(dtype=wp.float32)
     """Its share in the cost of its object; negative: it touches the back."""
-    nearest: wp.array(dtype=wp.int32)
-    """For each start the point that was nearest to each skin point, or -1; it is a first guess."""
     rho: float
     """Distance at which contact costs a half [m]."""
-    top: Cloud
-    back: Cloud
+    top: wp.array2d(dtype=wp.vec3)
+    back: wp.array2d(dtype=wp.vec3)
 
 
 @wp.struct

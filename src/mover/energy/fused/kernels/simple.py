@@ -20,7 +20,6 @@ from mover.energy.fused.kernels.data import (
 )
 from mover.geometry.camera import NEAR
 from mover.geometry.kernels.lookup import interpolate
-from mover.geometry.kernels.nearest import Query, nearest_of
 
 
 @wp.func
@@ -112,30 +111,36 @@ EPS = wp.constant(1.0e-12)  # [m²], as in `minimize.safe_norm`
 
 
 @wp.func
+def nearest_of(points: wp.array2d(dtype=wp.vec3), p: Pose, at: wp.vec3) -> wp.vec3:
+    """The point of an object's part that is nearest to a position, the first of equals."""
+    near = points[p.thing, 0]
+    best = wp.length_sq(wp.cw_mul(near, p.scale) - at)
+    for k in range(1, points.shape[1]):
+        d = wp.length_sq(wp.cw_mul(points[p.thing, k], p.scale) - at)
+        if d < best:
+            best = d
+            near = points[p.thing, k]
+    return near
+
+
+@wp.func
 def contact_cost(data: KernelInput, p: Pose) -> tuple[float, Slope]:
     """Robust cost of the distance of the skin that touches, and its change."""
     total = wp.float64(0.0)
     slope = Slope()
-    q = Query()
-    q.item = p.thing
-    q.scale = p.scale
     back = wp.transpose(p.turn)
     first = data.things.starts[p.thing, QUERIES]
-    start = p.item / (data.things.starts.shape[0] - 1) * data.people.queries.shape[0]
     rho2 = data.people.rho * data.people.rho
     for k in range(first, data.things.starts[p.thing + 1, QUERIES]):
-        q.place = back * (data.people.queries[k] - p.place)
+        at = back * (data.people.queries[k] - p.place)
         share = data.people.share[k]
         near = wp.vec3()
         if share > 0.0:
-            place = nearest_of(data.people.top, q, data.people.nearest[start + k])
-            near = data.people.top.points[p.thing, place]
+            near = nearest_of(data.people.top, p, at)
         else:
-            place = nearest_of(data.people.back, q, data.people.nearest[start + k])
-            near = data.people.back.points[p.thing, place]
-        data.people.nearest[start + k] = place
+            near = nearest_of(data.people.back, p, at)
         arm = wp.cw_mul(near, p.scale)
-        off = q.place - arm
+        off = at - arm
         length = wp.sqrt(wp.length_sq(off) + EPS)
         gap = length - wp.sqrt(EPS)
         whole = gap * gap + rho2
