@@ -89,7 +89,7 @@ def test_open_and_inverted_meshes_become_closed_proxies():
     assert signed_volume(proxy) > 0
 
 
-def test_objects_prepared_beside_each_other_are_those_prepared_one_by_one(tmp_path, monkeypatch):
+def test_objects_prepared_beside_each_other_are_those_prepared_one_by_one():
     sphere = trimesh.creation.icosphere(4)
     shapes = []
     for k in range(4):
@@ -100,7 +100,6 @@ def test_objects_prepared_beside_each_other_are_those_prepared_one_by_one(tmp_pa
     config = PrepareConfig(cells=16, faces=400, samples=100)
     made = []
     for count in (4, 1):
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / str(count)))  # nothing is kept
         with use_threads(count):
             made.append(prepare_objects(inputs, config).objects)
     assert torch.equal(made[0].verts, made[1].verts)

@@ -4,7 +4,6 @@ import json
 import logging
 import os
 import shutil
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -119,37 +118,6 @@ def test_a_damaged_stage_is_said_and_computed_anew(
     again = Run(tmp_path)
     assert torch.equal(again.stage(doubled, PLANE, Twice()).points, wanted.points)
     assert [stage.kept for stage in again.stages] == [True]
-
-
-def test_a_stage_that_is_begun_is_computed_once_beside_the_others(tmp_path: Path) -> None:
-    wanted = Run(tmp_path / "plain").stage(doubled, PLANE, Twice())
-    threads: list[int] = []
-
-    def noted(inputs: Plane, config: Twice, observe: Observer = silent) -> Plane:
-        threads.append(threading.get_ident())
-        return doubled(inputs, config, observe)
-
-    run = Run(tmp_path / "beside")
-    for _ in range(2):
-        run.begin(noted, PLANE, Twice())
-    assert torch.equal(run.stage(noted, PLANE, Twice()).points, wanted.points)
-    assert threads != [threading.get_ident()]
-    run.begin(noted, PLANE, Twice())  # it is on disk
-    assert torch.equal(run.stage(noted, PLANE, Twice()).points, wanted.points)
-    assert len(threads) == 1
-    assert [stage.kept for stage in run.stages] == [False, True]
-
-
-def test_what_fails_beside_fails_where_it_is_asked_for(tmp_path: Path) -> None:
-    def failing(inputs: Plane, _: Twice, observe: Observer = silent) -> Plane:
-        observe(Step("failing", 0, 1))
-        raise InputError(f"no plane at {inputs.ground}")
-
-    run = Run(tmp_path)
-    run.begin(failing, PLANE, Twice())
-    with pytest.raises(InputError, match="no plane"):
-        run.stage(failing, PLANE, Twice())
-    assert not run.stages
 
 
 def test_a_damaged_record_is_one_sentence_with_its_file(tmp_path: Path) -> None:

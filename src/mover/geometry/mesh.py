@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mover.core.types import Mesh
-from mover.geometry.nearest import as_float64, as_int64, closest
+from mover.geometry.nearest import as_float64, as_int64, closest, enclosed
 from mover.geometry.thinning import farthest_first, simplifying
 from mover.geometry.topology import edges_of as edges_of
 from mover.geometry.topology import is_closed as is_closed
@@ -166,15 +166,13 @@ def _strays(mesh: Mesh, whole: Mesh, small: Mesh) -> float:
     What was left out of the whole simplification may lie inside the rest only: a hollow whose way
     out became too narrow is no part of the shape, a leg that was turned inside out is.
     """
-    import igl
-
     verts = as_float64(mesh.verts)[:: max(1, len(mesh.verts) // TRIED)]
     squared, _, _ = closest(verts, as_float64(whole.verts), as_int64(whole.faces))
     if small is not whole:
         solid = as_float64(small.verts), as_int64(small.faces)
         kept = closest(verts, *solid)[0]
         far = np.flatnonzero(kept > squared)
-        outside = far[np.asarray(igl.fast_winding_number(*solid, verts[far])) < 0.5]
+        outside = far[~enclosed(verts[far], *solid)]
         squared[outside] = kept[outside]
     low, high = box(mesh.verts)
     return float(squared.max() ** 0.5 / (high - low).max())

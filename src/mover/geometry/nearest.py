@@ -49,35 +49,11 @@ def closest(
     return np.asarray(squared), np.asarray(face), np.asarray(place)
 
 
-SIDE = 0.05  # [m], of the cells whose places may share an answer: fewest are left to ask
-
-
-def enclosed(
-    query: np.ndarray, verts: np.ndarray, faces: np.ndarray, distance: np.ndarray
-) -> np.ndarray:
-    """Whether places are inside a closed surface, by its winding number.
-
-    Only one place of a cell is asked for all that no surface can part from it.
-
-    Args:
-        query: The places [m].
-        verts: Of the surface [m].
-        faces: Wound outwards.
-        distance: Of each place from the surface [m].
-    """
+def enclosed(query: np.ndarray, verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Whether positions are inside a closed surface, wound outwards, by its winding number."""
     import igl
 
-    cells = np.floor(query / SIDE).astype(np.int64)
-    cells -= cells.min(0)
-    key = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(0) + 1))
-    _, first, of = np.unique(key, return_index=True, return_inverse=True)
-    other = first[of]
-    away = np.linalg.norm(query - query[other], axis=1)
-    alone = away >= np.maximum(distance, distance[other])
-    alone[first] = True
-    inside = np.zeros(len(query), dtype=bool)
-    inside[alone] = np.asarray(igl.fast_winding_number(verts, faces, query[alone])) > 0.5
-    return inside[np.where(alone, np.arange(len(query)), other)]
+    return np.asarray(igl.fast_winding_number(verts, faces, query)) > 0.5
 
 
 def as_float64(points: Tensor) -> np.ndarray:

@@ -148,7 +148,7 @@ def signed_distance(
     distance = np.sqrt(closest(query, corners, triangles)[0])
     within = ((query > corners.min(0)) & (query < corners.max(0))).all(-1)
     if within.any():  # outside of the box nothing is inside
-        deep = enclosed(query[within], corners, triangles, distance[within])
+        deep = enclosed(query[within], corners, triangles)
         distance[within] *= np.where(deep, -1, 1)
     return torch.from_numpy(distance).to(points)
 

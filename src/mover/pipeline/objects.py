@@ -1,16 +1,14 @@
 """The steps of the method that place objects: what each stage is given, and what becomes of it."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mover.core.observe import Observer
 from mover.core.records import to_device
-from mover.core.run import Conf, In, Run
+from mover.core.run import Run
 from mover.core.types import Camera, Capture, Layout, Objects
 from mover.energy.config import Adam, SceneConfig, only
 from mover.energy.fused.energy import energy_function
@@ -18,7 +16,6 @@ from mover.energy.objective import HumanCues, ImageCues
 from mover.geometry.camera import to_camera
 from mover.geometry.path import scaled
 from mover.geometry.placement import larger, place, reproject, rest_on_support
-from mover.geometry.warp_start import threads
 from mover.pipeline.people import HIGHEST, Located, lines_of
 from mover.pipeline.presets import Config, with_sizes
 from mover.stages.camera.refine_camera import RefineInputs, refine_camera
@@ -123,12 +120,6 @@ class Humans:
 
     cues: Cues
     contacts: ContactAssignment
-
-
-def start(run: Run, fn: Callable[[In, Conf, Observer], object], inputs: In, config: Conf) -> None:
-    """Start a stage beside the next ones where there is a second thread for it."""
-    if threads() > 1:
-        run.begin(fn, inputs, config)
 
 
 def prepare(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...]) -> Setup:
@@ -265,8 +256,6 @@ def gather_humans(
     """
     bodies, capture, seen = people.in_world(placed.camera), setup.capture, setup.seen
     inputs = GatherInputs(bodies, capture.people, seen.masks, placed.camera, people.path)
-    if before is None:
-        start(setup.run, gather_cues, inputs, setup.config.gather)
     given = None if capture.touch is None else capture.touch[people.kept]
     touching = ContactInputs(bodies, people.parts, placed.ground, given)
     chance = setup.run.stage(find_contacts, touching, setup.config.contacts).probability

@@ -10,10 +10,8 @@ from mover.pipeline import objects as steps
 from mover.pipeline.people import Located, check_floor, estimate_people, through_its_lens
 from mover.pipeline.presets import PRESETS as PRESETS
 from mover.pipeline.presets import Config as Config
-from mover.pipeline.result import check_room, furnished, label_inputs, unfurnished
-from mover.stages.contacts.label_contacts import LabelConfig, label_contacts
+from mover.pipeline.result import check_room, furnished, unfurnished
 from mover.stages.objects.find_image_cues import ground_without_people
-from mover.stages.objects.prepare_objects import PrepareInputs, prepare_objects
 
 
 def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, ...] = ()) -> Room:
@@ -26,8 +24,6 @@ def reconstruct(capture: Capture, config: Config, run: Run, pinned: tuple[str, .
     odd: list[str] = []
     check_plausible(capture, odd.append)
     capture = replace(capture, warnings=tuple(dict.fromkeys((*capture.warnings, *odd))))
-    if capture.scene.objects:
-        steps.start(run, prepare_objects, PrepareInputs(capture.scene.objects), config.prepare)
     given, capture = capture.scene, through_its_lens(capture, config, run, pinned)  # robust
     people = estimate_people(capture, config, run)  # frames, depth, feet: camera and ground
     if not capture.scene.objects:
@@ -67,7 +63,4 @@ def from_image_and_people(
             humans = steps.gather_humans(setup, people, placed, humans)
         setup = steps.with_seats_lifted(setup, people, placed, humans, fit)  # robust
         placed = steps.place_by_all(setup, people, placed, humans, fit)  # Eq. 1
-    room = furnished(setup, placed, people, humans)
-    if capture.furniture is None:  # nothing of it is moved later
-        steps.start(run, label_contacts, label_inputs(room), LabelConfig())
-    return room
+    return furnished(setup, placed, people, humans)

@@ -123,7 +123,7 @@ def _solid(
     if bool(near.any()):
         query = as_float64(points[near])
         squared, face, nearest = closest(query, verts, faces)
-        inside = enclosed(query, verts, faces, np.sqrt(squared))
+        inside = enclosed(query, verts, faces)
         corners = torch.from_numpy(verts[faces[face]])
         across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         gap[near] = torch.from_numpy(np.where(inside, -1, 1) * np.sqrt(squared)).to(gap)

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
-from mover.core.records import fingerprint, record
-from mover.core.run import kept, sources
+from mover.core.records import record
 from mover.core.types import Layout, Mesh, Objects, SceneObject, SeatStretch
 from mover.furniture.library import BACKS, SEATS, canonical
 from mover.geometry.mesh import bottom_center, box, decimate, sample_surface, signed_volume, used
@@ -175,8 +174,7 @@ def _closing(config: PrepareConfig) -> tuple[Callable[[Mesh], Mesh], list[str]]:
     notes: list[str] = []
 
     def wrapped(mesh: Mesh) -> Mesh:
-        key = fingerprint(mesh, config.cells, config.faces, sources())
-        return kept(Mesh, key, lambda: decimate(close_mesh(mesh, config.cells), config.faces))
+        return decimate(close_mesh(mesh, config.cells), config.faces)
 
     if config.watertight == "wrap":
         return wrapped, notes
