@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import group_norm, linear
 
 from mover.core.errors import InputError
 from mover.core.records import BROKEN
@@ -94,31 +95,27 @@ def spirals(
     Where the rings end before that (or would, one ring on), the nearest vertices stand instead.
     """
     around, _ = neighbours(faces, len(verts))
+
+    def ring_outside(last: list[int], row: list[int]) -> list[int]:
+        """Of each vertex of a ring first what follows another of the ring."""
+        inner, taken = set(last), {*last, *row}
+        ring: dict[int, None] = {}
+        for near in (around[vertex] for vertex in last):
+            start = next((k for k, n in enumerate(near) if n in inner), len(near))
+            ring |= dict.fromkeys(n for n in (*near[start:], *near[:start]) if n not in taken)
+        return list(ring)
+
     rows: list[list[int]] = []
     for vertex in range(len(verts)):  # spirals differ in the number of their rings
-        row, ahead = [vertex, *around[vertex]], _next_ring(around, around[vertex], [vertex])
+        row, ahead = [vertex, *around[vertex]], ring_outside(around[vertex], [vertex])
         while ahead and len(row) + len(ahead) < length:
             row = [*row, *ahead]
-            ahead = _next_ring(around, ahead, row)
+            ahead = ring_outside(ahead, row)
         if not ahead:
             distance = np.square(verts - verts[vertex]).sum(-1)
             row = np.argsort(distance, kind="stable").tolist()
         rows.append([*row, *ahead][:length])
     return np.asarray(rows, dtype=np.int64)
-
-
-def _next_ring(around: list[list[int]], last: list[int], row: list[int]) -> list[int]:
-    """The ring outside of `last`: of each vertex first what follows a vertex of `last`."""
-    inner, taken = set(last), {*last, *row}
-    ring: list[int] = []
-    for vertex in last:
-        near = around[vertex]
-        start = next((k for k, n in enumerate(near) if n in inner), len(near))
-        for neighbour in [*near[start:], *near[:start]]:
-            if neighbour not in taken:
-                ring.append(neighbour)
-                taken.add(neighbour)
-    return ring
 
 
 def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -127,17 +124,13 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         InputError: If it is missing or is no such file.
     """
-    verts: list[list[float]] = []
-    faces: list[list[int]] = []
     try:
-        for words in (line.split() for line in path.read_text().splitlines()):
-            if words[:1] == ["v"]:
-                verts.append([float(w) for w in words[1:4]])
-            elif words[:1] == ["f"]:
-                faces.append([int(w.split("/")[0]) - 1 for w in words[1:4]])
+        rows = [line.split() for line in path.read_text().splitlines()]
+        verts = [[float(w) for w in row[1:4]] for row in rows if row[:1] == ["v"]]
+        faces = [[int(w.split("/")[0]) - 1 for w in row[1:4]] for row in rows if row[:1] == ["f"]]
+        return np.asarray(verts).reshape(-1, 3), np.asarray(faces, dtype=np.int64).reshape(-1, 3)
     except BROKEN as error:
         raise InputError(f"{path}: cannot be read as a mesh ({error})") from error
-    return np.asarray(verts).reshape(-1, 3), np.asarray(faces, dtype=np.int64).reshape(-1, 3)
 
 
 def _sparse(path: Path, shape: tuple[int, int]) -> Tensor:
@@ -176,9 +169,13 @@ def load_posa(weights: Path, meshes: Path) -> Posa:
     Raises:
         InputError: If a file is missing, or is not what the published network needs.
     """
-    state = _state(weights)
-    last = state.get(f"{DECODER}.5.layer.weight")
-    channels = 0 if last is None else len(last)
+    try:
+        tree: Any = torch.load(weights, map_location="cpu", weights_only=True)
+    except Exception as error:  # a broken file may raise anything
+        raise InputError(f"{weights.name}: no checkpoint can be read from it ({error})") from error
+    tree = tree.get("model_state_dict", tree) if isinstance(tree, dict) else {}
+    state = {k: v for k, v in tree.items() if isinstance(v, Tensor)}
+    channels = len(state.get(f"{DECODER}.5.layer.weight", ()))
     if channels not in COUNTS:
         raise InputError(f"{weights.name}: no POSA network in it, expected '{DECODER}.5.layer'")
     decoder = {k: v.float() for k, v in state.items() if k.startswith("decoder.")}
@@ -198,17 +195,8 @@ def load_posa(weights: Path, meshes: Path) -> Posa:
         log.warning("%s: mesh_2.obj is not the official one: are the contacts right?", meshes)
     maps = {"D_1": (middle, full), "D_2": (coarse, middle), "U_2": (middle, coarse),
             "U_1": (full, middle)}  # fmt: skip
-    found = [_sparse(meshes / f"{name}.npz", shape) for name, shape in maps.items()]
-    return Posa(decoder, torch.from_numpy(index), tuple(found[:2]), tuple(found[2:]), channels)
-
-
-def _state(path: Path) -> dict[str, Tensor]:
-    try:
-        loaded: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a broken file may raise anything
-        raise InputError(f"{path.name}: no checkpoint can be read from it ({error})") from error
-    state = loaded.get("model_state_dict", loaded) if isinstance(loaded, dict) else {}
-    return {k: v for k, v in state.items() if isinstance(v, Tensor)}
+    d1, d2, u2, u1 = (_sparse(meshes / f"{name}.npz", shape) for name, shape in maps.items())
+    return Posa(decoder, torch.from_numpy(index), (d1, d2), (u2, u1), channels)
 
 
 def posa_contacts(
@@ -228,21 +216,21 @@ def posa_contacts(
     """
     if bodies.space != "world":
         raise ValueError(f"posa_contacts: bodies are in space '{bodies.space}', expected 'world'")
-    full = posa.down[0].shape[1]
-    if bodies.verts.shape[1] != full:
-        raise InputError(f"bodies: {bodies.verts.shape[1]} vertices, POSA expects {full} (SMPL-X)")
+    if bodies.verts.shape[1] != LEVELS[0]:
+        found = bodies.verts.shape[1]
+        raise InputError(f"bodies: {found} vertices, POSA expects {LEVELS[0]} (SMPL-X)")
     if bodies.pose is None or bodies.joints is None:
         raise InputError("bodies: POSA needs SMPL-X parameters and joints, found meshes only")
     noise = np.random.default_rng(seed).standard_normal((max(samples, 1), CODE))
     codes = torch.from_numpy(noise).float() * float(samples > 0)
     still = canonical(bodies.verts, bodies.joints[:, 0], axis_angle(bodies.pose.global_orient))
-    found: list[Tensor] = []
+    chances: list[Tensor] = []
     for part in still.float().split(CHUNK):
         coarse = _through(posa.down, part)
         with torch.no_grad():
             chance = torch.stack([decode(posa, coarse, z)[..., :1] for z in codes]).mean(0)
-        found.append(_through(posa.up, chance)[..., 0].clamp(0, 1))
-    return torch.cat(found)
+        chances.append(_through(posa.up, chance)[..., 0].clamp(0, 1))
+    return torch.cat(chances)
 
 
 def canonical(
@@ -264,21 +252,17 @@ def decode(
     posa: Posa, coarse: Float[Tensor, "bodies coarse 3"], code: Float[Tensor, " code"]
 ) -> Float[Tensor, "bodies coarse channels"]:
     """Contact (a chance) and, if the network has them, scores of the kinds of objects."""
+
+    def of(name: str) -> tuple[Tensor, Tensor]:
+        return posa.weights[f"{DECODER}.{name}.weight"], posa.weights[f"{DECODER}.{name}.bias"]
+
     x = torch.cat([coarse, code.expand(*coarse.shape[:2], -1)], -1)
     for layer in range(5):
-        name = f"{DECODER}.{layer}"
         x = x[:, posa.spirals].flatten(2) if layer > 1 else x
-        x = _linear(posa, f"{name}.conv.layer", x)
-        scale, shift = (posa.weights[f"{name}.norm.{k}"] for k in ("weight", "bias"))
-        x = torch.nn.functional.group_norm(x.mT, GROUPS, scale, shift).mT.relu()
-    x = _linear(posa, f"{DECODER}.5.layer", x[:, posa.spirals].flatten(2))
+        x = linear(x, *of(f"{layer}.conv.layer"))
+        x = group_norm(x.mT, GROUPS, *of(f"{layer}.norm")).mT.relu()
+    x = linear(x[:, posa.spirals].flatten(2), *of("5.layer"))
     return torch.cat([x[..., :1].sigmoid(), x[..., 1:]], -1)
-
-
-def _linear(posa: Posa, name: str, x: Float[Tensor, "b v c"]) -> Float[Tensor, "b v d"]:
-    return torch.nn.functional.linear(
-        x, posa.weights[f"{name}.weight"], posa.weights[f"{name}.bias"]
-    )
 
 
 def _through(maps: tuple[Tensor, ...], x: Float[Tensor, "b v c"]) -> Float[Tensor, "b w c"]:

@@ -7,6 +7,7 @@ scale and shift from the shape's code. The surface is found by multiresolution e
 marching cubes.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,112 +16,71 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
+from torch.nn.functional import interpolate, max_pool3d, pad
 
 from mover.core.errors import InputError
 from mover.core.settings import float_in, int_in
 from mover.core.types import Mesh
 from mover.geometry.mesh import box, fit_box, sample_surface, used
+from mover.geometry.topology import level_set
 
 BLOCKS = 5
 PADDING = 1.1  # side of the box around the unit cube, as MOVER runs it; so is the next
 POINTS = 2048  # of the cloud that is encoded
 OUTSIDE = -1e6  # logit beyond the box, so that every surface closes
 AT_ONCE = 100_000  # points that the network sees
+EPS = 1e-5  # of batch norms
+IGNORED = re.compile(r"^encoder_latent\.|\.num_batches_tracked$")
+KEYS = re.compile(
+    r"(encoder\.(fc_pos|fc_c|block_[0-4]\.fc_[01])|decoder\.(fc_p|fc_z|fc_out|block[0-4]\.fc_[01])|"
+    r"decoder\.(block[0-4]\.bn_[01]|bn)\.conv_(gamma|beta))\.(weight|bias)|"
+    r"encoder\.block_[0-4]\.shortcut\.weight|"
+    r"decoder\.(block[0-4]\.bn_[01]|bn)\.bn\.running_(mean|var)"
+)
 Inside = Callable[[Float[Tensor, "points 3"]], Float[Tensor, " points"]]
 
 
-class _Residual(nn.Module):
-    """Two linear layers beside a shortcut."""
+@dataclass(frozen=True)
+class OccupancyNetwork:
+    """Encoder and decoder, by the parameters of a checkpoint."""
 
-    def __init__(self, size_in: int, size_out: int) -> None:
-        super().__init__()
-        inner = min(size_in, size_out)
-        self.fc_0, self.fc_1 = nn.Linear(size_in, inner), nn.Linear(inner, size_out)
-        self.shortcut = nn.Linear(size_in, size_out, bias=False)
+    weights: dict[str, Tensor]
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.shortcut(x) + self.fc_1(self.fc_0(x.relu()).relu())
-
-
-class _Encoder(nn.Module):
-    """Code of a point cloud; each block sees its own point and the largest value of all."""
-
-    def __init__(self, hidden: int, code: int) -> None:
-        super().__init__()
-        self.fc_pos, self.fc_c = nn.Linear(3, 2 * hidden), nn.Linear(hidden, code)
+    def encode(self, cloud: Float[Tensor, "shapes points 3"]) -> Float[Tensor, "shapes code"]:
+        """Code of a point cloud; each block sees its own point and the largest value of all."""
+        x = self._linear("encoder.fc_pos", cloud)
         for k in range(BLOCKS):
-            self.add_module(f"block_{k}", _Residual(2 * hidden, hidden))
+            if k:
+                x = torch.cat([x, x.amax(1, keepdim=True).expand_as(x)], -1)
+            name = f"encoder.block_{k}"
+            inner = self._linear(f"{name}.fc_0", x.relu()).relu()
+            shortcut = x @ self.weights[f"{name}.shortcut.weight"].mT
+            x = shortcut + self._linear(f"{name}.fc_1", inner)
+        return self._linear("encoder.fc_c", x.amax(1).relu())
 
-    def forward(self, points: Float[Tensor, "shapes points 3"]) -> Float[Tensor, "shapes code"]:
-        x = self.get_submodule("block_0")(self.fc_pos(points))
-        for k in range(1, BLOCKS):
-            pooled = x.amax(1, keepdim=True).expand_as(x)
-            x = self.get_submodule(f"block_{k}")(torch.cat([x, pooled], -1))
-        return self.fc_c(x.amax(1).relu())
-
-
-class _Norm(nn.Module):
-    """Batch norm whose scale and shift are linear in the code."""
-
-    def __init__(self, code: int, size: int) -> None:
-        super().__init__()
-        self.conv_gamma, self.conv_beta = nn.Conv1d(code, size, 1), nn.Conv1d(code, size, 1)
-        self.bn = nn.BatchNorm1d(size, affine=False)
-
-    def forward(self, x: Tensor, code: Tensor) -> Tensor:
-        return self.conv_gamma(code) * self.bn(x) + self.conv_beta(code)
-
-
-class _Block(nn.Module):
-    """Two layers, each after a conditional norm, added to what came in."""
-
-    def __init__(self, code: int, size: int) -> None:
-        super().__init__()
-        self.bn_0, self.bn_1 = _Norm(code, size), _Norm(code, size)
-        self.fc_0, self.fc_1 = nn.Conv1d(size, size, 1), nn.Conv1d(size, size, 1)
-
-    def forward(self, x: Tensor, code: Tensor) -> Tensor:
-        inner = self.fc_0(self.bn_0(x, code).relu())
-        return x + self.fc_1(self.bn_1(inner, code).relu())
-
-
-class _Decoder(nn.Module):
-    """Is a point inside the shape of a code? A latent code, where there is one, is at its mean."""
-
-    def __init__(self, code: int, hidden: int, latent: int) -> None:
-        super().__init__()
-        if latent:
-            self.fc_z = nn.Linear(latent, hidden)
-        self.latent = latent
-        self.fc_p, self.fc_out = nn.Conv1d(3, hidden, 1), nn.Conv1d(hidden, 1, 1)
-        for k in range(BLOCKS):
-            self.add_module(f"block{k}", _Block(code, hidden))
-        self.bn = _Norm(code, hidden)
-
-    def forward(
+    def decode(
         self, points: Float[Tensor, "shapes points 3"], code: Float[Tensor, "shapes code"]
     ) -> Float[Tensor, "shapes points"]:
-        x, column = self.fc_p(points.mT), code[..., None]
-        if self.latent:
-            x = x + self.fc_z(x.new_zeros(len(x), self.latent))[..., None]
+        """Logits of points being inside the shapes; a latent code, if any, is at its mean."""
+        x, code = self._linear("decoder.fc_p", points), code[:, None]
+        if "decoder.fc_z.bias" in self.weights:
+            x = x + self.weights["decoder.fc_z.bias"]
         for k in range(BLOCKS):
-            x = self.get_submodule(f"block{k}")(x, column)
-        return self.fc_out(self.bn(x, column).relu())[:, 0]
+            name = f"decoder.block{k}"
+            inner = self._linear(f"{name}.fc_0", self._norm(f"{name}.bn_0", x, code).relu())
+            x = x + self._linear(f"{name}.fc_1", self._norm(f"{name}.bn_1", inner, code).relu())
+        return self._linear("decoder.fc_out", self._norm("decoder.bn", x, code).relu())[..., 0]
 
+    def _linear(self, name: str, x: Tensor) -> Tensor:
+        weight, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
+        return torch.nn.functional.linear(x, weight.flatten(1), bias)
 
-class OccupancyNetwork(nn.Module):
-    """Encoder and decoder."""
-
-    def __init__(self, code: int, encoder: int, decoder: int, latent: int = 0) -> None:
-        super().__init__()
-        self.encoder, self.decoder = _Encoder(encoder, code), _Decoder(code, decoder, latent)
-
-    def forward(
-        self, cloud: Float[Tensor, "shapes cloud 3"], points: Float[Tensor, "shapes points 3"]
-    ) -> Float[Tensor, "shapes points"]:
-        """Logits of points being inside the shape of a point cloud."""
-        return self.decoder(points, self.encoder(cloud))
+    def _norm(self, name: str, x: Tensor, code: Tensor) -> Tensor:
+        """Batch norm whose scale and shift are linear in the code."""
+        mean, var = (self.weights[f"{name}.bn.running_{part}"] for part in ("mean", "var"))
+        scale, shift = (self._linear(f"{name}.conv_{part}", code) for part in ("gamma", "beta"))
+        return scale * (x - mean) / (var + EPS).sqrt() + shift
 
 
 def load_occupancy(path: Path) -> OccupancyNetwork:
@@ -159,15 +119,14 @@ def network_of(state: dict[str, Tensor]) -> OccupancyNetwork:
     Raises:
         KeyError, ValueError, RuntimeError, IndexError: If it is another network's.
     """
-    state = {key.removeprefix("module."): value for key, value in state.items()}
-    code, encoder = state["encoder.fc_c.weight"].shape
-    decoder = state["decoder.fc_p.weight"].shape[0]
-    latent = state["decoder.fc_z.weight"].shape[1] if "decoder.fc_z.weight" in state else 0
-    network = OccupancyNetwork(code, encoder, decoder, latent)
-    kept = {k: v for k, v in state.items() if not k.startswith("encoder_latent.")}
-    counts = {k: v for k, v in network.state_dict().items() if k.endswith("num_batches_tracked")}
-    network.load_state_dict({**counts, **kept})  # checkpoints of old torch do not count batches
-    return network.eval()
+    state = {key.removeprefix("module."): value.float() for key, value in state.items()}
+    state = {key: value for key, value in state.items() if not IGNORED.search(key)}
+    unknown = [key for key in state if not KEYS.fullmatch(key)]
+    if unknown:
+        raise ValueError(f"unknown parameter {unknown[0]}")
+    network = OccupancyNetwork(state)
+    network.decode(torch.zeros(1, 1, 3), network.encode(torch.zeros(1, 2, 3)))  # else it raises
+    return network
 
 
 @dataclass(frozen=True)
@@ -188,21 +147,14 @@ def extract(inside: Inside, config: ExtractConfig) -> Mesh:
     Raises:
         ValueError: If nothing is inside.
     """
-    import igl
-
     limit = float(np.log(config.threshold) - np.log1p(-config.threshold))
     field = refined(lambda p: inside(p) - limit, config)
     if not bool((field > 0).any()):
         raise ValueError("extract: nothing is inside")
-    padded = torch.nn.functional.pad(field, (1,) * 6, value=OUTSIDE).double().numpy()
-    n = padded.shape[0]
-    axis = np.arange(n, dtype=np.float64)
-    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")  # x runs fastest, as igl has it
-    grid = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
-    values = np.maximum(padded, -20.0).transpose(2, 1, 0).ravel()
-    points, faces, _ = igl.marching_cubes(-values, grid, n, n, n, isovalue=0.0)
-    verts = (torch.from_numpy(np.asarray(points)) - 1) * (PADDING / (n - 3)) - PADDING / 2
-    return Mesh(verts.float(), torch.from_numpy(np.asarray(faces, dtype=np.int64)))
+    padded = pad(field, (1,) * 6, value=OUTSIDE).double().numpy()
+    cell = PADDING / (len(padded) - 3)
+    verts, faces = level_set(-np.maximum(padded, -20.0), [-PADDING / 2 - cell] * 3, cell, 0.0)
+    return Mesh(torch.from_numpy(verts).float(), torch.from_numpy(faces))
 
 
 def refined(field: Inside, config: ExtractConfig) -> Float[Tensor, "n n n"]:
@@ -220,7 +172,7 @@ def refined(field: Inside, config: ExtractConfig) -> Float[Tensor, "n n n"]:
         for dim in range(3):
             split = split.repeat_interleave(2, dim)
         cells *= 2
-        values = torch.nn.functional.interpolate(
+        values = interpolate(
             values[None, None], size=(cells + 1,) * 3, mode="trilinear", align_corners=True
         )[0, 0]
         known = torch.zeros_like(values, dtype=torch.bool)
@@ -244,15 +196,13 @@ def _evaluated(
 def _mixed(values: Float[Tensor, "n n n"]) -> Bool[Tensor, "m m m"]:
     """Cells whose corners differ in sign."""
     inside = (values > 0)[None, None].float()
-    most = torch.nn.functional.max_pool3d(inside, 2, stride=1)
-    least = -torch.nn.functional.max_pool3d(-inside, 2, stride=1)
+    most, least = (sign * max_pool3d(sign * inside, 2, stride=1) for sign in (1, -1))
     return (most != least)[0, 0]
 
 
 def _corners(cells: Bool[Tensor, "m m m"]) -> Bool[Tensor, "n n n"]:
     """Grid points that are corners of the cells."""
-    padded = torch.nn.functional.pad(cells[None, None].float(), (1,) * 6)
-    return torch.nn.functional.max_pool3d(padded, 2, stride=1)[0, 0] > 0
+    return max_pool3d(pad(cells[None, None].float(), (1,) * 6), 2, stride=1)[0, 0] > 0
 
 
 def occupied_mesh(
@@ -272,7 +222,7 @@ def occupied_mesh(
     points, _ = sample_surface(source, POINTS)
     cloud = ((points - middle) / longest).float().flip(-1)
     with torch.no_grad():
-        code = network.encoder(cloud[None])
-        found = extract(lambda p: network.decoder(p[None], code)[0], config or ExtractConfig())
+        code = network.encode(cloud[None])
+        found = extract(lambda p: network.decode(p[None], code)[0], config or ExtractConfig())
     verts, faces = found.verts.flip(-1), found.faces.flip(-1)  # the change of axes is a mirror
     return fit_box(Mesh(verts.to(mesh.verts), faces), low, high)

@@ -1,5 +1,6 @@
 """Closed parts of a mesh as one solid, without resampling."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,20 @@ def volumes(verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     part_of = np.asarray(igl.facet_components(faces)[1])
     a, b, c = np.moveaxis(verts[faces] - verts.mean(0), 1, 0)
     return part_of, np.bincount(part_of, (np.cross(a, b) * c).sum(-1) / 6)
+
+
+def level_set(
+    values: np.ndarray, start: Sequence[float] | np.ndarray, cell: float, level: float
+) -> Triangles:
+    """Where values on a grid (x, y, z) from `start` on [m] have a level, by marching cubes."""
+    import igl
+
+    axes = [s + cell * np.arange(n) for s, n in zip(start, values.shape, strict=True)]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")  # x runs fastest in libigl
+    places = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
+    flat = np.ascontiguousarray(values.transpose(2, 1, 0).ravel())
+    verts, faces, _ = igl.marching_cubes(flat, places, *values.shape, isovalue=level)
+    return np.asarray(verts), np.asarray(faces, dtype=np.int64)
 
 
 def _closed_part(verts: np.ndarray, faces: np.ndarray, largest: float) -> list[Triangles] | None:

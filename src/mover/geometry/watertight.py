@@ -20,6 +20,7 @@ from mover.geometry.topology import (
     areas,
     is_closed,
     labels,
+    level_set,
     manifold,
     solid,
     volumes,
@@ -39,19 +40,12 @@ SPECK = 1e-3  # of the largest component's volume: what is smaller is no part of
 
 def wrap(verts: np.ndarray, faces: np.ndarray, cells: int) -> Triangles:
     """A closed, outward-wound surface around the triangles; `cells` along the longest side."""
-    import igl
-
     low, high = verts[faces].min((0, 1)), verts[faces].max((0, 1))
     cell = float((high - low).max()) / cells
     counts = np.ceil((high - low) / cell).astype(np.int64) + 1 + 2 * MARGIN
     start = (low + high) / 2 - cell * (counts - 1) / 2
     field = _field(verts, faces, start, cell, counts)
-    axes = [start[k] + cell * np.arange(counts[k]) for k in range(3)]
-    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
-    places = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
-    level = np.ascontiguousarray(field.transpose(2, 1, 0).ravel())
-    points, shell, _ = igl.marching_cubes(level, places, *counts.tolist(), isovalue=WALL * cell)
-    points, shell = _bodies(np.asarray(points), np.asarray(shell))
+    points, shell = _bodies(*level_set(field, start, cell, WALL * cell))
     squared, _, onto = closest(points, verts, faces)  # which lay a wall's thickness away
     distance, wall = np.sqrt(squared)[:, None], WALL * cell
     pull = np.clip((REACH * wall - distance) / ((REACH - 1) * wall), 0, 1)
