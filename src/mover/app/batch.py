@@ -1,7 +1,7 @@
 """Many captures, each in a process of its own, none of them run twice.
 
-A capture is finished when its products and `batch.json` with its fingerprint stand in its folder;
-it has failed when its failure record holds that fingerprint. A batch that was killed goes on there.
+How a capture ended stands in `batch.json` in the folder of its result, with the fingerprint of what
+it was run on. A batch that was killed goes on there.
 """
 
 import csv
@@ -13,8 +13,9 @@ import signal
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -25,13 +26,12 @@ from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.settings import float_in
 
-PRODUCTS, MARK, LOG = ("scene.json", "run.json"), "batch.json", "log.txt"  # of each capture
-FAILURES, SUMMARY, CONFIG = "failures", "summary.csv", "config.json"  # of the batch
+PRODUCTS, RECORD, LOG = ("scene.json", "run.json"), "batch.json", "log.txt"  # of each capture
+SUMMARY, CONFIG = "summary.csv", "config.json"  # of the batch
 COLUMNS: tuple[str, ...] = (
     "name", "state", "seconds", "peak_memory_mb", "warnings", "reason", "capture", "out",
 )  # fmt: skip
 INTERRUPTED = (-signal.SIGINT, 130)  # exit codes after Ctrl-C: the job is still to be done
-LINES = 20  # last lines of the log that a failure record keeps
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -63,11 +63,6 @@ class BatchJob:
     """Most seconds; 0: no limit."""
     threads: int = 1
     """Threads of the numerical libraries."""
-
-    @property
-    def record(self) -> Path:
-        """File that says why it failed."""
-        return Path(self.out).parent / FAILURES / f"{self.name}.json"
 
 
 @dataclass(frozen=True)
@@ -109,7 +104,7 @@ def captures_in(listing: Path, out: Path | None = None) -> tuple[Path, ...]:
 
 def names_of(captures: Sequence[Path]) -> list[str]:
     """A folder name for each capture: its own, with a mark of its path where two share one."""
-    taken = Counter([FAILURES, SUMMARY, CONFIG, *(path.name.casefold() for path in captures)])
+    taken = Counter([SUMMARY, CONFIG, *(path.name.casefold() for path in captures)])
     marks = [hashlib.sha256(str(path).encode()).hexdigest()[:8] for path in captures]
     return [
         path.name if taken[path.name.casefold()] == 1 else f"{path.name}-{mark}"
@@ -130,14 +125,14 @@ def fingerprint(settings: str, capture: Path) -> str:
 
 def earlier(job: BatchJob, retry: bool = False) -> Outcome | None:
     """How the job ended before; None: it is to be done, as are failed ones with `retry`."""
-    mark, failure = read_tree(Path(job.out) / MARK), read_tree(job.record)
-    whole = all((Path(job.out) / name).is_file() for name in PRODUCTS)
-    if whole and mark.get("fingerprint") == job.fingerprint:
-        return Outcome(job.name, "kept", float(mark.get("seconds", 0.0)))
-    if not retry and failure.get("fingerprint") == job.fingerprint:
-        seconds = float(failure.get("seconds", 0.0))
-        return Outcome(job.name, "failed", seconds, str(failure.get("reason", "")))
-    return None
+    found, out = read_tree(Path(job.out) / RECORD), Path(job.out)
+    if found.get("fingerprint") != job.fingerprint:
+        return None
+    seconds, reason = float(found.get("seconds", 0.0)), str(found.get("reason", ""))
+    if reason:
+        return None if retry else Outcome(job.name, "failed", seconds, reason)
+    whole = all((out / name).is_file() for name in PRODUCTS)
+    return Outcome(job.name, "kept", seconds) if whole else None
 
 
 def run_job(job: BatchJob) -> Outcome:
@@ -156,8 +151,7 @@ def run_job(job: BatchJob) -> Outcome:
 
 
 def _run(job: BatchJob, out: Path, lock: int) -> Outcome:
-    for stale in (out / MARK, job.record):
-        stale.unlink(missing_ok=True)
+    (out / RECORD).unlink(missing_ok=True)
     environment = {**dict.fromkeys(THREADS, str(job.threads)), **os.environ}
     start = time.monotonic()
     try:
@@ -167,37 +161,36 @@ def _run(job: BatchJob, out: Path, lock: int) -> Outcome:
                 timeout=job.limit or None, pass_fds=(lock,), check=False,
             ).returncode  # fmt: skip
     except OSError as error:
-        return _failed(job, "no start", f"could not be started: {error}")
+        return ended(job, 0.0, f"could not be started: {error}")
     except subprocess.TimeoutExpired:
-        return _failed(job, "time limit", f"ran longer than its limit of {job.limit:g} s")
-    seconds = time.monotonic() - start
+        return ended(job, job.limit, f"ran longer than its limit of {job.limit:g} s")
     if code in INTERRUPTED:
         return Outcome(job.name, "stopped")
+    seconds, why = time.monotonic() - start, f"exit code {code}"
     missing = [name for name in PRODUCTS if not (out / name).is_file()]
     if code == 0 and not missing:
-        write_tree(out / MARK, {"fingerprint": job.fingerprint, "seconds": seconds})
-        return Outcome(job.name, "done", seconds)
-    kind, why = "no result", f"ended well without {' and '.join(missing)}"
-    if code < 0:
-        names = {one.value: one.name for one in signal.Signals}
-        kind, why = "signal", f"ended by {names.get(-code, f'signal {-code}')}"
-    elif code > 0:
-        kind, why = "input" if code == 2 else "exit", f"exit code {code}"
-    last = (last_lines(out / LOG) or ["it said nothing"])[-1]
-    return _failed(job, kind, f"{why}: {last}", seconds)
+        return ended(job, seconds)
+    if code == 0:
+        why = f"ended well without {' and '.join(missing)}"
+    elif code < 0:
+        why = f"ended by signal {-code} ({signal.strsignal(-code)})"
+    lines = (out / LOG).read_text(errors="replace").splitlines()
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
+    return ended(job, seconds, f"{why}: {last}")
 
 
-def _failed(job: BatchJob, kind: str, reason: str, seconds: float = 0.0) -> Outcome:
-    """Write down how a job failed: what it was, why, and its last lines."""
-    ended = {"kind": kind, "reason": reason, "seconds": round(seconds, 3)}
-    write_tree(job.record, {**asdict(job), **ended, "last_lines": last_lines(Path(job.out) / LOG)})
-    return Outcome(job.name, "failed", seconds, reason)
+def ended(job: BatchJob, seconds: float, reason: str = "") -> Outcome:
+    """Record that a job is done, or why it failed."""
+    tree = {**asdict(job), "seconds": round(seconds, 3), "reason": reason}
+    with suppress(OSError), replacing(Path(job.out) / RECORD) as part:
+        part.write_text(json.dumps(tree, indent=1))
+    return Outcome(job.name, "failed" if reason else "done", seconds, reason)
 
 
 def lost(job: BatchJob, error: Exception) -> Outcome:
     """Record a job whose worker vanished, so that it could not do so itself."""
     text = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-    return earlier(job) or _failed(job, "worker", f"its worker was lost: {text}")
+    return earlier(job) or ended(job, 0.0, f"its worker was lost: {text}")
 
 
 def read_tree(path: Path) -> dict[str, Any]:
@@ -207,18 +200,6 @@ def read_tree(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def write_tree(path: Path, tree: Mapping[str, Any]) -> None:
-    """Write a JSON object in one step."""
-    with replacing(path) as part:
-        part.write_text(json.dumps(tree, indent=1, allow_nan=False))
-
-
-def last_lines(log: Path) -> list[str]:
-    """What a job said last; empty where it said nothing."""
-    text = log.read_text(errors="replace")[-16_384:] if log.is_file() else ""
-    return [line.rstrip() for line in text.splitlines() if line.strip()][-LINES:]
 
 
 def on_this_machine(jobs: Sequence[BatchJob], workers: int) -> Iterator[Outcome]:

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from mover.app.batch import CONFIG, FAILURES, SUMMARY, BatchJob, RayOptions
+from mover.app.batch import CONFIG, SUMMARY, BatchJob, RayOptions
 from mover.app.cli import say
 from mover.app.cli.config import RUN_SETTINGS, Device, chosen_config, parsed_with
 from mover.core.settings import Seconds, int_in
 from mover.io.formats import chosen
-from mover.pipeline.presets import Config
+from mover.pipeline.presets import PRESETS, Config
 
 if TYPE_CHECKING:
     from mover.app.results import Origin
@@ -49,7 +49,7 @@ class RunArgs:
 
 def parse_run(arguments: Sequence[str]) -> tuple[RunArgs, Config]:
     """What `mover run` is asked for, and the settings."""
-    config = chosen_config(arguments)
+    config = chosen_config(arguments, PRESETS)
     return parsed_with(RunArgs, config, RUN_SETTINGS, "mover run", arguments)
 
 
@@ -109,7 +109,7 @@ class BatchArgs:
     source: Annotated[Positional[Path], arg(metavar="LIST")]
     """A text file with one capture a line, or a folder of captures."""
     out: Path = Path("batch")
-    """Folder of all results, the failures and summary.csv."""
+    """Folder of all results and summary.csv, which has the reasons of failures."""
     engine: Literal["local", "ray"] = "local"
     """Where captures run: on this machine, or on a Ray cluster."""
     workers: Annotated[int, int_in(0, 10_000)] = 0
@@ -133,7 +133,7 @@ class BatchArgs:
 
 def batch(arguments: Sequence[str]) -> None:
     """`mover batch`; the exit code is 1 if a capture failed."""
-    config = chosen_config(arguments)
+    config = chosen_config(arguments, PRESETS)
     args, config = parsed_with(BatchArgs, config, RUN_SETTINGS, "mover batch", arguments)
     from mover.app.batch import captures_in, run_batch
 
@@ -146,7 +146,7 @@ def batch(arguments: Sequence[str]) -> None:
     done = states["done"] + states["kept"]
     say(f"{done} done{before}, {states['failed']} failed: {args.out / SUMMARY}")
     if states["failed"]:
-        say(f"records of what failed: {args.out / FAILURES}; --retry runs them again")
+        say("the summary has the reasons; --retry runs those again that failed")
         raise SystemExit(1)
 
 
