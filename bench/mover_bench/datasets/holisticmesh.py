@@ -16,10 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mover.core.errors import InputError
-from mover.furniture.library import BACKS, BEDS, canonical
 from mover.geometry.rotations import affine
 from mover.io.capture.parts import Hints, Parts
 from mover.io.files.fields import At, choice, get, items, maybe, read_json, refuse, vector
@@ -71,7 +69,7 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
         own = verts[i * size : (i + 1) * size]
         file = hints.work / f"holisticmesh_{i}.glb"
         write_mesh(mesh_of(own, faces[owner[:, 0] == i] - i * size, at), file)
-        copy = partial(without_axes, file, affine(R.T), category)
+        copy = partial(without_axes, file, affine(R.T))
         found.add(category, f"{category}_{i}", lambda key, c=copy: c(hints.work / f"{key}.glb"))
         found.rows[-1]["annotation"] = i
         box = get(row, "bbox")  # of the mirrored picture, with a score where it has five numbers
@@ -88,57 +86,30 @@ def holisticmesh_parts(folder: Path, hints: Hints) -> Parts:
     )
 
 
-# Where the front of a mesh is that has no axes of its own.
-
-
 TURNS = 90  # angles that are tried for the box around a footprint, over a quarter turn
-UPPER = 0.75  # [share of the height], above it a seat has only its back
-CLEAR = 0.05  # [share of the size], a back that is so far off the middle is one
 
 
-def guess_front(verts: NDArray[np.float64], category: str) -> float:
-    """The yaw of a box around the points whose +z is most likely the front [rad].
-
-    The box is the one with the smallest footprint. What has a back (chairs, sofas, beds with a
-    headboard) turns it away from where its highest points are; all else faces the camera, as
-    things along walls do.
-
-    Args:
-        verts: Points in the world: +y up, the camera at the origin.
-        category: Free text.
-    """
-    flat = verts[:, [0, 2]]
-    angles = np.arange(TURNS) * (math.pi / 2 / TURNS)
-    x = flat @ np.stack([np.cos(angles), -np.sin(angles)])
-    z = flat @ np.stack([np.sin(angles), np.cos(angles)])
-    areas = np.ptp(x, axis=0) * np.ptp(z, axis=0)
-    best = float(angles[int(areas.argmin())])
-    centre = (flat.max(0) + flat.min(0)) / 2
-    wanted = -centre  # towards the camera
-    if canonical(category) in BACKS | BEDS:
-        low, high = verts[:, 1].min(), verts[:, 1].max()
-        top = flat[verts[:, 1] >= low + UPPER * (high - low)]
-        off = (top.max(0) + top.min(0)) / 2 - centre
-        if np.linalg.norm(off) > CLEAR * np.ptp(flat, axis=0).max():
-            wanted = -off
-    quarters = best + np.arange(4) * math.pi / 2
-    towards = np.sin(quarters) * wanted[0] + np.cos(quarters) * wanted[1]
-    yaw = float(quarters[int(towards.argmax())])
-    return math.atan2(math.sin(yaw), math.cos(yaw))
-
-
-def without_axes(path: Path, world: Matrix, category: str, file: Path) -> Placed:
+def without_axes(path: Path, world: Matrix, file: Path) -> Placed:
     """The object of a mesh that lies where it is, and a copy about the middle of its bottom.
+
+    Its box is the upright one with the smallest footprint; its front is the side that faces the
+    camera, as that of furniture along walls.
 
     Args:
         path: The mesh.
         world: Our world (+y up, the camera at the origin) from its vertices (4, 4).
-        category: Free text.
         file: Where the copy goes.
     """
     mesh, _ = read_mesh(At(path.name, path.name), path.parent)
     verts = mesh.verts.double().numpy() @ world[:3, :3].T + world[:3, 3]
-    yaw = guess_front(verts, category)
+    flat, angles = verts[:, [0, 2]], np.arange(TURNS) * (math.pi / 2 / TURNS)
+    x = flat @ np.stack([np.cos(angles), -np.sin(angles)])
+    z = flat @ np.stack([np.sin(angles), np.cos(angles)])
+    areas = np.ptp(x, axis=0) * np.ptp(z, axis=0)
+    quarters = angles[int(areas.argmin())] + np.arange(4) * math.pi / 2
+    middle = (flat.max(0) + flat.min(0)) / 2
+    away = np.sin(quarters) * middle[0] + np.cos(quarters) * middle[1]
+    yaw = math.remainder(float(quarters[int(away.argmin())]), 2 * math.pi)
     local = verts @ about_y(yaw)  # rows: R_y(-yaw) v
     low, high = local.min(0), local.max(0)
     origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])

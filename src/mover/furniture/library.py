@@ -197,14 +197,8 @@ BACKS = frozenset({"chair", "armchair", "office chair", "sofa"})
 TOPS = frozenset({"table", "desk", "coffee table", "cabinet", "nightstand", "shelf", "bed"})
 """Classes whose top carries a hand."""
 
-BEDS = frozenset({"bed", "sofa"})
-"""Classes that one may lie on."""
-
 WALL_PIECES = frozenset({"sofa", "bed", "desk", "shelf", "cabinet", "wardrobe", "nightstand"})
 """Classes that usually stand with their back to a wall."""
-
-FRONTLESS = frozenset({"table", "coffee table", "stool", "bench", "floor lamp"})
-"""Classes of which no side is the front, so that only their shapes distinguish turns."""
 
 
 @cache
