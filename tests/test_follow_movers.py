@@ -12,10 +12,10 @@ from mover.bodies.parts import BodyParts
 from mover.bodies.skin import LANDMARKS
 from mover.core.types import Bodies, Scene, SceneObject, Segment
 from mover.evaluate.contact import StandingMesh, nearness
-from mover.extensions.moved_furniture.measure import measure_moves
 from mover.extensions.moved_furniture.movers import Between, Followed, follow_mover
 from mover.geometry.placement import changes, mover_at, placed_at, standing_meshes
 from mover.geometry.rotations import rot_y, wrap
+from mover_bench.experiment.measures import measure_moves
 
 FPS = 5.0
 BEGIN, END, COUNT = 10, 22, 40  # frames in which something moves, and of the video

@@ -10,17 +10,17 @@ from mover.core.records import record
 from mover.core.types import Bodies, Camera, Capture, Room, Scene, SceneObject
 from mover.evaluate.contact import TrueTouch
 from mover.evaluate.evaluation import EvaluateConfig, EvaluatedBodies, evaluate, touch_in_truth
-from mover.evaluate.scene import unmatched
-from mover.extensions.moved_furniture.measure import measure_moves
+from mover.evaluate.scene import Pair, iou3d, unmatched
 from mover.extensions.moving_camera import bodies_as_given
 from mover.furniture.library import SEATS, canonical
 from mover.geometry.boxes import box_of
 from mover.geometry.mesh import sample_surface
-from mover.geometry.placement import place_object
+from mover.geometry.placement import changes, place_object, placed_at
 from mover.pipeline.result import to_world
 from mover.stages.objects.prepare_objects import find_regions
 
 NEAR = 0.6  # [m] from the middle of a seat, at most, of its proposal
+SOON = 5  # frames after a true change, by which a video of any rate shows the object at rest
 SURFACE = 4000  # points that give the height of a seat
 
 
@@ -82,6 +82,44 @@ class Judge:
             "moved": measure_moves(self.trial.truth, room.scene, fps),
             "warnings": list(room.warnings),
         }
+
+
+def measure_moves(truth: Scene, found: Scene, fps: float | None = None) -> dict[str, Any]:
+    """Whether objects that are moved stand where they should when, and move when they should.
+
+    Args:
+        truth: The true scene.
+        found: The scene that is judged.
+        fps: Frames a second; None: errors of times are in frames.
+
+    Returns:
+        `objects` that are truly moved: IoU3D in each true stay, how far the nearest change is from
+        each true one [s] (None: none is), mean IoU3D while a person moves it; and how many others
+        are moved by mistake (`false`).
+    """
+    pieces = {piece.id: piece for piece in found.objects}
+    rows: list[dict[str, Any]] = []
+    for true in truth.objects:
+        piece = pieces.get(true.id)
+        if not true.segments or piece is None:
+            continue
+        stays = [segment.frame + SOON for segment in true.segments if segment.mover is None]
+        held = [segment.frame for segment in true.segments if segment.mover is not None]
+        shared = {
+            frame: iou3d(Pair(
+                placed_at(piece, frame), found.camera, placed_at(true, frame), truth.camera, 1
+            ))
+            for frame in (*stays, *held)
+        }  # fmt: skip
+        late = [
+            min((abs(change - when) / (fps or 1.0) for change in changes(piece)), default=None)
+            for when in changes(true)
+        ]
+        on_the_way = sum(shared[frame] for frame in held) / len(held) if held else None
+        row = {"iou3d": [shared[frame] for frame in stays], "late": late, "on_the_way": on_the_way}
+        rows.append({"id": true.id} | row)
+    still = {true.id for true in truth.objects if not true.segments}
+    return {"objects": rows, "false": sum(bool(p.segments) for p in found.objects if p.id in still)}
 
 
 def measure_proposals(trial: Trial, room: Room) -> dict[str, Any]:

@@ -27,7 +27,7 @@ def lens_and_scale(camera: Camera, lens: float | None, size: float | None) -> tu
     Args:
         camera: Of the room.
         lens: Standard deviation of the logarithm of its focal length; None: not stated.
-        size: The same of all lengths together; 0: people's size is trusted; None: no people.
+        size: The same of all lengths together; 0: it was given; None: no people.
     """
     focal = float(camera.K[0, 0])
     across = math.degrees(2 * math.atan(camera.width / (2 * focal)))
@@ -37,7 +37,7 @@ def lens_and_scale(camera: Camera, lens: float | None, size: float | None) -> tu
         text += "; a measured one (camera.json, 'focal_spread': 0) would narrow it"
     if size is None:
         return text, "scale: that of the initial scene, as there are no people"
-    scale = "scale: by the size of the people as it was given"
+    scale = "scale: as the size of the people or the camera's height was given"
     if size:
         scale = f"scale: all lengths ± {100 * size:.1f} %"
     if size > LOOSE:

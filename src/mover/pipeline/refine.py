@@ -1,6 +1,5 @@
 """Refine the people of a finished result with its room; find the contacts of bodies."""
 
-import json
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,7 +11,6 @@ from torch import Tensor
 
 from mover.bodies.posa import load_posa, posa_contacts
 from mover.core.errors import InputError
-from mover.core.files import replacing
 from mover.core.observe import Observer, silent
 from mover.core.types import Bodies, Capture, Room
 from mover.evaluate.evaluation import evaluate_people
@@ -21,7 +19,7 @@ from mover.io.capture.bodies_file import read_bodies, write_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import read_scene
 from mover.io.export.finished import read_finished
-from mover.io.files.fields import At, read_json
+from mover.io.files.fields import At, read_json, write_json
 from mover.io.files.meshes import read_mesh
 from mover.io.formats import read
 from mover.pipeline.result import to_world
@@ -108,8 +106,7 @@ def measure_people(out: Path, truth: Path | None = None) -> dict[str, dict[str, 
     values = {
         name: evaluate_people(read_bodies(file), floor, solid, true) for name, file in files.items()
     }
-    with replacing(out / "refined" / "metrics.json") as part:
-        part.write_text(json.dumps(values, indent=1, allow_nan=False))
+    write_json(values, out / "refined" / "metrics.json")
     return values
 
 

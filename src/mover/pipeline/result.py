@@ -88,6 +88,8 @@ def furnished(
 
 def _lens_and_scale(capture: Capture, camera: Camera, people: Located | None) -> tuple[str, ...]:
     size = None if people is None else people.size
+    if people is not None and capture.camera_height is not None:
+        size = 0.0
     return lens_and_scale(camera, capture.focal_spread, size)
 
 

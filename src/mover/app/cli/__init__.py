@@ -1,6 +1,5 @@
 """The command line. This file imports nothing heavy: `mover --help` answers at once."""
 
-import gc
 import importlib
 import logging
 import os
@@ -105,9 +104,7 @@ def main() -> None:
         raise SystemExit(2)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     logging.getLogger("mover.geometry.kernels").setLevel(logging.INFO)  # what is compiled, once
-    code = run_command(arguments[0], arguments[1:])
-    gc.freeze()  # at its end Python would look once more through the million objects of torch
-    raise SystemExit(code)
+    raise SystemExit(run_command(arguments[0], arguments[1:]))
 
 
 def run_command(name: str, arguments: Sequence[str]) -> int:

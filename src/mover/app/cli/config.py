@@ -18,7 +18,6 @@ from tyro.conf import arg
 from mover.app.cli import say
 from mover.core.errors import InputError
 from mover.core.settings import check_settings, settings_of
-from mover.pipeline.presets import PRESETS, Config
 
 T = TypeVar("T")
 C = TypeVar("C")
@@ -90,44 +89,32 @@ LAYOUT_SETTINGS = {
 """The same of `LayoutConfig`, of `mover layout`."""
 
 
-def preset_of(arguments: Sequence[str], table: Mapping[Any, T]) -> T:
-    """The preset that a command line names (or the first), whose settings the other flags change.
+def preset_named(name: str, table: Mapping[Any, T]) -> T:
+    """A preset by its name.
 
     Raises:
         InputError: If there is none of that name.
     """
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--preset", default=next(iter(table)))
-    return named(early.parse_known_args(arguments)[0].preset, table)
-
-
-def preset_named(name: str) -> Config:
-    """A preset of the main job by its name.
-
-    Raises:
-        InputError: If there is none of that name.
-    """
-    return named(name, PRESETS)
-
-
-def named(name: str, table: Mapping[Any, T]) -> T:
-    """An entry of a table that a flag names."""
     if name not in table:
         raise InputError(f"--preset: {name!r} is none of {', '.join(table)}")
     return table[name]
 
 
-def chosen_config(arguments: Sequence[str]) -> Config:
-    """The preset or file is read first, so that the other flags may stand before or after it."""
+def chosen_config(arguments: Sequence[str], table: Mapping[Any, T]) -> T:
+    """The preset or file of settings that a command line names, read before its other flags.
+
+    Raises:
+        InputError: If there is none of that name.
+    """
     early = argparse.ArgumentParser(prog="mover run", add_help=False, allow_abbrev=False)
     early.add_argument("--preset", default="robust")
     early.add_argument("--config", type=Path)
     chosen, _ = early.parse_known_args(arguments)
-    config = preset_named(chosen.preset)
+    config = preset_named(chosen.preset, table)
     if chosen.config is not None:
         from mover.app.results import read_config
 
-        config = read_config(chosen.config)
+        config = cast(T, read_config(chosen.config))
     return config
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from mover.app.cli import say
-from mover.app.cli.config import parsed, parsed_with, preset_of
+from mover.app.cli.config import chosen_config, parsed, parsed_with
 from mover.core.errors import InputError
 from mover.core.settings import Index, Rate, float_in
 from mover.fitting.config import FITS, FitConfig
@@ -131,7 +131,7 @@ class FitArgs:
 
 def fit(arguments: Sequence[str]) -> None:
     """`mover fit`."""
-    fit_into(*parsed_with(FitArgs, preset_of(arguments, FITS), {}, "mover fit", arguments))
+    fit_into(*parsed_with(FitArgs, chosen_config(arguments, FITS), {}, "mover fit", arguments))
 
 
 def fit_into(args: FitArgs, config: FitConfig | None = None) -> None:
