@@ -19,7 +19,7 @@ CAMERA = little_room.camera()  # 400 px, 640 px wide: 77 degrees
     [
         (0.01, 0.02, ("400 px, 77° across, ± 1.0 %", "± 2.0 %"), (False, False)),
         (0.064, 0.06, ("± 6.4 %", "± 6.0 %"), (True, True)),
-        (None, 0.0, ("not stated", "size of the people"), (False, False)),
+        (None, 0.0, ("not stated", "size of the people or"), (False, False)),
         (0.03, None, ("± 3.0 %", "no people"), (True, False)),
     ],
 )

@@ -21,7 +21,7 @@ from mover.core.observe import Step
 from mover.core.run import Run
 from mover.core.types import Camera, Capture, Detection, Masks, Scene
 from mover.energy.config import Adam
-from mover.evaluate.evaluation import EvaluateConfig
+from mover.evaluate.evaluation import METRICS, EvaluateConfig
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import place_object
 from mover.geometry.raster import first_hit
@@ -33,7 +33,7 @@ from mover_bench.experiment.args import ExperimentArgs
 from mover_bench.experiment.measures import Judge, Trial
 from mover_bench.experiment.run import Jobs, run_each, run_experiment
 from mover_bench.experiment.sets import CHANGES, SETS, changed, parse_seeds, set_named
-from mover_bench.experiment.tables import COLUMNS, interval, last_line
+from mover_bench.experiment.tables import head_of, interval, last_line
 from mover_bench.experiment.variants import (
     LISTS,
     VARIANTS,
@@ -202,8 +202,8 @@ def test_the_page_has_the_means_and_differences_of_the_files(finished) -> None:
 
     table = page.split("## Mean over rooms")[1].split("##")[0]
     head, _, *lines = [x for x in table.splitlines() if x.startswith("|")]
-    assert "| IoU3D ↑ |" in head
-    assert "| P2S [cm] ↓ |" in head
+    assert "| iou3d ↑ |" in head
+    assert "| p2s [cm] ↓ |" in head
     assert [line.split("|")[1].strip() for line in lines] == [
         "robust, initial", "robust, image", *args.variants,
     ]  # fmt: skip
@@ -213,7 +213,8 @@ def test_the_page_has_the_means_and_differences_of_the_files(finished) -> None:
     gaps = page.split("## Difference from robust")[1].split("##")[0]
     paper = next(x for x in gaps.splitlines() if x.startswith("| paper |"))
     gap = mean("paper", "full") - mean("robust", "full")
-    assert float(paper.split("|")[2].split("(")[0]) == pytest.approx(gap, abs=6e-4)
+    shown = paper.split("|")[2].split("(")[0].replace("\N{MINUS SIGN}", "-")
+    assert float(shown) == pytest.approx(gap, abs=6e-4)
     assert "mover experiment --set rooms --seeds 0,1 --variants robust paper no-people" in page
 
 
@@ -397,11 +398,13 @@ class TestWithheld:
 
 class TestTables:
     def test_columns_speak_of_centimetres_and_degrees(self) -> None:
-        assert COLUMNS["p2s"].shown(0.123) == "12.3"
-        assert COLUMNS["pitch_error"].shown(math.radians(0.25)) == "0.25"
-        assert COLUMNS["pje"].shown(math.nan) == "-"
-        assert COLUMNS["iou3d"].shown(-1e-9, sign=True) == "+0.000"
-        assert COLUMNS["p2s"].head == "P2S [cm] ↓"
+        assert METRICS["p2s"].shown(0.123, unit=True) == "12.3\N{NO-BREAK SPACE}cm"
+        assert METRICS["pitch_error"].shown(math.radians(-0.25), unit=True) == "\N{MINUS SIGN}0.25°"
+        assert METRICS["pje"].shown(math.nan) == METRICS["pje"].shown(None) == "\N{EN DASH}"
+        assert METRICS["iou3d"].shown(-1e-9, sign=True) == "+0.000"
+        assert [head_of(n) for n in ("p2s", "iou3d", "contact")] == [
+            "p2s [cm] ↓", "iou3d ↑", "contact [%]",
+        ]  # fmt: skip
 
     def test_the_interval_is_that_of_another_library(self) -> None:
         values = np.random.default_rng(2).gamma(2.0, size=30)

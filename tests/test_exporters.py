@@ -215,34 +215,6 @@ def test_parameters_of_the_capture_move_bodies_that_were_turned_and_sized(tmp_pa
     assert turn.shape == (3, 3)
 
 
-def test_the_validator_of_gltf_finds_nothing(tmp_path: Path):
-    import os
-    import shutil
-    import subprocess
-
-    node = shutil.which("node")
-    script = (
-        "const v=require('gltf-validator'),fs=require('fs');v.validateBytes(new Uint8Array("
-        "fs.readFileSync(process.argv[1]))).then(r=>console.log(JSON.stringify(r.issues)))"
-    )
-    if (
-        node is None
-        or subprocess.run(
-            [node, "-e", "require('gltf-validator')"],
-            capture_output=True,
-            env=os.environ,
-            check=False,
-        ).returncode
-    ):
-        pytest.skip("needs node with the package gltf-validator on NODE_PATH")
-    home = finished(tmp_path, two_people())
-    for form in ("skin", "morph", "none"):
-        path = export_glb(home, tmp_path / form, form).files[0]
-        said = subprocess.run([node, "-e", script, str(path)], capture_output=True, check=True)
-        issues = json.loads(said.stdout)
-        assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"][:3]
-
-
 def test_trimesh_opens_the_file_with_the_objects_in_place(tmp_path: Path):
     home = finished(tmp_path, two_people(4))
     scene = trimesh.load_scene(export_glb(home, tmp_path).files[0])
@@ -273,7 +245,7 @@ def test_an_object_that_is_moved_jumps_to_its_next_place(tmp_path: Path, people:
             assert found == pytest.approx(placement_of(placed_at(one, frame)), abs=1e-5)
 
 
-def test_no_frame_between_keys_is_farther_off_than_is_said():
+def test_no_frame_between_keys_is_farther_off_than_is_said_and_few_keys_are_few():
     verts = bodies_of(moving_pose(60)).verts
     time = torch.linspace(0, 4, 60).double().square()  # uneven
     keys, miss = keyframes(verts, time, 0.004, 1000)
@@ -289,12 +261,8 @@ def test_no_frame_between_keys_is_farther_off_than_is_said():
     assert miss <= 0.004
     assert keys[0] == 0
     assert keys[-1] == 59
-
-
-def test_keys_stop_where_there_are_enough():
-    verts = bodies_of(moving_pose(30)).verts
-    keys, miss = keyframes(verts, torch.arange(30).double(), 0.0, 7)
-    assert len(keys) == 7
+    few, miss = keyframes(verts, time, 0.0, 7)
+    assert len(few) == 7
     assert miss > 0
 
 
@@ -383,11 +351,6 @@ def test_the_command_writes_what_is_asked_for(tmp_path: Path, capsys):
     names = {p.name for p in (out / "export").rglob("*") if p.is_file()}
     assert {"scene.glb", "chair_0.ply", "amass_0.npz"} <= names
     assert "on bones" in capsys.readouterr().out
-
-
-def test_a_folder_without_a_result_is_refused(tmp_path: Path, capsys):
-    assert run_command("export", [str(tmp_path)]) == 2
-    assert "scene.json" in capsys.readouterr().err
 
 
 def test_without_usd_core_the_way_to_get_it_is_said(tmp_path: Path, monkeypatch):

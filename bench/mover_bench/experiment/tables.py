@@ -1,6 +1,5 @@
 """The tables of an experiment: every object, the means, and a page that one can read."""
 
-import math
 import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,6 +13,8 @@ from jaxtyping import Float
 
 from mover.core.files import replacing
 from mover.core.records import plain
+from mover.evaluate.evaluation import METRICS
+from mover.evaluate.scene import SHOWN
 from mover_bench.experiment.args import ExperimentArgs
 from mover_bench.experiment.job import path_of, read_numbers
 from mover_bench.experiment.sets import set_named
@@ -26,49 +27,19 @@ STAGES = ("initial", "image", "full")
 RESAMPLES, LEVEL = 10_000, 0.95
 
 
-@dataclass(frozen=True)
-class Column:
-    """How a metric is shown."""
-
-    title: str
-    better: int = 1
-    """1: larger is better, -1: smaller, 0: neither (it is compared with the truth's own)."""
-    unit: str = ""
-    factor: float = 1.0
-    """From metres, radians or shares to the unit."""
-    digits: int = 3
-
-    @property
-    def head(self) -> str:
-        """Name, unit, and the better side."""
-        unit = f" [{self.unit}]" if self.unit else ""
-        return f"{self.title}{unit}{ {1: ' ↑', -1: ' ↓', 0: ''}[self.better] }"
-
-    def shown(self, value: float, *, sign: bool = False) -> str:
-        """A value in the unit; `-` where there is none."""
-        if math.isnan(value):
-            return "-"
-        rounded = round(self.factor * value, self.digits) + 0.0  # no negative zero
-        return f"{rounded:{'+' if sign else ''}.{self.digits}f}"
-
-
-DEGREES = math.degrees(1)
-COLUMNS: dict[str, Column] = {
-    "iou3d": Column("IoU3D"),
-    "iou3d_aligned": Column("IoU3D aligned"),
-    "p2s": Column("P2S", -1, "cm", 100, 1),
-    "iou2d": Column("IoU2D"),
-    "center_error": Column("centre", -1, "cm", 100, 1),
-    "worse_by_10cm": Column("worse by > 10 cm", -1, "%", 100, 1),
-    "non_collision": Column("Non-Col"),
-    "contact": Column("Cont.", 0),
-    "contact_f1": Column("contact F1"),
-    "pitch_error": Column("pitch", -1, "°", DEGREES, 2),
-    "roll_error": Column("roll", -1, "°", DEGREES, 2),
-    "pje": Column("PJE", -1, "mm", 1000, 1),
-    "p_pje": Column("p.PJE", -1, "mm", 1000, 1),
-}
+COLUMNS = (
+    "iou3d", "iou3d_aligned", "p2s", "iou2d", "center_error", "worse_by_10cm", "non_collision",
+    "contact", "contact_f1", "pitch_error", "roll_error", "pje", "p_pje",
+)  # fmt: skip
 """Metrics of the tables, in their order."""
+
+
+def head_of(name: str) -> str:
+    """A metric's name, unit, and the better side; contact is compared with the truth's own."""
+    metric = METRICS[name]
+    unit = f" [{SHOWN[metric.unit][0]}]" if SHOWN[metric.unit][0] else ""
+    side = "" if name == "contact" else " ↑" if metric.best > 0 else " ↓"
+    return f"{name}{unit}{side}"
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -207,9 +178,9 @@ def _means(means: Frame, shown: Iterable[tuple[str, str]]) -> str:
         rooms = _chosen(means, *key)
         if not len(rooms):
             continue
-        cells = [COLUMNS[name].shown(float(rooms[name].mean())) for name in columns]
+        cells = [METRICS[name].shown(float(rooms[name].mean())) for name in columns]
         lines.append([", ".join(key) if key[1] != "full" else key[0], *cells, str(len(rooms))])
-    return markdown(["", *(COLUMNS[name].head for name in columns), "rooms"], lines)
+    return markdown(["", *map(head_of, columns), "rooms"], lines)
 
 
 def _differences(means: Frame, rows: Sequence[str]) -> str:
@@ -226,8 +197,8 @@ def _differences(means: Frame, rows: Sequence[str]) -> str:
             if not len(values):
                 cells.append("-")
                 continue
-            gap, column = interval(values), COLUMNS[name]
+            gap, column = interval(values), METRICS[name]
             ends = " … ".join(column.shown(x, sign=True) for x in (gap.low, gap.high))
             cells.append(f"{column.shown(gap.mean, sign=True)} ({ends})")
         lines.append([row, *cells, str(int(gaps[columns].notna().any(axis=1).sum()))])
-    return markdown(["", *(COLUMNS[name].head for name in columns), "rooms"], lines)
+    return markdown(["", *map(head_of, columns), "rooms"], lines)

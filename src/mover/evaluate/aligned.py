@@ -82,4 +82,6 @@ def _weighted(
     return _Similarity(yaw, scale, aim - scale * (rot_y(yaw) @ middle))
 
 
-SCENE_METRICS: dict[str, Metric[Together]] = {"iou3d_aligned": Metric("", 1.0, iou3d_aligned)}
+SCENE_METRICS: dict[str, Metric[Together]] = {
+    "iou3d_aligned": Metric("3D overlap after one similarity of all", "", 1.0, iou3d_aligned)
+}

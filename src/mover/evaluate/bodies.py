@@ -70,14 +70,18 @@ def p_v2v(twins: Twins) -> float | None:
 
 
 GROUND_METRICS: dict[str, Metric[Standing]] = {
-    "ground_penetration_frequency": Metric("", 0.0, ground_penetration_frequency),
-    "ground_penetration_distance": Metric("m", 0.0, ground_penetration_distance),
+    "ground_penetration_frequency": Metric(
+        "Soles under the floor", "share", 0.0, ground_penetration_frequency
+    ),
+    "ground_penetration_distance": Metric(
+        "Depth of soles under the floor", "m", 0.0, ground_penetration_distance
+    ),
 }
 POSE_METRICS: dict[str, Metric[Twins]] = {
-    "pje": Metric("m", 0.0, pje),
-    "v2v": Metric("m", 0.0, v2v),
-    "p_pje": Metric("m", 0.0, p_pje),
-    "p_v2v": Metric("m", 0.0, p_v2v),
+    "pje": Metric("Error of the joints", "m", 0.0, pje),
+    "v2v": Metric("Error of the body's surface", "m", 0.0, v2v),
+    "p_pje": Metric("Error of the joints, aligned", "m", 0.0, p_pje),
+    "p_v2v": Metric("Error of the body's surface, aligned", "m", 0.0, p_v2v),
 }
 
 

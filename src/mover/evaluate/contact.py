@@ -72,9 +72,9 @@ def contact_f1(touch: Touch) -> float | None:
 
 
 TOUCH_METRICS: dict[str, Metric[Touch]] = {
-    "non_collision": Metric("", 1.0, non_collision),
-    "contact": Metric("", 1.0, contact),
-    "contact_f1": Metric("", 1.0, contact_f1),
+    "non_collision": Metric("Body outside furniture", "share", 1.0, non_collision),
+    "contact": Metric("Bodies that touch furniture", "share", 1.0, contact),
+    "contact_f1": Metric("Contact F1", "", 1.0, contact_f1),
 }
 
 

@@ -3,7 +3,6 @@
 Definitions, matching rules and sampling densities: docs/metrics.md.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,6 @@ from torch import Tensor
 
 from mover.bodies.corrected import in_world
 from mover.bodies.parts import members, parts_of
-from mover.core.files import replacing
 from mover.core.records import map_tensors, record
 from mover.core.run import Run
 from mover.core.settings import Count, Metres, int_in
@@ -60,7 +58,7 @@ from mover.geometry.warp_start import mapped
 from mover.io.capture.bodies_file import read_bodies
 from mover.io.capture.camera_file import camera_of
 from mover.io.capture.scene_file import read_scene
-from mover.io.files.fields import read_json
+from mover.io.files.fields import read_json, write_json
 
 T = TypeVar("T")
 
@@ -207,8 +205,7 @@ def evaluate_folder(
     elif physics:
         for side, scene in zip(SIDES, (initial, result), strict=True):
             metrics[side] |= measure(PHYSICS_METRICS, settle(scene, Run(out)))
-    with replacing(out / "metrics.json") as part:
-        part.write_text(json.dumps(metrics, indent=1, allow_nan=False))
+    write_json(metrics, out / "metrics.json")
     return metrics
 
 
@@ -223,7 +220,7 @@ def table(metrics: Mapping[str, Any], shown: Sequence[str] | None = None) -> str
     lines = [f"{'metric':34}{'before':>10}{'after':>10}{'best':>8}"]
     for name, metric in (METRICS | PHYSICS_METRICS).items():
         if (shown is None or name in shown) and (name in initial or name in result):
-            title = f"{name} [{metric.unit}]" if metric.unit else name
+            title = f"{name} [{metric.unit}]" if metric.unit in ("m", "rad") else name
             values = _cell(initial, name) + _cell(result, name)
             lines.append(f"{title:34}{values}{metric.best:8.0f}")
     lines += ["", f"{'object':34}{'iou3d before, after':>20}{'center_error [m]':>20}"]

@@ -30,16 +30,34 @@ PLASTIC = 1.32471795724474602596  # x³ = x + 1: its powers spread points evenly
 NEARER = 1e-3  # [1/m], boxes that do not overlap are paired by distance: this breaks the tie
 
 
+SHOWN = {
+    "": ("", 1.0, 3), "share": ("%", 100.0, 1), "m": ("cm", 100.0, 1),
+    "rad": ("°", math.degrees(1), 2),
+}  # fmt: skip
+"""The unit in which a number of a unit is shown, its factor and its digits."""
+
+
 @dataclass(frozen=True)
 class Metric(Generic[T]):
     """One line of the table of metrics."""
 
+    label: str
     unit: str
-    """`m`, `rad` or nothing."""
+    """`m`, `rad`, `share` (shown in per cent) or nothing."""
     best: float
     """What a perfect reconstruction scores: 1 where more is better, 0 where less is."""
     measure: Callable[[T], float | None]
     """The value, or None where the truth that it needs is missing."""
+
+    def shown(self, value: float | None, *, sign: bool = False, unit: bool = False) -> str:
+        """The value as people read it; a dash where there is none."""
+        if value is None or not math.isfinite(value):
+            return "\N{EN DASH}"
+        name, factor, digits = SHOWN[self.unit]
+        rounded = round(factor * value, digits) + 0.0  # no negative zero
+        text = f"{rounded:{'+' if sign else ''}.{digits}f}".replace("-", "\N{MINUS SIGN}")
+        space = "\N{NO-BREAK SPACE}" if name not in ("", "°") else ""
+        return text + space + name if unit else text
 
 
 @record
@@ -111,19 +129,24 @@ def roll_error(sight: Sight) -> float:
 
 
 OBJECT_METRICS: dict[str, Metric[Pair]] = {
-    "iou3d": Metric("", 1.0, iou3d),
-    "iou2d": Metric("", 1.0, iou2d),
-    "p2s": Metric("m", 0.0, p2s),
-    "center_error": Metric("m", 0.0, center_error),
+    "iou3d": Metric("3D overlap with the truth (IoU)", "", 1.0, iou3d),
+    "iou2d": Metric("Overlap of the image boxes (IoU)", "", 1.0, iou2d),
+    "p2s": Metric("True surface to estimated surface", "m", 0.0, p2s),
+    "center_error": Metric("Error of the centre", "m", 0.0, center_error),
 }
 HARM_METRICS: dict[str, Metric[float]] = {
-    "worse_by_10cm": Metric("", 0.0, lambda farther: float(farther > 0.1)),
+    "worse_by_10cm": Metric(
+        "Objects more than 10 cm worse than initially",
+        "share",
+        0.0,
+        lambda farther: float(farther > 0.1),
+    ),
 }
 """Of how much farther from the truth an object's centre is than initially [m]; the mean is the
 share of objects that were made worse."""
 CAMERA_METRICS: dict[str, Metric[Sight]] = {
-    "pitch_error": Metric("rad", 0.0, pitch_error),
-    "roll_error": Metric("rad", 0.0, roll_error),
+    "pitch_error": Metric("Error of the camera's pitch", "rad", 0.0, pitch_error),
+    "roll_error": Metric("Error of the camera's roll", "rad", 0.0, roll_error),
 }
 
 

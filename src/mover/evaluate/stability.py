@@ -97,4 +97,6 @@ def stable_share(found: Sequence[Settled]) -> float | None:
     return sum(loose) / len(loose) if loose else None
 
 
-PHYSICS_METRICS: dict[str, Metric[Sequence[Settled]]] = {"stable": Metric("", 1.0, stable_share)}
+PHYSICS_METRICS: dict[str, Metric[Sequence[Settled]]] = {
+    "stable": Metric("Objects that stay under gravity", "share", 1.0, stable_share)
+}

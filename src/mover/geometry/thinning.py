@@ -27,6 +27,29 @@ def farthest_first(points: Float[Tensor, "points 3"], count: int) -> Int[Tensor,
     return torch.from_numpy(chosen).to(points.device)
 
 
+def chosen_vertices(
+    verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"], count: int
+) -> tuple[Int[Tensor, " fewer"], Int[Tensor, "triangles 3"]] | None:
+    """Vertices that stand for all, and about `count` triangles between them.
+
+    Each vertex of the simplified mesh is replaced by the nearest of those that collapsed into it;
+    None where one has none.
+    """
+    import fast_simplification
+
+    points, rows = as_float64(verts), as_int64(faces).astype(np.int32)
+    with simplifying:
+        found: Any = fast_simplification.simplify(
+            points, rows, target_count=count, return_collapses=True
+        )
+        fewer, rows, group = fast_simplification.replay_simplification(points, rows, found[2])
+    order = np.lexsort([np.linalg.norm(points - fewer[group], axis=1), group])
+    nearest = order[np.unique(group[order], return_index=True)[1]]
+    if len(nearest) < len(fewer):
+        return None
+    return torch.from_numpy(nearest), torch.from_numpy(rows.astype(np.int64)).to(faces)
+
+
 def coarser(
     meshes: Float[Tensor, "meshes verts 3"], faces: Int[Tensor, "faces 3"], count: int
 ) -> tuple[Float[Tensor, "meshes fewer 3"], Int[Tensor, "triangles 3"]]:
@@ -35,19 +58,9 @@ def coarser(
     Each of the new vertices is an old one. Meshes of fewer triangles, and those that would not be
     closed any more, stay as they are.
     """
-    import fast_simplification
-
     if len(meshes) == 0 or len(faces) <= count:
         return meshes, faces
-    verts, rows = as_float64(meshes[0]), as_int64(faces).astype(np.int32)
-    with simplifying:
-        found: Any = fast_simplification.simplify(
-            verts, rows, target_count=count, return_collapses=True
-        )
-        points, rows, group = fast_simplification.replay_simplification(verts, rows, found[2])
-    order = np.lexsort([np.linalg.norm(verts - points[group], axis=1), group])
-    nearest = order[np.unique(group[order], return_index=True)[1]]
-    triangles = torch.from_numpy(rows.astype(np.int64)).to(faces)
-    if len(nearest) < len(points) or not is_closed(triangles):
+    found = chosen_vertices(meshes[0], faces, count)
+    if found is None or not is_closed(found[1]):
         return meshes, faces
-    return meshes[:, torch.from_numpy(nearest).to(meshes.device)].contiguous(), triangles
+    return meshes[:, found[0].to(meshes.device)].contiguous(), found[1]

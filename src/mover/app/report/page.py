@@ -18,17 +18,16 @@ from torch import Tensor
 from mover import __version__
 from mover.app.pictures.film import pixels
 from mover.app.pictures.overlay import WIDEST, canvas, draw_overlay, on_cpu
+from mover.app.report import asset, fill
 from mover.app.report.plan import draw_top, extent_of
 from mover.app.report.scene_view import ReportScene, pack_view
 from mover.app.report.tables import (
-    QUANTITIES,
     find_changes,
+    metric_of,
     metrics_table,
     objects_table,
     settings_of,
-    write_quantity,
 )
-from mover.app.report.templates import asset, fill
 from mover.core.files import replacing
 from mover.core.records import map_tensors
 from mover.core.types import Bodies, Scene
@@ -147,8 +146,10 @@ def _count(number: int, one: str, many: str) -> str:
 def _tiles(content: ReportContent) -> list[tuple[str, str, str]]:
     """The few numbers that matter most, before and after."""
     before, after = ((content.metrics or {}).get(k) or {} for k in ("initial", "result"))
-    pairs = [(k, write_quantity(k, before.get(k), False)) for k in TILES if k in after]
-    return [(QUANTITIES[k].label, old, write_quantity(k, after.get(k))) for k, old in pairs]
+    metrics = [(key, metric_of(key)) for key in TILES if key in after]
+    return [
+        (m.label, m.shown(before.get(key)), m.shown(after[key], unit=True)) for key, m in metrics
+    ]
 
 
 def _plans(content: ReportContent) -> list[tuple[str, str]]:

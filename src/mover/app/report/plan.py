@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mover.app.report.templates import fill
+from mover.app.report import fill
 from mover.core.colours import colour, css, person_colour
 from mover.core.types import Bodies, Camera, Scene, SceneObject
 from mover.geometry.boxes import box_of

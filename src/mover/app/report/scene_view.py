@@ -13,7 +13,7 @@ from torch import Tensor
 from mover.core.colours import colour, css, person_colour
 from mover.core.types import Bodies, Mesh, Scene
 from mover.geometry.placement import place_object
-from mover.geometry.thinning import simplifying
+from mover.geometry.thinning import chosen_vertices, simplifying
 
 GRAIN = 1e-4  # share of the longest side within which vertices are the same
 FACES_OBJECT, FACES_BODY = 3000, 1600  # at most
@@ -55,28 +55,11 @@ def thin(mesh: Mesh, count: int) -> Mesh:
 def thin_choice(
     verts: Float[Tensor, "verts 3"], faces: Int[Tensor, "faces 3"], count: int
 ) -> Thinning:
-    """Choose vertices of one pose so that all other poses can be drawn with them as well.
-
-    Each vertex of the simplified mesh is replaced by the nearest of those that collapsed into it.
-    """
-    from fast_simplification import replay_simplification, simplify
-
-    if len(faces) <= count:
-        used, ends = faces.cpu().long().unique(return_inverse=True)
-        return Thinning(used, ends.reshape(-1, 3))
-    points = verts.detach().cpu().double().numpy()
-    triangles = faces.cpu().int().numpy()
-    with simplifying:
-        *_, collapses = simplify(points, triangles, target_count=count, return_collapses=True)
-        fewer, kept_faces, heir = replay_simplification(points, triangles, collapses)
-    used = np.unique(triangles)
-    heirs = np.asarray(heir)[used]
-    far = np.linalg.norm(points[used] - np.asarray(fewer)[heirs], axis=1)
-    order = np.lexsort((far, heirs))
-    first = np.unique(heirs[order], return_index=True)
-    choice = np.zeros(len(fewer), dtype=np.int64)
-    choice[first[0]] = used[order][first[1]]
-    return Thinning(torch.from_numpy(choice), torch.from_numpy(np.asarray(kept_faces, np.int64)))
+    """Choose vertices of one pose so that all other poses can be drawn with them as well."""
+    used, ends = faces.cpu().long().unique(return_inverse=True)
+    ends = ends.reshape(-1, 3)
+    few = None if len(faces) <= count else chosen_vertices(verts.detach().cpu()[used], ends, count)
+    return Thinning(used, ends) if few is None else Thinning(used[few[0]], few[1])
 
 
 @dataclass(frozen=True)

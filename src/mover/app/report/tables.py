@@ -8,61 +8,19 @@ from typing import Any
 
 import torch
 
-from mover.app.report.templates import fill
+from mover.app.report import fill
 from mover.core.colours import colour, css
 from mover.core.types import Scene, SceneObject
+from mover.evaluate.evaluation import METRICS
+from mover.evaluate.scene import Metric
+from mover.evaluate.stability import PHYSICS_METRICS
 from mover.geometry.camera import to_camera
 from mover.geometry.placement import place_object
 from mover.geometry.rotations import wrap
 
 NOTHING = "\N{EN DASH}"
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """How a number of metrics.json is written."""
-
-    label: str
-    unit: str = ""
-    factor: float = 1.0
-    digits: int = 3
-    more_is_better: bool = False
-    short: str = ""
-    """Title of a narrow column."""
-
-
-_CM, _DEG, _PERCENT = ("cm", 100.0, 1), ("°", 180 / math.pi, 2), ("%", 100.0, 1)
-QUANTITIES = {
-    "iou3d": Quantity("3D overlap with the truth (IoU)", more_is_better=True, short="3D IoU"),
-    "iou2d": Quantity("Overlap of the image boxes (IoU)", more_is_better=True),
-    "p2s": Quantity("True surface to estimated surface", *_CM),
-    "center_error": Quantity("Error of the centre", *_CM, short="Centre error"),
-    "worse_by_10cm": Quantity("Objects more than 10 cm worse than initially", *_PERCENT),
-    "iou3d_aligned": Quantity("3D overlap after one similarity of all", more_is_better=True),
-    "stable": Quantity("Objects that stay under gravity", *_PERCENT, True),
-    "contact": Quantity("Contacts that touch furniture", *_PERCENT, True),
-    "contact_f1": Quantity("Contact F1", more_is_better=True),
-    "non_collision": Quantity("Body outside furniture", *_PERCENT, True),
-    "pitch_error": Quantity("Error of the camera's pitch", *_DEG),
-    "roll_error": Quantity("Error of the camera's roll", *_DEG),
-    "ground_penetration_frequency": Quantity("Frames with soles under the floor", *_PERCENT),
-    "ground_penetration_distance": Quantity("Depth of soles under the floor", *_CM),
-    "pje": Quantity("Error of the joints", *_CM),
-    "v2v": Quantity("Error of the body's surface", *_CM),
-    "p_pje": Quantity("Error of the joints, aligned", *_CM),
-    "p_v2v": Quantity("Error of the body's surface, aligned", *_CM),
-}
-
-
-def write_quantity(key: str, value: float | None, unit: bool = True) -> str:
-    """A number of metrics.json with its unit."""
-    quantity = QUANTITIES.get(key, Quantity(key))
-    if value is None or not math.isfinite(value):
-        return NOTHING
-    text = f"{quantity.factor * value:.{quantity.digits}f}"
-    if not unit or not quantity.unit:
-        return text
-    return text + ("" if quantity.unit == "°" else "\N{NO-BREAK SPACE}") + quantity.unit
+QUANTITIES: dict[str, Metric[Any]] = {**METRICS, **PHYSICS_METRICS}
+"""How the numbers of metrics.json are shown, in their order."""
 
 
 def write_value(value: Any) -> str:  # noqa: ANN401
@@ -92,7 +50,7 @@ def signed(value: float, digits: int) -> str:
     return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
 
 
-JUDGED = ("iou3d", "center_error")  # metrics that stand beside each object
+JUDGED = {"iou3d": "3D IoU", "center_error": "Centre error"}  # beside each object
 
 
 @dataclass(frozen=True)
@@ -151,16 +109,19 @@ def metrics_table(metrics: Mapping[str, Any]) -> str:
     return draw_table([Cell("Metric", "text"), *map(Cell, ("Before", "After", "Change"))], rows)
 
 
+def metric_of(key: str) -> Metric[Any]:
+    """How a number of metrics.json is shown; one that is not known as it is."""
+    return QUANTITIES.get(key) or Metric(key, "", 0.0, lambda _: None)
+
+
 def _metric_row(key: str, before: float | None, after: float | None) -> list[Cell]:
-    quantity = QUANTITIES.get(key, Quantity(key))
-    change, mood = NOTHING, ""
-    if before is not None and after is not None and math.isfinite(before) and math.isfinite(after):
-        grown = quantity.factor * (after - before)
-        change = signed(grown, quantity.digits)
-        if key in QUANTITIES and float(f"{grown:.{quantity.digits}f}"):
-            mood = "better" if (grown > 0) == quantity.more_is_better else "worse"
-    values = (quantity.label, write_quantity(key, before), write_quantity(key, after))
-    return [*map(Cell, values), Cell(change, mood)]
+    metric, change, mood = metric_of(key), NOTHING, ""
+    if before is not None and after is not None:
+        change = metric.shown(after - before, sign=True)
+        if key in QUANTITIES and any(c in "123456789" for c in change):
+            mood = "better" if (after > before) == (metric.best > 0) else "worse"
+    shown = (metric.shown(value, unit=True) for value in (before, after))
+    return [Cell(metric.label), *map(Cell, shown), Cell(change, mood)]
 
 
 def objects_table(
@@ -175,7 +136,7 @@ def objects_table(
     fields = list(dict.fromkeys(k for row in rows for k in row if k not in ("id", "category")))
     scores = {str(o.get("id")): o for o in (metrics or {}).get("objects") or ()}
     judged = [k for k in JUDGED if any(k in (o.get("result") or {}) for o in scores.values())]
-    titles = ["Moved", "Turned", "Size", *(QUANTITIES[k].short for k in judged)]
+    titles = ["Moved", "Turned", "Size", *(JUDGED[k] for k in judged)]
     titles += [f.replace("_", " ") for f in fields]
     lines: list[list[Cell]] = []
     for index, item in enumerate(result.objects):
@@ -183,7 +144,8 @@ def objects_table(
         values = [*_change_cells(changes.get(item.id))]
         for key in judged:
             before, after = (side.get(key) for side in sides)
-            values.append(f"{write_quantity(key, before, False)} → {write_quantity(key, after)}")
+            metric = metric_of(key)
+            values.append(f"{metric.shown(before)} → {metric.shown(after, unit=True)}")
         values += [write_value(extra.get(item.id, {}).get(f)) for f in fields]
         head = [Cell(item.id, tint=css(colour(index))), Cell(item.category, "text")]
         lines.append([*head, *map(Cell, values)])
