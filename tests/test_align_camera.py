@@ -95,7 +95,7 @@ def test_outliers_and_a_wrong_ground_do_no_harm(ground):
     assert floor < 0.005
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("spots", [line(feet=0.0), line(), line(angle=1.5)], ids=["0", "1", "2"])
 def test_a_straight_walk_is_never_worse_than_the_guess(spots, seed):
     sign = (-1.0) ** seed, 1.0
@@ -105,17 +105,6 @@ def test_a_straight_walk_is_never_worse_than_the_guess(spots, seed):
     assert np.abs(errors(found)[:2]).max() < 3.6
     assert len(found.warnings) == 1
     assert "line" in found.warnings[0]
-
-
-def test_the_tilt_about_an_exact_line_stays_at_the_guess():
-    spots = line(feet=0.0, angle=0.0)
-    still = soles_at(spots, noise=0.0)
-    flat = FootContacts(
-        still.points_cam.reshape(-1, 4, 3).mean(1), still.person[::4], still.frame[::4], ()
-    )
-    pitch, roll, _ = errors(align(flat, camera_off((3.0, 3.0))))
-    assert abs(pitch - 3) < 0.3  # the ends of the line are seen from different distances
-    assert abs(roll) < 0.1
 
 
 @pytest.mark.parametrize("config", [AlignConfig(), PAPER], ids=["robust", "paper"])
@@ -261,17 +250,6 @@ def test_the_result_is_a_minimum_of_feet_term_and_prior():
     ]
     assert min(around) >= fit.cost
     assert torch.linalg.eigvalsh(covariance_of(fit, votes).double()).min() > 0
-
-
-def test_places_share_their_votes():
-    once, often = soles_at(room(3), frames=1), soles_at([(0.0, -3.0)], frames=50)
-    votes = vote(
-        joined(once, FootContacts(often.points_cam, often.person, often.frame + 3, ())), "places"
-    )
-    stood, walked = votes.weight[12:].sum(), votes.weight[:4].sum()
-    assert len(votes.place_of.unique()) == 4
-    assert 2 < stood / walked < 6
-    assert vote(once, "points").weight.unique().numel() == 1
 
 
 def test_the_term_is_the_printed_formula_point_by_point():

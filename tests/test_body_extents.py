@@ -53,9 +53,9 @@ def compared(bodies, seen, objects=NO_PEOPLE):
     return compare_extents(bodies, rows, CAMERA, table, covered(Cover(objects)))
 
 
-@pytest.mark.parametrize("pixels", [-2, -1, 0, 1, 2])
+@pytest.mark.parametrize("pixels", [-2, 0, 1])
 @pytest.mark.parametrize("bias", [1.02, 0.98])
-def test_bodies_at_a_wrong_depth_are_told_whatever_the_width_of_the_masks(bias, pixels):
+def test_bodies_at_a_wrong_depth_are_found_whatever_the_width_of_the_masks(bias, pixels):
     true = upright()
     seen = masks_of(true)
     found = compared(moved(true, bias), wider(seen, pixels) if pixels else seen)
@@ -65,7 +65,7 @@ def test_bodies_at_a_wrong_depth_are_told_whatever_the_width_of_the_masks(bias, 
     assert found.spread < 0.005
 
 
-def test_whoever_objects_or_others_hide_is_left_out():
+def test_people_whom_objects_or_others_hide_are_left_out():
     true = upright()
     table = torch.zeros(SIZE, dtype=torch.bool)
     table[230:] = True
@@ -81,7 +81,7 @@ def test_whoever_objects_or_others_hide_is_left_out():
     assert compared(true, two) is None
 
 
-def test_an_object_behind_a_person_hides_nobody():
+def test_an_object_behind_a_person_hides_no_one():
     true = upright()
     wall = torch.ones(SIZE, dtype=torch.bool)
     found = compared(true, masks_of(true), Masks(*SIZE, (encode(wall),)))

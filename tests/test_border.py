@@ -135,8 +135,7 @@ class TestTerm:
 
 
 class TestKernel:
-    @pytest.mark.parametrize("size", [33, 64, 130])
-    @pytest.mark.parametrize("amount", [0.02, 0.15])
+    @pytest.mark.parametrize(("size", "amount"), [(33, 0.15), (64, 0.02), (130, 0.15)])
     def test_values_and_gradients_are_those_of_the_terms(self, size, amount):
         pytest.importorskip("warp")
         inputs = loosened(room(size))
@@ -217,8 +216,8 @@ class TestFixed:
         assert fixed_borders(image, one, inputs.objects, inputs.camera, WEIGHTS) is image
 
 
-def seen_room(grow, hide):
-    """The cabinet of the analytic room, its mask as wide as told, its base hidden by somebody."""
+def seen_room(grow):
+    """The cabinet of the analytic room under a mask too wide or narrow, its base hidden."""
     inputs = make_inputs()
     cabinet = some_objects(inputs.objects, torch.tensor([2]))
     true = Layout(*(getattr(inputs.starts, f.name)[0, 2:] for f in fields(Layout)))
@@ -227,13 +226,10 @@ def seen_room(grow, hide):
     views = Crops(camera.K[None], camera.height, camera.width)
     drawn, _ = look(verts, Topology(cabinet.faces, cabinet.edges), views, depth=False)
     mask = drawn[0] > 0.5
-    if grow:
-        grown = torch.nn.functional.max_pool2d(grow * mask.float()[None, None], 3, 1, 1)[0, 0]
-        mask = grown > 0 if grow > 0 else grown < 0
-    people = torch.zeros_like(mask)
-    if hide:
-        rows = torch.nonzero(mask.any(1))[:, 0]
-        people[int(rows[0]) + len(rows) * 2 // 3 :] = True
+    grown = torch.nn.functional.max_pool2d(grow * mask.float()[None, None], 3, 1, 1)[0, 0]
+    mask = grown > 0 if grow > 0 else grown < 0
+    people, rows = torch.zeros_like(mask), torch.nonzero(mask.any(1))[:, 0]
+    people[int(rows[0]) + len(rows) * 2 // 3 :] = True
     mask = mask & ~people
     ends = [torch.nonzero(mask.any(axis))[:, 0] for axis in (0, 1)]
     box = [float(e[0]) for e in ends] + [float(e[-1]) + 1 for e in ends]
@@ -250,7 +246,7 @@ def seen_room(grow, hide):
 
 @pytest.mark.parametrize("grow", [-1, 1])
 def test_an_object_whose_base_is_hidden_is_placed_nearer_to_the_truth_if_borders_are_free(grow):
-    inputs, cues = seen_room(grow, hide=True)
+    inputs, cues = seen_room(grow)
     config = replace(
         ROBUST.layout, weights=WEIGHTS, method=Adam(120, 0.03, 0.002, beta2=0.98, keep_best=True),
         yaws=1, short=Adam(0), num_hypotheses=1,

@@ -83,7 +83,8 @@ def test_refine_lifts_people_out_of_the_floor_and_says_how_wrong_they_were(tmp_p
     assert "3 bodies refined with their pose" in capsys.readouterr().out
 
 
-def test_without_the_floor_nobody_is_lifted(tmp_path):
+@pytest.mark.slow
+def test_without_the_floor_no_one_is_lifted(tmp_path):
     out = finished(tmp_path / "out", standing(FAR))
     assert cli.run_command("refine", [str(out), "--no-camgp", "--rounds", "1"]) == 0
     assert lowest(read_bodies(out / "refined" / "bodies.npz")).max() < -0.02
@@ -96,6 +97,7 @@ def test_a_result_without_people_is_refused_and_nothing_is_written(tmp_path, cap
     assert not (out / "refined").exists()
 
 
+@pytest.mark.slow
 def test_bodies_of_a_licensed_model_are_refined_with_their_parameters(tmp_path, monkeypatch):
     write_npz(make_model("smplx"), tmp_path / "models" / "smplx" / "SMPLX_NEUTRAL.npz")
     monkeypatch.setenv("MOVER_BODY_MODELS", str(tmp_path / "models"))

@@ -11,8 +11,7 @@ from figures import ARMS_DOWN, SEATED, STRIDE, people, pose, turned
 
 from mover.bodies.parts import parts_of
 from mover.core.types import Bodies, Camera
-from mover.geometry.camera import pitch_roll, tilted
-from mover.stages.camera.align_camera import AlignInputs, align_camera
+from mover.geometry.camera import tilted
 from mover.stages.camera.find_foot_contacts import (
     FootContactInputs,
     find_foot_contacts,
@@ -73,18 +72,6 @@ def test_only_the_soles_of_standing_people_are_found_though_others_are_nearer_th
     assert sorted(soles.frame.unique().tolist()) == list(range(15, 30))
     assert soles.frame.bincount()[15:].unique().tolist() == [4]
     assert heights_of(soles).abs().max() < 0.015
-
-
-def test_the_camera_is_levelled_by_the_standing_feet_of_a_sitter():
-    filmed_ = filmed(at(SEATED, SPOTS, height=0.1), at(ARMS_DOWN, SPOTS))
-    camera = camera_off(3.0, -3.0)
-    found = align_camera(AlignInputs(soles_of(filmed_, camera), camera, None, None))
-    again = soles_of(filmed_, found.camera)  # now the truly lowest points of the soles are known
-    found = align_camera(AlignInputs(again, camera, None, None))
-    pitch, roll = pitch_roll(found.camera.R_cam_world)
-    assert abs(math.degrees(float(pitch) - PITCH)) < 0.1
-    assert abs(math.degrees(float(roll) - ROLL)) < 0.1
-    assert abs(found.ground - GROUND) < 0.005
 
 
 def test_the_standing_leg_of_a_stride_carries_and_the_lifted_one_does_not():

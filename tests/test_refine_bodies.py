@@ -321,14 +321,6 @@ QUICK = RefineBodiesConfig(method=Adam(25, 0.01, 0.003, beta2=0.98), rounds=4)
 
 
 @pytest.mark.slow
-def test_a_body_sunk_in_the_floor_comes_out():
-    bodies = still_people(ARMS_DOWN, 3, lift=-0.05)
-    found = refine_bodies(room_with(bodies), None, QUICK).bodies
-    assert lowest(bodies).max() < -0.045
-    assert lowest(found).abs().max() < 0.015
-
-
-@pytest.mark.slow
 def test_a_floating_sitter_sits():
     sitter = still_people(SEATED, 3)
     height = float(seat_gap(sitter, 0.0)[0]) - 0.06
