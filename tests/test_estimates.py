@@ -8,6 +8,7 @@ import torch
 
 from mover.bodies.parts import parts_of
 from mover.bodies.skinning import open_body, zero_pose
+from mover.core.records import rows_of
 from mover.core.types import Bodies
 from mover.pipeline.estimates import lens_and_scale, odd_sizes, odd_statures, poor_fits
 
@@ -46,6 +47,8 @@ def standing(scale: float) -> Bodies:
 
 def test_only_a_stature_beyond_the_population_is_named():
     usual = standing(1.0)
+    none = rows_of(usual, torch.zeros(2, dtype=torch.bool))
+    assert odd_statures(none, parts_of(usual)) == ()
     height = float(usual.verts[0, :, 1].max() - usual.verts[0, :, 1].min())
     for tall, count in ((1.90, 0), (1.96, 1), (1.45, 0), (1.40, 1)):
         bodies = standing(tall / height)

@@ -49,6 +49,8 @@ def lens_and_scale(camera: Camera, lens: float | None, size: float | None) -> tu
 
 def odd_statures(bodies: Bodies, parts: BodyParts) -> tuple[str, ...]:
     """People in the world who are taller or shorter than `ODD` deviations from adults allow."""
+    if not len(bodies.frame):
+        return ()
     up = torch.tensor([0.0, 1.0, 0.0]).to(bodies.verts)
     stands = straight_legs(bodies, parts, up).all(1)
     found: list[str] = []

@@ -40,7 +40,9 @@ def unfurnished(capture: Capture, people: Located | None) -> Room:
     camera = capture.scene.camera if found is None else found.camera
     ground = capture.scene.ground if found is None else found.ground
     scene = Scene(camera, ground, ())
-    warnings = (*capture.warnings, *(() if people is None else people.warnings))
+    warnings = capture.warnings
+    if people is not None:
+        warnings += (*people.warnings, *_odd_people(people, camera))
     return Room(
         scene=scene, initial=capture.scene, image_only=scene,
         bodies=None if people is None else to_world(people.bodies, camera),
