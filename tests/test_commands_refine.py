@@ -86,7 +86,7 @@ def test_refine_lifts_people_out_of_the_floor_and_says_how_wrong_they_were(tmp_p
 @pytest.mark.slow
 def test_without_the_floor_no_one_is_lifted(tmp_path):
     out = finished(tmp_path / "out", standing(FAR))
-    assert cli.run_command("refine", [str(out), "--no-camgp", "--rounds", "1"]) == 0
+    assert cli.run_command("refine", [str(out), "--without", "camgp", "--rounds", "1"]) == 0
     assert lowest(read_bodies(out / "refined" / "bodies.npz")).max() < -0.02
 
 

@@ -1,7 +1,7 @@
 """Refine the people of a finished result with its room; find the contacts of bodies."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -133,11 +133,14 @@ def find_posa(
     return posa_contacts(load_posa(weights, meshes), bodies, samples)
 
 
-def switched(config: RefineBodiesConfig, off: Mapping[str, bool]) -> RefineBodiesConfig:
-    """The settings without some of the evidence: camgp, sdf, contact, order, masks."""
-    terms = {
-        "camgp": ("under", "stand", "lock"), "sdf": ("sink",), "contact": ("touch",),
-        "order": ("order",), "masks": ("outline",),
-    }  # fmt: skip
-    zero: dict[str, Any] = {t: 0.0 for name, is_off in off.items() if is_off for t in terms[name]}
+TERMS = {
+    "camgp": ("under", "stand", "lock"), "sdf": ("sink",), "contact": ("touch",),
+    "order": ("order",), "masks": ("outline",),
+}  # fmt: skip
+"""The terms of each kind of evidence."""
+
+
+def without(config: RefineBodiesConfig, evidence: Sequence[str]) -> RefineBodiesConfig:
+    """The settings without some of the evidence of `TERMS`."""
+    zero: dict[str, Any] = {term: 0.0 for name in evidence for term in TERMS[name]}
     return replace(config, weights=replace(config.weights, **zero))

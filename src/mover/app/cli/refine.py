@@ -25,16 +25,10 @@ class RefineArgs:
     """Folder of its capture, for masks and contacts; by default where run.json says."""
     truth: Path | None = None
     """Folder with the true people: their errors are measured as well."""
-    camgp: bool = True
-    """Use the floor: no person under it, soles at rest on it."""
-    sdf: bool = True
-    """Use the furniture's signed distance: no person inside it."""
-    contact: bool = True
-    """Use contacts: seats, backs and hands at rest lie on furniture."""
-    order: bool = True
-    """Use who hides whom."""
-    masks: bool = True
-    """Use the outlines of people's masks."""
+    without: tuple[Literal["camgp", "sdf", "contact", "order", "masks"], ...] = ()
+    """Evidence to leave out. camgp: no person under the floor, soles at rest on it; sdf: no person
+    inside furniture; contact: seats, backs and hands at rest lie on it; order: what hides what;
+    masks: the outlines of people's masks."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +65,11 @@ def refine(arguments: Sequence[str]) -> None:
     import torch
 
     from mover.app.cli.progress import Bar
-    from mover.pipeline.refine import measure_people, refine_result, switched
+    from mover.pipeline.refine import measure_people, refine_result, without
 
     torch.set_num_threads(1)
-    off = {"camgp": not args.camgp, "sdf": not args.sdf, "contact": not args.contact}
-    off |= {"order": not args.order, "masks": not args.masks}
     with Bar() as bar:
-        found = refine_result(args.out, switched(config, off), args.capture, bar)
+        found = refine_result(args.out, without(config, args.without), args.capture, bar)
     how = "rigidly" if found.bodies.pose is None else "with their pose"
     way = f"moved by {1000 * float(found.shift.norm(dim=-1).median()):.0f} mm (median)"
     file = args.out / "refined" / "bodies.npz"
