@@ -63,25 +63,12 @@ def capsule_people(
 
 def _unit_capsule() -> tuple[Matrix, NDArray[np.int64]]:
     """Points (x, y, end, bulge): a circle's place, which end, how far beyond it; and triangles."""
-    angles = np.arange(SIDES) * 2 * np.pi / SIDES
-    tilts = np.linspace(0, np.pi / 2, RINGS + 1)[:-1]
-    rows: list[list[float]] = []
-    rings = [(0.0, -t) for t in reversed(tilts)] + [(1.0, t) for t in tilts]
-    for end, tilt in rings:
-        c, s = np.cos(tilt), np.sin(tilt)
-        rows += [[c * np.cos(a), c * np.sin(a), end, s] for a in angles.tolist()]
-    poles = len(rows)
-    rows += [[0.0, 0.0, 0.0, -1.0], [0.0, 0.0, 1.0, 1.0]]
-    faces: list[tuple[int, int, int]] = []
-    for ring in range(len(rings) - 1):
-        for i in range(SIDES):
-            a, b = ring * SIDES + i, ring * SIDES + (i + 1) % SIDES
-            faces += [(a, b, b + SIDES), (a, b + SIDES, a + SIDES)]
-    last = (len(rings) - 1) * SIDES
-    for i in range(SIDES):
-        j = (i + 1) % SIDES
-        faces += [(j, i, poles), (last + i, last + j, poles + 1)]
-    return np.array(rows), np.array(faces)
+    import trimesh
+
+    shape = trimesh.creation.capsule(height=1.0, radius=1.0, count=[2 * RINGS, SIDES])
+    x, y, z = (shape.vertices - shape.bounds.mean(0)).T
+    end = (z > 0).astype(float)
+    return np.stack([x, y, end, z - (end - 0.5)], axis=-1), np.asarray(shape.faces, np.int64)
 
 
 def _limbs(start: Matrix, end: Matrix, radius: float, unit: Matrix) -> Matrix:
