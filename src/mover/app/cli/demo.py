@@ -7,7 +7,6 @@ from pathlib import Path
 from mover.app.cli import say
 from mover.app.cli.config import Device, parsed, preset_named
 from mover.app.cli.run import reconstruct_into
-from mover.pipeline.presets import PRESETS
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class DemoArgs:
 def demo(arguments: Sequence[str]) -> None:
     """`mover demo`."""
     args = parsed(DemoArgs, "mover demo", arguments)
-    config = preset_named(args.preset, PRESETS)
+    config = preset_named(args.preset)
     from mover.app.demo import write_demo
     from mover.app.report.page import write_report
     from mover.app.results import Origin, report_of
