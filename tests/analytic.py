@@ -110,7 +110,8 @@ def given_at(layout):
     one = torch.ones_like(layout.yaw)
     return Given(
         layout.t_world_object.norm(dim=-1), layout.yaw, 0.6 * one, 5 * one, layout.yaw,
-        torch.zeros_like(layout.log_scale), 60 * torch.ones_like(layout.log_scale), 1.5 * one,
+        torch.zeros_like(layout.log_scale), 60 * torch.ones_like(layout.log_scale),
+        torch.zeros_like(layout.log_scale), 1.5 * one,
     )  # fmt: skip
 
 
@@ -142,6 +143,7 @@ def humans_at(objects, layout, camera, image):
         torch.tensor([6.0, 6.0]).to(near),
         shares_of(weight),
         heading,
+        torch.tensor([False, False]),
     )
     return HumanCues(DepthRange(near, far, area), BodySpace(volume), touches)
 

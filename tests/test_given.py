@@ -15,7 +15,15 @@ from mover.core.types import Bodies, Camera, Heading, Layout, Mesh
 from mover.energy.human_terms import ContactPoints
 from mover.energy.image_terms import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.prior_terms import AWAY, Given, given_term
-from mover.furniture.library import PIECES, SIZES, STANDARD, STYLES, canonical, make_piece
+from mover.furniture.library import (
+    MORE_STYLES,
+    PIECES,
+    SIZES,
+    STANDARD,
+    STYLES,
+    canonical,
+    make_piece,
+)
 from mover.geometry.camera import tilted, to_camera, to_world
 from mover.geometry.mesh import box
 from mover.geometry.placement import larger
@@ -149,16 +157,28 @@ def test_shapes_are_held_to_firm_standards_of_the_meaning_that_fits_their_size()
     kinds = ("bed", "chair", "desk", "nightstand", "aquarium", "table", "table")
     heights = torch.tensor([0.5, 0.5, 0.5, 0.5, 0.5, 0.65, 0.4])
     sizes = torch.stack([torch.full((7,), 1.4), heights, torch.full((7,), 1.15)], -1)
-    standard, precision = sizes_of_shapes(kinds, sizes)
-    meanings = (*kinds[:-1], "coffee table")  # COCO's dining table, as high as one
+    standard, precision, slack = sizes_of_shapes(kinds, sizes)
+    meanings = ("bed", "stool", *kinds[2:-1], "coffee table")  # COCO's words, as high as one
+    known = replace(unplaced(7), standard=standard, precision=precision, slack=slack)
+    at = replace(somewhere(7), log_scale=torch.zeros(7, 3))
     for i, kind in enumerate(meanings):
         for axis, usual in enumerate(STANDARD.get(kind, (None,) * 3)):
-            known = usual is not None and usual[1] <= FIRM
-            off = math.log(usual[0] / float(sizes[i, axis])) if known else 0.0
-            assert float(standard[i, axis]) == pytest.approx(off, abs=1e-5)
-            sharp = usual[1] ** -2 if known else 0.0
-            assert float(precision[i, axis]) == pytest.approx(sharp, rel=1e-5)
-    assert (precision > 0).sum(1).tolist() == [1, 0, 1, 0, 0, 1, 0]
+            if usual is not None and usual[1] <= FIRM:
+                off = math.log(usual[0] / float(sizes[i, axis]))
+                assert float(standard[i, axis]) == pytest.approx(off, abs=1e-5)
+                assert float(precision[i, axis]) == pytest.approx(usual[1] ** -2, rel=1e-5)
+                assert float(slack[i, axis]) == 0
+                continue
+            for share, limit in zip((-1, 1), SIZES.get(kind, ((0.1, 9.0),) * 3)[axis], strict=True):
+                end = math.log(limit / float(sizes[i, axis])) * share
+                costs = []  # at the limit of the class, or as large as the shape, and beyond
+                for beyond in (0.0, 0.3):
+                    scale = torch.zeros(7, 3)
+                    scale[i] = standard[i]
+                    scale[i, axis] = share * (max(end, 0.0) + beyond)
+                    costs.append(float(given_term(replace(at, log_scale=scale), known)[i]))
+                assert costs[0] == pytest.approx(0, abs=1e-3)
+                assert (costs[1] > 3) == (kind in SIZES)
 
 
 def test_of_what_was_not_placed_sizes_cost_as_a_student_t_and_places_nothing() -> None:
@@ -175,7 +195,7 @@ def test_of_what_was_not_placed_sizes_cost_as_a_student_t_and_places_nothing() -
 def test_standard_sizes_pull_what_they_know_and_leave_the_rest() -> None:
     sizes = [(1.2, 0.60, 0.8), (0.45, 0.95, 0.5), (1.0, 1.0, 1.0)]
     objects = boxes_of(("table", "chair", "aquarium"), sizes)
-    standard, precision = standard_sizes(objects)
+    standard, precision, _ = standard_sizes(objects)
     assert float(standard[0, 1]) == pytest.approx(math.log(0.74 / 0.60), abs=1e-5)
     assert float(standard[1].abs().max()) < 0.1
     assert float(precision[2].max()) == 0 < float(precision[0, 1])
@@ -198,7 +218,7 @@ def test_standard_sizes_pull_what_they_know_and_leave_the_rest() -> None:
 def test_the_standard_of_another_class_of_the_same_name_counts_where_its_own_is_contradicted(
     category: str, size: tuple[float, float, float], expected: float | None
 ) -> None:
-    standard, precision = standard_sizes(boxes_of((category,), [size]))
+    standard, precision, _ = standard_sizes(boxes_of((category,), [size]))
     if expected is None:
         assert float(precision[0, 1]) == 0
     else:
@@ -288,7 +308,7 @@ def test_of_what_people_use_a_guess_says_less_beside_them() -> None:
     touched = ContactPoints(
         object_of=torch.tensor([1]), points=torch.zeros(1, 4, 2, 3),
         weight=torch.ones(1, 4, 2), bodies=torch.ones(1), share=torch.ones(1, 4),
-        heading=torch.zeros(1, 2),
+        heading=torch.zeros(1, 2), across=torch.tensor([False]),
     )  # fmt: skip
     trust = torch.full((3,), 0.25)
     assert lighter_where_used(given, trust, touched).weight.tolist() == [4.0, 1.0, 4.0]
@@ -309,7 +329,7 @@ def test_prior_weights_count_for_positions_and_sizes_but_not_beyond_one_for_yaws
 
 @pytest.mark.parametrize("name", PIECES)
 def test_feet_that_stand_level_stay_as_they_are(name: str) -> None:
-    for style in range(STYLES[name]):
+    for style in range(STYLES[name] + MORE_STYLES.get(name, 0)):
         mesh = make_piece(name, np.random.default_rng(style), style).mesh
         assert levelled(mesh) is mesh
 

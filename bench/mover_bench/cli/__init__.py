@@ -6,8 +6,8 @@ from mover.app.cli import say
 from mover.app.cli.config import parsed
 from mover_bench.experiment.args import ExperimentArgs, TableArgs
 
-REAL = "i3db"
-"""The set of real recordings; all others are known rooms."""
+REAL = ("i3db", "clips")
+"""The sets of real recordings; all others are known rooms."""
 
 
 def experiment(arguments: Sequence[str]) -> None:
@@ -15,10 +15,12 @@ def experiment(arguments: Sequence[str]) -> None:
     args = parsed(ExperimentArgs, "mover experiment", arguments)
     from mover.app.cli.progress import Bar
     from mover_bench.experiment.run import run_experiment
+    from mover_bench.real.clips import judge_clips
     from mover_bench.real.judge import judge_i3db
 
+    judges = dict(zip(REAL, (judge_i3db, judge_clips), strict=True))
     with Bar() as bar:
-        summary = (judge_i3db if args.set == REAL else run_experiment)(args, bar)
+        summary = judges.get(args.set, run_experiment)(args, bar)
     say(f"{summary.read_text()}\nsummary: {summary}")
 
 

@@ -25,10 +25,11 @@ class ExperimentArgs:
     workers: Workers = 0
     """How many rooms are processed at once; 0: as many as there are cores."""
     set: str = "rooms"
-    """Set of rooms, see docs/rooms.md; or i3db, with --source."""
+    """Set of rooms, see docs/rooms.md; or i3db or clips, with --source."""
     source: Path | None = None
     """For the set i3db: the folder i3DB of amonszpart/iMapper. Its scenes are reconstructed with
-    the first variant, from library furniture and from the true shapes."""
+    the first variant, from library furniture and from the true shapes. For clips: folders with
+    video.mp4 and furniture.json (outlines), of which `mover video` makes rooms."""
 
 
 Table = Literal["prox", "prox-quantitative", "pigraphs"]

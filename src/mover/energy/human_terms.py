@@ -10,6 +10,8 @@ r"""Terms of Eq. 1 that people say of the room: depth order, free space, contact
 Sec. 3.1 and 3.2 of the paper: as printed (`paper`), and normalised and robust (`robust`).
 """
 
+from dataclasses import fields
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -226,6 +228,8 @@ class ContactPoints:
     heading: Float[Tensor, "touched 2"]
     """Mean direction (x, z) that its sitters face, or that a person lying on a bed stretches to
     from the neck to the hips, a unit vector; zero where it is not known."""
+    across: Bool[Tensor, " touched"]
+    """Whether it is known up to the side instead: the front is at right angles to it."""
 
 
 def shares_of(weight: Float[Tensor, "touched 4 points"]) -> Float[Tensor, "touched 4"]:
@@ -241,8 +245,8 @@ def some_touches(touches: ContactPoints, index: Int[Tensor, " few"], count: int)
     row[touches.object_of] = torch.arange(len(touches.object_of)).to(index)
     touched = torch.nonzero(row[index] >= 0)[:, 0]
     few = row[index[touched]]
-    rest = {k: getattr(touches, k)[few] for k in ("points", "weight", "bodies", "share", "heading")}
-    return ContactPoints(touched, **rest)
+    rest = [f.name for f in fields(touches) if f.name != "object_of"]
+    return ContactPoints(touched, **{name: getattr(touches, name)[few] for name in rest})
 
 
 def contact_distance(
@@ -289,11 +293,15 @@ def contact_term(
 
 
 def heading_term(layout: Layout, touches: ContactPoints) -> Float[Tensor, "*starts objects"]:
-    """Seats face as their sitters, beds as people lying: 1 - cos of the angle (`robust` only)."""
+    """Seats face as their sitters, beds as people lying: 1 - cos of the angle (`robust` only).
+
+    People on the edge of a bed sit across its long side: cos^2, whichever side it is.
+    """
     yaw = layout.yaw[..., touches.object_of]
     facing = yaw.sin() * touches.heading[:, 0] + yaw.cos() * touches.heading[:, 1]
     seated = touches.heading.square().sum(-1) > 0
-    cost = torch.where(seated, 1 - facing, torch.zeros_like(facing))
+    off = torch.where(touches.across, facing.square(), 1 - facing)
+    cost = torch.where(seated, off, torch.zeros_like(facing))
     return torch.zeros_like(layout.yaw).index_add(-1, touches.object_of, cost)
 
 

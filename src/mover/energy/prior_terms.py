@@ -116,6 +116,8 @@ class Given:
     """Standard sizes, as logarithms of factors on those of the mesh."""
     precision: Float[Tensor, "objects 3"]
     """How well they are known: one over the variance; 0 where there is no standard."""
+    slack: Float[Tensor, "objects 3"]
+    """By how much (of the logarithm) every size about the standard one is as usual."""
     weight: Float[Tensor, " objects"]
     """How little the image constrains it: 1 is usual, 0 leaves it to the image."""
     placed: bool = True
@@ -168,7 +170,8 @@ def _axis(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:
 
 def _off_standard(layout: Layout, given: Given) -> Float[Tensor, "*starts objects 3"]:
     """Squared standard deviations from the standard sizes."""
-    return given.precision * (layout.log_scale - given.standard).square()
+    off = ((layout.log_scale - given.standard).abs() - given.slack).relu()
+    return given.precision * off.square()
 
 
 def _away(layout: Layout, given: Given) -> Float[Tensor, "*starts objects"]:

@@ -23,7 +23,7 @@ def catalogue(category: str) -> tuple[Furniture, ...]:
         make_piece(name, np.random.default_rng(seed), style)
         for name in PIECES
         if canonical(name) == kind
-        for style in range(STYLES[name])
+        for style in range(STYLES[name] + MORE_STYLES.get(name, 0))
         for seed in range(SEEDS)
     )
 
@@ -73,7 +73,10 @@ STYLES: dict[str, int] = {
     "single bed": 3, "double bed": 3, "table": 4, "desk": 3, "coffee table": 3, "shelf": 4,
     "cabinet": 3, "wardrobe": 2, "nightstand": 3, "floor lamp": 3,
 }  # fmt: skip
-"""Number of designs of each piece."""
+"""Number of designs of each piece,"""
+
+MORE_STYLES = {"single bed": 2, "double bed": 2}
+"""and of those that stand for detected furniture alone: known rooms have none of them."""
 
 SIZES: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     "chair": ((0.40, 0.62), (0.80, 1.02), (0.40, 0.66)),
@@ -82,7 +85,7 @@ SIZES: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, fl
     "stool": ((0.30, 0.55), (0.40, 0.50), (0.30, 0.55)),
     "bench": ((0.90, 1.60), (0.40, 0.50), (0.32, 0.50)),
     "sofa": ((0.65, 3.40), (0.70, 0.92), (0.70, 1.60)),
-    "bed": ((0.85, 1.95), (0.42, 1.20), (1.90, 2.25)),
+    "bed": ((0.85, 1.95), (0.42, 1.25), (1.80, 2.25)),
     "table": ((0.80, 1.80), (0.68, 0.80), (0.70, 1.25)),
     "desk": ((1.00, 1.60), (0.68, 0.80), (0.55, 0.80)),
     "coffee table": ((0.60, 1.30), (0.32, 0.48), (0.48, 0.95)),
@@ -278,8 +281,9 @@ def make_piece(name: str, rng: np.random.Generator, style: int | None = None) ->
         raise ValueError(f"no piece {name!r}, expected one of {sorted(PIECES)}")
     if style is None:
         style = int(rng.integers(STYLES[name]))
-    if not 0 <= style < STYLES[name]:
-        raise ValueError(f"{name} has no style {style}, expected 0 to {STYLES[name] - 1}")
+    count = STYLES[name] + MORE_STYLES.get(name, 0)
+    if not 0 <= style < count:
+        raise ValueError(f"{name} has no style {style}, expected 0 to {count - 1}")
     return PIECES[name](rng, style)
 
 

@@ -78,7 +78,10 @@ def double_bed(rng: np.random.Generator, style: int) -> Furniture:
 def _bed(
     category: str, rng: np.random.Generator, style: int, width: float, pillows: int
 ) -> Furniture:
-    """0 box with headboard, 1 frame with head and foot boards, 2 low platform."""
+    """0 box with headboard, 1 frame with head and foot boards, 2 low platform.
+
+    For detected beds only: 3 planks on legs, 4 head and foot boards of one piece with high legs.
+    """
     length, h = draw(rng, 1.96, 2.05), draw(rng, 0.44, 0.52)
     x, z = width / 2, length / 2
     if style == 2:
@@ -87,6 +90,9 @@ def _bed(
     mattress = block((-x, x), (h - 0.2, h), (-z, z), 0.03)
     frame = block((-x - edge, x + edge), (under, h - 0.14), (-z - edge, z + edge), 0.008)
     parts = [mattress, frame]
+    if style >= 3:
+        length = draw(rng, 1.8, 2.05)
+        return _open_bed(category, (width, h, length), style == 4, draw(rng, 0.8, 1.1), pillows)
     if style > 0:
         parts += posts(pair(x - 0.04), pair(z - 0.04), (0, h - 0.15), 0.04)
     board = draw(rng, 0.95, 1.15)
@@ -99,6 +105,22 @@ def _bed(
         parts += _slats((-x - edge, x + edge), (h - 0.15, h + 0.14), ahead)
     parts += _pillows(x, z, h, pillows)
     return finish(category, style, parts, Seat(h, (-x, x), (-z, z)), top=h)
+
+
+def _open_bed(
+    category: str, size: tuple[float, float, float], boards: bool, high: float, pillows: int
+) -> Furniture:
+    """A thin mattress on a thin frame, with nothing but legs below."""
+    width, h, length = size
+    x, z = width / 2, length / 2
+    parts = [block((-x, x), (h - 0.1, h), (-z, z), 0.03)]
+    parts.append(block((-x, x), (h - 0.18, h - 0.08), (-z, z), 0.008))
+    parts += posts(pair(x - 0.04), pair(z - 0.04), (0, h - 0.1), 0.035)
+    for k, top in ((-z, high), (z, 0.85 * high)) if boards else ():
+        parts.append(block((-x, x), (h - 0.15, top), (k - 0.03, k + 0.03), 0.01))
+        parts += posts(pair(x - 0.03), (k, k), (0, top), 0.03)
+    parts += _pillows(x, z, h, pillows)
+    return finish(category, 3 + boards, parts, Seat(h, (-x, x), (-z, z)), top=h)
 
 
 def _pillows(x: float, z: float, h: float, count: int) -> list[Part]:

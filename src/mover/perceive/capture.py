@@ -42,6 +42,7 @@ from mover.perceive.mediapipe import (
     find_poses,
     pose_inputs,
     poses_to_keypoints,
+    without_furniture,
 )
 from mover.perceive.networks import (
     DetectInputs,
@@ -54,9 +55,12 @@ from mover.perceive.networks import (
     link_people,
 )
 from mover.perceive.own import Own, own_keypoints, own_masks, own_objects, same_people
-from mover.perceive.reference import clip_of_clean, detections_in, hidden_mask, reference_of
+from mover.perceive.reference import Clean, clip_of_clean, detections_in, hidden_mask, reference_of
 from mover.perceive.steady import Drift, SteadyInputs, find_drift, steady_frames, warnings_of
 from mover.perceive.video import Clip, TakeInputs, stamp_of, take_frames
+from mover.stages.camera.find_lens import LensInputs, find_lens, zoomed
+from mover.stages.camera.room_lines import find_segments
+from mover.stages.config import LensConfig
 
 log = logging.getLogger(__name__)
 CHUNK = 50  # frames whose detections are kept together
@@ -67,6 +71,7 @@ FULL_FRAME = math.hypot(36, 24)  # [mm], diagonal to which "equivalent" focal le
 SAME_FORMAT = 0.01  # difference of two ratios of width and height
 GUESS = "perceived/guess.json"  # the camera before a first scene, and as it left it
 SAME_TILT = 1e-6  # elements of a rotation that was read back
+TILT = math.radians(8)  # of a camera on a shelf, before anything is seen of it
 USUAL = 60.0  # [degrees], horizontal field of view of phones held level, where nothing is known
 EXIF_IFD, FOCAL_35 = 0x8769, 0xA405
 Say = Callable[[str], None]
@@ -104,11 +109,25 @@ def perceive(
     at, text = lens_of((clip.width, clip.height), video.lens)
     if text is not None:
         say(f"warning: {text}")
-    camera = camera_of(at)
-    known = {k: at.value[k] for k in ("height", "focal_spread") if k in at.value}
-    write_json({**camera_to_json(camera), **known}, out / "camera.json")
-    tracks, joints = people_of_clip(clip, drift, video.own, config, run, say, finders)
+    camera, spread = camera_of(at), at.value.get("focal_spread")
+    tracks, joints, poses = people_of_clip(clip, drift, video.own, config, run, say, finders)
     clean = reference_of(clip, drift, tracks)
+    lacking: InputError | None = None
+    try:
+        if video.own.objects is not None:
+            objects = own_objects(video.own, clip, drift)
+        else:
+            objects = furniture_in(clean, camera, config, run, finders, out)
+    except InputError as error:  # all else is written
+        objects, lacking = None, error
+        (out / "objects.json").unlink(missing_ok=True)  # of another video
+    if objects is not None and poses is not None:
+        furniture = detections_of(At(objects, "objects.json"), camera, log.warning)
+        outlines = [decode(d.mask, 0) for d in furniture if d.mask is not None]
+        if outlines:
+            less = without_furniture(poses, torch.stack(outlines).any(0))
+            tracks = replace(tracks, masks=less.masks)
+        clean = reference_of(clip, drift, tracks)
     unseen = 100 * float(clean.hidden.float().mean())
     count = len(tracks.person.unique())
     say(
@@ -116,6 +135,10 @@ def perceive(
         "without a person"
     )
     write_image(clean.picture, out / "reference.png")
+    camera, spread = lens_by_lines(camera, spread, clean, say)
+    known = {"height": at.value.get("height"), "focal_spread": spread}
+    known = {name: value for name, value in known.items() if value is not None}
+    write_json({**camera_to_json(camera), **known}, out / "camera.json")
     people = None
     if tracks.masks.counts:
         people = People(tracks.masks, clip.numbers[tracks.frame], tracks.person, {})
@@ -125,19 +148,8 @@ def perceive(
         write_keypoints(replace(joints, frame=clip.numbers[joints.frame]), out / "keypoints.npz")
     else:
         (out / "keypoints.npz").unlink(missing_ok=True)  # of another video
-    if video.own.objects is not None:
-        write_json(own_objects(video.own, clip, drift), out / "objects.json")
-        return
-    clean_clip = clip_of_clean(clean, out / "perceived" / "reference")
-    try:
-        found = run.stage(finders.instances, DetectInputs(clean_clip, (0,)), config)
-    except InputError as error:
-        (out / "objects.json").unlink(missing_ok=True)  # of another video
-        raise InputError(
-            f"furniture is not known yet: outline it in {out / 'reference.png'} (labelme, COCO, or "
-            f"boxes alone), and add --objects FILE to the command; or a network finds it: {error}"
-        ) from error
-    objects = detections_to_json(detections_in(found), camera, "reference.png")
+    if lacking is not None:
+        raise lacking
     write_json(objects, out / "objects.json")
 
 
@@ -159,15 +171,19 @@ def steady_clip(
 
 def people_of_clip(
     clip: Clip, drift: Drift, own: Own, config: PerceiveConfig, run: Run, say: Say, finders: Finders
-) -> tuple[Tracks, Keypoints | None]:
-    """People's masks and joints in all frames: those of the user, of MediaPipe, or of networks."""
+) -> tuple[Tracks, Keypoints | None, Poses | None]:
+    """People's masks and joints in all frames: those of the user, of MediaPipe, or of networks.
+
+    Returns:
+        Masks, joints, and both as MediaPipe gives them where the masks are its own.
+    """
     joints = own_keypoints(own, clip, drift, say)
     poses = None
     if own.mediapipe:
         poses = run.stage(finders.poses, pose_inputs(clip), None)
         joints = poses_to_keypoints(poses, clip.fps)
     if own.masks is not None:
-        tracks = own_masks(own.masks, clip, drift, say)
+        tracks, poses = own_masks(own.masks, clip, drift, say), None
     elif poses is not None:
         tracks = Tracks(poses.masks, poses.frame, poses.person)
     else:
@@ -179,7 +195,47 @@ def people_of_clip(
         joints = run.stage(finders.joints, JointsInputs(clip, tracks), config.models)
     if joints is not None and not (own.keypoints is None and own.masks is None):
         joints = same_people(joints, tracks)
-    return tracks, joints
+    return tracks, joints, poses
+
+
+def furniture_in(
+    clean: Clean, camera: Camera, config: PerceiveConfig, run: Run, finders: Finders, out: Path
+) -> dict[str, Any]:
+    """The fields of objects.json as a network finds furniture in the clean picture.
+
+    Raises:
+        InputError: If the network is not there.
+    """
+    clip = clip_of_clean(clean, out / "perceived" / "reference")
+    try:
+        found = run.stage(finders.instances, DetectInputs(clip, (0,)), config)
+    except InputError as error:
+        raise InputError(
+            f"furniture is not known yet: outline it in {out / 'reference.png'} (labelme, COCO, or "
+            f"boxes alone), and add --objects FILE to the command; or a network finds it: {error}"
+        ) from error
+    return detections_to_json(detections_in(found), camera, "reference.png")
+
+
+def lens_by_lines(
+    camera: Camera, spread: float | None, clean: Clean, say: Say
+) -> tuple[Camera, float | None]:
+    """The camera with the focal length of the picture's own lines, if the given one is a guess.
+
+    Bodies are fitted under it, so it counts before they are. The same lines are not weighted a
+    second time in the room: a focal length that they determine counts as measured.
+    """
+    if not spread:
+        return camera, spread
+    segments = find_segments(clean.picture, clean.hidden, camera.K[:2, 2])
+    found = find_lens(LensInputs(segments, camera, spread, TILT), LensConfig())
+    if found.zoom == 1:
+        return camera, spread
+    say(
+        f"lens: the lines of the picture show a focal length {100 * (found.zoom - 1):+.1f} ± "
+        f"{100 * found.spread:.1f} % of the guess; it is taken (--camera FILE keeps a measured one)"
+    )
+    return zoomed(camera, found.zoom), 0.0
 
 
 def lens_of(size: tuple[int, int], lens: Lens) -> tuple[At, str | None]:

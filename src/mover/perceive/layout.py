@@ -283,12 +283,13 @@ def _cues_of(picture: Picture, cues: ImageCues, chosen: list[tuple[int, ShapeCho
     things = torch.tensor([thing for thing, _ in chosen])
     kinds = [canonical(picture.detections[thing].category) for thing, _ in chosen]
     sizes = torch.tensor([shape.size for _, shape in chosen])
-    standard, precision = sizes_of_shapes(kinds, sizes)
+    standard, precision, slack = sizes_of_shapes(kinds, sizes)
     known = rows_of(axes_of(picture), things, "objects")
+    known = replace(known, standard=standard, precision=precision, slack=slack)
     views = Crops(cues.views.K[things], cues.views.height, cues.views.width)
     return ImageCues(
         cues.boxes[things], cues.sides[things], views, cues.masks[things], cues.keep[things],
-        cues.trust[things], given=replace(known, standard=standard, precision=precision),
+        cues.trust[things], given=known,
     )  # fmt: skip
 
 

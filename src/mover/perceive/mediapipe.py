@@ -13,6 +13,7 @@ are counted as there: whole numbers in a crop are whole numbers in the picture.
 
 import hashlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
@@ -20,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -28,7 +29,7 @@ from mover.core.errors import InputError
 from mover.core.observe import Observer, Step, silent
 from mover.core.records import record
 from mover.core.types import Keypoints, Masks
-from mover.geometry.rle import encode
+from mover.geometry.rle import decode, encode
 from mover.io.people.found import followed
 from mover.perceive import weights
 from mover.perceive.needs import install
@@ -234,6 +235,43 @@ def refined(places: Array, maps: Array) -> Array:
                            likely.sum(1) @ np.arange(top, top + near.shape[0])])  # fmt: skip
             found[k] = at / likely.sum() * SIZES[1] / cells
     return found
+
+
+LIMBS = (
+    ((11, 13, 15), 0.045), ((12, 14, 16), 0.045), ((23, 25), 0.065), ((24, 26), 0.065),
+    ((25, 27), 0.05), ((26, 28), 0.05), ((27, 29, 31), 0.04), ((28, 30, 32), 0.04),
+    ((15, 19), 0.05), ((16, 20), 0.05), ((7, 0, 8), 0.085), ((11, 12, 24, 23, 11), 0.055),
+)  # fmt: skip
+"""Landmarks along limbs, and how far skin and clothes reach around them [of the height]."""
+BONES = ((11, 23, 0.3), (12, 24, 0.3), (23, 25, 0.245), (24, 26, 0.245), (25, 27, 0.246),
+         (26, 28, 0.246))  # fmt: skip
+"""Pairs of landmarks, and how far apart they are [of the height] (Drillis & Contini 1966)."""
+
+
+def without_furniture(poses: Poses, furniture: Bool[Tensor, "h w"], margin: float = 1.25) -> Poses:
+    """The masks without what they swallow of the furniture: all of it that no limb is near to.
+
+    Args:
+        poses: People in frames.
+        furniture: Where furniture is seen in the clean picture.
+        margin: On how far skin and clothes reach.
+    """
+    import cv2
+
+    kept = list[bytes]()
+    for row, points in enumerate(poses.points.double().numpy()):
+        tall = max(np.linalg.norm(points[a] - points[b]) / share for a, b, share in BONES)
+        near = np.zeros(furniture.shape, np.uint8)
+        for chain, reach in LIMBS:
+            line = points[list(chain)].round().astype(np.int32)[None]
+            width = max(1, round(2 * margin * reach * tall))
+            cv2.polylines(near, line, isClosed=False, color=1, thickness=width)
+            if chain[0] == chain[-1]:
+                cv2.fillPoly(near, line, 1)
+        mask = decode(poses.masks, row)
+        less = mask & ~(furniture & ~torch.from_numpy(near).bool())
+        kept.append(encode(less if bool(less.any()) else mask))
+    return replace(poses, masks=replace(poses.masks, counts=tuple(kept)))
 
 
 def _shared(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:

@@ -4,13 +4,15 @@ A part goes to an object by the overlap of its projection with the objects' mask
 distance in 3D: `contact_association` has the rules of both presets (Sec. 3.1).
 """
 
+import math
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from mover.bodies.parts import BodyParts
-from mover.bodies.posture import at, headings, landmarks, postures, touching
+from mover.bodies.posture import at, elevation, headings, landmarks, postures, touching
 from mover.bodies.skin import PARTS
 from mover.core.observe import Observer, silent
 from mover.core.records import record
@@ -141,7 +143,7 @@ def assign_contacts(
     points = ContactPoints(
         touched, packed.unflatten(0, (len(touched), 4)), weight,
         torch.tensor([counts[i] for i in touched.tolist()], dtype=packed.dtype),
-        shares_of(weight), _headings(rows, touched, inputs),
+        shares_of(weight), *_headings(rows, touched, inputs),
     )  # fmt: skip
     pairs = torch.stack([rows.body, rows.object_of, part], -1)
     sizes = pairs.amax(0) + 1  # unique as numbers, which sort far faster than rows
@@ -160,22 +162,44 @@ def _parts(rows: ContactRows, inputs: AssignInputs, config: AssignConfig) -> Int
     return (~level).long() + 2 * rows.hand.long()
 
 
-def _headings(rows: ContactRows, touched: Int[Tensor, " touched"], inputs: AssignInputs) -> Tensor:
+LONG = 1.3  # times as long as wide: what people sit across
+STEEP = 45.0  # [degrees] above level, at least, of the shins of people whose feet are on the floor
+
+
+def _headings(
+    rows: ContactRows, touched: Int[Tensor, " touched"], inputs: AssignInputs
+) -> tuple[Float[Tensor, "touched 2"], Bool[Tensor, " touched"]]:
     """Mean horizontal direction of the people sitting or lying on each touched object; else zero.
 
-    Seated people face as objects with a back do; on the side of a bed or round a stool they do
-    not. Lying people give the heading of a bed, whose back is where heads lie.
+    Seated people face as objects with a back do. On a bed or a bench they sit across the long side,
+    their feet on the floor; round a stool they face anywhere. Lying people give the heading of a
+    bed, whose back is where heads lie, and they count before those who sit on it.
+
+    Returns:
+        Unit vectors, and which of them are across the front.
     """
-    bodies, parts = inputs.bodies, inputs.parts
+    bodies, parts, objects = inputs.bodies, inputs.parts, inputs.objects
     pose, places = postures(bodies, parts), landmarks(bodies, parts)
     facing = headings(bodies, parts)[:, [0, 2]]
     along = normalize((at(places, "hips") - at(places, "neck"))[:, [0, 2]], dim=-1)
-    means: list[Tensor] = []
+    edge = pose.sitting & (elevation(at(places, "knees") - at(places, "ankles")) > STEEP)
+    means, across = list[Tensor](), list[bool]()
     for o in touched.tolist():
-        bed = inputs.objects.categories[o] == "bed"
-        ways, does = (along, pose.lying) if bed else (facing, pose.sitting)
         there = rows.body[(rows.object_of == o) & ~rows.hand].unique()
-        mean = ways[there[does[there]]].sum(0)
-        known = (bed or bool(inputs.objects.has_back[o])) and float(mean.norm()) > 0.1
-        means.append(mean / mean.norm() if known else 0 * mean)
-    return torch.stack(means)
+        bed, (width, _, depth) = objects.categories[o] == "bed", objects.size[o]
+        lies = bed and bool(pose.lying[there].any())
+        aside = not lies and not bool(objects.has_back[o])
+        ways, does = (along, pose.lying) if lies else (facing, edge if aside else pose.sitting)
+        known = not aside or float(torch.maximum(width / depth, depth / width)) > LONG
+        ways = ways[there[does[there]]]
+        if aside:  # up to half turns
+            angle = 2 * torch.atan2(ways[:, 0], ways[:, 1])
+            x, z = angle.sin().sum() / 2, angle.cos().sum() / 2
+            turn = torch.atan2(x, z) / 2 + (math.pi / 2 if width > depth else 0)
+            mean = torch.hypot(x, z) * torch.stack([turn.sin(), turn.cos()])
+        else:
+            mean = ways.sum(0)
+        length = float(mean.norm())
+        means.append(mean / length if known and length > 0.1 else 0 * mean)
+        across.append(aside)
+    return torch.stack(means), torch.tensor(across)

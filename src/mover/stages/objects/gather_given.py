@@ -12,7 +12,7 @@ from mover.core.types import Heading, Layout, Objects
 from mover.energy.human_terms import ContactPoints
 from mover.energy.image_terms import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.prior_terms import COMMON, SIZE, TURN, Given
-from mover.furniture.library import STANDARD, WALL_PIECES, WIDE_CLASSES, canonical
+from mover.furniture.library import SIZES, STANDARD, WALL_PIECES, WIDE_CLASSES, canonical
 from mover.stages.config import SpreadConfig
 from mover.stages.objects.own_edges import OwnEdges
 
@@ -50,7 +50,7 @@ def gather_given(
         heading: Of the room's walls, where they are seen.
         edges: Of the objects, where they are seen.
     """
-    standard, precision = standard_sizes(objects)
+    standard, precision, slack = standard_sizes(objects)
     along, known = chance_along(objects.categories), torch.ones_like(start.yaw)
     weight = prior_weights(energy)
     loose = (LOOSE * (0.1 + weight).sqrt()).clamp(SQUARE, TURN)
@@ -60,7 +60,7 @@ def gather_given(
         observed.append((yaw, off, sure))
     given = Given(
         distance=start.t_world_object.norm(dim=-1), yaw=start.yaw, along=known, sharpness=known,
-        axis=known, standard=standard, precision=precision, weight=weight,
+        axis=known, standard=standard, precision=precision, slack=slack, weight=weight,
     )  # fmt: skip
     return _along_axes(given, along, room_axis(observed), edges)
 
@@ -107,7 +107,7 @@ def unplaced(count: int) -> Given:
     known, none = torch.ones(count), torch.zeros(count, 3)
     return Given(
         distance=known, yaw=0 * known, along=0 * known, sharpness=known, axis=0 * known,
-        standard=none, precision=none, weight=known, placed=False,
+        standard=none, precision=none, slack=none, weight=known, placed=False,
     )  # fmt: skip
 
 
@@ -160,10 +160,12 @@ MEANINGS = {canonical(name): kinds for name, kinds in WIDE_CLASSES.items()}
 """Of classes that detectors have one name for, the likeliest first."""
 
 
-def standard_sizes(
-    objects: Objects,
-) -> tuple[Float[Tensor, "objects 3"], Float[Tensor, "objects 3"]]:
-    """Logarithms of the standard sizes over those of the meshes, and how well they are known.
+Sizes = tuple[Float[Tensor, "items 3"], Float[Tensor, "items 3"], Float[Tensor, "items 3"]]
+"""`standard`, `precision` and `slack` of `Given`."""
+
+
+def standard_sizes(objects: Objects) -> Sizes:
+    """Standard sizes of objects that were given with their sizes.
 
     Detectors call a coffee table a dining table. So of the classes that have one name the first
     counts whose standard the given size does not contradict, and none where all are contradicted.
@@ -171,21 +173,18 @@ def standard_sizes(
     return _standards(objects.categories, objects.size, firm=False)
 
 
-def sizes_of_shapes(
-    categories: Sequence[str], sizes: Float[Tensor, "items 3"]
-) -> tuple[Float[Tensor, "items 3"], Float[Tensor, "items 3"]]:
-    """The same of shapes that may stand for things of a class: firm standards only.
+def sizes_of_shapes(categories: Sequence[str], sizes: Float[Tensor, "items 3"]) -> Sizes:
+    """The same of shapes that may stand for things of a class: firm standards, and the limits.
 
     Of a class with several meanings (a dining table of COCO may be a desk or a coffee table) it is
-    that which the size of the shape fits; of what is not firm the shape itself says as much.
+    that which the size of the shape fits; of what is not firm the shape itself says as much, but
+    nothing is larger or smaller than all of its class (`SIZES`), if its shape is not.
     """
     return _standards(categories, sizes, firm=True)
 
 
-def _standards(
-    categories: Sequence[str], sizes: Float[Tensor, "items 3"], *, firm: bool
-) -> tuple[Float[Tensor, "items 3"], Float[Tensor, "items 3"]]:
-    usual, sharp = torch.zeros_like(sizes), torch.zeros_like(sizes)
+def _standards(categories: Sequence[str], sizes: Float[Tensor, "items 3"], *, firm: bool) -> Sizes:
+    usual, sharp, slack = (torch.zeros_like(sizes) for _ in range(3))
     for i, (category, size) in enumerate(zip(categories, sizes, strict=True)):
         for name in MEANINGS.get(category, (category,)):
             known = [
@@ -195,11 +194,15 @@ def _standards(
             ]
             fits = all(abs(x) < CONTRADICTED * math.hypot(s, SIZE, COMMON) for _, x, s in known)
             if fits or (firm and category not in MEANINGS):
+                if firm and name in SIZES:
+                    limits = torch.tensor(SIZES[name]).to(size).log() - size.log()[:, None]
+                    low, high = limits[:, 0].clamp_max(0), limits[:, 1].clamp_min(0)
+                    usual[i], slack[i], sharp[i] = (low + high) / 2, (high - low) / 2, FIRM**-2
                 for axis, off, sigma in known:
                     if sigma <= FIRM or not firm:
-                        usual[i, axis], sharp[i, axis] = off, 1 / sigma**2
+                        usual[i, axis], slack[i, axis], sharp[i, axis] = off, 0, 1 / sigma**2
                 break
-    return usual, sharp
+    return usual, sharp, slack
 
 
 def room_axis(

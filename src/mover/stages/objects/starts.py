@@ -102,7 +102,7 @@ def reference_yaw(
     yaw = initial.clone()
     if touches is not None:
         x, z = touches.heading.unbind(-1)
-        seated = (x.abs() + z.abs()) > 0
+        seated = ((x.abs() + z.abs()) > 0) & ~touches.across
         yaw[touches.object_of[seated]] = torch.atan2(x, z)[seated]
     return yaw
 

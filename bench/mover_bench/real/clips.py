@@ -1,0 +1,190 @@
+"""Measure `mover video` on clips without truth: what a room that is right must show.
+
+A clip is a folder with `video.mp4` and `furniture.json` (outlines of furniture in the clean
+picture, as labelme writes them). Its room is made as a user makes it, and judged by what is known
+of all rooms: people are as tall as people are, furniture as large as its class; beds and sofas run
+along a wall; skin rests on seats and soles on the floor; furniture covers its outline.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mover.app.cli.video import VideoArgs, video_to_room
+from mover.bodies.keypoints import keypoints_of
+from mover.bodies.parts import BodyParts, members, parts_of
+from mover.bodies.posture import postures
+from mover.bodies.skinning import open_body
+from mover.bodies.smpl_model import heights_of
+from mover.core.errors import InputError
+from mover.core.files import replacing
+from mover.core.observe import Observer, Step, silent
+from mover.core.types import Bodies, Scene, SceneObject
+from mover.furniture.library import BEDS, SEATS, STANDARD, canonical
+from mover.geometry.boxes import box_of
+from mover.geometry.camera import project, to_camera
+from mover.geometry.placement import place_object
+from mover.geometry.raster import Crops, Topology, look
+from mover.geometry.topology import edges_of
+from mover.io.capture.bodies_file import read_bodies
+from mover.io.capture.scene_file import read_scene
+from mover.io.people.keypoints import read_keypoints
+from mover.perceive.capture import read_picture_of
+from mover.perceive.layout import Picture
+from mover_bench.experiment.args import ExperimentArgs
+
+VIEW = 65.0  # [degrees], horizontal, of a clip whose lens nobody measured
+STEP_UP = 0.15  # [m] that a seat may reach into its sitter and still be below
+LOWEST = 0.1  # of the skin over a seat that may be in it: a mattress gives way
+SURE = 0.5  # least confidence of a joint whose distance counts
+COLUMNS = {
+    "stature": "stature [m]", "miss": "joints off [% of the height]", "sole": "soles off [cm]",
+    "object": "object", "size": "size [m]", "standard": "off the standard [σ]",
+    "wall": "long side off the wall [°]", "seat": "seat gap [cm]", "iou": "IoU on the outline",
+}  # fmt: skip
+
+
+def judge_clips(args: ExperimentArgs, observe: Observer = silent) -> Path:
+    """Make and measure the rooms of all clips below `args.source`; what is finished is kept.
+
+    Returns:
+        The summary, OUT/clips/summary.md; the numbers are the .json beside it.
+
+    Raises:
+        InputError: If there is no clip.
+    """
+    source = args.source or Path()
+    clips = sorted(p.parent for p in source.glob("*/video.mp4") if args.source)
+    if not clips:
+        raise InputError("--source: expected a folder of clips, CLIP/video.mp4 and furniture.json")
+    out, found = args.out / "clips", dict[str, dict[str, Any]]()
+    for done, clip in enumerate(clips):
+        observe(Step(f"clips {clip.name}", done, len(clips)))
+        video_to_room(VideoArgs(
+            clip / "video.mp4", out / clip.name, keypoints="mediapipe", fov=VIEW,
+            objects=clip / "furniture.json", preset=args.variants[0],
+        ))  # fmt: skip
+        found[clip.name] = judge_room(out / clip.name)
+    with replacing(out / "summary.json") as part:
+        part.write_text(json.dumps(found, indent=1))
+    with replacing(out / "summary.md") as part:
+        part.write_text(table_of(found))
+    return out / "summary.md"
+
+
+def table_of(found: dict[str, dict[str, Any]]) -> str:
+    """A row for each object of each clip."""
+    lines = ["| clip | " + " | ".join(COLUMNS.values()) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
+    for name, clip in found.items():
+        for row in clip["objects"]:
+            cells = [{**clip, **row}.get(key) for key in COLUMNS]
+            lines.append(f"| {name} | " + " | ".join("" if c is None else str(c) for c in cells))
+            lines[-1] += " |"
+    return "\n".join([*lines, ""])
+
+
+def judge_room(folder: Path) -> dict[str, Any]:
+    """What a folder of `mover video` shows."""
+    capture, room = folder / "capture", folder / "room"
+    scene, bodies = read_scene(room / "scene.json"), read_bodies(room / "bodies.npz")
+    parts, picture = parts_of(bodies), read_picture_of(capture)
+    pose = postures(bodies, parts, scene.ground)
+    soles = bodies.verts[:, members(parts, "left_sole", "right_sole"), 1].amin(1)
+    on_feet = pose.standing | pose.sitting
+    off = 100 * (soles[on_feet] - (scene.ground or 0.0))
+    usual, growth = heights_of(open_body())
+    stature = None
+    if bodies.pose is not None:
+        betas = bodies.pose.betas[0]
+        stature = round(usual + float(betas @ growth[: len(betas)]), 3)
+    rows = [row_of(thing, scene, picture, bodies, parts) for thing in scene.objects]
+    return {
+        "stature": stature, "miss": miss_of(capture, stature or usual),
+        "sole": round(float(off.abs().median()), 1) if len(off) else None, "objects": rows,
+    }  # fmt: skip
+
+
+def row_of(
+    thing: SceneObject, scene: Scene, picture: Picture, bodies: Bodies, parts: BodyParts
+) -> dict[str, Any]:
+    """The measures of one object."""
+    box, kind = box_of(thing), canonical(thing.category)
+    size = box.size.tolist()
+    standards = zip(size, STANDARD.get(kind, (None,) * 3), strict=True)
+    off = [abs(math.log(x / known[0])) / known[1] for x, known in standards if known is not None]
+    wall = None
+    if kind in BEDS:  # its long side runs across the view, along the wall behind it
+        long = float(thing.yaw) + (math.pi / 2 if size[2] > size[0] else 0.0)
+        heading = 0.0 if picture.heading is None else picture.heading.yaw
+        across = heading + round(-heading / (math.pi / 2)) * math.pi / 2
+        turned = (long - across) % math.pi
+        wall = round(math.degrees(min(turned, math.pi - turned)), 1)
+    gaps = seat_gaps(thing, bodies, parts, scene) if kind in SEATS else []
+    row = [k for k, d in enumerate(picture.detections) if d.id == thing.annotation]
+    return {
+        "object": thing.id, "size": " x ".join(f"{x:.2f}" for x in size), "wall": wall,
+        "standard": round(max(off), 1) if off else None,
+        "seat": round(100 * float(torch.tensor(gaps).median()), 1) if gaps else None,
+        "iou": outline_iou(thing, scene, picture, row[0]) if row else None,
+    }  # fmt: skip
+
+
+def outline_iou(thing: SceneObject, scene: Scene, picture: Picture, row: int) -> float:
+    """Of the object's silhouette with its outline, where no person hides it."""
+    camera, mesh = scene.camera, place_object(thing)
+    verts = to_camera(mesh.verts, camera.R_cam_world)[None]
+    views = Crops(camera.K[None], camera.height, camera.width)
+    cover, _ = look(verts, Topology(mesh.faces[None], edges_of(mesh.faces)[None]), views)
+    ours, seen = (cover[0] > 0.5) & ~picture.people, picture.masks[row] & ~picture.people
+    return round(float((ours & seen).sum() / (ours | seen).sum().clamp_min(1)), 3)
+
+
+def seat_gaps(thing: SceneObject, bodies: Bodies, parts: BodyParts, scene: Scene) -> list[float]:
+    """How far the lowest skin of pelvis and thighs of each sitter is over the object [m]."""
+    mesh, sitting = place_object(thing), postures(bodies, parts, scene.ground).sitting
+    skin, gaps = members(parts, "seat", "left_thigh", "right_thigh"), list[float]()
+    for row in sitting.nonzero()[:, 0].tolist():
+        points = bodies.verts[row, skin]
+        gap = points[:, 1] - tops_below(points, mesh.verts[mesh.faces])
+        if bool(gap.isfinite().any()):
+            gaps.append(float(gap[gap.isfinite()].quantile(LOWEST)))
+    return gaps
+
+
+def tops_below(
+    points: Float[Tensor, "points 3"], faces: Float[Tensor, "faces 3 3"]
+) -> Float[Tensor, " points"]:
+    """Height of the highest surface under each point [m]; minus infinity where there is none."""
+    a, b, c = (faces[None, :, k] for k in range(3))
+    ab, ac, ap = ((x - a)[..., [0, 2]] for x in (b, c, points[:, None]))
+    area = ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0]
+    area = torch.where(area.abs() < 1e-9, torch.full_like(area, math.nan), area)
+    v = (ap[..., 0] * ac[..., 1] - ap[..., 1] * ac[..., 0]) / area
+    w = (ab[..., 0] * ap[..., 1] - ab[..., 1] * ap[..., 0]) / area
+    height = a[..., 1] + v * (b - a)[..., 1] + w * (c - a)[..., 1]
+    inside = (v >= 0) & (w >= 0) & (v + w <= 1) & (height < points[:, None, 1] + STEP_UP)
+    return torch.where(inside, height, torch.full_like(height, -math.inf)).amax(1)
+
+
+def miss_of(capture: Path, stature: float) -> float | None:
+    """Mean distance of the fitted joints from the detected ones, of the height in the picture."""
+    bodies, joints = read_bodies(capture / "bodies.npz"), read_keypoints(capture / "keypoints.npz")
+    if bodies.joints is None or bodies.space != "camera":
+        return None
+    K = read_picture_of(capture).camera.K
+    places = keypoints_of(open_body(), bodies.verts, bodies.joints, joints.layout)
+    seen = zip(joints.frame.tolist(), joints.person.tolist(), strict=True)
+    keys = {key: k for k, key in enumerate(seen)}
+    misses = list[Tensor]()
+    for row, key in enumerate(zip(bodies.frame.tolist(), bodies.person.tolist(), strict=True)):
+        if key in keys:
+            sure = (joints.confidence[keys[key]] > SURE) & places[row].isfinite().all(-1)
+            off = project(places[row], K) - joints.points[keys[key]]
+            tall = stature * K[1, 1] / bodies.verts[row, :, 2].mean()
+            misses.append(off[sure].norm(dim=-1) / tall)
+    return round(100 * float(torch.cat(misses).mean()), 1) if misses else None
