@@ -13,16 +13,19 @@ import torch
 from mover.app.cli import run_command
 from mover.bodies.keypoints import LAYOUTS
 from mover.core.errors import InputError
-from mover.geometry.rle import decode
+from mover.core.types import Masks
+from mover.geometry.rle import decode, encode
 from mover.perceive import mediapipe, needs, weights
 from mover.perceive.config import FramesConfig, ModelsConfig
 from mover.perceive.mediapipe import (
     PoseInputs,
+    Poses,
     detected,
     find_poses,
     people_in,
     pose_inputs,
     refined,
+    without_furniture,
 )
 from mover.perceive.video import Clip, read_frames, write_jpeg
 
@@ -107,6 +110,29 @@ def test_several_people_are_found_upright_in_the_pixels_of_the_picture(
         mask = decode(found.masks, k)
         assert float((mask & true).sum() / (mask | true).sum()) > 0.9
     assert found.confidence.flatten().tolist() == pytest.approx([0.8] * 5 * 33)
+
+
+def test_masks_lose_the_furniture_that_no_limb_is_near_to():
+    """A man of 200 px stands upright before a chair; his mask takes the chair along."""
+    points = np.full((1, 33, 2), 160.0)
+    rows = {0: 20, 7: 20, 8: 20, 11: 60, 12: 60, 23: 120, 24: 120, 25: 169, 26: 169, 27: 218,
+            28: 218, 29: 225, 30: 225, 31: 225, 32: 225}  # fmt: skip
+    for k in range(33):
+        points[0, k, 1] = rows.get(k, 100)
+    y, x = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
+    body = ((x - 160).abs() < 10) & (y > 10) & (y < 228)
+    chair = (x > 150) & (x < 260) & (y > 130) & (y < 220)
+    masks = Masks(H, W, (encode(body | chair | ((x > 280) & (y > 200))),))
+    poses = Poses(
+        masks, torch.from_numpy(points).float(), torch.ones(1, 33), torch.tensor([0]),
+        torch.tensor([0]),
+    )  # fmt: skip
+    found = decode(without_furniture(poses, chair).masks, 0)
+    assert bool((found & body).sum() == body.sum())  # what is near to a limb stays
+    assert not bool(found[:, 200:260].any())  # of the chair nothing else
+    assert bool(found[220, 300])  # what is no furniture stays
+    none = without_furniture(poses, torch.zeros(H, W, dtype=torch.bool))
+    assert none.masks.counts == masks.counts
 
 
 def test_nothing_is_found_in_an_empty_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -236,7 +236,7 @@ def test_the_lens_comes_from_the_file_the_angle_or_the_photo(tmp_path: Path):
     exif.get_ifd(0x8769)[0xA405] = 28
     picture.save(tmp_path / "p.jpg", exif=exif)
     assert exif_focal(tmp_path / "p.jpg", (3600, 2400)) == pytest.approx(2800)
-    at, text = lens_of((3600, 2400), Lens(photo=tmp_path / "p.jpg"))
+    at, text = lens_of((3600, 2400), Lens(tmp_path / "p.jpg"))
     assert text is None
     _, text = lens_of((3600, 2400), Lens())
     assert "--fov" in (text or "")

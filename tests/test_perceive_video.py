@@ -1,19 +1,21 @@
 """The way from a video to a capture, on tiny networks, and what is kept of their finds."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from test_lens import FOCAL, camera_of, drawn
 from tiny_models import tiny_mask2former, tiny_vitpose
 
 from mover.core.run import Run
-from mover.core.types import Masks
+from mover.core.types import Keypoints, Masks
 from mover.geometry.rle import decode, encode
 from mover.io.people.keypoints import read_keypoints
-from mover.perceive.capture import Finders, Video, perceive
+from mover.perceive.capture import Finders, Video, lens_by_lines, perceive, restless
 from mover.perceive.config import FramesConfig, Lens, ModelsConfig, PerceiveConfig
 from mover.perceive.networks import Finds, Tracks
 from mover.perceive.reference import Clean, detections_in, grown, hidden_mask, reference_of
@@ -102,3 +104,31 @@ def test_furniture_is_kept_once_and_cups_are_not():
     one = hidden_mask(hidden)
     assert one is not None
     assert torch.equal(decode(one, 0), masks[0])
+
+
+@pytest.mark.parametrize(("fps", "dense"), [(5.0, False), (10.0, True)])
+def test_jumps_ask_for_more_frames_a_second_and_walks_do_not(fps: float, dense: bool):
+    """A person 100 px tall jumps 1.6 times a second by 30 px, or walks."""
+    time = torch.arange(int(6 * fps)) / fps
+    person = torch.rand(17, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([30, 100])
+    for jumps, walks in ((True, 0.0), (False, 90.0)):
+        points = person + torch.stack([walks * time, 0 * time], -1)[:, None]
+        if jumps:
+            points[..., 1] += 15 * (2 * torch.pi * 1.6 * time).sin()[:, None]
+        frames = torch.arange(len(time))
+        joints = Keypoints(points, torch.ones(len(time), 17), "coco17", frames, 0 * frames, fps)
+        assert restless(joints) == (jumps and not dense)
+        gone = replace(joints, frame=3 * frames)  # no two frames that follow each other
+        assert not restless(gone)
+
+
+@pytest.mark.parametrize(("spread", "taken"), [(0.055, True), (0.0, False), (None, False)])
+def test_the_lens_of_the_lines_counts_before_bodies_are_fitted(spread: float | None, taken: bool):
+    picture, said = drawn(0.5, seed=1), list[str]()
+    clean = Clean(picture, torch.zeros(picture.shape[:2], dtype=torch.bool))
+    guess = camera_of(1.08 * FOCAL, -0.1)
+    found, left = lens_by_lines(guess, spread, clean, said.append)
+    off = float(found.K[0, 0]) / FOCAL - 1
+    assert abs(off) < 0.03 if taken else off == pytest.approx(0.08)
+    assert left == (0.0 if taken else spread)
+    assert len(said) == taken

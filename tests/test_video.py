@@ -242,7 +242,7 @@ def test_a_video_becomes_a_room_and_files_that_are_replaced_stay(
     assert (found.verts.norm(dim=-1).mean() / heights - 1).abs() < 0.15
     capsys.readouterr()
     write_bodies(bodies, out / "capture" / "bodies.npz")
-    args = VideoArgs(video, out, camera=args.camera, refine=False)
+    args = VideoArgs(video, out, camera=args.camera)
     video_to_room(args, finders)
     told = capsys.readouterr().out
     assert [line for line in told.splitlines() if line.endswith("kept")] == [

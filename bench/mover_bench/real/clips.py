@@ -44,7 +44,7 @@ LOWEST = 0.1  # of the skin over a seat that may be in it: a mattress gives way
 SURE = 0.5  # least confidence of a joint whose distance counts
 COLUMNS = {
     "stature": "stature [m]", "miss": "joints off [% of the height]", "sole": "soles off [cm]",
-    "object": "object", "size": "size [m]", "standard": "off the standard [σ]",
+    "object": "object", "size": "size [m]", "standard": "off the standard [spreads]",
     "wall": "long side off the wall [°]", "seat": "seat gap [cm]", "iou": "IoU on the outline",
 }  # fmt: skip
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from mover.bodies.keypoints import LAYOUTS
 from mover.core.errors import InputError
 from mover.core.observe import Observer
 from mover.core.records import fingerprint
@@ -57,12 +58,18 @@ from mover.perceive.networks import (
 from mover.perceive.own import Own, own_keypoints, own_masks, own_objects, same_people
 from mover.perceive.reference import Clean, clip_of_clean, detections_in, hidden_mask, reference_of
 from mover.perceive.steady import Drift, SteadyInputs, find_drift, steady_frames, warnings_of
-from mover.perceive.video import Clip, TakeInputs, stamp_of, take_frames
+from mover.perceive.video import PICTURES, Clip, TakeInputs, rate_of, stamp_of, take_frames
 from mover.stages.camera.find_lens import LensInputs, find_lens, zoomed
 from mover.stages.camera.room_lines import find_segments
 from mover.stages.config import LensConfig
 
 log = logging.getLogger(__name__)
+BEND, OFTEN = 0.15, 0.9  # of the height: second difference of the trunk, and of how many frames
+FEWEST, DENSEST = (
+    30,
+    20.0,
+)  # frames that a clip should have, and frames a second from which none more
+SIDES = ("left", "right")
 CHUNK = 50  # frames whose detections are kept together
 # How far off a focal length may be, of its logarithm; what a file gives stays as it is.
 BY_EXIF = 0.05  # of a photo, while a video is cut by what steadies it
@@ -105,12 +112,11 @@ def perceive(
         InputError: If the source, a file or a network is missing; if it is only that of furniture,
             all else is written.
     """
-    clip, drift = steady_clip(video.source, out, config, run, say)
+    clip, drift, tracks, joints, poses = moving_people(video, out, config, run, say, finders)
     at, text = lens_of((clip.width, clip.height), video.lens)
     if text is not None:
         say(f"warning: {text}")
     camera, spread = camera_of(at), at.value.get("focal_spread")
-    tracks, joints, poses = people_of_clip(clip, drift, video.own, config, run, say, finders)
     clean = reference_of(clip, drift, tracks)
     lacking: InputError | None = None
     try:
@@ -153,19 +159,55 @@ def perceive(
     write_json(objects, out / "objects.json")
 
 
+def moving_people(
+    video: Video, out: Path, config: PerceiveConfig, run: Run, say: Say, finders: Finders
+) -> tuple[Clip, Drift, Tracks, Keypoints | None, Poses | None]:
+    """The steadied clip, and the people in it, at as many frames a second as their motion needs."""
+    most = min(DENSEST, rate_of(video.source, replace(config.frames, fps=0.0)) or 0.0)
+    while True:
+        clip, drift = steady_clip(video.source, out, config, run, say)
+        found = people_of_clip(clip, drift, video.own, config, run, say, finders)
+        joints, faster = found[1], min(2 * (clip.fps or 0.0), most)
+        if joints is None or video.own.keypoints is not None or faster <= (clip.fps or 0.0):
+            return clip, drift, *found
+        if len(clip.time) >= FEWEST and not restless(joints):
+            return clip, drift, *found
+        say(f"people move fast, or the clip is short: {faster:g} frames a second are taken")
+        config = replace(config, frames=replace(config.frames, fps=faster))
+
+
+def restless(joints: Keypoints) -> bool:
+    """Whether people turn back between two frames: a jump would be flattened."""
+    names = LAYOUTS[joints.layout]
+    trunk = [names.index(f"{side}_{part}") for side in SIDES for part in ("shoulder", "hip")]
+    bends = [torch.zeros(1)]
+    for person in joints.person.unique():
+        mine = (joints.person == person).nonzero()[:, 0]
+        mine = mine[joints.frame[mine].argsort()]
+        points, frame = joints.points[mine], joints.frame[mine]
+        tall = (points.amax(1) - points.amin(1)).amax(-1).median()
+        middle = points[:, trunk].mean(1)
+        bend = (middle[2:] - 2 * middle[1:-1] + middle[:-2]).norm(dim=-1) / tall
+        bends.append(bend[frame[2:] - frame[:-2] == 2])
+    return float(torch.cat(bends).quantile(OFTEN)) > BEND
+
+
 def steady_clip(
     source: Path, out: Path, config: PerceiveConfig, run: Run, say: Say
 ) -> tuple[Clip, Drift]:
     """The longest shot of a video, as a camera that stands still saw it, in CAPTURE/frames."""
-    taken = TakeInputs(source, stamp_of(source), out / "perceived" / "raw")
+    raw = out / "perceived" / "raw" / f"{config.frames.fps:g}"
+    taken = TakeInputs(source, stamp_of(source), raw)
     whole = run.stage(take_frames, taken, config.frames)
     drift = run.stage(find_drift, SteadyInputs(whole), None)
     for text in warnings_of(drift, whole.time):
         say(f"warning: {text}")
     raw = whole.part(drift.first, drift.first + len(drift.agree))
     steady = replace(raw, folder=str(out / "frames"), origin=fingerprint(raw.origin, drift))
-    if not steady.path(len(raw.time) - 1).is_file() or not run.stages[-1].kept:
+    made = out / "perceived" / "frames.txt"  # of which clip the files there are
+    if not made.is_file() or made.read_text() != steady.origin:
         steady_frames(raw, drift, out / "frames", run.observe)
+        made.write_text(steady.origin)
     return steady, drift
 
 
@@ -243,14 +285,15 @@ def lens_of(size: tuple[int, int], lens: Lens) -> tuple[At, str | None]:
 
     Args:
         size: Width and height of the frames [px].
-        lens: A calibration of any known kind (GeoCalib's also gives pitch and roll), the
-            horizontal field of view [degrees], or a picture whose EXIF gives the focal length.
+        lens: A calibration of any known kind (GeoCalib's also gives pitch and roll), a picture
+            whose EXIF gives the focal length, or the horizontal field of view [degrees].
 
     Raises:
         InputError: If what is given cannot be used.
     """
-    file, fov, photo = lens.file, lens.fov, lens.photo
-    if file is not None:
+    file, fov = lens.file, lens.fov
+    photo = file if file is not None and file.suffix.lower() in PICTURES else None
+    if file is not None and photo is None:
         return _in_pixels_of(size, read_camera_file(file, size)), None
     if fov is not None:
         return guessed_view(fov, size), None

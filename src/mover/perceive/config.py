@@ -15,7 +15,7 @@ class FramesConfig:
     """Which frames are taken."""
 
     fps: Annotated[float, float_in(0, 1e4)] = 5.0
-    """Frames a second; 0: all, at the rate of the video."""
+    """Frames a second at least, more where people move fast; 0: all, at the rate of the video."""
     start: Seconds = 0.0
     """Start of the part that is used [s]."""
     end: Seconds = 0.0
@@ -34,8 +34,6 @@ class ModelsConfig:
     """Joints of people (ViTPose on COCO's 17); empty: none."""
     device: str = "auto"
     """auto, cpu or cuda."""
-    download: bool = False
-    """Fetch what is not in the cache."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +53,8 @@ class Lens:
     """What is known of the camera."""
 
     file: Path | None = None
+    """A calibration, or a photo of the same camera."""
     fov: Annotated[float, float_in(1, 179)] | None = None
-    photo: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -64,10 +64,8 @@ def missing(
 
 
 def _is_here(kind: str, models: ModelsConfig) -> bool:
-    """Whether a network can be loaded; a network that may be fetched counts as there."""
+    """Whether a network can be loaded."""
     name = str(getattr(models, kind))
-    if models.download:
-        return True
     if Path(name).is_dir():
         held = {path.name for path in Path(name).iterdir()}
         return "config.json" in held and any(file in held for file in FILES)
@@ -87,7 +85,7 @@ def absent(kind: str, models: ModelsConfig) -> str:
     known = f" ({'; '.join(FACTS[name])})" if name in FACTS else ""
     return (
         f"--models.{kind}: {name}{known}: run `hf download {name}` once where there is a network, "
-        f"or --models.download, or --models.{kind} with a folder that holds it"
+        f"or --models.{kind} with a folder that holds it"
     )
 
 

@@ -62,11 +62,11 @@ def network(kind: str, config: ModelsConfig) -> Network:
         raise InputError(f"--models.device: {device!r} is none of auto, cpu, cuda")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise InputError("--models.device: there is no GPU that torch can use, expected cpu")
-    return _loaded(kind, str(getattr(config, kind)), device, config.download)
+    return _loaded(kind, str(getattr(config, kind)), device)
 
 
 @lru_cache(maxsize=4)
-def _loaded(kind: str, name: str, device: str, download: bool) -> Network:
+def _loaded(kind: str, name: str, device: str) -> Network:
     try:
         library: Any = importlib.import_module("transformers")
     except ImportError as error:
@@ -74,9 +74,9 @@ def _loaded(kind: str, name: str, device: str, download: bool) -> Network:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            own: dict[str, Any] = {"local_files_only": not download}
-            model = getattr(library, CLASSES[kind]).from_pretrained(name, **own)
-            processor = library.AutoImageProcessor.from_pretrained(name, **own)
+            here: dict[str, Any] = {"local_files_only": True}
+            model = getattr(library, CLASSES[kind]).from_pretrained(name, **here)
+            processor = library.AutoImageProcessor.from_pretrained(name, **here)
     except (OSError, ValueError, KeyError, ImportError) as error:
         log.debug("loading %s: %s", name, error)
         raise InputError(absent(kind, replace(ModelsConfig(), **{kind: name}))) from error

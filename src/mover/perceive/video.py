@@ -114,7 +114,7 @@ def take_frames(inputs: TakeInputs, config: FramesConfig, observe: Observer = si
         old.unlink()
     times, numbers, indices = list[float](), list[int](), list[int]()
     size: tuple[int, int] | None = None
-    fps = _rate(inputs.source, config)
+    fps = rate_of(inputs.source, config)
     for number, (index, time, pixels) in chosen(read_frames(inputs.source, config), config, fps):
         picture = pixels()
         found = picture.shape[1], picture.shape[0]
@@ -216,7 +216,7 @@ def write_jpeg(picture: Picture, path: Path) -> None:
         Image.fromarray(picture).save(part, format="JPEG", quality=QUALITY)
 
 
-def _rate(source: Path, config: FramesConfig) -> float | None:
+def rate_of(source: Path, config: FramesConfig) -> float | None:
     """Frames a second of what is taken."""
     known = config.folder_fps or None
     if not pictures_of(source):

@@ -70,12 +70,11 @@ RUN_SETTINGS = {
 }
 """Settings of `Config` that `mover run` and `mover batch` have as flags, and what they are."""
 PERCEIVE_SETTINGS = {
-    "frames.fps": "Frames a second that are taken.",
+    "frames.fps": "Frames a second that are taken at least.",
     "frames.start": "Where the part of the video starts [s].",
     "frames.end": "Where it ends; 0: with the video [s].",
     "models.masks": "The network of masks.",
     "models.keypoints": "The network of joints.",
-    "models.download": "Fetch networks that are missing.",
     "score": "Least score of a detection.",
 }
 """The same of `PerceiveConfig`, of `mover video`."""

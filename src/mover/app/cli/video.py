@@ -178,11 +178,10 @@ class VideoArgs:
     """How tall people are, one for all or for each in the order of their numbers [m]: gives
     `--bodies fit` and the room how far they are."""
     camera: Path | None = None
-    """A calibration; GeoCalib's also has pitch and roll."""
+    """A calibration (GeoCalib's also has pitch and roll), or a photo of the same camera, whose EXIF
+    has the focal length."""
     fov: Annotated[float, float_in(1, 179)] | None = None
     """Horizontal field of view, where there is no calibration [degrees]."""
-    photo: Path | None = None
-    """A photo of the same camera, whose EXIF has the focal length."""
     depth: Path | None = None
     """Metric depth of the reference picture, for the first scene and the room."""
     meshes: Path | None = None
@@ -191,8 +190,6 @@ class VideoArgs:
     """Settings of the room: paper or robust."""
     device: Device = "cpu"
     """Where the room is computed: cpu, cuda or auto."""
-    refine: bool = True
-    """Refine the people with the room at the end."""
     config: Suppress[Fixed[PerceiveConfig]] = field(default_factory=PerceiveConfig)
 
 
@@ -228,7 +225,7 @@ def video_to_room(args: VideoArgs, finders: "Finders | None" = None) -> None:
         read_picture(pictures[0])
         say(ONE_IMAGE)
     capture, steps = args.out / "capture", steps_in(args.out, say, STEPS)
-    lens = args.camera, args.fov, args.photo
+    lens = args.camera, args.fov
     own = [args.people_masks, args.objects, None if OUT in args.keypoints else Path(args.keypoints)]
     seen = [str((str(source.resolve()), *stamp_of(source))), repr(args.config), *map(str, lens)]
     seen += [args.keypoints, str(args.objects_frame), *("none" if p is None else p for p in own)]
@@ -256,7 +253,7 @@ def _pictures(args: VideoArgs, capture: Path, finders: "Finders | None") -> None
     torch.set_num_threads(THREADS)
     with Bar() as bar:
         run = Run(capture / "perceived", bar)
-        video = Video(args.source, Lens(args.camera, args.fov, args.photo), _own(args, capture))
+        video = Video(args.source, Lens(args.camera, args.fov), _own(args, capture))
         perceive(video, capture, args.config, run, say, finders or Finders())
     say(f"{capture}: wrote frames/, reference.png, objects.json, people.json, camera.json")
 
@@ -353,7 +350,7 @@ def _room(capture: Path, args: VideoArgs) -> None:
     from mover.io.formats import read
 
     say(f"{len(STEPS)}/{len(STEPS)} {STEPS[-1]} ...")
-    people = (capture / "bodies.npz").is_file() and args.refine
+    people = (capture / "bodies.npz").is_file()
     origin = Origin(str(capture.resolve()), refine=people, device=device_of(args.device))
     reconstruct_into(args.out / "room", read("folder", capture), preset_named(args.preset), origin)
     say(f"report: {args.out / 'room' / 'report.html'}")
