@@ -12,7 +12,7 @@ from analytic import FACES, box_verts, boxes_of, given_at
 from torch import Tensor
 
 from mover.core.types import Bodies, Camera, Heading, Layout, Mesh
-from mover.energy.human_terms import ContactPoints
+from mover.energy.human_terms import ContactPoints, heading_term, some_touches
 from mover.energy.image_terms import LEAST, LIKELY, SEEN, UNKNOWN
 from mover.energy.prior_terms import AWAY, Given, given_term
 from mover.furniture.library import (
@@ -43,6 +43,7 @@ from mover.stages.objects.gather_given import (
     unplaced,
 )
 from mover.stages.objects.prepare_objects import levelled
+from mover.stages.objects.starts import reference_yaw
 from mover.stages.people.find_depth import are_shapeless, nearer, size_spread
 from mover_bench.rooms.foreign import foreign_mesh
 
@@ -313,6 +314,22 @@ def test_of_what_people_use_a_guess_says_less_beside_them() -> None:
     trust = torch.full((3,), 0.25)
     assert lighter_where_used(given, trust, touched).weight.tolist() == [4.0, 1.0, 4.0]
     assert lighter_where_used(given, trust, None) is given
+
+
+def test_sitters_turn_chairs_to_where_they_face_and_beds_across_it_to_either_side() -> None:
+    touched = ContactPoints(
+        object_of=torch.tensor([0, 1]), points=torch.zeros(2, 4, 2, 3),
+        weight=torch.ones(2, 4, 2), bodies=torch.ones(2), share=torch.ones(2, 4),
+        heading=torch.tensor([[0.0, 1.0]] * 2), across=torch.tensor([False, True]),
+    )  # fmt: skip
+    quarters = math.pi / 2 * torch.arange(4)[:, None].expand(4, 2)
+    starts = Layout(torch.zeros(4, 2, 3), quarters, torch.zeros(4, 2, 3))
+    found = heading_term(starts, touched)
+    assert found[:, 0].tolist() == pytest.approx([0, 1, 2, 1], abs=1e-6)
+    assert found[:, 1].tolist() == pytest.approx([1, 0, 1, 0], abs=1e-6)
+    few = some_touches(touched, torch.tensor([1]), 2)
+    assert few.across.tolist() == [True]
+    assert reference_yaw(torch.tensor([0.3, 0.3]), touched).tolist() == pytest.approx([0.0, 0.3])
 
 
 def test_prior_weights_count_for_positions_and_sizes_but_not_beyond_one_for_yaws() -> None:
