@@ -25,7 +25,7 @@ from mover.core.errors import InputError
 from mover.core.files import replacing
 from mover.core.observe import Observer, Step, silent
 from mover.core.types import Bodies, Scene, SceneObject
-from mover.furniture.library import BEDS, SEATS, STANDARD, canonical
+from mover.furniture.library import SEATS, STANDARD, canonical
 from mover.geometry.boxes import box_of
 from mover.geometry.camera import project, to_camera
 from mover.geometry.placement import place_object
@@ -118,7 +118,7 @@ def row_of(
     standards = zip(size, STANDARD.get(kind, (None,) * 3), strict=True)
     off = [abs(math.log(x / known[0])) / known[1] for x, known in standards if known is not None]
     wall = None
-    if kind in BEDS:  # its long side runs across the view, along the wall behind it
+    if kind in ("bed", "sofa"):  # its long side runs across the view, along the wall behind it
         long = float(thing.yaw) + (math.pi / 2 if size[2] > size[0] else 0.0)
         heading = 0.0 if picture.heading is None else picture.heading.yaw
         across = heading + round(-heading / (math.pi / 2)) * math.pi / 2
